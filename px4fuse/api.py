@@ -106,7 +106,7 @@ def compare(
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
-    arguments = locals()  # by the names of the fields of ComparisonRequest
+    arguments = locals()  # names equal the fields of ComparisonRequest
     known_axes = get_args(request.AxisName)
     axis_names = (axes,) if isinstance(axes, str) else tuple(axes)
     if unknown_axes := set(axis_names).difference(known_axes):
@@ -123,14 +123,17 @@ def compare(
         raise SettingsError(
             f"`clock_offset_s` {clock_offset_s!r} is not a number of seconds or 'auto'."
         )
-    fields = {name: arguments[name] for name in request.ComparisonRequest.__struct_fields__}
-    fields |= {"log": log.log.name if isinstance(log, Flight) else str(log), "axes": axis_names}
+    request_fields = {name: arguments[name] for name in request.ComparisonRequest.__struct_fields__}
+    request_fields |= {
+        "log": log.log.name if isinstance(log, Flight) else str(log),
+        "axes": axis_names,
+    }
     if isinstance(position, str | Path):
-        fields["position"] = request.PositionFile(path=str(position))
+        request_fields["position"] = request.PositionFile(path=str(position))
     if isinstance(clock_offset_s, int):
-        fields["clock_offset_s"] = float(clock_offset_s)
+        request_fields["clock_offset_s"] = float(clock_offset_s)
     flight = log if isinstance(log, Flight) else None
-    return diagnose(request.ComparisonRequest(**fields), progress, flight)
+    return diagnose(request.ComparisonRequest(**request_fields), progress, flight)
 
 
 def table(analysis: Analysis) -> pd.DataFrame:
@@ -139,14 +142,19 @@ def table(analysis: Analysis) -> pd.DataFrame:
     Columns have the names of the JSON results; ``nis_low`` and ``nis_high`` are the 95 % band of
     the mean NIS. RMSE and NEES are against ground truth. Missing numbers are NaN.
     """
-    rows = {
+    row_by_axis_and_filter = {
         (axis_name, filter_name): _summary_row(summary)
         for axis_name, axis in analysis.axes.items()
         for filter_name, summary in axis.filters.items()
     }
-    index = pd.MultiIndex.from_tuples(rows, names=["axis", "filter"])
-    types = dict.fromkeys(SUMMARY_COLUMNS, "float64") | {"count": "Int64", "verdict": "object"}
-    return pd.DataFrame(list(rows.values()), index, SUMMARY_COLUMNS).astype(types)
+    index = pd.MultiIndex.from_tuples(row_by_axis_and_filter, names=["axis", "filter"])
+    column_types = dict.fromkeys(SUMMARY_COLUMNS, "float64") | {
+        "count": "Int64",
+        "verdict": "object",
+    }
+    return pd.DataFrame(list(row_by_axis_and_filter.values()), index, SUMMARY_COLUMNS).astype(
+        column_types
+    )
 
 
 def _summary_row(summary: FilterSummary | UntestedFilter) -> dict[str, Any]:
@@ -232,15 +240,15 @@ def close_loop(
     TrajectoryError, LogError, MissingDataError, SettingsError
         A file cannot be read or lacks required data, or a number is out of range.
     """
-    fields = {name: value for name, value in locals().items() if name != "progress"}
-    fields |= {"source": str(source), "reference": None, "closures": tuple(closures)}
-    fields["landed_at"] = None if landed_at is None else request.Landing(*landed_at)
+    request_fields = {name: value for name, value in locals().items() if name != "progress"}
+    request_fields |= {"source": str(source), "reference": None, "closures": tuple(closures)}
+    request_fields["landed_at"] = None if landed_at is None else request.Landing(*landed_at)
     if isinstance(source, Trajectory):
         loop_source = LoopSource(source, None)
     else:
         loop_source = read_source(str(source), frame=frame)
-    track = None if reference is None else _read_reference(reference)
-    return analyse(loop_source, request.LoopRequest(**fields), track, progress)
+    reference_track = None if reference is None else _read_reference(reference)
+    return analyse(loop_source, request.LoopRequest(**request_fields), reference_track, progress)
 
 
 def write_report(analysis: Analysis, path: Pathlike) -> Path:

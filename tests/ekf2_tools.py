@@ -78,7 +78,7 @@ def plain_replay(
             F = step_matrix(segment, k, trapezoid=False)
             x = step_state(segment, k, x)
             P = F @ P @ F.T + step_noise(segment, k, gyro, force)
-            P += np.diag(drift * inputs.step_s**2)
+            P += np.diag(drift * inputs.mean_step_s**2)
             k += 1
         position = inputs.received.position_m[sample]
         if action:

@@ -170,7 +170,7 @@ def score_grid(
                 p_ij + q * unit + fixed
                 for p_ij, unit, fixed in zip(
                     propagate_covariance(covariance, axis.length_s[k]),
-                    axis.noise_unit[k], axis.noise_fixed[k], strict=True,
+                    axis.unit_process_noise[k], axis.added_process_noise[k], strict=True,
                 )
             )  # fmt: skip
             (nu, s, _, _), (p, v, covariance) = update_step(p, v, covariance, z, r / weight[k])

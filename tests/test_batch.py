@@ -505,7 +505,7 @@ def assert_failed_job_does_not_affect_others(address):
     # jobs that end at once or never: reporting an exception takes seconds of imports
     jobs = [("square", 3), ("unreadable", 0), ("exit", 3), ("hang", 0), ("square", 4)]
     work = partial(run_with_limits, failing_jobs.run_job, timeout_s=5.0, memory_bytes=2 * 10**9)
-    expected = [9, "could not be unpickled (ValueError)", "exit code 3", "limit of 5 s", 16]
+    expected = [9, "cannot be read (ValueError)", "exit code 3", "limit of 5 s", 16]
     with connect_cluster(address) as client:
         found = []
         for one, result in run_jobs(client, work, [*jobs, ("square", 5)]):

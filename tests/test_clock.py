@@ -37,11 +37,11 @@ from px4fuse.core.arrays import Array
 from px4fuse.filter import time_offset
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.imu_motion import (
-    CONSTANT_SIGMAS,
+    CONSTANTS_PRIOR_SIGMA,
     INTEGRATION_STEP_S,
     START_PRECISION,
-    Signals,
-    make_signals,
+    SegmentMotion,
+    make_segment_motion,
     prepare_motion,
 )
 from px4fuse.filter.likelihood import profile_interval
@@ -84,7 +84,7 @@ def heading(angle: Array) -> Rotation:
 def level_signals(
     force: tuple[float, float, float] = (0.0, 0.0, 0.0), *, turn: float = 0.0,
     interval: float = 0.01,
-) -> Signals:  # fmt: skip
+) -> SegmentMotion:  # fmt: skip
     """Return signals of a level vehicle at constant yaw rate and body acceleration."""
     time = np.arange(0.0, 20.0, interval)
     still = np.zeros((len(time), 3))
@@ -92,7 +92,7 @@ def level_signals(
     # only the start of the logged attitude is used; a wrong later attitude must not matter
     spoiled = Rotation.concatenate([logged[:300], heading(np.full(len(time) - 300, -0.3))])
     imu = imu_table(time, still + np.array(force) - GRAVITY, still + np.array([0.0, 0.0, turn]))
-    return make_signals(imu, attitude_table(time, spoiled), (0.5, 19.0))
+    return make_segment_motion(imu, attitude_table(time, spoiled), (0.5, 19.0))
 
 
 def test_imu_error_sensitivities_at_rest_equal_closed_form() -> None:
@@ -100,7 +100,7 @@ def test_imu_error_sensitivities_at_rest_equal_closed_form() -> None:
     t, g = signals.time_s - signals.time_s[0], GRAVITY[2]
     speed = signals.table[:, 1]
     value = np.diff(speed, axis=0) / INTEGRATION_STEP_S
-    assert signals.table.shape == (len(t), 2, 3, len(CONSTANT_SIGMAS))
+    assert signals.table.shape == (len(t), 2, 3, len(CONSTANTS_PRIOR_SIGMA))
     np.testing.assert_allclose(signals.table[..., 0], 0.0, atol=1e-10)
     # tilt θ about north and east moves it sideways by θ × f, f = [0, 0, -g]; heading does not
     tilted = np.tile([[0, -g, 0], [g, 0, 0], [0, 0, 0]], (len(value), 1, 1))
@@ -139,16 +139,18 @@ def test_integrated_imu_motion_equals_constant_acceleration() -> None:
     measured = np.column_stack([stamps, np.full(len(stamps), np.nan)])
     measured[:5, 0] = np.nan
     moved = prepare_motion(flight, stamps, measured, directions=np.eye(3)[:2], dt_s=DT)
-    assert len(moved.signals) == 3
+    assert len(moved.segment_motions) == 3
     assert moved.time_s[[0, -1]] == pytest.approx([0.75, 79.25])
     positions = moved.positions(np.array([-0.3, 0.0, 0.21]))
     way, speed = positions.delta_position_m, positions.delta_velocity_m_s
-    assert way.shape == (2, 3, 1 + len(CONSTANT_SIGMAS), len(moved.time_s) - 1)
+    assert way.shape == (2, 3, 1 + len(CONSTANTS_PRIOR_SIGMA), len(moved.time_s) - 1)
     inside = np.flatnonzero(positions.is_joined)
     np.testing.assert_allclose(way[0, :, 0], 0.0, atol=1e-9)
     np.testing.assert_allclose(way[1, :, 0, inside], 1.5 * 0.25**2 / 2.0, atol=1e-9)
     np.testing.assert_allclose(speed[1, :, 0, inside], 1.5 * 0.25, atol=1e-9)
-    np.testing.assert_array_equal(np.flatnonzero(~positions.is_joined) + 1, moved.edges[1:-1])
+    np.testing.assert_array_equal(
+        np.flatnonzero(~positions.is_joined) + 1, moved.segment_edges[1:-1]
+    )
     # positions are relative to the first measured one of each stretch
     for begin, end in positions.segments:
         known = positions.measurement_m[begin:end, 0]
@@ -158,7 +160,7 @@ def test_integrated_imu_motion_equals_constant_acceleration() -> None:
     # a third of the measurements, in every stretch
     some = moved.downsample(len(moved.time_s) // 3)
     np.testing.assert_array_equal(some.time_s, moved.time_s[::3])
-    assert len(some.edges) == 4
+    assert len(some.segment_edges) == 4
 
 
 # --- the likelihood of an offset ---
@@ -269,7 +271,9 @@ def test_time_offset_likelihood_equals_joint_normal_density(exact_imu) -> None:
         costs.append(cost)
     expected = np.array([cost(noises) for cost in costs])
     expected -= expected.min()
-    profile_drop = found.curve_drop[within] - found.curve_drop[within].min()
+    profile_drop = (
+        found.curve_log_likelihood_drop[within] - found.curve_log_likelihood_drop[within].min()
+    )
     assert 1.0 < expected.max() < 4.0
     np.testing.assert_allclose(profile_drop, expected, rtol=0.02, atol=0.03)
     options = {"xatol": 0.01, "fatol": 0.003}
@@ -435,7 +439,7 @@ def stated(
     curve = np.array([0.0])
     return ClockOffset(
         offset_s=middle, interval_s=(middle - 0.02, middle + 0.02), sigma_s=0.01, applied_s=0.0,
-        is_determinable=True, curve_s=curve, curve_drop=curve, parts=parts,
+        is_determinable=True, curve_s=curve, curve_log_likelihood_drop=curve, parts=parts,
         drift_ppm=100.0, drift_sigma_ppm=50.0, change_p_value=change_p_value, sigma_a_m_s2=0.2,
         sigma_z_m=0.01, count=3000,
     )  # fmt: skip

@@ -148,11 +148,12 @@ def test_ekf2_fusion_rules_depend_on_px4_release(flown):
     new = flown(EKF2_DELAY_MAX=200.0, EKF2_IMU_POS_Y=0.25)
     assert new.rules == FusionRules(0.2, 0.4, 1.0, 5, None, False)
     assert new.imu_offset_m.tolist() == [0.0, 0.25, 0.0]
-    assert (new.step_s, new.horizon_s, new.predict_s, new.max_interval_s) == (0.01, 0.1, 0.01, 0.25)
+    assert (new.mean_step_s, new.configured_step_s) == (0.01, 0.01)
+    assert (new.horizon_s, new.max_interval_s) == (0.1, 0.25)
     old = flown(EKF2_AID_MASK=8.0, stores_bias_increments=True)
     assert old.rules == FusionRules(math.inf, 7.0, 7.0, 1_000_000, pytest.approx(5e-4), True)
     assert old.settings["EKF2_EV_DELAY"] == 175.0
-    assert flown(EKF2_PREDICT_US=8000.0).predict_s == pytest.approx(0.008)
+    assert flown(EKF2_PREDICT_US=8000.0).configured_step_s == pytest.approx(0.008)
 
 
 def test_ekf2_replay_without_complete_imu_data_is_unavailable(flown):

@@ -144,7 +144,14 @@ def test_replayed_fusion_decision_follows_ekf2_rules(case, expected):
 def test_fusion_horizon_equals_length_of_ekf2_buffer(settings, by_delay, timing):
     usual = {"EKF2_EV_DELAY": 0.0, "EKF2_DELAY_MAX": 200.0}
     rules = replace(RULES, uses_delay_as_horizon=by_delay)
-    inputs = made(Inputs, rules=rules, settings=usual, horizon_s=0.12, step_s=0.01, predict_s=0.01)
+    inputs = made(
+        Inputs,
+        rules=rules,
+        settings=usual,
+        horizon_s=0.12,
+        mean_step_s=0.01,
+        configured_step_s=0.01,
+    )
     found = FilterConfiguration({**usual, **settings}).timing(inputs)
     assert (found.delay_s, found.horizon_s) == pytest.approx((timing.delay_s, timing.horizon_s))
     shifted = FilterConfiguration(usual, timestamp_offset_s=0.03).timing(inputs)
@@ -467,7 +474,11 @@ def events(
     stamps: list[float], *, delay_s: float = 0.0, age_s: float = -9.0, horizon_s: float = 0.0
 ) -> Any:
     inputs = made(
-        Inputs, received=vision_of(stamps, age_s), step_s=0.01, rules=RULES, max_interval_s=0.25
+        Inputs,
+        received=vision_of(stamps, age_s),
+        mean_step_s=0.01,
+        rules=RULES,
+        max_interval_s=0.25,
     )
     return _make_events(inputs, stretch_of(100), Timing(delay_s, horizon_s))
 

@@ -24,7 +24,7 @@ from px4fuse.ekf2.steps import (
     FLOW_STEP,
     GATE,
     OUTPUT,
-    STEPS,
+    REPLACEMENT_STEPS,
     VELOCITY_STEP,
     DifferenceExplanation,
     _longest_rejection,
@@ -78,7 +78,7 @@ def test_what_if_without_replay_agreement_is_unavailable(model):
 def test_contributions_to_kf_ekf2_difference_add_up_to_total(model):
     for axis in explain_by_steps(model).values():
         assert axis.longest_rejection is None
-        assert tuple(step.name for step in axis.steps) == STEPS
+        assert tuple(step.name for step in axis.steps) == REPLACEMENT_STEPS
         for quantity in ("position_mean_square_m2", "velocity_mean_square_m2_s2"):
             unexplained = getattr(axis, f"unexplained_{quantity.removeprefix('position_')}")
             total = sum(getattr(step, quantity) for step in axis.steps) + unexplained
@@ -108,7 +108,7 @@ def test_kf_ekf2_difference_is_split_one_property_at_a_time():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(ReceivedPositions)
     plain = (made(ReplaySegment, flow=None, heights=None),)
-    flight = made(Inputs, settings=flown, step_s=0.01, received=received, segments=plain)
+    flight = made(Inputs, settings=flown, mean_step_s=0.01, received=received, segments=plain)
     kf_settings = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
     found = list(step_configurations(flight, kf_settings).values())
     settings = [configuration.settings for configuration in found]
@@ -126,7 +126,7 @@ def test_kf_ekf2_difference_is_split_one_property_at_a_time():
     gnss = made(
         Inputs,
         aid=GNSS_POS,
-        step_s=0.01,
+        mean_step_s=0.01,
         received=made(ReceivedPositions, velocity_m_s=np.zeros((1, 3))),
         settings={"EKF2_ACC_NOISE": 0.35, "EKF2_GPS_P_NOISE": 0.5, "EKF2_GPS_DELAY": 110.0},
         segments=plain,

@@ -379,7 +379,7 @@ def test_evaluate_camera_track_removes_mounting_rotation() -> None:
     camera = replace(camera, rotation=camera.rotation * mounted * noise)
     got = evaluate(camera, reference)
     assert got.ate.rotation_deg.rmse == pytest.approx(np.degrees(0.01 * np.sqrt(3)), rel=0.05)
-    assert "vehicle to camera axes, 120" in got.notes[0]
+    assert "vehicle and camera axes, 120" in got.notes[0]
     assert got.rpe[0].translation_m.rmse < 0.03
     for one, other in ((replace(camera, rotation=None), reference),
                        (camera, replace(reference, rotation=None))):  # fmt: skip
@@ -402,7 +402,7 @@ def test_evaluate_constant_reference_orientation_is_not_scored() -> None:
     reference = flight()
     identity = Rotation.from_quat(np.tile([0.0, 0.0, 0.0, 1.0], (len(reference), 1)))
     got = evaluate(reference, replace(reference, rotation=identity))
-    assert "no orientation (constant quaternion)" in got.notes[0]
+    assert "is constant, so rotation errors are not computed" in got.notes[0]
     assert isinstance(got.ate.rotation_deg, Unavailable)
     assert got.rpe[-1].translation_m.rmse < 1e-6
 
@@ -515,7 +515,7 @@ def test_trajectory_time_offset_needs_varying_motion(kind: str, noise_m: float) 
     assert "cannot be estimated" in got.reason
     used = evaluate(estimate, reference, alignment="none", time_offset_s="auto")
     assert used.time_offset.offset_s == 0.0
-    assert "Instead, px4fuse uses unchanged timestamps." in used.warnings[0]
+    assert "Instead, poses are matched by unchanged timestamps." in used.warnings[0]
 
 
 def test_time_offset_of_periodic_motion_is_undetermined() -> None:

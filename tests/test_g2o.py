@@ -68,7 +68,7 @@ def test_parse_g2o_without_vertices_initialises_poses_from_edges() -> None:
 EDGE = f"EDGE_SE2 0 1 1 0 0 {UNIT_2}"
 NOT_READ, NO_TABLE, NO_VERTEX = (
     "are not supported",
-    "columns of numbers",
+    "columns with numbers",
     "a vertex id is not a 64-bit",
 )
 INVALID_TEXTS = {

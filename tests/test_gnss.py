@@ -201,7 +201,7 @@ def test_compare_of_gnss_flight_uses_gnss_innovations(tmp_path):
     np.testing.assert_allclose(north["innovation_m"], -logged[:, 0], rtol=1e-6)
     np.testing.assert_allclose(north["observation_variance_m2"], 0.16, rtol=1e-6)
     assert isinstance(down, Unavailable)
-    assert down.reason == "EKF2 never fused GNSS for height in this log"
+    assert down.reason == "EKF2 never fused the height from GNSS in this log"
     assert ekf2.innovation_topics == ("estimator_aid_src_gnss_pos",)
     assert ekf2.gate == 5.0
     # the flight itself is unchanged
@@ -407,7 +407,7 @@ def models(shared_logs: Path, model_of: Any) -> dict[str, Model]:
     found = {}
     for name in REPLAYED:
         model = model_of(shared_logs / "gps" / f"v1.16.1_gps_{name}.ulg")
-        assert model.inputs.step_s == pytest.approx(0.008, abs=1e-6)
+        assert model.inputs.mean_step_s == pytest.approx(0.008, abs=1e-6)
         found[name] = model
     return found
 
@@ -515,7 +515,7 @@ def test_what_if_without_aiding_source_predicts_position_error(models):
 
 @pytest.mark.reallogs
 def test_what_if_with_unused_parameter_raises_settings_error(models):
-    with pytest.raises(SettingsError, match="EKF2 fused GNSS position in this log"):
+    with pytest.raises(SettingsError, match="EKF2 fused GNSS position, to which this"):
         what_if(models["nominal"], [{"EKF2_EVP_NOISE": 0.2}])
     own = replace(models["nominal"].inputs.received, uses_sender_times=True)
     model = replace(models["nominal"], inputs=replace(models["nominal"].inputs, received=own))

@@ -228,7 +228,7 @@ def test_what_if_without_height_sensor_reports_drift() -> None:
     (lost,) = found.whatif
     assert lost.heights == {}
     assert lost.height_rmse_to_truth_m > 2.0 * found.replayed.height_rmse_to_truth_m
-    assert ". The published height differs by at most " in found.notes[-1]
+    assert ". The heights of the two replays differ by at most " in found.notes[-1]
 
 
 def test_what_if_with_long_height_rejection_is_unpredictable() -> None:
@@ -290,7 +290,7 @@ def test_ekf2_replay_of_heights_without_data_states_reason() -> None:
         return update_log if isinstance(update_log, str) else ""
 
     assert why({"baro_hgt": 1.0}) == ""
-    assert "range to the ground in part" in why({"baro_hgt": 1.0, "rng_hgt": 0.0})
+    assert "range finder in part" in why({"baro_hgt": 1.0, "rng_hgt": 0.0})
     assert "GNSS height in part" in why({"baro_hgt": 1.0, "gnss_hgt": 0.0})
     assert "bias of the barometer" in why(dict.fromkeys(BOTH, 1.0), EKF2_HGT_REF=1.0)
     assert "bias of the GNSS height" in why(dict.fromkeys(BOTH, 1.0), EKF2_HGT_REF=0.0)
@@ -491,7 +491,7 @@ def test_what_if_with_smaller_barometer_gate_rejects_more(models: dict[str, Mode
 def test_what_if_on_flight_with_range_finder_raises_error(shared_logs: Path) -> None:
     model = opened(read_log(shared_logs / "simulated" / "v1.16.1_no_uwb.ulg"))
     assert model.agreement.good
-    with pytest.raises(SettingsError, match="EKF2 also fused range to the ground"):
+    with pytest.raises(SettingsError, match="EKF2 also fused range finder"):
         what_if(model, [{"EKF2_BARO_NOISE": 1.0}])
 
 

@@ -99,9 +99,9 @@ def test_bias_regression_with_imu_gap_equals_kf_innovations() -> None:
     analysis = flown()
     axes = tuple(analysis.axes[name].axis for name in ("north", "east"))
     model = make_design_matrix(analysis.flight, axes, RIGHT, 0.10, 0.0)
-    gap = np.zeros_like(model.signals.noise_fixed)
+    gap = np.zeros_like(model.signals.added_process_noise)
     gap[200] = 0.5, 0.5, 1.0
-    with_gap = replace(model, signals=replace(model.signals, noise_fixed=gap))
+    with_gap = replace(model, signals=replace(model.signals, added_process_noise=gap))
     skip = np.zeros(len(model.time_s), dtype=bool)
     for each in (model, with_gap):
         fits, (data, columns, _) = each.fit(0.27, skip), each.whitened_design(0.27, skip)

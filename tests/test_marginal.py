@@ -38,7 +38,7 @@ from px4fuse.filter.likelihood import (
 from px4fuse.filter.marginal_likelihood import (
     Positions,
     centre_on_path,
-    expected_squares,
+    expected_squared_errors,
     factorise,
     fit_positions,
 )
@@ -146,9 +146,9 @@ def with_constants(offsets: int = 3) -> Positions:
     initial[START] = WEAK
     return Positions(
         measurement_m=measured, segment_starts=START, length_s=length,
-        noise_unit=0.1 * np.stack(continuous_noise_unit(length)),
-        noise_fixed=np.outer([0.3, 0.0, 0.2], rng.choice([0.0, 0.01], COUNT - 1)),
-        prior_precision=initial, constant_sigma=np.array([0.3, 1.0, 0.1]),
+        unit_process_noise=0.1 * np.stack(continuous_noise_unit(length)),
+        added_process_noise=np.outer([0.3, 0.0, 0.2], rng.choice([0.0, 0.01], COUNT - 1)),
+        prior_precision=initial, constants_prior_sigma=np.array([0.3, 1.0, 0.1]),
         delta_position_m=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
         delta_velocity_m_s=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
     )  # fmt: skip
@@ -168,7 +168,7 @@ def stretch_normal(
     part: Positions, noises: Noises, variance: Array, stretch: int, axis: int, at: int = 0
 ) -> tuple[IntArray, Array, Array]:
     """Return measured rows, their signals (data minus mean, constants) and their covariance."""
-    q = matrices(noises.sigma_a_m_s2**2 * part.noise_unit + part.noise_fixed)
+    q = matrices(noises.sigma_a_m_s2**2 * part.unit_process_noise + part.added_process_noise)
     rows = list(range(*(*START, COUNT)[stretch : stretch + 2]))
     # position and velocity for the signals of data and constants
     means = [np.zeros((2, 4))]
@@ -204,7 +204,7 @@ def joint_normal(
     """Return data and covariance (with constants) of all axes, and each axis separately."""
     made = [stretch_normal(part, noises, variance, stretch, axis, at) for axis in range(3)]
     signals = np.concatenate([each[1] for each in made])
-    covariance = signals[:, 1:] * part.constant_sigma**2 @ signals[:, 1:].T
+    covariance = signals[:, 1:] * part.constants_prior_sigma**2 @ signals[:, 1:].T
     return signals[:, 0], covariance + block_diag(*(each[2] for each in made)), made
 
 
@@ -259,7 +259,7 @@ def test_fitted_imu_biases_equal_dense_least_squares() -> None:
         constants = fit_positions(*arranged).constants()[:, 0]
         for stretch in range(2):
             _, _, made = joint_normal(part, noises, variance, stretch)
-            information, right = np.diag(part.constant_sigma**-2.0), np.zeros(3)
+            information, right = np.diag(part.constants_prior_sigma**-2.0), np.zeros(3)
             for _, signals, covariance in made[:2]:
                 by = -signals[:, 1:]  # effect of a constant on the positions
                 information = information + by.T @ np.linalg.solve(covariance, by)
@@ -271,7 +271,7 @@ def test_fitted_imu_biases_equal_dense_least_squares() -> None:
                 r = np.diag(variance[rows])
                 error = r @ np.linalg.solve(covariance, signals @ [1.0, *found])
                 square[rows] += error**2 + np.diag(r - r @ np.linalg.solve(covariance, r))
-        found_values, count = expected_squares(*arranged, constants)
+        found_values, count = expected_squared_errors(*arranged, constants)
         np.testing.assert_allclose(found_values, square, rtol=1e-4, atol=1e-9)
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
 
@@ -301,14 +301,14 @@ def test_interpolated_likelihood_equals_computed_likelihood(which: str) -> None:
     parts = [filter_positions(preintegrate(modelled(seed, COUNT), TRUE)) for seed in (1, 2)]
     if which == "constants":
         part = with_constants(offsets=1)
-        parts = [replace(part, noise_fixed=0.0 * part.noise_fixed)]
+        parts = [replace(part, added_process_noise=0.0 * part.added_process_noise)]
     some = np.exp(np.random.default_rng(4).uniform(-4.6, 1.0, (30, 2))).tolist()
     direct = [negative_log_likelihood(parts, Noises(*pair), WEIGHT) for pair in some]
     assert np.ptp(direct) > 100.0
     # far from the maximum the weak prior of the initial state has an effect
     for rough, error in ((False, 1e-6 if which == "filter" else 1e-4), (True, 2e-3)):
         score = Likelihood(parts, WEIGHT, 0.1, rough)
-        assert score.is_tabulated
+        assert score.is_interpolated
         found_values = np.array([score(Noises(*pair)) for pair in some])
         expected = np.array(direct) - direct[0]
         np.testing.assert_allclose(found_values - found_values[0], expected, rtol=error, atol=1e-3)

@@ -407,8 +407,8 @@ def test_mavlink_parameter_out_of_range_is_replaced_by_default(read):
     flight = read(recorder)
     notes = [note for note in flight.log.notes if "EKF2_" in note]
     assert notes == [
-        "EKF2_EVP_GATE 0 SD is outside PX4's range 1 to 1000; the default 5 is used.",
-        "EKF2_EVP_NOISE 1e+30 m is outside PX4's range 0.01 to 1000; the default 0.1 is used.",
+        "EKF2_EVP_GATE 0 SD is outside PX4's range 1 to 1000. px4fuse uses the default 5.",
+        "EKF2_EVP_NOISE 1e+30 m is outside PX4's range 0.01 to 1000. px4fuse uses the default 0.1.",
     ]
     assert flight.ekf2.gate == 5.0
     assert flight.log.parameters["EKF2_EV_DELAY"] == 300.0
@@ -453,7 +453,7 @@ def test_read_mavlink_reads_firmware_from_autopilot_version(read):
     flight = read(recorder)
     assert flight.log.firmware == "PX4 v1.16.1"
     assert flight.log.firmware_hash == "0123456789abcdef"
-    assert "version not in the recording" in read(Aisle()).log.firmware
+    assert "unknown version" in read(Aisle()).log.firmware
 
 
 ORIGIN_DEG = (47.4, 8.5)

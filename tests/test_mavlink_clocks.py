@@ -217,7 +217,7 @@ def test_mavlink_clock_mapping_ignores_ground_station_timesync(read):
 def test_mavlink_stream_without_receive_time_uses_timesync(read):
     for replies, method, allowed in (
         (True, "TIMESYNC", 1.5 * LEAST_DELAY_S),
-        (False, "position in the stream", 0.1),
+        (False, "message order", 0.1),
     ):
         aisle = Aisle(replies=replies)
         flight = read(aisle, stamped=False)
@@ -321,7 +321,7 @@ def test_mavlink_recording_with_reboot_keeps_longer_part(read):
     assert flight.log.boot_time_s == pytest.approx(3.0, abs=0.1)
     assert flight.log.duration_s == pytest.approx(60.0, abs=0.1)
     [note] = [note for note in flight.log.notes if "restart" in note]
-    assert "restarts of the boot clock: 1; only session 2 is analysed" in note
+    assert "restarts of the boot clock: 1. Only the longest part" in note
     # messages before the first one with the new boot clock cannot be assigned
     times = flight.positions[0].samples.index.to_numpy() + flight.log.boot_time_s
     assert len(times) >= 299
@@ -420,7 +420,7 @@ def test_timesync_that_contradicts_receive_time_is_ignored():
     wrong = (received, UNIX_S + 3600.0 + received), NO_EXCHANGES[1]
     stamps, found = map_unix_timestamps(received, *wrong)
     assert found.description.method == "receive time"
-    np.testing.assert_allclose(found.to_boot.at(stamps), received, atol=1e-6)
+    np.testing.assert_allclose(found.sender_to_boot.at(stamps), received, atol=1e-6)
 
 
 def test_mavlink_clock_mapping_equals_reported_offset_and_drift():
@@ -431,5 +431,5 @@ def test_mavlink_clock_mapping_equals_reported_offset_and_drift():
     assert statement.drift_ppm == pytest.approx(100.0, abs=0.1)
     middle = 0.5 * (stamps[0] + stamps[-1])
     by_statement = stamps + statement.offset_s + statement.drift_ppm * 1e-6 * (stamps - middle)
-    np.testing.assert_allclose(by_statement, found.to_boot.at(stamps), atol=2e-6)
+    np.testing.assert_allclose(by_statement, found.sender_to_boot.at(stamps), atol=2e-6)
     np.testing.assert_allclose(by_statement, received, atol=2e-6)

@@ -127,7 +127,7 @@ def assert_equals_pymavlink(path: Path) -> None:
     with_stamps = path.suffix == ".tlog"
     heard, unknown = heard_by_pymavlink(path, stamped=with_stamps)
     frames = read_frames(path.name, path.read_bytes())
-    at = {start: row for row, start in enumerate(frames.start.tolist())}
+    at = {start: row for row, start in enumerate(frames.start_offsets.tolist())}
     count = 0
     for name, all_heard in heard.items():
         rows = np.array([at[one.start] for one in all_heard], dtype=np.intp)
@@ -157,7 +157,7 @@ def test_mavlink_frames_of_real_recordings_equal_pymavlink(path, tmp_path):
     if path.stat().st_size > LONG_BYTES and path.name not in BEYOND_PYMAVLINK:
         frames, content = read_frames(path.name, path.read_bytes()), path.read_bytes()
         gap = 8 if path.suffix == ".tlog" else 0
-        starts = frames.start - gap
+        starts = frames.start_offsets - gap
         first = int(starts[np.searchsorted(starts, LONG_BYTES // 2)])
         last = int(starts[np.searchsorted(starts, len(content) - LONG_BYTES // 2)])
         path = tmp_path / path.name

@@ -195,13 +195,13 @@ def test_mcp_call_with_invalid_file_or_argument_is_an_error(tmp_path: Path, serv
     os.mkfifo(root / "pipe.ulg")
     with (root / "sparse.ulg").open("wb") as file:
         file.truncate(3_000_000_000)
-    no_root = "secret.ulg is outside the folders of --root"
+    no_root = "secret.ulg is outside the folders that --root allows"
     expected = {
         "../secret.ulg": no_root,
         str(outside): no_root,
         "folder/secret.ulg": no_root,
-        "../nothing.ulg": "nothing.ulg is outside the folders of --root",
-        "link.ulg": "link.ulg is outside the folders of --root",
+        "../nothing.ulg": "nothing.ulg is outside the folders that --root allows",
+        "link.ulg": "link.ulg is outside the folders that --root allows",
         "pipe.ulg": "pipe.ulg is a device, pipe or socket",
         "sparse.ulg": "3,000 MB, more than the limit of 2,000 MB",
         "nothing.ulg": "nothing.ulg: the file cannot be read (No such file",
@@ -387,7 +387,7 @@ def test_mcp_server_reads_no_file_outside_its_root_folder(tmp_path: Path) -> Non
     async def talk(client: Client) -> None:
         result = await client.call_tool("close_loop", {"log": "poses.txt"})
         assert result.is_error
-        assert "times.txt is outside the folders of --root" in text_of(result)
+        assert "times.txt is outside the folders that --root allows" in text_of(result)
 
     connect(started(folder=root), talk)
 

@@ -417,7 +417,7 @@ def test_loop_closure_gate_without_odometry_edge_raises_error() -> None:
         gate_edges(gap, [edge - 1])
     for at, direction, said in (
         (12, 2, "has no information in one direction"),
-        (edge, slice(None), "the closure has no information"),
+        (edge, slice(None), "its information matrix is zero"),
     ):
         information = graph.information.copy()
         information[at, direction, :] = information[at, :, direction] = 0.0

@@ -294,7 +294,7 @@ def test_read_position_file_unit_option_overrides_column_name(read, unit):
 
 
 @pytest.mark.parametrize(("x", "words"), [
-    ([*X[:7], "4000.0", *X[8:]], "px4fuse assumes this unit, because the column names contain no"),
+    ([*X[:7], "4000.0", *X[8:]], "px4fuse assumes metres, because the column names contain no"),
     (fixed(np.linspace(0.0, 5e6, ROWS), 1), "no unit gives the extent of an indoor flight"),
 ])  # fmt: skip
 def test_read_position_file_unit_is_not_changed_by_outlier(read, x, words):
@@ -339,7 +339,7 @@ def test_read_position_file_sets_non_positive_sigma_to_nan(read):
     file = read(table({**PLAIN, "sigma": sigma}))
     assert_track(file)
     assert np.flatnonzero(file.samples["sigma_x_m"].isna()).tolist() == [3, 4]
-    assert_stated(file, "ignored sigmas that are zero or negative: 2")
+    assert_stated(file, "sigma that is ignored, because it is not positive: 2")
 
 
 # -- rows ------------------------------------------------------------------------------------------
@@ -398,7 +398,7 @@ def test_read_position_file_with_two_tags_requires_body(read, name):
     assert "contains the bodies A1, B2. Choose a body with --body." in error_message(read, text)
     assert_track(read(text, body="B2"), rows=slice(1, None, 2))
     assert "contains the bodies A1, B2" in error_message(read, text, body="C3")
-    assert "one body, without a name" in error_message(read, table(PLAIN), body="C3")
+    assert "only one body, which has no name" in error_message(read, table(PLAIN), body="C3")
 
 
 # -- the options -----------------------------------------------------------------------------------

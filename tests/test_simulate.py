@@ -18,7 +18,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Segment, make_axes, project_acceleration, step_means
+from px4fuse.filter.signals import Segment, make_axes, mean_step_acceleration, project_acceleration
 from px4fuse.findings import find
 from px4fuse.flight.model import Columns
 from px4fuse.simulation import sensors
@@ -150,7 +150,7 @@ def test_simulated_imu_noise_averaged_over_dt_equals_sigma_a(texts):
     frame = pd.DataFrame(error, index=imu.index)
     for axis in np.eye(3):
         signal = project_acceleration(frame, axis, Segment(0.0, time[-1], ""))
-        mean, _ = step_means(signal, np.arange(0.0, time[-1], DT_S))
+        mean, _ = mean_step_acceleration(signal, np.arange(0.0, time[-1], DT_S))
         expected = np.hypot(0.2, 0.5 if texts else 0.0)
         assert np.std(mean) == pytest.approx(expected, rel=0.07)
 

@@ -18,7 +18,7 @@ from exchange import replace
 from rich.console import Console
 
 from px4fuse.analysis import Analysis
-from px4fuse.cli.outputs import default_report, progress, terminal
+from px4fuse.cli.outputs import default_report_path, progress, terminal
 from px4fuse.diagnose import diagnose as analyse
 from px4fuse.errors import OutputError
 from px4fuse.report import card_text, screen
@@ -204,7 +204,7 @@ def reported(made: ComparisonResults, **changes: object) -> str:
     student = Student(name=str(changes.pop("student", "")))
     request = replace(made.request, **changes)
     changed = replace(made, request=request.without_paths(), student=student)
-    path = default_report(Path(request.log).stem + settings_name(request), changed)
+    path = default_report_path(Path(request.log).stem + settings_name(request), changed)
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(blank_page(None, to_json(changed)))
     path.with_suffix(".json").write_text(to_json(changed), encoding="utf-8")

@@ -118,7 +118,7 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
     noises = settings["EKF2_GYR_NOISE"], settings["EKF2_ACC_NOISE"]
     deviation = np.sqrt(segment.variance)
     x, P = segment.state.copy(), deviation[:, None] * segment.state_correlation * deviation
-    measured_at_s = vision.stamp_s - 1e-3 * settings["EKF2_EV_DELAY"] - 0.5 * inputs.step_s
+    measured_at_s = vision.stamp_s - 1e-3 * settings["EKF2_EV_DELAY"] - 0.5 * inputs.mean_step_s
     steps = np.searchsorted(segment.time_s, measured_at_s - 1e-9).tolist()
     has_sample = {step: row for row, step in enumerate(steps) if step > 0}
     at = {int(event.end_step): event for event in events}
@@ -135,9 +135,10 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
 
     for k in range(1, int(events.end_step[-1]) + 1):
         F, x = step_matrix(segment, k - 1, trapezoid=False), step_state(segment, k - 1, x)
-        P = F @ P @ F.T + step_noise(segment, k - 1, *noises) + np.diag(drift * inputs.step_s**2)
+        P = F @ P @ F.T + step_noise(segment, k - 1, *noises)
+        P += np.diag(drift * inputs.mean_step_s**2)
         for bias in biases:
-            bias.predict(inputs.step_s)
+            bias.predict(inputs.mean_step_s)
         event = at.get(k)
         if event is not None and event.action:
             row = event.sample
@@ -167,7 +168,7 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
         S = np.diag(P)[6:8] + R
         update_log.append(np.concatenate([[measured_at_s[has_sample[k]]], nu, S]))
         for j, bias in enumerate(biases):
-            bias.fuse(float(off[j]), R0 + P[6 + j, 6 + j], inputs.step_s)
+            bias.fuse(float(off[j]), R0 + P[6 + j, 6 + j], inputs.mean_step_s)
         if np.all(nu**2 <= settings["EKF2_EVP_GATE"] ** 2 * S):
             for j in range(2):
                 fuse(6 + j, nu[j], S[j], R[j])
@@ -252,7 +253,7 @@ def test_vision_lever_arm_is_subtracted_in_replay() -> None:
     """EKF2_EV_POS is in the body frame, rotated by the attitude at each sample."""
     inputs, vision, lever_arm_m = flying(sent()), sent(), np.array([1.5, -0.5, 0.8])
     (segment,) = inputs.segments
-    step = np.searchsorted(segment.time_s, vision.stamp_s - 0.5 * inputs.step_s - 1e-9)
+    step = np.searchsorted(segment.time_s, vision.stamp_s - 0.5 * inputs.mean_step_s - 1e-9)
     turn = segment.body_to_ned[np.minimum(step, len(segment.body_to_ned) - 1)]
     beside = replace(vision, position_m=vision.position_m + turn @ lever_arm_m)
     settings = {
@@ -371,7 +372,7 @@ def test_larger_vision_delay_extends_the_fusion_horizon() -> None:
     flown = FilterConfiguration(settings).timing(inputs)
     later = FilterConfiguration({**settings, "EKF2_EV_DELAY": 290.0}).timing(inputs)
     assert later.delay_s == flown.delay_s == pytest.approx(1e-3 * settings["EKF2_GPS_DELAY"])
-    assert later.horizon_s == pytest.approx(28 * inputs.step_s)
+    assert later.horizon_s == pytest.approx(28 * inputs.mean_step_s)
     assert flown.horizon_s == inputs.horizon_s < later.horizon_s
 
 

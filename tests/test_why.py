@@ -14,7 +14,7 @@ from px4fuse.comparison.difference_steps import (
     corrected_settings,
     explain_ekf2_difference,
 )
-from px4fuse.ekf2.steps import NOISE, SAMPLES, STEPS, TIMESTAMPS, DifferenceExplanation
+from px4fuse.ekf2.steps import NOISE, REPLACEMENT_STEPS, SAMPLES, TIMESTAMPS, DifferenceExplanation
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Unavailable
@@ -117,7 +117,7 @@ def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text)
     shares = [share, *[1e-3] * (len(explanation.steps) - 1)]
     steps = tuple(replace(one, position_mean_square_m2=of * whole)
                   for one, of in zip(explanation.steps, shares, strict=True))  # fmt: skip
-    reasons = {name: f"Reason of {name}" for name in STEPS}
+    reasons = {name: f"Reason of {name}" for name in REPLACEMENT_STEPS}
     explained = add_sentences(replace(explanation, steps=steps), "the aisle", reasons)
     assert f"along the aisle: {first.name}." in explained.cause
     assert text in explained.sentences[0]

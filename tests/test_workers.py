@@ -52,7 +52,7 @@ def test_worker_job_that_fails_does_not_affect_other_jobs():
     assert results[2] == JobFailure("ValueError: a b[2J")
     assert results[4] == JobFailure("x.ulg: empty.")
     assert isinstance(results[5], JobFailure)
-    assert results[6] == JobFailure("the result could not be unpickled (ValueError).")
+    assert results[6] == JobFailure("the result of the job cannot be read (ValueError).")
     assert results[7] == bytes(30_000_000)
     assert results[8] == "1"
     assert results[9] == JobFailure("the worker process ended during a job (exit code 0).")

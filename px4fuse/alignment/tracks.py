@@ -180,7 +180,7 @@ def make_imu_references(flight: Flight) -> list[SampledTrack]:
     """Return the IMU acceleration integrated twice, band-pass filtered after each integration."""
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
-        raise NoMatchError(acceleration.reason)
+        raise NoMatchError(f"the log has no acceleration in NED ({acceleration.reason})")
     time_s = acceleration.index.to_numpy()
     velocity_m_s = cumulative_trapezoid(acceleration.to_numpy(), time_s, axis=0, initial=0)
     grid = resample_to_grid(_track_without_gaps(time_s, velocity_m_s))

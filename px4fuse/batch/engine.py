@@ -105,9 +105,15 @@ def run_jobs(
         return
     from distributed import as_completed  # noqa: PLC0415
 
-    tasks = [jobs[start : start + JOBS_PER_TASK] for start in range(0, len(jobs), JOBS_PER_TASK)]
+    job_lists = [
+        jobs[start : start + JOBS_PER_TASK] for start in range(0, len(jobs), JOBS_PER_TASK)
+    ]
     futures = dict(
-        zip(client.map(partial(_run_task, run_job_list), tasks, pure=False), tasks, strict=True)
+        zip(
+            client.map(partial(_run_task, run_job_list), job_lists, pure=False),
+            job_lists,
+            strict=True,
+        )
     )
     try:
         for future in as_completed(list(futures)):

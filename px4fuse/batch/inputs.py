@@ -17,7 +17,7 @@ from px4fuse.results.contract import AidsResults, ComparisonResults, to_json
 from px4fuse.results.reading import MAX_RESULTS_BYTES, read_results
 from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_attached_results
 
-Kind = Literal["log", "report", "results"]
+InputKind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
 Results = ComparisonResults | AidsResults
 # Settings that are copied from results to the analysis of another log
@@ -31,7 +31,7 @@ class InputResults:
     """Results of the input A or B of ``px4fuse diff``."""
 
     file_name: str
-    kind: Kind
+    kind: InputKind
     results: Results
 
 
@@ -85,9 +85,9 @@ def _analyse_log(path: Path, other_input: InputResults | None, progress: Progres
             request,
             **{name: getattr(other_input.results.request, name) for name in copied_settings},
         )
-    result = diagnose_or_check_aids(request, progress)
+    analysis = diagnose_or_check_aids(request, progress)
     # to_json rounds the numbers as in a report
-    results_json = to_json(outcome_results(request, result))
+    results_json = to_json(outcome_results(request, analysis))
     results = read_results(results_json.encode())
     assert isinstance(results, Results)
     return InputResults(display_name(path), "log", results)

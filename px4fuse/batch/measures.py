@@ -45,9 +45,9 @@ def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, Compa
     # EKF2 rejects north and east together, so px4fuse diff lists the rejections of one axis only
     horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
     # the numbers of these aiding sources are already in the results of each axis
-    source_aids: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
+    position_source_aids: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
     if value_at(results, "source.kind") == "gnss":
-        source_aids = ("gnss_pos",)
+        position_source_aids = ("gnss_pos",)
     numbers_by_path: dict[str, ComparedNumber] = {}
     for measure in MEASURES:
         pattern, interval_field = measure["path"], measure["interval"]
@@ -57,7 +57,7 @@ def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, Compa
             value = getattr(record, field_name, None)
             is_undetermined = isinstance(record, ClockOffset) and not record.is_determinable
             is_undetermined |= isinstance(record, HeadingError) and record.drifts
-            is_duplicate = pattern.startswith("aids.") and first_name in source_aids
+            is_duplicate = pattern.startswith("aids.") and first_name in position_source_aids
             if pattern == "axes.*.rejected_fraction":
                 is_duplicate = first_name not in (horizontal_axis, "down")
             if is_undetermined or is_duplicate or not isinstance(value, int | float):

@@ -165,12 +165,12 @@ def sort_logs(logs: Iterable[LogSummary]) -> list[LogSummary]:
 
 
 def _log_details(log: LogSummary) -> tuple[Section, ...]:
-    axes = [
+    value_rows = [
         [name, *(_format_value(axis.get(name, "")) for axis in log["axes"])]
         for name in AXIS_COLUMNS
         if any(name in axis for axis in log["axes"])
     ]
-    titles = ["", *(axis["axis"] for axis in log["axes"])]
+    column_titles = ["", *(axis["axis"] for axis in log["axes"])]
     return (
         frame.list_section(
             "Missing results",
@@ -184,7 +184,9 @@ def _log_details(log: LogSummary) -> tuple[Section, ...]:
             "Findings",
             [f"{finding_title(finding_id)} ({finding_id})" for finding_id in log["findings"]],
         ),
-        frame.table_section("Axes", titles if axes else (), axes, range(1, len(titles))),
+        frame.table_section(
+            "Axes", column_titles if value_rows else (), value_rows, range(1, len(column_titles))
+        ),
     )
 
 
@@ -205,7 +207,7 @@ def _format_value(value: str | float) -> str:
 
 def _selections(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, str]]]]:
     """Return the label and the options of each drop-down list, most frequent option first."""
-    counts = Counter(tag for log in logs for tag in log["tags"])
+    count_by_tag = Counter(tag for log in logs for tag in log["tags"])
     label_by_tag: Mapping[str, str] = {
         tag: label for log in logs for tag, label in log["tags"].items()
     }
@@ -213,7 +215,7 @@ def _selections(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, s
     for kind, label in SELECTION_LABELS.items():
         options = [
             (tag, f"{clean_text(label_by_tag[tag], 60)} ({count})")
-            for tag, count in counts.most_common()
+            for tag, count in count_by_tag.most_common()
             if tag.startswith(f"{kind}:")
         ]
         if options:
@@ -236,12 +238,12 @@ def logs_from_table(table: pd.DataFrame) -> list[LogSummary]:
 
 def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
     """Combine the table rows of one log; values of the main axes replace those of other axes."""
-    axes = [row for row in rows if "axis" in row]
+    axis_rows = [row for row in rows if "axis" in row]
     main_rows = next(
         (
-            axis_rows
+            preferred_rows
             for names in MAIN_AXES_BY_PREFERENCE
-            if (axis_rows := [row for row in axes if row["axis"] in names])
+            if (preferred_rows := [row for row in axis_rows if row["axis"] in names])
         ),
         rows,
     )
@@ -253,7 +255,7 @@ def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
         "name": log.get("name") or PurePosixPath(log["log"]).name or "unnamed",
         "status": DONE if any(row["status"] == DONE for row in rows) else rows[0]["status"],
         "missing_results": tuple(dict.fromkeys(pair for pair in reasons_and_remedies if any(pair))),
-        "axes": axes,
+        "axes": axis_rows,
         "findings": [id_ for id_ in log.get("findings", "").split(FINDING_SEPARATOR) if id_],
     }
     status_text = log["status"] if log["status"] == NOT_COMPARED else "refused"
@@ -267,13 +269,13 @@ def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
 
 
 def _log_tags(log: LogSummary) -> dict[str, str]:
-    tags = {
+    label_by_tag = {
         f"severity:{log['severity']}": log["severity"],
         f"status:{log['status']}": log["status"],
     }
     for name in ("vehicle", "firmware"):
-        tags[f"{name}:{log.get(name, '')}"] = log.get(name, f"{name} unknown")
-    tags |= {f"finding:{finding}": finding_title(finding) for finding in log["findings"]}
-    return tags | {
+        label_by_tag[f"{name}:{log.get(name, '')}"] = log.get(name, f"{name} unknown")
+    label_by_tag |= {f"finding:{finding}": finding_title(finding) for finding in log["findings"]}
+    return label_by_tag | {
         f"remedy:{remedy}": remedy or "no action" for _, remedy in log["missing_results"]
     }

@@ -79,14 +79,14 @@ def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) 
 
     A finding that is the effect of another finding is omitted.
     """
-    causes = [finding for finding in findings if finding.caused_by is None]
+    cause_findings = [finding for finding in findings if finding.caused_by is None]
     aid_verdicts = [
         f"{name} {aid.verdict}" for name, aid in aids.items() if aid.verdict != "disabled"
     ]
     return {
         "aids": FINDING_SEPARATOR.join(aid_verdicts),
-        "findings": FINDING_SEPARATOR.join(finding.id for finding in causes),
-        "severities": sorted({finding.severity for finding in causes}),
+        "findings": FINDING_SEPARATOR.join(finding.id for finding in cause_findings),
+        "severities": sorted({finding.severity for finding in cause_findings}),
     }
 
 
@@ -134,16 +134,16 @@ def with_log_path(row: Row, path: str) -> Row:
     action = row.get("action", "")
     if not action.startswith("px4fuse "):
         return row
-    words = [path if word == row["name"] else word for word in shlex.split(action)]
-    return row | {"action": quote_command(words)}
+    command_words = [path if word == row["name"] else word for word in shlex.split(action)]
+    return row | {"action": quote_command(command_words)}
 
 
 def log_columns(log: Log) -> Row:
-    start, values = utc_time(log.start_unix_s), {"log": log}
-    paths = {name: path for name, path in RESULT_PATHS.items() if path.startswith("log.")}
-    return {name: value_at(values, path) for name, path in paths.items()} | {
+    start_utc, record = utc_time(log.start_unix_s), {"log": log}
+    path_by_column = {name: path for name, path in RESULT_PATHS.items() if path.startswith("log.")}
+    return {name: value_at(record, path) for name, path in path_by_column.items()} | {
         "airframe": f"{airframe:g}" if (airframe := log.parameters.get("SYS_AUTOSTART")) else "",
-        "date": f"{start[:19]}Z" if start else "",
+        "date": f"{start_utc[:19]}Z" if start_utc else "",
     }
 
 
@@ -169,7 +169,7 @@ def csv_bytes(table: pd.DataFrame) -> bytes:
         for name, kind in COLUMN_TYPES.items()
         if kind == "str"
     }
-    text = table.assign(**text_columns).to_csv(
+    csv_text = table.assign(**text_columns).to_csv(
         index=False, lineterminator="\r\n", float_format="%.10g"
     )
-    return ("\ufeff" + text).encode()
+    return ("\ufeff" + csv_text).encode()

@@ -53,14 +53,14 @@ class BatchResult:
         One row per log and axis, with the columns of :data:`px4fuse.batch.rows.COLUMN_TYPES`.
     reused_count : int
         Number of logs whose results are from an earlier run.
-    written : tuple of Path
+    written_paths : tuple of Path
         Files of the table.
     """
 
     table: pd.DataFrame
     reused_count: int
     severities: frozenset[str]
-    written: tuple[Path, ...]
+    written_paths: tuple[Path, ...]
 
 
 class CachedRows(msgspec.Struct, frozen=True):
@@ -73,7 +73,7 @@ class CachedRows(msgspec.Struct, frozen=True):
     rows: Annotated[list[Row], msgspec.Meta(min_length=1)]
 
     @property
-    def file(self) -> str:
+    def relative_path(self) -> str:
         return f"rows/{self.sha256}.json"
 
 
@@ -82,7 +82,7 @@ class _RunState:
     """State of a run of ``px4fuse batch``: settings, and the logs that are finished so far."""
 
     output: Path
-    px4fuse: str
+    version: str
     settings: str
     # SHA-256 of logs that did not fail, by address
     hash_by_address: dict[str, str] = field(default_factory=dict)
@@ -142,7 +142,7 @@ def run_batch(
         batch_result = run(
             map(str, sources), folder, reports=reports and output is not None, **settings
         )
-    # the results in a temporary folder are deleted
+    # without an output folder, the files were temporary
     missing_files = {} if output else dict.fromkeys(OUTPUT_FILE_COLUMNS, "")
     return batch_result.table.assign(**missing_files)
 
@@ -220,8 +220,8 @@ def run(
                 if state.hash_by_address or state.failed_row_by_address:
                     batch_result = _write_table(state, logs)
         except Px4FuseError as error:
-            note = RESUME_NOTE if (output / "rows").is_dir() else ""
-            raise type(error)(f"{error} {note}".rstrip()) from error
+            resume_note = RESUME_NOTE if (output / "rows").is_dir() else ""
+            raise type(error)(f"{error} {resume_note}".rstrip()) from error
     return batch_result
 
 
@@ -230,8 +230,10 @@ def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
     for cached_rows in load_cached_rows(state):
         first_row = cached_rows.rows[0]
-        columns = OUTPUT_FILE_COLUMNS[: 1 + reports] if "axis" in first_row else ()
-        if all((state.output / first_row.get(column, "")).is_file() for column in columns):
+        required_file_columns = OUTPUT_FILE_COLUMNS[: 1 + reports] if "axis" in first_row else ()
+        if all(
+            (state.output / first_row.get(column, "")).is_file() for column in required_file_columns
+        ):
             hashes_by_size[cached_rows.size_bytes].add(cached_rows.sha256)
     return hashes_by_size
 
@@ -243,7 +245,7 @@ def load_cached_rows(state: _RunState) -> Iterator[CachedRows]:
             cached_rows = msgspec.json.decode(cache_file.read_bytes(), type=CachedRows)
         except (OSError, msgspec.MsgspecError):
             continue  # no cache file of this px4fuse version, so the log is compared again
-        if (cached_rows.px4fuse, cached_rows.settings) == (state.px4fuse, state.settings):
+        if (cached_rows.px4fuse, cached_rows.settings) == (state.version, state.settings):
             yield cached_rows
 
 
@@ -275,8 +277,8 @@ def _write_log(state: _RunState, log: LogAddress, outcome: Outcome) -> None:
         for column, name in zip(OUTPUT_FILE_COLUMNS, content_by_name, strict=True)
     }
     rows = [clean_row(row) | path_by_column for row in outcome.rows]
-    cached_rows = CachedRows(outcome.sha256, state.px4fuse, state.settings, log.size_bytes, rows)
-    contents = content_by_name | {cached_rows.file: msgspec.json.encode(cached_rows)}
+    cached_rows = CachedRows(outcome.sha256, state.version, state.settings, log.size_bytes, rows)
+    contents = content_by_name | {cached_rows.relative_path: msgspec.json.encode(cached_rows)}
     write_all({state.output / name: content for name, content in contents.items() if content})
 
 
@@ -305,13 +307,13 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
     def rows() -> Iterator[Row]:
         for log in logs:
             common_columns = {"log": log.table_path, "name": log.name}
-            common_columns |= {"px4fuse": state.px4fuse, "settings": state.settings}
+            common_columns |= {"px4fuse": state.version, "settings": state.settings}
             for row in rows_of_log(log):
                 severities.update(row.get("severities", ()))
                 yield with_log_path(row, log.table_path) | common_columns
 
     table = make_table(rows())
-    page = html_text(table, state.output.resolve().name, f"px4fuse {state.px4fuse}")
+    page = html_text(table, state.output.resolve().name, f"px4fuse {state.version}")
     contents = {
         state.output / "fleet.parquet": table.to_parquet(index=False),
         state.output / "fleet.csv": csv_bytes(table),

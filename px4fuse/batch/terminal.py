@@ -26,8 +26,10 @@ NUMBER_TABLE_TITLES = ("number", "A", "95 %", "B", "95 %", "unit")
 def format_summary(batch_result: BatchResult) -> Page:
     """Format a run of ``px4fuse batch``: reasons for missing results, and diagnoses of all logs."""
     page, logs = Page(), batch_result.table.drop_duplicates("log")
-    uncompared = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)["log"]
-    reasons = uncompared.agg(["count", "first"]).reset_index()
+    uncompared_logs = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)[
+        "log"
+    ]
+    reasons = uncompared_logs.agg(["count", "first"]).reset_index()
     sorted_reasons = reasons.sort_values("count", ascending=False, kind="stable")
     for reason in sorted_reasons.head(MAX_LISTED_REASONS).to_dict("records"):
         template = "{first}: {status}: {reason}. {remedy}"
@@ -73,9 +75,9 @@ def format_differences(results: ChangeResults) -> Page:
     """Format the output of ``px4fuse diff``: differences, and verdicts that are worse in B."""
     page = Page()
     for name, diff_input in (("A", results.a), ("B", results.b)):
-        log = f" of {diff_input.log}" * (diff_input.given != diff_input.log)
+        log_text = f" of {diff_input.log}" * (diff_input.given != diff_input.log)
         versions = f"SHA-256 {diff_input.log_sha256[:12]}, px4fuse {diff_input.px4fuse}"
-        page.write_labelled(name, f"{diff_input.given} ({diff_input.kind}{log}), {versions}")
+        page.write_labelled(name, f"{diff_input.given} ({diff_input.kind}{log_text}), {versions}")
     settings = [
         (setting.name, _format_setting(setting.a), _format_setting(setting.b))
         for setting in results.settings
@@ -84,11 +86,11 @@ def format_differences(results: ChangeResults) -> Page:
         page.table(("setting", "A", "B"), settings)
     rows = []
     for number in results.numbers:
-        factor, unit = (100.0, "%") if number.unit == "share" else (1.0, number.unit)
+        display_factor, unit = (100.0, "%") if number.unit == "share" else (1.0, number.unit)
         cells = [
             cell
             for value, interval in ((number.a, number.a_interval), (number.b, number.b_interval))
-            for cell in (_format_value(value, factor), _format_interval(interval))
+            for cell in (_format_value(value, display_factor), _format_interval(interval))
         ]
         rows.append((number.label, *cells, unit))
     if rows:
@@ -98,10 +100,10 @@ def format_differences(results: ChangeResults) -> Page:
         f"Numbers that differ by less than {tolerance_text} are not listed.", colour=MUTED_COLOUR
     )
     for finding in results.findings:
-        styled = styled_text(
+        styled_message = styled_text(
             f"{finding.severity}: {finding.message}", 8.0, SEVERITY_COLOURS[finding.severity]
         )
-        page.write_labelled(f"Only {finding.only_in}", styled)
+        page.write_labelled(f"Only {finding.only_in}", styled_message)
     for text in results.worse:
         page.write_labelled("Worse", styled_text(text, 8.0, ERROR_COLOUR))
     if not results.worse:

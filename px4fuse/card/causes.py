@@ -17,10 +17,10 @@ from px4fuse.comparison.trials import (
     halves_discrepancy,
     has_effect,
     improvement,
-    preference,
-    ratios,
-    reduction,
+    log_ratio_reduction,
+    preference_key,
     remains_overconfident,
+    sigma_ratios,
 )
 from px4fuse.core.text import lower_first, with_log_name
 from px4fuse.filter.consistency import classify_sigma_ratio
@@ -86,7 +86,9 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
         ):
             continue
         ranked_causes.append(
-            RankedCause(finding, _cause_tier(finding, trials), sum(map(reduction, trials)), trials)
+            RankedCause(
+                finding, _cause_tier(finding, trials), sum(map(log_ratio_reduction, trials)), trials
+            )
         )
     fault_causes = [
         cause for cause in ranked_causes if CATALOGUE[cause.finding.id].verdict != "repeated"
@@ -127,7 +129,7 @@ def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial,
     for trial in trials:
         if len(trial.kinds) == 1 and trial.kinds[0] in kinds:
             key = trial.filter, trial.kinds[0]
-            best_trials[key] = min(trial, best_trials.get(key, trial), key=preference)
+            best_trials[key] = min(trial, best_trials.get(key, trial), key=preference_key)
     return tuple(best_trials.values())
 
 
@@ -298,8 +300,8 @@ def _make_rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
     rejected_fractions = [outcome.rejected_fraction for outcome in outcomes]
     before_and_after: dict[str, Any] = {
         "position_rmse_m": [outcome.position_rmse_m for outcome in outcomes],
-        "source_ratio": [ratios(outcome).get("source") for outcome in outcomes],
-        "truth_ratio": [ratios(outcome).get("truth") for outcome in outcomes],
+        "source_ratio": [sigma_ratios(outcome).get("source") for outcome in outcomes],
+        "truth_ratio": [sigma_ratios(outcome).get("truth") for outcome in outcomes],
     }
     if max(fraction or 0.0 for fraction in rejected_fractions) >= MIN_SHOWN_REJECTED_FRACTION:
         before_and_after["rejected_fraction"] = rejected_fractions

@@ -63,7 +63,7 @@ PARQUET_COMMANDS = ("batch", "extract")
 
 
 class LazyGroup(click.Group):
-    """Group of click that imports a command only when the command is called."""
+    """Group of commands of click, each imported when it is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -126,23 +126,23 @@ def cli() -> None:
     """
 
 
-def _make_system_error(error: MemoryError | OSError, written_text: str) -> Px4FuseError:
+def _make_system_error(error: MemoryError | OSError, files_sentence: str) -> Px4FuseError:
     if isinstance(error, MemoryError) or error.errno == errno.ENOMEM:
         return Px4FuseError(
-            f"not enough memory; {written_text}",
+            f"not enough memory; {files_sentence}",
             "Close other programs, or raise the limit (ulimit -v).",
         )
     try:
         Path.cwd()
     except OSError:
         return SettingsError(
-            f"the current folder no longer exists; {written_text}", "Change to another folder."
+            f"the current folder no longer exists; {files_sentence}", "Change to another folder."
         )
     if error.filename is not None:
         return OutputError(
-            f"The file {error.filename} cannot be used ({error.strerror}); {written_text}"
+            f"The file {error.filename} cannot be used ({error.strerror}); {files_sentence}"
         )
-    return OutputError(f"standard output cannot be written ({error.strerror}); {written_text}")
+    return OutputError(f"standard output cannot be written ({error.strerror}); {files_sentence}")
 
 
 def _check_memory() -> None:
@@ -151,10 +151,10 @@ def _check_memory() -> None:
         import resource
     except ImportError:  # Windows has no memory limit for a process
         return
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit != resource.RLIM_INFINITY and limit < MIN_ADDRESS_SPACE_BYTES:
+    limit_bytes = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit_bytes != resource.RLIM_INFINITY and limit_bytes < MIN_ADDRESS_SPACE_BYTES:
         raise SettingsError(
-            f"the memory limit is {limit / 1e6:.0f} MB; px4fuse needs at least "
+            f"the memory limit is {limit_bytes / 1e6:.0f} MB; px4fuse needs at least "
             f"{MIN_ADDRESS_SPACE_BYTES / 1e6:.0f} MB of address space",
             "Raise the memory limit, for example with ulimit -v unlimited.",
         )
@@ -206,7 +206,7 @@ def _prepare_libraries() -> None:
     # matplotlib warns if the home folder is read-only, which has no effect on px4fuse
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     if not set(PARQUET_COMMANDS) & set(sys.argv[1:2]):
-        # pandas then assumes that pyarrow is not installed
+        # with None, pandas assumes that pyarrow is not installed
         sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]
 
 

@@ -68,7 +68,9 @@ def batch(
         if (output / "rows").is_dir():
             message = f"results of finished logs are in {output}. Run the same command to continue."
         raise outputs.Interrupted(interrupt, message) from None
-    outputs.write_and_print({}, format_summary(batch_result), written_files=batch_result.written)
+    outputs.write_and_print(
+        {}, format_summary(batch_result), written_files=batch_result.written_paths
+    )
     options.exit_for_severity(
         fail_on, FAIL_LEVELS, {*batch_result.severities, *batch_result.table["status"]}
     )

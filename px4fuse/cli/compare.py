@@ -80,10 +80,10 @@ def compare(
     outputs.write_and_print(contents, page, request)
     if not quiet and STANDARD_OUTPUT not in contents:
         outputs.show_page(card_page("closing", results.card))
-    failed_findings = failed_checks(outcome) if checks else {}
-    for name, verdict in failed_findings.items():
+    failed_verdicts = failed_checks(outcome) if checks else {}
+    for name, verdict in failed_verdicts.items():
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)
-    if failed_findings:
+    if failed_verdicts:
         sys.exit(1)
-    causes = [finding for finding in results.findings if finding.caused_by is None]
-    options.exit_for_severity(fail_on, SEVERITIES, {finding.severity for finding in causes})
+    cause_findings = [finding for finding in results.findings if finding.caused_by is None]
+    options.exit_for_severity(fail_on, SEVERITIES, {finding.severity for finding in cause_findings})

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 
 # Maximum RPE delta (m, s or frames)
 MAX_RPE_DELTA = 1e6
-_DELTA = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
+_DELTA_PATTERN = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
 
 def parse_delta(text: str) -> Delta:
     """Parse an RPE delta: a distance, a time or a number of frames (``5m``, ``10s``, ``1f``)."""
     from px4fuse.trajectory.scores import Delta
 
-    match = _DELTA.fullmatch(text.strip())
+    match = _DELTA_PATTERN.fullmatch(text.strip())
     if match is None or not 0.0 < float(match[1]) <= MAX_RPE_DELTA:
         raise click.BadParameter(
             f"The delta {text!r} is not a distance (5m), a time (10s) or a number of frames (1f)."
@@ -50,7 +50,7 @@ _evaluation_option = partial(options.request_option, EvaluationRequest)
 )
 @_evaluation_option(
     "alignment",
-    "Transform of the estimate that is fitted to the reference before errors are computed.  "
+    "Transform that aligns the estimate with the reference before errors are computed.  "
     "[default: yaw for VIO, EKF2 and KF; se3 for SLAM; sim3 for monocular SLAM]",
 )
 @_evaluation_option(

@@ -27,7 +27,9 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
 
     log = log or sample_log()
     request = options.comparison_request(log, option_values)
-    target = outputs.web_page(output, Path("reports", f"{log.stem}{settings_name(request)}.html"))
+    target = outputs.web_page_path(
+        output, Path("reports", f"{log.stem}{settings_name(request)}.html")
+    )
     with outputs.progress(target) as show_progress:
         analysis = diagnose(request, show_progress)
         show_progress("writing the page")

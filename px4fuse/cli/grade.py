@@ -82,15 +82,15 @@ from px4fuse.errors import OutputError, SettingsError
     "--questions",
     1,
     10,
-    help="Write questions.txt: N questions to each student for an oral check, from the student's "
+    help="Write questions.txt: N questions for an oral check of each student, on the student's "
     "own form and flight, with the expected answers. Requires --key.",
 )
 @flag_option("--include-pending", help="Count points that the instructor has not confirmed yet.")
 @input_option(
     "--worksheet",
     "FILE.csv",
-    "Moodle grading worksheet, Canvas gradebook, or another table with student ids or names, "
-    "of which a copy with the grades is written; repeatable.",
+    "Moodle grading worksheet, Canvas gradebook, or another table with student ids or names; a "
+    "copy with the grades is written. Repeatable.",
     multiple=True,
 )
 @click.option(

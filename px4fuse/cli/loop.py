@@ -176,7 +176,6 @@ def loop(
 
 
 def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
-    """Convert the values of the options to the settings of a loop analysis."""
     del option_values["robust"]
     return LoopRequest(
         source=str(source), closed_loop=not option_values.pop("opened"), **option_values
@@ -184,7 +183,7 @@ def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
 
 
 def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:
-    """Return the contents of the files with the corrected path (TUM) and the pose graph (g2o)."""
+    """Return the corrected path (TUM) and the pose graph (g2o) by their paths."""
     from px4fuse.loop.closure import from_z_down
     from px4fuse.readers.g2o import g2o_text
     from px4fuse.readers.trajectory import tum_text

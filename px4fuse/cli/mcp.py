@@ -25,7 +25,7 @@ from px4fuse.core.reading import (
 )
 from px4fuse.errors import SettingsError
 
-# Name of the argument of a tool, by the name of the command's parameter if the names differ
+# Names of tool arguments that differ from the name of the command's parameter
 ARGUMENT_NAMES = {"finding": "finding_id", "parameter_texts": "parameters", "source": "log"}
 # Parameters of commands that tools do not have: outputs, exit codes and student
 HIDDEN_PARAMETERS = {
@@ -111,17 +111,17 @@ def run_command(
     try:
         with redirect_stdout(text), redirect_stderr(io.StringIO()):
             # with "-" the command makes no report
-            defaults = {words[0]: {"json_path": None if out else "-"}}
-            with cli.make_context("px4fuse", [*words], default_map=defaults) as context:
-                context.meta[outputs.SEND_KEY] = sender and sender.send
+            default_options = {words[0]: {"json_path": None if out else "-"}}
+            with cli.make_context("px4fuse", [*words], default_map=default_options) as context:
+                context.meta[outputs.SEND_PROGRESS_KEY] = sender and sender.send
                 context.meta[outputs.RESULTS_KEY] = results
                 cli.invoke(context)
     except click.UsageError as error:
         raise SettingsError(error.format_message()) from error
     if not results:
         return text.getvalue(), None
-    data = json.loads(results[0])
-    return text.getvalue(), data["card"] if words[0] == "compare" else data
+    results_data = json.loads(results[0])
+    return text.getvalue(), results_data["card"] if words[0] == "compare" else results_data
 
 
 def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:

@@ -239,20 +239,21 @@ def request_option(
     """
     field = next(field for field in structs.fields(request_type) if field.name == name)
     types = (field.type, *get_args(field.type))
-    literals = [each for each in types if get_origin(each) is Literal]
+    literal_types = [each for each in types if get_origin(each) is Literal]
     if float in types:
         unit = next(unit for suffix, unit in SUFFIX_UNITS.items() if name.endswith(suffix))
-        details["type"] = TypedQuantity(unit, field.default or example, auto=bool(literals))
-    elif literals:
-        details["type"] = Choice(get_args(literals[0]))
+        details["type"] = TypedQuantity(unit, field.default or example, auto=bool(literal_types))
+    elif literal_types:
+        details["type"] = Choice(get_args(literal_types[0]))
     if field.default:
         details["default"] = field.default
     if name in SETTING_RANGES:
-        range_text = "{:g} to {:g} {}".format(*SETTING_RANGES[name])
-        help_text = help_text.replace("RANGE", range_text)
+        help_text = help_text.replace("RANGE", "{:g} to {:g} {}".format(*SETTING_RANGES[name]))
     # for a position file, click derives the parameter name from the option (position_frame)
-    names = () if request_type is PositionFile else (name,)
-    return click.option(OPTION_NAMES[request_type][name], *names, help=help_text, **details)
+    parameter_names = () if request_type is PositionFile else (name,)
+    return click.option(
+        OPTION_NAMES[request_type][name], *parameter_names, help=help_text, **details
+    )
 
 
 _comparison_option = partial(request_option, ComparisonRequest)
@@ -380,7 +381,6 @@ def _position_file(option_values: dict[str, Any]) -> PositionFile | None:
 
 
 def typed_parameters() -> Iterator[click.Parameter]:
-    """Yield the options and arguments that the user typed."""
     context = click.get_current_context()
     for parameter in context.command.params:
         if context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE:

@@ -35,17 +35,17 @@ NO_STUDENT_NAME = ("", "")
 # Line width (characters) in a pipe: longer than any paragraph
 UNWRAPPED_WIDTH = 10_000
 # Key in the context of click for the list of files that this run has written
-WRITTEN_KEY = "px4fuse.written"
+WRITTEN_FILES_KEY = "px4fuse.written"
 # Key in the context of click: True if the command opens its output in the default program
 OPENS_OUTPUT_KEY = "px4fuse.opens_output"
 # Key in the context of click for the function that reports progress to px4fuse mcp
-SEND_KEY = "px4fuse.send"
+SEND_PROGRESS_KEY = "px4fuse.send"
 # Key in the context of click for the list of results (JSON text) that px4fuse mcp returns
 RESULTS_KEY = "px4fuse.results"
 # Suffixes of files that --open can open, the preferred suffix first
 OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
 # HTML element that contains the command and the SHA-256 of the log of a web page
-GENERATOR = re.compile('<meta name="generator" content="([^"]*)">')
+GENERATOR_PATTERN = re.compile('<meta name="generator" content="([^"]*)">')
 
 
 # Function that receives the current activity of a run and, if known, the counts of finished and all
@@ -75,7 +75,7 @@ def progress(*targets: Path | None) -> Iterator[ShowProgress]:
     """
     check_targets(targets)
     context = click.get_current_context(silent=True)
-    if context and (send := context.meta.get(SEND_KEY)):
+    if context and (send := context.meta.get(SEND_PROGRESS_KEY)):
         yield lambda activity, *_: send(activity)
         return
     from rich.console import Console
@@ -107,8 +107,8 @@ def progress(*targets: Path | None) -> Iterator[ShowProgress]:
         yield show
 
 
-def default_report(name: str, results: Results) -> Path:
-    """Return the default path of a report; a long name is cut.
+def default_report_path(name: str, results: Results) -> Path:
+    """Return the path of a report without -o; a long name is cut.
 
     Raises
     ------
@@ -138,11 +138,11 @@ def check_default_page(path: Path, page: str) -> None:
     OutputError
         The path is a file that is not a web page of the same command and log.
     """
-    generator = GENERATOR.findall(page)
+    generator = GENERATOR_PATTERN.findall(page)
     _check_default(
         path,
         "the file is not a page of this px4fuse version for the same command and log",
-        lambda content: GENERATOR.findall(content.decode()) == generator,
+        lambda content: GENERATOR_PATTERN.findall(content.decode()) == generator,
     )
 
 
@@ -178,8 +178,8 @@ def _student_name_and_id(results: Results) -> tuple[str, str]:
     return NO_STUDENT_NAME if student is None else (student.name, student.id)
 
 
-def web_page(output: Path | None, default: Path) -> Path:
-    """Return the path of the web page to write: the value of -o, else the default path.
+def web_page_path(output: Path | None, default: Path) -> Path:
+    """Return the value of -o, or else the default path, and check the path.
 
     Raises
     ------
@@ -228,7 +228,7 @@ def result_files(
     from px4fuse.results.contract import to_json
 
     if default_name and output is None and json_path is None:
-        output = default_report(default_name, results)
+        output = default_report_path(default_name, results)
     json_text, contents = to_json(results), dict[Path, bytes]()
     if (recorded_texts := click.get_current_context().meta.get(RESULTS_KEY)) is not None:
         recorded_texts.append(json_text)
@@ -253,12 +253,12 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
         An output cannot be written.
     """
     check_targets(contents)
-    written_files: list[Path] = click.get_current_context().meta.setdefault(WRITTEN_KEY, [])
+    written_files: list[Path] = click.get_current_context().meta.setdefault(WRITTEN_FILES_KEY, [])
     write_all(contents, written_files.append)
 
 
 def written_files_sentence(context: click.Context) -> str:
-    written_files: list[Path] = context.meta.get(WRITTEN_KEY, [])
+    written_files: list[Path] = context.meta.get(WRITTEN_FILES_KEY, [])
     return f"{format_written_outputs(written_files)}." if written_files else "nothing was written."
 
 

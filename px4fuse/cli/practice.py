@@ -11,7 +11,7 @@ from px4fuse.cli.outputs import (
     OPENS_OUTPUT_KEY,
     check_default_page,
     progress,
-    web_page,
+    web_page_path,
     write_and_print,
 )
 
@@ -54,7 +54,7 @@ def practice(
     solution. Not for exams: the page contains the solutions.
     """
     seed = secrets.randbelow(10**6) if seed is None else seed
-    target = web_page(output, Path("reports", f"practice_{seed}.html"))
+    target = web_page_path(output, Path("reports", f"practice_{seed}.html"))
     ctx.meta[OPENS_OUTPUT_KEY] = sys.stdout.isatty() if opened is None else opened
     with progress(target) as show_progress:
         from px4fuse.explore.practice import practice_text

@@ -225,14 +225,14 @@ def _read_secret(file: Path | None) -> bytes | None:
     if file is None:
         return None
     name = f"--secret-file {file}"
-    text = read_text(
+    secret_text = read_text(
         file,
         SettingsError,
         MAX_SECRET_BYTES,
         name=name,
         size_remedy="Give a file with one line of text.",
     )
-    return encode_secret(text, name)
+    return encode_secret(secret_text, name)
 
 
 def _write_assignment(
@@ -244,7 +244,6 @@ def _write_assignment(
     fault_count: int | None,
     has_truth: bool,
 ) -> None:
-    """Write one flight per student and the answer key."""
     from px4fuse.classroom.assignment import assignment
     from px4fuse.classroom.assignment.roster import read_roster
     from px4fuse.classroom.terminal import assignment_page

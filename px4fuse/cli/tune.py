@@ -20,7 +20,7 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     Prints the estimates for each axis with 95 % intervals, and compares them with --sigma-a and
     --sigma-z. LOG is a PX4 ULog or a MAVLink recording.
     """
-    from px4fuse.comparison.estimates import tuned
+    from px4fuse.comparison.estimates import estimate_noises
     from px4fuse.diagnose import prepare_comparison
     from px4fuse.errors import MissingDataError
     from px4fuse.report.tuning import summary
@@ -29,7 +29,7 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     request = comparison_request(log, option_values)
     with progress(json_path) as show_progress:
         comparison = prepare_comparison(request, show_progress)
-        tunings = tuned(comparison, progress=show_progress)
+        tunings = estimate_noises(comparison, progress=show_progress)
     missing = [tuning for tuning in tunings.values() if isinstance(tuning, Unavailable)]
     if len(missing) == len(tunings):
         raise MissingDataError(

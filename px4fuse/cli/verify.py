@@ -45,13 +45,13 @@ def verify(
     recorded_results = read_report(content, display_name(report))
     with progress(json_path) as show_progress:
         show_progress("computing the SHA-256 of the logs")
-        files = files_by_sha256(logs)
+        file_by_sha256 = files_by_sha256(logs)
         check_targets([json_path, output])
-        if logs and not files:
+        if logs and not file_by_sha256:
             raise LogError("The folders LOG contain no files. Give the flight log or its folder.")
         show_progress("repeating the analysis")
         verification = run_one_with_limits(
-            partial(verify_report, pdf=content, logs=files), recorded_results, TIMEOUT_S
+            partial(verify_report, pdf=content, logs=file_by_sha256), recorded_results, TIMEOUT_S
         )
     if isinstance(verification, JobFailure):
         raise LogError(f"{display_name(report)}: cannot be verified: {verification.reason}")

@@ -1,6 +1,6 @@
-"""Candidate changes of KF, of EKF2 or of their data, to be tested by re-runs.
+"""Changes of KF, of EKF2 or of their data that re-runs of the filter test one at a time.
 
-The parameter ``inputs`` is None for changes of KF.
+The argument ``ekf2_inputs`` is None for changes of KF.
 """
 
 from collections.abc import Iterable
@@ -31,7 +31,7 @@ from px4fuse.flight.model import LogInfo, Unavailable
 # Minimum SIGMA_Z (m) of a KF re-run: the noise of motion capture, the best position source
 MIN_RERUN_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
-# Kind of each change of KF (:attr:`Trial.kinds`)
+# Label in :attr:`Trial.kinds` of each KF setting or data correction that a re-run changes
 KF_KINDS = {
     SIGMA_A: "noises",
     SIGMA_Z: "noises",
@@ -62,51 +62,51 @@ MIN_MISALIGNMENT_SIGMAS = 3.0
 def candidate_changes(
     comparison: Comparison,
     estimates: Estimates,
-    inputs: Inputs | None,
+    ekf2_inputs: Inputs | None,
     axis_result: AxisComparison,
     statistic: Statistic,
 ) -> list[Change]:
-    """Return the changes that may explain a mean NIS or NEES (``statistic``) outside its limits."""
-    summary, origin = (
-        axis_result.filters["kf" if inputs is None else "ekf2"],
-        comparison.source.origin,
-    )
-    assert isinstance(summary, FilterSummary)  # only a tested filter has a discrepancy
+    """Return the changes of a filter that may bring its mean NIS or NEES inside the limits."""
+    summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
+    assert isinstance(summary, FilterSummary)  # an UntestedFilter has no mean NIS or NEES
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
     axis_tuning = tuning_of_axis(estimates.tuning, axis_result.axis.name)
     changes = list[Change]()
     # innovations do not show slow errors of GNSS and odometry: small innovations do not justify a
     # smaller noise
+    origin = comparison.source.origin
     hides_slow_errors = origin.may_drift or origin.is_gnss
     if axis_tuning is not None and not (is_underconfident and hides_slow_errors):
         changes += (
             _kf_noise_changes(comparison.settings, axis_tuning, is_underconfident)
-            if inputs is None
-            else _ekf2_noise_changes(inputs, summary, axis_tuning)
+            if ekf2_inputs is None
+            else _ekf2_noise_changes(ekf2_inputs, summary, axis_tuning)
         )
     if axis_tuning is not None and not is_underconfident and len(axis_tuning.outlier_time_s):
         changes.append({OUTLIERS: float(len(axis_tuning.outlier_time_s))})
     delay_parameters = (
-        {} if inputs is None else ml_delay_change(comparison, inputs, estimates.clock)
+        {} if ekf2_inputs is None else ml_delay_change(comparison, ekf2_inputs, estimates.clock)
     )
-    changes += [delay_parameters] if delay_parameters else _time_offset_changes(estimates, inputs)
+    changes += (
+        [delay_parameters] if delay_parameters else _time_offset_changes(estimates, ekf2_inputs)
+    )
     if axis_result.axis.name == "down":
         return changes
     if isinstance(heading := estimates.heading, HeadingError):
         is_significant = abs(heading.misalignment_deg) > MIN_MISALIGNMENT_SIGMAS * heading.sigma_deg
         changes += [{ROTATION: -round(heading.misalignment_deg, 1)}] if is_significant else []
-    if inputs is None:
+    if ekf2_inputs is None:
         return changes + _bias_changes(estimates)
-    changes += _px4_default_changes(comparison.flight.log, inputs)
+    changes += _px4_default_changes(comparison.flight.log, ekf2_inputs)
     if axis_tuning is not None and not is_underconfident:
-        changes += _vibration_noise_changes(comparison.settings, inputs, axis_tuning)
+        changes += _vibration_noise_changes(comparison.settings, ekf2_inputs, axis_tuning)
     return changes
 
 
 def main_axis_changes(
-    comparison: Comparison, estimates: Estimates, inputs: Inputs | None
+    comparison: Comparison, estimates: Estimates, ekf2_inputs: Inputs | None
 ) -> list[Change]:
-    """Return the changes to try along the main axis, where more changes are tried.
+    """Return the changes to test along the main axis: more than along the other axes.
 
     KF is also re-run with both noises changed and with its default noises. EKF2 is also re-run with
     shifted timestamps if its delay parameter is wrong.
@@ -114,11 +114,13 @@ def main_axis_changes(
     changes = unique_changes(
         change
         for statistic in DISCREPANCIES[::-1]
-        for change in candidate_changes(comparison, estimates, inputs, comparison.main, statistic)
+        for change in candidate_changes(
+            comparison, estimates, ekf2_inputs, comparison.main, statistic
+        )
     )
-    if inputs is not None:
-        has_delay = any(inputs.aid.delay in change for change in changes)
-        offset_changes = _time_offset_changes(estimates, inputs) if has_delay else []
+    if ekf2_inputs is not None:
+        has_delay = any(ekf2_inputs.aid.delay in change for change in changes)
+        offset_changes = _time_offset_changes(estimates, ekf2_inputs) if has_delay else []
         return unique_changes([*changes, *offset_changes])
     noise_changes = [change for change in changes if change.keys() <= SETTING_CHANGES]
     if len(noise_changes) > 1:
@@ -131,13 +133,15 @@ def unique_changes(changes: Iterable[Change]) -> list[Change]:
     return list({frozenset(change.items()): change for change in changes}.values())
 
 
-def change_kinds(comparison: Comparison, inputs: Inputs | None, change: Change) -> tuple[str, ...]:
+def change_kinds(
+    comparison: Comparison, ekf2_inputs: Inputs | None, change: Change
+) -> tuple[str, ...]:
     """Return the kinds of a change, for example ("noise",) or ("delay", "outliers")."""
-    if inputs is None and change == default_settings(comparison):
+    if ekf2_inputs is None and change == default_settings(comparison):
         return ("defaults",)
     kinds: dict[str, str] = {}
-    if inputs is not None:
-        aid = inputs.aid
+    if ekf2_inputs is not None:
+        aid = ekf2_inputs.aid
         kinds = {aid.noise: "noise", aid.gate: "gate", aid.delay: "delay"}
     changed_names = [name for name in change if name not in ACCOMPANYING_CHANGES]
     return tuple(
@@ -148,7 +152,7 @@ def change_kinds(comparison: Comparison, inputs: Inputs | None, change: Change) 
 
 
 def default_settings(comparison: Comparison) -> Change:
-    """Return KF's default noises in place of the values that the user chose."""
+    """Return the default of each KF noise for which the user chose another value."""
     chosen_settings, px4fuse_default = comparison.settings, Settings()
     setting_names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
     return {
@@ -163,7 +167,7 @@ def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
     return first_axis_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
-def _time_offset_changes(estimates: Estimates, inputs: Inputs | None) -> list[Change]:
+def _time_offset_changes(estimates: Estimates, ekf2_inputs: Inputs | None) -> list[Change]:
     """Return the estimated time offset if a significant part of it is not yet applied.
 
     For EKF2, EKF2_DELAY_MAX is increased if the shifted positions would be too old to be fused.
@@ -172,20 +176,20 @@ def _time_offset_changes(estimates: Estimates, inputs: Inputs | None) -> list[Ch
     if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
         return []
     if not clock_offset.is_significant(
-        clock_offset.remaining_s if inputs is None else clock_offset.offset_s
+        clock_offset.remaining_s if ekf2_inputs is None else clock_offset.offset_s
     ):
         return []
     change = {CLOCK_OFFSET: round(clock_offset.offset_s, 3)}
-    if inputs is not None:
-        age_ms = inputs.settings[inputs.aid.delay] - 1e3 * clock_offset.offset_s
-        change |= horizon_change(inputs.settings, age_ms)
+    if ekf2_inputs is not None:
+        age_ms = ekf2_inputs.settings[ekf2_inputs.aid.delay] - 1e3 * clock_offset.offset_s
+        change |= horizon_change(ekf2_inputs.settings, age_ms)
     return [change]
 
 
 def _kf_noise_changes(
     settings: Settings, axis_tuning: AxisTuning, is_underconfident: bool
 ) -> list[Change]:
-    """Return the noise estimates that differ significantly from the settings."""
+    """Return the estimates of SIGMA_A and SIGMA_Z that differ significantly from KF's settings."""
     changes = list[Change]()
     for name, noise in ((SIGMA_A, axis_tuning.sigma_a_two_state), (SIGMA_Z, axis_tuning.sigma_z)):
         chosen_sigma = getattr(settings, name)
@@ -214,19 +218,22 @@ def _bias_changes(estimates: Estimates) -> list[Change]:
 
 
 def _ekf2_noise_changes(
-    inputs: Inputs, summary: FilterSummary, axis_tuning: AxisTuning
+    ekf2_inputs: Inputs, summary: FilterSummary, axis_tuning: AxisTuning
 ) -> list[Change]:
-    """Return EKF2 parameters for the estimated position noise, if it differs significantly."""
+    """Return EKF2 parameters for the estimated position noise if EKF2's differs significantly."""
     noise_m = axis_tuning.sigma_z.value
     if noise_m is None:  # the RMS innovation is an upper bound of the noise
         noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
-    change = ml_noise_change(inputs, axis_tuning.sigma_z, noise_m)
+    change = ml_noise_change(ekf2_inputs, axis_tuning.sigma_z, noise_m)
     return [change] if change else []
 
 
-def _px4_default_changes(log: LogInfo, inputs: Inputs) -> list[Change]:
-    """Return PX4's default of each changed noise, and of a gate below PX4's default."""
-    gate, logged_parameters = inputs.aid.gate, inputs.settings
+def _px4_default_changes(log: LogInfo, ekf2_inputs: Inputs) -> list[Change]:
+    """Return PX4's default of each EKF2 noise that the log changes.
+
+    PX4's default of the gate is included if the logged gate is smaller.
+    """
+    gate, logged_parameters = ekf2_inputs.aid.gate, ekf2_inputs.settings
     defaults = {name: log.default_of(name) for name in (gate, *RESTORED_PARAMETERS)}
     return [
         {name: value}
@@ -238,15 +245,15 @@ def _px4_default_changes(log: LogInfo, inputs: Inputs) -> list[Change]:
 
 
 def _vibration_noise_changes(
-    settings: Settings, inputs: Inputs, axis_tuning: AxisTuning
+    settings: Settings, ekf2_inputs: Inputs, axis_tuning: AxisTuning
 ) -> list[Change]:
     """Return the EKF2_ACC_NOISE that corresponds to the estimated SIGMA_A, if it is much larger.
 
     EKF2 adds (EKF2_ACC_NOISE · step)² to the velocity variance in each step; KF adds SIGMA_A² · DT²
     in each DT.
     """
-    steps_per_dt = settings.dt_s / inputs.step_s
-    logged_noise, px4_maximum = inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
+    steps_per_dt = settings.dt_s / ekf2_inputs.mean_step_s
+    logged_noise, px4_maximum = ekf2_inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
     if (
         axis_tuning.sigma_a_two_state.low or 0.0
     ) * steps_per_dt**0.5 <= MIN_VIBRATION_RATIO * logged_noise:

@@ -44,10 +44,10 @@ def compare(prepared: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comp
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, note = projection.continuous_state(ekf2, prepared.source, prepared.segment)
-        notes += [f"EKF2 {note}"] if note else []
+        notes += [note] if note else []
         notes += ekf2.notes
         if not state.equals(ekf2.state):
-            # the removed resets moved the origin, also of the positions at the fusion horizon
+            # omit the states at the fusion horizon: their origin still moves with the resets
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     axes = {name: _compare_axis(prepared, ekf2, kf_run) for name, kf_run in kf_runs.items()}
     innovations: dict[FilterName, dict[str, Frame]] = {
@@ -57,8 +57,8 @@ def compare(prepared: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comp
     horizontal = {
         name: nis for name, frames in innovations.items() if (nis := _horizontal_nis(frames))
     }
-    inputs = replace(prepared, notes=tuple(notes))
-    return Comparison(**vars(inputs), axes=axes, horizontal=horizontal)
+    prepared = replace(prepared, notes=tuple(notes))
+    return Comparison(**vars(prepared), axes=axes, horizontal=horizontal)
 
 
 def _compare_axis(
@@ -81,13 +81,11 @@ def _compare_axis(
         prior_variance_m2=kf_run.updates["prior_position_variance_m2"],
         posterior_variance_m2=kf_run.steps["position_variance_m2"].reindex(kf_run.updates.index),
     )
-    (north, east, down), rejected_flags = (
-        axis.direction.tolist(),
-        _known_values(innovations, "rejected"),
-    )
+    north_component, east_component, down_component = axis.direction.tolist()
+    rejected_flags = _known_values(innovations, "rejected")
     return AxisComparison(
         heading_deg=axis.heading_deg,
-        direction=(north, east, down),
+        direction=(north_component, east_component, down_component),
         note=axis.note,
         updates=Updates(
             count=len(updates),
@@ -254,7 +252,7 @@ def _errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
 
 
 def reported_sigma(time_s: Array, variance: Frame, column: str) -> Array:
-    """Interpolate a reported variance to ``time_s``, and return σ; NaN where unknown."""
+    """Return the reported σ, interpolated to ``time_s``; NaN where unknown."""
     known_variance = _known_values(variance, column)
     if known_variance.empty:
         return np.full(len(time_s), np.nan)

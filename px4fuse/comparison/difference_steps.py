@@ -1,8 +1,8 @@
 """Explanation of the difference KF - EKF2 along each horizontal axis, in sentences.
 
-KF's settings and equations are replaced by those of EKF2, one at a time
-(:mod:`px4fuse.ekf2.steps`). The sentences describe the two replacements that reduce the difference
-most.
+KF's settings and equations are replaced by those of EKF2, one property at a time
+(:mod:`px4fuse.ekf2.steps`). The sentences describe the two properties of EKF2 that reduce the
+difference most.
 """
 
 from collections.abc import Mapping
@@ -32,16 +32,17 @@ from px4fuse.request import COMPARISON_OPTIONS
 
 # Maximum relative difference between position RMSEs that the report calls equal
 EQUAL_RMSE_TOLERANCE = 0.05
-# Minimum fraction of the mean square difference KF - EKF2 for the second cause in the report
+# Minimum fraction of the mean square difference KF - EKF2 that a reported second cause explains
 MIN_NOTABLE_FRACTION = 0.05
-# Minimum factor between a KF noise setting and its estimate that is corrected first
+# A KF noise setting that differs from its estimate by this factor is replaced by the estimate
+# before the difference KF - EKF2 is explained
 MIN_SETTING_RATIO = 4.0
-# Minimum position change (m) by a replacement that the report lists
+# Minimum effect (m) on KF's position of a property of EKF2 that the report lists
 MIN_STEP_EFFECT_M = 1e-6
-# Minimum position difference KF - EKF2 (m) outside the replayed times that is reported
+# Position differences KF - EKF2 outside the replayed times are reported above this value (m)
 MIN_UNREPLAYED_M = 0.5
-# Minimum ratio of the largest difference KF - EKF2 outside the replayed times to the largest
-# inside that is reported
+# Position differences KF - EKF2 outside the replayed times are reported if they exceed the
+# differences inside by this factor
 MIN_UNREPLAYED_RATIO = 3.0
 
 
@@ -53,9 +54,8 @@ def explain_ekf2_difference(
 ) -> dict[str, DifferenceExplanation | Unavailable]:
     """Explain the difference KF - EKF2 along each horizontal axis of a comparison.
 
-    ``estimated_noises`` contains noise estimates that replace wrong settings of KF
-    (:func:`corrected_settings`). If only the down axis was analysed, the result is the reason why
-    it is not explained.
+    ``estimated_noises`` are the noise estimates from :func:`corrected_settings`. If only the down
+    axis was analysed, return the reason why its difference is not explained.
     """
     axis_results = {
         name: axis_result for name, axis_result in comparison.axes.items() if name != "down"
@@ -93,9 +93,9 @@ def explain_ekf2_difference(
 
 
 def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, float]:
-    """Return the noise estimates for those KF settings that are wrong by a large factor.
+    """Return noise estimates for the KF settings that are wrong by a large factor.
 
-    With such a setting, each replacement alone would remove nearly the whole difference KF - EKF2.
+    With a very wrong setting, each property of EKF2 alone would remove nearly the whole difference.
     """
     axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     if axis_tuning is None or comparison.source.origin.is_gnss:
@@ -114,21 +114,21 @@ def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, floa
 
 
 def explanation_configurations(
-    comparison: Comparison, inputs: Inputs, corrected: Mapping[str, Any]
+    comparison: Comparison, ekf2_inputs: Inputs, estimated_noises: Mapping[str, Any]
 ) -> list[FilterConfiguration]:
     """Return the EKF2 parameter sets that :func:`explain_ekf2_difference` replays."""
     return list(
         steps.step_configurations(
-            inputs, _comparable_settings(comparison, inputs, corrected)
+            ekf2_inputs, _comparable_settings(comparison, ekf2_inputs, estimated_noises)
         ).values()
     )
 
 
 def _comparable_settings(
-    comparison: Comparison, inputs: Inputs, corrected: Mapping[str, Any]
+    comparison: Comparison, ekf2_inputs: Inputs, estimated_noises: Mapping[str, Any]
 ) -> Settings:
-    settings = replace(comparison.settings, **corrected)
-    is_same_source = comparison.source.name == inputs.received.source
+    settings = replace(comparison.settings, **estimated_noises)
+    is_same_source = comparison.source.name == ekf2_inputs.received.source
     return settings if is_same_source else replace(settings, clock_offset_s=0.0)
 
 
@@ -161,7 +161,7 @@ def add_sentences(
     axis_label : str
         For example "the main axis".
     step_reasons : dict
-        Different behaviour of KF and EKF2, by the name of the replaced property.
+        How KF and EKF2 differ in each property, by the name of the property.
     """
     step_reasons = {
         **step_reasons,
@@ -198,8 +198,8 @@ def add_sentences(
     )
     if explanation.outside is not None and explanation.outside.maximum_m > min_reported_m:
         sentences.append(
-            "Outside the replayed times (EKF2 starts or does not fuse positions) the positions "
-            f"of KF and EKF2 differ by up to {explanation.outside.maximum_m:.1f} m (at "
+            "Outside the replayed times (while EKF2 initialises or does not fuse positions) the "
+            f"positions of KF and EKF2 differ by up to {explanation.outside.maximum_m:.1f} m (at "
             f"{explanation.outside.at_s:.0f} s)."
         )
     return structs.replace(explanation, sentences=tuple(sentences), cause=cause_text)
@@ -207,12 +207,14 @@ def add_sentences(
 
 def _effect_text(step: Step, explanation: DifferenceExplanation) -> str:
     explained_share = step.position_mean_square_m2 / explanation.position_mean_square_m2
-    # all fractions add up to 100 %
-    increase_text = "; other properties of EKF2 increase it" if explained_share > 1.0 else ""
+    # the fractions of all properties add up to 100 %: above 100 %, others increase the difference
+    increase_text = (
+        " Other properties of EKF2 increase the difference." if explained_share > 1.0 else ""
+    )
     return (
         f"With EKF2's {step.name}, KF's position changes by up to {step.position_moved_m:.2f} m "
         f"(at {step.moved_at_s:.1f} s), and the mean square difference KF - EKF2 decreases by "
-        f"{100 * explained_share:.0f} %{increase_text}."
+        f"{100 * explained_share:.0f} %.{increase_text}"
     )
 
 
@@ -230,16 +232,16 @@ def _rejection_text(explanation: DifferenceExplanation) -> str:
 def _step_reasons(
     comparison: Comparison, model: Model, clock_offset: ClockOffset | Unavailable
 ) -> dict[str, str]:
-    kf_settings, inputs, source = comparison.settings, model.inputs, comparison.source
-    ekf2_parameters, aid = inputs.settings, inputs.aid
+    kf_settings, ekf2_inputs, source = comparison.settings, model.inputs, comparison.source
+    ekf2_parameters, aid = ekf2_inputs.settings, ekf2_inputs.aid
     samples_text = (
-        f"KF predicts every {kf_settings.dt_s:g} s from its first position; EKF2 predicts every "
-        f"{1e3 * inputs.step_s:.0f} ms"
+        f"KF predicts every {kf_settings.dt_s:g} s, starting at its first position; EKF2 predicts "
+        f"every {1e3 * ekf2_inputs.mean_step_s:.0f} ms"
     )
     if kf_settings.input == "zero":
         samples_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
-    elif source.name != inputs.received.source:
-        samples_text = f"KF uses {source.name}; EKF2 uses {inputs.received.source}"
+    elif source.name != ekf2_inputs.received.source:
+        samples_text = f"KF uses {source.name}; EKF2 uses {ekf2_inputs.received.source}"
     age_ms = 1e3 * (source.assumed_delay_s - kf_settings.clock_offset_s)
     delay_text = (
         f"EKF2 assumes that positions are {ekf2_parameters[aid.delay]:g} ms old ({aid.delay}), KF "
@@ -255,7 +257,7 @@ def _step_reasons(
             f"{low_ms:.0f} to {high_ms:.0f} ms)"
         )
     equivalent_sigma_a = ekf2_parameters["EKF2_ACC_NOISE"] * np.sqrt(
-        inputs.step_s / kf_settings.dt_s
+        ekf2_inputs.mean_step_s / kf_settings.dt_s
     )
     trusted_input = "IMU" if equivalent_sigma_a < kf_settings.sigma_a_m_s2 else "positions"
     return {
@@ -285,9 +287,9 @@ def _step_reasons(
             "positions; KF has no innovation gate"
         ),
         steps.OUTPUT: (
-            f"EKF2 fuses positions {1e3 * inputs.horizon_s:.0f} ms late, and its output predictor "
-            f"(EKF2_TAU_POS {ekf2_parameters['EKF2_TAU_POS']:g} s) predicts the present state; "
-            "KF has no delay"
+            f"EKF2 fuses positions {1e3 * ekf2_inputs.horizon_s:.0f} ms late, and its output "
+            f"predictor (EKF2_TAU_POS {ekf2_parameters['EKF2_TAU_POS']:g} s) predicts the present "
+            "state; KF has no delay"
         ),
     }
 
@@ -336,6 +338,6 @@ def _truth_sentences(explanation: DifferenceExplanation) -> list[str]:
     )
     before_m, after_m = rmse_by_step[step_index : step_index + 2]
     return [
-        f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. The replacement that "
-        f"changes the RMSE most: {step_names[step_index]} ({before_m:.3f} → {after_m:.3f} m)."
+        f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. KF's RMSE changes most "
+        f"with EKF2's {step_names[step_index]} ({before_m:.3f} → {after_m:.3f} m)."
     ]

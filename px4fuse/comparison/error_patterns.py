@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import median_filter, uniform_filter1d
-from scipy.stats import rankdata
+from scipy.stats import spearmanr
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.core.arrays import Array, cumulative_integral
@@ -44,6 +44,9 @@ JITTER_RATIOS = 0.6, 1.5
 MIN_JITTER_FRACTION = 0.4
 # Minimum significance (σ) of jitter, and of noise that grows with speed
 MIN_PATTERN_SIGMAS = 6.0
+# Number of flight parts in which the growth with speed is tested, and its minimum median
+# significance (σ)
+PART_COUNT, MIN_PART_SIGMAS = 5, 1.2
 # Fractions of the positions that are slow and fast
 SLOW_FRACTION, FAST_FRACTION = 0.3, 0.7
 # Minimum ratio of the noises at high and low speed, along and across the motion
@@ -58,6 +61,9 @@ OFFSET_PART_S = 4.0
 MIN_OFFSET_SPEED_M_S = 0.3
 # Minimum range (s) of a time offset that varies: an error of 8 cm at 1 m/s
 MIN_OFFSET_RANGE_S = 0.08
+# Minimum ratio of the mean square slow error to that of the white noise: below, the fit of many
+# offsets only fits noise
+MIN_SLOW_RATIO = 0.25
 # Maximum fraction of the mean square slow error that remains after a fit of varying time offsets
 MAX_REMAINING_FRACTION = 0.2
 # Minimum fraction of the mean square slow error that a sinusoid explains
@@ -155,6 +161,7 @@ def _rotate_90(vectors: Array) -> Array:
 def _positions(comparison: Comparison) -> tuple[Array, Array]:
     samples = cut_to_segment(comparison.source.samples, comparison.segment)
     samples = samples[Columns.POSITION[:2]].dropna()
+    samples = samples[~(samples.diff() == 0.0).all(axis=1)]  # without repeated positions
     return samples.index.to_numpy(), samples.to_numpy()
 
 
@@ -218,10 +225,17 @@ def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
     """Return the noise at low and high speed if it grows with speed in all directions."""
     speed_m_s = np.linalg.norm(errors.velocity_m_s, axis=1)
     sizes_m = np.linalg.norm(errors.residual_m, axis=1)
-    if not np.ptp(sizes_m) or not np.ptp(speed_m_s):
-        return None
-    rank_correlation = np.corrcoef(rankdata(sizes_m), rankdata(speed_m_s))[0, 1]
-    if rank_correlation * np.sqrt(len(sizes_m) / SHARED_RESIDUALS) < MIN_PATTERN_SIGMAS:
+    # noise that is larger in one part of the flight correlates with speed in a few parts only
+    significances = [
+        spearmanr(sizes_m[part], speed_m_s[part]).statistic * np.sqrt(len(part) / SHARED_RESIDUALS)
+        for part in (np.arange(len(sizes_m)), *np.array_split(np.arange(len(sizes_m)), PART_COUNT))
+        if np.ptp(sizes_m[part]) and np.ptp(speed_m_s[part])
+    ]
+    if (
+        len(significances) <= PART_COUNT
+        or significances[0] < MIN_PATTERN_SIGMAS
+        or np.median(significances[1:]) < MIN_PART_SIGMAS
+    ):
         return None
     limits_m_s = np.quantile(speed_m_s, [SLOW_FRACTION, FAST_FRACTION])
     is_slow, is_fast = speed_m_s <= limits_m_s[0], speed_m_s >= limits_m_s[1]
@@ -352,7 +366,7 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     remaining_square_m2 = float(np.mean(remaining_m**2, axis=0).sum()) - 2.0 * fit.white_m**2
     if (
         np.ptp(offsets_s) < MIN_OFFSET_RANGE_S
-        or fit.slow_square_m2 <= 0.0
+        or fit.slow_square_m2 < MIN_SLOW_RATIO * 2.0 * fit.white_m**2
         or remaining_square_m2 > MAX_REMAINING_FRACTION * fit.slow_square_m2
     ):
         return None

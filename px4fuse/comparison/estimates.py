@@ -23,7 +23,7 @@ from px4fuse.filter.correlated_noise import (
 from px4fuse.filter.fitting import Noises
 from px4fuse.filter.frame_rotation import HeadingError, estimate_heading_error
 from px4fuse.filter.hypotheses import OUTLIERS_AFTER_STEP_S, SystematicErrors, fit_systematic_errors
-from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, SignalCache
+from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, MotionCache
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import (
     MAX_HALF_INTERVAL_S,
@@ -43,7 +43,7 @@ MIN_TELEMETRY_IMU_HZ = 200.0
 MIN_IMU_RATE_RATIO = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
-# Minimum number of time offset estimates on each side of a tested change in flight
+# Minimum number of time offset estimates before and after a tested change in flight
 MIN_PARTS_PER_SIDE = 2
 
 # Axes with a noise estimate in the report; north and east share one estimate
@@ -68,7 +68,7 @@ class Estimates:
     tuning_by_axis : tuple of AxisTuning
         Noises along north and along east if they differ; empty for GNSS and odometry.
     noisy_part : NoisyPart or None
-        Time span with larger innovations; None for odometry.
+        Time span in which most innovations are larger; None for odometry.
     """
 
     tuning: Tuning
@@ -99,7 +99,7 @@ def value_or_bound(noise: Noise, fallback: float) -> float:
 
 
 def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Estimates:
-    """Estimate noises, time offset, yaw misalignment and errors of the source."""
+    """Estimate noises, time offset, yaw misalignment and systematic errors of the source."""
     tuned_axes = (
         REPORTED_AXES
         if {"north", "east"} <= {axis.name for axis in comparison.input_axes}
@@ -120,11 +120,11 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
     )
 
 
-def tuned(
+def estimate_noises(
     comparison: PreparedComparison,
     names: tuple[str, ...] | None = None,
     progress: Progress = ignore_progress,
-    cache: SignalCache | None = None,
+    motion_cache: MotionCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Estimate measurement noise and process noise along the axes.
 
@@ -135,7 +135,7 @@ def tuned(
         Axis names, or "horizontal" for north and east together; default: all.
     progress : callable
         Called with the name of each estimate before it is computed.
-    cache : dict, optional
+    motion_cache : dict, optional
         IMU motion that several estimates share.
     """
     flight, slow_imu = comparison.flight, missing_imu_rate(comparison.flight)
@@ -148,7 +148,7 @@ def tuned(
         lambda name: progress(f"tuning {name}"),
         flight if slow_imu is None else replace(flight, imu=slow_imu),
         comparison.source.origin.may_drift,
-        cache,
+        motion_cache,
     )
 
 
@@ -159,10 +159,10 @@ def estimate_noises_and_clock(
 ) -> tuple[Tuning, ClockOffset | Unavailable]:
     """Estimate measurement noise, process noise, and the time offset between positions and IMU.
 
-    Parameters are those of :func:`tuned`.
+    Parameters are those of :func:`estimate_noises`.
     """
-    signal_cache: SignalCache = {}  # both estimates use the same IMU signals
-    tuning = tuned(comparison, names, progress, signal_cache)
+    motion_cache: MotionCache = {}
+    tuning = estimate_noises(comparison, names, progress, motion_cache)
     if comparison.flight.log.is_assessed:
         return tuning, DIAGNOSIS_WITHHELD
     if slow_imu := missing_imu_rate(comparison.flight):
@@ -176,7 +176,7 @@ def estimate_noises_and_clock(
         axis_tuning.noises if axis_tuning else Noises(settings.sigma_a_m_s2, settings.sigma_z_m),
         axis_tuning.outlier_time_s if axis_tuning else None,
         progress,
-        signal_cache,
+        motion_cache,
     )
     may_drift = comparison.source.origin.may_drift
     if may_drift and isinstance(clock_offset, ClockOffset):
@@ -349,7 +349,7 @@ def _weighted_square_sum(offsets_s: Array, weights: Array) -> float:
 
 
 def _largest_step_p_value(offsets_s: Array, weights: Array) -> float | None:
-    """Return the p-value of the largest change of the time offset in flight; None if too short.
+    """Return the p-value of the largest change of the time offset; None for a short flight.
 
     Student's t-test of the mean offsets before and after each time, with Bonferroni correction.
     Changes below ``MIN_CHANGE_S`` are ignored.

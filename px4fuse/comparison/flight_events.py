@@ -1,4 +1,4 @@
-"""Events of a flight (gaps, rejections, resets) for the time axes of all charts."""
+"""Events of a flight (gaps, rejections, resets), which the charts mark on their time axes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ MIN_GAP_INTERVALS = 5.0
 
 @dataclass(frozen=True)
 class Events:
-    """Events of a flight, also before and after the analysed time span (s since the first data).
+    """Events of the whole flight; times are in seconds since the first data of the log.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Events:
 
 
 def max_interval_s(interval_s: float) -> float:
-    """Return the interval (s) between positions above which they have a gap."""
+    """Return the longest interval (s) between two positions that is not a gap."""
     return max(MIN_GAP_S, MIN_GAP_INTERVALS * interval_s)
 
 

@@ -116,7 +116,7 @@ class AxisComparison(Record, kw_only=True):
     direction : (float, float, float)
         Unit vector in NED.
     note : str
-        Origin of the axis direction, for the user.
+        How the axis direction was chosen, for the user.
     rejected_fraction : float or None
         Fraction of the positions that EKF2 rejected; None if not logged.
     ekf2_state : DataFrame or Unavailable
@@ -125,7 +125,8 @@ class AxisComparison(Record, kw_only=True):
         :attr:`Ekf2.innovations` along the axis, with the position variance before (P⁻ = S - R) and
         after (P⁺ = P⁻R/S) each update.
     flight_tracks : mapping from attribute name to DataFrame or Unavailable
-        State, variance and ground truth of the whole flight; the attributes contain the segment.
+        EKF2's state and variance and the ground truth over the whole flight; the attributes of the
+        same names cover the analysed segment only.
     """
 
     heading_deg: float | None = None
@@ -145,7 +146,7 @@ class AxisComparison(Record, kw_only=True):
 
     @property
     def in_flight(self) -> "AxisComparison":
-        """Same result with the tracks of the whole flight, for plots."""
+        """Result with the tracks of the whole flight instead of the analysed segment, for plots."""
         return structs.replace(self, **self.flight_tracks)
 
 
@@ -162,7 +163,7 @@ class PreparedComparison:
     notes : tuple of str
         Notes for the user about the log and about automatic choices.
     convention : Convention or None
-        Axes, unit and clock with which the source was sent; ``source`` is already converted.
+        Detected axes, unit and clock of the sent positions; ``source`` is already converted.
     """
 
     flight: Flight

@@ -11,21 +11,21 @@ from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.tuning import AxisTuning, tune
 from px4fuse.flight.model import Unavailable
 
-# Minimum ratio of the mean NIS along north and east for separate noise estimates
+# Noises are estimated separately along north and east if their mean NIS differ by this factor
 MIN_AXIS_NIS_RATIO = 1.7
-# Maximum number of equal flight parts that are searched for a noisy part
+# Maximum number of equal flight parts whose innovations are compared
 MAX_PART_COUNT = 12
-# Minimum number of measurements in each flight part of the search for a noisy part
+# Minimum number of measurements in each compared flight part
 MIN_PART_MEASUREMENTS = 25
 
 
 class NoisyPart(NamedTuple):
-    """Time span (s) with larger innovations; ``ratio``: their σ ÷ σ in the rest of the flight."""
+    """Time span (s) with larger innovations, and their σ ÷ σ in the rest of the flight."""
 
     start_s: float
     end_s: float
-    ratio: float
-    ratio_without_outliers: float
+    sigma_ratio: float
+    sigma_ratio_without_outliers: float
 
 
 def tune_by_axis(comparison: Comparison) -> tuple[AxisTuning, ...]:
@@ -63,21 +63,19 @@ def find_noisy_part(
     axes = [axis_result.axis for axis_result in north_and_east(comparison)]
     if sigma_a is None or sigma_z is None or len(axes) < 2:
         return None
-    increments_by_axis = [preintegrate(line, settings) for line in axes]
-    time_s = axes[0].measurement_time_s[-len(increments_by_axis[0].measurement_m) :]
+    kf_inputs = [preintegrate(axis, settings) for axis in axes]
+    time_s = axes[0].measurement_time_s[-len(kf_inputs[0].measurement_m) :]
     if len(time_s) < MAX_PART_COUNT * MIN_PART_MEASUREMENTS // 2:
         return None
     part_count = min(MAX_PART_COUNT, len(time_s) // MIN_PART_MEASUREMENTS)
     part_edges = np.linspace(0, len(time_s), part_count + 1).astype(int)
 
     def relative_innovations(is_excluded: BoolArray | None) -> Array:
-        # wrong noise settings would change the size of innovations along the flight
+        # use sizes relative to the median, because wrong noise settings scale all innovations
         axis_innovations = [
-            innovations(increments, sigma_a, sigma_z, is_excluded)
-            for increments in increments_by_axis
+            innovations(kf_input, sigma_a, sigma_z, is_excluded) for kf_input in kf_inputs
         ]
         normalised_sizes = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
-        # the median of each axis removes the difference between the axes
         return np.asarray(normalised_sizes / np.median(normalised_sizes, axis=1, keepdims=True))
 
     relative_sizes = relative_innovations(None)

@@ -16,6 +16,7 @@ from px4fuse.filter.settings import SETTING_RANGES, requested_settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import (
+    ALIGNED,
     HEIGHT_ONLY_REASON,
     POSITION_FILE,
     Columns,
@@ -38,7 +39,9 @@ from px4fuse.request import ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
 # Origin of each position source, by PX4 topic or MAVLink message
-LOGGED_ORIGINS = ORIGIN_BY_TRACK_NAME | {source.name: source.origin for source in POSITION_INPUTS}
+LOGGED_ORIGINS = ORIGIN_BY_TRACK_NAME | {
+    source.track_name: source.origin for source in POSITION_INPUTS
+}
 GNSS_MESSAGES = {layout.topic for layout in GNSS_LAYOUTS}
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
@@ -54,7 +57,7 @@ def prepare(
 ) -> PreparedComparison:
     """Choose position source, segment and axes of a flight.
 
-    With ``as_sent``, axes, unit and clock of the source are neither checked nor corrected.
+    With ``as_sent``, do not check or correct the axes, unit and clock of the source.
 
     Raises
     ------
@@ -74,13 +77,13 @@ def prepare(
             source_track, origin=structs.replace(source_track.origin, kind=source_kind)
         )
     source_track = shift_clock(source_track, settings.clock_offset_s)
-    is_in_ned = source_track.origin.is_gnss or source_track.origin.path == "aligned by EKF2"
+    is_in_ned = source_track.origin.is_gnss or source_track.origin.path == ALIGNED.path
     is_withheld = as_sent or is_in_ned or flight.log.is_assessed
     convention = None if is_withheld else check_convention(flight, source_track)
     if convention is not None and settings.clock_offset_s:  # keep a time offset that the user chose
         convention = structs.replace(convention, late_s=0.0)
     late_s = convention_faults(convention, flight, source_track.frame).late_s
-    # a time offset beyond the range of the settings is found at the edge of the searched range
+    # clip to the valid range: a larger offset is then estimated at the edge of the search range
     limits_s = SETTING_RANGES["clock_offset_s"][:2]
     clock_offset_s = float(np.clip(settings.clock_offset_s - late_s, *limits_s))
     settings = replace(settings, clock_offset_s=clock_offset_s)
@@ -153,7 +156,7 @@ def _missing_innovations(ekf2: Ekf2) -> tuple[Unavailable, ...]:
 def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:
     """Return the position source and, for the user, the reason for the choice.
 
-    Without a ``name``, the source with the fewest conversions before logging is chosen; GNSS only
+    Without a ``name``, choose the source that was converted least before it was logged; GNSS only
     if EKF2 fused it.
 
     Raises
@@ -208,8 +211,12 @@ def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
         return track
     samples = track.samples.copy()
     offset_m = [
-        float(np.nanmedian(samples[c] - np.interp(samples.index, ekf2.state.index, ekf2.state[c])))
-        for c in Columns.POSITION
+        float(
+            np.nanmedian(
+                samples[column] - np.interp(samples.index, ekf2.state.index, ekf2.state[column])
+            )
+        )
+        for column in Columns.POSITION
     ]
     if track.frame != "NED" or not np.isfinite(offset_m).all():
         return track
@@ -223,39 +230,39 @@ def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
 
 
 def _use_barometer_height(
-    track: PositionTrack, flight: Flight, height_name: HeightName | None
+    track: PositionTrack, flight: Flight, height_sensor: HeightName | None
 ) -> PositionTrack:
     """Use the barometer height instead of GNSS height, if requested or if EKF2 did.
 
     A barometer has no absolute zero, so the median difference to EKF2's height is removed.
     """
     ekf2, heights, log_name = flight.ekf2, flight.barometer, flight.log.name
-    if height_name and not track.origin.fused_as_gnss:
+    if height_sensor and not track.origin.fused_as_gnss:
         raise SettingsError(
             f"{log_name}: `height` needs GNSS as position source, not {track.name}."
         )
     is_fused_by_ekf2 = has_fused_aid(ekf2, BAROMETER.name) and not has_fused_aid(
         ekf2, GNSS.vertical
     )
-    uses_barometer = height_name == "barometer" or (
-        height_name is None and track.origin.fused_as_gnss and is_fused_by_ekf2
+    uses_barometer = height_sensor == "barometer" or (
+        height_sensor is None and track.origin.fused_as_gnss and is_fused_by_ekf2
     )
     if not uses_barometer or heights is None:
-        if height_name == "barometer":
+        if height_sensor == "barometer":
             raise MissingDataError(f"{log_name}: no barometer height in the log.", GNSS.to_log)
         return track
-    zero_m, zero_text = heights["down_m"].iloc[0], "the first barometer height"
+    zero_height_down_m, zero_text = heights["down_m"].iloc[0], "the first barometer height"
     if isinstance(ekf2, Ekf2):
         ekf2_down_m = np.interp(
             heights.index, ekf2.state.index, ekf2.state["down_m"], np.nan, np.nan
         )
         if np.isfinite(ekf2_down_m).any():
-            zero_m = float(np.nanmedian(heights["down_m"] - ekf2_down_m))
-        zero_text = "the median of EKF2's height"
+            zero_height_down_m = float(np.nanmedian(heights["down_m"] - ekf2_down_m))
+        zero_text = "that of EKF2 (median difference removed)"
     height_note = f"heights are from the barometer; height 0 is {zero_text}"
     return replace(
         track,
-        barometer=heights - zero_m,
+        barometer=heights - zero_height_down_m,
         description=f"{track.description}, barometer height",
         notes=(*track.notes, height_note),
     )
@@ -271,8 +278,10 @@ def explain_missing_source(flight: Flight) -> Unavailable:
     )
     if flight.log.format.startswith("MAVLink"):
         topics = "VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP"
-        ulog_text = ", or the ULog" if flight.log.has_ulog else ""
-        remedy = f"give the position file of the positioning system with `position`{ulog_text}."
+        ulog_text = ", or read the ULog of this flight" if flight.log.has_ulog else ""
+        remedy = (
+            f"give the position file of the positioning system as argument `position`{ulog_text}."
+        )
     if flight.positions:
         track_name = flight.positions[0].name
         remedy = (
@@ -332,50 +341,52 @@ def choose_segment(
         The segment is empty or contains fewer than three measurements.
     """
     source_span_s = track.samples.index[[0, -1]].tolist()
-    first_s, last_s = max(source_span_s[0], 0.0), min(source_span_s[1], flight.log.duration_s)
-    flight_start_s, flight_end_s = first_s, last_s
+    available_start_s = max(source_span_s[0], 0.0)
+    available_end_s = min(source_span_s[1], flight.log.duration_s)
+    chosen_start_s, chosen_end_s = available_start_s, available_end_s
     if isinstance(flight.airborne, Unavailable):
         reason = "whole duration of the position source (no land detector in the log)"
     elif not flight.airborne:
         reason = "whole duration of the position source (the vehicle never took off)"
     else:
         flights = join_flights(flight.airborne)
-        flight_start_s, flight_end_s = max(
-            flights, key=lambda span: min(span[1], last_s) - max(span[0], first_s)
+        chosen_start_s, chosen_end_s = max(
+            flights,
+            key=lambda span: min(span[1], available_end_s) - max(span[0], available_start_s),
         )
         reason = "positions available and vehicle airborne"
         if len(flights) > 1:
             others_text = ", ".join(
                 f"{start_s:.1f} to {end_s:.1f} s (--start {start_s:.1f} --end {end_s:.1f})"
                 for start_s, end_s in flights
-                if start_s != flight_start_s
+                if start_s != chosen_start_s
             )
             reason += f"; this is the longest of {len(flights)} flights; the others: {others_text}"
-        if not max(flight_start_s, first_s) < min(flight_end_s, last_s):
-            flight_start_s, flight_end_s = min(flight_start_s, first_s), max(flight_end_s, last_s)
+        if not max(chosen_start_s, available_start_s) < min(chosen_end_s, available_end_s):
+            chosen_start_s = min(chosen_start_s, available_start_s)
+            chosen_end_s = max(chosen_end_s, available_end_s)
             reason = "whole duration of the position source (no positions in flight)"
     if start_s is not None or end_s is not None:
-        flight_start_s, flight_end_s = (
-            flight_start_s if start_s is None else start_s,
-            flight_end_s if end_s is None else end_s,
-        )
+        chosen_start_s = chosen_start_s if start_s is None else start_s
+        chosen_end_s = chosen_end_s if end_s is None else end_s
         time_options = {"--start": start_s, "--end": end_s}
         given_options = [option for option, time_s in time_options.items() if time_s is not None]
         reason = f"chosen with {' and '.join(given_options)}"
-        clipped_s = max(flight_start_s, 0.0), min(flight_end_s, flight.log.duration_s)
-        if clipped_s != (flight_start_s, flight_end_s) and clipped_s[0] < clipped_s[1]:
-            flight_start_s, flight_end_s = clipped_s
+        clipped_s = max(chosen_start_s, 0.0), min(chosen_end_s, flight.log.duration_s)
+        if clipped_s != (chosen_start_s, chosen_end_s) and clipped_s[0] < clipped_s[1]:
+            chosen_start_s, chosen_end_s = clipped_s
             reason += ", limited to the logged time"
-    if not flight_start_s < flight_end_s:
+    if not chosen_start_s < chosen_end_s:
         raise SettingsError(
-            f"{flight.log.name}: no positions between {flight_start_s:.6g} s and "
-            f"{flight_end_s:.6g} s; the position source runs from "
+            f"{flight.log.name}: no positions between {chosen_start_s:.6g} s and "
+            f"{chosen_end_s:.6g} s; the position source runs from "
             f"{source_span_s[0]:.2f} s to {source_span_s[1]:.2f} s. Change --start or --end."
         )
-    segment_start_s, segment_end_s = max(flight_start_s, first_s), min(flight_end_s, last_s)
+    segment_start_s = max(chosen_start_s, available_start_s)
+    segment_end_s = min(chosen_end_s, available_end_s)
     if segment_start_s >= segment_end_s:
-        segment_start_s, segment_end_s = flight_start_s, flight_end_s
-    segment = Segment(segment_start_s, segment_end_s, reason, (flight_start_s, flight_end_s))
+        segment_start_s, segment_end_s = chosen_start_s, chosen_end_s
+    segment = Segment(segment_start_s, segment_end_s, reason, (chosen_start_s, chosen_end_s))
     position_count = len(cut_to_segment(track.samples, segment))
     if position_count < MIN_MEASUREMENTS:
         raise SettingsError(

@@ -33,8 +33,8 @@ PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
     "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
 }
-# Maximum ratio of EKF2's median squared distance to the positions without and with resets, for
-# which resets are removed
+# Resets are removed if this lowers EKF2's median squared distance to the positions to at most this
+# fraction
 MAX_DISTANCE_RATIO = 0.95
 
 
@@ -43,17 +43,19 @@ def continuous_state(
 ) -> tuple[pd.DataFrame, str]:
     """Remove the resets that only move the origin of EKF2's frame.
 
-    Such resets are found by a smaller median distance to the measurements without them. Other
-    resets correct an error of EKF2 and remain.
+    Resets are removed if EKF2 is closer to the measurements without them (median distance). All
+    other resets correct an error of EKF2 and remain.
 
     Returns
     -------
     state : DataFrame
         Position and velocity as in :attr:`Ekf2.state`.
     statement : str
-        Removed and other resets, for the user; empty without a reset.
+        Numbers of removed and of remaining resets, for the user; empty without a reset.
     """
-    resets_inside = [r for r in ekf2.resets if segment.start_s < r.time_s <= segment.end_s]
+    resets_inside = [
+        reset for reset in ekf2.resets if segment.start_s < reset.time_s <= segment.end_s
+    ]
     state = ekf2.state.copy() if resets_inside else ekf2.state
     removed_resets, kept_resets = list[str](), list[str]()
     for label, quantity, columns in (
@@ -63,9 +65,9 @@ def continuous_state(
     ):
         axes = [Columns.STATE.index(column) % 3 for column in columns]
         resets = [
-            r
-            for r in resets_inside
-            if r.quantity == quantity and any(r.delta[axis] for axis in axes)
+            reset
+            for reset in resets_inside
+            if reset.quantity == quantity and any(reset.delta[axis] for axis in axes)
         ]
         if not resets:
             continue
@@ -83,8 +85,8 @@ def continuous_state(
     reset_statements = (
         f"EKF2 resets {treatment}: {', '.join(reset_texts)} ({reason})"
         for treatment, reset_texts, reason in (
-            ("removed", removed_resets, "they move the origin"),
-            ("not removed", kept_resets, "they correct an error"),
+            ("removed", removed_resets, "these resets move the origin"),
+            ("not removed", kept_resets, "these resets correct an error of EKF2"),
         )
         if reset_texts
     )
@@ -94,7 +96,7 @@ def continuous_state(
 def _continuous_candidates(
     published: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
-    """Yield EKF2's position without resets, with the origin of each time span between resets."""
+    """Yield EKF2's position without resets, once with the origin of each span between resets."""
     reset_m = np.array([reset.delta for reset in resets])[:, axes]
     is_after = np.array([published.index >= reset.time_s for reset in resets]).T
     for earlier_count in range(len(resets) + 1):
@@ -188,10 +190,10 @@ def _altitude_offset_m(ekf2: Ekf2, down_m: pd.Series) -> float:
 def project_innovations(
     flight: Flight, ekf2: Ekf2, track: PositionTrack, axis: Axis, segment: Segment
 ) -> pd.DataFrame | Unavailable:
-    """Project EKF2's innovations onto an axis, with its variance before and after each update.
+    """Project EKF2's innovations onto an axis, and add EKF2's position variance at each update.
 
-    Adds to :attr:`Ekf2.innovations` the columns ``prior_variance_m2`` (P⁻ = S - R) and
-    ``posterior_variance_m2`` (P⁺ = P⁻R/S; P⁻ if rejected); NaN if R is unknown.
+    The added columns are ``prior_variance_m2`` (P⁻ = S - R) and ``posterior_variance_m2``
+    (P⁺ = P⁻R/S; P⁻ if rejected); NaN if R is unknown.
     """
     if track.aid(axis.name) is None:
         return Unavailable(

@@ -21,7 +21,7 @@ from px4fuse.flight.model import Unavailable
 GNSS_DELAYS_MS = (0.0, 150.0, 300.0)
 # Transmission time (ms) of a position message, which EKF2_DELAY_MAX must include
 TRANSMISSION_MS = 30.0
-# Step (ms) of the rounded EKF2_DELAY_MAX
+# EKF2_DELAY_MAX is rounded up to a multiple of this value (ms)
 DELAY_MAX_STEP_MS = 50.0
 
 
@@ -72,43 +72,45 @@ def ml_ekf2_parameters(
     if EKF2 did not fuse the analysed source.
     """
     changes: dict[str, float] = {}
-    inputs, min_vision_noise_m = model.inputs, 0.0
-    if inputs.vision is not None and comparison.source.name == inputs.vision.source:
+    ekf2_inputs, min_vision_noise_m = model.inputs, 0.0
+    if ekf2_inputs.vision is not None and comparison.source.name == ekf2_inputs.vision.source:
         if (gnss_delay := wrong_gnss_delay_ms(model)) is not None:
-            changes |= delay_change(inputs, gnss_delay[0])
+            changes |= delay_change(ekf2_inputs, gnss_delay[0])
         # while EKF2 fuses GNSS, the noise of vision is at least that of GNSS
-        min_vision_noise_m = inputs.settings[GNSS_POS.noise]
-        inputs = replace(inputs, aid=EV_POS, received=inputs.vision)
-    if not is_source_fused(comparison, inputs):
+        min_vision_noise_m = ekf2_inputs.settings[GNSS_POS.noise]
+        ekf2_inputs = replace(ekf2_inputs, aid=EV_POS, received=ekf2_inputs.vision)
+    if not is_source_fused(comparison, ekf2_inputs):
         return {}
     axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     has_slow_errors = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
     noise_m = None if axis_tuning is None else axis_tuning.sigma_z.value
-    used_m = noise_used_m(inputs)
-    min_noise_m = used_m if has_slow_errors else 0.0
+    used_noise_m = noise_used_m(ekf2_inputs)
+    min_noise_m = used_noise_m if has_slow_errors else 0.0
     if (
         axis_tuning
         and noise_m
         and noise_m > min_noise_m
-        and (max(noise_m, used_m) > min_vision_noise_m)
+        and (max(noise_m, used_noise_m) > min_vision_noise_m)
     ):
-        changes |= ml_noise_change(inputs, axis_tuning.sigma_z, noise_m)
-    return changes | ml_delay_change(comparison, inputs, clock_offset)
+        changes |= ml_noise_change(ekf2_inputs, axis_tuning.sigma_z, noise_m)
+    return changes | ml_delay_change(comparison, ekf2_inputs, clock_offset)
 
 
-def is_source_fused(comparison: Comparison, inputs: Inputs) -> bool:
+def is_source_fused(comparison: Comparison, ekf2_inputs: Inputs) -> bool:
     """Return True if EKF2 fused the analysed source."""
     source = comparison.source
-    return source.name == inputs.received.source and source.alignment is None
+    return source.name == ekf2_inputs.received.source and source.alignment is None
 
 
 def ml_delay_change(
-    comparison: Comparison, inputs: Inputs, clock_offset: ClockOffset | Unavailable
+    comparison: Comparison, ekf2_inputs: Inputs, clock_offset: ClockOffset | Unavailable
 ) -> dict[str, float]:
     if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
         return {}
-    ml_delay_ms = wrong_delay_ms(comparison, clock_offset, inputs.settings[inputs.aid.delay])
-    return {} if ml_delay_ms is None else delay_change(inputs, ml_delay_ms)
+    ml_delay_ms = wrong_delay_ms(
+        comparison, clock_offset, ekf2_inputs.settings[ekf2_inputs.aid.delay]
+    )
+    return {} if ml_delay_ms is None else delay_change(ekf2_inputs, ml_delay_ms)
 
 
 def wrong_delay_ms(
@@ -122,7 +124,7 @@ def wrong_delay_ms(
 
 
 def delay_limit(parameter_name: str, ml_delay_ms: float, logged_delay_ms: float) -> str:
-    """Return the limit of PX4 that a delay violates, for example "exceed 300 ms"."""
+    """Return how a delay violates PX4's limits, for a sentence: "exceed 300 ms", "be negative"."""
     if ml_delay_ms > (maximum_ms := PARAMETERS[parameter_name].maximum):
         return f"exceed {maximum_ms:g} ms"
     return "be negative" if round(ml_delay_ms) <= 0.0 == logged_delay_ms else ""
@@ -134,26 +136,28 @@ def aid_of(comparison: PreparedComparison, axis: str = "") -> Aid:
 
 
 def delay_ms(comparison: PreparedComparison) -> float | None:
-    """Return the delay (ms) that EKF2 subtracts from the timestamps of the positions.
+    """Return the logged delay (ms) that EKF2 subtracts from the timestamps of the positions.
 
-    None if the parameter is not logged or EKF2 does not use it.
+    None if the delay parameter is not logged or EKF2 does not use it.
     """
     source = comparison.source
     if source.origin.aid is None or source.alignment is not None:
         return None
-    parameter_ms = comparison.flight.log.parameters.get(source.origin.aid.delay)
+    logged_delay_ms = comparison.flight.log.parameters.get(source.origin.aid.delay)
     return (
         None
-        if source.origin.fused_as_gnss and source.assumed_delay_s == 0.0 != parameter_ms
-        else parameter_ms
+        if source.origin.fused_as_gnss and source.assumed_delay_s == 0.0 != logged_delay_ms
+        else logged_delay_ms
     )
 
 
-def ml_noise_change(inputs: Inputs, ml_noise: Noise, noise_m: float) -> dict[str, float]:
-    """Return EKF2's parameters for ``noise_m`` if its noise is outside the 95 % interval."""
-    if (ml_noise.low or 0.0) <= noise_used_m(inputs) <= (ml_noise.high or math.inf):
+def ml_noise_change(ekf2_inputs: Inputs, ml_noise: Noise, noise_m: float) -> dict[str, float]:
+    """Return EKF2 parameters for the noise ``noise_m``; empty if EKF2's is in the 95 % interval."""
+    if (ml_noise.low or 0.0) <= noise_used_m(ekf2_inputs) <= (ml_noise.high or math.inf):
         return {}
-    return noise_change(inputs.aid, inputs.settings, _reported_noise_m(inputs), noise_m)
+    return noise_change(
+        ekf2_inputs.aid, ekf2_inputs.settings, _reported_noise_m(ekf2_inputs), noise_m
+    )
 
 
 def noise_change(
@@ -169,18 +173,18 @@ def noise_change(
     return changes
 
 
-def delay_change(inputs: Inputs, delay_ms: float) -> dict[str, float]:
+def delay_change(ekf2_inputs: Inputs, delay_ms: float) -> dict[str, float]:
     """Return the EKF2 parameters for a position delay; a negative delay is set to 0.
 
     Empty if the delay exceeds PX4's maximum, or if EKF2 ignores the delay parameter.
     """
-    delay_name = inputs.aid.delay
+    delay_name = ekf2_inputs.aid.delay
     parameter = PARAMETERS[delay_name]
-    if delay_ms > parameter.maximum or inputs.received.uses_sender_times:
+    if delay_ms > parameter.maximum or ekf2_inputs.received.uses_sender_times:
         return {}
     changes = {delay_name: max(float(round(delay_ms)), parameter.minimum)}
-    changes |= horizon_change(inputs.settings, changes[delay_name])
-    return {name: value for name, value in changes.items() if value != inputs.settings[name]}
+    changes |= horizon_change(ekf2_inputs.settings, changes[delay_name])
+    return {name: value for name, value in changes.items() if value != ekf2_inputs.settings[name]}
 
 
 def horizon_change(settings: Mapping[str, float], age_ms: float) -> dict[str, float]:
@@ -191,15 +195,15 @@ def horizon_change(settings: Mapping[str, float], age_ms: float) -> dict[str, fl
     return {"EKF2_DELAY_MAX": DELAY_MAX_STEP_MS * math.ceil(needed_ms / DELAY_MAX_STEP_MS)}
 
 
-def noise_used_m(inputs: Inputs) -> float:
+def noise_used_m(ekf2_inputs: Inputs) -> float:
     """Return the median √R (m) that EKF2 used for the positions."""
-    aid, logged_parameters = inputs.aid, inputs.settings
+    aid, logged_parameters = ekf2_inputs.aid, ekf2_inputs.settings
     is_fixed = aid.noise_mode and logged_parameters[aid.noise_mode] == 1.0
-    return max(logged_parameters[aid.noise], 0.0 if is_fixed else _reported_noise_m(inputs))
+    return max(logged_parameters[aid.noise], 0.0 if is_fixed else _reported_noise_m(ekf2_inputs))
 
 
-def _reported_noise_m(inputs: Inputs) -> float:
-    return float(np.sqrt(np.median(inputs.received.variance_m2[:, :2])))
+def _reported_noise_m(ekf2_inputs: Inputs) -> float:
+    return float(np.sqrt(np.median(ekf2_inputs.received.variance_m2[:, :2])))
 
 
 def format_settings(changes: Mapping[str, float]) -> str:

@@ -1,4 +1,4 @@
-"""Re-runs of a filter along one axis with a change, and the statistics that they improve."""
+"""Re-runs of KF or EKF2 along one axis with a change, and the statistics that they improve."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -12,34 +12,34 @@ from px4fuse.filter.consistency import Reference, classify_sigma_ratio, nis_band
 from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
-# Statistics of an inconsistent filter that re-runs try to correct
+# Statistics of an inconsistent filter that a change in a re-run may correct
 DISCREPANCIES: tuple[Statistic, Statistic] = ("nees", "nis")
 Change = Mapping[str, float]
 # Keys of Trial.change that are not EKF2 parameters
 CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
-# Minimum reported mean NEES (error of 2 reported σ): flights without a fault stay below 3
+# Mean NEES from which an error is reported (2 reported σ): flights without a fault stay below 3
 MIN_REPORTED_NEES = 4.0
-# Maximum mean NEES after a reduction of a noise of an overconfident filter
+# Limit of the mean NEES if a smaller noise corrects the NIS of a filter whose NEES is above 1
 MAX_NEES_AFTER_CHANGE = 2.0
-# Tolerance of the explained_fraction of a cause, which is 1 if it explains all
+# A change is a cause if its explained_fraction differs from 1 by at most this value
 CAUSE_TOLERANCE = 0.5
-# Tolerance of the explained_fraction of a sensor fault as the only cause
+# A sensor fault is the only cause if its explained_fraction differs from 1 by at most this value
 SENSOR_CAUSE_TOLERANCE = 0.25
-# Tolerance of the explained_fraction of changes that are combined in one re-run
+# Changes are combined in one re-run if their explained_fraction differs from 1 by less than this
 COMBINED_CAUSE_TOLERANCE = 0.9
 # Keys of Trial.change that correct a sensor fault instead of a setting
 SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
 # Keys of Trial.change that only accompany another change
 ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
-# Minimum factor by which a re-run with an effect changes a σ ratio
+# A re-run has an effect if it changes a ratio of actual to reported σ by at least this factor
 MIN_RATIO_CHANGE = 1.10
-# Minimum relative change of the position RMSE by a re-run with an effect
+# A re-run has an effect if it changes the position RMSE by more than this fraction
 MIN_RMSE_CHANGE = 0.05
-# Minimum relative reduction of the position RMSE by a re-run that improves the position
+# A re-run improves the position if it reduces the position RMSE by at least this fraction
 POSITION_IMPROVEMENT = 0.20
-# Maximum ratio of ln(σ ratio) after and before a re-run that corrects the error
+# A filter remains overconfident if a re-run leaves more than this fraction of ln(σ ratio)
 MAX_REMAINING_ERROR_FRACTION = 0.75
 
 
@@ -100,8 +100,8 @@ class Trial(Record, kw_only=True):
 def explained_fraction(trial: Trial, statistic: Statistic) -> float:
     """Return the fraction of ln(mean NIS) or ln(mean NEES) that a change removes.
 
-    For "difference": the removed fraction of the mean square difference KF - EKF2. Above 1 the
-    change is too large; 0 if unknown.
+    For the statistic "difference": the removed fraction of the mean square difference KF - EKF2.
+    A value above 1 means that the change is too large; 0 means unknown.
     """
     before, after = trial.before.value(statistic), trial.after.value(statistic)
     if not before or not after:
@@ -111,7 +111,7 @@ def explained_fraction(trial: Trial, statistic: Statistic) -> float:
     return 1.0 - float(np.log(after) / np.log(before))
 
 
-def _distance(trial: Trial, statistic: Statistic) -> float:
+def _explanation_error(trial: Trial, statistic: Statistic) -> float:
     return abs(explained_fraction(trial, statistic) - 1.0)
 
 
@@ -157,33 +157,36 @@ def find_cause(
     """
 
     def rank(trial: Trial) -> tuple[bool, int, bool, float]:
-        distance = _distance(trial, statistic)
-        is_complete = trial.corrects_sensor and distance <= SENSOR_CAUSE_TOLERANCE
+        explanation_error = _explanation_error(trial, statistic)
+        is_complete = trial.corrects_sensor and explanation_error <= SENSOR_CAUSE_TOLERANCE
         return (
             not (is_complete or is_sufficient(trial, statistic)),
             len(trial.change.keys() - ACCOMPANYING_CHANGES),
             not trial.corrects_sensor,
-            distance,
+            explanation_error,
         )
 
     causes = (
         trial
         for trial in find_trials(trials, filter_name, axis, statistic)
-        if _distance(trial, statistic) <= CAUSE_TOLERANCE
+        if _explanation_error(trial, statistic) <= CAUSE_TOLERANCE
         and not makes_overconfident(trial, statistic)
     )
     return min(causes, key=rank, default=None)
 
 
 def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]:
-    """Return the re-runs that correct a statistic partly, best first; empty if one suffices."""
+    """Return the re-runs that correct a statistic only partly, best first.
+
+    Empty if one re-run brings the statistic inside its limits.
+    """
     helpful = [
         trial
         for trial in trials
         if statistic in trial.discrepancies
-        and _distance(trial, statistic) < COMBINED_CAUSE_TOLERANCE
+        and _explanation_error(trial, statistic) < COMBINED_CAUSE_TOLERANCE
     ]
-    helpful.sort(key=lambda trial: _distance(trial, statistic))
+    helpful.sort(key=lambda trial: _explanation_error(trial, statistic))
     return [] if any(is_sufficient(trial, statistic) for trial in helpful) else helpful
 
 
@@ -197,7 +200,7 @@ def log_ratio_sum(statistics: RunStatistics) -> float:
     return sum(0.5 * abs(math.log(squared_ratio)) for squared_ratio in squared_ratios)
 
 
-def preference(trial: Trial) -> tuple[bool, int, float]:
+def preference_key(trial: Trial) -> tuple[bool, int, float]:
     """Return a sort key for re-runs of one kind of change; the best re-run has the smallest."""
     is_solved = becomes_consistent(trial)
     return (
@@ -207,8 +210,8 @@ def preference(trial: Trial) -> tuple[bool, int, float]:
     )
 
 
-def ratios(statistics: RunStatistics) -> dict[Reference, float]:
-    """Return the σ ratios (actual over reported) against source and ground truth."""
+def sigma_ratios(statistics: RunStatistics) -> dict[Reference, float]:
+    """Return the σ sigma_ratios (actual over reported) against source and ground truth."""
     squared_ratios: dict[Reference, float | None] = {
         "source": statistics.nis_mean,
         "truth": statistics.nees_mean,
@@ -216,14 +219,14 @@ def ratios(statistics: RunStatistics) -> dict[Reference, float]:
     return {reference: math.sqrt(mean) for reference, mean in squared_ratios.items() if mean}
 
 
-def reduction(trial: Trial) -> float:
+def log_ratio_reduction(trial: Trial) -> float:
     """Return the decrease of the sum of |ln σ ratio| (:func:`log_ratio_sum`) by a re-run."""
     return log_ratio_sum(trial.before) - log_ratio_sum(trial.after)
 
 
 def sigma_ratio_changes(trial: Trial) -> list[tuple[Reference, float, float]]:
     """Return (reference, σ ratio before, σ ratio after the change) for source and ground truth."""
-    ratios_before, ratios_after = ratios(trial.before), ratios(trial.after)
+    ratios_before, ratios_after = sigma_ratios(trial.before), sigma_ratios(trial.after)
     return [
         (reference, ratios_before[reference], ratios_after[reference])
         for reference in ratios_before.keys() & ratios_after.keys()
@@ -276,7 +279,7 @@ def find_trial(
             and (not name or name in trial.change)
             and improvement(trial) != "nothing"
         ),
-        key=preference,
+        key=preference_key,
         default=None,
     )
 

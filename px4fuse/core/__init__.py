@@ -1,1 +1,1 @@
-"""Records, files, texts and processes that every package uses."""
+"""Utilities of all packages: result records, file access, text formatting, worker processes."""

@@ -25,9 +25,9 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-#: Maximum size (bytes) of a flight log, which ``--max-size`` sets for one command
+#: Maximum size (bytes) of a flight log; the option ``--max-size`` overrides it
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
-#: Folders from which ``px4fuse mcp`` may read files; all folders if empty
+#: Folders from which ``px4fuse mcp`` may read files (option ``--root``); all folders if empty
 readable_folders: ContextVar[tuple[Path, ...]] = ContextVar("readable_folders", default=())
 LOG_SIZE_REMEDY = "Shorten the log to the flight, or increase the size limit with --max-size MB."
 
@@ -42,7 +42,7 @@ def display_name(path: Path) -> str:
 
 
 def split_path_and_part(argument: str) -> tuple[Path, str | None]:
-    """Split ``FILE:PART``: a track of a log, a rigid body of a table, or a topic of a ROS bag."""
+    """Split ``FILE:PART``; a part is a track, a body in a motion-capture file, or a ROS topic."""
     path, colon, part = argument.rpartition(":")
     if colon and not Path(argument).exists() and (part.isidentifier() or Path(path).exists()):
         return Path(path), part
@@ -58,7 +58,8 @@ def check_readable(path: Path, folders: Sequence[Path]) -> None:
     if folders and not any(map(target.is_relative_to, folders)):
         folder_names = " or ".join(map(str, folders))
         raise LogError(
-            f"{display_name(path)} is outside the folders of --root", f"Copy it to {folder_names}."
+            f"{display_name(path)} is outside the folders that --root allows",
+            f"Copy the file to {folder_names}.",
         )
 
 
@@ -107,7 +108,7 @@ def read_bytes_limited(
 ) -> bytes:
     """Read all bytes of a regular file up to a size limit.
 
-    ``size_remedy`` and ``empty_remedy`` are the actions for a file that is too large or empty.
+    ``size_remedy`` and ``empty_remedy`` are advice to the user if the file is too large or empty.
     Without ``empty_remedy``, empty files are accepted.
 
     Raises
@@ -120,7 +121,7 @@ def read_bytes_limited(
     content = (
         b"" if size_bytes > limit_bytes else _read_bytes(path, size_bytes + 1, error_type, name)
     )
-    if len(content) > size_bytes:  # the file grows, or is in /proc, in which all sizes are 0
+    if len(content) > size_bytes:  # the file grows, or is in /proc, where files report size 0
         content = _read_bytes(path, limit_bytes + 1, error_type, name)
     if (actual_size_bytes := max(size_bytes, len(content))) > limit_bytes:
         raise error_type(format_size_limit(name, actual_size_bytes, limit_bytes), size_remedy)

@@ -83,16 +83,16 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
 
 
 class Unavailable(Record):
-    """Missing data with reason and action, used in place of a record.
+    """Missing data with cause and advice, used in place of a record.
 
     Attributes
     ----------
     what : str
         Missing data as a noun phrase ("EKF2 innovations").
     reason : str
-        Property of the log that is the reason ("no topic vehicle_attitude").
+        Cause in the log ("no topic vehicle_attitude").
     remedy : str
-        Action, for example a setting to log the data.
+        Advice to the user, for example a setting to log the data.
     source : str
         Name of the missing position source; empty if other data are missing.
     """
@@ -121,9 +121,10 @@ else:
             return msgspec.UnsetType
 
     class RecordOrUnavailable:
-        """``RecordOrUnavailable[T, A]``: a record T, or an Unavailable of type A.
+        """``RecordOrUnavailable[T, A]``: a record T, or a subclass A of :class:`Unavailable`.
 
-        msgspec itself decodes such a union only if both types have tags.
+        msgspec decodes unions of tagged records only, so :func:`decode_record_or_unavailable`
+        decodes these untagged records.
         """
 
         def __class_getitem__(cls, kinds: tuple[type, type]) -> type:
@@ -144,13 +145,13 @@ else:
 def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
     """Decode a :class:`RecordOrUnavailable` for msgspec (argument ``dec_hook``)."""
     record_type, unavailable_type = union_type.union_members
-    kind = (
+    record_class = (
         unavailable_type
         if isinstance(value, dict) and {"what", "reason"} <= value.keys()
         else record_type
     )
     try:
-        return msgspec.convert(value, kind, dec_hook=decode_record_or_unavailable)
+        return msgspec.convert(value, record_class, dec_hook=decode_record_or_unavailable)
     except msgspec.ValidationError as error:
         raise ValueError(str(error)) from error  # msgspec adds the path of the value to the message
 

@@ -84,7 +84,7 @@ def count_noun(count: int, noun: str) -> str:
 
 
 def format_factor(factor: float) -> str:
-    """Format a factor with 2 significant digits, or 3 below 2.
+    """Format a factor with 2 significant digits (3 if the factor is below 2).
 
     >>> [format_factor(f) for f in (1.18, 9.87, 61.2, 388.0, 3412.0, 5.13e6)]
     ['1.18', '9.9', '61', '390', '3,400', '5,100,000']
@@ -112,7 +112,7 @@ def join_first(names: Sequence[str], max_count: int, separator: str = ", ") -> s
 
 
 def format_p_value(p: float) -> str:
-    """Format a p-value with 2 digits, or as "p < 0.001".
+    """Format a p-value with 2 significant digits, or as "p < 0.001".
 
     >>> [format_p_value(p) for p in (0.43, 0.0214, 0.00051, 3e-113, 0.0)]
     ['p 0.43', 'p 0.021', 'p < 0.001', 'p < 0.001', 'p < 0.001']

@@ -7,11 +7,11 @@ from typing import Any
 
 from px4fuse.core.record import read_toml
 
-_UNITS = read_toml(__file__, dict[str, dict[str, Any]])
+_UNIT_TABLES = read_toml(__file__, dict[str, dict[str, Any]])
 # Full name of each unit, by its symbol
-UNIT_NAMES: Mapping[str, str] = _UNITS["names"]
-# Ratio of each unit (lower case) to one unit of the same quantity, by quantity
-_RATIOS: Mapping[str, Mapping[str, float]] = _UNITS["typed"]
+UNIT_NAMES: Mapping[str, str] = _UNIT_TABLES["names"]
+# Conversion factors to one unit of each quantity, by quantity and unit (lower case)
+_RATIOS: Mapping[str, Mapping[str, float]] = _UNIT_TABLES["typed"]
 _NUMBER_WITH_UNIT = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)
 
 
@@ -28,6 +28,6 @@ def convert_to_unit(text: str, unit: str) -> float | None:
     typed_unit = match[2].lower() or unit if match else ""
     for ratios in ({unit: 1.0}, *_RATIOS.values()):
         if match and {typed_unit, unit} <= ratios.keys():
-            with suppress(ValueError):  # the text contains several decimal points
+            with suppress(ValueError):  # float() rejects several decimal points
                 return float(match[1].replace(",", ".")) * (ratios[typed_unit] / ratios[unit])
     return None

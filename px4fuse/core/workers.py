@@ -34,8 +34,8 @@ MAX_JOBS_PER_WORKER = 80
 TIMEOUT_S, MAX_MEMORY_BYTES = 120.0, 4_000_000_000
 # Maximum time (s) for the imports of a new process on a slow and busy computer
 START_TIMEOUT_S = 180.0
-# Environment variables of worker processes. PYTHONSAFEPATH prevents imports from the current
-# folder, by which a submitted functools.py would be executed
+# Environment variables of worker processes. PYTHONSAFEPATH prevents that Python imports a file of a
+# student, such as functools.py, from the current folder
 _WORKER_ENVIRONMENT = {"PYTHONSAFEPATH": "1", **ONE_THREAD}
 
 
@@ -66,7 +66,7 @@ class _Worker:
         finally:
             os.environ.clear()
             os.environ.update(environment)
-        child_pipe.close()  # only the worker process may keep this end of the pipe open
+        child_pipe.close()  # else the pipe would stay open after the worker process has died
         self.is_ready = False
         self.job_index = job_index
         self.finished_count = 0
@@ -81,7 +81,7 @@ class _Worker:
 
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Block Ctrl-C; a process that starts meanwhile inherits this, and prints no traceback."""
+    """Block Ctrl-C; processes that start meanwhile ignore Ctrl-C, too, and print no traceback."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
@@ -141,7 +141,7 @@ def poll_with_limits(
     try:
         while waiting_indices or workers:
             while waiting_indices and len(workers) < (processes or os.cpu_count() or 1):
-                # the job is assigned before the process starts, so that a failed start ends one job
+                # assigned before the process starts, so that a failed start fails only this job
                 new_worker = _Worker(function, memory_bytes, waiting_indices.pop())
                 workers[new_worker.pipe] = new_worker
             # the wait ends at the first deadline or if a pipe has data
@@ -202,11 +202,11 @@ def _receive_result(worker: _Worker) -> tuple[bool, Any]:
         phase = "a job" if worker.is_ready else "its start"
         exit_code = worker.process.exitcode
         return False, JobFailure(
-            f"the worker process ended during {phase} (exit code {exit_code})."
+            f"the worker process ended during {phase} (exit code {exit_code}). Repeat the command."
         )
     # unpickling runs code of the classes of the result, which may raise any exception
     except Exception as error:  # noqa: BLE001
-        return False, JobFailure(f"the result could not be unpickled ({type(error).__name__}).")
+        return False, JobFailure(f"the result of the job cannot be read ({type(error).__name__}).")
     return message
 
 

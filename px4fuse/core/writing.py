@@ -18,7 +18,7 @@ STANDARD_OUTPUT = Path("-")
 PIPE_READER_TIMEOUT_S = 5.0
 # True on Windows, on which a file cannot be replaced while another program has it open
 LOCKS_OPEN_FILES = sys.platform == "win32"
-# Action if an output cannot be written, by error number
+# Advice to the user if an output cannot be written, by error number
 REMEDY_BY_ERRNO = {
     errno.ENOSPC: "Free disk space, or choose another disk.",
     errno.EROFS: "Choose a folder that can be written.",

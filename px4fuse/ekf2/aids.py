@@ -108,7 +108,7 @@ class AidResult(Record, kw_only=True):
     noise : float or None
         Median √R.
     noise_from : str
-        Parameter from which R is, or the reported accuracy.
+        Parameter that sets R, or the reported accuracy.
     """
 
     label: str
@@ -262,31 +262,31 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
 def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
     """Return time (s) and size (√S) of the largest change of the mean; None if not significant.
 
-    For each window, the mean of the two windows after it is compared with the mean before it. The
-    change begins in the window itself if its own mean has changed by a third of that.
+    The mean before each window is compared with the mean of the two windows after it. The change
+    starts in the window if the mean of the window already contains a third of the change.
     """
     window_index = np.floor((time_s - time_s[0]) / CHANGE_WINDOW_S)
     windows = pd.Series(normalised).groupby(window_index).agg(["mean", "size"])
     windows = windows[windows["size"] >= MIN_WINDOW_SAMPLES]
     window_means = windows["mean"].to_numpy()
     largest_change = None
-    min_change = MIN_CHANGE_IN_SIGMA
+    min_size = MIN_CHANGE_IN_SIGMA
     for index in range(MIN_WINDOWS_BEFORE, len(window_means) - 2):
         mean_before = np.mean(window_means[:index])
         mean_change = float(np.mean(window_means[index + 1 : index + 3]) - mean_before)
         innovation_std = np.std(normalised[window_index < windows.index[index]])
         standard_error = innovation_std / math.sqrt(2.0 * windows["size"].iloc[:index].median())
         mean_scatter = max(np.std(window_means[:index], ddof=1), standard_error)
-        if abs(mean_change) > max(min_change, MIN_CHANGE_SCATTER_RATIO * mean_scatter):
-            has_begun = abs(window_means[index] - mean_before) > abs(mean_change) / 3.0
-            first_window = windows.index[index if has_begun else index + 1]
-            largest_change = float(time_s[0] + CHANGE_WINDOW_S * first_window), mean_change
-            min_change = abs(mean_change)
+        if abs(mean_change) > max(min_size, MIN_CHANGE_SCATTER_RATIO * mean_scatter):
+            starts_in_window = abs(window_means[index] - mean_before) > abs(mean_change) / 3.0
+            first_changed_window = windows.index[index if starts_in_window else index + 1]
+            largest_change = float(time_s[0] + CHANGE_WINDOW_S * first_changed_window), mean_change
+            min_size = abs(mean_change)
     return largest_change
 
 
-def _fraction_within(is_selected: BoolArray, is_in_set: BoolArray) -> float:
-    return float((is_selected & is_in_set).sum() / max(is_in_set.sum(), 1))
+def _fraction_within(is_selected: BoolArray, is_counted: BoolArray) -> float:
+    return float((is_selected & is_counted).sum() / max(is_counted.sum(), 1))
 
 
 def _effective_gate(aid: Aid, aid_log: AidLog) -> float:
@@ -301,7 +301,7 @@ def _effective_gate(aid: Aid, aid_log: AidLog) -> float:
 
 
 def _noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
-    """Return the parameter whose value is √R, else the origin stated for the source."""
+    """Return the parameter that √R equals, or another origin of R (the reported accuracy)."""
     parameter_value = aid_log.parameters.get(aid.noise)
     if noise_sigma is None or parameter_value is None:
         return "" if noise_sigma is None else aid.noise_origin

@@ -14,12 +14,12 @@ import numpy as np
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.ekf2.replay_segments import ReplaySegment
 
-# Minimum larger innovation (√S) of barometer and GNSS height for a bad acceleration
+# Minimum of the larger one of the height innovations (√S) of barometer and GNSS that sets the flag
 # (vert_innov_test_lim, common.h)
-MIN_LARGER_RATIO = 3.0
-# Minimum smaller innovation (√S) of barometer and GNSS height for a bad acceleration
+MIN_LARGER_INNOVATION = 3.0
+# Minimum of the smaller one of the height innovations (√S) of barometer and GNSS that sets the flag
 # (vert_innov_test_min, common.h)
-MIN_SMALLER_RATIO = 1.0
+MIN_SMALLER_INNOVATION = 1.0
 
 
 class BadAcceleration:
@@ -29,7 +29,7 @@ class BadAcceleration:
     ----------
     follows_log : ndarray of bool, shape (S,)
         True for configurations that use the logged flag.
-    duration_s : float
+    flag_duration_s : float
         Time for which the flag remains set after the last innovation that sets it.
     segment : ReplaySegment
         Segment with the logged flag.
@@ -42,24 +42,28 @@ class BadAcceleration:
         True if any configuration does not use the logged flag.
     """
 
-    def __init__(self, follows_log: BoolArray, duration_s: float, segment: ReplaySegment) -> None:
+    def __init__(
+        self, follows_log: BoolArray, flag_duration_s: float, segment: ReplaySegment
+    ) -> None:
         time_s = segment.time_s
-        is_logged = segment.is_acceleration_bad
-        if is_logged is None:
-            is_logged = np.zeros(len(time_s), bool)
+        logged_flag = segment.is_acceleration_bad
+        if logged_flag is None:
+            logged_flag = np.zeros(len(time_s), bool)
         self.models_flag = not follows_log.all()
         self.follows_log = follows_log
-        self.duration_s = duration_s
-        edges = np.flatnonzero(np.diff(is_logged, prepend=False, append=False))
+        self.flag_duration_s = flag_duration_s
+        edges = np.flatnonzero(np.diff(logged_flag, prepend=False, append=False))
         self.logged_since_s, self.logged_until_s = np.append(time_s, np.inf)[edges].reshape(-1, 2).T
         self.since_s = np.full(len(follows_log), time_s[0])
-        self.until_s = np.full(len(follows_log), time_s[0] + duration_s * float(is_logged[0]))
+        self.until_s = np.full(
+            len(follows_log), time_s[0] + flag_duration_s * float(logged_flag[0])
+        )
 
     def flagged_fraction(self, begin_s: Array, end_s: Array) -> Array | None:
         """Return the fraction of an interval with the flag, per configuration; None without a flag.
 
-        Each call continues the logged flag, so call it for successive intervals. If the flag is
-        set several times in an interval, only the last time counts.
+        Call for successive intervals: the flag is kept from call to call. If it is set several
+        times in an interval, only the last time counts.
         """
         if len(self.logged_since_s):
             last_row = np.searchsorted(self.logged_since_s, end_s) - 1
@@ -71,33 +75,39 @@ class BadAcceleration:
         overlap_s = np.minimum(self.until_s, end_s) - np.maximum(self.since_s, begin_s)
         return np.asarray(np.maximum(overlap_s, 0.0) / np.maximum(end_s - begin_s, 1e-9))
 
-    def update(self, time_s: Array, previous_ratios: Array, ratios: Array) -> None:
+    def update(self, time_s: Array, previous_innovations: Array, innovations: Array) -> None:
         """Update the modelled flag after all fusions of one event.
 
         Parameters
         ----------
         time_s : ndarray, shape (S,) or (1,)
             Time of the event.
-        previous_ratios, ratios : ndarray, shape (k + 1, S)
-            Measured height above the state, in √S, at the previous and at this event: of k
-            barometer samples, then of GNSS. NaN without a sample.
+        previous_innovations, innovations : ndarray, shape (k + 1, S)
+            Normalised height innovations (√S, positive upwards) of the previous and of the current
+            event: k rows for barometer samples, one row for GNSS. NaN without a sample.
         """
         # an innovation is valid until the next innovation of the same sensor
-        gnss_ratio = previous_ratios[-1]
-        barometer_ratio = np.full(len(gnss_ratio), np.nan)
-        for sample_ratio in previous_ratios[:-1]:
-            barometer_ratio = np.where(np.isnan(sample_ratio), barometer_ratio, sample_ratio)
-        is_bad = _is_falling(barometer_ratio, gnss_ratio)
-        for sample_ratio in ratios[:-1]:
-            barometer_ratio = np.where(np.isnan(sample_ratio), barometer_ratio, sample_ratio)
-            is_bad |= _is_falling(barometer_ratio, gnss_ratio)
-        is_bad |= _is_falling(barometer_ratio, ratios[-1])
+        gnss_innovation = previous_innovations[-1]
+        barometer_innovation = np.full(len(gnss_innovation), np.nan)
+        for sample_innovation in previous_innovations[:-1]:
+            barometer_innovation = np.where(
+                np.isnan(sample_innovation), barometer_innovation, sample_innovation
+            )
+        is_bad = _is_falling(barometer_innovation, gnss_innovation)
+        for sample_innovation in innovations[:-1]:
+            barometer_innovation = np.where(
+                np.isnan(sample_innovation), barometer_innovation, sample_innovation
+            )
+            is_bad |= _is_falling(barometer_innovation, gnss_innovation)
+        is_bad |= _is_falling(barometer_innovation, innovations[-1])
         is_bad &= ~self.follows_log
         self.since_s = np.where(is_bad & (self.until_s < time_s), time_s, self.since_s)
-        self.until_s = np.where(is_bad, time_s + self.duration_s, self.until_s)
+        self.until_s = np.where(is_bad, time_s + self.flag_duration_s, self.until_s)
 
 
-def _is_falling(barometer_ratio: Array, gnss_ratio: Array) -> BoolArray:
-    larger_ratio = np.maximum(barometer_ratio, gnss_ratio)
-    smaller_ratio = np.minimum(barometer_ratio, gnss_ratio)
-    return np.asarray((larger_ratio > MIN_LARGER_RATIO) & (smaller_ratio > MIN_SMALLER_RATIO))
+def _is_falling(barometer_innovation: Array, gnss_innovation: Array) -> BoolArray:
+    larger_innovation = np.maximum(barometer_innovation, gnss_innovation)
+    smaller_innovation = np.minimum(barometer_innovation, gnss_innovation)
+    return np.asarray(
+        (larger_innovation > MIN_LARGER_INNOVATION) & (smaller_innovation > MIN_SMALLER_INNOVATION)
+    )

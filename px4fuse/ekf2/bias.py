@@ -71,8 +71,8 @@ class BiasEstimator:
         K = bias_variance / S * (updates_bias & (test_ratio < 1.0))
         self.value_m = self.value_m - K * nu
         self.variance_m2 = np.maximum(bias_variance - K * bias_variance, MIN_BIAS_VARIANCE_M2)
-        ratio_change = np.copysign(np.minimum(test_ratio, 1.0), nu) + self.mean_signed_ratio
+        signed_ratio_sum = np.copysign(np.minimum(test_ratio, 1.0), nu) + self.mean_signed_ratio
         self.mean_signed_ratio = self.mean_signed_ratio - (
-            self.filter_weight * weight * updates_bias * ratio_change
+            self.filter_weight * weight * updates_bias * signed_ratio_sum
         )
         return nu, R

@@ -128,28 +128,28 @@ class FilterConfiguration:
 
     def keeps_logged_bad_acceleration(self, inputs: Inputs) -> bool:
         """Return True if the logged flag for a bad acceleration is valid with these parameters."""
-        has_same_heights = not self.without and all(
+        has_same_height_parameters = not self.without and all(
             value == inputs.settings[name] or name.startswith(HEIGHT_NEUTRAL_PREFIXES)
             for name, value in self.settings.items()
         )
-        return self.uses_logged_decisions or has_same_heights
+        return self.uses_logged_decisions or has_same_height_parameters
 
     def timing(self, inputs: Inputs) -> Timing:
         """Return the delay of a position, and the delay of the fusion horizon."""
         if self.timestamp_offset_s is not None:
-            return Timing(-self.timestamp_offset_s - 0.5 * inputs.step_s, np.inf)
+            return Timing(-self.timestamp_offset_s - 0.5 * inputs.mean_step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         max_delay_ms = max(self.settings.get(aid.delay, 0.0) for aid in (GNSS_POS, EV_POS))
         if inputs.rules.uses_delay_as_horizon:  # the length of the IMU buffer is the largest delay
-            buffer_length = math.ceil(max_delay_ms * 1e-3 / inputs.predict_s)
-            return Timing(delay_s, max(inputs.horizon_s, (buffer_length - 1) * inputs.step_s))
+            buffer_length = math.ceil(max_delay_ms * 1e-3 / inputs.configured_step_s)
+            return Timing(delay_s, max(inputs.horizon_s, (buffer_length - 1) * inputs.mean_step_s))
         # at its start EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
         longest_ms = max(self.settings["EKF2_DELAY_MAX"], max_delay_ms)
         if longest_ms == inputs.settings["EKF2_DELAY_MAX"]:
             return Timing(delay_s, inputs.horizon_s)
         # number of samples in the IMU buffer (initialise_interface, estimator_interface.cpp)
-        buffer_length = max(math.ceil(longest_ms * 1e-3 / inputs.predict_s), 2)
-        return Timing(delay_s, (buffer_length - 1) * inputs.step_s)
+        buffer_length = max(math.ceil(longest_ms * 1e-3 / inputs.configured_step_s), 2)
+        return Timing(delay_s, (buffer_length - 1) * inputs.mean_step_s)
 
 
 @dataclass(frozen=True)
@@ -163,15 +163,15 @@ class SegmentRun:
     innovation, innovation_variance, noise : ndarray, shape (E, S, 6)
         ν (measurement minus state), S and R of velocity (m/s) and position (m), NED.
     rejected, fused, reset : ndarray of bool, shape (E, S)
-        Decisions on the position sample of each event.
+        True if the position sample of each event was rejected, fused, or used for a reset.
     position_reset_m : ndarray, shape (E, S, 2)
         Change of the position by resets, north and east.
     state, variance : ndarray, shape (E + 1, S, n)
         State and its variance at the start and after each event.
     covariance : ndarray, shape (S, n, n)
         Covariance at the end.
-    field : ndarray, shape (E, 3, S, 3)
-        Magnetometer (body FRD): innovation (gauss), its variance, and 1 if fused.
+    magnetometer_updates : ndarray, shape (E, 3, S, 3)
+        Innovation (gauss, body FRD), its variance, and 1 if fused.
     heights : HeightFilter or None
         None if the logged EKF2 height is used.
     vision : VisionFilter or None
@@ -191,7 +191,7 @@ class SegmentRun:
     state: Array
     variance: Array
     covariance: Array
-    field: Array
+    magnetometer_updates: Array
     heights: HeightFilter | None = None
     vision: VisionFilter | None = None
 
@@ -243,8 +243,10 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     )
 
     def stack_configurations(name: str, rows: slice = slice(None)) -> Any:
-        arrays = [getattr(interval_arrays, name)[rows] for interval_arrays in distinct_intervals]
-        return np.stack(arrays, axis=1)[:, configuration_intervals]
+        interval_quantities = [
+            getattr(interval_arrays, name)[rows] for interval_arrays in distinct_intervals
+        ]
+        return np.stack(interval_quantities, axis=1)[:, configuration_intervals]
 
     event_table = stack_configurations("events")
     action = np.where(has_gate, event_table["action"], FUSE * event_table["usable"])
@@ -279,12 +281,12 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         [attitude_variance[:, :, HEADING], segment.down_variance_m2[event_steps]], axis=-1
     )
     heights = vision = None
-    has_field = segment.field is not None
-    ends = [interval_arrays.events.end_step for interval_arrays in distinct_intervals]
+    has_magnetometer = segment.field is not None
+    event_step_arrays = [interval_arrays.events.end_step for interval_arrays in distinct_intervals]
     vector_means = []
     for aid, samples in ((MAG, segment.field), (FLOW, segment.flow)):
         if samples is not None:
-            means = [mean_by_event(segment, samples, end_steps) for end_steps in ends]
+            means = [mean_by_event(segment, samples, end_steps) for end_steps in event_step_arrays]
             stacked_means = (
                 np.stack(quantities, axis=1)[:, configuration_intervals]
                 for quantities in zip(*means, strict=True)
@@ -307,7 +309,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         np.array(follows_log), inputs.rules.bad_acceleration_s, segment
     )
     if segment.heights is not None:
-        barometer = np.stack(barometer_samples(segment, ends), axis=-1)
+        barometer = np.stack(barometer_samples(segment, event_step_arrays), axis=-1)
         heights = HeightFilter(
             segment,
             barometer[..., configuration_intervals],
@@ -357,8 +359,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         )
     x, P = _start_state(segment, has_biases, has_attitude)
     if bad_acceleration.until_s[0] > segment.time_s[0]:
-        # the log contains no bias estimate while EKF2 declared its acceleration bad: start with the
-        # bias from the published velocity
+        # while EKF2 reports a bad acceleration, its bias is not logged: start with the mean bias,
+        # computed from the published velocity
         set_states(
             x,
             P,
@@ -381,7 +383,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         inputs.received.has_all_resets,
     )
     innovations, variances = np.full((2, event_count, configuration_count, 6), np.nan)
-    field_results = np.full((event_count * has_field, 3, configuration_count, 3), np.nan)
+    magnetometer_updates = np.full(
+        (event_count * has_magnetometer, 3, configuration_count, 3), np.nan
+    )
     is_rejected, is_fused, is_reset = np.zeros((3, event_count, configuration_count), bool)
     position_reset_m = np.zeros((event_count, configuration_count, 2))
     states, state_variances = np.empty((2, event_count + 1, configuration_count, x.shape[1]))
@@ -417,11 +421,11 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             event_time_s[e - 1] if e else start_s, event_time_s[e]
         )
         if flagged_fraction is not None:
-            increase = flagged_fraction * (
+            variance_increase = flagged_fraction * (
                 BAD_ACCELERATION_NOISE**2 - acceleration_variance[e, :, 0, 0]
             )
             P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += (
-                increase[:, None, None] * accelerometer_noise[batch_index]
+                variance_increase[:, None, None] * accelerometer_noise[batch_index]
             )
             is_bias_constant = bad_acceleration.until_s > event_time_s[e]
             bias_before = x[:, ACCELEROMETER_BIAS].copy()
@@ -434,10 +438,10 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         R[:, 2:] = IGNORED_VARIANCE
         for mean, gate, state_rows in vector_means:
             if mean.sample_count[e].any():
-                mean_now = EventSamples(*(quantity[e] for quantity in mean))
-                x, P, vector_results = fuse_mean(x, P, mean_now, gate, *state_rows)
+                event_mean = EventSamples(*(quantity[e] for quantity in mean))
+                x, P, vector_updates = fuse_mean(x, P, event_mean, gate, *state_rows)
                 if EARTH_FIELD in state_rows:
-                    field_results[e] = vector_results
+                    magnetometer_updates[e] = vector_updates
         if vision is not None:
             x, P = vision.fuse(e, x, P, False, fusion.last_position_s)
         if heights is not None:
@@ -463,7 +467,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 e, is_outside_gate, is_velocity_fused
             )
             if inputs.aid == GNSS_POS:
-                if not has_field:
+                if not has_magnetometer:
                     # without logged magnetometer samples the correction of the tilt is unknown, so
                     # only the tilt variance is set to the logged value
                     for row in range(HEADING):
@@ -487,11 +491,11 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 e, x, P, measured_values[e, :, 5], measurement_variance[e, :, 5]
             )
         # the magnetometer corrects the heading, so only the height is set to EKF2's logged value
-        elif has_field:
+        elif has_magnetometer:
             K, P = _reduce_variance_to(P, DOWN, logged_variance[e, :, 1])
             x = x + K * (logged_values[e, :, 1] - x[:, DOWN])[:, None]
             x[:, DOWN] = logged_values[e, :, 1]
-        if not has_field:
+        if not has_magnetometer:
             np.subtract(logged_values[e], x[:, LOGGED_STATES], out=innovation[:, :2])
             R[:, :2] = _noise_for_variance(_diagonal(P)[:, LOGGED_STATES], logged_variance[e])
             heading = np.where(has_attitude, x[:, HEADING] + innovation[:, 0], 0.0)
@@ -545,7 +549,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         states,
         state_variances,
         P,
-        field_results,
+        magnetometer_updates,
         heights,
         vision,
     )
@@ -593,8 +597,8 @@ def _sequential_update(
             factor = b[:, j, None] * cross_covariance[:, j + 1 :]
             columns[:, j + 1 :] -= factor[:, :, None] * column
     x = x + ((fused_weight * nu)[:, None] @ columns)[:, 0]
-    root = np.sqrt(b)[:, :, None] * columns
-    return x, P - np.swapaxes(root, 1, 2) @ root
+    reduction_root = np.sqrt(b)[:, :, None] * columns
+    return x, P - np.swapaxes(reduction_root, 1, 2) @ reduction_root
 
 
 @dataclass
@@ -602,8 +606,9 @@ class _Fusion:
     """Rejection, fusion and reset of the position, for S configurations and E events.
 
     After a time without fusion the position is reset; after several resets in a row fusion stops
-    until a sample with ``can_start``. Source: updateEvPosFusion and startEvPosFusion
-    (``ev_pos_control.cpp``). ``logged_rejected`` and ``logged_reset`` are EKF2's logged decisions.
+    until a sample with which EKF2 may start (``can_start``). ``logged_rejected`` and
+    ``logged_reset`` are EKF2's logged decisions. Source: updateEvPosFusion, startEvPosFusion
+    (``ev_pos_control.cpp``).
     """
 
     rules: FusionRules
@@ -656,10 +661,10 @@ class _Fusion:
         )
         gap_s = now_s - self.last_position_s
         if self.has_all_resets and not is_decision_logged:
-            # without a reset in the log EKF2 fused the last sample before the time limit
-            following = min(e + 1, len(self.time_s) - 1)
-            is_last = self.time_s[following] - self.last_position_s > rules.reset_s
-            is_rejected &= ~(follows_log & is_last & ~self.logged_reset[following])
+            # if the log has no reset at the next event, EKF2 fused the last sample before the limit
+            next_event = min(e + 1, len(self.time_s) - 1)
+            is_last_before_limit = self.time_s[next_event] - self.last_position_s > rules.reset_s
+            is_rejected &= ~(follows_log & is_last_before_limit & ~self.logged_reset[next_event])
         is_fused = may_fuse & ~is_rejected & ~self.is_stopped
         is_starting = has_gate & ((action == START) | (self.is_stopped & self.can_start[e]))
         is_failing = is_rejected & ~self.is_stopped & (gap_s > rules.reset_s)
@@ -701,7 +706,7 @@ def _variance_growth(
         for noises in (initial_and_process_names, initial_and_process_names.values())
     )
     noise_density[:, :2] *= np.stack([has_attitude, has_biases], axis=-1)
-    return np.repeat((noise_density * inputs.step_s) ** 2, 3, axis=-1), np.repeat(
+    return np.repeat((noise_density * inputs.mean_step_s) ** 2, 3, axis=-1), np.repeat(
         variance_limit**2, 3, axis=-1
     )
 
@@ -775,7 +780,7 @@ def _start_state(
 
 
 def _noise_for_variance(variance: Array, target_variance: Array) -> Array:
-    """Return the R with which an update reduces a state variance to a target.
+    """Return the R of an update that reduces a state variance to a target.
 
     1/R = 1/target - 1/variance. EKF2's published height and heading are fused with this R to
     reproduce their logged variances.

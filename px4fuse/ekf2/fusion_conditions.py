@@ -32,7 +32,7 @@ BUFFER_COUNT = 20
 INTERVAL_TOLERANCE_S = 5e-7
 # Time (s) with all samples rejected after which EKF2 stops fusion: no_aid_timeout_max
 MAX_REJECTED_S = 1.0
-# Maximum range (m) of constant positions, which are no measurement
+# Maximum variation (m) of x and y that are placeholders instead of measurements
 MAX_CONSTANT_RANGE_M = 1e-3
 # Minimum fraction of the time with a failed GNSS check that explains missing GNSS fusion
 MIN_FAILED_FRACTION = 0.1
@@ -43,16 +43,17 @@ SYNCHRONISE_ACTION = (
     "Synchronise the clocks: UXRCE_DDS_SYNCT 1 with the uXRCE-DDS agent, or answer TIMESYNC of "
     "MAVLink. Send microseconds."
 )
-# Age that EKF2 computes for positions whose timestamps are from a wrong clock or in a wrong unit
-WRONG_CLOCKS = {
+# Age that EKF2 computes for positions, by the wrong clock of their timestamps
+AGE_BY_WRONG_CLOCK = {
     **dict.fromkeys(
         ("another clock", "an unknown clock", "UNIX time in seconds"), "too old or in the future"
     ),
     **{f"UNIX time in {unit}seconds": "in the future" for unit in ("nano", "micro", "milli")},
 }
-STAMP_FAULTS = {
+# Age that EKF2 computes for positions, by the wrong clock or unit of their timestamps
+AGE_BY_WRONG_TIMESTAMP = {
     **dict.fromkeys(("0", "milliseconds", "seconds"), "too old"),
-    **WRONG_CLOCKS,
+    **AGE_BY_WRONG_CLOCK,
     "nanoseconds": "in the future",
 }
 # GNSS checks (by bit of gps_check_fail_flags) with the parameter and unit of the limit
@@ -125,10 +126,10 @@ class Attempt:
 
     def fraction(self, state: str, bit: int = 0) -> float:
         """Return the fraction of ``span_s`` in which a status bit is set; NaN if not logged."""
-        state_steps = self.ekf2.states.get(state)
-        if state_steps is None:
+        state_changes = self.ekf2.states.get(state)
+        if state_changes is None:
             return float("nan")
-        state_values = step_values_at(state_steps, np.linspace(*self.span_s, 200))
+        state_values = step_values_at(state_changes, np.linspace(*self.span_s, 200))
         return float(np.mean(state_values.astype(np.int64) >> bit & 1))
 
 
@@ -192,13 +193,13 @@ def _check_gap(attempt: Attempt) -> Iterator[UnmetCondition]:
 
 def _check_timestamps(attempt: Attempt) -> Iterator[UnmetCondition]:
     clock_map, status = attempt.source.clock_map, attempt.source.status
-    if clock_map and (clock := clock_map.clock) in STAMP_FAULTS:
+    if clock_map and (clock := clock_map.clock) in AGE_BY_WRONG_TIMESTAMP:
         yield UnmetCondition(
             "clock",
             "the timestamps are " + ("0" if clock == "0" else f"in {clock}"),
             "EKF2 reads timestamp_sample in microseconds since the autopilot's boot. For EKF2 the "
-            f"positions are {STAMP_FAULTS[clock]}.",
-            SYNCHRONISE_ACTION if clock in WRONG_CLOCKS else SET_TIMESTAMP_ACTION,
+            f"positions are {AGE_BY_WRONG_TIMESTAMP[clock]}.",
+            SYNCHRONISE_ACTION if clock in AGE_BY_WRONG_CLOCK else SET_TIMESTAMP_ACTION,
         )
     if "age_s" not in status:
         return
@@ -318,15 +319,16 @@ def _check_gnss(attempt: Attempt) -> Iterator[UnmetCondition]:
     check_texts = []
     for bit in failed_bits[:3]:
         name, parameter, unit = GNSS_CHECKS[bit]
-        text = f"{name} ({100.0 * fractions[bit]:.0f} % of the time"
+        check_details = [f"{100.0 * fractions[bit]:.0f} % of the time"]
         if np.isfinite(limit := parameters.get(parameter, np.nan)):
             median_value = (
                 float(np.sqrt(median_squares[bit].median())) if bit in median_squares else np.nan
             )
             # the samples contain only positions with a fix, so their median may be below the limit
-            text += f", median {median_value:.2f}{unit}" if median_value > limit else ""
-            text += f", limit {parameter} {limit:g}{unit}"
-        check_texts.append(f"{text})")
+            if median_value > limit:
+                check_details.append(f"median {median_value:.2f}{unit}")
+            check_details.append(f"limit {parameter} {limit:g}{unit}")
+        check_texts.append(f"{name} ({', '.join(check_details)})")
     yield UnmetCondition(
         "checks",
         f"GNSS fails EKF2's check of the {GNSS_CHECKS[failed_bits[0]][0]}",
@@ -364,5 +366,6 @@ VISION_CONDITIONS = (
     _check_alignment,
     _check_gate,
 )
-# GNSS checks; those of the receiver precede the gap, because the log has no positions without a fix
+# GNSS checks. _check_gnss precedes _check_gap, because the log contains no positions without a fix:
+# failed receiver checks would look like a gap
 GNSS_CONDITIONS = (_check_switch, _check_gnss, _check_gap, _check_alignment, _check_gate)

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
-from px4fuse.ekf2.bad_acceleration import MIN_LARGER_RATIO, BadAcceleration
+from px4fuse.ekf2.bad_acceleration import MIN_LARGER_INNOVATION, BadAcceleration
 from px4fuse.ekf2.barometer import fused_samples
 from px4fuse.ekf2.bias import BiasEstimator
 from px4fuse.ekf2.replay_segments import (
@@ -119,18 +119,18 @@ def add_heights(
 
 
 def barometer_samples_inside(
-    segment: ReplaySegment, measured_at_s: Array, *more: Array
+    segment: ReplaySegment, measured_at_s: Array, *quantities: Array
 ) -> tuple[Any, ...]:
-    """Return step, time (s) and ``more`` (:class:`HeightSamples`) of the samples in a segment."""
+    """Return prediction step, time (s) and other quantities of the samples inside a segment."""
     step, is_inside = sample_steps(segment, measured_at_s)
-    return step, *(values[is_inside] for values in (measured_at_s, *more))
+    return step, *(values[is_inside] for values in (measured_at_s, *quantities))
 
 
-def barometer_samples(segment: ReplaySegment, ends: Sequence[IntArray]) -> list[Array]:
+def barometer_samples(segment: ReplaySegment, event_step_arrays: Sequence[IntArray]) -> list[Array]:
     """Return the barometer samples that are fused at each event, for each array of event steps.
 
     Rows of each result, shape (6, k, E): height (m, down), age (s), time (s), dead zone (m),
-    weight, and 1 for a sample; see :func:`~px4fuse.ekf2.replay_segments.samples_by_event`.
+    weight, and a mask (0 for an empty slot).
     """
     heights = segment.heights
     assert heights is not None
@@ -146,7 +146,7 @@ def barometer_samples(segment: ReplaySegment, ends: Sequence[IntArray]) -> list[
                 heights.dead_zone_m,
                 heights.weight,
             )
-            for event_steps in ends
+            for event_steps in event_step_arrays
         ]
     )
 
@@ -200,22 +200,22 @@ class HeightFilter:
         gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in SENSORS]
         self.gate_squared = [np.where(has_gate, gate**2, np.inf) for gate in gates]
         self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
-        self.biased = [aid.name != heights.reference for aid in SENSORS]
+        self.has_bias = [aid.name != heights.reference for aid in SENSORS]
         self.weight = [*np.maximum(weight, 1.0), np.ones_like(fix_s)]
         value_m, variance_m2 = np.tile(heights.bias, (configuration_count, 1)).T
         start_s = segment.time_s[0]
         self.bias = BiasEstimator(value_m, variance_m2, segment.step_s)
         self.updates_bias = self.has_sample & enabled[heights.reference]
-        biased_slots = slice(0, -1) if self.biased[0] else slice(-1, None)
+        slots_with_bias = slice(0, -1) if self.has_bias[0] else slice(-1, None)
         self.interval_s = np.zeros(self.has_sample.shape)
         self.time_s = np.stack(np.broadcast_arrays(*measured_at_s, fix_s, self.has_sample[0])[:-1])
         slot_count, event_count, _ = self.time_s.shape
         self.update_log = np.full((event_count, slot_count + 1, 4, configuration_count), np.nan)
         # times of the samples in the order of fusion, event after event
-        sample_s = np.where(self.has_sample, self.time_s, start_s)[biased_slots].swapaxes(0, 1)
+        sample_s = np.where(self.has_sample, self.time_s, start_s)[slots_with_bias].swapaxes(0, 1)
         latest_s = np.maximum.accumulate(sample_s.reshape(-1, configuration_count), axis=0)
         interval_s = np.diff(latest_s, axis=0, prepend=start_s).reshape(sample_s.shape)
-        self.interval_s[biased_slots] = interval_s.swapaxes(0, 1)
+        self.interval_s[slots_with_bias] = interval_s.swapaxes(0, 1)
         self.interval_s *= self.updates_bias
 
     def updates(self, sensor: str, configuration_index: int, end_s: Array) -> pd.DataFrame:
@@ -242,10 +242,10 @@ class HeightFilter:
 
     def update_bad_acceleration(self, e: int, time_s: Array) -> None:
         update_log = self.update_log[max(e - 1, 0) : e + 1]
-        ratios = -update_log[:, :, 0] / np.sqrt(update_log[:, :, 1])
-        if (ratios > MIN_LARGER_RATIO).any():
-            ratios[:, -2] = np.fmax(ratios[:, -2], ratios[:, -1])
-            self.bad_acceleration.update(time_s, ratios[0, :-1], ratios[-1, :-1])
+        innovations = -update_log[:, :, 0] / np.sqrt(update_log[:, :, 1])
+        if (innovations > MIN_LARGER_INNOVATION).any():
+            innovations[:, -2] = np.fmax(innovations[:, -2], innovations[:, -1])
+            self.bad_acceleration.update(time_s, innovations[0, :-1], innovations[-1, :-1])
 
     def _fuse_sample(
         self, e: int, slot: int, x: Array, P: Array, down_m: Array, age_s: Array, R: Array
@@ -259,7 +259,7 @@ class HeightFilter:
         predicted_variance = column[:, DOWN] - age_s * column[:, VELOCITY_DOWN]
         nu = down_m - x[:, DOWN] + age_s * x[:, VELOCITY_DOWN]
         sample_weight = self.weight[slot][e]
-        if self.biased[sensor_index]:
+        if self.has_bias[sensor_index]:
             nu, R = self.bias.remove_bias(
                 nu,
                 predicted_variance,

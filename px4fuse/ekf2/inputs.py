@@ -28,7 +28,7 @@ from px4fuse.flight.ekf2_parameters import (
     BAROMETER,
     EV_POS,
     FLOW,
-    GNSS_MODE,
+    GNSS_MODE_PARAMETER,
     GNSS_POS,
     GNSS_VEL,
     MAG,
@@ -55,7 +55,7 @@ from px4fuse.readers.px4_topics import DEFAULT_PROFILE_REMEDY
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, rotate, to_matrix
 
 ANALYSIS_NAME = "EKF2 replay"
-# Note that px4fuse writes into simulated logs
+# Text that marks simulated logs
 MODEL_NOTE = (
     "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
 )
@@ -73,7 +73,7 @@ SAMPLE_MATCH_TOLERANCE_S = 0.006
 STEP_TOLERANCE_S = 1e-4
 # Time (s) without fusion of horizontal aiding after which EKF2 reports inertial dead reckoning
 # (no_aid_timeout_max, common.h)
-DEAD_RECKONING_S = 1.0
+DEAD_RECKONING_TIMEOUT_S = 1.0
 # Bit of EKF2_GPS_CTRL that enables GNSS velocity; before PX4 v1.14 EKF2 always fuses it
 GNSS_VELOCITY_BIT = 4
 # Maximum time (s) from a reset to its publication: vehicle_local_position is logged every 0.1 s
@@ -190,8 +190,8 @@ class Inputs:
         EKF2 parameters in the model, by PX4 name.
     received : ReceivedPositions
         Samples of the horizontal position source ``aid``.
-    step_s, predict_s : float
-        Mean and configured prediction step.
+    mean_step_s, configured_step_s : float
+        Prediction step: mean of the log, and EKF2_PREDICT_US.
     horizon_s : float
         Delay of the fusion horizon.
     vision_height : bool
@@ -210,9 +210,9 @@ class Inputs:
     segments: tuple[ReplaySegment, ...]
     received: ReceivedPositions
     rules: FusionRules
-    step_s: float
+    mean_step_s: float
     horizon_s: float
-    predict_s: float
+    configured_step_s: float
     vision_height: bool
     imu_offset_m: Array
     aid: Aid = EV_POS
@@ -257,11 +257,11 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if unmodelled_aids := [
         label for label in fusion_record.other_horizontal_aids if label not in modelled_aids
     ]:
-        disable_gnss = "" if is_gnss else f", {GNSS_POS.switch} 0"
+        switches = ["EKF2_OF_CTRL 0", *([] if is_gnss else [f"{GNSS_POS.switch} 0"])]
         return Unavailable(
             ANALYSIS_NAME,
             f"EKF2 also fused {', '.join(unmodelled_aids)}, which the model does not contain",
-            f"Fly with EKF2_OF_CTRL 0{disable_gnss} and without bit 2 of {EV_POS.switch}.",
+            f"Fly with {', '.join(switches)} and without bit 2 of {EV_POS.switch}.",
         )
     if missing_imu := _explain_missing_imu(imu.index.to_numpy()):
         return missing_imu
@@ -332,9 +332,9 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         segments=segments,
         received=position_samples,
         rules=_fusion_rules(fusion_record, ekf2.step_s, is_gnss=is_gnss),
-        step_s=ekf2.step_s,
+        mean_step_s=ekf2.step_s,
         horizon_s=horizon_s,
-        predict_s=predict_s(fusion_record),
+        configured_step_s=predict_s(fusion_record),
         # EKF2 clips vision heights while it reports a bad acceleration; the model does not
         vision_height=not is_gnss
         and isinstance(ekf2.fusion_flags, pd.DataFrame)
@@ -378,9 +378,9 @@ def _fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) 
     rules, parameters = VISION_RULES, fusion_record.parameters
     if is_gnss:
         # in PX4 main since 2026, position and velocity have separate timeouts and separate resets
-        rules = replace(GNSS_RULES, resets_velocity=GNSS_MODE not in parameters)
+        rules = replace(GNSS_RULES, resets_velocity=GNSS_MODE_PARAMETER not in parameters)
         if not fusion_record.stores_latitude:
-            # bad_acceleration_s: BADACC_PROBATION
+            # the flag stays set for 10 s (BADACC_PROBATION, common.h)
             rules = replace(rules, reset_variance_factor=1.0, bad_acceleration_s=10.0)
     elif uses_aid_mask(parameters):
         rules = FusionRules(np.inf, 7.0, 7.0, UNLIMITED_RESETS)
@@ -563,32 +563,35 @@ def _logged_decisions(
     # EKF2 fuses a sample at the first step after its measurement time, or after a late arrival
     due_s = np.maximum.accumulate(np.maximum(measured_s, arrival_s - horizon_s))
     aid_rows = ekf2.aids[aid.name].samples
-    # EKF2 rejected all samples from the last fusion or reset to each row, and in dead reckoning
+    # EKF2 rejected all samples between the last fusion or reset and each logged row, and all in
+    # dead reckoning
     fusions = aid_rows.reindex(columns=["last_fused_s"]).dropna()
-    to_rows = np.column_stack([fusions, fusions.index])
-    dead_reckoning_s = _dead_reckoning_spans(ekf2, fusion_record) if aid == EV_POS else to_rows[:0]
-    span_rows = np.searchsorted(
-        due_s, np.concatenate([to_rows, dead_reckoning_s]) + STEP_TOLERANCE_S
+    fusion_to_row_s = np.column_stack([fusions, fusions.index])
+    dead_reckoning_s = (
+        _dead_reckoning_spans(ekf2, fusion_record) if aid == EV_POS else fusion_to_row_s[:0]
     )
-    for begin, end in span_rows.tolist():
+    rejection_rows = np.searchsorted(
+        due_s, np.concatenate([fusion_to_row_s, dead_reckoning_s]) + STEP_TOLERANCE_S
+    )
+    for begin, end in rejection_rows.tolist():
         rejected_flags[begin : max(end - 1, 0)] = 1.0
-    may_reset = np.isnan(rejected_flags)
+    is_reset_possible = np.isnan(rejected_flags)
     sample_row = matching_sample_rows(innovations.index.to_numpy(), measured_s)
     sample_innovations = innovations.iloc[sample_row[sample_row >= 0]]
     rejected_flags[sample_row >= 0] = sample_innovations["rejected"]
     # a sample to which EKF2 resets its position is logged with innovation 0, and not as rejected
-    may_reset[sample_row >= 0] &= (sample_innovations["rejected"] > 0.0) | (
+    is_reset_possible[sample_row >= 0] &= (sample_innovations["rejected"] > 0.0) | (
         sample_innovations["innovation_m"] == 0.0
     )
     last_fused_rows, dead_reckoning_ends = (
-        span_rows[: len(to_rows), 0] - 1,
-        span_rows[len(to_rows) :, 1] - 1,
+        rejection_rows[: len(fusion_to_row_s), 0] - 1,
+        rejection_rows[len(fusion_to_row_s) :, 1] - 1,
     )
     # a reset is visible in the next published state, one fusion horizon later than the measurement
     published_s = due_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):
         is_recent = (published_s <= reset_s) & (published_s > reset_s - MAX_RESET_PUBLICATION_S)
-        reset_rows = np.flatnonzero(is_recent & may_reset)
+        reset_rows = np.flatnonzero(is_recent & is_reset_possible)
         ends_here = np.intersect1d(reset_rows, dead_reckoning_ends)
         is_reset[ends_here[:1] if len(ends_here) else reset_rows[-1:]] = True
     is_fused = np.zeros(len(is_reset), bool)
@@ -600,15 +603,17 @@ def _logged_decisions(
 def _dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array:
     """Return the times (s) without fusion of vision; each ends with a fusion or a reset.
 
-    EKF2 reports inertial dead reckoning after DEAD_RECKONING_S without fusion, and immediately if
-    vision is disabled.
+    EKF2 reports inertial dead reckoning after DEAD_RECKONING_TIMEOUT_S without fusion, and
+    immediately if vision is disabled.
     """
-    dead_reckoning_steps = fusion_record.states.get(DEAD_RECKONING)
-    vision_enabled_steps = ekf2.states.get(EV_POS.name)
-    if dead_reckoning_steps is None or vision_enabled_steps is None:
+    dead_reckoning_changes = fusion_record.states.get(DEAD_RECKONING)
+    vision_enabled_changes = ekf2.states.get(EV_POS.name)
+    if dead_reckoning_changes is None or vision_enabled_changes is None:
         return np.zeros((0, 2))
-    spans_s = np.array(flight_spans(dead_reckoning_steps == 0.0, np.inf)).reshape(-1, 2)
-    spans_s[:, 0] -= DEAD_RECKONING_S * (step_values_at(vision_enabled_steps, spans_s[:, 0]) > 0.0)
+    spans_s = np.array(flight_spans(dead_reckoning_changes == 0.0, np.inf)).reshape(-1, 2)
+    spans_s[:, 0] -= DEAD_RECKONING_TIMEOUT_S * (
+        step_values_at(vision_enabled_changes, spans_s[:, 0]) > 0.0
+    )
     return spans_s
 
 

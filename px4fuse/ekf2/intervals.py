@@ -41,9 +41,9 @@ MAX_LATENESS_S = 0.1
 MIN_LATENESS_S = 0.03
 # Actions on a position sample: none, update of the state, start of fusion with a reset
 IDLE, FUSE, START = 0, 1, 2
-# Causes of a change of the state in an interval, as columns: initial attitude error, gyro bias,
-# accelerometer bias (3 each), correction of the nominal attitude, acceleration
-EFFECT_COLUMN_COUNT = 11
+# Columns of the state sensitivities: to the initial attitude error, gyro bias and accelerometer
+# bias (3 each), to the correction of the nominal attitude, and to the acceleration
+SENSITIVITY_COLUMN_COUNT = 11
 CORRECTION_COLUMN, INPUT_COLUMN = 9, 10
 
 # One row per event (end of an interval), in time order
@@ -102,11 +102,11 @@ def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> In
     duration_s = segment.time_s[end_steps] - segment.time_s[start_steps]
     transition = np.tile(np.eye(STATE_COUNT), (event_count, 1, 1))
     correction_input, acceleration_input = np.zeros((2, event_count, STATE_COUNT))
-    effects = _interval_effects(segment, start_steps, end_steps)
-    transition[:, :IMU_STATE_COUNT, THETA] = effects[..., :3]
-    transition[:, :IMU_STATE_COUNT, BIASES] = effects[..., 3:9]
-    correction_input[:, :IMU_STATE_COUNT] = effects[..., CORRECTION_COLUMN]
-    acceleration_input[:, :IMU_STATE_COUNT] = effects[..., INPUT_COLUMN]
+    sensitivities = _state_sensitivities(segment, start_steps, end_steps)
+    transition[:, :IMU_STATE_COUNT, THETA] = sensitivities[..., :3]
+    transition[:, :IMU_STATE_COUNT, BIASES] = sensitivities[..., 3:9]
+    correction_input[:, :IMU_STATE_COUNT] = sensitivities[..., CORRECTION_COLUMN]
+    acceleration_input[:, :IMU_STATE_COUNT] = sensitivities[..., INPUT_COLUMN]
     transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
     noise_by_interval = _imu_noise_by_interval(
         (end_steps - start_steps).astype(float), duration_s, transition[:, VELOCITY, THETA]
@@ -120,7 +120,7 @@ def _make_events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Even
     first_row, last_row = np.searchsorted(received.stamp_s, time_s[[0, -1]])
     stamp_s = received.stamp_s[first_row:last_row]
     last_step = len(time_s) - 1
-    measured_s = stamp_s - timing.delay_s - 0.5 * inputs.step_s
+    measured_s = stamp_s - timing.delay_s - 0.5 * inputs.mean_step_s
     # a sample that arrives after the fusion horizon has passed its measurement time is fused late
     # or never
     due_s = np.maximum(measured_s, received.arrival_s[first_row:last_row] - timing.horizon_s)
@@ -192,17 +192,19 @@ def _sample_actions(
     return action, can_start
 
 
-def _interval_effects(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
-    """Return the effect of each cause on attitude, velocity and position at the end of an interval.
+def _state_sensitivities(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
+    """Return the sensitivity of attitude, velocity and position at the end of each interval.
 
-    Shape (E, 9, EFFECT_COLUMN_COUNT), with one column per cause.
+    Shape (E, 9, SENSITIVITY_COLUMN_COUNT).
     """
     step_counts = end - start
     # integrate the first prediction step of all intervals, then the second step, and so on. Longer
     # intervals are sorted first, so the intervals with a next step are the first rows
     longest_first = np.argsort(-step_counts, kind="stable")
     first_start = start[longest_first]
-    attitude, velocity, position = effects = np.zeros((3, len(end), 3, EFFECT_COLUMN_COUNT))
+    attitude, velocity, position = sensitivities = np.zeros(
+        (3, len(end), 3, SENSITIVITY_COLUMN_COUNT)
+    )
     attitude[:, :, 0:3] = np.eye(3)
     force_m_s2 = rotate(segment.body_to_ned[1:], segment.force_m_s2)
     step_numbers = np.arange(int(step_counts.max(initial=0)))
@@ -222,8 +224,8 @@ def _interval_effects(segment: ReplaySegment, start: IntArray, end: IntArray) ->
         position[rows] += 0.5 * dt * velocity[rows]
         attitude[rows, :, 3:6] += rotation_step
         attitude[rows, :, CORRECTION_COLUMN] -= segment.correction_rad[step]
-    effects[:, longest_first] = effects.copy()
-    return np.concatenate(effects, axis=1)
+    sensitivities[:, longest_first] = sensitivities.copy()
+    return np.concatenate(sensitivities, axis=1)
 
 
 def _imu_noise_by_interval(
@@ -237,7 +239,7 @@ def _imu_noise_by_interval(
     """
     n = np.maximum(step_counts, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n
-    # effect of the attitude error on the velocity, in one of n equal steps
+    # velocity change per attitude error in one of n equal prediction steps
     m = tilt / n
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)

@@ -1,6 +1,6 @@
-"""Replay of EKF2 from a default log, with the logged and with other parameters.
+"""Replay of EKF2 with logged or other parameters, from a log with PX4's default profile.
 
-The model has 15 error states about the published attitude and starts from the logged
+The model has 15 error states, linearised about the published attitude, and starts from the logged
 ``estimator_states``. Inputs are the logged IMU and positions; in a flight with GNSS also velocities
 and, if logged, the magnetometer (21 states). Other measurements are replaced by EKF2's published
 height and heading. :mod:`px4fuse.ekf2.replay` tests for each log if the model agrees with EKF2.
@@ -72,7 +72,8 @@ from px4fuse.trajectory.rotation import rotate
 # Maximum delay (s) of the fusion horizon: PX4's maximum of EKF2_DELAY_MAX
 MAX_HORIZON_S = 1.0
 
-# Field of Agreement for an aiding source, if it is not PX4's name of the source
+# Field of Agreement with the result for an aiding source, where its name is not PX4's name of the
+# source
 AGREEMENT_FIELDS = {FLOW.name: "carried_difference_m"}
 
 RequestConfigurations = Callable[[Inputs], Sequence[FilterConfiguration]]
@@ -125,8 +126,8 @@ def _open_without_aids(
 ) -> Model | Unavailable:
     """Prepare the replay without some aiding sources.
 
-    ``failed_agreements`` contains, by PX4's name of the source, the bad agreement of a replay with
-    it.
+    ``failed_agreements`` contains, for each omitted source (PX4's name), the agreement with the log
+    of the replay that fused it.
     """
     omitted_aids = {name: agreement.doubtful[name] for name, agreement in failed_agreements.items()}
     inputs = prepare_inputs(flight, omitted_aids)
@@ -154,16 +155,16 @@ def _open_without_aids(
         rejected_share > MAX_COMPARED_REJECTED_FRACTION
         and np.isfinite(inputs.received.rejected).any()
     ):
-        with_decisions = agreement_with_log(flight, replay_with_logged_rejections(model))
-        if isinstance(with_decisions, Agreement):
-            agreement = with_logged_rejections(agreement, with_decisions)
+        rejecting_agreement = agreement_with_log(flight, replay_with_logged_rejections(model))
+        if isinstance(rejecting_agreement, Agreement):
+            agreement = with_logged_rejections(agreement, rejecting_agreement)
     # the agreement of an omitted aiding source is from the replay that contained this source
-    failed_fields = {
+    failed_results = {
         (field_name := AGREEMENT_FIELDS.get(name, name)): getattr(failed_agreement, field_name)
         for name, failed_agreement in failed_agreements.items()
     }
     agreement = structs.replace(
-        agreement, doubtful={**omitted_aids, **agreement.doubtful}, **failed_fields
+        agreement, doubtful={**omitted_aids, **agreement.doubtful}, **failed_results
     )
     return replace(
         model,
@@ -204,7 +205,10 @@ def replay_settings(
     changes = [check_parameters(change) for change in settings]
     inputs = model.inputs
     unmodelled_parameters = PARAMETERS.keys() - inputs.settings.keys()
-    reasons = dict.fromkeys(unmodelled_parameters, f"EKF2 fused {inputs.aid.label} in this log")
+    reasons = dict.fromkeys(
+        unmodelled_parameters,
+        f"EKF2 fused {inputs.aid.label}, to which this parameter does not apply",
+    )
     height_text = f"the replay uses the logged EKF2 height ({inputs.logged_height_reason})"
     if inputs.aid == GNSS_POS:
         for parameter_names, reason in (
@@ -263,7 +267,7 @@ def replay_settings(
         replay = _make_replay(inputs, runs, configuration, change)
         updates = replay.updates
         if excluded_s is not None:
-            age_s = configuration.settings[inputs.aid.delay] * 1e-3 + 0.5 * inputs.step_s
+            age_s = configuration.settings[inputs.aid.delay] * 1e-3 + 0.5 * inputs.mean_step_s
             excluded_rows = matching_sample_rows(updates.index.to_numpy(), excluded_s - age_s)
             updates = updates.iloc[
                 np.delete(np.arange(len(updates)), excluded_rows[excluded_rows >= 0])
@@ -463,13 +467,13 @@ def _delayed_and_published(
     configuration = run.configurations[configuration_index]
     state, reset = delayed_states(run, configuration_index)
     horizon_s = min(configuration.timing(inputs).horizon_s, MAX_HORIZON_S)
-    lag_steps = max(round(horizon_s / inputs.step_s), 1)
+    lag_steps = max(round(horizon_s / inputs.mean_step_s), 1)
     published_rotation = np.zeros((len(state), 3))
     # without attitude states, the nominal (published) attitude already is EKF2's logged attitude
     if configuration.estimates_attitude:
         attitude_difference = state[:, THETA] - segment.attitude_error_rad
         published_rotation = follow_attitude(
-            attitude_difference, lag_steps, inputs.step_s, horizon_s
+            attitude_difference, lag_steps, inputs.mean_step_s, horizon_s
         )
     published_track = publish(
         segment, state, reset, published_rotation, lag_steps, configuration.settings

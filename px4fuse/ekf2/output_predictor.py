@@ -79,8 +79,9 @@ def _follow_state(
 ) -> Array:
     """Return the output: the sum of the IMU's ``increments`` and of the corrections.
 
-    The offset o is the state minus the output without corrections. With gain g and error e_k =
-    o_(k-lag) - c_k, the sum of corrections is c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
+    A correction shifts the whole buffer. In step k the error at the fusion horizon is therefore e_k
+    = o_(k-lag) - c_k, with the state minus the uncorrected output o and the sum of corrections c.
+    With gain g, c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
     """
     dead_reckoned = np.cumsum(np.concatenate([state[:1], increments]), axis=0)
     offset = state - dead_reckoned

@@ -152,11 +152,13 @@ class Agreement(Record, kw_only=True):
         return {"north": self.north, "east": self.east}
 
     def as_unavailable(self, result_name: str) -> Unavailable:
-        profile = "3 (default and full rates)" if self.gnss_pos else "129 (default and vision)"
+        profile = "SDLOG_PROFILE 129 (default and vision)"
+        if self.gnss_pos:
+            profile = "SDLOG_PROFILE 3 (default and full rates)"
         return Unavailable(
             result_name,
             f"the EKF2 replay does not agree with the log: {self.reason}",
-            f"Record without dropouts and with SDLOG_PROFILE {profile}.",
+            f"Record without dropouts and with {profile}.",
         )
 
 
@@ -248,9 +250,9 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             position_agreement,
             "Record a longer flight with motion, with SDLOG_PROFILE bit 0 (default).",
         )
-    rejected_in_log, rejected_in_replay = position_agreement.rejected_fractions
+    rejected_fraction_logged, rejected_fraction_replayed = position_agreement.rejected_fractions
     is_good, reason = _agreement_verdict(
-        position_agreement.axes, rejected_in_log, rejected_in_replay
+        position_agreement.axes, rejected_fraction_logged, rejected_fraction_replayed
     )
     agreements, omitted_aids = _other_agreements(ekf2, replay)
     flow_only_m = _flow_only_error_m(ekf2, replay)
@@ -270,8 +272,8 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
         **(agreements | {aid.name: position_agreement.axes}),
         doubtful=omitted_aids,
         samples=len(position_agreement.logged),
-        rejected_fraction_logged=rejected_in_log,
-        rejected_fraction_replayed=rejected_in_replay,
+        rejected_fraction_logged=rejected_fraction_logged,
+        rejected_fraction_replayed=rejected_fraction_replayed,
         decisions_same=float(np.mean(is_same_decision)),
         published_rms_difference_m=math.hypot(*distances_m),
         good=is_good,
@@ -284,29 +286,42 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
 def _compare_innovations(
     ekf2: Ekf2,
     replay: Ekf2Replay,
-    updates: pd.DataFrame,
-    logged: pd.DataFrame,
-    is_own_topic: bool,
+    replayed_innovations: pd.DataFrame,
+    logged_innovations: pd.DataFrame,
+    has_measurement_times: bool,
 ) -> _ComparedInnovations | str:
     """Compare innovations in the evaluated times, or return the reason why this is impossible."""
-    matched_updates = match_updates(updates, logged.index.to_numpy(), is_own_topic=is_own_topic)
-    is_used = (matched_updates >= 0) & inside_spans(logged.index, replay.evaluated_s)
+    matched_updates = match_updates(
+        replayed_innovations,
+        logged_innovations.index.to_numpy(),
+        has_measurement_times=has_measurement_times,
+    )
+    is_used = (matched_updates >= 0) & inside_spans(logged_innovations.index, replay.evaluated_s)
     # a sample to which EKF2 resets its state is logged with innovation 0
-    is_used &= logged.filter(regex="innovation_[a-z]+_m$").any(axis=1)
-    logged, updates = logged[is_used], updates.iloc[matched_updates[is_used]]
-    if len(logged) < MIN_COMPARED_INNOVATIONS:
+    is_used &= logged_innovations.filter(regex="innovation_[a-z]+_m$").any(axis=1)
+    logged_innovations, replayed_innovations = (
+        logged_innovations[is_used],
+        replayed_innovations.iloc[matched_updates[is_used]],
+    )
+    if len(logged_innovations) < MIN_COMPARED_INNOVATIONS:
         return (
-            f"the log contains only {count_noun(len(logged), 'innovation')} in the replayed time "
-            f"(at least {MIN_COMPARED_INNOVATIONS} are needed)"
+            f"the log contains only {count_noun(len(logged_innovations), 'innovation')} in the "
+            f"replayed time (at least {MIN_COMPARED_INNOVATIONS} are needed)"
         )
-    axes = axes_of(updates)
+    axes = axes_of(replayed_innovations)
     columns = [f"innovation_{axis}_m" for axis in axes]
-    if not all(np.ptp(innovations[columns], axis=0).all() for innovations in (logged, updates)):
+    if not all(
+        np.ptp(innovations[columns], axis=0).all()
+        for innovations in (logged_innovations, replayed_innovations)
+    ):
         return CONSTANT_INNOVATIONS
     return _ComparedInnovations(
-        logged,
-        updates,
-        {axis: _axis_agreement(axis, logged, updates, ekf2, replay) for axis in axes},
+        logged_innovations,
+        replayed_innovations,
+        {
+            axis: _axis_agreement(axis, logged_innovations, replayed_innovations, ekf2, replay)
+            for axis in axes
+        },
     )
 
 
@@ -411,21 +426,25 @@ def rows_inside(table: T, spans_s: Spans) -> T:
     return table[inside_spans(table.index, spans_s)]
 
 
-def match_updates(updates: pd.DataFrame, logged_s: Array, *, is_own_topic: bool) -> IntArray:
+def match_updates(
+    updates: pd.DataFrame, logged_s: Array, *, has_measurement_times: bool
+) -> IntArray:
     """Return the index of the update of each logged innovation; -1 without an update.
 
-    ``is_own_topic`` is True for estimator_aid_src topics, which contain measurement times.
+    ``has_measurement_times`` is True for estimator_aid_src topics.
     """
-    if is_own_topic:
+    if has_measurement_times:
         return matching_sample_rows(updates.index.to_numpy(), logged_s)
-    fused_at = updates["fused_at_s"].to_numpy()
-    update_row = np.searchsorted(fused_at, logged_s + 1e-4, side="right") - 1
-    age_s = logged_s - fused_at[np.maximum(update_row, 0)]
+    fused_at_s = updates["fused_at_s"].to_numpy()
+    update_row = np.searchsorted(fused_at_s, logged_s + 1e-4, side="right") - 1
+    age_s = logged_s - fused_at_s[np.maximum(update_row, 0)]
     is_match = (update_row >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
     # a row that is logged in the prediction step of a fusion may still contain the previous
     # innovation
-    is_clear = is_match & (age_s >= SAME_STEP_S)
-    return np.where(is_clear if is_clear.sum() > 0.5 * is_match.sum() else is_match, update_row, -1)
+    is_unambiguous = is_match & (age_s >= SAME_STEP_S)
+    return np.where(
+        is_unambiguous if is_unambiguous.sum() > 0.5 * is_match.sum() else is_match, update_row, -1
+    )
 
 
 def _axis_agreement(
@@ -490,8 +509,8 @@ def rms(values: Array) -> float:
 
 def _agreement_verdict(
     axes: Mapping[str, AxisAgreement],
-    rejected_in_log: float,
-    rejected_in_replay: float,
+    rejected_fraction_logged: float,
+    rejected_fraction_replayed: float,
     published_factor: float = 1.0,
 ) -> tuple[bool, str]:
     """Return True if the replay agrees with the log, and the reason with numbers."""
@@ -515,15 +534,16 @@ def _agreement_verdict(
                 f"{_format_above(difference_m, limit_m)} m RMS (limit {limit_m:g} m): the log "
                 "lacks an input of EKF2's output predictor"
             )
-        return True, f"{correlation_text}"
-    if max(rejected_in_log, rejected_in_replay) < MAX_COMPARED_REJECTED_FRACTION:
+        return True, correlation_text
+    if max(rejected_fraction_logged, rejected_fraction_replayed) < MAX_COMPARED_REJECTED_FRACTION:
         return False, f"{correlation_text}, below the minimum of {MIN_INNOVATION_CORRELATION:g}"
-    rejected_difference = abs(rejected_in_replay - rejected_in_log)
+    rejected_difference = abs(rejected_fraction_replayed - rejected_fraction_logged)
     nis_difference = max(
         abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) for axis in axes.values()
     )
     tolerance_text = (
-        f"the replay rejected {rejected_in_replay:.1%} of the samples, EKF2 {rejected_in_log:.1%}; "
+        f"the replay rejected {rejected_fraction_replayed:.1%} of the samples, EKF2 "
+        f"{rejected_fraction_logged:.1%}; "
         f"the mean NIS differs by {nis_difference:.0%}"
     )
     if rejected_difference > MAX_REJECTED_DIFFERENCE or nis_difference > MAX_NIS_DIFFERENCE:
@@ -532,8 +552,8 @@ def _agreement_verdict(
         )
     return (
         True,
-        f"{tolerance_text}; single innovations are not compared, because rejections change later "
-        "ones",
+        f"{tolerance_text}; single innovations are not compared, because each rejection changes "
+        "the later innovations",
     )
 
 
@@ -542,17 +562,17 @@ def _format_above(value: float, limit: float) -> str:
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 
 
-def with_logged_rejections(agreement: Agreement, with_decisions: Agreement) -> Agreement:
-    """Return the agreement of a replay with EKF2's logged decisions.
+def with_logged_rejections(agreement: Agreement, rejecting_agreement: Agreement) -> Agreement:
+    """Return the agreement of a replay with EKF2's logged rejections, ``rejecting_agreement``.
 
-    With many rejections, one sample near the gate makes a correct replay differ from the log.
-    ``agreement`` is of the replay with the gate of the model.
+    With many rejections, one sample near the gate makes a correct replay differ from the log. The
+    rejected fraction and the decisions are from ``agreement``: a replay that applies the gate.
     """
     rejected_fraction = agreement.rejected_fraction_logged
     relies_on_imu = rejected_fraction > MOSTLY_REJECTED_FRACTION
     published_factor = np.inf if relies_on_imu else REJECTING_TOLERANCE_FACTOR
-    is_good, reason = _agreement_verdict(with_decisions.axes, 0.0, 0.0, published_factor)
-    min_correlation = min(axis.innovation_correlation for axis in with_decisions.axes.values())
+    is_good, reason = _agreement_verdict(rejecting_agreement.axes, 0.0, 0.0, published_factor)
+    min_correlation = min(axis.innovation_correlation for axis in rejecting_agreement.axes.values())
     if is_good and relies_on_imu and min_correlation < MIN_IMU_CORRELATION:
         is_good = False
         reason = (
@@ -561,12 +581,12 @@ def with_logged_rejections(agreement: Agreement, with_decisions: Agreement) -> A
         )
     reason = f"in a replay with EKF2's logged rejections, {reason}"
     if relies_on_imu and not is_good:
-        reason += (
-            f". EKF2 rejected {rejected_fraction:.0%} of the positions and relied on the IMU. The "
-            "frame of the source is probably wrong"
+        reason = (
+            f"{reason}. EKF2 rejected {rejected_fraction:.0%} of the positions and relied on the "
+            "IMU. The frame of the source is probably wrong"
         )
     return replace(
-        with_decisions,
+        rejecting_agreement,
         rejected_fraction_replayed=agreement.rejected_fraction_replayed,
         decisions_same=agreement.decisions_same,
         good=is_good,

@@ -51,7 +51,8 @@ MIN_FUSION_S = 1.0
 MIN_AIRBORNE_S = 4.0
 # Time (s) from the start of a replay to the start of the evaluation
 SETTLING_S = 5.0
-# Time (s) from the first fusion of all magnetometer axes to the log of the reset field states
+# Time (s) from the first fusion of all magnetometer axes until the log contains the reset field
+# states
 FIELD_RESET_S = 1.0
 # Flight time (s) before the replay that is used to estimate correlations of the initial state
 CORRELATION_HISTORY_S = 20.0
@@ -93,7 +94,8 @@ class SensorSamples:
     step : ndarray of int, shape (m,)
         Prediction step that fuses the last sample of each mean.
     value : ndarray, shape (m, k)
-        Field (gauss, FRD; k = 3), or velocity forward and right minus the IMU's velocity (m/s).
+        Field (gauss, FRD), or flow velocity forward and right (m/s) minus the velocity change from
+        the IMU since the start of the segment.
     rotation_to_body : ndarray, shape (m, k, 3)
         Mean rotation from NED to the body axes.
     sample_count : ndarray, shape (m,)
@@ -235,7 +237,7 @@ def samples_by_event(
     measurement_step: IntArray,
     position_m: Array,
     axes: slice,
-    *more: Array,
+    *quantities: Array,
 ) -> Array:
     """Sort samples by the event at which they are fused: k slots for each of E events.
 
@@ -249,14 +251,14 @@ def samples_by_event(
     position_m : ndarray, shape (m, a)
     axes : slice
         Axes of the position within NED.
-    *more : ndarray, shape (m,)
-        Further quantities.
+    *quantities : ndarray, shape (m,)
+        Further quantities of each sample.
 
     Returns
     -------
-    ndarray, shape (a + 2 + len(more), k, E)
-        Position moved to the event by the IMU acceleration, age (s), ``more``, and 1 for a sample;
-        0 in empty slots.
+    ndarray, shape (a + 2 + len(quantities), k, E)
+        Position moved to the event by the IMU acceleration, age (s), further quantities, and a mask
+        (0 for an empty slot).
     """
     event_index = np.searchsorted(event_steps, measurement_step)
     event_index = event_index[event_index < len(event_steps)]
@@ -276,7 +278,7 @@ def samples_by_event(
     columns = (
         *position_m.T,
         age_s,
-        *(column[:sample_count] for column in more),
+        *(column[:sample_count] for column in quantities),
         np.ones(sample_count),
     )
     samples = np.zeros((len(columns), slot_index.max(initial=-1) + 1, len(event_steps)))
@@ -292,9 +294,9 @@ def update_table(
     Parameters
     ----------
     update_log : ndarray, shape (E, k, ...)
-        For k samples of each event: ν and S along each axis, 1 for a sample that was rejected,
-        fused, or used for a reset, position variance after the update and R along each axis (the
-        last quantities are optional). NaN without a sample.
+        For k samples of each event: ν and S along each axis, then optionally 1 if rejected, 1 if
+        fused, 1 if used for a reset, position variance after the update along each axis, and R
+        along each axis. NaN without a sample.
     measured_at_s : ndarray, shape (E, k)
     end_s : ndarray, shape (E,)
         Time of each event.
@@ -408,7 +410,7 @@ def find_replay_segments(
 def _with_gnss_model(
     segment: ReplaySegment, imu: pd.DataFrame, ekf2: Ekf2, fusion_record: FusionRecord
 ) -> ReplaySegment:
-    """Add earth rotation, positions in EKF2's metres, and bad accelerations to a segment."""
+    """Add earth rotation, EKF2's position scale, clipping, and mean vertical bias to a segment."""
     metres_per_metre = ekf2_metres_per_metre(fusion_record)
     initial_state = segment.state.copy()
     initial_state[POSITION] *= metres_per_metre
@@ -594,23 +596,24 @@ def _mean_field(
     between_s = between_s[gap_free_rows - 1]
     fused_counts = np.maximum(np.rint(MAG_FUSION_HZ * between_s), 1.0)
     filter_share = between_s / (between_s + fused_counts * INNOVATION_FILTER_S)
-    remaining_fraction = ((1.0 - filter_share) ** fused_counts)[:, None]
+    previous_innovation_weight = ((1.0 - filter_share) ** fused_counts)[:, None]
     innovation = (
-        filtered_gauss[gap_free_rows] - remaining_fraction * filtered_gauss[gap_free_rows - 1]
-    ) / (1.0 - remaining_fraction)
+        filtered_gauss[gap_free_rows]
+        - previous_innovation_weight * filtered_gauss[gap_free_rows - 1]
+    ) / (1.0 - previous_innovation_weight)
     step, weight = low_pass_weights(
         segment, measured_at_s, fused_counts, between_s / fused_counts, filter_share
     )
     rotation_to_body = segment.body_to_ned[step].swapaxes(2, 3)
-    earth, body = (
+    earth_gauss, body_gauss = (
         _interpolate(delayed_state[names], measured_at_s)
         for names in (Columns.EARTH_FIELD, Columns.BODY_FIELD)
     )
-    rotated_earth_field = earth[:, None] - np.cross(
-        segment.attitude_error_rad[step], earth[:, None]
+    rotated_earth_field = earth_gauss[:, None] - np.cross(
+        segment.attitude_error_rad[step], earth_gauss[:, None]
     )
     expected_field = (
-        np.einsum("ki,kiab,kib->ka", weight, rotation_to_body, rotated_earth_field) + body
+        np.einsum("ki,kiab,kib->ka", weight, rotation_to_body, rotated_earth_field) + body_gauss
     )
     mean = np.einsum("ki,kiab->kab", weight, rotation_to_body)
     return SensorSamples(
@@ -644,9 +647,9 @@ def add_field_states(
     segment: ReplaySegment,
     measured_at_s: Array,
     gauss: Array,
-    weight: float,
-    fields: Array,
-    variance: Array,
+    sample_weight: float,
+    fields_gauss: Array,
+    field_variance_gauss2: Array,
 ) -> ReplaySegment:
     """Add the magnetic fields of earth and body to the states, uncorrelated with other states.
 
@@ -654,9 +657,9 @@ def add_field_states(
     ----------
     measured_at_s, gauss : ndarray, shape (m,) and (m, 3)
         Magnetometer samples (body FRD) at EKF2's measurement time.
-    weight : float
+    sample_weight : float
         Number of samples that EKF2 fused per logged sample.
-    fields, variance : ndarray, shape (6,)
+    fields_gauss, field_variance_gauss2 : ndarray, shape (6,)
         Initial fields of earth (NED) and body (FRD), and their variances.
     """
     step_index, is_inside = sample_steps(segment, measured_at_s)
@@ -664,14 +667,14 @@ def add_field_states(
     sample_count = len(step_index)
     return replace(
         segment,
-        state=np.concatenate([segment.state, fields]),
-        variance=np.concatenate([segment.variance, variance]),
-        state_correlation=block_diag(segment.state_correlation, np.eye(len(fields))),
+        state=np.concatenate([segment.state, fields_gauss]),
+        variance=np.concatenate([segment.variance, field_variance_gauss2]),
+        state_correlation=block_diag(segment.state_correlation, np.eye(len(fields_gauss))),
         field=SensorSamples(
             step_index,
             gauss[is_inside],
             rotation_to_body,
-            np.full(sample_count, weight),
+            np.full(sample_count, sample_weight),
             np.zeros(sample_count),
         ),
     )
@@ -698,7 +701,7 @@ def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntA
     """Return the index of the IMU sample at the end of each prediction step of EKF2.
 
     A step ends after :func:`samples_per_step` IMU samples, after EKF2_PREDICT_US (``target_s``), or
-    at a logged end, at which the count restarts.
+    at a logged end of a step.
     """
     median_s = float(np.median(interval_s))
     # number of samples in each interval; a single gap may be a gap of the IMU itself
@@ -728,10 +731,14 @@ def downsample_imu(
     """Return rotation and velocity change of each prediction step, body frame at the step's end."""
     start_indices = np.append(0, ends[:-1])
     summed_rotation = np.concatenate([np.zeros((1, 3)), np.cumsum(rotation_vectors, axis=0)])
-    end_rotation = np.repeat(summed_rotation[ends], ends - start_indices, axis=0)
-    step_count = len(end_rotation)
-    middle_rotation = 0.5 * (summed_rotation[:step_count] + summed_rotation[1 : step_count + 1])
-    increments = velocity_increments[:step_count]
-    increments = increments - np.cross(end_rotation - middle_rotation, increments)
+    rotation_at_step_end_rad = np.repeat(summed_rotation[ends], ends - start_indices, axis=0)
+    step_count = len(rotation_at_step_end_rad)
+    rotation_at_sample_middle_rad = 0.5 * (
+        summed_rotation[:step_count] + summed_rotation[1 : step_count + 1]
+    )
+    rotated_increments = velocity_increments[:step_count]
+    rotated_increments = rotated_increments - np.cross(
+        rotation_at_step_end_rad - rotation_at_sample_middle_rad, rotated_increments
+    )
     step_rotation = summed_rotation[ends] - summed_rotation[start_indices]
-    return step_rotation, np.add.reduceat(increments, start_indices, axis=0)
+    return step_rotation, np.add.reduceat(rotated_increments, start_indices, axis=0)

@@ -1,11 +1,11 @@
-"""Explanation of the difference KF - EKF2: replace KF by EKF2, one property at a time.
+"""Explanation of the difference between KF (position and velocity states) and EKF2, step by step.
 
 The flight is replayed with KF, then with one more property of EKF2 each time: sample times, noises,
 estimated states, gate, and output predictor. Each replacement is called a step. It reduces or
 increases the mean square difference from the logged EKF2.
 
-Bias states precede process noise, because without them EKF2's small process noise would increase
-the error. The last replays use EKF2's logged rejections.
+Bias states are added before EKF2's process noise: this noise is small, so it would increase the
+error of a filter without them. The last replays use EKF2's logged rejections.
 """
 
 import math
@@ -43,7 +43,7 @@ OTHER_TIME = Unavailable(
     "Record ground truth during the whole flight.",
 )
 # Names of the properties that differ between KF and EKF2
-SAMPLES = "samples and time steps"
+SAMPLES = "sample times and time steps"
 TIMESTAMPS = "timestamps and delay"
 NOISE = "measurement noise"
 BIASES = "accelerometer bias as a state"
@@ -55,10 +55,10 @@ FLOW_STEP = "optical flow"
 VISION_STEP = "external vision"
 GATE = "rejections and resets"
 OUTPUT = "output predictor"
-# Steps of further aiding sources of the position
+# Step of each further aiding source of the position, by PX4's name of the source
 FURTHER_STEPS = {FLOW.name: FLOW_STEP, EV_POS.name: VISION_STEP}
 # Order in which properties of KF are replaced by those of EKF2; further aids precede GATE
-STEPS = (SAMPLES, TIMESTAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
+REPLACEMENT_STEPS = (SAMPLES, TIMESTAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
@@ -166,7 +166,7 @@ def explain_by_steps(
     ----------
     model : Model
     settings : Settings, optional
-        Settings of KF, with the time offset for the position source that EKF2 fused.
+        Settings of KF; their time offset is that of the position source that EKF2 fused.
     runs : mapping from axis name to Replay, optional
         Runs of KF along horizontal axes; default: north and east, with EKF2's sample times.
     """
@@ -191,7 +191,7 @@ def explain_by_steps(
     if not len(state_times_s):
         return Unavailable(
             ANALYSIS_NAME,
-            "the times of KF and of the EKF2 replay do not overlap",
+            "KF and the EKF2 replay do not overlap in time",
             "Analyse a segment in which EKF2 fused the source (--start, --end).",
         )
     state_span_s = float(state_times_s[0]), float(state_times_s[-1])
@@ -247,17 +247,15 @@ def explain_by_steps(
                 strict=True,
             )
         )
-        (position, velocity), *_, (unexplained_position, unexplained_velocity) = (
-            mean_squares.tolist()
-        )
+        total_mean_squares, *_, unexplained_mean_squares = mean_squares.tolist()
         filter_errors = {"kf": rmse_by_step[0], "ekf2": rmse_by_step[-1]}
         steps_by_axis[axis] = DifferenceExplanation(
             count=len(state_times_s),
-            position_mean_square_m2=position,
-            velocity_mean_square_m2_s2=velocity,
+            position_mean_square_m2=total_mean_squares[0],
+            velocity_mean_square_m2_s2=total_mean_squares[1],
             steps=steps,
-            unexplained_mean_square_m2=unexplained_position,
-            unexplained_velocity_mean_square_m2_s2=unexplained_velocity,
+            unexplained_mean_square_m2=unexplained_mean_squares[0],
+            unexplained_velocity_mean_square_m2_s2=unexplained_mean_squares[1],
             position_rmse_to_truth_m={
                 name: no_truth if error is None else error for name, error in filter_errors.items()
             },
@@ -272,10 +270,10 @@ def explain_by_steps(
 
 
 def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, FilterConfiguration]:
-    """Return the filter configuration after each replacement but the output predictor."""
+    """Return the filter configuration after each step; the output predictor needs none."""
     logged_settings = inputs.settings
     aid = inputs.aid
-    acceleration_noise = kf_settings.sigma_a_m_s2 * math.sqrt(kf_settings.dt_s / inputs.step_s)
+    acceleration_noise = kf_settings.sigma_a_m_s2 * math.sqrt(kf_settings.dt_s / inputs.mean_step_s)
     kf_process_noise = {**logged_settings, "EKF2_ACC_NOISE": acceleration_noise}
     kf_parameters = {**kf_process_noise, aid.noise: kf_settings.sigma_z_m}
     # the delay is already subtracted from the timestamps of GNSS positions

@@ -54,7 +54,7 @@ def vision_samples(
     vision = inputs.vision
     time_s = segment.time_s
     assert vision is not None
-    measured_at_s = vision.stamp_s - settings[EV_POS.delay] * 1e-3 - 0.5 * inputs.step_s
+    measured_at_s = vision.stamp_s - settings[EV_POS.delay] * 1e-3 - 0.5 * inputs.mean_step_s
     due_s = np.maximum(measured_at_s, vision.arrival_s - horizon_s)
     step_index = np.maximum.accumulate(np.searchsorted(time_s, due_s - 1e-9))
     is_usable = (
@@ -146,8 +146,9 @@ class VisionFilter:
     def fuse(self, e: int, x: Array, P: Array, at_event: bool, gnss_fused_s: Array) -> ArrayPair:
         """Fuse the vision samples of one event.
 
-        ``at_event`` selects the samples of the last prediction step before the event, which EKF2
-        fuses after GNSS. ``gnss_fused_s`` is the time of the last position fusion from GNSS.
+        ``at_event`` is True for the samples of the last prediction step before the event (EKF2
+        fuses these after GNSS), and False for earlier samples. ``gnss_fused_s`` is the time of the
+        last position fusion from GNSS.
         """
         for slot, has_sample in enumerate(self.has_sample[at_event][:, e]):
             if has_sample.any():

@@ -1,6 +1,6 @@
-"""Comparison of EKF2 as logged, replayed, and replayed with other parameters.
+"""Statistics of EKF2 as logged, replayed, and replayed with other parameters.
 
-All columns of this parameter table are evaluated over the same times.
+The parameter table has one column per set of parameters; all are evaluated over the same times.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,7 +37,8 @@ from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, chec
 from px4fuse.flight.model import AxisName, Columns, Ekf2, Flight, Unavailable
 
 ANALYSIS_NAME = "EKF2 replay with other parameters"
-# Minimum fraction of the replayed innovations in the log for a logged time between fusions
+# Minimum fraction of the innovations that must be logged for computing the longest time between
+# fusions from the log
 MIN_COMPLETE_FRACTION = 0.9
 NO_TRUTH = Unavailable(
     "RMSE against ground truth",
@@ -50,19 +51,19 @@ HEADING_LOGGED_NOTE = (
 )
 HEIGHT_REPLAYED_NOTE = "Height is replayed with the logged height sensors"
 HEIGHT_START_NOTE = (
-    ". When the replay starts, EKF2 has declared its vertical acceleration bad, so the replayed "
+    "When the replay starts, EKF2 has declared its vertical acceleration bad, so the replayed "
     "height may be wrong at first"
 )
 HEIGHT_LOGGED_NOTE = "The logged EKF2 height is used in all columns"
 HEADING_NOT_REPLAYED = Unavailable(
     "heading error",
     "with external vision the replay uses the logged EKF2 heading",
-    "Take the heading from the log (vehicle_attitude).",
+    "Use the logged heading (vehicle_attitude) instead of a replayed heading.",
 )
 HEIGHT_NOT_REPLAYED = Unavailable(
     "height error",
     "the replay uses the logged EKF2 height",
-    "Take the height from the log (vehicle_local_position).",
+    "Use the logged height (vehicle_local_position) instead of a replayed height.",
 )
 HEIGHT_NAMES = {aid.name for aid in SENSORS}
 # Minimum evaluated flight time (s) after an aiding source is disabled
@@ -275,7 +276,7 @@ def _heading_and_height_notes(model: Model) -> tuple[str, str]:
     height_note = HEIGHT_LOGGED_NOTE if model.inputs.logged_height_reason else HEIGHT_REPLAYED_NOTE
     is_bad = model.inputs.segments[0].is_acceleration_bad
     if height_note == HEIGHT_REPLAYED_NOTE and is_bad is not None and is_bad[0]:
-        height_note += HEIGHT_START_NOTE
+        height_note = f"{height_note}. {HEIGHT_START_NOTE}"
     return heading_note, height_note
 
 
@@ -312,18 +313,18 @@ def _mark_unpredictable(
 ) -> tuple[Summary, ...]:
     """Set ``is_predictable`` to False where added position noise changes the statistics."""
     repeated_summaries = [[summary] for summary in summaries]
-    uncertain_runs = [
-        repeated_runs
-        for repeated_runs in repeated_summaries
-        if repeated_runs[0].changed
-        and MIN_REJECTED_FRACTION < repeated_runs[0].rejected_fraction <= MAX_REJECTED_FRACTION
+    uncertain_summaries = [
+        replay_summaries
+        for replay_summaries in repeated_summaries
+        if replay_summaries[0].changed
+        and MIN_REJECTED_FRACTION < replay_summaries[0].rejected_fraction <= MAX_REJECTED_FRACTION
     ]
-    uncertain_changes = [repeated_runs[0].changed for repeated_runs in uncertain_runs]
+    uncertain_changes = [replay_summaries[0].changed for replay_summaries in uncertain_summaries]
     for seed in range(NOISY_REPLAY_COUNT if uncertain_changes else 0):
         noisy_model = with_position_noise(model, ADDED_NOISE_M, seed)
         replays = replay_settings(noisy_model, uncertain_changes, without=without)
-        for repeated_runs, replay in zip(uncertain_runs, replays, strict=True):
-            repeated_runs.append(_summarise_replay(model.flight, replay, evaluated_s))
+        for replay_summaries, replay in zip(uncertain_summaries, replays, strict=True):
+            replay_summaries.append(_summarise_replay(model.flight, replay, evaluated_s))
     marked_summaries = []
     for summary, *noisy_summaries in repeated_summaries:
         rejected_fractions = [
@@ -415,7 +416,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
         )
     # a flight with a replay has an attitude
     assert isinstance(flight.attitude, pd.DataFrame)
-    heading = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
+    headings_rad = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
     other_aid_updates = {
         name: logged_aid_innovations(name, ekf2.aids[name])
         for name in replay.other_aid_updates
@@ -429,7 +430,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
         ekf2.state,
         None,
         other_aid_updates,
-        heading,
+        headings_rad,
         changed={},
         longest_without_fusion_s=longest_gap_s,
         resets=len(reset_times_s),
@@ -444,7 +445,7 @@ def _make_summary(
     published_track: pd.DataFrame,
     variance: pd.DataFrame | None,
     other_aid_updates: Mapping[str, pd.DataFrame],
-    heading: pd.Series,
+    headings_rad: pd.Series,
     **more: Any,
 ) -> Summary:
     """Compute one column of the parameter table; ``more`` are further fields of :class:`Summary`.
@@ -491,7 +492,7 @@ def _make_summary(
     return Summary(
         samples=len(evaluated_updates),
         rejected_fraction=float(evaluated_updates["rejected"].mean()),
-        heading_error_mean_deg=_heading_error(flight, replay, heading, evaluated_s),
+        heading_error_mean_deg=_heading_error(flight, replay, headings_rad, evaluated_s),
         **more,
     )
 
@@ -517,19 +518,19 @@ def _summarise_aid(evaluated_updates: pd.DataFrame, evaluated_s: Spans) -> Heigh
 
 
 def _heading_error(
-    flight: Flight, replay: Ekf2Replay, heading: pd.Series, evaluated_s: Spans
+    flight: Flight, replay: Ekf2Replay, headings_rad: pd.Series, evaluated_s: Spans
 ) -> float | Unavailable:
-    """Return the mean of ``heading`` (rad) minus true heading, in degrees."""
+    """Return the mean of ``headings_rad`` (rad) minus true heading, in degrees."""
     if GNSS_POS.noise not in replay.settings:
         return HEADING_NOT_REPLAYED
     true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude
     if true_attitude is None:
         return replace(NO_TRUTH, what="heading error", reason="the log has no true attitude")
-    heading = rows_inside(heading, evaluated_s)
-    true_heading = np.interp(
-        heading.index, true_attitude.index, heading_rad(true_attitude), np.nan, np.nan
+    headings_rad = rows_inside(headings_rad, evaluated_s)
+    true_headings_rad = np.interp(
+        headings_rad.index, true_attitude.index, heading_rad(true_attitude), np.nan, np.nan
     )
-    error_rad = np.angle(np.exp(1j * (heading.to_numpy() - true_heading)))
+    error_rad = np.angle(np.exp(1j * (headings_rad.to_numpy() - true_headings_rad)))
     return float(np.degrees(np.nanmean(error_rad)))
 
 
@@ -547,26 +548,24 @@ def _deviation_note(
         evaluated_s,
     )
     *horizontal_m, down_difference_m = np.abs(position_difference_m.to_numpy()).T
-    horizontal_distance_m = np.hypot(*horizontal_m)
+    horizontal_distance_m, max_down_m = np.hypot(*horizontal_m), down_difference_m.max()
     aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in replays_without.items())
     height_aids = HEIGHT_NAMES & model.baseline_replay.other_aid_updates.keys()
     horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - height_aids
-    height_note = (
-        f". The published height differs by at most {down_difference_m.max():.3g} m"
-        if height_aids & {*replays_without}
-        else ""
-    )
-    give_up_note = (
-        ". The replay continues with the IMU alone; EKF2 stops publishing a position after "
-        "EKF2_NOAID_TOUT (5 s)"
-    )
     at_s = position_difference_m.index[horizontal_distance_m.argmax()]
-    return (
+    note = (
         f"Without {aids_text} the published position differs from the replay with all aiding "
         f"sources by at most {horizontal_distance_m.max():.3g} m (at {at_s:.1f} s), and by "
-        f"{horizontal_distance_m[-1]:.3g} m at the end{height_note}"
-        + (give_up_note if horizontal_aids <= replays_without.keys() else "")
+        f"{horizontal_distance_m[-1]:.3g} m at the end"
     )
+    if height_aids & {*replays_without}:
+        note = f"{note}. The heights of the two replays differ by at most {max_down_m:.3g} m"
+    if horizontal_aids <= replays_without.keys():
+        note = (
+            f"{note}. The replay continues with the IMU alone; EKF2 stops publishing a position "
+            "after EKF2_NOAID_TOUT (5 s)"
+        )
+    return note
 
 
 def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:

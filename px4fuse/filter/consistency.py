@@ -1,4 +1,4 @@
-"""Consistency of innovations with their reported variance: NIS, bias, whiteness and verdict.
+"""Consistency of innovations with their reported variance: NIS, bias and whiteness.
 
 The same functions evaluate KF and EKF2.
 
@@ -24,11 +24,12 @@ from px4fuse.core.record import (
 )
 from px4fuse.core.text import count_noun
 
-# Verdict on the reported σ: "underconfident" if it is too large, "overconfident" if it is too small
+# Consistency of a filter: "underconfident" if its reported σ is too large, "overconfident" if it is
+# too small
 Verdict = Literal["consistent", "underconfident", "overconfident"]
 
 Interval = tuple[float, float]
-# Minimum number of innovations for a verdict; the 95 % band of their mean NIS is 0.3 to 2.1
+# Minimum number of innovations for a test of consistency; the 95 % band of their NIS is 0.3 to 2.1
 MIN_INNOVATIONS = 10
 CONFIDENCE_LEVEL = 0.95
 # Number of lags of the Ljung-Box whiteness test
@@ -42,7 +43,7 @@ DEFAULT_GATE = 5.0
 
 
 class NisVerdict(Record, kw_only=True):
-    """Mean NIS with its 95 % band, and the verdict on the reported σ.
+    """Mean NIS with its 95 % band, and the consistency verdict on the reported σ.
 
     Attributes
     ----------
@@ -123,7 +124,7 @@ def nis_band(count: int, dimensions: int = 1) -> Interval:
 def classify_sigma_ratio(
     ratio: float, reference: Reference, interval: Interval | None = None
 ) -> Verdict:
-    """Return the verdict on a ratio of actual to reported σ.
+    """Return the consistency verdict on a ratio of actual to reported σ.
 
     The filter is consistent inside :data:`CONSISTENT_RATIOS`, or if the 95 % ``interval`` of the
     ratio contains 1.
@@ -195,7 +196,7 @@ def assess(
     bias_t = float(np.sqrt(innovation_count) * np.mean(nu_m) / std_m)
     lag_count = min(LJUNG_BOX_LAGS, innovation_count // 5)
     autocorrelations = autocorrelation(normalised, lag_count)
-    q_terms = autocorrelations**2 / (innovation_count - np.arange(1, lag_count + 1))
+    ljung_box_terms = autocorrelations**2 / (innovation_count - np.arange(1, lag_count + 1))
     return Consistency(
         **_nis_verdict_fields(normalised**2),
         innovation_mean_m=float(np.mean(nu_m)),
@@ -207,7 +208,7 @@ def assess(
         bias_p=float(2.0 * stdtr(innovation_count - 1, -abs(bias_t))),
         lag1_autocorrelation=float(autocorrelations[0]),
         ljung_box_p=float(
-            chdtrc(lag_count, innovation_count * (innovation_count + 2) * q_terms.sum())
+            chdtrc(lag_count, innovation_count * (innovation_count + 2) * ljung_box_terms.sum())
         ),
         ljung_box_lags=lag_count,
     )

@@ -24,7 +24,7 @@ from scipy.optimize import minimize_scalar
 from px4fuse.core.arrays import Array
 from px4fuse.filter.fitting import NoiseFit, Noises, fit_noises, maximise_likelihood
 from px4fuse.filter.hypotheses import Jump, unit_steps
-from px4fuse.filter.imu_motion import PreparedMotion, SignalCache, prepare_motion
+from px4fuse.filter.imu_motion import MotionCache, PreparedMotion, prepare_motion
 from px4fuse.filter.likelihood import PROFILE_DROP
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, too_few_measurements
@@ -33,7 +33,7 @@ from px4fuse.flight.model import Flight, Unavailable
 MIN_MEASUREMENTS = 100
 # Maximum number of positions in a noise fit; of a longer flight only the middle is used
 MAX_MEASUREMENTS = 2000
-# Maximum interval, as multiple of the median, over which positions are correlated
+# The noise of two positions is uncorrelated if their interval exceeds this multiple of the median
 MAX_INTERVAL_RATIO = 3.0
 # Time constants (s) in the coarse search for time-correlated noise
 COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
@@ -45,7 +45,7 @@ COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
 COARSE_NOISE_FACTORS = np.geomspace(0.7, 1.6, 12)
 # Approximate number of position measurements in the coarse search for time-correlated noise
 COARSE_MEASUREMENTS = 1000
-# Minimum gain of log-likelihood over white noise in the coarse search, before a full fit
+# Minimum gain of log-likelihood over white noise in the coarse search for which a full fit is run
 MIN_COARSE_GAIN_NATS = 0.5
 # Maximum SIGMA_Z (m) of positions that are probably low-pass filtered
 MAX_SMOOTH_SIGMA_M = 0.01
@@ -57,7 +57,7 @@ OFFSET_PENALTY_NATS = 2.0
 LOW_PASS_TAU_S = (0.02, 3.0)
 # Tolerance of ln τ in the search for the time constant τ of a low pass
 LOG_TAU_TOLERANCE = 0.05
-# Maximum number of position errors against ground truth in the fit, which limits its time
+# Maximum number of fitted position errors against ground truth, which limits the computing time
 MAX_TRUTH_MEASUREMENTS = 300
 # Minimum gain of log-likelihood over white noise in the noise fit to ground truth
 MIN_TRUTH_GAIN_NATS = 5.0
@@ -166,7 +166,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         interval_s > 0.0
     )
     directions = np.array([axis.direction for axis in axes])
-    signal_cache = SignalCache()
+    motion_cache = MotionCache()
 
     def undo_low_pass(tau_s: float) -> tuple[PreparedMotion | Unavailable, float]:
         """Return the positions before the low pass, and -ln of the Jacobian of the inverse."""
@@ -183,13 +183,15 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
             unfiltered_m[is_used_position],
             directions=directions,
             dt_s=settings.dt_s,
-            signal_cache=signal_cache,
+            motion_cache=motion_cache,
         )
         if isinstance(prepared_motion, Unavailable):
             return prepared_motion, 0.0
         # the first position of an IMU segment sets the initial state and does not contribute to the
         # likelihood
-        is_used = np.isin(time_s, np.delete(prepared_motion.time_s, prepared_motion.edges[:-1]))
+        is_used = np.isin(
+            time_s, np.delete(prepared_motion.time_s, prepared_motion.segment_edges[:-1])
+        )
         return prepared_motion, len(axes) * float(np.sum(np.log1p(-rho[is_used])))
 
     prepared_motion, _ = undo_low_pass(0.0)
@@ -283,41 +285,42 @@ def fit_time_correlation_to_truth(
     """Fit time-correlated noise to the position errors against ground truth.
 
     Frame errors and time offsets are removed from the errors first. ``imu_fit`` and ``low_pass``
-    are the results of :func:`fit_time_correlation`; ``imu_fit`` is returned if it has the larger
-    gain.
+    are the results of :func:`fit_time_correlation`; return ``imu_fit`` if its gain is larger.
     """
-    min_gain = MIN_TRUTH_GAIN_NATS
+    min_gain_nats = MIN_TRUTH_GAIN_NATS
     low_pass_gain_nats = low_pass.gain_nats
     if isinstance(imu_fit, TimeCorrelatedNoise):
-        min_gain = max(MIN_TRUTH_GAIN_NATS, imu_fit.gain_nats)
+        min_gain_nats = max(MIN_TRUTH_GAIN_NATS, imu_fit.gain_nats)
         low_pass_gain_nats = imu_fit.low_pass_gain_nats
     true_track = pd.concat([truth["position_m"] for truth in truths], axis=1).dropna()
-    measured_s = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
-    measured_s = measured_s[
+    measurement_time_s = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
+    measurement_time_s = measurement_time_s[
         true_track.index.get_indexer(
-            pd.Index(measured_s), "nearest", tolerance=MAX_TRUTH_DISTANCE_S
+            pd.Index(measurement_time_s), "nearest", tolerance=MAX_TRUTH_DISTANCE_S
         )
         >= 0
     ]
-    measured_s = measured_s[:: max(1, -(-len(measured_s) // MAX_TRUTH_MEASUREMENTS))]
-    if len(measured_s) < MIN_MEASUREMENTS:
+    measurement_time_s = measurement_time_s[
+        :: max(1, -(-len(measurement_time_s) // MAX_TRUTH_MEASUREMENTS))
+    ]
+    if len(measurement_time_s) < MIN_MEASUREMENTS:
         return imu_fit
     measured_m = np.transpose(
-        [axis.measurement_m[np.isin(axis.measurement_time_s, measured_s)] for axis in axes]
+        [axis.measurement_m[np.isin(axis.measurement_time_s, measurement_time_s)] for axis in axes]
     )
     true_spline = CubicSpline(true_track.index, true_track)
     true_m, true_velocity_m_s = (
-        true_spline(measured_s + clock_offset_s, order) for order in (0, 1)
+        true_spline(measurement_time_s + clock_offset_s, order) for order in (0, 1)
     )
     part_indicators = np.eye(OFFSET_PART_COUNT)[
-        OFFSET_PART_COUNT * np.arange(len(measured_s)) // len(measured_s)
+        OFFSET_PART_COUNT * np.arange(len(measurement_time_s)) // len(measurement_time_s)
     ]
     offset_columns = np.einsum("tp,ta->tpa", part_indicators, true_velocity_m_s).reshape(
-        len(measured_s), -1
+        len(measurement_time_s), -1
     )
-    jump_columns = unit_steps(measured_s, [jump.time_s for jump in jumps])
+    jump_columns = unit_steps(measurement_time_s, [jump.time_s for jump in jumps])
     nuisance_columns = np.column_stack(
-        [np.ones_like(measured_s), true_m, offset_columns, jump_columns]
+        [np.ones_like(measurement_time_s), true_m, offset_columns, jump_columns]
     )
     residual_basis = np.linalg.qr(nuisance_columns, mode="complete")[0][
         :, nuisance_columns.shape[1] :
@@ -325,17 +328,16 @@ def fit_time_correlation_to_truth(
     residuals = residual_basis.T @ (measured_m - true_m)
     if np.abs(residuals).max() < MIN_TRUTH_RESIDUAL_M:
         return imu_fit  # the source was logged as ground truth, too
-    correlated_fractions = CORRELATED_FRACTIONS
     grid_scores = []
     half_counts = 0.5 * np.array([len(axes), len(residuals)])
-    for tau_candidate_s in TRUTH_TAUS_S:
+    for tested_tau_s in TRUTH_TAUS_S:
         correlation_matrix = (
             residual_basis.T
-            @ np.exp(-np.abs(measured_s[:, None] - measured_s) / tau_candidate_s)
+            @ np.exp(-np.abs(measurement_time_s[:, None] - measurement_time_s) / tested_tau_s)
             @ residual_basis
         )
         eigenvalues, eigenvectors = np.linalg.eigh(correlation_matrix)
-        relative_variance = 1.0 - correlated_fractions + correlated_fractions * eigenvalues[:, None]
+        relative_variance = 1.0 - CORRELATED_FRACTIONS + CORRELATED_FRACTIONS * eigenvalues[:, None]
         mean_squares = (
             ((eigenvectors.T @ residuals) ** 2).T @ (1.0 / relative_variance) / len(residuals)
         )
@@ -346,9 +348,9 @@ def fit_time_correlation_to_truth(
         grid_scores.append((scores, mean_squares.mean(axis=0)))
     # both have the shape (time constants, correlated fractions)
     scores, mean_squares = np.transpose(grid_scores, (1, 0, 2))
-    tau_index, fraction_index = divmod(int(np.argmin(scores)), len(correlated_fractions))
+    tau_index, fraction_index = divmod(int(np.argmin(scores)), len(CORRELATED_FRACTIONS))
     gains_nats = half_counts[1] * np.log(np.mean(residuals**2, axis=0)).sum() - scores.min(axis=1)
-    if gains_nats.max() < min_gain:
+    if gains_nats.max() < min_gain_nats:
         return imu_fit
     first_tau_index, last_tau_index = np.flatnonzero(gains_nats > gains_nats.max() - PROFILE_DROP)[
         [0, -1]
@@ -360,7 +362,7 @@ def fit_time_correlation_to_truth(
     sigmas_m = np.sqrt(
         mean_squares[tau_index, fraction_index]
         * np.array(
-            [correlated_fractions[fraction_index], 1.0 - correlated_fractions[fraction_index]]
+            [CORRELATED_FRACTIONS[fraction_index], 1.0 - CORRELATED_FRACTIONS[fraction_index]]
         )
     )
     return TimeCorrelatedNoise(
@@ -372,7 +374,10 @@ def _fit_noises_at(
     prepared_motion: PreparedMotion, offset_s: float, start_noises: Noises
 ) -> NoiseFit:
     return maximise_likelihood(
-        [prepared_motion.at(offset_s)], start_noises, prepared_motion.weight, fits_outliers=False
+        [prepared_motion.positions_at_offset(offset_s)],
+        start_noises,
+        prepared_motion.weight,
+        fits_outliers=False,
     )
 
 
@@ -381,11 +386,9 @@ def _best_of_grid(
 ) -> tuple[float, Noises]:
     """Return the lowest -ln p on a coarse grid of time offsets and noises, with its noises."""
     scored_noises = []
-    for positions in map(prepared_motion.at, offsets_s):
-        for noises_candidate, sigma_a_factor in product(candidate_noises, COARSE_SIGMA_A_FACTORS):
-            noises = replace(
-                noises_candidate, sigma_a_m_s2=sigma_a_factor * noises_candidate.sigma_a_m_s2
-            )
+    for positions in map(prepared_motion.positions_at_offset, offsets_s):
+        for candidate, sigma_a_factor in product(candidate_noises, COARSE_SIGMA_A_FACTORS):
+            noises = replace(candidate, sigma_a_m_s2=sigma_a_factor * candidate.sigma_a_m_s2)
             total_scores = fit_noises([positions], noises, prepared_motion.weight).scores(
                 COARSE_NOISE_FACTORS
             )[:, 0]

@@ -21,7 +21,7 @@ from px4fuse.filter.marginal_likelihood import (
     FittedPositions,
     Positions,
     centre_on_path,
-    expected_squares,
+    expected_squared_errors,
     fit_positions,
 )
 from px4fuse.filter.model import INITIAL_COVARIANCE
@@ -32,7 +32,7 @@ SIGMA_A_SEARCH_M_S2 = (1e-3, 30.0)
 SIGMA_Z_SEARCH_M = (1e-3, 10.0)
 # Maximum number of expectation maximisation iterations that estimate the outliers
 MAX_OUTLIER_ITERATIONS = 12
-# Maximum number of L-BFGS-B iterations for the final noises
+# Maximum number of L-BFGS-B iterations after the outlier probabilities have converged
 MAX_FINAL_ITERATIONS = 50
 # Maximum number of L-BFGS-B iterations while the outlier probabilities still change
 MAX_COARSE_ITERATIONS = 3
@@ -44,17 +44,17 @@ START_OUTLIER_FRACTION = 0.005
 START_OUTLIER_WIDTH = 10.0
 # Maximum fraction of outliers
 MAX_OUTLIER_FRACTION = 0.4
-# Maximum ratio of SIGMA_Z to its robust estimate (median) while outliers are estimated
+# While outliers are estimated, SIGMA_Z is limited to this multiple of its estimate from the median
 MAX_SIGMA_Z_RATIO = 1.2
 # Maximum change of an outlier probability after convergence of the expectation maximisation
 MAX_PROBABILITY_CHANGE = 0.01
-# Value of -ln p per measurement if the likelihood cannot be computed: larger than any other
+# Value of -ln p per measurement if the likelihood cannot be computed: larger than any real value
 UNCOMPUTABLE_SCORE = 1e6
 # Step of ln σ for numerical derivatives of the log-likelihood
 DERIVATIVE_LOG_STEP = 1e-4
-# Number of nodes for interpolation of the final likelihood, and distance of the nodes in ln σ
+# Number and distance (in ln σ) of the nodes between which the final likelihood is interpolated
 LIKELIHOOD_NODES = 10, 0.25
-# Number and distance (ln σ) of the nodes while the outlier probabilities still change
+# Number and distance (in ln σ) of the nodes while the outlier probabilities still change
 COARSE_LIKELIHOOD_NODES = 6, 0.2
 # Number of measurements at the start of a long flight that give the initial values of its noise fit
 FIRST_MEASUREMENTS = 2000
@@ -99,7 +99,7 @@ class Likelihood:
     """-ln p of the measurements (without a constant) as a function of the noises.
 
     For white noise, -ln p is a smooth function of ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z. It is
-    computed at nodes and interpolated by polynomials, with an error of the size of rounding errors.
+    computed at the nodes of a grid and interpolated by polynomials, as exactly as rounding allows.
 
     Parameters
     ----------
@@ -123,7 +123,9 @@ class Likelihood:
         self.axis_positions = axis_positions
         self.weight = weight
         self.sigma_z_m = sigma_z_m
-        self.is_tabulated = not any(positions.noise_fixed.any() for positions in axis_positions)
+        self.is_interpolated = not any(
+            positions.added_process_noise.any() for positions in axis_positions
+        )
         self.nodes, self.step = nodes, step = (
             COARSE_LIKELIHOOD_NODES if is_coarse else LIKELIHOOD_NODES
         )
@@ -150,7 +152,7 @@ class Likelihood:
 
     def __call__(self, noises: Noises) -> float:
         """Return -ln p of the measurements, without a constant."""
-        if noises.random_walk_m or noises.correlated_sigma_m or not self.is_tabulated:
+        if noises.random_walk_m or noises.correlated_sigma_m or not self.is_interpolated:
             return negative_log_likelihood(self.axis_positions, noises, self.weight)
         ln_z = log(noises.sigma_z_m) / self.step
         ln_ratio = log(noises.sigma_a_m_s2) / self.step - ln_z
@@ -218,10 +220,9 @@ def fit_noises(
             replace(positions, correlated_noise=(noises.correlated_sigma_m, noises.tau_s))
             for positions in position_batches
         )
-    sigma_ratio = noises.sigma_a_m_s2 / sigma_z_m
     (fitted_positions,) = fit_ratios(
         position_batches,
-        [sigma_ratio],
+        [noises.sigma_a_m_s2 / sigma_z_m],
         noises.random_walk_m / sigma_z_m,
         measurement_weights,
         sigma_z_m,
@@ -272,27 +273,30 @@ class NoiseFit:
         return self.score(self.noises)
 
 
-def filter_positions(intervals: Preintegrated) -> Positions:
-    """Convert the input of KF to positions; the error of the initial state is unknown."""
-    measurement_count = len(intervals.measurement_m)
+def filter_positions(kf_input: Preintegrated) -> Positions:
+    """Return KF's measurements and integrated input as Positions with one segment.
+
+    Its unknown constants are the errors of the initial position and velocity.
+    """
+    measurement_count = len(kf_input.measurement_m)
     prior_precision = np.zeros((measurement_count + 1, 2))
     prior_precision[0] = KNOWN_START_PRECISION
-    measured_m = np.append(np.nan, intervals.measurement_m - intervals.initial.position_m)[:, None]
+    measured_m = np.append(np.nan, kf_input.measurement_m - kf_input.initial.position_m)[:, None]
     dp, dv = np.zeros((2, 1, 1, 3, measurement_count))
-    dp[0, 0, 0] = intervals.delta_position_m
-    dv[0, 0, 0] = intervals.delta_velocity_m_s
+    dp[0, 0, 0] = kf_input.delta_position_m
+    dv[0, 0, 0] = kf_input.delta_velocity_m_s
     # an initial position or velocity error changes only the first increment
-    dp[0, 0, 1:, 0] = (1.0, intervals.length_s[0])
+    dp[0, 0, 1:, 0] = (1.0, kf_input.length_s[0])
     dv[0, 0, 2, 0] = 1.0
     return centre_on_path(
         Positions(
             measurement_m=measured_m,
             segment_starts=np.array([0]),
-            length_s=intervals.length_s,
-            noise_unit=intervals.noise_unit.T,
-            noise_fixed=intervals.noise_fixed.T,
+            length_s=kf_input.length_s,
+            unit_process_noise=kf_input.unit_process_noise.T,
+            added_process_noise=kf_input.added_process_noise.T,
             prior_precision=prior_precision,
-            constant_sigma=np.sqrt([INITIAL_COVARIANCE[0], INITIAL_COVARIANCE[2]]),
+            constants_prior_sigma=np.sqrt([INITIAL_COVARIANCE[0], INITIAL_COVARIANCE[2]]),
             delta_position_m=dp,
             delta_velocity_m_s=dv,
         )
@@ -307,15 +311,15 @@ def maximise_likelihood(
 ) -> NoiseFit:
     """Estimate the noises and, if ``fits_outliers`` is True, the outliers by maximum likelihood.
 
-    The fit of a long flight starts at the result of the flight's first measurements, which leaves
-    only small changes: fewer nodes and fewer iterations are then sufficient.
+    A long flight starts from the fit of its first measurements, so that fewer nodes and iterations
+    are sufficient.
 
     Parameters
     ----------
     axis_positions : sequence of Positions
         Axes of the same measurements.
     start_noises : Noises
-        Initial values. Random walk and time-correlated noise are only fitted if not zero.
+        Initial values. A random walk or time-correlated noise of zero stays zero.
     weight : ndarray, shape (m,)
         Initial weight of each measurement.
     fits_outliers : bool
@@ -340,18 +344,20 @@ def maximise_likelihood(
         noises = _maximise_by_gradient(
             likelihood, noises, MAX_COARSE_ITERATIONS if iteration else MAX_FINAL_ITERATIONS
         )
-        expected_squares_m2, axis_counts = _expected_squares_of_axes(axis_positions, noises, weight)
+        expected_squared_errors_m2, axis_counts = _expected_squared_errors(
+            axis_positions, noises, weight
+        )
         # outliers increase the estimated SIGMA_Z, which would hide the outliers; they hardly change
         # the median
         median_square = float(
-            np.median(expected_squares_m2 / axis_counts)
+            np.median(expected_squared_errors_m2 / axis_counts)
             / (chdtri(axis_counts[0], 0.5) / axis_counts[0])
         )
         # if the median error is above the search range, large errors are noise, not outliers
         if median_square > SIGMA_Z_SEARCH_M[1] ** 2:
             break
         sigma_z_variance_m2 = min(noises.sigma_z_m**2, MAX_SIGMA_Z_RATIO**2 * median_square)
-        normalised_squares = expected_squares_m2 / sigma_z_variance_m2
+        normalised_squares = expected_squared_errors_m2 / sigma_z_variance_m2
         previous_probability = outlier_probability
         for _ in range(MAX_OUTLIER_ITERATIONS if is_long else 1):
             outlier_probability = _outlier_probability(
@@ -379,9 +385,11 @@ def maximise_likelihood(
     noises = _maximise_by_gradient(likelihood, noises)
     sigma_z_variance_factor = 1.0
     if outlier_probability.any():
-        expected_squares_m2, axis_counts = _expected_squares_of_axes(axis_positions, noises, weight)
+        expected_squared_errors_m2, axis_counts = _expected_squared_errors(
+            axis_positions, noises, weight
+        )
         sigma_z_variance_factor = outlier_variance_factor(
-            expected_squares_m2 / noises.sigma_z_m**2,
+            expected_squared_errors_m2 / noises.sigma_z_m**2,
             axis_counts,
             outlier_probability,
             outlier_width,
@@ -398,18 +406,18 @@ def maximise_likelihood(
 
 
 def outlier_probability(axis_positions: Sequence[Positions], fit: NoiseFit, count: int) -> Array:
-    """Return the outlier probability of ``count`` measurements with the noises of another fit."""
+    """Return the outlier probability of ``count`` measurements, with the noises of ``fit``."""
     probability = np.zeros(count)
     for _ in range(MAX_COARSE_ITERATIONS):
         weight = 1.0 - probability * (1.0 - fit.outlier_width**-2.0)
-        squares_m2, axis_counts = _expected_squares_of_axes(axis_positions, fit.noises, weight)
+        squares_m2, axis_counts = _expected_squared_errors(axis_positions, fit.noises, weight)
         probability = _outlier_probability(
             squares_m2 / fit.noises.sigma_z_m**2, axis_counts, fit.outlier_share, fit.outlier_width
         )
     return probability
 
 
-def _expected_squares_of_axes(
+def _expected_squared_errors(
     axis_positions: Sequence[Positions], noises: Noises, measurement_weights: Array
 ) -> tuple[Array, Array]:
     """Return the expected squared error (m²) and the number of axes of each measurement."""
@@ -420,17 +428,19 @@ def _expected_squares_of_axes(
             1.0, noises.random_walk_m, measurement_weights / noises.sigma_z_m**2
         )
         squares_and_counts.append(
-            expected_squares(scaled_positions, noises.sigma_a_m_s2, scaled_variance, constants)
+            expected_squared_errors(
+                scaled_positions, noises.sigma_a_m_s2, scaled_variance, constants
+            )
         )
     squares_m2, axis_counts = np.sum(squares_and_counts, axis=0)[:, -len(measurement_weights) :]
     return squares_m2, axis_counts
 
 
 def _outlier_probability(
-    expected_squares: Array, axis_counts: Array, outlier_share: float, outlier_width: float
+    normalised_squares: Array, axis_counts: Array, outlier_share: float, outlier_width: float
 ) -> Array:
     log_odds = np.log(outlier_share / (1.0 - outlier_share)) - axis_counts * np.log(outlier_width)
-    return np.asarray(expit(log_odds + 0.5 * expected_squares * (1.0 - outlier_width**-2.0)))
+    return np.asarray(expit(log_odds + 0.5 * normalised_squares * (1.0 - outlier_width**-2.0)))
 
 
 def outlier_variance_factor(

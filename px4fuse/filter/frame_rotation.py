@@ -23,7 +23,7 @@ from px4fuse.filter.fitting import Noises, fit_noises, maximise_likelihood
 from px4fuse.filter.imu_motion import (
     MAX_IMU_INTERVAL_S,
     MIN_SEGMENT_MEASUREMENTS,
-    SignalCache,
+    MotionCache,
     prepare_motion,
 )
 from px4fuse.filter.settings import Settings
@@ -45,11 +45,11 @@ MIN_MEASUREMENTS = 50
 MIN_PART_SAMPLES = 3
 # Maximum number of positions for the heading error; longer tracks are downsampled
 MAX_MEASUREMENTS = 1000
-# Maximum p-value of a constant heading error for the result that it changes in flight
+# The heading error changes in flight if the p-value of a constant error is below this limit
 MAX_DRIFT_P_VALUE = 0.002
 # Minimum reported change (°) of the heading error in flight
 MIN_DRIFT_DEG = 5.5
-# Maximum yaw rate (°/s) for a comparison of headings: a delay of 0.2 s causes an error of 2°
+# Headings are compared below this yaw rate (°/s): a delay of 0.2 s then causes an error of 2°
 MAX_YAW_RATE_DEG_S = 10.0
 # Minimum σ (°) of a heading difference between source and EKF2
 MIN_SIGMA_DEG = 0.5
@@ -171,8 +171,8 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     ]
     position_samples = position_samples.set_axis(position_samples.index.to_numpy() + offset_s)
     noises = Noises(settings.sigma_a_m_s2, sigma_z_m)
-    # the mounting angle of the source is unknown, so an orientation only shows if the misalignment
-    # is constant
+    # the mounting angle of the source is unknown: orientations only show that the misalignment is
+    # constant
     return _estimate_from_positions(
         flight,
         position_samples,
@@ -216,13 +216,13 @@ def _compare_orientations(
     """Compare the source's heading with EKF2's logged heading; None with too few samples."""
     orientation_samples = cut_to_segment(orientation, segment)
     time_s = orientation_samples.index.to_numpy() + offset_s
-    attitude_s = attitude.index.to_numpy()
-    is_covered = (time_s >= attitude_s[0]) & (time_s <= attitude_s[-1])
+    attitude_time_s = attitude.index.to_numpy()
+    is_covered = (time_s >= attitude_time_s[0]) & (time_s <= attitude_time_s[-1])
     if np.count_nonzero(is_covered) < MIN_FLIGHT_PARTS * MIN_PART_SAMPLES:
         return None
     source_yaw_rad = heading_rad(orientation_samples)[is_covered]
     time_s = time_s[is_covered]
-    yaw_rad = np.interp(time_s, attitude_s, heading_rad(attitude))
+    yaw_rad = np.interp(time_s, attitude_time_s, heading_rad(attitude))
     rotation_rad = source_yaw_rad - yaw_rad
     rotation_rad -= 2.0 * np.pi * np.round(np.median(rotation_rad) / (2.0 * np.pi))
     is_calm = np.abs(np.gradient(yaw_rad, time_s)) < np.radians(MAX_YAW_RATE_DEG_S)
@@ -257,31 +257,34 @@ def _estimate_from_positions(
     """
     time_s = position_samples.index.to_numpy()
     part_length_s = max(POSITION_PART_S, 2 * MIN_SEGMENT_MEASUREMENTS * median_interval(time_s))
-    signal_cache = SignalCache()
+    motion_cache = MotionCache()
     rotation_rad = 0.0
     for _ in range(MAX_LINEARISATIONS):
-        c, s = np.cos(rotation_rad), np.sin(rotation_rad)
+        cosine, sine = np.cos(rotation_rad), np.sin(rotation_rad)
         motion = prepare_motion(
             flight,
             time_s,
-            position_samples.to_numpy() @ np.array([[c, -s], [s, c]]),
+            position_samples.to_numpy() @ np.array([[cosine, -sine], [sine, cosine]]),
             directions=np.eye(3)[:2],
             dt_s=dt_s,
-            signal_cache=signal_cache,
+            motion_cache=motion_cache,
             heading_sigma_rad=HEADING_SIGMA_RAD,
             max_segment_s=part_length_s,
         )
         if isinstance(motion, Unavailable):
             return structs.replace(motion, what="heading error")
-        spans_s = motion.time_s[np.column_stack([motion.edges[:-1], motion.edges[1:] - 1])]
+        spans_s = motion.time_s[
+            np.column_stack([motion.segment_edges[:-1], motion.segment_edges[1:] - 1])
+        ]
         is_long = np.ptp(spans_s, axis=1) >= MIN_POSITION_PART_S
         if not is_long.any():
             return Unavailable(
                 "heading error",
-                f"no part of the flight without an IMU gap has {MIN_POSITION_PART_S:g} s",
+                "the longest part of the flight without an IMU gap is shorter than "
+                f"{MIN_POSITION_PART_S:g} sine",
                 "Analyse a longer segment.",
             )
-        part_positions = motion.at(0.0)
+        part_positions = motion.positions_at_offset(0.0)
         # use the path without IMU noise as sensitivity to the heading: noise would bias the
         # estimate to zero (errors in variables)
         for increments in (part_positions.delta_position_m, part_positions.delta_velocity_m_s):
@@ -293,7 +296,7 @@ def _estimate_from_positions(
         fitted_positions = fit_noises([part_positions], noises, motion.weight)
         constants = fitted_positions.constants()[is_long, 0]
         constant_covariance = np.linalg.inv(fitted_positions.information())[is_long, 0]
-        # the path has the scale of the positions, which is estimated too
+        # the sensitivity to heading is computed from positions: divide by their estimated scale
         position_scale = np.maximum(1.0 + constants[:, -1], MIN_POSITION_SCALE)
         error_rad = constants[:, HEADING_ERROR_INDEX] / position_scale
         heading_variance = (
@@ -307,7 +310,7 @@ def _estimate_from_positions(
     # variance of the true heading error: variance of the estimates minus that of their errors
     excess_variance = max(float(np.mean(difference_rad**2 - heading_variance)), 0.0)
     drift_variance = 0.0 if has_constant_heading else excess_variance
-    # shrink each estimate towards the mean, according to its estimation error
+    # shrink each estimate towards the mean: the more, the larger its estimation error
     drift_fraction = drift_variance / (drift_variance + heading_variance)
     rotation_rad = float(np.angle(np.exp(1j * rotation_rad)))
     parts = [

@@ -47,7 +47,7 @@ MAX_KNOTS = 40
 # Columns of the design matrix: accelerometer bias forward, accelerometer bias right, frame rotation
 FORWARD, RIGHT, ROTATION = range(3)
 CONSTANT_COUNT = 3
-# Tested factors on KF's SIGMA_A: fitted biases and tilt reduce the acceleration noise
+# Tested multiples of KF's SIGMA_A: with biases and tilt fitted, the acceleration noise is smaller
 TESTED_SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 # Tested scale factors of the position source
 SCALE_GRID = np.linspace(0.7, 1.3, 7)
@@ -55,9 +55,9 @@ SCALE_GRID = np.linspace(0.7, 1.3, 7)
 MAX_TESTED_TIMES = 800
 # Number of tested jump times per batch, which limits memory
 STEP_BATCH_SIZE = 200
-# Time (s) after a jump in which measurements are ignored: a burst of outliers is no jump
+# Measurements within this time (s) after a tested jump are ignored: a burst of outliers is no jump
 OUTLIER_BURST_S = 1.0
-# Time (s) after a jump in which outliers are tested again: they may be shifted positions
+# Outliers within this time (s) after a jump are tested again: they may be shifted positions
 OUTLIERS_AFTER_STEP_S = 6.0
 # Maximum probability of a false detection of a jump, per flight
 MAX_STEP_FALSE_ALARM_P = 1e-3
@@ -197,7 +197,7 @@ def _fit_sigma_a(
 
 
 def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
-    """Return the index of the only minimum of a sequence, searched from the middle."""
+    """Return the index of the minimum of a sequence with one minimum; search from the middle."""
     index = count // 2
     direction = 1 if index + 1 < count and score(index + 1) < score(index) else -1
     while 0 <= index + direction < count and score(index + direction) < score(index):
@@ -206,7 +206,7 @@ def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
 
 
 def _fit_scale(design: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> Estimate:
-    """Estimate the scale factor error of the positions from fits with several scales."""
+    """Estimate the scale factor error of the positions from fits with scales on a grid."""
     fit_at = cache(
         lambda grid_index: design.fit(sigma_a, is_skipped, float(SCALE_GRID[grid_index]))
     )
@@ -233,8 +233,8 @@ def _find_jumps(
 ) -> tuple[tuple[Jump, ...], BoolArray]:
     """Detect lasting jumps of the positions; return the jumps in time order, and an outlier mask.
 
-    Tested times: announced jumps, the best time of a scan, and the start of each run of outliers,
-    because the first measurements after a jump look like outliers.
+    Jumps are tested at the announced times, at the most likely time of the flight, and at the start
+    of each run of outliers, because the first measurements after a jump look like outliers.
     """
     jumps: list[Jump] = []
 
@@ -529,7 +529,10 @@ class DesignMatrix:
     def whitened_design(
         self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
-        """Return whitened innovations (a, m), their design matrix (a, m, k), and Σ ln S."""
+        """Return whitened innovations, their design matrix, and Σ ln S.
+
+        The arrays have the shapes (axes, measurements) and (axes, measurements, columns).
+        """
         signals, axis_count, step_count = self.signals, self.axis_count, self.step_columns.shape[1]
         column_count = len(self.prior_sigma)
         whitened_innovations = np.empty((axis_count, len(is_skipped)))
@@ -584,34 +587,36 @@ def make_design_matrix(
     settings = replace(settings, input="imu")
     timeline = make_timeline(shifted_axes[0], settings)
     common_accelerations = _common_accelerations(attitude, acceleration)
-    axis_inputs = [preintegrate(axis, settings) for axis in shifted_axes]
+    kf_inputs = [preintegrate(axis, settings) for axis in shifted_axes]
     column_pairs: list[ArrayPair] = []
-    for axis, interval_input in zip(axes, axis_inputs, strict=True):
-        column_pairs.append((interval_input.delta_position_m, interval_input.delta_velocity_m_s))
+    for axis, kf_input in zip(axes, kf_inputs, strict=True):
+        column_pairs.append((kf_input.delta_position_m, kf_input.delta_velocity_m_s))
         column_pairs += [
             _integrate_signal(value @ axis.direction, input_time_s, timeline)
             for input_time_s, value in common_accelerations
         ]
-    time_s = axes[0].measurement_time_s[-len(axis_inputs[0].measurement_m) :]
+    time_s = axes[0].measurement_time_s[-len(kf_inputs[0].measurement_m) :]
     hat_time_s, hat_functions = _hat_functions(
         time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s
     )
     column_pairs += [_integrate_signal(hat, hat_time_s, timeline) for hat in hat_functions]
     dp, dv = (np.stack(arrays, axis=1) for arrays in zip(*column_pairs, strict=True))
     measured_m = np.zeros_like(dp)
-    for index, interval_input in enumerate(axis_inputs):
+    for index, kf_input in enumerate(kf_inputs):
         # positions relative to the first measurement, which is KF's initial position
         measured_m[:, index * (1 + CONSTANT_COUNT)] = (
-            interval_input.measurement_m - interval_input.initial.position_m
+            kf_input.measurement_m - kf_input.initial.position_m
         )
     signals = replace(
-        axis_inputs[0],
+        kf_inputs[0],
         delta_position_m=dp,
         delta_velocity_m_s=dv,
         measurement_m=measured_m,
         # all axes share one process noise, also the additional one in gaps of the IMU
-        noise_fixed=np.mean([each.noise_fixed for each in axis_inputs], axis=0),
-        initial=replace(axis_inputs[0].initial, position_m=0.0),
+        added_process_noise=np.mean(
+            [kf_input.added_process_noise for kf_input in kf_inputs], axis=0
+        ),
+        initial=replace(kf_inputs[0].initial, position_m=0.0),
     )
     tilt_sigma = np.full(len(axes) * len(hat_functions), TILT_SIGMA_RAD * constants.g)
     prior_sigma = np.append(np.full(CONSTANT_COUNT, np.inf), tilt_sigma)
@@ -633,8 +638,8 @@ def _common_accelerations(
     """Return times and NED accelerations of unit biases forward and right and a unit rotation."""
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
-    attitude_s = attitude.index.to_numpy()
-    biases = [(attitude_s, body_to_ned.apply(np.eye(3)[axis])) for axis in (FORWARD, RIGHT)]
+    attitude_time_s = attitude.index.to_numpy()
+    biases = [(attitude_time_s, body_to_ned.apply(np.eye(3)[axis])) for axis in (FORWARD, RIGHT)]
     north, east, _ = acceleration.ned_m_s2.T
     return [*biases, (acceleration.time_s, np.column_stack([-east, north, 0.0 * north]))]
 

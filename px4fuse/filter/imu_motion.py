@@ -1,4 +1,4 @@
-"""Motion from the IMU alone, and its sensitivity to every constant IMU error.
+"""Motion from the IMU alone, and its sensitivity to constant errors of IMU, attitude and scale.
 
 A segment is a part of the flight, at most 30 s long, without a gap in IMU or attitude. The attitude
 is integrated from the gyroscopes, starting at EKF2's attitude. EKF2's later attitude is not used,
@@ -44,9 +44,9 @@ from px4fuse.trajectory.rotation import (
 HEADING_SIGMA_RAD = 0.05
 # Prior σ of the unknown constants, wide for consumer sensors: initial tilt and heading (rad), gyro
 # bias (rad/s), accelerometer bias (m/s²), scale of the positions (1)
-CONSTANT_SIGMAS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
-# Maximum gyro bias (rad/s) that the prior of the constants covers (5 σ); a larger bias that EKF2
-# removed from its attitude is removed here, too
+CONSTANTS_PRIOR_SIGMA = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
+# Maximum gyro bias (rad/s) that the prior of the constants covers (5 σ); a larger bias is removed,
+# as estimated from EKF2's attitude
 MAX_PRIOR_GYRO_BIAS_RAD_S = 0.02
 # Maximum length (s) of a segment: in 30 s a gyro bias of 0.004 rad/s rotates the attitude by
 # 0.12 rad, with a linearisation error of 0.07 m/s²
@@ -58,7 +58,7 @@ COARSE_OFFSET_COUNT = 25
 # Approximate number of position measurements in the coarse search for a time offset
 COARSE_MEASUREMENTS = 600
 # Maximum number of array elements per batch of time offsets, which limits memory
-SIGNALS_PER_BATCH = 2**16
+MAX_BATCH_ELEMENTS = 2**16
 # Minimum number of position measurements in all segments together
 MIN_MEASUREMENTS = 30
 # Minimum number of position measurements in a segment
@@ -67,15 +67,15 @@ MIN_SEGMENT_MEASUREMENTS = 15
 MIN_KEPT_MEASUREMENTS = 5
 # Interval (s) over which the IMU is averaged before integration
 INTEGRATION_STEP_S = 0.02
-# Prior precision of position (1/m²) and velocity (s²/m²) at the start of a segment: negligible, but
-# it avoids a singular matrix
+# Prior precision of position (1/m²) and velocity (s²/m²) at the start of a segment: negligible, it
+# only avoids a singular matrix
 START_PRECISION = 1e-6, 1e-4
 # Maximum median interval (s) between IMU samples for an estimate of the motion
 MAX_IMU_INTERVAL_S = 0.025
 
 
 @dataclass(frozen=True)
-class Signals:
+class SegmentMotion:
     """Motion of one segment from the IMU, and its sensitivity to constant errors.
 
     ``table``, shape (n, 2, 3, 1 + constants), contains position and velocity (second dimension)
@@ -86,7 +86,7 @@ class Signals:
     time_s: Array
     table: Array
 
-    def at(self, time_s: Array) -> tuple[Array, Array]:
+    def interpolate(self, time_s: Array) -> tuple[Array, Array]:
         """Interpolate position and velocity at other times, shape (..., 3, 1 + constants)."""
         last_index = len(self.time_s) - 2
         row = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
@@ -98,13 +98,13 @@ class Signals:
         return position, velocity
 
 
-# Signals that were computed for a flight, by time span (s)
-SignalCache = dict[Span, Signals]
+# Motion that was computed for the segments of a flight, by time span (s)
+MotionCache = dict[Span, SegmentMotion]
 
 
 @dataclass(frozen=True)
 class PreparedMotion:
-    """Position measurements and IMU motion of s segments, for any time offset.
+    """Position measurements and IMU motion of s segments; m measurements along a axes.
 
     Attributes
     ----------
@@ -112,9 +112,9 @@ class PreparedMotion:
     measurement_m : ndarray, shape (m, a)
         Positions relative to the segment's first position; NaN if missing.
     weight : ndarray, shape (m,)
-    edges : ndarray of int, shape (s + 1,)
-        First measurement of each segment, and m.
-    signals : tuple of Signals
+    segment_edges : ndarray of int, shape (s + 1,)
+        Index of the first measurement of each segment; the last element is m.
+    segment_motions : tuple of SegmentMotion
     directions : ndarray, shape (a, 3)
         Unit vectors of the axes in NED.
     dt_s : float
@@ -126,77 +126,99 @@ class PreparedMotion:
     time_s: Array
     measurement_m: Array
     weight: Array
-    edges: IntArray
-    signals: tuple[Signals, ...]
+    segment_edges: IntArray
+    segment_motions: tuple[SegmentMotion, ...]
     directions: Array
     dt_s: float
     imu_interval_s: float
     heading_sigma_rad: float = HEADING_SIGMA_RAD
 
     def downsample(self, max_count: int) -> PreparedMotion:
-        """Keep about ``max_count`` measurements; keep all if every segment would get too few."""
+        """Keep about ``max_count`` measurements; keep all if no segment would have enough."""
         is_kept = np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / max_count)) == 0
-        kept_counts = np.add.reduceat(is_kept.astype(int), self.edges[:-1])
-        keeps_enough = kept_counts >= MIN_KEPT_MEASUREMENTS
-        if not keeps_enough.any():
+        kept_counts = np.add.reduceat(is_kept.astype(int), self.segment_edges[:-1])
+        has_enough_kept = kept_counts >= MIN_KEPT_MEASUREMENTS
+        if not has_enough_kept.any():
             return self
-        is_kept &= np.repeat(keeps_enough, np.diff(self.edges))
+        is_kept &= np.repeat(has_enough_kept, np.diff(self.segment_edges))
         arrays = {
             name: getattr(self, name)[is_kept] for name in ("time_s", "measurement_m", "weight")
         }
-        signals = tuple(self.signals[index] for index in np.flatnonzero(keeps_enough))
+        segment_motions = tuple(
+            self.segment_motions[index] for index in np.flatnonzero(has_enough_kept)
+        )
         return replace(
-            self, **arrays, edges=np.cumsum([0, *kept_counts[keeps_enough]]), signals=signals
+            self,
+            **arrays,
+            segment_edges=np.cumsum([0, *kept_counts[has_enough_kept]]),
+            segment_motions=segment_motions,
         )
 
-    def positions(self, offset_s: Array) -> Positions:
-        """Return positions and integrated IMU data for each time offset, with a known scale."""
+    def positions(self, time_offsets_s: Array) -> Positions:
+        """Return positions and integrated IMU data for each time offset; the scale is 1."""
         length_s = np.diff(self.time_s)
-        noise_unit = self.dt_s * np.stack(continuous_noise_unit(length_s))
+        unit_process_noise = self.dt_s * np.stack(continuous_noise_unit(length_s))
         prior_precision = np.zeros((len(self.time_s), 2))
-        prior_precision[self.edges[:-1]] = START_PRECISION
-        signal_shape = len(self.directions), len(offset_s), 1 + len(CONSTANT_SIGMAS), len(length_s)
+        prior_precision[self.segment_edges[:-1]] = START_PRECISION
+        signal_shape = (
+            len(self.directions),
+            len(time_offsets_s),
+            1 + len(CONSTANTS_PRIOR_SIGMA),
+            len(length_s),
+        )
         dp, dv = np.zeros((2, *signal_shape))
-        for begin, end, signals in zip(self.edges, self.edges[1:], self.signals, strict=False):
-            measured_s = self.time_s[begin:end]
+        for begin, end, segment_motion in zip(
+            self.segment_edges, self.segment_edges[1:], self.segment_motions, strict=False
+        ):
+            measurement_time_s = self.time_s[begin:end]
             # both arrays have the shape (axes, time offsets, constants, times)
             position, velocity = (
                 np.moveaxis(self.directions @ signal, (2, 0, 3, 1), range(4))
-                for signal in signals.at(measured_s + offset_s[:, None])
+                for signal in segment_motion.interpolate(
+                    measurement_time_s + time_offsets_s[:, None]
+                )
             )
             interval_rows = np.s_[:, :, :-1, begin : end - 1]
             dv[interval_rows] = np.diff(velocity)
-            dp[interval_rows] = np.diff(position) - velocity[..., :-1] * np.diff(measured_s)
+            dp[interval_rows] = np.diff(position) - velocity[..., :-1] * np.diff(measurement_time_s)
         return Positions(
             measurement_m=self.measurement_m,
-            segment_starts=self.edges[:-1],
+            segment_starts=self.segment_edges[:-1],
             length_s=length_s,
-            noise_unit=noise_unit,
-            noise_fixed=np.zeros_like(noise_unit),
+            unit_process_noise=unit_process_noise,
+            added_process_noise=np.zeros_like(unit_process_noise),
             prior_precision=prior_precision,
-            constant_sigma=np.r_[CONSTANT_SIGMAS[:2], self.heading_sigma_rad, CONSTANT_SIGMAS[3:]],
+            constants_prior_sigma=np.r_[
+                CONSTANTS_PRIOR_SIGMA[:2], self.heading_sigma_rad, CONSTANTS_PRIOR_SIGMA[3:]
+            ],
             delta_position_m=dp,
             delta_velocity_m_s=dv,
         )
 
-    def at(self, offset_s: float) -> Positions:
-        """Return the positions for one time offset, with an unknown scale."""
+    def positions_at_offset(self, offset_s: float) -> Positions:
+        """Return positions and integrated IMU data for one time offset; the scale is unknown."""
         return next(self.position_batches(np.array([offset_s])))
 
-    def position_batches(self, offset_s: Array, *, has_scale: bool = True) -> Iterator[Positions]:
-        """Yield the positions for batches of time offsets; ``has_scale``: with an unknown scale."""
-        signal_count = len(self.time_s) * len(self.directions) * (1 + len(CONSTANT_SIGMAS))
-        batch_size = max(1, SIGNALS_PER_BATCH // signal_count)
-        for batch in np.split(offset_s, range(batch_size, len(offset_s), batch_size)):
+    def position_batches(
+        self, time_offsets_s: Array, *, has_scale: bool = True
+    ) -> Iterator[Positions]:
+        """Yield positions and integrated IMU data for batches of time offsets.
+
+        ``has_scale`` is True for an unknown scale, False for a scale of 1.
+        """
+        signal_count = len(self.time_s) * len(self.directions) * (1 + len(CONSTANTS_PRIOR_SIGMA))
+        batch_size = max(1, MAX_BATCH_ELEMENTS // signal_count)
+        for batch in np.split(time_offsets_s, range(batch_size, len(time_offsets_s), batch_size)):
             positions = self.positions(batch)
             yield centre_on_path(positions, has_scale=True) if has_scale else positions
 
     def search_offset(
         self, noises: Noises, sigma_a_factors: Sequence[float] = (1.0,), *, has_scale: bool = True
     ) -> tuple[float, Noises]:
-        """Return time offset and noises with the maximum likelihood on a coarse grid.
+        """Return the time offset and SIGMA_A with the maximum likelihood on a coarse grid.
 
-        ``sigma_a_factors`` are tested on SIGMA_A; ``has_scale`` is True for an unknown scale.
+        ``sigma_a_factors`` are the tested multiples of SIGMA_A; ``has_scale`` is True for an
+        unknown scale.
         """
         tested_offsets_s = np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSET_COUNT)
         sigma_z_m = noises.sigma_z_m
@@ -230,7 +252,7 @@ def prepare_motion(
     directions: Array,
     dt_s: float,
     weight: Array | None = None,
-    signal_cache: SignalCache | None = None,
+    motion_cache: MotionCache | None = None,
     heading_sigma_rad: float = HEADING_SIGMA_RAD,
     max_segment_s: float = MAX_SEGMENT_S,
 ) -> PreparedMotion | Unavailable:
@@ -243,7 +265,7 @@ def prepare_motion(
     measurement_m : ndarray, shape (m, a)
     directions, dt_s, weight, heading_sigma_rad
         See :class:`PreparedMotion`; weights are 1 by default.
-    signal_cache : dict, optional
+    motion_cache : dict, optional
         IMU motion of this flight that was already computed; new motion is added.
     max_segment_s : float
         Maximum length of a segment.
@@ -254,30 +276,32 @@ def prepare_motion(
         return imu
     if isinstance(attitude, Unavailable):
         return attitude
-    signal_cache = {} if signal_cache is None else signal_cache
-    segment_signals: list[Signals] = []
-    imu_s = imu.index.to_numpy()
-    attitude_s = attitude.index.to_numpy()
+    motion_cache = {} if motion_cache is None else motion_cache
+    segment_motions: list[SegmentMotion] = []
+    imu_time_s = imu.index.to_numpy()
+    attitude_time_s = attitude.index.to_numpy()
     rows_by_segment: list[IntArray] = []
-    for begin_s, end_s in _covered_spans(imu_s, attitude_s):
+    for begin_s, end_s in _covered_spans(imu_time_s, attitude_time_s):
         covered_rows = np.flatnonzero(
             (time_s >= begin_s + MAX_OFFSET_S) & (time_s <= end_s - MAX_OFFSET_S)
         )
         if not len(covered_rows):
             continue
-        covered_s = time_s[covered_rows]
-        segment_count = max(1, int(np.ceil((covered_s[-1] - covered_s[0]) / max_segment_s)))
-        cut_times_s = np.linspace(covered_s[0], covered_s[-1], segment_count + 1)[1:-1]
-        for segment_rows in np.split(covered_rows, np.searchsorted(covered_s, cut_times_s)):
+        covered_time_s = time_s[covered_rows]
+        segment_count = max(
+            1, int(np.ceil((covered_time_s[-1] - covered_time_s[0]) / max_segment_s))
+        )
+        cut_times_s = np.linspace(covered_time_s[0], covered_time_s[-1], segment_count + 1)[1:-1]
+        for segment_rows in np.split(covered_rows, np.searchsorted(covered_time_s, cut_times_s)):
             if len(segment_rows) >= MIN_SEGMENT_MEASUREMENTS:
                 rows_by_segment.append(segment_rows)
                 span = (
                     time_s[segment_rows[0]] - MAX_OFFSET_S,
                     time_s[segment_rows[-1]] + MAX_OFFSET_S,
                 )
-                if span not in signal_cache:
-                    signal_cache[span] = make_signals(imu, attitude, span)
-                segment_signals.append(signal_cache[span])
+                if span not in motion_cache:
+                    motion_cache[span] = make_segment_motion(imu, attitude, span)
+                segment_motions.append(motion_cache[span])
     used_rows = np.concatenate([np.zeros(0, dtype=np.intp), *rows_by_segment])
     if len(used_rows) < MIN_MEASUREMENTS:
         return Unavailable(
@@ -296,54 +320,54 @@ def prepare_motion(
         (measured_m - first_m).to_numpy(),
         np.ones(len(used_rows)) if weight is None else weight[used_rows],
         segment_edges,
-        tuple(segment_signals),
+        tuple(segment_motions),
         directions,
         dt_s,
-        float(np.median(np.diff(imu_s))),
+        float(np.median(np.diff(imu_time_s))),
         heading_sigma_rad,
     )
 
 
-def _covered_spans(imu_s: Array, attitude_s: Array) -> list[Span]:
+def _covered_spans(imu_time_s: Array, attitude_time_s: Array) -> list[Span]:
     """Find the time spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
-    if len(imu_s) < 2 or np.median(np.diff(imu_s)) > MAX_IMU_INTERVAL_S:
+    if len(imu_time_s) < 2 or np.median(np.diff(imu_time_s)) > MAX_IMU_INTERVAL_S:
         return []
-    gap_indices = np.flatnonzero(imu_gaps(imu_s))
-    starts_s = np.maximum(imu_s[np.r_[0, gap_indices + 1]], attitude_s[0])
-    ends = np.minimum(imu_s[np.r_[gap_indices, len(imu_s) - 1]], attitude_s[-1])
-    return list(zip(starts_s.tolist(), ends.tolist(), strict=True))
+    gap_indices = np.flatnonzero(imu_gaps(imu_time_s))
+    starts_s = np.maximum(imu_time_s[np.r_[0, gap_indices + 1]], attitude_time_s[0])
+    ends_s = np.minimum(imu_time_s[np.r_[gap_indices, len(imu_time_s) - 1]], attitude_time_s[-1])
+    return list(zip(starts_s.tolist(), ends_s.tolist(), strict=True))
 
 
-def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> Signals:
+def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> SegmentMotion:
     """Compute the motion in NED from the IMU, and its sensitivity to each constant."""
-    imu_s = imu.index.to_numpy()
+    imu_time_s = imu.index.to_numpy()
     first_row, end_row = np.searchsorted(
-        imu_s, [span[0] - 2 * INTEGRATION_STEP_S, span[1] + 2 * INTEGRATION_STEP_S], side="left"
+        imu_time_s,
+        [span[0] - 2 * INTEGRATION_STEP_S, span[1] + 2 * INTEGRATION_STEP_S],
+        side="left",
     )
     imu_samples = imu.iloc[first_row:end_row]
-    imu_s = imu_s[first_row:end_row]
+    imu_time_s = imu_time_s[first_row:end_row]
     columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
-    imu_integral = cumulative_integral(imu_samples[columns].to_numpy(), imu_s)
-    step_times_s = np.arange(imu_s[0], imu_s[-1], INTEGRATION_STEP_S)
+    imu_integral = cumulative_integral(imu_samples[columns].to_numpy(), imu_time_s)
+    step_times_s = np.arange(imu_time_s[0], imu_time_s[-1], INTEGRATION_STEP_S)
     integrals_at_steps = np.column_stack(
-        [np.interp(step_times_s, imu_s, column) for column in imu_integral.T]
+        [np.interp(step_times_s, imu_time_s, column) for column in imu_integral.T]
     )
-    velocity_increment = integrals_at_steps[:, :3]
-    rotation_vector = integrals_at_steps[:, 3:]
-    rotation_vector -= np.outer(
-        step_times_s, _large_gyro_bias(step_times_s, rotation_vector, attitude)
-    )
-    attitude_quaternion = _integrate_gyros(step_times_s, rotation_vector, attitude)
+    specific_force_integral_m_s = integrals_at_steps[:, :3]
+    angle_rad = integrals_at_steps[:, 3:]
+    angle_rad -= np.outer(step_times_s, _large_gyro_bias(step_times_s, angle_rad, attitude))
+    attitude_quaternion = _integrate_gyros(step_times_s, angle_rad, attitude)
     # the mean specific force of each step is rotated by the attitude in the middle of the step
-    mean_force = np.diff(velocity_increment, axis=0) / INTEGRATION_STEP_S
+    mean_specific_force_m_s2 = np.diff(specific_force_integral_m_s, axis=0) / INTEGRATION_STEP_S
     body_to_ned = to_matrix(
-        multiply(attitude_quaternion[:-1], from_vector(np.diff(rotation_vector, axis=0) / 2.0))
+        multiply(attitude_quaternion[:-1], from_vector(np.diff(angle_rad, axis=0) / 2.0))
     )
-    force_ned = rotate(body_to_ned, mean_force)
-    table = np.zeros((len(mean_force), 2, 3, len(CONSTANT_SIGMAS)))
+    specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2)
+    table = np.zeros((len(mean_specific_force_m_s2), 2, 3, len(CONSTANTS_PRIOR_SIGMA)))
     position, velocity = np.moveaxis(table, 1, 0)
     acceleration = np.zeros_like(velocity)
-    acceleration[:, :, 0] = force_ned
+    acceleration[:, :, 0] = specific_force_ned_m_s2
     acceleration[:, 2, 0] += constants.g
     # a rotation of the attitude by a small angle θ adds θ × f to the acceleration; a gyro bias b
     # causes the rotation θ = -∫ R b dt
@@ -351,47 +375,60 @@ def make_signals(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> Signa
     for axis in range(3):
         next_axis = (axis + 1) % 3
         last_axis = (axis + 2) % 3
-        acceleration[:, next_axis, 1 + axis] = -force_ned[:, last_axis]
-        acceleration[:, last_axis, 1 + axis] = force_ned[:, next_axis]
-        acceleration[:, axis, 4:7] = gyro_bias_rotation[:, next_axis] * force_ned[:, [last_axis]]
-        acceleration[:, axis, 4:7] -= gyro_bias_rotation[:, last_axis] * force_ned[:, [next_axis]]
+        acceleration[:, next_axis, 1 + axis] = -specific_force_ned_m_s2[:, last_axis]
+        acceleration[:, last_axis, 1 + axis] = specific_force_ned_m_s2[:, next_axis]
+        acceleration[:, axis, 4:7] = (
+            gyro_bias_rotation[:, next_axis] * specific_force_ned_m_s2[:, [last_axis]]
+        )
+        acceleration[:, axis, 4:7] -= (
+            gyro_bias_rotation[:, last_axis] * specific_force_ned_m_s2[:, [next_axis]]
+        )
     acceleration[:, :, 7:10] = -body_to_ned
     np.cumsum(acceleration[:-1] * INTEGRATION_STEP_S, axis=0, out=velocity[1:])
     mean_velocity = velocity[:-1] + acceleration[:-1] * (INTEGRATION_STEP_S / 2.0)
     np.cumsum(mean_velocity * INTEGRATION_STEP_S, axis=0, out=position[1:])
-    return Signals(step_times_s[:-1], table)
+    return SegmentMotion(step_times_s[:-1], table)
 
 
-def _large_gyro_bias(step_times_s: Array, angle: Array, attitude: pd.DataFrame) -> Array:
-    """Return the gyro bias (rad/s) relative to the logged attitude; 0 if its prior σ covers it."""
+def _large_gyro_bias(step_times_s: Array, angle_rad: Array, attitude: pd.DataFrame) -> Array:
+    """Return the gyro bias (rad/s) from the logged attitude.
+
+    Zero up to ``MAX_PRIOR_GYRO_BIAS_RAD_S``, because the prior of the unknown constants covers it.
+    """
     samples = attitude.loc[step_times_s[0] : step_times_s[-1], Columns.QUATERNION]
     if len(samples) < MIN_KEPT_MEASUREMENTS:
         return np.zeros(3)
-    attitude_s, quaternions = samples.index.to_numpy(), samples.to_numpy()
+    attitude_time_s, quaternions = samples.index.to_numpy(), samples.to_numpy()
     angle_at_attitude = np.column_stack(
-        [np.interp(attitude_s, step_times_s, column) for column in angle.T]
+        [np.interp(attitude_time_s, step_times_s, column) for column in angle_rad.T]
     )
     excess_rad = np.diff(angle_at_attitude, axis=0) - to_vector(
         multiply(conjugate(quaternions[:-1]), quaternions[1:])
     )
-    bias = np.asarray(np.median(excess_rad / np.diff(attitude_s)[:, None], axis=0))
+    bias = np.asarray(np.median(excess_rad / np.diff(attitude_time_s)[:, None], axis=0))
     return bias if np.abs(bias).max() > MAX_PRIOR_GYRO_BIAS_RAD_S else np.zeros(3)
 
 
-def _integrate_gyros(step_times_s: Array, angle: Array, attitude: pd.DataFrame) -> Array:
+def _integrate_gyros(step_times_s: Array, angle_rad: Array, attitude: pd.DataFrame) -> Array:
     """Integrate the gyroscopes from the logged attitude at the start of a segment.
 
-    ``angle`` is the integrated angular rate (rad). Return quaternions body to NED, w first.
+    ``angle_rad`` is the integrated angular rate (rad). Return quaternions body to NED, w first.
     """
-    attitude_s = attitude.index.to_numpy()
+    attitude_time_s = attitude.index.to_numpy()
     near_rows = slice(
         *np.clip(
-            np.searchsorted(attitude_s, step_times_s[0]) + np.array([-2, 3]), 0, len(attitude_s)
+            np.searchsorted(attitude_time_s, step_times_s[0]) + np.array([-2, 3]),
+            0,
+            len(attitude_time_s),
         )
     )
     logged_quaternions = attitude.iloc[near_rows][Columns.QUATERNION].to_numpy(copy=True)
-    start_s = np.clip(step_times_s[0], attitude_s[near_rows][0], attitude_s[near_rows][-1])
-    slerp = Slerp(attitude_s[near_rows], Rotation.from_quat(logged_quaternions, scalar_first=True))
+    start_s = np.clip(
+        step_times_s[0], attitude_time_s[near_rows][0], attitude_time_s[near_rows][-1]
+    )
+    slerp = Slerp(
+        attitude_time_s[near_rows], Rotation.from_quat(logged_quaternions, scalar_first=True)
+    )
     start_quaternion = slerp(start_s).as_quat(scalar_first=True)
-    rotation_since_start = cumulative_product(from_vector(np.diff(angle, axis=0)))
+    rotation_since_start = cumulative_product(from_vector(np.diff(angle_rad, axis=0)))
     return np.vstack([start_quaternion, multiply(start_quaternion, rotation_since_start)])

@@ -32,10 +32,10 @@ from px4fuse.filter.steps import Timeline, make_timeline
 PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
 # Distance in ln σ from the maximum at which the search for the end of a 95 % interval starts
 START_LOG_DISTANCE = 0.05
-# Maximum change of the other noise's logarithm (for example SIGMA_Z in the profile of SIGMA_A)
-# between two points of a likelihood profile
+# Maximum change of ln σ of the second noise (SIGMA_Z in the profile of SIGMA_A) between two points
+# of a likelihood profile
 MAX_OTHER_LOG_STEP = 1.0
-# Tolerance of the other noise's logarithm at each point of a profile likelihood
+# Tolerance of ln σ of the second noise at each point of a likelihood profile
 OTHER_LOG_TOLERANCE = 2e-3
 
 
@@ -48,7 +48,7 @@ class Preintegrated:
     length_s : ndarray
     delta_position_m, delta_velocity_m_s : ndarray
         Δp and Δv due to the acceleration.
-    noise_unit, noise_fixed : ndarray, shape (m, 3)
+    unit_process_noise, added_process_noise : ndarray, shape (m, 3)
         Elements 00, 01, 11 of Q for SIGMA_A = 1 m/s², and of the additional Q in gaps of the IMU.
     measurement_m : ndarray
     initial : InitialState
@@ -57,8 +57,8 @@ class Preintegrated:
     length_s: Array
     delta_position_m: Array
     delta_velocity_m_s: Array
-    noise_unit: Array
-    noise_fixed: Array
+    unit_process_noise: Array
+    added_process_noise: Array
     measurement_m: Array
     initial: InitialState
 
@@ -74,7 +74,7 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
     timeline = make_timeline(axis, settings)
     last_steps, interval_index, remaining_s = _interval_index(timeline)
     step_times_s = timeline.time_s
-    noise_unit = settings.dt_s * np.stack(
+    unit_process_noise = settings.dt_s * np.stack(
         propagate_covariance(process_noise_unit(np.diff(step_times_s)), remaining_s), 1
     )
     dp, dv = integrate_acceleration(timeline, timeline.acceleration_m_s2)
@@ -86,8 +86,10 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
         length_s=np.diff(step_times_s[np.append(0, last_steps)]),
         delta_position_m=dp,
         delta_velocity_m_s=dv,
-        noise_unit=sum_by_interval(noise_unit),
-        noise_fixed=sum_by_interval(noise_unit * timeline.input_variance_m2_s4[:, None]),
+        unit_process_noise=sum_by_interval(unit_process_noise),
+        added_process_noise=sum_by_interval(
+            unit_process_noise * timeline.input_variance_m2_s4[:, None]
+        ),
         measurement_m=axis.measurement_m[timeline.measurement_index[last_steps]],
         initial=InitialState(float(step_times_s[0]), float(axis.measurement_m[0])),
     )
@@ -110,9 +112,10 @@ def integrate_acceleration(timeline: Timeline, acceleration_m_s2: Array) -> Arra
 
 
 def _interval_index(timeline: Timeline) -> tuple[IntArray, IntArray, Array]:
-    """Return the last step of each interval between measurements, and two values for each step.
+    """Assign the prediction steps to the intervals between measurements.
 
-    These are the index of the step's interval and the time (s) until the interval ends.
+    Return the last step of each interval, then for each step the index of its interval and the time
+    (s) from the end of the step to the end of the interval.
     """
     last_steps = np.flatnonzero(timeline.measurement_index >= 0)
     interval_index = np.searchsorted(last_steps, np.arange(1, len(timeline.time_s)))
@@ -121,7 +124,7 @@ def _interval_index(timeline: Timeline) -> tuple[IntArray, IntArray, Array]:
 
 
 def innovations(
-    intervals: Preintegrated,
+    kf_input: Preintegrated,
     sigma_a_m_s2: float,
     sigma_z_m: float,
     is_skipped: BoolArray | None = None,
@@ -133,7 +136,7 @@ def innovations(
 
     Parameters
     ----------
-    intervals : Preintegrated
+    kf_input : Preintegrated
     sigma_a_m_s2, sigma_z_m : float
     is_skipped : ndarray of bool, shape (m,), optional
         Measurements with an innovation but without an update.
@@ -141,18 +144,18 @@ def innovations(
     q, r = sigma_a_m_s2 * sigma_a_m_s2, sigma_z_m * sigma_z_m
     covariance: Symmetric[float] = INITIAL_COVARIANCE
     variances_and_gains = []
-    for dt, noise_unit, noise_fixed, skips_update in zip(
-        intervals.length_s.tolist(),
-        intervals.noise_unit.tolist(),
-        intervals.noise_fixed.tolist(),
-        [False] * len(intervals.length_s) if is_skipped is None else is_skipped.tolist(),
+    for dt, unit_process_noise, added_process_noise, skips_update in zip(
+        kf_input.length_s.tolist(),
+        kf_input.unit_process_noise.tolist(),
+        kf_input.added_process_noise.tolist(),
+        [False] * len(kf_input.length_s) if is_skipped is None else is_skipped.tolist(),
         strict=True,
     ):
         p00, p01, p11 = propagate_covariance(covariance, dt)  # P = FPFᵀ + Q
         covariance = (
-            p00 + q * noise_unit[0] + noise_fixed[0],
-            p01 + q * noise_unit[1] + noise_fixed[1],
-            p11 + q * noise_unit[2] + noise_fixed[2],
+            p00 + q * unit_process_noise[0] + added_process_noise[0],
+            p01 + q * unit_process_noise[1] + added_process_noise[1],
+            p11 + q * unit_process_noise[2] + added_process_noise[2],
         )
         (_, s, k0, k1), (_, _, updated) = update_step(0.0, 0.0, covariance, 0.0, r)
         variances_and_gains.append((s, 0.0, 0.0) if skips_update else (s, k0, k1))
@@ -160,16 +163,16 @@ def innovations(
     s, k0, k1 = np.array(variances_and_gains).T
     # The states before the updates solve a system with a unit lower band matrix: the state at the
     # next measurement is x = F(x + K(z - Hx)) + [Δp, Δv]
-    dt = intervals.length_s[1:]
+    dt = kf_input.length_s[1:]
     position_gain = k0[:-1] + dt * k1[:-1]
-    measured_m = np.ascontiguousarray(intervals.measurement_m.T)
+    measured_m = np.ascontiguousarray(kf_input.measurement_m.T)
     right_side = np.empty((*measured_m.shape, 2))
-    right_side[..., 0] = intervals.delta_position_m.T
-    right_side[..., 1] = intervals.delta_velocity_m_s.T
+    right_side[..., 0] = kf_input.delta_position_m.T
+    right_side[..., 1] = kf_input.delta_velocity_m_s.T
     right_side[..., 1:, 0] += position_gain * measured_m[..., :-1]
     right_side[..., 1:, 1] += k1[:-1] * measured_m[..., :-1]
-    initial = intervals.initial
-    right_side[..., 0, 0] += initial.position_m + intervals.length_s[0] * initial.velocity_m_s
+    initial = kf_input.initial
+    right_side[..., 0, 0] += initial.position_m + kf_input.length_s[0] * initial.velocity_m_s
     right_side[..., 0, 1] += initial.velocity_m_s
     bands = np.zeros((len(s), 2, 4))
     bands[:-1, 1, 1] = -dt
@@ -187,10 +190,10 @@ def innovations(
 
 
 def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
-    """Return the minimum of the parabola through a point of a profile and its two neighbours.
+    """Fit a parabola to a point of a profile and its two neighbours.
 
-    Return the distance from the point to the minimum, in steps (0 without a minimum), and the
-    second difference of the profile.
+    Return the distance from the point to the minimum, in steps of the grid (0 without a minimum),
+    and the second difference of the profile.
     """
     left_value, middle_value, right_value = profile[index - 1 : index + 2]
     curvature = left_value - 2.0 * middle_value + right_value
@@ -233,12 +236,12 @@ def profile_ends(
     Parameters
     ----------
     score : callable
-        -ln p as a function of the logarithms of the parameter and of another parameter, over which
-        it is minimised.
+        -ln p as a function of the logarithms of the parameter and of a second parameter, over
+        which -ln p is minimised.
     best_logs : (float, float)
         Logarithms of both parameters at the minimum.
     bounds : (float, float)
-        Bounds of the parameter itself.
+        Bounds of the first parameter, not of its logarithm.
     variance_factor : float
         Factor on the parameter's variance, for uncertainty that ``score`` does not include.
     """
@@ -250,7 +253,7 @@ def profile_ends(
 
         # the square root of the drop is nearly linear in the distance, which helps brentq
         @cache
-        def excess_root_drop(log_distance: float) -> float:
+        def root_drop_minus_limit(log_distance: float) -> float:
             nonlocal other_log
             if log_distance == 0.0:
                 return -max_root_drop
@@ -264,11 +267,13 @@ def profile_ends(
 
         max_distance = direction * (float(np.log(bound)) - best_logs[0])
         distance_limit = min(START_LOG_DISTANCE, max_distance)
-        while excess_root_drop(distance_limit) < 0.0:
+        while root_drop_minus_limit(distance_limit) < 0.0:
             if distance_limit == max_distance:
                 return None
             distance_limit = min(2.0 * distance_limit, max_distance)
-        log_distance = brentq(excess_root_drop, 0.0, distance_limit, xtol=1e-3 * distance_limit)
+        log_distance = brentq(
+            root_drop_minus_limit, 0.0, distance_limit, xtol=1e-3 * distance_limit
+        )
         return float(np.exp(best_logs[0] + direction * log_distance))
 
     return find_interval_end(-1.0, bounds[0]), find_interval_end(1.0, bounds[1])

@@ -12,8 +12,8 @@ The matrix A of this quadratic form has three bands below the diagonal, so LAPAC
 flight in a millisecond. log|A| and the squared residuals at the minimum give the likelihood, which
 equals that of KF's innovations (Schweppe 1965).
 
-The data, and their sensitivity to each constant, are inputs of the same linear system ("signals").
-The constants are eliminated by the Schur complement of the inner products of the signals.
+The data and their sensitivity to each constant are inputs of the same linear system. The constants
+are eliminated by the Schur complement of the inner products of the inputs.
 Time-correlated noise is a third state, c_{k+1} = ρ c_k + noise, in the measurement: z - p - c.
 
 Symbols in shapes: m measurements, a axes, s segments, T time offsets, c constants.
@@ -37,13 +37,13 @@ UNIT_SCALE = np.ones(1)
 SMOOTHED_PATH_NOISES = 0.5, 0.1
 # Minimum prior precision (1/m²) for which an initial position is treated as known
 MIN_KNOWN_START_PRECISION = 1e-3
-# Minimum position noise (σ) that each interval adds, relative to the measurement noise and to Q: it
-# makes a singular Q invertible
+# Position noise (σ) added to each interval, relative to the measurement noise and to Q: it makes a
+# singular Q invertible
 MIN_NOISE_RATIO = 1e-5
-# Number of input signals per batch, which limits memory
-SIGNAL_BATCH_SIZE = 8
-# Minimum determinant of Q ÷ product of its diagonal: smaller values are rounding errors
-MIN_DETERMINANT_RATIO = 1e-12
+# Number of pairs of inputs per batch, which limits memory
+INPUT_BATCH_SIZE = 8
+# A determinant of Q below this fraction of the product of its diagonal is a rounding error
+MIN_Q_DETERMINANT_RATIO = 1e-12
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,11 @@ class Positions:
         Index of the first measurement of each segment.
     length_s : ndarray, shape (m - 1,)
         Intervals between measurements; like Δp and Δv, ignored between segments.
-    noise_unit, noise_fixed : ndarray, shape (3, m - 1)
-        Elements 00, 01, 11 of Q for SIGMA_A = 1 m/s², and of the Q that is added to it.
+    unit_process_noise, added_process_noise : ndarray, shape (3, m - 1)
+        Elements 00, 01, 11 of Q for SIGMA_A = 1 m/s², and of additional process noise.
     prior_precision : ndarray, shape (m, 2)
         Prior precision of position and velocity; 0 without a prior.
-    constant_sigma : ndarray, shape (c,)
+    constants_prior_sigma : ndarray, shape (c,)
         Prior σ of the unknown constants of each segment.
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + c, m - 1)
         Δp and Δv of each interval, then their sensitivity to each constant.
@@ -73,17 +73,17 @@ class Positions:
     measurement_m: Array
     segment_starts: IntArray
     length_s: Array
-    noise_unit: Array
-    noise_fixed: Array
+    unit_process_noise: Array
+    added_process_noise: Array
     prior_precision: Array
-    constant_sigma: Array
+    constants_prior_sigma: Array
     delta_position_m: Array
     delta_velocity_m_s: Array
     correlated_noise: tuple[float, float] | None = None
 
     @cached_property
     def segments(self) -> list[tuple[int, int]]:
-        """First measurement of each segment, and its last one plus 1."""
+        """Slice bounds of each segment: index of its first measurement, and of its last plus 1."""
         return list(pairwise([*self.segment_starts.tolist(), len(self.measurement_m)]))
 
     @cached_property
@@ -92,7 +92,7 @@ class Positions:
         return ~np.isin(np.arange(1, len(self.measurement_m)), self.segment_starts)
 
     def first(self, count: int) -> Positions:
-        """Return the first measurements."""
+        """Return the positions cut to the first ``count`` measurements."""
         interval_rows = np.s_[..., : count - 1]
         return replace(
             self,
@@ -103,8 +103,8 @@ class Positions:
                 name: getattr(self, name)[interval_rows]
                 for name in (
                     "length_s",
-                    "noise_unit",
-                    "noise_fixed",
+                    "unit_process_noise",
+                    "added_process_noise",
                     "delta_position_m",
                     "delta_velocity_m_s",
                 )
@@ -119,15 +119,15 @@ class Positions:
         ``random_walk`` is the random walk of the source / SIGMA_Z (1/√s). ``measurement_weights``
         may omit the first measurement, which is KF's initial state and gets weight 1.
         """
-        noise_fixed = self.noise_fixed / sigma_z_m**2
-        noise_fixed[0] += self.length_s * random_walk**2
+        added_process_noise = self.added_process_noise / sigma_z_m**2
+        added_process_noise[0] += self.length_s * random_walk**2
         start_weights = np.ones(len(self.measurement_m) - len(measurement_weights))
         correlated_noise = self.correlated_noise
         if correlated_noise:
             correlated_noise = correlated_noise[0] / sigma_z_m, correlated_noise[1]
         scaled_positions = replace(
             self,
-            noise_fixed=noise_fixed,
+            added_process_noise=added_process_noise,
             prior_precision=self.prior_precision * sigma_z_m**2,
             correlated_noise=correlated_noise,
         )
@@ -141,7 +141,7 @@ class Positions:
         Axes that are measured at the same times have the same equations.
         """
         is_measured = np.isfinite(self.measurement_m)
-        process_noise = sigma_a_m_s2**2 * self.noise_unit + self.noise_fixed
+        process_noise = sigma_a_m_s2**2 * self.unit_process_noise + self.added_process_noise
         axes_left = list(range(is_measured.shape[1]))
         while axes_left:
             is_axis_measured = is_measured[:, axes_left[0]]
@@ -188,13 +188,13 @@ class FittedPositions:
     log_determinant : float
     degrees_of_freedom : int
         Number of measured positions minus the number that determines the initial states.
-    constant_sigma : ndarray, shape (c,)
+    constants_prior_sigma : ndarray, shape (c,)
     """
 
     gram: Array
     log_determinant: float
     degrees_of_freedom: int
-    constant_sigma: Array
+    constants_prior_sigma: Array
 
     def scaled(self, sigma: float) -> FittedPositions:
         """Return the likelihood with all noises multiplied by ``sigma``."""
@@ -203,19 +203,19 @@ class FittedPositions:
 
     def information(self) -> Array:
         """Return the inverse covariance of the unknown constants, shape (s, T, c, c)."""
-        return np.asarray(self.gram[..., 1:, 1:] + np.diag(self.constant_sigma**-2.0))
+        return np.asarray(self.gram[..., 1:, 1:] + np.diag(self.constants_prior_sigma**-2.0))
 
     def constants(self) -> Array:
         """Return the maximum-likelihood values of the unknown constants, shape (s, T, c)."""
         return np.asarray(-np.linalg.solve(self.information(), self.gram[..., 1:, :1])[..., 0])
 
     def scores_by_segment(self, scales: Array = UNIT_SCALE) -> Array:
-        """Return -ln p of each segment without the log-determinant, shape (k, s, T).
+        """Return -ln p of each segment for k factors on all noises, shape (k, s, T).
 
-        ``scales`` are k factors on all noises.
+        The log-determinant is omitted.
         """
         scaled_gram = self.gram / scales[:, None, None, None, None] ** 2
-        prior_sigma = self.constant_sigma
+        prior_sigma = self.constants_prior_sigma
         information = scaled_gram[..., 1:, 1:] * np.outer(prior_sigma, prior_sigma) + np.eye(
             len(prior_sigma)
         )
@@ -227,7 +227,7 @@ class FittedPositions:
         return np.asarray(0.5 * square_sum + log_diagonal)
 
     def scores(self, scales: Array = UNIT_SCALE) -> Array:
-        """Return -ln p of all segments (without a constant), shape (k, T), with scaled noises."""
+        """Return -ln p (without a constant) for k factors on all noises, shape (k, T)."""
         determinant_terms = 0.5 * self.log_determinant + self.degrees_of_freedom * np.log(scales)
         return np.asarray(self.scores_by_segment(scales).sum(axis=1) + determinant_terms[:, None])
 
@@ -235,10 +235,10 @@ class FittedPositions:
 def fit_positions(
     positions: Positions, sigma_a_m_s2: float, variance_m2: Array, measured_m: Array | None = None
 ) -> FittedPositions:
-    """Fit positions with one SIGMA_A; ``variance_m2``, shape (m,), are the measurement variances.
+    """Compute the likelihood of positions for one SIGMA_A and one variance of each measurement.
 
-    ``measured_m``, shape (a, 1 or T, k, m), replaces the measured positions by the measurements of
-    the first k signals.
+    ``measured_m``, shape (a, 1 or T, k, m), replaces the measured positions by those of the first k
+    inputs (data, then sensitivities).
     """
     if measured_m is None:
         measured_m = np.nan_to_num(positions.measurement_m.T)[:, None, None]
@@ -262,12 +262,14 @@ def fit_positions(
             gram[index] -= _inner_products(explained[..., state_columns])
             measured_products = _inner_products(measured[..., begin:end])
             gram[index, :, :measured_count, :measured_count] += measured_products
-    return FittedPositions(gram, log_determinant, degrees_of_freedom, positions.constant_sigma)
+    return FittedPositions(
+        gram, log_determinant, degrees_of_freedom, positions.constants_prior_sigma
+    )
 
 
-def _inner_products(signals: Array) -> Array:
-    """Return the inner products of signals, summed over the axes."""
-    return np.asarray((signals @ np.swapaxes(signals, -1, -2)).sum(axis=0))
+def _inner_products(whitened: Array) -> Array:
+    """Return the Gram matrix of whitened inputs, summed over the axes."""
+    return np.asarray((whitened @ np.swapaxes(whitened, -1, -2)).sum(axis=0))
 
 
 def centre_on_path(positions: Positions, *, has_scale: bool = False) -> Positions:
@@ -289,16 +291,16 @@ def centre_on_path(positions: Positions, *, has_scale: bool = False) -> Position
         path_m = smoothed_state[..., 0]
         path_velocity_m_s = smoothed_state[..., 1]
         measured_m[:, axes] -= path_m[:, 0].T
-        path_increment = np.diff(path_m) - positions.length_s * path_velocity_m_s[..., :-1]
+        path_delta_position_m = np.diff(path_m) - positions.length_s * path_velocity_m_s[..., :-1]
         # the same path, of the first time offset, is subtracted for all time offsets
-        for array, increment in ((dp, path_increment), (dv, np.diff(path_velocity_m_s))):
+        for array, increment in ((dp, path_delta_position_m), (dv, np.diff(path_velocity_m_s))):
             array[axes, :, 0] -= increment[:, :1]
             if has_scale:
                 array[axes, :, -1] = increment
     return replace(positions, measurement_m=measured_m, delta_position_m=dp, delta_velocity_m_s=dv)
 
 
-def expected_squares(
+def expected_squared_errors(
     positions: Positions, sigma_a_m_s2: float, variance_m2: Array, constants: Array
 ) -> ArrayPair:
     """Return the expected squared error (m²) and the number of measured axes of each measurement.
@@ -333,10 +335,12 @@ def products_by_segment(
     positions: Positions,
     sigma_a_m_s2: float,
     variance_m2: Array,
-    signals: Sequence[Array],
-    measured_m: Array,
+    first_inputs: Sequence[Array],
+    second_measured_m: Array,
 ) -> Array:
-    """Return the inner product of each of k signals with a second signal, shape (s, k).
+    """Return the inner products of k pairs of inputs in each segment, shape (s, k).
+
+    The constants are eliminated, and the inner product is weighted by the inverse covariance.
 
     Parameters
     ----------
@@ -345,33 +349,36 @@ def products_by_segment(
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
         Variance of each measurement.
-    signals : three ndarray, shape (a, k, m) and twice (a, k, m - 1)
-        Measurements, Δp and Δv of the first signals.
-    measured_m : ndarray, shape (a, k, m)
-        Measurements of the second signals, which have no Δp and Δv.
+    first_inputs : three ndarray, shape (a, k, m) and twice (a, k, m - 1)
+        Measurements, Δp and Δv of the first input of each pair.
+    second_measured_m : ndarray, shape (a, k, m)
+        Measurements of the second input of each pair; its Δp and Δv are zero.
     """
-    first_measured_m, *increments = signals
-    constant_signals = positions.delta_position_m[:, 0, 1:], positions.delta_velocity_m_s[:, 0, 1:]
+    first_measured_m, *increments = first_inputs
+    constant_increments = (
+        positions.delta_position_m[:, 0, 1:],
+        positions.delta_velocity_m_s[:, 0, 1:],
+    )
     batch_products = []
-    for begin in range(0, measured_m.shape[1], SIGNAL_BATCH_SIZE):
-        batch_signals = np.s_[:, begin : begin + SIGNAL_BATCH_SIZE]
-        # order: first signals, second signals, sensitivities to the constants
+    for begin in range(0, second_measured_m.shape[1], INPUT_BATCH_SIZE):
+        batch = np.s_[:, begin : begin + INPUT_BATCH_SIZE]
+        # order: first inputs of the pairs, second inputs, sensitivities to the constants
         dp, dv = (
-            np.concatenate(
-                [increment[batch_signals], 0.0 * increment[batch_signals], constant_signal], axis=1
-            )[:, None]
-            for increment, constant_signal in zip(increments, constant_signals, strict=True)
+            np.concatenate([increment[batch], 0.0 * increment[batch], constant_increment], axis=1)[
+                :, None
+            ]
+            for increment, constant_increment in zip(increments, constant_increments, strict=True)
         )
         first_rows, second_rows, constant_rows = np.split(
-            np.arange(dp.shape[2]), np.array([1, 2]) * first_measured_m[batch_signals].shape[1]
+            np.arange(dp.shape[2]), np.array([1, 2]) * first_measured_m[batch].shape[1]
         )
         batch_measured_m = np.concatenate(
-            [first_measured_m[batch_signals], measured_m[batch_signals]], axis=1
+            [first_measured_m[batch], second_measured_m[batch]], axis=1
         )[:, None]
-        all_signals = replace(positions, delta_position_m=dp, delta_velocity_m_s=dv)
-        gram = fit_positions(all_signals, sigma_a_m_s2, variance_m2, batch_measured_m).gram[:, 0]
+        all_inputs = replace(positions, delta_position_m=dp, delta_velocity_m_s=dv)
+        gram = fit_positions(all_inputs, sigma_a_m_s2, variance_m2, batch_measured_m).gram[:, 0]
         information = gram[:, constant_rows[:, None], constant_rows] + np.diag(
-            positions.constant_sigma**-2.0
+            positions.constants_prior_sigma**-2.0
         )
         constant_coefficients = np.linalg.solve(
             information, gram[:, constant_rows[:, None], second_rows]
@@ -417,24 +424,12 @@ class BandedSystem:
         return len(self.bands) - 2
 
     def whiten(self, measured_m: Array, dp: Array, dv: Array) -> ArrayPair:
-        """Whiten signals, so that their inner products are sums of plain products.
+        """Return whitened Δp and Δv, and the component of the inputs that the states explain.
 
-        Inner product = product of ``intervals`` - product of ``explained`` + product of the
-        measurements over their σ.
-
-        Parameters
-        ----------
-        measured_m : ndarray, shape (..., k, m)
-            Measurements of the first k signals; the others have none.
-        dp, dv : ndarray, shape (..., signals, m - 1)
-            Δp (m) and Δv (m/s) of the intervals.
-
-        Returns
-        -------
-        intervals : ndarray, shape (..., signals, 2 · (m - 1))
-            Whitened Δp and Δv.
-        explained : ndarray, shape (..., signals, states · m)
-            Component of the signals that the states explain.
+        The inner product of two inputs, weighted by the inverse covariance, is the product of their
+        whitened increments, minus that of their explained components, plus that of their
+        measurements over σ. ``measured_m``, shape (..., k, m), are the measurements of the first k
+        inputs; the remaining inputs have none.
         """
         intervals, right_side = self._interval_sides(measured_m, dp, dv)
         # a unit diagonal is 30 % faster, because it needs no division in each row
@@ -450,7 +445,7 @@ class BandedSystem:
         return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.state_count))
 
     def _interval_sides(self, measured_m: Array, dp: Array, dv: Array) -> ArrayPair:
-        """Return the whitened intervals, and the right-hand side of the normal equations."""
+        """Return whitened Δp and Δv, and the right-hand side of the normal equations."""
         i00, i01, _ = self.inverse_q
         # Cholesky factor U of Q⁻¹ = UᵀU
         u00 = np.sqrt(i00)
@@ -467,10 +462,10 @@ class BandedSystem:
         g0 *= self.length_s
         g0 += g1
         right_side[..., :-1, 1] -= g0
-        weighted_m = self.precision[:, 0] * measured_m
+        weighted_measurements = self.precision[:, 0] * measured_m
         measured_side = right_side[..., : measured_m.shape[-2], :, :]
-        measured_side[..., 0] += weighted_m
-        measured_side[..., 2:] += weighted_m[..., None]
+        measured_side[..., 0] += weighted_measurements
+        measured_side[..., 2:] += weighted_measurements[..., None]
         return whitened.reshape(*dp.shape[:-1], -1), right_side.reshape(
             -1, self.state_count * len(self.precision)
         )
@@ -535,7 +530,7 @@ def factorise(
     variance_product = q00 * q11
     raw_determinant = variance_product - q01**2
     determinant = (
-        np.where(raw_determinant > MIN_DETERMINANT_RATIO * variance_product, raw_determinant, 0.0)
+        np.where(raw_determinant > MIN_Q_DETERMINANT_RATIO * variance_product, raw_determinant, 0.0)
         + min_noise * q11
     )
     inverse_q = np.where(is_joined, np.stack([q11, -q01, q00 + min_noise]) / determinant, 0.0)

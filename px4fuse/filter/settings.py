@@ -17,7 +17,7 @@ INPUT_NAMES: tuple[InputName, ...] = get_args(InputName)
 
 
 class Range(NamedTuple):
-    """Valid range of a numeric setting with unit and name in texts; a value outside is a typo."""
+    """Valid range of a numeric setting, with the unit and name in messages."""
 
     low: float
     high: float
@@ -29,7 +29,7 @@ SETTING_RANGES = {
     "sigma_a_m_s2": Range(1e-4, 100.0, "m/s²", "SIGMA_A"),
     "sigma_z_m": Range(1e-4, 100.0, "m", "SIGMA_Z"),
     "dt_s": Range(1e-3, 1.0, "s", "DT"),
-    "clock_offset_s": Range(-10.0, 10.0, "s", "time offset added to the source"),
+    "clock_offset_s": Range(-10.0, 10.0, "s", "time offset added to the source timestamps"),
 }
 # Numeric settings of KF itself: the time offset belongs to the position source
 KF_NUMBERS = tuple(name for name in SETTING_RANGES if name != "clock_offset_s")
@@ -78,7 +78,7 @@ class Settings:
 
 
 def requested_settings(request: ComparisonRequest) -> Settings:
-    """Return the settings in the fields of a request with the same names; None is the default."""
+    """Return KF's settings from a request; a field that is None keeps its default."""
     values = {name: getattr(request, name) for name in Settings.__dataclass_fields__}
     # "auto" is estimated later; the time offset of a position file is applied by its reader
     if request.clock_offset_s == AUTO or request.position is not None:

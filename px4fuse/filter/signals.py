@@ -22,11 +22,11 @@ from px4fuse.flight.model import AXIS_NAMES, Columns, Flight, PositionTrack, Una
 
 AISLE = "aisle"
 # Minimum length (s) of a gap in the IMU
-IMU_GAP_S = 0.1
+MIN_IMU_GAP_S = 0.1
 # Minimum length of a gap in the IMU, as multiple of the median sample interval
-IMU_GAP_INTERVALS = 5.0
-# Maximum rate (Hz) of positions in estimates by likelihood: a faster source has time-correlated
-# errors, so more positions would add cost but no information
+MIN_IMU_GAP_INTERVALS = 5.0
+# Minimum rate (Hz) of downsampled positions in estimates by likelihood: errors of a faster source
+# are time-correlated, so more positions would add computing time but no information
 MAX_INDEPENDENT_HZ = 25.0
 # Minimum number of position measurements along an axis
 MIN_MEASUREMENTS = 3
@@ -69,7 +69,7 @@ class Acceleration:
     integral_m_s : ndarray, shape (n,)
         Integral of the acceleration along the axis from the first sample.
     gap_time_s, gap_integral_s : ndarray, shape (k,)
-        Start and end of each IMU gap, and total length of the gaps until then.
+        Start and end of each IMU gap, and total length of all gaps up to each of these times.
     rms_m_s2 : float
         RMS of the acceleration in the segment, which is the σ of the input in a gap.
     """
@@ -97,7 +97,7 @@ class Axis:
     heading_deg : float or None
         Heading of a horizontal axis, clockwise from north.
     note : str
-        Origin of the heading of the aisle, for the user.
+        How the heading of the aisle was chosen, for the user.
     measurement_time_s, measurement_m : ndarray, shape (n,)
     acceleration : Acceleration or Unavailable
         Input of KF.
@@ -113,8 +113,8 @@ class Axis:
 
     __repr__ = one_line_repr
 
-    def keep(self, rows: slice) -> Axis:
-        """Return the axis with some of the measurements."""
+    def keep_rows(self, rows: slice) -> Axis:
+        """Return the axis with the measurements of the given rows only."""
         return replace(
             self,
             measurement_time_s=self.measurement_time_s[rows],
@@ -252,7 +252,7 @@ def make_axes(
 
 
 def independent_rows(time_s: Array) -> slice:
-    """Return every n-th measurement, at ``MAX_INDEPENDENT_HZ`` or a rate up to twice as high."""
+    """Return a slice that downsamples a fast source to 1 to 2 times ``MAX_INDEPENDENT_HZ``."""
     interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else np.inf
     return slice(None, None, max(1, int(1.0 / (interval_s * MAX_INDEPENDENT_HZ))))
 
@@ -298,8 +298,8 @@ def project_acceleration(
     if isinstance(acceleration, Unavailable):
         return acceleration
     time_s = acceleration.index.to_numpy()
-    ned_m_s2 = acceleration.to_numpy()
-    along_m_s2 = ned_m_s2 @ direction
+    acceleration_ned_m_s2 = acceleration.to_numpy()
+    along_m_s2 = acceleration_ned_m_s2 @ direction
     is_inside = (time_s >= segment.start_s) & (time_s <= segment.end_s)
     if np.count_nonzero(is_inside) < 2:
         return Unavailable(
@@ -313,7 +313,7 @@ def project_acceleration(
     gap_ends = np.unique([0, *gap_rows, *(gap_rows + 1), len(time_s) - 1])
     return Acceleration(
         time_s=time_s,
-        ned_m_s2=ned_m_s2,
+        ned_m_s2=acceleration_ned_m_s2,
         direction=direction,
         integral_m_s=cumulative_integral(along_m_s2, time_s),
         gap_time_s=time_s[gap_ends],
@@ -324,20 +324,22 @@ def project_acceleration(
 
 def imu_gaps(time_s: Array) -> BoolArray:
     """Return a mask of the intervals between IMU samples that are gaps, shape (n - 1,)."""
-    interval = np.diff(time_s)
-    return interval > max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(interval)))
+    interval_s = np.diff(time_s)
+    return interval_s > max(MIN_IMU_GAP_S, MIN_IMU_GAP_INTERVALS * float(np.median(interval_s)))
 
 
-def step_means(acceleration: Acceleration, edges: ArrayLike) -> tuple[Array, Array]:
+def mean_step_acceleration(
+    acceleration: Acceleration, step_edges_s: ArrayLike
+) -> tuple[Array, Array]:
     """Return the mean acceleration of each prediction step, and the fraction of it in an IMU gap.
 
-    ``edges`` are the start and end times (s) of the steps.
+    ``step_edges_s`` are the start and end times (s) of the steps.
     """
-    edges = np.asarray(edges, dtype=np.float64)
-    length_s = np.diff(edges)
-    velocity_m_s = np.interp(edges, acceleration.time_s, acceleration.integral_m_s)
-    gap_s = np.interp(edges, acceleration.gap_time_s, acceleration.gap_integral_s)
-    covered_s = np.clip(edges, acceleration.time_s[0], acceleration.time_s[-1])
+    step_edges_s = np.asarray(step_edges_s, dtype=np.float64)
+    length_s = np.diff(step_edges_s)
+    velocity_m_s = np.interp(step_edges_s, acceleration.time_s, acceleration.integral_m_s)
+    gap_s = np.interp(step_edges_s, acceleration.gap_time_s, acceleration.gap_integral_s)
+    covered_s = np.clip(step_edges_s, acceleration.time_s[0], acceleration.time_s[-1])
     outside_fraction = 1.0 - np.diff(covered_s) / length_s
     return np.diff(velocity_m_s) / length_s, np.clip(
         np.diff(gap_s) / length_s + outside_fraction, 0.0, 1.0

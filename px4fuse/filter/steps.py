@@ -7,7 +7,7 @@ import numpy as np
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import InitialState, Settings
-from px4fuse.filter.signals import Axis, step_means
+from px4fuse.filter.signals import Axis, mean_step_acceleration
 from px4fuse.flight.model import Unavailable
 
 # Maximum difference (s) of equal timestamps: half of their resolution of 1 µs
@@ -52,22 +52,22 @@ def make_timeline(
     """
     start_s = axis.measurement_time_s[0] if initial_state is None else initial_state.time_s
     is_usable = axis.measurement_time_s > start_s + MAX_SAME_TIME_S
-    measured_s = axis.measurement_time_s[is_usable]
-    if not len(measured_s):
+    measurement_time_s = axis.measurement_time_s[is_usable]
+    if not len(measurement_time_s):
         raise SettingsError(
             f"Axis {axis.name} has no position after the initial time of KF, {start_s:.2f} s."
         )
-    grid_count = int(np.floor((measured_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
+    grid_count = int(np.floor((measurement_time_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
     grid_s = start_s + settings.dt_s * np.arange(grid_count)
     # a measurement at a time of the DT grid replaces the grid time
-    next_index = np.searchsorted(measured_s, grid_s)
-    neighbours = np.clip([next_index - 1, next_index], 0, len(measured_s) - 1)
-    distance_s = np.abs(measured_s[neighbours] - grid_s).min(axis=0)
-    time_s = np.union1d(grid_s[distance_s > MAX_SAME_TIME_S], measured_s)
+    next_index = np.searchsorted(measurement_time_s, grid_s)
+    neighbours = np.clip([next_index - 1, next_index], 0, len(measurement_time_s) - 1)
+    distance_s = np.abs(measurement_time_s[neighbours] - grid_s).min(axis=0)
+    time_s = np.union1d(grid_s[distance_s > MAX_SAME_TIME_S], measurement_time_s)
     if time_s[0] > start_s + MAX_SAME_TIME_S:
         time_s = np.append(start_s, time_s)
     measurement_index = np.full(len(time_s), -1, dtype=np.intp)
-    measurement_index[np.searchsorted(time_s, measured_s)] = np.flatnonzero(is_usable)
+    measurement_index[np.searchsorted(time_s, measurement_time_s)] = np.flatnonzero(is_usable)
     step_count = len(time_s) - 1
     if settings.input == "zero":
         return Timeline(time_s, measurement_index, np.zeros(step_count), np.zeros(step_count), 0.0)
@@ -75,7 +75,7 @@ def make_timeline(
         raise SettingsError(
             "With the setting `input` imu, KF needs IMU data.", f"{axis.acceleration}"
         )
-    mean_m_s2, gap_fraction = step_means(axis.acceleration, time_s)
+    mean_m_s2, gap_fraction = mean_step_acceleration(axis.acceleration, time_s)
     gap_s = gap_fraction * np.diff(time_s)
     # In a gap of T seconds the unknown acceleration is assumed constant. The velocity error is then
     # rms·T, not rms·√(DT·T) as for white noise, so the variance is scaled by T/DT.

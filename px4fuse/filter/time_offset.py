@@ -24,8 +24,8 @@ from px4fuse.filter.imu_motion import (
     COARSE_OFFSET_COUNT,
     HEADING_SIGMA_RAD,
     MAX_OFFSET_S,
+    MotionCache,
     PreparedMotion,
-    SignalCache,
     prepare_motion,
 )
 from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
@@ -44,17 +44,17 @@ GNSS_HEADING_SIGMA_RAD = 0.2
 # Maximum half-width (s) of the 95 % interval of an accepted time offset
 MAX_HALF_INTERVAL_S = 0.15
 # Maximum σ (s) of the time offset of a flight part in the test for a change
-MAX_PART_SIGMA_S = 0.15
-# Maximum p-value of a constant time offset for the result that it changes in flight
+MAX_PART_OFFSET_SIGMA_S = 0.15
+# The time offset changes in flight if the p-value of a constant offset is below this limit
 MAX_CHANGE_P_VALUE = 0.005
 # Minimum change (s) of the time offset in flight: a smaller change may be drift of the source
 MIN_CHANGE_S = 0.10
-# Minimum significant time offset, in σ of its estimate: false alarm probability 0.3 %
+# A time offset is significant above this multiple of its σ: false alarm probability 0.3 %
 MIN_OFFSET_SIGMAS = 3.0
-# Minimum significant time offset (s): a position error of 3 cm at 1 m/s
+# A time offset is significant above this value (s): a position error of 3 cm at 1 m/s
 MIN_OFFSET_S = 0.03
-# Number of simulated IMU noise series for the variance of the time offset, and number of segments
-# per sum; the sums of a longer flight are independent, so it needs fewer series
+# The variance of the time offset is simulated with 96 series of IMU noise for a flight of up to 12
+# segments; a longer flight needs fewer, because its groups of 12 segments are independent
 SIMULATION_COUNT, SIMULATED_SEGMENTS = 96, 12
 
 
@@ -77,7 +77,7 @@ class ClockOffset(Record, kw_only=True):
     interval_s : (float, float)
         95 % interval.
     applied_s : float
-        Part of ``offset_s`` that was already added to the timestamps.
+        Time offset that was already added to the timestamps before the estimate.
     is_determinable : bool
         True if the 95 % interval is narrow; ``reason`` is then empty.
     parts : tuple of PartOffset
@@ -86,7 +86,7 @@ class ClockOffset(Record, kw_only=True):
         Drift of the source's clock; None with fewer than three parts.
     change_p_value : float or None
         p-value of a constant offset (likelihood ratio test); None with one part.
-    curve_s, curve_drop : ndarray, shape (n,)
+    curve_s, curve_log_likelihood_drop : ndarray, shape (n,)
         Time offsets (s), and the decrease of the log-likelihood from its maximum.
     """
 
@@ -102,7 +102,7 @@ class ClockOffset(Record, kw_only=True):
     parts: tuple[PartOffset, ...]
     count: Count
     curve_s: NotWritten[Array] = NOT_WRITTEN
-    curve_drop: NotWritten[Array] = NOT_WRITTEN
+    curve_log_likelihood_drop: NotWritten[Array] = NOT_WRITTEN
     sigma_a_m_s2: NotWritten[float] = NOT_WRITTEN
     sigma_z_m: NotWritten[float] = NOT_WRITTEN
 
@@ -134,7 +134,7 @@ def estimate_time_offset(
     noises: Noises,
     outlier_time_s: Array | None = None,
     progress: Callable[[str], None] = lambda _: None,
-    signal_cache: SignalCache | None = None,
+    motion_cache: MotionCache | None = None,
 ) -> ClockOffset | Unavailable:
     """Estimate the time offset to add to the timestamps of a position track.
 
@@ -151,7 +151,7 @@ def estimate_time_offset(
         Timestamps of measurements to exclude.
     progress : callable
         Called with the name of each step of the analysis.
-    signal_cache : dict, optional
+    motion_cache : dict, optional
         IMU motion that several estimates share.
     """
     # the height of GNSS is not used: it is noisier, and all axes share one SIGMA_Z
@@ -167,7 +167,7 @@ def estimate_time_offset(
         position_samples.to_numpy(),
         directions=np.eye(3)[:axis_count],
         dt_s=settings.dt_s,
-        signal_cache=signal_cache,
+        motion_cache=motion_cache,
         heading_sigma_rad=GNSS_HEADING_SIGMA_RAD if track.origin.is_gnss else HEADING_SIGMA_RAD,
     )
     if isinstance(prepared_motion, Unavailable):
@@ -179,22 +179,26 @@ def estimate_time_offset(
     half_width_s = 0.1
     for motion in (coarse_motion, prepared_motion):
         noises = maximise_likelihood(
-            [motion.at(offset_s)], noises, motion.weight, fits_outliers=False
+            [motion.positions_at_offset(offset_s)], noises, motion.weight, fits_outliers=False
         ).noises
         curve_s = _offset_grid(offset_s, half_width_s, FINE_OFFSET_COUNT)
         fitted_positions = fit_noises(motion.position_batches(curve_s), noises, motion.weight)
         offset_s, sigma_s = _minimum_and_sigma(curve_s, fitted_positions.scores()[0])
         half_width_s = float(np.clip(3.5 * sigma_s, 0.01, MAX_OFFSET_S))
-    variance_factor = _simulate_variance_factor(prepared_motion, offset_s, noises, sigma_s**-2.0)
+    offset_variance_factor = _simulate_offset_variance_factor(
+        prepared_motion, offset_s, noises, sigma_s**-2.0
+    )
     while True:
-        nodes_s, curve_s = (
+        node_offsets_s, curve_s = (
             _offset_grid(offset_s, half_width_s, offset_count)
             for offset_count in (FINE_OFFSET_COUNT, CURVE_OFFSET_COUNT)
         )
-        position_batches = prepared_motion.position_batches(nodes_s)
+        position_batches = prepared_motion.position_batches(node_offsets_s)
         node_scores = fit_noises(position_batches, noises, prepared_motion.weight).scores()[0]
-        curve_scores = CubicSpline(nodes_s, node_scores)(curve_s)
-        low_s, high_s = profile_interval(curve_s, curve_scores, PROFILE_DROP * variance_factor)
+        curve_scores = CubicSpline(node_offsets_s, node_scores)(curve_s)
+        low_s, high_s = profile_interval(
+            curve_s, curve_scores, PROFILE_DROP * offset_variance_factor
+        )
         is_closed = low_s is not None and high_s is not None
         if is_closed or half_width_s >= 2.0 * MAX_OFFSET_S:
             break
@@ -216,18 +220,20 @@ def estimate_time_offset(
     change_p_value = None
     if not rejection_reason:
         progress("changes of the time offset in flight")
-        parts, change_p_value = _offset_per_part(prepared_motion, offset_s, noises, variance_factor)
+        parts, change_p_value = _offset_per_part(
+            prepared_motion, offset_s, noises, offset_variance_factor
+        )
     drift_ppm, drift_sigma_ppm = _fit_clock_drift(parts)
     applied_s = settings.clock_offset_s
     return ClockOffset(
         offset_s=applied_s + offset_s,
         interval_s=(applied_s + low_s, applied_s + high_s),
         applied_s=applied_s,
-        sigma_s=float(np.hypot(sigma_s * np.sqrt(variance_factor), resolution_s)),
+        sigma_s=float(np.hypot(sigma_s * np.sqrt(offset_variance_factor), resolution_s)),
         is_determinable=not rejection_reason,
         reason=rejection_reason,
         curve_s=applied_s + curve_s,
-        curve_drop=curve_scores - curve_scores.min(),
+        curve_log_likelihood_drop=curve_scores - curve_scores.min(),
         parts=tuple(structs.replace(part, offset_s=applied_s + part.offset_s) for part in parts),
         drift_ppm=drift_ppm,
         drift_sigma_ppm=drift_sigma_ppm,
@@ -243,7 +249,7 @@ def _offset_grid(centre_s: float, half_width_s: float, offset_count: int) -> Arr
     return np.linspace(low_s, min(centre_s + half_width_s, MAX_OFFSET_S), offset_count)
 
 
-def _simulate_variance_factor(
+def _simulate_offset_variance_factor(
     prepared_motion: PreparedMotion, offset_s: float, noises: Noises, information: float
 ) -> float:
     """Return the simulated variance of the time offset ÷ its variance from the curvature.
@@ -252,19 +258,19 @@ def _simulate_variance_factor(
     covariance M, velocity v and velocity noise n of the IMU. The term eᵀMn is random even at rest,
     because e contains the same noise n.
     """
-    offset_positions = prepared_motion.at(offset_s)
+    offset_positions = prepared_motion.positions_at_offset(offset_s)
     is_joined = offset_positions.is_joined
     measurement_count = len(prepared_motion.time_s)
     axis_count = len(prepared_motion.directions)
     interval_count = int(np.count_nonzero(is_joined))
     rng = np.random.default_rng(measurement_count)
-    first_segments = np.arange(0, len(prepared_motion.signals), SIMULATED_SEGMENTS)
+    first_segments = np.arange(0, len(prepared_motion.segment_motions), SIMULATED_SEGMENTS)
     series_count = -(-SIMULATION_COUNT // len(first_segments))
 
     def draw_normal(size: int) -> Array:
         return rng.standard_normal((size, axis_count, series_count)).transpose(1, 2, 0)
 
-    q00, q01, q11 = noises.sigma_a_m_s2**2 * offset_positions.noise_unit[:, is_joined]
+    q00, q01, q11 = noises.sigma_a_m_s2**2 * offset_positions.unit_process_noise[:, is_joined]
     dp, dv = np.zeros((2, axis_count, series_count, measurement_count - 1))
     dp[..., is_joined] = np.sqrt(q00) * draw_normal(interval_count)
     dv[..., is_joined] = np.sqrt(q11 - q01**2 / q00) * draw_normal(interval_count)
@@ -292,7 +298,7 @@ def _simulate_variance_factor(
 
 
 def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
-    """Return the minimum of a profile, found by a parabola, and σ from the curvature."""
+    """Return the minimum of a profile (-ln p on a grid), and σ from the curvature of a parabola."""
     minimum_index = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
     grid_step = grid[1] - grid[0]
     vertex_shift, curvature = parabola_vertex(profile, minimum_index)
@@ -304,7 +310,7 @@ def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
 
 
 def _offset_per_part(
-    prepared_motion: PreparedMotion, offset_s: float, noises: Noises, variance_factor: float
+    prepared_motion: PreparedMotion, offset_s: float, noises: Noises, offset_variance_factor: float
 ) -> tuple[tuple[PartOffset, ...], float | None]:
     """Estimate the time offset of each segment, and the p-value of a constant offset."""
     coarse_s = offset_s + np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSET_COUNT)
@@ -317,17 +323,20 @@ def _offset_per_part(
     part_offsets = []
     score_drops = []
     for begin, end, profile in zip(
-        prepared_motion.edges, prepared_motion.edges[1:], part_profiles, strict=False
+        prepared_motion.segment_edges,
+        prepared_motion.segment_edges[1:],
+        part_profiles,
+        strict=False,
     ):
         part_offset_s, sigma_s = _minimum_and_sigma(grid_s, profile)
-        sigma_s *= float(np.sqrt(variance_factor))
-        if sigma_s < MAX_PART_SIGMA_S:
+        sigma_s *= float(np.sqrt(offset_variance_factor))
+        if sigma_s < MAX_PART_OFFSET_SIGMA_S:
             start_s, end_s = prepared_motion.time_s[[begin, end - 1]].tolist()
             part_offsets.append(PartOffset(start_s, end_s, part_offset_s, sigma_s))
             score_drops.append(profile - profile.min())
     if len(part_offsets) < 2:
         return tuple(part_offsets), None
-    chi_square = 2.0 * float(np.sum(score_drops, axis=0).min()) / variance_factor
+    chi_square = 2.0 * float(np.sum(score_drops, axis=0).min()) / offset_variance_factor
     return tuple(part_offsets), float(chdtrc(len(part_offsets) - 1, chi_square))
 
 

@@ -26,7 +26,7 @@ from px4fuse.filter.fitting import (
     maximise_likelihood,
     outlier_probability,
 )
-from px4fuse.filter.imu_motion import SignalCache, prepare_motion
+from px4fuse.filter.imu_motion import MotionCache, prepare_motion
 from px4fuse.filter.likelihood import (
     Preintegrated,
     innovations,
@@ -39,15 +39,15 @@ from px4fuse.flight.model import Flight, Unavailable
 
 HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NotNegative, NotNegative | None]
-# Minimum number of positions for an estimate of SIGMA_A and SIGMA_Z
+# Minimum number of positions from which SIGMA_A and SIGMA_Z are estimated
 MIN_MEASUREMENTS = 30
-# Maximum fraction of outliers for an estimate of SIGMA_A and SIGMA_Z
+# SIGMA_A and SIGMA_Z are not estimated if the fraction of outliers is above this limit
 MAX_OUTLIER_FRACTION = 0.3
 # Factors on KF's SIGMA_A that give the initial values of the noise fit with IMU biases
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value of the random walk (m/√s) of a source that may drift
 START_RANDOM_WALK_M = 0.02
-# Maximum ratio of a noise estimate to an end of its search range for which it is only a bound
+# A noise estimate within this factor of an end of its search range is only a bound
 MAX_SEARCH_END_RATIO = 1.001
 
 
@@ -63,8 +63,8 @@ class Noise(Record):
     high: float | None
 
     @classmethod
-    def of(cls, value: float | None, interval: NoiseInterval | None) -> Noise:
-        """Make a noise from the fields of :class:`AxisTuning`."""
+    def from_fields(cls, value: float | None, interval: NoiseInterval | None) -> Noise:
+        """Return a noise with the value and interval in the fields of :class:`AxisTuning`."""
         low, high = interval or (0.0, None)
         return cls(value, low or None, high)
 
@@ -83,7 +83,7 @@ class HeldOutCheck(Record):
     count : int
         Number of measurements in the second half.
     log_likelihood_gain_per_measurement : float
-        Gain over the chosen settings; positive if tuning improves data not used for it.
+        Gain over the chosen settings in the second half, which was not used for tuning.
     """
 
     sigma_a_m_s2: NotNegative
@@ -133,16 +133,16 @@ class AxisTuning(Record, kw_only=True):
     @property
     def sigma_a(self) -> Noise:
         """SIGMA_A of the acceleration noise alone (m/s²)."""
-        return Noise.of(self.sigma_a_m_s2, self.sigma_a_m_s2_interval)
+        return Noise.from_fields(self.sigma_a_m_s2, self.sigma_a_m_s2_interval)
 
     @property
     def sigma_a_two_state(self) -> Noise:
         """SIGMA_A of KF, which has no states for biases (m/s²)."""
-        return Noise.of(self.sigma_a_two_state_m_s2, self.sigma_a_two_state_m_s2_interval)
+        return Noise.from_fields(self.sigma_a_two_state_m_s2, self.sigma_a_two_state_m_s2_interval)
 
     @property
     def sigma_z(self) -> Noise:
-        return Noise.of(self.sigma_z_m, self.sigma_z_m_interval)
+        return Noise.from_fields(self.sigma_z_m, self.sigma_z_m_interval)
 
 
 def tune(
@@ -152,7 +152,7 @@ def tune(
     progress: Callable[[str], None] = lambda _: None,
     flight: Flight | None = None,
     may_drift: bool = False,
-    signal_cache: SignalCache | None = None,
+    motion_cache: MotionCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
     """Estimate SIGMA_A and SIGMA_Z of each axis, and of north and east together.
 
@@ -169,7 +169,7 @@ def tune(
         Flight whose IMU data separate biases and tilt from noise.
     may_drift : bool
         True if the source may drift, as odometry does.
-    signal_cache : dict, optional
+    motion_cache : dict, optional
         IMU motion that several estimates share.
     """
     groups: dict[str, tuple[Axis, ...]] = {axis.name: (axis,) for axis in axes}
@@ -180,18 +180,19 @@ def tune(
         ):
             groups[HORIZONTAL] = horizontal_axes
     tunings = {}
-    signal_cache = {} if signal_cache is None else signal_cache
+    motion_cache = {} if motion_cache is None else motion_cache
     for name, group_axes in groups.items():
         if names is None or name in names:
             progress(name)
             try:
                 tunings[name] = tune_axes(
-                    name, group_axes, settings, flight, may_drift, signal_cache
+                    name, group_axes, settings, flight, may_drift, motion_cache
                 )
             except np.linalg.LinAlgError as error:  # positions far outside of the track
-                failed_analysis = f"estimate of the noises ({name})"
                 tunings[name] = Unavailable(
-                    failed_analysis, str(error), "Remove positions far from the path."
+                    f"estimate of the noises ({name})",
+                    str(error),
+                    "Remove positions far from the path.",
                 )
     return tunings
 
@@ -202,12 +203,12 @@ def tune_axes(
     settings: Settings,
     flight: Flight | None = None,
     may_drift: bool = False,
-    signal_cache: SignalCache | None = None,
+    motion_cache: MotionCache | None = None,
 ) -> AxisTuning | Unavailable:
-    """Estimate the noises that axes with the same measurement times share, as :func:`tune`."""
-    all_intervals = [preintegrate(axis, settings) for axis in axes]
-    all_time_s = axes[0].measurement_time_s[-len(all_intervals[0].measurement_m) :]
-    axes = tuple(axis.keep(independent_rows(axis.measurement_time_s)) for axis in axes)
+    """Estimate the common noises of axes with the same measurement times; see :func:`tune`."""
+    kf_inputs = [preintegrate(axis, settings) for axis in axes]
+    all_time_s = axes[0].measurement_time_s[-len(kf_inputs[0].measurement_m) :]
+    axes = tuple(axis.keep_rows(independent_rows(axis.measurement_time_s)) for axis in axes)
     axis_positions = [filter_positions(preintegrate(axis, settings)) for axis in axes]
     measurement_count = len(axis_positions[0].measurement_m) - 1
     if measurement_count < MIN_MEASUREMENTS:
@@ -229,7 +230,7 @@ def tune_axes(
             directions=np.array([axis.direction for axis in axes]),
             dt_s=settings.dt_s,
             weight=axis_weights,
-            signal_cache=signal_cache,
+            motion_cache=motion_cache,
         )
         if not isinstance(prepared_motion, Unavailable):
             start_noises = replace(
@@ -240,12 +241,14 @@ def tune_axes(
                 start_noises, START_SIGMA_A_FACTORS, has_scale=False
             )
             motion_fit = maximise_likelihood(
-                [prepared_motion.at(offset_s)], start_noises, prepared_motion.weight
+                [prepared_motion.positions_at_offset(offset_s)],
+                start_noises,
+                prepared_motion.weight,
             )
     best_fit = kf_fit if motion_fit is None else motion_fit
     is_outlier = kf_fit.outlier_probability > 0.5
     if len(all_time_s) > measurement_count:
-        all_positions = [filter_positions(interval_input) for interval_input in all_intervals]
+        all_positions = [filter_positions(kf_input) for kf_input in kf_inputs]
         is_outlier = outlier_probability(all_positions, kf_fit, len(all_time_s)) > 0.5
     if np.mean(is_outlier) > MAX_OUTLIER_FRACTION:
         return Unavailable(
@@ -270,8 +273,8 @@ def tune_axes(
         **sigma_z.as_fields("sigma_z_m"),
         **kf_sigma_a.as_fields("sigma_a_two_state_m_s2"),
         log_likelihood_gain_per_measurement=gain_nats / measurement_count,
-        before=_assess_innovations(all_intervals[0], chosen_noises, is_outlier),
-        after=_assess_innovations(all_intervals[0], final_noises, is_outlier),
+        before=_assess_innovations(kf_inputs[0], chosen_noises, is_outlier),
+        after=_assess_innovations(kf_inputs[0], final_noises, is_outlier),
         outlier_time_s=all_time_s[is_outlier],
         count=len(all_time_s),
         outliers=int(np.count_nonzero(is_outlier)),
@@ -327,9 +330,9 @@ def _noise_with_interval(
 
 
 def _assess_innovations(
-    intervals: Preintegrated, noises: Noises, is_outlier: BoolArray
+    kf_input: Preintegrated, noises: Noises, is_outlier: BoolArray
 ) -> Consistency | Unavailable:
-    nu, s = innovations(intervals, noises.sigma_a_m_s2, noises.sigma_z_m, is_outlier)
+    nu, s = innovations(kf_input, noises.sigma_a_m_s2, noises.sigma_z_m, is_outlier)
     return assess(nu[~is_outlier], s[~is_outlier])
 
 

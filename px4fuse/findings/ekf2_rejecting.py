@@ -5,7 +5,7 @@ import math
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison
 from px4fuse.comparison.remedy import aid_of
-from px4fuse.comparison.trials import Trial, improvement, preference
+from px4fuse.comparison.trials import Trial, improvement, preference_key
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_text import format_action
 from px4fuse.findings.model import (
@@ -87,7 +87,7 @@ def _rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
     aid = aid_of(analysis, result.axis.name)
     helpful_trials = [trial for trial in analysis.main_trials if _prevents_rejections(trial)]
     if helpful_trials and result is analysis.main:
-        return format_action(analysis, min(helpful_trials, key=preference).change)
+        return format_action(analysis, min(helpful_trials, key=preference_key).change)
     return (
         f"Check {source_words(analysis.source).reception}. Then check {aid.delay} and {aid.noise}. "
         f"Increase {aid.gate} last."

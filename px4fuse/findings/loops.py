@@ -3,7 +3,7 @@
 from px4fuse.analysis import Analysis
 from px4fuse.finding import Finding
 from px4fuse.findings.model import Findings, error, note, warning
-from px4fuse.loop.model import LANDING_SOURCE, Closure, Loop
+from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
 # Maximum fraction of loop closures that robust optimisation rejects if the stated drift is correct
@@ -76,7 +76,7 @@ def detect_wrong_assumptions(loop: Loop) -> Findings:
 
 
 def _false_closure(closure: Closure, is_end_assumed: bool) -> Finding:
-    is_landing = closure.source == LANDING_SOURCE
+    is_landing = closure.source == LANDING_CLOSURE_SOURCE
     fault = f"False loop closure of {closure.distance_m:.2f} m: {closure}"
     if is_landing and is_end_assumed:
         fault = (

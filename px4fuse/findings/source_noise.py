@@ -154,12 +154,12 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     noisy_part = analysis.noisy_part
     if (
         noisy_part is None
-        or noisy_part.ratio < MIN_PART_NOISE_RATIO
+        or noisy_part.sigma_ratio < MIN_PART_NOISE_RATIO
         # a fused outlier increases later innovations
-        or noisy_part.ratio_without_outliers < MIN_PART_NOISE_RATIO_WITHOUT_OUTLIERS
+        or noisy_part.sigma_ratio_without_outliers < MIN_PART_NOISE_RATIO_WITHOUT_OUTLIERS
     ):
         return
-    noise_ratio, start_s, end_s = noisy_part.ratio, noisy_part.start_s, noisy_part.end_s
+    noise_ratio, start_s, end_s = noisy_part.sigma_ratio, noisy_part.start_s, noisy_part.end_s
     yield (error if noise_ratio >= MIN_PART_NOISE_RATIO_ERROR else warning)(
         "source_noise_varies",
         f"{source_name(analysis.source)} noise is {noise_ratio:.1f} times larger from "

@@ -7,7 +7,11 @@ from scipy.stats import spearmanr
 from px4fuse.analysis import Analysis
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres
-from px4fuse.ekf2.fusion_conditions import SET_TIMESTAMP_ACTION, STAMP_FAULTS, SYNCHRONISE_ACTION
+from px4fuse.ekf2.fusion_conditions import (
+    AGE_BY_WRONG_TIMESTAMP,
+    SET_TIMESTAMP_ACTION,
+    SYNCHRONISE_ACTION,
+)
 from px4fuse.findings.model import Findings, error, fraction_of_ones, note, warning
 from px4fuse.flight.model import (
     ARRIVAL_METHODS,
@@ -51,7 +55,7 @@ def detect(analysis: Analysis) -> Findings:
         yield from detect_growing_latency(analysis)
     elif clock.note == REPEATED_TIMESTAMPS and clock.distinct_stamps:
         yield from detect_shared_timestamps(analysis, clock.pairs, clock.distinct_stamps)
-    elif clock.clock in STAMP_FAULTS:
+    elif clock.clock in AGE_BY_WRONG_TIMESTAMP:
         yield from detect_timestamp_unit(analysis, clock.clock)
     elif clock.distinct_stamps is not None:
         yield from detect_constant_timestamps(positions, clock, clock.distinct_stamps)
@@ -107,7 +111,7 @@ def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
         fusion_flags["horizontal"], segment
     ):
         fusion_sentence = (
-            f"EKF2 never fused the positions: it reads them as {STAMP_FAULTS[clock]}. "
+            f"EKF2 never fused the positions: it reads them as {AGE_BY_WRONG_TIMESTAMP[clock]}. "
         )
     is_unix = clock.startswith("UNIX") or clock == "another clock"
     yield error(

@@ -36,7 +36,7 @@ class Aid:
     label: str = ""
     # Unit of the innovations
     unit: str = "m"
-    # Origin of the measurement variance, if it is not ``noise`` alone
+    # Source of the measurement variance, if it is not the parameter ``noise`` alone
     noise_origin: str = ""
     # Gate (√S) for logs without the parameter ``gate``
     default_gate: float = 5.0
@@ -47,15 +47,15 @@ class Aid:
     fields: str = ""
     # Fields of ekf2_innovations (v1.8 to v1.10); ``_var`` is appended for the variance
     old_fields: str = ""
-    # Groups of flags in estimator_status_flags, separated by commas. In the first group that the
-    # log contains, any flag shows that EKF2 is configured to fuse this source
+    # Flags in estimator_status_flags that are 1 while EKF2 is configured to fuse this source. Each
+    # element contains the flags of one PX4 release, separated by commas
     flags: tuple[str, ...] = ()
-    # Bit of estimator_status.control_mode_flags with the same meaning as ``flags``
+    # Bit of estimator_status.control_mode_flags that is used if ``flags`` are not logged
     status_bit: int | None = None
 
     @property
     def measurement_parameters(self) -> frozenset[str]:
-        """Names of the parameters that affect only the measurements of this aiding source."""
+        """Names of the parameters for noise, gate and delay, without the fusion switch."""
         return frozenset((self.noise, self.gate, self.delay, self.noise_mode))
 
     def logged_parameters(self, logged_values: Mapping[str, float]) -> dict[str, float]:
@@ -66,7 +66,7 @@ class Aid:
 
 AID_MASK = "EKF2_AID_MASK"
 # Parameter of PX4 main since 2026, with which EKF2 uses the GNSS driver's measurement times
-GNSS_MODE = "EKF2_GPS_MODE"
+GNSS_MODE_PARAMETER = "EKF2_GPS_MODE"
 # Relative tolerance of PX4's parameter ranges, because logged values are float32 (rounding 6e-8)
 FLOAT32_TOLERANCE = 1e-6
 # Parameters for the delay (ms) from fix to timestamp of the first GNSS receiver (since PX4 v1.17)
@@ -121,7 +121,7 @@ PARAMETERS, _LOGGED_PARAMETERS = (
     )
     for table in ("parameters", "logged")
 )
-# Parameters of the EKF2 model, and other logged parameters with which px4fuse computes
+# Parameters of the EKF2 model, and other logged parameters that px4fuse needs
 PARAMETER_RANGES = PARAMETERS | _LOGGED_PARAMETERS
 FIELD_NOISE_PARAMETERS = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # EKF2_MAG_TYPE without magnetometer
@@ -135,7 +135,7 @@ REPORTED_PARAMETERS: tuple[str, ...] = tuple(PARAMETER_TABLES["reported"].split(
 def effective_settings(
     logged_values: Mapping[str, float], aid: Aid = EV_POS, *other_aids: Aid
 ) -> dict[str, float]:
-    """Return the values of the EKF2 parameters in the model: logged value, else PX4's default.
+    """Return all parameters of the EKF2 model: the logged value or, if not logged, PX4's default.
 
     Parameters of aiding sources that are not given are omitted.
     """
@@ -168,7 +168,7 @@ def uses_aid_mask(logged_values: Mapping[str, float]) -> bool:
 def replace_invalid_parameters(
     logged_values: Mapping[str, float],
 ) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Replace invalid logged parameters by their defaults, and return one sentence for each.
+    """Replace invalid logged parameters by their defaults, and return a note on each.
 
     Parameters without a known default are omitted.
 
@@ -182,17 +182,17 @@ def replace_invalid_parameters(
     if uses_aid_mask(logged_values):
         defaults |= OLD_DEFAULTS
     for name, value in logged_values.items():
-        parameter = PARAMETER_RANGES.get(name)
-        fault = "" if parameter is None else parameter.describe_range_error(name, value)
+        parameter_range = PARAMETER_RANGES.get(name)
+        fault = "" if parameter_range is None else parameter_range.describe_range_error(name, value)
         if not math.isfinite(value):
             fault = f"{name} is not a finite number"
         if not fault:
             valid_values[name] = value
-        elif parameter is None:
-            notes.append(f"{fault}; the parameter is not used.")
+        elif parameter_range is None:
+            notes.append(f"{fault}. px4fuse ignores this parameter.")
         else:
             valid_values[name] = defaults[name]
-            notes.append(f"{fault}; the default {valid_values[name]:g} is used.")
+            notes.append(f"{fault}. px4fuse uses the default {valid_values[name]:g}.")
     return valid_values, tuple(notes)
 
 

@@ -37,15 +37,19 @@ from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETE
 
 PositionKind = Literal["uwb", "vio", "mocap", "gnss", "unknown", "file"]
 DataPath = Literal[
-    "given file", "as received", "aligned by EKF2", "kept by EKF2", "rebuilt from innovations"
+    "given file",
+    "as received",
+    "positions aligned by EKF2",
+    "observation logged by EKF2",
+    "EKF2 position plus innovation",
 ]
 
 
 class Origin(Record):
-    """Kind of a position source, and the path of its positions from the sender to the log."""
+    """Kind of a position source, and the route by which its positions reach the log."""
 
-    # "vio" is any source with a changing orientation, "uwb" a noisy one without orientation, and
-    # "unknown" another one without orientation (kind_without_orientation)
+    # Estimated from the data, which do not contain the device: "vio" sends a changing orientation,
+    # "uwb" only noisy positions, "unknown" only precise positions (kind_without_orientation)
     kind: PositionKind
     path: DataPath
     # Aiding source of EKF2 for these positions; None if EKF2 never fuses them
@@ -65,7 +69,7 @@ class Origin(Record):
     @property
     def reconstructed(self) -> bool:
         """True if the positions are derived from EKF2's logged data, not logged as received."""
-        return self.path in ("kept by EKF2", "rebuilt from innovations")
+        return self.path in (LOGGED_BY_EKF2.path, FROM_INNOVATIONS.path)
 
     @property
     def has_all_samples(self) -> bool:
@@ -91,16 +95,16 @@ class Origin(Record):
 
     @property
     def preference_rank(self) -> int:
-        """Index of this origin in :data:`ORIGINS`; a smaller index is preferred."""
+        """Rank of this kind of position source if px4fuse selects one; 0 is preferred."""
         return [(origin.aid, origin.path) for origin in ORIGINS].index((self.aid, self.path))
 
 
 POSITION_FILE = Origin("file", "given file", EV_POS)
 RECEIVED = Origin("uwb", "as received", EV_POS)
 MOTION_CAPTURE = Origin("mocap", "as received", None)
-ALIGNED = Origin("uwb", "aligned by EKF2", EV_POS)
-LOGGED_BY_EKF2 = Origin("uwb", "kept by EKF2", EV_POS)
-FROM_INNOVATIONS = Origin("uwb", "rebuilt from innovations", EV_POS)
+ALIGNED = Origin("uwb", "positions aligned by EKF2", EV_POS)
+LOGGED_BY_EKF2 = Origin("uwb", "observation logged by EKF2", EV_POS)
+FROM_INNOVATIONS = Origin("uwb", "EKF2 position plus innovation", EV_POS)
 GNSS = Origin("gnss", "as received", GNSS_POS, is_automatic=False)
 # All origins in order of preference
 ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS, GNSS)
@@ -110,7 +114,7 @@ def find_origin(kind: str, path: str) -> Origin:
     for origin in ORIGINS:
         if (origin.kind, origin.path) == (kind, path):
             return origin
-    raise ValueError(f"ORIGINS in {__file__} has no kind and path {(kind, path)}")
+    raise ValueError(f"no position source has the kind {kind!r} and the path {path!r}")
 
 
 def with_orientation(origin: Origin, *, is_changing: bool) -> Origin:
@@ -118,14 +122,14 @@ def with_orientation(origin: Origin, *, is_changing: bool) -> Origin:
     return replace(origin, kind="vio") if origin.kind == "uwb" and is_changing else origin
 
 
-REPEATED_TIMESTAMPS = "most timestamps are repeated"
+REPEATED_TIMESTAMPS = "most timestamps of the sender are repeated"
 # Name of the clock of a sender in a ULog: PX4 converts or replaces the sender's timestamps
 SENDER_CLOCK = "sender timestamps"
-# Replacement for the estimates, re-runs and findings of a flight that is a student assignment
+# Replaces all results of an assignment that would show its injected fault to the student
 DIAGNOSIS_WITHHELD = Unavailable(
     "diagnosis",
-    "the flight is an assignment, so px4fuse withholds its diagnosis",
-    "Analyse the flight with your own settings, and give your diagnosis with --answers.",
+    "the flight is a student assignment, for which px4fuse shows no diagnosis",
+    "Analyse the flight with your own settings. Give your answers with px4fuse compare --answers.",
 )
 
 
@@ -171,7 +175,7 @@ class ClockMap(Record):
     # Name of the clock ("UNIX time of system 1, component 197")
     clock: str
     # Source of the conversion: "boot clock", "TIMESYNC", "SYSTEM_TIME", "receive time", "arrival
-    # time" or "position in the stream"
+    # time" or "message order"
     method: str
     # Number of simultaneous readings of both clocks
     pairs: Count
@@ -190,7 +194,10 @@ class ClockMap(Record):
 def clock_of_repeated_timestamps(
     clock: str, sample_count: int, distinct_count: int
 ) -> ClockMap | None:
-    """Describe a clock of which most timestamps are repeated, else return None."""
+    """Describe a clock that cannot be converted, because most timestamps are repeated.
+
+    Return None if at least half of the timestamps are distinct.
+    """
     if 2 * distinct_count > sample_count:
         return None
     return ClockMap(
@@ -200,7 +207,7 @@ def clock_of_repeated_timestamps(
 
 @dataclass(frozen=True)
 class Stream:
-    """Origin of one kind of data: topics or messages, clock of the timestamps, and file name."""
+    """Provenance of one kind of data: topics or messages, clock of timestamps, and file name."""
 
     topics: tuple[str, ...]
     clock: str
@@ -239,8 +246,8 @@ class LogInfo(Record, omit_defaults=False):
     hardware: str
     # Boot clock at time zero of the flight, which is the first sample
     boot_time_s: float
-    # ULog: duration of the IMU samples, else of the topic with the most samples. MAVLink: duration
-    # of the messages with boot time. Outliers of time are ignored
+    # Time span of the IMU samples, or of the topic with the most samples if the IMU is not logged.
+    # MAVLink: time span of the boot times. Outlying timestamps are ignored
     duration_s: NotNegative
     dropouts: tuple[Dropout, ...] = ()
     # PX4 parameters for fusion and logging at the start of the log
@@ -289,12 +296,12 @@ TableOrUnavailable = pd.DataFrame | Unavailable
 StepFunctions: TypeAlias = "Mapping[str, pd.Series[float]]"
 # Intervals (start, end) in s of flight time
 Spans = tuple[Span, ...]
-# Minimum fraction of sample intervals of at most three median intervals: with a smaller fraction,
-# samples arrive in bursts
+# Minimum fraction of sample intervals up to three median intervals; below it, the samples arrive
+# in bursts
 MIN_REGULAR_FRACTION = 0.8
 # Values of ClockMap.method for which the timestamps are not times of measurement
-ARRIVAL_METHODS = ("arrival time", "receive time", "position in the stream")
-# Reason why a source that measures only the height has no positions
+ARRIVAL_METHODS = ("arrival time", "receive time", "message order")
+# Reason for missing positions if the source measures only the height
 HEIGHT_ONLY_REASON = "x and y are NaN in all messages, so the source measures only the height"
 # Ratio of the median absolute second difference to the σ of white noise
 SECOND_DIFFERENCE_FACTOR = 6.0**0.5 / 1.4826
@@ -380,15 +387,15 @@ class Alignment(Record, kw_only=True):
     clock_offset_s: float
     clock_offset_sigma_s: NotNegative | None = None
     clock_reason: str
-    # Reference of the estimates: "EKF2 position", "IMU", or "" if nothing was estimated
+    # Reference for the estimated alignment: "EKF2 position", "IMU", or "" without an estimate
     reference: str
-    # Correlation of the track with the reference after alignment; 1 is perfect
+    # Correlation of the aligned track with the reference; 1 is perfect
     correlation: float | None = None
     # Horizontal residual (RMS per axis); None if the reference has no position
     residual_rms_m: NotNegative | None = None
-    # One sentence per error of the frame: wrong axes, yaw or origin
+    # Errors of the coordinate frame (wrong axes, yaw or origin), one sentence each
     misplaced: tuple[str, ...] = ()
-    # One sentence per estimate with a large uncertainty
+    # Alignment estimates with a large uncertainty, one sentence each
     warnings: tuple[str, ...]
 
 
@@ -403,7 +410,7 @@ class PositionTrack:
     # Position in NED and the reported variances (columns POSITION and POSITION_VARIANCE); NaN for
     # variances that are not logged
     samples: pd.DataFrame
-    # "NED", "FRD" (x is forward at start, not north) or "unknown"
+    # "NED", "FRD" (world-fixed, x is the initial heading) or "unknown"
     frame: str
     # Clock of the timestamps
     clock: str
@@ -426,12 +433,12 @@ class PositionTrack:
     lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     # One sentence per kind of sample that was interpolated, reconstructed or dropped
     notes: tuple[str, ...] = ()
-    # Reason for each row that is not a measurement: "NaN", "zero" (0, 0, 0) or "held" (the last
-    # position sent again)
+    # Reason for each row that is not a measurement: "NaN", "zero" (0, 0, 0), "far"
+    # (damaged) or "held" (the last position sent again)
     invalid: pd.Series[str] = field(default_factory=lambda: NO_INVALID_ROWS)
-    # ``reset_counter``, ``quality`` and ``age_s`` (arrival - timestamp), if logged
+    # ``reset_counter``, ``quality`` and ``age_s`` (arrival in PX4 minus timestamp), if logged
     status: pd.DataFrame = field(default_factory=pd.DataFrame)
-    # Rounding step of the coarsest horizontal coordinate as sent; 0 if there is none
+    # Quantisation step of the horizontal position as sent; 0 if it is not quantised
     step_m: float = 0.0
 
     __repr__ = one_line_repr
@@ -500,7 +507,7 @@ def reset_times_s(track: PositionTrack) -> Array:
 def positions_phrase(source: PositionTrack) -> str:
     """Return the noun phrase for the positions of a source: "UWB positions"."""
     if source.origin.kind == "file":
-        return "positions in the position file"
+        return "positions from the file"
     return f"{source_name(source)} positions"
 
 
@@ -531,7 +538,7 @@ BIAS_NOT_LOGGED = Unavailable(
 )
 HORIZON_NOT_LOGGED = Unavailable(
     "EKF2 fusion horizon",
-    "the log has publication times but no fusion times",
+    "the log contains only publication times of the EKF2 state, no fusion times",
     "Record a ULog with PX4 v1.13 or newer.",
 )
 
@@ -564,22 +571,22 @@ class FusionRecord:
     other_horizontal_aids: tuple[str, ...]
     # Delay (s) from measurement to publication of each external vision sample
     vision_age_s: pd.Series
-    # Measured magnetic field (body FRD), ``fused_3d`` (1 while EKF2 fuses all components, 0 for
-    # heading only) and, since v1.16, EKF2's low-pass filtered innovations (expected minus measured)
+    # Measured magnetic field (body FRD). ``fused_3d`` is 1 while EKF2 fuses all components, 0 for
+    # heading only. Since v1.16: EKF2's low-pass filtered innovations (predicted minus measured)
     field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
-    # Velocity from optical flow (body FRD). Each row is the mean of ``samples`` measurements at
-    # intervals of ``interval_s``, weighted as in EKF2's low-pass filter (FLOW_FILTER_WEIGHT);
-    # ``noise_m2_s2`` is the variance R of one measurement
+    # Velocity from optical flow (body FRD): mean of the measurements since the previous row, with
+    # the weights of EKF2's low-pass filter (FLOW_FILTER_WEIGHT). ``samples`` is their number,
+    # ``interval_s`` their interval, ``noise_m2_s2`` the variance R of one measurement
     flow: pd.DataFrame = field(default_factory=pd.DataFrame)
     # Latitude of the origin
     latitude_deg: float = np.nan
     # Altitude of the origin if EKF2 stores altitude above sea level (since v1.16), else 0
     altitude_m: float = 0.0
-    # Updates of the height bias of each aiding source relative to the height reference: ``bias_m``
-    # and ``bias_m2`` after the update, ``innovation_m`` and its ``variance_m2``
+    # Logged updates of EKF2's height bias estimators, by aiding source: ``bias_m`` and its variance
+    # ``bias_m2`` after the update, ``innovation_m`` and its variance ``variance_m2``
     height_bias: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    # 1 while EKF2 reports GROUND_EFFECT on the barometer, BAD_ACCELERATION (vertical), or inertial
-    # DEAD_RECKONING
+    # 1 while EKF2 reports a condition, by the PX4 names GROUND_EFFECT (on the barometer),
+    # BAD_ACCELERATION (vertical) and DEAD_RECKONING
     states: StepFunctions = field(default_factory=dict)
 
     __repr__ = one_line_repr
@@ -668,9 +675,9 @@ class Ekf2:
     horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
     record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
     aids: Mapping[str, AidLog] = field(default_factory=dict)
-    # Logged flags, 1 while set: aiding sources that are enabled, by PX4 name; ``tilt_align``,
-    # ``yaw_align``, ``gnss_fault``, ``xy_valid``, ``xy_global``, and the keys of
-    # FusionRecord.states. ``failed_checks`` is gps_check_fail_flags
+    # Logged flags, 1 while set: enabled aiding sources by PX4 name, the conditions of
+    # FusionRecord.states, ``tilt_align``, ``yaw_align``, ``gnss_fault``, ``xy_valid`` and
+    # ``xy_global``. ``failed_checks`` contains the bits of gps_check_fail_flags
     states: StepFunctions = field(default_factory=dict)
     # All EKF2_ parameters at take-off, by PX4 name, in PX4 units
     parameters: Mapping[str, float] = field(default_factory=dict)

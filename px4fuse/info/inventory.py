@@ -17,8 +17,8 @@ from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.inputs import prepare_inputs
 from px4fuse.errors import MissingDataError, Px4FuseError
 from px4fuse.filter.signals import (
-    IMU_GAP_INTERVALS,
-    IMU_GAP_S,
+    MIN_IMU_GAP_INTERVALS,
+    MIN_IMU_GAP_S,
     Segment,
     cut_to_segment,
     imu_and_attitude,
@@ -38,9 +38,9 @@ from px4fuse.request import ComparisonRequest, with_options
 
 SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
-# Fields of Flight that the JSON output of px4fuse info contains without change
+# Fields of Flight in the JSON output of px4fuse info
 FLIGHT_FIELDS = ("log", "airborne", "clocks", "missing", "unused", "inputs")
-# Label of each kind of data, by its name in Flight.streams
+# Labels of the names in Flight.streams
 DATA_LABELS = {
     "imu": "IMU",
     "attitude": "attitude",
@@ -100,12 +100,10 @@ class Source:
         Kind of data: a value of :data:`DATA_LABELS`.
     name : str
         Name of a position track, or else of the first topic.
-    log : str
-        Name of the file.
     samples : int or None
         Number of samples; None for the land detector.
     start_s, end_s : float or None
-        Times of the first and last sample, in seconds after the first data.
+        Times of the first and last sample, after the first data.
     chosen : bool
         True for the position source that ``px4fuse compare`` uses by default.
     unavailable : str
@@ -199,8 +197,10 @@ def to_json_dict(inventory: Inventory) -> dict[str, Any]:
     flight_fields = {name: getattr(flight, name) for name in FLIGHT_FIELDS}
     if isinstance(flight.airborne, Unavailable):
         del flight_fields["airborne"]
-    data: dict[str, Any] = to_json_types(flight_fields | inventory_fields)
-    return {"schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION}, **data}
+    return {
+        "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
+        **to_json_types(flight_fields | inventory_fields),
+    }
 
 
 def _data_by_stream(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavailable]:
@@ -271,7 +271,7 @@ def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
     """Measure sample intervals above five median intervals and above 0.1 s (IMU) or 1 s."""
     intervals_s = np.diff(samples.index.to_numpy())
     limit_s = (
-        max(IMU_GAP_S, IMU_GAP_INTERVALS * float(np.median(intervals_s)))
+        max(MIN_IMU_GAP_S, MIN_IMU_GAP_INTERVALS * float(np.median(intervals_s)))
         if is_imu
         else float(max_interval_s(1.0 / sample_rate(samples)))
     )
@@ -306,19 +306,19 @@ def _list_analyses(
     yield from _analyses_against_ekf2_and_truth(flight, comparison)
     results_by_aid, ekf2, description = evaluate_aids(flight), flight.ekf2, ""
     if isinstance(results_by_aid, dict) and isinstance(ekf2, Ekf2):
-        rates = (
+        rate_texts = (
             f"{aid.label} {sample_rate(samples):.2g} Hz"
             if len(samples := ekf2.aids[name].samples) > 1
             else f"{aid.label} 1 sample"
             for name, aid in results_by_aid.items()
         )
-        description = ", ".join(rates)
+        description = ", ".join(rate_texts)
     yield _make_analysis_option("aids", results_by_aid, description)
-    inputs, description = prepare_inputs(flight), ""
-    if not isinstance(inputs, Unavailable):
-        replayed_s = sum(float(np.ptp(segment.time_s)) for segment in inputs.segments)
-        description = f"EKF2 replay of {replayed_s:.0f} s with {inputs.aid.label}"
-    yield _make_analysis_option("what-if", inputs, description)
+    replay_inputs, description = prepare_inputs(flight), ""
+    if not isinstance(replay_inputs, Unavailable):
+        replayed_s = sum(float(np.ptp(segment.time_s)) for segment in replay_inputs.segments)
+        description = f"EKF2 replay of {replayed_s:.0f} s with {replay_inputs.aid.label}"
+    yield _make_analysis_option("what-if", replay_inputs, description)
 
 
 def _make_analysis_option(name: str, data: object, description: str) -> AnalysisOption:
@@ -335,8 +335,9 @@ def _analyses_against_ekf2_and_truth(
     data_by_analysis["error"] = flight.truth
     if comparison is not None:
         main_axis, segment, ekf2 = comparison.input_axes[0], comparison.segment, flight.ekf2
-        projected_tracks = project_tracks(ekf2, comparison.flight.truth, main_axis, segment)
-        ekf2_state, ekf2_variance, truth = projected_tracks.values()
+        ekf2_state, ekf2_variance, truth = project_tracks(
+            ekf2, comparison.flight.truth, main_axis, segment
+        ).values()
         innovations = (
             ekf2
             if isinstance(ekf2, Unavailable)
@@ -347,9 +348,11 @@ def _analyses_against_ekf2_and_truth(
         )
     for name, data in data_by_analysis.items():
         has_data = not isinstance(data, Unavailable)
-        count = f"{len(data)} {SAMPLES_BY_ANALYSIS[name]}" if isinstance(data, pd.DataFrame) else ""
+        count_text = (
+            f"{len(data)} {SAMPLES_BY_ANALYSIS[name]}" if isinstance(data, pd.DataFrame) else ""
+        )
         yield _make_analysis_option(
-            name, NO_COMPARISON if comparison is None and has_data else data, count
+            name, NO_COMPARISON if comparison is None and has_data else data, count_text
         )
 
 

@@ -48,7 +48,7 @@ class DescribedTable:
 
 
 def with_source_innovations(flight: Flight) -> Flight:
-    """Return the flight with the EKF2 innovations of the default position source."""
+    """Add the EKF2 innovations of the default position source to a flight."""
     try:
         return select_innovations(flight, choose_source(flight)[0])
     except MissingDataError:
@@ -113,15 +113,15 @@ def description(flight: Flight) -> dict[str, Any]:
 
 @cache
 def _read_column_descriptions() -> pd.DataFrame:
-    """Read columns.csv: unit, frame and meaning of each column, indexed by table."""
-    lines = files("px4fuse.info").joinpath("columns.csv").read_text("utf-8").splitlines()
+    """Read columns.csv, indexed by table."""
+    csv_lines = files("px4fuse.info").joinpath("columns.csv").read_text("utf-8").splitlines()
     for placeholder, names in PLACEHOLDER_NAMES.items():
-        lines = [
+        csv_lines = [
             line.replace(placeholder, name)
-            for line in lines
+            for line in csv_lines
             for name in (names if placeholder in line else [placeholder])
         ]
-    return pd.read_csv(StringIO("\n".join(lines)), index_col="table", keep_default_na=False)
+    return pd.read_csv(StringIO("\n".join(csv_lines)), index_col="table", keep_default_na=False)
 
 
 def _describe_table(
@@ -145,7 +145,7 @@ def _describe_table(
     column_descriptions = column_descriptions.assign(
         table=name, source_topic=" ".join(topics), clock=clock
     )
-    described_data = data.reindex(columns=column_descriptions["column"].tolist())
+    described_data = data.reindex(columns=[*column_descriptions["column"]])
     return DescribedTable(name, described_data, column_descriptions)
 
 
@@ -199,7 +199,7 @@ def _described_tables(flight: Flight) -> Iterator[DescribedTable]:
     if log.dropouts:
         rows = [(dropout.start_s, dropout.duration_s) for dropout in log.dropouts]
         yield _describe_table("dropouts", _numeric_table(["time_s", "duration_s"], rows))
-    if parameters := _parameters(flight):
+    if parameters := _logged_parameters(flight):
         yield _describe_table(
             "parameters", pd.DataFrame(parameters.items(), columns=["name", "value"])
         )
@@ -209,7 +209,7 @@ def _described_tables(flight: Flight) -> Iterator[DescribedTable]:
         yield _describe_table("clocks", clock_table.astype({"distinct_stamps": np.float64}))
 
 
-def _parameters(flight: Flight) -> dict[str, float]:
+def _logged_parameters(flight: Flight) -> dict[str, float]:
     """Return the logged values of the PX4 parameters for logging and fusion."""
     logged_values = dict(flight.log.parameters)
     if isinstance(flight.ekf2, Ekf2):
@@ -238,15 +238,17 @@ def _ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
     yield from _stream_table(flight, "ekf2_fusing", ekf2.fusion_flags)
     topics_and_clock = _topics_and_clock(flight, "ekf2_state")
     delta_rows = [reset.delta for reset in ekf2.resets]
-    resets = _numeric_table(["delta_north", "delta_east", "delta_down"], delta_rows)
-    resets["time_s"] = np.array([reset.time_s for reset in ekf2.resets], np.float64)
-    resets["quantity"] = np.array([reset.quantity for reset in ekf2.resets], object)
-    yield _describe_table("resets", resets, topics_and_clock)
+    reset_table = _numeric_table(["delta_north", "delta_east", "delta_down"], delta_rows)
+    reset_table["time_s"] = np.array([reset.time_s for reset in ekf2.resets], np.float64)
+    reset_table["quantity"] = np.array([reset.quantity for reset in ekf2.resets], object)
+    yield _describe_table("resets", reset_table, topics_and_clock)
     # the start time of the first EKF2 instance is minus infinity in a Flight
     first_time_s = min(float(ekf2.state.index[0]), 0.0)
     instance_rows = [(max(time_s, first_time_s), instance) for time_s, instance in ekf2.instances]
-    instances = _numeric_table(["time_s", "instance"], instance_rows).astype({"instance": np.int64})
-    yield _describe_table("instances", instances, topics_and_clock)
+    instance_table = _numeric_table(["time_s", "instance"], instance_rows).astype(
+        {"instance": np.int64}
+    )
+    yield _describe_table("instances", instance_table, topics_and_clock)
 
 
 def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:

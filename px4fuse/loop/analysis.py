@@ -1,4 +1,4 @@
-"""Loop analysis: segment, landing place, loop closures, corrected paths and their scores."""
+"""Loop analysis of a trajectory: loop closure error, and corrected paths with ATE and RPE."""
 
 from collections.abc import Callable
 
@@ -18,13 +18,13 @@ from px4fuse.loop.corrections import (
     score_paths,
     solve_pose_graphs,
 )
-from px4fuse.loop.model import LANDING_SOURCE, Loop, OdometryNoise, TrueEnd
+from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Loop, OdometryNoise, TrueEnd
 from px4fuse.loop.tracks import LoopSource, find_odometry, trajectory_of
 from px4fuse.request import GivenClosure, LoopRequest
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Trajectory, components_by_axis, cumulative_distance
 
-# Minimum time (s) in an option that is UNIX time; a smaller time counts from the first pose
+# A time (s) in an option is UNIX time above this limit, else time from the first pose
 MIN_UNIX_TIME_S = 1e6
 # Minimum path length (m) of a loop
 MIN_PATH_M = 2.0
@@ -51,7 +51,7 @@ def analyse(
     request : LoopRequest, optional
         Options, with times on the clock of the trajectory.
     reference : Trajectory, optional
-        Reference for the scores, in addition to the ground truth in the log.
+        Reference for ATE and RPE, in addition to the ground truth in the log.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def analyse(
     )
     notes = [*z_down_trajectory.notes, variance_note]
     if isinstance(truth_end, str):
-        notes.append(f"the landing place is not in the ground truth: {truth_end}")
+        notes.append(f"the ground truth does not contain the landing place: {truth_end}")
     gated_closures = gate_closures(graph, closures_and_landings)
     graph_corrections, gated_closures = solve_pose_graphs(
         path, nodes, graph, gated_closures, progress
@@ -110,7 +110,7 @@ def analyse(
         true_end if isinstance(true_end, Unavailable) else end_from_start_m - true_end.displacement
     )
     heading_error_deg = _compute_heading_error(true_end, heading_deg)
-    landing_closure = next((c for c in gated_closures if c.source == LANDING_SOURCE), None)
+    landing_closure = next((c for c in gated_closures if c.source == LANDING_CLOSURE_SOURCE), None)
     distance_corrections = correct_paths_by_distance(
         path, distance_m, misclosure_m, heading_error_deg, landing_closure
     )
@@ -160,7 +160,7 @@ def _find_true_end(
     *,
     is_assessed: bool,
 ) -> TrueEnd | Unavailable:
-    """Find the landing place: as measured, from ground truth, or assumed at the take-off place."""
+    """Return the true final pose: measured, from ground truth, or equal to the initial pose."""
     if request.landed_at is not None:
         if not request.closed_loop:
             raise SettingsError(
@@ -171,7 +171,7 @@ def _find_true_end(
     if not request.closed_loop:
         return Unavailable(
             "loop closure error",
-            "--open states that the path does not return to its start",
+            "with --open, the path does not return to its start",
             "Omit --open.",
         )
     if isinstance(truth_end, TrueEnd):

@@ -1,6 +1,6 @@
-"""Loop closure by distance: key frames, path length, and distribution of the closure error.
+"""Distribution of the loop closure error along the path in proportion to distance; key frames.
 
-Positions have z down (NED, or forward-right-down at the start); see :func:`to_z_down`.
+Frames have z down: NED, or FRD (forward, right, down at the start); see :func:`to_z_down`.
 """
 
 from dataclasses import replace
@@ -14,8 +14,8 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
 
 DOWN_DIRECTION = np.array([0.0, 0.0, 1.0])
-# Conversion of each frame to a frame with z down: key of FRAMES (with forward instead of north for
-# FRD), new frame, and note
+# Conversions to z down by frame: key of FRAMES for the order and signs of the axes (in FRD, forward
+# and right replace north and east), new frame, and note to the user
 _Z_DOWN_CONVERSIONS: dict[Frame, tuple[str, Frame, str]] = {
     "ENU": ("enu", "NED", "the axes were converted from east, north, up to north, east, down"),
     "camera": (
@@ -99,7 +99,7 @@ def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
         len(key_frame_indices) > 1
         and np.linalg.norm(position_m[-1] - last_key_frame_m) < spacing_m / 2.0
     ):
-        # too near to the last pose, so the distance between them would be mostly noise
+        # The last two key frames would be so near that their distance is mostly noise
         key_frame_indices.pop()
     return np.array([*key_frame_indices, len(position_m) - 1])
 
@@ -107,10 +107,10 @@ def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
 def distribute_by_distance(
     position_m: Array, misclosure_m: Array, cumulative_m: Array | None = None
 ) -> Array:
-    """Correct a path in proportion to the distance (compass rule, Bowditch 1808).
+    """Subtract a part of the loop closure error from each position, in proportion to the distance.
 
-    The closure error (measured minus true end), multiplied by the distance up to a position over
-    the path length, is subtracted from the position. See UAT 366 module 2, Example 2.
+    ``misclosure_m`` is the final position minus the true final position. The method is the compass
+    rule of surveying (Bowditch 1808; UAT 366 module 2, Example 2).
     """
     distance_m = cumulative_distance(position_m) if cumulative_m is None else cumulative_m
     return np.asarray(position_m - (distance_m / distance_m[-1])[:, None] * misclosure_m)
@@ -131,10 +131,10 @@ def correct_by_distance(
     misclosure_m: Array,
     misclosure_heading_rad: float,
 ) -> Trajectory:
-    """Distribute the closure errors (measured minus true) of position and heading by distance.
+    """Distribute the loop closure errors of position and heading in proportion to the distance.
 
-    Orientations, and displacements between poses, are rotated about the vertical in proportion to
-    the distance. The remaining position error is distributed by the compass rule.
+    The errors are final minus true final values. Orientations, and displacements between poses, are
+    rotated about the vertical; then :func:`distribute_by_distance` corrects the position error.
     """
     position_m = trajectory.position_m
     distance_fraction = cumulative_distance_m / cumulative_distance_m[-1]
@@ -145,11 +145,11 @@ def correct_by_distance(
     middle_rotation = Rotation.from_rotvec(
         np.outer(-middle_fraction * misclosure_heading_rad, DOWN_DIRECTION)
     )
-    rotated_m = position_m[0] + np.concatenate(
+    rotated_position_m = position_m[0] + np.concatenate(
         [np.zeros((1, 3)), np.cumsum(middle_rotation.apply(np.diff(position_m, axis=0)), axis=0)]
     )
-    remaining_error_m = rotated_m[-1] - (position_m[-1] - misclosure_m)
+    remaining_error_m = rotated_position_m[-1] - (position_m[-1] - misclosure_m)
     return trajectory.with_positions(
-        distribute_by_distance(rotated_m, remaining_error_m, cumulative_distance_m),
+        distribute_by_distance(rotated_position_m, remaining_error_m, cumulative_distance_m),
         correction_rotation,
     )

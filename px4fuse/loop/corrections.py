@@ -1,4 +1,4 @@
-"""Corrections of odometry by loop closures: gate, corrected paths, and scores of each path."""
+"""Corrections of odometry by loop closures: gate, corrected paths, and their ATE and RPE."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -17,7 +17,7 @@ from px4fuse.loop.closure import (
     heading_change_rad,
 )
 from px4fuse.loop.model import (
-    LANDING_SOURCE,
+    LANDING_CLOSURE_SOURCE,
     Closure,
     CorrectedPath,
     CorrectionName,
@@ -39,7 +39,7 @@ MIN_VARIANCE_GROWTH = 2.0
 MIN_VARIANCE_FRACTION = 1e-2
 # Fraction of the poses at each end of the path over which the reported variance is averaged
 END_FRACTION = 0.1
-# Loop closure, with the landing place if the closure connects landing and take-off
+# Loop closure, and the true final pose if the closure connects take-off and landing (else None)
 ClosureAndLanding = tuple[GivenClosure, TrueEnd | None]
 
 
@@ -53,7 +53,7 @@ def odometry_variances(
     nodes : ndarray of int, shape (k,)
         Indices of the poses that are nodes of the graph.
     noise : OdometryNoise
-        Drift that is used if the reported variances of the trajectory do not grow.
+        Drift, used if the variances that the odometry reports do not grow.
 
     Returns
     -------
@@ -61,8 +61,8 @@ def odometry_variances(
         Variance per axis.
     rotation_rad2 : ndarray, shape (k - 1, 3)
         Variances about the body axes.
-    statement : str
-        Sentence on the origin of the variances.
+    variance_note : str
+        Data from which the variances are computed, for the user.
     """
     length_m = np.diff(cumulative_distance(path.position_m[nodes]))
     duration_s = np.diff(path.time_s[nodes])
@@ -120,17 +120,15 @@ def build_pose_graph(
     closures_and_landings: Sequence[ClosureAndLanding],
     noise: OdometryNoise,
 ) -> tuple[PoseGraph | Unavailable, IntArray, str]:
-    """Build the pose graph of a path (z down): odometry edges between nodes, then closures.
-
-    ``key_frame_indices`` are the indices of the key frames.
+    """Build the pose graph of a path with z down; its last edges are the loop closures.
 
     Returns
     -------
     graph : PoseGraph or Unavailable
     nodes : ndarray of int, shape (k,)
-        Indices of the nodes: key frames, and the poses nearest to the times of closures.
+        Indices of the poses that are nodes: key frames, and the poses nearest in time to closures.
     variance_note : str
-        Sentence on the origin of the variances.
+        Data from which the variances of the odometry are computed, for the user.
     """
     if path.rotation is None:
         return (
@@ -200,8 +198,8 @@ def build_pose_graph(
 
 
 UNCORRECTED_LABEL = "uncorrected"
-POSITIONS_CORRECTED_LABEL = "positions corrected by distance"
-HEADINGS_CORRECTED_LABEL = "positions and headings corrected by distance"
+POSITIONS_CORRECTED_LABEL = "closure error distributed over positions"
+HEADINGS_CORRECTED_LABEL = "closure error distributed over positions and headings"
 # Labels of the path corrections, by the key in results.json
 CORRECTION_LABELS: Mapping[str, str] = {
     "uncorrected": UNCORRECTED_LABEL,
@@ -209,12 +207,12 @@ CORRECTION_LABELS: Mapping[str, str] = {
     "by_distance": HEADINGS_CORRECTED_LABEL,
     **{f"pose_graph_{name}": label for name, label in SOLUTIONS.items()},
 }
-SINGLE_LOOP_REASON = (
-    "A single loop closure has no redundancy: only the gate can reject the loop closure, robust "
-    "optimisation cannot."
+SINGLE_CLOSURE_REASON = (
+    "Robust optimisation rejects loop closures that contradict other loop closures, but the path "
+    "has only one loop closure. The gate also tests a single loop closure."
 )
-# Corrected path with the solution of its pose graph (None without a pose graph), or the reason why
-# the corrected path is missing
+# Corrected path and solution of its pose graph (None without a pose graph), or the reason why the
+# corrected path is missing
 CorrectionOutcome = tuple[Trajectory, Solution | None] | Unavailable
 
 
@@ -225,9 +223,9 @@ def correct_paths_by_distance(
     heading_error_deg: float | Unavailable,
     landing_closure: Closure | None,
 ) -> dict[CorrectionName, CorrectionOutcome]:
-    """Distribute the closure error along the path: over positions only, and also over headings."""
+    """Distribute the loop closure error over positions only, and over positions and headings."""
     if landing_closure is not None and not landing_closure.accepted:
-        misclosure_m = _unavailable_by_gate("correction by distance", landing_closure)
+        misclosure_m = _unavailable_by_gate("distribution of the closure error", landing_closure)
     if isinstance(misclosure_m, Unavailable):
         return {"by_distance_plain": misclosure_m, "by_distance": misclosure_m}
     positions_only = distribute_by_distance(path.position_m, misclosure_m, distance_m)
@@ -265,7 +263,7 @@ def gate_closures(
         odometry_m = graph.poses[gate_result.second, :3] - graph.poses[gate_result.first, :3]
         closure_fields = structs.asdict(closure) | structs.asdict(gate_result)
         del closure_fields["first"], closure_fields["second"]
-        closure_fields["source"] = "given" if true_end is None else LANDING_SOURCE
+        closure_fields["source"] = "given" if true_end is None else LANDING_CLOSURE_SOURCE
         true_m = np.zeros(3) if true_end is None else true_end.displacement
         closures.append(
             Closure(distance_m=float(np.linalg.norm(odometry_m - true_m)), **closure_fields)
@@ -280,7 +278,7 @@ def solve_pose_graphs(
     closures: tuple[Closure, ...],
     progress: Callable[[str], None],
 ) -> tuple[dict[CorrectionName, CorrectionOutcome], tuple[Closure, ...]]:
-    """Optimise the pose graph three times: with all closures, with gated closures, and robustly.
+    """Optimise the pose graph with all closures, with closures that pass the gate, and robustly.
 
     Return the corrected paths, and the closures with their weights from robust optimisation.
     """
@@ -305,7 +303,7 @@ def solve_pose_graphs(
         progress(f"optimising: {label}")
         if robust and len(closures) < 2:
             corrections[name] = Unavailable(
-                label, SINGLE_LOOP_REASON, "Give more loop closures with --closure."
+                label, SINGLE_CLOSURE_REASON, "Give more loop closures with --closure."
             )
         elif is_gated and is_rejected[is_closure].all():
             corrections[name] = _unavailable_by_gate("pose graph", closures[0])
@@ -358,7 +356,7 @@ def score_paths(
     corrected_paths: Mapping[CorrectionName, CorrectionOutcome],
     references: tuple[Trajectory, ...],
 ) -> dict[CorrectionName, CorrectedPath | Unavailable]:
-    """Compute ATE and RPE of the odometry, and of corrected paths with the same time offset."""
+    """Compute ATE and RPE of odometry and corrected paths, all with the odometry's time offset."""
     offset_by_reference: dict[str, float] = {}
 
     def score(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:

@@ -1,4 +1,4 @@
-"""Segment of a trajectory that is analysed as a loop, and the true landing place."""
+"""Segment of a trajectory that is analysed as a loop, and its true final pose."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def cut_trajectory(
 ) -> Trajectory:
     """Cut a trajectory to a segment.
 
-    If ``rests_at_ends``, the first and last pose are averages over the rest on the ground.
+    If ``rests_at_ends``, the first and last pose are averages over REST_TIME_S on the ground.
 
     Raises
     ------
@@ -64,14 +64,14 @@ def cut_trajectory(
 def choose_loop_segment(
     flight: Flight | None, trajectory: Trajectory, start_s: float | None, end_s: float | None
 ) -> tuple[Segment, bool]:
-    """Return the segment from take-off to landing, and True if the vehicle rests at both ends.
+    """Return the segment to analyse, and True if the vehicle is on the ground at both ends.
 
     Parameters
     ----------
     flight : Flight or None
-        Flight of the trajectory; without it the segment is the whole trajectory.
+        Flight of the trajectory; None: the segment is the whole trajectory.
     start_s, end_s : float or None
-        Start or end of the segment; None for take-off or landing.
+        Start and end from the user; None: take-off and landing.
 
     Raises
     ------
@@ -125,10 +125,10 @@ def heading_change_deg(path: Trajectory) -> float | None:
 
 
 def assume_end_at_takeoff(path: Trajectory) -> TrueEnd:
-    """Return the take-off place as landing place.
+    """Assume that the vehicle landed at the take-off place.
 
-    If the heading change from odometry is small, the final heading is assumed equal to the initial
-    heading; after a larger change the final heading is unknown.
+    If the odometry's heading change is small, the final heading is assumed equal to the initial
+    heading, else it is unknown.
     """
     change_deg = heading_change_deg(path)
     is_same_heading = change_deg is not None and abs(change_deg) <= MAX_SAME_HEADING_DEG

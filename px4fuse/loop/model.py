@@ -1,4 +1,4 @@
-"""Results of a loop analysis: landing place, closures, corrected paths."""
+"""Results of a loop analysis: true final pose, loop closures and corrected paths."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,7 +23,7 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
 from px4fuse.trajectory.model import AxisComponents, Frame, Trajectory, TrajectoryKind
 
-# Name of a correction; after "pose_graph_" follows a key of trajectory.graph.solver.SOLUTIONS
+# Name of a correction of the path; the end of "pose_graph_..." is a key of SOLUTIONS (solver.py)
 CorrectionName = Literal[
     "uncorrected",
     "by_distance_plain",
@@ -32,24 +32,25 @@ CorrectionName = Literal[
     "pose_graph_gated",
     "pose_graph_gnc",
 ]
-# Source of the loop closure between take-off and landing
-LANDING_SOURCE = "landing"
+# ``Closure.source`` of the loop closure between take-off and landing
+LANDING_CLOSURE_SOURCE = "landing"
 
 
 class TrueEnd(Record, kw_only=True):
-    """True landing place relative to the take-off place.
+    """True final pose of a path relative to its initial pose.
 
     Attributes
     ----------
     displacement_m : mapping from axis name to float
+        Final position minus initial position.
     heading_change_deg : float or None
         Final heading minus initial heading, clockwise; None if unknown.
     sigma_m, sigma_heading_deg : float
-        Standard deviations of position and heading; None for an unknown heading.
+        Standard deviations of final position and final heading; None for an unknown heading.
     source : str
-        Description of the data from which the landing place is computed.
+        Data from which the final pose is computed, for the user.
     assumed : bool
-        True if landing at the take-off place is assumed without a measurement.
+        True if the final position is assumed equal to the initial position.
     """
 
     displacement_m: AxisComponents
@@ -79,7 +80,7 @@ class OdometryNoise(Record, omit_defaults=False):
     # Random walk over time (m/√s, °/√s), also while hovering
     position_m_per_root_s: NotNegative = 0.01
     heading_deg_per_root_s: NotNegative = 0.03
-    # Ratio of the drift of roll and pitch to that of heading; small, because of gravity
+    # Drift of roll and pitch over drift of heading; small, because gravity shows roll and pitch
     tilt_share: NotNegative = 0.1
 
 
@@ -91,11 +92,11 @@ class Closure(Record, kw_only=True):
     time_2_s: float
     # σ of the displacement between the two times, per axis
     sigma_m: NotNegative
-    # "landing" for the closure between take-off and landing, "given" for ``--closure``
+    # "landing": closure between take-off and landing; "given": closure from ``--closure``
     source: str
     # Closure error: displacement from odometry minus true displacement
     distance_m: NotNegative
-    # Gate: squared Mahalanobis distance, degrees of freedom, p-value, and True for acceptance
+    # χ² gate: squared Mahalanobis distance, degrees of freedom, p-value, True for acceptance
     d2: NotNegative
     degrees_of_freedom: Count
     p: Share
@@ -104,15 +105,15 @@ class Closure(Record, kw_only=True):
     weight_gnc: float | None = None
 
     def __str__(self) -> str:
-        if self.source == LANDING_SOURCE:
+        if self.source == LANDING_CLOSURE_SOURCE:
             return "the loop closure of take-off and landing"
         return f"the loop closure between {self.time_1_s:.12g} s and {self.time_2_s:.12g} s"
 
 
 class CorrectedPath(Record, kw_only=True):
-    """Corrected path, or uncorrected odometry, with its scores against each reference."""
+    """Corrected path, or uncorrected odometry, with ATE and RPE against each reference."""
 
-    # Largest and RMS displacement of the poses by the correction
+    # Maximum and RMS distance between corrected and uncorrected positions
     correction_max_m: NotNegative
     correction_rms_m: NotNegative
     # Cost (initial, final), iterations and convergence of the pose graph; None without pose graph
@@ -127,16 +128,16 @@ class CorrectedPath(Record, kw_only=True):
 
 
 class Loop(Record, kw_only=True):
-    """Result of ``px4fuse loop``: path, landing place, closure errors and corrections.
+    """Result of ``px4fuse loop``: path, true final pose, loop closure errors and corrections.
 
     Attributes
     ----------
     closure_error_m, closure_percent : float or None
-        Distance between measured and true end: in m, and in per cent of the path length.
+        Distance between final and true final position: in m, and in per cent of the path length.
     is_absolute_track : bool
         True if the positions do not drift, because they are from a positioning system.
     distance_m : ndarray, shape (n,)
-        Distance along the key frames at each pose.
+        Path length from the start to each pose, along the key frames.
     graph : PoseGraph or Unavailable
         Pose graph with all closures, before optimisation.
     original_frame : Frame
@@ -185,7 +186,7 @@ class Loop(Record, kw_only=True):
 
     @property
     def reported_paths(self) -> tuple[CorrectedPath, ...]:
-        """Available paths without duplicates."""
+        """Available paths, except paths that are equal to another one by definition."""
         duplicates: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
             duplicates.add("pose_graph_all")
@@ -195,7 +196,7 @@ class Loop(Record, kw_only=True):
 
     @property
     def best(self) -> CorrectedPath:
-        """Most reliable path: pose graph with gated closures, or by distance, or else odometry."""
+        """First available path of: gated pose graph, distributed closure error, odometry."""
         names: tuple[CorrectionName, ...] = ("pose_graph_gated", "by_distance", "uncorrected")
         return next(self.paths[name] for name in names if name in self.paths)
 

@@ -40,7 +40,7 @@ _G2O_TAGS = (b"VERTEX_", b"EDGE_", b"FIX")
 
 
 def find_odometry(flight: Flight) -> PositionTrack | Unavailable:
-    """Return the odometry of a flight: external vision with a varying orientation.
+    """Return the odometry of a flight: an external vision source with a varying orientation.
 
     Positioning systems such as UWB send no orientation, or a constant one.
     """
@@ -68,7 +68,7 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
     Raises
     ------
     MissingDataError
-        The log does not contain the track. The message contains an action to log it.
+        The log does not contain the track.
     """
     if track_name == "truth" and flight.log.is_assessed:
         raise MissingDataError(

@@ -115,8 +115,8 @@ class Server(MCPServer[Any]):
                 async with self._one_at_a_time:
                     text, results = await self._analyse(command_words, files, context)
         except jsonschema.ValidationError as error:
-            place = error.json_path.replace("$", name, 1)
-            raise ToolError(f"{place}: {one_line(error.message, 300)}.") from error
+            argument_path = error.json_path.replace("$", name, 1)
+            raise ToolError(f"{argument_path}: {one_line(error.message, 300)}.") from error
         except (Px4FuseError, OSError) as error:
             raise ToolError(str(error)) from error
         return CallToolResult(
@@ -128,13 +128,13 @@ class Server(MCPServer[Any]):
         if cache_key in self._cache:
             return self._cache[cache_key]
         receiver, sender = Pipe(duplex=False)
-        jobs = poll_with_limits(
+        job_results = poll_with_limits(
             partial(self._run_command, sender), [command_words], 1, *self._limits, max_wait_s=0.0
         )
         progress_numbers = count(1)
         # closing ends the worker process, also after the client has cancelled the call
-        with receiver, sender, closing(jobs):
-            while (outcome := next(jobs)) is None:
+        with receiver, sender, closing(job_results):
+            while (outcome := next(job_results)) is None:
                 while receiver.poll():
                     await context.report_progress(next(progress_numbers), message=receiver.recv())
                 await anyio.sleep(POLL_INTERVAL_S)

@@ -10,7 +10,7 @@ from px4fuse.readers.text_table import refuse_foreign_format
 # Number of bytes at the start of a file that identify its format
 _FORMAT_BYTES = 100
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
-# Text files that users give instead of a flight log: suffixes, kind of file and action
+# Text files that users give instead of a flight log: suffixes, kind of file and advice
 _TEXT_FILES = {
     (".csv", ".tsv", ".jsonl"): (
         "table",

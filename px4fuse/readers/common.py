@@ -1,4 +1,4 @@
-"""Common functions of all readers: valid rows, time intervals, missing data."""
+"""Utilities of all readers: valid rows, time intervals, missing data."""
 
 import numpy as np
 import pandas as pd
@@ -12,22 +12,22 @@ MAX_VALID_VALUE = 1e9
 # Maximum absolute value (m/s², rad/s) of valid IMU data: above the range of accelerometers (400 g)
 # and gyros (4000 °/s)
 MAX_IMU_VALUE = 1e4
-# Minimum distance (m) of a position 0, 0, 0 from its neighbours to reject it as not measured: 3 σ
-# of good UWB (0.1 m)
+# Minimum distance (m) from the neighbours to reject a position 0, 0, 0 as a placeholder: 3 σ of
+# accurate UWB (0.1 m)
 MIN_ZERO_DISTANCE_M = 0.3
-# Minimum distance (m) of a position from the median position to reject it as not measured
+# Minimum distance (m) from the median position to reject a position as damaged
 MIN_FAR_DISTANCE_M = 1e4
-# Minimum ratio of the distance from the median position to its median, to reject a position
+# The same minimum distance, as multiple of the median distance of all positions
 MIN_FAR_DISTANCE_RATIO = 100.0
-# Minimum duration (s) of an unchanged position that the source repeats instead of measuring:
-# sources that send each position several times repeat it for a shorter time
+# Minimum duration (s) of frozen positions, which are not measured: sources that send each position
+# several times repeat it for a shorter time
 MIN_HELD_S = 1.0
-# Minimum number of equal positions that the source repeats instead of measuring
+# Minimum number of successive equal positions that are frozen
 MIN_HELD_COUNT = 5
-# Maximum fraction of repeated positions that are rejected: with more, the vehicle may be at rest
+# Maximum fraction of frozen positions to reject them: with more, the vehicle may be at rest
 MAX_HELD_FRACTION = 0.5
-# Maximum deviation of a coordinate difference from whole rounding steps, in rounding steps
-MAX_MULTIPLE_ERROR = 0.01
+# Tolerance, in rounding steps, for a coordinate difference that is a whole number of steps
+MAX_STEP_ERROR = 0.01
 # Minimum norm of a valid quaternion: senders without attitude send zeros
 MIN_QUATERNION_NORM = 0.5
 
@@ -74,8 +74,8 @@ def finite_rows(
 def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
     """Return the reason for each row that is not a measurement, and "" for all others.
 
-    "NaN": a coordinate is not finite. "zero": 0, 0, 0 is sent instead of a position. "held": the
-    last position is sent again.
+    "NaN": a coordinate is not finite. "zero": 0, 0, 0 is sent instead of a position. "far": the
+    position is damaged. "held": the last position is sent again.
     """
     values, time_s = samples[columns].to_numpy(), samples.index.to_numpy()
     reasons = pd.Series("", index=samples.index)
@@ -97,8 +97,8 @@ def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[s
         )
         reasons.iloc[valid_rows[is_far]] = "far"
         valid_rows = valid_rows[~is_far]
-    is_same = np.all(np.diff(values[valid_rows], axis=0) == 0.0, axis=1)
-    starts = np.flatnonzero(np.append(True, ~is_same))
+    is_repeated = np.all(np.diff(values[valid_rows], axis=0) == 0.0, axis=1)
+    starts = np.flatnonzero(np.append(True, ~is_repeated))
     held_rows = [
         valid_rows[start + 1 : end]
         for start, end in zip(starts, [*starts[1:], len(valid_rows)], strict=True)
@@ -116,7 +116,7 @@ def rounding_step(values: Array) -> float:
         return 0.0
     with np.errstate(over="ignore", invalid="ignore"):  # a tiny step makes the ratio infinite
         multiples = steps / steps.min()
-        is_multiple = np.abs(multiples - np.rint(multiples)) < MAX_MULTIPLE_ERROR
+        is_multiple = np.abs(multiples - np.rint(multiples)) < MAX_STEP_ERROR
     return float(steps.min()) if is_multiple.all() else 0.0
 
 

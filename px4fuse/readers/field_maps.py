@@ -23,12 +23,11 @@ class Layout:
 
     # PX4 topic or MAVLink message; empty if the table row has another key for it
     topic: str = ""
-    # Required field of each column; ``name[i]`` is an array element
+    # Required fields, by column; ``name[i]`` is an array element
     columns: Mapping[str, str] = field(default_factory=dict)
-    # Field of each column that is read only if the topic contains it; not for MAVLink messages,
-    # because they contain all their fields
+    # Optional fields, by column; none for MAVLink messages, which contain all their fields
     optional: Mapping[str, str] = field(default_factory=dict)
-    # Factor from field value to column value; 1 if absent
+    # Factor from field value to column value, by column; 1 if absent
     scale: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -46,7 +45,10 @@ def expand_layouts(rows: Mapping[str, Any]) -> dict[str, Layout]:
 
 
 def expand_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Expand groups of columns (lists of names, or a list in Columns) to one entry per column.
+    """Expand groups of columns to one entry per column.
+
+    A key is a list in :class:`Columns`, or names separated by blanks. A value is a number for all
+    columns, field names, an array ``q[]``, or elements of an array ``covariance[0 6]``.
 
     Examples
     --------

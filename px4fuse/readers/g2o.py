@@ -21,7 +21,7 @@ _COUNTS_BY_TAG = {
     "EDGE_SE2": (2, 3 + 6),
     "EDGE_SE3:QUAT": (2, 7 + 21),
 }
-# Tags of lines that are skipped, or their first letters: laser scans and parameters
+# Tags of lines that are skipped, or prefixes of these tags: laser scans and parameters
 _SKIPPED_TAGS = ("PARAMS", "ROBOTLASER", "RAWLASER", "FLASER", "RLASER")
 _FORMAT_REMEDY = (
     "Give poses as VERTEX_SE2 or VERTEX_SE3:QUAT, and edges as EDGE_SE2 or EDGE_SE3:QUAT. Remove "
@@ -33,8 +33,8 @@ _MAX_VERTEX_ID = 2**63 - 1
 # Maximum ratio of a negative eigenvalue of an information matrix to its largest eigenvalue, due to
 # rounding of the printed digits
 _EIGENVALUE_TOLERANCE = 1e-9
-# Minimum and maximum valid entry (1/m², 1/rad²) of an information matrix: squares of the limits do
-# not overflow
+# Minimum and maximum valid entry (1/m², 1/rad²) of an information matrix: products of two
+# entries neither overflow nor become zero
 _MIN_INFORMATION, _MAX_INFORMATION = 1e-50, 1e50
 
 
@@ -200,20 +200,20 @@ def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
     return np.hstack([poses[:, :3], poses[:, 3:] / norm[:, None]])
 
 
-def _information_matrices(rows: Rows, numbers: Array, size: int) -> Array:
+def _information_matrices(edges: Rows, numbers: Array, size: int) -> Array:
     """Return the information matrices, (n, size, size), from upper triangles in row order."""
     row, column = np.triu_indices(size)
     matrices = np.empty((len(numbers), size, size))
     matrices[:, row, column] = matrices[:, column, row] = numbers
     magnitude = np.abs(numbers)
     is_too_small = (row == column) & (magnitude > 0.0) & (magnitude < _MIN_INFORMATION)
-    rows.raise_where(
+    edges.raise_where(
         is_too_small | (magnitude > _MAX_INFORMATION),
         "the information matrix contains a number that is too small or too large",
         f"Give 0, or a number from {_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}.",
     )
     eigenvalues = np.linalg.eigvalsh(matrices)
-    rows.raise_where(
+    edges.raise_where(
         eigenvalues[:, 0] < -_EIGENVALUE_TOLERANCE * np.maximum(eigenvalues[:, -1], 0.0),
         "the information matrix has a negative eigenvalue",
         "Give the upper triangle of an inverse covariance, row by row.",

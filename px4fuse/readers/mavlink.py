@@ -82,7 +82,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     truth = read_truth(recording, positions, remedies)
     airborne = _read_airborne(recording, remedies["landed"])
     is_in_flight = common.ends_in_flight(airborne, recording.duration_s)
-    pressure_hpa = recording.read(messages.LAYOUTS["pressure"])["pressure_hpa"]
+    pressure_hpa = recording.read(messages.MESSAGE_LAYOUTS["pressure"])["pressure_hpa"]
     return Flight(
         # The log description is made last, because it counts the samples that the readers dropped
         log=_describe_log(recording, parameters, parameter_faults, autopilot, is_in_flight),
@@ -166,9 +166,9 @@ def _read_ekf2(
         reason = f"{message_name} contains no finite EKF2 state"
         return Unavailable("EKF2", reason, "Start the recording after EKF2 has started.")
     recording.record_stream("ekf2_state", message_name)
-    notes = [f"the EKF2 state is from {message_name}, which the autopilot sent"]
+    notes = [f"the EKF2 state is from the autopilot's {message_name} messages"]
     if autopilot != "PX4":
-        notes.append(f"the name EKF2 stands for the estimator of {autopilot}")
+        notes.append(f"in this analysis, EKF2 means the estimator of {autopilot}")
     if "reset_counter" in samples and (
         reset_count := np.count_nonzero(samples["reset_counter"].diff()[1:])
     ):
@@ -179,7 +179,7 @@ def _read_ekf2(
     variance = samples.reindex(columns=VARIANCE_COLUMNS)
     variance = variance[(variance > 0.0).all(axis=1)]
     if variance.empty:
-        message_name = messages.LAYOUTS["accuracy"].topic
+        message_name = messages.MESSAGE_LAYOUTS["accuracy"].topic
         variance = _variance_from_accuracy(recording)
         if len(variance):
             notes.append(
@@ -224,7 +224,7 @@ def _variance_from_accuracy(recording: Recording) -> pd.DataFrame:
     PX4's horizontal accuracy is the square root of the sum of both axes' variances
     (``get_ekf_lpos_accuracy``).
     """
-    accuracy = recording.read(messages.LAYOUTS["accuracy"])
+    accuracy = recording.read(messages.MESSAGE_LAYOUTS["accuracy"])
     horizontal_m2 = accuracy["horizontal_m"] ** 2 / 2.0
     variance = pd.concat([horizontal_m2, horizontal_m2, accuracy["vertical_m"] ** 2], axis=1)
     variance = variance[(variance > 0.0).all(axis=1)].set_axis(Columns.POSITION_VARIANCE, axis=1)
@@ -273,7 +273,7 @@ def _describe_log(
     damage = []
     if frames.ends_in_frame:
         damage.append(common.format_truncation("frame", recording.duration_s, is_in_flight))
-    firmware = f"{autopilot} (version not in the recording)"
+    firmware = f"{autopilot}, unknown version"
     firmware_hash = "unknown"
     vehicle = ""
     version_rows = recording.rows("AUTOPILOT_VERSION")
@@ -322,9 +322,9 @@ def _start_unix_s(recording: Recording) -> float | None:
     """
     if recording.zero_s >= MIN_UNIX_TIME_S:
         return recording.zero_s
-    unix_line = map_boot_to_unix(recording)
-    if unix_line is not None:
-        return float(unix_line.at(recording.zero_s))
+    boot_to_unix = map_boot_to_unix(recording)
+    if boot_to_unix is not None:
+        return float(boot_to_unix.at(recording.zero_s))
     received_us = recording.frames.received_us
     if received_us is None or not recording.receipt_to_boot.pairs:
         return None

@@ -16,15 +16,14 @@ from scipy.stats import theilslopes
 from px4fuse.core.arrays import Array
 from px4fuse.flight.model import ClockMap
 
-# Maximum median difference (s) between timestamps of a sender and the receive time since boot: with
-# a larger difference the timestamps are not boot time
+# Maximum median difference (s) between timestamps on the boot clock and their receive times
 MAX_BOOT_CLOCK_DISTANCE_S = 10.0
-# Minimum time (s) by which TIMESYNC brings timestamps nearer to the receive time; with less, the
-# sender uses the boot clock
+# Minimum reduction (s) of the difference between timestamps and receive times by TIMESYNC that
+# shows that the sender has its own clock, not the boot clock
 MIN_TIMESYNC_IMPROVEMENT_S = 0.1
 # Minimum UNIX time (s), 2001-09-09: smaller times are times since boot
 MIN_UNIX_TIME_S = 1e9
-# Length (s) of the intervals from each of which the message with the least delay is used
+# Length (s) of an interval. The clock fit uses the message with the least delay of each interval
 ENVELOPE_INTERVAL_S = 2.0
 MAX_ENVELOPE_INTERVALS = 200
 # Minimum time span (s) to estimate a clock drift: in a shorter span both clocks are assumed to have
@@ -32,7 +31,7 @@ MAX_ENVELOPE_INTERVALS = 200
 MIN_DRIFT_SPAN_S = 30.0
 # Maximum relative difference between the rates of two real clocks. A replayed recording has a
 # larger difference, which is estimated even below MIN_DRIFT_SPAN_S
-MAX_RATE_DIFFERENCE = 0.01
+MAX_RELATIVE_RATE_DIFFERENCE = 0.01
 # Maximum valid ratio of the rates of two clocks: a wrong unit of time gives up to 1e9 (s for ns)
 MAX_RATE_RATIO = 1e12
 MIN_TIMESYNC_PAIRS = 3
@@ -82,19 +81,21 @@ def fit_least_delay(x: Array, y: Array) -> ClockLine:
     middle_rows = [rows[len(rows) // 2] for rows in interval_rows]
     if len(middle_rows) > 1 and x[middle_rows[-1]] > x[middle_rows[0]]:
         initial_slope = _median_slope(x[middle_rows], y[middle_rows])
-        if abs(initial_slope - 1.0) > MAX_RATE_DIFFERENCE and _is_rate_ratio(initial_slope):
+        if abs(initial_slope - 1.0) > MAX_RELATIVE_RATE_DIFFERENCE and _is_rate_ratio(
+            initial_slope
+        ):
             slope = initial_slope
-    residual = y - slope * (x - x0)
-    envelope_rows = [rows[np.argmin(residual[rows])] for rows in interval_rows]
+    residual_s = y - slope * (x - x0)
+    envelope_rows = [rows[np.argmin(residual_s[rows])] for rows in interval_rows]
     if span_s >= MIN_DRIFT_SPAN_S and len(envelope_rows) > 1:
-        # Two iterations, because with a better slope other messages have the smallest delay
+        # Two iterations, because a new slope may change which messages have the smallest delay
         for _ in range(2):
-            corrected_slope = slope + _median_slope(x[envelope_rows], residual[envelope_rows])
+            corrected_slope = slope + _median_slope(x[envelope_rows], residual_s[envelope_rows])
             slope = corrected_slope if _is_rate_ratio(corrected_slope) else 1.0
-            residual = y - slope * (x - x0)
-            envelope_rows = [rows[np.argmin(residual[rows])] for rows in interval_rows]
+            residual_s = y - slope * (x - x0)
+            envelope_rows = [rows[np.argmin(residual_s[rows])] for rows in interval_rows]
     return ClockLine(
-        x0, float(np.median(residual[envelope_rows])), slope, robust_std(residual), len(x)
+        x0, float(np.median(residual_s[envelope_rows])), slope, robust_std(residual_s), len(x)
     )
 
 
@@ -122,10 +123,10 @@ def robust_std(values: Array) -> float:
 class ClockMapping:
     """Map from the timestamps of a sender to the boot clock, with a description for results.
 
-    ``to_boot`` is None if most timestamps are equal; the receive time is then used instead.
+    ``sender_to_boot`` is None if most timestamps are equal; receive times then replace them.
     """
 
-    to_boot: ClockLine | None
+    sender_to_boot: ClockLine | None
     description: ClockMap
 
 
@@ -155,13 +156,13 @@ def map_clock(
     has_receipt : bool
         False if the recording contains only the order of the messages, no receive times.
     """
-    time_source = "receive time" if has_receipt else "position in the stream"
+    time_source = "receive time" if has_receipt else "message order"
     boot_at_receipt = receipt_to_boot.at(received_s)
     if not is_running_clock(stamp_s):
         distinct_count = len(np.unique(stamp_s))
         note = (
-            f"the {len(stamp_s)} timestamps have only {distinct_count} distinct values, so the "
-            f"{time_source} is used instead"
+            f"the {len(stamp_s)} timestamps have only {distinct_count} distinct values, so "
+            f"px4fuse uses the {time_source}"
         )
         # Jitter of the receive time if samples are sent at regular intervals; gaps are excluded
         intervals_s = np.diff(received_s)
@@ -186,10 +187,10 @@ def map_clock(
         unmapped_distance_s <= MAX_BOOT_CLOCK_DISTANCE_S
         and improvement_s < MIN_TIMESYNC_IMPROVEMENT_S
     ):
-        boot_line = ClockLine(float(stamp_s[0]), float(stamp_s[0]), 1.0, 0.0, len(stamp_s))
+        sender_to_boot = ClockLine(float(stamp_s[0]), float(stamp_s[0]), 1.0, 0.0, len(stamp_s))
         note = "the timestamps of the sender are boot times of the autopilot"
         return ClockMapping(
-            boot_line, ClockMap(name, "boot clock", len(stamp_s), 0.0, 0.0, 0.0, note)
+            sender_to_boot, ClockMap(name, "boot clock", len(stamp_s), 0.0, 0.0, 0.0, note)
         )
     clock_kind = "UNIX time" if float(np.median(stamp_s)) > MIN_UNIX_TIME_S else "clock"
     clock_name = f"{clock_kind} of {name}"
@@ -197,23 +198,26 @@ def map_clock(
     if clock_kind == "UNIX time" and map_boot_to_unix is not None:
         unix_note = "sender and autopilot are assumed to have the same UNIX time"
         candidates.append(("SYSTEM_TIME", map_boot_to_unix.inverse(), unix_note))
-    for method, boot_line, note in candidates:
+    for method, sender_to_boot, note in candidates:
         # TIMESYNC or SYSTEM_TIME of another clock gives boot times far from the receive times
-        if distance_s(boot_line.at(stamp_s)) <= MAX_BOOT_CLOCK_DISTANCE_S:
-            return ClockMapping(boot_line, _clock_map(clock_name, method, boot_line, stamp_s, note))
-    boot_line = fit_least_delay(stamp_s, received_s)
-    slope = boot_line.slope * receipt_to_boot.slope
-    boot_line = replace(boot_line, y0=float(receipt_to_boot.at(boot_line.y0)), slope=slope)
-    note = "without TIMESYNC and SYSTEM_TIME the mapped times are late by the minimum link delay"
-    return ClockMapping(boot_line, _clock_map(clock_name, time_source, boot_line, stamp_s, note))
+        if distance_s(sender_to_boot.at(stamp_s)) <= MAX_BOOT_CLOCK_DISTANCE_S:
+            return _clock_mapping(clock_name, method, sender_to_boot, stamp_s, note)
+    sender_to_boot = fit_least_delay(stamp_s, received_s)
+    slope = sender_to_boot.slope * receipt_to_boot.slope
+    y0 = float(receipt_to_boot.at(sender_to_boot.y0))
+    sender_to_boot = replace(sender_to_boot, y0=y0, slope=slope)
+    note = (
+        "the recording has no usable TIMESYNC or SYSTEM_TIME, so the boot times of the samples are "
+        "too late by the unknown minimum link delay"
+    )
+    return _clock_mapping(clock_name, time_source, sender_to_boot, stamp_s, note)
 
 
 def _fit_timesync(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> ClockLine | None:
     """Map the clock of a sender to the boot clock by TIMESYNC, averaged over both directions."""
     lines = []
     if len(replies[0]) >= MIN_TIMESYNC_PAIRS:
-        # In a reply the autopilot's clock is read first, so the map from that clock is fitted and
-        # then inverted
+        # The autopilot reads its clock first, so the fit gives the map from boot clock to sender
         lines.append(fit_least_delay(*replies).inverse())
     if len(answers[0]) >= MIN_TIMESYNC_PAIRS:
         lines.append(fit_least_delay(*answers))
@@ -225,8 +229,11 @@ def _fit_timesync(replies: tuple[Array, Array], answers: tuple[Array, Array]) ->
     return ClockLine(x0, y0, slope, jitter, sum(line.pairs for line in lines))
 
 
-def _clock_map(clock: str, method: str, line: ClockLine, stamp_s: Array, note: str) -> ClockMap:
+def _clock_mapping(
+    clock: str, method: str, line: ClockLine, stamp_s: Array, note: str
+) -> ClockMapping:
     middle_s = float(0.5 * (stamp_s.min() + stamp_s.max()))
     offset_s = float(line.at(middle_s)) - middle_s
     drift_ppm = (line.slope - 1.0) * 1e6
-    return ClockMap(clock, method, line.pairs, offset_s, drift_ppm, line.jitter, note)
+    description = ClockMap(clock, method, line.pairs, offset_s, drift_ppm, line.jitter, note)
+    return ClockMapping(line, description)

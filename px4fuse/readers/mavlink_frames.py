@@ -68,8 +68,8 @@ class Frames:
     name: str
     content: bytes
     sha256: str
-    # Offset of each frame's first byte in the content
-    start: Int64Array
+    # Offset of the first byte of each frame in the content
+    start_offsets: Int64Array
     message_id: NDArray[np.int32]
     system: ByteArray
     component: ByteArray
@@ -88,7 +88,7 @@ class Frames:
     damaged_receive_time_count: int
 
     def __len__(self) -> int:
-        return len(self.start)
+        return len(self.start_offsets)
 
     def rows(self, message: str) -> IntArray:
         """Return the indices of the frames with one message; ``message`` is the MAVLink name."""
@@ -151,35 +151,41 @@ def read_frames(name: str, content: bytes) -> Frames:
     LogError
         The content is not MAVLink.
     """
-    start, end, message_id = _remove_nested_frames(_find_valid_frames(content)).T
-    time_bytes = RECEIVE_TIME_BYTES if len(start) and _has_receive_times(start, end) else 0
-    if int(np.sum(end - start)) < MIN_VALID_FRACTION * len(content) or not len(start):
+    start_offsets, end_offsets, message_id = _remove_nested_frames(_find_valid_frames(content)).T
+    time_bytes = (
+        RECEIVE_TIME_BYTES
+        if len(start_offsets) and _has_receive_times(start_offsets, end_offsets)
+        else 0
+    )
+    if int(np.sum(end_offsets - start_offsets)) < MIN_VALID_FRACTION * len(content) or not len(
+        start_offsets
+    ):
         raise LogError(
-            f"{name}: the file is neither a PX4 ULog nor a MAVLink recording ({len(start)} frames "
-            f"with a valid checksum in {len(content)} bytes).",
+            f"{name}: the file is neither a PX4 ULog nor a MAVLink recording. It contains "
+            f"{len(start_offsets)} frames with a valid checksum in {len(content)} bytes.",
             "Give a .ulg, a .tlog or a raw MAVLink stream.",
         )
     content_bytes = np.frombuffer(content, dtype=np.uint8)
-    is_version_2 = content_bytes[start] == MAGIC_BYTE_V2
+    is_version_2 = content_bytes[start_offsets] == MAGIC_BYTE_V2
     # Three consecutive header bytes: sequence, system, component
-    sequence_offset = start + np.where(is_version_2, 4, 2)
+    sequence_offset = start_offsets + np.where(is_version_2, 4, 2)
     unknown_frame_count, bad_byte_count, ends_in_frame = _count_other_bytes(
-        content, start - time_bytes, end, time_bytes
+        content, start_offsets - time_bytes, end_offsets, time_bytes
     )
     received_us, damaged_receive_time_count = (
-        _read_receive_times(content_bytes, start, end) if time_bytes else (None, 0)
+        _read_receive_times(content_bytes, start_offsets, end_offsets) if time_bytes else (None, 0)
     )
     return Frames(
         name=name,
         content=content,
         sha256=hashlib.sha256(content).hexdigest(),
-        start=start,
+        start_offsets=start_offsets,
         message_id=message_id.astype(np.int32),
         system=content_bytes[sequence_offset + 1],
         component=content_bytes[sequence_offset + 2],
         sequence=content_bytes[sequence_offset],
-        payload_start=start + np.where(is_version_2, HEADER_BYTES_V2, HEADER_BYTES_V1),
-        payload_length=content_bytes[start + 1],
+        payload_start=start_offsets + np.where(is_version_2, HEADER_BYTES_V2, HEADER_BYTES_V1),
+        payload_length=content_bytes[start_offsets + 1],
         received_us=received_us,
         unknown_frame_count=unknown_frame_count,
         bad_byte_count=bad_byte_count,
@@ -206,25 +212,25 @@ def _find_valid_frames(content: bytes) -> Int64Array:
 
 
 def _remove_nested_frames(frames: Int64Array) -> Int64Array:
-    """Remove frames that begin inside the previous frame.
+    """Remove false frames, which overlap with another frame.
 
-    The payload of TUNNEL may contain a frame, and a receive time may look like a frame header. Such
-    a false frame must not remove the frame after the receive time.
+    The payload of TUNNEL may contain a frame, and a receive time may look like a frame header. The
+    frame that begins directly after the previous frame, or after its receive time, is kept.
     """
     if not np.any(frames[1:, 0] < frames[:-1, 1]):
         return frames
-    start = frames[:, 0].tolist()
-    end = frames[:, 1].tolist()
+    start_offsets = frames[:, 0].tolist()
+    end_offsets = frames[:, 1].tolist()
     kept_rows = []
     previous_end = 0
-    starts = {*start}
-    for row, frame_start in enumerate(start):
+    starts = {*start_offsets}
+    for row, frame_start in enumerate(start_offsets):
         next_starts = previous_end, previous_end + RECEIVE_TIME_BYTES
         if frame_start >= previous_end and (
             frame_start in next_starts or starts.isdisjoint(next_starts)
         ):
             kept_rows.append(row)
-            previous_end = end[row]
+            previous_end = end_offsets[row]
     return frames[kept_rows]
 
 
@@ -233,53 +239,60 @@ def _find_possible_frames(
 ) -> tuple[Int64Array, Int64Array]:
     """Return start, end and message id of possible frames in a block, and checksum offsets."""
     block = content_bytes[block_start : block_start + BLOCK_BYTES]
-    start = block_start + np.flatnonzero((block == MAGIC_BYTE_V1) | (block == MAGIC_BYTE_V2))
-    header_bytes = np.where(content_bytes[start] == MAGIC_BYTE_V2, HEADER_BYTES_V2, HEADER_BYTES_V1)
-    has_whole_header = start + header_bytes + CHECKSUM_BYTES <= len(content_bytes)
-    start = start[has_whole_header]
+    start_offsets = block_start + np.flatnonzero(
+        (block == MAGIC_BYTE_V1) | (block == MAGIC_BYTE_V2)
+    )
+    header_bytes = np.where(
+        content_bytes[start_offsets] == MAGIC_BYTE_V2, HEADER_BYTES_V2, HEADER_BYTES_V1
+    )
+    has_whole_header = start_offsets + header_bytes + CHECKSUM_BYTES <= len(content_bytes)
+    start_offsets = start_offsets[has_whole_header]
     header_bytes = header_bytes[has_whole_header]
     is_version_2 = header_bytes == HEADER_BYTES_V2
-    start_v2 = start[is_version_2]
-    message_id = content_bytes[start + 5].astype(np.int64)
+    start_offsets_v2 = start_offsets[is_version_2]
+    message_id = content_bytes[start_offsets + 5].astype(np.int64)
     message_id[is_version_2] = (
-        content_bytes[start_v2 + 7] | content_bytes[start_v2 + 8].astype(np.int64) << 8
+        content_bytes[start_offsets_v2 + 7]
+        | content_bytes[start_offsets_v2 + 8].astype(np.int64) << 8
     )
     is_candidate = _CRC_EXTRA[message_id] >= 0
-    is_candidate[is_version_2] &= (content_bytes[start_v2 + 9] == 0) & (
-        content_bytes[start_v2 + 2] <= SIGNED_FLAG
+    is_candidate[is_version_2] &= (content_bytes[start_offsets_v2 + 9] == 0) & (
+        content_bytes[start_offsets_v2 + 2] <= SIGNED_FLAG
     )
-    crc_end = start + content_bytes[start + 1] + header_bytes
-    end = crc_end + CHECKSUM_BYTES
-    end[is_version_2] += SIGNATURE_BYTES * (content_bytes[start_v2 + 2] & SIGNED_FLAG).astype(
-        np.int64
-    )
-    is_candidate &= end <= len(content_bytes)
-    return np.stack([start, end, message_id], axis=1)[is_candidate], crc_end[is_candidate]
+    crc_end = start_offsets + content_bytes[start_offsets + 1] + header_bytes
+    end_offsets = crc_end + CHECKSUM_BYTES
+    end_offsets[is_version_2] += SIGNATURE_BYTES * (
+        content_bytes[start_offsets_v2 + 2] & SIGNED_FLAG
+    ).astype(np.int64)
+    is_candidate &= end_offsets <= len(content_bytes)
+    return np.stack([start_offsets, end_offsets, message_id], axis=1)[is_candidate], crc_end[
+        is_candidate
+    ]
 
 
-def _has_receive_times(start: Int64Array, end: Int64Array) -> bool:
+def _has_receive_times(start_offsets: Int64Array, end_offsets: Int64Array) -> bool:
     """Return True if most frames are separated by the eight bytes of a receive time."""
-    gap_bytes = start[1:] - end[:-1]
+    gap_bytes = start_offsets[1:] - end_offsets[:-1]
     with_time_count = int(np.count_nonzero(gap_bytes == RECEIVE_TIME_BYTES))
     without_time_count = int(np.count_nonzero(gap_bytes == 0))
     if with_time_count + without_time_count:
         return with_time_count > without_time_count
-    return bool(start[0] == RECEIVE_TIME_BYTES)
+    return bool(start_offsets[0] == RECEIVE_TIME_BYTES)
 
 
 def _count_other_bytes(
-    content: bytes, start: Int64Array, end: Int64Array, time_bytes: int
+    content: bytes, start_offsets: Int64Array, end_offsets: Int64Array, time_bytes: int
 ) -> tuple[int, int, bool]:
     """Count unknown frames and other bytes between the valid frames.
 
-    Return also True if the file ends within a frame. Each ``start`` includes the ``time_bytes`` of
-    a receive time.
+    Return also True if the file ends within a frame. The ``time_bytes`` of a receive time are part
+    of each frame.
     """
     unknown_frame_count = 0
     bad_byte_count = 0
     last_bytes = b""
-    gap_starts = np.append(0, end)
-    gap_ends = np.append(start, len(content))
+    gap_starts = np.append(0, end_offsets)
+    gap_ends = np.append(start_offsets, len(content))
     for gap_start, gap_end in np.column_stack([gap_starts, gap_ends])[
         gap_starts < gap_ends
     ].tolist():
@@ -314,16 +327,16 @@ def _unknown_frames(content: bytes, offset: int, gap_end: int, time_bytes: int) 
 
 
 def _read_receive_times(
-    content_bytes: ByteArray, start: Int64Array, end: Int64Array
+    content_bytes: ByteArray, start_offsets: Int64Array, end_offsets: Int64Array
 ) -> tuple[Int64Array, int]:
     """Return the receive times (UNIX, µs) and the number of damaged receive times."""
-    is_usable = start >= RECEIVE_TIME_BYTES
-    is_usable[1:] &= start[1:] - end[:-1] >= RECEIVE_TIME_BYTES
+    is_usable = start_offsets >= RECEIVE_TIME_BYTES
+    is_usable[1:] &= start_offsets[1:] - end_offsets[:-1] >= RECEIVE_TIME_BYTES
     windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)
     # The file may begin without the receive time of the first frame
-    raw_us = np.ascontiguousarray(windows[np.maximum(start - RECEIVE_TIME_BYTES, 0)]).view(">u8")[
-        :, 0
-    ]
+    raw_us = np.ascontiguousarray(windows[np.maximum(start_offsets - RECEIVE_TIME_BYTES, 0)]).view(
+        ">u8"
+    )[:, 0]
     # values above 1 << 63 become negative and are then invalid
     received_us = raw_us.astype(np.int64)
     is_usable &= (received_us >= 0) & (received_us < 1 << 62)
@@ -334,7 +347,7 @@ def _read_receive_times(
         rows = np.flatnonzero(is_usable)
         # Times are relative to the first receive time, so that float64 resolves microseconds
         since_first_us = np.interp(
-            np.arange(len(start)), rows, received_us[rows] - received_us[rows[0]]
+            np.arange(len(start_offsets)), rows, received_us[rows] - received_us[rows[0]]
         )
         received_us = received_us[rows[0]] + np.rint(since_first_us).astype(np.int64)
     return received_us, int(np.count_nonzero(~is_usable))

@@ -20,7 +20,7 @@ ON_GROUND_STATE = 1  # MAV_LANDED_STATE_ON_GROUND
 ARDUPILOT_REPLAY = Unavailable(
     "estimator replay",
     "px4fuse has no model of ArduPilot's estimator (EKF3)",
-    "Use the logged state of EKF3.",
+    "Give a PX4 ULog. px4fuse replays only PX4's EKF2.",
 )
 # Messages with the boot time in time_usec; in other messages time_usec may be from another clock
 BOOT_CLOCK_MESSAGES = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
@@ -43,11 +43,11 @@ AUTOPILOT_MESSAGES = (
 class PositionInput:
     """Message that sends an external position to the autopilot."""
 
-    # Key of the message in LAYOUTS
+    # Key of the message in MESSAGE_LAYOUTS
     row: str
     description: str
     # Name of the track for ``--position-source``
-    name: str = ""
+    track_name: str = ""
     kind: str = "uwb"
     # Frame of the positions; "unknown": MAV_FRAME in the column frame_id, if the layout has it
     frame: str = "unknown"
@@ -60,7 +60,7 @@ class PositionInput:
 
     @property
     def layout(self) -> Layout:
-        return LAYOUTS[self.row]
+        return MESSAGE_LAYOUTS[self.row]
 
     @property
     def origin(self) -> Origin:
@@ -82,26 +82,34 @@ class FrameOfReference:
 
 
 _TABLE = read_toml(__file__, dict[str, dict[str, Any]])
-LAYOUTS = expand_layouts(_TABLE["layouts"])
-assert not any(row.optional for row in LAYOUTS.values()), "mavlink_messages.toml: use `columns`"
+MESSAGE_LAYOUTS = expand_layouts(_TABLE["layouts"])
+assert not any(row.optional for row in MESSAGE_LAYOUTS.values()), (
+    "a MAVLink layout has optional fields"
+)
 _INPUTS = msgspec.convert(_TABLE["positions"], dict[str, PositionInput])
 FRAMES_OF_REFERENCE = msgspec.convert(_TABLE["frames"], dict[int, FrameOfReference], strict=False)
 AUTOPILOTS = msgspec.convert(_TABLE["autopilots"], dict[int, str], strict=False)
 UNUSED_MESSAGES: Mapping[str, str] = _TABLE["unused"]
-POSITION_INPUTS = tuple(replace(row, name=name) for name, row in _INPUTS.items())
-_SCALED_IMU = (replace(LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{n}") for n in ("", "2", "3"))
-IMU_LAYOUTS = (LAYOUTS["highres_imu"], *_SCALED_IMU)
+POSITION_INPUTS = tuple(replace(row, track_name=name) for name, row in _INPUTS.items())
+_SCALED_IMU_LAYOUTS = (
+    replace(MESSAGE_LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{n}") for n in ("", "2", "3")
+)
+IMU_LAYOUTS = (MESSAGE_LAYOUTS["highres_imu"], *_SCALED_IMU_LAYOUTS)
 # Attitude messages, in order of preference for equal message counts
-ATTITUDE_LAYOUTS = (LAYOUTS["quaternion"], LAYOUTS["angles"], LAYOUTS["attitude_of_odometry"])
+ATTITUDE_LAYOUTS = (
+    MESSAGE_LAYOUTS["quaternion"],
+    MESSAGE_LAYOUTS["angles"],
+    MESSAGE_LAYOUTS["attitude_of_odometry"],
+)
 # Messages with EKF2's state; ODOMETRY is first because it contains variances
-STATE_LAYOUTS = (LAYOUTS["odometry"], LAYOUTS["local_position"])
+STATE_LAYOUTS = (MESSAGE_LAYOUTS["odometry"], MESSAGE_LAYOUTS["local_position"])
 # Messages with ground truth of a simulation
-TRUTH_LAYOUTS = (LAYOUTS["truth"], LAYOUTS["sim_state"])
-GNSS_LAYOUTS = (LAYOUTS["gnss"], replace(LAYOUTS["gnss"], topic="GPS2_RAW"))
+TRUTH_LAYOUTS = (MESSAGE_LAYOUTS["truth"], MESSAGE_LAYOUTS["sim_state"])
+GNSS_LAYOUTS = (MESSAGE_LAYOUTS["gnss"], replace(MESSAGE_LAYOUTS["gnss"], topic="GPS2_RAW"))
 
 
 def remedies_of_autopilot(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
-    """Return the actions to record missing data, and the reason why EKF2 cannot be replayed."""
+    """Return advice how to record missing messages, and the reason why EKF2 cannot be replayed."""
     if autopilot == "ArduPilot":
         return _TABLE["remedies"][autopilot], ARDUPILOT_REPLAY
     return _TABLE["remedies"]["PX4"], RECORD_NOT_LOGGED

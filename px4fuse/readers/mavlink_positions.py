@@ -23,8 +23,8 @@ from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unpr
 # Maximum median difference (s) between GNSS timestamps and the receive time since boot: with a
 # larger difference the timestamps are not boot time
 MAX_BOOT_CLOCK_DISTANCE_S = 5.0
-# Maximum time difference (s) between a global and a local position to compute the origin: an error
-# of 5 cm at 1 m/s
+# Maximum time difference (s) between a global and a local position to compute the origin from both;
+# at 1 m/s the error of the origin is 5 cm
 MAX_ORIGIN_TIME_DIFFERENCE_S = 0.05
 
 
@@ -38,7 +38,7 @@ def read_positions(
     clocks : mapping from address to ClockMapping
         Clock of every sender.
     remedy : str
-        Action to record missing positions.
+        Advice to the user if no positions were recorded.
     delay_s : float
         Delay between a GNSS fix and its timestamp that the autopilot assumes.
     """
@@ -79,12 +79,12 @@ def _read_track(
         table = table[is_of_estimator]
     if not len(rows):
         return None
-    name = source.name + (f"_{sender[0]}_{sender[1]}" if len(senders) > 1 else "")
+    name = source.track_name + (f"_{sender[0]}_{sender[1]}" if len(senders) > 1 else "")
     stamp_s = table[source.stamp] * 1e-6
-    boot_s = recording.receipt_boot_s(rows)
-    if clock.to_boot is not None:
-        boot_s = np.where(stamp_s > 0.0, clock.to_boot.at(stamp_s), np.nan)
-    samples = recording.read(source.layout, rows, boot_s, name)
+    sample_boot_s = recording.receipt_boot_s(rows)
+    if clock.sender_to_boot is not None:
+        sample_boot_s = np.where(stamp_s > 0.0, clock.sender_to_boot.at(stamp_s), np.nan)
+    samples = recording.read(source.layout, rows, sample_boot_s, name)
     frame = source.frame
     if "frame_id" in samples and len(samples):
         # A track has one coordinate frame: the frame of the last sample, as in PX4
@@ -103,7 +103,7 @@ def _read_track(
         frame=frame,
         clock=clock_map.clock
         if clock_map.method == "boot clock"
-        else f"{clock_map.clock}, mapped to boot time by {clock_map.method}",
+        else f"autopilot boot clock, converted from {clock_map.clock} by {clock_map.method}",
         topics=(source.message,),
         log=recording.frames.name,
         clock_map=clock_map,
@@ -133,12 +133,14 @@ def _read_gnss(
         fix_count = "none" if fixes.empty else f"only {len(fixes)}"
         return px4_positions.unavailable_source(
             layout.topic,
-            f"{message_count} messages, {fix_count} with a 3D fix",
+            f"the recording has {message_count} {layout.topic}, {fix_count} with a 3D fix",
             "Give the antenna a free view of the sky and wait for a fix.",
         )
     samples = project_to_ned(fixes, local_origin(recording))
     accuracy = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2
-    is_automatic = bool(recording.read(messages.LAYOUTS["global_state"])["latitude_deg"].any())
+    is_automatic = bool(
+        recording.read(messages.MESSAGE_LAYOUTS["global_state"])["latitude_deg"].any()
+    )
     return px4_positions.make_track(
         layout.topic,
         samples.join(accuracy),
@@ -164,11 +166,11 @@ def local_origin(recording: Recording) -> GeodeticPosition | None:
     The origin is from GPS_GLOBAL_ORIGIN, or else computed from global and local positions. None if
     the recording contains neither.
     """
-    sent_origin = recording.read(messages.LAYOUTS["origin"]).dropna()
+    sent_origin = recording.read(messages.MESSAGE_LAYOUTS["origin"]).dropna()
     if len(sent_origin):
         return tuple(sent_origin.iloc[-1].tolist())
     joined = join_nearest(
-        recording.read(messages.LAYOUTS["global_state"]),
+        recording.read(messages.MESSAGE_LAYOUTS["global_state"]),
         recording.read(messages.STATE_LAYOUTS[-1])[Columns.POSITION],
         MAX_ORIGIN_TIME_DIFFERENCE_S,
     ).dropna()

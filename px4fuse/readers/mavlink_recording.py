@@ -30,7 +30,7 @@ from px4fuse.readers.ulog_topics import longest_increasing_run
 from px4fuse.trajectory.rotation import rotate
 
 BOOT_CLOCK = "autopilot boot clock"
-RECEIPT_CLOCK = "receive time minus minimum link delay"
+RECEIPT_CLOCK = "autopilot boot clock, estimated from receive times"
 # Minimum backward step (s) of the boot clock at a restart; a smaller step is a late packet
 MIN_RESTART_STEP_S = 5.0
 # Number of messages before and after a backward step whose boot times have to confirm a restart
@@ -55,8 +55,8 @@ class Recording:
     address: Address
     # Analysed frames: the longest part of the recording between two restarts of the autopilot
     session: slice
-    # Receive time of each frame since the first frame. In a stream without receive times: boot time
-    # of the last autopilot message before the frame
+    # Receive time of each frame (s since the first frame). If the file contains no receive times,
+    # the boot time of the last autopilot message before the frame replaces them
     received_s: Array
     # Map from receive time to boot clock
     receipt_to_boot: ClockLine
@@ -112,9 +112,9 @@ class Recording:
         # One hour of IMU data has hundreds of megabytes, so fields are copied only once
         values = np.empty((len(selected_rows), len(layout.columns)))
         for column_index, (column, field_name) in enumerate(layout.columns.items()):
-            array_name, _, element = field_name.removesuffix("]").partition("[")
+            array_name, _, element_text = field_name.removesuffix("]").partition("[")
             values[:, column_index] = (
-                table[array_name][:, int(element)] if element else table[array_name]
+                table[array_name][:, int(element_text)] if element_text else table[array_name]
             )
             values[:, column_index] *= layout.scale.get(column, 1.0)
         del table
@@ -246,8 +246,8 @@ def read_recording(frames: Frames, address: Address) -> Recording:
             int(rows[-1]) + 1 if session_index < len(restart_rows) else len(frames),
         )
         notes.append(
-            f"restarts of the boot clock: {len(restart_rows)}; only session {session_index + 1} "
-            f"is analysed, from {boot_s[0]:.1f} s to {boot_s[-1]:.1f} s after boot "
+            f"number of restarts of the boot clock: {len(restart_rows)}. Only the longest part "
+            f"between two restarts is analysed: {boot_s[0]:.1f} s to {boot_s[-1]:.1f} s after boot "
             f"({used_fraction:.0%} of the data)"
         )
     increasing_rows = _remove_stray_timestamps(
@@ -262,18 +262,21 @@ def read_recording(frames: Frames, address: Address) -> Recording:
             receipt_to_boot = fit_least_delay(boot_s, received_s[rows]).inverse()
     elif len(rows):
         # A raw stream has no receive times; the last boot time before each frame is used instead
-        previous_rows = np.searchsorted(rows, np.arange(len(frames)), side="right") - 1
-        received_s = boot_s[np.maximum(previous_rows, 0)]
+        previous_message_index = np.searchsorted(rows, np.arange(len(frames)), side="right") - 1
+        received_s = boot_s[np.maximum(previous_message_index, 0)]
     else:
         notes.append("no message in the stream contains a time")
     receipt_reversal_count = int(np.count_nonzero(np.diff(received_s) < 0.0))
     for quantity, count in (
-        ("ignored frames with unknown message type", frames.unknown_frame_count),
-        ("damaged receive times that were interpolated", frames.damaged_receive_time_count),
-        ("backward jumps of the receive time", receipt_reversal_count),
+        ("number of ignored MAVLink frames with unknown message type", frames.unknown_frame_count),
+        (
+            "number of damaged receive times that were interpolated",
+            frames.damaged_receive_time_count,
+        ),
+        ("number of backward jumps of the receive time", receipt_reversal_count),
     ):
         if count:
-            notes.append(f"number of {quantity}: {count}")
+            notes.append(f"{quantity}: {count}")
     bad_bytes, byte_count = frames.bad_byte_count, len(frames.content)
     lost_text = (
         f"{bad_bytes:,} bytes ({bad_bytes / byte_count:.2%}) are not part of a complete MAVLink "

@@ -10,7 +10,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.flight.model import ClockMap, Sender
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers.mavlink_clocks import (
-    MAX_RATE_DIFFERENCE,
+    MAX_RELATIVE_RATE_DIFFERENCE,
     ClockLine,
     ClockMapping,
     is_running_clock,
@@ -21,9 +21,9 @@ from px4fuse.readers.mavlink_recording import MIN_RESTART_STEP_S, Recording, map
 
 # Maximum number of senders that are read and described: the senders with the most messages
 MAX_SENDERS = 32
-# Maximum fraction of lost messages: with a larger fraction the sender does not set sequence numbers
+# Maximum fraction of lost messages; a larger fraction means that the sender does not number them
 MAX_LOST_FRACTION = 0.9
-# Maximum lateness (sequence numbers) of a message that was received over a slower link
+# Maximum number of sequence numbers by which a message may be late, on a slower link
 MAX_LATE_MESSAGES = 16
 # Maximum difference (s) of TIMESYNC timestamps from a sender's position timestamps: a larger
 # difference shows another clock
@@ -103,17 +103,17 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
 def senders_of(recording: Recording, message: str) -> list[Address]:
     """Return the senders of a message that are not autopilots, such as companion computers."""
     frames = recording.frames
-    own_address = recording.address
+    autopilot_address = recording.address
     other_vehicles = {
         address[0]
         for address, vehicle_type in _read_vehicle_types(frames).items()
         if _is_vehicle(*vehicle_type)
-    } - {own_address[0]}
+    } - {autopilot_address[0]}
     counts = _count_frames(frames, recording.rows_of_all_senders(message))
     return [
         address
         for address, _ in counts
-        if address != own_address and address[0] not in other_vehicles
+        if address != autopilot_address and address[0] not in other_vehicles
     ][:MAX_SENDERS]
 
 
@@ -121,12 +121,14 @@ def map_senders(recording: Recording) -> dict[Address, ClockMapping]:
     """Map the clock of every sender of an external position to the boot clock."""
     message_names = {source.message for source in messages.POSITION_INPUTS}
     senders = {address for message in message_names for address in senders_of(recording, message)}
-    unix_line = map_boot_to_unix(recording)
-    return {sender: _map_sender_clock(recording, sender, unix_line) for sender in sorted(senders)}
+    boot_to_unix = map_boot_to_unix(recording)
+    return {
+        sender: _map_sender_clock(recording, sender, boot_to_unix) for sender in sorted(senders)
+    }
 
 
 def _map_sender_clock(
-    recording: Recording, sender: Address, unix_line: ClockLine | None
+    recording: Recording, sender: Address, boot_to_unix: ClockLine | None
 ) -> ClockMapping:
     frames = recording.frames
     timestamps_s = []
@@ -141,11 +143,11 @@ def _map_sender_clock(
     timesync = frames.table("TIMESYNC", rows)
     reply_s = timesync["tc1"] * 1e-9
     request_s = timesync["ts1"] * 1e-9
-    # Replies to another sender's request contain that sender's clock, so they are excluded
+    # In a reply, ts1 is the clock of the requester: the boot clock only in replies to the autopilot
     is_reply = (reply_s != 0.0) & (
         np.abs(request_s - recording.receipt_boot_s(rows)) <= MIN_RESTART_STEP_S
     )
-    # TIMESYNC requests are sent without delay after their timestamp, so they improve the clock map
+    # A TIMESYNC request is sent as soon as its clock is read, so it has the smallest delay
     is_request = (
         has_running_clock
         & (reply_s == 0.0)
@@ -167,7 +169,7 @@ def _map_sender_clock(
         recording.receipt_to_boot,
         (request_s[is_reply], reply_s[is_reply]),
         (answered_request_s[is_answer], answer_s[is_answer]),
-        unix_line,
+        boot_to_unix,
         has_receipt=frames.received_us is not None,
     )
 
@@ -186,22 +188,22 @@ def clock_maps(
     """Return the maps from sender clocks and receive time to the boot clock."""
     clocks = [mapping.description for mapping in clock_mappings.values()]
     received_us = recording.frames.received_us
-    line = recording.receipt_to_boot
-    if received_us is not None and line.pairs:
-        note = "the recording was not in real time"
-        if abs(line.slope - 1.0) < MAX_RATE_DIFFERENCE:
+    receipt_to_boot = recording.receipt_to_boot
+    if received_us is not None and receipt_to_boot.pairs:
+        note = "the recorded link was replayed faster or slower than real time"
+        if abs(receipt_to_boot.slope - 1.0) < MAX_RELATIVE_RATE_DIFFERENCE:
             note = (
-                "this conversion is estimated from the messages with the least delay; it is only "
-                "used to order messages and to convert other clocks"
+                "the messages with the least link delay determine the boot time of a receive time, "
+                "which only orders messages and converts other clocks"
             )
         clocks.append(
             ClockMap(
                 clock="receive time (UNIX time of the recording computer)",
                 method="receive time",
-                pairs=line.pairs,
-                offset_s=line.y0 - line.x0 - float(received_us[0]) * 1e-6,
-                drift_ppm=(line.slope - 1.0) * 1e6,
-                jitter_s=line.jitter,
+                pairs=receipt_to_boot.pairs,
+                offset_s=receipt_to_boot.y0 - receipt_to_boot.x0 - float(received_us[0]) * 1e-6,
+                drift_ppm=(receipt_to_boot.slope - 1.0) * 1e6,
+                jitter_s=receipt_to_boot.jitter,
                 note=note,
             )
         )

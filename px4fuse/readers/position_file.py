@@ -43,19 +43,19 @@ from px4fuse.readers.ulog_topics import longest_increasing_run
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 
-# Maximum number of tags in a column: a column with more values contains a running number
+# Maximum number of tags in a column: a column with more values is a counter
 MAX_TAGS = 100
 MIN_USABLE_ROWS = 3
-# Minimum fraction of rows that agree with the assumed meaning of a column
+# Minimum fraction of rows with increasing times, or with whole seconds, in a column of times
 MIN_USABLE_FRACTION = 0.9
 # Minimum plausible median interval (s): UWB systems send at most 200 positions per second, ±10 %
 MIN_INTERVAL_S = 0.9 / 200
 # Maximum plausible median interval (s): UWB systems send a position every 5 s or more often, ±10 %
 MAX_INTERVAL_S = 1.1 / 0.2
-# Plausible time units of positions, and minimum and maximum of their median interval (s)
-POSITION_TIMES = tuple(TIME_UNITS), (MIN_INTERVAL_S, MAX_INTERVAL_S)
-# Plausible time units of trajectories, and minimum and maximum of their median interval (s)
-TRAJECTORY_TIMES = ("s", "ns"), (1e-3, 1e3)
+# Plausible time units of positions, and limits of their median interval (s)
+POSITION_TIME_LIMITS = tuple(TIME_UNITS), (MIN_INTERVAL_S, MAX_INTERVAL_S)
+# Plausible time units of trajectories, and limits of their median interval (s)
+TRAJECTORY_TIME_LIMITS = ("s", "ns"), (1e-3, 1e3)
 # Maximum median interval (s) of UNIX times: boot times in µs may be equally large numbers, but as
 # UNIX times they would have larger intervals
 MAX_UNIX_TIME_INTERVAL_S = 60.0
@@ -77,7 +77,7 @@ class PositionRecording:
     samples: pd.DataFrame
     # "UNIX" if the timestamps are between 2000 and 2100
     clock: Literal["UNIX", "local"]
-    # Frames that the column names or the format allow; empty for all
+    # Coordinate frames that the column names or the format allow; empty if all are possible
     frames: tuple[str, ...]
     # Sentences about the detected format, such as unit or frame
     detected: tuple[str, ...]
@@ -89,7 +89,7 @@ class PositionRecording:
     metres_per_unit: float = 1.0
     # Reason for each row that is not a measurement, see :func:`find_invalid_rows`
     invalid: "pd.Series[str]" = field(default_factory=lambda: NO_INVALID_ROWS)
-    # Rounding step of the coarsest horizontal coordinate; 0 if there is none
+    # Quantisation step of the horizontal position; 0 if it is not quantised
     step_m: float = 0.0
     # Name of the format; "" for a table with a header
     format: str = ""
@@ -163,7 +163,7 @@ def read_position_file(
     empty_times = numbers.loc[has_time & ~is_usable, time_column].to_numpy()
     numbers = numbers[is_usable]
     times = numbers[time_column].to_numpy()
-    units, interval_range_s = TRAJECTORY_TIMES if is_trajectory else POSITION_TIMES
+    units, interval_range_s = TRAJECTORY_TIME_LIMITS if is_trajectory else POSITION_TIME_LIMITS
     unit, unit_text = _time_unit(
         times, meanings[time_column].unit, time_unit, units, interval_range_s
     )
@@ -188,7 +188,7 @@ def read_position_file(
                     *notes,
                 )
             ),
-            f"Write numbers with decimal points, or name the columns with {COLUMNS_OPTION}.",
+            f"Write decimal points. Alternatively, name the columns with {COLUMNS_OPTION}.",
         )
     numbers = numbers.iloc[kept_rows].set_index(time_index(seconds[kept_rows]))
     median_interval_s = median_interval(numbers.index)
@@ -233,7 +233,7 @@ def read_position_file(
         frames=(frame,) if frame else table.frames,
         dropped=dropped,
         detected=(
-            f"the format is {table.format}"
+            f"the file format is {table.format}"
             if table.format
             else f"the separator is {SEPARATORS[table.separator]}, the header is line "
             f"{table.header_line}",
@@ -306,7 +306,7 @@ def _read_numbers(
     texts = table.texts([*chosen_columns, *quaternion_columns, *named_columns])
     texts = _select_body(table, texts, meanings, body)
     is_comma_decimal = table.separator != ","
-    # without rows, apply returns objects
+    # apply on an empty table returns the dtype object
     numbers = texts.apply(_to_numbers, is_comma_decimal=is_comma_decimal).astype(np.float64)
     has_time_zone = True
     for index in chosen_columns[:1] or [i for i in named_columns if meanings[i].kind == "time"]:
@@ -321,7 +321,11 @@ def _drop_invalid_sigmas(samples: pd.DataFrame) -> list[str]:
     is_not_positive = samples[SIGMA_COLUMNS] <= 0.0
     samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_not_positive)
     count = int(is_not_positive.any(axis=1).sum())
-    return [f"number of ignored sigmas that are zero or negative: {count}"] if count else []
+    return (
+        [f"number of rows with a sigma that is ignored, because it is not positive: {count}"]
+        if count
+        else []
+    )
 
 
 def _to_numbers(texts: "pd.Series[str]", *, is_comma_decimal: bool) -> "pd.Series[float]":
@@ -350,17 +354,18 @@ def _select_body(
                 return texts[texts[index] == choose_body(table.file_name, tags, body)]
     if body is not None and not table.is_chosen_body:
         raise LogError(
-            f"{table.file_name} contains one body, without a name", "Omit the name of the body."
+            f"{table.file_name} contains only one body, which has no name",
+            "Omit the name of the body.",
         )
     return texts
 
 
-def _column_indices(table: Table, columns: tuple[str, ...]) -> list[int]:
+def _column_indices(table: Table, wanted_columns: tuple[str, ...]) -> list[int]:
     names = [name.casefold() for name in table.names]
     # A name is preferred to the number of a column
     names += [str(index + 1) for index in range(len(names))]
     indices = []
-    for column in columns:
+    for column in wanted_columns:
         wanted_name = column.strip().casefold()
         if wanted_name not in names:
             raise SettingsError(
@@ -370,7 +375,9 @@ def _column_indices(table: Table, columns: tuple[str, ...]) -> list[int]:
             )
         indices.append(names.index(wanted_name) % len(table.names))
     if len({*indices}) < len(indices):
-        raise SettingsError(f"{COLUMNS_OPTION}: {quote(','.join(columns))} names one column twice.")
+        raise SettingsError(
+            f"{COLUMNS_OPTION}: {quote(','.join(wanted_columns))} names one column twice."
+        )
     return indices
 
 
@@ -380,7 +387,7 @@ def _choose_columns(
     chosen_columns: list[int],
     numbers: pd.DataFrame,
 ) -> tuple[int, _Columns, _Columns, str | None, str]:
-    """Choose the columns of time, position and sigma; return also the frame and a text on time.
+    """Return the columns of time, position and sigma, the frame, and the name of the time column.
 
     The time of measurement is preferred to the time of recording.
     """
@@ -438,8 +445,8 @@ def _time_unit(
 ) -> tuple[str, str]:
     """Return the unit of the time column, and the reason for this unit.
 
-    ``units`` and ``interval_range_s`` are plausible units and median intervals of times other than
-    UNIX times.
+    A unit is plausible if it gives UNIX times, or if it is in ``units`` and gives a median interval
+    in ``interval_range_s``.
     """
     if given_unit is not None:
         return given_unit, "the unit was given with --position-time-unit"
@@ -452,16 +459,16 @@ def _time_unit(
     for unit, scale in TIME_UNITS.items():
         is_unix = UNIX_START_S <= median * scale < UNIX_END_S
         if is_unix and median_step * scale <= MAX_UNIX_TIME_INTERVAL_S:
-            return unit, "with this unit the times are UNIX times"
+            return unit, f"as UNIX times in {unit}, the times are between 2000 and 2100"
         if unit in units and interval_range_s[0] <= median_step * scale <= interval_range_s[1]:
             plausible_units.append(unit)
     if not plausible_units:
         return "s", (
-            "px4fuse assumes this unit, because no unit gives a plausible UWB rate; set another "
-            "unit with --position-time-unit"
+            "px4fuse assumes seconds, because no unit gives a plausible UWB rate; set another unit "
+            "with --position-time-unit"
         )
     unit, *other_units = plausible_units
-    reasons = [f"with this unit the median interval is {median_step * TIME_UNITS[unit]:.3g} s"]
+    reasons = [f"in {unit}, the median interval is {median_step * TIME_UNITS[unit]:.3g} s"]
     if other_units:
         reasons.append(f"if the unit is {other_units[0]}, give --position-time-unit")
     return unit, "; ".join(reasons)
@@ -484,7 +491,7 @@ def _length_units(
     extents = numbers[position_columns].quantile(0.95) - numbers[position_columns].quantile(0.05)
     max_extent = float(extents.max())
     unit = "m"
-    reason = "px4fuse assumes this unit, because the column names contain no unit"
+    reason = "px4fuse assumes metres, because the column names contain no unit"
     if given_unit is not None:
         unit = given_unit
         name_units = {}
@@ -500,7 +507,7 @@ def _length_units(
         )
     elif max_extent > max_extent_m:
         reason = (
-            "px4fuse assumes this unit, because no unit gives the extent of an indoor flight; set "
+            "px4fuse assumes metres, because no unit gives the extent of an indoor flight; set "
             "another unit with --position-unit"
         )
     unit_by_column = {index: name_units.get(index, unit) for index in map(int, numbers.columns)}

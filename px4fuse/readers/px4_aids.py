@@ -150,8 +150,8 @@ def _drop_repeats(samples: pd.DataFrame) -> pd.DataFrame:
 
 
 def _unknown_fusion_times(innovation: pd.Series, variance: pd.Series) -> Array:
-    # An innovation of 0 means that EKF2 had no sample. A variance that changes shows fusion, even
-    # if the logged innovation is old
+    # EKF2 logs the innovation 0 if it had no sample. It computes S only to fuse a sample, so a new
+    # S shows a fusion even if the logged innovation is repeated from an older sample
     is_changed = (variance > 0.0) & variance.ne(variance.shift())
     return np.union1d(innovation.index[innovation == 0.0], variance.index[is_changed])
 
@@ -175,7 +175,7 @@ def _make_aid_log(
     samples = samples[(samples[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
     if samples.empty:
         return None
-    innovations = [f"innovation_{axis}" for axis in aid.axes]
+    innovation_columns = [f"innovation_{axis}" for axis in aid.axes]
     parameters = aid.logged_parameters(topics.ekf2_parameters)
-    samples = samples.assign(**-samples[innovations])
+    samples = samples.assign(**-samples[innovation_columns])
     return AidLog(used_topics, aid.axes, samples, enabled, parameters, excluded_count)

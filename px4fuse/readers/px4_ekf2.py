@@ -1,7 +1,7 @@
 """EKF2 data of a ULog: state, variances, innovations, resets, and state at the fusion horizon.
 
 Sources: PX4-Autopilot ``EKF2.cpp`` (PublishStates), ``EKF/common.h`` (order of the states),
-``msg/EstimatorStatusFlags.msg`` and ``msg/EstimatorStatus.msg`` (horizontal aiding).
+``msg/EstimatorStatusFlags.msg`` and ``msg/EstimatorStatus.msg`` (flags of aiding sources).
 """
 
 from typing import Literal
@@ -44,8 +44,8 @@ STATE_COUNT = 22
 MAG_3D_BIT = 5
 # Minimum rate (Hz) of a magnetometer topic that contains all samples: EKF2 uses 14 per second
 MIN_COMPLETE_FIELD_HZ = 10.0
-# Maximum distance of the ratio of prediction interval to IMU interval from n + 0.5, at which EKF2
-# may round up or down
+# EKF2 may round the ratio of prediction interval to IMU interval up or down if its distance from
+# n + 0.5 is smaller
 MAX_HALF_RATIO_DISTANCE = 0.05
 # Maximum interval (s) between two rows of low-pass filtered optical flow to compute the mean flow
 # between them
@@ -98,9 +98,9 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     topics.record_stream("ekf2_state", px4.LOCAL_POSITION.topic)
     enabled_aids = read_enabled_aids(topics)
     fusion_flags = _read_fusion_flags(topics, enabled_aids)
-    gate = effective_settings(parameters)[EV_POS.gate]
+    vision_gate = effective_settings(parameters)[EV_POS.gate]
     aids = read_aids(topics, enabled_aids)
-    innovations, innovation_topics = innovations_by_axis(aids, fusion_flags, gate)
+    innovations, innovation_topics = innovations_by_axis(aids, fusion_flags, vision_gate)
     if innovation_topics:
         topics.record_stream("ekf2_innovations", *innovation_topics)
     notes = [
@@ -111,7 +111,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     ]
     notes += [
         f"{log.excluded_count} samples of {log.topics[0]} ({', '.join(log.axes)}) were dropped, "
-        f"because {log.topics[-1]} has no sample within {JOIN_TOLERANCE_S:g} s"
+        f"because {log.topics[-1]} has no variance within {JOIN_TOLERANCE_S:g} s"
         for log in (aids[name] for name in ("ev_pos", "ev_hgt") if name in aids)
         if log.excluded_count
     ]
@@ -137,7 +137,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         fusion_flags=fusion_flags,
         resets=read_resets(local_position),
         instances=topics.primary_instances,
-        gate=gate,
+        gate=vision_gate,
         notes=tuple(notes),
         accelerometer_bias=_accelerometer_bias(topics, delayed_state),
         step_s=step_s,
@@ -177,7 +177,7 @@ def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
     if not attitude_variance_count:
         return Unavailable(
             "EKF2 variances",
-            f"{topic} has arrays of unknown length",
+            f"the arrays in {topic} have the lengths of no supported PX4 release",
             "Report the PX4 version in an issue of px4fuse.",
         )
     states = [f"states[{i}]" for i in range(STATE_COUNT)]
@@ -213,10 +213,10 @@ def _prediction_interval_s(topics: Topics) -> float:
     return samples_per_step(configured_s, interval_s, step_ends) * interval_s
 
 
-def rows_of_timestamps(times_s: Array, other_s: ArrayLike) -> IntArray:
-    """Return the indices of the ``times_s`` that are also in ``other_s``, compared in µs."""
+def rows_of_timestamps(times_s: Array, wanted_times_s: ArrayLike) -> IntArray:
+    """Return the indices of the ``times_s`` that are in ``wanted_times_s``, compared in µs."""
     return np.flatnonzero(
-        np.isin(np.rint(times_s * 1e6), np.rint(np.asarray(other_s, dtype=float) * 1e6))
+        np.isin(np.rint(times_s * 1e6), np.rint(np.asarray(wanted_times_s, dtype=float) * 1e6))
     )
 
 
@@ -374,9 +374,9 @@ def _last_finite_value(samples: pd.DataFrame, column: str, default: float) -> fl
 
 
 def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
-    """Read the magnetic field from the magnetometer or from EKF2's observations.
+    """Read the magnetic field from the magnetometer topic or from EKF2's observations.
 
-    A topic with all samples is preferred, else one with EKF2's low-pass filtered innovations.
+    A topic with all samples is preferred, then EKF2's observations with filtered innovations.
     """
     candidates = [topics.primary_samples(layout).dropna() for layout in px4.MAGNETIC_FIELD_LAYOUTS]
     # EKF2 subtracts EKF2_MAG_DELAY and half a prediction step from the times of its observations
@@ -395,7 +395,7 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
 
 
 def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
-    """Undo EKF2's low-pass filter of optical flow; return the mean of each interval."""
+    """Undo EKF2's low-pass filter: return the mean optical flow between successive logged rows."""
     velocity, interval, noise = (
         topics.primary_samples(px4.LAYOUTS[f"flow_{quantity}"]).dropna()
         for quantity in ("velocity", "interval", "noise")

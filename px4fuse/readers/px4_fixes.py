@@ -13,8 +13,8 @@ from px4fuse.readers.ulog_topics import Topics
 # Maximum time difference (s) of a logged fix and an EKF2 observation of the same fix: receivers
 # send a fix every 0.05 s or less often
 MAX_SAME_FIX_S = 0.01
-# Maximum difference (°, about 100 km) of observed and logged latitude: a larger difference shows
-# that the observation is in m
+# Maximum difference (°) of EKF2's observation from the logged latitude: above it (100 km), the
+# observation is a local position (m), not a latitude
 MAX_LATITUDE_DISTANCE_DEG = 1.0
 # Possible intervals (s) of a GNSS receiver: receivers send 4 to 20 fixes per second
 FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
@@ -23,8 +23,8 @@ FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
 MAX_MULTIPLE_ERROR_S = 0.006
 # Minimum number of logged fixes to measure the error of reconstructed fixes
 MIN_LOGGED_FIXES = 10
-# Minimum number of logged intervals of n receiver intervals, and also of n + 1, to estimate the
-# receiver interval
+# Minimum number of logged intervals with a length of n receiver intervals, and of those with n + 1:
+# otherwise n is unknown
 MIN_REPEATED_INTERVALS = 3
 # Maximum error (m, RMS) of reconstructed fixes, measured at fixes that are also logged
 MAX_RECONSTRUCTION_ERROR_M = 0.1
@@ -90,21 +90,20 @@ def reconstruct_fixes(
     interval_s = _receiver_interval_s(fix_s)
     if interval_s is None or isinstance(north, Unavailable) or isinstance(east, Unavailable):
         return no_fixes
-    # EKF2 fuses a fix older than the fusion horizon at the horizon (RingBuffer.h)
+    # A fix older than the fusion horizon is fused at the horizon, so later (RingBuffer.h)
     delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
     fused_s = north.index.to_numpy() - delay_beyond_horizon_s
-    # An innovation, logged at 2 Hz, belongs to the last fix before it, which is a whole number of
-    # receiver intervals after a logged fix. If the number is 0, the fix itself is logged
-    previous_fix = np.searchsorted(fix_s, fused_s) - 1
-    intervals_passed = (fused_s - fix_s[previous_fix]) / interval_s
-    is_between_fixes = (previous_fix >= 0) & (previous_fix < len(fix_s) - 1)
-    # Skip innovations logged within one EKF2 step of a fix: they may belong to this fix or to the
-    # previous fix
+    # An innovation belongs to the last fix before it. This fix came a whole number of receiver
+    # intervals after the last logged fix, 0 if the fix itself is logged
+    previous_fix_index = np.searchsorted(fix_s, fused_s) - 1
+    intervals_passed = (fused_s - fix_s[previous_fix_index]) / interval_s
+    is_between_fixes = (previous_fix_index >= 0) & (previous_fix_index < len(fix_s) - 1)
+    # Skip innovations within one EKF2 step after a fix: they may also belong to the fix before
     is_used = is_between_fixes & (intervals_passed % 1.0 > ekf2.step_s / interval_s)
-    previous_fix = previous_fix[is_used]
+    previous_fix_index = previous_fix_index[is_used]
     intervals_passed = np.floor(intervals_passed[is_used])
-    fix_time_s = fix_s[previous_fix] + intervals_passed * interval_s
-    reconstructed = pd.DataFrame(
+    fix_time_s = fix_s[previous_fix_index] + intervals_passed * interval_s
+    reconstructed_fixes = pd.DataFrame(
         {
             column: interpolate_inside(fix_time_s + delay_beyond_horizon_s, ekf2.state[column])
             + innovations["innovation_m"].to_numpy()[is_used]
@@ -113,20 +112,20 @@ def reconstruct_fixes(
         index=time_index(fix_time_s),
     )
     is_logged = intervals_passed == 0.0
-    error = reconstructed - fixes[reconstructed.columns].to_numpy()[previous_fix]
+    error = reconstructed_fixes - fixes[reconstructed_fixes.columns].to_numpy()[previous_fix_index]
     error = error[is_logged].dropna()
-    reconstructed = reconstructed[~is_logged].dropna()
-    reconstructed = reconstructed[~reconstructed.index.duplicated()]
-    if len(error) < MIN_LOGGED_FIXES or reconstructed.empty:
+    reconstructed_fixes = reconstructed_fixes[~is_logged].dropna()
+    reconstructed_fixes = reconstructed_fixes[~reconstructed_fixes.index.duplicated()]
+    if len(error) < MIN_LOGGED_FIXES or reconstructed_fixes.empty:
         return no_fixes
     error_m = float(np.sqrt(np.mean(error.to_numpy() ** 2)))
     if error_m > MAX_RECONSTRUCTION_ERROR_M:
         return no_fixes
     for column in (Columns.POSITION[2], *Columns.POSITION_VARIANCE):
         if column in fixes:
-            reconstructed[column] = np.interp(reconstructed.index, fix_s, fixes[column])
-    return reconstructed, (
-        f"{len(reconstructed)} unlogged GNSS fixes are reconstructed as EKF2 position plus "
+            reconstructed_fixes[column] = np.interp(reconstructed_fixes.index, fix_s, fixes[column])
+    return reconstructed_fixes, (
+        f"{len(reconstructed_fixes)} unlogged GNSS fixes are reconstructed as EKF2 position plus "
         f"innovation (RMS error {error_m:.2f} m per axis at {len(error)} logged fixes)"
     )
 
@@ -143,11 +142,13 @@ def _receiver_interval_s(times: Array) -> float | None:
     possible_intervals = np.flatnonzero(worst_error_s <= MAX_MULTIPLE_ERROR_S)
     if not len(possible_intervals):
         return None
-    longest_s = FIX_INTERVALS_S[possible_intervals[-1]]
+    longest_interval_s = FIX_INTERVALS_S[possible_intervals[-1]]
     # Use the interval with the smallest error within 10 % of the longest possible interval
-    near_intervals = np.flatnonzero(np.abs(FIX_INTERVALS_S - longest_s) < 0.1 * longest_s)
-    best_s = FIX_INTERVALS_S[near_intervals[np.argmin(worst_error_s[near_intervals])]]
-    interval_multiples = np.round(logged_s[:, 0] / best_s)
+    near_intervals = np.flatnonzero(
+        np.abs(FIX_INTERVALS_S - longest_interval_s) < 0.1 * longest_interval_s
+    )
+    best_interval_s = FIX_INTERVALS_S[near_intervals[np.argmin(worst_error_s[near_intervals])]]
+    interval_multiples = np.round(logged_s[:, 0] / best_interval_s)
     is_frequent = np.bincount(interval_multiples.astype(int)) >= MIN_REPEATED_INTERVALS
     if not np.any(is_frequent[1:] & is_frequent[:-1]):
         return None

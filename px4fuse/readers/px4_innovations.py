@@ -21,9 +21,9 @@ class Ekf2Source:
     # PX4's names of the aiding sources for horizontal position and height
     horizontal: str
     vertical: str
-    # Actions to enable the fusion of horizontal position and height
+    # Advice how to enable the fusion, by "horizontal" and "vertical" (height)
     remedies: Mapping[str, str]
-    # Action to log the innovations
+    # Advice to the user if the innovations are not logged
     to_log: str
     # Name of a separate height sensor, if any
     height: str = ""
@@ -114,7 +114,7 @@ def innovations_by_axis(
         axis_innovations = None if aid_log is None else innovations_along(aid_log, axis, gate)
         if isinstance(fusion_flags, pd.DataFrame) and not fusion_flags[group].any():
             quantity = "height" if axis == "down" else "horizontal position"
-            reason = f"EKF2 never fused {sensor} for {quantity} in this log"
+            reason = f"EKF2 never fused the {quantity} from {sensor} in this log"
             remedy = source.remedies[group]
         elif aid_log is None or axis_innovations is None or axis_innovations.empty:
             reason = (

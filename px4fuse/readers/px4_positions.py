@@ -9,7 +9,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.core.arrays import Array, IntArray
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_MODE, GNSS_POS, effective_settings
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_MODE_PARAMETER, GNSS_POS, effective_settings
 from px4fuse.flight.model import (
     HEIGHT_ONLY_REASON,
     NO_INVALID_ROWS,
@@ -46,20 +46,19 @@ from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 FIX_TYPE_3D = 3
-# Maximum delay (µs) from timestamp to publication of a message with its arrival time as timestamp
+# Maximum delay (µs) from timestamp to publication if PX4 set the timestamp at the arrival
 MAX_ARRIVAL_DELAY_US = 100
-# Minimum fraction of arrival times among the timestamps of a topic to report that the topic has no
-# measurement times
+# Minimum fraction of timestamps that PX4 set at the arrival, to report missing measurement times
 MIN_ARRIVAL_FRACTION = 0.9
 # Maximum time difference (s) between a height and the horizontal position to which it is added:
 # 2.5 cm error at a climb rate of 0.5 m/s
 MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
-# Maximum rate (Hz) of logged GNSS fixes to report missing fixes: receivers send 5 to 20 per second
+# Maximum logged rate (Hz) to report that the logger dropped GNSS fixes: receivers send 5 to 20 Hz
 MAX_DOWNSAMPLED_HZ = 4.0
 STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
 # Length (µs) of each unit of timestamps
 STAMP_UNITS = {"microseconds": 1.0, "milliseconds": 1e3, "seconds": 1e6, "nanoseconds": 1e-3}
-# Maximum relative error of the rate of a clock, to recognise the unit of its timestamps
+# Maximum relative clock error with which the unit of timestamps is recognised from their rate
 MAX_RATE_ERROR = 0.05
 AUTOPILOT_CLOCK = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude in degrees, optionally altitude in m
@@ -87,7 +86,7 @@ def read_positions(
 def split_tracks(
     tracks: list[PositionTrack | Unavailable],
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Separate the position tracks, best first, from the reasons for missing tracks."""
+    """Separate position tracks, best first, from the records of missing tracks."""
     available_tracks = [track for track in tracks if isinstance(track, PositionTrack)]
     available_tracks.sort(key=lambda track: track.origin.preference_rank)
     return tuple(available_tracks), tuple(t for t in tracks if isinstance(t, Unavailable))
@@ -163,7 +162,11 @@ def _make_ulog_track(
     is_automatic: bool = True,
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a ULog track; ``is_odometry`` is True if its source sends a changing orientation."""
+    """Make a position track of the ULog topics ``topic_names``.
+
+    ``is_odometry`` is True if the orientation changes, ``is_automatic`` if px4fuse may select the
+    track without ``--position-source``.
+    """
     source = px4.TRACKS[name]
     origin = with_orientation(source.origin, is_changing=is_odometry)
     origin = structs.replace(origin, is_automatic=is_automatic)
@@ -330,7 +333,7 @@ def _reconstruct_track(
         None if height is None else height.to_frame("down_m"),
         ("vehicle_local_position", *ekf2.innovation_topics),
         is_odometry=is_odometry,
-        clock=f"time of the innovation plus {EV_POS.delay}, up to one sample interval late",
+        clock=f"innovation time plus {EV_POS.delay}, too late by up to one sample interval",
     )
 
 
@@ -415,7 +418,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         return unavailable_source(px4.GPS_POSITION, "the GNSS receiver never had a 3D fix")
     parameters = topics.ekf2_parameters
     published_s = (gps["published_us"].to_numpy() - topics.zero_us) * 1e-6
-    has_driver_times = GNSS_MODE in parameters and bool(
+    has_driver_times = GNSS_MODE_PARAMETER in parameters and bool(
         np.any(published_s - gps.index > MAX_ARRIVAL_DELAY_US * 1e-6)
     )
     delay_ms = 0.0 if has_driver_times else effective_settings(parameters, GNSS_POS)[GNSS_POS.delay]
@@ -427,7 +430,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     if len(unlogged_fixes):
         gps = pd.concat([gps, unlogged_fixes]).sort_index()
         interpolated_count = int(gps["altitude_m"].isna().sum())
-        # Fields that unlogged fixes lack are copied from the previous fix
+        # The added fixes lack some fields, which are copied from the previous fix
         gps = gps.assign(altitude_m=gps["altitude_m"].interpolate("index")).ffill()
     samples = project_to_ned(gps, _local_origin(topics))
     if {"eph_m", "epv_m"} <= {*gps}:

@@ -20,17 +20,17 @@ from px4fuse.readers.field_maps import Layout, expand_layouts
 
 @dataclass(frozen=True)
 class TrackSource:
-    """Position track that a ULog may contain, by the name for ``--position-source`` in TRACKS."""
+    """Position track that a ULog may contain; its key in TRACKS is the ``--position-source``."""
 
-    # Kind of the position source, and path of its positions to the log, see Origin
+    # Kind of the position source, and route by which its positions reach the log (see Origin)
     kind: str
     path: str
     description: str
-    # Action to record positions of this source in the log
+    # Advice how to record these positions
     remedy: str
     # Frame of the positions; "unknown": value of the topic's frame field (FRAMES), if it has one
     frame: str = "unknown"
-    # Keys of the possible layouts of its topic; empty without a topic
+    # Keys in LAYOUTS of its topic in different PX4 releases; empty if no topic contains the track
     layouts: tuple[str, ...] = ()
 
     @property
@@ -45,14 +45,14 @@ FRAMES = msgspec.convert(_TABLE["frames"], dict[str, dict[int, str]], strict=Fal
 UNUSED_TOPICS: Mapping[str, str] = _TABLE["unused"]
 IMU, LOCAL_POSITION = LAYOUTS["imu"], LAYOUTS["local_position"]
 HEIGHT_BIAS_LAYOUTS = {name: LAYOUTS[f"bias_of_{name}"] for name in ("baro_hgt", "gnss_hgt")}
-# Action for topics that the default logging profile contains
+# Advice if topics of the default logging profile are not logged
 DEFAULT_PROFILE_REMEDY = "Record with SDLOG_PROFILE bit 0 (default)."
 # Topics with EKF2's state vector and variances, in order of preference
 STATE_VECTOR_TOPICS = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
 # Layouts of the measured magnetic field: magnetometer, and EKF2's observation (since v1.14)
 MAGNETIC_FIELD_LAYOUTS = LAYOUTS["magnetometer"], LAYOUTS["observed_field"]
-# Number of attitude variances, by the lengths of the logged arrays of states and variances: 4 for a
-# filter with quaternion states, 3 for an error-state filter (generated/state.h, v1.15.4 and v1.16)
+# Number of attitude variances, by the numbers of logged states and variances: 4 for a filter with
+# quaternion states, 3 for an error-state filter (generated/state.h, v1.15.4 and v1.16)
 ATTITUDE_VARIANCE_COUNTS: Mapping[tuple[int, int], int] = {
     (24, 24): 4,
     (24, 23): 3,

@@ -43,14 +43,14 @@ class Table:
     # Name of the format; "" for a table with a header
     format: str
     names: list[str]
-    # Text of the lines below the header
-    body: str
+    # Lines below the header
+    data_text: str
     separator: str = ","
-    # Line number of the header; 0 without a header, None if rows are not lines of the file
+    # Line number of the header, 0 without a header; None if the rows are not lines of the file
     header_line: int | None = None
-    # Frames that the format may have; empty for all
+    # Coordinate frames that are possible for the format; empty if all are
     frames: tuple[str, ...] = ()
-    # Rate of the frame numbers in the time column; None for times
+    # Frame rate, if the time column contains frame numbers instead of times
     rate_hz: float | None = None
     # True if the columns belong to one body that was chosen from several
     is_chosen_body: bool = False
@@ -76,7 +76,7 @@ class Table:
         column_indices = sorted({*columns})
         try:
             texts = pd.read_csv(
-                io.StringIO(self.body),
+                io.StringIO(self.data_text),
                 sep=r"\s+" if self.separator == " " else self.separator,
                 header=None,
                 index_col=False,
@@ -163,9 +163,9 @@ def find_table(
         raise LogError(
             f"{file_name}: the first {len(lines)} lines contain no header with the columns "
             f"{column_list}. The first line is {quote(lines[0])}.",
-            f"Add a header such as time,x,y,z, or name the columns with {COLUMNS_OPTION}.",
+            f"Add the header time,x,y,z. Alternatively, name the columns with {COLUMNS_OPTION}.",
         )
-    first_row = table.body[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0]
+    first_row = table.data_text[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0]
     row_width = len(_split_line(first_row.rstrip(f"{table.separator} "), table.separator))
     if row_width > len(table.names):
         raise LogError(
@@ -199,8 +199,8 @@ def _find_header_table(
         for separator in SEPARATORS:
             names = _split_line(line.strip("#% "), separator)
             if len(names) <= MAX_COLUMNS and _is_header(names, wanted_names):
-                body = _without_comments(text.split("\n", index + 1)[index + 1])
-                return Table(file_name, "", names, body, separator, index + 1)
+                data_text = _without_comments(text.split("\n", index + 1)[index + 1])
+                return Table(file_name, "", names, data_text, separator, index + 1)
     return None
 
 
@@ -221,14 +221,14 @@ def _find_body_table(
     is_motive = header_index >= 3 and rows[0][0] == "Format Version"
     if header_index < 3 or not (is_motive or is_number(rows[1][0])):
         return None
-    axes, body = rows[header_index], text.split("\n", header_index + 1)[header_index + 1]
+    axes, data_text = rows[header_index], text.split("\n", header_index + 1)[header_index + 1]
     rows = [row + [""] * (len(axes) - len(row)) for row in rows]
     if is_motive:
         unit = dict(zip(rows[0][::2], rows[0][1::2], strict=False)).get("Length Units", "")
         row_by_title = {row[1]: row for row in rows[2:header_index]}
         body_names, body_types = (row_by_title.get(title, axes) for title in ("Name", "Type"))
         used_types = {"Rigid Body"} if "Rigid Body" in body_types else {*body_types}
-        # Rotations are not read, because the axes of a rigid body are not those of the vehicle
+        # A name "" omits a column. Rotations are omitted: the axes of a rigid body are not FRD
         names = [
             f"{axis}_{unit}" if group == "Position" and body_type in used_types else ""
             for axis, group, body_type in zip(
@@ -241,7 +241,7 @@ def _find_body_table(
             f"{axis.removeprefix('T')}_{unit}" if axis.removeprefix("T") in {*"XYZ"} else ""
             for axis, unit in zip(axes, rows[header_index + 1], strict=False)
         ]
-        body = re.split(r"\n[, ]*\n", body.partition("\n")[2], maxsplit=1)[0] + "\n"
+        data_text = re.split(r"\n[, ]*\n", data_text.partition("\n")[2], maxsplit=1)[0] + "\n"
     bodies_with_position = (
         body_name for body_name, name in zip(body_names, names, strict=False) if name
     )
@@ -255,7 +255,7 @@ def _find_body_table(
         file_name,
         "OptiTrack Motive CSV export" if is_motive else "Vicon Nexus CSV export",
         names,
-        body,
+        data_text,
         header_line=header_index + 1,
         # Motive exports y up by default, and z up by an option that the file does not contain
         frames=("eus", "enu") if is_motive else (),
@@ -273,11 +273,12 @@ def _find_stream_table(file_name: str, text: str, lines: Sequence[str]) -> Table
         if first_row is not None:
             rows = pattern.findall(text)
             range_count = len(re.findall(stream["ranges"], first_row))
-            notes = [f"the {range_count} ranges beside each position are not used"]
+            notes = [f"px4fuse does not use the {range_count} UWB ranges in each line"]
             if lost_count := text.count("\n") - len(rows):
                 notes.append(f"lines without a position: {lost_count}")
-            body = "".join(f"{','.join(row)}\n" for row in rows)
-            return Table(file_name, stream["name"], [*pattern.groupindex], body, notes=tuple(notes))
+            csv_text = "".join(f"{','.join(row)}\n" for row in rows)
+            names = [*pattern.groupindex]
+            return Table(file_name, stream["name"], names, csv_text, notes=tuple(notes))
     return None
 
 
@@ -331,8 +332,8 @@ def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Table
             names = ["time", "x", "y", "z", *(f"q{axis}" for axis in order)]
             names += [""] * (len(fields) - len(names))
             note = "the file has no header: columns 1 to 4 are read as time, x, y, z"
-            body = _without_comments(text)
-            return Table(display_name(path), name, names, body, separator, 0, notes=(note,))
+            data_text = _without_comments(text)
+            return Table(display_name(path), name, names, data_text, separator, 0, notes=(note,))
     return None
 
 
@@ -342,7 +343,7 @@ def _without_comments(text: str) -> str:
 
 def _kitti_table(path: Path, text: str) -> Table:
     """Read KITTI poses (rows of 3x4 matrices), and their times from a file in the same folder."""
-    # imported on demand, as most recordings need no rotations
+    # imported here, because most recordings need no rotations
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
     name, times_name = display_name(path), f"{path.stem}_times.txt"
@@ -365,5 +366,5 @@ def _kitti_table(path: Path, text: str) -> Table:
         ) from error
     names = ["time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
     note = f"the times are from {display_name(times_path)}"
-    body = pd.DataFrame(cells).to_csv(index=False, header=False)
-    return Table(name, "KITTI poses", names, body, frames=("edn",), notes=(note,))
+    csv_text = pd.DataFrame(cells).to_csv(index=False, header=False)
+    return Table(name, "KITTI poses", names, csv_text, frames=("edn",), notes=(note,))

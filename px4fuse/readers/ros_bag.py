@@ -72,7 +72,7 @@ def read_bag(path: Path, topic: str | None) -> tuple[Table, str, int]:
     """
     name = display_name(path)
     try:
-        # imported on demand, as only bags need this optional library
+        # imported here, because this library is optional
         from rosbags.highlevel import AnyReader  # noqa: PLC0415
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
     except ImportError:
@@ -117,7 +117,9 @@ def _read_topic(name: str, reader: Any, topic: str | None) -> Table:
         [connection for connection in reader.connections if connection.topic == chosen_topic]
     )
     if message_type == _PATH_TYPE:
-        messages = deque(messages, maxlen=1)  # each path repeats the poses of the previous one
+        messages = deque(
+            messages, maxlen=1
+        )  # the last path contains the poses of all previous paths
     lags_s, rows, frames = [], [], set()
     for connection, receive_ns, raw_message in messages:
         message = reader.deserialize(raw_message, connection.msgtype)

@@ -140,7 +140,7 @@ class Rows:
             row = next((row for row, is_row_valid in enumerate(is_valid) if not is_row_valid), 0)
             raise self.row_error(
                 row,
-                f"{quote(lines[row])} does not have {text_count + number_count} columns of numbers",
+                f"{quote(lines[row])} has not {text_count + number_count} columns with numbers",
                 "Correct or remove this line.",
             ) from error
         return table["texts"], np.ascontiguousarray(table["numbers"])

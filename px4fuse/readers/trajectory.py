@@ -15,7 +15,7 @@ from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.reading import read_head
 from px4fuse.errors import LogError, TrajectoryError
 from px4fuse.readers.position_file import PositionRecording, read_position_file
-from px4fuse.readers.recording_table import NO_HEADER
+from px4fuse.readers.recording_table import COLUMNS_OPTION, NO_HEADER
 from px4fuse.readers.ros_bag import is_bag
 from px4fuse.trajectory.model import Frame, Trajectory, TrajectoryKind
 
@@ -25,16 +25,16 @@ MAX_NORM_ERROR = 0.1
 MAX_COORDINATE_M = 1e9
 # Maximum deviation of a quaternion from norm 1 that is not corrected: a rounding error of float64
 UNIT_NORM_TOLERANCE = 1e-15
-# Maximum fraction of rows that are dropped: a larger fraction shows that timestamps have too few
-# digits, or that the rows are of several recordings
+# Maximum fraction of rows that are dropped. More rows are dropped if rounded timestamps repeat, or
+# if the file contains several recordings
 MAX_DROPPED_FRACTION = 0.01
 # Maximum coordinate (m) and rotation angle (rad) to accept the first pose as the identity
 MAX_IDENTITY_DISTANCE = 1e-6
-# Maximum ratio of height to width of a level motion (RMS extents along the principal axes)
+# Maximum ratio of thickness to width of a planar motion (RMS extents along the principal axes)
 MAX_THICKNESS_RATIO = 1 / 3
-# Minimum ratio of width to length of a level motion: a straight motion does not show the vertical
+# Minimum ratio of width to length of a planar motion: a straight motion is in many planes
 MIN_WIDTH_RATIO = 0.1
-# Maximum angle (rad) between the vertical of a level motion and the y axis of a camera frame
+# Maximum angle (rad) between the normal of the plane of motion and the y axis of a camera frame
 MAX_TILT_RAD = math.radians(20.0)
 # Minimum fraction of intervals between poses near the median interval, for a regular frame rate
 MIN_REGULAR_FRACTION = 0.9
@@ -66,9 +66,9 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     try:
         recording = read_position_file(path, body=body, is_trajectory=True)
     except LogError as error:
-        # evaluate and loop have no option for the columns
-        remedy = error.remedy.partition(", or name the columns")[0].removesuffix(".")
-        raise TrajectoryError(error.reason, f"{remedy}.") from error
+        # The option exists only in px4fuse compare, not in evaluate and loop
+        remedy = re.sub(f" [^.]*{COLUMNS_OPTION}.", "", error.remedy)
+        raise TrajectoryError(error.reason, remedy) from error
     name, samples = recording.name, recording.samples
     position = samples[["x_m", "y_m", "z_m"]].to_numpy()
     dropped_count = recording.row_count - len(samples)
@@ -93,7 +93,7 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     frame, frame_note = _detect_frame(kind, position)
     time_s = samples.index.to_numpy()
     notes = (*recording.detected, *recording.notes)
-    more_notes = (kind_note, frame_note, _describe_gaps(time_s, kind))
+    more_notes = (kind_note, frame_note, _describe_gaps(time_s))
     return Trajectory(
         name=name,
         kind=kind,
@@ -156,10 +156,14 @@ def _detect_kind(
 ) -> tuple[TrajectoryKind, str]:
     # EuRoC files are always called data.csv; their folder name indicates the kind
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
-    text_by_source = {"a comment": comments, "the file name": path.name, "the folder name": folder}
-    for source, text in text_by_source.items():
+    text_by_note = {
+        "A comment states that the trajectory is ground truth.": comments,
+        "The file name states that the trajectory is ground truth.": path.name,
+        "The folder name states that the trajectory is ground truth.": folder,
+    }
+    for note, text in text_by_note.items():
         if _TRUTH_WORDS.search(text):
-            return "truth", f"The trajectory is ground truth, according to {source}."
+            return "truth", note
     if (
         rotation is not None
         and max(np.abs(position[0]).max(), rotation[0].magnitude()) < MAX_IDENTITY_DISTANCE
@@ -175,8 +179,8 @@ def _detect_frame(kind: TrajectoryKind, position: Array) -> tuple[Frame, str]:
     eigenvalues, axes = np.linalg.eigh(centred_m.T @ centred_m)  # eigenvalues in ascending order
     height, width, length = np.sqrt(np.maximum(eigenvalues, 0.0) / len(position))
     tilt_rad = math.acos(min(1.0, abs(float(axes[1, 0]))))
-    is_level = width > MIN_WIDTH_RATIO * length and height < MAX_THICKNESS_RATIO * width
-    if not is_level or tilt_rad > MAX_TILT_RAD:
+    is_planar = width > MIN_WIDTH_RATIO * length and height < MAX_THICKNESS_RATIO * width
+    if not is_planar or tilt_rad > MAX_TILT_RAD:
         return "unknown", ""
     return "camera", (
         "The frame is a camera frame (x right, y down, z forward), because the motion is in a "
@@ -184,7 +188,7 @@ def _detect_frame(kind: TrajectoryKind, position: Array) -> tuple[Frame, str]:
     )
 
 
-def _describe_gaps(time_s: Array, kind: TrajectoryKind) -> str:
+def _describe_gaps(time_s: Array) -> str:
     """Return a note on gaps between poses or an irregular pose rate, else an empty text."""
     intervals_s = np.diff(time_s)
     median_s = float(np.median(intervals_s))
@@ -199,8 +203,7 @@ def _describe_gaps(time_s: Array, kind: TrajectoryKind) -> str:
         return ""
     lost_s = intervals_s[gap_indices] - median_s
     longest_start_s = time_s[gap_indices[np.argmax(lost_s)]] - time_s[0]
-    fault = "Tracking was lost" if kind == "slam" else "Poses are missing"
     return (
-        f"{fault} for {lost_s.sum():.1f} s in {len(gap_indices)} gaps. The longest gap begins "
-        f"{longest_start_s:.1f} s after the first pose."
+        f"Poses are missing for {lost_s.sum():.1f} s in {len(gap_indices)} gaps. The longest gap "
+        f"begins {longest_start_s:.1f} s after the first pose."
     )

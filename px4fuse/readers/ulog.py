@@ -117,7 +117,7 @@ def _start_unix_s(topics: Topics) -> float | None:
 def _require_samples(
     topics: Topics, samples: pd.DataFrame, name: str, layout: Layout, remedy: str
 ) -> TableOrUnavailable:
-    """Return the samples, or the reason why too few are in the log."""
+    """Return the samples, or the reason why the log has fewer than two."""
     topic = layout.topic
     if topics.find(layout) is None:
         return Unavailable(name, f"{topic} is not logged", px4.DEFAULT_PROFILE_REMEDY)
@@ -145,7 +145,7 @@ def _read_airborne(topics: Topics) -> Spans | Unavailable:
         return Unavailable(
             "land detector",
             "vehicle_land_detected is not logged or not usable",
-            f"{px4.DEFAULT_PROFILE_REMEDY} Or give the time of the flight with --start and --end.",
+            f"{px4.DEFAULT_PROFILE_REMEDY} Alternatively, give the flight time (--start, --end).",
         )
     topics.record_stream("airborne", px4.LAYOUTS["land_detected"].topic)
     return common.flight_spans(land_detected["landed"], topics.log.duration_s)

@@ -71,21 +71,21 @@ class _CountingContent(io.BytesIO):
     byte, or to the next synchronisation message.
     """
 
-    # Offsets of the last message header, of the end of the last read, and of the next read
-    skipped_bytes = start = end = position = 0
+    # Byte offsets, except for the number of skipped bytes
+    skipped_bytes = header_start = read_end = position = 0
 
     def read(self, size: int, /) -> bytes:  # type: ignore[override]  # pyulog gives a size
         start = self.position
         if size == HEADER_BYTES:
-            if start != self.end:
-                self.skipped_bytes += start - self.start
-            self.start = start
-        self.end = self.position = start + size
+            if start != self.read_end:
+                self.skipped_bytes += start - self.header_start
+            self.header_start = start
+        self.read_end = self.position = start + size
         return io.BytesIO.read(self, size)
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        # pyulog moves back by the requested length, although a damaged file may have ended before.
-        # The position after the end of the file prevents an endless loop
+        # pyulog seeks back by the length that it requested, even if it got fewer bytes. A position
+        # after the end of the file prevents an endless loop
         if whence == io.SEEK_CUR:
             offset += self.position
         self.position = super().seek(offset)
@@ -189,7 +189,7 @@ class Topics:
         return tuple(zip(times, changes.astype(int).tolist(), strict=False)) or NO_SELECTOR
 
     def find(self, *layouts: Layout) -> Layout | None:
-        """Return the first layout whose required fields are all in the log, if any."""
+        """Return the first layout whose required fields are in a topic of the log, else None."""
         for layout in layouts:
             if any(
                 {*layout.columns.values()} <= table.keys() for table in self.tables_of(layout.topic)
@@ -267,14 +267,14 @@ class Topics:
         switch_s, numbers = (
             np.array(values) for values in zip(*self.primary_instances, strict=True)
         )
-        primary_frames: list[pd.DataFrame] = []
+        instance_tables: list[pd.DataFrame] = []
         for number in available[:1] if is_single else available:
             samples = self.read_instance(layout, number, step=step)
             samples = samples if select is None else select(samples)
             switch_index = np.searchsorted(switch_s, samples.index, side="right") - 1
-            primary_frames.append(samples[is_single | (numbers[switch_index] == number)])
-        joined_frames = pd.concat(primary_frames).sort_index()
-        return joined_frames[~joined_frames.index.duplicated()]
+            instance_tables.append(samples[is_single | (numbers[switch_index] == number)])
+        joined_tables = pd.concat(instance_tables).sort_index()
+        return joined_tables[~joined_tables.index.duplicated()]
 
     def record_stream(self, data_kind: str, *topics: str) -> None:
         """Record topics and clock (measurement or publication time) of data such as "imu"."""
@@ -284,7 +284,7 @@ class Topics:
             for table in self.tables_of(topics[0])
         )
         event = "measurement" if has_measurement_time else "publication"
-        clock = f"autopilot boot clock, time of {event}"
+        clock = f"autopilot boot clock ({event} time)"
         self.streams[data_kind] = Stream(topics, clock, self.log.name)
 
 
@@ -374,7 +374,7 @@ def read_topics(name: str, content: bytes) -> Topics:
     if not time_tables:
         raise LogError(
             f"{name}: the ULog contains no samples",
-            "Copy the file again, or record with SDLOG_PROFILE 129.",
+            "Copy the file again, or set SDLOG_PROFILE to 129 (default and vision topics).",
         )
     if not tables:
         names = sorted({topic for topic, _ in time_tables})
@@ -383,7 +383,7 @@ def read_topics(name: str, content: bytes) -> Topics:
         )
     if NOTE_KEY in ulog.msg_info_dict:
         notes += (_printable_text(ulog.msg_info_dict, NOTE_KEY, ""),)
-    zero_us, end_us = _data_span_us(time_tables, name)
+    zero_us, data_end_us = _data_span_us(time_tables, name)
     logged_values, parameter_changes = _read_parameters(ulog, tables, zero_us)
     parameter_values, parameter_faults = replace_invalid_parameters(logged_values)
     log = LogInfo(
@@ -395,7 +395,7 @@ def read_topics(name: str, content: bytes) -> Topics:
         firmware_hash=_printable_text(ulog.msg_info_dict, "ver_sw", "unknown"),
         hardware=_printable_text(ulog.msg_info_dict, "ver_hw", "unknown"),
         boot_time_s=zero_us * _MICROSECOND,
-        duration_s=(end_us - zero_us) * _MICROSECOND,
+        duration_s=(data_end_us - zero_us) * _MICROSECOND,
         dropouts=tuple(
             Dropout((dropout.timestamp - zero_us) * _MICROSECOND, dropout.duration * 1e-3)
             for dropout in ulog.dropouts
@@ -409,7 +409,7 @@ def read_topics(name: str, content: bytes) -> Topics:
             if name in PARAMETERS
         },
         notes=(*notes, *parameter_faults),
-        bytes_read=content_reader.start - content_reader.skipped_bytes,
+        bytes_read=content_reader.header_start - content_reader.skipped_bytes,
         autopilot=_printable_text(ulog.msg_info_dict, "sys_name", "PX4"),
         vehicle=_printable_text(ulog.msg_info_dict, "sys_uuid", ""),
         is_assessed=True
@@ -422,7 +422,7 @@ def read_topics(name: str, content: bytes) -> Topics:
         zero_us,
         {},
         {name: value for name, value in parameter_values.items() if name.startswith("EKF2_")},
-        content_reader.start < len(content) < content_reader.end,
+        content_reader.header_start < len(content) < content_reader.read_end,
         ulog.file_corruption,
         parameter_changes=parameter_changes,
     )

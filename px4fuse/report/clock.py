@@ -129,9 +129,11 @@ def draw_curve(axes: Axes, clock: ClockOffset) -> None:
     """Draw the log-likelihood over the time offset of the source, with the 95 % interval."""
     (low_s, high_s), estimate_s, applied_s = clock.interval_s, clock.offset_s, clock.applied_s
     axes.axvspan(low_s, high_s, color=KF_BAND_COLOUR, lw=0, label="95 % interval")
-    axes.plot(clock.curve_s, clock.curve_drop, **TRACK_LINES["KF"])
+    axes.plot(clock.curve_s, clock.curve_log_likelihood_drop, **TRACK_LINES["KF"])
     axes.axvline(applied_s, color="black", lw=0.8, ls="--", label="as analysed")
-    axes.set_ylim(min(MAX_DRAWN_DROP_NATS, float(clock.curve_drop.max()) * 1.05), 0.0)
+    axes.set_ylim(
+        min(MAX_DRAWN_DROP_NATS, float(clock.curve_log_likelihood_drop.max()) * 1.05), 0.0
+    )
     half_width_s = PLOT_HALF_WIDTH_INTERVALS * max(high_s - estimate_s, estimate_s - low_s)
     margin_s = 0.1 * half_width_s
     axes.set_xlim(

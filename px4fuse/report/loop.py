@@ -11,8 +11,8 @@ from px4fuse.findings import Finding, group_by_root
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop import corrections
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
-from px4fuse.loop.corrections import SINGLE_LOOP_REASON
-from px4fuse.loop.model import LANDING_SOURCE, Closure, Loop
+from px4fuse.loop.corrections import SINGLE_CLOSURE_REASON
+from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
 from px4fuse.report.evaluation import describe_method, format_interval, plot_path
 from px4fuse.report.page import Cell, Page, appendix_title
 from px4fuse.report.phrases import student_line, write_finding
@@ -151,7 +151,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
     for closure in loop.closures[:1]:
         texts["Gate"] = describe_gate(closure)
     page.write_labelled_texts(texts)
-    single_loop_note = SINGLE_LOOP_REASON if len(loop.closures) == 1 else ""
+    single_loop_note = SINGLE_CLOSURE_REASON if len(loop.closures) == 1 else ""
     notes = correction_by_distance_sentence(loop), single_loop_note, *missing_corrections(loop)
     for note in notes:
         page.write(note, colour=MUTED_COLOUR, above=2.0)
@@ -254,7 +254,7 @@ def describe_gate(closure: Closure) -> str:
 
 def closure_name(closure: Closure, loop: Loop) -> str:
     """Format the times of the two poses of a loop closure (s)."""
-    if closure.source == LANDING_SOURCE:
+    if closure.source == LANDING_CLOSURE_SOURCE:
         return "take-off and landing"
     origin_s = loop.start_s if loop.start_s > MIN_UNIX_TIME_S else 0.0
     return f"{closure.time_1_s - origin_s:.2f} s and {closure.time_2_s - origin_s:.2f} s"
@@ -281,7 +281,7 @@ def missing_corrections(loop: Loop) -> list[str]:
     reasons = {
         f"{correction.what}: {correction.reason}": None
         for correction in loop.corrections.values()
-        if isinstance(correction, Unavailable) and SINGLE_LOOP_REASON not in correction.reason
+        if isinstance(correction, Unavailable) and SINGLE_CLOSURE_REASON not in correction.reason
     }
     return list(reasons)
 

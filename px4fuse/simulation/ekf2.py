@@ -47,7 +47,7 @@ from px4fuse.flight.ekf2_parameters import (
     effective_settings,
 )
 from px4fuse.simulation import sensors
-from px4fuse.simulation.ekf2_topics import VEHICLE_AID_SOURCE_HZ, TopicTrack, ekf2_topics
+from px4fuse.simulation.ekf2_topics import VEHICLE_AID_SOURCE_HZ, Ekf2Output, ekf2_topics
 from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.motion import Motion, attitude
 from px4fuse.simulation.scenario import Scenario
@@ -65,7 +65,7 @@ from px4fuse.trajectory.rotation import (
 PREDICTION_STEP_US = 10_000
 # σ (gauss) per axis of earth field and magnetometer bias at the start of the log
 FIELD_SIGMA_GAUSS = 0.03
-# Time (s) without any aiding source after which EKF2 holds its position: EKF2_NOAID_TOUT
+# Time (s) without fusion of an aiding source after which EKF2 holds the position: EKF2_NOAID_TOUT
 # (fake_pos_control.cpp)
 NO_AID_TIMEOUT_S = 5.0
 # Initial σ of tilt, velocity, position, gyro bias and accelerometer bias: EKF2_ANGERR_INIT,
@@ -81,7 +81,7 @@ REST_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
 HEADING_SIGMA_RAD = 0.03
 # σ of EKF2's height (m) as PX4 v1.16 logs it in flight
 HEIGHT_SIGMA_M = 0.15
-# Maximum interval (s) between two variances of estimator_states that the EKF2 model computes
+# Maximum interval (s) between the variances that the EKF2 model computes for estimator_states
 MAX_EVENT_INTERVAL_S = 0.1
 
 
@@ -124,10 +124,11 @@ def simulate_ekf2(
     other_sensors: tuple[Topic, ...],
     log_parameters: Mapping[str, int | float],
 ) -> tuple[Topic, ...]:
-    """Simulate EKF2 and return its topics, without empty ones.
+    """Simulate EKF2 and return EKF2's topics, without empty topics.
 
-    The sensor data are those that EKF2 received, before logging. ``other_sensors`` are magnetometer
-    and barometer outdoors. ``log_parameters`` are all parameters in the log, by PX4 name.
+    ``imu``, ``source`` and ``other_sensors`` (outdoors magnetometer and barometer) contain all
+    samples that EKF2 receives; the log may contain fewer. ``log_parameters`` are all parameters in
+    the log, by PX4 name.
     """
     aid, aids = scenario.aid, _fused_aids(scenario)
     segment, time_us, true_quaternions = _make_segment(scenario, mistakes, motion, imu)
@@ -168,18 +169,18 @@ def simulate_ekf2(
         rules=rules
         if int(log_parameters[aid.switch]) & 1
         else replace(rules, start_interval_s=0.0),
-        step_s=step_s,
+        mean_step_s=step_s,
         horizon_s=(buffer_length - 1) * step_s,
-        predict_s=PREDICTION_STEP_US * 1e-6,
+        configured_step_s=PREDICTION_STEP_US * 1e-6,
         vision_height=False,
         imu_offset_m=np.zeros(3),
         aid=aid,
         max_interval_s=MAX_EVENT_INTERVAL_S,
     )
     model_run = run_configurations(inputs, [FilterConfiguration(settings)], {})[0]
-    track = _make_topic_track(inputs, model_run, time_us, true_quaternions)
+    output = _compute_output(inputs, model_run, time_us, true_quaternions)
     aid_source_hz = VEHICLE_AID_SOURCE_HZ if mistakes.no_vvo else 0.0
-    return ekf2_topics(inputs, model_run, track, scenario.attitude_rate_hz, aid_source_hz)
+    return ekf2_topics(inputs, model_run, output, scenario.attitude_rate_hz, aid_source_hz)
 
 
 def _make_segment(
@@ -189,12 +190,12 @@ def _make_segment(
     time_us = sensors.time_us(imu)
     interval_s = np.diff(time_us) * 1e-6
     step_end_indices = step_ends(interval_s, np.array([], dtype=np.intp), PREDICTION_STEP_US * 1e-6)
-    rotation_steps_rad, velocity_steps_m_s = (
+    delta_angle_rad, delta_velocity_m_s = (
         imu.fields[name][1:].astype(np.float64) * interval_s[:, None]
         for name in ("gyro_rad", "accelerometer_m_s2")
     )
     rotation_rad, velocity_increment_m_s = downsample_imu(
-        rotation_steps_rad, velocity_steps_m_s, step_end_indices
+        delta_angle_rad, delta_velocity_m_s, step_end_indices
     )
     step_us = time_us[np.concatenate([[0], step_end_indices])]
     time_s = step_us * 1e-6
@@ -234,7 +235,7 @@ def _make_segment(
             state=state,
             variance=variance,
             down_m=motion.at(time_s).position_m[:, 2] + sensors.height_error(scenario, time_s),
-            # without logged tilt (infinite variance), only positions correct the tilt
+            # The variance of tilt measurements is infinite, so only positions correct the tilt
             attitude_variance_rad2=np.tile(
                 [np.inf, np.inf, HEADING_SIGMA_RAD**2], (len(time_s), 1)
             ),
@@ -304,11 +305,11 @@ def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions
     )
 
 
-def _make_topic_track(
+def _compute_output(
     inputs: Inputs, model_run: SegmentRun, time_us: IntArray, true_quaternions: Array
-) -> TopicTrack:
+) -> Ekf2Output:
     segment = model_run.segment
-    lag_steps = round(inputs.horizon_s / inputs.step_s)
+    lag_steps = round(inputs.horizon_s / inputs.mean_step_s)
     state, _ = delayed_states(model_run, 0)
     resets, is_step_aided = _hold_without_aiding(model_run, state)
     reset_sum_m = np.zeros((len(state), 3))
@@ -323,12 +324,12 @@ def _make_topic_track(
         [np.zeros((1, 3)), np.cumsum(attitude_steps_rad, axis=0)]
     )
     attitude_error_rad = gyro_attitude_error_rad + follow_attitude(
-        state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.step_s, inputs.horizon_s
+        state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.mean_step_s, inputs.horizon_s
     )
     velocity_m_s, position_m = publish(
         segment, state, reset_sum_m, attitude_error_rad, lag_steps, inputs.settings
     )
-    return TopicTrack(
+    return Ekf2Output(
         time_us=time_us,
         lag_steps=lag_steps,
         delayed_attitude=multiply(from_vector(state[:, THETA]), true_quaternions),
@@ -344,9 +345,10 @@ def _make_topic_track(
 def _hold_without_aiding(
     model_run: SegmentRun, state: Array
 ) -> tuple[list[tuple[int, Array]], BoolArray]:
-    """Keep the position in ``state`` constant while EKF2 has no aiding source, as PX4 does.
+    """Set the position in ``state`` constant from NO_AID_TIMEOUT_S after the last fused sample.
 
-    Return the position resets (step, size in m), and a mask of the steps with an aiding source.
+    PX4 does this (fake_pos_control.cpp). Return the resets of the position (step, size in m), and a
+    mask of the steps that are not held.
     """
     events, time_s = model_run.events[0], model_run.segment.time_s
     aid_events = np.flatnonzero(model_run.fused[:, 0] | model_run.reset[:, 0])

@@ -15,9 +15,9 @@ from px4fuse.simulation.scenario import KINDS, ScenarioKind, bounded_number, bou
 
 @dataclass(frozen=True)
 class Mistakes:
-    """Sizes of all injected faults, which ``mistakes.toml`` explains; the defaults are no faults.
+    """Sizes of the faults to inject into a simulated flight; ``mistakes.toml`` explains each fault.
 
-    A rate of 0 does not change the rate. An EKF2 noise of 0 and an EKF2 delay of None are right.
+    By default, no fault is injected. An EKF2 noise of 0 and a delay of None are the correct values.
     """
 
     clock_offset_s: float = bounded_number(0.0, -5.0, 5.0, "s", "SECONDS")
@@ -61,18 +61,18 @@ _ASCII_UNITS = {"°": "deg", "m/s²": "m/s2"}
 
 @dataclass(frozen=True)
 class Mistake:
-    """Fault that can be injected into a simulated flight (table ``mistakes.toml``).
+    """Fault that can be injected into a simulated flight, from ``mistakes.toml``.
 
     Attributes
     ----------
     default : float or True
-        Default of the first field; True for a fault without a size.
+        Default size of the fault; True for a fault without a size.
     finding : str
-        Finding that a student is expected to report.
+        Effect of the fault in the report, which a student is expected to find.
     changes_ekf2 : bool
         True if the fault changes EKF2 parameters.
     fields : tuple of str
-        Fields of :class:`Mistakes` that the fault sets; values of all but the first are optional.
+        Fields of :class:`Mistakes` that the fault sets: the size, then optional values.
     """
 
     default: float | bool

@@ -33,9 +33,8 @@ MAX_FLIGHT_S = 3600.0
 DEVIATION_FADE_S = 3.0
 # Time (s) of a 180° turn at the end of the aisle with --yaw follow
 TURN_ROUND_S = 4.0
-# Minimum time (s) between two velocity or yaw ramps: a ramp that starts earlier continues the
-# previous ramp
-MIN_RAMP_DISTANCE_S = 1e-9
+# Minimum distance (s) of the breakpoints of piecewise polynomials; nearer breakpoints are merged
+MIN_BREAKPOINT_DISTANCE_S = 1e-9
 # Range of the periods (s) of the sines whose sum is the slow deviation from the path
 DEVIATION_PERIODS_S = (3.0, 20.0)
 # Number of sines in a slow deviation or sensor error
@@ -52,8 +51,8 @@ def _sum_of_ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
     value_after = np.concatenate([0.0 * change[:1], np.cumsum(change, axis=0)])
     end_s = start_s + duration_s
     times_s = np.r_[start_s[0] - 1.0, np.column_stack([start_s, end_s]).ravel(), end_s[-1] + 1.0]
-    # a ramp that starts at the end of the previous ramp continues it
-    is_used = np.diff(times_s, prepend=-np.inf) > MIN_RAMP_DISTANCE_S
+    # If a ramp starts at the end of the previous ramp, both have one breakpoint
+    is_used = np.diff(times_s, prepend=-np.inf) > MIN_BREAKPOINT_DISTANCE_S
     values = np.repeat(value_after, 2, axis=0)[is_used]
     derivatives = np.stack([values, 0.0 * values, 0.0 * values], axis=1)
     return PPoly.from_bernstein_basis(BPoly.from_derivatives(times_s[is_used], derivatives))
@@ -167,12 +166,12 @@ class Attitude:
 def attitude(state: State) -> Attitude:
     """Return attitude, angular rate and specific force of a quadrotor in the true motion."""
     gravity = np.array([0.0, 0.0, constants.g])
-    thrust_opposite_m_s2 = gravity - state.acceleration_m_s2
-    thrust_m_s2 = np.sqrt(np.einsum("ij,ij->i", thrust_opposite_m_s2, thrust_opposite_m_s2))[
-        :, None
-    ]
-    z = thrust_opposite_m_s2 / thrust_m_s2
-    z_rate = -state.jerk_m_s3 / thrust_m_s2
+    opposite_thrust_m_s2 = gravity - state.acceleration_m_s2
+    specific_thrust_m_s2 = np.sqrt(
+        np.einsum("ij,ij->i", opposite_thrust_m_s2, opposite_thrust_m_s2)
+    )[:, None]
+    z = opposite_thrust_m_s2 / specific_thrust_m_s2
+    z_rate = -state.jerk_m_s3 / specific_thrust_m_s2
     z_rate -= z * np.einsum("ij,ij->i", z, z_rate)[:, None]
     yaw_rad = state.yaw_rad
     nose, right = (
@@ -195,7 +194,7 @@ def attitude(state: State) -> Attitude:
         axis=1,
     )
     force_m_s2 = np.zeros_like(z)
-    force_m_s2[:, 2] = -thrust_m_s2[:, 0]
+    force_m_s2[:, 2] = -specific_thrust_m_s2[:, 0]
     return Attitude(np.stack([x, y, z], axis=2), rate_rad_s, force_m_s2)
 
 
@@ -238,10 +237,13 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
 
 
 class _FlightPlan:
-    """Velocity and yaw ramps of a flight; ramps are placed by the times of their centres."""
+    """Velocity and yaw ramps of a flight; ``ramp_centre_s`` is the next velocity ramp's centre.
 
-    def __init__(self, start_s: float, heading_deg: float) -> None:
-        self.ramp_centre_s = start_s + CLIMB_RAMP_S / 2.0
+    The distance flown between two ramps is the speed times the time between their centres.
+    """
+
+    def __init__(self, climb_start_s: float, heading_deg: float) -> None:
+        self.ramp_centre_s = climb_start_s + CLIMB_RAMP_S / 2.0
         self.velocity_ramps: list[tuple[float, float, Array]] = []
         # the first yaw ramp ends before the first data, so the nose then points along the heading
         self.yaw_ramps = [(-1.0, 1.0, np.radians([heading_deg]))]
@@ -249,7 +251,7 @@ class _FlightPlan:
     def add_velocity_change(
         self, velocity_change_m_s: Array, duration_s: float, until_next_s: float
     ) -> None:
-        """Add a ramp at ``ramp_centre_s``, then increase this time by ``until_next_s``."""
+        """Add a velocity ramp; the next ramp's centre is ``until_next_s`` later."""
         self.velocity_ramps.append(
             (self.ramp_centre_s - duration_s / 2.0, duration_s, velocity_change_m_s)
         )

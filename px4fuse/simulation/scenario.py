@@ -31,8 +31,8 @@ DEFAULTS_OF_KIND: Mapping[ScenarioKind, Mapping[str, float]] = {
 class Bounds:
     """Limits of a numeric option, with its unit (:data:`px4fuse.core.units.UNIT_NAMES`).
 
-    ``cli_name`` is the name of the option, or the placeholder in the syntax of a ``--mistake``.
-    ``meaning`` is the help text of the option; empty for a field without option.
+    ``cli_name`` is the option, such as --speed, or the placeholder for the size of a fault, such as
+    SECONDS. ``meaning`` is the help text of the option; empty for a field without option.
     """
 
     low: float
@@ -73,7 +73,7 @@ class Scenario:
     kind : {"aisle", "loop", "outdoor"}
         Passes along a straight line with UWB, laps of a square with VIO, or laps with GNSS.
     yaw : {"fixed", "follow"} or None
-        Constant heading, or nose along the direction of flight; None: fixed in the aisle only.
+        Constant heading, or nose in the direction of flight; None: fixed for "aisle", else follow.
     pause_s : float
         Time of hover at each end of the aisle.
     wander_m : float
@@ -111,7 +111,12 @@ class Scenario:
     wander_m: float = 0.03
     uwb_rate_hz: float = bounded_number(5.0, 0.5, 100.0, "Hz", "--uwb-rate", "UWB rate.")
     sigma_uwb_m: float = bounded_number(
-        0.10, 0.0, 10.0, "m", "--sigma-uwb", "White UWB position noise (1 σ): the true SIGMA_Z."
+        0.10,
+        0.0,
+        10.0,
+        "m",
+        "--sigma-uwb",
+        "White UWB position noise (1 σ): the true measurement noise.",
     )
     vio_rate_hz: float = 30.0
     sigma_vio_m: float = 0.01
@@ -130,7 +135,7 @@ class Scenario:
         20.0,
         "m/s²",
         "--sigma-a",
-        "White accelerometer noise averaged over 0.1 s (1 σ): the true SIGMA_A.",
+        "White accelerometer noise (1 σ of 0.1 s averages): the true process noise SIGMA_A.",
     )
     accel_bias_sigma_m_s2: float = bounded_number(
         0.03,

@@ -64,8 +64,8 @@ ATTITUDE_LATENCY_US = 200
 LAND_DETECTOR_INTERVAL_US = 1_000_000
 
 
-# Random numbers of each sensor and of each kind of error: because the streams are separate, an
-# injected fault of one sensor does not change the noise of other sensors
+# Independent random number streams, one for each sensor and kind of error. A fault of one sensor
+# therefore does not change the noise of the others
 Stream = IntEnum(
     "Stream",
     "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST SLOW FIX_VELOCITY "
@@ -75,7 +75,6 @@ Stream = IntEnum(
 
 
 def random_stream(scenario: Scenario, name: Stream) -> np.random.Generator:
-    """Return the random number generator of one stream, from the scenario's seed."""
     return np.random.default_rng([scenario.seed, name])
 
 
@@ -136,7 +135,7 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
 def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     time_us = _grid_us(motion.duration_s, MAGNETOMETER_RATE_HZ)
     body_to_ned = attitude(motion.at(seconds(time_us))).body_to_ned
-    # outdoors the measured field is rotated, which causes the heading error of EKF2
+    # The measured field is rotated, which causes EKF2's heading error outdoors
     if mistakes.heading_deg:
         body_to_ned = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix() @ body_to_ned
     field_gauss = np.einsum("nji,j->ni", body_to_ned, EARTH_FIELD_GAUSS)
@@ -235,8 +234,8 @@ def attitude_topic(
 
 def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rotation:
     """Simulate the error of the logged attitude, a rotation in NED."""
-    tilt_deg, yaw_deg = scenario.tilt_error_deg, scenario.yaw_error_deg
-    rms_rad = np.radians([tilt_deg, tilt_deg, yaw_deg])
+    tilt_rms_deg = scenario.tilt_error_deg
+    rms_rad = np.radians([tilt_rms_deg, tilt_rms_deg, scenario.yaw_error_deg])
     rng = random_stream(scenario, Stream.ATTITUDE)
     error_rad = Sines.draw(rng, rms_rad, SLOW_ERROR_PERIODS_S).at(time_s)[0]
     if mistakes.heading_deg:
@@ -318,9 +317,13 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
         velocity_m_s = (
             state.velocity_m_s + scenario.sigma_gnss_m_s * GNSS_SIGMA_FACTORS * velocity_noise
         )[is_logged]
-        fix_us = timestamp_us + round(1e6 * FIX_AGE_S)
+        gnss_timestamp_us = timestamp_us + round(1e6 * FIX_AGE_S)
         topic = _gnss_topic(
-            fix_us[is_logged], position_m[is_logged], velocity_m_s, reported_sigma, scenario
+            gnss_timestamp_us[is_logged],
+            position_m[is_logged],
+            velocity_m_s,
+            reported_sigma,
+            scenario,
         )
     else:
         body_to_ned = attitude(state).body_to_ned[is_logged] if scenario.kind == "loop" else None
@@ -390,7 +393,7 @@ def outliers(
         len(airborne_indices) - outlier_count, np.full(burst_count + 1, 1.0 / (burst_count + 1))
     )
     burst_index = np.repeat(np.arange(burst_count), burst_lengths)
-    # number of outliers and of other positions before each outlier
+    # index of an outlier: number of outliers plus number of other positions before it
     outlier_indices = airborne_indices[
         np.arange(outlier_count) + np.cumsum(gap_lengths)[burst_index]
     ]

@@ -25,7 +25,7 @@ def summary(simulation: Simulation, answer: Path | None) -> Page:
         f"{scenario.source_rate_hz:g} Hz",
     }
     if scenario.kind == "loop":
-        texts["VIO drift"] = f"{scenario.vio_drift:.1%} of the path"
+        texts["VIO drift"] = f"{scenario.vio_drift:.1%} of the distance flown"
     texts["IMU"] = f"{scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²"
     page.write_labelled_texts(texts)
     mistake_texts = [
@@ -40,6 +40,6 @@ def summary(simulation: Simulation, answer: Path | None) -> Page:
         else "EKF2 is not simulated (--no-ekf2)",
     }
     if answer is not None:
-        texts["Answer"] = f"{to_one_line(str(answer))} (not for students)"
+        texts["Answer"] = f"{to_one_line(str(answer))}; do not give this file to students"
     page.write_labelled_texts(texts)
     return page

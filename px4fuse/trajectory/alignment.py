@@ -21,11 +21,11 @@ AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 MIN_EXTENT_FRACTION = 1e-6
 # Minimum extent (m, RMS) of the motion for an estimate of rotation
 MIN_EXTENT_M = 1e-6
-# Maximum ratio of residual to horizontal motion for an estimate of yaw: two tracks of pure noise
-# have √2
+# Maximum ratio of residual to horizontal motion for an estimate of yaw: two independent noise
+# tracks of equal variance have the ratio √2
 MAX_YAW_RESIDUAL_RATIO = 1.0
-# Maximum ratio of residual to motion perpendicular to the main direction, for an estimate of the
-# full rotation: two tracks of pure noise have √6
+# Maximum ratio of residual to motion along the second principal axis for an estimate of the full
+# rotation: two independent noise tracks of equal variance have the ratio √6
 MAX_ROTATION_RESIDUAL_RATIO = 2.0
 
 
@@ -104,9 +104,9 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
 
 
 def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Transform:
-    """Fit SE(3) or Sim(3) by least squares, without a test that the motion determines the result.
+    """Fit SE(3) or Sim(3) by least squares (Umeyama 1991).
 
-    For motion along a line the result is one of many transforms with the same residual.
+    For motion along a line, the result is one of many transforms with the same residual.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
 def _align_means(
     rotation: Rotation, estimate_m: Array, reference_m: Array, scale: float, degrees_of_freedom: int
 ) -> Transform:
-    """Return the transform with this rotation and scale that aligns the means (eq. 41)."""
+    """Return the transform with ``rotation`` and ``scale`` that aligns the means (eq. 41)."""
     translation_m = reference_m.mean(axis=0) - scale * rotation.apply(estimate_m.mean(axis=0))
     quaternion = tuple(rotation.as_quat(scalar_first=True).tolist())
     return Transform(quaternion, tuple(translation_m.tolist()), scale, degrees_of_freedom)
@@ -160,15 +160,15 @@ def _require_determined(
         max_extent_m = float(np.linalg.norm(reference_extents))
         max_residual_ratio = MAX_YAW_RESIDUAL_RATIO
         motion_text = "horizontal motion"
-        possible_alignment = "none"
+        remedy = "Use `alignment` none."
     else:
         # motion along a line does not determine the rotation around the line
         max_extent_m, extent_m, _ = np.minimum(
             transform.scale * estimate_extents, reference_extents
         )
         max_residual_ratio = MAX_ROTATION_RESIDUAL_RATIO
-        motion_text = "motion perpendicular to the main direction"
-        possible_alignment = "yaw or none"
+        motion_text = "motion perpendicular to the main direction of flight"
+        remedy = "Use `alignment` yaw or none."
     residual_m = rms_m(residuals_m)
     if (
         extent_m < max(MIN_EXTENT_M, MIN_EXTENT_FRACTION * max_extent_m)
@@ -177,5 +177,5 @@ def _require_determined(
         raise TrajectoryError(
             f"the alignment {kind} cannot be estimated: the {motion_text} is {extent_m:.2g} m "
             f"(RMS), and the residual after alignment is {residual_m:.2g} m",
-            f"Use `alignment` {possible_alignment}.",
+            remedy,
         )

@@ -13,29 +13,31 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 Method = Literal["interpolate", "nearest"]
 
-# Default of the maximum gap in the reference that is interpolated, in median intervals
+# Default maximum gap in the reference over which poses are interpolated, in median intervals
 MAX_GAP_INTERVALS = 3.0
-# Minimum pose interval (s) of a reference that is paired with the estimate, not interpolated
+# Minimum pose interval (s) of a sparse reference, which is not interpolated: its poses are paired
+# with the nearest poses of the estimate
 MIN_SPARSE_INTERVAL_S = 2.0
-# Minimum value (s) of the default maximum gap in the reference that is interpolated
+# Lower limit (s) of the default maximum gap over which poses are interpolated
 MIN_GAP_LIMIT_S = 0.1
-# Maximum time difference (s) of a pair of poses: default of the evo package
+# Default maximum time difference (s) of a pair of poses, as in the evo package
 MAX_NEAREST_DIFFERENCE_S = 0.01
 
 
 class Association(Record):
-    """Association of the poses of two trajectories by time, with the numbers of unused poses.
+    """Result of matching the poses of two trajectories by time.
 
     Attributes
     ----------
     max_gap_s : float
-        Maximum gap in the reference that is interpolated; for "nearest" the maximum time difference
-        of a pair.
+        Maximum gap in the reference over which poses are interpolated; for "nearest", the maximum
+        time difference of a pair.
     outside, in_gaps : int
-        Numbers of unused poses of the estimate: outside the reference, and in its gaps.
-    coverage_estimate, coverage_reference : float
-        Fraction of the poses of the estimate that are used, and of the reference's time span that
-        the used poses cover without long gaps.
+        Numbers of unused poses of the estimate: outside the reference's time span, and in its gaps.
+    coverage_estimate : float
+        Fraction of the poses of the estimate that are used.
+    coverage_reference : float
+        Fraction of the reference's time span that the used poses cover without long gaps.
     """
 
     method: Method
@@ -80,15 +82,17 @@ def associate(
             method, max_gap_s = "nearest", estimate_interval_s
     time_s, (first_s, last_s) = estimate.time_s + time_offset_s, reference.time_s[[0, -1]]
     if method == "nearest":
-        limit_s = end_tolerance_s = MAX_NEAREST_DIFFERENCE_S if max_gap_s is None else max_gap_s
+        gap_limit_s = reference_end_tolerance_s = (
+            MAX_NEAREST_DIFFERENCE_S if max_gap_s is None else max_gap_s
+        )
         pose_indices, reference_indices = _pair_nearest(
-            estimate.time_s, reference.time_s, limit_s, time_offset_s
+            estimate.time_s, reference.time_s, gap_limit_s, time_offset_s
         )
         matched_reference = reference[reference_indices]
     else:
-        limit_s = gap_limit(reference.time_s) if max_gap_s is None else max_gap_s
-        end_tolerance_s = 0.0
-        pose_indices = np.flatnonzero(is_bracketed(time_s, reference.time_s, limit_s))
+        gap_limit_s = gap_limit(reference.time_s) if max_gap_s is None else max_gap_s
+        reference_end_tolerance_s = 0.0
+        pose_indices = np.flatnonzero(is_bracketed(time_s, reference.time_s, gap_limit_s))
         matched_reference = _interpolate_poses(reference, time_s[pose_indices])
     if len(pose_indices) < MIN_POSES:
         raise TrajectoryError(
@@ -98,7 +102,9 @@ def associate(
             "Check that both trajectories are of the same flight. If clocks differ, give "
             "`time_offset_s` auto.",
         )
-    is_outside = (time_s < first_s - end_tolerance_s) | (time_s > last_s + end_tolerance_s)
+    is_outside = (time_s < first_s - reference_end_tolerance_s) | (
+        time_s > last_s + reference_end_tolerance_s
+    )
     outside_count = int(is_outside.sum())
     used_steps_s = np.diff(time_s[pose_indices])
     used_steps_s = used_steps_s[used_steps_s <= max(5.0 * estimate_interval_s, 0.5)]
@@ -106,7 +112,7 @@ def associate(
     association = Association(
         method=method,
         poses=len(pose_indices),
-        max_gap_s=limit_s,
+        max_gap_s=gap_limit_s,
         outside=outside_count,
         in_gaps=pose_count - outside_count - used_count,
         coverage_estimate=used_count / pose_count,
@@ -116,19 +122,19 @@ def associate(
 
 
 def gap_limit(time_s: Array, min_limit_s: float = MIN_GAP_LIMIT_S) -> float:
-    """Return the default of the maximum gap (s) between timestamps to interpolate over."""
+    """Return the default maximum gap (s) between timestamps over which poses are interpolated."""
     return max(MAX_GAP_INTERVALS * median_interval(time_s), min_limit_s)
 
 
-def is_bracketed(time_s: Array, reference_s: Array, limit_s: float) -> BoolArray:
-    """Return a mask of the times within an interval of the reference of at most ``limit_s``.
+def is_bracketed(time_s: Array, reference_s: Array, gap_limit_s: float) -> BoolArray:
+    """Return a mask of times between two reference times that are at most ``gap_limit_s`` apart.
 
     Times that equal a reference time are included.
     """
-    right_rows = np.clip(np.searchsorted(reference_s, time_s), 1, len(reference_s) - 1)
-    previous_s = reference_s[right_rows - 1]
-    next_s = reference_s[right_rows]
-    is_between = (previous_s <= time_s) & (time_s <= next_s) & (next_s - previous_s <= limit_s)
+    next_indices = np.clip(np.searchsorted(reference_s, time_s), 1, len(reference_s) - 1)
+    previous_s = reference_s[next_indices - 1]
+    next_s = reference_s[next_indices]
+    is_between = (previous_s <= time_s) & (time_s <= next_s) & (next_s - previous_s <= gap_limit_s)
     return np.asarray(is_between | (previous_s == time_s) | (next_s == time_s))
 
 
@@ -148,23 +154,29 @@ def positions_at(trajectory: Trajectory, time_s: Array) -> Array:
 
 
 def _pair_nearest(
-    estimate_s: Array, reference_s: Array, limit_s: float, offset_s: float
+    estimate_s: Array, reference_s: Array, max_difference_s: float, offset_s: float
 ) -> tuple[IntArray, IntArray]:
-    """Pair each pose of the shorter trajectory with the pose of the other that is nearest in time.
+    """Pair each pose of the shorter trajectory with the nearest pose (in time) of the longer one.
 
-    Return the pose indices of both. Pairs with a time difference above ``limit_s`` are omitted.
+    Return the pose indices of both, without pairs that differ by more than ``max_difference_s``.
     """
-    # The offset is added to the longer series, to have the same rounding as evo
+    # The offset is added to the longer series as in the evo package, for equal rounding errors
     is_estimate_longer = len(estimate_s) > len(reference_s)
     shorter_s = reference_s if is_estimate_longer else estimate_s
     longer_s = estimate_s + offset_s if is_estimate_longer else reference_s - offset_s
-    right_rows = np.minimum(np.searchsorted(longer_s, shorter_s, side="right"), len(longer_s) - 1)
-    left_rows = np.maximum(right_rows - 1, 0)
-    nearest_rows = np.where(
-        np.abs(longer_s[right_rows] - shorter_s) < np.abs(shorter_s - longer_s[left_rows]),
-        right_rows,
-        left_rows,
+    next_indices = np.minimum(np.searchsorted(longer_s, shorter_s, side="right"), len(longer_s) - 1)
+    previous_indices = np.maximum(next_indices - 1, 0)
+    nearest_indices = np.where(
+        np.abs(longer_s[next_indices] - shorter_s) < np.abs(shorter_s - longer_s[previous_indices]),
+        next_indices,
+        previous_indices,
     )
-    rows = np.flatnonzero(np.abs(longer_s[nearest_rows] - shorter_s) <= limit_s)
-    nearest_rows = nearest_rows[rows]
-    return (nearest_rows, rows) if is_estimate_longer else (rows, nearest_rows)
+    paired_indices = np.flatnonzero(
+        np.abs(longer_s[nearest_indices] - shorter_s) <= max_difference_s
+    )
+    nearest_indices = nearest_indices[paired_indices]
+    return (
+        (nearest_indices, paired_indices)
+        if is_estimate_longer
+        else (paired_indices, nearest_indices)
+    )

@@ -13,10 +13,10 @@ Series = TypeVar("Series", Array, Complex)
 
 @dataclass(frozen=True)
 class Moments:
-    """Second moments of two series a and b over their common samples, for each lag.
+    """Second moments of two series a and b over their common samples, at each lag.
 
-    Arrays have shape (n + m - 1,). At index k, sample 0 of a coincides with sample k - (n - 1) of
-    b. Sums and the means ā and b̄ are over the common samples.
+    Arrays have shape (n + m - 1,). At index k, a[0] coincides with b[k - (n - 1)]. Sums, and the
+    means ā and b̄, are over the common samples.
 
     Attributes
     ----------

@@ -26,30 +26,33 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory, cumulative_distance
 from px4fuse.trajectory.scores import Delta, Interval, RelativeError, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset, clock_difference, estimate_time_offset
 
-# Maximum rotation (rad) in a constant orientation, from rounded digits in a file
+# Maximum rotation (rad) relative to the first pose of an orientation that counts as constant: files
+# contain rounded digits
 MAX_CONSTANT_ROTATION_RAD = 1e-6
-# Minimum number of poses, and minimum motion (m), for a constant orientation
+# Minimum number of poses and minimum motion (m) of a trajectory for removing a constant orientation
 MIN_CONSTANT_POSES, MIN_CONSTANT_MOTION_M = 10, 1.0
-# Minimum duration (s) of a frozen pose, and minimum motion (m) of the reference during a frozen
-# pose
+# Minimum duration (s) of a repeated position for a warning, and minimum motion (m) of the reference
+# in this time
 MIN_FROZEN_S, MIN_FROZEN_MOTION_M = 2.0, 0.5
-# Minimum length (m) of a jump of the estimate relative to the reference, and minimum ratio of the
-# jump to the median difference of the step lengths
+# Minimum difference (m) of the step lengths of estimate and reference at a jump, and minimum ratio
+# of this difference to its median
 MIN_JUMP_M, MIN_JUMP_RATIO = 0.5, 20.0
-# Maximum distance (m) from the first position, or from 0, after a restart of the map
+# Maximum distance (m) of the position after a jump from the first position or from the origin, for
+# attributing the jump to a restart of the map
 MAX_RESTART_DISTANCE_M = 0.5
-# Maximum number of jumps whose times are stated
+# Maximum number of jump times in the warning about jumps
 MAX_STATED_JUMPS = 5
-# Minimum constant rotation (rad) between orientations of different body axes
+# Minimum mean rotation (rad) between the orientations of estimate and reference for the conclusion
+# that their body axes differ
 MIN_BODY_ROTATION_RAD = np.radians(30.0)
-# Maximum RMS deviation (rad) from the constant rotation between body axes
+# Maximum RMS deviation (rad) from the mean rotation for the conclusion that body axes differ
 MAX_BODY_DEVIATION_RAD = np.radians(5.0)
 # Number of alternating estimates of alignment and lever arm
 LEVER_ARM_ITERATIONS = 5
 
 
 def drop_constant_orientation(trajectory: Trajectory) -> tuple[Trajectory, tuple[str, ...]]:
-    """Remove the orientation of a trajectory that moves without rotating; return also a note."""
+    """Remove a constant orientation of a moving trajectory as not measured; also return a note."""
     rotation, extent_m = trajectory.rotation, np.ptp(trajectory.position_m, axis=0).max()
     if (
         rotation is None
@@ -59,14 +62,14 @@ def drop_constant_orientation(trajectory: Trajectory) -> tuple[Trajectory, tuple
     ):
         return trajectory, ()
     return replace(trajectory, rotation=None), (
-        f"{trajectory.name} has no orientation (constant quaternion). Rotations are not scored.",
+        f"The quaternion of {trajectory.name} is constant, so rotation errors are not computed.",
     )
 
 
 def find_frozen_poses(
     estimate: Trajectory, reference: Trajectory, time_offset_s: float
 ) -> tuple[BoolArray, tuple[str, ...]]:
-    """Return a mask of positions that repeat while the reference moves, and warnings."""
+    """Return a mask of repeated positions while the reference moves, and warnings."""
     is_frozen, warnings = np.zeros(len(estimate), bool), []
     is_new = np.r_[True, np.any(np.diff(estimate.position_m, axis=0) != 0.0, axis=1)]
     for start, end in pairwise([*np.flatnonzero(is_new).tolist(), len(estimate)]):
@@ -83,7 +86,7 @@ def find_frozen_poses(
                 f"The position of {estimate.name} does not change from "
                 f"{start_s - estimate.time_s[0]:.1f} s to {end_s - estimate.time_s[0]:.1f} s after "
                 f"its start ({(end - start) / len(estimate):.0%} of the estimate), while the "
-                f"reference moves {motion_m:.1f} m. These poses are not scored."
+                f"reference moves {motion_m:.1f} m. ATE and RPE exclude these poses."
             )
     return is_frozen, tuple(warnings)
 
@@ -100,22 +103,23 @@ def find_jumps(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
     is_jump = (differences_m > max(MIN_JUMP_M, MIN_JUMP_RATIO * np.median(differences_m))) & (
         step_lengths_m[0] > step_lengths_m[1]
     )
-    rows = np.flatnonzero(is_jump)
-    if not len(rows):
+    jump_indices = np.flatnonzero(is_jump)
+    if not len(jump_indices):
         return ()
-    times_s = estimate.time_s[rows + 1] - estimate.time_s[0]
+    times_s = estimate.time_s[jump_indices + 1] - estimate.time_s[0]
     times_text = ", ".join(f"{time_s:.1f}" for time_s in times_s[:MAX_STATED_JUMPS])
     starts_m = estimate.position_m[0], np.zeros(3)
     distances_m = [
-        np.linalg.norm(estimate.position_m[rows + 1] - start_m, axis=1) for start_m in starts_m
+        np.linalg.norm(estimate.position_m[jump_indices + 1] - start_m, axis=1)
+        for start_m in starts_m
     ]
-    cause = "a lost track or a relocalisation"
+    cause_text = "The SLAM system probably lost track or relocalised."
     if np.min(distances_m) < MAX_RESTART_DISTANCE_M:
-        cause = "a restart of the map, because it returns to its origin"
+        cause_text = "Probable cause: restart of the map, because the jump ends near the origin."
     return (
-        f"{estimate.name} jumps by up to {differences_m[rows].max():.1f} m, {times_text} s after "
-        f"its start: probably {cause}. ATE and RPE contain the jumps. One alignment does not fit "
-        "both parts: evaluate the poses before and after a jump as separate files.",
+        f"{estimate.name} jumps by up to {differences_m[jump_indices].max():.1f} m, {times_text} s "
+        f"after its start. {cause_text} ATE and RPE contain the jumps. One alignment does not fit "
+        "the poses before and after a jump: evaluate them as separate files.",
     )
 
 
@@ -137,10 +141,11 @@ MAX_SCALE_ERROR = 0.1
 # Minimum fraction of used poses of the estimate, and of covered time of the reference, without a
 # warning
 MIN_COVERAGE = 0.5
-# Minimum estimated time offset (s) for a warning that the clocks differ: a filter lags by less
+# Minimum estimated time offset (s) for a warning that the clocks differ: a smaller time offset may
+# be the delay of a filter
 MIN_DOUBTFUL_OFFSET_S = 0.1
-# Maximum ratio of the pose intervals of reference and estimate: with a larger ratio, reference and
-# estimate are probably interchanged
+# Maximum ratio of the pose interval of the reference to that of the estimate; above it, the user
+# probably interchanged reference and estimate
 MAX_INTERVAL_RATIO = 5.0
 
 # Frames with the z axis down
@@ -327,11 +332,11 @@ def evaluate(
 
 
 def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[AlignmentKind, str]:
-    """Choose the alignment by the kinds of the trajectories.
+    """Choose the alignment by the kinds of the trajectories; also return the reason, a sentence.
 
     Ground truth is not aligned. Estimators that use gravity are aligned in yaw and position. SLAM
     is aligned in rotation and position, and in scale if it is monocular or the scale factor error
-    exceeds 10 %. The reason for the choice is returned as a sentence.
+    exceeds 10 %.
     """
     has_same_frame = estimate.frame == reference.frame != "unknown"
     if estimate.kind == "truth" and (has_same_frame or reference.kind == "truth"):
@@ -392,7 +397,9 @@ def _choose_time_offset(
     offset = TimeOffset(
         offset_s=added_s,
         is_determinable=True,
-        reason="The user chose the time offset." if is_given else f"px4fuse uses {clock_text}.",
+        reason="The user chose the time offset."
+        if is_given
+        else f"Poses are matched by {clock_text}.",
     )
     start_s, end_s = estimate.time_s[[0, -1]] + added_s
     is_disjoint = start_s > reference.time_s[-1] or end_s < reference.time_s[0]
@@ -406,7 +413,7 @@ def _choose_time_offset(
         if estimated.is_determinable:
             return estimated, []
         fallback = structs.replace(offset, is_determinable=False, reason=estimated.reason)
-        return fallback, [f"{estimated.reason} Instead, px4fuse uses {clock_text}."]
+        return fallback, [f"{estimated.reason} Instead, poses are matched by {clock_text}."]
     low_s, high_s = estimated.interval_s or (0.0, 0.0)
     if low_s <= 0.0 <= high_s or abs(estimated.offset_s or 0.0) < MIN_DOUBTFUL_OFFSET_S:
         return offset, []
@@ -451,7 +458,7 @@ def _comparison_warnings(
         )
     if has_jumps:  # a jump changes the scale of the best fit
         return
-    # fit_alignment would raise an error if the motion does not determine the rotation
+    # Unlike fit_alignment, umeyama also returns the scale for motion along a line
     scale = umeyama(estimate.position_m, reference.position_m, with_scale=True).scale
     has_motion = np.ptp(reference.position_m, axis=0).any()
     if alignment != "sim3" and has_motion and abs(scale - 1.0) > MAX_SCALE_ERROR:
@@ -464,12 +471,13 @@ def _comparison_warnings(
 def _fit_or_approximate(
     estimate: Trajectory, reference: Trajectory, alignment: AlignmentKind, *, is_requested: bool
 ) -> tuple[Transform, tuple[str, ...]]:
-    """Fit the alignment. If the motion does not determine it, use the best fit with a warning.
+    """Fit the alignment. For motion along a line, return a best fit and a warning.
 
     Raises
     ------
     TrajectoryError
-        The motion does not determine an alignment that the user requested, or has too few poses.
+        The motion does not determine the alignment that the user requested, or there are too few
+        poses.
     """
     try:
         return fit_alignment(estimate.position_m, reference.position_m, alignment), ()
@@ -486,9 +494,10 @@ def _fit_or_approximate(
 def _move_to_reference_body(
     estimate: Trajectory, reference: Trajectory, alignment: AlignmentKind
 ) -> tuple[Trajectory, tuple[str, ...]]:
-    """Convert the poses of the estimate to the body axes and the origin of the reference.
+    """Convert the poses of the estimate to the body axes and body origin of the reference.
 
-    Rotation and lever arm are constant, and are estimated together with the alignment.
+    The rotation and the lever arm between the bodies are constant; they are fitted by turns with
+    the alignment.
     """
     assert estimate.rotation is not None
     assert reference.rotation is not None
@@ -510,9 +519,9 @@ def _move_to_reference_body(
     )
     return corrected, (
         f"The orientations differ by a constant {np.degrees(body_rotation.magnitude()):.1f}°: the "
-        "estimate has other body axes than the reference, for example those of a camera. Its "
-        f"origin is at {lever_arm_text} of the reference body. Both are corrected before the "
-        "errors are computed.",
+        "estimate has other body axes than the reference, for example those of a camera. The "
+        f"position of the estimate is {lever_arm_text} of the reference body. The errors are "
+        "computed after a correction of rotation and position.",
     )
 
 
@@ -536,7 +545,7 @@ def _with_reference_body_axes(
     # chordal mean (Hartley 2013, section 5.3)
     rotation = (estimate_rotation.inv() * reference.rotation).mean()
     return replace(aligned_estimate, rotation=estimate_rotation * rotation), (
-        "Rotation errors exclude the estimated constant rotation from vehicle to camera axes, "
+        "Rotation errors exclude the estimated constant rotation between vehicle and camera axes, "
         f"{np.degrees(rotation.magnitude()):.1f}°. Position errors include the "
         "lever arm between vehicle and camera.",
     )

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.core.record import Count, Record, one_line_repr
 
-# Source of a trajectory; "slam": SLAM in the frame of its first key frame (such as ORB-SLAM3)
+# Source of a trajectory; "slam" is SLAM in the frame of its first key frame, such as ORB-SLAM3
 TrajectoryKind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
 # World frame: z is down in "NED" and "FRD", up in "ENU"; "camera" has y down and z forward
 Frame = Literal["NED", "FRD", "ENU", "camera", "unknown"]
@@ -152,7 +152,7 @@ class Trajectory:
     ) -> Trajectory:
         """Return the trajectory with new positions, and without reported variances.
 
-        ``world_rotation``, if given, is applied to the orientations: one rotation, or one per pose.
+        ``world_rotation`` (one, or one per pose) rotates the orientations in the world frame.
         """
         rotation = self.rotation
         if rotation is not None and world_rotation is not None:

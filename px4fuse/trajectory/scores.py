@@ -1,6 +1,6 @@
-"""Scores of a trajectory: statistics, pairs of poses, RPE, and 95 % intervals of an RMSE.
+"""Errors of a trajectory: statistics, relative pose error (RPE), 95 % interval of the RMSE.
 
-Errors of successive poses are correlated, so intervals use a block bootstrap.
+The interval is from a block bootstrap, because errors of successive poses are correlated.
 """
 
 from collections.abc import Sequence
@@ -20,8 +20,8 @@ from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 DeltaUnit = Literal["frames", "m", "s"]
 
-# Maximum relative deviation of the distance of an RPE pair from delta, if all pairs are used:
-# default of the evo package
+# Maximum relative difference between the distance of an RPE pair and the requested distance, if all
+# pairs are used: default of the evo package
 DELTA_TOLERANCE = 0.1
 # Default distances (m) of RPE pairs
 DEFAULT_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
@@ -212,7 +212,7 @@ def find_pairs(
 
 
 def _consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
-    # The distance of each pair is summed from zero, to have the same rounding as evo
+    # Distances are summed from the start of each pair as in the evo package, for equal rounding
     pair_ends = [0]
     distance_or_time = 0.0
     for index, step in enumerate(steps.tolist(), 1):
@@ -257,8 +257,10 @@ def relative_error(
     rotations = get_rotations(aligned_estimate, reference, analysis_name)
     rotation_deg: OrUnavailable[Statistics]
     if isinstance(rotations, Unavailable):
-        rotation_deg = rotations  # both motions are compared in the frame of the reference
+        # without orientations, the motions are compared in the frame of the reference
+        rotation_deg = rotations
     else:
+        # with orientations, each motion is compared in the axes of its first pose
         inverses = [rotation[start_indices].inv() for rotation in rotations]
         motions = [inverse.apply(motion) for inverse, motion in zip(inverses, motions, strict=True)]
         estimated_turn, reference_turn = (
@@ -284,7 +286,7 @@ def relative_error(
 def get_rotations(
     aligned_estimate: Trajectory, reference: Trajectory, analysis_name: str
 ) -> tuple[Rotation, Rotation] | Unavailable:
-    """Return both orientations, or the reason why the score ``analysis_name`` is missing."""
+    """Return both orientations, or the reason why ``analysis_name`` cannot be computed."""
     if aligned_estimate.rotation is not None and reference.rotation is not None:
         return aligned_estimate.rotation, reference.rotation
     role = "reference" if aligned_estimate.rotation else "estimate"

@@ -1,8 +1,7 @@
 """Time offset between two recordings of the same motion: search over all lags, then least squares.
 
-The speeds of both trajectories are correlated at all lags, because they do not depend on frame and
-scale. The best lag is refined with a similarity transform, and rejected if another lag fits nearly
-as well.
+The search correlates speeds, which do not depend on the frame. Least squares fits time offset and
+similarity transform. The result is rejected if another lag has a similar residual.
 """
 
 from dataclasses import dataclass
@@ -30,8 +29,7 @@ MAX_GRID_SAMPLES = 200_000
 SMOOTHING_S = 0.25
 # Minimum overlap of the two trajectories in time, as fraction of the shorter trajectory
 MIN_OVERLAP_FRACTION = 0.5
-# Minimum ratio of the number of overlapping poses to the number of poses in the time span of the
-# shorter trajectory
+# Minimum number of overlapping poses, as fraction of their number at complete overlap
 MIN_POSES_FRACTION = 0.3
 # Maximum number of candidate time offsets (correlation peaks) for which the ATE is computed
 MAX_CANDIDATES = 12
@@ -53,12 +51,13 @@ MAX_FITTED_POSES = 2000
 MAX_MISFIT = 0.5
 # Ratio of residual to extent of the motion below which two fits of the time offset are equally good
 MIN_MISFIT = 1e-3
-# Minimum free velocity (RMS) as fraction of the speed: the free velocity is the part that a
-# similarity transform cannot explain
-MIN_FREE_SPEED_FRACTION = 0.05
-# Minimum correlation of the free velocities of both trajectories: noise is not correlated
-MIN_FREE_CORRELATION = 0.5
-# Window of the long-run variance of the likelihood score, in correlation lengths
+# Minimum RMS of the velocity that shift, rotation and scale of the path cannot explain, as fraction
+# of the speed: a time offset is observable in this part of the velocity only
+MIN_UNEXPLAINED_SPEED_FRACTION = 0.05
+# Minimum correlation between two trajectories of the velocity that shift, rotation and scale cannot
+# explain: noise is not correlated
+MIN_UNEXPLAINED_CORRELATION = 0.5
+# Number of lags in the variance of a sum of correlated residuals, in correlation lengths
 WINDOW_CORRELATION_LENGTHS = 4
 # Maximum half-width (s) of the 95 % interval of an accepted time offset
 MAX_HALF_INTERVAL_S = 0.5
@@ -132,8 +131,8 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
     )
     if not accepted_fits:
         return _not_determinable(
-            "the time offsets with correlated speeds do not fit the positions, or both "
-            "trajectories overlap for a short time only"
+            "at the time offsets with correlated speeds, the positions do not match, or too few "
+            "poses overlap"
         )
     best_fit = accepted_fits[0]
     similar_fits = [
@@ -245,15 +244,15 @@ def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[
         (mean_correlation == local_maximum) & (mean_correlation > MIN_CORRELATION)
     )
     peak_indices = peak_indices[np.argsort(-mean_correlation[peak_indices])][:MAX_CANDIDATES]
-    # The n sparse samples begin at the dense sample k - (n - 1) for the correlation with index k
-    first_index = peak_indices - (len(is_known_sparse) - 1)
-    lags_s = first_index * step_s + dense_track.time_s[0] - sparse_track.time_s[0]
+    # At index k of the correlation, the first sparse sample coincides with dense sample k - (n - 1)
+    first_dense_indices = peak_indices - (len(is_known_sparse) - 1)
+    lags_s = first_dense_indices * step_s + dense_track.time_s[0] - sparse_track.time_s[0]
     return list(lags_s.tolist())
 
 
 @dataclass(frozen=True)
 class _OffsetFit:
-    """Fit of the trajectory with fewer poses (sparse) to the dense one, near a correlation peak.
+    """Fit of the trajectory with fewer poses (sparse) to that with more poses (dense).
 
     ``time_s`` and ``aligned_m`` are times and positions of the sparse trajectory after alignment,
     ``target_m`` the positions of the dense trajectory at these times.
@@ -301,8 +300,9 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
     )
     (information, cross_information), (_, other_information) = (velocities.T @ velocities).tolist()
     if (
-        information <= MIN_FREE_SPEED_FRACTION**2 * float((dense_velocity**2).sum())
-        or cross_information <= MIN_FREE_CORRELATION * (information * other_information) ** 0.5
+        information <= MIN_UNEXPLAINED_SPEED_FRACTION**2 * float((dense_velocity**2).sum())
+        or cross_information
+        <= MIN_UNEXPLAINED_CORRELATION * (information * other_information) ** 0.5
     ):
         return float("inf")
     likelihood_score = (
@@ -356,7 +356,8 @@ def _refine_offset(
 
     def fit_at(shift_s: float) -> _OffsetFit:
         target_m = positions_at(dense_track, sparse_time_s + (lag_s + shift_s))
-        # The sparse trajectory is transformed: a transformed target could get the scale zero
+        # The transform is applied to the sparse trajectory, because a transform of the target could
+        # shrink the target to a point
         transform = umeyama(sparse_position_m, target_m, with_scale=True)
         return _OffsetFit(
             lag_s + shift_s, transform, sparse_time_s, transform.apply(sparse_position_m), target_m

@@ -73,8 +73,8 @@ _XMP_WRITER_FIELDS = re.compile(
 )
 MAX_XMP_BYTES = 100_000
 # Typst version in the PDF, which is not compared: 0.15.0 and 0.15.2 produce the same pages
-_TYPST_VERSION = re.compile(r"Typst \d+(\.\d+)*")
-_END_OF_FILE = re.compile(rb"startxref\s+(\d{1,10})\s+%%EOF\s*\Z")
+_TYPST_VERSION_PATTERN = re.compile(r"Typst \d+(\.\d+)*")
+_END_OF_FILE_PATTERN = re.compile(rb"startxref\s+(\d{1,10})\s+%%EOF\s*\Z")
 _FEATURE_NAMES = {
     "/AA": "a PDF action that runs automatically",
     "/AcroForm": "form fields",
@@ -94,7 +94,7 @@ _TOKEN_PATTERN = re.compile(
     re.DOTALL,
 )
 _NUMBER_PATTERN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)")
-_ESCAPE = re.compile(r"\\([0-7]{1,3}|\r\n?|.)|\r\n?", re.DOTALL)
+_ESCAPE_PATTERN = re.compile(r"\\([0-7]{1,3}|\r\n?|.)|\r\n?", re.DOTALL)
 _ESCAPED_CHARACTERS = {
     "n": "\n",
     "r": "\r",
@@ -109,7 +109,7 @@ _ESCAPED_CHARACTERS = {
 _FIRST_COORDINATE_INDEX = {"m": 0, "l": 0, "c": 0, "v": 0, "y": 0, "re": 0, "cm": 4, "Tm": 4}
 _TEXT_OPERATORS = frozenset(("Tj", "TJ"))
 # Entry of a font's ToUnicode map: glyph number and UTF-16 characters, in hexadecimal digits
-_TO_UNICODE_ENTRY = re.compile(r"<([0-9A-Fa-f]{4})> <((?:[0-9A-Fa-f]{4})+)>\n")
+_TO_UNICODE_ENTRY_PATTERN = re.compile(r"<([0-9A-Fa-f]{4})> <((?:[0-9A-Fa-f]{4})+)>\n")
 
 TextComparison = Callable[[str, str], bool]
 # Operand of a PDF drawing operation: number, string, or another token (name or bracket)
@@ -281,7 +281,7 @@ class _PdfComparison:
             str(value) if isinstance(value, str) else value.decode("latin-1")
             for value in (submitted_value, redrawn_value)
         ]
-        return all(map(_TYPST_VERSION.fullmatch, texts)) or self.is_same_text(*texts)
+        return all(map(_TYPST_VERSION_PATTERN.fullmatch, texts)) or self.is_same_text(*texts)
 
     def _compare_streams(
         self, submitted_stream: StreamObject, redrawn_stream: StreamObject, key: str, page: int
@@ -329,8 +329,8 @@ class _PdfComparison:
             if {submitted_operator, redrawn_operator} <= _TEXT_OPERATORS:
                 texts = [self._decode_text(operands, font_name) for _, operands in operations]
                 kerning = [abs(value) for value in submitted_operands if isinstance(value, float)]
-                is_narrow = max(kerning, default=0.0) < MAX_KERNING
-                if texts[0] != texts[1] and is_narrow and self.is_same_text(*texts):
+                has_small_kerning = max(kerning, default=0.0) < MAX_KERNING
+                if texts[0] != texts[1] and has_small_kerning and self.is_same_text(*texts):
                     continue
                 submitted_text, redrawn_text = (one_line(text, 60) for text in texts)
                 return f"the text is {submitted_text!r}; px4fuse prints {redrawn_text!r}"
@@ -346,7 +346,7 @@ class _PdfComparison:
         to_unicode = self.fonts[font].get_object()["/ToUnicode"].get_data().decode("latin-1")
         text_by_glyph = {
             int(glyph, 16): bytes.fromhex(utf16_text)
-            for glyph, utf16_text in _TO_UNICODE_ENTRY.findall(to_unicode)
+            for glyph, utf16_text in _TO_UNICODE_ENTRY_PATTERN.findall(to_unicode)
         }
         glyph_bytes = b"".join(operand for operand in operands if isinstance(operand, bytes))
         glyph_numbers = struct.unpack(
@@ -358,7 +358,7 @@ class _PdfComparison:
 
 def _find_ambiguities(pdf: bytes) -> Iterator[str]:
     """Describe structures of a PDF that make different programs read different objects."""
-    end_match = _END_OF_FILE.search(pdf[-1024:])
+    end_match = _END_OF_FILE_PATTERN.search(pdf[-1024:])
     if end_match is None:
         yield "the file has bytes after the end of the PDF"
     elif b"/Linearized" in pdf[:1024]:
@@ -370,8 +370,8 @@ def _find_ambiguities(pdf: bytes) -> Iterator[str]:
 
 def _get_page_references(reader: pypdf.PdfReader) -> list[Any]:
     """Return references to the pages of a page tree with one level, as px4fuse writes it."""
-    tree: Any = reader.root_object["/Pages"]
-    return [*list.__iter__(tree["/Kids"])]
+    page_tree: Any = reader.root_object["/Pages"]
+    return [*list.__iter__(page_tree["/Kids"])]
 
 
 def _pdf_type_of(value: Any) -> type:
@@ -394,26 +394,26 @@ def _compared_keys(value: DictionaryObject, key: str) -> set[str]:
     return compared_keys - {"/Params"} if value.get("/Type") == "/EmbeddedFile" else compared_keys
 
 
-def _xmp_metadata(data: bytes) -> str:
+def _xmp_metadata(xmp_bytes: bytes) -> str:
     """Return XMP metadata in canonical form, without fields that other programs change."""
     # an XML document type ("<!") may contain entities that expand to huge texts
-    if len(data) > MAX_XMP_BYTES or b"<!" in data:
-        return data.decode("latin-1")
-    packet = re.sub(r"<\?.*?\?>", "", data.decode("utf-8", "replace"))
-    canonical_text = ElementTree.canonicalize(packet.strip(), strip_text=True)
-    return _TYPST_VERSION.sub("Typst", _XMP_WRITER_FIELDS.sub("", canonical_text))
+    if len(xmp_bytes) > MAX_XMP_BYTES or b"<!" in xmp_bytes:
+        return xmp_bytes.decode("latin-1")
+    xmp_text = re.sub(r"<\?.*?\?>", "", xmp_bytes.decode("utf-8", "replace"))
+    canonical_text = ElementTree.canonicalize(xmp_text.strip(), strip_text=True)
+    return _TYPST_VERSION_PATTERN.sub("Typst", _XMP_WRITER_FIELDS.sub("", canonical_text))
 
 
 def _drawing_operations(content: bytes) -> Iterator[Operation]:
     """Parse the content of a PDF page; yield each drawing operator with its operands."""
     operands: list[Operand] = []
     for match in _TOKEN_PATTERN.finditer(content.decode("latin-1")):
-        literal, digits, token = match.groups("")
+        string_text, hex_digits, token = match.groups("")
         if not token:
             operands.append(
-                bytes.fromhex(digits + "0" * (len(digits) % 2))
-                if digits
-                else _ESCAPE.sub(_unescape, literal).encode("latin-1")
+                bytes.fromhex(hex_digits + "0" * (len(hex_digits) % 2))
+                if hex_digits
+                else _ESCAPE_PATTERN.sub(_unescape, string_text).encode("latin-1")
             )
         elif _NUMBER_PATTERN.fullmatch(token):
             operands.append(float(token))

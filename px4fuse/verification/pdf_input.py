@@ -161,18 +161,22 @@ def _check_file(pdf: bytes) -> None:
             )
 
 
-def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
-    """Return the size (bytes) of the zlib data at ``start``, up to ``limit`` + 1; 0 without zlib.
+def _inflated_bytes(pdf: bytes, start: int, limit_bytes: int) -> int:
+    """Return the size (bytes) of the zlib data at ``start``; 0 if there are none.
 
-    The size is the maximum of compressed, inflated and 1000 bytes, so that limits of the sizes
-    also limit the time.
+    The size is the maximum of compressed, inflated and 1000 bytes, so that a limit of the size also
+    limits the time. Inflating stops at ``limit_bytes`` + 1.
     """
-    header = pdf[start : start + 2]
-    if len(header) < 2 or header[0] & 15 != zlib.DEFLATED or int.from_bytes(header) % 31:
+    zlib_header = pdf[start : start + 2]
+    if (
+        len(zlib_header) < 2
+        or zlib_header[0] & 15 != zlib.DEFLATED
+        or int.from_bytes(zlib_header) % 31
+    ):
         return 0  # not zlib data (RFC 1950, section 2.2)
     inflate = zlib.decompressobj()
     input_bytes = output_bytes = 0
-    while not inflate.eof and max(input_bytes, output_bytes) <= limit:
+    while not inflate.eof and max(input_bytes, output_bytes) <= limit_bytes:
         if not (chunk := inflate.unconsumed_tail):
             chunk = pdf[start + input_bytes : start + input_bytes + 16_384]
             input_bytes += len(chunk)
@@ -184,7 +188,7 @@ def _inflated_bytes(pdf: bytes, start: int, limit: int) -> int:
             break
     input_bytes -= len(inflate.unused_data)
     # the start of inflating takes the time of 1000 bytes
-    return min(max(input_bytes, output_bytes, 1000), limit + 1)
+    return min(max(input_bytes, output_bytes, 1000), limit_bytes + 1)
 
 
 def _all_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, bool]]:

@@ -94,7 +94,7 @@ _LinkFile = Callable[[str, str | None, str], str]
 
 
 class NotRepeatableError(Exception):
-    """Error of an analysis that cannot be repeated; arguments: reason, remedy, missing file."""
+    """Error of an analysis that cannot be repeated; arguments: reason and remedy."""
 
 
 def log_sha256(results: ReportedResults) -> str:
@@ -147,7 +147,7 @@ def _link_file(
     if path is None:
         missing_name = one_line(name, 80) or "the file"
         reason = f"none of the given files has the SHA-256 of {file_label}"
-        raise NotRepeatableError(reason, f"Add {missing_name} to --logs.", missing_name)
+        raise NotRepeatableError(reason, f"Add {missing_name} to --logs.")
     if name != Path(name).name or name == ".." or "\\" in name or not name.isprintable():
         reason = f"{FOREIGN_REQUEST_REASON}: it contains a path instead of a file name"
         raise NotRepeatableError(reason, ASK_AUTHOR_REMEDY)
@@ -184,8 +184,8 @@ def _repeat_comparison(
         log=link_file(recorded_request.log, submitted_results.log.sha256, "the log"),
     )
     if (position := recorded_request.position) is not None:
-        link = link_file(position.path, hash_by_role.get("position"), "--position")
-        request = replace(request, position=replace(position, path=link))
+        linked_path = link_file(position.path, hash_by_role.get("position"), "--position")
+        request = replace(request, position=replace(position, path=linked_path))
     analysis = diagnose(request)
     return analysis, results(recorded_request, analysis, submitted_results.student)
 
@@ -198,8 +198,8 @@ def _repeat_loop(
 
     recorded_request = submitted_results.request
     path, track = split_track(recorded_request.source)
-    link = link_file(path, submitted_results.track.sha256, "the log")
-    request = replace(recorded_request, source=link + track)
+    linked_path = link_file(path, submitted_results.track.sha256, "the log")
+    request = replace(recorded_request, source=linked_path + track)
     if recorded_request.reference is not None:
         path, track = split_track(recorded_request.reference)
         sha256 = submitted_results.references[-1].sha256 if submitted_results.references else None
@@ -208,11 +208,13 @@ def _repeat_loop(
     return analysis, loop_results(recorded_request, analysis, submitted_results.student)
 
 
-def _draw_report(analysis: object, results: ReportedResults, versions: Provenance) -> bytes:
+def _draw_report(
+    analysis: object, results: ReportedResults, submitted_provenance: Provenance
+) -> bytes:
     """Draw the report with the library versions that the submitted report states."""
     from px4fuse.report.pdf import render  # noqa: PLC0415
 
-    new_provenance = replace(versions, command=results.provenance.command)
+    new_provenance = replace(submitted_provenance, command=results.provenance.command)
     return render(analysis, replace(results, provenance=new_provenance), to_json(results))
 
 
@@ -251,13 +253,13 @@ def verify(
         return cannot_verify(reason, f"Verify the report with px4fuse {report_version}.")
     log_file_name = one_line(log_name(results), 80) or "the log"
     if not logs:
-        return cannot_verify(NO_LOG_REASON, f"Add {log_file_name} to --logs.", log_file_name)
+        return cannot_verify(NO_LOG_REASON, f"Add {log_file_name} to --logs.")
     sha256 = log_sha256(results)
     if sha256 not in logs:
         expected_hash = one_line(sha256, 64) or "none"
         reason = f"the given files do not contain the log (SHA-256 {expected_hash})"
         remedy = f"If the log is yours, add {log_file_name} to --logs."
-        return Verification("other log", (reason,), False, remedy=remedy, missing=log_file_name)
+        return Verification("other log", (reason,), False, remedy=remedy)
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"the student's notes have more than {MAX_NOTES_LINES} lines"
         return cannot_verify(reason, ASK_AUTHOR_REMEDY)
@@ -267,10 +269,8 @@ def verify(
     return _verify_with_log(results, pdf, *recomputed)
 
 
-def cannot_verify(reason: str, remedy: str = "", missing_input: str = "") -> Verification:
-    """Return the verdict "cannot verify", with the reason and the name of a missing input file."""
-    reasons = (one_line(reason, 400),)
-    return Verification("cannot verify", reasons, False, remedy=remedy, missing=missing_input)
+def cannot_verify(reason: str, remedy: str = "") -> Verification:
+    return Verification("cannot verify", (one_line(reason, 400),), False, remedy=remedy)
 
 
 def _verify_with_log(
@@ -301,23 +301,23 @@ def _verify_with_log(
     is_same_text = partial(is_same_text_rounded, is_same_number=is_same_number)
     page_differences = compare_pages(pdf, redrawn_pdf, is_same_text)
     is_from_other_program = any(difference.is_structural for difference in page_differences)
-    own_versions = new_results.provenance.libraries.items()
-    other_versions = (
-        {*submitted_results.provenance.libraries.items()} - {*own_versions}
+    installed_libraries = new_results.provenance.libraries.items()
+    differing_libraries = (
+        {*submitted_results.provenance.libraries.items()} - {*installed_libraries}
         if page_differences
         else ()
     )
     # pages from another program or from other library versions may differ without a forgery
-    is_comparable = not (is_from_other_program or other_versions)
+    is_comparable = not (is_from_other_program or differing_libraries)
     page_status: PageStatus = "same"
     if page_differences:
         page_status = "differ" if is_comparable else "not compared"
     status: Status = "verified" if is_comparable else "cannot verify"
     if mismatches:
         status = "numbers differ"
-    sentences = [difference.sentence for difference in page_differences]
-    page_sentences = sentences[:MAX_LISTED_PAGE_DIFFERENCES]
-    if unlisted_count := len(sentences) - len(page_sentences):
+    difference_sentences = [difference.sentence for difference in page_differences]
+    page_sentences = difference_sentences[:MAX_LISTED_PAGE_DIFFERENCES]
+    if unlisted_count := len(difference_sentences) - len(page_sentences):
         page_sentences.append(f"the PDF has {unlisted_count} more differences")
     # the class table shows only the first reason, so the decisive reasons are first
     if status == "cannot verify":
@@ -325,8 +325,8 @@ def _verify_with_log(
     else:
         reasons += page_sentences
     remedy = ORIGINAL_PDF_REMEDY if is_from_other_program else ""
-    if other_versions:  # other library versions may draw other pages
-        versions_text = one_line(", ".join(map(" ".join, sorted(other_versions))), 300)
+    if differing_libraries:  # other library versions may draw other pages
+        versions_text = one_line(", ".join(map(" ".join, sorted(differing_libraries))), 300)
         reasons.append(
             f"the report was made with {versions_text}; this computer has other versions"
         )
@@ -345,18 +345,18 @@ def _verify_with_log(
 
 
 def is_same_number_rounded(
-    pairs: Iterable[tuple[float, float]], submitted_number: str, redrawn_number: str
+    agreeing_pairs: Iterable[tuple[float, float]], submitted_number: str, redrawn_number: str
 ) -> bool:
     """Return True if two printed numbers are roundings of results that agree.
 
-    ``pairs`` are recorded and recomputed results that are equal within the tolerances.
+    ``agreeing_pairs`` are recorded and recomputed results that are equal within the tolerances.
     """
     decimals = _decimal_count(submitted_number)
     printed_pair = float(submitted_number), float(redrawn_number)
     return decimals == _decimal_count(redrawn_number) and any(
         printed_pair == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
         for scale in PRINTED_SCALES
-        for a, b in pairs
+        for a, b in agreeing_pairs
     )
 
 
@@ -377,7 +377,7 @@ def compare_results(
     command = str(new_results["provenance"]["command"])
     # with the value "auto" or the option --position, all numbers depend on an estimated time offset
     # or frame alignment
-    is_estimate_everywhere = not {"auto", "--position"}.isdisjoint(command.split())
+    are_all_estimated = not {"auto", "--position"}.isdisjoint(command.split())
     recorded_values, new_values = dict(flatten(recorded_results)), dict(flatten(new_results))
     pair_by_path = {
         path: (recorded_values.get(path, _ABSENT), new_values.get(path, _ABSENT))
@@ -385,7 +385,7 @@ def compare_results(
         if not path.startswith(MACHINE_PATHS)
     }
     is_near_by_path = {
-        path: _is_near(path, *value_pair, is_estimate_everywhere or path.startswith(ESTIMATE_PATHS))
+        path: _is_near(path, *value_pair, are_all_estimated or path.startswith(ESTIMATE_PATHS))
         for path, value_pair in pair_by_path.items()
         if all(map(is_number, value_pair))
     }
@@ -425,7 +425,7 @@ def flatten(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def is_number(value: object) -> bool:
-    """Return True for a number that is not a bool."""
+    """Return True for a number, False for a bool."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 

@@ -21,7 +21,13 @@ import numpy as np
 
 from px4fuse.ekf2.model import Model, open_model, replay_settings
 from px4fuse.ekf2.replay import Agreement
-from px4fuse.ekf2.steps import FIELD_STEP, FLOW_STEP, STEPS, VELOCITY_STEP, explain_by_steps
+from px4fuse.ekf2.steps import (
+    FIELD_STEP,
+    FLOW_STEP,
+    REPLACEMENT_STEPS,
+    VELOCITY_STEP,
+    explain_by_steps,
+)
 from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.readers import read_log
@@ -90,7 +96,7 @@ def waterfalls(models: dict[str, Model]) -> dict[str, float]:
     Returns the unexplained share of each flight.
     """
     unexplained = {}
-    steps = (*STEPS[:-2], FIELD_STEP, VELOCITY_STEP, FLOW_STEP, *STEPS[-2:])
+    steps = (*REPLACEMENT_STEPS[:-2], FIELD_STEP, VELOCITY_STEP, FLOW_STEP, *REPLACEMENT_STEPS[-2:])
     print("\nwhy EKF2 differs | total rms m | " + " | ".join(steps) + " | left")
     for name, model in models.items():
         found = explain_by_steps(model)

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 from px4fuse.analysis import Analysis
 from px4fuse.cli.options import comparison_request
 from px4fuse.cli.tune import tune as tune_command
-from px4fuse.comparison.estimates import estimate_noises_and_clock, tuned
+from px4fuse.comparison.estimates import estimate_noises, estimate_noises_and_clock
 from px4fuse.diagnose import (
     diagnose_or_check_aids,
     prepare_comparison,
@@ -94,7 +94,7 @@ def flight_outputs(request: ComparisonRequest, flight: Flight | None = None) -> 
         "parameters": {n: v for n, v in flight.log.parameters.items() if n in PARAMETERS},
     }
     comparison = prepare_comparison(request, flight=flight)
-    noises = tuned(comparison)
+    noises = estimate_noises(comparison)
     outputs["tune"] = phrases.tuning_advice(comparison, noises)
     outputs["tune_json"] = to_json_dict(build.tuning_results(request, comparison, noises))
     _, offset = estimate_noises_and_clock(comparison)

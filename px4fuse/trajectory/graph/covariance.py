@@ -1,4 +1,4 @@
-"""Covariance of relative poses from odometry, and the test of loop closures against odometry."""
+"""Test (gate) of loop closures against odometry, with the covariance of the odometry."""
 
 from collections.abc import Sequence
 
@@ -12,8 +12,7 @@ from px4fuse.trajectory.graph import lie, model
 
 # Probability that the gate rejects a true closure
 GATE_ALPHA = 0.001
-# Minimum valid eigenvalue of a covariance matrix with unit diagonal: smaller ones are rounding
-# errors
+# Eigenvalues of a covariance matrix with unit diagonal are rounding errors below this limit
 _MIN_EIGENVALUE = 1e-13
 
 
@@ -52,8 +51,8 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     Raises
     ------
     TrajectoryError
-        Odometry does not connect the vertices of a closure or has a direction without information,
-        or a closure has no information.
+        Odometry does not connect the vertices of a closure, or an information matrix is singular
+        (odometry) or zero (closure).
     """
     tested_edges = np.asarray(edge_indices, dtype=np.intp)
     if not len(tested_edges):
@@ -63,9 +62,9 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     second_nodes = graph.second[tested_edges]
     first_pose_index = int(min(first_nodes.min(), second_nodes.min()))
     chain_edges = chain[first_pose_index : int(max(first_nodes.max(), second_nodes.max()))]
-    missing_steps = np.flatnonzero(chain_edges < 0)
-    if len(missing_steps):
-        vertex = first_pose_index + int(missing_steps[0])
+    missing_edge_indices = np.flatnonzero(chain_edges < 0)
+    if len(missing_edge_indices):
+        vertex = first_pose_index + int(missing_edge_indices[0])
         raise TrajectoryError(
             f"The closures cannot be tested, because no odometry edge connects vertices "
             f"{graph.ids[vertex]} and {graph.ids[vertex + 1]}",
@@ -75,7 +74,7 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     step_adjoints = lie.adjoint(poses[1:])
     step_covariances = (
         step_adjoints @ _covariances(graph, chain_edges) @ step_adjoints.transpose(0, 2, 1)
-    )  # covariances in the axes of the first pose of the odometry chain
+    )  # in the axes of the first pose of the odometry chain
     cumulative_covariance = np.concatenate(
         [np.zeros((1, *step_covariances.shape[1:])), np.cumsum(step_covariances, axis=0)]
     )
@@ -113,13 +112,13 @@ def _test_edge(
         <= _MIN_EIGENVALUE
     ):
         raise TrajectoryError(
-            f"The closure from vertex {vertices[0]} to {vertices[1]} cannot be tested: the "
-            "closure has no information, or information that differs too much from the odometry",
+            f"The closure from vertex {vertices[0]} to {vertices[1]} cannot be tested: its "
+            "information matrix is zero, or far larger or smaller than that of the odometry",
             "Give information matrices of similar magnitude.",
         )
     d2 = float(projected_residual @ np.linalg.solve(residual_covariance, projected_residual))
-    p = float(chdtrc(degrees_of_freedom, d2))
-    return GateResult(*vertices, d2, degrees_of_freedom, p, p >= GATE_ALPHA)
+    p_value = float(chdtrc(degrees_of_freedom, d2))
+    return GateResult(*vertices, d2, degrees_of_freedom, p_value, p_value >= GATE_ALPHA)
 
 
 def _covariances(graph: model.PoseGraph, chain_edges: IntArray) -> Array:

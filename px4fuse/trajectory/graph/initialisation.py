@@ -69,13 +69,13 @@ def _solve_positions(
     first_coefficient: Array,
     second_coefficient: Array,
     information: Array,
-    value: Array,
+    edge_value: Array,
     first_pose: Array,
 ) -> Array:
     """Solve :func:`normal_equations`; the result has the shape (n, d, k)."""
     solution = solve_normal_equations(
         *normal_equations(
-            graph, first_coefficient, second_coefficient, information, value, first_pose
+            graph, first_coefficient, second_coefficient, information, edge_value, first_pose
         )
     )
     if solution is None:

@@ -132,7 +132,7 @@ def adjoint(pose: Array) -> Array:
 
 
 def right_jacobian_inverse(tangent: Array) -> Array:
-    """Return the inverse right Jacobians: derivative of log(X) by a right perturbation of X.
+    """Return the inverse right Jacobians, the derivatives of log(X exp(xi)) by xi at xi = 0.
 
     Parameters
     ----------
@@ -148,7 +148,8 @@ def right_jacobian_inverse(tangent: Array) -> Array:
     theta = np.linalg.norm(tangent[..., _dimension(tangent) :], axis=-1)[..., None, None]
     cot_term = _cot_term(theta)
     half_cot_slope = 0.5 * _cot_term_slope(theta)
-    # Series of x / (1 - exp(-x)) with x = ad, reduced by ad^5 = -2 theta^2 ad^3 - theta^4 ad
+    # Power series of x / (1 - exp(-x)) for the matrix x = ad; powers above 4 are replaced with
+    # ad^5 = -2 theta^2 ad^3 - theta^4 ad
     jacobian: Array = (
         np.eye(commutator.shape[-1])
         + 0.5 * commutator

@@ -15,11 +15,10 @@ from px4fuse.core.record import one_line_repr
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
 
-# Option relax of SuperLU: 1 gives the least fill-in. With a value above the default of 10, SuperLU
-# writes outside its workspace (scipy 1.17, shown by valgrind)
+# Option relax of SuperLU: 1 gives the least fill-in; above the default of 10 SuperLU writes outside
+# its workspace (scipy 1.17, shown by valgrind)
 _SUPERLU_RELAX = 1
-# Option panel_size of SuperLU. With a value above the default of 20, SuperLU also writes outside
-# its workspace
+# Option panel_size of SuperLU: above the default of 20, SuperLU writes outside its workspace
 _SUPERLU_PANEL_SIZE = 4
 if TYPE_CHECKING:  # scipy before 1.16 has no generic arrays
     Matrix = sparse.csc_array[np.float64]
@@ -30,17 +29,18 @@ def normal_equations(
     first_coefficient: Array,
     second_coefficient: Array,
     information: Array,
-    value: Array,
+    edge_value: Array,
     first_value: Array | float = 0.0,
 ) -> tuple[Matrix, Array]:
-    """Return the normal equations of ``A x_i + B x_j = value`` over all edges, with x_0 fixed.
+    """Return the normal equations of ``A x_i + B x_j = c`` over all edges (i, j), with x_0 fixed.
 
     Parameters
     ----------
     graph : PoseGraph
     first_coefficient, second_coefficient, information : ndarray, shape (m, d, d)
         A, B, and the weight matrix of each equation.
-    value : ndarray, shape (m, d, k)
+    edge_value : ndarray, shape (m, d, k)
+        Right sides c.
     first_value : ndarray, shape (d, k), or 0
         Value of x_0.
 
@@ -50,7 +50,7 @@ def normal_equations(
     right_side : ndarray, shape ((n - 1) d, k)
     """
     edge_indices = np.arange(len(graph.first) + 1)
-    d = value.shape[1]
+    d = edge_value.shape[1]
     edge_nodes = np.column_stack([graph.first, graph.second]).ravel()
     blocks = np.stack([first_coefficient, second_coefficient], axis=1).reshape(-1, d, d)
     rows = sparse.bsr_array(
@@ -60,11 +60,11 @@ def normal_equations(
     columns = rows.tocsc()
     first_columns = columns[:, :d]
     free_columns = columns[:, d:]
-    weighted = free_columns.T @ weights
-    right_side = value.reshape(-1, value.shape[-1]) - first_columns @ np.broadcast_to(
-        first_value, value.shape[1:]
+    weighted_transpose = free_columns.T @ weights
+    right_side = edge_value.reshape(-1, edge_value.shape[-1]) - first_columns @ np.broadcast_to(
+        first_value, edge_value.shape[1:]
     )
-    return (weighted @ free_columns).tocsc(), weighted @ right_side
+    return (weighted_transpose @ free_columns).tocsc(), weighted_transpose @ right_side
 
 
 def solve_normal_equations(matrix: Matrix, right_side: Array, damping: float = 0.0) -> Array | None:
@@ -88,7 +88,8 @@ def solve_normal_equations(matrix: Matrix, right_side: Array, damping: float = 0
     return solution if np.all(np.isfinite(solution)) else None
 
 
-# Minimum eigenvalue of an information matrix (scaled to unit diagonal) in a measured direction
+# A direction is not measured if the eigenvalue of the information matrix (scaled to unit diagonal)
+# is below this limit
 MIN_OBSERVED_EIGENVALUE = 1e-9
 # Sources of the initial poses of a pose graph
 FROM_FILE = "the file's vertices"
@@ -162,8 +163,8 @@ def residuals(graph: PoseGraph, poses: Array) -> Residuals:
     """Compute the residuals of all edges at the poses, shape (n, 3) or (n, 7)."""
     relative = lie.between(poses[graph.first], poses[graph.second])
     residual = lie.log(lie.between(graph.measurements, relative))
-    weighted = (graph.information @ residual[..., None])[..., 0]
-    return Residuals(poses, relative, residual, np.sum(residual * weighted, axis=-1))
+    weighted_residual = (graph.information @ residual[..., None])[..., 0]
+    return Residuals(poses, relative, residual, np.sum(residual * weighted_residual, axis=-1))
 
 
 def cost(graph: PoseGraph) -> float:
@@ -172,10 +173,10 @@ def cost(graph: PoseGraph) -> float:
 
 
 def information_eigenvectors(information: Array) -> tuple[Array, Array]:
-    """Return the directions (columns) in which a measurement has information, and the variances.
+    """Return the directions (columns) that a measurement observes, and the variances along them.
 
-    ``information == directions @ diag(1 / variance) @ directions.T``. Translation and rotation have
-    different units, so the matrix is scaled to unit diagonal first.
+    ``information == directions @ diag(1 / variance) @ directions.T``. The matrix is scaled to unit
+    diagonal first, because translation and rotation have different units.
     """
     scale, scaled_information = scale_to_unit_diagonal(information)
     eigenvalues, eigenvectors = np.linalg.eigh(scaled_information)
@@ -191,10 +192,9 @@ def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
 
 
 def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> None:
-    """Raise TrajectoryError if the graph is not connected.
+    """Raise TrajectoryError if edges in the mask ``is_used`` do not connect all poses.
 
-    Only edges in the mask ``is_used`` that have information connect poses. ``edges_name`` is the
-    name of these edges in the message.
+    Edges without information connect nothing. ``edges_name`` names the edges in the message.
     """
     if not len(graph.first):
         raise TrajectoryError("The pose graph has no edges", "Give a file with EDGE lines.")

@@ -39,7 +39,7 @@ _INITIAL_DAMPING = 1e-5
 _DAMPING_FACTOR = 10.0
 # Maximum damping of Levenberg-Marquardt, as in GTSAM
 _MAX_DAMPING = 1e5
-# Minimum ratio of actual to predicted decrease of the cost for accepting a step, as in GTSAM
+# Minimum ratio of actual to predicted cost decrease for accepting a step, as in GTSAM
 _MIN_FIDELITY = 1e-3
 # Relative and absolute tolerance of the cost of a pose graph
 _COST_TOLERANCE = 1e-10
@@ -51,7 +51,7 @@ _MAX_STAGE_ITERATIONS = 20
 
 # Probability that graduated non-convexity does not truncate the residual of a true closure
 GNC_PROBABILITY = 0.99
-# Probability that the cost of a true closure is below the cost of dropping the closure
+# Probability that a true closure is kept, because dropping the closure would increase the cost
 DROP_PROBABILITY = 0.999
 # Factor on the control parameter of graduated non-convexity per stage (Yang 2020, section V)
 _GNC_CONTROL_FACTOR = 1.4
@@ -82,7 +82,7 @@ class Solution(Record, kw_only=True):
 
 @dataclass(frozen=True)
 class _Minimum:
-    state: Residuals
+    residuals: Residuals
     iterations: int
     converged: bool
 
@@ -122,8 +122,8 @@ def solve(
     if robust and np.any(is_doubtful):
         minimum, weights = _solve_gnc(graph, start_residuals, minimum, is_doubtful)
     return Solution(
-        poses=minimum.state.poses,
-        cost=0.5 * float(np.sum(weights * minimum.state.chi2)),
+        poses=minimum.residuals.poses,
+        cost=0.5 * float(np.sum(weights * minimum.residuals.chi2)),
         cost_initial=cost_initial,
         iterations=minimum.iterations,
         converged=minimum.converged,
@@ -134,64 +134,64 @@ def solve(
 
 def _minimise(
     graph: PoseGraph,
-    state: Residuals,
+    residuals: Residuals,
     weights: Array,
     tolerance: float = _COST_TOLERANCE,
     max_iterations: int = MAX_ITERATIONS,
 ) -> _Minimum:
-    """Minimise the cost from ``state``, like GTSAM's LevenbergMarquardtOptimizer."""
+    """Minimise the cost from ``residuals``, like GTSAM's LevenbergMarquardtOptimizer."""
     damping = _INITIAL_DAMPING
     iterations = 0
-    cost = float(np.sum(0.5 * weights * state.chi2))
+    cost = float(np.sum(0.5 * weights * residuals.chi2))
     while iterations < max_iterations and cost > _COST_TOLERANCE:
         # d r / d x_j = J, d r / d x_i = -J A, with A the adjoint of x_i relative to x_j
-        jacobian = lie.right_jacobian_inverse(state.residual)
-        first_jacobian = jacobian @ lie.adjoint(lie.inverse(state.relative))
+        jacobian = lie.right_jacobian_inverse(residuals.residual)
+        first_jacobian = jacobian @ lie.adjoint(lie.inverse(residuals.relative))
         matrix, gradient = normal_equations(
             graph,
             -first_jacobian,
             jacobian,
             weights[:, None, None] * graph.information,
-            -state.residual[..., None],
+            -residuals.residual[..., None],
         )
         while True:
             cost_decrease = 0.0
             predicted_decrease = 0.0
-            is_flat = False
+            is_converged = False
             step = solve_normal_equations(matrix, gradient, damping)
             if step is not None:
                 predicted_decrease = 0.5 * float(np.sum(step * (damping * step + gradient)))
                 tangent = np.concatenate([np.zeros(graph.degrees_of_freedom), step[:, 0]])
-                trial_state = model.residuals(
-                    graph, lie.compose(state.poses, lie.exp(tangent.reshape(len(graph), -1)))
+                trial_residuals = model.residuals(
+                    graph, lie.compose(residuals.poses, lie.exp(tangent.reshape(len(graph), -1)))
                 )
-                cost_decrease = cost - float(np.sum(0.5 * weights * trial_state.chi2))
-                is_flat = abs(cost_decrease) < tolerance * cost
+                cost_decrease = cost - float(np.sum(0.5 * weights * trial_residuals.chi2))
+                is_converged = abs(cost_decrease) < tolerance * cost
             is_accepted = (
                 predicted_decrease > _FLOAT_EPSILON * cost
                 and cost_decrease > _MIN_FIDELITY * predicted_decrease
             )
-            if is_accepted or is_flat or damping >= _MAX_DAMPING:
+            if is_accepted or is_converged or damping >= _MAX_DAMPING:
                 break
             damping *= _DAMPING_FACTOR
         if not is_accepted:
-            return _Minimum(state, iterations, is_flat)
-        state = trial_state
+            return _Minimum(residuals, iterations, is_converged)
+        residuals = trial_residuals
         cost_before = cost
         cost = cost - cost_decrease
         iterations += 1
         damping /= _DAMPING_FACTOR
         if cost_decrease <= max(tolerance * cost_before, _COST_TOLERANCE):
-            return _Minimum(state, iterations, True)
-    return _Minimum(state, iterations, cost <= _COST_TOLERANCE)
+            return _Minimum(residuals, iterations, True)
+    return _Minimum(residuals, iterations, cost <= _COST_TOLERANCE)
 
 
 def _solve_gnc(
     graph: PoseGraph, start: Residuals, plain_minimum: _Minimum, is_doubtful: BoolArray
 ) -> tuple[_Minimum, Array]:
-    """Minimise truncated least squares from two starts, and use the result with the lower cost.
+    """Minimise truncated least squares from ``plain_minimum`` and from ``start``.
 
-    Then dropped closures are restored one by one, if that lowers the cost.
+    In the result with the lower cost, each dropped closure is restored if this lowers the cost.
     """
     _, scaled_information = model.scale_to_unit_diagonal(graph.information)
     degrees_of_freedom = np.sum(
@@ -207,67 +207,67 @@ def _solve_gnc(
         degrees_of_freedom[is_testable] / 2.0, DROP_PROBABILITY
     )
 
-    def truncated_cost(state: Residuals, edge_weights: Array) -> float:
-        return 0.5 * float(np.sum(np.where(edge_weights > 0.0, state.chi2, drop_cost)))
+    def truncated_cost(residuals: Residuals, edge_weights: Array) -> float:
+        return 0.5 * float(np.sum(np.where(edge_weights > 0.0, residuals.chi2, drop_cost)))
 
     iteration_count = plain_minimum.iterations
     solutions = []
-    for start_state in (plain_minimum.state, start):
-        minimum, weights = _descend_graduated(graph, start_state, chi2_bound)
+    for start_residuals in (plain_minimum.residuals, start):
+        minimum, weights = _descend_graduated(graph, start_residuals, chi2_bound)
         iteration_count += minimum.iterations
-        solutions.append((truncated_cost(minimum.state, weights), minimum, weights))
+        solutions.append((truncated_cost(minimum.residuals, weights), minimum, weights))
     lowest_cost, minimum, weights = min(solutions, key=lambda solution: solution[0])
     dropped_edges = np.flatnonzero(weights == 0.0)
-    for edge_index in dropped_edges[np.argsort(minimum.state.chi2[dropped_edges])][
+    for edge_index in dropped_edges[np.argsort(minimum.residuals.chi2[dropped_edges])][
         :_MAX_RETRIED_CLOSURES
     ]:
         trial_weights = weights.copy()
         trial_weights[edge_index] = 1.0
-        retried_minimum = _minimise(graph, minimum.state, trial_weights)
+        retried_minimum = _minimise(graph, minimum.residuals, trial_weights)
         iteration_count += retried_minimum.iterations
-        if (cost := truncated_cost(retried_minimum.state, trial_weights)) < lowest_cost:
+        if (cost := truncated_cost(retried_minimum.residuals, trial_weights)) < lowest_cost:
             lowest_cost = cost
             minimum = retried_minimum
             weights = trial_weights
     model.require_connected(graph, weights > 0.0, "the edges that robust optimisation did not drop")
-    return _Minimum(minimum.state, iteration_count, minimum.converged), weights
+    return _Minimum(minimum.residuals, iteration_count, minimum.converged), weights
 
 
 def _descend_graduated(
     graph: PoseGraph, start: Residuals, chi2_bound: Array
 ) -> tuple[_Minimum, Array]:
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
-    state = start
+    residuals = start
     iteration_count = 0
-    # Edges that cannot be false have an infinite bound, so their excess is -1
-    chi2_excess = 2.0 * state.chi2 / chi2_bound - 1.0
+    # -1 for edges that cannot be false, because their bound is infinite
+    chi2_excess = 2.0 * residuals.chi2 / chi2_bound - 1.0
     if np.max(chi2_excess) > 0.0:
         gnc_control = 1.0 / float(np.max(chi2_excess))
         for _ in range(_MAX_GNC_STAGES):
-            # avoids a division by zero; the weight is 1 anyway
-            ratio = np.maximum(state.chi2 / chi2_bound, 1e-200)
+            # the limit avoids a division by zero; the weight of such a small residual is 1
+            chi2_ratio = np.maximum(residuals.chi2 / chi2_bound, 1e-200)
             weights = np.clip(
-                np.sqrt(gnc_control * (gnc_control + 1.0) / ratio) - gnc_control, 0.0, 1.0
+                np.sqrt(gnc_control * (gnc_control + 1.0) / chi2_ratio) - gnc_control, 0.0, 1.0
             )
             stage_minimum = _minimise(
-                graph, state, weights, _STAGE_TOLERANCE, _MAX_STAGE_ITERATIONS
+                graph, residuals, weights, _STAGE_TOLERANCE, _MAX_STAGE_ITERATIONS
             )
-            state = stage_minimum.state
+            residuals = stage_minimum.residuals
             iteration_count = iteration_count + stage_minimum.iterations
             if np.all((weights < 1e-6) | (weights > 1.0 - 1e-6)):
                 break
             gnc_control *= _GNC_CONTROL_FACTOR
-    weights = (state.chi2 <= chi2_bound).astype(float)
+    weights = (residuals.chi2 <= chi2_bound).astype(float)
     for _ in range(_MAX_TRUNCATION_ROUNDS):
-        truncated_minimum = _minimise(graph, state, weights)
-        state = truncated_minimum.state
+        truncated_minimum = _minimise(graph, residuals, weights)
+        residuals = truncated_minimum.residuals
         iteration_count = iteration_count + truncated_minimum.iterations
-        # Each round decreases the truncated cost, so the iteration ends
-        new_weights = (state.chi2 <= chi2_bound).astype(float)
+        # the iteration ends, because each round decreases the truncated cost
+        new_weights = (residuals.chi2 <= chi2_bound).astype(float)
         if np.array_equal(new_weights, weights):
             break
         weights = new_weights
-    return _Minimum(state, iteration_count, truncated_minimum.converged), weights
+    return _Minimum(residuals, iteration_count, truncated_minimum.converged), weights
 
 
 class Graph(Record, kw_only=True):
@@ -302,9 +302,9 @@ def analyse_graph(
 ) -> tuple[Graph, PoseGraph]:
     """Test the loop closures of a pose graph, and optimise the graph by least squares and robustly.
 
-    Edges between successive vertices are odometry, all other edges are closures. ``run_robust``
-    is by default True with up to 1000 closures. Return also the pose graph with the poses of the
-    least-squares solution.
+    Edges between successive vertices are odometry, all other edges are closures. By default, robust
+    optimisation is run with up to MAX_ROBUST_CLOSURES closures. Also return the pose graph with the
+    least-squares poses.
 
     Raises
     ------
