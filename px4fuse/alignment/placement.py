@@ -39,6 +39,7 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_file import PositionRecording
+from px4fuse.trajectory.model import NED_COMPONENTS
 
 # Maximum time span (s) of file and log for _explain_mismatch, which takes 1 s per hour
 MAX_EXPLAINED_SPAN_S = 7200.0
@@ -199,8 +200,8 @@ def align_position_file(
 def _check_options(
     frame: str | None, yaw_deg: float | str | None, clock_offset_s: float | None
 ) -> None:
-    if frame not in (None, *tracks.FRAMES):
-        remedy = f"Use one of {', '.join(tracks.FRAMES)}."
+    if frame not in (None, *NED_COMPONENTS):
+        remedy = f"Use one of {', '.join(NED_COMPONENTS)}."
         raise SettingsError(f"`frame` {frame} is not a known coordinate frame.", remedy)
     if isinstance(yaw_deg, str) and yaw_deg != "auto":
         raise SettingsError(f"`yaw_deg` {yaw_deg} is neither a number (degrees) nor auto.")

@@ -22,16 +22,9 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers.common import finite_rows
 from px4fuse.trajectory.association import gap_limit, is_bracketed
+from px4fuse.trajectory.model import NED_COMPONENTS
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 
-# Indices of north, east and down in (x, y, z), and the signs of these components, by frame
-FRAMES = {
-    "ned": ([0, 1, 2], [1.0, 1.0, 1.0]),
-    "enu": ([1, 0, 2], [1.0, 1.0, -1.0]),
-    "nwu": ([0, 1, 2], [1.0, -1.0, -1.0]),
-    "eus": ([2, 0, 1], [-1.0, 1.0, -1.0]),
-    "edn": ([2, 0, 1], [1.0, 1.0, 1.0]),
-}
 EKF2_POSITION, IMU = "EKF2 position", "IMU"
 
 # An interval between two samples is a gap if it is longer than this time (s), and longer than three
@@ -97,7 +90,7 @@ class SampledTrack:
 
 def convert_to_ned(samples: pd.DataFrame, frame: str) -> SampledTrack:
     """Convert the positions of a file to north, east, down, with times from the first sample."""
-    axis_order, axis_signs = FRAMES[frame]
+    axis_order, axis_signs = NED_COMPONENTS[frame]
     position_m = samples[["x_m", "y_m", "z_m"]].to_numpy()[:, axis_order] * axis_signs
     return _track_without_gaps(samples.index.to_numpy() - samples.index[0], position_m)
 
@@ -200,7 +193,7 @@ def align_samples(
     """
     track = convert_to_ned(samples, frame)
     position_m = track.position_m
-    axis_order, _ = FRAMES[frame]
+    axis_order, _ = NED_COMPONENTS[frame]
     variance_m2 = samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()[:, axis_order] ** 2
     if yaw_rad:  # a rotation mixes both axes, so both sigmas are then needed
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)

@@ -12,10 +12,9 @@ import numpy as np
 import pandas as pd
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import median_filter, uniform_filter1d
-from scipy.stats import spearmanr
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.core.arrays import Array, cumulative_integral
+from px4fuse.core.arrays import Array, cumulative_integral, rank_correlation
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.flight.model import Columns, Unavailable
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_vector
@@ -227,7 +226,7 @@ def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
     sizes_m = np.linalg.norm(errors.residual_m, axis=1)
     # noise that is larger in one part of the flight correlates with speed in a few parts only
     significances = [
-        spearmanr(sizes_m[part], speed_m_s[part]).statistic * np.sqrt(len(part) / SHARED_RESIDUALS)
+        rank_correlation(sizes_m[part], speed_m_s[part]) * np.sqrt(len(part) / SHARED_RESIDUALS)
         for part in (np.arange(len(sizes_m)), *np.array_split(np.arange(len(sizes_m)), PART_COUNT))
         if np.ptp(sizes_m[part]) and np.ptp(speed_m_s[part])
     ]
@@ -351,7 +350,8 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     At rest a time offset causes no error, so jumps and slow errors are not explained.
     """
     parts = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_S).astype(int)
-    square_speeds = np.bincount(parts, np.sum(fit.velocity_m_s**2, axis=1)) / np.bincount(parts)
+    square_sums = np.bincount(parts, np.sum(fit.velocity_m_s**2, axis=1))
+    square_speeds = square_sums / np.maximum(np.bincount(parts), 1)
     moving_parts = np.flatnonzero(square_speeds > MIN_OFFSET_SPEED_M_S**2)
     if len(moving_parts) < 2:
         return None

@@ -48,6 +48,8 @@ CONSTANTS_PRIOR_SIGMA = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3
 # Maximum gyro bias (rad/s) that the prior of the constants covers (5 σ); a larger bias is removed,
 # as estimated from EKF2's attitude
 MAX_PRIOR_GYRO_BIAS_RAD_S = 0.02
+# Maximum gyro bias (rad/s) that EKF2 can remove from its attitude: the maximum of EKF2_GYR_B_LIM
+MAX_REMOVED_GYRO_BIAS_RAD_S = 0.4
 # Maximum length (s) of a segment: in 30 s a gyro bias of 0.004 rad/s rotates the attitude by
 # 0.12 rad, with a linearisation error of 0.07 m/s²
 MAX_SEGMENT_S = 30.0
@@ -393,7 +395,8 @@ def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -
 def _large_gyro_bias(step_times_s: Array, angle_rad: Array, attitude: pd.DataFrame) -> Array:
     """Return the gyro bias (rad/s) from the logged attitude.
 
-    Zero up to ``MAX_PRIOR_GYRO_BIAS_RAD_S``, because the prior of the unknown constants covers it.
+    Zero up to ``MAX_PRIOR_GYRO_BIAS_RAD_S``, because the prior of the unknown constants covers it,
+    and above ``MAX_REMOVED_GYRO_BIAS_RAD_S``, because then the logged attitude is wrong.
     """
     samples = attitude.loc[step_times_s[0] : step_times_s[-1], Columns.QUATERNION]
     if len(samples) < MIN_KEPT_MEASUREMENTS:
@@ -406,7 +409,8 @@ def _large_gyro_bias(step_times_s: Array, angle_rad: Array, attitude: pd.DataFra
         multiply(conjugate(quaternions[:-1]), quaternions[1:])
     )
     bias = np.asarray(np.median(excess_rad / np.diff(attitude_time_s)[:, None], axis=0))
-    return bias if np.abs(bias).max() > MAX_PRIOR_GYRO_BIAS_RAD_S else np.zeros(3)
+    is_removed = MAX_PRIOR_GYRO_BIAS_RAD_S < np.abs(bias).max() <= MAX_REMOVED_GYRO_BIAS_RAD_S
+    return bias if is_removed else np.zeros(3)
 
 
 def _integrate_gyros(step_times_s: Array, angle_rad: Array, attitude: pd.DataFrame) -> Array:

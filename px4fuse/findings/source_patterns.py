@@ -94,7 +94,7 @@ def detect_slow_patterns(analysis: Analysis, fit: ErrorFit) -> Findings:
             f"sinusoid explains {format_percent(min(periodic.fraction, 1.0))} of the slow errors "
             "against ground truth. KF and EKF2 follow it, and innovations hardly show it.",
             f"Check {source_words(analysis.source).errors}. Look for a process with this period, "
-            "such as multipath, a rotating part or a control loop. No noise setting corrects it.",
+            "such as a rotating part or a control loop. No noise setting corrects it.",
             periodic._asdict(),
         )
         return

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pandas as pd
-from scipy.stats import spearmanr
 
 from px4fuse.analysis import Analysis
-from px4fuse.core.arrays import Array
+from px4fuse.core.arrays import Array, rank_correlation
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.fusion_conditions import (
     AGE_BY_WRONG_TIMESTAMP,
@@ -194,7 +193,7 @@ def detect_growing_latency(analysis: Analysis) -> Findings:
         float(part.median())
         for part in (position_age_s.iloc[:part_count], position_age_s.iloc[-part_count:])
     )
-    trend = spearmanr(position_age_s.index, position_age_s).statistic
+    trend = rank_correlation(position_age_s.index.to_numpy(), position_age_s.to_numpy())
     if end_s - start_s < MIN_LATENCY_ERROR_S or trend < MIN_LATENCY_TREND:
         return
     ekf2, buffer_sentence, make_finding = analysis.flight.ekf2, "", warning

@@ -8,14 +8,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from px4fuse.alignment.tracks import FRAMES
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.trajectory.graph import lie
-from px4fuse.trajectory.model import Frame, Trajectory, cumulative_distance
+from px4fuse.trajectory.model import NED_COMPONENTS, Frame, Trajectory, cumulative_distance
 
 DOWN_DIRECTION = np.array([0.0, 0.0, 1.0])
-# Conversions to z down by frame: key of FRAMES for the order and signs of the axes (in FRD, forward
-# and right replace north and east), new frame, and note to the user
+# Conversions to z down by frame: key of NED_COMPONENTS (in FRD, forward and right replace north and
+# east), new frame, and note to the user
 _Z_DOWN_CONVERSIONS: dict[Frame, tuple[str, Frame, str]] = {
     "ENU": ("enu", "NED", "the axes were converted from east, north, up to north, east, down"),
     "camera": (
@@ -41,7 +40,7 @@ def to_z_down(trajectory: Trajectory) -> Trajectory:
     if trajectory.frame not in _Z_DOWN_CONVERSIONS:
         return trajectory
     axes, z_down_frame, note = _Z_DOWN_CONVERSIONS[trajectory.frame]
-    axis_order, axis_signs = FRAMES[axes]
+    axis_order, axis_signs = NED_COMPONENTS[axes]
     position_variance_m2 = trajectory.position_variance_m2
     return replace(
         _rotate(trajectory, np.diag(axis_signs) @ np.eye(3)[axis_order], z_down_frame),
@@ -57,7 +56,7 @@ def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
     """Convert a result of :func:`to_z_down` back to the original ``frame``."""
     if frame not in _Z_DOWN_CONVERSIONS or trajectory.frame in _Z_DOWN_CONVERSIONS:
         return trajectory
-    axis_order, axis_signs = FRAMES[_Z_DOWN_CONVERSIONS[frame][0]]
+    axis_order, axis_signs = NED_COMPONENTS[_Z_DOWN_CONVERSIONS[frame][0]]
     return _rotate(trajectory, (np.diag(axis_signs) @ np.eye(3)[axis_order]).T, frame)
 
 

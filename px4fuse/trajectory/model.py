@@ -18,6 +18,14 @@ TrajectoryKind = Literal["vio", "ekf2", "kf", "truth", "slam", "unknown"]
 # World frame: z is down in "NED" and "FRD", up in "ENU"; "camera" has y down and z forward
 Frame = Literal["NED", "FRD", "ENU", "camera", "unknown"]
 MIN_POSES = 3
+# Indices of north, east and down in (x, y, z), and the signs of these components, by frame
+NED_COMPONENTS = {
+    "ned": ([0, 1, 2], [1.0, 1.0, 1.0]),
+    "enu": ([1, 0, 2], [1.0, 1.0, -1.0]),
+    "nwu": ([0, 1, 2], [1.0, -1.0, -1.0]),
+    "eus": ([2, 0, 1], [-1.0, 1.0, -1.0]),
+    "edn": ([2, 0, 1], [1.0, 1.0, 1.0]),
+}
 AXES_OF_FRAME: Mapping[Frame, tuple[str, str, str]] = {
     "NED": ("north", "east", "down"),
     "FRD": ("forward", "right", "down"),
