@@ -379,7 +379,7 @@ def compare_results(
     command = str(new_results["provenance"]["command"])
     # with the value "auto" or the option --position, all numbers depend on an estimated time offset
     # or frame alignment
-    is_estimate_everywhere = not {"auto", "--position"}.isdisjoint(command.split())
+    are_all_estimated = not {"auto", "--position"}.isdisjoint(command.split())
     recorded_values, new_values = dict(flatten(recorded_results)), dict(flatten(new_results))
     pair_by_path = {
         path: (recorded_values.get(path, _ABSENT), new_values.get(path, _ABSENT))
@@ -387,7 +387,7 @@ def compare_results(
         if not path.startswith(MACHINE_PATHS)
     }
     is_near_by_path = {
-        path: _is_near(path, *value_pair, is_estimate_everywhere or path.startswith(ESTIMATE_PATHS))
+        path: _is_near(path, *value_pair, are_all_estimated or path.startswith(ESTIMATE_PATHS))
         for path, value_pair in pair_by_path.items()
         if all(map(is_number, value_pair))
     }
@@ -427,7 +427,7 @@ def flatten(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def is_number(value: object) -> bool:
-    """Return True for a number that is not a bool."""
+    """Return True for a number, False for a bool."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
