@@ -292,8 +292,10 @@ def test_grade_report_with_forged_results_is_not_verified(
     graded = flight.graded(report, verdict, rubric)
     assert graded.status != "verified"
     assert not graded.counted_points
-    assert graded.status == status, graded.verdict.reasons
-    assert not any("Error" in reason for reason in graded.verdict.reasons), graded.verdict.reasons
+    assert graded.status == status, graded.verification.reasons
+    assert not any("Error" in reason for reason in graded.verification.reasons), (
+        graded.verification.reasons
+    )
     assert pending in graded.instructor_action
     assert bool(graded.instructor_action) == bool(pending)
     assert graded.points <= honest.points + 1e-9
