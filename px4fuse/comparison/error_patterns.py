@@ -43,8 +43,8 @@ JITTER_RATIOS = 0.6, 1.5
 MIN_JITTER_FRACTION = 0.4
 # Minimum significance (σ) of jitter, and of noise that grows with speed
 MIN_PATTERN_SIGMAS = 6.0
-# Growth of the noise with speed: number of tested flight parts, and minimum median of their
-# significances (σ)
+# Number of flight parts in which the growth with speed is tested, and its minimum median
+# significance (σ)
 PART_COUNT, MIN_PART_SIGMAS = 5, 1.2
 # Speed quantiles: below the first the vehicle is slow, above the second it is fast
 SLOW_FRACTION, FAST_FRACTION = 0.3, 0.7
@@ -60,8 +60,8 @@ OFFSET_PART_S = 4.0
 MIN_OFFSET_SPEED_M_S = 0.3
 # Minimum range (s) of a time offset that varies: an error of 8 cm at 1 m/s
 MIN_OFFSET_RANGE_S = 0.08
-# Minimum mean square of slow errors ÷ that of white noise: with less, the time offsets of the
-# flight parts only fit noise
+# Minimum ratio of the mean square slow error to that of the white noise: below, the fit of many
+# offsets only fits noise
 MIN_SLOW_RATIO = 0.25
 # Maximum fraction of the mean square slow error that remains after a fit of varying time offsets
 MAX_REMAINING_FRACTION = 0.2
@@ -89,6 +89,8 @@ MAX_ROTATION_RAD = 0.2
 MAX_DELAYED_RATIO = 0.5
 # Minimum speed (m/s), and minimum noise (m) at this speed, for noise that grows with speed
 MIN_FAST_M_S, MIN_FAST_NOISE_M = 0.3, 0.02
+# Minimum high speed, in σ of the noise of this speed
+MIN_SPEED_SIGMAS = 2.0
 # Ratio of the standard deviation to the median absolute value of normal noise
 SIGMA_PER_MEDIAN = 1.4826
 
@@ -213,8 +215,8 @@ def find_timestamp_jitter(errors: WhiteErrors) -> float | None:
     if jitter_s < MIN_JITTER_S or not expected_square_m2:
         return None
     ratio = float(np.sum(errors.residual_m * expected_m)) / expected_square_m2
-    other_errors_m = errors.residual_m - ratio * expected_m
-    sigma = np.sqrt(SHARED_RESIDUALS * np.mean(other_errors_m**2) / expected_square_m2)
+    rest_m = errors.residual_m - ratio * expected_m
+    sigma = np.sqrt(SHARED_RESIDUALS * np.mean(rest_m**2) / expected_square_m2)
     fraction = np.sqrt(expected_square_m2 / np.sum(errors.residual_m**2))
     is_jitter = (
         JITTER_RATIOS[0] < ratio < JITTER_RATIOS[1]
@@ -257,7 +259,12 @@ def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
     )
     speeds_m_s = (float(np.median(speed_m_s[rows])) for rows in (is_slow, is_fast))
     noise = SpeedNoise(*noises_m, *speeds_m_s)
-    is_relevant = noise.fast_m_s >= MIN_FAST_M_S and noise.fast_m >= MIN_FAST_NOISE_M
+    # the speed is the difference of two noisy positions: noise must not dominate it
+    speed_noise_m_s = np.sqrt(2.0) * noise.fast_m / (2.0 * HALF_VELOCITY_S)
+    is_relevant = (
+        noise.fast_m_s >= max(MIN_FAST_M_S, MIN_SPEED_SIGMAS * speed_noise_m_s)
+        and noise.fast_m >= MIN_FAST_NOISE_M
+    )
     return noise if is_relevant else None
 
 
@@ -289,10 +296,10 @@ def fit_errors(comparison: Comparison, white: WhiteErrors) -> ErrorFit | None:
     )
     error_m = position_m - curve(time_s)
     parameters, remaining_m = _least_squares(columns, error_m)
-    # successive errors are correlated, so fewer of them are independent
+    # successive errors are correlated
     interval_s = float(np.median(np.diff(time_s)))
-    independent_count = len(time_s) / max(*map(autocorrelation_time, remaining_m.T), 1.0)
-    scale_sigma = np.sqrt(np.mean(remaining_m**2) / (path_square_m2 * independent_count))
+    independent = len(time_s) / max(*map(autocorrelation_time, remaining_m.T), 1.0)
+    sigma = np.sqrt(np.mean(remaining_m**2) / (path_square_m2 * independent))
     if comparison.source.origin.may_drift:
         width = max(1, round(DRIFT_WINDOW_S / interval_s))
 
@@ -309,7 +316,7 @@ def fit_errors(comparison: Comparison, white: WhiteErrors) -> ErrorFit | None:
         remaining_m,
         white_m,
         float(parameters[2]),
-        float(scale_sigma),
+        float(sigma),
     )
 
 
@@ -353,13 +360,13 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     The time offsets of all flight parts and the constants of :class:`ErrorFit` are fitted together.
     At rest a time offset causes no error, so jumps and slow errors are not explained.
     """
-    part_indices = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_S).astype(int)
-    square_sums = np.bincount(part_indices, np.sum(fit.velocity_m_s**2, axis=1))
-    square_speeds = square_sums / np.maximum(np.bincount(part_indices), 1)
+    parts = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_S).astype(int)
+    square_sums = np.bincount(parts, np.sum(fit.velocity_m_s**2, axis=1))
+    square_speeds = square_sums / np.maximum(np.bincount(parts), 1)
     moving_parts = np.flatnonzero(square_speeds > MIN_OFFSET_SPEED_M_S**2)
     if len(moving_parts) < 2:
         return None
-    is_in_part = part_indices[:, None] == moving_parts
+    is_in_part = parts[:, None] == moving_parts
     offset_columns = -fit.velocity_m_s[:, :, None] * is_in_part[:, None, :]
     constant_columns = fit.columns[..., :-1]  # without the constant time offset
     parameters, remaining_m = _least_squares(
@@ -375,9 +382,9 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     ):
         return None
     times_s = fit.time_s[0] + OFFSET_PART_S * (moving_parts + 0.5)
-    extremes = np.argmin(offsets_s), np.argmax(offsets_s)
+    least, most = np.argmin(offsets_s), np.argmax(offsets_s)
     return OffsetVariation(
-        *(float(values_s[index]) for values_s in (offsets_s, times_s) for index in extremes)
+        float(offsets_s[least]), float(offsets_s[most]), float(times_s[least]), float(times_s[most])
     )
 
 
@@ -402,15 +409,14 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
         differences_rad = (
             rotation_rad - (np.array(angles)[:, step_rows:] - np.array(angles)[:, :-step_rows]).T
         )
-        differences_rad = rotation_rad - (angles_rad[:, step:] - angles_rad[:, :-step]).T
         differences_rad -= np.median(differences_rad, axis=0)  # the gyroscope bias
         # limit each difference: resets of the attitude exceed the rotations of a multicopter
         sizes_rad = np.minimum(np.linalg.norm(differences_rad, axis=1), MAX_ROTATION_RAD)
         return float(np.mean(sizes_rad**2))
 
     delays_s = np.arange(-MAX_ATTITUDE_DELAY_S, MAX_ATTITUDE_DELAY_S, 2.0 * DELAY_STEP_S)
-    delay_s = float(min(delays_s, key=mean_square_difference))
-    is_delay_confirmed = mean_square_difference(
+    delay_s = float(min(delays_s, key=difference))
+    is_late = abs(delay_s) >= MIN_ATTITUDE_DELAY_S and difference(
         delay_s
-    ) < MAX_DELAYED_RATIO * mean_square_difference(0.0)
-    return delay_s if is_delay_confirmed and abs(delay_s) >= MIN_ATTITUDE_DELAY_S else None
+    ) < MAX_DELAYED_RATIO * difference(0.0)
+    return delay_s if is_late else None
