@@ -39,9 +39,9 @@ PositionKind = Literal["uwb", "vio", "mocap", "gnss", "unknown", "file"]
 DataPath = Literal[
     "given file",
     "as received",
-    "positions aligned by EKF2",
-    "observation logged by EKF2",
-    "EKF2 position plus innovation",
+    "aligned by EKF2",
+    "kept by EKF2",
+    "rebuilt from innovations",
 ]
 
 
@@ -69,7 +69,7 @@ class Origin(Record):
     @property
     def reconstructed(self) -> bool:
         """True if the positions are derived from EKF2's logged data, not logged as received."""
-        return self.path in ("observation logged by EKF2", "EKF2 position plus innovation")
+        return self.path in ("kept by EKF2", "rebuilt from innovations")
 
     @property
     def has_all_samples(self) -> bool:
@@ -102,9 +102,9 @@ class Origin(Record):
 POSITION_FILE = Origin("file", "given file", EV_POS)
 RECEIVED = Origin("uwb", "as received", EV_POS)
 MOTION_CAPTURE = Origin("mocap", "as received", None)
-ALIGNED = Origin("uwb", "positions aligned by EKF2", EV_POS)
-LOGGED_BY_EKF2 = Origin("uwb", "observation logged by EKF2", EV_POS)
-FROM_INNOVATIONS = Origin("uwb", "EKF2 position plus innovation", EV_POS)
+ALIGNED = Origin("uwb", "aligned by EKF2", EV_POS)
+LOGGED_BY_EKF2 = Origin("uwb", "kept by EKF2", EV_POS)
+FROM_INNOVATIONS = Origin("uwb", "rebuilt from innovations", EV_POS)
 GNSS = Origin("gnss", "as received", GNSS_POS, is_automatic=False)
 # All origins in order of preference
 ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS, GNSS)
