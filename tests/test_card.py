@@ -136,7 +136,7 @@ def test_diagnosis_merges_equal_actions_for_kf_and_ekf2() -> None:
     (ranked,) = rank_causes(flight, [gap])
     cause = make_cause(flight, ranked, verdicts(*ratios), REQUEST)
     assert [(action.target, action.sentence) for action in cause.actions] == [
-        ("sender", "Check the link."), ("KF, EKF2", "no setting corrects this fault"),
+        ("sender", "Check the link."), ("KF, EKF2", "no setting removes this fault"),
     ]  # fmt: skip
 
 
@@ -164,7 +164,7 @@ def test_diagnosis_of_unreadable_log_shows_first_bytes_of_file(tmp_path) -> None
              line.wrapped(100)]  # fmt: skip
     assert lines == [
         "error[log_unreadable]: a.bin: the file is an ArduPilot DataFlash log, not a PX4 ULog",
-        "  read     1,200 bytes; the file begins with A3 95 80 01, a ULog with 55 4C 6F 67",
+        "  read     1,200 bytes; first bytes A3 95 80 01 (of a ULog: 55 4C 6F 67)",
         "  fix      Give the MAVLink recording (.tlog) of the ground station.",
         "No file was written. Exit code 2.",
     ]
@@ -188,6 +188,6 @@ def test_diagnosis_explains_differing_nis_and_nees_verdicts() -> None:
         "position and σ",
     )
     assert card.reconcile == (
-        "The verdicts of EKF2 against source and ground truth differ: innovations hardly show this "
-        "fault. The re-run with the first action removes most of the position error."
+        "The verdicts on EKF2 against source and ground truth differ, because innovations show "
+        "little of this fault. The first action of this card removes most of the position error."
     )

@@ -12,7 +12,7 @@ from px4fuse.card.model import Action, Card, Note
 from px4fuse.report import card_text
 from px4fuse.report.card_text import axis_text, to_ascii, with_typed_path
 
-SENDER = Action("sender", "subtract 0.264 s from the timestamp (usec) of each position")
+SENDER = Action("sender", "subtract 0.264 s from the timestamp of each position")
 DELAY = Action("EKF2", "EKF2_EV_DELAY 0 → 264 ms", ("param set EKF2_EV_DELAY 264",), "console")
 
 

@@ -968,7 +968,7 @@ def test_time_offset_action_includes_the_offset_already_applied() -> None:
     assert finding.title == "Position timestamps are 0.10 s late"
     assert "0.100 s (95 % 0.080 to 0.110 s)" in finding.message
     assert "a position error of 0.10 m" in finding.message
-    assert finding.remedy == "Subtract 0.100 s from the timestamp (usec) of each position."
+    assert finding.remedy == "Subtract 0.100 s from the timestamp of each position."
     expected = {"offset_s": -0.15, "interval_low_s": -0.16, "interval_high_s": -0.13}
     assert finding.evidence == pytest.approx(expected)
     early = only(source_clock.detect, analysis(clock=late(0.1)))

@@ -217,8 +217,8 @@ def test_near_zero_process_noise_report_states_response_time() -> None:
     slower.axis.name = "east"
     finding = only(noises.detect_process_noise_near_zero, analysis(axes=(following(0.05), slower)))
     assert finding.remedy == "Increase SIGMA_A (--sigma-a)."
-    assert finding.title == "SIGMA_A 1 m/s² makes Q almost zero: KF ignores new positions"
-    assert "The gain falls to 0.05. KF needs 5 s" in finding.message
+    assert finding.title.startswith("Process noise SIGMA_A is almost zero (1 m/s²): KF ignores")
+    assert "decreases to 0.05, so KF needs 5 s" in finding.message
     assert finding.evidence["response_s"] == pytest.approx(5.0)
     one = analysis(axes=(following(0.05),), tuning=tuned(None, Noise(2.3456, 2.0, 3.0)),
                    trials=(trial({"sigma_a_m_s2": 2.35}),))  # fmt: skip
@@ -376,9 +376,9 @@ def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
     [
         (fused(0.1), Noise(0.3, 0.2, 0.4), {}, "Set EKF2_EVP_NOISE to 0.3 m (EKF2 uses 0.1 m)."),
         (fused(0.1), Noise(0.124, 0.12, 0.13), {},
-         "EKF2's measurement noise (0.1 m) fits the position noise"),
+         "EKF2's measurement noise (0.1 m) equals the estimated position"),
         (fused(0.1, 0.2), Noise(0.081, 0.08, 0.09), {},
-         "EKF2's measurement noise (0.1 m) fits"),
+         "EKF2's measurement noise (0.1 m) equals"),
         # a smaller noise than the sender reports: its variances must not be used
         (fused(0.3, 0.2), Noise(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.1},
          "Set EKF2_EV_NOISE_MD to 1 (EKF2"),
@@ -412,10 +412,11 @@ def test_noise_of_overconfident_ekf2_is_advised_without_replay(
         (0.5, "uwb", 0.0, ("ekf2_noise_too_large", "error", "EKF2_EVP_NOISE is 5 times too large")),
         # PX4's default: not chosen, so the title names the sensor
         (0.1, "uwb", 0.0,
-         ("ekf2_noise_too_small", "error", "UWB noise is 4 times what EKF2 assumes")),
+         ("ekf2_noise_too_small", "error", "UWB noise is 4 times the noise setting of EKF2")),
         (0.5, "gnss", 0.44,
-         ("ekf2_noise_too_small", "error", "GNSS noise is 4 times what KF and EKF2 assume: EKF2 "
-          "rejects 44 % of the positions")),
+         ("ekf2_noise_too_small", "error",
+          "GNSS noise is 4 times the noise setting of KF and EKF2: EKF2 rejects 44 % of the "
+          "positions")),
     ],
 )  # fmt: skip
 def test_wrong_ekf2_noise_report_names_parameter_or_sensor(
@@ -491,7 +492,7 @@ def closing(gap_m: float | None, length_m: float = 50.0, end: Any = NONE, **part
 def test_possible_drift_report_states_loop_closure_error() -> None:
     finding = only(hidden_errors.detect, analysis(source=ODOMETRY))
     assert finding.evidence == {"source": "uwb"}
-    assert finding.message.endswith("not the position error.")
+    assert finding.message.endswith("innovations do not show the drift.")
     for noise, bound, value in (
         (Noise(0.02, 0.01, 0.03), "", 0.02), (Noise(None, None, 0.04), "at most ", 0.04)
     ):  # fmt: skip
@@ -512,7 +513,7 @@ END = TrueEnd(displacement_m={"forward": 0.0, "right": 0.0, "down": 0.0}, sigma_
 @pytest.mark.parametrize(
     ("loop", "size"),
     [
-        (closing(1.42, 88.0, END), "loop closure error 1.42 m after a path of 88 m (1.6 %)"),
+        (closing(1.42, 88.0, END), "loop closure error 1.42 m, 1.6 % of a path of 88 m"),
         # the landing place is only assumed, or the track does not drift
         (closing(1.42, 88.0, replace(END, assumed=True)), None),
         (closing(1.42, 88.0, END, is_absolute_track=True), None),

@@ -28,14 +28,14 @@ def time_s() -> np.ndarray:
 
 
 @pytest.mark.parametrize(("shift_m", "count", "words"), [
-    (1.2 * (time_s() / 12.0 % 1.0), 9, "possible causes are relocalisation"),
+    (1.2 * (time_s() / 12.0 % 1.0), 9, "Possible causes: a relocalisation"),
     (0.18 * (time_s() // 3.0 % 2.0), 39, "measures two points in turn, 0.18 m apart"),
 ])  # fmt: skip
 def test_position_jumps_without_reset_counter_are_reported(shift_m, count, words) -> None:
     (found,) = source_positions.detect_repeated_jumps(shifted(shift_m))
     assert found.evidence["count"] == pytest.approx(count, abs=2)
     assert words in found.message
-    assert "without a change of reset_counter" in found.message
+    assert "without a change of its reset_counter" in found.message
 
 
 def test_single_outliers_are_not_reported_as_jumps() -> None:

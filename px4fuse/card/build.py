@@ -182,8 +182,7 @@ def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
         first_bytes = read_head(path, HEAD_BYTE_COUNT, LogError).hex(" ").upper()
         size_bytes = file_size(path, LogError)
         facts["read"] = (
-            f"{size_bytes:,} bytes; the file begins with {first_bytes}, but a ULog begins with "
-            f"{ULOG_HEAD_BYTES}"
+            f"{size_bytes:,} bytes; first bytes {first_bytes} (of a ULog: {ULOG_HEAD_BYTES})"
         )
     if error.remedy:
         facts["fix"] = with_options(with_log_name(error.remedy, str(path)))

@@ -187,12 +187,12 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
     lost_fraction = lost_imu_fraction(samples.index.to_numpy()) if len(samples) > 1 else 0.0
     if lost_fraction <= MAX_LOST_FRACTION:
         return
-    profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE))
+    sdlog_profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE))
     action = "Use a faster SD card."
-    if other_topics := profile & ~(DEFAULT_PROFILE | VISION_PROFILE_BIT):
+    if other_topics := sdlog_profile & ~(DEFAULT_PROFILE | VISION_PROFILE_BIT):
         action = (
             "Use a faster SD card, or log fewer topics: set SDLOG_PROFILE to "
-            f"{profile ^ other_topics}."
+            f"{sdlog_profile ^ other_topics}."
         )
     yield warning(
         "imu_samples_missing",
@@ -200,7 +200,7 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
         "increases Q in these gaps. EKF2 cannot be replayed, so the effect of changed parameters "
         "is unknown.",
         action,
-        {"lost_fraction": lost_fraction, "sdlog_profile": profile},
+        {"lost_fraction": lost_fraction, "sdlog_profile": sdlog_profile},
     )
 
 
@@ -229,8 +229,10 @@ def detect_low_rates(flight: Flight) -> Findings:
         topic = flight.streams[name].topics[0] if name in flight.streams else default_topic
         if isinstance(samples, pd.DataFrame) and is_rate_too_low(samples, needed_hz):
             rate_hz, requested_hz = sample_rate(samples), 2.0 * needed_hz
-            profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE)) | HIGH_RATE_BIT
-            action = f"Set SDLOG_PROFILE to {profile} (bit 4 logs {topic} at full rate)."
+            sdlog_profile = (
+                int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE)) | HIGH_RATE_BIT
+            )
+            action = f"Set SDLOG_PROFILE to {sdlog_profile} (bit 4 logs {topic} at full rate)."
             if log.format.startswith("MAVLink"):
                 action = (
                     f"Request {topic} at {requested_hz:g} Hz "

@@ -36,10 +36,10 @@ def detect(analysis: Analysis) -> Findings:
         if change.name in (*PARAMETERS, *fusion_parameters)
         and segment.start_s < change.time_s < segment.end_s
     ]
-    edges_s = [segment.start_s, *(change.time_s for change in changes), segment.end_s]
+    part_edges_s = [segment.start_s, *(change.time_s for change in changes), segment.end_s]
     for change_index, (time_s, name, before, after) in enumerate(changes):
         part_before, part_after = (
-            _assess_part(analysis, *edges_s[part_index : part_index + 2])
+            _assess_part(analysis, *part_edges_s[part_index : part_index + 2])
             for part_index in (change_index, change_index + 1)
         )
         unit = "" if name in fusion_parameters else f" {PARAMETERS[name].printed_unit}".rstrip()
