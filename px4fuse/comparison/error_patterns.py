@@ -16,7 +16,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from px4fuse.comparison.model import Comparison
 from px4fuse.core.arrays import Array, cumulative_integral, rank_correlation
 from px4fuse.filter.signals import cut_to_segment
-from px4fuse.flight.model import Columns, Unavailable
+from px4fuse.flight.model import Columns, Ekf2, Unavailable
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_vector
 from px4fuse.trajectory.scores import autocorrelation_time
 
@@ -89,8 +89,6 @@ MAX_ROTATION_RAD = 0.2
 MAX_DELAYED_RATIO = 0.5
 # Minimum speed (m/s), and minimum noise (m) at this speed, for noise that grows with speed
 MIN_FAST_M_S, MIN_FAST_NOISE_M = 0.3, 0.02
-# Minimum high speed, in σ of the noise of this speed
-MIN_SPEED_SIGMAS = 2.0
 # Ratio of the standard deviation to the median absolute value of normal noise
 SIGMA_PER_MEDIAN = 1.4826
 
@@ -109,12 +107,13 @@ class WhiteErrors(NamedTuple):
 
     ``residual_m``, shape (n, 2), is divided by the noise gain of the cubic: its σ is that of a
     position. ``late_s``, divided by the same gain, is the residual of the deviation (s) of the
-    timestamps from a constant rate.
+    timestamps from a constant rate. ``ekf2_speed_m_s`` is the horizontal speed from EKF2.
     """
 
     residual_m: Array
     velocity_m_s: Array
     late_s: Array
+    ekf2_speed_m_s: Array | None
 
 
 class ErrorFit(NamedTuple):
@@ -200,7 +199,16 @@ def white_errors(comparison: Comparison) -> WhiteErrors | None:
         scaled = ((values[rows] - interpolated).T / noise_gain).T
         return np.asarray(scaled[is_accurate])
 
-    return WhiteErrors(residual(position_m), velocity_m_s[is_accurate], residual(late_s))
+    ekf2 = comparison.flight.ekf2
+    ekf2_speed_m_s = None
+    if isinstance(ekf2, Ekf2):
+        logged_speed_m_s = np.linalg.norm(ekf2.state[Columns.VELOCITY[:2]].to_numpy(), axis=1)
+        ekf2_speed_m_s = np.interp(
+            time_s[rows[is_accurate]], ekf2.state.index.to_numpy(), logged_speed_m_s
+        )
+    return WhiteErrors(
+        residual(position_m), velocity_m_s[is_accurate], residual(late_s), ekf2_speed_m_s
+    )
 
 
 def find_timestamp_jitter(errors: WhiteErrors) -> float | None:
@@ -228,7 +236,10 @@ def find_timestamp_jitter(errors: WhiteErrors) -> float | None:
 
 def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
     """Return the noise at low and high speed if it grows with speed in all directions."""
-    speed_m_s = np.linalg.norm(errors.velocity_m_s, axis=1)
+    # differences of the positions would give a speed that contains their noise
+    speed_m_s = errors.ekf2_speed_m_s
+    if speed_m_s is None:
+        return None
     sizes_m = np.linalg.norm(errors.residual_m, axis=1)
     # noise that is larger in one part of the flight correlates with speed in a few parts only
     significances = [
@@ -244,7 +255,8 @@ def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
         return None
     limits_m_s = np.quantile(speed_m_s, [SLOW_FRACTION, FAST_FRACTION])
     is_slow, is_fast = speed_m_s <= limits_m_s[0], speed_m_s >= limits_m_s[1]
-    direction = errors.velocity_m_s / np.maximum(speed_m_s, 1e-6)[:, None]
+    source_speed_m_s = np.linalg.norm(errors.velocity_m_s, axis=1, keepdims=True)
+    direction = errors.velocity_m_s / np.maximum(source_speed_m_s, 1e-6)
     along_m = np.abs(np.sum(errors.residual_m * direction, axis=1))
     across_m = np.abs(np.sum(errors.residual_m * _rotate_90(direction), axis=1))
     # jitter of the timestamps causes errors along the motion only
@@ -259,12 +271,7 @@ def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
     )
     speeds_m_s = (float(np.median(speed_m_s[rows])) for rows in (is_slow, is_fast))
     noise = SpeedNoise(*noises_m, *speeds_m_s)
-    # the speed is the difference of two noisy positions: noise must not dominate it
-    speed_noise_m_s = np.sqrt(2.0) * noise.fast_m / (2.0 * HALF_VELOCITY_S)
-    is_relevant = (
-        noise.fast_m_s >= max(MIN_FAST_M_S, MIN_SPEED_SIGMAS * speed_noise_m_s)
-        and noise.fast_m >= MIN_FAST_NOISE_M
-    )
+    is_relevant = noise.fast_m_s >= MIN_FAST_M_S and noise.fast_m >= MIN_FAST_NOISE_M
     return noise if is_relevant else None
 
 
