@@ -261,14 +261,14 @@ def write_report(analysis: Analysis, path: Pathlike) -> Path:
     OutputError, SettingsError
         A file cannot be written, or the analysis is not from :func:`px4fuse.compare`.
     """
-    from px4fuse.report.pdf import render  # noqa: PLC0415 - slow import
+    from px4fuse.report.pdf import render_pdf  # noqa: PLC0415 - slow import
     from px4fuse.results.build import results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
     target = _require_suffix(path, ".pdf")
     contract_results = results(_require_request(analysis), analysis)
     results_json = to_json(contract_results)
-    pdf = render(analysis, contract_results, results_json)
+    pdf = render_pdf(analysis, contract_results, results_json)
     write_all({target: pdf, target.with_suffix(".json"): results_json.encode()})
     return target
 

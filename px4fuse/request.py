@@ -233,7 +233,7 @@ class EvaluationRequest(_BaseRequest, frozen=True, kw_only=True):
 Request = ComparisonRequest | LoopRequest | WhatIfRequest
 
 
-# Unit of the numbers in a field, by the end of its name
+# Unit of a field of a request, by the end of the field name
 SUFFIX_UNITS = {"_m_s2": "m/s²", "_m": "m", "_s": "s", "_deg": "°"}
 _POSITION_OPTIONS = {
     "path": "--position",

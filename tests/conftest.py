@@ -201,7 +201,7 @@ def blank_page(*drawn: Any) -> bytes:
 @pytest.fixture
 def no_drawing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Replace the pages of reports by an empty one, for tests that do not examine them."""
-    monkeypatch.setattr(pdf, "render", blank_page)
+    monkeypatch.setattr(pdf, "render_pdf", blank_page)
 
 
 # Size of each cache
@@ -212,16 +212,16 @@ _page_cache: dict[str, bytes] = {}
 @pytest.fixture
 def cached_pages(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw the pages of equal results once per process."""
-    render = pdf.render
+    render_pdf = pdf.render_pdf
 
     def from_memory(found: object, results: object, text: str) -> bytes:
         if text not in _page_cache:
-            _page_cache[text] = render(found, results, text)
+            _page_cache[text] = render_pdf(found, results, text)
             if len(_page_cache) > MOST_ANALYSES:
                 del _page_cache[next(iter(_page_cache))]
         return _page_cache[text]
 
-    monkeypatch.setattr(pdf, "render", from_memory)
+    monkeypatch.setattr(pdf, "render_pdf", from_memory)
 
 
 # The original functions, saved before a test replaces them

@@ -120,7 +120,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     notes.write_text(HONEST, encoding="utf-8")
     own = "--student", "Ada", "--id", "s01", "--notes", notes, "--answers", folder / "a.toml"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pdf_module, "render", blank_page)  # drawn below from the results
+        patch.setattr(pdf_module, "render_pdf", blank_page)  # drawn below from the results
         run_checked("compare", log, "-o", pdf, *own)
     honest = make_verified_report(pdf.read_bytes(), log)
     (sha256,) = honest.files
@@ -278,7 +278,7 @@ def test_grade_report_with_forged_results_is_not_verified(
 ) -> None:
     change, status, pending = FILES[name]
     if status == "numbers differ":  # numbers decide, not pages
-        monkeypatch.setattr(pdf_module, "render", blank_page)
+        monkeypatch.setattr(pdf_module, "render_pdf", blank_page)
     results = copy.deepcopy(flight.honest.results)
     change(results)
     # pages are compared only if the numbers agree
@@ -292,8 +292,10 @@ def test_grade_report_with_forged_results_is_not_verified(
     graded = flight.graded(report, verdict, rubric)
     assert graded.status != "verified"
     assert not graded.counted_points
-    assert graded.status == status, graded.verdict.reasons
-    assert not any("Error" in reason for reason in graded.verdict.reasons), graded.verdict.reasons
+    assert graded.status == status, graded.verification.reasons
+    assert not any("Error" in reason for reason in graded.verification.reasons), (
+        graded.verification.reasons
+    )
     assert pending in graded.instructor_action
     assert bool(graded.instructor_action) == bool(pending)
     assert graded.points <= honest.points + 1e-9

@@ -38,7 +38,7 @@ def entry(graded: GradedReport, **more) -> Entry:
 def graded(text: str, numbers: dict[str, float] | None = None, points: float = 1.0) -> Entry:
     one = GradedReport(
         submission=text, student=text, student_id=text,
-        verdict=Verification("cannot verify", (text, text), with_log=False),
+        verification=Verification("cannot verify", (text, text), with_log=False),
         items=(Item(text, points, 2.0, text),), flags=(text, text), numbers=numbers or {},
         log_sha256="ab" * 32,
     )  # fmt: skip

@@ -310,7 +310,7 @@ def test_time_offset_maximises_joint_likelihood_of_flight_parts(monkeypatch, off
 
     monkeypatch.setattr(time_offset, "fit_noises", fit_noises)
     moved = SimpleNamespace(
-        edges=np.arange(5) * 2,
+        segment_edges=np.arange(5) * 2,
         time_s=np.arange(8.0),
         position_batches=lambda grid: grid,
         weight=None,

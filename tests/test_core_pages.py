@@ -107,7 +107,7 @@ def test_zoomed_plot_window_avoids_position_gap() -> None:
 )
 def test_report_pages_without_data_have_note_and_no_empty_plot(changes, expected: str) -> None:
     of = document(compare(aisle_flight(**changes)))
-    draws = cover.draw, flight.draw, flight.draw_innovations, flight.draw_other_axes
+    draws = cover.draw_pages, flight.draw_pages, flight.draw_innovations, flight.draw_other_axes
     pages = [page for draw in draws for page in drawn(draw, of)]
     assert expected in words(*pages)
     assert len(pages) == 4

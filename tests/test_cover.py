@@ -37,7 +37,7 @@ def text_of(card: Card) -> str:
 def drawn(analysis: Analysis) -> Page:
     made = results(ComparisonRequest(log="aisle.ulg"), analysis)
     with report_style():
-        (page,) = cover.draw(analysis, made)
+        (page,) = cover.draw_pages(analysis, made)
     return page
 
 

@@ -26,7 +26,7 @@ def settings(tmp_path_factory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("settings")
     files = folder / "usual.pdf", folder / "small.pdf"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pdf, "render", blank_page)  # a fast replacement for the report
+        patch.setattr(pdf, "render_pdf", blank_page)  # a fast replacement for the report
         run_checked("compare", LOG, "--axis", "aisle", "-o", files[0])
         run_checked("compare", LOG, "--axis", "aisle", "--sigma-z", 0.03, "-o", files[1])
     return files

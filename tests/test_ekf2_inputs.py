@@ -162,8 +162,8 @@ def test_ekf2_replay_without_complete_imu_data_is_unavailable(flown):
     assert isinstance(flown(horizon_s=NONE), Unavailable)
     assert flown(horizon_s=NONE, firmware="PX4 v1.13.3").horizon_s == 0.0
     for vertical, there in (([1.0, 0.0], False), ([1.0, 1.0, 0.0], True)):
-        assert flown(fusing=pd.DataFrame({"vertical": vertical})).vision_height is there
-    assert flown(fusing=NONE).vision_height is False
+        assert flown(fusing=pd.DataFrame({"vertical": vertical})).fuses_vision_height is there
+    assert flown(fusing=NONE).fuses_vision_height is False
     every = np.arange(2, 998)
     assert "12 % of the IMU samples are missing" in flown(without=every[::8]).reason
     # fewer missing samples, and a gap, at which a segment ends
@@ -364,7 +364,7 @@ def test_ekf2_replay_inputs_of_turning_vehicle_equal_true_motion():
     assert_allclose(found.attitude_variance_rad2[:, 2], steps)
     assert_allclose(found.down_m, steps)
     assert_allclose(found.attitude_error_rad[:, 2], 0.05 + 0.1 * (steps - 10.5), atol=1e-6)
-    assert found.fusing
+    assert found.is_fusing
     flown[3].delayed[Columns.POSITION] = 3.0
     assert_allclose(_make_segment(*flown, 5, 11.5).state[6:9], [3.0, 3.0, 10.5])
 

@@ -129,7 +129,7 @@ def test_ekf2_replay_counts_late_and_lost_vision_samples(model: Model) -> None:
     # the horizon is 214 ms, and samples may be 100 ms later
 
     def arriving(after_s: float, **settings: float) -> Any:
-        slow = replace(vision, arrival_s=vision.stamp_s + after_s)
+        slow = replace(vision, arrival_s=vision.timestamp_s + after_s)
         made = replace(model, inputs=replace(model.inputs, received=slow))
         return replay_settings(made, [{"EKF2_EV_DELAY": 1.0, **settings}])[0]
 

@@ -172,7 +172,7 @@ def test_what_if_with_ekf2_delay_max_on_px4_v1_14_raises_error():
 
 
 GNSS_RULES = replace(
-    RULES, stop_s=math.inf, reset_s=7.0, max_resets=1_000_000, resets_velocity=True
+    RULES, stop_timeout_s=math.inf, reset_timeout_s=7.0, max_resets=1_000_000, resets_velocity=True
 )
 
 
@@ -364,7 +364,7 @@ def at_rest(
     inputs = Inputs(
         effective_settings(settings, aid, *([MAG] if segment.field else [])), (segment,), vision,
         rules, 0.01, 0.1, 0.01,
-        vision_height=False, imu_offset_m=np.zeros(3), aid=aid,
+        fuses_vision_height=False, imu_offset_m=np.zeros(3), aid=aid,
     )  # fmt: skip
     intervals = make_intervals(inputs, segment, Timing(0.0, 0.1))
     configuration = FilterConfiguration(
@@ -442,12 +442,12 @@ def test_closed_form_process_noise_equals_sum_over_steps(n):
 
 
 def stretch_of(count: int, *, fusing: bool = True) -> ReplaySegment:
-    return made(ReplaySegment, time_s=10.0 + 0.01 * np.arange(count + 1), fusing=fusing)
+    return made(ReplaySegment, time_s=10.0 + 0.01 * np.arange(count + 1), is_fusing=fusing)
 
 
 def vision_of(stamps: list[float], age_s: float = 0.0) -> ReceivedPositions:
     stamp = np.array(stamps)
-    return made(ReceivedPositions, stamp_s=stamp, arrival_s=stamp + age_s)
+    return made(ReceivedPositions, timestamp_s=stamp, arrival_s=stamp + age_s)
 
 
 def acting(stamps: list[float], *, fusing: bool = True, rules: FusionRules = RULES) -> list[int]:
@@ -466,7 +466,7 @@ def test_vision_fusion_starts_and_stops_by_sample_interval():
     # 0.4 s to the previous step
     assert acting([10.1, 10.5, 10.6]) == [FUSE, FUSE, FUSE]
     assert acting([10.1, 10.53, 10.6]) == [FUSE, IDLE, START]
-    old = replace(RULES, start_interval_s=math.inf, stop_s=7.0)
+    old = replace(RULES, start_interval_s=math.inf, stop_timeout_s=7.0)
     assert acting([10.1, 12.0, 14.9], fusing=False, rules=old) == [IDLE, START, FUSE]
 
 

@@ -132,7 +132,9 @@ def test_invalid_due_date_extension_error_names_the_student() -> None:
 
 def test_grade_ignores_other_file_submitted_beside_a_report() -> None:
     essay = replace(
-        graded_report("", 0.0), version="", verdict=Verification("cannot verify", ("x",), False)
+        graded_report("", 0.0),
+        version="",
+        verification=Verification("cannot verify", ("x",), False),
     )
     files = {blackboard("ada", "19-10-00-00"): graded_report("", 4.0),
              blackboard("ada", "20-10-00-00"): essay}  # fmt: skip

@@ -572,7 +572,7 @@ def test_rmse_interval_from_too_few_blocks_is_unavailable() -> None:
     got = rmse_interval(drift, "ATE")
     assert isinstance(got, Unavailable)
     assert f"fewer than {MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks" in str(got)
-    assert isinstance(rmse_interval(np.ones(100), "ATE", min_block=30), Unavailable)
+    assert isinstance(rmse_interval(np.ones(100), "ATE", min_block_length=30), Unavailable)
     same = rmse_interval(np.full(100, 0.5), "ATE")
     assert (same.low, same.high) == (pytest.approx(0.5), pytest.approx(0.5))
     assert rmse_interval(np.sin(drift * 99), "ATE") == rmse_interval(np.sin(drift * 99), "ATE")

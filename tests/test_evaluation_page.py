@@ -16,7 +16,7 @@ from trajectory_tools import flight, transformed
 from px4fuse.core.text import format_metres
 from px4fuse.loop.tracks import read_source
 from px4fuse.report.evaluation import (
-    draw,
+    draw_pages,
     rpe_growth_sentence,
     unaligned_sentence,
 )
@@ -57,7 +57,7 @@ def across(values: np.ndarray) -> np.ndarray:
 
 def pages(score: Evaluation) -> list[Page]:
     with report_style():
-        return list(draw(score, None))
+        return list(draw_pages(score, None))
 
 
 def panels(score: Evaluation) -> dict[str, Axes]:

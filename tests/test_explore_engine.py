@@ -18,7 +18,7 @@ from flights import Imu, Uwb, aisle_flight
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import shift_clock
-from px4fuse.explore.data import OFFSET_SLIDER_HALF_RANGE_S, raw_source, replay_signals
+from px4fuse.explore.data import OFFSET_SLIDER_HALF_RANGE_S, kf_inputs, raw_source
 from px4fuse.explore.packing import FINE_SCALE, Packer
 from px4fuse.filter.kalman import Replay, replay, state_at
 from px4fuse.filter.settings import Settings
@@ -71,7 +71,7 @@ def in_browser(
     engine: Browser, comparison: Comparison, tries: list[tuple[int, Settings]]
 ) -> list[dict[str, dict[str, list[float]]]]:
     packer = Packer()
-    flight = replay_signals(comparison, packer)
+    flight = kf_inputs(comparison, packer)
     tries_for_page = [(at, asdict(settings)) for at, settings in tries]
     values = {
         "text": packer.text(), "specs": packer.array_specs, "flight": json.dumps(flight),
@@ -171,7 +171,7 @@ def test_javascript_unpack_restores_packed_arrays(engine: Browser) -> None:
 def test_javascript_kf_with_too_few_measurements_returns_null(engine: Browser) -> None:
     comparison = compare(aisle_flight(duration_s=30.0))
     packer = Packer()
-    flight = replay_signals(comparison, packer)
+    flight = kf_inputs(comparison, packer)
     flight["segment"] = [flight["segment"][0], flight["segment"][0] + 0.05]
     flight["axes"] = [{"time": [0.0, 1.0, 2.0], "z": [0.0, 0.0, 0.0]}]
     settings = asdict(Settings(input="zero"))

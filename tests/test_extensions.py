@@ -37,7 +37,7 @@ def detect(analysis):
 from px4fuse.report.page import Page
 
 
-def draw(content, results):
+def draw_pages(content, results):
     yield Page("Wind page")
 """,
     "cli/wind.py": """
@@ -125,8 +125,8 @@ def extended(tmp_path_factory: pytest.TempPathFactory) -> Path:
     change(
         package / "report" / "pdf.py",
         lambda text: text.replace("    provenance,\n", "    provenance,\n    wind,\n").replace(
-            "        provenance.draw,\n    ),",
-            "        provenance.draw,\n        wind.draw,\n    ),",
+            "        provenance.draw_pages,\n    ),",
+            "        provenance.draw_pages,\n        wind.draw_pages,\n    ),",
             1,
         ),
     )

@@ -196,10 +196,10 @@ def test_read_gnss_omits_fixes_while_fusion_is_disabled():
     aids["gnss_pos"] = replace(ekf2.aids["gnss_pos"], enabled=None)
     every = read_gnss(flight, with_gnss_innovations(replace(ekf2, aids=aids)), ekf2.record)
     delay_s = ekf2.record.parameters["EKF2_GPS_DELAY"] * 1e-3
-    measured_s = every.stamp_s - delay_s  # type: ignore[union-attr]
+    measured_s = every.timestamp_s - delay_s  # type: ignore[union-attr]
     remaining = (measured_s < 50.0) | (measured_s >= 60.0)
     assert 0 < np.sum(~remaining) < len(remaining)
-    np.testing.assert_array_equal(found.stamp_s, every.stamp_s[remaining])  # type: ignore[union-attr]
+    np.testing.assert_array_equal(found.timestamp_s, every.timestamp_s[remaining])  # type: ignore[union-attr]
 
 
 def test_ekf2_replay_start_covariance_uses_data_before_start():

@@ -34,7 +34,7 @@ from px4fuse.results.answer_form import (
     update_renamed_values,
 )
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import FAULT_KINDS as SIMULATED
+from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
 from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario, make_scenario
 

@@ -9,7 +9,7 @@ import pytest
 from comparisons import compare
 from findings_tools import NONE, analysis, made, moving, named, only, positions, source
 
-from px4fuse.ekf2.fusion_conditions import Attempt, find_unmet
+from px4fuse.ekf2.fusion_conditions import FusionAttempt, find_unmet
 from px4fuse.findings import ekf2_not_fusing
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.flight.model import GNSS, POSITION_FILE, AidLog, ClockMap, Ekf2
@@ -25,11 +25,13 @@ def on(value: float) -> "pd.Series[float]":
     return pd.Series([value], index=[0.0])
 
 
-def attempt(rate_hz: float = 10.0, ekf2: Any = None, aid: Any = EV_POS, **parts: Any) -> Attempt:
+def attempt(
+    rate_hz: float = 10.0, ekf2: Any = None, aid: Any = EV_POS, **parts: Any
+) -> FusionAttempt:
     parameters = parts.pop("parameters", V114)
     usual = {"states": {}, "aids": {}, "record": NONE, "horizon_s": 0.2}
     track = source(rate_hz=rate_hz, **parts)
-    return Attempt(made(Ekf2, **{**usual, **(ekf2 or {})}), track, aid, parameters, SPAN_S)
+    return FusionAttempt(made(Ekf2, **{**usual, **(ekf2 or {})}), track, aid, parameters, SPAN_S)
 
 
 def with_quality(*values: float) -> dict[str, Any]:
@@ -39,7 +41,7 @@ def with_quality(*values: float) -> dict[str, Any]:
             "parameters": {**V114, "EKF2_EV_QMIN": 50.0}}  # fmt: skip
 
 
-def gnss(failed: int = 0, accuracy_m: float = 0.4, **parts: Any) -> Attempt:
+def gnss(failed: int = 0, accuracy_m: float = 0.4, **parts: Any) -> FusionAttempt:
     samples = moving(10.0).assign(north_m2=accuracy_m**2, down_m2=1.0)
     states = {"failed_checks": on(failed), **parts.pop("states", {})}
     return attempt(aid=GNSS_POS, origin=GNSS, samples=samples, ekf2={"states": states}, **parts)
@@ -98,7 +100,7 @@ def clock(name: str) -> ClockMap:
     ],
 )  # fmt: skip
 def test_unmet_ekf2_fusion_condition_is_reported_with_value(
-    tried: Attempt, name: str | None, texts: tuple[str, ...]
+    tried: FusionAttempt, name: str | None, texts: tuple[str, ...]
 ) -> None:
     found = find_unmet(tried)
     assert found.condition == (name or "")

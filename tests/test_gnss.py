@@ -588,8 +588,8 @@ def test_gnss_noise_is_limited_by_the_same_bounds_as_in_ekf2(parameters, fused, 
     record = made(FusionRecord, parameters=parameters)
     found = read_gnss(flight, flight.ekf2, record)
     samples = track_of(flight).samples
-    np.testing.assert_allclose(found.stamp_s, samples.index + 0.11)
-    np.testing.assert_allclose(found.arrival_s, found.stamp_s)
+    np.testing.assert_allclose(found.timestamp_s, samples.index + 0.11)
+    np.testing.assert_allclose(found.arrival_s, found.timestamp_s)
     np.testing.assert_allclose(found.variance_m2[:, :2], 100.0)
     assert not found.uses_sender_times
     assert (found.velocity_m_s is not None) is fused
@@ -618,7 +618,7 @@ def test_gnss_driver_timestamp_replaces_delay_parameter(tmp_path):
     assert found.uses_sender_times
     assert found.velocity_m_s is None
     # the timestamp is chosen so that the delay leads to the driver's time
-    np.testing.assert_allclose(found.stamp_s - 0.11, track_of(flight).samples.index)
+    np.testing.assert_allclose(found.timestamp_s - 0.11, track_of(flight).samples.index)
 
 
 @pytest.mark.parametrize(("north_m", "parameters", "scale", "with_velocity"), [
@@ -631,7 +631,7 @@ def test_gnss_reset_rule_depends_on_px4_release(north_m, parameters, scale, with
     )
     rules = _fusion_rules(record, 0.01, is_gnss=True)
     assert (rules.reset_variance_factor, rules.resets_velocity) == (scale, with_velocity)
-    assert (rules.reset_s, rules.stop_s) == (7.0, np.inf)
+    assert (rules.reset_timeout_s, rules.stop_timeout_s) == (7.0, np.inf)
 
 
 @pytest.mark.parametrize(("delay_ms", "age_s", "remaining_s", "expected"), [

@@ -114,12 +114,12 @@ def test_grade_with_log_verifies_only_the_unchanged_report(tmp_path) -> None:
     output = tmp_path / "class"
     outcome = grade([folder], Course(read_rubric(None), logs=[LOG.parent]), output, processes=2)
     first, second, third = outcome.reports
-    assert first.verdict.status == "verified"
-    assert first.verdict.with_log
+    assert first.verification.status == "verified"
+    assert first.verification.with_log
     assert first.numbers["SIGMA_Z (m)"] == 0.1
-    assert second.verdict.status == "numbers differ"
+    assert second.verification.status == "numbers differ"
     assert second.points == 0.0
-    assert any("nis_mean" in difference.path for difference in second.verdict.differences)
+    assert any("nis_mean" in difference.path for difference in second.verification.differences)
     # each report is redrawn from the log
     redrawn = [path.read_bytes() for path in (output / "reports").glob("*.pdf")]
     assert len(redrawn) == 3
@@ -128,7 +128,7 @@ def test_grade_with_log_verifies_only_the_unchanged_report(tmp_path) -> None:
     page = (output / "class.html").read_text(encoding="utf-8")
     assert all(f"reports/{name}.pdf" in page for name in ("a", "b", "c"))
     # a missing page is flagged and costs no points
-    assert (third.verdict.status, third.verdict.outcome) == ("verified", "page differs")
+    assert (third.verification.status, third.verification.outcome) == ("verified", "page differs")
     assert third.status == "page differs"
     assert third.points == first.points
     assert any(f"Page {REPORT_PAGES}: the page is missing." in flag for flag in third.flags)
@@ -176,7 +176,7 @@ def test_grade_with_other_logs_verifies_reports_again(tmp_path) -> None:
         outcome = grade(
             [tmp_path / "in"], Course(read_rubric(None), logs=logs), tmp_path / "out", processes=1
         )
-        said.append((outcome.reports[0].verdict.status, outcome.reused_count))
+        said.append((outcome.reports[0].verification.status, outcome.reused_count))
         # only the redrawn report of this run
         assert len([*(tmp_path / "out" / "records").glob("*.p*")]) == len(logs)
     assert said == [
@@ -196,7 +196,7 @@ def test_grade_report_without_its_log_makes_points_pending(tmp_path) -> None:
         key = AnswerKey("aisle", (RightAnswers("1", "Ada", "1.ulg", given),))
         outcome = grade([tmp_path / "in"], Course(rubric, key, logs), tmp_path / "out", processes=1)
         (one,) = outcome.reports
-        assert one.verdict.status == status
+        assert one.verification.status == status
         assert one.points > 0
         assert one.counted_points is None
         assert "aisle_uwb.ulg" in one.instructor_action

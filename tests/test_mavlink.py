@@ -161,8 +161,9 @@ def test_mavlink_raw_imu_is_unavailable_with_reason(read):
     ))  # fmt: skip
     flight = read(recorder)
     assert isinstance(flight.imu, Unavailable)
-    assert "2000 RAW_IMU messages are not used, because raw counts" in reason(flight, "IMU")
-    assert [(u.name, u.count) for u in flight.unused] == [("RAW_IMU", 2000)]
+    assert "no HIGHRES_IMU or SCALED_IMU" in reason(flight, "IMU")
+    reason_raw = "RAW_IMU contains raw counts without a unit"
+    assert [(u.name, u.count, u.reason) for u in flight.unused] == [("RAW_IMU", 2000, reason_raw)]
 
 
 def test_mavlink_imu_with_several_ids_uses_most_frequent_id(read):

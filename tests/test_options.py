@@ -77,5 +77,5 @@ def test_each_option_of_compare_changes_the_results(name: str) -> None:
 def test_unknown_kind_of_position_source_raises_an_error() -> None:
     for origin in ORIGINS:
         assert find_origin(origin.kind, origin.path) is origin
-    with pytest.raises(ValueError, match="no kind and path"):
+    with pytest.raises(ValueError, match="no position source has the kind"):
         find_origin("lidar", "as received")

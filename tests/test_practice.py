@@ -313,11 +313,11 @@ def test_practice_page_gives_half_a_point_for_half_an_answer(browser: Browser, q
 def test_practice_page_summary_names_fault_missed_by_student() -> None:
     clean = structs.replace(SMALL_SIGMA_A, severity="clean", causes=(), headline="No fault found")
     described = [{"fault": "gate of EKF2 too small", "size": "EKF2_EVP_GATE 1.4"}]
-    named = practice._name_mistakes(clean, described)
+    named = practice._with_fault_headline(clean, described)
     assert named.headline == "Gate of EKF2 too small: EKF2_EVP_GATE 1.4"
     assert named.severity == "warning"
-    assert practice._name_mistakes(clean, []) is clean
-    assert practice._name_mistakes(SMALL_SIGMA_A, described) is SMALL_SIGMA_A
+    assert practice._with_fault_headline(clean, []) is clean
+    assert practice._with_fault_headline(SMALL_SIGMA_A, described) is SMALL_SIGMA_A
 
 
 def test_practice_page_has_no_serious_accessibility_violation(browser: Browser, quiz: Path) -> None:

@@ -544,7 +544,7 @@ def test_data_streams_state_their_topics_clock_and_file(read, generation):
         "ekf2_state": ("vehicle_local_position",), "airborne": ("vehicle_land_detected",),
     }  # fmt: skip
     assert {stream.log for stream in streams.values()} == {"made.ulg"}
-    measured = {part for part, s in streams.items() if s.clock.endswith("time of measurement")}
+    measured = {part for part, s in streams.items() if s.clock.endswith("(measurement time)")}
     assert measured == {"imu"} | (set() if generation == "v1.9" else {"ekf2_state", *of_ekf2})
 
 
@@ -555,7 +555,7 @@ def test_uwb_ranges_are_listed_as_unused_data(read):
     flight = read(make_log().add(ranges, grid))
     unused = [(part.name, part.count) for part in flight.unused]
     assert unused == [("sensor_uwb", 40), ("uwb_grid", 3)]
-    assert "one range and two angles" in flight.unused[0].reason
+    assert "a range and two angles" in flight.unused[0].reason
     assert flight.positions[0].name == "vehicle_visual_odometry"
 
 

@@ -21,7 +21,7 @@ from px4fuse.filter.time_offset import ClockOffset, PartOffset
 from px4fuse.findings import Finding
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import clock, fonts, notes
-from px4fuse.report.notes import write
+from px4fuse.report.notes import write_markdown
 from px4fuse.report.page import Block, Page, replace_unprintable
 from px4fuse.report.typesetting import compile_pdf
 from px4fuse.results.model import Student
@@ -31,7 +31,7 @@ THAI, HAN, ARABIC = "สมชาย", "王小明", "محمد"
 
 def written(markdown: str) -> list[Block]:
     page = Page()
-    write(page, markdown)
+    write_markdown(page, markdown)
     return page.blocks
 
 
@@ -136,7 +136,7 @@ def test_any_markdown_in_notes_is_accepted(text: str) -> None:
 
 def pages_of(student: Student) -> Iterator[Page]:
     empty = object.__new__(Analysis)  # the page uses only its type
-    return notes.draw(empty, SimpleNamespace(student=student))  # type: ignore[arg-type]
+    return notes.draw_pages(empty, SimpleNamespace(student=student))  # type: ignore[arg-type]
 
 
 def test_long_notes_continue_on_next_report_pages() -> None:
@@ -215,19 +215,19 @@ def test_report_omits_time_offset_page_if_not_significant() -> None:
     ]
     nothing: Any = SimpleNamespace(findings=[])
     assert "no significant time offset" in clock.summarise_offset(fine, [])
-    assert not list(clock.draw(fine, nothing))
+    assert not list(clock.draw_pages(fine, nothing))
     for analysis, results in (
         (with_clock(unknown), nothing), *((fine, each) for each in with_finding)
     ):  # fmt: skip
         line = clock.summarise_offset(analysis, results.findings)
         assert line == "The appendix on the time offset contains the estimate."
-        assert len(list(clock.draw(analysis, results))) == 1
+        assert len(list(clock.draw_pages(analysis, results))) == 1
     none = with_clock(Unavailable("clock offset", "no IMU", "Give the ULog."))
     assert (
         clock.summarise_offset(none, [])
         == "The time offset cannot be estimated: no IMU. Give the ULog."
     )
-    assert not list(clock.draw(none, nothing))
+    assert not list(clock.draw_pages(none, nothing))
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from px4fuse.comparison.model import UntestedFilter
 from px4fuse.diagnose import find_faults
 from px4fuse.errors import ResultsError
 from px4fuse.flight.model import Flight
-from px4fuse.report.pdf import render
+from px4fuse.report.pdf import render_pdf
 from px4fuse.request import ComparisonRequest
 from px4fuse.results import build
 from px4fuse.results.bounds import within_bounds
@@ -68,7 +68,7 @@ def test_results_json_of_any_settings_follows_the_schema(sample_flight, options)
     made = document(sample_flight, **({"start_s": 40.0, "end_s": 70.0} | options))
     text = to_json(made[1])
     assert_valid(text)
-    assert render(*made, text).startswith(b"%PDF-")
+    assert render_pdf(*made, text).startswith(b"%PDF-")
 
 
 def test_results_of_too_few_updates_state_reason_instead_of_zero(sample_flight):

@@ -18,7 +18,7 @@ def test_default_rubric_contains_each_check_and_its_parameters():
     checks = AnyRubricItem.__args__
     assert used == {check.__struct_config__.tag for check in checks}
     for check in checks:
-        for name in check.__struct_fields__:
+        for name in check.__struct_encode_fields__:
             assert name in text, name
 
 

@@ -71,8 +71,8 @@ def test_report_without_log_earns_no_points_for_verification():
     pdf = (ROOT / "reports" / "example" / "aisle_uwb.pdf").read_bytes()
     verdict = verify(read_report(pdf, "a.pdf"), pdf, {})
     assert check_points("verified", verdict=verdict)[0] == 0.0
-    assert "Hand in aisle_uwb.ulg" in feedback_words(graded(verdict=verdict))
-    other = replace(verdict, reasons=("made with another version",))
+    assert "Hand in aisle_uwb.ulg" in feedback_words(graded(verification=verdict))
+    other = replace(verdict, reasons=("made with another version",), missing="")
     points, comment = check_points("verified", verdict=other)
     assert (points, comment[-28:]) == (0.0, "(made with another version).")
 
@@ -304,7 +304,7 @@ def feedback_words(one, title=""):
 
 def graded(items=(), **values):
     given = {"submission": "a.pdf", "student": "Ann Lee", "student_id": "1001"}
-    return GradedReport(**{**given, "verdict": VERIFIED, "items": tuple(items), **values})
+    return GradedReport(**{**given, "verification": VERIFIED, "items": tuple(items), **values})
 
 
 class TestFeedback:
@@ -313,7 +313,7 @@ class TestFeedback:
         [
             ({"items": assess_results().items, "flags": ("copied",)},
              ("Lab 2 Report a.pdf Student Ann Lee, 1001",), "copied"),
-            ({"verdict": Verification("cannot verify", ("one", "page 3: two"), False)},
+            ({"verification": Verification("cannot verify", ("one", "page 3: two"), False)},
              ("could not be verified: one; page 3: two. Make a new report",), "Points"),
             ({"student": "=cmd|' /C calc'!A0\n<script>", "student_id": "\x1b[31m"},
              ("=cmd|' /C calc'!A0 <script>",), "\x1b"),
@@ -355,7 +355,7 @@ class TestFeedback:
         ({"settings__end_s": 50.0}, ()),
         ({"settings__input": "zero"}, ("IMU",)),
         ({"log__hardware": SIMULATION_HARDWARE}, ("simulate",)),
-        ({"source__path": "observation logged by EKF2"}, ("logged by EKF2",)),
+        ({"source__path": "kept by EKF2"}, ("logged by EKF2",)),
     ],
 )
 def test_report_with_suspicious_settings_is_flagged(values, said):

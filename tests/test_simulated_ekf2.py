@@ -192,8 +192,8 @@ def test_simulated_ekf2_ignores_samples_with_older_timestamps():
     assert np.any(np.diff(sent) < 0)
     assert np.all(np.diff(taken) > 0)
     rows = ekf2._received_positions(simulation.positions)
-    assert len(rows.stamp_s) < len(sent)
-    assert np.all(np.diff(rows.stamp_s) > 0)
+    assert len(rows.timestamp_s) < len(sent)
+    assert np.all(np.diff(rows.timestamp_s) > 0)
 
 
 # --- faults in EKF2 parameters

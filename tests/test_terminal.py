@@ -24,7 +24,7 @@ from px4fuse.errors import OutputError
 from px4fuse.report import card_text, screen
 from px4fuse.report.card_text import card_lines, with_typed_path
 from px4fuse.report.screen import expand_commands, print_paragraph
-from px4fuse.report.terminal import summary
+from px4fuse.report.terminal import comparison_page
 from px4fuse.request import ComparisonRequest, PositionFile, command_line, settings_name
 from px4fuse.results.build import results
 from px4fuse.results.contract import ComparisonResults, to_json
@@ -79,7 +79,7 @@ def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> N
             monkeypatch.setenv("COLUMNS", str(width))
         console = terminal()
         with console.capture() as captured:
-            page = summary(*document, verbose=True)
+            page = comparison_page(*document, verbose=True)
             screen.show(console, page.blocks, document[0].request)
         summaries[width] = captured.get()
     whole = summaries[None]

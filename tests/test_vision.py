@@ -118,7 +118,7 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
     noises = settings["EKF2_GYR_NOISE"], settings["EKF2_ACC_NOISE"]
     deviation = np.sqrt(segment.variance)
     x, P = segment.state.copy(), deviation[:, None] * segment.state_correlation * deviation
-    measured_at_s = vision.stamp_s - 1e-3 * settings["EKF2_EV_DELAY"] - 0.5 * inputs.mean_step_s
+    measured_at_s = vision.timestamp_s - 1e-3 * settings["EKF2_EV_DELAY"] - 0.5 * inputs.mean_step_s
     steps = np.searchsorted(segment.time_s, measured_at_s - 1e-9).tolist()
     has_sample = {step: row for row, step in enumerate(steps) if step > 0}
     at = {int(event.end_step): event for event in events}
@@ -253,7 +253,7 @@ def test_vision_lever_arm_is_subtracted_in_replay() -> None:
     """EKF2_EV_POS is in the body frame, rotated by the attitude at each sample."""
     inputs, vision, lever_arm_m = flying(sent()), sent(), np.array([1.5, -0.5, 0.8])
     (segment,) = inputs.segments
-    step = np.searchsorted(segment.time_s, vision.stamp_s - 0.5 * inputs.mean_step_s - 1e-9)
+    step = np.searchsorted(segment.time_s, vision.timestamp_s - 0.5 * inputs.mean_step_s - 1e-9)
     turn = segment.body_to_ned[np.minimum(step, len(segment.body_to_ned) - 1)]
     beside = replace(vision, position_m=vision.position_m + turn @ lever_arm_m)
     settings = {
@@ -279,7 +279,9 @@ def test_vision_position_bias_estimates_frame_offset() -> None:
 def test_ekf2_rejects_vision_jump_until_position_bias_is_reset() -> None:
     vision = sent(sigma_m=0.05)
     at_s = float(on_gnss().inputs.segments[0].time_s[0]) + 20.0
-    jumped = replace(vision, position_m=vision.position_m + 20.0 * (vision.stamp_s > at_s)[:, None])
+    jumped = replace(
+        vision, position_m=vision.position_m + 20.0 * (vision.timestamp_s > at_s)[:, None]
+    )
     smooth, done = ran(flying(vision)), ran(flying(jumped))
     found = update_log(done)
     rejected = found.index[found["rejected"] > 0.0]
@@ -298,8 +300,8 @@ def test_vision_position_bias_restarts_after_a_gap() -> None:
     vision = sent(sigma_m=0.05)
     at_s = float(on_gnss().inputs.segments[0].time_s[0]) + 20.0
     for gap_s, anew in ((0.9 * MAX_SAMPLE_GAP_S, False), (1.5 * MAX_SAMPLE_GAP_S, True)):
-        remaining = (vision.stamp_s < at_s) | (vision.stamp_s > at_s + gap_s)
-        moved = vision.position_m + 20.0 * (vision.stamp_s > at_s)[:, None]
+        remaining = (vision.timestamp_s < at_s) | (vision.timestamp_s > at_s + gap_s)
+        moved = vision.position_m + 20.0 * (vision.timestamp_s > at_s)[:, None]
         fields = ("stamp_s", "arrival_s", "variance_m2", "rejected", "reset")
         parts = {name: getattr(vision, name)[remaining] for name in fields}
         found = update_log(ran(flying(replace(vision, position_m=moved[remaining], **parts))))
@@ -350,7 +352,7 @@ def test_vision_position_bias_changes_with_gnss_position_reset() -> None:
 def off_by(received: ReceivedPositions, north_m: float) -> ReceivedPositions:
     """Return the positions with an offset from 15 s on."""
     start_s = float(on_gnss().inputs.segments[0].time_s[0])
-    far = (received.stamp_s > start_s + 15.0)[:, None] * np.array([north_m, 0.0, 0.0])
+    far = (received.timestamp_s > start_s + 15.0)[:, None] * np.array([north_m, 0.0, 0.0])
     return replace(received, position_m=received.position_m + far)
 
 
@@ -382,14 +384,14 @@ def test_second_vision_sample_in_one_step_is_dropped() -> None:
         name: np.repeat(getattr(vision, name), 2, axis=0)
         for name in ("arrival_s", "position_m", "variance_m2", "rejected", "reset")
     }
-    stamps = np.repeat(vision.stamp_s, 2)
+    stamps = np.repeat(vision.timestamp_s, 2)
     stamps[::2] -= 0.0005
     once, twice = (update_log(ran(flying(one))) for one in (
         vision, replace(vision, stamp_s=stamps, **doubled)))  # fmt: skip
     assert len(once) <= len(twice) <= 1.1 * len(once)
     horizon_s = flying(vision).horizon_s
     for age_s, remaining in ((horizon_s + 0.05, True), (horizon_s + 0.15, False)):
-        late = replace(vision, arrival_s=vision.stamp_s + age_s)
+        late = replace(vision, arrival_s=vision.timestamp_s + age_s)
         assert bool(len(update_log(ran(flying(late))))) is remaining
 
 
@@ -438,7 +440,7 @@ def flown(
     log = AidLog(
         ("estimator_aid_src_ev_pos",), ("north", "east"), samples, enabled, {**OF_VISION, **changed}
     )
-    rows = pd.DataFrame(np.hstack([vision.position_m, vision.variance_m2]), vision.stamp_s,
+    rows = pd.DataFrame(np.hstack([vision.position_m, vision.variance_m2]), vision.timestamp_s,
                         [*Columns.POSITION, *Columns.POSITION_VARIANCE])  # fmt: skip
     track = PositionTrack(
         vision.source, RECEIVED, "external vision", rows, "NED", "boot", (vision.source,)
@@ -529,7 +531,7 @@ def test_ekf2_model_does_not_fuse_vision_while_disabled() -> None:
     found = opened(flown(off_from_s=60.0))
     assert found.inputs.vision is not None
     update_log = np.isfinite(found.inputs.vision.position_m[:, 0])
-    assert found.inputs.vision.stamp_s[update_log][-1] == pytest.approx(60.0, abs=0.1)
+    assert found.inputs.vision.timestamp_s[update_log][-1] == pytest.approx(60.0, abs=0.1)
     assert found.agreement.good
     assert found.agreement.doubtful == {}
 

@@ -18,7 +18,7 @@ from px4fuse.ekf2.steps import NOISE, REPLACEMENT_STEPS, SAMPLES, TIMESTAMPS, Di
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Unavailable
-from px4fuse.report.difference_page import draw, unexplained_note
+from px4fuse.report.difference_page import draw_pages, unexplained_note
 from px4fuse.report.style import report_style
 
 
@@ -82,7 +82,7 @@ def test_kf_ekf2_difference_without_replay_states_reason(sample: Analysis) -> No
 
 def drawn(analysis: Analysis) -> list:
     with report_style():
-        return list(draw(analysis, None))
+        return list(draw_pages(analysis, None))
 
 
 def test_report_without_ekf2_replay_omits_difference_page(sample: Analysis) -> None:
@@ -109,7 +109,7 @@ def test_report_without_ekf2_replay_omits_difference_page(sample: Analysis) -> N
 
 @pytest.mark.parametrize(
     ("share", "text"),
-    [(0.47, "decreases by 47 %."), (1.4, "decreases by 140 %; other properties")],
+    [(0.47, "decreases by 47 %."), (1.4, "decreases by 140 %. Other properties")],
 )
 def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text) -> None:
     explanation = of(sample)

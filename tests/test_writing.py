@@ -317,11 +317,11 @@ def test_compare_warns_if_no_font_can_print_student_name(
 ) -> None:
     warnings = []
 
-    def render(found: object, results: object, text: str) -> bytes:
+    def render_pdf(found: object, results: object, text: str) -> bytes:
         warnings.append(capsys.readouterr().err)
         return b"%PDF-"
 
-    monkeypatch.setattr(pdf, "render", render)
+    monkeypatch.setattr(pdf, "render_pdf", render_pdf)
     monkeypatch.setattr(fonts, "_other_fonts", lambda: ())
     fonts.font_of.cache_clear()
     run_main(monkeypatch, capsys, *f"compare l.ulg -o r.pdf --student {name}".split())

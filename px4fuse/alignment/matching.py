@@ -224,14 +224,14 @@ def _refit_with_corrected_resets(flight: Flight, match: Match, problem: Alignmen
         problem.samples, match.frame, fit.yaw_rad, fit.origin_m, fit.lag_s
     )
     ekf2_track = tracks.ekf2_track_without_resets(ekf2, aligned_samples)
-    fit_again = partial(
+    refit = partial(
         time_and_pose_fit.fit_by_least_squares,
         tracks.convert_to_ned(problem.samples, match.frame),
         ekf2_track,
         is_lag_free=problem.lag_s is None,
     )
-    free_yaw_fit = fit_again(match.free_yaw_fit, None)
-    fit = free_yaw_fit if problem.yaw_rad is None else fit_again(match.fit, problem.yaw_rad)
+    free_yaw_fit = refit(match.free_yaw_fit, None)
+    fit = free_yaw_fit if problem.yaw_rad is None else refit(match.fit, problem.yaw_rad)
     return replace(match, reference=ekf2_track, fit=fit, free_yaw_fit=free_yaw_fit)
 
 

@@ -20,7 +20,7 @@ from px4fuse.alignment import matching, tracks
 from px4fuse.alignment.matching import AlignmentProblem, Match
 from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, truncated_rms
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
-from px4fuse.convention.axes import UNITS
+from px4fuse.convention.axes import UNIT_SIZES_M
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import MIN_ROTATION_DEG
 from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, describe_unit
@@ -41,7 +41,7 @@ from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_file import PositionRecording
 from px4fuse.trajectory.model import NED_COMPONENTS
 
-# Maximum time span (s) of file and log for _explain_mismatch, which takes 1 s per hour
+# Maximum time span (s) of file and log in which a mismatch is explained: takes 1 s per hour of data
 MAX_EXPLAINED_SPAN_S = 7200.0
 
 
@@ -64,9 +64,9 @@ def _explain_mismatch(
     if convention is None or convention.verdict != "determined":
         return None
     axes, faults = convention.axes, []
-    if UNITS[convention.unit] != metres_per_unit:
+    if UNIT_SIZES_M[convention.unit] != metres_per_unit:
         stated_unit = next(
-            name for unit, name in UNIT_NAMES.items() if UNITS[unit] == metres_per_unit
+            name for unit, name in UNIT_NAMES.items() if UNIT_SIZES_M[unit] == metres_per_unit
         )
         faults.append(describe_unit(convention.unit, "the positions", stated_unit, is_file=True))
     stated_frame = problem.frames[0].upper() if len(problem.frames) == 1 else ""

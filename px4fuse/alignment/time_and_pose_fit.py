@@ -51,7 +51,7 @@ class CorrelationPeak:
 
 @dataclass(frozen=True, kw_only=True)
 class Fit(CorrelationPeak):
-    """Least-squares fit of e^{i·yaw}·file(t) + origin to reference(t + lag), near a peak.
+    """Least-squares fit of e^{i·yaw}·file(t) + origin to reference(t + lag).
 
     Attributes
     ----------
@@ -173,20 +173,25 @@ def fit_by_least_squares(
             f"only {np.count_nonzero(is_used)} positions of the file overlap the reference in time"
         )
     reference_time_s = file_track.time_s[is_used] + peak.lag_s
-    file_m = file_track.horizontal_m[is_used]
-    target_m = (reference_m[:, 0] + 1j * reference_m[:, 1])[is_used]
-    centre_m = np.mean(file_m)
+    file_position_m = file_track.horizontal_m[is_used]
+    reference_position_m = (reference_m[:, 0] + 1j * reference_m[:, 1])[is_used]
+    centre_m = np.mean(file_position_m)
     # with a centred track, the errors of yaw and origin are uncorrelated
-    file_m = file_m - centre_m
-    std_product = float(np.sqrt(np.var(file_m) * np.var(target_m)))
+    file_position_m = file_position_m - centre_m
+    sigma_product_m2 = float(np.sqrt(np.var(file_position_m) * np.var(reference_position_m)))
     coherence = (
-        complex(np.vdot(file_m, target_m) / len(file_m) / std_product) if std_product > 0 else 0j
+        complex(
+            np.vdot(file_position_m, reference_position_m) / len(file_position_m) / sigma_product_m2
+        )
+        if sigma_product_m2 > 0
+        else 0j
     )
-    mean_variance = float(np.var(file_m) + np.var(target_m)) / 2.0
+    mean_variance_m2 = float(np.var(file_position_m) + np.var(reference_position_m)) / 2.0
     reference_horizontal_m = reference.horizontal_m
 
     # Parameters: origin north, origin east, lag relative to the peak, yaw
-    parameters = np.array([target_m.mean().real, target_m.mean().imag, 0.0, np.angle(coherence)])
+    mean_m = reference_position_m.mean()
+    parameters = np.array([mean_m.real, mean_m.imag, 0.0, np.angle(coherence)])
     bounds = np.array([np.inf, np.inf, MAX_LAG_SHIFT_S, np.inf])
     is_fitted = np.array([True, True, is_lag_free, yaw_rad is None])
     if yaw_rad is not None:
@@ -196,7 +201,7 @@ def fit_by_least_squares(
         parameters[is_fitted] = free_parameters
         north, east, lag_shift_s, yaw = parameters
         target = np.interp(reference_time_s + lag_shift_s, reference.time_s, reference_horizontal_m)
-        residuals = np.exp(1j * yaw) * file_m + complex(north, east) - target
+        residuals = np.exp(1j * yaw) * file_position_m + complex(north, east) - target
         return np.concatenate([residuals.real, residuals.imag])
 
     solution = least_squares(
@@ -208,7 +213,7 @@ def fit_by_least_squares(
     )
     residuals = residuals_at(solution.x)
     north, east, lag_shift_s, yaw = parameters.tolist()
-    complex_residuals = residuals[: len(file_m)] + 1j * residuals[len(file_m) :]
+    complex_residuals = residuals[: len(file_position_m)] + 1j * residuals[len(file_position_m) :]
     jacobian = np.asarray(solution.jac)
     information = jacobian.T @ jacobian
     # The added diagonal gives a huge variance instead of an error for a singular matrix
@@ -231,8 +236,10 @@ def fit_by_least_squares(
     concordance = peak.concordance
     if np.isnan(concordance):
         real_covariance = float((np.exp(-1j * yaw) * coherence).real)
-        concordance = real_covariance * std_product / mean_variance if std_product > 0 else 0.0
-    origin = complex(north, east) - np.exp(1j * yaw) * centre_m
+        concordance = (
+            real_covariance * sigma_product_m2 / mean_variance_m2 if sigma_product_m2 > 0 else 0.0
+        )
+    horizontal_origin_m = complex(north, east) - np.exp(1j * yaw) * centre_m
     return Fit(
         lag_s=peak.lag_s + lag_shift_s,
         lag_sigma_s=(np.inf if is_at_limit else float(parameter_sigma[2])) if is_lag_free else None,
@@ -241,7 +248,7 @@ def fit_by_least_squares(
         second_peak_ratio=peak.second_peak_ratio,
         yaw_rad=yaw,
         yaw_sigma_rad=float(parameter_sigma[-1]) if yaw_rad is None else None,
-        origin_m=np.array([origin.real, origin.imag, origin_down_m]),
+        origin_m=np.array([horizontal_origin_m.real, horizontal_origin_m.imag, origin_down_m]),
         coherence=coherence,
         horizontal_rms_m=float(horizontal_rms_m),
         rms_m=float(np.sqrt(2.0 * horizontal_rms_m**2 + vertical_rms_m**2)),

@@ -87,9 +87,9 @@ def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
         contract_results = results(request, analysis)
         results_json, report_pdf = to_json(contract_results), b""
         if job.with_report:
-            from px4fuse.report.pdf import render  # noqa: PLC0415
+            from px4fuse.report.pdf import render_pdf  # noqa: PLC0415
 
-            report_pdf = render(analysis, contract_results, results_json)
+            report_pdf = render_pdf(analysis, contract_results, results_json)
     except Px4FuseError as error:
         status = NOT_COMPARED if isinstance(error, MissingDataError) else FAILED
         return Outcome(sha256, (row | failure_row(error, status, path.name),))

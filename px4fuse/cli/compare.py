@@ -52,7 +52,7 @@ def compare(
     from px4fuse.card.build import build_refusal_card
     from px4fuse.core.memory import release_free_memory
     from px4fuse.diagnose import diagnose_or_check_aids
-    from px4fuse.report.terminal import card_page, summary
+    from px4fuse.report.terminal import card_page, comparison_page
     from px4fuse.results.build import outcome_results
 
     student = options.read_student(option_values, log)
@@ -76,7 +76,7 @@ def compare(
             raise
         outputs.show_page(card_page("card", build_refusal_card(error, log)), is_error=True)
         sys.exit(2)
-    page = summary(outcome, results, verbose=verbose, quiet=quiet)
+    page = comparison_page(outcome, results, verbose=verbose, quiet=quiet)
     outputs.write_and_print(contents, page, request)
     if not quiet and STANDARD_OUTPUT not in contents:
         outputs.show_page(card_page("closing", results.card))

@@ -150,7 +150,7 @@ def loop(
     """
     from px4fuse.diagnose import analyse_loop_closure
     from px4fuse.loop.tracks import file_name, is_g2o
-    from px4fuse.report.loop import summary
+    from px4fuse.report.loop import loop_page
     from px4fuse.results.build import loop_results
 
     log = split_path_and_part(str(source))[0]  # without the name of the track
@@ -172,7 +172,7 @@ def loop(
         contents = _output_files(loop_result, tum, g2o) | outputs.result_files(
             results, json_path, output, loop_result, show_progress, name
         )
-    outputs.write_and_print(contents, summary(loop_result, results.findings), request)
+    outputs.write_and_print(contents, loop_page(loop_result, results.findings), request)
 
 
 def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
@@ -208,7 +208,7 @@ def _solve_graph(
     source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None
 ) -> None:
     from px4fuse.readers.g2o import g2o_text, read_g2o
-    from px4fuse.report.loop import graph_summary
+    from px4fuse.report.loop import pose_graph_page
     from px4fuse.results.build import graph_results
     from px4fuse.trajectory.graph.solver import analyse_graph
 
@@ -231,4 +231,4 @@ def _solve_graph(
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
     contents = {} if g2o is None else {g2o: g2o_text(solved_graph).encode()}
     contents |= outputs.result_files(graph_results(results, command), json_path)
-    outputs.write_and_print(contents, graph_summary(results))
+    outputs.write_and_print(contents, pose_graph_page(results))

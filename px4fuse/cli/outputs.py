@@ -234,11 +234,14 @@ def result_files(
         recorded_texts.append(json_text)
         json_path = None if json_path == STANDARD_OUTPUT else json_path
     if output is not None:
-        from px4fuse.report.pdf import render
+        from px4fuse.report.pdf import render_pdf
 
         show_progress("writing the report")
         output, results_path = report_paths(output, json_path)
-        contents |= {output: render(analysis, results, json_text), results_path: json_text.encode()}
+        contents |= {
+            output: render_pdf(analysis, results, json_text),
+            results_path: json_text.encode(),
+        }
     if json_path is not None:
         contents[json_path] = json_text.encode()
     return contents

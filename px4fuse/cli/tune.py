@@ -23,7 +23,7 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     from px4fuse.comparison.estimates import estimate_noises
     from px4fuse.diagnose import prepare_comparison
     from px4fuse.errors import MissingDataError
-    from px4fuse.report.tuning import summary
+    from px4fuse.report.tuning import tuning_page
     from px4fuse.results.build import tuning_results
 
     request = comparison_request(log, option_values)
@@ -38,4 +38,4 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
             missing[0].remedy,
         )
     results = tuning_results(request, comparison, tunings)
-    write_and_print(result_files(results, json_path), summary(comparison, tunings), request)
+    write_and_print(result_files(results, json_path), tuning_page(comparison, tunings), request)

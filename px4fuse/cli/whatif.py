@@ -64,7 +64,7 @@ def whatif(
     on.
     """
     from px4fuse.diagnose import run_what_if
-    from px4fuse.report.whatif import summary
+    from px4fuse.report.whatif import whatif_page
     from px4fuse.results.build import whatif_results
 
     if start_s is not None and not without:
@@ -79,7 +79,7 @@ def whatif(
     with outputs.progress(json_path) as show_progress:
         analysis = run_what_if(request, show_progress)
     results = whatif_results(request, analysis)
-    outputs.write_and_print(outputs.result_files(results, json_path), summary(analysis))
+    outputs.write_and_print(outputs.result_files(results, json_path), whatif_page(analysis))
 
 
 def _parse_parameters(parameter_texts: tuple[str, ...]) -> dict[str, float]:

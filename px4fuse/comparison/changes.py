@@ -28,7 +28,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.ekf2_parameters import GNSS_VEL, PARAMETERS
 from px4fuse.flight.model import LogInfo, Unavailable
 
-# Minimum SIGMA_Z (m) of a KF re-run: the noise of motion capture, the best position source
+# Minimum SIGMA_Z (m) of a KF re-run: noise of motion capture, the most accurate position source
 MIN_RERUN_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
 # Label in :attr:`Trial.kinds` of each KF setting or data correction that a re-run changes
@@ -43,7 +43,7 @@ KF_KINDS = {
 }
 SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
-# Minimum ratio of estimated SIGMA_A to EKF2_ACC_NOISE for a re-run with a larger EKF2_ACC_NOISE:
+# EKF2 is re-run with a larger EKF2_ACC_NOISE if the estimated SIGMA_A exceeds it by this factor:
 # SIGMA_A also covers tilt error and bias
 MIN_VIBRATION_RATIO = 3.0
 # EKF2 parameters that a re-run sets to PX4's default if the log has another value
@@ -168,7 +168,7 @@ def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
 
 
 def _time_offset_changes(estimates: Estimates, ekf2_inputs: Inputs | None) -> list[Change]:
-    """Return the estimated time offset if a significant part of it is not yet applied.
+    """Return the estimated time offset if the filter does not yet correct a significant part of it.
 
     For EKF2, EKF2_DELAY_MAX is increased if the shifted positions would be too old to be fused.
     """

@@ -40,7 +40,7 @@ def run_kf(
 
 
 def compare(prepared: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comparison:
-    """Add the results along each axis: KF against EKF2, and both against ground truth."""
+    """Compare KF with EKF2, and both with ground truth, along each axis that KF ran along."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, note = projection.continuous_state(ekf2, prepared.source, prepared.segment)
@@ -100,7 +100,7 @@ def _compare_axis(
             ),
             "ekf2": _summarise_filter(innovations, ekf2_variance, ekf2_errors, gate),
         },
-        difference=difference(kf_run, ekf2_state),
+        difference=difference_statistics(kf_run, ekf2_state),
         rejected_fraction=float(rejected_flags.mean()) if len(rejected_flags) else None,
         axis=axis,
         replay=kf_run,
@@ -153,7 +153,7 @@ def _known_values(frame: Frame, column: str) -> pd.Series:
     return pd.Series(dtype=float) if isinstance(frame, Unavailable) else frame[column].dropna()
 
 
-def difference(kf_run: Replay, ekf2_state: Frame) -> Difference | Unavailable:
+def difference_statistics(kf_run: Replay, ekf2_state: Frame) -> Difference | Unavailable:
     """Compute the difference KF - EKF2 along one axis at EKF2's sample times."""
     if isinstance(ekf2_state, Unavailable):
         return ekf2_state
@@ -318,7 +318,7 @@ def _horizontal_nis(frames: Mapping[str, Frame]) -> HorizontalNis | None:
     ]
     if len(frames_of_axes) < 2:
         return None
-    # the horizontal NIS needs the innovations north and east of an update (same timestamp)
+    # keep updates with innovations along both axes (same timestamp)
     north_and_east = pd.concat(frames_of_axes, axis=1, join="inner").to_numpy().T
     return assess_horizontal(
         (north_and_east[0], north_and_east[1]), (north_and_east[2], north_and_east[3])

@@ -30,7 +30,7 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
-# Maximum relative difference between position RMSEs that the report calls equal
+# The report calls the position RMSEs of KF and EKF2 equal up to this relative difference
 EQUAL_RMSE_TOLERANCE = 0.05
 # Minimum fraction of the mean square difference KF - EKF2 that a reported second cause explains
 MIN_NOTABLE_FRACTION = 0.05

@@ -16,52 +16,52 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from px4fuse.comparison.model import Comparison
 from px4fuse.core.arrays import Array, cumulative_integral, rank_correlation
 from px4fuse.filter.signals import cut_to_segment
-from px4fuse.flight.model import Columns, Unavailable
+from px4fuse.flight.model import Columns, Ekf2, Unavailable
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_vector
 from px4fuse.trajectory.scores import autocorrelation_time
 
-# Minimum number of positions for a pattern
+# Minimum number of positions in which error patterns are searched
 MIN_POSITIONS = 100
 # Rows of the neighbours of a position, relative to its row
 NEIGHBOURS = np.array([-2, -1, 1, 2])
-# Maximum time (median intervals) from the first to the last neighbour: lost positions and gaps
-# make the cubic inaccurate
+# Maximum time from the first to the last neighbour, in median intervals: across gaps the cubic
+# interpolation is inaccurate
 MAX_NEIGHBOUR_SPAN = 8.0
-# Maximum noise of a residual ÷ noise of a position
-MAX_RESIDUAL_FACTOR = 4.0
-# Number of timestamps in a running median: jitter does not shift this median, a lost position does
-MEDIAN_COUNT = 9
+# Residuals whose σ exceeds this multiple of the position σ are not used
+MAX_RESIDUAL_NOISE_GAIN = 4.0
+# Number of timestamps in the running median: it follows lost positions, but not jitter
+MEDIAN_TIMESTAMP_COUNT = 9
 # Half of the time (s) over which the velocity is averaged
 HALF_VELOCITY_S = 0.3
-# Only one of this number of successive residuals is independent, because they share neighbours
+# Number of residuals per independent residual: successive residuals share neighbours
 SHARED_RESIDUALS = 3
 # Minimum timestamp jitter (s, 1 σ): an error of 1 cm at 1 m/s
 MIN_JITTER_S = 0.008
-# Minimum and maximum of residual ÷ (jitter · velocity), if jitter causes the residuals
+# Jitter causes the residuals if their ratio to jitter · velocity is in this range
 JITTER_RATIOS = 0.6, 1.5
-# Minimum fraction of the white errors that jitter causes
+# Minimum fraction of the white errors (RMS) that jitter must explain
 MIN_JITTER_FRACTION = 0.4
 # Minimum significance (σ) of jitter, and of noise that grows with speed
 MIN_PATTERN_SIGMAS = 6.0
-# Growth of the noise with speed: number of tested flight parts, and minimum median of their
-# significances (σ)
+# Number of flight parts in which the growth with speed is tested, and its minimum median
+# significance (σ)
 PART_COUNT, MIN_PART_SIGMAS = 5, 1.2
-# Quantiles of the speed: below the first a position is slow, above the second it is fast
+# Speed quantiles: below the first the vehicle is slow, above the second it is fast
 SLOW_FRACTION, FAST_FRACTION = 0.3, 0.7
-# Minimum noise at high speed ÷ noise at low speed, along and across the motion
+# Noise grows with speed if it is larger by this factor at high speed, along and across the motion
 MIN_SPEED_NOISE_RATIO = 1.6
-# Minimum extent (m, RMS) of the motion for a fit to ground truth
+# Minimum extent (m, RMS) of a path whose errors are fitted to ground truth
 MIN_PATH_RMS_M = 0.5
 # Length (s) of the running mean that is removed from the errors of odometry, which drifts
 DRIFT_WINDOW_S = 12.0
 # Length (s) of the flight parts with separate time offsets
 OFFSET_PART_S = 4.0
-# Minimum speed (m/s, RMS of a part) for a time offset of the part
+# Minimum RMS speed (m/s) of a flight part whose time offset is estimated
 MIN_OFFSET_SPEED_M_S = 0.3
 # Minimum range (s) of a time offset that varies: an error of 8 cm at 1 m/s
 MIN_OFFSET_RANGE_S = 0.08
-# Minimum mean square of slow errors ÷ that of white noise: with less, the time offsets of the
-# flight parts only fit noise
+# Minimum ratio of the mean square slow error to that of the white noise: below, the fit of many
+# offsets only fits noise
 MIN_SLOW_RATIO = 0.25
 # Maximum fraction of the mean square slow error that remains after a fit of varying time offsets
 MAX_REMAINING_FRACTION = 0.2
@@ -73,7 +73,7 @@ MIN_AMPLITUDE_SIGMAS = 1.0
 MIN_PERIODS = 5.0
 # Maximum tested frequency (Hz)
 MAX_FREQUENCY_HZ = 2.0
-# Maximum fraction of the mean square motion at the frequency of a periodic error
+# Maximum fraction of the mean square motion at the frequency of a sinusoidal error
 MAX_MOTION_FRACTION = 0.1
 # Interval (s) and limit (s) of the tested delays of the logged attitude
 DELAY_STEP_S, MAX_ATTITUDE_DELAY_S = 0.01, 0.5
@@ -85,7 +85,7 @@ MAX_ROTATIONS = 20_000
 ROTATION_STEP_S = 0.1
 # Maximum difference (rad) of rotations: larger differences are resets of the attitude
 MAX_ROTATION_RAD = 0.2
-# Maximum mean square rotation difference with ÷ without correction of the delay
+# A delay of the attitude must reduce the mean square rotation difference to this fraction
 MAX_DELAYED_RATIO = 0.5
 # Minimum speed (m/s), and minimum noise (m) at this speed, for noise that grows with speed
 MIN_FAST_M_S, MIN_FAST_NOISE_M = 0.3, 0.02
@@ -103,15 +103,17 @@ class SpeedNoise(NamedTuple):
 
 
 class WhiteErrors(NamedTuple):
-    """Residuals of positions against the cubic through their neighbours.
+    """Residuals of positions and timestamps against the cubic through their neighbours.
 
-    ``residual_m``, shape (n, 2), is scaled to the noise of a position. ``late_s`` is the deviation
-    of the timestamp from a constant interval, relative to the neighbours and scaled likewise.
+    ``residual_m``, shape (n, 2), is divided by the noise gain of the cubic: its σ is that of a
+    position. ``late_s``, divided by the same gain, is the residual of the deviation (s) of the
+    timestamps from a constant rate. ``ekf2_speed_m_s`` is the horizontal speed from EKF2.
     """
 
     residual_m: Array
     velocity_m_s: Array
     late_s: Array
+    ekf2_speed_m_s: Array | None
 
 
 class ErrorFit(NamedTuple):
@@ -132,7 +134,7 @@ class ErrorFit(NamedTuple):
 
     @property
     def slow_square_m2(self) -> float:
-        """Sum of the mean squares of both axes, without white noise."""
+        """Mean square slow error (m²), summed over both axes; the white noise is subtracted."""
         return float(np.mean(self.remaining_m**2, axis=0).sum()) - 2.0 * self.white_m**2
 
 
@@ -165,7 +167,7 @@ def _positions(comparison: Comparison) -> tuple[Array, Array]:
 
 
 def white_errors(comparison: Comparison) -> WhiteErrors | None:
-    """Compare each position with the cubic through its neighbours; None if there are too few."""
+    """Compare each position with the cubic through its neighbours; None with too few positions."""
     time_s, position_m = _positions(comparison)
     if len(time_s) < MIN_POSITIONS:
         return None
@@ -181,21 +183,32 @@ def white_errors(comparison: Comparison) -> WhiteErrors | None:
     for row in range(len(NEIGHBOURS)):
         for other in set(range(len(NEIGHBOURS))) - {row}:
             weights[:, row] *= elapsed_s[:, other] / (elapsed_s[:, other] - elapsed_s[:, row])
-    noise_factor = np.sqrt(1.0 + np.sum(weights**2, axis=1))
-    deviation_s = time_s - interval_s * np.arange(len(time_s))
-    late_s = deviation_s - median_filter(deviation_s, MEDIAN_COUNT, mode="nearest")
-    half_count = max(2, round(HALF_VELOCITY_S / interval_s))
-    first = np.clip(rows - half_count, 0, None)
-    last = np.clip(rows + half_count, None, len(time_s) - 1)
+    noise_gain = np.sqrt(1.0 + np.sum(weights**2, axis=1))
+    phase_s = time_s - interval_s * np.arange(len(time_s))
+    late_s = phase_s - median_filter(phase_s, MEDIAN_TIMESTAMP_COUNT, mode="nearest")
+    half_window_rows = max(2, round(HALF_VELOCITY_S / interval_s))
+    first, last = (
+        np.clip(rows - half_window_rows, 0, None),
+        np.clip(rows + half_window_rows, None, len(time_s) - 1),
+    )
     velocity_m_s = (position_m[last] - position_m[first]) / (time_s[last] - time_s[first])[:, None]
-    is_accurate = noise_factor < MAX_RESIDUAL_FACTOR
+    is_accurate = noise_gain < MAX_RESIDUAL_NOISE_GAIN
 
     def residual(values: Array) -> Array:
         interpolated = np.einsum("nk,nk...->n...", weights, values[neighbour_rows])
-        residuals = ((values[rows] - interpolated).T / noise_factor).T
-        return np.asarray(residuals[is_accurate])
+        scaled = ((values[rows] - interpolated).T / noise_gain).T
+        return np.asarray(scaled[is_accurate])
 
-    return WhiteErrors(residual(position_m), velocity_m_s[is_accurate], residual(late_s))
+    ekf2 = comparison.flight.ekf2
+    ekf2_speed_m_s = None
+    if isinstance(ekf2, Ekf2):
+        logged_speed_m_s = np.linalg.norm(ekf2.state[Columns.VELOCITY[:2]].to_numpy(), axis=1)
+        ekf2_speed_m_s = np.interp(
+            time_s[rows[is_accurate]], ekf2.state.index.to_numpy(), logged_speed_m_s
+        )
+    return WhiteErrors(
+        residual(position_m), velocity_m_s[is_accurate], residual(late_s), ekf2_speed_m_s
+    )
 
 
 def find_timestamp_jitter(errors: WhiteErrors) -> float | None:
@@ -210,8 +223,8 @@ def find_timestamp_jitter(errors: WhiteErrors) -> float | None:
     if jitter_s < MIN_JITTER_S or not expected_square_m2:
         return None
     ratio = float(np.sum(errors.residual_m * expected_m)) / expected_square_m2
-    other_errors_m = errors.residual_m - ratio * expected_m
-    sigma = np.sqrt(SHARED_RESIDUALS * np.mean(other_errors_m**2) / expected_square_m2)
+    rest_m = errors.residual_m - ratio * expected_m
+    sigma = np.sqrt(SHARED_RESIDUALS * np.mean(rest_m**2) / expected_square_m2)
     fraction = np.sqrt(expected_square_m2 / np.sum(errors.residual_m**2))
     is_jitter = (
         JITTER_RATIOS[0] < ratio < JITTER_RATIOS[1]
@@ -223,7 +236,10 @@ def find_timestamp_jitter(errors: WhiteErrors) -> float | None:
 
 def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
     """Return the noise at low and high speed if it grows with speed in all directions."""
-    speed_m_s = np.linalg.norm(errors.velocity_m_s, axis=1)
+    # differences of the positions would give a speed that contains their noise
+    speed_m_s = errors.ekf2_speed_m_s
+    if speed_m_s is None:
+        return None
     sizes_m = np.linalg.norm(errors.residual_m, axis=1)
     # noise that is larger in one part of the flight correlates with speed in a few parts only
     significances = [
@@ -239,7 +255,8 @@ def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
         return None
     limits_m_s = np.quantile(speed_m_s, [SLOW_FRACTION, FAST_FRACTION])
     is_slow, is_fast = speed_m_s <= limits_m_s[0], speed_m_s >= limits_m_s[1]
-    direction = errors.velocity_m_s / np.maximum(speed_m_s, 1e-6)[:, None]
+    source_speed_m_s = np.linalg.norm(errors.velocity_m_s, axis=1, keepdims=True)
+    direction = errors.velocity_m_s / np.maximum(source_speed_m_s, 1e-6)
     along_m = np.abs(np.sum(errors.residual_m * direction, axis=1))
     across_m = np.abs(np.sum(errors.residual_m * _rotate_90(direction), axis=1))
     # jitter of the timestamps causes errors along the motion only
@@ -286,10 +303,10 @@ def fit_errors(comparison: Comparison, white: WhiteErrors) -> ErrorFit | None:
     )
     error_m = position_m - curve(time_s)
     parameters, remaining_m = _least_squares(columns, error_m)
-    # successive errors are correlated, so fewer of them are independent
+    # successive errors are correlated
     interval_s = float(np.median(np.diff(time_s)))
-    independent_count = len(time_s) / max(*map(autocorrelation_time, remaining_m.T), 1.0)
-    scale_sigma = np.sqrt(np.mean(remaining_m**2) / (path_square_m2 * independent_count))
+    independent = len(time_s) / max(*map(autocorrelation_time, remaining_m.T), 1.0)
+    sigma = np.sqrt(np.mean(remaining_m**2) / (path_square_m2 * independent))
     if comparison.source.origin.may_drift:
         width = max(1, round(DRIFT_WINDOW_S / interval_s))
 
@@ -306,7 +323,7 @@ def fit_errors(comparison: Comparison, white: WhiteErrors) -> ErrorFit | None:
         remaining_m,
         white_m,
         float(parameters[2]),
-        float(scale_sigma),
+        float(sigma),
     )
 
 
@@ -318,7 +335,7 @@ def _least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
 
 
 def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
-    """Return the sinusoid that explains most of the slow errors, unless it is in the motion."""
+    """Return the sinusoid that explains most of the slow errors; None if the motion contains it."""
     duration_s = fit.time_s[-1] - fit.time_s[0]
     highest_hz = min(MAX_FREQUENCY_HZ, 0.25 / float(np.median(np.diff(fit.time_s))))
     frequencies_hz = np.arange(MIN_PERIODS / duration_s, highest_hz, 0.2 / duration_s)
@@ -350,13 +367,13 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     The time offsets of all flight parts and the constants of :class:`ErrorFit` are fitted together.
     At rest a time offset causes no error, so jumps and slow errors are not explained.
     """
-    part_indices = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_S).astype(int)
-    square_sums = np.bincount(part_indices, np.sum(fit.velocity_m_s**2, axis=1))
-    square_speeds = square_sums / np.maximum(np.bincount(part_indices), 1)
+    parts = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_S).astype(int)
+    square_sums = np.bincount(parts, np.sum(fit.velocity_m_s**2, axis=1))
+    square_speeds = square_sums / np.maximum(np.bincount(parts), 1)
     moving_parts = np.flatnonzero(square_speeds > MIN_OFFSET_SPEED_M_S**2)
     if len(moving_parts) < 2:
         return None
-    is_in_part = part_indices[:, None] == moving_parts
+    is_in_part = parts[:, None] == moving_parts
     offset_columns = -fit.velocity_m_s[:, :, None] * is_in_part[:, None, :]
     constant_columns = fit.columns[..., :-1]  # without the constant time offset
     parameters, remaining_m = _least_squares(
@@ -372,38 +389,41 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     ):
         return None
     times_s = fit.time_s[0] + OFFSET_PART_S * (moving_parts + 0.5)
-    extremes = np.argmin(offsets_s), np.argmax(offsets_s)
+    least, most = np.argmin(offsets_s), np.argmax(offsets_s)
     return OffsetVariation(
-        *(float(values_s[index]) for values_s in (offsets_s, times_s) for index in extremes)
+        float(offsets_s[least]), float(offsets_s[most]), float(times_s[least]), float(times_s[most])
     )
 
 
 def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | None:
     """Return the time (s) by which the logged attitude is late, if it is not zero."""
-    imu_s, attitude_s = imu.index.to_numpy(), attitude.index.to_numpy()
-    start_s, end_s = max(imu_s[0], attitude_s[0]), min(imu_s[-1], attitude_s[-1])
+    imu_time_s, attitude_time_s = imu.index.to_numpy(), attitude.index.to_numpy()
+    start_s, end_s = (
+        max(imu_time_s[0], attitude_time_s[0]),
+        min(imu_time_s[-1], attitude_time_s[-1]),
+    )
     time_s = np.arange(start_s + MAX_ATTITUDE_DELAY_S, end_s - MAX_ATTITUDE_DELAY_S, DELAY_STEP_S)
     time_s = time_s[:MAX_ROTATIONS]
-    step = round(ROTATION_STEP_S / DELAY_STEP_S)
+    step_rows = round(ROTATION_STEP_S / DELAY_STEP_S)
     if len(time_s) < MIN_POSITIONS:
         return None
-    quaternions = interpolate(time_s, attitude_s, attitude[Columns.QUATERNION].to_numpy())
-    rotation_rad = to_vector(multiply(conjugate(quaternions[:-step]), quaternions[step:]))
-    gyro_angle_rad = cumulative_integral(imu[Columns.ANGULAR_RATE].to_numpy(), imu_s)
+    quaternions = interpolate(time_s, attitude_time_s, attitude[Columns.QUATERNION].to_numpy())
+    rotation_rad = to_vector(multiply(conjugate(quaternions[:-step_rows]), quaternions[step_rows:]))
+    angle_rad = cumulative_integral(imu[Columns.ANGULAR_RATE].to_numpy(), imu_time_s)
 
-    def mean_square_difference(delay_s: float) -> float:
-        angles_rad = np.array(
-            [np.interp(time_s - delay_s, imu_s, column) for column in gyro_angle_rad.T]
+    def difference(delay_s: float) -> float:
+        angles = [np.interp(time_s - delay_s, imu_time_s, column) for column in angle_rad.T]
+        differences_rad = (
+            rotation_rad - (np.array(angles)[:, step_rows:] - np.array(angles)[:, :-step_rows]).T
         )
-        differences_rad = rotation_rad - (angles_rad[:, step:] - angles_rad[:, :-step]).T
         differences_rad -= np.median(differences_rad, axis=0)  # the gyroscope bias
-        # resets of the attitude are larger than the rotations of a multicopter
+        # limit each difference: resets of the attitude exceed the rotations of a multicopter
         sizes_rad = np.minimum(np.linalg.norm(differences_rad, axis=1), MAX_ROTATION_RAD)
         return float(np.mean(sizes_rad**2))
 
     delays_s = np.arange(-MAX_ATTITUDE_DELAY_S, MAX_ATTITUDE_DELAY_S, 2.0 * DELAY_STEP_S)
-    delay_s = float(min(delays_s, key=mean_square_difference))
-    is_delay_confirmed = mean_square_difference(
+    delay_s = float(min(delays_s, key=difference))
+    is_late = abs(delay_s) >= MIN_ATTITUDE_DELAY_S and difference(
         delay_s
-    ) < MAX_DELAYED_RATIO * mean_square_difference(0.0)
-    return delay_s if is_delay_confirmed and abs(delay_s) >= MIN_ATTITUDE_DELAY_S else None
+    ) < MAX_DELAYED_RATIO * difference(0.0)
+    return delay_s if is_late else None

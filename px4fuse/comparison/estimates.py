@@ -39,7 +39,7 @@ MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
 # Minimum IMU rate (Hz) of telemetry: PX4 publishes vehicle_imu at 200 Hz (IMU_INTEG_RATE), and
 # slower telemetry skips samples
 MIN_TELEMETRY_IMU_HZ = 200.0
-# Minimum ratio of measured to nominal IMU rate: measured rates are up to 2 % lower
+# Minimum ratio of the measured IMU rate to the needed one: measured rates are up to 2 % lower
 MIN_IMU_RATE_RATIO = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 

@@ -89,7 +89,7 @@ def find_noisy_part(
     first_part = int(np.argmax(is_noisy))
     end_part = first_part + int(np.argmin(np.append(is_noisy[first_part:], False)))
     if is_noisy.sum() != end_part - first_part or is_noisy.all() or not is_noisy.any():
-        return None  # the noisy time spans are not contiguous
+        return None  # not exactly one noisy time span
     is_quiet = np.ones(len(time_s), bool)
     is_quiet[part_edges[first_part] : part_edges[end_part]] = False
     sigma_ratios = (

@@ -80,7 +80,7 @@ def prepare(
     is_in_ned = source_track.origin.is_gnss or source_track.origin.path == ALIGNED.path
     is_withheld = as_sent or is_in_ned or flight.log.is_assessed
     convention = None if is_withheld else check_convention(flight, source_track)
-    if convention is not None and settings.clock_offset_s:  # keep a time offset that the user chose
+    if convention is not None and settings.clock_offset_s:  # the user chose the time offset
         convention = structs.replace(convention, late_s=0.0)
     late_s = convention_faults(convention, flight, source_track.frame).late_s
     # clip to the valid range: a larger offset is then estimated at the edge of the search range

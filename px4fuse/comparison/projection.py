@@ -24,7 +24,7 @@ from px4fuse.flight.model import (
 
 # Minimum measurement noise √R (m) that EKF2 uses (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
-# Minimum number of common samples of two tracks for statistics of their difference
+# Minimum number of common samples of two tracks whose difference is evaluated
 MIN_COMMON_SAMPLES = 3
 # NED columns of each projected quantity, and exponent of the direction cosines (2 for variances)
 PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
@@ -231,7 +231,7 @@ def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array
     common_times = north.index.intersection(east.index)
     north, east = north.loc[common_times], east.loc[common_times]
     cosine, sine = float(direction[0]), float(direction[1])
-    projected = cosine * cosine * north + sine * sine * east  # correct for variances only
+    projected = cosine * cosine * north + sine * sine * east  # correct only for variances
     projected["innovation_m"] = cosine * north["innovation_m"] + sine * east["innovation_m"]
     for column in ("test_ratio", "fused", "rejected"):
         # EKF2 fuses or rejects both axes together: take the larger value
@@ -260,7 +260,7 @@ def observation_variance(
         return math.nan
     noise_factor = GNSS_HEIGHT_NOISE_FACTOR if aid == GNSS_POS and axis.name == "down" else 1.0
     configured_m2 = max(noise_factor * noise_m, EKF2_MIN_NOISE_M) ** 2
-    # EKF2 did not receive the variance in a position file
+    # EKF2 did not receive the variances of a position file
     ignores_reported = track.alignment is not None or aid == BAROMETER
     if ignores_reported or parameters.get(aid.noise_mode) == 1.0:
         return configured_m2

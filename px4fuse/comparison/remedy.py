@@ -45,8 +45,8 @@ def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
             for axis in ("north", "east")
             for updates in update_tables
         ]
-        # mean NIS times a fixed number: the number of evaluated samples depends on the delay
-        nis_sums.append(float(np.mean(nis)) * len(nis) * len(received.stamp_s))
+        # multiply the mean by a fixed number: the number of evaluated samples depends on the delay
+        nis_sums.append(float(np.mean(nis)) * len(nis) * len(received.timestamp_s))
     quadratic_coefficient, linear_coefficient, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
     if quadratic_coefficient <= 0.0:
         return None
@@ -131,7 +131,7 @@ def delay_limit(parameter_name: str, ml_delay_ms: float, logged_delay_ms: float)
 
 
 def aid_of(comparison: PreparedComparison, axis: str = "") -> Aid:
-    """Return EKF2's aiding source for the positions along an axis."""
+    """Return the EKF2 aiding source that fuses the positions along an axis."""
     return comparison.source.aid(axis) or EV_POS
 
 

@@ -21,7 +21,11 @@ from px4fuse.comparison.changes import (
     tuning_of_axis,
     unique_changes,
 )
-from px4fuse.comparison.comparison import difference, error_statistics, kf_error_statistics
+from px4fuse.comparison.comparison import (
+    difference_statistics,
+    error_statistics,
+    kf_error_statistics,
+)
 from px4fuse.comparison.estimates import Estimates, Tuning
 from px4fuse.comparison.model import (
     AxisComparison,
@@ -68,7 +72,7 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable
 
-# Maximum mean NIS of innovations without visible errors
+# Mean NIS up to which innovations count as normal
 MAX_NORMAL_NIS = 1.5
 INNOVATIONS = [f"innovation_{axis}_m" for axis in HORIZONTAL_AXES]
 INNOVATION_VARIANCES = [f"innovation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
@@ -77,9 +81,9 @@ OBSERVATION_VARIANCES = [f"observation_variance_{axis}_m2" for axis in HORIZONTA
 NO_DIFFERENCE = Unavailable(
     "difference KF - EKF2", "with this change KF and EKF2 use different frames", ""
 )
-# Maximum ratio of RMSE or σ ratio between log and EKF2 replay, for a comparison of re-runs with the
-# log instead of the replay
-MAX_REPLAY_LOG_RATIO = 1.10
+# Re-runs are compared with the log if the RMSE and the σ ratios of EKF2's replay agree with the log
+# within this factor, else with the replay
+MAX_REPLAY_TO_LOGGED_RATIO = 1.10
 
 
 class ErrorAboveSigma(NamedTuple):
@@ -135,7 +139,7 @@ class _Filter(NamedTuple):
     model: Model | None = None
 
     @property
-    def inputs(self) -> Inputs | None:
+    def ekf2_inputs(self) -> Inputs | None:
         return None if self.model is None else self.model.inputs
 
 
@@ -170,16 +174,16 @@ def rerun_filters(
 
 
 def planned_configurations(
-    comparison: Comparison, estimates: Estimates, inputs: Inputs
+    comparison: Comparison, estimates: Estimates, ekf2_inputs: Inputs
 ) -> list[FilterConfiguration]:
     """Return the EKF2 parameter sets that :func:`rerun_filters` will replay."""
-    if not is_source_fused(comparison, inputs):
+    if not is_source_fused(comparison, ekf2_inputs):
         return []
-    logged_parameters = inputs.settings
+    logged_parameters = ekf2_inputs.settings
     return [
         FilterConfiguration({**logged_parameters, **change})
         for axis_result in comparison.axes.values()
-        for change, _ in _changes_along(comparison, estimates, inputs, axis_result)
+        for change, _ in _changes_along(comparison, estimates, ekf2_inputs, axis_result)
         if change.keys() <= logged_parameters.keys()
     ]
 
@@ -190,12 +194,15 @@ def is_inconsistent(summary: FilterSummary | UntestedFilter) -> TypeGuard[Filter
 
 
 def _changes_along(
-    comparison: Comparison, estimates: Estimates, inputs: Inputs | None, axis_result: AxisComparison
+    comparison: Comparison,
+    estimates: Estimates,
+    ekf2_inputs: Inputs | None,
+    axis_result: AxisComparison,
 ) -> list[tuple[Change, tuple[Statistic, ...]]]:
     """Return each change to try along an axis, with the statistics that it may correct."""
-    summary = axis_result.filters["kf" if inputs is None else "ekf2"]
+    summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
     if not isinstance(summary, FilterSummary) or (
-        inputs is not None and axis_result.axis.name == "down"
+        ekf2_inputs is not None and axis_result.axis.name == "down"
     ):
         return []  # an EKF2 replay has no vertical position
     has_discrepancy = {
@@ -203,13 +210,13 @@ def _changes_along(
         "nis": is_inconsistent(summary),
     }
     candidates = {
-        statistic: candidate_changes(comparison, estimates, inputs, axis_result, statistic)
+        statistic: candidate_changes(comparison, estimates, ekf2_inputs, axis_result, statistic)
         for statistic in DISCREPANCIES
         if has_discrepancy[statistic]
     }
     changes = unique_changes(chain.from_iterable(candidates.values()))
     if axis_result is comparison.main:
-        changes = main_axis_changes(comparison, estimates, inputs)
+        changes = main_axis_changes(comparison, estimates, ekf2_inputs)
     return [
         (change, tuple(statistic for statistic in candidates if change in candidates[statistic]))
         for change in changes
@@ -222,7 +229,7 @@ def _try_changes(
     tested_filter: _Filter,
     axis_result: AxisComparison,
 ) -> list[Trial]:
-    changes = _changes_along(comparison, estimates, tested_filter.inputs, axis_result)
+    changes = _changes_along(comparison, estimates, tested_filter.ekf2_inputs, axis_result)
     if not changes:
         return []
     before, is_logged = _unchanged_statistics(tested_filter, axis_result)
@@ -232,7 +239,7 @@ def _try_changes(
         return Trial(
             filter=tested_filter.name,
             axis=axis_result.axis.name,
-            kinds=change_kinds(comparison, tested_filter.inputs, change),
+            kinds=change_kinds(comparison, tested_filter.ekf2_inputs, change),
             change=change,
             discrepancies=tuple(
                 statistic
@@ -260,7 +267,7 @@ def _try_changes(
 def _unchanged_statistics(
     tested_filter: _Filter, axis_result: AxisComparison
 ) -> tuple[RunStatistics, bool]:
-    """Return the statistics of the logged filter, and False if they are from EKF2's replay."""
+    """Return the statistics without a change, and True if they are from the log."""
     replayed_statistics, logged_state = tested_filter.rerun(axis_result, {}), axis_result.ekf2_state
     if tested_filter.model is None:
         return replayed_statistics, True
@@ -275,17 +282,17 @@ def _unchanged_statistics(
         innovations["innovation_m"].to_numpy(),
         innovations["innovation_variance_m2"].to_numpy(),
         error_statistics(compared_state, axis_result.ekf2_variance, axis_result.truth),
-        difference(axis_result.replay, compared_state),
+        difference_statistics(axis_result.replay, compared_state),
         float((rejected_flags > 0.0).mean()) if len(rejected_flags) else None,
     )
     logged_and_replayed = (
         (
             logged_statistics.position_rmse_m,
             replayed_statistics.position_rmse_m,
-            MAX_REPLAY_LOG_RATIO,
+            MAX_REPLAY_TO_LOGGED_RATIO,
         ),
-        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAY_LOG_RATIO**2),
-        (logged_statistics.nees_mean, replayed_statistics.nees_mean, MAX_REPLAY_LOG_RATIO**2),
+        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAY_TO_LOGGED_RATIO**2),
+        (logged_statistics.nees_mean, replayed_statistics.nees_mean, MAX_REPLAY_TO_LOGGED_RATIO**2),
     )
     is_replay_similar = all(
         logged_value and replayed_value and 1.0 / factor <= logged_value / replayed_value <= factor
@@ -359,7 +366,7 @@ def _rerun_kf(
         kf_error_statistics(kf_run, truth, ekf2_state),
         NO_DIFFERENCE
         if is_gnss_rotation or isinstance(ekf2_state, Unavailable)
-        else difference(kf_run, ekf2_state),
+        else difference_statistics(kf_run, ekf2_state),
     )
 
 
@@ -404,7 +411,7 @@ def _replay_statistics(
 ) -> RunStatistics:
     compared_s, axis = model.baseline_replay.evaluated_s, axis_result.axis
     if ROTATION in change and comparison.source.origin.is_gnss:
-        # a rotation of GNSS positions corrects EKF2's heading: the axis itself does not rotate
+        # the replay rotates GNSS positions and therefore EKF2's heading: rotate the axis back
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))
     direction_cosines, ekf2_updates = axis.direction[:2], ekf2_replay.updates
     ekf2_updates = rows_inside(ekf2_updates, compared_s)
@@ -429,6 +436,6 @@ def _replay_statistics(
         weighted_sum(ekf2_updates, INNOVATIONS, direction_cosines),
         innovation_variance_m2,
         error_statistics(published, variance_by_time, axis_result.truth),
-        difference(axis_result.replay, compared_track),
+        difference_statistics(axis_result.replay, compared_track),
         float((ekf2_updates["rejected"] > 0.0).mean()) if len(ekf2_updates) else None,
     )

@@ -31,7 +31,7 @@ SENSOR_CAUSE_TOLERANCE = 0.25
 COMBINED_CAUSE_TOLERANCE = 0.9
 # Keys of Trial.change that correct a sensor fault instead of a setting
 SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
-# Keys of Trial.change that only accompany another change
+# Keys of Trial.change that have no effect alone: a re-run sets them together with another change
 ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
 # A re-run has an effect if it changes a ratio of actual to reported σ by at least this factor
 MIN_RATIO_CHANGE = 1.10
@@ -201,7 +201,7 @@ def log_ratio_sum(statistics: RunStatistics) -> float:
 
 
 def preference_key(trial: Trial) -> tuple[bool, int, float]:
-    """Return a sort key for re-runs of one kind of change; the best re-run has the smallest."""
+    """Return a sort key for re-runs with one kind of change; the best re-run has the smallest."""
     is_solved = becomes_consistent(trial)
     return (
         not is_solved,
@@ -211,7 +211,7 @@ def preference_key(trial: Trial) -> tuple[bool, int, float]:
 
 
 def sigma_ratios(statistics: RunStatistics) -> dict[Reference, float]:
-    """Return the σ sigma_ratios (actual over reported) against source and ground truth."""
+    """Return the ratios of actual to reported σ against source and ground truth."""
     squared_ratios: dict[Reference, float | None] = {
         "source": statistics.nis_mean,
         "truth": statistics.nees_mean,
@@ -220,7 +220,7 @@ def sigma_ratios(statistics: RunStatistics) -> dict[Reference, float]:
 
 
 def log_ratio_reduction(trial: Trial) -> float:
-    """Return the decrease of the sum of |ln σ ratio| (:func:`log_ratio_sum`) by a re-run."""
+    """Return by how much a re-run reduces the sum of |ln σ ratio| (:func:`log_ratio_sum`)."""
     return log_ratio_sum(trial.before) - log_ratio_sum(trial.after)
 
 
@@ -252,7 +252,7 @@ def halves_discrepancy(trial: Trial) -> bool:
 
 
 def remains_overconfident(trial: Trial) -> bool:
-    """Return True if the filter remains nearly as overconfident against ground truth as before."""
+    """Return True if a re-run leaves the filter nearly as overconfident against ground truth."""
     return any(
         reference == "truth"
         and classify_sigma_ratio(before, reference)
@@ -266,7 +266,7 @@ def remains_overconfident(trial: Trial) -> bool:
 def find_trial(
     trials: Iterable[Trial], filter_name: FilterName, kind: str, name: str = ""
 ) -> Trial | None:
-    """Return the best re-run of one filter with one kind of change that improves something.
+    """Return the best re-run of a filter with one kind of change; None without an improvement.
 
     ``name`` limits the search to changes of one setting or EKF2 parameter.
     """

@@ -31,7 +31,7 @@ MIN_SIGMA_DOWN_M = 0.08
 # Degrees of freedom of the Student distribution of the residuals
 DEGREES_OF_FREEDOM = 4.0
 # Size of each length unit in metres
-UNITS: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
+UNIT_SIZES_M: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
 # Rotations (rad) of the frame about the vertical up to this angle are a misalignment
 SMALL_ROTATION_RAD = np.radians(8.0)
 # Maximum time offset (s) that does not lower the prior odds of a hypothesis
@@ -64,7 +64,7 @@ MAX_OFFSET_STEP_S = 0.15
 # 0.05 °/s), accelerometer bias (σ 0.3 m/s², 3 axes), no prior (0) for the others
 PARAMETER_PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
 # Horizontal directions, clockwise from above
-CLOCKWISE: tuple[Direction, ...] = ("north", "east", "south", "west")
+CLOCKWISE_DIRECTIONS: tuple[Direction, ...] = ("north", "east", "south", "west")
 # Log prior odds of common directions of x, y, z
 AXES_ODDS: Final[dict[Axes, float]] = {
     ("north", "east", "down"): 1.0,  # convention of PX4
@@ -102,8 +102,8 @@ class AxisAssignment(NamedTuple):
     def axes(self, quarter_turns: int) -> Axes:
         """Return the directions of x, y, z with ``axis_a`` at ``quarter_turns`` from north."""
         directions: list[Direction] = ["down" if self.vertical_sign > 0 else "up"] * 3
-        directions[self.axis_a] = CLOCKWISE[quarter_turns % 4]
-        directions[self.axis_b] = CLOCKWISE[(quarter_turns + self.handedness) % 4]
+        directions[self.axis_a] = CLOCKWISE_DIRECTIONS[quarter_turns % 4]
+        directions[self.axis_b] = CLOCKWISE_DIRECTIONS[(quarter_turns + self.handedness) % 4]
         return directions[0], directions[1], directions[2]
 
     def log_odds(self, quarter_turns: int) -> float:
@@ -127,8 +127,8 @@ class SentPositions:
     max_offset_s: float
     barometer: tuple[Array, Array] | None = None
 
-    def with_clock_drift(self, drift: float) -> "SentPositions":
-        return replace(self, time_s=without_clock_drift(self.time_s, drift))
+    def with_clock_drift(self, clock_drift: float) -> "SentPositions":
+        return replace(self, time_s=without_clock_drift(self.time_s, clock_drift))
 
     def motion(self, imu: ImuMotion) -> SourceMotion:
         """Return the second differences of the positions at a constant interval."""
@@ -198,10 +198,10 @@ class Hypothesis:
         return bool(is_similar and (self.assignment, self.unit) == (other.assignment, other.unit))
 
 
-def without_clock_drift(time_s: Array, drift: float) -> Array:
+def without_clock_drift(time_s: Array, clock_drift: float) -> Array:
     """Remove the drift of a clock (rate minus 1) from timestamps; their mean does not change."""
-    middle_s = float(np.mean(time_s))
-    return middle_s + (time_s - middle_s) / (1.0 + drift)
+    mean_time_s = float(np.mean(time_s))
+    return mean_time_s + (time_s - mean_time_s) / (1.0 + clock_drift)
 
 
 def search(
@@ -254,10 +254,8 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
     has_overlap = moments[:, 6, 6] * GRID_INTERVAL_S >= MIN_OVERLAP_S
     if not has_overlap.any():
         return []
-    offset_s, moments = (
-        (offset_steps[has_overlap] - offset_steps[-1] / 2.0) * GRID_INTERVAL_S,
-        moments[has_overlap],
-    )
+    offset_s = (offset_steps[has_overlap] - offset_steps[-1] / 2.0) * GRID_INTERVAL_S
+    moments = moments[has_overlap]
     independent_count = moments[:, 6, 6, None, None] * (GRID_INTERVAL_S / DIFFERENCE_WINDOW_S)
     moments /= moments[:, 6:, 6:]
     vertical_axis, vertical_sign, axis_a, axis_b, handedness = np.array(AXIS_ASSIGNMENTS).T
@@ -265,10 +263,8 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
         moments[:, axis_a, 0] + handedness * moments[:, axis_b, 1] + 1j * moments[:, axis_a, 1]
     )
     correlation -= 1j * handedness * moments[:, axis_b, 0]
-    source_square, unit_sizes_m = (
-        np.maximum(moments[:, 3:6, 6, None], 1e-12),
-        np.array([*UNITS.values()]),
-    )
+    source_square = np.maximum(moments[:, 3:6, 6, None], 1e-12)
+    unit_sizes_m = np.array([*UNIT_SIZES_M.values()])
     north_square, east_square, imu_down_square = np.moveaxis(moments[:, 6, 3:6, None, None], 1, 0)
     horizontal_square = (
         unit_sizes_m**2 * (source_square[:, axis_a] + source_square[:, axis_b])
@@ -283,8 +279,8 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
     score = np.sum(np.log(source_square), axis=1)[:, None] + 6.0 * np.log(unit_sizes_m)
     score = score - 2.0 * np.log(np.maximum(horizontal_square, MIN_SIGMA_M**2))
     score = 0.5 * independent_count * (score - np.log(np.maximum(down_square, MIN_SIGMA_DOWN_M**2)))
-    rotation_angle = np.angle(correlation)
-    nearest_quarter_turns = np.round(rotation_angle / (np.pi / 2.0)).astype(int) % 4
+    rotation_rad = np.angle(correlation)
+    nearest_quarter_turns = np.round(rotation_rad / (np.pi / 2.0)).astype(int) % 4
     hypotheses = []
     for quarter_turns in range(4):
         scores_at_quarter = np.where(
@@ -293,7 +289,7 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
         for (assignment_index, unit_index), offset_index in np.ndenumerate(
             np.argmax(scores_at_quarter, axis=0)
         ):
-            unit_name, assignment = [*UNITS][unit_index], AXIS_ASSIGNMENTS[assignment_index]
+            unit_name, assignment = [*UNIT_SIZES_M][unit_index], AXIS_ASSIGNMENTS[assignment_index]
             # without heights, only the third axis can be vertical
             if assignment.vertical_axis != 2 and not source_motion.table[:, 2].any():
                 continue
@@ -303,7 +299,7 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
                 + UNIT_ODDS * (unit_name != "m")
             )
             parameters = np.array(
-                [offset_s[offset_index], rotation_angle[offset_index, assignment_index], *[0.0] * 5]
+                [offset_s[offset_index], rotation_rad[offset_index, assignment_index], *[0.0] * 5]
             )
             hypotheses.append(Hypothesis(assignment, unit_name, parameters, float(total_score)))
     hypotheses.sort(key=lambda hypothesis: -hypothesis.score)
@@ -335,11 +331,11 @@ def _evaluate_hypothesis(
     hypothesis: Hypothesis, rows: IntArray, source_motion: SourceMotion, imu_motion: ImuMotion
 ) -> tuple[Hypothesis, Array]:
     """Return the hypothesis with its log likelihood, and the Gauss-Newton step."""
-    offset_s, rotation_angle, heading_drift, clock_drift = hypothesis.parameters[:4]
+    offset_s, rotation_rad, heading_drift_rad_s, clock_drift = hypothesis.parameters[:4]
     accelerometer_bias, time_s = hypothesis.parameters[4:], source_motion.time_s[rows]
     row_interval_s = GRID_INTERVAL_S * float(np.median(np.diff(rows)))
-    middle_s = float(np.mean(time_s))
-    grid_position = time_s - offset_s - clock_drift * (time_s - middle_s)
+    mean_time_s = float(np.mean(time_s))
+    grid_position = time_s - offset_s - clock_drift * (time_s - mean_time_s)
     grid_position = (grid_position - imu_motion.time_s[0]) / GRID_INTERVAL_S
     grid_index = np.clip(np.floor(grid_position).astype(int), 0, len(imu_motion.time_s) - 2)
     is_used = (
@@ -356,12 +352,10 @@ def _evaluate_hypothesis(
     imu_table = (1.0 - grid_fraction) * imu_motion.table[
         grid_index
     ] + grid_fraction * imu_motion.table[grid_index + 1]
-    sent_differences, (vertical_axis, vertical_sign, axis_a, axis_b, handedness) = (
-        source_motion.table[rows[is_used]],
-        hypothesis.assignment,
-    )
-    unit_m = UNITS[hypothesis.unit]
-    complex_rotation = unit_m * np.exp(1j * (rotation_angle + heading_drift * elapsed_s))
+    sent_differences = source_motion.table[rows[is_used]]
+    vertical_axis, vertical_sign, axis_a, axis_b, handedness = hypothesis.assignment
+    unit_m = UNIT_SIZES_M[hypothesis.unit]
+    complex_rotation = unit_m * np.exp(1j * (rotation_rad + heading_drift_rad_s * elapsed_s))
     horizontal_m = complex_rotation * (
         sent_differences[:, axis_a] + 1j * handedness * sent_differences[:, axis_b]
     )
@@ -378,8 +372,9 @@ def _evaluate_hypothesis(
     log_likelihood_gain, sigma_m = student_score(residual_squares[0], 2, MIN_SIGMA_M)
     vertical_log_likelihood, sigma_down_m = student_score(residual_squares[1], 1, MIN_SIGMA_DOWN_M)
     is_axis_known = sent_differences.any(axis=0)  # False for the height if the source has none
-    log_likelihood_gain += vertical_log_likelihood * is_axis_known[vertical_axis]
-    log_likelihood_gain += np.log(unit_m) * np.count_nonzero(is_axis_known)
+    log_likelihood_gain += vertical_log_likelihood * is_axis_known[vertical_axis] + np.log(
+        unit_m
+    ) * np.count_nonzero(is_axis_known)
     log_likelihood_gain -= sum(
         student_score(column**2, 1, 1e-6)[0] for column in sent_differences.T[is_axis_known]
     )
@@ -402,16 +397,14 @@ def _evaluate_hypothesis(
     jacobian[..., 0] = imu_motion.rate_m_s[grid_index]
     jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal_m.imag, horizontal_m.real
     jacobian[..., 2] = jacobian[..., 1] * elapsed_s[:, None]
-    jacobian[..., 3] = jacobian[..., 0] * (time_s - middle_s)[:, None]
+    jacobian[..., 3] = jacobian[..., 0] * (time_s - mean_time_s)[:, None]
     jacobian[..., 4:] = imu_table[..., 1:]
     uses_gyro_heading = hypothesis.heading_from != "EKF2"
     is_free = np.array(
         [True, hypothesis.has_rotation, uses_gyro_heading, hypothesis.has_clock_drift, *[True] * 3]
     )
-    weights, columns = (
-        weight[[0, 0, 1]].T.ravel(),
-        jacobian[..., is_free].reshape(-1, is_free.sum()),
-    )
+    weights = weight[[0, 0, 1]].T.ravel()
+    columns = jacobian[..., is_free].reshape(-1, is_free.sum())
     weighted_columns = columns.T * weights
     normal_matrix = weighted_columns @ columns + np.diag(PARAMETER_PRECISION[is_free] + 1e-9)
     gradient = (
@@ -468,7 +461,7 @@ def _height_log_likelihood(
     """Return the log likelihood ratio of the barometer heights: sent heights against a constant."""
     height_m = np.interp(positions.time_s - hypothesis.offset_s, time_s, barometer_m)
     down_m = (
-        UNITS[hypothesis.unit]
+        UNIT_SIZES_M[hypothesis.unit]
         * hypothesis.assignment.vertical_sign
         * positions.position_m[:, hypothesis.assignment.vertical_axis]
     )

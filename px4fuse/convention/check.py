@@ -8,7 +8,7 @@ from msgspec import structs
 from px4fuse.convention.axes import (
     MAX_OFFSET_S,
     SMALL_ROTATION_RAD,
-    UNITS,
+    UNIT_SIZES_M,
     Hypothesis,
     SentPositions,
     find_candidates,
@@ -94,9 +94,12 @@ def check_convention(
         return None
     if clock_drift := _clock_drift(positions, motions[hypotheses[0].heading_from], hypotheses[0]):
         positions_without_drift = positions.with_clock_drift(clock_drift)
-        with_drift = _search_hypotheses(positions_without_drift, motions)
-        if with_drift and with_drift[0].score > hypotheses[0].score + MIN_DRIFT_GAIN:
-            hypotheses, positions = with_drift, positions_without_drift
+        hypotheses_without_drift = _search_hypotheses(positions_without_drift, motions)
+        if (
+            hypotheses_without_drift
+            and hypotheses_without_drift[0].score > hypotheses[0].score + MIN_DRIFT_GAIN
+        ):
+            hypotheses, positions = hypotheses_without_drift, positions_without_drift
         else:
             clock_drift = 0.0
     convention = _choose_convention(hypotheses, positions, clock_drift)
@@ -192,13 +195,11 @@ def _choose_convention(
 
 
 def _describe_hypothesis(hypothesis: Hypothesis) -> str:
-    rotation = (
-        f", rotated by {-np.degrees(hypothesis.remainder_rad):+.0f}°"
-        if hypothesis.has_rotation
-        else ""
-    )
-    axes = format_axes(hypothesis.axes, hypothesis.unit)
-    return f"{axes}{rotation}, timestamps {hypothesis.offset_s:+.1f} s late"
+    properties = [format_axes(hypothesis.axes, hypothesis.unit)]
+    if hypothesis.has_rotation:
+        properties.append(f"rotated by {-np.degrees(hypothesis.remainder_rad):+.0f}°")
+    properties.append(f"timestamps {hypothesis.offset_s:+.1f} s late")
+    return ", ".join(properties)
 
 
 def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
@@ -208,12 +209,12 @@ def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
     motion.
     """
     third_differences = np.diff(positions.position_m, 3, axis=0)
-    residual_deviation = 1.4826 * float(
+    third_difference_sigma = 1.4826 * float(
         np.median(np.abs(third_differences - np.median(third_differences, axis=0)))
     )
     noise_m = (
-        UNITS[hypothesis.unit]
-        * residual_deviation
+        UNIT_SIZES_M[hypothesis.unit]
+        * third_difference_sigma
         * np.sqrt(SECOND_DIFFERENCE_VARIANCE / THIRD_DIFFERENCE_VARIANCE)
     )
     return float(hypothesis.residual_sigma_m / np.hypot(noise_m, IMU_SIGMA_M))
@@ -282,9 +283,9 @@ def _check_orientation(
             best.unit,
             True,
         ):
-            x_deg = float(np.degrees(hypothesis.parameters[1]))
+            x_heading_deg = float(np.degrees(hypothesis.parameters[1]))
             heading_errors = [
-                (x_deg - correct_heading_deg + 180.0) % 360.0 - 180.0
+                (x_heading_deg - correct_heading_deg + 180.0) % 360.0 - 180.0
                 for correct_heading_deg in correct_headings_deg
             ]
             return structs.replace(convention, heading_error_deg=min(heading_errors, key=abs))

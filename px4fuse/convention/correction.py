@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.convention.axes import CLOCKWISE, UNITS, without_clock_drift
+from px4fuse.convention.axes import CLOCKWISE_DIRECTIONS, UNIT_SIZES_M, without_clock_drift
 from px4fuse.convention.model import Convention
 from px4fuse.convention.motion import read_inertial, replace_heading
 from px4fuse.convention.orientation import to_attitude
@@ -143,7 +143,7 @@ def _axes_and_rotation(convention: Convention) -> tuple[bool, float]:
     is_known_frame = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
     if convention.is_mirrored or is_known_frame or convention.z not in ("up", "down"):
         return True, rotation_deg * (abs(rotation_deg) > MIN_REMAINDER_DEG)
-    total_deg = rotation_deg - 90.0 * CLOCKWISE.index(convention.x) + 90.0 * is_up
+    total_deg = rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x) + 90.0 * is_up
     total_deg = (total_deg + 180.0) % 360.0 - 180.0
     return is_up, total_deg * (abs(total_deg) > MIN_ROTATION_DEG)
 
@@ -197,14 +197,14 @@ def correct_convention(
     attitude = inertial.attitudes[convention.heading_from]
     # the axes of the positions are correct: rotate the attitude to the north of the positions
     if not faults.has_wrong_axes and not faults.rotation_deg:
-        turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE.index(convention.x)
+        turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x)
         attitude = replace_heading(attitude, heading(attitude) + np.radians(turn_deg))
     attitude_table = pd.DataFrame(attitude, time_index(inertial.time_s), Columns.QUATERNION)
     return replace(flight, attitude=attitude_table), track
 
 
 def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:
-    unit_m = UNITS[convention.unit]
+    unit_m = UNIT_SIZES_M[convention.unit]
     if not faults.has_wrong_axes and not faults.rotation_deg:
         return unit_m * np.eye(3)
     permutation = [

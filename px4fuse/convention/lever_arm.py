@@ -66,13 +66,13 @@ def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverAr
     if isinstance(attitude, Unavailable) or len(position_samples) < 2:
         return None
     time_s, true_samples = position_samples.index.to_numpy(), truth.samples
-    true_m = [
+    true_positions_m = [
         np.interp(time_s, true_samples.index, true_samples[name], np.nan, np.nan)
         for name in columns
     ]
-    error_m = position_samples.to_numpy() - np.transpose(true_m)
+    error_m = position_samples.to_numpy() - np.transpose(true_positions_m)
     # a delay is estimated too (error = velocity · delay), because it resembles a lever arm
-    velocity_m_s = np.gradient(np.transpose(true_m), time_s, axis=0)
+    velocity_m_s = np.gradient(np.transpose(true_positions_m), time_s, axis=0)
     quaternions = attitude[Columns.QUATERNION].to_numpy()
     rotation = to_matrix(interpolate(time_s, attitude.index.to_numpy(), quaternions))[:, :2, :2]
     identity_columns = np.broadcast_to(np.eye(2), rotation.shape)
@@ -117,10 +117,8 @@ def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
         source_motion = SourceMotion.of(time_s, position_samples.to_numpy(), imu_motion.time_s)
         is_used = is_used & source_motion.is_valid
         difference_m = source_motion.table - imu_motion.table[:, :2, 0]
-        design_rows, used_differences_m = (
-            design[is_used].reshape(-1, design.shape[2]),
-            difference_m[is_used].ravel(),
-        )
+        design_rows = design[is_used].reshape(-1, design.shape[2])
+        used_differences_m = difference_m[is_used].ravel()
         # second differences overlap over twice the window, so only these are independent
         independent_count = len(used_differences_m) * GRID_INTERVAL_S / (2.0 * DIFFERENCE_WINDOW_S)
         if independent_count < 2 * design_rows.shape[1]:

@@ -94,12 +94,12 @@ class SourceMotion:
         """Compute the second differences of positions at the times ``grid_s``; invalid in gaps."""
         window_steps = round(DIFFERENCE_WINDOW_S / GRID_INTERVAL_S)
         at_s = grid_s[0] + GRID_INTERVAL_S * np.arange(-window_steps, len(grid_s) + window_steps)
-        is_near = is_bracketed(at_s, time_s, gap_limit(time_s, MIN_GAP_S))
+        has_near_samples = is_bracketed(at_s, time_s, gap_limit(time_s, MIN_GAP_S))
         columns = np.column_stack([np.interp(at_s, time_s, column) for column in position.T])
         is_valid = (
-            is_near[2 * window_steps :]
-            & is_near[window_steps:-window_steps]
-            & is_near[: -2 * window_steps]
+            has_near_samples[2 * window_steps :]
+            & has_near_samples[window_steps:-window_steps]
+            & has_near_samples[: -2 * window_steps]
         )
         return cls(grid_s, high_pass(second_difference(columns, window_steps), is_valid), is_valid)
 
@@ -204,10 +204,8 @@ def _level_attitude(attitude: Array, force_m_s2: Array) -> Array:
 def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
     """Return the centred running mean over ``width`` rows, without invalid rows."""
     rows = np.arange(len(values))
-    first_rows, end_rows = (
-        np.clip(rows - width // 2, 0, None),
-        np.clip(rows + width // 2 + 1, None, len(rows)),
-    )
+    first_rows = np.clip(rows - width // 2, 0, None)
+    end_rows = np.clip(rows + width // 2 + 1, None, len(rows))
     valid_values = np.where(is_valid[:, None], values.reshape(len(rows), -1), 0.0)
     cumulative = np.cumsum(np.column_stack([valid_values, is_valid]), axis=0)
     cumulative = np.concatenate([np.zeros_like(cumulative[:1]), cumulative])
@@ -260,8 +258,8 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
 
 def replace_heading(attitude: Array, heading_rad: Array) -> Array:
     """Rotate an attitude about the vertical to another heading."""
-    half_angle = np.unwrap(heading_rad - heading(attitude)) / 2.0
-    zeros = np.zeros_like(half_angle)
+    half_turn_rad = np.unwrap(heading_rad - heading(attitude)) / 2.0
+    zeros = np.zeros_like(half_turn_rad)
     return multiply(
-        np.stack([np.cos(half_angle), zeros, zeros, np.sin(half_angle)], axis=-1), attitude
+        np.stack([np.cos(half_turn_rad), zeros, zeros, np.sin(half_turn_rad)], axis=-1), attitude
     )

@@ -18,16 +18,16 @@ from px4fuse.trajectory.rotation import from_vector, heading, interpolate, multi
 
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 # Quaternion (w, x, y, z) of half a turn about x, from FLU to FRD
-FRD_FLU = np.array([0.0, 1.0, 0.0, 0.0])
+FLU_TO_FRD = np.array([0.0, 1.0, 0.0, 0.0])
 # Quaternion (w, x, y, z) from ENU to NED
-ENU_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
+ENU_TO_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 # Quaternions that convert the world frame to NED and the body frame to FRD, by names of both frames
 FRAMES: Final[dict[Frames, tuple[Array, Array]]] = {
     "FRD to NED": (IDENTITY, IDENTITY),
-    "FLU to ENU": (ENU_NED, FRD_FLU),
-    "FLU to NWU": (FRD_FLU, FRD_FLU),
-    "FLU to NED": (IDENTITY, FRD_FLU),
-    "FRD to ENU": (ENU_NED, IDENTITY),
+    "FLU to ENU": (ENU_TO_NED, FLU_TO_FRD),
+    "FLU to NWU": (FLU_TO_FRD, FLU_TO_FRD),
+    "FLU to NED": (IDENTITY, FLU_TO_FRD),
+    "FRD to ENU": (ENU_TO_NED, IDENTITY),
 }
 ORDERS: tuple[Order, Order] = ("w x y z", "x y z w")
 # Maximum median difference (°) from EKF2's attitude for a copy of it: copies differ by 0.03°, fused
@@ -107,11 +107,13 @@ def check_orientation(
     return convention, sample_s, to_attitude(sent_quaternions, convention)
 
 
-def to_attitude(sent: Array, convention: OrientationConvention) -> Array:
+def to_attitude(sent_quaternions: Array, convention: OrientationConvention) -> Array:
     """Convert an orientation as sent to the attitude (w, x, y, z; FRD to NED)."""
-    world, body = FRAMES[convention.frames]
-    w_first = sent if convention.order == "w x y z" else np.roll(sent, 1, 1)
-    return multiply(multiply(world, w_first), body)
+    world_rotation, body_rotation = FRAMES[convention.frames]
+    w_first_quaternions = (
+        sent_quaternions if convention.order == "w x y z" else np.roll(sent_quaternions, 1, 1)
+    )
+    return multiply(multiply(world_rotation, w_first_quaternions), body_rotation)
 
 
 def _make_candidate(

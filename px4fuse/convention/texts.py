@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from px4fuse.convention.axes import UNITS
+from px4fuse.convention.axes import UNIT_SIZES_M
 from px4fuse.convention.model import Axes, Direction, Unit
 
 # Directions ordered so that the reversed tuple contains the opposite of each direction
@@ -93,9 +93,8 @@ def describe_unit(
     fault = f"{positions} are in {UNIT_NAMES[unit]}, not in {stated_unit}"
     if is_file and unit != "feet":
         return fault, f"Run again with --position-unit {unit}."
-    return fault, (
-        f"Multiply x, y and z by {UNITS[unit]:g} {'in the file' if is_file else 'before sending'}."
-    )
+    place = "in the file" if is_file else "before sending"
+    return fault, f"Multiply x, y and z by {UNIT_SIZES_M[unit]:g} {place}."
 
 
 def describe_conversion(frames: str) -> str:

@@ -33,21 +33,21 @@ _register: ContextVar[_InputRegister | None] = ContextVar("register", default=No
 @contextmanager
 def inputs_protected() -> Iterator[None]:
     """Register all files that are read inside the context, and reject writing to them."""
-    token = _register.set(_InputRegister())
+    previous_register = _register.set(_InputRegister())
     try:
         yield
     finally:
-        _register.reset(token)
+        _register.reset(previous_register)
 
 
 @contextmanager
 def inputs_not_registered() -> Iterator[None]:
     """Do not register files that are read inside the context; outputs may overwrite them."""
-    token = _register.set(None)
+    previous_register = _register.set(None)
     try:
         yield
     finally:
-        _register.reset(token)
+        _register.reset(previous_register)
 
 
 def add_input(path: Path) -> None:
@@ -79,11 +79,11 @@ def check_output_folder(folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"the output folder {folder} is a file. Choose another name.")
     register = _register.get() or _InputRegister()
-    entries = _folder_entries(folder)
+    folder_entries = _folder_entries(folder)
     for path in (
         folder,
-        *entries,
-        *(child for entry in entries for child in _folder_entries(entry)),
+        *folder_entries,
+        *(child for entry in folder_entries for child in _folder_entries(entry)),
     ):
         if (identity := _file_identity(path)) is None:
             continue

@@ -54,8 +54,8 @@ def check_readable(path: Path, folders: Sequence[Path]) -> None:
 
     ``folders`` are resolved paths; without folders, each path is accepted.
     """
-    target = Path(os.path.realpath(path))
-    if folders and not any(map(target.is_relative_to, folders)):
+    resolved_path = Path(os.path.realpath(path))
+    if folders and not any(map(resolved_path.is_relative_to, folders)):
         folder_names = " or ".join(map(str, folders))
         raise LogError(
             f"{display_name(path)} is outside the folders that --root allows",
@@ -76,19 +76,19 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
     name = name or display_name(path)
     try:
         check_readable(path, readable_folders.get())
-        status = path.stat()
+        file_status = path.stat()
     except (OSError, ValueError) as error:  # ValueError: the path contains NUL
         suggestion = ""
         with suppress(OSError):  # no suggestion if the folder cannot be listed
             if isinstance(error, FileNotFoundError):
                 suggestion = suggest_name(path.name, os.listdir(path.parent)).strip()  # noqa: PTH208
         raise _read_error(name, error, error_type, suggestion) from error
-    if stat.S_ISDIR(status.st_mode):
+    if stat.S_ISDIR(file_status.st_mode):
         raise error_type(f"{name} is a folder", "Give a file.")
-    if not stat.S_ISREG(status.st_mode):
+    if not stat.S_ISREG(file_status.st_mode):
         raise error_type(f"{name} is a device, pipe or socket.", "Save the data to a file first.")
     add_input(path)
-    return status.st_size
+    return file_status.st_size
 
 
 def read_head(path: Path, byte_count: int, error_type: type[Px4FuseError]) -> bytes:
@@ -138,9 +138,12 @@ def read_log_bytes(path: Path) -> bytes:
     LogError
         The log cannot be read, is not a regular file, is empty or too large.
     """
-    limit_bytes, empty_remedy = max_log_bytes.get(), "Copy the log from the vehicle again."
     return read_bytes_limited(
-        path, LogError, limit_bytes, size_remedy=LOG_SIZE_REMEDY, empty_remedy=empty_remedy
+        path,
+        LogError,
+        max_log_bytes.get(),
+        size_remedy=LOG_SIZE_REMEDY,
+        empty_remedy="Copy the log from the vehicle again.",
     )
 
 
@@ -184,9 +187,9 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
     for path in paths:
         if path.is_dir():
             files = [
-                f
-                for f in files_below(path)
-                if f.is_file() and file_size(f, LogError) <= limit_bytes
+                folder_file
+                for folder_file in files_below(path)
+                if folder_file.is_file() and file_size(folder_file, LogError) <= limit_bytes
             ]
         elif (size_bytes := file_size(path, LogError)) > limit_bytes:
             raise LogError(
@@ -217,8 +220,8 @@ def files_below(folder: Path) -> list[Path]:
         try:
             with os.scandir(folder_path) as entries:
                 for entry in entries:
-                    targets = pending_folders if entry.is_dir(follow_symlinks=False) else files
-                    targets.append(Path(entry.path))
+                    destination = pending_folders if entry.is_dir(follow_symlinks=False) else files
+                    destination.append(Path(entry.path))
         except OSError:
             files.append(folder_path)
     return sorted(files)
@@ -236,8 +239,8 @@ def _read_bytes(path: Path, byte_count: int, error_type: type[Px4FuseError], nam
 def _open_decompressed(path: Path) -> Any:
     """Open a file; if gzip or zstd compressed it, its decompressed content is read."""
     with path.open("rb") as file:
-        library = {b"\x1f\x8b\x08": gzip, b"\x28\xb5\x2f": zstd}.get(file.read(3))
-    return library.open(path) if library else path.open("rb")
+        compression_module = {b"\x1f\x8b\x08": gzip, b"\x28\xb5\x2f": zstd}.get(file.read(3))
+    return compression_module.open(path) if compression_module else path.open("rb")
 
 
 def _read_error(

@@ -159,12 +159,13 @@ def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
 def to_serializable(value: Any) -> Any:
     """Remove from a record, and the records in it, the fields that are not written."""
     if isinstance(value, Record):
-        written = (
+        written_names = (
             field.name
             for field in msgspec.structs.fields(value)
             if field.type is not msgspec.UnsetType
         )
-        return type(value)(**{name: to_serializable(getattr(value, name)) for name in written})
+        fields = {name: to_serializable(getattr(value, name)) for name in written_names}
+        return type(value)(**fields)
     if isinstance(value, Mapping):
         return {key: to_serializable(child) for key, child in value.items()}
     return tuple(map(to_serializable, value)) if isinstance(value, tuple) else value

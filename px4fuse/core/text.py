@@ -111,13 +111,13 @@ def join_first(names: Sequence[str], max_count: int, separator: str = ", ") -> s
     return separator.join(names[:max_count]) + suffix
 
 
-def format_p_value(p: float) -> str:
+def format_p_value(p_value: float) -> str:
     """Format a p-value with 2 significant digits, or as "p < 0.001".
 
     >>> [format_p_value(p) for p in (0.43, 0.0214, 0.00051, 3e-113, 0.0)]
     ['p 0.43', 'p 0.021', 'p < 0.001', 'p < 0.001', 'p < 0.001']
     """
-    return "p < 0.001" if p < 0.001 else f"p {format_number(p, 2)}"
+    return "p < 0.001" if p_value < 0.001 else f"p {format_number(p_value, 2)}"
 
 
 def format_length(length_m: float) -> str:
@@ -194,14 +194,14 @@ def one_line(text: str, max_length: int) -> str:
 
 @cache
 def _is_safe_character(character: str) -> bool:
-    code = ord(character)
+    code_point = ord(character)
     if character in "\n\t":
         return True
     return not (
         unicodedata.category(character) in {"Cc", "Cs", "Zl", "Zp"}
-        or 0x202A <= code <= 0x202E
-        or 0x2066 <= code <= 0x2069
-        or 0xE0000 <= code <= 0xE007F
-        or 0xFDD0 <= code <= 0xFDEF
-        or code & 0xFFFE == 0xFFFE
+        or 0x202A <= code_point <= 0x202E
+        or 0x2066 <= code_point <= 0x2069
+        or 0xE0000 <= code_point <= 0xE007F
+        or 0xFDD0 <= code_point <= 0xFDEF
+        or code_point & 0xFFFE == 0xFFFE
     )

@@ -11,7 +11,7 @@ _UNIT_TABLES = read_toml(__file__, dict[str, dict[str, Any]])
 # Full name of each unit, by its symbol
 UNIT_NAMES: Mapping[str, str] = _UNIT_TABLES["names"]
 # Conversion factors to one unit of each quantity, by quantity and unit (lower case)
-_RATIOS: Mapping[str, Mapping[str, float]] = _UNIT_TABLES["typed"]
+_UNIT_FACTORS: Mapping[str, Mapping[str, float]] = _UNIT_TABLES["typed"]
 _NUMBER_WITH_UNIT = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)
 
 
@@ -26,8 +26,8 @@ def convert_to_unit(text: str, unit: str) -> float | None:
     match = _NUMBER_WITH_UNIT.fullmatch(text.strip())
     unit = unit.lower()
     typed_unit = match[2].lower() or unit if match else ""
-    for ratios in ({unit: 1.0}, *_RATIOS.values()):
-        if match and {typed_unit, unit} <= ratios.keys():
+    for factors in ({unit: 1.0}, *_UNIT_FACTORS.values()):
+        if match and {typed_unit, unit} <= factors.keys():
             with suppress(ValueError):  # float() rejects several decimal points
-                return float(match[1].replace(",", ".")) * (ratios[typed_unit] / ratios[unit])
+                return float(match[1].replace(",", ".")) * (factors[typed_unit] / factors[unit])
     return None

@@ -58,14 +58,14 @@ class _Worker:
         self.process = context.Process(
             target=_run_worker, args=(child_pipe, function, memory_bytes)
         )
-        environment = dict(os.environ)
+        previous_environment = dict(os.environ)
         os.environ.update(_WORKER_ENVIRONMENT)
         try:
             with _interrupts_blocked():
                 self.process.start()
         finally:
             os.environ.clear()
-            os.environ.update(environment)
+            os.environ.update(previous_environment)
         child_pipe.close()  # else the pipe would stay open after the worker process has died
         self.is_ready = False
         self.job_index = job_index
@@ -189,9 +189,10 @@ def run_one_with_limits(
     memory_bytes: int = MAX_MEMORY_BYTES,
 ) -> Result | JobFailure:
     """Call a function on one job in a worker process, with limits as in :func:`run_with_limits`."""
-    results = run_with_limits(function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes)
-    with closing(results):
-        return next(results)[1]
+    [(_, outcome)] = run_with_limits(
+        function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes
+    )
+    return outcome
 
 
 def _receive_result(worker: _Worker) -> tuple[bool, Any]:
@@ -202,7 +203,7 @@ def _receive_result(worker: _Worker) -> tuple[bool, Any]:
         phase = "a job" if worker.is_ready else "its start"
         exit_code = worker.process.exitcode
         return False, JobFailure(
-            f"the worker process ended during {phase} (exit code {exit_code}). Repeat the command."
+            f"the worker process ended during {phase} (exit code {exit_code})."
         )
     # unpickling runs code of the classes of the result, which may raise any exception
     except Exception as error:  # noqa: BLE001
@@ -231,8 +232,8 @@ def _pickled_result(function: Callable[[Any], Any], job: Any) -> bytes:
         failure = JobFailure("the job exceeded the memory limit for one file.")
         return pickle.dumps((False, failure))
     except Exception as error:  # noqa: BLE001 - the failure of a job is its result
-        kind = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "
-        return pickle.dumps((True, JobFailure(one_line(f"{kind}{error}", 300))))
+        error_prefix = "" if isinstance(error, Px4FuseError) else f"{type(error).__name__}: "
+        return pickle.dumps((True, JobFailure(one_line(f"{error_prefix}{error}", 300))))
 
 
 def _end_with_parent() -> None:

@@ -74,10 +74,10 @@ def _write_output(path: Path, content: bytes) -> None:
         sys.stdout.flush()
         sys.stdout.buffer.write(content)
         sys.stdout.flush()
-    elif stat.S_ISREG(mode := _file_mode(path)):
+    elif stat.S_ISREG(file_mode := _file_mode(path)):
         _replace_file(path.resolve(), content)
     else:
-        with _open_pipe(path) if stat.S_ISFIFO(mode) else path.open("wb") as file:
+        with _open_pipe(path) if stat.S_ISFIFO(file_mode) else path.open("wb") as file:
             file.write(content)
 
 

@@ -155,9 +155,9 @@ def flight_span(flight: Flight) -> Span | Unavailable:
     if flight.barometer is not None:
         down_m = flight.barometer["down_m"].loc[start:end].rolling(HEIGHT_MEDIAN_SAMPLES).median()
         height_m = (down_m.dropna().iloc[0] if down_m.notna().any() else 0.0) - down_m
-        flying_s = height_m.index[height_m > min(MIN_HEIGHT_M, height_m.max() / 2.0)]
-        if len(flying_s):
-            start, end = flying_s[[0, -1]].tolist()
+        flight_times_s = height_m.index[height_m > min(MIN_HEIGHT_M, height_m.max() / 2.0)]
+        if len(flight_times_s):
+            start, end = flight_times_s[[0, -1]].tolist()
     return start, end
 
 
@@ -259,14 +259,14 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
     )
 
 
-def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
+def _largest_mean_change(time_s: Array, normalised_innovations: Array) -> Span | None:
     """Return time (s) and size (√S) of the largest change of the mean; None if not significant.
 
     The mean before each window is compared with the mean of the two windows after it. The change
     starts in the window if the mean of the window already contains a third of the change.
     """
     window_index = np.floor((time_s - time_s[0]) / CHANGE_WINDOW_S)
-    windows = pd.Series(normalised).groupby(window_index).agg(["mean", "size"])
+    windows = pd.Series(normalised_innovations).groupby(window_index).agg(["mean", "size"])
     windows = windows[windows["size"] >= MIN_WINDOW_SAMPLES]
     window_means = windows["mean"].to_numpy()
     largest_change = None
@@ -274,7 +274,7 @@ def _largest_mean_change(time_s: Array, normalised: Array) -> Span | None:
     for index in range(MIN_WINDOWS_BEFORE, len(window_means) - 2):
         mean_before = np.mean(window_means[:index])
         mean_change = float(np.mean(window_means[index + 1 : index + 3]) - mean_before)
-        innovation_std = np.std(normalised[window_index < windows.index[index]])
+        innovation_std = np.std(normalised_innovations[window_index < windows.index[index]])
         standard_error = innovation_std / math.sqrt(2.0 * windows["size"].iloc[:index].median())
         mean_scatter = max(np.std(window_means[:index], ddof=1), standard_error)
         if abs(mean_change) > max(min_size, MIN_CHANGE_SCATTER_RATIO * mean_scatter):

@@ -41,12 +41,16 @@ def sample_interval_s(fusion_record: FusionRecord) -> float:
     In the steady state, an update reduces the variance of the barometer bias as much as the random
     walk increases it between samples: p' = p - p²/S and p = p' + q² Δt.
     """
-    bias = fusion_record.height_bias.get(BAROMETER.name)
-    if bias is not None and len(bias) > 1:
-        variance_m2 = bias["variance_m2"] * _bias_gain(bias)
-        intervals_s = (variance_m2 - bias["bias_m2"])[len(bias) // 5 :] / BIAS_NOISE_DENSITY**2
-        low_s, median_s, high_s = np.percentile(intervals_s, [25.0, 50.0, 75.0])
-        if high_s - low_s < MAX_INTERVAL_SCATTER * median_s:
+    bias_updates = fusion_record.height_bias.get(BAROMETER.name)
+    if bias_updates is not None and len(bias_updates) > 1:
+        variance_m2 = bias_updates["variance_m2"] * _bias_gain(bias_updates)
+        intervals_s = (variance_m2 - bias_updates["bias_m2"])[
+            len(bias_updates) // 5 :
+        ] / BIAS_NOISE_DENSITY**2
+        lower_quartile_s, median_s, upper_quartile_s = np.percentile(
+            intervals_s, [25.0, 50.0, 75.0]
+        )
+        if upper_quartile_s - lower_quartile_s < MAX_INTERVAL_SCATTER * median_s:
             return float(median_s)
     return 1.0 / (OLD_BAROMETER_HZ if fusion_record.stores_bias_increments else BAROMETER_HZ)
 
@@ -77,62 +81,70 @@ def fused_samples(
 
 
 def _known_and_simulated_samples(
-    ekf2: Ekf2, fusion_record: FusionRecord, logged: "pd.Series[float]", interval_s: float
+    ekf2: Ekf2, fusion_record: FusionRecord, logged_down_m: "pd.Series[float]", interval_s: float
 ) -> "pd.Series[float]":
     logged_rows = ekf2.aids[BAROMETER.name].samples
     if "observation_down" not in logged_rows or len(logged_rows) < 2:
-        return logged
-    row_s = logged_rows.index.to_numpy()
+        return logged_down_m
+    row_times_s = logged_rows.index.to_numpy()
     velocity_down_m_s = ekf2.state["down_m_s"]
-    velocity_s = velocity_down_m_s.index.to_numpy()
-    displacement_m = cumulative_trapezoid(velocity_down_m_s.to_numpy(), velocity_s, initial=0)
+    velocity_times_s = velocity_down_m_s.index.to_numpy()
+    displacement_m = cumulative_trapezoid(velocity_down_m_s.to_numpy(), velocity_times_s, initial=0)
     no_bias = dict.fromkeys(("bias_m", "bias_m2"), 0.0)
     no_bias |= {"innovation_m": np.nan, "variance_m2": 1.0}
-    bias = fusion_record.height_bias.get(BAROMETER.name, pd.DataFrame(no_bias, index=row_s[:1]))
+    bias_updates = fusion_record.height_bias.get(
+        BAROMETER.name, pd.DataFrame(no_bias, index=row_times_s[:1])
+    )
     # EKF2 logs the bias after the update, but fuses the sample with the bias before the update
-    bias_s = np.column_stack([bias.index, bias.index + 0.5 * interval_s]).ravel()
-    previous_m = bias["bias_m"] - (_bias_gain(bias) * bias["innovation_m"]).fillna(0.0)
-    fused_bias_m = np.column_stack([previous_m, bias["bias_m"]]).ravel()
+    bias_times_s = np.column_stack(
+        [bias_updates.index, bias_updates.index + 0.5 * interval_s]
+    ).ravel()
+    previous_bias_m = bias_updates["bias_m"] - (
+        _bias_gain(bias_updates) * bias_updates["innovation_m"]
+    ).fillna(0.0)
+    fused_bias_m = np.column_stack([previous_bias_m, bias_updates["bias_m"]]).ravel()
     # innovations in ground effect are not used: EKF2 reduces them by the dead zone
-    rows_outside_ground_effect = logged_rows[~fusion_record.was_in_state(GROUND_EFFECT, row_s)]
+    rows_outside_ground_effect = logged_rows[
+        ~fusion_record.was_in_state(GROUND_EFFECT, row_times_s)
+    ]
     height_without_motion_m = (
         rows_outside_ground_effect["observation_down"]
         - rows_outside_ground_effect["innovation_down"]
     )
     height_without_motion_m -= np.interp(
-        rows_outside_ground_effect.index, velocity_s, displacement_m
+        rows_outside_ground_effect.index, velocity_times_s, displacement_m
     )
 
     def bias_m(time_s: Array) -> Array:
-        return np.asarray(np.interp(time_s, bias_s, fused_bias_m))
+        return np.asarray(np.interp(time_s, bias_times_s, fused_bias_m))
 
     def prediction_m(time_s: Array) -> Array:
         """Return EKF2's prediction of the measured height."""
         state_m = np.interp(
             time_s, rows_outside_ground_effect.index, height_without_motion_m
-        ) + np.interp(time_s, velocity_s, displacement_m)
+        ) + np.interp(time_s, velocity_times_s, displacement_m)
         return np.asarray(state_m - bias_m(time_s))
 
     # arrays have one row per row of the log, and one column per sample since the previous row
-    span_s = np.diff(row_s)
+    span_s = np.diff(row_times_s)
     sample_count = np.maximum(np.rint(span_s / interval_s), 1.0).astype(int)
     is_regular = np.abs(span_s - sample_count * interval_s) < MATCH_TOLERANCE * interval_s
     is_regular &= sample_count <= MAX_SAMPLES_PER_ROW
-    sample_s = span_s / sample_count
+    sample_interval_by_row_s = span_s / sample_count
     sample_column = np.arange(sample_count[is_regular].max(initial=1))
     innovation_m = np.full((len(sample_count), len(sample_column)), np.nan)
     # a sample may be in several topics; later topics overwrite earlier ones
-    time_s = np.concatenate([bias.index, logged.index, row_s])
+    time_s = np.concatenate([bias_updates.index, logged_down_m.index, row_times_s])
     down_m = np.concatenate(
         [
-            prediction_m(bias.index.to_numpy()) - bias["innovation_m"],
-            logged,
-            logged_rows["observation_down"] - bias_m(row_s),
+            prediction_m(bias_updates.index.to_numpy()) - bias_updates["innovation_m"],
+            logged_down_m,
+            logged_rows["observation_down"] - bias_m(row_times_s),
         ]
     )
-    row_index = np.searchsorted(row_s[1:], time_s - MATCH_TOLERANCE * interval_s)
+    row_index = np.searchsorted(row_times_s[1:], time_s - MATCH_TOLERANCE * interval_s)
     row_index = np.minimum(row_index, len(sample_count) - 1)
-    position_in_interval = (time_s - row_s[row_index]) / sample_s[row_index]
+    position_in_interval = (time_s - row_times_s[row_index]) / sample_interval_by_row_s[row_index]
     is_matched = is_regular[row_index] & (
         np.abs(position_in_interval - np.rint(position_in_interval)) < MATCH_TOLERANCE
     )
@@ -148,14 +160,16 @@ def _known_and_simulated_samples(
         age_samples = sample_count[:, None] - 1.0 - sample_column
         is_missing = np.isnan(innovation_m) & (age_samples >= 0.0) & is_regular[:, None]
         innovation_m = _with_missing_innovations(
-            innovation_m, is_missing, sample_s[:, None], age_samples, filtered_m
+            innovation_m, is_missing, sample_interval_by_row_s[:, None], age_samples, filtered_m
         )
-    sampled_s = row_s[:-1, None] + sample_s[:, None] * (sample_column + 1)
+    sample_times_s = row_times_s[:-1, None] + sample_interval_by_row_s[:, None] * (
+        sample_column + 1
+    )
     has_sample = np.isfinite(innovation_m)
-    sampled_s = sampled_s[has_sample]
-    time_s = np.concatenate([sampled_s, time_s[~is_matched]])
+    sample_times_s = sample_times_s[has_sample]
+    time_s = np.concatenate([sample_times_s, time_s[~is_matched]])
     down_m = np.concatenate(
-        [prediction_m(sampled_s) + innovation_m[has_sample], down_m[~is_matched]]
+        [prediction_m(sample_times_s) + innovation_m[has_sample], down_m[~is_matched]]
     )
     height_samples = pd.Series(down_m, pd.Index(time_s, name="time_s")).dropna().sort_index()
     return height_samples[
@@ -183,16 +197,16 @@ def _with_missing_innovations(
     filtered_m : ndarray, shape (n + 1,)
         Low-pass filtered innovation, at the start and at each row.
     """
-    new_weight = interval_s / (interval_s + INNOVATION_FILTER_S)
-    filter_weight = new_weight * (1.0 - new_weight) ** np.maximum(age_samples, 0.0)
+    new_sample_weight = interval_s / (interval_s + INNOVATION_FILTER_S)
+    filter_weight = new_sample_weight * (1.0 - new_sample_weight) ** np.maximum(age_samples, 0.0)
     missing_weight = filter_weight * is_missing
-    scatter_m = np.random.default_rng(0).normal(
+    simulated_m = np.random.default_rng(0).normal(
         scale=np.nanstd(innovation_m), size=innovation_m.shape
     )
-    remaining_fraction = (1.0 - new_weight[:, 0]) ** (age_samples[:, 0] + 1.0)
-    known_m = np.nansum(filter_weight * innovation_m, axis=1) + (missing_weight * scatter_m).sum(
-        axis=1
-    )
-    offset_m = filtered_m[1:] - remaining_fraction * filtered_m[:-1] - known_m
+    previous_value_weight = (1.0 - new_sample_weight[:, 0]) ** (age_samples[:, 0] + 1.0)
+    known_sum_m = np.nansum(filter_weight * innovation_m, axis=1) + (
+        missing_weight * simulated_m
+    ).sum(axis=1)
+    offset_m = filtered_m[1:] - previous_value_weight * filtered_m[:-1] - known_sum_m
     offset_m /= np.maximum(missing_weight.sum(axis=1), MIN_WEIGHT_SUM)
-    return np.where(is_missing, scatter_m + offset_m[:, None], innovation_m)
+    return np.where(is_missing, simulated_m + offset_m[:, None], innovation_m)

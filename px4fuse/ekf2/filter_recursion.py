@@ -22,9 +22,9 @@ from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.bad_acceleration import BadAcceleration
 from px4fuse.ekf2.heights import (
     GNSS_HEIGHT_NOISE_FACTOR,
+    HEIGHT_SENSORS,
     MIN_GATE,
     MIN_SIGMA,
-    SENSORS,
     HeightFilter,
     barometer_samples,
 )
@@ -144,11 +144,11 @@ class FilterConfiguration:
             buffer_length = math.ceil(max_delay_ms * 1e-3 / inputs.configured_step_s)
             return Timing(delay_s, max(inputs.horizon_s, (buffer_length - 1) * inputs.mean_step_s))
         # at its start EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
-        longest_ms = max(self.settings["EKF2_DELAY_MAX"], max_delay_ms)
-        if longest_ms == inputs.settings["EKF2_DELAY_MAX"]:
+        longest_delay_ms = max(self.settings["EKF2_DELAY_MAX"], max_delay_ms)
+        if longest_delay_ms == inputs.settings["EKF2_DELAY_MAX"]:
             return Timing(delay_s, inputs.horizon_s)
         # number of samples in the IMU buffer (initialise_interface, estimator_interface.cpp)
-        buffer_length = max(math.ceil(longest_ms * 1e-3 / inputs.configured_step_s), 2)
+        buffer_length = max(math.ceil(longest_delay_ms * 1e-3 / inputs.configured_step_s), 2)
         return Timing(delay_s, (buffer_length - 1) * inputs.mean_step_s)
 
 
@@ -259,7 +259,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         < np.array(
             [configuration.without.get(aid.name, np.inf) for configuration in configurations]
         )
-        for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, EV_POS, *SENSORS)
+        for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, EV_POS, *HEIGHT_SENSORS)
     }
     can_fuse_velocity = (action == FUSE) & is_enabled_by_aid[GNSS_VEL.name] & fuses_velocity
     sample_index = np.maximum(intervals[0].events.sample, 0)
@@ -286,10 +286,12 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     vector_means = []
     for aid, samples in ((MAG, segment.field), (FLOW, segment.flow)):
         if samples is not None:
-            means = [mean_by_event(segment, samples, end_steps) for end_steps in event_step_arrays]
+            means_by_interval = [
+                mean_by_event(segment, samples, end_steps) for end_steps in event_step_arrays
+            ]
             stacked_means = (
                 np.stack(quantities, axis=1)[:, configuration_intervals]
-                for quantities in zip(*means, strict=True)
+                for quantities in zip(*means_by_interval, strict=True)
             )
             mean = EventSamples(*stacked_means)
             if aid == MAG:
@@ -306,7 +308,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         for configuration in configurations
     ]
     bad_acceleration = BadAcceleration(
-        np.array(follows_log), inputs.rules.bad_acceleration_s, segment
+        np.array(follows_log), inputs.rules.bad_acceleration_duration_s, segment
     )
     if segment.heights is not None:
         barometer = np.stack(barometer_samples(segment, event_step_arrays), axis=-1)
@@ -454,8 +456,10 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 # EKF2 clips the vertical velocity if the horizontal velocity is inside the gate
                 is_clipped = has_gate & (bad_acceleration.until_s > event_time_s[e])
                 is_clipped &= ~is_outside_gate[:, :DOWN_COLUMN].any(axis=1)
-                limit = np.sqrt(gate_squared * S)[is_clipped, DOWN_COLUMN]
-                nu[is_clipped, DOWN_COLUMN] = np.clip(nu[is_clipped, DOWN_COLUMN], -limit, limit)
+                innovation_limit = np.sqrt(gate_squared * S)[is_clipped, DOWN_COLUMN]
+                nu[is_clipped, DOWN_COLUMN] = np.clip(
+                    nu[is_clipped, DOWN_COLUMN], -innovation_limit, innovation_limit
+                )
                 is_outside_gate[:, DOWN_COLUMN] &= ~is_clipped
             innovations[e] = nu
             variances[e] = S
@@ -470,8 +474,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 if not has_magnetometer:
                     # without logged magnetometer samples the correction of the tilt is unknown, so
                     # only the tilt variance is set to the logged value
-                    for row in range(HEADING):
-                        _, P = _reduce_variance_to(P, row, attitude_variance[e, :, row])
+                    for tilt_row in range(HEADING):
+                        _, P = _reduce_variance_to(P, tilt_row, attitude_variance[e, :, tilt_row])
                 is_component_fused[:, VELOCITY_COLUMNS] = is_velocity_fused[:, None]
                 is_component_fused[:, POSITION_COLUMNS] = is_fused[e, :, None]
                 x, P = _sequential_update(
@@ -498,8 +502,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         if not has_magnetometer:
             np.subtract(logged_values[e], x[:, LOGGED_STATES], out=innovation[:, :2])
             R[:, :2] = _noise_for_variance(_diagonal(P)[:, LOGGED_STATES], logged_variance[e])
-            heading = np.where(has_attitude, x[:, HEADING] + innovation[:, 0], 0.0)
-            if inputs.vision_height or heights is not None:
+            heading_error_rad = np.where(has_attitude, x[:, HEADING] + innovation[:, 0], 0.0)
+            if inputs.fuses_vision_height or heights is not None:
                 R[:, 1] = IGNORED_VARIANCE
                 if has_sample[e] and heights is None:
                     innovation[:, 1] = nu[:, 5]
@@ -507,10 +511,10 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                         is_active[e], measurement_variance[e, :, 5], IGNORED_VARIANCE
                     )
             x, P = _joint_update(x, P, innovation, R)
-            x[:, HEADING] = heading
+            x[:, HEADING] = heading_error_rad
         if has_sample[e] and is_reset[e].any():
-            for rows, columns, factor in reset_states:
-                reset_variance = factor * measurement_variance[e, :, columns]
+            for rows, columns, variance_factor in reset_states:
+                reset_variance = variance_factor * measurement_variance[e, :, columns]
                 set_states(x, P, is_reset[e], rows, measured_values[e, :, columns], reset_variance)
             position_reset_m[e, is_reset[e]] = nu[is_reset[e], POSITION_COLUMNS]
         if vision is not None:
@@ -659,22 +663,24 @@ class _Fusion:
             & has_gate
             & may_fuse
         )
-        gap_s = now_s - self.last_position_s
+        since_fusion_s = now_s - self.last_position_s
         if self.has_all_resets and not is_decision_logged:
             # if the log has no reset at the next event, EKF2 fused the last sample before the limit
             next_event = min(e + 1, len(self.time_s) - 1)
-            is_last_before_limit = self.time_s[next_event] - self.last_position_s > rules.reset_s
+            is_last_before_limit = (
+                self.time_s[next_event] - self.last_position_s > rules.reset_timeout_s
+            )
             is_rejected &= ~(follows_log & is_last_before_limit & ~self.logged_reset[next_event])
         is_fused = may_fuse & ~is_rejected & ~self.is_stopped
         is_starting = has_gate & ((action == START) | (self.is_stopped & self.can_start[e]))
-        is_failing = is_rejected & ~self.is_stopped & (gap_s > rules.reset_s)
+        is_failing = is_rejected & ~self.is_stopped & (since_fusion_s > rules.reset_timeout_s)
         if rules.resets_velocity:
-            are_both_late = now_s - self.last_velocity_s > rules.reset_s
-            is_failing &= are_both_late | (gap_s > 2.0 * rules.reset_s)
+            is_velocity_late = now_s - self.last_velocity_s > rules.reset_timeout_s
+            is_failing &= is_velocity_late | (since_fusion_s > 2.0 * rules.reset_timeout_s)
         is_restarted = is_starting | (is_failing & (self.remaining_resets > 0))
         if is_decision_logged or self.logged_reset[e] or self.has_all_resets:
-            logged_restart = has_gate & (self.logged_reset[e] | (action == START))
-            is_restarted = np.where(follows_log, logged_restart, is_restarted)
+            is_restart_logged = has_gate & (self.logged_reset[e] | (action == START))
+            is_restarted = np.where(follows_log, is_restart_logged, is_restarted)
             is_fused &= ~is_restarted
             is_failing &= ~follows_log
         self.last_position_s = np.where(is_fused | is_restarted, now_s, self.last_position_s)
@@ -718,7 +724,7 @@ def with_state_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegm
     tilt and accelerometer bias. The correlations are estimated from the flight before the segment.
     """
     state_correlation = _settled_state_correlation(segment)
-    if (history := segment.history) is not None:
+    if history := segment.history:
         inputs = replace(inputs, vision=None)
         configuration = FilterConfiguration(inputs.settings)
         history = replace(history, state_correlation=_settled_state_correlation(history))
@@ -751,9 +757,13 @@ def _settled_state_correlation(segment: ReplaySegment) -> Array:
     to_earth = np.eye(STATE_COUNT)
     to_earth[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.body_to_ned[0]
     P = np.diag(np.diagonal(to_earth @ np.diag(segment.variance[:STATE_COUNT]) @ to_earth.T))
-    for tilt, bias, acceleration_per_rad in ((1, BIAS_NORTH, -GRAVITY), (0, BIAS_EAST, GRAVITY)):
-        P[tilt, bias] = P[bias, tilt] = (
-            min(P[tilt, tilt] * acceleration_per_rad**2, P[bias, bias]) / acceleration_per_rad
+    for tilt_state, bias_state, acceleration_per_rad in (
+        (1, BIAS_NORTH, -GRAVITY),
+        (0, BIAS_EAST, GRAVITY),
+    ):
+        P[tilt_state, bias_state] = P[bias_state, tilt_state] = (
+            min(P[tilt_state, tilt_state] * acceleration_per_rad**2, P[bias_state, bias_state])
+            / acceleration_per_rad
         )
     return _correlation_of_covariance(to_earth.T @ P @ to_earth)
 
@@ -815,12 +825,14 @@ def _measurements_by_event(
     """Return measured velocity and position (NED), and their variances, each of shape (E, S, 6)."""
     received = inputs.received
     aid = inputs.aid
-    offset_m = (np.stack([parameters[name] for name in aid.lever_arm], -1) - inputs.imu_offset_m)[
-        :, :, None
-    ]
-    measured_values, measurement_variance = np.full((2, len(event_steps), len(offset_m), 6), np.nan)
-    lever_arm_ned = (segment.body_to_ned[event_steps] @ offset_m)[..., 0]
-    measured_values[..., 3:] = received.position_m[sample_index][:, None] - lever_arm_ned
+    sensor_offset_m = (
+        np.stack([parameters[name] for name in aid.lever_arm], -1) - inputs.imu_offset_m
+    )[:, :, None]
+    measured_values, measurement_variance = np.full(
+        (2, len(event_steps), len(sensor_offset_m), 6), np.nan
+    )
+    lever_arm_ned_m = (segment.body_to_ned[event_steps] @ sensor_offset_m)[..., 0]
+    measured_values[..., 3:] = received.position_m[sample_index][:, None] - lever_arm_ned_m
     if aid.noise_mode:
         uses_reported_noise = uses_reported_noise & (parameters[aid.noise_mode] != 1.0)
     reported_variance = np.where(
@@ -835,8 +847,10 @@ def _measurements_by_event(
             np.diff(segment.body_to_ned, axis=0)[event_steps - 1]
             / segment.step_s[event_steps - 1, None, None]
         )
-        lever_arm_ned = (rotation_rate @ offset_m)[..., 0]
-        measured_values[..., :3] = received.velocity_m_s[sample_index][:, None] - lever_arm_ned
+        lever_arm_velocity_m_s = (rotation_rate @ sensor_offset_m)[..., 0]
+        measured_values[..., :3] = (
+            received.velocity_m_s[sample_index][:, None] - lever_arm_velocity_m_s
+        )
         reported_variance = received.velocity_variance_m2_s2[sample_index][:, None]
         min_variance = np.maximum(parameters[GNSS_VEL.noise], MIN_SIGMA)[:, None] ** 2
         measurement_variance[..., :3] = (

@@ -91,7 +91,7 @@ UNKNOWN_CONDITION = UnmetCondition(
 
 
 @dataclass(frozen=True)
-class Attempt:
+class FusionAttempt:
     """Positions that EKF2 received but did not fuse in the time span ``span_s``."""
 
     ekf2: Ekf2
@@ -106,7 +106,7 @@ class Attempt:
 
     @property
     def has_switch(self) -> bool:
-        """True for PX4 v1.14 and later, where this source has its own parameter to enable it."""
+        """True for PX4 v1.14 and later, with a separate parameter that enables the source."""
         return self.aid.switch in self.parameters
 
     @property
@@ -124,7 +124,7 @@ class Attempt:
         """Return the samples in ``span_s``, and up to ``before_s`` (s) before it."""
         return samples.loc[self.span_s[0] - before_s : self.span_s[1]]
 
-    def fraction(self, state: str, bit: int = 0) -> float:
+    def fraction_set(self, state: str, bit: int = 0) -> float:
         """Return the fraction of ``span_s`` in which a status bit is set; NaN if not logged."""
         state_changes = self.ekf2.states.get(state)
         if state_changes is None:
@@ -133,13 +133,13 @@ class Attempt:
         return float(np.mean(state_values.astype(np.int64) >> bit & 1))
 
 
-def find_unmet(attempt: Attempt) -> UnmetCondition:
+def find_unmet(attempt: FusionAttempt) -> UnmetCondition:
     """Return the first condition of EKF2 that is not met; UNKNOWN_CONDITION if all are met."""
     conditions = VISION_CONDITIONS if attempt.is_vision else GNSS_CONDITIONS
     return next((unmet for check in conditions for unmet in check(attempt)), UNKNOWN_CONDITION)
 
 
-def _check_switch(attempt: Attempt) -> Iterator[UnmetCondition]:
+def _check_switch(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
     parameter_name, bit = attempt.aid.switch, 0
     if not attempt.has_switch:
         parameter_name, bit = AID_MASK, 3 if attempt.is_vision else 0
@@ -162,7 +162,7 @@ def is_height_only(source: PositionTrack) -> bool:
     return bool(np.ptp(source.samples[Columns.POSITION[:2]], axis=0).max() < MAX_CONSTANT_RANGE_M)
 
 
-def _check_frame(attempt: Attempt) -> Iterator[UnmetCondition]:
+def _check_frame(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
     source = attempt.source
     if attempt.has_switch and (source.frame, source.name) == ("unknown", "vehicle_visual_odometry"):
         yield UnmetCondition(
@@ -174,24 +174,24 @@ def _check_frame(attempt: Attempt) -> Iterator[UnmetCondition]:
         )
 
 
-def _check_gap(attempt: Attempt) -> Iterator[UnmetCondition]:
-    is_short = attempt.is_vision and attempt.has_switch
-    limit_s = EV_STOP_INTERVAL_S if is_short else FUSION_STOP_S
+def _check_gap(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
+    has_short_timeout = attempt.is_vision and attempt.has_switch
+    stop_timeout_s = EV_STOP_INTERVAL_S if has_short_timeout else FUSION_STOP_S
     times_s = attempt.source.samples.index.to_numpy()
     start_s, end_s = attempt.span_s
     # EKF2 stops fusion when no position has arrived for limit_s
-    last_s = max(times_s[times_s < start_s], default=start_s)
-    duration_s = np.min(times_s[times_s >= start_s], initial=end_s) - last_s
-    if duration_s > limit_s + attempt.interval_s:
+    last_position_s = max(times_s[times_s < start_s], default=start_s)
+    duration_s = np.min(times_s[times_s >= start_s], initial=end_s) - last_position_s
+    if duration_s > stop_timeout_s + attempt.interval_s:
         yield UnmetCondition(
             "gap",
-            f"no position for {duration_s:.1f} s from {last_s:.1f} s on",
-            f"EKF2 stops fusion {limit_s:g} s after the last position.",
+            f"no position for {duration_s:.1f} s from {last_position_s:.1f} s on",
+            f"EKF2 stops fusion {stop_timeout_s:g} s after the last position.",
             "Check the position source and its data link.",
         )
 
 
-def _check_timestamps(attempt: Attempt) -> Iterator[UnmetCondition]:
+def _check_timestamps(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
     clock_map, status = attempt.source.clock_map, attempt.source.status
     if clock_map and (clock := clock_map.clock) in AGE_BY_WRONG_TIMESTAMP:
         yield UnmetCondition(
@@ -230,15 +230,15 @@ def _check_timestamps(attempt: Attempt) -> Iterator[UnmetCondition]:
         )
 
 
-def _check_quality(attempt: Attempt) -> Iterator[UnmetCondition]:
-    minimum, status = attempt.parameters.get("EKF2_EV_QMIN", 0.0), attempt.source.status
-    if minimum <= 0.0 or "quality" not in status:
+def _check_quality(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
+    min_quality, status = attempt.parameters.get("EKF2_EV_QMIN", 0.0), attempt.source.status
+    if min_quality <= 0.0 or "quality" not in status:
         return
     quality = attempt.samples_in_span(status)["quality"]
     # EKF2 needs a good quality of the sample, of the sample before, and of the newest sample in the
     # buffer
     sample_count = int(np.ceil(attempt.horizon_s / attempt.interval_s)) + 2
-    is_good = (quality >= minimum).astype(float)
+    is_good = (quality >= min_quality).astype(float)
     if is_good.rolling(min(sample_count, max(len(quality), 1))).min().max() == 1.0:
         return
     median_quality = float(quality.median())
@@ -250,18 +250,20 @@ def _check_quality(attempt: Attempt) -> Iterator[UnmetCondition]:
         f"{max(median_quality, 0.0):.0f} only if the positions are correct."
     )
     if not quality.any():
-        reason += " The MAVLink message VISION_POSITION_ESTIMATE has no quality; EKF2 then uses 0."
+        reason = f"{reason} MAVLink VISION_POSITION_ESTIMATE has no quality; EKF2 then uses 0."
         action = "Send the quality with MAVLink ODOMETRY, or set EKF2_EV_QMIN to 0."
-    fault = f"the quality is {median_quality:.0f}, below EKF2_EV_QMIN {minimum:.0f}"
+    fault = f"the quality is {median_quality:.0f}, below EKF2_EV_QMIN {min_quality:.0f}"
     yield UnmetCondition("quality", fault, reason, action)
 
 
-def _check_interval(attempt: Attempt) -> Iterator[UnmetCondition]:
+def _check_interval(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
     intervals_s = np.diff(attempt.samples_in_span(attempt.source.samples).index)
     # a source that is reconstructed from EKF2 topics has the rate of the logger, not of the
     # positioning system
-    is_known = attempt.has_switch and not attempt.source.origin.reconstructed and len(intervals_s)
-    if is_known and intervals_s.min() >= EV_START_INTERVAL_S - INTERVAL_TOLERANCE_S:
+    is_interval_known = (
+        attempt.has_switch and not attempt.source.origin.reconstructed and len(intervals_s)
+    )
+    if is_interval_known and intervals_s.min() >= EV_START_INTERVAL_S - INTERVAL_TOLERANCE_S:
         yield UnmetCondition(
             "interval",
             f"the positions come at {attempt.source.rate_hz:.2g} Hz",
@@ -272,29 +274,29 @@ def _check_interval(attempt: Attempt) -> Iterator[UnmetCondition]:
         )
 
 
-def _check_alignment(attempt: Attempt) -> Iterator[UnmetCondition]:
-    if attempt.fraction("tilt_align") < 0.5:
+def _check_alignment(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
+    if attempt.fraction_set("tilt_align") < 0.5:
         yield UnmetCondition(
             "alignment",
             "EKF2 has not aligned its tilt",
             "The flag cs_tilt_align is 0. EKF2 fuses no position before the tilt is aligned.",
             "Keep the vehicle at rest after boot until EKF2 is ready.",
         )
-    is_free = attempt.is_vision and attempt.has_switch and attempt.source.frame == "FRD"
-    if not is_free and attempt.fraction("yaw_align") < 0.5:
-        action = "Calibrate and enable the magnetometer (EKF2_MAG_TYPE 0)"
+    needs_no_heading = attempt.is_vision and attempt.has_switch and attempt.source.frame == "FRD"
+    if not needs_no_heading and attempt.fraction_set("yaw_align") < 0.5:
+        actions = ["Calibrate and enable the magnetometer (EKF2_MAG_TYPE 0)"]
         if attempt.is_vision:
-            action += ", or send a valid orientation and set bit 3 (yaw) of EKF2_EV_CTRL"
+            actions.append("send a valid orientation and set bit 3 (yaw) of EKF2_EV_CTRL")
         yield UnmetCondition(
             "alignment",
             "EKF2 has not aligned its heading",
             "The flag cs_yaw_align is 0. EKF2 needs a heading to fuse positions relative to north.",
-            f"{action}.",
+            f"{', or '.join(actions)}.",
         )
 
 
-def _check_gnss(attempt: Attempt) -> Iterator[UnmetCondition]:
-    if attempt.fraction("gnss_fault") > MIN_FAILED_FRACTION:
+def _check_gnss(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
+    if attempt.fraction_set("gnss_fault") > MIN_FAILED_FRACTION:
         yield UnmetCondition(
             "fault",
             "EKF2 declared GNSS faulty",
@@ -305,7 +307,7 @@ def _check_gnss(attempt: Attempt) -> Iterator[UnmetCondition]:
     parameters, source = attempt.parameters, attempt.source
     # bits of EKF2_GPS_CHECK are lower by one; the fix is always checked
     checked_mask = int(parameters.get("EKF2_GPS_CHECK", -1)) << 1 | 1
-    fractions = {bit: attempt.fraction("failed_checks", bit) for bit in range(len(GNSS_CHECKS))}
+    fractions = {bit: attempt.fraction_set("failed_checks", bit) for bit in range(len(GNSS_CHECKS))}
     failed_bits = [
         bit for bit in fractions if checked_mask >> bit & 1 and fractions[bit] > MIN_FAILED_FRACTION
     ]
@@ -313,20 +315,19 @@ def _check_gnss(attempt: Attempt) -> Iterator[UnmetCondition]:
         return
     failed_bits.sort(key=lambda bit: -fractions[bit])
     samples = attempt.samples_in_span(source.samples)
-    median_squares = {3: samples["north_m2"], 4: samples["down_m2"]}
+    reported_variances = {3: samples["north_m2"], 4: samples["down_m2"]}
     if source.velocity is not None:
-        median_squares[5] = attempt.samples_in_span(source.velocity)["north_m2_s2"]
+        reported_variances[5] = attempt.samples_in_span(source.velocity)["north_m2_s2"]
     check_texts = []
     for bit in failed_bits[:3]:
         name, parameter, unit = GNSS_CHECKS[bit]
         check_details = [f"{100.0 * fractions[bit]:.0f} % of the time"]
         if np.isfinite(limit := parameters.get(parameter, np.nan)):
-            median_value = (
-                float(np.sqrt(median_squares[bit].median())) if bit in median_squares else np.nan
-            )
             # the samples contain only positions with a fix, so their median may be below the limit
-            if median_value > limit:
-                check_details.append(f"median {median_value:.2f}{unit}")
+            if bit in reported_variances:
+                median_value = float(np.sqrt(reported_variances[bit].median()))
+                if median_value > limit:
+                    check_details.append(f"median {median_value:.2f}{unit}")
             check_details.append(f"limit {parameter} {limit:g}{unit}")
         check_texts.append(f"{name} ({', '.join(check_details)})")
     yield UnmetCondition(
@@ -338,7 +339,7 @@ def _check_gnss(attempt: Attempt) -> Iterator[UnmetCondition]:
     )
 
 
-def _check_gate(attempt: Attempt) -> Iterator[UnmetCondition]:
+def _check_gate(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
     aid = attempt.aid
     aid_log = attempt.ekf2.aids.get(aid.name)
     if aid_log is None or "rejected" not in aid_log.samples:

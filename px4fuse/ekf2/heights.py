@@ -35,8 +35,8 @@ from px4fuse.flight.model import GROUND_EFFECT, Ekf2, Flight, FusionRecord, step
 
 # Indices of vertical velocity and height in the state
 VELOCITY_DOWN, DOWN = 5, 8
-SENSORS = (BAROMETER, GNSS_HGT)
-HEIGHT_AIDS = (*SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
+HEIGHT_SENSORS = (BAROMETER, GNSS_HGT)
+HEIGHT_AIDS = (*HEIGHT_SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
 # Default (m) of EKF2_GND_EFF_DZ, the barometer's dead zone near the ground
 DEFAULT_DEAD_ZONE_M = 4.0
 # PX4's name of the height reference, by value of EKF2_HGT_REF
@@ -66,7 +66,7 @@ def add_heights(
         for name, log in ekf2.aids.items()
         if log.enabled is not None
     }
-    fused_aids = [aid.name for aid in SENSORS if enabled_fractions.get(aid.name) == 1.0]
+    fused_aids = [aid.name for aid in HEIGHT_SENSORS if enabled_fractions.get(aid.name) == 1.0]
     for aid in HEIGHT_AIDS:
         if enabled_fractions.get(aid.name) and aid.name not in fused_aids:
             return f"EKF2 also fused {aid.label} in part of the flight"
@@ -84,9 +84,9 @@ def add_heights(
         measured_at_s = fused_barometer.index.to_numpy()
         down_m = fused_barometer["down_m"].to_numpy() + fusion_record.altitude_m
         sample_weight = fused_barometer["weight"].to_numpy()
-    effect_height_m = parameters.get("EKF2_GND_EFF_DZ", DEFAULT_DEAD_ZONE_M)
+    ground_effect_dead_zone_m = parameters.get("EKF2_GND_EFF_DZ", DEFAULT_DEAD_ZONE_M)
     dead_zone_m = np.where(
-        fusion_record.was_in_state(GROUND_EFFECT, measured_at_s), effect_height_m, 0.0
+        fusion_record.was_in_state(GROUND_EFFECT, measured_at_s), ground_effect_dead_zone_m, 0.0
     )
     new_segments = []
     delayed_down_m = fusion_record.delayed["down_m"]
@@ -161,7 +161,7 @@ class HeightFilter:
         Result of :func:`barometer_samples`.
     fix_s, has_fix : ndarray, shape (E, S) or (E, 1)
         Time of the GNSS fix of each event, and mask of the events with a fix.
-    enabled : mapping from PX4's name of an aiding source to ndarray of bool, shape (E, S)
+    is_enabled_by_aid : mapping from PX4's name of an aiding source to ndarray of bool, shape (E, S)
     parameters : mapping from parameter name to ndarray, shape (S,)
     has_gate : ndarray of bool, shape (S,)
     bad_acceleration : BadAcceleration
@@ -179,7 +179,7 @@ class HeightFilter:
         barometer: Array,
         fix_s: Array,
         has_fix: BoolArray,
-        enabled: Mapping[str, BoolArray],
+        is_enabled_by_aid: Mapping[str, BoolArray],
         parameters: Mapping[str, Array],
         has_gate: BoolArray,
         bad_acceleration: BadAcceleration,
@@ -188,34 +188,36 @@ class HeightFilter:
         heights = segment.heights
         configuration_count = len(has_gate)
         assert heights is not None
-        self.fused = heights.fused
+        self.fused_sensors = heights.fused_sensors
         self.down_m, self.age_s, measured_at_s, self.dead_zone_m, weight, is_sample = barometer
-        has_fix = has_fix & enabled[GNSS_HGT.name] & (GNSS_HGT.name in heights.fused)
-        has_barometer = (is_sample > 0.0) & enabled[BAROMETER.name]
+        has_fix = (
+            has_fix & is_enabled_by_aid[GNSS_HGT.name] & (GNSS_HGT.name in heights.fused_sensors)
+        )
+        has_barometer = (is_sample > 0.0) & is_enabled_by_aid[BAROMETER.name]
         self.has_sample = np.concatenate(
             [has_barometer, np.broadcast_to(has_fix, (1, *has_barometer.shape[1:]))]
         )
         self.any_sample = [np.any(mask, axis=1).tolist() for mask in self.has_sample]
         self.in_ground_effect = self.dead_zone_m.any(axis=2)
-        gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in SENSORS]
+        gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in HEIGHT_SENSORS]
         self.gate_squared = [np.where(has_gate, gate**2, np.inf) for gate in gates]
         self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
-        self.has_bias = [aid.name != heights.reference for aid in SENSORS]
+        self.has_bias = [aid.name != heights.reference for aid in HEIGHT_SENSORS]
         self.weight = [*np.maximum(weight, 1.0), np.ones_like(fix_s)]
-        value_m, variance_m2 = np.tile(heights.bias, (configuration_count, 1)).T
+        bias_m, bias_m2 = np.tile(heights.initial_bias, (configuration_count, 1)).T
         start_s = segment.time_s[0]
-        self.bias = BiasEstimator(value_m, variance_m2, segment.step_s)
-        self.updates_bias = self.has_sample & enabled[heights.reference]
-        slots_with_bias = slice(0, -1) if self.has_bias[0] else slice(-1, None)
+        self.bias = BiasEstimator(bias_m, bias_m2, segment.step_s)
+        self.updates_bias = self.has_sample & is_enabled_by_aid[heights.reference]
+        biased_slots = slice(0, -1) if self.has_bias[0] else slice(-1, None)
         self.interval_s = np.zeros(self.has_sample.shape)
         self.time_s = np.stack(np.broadcast_arrays(*measured_at_s, fix_s, self.has_sample[0])[:-1])
         slot_count, event_count, _ = self.time_s.shape
         self.update_log = np.full((event_count, slot_count + 1, 4, configuration_count), np.nan)
         # times of the samples in the order of fusion, event after event
-        sample_s = np.where(self.has_sample, self.time_s, start_s)[slots_with_bias].swapaxes(0, 1)
+        sample_s = np.where(self.has_sample, self.time_s, start_s)[biased_slots].swapaxes(0, 1)
         latest_s = np.maximum.accumulate(sample_s.reshape(-1, configuration_count), axis=0)
         interval_s = np.diff(latest_s, axis=0, prepend=start_s).reshape(sample_s.shape)
-        self.interval_s[slots_with_bias] = interval_s.swapaxes(0, 1)
+        self.interval_s[biased_slots] = interval_s.swapaxes(0, 1)
         self.interval_s *= self.updates_bias
 
     def updates(self, sensor: str, configuration_index: int, end_s: Array) -> pd.DataFrame:

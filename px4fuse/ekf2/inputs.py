@@ -96,7 +96,7 @@ class ReceivedPositions:
 
     Attributes
     ----------
-    stamp_s, arrival_s : ndarray, shape (m,)
+    timestamp_s, arrival_s : ndarray, shape (m,)
         Timestamps and arrival times.
     position_m, variance_m2 : ndarray, shape (m, 3)
         Position in NED, and variance reported by the sender; 0 if not reported.
@@ -114,7 +114,7 @@ class ReceivedPositions:
         True if the log contains all resets of EKF2's position to a sample.
     """
 
-    stamp_s: Array
+    timestamp_s: Array
     arrival_s: Array
     position_m: Array
     variance_m2: Array
@@ -136,9 +136,9 @@ class FusionRules:
     ----------
     start_interval_s : float
         Fusion starts if two samples arrive within this time.
-    stop_s : float
+    stop_timeout_s : float
         Fusion stops after this time without a sample.
-    reset_s : float
+    reset_timeout_s : float
         The position is reset after this time of rejections.
     max_resets : int
         Fusion stops after this number of resets in a row.
@@ -150,30 +150,32 @@ class FusionRules:
         Position variance after a reset ÷ measurement variance.
     resets_velocity : bool
         True if velocity is reset together with position.
-    bad_acceleration_s : float
+    bad_acceleration_duration_s : float
         Time for which the flag for a bad vertical acceleration stays set.
     """
 
     start_interval_s: float
-    stop_s: float
-    reset_s: float
+    stop_timeout_s: float
+    reset_timeout_s: float
     max_resets: int
     min_bias_variance: float | None = None
     uses_delay_as_horizon: bool = False
     reset_variance_factor: float = 1.0
     resets_velocity: bool = False
-    bad_acceleration_s: float = 3.0
+    bad_acceleration_duration_s: float = 3.0
 
 
 # Rules of EKF2 v1.14 and later for external vision: EV_MAX_INTERVAL (ev_control.cpp),
 # no_aid_timeout_max and reset_timeout_max (common.h)
-VISION_RULES = FusionRules(start_interval_s=0.2, stop_s=0.4, reset_s=1.0, max_resets=5)
+VISION_RULES = FusionRules(
+    start_interval_s=0.2, stop_timeout_s=0.4, reset_timeout_s=1.0, max_resets=5
+)
 # Rules of EKF2 v1.16 for GNSS: a reset doubles the variance of the sample
 # (resetHorizontalPositionTo, gps_control.cpp)
 GNSS_RULES = FusionRules(
     start_interval_s=np.inf,
-    stop_s=np.inf,
-    reset_s=7.0,
+    stop_timeout_s=np.inf,
+    reset_timeout_s=7.0,
     max_resets=UNLIMITED_RESETS,
     reset_variance_factor=2.0,
     resets_velocity=True,
@@ -194,7 +196,7 @@ class Inputs:
         Prediction step: mean of the log, and EKF2_PREDICT_US.
     horizon_s : float
         Delay of the fusion horizon.
-    vision_height : bool
+    fuses_vision_height : bool
         True if EKF2 fused the height of external vision.
     imu_offset_m : ndarray, shape (3,)
         Position of the IMU (EKF2_IMU_POS, body FRD).
@@ -213,7 +215,7 @@ class Inputs:
     mean_step_s: float
     horizon_s: float
     configured_step_s: float
-    vision_height: bool
+    fuses_vision_height: bool
     imu_offset_m: Array
     aid: Aid = EV_POS
     max_interval_s: float = MAX_INTERVAL_S
@@ -265,14 +267,14 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         )
     if missing_imu := _explain_missing_imu(imu.index.to_numpy()):
         return missing_imu
-    position_samples = (
+    received = (
         read_gnss(flight, ekf2, fusion_record)
         if is_gnss
         else read_vision(flight, ekf2, fusion_record, attitude)
     )
-    if isinstance(position_samples, Unavailable):
-        return position_samples
-    if not len(position_samples.stamp_s):
+    if isinstance(received, Unavailable):
+        return received
+    if not len(received.timestamp_s):
         return Unavailable(
             ANALYSIS_NAME,
             f"the log has no sample of {aid.label} while EKF2 reports its fusion",
@@ -295,12 +297,12 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
         # the fusion horizon has no delay if EKF2_EV_DELAY is at most one prediction step
         horizon_s = 0.0
-    aiding_s = position_samples.stamp_s
+    aiding_times_s = received.timestamp_s
     flow_samples = fusion_record.flow if is_gnss else fusion_record.flow.iloc[:0]
     if len(flow_samples) and FLOW.name not in omitted_aids:
-        aiding_s = np.union1d(aiding_s, flow_samples.index)
+        aiding_times_s = np.union1d(aiding_times_s, flow_samples.index)
     segments = find_replay_segments(
-        flight, imu, attitude, ekf2, fusion_record, aiding_s, is_gnss=is_gnss
+        flight, imu, attitude, ekf2, fusion_record, aiding_times_s, is_gnss=is_gnss
     )
     if not segments:
         return Unavailable(
@@ -326,17 +328,17 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     other_aids = [EV_POS] if vision else []
     other_aids += [MAG] if any(segment.field for segment in segments) else []
     heights = segments[0].heights
-    other_aids += [BAROMETER] if heights and BAROMETER.name in heights.fused else []
+    other_aids += [BAROMETER] if heights and BAROMETER.name in heights.fused_sensors else []
     return Inputs(
         settings=effective_settings(fusion_record.parameters, aid, *other_aids) | lever_arm,
         segments=segments,
-        received=position_samples,
+        received=received,
         rules=_fusion_rules(fusion_record, ekf2.step_s, is_gnss=is_gnss),
         mean_step_s=ekf2.step_s,
         horizon_s=horizon_s,
         configured_step_s=predict_s(fusion_record),
         # EKF2 clips vision heights while it reports a bad acceleration; the model does not
-        vision_height=not is_gnss
+        fuses_vision_height=not is_gnss
         and isinstance(ekf2.fusion_flags, pd.DataFrame)
         and bool(ekf2.fusion_flags["vertical"].mean() > 0.5)
         and not any(np.any(segment.is_acceleration_bad) for segment in segments),
@@ -381,7 +383,7 @@ def _fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) 
         rules = replace(GNSS_RULES, resets_velocity=GNSS_MODE_PARAMETER not in parameters)
         if not fusion_record.stores_latitude:
             # the flag stays set for 10 s (BADACC_PROBATION, common.h)
-            rules = replace(rules, reset_variance_factor=1.0, bad_acceleration_s=10.0)
+            rules = replace(rules, reset_variance_factor=1.0, bad_acceleration_duration_s=10.0)
     elif uses_aid_mask(parameters):
         rules = FusionRules(np.inf, 7.0, 7.0, UNLIMITED_RESETS)
     return replace(
@@ -394,7 +396,7 @@ def _fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) 
 def replayed_aid(ekf2: Ekf2) -> Aid:
     """Return the position source to replay: GNSS if EKF2 fused GNSS, else external vision."""
     vision = ekf2.aids.get(EV_POS.name)
-    is_vision_used = vision is not None and (vision.enabled is None or bool(vision.enabled.any()))
+    is_vision_used = bool(vision and (vision.enabled is None or vision.enabled.any()))
     has_gnss = _enabled_log(ekf2, GNSS_POS) is not None
     return GNSS_POS if has_fused_aid(ekf2) and (has_gnss or not is_vision_used) else EV_POS
 
@@ -404,7 +406,7 @@ def _enabled_log(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
     aid_log = ekf2.aids.get(aid.name)
     return (
         aid_log.enabled
-        if aid_log is not None and aid_log.enabled is not None and aid_log.enabled.any()
+        if aid_log and aid_log.enabled is not None and aid_log.enabled.any()
         else None
     )
 
@@ -535,7 +537,7 @@ def _read_vision_besides_gnss(
     received = read_vision(flight, ekf2, fusion_record, attitude)
     if isinstance(received, Unavailable):
         return received
-    is_disabled = step_values_at(enabled_log, received.stamp_s) == 0.0
+    is_disabled = step_values_at(enabled_log, received.timestamp_s) == 0.0
     position_m = received.position_m * ekf2_metres_per_metre(fusion_record)
     return replace(received, position_m=np.where(is_disabled[:, None], np.nan, position_m))
 
@@ -583,17 +585,17 @@ def _logged_decisions(
     is_reset_possible[sample_row >= 0] &= (sample_innovations["rejected"] > 0.0) | (
         sample_innovations["innovation_m"] == 0.0
     )
-    last_fused_rows, dead_reckoning_ends = (
-        rejection_rows[: len(fusion_to_row_s), 0] - 1,
-        rejection_rows[len(fusion_to_row_s) :, 1] - 1,
-    )
+    last_fused_rows = rejection_rows[: len(fusion_to_row_s), 0] - 1
+    dead_reckoning_ends = rejection_rows[len(fusion_to_row_s) :, 1] - 1
     # a reset is visible in the next published state, one fusion horizon later than the measurement
     published_s = due_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):
         is_recent = (published_s <= reset_s) & (published_s > reset_s - MAX_RESET_PUBLICATION_S)
         reset_rows = np.flatnonzero(is_recent & is_reset_possible)
-        ends_here = np.intersect1d(reset_rows, dead_reckoning_ends)
-        is_reset[ends_here[:1] if len(ends_here) else reset_rows[-1:]] = True
+        dead_reckoning_end_rows = np.intersect1d(reset_rows, dead_reckoning_ends)
+        is_reset[
+            dead_reckoning_end_rows[:1] if len(dead_reckoning_end_rows) else reset_rows[-1:]
+        ] = True
     is_fused = np.zeros(len(is_reset), bool)
     is_fused[last_fused_rows[last_fused_rows >= 0]] = True
     rejected_flags[is_fused & ~is_reset & np.isnan(rejected_flags)] = 0.0

@@ -117,10 +117,10 @@ def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> In
 def _make_events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
     received = inputs.received
     time_s = segment.time_s
-    first_row, last_row = np.searchsorted(received.stamp_s, time_s[[0, -1]])
-    stamp_s = received.stamp_s[first_row:last_row]
+    first_row, last_row = np.searchsorted(received.timestamp_s, time_s[[0, -1]])
+    timestamp_s = received.timestamp_s[first_row:last_row]
     last_step = len(time_s) - 1
-    measured_s = stamp_s - timing.delay_s - 0.5 * inputs.mean_step_s
+    measured_s = timestamp_s - timing.delay_s - 0.5 * inputs.mean_step_s
     # a sample that arrives after the fusion horizon has passed its measurement time is fused late
     # or never
     due_s = np.maximum(measured_s, received.arrival_s[first_row:last_row] - timing.horizon_s)
@@ -132,18 +132,18 @@ def _make_events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Even
     # EKF2 fuses only the newer of two samples in one prediction step
     is_usable[:-1] &= end_steps[1:] > end_steps[:-1]
     action, can_start = _sample_actions(inputs, segment, measured_s, end_steps, is_usable)
-    action[np.isin(stamp_s, received.reset_s) & (action == FUSE)] = START
+    action[np.isin(timestamp_s, received.reset_s) & (action == FUSE)] = START
     # in gaps of the position source there are additional events; their number does not depend on
     # the delay
-    gap_s = np.diff(np.r_[time_s[0], stamp_s, time_s[-1]])
-    extra_events = np.maximum(np.ceil(gap_s / inputs.max_interval_s).astype(int) - 1, 0)
-    sample_places = np.cumsum(extra_events[:-1] + 1) - 1
-    event_count = len(stamp_s) + int(extra_events.sum())
+    gap_s = np.diff(np.r_[time_s[0], timestamp_s, time_s[-1]])
+    extra_event_counts = np.maximum(np.ceil(gap_s / inputs.max_interval_s).astype(int) - 1, 0)
+    sample_event_rows = np.cumsum(extra_event_counts[:-1] + 1) - 1
+    event_count = len(timestamp_s) + int(extra_event_counts.sum())
     events = np.zeros(event_count, EVENT)
     events["end_step"] = np.rint(
         np.interp(
             np.arange(event_count),
-            np.r_[-1, sample_places, event_count],
+            np.r_[-1, sample_event_rows, event_count],
             np.r_[0, end_steps, last_step],
         )
     )
@@ -151,7 +151,7 @@ def _make_events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Even
     is_late = is_inside & is_in_time & (due_s - measured_s > MIN_LATENESS_S)
     sample_indices = np.arange(first_row, last_row)
     is_lost = is_inside & ~is_in_time
-    events[sample_places] = np.rec.fromarrays(
+    events[sample_event_rows] = np.rec.fromarrays(
         [end_steps, sample_indices, action, is_usable, can_start, is_late, is_lost, measured_s],
         dtype=EVENT,
     )
@@ -162,7 +162,7 @@ def _sample_actions(
     inputs: Inputs,
     segment: ReplaySegment,
     measured_at_s: Array,
-    end: IntArray,
+    end_steps: IntArray,
     is_usable: BoolArray,
 ) -> tuple[IntArray, BoolArray]:
     """Return IDLE, FUSE or START for each sample, and a mask of samples that may start fusion.
@@ -176,14 +176,14 @@ def _sample_actions(
     intervals_s = np.diff(measured_at_s[usable_rows], prepend=-np.inf)
     can_start[usable_rows] = intervals_s < rules.start_interval_s
     # time (s) without a usable sample before each sample
-    gaps_s = segment.time_s[end[usable_rows] - 1] - np.concatenate(
+    sample_gaps_s = segment.time_s[end_steps[usable_rows] - 1] - np.concatenate(
         [[np.inf], measured_at_s[usable_rows[:-1]]]
     )
-    is_fusing = segment.fusing
+    is_fusing = segment.is_fusing
     for row, (interval_s, gap_s) in enumerate(
-        zip(intervals_s.tolist(), gaps_s.tolist(), strict=True)
+        zip(intervals_s.tolist(), sample_gaps_s.tolist(), strict=True)
     ):
-        is_fusing = is_fusing and not gap_s > rules.stop_s
+        is_fusing = is_fusing and not gap_s > rules.stop_timeout_s
         if is_fusing:
             action[usable_rows[row]] = FUSE
         elif interval_s < rules.start_interval_s:
@@ -201,7 +201,7 @@ def _state_sensitivities(segment: ReplaySegment, start: IntArray, end: IntArray)
     # integrate the first prediction step of all intervals, then the second step, and so on. Longer
     # intervals are sorted first, so the intervals with a next step are the first rows
     longest_first = np.argsort(-step_counts, kind="stable")
-    first_start = start[longest_first]
+    first_start_steps = start[longest_first]
     attitude, velocity, position = sensitivities = np.zeros(
         (3, len(end), 3, SENSITIVITY_COLUMN_COUNT)
     )
@@ -211,25 +211,25 @@ def _state_sensitivities(segment: ReplaySegment, start: IntArray, end: IntArray)
     for step_number, count in zip(
         step_numbers, np.searchsorted(-step_counts[longest_first], -step_numbers), strict=True
     ):
-        step = first_start[:count] + step_number
+        step = first_start_steps[:count] + step_number
         rows = slice(count)
         dt = segment.step_s[step][:, None, None]
         force = force_m_s2[step]
         # sensitivity of attitude to gyro bias, and of velocity to accelerometer bias, in one step
-        rotation_step = -segment.body_to_ned[1:][step] * dt
+        bias_sensitivity_step = -segment.body_to_ned[1:][step] * dt
         position[rows] += 0.5 * dt * velocity[rows]
         velocity[rows] += (-skew(force) * dt) @ attitude[rows]
-        velocity[rows, :, 6:9] += rotation_step
+        velocity[rows, :, 6:9] += bias_sensitivity_step
         velocity[rows, :, INPUT_COLUMN] += (force + GRAVITY_M_S2) * dt[:, :, 0]
         position[rows] += 0.5 * dt * velocity[rows]
-        attitude[rows, :, 3:6] += rotation_step
+        attitude[rows, :, 3:6] += bias_sensitivity_step
         attitude[rows, :, CORRECTION_COLUMN] -= segment.correction_rad[step]
     sensitivities[:, longest_first] = sensitivities.copy()
     return np.concatenate(sensitivities, axis=1)
 
 
 def _imu_noise_by_interval(
-    step_counts: Array, duration_s: Array, tilt: Array
+    step_counts: Array, duration_s: Array, velocity_per_attitude_error: Array
 ) -> tuple[Array, Array]:
     """Return the process noise of each interval for unit gyro noise and unit accelerometer noise.
 
@@ -240,22 +240,24 @@ def _imu_noise_by_interval(
     n = np.maximum(step_counts, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n
     # velocity change per attitude error in one of n equal prediction steps
-    m = tilt / n
+    m = velocity_per_attitude_error / n
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)
-    gyro, accelerometer = np.zeros((2, len(step_counts), IMU_STATE_COUNT, IMU_STATE_COUNT))
+    gyro_noise, accelerometer_noise = np.zeros(
+        (2, len(step_counts), IMU_STATE_COUNT, IMU_STATE_COUNT)
+    )
     for matrix, rows, columns, block in (
-        (gyro, THETA, THETA, n * d**2 * eye),
-        (gyro, VELOCITY, THETA, m * d**2 * n * (n - 1) / 2),
-        (gyro, POSITION, THETA, m * d**3 * n * (n - 1) * (n - 2) / 6),
-        (gyro, VELOCITY, VELOCITY, mm * d**2 * n * (n - 1) * (2 * n - 1) / 6),
-        (gyro, POSITION, VELOCITY, mm * d**3 * n**4 / 8),
-        (gyro, POSITION, POSITION, mm * d**4 * n**5 / 20),
-        (accelerometer, VELOCITY, VELOCITY, n * d**2 * eye),
-        (accelerometer, POSITION, VELOCITY, d**3 * n * (n - 1) / 2 * eye),
-        (accelerometer, POSITION, POSITION, d**4 * n * (n - 1) * (2 * n - 1) / 6 * eye),
+        (gyro_noise, THETA, THETA, n * d**2 * eye),
+        (gyro_noise, VELOCITY, THETA, m * d**2 * n * (n - 1) / 2),
+        (gyro_noise, POSITION, THETA, m * d**3 * n * (n - 1) * (n - 2) / 6),
+        (gyro_noise, VELOCITY, VELOCITY, mm * d**2 * n * (n - 1) * (2 * n - 1) / 6),
+        (gyro_noise, POSITION, VELOCITY, mm * d**3 * n**4 / 8),
+        (gyro_noise, POSITION, POSITION, mm * d**4 * n**5 / 20),
+        (accelerometer_noise, VELOCITY, VELOCITY, n * d**2 * eye),
+        (accelerometer_noise, POSITION, VELOCITY, d**3 * n * (n - 1) / 2 * eye),
+        (accelerometer_noise, POSITION, POSITION, d**4 * n * (n - 1) * (2 * n - 1) / 6 * eye),
     ):
         matrix[:, rows, columns] = block
         if rows != columns:
             matrix[:, columns, rows] = block.transpose(0, 2, 1)
-    return gyro, accelerometer
+    return gyro_noise, accelerometer_noise

@@ -56,12 +56,12 @@ from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import (
     BAROMETER,
     EV_POS,
-    FIELD_NOISE_PARAMETERS,
     FLOW,
     GNSS_HGT,
     GNSS_POS,
     GNSS_VEL,
     MAG,
+    MAGNETIC_FIELD_NOISE_PARAMETERS,
     PARAMETERS,
     check_parameters,
 )
@@ -213,7 +213,7 @@ def replay_settings(
     if inputs.aid == GNSS_POS:
         for parameter_names, reason in (
             (
-                MAG.measurement_parameters.union(FIELD_NOISE_PARAMETERS),
+                MAG.measurement_parameters.union(MAGNETIC_FIELD_NOISE_PARAMETERS),
                 "the log lacks some fused magnetometer samples",
             ),
             (
@@ -234,16 +234,18 @@ def replay_settings(
     without = without or {}
     fused_aids = modelled_aids(inputs) if without else []
     if unknown_aids := without.keys() - set(fused_aids):
-        height_note = f"; {height_text}" if inputs.logged_height_reason else ""
+        fused_text = ", ".join(fused_aids)
+        if inputs.logged_height_reason:
+            fused_text = f"{fused_text}; {height_text}"
         raise SettingsError(
             f"{min(unknown_aids)} cannot be omitted: the replay of this log fuses only "
-            f"{', '.join(fused_aids)}{height_note}."
+            f"{fused_text}."
         )
     if not changes:
         return ()
     if excluded_s is not None:
-        excluded_rows = matching_sample_rows(inputs.received.stamp_s, excluded_s)
-        rejected_flags = np.full(len(inputs.received.stamp_s), np.nan)
+        excluded_rows = matching_sample_rows(inputs.received.timestamp_s, excluded_s)
+        rejected_flags = np.full(len(inputs.received.timestamp_s), np.nan)
         rejected_flags[excluded_rows[excluded_rows >= 0]] = 1.0
         no_reset = np.zeros(len(rejected_flags), dtype=bool)
         inputs = replace(
@@ -286,7 +288,7 @@ def modelled_aids(inputs: Inputs) -> list[str]:
         MAG: MAG.noise in inputs.settings,
         FLOW: segment.flow is not None,
     }
-    height_aids = segment.heights.fused if segment.heights else ()
+    height_aids = segment.heights.fused_sensors if segment.heights else ()
     return [*(aid.name for aid in is_fused if is_fused[aid]), *height_aids]
 
 
@@ -312,7 +314,7 @@ def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float)
     velocity_m_s = received.velocity_m_s
     received = replace(
         received,
-        stamp_s=received.stamp_s + delay_s,
+        timestamp_s=received.timestamp_s + delay_s,
         position_m=received.position_m @ rotation_matrix,
         velocity_m_s=None if velocity_m_s is None else velocity_m_s @ rotation_matrix,
     )
@@ -405,7 +407,11 @@ def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Sp
     """Return the spans (s) longer than RESTART_GAP_S without a fused position."""
     is_used = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
     fusion_times_s = [*updates.loc[is_used, "fused_at_s"], float(segment.time_s[-1])]
-    return [(a, b) for a, b in pairwise(fusion_times_s) if b - a > RESTART_GAP_S]
+    return [
+        (start_s, end_s)
+        for start_s, end_s in pairwise(fusion_times_s)
+        if end_s - start_s > RESTART_GAP_S
+    ]
 
 
 def _updates_by_aid(
@@ -444,7 +450,7 @@ def _updates_by_aid(
         )
     }
     if heights is not None:
-        for name in heights.fused:
+        for name in heights.fused_sensors:
             updates_by_aid[name] = heights.updates(name, configuration_index, end_s)
     if inputs.received.velocity_m_s is not None:
         gate = run.configurations[configuration_index].settings[GNSS_VEL.gate]
@@ -478,10 +484,10 @@ def _delayed_and_published(
     published_track = publish(
         segment, state, reset, published_rotation, lag_steps, configuration.settings
     )
-    heading = (
+    heading_rad = (
         np.arctan2(segment.body_to_ned[:, 1, 0], segment.body_to_ned[:, 0, 0]) + state[:, HEADING]
     )
-    delayed_track = _published_columns(run, state).assign(heading_rad=heading)
+    delayed_track = _published_columns(run, state).assign(heading_rad=heading_rad)
     return delayed_track, _published_columns(run, np.hstack([state[:, THETA], *published_track]))
 
 
@@ -526,9 +532,9 @@ def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Ar
     )
     acceleration -= rotate(body_to_ned, state[1:, ACCELEROMETER_BIAS])
     state[1:, VELOCITY] += sum_since_event(acceleration * step_s)
-    speed = state[1:, VELOCITY]
+    velocity_m_s = state[1:, VELOCITY]
     state[1:, POSITION] += sum_since_event(
-        0.5 * step_s * (value_before_step(speed, VELOCITY) + speed)
+        0.5 * step_s * (value_before_step(velocity_m_s, VELOCITY) + velocity_m_s)
     )
     state[event_steps] = event_states[1:]
     reset_m = np.zeros((step_count + 1, 3))

@@ -299,10 +299,8 @@ def _compare_innovations(
     is_used = (matched_updates >= 0) & inside_spans(logged_innovations.index, replay.evaluated_s)
     # a sample to which EKF2 resets its state is logged with innovation 0
     is_used &= logged_innovations.filter(regex="innovation_[a-z]+_m$").any(axis=1)
-    logged_innovations, replayed_innovations = (
-        logged_innovations[is_used],
-        replayed_innovations.iloc[matched_updates[is_used]],
-    )
+    logged_innovations = logged_innovations[is_used]
+    replayed_innovations = replayed_innovations.iloc[matched_updates[is_used]]
     if len(logged_innovations) < MIN_COMPARED_INNOVATIONS:
         return (
             f"the log contains only {count_noun(len(logged_innovations), 'innovation')} in the "
@@ -349,15 +347,15 @@ def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     if logged_state.empty:
         return None
     replayed_heading_rad = replay.delayed["heading_rad"]
-    replayed_rad = np.interp(
+    replayed_at_log_times_rad = np.interp(
         logged_state.index, replayed_heading_rad.index, np.unwrap(replayed_heading_rad)
     )
-    difference_rad = np.angle(np.exp(1j * (replayed_rad - heading_rad(logged_state))))
+    difference_rad = np.angle(np.exp(1j * (replayed_at_log_times_rad - heading_rad(logged_state))))
     return float(np.degrees(rms(difference_rad)))
 
 
 def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the agreement of the other aiding sources, and the reason of each disagreement."""
+    """Return the agreement of aiding sources except the position, and reasons of disagreement."""
     agreements: dict[str, Any] = {}
     omitted_aids = {}
     for name, updates in replay.other_aid_updates.items():

@@ -123,11 +123,11 @@ class HeightSamples:
 
     Attributes
     ----------
-    fused : tuple of str
+    fused_sensors : tuple of str
         PX4's names of the fused height sensors.
     reference : str
         Sensor without a bias.
-    bias : (float, float)
+    initial_bias : (float, float)
         Initial bias of the other sensor (m, positive: too high), and its variance (m²).
     step, measured_at_s, down_m : ndarray, shape (m,)
         Prediction step, measurement time, and height (m, down) of each barometer sample.
@@ -137,9 +137,9 @@ class HeightSamples:
         Number of barometer samples that EKF2 fused per known sample.
     """
 
-    fused: tuple[str, ...]
+    fused_sensors: tuple[str, ...]
     reference: str
-    bias: tuple[float, float]
+    initial_bias: tuple[float, float]
     step: IntArray
     measured_at_s: Array
     down_m: Array
@@ -203,7 +203,7 @@ class ReplaySegment:
     down_variance_m2: Array
     attitude_error_rad: Array
     state_correlation: Array
-    fusing: bool = True
+    is_fusing: bool = True
     field: SensorSamples | None = None
     heights: HeightSamples | None = None
     clipped_fraction: Array | None = None
@@ -368,31 +368,33 @@ def find_replay_segments(
         return _with_gnss_model(segment, imu, ekf2, fusion_record) if is_gnss else segment
 
     segments = []
-    for low_s, high_s in pairwise(np.unique(np.clip(cut_times_s, first_s, end_s))):
-        fused_inside = fused_s[(fused_s >= low_s) & (fused_s <= high_s)]
+    for part_start_s, part_end_s in pairwise(np.unique(np.clip(cut_times_s, first_s, end_s))):
+        fused_inside = fused_s[(fused_s >= part_start_s) & (fused_s <= part_end_s)]
         if not len(fused_inside):
             continue
         # the replay starts MIN_AIRBORNE_S after the first take-off, if this is before the end of
         # the segment
         earliest_starts_s = [
-            start_s + MIN_AIRBORNE_S for start_s, _ in airborne[:1] if start_s < high_s
+            start_s + MIN_AIRBORNE_S for start_s, _ in airborne[:1] if start_s < part_end_s
         ]
-        if field_span and low_s <= field_span[0] < high_s:
+        if field_span and part_start_s <= field_span[0] < part_end_s:
             earliest_starts_s.append(field_span[0])
         start_row = int(
             np.searchsorted(
                 state_times_s, max([fused_inside[0] + MIN_FUSION_S, *earliest_starts_s])
             )
         )
-        if start_row == len(state_times_s) or high_s - state_times_s[start_row] < MIN_SEGMENT_S:
+        if start_row == len(state_times_s) or part_end_s - state_times_s[start_row] < MIN_SEGMENT_S:
             continue
-        is_covered = (imu_s[1:] > state_times_s[start_row]) & (imu_s[:-1] < high_s)
+        is_covered = (imu_s[1:] > state_times_s[start_row]) & (imu_s[:-1] < part_end_s)
         if not np.all(np.diff(imu_s)[is_covered] <= IMU_GAP_S):
             continue
         changed = {
-            change.name: change.after for change in parameter_changes if change.time_s <= low_s
+            change.name: change.after
+            for change in parameter_changes
+            if change.time_s <= part_start_s
         }
-        segment = make_segment(start_row, high_s)
+        segment = make_segment(start_row, part_end_s)
         history_row = int(
             np.searchsorted(
                 state_times_s, max(first_s, state_times_s[start_row] - CORRELATION_HISTORY_S)
@@ -401,7 +403,7 @@ def find_replay_segments(
         if history_row < start_row:
             history = make_segment(history_row, state_times_s[start_row])
             segment = replace(segment, history=history)
-        if field_span and field_span[0] <= state_times_s[start_row] and high_s <= field_span[1]:
+        if field_span and field_span[0] <= state_times_s[start_row] and part_end_s <= field_span[1]:
             segment = _add_field(segment, fusion_record, start_row, ekf2.step_s)
         segments.append(replace(segment, changed=changed))
     return tuple(segments)
@@ -502,8 +504,10 @@ def _make_segment(
         return at_s, multiply(attitude_samples[Columns.QUATERNION].to_numpy(), end_rotation)
 
     # published attitude relative to the integrated gyro, in NED
-    extra_rotation = interpolate(step_times_s, *relative_attitude(attitude, 0.0, gyro_attitude))
-    nominal_attitude = multiply(extra_rotation, gyro_attitude)
+    published_relative_to_gyro = interpolate(
+        step_times_s, *relative_attitude(attitude, 0.0, gyro_attitude)
+    )
+    nominal_attitude = multiply(published_relative_to_gyro, gyro_attitude)
     state_times_s, state_rotation = relative_attitude(fusion_record.delayed, 1e-4, nominal_attitude)
     attitude_error_rad = to_vector(state_rotation)
     published_m = _interpolate(ekf2.state[Columns.POSITION], step_times_s[:1])[0]
@@ -515,7 +519,9 @@ def _make_segment(
         time_s=step_times_s,
         step_s=step_s,
         body_to_ned=to_matrix(nominal_attitude),
-        correction_rad=to_vector(multiply(extra_rotation[1:], conjugate(extra_rotation[:-1]))),
+        correction_rad=to_vector(
+            multiply(published_relative_to_gyro[1:], conjugate(published_relative_to_gyro[:-1]))
+        ),
         force_m_s2=velocity_increments / step_s[:, None],
         accelerometer_bias_m_s2=accelerometer_bias,
         state=np.concatenate(
@@ -595,14 +601,14 @@ def _mean_field(
     measured_at_s = measured_at_s[gap_free_rows]
     between_s = between_s[gap_free_rows - 1]
     fused_counts = np.maximum(np.rint(MAG_FUSION_HZ * between_s), 1.0)
-    filter_share = between_s / (between_s + fused_counts * INNOVATION_FILTER_S)
-    previous_innovation_weight = ((1.0 - filter_share) ** fused_counts)[:, None]
+    new_sample_weight = between_s / (between_s + fused_counts * INNOVATION_FILTER_S)
+    previous_innovation_weight = ((1.0 - new_sample_weight) ** fused_counts)[:, None]
     innovation = (
         filtered_gauss[gap_free_rows]
         - previous_innovation_weight * filtered_gauss[gap_free_rows - 1]
     ) / (1.0 - previous_innovation_weight)
     step, weight = low_pass_weights(
-        segment, measured_at_s, fused_counts, between_s / fused_counts, filter_share
+        segment, measured_at_s, fused_counts, between_s / fused_counts, new_sample_weight
     )
     rotation_to_body = segment.body_to_ned[step].swapaxes(2, 3)
     earth_gauss, body_gauss = (
@@ -622,7 +628,11 @@ def _mean_field(
 
 
 def low_pass_weights(
-    segment: ReplaySegment, newest_s: Array, count: Array, interval_s: Array, share: Array | float
+    segment: ReplaySegment,
+    newest_sample_s: Array,
+    sample_count: Array,
+    interval_s: Array,
+    new_sample_weight: Array | float,
 ) -> tuple[IntArray, Array]:
     """Return prediction step and weight of each sample in low-pass filtered means, shape (m, k).
 
@@ -630,16 +640,18 @@ def low_pass_weights(
     ----------
     newest_s, count, interval_s : ndarray, shape (m,)
         Time of the newest sample, number of samples, and sample interval of each mean.
-    share : float or ndarray, shape (m,)
+    new_sample_weight : float or ndarray, shape (m,)
         Weight of a new sample in the low-pass filter.
     """
     # age of a sample, in sample intervals
-    sample_age = np.arange(int(count.max(initial=1.0)))
+    sample_age = np.arange(int(sample_count.max(initial=1.0)))
     weight = np.where(
-        sample_age < count[:, None], (1.0 - np.reshape(share, (-1, 1))) ** sample_age, 0.0
+        sample_age < sample_count[:, None],
+        (1.0 - np.reshape(new_sample_weight, (-1, 1))) ** sample_age,
+        0.0,
     )
     weight /= weight.sum(axis=1, keepdims=True)
-    measured_at_s = newest_s[:, None] - sample_age * interval_s[:, None]
+    measured_at_s = newest_sample_s[:, None] - sample_age * interval_s[:, None]
     return np.searchsorted(segment.time_s, measured_at_s - 1e-9), weight
 
 
@@ -697,11 +709,11 @@ def _interpolate(table: pd.DataFrame, times_s: Array) -> Array:
     return np.column_stack([np.interp(times_s, table.index, table[name]) for name in table])
 
 
-def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntArray:
+def step_ends(interval_s: Array, logged_ends: IntArray, configured_step_s: float) -> IntArray:
     """Return the index of the IMU sample at the end of each prediction step of EKF2.
 
-    A step ends after :func:`samples_per_step` IMU samples, after EKF2_PREDICT_US (``target_s``), or
-    at a logged end of a step.
+    A step ends after :func:`samples_per_step` IMU samples, after ``configured_step_s``, or at a
+    logged end of a step.
     """
     median_s = float(np.median(interval_s))
     # number of samples in each interval; a single gap may be a gap of the IMU itself
@@ -709,7 +721,7 @@ def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntA
     if sample_counts.mean() <= 1.0 + MAX_LOST_IMU_FRACTION:
         sample_counts[:] = 1.0
     end_counts = np.append(0.0, np.cumsum(sample_counts))[logged_ends]
-    samples_needed = samples_per_step(target_s, median_s, end_counts)
+    samples_needed = samples_per_step(configured_step_s, median_s, end_counts)
     logged_end_set = set(logged_ends.tolist())
     end_indices = []
     accumulated_count = accumulated_s = 0.0
@@ -718,20 +730,24 @@ def step_ends(interval_s: Array, logged_ends: IntArray, target_s: float) -> IntA
     ):
         accumulated_count = accumulated_count + sample_count
         accumulated_s = accumulated_s + interval
-        is_complete = accumulated_count >= samples_needed and accumulated_s > 0.5 * target_s
-        if is_complete or accumulated_s > target_s or sample in logged_end_set:
+        is_complete = (
+            accumulated_count >= samples_needed and accumulated_s > 0.5 * configured_step_s
+        )
+        if is_complete or accumulated_s > configured_step_s or sample in logged_end_set:
             end_indices.append(sample)
             accumulated_count = accumulated_s = 0.0
     return np.array(end_indices, dtype=np.intp)
 
 
 def downsample_imu(
-    rotation_vectors: Array, velocity_increments: Array, ends: IntArray
+    rotation_vectors: Array, velocity_increments: Array, step_end_indices: IntArray
 ) -> ArrayPair:
     """Return rotation and velocity change of each prediction step, body frame at the step's end."""
-    start_indices = np.append(0, ends[:-1])
+    start_indices = np.append(0, step_end_indices[:-1])
     summed_rotation = np.concatenate([np.zeros((1, 3)), np.cumsum(rotation_vectors, axis=0)])
-    rotation_at_step_end_rad = np.repeat(summed_rotation[ends], ends - start_indices, axis=0)
+    rotation_at_step_end_rad = np.repeat(
+        summed_rotation[step_end_indices], step_end_indices - start_indices, axis=0
+    )
     step_count = len(rotation_at_step_end_rad)
     rotation_at_sample_middle_rad = 0.5 * (
         summed_rotation[:step_count] + summed_rotation[1 : step_count + 1]
@@ -740,5 +756,5 @@ def downsample_imu(
     rotated_increments = rotated_increments - np.cross(
         rotation_at_step_end_rad - rotation_at_sample_middle_rad, rotated_increments
     )
-    step_rotation = summed_rotation[ends] - summed_rotation[start_indices]
+    step_rotation = summed_rotation[step_end_indices] - summed_rotation[start_indices]
     return step_rotation, np.add.reduceat(rotated_increments, start_indices, axis=0)

@@ -37,7 +37,7 @@ from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable
 
 ANALYSIS_NAME = "difference KF - EKF2"
-OTHER_TIME = Unavailable(
+NO_TRUTH_OVERLAP = Unavailable(
     "RMSE against ground truth",
     "ground truth and replay do not overlap in time",
     "Record ground truth during the whole flight.",
@@ -57,14 +57,15 @@ GATE = "rejections and resets"
 OUTPUT = "output predictor"
 # Step of each further aiding source of the position, by PX4's name of the source
 FURTHER_STEPS = {FLOW.name: FLOW_STEP, EV_POS.name: VISION_STEP}
-# Order in which properties of KF are replaced by those of EKF2; further aids precede GATE
+# Order in which properties of KF are replaced by properties of EKF2; steps of further aiding
+# sources are inserted before GATE
 REPLACEMENT_STEPS = (SAMPLES, TIMESTAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class Step(Record, kw_only=True):
-    """Replacement of one property of KF by that of EKF2, and its effect.
+    """Effect of replacing one property of KF by the same property of EKF2.
 
     Attributes
     ----------
@@ -158,7 +159,7 @@ class DifferenceExplanation(Record, kw_only=True):
 
 
 def explain_by_steps(
-    model: Model, settings: Settings | None = None, runs: Mapping[str, Replay] | None = None
+    model: Model, settings: Settings | None = None, kf_runs: Mapping[str, Replay] | None = None
 ) -> dict[str, DifferenceExplanation] | Unavailable:
     """Replace properties of KF by those of EKF2, one after the other, and compare with EKF2.
 
@@ -167,12 +168,12 @@ def explain_by_steps(
     model : Model
     settings : Settings, optional
         Settings of KF; their time offset is that of the position source that EKF2 fused.
-    runs : mapping from axis name to Replay, optional
+    kf_runs : mapping from axis name to Replay, optional
         Runs of KF along horizontal axes; default: north and east, with EKF2's sample times.
     """
     if not model.agreement.good:
         return model.agreement.as_unavailable(ANALYSIS_NAME)
-    runs = runs or {}
+    kf_runs = kf_runs or {}
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
     configurations = step_configurations(model.inputs, settings or Settings())
@@ -184,7 +185,7 @@ def explain_by_steps(
     # compare only at times that the replay and all KF runs cover
     for index in (
         baseline_replay.delayed.index,
-        *(run.steps.index for run in runs.values()),
+        *(run.steps.index for run in kf_runs.values()),
     ):
         is_inside &= (state_times_s >= index[0]) & (state_times_s <= index[-1])
     state_times_s = state_times_s[is_inside]
@@ -195,13 +196,13 @@ def explain_by_steps(
             "Analyse a segment in which EKF2 fused the source (--start, --end).",
         )
     state_span_s = float(state_times_s[0]), float(state_times_s[-1])
-    directions = {name: run.axis.direction for name, run in runs.items()}
+    directions = {name: run.axis.direction for name, run in kf_runs.items()}
     directions = directions or dict(zip(HORIZONTAL, np.eye(3), strict=False))
-    stages = []
+    tracks_by_step = []
     # tracks are computed one at a time, to limit memory
     tracks = chain(delayed_positions, (baseline_replay.published, ekf2.state))
-    for stage, track in zip((*configurations, OUTPUT, "EKF2 as logged"), tracks, strict=True):
-        stages.append(
+    for step_name, track in zip((*configurations, OUTPUT, "EKF2 as logged"), tracks, strict=True):
+        tracks_by_step.append(
             [
                 [
                     component_along(track, columns, direction, state_times_s)
@@ -210,19 +211,24 @@ def explain_by_steps(
                 for direction in directions.values()
             ]
         )
-        if stage == [*configurations][-2]:  # all EKF2 properties but gate and output predictor
-            without_gate = track
+        # all EKF2 properties but gate and output predictor
+        if step_name == [*configurations][-2]:
+            track_without_gate = track
     spans = Segment(*state_span_s, "").cut(evaluated_spans)
     longest_rejection = _longest_rejection(
-        baseline_replay, without_gate, state_span_s, evaluated_spans
+        baseline_replay, track_without_gate, state_span_s, evaluated_spans
     )
     truth = model.flight.truth
     steps_by_axis = {}
-    no_truth = OTHER_TIME if isinstance(truth, Truth) else truth
+    no_truth = NO_TRUTH_OVERLAP if isinstance(truth, Truth) else truth
     for axis_index, (axis, direction) in enumerate(directions.items()):
-        kf_state = state_at(runs[axis], state_times_s) if runs else stages[0][axis_index]
+        kf_state = (
+            state_at(kf_runs[axis], state_times_s) if kf_runs else tracks_by_step[0][axis_index]
+        )
         # position and velocity of KF, of k replays, and of the logged EKF2: shape (k + 2, 2, n)
-        positions_by_step = np.array([kf_state, *(stage[axis_index] for stage in stages)])
+        positions_by_step = np.array(
+            [kf_state, *(step_tracks[axis_index] for step_tracks in tracks_by_step)]
+        )
         difference_by_step_m = positions_by_step - positions_by_step[-1]
         rmse_by_step = [
             rms_to_truth(model.flight, track, direction, state_times_s)
@@ -235,11 +241,11 @@ def explain_by_steps(
                 name=name,
                 position_mean_square_m2=position_reduction,
                 velocity_mean_square_m2_s2=velocity_reduction,
-                position_moved_m=float(change.max()),
-                moved_at_s=float(state_times_s[change.argmax()]),
-                position_rmse_to_truth_m=error,
+                position_moved_m=float(position_change_m.max()),
+                moved_at_s=float(state_times_s[position_change_m.argmax()]),
+                position_rmse_to_truth_m=rmse_m,
             )
-            for name, (position_reduction, velocity_reduction), change, error in zip(
+            for name, (position_reduction, velocity_reduction), position_change_m, rmse_m in zip(
                 (*configurations, OUTPUT),
                 (mean_squares[:-1] - mean_squares[1:]).tolist(),
                 position_change,
@@ -248,7 +254,7 @@ def explain_by_steps(
             )
         )
         total_mean_squares, *_, unexplained_mean_squares = mean_squares.tolist()
-        filter_errors = {"kf": rmse_by_step[0], "ekf2": rmse_by_step[-1]}
+        rmse_by_filter = {"kf": rmse_by_step[0], "ekf2": rmse_by_step[-1]}
         steps_by_axis[axis] = DifferenceExplanation(
             count=len(state_times_s),
             position_mean_square_m2=total_mean_squares[0],
@@ -257,7 +263,8 @@ def explain_by_steps(
             unexplained_mean_square_m2=unexplained_mean_squares[0],
             unexplained_velocity_mean_square_m2_s2=unexplained_mean_squares[1],
             position_rmse_to_truth_m={
-                name: no_truth if error is None else error for name, error in filter_errors.items()
+                name: no_truth if rmse_m is None else rmse_m
+                for name, rmse_m in rmse_by_filter.items()
             },
             spans_s=spans,
             longest_rejection=longest_rejection,
@@ -278,7 +285,7 @@ def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, Filt
     kf_parameters = {**kf_process_noise, aid.noise: kf_settings.sigma_z_m}
     # the delay is already subtracted from the timestamps of GNSS positions
     applied_delay_s = logged_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
-    offset_s = kf_settings.clock_offset_s - applied_delay_s
+    time_offset_s = kf_settings.clock_offset_s - applied_delay_s
     without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.lever_arm, 0.0)}
     replayed_aids = modelled_aids(inputs)[1:]
     further_steps = {aid: step for aid, step in FURTHER_STEPS.items() if aid in replayed_aids}
@@ -300,7 +307,9 @@ def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, Filt
     )
     configuration = replace(process_configuration, estimates_attitude=True)
     configurations = {
-        SAMPLES: replace(kf_configuration, settings=without_lever_arm, timestamp_offset_s=offset_s),
+        SAMPLES: replace(
+            kf_configuration, settings=without_lever_arm, timestamp_offset_s=time_offset_s
+        ),
         TIMESTAMPS: kf_configuration,
         NOISE: noise_configuration,
         BIASES: replace(noise_configuration, estimates_biases=True),
@@ -321,7 +330,7 @@ def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, Filt
 
 
 def _longest_rejection(
-    baseline_replay: Ekf2Replay, without_gate: pd.DataFrame, span: Span, spans_s: Spans
+    baseline_replay: Ekf2Replay, track_without_gate: pd.DataFrame, span: Span, spans_s: Spans
 ) -> RejectionRun | None:
     updates = rows_inside(baseline_replay.updates, spans_s)
     updates = updates[updates["fused_at_s"].between(*span)]
@@ -336,9 +345,10 @@ def _longest_rejection(
     longest_index = int(np.argmax(run_ends - run_starts))
     begin_s = fused_at_s[run_starts[longest_index]]
     end_s = fused_at_s[min(run_ends[longest_index], len(fused_at_s) - 1)]
-    with_gate = baseline_replay.delayed.loc[begin_s:end_s]
+    track_with_gate = baseline_replay.delayed.loc[begin_s:end_s]
     position_difference = [
-        with_gate[column] - np.interp(with_gate.index, without_gate.index, without_gate[column])
+        track_with_gate[column]
+        - np.interp(track_with_gate.index, track_without_gate.index, track_without_gate[column])
         for column in Columns.POSITION[:2]
     ]
     return RejectionRun(

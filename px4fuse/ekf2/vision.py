@@ -54,7 +54,7 @@ def vision_samples(
     vision = inputs.vision
     time_s = segment.time_s
     assert vision is not None
-    measured_at_s = vision.stamp_s - settings[EV_POS.delay] * 1e-3 - 0.5 * inputs.mean_step_s
+    measured_at_s = vision.timestamp_s - settings[EV_POS.delay] * 1e-3 - 0.5 * inputs.mean_step_s
     due_s = np.maximum(measured_at_s, vision.arrival_s - horizon_s)
     step_index = np.maximum.accumulate(np.searchsorted(time_s, due_s - 1e-9))
     is_usable = (
@@ -86,7 +86,7 @@ class VisionFilter:
     segment : ReplaySegment
     sample_arrays : sequence of S ndarrays, shape (8, k, E)
         Results of :func:`vision_samples`.
-    enabled : mapping from PX4's name of an aiding source to ndarray of bool, shape (E, S)
+    is_enabled_by_aid : mapping from PX4's name of an aiding source to ndarray of bool, shape (E, S)
     parameters : mapping from parameter name to ndarray, shape (S,)
     has_gate, uses_reported_noise : ndarray of bool, shape (S,)
 
@@ -104,23 +104,23 @@ class VisionFilter:
         self,
         segment: ReplaySegment,
         sample_arrays: Sequence[Array],
-        enabled: Mapping[str, BoolArray],
+        is_enabled_by_aid: Mapping[str, BoolArray],
         parameters: Mapping[str, Array],
         has_gate: BoolArray,
         uses_reported_noise: BoolArray,
     ) -> None:
         samples = np.stack(pad_samples(sample_arrays), axis=-1)
         self.position_m = np.moveaxis(samples[:2], 0, -1)
-        self.age_s, self.measured_at_s, self.now_s = samples[2:5]
+        self.age_s, self.measured_at_s, self.fusion_time_s = samples[2:5]
         _, sample_count, event_count, configuration_count = samples.shape
         self.update_log = np.full((event_count, sample_count, 7, configuration_count), np.nan)
         self.position_reset_m = np.zeros((event_count, configuration_count, 2))
-        has_sample = (samples[7] > 0.0) & enabled[EV_POS.name]
+        has_sample = (samples[7] > 0.0) & is_enabled_by_aid[EV_POS.name]
         # EKF2 fuses GNSS before vision in the same prediction step: samples of an interval's last
         # step are fused after GNSS, earlier samples before GNSS
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
         self.has_gate = has_gate
-        self.without_gnss = ~enabled[GNSS_POS.name]
+        self.without_gnss = ~is_enabled_by_aid[GNSS_POS.name]
         self.gate_squared = np.maximum(parameters[EV_POS.gate], MIN_GATE)[:, None] ** 2
         reported_variance = samples[5:7] * (
             uses_reported_noise & (parameters[EV_POS.noise_mode] != 1.0)
@@ -159,33 +159,37 @@ class VisionFilter:
         self, e: int, slot: int, has_sample: BoolArray, x: Array, P: Array, gnss_fused_s: Array
     ) -> ArrayPair:
         age_s = self.age_s[slot, e][:, None]
-        now_s = self.now_s[slot, e]
+        fusion_time_s = self.fusion_time_s[slot, e]
         without_gnss = self.without_gnss[e]
         noise_m2 = self.noise_m2[slot, e]
         HP = P[:, HORIZONTAL_POSITION] - age_s[:, None] * P[:, HORIZONTAL_VELOCITY]
         S = HP[:, :, HORIZONTAL_POSITION] - age_s[:, None] * HP[:, :, HORIZONTAL_VELOCITY]
         # diagonal is a view of S: `diagonal += R` changes S
         diagonal = S.reshape(len(S), -1)[:, ::3]
-        distance_m = (
+        position_innovation_m = (
             self.position_m[slot, e] - x[:, HORIZONTAL_POSITION] + age_s * x[:, HORIZONTAL_VELOCITY]
         )
         updates_bias = has_sample & ~without_gnss
-        interval_s = np.where(updates_bias, now_s - self.last_sample_s, 0.0)
+        interval_s = np.where(updates_bias, fusion_time_s - self.last_sample_s, 0.0)
         nu, R = self.bias.remove_bias(
-            distance_m, diagonal.copy(), noise_m2, interval_s[:, None], updates_bias[:, None]
+            position_innovation_m,
+            diagonal.copy(),
+            noise_m2,
+            interval_s[:, None],
+            updates_bias[:, None],
         )
         diagonal += R
-        has_restarted = (now_s - self.last_sample_s > MAX_SAMPLE_GAP_S) | (
+        has_restarted = (fusion_time_s - self.last_sample_s > MAX_SAMPLE_GAP_S) | (
             without_gnss != self.was_without_gnss
         )
         is_outside_gate = (
             (nu * nu > self.gate_squared * diagonal).any(axis=1) & self.has_gate & ~has_restarted
         )
-        is_failing = is_outside_gate & (now_s - self.last_attempt_s > MAX_REJECTED_S)
+        is_failing = is_outside_gate & (fusion_time_s - self.last_attempt_s > MAX_REJECTED_S)
         is_restarting = has_sample & (has_restarted | is_failing)
         is_fused = has_sample & ~is_outside_gate & ~has_restarted
         is_position_reset = is_restarting & (
-            without_gnss | (is_failing & (now_s - gnss_fused_s > MAX_REJECTED_S))
+            without_gnss | (is_failing & (fusion_time_s - gnss_fused_s > MAX_REJECTED_S))
         )
         is_evaluated = has_sample & ~has_restarted | is_position_reset
         # if EKF2 resets its position to a sample, it logs innovation 0 for this sample
@@ -202,7 +206,8 @@ class VisionFilter:
         P = P - K @ HP
         if is_position_reset.any():
             position_reset_m = (
-                np.where(without_gnss[:, None], distance_m, nu) * is_position_reset[:, None]
+                np.where(without_gnss[:, None], position_innovation_m, nu)
+                * is_position_reset[:, None]
             )
             restart_variance = np.where(without_gnss[:, None], noise_m2, R)
             set_states(
@@ -215,15 +220,15 @@ class VisionFilter:
             )
             self.position_reset_m[e] += position_reset_m
         if is_restarting.any():
-            new_bias = (is_restarting & ~is_position_reset)[:, None]
-            no_bias = (is_position_reset & without_gnss)[:, None]
+            starts_bias = (is_restarting & ~is_position_reset)[:, None]
+            clears_bias = (is_position_reset & without_gnss)[:, None]
             self.bias.value_m = np.where(
-                new_bias, -distance_m, np.where(no_bias, 0.0, self.bias.value_m)
+                starts_bias, -position_innovation_m, np.where(clears_bias, 0.0, self.bias.value_m)
             )
-            self.bias.variance_m2 = np.where(no_bias, 0.0, self.bias.variance_m2)
-        self.last_sample_s = np.where(has_sample, now_s, self.last_sample_s)
-        self.last_attempt_s = np.where(is_fused | is_restarting, now_s, self.last_attempt_s)
-        self.fused_s = np.where(is_fused | is_position_reset, now_s, self.fused_s)
+            self.bias.variance_m2 = np.where(clears_bias, 0.0, self.bias.variance_m2)
+        self.last_sample_s = np.where(has_sample, fusion_time_s, self.last_sample_s)
+        self.last_attempt_s = np.where(is_fused | is_restarting, fusion_time_s, self.last_attempt_s)
+        self.fused_s = np.where(is_fused | is_position_reset, fusion_time_s, self.fused_s)
         self.was_without_gnss = np.where(has_sample, without_gnss, self.was_without_gnss)
         return x, P
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Count, NotNegative, Record, Share, one_line_repr
-from px4fuse.ekf2.heights import SENSORS
+from px4fuse.ekf2.heights import HEIGHT_SENSORS
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2.model import Model, modelled_aids, replay_settings, with_position_noise
 from px4fuse.ekf2.replay import (
@@ -65,7 +65,7 @@ HEIGHT_NOT_REPLAYED = Unavailable(
     "the replay uses the logged EKF2 height",
     "Use the logged height (vehicle_local_position) instead of a replayed height.",
 )
-HEIGHT_NAMES = {aid.name for aid in SENSORS}
+HEIGHT_NAMES = {aid.name for aid in HEIGHT_SENSORS}
 # Minimum evaluated flight time (s) after an aiding source is disabled
 MIN_EVALUATED_S = 5.0
 # Default number and maximum number of parameter values in a sweep
@@ -274,8 +274,12 @@ def _heading_and_height_notes(model: Model) -> tuple[str, str]:
             f"the log by {difference_deg:.1f}° RMS)"
         )
     height_note = HEIGHT_LOGGED_NOTE if model.inputs.logged_height_reason else HEIGHT_REPLAYED_NOTE
-    is_bad = model.inputs.segments[0].is_acceleration_bad
-    if height_note == HEIGHT_REPLAYED_NOTE and is_bad is not None and is_bad[0]:
+    bad_acceleration_flags = model.inputs.segments[0].is_acceleration_bad
+    if (
+        height_note == HEIGHT_REPLAYED_NOTE
+        and bad_acceleration_flags is not None
+        and bad_acceleration_flags[0]
+    ):
         height_note = f"{height_note}. {HEIGHT_START_NOTE}"
     return heading_note, height_note
 
@@ -344,9 +348,9 @@ def _mark_unpredictable(
 def _results_agree(summaries: Sequence[Summary]) -> bool:
     """Return True if repeated replays have nearly the same statistics."""
     rmse_values = [
-        error
+        rmse_m
         for summary in summaries
-        if isinstance(error := summary.position_rmse_to_truth_m, float)
+        if isinstance(rmse_m := summary.position_rmse_to_truth_m, float)
     ]
     rejected_fractions = [summary.rejected_fraction for summary in summaries]
     nis_by_axis = [[summary.axes[axis].nis_mean for summary in summaries] for axis in HORIZONTAL]
@@ -370,11 +374,13 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
     # position variance before and after each update
     variance = pd.DataFrame(index=np.column_stack([fused_at_s - 1e-6, fused_at_s]).ravel())
     for axis in HORIZONTAL:
-        s, r = (
+        innovation_variance, noise_variance = (
             updates[f"{quantity}_variance_{axis}_m2"] for quantity in ("innovation", "observation")
         )
         variance_after = updates[f"position_variance_{axis}_m2"]
-        variance[f"{axis}_m2"] = np.column_stack([s - r, variance_after]).ravel()
+        variance[f"{axis}_m2"] = np.column_stack(
+            [innovation_variance - noise_variance, variance_after]
+        ).ravel()
     fused_s = evaluated_updates["fused_at_s"][evaluated_updates[["fused", "reset"]].any(axis=1)]
     reset_count = evaluated_updates["reset"].sum()
     if (vision := replay.other_aid_updates.get(EV_POS.name)) is not None:
@@ -465,17 +471,17 @@ def _make_summary(
         return NO_TRUTH if rmse_to_truth is None else rmse_to_truth
 
     for axis, direction in zip(HORIZONTAL, np.eye(3), strict=False):
-        sigma: float | Unavailable
+        median_sigma: float | Unavailable
         if isinstance(logged_variance, Unavailable):
-            sigma = logged_variance
+            median_sigma = logged_variance
         else:
             variance_s = rows_inside(logged_variance, evaluated_s).index
             axis_variance = (logged_variance if variance is None else variance)[f"{axis}_m2"]
-            sigma = float(
+            median_sigma = float(
                 np.sqrt(np.median(np.interp(variance_s, axis_variance.index, axis_variance)))
             )
         more[axis] = AxisSummary(
-            *_innovation_statistics(evaluated_updates, axis), sigma, error_m(direction)
+            *_innovation_statistics(evaluated_updates, axis), median_sigma, error_m(direction)
         )
     aids = {
         name: _summarise_aid(evaluated, evaluated_s)
@@ -569,21 +575,22 @@ def _deviation_note(
 
 
 def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
-    min_noise = replay.settings.get(GNSS_POS.noise, 0.0)
-    if min_noise >= replay.changed.get(EV_POS.noise, np.inf):
+    min_noise_m = replay.settings.get(GNSS_POS.noise, 0.0)
+    if min_noise_m >= replay.changed.get(EV_POS.noise, np.inf):
         yield (
             f"While EKF2 fuses GNSS, the noise of vision positions is at least {GNSS_POS.noise} "
-            f"({min_noise:g} m)"
+            f"({min_noise_m:g} m)"
         )
     if replay.late or replay.lost:
-        remedy = "" if model.inputs.rules.uses_delay_as_horizon else ". Increase EKF2_DELAY_MAX"
         # there may be fewer updates than samples: EKF2 fuses only the newer of two samples in a
         # prediction step
         received_count = max(len(replay.updates), replay.late) + replay.lost
-        yield (
+        note = (
             f"{_change_text(replay)}: {replay.late + replay.lost} of {received_count} samples "
-            f"would arrive after the fusion horizon ({replay.lost} would never be fused){remedy}"
+            f"would arrive after the fusion horizon ({replay.lost} would never be fused)"
         )
+        has_delay_limit = not model.inputs.rules.uses_delay_as_horizon
+        yield f"{note}. Increase EKF2_DELAY_MAX" if has_delay_limit else note
 
 
 def _change_text(replay: Ekf2Replay) -> str:

@@ -1,4 +1,4 @@
-"""Data of one flight for the explore page, which runs KF in the browser."""
+"""Data of one flight for the interactive page of ``px4fuse explore``."""
 
 from dataclasses import asdict
 from typing import Any
@@ -29,13 +29,13 @@ from px4fuse.request import ComparisonRequest, command_line
 
 # Data of the explore page, encoded as JSON
 PageData = dict[str, Any]
-# Half the range (s) of the time offset slider, centred at the analysed time offset
+# Half the range (s) of the slider of the time offset, which is centred at the analysed value
 OFFSET_SLIDER_HALF_RANGE_S = 0.6
 
 
 def flight_data(analysis: Analysis, packer: Packer) -> PageData:
-    """Return the data of one flight, which become JSON; the arrays are added to the packer."""
-    signals = replay_signals(analysis, packer)
+    """Return the data of one flight for JSON, with placeholders for the arrays in the packer."""
+    signals = kf_inputs(analysis, packer)
     events, request = analysis.events, analysis.request
     assert request is not None
     return {
@@ -48,7 +48,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> PageData:
             axis_signals | _axis_data(analysis, result, packer)
             for axis_signals, result in zip(signals["axes"], analysis.axes.values(), strict=True)
         ],
-        "likely": _likely_noises(analysis),
+        "likely": _ml_noises_by_axis(analysis),
         "events": {
             "gap": events.gaps,
             "dropout": events.dropouts,
@@ -61,8 +61,8 @@ def flight_data(analysis: Analysis, packer: Packer) -> PageData:
     }
 
 
-def replay_signals(comparison: Comparison, packer: Packer) -> PageData:
-    """Return the inputs of KF."""
+def kf_inputs(comparison: Comparison, packer: Packer) -> PageData:
+    """Return the inputs of KF in the browser: positions, accelerations and initial covariance."""
     source = raw_source(comparison)
     return {
         "segment": [comparison.segment.start_s, comparison.segment.end_s],
@@ -73,7 +73,7 @@ def replay_signals(comparison: Comparison, packer: Packer) -> PageData:
 
 
 def ranges() -> PageData:
-    """Return minimum, maximum and default of the KF settings, and the scale of σ ratio plots."""
+    """Return minimum, maximum and default of each KF setting, and the axis of σ ratios."""
     return {
         "settings": {name: (low, high) for name, (low, high, *_) in SETTING_RANGES.items()},
         "lesson": asdict(Settings()),
@@ -116,7 +116,7 @@ def _imu_data(comparison: Comparison, packer: Packer) -> PageData | str:
         "time": packer.add_times(time_s[_segment_slice(comparison, acceleration)]),
         "span": [time_s[0], time_s[-1]],
         "gapEdges": gap_edges_s.ravel().tolist(),
-        # cumulative duration of the gaps at these edges
+        # total duration (s) of all gaps up to each edge of a gap
         "gapSum": gap_sum_s.tolist(),
     }
 
@@ -132,22 +132,25 @@ def _segment_slice(comparison: Comparison, acceleration: Acceleration) -> slice:
 def _axis_signals(
     comparison: Comparison, axis: Axis, raw_source: PositionTrack, packer: Packer
 ) -> PageData:
-    """Return measurements of an axis, in and near the segment, and its integrated acceleration."""
+    """Return position measurements (m) along an axis, and the integral of its acceleration (m/s).
+
+    Measurements outside the segment are included if a time offset can move them into it.
+    """
     segment = comparison.segment
     time_s = raw_source.samples.index.to_numpy()
     position_m = weighted_sum(raw_source.samples, Columns.POSITION, axis.direction)
-    reach_s = OFFSET_SLIDER_HALF_RANGE_S + abs(comparison.settings.clock_offset_s)
-    is_in_reach = (time_s >= segment.start_s - reach_s) & (time_s <= segment.end_s + reach_s)
-    is_in_reach &= np.isfinite(position_m)
+    margin_s = OFFSET_SLIDER_HALF_RANGE_S + abs(comparison.settings.clock_offset_s)
+    is_near_segment = (time_s >= segment.start_s - margin_s) & (time_s <= segment.end_s + margin_s)
+    is_near_segment &= np.isfinite(position_m)
     signals: PageData = {
         "name": axis.name,
-        "time": packer.add_times(time_s[is_in_reach]),
-        "z": packer.add(position_m[is_in_reach]),
+        "time": packer.add_times(time_s[is_near_segment]),
+        "z": packer.add(position_m[is_near_segment]),
     }
     if isinstance(axis.acceleration, Acceleration):
-        velocity_m_s = axis.acceleration.integral_m_s[_segment_slice(comparison, axis.acceleration)]
+        integral_m_s = axis.acceleration.integral_m_s[_segment_slice(comparison, axis.acceleration)]
         signals |= {
-            "integral": packer.add(velocity_m_s - velocity_m_s[0]),
+            "integral": packer.add(integral_m_s - integral_m_s[0]),
             "rms": axis.acceleration.rms_m_s2,
         }
     return signals
@@ -246,8 +249,7 @@ def _pack_frame(table: pd.DataFrame, columns: list[str], packer: Packer) -> list
     return [packer.add_times(table.index.to_numpy()), *values]
 
 
-def _likely_noises(analysis: Analysis) -> PageData:
-    """Return the maximum-likelihood estimates of SIGMA_A and SIGMA_Z by axis."""
+def _ml_noises_by_axis(analysis: Analysis) -> PageData:
     return {
         name: [axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value]
         for name, axis_tuning in analysis.tuning.items()
@@ -256,7 +258,7 @@ def _likely_noises(analysis: Analysis) -> PageData:
 
 
 def _ekf2_settings(analysis: Analysis) -> dict[str, str]:
-    """Return EKF2's parameters of the source with their units."""
+    """Return EKF2's noise, delay and gate of the position source, with units, by parameter."""
     aid, logged_parameters = aid_of(analysis), analysis.flight.log.parameters
     return {
         name: f"{logged_parameters[name]:.4g} {PARAMETERS[name].unit}".rstrip()
@@ -266,27 +268,27 @@ def _ekf2_settings(analysis: Analysis) -> dict[str, str]:
 
 
 def _command_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
-    """Return the `compare` command, with automatic and with explicit segment and aisle.
+    """Return the `compare` command with automatic ("base") and with stated segment and main axis.
 
-    Automatic segment and aisle depend on the clock offset, so a command with another offset states
-    them explicitly.
+    px4fuse chooses them by the time offset. With a changed time offset the command states them
+    ("fixed"), so it analyses the same data.
     """
     offset_s = None if request.position is None else request.clock_offset_s
-    automatic_request = msgspec.structs.replace(
+    request_with_automatic_segment = msgspec.structs.replace(
         request, sigma_a_m_s2=0.5, sigma_z_m=None, dt_s=0.1, input=None, clock_offset_s=offset_s
     )
     heading_deg = request.heading_deg
     if heading_deg is None and AISLE in analysis.axes:
         heading_deg = analysis[AISLE].heading_deg
-    explicit_request = msgspec.structs.replace(
-        automatic_request,
+    request_with_stated_segment = msgspec.structs.replace(
+        request_with_automatic_segment,
         start_s=analysis.segment.start_s,
         end_s=analysis.segment.end_s,
         heading_deg=heading_deg,
     )
     return {
-        "base": command_line(automatic_request, for_shell=True),
-        "fixed": command_line(explicit_request, for_shell=True),
+        "base": command_line(request_with_automatic_segment, for_shell=True),
+        "fixed": command_line(request_with_stated_segment, for_shell=True),
         "input": request.input,
         "default_input": "zero"
         if isinstance(analysis.main.axis.acceleration, Unavailable)

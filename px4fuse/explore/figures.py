@@ -13,11 +13,16 @@ from px4fuse.explore.data import PageData
 
 # Keyword arguments of Bokeh's drawing functions
 BokehStyle = dict[str, Any]
-# Columns of the Bokeh data sources, filled by JavaScript: time, position, velocity and σ of both;
-# KF gains; position error and its ±2σ limits; plotted values x, y, z; arrow angle; event row, start
-# and end
-SOURCE_COLUMNS = "t p v sp sv k0 k1 e minus plus x y z turn row left right"
-# JavaScript sets the colours by `name`. KF is solid and round, EKF2 dashed and square
+# Columns of the Bokeh data sources, which JavaScript fills
+SOURCE_COLUMNS = (
+    "t p v sp sv "  # time, position, velocity, σ of position, σ of velocity
+    "k0 k1 "  # KF gain of position and of velocity
+    "e minus plus "  # position error, lower and upper ±2σ limit
+    "x y "  # innovation ÷ √S, height of an arrow head at the edge of the plot
+    "z turn "  # measured position, angle of an arrow head (rad)
+    "row left right"  # row, start and end of an event
+)
+# JavaScript sets the colours by `name`. Shapes distinguish the filters without colour
 KF_LINE: BokehStyle = {"line_width": 1.6, "name": "kf"}
 EKF2_LINE: BokehStyle = {"line_width": 1.6, "line_dash": [6, 3], "name": "ekf2"}
 TRUTH_LINE: BokehStyle = {"line_width": 1.2, "line_dash": [1, 3], "name": "truth"}
@@ -56,7 +61,7 @@ class Plot(Record):
     Attributes
     ----------
     lines : tuple of (str, str, str, str)
-        Data source, column, key of :data:`STYLES`, and label in the tooltip of each line.
+        Data source, column, key of :data:`LINE_STYLES`, and label in the tooltip of each line.
     """
 
     lines: tuple[tuple[str, str, str, str], ...]

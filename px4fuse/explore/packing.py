@@ -12,18 +12,18 @@ import numpy as np
 
 from px4fuse.core.arrays import Array
 
-# Number of rounding steps per unit (m, m/s or s) of inputs of KF: the rounding error is 1 % of the
-# tolerance between KF in JavaScript and KF in Python
+# Inputs of KF (m, m/s or s) are multiplied by this factor and rounded to integers. The rounding
+# error is 1 % of the tolerance between KF in JavaScript and KF in Python
 FINE_SCALE = 2.0**36
-# Number of rounding steps per unit (m, m/s or s) of values that are only drawn or averaged
+# Values (m, m/s or s) that are only drawn or averaged are multiplied by this factor and rounded
 COARSE_SCALE = 1e6
-# Maximum integer: half of the largest integer that JavaScript represents exactly
+# Limit of the rounded values: half of the largest integer that JavaScript represents exactly
 MAX_EXACT_INTEGER = 2.0**52
 
 
 @dataclass
 class Packer:
-    """Encoder of arrays; ``array_specs``: length, number of byte planes and scale of each array."""
+    """Encoder of arrays; ``array_specs`` are length, bytes per value and scale of each array."""
 
     array_specs: list[tuple[int, int, float]] = field(default_factory=list)
     _bytes: list[bytes] = field(default_factory=list)
@@ -38,11 +38,11 @@ class Packer:
         differences = np.diff(integers, prepend=0)
         # the lowest bit is the sign, so small negative numbers have few bits too
         signed_integers = ((differences << 1) ^ (differences >> 63)).astype("<u8")
-        plane_count = max(1, (int(signed_integers.max(initial=0)).bit_length() + 7) // 8)
+        byte_count = max(1, (int(signed_integers.max(initial=0)).bit_length() + 7) // 8)
         self._bytes.append(
-            signed_integers.view(np.uint8).reshape(-1, 8)[:, :plane_count].T.tobytes()
+            signed_integers.view(np.uint8).reshape(-1, 8)[:, :byte_count].T.tobytes()
         )
-        self.array_specs.append((len(values), plane_count, scale))
+        self.array_specs.append((len(values), byte_count, scale))
         return {"array": len(self.array_specs) - 1}
 
     def add_times(self, time_s: Array) -> dict[str, int]:

@@ -16,7 +16,7 @@ const Explore = (async () => {
     { id: "sigma-z", key: "sigma_z_m", title: "SIGMA_Z", unit: "m", log: [0.001, 10],
       hint: "measurement noise", likely: () => likelyNow()[1] },
     { id: "clock-offset", key: "clock_offset_s", title: "Time offset", unit: "s",
-      hint: "added to timestamps", likely: () => flight.offset.likely },
+      hint: "added to the position timestamps", likely: () => flight.offset.likely },
     { id: "dt", key: "dt_s", title: "DT", unit: "s", log: [0.01, 1], hint: "prediction step" },
   ];
   const TICKS = 600;

@@ -52,8 +52,8 @@ SCENARIO_VALUES: dict[str, Any] = {
 }
 # Range of the random length (m) of a pass along the aisle
 AISLE_LENGTH_RANGE_M = (8.0, 12.0)
-# Id of the finding whose time span is the time span of the injected fault
-FINDING_WITH_TIME_BY_MISTAKE = {
+# Id of the finding that reports the time of an injected fault, by name of the fault
+FINDING_ID_BY_MISTAKE = {
     "nlos": "source_outliers",
     "jump": "source_position_jump",
     "dropout": "source_gap",
@@ -124,19 +124,19 @@ def draw_flights(seed: int, level: int, count: int) -> tuple[PracticeFlight, ...
         Number of flights.
     """
     rng = np.random.default_rng([seed, level, count])
-    choices: list[str] = []
-    while len(choices) < count:
-        choices += [str(name) for name in rng.permutation(list(FAULT_CHOICES))]
-    return tuple(_draw_flight(rng, name, level) for name in choices[:count])
+    right_answers: list[str] = []
+    while len(right_answers) < count:
+        right_answers += [str(name) for name in rng.permutation(list(FAULT_CHOICES))]
+    return tuple(_draw_flight(rng, answer, level) for answer in right_answers[:count])
 
 
-def _draw_flight(rng: np.random.Generator, choice: str, level: int) -> PracticeFlight:
-    def draw_one(choices: list[HiddenMistake]) -> list[HiddenMistake]:
-        return [choices[rng.integers(len(choices))]] if choices else []
+def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> PracticeFlight:
+    def draw_one(candidates: list[HiddenMistake]) -> list[HiddenMistake]:
+        return [candidates[rng.integers(len(candidates))]] if candidates else []
 
-    mistakes = draw_one([mistake for mistake in HIDDEN_MISTAKES if mistake.choice == choice])
+    mistakes = draw_one([mistake for mistake in HIDDEN_MISTAKES if mistake.choice == right_answer])
     if level == MAX_LEVEL and mistakes and rng.random() < 0.5:
-        pairs = ((mistake, {mistake.choice, choice}) for mistake in HIDDEN_MISTAKES)
+        pairs = ((mistake, {mistake.choice, right_answer}) for mistake in HIDDEN_MISTAKES)
         mistakes += draw_one([mistake for mistake, pair in pairs if pair in COMBINABLE_CHOICES])
     sizes, noise_m = [], SIGMA_Z_M
     for mistake in mistakes:
@@ -164,15 +164,15 @@ def practice_text(
 
     ``progress`` is called with a text, the number of finished flights, and the number of flights.
     """
-    data_elements = []
+    elements = []
     data: dict[str, Any] = {}
-    for number, practice_flight in enumerate(draw_flights(seed, level, count)):
-        progress(f"flight {number + 1}", number, count)
-        data, data_element = _flight_data(practice_flight, number)
-        data_elements.append(data_element)
+    for flight_index, practice_flight in enumerate(draw_flights(seed, level, count)):
+        progress(f"flight {flight_index + 1}", flight_index, count)
+        data, element = _flight_data(practice_flight, flight_index)
+        elements.append(element)
     return page_text(
         data,
-        data_scripts="\n".join(data_elements),
+        data_scripts="\n".join(elements),
         command="practice",
         title="simulated flights with known faults",
         about=f"seed {seed}, level {level}",
@@ -181,7 +181,7 @@ def practice_text(
     )
 
 
-def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str, Any], str]:
+def _flight_data(practice_flight: PracticeFlight, flight_index: int) -> tuple[dict[str, Any], str]:
     mistakes_and_sizes = [*zip(practice_flight.mistakes, practice_flight.sizes, strict=True)]
     options = [
         f"{mistake.mistake}={size}"
@@ -189,7 +189,7 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
         if mistake.mistake != NOISY_UWB
     ]
     simulation = flights.simulate(practice_flight.scenario, parse_mistakes(options))
-    flight = flights.to_flight(simulation, f"flight {number + 1}")
+    flight = flights.to_flight(simulation, f"flight {flight_index + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     # as_sent: an automatic correction of the frame would hide the injected fault
     analysis, packer = diagnose(request, flight=flight, as_sent=True), Packer()
@@ -198,20 +198,20 @@ def _flight_data(practice_flight: PracticeFlight, number: int) -> tuple[dict[str
     answer_key = {
         "right": practice_flight.correct_answers,
         "mistakes": descriptions,
-        "card": card_html(_name_mistakes(card, descriptions), has_apply=True),
+        "card": card_html(_with_fault_headline(card, descriptions), has_apply=True),
     }
     compressed_key = base64.b64encode(zlib.compress(json.dumps(answer_key).encode())).decode()
-    data_elements = data_scripts(data, analysis, packer, f"-{number}")
+    elements = data_scripts(data, analysis, packer, f"-{flight_index}")
     return (
         data,
-        f'{data_elements}\n<script type="text/plain" id="key-{number}">{compressed_key}</script>',
+        f'{elements}\n<script type="text/plain" id="key-{flight_index}">{compressed_key}</script>',
     )
 
 
 def _describe_mistake(
     mistake: HiddenMistake, size: str, findings: tuple[Finding, ...]
 ) -> dict[str, Any]:
-    finding_id = FINDING_WITH_TIME_BY_MISTAKE.get(mistake.mistake)
+    finding_id = FINDING_ID_BY_MISTAKE.get(mistake.mistake)
     spans = [span for finding in findings if finding.id == finding_id for span in finding.spans_s]
     time_text = f"{spans[0][0]:.1f} to {spans[-1][1]:.1f} s" if spans else "whole flight"
     return {
@@ -233,7 +233,7 @@ def size_parts(size: str) -> list[str]:
     return [re.sub(r"(?<=\d)(?=[^\d.])", " ", part).replace("deg", "°") for part in size.split(",")]
 
 
-def _name_mistakes(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Card:
+def _with_fault_headline(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Card:
     if card.causes or not descriptions:
         return card
     fault_text = "; ".join(f"{mistake['fault']}: {mistake['size']}" for mistake in descriptions)

@@ -39,9 +39,9 @@ MAX_INTERVAL_RATIO = 3.0
 COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
 # Time-correlated fractions of the variance SIGMA_Z² in the coarse search
 COARSE_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
-# Factors on SIGMA_A in the coarse search for time-correlated noise
+# Tested multiples of SIGMA_A in the coarse search for time-correlated noise
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
-# Common factors on all noises in the coarse search for time-correlated noise
+# Tested common factors on all noises in the coarse search for time-correlated noise
 COARSE_NOISE_FACTORS = np.geomspace(0.7, 1.6, 12)
 # Approximate number of position measurements in the coarse search for time-correlated noise
 COARSE_MEASUREMENTS = 1000
@@ -187,8 +187,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         )
         if isinstance(prepared_motion, Unavailable):
             return prepared_motion, 0.0
-        # the first position of an IMU segment sets the initial state and does not contribute to the
-        # likelihood
+        # the likelihood omits the first position of each IMU segment, which is its initial state
         is_used = np.isin(
             time_s, np.delete(prepared_motion.time_s, prepared_motion.segment_edges[:-1])
         )
@@ -240,7 +239,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
 
     def fit_low_pass(log_tau: float) -> tuple[float, Noises]:
         prepared_motion, jacobian_term = undo_low_pass(float(np.exp(log_tau)))
-        # prepare_motion succeeded for the white-noise model with the same measurements
+        # prepare_motion succeeded with the same measurement times before
         assert not isinstance(prepared_motion, Unavailable)
         noise_fit = _fit_noises_at(prepared_motion, 0.0, white_fit.noises)
         return noise_fit.lowest_score + jacobian_term, noise_fit.noises
@@ -384,7 +383,7 @@ def _fit_noises_at(
 def _best_of_grid(
     prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidate_noises: Sequence[Noises]
 ) -> tuple[float, Noises]:
-    """Return the lowest -ln p on a coarse grid of time offsets and noises, with its noises."""
+    """Return the lowest -ln p on a coarse grid of time offsets and noises, and these noises."""
     scored_noises = []
     for positions in map(prepared_motion.positions_at_offset, offsets_s):
         for candidate, sigma_a_factor in product(candidate_noises, COARSE_SIGMA_A_FACTORS):

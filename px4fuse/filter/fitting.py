@@ -46,7 +46,7 @@ START_OUTLIER_WIDTH = 10.0
 MAX_OUTLIER_FRACTION = 0.4
 # While outliers are estimated, SIGMA_Z is limited to this multiple of its estimate from the median
 MAX_SIGMA_Z_RATIO = 1.2
-# Maximum change of an outlier probability after convergence of the expectation maximisation
+# Expectation maximisation has converged if no outlier probability changes by more than this
 MAX_PROBABILITY_CHANGE = 0.01
 # Value of -ln p per measurement if the likelihood cannot be computed: larger than any real value
 UNCOMPUTABLE_SCORE = 1e6
@@ -483,11 +483,10 @@ def _maximise_by_gradient(
     measurement_count = len(likelihood.weight)
 
     def score_per_measurement(logs: Array) -> float:
-        # divided by the number of measurements, the gradient and the first step are about 1
+        # divide by the number of measurements, so that the gradient and the first step are about 1
         try:
             return likelihood(to_noises(logs)) / measurement_count
-        # far from the maximum rounding errors dominate; the large value makes L-BFGS-B shorten the
-        # step
+        # where rounding errors dominate, a large value makes L-BFGS-B shorten its step
         except np.linalg.LinAlgError:
             return UNCOMPUTABLE_SCORE
 

@@ -57,7 +57,7 @@ MIN_SIGMA_DEG = 0.5
 MAX_ATTITUDE_INTERVAL_S = 0.11
 # Maximum number of linearisations in the fit of the heading error
 MAX_LINEARISATIONS = 5
-# Maximum change (rad) of the heading error in the last iteration of the linearised fit
+# The linearised fit has converged if the heading error changes by less than this (rad)
 MAX_CONVERGED_CHANGE_RAD = 0.01
 # Prior σ (rad) of the heading error
 HEADING_SIGMA_RAD = 1.0
@@ -230,7 +230,7 @@ def _compare_orientations(
         return None
     time_s = time_s[is_calm]
     rotation_rad = rotation_rad[is_calm]
-    # σ from differences of successive samples
+    # σ from the median difference of successive samples
     noise_rad = 1.4826 * np.median(np.abs(np.diff(rotation_rad))) / np.sqrt(2.0)
     sigma_rad = np.full(len(time_s), max(float(noise_rad), np.radians(MIN_SIGMA_DEG)))
     part_headings = _mean_per_part(time_s, rotation_rad, sigma_rad)
@@ -307,7 +307,7 @@ def _estimate_from_positions(
         if abs(step_rad) < MAX_CONVERGED_CHANGE_RAD:
             break
     difference_rad = error_rad - step_rad
-    # variance of the true heading error: variance of the estimates minus that of their errors
+    # the variance of the estimates is that of the true heading error plus that of estimation errors
     excess_variance = max(float(np.mean(difference_rad**2 - heading_variance)), 0.0)
     drift_variance = 0.0 if has_constant_heading else excess_variance
     # shrink each estimate towards the mean: the more, the larger its estimation error

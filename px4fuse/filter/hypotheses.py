@@ -41,7 +41,7 @@ ANALYSIS_NAME = "biases, scale factor error and jumps"
 MIN_MEASUREMENTS = 50
 # Prior σ (rad) of the slow tilt error of the logged attitude
 TILT_SIGMA_RAD = 0.002
-# Interval (s) between the knots of the slowly varying acceleration error
+# Interval (s) between the knots of the linearly interpolated slow acceleration error
 KNOT_SPACING_S = 15.0
 MAX_KNOTS = 40
 # Columns of the design matrix: accelerometer bias forward, accelerometer bias right, frame rotation
@@ -121,8 +121,7 @@ class SystematicErrors:
     @property
     def bias(self) -> Estimate:
         """Magnitude of the horizontal accelerometer bias (m/s²)."""
-        forward = self.forward_bias
-        right = self.right_bias
+        forward, right = self.forward_bias, self.right_bias
         return Estimate(
             math.hypot(forward.value, right.value), math.hypot(forward.sigma, right.sigma)
         )
@@ -357,6 +356,7 @@ def _locate_jump(
             is_near, residual_squares > max_residual_square, is_skipped
         )
     # with a wrong jump time, good measurements look like outliers: choose the time with the fewest
+    # outliers
     best_time_s = min(
         outliers_by_time, key=lambda jump_s: np.count_nonzero(outliers_by_time[jump_s])
     )
@@ -370,7 +370,7 @@ def _locate_jump(
 def _test_step(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, time_s: float, false_alarm_p: float
 ) -> Jump | None:
-    """Test a jump without the skipped measurements; return None if it is not significant."""
+    """Return the jump at ``time_s`` if it is significant without the skipped measurements."""
     design, step_column_indices = design.with_step(time_s)
     count_before = np.count_nonzero(~is_skipped & (design.time_s < time_s))
     if (
@@ -469,7 +469,7 @@ class DesignMatrix:
     def whitened(
         self, dp: Array, dv: Array, measured_m: Array, sigma_a: float, is_skipped: BoolArray
     ) -> tuple[Array, float]:
-        """Return ν/√S of k signals, shape (m, k), and Σ ln S of the fused measurements."""
+        """Return ν/√S of k inputs, shape (m, k), and Σ ln S of the fused measurements."""
         signals = replace(
             self.signals, delta_position_m=dp, delta_velocity_m_s=dv, measurement_m=measured_m
         )
@@ -500,8 +500,7 @@ class DesignMatrix:
             self.prior_sigma, np.full(column_count - len(self.prior_sigma), np.inf)
         )
         information = np.diag(prior_sigma**-2.0) + columns.T @ columns
-        # a small diagonal keeps the matrix regular if a column is zero, as the frame rotation in
-        # hover
+        # a small diagonal keeps the matrix regular if a column is zero (frame rotation in hover)
         information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(column_count)
         moment = columns.T @ innovations_by_axis
         information_factor = cho_factor(information)
@@ -537,7 +536,7 @@ class DesignMatrix:
         column_count = len(self.prior_sigma)
         whitened_innovations = np.empty((axis_count, len(is_skipped)))
         columns = np.zeros((axis_count, len(is_skipped), column_count + axis_count * step_count))
-        # the scale does not multiply the biases
+        # the scale multiplies data and rotation, not the biases
         data_columns = (1 + CONSTANT_COUNT) * np.arange(axis_count)
         scales = np.ones(signals.measurement_m.shape[1])
         scales[np.append(data_columns, data_columns + 1 + ROTATION)] = scale
@@ -635,7 +634,7 @@ def _integrate_signal(acceleration_m_s2: Array, time_s: ArrayLike, timeline: Tim
 def _common_accelerations(
     attitude: pd.DataFrame, acceleration: Acceleration
 ) -> list[tuple[Array, Array]]:
-    """Return times and NED accelerations of unit biases forward and right and a unit rotation."""
+    """Return (time, NED acceleration) for unit biases forward and right and a unit rotation."""
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
     attitude_time_s = attitude.index.to_numpy()

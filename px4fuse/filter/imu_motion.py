@@ -162,13 +162,10 @@ class PreparedMotion:
         unit_process_noise = self.dt_s * np.stack(continuous_noise_unit(length_s))
         prior_precision = np.zeros((len(self.time_s), 2))
         prior_precision[self.segment_edges[:-1]] = START_PRECISION
-        signal_shape = (
-            len(self.directions),
-            len(time_offsets_s),
-            1 + len(CONSTANTS_PRIOR_SIGMA),
-            len(length_s),
+        column_count = 1 + len(CONSTANTS_PRIOR_SIGMA)
+        dp, dv = np.zeros(
+            (2, len(self.directions), len(time_offsets_s), column_count, len(length_s))
         )
-        dp, dv = np.zeros((2, *signal_shape))
         for begin, end, segment_motion in zip(
             self.segment_edges, self.segment_edges[1:], self.segment_motions, strict=False
         ):
@@ -313,7 +310,7 @@ def prepare_motion(
             "Analyse a longer segment.",
         )
     segment_edges = np.cumsum([0, *map(len, rows_by_segment)])
-    # the initial position is unknown, and small numbers limit rounding errors
+    # subtract the first position, which is unknown anyway: small numbers limit rounding errors
     measured_m = pd.DataFrame(measurement_m[used_rows])
     segment_index = np.repeat(np.arange(len(rows_by_segment)), np.diff(segment_edges))
     first_m = measured_m.groupby(segment_index).transform("first")
@@ -427,12 +424,9 @@ def _integrate_gyros(step_times_s: Array, angle_rad: Array, attitude: pd.DataFra
         )
     )
     logged_quaternions = attitude.iloc[near_rows][Columns.QUATERNION].to_numpy(copy=True)
-    start_s = np.clip(
-        step_times_s[0], attitude_time_s[near_rows][0], attitude_time_s[near_rows][-1]
-    )
-    slerp = Slerp(
-        attitude_time_s[near_rows], Rotation.from_quat(logged_quaternions, scalar_first=True)
-    )
+    near_time_s = attitude_time_s[near_rows]
+    start_s = np.clip(step_times_s[0], near_time_s[0], near_time_s[-1])
+    slerp = Slerp(near_time_s, Rotation.from_quat(logged_quaternions, scalar_first=True))
     start_quaternion = slerp(start_s).as_quat(scalar_first=True)
     rotation_since_start = cumulative_product(from_vector(np.diff(angle_rad, axis=0)))
     return np.vstack([start_quaternion, multiply(start_quaternion, rotation_since_start)])

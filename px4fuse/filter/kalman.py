@@ -179,7 +179,7 @@ def _run_floats(
 
 
 def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
-    """Return the step before each time, the time since it (s), and a mask of times outside."""
+    """Return the last step before each time, the time since it (s), and a mask of times outside."""
     step_times_s = run.steps.index.to_numpy()
     step_index = np.clip(
         np.searchsorted(step_times_s, times_s, side="right") - 1, 0, len(step_times_s) - 1

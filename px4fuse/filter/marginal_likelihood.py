@@ -33,7 +33,7 @@ from scipy.linalg import lapack
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 
 UNIT_SCALE = np.ones(1)
-# SIGMA_A (m/s²) and SIGMA_Z (m) for the smoothed path, which is subtracted from the positions
+# SIGMA_A (m/s²) and SIGMA_Z (m) of the smoother whose path is subtracted from the positions
 SMOOTHED_PATH_NOISES = 0.5, 0.1
 # Minimum prior precision (1/m²) for which an initial position is treated as known
 MIN_KNOWN_START_PRECISION = 1e-3
@@ -292,7 +292,7 @@ def centre_on_path(positions: Positions, *, has_scale: bool = False) -> Position
         path_velocity_m_s = smoothed_state[..., 1]
         measured_m[:, axes] -= path_m[:, 0].T
         path_delta_position_m = np.diff(path_m) - positions.length_s * path_velocity_m_s[..., :-1]
-        # the same path, of the first time offset, is subtracted for all time offsets
+        # subtract the path for the first time offset from the increments for all time offsets
         for array, increment in ((dp, path_delta_position_m), (dv, np.diff(path_velocity_m_s))):
             array[axes, :, 0] -= increment[:, :1]
             if has_scale:
@@ -484,7 +484,7 @@ class BandedSystem:
         reversed_lower, _ = lapack.dpbtrf(reversed_bands, lower=1, overwrite_ab=1)
         (a, c) = (self.cholesky_factor[0, first_row::2] for first_row in (0, 1))
         b = self.cholesky_factor[1, 0::2]
-        # the reversed order also exchanges position and velocity
+        # in reversed order, velocity stands before position
         (d, f) = (reversed_lower[0, first_row::2][::-1] for first_row in (0, 1))
         e = reversed_lower[1, 0::2][::-1]
         p00 = a**2 + e**2 + f**2 - self.bands[0, 0::2]

@@ -63,7 +63,7 @@ def propagate_state(position: T, velocity: T, acceleration: T, dt_s: T) -> tuple
 
 
 def propagate_covariance(covariance: Symmetric[T], dt_s: T) -> Symmetric[T]:
-    """Return the predicted covariance FPFᵀ without Q: elements 00, 01, 11."""
+    """Return FPFᵀ, the predicted covariance without process noise: elements 00, 01, 11."""
     p00, p01, p11 = covariance
     return p00 + 2.0 * dt_s * p01 + dt_s**2 * p11, p01 + dt_s * p11, p11
 

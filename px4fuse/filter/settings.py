@@ -31,7 +31,7 @@ SETTING_RANGES = {
     "dt_s": Range(1e-3, 1.0, "s", "DT"),
     "clock_offset_s": Range(-10.0, 10.0, "s", "time offset added to the source timestamps"),
 }
-# Numeric settings of KF itself: the time offset belongs to the position source
+# Numeric settings of KF; the time offset is a setting of the position source
 KF_NUMBERS = tuple(name for name in SETTING_RANGES if name != "clock_offset_s")
 
 
@@ -67,7 +67,7 @@ class Settings:
     def __post_init__(self) -> None:
         for name, (low, high, unit, _) in SETTING_RANGES.items():
             value = getattr(self, name)
-            if not low <= value <= high:  # also True for NaN
+            if not low <= value <= high:  # NaN is out of range, too
                 raise SettingsError(
                     f"`{name}` {value:g} is out of range: give {low:g} to {high:g} {unit}."
                 )
@@ -80,7 +80,7 @@ class Settings:
 def requested_settings(request: ComparisonRequest) -> Settings:
     """Return KF's settings from a request; a field that is None keeps its default."""
     values = {name: getattr(request, name) for name in Settings.__dataclass_fields__}
-    # "auto" is estimated later; the time offset of a position file is applied by its reader
+    # "auto" is estimated later, and the reader of a position file already adds the time offset
     if request.clock_offset_s == AUTO or request.position is not None:
         del values["clock_offset_s"]
     return Settings(**{name: value for name, value in values.items() if value is not None})

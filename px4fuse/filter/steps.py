@@ -10,7 +10,7 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis, mean_step_acceleration
 from px4fuse.flight.model import Unavailable
 
-# Maximum difference (s) of equal timestamps: half of their resolution of 1 µs
+# Timestamps are equal up to this difference (s): half of their resolution of 1 µs
 MAX_SAME_TIME_S = 5e-7
 
 
@@ -59,7 +59,7 @@ def make_timeline(
         )
     grid_count = int(np.floor((measurement_time_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
     grid_s = start_s + settings.dt_s * np.arange(grid_count)
-    # a measurement at a time of the DT grid replaces the grid time
+    # omit grid times at which there is a measurement
     next_index = np.searchsorted(measurement_time_s, grid_s)
     neighbours = np.clip([next_index - 1, next_index], 0, len(measurement_time_s) - 1)
     distance_s = np.abs(measurement_time_s[neighbours] - grid_s).min(axis=0)

@@ -204,7 +204,7 @@ def estimate_time_offset(
             break
         half_width_s *= 2.0
     offset_s = _minimum_and_sigma(curve_s, curve_scores)[0]
-    # an IMU sample is a mean, and its timestamp may be anywhere in the averaged interval
+    # an IMU sample is the mean over an interval; its timestamp may be anywhere in this interval
     resolution_s = 0.5 * prepared_motion.imu_interval_s
     ends_s = curve_s[0] if low_s is None else low_s, curve_s[-1] if high_s is None else high_s
     half_intervals_s = np.hypot(np.array(ends_s) - offset_s, 1.96 * resolution_s)

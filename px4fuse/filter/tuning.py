@@ -43,7 +43,7 @@ NoiseInterval = tuple[NotNegative, NotNegative | None]
 MIN_MEASUREMENTS = 30
 # SIGMA_A and SIGMA_Z are not estimated if the fraction of outliers is above this limit
 MAX_OUTLIER_FRACTION = 0.3
-# Factors on KF's SIGMA_A that give the initial values of the noise fit with IMU biases
+# Multiples of KF's SIGMA_A from which the noise fit with IMU biases starts
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value of the random walk (m/√s) of a source that may drift
 START_RANDOM_WALK_M = 0.02
@@ -168,7 +168,7 @@ def tune(
     flight : Flight, optional
         Flight whose IMU data separate biases and tilt from noise.
     may_drift : bool
-        True if the source may drift, as odometry does.
+        True if the source may drift (odometry).
     motion_cache : dict, optional
         IMU motion that several estimates share.
     """
@@ -188,7 +188,9 @@ def tune(
                 tunings[name] = tune_axes(
                     name, group_axes, settings, flight, may_drift, motion_cache
                 )
-            except np.linalg.LinAlgError as error:  # positions far outside of the track
+            except (
+                np.linalg.LinAlgError
+            ) as error:  # rounding errors due to positions far from the path
                 tunings[name] = Unavailable(
                     f"estimate of the noises ({name})",
                     str(error),
@@ -217,7 +219,7 @@ def tune_axes(
         )
     chosen_noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
     kf_fit = maximise_likelihood(axis_positions, chosen_noises, np.ones(measurement_count))
-    # fit with biases, tilt and time offset; None without IMU data
+    # the fit that includes biases, tilt and time offset needs IMU data
     motion_fit = None
     if flight is not None and settings.input == "imu":
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
@@ -351,7 +353,7 @@ def _check_held_out(name: str, chosen_noises: Noises, fit: NoiseFit) -> HeldOutC
         first_half, fit.noises, fit.weight[:half_count], fits_outliers=False
     )
     tuned_noises = first_fit.noises
-    # -ln p of the second half
+    # -ln p of the second half: whole flight minus first half
     chosen_score, tuned_score = (
         fit.score(noises) - first_fit.score(noises) for noises in (chosen_noises, tuned_noises)
     )

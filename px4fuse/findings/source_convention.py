@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from msgspec.structs import replace
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.convention.axes import UNITS
+from px4fuse.convention.axes import UNIT_SIZES_M
 from px4fuse.convention.correction import MIN_REMAINDER_DEG, Faults, convention_faults
 from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.convention.texts import (
@@ -152,7 +152,7 @@ def _position_faults(
         yield "source_frame_misaligned", "rotation", message, action
     if faults.has_wrong_unit:
         fault, action = describe_unit(convention.unit, positions, is_file=is_file)
-        distance_ratio = convention.scale / UNITS[convention.unit]
+        distance_ratio = convention.scale / UNIT_SIZES_M[convention.unit]
         message = (
             f"{fault}. Distances are {distance_ratio:.3g} times those that the IMU measures. "
             f"{basis_text} The analysis uses the positions in metres."

@@ -77,9 +77,8 @@ def detect_white_patterns(analysis: Analysis, white: WhiteErrors) -> Findings:
             f"{format_metres(noise.fast_m)} m at {noise.fast_m_s:.1f} m/s (1 σ). The noise grows "
             "along and across the motion, so time offset and jitter are not the cause. No single "
             "measurement noise fits the whole flight.",
-            "Let the source send a variance that grows with speed (EKF2_EV_NOISE_MD 0). For "
-            "cameras, check motion blur and exposure; for UWB, check the time that the ranges of "
-            "one position take.",
+            "Let the source send a variance that grows with speed (EKF2_EV_NOISE_MD 0). "
+            "Shorten the time of one measurement: exposure time or ranging time.",
             noise._asdict(),
         )
 

@@ -88,9 +88,9 @@ class Parameter(NamedTuple):
 
     def describe_range_error(self, name: str, value: float) -> str:
         """Return "EKF2_EVP_NOISE 9 m is outside PX4's range 0.01 to 5", or "" inside the range."""
-        low = self.minimum - FLOAT32_TOLERANCE * abs(self.minimum)
-        high = self.maximum + FLOAT32_TOLERANCE * abs(self.maximum)
-        if low <= value <= high:
+        lower_limit = self.minimum - FLOAT32_TOLERANCE * abs(self.minimum)
+        upper_limit = self.maximum + FLOAT32_TOLERANCE * abs(self.maximum)
+        if lower_limit <= value <= upper_limit:
             return ""
         unit = f" {self.unit}" if self.unit else ""
         return f"{name} {value:g}{unit} is outside PX4's range {self.minimum:g} to {self.maximum:g}"
@@ -123,7 +123,7 @@ PARAMETERS, _LOGGED_PARAMETERS = (
 )
 # Parameters of the EKF2 model, and other logged parameters that px4fuse needs
 PARAMETER_RANGES = PARAMETERS | _LOGGED_PARAMETERS
-FIELD_NOISE_PARAMETERS = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
+MAGNETIC_FIELD_NOISE_PARAMETERS = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # EKF2_MAG_TYPE without magnetometer
 NO_MAGNETOMETER = 5
 # Defaults of PX4 up to v1.13 that differ from the defaults of later releases (ekf2_params.c)
@@ -147,7 +147,7 @@ def effective_settings(
         for name in (
             *other_aid.measurement_parameters,
             *other_aid.lever_arm,
-            *(FIELD_NOISE_PARAMETERS if other_aid == MAG else ()),
+            *(MAGNETIC_FIELD_NOISE_PARAMETERS if other_aid == MAG else ()),
         )
     }
     defaults = {

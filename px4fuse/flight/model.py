@@ -39,9 +39,9 @@ PositionKind = Literal["uwb", "vio", "mocap", "gnss", "unknown", "file"]
 DataPath = Literal[
     "given file",
     "as received",
-    "positions aligned by EKF2",
-    "observation logged by EKF2",
-    "EKF2 position plus innovation",
+    "aligned by EKF2",
+    "kept by EKF2",
+    "rebuilt from innovations",
 ]
 
 
@@ -69,7 +69,7 @@ class Origin(Record):
     @property
     def reconstructed(self) -> bool:
         """True if the positions are derived from EKF2's logged data, not logged as received."""
-        return self.path in (LOGGED_BY_EKF2.path, FROM_INNOVATIONS.path)
+        return self.path in ("kept by EKF2", "rebuilt from innovations")
 
     @property
     def has_all_samples(self) -> bool:
@@ -102,9 +102,9 @@ class Origin(Record):
 POSITION_FILE = Origin("file", "given file", EV_POS)
 RECEIVED = Origin("uwb", "as received", EV_POS)
 MOTION_CAPTURE = Origin("mocap", "as received", None)
-ALIGNED = Origin("uwb", "positions aligned by EKF2", EV_POS)
-LOGGED_BY_EKF2 = Origin("uwb", "observation logged by EKF2", EV_POS)
-FROM_INNOVATIONS = Origin("uwb", "EKF2 position plus innovation", EV_POS)
+ALIGNED = Origin("uwb", "aligned by EKF2", EV_POS)
+LOGGED_BY_EKF2 = Origin("uwb", "kept by EKF2", EV_POS)
+FROM_INNOVATIONS = Origin("uwb", "rebuilt from innovations", EV_POS)
 GNSS = Origin("gnss", "as received", GNSS_POS, is_automatic=False)
 # All origins in order of preference
 ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS, GNSS)
@@ -179,9 +179,9 @@ class ClockMap(Record):
     method: str
     # Number of simultaneous readings of both clocks
     pairs: Count
-    # Boot clock minus this clock, at the middle of the readings
+    # Boot clock minus converted clock, at the middle of the readings
     offset_s: float
-    # Rate of the boot clock minus rate of this clock
+    # Rate of the boot clock minus rate of the converted clock
     drift_ppm: float
     # Standard deviation of the readings from the fitted line (1.4826 · median absolute deviation)
     jitter_s: NotNegative
@@ -421,7 +421,7 @@ class PositionTrack:
     clock_map: ClockMap | None = None
     alignment: Alignment | None = None
     # Quaternion body FRD to ``frame``, and variances about the body axes (NaN if not sent). None
-    # for a constant orientation: such a source is not odometry
+    # if the orientation is constant, because the source is then not odometry
     orientation: pd.DataFrame | None = None
     # Velocity in NED and its variances, if the source measures velocity (GNSS)
     velocity: pd.DataFrame | None = None
@@ -487,9 +487,11 @@ def kind_without_orientation(samples: pd.DataFrame) -> PositionKind:
     Motion capture, odometry and other precise systems may also send positions only.
     """
     position_m = samples[Columns.POSITION[:2]].dropna().drop_duplicates().to_numpy()
-    if len(position_m) < MIN_NOISE_SAMPLES:
-        return "unknown"
-    is_uwb = white_noise_m(position_m) > MIN_UWB_NOISE_M and sample_rate(samples) < MAX_UWB_RATE_HZ
+    is_uwb = (
+        len(position_m) >= MIN_NOISE_SAMPLES
+        and white_noise_m(position_m) > MIN_UWB_NOISE_M
+        and sample_rate(samples) < MAX_UWB_RATE_HZ
+    )
     return "uwb" if is_uwb else "unknown"
 
 
@@ -500,8 +502,8 @@ def source_name(source: PositionTrack) -> str:
 
 def reset_times_s(track: PositionTrack) -> Array:
     """Return the times at which ``reset_counter`` of the source changes."""
-    counter = track.status.get("reset_counter", pd.Series(dtype=float))
-    return np.asarray(counter.index[1:][np.diff(counter) != 0.0], dtype=np.float64)
+    reset_counter = track.status.get("reset_counter", pd.Series(dtype=float))
+    return np.asarray(reset_counter.index[1:][np.diff(reset_counter) != 0.0], dtype=np.float64)
 
 
 def positions_phrase(source: PositionTrack) -> str:
@@ -782,8 +784,8 @@ def sample_rate(samples: pd.DataFrame) -> float:
     """
     if len(samples) < 2:
         return float("nan")
-    intervals = samples.index.to_series().diff().dropna()
-    regular_intervals = intervals[intervals <= 3.0 * intervals.median()]
-    if len(regular_intervals) < MIN_REGULAR_FRACTION * len(intervals):
-        regular_intervals = intervals
-    return float(1.0 / regular_intervals.mean())
+    intervals_s = samples.index.to_series().diff().dropna()
+    regular_intervals_s = intervals_s[intervals_s <= 3.0 * intervals_s.median()]
+    if len(regular_intervals_s) < MIN_REGULAR_FRACTION * len(intervals_s):
+        regular_intervals_s = intervals_s
+    return float(1.0 / regular_intervals_s.mean())

@@ -70,7 +70,7 @@
         });
       }
     }
-    if (otherRows.length) node.append(make("small", `${otherRows.length} other rows of overrides.csv stay unchanged.`));
+    if (otherRows.length) node.append(make("small", `${otherRows.length} other rows of overrides.csv (corrected points) stay unchanged.`));
     return node;
   };
   const overridesText = () => {

@@ -105,15 +105,16 @@ def links_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
 
 def boxes_section(
     title: str,
-    person_id: str,
+    student_id: str,
     rows: Sequence[tuple[str, float, float | None, str]],
     other_rows: Sequence[tuple[str, float | None, str]],
 ) -> Section:
-    """Return a section with input boxes for points and comments, exported as CSV.
+    """Return a section in which the instructor enters points and comments of a student.
 
-    ``rows`` are (name, maximum, points, comment); ``other_rows`` are exported without boxes.
+    ``rows`` are (item, maximum, points, comment). The page exports them and ``other_rows`` (item,
+    points, comment), which cannot be edited, as CSV.
     """
-    return ["boxes", title, person_id, rows, other_rows]
+    return ["boxes", title, student_id, rows, other_rows]
 
 
 # ------------------------------------------------------------------ the page
@@ -189,7 +190,7 @@ def page(
 
 
 def _compact_cell(cell: Cell) -> list[Any]:
-    # short fields keep the page small: True is a value equal to the text
+    # short fields keep the page small: True replaces a sort key that is equal to the text
     value = True if cell.value == cell.text else "" if cell.value is None else cell.value
     cell_fields = [cell.text, value, cell.below, cell.style_class]
     while cell_fields and cell_fields[-1] == "":

@@ -93,16 +93,16 @@ def analyse(
         )
     spacing_m = request.key_frames_m
     spacing_m = default_key_frame_spacing_m(path.position_m) if spacing_m is None else spacing_m
-    frame_indices, distance_m = _choose_key_frames(path, spacing_m)
-    graph, nodes, variance_note = build_pose_graph(
-        path, frame_indices, closures_and_landings, noise
+    key_frame_indices, distance_m = _choose_key_frames(path, spacing_m)
+    graph, node_indices, variance_note = build_pose_graph(
+        path, key_frame_indices, closures_and_landings, noise
     )
     notes = [*z_down_trajectory.notes, variance_note]
     if isinstance(truth_end, str):
         notes.append(f"the ground truth does not contain the landing place: {truth_end}")
     gated_closures = gate_closures(graph, closures_and_landings)
     graph_corrections, gated_closures = solve_pose_graphs(
-        path, nodes, graph, gated_closures, progress
+        path, node_indices, graph, gated_closures, progress
     )
     end_from_start_m = path.position_m[-1] - path.position_m[0]
     heading_deg = loop_segment.heading_change_deg(path)
@@ -115,9 +115,10 @@ def analyse(
         path, distance_m, misclosure_m, heading_error_deg, landing_closure
     )
     references = tuple(track for track in (truth, reference) if track is not None)
-    closure_error_m = closure_error_axes_m = None
+    closure_error_m = closure_percent = closure_error_axes_m = None
     if not isinstance(misclosure_m, Unavailable):
         closure_error_m = float(np.linalg.norm(misclosure_m))
+        closure_percent = 100.0 * closure_error_m / float(distance_m[-1])
         closure_error_axes_m = components_by_axis(path.frame, misclosure_m)
     return Loop(
         track=path.name,
@@ -127,16 +128,14 @@ def analyse(
         end_s=segment.end_s,
         part_reason=segment.reason,
         poses=len(path),
-        key_frames=len(frame_indices),
+        key_frames=len(key_frame_indices),
         key_frame_spacing_m=spacing_m,
         path_length_m=float(distance_m[-1]),
         end_from_start_m=components_by_axis(path.frame, end_from_start_m),
         heading_change_deg=heading_deg,
         true_end=true_end,
         closure_error_m=closure_error_m,
-        closure_percent=None
-        if closure_error_m is None
-        else 100.0 * closure_error_m / float(distance_m[-1]),
+        closure_percent=closure_percent,
         closure_error_axes_m=closure_error_axes_m,
         heading_error_deg=heading_error_deg,
         is_absolute_track=flight is not None and _is_drift_free(trajectory, flight),
@@ -171,7 +170,7 @@ def _find_true_end(
     if not request.closed_loop:
         return Unavailable(
             "loop closure error",
-            "with --open, the path does not return to its start",
+            "the path does not return to its start, as stated with --open",
             "Omit --open.",
         )
     if isinstance(truth_end, TrueEnd):
@@ -202,15 +201,15 @@ def _is_drift_free(trajectory: Trajectory, flight: Flight) -> bool:
 def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
     """Return the indices of the key frames, and the distance (m) along them at each pose."""
     _require_in_range("key_frames_m", spacing_m, 1e-3)
-    frame_indices = choose_key_frames(path.position_m, spacing_m)
-    distance_m = cumulative_distance(path.position_m[frame_indices])
+    key_frame_indices = choose_key_frames(path.position_m, spacing_m)
+    distance_m = cumulative_distance(path.position_m[key_frame_indices])
     if not distance_m[-1] >= max(MIN_PATH_M * min(1.0, spacing_m / 0.5), 1e-6):
         raise TrajectoryError(
             f"{path.name}: the path of {distance_m[-1]:.2f} m is too short for key frames every "
             f"{spacing_m:g} m",
             "Change the time span (--from, --to) or the distance of key frames (--key-frames).",
         )
-    return frame_indices, np.interp(path.time_s, path.time_s[frame_indices], distance_m)
+    return key_frame_indices, np.interp(path.time_s, path.time_s[key_frame_indices], distance_m)
 
 
 def _require_in_range(name: str, value: float, min_value: float) -> None:
@@ -241,7 +240,9 @@ def _compute_heading_error(
     if isinstance(true_end, Unavailable):
         return true_end
     if heading_change_deg is None:
-        return Unavailable(quantity, "the trajectory has no orientations", "No action is needed.")
+        return Unavailable(
+            quantity, "the trajectory has no orientations", "Use a trajectory with orientations."
+        )
     if true_end.heading_change_deg is None:
         return Unavailable(
             quantity,
@@ -278,19 +279,19 @@ def analyse_flight_loop(
             "Send visual-inertial odometry to PX4 as MAVLink message ODOMETRY.",
         )
     segment, _ = loop_segment.choose_loop_segment(flight, trajectory, None, None)
-    segment_m = trajectory.between(segment.start_s, segment.end_s).position_m
-    extent_m = gap_m = 0.0
-    if len(segment_m):
-        extent_m = float(np.linalg.norm(np.ptp(segment_m, axis=0)))
-        gap_m = float(np.linalg.norm(segment_m[-1] - segment_m[0]))
+    segment_position_m = trajectory.between(segment.start_s, segment.end_s).position_m
+    extent_m = end_distance_m = 0.0
+    if len(segment_position_m):
+        extent_m = float(np.linalg.norm(np.ptp(segment_position_m, axis=0)))
+        end_distance_m = float(np.linalg.norm(segment_position_m[-1] - segment_position_m[0]))
     if (
         2.0 * extent_m < MIN_FLIGHT_LOOP_PATH_M
-        or gap_m > MAX_END_DISTANCE_FRACTION * 2.0 * extent_m
+        or end_distance_m > MAX_END_DISTANCE_FRACTION * 2.0 * extent_m
     ):
         return Unavailable(
             "loop closure",
-            f"the odometry has an extent of {extent_m:.1f} m and ends {gap_m:.1f} m from its "
-            "start, so it is not a loop",
+            f"the odometry has an extent of {extent_m:.1f} m and ends {end_distance_m:.1f} m from "
+            "its start, so it is not a loop",
             "Fly back to the take-off place, or give two times at one place with px4fuse loop "
             "--closure.",
         )

@@ -104,14 +104,16 @@ def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
 
 
 def distribute_by_distance(
-    position_m: Array, misclosure_m: Array, cumulative_m: Array | None = None
+    position_m: Array, misclosure_m: Array, cumulative_distance_m: Array | None = None
 ) -> Array:
     """Subtract a part of the loop closure error from each position, in proportion to the distance.
 
     ``misclosure_m`` is the final position minus the true final position. The method is the compass
     rule of surveying (Bowditch 1808; UAT 366 module 2, Example 2).
     """
-    distance_m = cumulative_distance(position_m) if cumulative_m is None else cumulative_m
+    distance_m = (
+        cumulative_distance(position_m) if cumulative_distance_m is None else cumulative_distance_m
+    )
     return np.asarray(position_m - (distance_m / distance_m[-1])[:, None] * misclosure_m)
 
 

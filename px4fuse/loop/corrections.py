@@ -44,13 +44,13 @@ ClosureAndLanding = tuple[GivenClosure, TrueEnd | None]
 
 
 def odometry_variances(
-    path: Trajectory, nodes: IntArray, noise: OdometryNoise
+    path: Trajectory, node_indices: IntArray, noise: OdometryNoise
 ) -> tuple[Array, Array, str]:
     """Compute the variances of the odometry between successive nodes of the pose graph.
 
     Parameters
     ----------
-    nodes : ndarray of int, shape (k,)
+    node_indices : ndarray of int, shape (k,)
         Indices of the poses that are nodes of the graph.
     noise : OdometryNoise
         Drift, used if the variances that the odometry reports do not grow.
@@ -64,13 +64,14 @@ def odometry_variances(
     variance_note : str
         Data from which the variances are computed, for the user.
     """
-    length_m = np.diff(cumulative_distance(path.position_m[nodes]))
-    duration_s = np.diff(path.time_s[nodes])
+    step_length_m = np.diff(cumulative_distance(path.position_m[node_indices]))
+    step_duration_s = np.diff(path.time_s[node_indices])
     translation_m2 = (
-        noise.position_m**2 / 100.0 * length_m + noise.position_m_per_root_s**2 * duration_s
+        noise.position_m**2 / 100.0 * step_length_m
+        + noise.position_m_per_root_s**2 * step_duration_s
     )
-    heading_rad2 = np.radians(noise.heading_deg) ** 2 / 100.0 * length_m
-    heading_rad2 = heading_rad2 + np.radians(noise.heading_deg_per_root_s) ** 2 * duration_s
+    heading_rad2 = np.radians(noise.heading_deg) ** 2 / 100.0 * step_length_m
+    heading_rad2 = heading_rad2 + np.radians(noise.heading_deg_per_root_s) ** 2 * step_duration_s
     tilt_rad2 = noise.tilt_share**2 * heading_rad2
     rotation_rad2 = np.column_stack([tilt_rad2, tilt_rad2, heading_rad2])
     drift_origin = "default" if noise == OdometryNoise() else "from options"
@@ -78,7 +79,7 @@ def odometry_variances(
         f"the odometry drift after 100 m is {noise.position_m:g} m in position and "
         f"{noise.heading_deg:g}° in heading (1 σ, {drift_origin})"
     ]
-    position_growth = _variance_growth(path.position_variance_m2, nodes)
+    position_growth = _variance_growth(path.position_variance_m2, node_indices)
     if position_growth is not None:
         translation_m2 = np.maximum(
             position_growth.mean(axis=1), MIN_VARIANCE_FRACTION * translation_m2
@@ -89,7 +90,7 @@ def odometry_variances(
         )
     elif path.position_variance_m2 is not None:
         origin_texts.append("the logged position variances do not grow, so they are not used")
-    rotation_growth = _variance_growth(path.rotation_variance_rad2, nodes)
+    rotation_growth = _variance_growth(path.rotation_variance_rad2, node_indices)
     if rotation_growth is not None:
         rotation_rad2 = np.maximum(rotation_growth, MIN_VARIANCE_FRACTION * rotation_rad2)
         origin_texts.append(
@@ -99,7 +100,7 @@ def odometry_variances(
     return translation_m2, rotation_rad2, "; ".join(origin_texts)
 
 
-def _variance_growth(variance: Array | None, nodes: IntArray) -> Array | None:
+def _variance_growth(variance: Array | None, node_indices: IntArray) -> Array | None:
     """Compute the growth of reported variances between graph nodes, shape (k - 1, 3).
 
     Return None if the variances do not grow by MIN_VARIANCE_GROWTH along the path.
@@ -111,7 +112,7 @@ def _variance_growth(variance: Array | None, nodes: IntArray) -> Array | None:
     end_variance_sum = float(np.median(variance[-averaged_count:].sum(axis=1)))
     if not end_variance_sum > MIN_VARIANCE_GROWTH * start_variance_sum:
         return None
-    return np.maximum(np.diff(variance[nodes], axis=0), 0.0)
+    return np.maximum(np.diff(variance[node_indices], axis=0), 0.0)
 
 
 def build_pose_graph(
@@ -125,7 +126,7 @@ def build_pose_graph(
     Returns
     -------
     graph : PoseGraph or Unavailable
-    nodes : ndarray of int, shape (k,)
+    node_indices : ndarray of int, shape (k,)
         Indices of the poses that are nodes: key frames, and the poses nearest in time to closures.
     variance_note : str
         Data from which the variances of the odometry are computed, for the user.
@@ -144,25 +145,27 @@ def build_pose_graph(
         [(closure.time_1_s, closure.time_2_s) for closure, _ in closures_and_landings]
     ).reshape(-1, 2)
     pose_indices = np.abs(path.time_s - closure_times_s[..., None]).argmin(axis=-1)
-    nodes = np.union1d(key_frame_indices, pose_indices).astype(np.intp)
-    end_nodes = np.searchsorted(nodes, pose_indices)
-    node_position_m = path.position_m[nodes]
-    node_rotation = path.rotation[nodes]
-    translation_m2, rotation_rad2, variance_note = odometry_variances(path, nodes, noise)
-    steps = np.arange(len(nodes) - 1)
-    first_nodes = np.append(steps, end_nodes[:, 0])
-    second_nodes = np.append(steps + 1, end_nodes[:, 1])
+    node_indices = np.union1d(key_frame_indices, pose_indices).astype(np.intp)
+    closure_nodes = np.searchsorted(node_indices, pose_indices)
+    node_position_m = path.position_m[node_indices]
+    node_rotation = path.rotation[node_indices]
+    translation_m2, rotation_rad2, variance_note = odometry_variances(path, node_indices, noise)
+    step_indices = np.arange(len(node_indices) - 1)
+    first_nodes = np.append(step_indices, closure_nodes[:, 0])
+    second_nodes = np.append(step_indices + 1, closure_nodes[:, 1])
     information = np.zeros((len(first_nodes), 6, 6))
-    diagonal = np.column_stack(
+    information_diagonal = np.column_stack(
         [np.repeat(1.0 / translation_m2[:, None], 3, axis=1), 1.0 / rotation_rad2]
     )
-    information[steps[:, None], range(6), range(6)] = diagonal
+    information[step_indices[:, None], range(6), range(6)] = information_diagonal
     first_inverse = node_rotation[first_nodes].inv()
     second_rotation = node_rotation[second_nodes]
     translation_measured = first_inverse.apply(
         node_position_m[second_nodes] - node_position_m[first_nodes]
     )
-    for edge_index, (closure, true_end) in enumerate(closures_and_landings, start=len(steps)):
+    for edge_index, (closure, true_end) in enumerate(
+        closures_and_landings, start=len(step_indices)
+    ):
         translation_measured[edge_index] = (
             0.0 if true_end is None else first_inverse[edge_index].apply(true_end.displacement)
         )
@@ -171,11 +174,12 @@ def build_pose_graph(
             odometry_change_rad = heading_change_rad(
                 second_rotation[edge_index] * node_rotation[first_nodes[edge_index]].inv()
             )
-            error_rad = float(
+            heading_correction_rad = float(
                 lie.wrap(np.radians(true_end.heading_change_deg) - odometry_change_rad)
             )
             second_rotation[edge_index] = (
-                Rotation.from_rotvec(error_rad * DOWN_DIRECTION) * second_rotation[edge_index]
+                Rotation.from_rotvec(heading_correction_rad * DOWN_DIRECTION)
+                * second_rotation[edge_index]
             )
             vertical_direction = second_rotation[edge_index].inv().apply(DOWN_DIRECTION)
             heading_sigma_rad = np.radians(true_end.sigma_heading_deg or 0.0)
@@ -184,7 +188,7 @@ def build_pose_graph(
             )
     graph = PoseGraph(
         dimension=3,
-        ids=np.arange(len(nodes)),
+        ids=np.arange(len(node_indices)),
         poses=np.column_stack([node_position_m, node_rotation.as_quat()]),
         first=first_nodes,
         second=second_nodes,
@@ -194,7 +198,7 @@ def build_pose_graph(
         information=information,
         initialised="odometry",
     )
-    return graph, nodes, variance_note
+    return graph, node_indices, variance_note
 
 
 UNCORRECTED_LABEL = "uncorrected"
@@ -228,13 +232,13 @@ def correct_paths_by_distance(
         misclosure_m = _unavailable_by_gate("distribution of the closure error", landing_closure)
     if isinstance(misclosure_m, Unavailable):
         return {"by_distance_plain": misclosure_m, "by_distance": misclosure_m}
-    positions_only = distribute_by_distance(path.position_m, misclosure_m, distance_m)
-    heading_rad = (
+    corrected_position_m = distribute_by_distance(path.position_m, misclosure_m, distance_m)
+    heading_error_rad = (
         0.0 if isinstance(heading_error_deg, Unavailable) else float(np.radians(heading_error_deg))
     )
-    corrected_path = correct_by_distance(path, distance_m, misclosure_m, heading_rad)
+    corrected_path = correct_by_distance(path, distance_m, misclosure_m, heading_error_rad)
     return {
-        "by_distance_plain": (path.with_positions(positions_only), None),
+        "by_distance_plain": (path.with_positions(corrected_position_m), None),
         "by_distance": (corrected_path, None),
     }
 
@@ -260,20 +264,25 @@ def gate_closures(
     for gate_result, (closure, true_end) in zip(
         gate_edges(graph, closure_edges), closures_and_landings, strict=True
     ):
-        odometry_m = graph.poses[gate_result.second, :3] - graph.poses[gate_result.first, :3]
+        odometry_displacement_m = (
+            graph.poses[gate_result.second, :3] - graph.poses[gate_result.first, :3]
+        )
         closure_fields = structs.asdict(closure) | structs.asdict(gate_result)
         del closure_fields["first"], closure_fields["second"]
         closure_fields["source"] = "given" if true_end is None else LANDING_CLOSURE_SOURCE
-        true_m = np.zeros(3) if true_end is None else true_end.displacement
+        true_displacement_m = np.zeros(3) if true_end is None else true_end.displacement
         closures.append(
-            Closure(distance_m=float(np.linalg.norm(odometry_m - true_m)), **closure_fields)
+            Closure(
+                distance_m=float(np.linalg.norm(odometry_displacement_m - true_displacement_m)),
+                **closure_fields,
+            )
         )
     return tuple(closures)
 
 
 def solve_pose_graphs(
     path: Trajectory,
-    nodes: IntArray,
+    node_indices: IntArray,
     graph: PoseGraph | Unavailable,
     closures: tuple[Closure, ...],
     progress: Callable[[str], None],
@@ -298,10 +307,10 @@ def solve_pose_graphs(
     is_rejected[is_closure] = [not closure.accepted for closure in closures]
     for solution_name, label in SOLUTIONS.items():
         name = f"pose_graph_{solution_name}"
-        robust = solution_name == ROBUST
+        is_robust = solution_name == ROBUST
         is_gated = solution_name == "gated"
         progress(f"optimising: {label}")
-        if robust and len(closures) < 2:
+        if is_robust and len(closures) < 2:
             corrections[name] = Unavailable(
                 label, SINGLE_CLOSURE_REASON, "Give more loop closures with --closure."
             )
@@ -313,12 +322,14 @@ def solve_pose_graphs(
             is_used = ~is_rejected if is_gated else np.ones_like(is_rejected)
             solution = solve(
                 graph.select_edges(is_used),
-                robust=robust,
+                robust=is_robust,
                 is_closure=is_closure[is_used],
             )
-            corrected_path = _interpolate_corrections(path, nodes, graph.poses, solution.poses)
+            corrected_path = _interpolate_corrections(
+                path, node_indices, graph.poses, solution.poses
+            )
             corrections[name] = corrected_path, solution
-            if robust:
+            if is_robust:
                 weights = solution.weights[is_closure].tolist()
                 closures = tuple(
                     structs.replace(closure, weight_gnc=weight)
@@ -328,27 +339,26 @@ def solve_pose_graphs(
 
 
 def _interpolate_corrections(
-    path: Trajectory, nodes: IntArray, graph_poses: Array, solved_poses: Array
+    path: Trajectory, node_indices: IntArray, graph_poses: Array, solved_poses: Array
 ) -> Trajectory:
     """Correct each pose by interpolation between the corrections of neighbouring graph nodes."""
-    node_rotations = (
+    node_corrections = (
         Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()
     )
-    previous_node = np.searchsorted(nodes, np.arange(len(path)), side="right") - 1
-    previous_node = np.clip(previous_node, 0, len(nodes) - 2)
+    previous_node = np.searchsorted(node_indices, np.arange(len(path)), side="right") - 1
+    previous_node = np.clip(previous_node, 0, len(node_indices) - 2)
     time_s = path.time_s
-    next_node_fraction = (time_s - time_s[nodes[previous_node]]) / (
-        time_s[nodes[previous_node + 1]] - time_s[nodes[previous_node]]
+    next_node_fraction = (time_s - time_s[node_indices[previous_node]]) / (
+        time_s[node_indices[previous_node + 1]] - time_s[node_indices[previous_node]]
     )
-    corrected_poses = [
-        solved_poses[node, :3] + node_rotations[node].apply(path.position_m - graph_poses[node, :3])
+    previous_m, next_m = (
+        solved_poses[node, :3]
+        + node_corrections[node].apply(path.position_m - graph_poses[node, :3])
         for node in (previous_node, previous_node + 1)
-    ]
+    )
     next_node_weight = np.clip(next_node_fraction, 0.0, 1.0)[:, None]
-    position_m = (1.0 - next_node_weight) * corrected_poses[0] + next_node_weight * corrected_poses[
-        1
-    ]
-    return path.with_positions(position_m, Slerp(time_s[nodes], node_rotations)(time_s))
+    position_m = (1.0 - next_node_weight) * previous_m + next_node_weight * next_m
+    return path.with_positions(position_m, Slerp(time_s[node_indices], node_corrections)(time_s))
 
 
 def score_paths(
@@ -366,7 +376,7 @@ def score_paths(
             return evaluate(path, reference, time_offset_s=offset_s)
         except Px4FuseError as error:
             return Unavailable(
-                f"score against {reference.name}",
+                f"ATE and RPE against {reference.name}",
                 str(error),
                 "Give another reference trajectory with --reference.",
             )
@@ -375,12 +385,10 @@ def score_paths(
         name: CorrectionName, path: Trajectory, solution: Solution | None
     ) -> CorrectedPath:
         displacement_m: Array = np.linalg.norm(path.position_m - odometry.position_m, axis=1)
-        solution_field_names = ("cost_initial", "cost", "iterations", "converged")
-        solution_fields = (
-            {}
-            if solution is None
-            else {name: getattr(solution, name) for name in solution_field_names}
-        )
+        solution_fields = {
+            field_name: getattr(solution, field_name, None)
+            for field_name in ("cost_initial", "cost", "iterations", "converged")
+        }
         return CorrectedPath(
             name=CORRECTION_LABELS[name],
             trajectory=path,

@@ -78,10 +78,7 @@ def choose_loop_segment(
     SettingsError
         The segment is empty.
     """
-    segment_start_s, segment_end_s = track_span_s = (
-        float(trajectory.time_s[0]),
-        float(trajectory.time_s[-1]),
-    )
+    segment_start_s, segment_end_s = track_span_s = trajectory.time_s[[0, -1]].tolist()
     rests_at_ends, flight_span_s = False, None
     if flight is None:
         reason = "the whole trajectory"
@@ -130,8 +127,10 @@ def assume_end_at_takeoff(path: Trajectory) -> TrueEnd:
     If the odometry's heading change is small, the final heading is assumed equal to the initial
     heading, else it is unknown.
     """
-    change_deg = heading_change_deg(path)
-    is_same_heading = change_deg is not None and abs(change_deg) <= MAX_SAME_HEADING_DEG
+    odometry_change_deg = heading_change_deg(path)
+    is_same_heading = (
+        odometry_change_deg is not None and abs(odometry_change_deg) <= MAX_SAME_HEADING_DEG
+    )
     source = "assumed: landing at the take-off place, final heading unknown"
     if is_same_heading:
         source = "assumed: landing at the take-off place with the initial heading"
@@ -169,7 +168,7 @@ def convert_measured_end(path: Trajectory, landing: Landing) -> TrueEnd:
 def read_end_from_truth(
     path: Trajectory, truth: Trajectory, segment: Segment, rests_at_ends: bool
 ) -> TrueEnd | str:
-    """Return the true landing place in the odometry frame, or the reason why it is unknown."""
+    """Return the true final pose in the odometry frame, or the reason why it is unknown."""
     try:
         true_path = cut_trajectory(truth, segment, rests_at_ends)
     except TrajectoryError as error:

@@ -85,7 +85,7 @@ class OdometryNoise(Record, omit_defaults=False):
 
 
 class Closure(Record, kw_only=True):
-    """Loop closure (two times at the same place), with gate result and robust weight."""
+    """Loop closure (two times at one place), with the results of gate and robust optimisation."""
 
     # Two times at the same place, on the clock of the trajectory
     time_1_s: float

@@ -95,7 +95,7 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
             f"{flight.log.name}:{track_name}: {track_data.reason}", track_data.remedy
         )
     state = track_data.state
-    notes = ["EKF2 position as published"]
+    notes = ["EKF2 position as published by PX4"]
     source = next((t for t in flight.positions if t.origin.is_vision), None)
     if source is not None:
         segment = Segment(0.0, flight.log.duration_s, "")
@@ -109,13 +109,15 @@ def _make_kf_trajectory(flight: Flight) -> Trajectory:
     prepared = prepare(flight, request)
     kf_comparison = compare(prepared, run_kf(prepared))
     columns = zip(Columns.POSITION, kf_comparison.axes.values(), strict=True)
-    position = pd.DataFrame({name: axis.replay.steps["position_m"] for name, axis in columns})
+    position_samples = pd.DataFrame(
+        {name: axis.replay.steps["position_m"] for name, axis in columns}
+    )
     settings = kf_comparison.settings
     note = (
         f"KF with position source {kf_comparison.source.name}, SIGMA_A {settings.sigma_a_m_s2:g} "
         f"m/s², SIGMA_Z {settings.sigma_z_m:g} m"
     )
-    return _make_trajectory(flight, "kf", position, flight.attitude, (note,))
+    return _make_trajectory(flight, "kf", position_samples, flight.attitude, (note,))
 
 
 def _make_trajectory(
@@ -199,9 +201,9 @@ def is_g2o(path: Path) -> bool:
     TrajectoryError
         The file cannot be read.
     """
-    head = b"" if is_bag(path) else read_head(path, _FILE_HEAD_BYTES, TrajectoryError)
-    return decode_text(head) is not None and any(
-        line.strip().startswith(_G2O_TAGS) for line in head.splitlines()
+    file_head = b"" if is_bag(path) else read_head(path, _FILE_HEAD_BYTES, TrajectoryError)
+    return decode_text(file_head) is not None and any(
+        line.strip().startswith(_G2O_TAGS) for line in file_head.splitlines()
     )
 
 
@@ -233,15 +235,15 @@ def read_source(
         ``frame`` is given for a flight log.
     """
     path, track_name = split_path_and_part(argument)
-    head = b"bag" if is_bag(path) else read_head(path, _FILE_HEAD_BYTES, TrajectoryError)
-    if not head:
+    file_head = b"bag" if is_bag(path) else read_head(path, _FILE_HEAD_BYTES, TrajectoryError)
+    if not file_head:
         raise TrajectoryError(f"{display_name(path)} is empty.", "Copy or export the file again.")
     if is_g2o(path):
         raise TrajectoryError(
             f"{display_name(path)} is a pose graph, not a trajectory.",
             f"Optimise the pose graph with px4fuse loop {display_name(path)}.",
         )
-    if decode_text(head) is not None:  # flight logs are binary
+    if decode_text(file_head) is not None:  # flight logs are binary
         trajectory = read_trajectory(path, track_name)
         return LoopSource(trajectory if frame is None else replace(trajectory, frame=frame), None)
     if frame is not None:

@@ -45,9 +45,9 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     """
     path = Path(path)
     name = display_name(path)
-    head = read_head(path, _FORMAT_BYTES, LogError)
+    first_bytes = read_head(path, _FORMAT_BYTES, LogError)
     # Imports are local, because the import of pyulog or pymavlink takes 0.1 s or more
-    if head.startswith(ULOG_MAGIC):
+    if first_bytes.startswith(ULOG_MAGIC):
         if system is not None:
             raise SettingsError(
                 f"{name}: the file is a ULog, but `system` is only for MAVLink recordings."
@@ -55,11 +55,11 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
         from px4fuse.readers.ulog import read_ulog  # noqa: PLC0415
 
         return read_ulog(name, read_log_bytes(path))
-    refuse_foreign_format(path, head, LogError)
-    for suffixes, (kind, remedy) in _TEXT_FILES.items():
-        if path.suffix.lower() in suffixes and head.isascii():
+    refuse_foreign_format(path, first_bytes, LogError)
+    for suffixes, (file_kind, remedy) in _TEXT_FILES.items():
+        if path.suffix.lower() in suffixes and first_bytes.isascii():
             raise LogError(
-                f"{name}: the file is a {kind}, not a flight log", remedy.format(name=name)
+                f"{name}: the file is a {file_kind}, not a flight log", remedy.format(name=name)
             )
     from px4fuse.readers.mavlink import read_mavlink  # noqa: PLC0415
 

@@ -42,9 +42,9 @@ def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
 
 def flight_spans(landed: pd.Series, duration_s: float) -> Spans:
     """Return the intervals (s) in flight, in which ``landed`` is 0 or False."""
-    changes = landed[landed.ne(landed.shift())]
-    starts = np.maximum.accumulate(np.maximum(changes.index.to_numpy(), 0.0)).tolist()
-    spans = zip(starts, [*starts[1:], duration_s], changes, strict=False)
+    landed_changes = landed[landed.ne(landed.shift())]
+    start_times_s = np.maximum.accumulate(np.maximum(landed_changes.index.to_numpy(), 0.0)).tolist()
+    spans = zip(start_times_s, [*start_times_s[1:], duration_s], landed_changes, strict=False)
     return tuple((start, end) for start, end, is_landed in spans if end > start and not is_landed)
 
 
@@ -56,11 +56,15 @@ def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:
 
 
 def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
-    """Return the sentence that the file is truncated within a ``unit`` ("frame" or "message")."""
+    """Return a note on a file that ends within a ``unit`` ("frame" or "message")."""
     return (
         f"the file ends within a {unit} after {duration_s:.1f} s{', in flight' * in_flight}; later "
         "data are missing"
     )
+
+
+# Maximum probability that a source with random repetitions has a run that counts as lost tracking
+MAX_RANDOM_RUN_PROBABILITY = 0.01
 
 
 def finite_rows(
@@ -90,19 +94,23 @@ def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[s
         reasons.iloc[zero_rows[distance_m > MIN_ZERO_DISTANCE_M]] = "zero"
     valid_rows = np.flatnonzero(reasons == "")
     if len(valid_rows):
-        from_median = values[valid_rows] - np.median(values[valid_rows], axis=0)
-        distance_m = np.linalg.norm(from_median, axis=1)
+        median_offset_m = values[valid_rows] - np.median(values[valid_rows], axis=0)
+        distance_m = np.linalg.norm(median_offset_m, axis=1)
         is_far = distance_m > max(
             MIN_FAR_DISTANCE_M, MIN_FAR_DISTANCE_RATIO * float(np.median(distance_m))
         )
         reasons.iloc[valid_rows[is_far]] = "far"
         valid_rows = valid_rows[~is_far]
     is_repeated = np.all(np.diff(values[valid_rows], axis=0) == 0.0, axis=1)
-    starts = np.flatnonzero(np.append(True, ~is_repeated))
+    run_starts = np.flatnonzero(np.append(True, ~is_repeated))
+    # longest run that is likely in a source that repeats positions at random
+    repeated_fraction = np.clip(np.mean(is_repeated), 1e-6, 1.0 - 1e-6) if len(is_repeated) else 0.5
+    random_count = np.log(len(valid_rows) / MAX_RANDOM_RUN_PROBABILITY) / -np.log(repeated_fraction)
     held_rows = [
-        valid_rows[start + 1 : end]
-        for start, end in zip(starts, [*starts[1:], len(valid_rows)], strict=True)
-        if end - start >= MIN_HELD_COUNT and np.ptp(time_s[valid_rows[start:end]]) >= MIN_HELD_S
+        valid_rows[run_start + 1 : run_end]
+        for run_start, run_end in zip(run_starts, [*run_starts[1:], len(valid_rows)], strict=True)
+        if run_end - run_start >= max(MIN_HELD_COUNT, random_count)
+        and np.ptp(time_s[valid_rows[run_start:run_end]]) >= MIN_HELD_S
     ]
     if held_rows and len(rows := np.concatenate(held_rows)) < MAX_HELD_FRACTION * len(valid_rows):
         reasons.iloc[rows] = "held"

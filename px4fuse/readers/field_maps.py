@@ -70,8 +70,8 @@ def expand_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
             columns |= dict.fromkeys(column_list, field_names)
             continue
         column_fields = field_names.split()
-        if array := re.fullmatch(r"([^\[]+)\[([\d ]*)\]", field_names):
-            elements = array[2].split() or range(len(column_list))
-            column_fields = [f"{array[1]}[{element}]" for element in elements]
+        if array_match := re.fullmatch(r"([^\[]+)\[([\d ]*)\]", field_names):
+            element_indices = array_match[2].split() or range(len(column_list))
+            column_fields = [f"{array_match[1]}[{element}]" for element in element_indices]
         columns |= zip(column_list, column_fields, strict=True)
     return columns

@@ -76,11 +76,11 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     poses[:, 6:] = 1.0  # the identity rotation has w = 1
     if vertices.lines:
         vertex_ids, poses = _parse_rows(vertices, f"VERTEX_{tag_kind}")
-        order = np.argsort(vertex_ids[:, 0], kind="stable")
-        ids = vertex_ids[order, 0]
-        poses = _normalise_quaternions(vertices, poses)[order]
+        id_order = np.argsort(vertex_ids[:, 0], kind="stable")
+        ids = vertex_ids[id_order, 0]
+        poses = _normalise_quaternions(vertices, poses)[id_order]
         is_repeated = np.zeros(len(ids), bool)
-        is_repeated[order[1:]] = ids[1:] == ids[:-1]
+        is_repeated[id_order[1:]] = ids[1:] == ids[:-1]
         vertices.raise_where(
             is_repeated, "another line has the same vertex id", "Remove one of both lines."
         )
@@ -189,15 +189,15 @@ def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
     if poses.shape[1] == 3:
         return poses
     with np.errstate(over="ignore"):
-        norm = np.linalg.norm(poses[:, 3:], axis=1)
+        quaternion_norms = np.linalg.norm(poses[:, 3:], axis=1)
     rows.raise_where(
-        (norm < 1e-6) | ~(norm < 1e6),
+        (quaternion_norms < 1e-6) | ~(quaternion_norms < 1e6),
         "the quaternion does not have unit length",
         "Give the unit quaternion qx qy qz qw after the position.",
     )
     # Unit quaternions are not changed, so that a written file is read back with the same digits
-    norm[np.abs(norm - 1.0) <= UNIT_NORM_TOLERANCE] = 1.0
-    return np.hstack([poses[:, :3], poses[:, 3:] / norm[:, None]])
+    quaternion_norms[np.abs(quaternion_norms - 1.0) <= UNIT_NORM_TOLERANCE] = 1.0
+    return np.hstack([poses[:, :3], poses[:, 3:] / quaternion_norms[:, None]])
 
 
 def _information_matrices(edges: Rows, numbers: Array, size: int) -> Array:
@@ -205,10 +205,10 @@ def _information_matrices(edges: Rows, numbers: Array, size: int) -> Array:
     row, column = np.triu_indices(size)
     matrices = np.empty((len(numbers), size, size))
     matrices[:, row, column] = matrices[:, column, row] = numbers
-    magnitude = np.abs(numbers)
-    is_too_small = (row == column) & (magnitude > 0.0) & (magnitude < _MIN_INFORMATION)
+    magnitudes = np.abs(numbers)
+    is_too_small = (row == column) & (magnitudes > 0.0) & (magnitudes < _MIN_INFORMATION)
     edges.raise_where(
-        is_too_small | (magnitude > _MAX_INFORMATION),
+        is_too_small | (magnitudes > _MAX_INFORMATION),
         "the information matrix contains a number that is too small or too large",
         f"Give 0, or a number from {_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}.",
     )

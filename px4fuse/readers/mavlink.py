@@ -47,7 +47,7 @@ VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
 REAL32_PARAMETER_TYPE = 9
 
 
-# No warnings for damaged values: they become NaN or infinite, and such samples are dropped
+# No warnings for damaged values: they become NaN or infinite, and their samples are dropped
 @np.errstate(invalid="ignore", over="ignore", divide="ignore")
 def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight:
     """Read a MAVLink recording: a ``.tlog``, or a raw stream of MAVLink 1 and 2.
@@ -105,19 +105,14 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
 
 
 def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
-    candidates = [(layout, recording.rows(layout.topic)) for layout in messages.IMU_LAYOUTS]
+    layouts_with_rows = [(layout, recording.rows(layout.topic)) for layout in messages.IMU_LAYOUTS]
     # HIGHRES_IMU is preferred, because it has SI units and µs timestamps; without HIGHRES_IMU, the
     # message with most samples is used
-    layout, rows = candidates[0]
+    layout, rows = layouts_with_rows[0]
     if len(rows) < 2:
-        layout, rows = max(candidates, key=lambda pair: len(pair[1]))
+        layout, rows = max(layouts_with_rows, key=lambda pair: len(pair[1]))
     if len(rows) < 2:
-        reasons = ["the recording contains no HIGHRES_IMU or SCALED_IMU"]
-        if raw_count := len(recording.rows("RAW_IMU")):
-            reasons.append(
-                f"{raw_count} RAW_IMU messages are not used, because raw counts have no unit"
-            )
-        return Unavailable("IMU", "; ".join(reasons), remedy)
+        return Unavailable("IMU", "the recording has no HIGHRES_IMU or SCALED_IMU", remedy)
     table = recording.frames.table(layout.topic, rows)
     if "id" in (table.dtype.names or ()):
         rows = rows[table["id"] == np.bincount(table["id"]).argmax()]
@@ -233,15 +228,15 @@ def _variance_from_accuracy(recording: Recording) -> pd.DataFrame:
 
 def _read_airborne(recording: Recording, remedy: str) -> Spans | Unavailable:
     rows = recording.rows("EXTENDED_SYS_STATE")
-    states = recording.frames.table("EXTENDED_SYS_STATE", rows)
-    is_known = states["landed_state"] > 0
+    landed_states = recording.frames.table("EXTENDED_SYS_STATE", rows)["landed_state"]
+    is_known = landed_states > 0
     if not np.any(is_known):
         return Unavailable(
             "land detector", "the recording contains no usable EXTENDED_SYS_STATE", remedy
         )
     recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK)
     time_s = recording.receipt_boot_s(rows[is_known]) - recording.zero_s
-    landed = pd.Series(states["landed_state"][is_known] == messages.ON_GROUND_STATE, index=time_s)
+    landed = pd.Series(landed_states[is_known] == messages.ON_GROUND_STATE, index=time_s)
     return common.flight_spans(landed, recording.duration_s)
 
 
@@ -270,9 +265,9 @@ def _describe_log(
     is_in_flight: bool,
 ) -> LogInfo:
     frames = recording.frames
-    damage = []
+    damage_notes = []
     if frames.ends_in_frame:
-        damage.append(common.format_truncation("frame", recording.duration_s, is_in_flight))
+        damage_notes.append(common.format_truncation("frame", recording.duration_s, is_in_flight))
     firmware = f"{autopilot}, unknown version"
     firmware_hash = "unknown"
     vehicle = ""
@@ -288,7 +283,7 @@ def _describe_log(
         vehicle = hardware_id if hardware_id.strip("0") else ""
     vehicle_types = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))["type"].tolist()
     vehicle_name = VEHICLE_TYPES.get(next(iter(vehicle_types), -1), "vehicle")
-    dropped = sorted(recording.dropped.items())
+    dropped_counts = sorted(recording.dropped.items())
     return LogInfo(
         name=frames.name,
         sha256=frames.sha256,
@@ -300,15 +295,15 @@ def _describe_log(
         boot_time_s=recording.zero_s,
         duration_s=recording.duration_s,
         parameters=parameters,
-        notes=(*recording.notes, *parameter_faults, *dropped_notes(dropped)),
+        notes=(*recording.notes, *parameter_faults, *dropped_notes(dropped_counts)),
         restarts=recording.restarts,
         receive_time_reversals=recording.receive_time_reversals,
-        dropped=dict(dropped),
+        dropped=dict(dropped_counts),
         autopilot=autopilot,
         start_unix_s=_start_unix_s(recording),
         senders=senders.describe_senders(recording),
         vehicle=vehicle,
-        damage=(*damage, *recording.damage),
+        damage=(*damage_notes, *recording.damage),
         ends_in_flight=is_in_flight,
         bytes_read=len(frames.content) - frames.bad_byte_count,
     )

@@ -26,8 +26,7 @@ MIN_UNIX_TIME_S = 1e9
 # Length (s) of an interval. The clock fit uses the message with the least delay of each interval
 ENVELOPE_INTERVAL_S = 2.0
 MAX_ENVELOPE_INTERVALS = 200
-# Minimum time span (s) to estimate a clock drift: in a shorter span both clocks are assumed to have
-# the same rate
+# Minimum time span (s) to estimate a clock drift: in a shorter span the drift is assumed to be 0
 MIN_DRIFT_SPAN_S = 30.0
 # Maximum relative difference between the rates of two real clocks. A replayed recording has a
 # larger difference, which is estimated even below MIN_DRIFT_SPAN_S
@@ -69,9 +68,9 @@ def fit_least_delay(x: Array, y: Array) -> ClockLine:
 
     The slope is 1 if the span is too short to estimate a drift.
     """
-    order = np.argsort(x, kind="stable")
-    x = x[order]
-    y = y[order]
+    time_order = np.argsort(x, kind="stable")
+    x = x[time_order]
+    y = y[time_order]
     x0 = float(x[len(x) // 2])
     span_s = float(x[-1] - x[0])
     interval_count = int(np.clip(span_s / ENVELOPE_INTERVAL_S, 1, MAX_ENVELOPE_INTERVALS))
@@ -137,7 +136,7 @@ def map_clock(
     receipt_to_boot: ClockLine,
     replies: tuple[Array, Array],
     answers: tuple[Array, Array],
-    map_boot_to_unix: ClockLine | None,
+    boot_to_unix: ClockLine | None,
     *,
     has_receipt: bool,
 ) -> ClockMapping:
@@ -194,11 +193,11 @@ def map_clock(
         )
     clock_kind = "UNIX time" if float(np.median(stamp_s)) > MIN_UNIX_TIME_S else "clock"
     clock_name = f"{clock_kind} of {name}"
-    candidates = [] if timesync_line is None else [("TIMESYNC", timesync_line, "")]
-    if clock_kind == "UNIX time" and map_boot_to_unix is not None:
+    candidate_maps = [] if timesync_line is None else [("TIMESYNC", timesync_line, "")]
+    if clock_kind == "UNIX time" and boot_to_unix is not None:
         unix_note = "sender and autopilot are assumed to have the same UNIX time"
-        candidates.append(("SYSTEM_TIME", map_boot_to_unix.inverse(), unix_note))
-    for method, sender_to_boot, note in candidates:
+        candidate_maps.append(("SYSTEM_TIME", boot_to_unix.inverse(), unix_note))
+    for method, sender_to_boot, note in candidate_maps:
         # TIMESYNC or SYSTEM_TIME of another clock gives boot times far from the receive times
         if distance_s(sender_to_boot.at(stamp_s)) <= MAX_BOOT_CLOCK_DISTANCE_S:
             return _clock_mapping(clock_name, method, sender_to_boot, stamp_s, note)

@@ -107,17 +107,19 @@ class Frames:
         layout = wire_layout(MESSAGE_IDS[message])
         payload = np.zeros((len(rows), layout.itemsize), dtype=np.uint8)
         content_bytes = np.frombuffer(self.content, dtype=np.uint8)
-        starts = self.payload_start[rows]
-        lengths = self.payload_length[rows]
-        for length in np.unique(lengths).tolist():
+        payload_starts = self.payload_start[rows]
+        payload_lengths = self.payload_length[rows]
+        for length in np.unique(payload_lengths).tolist():
             byte_count = min(length, layout.itemsize)
             if byte_count:
-                rows_of_length = np.flatnonzero(lengths == length)
-                windows = np.lib.stride_tricks.sliding_window_view(content_bytes, byte_count)
+                rows_of_length = np.flatnonzero(payload_lengths == length)
+                payload_windows = np.lib.stride_tricks.sliding_window_view(
+                    content_bytes, byte_count
+                )
                 # Indexing copies the payloads, so frames are decoded in batches
                 for batch_start in range(0, len(rows_of_length), DECODE_BATCH_SIZE):
                     batch_rows = rows_of_length[batch_start : batch_start + DECODE_BATCH_SIZE]
-                    payload[batch_rows, :byte_count] = windows[starts[batch_rows]]
+                    payload[batch_rows, :byte_count] = payload_windows[payload_starts[batch_rows]]
         return payload.view(layout)[:, 0]
 
 
@@ -197,17 +199,20 @@ def read_frames(name: str, content: bytes) -> Frames:
 def _find_valid_frames(content: bytes) -> Int64Array:
     """Return start, end and message id, shape (n, 3), of all frames with valid checksums."""
     content_bytes = np.frombuffer(content, dtype=np.uint8)
-    view = memoryview(content)
+    content_view = memoryview(content)
     valid_frames = [np.zeros((0, 3), dtype=np.int64)]
     for block_start in range(0, len(content_bytes), BLOCK_BYTES):
-        frames, crc_end = _find_possible_frames(content_bytes, block_start)
-        checked_ranges = zip((frames[:, 0] + 1).tolist(), crc_end.tolist(), strict=True)
-        crc = np.array([mcrf4xx(view[a:b]) for a, b in checked_ranges], dtype=np.uint16)
+        possible_frames, crc_end = _find_possible_frames(content_bytes, block_start)
+        checked_ranges = zip((possible_frames[:, 0] + 1).tolist(), crc_end.tolist(), strict=True)
+        crc = np.array(
+            [mcrf4xx(content_view[first_byte:end_byte]) for first_byte, end_byte in checked_ranges],
+            dtype=np.uint16,
+        )
         crc = (crc >> 8) ^ _BYTE_CHECKSUMS[
-            (crc ^ _CRC_EXTRA[frames[:, 2]].astype(np.uint16)) & 0xFF
+            (crc ^ _CRC_EXTRA[possible_frames[:, 2]].astype(np.uint16)) & 0xFF
         ]
         stored_crc = content_bytes[crc_end] | content_bytes[crc_end + 1].astype(np.uint16) << 8
-        valid_frames.append(frames[stored_crc == crc])
+        valid_frames.append(possible_frames[stored_crc == crc])
     return np.concatenate(valid_frames)
 
 
@@ -223,11 +228,11 @@ def _remove_nested_frames(frames: Int64Array) -> Int64Array:
     end_offsets = frames[:, 1].tolist()
     kept_rows = []
     previous_end = 0
-    starts = {*start_offsets}
+    start_set = {*start_offsets}
     for row, frame_start in enumerate(start_offsets):
-        next_starts = previous_end, previous_end + RECEIVE_TIME_BYTES
+        expected_starts = previous_end, previous_end + RECEIVE_TIME_BYTES
         if frame_start >= previous_end and (
-            frame_start in next_starts or starts.isdisjoint(next_starts)
+            frame_start in expected_starts or start_set.isdisjoint(expected_starts)
         ):
             kept_rows.append(row)
             previous_end = end_offsets[row]
@@ -332,11 +337,11 @@ def _read_receive_times(
     """Return the receive times (UNIX, µs) and the number of damaged receive times."""
     is_usable = start_offsets >= RECEIVE_TIME_BYTES
     is_usable[1:] &= start_offsets[1:] - end_offsets[:-1] >= RECEIVE_TIME_BYTES
-    windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)
+    time_windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)
     # The file may begin without the receive time of the first frame
-    raw_us = np.ascontiguousarray(windows[np.maximum(start_offsets - RECEIVE_TIME_BYTES, 0)]).view(
-        ">u8"
-    )[:, 0]
+    raw_us = np.ascontiguousarray(
+        time_windows[np.maximum(start_offsets - RECEIVE_TIME_BYTES, 0)]
+    ).view(">u8")[:, 0]
     # values above 1 << 63 become negative and are then invalid
     received_us = raw_us.astype(np.int64)
     is_usable &= (received_us >= 0) & (received_us < 1 << 62)

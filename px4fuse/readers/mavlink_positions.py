@@ -79,23 +79,23 @@ def _read_track(
         table = table[is_of_estimator]
     if not len(rows):
         return None
-    name = source.track_name + (f"_{sender[0]}_{sender[1]}" if len(senders) > 1 else "")
+    track_name = source.track_name + (f"_{sender[0]}_{sender[1]}" if len(senders) > 1 else "")
     stamp_s = table[source.stamp] * 1e-6
     sample_boot_s = recording.receipt_boot_s(rows)
     if clock.sender_to_boot is not None:
         sample_boot_s = np.where(stamp_s > 0.0, clock.sender_to_boot.at(stamp_s), np.nan)
-    samples = recording.read(source.layout, rows, sample_boot_s, name)
+    samples = recording.read(source.layout, rows, sample_boot_s, track_name)
     frame = source.frame
     if "frame_id" in samples and len(samples):
         # A track has one coordinate frame: the frame of the last sample, as in PX4
-        reference = messages.FRAMES_OF_REFERENCE.get(int(samples["frame_id"].iloc[-1]))
-        frame = "unknown" if reference is None else reference.name
+        reference_frame = messages.FRAMES_OF_REFERENCE.get(int(samples["frame_id"].iloc[-1]))
+        frame = "unknown" if reference_frame is None else reference_frame.name
     if source.drops_covariance:
         samples[Columns.POSITION_VARIANCE + Columns.ROTATION_VARIANCE] = np.nan
     orientation = read_orientation(samples)
     clock_map = clock.description
     return px4_positions.make_track(
-        name,
+        track_name,
         samples,
         with_orientation(source.origin, is_changing=orientation is not None),
         remedy=remedy,
@@ -123,11 +123,12 @@ def _read_gnss(
         return None
     message_count = len(rows)
     rows = rows[np.diff(recording.frames.table(layout.topic, rows)["time_usec"], prepend=0) > 0]
-    boot_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
+    fix_boot_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
     receipt_boot_s = recording.receipt_boot_s(rows)
-    if len(rows) and np.median(np.abs(receipt_boot_s - boot_s)) > MAX_BOOT_CLOCK_DISTANCE_S:
-        boot_s = receipt_boot_s  # the timestamps are UNIX time, or the recording has no boot clock
-    fixes = recording.read(layout, rows, boot_s - delay_s)
+    if len(rows) and np.median(np.abs(receipt_boot_s - fix_boot_s)) > MAX_BOOT_CLOCK_DISTANCE_S:
+        # The timestamps are UNIX time, or the recording has no boot clock
+        fix_boot_s = receipt_boot_s
+    fixes = recording.read(layout, rows, fix_boot_s - delay_s)
     fixes = fixes[fixes["fix_type"] >= px4_positions.FIX_TYPE_3D]
     if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
         fix_count = "none" if fixes.empty else f"only {len(fixes)}"
@@ -137,13 +138,13 @@ def _read_gnss(
             "Give the antenna a free view of the sky and wait for a fix.",
         )
     samples = project_to_ned(fixes, local_origin(recording))
-    accuracy = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2
+    variance = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2
     is_automatic = bool(
         recording.read(messages.MESSAGE_LAYOUTS["global_state"])["latitude_deg"].any()
     )
     return px4_positions.make_track(
         layout.topic,
-        samples.join(accuracy),
+        samples.join(variance),
         structs.replace(GNSS, is_automatic=is_automatic),
         description="GNSS position",
         frame="NED",
@@ -169,20 +170,22 @@ def local_origin(recording: Recording) -> GeodeticPosition | None:
     sent_origin = recording.read(messages.MESSAGE_LAYOUTS["origin"]).dropna()
     if len(sent_origin):
         return tuple(sent_origin.iloc[-1].tolist())
-    joined = join_nearest(
+    joined_positions = join_nearest(
         recording.read(messages.MESSAGE_LAYOUTS["global_state"]),
         recording.read(messages.STATE_LAYOUTS[-1])[Columns.POSITION],
         MAX_ORIGIN_TIME_DIFFERENCE_S,
     ).dropna()
-    joined = joined[joined["latitude_deg"] != 0.0]
-    if joined.empty:
+    joined_positions = joined_positions[joined_positions["latitude_deg"] != 0.0]
+    if joined_positions.empty:
         return None
     position_pairs = zip(
-        joined[Columns.GEODETIC].to_numpy(), joined[Columns.POSITION].to_numpy(), strict=True
+        joined_positions[Columns.GEODETIC].to_numpy(),
+        joined_positions[Columns.POSITION].to_numpy(),
+        strict=True,
     )
     origins = [
-        (*unproject(-n, -e, tuple(position[:2])), position[2] + d)
-        for position, (n, e, d) in position_pairs
+        (*unproject(-north_m, -east_m, tuple(geodetic[:2])), geodetic[2] + down_m)
+        for geodetic, (north_m, east_m, down_m) in position_pairs
     ]
     return tuple(np.median(origins, axis=0).tolist())
 
@@ -194,7 +197,7 @@ def read_truth(
 
     1. Simulation ground truth has no usable timestamps (``HIL_STATE_QUATERNION.time_usec`` is 0 in
        PX4), so receive times are used.
-    2. Its latitude and longitude are projected from the autopilot's origin if the source is GNSS;
+    2. True latitude and longitude are projected from the autopilot's origin if the source is GNSS,
        otherwise from the first sample, the start of the simulated vehicle.
     """
     for layout in messages.TRUTH_LAYOUTS:
@@ -212,7 +215,7 @@ def read_truth(
             samples[Columns.VELOCITY] = np.nan
         recording.record_stream("truth", layout.topic, clock=RECEIPT_CLOCK)
         origin = local_origin(recording) if positions and positions[0].origin.is_gnss else None
-        state = pd.concat([project_to_ned(samples, origin), samples[Columns.VELOCITY]], axis=1)
+        state = project_to_ned(samples, origin).join(samples[Columns.VELOCITY])
         return Truth(layout.topic, state[Columns.STATE], read_attitude(samples))
     mocap_truth = px4_positions.motion_capture_truth(positions, "ATT_POS_MOCAP")
     for track in positions:

@@ -42,7 +42,7 @@ MIN_GROUP_FRACTION = 0.01
 MAX_OUTSIDE_S = 60.0
 # Maximum fraction of bytes outside of MAVLink frames in a file without damage
 MAX_STRAY_BYTE_FRACTION = 0.002
-# Minimum number of equal boot timestamps that show that the field is not a clock
+# Minimum number of boot timestamps to reject them as no clock if almost all are equal
 MIN_CONSTANT_TIMESTAMPS = 10
 
 
@@ -133,11 +133,11 @@ class Recording:
         rows = np.flatnonzero(is_inside & (boot_s > 0.0))
         time_us = np.rint(boot_s[rows] * 1e6).astype(np.int64)
         # A message that is received twice, over two links, is one sample
-        first_copies = np.sort(np.unique(time_us, return_index=True)[1])
-        increasing_rows = longest_increasing_run(time_us[first_copies])
-        if dropped := len(boot_s) - len(rows) + len(first_copies) - len(increasing_rows):
-            self.dropped[name] = dropped
-        return np.asarray(rows[first_copies[increasing_rows]])
+        first_copy_rows = np.sort(np.unique(time_us, return_index=True)[1])
+        increasing_rows = longest_increasing_run(time_us[first_copy_rows])
+        if dropped_count := len(boot_s) - len(rows) + len(first_copy_rows) - len(increasing_rows):
+            self.dropped[name] = dropped_count
+        return np.asarray(rows[first_copy_rows[increasing_rows]])
 
     def receipt_boot_s(self, rows: IntArray) -> Array:
         """Return the receive time since boot (s) of frames, minus the minimum link delay."""
@@ -277,17 +277,17 @@ def read_recording(frames: Frames, address: Address) -> Recording:
     ):
         if count:
             notes.append(f"{quantity}: {count}")
-    bad_bytes, byte_count = frames.bad_byte_count, len(frames.content)
-    lost_text = (
-        f"{bad_bytes:,} bytes ({bad_bytes / byte_count:.2%}) are not part of a complete MAVLink "
-        "frame"
+    bad_byte_count, byte_count = frames.bad_byte_count, len(frames.content)
+    stray_bytes_note = (
+        f"{bad_byte_count:,} bytes ({bad_byte_count / byte_count:.2%}) are not part of a complete "
+        "MAVLink frame"
     )
     damage: tuple[str, ...] = ()
     # Incomplete frames at the beginning and end of the file do not count as damage
-    if bad_bytes - 2 * MAX_FRAME_BYTES > MAX_STRAY_BYTE_FRACTION * byte_count:
-        damage = (f"the file is damaged: {lost_text}",)
-    elif bad_bytes:
-        notes.append(lost_text)
+    if bad_byte_count - 2 * MAX_FRAME_BYTES > MAX_STRAY_BYTE_FRACTION * byte_count:
+        damage = (f"the file is damaged: {stray_bytes_note}",)
+    elif bad_byte_count:
+        notes.append(stray_bytes_note)
     # Without a boot clock, flight time is receive time
     zero_s, end_s = (boot_s if len(boot_s) else np.array([0.0, received_s.max()]))[[0, -1]].tolist()
     return Recording(

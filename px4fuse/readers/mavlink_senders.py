@@ -33,8 +33,8 @@ MAX_SAME_CLOCK_DISTANCE_S = 1e5
 def _read_vehicle_types(frames: Frames) -> dict[Address, tuple[int, int]]:
     rows = frames.rows("HEARTBEAT")
     heartbeats = frames.table("HEARTBEAT", rows)
-    types = zip(heartbeats["type"].tolist(), heartbeats["autopilot"].tolist(), strict=True)
-    return dict([*zip(_read_addresses(frames, rows), types, strict=True)][::-1])
+    type_pairs = zip(heartbeats["type"].tolist(), heartbeats["autopilot"].tolist(), strict=True)
+    return dict([*zip(_read_addresses(frames, rows), type_pairs, strict=True)][::-1])
 
 
 def _read_addresses(frames: Frames, rows: IntArray | slice) -> Iterator[Address]:
@@ -63,41 +63,45 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
     SettingsError
         No autopilot has the given system id.
     """
-    counts = dict(_count_frames(frames))
-    vehicles = _read_vehicle_types(frames)
+    frame_counts = dict(_count_frames(frames))
+    vehicle_types = _read_vehicle_types(frames)
     vehicle_addresses = [
-        address for address in counts if address in vehicles and _is_vehicle(*vehicles[address])
+        address
+        for address in frame_counts
+        if address in vehicle_types and _is_vehicle(*vehicle_types[address])
     ]
-    rows = np.concatenate([frames.rows(name) for name in messages.AUTOPILOT_MESSAGES])
+    rows = np.concatenate([frames.rows(message) for message in messages.AUTOPILOT_MESSAGES])
     autopilot_counts = dict(_count_frames(frames, rows))
     # Companion computers may send autopilot heartbeats, so senders of messages that only autopilots
     # send are preferred. Without a heartbeat, these messages or the component id identify the
     # autopilot
     candidates = (
         [address for address in vehicle_addresses if address in autopilot_counts]
-        or [address for address in autopilot_counts if address not in vehicles]
+        or [address for address in autopilot_counts if address not in vehicle_types]
         or vehicle_addresses
     )
     candidates = candidates or [
-        address for address in counts if address[1] == messages.AUTOPILOT_COMPONENT_ID
+        address for address in frame_counts if address[1] == messages.AUTOPILOT_COMPONENT_ID
     ]
     # The recording may contain no message that the autopilot sent
-    candidates = candidates or [(address[0], messages.AUTOPILOT_COMPONENT_ID) for address in counts]
+    candidates = candidates or [
+        (address[0], messages.AUTOPILOT_COMPONENT_ID) for address in frame_counts
+    ]
     if system is not None:
         candidates = [
             address for address in {*vehicle_addresses, *candidates} if address[0] == system
         ]
         if not candidates:
-            ids = (
+            system_ids = (
                 ", ".join(map(str, sorted({address[0] for address in vehicle_addresses}))) or "none"
             )
             raise SettingsError(
                 f"{frames.name}: no autopilot has MAVLink system id {system}. System ids of "
-                f"autopilots in this file: {ids}."
+                f"autopilots in this file: {system_ids}."
             )
-    best_address = max(candidates, key=lambda address: counts.get(address, 0))
-    name = messages.AUTOPILOTS.get(vehicles[best_address][1]) if best_address in vehicles else None
-    return best_address, name or "unknown autopilot"
+    best_address = max(candidates, key=lambda address: frame_counts.get(address, 0))
+    _, autopilot_type = vehicle_types.get(best_address, (-1, -1))
+    return best_address, messages.AUTOPILOTS.get(autopilot_type, "unknown autopilot")
 
 
 def senders_of(recording: Recording, message: str) -> list[Address]:
@@ -213,12 +217,12 @@ def clock_maps(
 def describe_senders(recording: Recording) -> tuple[Sender, ...]:
     """Describe the senders in the recording, most messages first."""
     frames = recording.frames
-    vehicles = _read_vehicle_types(recording.frames)
+    vehicle_types = _read_vehicle_types(recording.frames)
     sender_descriptions = []
     for address, count in _count_frames(frames)[:MAX_SENDERS]:
         description = "sender without heartbeat"
-        if address in vehicles:
-            vehicle_type, autopilot = vehicles[address]
+        if address in vehicle_types:
+            vehicle_type, autopilot = vehicle_types[address]
             description = VEHICLE_TYPES.get(vehicle_type, f"vehicle of MAV_TYPE {vehicle_type}")
             if autopilot != messages.INVALID_AUTOPILOT:
                 description = f"{messages.AUTOPILOTS.get(autopilot, 'autopilot')} {description}"
@@ -235,8 +239,8 @@ def _lost_fraction(frames: Frames, address: Address) -> float | None:
     sequence numbers, or sets them separately on two links.
     """
     sequence = frames.sequence[frames.sent_by(address)].astype(np.int64)
-    step = np.mod(np.diff(sequence) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES
-    unwrapped_sequence = np.append(0, np.cumsum(step))
+    sequence_steps = np.mod(np.diff(sequence) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES
+    unwrapped_sequence = np.append(0, np.cumsum(sequence_steps))
     lost_fraction = float(
         1.0 - len(np.unique(unwrapped_sequence)) / (np.ptp(unwrapped_sequence) + 1)
     )

@@ -148,10 +148,10 @@ def read_position_file(
         table, meanings, chosen_columns, quaternion_columns, body or body_in_path
     )
     row_count = len(numbers)
-    time_column, position, sigma, frame, time_text = _choose_columns(
+    time_column, axis_columns, sigma_columns, frame, time_text = _choose_columns(
         table, meanings, chosen_columns, numbers
     )
-    position_columns = [index for index in position if index is not None]
+    position_columns = [index for index in axis_columns if index is not None]
     # pandas reads numbers such as 1e999 as infinite
     has_time = np.isfinite(numbers[time_column])
     is_usable = has_time & (numbers[position_columns].abs() < MAX_COORDINATE).all(axis=1)
@@ -160,23 +160,23 @@ def read_position_file(
             f"number of dropped rows without valid time or position: {unusable_count}"
             f"{table.first_line(numbers.index[~is_usable])}"
         )
-    empty_times = numbers.loc[has_time & ~is_usable, time_column].to_numpy()
+    times_without_position = numbers.loc[has_time & ~is_usable, time_column].to_numpy()
     numbers = numbers[is_usable]
-    times = numbers[time_column].to_numpy()
+    file_times = numbers[time_column].to_numpy()
     units, interval_range_s = TRAJECTORY_TIME_LIMITS if is_trajectory else POSITION_TIME_LIMITS
     unit, unit_text = _time_unit(
-        times, meanings[time_column].unit, time_unit, units, interval_range_s
+        file_times, meanings[time_column].unit, time_unit, units, interval_range_s
     )
     units_per_second: float = round(1.0 / TIME_UNITS[unit])
     if table.rate_hz is not None:
         unit_text = f"the frame rate is {table.rate_hz:g} Hz"
         unit, units_per_second = "frame numbers", table.rate_hz
-    seconds = times / units_per_second
-    kept_rows = _increasing_rows(seconds)
-    if dropped := len(seconds) - len(kept_rows):
+    times_s = file_times / units_per_second
+    kept_rows = _increasing_rows(times_s)
+    if dropped_count := len(times_s) - len(kept_rows):
         notes.append(
             "number of dropped rows with timestamps that repeat, decrease or are after 2100: "
-            f"{dropped}"
+            f"{dropped_count}"
         )
     is_not_time = table.format == NO_HEADER and len(kept_rows) < MIN_USABLE_FRACTION * row_count
     if is_not_time or len(kept_rows) < MIN_USABLE_ROWS:
@@ -190,7 +190,7 @@ def read_position_file(
             ),
             f"Write decimal points. Alternatively, name the columns with {COLUMNS_OPTION}.",
         )
-    numbers = numbers.iloc[kept_rows].set_index(time_index(seconds[kept_rows]))
+    numbers = numbers.iloc[kept_rows].set_index(time_index(times_s[kept_rows]))
     median_interval_s = median_interval(numbers.index)
     if not interval_range_s[0] <= median_interval_s <= interval_range_s[1]:
         notes.append(
@@ -206,7 +206,7 @@ def read_position_file(
     )
     columns_m = {
         name: np.nan if index is None else numbers[index] * scale_by_column[index]
-        for name, index in zip(SAMPLE_COLUMNS, (*position, *sigma), strict=True)
+        for name, index in zip(SAMPLE_COLUMNS, (*axis_columns, *sigma_columns), strict=True)
     }
     samples = pd.DataFrame(columns_m, index=numbers.index).replace([np.inf, -np.inf], np.nan)
     invalid_reasons = find_invalid_rows(samples, SAMPLE_COLUMNS[: len(position_columns)])
@@ -214,7 +214,7 @@ def read_position_file(
         invalid_reasons[:] = ""
     invalid_parts = (
         invalid_reasons[invalid_reasons != ""],
-        pd.Series("NaN", empty_times / units_per_second),
+        pd.Series("NaN", times_without_position / units_per_second),
     )
     quaternions = numbers.loc[invalid_reasons == "", quaternion_columns].to_numpy()
     samples = samples[invalid_reasons == ""]
@@ -231,15 +231,16 @@ def read_position_file(
         samples=samples,
         clock=clock,
         frames=(frame,) if frame else table.frames,
-        dropped=dropped,
+        dropped=dropped_count,
         detected=(
             f"the file format is {table.format}"
             if table.format
             else f"the separator is {SEPARATORS[table.separator]}, the header is line "
             f"{table.header_line}",
             f"time: column {time_text}, {clock} clock, unit {unit} ({unit_text})",
-            f"position: columns {table.label(*position)} as {axes_text}, unit {length_unit_text}",
-            f"sigma: columns {table.label(*sigma) or 'none'}",
+            f"position: columns {table.label(*axis_columns)} as {axes_text}, unit "
+            f"{length_unit_text}",
+            f"sigma: columns {table.label(*sigma_columns) or 'none'}",
         ),
         notes=tuple(notes),
         metres_per_unit=scale_by_column[position_columns[0]],
@@ -265,11 +266,11 @@ def _open_table(
     return table, hashlib.sha256(content).hexdigest(), len(content)
 
 
-def _increasing_rows(seconds: Array) -> IntArray:
+def _increasing_rows(times_s: Array) -> IntArray:
     """Return the indices of rows whose times increase and are before 2100."""
-    usable_rows = np.flatnonzero(np.abs(seconds) < UNIX_END_S)
+    usable_rows = np.flatnonzero(np.abs(times_s) < UNIX_END_S)
     # Ranks are used instead of times, because longest_increasing_run requires positive values
-    ranks = np.unique(seconds[usable_rows], return_inverse=True)[1].astype(np.int64)
+    ranks = np.unique(times_s[usable_rows], return_inverse=True)[1].astype(np.int64)
     return usable_rows[longest_increasing_run(ranks + 1)]
 
 
@@ -298,7 +299,7 @@ def _read_numbers(
     quaternion_columns: list[int],
     body: str | None,
 ) -> tuple[pd.DataFrame, bool]:
-    """Read columns as numbers; also return False if ISO 8601 times lack the time zone.
+    """Return columns as numbers, and False if ISO 8601 times lack the time zone (else True).
 
     The unit of columns with ISO 8601 times becomes "s" in ``meanings``.
     """
@@ -336,17 +337,17 @@ def _to_numbers(texts: "pd.Series[str]", *, is_comma_decimal: bool) -> "pd.Serie
 
 
 def _read_dates(texts: "pd.Series[str]") -> tuple["pd.Series[float]", bool]:
-    """Convert ISO 8601 times to seconds since 1970; also return False if they lack the zone."""
+    """Convert ISO 8601 times to UNIX time (s); also return True if they have a time zone."""
     texts = texts.str.replace(",", ".", regex=False)
     dates = pd.to_datetime(texts, format="ISO8601", utc=True, errors="coerce")
-    seconds = (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
-    return seconds, bool(texts.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$").mean() > 0.5)
+    unix_s = (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
+    return unix_s, bool(texts.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$").mean() > 0.5)
 
 
 def _select_body(
     table: Table, texts: pd.DataFrame, meanings: Sequence[ColumnMeaning], body: str | None
 ) -> pd.DataFrame:
-    """Return the rows of one tag, if a column contains the tags of several bodies."""
+    """Return the rows of the chosen body, if a column contains tags of several bodies."""
     for index, meaning in enumerate(meanings):
         if meaning.kind == "tag":
             tags = texts[index].dropna().unique().tolist()
@@ -392,48 +393,48 @@ def _choose_columns(
     The time of measurement is preferred to the time of recording.
     """
     if chosen_columns:
-        time = chosen_columns[0]
-        time_text = table.label(time)
+        time_column = chosen_columns[0]
+        time_text = table.label(time_column)
         frame = None
-        position: _Columns = (*chosen_columns[1:4], None)[:3]
+        axis_columns: _Columns = (*chosen_columns[1:4], None)[:3]
         # The column names may contain the frame, which determines the order of the axes
         chosen_meanings = [
-            meaning if index in position else ColumnMeaning()
+            meaning if index in axis_columns else ColumnMeaning()
             for index, meaning in enumerate(meanings)
         ]
-        named_position = position_names.find_position(chosen_meanings)
-        if named_position and {*named_position[1]} == {*position}:
-            frame, position = named_position
+        named_axis_columns = position_names.find_position(chosen_meanings)
+        if named_axis_columns and {*named_axis_columns[1]} == {*axis_columns}:
+            frame, axis_columns = named_axis_columns
     else:
         time_columns = [index for index, column in enumerate(meanings) if column.kind == "time"]
         is_mostly_empty = numbers[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
-        rank = position_names.TIME_KINDS.index
-        time, *other_times = sorted(
+        kind_rank = position_names.TIME_KINDS.index
+        time_column, *other_times = sorted(
             time_columns,
             key=lambda index: (
                 is_mostly_empty[index],
-                rank(meanings[index].key),
+                kind_rank(meanings[index].key),
                 meanings[index].unit == "ns",
             ),
         )
-        time_text = table.label(time)
+        time_text = table.label(time_column)
         for index in [*other_times]:
-            are_whole_seconds = (numbers[time] % 1.0 == 0.0).mean() > MIN_USABLE_FRACTION
+            are_whole_seconds = (numbers[time_column] % 1.0 == 0.0).mean() > MIN_USABLE_FRACTION
             if are_whole_seconds and meanings[index].unit == "ns" and numbers[index].max() < 1e9:
-                numbers[time] += numbers[index] * 1e-9
+                numbers[time_column] += numbers[index] * 1e-9
                 other_times.remove(index)
                 time_text += f" plus {table.label(index)}"
         if other_times:
-            time_text += f" ({meanings[time].key}; not used: {table.label(*other_times)})"
-        frame, position = position_names.find_position(meanings) or (None, ())
-    if position[2] is not None and numbers[position[2]].isna().all():
-        position = (*position[:2], None)
-    sigma = (
+            time_text += f" ({meanings[time_column].key}; not used: {table.label(*other_times)})"
+        frame, axis_columns = position_names.find_position(meanings) or (None, ())
+    if axis_columns[2] is not None and numbers[axis_columns[2]].isna().all():
+        axis_columns = (*axis_columns[:2], None)
+    sigma_columns = (
         (chosen_columns[4],) * 3
         if len(chosen_columns) > 4
         else position_names.find_sigma(meanings, frame)
     )
-    return time, position, sigma, frame, time_text
+    return time_column, axis_columns, sigma_columns, frame, time_text
 
 
 def _time_unit(
@@ -450,17 +451,17 @@ def _time_unit(
     """
     if given_unit is not None:
         return given_unit, "the unit was given with --position-time-unit"
-    median = float(np.median(times)) if len(times) else 0.0
-    if abs(median) * TIME_UNITS.get(name_unit, np.inf) < UNIX_END_S:
+    median_time = float(np.median(times)) if len(times) else 0.0
+    if abs(median_time) * TIME_UNITS.get(name_unit, np.inf) < UNIX_END_S:
         return name_unit, "the column name contains the unit"
-    steps = np.diff(times)
-    median_step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    time_steps = np.diff(times)
+    median_step = float(np.median(time_steps[time_steps > 0])) if (time_steps > 0).any() else 0.0
     plausible_units = []
-    for unit, scale in TIME_UNITS.items():
-        is_unix = UNIX_START_S <= median * scale < UNIX_END_S
-        if is_unix and median_step * scale <= MAX_UNIX_TIME_INTERVAL_S:
+    for unit, unit_s in TIME_UNITS.items():
+        is_unix = UNIX_START_S <= median_time * unit_s < UNIX_END_S
+        if is_unix and median_step * unit_s <= MAX_UNIX_TIME_INTERVAL_S:
             return unit, f"as UNIX times in {unit}, the times are between 2000 and 2100"
-        if unit in units and interval_range_s[0] <= median_step * scale <= interval_range_s[1]:
+        if unit in units and interval_range_s[0] <= median_step * unit_s <= interval_range_s[1]:
             plausible_units.append(unit)
     if not plausible_units:
         return "s", (

@@ -82,16 +82,16 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
 
 
 def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) -> AidLog | None:
-    fields = {
+    field_by_quantity = {
         "innovation": "innovation",
         "variance": "innovation_variance",
         "noise": "observation_variance",
         "ratio": "test_ratio",
     }
     if aid.name in px4.AIDS_WITH_OBSERVATION:
-        fields["observation"] = "observation"
+        field_by_quantity["observation"] = "observation"
     columns = {"fused": "fused", "rejected": "innovation_rejected"}
-    for name, field in fields.items():
+    for name, field in field_by_quantity.items():
         columns |= _columns_by_axis(name, aid, field + "[]" * (len(aid.axes) > 1))
     layout = Layout(f"estimator_aid_src_{aid.name}", columns, OPTIONAL_FIELDS.get(aid.name, {}))
     if topics.find(layout) is None:  # return early: reading an empty table takes time
@@ -112,9 +112,12 @@ def _read_common_topics(
     )
     layouts = []
     if aid.fields and not is_in_gauss:
-        pairs = zip(px4.INNOVATION_TOPICS, ("innovation", "variance"), strict=True)
+        topic_quantities = zip(px4.INNOVATION_TOPICS, ("innovation", "variance"), strict=True)
         layouts.append(
-            [Layout(topic, _columns_by_axis(name, aid, aid.fields)) for topic, name in pairs]
+            [
+                Layout(topic, _columns_by_axis(name, aid, aid.fields))
+                for topic, name in topic_quantities
+            ]
         )
     if aid.old_fields:
         fields = _columns_by_axis("innovation", aid, aid.old_fields)

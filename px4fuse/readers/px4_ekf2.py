@@ -42,13 +42,12 @@ VALIDITY_FLAGS = ("xy_valid", "xy_global")
 STATE_COUNT = 22
 # Bit of filter_control_status_u (common.h) that is set while EKF2 fuses the 3D magnetic field
 MAG_3D_BIT = 5
-# Minimum rate (Hz) of a magnetometer topic that contains all samples: EKF2 uses 14 per second
+# Minimum logged rate (Hz) of a magnetometer topic with all samples: EKF2 uses 14 per second
 MIN_COMPLETE_FIELD_HZ = 10.0
 # EKF2 may round the ratio of prediction interval to IMU interval up or down if its distance from
 # n + 0.5 is smaller
 MAX_HALF_RATIO_DISTANCE = 0.05
-# Maximum interval (s) between two rows of low-pass filtered optical flow to compute the mean flow
-# between them
+# Maximum interval (s) between two logged rows of optical flow to undo EKF2's low-pass filter
 MAX_FLOW_INTERVAL_S = 0.5
 # Aiding sources of horizontal position and velocity other than external vision position
 OTHER_HORIZONTAL_AIDS = (
@@ -180,13 +179,15 @@ def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
             f"the arrays in {topic} have the lengths of no supported PX4 release",
             "Report the PX4 version in an issue of px4fuse.",
         )
-    states = [f"states[{i}]" for i in range(STATE_COUNT)]
-    variances = [f"covariances[{i}]" for i in range(STATE_COUNT - 4 + attitude_variance_count)]
-    layout = Layout(topic, {name: name for name in states + variances})
+    state_fields = [f"states[{i}]" for i in range(STATE_COUNT)]
+    variance_fields = [
+        f"covariances[{i}]" for i in range(STATE_COUNT - 4 + attitude_variance_count)
+    ]
+    layout = Layout(topic, {name: name for name in state_fields + variance_fields})
     samples = topics.primary_samples(layout).dropna()
-    samples = samples[(samples[variances] >= 0.0).all(axis=1)]
-    state = samples[states].to_numpy(copy=True)
-    variance = samples[variances].to_numpy(copy=True)
+    samples = samples[(samples[variance_fields] >= 0.0).all(axis=1)]
+    state = samples[state_fields].to_numpy(copy=True)
+    variance = samples[variance_fields].to_numpy(copy=True)
     if attitude_variance_count == px4.QUATERNION_VARIANCE_COUNT:
         state[:, 10:16] /= step_s
         variance = np.hstack([_attitude_variance(state[:, :4], variance[:, :4]), variance[:, 4:]])
@@ -207,10 +208,10 @@ def _prediction_interval_s(topics: Topics) -> float:
     if len(imu_s) < 2 or (interval_s := median_interval(imu_s)) >= configured_s:
         return configured_s
     layout = Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
-    end_rows = rows_of_timestamps(imu_s, topics.primary_samples(layout).index)
+    prediction_end_rows = rows_of_timestamps(imu_s, topics.primary_samples(layout).index)
     # time differences are used instead of row numbers, because IMU samples may be missing
-    step_ends = np.rint((imu_s[end_rows] - imu_s[0]) / interval_s)
-    return samples_per_step(configured_s, interval_s, step_ends) * interval_s
+    prediction_ends = np.rint((imu_s[prediction_end_rows] - imu_s[0]) / interval_s)
+    return samples_per_step(configured_s, interval_s, prediction_ends) * interval_s
 
 
 def rows_of_timestamps(times_s: Array, wanted_times_s: ArrayLike) -> IntArray:
@@ -275,22 +276,22 @@ def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
     for table in topics.tables_of(topic)[:1]:
         if "timestamp_sample" in table:
             measured_us = measurement_time_us(table)
-            times = time_index((measured_us - topics.zero_us) * 1e-6)
+            measured_index = time_index((measured_us - topics.zero_us) * 1e-6)
             age_us = table["timestamp"].astype(np.int64) - measured_us
-            return pd.Series(age_us * 1e-6, index=times)
+            return pd.Series(age_us * 1e-6, index=measured_index)
     return pd.Series(dtype=np.float64)
 
 
 def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUnavailable:
     """Read the fusion flags of external vision: horizontal and vertical position, and yaw."""
-    vision = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
-    if not {*vision.values()} <= enabled_aids.keys():
+    aid_by_group = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
+    if not {*aid_by_group.values()} <= enabled_aids.keys():
         return Unavailable(
             "EKF2 fusion flags",
             "estimator_status_flags and estimator_status are not logged",
             px4.DEFAULT_PROFILE_REMEDY,
         )
-    flags = pd.DataFrame({group: enabled_aids[aid] for group, aid in vision.items()}).dropna()
+    flags = pd.DataFrame({group: enabled_aids[aid] for group, aid in aid_by_group.items()}).dropna()
     topic = px4.STATUS_FLAGS if topics.instances(px4.STATUS_FLAGS) else px4.STATUS_TOPIC
     if flags.empty:
         return Unavailable(
@@ -378,60 +379,68 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
 
     A topic with all samples is preferred, then EKF2's observations with filtered innovations.
     """
-    candidates = [topics.primary_samples(layout).dropna() for layout in px4.MAGNETIC_FIELD_LAYOUTS]
-    # EKF2 subtracts EKF2_MAG_DELAY and half a prediction step from the times of its observations
-    shift_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
-    candidates[1] = candidates[1].set_axis(candidates[1].index + shift_s)
-    complete_fields = [
-        field for field in candidates if len(field) > MIN_COMPLETE_FIELD_HZ * topics.log.duration_s
+    field_candidates = [
+        topics.primary_samples(layout).dropna() for layout in px4.MAGNETIC_FIELD_LAYOUTS
     ]
-    fields_with_innovation = [field for field in candidates if Columns.FIELD_INNOVATION[0] in field]
-    field = max(complete_fields or fields_with_innovation or candidates, key=len)
-    bits = topics.read(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
-    if field.empty or bits.empty:
+    # EKF2 subtracts EKF2_MAG_DELAY and half a prediction step from the times of its observations
+    delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
+    field_candidates[1] = field_candidates[1].set_axis(field_candidates[1].index + delay_s)
+    complete_fields = [
+        field
+        for field in field_candidates
+        if len(field) > MIN_COMPLETE_FIELD_HZ * topics.log.duration_s
+    ]
+    fields_with_innovation = [
+        field for field in field_candidates if Columns.FIELD_INNOVATION[0] in field
+    ]
+    field = max(complete_fields or fields_with_innovation or field_candidates, key=len)
+    control_bits = topics.read(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
+    if field.empty or control_bits.empty:
         return pd.DataFrame()
-    flags = step_values_at(bits, field.index).astype(np.int64)
+    flags = step_values_at(control_bits, field.index).astype(np.int64)
     return field.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
 
 
 def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
     """Undo EKF2's low-pass filter: return the mean optical flow between successive logged rows."""
-    velocity, interval, noise = (
+    flow_velocity, flow_intervals, flow_noise = (
         topics.primary_samples(px4.LAYOUTS[f"flow_{quantity}"]).dropna()
         for quantity in ("velocity", "interval", "noise")
     )
-    interval_s = float(interval["interval_us"].median()) * 1e-6
-    if not interval_s > 0.0 or noise.empty:
+    interval_s = float(flow_intervals["interval_us"].median()) * 1e-6
+    if not interval_s > 0.0 or flow_noise.empty:
         return pd.DataFrame()
-    times = velocity.index.to_numpy()
+    times_s = flow_velocity.index.to_numpy()
     # After longer intervals the low-pass filter no longer contains the samples of the previous row
-    steps_s = np.diff(times)
-    rows = np.flatnonzero((steps_s > 0.5 * interval_s) & (steps_s <= MAX_FLOW_INTERVAL_S)) + 1
+    steps_s = np.diff(times_s)
+    used_rows = np.flatnonzero((steps_s > 0.5 * interval_s) & (steps_s <= MAX_FLOW_INTERVAL_S)) + 1
     if FLOW.name in enabled_aids:
-        rows = rows[step_values_at(enabled_aids[FLOW.name], times[rows]) > 0.0]
-    sample_count = np.rint((times[rows] - times[rows - 1]) / interval_s)
+        used_rows = used_rows[step_values_at(enabled_aids[FLOW.name], times_s[used_rows]) > 0.0]
+    sample_count = np.rint((times_s[used_rows] - times_s[used_rows - 1]) / interval_s)
     filter_memory = ((1.0 - FLOW_FILTER_WEIGHT) ** sample_count)[:, None]
-    low_passed = velocity[["forward_m_s", "right_m_s"]].to_numpy()
+    filtered_velocity = flow_velocity[["forward_m_s", "right_m_s"]].to_numpy()
     forward, right = (
-        (low_passed[rows] - filter_memory * low_passed[rows - 1]) / (1.0 - filter_memory)
+        (filtered_velocity[used_rows] - filter_memory * filtered_velocity[used_rows - 1])
+        / (1.0 - filter_memory)
     ).T
-    velocity = velocity.iloc[rows]
+    flow_velocity = flow_velocity.iloc[used_rows]
     newest_columns, rate_columns = (
         ["newest_forward_m_s", "newest_right_m_s"],
         ["x_rad_s", "y_rad_s"],
     )
-    squared_range = (velocity[newest_columns] ** 2).sum(axis=1) / (velocity[rate_columns] ** 2).sum(
-        axis=1
-    )
+    squared_range = (flow_velocity[newest_columns] ** 2).sum(axis=1) / (
+        flow_velocity[rate_columns] ** 2
+    ).sum(axis=1)
     flow = pd.DataFrame(
         {
             "forward_m_s": forward,
             "right_m_s": right,
             "samples": sample_count,
             "interval_s": interval_s,
-            "noise_m2_s2": squared_range * np.interp(times[rows], noise.index, noise["noise"]),
+            "noise_m2_s2": squared_range
+            * np.interp(times_s[used_rows], flow_noise.index, flow_noise["noise"]),
         },
-        index=velocity.index,
+        index=flow_velocity.index,
     )
     return flow.replace(np.inf, np.nan).dropna()
 

@@ -10,7 +10,7 @@ from px4fuse.readers.common import interpolate_inside
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics
 
-# Maximum time difference (s) of a logged fix and an EKF2 observation of the same fix: receivers
+# Maximum time difference (s) between a logged fix and EKF2's observation of it: receivers
 # send a fix every 0.05 s or less often
 MAX_SAME_FIX_S = 0.01
 # Maximum difference (°) of EKF2's observation from the logged latitude: above it (100 km), the
@@ -47,13 +47,13 @@ def read_unlogged_fixes(
     # EKF2 shifts GNSS times back by half a prediction step (estimator_interface.cpp)
     fixes = position.join(velocity, how="inner").dropna()
     # Unless GNSS is the height reference, EKF2's estimate of the GNSS bias is part of the height
-    height = px4.LAYOUTS["fused_height"]
-    if topics.find(height) and topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
-        fixes = fixes.join(topics.primary_samples(height))
+    height_layout = px4.LAYOUTS["fused_height"]
+    if topics.find(height_layout) and topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
+        fixes = fixes.join(topics.primary_samples(height_layout))
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
     next_row = np.clip(np.searchsorted(gps.index, fixes.index), 1, len(gps) - 1)
     distance_s = np.minimum(
-        *(np.abs(gps.index.to_numpy()[next_row - k] - fixes.index) for k in (0, 1))
+        *(np.abs(gps.index.to_numpy()[next_row - offset] - fixes.index) for offset in (0, 1))
     )
     is_between_fixes = (fixes.index > gps.index[0]) & (fixes.index < gps.index[-1])
     logged_fixes = fixes[distance_s <= MAX_SAME_FIX_S]
@@ -86,47 +86,57 @@ def reconstruct_fixes(
         return no_fixes
     gnss_innovations = with_gnss_innovations(ekf2).innovations
     north, east = gnss_innovations["north"], gnss_innovations["east"]
-    fix_s = fixes.index.to_numpy()
-    interval_s = _receiver_interval_s(fix_s)
-    if interval_s is None or isinstance(north, Unavailable) or isinstance(east, Unavailable):
+    logged_fix_s = fixes.index.to_numpy()
+    receiver_interval_s = _receiver_interval_s(logged_fix_s)
+    if (
+        receiver_interval_s is None
+        or isinstance(north, Unavailable)
+        or isinstance(east, Unavailable)
+    ):
         return no_fixes
     # A fix older than the fusion horizon is fused at the horizon, so later (RingBuffer.h)
     delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
     fused_s = north.index.to_numpy() - delay_beyond_horizon_s
     # An innovation belongs to the last fix before it. This fix came a whole number of receiver
     # intervals after the last logged fix, 0 if the fix itself is logged
-    previous_fix_index = np.searchsorted(fix_s, fused_s) - 1
-    intervals_passed = (fused_s - fix_s[previous_fix_index]) / interval_s
-    is_between_fixes = (previous_fix_index >= 0) & (previous_fix_index < len(fix_s) - 1)
+    previous_fix_index = np.searchsorted(logged_fix_s, fused_s) - 1
+    intervals_passed = (fused_s - logged_fix_s[previous_fix_index]) / receiver_interval_s
+    is_between_fixes = (previous_fix_index >= 0) & (previous_fix_index < len(logged_fix_s) - 1)
     # Skip innovations within one EKF2 step after a fix: they may also belong to the fix before
-    is_used = is_between_fixes & (intervals_passed % 1.0 > ekf2.step_s / interval_s)
-    previous_fix_index = previous_fix_index[is_used]
-    intervals_passed = np.floor(intervals_passed[is_used])
-    fix_time_s = fix_s[previous_fix_index] + intervals_passed * interval_s
+    is_unambiguous = is_between_fixes & (intervals_passed % 1.0 > ekf2.step_s / receiver_interval_s)
+    previous_fix_index = previous_fix_index[is_unambiguous]
+    intervals_passed = np.floor(intervals_passed[is_unambiguous])
+    reconstructed_fix_s = logged_fix_s[previous_fix_index] + intervals_passed * receiver_interval_s
     reconstructed_fixes = pd.DataFrame(
         {
-            column: interpolate_inside(fix_time_s + delay_beyond_horizon_s, ekf2.state[column])
-            + innovations["innovation_m"].to_numpy()[is_used]
+            column: interpolate_inside(
+                reconstructed_fix_s + delay_beyond_horizon_s, ekf2.state[column]
+            )
+            + innovations["innovation_m"].to_numpy()[is_unambiguous]
             for column, innovations in zip(Columns.POSITION, (north, east), strict=False)
         },
-        index=time_index(fix_time_s),
+        index=time_index(reconstructed_fix_s),
     )
     is_logged = intervals_passed == 0.0
-    error = reconstructed_fixes - fixes[reconstructed_fixes.columns].to_numpy()[previous_fix_index]
-    error = error[is_logged].dropna()
+    position_error = (
+        reconstructed_fixes - fixes[reconstructed_fixes.columns].to_numpy()[previous_fix_index]
+    )
+    position_error = position_error[is_logged].dropna()
     reconstructed_fixes = reconstructed_fixes[~is_logged].dropna()
     reconstructed_fixes = reconstructed_fixes[~reconstructed_fixes.index.duplicated()]
-    if len(error) < MIN_LOGGED_FIXES or reconstructed_fixes.empty:
+    if len(position_error) < MIN_LOGGED_FIXES or reconstructed_fixes.empty:
         return no_fixes
-    error_m = float(np.sqrt(np.mean(error.to_numpy() ** 2)))
+    error_m = float(np.sqrt(np.mean(position_error.to_numpy() ** 2)))
     if error_m > MAX_RECONSTRUCTION_ERROR_M:
         return no_fixes
     for column in (Columns.POSITION[2], *Columns.POSITION_VARIANCE):
         if column in fixes:
-            reconstructed_fixes[column] = np.interp(reconstructed_fixes.index, fix_s, fixes[column])
+            reconstructed_fixes[column] = np.interp(
+                reconstructed_fixes.index, logged_fix_s, fixes[column]
+            )
     return reconstructed_fixes, (
         f"{len(reconstructed_fixes)} unlogged GNSS fixes are reconstructed as EKF2 position plus "
-        f"innovation (RMS error {error_m:.2f} m per axis at {len(error)} logged fixes)"
+        f"innovation (RMS error {error_m:.2f} m per axis at {len(position_error)} logged fixes)"
     )
 
 
@@ -135,21 +145,21 @@ def _receiver_interval_s(times: Array) -> float | None:
 
     Return None if all logged intervals are equal, because the multiple is then unknown.
     """
-    logged_s = np.diff(times)[:, None]
-    multiples = logged_s / FIX_INTERVALS_S
+    logged_intervals_s = np.diff(times)[:, None]
+    multiples = logged_intervals_s / FIX_INTERVALS_S
     multiple_error_s = np.abs(multiples - np.round(multiples)) * FIX_INTERVALS_S
     worst_error_s = np.percentile(multiple_error_s, 98, axis=0)
-    possible_intervals = np.flatnonzero(worst_error_s <= MAX_MULTIPLE_ERROR_S)
-    if not len(possible_intervals):
+    possible_indices = np.flatnonzero(worst_error_s <= MAX_MULTIPLE_ERROR_S)
+    if not len(possible_indices):
         return None
-    longest_interval_s = FIX_INTERVALS_S[possible_intervals[-1]]
+    longest_interval_s = FIX_INTERVALS_S[possible_indices[-1]]
     # Use the interval with the smallest error within 10 % of the longest possible interval
-    near_intervals = np.flatnonzero(
+    near_indices = np.flatnonzero(
         np.abs(FIX_INTERVALS_S - longest_interval_s) < 0.1 * longest_interval_s
     )
-    best_interval_s = FIX_INTERVALS_S[near_intervals[np.argmin(worst_error_s[near_intervals])]]
-    interval_multiples = np.round(logged_s[:, 0] / best_interval_s)
+    best_interval_s = FIX_INTERVALS_S[near_indices[np.argmin(worst_error_s[near_indices])]]
+    interval_multiples = np.round(logged_intervals_s[:, 0] / best_interval_s)
     is_frequent = np.bincount(interval_multiples.astype(int)) >= MIN_REPEATED_INTERVALS
     if not np.any(is_frequent[1:] & is_frequent[:-1]):
         return None
-    return float(np.median(logged_s[:, 0] / interval_multiples))
+    return float(np.median(logged_intervals_s[:, 0] / interval_multiples))

@@ -89,7 +89,8 @@ def split_tracks(
     """Separate position tracks, best first, from the records of missing tracks."""
     available_tracks = [track for track in tracks if isinstance(track, PositionTrack)]
     available_tracks.sort(key=lambda track: track.origin.preference_rank)
-    return tuple(available_tracks), tuple(t for t in tracks if isinstance(t, Unavailable))
+    missing_tracks = (track for track in tracks if isinstance(track, Unavailable))
+    return tuple(available_tracks), tuple(missing_tracks)
 
 
 def unavailable_source(name: str, reason: str = "", remedy: str = "") -> Unavailable:
@@ -123,7 +124,7 @@ def make_track(
     track_fields
         Other fields of :class:`~px4fuse.flight.model.PositionTrack`.
     """
-    status = samples[[name for name in STATUS_COLUMNS if name in samples]]
+    source_status = samples[[name for name in STATUS_COLUMNS if name in samples]]
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
     is_nan = samples[Columns.POSITION].isna().to_numpy()
     is_height_only = bool(is_nan[:, :2].all() and not is_nan[:, 2].all())
@@ -131,8 +132,8 @@ def make_track(
     if origin.is_gnss:  # a receiver at rest may repeat its position
         samples, invalid = finite_rows(samples, needed_columns), NO_INVALID_ROWS
     else:
-        reason = find_invalid_rows(samples, needed_columns)
-        samples, invalid = samples[reason == ""], reason[reason != ""]
+        invalid_reasons = find_invalid_rows(samples, needed_columns)
+        samples, invalid = samples[invalid_reasons == ""], invalid_reasons[invalid_reasons != ""]
     if len(samples) < MIN_TRACK_SAMPLES:
         fault = f"the track has only {len(samples)} finite samples, fewer than {MIN_TRACK_SAMPLES}"
         if is_height_only:
@@ -146,7 +147,7 @@ def make_track(
         samples=samples.assign(**variance.where(variance > 0)),
         origin=origin,
         invalid=invalid,
-        status=status,
+        status=source_status,
         step_m=step_m,
         **track_fields,
     )
@@ -187,23 +188,23 @@ def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable
     is_ekf2 = layout.topic.startswith("estimator_")
     samples = topics.primary_samples(layout) if is_ekf2 else topics.read_instance(layout)
     frame = px4.TRACKS[name].frame
-    for field, frame_names in px4.FRAMES.items():
-        if frame == "unknown" and field in samples and len(samples):
-            frame = frame_names.get(int(samples[field].iloc[-1]), "unknown")
+    for frame_field, frame_names in px4.FRAMES.items():
+        if frame == "unknown" and frame_field in samples and len(samples):
+            frame = frame_names.get(int(samples[frame_field].iloc[-1]), "unknown")
     if "published_us" in samples:
         samples["age_s"] = 1e-6 * (samples["published_us"] - topics.zero_us) - samples.index
     orientation = read_orientation(samples)
-    count = len(topics.instances(layout.topic))
+    instance_count = len(topics.instances(layout.topic))
     note = (
-        f"{layout.topic} has {count} instances: {count} programs publish it. px4fuse and EKF2 use "
-        "instance 0."
+        f"{instance_count} programs publish {layout.topic}, each as one instance. px4fuse and EKF2 "
+        "use instance 0."
     )
     return _make_ulog_track(
         topics,
         name,
         samples,
         (layout.topic,),
-        notes=(note,) if count > 1 and not is_ekf2 else (),
+        notes=(note,) if instance_count > 1 and not is_ekf2 else (),
         is_odometry=orientation is not None,
         frame=frame,
         clock_map=_arrival_clock_map(topics, layout.topic),
@@ -240,9 +241,9 @@ def _timestamp_clock(published_us: IntArray, sampled_us: IntArray) -> str:
     """Return the clock of timestamps that are not boot time in microseconds."""
     if not sampled_us.any():
         return "0"
-    rate = float(np.ptp(published_us)) / max(float(np.ptp(sampled_us)), 1.0)
+    rate_ratio = float(np.ptp(published_us)) / max(float(np.ptp(sampled_us)), 1.0)
     for unit, unit_us in STAMP_UNITS.items():
-        if abs(rate / unit_us - 1.0) < MAX_RATE_ERROR:
+        if abs(rate_ratio / unit_us - 1.0) < MAX_RATE_ERROR:
             if UNIX_START_S <= float(np.median(sampled_us)) * unit_us * 1e-6 < UNIX_END_S:
                 return f"UNIX time in {unit}"
             return "another clock" if unit == "microseconds" else unit
@@ -345,14 +346,15 @@ def project(
     Source: PX4 ``MapProjection::project``, src/lib/geo/geo.cpp (Snyder 1987, equation 25-2).
     """
     latitude_0, longitude_0 = np.radians(origin[:2])
-    latitude, difference = np.radians(latitude_deg), np.radians(longitude_deg) - longitude_0
+    latitude = np.radians(latitude_deg)
+    longitude_difference = np.radians(longitude_deg) - longitude_0
     sine, cosine = np.sin(latitude), np.cos(latitude)
     sine_0, cosine_0 = np.sin(latitude_0), np.cos(latitude_0)
-    cosine_difference = np.cos(difference)
+    cosine_difference = np.cos(longitude_difference)
     angle = np.arccos(np.clip(sine_0 * sine + cosine_0 * cosine * cosine_difference, -1.0, 1.0))
     arc_over_chord = np.where(angle > 0, angle / np.where(angle > 0, np.sin(angle), 1.0), 1.0)
     north = arc_over_chord * (cosine_0 * sine - sine_0 * cosine * cosine_difference)
-    east = arc_over_chord * cosine * np.sin(difference)
+    east = arc_over_chord * cosine * np.sin(longitude_difference)
     return north * EARTH_RADIUS_M, east * EARTH_RADIUS_M
 
 
@@ -411,37 +413,39 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     layout = topics.find(*px4.layouts_of_track(px4.GPS_POSITION))
     if layout is None:
         return unavailable_source(px4.GPS_POSITION)
-    gps = topics.read_instance(layout)
-    if "fix_type" in gps:
-        gps = gps[gps["fix_type"] >= FIX_TYPE_3D]
-    if gps.empty:
+    fixes = topics.read_instance(layout)
+    if "fix_type" in fixes:
+        fixes = fixes[fixes["fix_type"] >= FIX_TYPE_3D]
+    if fixes.empty:
         return unavailable_source(px4.GPS_POSITION, "the GNSS receiver never had a 3D fix")
     parameters = topics.ekf2_parameters
-    published_s = (gps["published_us"].to_numpy() - topics.zero_us) * 1e-6
+    published_s = (fixes["published_us"].to_numpy() - topics.zero_us) * 1e-6
     has_driver_times = GNSS_MODE_PARAMETER in parameters and bool(
-        np.any(published_s - gps.index > MAX_ARRIVAL_DELAY_US * 1e-6)
+        np.any(published_s - fixes.index > MAX_ARRIVAL_DELAY_US * 1e-6)
     )
     delay_ms = 0.0 if has_driver_times else effective_settings(parameters, GNSS_POS)[GNSS_POS.delay]
     clock = "autopilot boot clock, measurement times from the GNSS driver"
     if not has_driver_times:
-        gps = gps.set_axis(time_index(published_s - delay_ms * 1e-3))
+        fixes = fixes.set_axis(time_index(published_s - delay_ms * 1e-3))
         clock = f"autopilot boot clock minus {delay_ms:g} ms ({GNSS_POS.delay})"
-    unlogged_fixes = read_unlogged_fixes(topics, gps, ekf2)
+    unlogged_fixes = read_unlogged_fixes(topics, fixes, ekf2)
     if len(unlogged_fixes):
-        gps = pd.concat([gps, unlogged_fixes]).sort_index()
-        interpolated_count = int(gps["altitude_m"].isna().sum())
+        fixes = pd.concat([fixes, unlogged_fixes]).sort_index()
+        interpolated_count = int(fixes["altitude_m"].isna().sum())
         # The added fixes lack some fields, which are copied from the previous fix
-        gps = gps.assign(altitude_m=gps["altitude_m"].interpolate("index")).ffill()
-    samples = project_to_ned(gps, _local_origin(topics))
-    if {"eph_m", "epv_m"} <= {*gps}:
+        fixes = fixes.assign(altitude_m=fixes["altitude_m"].interpolate("index")).ffill()
+    samples = project_to_ned(fixes, _local_origin(topics))
+    if {"eph_m", "epv_m"} <= {*fixes}:
         # EKF2 uses the horizontal accuracy as σ of each horizontal axis (gps_control.cpp)
-        samples["north_m2"] = samples["east_m2"] = gps["eph_m"].to_numpy() ** 2
-        samples["down_m2"] = gps["epv_m"].to_numpy() ** 2
+        samples["north_m2"] = samples["east_m2"] = fixes["eph_m"].to_numpy() ** 2
+        samples["down_m2"] = fixes["epv_m"].to_numpy() ** 2
     # The velocity is added before the check, so that it is dropped together with a damaged
     # position. Its variance per axis is the reported accuracy squared
-    velocity = gps.reindex(columns=Columns.VELOCITY).set_axis(samples.index)
-    accuracy = gps.get("speed_accuracy_m_s", pd.Series(np.nan, gps.index)).to_numpy()
-    samples = samples.assign(**velocity, **dict.fromkeys(Columns.VELOCITY_VARIANCE, accuracy**2))
+    velocity = fixes.reindex(columns=Columns.VELOCITY).set_axis(samples.index)
+    speed_accuracy_m_s = fixes.get("speed_accuracy_m_s", pd.Series(np.nan, fixes.index)).to_numpy()
+    samples = samples.assign(
+        **velocity, **dict.fromkeys(Columns.VELOCITY_VARIANCE, speed_accuracy_m_s**2)
+    )
     samples = finite_rows(samples, Columns.POSITION)
     rate_hz = sample_rate(samples)
     notes: list[str] = []
@@ -462,8 +466,8 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
             notes.append(note)
     track_fields: dict[str, Any] = {}
     # the lever arm of each receiver is logged since v1.17
-    if {*px4.ANTENNA_COLUMNS} <= {*gps}:
-        track_fields["lever_arm_m"] = tuple(gps[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
+    if {*px4.ANTENNA_COLUMNS} <= {*fixes}:
+        track_fields["lever_arm_m"] = tuple(fixes[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
     return _make_ulog_track(
         topics,
         px4.GPS_POSITION,
@@ -483,10 +487,10 @@ def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFram
 
     Return None with fewer than three samples.
     """
-    heights = altitude_m[np.isfinite(altitude_m)]
-    if len(heights) < MIN_TRACK_SAMPLES:
+    finite_altitude_m = altitude_m[np.isfinite(altitude_m)]
+    if len(finite_altitude_m) < MIN_TRACK_SAMPLES:
         return None
-    return _shift_times(-heights.to_frame("down_m"), -delay_s)
+    return _shift_times(-finite_altitude_m.to_frame("down_m"), -delay_s)
 
 
 def read_truth(
@@ -503,15 +507,17 @@ def read_truth(
     local_samples = finite_rows(logged_local, logged_local.columns.tolist())
     global_positions = finite_rows(topics.read(global_layout), Columns.GEODETIC[:2])
     if len(global_positions):
-        projected = project_to_ned(global_positions, _local_origin(topics))
+        projected_positions = project_to_ned(global_positions, _local_origin(topics))
         if local_samples.empty:
             velocity = global_positions.reindex(columns=Columns.VELOCITY)
-            return Truth(global_layout.topic, projected.join(velocity), attitude)
+            return Truth(global_layout.topic, projected_positions.join(velocity), attitude)
         if has_fused_aid(ekf2):
             local_samples = local_samples.copy()
             for column in Columns.POSITION:  # shift by the median difference
-                at_global = interpolate_inside(projected.index, local_samples[column])
-                shift_m = (projected[column] - at_global).median()
+                interpolated_m = interpolate_inside(
+                    projected_positions.index, local_samples[column]
+                )
+                shift_m = (projected_positions[column] - interpolated_m).median()
                 local_samples[column] += np.nan_to_num(shift_m)
     if len(local_samples):
         return Truth(local_layout.topic, local_samples, attitude)

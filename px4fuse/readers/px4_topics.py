@@ -83,14 +83,14 @@ def layouts_of_track(track: str) -> list[Layout]:
 
     If a layout has no topic, the name of the track is the topic.
     """
-    rows = [LAYOUTS[name] for name in TRACKS[track].layouts]
-    return [replace(row, topic=row.topic or track) for row in rows]
+    layouts = [LAYOUTS[name] for name in TRACKS[track].layouts]
+    return [replace(layout, topic=layout.topic or track) for layout in layouts]
 
 
 def topics() -> list[str]:
     """Return the sorted names of all PX4 topics that the ULog reader decodes."""
-    named_topics = {row.topic for track in TRACKS for row in layouts_of_track(track)}
-    named_topics |= {row.topic for row in LAYOUTS.values() if row.topic}
+    named_topics = {layout.topic for track in TRACKS for layout in layouts_of_track(track)}
+    named_topics |= {layout.topic for layout in LAYOUTS.values() if layout.topic}
     named_topics |= {f"estimator_aid_src_{name}" for name in AIDS}
     aid_topics = {STATUS_FLAGS, *INNOVATION_TOPICS, OLD_INNOVATION_TOPIC}
     return sorted(named_topics | UNUSED_TOPICS.keys() | aid_topics | {*STATE_VECTOR_TOPICS})

@@ -317,19 +317,18 @@ def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Table
     first_row = next((line for line in plain_lines if line.strip(" \t%")), "")
     for separator in SEPARATORS:
         fields = _split_line(first_row, separator)
-        decimals = [field.replace(",", ".") for field in fields]
-        if not 4 <= len(fields) <= MAX_COLUMNS or not all(map(is_number, decimals[1:])):
+        decimal_fields = [field.replace(",", ".") for field in fields]
+        if not 4 <= len(fields) <= MAX_COLUMNS or not all(map(is_number, decimal_fields[1:])):
             continue
-        is_time = is_number(decimals[0]) or _ISO_DATE.match(fields[0])
         if separator == " " and len(fields) == 12:
             return _kitti_table(path, text)
-        if is_time:
-            name, order = NO_HEADER, ""
+        if is_number(decimal_fields[0]) or _ISO_DATE.match(fields[0]):
+            name, quaternion_order = NO_HEADER, ""
             if separator in " \t" and len(fields) == 8:
-                name, order = "TUM trajectory", "xyzw"
+                name, quaternion_order = "TUM trajectory", "xyzw"
             elif separator == "," and len(fields) in (8, 17) and len(fields[0]) == 19:
-                name, order = "EuRoC ground truth", "wxyz"
-            names = ["time", "x", "y", "z", *(f"q{axis}" for axis in order)]
+                name, quaternion_order = "EuRoC ground truth", "wxyz"
+            names = ["time", "x", "y", "z", *(f"q{axis}" for axis in quaternion_order)]
             names += [""] * (len(fields) - len(names))
             note = "the file has no header: columns 1 to 4 are read as time, x, y, z"
             data_text = _without_comments(text)
@@ -347,18 +346,19 @@ def _kitti_table(path: Path, text: str) -> Table:
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 
     name, times_name = display_name(path), f"{path.stem}_times.txt"
-    paths = (path.with_name(times_name), path.with_name("times.txt"))
-    times_path = next((times_path for times_path in paths if times_path.is_file()), None)
+    candidate_paths = (path.with_name(times_name), path.with_name("times.txt"))
+    times_path = next((times_path for times_path in candidate_paths if times_path.is_file()), None)
     if times_path is None:
         raise LogError(
             f"{name}: the file contains KITTI poses, which have no times",
-            f"Save the times (s), one per line, as {display_name(paths[0])} in the same folder.",
+            f"Save the times (s), one per line, as {times_name} in the same folder.",
         )
-    times = read_text(times_path, LogError, MAX_FILE_BYTES).split()
+    time_texts = read_text(times_path, LogError, MAX_FILE_BYTES).split()
     try:
         matrices = np.loadtxt(io.StringIO(text), ndmin=2)
         quaternions = Rotation.from_matrix(matrices.reshape(-1, 3, 4)[:, :, :3]).as_quat()
-        cells = np.column_stack([np.array(times, dtype=float), matrices[:, 3::4], quaternions])
+        time_s = np.array(time_texts, dtype=float)
+        pose_rows = np.column_stack([time_s, matrices[:, 3::4], quaternions])
     except ValueError as error:
         raise LogError(
             f"{name}: the KITTI poses or the times in {display_name(times_path)} are not valid",
@@ -366,5 +366,5 @@ def _kitti_table(path: Path, text: str) -> Table:
         ) from error
     names = ["time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
     note = f"the times are from {display_name(times_path)}"
-    csv_text = pd.DataFrame(cells).to_csv(index=False, header=False)
+    csv_text = pd.DataFrame(pose_rows).to_csv(index=False, header=False)
     return Table(name, "KITTI poses", names, csv_text, frames=("edn",), notes=(note,))

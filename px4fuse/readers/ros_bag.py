@@ -81,16 +81,16 @@ def read_bag(path: Path, topic: str | None) -> tuple[Table, str, int]:
             "Run pip install 'px4fuse[ros]'.",
         ) from None
     files = files_below(path) if path.is_dir() else [path]
-    size = sum(file_size(file, LogError) for file in files)
-    if size > max_log_bytes.get():
-        raise LogError(format_size_limit(name, size, max_log_bytes.get()), LOG_SIZE_REMEDY)
-    hashes = hashlib.sha256()
+    size_bytes = sum(file_size(file, LogError) for file in files)
+    if size_bytes > max_log_bytes.get():
+        raise LogError(format_size_limit(name, size_bytes, max_log_bytes.get()), LOG_SIZE_REMEDY)
+    sha256 = hashlib.sha256()
     for file in files:
         with file.open("rb") as stream:
-            hashlib.file_digest(stream, lambda: hashes)
+            hashlib.file_digest(stream, lambda: sha256)
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            return _read_topic(name, reader, topic), hashes.hexdigest(), size
+            return _read_topic(name, reader, topic), sha256.hexdigest(), size_bytes
     except LogError:
         raise
     except Exception as error:  # rosbags raises many types for damaged bags
@@ -120,16 +120,16 @@ def _read_topic(name: str, reader: Any, topic: str | None) -> Table:
         messages = deque(
             messages, maxlen=1
         )  # the last path contains the poses of all previous paths
-    lags_s, rows, frames = [], [], set()
+    lags_s, csv_rows, pose_frames = [], [], set()
     for connection, receive_ns, raw_message in messages:
         message = reader.deserialize(raw_message, connection.msgtype)
         for stamped_message in message.poses if message_type == _PATH_TYPE else [message]:
             time_ns = _time_ns(stamped_message)
-            frames.add(getattr(stamped_message, "pose_frame", None))
+            pose_frames.add(getattr(stamped_message, "pose_frame", None))
             lags_s.append((receive_ns - time_ns) * 1e-9)
-            rows.append(f"{time_ns},{str(_pose_values(stamped_message))[1:-1]}\n")
+            csv_rows.append(f"{time_ns},{str(_pose_values(stamped_message))[1:-1]}\n")
     notes = [f"the topic is {chosen_topic} ({message_type})"]
-    if rows:
+    if csv_rows:
         low_s, median_s, high_s = np.percentile(lags_s, [2.5, 50.0, 97.5])
         notes.append(
             f"the timestamps in the messages are used; they were received {median_s:.3f} s later "
@@ -138,10 +138,10 @@ def _read_topic(name: str, reader: Any, topic: str | None) -> Table:
     return Table(
         name,
         "ROS bag",
-        ["time_ns", *_POSE_COLUMNS[: rows[0].count(",") if rows else 3]],
-        "".join(rows),
+        ["time_ns", *_POSE_COLUMNS[: csv_rows[0].count(",") if csv_rows else 3]],
+        "".join(csv_rows),
         is_chosen_body=True,
-        frames=("ned",) if frames == {_FRAME_NED} else (),
+        frames=("ned",) if pose_frames == {_FRAME_NED} else (),
         notes=tuple(notes),
     )
 

@@ -31,8 +31,8 @@ def refuse_foreign_format(path: Path, head: bytes, error_type: type[Px4FuseError
 
 # Minimum and maximum valid UNIX time (s): the years 2000 and 2100
 UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0
-# Number of characters at the beginning of a file in which a control character shows that the file
-# is binary; a NUL shows this anywhere
+# Number of characters at the beginning of a file in which a control character shows a binary file;
+# a NUL character shows a binary file at any position
 _CHECKED_CHARS = 100_000
 # Byte order marks of UTF-16, which Windows shells write
 _UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
@@ -140,7 +140,8 @@ class Rows:
             row = next((row for row, is_row_valid in enumerate(is_valid) if not is_row_valid), 0)
             raise self.row_error(
                 row,
-                f"{quote(lines[row])} has not {text_count + number_count} columns with numbers",
+                f"{quote(lines[row])} does not have {text_count + number_count} columns with "
+                "numbers",
                 "Correct or remove this line.",
             ) from error
         return table["texts"], np.ascontiguousarray(table["numbers"])

@@ -70,7 +70,7 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
         remedy = re.sub(f" [^.]*{COLUMNS_OPTION}.", "", error.remedy)
         raise TrajectoryError(error.reason, remedy) from error
     name, samples = recording.name, recording.samples
-    position = samples[["x_m", "y_m", "z_m"]].to_numpy()
+    position_m = samples[["x_m", "y_m", "z_m"]].to_numpy()
     dropped_count = recording.row_count - len(samples)
     if recording.format == NO_HEADER:
         raise TrajectoryError(
@@ -83,14 +83,13 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
             f"({'; '.join(recording.notes)})",
             "Export the timestamps with all digits (%.9f), and remove other rows.",
         )
-    if np.isnan(position).any():
+    if np.isnan(position_m).any():
         raise TrajectoryError(f"{name} contains no height", "Export x, y and z.")
     rotation = _read_rotation(recording)
-    is_text = not is_bag(path)
-    head = read_head(path, _HEAD_BYTES, TrajectoryError).decode(errors="replace") if is_text else ""
-    comments = "\n".join(re.findall(r"(?m)^\s*#.*", head))
-    kind, kind_note = _detect_kind(path, comments, position, rotation)
-    frame, frame_note = _detect_frame(kind, position)
+    first_bytes = b"" if is_bag(path) else read_head(path, _HEAD_BYTES, TrajectoryError)
+    comments = "\n".join(re.findall(r"(?m)^\s*#.*", first_bytes.decode(errors="replace")))
+    kind, kind_note = _detect_kind(path, comments, position_m, rotation)
+    frame, frame_note = _detect_frame(kind, position_m)
     time_s = samples.index.to_numpy()
     notes = (*recording.detected, *recording.notes)
     more_notes = (kind_note, frame_note, _describe_gaps(time_s))
@@ -98,7 +97,7 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
         name=name,
         kind=kind,
         time_s=time_s,
-        position_m=position,
+        position_m=position_m,
         rotation=rotation,
         frame=_FRAMES.get(recording.frames, frame),
         unix_offset_s=0.0 if recording.clock == "UNIX" else None,
@@ -129,9 +128,9 @@ def tum_text(trajectory: Trajectory) -> str:
             f"{trajectory.name} has no orientations, which a TUM file needs",
             "Choose a track with orientations.",
         )
-    time = trajectory.time_s + (trajectory.unix_offset_s or 0.0)
-    table = np.column_stack((time, trajectory.position_m, trajectory.rotation.as_quat()))
-    rows = (" ".join(map(repr, row)) for row in table.tolist())
+    time_s = trajectory.time_s + (trajectory.unix_offset_s or 0.0)
+    tum_columns = np.column_stack((time_s, trajectory.position_m, trajectory.rotation.as_quat()))
+    rows = (" ".join(map(repr, row)) for row in tum_columns.tolist())
     return "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n"
 
 
@@ -152,7 +151,7 @@ def _read_rotation(recording: PositionRecording) -> Rotation | None:
 
 
 def _detect_kind(
-    path: Path, comments: str, position: Array, rotation: Rotation | None
+    path: Path, comments: str, position_m: Array, rotation: Rotation | None
 ) -> tuple[TrajectoryKind, str]:
     # EuRoC files are always called data.csv; their folder name indicates the kind
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
@@ -166,20 +165,20 @@ def _detect_kind(
             return "truth", note
     if (
         rotation is not None
-        and max(np.abs(position[0]).max(), rotation[0].magnitude()) < MAX_IDENTITY_DISTANCE
+        and max(np.abs(position_m[0]).max(), rotation[0].magnitude()) < MAX_IDENTITY_DISTANCE
     ):
         return "slam", "The trajectory is from SLAM, because the first pose is the identity."
     return "unknown", ""
 
 
-def _detect_frame(kind: TrajectoryKind, position: Array) -> tuple[Frame, str]:
+def _detect_frame(kind: TrajectoryKind, position_m: Array) -> tuple[Frame, str]:
     if kind != "slam":
         return "unknown", ""
-    centred_m = position - position.mean(axis=0)
+    centred_m = position_m - position_m.mean(axis=0)
     eigenvalues, axes = np.linalg.eigh(centred_m.T @ centred_m)  # eigenvalues in ascending order
-    height, width, length = np.sqrt(np.maximum(eigenvalues, 0.0) / len(position))
+    thickness_m, width_m, length_m = np.sqrt(np.maximum(eigenvalues, 0.0) / len(position_m))
     tilt_rad = math.acos(min(1.0, abs(float(axes[1, 0]))))
-    is_planar = width > MIN_WIDTH_RATIO * length and height < MAX_THICKNESS_RATIO * width
+    is_planar = width_m > MIN_WIDTH_RATIO * length_m and thickness_m < MAX_THICKNESS_RATIO * width_m
     if not is_planar or tilt_rad > MAX_TILT_RAD:
         return "unknown", ""
     return "camera", (

@@ -55,13 +55,13 @@ def read_ulog(name: str, content: bytes) -> Flight:
     altitude_m = topics.read(px4.LAYOUTS["barometer"])["altitude_m"]
     delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     is_in_flight = common.ends_in_flight(airborne, topics.log.duration_s)
-    dropped = [(topic, count) for (topic, _), count in sorted(topics.dropped.items())]
+    dropped_counts = [(topic, count) for (topic, _), count in sorted(topics.dropped.items())]
     tilt_failures = topics.read(px4.LAYOUTS["failure"], step=True)[["roll", "pitch"]]
     return Flight(
         log=structs.replace(
             topics.log,
-            notes=(*topics.log.notes, *dropped_notes(dropped)),
-            dropped=dict(dropped),
+            notes=(*topics.log.notes, *dropped_notes(dropped_counts)),
+            dropped=dict(dropped_counts),
             start_unix_s=_start_unix_s(topics),
             damage=_describe_damage(topics, imu, is_in_flight),
             ends_in_flight=is_in_flight,
@@ -87,17 +87,18 @@ def read_ulog(name: str, content: bytes) -> Flight:
 def _describe_damage(
     topics: Topics, imu: TableOrUnavailable, is_in_flight: bool
 ) -> tuple[str, ...]:
-    end_s = topics.log.duration_s
+    duration_s = topics.log.duration_s
     damage_sentences = []
     if topics.is_truncated:
-        damage_sentences.append(common.format_truncation("message", end_s, is_in_flight))
+        damage_sentences.append(common.format_truncation("message", duration_s, is_in_flight))
     if topics.is_damaged:
-        missing_s = end_s
+        missing_imu_s = duration_s
         if not isinstance(imu, Unavailable):
             steps_s = np.diff(imu.index.to_numpy())
-            missing_s = float(steps_s[steps_s > MIN_IMU_GAP_S].sum())
+            missing_imu_s = float(steps_s[steps_s > MIN_IMU_GAP_S].sum())
         damage_sentences.append(
-            f"the file is damaged: {missing_s:.1f} s of {end_s:.1f} s of IMU data are missing"
+            f"the file is damaged: {missing_imu_s:.1f} s of {duration_s:.1f} s of IMU data are "
+            "missing"
         )
     return tuple(damage_sentences)
 

@@ -34,7 +34,7 @@ from px4fuse.flight.model import Dropout, LogInfo, ParameterChange, Stream, time
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
 
-_MICROSECOND = 1e-6
+_MICROSECOND_S = 1e-6
 # Maximum delay (s) from measurement to publication: with a longer delay the measurement time is not
 # boot time (GPS topics before v1.16 have receiver time, ground truth in v1.13 has 0)
 MAX_PUBLICATION_LAG_S = 10.0
@@ -184,9 +184,10 @@ class Topics:
         """Start time (s) and number of each primary EKF2 instance (``EKF2Selector.cpp``)."""
         instances = self.read(LAYOUTS["selector"], step=True)["instance"]
         instances = instances[instances < 255]  # 255 means that no instance is selected yet
-        changes = instances[instances.ne(instances.shift())]
-        times = [-np.inf, *changes.index[1:]]
-        return tuple(zip(times, changes.astype(int).tolist(), strict=False)) or NO_SELECTOR
+        primary_changes = instances[instances.ne(instances.shift())]
+        switch_times_s = [-np.inf, *primary_changes.index[1:]]
+        numbers = primary_changes.astype(int).tolist()
+        return tuple(zip(switch_times_s, numbers, strict=False)) or NO_SELECTOR
 
     def find(self, *layouts: Layout) -> Layout | None:
         """Return the first layout whose required fields are in a topic of the log, else None."""
@@ -216,8 +217,9 @@ class Topics:
         DataFrame
             Strictly increasing in time; may be empty.
         """
-        available = self.instances(layout.topic)
-        table = self.tables[layout.topic, instance if instance in available else available[0]]
+        instance_numbers = self.instances(layout.topic)
+        number = instance if instance in instance_numbers else instance_numbers[0]
+        table = self.tables[layout.topic, number]
         columns = {**layout.columns, **layout.optional}
         time_us = measurement_time_us(table)
         kept_rows = longest_increasing_run(time_us)
@@ -231,7 +233,7 @@ class Topics:
                     for column, field_name in columns.items()
                     if field_name in table
                 },
-                index=time_index((time_us[kept_rows] - self.zero_us) * _MICROSECOND),
+                index=time_index((time_us[kept_rows] - self.zero_us) * _MICROSECOND_S),
             )
         samples = samples.where(np.abs(samples) < MAX_FIELD_VALUE)  # damaged values become NaN
         end_s = self.log.duration_s + MAX_OUTSIDE_S
@@ -262,17 +264,17 @@ class Topics:
         """
         if self.find(layout) is None:
             return _empty_frame(layout)
-        available = self.instances(layout.topic)
+        instance_numbers = self.instances(layout.topic)
         is_single = self.primary_instances == NO_SELECTOR
-        switch_s, numbers = (
+        switch_times_s, primary_numbers = (
             np.array(values) for values in zip(*self.primary_instances, strict=True)
         )
         instance_tables: list[pd.DataFrame] = []
-        for number in available[:1] if is_single else available:
+        for number in instance_numbers[:1] if is_single else instance_numbers:
             samples = self.read_instance(layout, number, step=step)
             samples = samples if select is None else select(samples)
-            switch_index = np.searchsorted(switch_s, samples.index, side="right") - 1
-            instance_tables.append(samples[is_single | (numbers[switch_index] == number)])
+            switch_index = np.searchsorted(switch_times_s, samples.index, side="right") - 1
+            instance_tables.append(samples[is_single | (primary_numbers[switch_index] == number)])
         joined_tables = pd.concat(instance_tables).sort_index()
         return joined_tables[~joined_tables.index.duplicated()]
 
@@ -307,7 +309,7 @@ def measurement_time_us(table: Table) -> NDArray[np.int64]:
     if sampled_us is None:
         return published_us
     sampled_us = sampled_us.astype(np.int64)
-    lag_s = np.abs(published_us - sampled_us) * _MICROSECOND
+    lag_s = np.abs(published_us - sampled_us) * _MICROSECOND_S
     # Single invalid measurement times, as in the first message, are replaced by publication times
     is_plausible = (sampled_us > 0) & (lag_s <= MAX_PUBLICATION_LAG_S)
     if np.count_nonzero(is_plausible) * 2 < len(is_plausible):
@@ -321,15 +323,15 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     A timestamp that is hours ahead is removed as a single sample; a running maximum would remove
     all later samples instead. Method: patience sorting, Fredman 1975.
     """
-    indices = np.flatnonzero(time_us > 0)
-    times = time_us[indices]
-    if len(times) < 2 or np.all(np.diff(times) > 0):
-        return indices
+    positive_indices = np.flatnonzero(time_us > 0)
+    positive_times = time_us[positive_indices]
+    if len(positive_times) < 2 or np.all(np.diff(positive_times) > 0):
+        return positive_indices
     # Smallest last timestamp of an increasing subsequence of each length, and its index
     last_times: list[int] = []
     last_indices: list[int] = []
-    previous_index = np.empty(len(times), dtype=np.intp)
-    for index, time in enumerate(times.tolist()):
+    previous_index = np.empty(len(positive_times), dtype=np.intp)
+    for index, time in enumerate(positive_times.tolist()):
         length = bisect_left(last_times, time)
         previous_index[index] = last_indices[length - 1] if length else -1
         last_times[length : length + 1] = [time]
@@ -339,7 +341,7 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     while index >= 0:
         run_indices.append(index)
         index = int(previous_index[index])
-    return indices[np.array(run_indices[::-1], dtype=np.intp)]
+    return positive_indices[np.array(run_indices[::-1], dtype=np.intp)]
 
 
 def dropped_notes(topic_counts: Iterable[tuple[str, int]]) -> tuple[str, ...]:
@@ -394,10 +396,10 @@ def read_topics(name: str, content: bytes) -> Topics:
         firmware=_firmware_text(ulog.msg_info_dict),
         firmware_hash=_printable_text(ulog.msg_info_dict, "ver_sw", "unknown"),
         hardware=_printable_text(ulog.msg_info_dict, "ver_hw", "unknown"),
-        boot_time_s=zero_us * _MICROSECOND,
-        duration_s=(data_end_us - zero_us) * _MICROSECOND,
+        boot_time_s=zero_us * _MICROSECOND_S,
+        duration_s=(data_end_us - zero_us) * _MICROSECOND_S,
         dropouts=tuple(
-            Dropout((dropout.timestamp - zero_us) * _MICROSECOND, dropout.duration * 1e-3)
+            Dropout((dropout.timestamp - zero_us) * _MICROSECOND_S, dropout.duration * 1e-3)
             for dropout in ulog.dropouts
         ),
         parameters={
@@ -435,7 +437,7 @@ def _read_parameters(
 
     Without a take-off in the log, the parameters are those at its start.
     """
-    values = {
+    parameter_values = {
         name: float(value)
         for name, value in ulog.initial_parameters.items()
         if isinstance(value, int | float)
@@ -444,18 +446,20 @@ def _read_parameters(
     landed = tables.get((layout.topic, 0), {}).get(layout.columns["landed"])
     if landed is not None and not landed.all():
         take_off_us = int(tables[layout.topic, 0]["timestamp"][np.argmin(landed)])
-    changes: list[ParameterChange] = []
-    last_values = values.copy()
+    parameter_changes: list[ParameterChange] = []
+    last_parameter_values = parameter_values.copy()
     for time_us, name, value in sorted(ulog.changed_parameters, key=lambda change: change[0]):
         if not isinstance(value, int | float):
             continue
-        if time_us <= take_off_us or name not in values:
-            values[name] = float(value)
-        elif name.startswith("EKF2_") and last_values[name] != value:
-            time_s = (time_us - zero_us) * _MICROSECOND
-            changes.append(ParameterChange(time_s, name, last_values[name], float(value)))
-        last_values[name] = float(value)
-    return values, tuple(changes)
+        if time_us <= take_off_us or name not in parameter_values:
+            parameter_values[name] = float(value)
+        elif name.startswith("EKF2_") and last_parameter_values[name] != value:
+            time_s = (time_us - zero_us) * _MICROSECOND_S
+            parameter_changes.append(
+                ParameterChange(time_s, name, last_parameter_values[name], float(value))
+            )
+        last_parameter_values[name] = float(value)
+    return parameter_values, tuple(parameter_changes)
 
 
 def _read_tables(ulog: ULog) -> Tables:
@@ -490,8 +494,8 @@ def _data_span_us(tables: Tables, name: str) -> tuple[int, int]:
         increasing_us = time_us[longest_increasing_run(time_us)]
         if len(increasing_us):
             # Timestamps hours away from the others are outdated, so only the longest run is used
-            breaks = np.flatnonzero(np.diff(increasing_us) > MAX_DATA_GAP_S / _MICROSECOND) + 1
-            longest_us = max(np.split(increasing_us, breaks), key=len)
+            gap_rows = np.flatnonzero(np.diff(increasing_us) > MAX_DATA_GAP_S / _MICROSECOND_S) + 1
+            longest_us = max(np.split(increasing_us, gap_rows), key=len)
             return int(longest_us[0]), int(longest_us[-1])
     raise LogError(f"{name}: all timestamps are zero", "Record the flight again.")
 

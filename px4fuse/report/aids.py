@@ -27,7 +27,7 @@ MAX_DRAWN_INNOVATION = 4.0  # maximum drawn ν/√S; larger values are triangles
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
-def draw(analysis: Analysis | AidsOnlyAnalysis, _: object) -> Iterator[Page]:
+def draw_pages(analysis: Analysis | AidsOnlyAnalysis, _: object) -> Iterator[Page]:
     """Draw EKF2's aiding sources; in a comparison only if EKF2 fused GNSS or optical flow."""
     is_comparison = isinstance(analysis, Analysis)
     if aids := outdoor_aids(analysis) if isinstance(analysis, Analysis) else analysis.aids:

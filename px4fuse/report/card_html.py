@@ -29,7 +29,7 @@ from px4fuse.report.card_text import (
     with_typed_path,
 )
 
-# SVG path of each marker of a σ ratio; "below" and "above" are for ratios outside the axis
+# SVG path of each marker of a σ ratio; "below" and "above" mark ratios outside the drawn axis
 MARK_PATHS = {
     "source": "M-5.5 0a5.5 5.5 0 1 0 11 0a5.5 5.5 0 1 0-11 0",
     "truth": "M-6.5 0L0-6.5L6.5 0L0 6.5z",
@@ -43,7 +43,7 @@ def card_of(analysis: Analysis) -> Card:
     """Return the diagnosis card of an analysis."""
     if analysis.request is None:
         raise SettingsError(
-            "This analysis contains no request, so its command is unknown.",
+            "The analysis was not made by px4fuse.compare, so its command is unknown.",
             "Create it with px4fuse.compare.",
         )
     card = build_card(analysis, analysis.request)
@@ -51,14 +51,14 @@ def card_of(analysis: Analysis) -> Card:
 
 
 def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> str:
-    """Return the diagnosis card as an HTML element; dir="auto" isolates names in another direction.
+    """Return the diagnosis card, the summary of a report, as an HTML element.
 
     Parameters
     ----------
     is_open : bool
         True to show causes and notes without a click.
     has_apply : bool
-        True for a button at each KF command, which the script of the page handles.
+        True for a button beside each KF command, which applies it on the explore page.
     """
     return load_template("report/card.html").render(
         card=card,
@@ -76,19 +76,19 @@ def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> 
     )
 
 
-def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
-    """Draw σ ratios on their logarithmic axis as an HTML figure.
+def axis_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
+    """Draw ratios "RMS of actual error ÷ reported σ" on a logarithmic axis as an HTML figure.
 
-    ``axis`` describes the direction of the errors; scripts find the figure by ``name``.
+    ``axis`` is the title of the spatial axis of the errors; ``name`` identifies it for scripts.
     """
     return load_template("report/card_axis.html").render(
-        verdicts=all_verdicts,
+        verdicts=verdicts,
         axis=axis,
         name=name,
         marks=axis_marks,
         paths=MARK_PATHS,
         percent=_axis_percent,
-        alternative=alternative_text(all_verdicts),
+        alternative=alternative_text(verdicts),
         ticks=[
             (_axis_percent(axis_fraction(tick)), label, tick not in LABELLED_TICKS)
             for tick, label in RATIO_AXIS_TICKS.items()
@@ -101,7 +101,7 @@ def axis_html(all_verdicts: Sequence[Verdict], axis: str, name: str = "") -> str
 
 
 def axis_figures(analysis: Analysis) -> str:
-    """Return an HTML figure with the four σ ratios of KF and EKF2 for each axis."""
+    """Return an HTML figure for each axis: KF and EKF2 against source and against ground truth."""
     return "".join(
         axis_html(make_sigma_verdicts(result), describe_axis(analysis, result), name)
         for name, result in analysis.axes.items()

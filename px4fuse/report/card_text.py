@@ -27,13 +27,13 @@ from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.consistency import CONSISTENT_RATIOS, Reference
 from px4fuse.request import quote_command
 
-CARD_WIDTH = 100
-AXIS_WIDTH = 37
+CARD_WIDTH = 100  # number of characters
+AXIS_WIDTH = 37  # number of characters of the axis of σ ratios
 AXIS_INDENT = 58  # number of characters left of the axis of σ ratios
 TEXT_INDENT = 11  # number of characters left of a text beside a label
-# Maximum length (characters) of a command on the line of its label
+# Maximum length (characters) of a command beside its label; longer commands get their own line
 MAX_COMMAND_LENGTH = 74
-# σ ratios at labelled ticks of the axis of σ ratios
+# Labelled ticks of the axis of σ ratios
 LABELLED_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 MARKS = {"source": "●", "truth": "◆"}
 QUANTITIES = {"source": "● source: innovation ÷ √S", "truth": "◆ ground truth: error ÷ σ"}
@@ -61,9 +61,9 @@ AIDS_HEADING = (
 
 
 class Line(NamedTuple):
-    """Line of a card on the terminal, in a style of rich.
+    """Text of a diagnosis card on the terminal, in a style of rich.
 
-    If it ``wraps``, ``first`` precedes the first line and ``indent`` the other lines.
+    A text that ``wraps`` begins with ``first``; its other lines begin with ``indent``.
     """
 
     text: str
@@ -119,7 +119,7 @@ def card_lines(card: Card) -> Iterator[Line]:
 
 
 def note_texts(card: Card, other_notes_place: str) -> list[str]:
-    """Format the first notes of a card; ``other_notes_place`` lists the other notes."""
+    """Format the first :data:`MAX_NOTES` notes of a card, and state where the others are listed."""
     texts = [
         f"note[{note.id}]: {note.text} {note.action}".rstrip() for note in card.notes[:MAX_NOTES]
     ]
@@ -129,7 +129,7 @@ def note_texts(card: Card, other_notes_place: str) -> list[str]:
 
 
 def closing_lines(card: Card) -> Iterator[Line]:
-    """Yield the last lines of a card: where to find details."""
+    """Yield the last lines of a diagnosis card, which state where details are printed."""
     actions = [action for cause in card.causes for _, action in marked_actions(cause)]
     text = "More: -v."
     if any(action.where == "console" for action in actions):
@@ -234,8 +234,8 @@ def _identity_lines(card: Card) -> Iterator[Line]:
 def headline_lines(card: Card) -> Iterator[Line]:
     """Yield the line with severity, id and headline."""
     label = "ok" if card.severity == "clean" else card.severity
-    name = f"{label}[{card.id}]" if card.id else label
-    yield Line(f"{name}: {card.headline}", SEVERITY_STYLES[card.severity])
+    severity_and_id = f"{label}[{card.id}]" if card.id else label
+    yield Line(f"{severity_and_id}: {card.headline}", SEVERITY_STYLES[card.severity])
 
 
 def _cause_lines(cause: Cause) -> Iterator[Line]:
@@ -301,8 +301,8 @@ def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
         }
         for rerun in reruns
     ]
-    heads = rows[0] if rows else ()
-    columns = [(head, *(row[head] for row in rows)) for head in heads]
+    headings = rows[0] if rows else ()
+    columns = [(head, *(row[head] for row in rows)) for head in headings]
     return [column for column in columns if any(column[1:])]
 
 

@@ -41,7 +41,7 @@ def has_clock_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
 def clock_advice(
     comparison: PreparedComparison, clock: ClockOffset | Unavailable
 ) -> dict[str, str]:
-    """Return sentences on the time offset of the position source, and their labels as keys."""
+    """Return sentences on the time offset of the position source, by their label."""
     if isinstance(clock, Unavailable):
         return {"Offset": f"The time offset cannot be estimated: {clock.reason}. {clock.remedy}"}
     if not clock.is_determinable:
@@ -62,8 +62,8 @@ def clock_advice(
         advice["Result"] = f"The position timestamps are {abs(offset_s):.3f} s {side}."
         option_s = clock_offset_option_s(comparison, clock)
         advice["Re-run"] = f"px4fuse compare LOG --clock-offset {option_s:.3f}"
-    if (flown_ms := delay_ms(comparison)) is not None:
-        advice["PX4"] = _delay_advice(comparison, clock, flown_ms)
+    if (logged_ms := delay_ms(comparison)) is not None:
+        advice["PX4"] = _delay_advice(comparison, clock, logged_ms)
     if clock.changes:
         offset_texts = ", ".join(
             f"{part.offset_s:+.2f} s from {part.start_s:.0f} s" for part in clock.parts
@@ -86,22 +86,22 @@ def clock_advice(
     return advice
 
 
-def _delay_advice(comparison: PreparedComparison, clock: ClockOffset, flown_ms: float) -> str:
-    name, ml_delay_ms = aid_of(comparison).delay, wrong_delay_ms(comparison, clock, flown_ms)
+def _delay_advice(comparison: PreparedComparison, clock: ClockOffset, logged_ms: float) -> str:
+    name, ml_delay_ms = aid_of(comparison).delay, wrong_delay_ms(comparison, clock, logged_ms)
     if ml_delay_ms is None:
-        return f"{name} {flown_ms:g} ms agrees with the estimate."
-    if limit_text := delay_limit(name, ml_delay_ms, flown_ms):
+        return f"{name} {logged_ms:g} ms agrees with the estimate."
+    if limit_text := delay_limit(name, ml_delay_ms, logged_ms):
         return (
             f"The maximum-likelihood {name} is {ml_delay_ms:.0f} ms, but {name} cannot "
             f"{limit_text}. Correct the sender's clock."
         )
     return (
-        f"Set {name} to {max(ml_delay_ms, 0.0):.0f} ms (now {flown_ms:g} ms), or correct the "
+        f"Set {name} to {max(ml_delay_ms, 0.0):.0f} ms (now {logged_ms:g} ms), or correct the "
         "sender's clock."
     )
 
 
-def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
+def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
     """Draw the appendix on the time offset of the position source if :func:`has_clock_page`."""
     clock = analysis.clock
     if isinstance(clock, Unavailable) or not has_clock_page(analysis, results.findings):
@@ -121,12 +121,14 @@ def draw(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
         "so it is wider than the curve shows."
     )
     title = "Log-likelihood relative to its maximum (nats, downwards)"
-    draw_curve(page.panel(title, CURVE_HEIGHT, caption=curve_sentence, above=14.0), clock)
+    draw_offset_likelihood(
+        page.panel(title, CURVE_HEIGHT, caption=curve_sentence, above=14.0), clock
+    )
     yield page
 
 
-def draw_curve(axes: Axes, clock: ClockOffset) -> None:
-    """Draw the log-likelihood over the time offset of the source, with the 95 % interval."""
+def draw_offset_likelihood(axes: Axes, clock: ClockOffset) -> None:
+    """Draw the log-likelihood of the positions over the time offset, with the 95 % interval."""
     (low_s, high_s), estimate_s, applied_s = clock.interval_s, clock.offset_s, clock.applied_s
     axes.axvspan(low_s, high_s, color=KF_BAND_COLOUR, lw=0, label="95 % interval")
     axes.plot(clock.curve_s, clock.curve_log_likelihood_drop, **TRACK_LINES["KF"])

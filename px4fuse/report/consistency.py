@@ -22,9 +22,9 @@ from px4fuse.report.page import Page, draw_legend_above, two_columns
 from px4fuse.report.panels import normalised_innovations
 from px4fuse.report.phrases import (
     VERDICT_TABLE_HEAD,
-    filters_by_name,
     format_noise_estimate,
     format_settings,
+    statistics_by_filter,
     verdict_cells,
 )
 from px4fuse.report.style import (
@@ -41,14 +41,14 @@ from px4fuse.report.style import (
 MAX_AUTOCORRELATION_LAG = 20
 MAX_DRAWN_INNOVATION = 4.0
 HISTOGRAM_EDGES = np.linspace(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION, 33)
-# Maximum of the density axis of the histogram: the normal density (maximum 0.4) remains visible
+# Upper limit of the density axis; a higher one would make the normal density (up to 0.4) flat
 MAX_DENSITY = 1.6
 # Maximum p value of the Ljung-Box test for the text "not white"
 MAX_NON_WHITE_P = 0.01
 RUNNING_NIS_HEIGHT = 140.0  # height (points) of the axes of the running mean NIS
 DISTRIBUTION_HEIGHT = 150.0  # height (points) of the axes of distribution and autocorrelation
 LEGEND_HEIGHT = 14.0  # height (points) of a legend above the axes
-# Label of each statistic, and exponent of the printed value (0.5: square root)
+# Label of each statistic, and power of the statistic that is printed (0.5: square root)
 STATISTIC_LABELS_AND_POWERS: Mapping[Statistic, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
     "nees": ("√NEES", 0.5),
@@ -56,10 +56,10 @@ STATISTIC_LABELS_AND_POWERS: Mapping[Statistic, tuple[str, float]] = {
 }
 NOISE_TABLE_HEAD = ("axis", "SIGMA_A (m/s²)", "SIGMA_Z (m)")
 
-InnovationSeries = Mapping[str, "pd.Series[float]"]
+InnovationsByFilter = Mapping[str, "pd.Series[float]"]
 
 
-def draw(analysis: Analysis, _: object) -> Iterator[Page]:
+def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the consistency tests of the main axis, and a table of all axes."""
     result = analysis.main
     axis_text = result.axis.label
@@ -69,26 +69,25 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
         "are normally distributed with mean 0, and are white. The plots show KF and EKF2 "
         f"along {axis_text}; the table lists all axes.",
     )
-    series = _tested_innovations(result)
-    if series:
+    if innovations := _tested_innovations(result):
         title = "Running mean NIS (log scale)"
-        axes = event_marks.panel(page, analysis, title, RUNNING_NIS_HEIGHT, above=LEGEND_HEIGHT)
-        left_page, right_page = two_columns()
-        left = left_page.panel(
+        axes = event_marks.add_panel(page, analysis, title, RUNNING_NIS_HEIGHT, above=LEGEND_HEIGHT)
+        left_column, right_column = two_columns()
+        histogram_axes = left_column.panel(
             "Distribution of ν/√S", DISTRIBUTION_HEIGHT, above=LEGEND_HEIGHT, left=4.0
         )
-        right = right_page.panel(
+        autocorrelation_axes = right_column.panel(
             "Autocorrelation",
             DISTRIBUTION_HEIGHT,
-            caption=_whiteness_sentence(result, series),
+            caption=_whiteness_sentence(result, innovations),
             above=LEGEND_HEIGHT,
         )
-        _draw_running_nis(axes, series)
-        _draw_histogram(left, series)
-        _draw_autocorrelation(right, series)
-        for labelled_axes in (axes, left, right):
+        _draw_running_nis(axes, innovations)
+        _draw_histogram(histogram_axes, innovations)
+        _draw_autocorrelation(autocorrelation_axes, innovations)
+        for labelled_axes in (axes, histogram_axes, autocorrelation_axes):
             draw_legend_above(labelled_axes)
-        page.add_columns(left_page, right_page)
+        page.add_columns(left_column, right_column)
     else:
         reason = getattr(result.filters["kf"], "reason", "too few innovations")
         page.write(f"The consistency along {axis_text} is not tested: {reason}.")
@@ -97,7 +96,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     rows = [
         [*verdict_cells(axis_result, name), *_statistic_cells(consistency)]
         for axis_result in analysis.axes.values()
-        for name, consistency in filters_by_name(axis_result).items()
+        for name, consistency in statistics_by_filter(axis_result).items()
     ]
     page.table(head, rows, right_aligned_columns=(2, 5, 6, 7, 8))
     noise_rows = [
@@ -114,7 +113,6 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _write_causes(page: Page, analysis: Analysis) -> None:
-    """Write the table of re-runs of KF and EKF2, each with one changed setting."""
     axis = analysis.main.axis
     tested_trials: list[tuple[Trial, Statistic]] = []
     for filter_name, statistic in product(FILTERS, DISCREPANCIES):
@@ -136,15 +134,15 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     head = ["filter", "change", "quantity", "as flown", "with change", "explains"]
     page.table(head, rows, right_aligned_columns=(3, 4))
     page.write(
-        "Each row is a re-run with one changed setting. 'explains' is the reduction of the "
-        "logarithm of the quantity (for distances: of the mean square); 'all' means that the "
+        "Each row is a re-run with one changed setting. 'explains' is the share of ln(quantity) "
+        "(of KF - EKF2: of its mean square) that the change removes; 'all' means that the "
         "re-run is consistent. A change that explains 50 % or more is a cause.",
         colour=MUTED_COLOUR,
     )
 
 
-def _tested_innovations(result: AxisComparison) -> InnovationSeries:
-    consistency_by_name = filters_by_name(result)
+def _tested_innovations(result: AxisComparison) -> InnovationsByFilter:
+    consistency_by_name = statistics_by_filter(result)
     return {
         name: values
         for name, values in normalised_innovations(result).items()
@@ -156,9 +154,9 @@ def _thin_line_style(name: str) -> dict[str, Any]:
     return line_style(TRACK_LINES[name]["color"], 0.6, (0, (1, 1.5)))
 
 
-def _draw_running_nis(axes: Axes, series: InnovationSeries) -> None:
-    lowest_nis, highest_nis = 0.5, 2.0
-    for name, values in series.items():
+def _draw_running_nis(axes: Axes, innovations: InnovationsByFilter) -> None:
+    min_drawn_nis, max_drawn_nis = 0.5, 2.0
+    for name, values in innovations.items():
         innovation_counts = np.arange(1, len(values) + 1)
         running_nis = (values**2).cumsum() / innovation_counts
         draw_curve(axes, running_nis.iloc[2:], **TRACK_LINES[name], label=name)
@@ -168,19 +166,19 @@ def _draw_running_nis(axes: Axes, series: InnovationSeries) -> None:
         axes.plot(drawn_times_s, band_low, **_thin_line_style(name))
         axes.plot(drawn_times_s, band_high, **_thin_line_style(name), label=f"95 % band {name}")
         settled_nis = running_nis.iloc[len(running_nis) // 4 :]
-        lowest_nis = min(lowest_nis, 0.7 * settled_nis.min())
-        highest_nis = max(highest_nis, 1.4 * settled_nis.max())
+        min_drawn_nis = min(min_drawn_nis, 0.7 * settled_nis.min())
+        max_drawn_nis = max(max_drawn_nis, 1.4 * settled_nis.max())
     axes.axhline(1.0, color="black", lw=0.5)
-    axes.set(yscale="log", ylim=(lowest_nis, highest_nis))
+    axes.set(yscale="log", ylim=(min_drawn_nis, max_drawn_nis))
     set_plain_ticks(axes)
 
 
-def _draw_histogram(axes: Axes, series: InnovationSeries) -> None:
-    innovations = np.linspace(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION, 81)
-    normal_density = np.exp(-0.5 * innovations**2) / np.sqrt(2.0 * np.pi)
-    axes.fill_between(innovations, normal_density, color="#dcdcdc", lw=0, label="normal")
+def _draw_histogram(axes: Axes, innovations: InnovationsByFilter) -> None:
+    grid = np.linspace(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION, 81)
+    normal_density = np.exp(-0.5 * grid**2) / np.sqrt(2.0 * np.pi)
+    axes.fill_between(grid, normal_density, color="#dcdcdc", lw=0, label="normal")
     density_limit = 0.4
-    for name, values in series.items():
+    for name, values in innovations.items():
         drawn_values = values.clip(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION)
         density, _ = np.histogram(drawn_values, HISTOGRAM_EDGES, density=True)
         axes.stairs(density, HISTOGRAM_EDGES, **TRACK_LINES[name], label=name)
@@ -191,8 +189,8 @@ def _draw_histogram(axes: Axes, series: InnovationSeries) -> None:
     axes.set_xlabel("ν / √S")
 
 
-def _draw_autocorrelation(axes: Axes, series: InnovationSeries) -> None:
-    for shift, (name, values) in zip((-0.18, 0.18), series.items(), strict=False):
+def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
+    for shift, (name, values) in zip((-0.18, 0.18), innovations.items(), strict=False):
         lag_count = min(MAX_AUTOCORRELATION_LAG, len(values) // 3)
         correlations = autocorrelation(np.asarray(values, np.float64), lag_count)
         lag_positions = np.arange(1, lag_count + 1) + shift
@@ -215,10 +213,10 @@ def _whiteness_half_band(values: pd.Series[float]) -> float:
     return float(1.96 / np.sqrt(len(values)))
 
 
-def _whiteness_sentence(result: AxisComparison, series: InnovationSeries) -> str:
+def _whiteness_sentence(result: AxisComparison, innovations: InnovationsByFilter) -> str:
     sentences = []
-    for name, values in series.items():
-        consistency = filters_by_name(result)[name]
+    for name, values in innovations.items():
+        consistency = statistics_by_filter(result)[name]
         assert isinstance(consistency, Consistency)
         lag1_correlation, p_value = consistency.lag1_autocorrelation, consistency.ljung_box_p
         interpretation = "white" if p_value >= MAX_NON_WHITE_P else "not white"

@@ -1,4 +1,4 @@
-"""First page of a report: the diagnosis card, and plots below it."""
+"""First page of a report: the diagnosis card (a summary), and plots below it."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -50,8 +50,8 @@ PLACE_NAMES = {"shell": "your computer", "console": "MAVLink Console of QGroundC
 ALL_FINDINGS = "All findings"
 
 
-def draw(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
-    """Draw the cover: the diagnosis card, and plots of a comparison in the space below it."""
+def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
+    """Draw the cover: the diagnosis card, and plots in the space below it."""
     page = Page()
     block = add_card(page, results.card)
     if isinstance(analysis, Analysis):

@@ -36,16 +36,16 @@ from px4fuse.report.panels import add_legend, draw_dots, normalised_innovations
 from px4fuse.report.style import TRACK_LINES, Axes, draw_curve
 
 POINTS_PER_MM = 72.0 / 25.4
-# Minimum ratio of length to width of a track whose map fills the page width
-MIN_LONG_RATIO = 2.2
+# Minimum ratio of length to width of a track; maps of longer tracks fill the page width
+MIN_LONG_TRACK_RATIO = 2.2
 # Minimum and maximum height (points) of the map, with title and labels
-MAP_HEIGHTS = 40.0 * POINTS_PER_MM, 53.0 * POINTS_PER_MM
+MAP_HEIGHT_RANGE = 40.0 * POINTS_PER_MM, 53.0 * POINTS_PER_MM
 # Minimum free height (points) below the diagnosis card for the plots
 MIN_PLOTS_HEIGHT = 38.0 * POINTS_PER_MM
 # Minimum free height (points) below the diagnosis card for a plot of the innovations
 MIN_INNOVATIONS_HEIGHT = 50.0 * POINTS_PER_MM
 # Minimum and maximum height (points) of the innovation plot, with title and labels
-INNOVATION_HEIGHTS = 27.0 * POINTS_PER_MM, 38.0 * POINTS_PER_MM
+INNOVATION_HEIGHT_RANGE = 27.0 * POINTS_PER_MM, 38.0 * POINTS_PER_MM
 # Minimum height (points) of each plot of a position error
 MIN_ERROR_HEIGHT = 17.0 * POINTS_PER_MM
 # Total height (points) of the plots on the page after the diagnosis card
@@ -60,17 +60,17 @@ MIN_HEIGHT_WITH_TICKS_AT_2 = 48.0
 MIN_WIDE_PLOT_WIDTH = 200.0
 LEFT_MARGIN = 38.0  # width (points) for tick and axis labels left of the axes
 # Fraction of the height of all plots that the innovation plot fills
-INNOVATION_FRACTION = 0.22
+INNOVATION_HEIGHT_FRACTION = 0.22
 # Fraction of the height of all plots that the map fills
-MAP_FRACTION = 0.25
+MAP_HEIGHT_FRACTION = 0.25
 # Maximum innovation ÷ √S in the innovation plot; larger values are triangles at the edge
 MAX_DRAWN_INNOVATION = 4.0
 # Height (points) below a plot, without and with labels of the time axis
 HEIGHT_BELOW_AXES = UNLABELLED_HEIGHT, TICKS_HEIGHT + AXIS_LABEL_HEIGHT
-# Ratio of the length of the map to the length of the tracks
-MAP_MARGIN = 1.08
-# Maximum margin of the map around the positions, as a fraction of the extent of the positions
-MAX_MAP_MARGIN = 0.25
+# Ratio of the extent of the map to the extent of the tracks
+MAP_MARGIN_FACTOR = 1.08
+# Maximum margin of the map around the positions, as a fraction of their extent
+MAX_MAP_MARGIN_FRACTION = 0.25
 MIN_MAP_LENGTH_M = 0.5
 # Maximum ratio of largest to smallest σ for which the title of a plot states only the median
 MAX_CONSTANT_SIGMA_RATIO = 1.5
@@ -80,7 +80,7 @@ Coordinates = tuple[Array, Array]
 
 
 class TimePlot(NamedTuple):
-    """Small plot over time."""
+    """Plot over time, and the function that draws it."""
 
     title: str
     draw: Callable[[Axes], None]
@@ -89,7 +89,7 @@ class TimePlot(NamedTuple):
 class FlightMap(NamedTuple):
     """Tracks seen from above: coordinates (m) to the right and upwards.
 
-    ``right_labels`` are labels of the horizontal axis, the longest first.
+    ``right_labels`` are possible labels of the horizontal axis, the longest first.
     """
 
     tracks: Mapping[str, Coordinates]
@@ -99,7 +99,7 @@ class FlightMap(NamedTuple):
     @property
     def is_long(self) -> bool:
         length_m, width_m = (float(np.ptp(values)) for values in self.tracks["positions"])
-        return length_m >= MIN_LONG_RATIO * max(width_m, 1e-6)
+        return length_m >= MIN_LONG_TRACK_RATIO * max(width_m, 1e-6)
 
 
 def write_panels(block: Block, analysis: Analysis, card: Card, free_height: float) -> None:
@@ -107,16 +107,20 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free_height: floa
     page = Page()
     block["blocks"] = page.blocks
     legend = add_legend(page, analysis)
-    errors, innovations = _error_plots(analysis, card), _innovation_plot(analysis.main)
+    errors, innovations = _position_error_plots(analysis, card), _innovation_plot(analysis.main)
     flight_map = _flight_map(analysis, card)
     plots_height = free_height - legend["height"] - UNUSED_HEIGHT
     if plots_height < MIN_PLOTS_HEIGHT:
         plots_height = NEXT_PAGE_HEIGHT
         page.blocks.insert(0, {"kind": "break"})
-    min_long_map_height = MAP_HEIGHTS[0] + INNOVATION_HEIGHTS[0] + len(errors) * MIN_ERROR_HEIGHT
-    innovation_height = float(np.clip(INNOVATION_FRACTION * plots_height, *INNOVATION_HEIGHTS))
+    min_long_map_height = (
+        MAP_HEIGHT_RANGE[0] + INNOVATION_HEIGHT_RANGE[0] + len(errors) * MIN_ERROR_HEIGHT
+    )
+    innovation_height = float(
+        np.clip(INNOVATION_HEIGHT_FRACTION * plots_height, *INNOVATION_HEIGHT_RANGE)
+    )
     if flight_map.is_long and plots_height >= min_long_map_height:
-        map_height = float(np.clip(MAP_FRACTION * plots_height, *MAP_HEIGHTS))
+        map_height = float(np.clip(MAP_HEIGHT_FRACTION * plots_height, *MAP_HEIGHT_RANGE))
         _draw_map(page, analysis, flight_map, map_height)
         error_heights = _equal_heights(page, errors, plots_height - map_height - innovation_height)
         _draw_plots(page, analysis, [*errors, innovations], [*error_heights, innovation_height])
@@ -155,10 +159,10 @@ def _add_panel(page: Page, title: str, axes_height: float) -> Axes:
     return axes
 
 
-def _equal_heights(page: Page, plots: Sequence[TimePlot], total: float) -> list[float]:
+def _equal_heights(page: Page, plots: Sequence[TimePlot], total_height: float) -> list[float]:
     """Return heights (points) of plots whose axes have equal height."""
     title_heights = [_title_height(page, plot.title) for plot in plots]
-    axes_height = (total - sum(title_heights)) / max(len(plots), 1)
+    axes_height = (total_height - sum(title_heights)) / max(len(plots), 1)
     return [axes_height + title_height for title_height in title_heights]
 
 
@@ -166,8 +170,8 @@ def _title_height(page: Page, title: str) -> float:
     return TITLE_HEIGHT + TITLE_LINE_HEIGHT * (line_count(title, page.width) - 1)
 
 
-def _error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
-    """Return a plot of the position error of each filter; without ground truth of KF - EKF2."""
+def _position_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
+    """Return a plot of the position error of each filter, or one of KF - EKF2 if it is unknown."""
     result, effect = analysis.main.in_flight, card.effect
     errors_by_filter = {
         filter_name: errors
@@ -207,19 +211,21 @@ def _error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
 
 def _error_plot(
     label: str,
-    size: tuple[str, float | None],
+    rms: tuple[str, float | None],
     error_m: pd.Series[float],
     sigmas: Mapping[str, pd.Series[float]],
     half_range_m: float,
 ) -> TimePlot:
-    size_name, length_m = size
-    texts = [] if length_m is None else [f"{size_name} {format_metres(length_m)}"]
-    known_sigmas = {
-        name: known for name, sigma in sigmas.items() if not (known := sigma.dropna()).empty
+    rms_name, rms_m = rms
+    texts = [] if rms_m is None else [f"{rms_name} {format_metres(rms_m)}"]
+    finite_sigmas = {
+        name: finite_sigma
+        for name, sigma in sigmas.items()
+        if not (finite_sigma := sigma.dropna()).empty
     }
     sigma_texts = [
         f"{name} {_format_sigma(sigma)}" if len(sigmas) > 1 else _format_sigma(sigma)
-        for name, sigma in known_sigmas.items()
+        for name, sigma in finite_sigmas.items()
     ]
     if sigma_texts:
         texts.append(f"σ {', '.join(sigma_texts)}")
@@ -227,7 +233,7 @@ def _error_plot(
 
     def draw(axes: Axes) -> None:
         axes.set_ylim(-half_range_m, half_range_m)
-        for name, sigma in known_sigmas.items():
+        for name, sigma in finite_sigmas.items():
             style.draw_sigma_band(axes, 0.0 * sigma, sigma, style.SIGMA_BAND_COLOURS[name])
         axes.axhline(0.0, color="black", lw=0.5)
         draw_curve(axes, error_m, **line)
@@ -251,16 +257,16 @@ def _format_sigma(sigma: pd.Series[float]) -> str:
 
 
 def _innovation_plot(result: AxisComparison) -> TimePlot:
-    series = normalised_innovations(result)
-    legend = ", ".join(f"{sign} {name}" for name, sign in zip(series, "●■", strict=False))
-    title = f"Innovations ÷ √S ({legend}): 95 % expected within ±2"
+    innovations = normalised_innovations(result)
+    legend = ", ".join(f"{sign} {name}" for name, sign in zip(innovations, "●■", strict=False))
+    titles = [f"Innovations ÷ √S ({legend}): 95 % expected within ±2"]
     largest_texts = [
         f"{name} {format_ratio(ratio)}"
-        for name, values in series.items()
+        for name, values in innovations.items()
         if (ratio := float(values.abs().max())) > MAX_DRAWN_INNOVATION
     ]
     if largest_texts:
-        title += f"; ▲▼ outside ±{MAX_DRAWN_INNOVATION:g}, up to {', '.join(largest_texts)}"
+        titles.append(f"▲▼ outside ±{MAX_DRAWN_INNOVATION:g}, up to {', '.join(largest_texts)}")
 
     def draw(axes: Axes) -> None:
         axes.set_ylim(-1.12 * MAX_DRAWN_INNOVATION, 1.12 * MAX_DRAWN_INNOVATION)
@@ -268,29 +274,29 @@ def _innovation_plot(result: AxisComparison) -> TimePlot:
         axes.set_yticks(np.arange(-4.0, 4.1, 2.0 if height >= MIN_HEIGHT_WITH_TICKS_AT_2 else 4.0))
         axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.05)
         axes.axhline(0.0, color="black", lw=0.5)
-        for name in reversed(series):
-            draw_dots(axes, series[name], MAX_DRAWN_INNOVATION, style.INNOVATION_DOTS[name])
+        for name in reversed(innovations):
+            draw_dots(axes, innovations[name], MAX_DRAWN_INNOVATION, style.INNOVATION_DOTS[name])
 
-    return TimePlot(title, draw)
+    return TimePlot("; ".join(titles), draw)
 
 
 def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
     """Return north and east (m) of positions, KF, EKF2 and ground truth."""
     segment, flight = analysis.segment.flight, analysis.flight
 
-    def cut(track: pd.DataFrame) -> Coordinates:
+    def cut_to_flight(track: pd.DataFrame) -> Coordinates:
         segment_track = cut_to_segment(track, segment)
         return segment_track["north_m"].to_numpy(), segment_track["east_m"].to_numpy()
 
-    tracks = {"positions": cut(analysis.source.samples)}
+    tracks = {"positions": cut_to_flight(analysis.source.samples)}
     results = north_and_east(analysis)
     if len(results) == 2:
         north, east = (result.replay.steps["position_m"].to_numpy() for result in results)
         tracks["KF"] = north, east
     if isinstance(flight.ekf2, Ekf2):
-        tracks["EKF2"] = cut(flight.ekf2.state)
+        tracks["EKF2"] = cut_to_flight(flight.ekf2.state)
     if isinstance(flight.truth, Truth):
-        tracks["ground truth"] = cut(flight.truth.samples)
+        tracks["ground truth"] = cut_to_flight(flight.truth.samples)
     return {name: track for name, track in tracks.items() if len(track[0])}
 
 
@@ -356,19 +362,19 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
 
 def _map_limits(tracks: Mapping[str, Coordinates], aspect_ratio: float) -> tuple[Array, Array]:
     """Return the lower left and the upper right corner of the map (m)."""
-    # MAX_MAP_MARGIN limits the other tracks, so a large error of a filter does not reduce the scale
+    # limited, so that a large error of a filter does not reduce the scale of the map
     middles_m, sizes_m = [], []
     for axis_index in (0, 1):
         ends_m = [np.percentile(tracks["positions"][axis_index], (1.0, 99.0))]
         if "ground truth" in tracks:
             ends_m.append(_range_of(tracks["ground truth"][axis_index]))
         low_m, high_m = _range_of(ends_m)
-        margin_m = MAX_MAP_MARGIN * (high_m - low_m)
+        margin_m = MAX_MAP_MARGIN_FRACTION * (high_m - low_m)
         limits_m = low_m - margin_m, high_m + margin_m
         ends_m += [np.clip(_range_of(track[axis_index]), *limits_m) for track in tracks.values()]
         low_m, high_m = _range_of(ends_m)
         middles_m.append(0.5 * (low_m + high_m))
-        sizes_m.append(max(MAP_MARGIN * (high_m - low_m), MIN_MAP_LENGTH_M))
+        sizes_m.append(max(MAP_MARGIN_FACTOR * (high_m - low_m), MIN_MAP_LENGTH_M))
     length_m = max(sizes_m[0], sizes_m[1] * aspect_ratio)
     half_size = 0.5 * np.array([length_m, length_m / aspect_ratio])
     return np.array(middles_m) - half_size, np.array(middles_m) + half_size

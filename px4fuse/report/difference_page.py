@@ -36,9 +36,9 @@ TIME_PLOT_HEIGHT = 105.0  # height (points) of the axes of the difference over t
 INCREASE_BAR_STYLE: dict[str, Any] = {"color": "white", "hatch": "////"}
 
 
-def draw(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the contribution of each EKF2 setting to the difference KF - EKF2."""
-    explanations = _axis_explanations(analysis)
+def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
+    """Draw the part of each setting of EKF2 in the mean square difference KF - EKF2."""
+    explanations = _explanations_by_axis(analysis)
     if not _has_explanation(explanations):
         return
     page = Page(
@@ -52,7 +52,7 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
             page.heading(f"{name}: no result")
             page.write(f"{capitalise_first(explanation.reason)}. {explanation.remedy}")
         else:
-            _draw_axis(page, name, explanation, analysis)
+            _draw_axis_explanation(page, name, explanation, analysis)
     replay = analysis.ekf2_replay
     assert isinstance(replay, Ekf2Replay)
     assert replay.agreement is not None
@@ -60,8 +60,8 @@ def draw(analysis: Analysis, _: object) -> Iterator[Page]:
     yield page
 
 
-def _axis_explanations(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
-    """Return the explanations of the difference KF - EKF2 along the aisle, else along all axes."""
+def _explanations_by_axis(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
+    """Return the explanation along the aisle (main direction) if it exists, else along all axes."""
     explanations = analysis.difference_steps
     return {AISLE: explanations[AISLE]} if AISLE in explanations else explanations
 
@@ -82,7 +82,7 @@ def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailab
 
 def unexplained_note(analysis: Analysis) -> str:
     """Return the reason why the difference KF - EKF2 is not explained; "" if it is explained."""
-    explanations = _axis_explanations(analysis)
+    explanations = _explanations_by_axis(analysis)
     if isinstance(analysis.flight.ekf2, Unavailable) or _has_explanation(explanations):
         return ""
     reasons = {
@@ -102,20 +102,21 @@ def format_agreement(agreement: Agreement) -> str:
         f"{axis.s_ratio_median:.3f} (5 to 95 % {axis.s_ratio_p5:.3f} to {axis.s_ratio_p95:.3f})"
         for axis in agreement.axes.values()
     )
-    return (
+    sentences = [
         f"{'agrees' if agreement.good else 'does not agree'} with the log ({agreement.reason}). "
         f"Correlation of {agreement.samples} innovations {correlation_text}; S of the replay ÷ S "
         f"of the log {ratio_text}; rejected {agreement.rejected_fraction_replayed:.1%} (log "
-        f"{agreement.rejected_fraction_logged:.1%})"
-        + "".join(
-            f". The replay of {AIDS[name].label} does not agree with the log and is not used: "
+        f"{agreement.rejected_fraction_logged:.1%})",
+        *(
+            f"The replay of {AIDS[name].label} does not agree with the log and is not used: "
             f"{reason}"
             for name, reason in agreement.doubtful.items()
-        )
-    )
+        ),
+    ]
+    return ". ".join(sentences)
 
 
-def _draw_axis(
+def _draw_axis_explanation(
     page: Page, name: str, explanation: DifferenceExplanation, analysis: Analysis
 ) -> None:
     span_texts = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in explanation.spans_s)
@@ -132,16 +133,19 @@ def _draw_axis(
         columns, (LABEL_WIDTH, 4.0), quantities, strict=True
     ):
         field = f"{quantity}_mean_square_{squared_unit}"
-        total = getattr(explanation, field)
-        reductions = np.array([getattr(step, field) for step in explanation.steps])
-        title = f"{quantity} difference, {np.sqrt(total):.3f} {unit} RMS"
+        total_mean_square = getattr(explanation, field)
+        mean_square_reductions = np.array([getattr(step, field) for step in explanation.steps])
+        title = f"{quantity} difference, {np.sqrt(total_mean_square):.3f} {unit} RMS"
         height = BAR_ROW_HEIGHT * (len(setting_names) + 2)
         axes = column.panel(title, height, left=left_edge)
-        percents = 100.0 * reductions / total, 100.0 * unexplained / total
+        percents = (
+            100.0 * mean_square_reductions / total_mean_square,
+            100.0 * unexplained / total_mean_square,
+        )
         _draw_waterfall(axes, setting_names, *percents)
     axes.set_yticklabels([])
     page.add_columns(*columns)
-    axes = event_marks.panel(
+    axes = event_marks.add_panel(
         page,
         analysis,
         "Position difference KF - EKF2 (m, dark) and unexplained difference (light)",

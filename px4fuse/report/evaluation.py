@@ -16,7 +16,7 @@ from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
 from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
 
-# Indices of the horizontal and the vertical axis of the map
+# Indices of the position axes that are drawn to the right and upwards on a map
 MAP_AXIS_INDICES: Mapping[Frame, tuple[int, int]] = {
     "NED": (1, 0),
     "FRD": (1, 0),
@@ -24,9 +24,9 @@ MAP_AXIS_INDICES: Mapping[Frame, tuple[int, int]] = {
     "camera": (0, 2),
     "unknown": (0, 1),
 }
-# Minimum ratio of an interval between poses to the median interval if it is drawn as a gap
+# Ratio of an interval between poses to the median interval above which it is drawn as a gap
 MIN_GAP_INTERVAL_RATIO = 10.0
-MAX_PATH_POINTS = 1200
+MAX_PATH_POINTS = 1200  # maximum number of drawn points of a path
 MIN_ERROR_RANGE_M = 1e-3  # minimum range (m) of an error axis: rounding errors look small
 PANEL_HEIGHT = 76.0  # height (points) of the axes of APE and RPE
 MAP_HEIGHT = 128.0  # height (points) of the axes of a map
@@ -41,16 +41,16 @@ STATISTIC_LINES = (
 NEGLIGIBLE_ERROR_M = 1e-6  # maximum position error (m) that rounding can cause
 
 
-def draw(evaluation: Evaluation, _: object) -> Iterator[Page]:
+def draw_pages(evaluation: Evaluation, _: object) -> Iterator[Page]:
     page = Page(
         "Trajectory error",
         "APE: distance of one pose from the reference (its RMSE over all poses is "
         "the ATE). RPE: error of the relative motion over a fixed distance or time.",
     )
-    page.write(summary(evaluation), size=9.0, bold=True)
+    page.write(ate_sentence(evaluation), size=9.0, bold=True)
     write_evaluation(page, evaluation)
     _draw_maps(page, evaluation)
-    _draw_panels(page, evaluation)
+    _draw_ape_and_rpe(page, evaluation)
     yield page
 
 
@@ -59,10 +59,10 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     frame, is_aligned = evaluation.reference_track.frame, evaluation.alignment != "none"
     axis_indices = list(MAP_AXIS_INDICES[frame])
     names = [AXES_OF_FRAME[frame][index] for index in axis_indices]
-    left, right = two_columns()
+    left_column, right_column = two_columns()
     unaligned_handles: dict[str, Artist] = {}
     if is_aligned:
-        axes = left.panel("Before alignment", MAP_HEIGHT, left=LABEL_MARGIN)
+        axes = left_column.panel("Before alignment", MAP_HEIGHT, left=LABEL_MARGIN)
         for position_m, line_style, label in (
             (evaluation.reference_m, REFERENCE_LINE, "reference"),
             (evaluation.unaligned_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
@@ -71,15 +71,15 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
             plot_path(axes, drawn_m, evaluation.time_s, label=label, **line_style)
         style.set_map_axes(axes, *names)
         unaligned_handles = _legend_handles(axes)
-        left.write_small(unaligned_sentence(evaluation))
+        left_column.write_small(unaligned_sentence(evaluation))
     title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
-    axes = right.panel(title, MAP_HEIGHT, left=LABEL_MARGIN, right=COLOUR_BAR_MARGIN)
+    axes = right_column.panel(title, MAP_HEIGHT, left=LABEL_MARGIN, right=COLOUR_BAR_MARGIN)
     _draw_path(axes, evaluation, axis_indices)
     style.set_map_axes(axes, *names)
-    right.write_small("Darker poses have a larger error; × marks the largest one.")
-    # both maps contain the reference
+    right_column.write_small("Darker poses have a larger error; × marks the largest one.")
+    # one legend for both maps lists the reference once
     page.legend([*(_legend_handles(axes) | unaligned_handles).values()])
-    page.add_columns(*[left] * is_aligned, right)
+    page.add_columns(*[left_column] * is_aligned, right_column)
 
 
 def _legend_handles(axes: Axes) -> dict[str, Artist]:
@@ -110,21 +110,21 @@ def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> N
     bar.outline.set_linewidth(0.5)
 
 
-def _draw_panels(page: Page, evaluation: Evaluation) -> None:
-    left, right = two_columns()
-    axes = left.panel("APE over time (m)", PANEL_HEIGHT)
+def _draw_ape_and_rpe(page: Page, evaluation: Evaluation) -> None:
+    left_column, right_column = two_columns()
+    axes = left_column.panel("APE over time (m)", PANEL_HEIGHT)
     origin_s = time_origin_s(evaluation)
     label = "time from the first pose (s)" if origin_s else "time (s)"
     draw_ape(axes, evaluation, evaluation.time_s - origin_s, label)
     page.legend(axes.get_legend_handles_labels()[0])
-    axes = right.panel("APE over distance (m)", PANEL_HEIGHT)
+    axes = right_column.panel("APE over distance (m)", PANEL_HEIGHT)
     draw_ape(axes, evaluation, evaluation.distance_m, "distance along the reference (m)")
-    page.add_columns(left, right)
+    page.add_columns(left_column, right_column)
     if _rpe_statistics(evaluation):
-        left, right = two_columns()
-        _draw_rpe(left.panel("RPE for each delta (m)", PANEL_HEIGHT), evaluation)
-        right.write(rpe_growth_sentence(evaluation.rpe), colour=MUTED_COLOUR, above=24.0)
-        page.add_columns(left, right)
+        left_column, right_column = two_columns()
+        _draw_rpe(left_column.panel("RPE for each delta (m)", PANEL_HEIGHT), evaluation)
+        right_column.write(rpe_growth_sentence(evaluation.rpe), colour=MUTED_COLOUR, above=24.0)
+        page.add_columns(left_column, right_column)
 
 
 def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) -> None:
@@ -181,7 +181,7 @@ def time_origin_s(evaluation: Evaluation) -> float:
     return start_s if start_s > MIN_UNIX_TIME_S else 0.0
 
 
-def summary(evaluation: Evaluation) -> str:
+def ate_sentence(evaluation: Evaluation) -> str:
     """Summarise ATE and largest position error in one line."""
     worst_index = int(np.argmax(evaluation.position_error_m))
     preposition = "without" if evaluation.alignment == "none" else "after"
@@ -209,13 +209,13 @@ def error_rows(evaluation: Evaluation) -> list[list[str]]:
     errors |= {f"RPE {error.delta_text} (m)": error for error in evaluation.rpe}
     rows = []
     for name, error in errors.items():
-        translation, rotation = error.translation_m, error.rotation_deg
+        errors_m, errors_deg = error.translation_m, error.rotation_deg
         cells = ["–", *[""] * 6]
-        if isinstance(translation, Statistics):
-            numbers = (translation.mean, translation.median, translation.std, translation.max)
-            cells = [f"{translation.rmse:.4f}", format_interval(error.interval_m)]
-            cells += [*(f"{number:.4f}" for number in numbers), f"{translation.count}"]
-        rotation_text = f"{rotation.rmse:.2f}" if isinstance(rotation, Statistics) else "–"
+        if isinstance(errors_m, Statistics):
+            numbers = (errors_m.mean, errors_m.median, errors_m.std, errors_m.max)
+            cells = [f"{errors_m.rmse:.4f}", format_interval(error.interval_m)]
+            cells += [*(f"{number:.4f}" for number in numbers), f"{errors_m.count}"]
+        rotation_text = f"{errors_deg.rmse:.2f}" if isinstance(errors_deg, Statistics) else "–"
         rows.append([name, *cells, rotation_text])
     return rows
 
@@ -258,11 +258,13 @@ def rpe_growth_sentence(rpe: tuple[RelativeError, ...]) -> str:
     deltas = sorted(delta for delta_unit, delta in rmse_by_unit_and_delta if delta_unit == unit)
     if len(deltas) < 2:
         return f"{interval_note} Give a second distance (--rpe) to distinguish noise from drift."
-    smallest, *_, largest = deltas
-    delta_ratio = largest / smallest
-    rmse_ratio = rmse_by_unit_and_delta[unit, largest] / rmse_by_unit_and_delta[unit, smallest]
+    smallest_delta, *_, largest_delta = deltas
+    delta_ratio = largest_delta / smallest_delta
+    rmse_ratio = (
+        rmse_by_unit_and_delta[unit, largest_delta] / rmse_by_unit_and_delta[unit, smallest_delta]
+    )
     return (
-        f"{interval_note} From {smallest:g} to {largest:g} {unit} the RMSE grows "
+        f"{interval_note} From {smallest_delta:g} to {largest_delta:g} {unit} the RMSE grows "
         f"{rmse_ratio:.2g} times. Expected: 1 for independent noise, {np.sqrt(delta_ratio):.2g} "
         f"for a random walk, {delta_ratio:.3g} for a scale or heading error."
     )
@@ -281,10 +283,10 @@ def describe_track(path: Trajectory) -> str:
 
 def describe_method(evaluation: Evaluation) -> str:
     association, offset_s = evaluation.association, evaluation.time_offset.offset_s
-    offset_text = "" if not offset_s else f"; time offset {offset_s:+.3f} s"
-    return (
-        f"alignment {evaluation.alignment} ({evaluation.alignment_reason.rstrip('.')}); "
+    texts = [
+        f"alignment {evaluation.alignment} ({evaluation.alignment_reason.rstrip('.')})",
         f"{association.poses} pose pairs, which cover {association.coverage_estimate:.0%} of the "
         f"time of the estimate and {association.coverage_reference:.0%} of the time of the "
-        f"reference{offset_text}"
-    )
+        "reference",
+    ]
+    return "; ".join(texts + [f"time offset {offset_s:+.3f} s"] * bool(offset_s))

@@ -29,8 +29,11 @@ TAKE_OFF_MARK, LANDING_MARK = dot_style("black", "*", 6.0), dot_style("black", "
 MIN_MARK_INTERVAL_FRACTION = 1.0 / 300.0
 
 
-class Mark(NamedTuple):
-    """Events of one type on a time axis: markers at a height (0 to 1), or bands without height."""
+class EventMarks(NamedTuple):
+    """Events of one type in a plot over time.
+
+    Markers at ``height``, a fraction of the axes; full-height bands if ``height`` is None.
+    """
 
     label: str
     spans_or_times: Sequence[Any] | Array
@@ -38,24 +41,24 @@ class Mark(NamedTuple):
     height: float | None = None
 
 
-def _event_marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[Mark, ...]:
+def _event_marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[EventMarks, ...]:
     events = analysis.events
     return (
-        Mark("on the ground", events.ground, GROUND_BAND),
-        Mark("gap in position source", events.gaps, GAP_BAND),
-        Mark("log dropout", events.dropouts, DROPOUT_BAND),
-        Mark("EKF2 rejected", rejected_s, REJECTED_DOTS, 0.025),
-        Mark("outlier", outlier_times(analysis), OUTLIER_MARK, 0.075),
-        Mark("EKF2 reset", events.resets_s, RESET_MARK, 0.92),
-        Mark("take-off", events.take_off_s, TAKE_OFF_MARK, 0.0),
-        Mark("landing", events.landing_s, LANDING_MARK, 0.0),
+        EventMarks("on the ground", events.ground, GROUND_BAND),
+        EventMarks("gap in position source", events.gaps, GAP_BAND),
+        EventMarks("log dropout", events.dropouts, DROPOUT_BAND),
+        EventMarks("EKF2 rejected", rejected_s, REJECTED_DOTS, 0.025),
+        EventMarks("outlier", outlier_times(analysis), OUTLIER_MARK, 0.075),
+        EventMarks("EKF2 reset", events.resets_s, RESET_MARK, 0.92),
+        EventMarks("take-off", events.take_off_s, TAKE_OFF_MARK, 0.0),
+        EventMarks("landing", events.landing_s, LANDING_MARK, 0.0),
     )
 
 
 def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> None:
     """Draw gaps, resets, rejections and outliers on a time axis.
 
-    ``axis`` selects the rejections: by default those of the main axis, none for "".
+    ``axis``: axis whose rejected measurements are drawn; None for the main axis, "" for none.
     """
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
     from matplotlib.lines import Line2D  # noqa: PLC0415
@@ -79,7 +82,7 @@ def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> No
             axes.add_artist(markers)  # unlike add_line, add_artist does not change the axis limits
 
 
-def panel(
+def add_panel(
     page: Page,
     analysis: Analysis,
     title: str,
@@ -118,7 +121,7 @@ def legend_entries(analysis: Analysis) -> list[Artist]:
 
 
 def visible_times(times: Any, min_interval_s: float) -> Array:
-    """Return the first time (s) of each interval, so that markers do not overlap."""
+    """Return the first of the times (s) in each interval, so that markers do not overlap."""
     times_s = np.asarray(times, dtype=np.float64)
     visible_s: Array = times_s[np.unique(np.floor(times_s / min_interval_s), return_index=True)[1]]
     return visible_s

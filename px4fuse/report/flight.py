@@ -13,7 +13,7 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.report import panels, style
 from px4fuse.report.difference_page import unexplained_note
 from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
-from px4fuse.report.phrases import filters_by_name, verdict_notes
+from px4fuse.report.phrases import statistics_by_filter, verdict_notes
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, Axes
 
 ZOOM_UPDATE_COUNT = 15  # number of updates in the plot of a few updates
@@ -21,7 +21,7 @@ MIN_ZOOM_S = 1.0  # minimum duration (s) of the plot of a few updates
 ZOOM_HEIGHT = 125.0  # height (points) of the axes of the plot of a few updates
 
 
-def draw(analysis: Analysis, _: object) -> Iterator[Page]:
+def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw position and velocity along the main axis over time."""
     result = analysis.main
     page = Page(f"Position and velocity along {result.axis.label}")
@@ -109,7 +109,7 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, zoom_span_s: Span) -> Non
 
 def zoom_sentence(result: AxisComparison) -> str:
     filter_texts = []
-    for name, filter_summary in filters_by_name(result).items():
+    for name, filter_summary in statistics_by_filter(result).items():
         prior_m = filter_summary.sigma_p_before_update_m
         posterior_m = filter_summary.sigma_p_after_update_m
         if prior_m is None or posterior_m is None:

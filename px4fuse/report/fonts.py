@@ -9,8 +9,8 @@ from pathlib import Path
 from matplotlib import font_manager
 from matplotlib.font_manager import FontEntry, FontPath
 
-# Font that matplotlib installs, with Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
-FONT = "DejaVu Sans"
+from px4fuse.report.style import FONT
+
 # Words in the names of fonts that draw a box for every character
 BOX_FONT_WORDS = ("lastresort", "last resort", "blank", "notdef")
 NO_GLYPH = "\N{WHITE SQUARE}"
@@ -34,7 +34,6 @@ def font_names(text: str) -> list[str]:
 
 
 def font_folders(names: tuple[str, ...]) -> list[str]:
-    """Return the folders with the files of the fonts."""
     paths = {name: path for name, path in _other_fonts() if name in names} if len(names) > 1 else {}
     font_files = [font_manager.findfont(FONT), *paths.values()]
     return list(dict.fromkeys(str(Path(str(path)).parent) for path in font_files))
@@ -46,7 +45,6 @@ def missing_characters(text: str) -> str:
 
 
 def font_advice(characters: str) -> str:
-    """Return the advice to install a font for missing characters."""
     listed_characters = characters[:MAX_LISTED_CHARACTERS] + (
         "…" if len(characters) > MAX_LISTED_CHARACTERS else ""
     )

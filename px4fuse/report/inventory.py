@@ -13,7 +13,7 @@ from px4fuse.request import ComparisonRequest, command_line
 SOURCES_HEAD = ("data", "topic", "samples", "rate (Hz)", "gaps", "span (s)")
 
 
-def summary(inventory: Inventory, request: ComparisonRequest) -> Page:
+def log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     """List the contents of a log, the possible analyses, and the ``compare`` command."""
     page = Page()
     page.write(inventory.flight.log.name, bold=True)
@@ -26,16 +26,16 @@ def summary(inventory: Inventory, request: ComparisonRequest) -> Page:
             right_aligned_columns=(2, 3),
         )
     page.table(SOURCES_HEAD, list(_source_rows(inventory)), right_aligned_columns=(2, 3, 4, 5))
-    answer_styles = {True: ("yes", GOOD_COLOUR), False: ("no", SEVERITY_COLOURS["warning"])}
+    possible_cells = {True: ("yes", GOOD_COLOUR), False: ("no", SEVERITY_COLOURS["warning"])}
     rows = [
-        (answer_styles[option.possible], option.name, option.reason)
+        (possible_cells[option.possible], option.name, option.reason)
         for option in inventory.abilities
     ]
     page.table(("possible", "analysis", ""), rows)
     if inventory.abilities[0].possible:  # comparison of KF and EKF2
         command = command_line(request, "compare", for_shell=True)
         page.add("command", text=command, label="Run")
-    lists = {
+    texts_by_label = {
         "Action": [
             f"{advice.remedy} ({'; '.join(advice.improves)})" for advice in inventory.advice
         ],
@@ -46,7 +46,7 @@ def summary(inventory: Inventory, request: ComparisonRequest) -> Page:
         ],
         "Notes": inventory.notes,
     }
-    for label, texts in lists.items():
+    for label, texts in texts_by_label.items():
         if texts:
             page.write_labelled(label, *texts)
     return page

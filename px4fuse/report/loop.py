@@ -60,7 +60,7 @@ TITLE = "Loop closure"
 MAP_HEIGHT = 290.0  # height (points) of the axes of the map
 
 
-def draw(analysis: Analysis, _: object) -> Iterator[Page]:
+def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the appendix on loop closure if the flight contains a loop."""
     if isinstance(analysis.loop, Loop):
         page = Page(appendix_title(TITLE), LEAD_TEXT)
@@ -118,16 +118,15 @@ def draw_map(axes: Axes, loop: Loop) -> None:
 
 
 def _draw_reference(axes: Axes, loop: Loop) -> None:
-    """Draw the reference trajectory in the frame of the odometry."""
     for reference in loop.references[:1]:
-        score = loop.best.scores.get(reference.name)
-        if isinstance(score, Evaluation):
-            reference_m = score.transform.apply_inverse(score.reference_m)[:, (1, 0)]
+        evaluation = loop.best.scores.get(reference.name)
+        if isinstance(evaluation, Evaluation):
+            reference_m = evaluation.transform.apply_inverse(evaluation.reference_m)[:, (1, 0)]
             line = {"label": reference.name, "zorder": 4, **TRACK_LINES["ground truth"]}
-            plot_path(axes, reference_m, score.time_s, **line)
+            plot_path(axes, reference_m, evaluation.time_s, **line)
 
 
-def summary(loop: Loop, findings: tuple[Finding, ...]) -> Page:
+def loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:
     """Make the terminal output on a loop: closure error, corrected paths and findings."""
     page = Page()
     write_loop(page, loop)
@@ -165,8 +164,8 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
         if path.correction_max_m:
             correction_text = f"{path.correction_rms_m:.2f} / {path.correction_max_m:.2f}"
         ate_texts = [
-            _format_error(score.ate.translation_m, score.ate.interval_m)
-            if isinstance(score := path.scores[name], Evaluation)
+            _format_error(evaluation.ate.translation_m, evaluation.ate.interval_m)
+            if isinstance(evaluation := path.scores[name], Evaluation)
             else "–"
             for name in names
         ]
@@ -201,23 +200,27 @@ def write_scores(page: Page, loop: Loop) -> None:
         page.table(head, rows, right_aligned_columns=(1, 2, 3, 4, 6))
     for reference in loop.references:
         page.heading(f"RPE against {reference.name}")
-        scores = {path.name: path.scores[reference.name] for path in loop.reported_paths}
-        missing_scores = [score for score in scores.values() if isinstance(score, Unavailable)]
-        for reason in dict.fromkeys(score.reason for score in missing_scores):
+        evaluations, reasons = dict[str, Evaluation](), dict[str, None]()
+        for path in loop.reported_paths:
+            evaluation = path.scores[reference.name]
+            if isinstance(evaluation, Unavailable):
+                reasons[evaluation.reason] = None
+            else:
+                evaluations[path.name] = evaluation
+        for reason in reasons:
             page.write(reason)
         rows = [
             [
                 name,
-                *(_format_error(error.translation_m, error.interval_m) for error in score.rpe),
-                _format_rmse(score.ate.rotation_deg, 2),
+                *(_format_error(error.translation_m, error.interval_m) for error in evaluation.rpe),
+                _format_rmse(evaluation.ate.rotation_deg, 2),
             ]
-            for name, score in scores.items()
-            if isinstance(score, Evaluation)
+            for name, evaluation in evaluations.items()
         ]
-        for first in [score for score in scores.values() if isinstance(score, Evaluation)][:1]:
-            delta_heads = [f"{error.delta_text} (m)" for error in first.rpe]
+        for evaluation in [*evaluations.values()][:1]:
+            delta_heads = [f"{error.delta_text} (m)" for error in evaluation.rpe]
             page.table(["path", *delta_heads, "rotation (°)"], rows)
-            for text in (describe_method(first), *first.notes, *first.warnings):
+            for text in (describe_method(evaluation), *evaluation.notes, *evaluation.warnings):
                 page.write_small(capitalise_first(text))
 
 
@@ -232,8 +235,8 @@ def describe_closure_error(loop: Loop) -> str:
     length_m = loop.path_length_m
     if error_m is None or error_axes_m is None:
         if loop.is_assessed:
-            return f"not stated for an assignment; the path is {length_m:.1f} m long"
-        return f"the path of {length_m:.1f} m does not return to its start (--open)"
+            return f"hidden in an assignment; the path is {length_m:.1f} m long"
+        return f"none: --open states that the path of {length_m:.1f} m does not return to its start"
     text = (
         f"{error_m:.2f} m after {length_m:.1f} m ({error_m / length_m:.2%}): "
         f"{format_vector(error_axes_m)}"
@@ -295,7 +298,7 @@ def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:
     return f"{statistics.rmse:.{digits}f}" if isinstance(statistics, Statistics) else "–"
 
 
-def graph_summary(solved_graph: Graph) -> Page:
+def pose_graph_page(solved_graph: Graph) -> Page:
     """Make the terminal output on a pose graph: tested closures, solver and costs."""
     page, gates = Page(), solved_graph.gates
     page.write_labelled(

@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 HEADING_SIZES = {"h1": 12.0, "h2": 10.8, "h3": 9.6}
 INDENT = 12.0  # indent (points) of each list level
-MAX_INDENTS = 8  # maximum number of indents of a text
+MAX_INDENTS = 8  # maximum number of drawn list levels; deeper levels are not indented further
 # Maximum depth of nested Markdown: each level needs three levels of Python's stack of 1000
 MAX_NESTING_DEPTH = 100
 TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
 
 
-def draw(subject: object, results: FlightResults | LoopResults) -> Iterator[Page]:
+def draw_pages(subject: object, results: FlightResults | LoopResults) -> Iterator[Page]:
     """Draw the answer form and the notes of the student, if there are any."""
     title, answers = "Student notes", results.student.answers
     page = Page(appendix_title(title) if isinstance(subject, Analysis) else title)
@@ -38,26 +38,26 @@ def draw(subject: object, results: FlightResults | LoopResults) -> Iterator[Page
         page.heading("Answer form")
         rows = [list(row) for row in form_rows(answers)]
         page.table(("Question", "Answer"), rows, column_widths=[3.0, 4.0])
-    write(page, results.student.notes)
+    write_markdown(page, results.student.notes)
     if len(page.blocks) > 1:
         yield page
 
 
-def write(page: Page, notes: str) -> None:
+def write_markdown(page: Page, notes: str) -> None:
     r"""Write Markdown on a page as plain text.
 
     >>> page = Page()
-    >>> write(page, "# A *b*\n\n- σ_z² is `R`\n\n![a map](m.png)")
+    >>> write_markdown(page, "# A *b*\n\n- σ_z² is `R`\n\n![a map](m.png)")
     >>> [block["text"] for block in page.blocks]
     ['A b', 'σ_z² is R', '[picture: a map]']
     """
     from markdown_it.tree import SyntaxTreeNode  # noqa: PLC0415
 
-    _write_blocks(page, SyntaxTreeNode(parse(notes)), 0)
+    _write_blocks(page, SyntaxTreeNode(parse_markdown(notes)), 0)
 
 
-def parse(notes: str, name: str = "the notes") -> list[Token]:
-    """Parse Markdown into tokens; ``name`` is the name of the text in errors.
+def parse_markdown(notes: str, name: str = "the notes") -> list[Token]:
+    """Parse Markdown into tokens; ``name`` names the text in error messages.
 
     Raises
     ------

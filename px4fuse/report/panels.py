@@ -1,4 +1,4 @@
-"""Plots over time along one axis, with caption and numbers."""
+"""Plots over time along one axis, with caption and statistics."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from px4fuse.filter.consistency import Consistency
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks, style
 from px4fuse.report.page import Block, Page
-from px4fuse.report.phrases import filters_by_name, format_verdict
+from px4fuse.report.phrases import format_verdict, statistics_by_filter
 from px4fuse.report.style import (
     INNOVATION_DOTS,
     TRACK_LINES,
@@ -27,20 +27,20 @@ from px4fuse.report.style import (
 )
 
 NARROW_HEIGHT = 72.0  # height (points) of the axes in narrow columns
-# Ratio of the limit of the innovation plot to the largest drawn innovation, for a margin
+# Ratio of the limit of the axis of innovations to the largest drawn innovation
 INNOVATION_AXIS_MARGIN_FACTOR = 1.3
-# Maximum limit (in √S) of the innovation plot, without the margin
+# Maximum innovation (multiple of the median √S) that enlarges the axis of innovations
 MAX_INNOVATION_AXIS_SIGMAS = 5.0
 
 
 class Quantity(NamedTuple):
-    """Position or velocity: its unit, and its names in tables and results."""
+    """Position or velocity, with the names of its columns and of its statistics."""
 
     unit: str
     column: str
-    variance: str
-    rmse: str
-    sigma: str
+    variance_column: str
+    rmse_field: str
+    median_sigma_field: str
 
 
 POSITIONS = Quantity(
@@ -57,8 +57,8 @@ class Panel(NamedTuple):
     title: str
     height: float
     draw: Callable[[Axes, AxisComparison], None]
-    caption: Callable[[Analysis, AxisComparison], str]
-    numbers: Callable[[AxisComparison], str]
+    make_caption: Callable[[Analysis, AxisComparison], str]
+    make_statistics_text: Callable[[AxisComparison], str]
 
     def draw_on_page(
         self,
@@ -70,11 +70,12 @@ class Panel(NamedTuple):
         is_narrow: bool = False,
     ) -> None:
         """Draw the plot on a page; a narrow plot has no caption."""
-        title, caption, height, numbers = self.title, "", NARROW_HEIGHT, self.numbers(result)
+        title, caption, height = self.title, "", NARROW_HEIGHT
+        statistics_text = self.make_statistics_text(result)
         if not is_narrow:
-            caption, height = self.caption(analysis, result), self.height
-            title, numbers = ": ".join(filter(None, (title, numbers))), ""
-        axes = event_marks.panel(
+            caption, height = self.make_caption(analysis, result), self.height
+            title, statistics_text = ": ".join(filter(None, (title, statistics_text))), ""
+        axes = event_marks.add_panel(
             page,
             analysis,
             title,
@@ -87,7 +88,7 @@ class Panel(NamedTuple):
         if is_narrow:
             axes.locator_params(axis="x", nbins=4)
         self.draw(axes, result.in_flight)
-        page.write_small(numbers)
+        page.write_small(statistics_text)
 
 
 def add_legend(page: Page, analysis: Analysis) -> Block:
@@ -99,9 +100,8 @@ def add_legend(page: Page, analysis: Analysis) -> Block:
         Line2D([], [], **style.MEASUREMENT_DOTS | {"ms": 5.0}, label="position"),
         Line2D([], [], **TRACK_LINES["KF"], label="KF"),
         Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="±2σ reported"),
+        *(Line2D([], [], **TRACK_LINES[name], label=name) for name in _other_tracks(analysis.main)),
     ]
-    for name in _other_tracks(analysis.main):
-        lines.append(Line2D([], [], **TRACK_LINES[name], label=name))
     return page.legend([*lines, *event_marks.legend_entries(analysis)])
 
 
@@ -120,7 +120,7 @@ def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
         measurements = pd.Series(result.axis.measurement_m, result.axis.measurement_time_s)
         draw_curve(axes, measurements, **style.MEASUREMENT_DOTS)
     kf_values = result.replay.steps[quantity.column]
-    draw_sigma_band(axes, kf_values, np.sqrt(result.replay.steps[quantity.variance]))
+    draw_sigma_band(axes, kf_values, np.sqrt(result.replay.steps[quantity.variance_column]))
     drawn_series = [kf_values]
     for name, track in _other_tracks(result).items():
         values = track[quantity.column]
@@ -134,7 +134,7 @@ def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
     axes.set_ylim(all_values.min() - margin, all_values.max() + margin)
 
 
-def _position_sentence(_: Analysis, result: AxisComparison) -> str:
+def _measurements_sentence(_: Analysis, result: AxisComparison) -> str:
     extent_m = float(np.ptp(result.axis.measurement_m))
     return f"{len(result.replay.updates)} measurements over {extent_m:.3g} m."
 
@@ -142,8 +142,8 @@ def _position_sentence(_: Analysis, result: AxisComparison) -> str:
 def _rmse_texts(result: AxisComparison, quantity: Quantity) -> list[str]:
     rmse_texts = [
         f"{name} {rmse:.3f} {quantity.unit}"
-        for name, filter_summary in filters_by_name(result).items()
-        if (rmse := getattr(filter_summary.truth, quantity.rmse, None)) is not None
+        for name, filter_summary in statistics_by_filter(result).items()
+        if (rmse := getattr(filter_summary.truth, quantity.rmse_field, None)) is not None
     ]
     return [f"RMSE against ground truth {', '.join(rmse_texts)}"] if rmse_texts else []
 
@@ -191,15 +191,15 @@ def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]
 
 
 def draw_dots(
-    axes: Axes, values: pd.Series[float], limit: float, marker_style: dict[str, Any]
+    axes: Axes, values: pd.Series[float], axis_limit: float, marker_style: dict[str, Any]
 ) -> None:
     """Draw dots between -limit and limit; values outside are triangles at the limits."""
-    draw_curve(axes, values[values.abs() <= limit], **marker_style)
+    draw_curve(axes, values[values.abs() <= axis_limit], **marker_style)
     for sign, marker in ((1.0, "^"), (-1.0, "v")):
-        outside = values[sign * values > limit]
+        outside = values[sign * values > axis_limit]
         triangles = {**marker_style, "marker": marker, "ms": 3.2, "clip_on": False}
         if len(outside):
-            draw_curve(axes, 0.0 * outside + sign * limit, **triangles)
+            draw_curve(axes, 0.0 * outside + sign * axis_limit, **triangles)
 
 
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
@@ -229,7 +229,7 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
     """Return the caption of the innovation plot."""
     axis_limit_m, sentences = _innovation_axis_limit_m(result), []
     innovation_tables = _innovation_tables(result)
-    for name, consistency in filters_by_name(result).items():
+    for name, consistency in statistics_by_filter(result).items():
         if isinstance(consistency, Unavailable):
             sentences.append(f"{name}: {consistency.reason}.")
             continue
@@ -253,7 +253,7 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
 def _fraction_outside_text(result: AxisComparison) -> str:
     fractions = ", ".join(
         f"{name} {consistency.fraction_outside_two_sigma:.1%}"
-        for name, consistency in filters_by_name(result).items()
+        for name, consistency in statistics_by_filter(result).items()
         if isinstance(consistency, Consistency)
     )
     return f"{fractions} outside ±2√S (expected 5 %)" if fractions else ""
@@ -261,7 +261,7 @@ def _fraction_outside_text(result: AxisComparison) -> str:
 
 def _draw_sigma(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
     for name, variance in _variance_tables(result).items():
-        draw_curve(axes, np.sqrt(variance[quantity.variance]), **TRACK_LINES[name])
+        draw_curve(axes, np.sqrt(variance[quantity.variance_column]), **TRACK_LINES[name])
     set_log_scale(axes)
 
 
@@ -289,8 +289,8 @@ def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
 
 def _median_sigma_text(result: AxisComparison, quantity: Quantity) -> str:
     texts = []
-    for name, filter_summary in filters_by_name(result).items():
-        median = getattr(filter_summary, quantity.sigma)
+    for name, filter_summary in statistics_by_filter(result).items():
+        median = getattr(filter_summary, quantity.median_sigma_field)
         text = "not logged" if median is None else f"{median:.3f} {quantity.unit}"
         texts.append(f"{name} {text}")
     return f"median: {', '.join(texts)}"
@@ -300,7 +300,7 @@ POSITION = Panel(
     "Position (m)",
     150.0,
     partial(draw_tracks, quantity=POSITIONS),
-    _position_sentence,
+    _measurements_sentence,
     _position_difference_text,
 )
 VELOCITY = Panel(

@@ -30,26 +30,26 @@ RESULTS_NAME = "results.json"
 # Functions that draw the pages of a report, in their order, by type of results
 PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
     contract.ComparisonResults: (
-        cover.draw,
-        flight.draw,
+        cover.draw_pages,
+        flight.draw_pages,
         flight.draw_innovations,
-        difference_page.draw,
+        difference_page.draw_pages,
         flight.draw_other_axes,
-        consistency.draw,
-        clock.draw,
-        aids.draw,
-        loop.draw,
-        notes.draw,
-        provenance.draw,
+        consistency.draw_pages,
+        clock.draw_pages,
+        aids.draw_pages,
+        loop.draw_pages,
+        notes.draw_pages,
+        provenance.draw_pages,
     ),
     contract.AidsResults: (
-        cover.draw,
-        aids.draw,
-        notes.draw,
-        provenance.draw,
+        cover.draw_pages,
+        aids.draw_pages,
+        notes.draw_pages,
+        provenance.draw_pages,
     ),
-    contract.LoopResults: (loop.draw_report, notes.draw, provenance.draw_loop),
-    contract.EvaluationResults: (evaluation.draw,),
+    contract.LoopResults: (loop.draw_report, notes.draw_pages, provenance.draw_loop),
+    contract.EvaluationResults: (evaluation.draw_pages,),
 }
 
 
@@ -63,7 +63,7 @@ def _title_name_hash(results: Any) -> tuple[str, str, str]:
     return f"px4fuse compare {log.name}", log.name, log.sha256
 
 
-def render(content: Any, results: Any, results_json: str) -> bytes:
+def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
     """Draw all pages and typeset them as PDF.
 
     Parameters

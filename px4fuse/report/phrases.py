@@ -1,4 +1,4 @@
-"""Texts that the terminal and the PDF share."""
+"""Texts that the terminal output and the PDF report share."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 # Minimum p value of the Ljung-Box test for white innovations: with eight tests per flight, less
 # than 1 % of the flights have a false alarm
 MIN_WHITE_P_VALUE = 0.001
-# Size of the reported σ compared with the actual σ, by verdict
+# Size of the reported σ compared with the actual error, by verdict
 SIGMA_SIZES = {"underconfident": "too large", "overconfident": "too small"}
-RMS_FIELDS = ("position_rms_m", "velocity_rms_m_s")
+DIFFERENCE_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
 
 
@@ -53,7 +53,7 @@ def format_settings(settings: Settings) -> str:
 
 
 def format_verdict(consistency: Consistency | Unavailable) -> str:
-    """Format the verdict on the reported σ of a filter; "not logged" without innovations."""
+    """State whether a filter is consistent, or by which factor its reported σ is wrong."""
     if isinstance(consistency, Unavailable):
         return "not logged"
     return format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
@@ -70,7 +70,7 @@ def format_sigma_verdict(verdict: str, factor: float) -> str:
     return f"{verdict}, σ {format_factor(factor)}× {SIGMA_SIZES[verdict]}"
 
 
-def filters_by_name(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
+def statistics_by_filter(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
     """Return the statistics of KF, and of EKF2 if logged, by filter name."""
     filters = {"KF": result.filters["kf"]}
     if not isinstance(result.ekf2_state, Unavailable):
@@ -82,8 +82,8 @@ VERDICT_TABLE_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
 
 
 def verdict_cells(result: AxisComparison, name: str) -> list[Cell]:
-    """Return the first cells of the table row of an axis and a filter ("KF" or "EKF2")."""
-    consistency = filters_by_name(result)[name]
+    """Return the cells for :data:`VERDICT_TABLE_HEAD` of an axis and a filter (KF or EKF2)."""
+    consistency = statistics_by_filter(result)[name]
     label = result.axis.label.removeprefix("the ") if name == "KF" else ""
     if isinstance(consistency, Unavailable):
         return [label, name, "", "", (format_verdict(consistency), MUTED_COLOUR)]
@@ -94,7 +94,7 @@ def verdict_cells(result: AxisComparison, name: str) -> list[Cell]:
     return [label, name, format_number(consistency.nis_mean), band_text, verdict]
 
 
-def write_errors(page: Page, analysis: Analysis) -> None:
+def write_error_table(page: Page, analysis: Analysis) -> None:
     """Write the table of verdicts and position errors of all axes."""
     axes = (analysis.main, *analysis.secondary_axes)
     has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
@@ -102,9 +102,9 @@ def write_errors(page: Page, analysis: Analysis) -> None:
 
     rows = []
     for result in axes:
-        for name, consistency in filters_by_name(result).items():
+        for name, consistency in statistics_by_filter(result).items():
             difference = result.difference if name == "KF" else None
-            cells = [_format_rms(difference, field) for field in RMS_FIELDS if has_ekf2]
+            cells = [_format_rms(difference, field) for field in DIFFERENCE_FIELDS if has_ekf2]
             cells += [_format_rms(consistency.truth, field) for field in RMSE_FIELDS if has_truth]
             rows.append([*verdict_cells(result, name), *cells])
     head = [*VERDICT_TABLE_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
@@ -118,11 +118,11 @@ def _format_rms(statistic: object, field: str) -> str:
 
 
 def verdict_notes(comparison: Comparison) -> list[str]:
-    """Return notes on the limits of the verdicts on σ."""
+    """Return reservations about consistency verdicts: drifting source, correlated innovations."""
     consistencies = [
         (result.axis.label, filter_name, consistency)
         for result in comparison.axes.values()
-        for filter_name, consistency in filters_by_name(result).items()
+        for filter_name, consistency in statistics_by_filter(result).items()
         if isinstance(consistency, Consistency)
     ]
     notes = []
@@ -157,15 +157,15 @@ def format_clock_map(clock: ClockMap) -> str:
 
 
 def describe_alignment(alignment: Alignment) -> dict[str, str]:
-    """Describe the alignment of a position file with the flight; labels are the keys."""
-    north, east, down = alignment.origin_m
+    """Describe the alignment of a position file with the flight, by label."""
+    north_m, east_m, down_m = alignment.origin_m
     yaw_sigma_text = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
     clock_sigma_s, residual_m = alignment.clock_offset_sigma_s, alignment.residual_rms_m
     clock_sigma_text = "" if clock_sigma_s is None else f" ± {clock_sigma_s:.3f} s"
     texts = {
         "frame": f"{alignment.frame} ({alignment.frame_reason})",
         "yaw": f"{alignment.yaw_deg:.2f}°{yaw_sigma_text} ({alignment.yaw_reason})",
-        "origin": f"north {north:.3f} m, east {east:.3f} m, down {down:.3f} m",
+        "origin": f"north {north_m:.3f} m, east {east_m:.3f} m, down {down_m:.3f} m",
         "clock": f"{alignment.clock_offset_s:+.3f} s{clock_sigma_text} to the boot clock "
         f"({alignment.clock_reason})",
     }
@@ -179,7 +179,7 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
 def tuning_advice(
     comparison: PreparedComparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
-    """Return the recommended actions after noise estimation, with their labels as keys."""
+    """Return recommendations after noise estimation, by their label."""
     names = (HORIZONTAL, "aisle", *tuning_by_axis)
     axis_name = next(
         (name for name in names if isinstance(tuning_by_axis.get(name), AxisTuning)), ""
@@ -204,7 +204,7 @@ def tuning_advice(
         advice["Action"] = f"Re-run with the estimates of {axis_name}: {command}"
     if sigma_z.value is None and sigma_z.low is not None:
         advice["SIGMA_Z"] = (
-            f"SIGMA_Z is at least {sigma_z.low:.2g} m. Check that the source measures positions."
+            f"SIGMA_Z is at least {sigma_z.low:.2g} m: the source may not measure this position."
         )
     elif sigma_z.value is None:
         bound_text = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
@@ -213,21 +213,21 @@ def tuning_advice(
             "process noise between samples. Log the source at a higher rate."
         )
     elif log.autopilot == "PX4" and not may_drift and comparison.source.origin.is_vision:
-        flown_m, name = log.parameters.get(EV_POS.noise), EV_POS.noise
+        logged_m, name = log.parameters.get(EV_POS.noise), EV_POS.noise
         variance_m2 = comparison.source.samples[Columns.POSITION_VARIANCE[:2]].median().mean()
         reported_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
         changes = noise_change(EV_POS, log.parameters, reported_m, sigma_z.value)
-        flown_text = "" if flown_m is None else f" (now {flown_m:g} m)"
-        advice["PX4"] = f"Set {name} to {changes[name]:g} m{flown_text}."
-        is_flown_within_interval = flown_m is not None and (sigma_z.low or 0.0) <= flown_m <= (
+        logged_text = "" if logged_m is None else f" (now {logged_m:g} m)"
+        advice["PX4"] = f"Set {name} to {changes[name]:g} m{logged_text}."
+        is_logged_within_interval = logged_m is not None and (sigma_z.low or 0.0) <= logged_m <= (
             sigma_z.high or 0.0
         )
         if EV_POS.noise_mode in changes and reported_m > (sigma_z.high or np.inf):
             advice["PX4"] = (
                 f"Set {format_parameters(changes)}: EKF2 uses the reported σ, {reported_m:.2g} m."
             )
-        elif is_flown_within_interval:
-            advice["PX4"] = f"{name} {flown_m:g} m is within the 95 % interval."
+        elif is_logged_within_interval:
+            advice["PX4"] = f"{name} {logged_m:g} m is within the 95 % interval."
     if sigma_a.value is None:
         advice["SIGMA_A"] = (
             "SIGMA_A cannot be estimated: the flight has too little motion, or is too short."

@@ -18,7 +18,7 @@ from px4fuse.results.contract import LoopResults
 LABEL_WIDTH = 168.0  # width (points) of the labels
 
 
-def draw(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
+def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
     """Draw the findings, and the provenance of a flight."""
     page = Page(ALL_FINDINGS)
     write_findings(page, results.findings)

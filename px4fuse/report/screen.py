@@ -25,8 +25,8 @@ from px4fuse.request import ComparisonRequest, Request, command_line
 
 # Terminal encodings that contain all characters of a diagnosis card
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
-# Function that yields the lines of each kind of block
-CARD_LINES = {"card": card_lines, "closing": closing_lines, "headline": headline_lines}
+# Function that yields the lines of a diagnosis card, by kind of block
+CARD_LINE_FUNCTIONS = {"card": card_lines, "closing": closing_lines, "headline": headline_lines}
 LABEL_COLUMNS = 9  # width (characters) of a label on the terminal
 POINTS_PER_COLUMN = 6.0  # indent (points) in the PDF that is one character on the terminal
 # Terminal styles of text colours; the other colours belong to plots
@@ -63,7 +63,7 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
             case "blank":
                 console.print()
             case "card" | "closing" | "headline":
-                _show_card(console, CARD_LINES[block["kind"]], block["card"], request)
+                _show_card(console, CARD_LINE_FUNCTIONS[block["kind"]], block["card"], request)
 
 
 def _show_card(
@@ -103,8 +103,8 @@ def expand_commands(text: str, request: Request) -> tuple[str, list[str]]:
     >>> expand_commands("px4fuse compare LOG --sigma-z 0.2: better.", request)
     ('--sigma-z 0.2: better.', ["px4fuse compare 'a b.ulg' --sigma-z 0.2"])
     """
-    log = str(getattr(request, "log", "") or getattr(request, "source", ""))
-    default_request = ComparisonRequest(log=log)
+    log_path = str(getattr(request, "log", "") or getattr(request, "source", ""))
+    default_request = ComparisonRequest(log=log_path)
     commands = [
         command_line(request if name == "compare" else default_request, name, for_shell=True)
         + options

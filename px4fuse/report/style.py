@@ -22,6 +22,7 @@ else:  # text-only commands do not import matplotlib (0.3 s)
     Artist = Axes = Any
 __all__ = ["Artist", "Axes"]  # matplotlib types for annotations
 
+# Font that matplotlib installs, with Latin, Greek, Cyrillic, Arabic, Hebrew and symbols
 FONT = "DejaVu Sans"
 STYLE_SHEET = Path(__file__).with_name("report.mplstyle")
 TIME_LABEL = "time since first data (s)"
@@ -47,9 +48,11 @@ def line_style(colour: str, width: float, dashes: object = "-") -> dict[str, Any
     return {"color": colour, "lw": width, "ls": dashes}
 
 
-def dot_style(colour: str, marker: str | int, size: float, edge: float = 0.0) -> dict[str, Any]:
+def dot_style(
+    colour: str, marker: str | int, size: float, edge_width: float = 0.0
+) -> dict[str, Any]:
     """Return the matplotlib options of markers; size and edge width in points."""
-    return {"color": colour, "marker": marker, "ms": size, "mew": edge, "ls": "none"}
+    return {"color": colour, "marker": marker, "ms": size, "mew": edge_width, "ls": "none"}
 
 
 # Style of the line of each track, by its name in legends
@@ -138,27 +141,27 @@ def label_time_axis(axes: Axes, with_time_label: bool) -> None:
         axes.tick_params(axis="x", labelbottom=False)
 
 
-def set_map_axes(axes: Axes, right: str, up: str) -> None:
+def set_map_axes(axes: Axes, right_name: str, up_name: str) -> None:
     """Set equal scales, a grid and the axis labels (m) of a map."""
     axes.set_aspect("equal", adjustable="datalim", anchor="W")
     axes.grid(True, axis="both")
-    axes.set(xlabel=f"{right} (m)", ylabel=f"{up} (m)")
+    axes.set(xlabel=f"{right_name} (m)", ylabel=f"{up_name} (m)")
     axes.locator_params(axis="x", nbins=6)
     axes.locator_params(axis="y", nbins=6)
 
 
-def decimate_series(time: Array, value: Array, limit: int) -> tuple[Array, Array]:
+def decimate_series(times: Array, values: Array, max_points: int) -> tuple[Array, Array]:
     """Reduce a series to ``limit`` points: the minimum and maximum of each interval."""
-    if len(time) <= limit:
-        return time, value
-    bucket_size, larger_bucket_count = divmod(len(time), limit // 2)
+    if len(times) <= max_points:
+        return times, values
+    bucket_size, larger_bucket_count = divmod(len(times), max_points // 2)
     split_row, index_groups = larger_bucket_count * (bucket_size + 1), []
     for first_row, last_row, width in (
         (0, split_row, bucket_size + 1),
-        (split_row, len(time), bucket_size),
+        (split_row, len(times), bucket_size),
     ):
-        buckets = value[first_row:last_row].reshape(-1, width)
+        buckets = values[first_row:last_row].reshape(-1, width)
         starts = np.arange(first_row, last_row, width)
         index_groups += [starts + buckets.argmin(axis=1), starts + buckets.argmax(axis=1)]
     selected_rows = np.unique(np.concatenate(index_groups))
-    return time[selected_rows], value[selected_rows]
+    return times[selected_rows], values[selected_rows]

@@ -15,7 +15,7 @@ from px4fuse.report.phrases import (
     describe_alignment,
     format_settings,
     verdict_notes,
-    write_errors,
+    write_error_table,
     write_finding,
     write_findings,
 )
@@ -27,16 +27,16 @@ ERROR_LEGEND = (
 )
 
 
-def summary(
+def comparison_page(
     analysis: Analysis | AidsOnlyAnalysis,
     results: Any,
     *,
     verbose: bool = False,
     quiet: bool = False,
 ) -> Page:
-    """Make the terminal output of `px4fuse compare`: the diagnosis card.
+    """Make the terminal output of ``px4fuse compare``: the diagnosis card.
 
-    ``quiet`` prints only its headline; ``verbose`` adds settings, table of axes and findings.
+    ``quiet``: only the headline of the card; ``verbose``: also settings, axes and findings.
     """
     page = card_page("headline" if quiet else "card", results.card)
     if not verbose:
@@ -53,7 +53,7 @@ def summary(
 def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
     page.add("blank")
     page.write_labelled_texts(_describe_setup(analysis))
-    write_errors(page, analysis)
+    write_error_table(page, analysis)
     for note in (ERROR_LEGEND, *verdict_notes(analysis)):
         page.write(note, colour=MUTED_COLOUR)
     explanation = analysis.difference_steps.get(analysis.main.axis.name)
@@ -66,7 +66,7 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
 
 
 def card_page(block_kind: str, card: Card) -> Page:
-    """Make a page with the "card", its "headline" or its "closing" lines."""
+    """Make a page with one block; ``block_kind`` is "card", "headline" or "closing"."""
     page = Page()
     page.add(block_kind, card=card)
     return page
@@ -74,14 +74,14 @@ def card_page(block_kind: str, card: Card) -> Page:
 
 def _describe_setup(comparison: Comparison) -> dict[str, str]:
     source, segment = comparison.source, comparison.segment
-    position = (
+    position_text = (
         f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, "
         f"{source.frame}; {comparison.source_reason}"
     )
     alignment = {} if source.alignment is None else describe_alignment(source.alignment)
     return {
         "Filter": format_settings(comparison.settings),
-        "Position": position,
+        "Position": position_text,
         **{capitalise_first(label): text for label, text in alignment.items()},
         "Segment": f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}",
     }

@@ -23,7 +23,9 @@ TUNING_NOTE = (
 )
 
 
-def summary(comparison: PreparedComparison, tunings: dict[str, AxisTuning | Unavailable]) -> Page:
+def tuning_page(
+    comparison: PreparedComparison, tunings: dict[str, AxisTuning | Unavailable]
+) -> Page:
     """Format the estimates of SIGMA_A and SIGMA_Z along each axis."""
     page, rows, sentences = Page(), [], list[str]()
     for name, tuning in tunings.items():

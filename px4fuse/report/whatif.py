@@ -39,18 +39,18 @@ def column_heads(analysis: WhatIfAnalysis) -> list[str]:
 def statistic_rows(analysis: WhatIfAnalysis) -> list[list[str]]:
     """Return a row for each statistic of EKF2: as logged, replayed, and replayed with changes."""
     result = analysis.whatif
-    labels = _statistic_texts(result.replayed, result.replayed)
+    texts_by_label = _statistic_texts(result.replayed, result.replayed)
     columns = [
         _statistic_texts(summary, result.replayed)
         if summary.is_predictable
-        else dict.fromkeys(labels, NOT_PREDICTABLE_TEXT)
+        else dict.fromkeys(texts_by_label, NOT_PREDICTABLE_TEXT)
         for summary in (
             result.logged,
             result.replayed,
             *result.whatif[: analysis.sweep_start_index],
         )
     ]
-    return [[label, *(column.get(label, "n/a") for column in columns)] for label in labels]
+    return [[label, *(column.get(label, "n/a") for column in columns)] for label in texts_by_label]
 
 
 def _statistic_texts(summary: Summary, replayed: Summary) -> dict[str, str]:
@@ -159,7 +159,7 @@ def _format_number(value: float | Unavailable, digits: int = 3) -> str:
     return "n/a" if isinstance(value, Unavailable) else f"{value:.{digits}f}"
 
 
-def summary(analysis: WhatIfAnalysis) -> Page:
+def whatif_page(analysis: WhatIfAnalysis) -> Page:
     """Make the terminal output of ``px4fuse whatif``."""
     page = Page()
     if AISLE in analysis.difference_steps:

@@ -130,9 +130,9 @@ def simulate_ekf2(
     samples that EKF2 receives; the log may contain fewer. ``log_parameters`` are all parameters in
     the log, by PX4 name.
     """
-    aid, aids = scenario.aid, _fused_aids(scenario)
+    aid, fused_aids = scenario.aid, _fused_aids(scenario)
     segment, time_us, true_quaternions = _make_segment(scenario, mistakes, motion, imu)
-    logged_values = {name: float(np.float32(v)) for name, v in log_parameters.items()}
+    logged_values = {name: float(np.float32(value)) for name, value in log_parameters.items()}
     step_s = float(np.median(segment.step_s))
     if other_sensors:
         magnetometer, barometer = other_sensors
@@ -157,7 +157,7 @@ def simulate_ekf2(
                 np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)]),
                 np.full(6, FIELD_SIGMA_GAUSS**2),
             )
-    settings = effective_settings(logged_values, *aids)
+    settings = effective_settings(logged_values, *fused_aids)
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
     buffer_length = int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICTION_STEP_US))
     inputs = Inputs(
@@ -172,7 +172,7 @@ def simulate_ekf2(
         mean_step_s=step_s,
         horizon_s=(buffer_length - 1) * step_s,
         configured_step_s=PREDICTION_STEP_US * 1e-6,
-        vision_height=False,
+        fuses_vision_height=False,
         imu_offset_m=np.zeros(3),
         aid=aid,
         max_interval_s=MAX_EVENT_INTERVAL_S,
@@ -242,7 +242,7 @@ def _make_segment(
             down_variance_m2=np.full(len(time_s), HEIGHT_SIGMA_M**2),
             attitude_error_rad=attitude_error_rad,
             state_correlation=covariance / sigma[:, None] / sigma,
-            fusing=False,
+            is_fusing=False,
         ),
         step_us,
         true_quaternions,
@@ -293,7 +293,7 @@ def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions
     else:
         position_variance, velocity_variance = fields["position_variance"][is_newer], None
     return ReceivedPositions(
-        stamp_s=timestamp_s[is_newer],
+        timestamp_s=timestamp_s[is_newer],
         arrival_s=arrival_s[is_newer],
         position_m=source.position_m[is_newer].astype(np.float32).astype(np.float64),
         variance_m2=position_variance.astype(np.float64),
@@ -319,9 +319,9 @@ def _compute_output(
     gyro_bias_rad_s = np.einsum(
         "nij,nj->ni", segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:]
     )
-    attitude_steps_rad = -segment.correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
+    attitude_error_steps_rad = -segment.correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
     gyro_attitude_error_rad = state[0, THETA] + np.concatenate(
-        [np.zeros((1, 3)), np.cumsum(attitude_steps_rad, axis=0)]
+        [np.zeros((1, 3)), np.cumsum(attitude_error_steps_rad, axis=0)]
     )
     attitude_error_rad = gyro_attitude_error_rad + follow_attitude(
         state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.mean_step_s, inputs.horizon_s

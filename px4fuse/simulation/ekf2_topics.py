@@ -146,14 +146,14 @@ def _position_aid_topics(
     model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output, rate_hz: float
 ) -> tuple[Topic, ...]:
     """Make estimator_aid_src_* of the position source, with one message per usable position."""
-    events, run, received = model_run.events[0], model_run, model_inputs.received
+    events, received = model_run.events[0], model_inputs.received
     velocity_m_s = received.velocity_m_s
     logged_indices = output.logged_message_indices(events.usable, events.end_step, rate_hz)
     steps, sample_indices = events.end_step[logged_indices], events.sample[logged_indices]
     timestamps = output.timestamps(steps, events.time_s[logged_indices])
     measured_m = received.position_m[sample_indices, :2]
     north, east = measured_m.T
-    innovation_arrays = (run.innovation, run.innovation_variance, run.noise)
+    innovation_arrays = (model_run.innovation, model_run.innovation_variance, model_run.noise)
     innovation, innovation_variance, noise_variance = (
         values[logged_indices, 0, POSITION_COLUMNS] for values in innovation_arrays
     )
@@ -163,25 +163,27 @@ def _position_aid_topics(
         np.isnan(innovation[:, :1]),
         (
             measured_m - output.delayed_states[steps][:, POSITION][:, :2],
-            run.variance[logged_indices + 1, 0, HORIZONTAL_POSITION] + noise_variance,
+            model_run.variance[logged_indices + 1, 0, HORIZONTAL_POSITION] + noise_variance,
         ),
         (innovation, innovation_variance),
     )
     fused_us = np.where(
-        run.fused[logged_indices, 0] | run.reset[logged_indices, 0], output.time_us[steps], -1
+        model_run.fused[logged_indices, 0] | model_run.reset[logged_indices, 0],
+        output.time_us[steps],
+        -1,
     )
     newest_fused_us = np.maximum.accumulate(fused_us)
     last_fused_us = np.where(newest_fused_us >= 0, sensors.START_US + newest_fused_us, 0)
-    observed = north, east
+    observation = north, east
     if velocity_m_s is not None:
-        observed = unproject(north, east, sensors.HOME_POSITION[:2])
+        observation = unproject(north, east, sensors.HOME_POSITION[:2])
     position_topic = _aid_source_topic(
         model_inputs.aid,
         model_inputs.settings,
         timestamps | {"time_last_fuse": last_fused_us},
-        np.stack(observed, axis=1),
+        np.stack(observation, axis=1),
         (innovation, innovation_variance, noise_variance),
-        (run.rejected[logged_indices, 0], run.fused[logged_indices, 0]),
+        (model_run.rejected[logged_indices, 0], model_run.fused[logged_indices, 0]),
     )
     if velocity_m_s is None:
         return (position_topic,)
@@ -308,14 +310,16 @@ def _aid_source_topic(
 
 def _flags_topic(model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output) -> Topic:
     """Make estimator_status_flags: once a second, and when fusion starts or stops."""
-    events, run, time_s = model_run.events[0], model_run, model_run.segment.time_s
-    fusion_attempts = np.flatnonzero(run.fused[:, 0] | run.rejected[:, 0] | run.reset[:, 0])
+    events, time_s = model_run.events[0], model_run.segment.time_s
+    fusion_attempts = np.flatnonzero(
+        model_run.fused[:, 0] | model_run.rejected[:, 0] | model_run.reset[:, 0]
+    )
     is_fusing = np.zeros(len(time_s), np.bool_)
     next_attempts_s = np.append(time_s[events.end_step[fusion_attempts]], np.inf)[1:]
     for step, next_attempt_s in zip(
         events.end_step[fusion_attempts].tolist(), next_attempts_s.tolist(), strict=True
     ):
-        stop_s = time_s[step] + model_inputs.rules.stop_s
+        stop_s = time_s[step] + model_inputs.rules.stop_timeout_s
         is_fusing[step : int(np.searchsorted(time_s, min(next_attempt_s, stop_s)))] = True
     has_changed = np.diff(is_fusing.astype(int), prepend=0) != 0
     is_logged = has_changed | sensors.keep_at_rate(time_s, FLAGS_HZ)

@@ -1,4 +1,4 @@
-"""Simulated flights as PX4 topics, ULog or Flight, with the answers for the instructor."""
+"""Simulated flights as PX4 topics, ULog or Flight; injected faults and true values as answers."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -21,7 +21,7 @@ from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic, encode
 
 NO_MISTAKES = Mistakes()
-# Values of the PX4 parameters with which EKF2 fuses positions (GNSS: and velocities)
+# PX4 parameter values with which EKF2 fuses positions (GNSS: positions and velocities)
 FUSION_ON_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}
 # SDLOG_PROFILE that logs the topics of external vision
 PROFILE_WITH_VISION = 129

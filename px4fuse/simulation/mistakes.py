@@ -91,7 +91,7 @@ class Mistake:
     def usage(self) -> str:
         """Syntax of the values after the name of the fault, such as ``=PERCENT[,SIZE]``."""
         required, *optional = [
-            f"={BOUNDS_BY_FIELD[placeholder].cli_name}" for placeholder in self.size_fields
+            f"={BOUNDS_BY_FIELD[field_name].cli_name}" for field_name in self.size_fields
         ] or [""]
         return required + "".join(f"[,{placeholder[1:]}]" for placeholder in optional)
 
@@ -139,8 +139,8 @@ def parse_mistakes(texts: Iterable[str]) -> Mistakes:
                 f"--mistake {option_text} has too many values: give {name}{mistake.usage}."
             )
         value_by_field[mistake.fields[0]] = mistake.default
-        for field, value in zip(mistake.size_fields, typed_values, strict=False):
-            bounds = BOUNDS_BY_FIELD[field]
+        for field_name, value in zip(mistake.size_fields, typed_values, strict=False):
+            bounds = BOUNDS_BY_FIELD[field_name]
             typed_size = convert_to_unit(value, bounds.unit)
             if typed_size is None:
                 raise SettingsError(
@@ -148,7 +148,7 @@ def parse_mistakes(texts: Iterable[str]) -> Mistakes:
                     f"{UNIT_NAMES[bounds.unit]}, as in {name}{mistake.usage}."
                 )
             bounds.check(typed_size, f"--mistake {option_text}: {bounds.cli_name}")
-            value_by_field[field] = typed_size
+            value_by_field[field_name] = typed_size
     return Mistakes(**value_by_field)  # type: ignore[arg-type]
 
 
@@ -169,8 +169,8 @@ def format_mistake(name: str, mistakes: Mistakes) -> str:
     'nlos=5%,2m'
     """
     value_texts = [
-        f"{value:g}{_ASCII_UNITS.get(unit := BOUNDS_BY_FIELD[field].unit, unit)}"
-        for field in MISTAKES[name].size_fields
-        if (value := getattr(mistakes, field)) is not None
+        f"{value:g}{_ASCII_UNITS.get(unit := BOUNDS_BY_FIELD[field_name].unit, unit)}"
+        for field_name in MISTAKES[name].size_fields
+        if (value := getattr(mistakes, field_name)) is not None
     ]
     return f"{name}={','.join(value_texts)}" if value_texts else name

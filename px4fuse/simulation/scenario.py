@@ -187,7 +187,7 @@ class Scenario:
 
     @property
     def aid(self) -> Aid:
-        """Aiding source as which EKF2 fuses the positions."""
+        """Aiding source of EKF2 that fuses the positions."""
         return GNSS_POS if self.kind == "outdoor" else EV_POS
 
     @property

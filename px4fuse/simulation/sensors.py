@@ -32,7 +32,8 @@ MIN_LATENCY_S = 0.005
 POSITION_INTERVAL_JITTER = 0.02
 # Time (s) from the first data to the first position
 FIRST_POSITION_S = 0.1
-# Time (s) until PX4 stops using arrival times: 500 TIMESYNC replies at 10 Hz (Timesync.cpp)
+# Time (s) until PX4 uses the sender's timestamps instead of arrival times: 500 TIMESYNC replies at
+# 10 Hz (Timesync.cpp)
 TIMESYNC_CONVERGED_S = 50.0
 # Mean number of positions in a burst of outliers
 MEAN_OUTLIER_BURST_LENGTH = 3
@@ -74,8 +75,8 @@ Stream = IntEnum(
 )
 
 
-def random_stream(scenario: Scenario, name: Stream) -> np.random.Generator:
-    return np.random.default_rng([scenario.seed, name])
+def random_stream(scenario: Scenario, stream: Stream) -> np.random.Generator:
+    return np.random.default_rng([scenario.seed, stream])
 
 
 @dataclass(frozen=True)
@@ -351,10 +352,13 @@ def reported_sigma_m(scenario: Scenario, mistakes: Mistakes) -> float:
     return max(scenario.source_sigma_m, 0.01) * float(np.sqrt(mistakes.r_scale))
 
 
-def slow_error(scenario: Scenario, mistakes: Mistakes, count: int, interval_s: float) -> Array:
+def slow_error(
+    scenario: Scenario, mistakes: Mistakes, sample_count: int, interval_s: float
+) -> Array:
     """Simulate time-correlated noise (m), shape (n, 3): a first-order Gauss-Markov process."""
     noise_m = (
-        random_stream(scenario, Stream.SLOW).standard_normal((count, 3)) * mistakes.slow_error_m
+        random_stream(scenario, Stream.SLOW).standard_normal((sample_count, 3))
+        * mistakes.slow_error_m
     )
     decay_factor = np.exp(-interval_s / mistakes.slow_error_s)
     noise_m[1:] *= np.sqrt(1.0 - decay_factor**2)

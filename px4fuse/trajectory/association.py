@@ -80,7 +80,8 @@ def associate(
         reference_interval_s = median_interval(reference.time_s)
         if reference_interval_s > max(MIN_SPARSE_INTERVAL_S, 2.0 * estimate_interval_s):
             method, max_gap_s = "nearest", estimate_interval_s
-    time_s, (first_s, last_s) = estimate.time_s + time_offset_s, reference.time_s[[0, -1]]
+    time_s = estimate.time_s + time_offset_s
+    reference_start_s, reference_end_s = reference.time_s[[0, -1]]
     if method == "nearest":
         gap_limit_s = reference_end_tolerance_s = (
             MAX_NEAREST_DIFFERENCE_S if max_gap_s is None else max_gap_s
@@ -98,12 +99,13 @@ def associate(
         raise TrajectoryError(
             f"{estimate.name}: {len(pose_indices)} poses match in time. With the time offset "
             f"{time_offset_s:.12g} s, the estimate is from {time_s[0]:.3f} to {time_s[-1]:.3f} s; "
-            f"the reference {reference.name} is from {first_s:.3f} to {last_s:.3f} s.",
+            f"the reference {reference.name} is from {reference_start_s:.3f} to "
+            f"{reference_end_s:.3f} s.",
             "Check that both trajectories are of the same flight. If clocks differ, give "
             "`time_offset_s` auto.",
         )
-    is_outside = (time_s < first_s - reference_end_tolerance_s) | (
-        time_s > last_s + reference_end_tolerance_s
+    is_outside = (time_s < reference_start_s - reference_end_tolerance_s) | (
+        time_s > reference_end_s + reference_end_tolerance_s
     )
     outside_count = int(is_outside.sum())
     used_steps_s = np.diff(time_s[pose_indices])
@@ -116,7 +118,9 @@ def associate(
         outside=outside_count,
         in_gaps=pose_count - outside_count - used_count,
         coverage_estimate=used_count / pose_count,
-        coverage_reference=min(float(used_steps_s.sum() / (last_s - first_s)), 1.0),
+        coverage_reference=min(
+            float(used_steps_s.sum() / (reference_end_s - reference_start_s)), 1.0
+        ),
     )
     return estimate[pose_indices], matched_reference, association
 
@@ -127,7 +131,7 @@ def gap_limit(time_s: Array, min_limit_s: float = MIN_GAP_LIMIT_S) -> float:
 
 
 def is_bracketed(time_s: Array, reference_s: Array, gap_limit_s: float) -> BoolArray:
-    """Return a mask of times between two reference times that are at most ``gap_limit_s`` apart.
+    """Return a mask of times between two reference times with a gap of at most ``gap_limit_s``.
 
     Times that equal a reference time are included.
     """

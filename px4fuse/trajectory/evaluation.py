@@ -71,47 +71,49 @@ def find_frozen_poses(
 ) -> tuple[BoolArray, tuple[str, ...]]:
     """Return a mask of repeated positions while the reference moves, and warnings."""
     is_frozen, warnings = np.zeros(len(estimate), bool), []
-    is_new = np.r_[True, np.any(np.diff(estimate.position_m, axis=0) != 0.0, axis=1)]
-    for start, end in pairwise([*np.flatnonzero(is_new).tolist(), len(estimate)]):
-        start_s, end_s = estimate.time_s[[start, end - 1]].tolist()
+    is_new_position = np.r_[True, np.any(np.diff(estimate.position_m, axis=0) != 0.0, axis=1)]
+    for start_index, end_index in pairwise(
+        [*np.flatnonzero(is_new_position).tolist(), len(estimate)]
+    ):
+        start_s, end_s = estimate.time_s[[start_index, end_index - 1]].tolist()
         if end_s - start_s < MIN_FROZEN_S:
             continue
-        motion = reference.between(start_s + time_offset_s, end_s + time_offset_s).position_m
+        reference_position_m = reference.between(
+            start_s + time_offset_s, end_s + time_offset_s
+        ).position_m
         if (
-            len(motion)
-            and (motion_m := np.linalg.norm(np.ptp(motion, axis=0))) > MIN_FROZEN_MOTION_M
+            len(reference_position_m)
+            and (motion_m := np.linalg.norm(np.ptp(reference_position_m, axis=0)))
+            > MIN_FROZEN_MOTION_M
         ):
-            is_frozen[start + 1 : end] = True
+            is_frozen[start_index + 1 : end_index] = True
             warnings.append(
                 f"The position of {estimate.name} does not change from "
                 f"{start_s - estimate.time_s[0]:.1f} s to {end_s - estimate.time_s[0]:.1f} s after "
-                f"its start ({(end - start) / len(estimate):.0%} of the estimate), while the "
-                f"reference moves {motion_m:.1f} m. ATE and RPE exclude these poses."
+                f"its start ({(end_index - start_index) / len(estimate):.0%} of the estimate), "
+                f"while the reference moves {motion_m:.1f} m. ATE and RPE exclude these poses."
             )
     return is_frozen, tuple(warnings)
 
 
 def find_jumps(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
     """Return a warning if matched poses of the estimate jump and those of the reference do not."""
-    step_lengths_m = [
+    estimate_steps_m, reference_steps_m = (
         np.linalg.norm(np.diff(trajectory.position_m, axis=0), axis=1)
         for trajectory in (estimate, reference)
-    ]
-    differences_m = np.abs(step_lengths_m[0] - step_lengths_m[1])
+    )
+    differences_m = np.abs(estimate_steps_m - reference_steps_m)
     if not len(differences_m):
         return ()
-    is_jump = (differences_m > max(MIN_JUMP_M, MIN_JUMP_RATIO * np.median(differences_m))) & (
-        step_lengths_m[0] > step_lengths_m[1]
-    )
-    jump_indices = np.flatnonzero(is_jump)
+    min_jump_m = max(MIN_JUMP_M, MIN_JUMP_RATIO * np.median(differences_m))
+    jump_indices = np.flatnonzero(estimate_steps_m - reference_steps_m > min_jump_m)
     if not len(jump_indices):
         return ()
     times_s = estimate.time_s[jump_indices + 1] - estimate.time_s[0]
     times_text = ", ".join(f"{time_s:.1f}" for time_s in times_s[:MAX_STATED_JUMPS])
-    starts_m = estimate.position_m[0], np.zeros(3)
     distances_m = [
-        np.linalg.norm(estimate.position_m[jump_indices + 1] - start_m, axis=1)
-        for start_m in starts_m
+        np.linalg.norm(estimate.position_m[jump_indices + 1] - origin_m, axis=1)
+        for origin_m in (estimate.position_m[0], 0.0)
     ]
     cause_text = "The SLAM system probably lost track or relocalised."
     if np.min(distances_m) < MAX_RESTART_DISTANCE_M:
@@ -127,9 +129,9 @@ def has_other_body_axes(aligned_estimate: Trajectory, reference: Trajectory) -> 
     """Return True if the orientations are of different body axes, such as those of a camera."""
     if aligned_estimate.rotation is None or reference.rotation is None:
         return False
-    difference = aligned_estimate.rotation.inv() * reference.rotation
-    mean_difference = difference.mean()
-    deviation_rad = (mean_difference.inv() * difference).magnitude()
+    rotation_difference = aligned_estimate.rotation.inv() * reference.rotation
+    mean_difference = rotation_difference.mean()
+    deviation_rad = (mean_difference.inv() * rotation_difference).magnitude()
     return bool(
         mean_difference.magnitude() > MIN_BODY_ROTATION_RAD
         and np.sqrt(np.mean(deviation_rad**2)) < MAX_BODY_DEVIATION_RAD
@@ -385,41 +387,46 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
 
 
 def _choose_time_offset(
-    estimate: Trajectory, reference: Trajectory, given_s: float | Literal["auto"] | None
+    estimate: Trajectory, reference: Trajectory, given_offset_s: float | Literal["auto"] | None
 ) -> tuple[TimeOffset, list[str]]:
     """Choose the offset to add to the timestamps of the estimate; also return warnings."""
-    is_given = isinstance(given_s, float | int)
+    is_given = isinstance(given_offset_s, float | int)
     clock_offset_s = clock_difference(estimate, reference)
-    if isinstance(given_s, float | int):
-        clock_offset_s = given_s
+    if isinstance(given_offset_s, float | int):
+        clock_offset_s = given_offset_s
     clock_text = "the UNIX time of both files" if clock_offset_s else "unchanged timestamps"
-    added_s = clock_offset_s or 0.0
-    offset = TimeOffset(
-        offset_s=added_s,
+    added_offset_s = clock_offset_s or 0.0
+    default_offset = TimeOffset(
+        offset_s=added_offset_s,
         is_determinable=True,
         reason="The user chose the time offset."
         if is_given
         else f"Poses are matched by {clock_text}.",
     )
-    start_s, end_s = estimate.time_s[[0, -1]] + added_s
+    start_s, end_s = estimate.time_s[[0, -1]] + added_offset_s
     is_disjoint = start_s > reference.time_s[-1] or end_s < reference.time_s[0]
     # The boot clock of a flight log and the clock of a trajectory file are unrelated
     are_clocks_unrelated = clock_offset_s is None and estimate.is_of_log != reference.is_of_log
-    is_estimated = given_s == "auto" or is_disjoint
+    is_estimated = given_offset_s == "auto" or is_disjoint
     if is_given or not (is_estimated or are_clocks_unrelated):
-        return offset, []
-    estimated = estimate_time_offset(estimate, reference)
+        return default_offset, []
+    estimated_offset = estimate_time_offset(estimate, reference)
     if is_estimated:
-        if estimated.is_determinable:
-            return estimated, []
-        fallback = structs.replace(offset, is_determinable=False, reason=estimated.reason)
-        return fallback, [f"{estimated.reason} Instead, poses are matched by {clock_text}."]
-    low_s, high_s = estimated.interval_s or (0.0, 0.0)
-    if low_s <= 0.0 <= high_s or abs(estimated.offset_s or 0.0) < MIN_DOUBTFUL_OFFSET_S:
-        return offset, []
-    return offset, [
-        f"The timestamps are unchanged, but the motions match best with {estimated.offset_s:+.3f} "
-        "s added to the timestamps of the estimate. For unrelated clocks, give --time-offset auto."
+        if estimated_offset.is_determinable:
+            return estimated_offset, []
+        fallback_offset = structs.replace(
+            default_offset, is_determinable=False, reason=estimated_offset.reason
+        )
+        return fallback_offset, [
+            f"{estimated_offset.reason} Instead, poses are matched by {clock_text}."
+        ]
+    low_s, high_s = estimated_offset.interval_s or (0.0, 0.0)
+    if low_s <= 0.0 <= high_s or abs(estimated_offset.offset_s or 0.0) < MIN_DOUBTFUL_OFFSET_S:
+        return default_offset, []
+    return default_offset, [
+        "The timestamps are unchanged, but the motions match best with "
+        f"{estimated_offset.offset_s:+.3f} s added to the timestamps of the estimate. For "
+        "unrelated clocks, give --time-offset auto."
     ]
 
 
@@ -503,9 +510,9 @@ def _move_to_reference_body(
     assert reference.rotation is not None
     reference_axes = reference.rotation.as_matrix()
     centred_axes = (reference_axes - reference_axes.mean(axis=0)).reshape(-1, 3)
-    corrected = estimate
+    corrected_estimate = estimate
     for _ in range(LEVER_ARM_ITERATIONS):
-        transform = fit_alignment(corrected.position_m, reference.position_m, alignment)
+        transform = fit_alignment(corrected_estimate.position_m, reference.position_m, alignment)
         # chordal mean (Hartley 2013, section 5.3)
         body_rotation = ((transform.rotation * estimate.rotation).inv() * reference.rotation).mean()
         error_m = transform.apply(estimate.position_m) - reference.position_m
@@ -513,15 +520,15 @@ def _move_to_reference_body(
         lever_arm_m = np.linalg.lstsq(centred_axes, centred_error_m, rcond=None)[0]
         rotation = estimate.rotation * body_rotation
         position_m = estimate.position_m - rotation.apply(lever_arm_m) / transform.scale
-        corrected = replace(estimate, position_m=position_m, rotation=rotation)
+        corrected_estimate = replace(estimate, position_m=position_m, rotation=rotation)
     lever_arm_text = ", ".join(
         f"{value:+.2f} m along {axis}" for value, axis in zip(lever_arm_m, "xyz", strict=True)
     )
-    return corrected, (
+    return corrected_estimate, (
         f"The orientations differ by a constant {np.degrees(body_rotation.magnitude()):.1f}°: the "
         "estimate has other body axes than the reference, for example those of a camera. The "
-        f"position of the estimate is {lever_arm_text} of the reference body. The errors are "
-        "computed after a correction of rotation and position.",
+        f"origin of the estimate is displaced by {lever_arm_text} of the reference body. Both "
+        "differences are removed before the errors are computed.",
     )
 
 

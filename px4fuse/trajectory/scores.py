@@ -185,27 +185,29 @@ def find_pairs(
         raise SettingsError(f"RPE delta {delta}: the value must be positive.")
     pose_count = len(time_s)
     if delta.unit == "frames":
-        step = int(delta.value)
-        if step != delta.value:
+        frame_step = int(delta.value)
+        if frame_step != delta.value:
             raise SettingsError(f"RPE delta {delta}: the number of frames must be an integer.")
-        start_indices = np.arange(0, max(pose_count - step, 0), 1 if all_pairs else step)
-        return start_indices, start_indices + step
+        start_indices = np.arange(
+            0, max(pose_count - frame_step, 0), 1 if all_pairs else frame_step
+        )
+        return start_indices, start_indices + frame_step
     distance_or_time = cumulative_distance(position_m) if delta.unit == "m" else time_s - time_s[0]
     if not all_pairs:
         return _consecutive_pairs(np.diff(distance_or_time), delta.value)
     start_indices = np.arange(pose_count - 1)
     # Neighbours of the nearest pose are tested, too, because of rounding errors
-    nearest_guess = np.searchsorted(distance_or_time, distance_or_time + delta.value)[:-1]
-    candidates = np.clip(
-        nearest_guess[:, None] + np.arange(-2, 2), start_indices[:, None] + 1, pose_count - 1
+    nearest_indices = np.searchsorted(distance_or_time, distance_or_time + delta.value)[:-1]
+    candidate_indices = np.clip(
+        nearest_indices[:, None] + np.arange(-2, 2), start_indices[:, None] + 1, pose_count - 1
     )
     distance_error = np.abs(
-        distance_or_time[candidates] - distance_or_time[start_indices, None] - delta.value
+        distance_or_time[candidate_indices] - distance_or_time[start_indices, None] - delta.value
     )
     best_columns = np.argmin(distance_error, axis=1)
     # If several poses have an equal distance (at rest), the first is used
     first_equal_indices = np.searchsorted(
-        distance_or_time, distance_or_time[candidates[start_indices, best_columns]]
+        distance_or_time, distance_or_time[candidate_indices[start_indices, best_columns]]
     )
     is_near = distance_error[start_indices, best_columns] <= DELTA_TOLERANCE * delta.value
     return start_indices[is_near], np.maximum(first_equal_indices, start_indices + 1)[is_near]
@@ -270,8 +272,10 @@ def relative_error(
         rotation_deg = rotation_statistics(reference_turn, estimated_turn)
     # The rotation Q_j⁻¹ Q_i in E does not change the length of the translation
     translation_m = np.linalg.norm(motions[0] - motions[1], axis=1)
-    overlap_count = int(np.median(end_indices - start_indices)) if all_pairs else 1
-    interval_m = rmse_interval(translation_m, analysis_name, min_block=overlap_count)
+    overlapping_pair_count = int(np.median(end_indices - start_indices)) if all_pairs else 1
+    interval_m = rmse_interval(
+        translation_m, analysis_name, min_block_length=overlapping_pair_count
+    )
     return RelativeError(
         delta.value,
         delta.unit,
@@ -298,18 +302,20 @@ def get_rotations(
 
 
 def rmse_interval(
-    errors: Array, analysis_name: str, *, min_block: int = 1
+    errors: Array, analysis_name: str, *, min_block_length: int = 1
 ) -> Interval | Unavailable:
     """Compute the 95 % interval of the RMSE of correlated errors by circular block bootstrap.
 
     The method is that of Politis & Romano (1992), with blocks of three integrated autocorrelation
     times. Percentiles are widened for a small number of blocks (Hesterberg 2015, section 5.3).
-    ``min_block`` is the number of pairs that overlap, because overlap correlates errors.
+    ``min_block_length`` is the number of pairs that overlap, because overlap correlates errors.
     """
-    squares = errors**2
-    error_count = len(squares)
+    squared_errors = errors**2
+    error_count = len(squared_errors)
     block_length = max(
-        int(np.ceil(BLOCK_CORRELATION_TIMES * autocorrelation_time(squares))), min_block, 1
+        int(np.ceil(BLOCK_CORRELATION_TIMES * autocorrelation_time(squared_errors))),
+        min_block_length,
+        1,
     )
     if error_count < MIN_BOOTSTRAP_BLOCKS * block_length:
         return Unavailable(
@@ -318,11 +324,11 @@ def rmse_interval(
             f"fewer than {MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks",
             "Use a longer flight.",
         )
-    cumulative_squares = np.concatenate(
-        ([0.0], np.cumsum(np.concatenate((squares, squares[: block_length - 1]))))
+    cumulative_squared_errors = np.concatenate(
+        ([0.0], np.cumsum(np.concatenate((squared_errors, squared_errors[: block_length - 1]))))
     )
     block_means = (
-        cumulative_squares[block_length:] - cumulative_squares[:-block_length]
+        cumulative_squared_errors[block_length:] - cumulative_squared_errors[:-block_length]
     ) / block_length  # mean squared error of each circular block
     block_count = error_count / block_length
     block_starts = np.random.default_rng(BOOTSTRAP_SEED).integers(
@@ -348,9 +354,12 @@ def autocorrelation_time(values: Array) -> float:
     sample_count = len(centred_values)
     covariance_by_lag = autocovariance(centred_values)
     correlation_times = 2.0 * np.cumsum(covariance_by_lag / covariance_by_lag[0]) - 1.0
-    long_windows = np.flatnonzero(
+    sufficient_windows = np.flatnonzero(
         np.arange(sample_count) >= WINDOW_CORRELATION_TIMES * correlation_times
     )
     return max(
-        1.0, float(correlation_times[long_windows[0]] if len(long_windows) else sample_count)
+        1.0,
+        float(
+            correlation_times[sufficient_windows[0]] if len(sufficient_windows) else sample_count
+        ),
     )

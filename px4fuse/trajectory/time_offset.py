@@ -183,7 +183,7 @@ def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]
 
 
 def _smooth(grid_values: Array, time_s: Array, step_s: float, order: int = 0) -> Array:
-    """Smooth values on a time grid, or return their derivative (order 1) by grid steps."""
+    """Smooth values on a time grid; with order 1, return their derivative per grid step."""
     sigma_samples = max(SMOOTHING_S, median_interval(time_s)) / step_s
     return np.asarray(gaussian_filter1d(grid_values, sigma_samples, axis=0, order=order))
 
@@ -278,7 +278,7 @@ class _OffsetFit:
 
 
 def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _OffsetFit) -> float:
-    """Compute the half-width (s) of the 95 % interval.
+    """Compute the half-width (s) of the 95 % interval of the time offset.
 
     The half-width is infinite if a shift, a rotation or another scale of the trajectory has the
     same effect as a time offset.
@@ -312,13 +312,13 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
     lag_count = min(
         max(1, WINDOW_CORRELATION_LENGTHS * _correlation_length(likelihood_score)), pose_count // 4
     )
-    weights = 1.0 - np.arange(1, lag_count + 1) / (lag_count + 1.0)
+    lag_weights = 1.0 - np.arange(1, lag_count + 1) / (lag_count + 1.0)
     lagged_products = [
         float(likelihood_score[k:] @ likelihood_score[:-k]) for k in range(1, lag_count + 1)
     ]
     uncorrelated_variance = float(likelihood_score @ likelihood_score)
     score_variance = max(
-        uncorrelated_variance + 2.0 * float(weights @ lagged_products), uncorrelated_variance
+        uncorrelated_variance + 2.0 * float(lag_weights @ lagged_products), uncorrelated_variance
     )
     quantile = float(stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.5 + CONFIDENCE_LEVEL / 2.0))
     return float(quantile * np.sqrt(score_variance) / information)
@@ -326,8 +326,8 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
 
 def _correlation_length(values: Array) -> int:
     """Return the first lag with autocorrelation below 1/e, at most n / 4."""
-    covariance = autocovariance(values - values.mean())
-    low_lags = np.flatnonzero(covariance < covariance[0] / np.e)
+    covariance_by_lag = autocovariance(values - values.mean())
+    low_lags = np.flatnonzero(covariance_by_lag < covariance_by_lag[0] / np.e)
     return int(low_lags[0]) if len(low_lags) else len(values) // 4
 
 

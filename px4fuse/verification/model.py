@@ -63,6 +63,8 @@ class Verification:
         analysis was not repeated.
     remedy : str
         Action of the user if the report was not verified.
+    missing : str
+        Name of a missing log or other input file.
     """
 
     status: Status
@@ -73,6 +75,7 @@ class Verification:
     pages: tuple[PageDifference, ...] = ()
     redrawn_pdf: bytes = field(default=b"", repr=False)
     remedy: str = ""
+    missing: str = ""
 
     @property
     def outcome(self) -> str:

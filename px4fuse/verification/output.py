@@ -16,7 +16,7 @@ SCHEMA = {"name": "px4fuse-verification", "version": "3.0"}
 def verdict_data(pdf: bytes, verification: Verification) -> dict[str, object]:
     """Return the JSON output of ``px4fuse verify``."""
     values = asdict(verification)
-    for name in ("redrawn_pdf", "remedy"):  # only px4fuse grade uses these fields
+    for name in ("redrawn_pdf", "remedy", "missing"):  # only px4fuse grade uses these fields
         del values[name]
     return {
         "schema": SCHEMA,

@@ -94,7 +94,7 @@ _LinkFile = Callable[[str, str | None, str], str]
 
 
 class NotRepeatableError(Exception):
-    """Error of an analysis that cannot be repeated; arguments: reason and remedy."""
+    """Error of an analysis that cannot be repeated; arguments: reason, remedy, missing file."""
 
 
 def log_sha256(results: ReportedResults) -> str:
@@ -147,7 +147,7 @@ def _link_file(
     if path is None:
         missing_name = one_line(name, 80) or "the file"
         reason = f"none of the given files has the SHA-256 of {file_label}"
-        raise NotRepeatableError(reason, f"Add {missing_name} to --logs.")
+        raise NotRepeatableError(reason, f"Add {missing_name} to --logs.", missing_name)
     if name != Path(name).name or name == ".." or "\\" in name or not name.isprintable():
         reason = f"{FOREIGN_REQUEST_REASON}: it contains a path instead of a file name"
         raise NotRepeatableError(reason, ASK_AUTHOR_REMEDY)
@@ -212,10 +212,10 @@ def _draw_report(
     analysis: object, results: ReportedResults, submitted_provenance: Provenance
 ) -> bytes:
     """Draw the report with the library versions that the submitted report states."""
-    from px4fuse.report.pdf import render  # noqa: PLC0415
+    from px4fuse.report.pdf import render_pdf  # noqa: PLC0415
 
     new_provenance = replace(submitted_provenance, command=results.provenance.command)
-    return render(analysis, replace(results, provenance=new_provenance), to_json(results))
+    return render_pdf(analysis, replace(results, provenance=new_provenance), to_json(results))
 
 
 # ------------------------------------------------------------------ the verdict
@@ -253,13 +253,13 @@ def verify(
         return cannot_verify(reason, f"Verify the report with px4fuse {report_version}.")
     log_file_name = one_line(log_name(results), 80) or "the log"
     if not logs:
-        return cannot_verify(NO_LOG_REASON, f"Add {log_file_name} to --logs.")
+        return cannot_verify(NO_LOG_REASON, f"Add {log_file_name} to --logs.", log_file_name)
     sha256 = log_sha256(results)
     if sha256 not in logs:
         expected_hash = one_line(sha256, 64) or "none"
         reason = f"the given files do not contain the log (SHA-256 {expected_hash})"
         remedy = f"If the log is yours, add {log_file_name} to --logs."
-        return Verification("other log", (reason,), False, remedy=remedy)
+        return Verification("other log", (reason,), False, remedy=remedy, missing=log_file_name)
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"the student's notes have more than {MAX_NOTES_LINES} lines"
         return cannot_verify(reason, ASK_AUTHOR_REMEDY)
@@ -269,8 +269,10 @@ def verify(
     return _verify_with_log(results, pdf, *recomputed)
 
 
-def cannot_verify(reason: str, remedy: str = "") -> Verification:
-    return Verification("cannot verify", (one_line(reason, 400),), False, remedy=remedy)
+def cannot_verify(reason: str, remedy: str = "", missing_input: str = "") -> Verification:
+    """Return the verdict "cannot verify", with the reason and the name of a missing input file."""
+    reasons = (one_line(reason, 400),)
+    return Verification("cannot verify", reasons, False, remedy=remedy, missing=missing_input)
 
 
 def _verify_with_log(

@@ -39,7 +39,7 @@ if __name__ == "__main__":
     outcome = grade([reports], Course(read_rubric(rubric), logs=[logs]), output)
     print(json.dumps({
         "reports": len(outcome.graded),
-        "verified": sum(one.verdict.status == "verified" for one in outcome.graded),
+        "verified": sum(one.verification.status == "verified" for one in outcome.graded),
         "seconds": time.perf_counter() - start,
         "reused": outcome.reused,
         "parent_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,

@@ -542,7 +542,7 @@ def run_command(
             stack.enter_context(warnings.catch_warnings())
             warnings.simplefilter("error")
             if not draw:
-                stack.enter_context(mock.patch.object(pdf, "render", blank_page))
+                stack.enter_context(mock.patch.object(pdf, "render_pdf", blank_page))
             done = CliRunner().invoke(cli, words)
     except TookTooLongError as error:
         outcome.add_fault("limits", f"{where}: more than {SLOW_S:.0f} s ({place_of(error)})")

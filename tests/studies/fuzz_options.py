@@ -243,7 +243,7 @@ def run_once(name: str, rng: random.Random, out: Path) -> tuple[str, str]:
         for module in (grading, workers):
             stack.enter_context(mock.patch.object(module, "run_with_limits", run_in_turn))
         if rng.random() > DRAWN_SHARE:
-            stack.enter_context(mock.patch.object(pdf, "render", blank_page))
+            stack.enter_context(mock.patch.object(pdf, "render_pdf", blank_page))
         done = CliRunner().invoke(cli, words)
     failure = done.exception
     if isinstance(failure, Px4FuseError):

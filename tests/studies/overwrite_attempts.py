@@ -81,7 +81,7 @@ def main() -> None:
     counts: dict[str, Counter[str]] = {case.command: Counter() for case in every}
     with (
         tempfile.TemporaryDirectory() as folder,
-        mock.patch("px4fuse.report.pdf.render", blank_page),
+        mock.patch("px4fuse.report.pdf.render_pdf", blank_page),
     ):
         desk = make_desk(Path(folder, "desk"))
         before = file_hashes(desk)

@@ -111,7 +111,7 @@ class CheckInput:
     """
 
     results: ReportedResults
-    verdict: Verification
+    verification: Verification
     key: AnswerKey | None
     submitter_id: str = ""
 
@@ -126,7 +126,7 @@ class CheckInput:
         return dict(flatten(to_json_dict(self.results)))
 
     @cached_property
-    def answer(self) -> RightAnswers | None:
+    def right_answers(self) -> RightAnswers | None:
         """Right answers for the log of the report; None if the log was not assigned."""
         return None if self.key is None else self.key.of_log(log_sha256(self.results))
 
@@ -169,7 +169,7 @@ class CheckInput:
     def form_points(self) -> FormPoints | str:
         """Points of the answer form, or the reason why the form has no points."""
         assigned_answer = self.assigned_answer
-        if self.answer is None or (assigned_answer and not self.is_own_log):
+        if self.right_answers is None or (assigned_answer and not self.is_own_log):
             file_text = format_reason(assigned_answer.file if assigned_answer else "")
             return (
                 f"this report is not about the log that you were given{file_text}. Make a "
@@ -177,9 +177,9 @@ class CheckInput:
             )
         if isinstance(self.form, str):
             return self.form
-        if self.answer.form is None:
+        if self.right_answers.form is None:
             return "the answer key contains no right answers for this log"
-        return form_points(self.form, self.answer.form)
+        return form_points(self.form, self.right_answers.form)
 
     def has_finding(self, *ids: str) -> bool:
         return any(finding.id in ids for finding in self.results.findings)
@@ -223,9 +223,10 @@ class VerifiedItem(RubricItem, frozen=True, tag="verified"):
     """Check that the numbers of the report agree with a re-run of the analysis on its log."""
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
-        verdict = check_input.verdict
-        reason_text = format_reason("".join(verdict.reasons[:1]))
-        return float(verdict.status == "verified"), f"Verification: {verdict.status}{reason_text}."
+        verification = check_input.verification
+        reason_text = format_reason("".join(verification.reasons[:1]))
+        is_verified = verification.status == "verified"
+        return float(is_verified), f"Verification: {verification.status}{reason_text}."
 
 
 class NumberItem(RubricItem, frozen=True, tag="number"):
@@ -387,7 +388,7 @@ class ConsistencyItem(
         nis_result = check_input.comparison.horizontal.get("kf")
         if not isinstance(nis_result, HorizontalNis):
             reason_text = check_input.missing_reason(f"{HORIZONTAL}.kf")
-            return 0.0, f"Your report has no verdict on KF{reason_text}."
+            return 0.0, f"Your report has no consistency verdict on KF{reason_text}."
         if nis_result.verdict == "consistent":
             return 1.0, "KF is consistent."
         direction = "small" if nis_result.nis_mean > 1.0 else "large"
@@ -432,7 +433,7 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
             reason_text = format_reason(clock.reason or "")
             statement = f"The time offset cannot be estimated from your flight{reason_text}."
             # the student could not choose the flight if the log was assigned
-            return 1.0 if check_input.answer is not None else fraction, statement
+            return 1.0 if check_input.right_answers is not None else fraction, statement
         (low, high), applied_s = clock.interval_s, clock.applied_s
         statement = (
             f"You applied a time offset of {applied_s:.3f} s. The 95 % interval of the estimate is "
@@ -471,8 +472,9 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
         loop = check_input.results.loop
         closures = loop.closures if isinstance(loop, Loop) else ()
         is_accepted = any(closure.accepted for closure in closures)
-        answer = check_input.answer
-        landing_distance_m = answer.true_values.get("closure_error_m", 0.0) if answer else 0.0
+        right_answers = check_input.right_answers
+        true_values = right_answers.true_values if right_answers else {}
+        landing_distance_m = true_values.get("closure_error_m", 0.0)
         if landing_distance_m > MAX_LANDING_DISTANCE_M and not is_accepted:
             return 1.0, (
                 f"Your vehicle landed {format_length(landing_distance_m)} from the take-off place, "

@@ -149,10 +149,10 @@ def _entry_details(entry: Entry) -> Iterator[Section]:
         yield frame.list_section("Missing", ["No submission."])
         yield comment
         return
-    verdict = report.verdict
+    verification = report.verification
     differences = [
         (difference.path, difference.recorded, difference.recomputed)
-        for difference in verdict.differences
+        for difference in verification.differences
     ]
     items = [
         (
@@ -173,7 +173,7 @@ def _entry_details(entry: Entry) -> Iterator[Section]:
     yield frame.list_section("Flags", entry.flags, is_warning=True)
     actions = [report.instructor_action] if report.instructor_action else []
     yield frame.list_section("Required decision of the instructor", actions, is_warning=True)
-    yield frame.list_section("Verification", verdict.reasons)
+    yield frame.list_section("Verification", verification.reasons)
     titles = ("Value", "Report", "New run") if differences else ()
     yield frame.table_section("Numbers that differ in the new run", titles, differences)
     title = "Points (proposed)" if report.instructor_action else "Points"

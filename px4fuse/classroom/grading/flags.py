@@ -34,10 +34,10 @@ MAX_LISTED_REPORTS = 4
 Pairs = Iterator[tuple[GradedReport, GradedReport]]
 
 
-def flag_pages(verdict: Verification) -> Iterator[str]:
+def flag_pages(verification: Verification) -> Iterator[str]:
     """Yield a flag with the first difference between a PDF and the redrawn report, if any."""
-    if verdict.pages:
-        first_difference, *further_differences = verdict.pages
+    if verification.pages:
+        first_difference, *further_differences = verification.pages
         count = len(further_differences)
         more_text = f" The PDF has {count} more differences." if count else ""
         yield (
@@ -152,7 +152,7 @@ EQUAL_CONTENT_CHECKS: tuple[
     (
         "The report has the numbers of {}, but another SHA-256 of the log: it is a copy.",
         lambda report: (
-            report.verdict.status == "verified"
+            report.verification.status == "verified"
             and len(report.numbers) >= MIN_SAME_NUMBERS
             and tuple(report.numbers.values())
         ),

@@ -139,11 +139,11 @@ def grade_submission(
     try:
         content = submissions.read_submission(submission)
         sha256 = hashlib.sha256(content).hexdigest()
-        results, verdict, is_loaded = load_or_verify(
+        results, verification, is_loaded = load_or_verify(
             records, content, path_by_sha256, assigned_hashes
         )
     except ResultsError as error:
         graded_report = grade_unreadable(rubric, key, f"{error.reason}.", error.remedy)
     else:
-        graded_report = score_report(results, verdict, rubric, key, submitter_id)
+        graded_report = score_report(results, verification, rubric, key, submitter_id)
     return replace(graded_report, sha256=sha256), is_loaded

@@ -109,7 +109,7 @@ class GradedReport:
     submission: str
     student: str
     student_id: str
-    verdict: Verification
+    verification: Verification
     items: tuple[Item, ...] = ()
     flags: tuple[str, ...] = ()
     instructor_action: str = ""
@@ -126,7 +126,7 @@ class GradedReport:
     @property
     def status(self) -> str:
         """Status of the verification; "page differs" if only pages differ."""
-        return self.verdict.outcome
+        return self.verification.outcome
 
     @property
     def points(self) -> float:

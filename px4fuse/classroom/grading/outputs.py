@@ -79,7 +79,7 @@ LAST_COLUMNS = (
     "log SHA-256",
 )
 LIST_SEPARATOR = " | "
-# Maximum number of reasons for a verdict that the feedback for a student lists
+# Maximum number of reasons in the feedback why a report was not verified
 MAX_REASONS = 4
 # Titles of grade columns in tables of learning platforms, as lower-case letters and digits
 GRADE_TITLES = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
@@ -222,7 +222,7 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
             "",
             "",
             "",
-            replace(report.verdict, reasons=(), differences=()),
+            replace(report.verification, reasons=(), differences=()),
             tuple(replace(item, comment="") for item in report.items),
             instructor_action=report.instructor_action
             and "The instructor has to decide on the points.",
@@ -273,7 +273,7 @@ def class_table_csv(entries: Sequence[Entry]) -> str:
             entry.comment,
             LIST_SEPARATOR.join(entry.flags),
             LIST_SEPARATOR.join(other_report.submission for other_report in entry.other_reports),
-            LIST_SEPARATOR.join(report.verdict.reasons) if report else "",
+            LIST_SEPARATOR.join(report.verification.reasons) if report else "",
             report.log_sha256 if report else "",
         ]
         cells = [
@@ -292,7 +292,7 @@ def class_table_csv(entries: Sequence[Entry]) -> str:
 def feedback_text(entry: Entry, class_name: str = "") -> str:
     """Format the feedback for one student, without the flags for the instructor."""
     report = entry.counted_report
-    reasons = report.verdict.reasons[:MAX_REASONS] if report else ()
+    reasons = report.verification.reasons[:MAX_REASONS] if report else ()
     text = load_template("classroom/grading/feedback.j2").render(
         entry=entry,
         report=report,

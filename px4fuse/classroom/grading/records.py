@@ -40,7 +40,7 @@ class VerificationRecord:
 
     dependencies: dict[str, str]
     results: str
-    verdict: Verification
+    verification: Verification
 
 
 def load_or_verify(
@@ -64,7 +64,7 @@ def load_or_verify(
     results : ComparisonResults or LoopResults
         Results attached to the PDF; for a verified report on an assigned log, the results with
         px4fuse's diagnosis.
-    verdict : Verification
+    verification : Verification
     is_loaded : bool
         True if a stored verification was loaded.
 
@@ -78,16 +78,16 @@ def load_or_verify(
         return *loaded, True
     results = read_report(pdf, "The file")
     dependencies = _dependencies(to_json(results), path_by_sha256, assigned_hashes)
-    # the verdict is "cannot verify" instead of "other log" if an assigned log is not available
+    # the status is "cannot verify" instead of "other log" if an assigned log is not available
     is_log_missing = dependencies.get(log_sha256(results)) == "assigned"
-    verdict = verify(results, pdf, {} if is_log_missing else path_by_sha256)
-    files = {REDRAWN_SUFFIX: verdict.redrawn_pdf} if verdict.redrawn_pdf else {}
-    if verdict.status == "verified" and log_sha256(results) in assigned_hashes:
+    verification = verify(results, pdf, {} if is_log_missing else path_by_sha256)
+    files = {REDRAWN_SUFFIX: verification.redrawn_pdf} if verification.redrawn_pdf else {}
+    if verification.status == "verified" and log_sha256(results) in assigned_hashes:
         results, files[DIAGNOSIS_SUFFIX] = diagnose_assigned(results, path_by_sha256)
-    stored_verdict = replace(verdict, redrawn_pdf=b"")
-    record = VerificationRecord(dependencies, to_json(results), stored_verdict)
+    stored_verification = replace(verification, redrawn_pdf=b"")
+    record = VerificationRecord(dependencies, to_json(results), stored_verification)
     _write_record(records, sha256, record, files)
-    return results, stored_verdict, False
+    return results, stored_verification, False
 
 
 def diagnose_assigned(
@@ -149,4 +149,4 @@ def _load_record(
     # if the stored verification cannot be read, the report is verified again
     except (OSError, msgspec.MsgspecError, ResultsError):
         return None
-    return (results, record.verdict) if isinstance(results, ReportedResults) else None
+    return (results, record.verification) if isinstance(results, ReportedResults) else None

@@ -134,7 +134,7 @@ OTHER_FORM_ADVICE = (
 
 def score_report(
     results: ReportedResults,
-    verdict: Verification,
+    verification: Verification,
     rubric: Rubric,
     key: AnswerKey | None,
     submitter_id: str = "",
@@ -144,7 +144,7 @@ def score_report(
     ``submitter_id`` is the student id according to the learning platform. It takes precedence over
     the id in the report.
     """
-    check_input = CheckInput(results, verdict, key, submitter_id)
+    check_input = CheckInput(results, verification, key, submitter_id)
     points_rule, rule_text = _points_rule(check_input, rubric)
     student, command = results.student, "loop" if isinstance(results, LoopResults) else "compare"
     graded_items = []
@@ -166,10 +166,10 @@ def score_report(
         "",
         student.name,
         student.id,
-        verdict,
+        verification,
         tuple(graded_items),
         flags=(
-            *flag_pages(verdict),
+            *flag_pages(verification),
             *flag_settings(results, key is not None),
             *([] if check_input.is_own_log else [_foreign_log_advice(check_input)]),
             *([OTHER_FORM_ADVICE] if check_input.has_form_of_other_log else []),
@@ -194,18 +194,20 @@ def _points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, s
 
     Return the rule, with the reason for zero points or the action of the instructor.
     """
-    verdict = check_input.verdict
-    first_reason = format_reason("".join(verdict.reasons[:1]))
-    if verdict.status == "numbers differ":
+    verification = check_input.verification
+    first_reason = format_reason("".join(verification.reasons[:1]))
+    if verification.status == "numbers differ":
         return "zero", f"the numbers of your report differ from those of its log{first_reason}"
     # problems of the report: rule of the rubric, reason for the student, action of the instructor
     problems: list[tuple[PointsRule, str, str]] = []
-    if verdict.status != "verified":
-        action = verdict.remedy or f"Check the report by hand: it was not verified{first_reason}."
+    if verification.status != "verified":
+        action = (
+            verification.remedy or f"Check the report by hand: it was not verified{first_reason}."
+        )
         problems.append(
             (rubric.unverified, f"your report could not be verified{first_reason}", action)
         )
-    elif verdict.page_status == "differ":
+    elif verification.page_status == "differ":
         reason_text = "pages of your PDF differ from those that px4fuse draws from the log"
         problems.append((rubric.pages, reason_text, "Compare the pages with the redrawn report."))
     if not check_input.is_own_log:
@@ -232,9 +234,9 @@ def _foreign_log_advice(check_input: CheckInput) -> str:
     id_text = f"the id in the report is {student_id}" if student_id else "the report has no id"
     if check_input.submitter_id:
         id_text += f", and {shorten_text(check_input.submitter_id)} submitted the report"
-    if check_input.answer is None:
+    if check_input.right_answers is None:
         return "The report is not about a log of the answer key. Ask for a report on that log."
-    given_to = shorten_text(check_input.answer.student_id)
+    given_to = shorten_text(check_input.right_answers.student_id)
     return f"Ask who wrote the report: its log was assigned to student {given_to}, but {id_text}."
 
 
@@ -243,10 +245,10 @@ def grade_unreadable(
 ) -> GradedReport:
     """Return a graded report with zero points, for a file that is not a report."""
     comment = f"No points: the file is not a px4fuse report ({shorten_text(reason).rstrip('.')})."
-    verdict, items = cannot_verify(reason, remedy), rubric.items
+    verification, items = cannot_verify(reason, remedy), rubric.items
     graded_items = tuple(
         Item(item.title, 0.0, item.points, comment)
         for item in items
         if item.applies("compare", key)
     )
-    return GradedReport("", "", "", verdict, graded_items, instructor_action=remedy)
+    return GradedReport("", "", "", verification, graded_items, instructor_action=remedy)

@@ -57,23 +57,25 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     tested_edges = np.asarray(edge_indices, dtype=np.intp)
     if not len(tested_edges):
         return []
-    chain = model.odometry_chain(graph, tested_edges)
+    odometry_edges = model.odometry_chain(graph, tested_edges)
     first_nodes = graph.first[tested_edges]
     second_nodes = graph.second[tested_edges]
     first_pose_index = int(min(first_nodes.min(), second_nodes.min()))
-    chain_edges = chain[first_pose_index : int(max(first_nodes.max(), second_nodes.max()))]
-    missing_edge_indices = np.flatnonzero(chain_edges < 0)
+    connecting_edges = odometry_edges[
+        first_pose_index : int(max(first_nodes.max(), second_nodes.max()))
+    ]
+    missing_edge_indices = np.flatnonzero(connecting_edges < 0)
     if len(missing_edge_indices):
-        vertex = first_pose_index + int(missing_edge_indices[0])
+        pose_index = first_pose_index + int(missing_edge_indices[0])
         raise TrajectoryError(
             f"The closures cannot be tested, because no odometry edge connects vertices "
-            f"{graph.ids[vertex]} and {graph.ids[vertex + 1]}",
+            f"{graph.ids[pose_index]} and {graph.ids[pose_index + 1]}",
             "Add an odometry edge between these vertices.",
         )
-    poses = lie.chain(model.odometry_steps(graph, chain_edges))
+    poses = lie.chain(model.odometry_steps(graph, connecting_edges))
     step_adjoints = lie.adjoint(poses[1:])
     step_covariances = (
-        step_adjoints @ _covariances(graph, chain_edges) @ step_adjoints.transpose(0, 2, 1)
+        step_adjoints @ _covariances(graph, connecting_edges) @ step_adjoints.transpose(0, 2, 1)
     )  # in the axes of the first pose of the odometry chain
     cumulative_covariance = np.concatenate(
         [np.zeros((1, *step_covariances.shape[1:])), np.cumsum(step_covariances, axis=0)]
@@ -82,8 +84,8 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
         cumulative_covariance[np.maximum(first_nodes, second_nodes) - first_pose_index]
         - cumulative_covariance[np.minimum(first_nodes, second_nodes) - first_pose_index]
     )
-    to_end = lie.adjoint(lie.inverse(poses[second_nodes - first_pose_index]))
-    covariance = to_end @ chain_covariance @ to_end.transpose(0, 2, 1)
+    end_adjoint = lie.adjoint(lie.inverse(poses[second_nodes - first_pose_index]))
+    covariance = end_adjoint @ chain_covariance @ end_adjoint.transpose(0, 2, 1)
     relative_poses = lie.between(
         poses[first_nodes - first_pose_index], poses[second_nodes - first_pose_index]
     )
@@ -121,21 +123,21 @@ def _test_edge(
     return GateResult(*vertices, d2, degrees_of_freedom, p_value, p_value >= GATE_ALPHA)
 
 
-def _covariances(graph: model.PoseGraph, chain_edges: IntArray) -> Array:
+def _covariances(graph: model.PoseGraph, odometry_edges: IntArray) -> Array:
     """Compute the covariances of odometry edges, in the axes of the later pose."""
-    scale, scaled_information = model.scale_to_unit_diagonal(graph.information[chain_edges])
+    scale, scaled_information = model.scale_to_unit_diagonal(graph.information[odometry_edges])
     is_full_rank = np.linalg.eigvalsh(scaled_information)[:, 0] > 1e-12
     if not np.all(is_full_rank):
-        edge = chain_edges[int(np.argmin(is_full_rank))]
+        edge_index = odometry_edges[int(np.argmin(is_full_rank))]
         raise TrajectoryError(
-            f"The odometry edge from vertex {graph.ids[graph.first[edge]]} to "
-            f"{graph.ids[graph.second[edge]]} has no information in one direction",
+            f"The odometry edge from vertex {graph.ids[graph.first[edge_index]]} to "
+            f"{graph.ids[graph.second[edge_index]]} has no information in one direction",
             "Give each edge an information matrix of full rank.",
         )
     covariance = np.linalg.inv(scaled_information) / (scale[:, :, None] * scale[:, None, :])
-    is_backward = graph.first[chain_edges] > graph.second[chain_edges]
-    # (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r)
-    measured_adjoint = lie.adjoint(graph.measurements[chain_edges[is_backward]])
+    is_backward = graph.first[odometry_edges] > graph.second[odometry_edges]
+    # An edge from a later to an earlier pose is inverted: (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r)
+    measured_adjoint = lie.adjoint(graph.measurements[odometry_edges[is_backward]])
     covariance[is_backward] = (
         measured_adjoint @ covariance[is_backward] @ measured_adjoint.transpose(0, 2, 1)
     )

@@ -53,13 +53,12 @@ def normal_equations(
     d = edge_value.shape[1]
     edge_nodes = np.column_stack([graph.first, graph.second]).ravel()
     blocks = np.stack([first_coefficient, second_coefficient], axis=1).reshape(-1, d, d)
-    rows = sparse.bsr_array(
+    design_matrix = sparse.bsr_array(
         (blocks, edge_nodes, 2 * edge_indices), shape=(d * edge_indices[-1], d * len(graph))
-    )
+    ).tocsc()
     weights = sparse.bsr_array((information, edge_indices[:-1], edge_indices))
-    columns = rows.tocsc()
-    first_columns = columns[:, :d]
-    free_columns = columns[:, d:]
+    first_columns = design_matrix[:, :d]
+    free_columns = design_matrix[:, d:]
     weighted_transpose = free_columns.T @ weights
     right_side = edge_value.reshape(-1, edge_value.shape[-1]) - first_columns @ np.broadcast_to(
         first_value, edge_value.shape[1:]
@@ -104,7 +103,7 @@ class PoseGraph:
     dimension: int
     # Vertex numbers of the file, in ascending order
     ids: IntArray
-    # x, y, heading in the plane; x, y, z, qx, qy, qz, qw in space
+    # Poses: x, y, heading in the plane; x, y, z, qx, qy, qz, qw in space
     poses: Array
     # Indices into ``poses`` of the two vertices of each edge
     first: IntArray
@@ -204,9 +203,9 @@ def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> 
     adjacency = sparse.coo_array(
         (np.ones(len(connected_nodes[0])), connected_nodes), shape=(node_count, node_count)
     )
-    component_count, component = connected_components(adjacency, directed=False)
+    component_count, component_by_node = connected_components(adjacency, directed=False)
     if component_count > 1:
-        other_vertex = graph.ids[np.flatnonzero(component != component[0])[0]]
+        other_vertex = graph.ids[np.flatnonzero(component_by_node != component_by_node[0])[0]]
         raise TrajectoryError(
             f"The pose graph has {component_count} disconnected parts: vertex "
             f"{other_vertex} is not connected to vertex {graph.ids[0]} by {edges_name}.",

@@ -51,7 +51,7 @@ _MAX_STAGE_ITERATIONS = 20
 
 # Probability that graduated non-convexity does not truncate the residual of a true closure
 GNC_PROBABILITY = 0.99
-# Probability that a true closure is kept, because dropping the closure would increase the cost
+# Cost of dropping a closure, as quantile of χ²: the probability that a true closure costs less
 DROP_PROBABILITY = 0.999
 # Factor on the control parameter of graduated non-convexity per stage (Yang 2020, section V)
 _GNC_CONTROL_FACTOR = 1.4
@@ -144,7 +144,8 @@ def _minimise(
     iterations = 0
     cost = float(np.sum(0.5 * weights * residuals.chi2))
     while iterations < max_iterations and cost > _COST_TOLERANCE:
-        # d r / d x_j = J, d r / d x_i = -J A, with A the adjoint of x_i relative to x_j
+        # Derivatives of the residual: J by x_j, -J A by x_i, with A the adjoint of x_i relative to
+        # x_j
         jacobian = lie.right_jacobian_inverse(residuals.residual)
         first_jacobian = jacobian @ lie.adjoint(lie.inverse(residuals.relative))
         matrix, gradient = normal_equations(
@@ -239,12 +240,12 @@ def _descend_graduated(
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
     residuals = start
     iteration_count = 0
-    # -1 for edges that cannot be false, because their bound is infinite
+    # The excess is -1 for edges that cannot be false, because their bound is infinite
     chi2_excess = 2.0 * residuals.chi2 / chi2_bound - 1.0
     if np.max(chi2_excess) > 0.0:
         gnc_control = 1.0 / float(np.max(chi2_excess))
         for _ in range(_MAX_GNC_STAGES):
-            # the limit avoids a division by zero; the weight of such a small residual is 1
+            # the limit avoids a division by zero and does not change the weight, which is 1
             chi2_ratio = np.maximum(residuals.chi2 / chi2_bound, 1e-200)
             weights = np.clip(
                 np.sqrt(gnc_control * (gnc_control + 1.0) / chi2_ratio) - gnc_control, 0.0, 1.0
