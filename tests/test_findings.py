@@ -288,7 +288,7 @@ FAULTS = [
     Fault("too_few_innovations", "warning", {"count": 7}, {"duration_s": 1.5}),
     Fault("source_timestamp_jitter", "warning", {"jitter_s": about(0.0287, 0.01)},
           {"uwb": Uwb(rate_hz=10.0, sigma_m=0.01)}, change=with_errors(no_errors, jitter_s)),
-    Fault("source_noise_grows_with_speed", "error", {"slow_m": about(0.163, 0.01)},
+    Fault("source_noise_grows_with_speed", "error", {"slow_m": about(0.139, 0.01)},
           {"uwb": Uwb(rate_hz=10.0, sigma_m=0.05)},
           change=with_errors(lambda t, v: np.hypot(*v.T.values)[:, None] * 0.4 * noise(len(t)))),
     Fault("source_error_periodic", "error", {"period_s": about(7.0), "amplitude_m": about(0.3)},

@@ -355,7 +355,7 @@ class TestFeedback:
         ({"settings__end_s": 50.0}, ()),
         ({"settings__input": "zero"}, ("IMU",)),
         ({"log__hardware": SIMULATION_HARDWARE}, ("simulate",)),
-        ({"source__path": "kept by EKF2"}, ("logged by EKF2",)),
+        ({"source__path": "kept by EKF2"}, ("kept by EKF2",)),
     ],
 )
 def test_report_with_suspicious_settings_is_flagged(values, said):

@@ -250,8 +250,8 @@ def _fault_fractions(matches: list[Match], truth: FormTruth) -> dict[str, float]
 def size_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
     """Return the fraction of the points for the size of a fault.
 
-    The fraction is 1 within the tolerance, 1/2 near the tolerance, and 1/3 for a wrong sign or a
-    right size of another fault.
+    The fraction is 1 within the tolerance and 1/2 near the tolerance. It is 1/3 for a wrong sign,
+    or if the size is correct but the named fault is wrong.
     """
     named_size = named_fault.size_in_first_unit()
     if fault.size is None or fault.low is None or fault.high is None or named_size is None:
