@@ -167,7 +167,7 @@ class TestFlownFlights:
     @pytest.mark.parametrize(
         ("log", "said"),
         [
-            ("simulated/v1.16.1_aisle_2hz_stock", "never fused external vision"),
+            ("simulated/v1.16.1_aisle_2hz_stock", "never fused the horizontal position"),
             ("gps/v1.13.3_gps_profile1", "below the rate that EKF2 fused"),
             ("real/mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3",
              "23 % of the IMU samples are missing"),
