@@ -18,7 +18,7 @@ import bench_ekf2
 pytestmark = pytest.mark.reallogs
 
 NOT_CARRIED = {
-    "v1.16.1_aisle_2hz_stock": "never fused external vision",
+    "v1.16.1_aisle_2hz_stock": "never fused the horizontal position",
     "v1.16.1_aisle_hwlog": "estimator_aid_src_ev_pos has a sample interval",
 }
 # the reasons are in test_gnss.py
