@@ -28,6 +28,7 @@ UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
 # Function that yields the lines of a diagnosis card, by kind of block
 CARD_LINE_FUNCTIONS = {"card": card_lines, "closing": closing_lines, "headline": headline_lines}
 LABEL_COLUMNS = 9  # width (characters) of a label on the terminal
+MIN_TABLE_WIDTH = 50  # minimum width (characters) of a terminal for tables
 POINTS_PER_COLUMN = 6.0  # indent (points) in the PDF that is one character on the terminal
 # Terminal styles of text colours; the other colours belong to plots
 STYLES_BY_COLOUR = {
@@ -57,7 +58,10 @@ def show(console: Console, blocks: Iterable[Block], request: Request | None = No
             case "labelled":
                 _show_labelled(console, block, request)
             case "table":
-                console.print(_rich_table(**block))
+                if console.width >= MIN_TABLE_WIDTH:
+                    console.print(_rich_table(**block))
+                else:
+                    _print_rows(console, **block)
             case "command":
                 print_line(console, block["label"], block["text"])
             case "blank":
@@ -135,6 +139,15 @@ def print_paragraph(
 def print_line(console: Console, label: str, text: str, style: str = "bold cyan not dim") -> None:
     """Print a command or path on one line, so it can be copied."""
     console.print(Text(f"{label:{LABEL_COLUMNS}}", "bold").append(text, style), soft_wrap=True)
+
+
+def _print_rows(
+    console: Console, head: Sequence[str], rows: Iterable[Iterable[Cell]], **_: object
+) -> None:
+    """Print a table on a narrow terminal as one paragraph per row."""
+    for row in (head, *rows):
+        texts = (cell if isinstance(cell, str) else cell[0] for cell in row)
+        print_paragraph(console, ", ".join(filter(None, texts)), indent=2)
 
 
 def _rich_table(
