@@ -11,7 +11,7 @@ from comparisons import compare
 from flights import aisle_flight
 from pypdf import PdfReader
 
-from px4fuse.classroom.assignment.truth import quantity_truth
+from px4fuse.classroom.assignment.truth import right_numeric_answer
 from px4fuse.errors import SettingsError
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
@@ -110,7 +110,7 @@ def test_answer_form_questions_differ_for_each_log() -> None:
             "gain": p / s, "variance": p * (1.0 - p / s), "nis": row["innovation_m"] ** 2 / s,
             "innovation": row["measurement_m"] - row["prior_position_m"],
         }  # fmt: skip
-        found = quantity_truth(main, quantity)
+        found = right_numeric_answer(main, quantity)
         assert found == pytest.approx(by_hand.get(quantity.kind, found), rel=1e-9)
 
 
@@ -131,7 +131,7 @@ def test_expected_answer_for_predicted_sigma_equals_closed_form() -> None:
     lags = dt * (np.arange(n) + 0.5)
     grown = settings.sigma_a_m_s2**2 * dt**2 * float((lags**2).sum())
     expected = np.sqrt(p0 + 2.0 * t * p1 + t**2 * p2 + grown)
-    assert quantity_truth(main, quantity) == pytest.approx(expected, rel=1e-9)
+    assert right_numeric_answer(main, quantity) == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.usefixtures("cached_analyses", "cached_pages")
@@ -152,7 +152,7 @@ def test_compare_with_answers_option_prints_answers_in_report(
     assert any("Answer form" in page.extract_text() for page in reader.pages)
 
 
-def test_compare_rejects_answer_form_of_other_log(tmp_path: Path, sample_log: Path) -> None:
+def test_student_answers_on_other_log_are_rejected(tmp_path: Path, sample_log: Path) -> None:
     form = tmp_path / "f.toml"
     form.write_text(form_text(sample_log.name, SHA256), encoding="utf-8")
     for command in ("compare", "loop"):

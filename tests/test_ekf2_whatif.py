@@ -190,7 +190,7 @@ def test_longest_time_without_fusion_includes_start_and_end():
     assert _longest_between_fusions(np.array([16.0]), evaluated_spans) == 44.0
 
 
-def test_what_if_summary_combines_north_and_east() -> None:
+def test_what_if_summary_has_horizontal_nis_and_rmse() -> None:
     north, east = (AxisSummary(nis, (0.9, 1.1), 0.1, 0.1, m) for nis, m in ((1.0, 0.3), (3.0, 0.4)))
     one = Summary(changed={}, north=north, east=east, samples=9, rejected_fraction=0.0,
                   longest_without_fusion_s=0.1, resets=0)  # fmt: skip

@@ -418,7 +418,7 @@ def test_evaluate_frozen_estimate_scores_only_time_before() -> None:
 
 
 @pytest.mark.parametrize(("restarts", "cause"), [(True, "restart of the map"), (False, "lost")])
-def test_evaluate_estimate_with_jump_states_cause_and_time(restarts: bool, cause: str) -> None:
+def test_evaluate_reports_cause_and_time_of_estimate_jump(restarts: bool, cause: str) -> None:
     reference = flight()
     middle, position_m = len(reference) // 2, reference.position_m.copy()
     position_m[middle:] += position_m[0] - position_m[middle] if restarts else [3.0, 0.0, 0.0]

@@ -25,7 +25,7 @@ def test_right_choices_of_one_figure_belong_to_one_fault() -> None:
         assert len(form.encode()) < MAX_FORM_BYTES
 
 
-def test_right_choices_of_figure_questions_are_equally_frequent() -> None:
+def test_right_multiple_choice_letters_are_equally_frequent() -> None:
     draws = [partial(random_uniform, b"secret", f"s{number}", "aisle") for number in range(200)]
     letters = [letter for random_number in draws for _, letter in select_choices(random_number)]
     for name in CHOICE_NAMES:

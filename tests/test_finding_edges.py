@@ -247,7 +247,7 @@ UNKNOWN = "The log does not contain the reason"
         ),
     ],
 )
-def test_report_on_missing_ekf2_fusion_states_reason(flight: Any, reason: str, remedy: str) -> None:
+def test_finding_on_missing_ekf2_fusion_has_reason(flight: Any, reason: str, remedy: str) -> None:
     finding = only(ekf2_not_fusing.detect, flight)
     assert finding.severity == "error"
     assert finding.title.startswith("EKF2 never fused the UWB positions")
@@ -422,7 +422,7 @@ def test_imu_rate_below_98_percent_of_required_is_reported(imu_hz, attitude_hz, 
         assert all(action.format(hz) in f.remedy for f, hz in zip(found, expected, strict=True))
 
 
-def test_position_source_not_logged_as_received_is_reported() -> None:
+def test_missing_log_of_received_positions_is_reported() -> None:
     lacks = (
         Unavailable("another", "no", "Do."),
         Unavailable("it", "it was disabled", "Do.", source="vehicle_visual_odometry"),

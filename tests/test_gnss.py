@@ -598,7 +598,7 @@ def test_gnss_noise_is_limited_by_the_same_bounds_as_in_ekf2(parameters, fused, 
         np.testing.assert_allclose(found.velocity_variance_m2_s2, 0.04, rtol=1e-6)
 
 
-def test_ekf2_model_without_fixes_during_fusion_is_unavailable(tmp_path):
+def test_ekf2_model_without_fused_gnss_samples_is_unavailable(tmp_path):
     log = with_velocity(outdoors())
     log["estimator_states"]["states"][:, 0] = 1.0
     log["estimator_status_flags"]["cs_gnss_pos"][1:] = False  # disabled from 1 s on

@@ -307,7 +307,7 @@ WHOLE = Segment(0.0, 19.9, "")
     ("at", "good"),
     [([2.0], 0), ([6.0], 0), ([17.0], 0), *(([5.0, 15.0], good) for good in range(3))],
 )
-def test_ekf2_reset_that_moves_the_frame_is_removed(at, good):
+def test_ekf2_reset_that_shifts_the_origin_is_removed(at, good):
     """The source is in the frame of the first, middle or last stretch between resets."""
     deltas = np.array([[1.0, 0.5, 0.0], [-3.0, 2.0, 0.0]])[: len(at)]
     later = STATE_TIME[:, None] >= np.array(at)

@@ -573,7 +573,7 @@ def test_verify_gives_expected_outcome_for_each_pdf_change(
     assert verdict.redrawn_pdf == (b"" if verdict.status == "other log" else aisle.pdf)
 
 
-def test_verify_with_log_of_other_flight_returns_other_log(aisle: VerifiedReport) -> None:
+def test_log_of_other_flight_gives_verify_status_other_log(aisle: VerifiedReport) -> None:
     for files in ([LOOP_LOG], [LOOP_LOG, Path(__file__)]):
         verdict = verify(read_attached_results(aisle.pdf), aisle.pdf, files)
         assert verdict.status == "other log"

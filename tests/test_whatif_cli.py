@@ -174,7 +174,7 @@ class TestFlownFlights:
             ("real/vladimireganov_ROS_PX4_MOCAP_square2", "EKF2 may have fused more samples"),
         ],
     )  # fmt: skip
-    def test_what_if_without_replay_agreement_raises_missing_data(
+    def test_what_if_raises_if_replay_differs_from_logged_ekf2(
         self, shared_logs: Path, log: str, said: str
     ) -> None:
         with pytest.raises(MissingDataError, match=said):

@@ -53,7 +53,7 @@ def test_report_on_assigned_flight_contains_no_diagnosis(assigned: Assigned) -> 
     results = assigned.results
     assert results.log.is_assessed is True
     assert (results.findings, results.trials, results.card.causes) == ((), (), ())
-    assert results.card.facts == {"Answers": "Verdict on KF: consistent"}
+    assert results.card.facts == {"Answers": "Consistency verdict on KF: consistent"}
     assert {*results.tuning.values(), results.clock, results.heading, results.loop} == {
         DIAGNOSIS_WITHHELD
     }
@@ -112,7 +112,7 @@ def test_report_on_log_with_removed_assignment_key_is_rejected(
     assert "other log" in result.stdout
 
 
-def test_answer_form_without_figures_earns_part_of_points() -> None:
+def test_form_without_answers_on_plots_earns_part_of_points() -> None:
     _, answer = simulate_assigned_flight(SECRET, Person("s01"), "aisle", 2)
     assert answer.form is not None
     complete = right(answer.form)

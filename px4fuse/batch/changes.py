@@ -142,7 +142,7 @@ def compare_numbers(
         )
 
 
-def _finding_changes(results_a: Results, results_b: Results) -> Iterator[contract.FindingChange]:
+def _finding_changes(results_a: Results, results_b: Results) -> Iterator[contract.UnsharedFinding]:
     """Yield the findings whose id and severity are only in A or only in B."""
     comparisons: tuple[tuple[Results, Results, contract.DiffSide], ...] = (
         (results_b, results_a, "B"),
@@ -152,11 +152,13 @@ def _finding_changes(results_a: Results, results_b: Results) -> Iterator[contrac
         other_findings = {(finding.id, finding.severity) for finding in other_results.findings}
         for finding in results.findings:
             if (finding.id, finding.severity) not in other_findings:
-                yield contract.FindingChange(finding.id, finding.severity, finding.message, only_in)
+                yield contract.UnsharedFinding(
+                    finding.id, finding.severity, finding.message, only_in
+                )
 
 
 def _describe_worse_verdicts(
-    results_a: Results, results_b: Results, findings: Iterable[contract.FindingChange]
+    results_a: Results, results_b: Results, findings: Iterable[contract.UnsharedFinding]
 ) -> Iterator[str]:
     """Yield a sentence on each consistency verdict that is worse in B, and on each new error."""
     verdicts_a, verdicts_b = map(_verdicts_by_label, (results_a, results_b))

@@ -211,7 +211,7 @@ def _selections(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, s
     label_by_tag: Mapping[str, str] = {
         tag: label for log in logs for tag, label in log["tags"].items()
     }
-    selections = []
+    drop_down_lists = []
     for kind, label in SELECTION_LABELS.items():
         options = [
             (tag, f"{clean_text(label_by_tag[tag], 60)} ({count})")
@@ -219,8 +219,8 @@ def _selections(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, s
             if tag.startswith(f"{kind}:")
         ]
         if options:
-            selections.append((label, [("", "All"), *options]))
-    return selections
+            drop_down_lists.append((label, [("", "All"), *options]))
+    return drop_down_lists
 
 
 # -------------------- combination of the table rows of each log

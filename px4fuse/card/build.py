@@ -59,7 +59,7 @@ from px4fuse.flight.model import Ekf2, LogInfo, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 
 MAX_ACTIONS = 3
-# Minimum fraction of positions rejected by EKF2; with fewer the card does not mention rejections
+# Minimum fraction of positions rejected by EKF2 for a sentence on rejections in the summary
 MIN_NAMED_REJECTED_FRACTION = 0.01
 # Aiding sources whose √S is usually too large with PX4's default noises: this is not a fault
 USUALLY_UNDERCONFIDENT = frozenset({"baro_hgt", "mag", "gravity"})

@@ -1,4 +1,4 @@
-"""Causes on the diagnosis card: order, actions, and the re-runs of KF and EKF2 that test them."""
+"""Order and actions of the causes of a fault, and the re-runs of KF and EKF2 that test them."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence

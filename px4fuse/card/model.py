@@ -68,7 +68,7 @@ class Verdict(Record, kw_only=True):
 
 
 class Effect(Record, kw_only=True):
-    """Position errors of KF and EKF2, and rejections and resets of EKF2.
+    """Effect of faults: position errors of KF and EKF2, rejections and resets of EKF2.
 
     Attributes
     ----------

@@ -20,9 +20,9 @@ def diff(a: Path, b: Path, json_path: Path | None) -> None:
 
     The exit code is 1 if a verdict is worse in B: the mean NIS or mean NEES of KF or EKF2 along an
     axis is consistent in A and not in B, or B has a new finding of severity error. A mean NIS is
-    consistent inside its 95 % band, or if √S is less than 1.25 times too small or too large. A mean
-    NEES is consistent if the position σ is at most 2 times too small or too large. The exit code
-    is 2 for invalid input, otherwise 0.
+    consistent inside its 95 % band, or if √S is wrong by a factor below 1.25. A mean NEES is
+    consistent if the position σ is wrong by a factor of at most 2. The exit code is 2 for invalid
+    input, otherwise 0.
     """
     from px4fuse.batch.changes import diff as compare_inputs
     from px4fuse.batch.terminal import format_differences

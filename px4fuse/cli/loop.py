@@ -18,7 +18,7 @@ from px4fuse.request import GivenClosure, Landing, LoopRequest, command_line, se
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop
 
-# Maximum distance (m) of the landing place (--landed-at): longer than any tape measure
+# Maximum distance (m) from take-off to landing place (--landed-at): a larger one is a typing error
 MAX_LANDING_DISTANCE_M = 10_000.0
 # Parameters of the command that are allowed if SOURCE is a pose graph
 GRAPH_PARAMETERS = ("source", "json_path", "g2o", "robust")

@@ -40,10 +40,10 @@ MIN_SETTING_RATIO = 4.0
 # Minimum effect (m) on KF's position of a property of EKF2 that the report lists
 MIN_STEP_EFFECT_M = 1e-6
 # Position differences KF - EKF2 outside the replayed times are reported above this value (m)
-MIN_UNREPLAYED_M = 0.5
+MIN_DIFFERENCE_OUTSIDE_REPLAY_M = 0.5
 # Position differences KF - EKF2 outside the replayed times are reported if they exceed the
 # differences inside by this factor
-MIN_UNREPLAYED_RATIO = 3.0
+MIN_DIFFERENCE_RATIO_OUTSIDE_REPLAY = 3.0
 
 
 def explain_ekf2_difference(
@@ -194,7 +194,8 @@ def add_sentences(
         )
     sentences += [_unexplained_sentence(explanation), *_truth_sentences(explanation)]
     min_reported_m = max(
-        MIN_UNREPLAYED_M, MIN_UNREPLAYED_RATIO * float(np.max(np.abs(explanation.kf_minus_ekf2_m)))
+        MIN_DIFFERENCE_OUTSIDE_REPLAY_M,
+        MIN_DIFFERENCE_RATIO_OUTSIDE_REPLAY * float(np.max(np.abs(explanation.kf_minus_ekf2_m))),
     )
     if explanation.outside is not None and explanation.outside.maximum_m > min_reported_m:
         sentences.append(
@@ -249,11 +250,11 @@ def _step_reasons(
     )
     if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
         ends_s = (clock_offset.offset_s, *clock_offset.interval_s[::-1])
-        ml_delay_ms, low_ms, high_ms = (
+        estimated_delay_ms, low_ms, high_ms = (
             1e3 * (source.assumed_delay_s - offset_s) for offset_s in ends_s
         )
         delay_text += (
-            f". The maximum-likelihood estimate of this delay is {ml_delay_ms:.0f} ms (95 % "
+            f". The maximum-likelihood estimate of this delay is {estimated_delay_ms:.0f} ms (95 % "
             f"{low_ms:.0f} to {high_ms:.0f} ms)"
         )
     equivalent_sigma_a = ekf2_parameters["EKF2_ACC_NOISE"] * np.sqrt(

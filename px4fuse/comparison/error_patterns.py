@@ -212,7 +212,7 @@ def white_errors(comparison: Comparison) -> WhiteErrors | None:
 
 
 def find_timestamp_jitter(errors: WhiteErrors) -> float | None:
-    """Return the jitter (s, 1 σ) of the timestamps if the positions show the same jitter.
+    """Return the jitter (s, 1 σ) of the timestamps if the position errors confirm it.
 
     A position that is measured at a constant interval, but has a late timestamp, lies behind the
     position of its neighbours by delay · velocity.

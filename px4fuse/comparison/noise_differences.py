@@ -46,9 +46,9 @@ def tune_by_axis(comparison: Comparison) -> tuple[AxisTuning, ...]:
 def find_noisy_part(
     comparison: Comparison, axis_tuning: AxisTuning | Unavailable | None
 ) -> NoisyPart | None:
-    """Find one time span of the flight in which most innovations are larger.
+    """Find a time span with larger innovations than in the rest of the flight.
 
-    ``axis_tuning`` is the noise estimate of north and east.
+    ``axis_tuning`` contains the estimated noises of north and east.
     """
     settings = comparison.settings
     if axis_tuning is None:

@@ -45,7 +45,7 @@ def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
             for axis in ("north", "east")
             for updates in update_tables
         ]
-        # multiply the mean by a fixed number: the number of evaluated samples depends on the delay
+        # mean NIS times a fixed count: the number of evaluated samples depends on the delay
         nis_sums.append(float(np.mean(nis)) * len(nis) * len(received.timestamp_s))
     quadratic_coefficient, linear_coefficient, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
     if quadratic_coefficient <= 0.0:

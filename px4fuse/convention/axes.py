@@ -70,9 +70,9 @@ AXES_ODDS: Final[dict[Axes, float]] = {
     ("north", "east", "down"): 1.0,  # convention of PX4
     ("east", "north", "up"): -0.5,
     ("north", "west", "up"): -1.0,
-    ("north", "east", "up"): -2.5,  # a sign is wrong
-    ("east", "north", "down"): -2.5,  # x and y are exchanged
-    ("north", "west", "down"): -2.5,
+    ("north", "east", "up"): -2.5,  # north, east, down with wrong sign of z
+    ("east", "north", "down"): -2.5,  # x and y exchanged
+    ("north", "west", "down"): -2.5,  # wrong sign of y
 }
 
 
@@ -100,7 +100,7 @@ class AxisAssignment(NamedTuple):
         return (self.vertical_sign * self.handedness < 0) != (self.vertical_axis == 1)
 
     def axes(self, quarter_turns: int) -> Axes:
-        """Return the directions of x, y, z with ``axis_a`` at ``quarter_turns`` from north."""
+        """Return the directions of x, y, z for ``axis_a`` at 90° · ``quarter_turns`` from north."""
         directions: list[Direction] = ["down" if self.vertical_sign > 0 else "up"] * 3
         directions[self.axis_a] = CLOCKWISE_DIRECTIONS[quarter_turns % 4]
         directions[self.axis_b] = CLOCKWISE_DIRECTIONS[(quarter_turns + self.handedness) % 4]
@@ -184,7 +184,7 @@ class Hypothesis:
 
     @property
     def axes(self) -> Axes:
-        """Directions of x, y, z, to the nearest quarter turn."""
+        """Directions of x, y, z of the positions, rounded to multiples of 90°."""
         return self.assignment.axes(self.quarter_turns)
 
     @property

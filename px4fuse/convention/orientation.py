@@ -39,7 +39,7 @@ COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
 MAX_TILT_DIFFERENCE_DEG = 6.0
 # Maximum median heading difference (°) of a correct convention
 MAX_HEADING_DIFFERENCE_DEG = 12.0
-# Minimum tilt or heading difference (°) in the score: a smaller one is noise
+# Smaller tilt or heading differences (°) are noise and count as this value in the score
 MIN_SCORED_DIFFERENCE_DEG = 0.7
 # Decrease of a convention's score per second of flight and per unit of ln(angle difference)
 SCORE_PER_S = 0.5

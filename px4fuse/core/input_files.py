@@ -51,7 +51,7 @@ def inputs_not_registered() -> Iterator[None]:
 
 
 def add_input(path: Path) -> None:
-    """Register an input file or folder that exists."""
+    """Register an input file or folder, so that no output overwrites it."""
     register = _register.get()
     if register is None or (identity := _file_identity(path)) is None:
         return

@@ -41,8 +41,8 @@ MAX_LATENESS_S = 0.1
 MIN_LATENESS_S = 0.03
 # Actions on a position sample: none, update of the state, start of fusion with a reset
 IDLE, FUSE, START = 0, 1, 2
-# Columns of the state sensitivities: to the initial attitude error, gyro bias and accelerometer
-# bias (3 each), to the correction of the nominal attitude, and to the acceleration
+# Columns of the sensitivities of the EKF2 states: 0 to 2 initial attitude error, 3 to 5 gyro bias,
+# 6 to 8 accelerometer bias, 9 known change of the nominal attitude, 10 measured acceleration
 SENSITIVITY_COLUMN_COUNT = 11
 CORRECTION_COLUMN, INPUT_COLUMN = 9, 10
 

@@ -294,9 +294,8 @@ def update_table(
     Parameters
     ----------
     update_log : ndarray, shape (E, k, ...)
-        For k samples of each event: ν and S along each axis, then optionally 1 if rejected, 1 if
-        fused, 1 if used for a reset, position variance after the update along each axis, and R
-        along each axis. NaN without a sample.
+        Columns of the result for k samples of each event; the last columns may be missing. NaN
+        without a sample.
     measured_at_s : ndarray, shape (E, k)
     end_s : ndarray, shape (E,)
         Time of each event.
@@ -569,13 +568,13 @@ def _add_field(
     field_gauss = fusion_record.field_gauss
     sample_times_s = field_gauss.index.to_numpy()
     age_s = fusion_record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
-    samples_per_row = max(MAG_FUSION_HZ * median_interval(sample_times_s), 1.0)
+    fused_samples_per_row = max(MAG_FUSION_HZ * median_interval(sample_times_s), 1.0)
     measured_at_s = sample_times_s - age_s
     extended_segment = add_field_states(
         segment,
         measured_at_s,
         field_gauss.iloc[:, :3].to_numpy(),
-        samples_per_row,
+        fused_samples_per_row,
         np.asarray(initial_row[[*Columns.EARTH_FIELD, *Columns.BODY_FIELD]]),
         np.asarray(initial_row[Columns.DELAYED_VARIANCE[-6:]]),
     )

@@ -199,7 +199,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     tested_offsets_s = sorted({0.0, clock_offset_s})
     sigma_z_m = noises.sigma_z_m
     coarse_motion = prepared_motion.downsample(COARSE_MEASUREMENTS)
-    low_pass = SourceLowPass(0.0, 0.0, 0.0, sigma_z_m)
+    source_low_pass = SourceLowPass(0.0, 0.0, 0.0, sigma_z_m)  # no low pass
     correlated_noises = [
         replace(
             noises,
@@ -218,7 +218,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     )
     is_smooth = sigma_z_m < MAX_SMOOTH_SIGMA_M
     if white_score - correlated_score < MIN_COARSE_GAIN_NATS and not is_smooth:
-        return low_pass, no_correlation
+        return source_low_pass, no_correlation
     (white_fit, _), (correlated_fit, offset_s) = (
         min(
             (
@@ -235,7 +235,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     # if time-correlated noise is significant, or the positions are too smooth for white noise
     is_correlated = white_full_score - correlated_score >= MIN_GAIN_NATS
     if not (is_correlated or is_smooth):
-        return low_pass, no_correlation
+        return source_low_pass, no_correlation
 
     def fit_low_pass(log_tau: float) -> tuple[float, Noises]:
         prepared_motion, jacobian_term = undo_low_pass(float(np.exp(log_tau)))
@@ -255,13 +255,13 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         median_s = float(np.median(np.diff(time_s)))
         lag1_correlation = float(np.exp(-median_s / np.exp(log_tau)))
         lag_s = median_s * lag1_correlation / (1.0 - lag1_correlation)
-        low_pass = SourceLowPass(
+        source_low_pass = SourceLowPass(
             lag1_correlation, lag_s, white_full_score - low_pass_score, filtered_noises.sigma_z_m
         )
     if not is_correlated:
-        return low_pass, no_correlation
+        return source_low_pass, no_correlation
     fitted_noises = correlated_fit.noises
-    return low_pass, TimeCorrelatedNoise(
+    return source_low_pass, TimeCorrelatedNoise(
         fitted_noises.tau_s,
         fitted_noises.tau_s,
         np.inf,

@@ -232,8 +232,8 @@ def _find_jumps(
 ) -> tuple[tuple[Jump, ...], BoolArray]:
     """Detect lasting jumps of the positions; return the jumps in time order, and an outlier mask.
 
-    Jumps are tested at the announced times, at the most likely time of the flight, and at the start
-    of each run of outliers, because the first measurements after a jump look like outliers.
+    Jumps are tested at ``announced_s`` (resets that the source reports), at the most likely time of
+    the flight, and at the start of each run of outliers, as data after a jump look like outliers.
     """
     jumps: list[Jump] = []
 
@@ -538,12 +538,12 @@ class DesignMatrix:
         columns = np.zeros((axis_count, len(is_skipped), column_count + axis_count * step_count))
         # the scale multiplies data and rotation, not the biases
         data_columns = (1 + CONSTANT_COUNT) * np.arange(axis_count)
-        scales = np.ones(signals.measurement_m.shape[1])
-        scales[np.append(data_columns, data_columns + 1 + ROTATION)] = scale
+        column_scales = np.ones(signals.measurement_m.shape[1])
+        column_scales[np.append(data_columns, data_columns + 1 + ROTATION)] = scale
         no_motion = 0.0 * self.step_columns
         normalised, log_variance_sum = self.whitened(
-            np.hstack([scales * signals.delta_position_m, no_motion]),
-            np.hstack([scales * signals.delta_velocity_m_s, no_motion]),
+            np.hstack([column_scales * signals.delta_position_m, no_motion]),
+            np.hstack([column_scales * signals.delta_velocity_m_s, no_motion]),
             np.hstack([signals.measurement_m, self.step_columns]),
             scale * sigma_a,
             is_skipped,
@@ -634,7 +634,7 @@ def _integrate_signal(acceleration_m_s2: Array, time_s: ArrayLike, timeline: Tim
 def _common_accelerations(
     attitude: pd.DataFrame, acceleration: Acceleration
 ) -> list[tuple[Array, Array]]:
-    """Return (time, NED acceleration) for unit biases forward and right and a unit rotation."""
+    """Return time and NED acceleration error of 1 m/s² forward bias, right bias, and 1 rad yaw."""
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
     attitude_time_s = attitude.index.to_numpy()

@@ -71,7 +71,7 @@ MIN_KEPT_MEASUREMENTS = 5
 INTEGRATION_STEP_S = 0.02
 # Prior precision of position (1/m²) and velocity (s²/m²) at the start of a segment: negligible, it
 # only avoids a singular matrix
-START_PRECISION = 1e-6, 1e-4
+SEGMENT_START_PRECISION = 1e-6, 1e-4
 # Maximum median interval (s) between IMU samples for an estimate of the motion
 MAX_IMU_INTERVAL_S = 0.025
 
@@ -161,7 +161,7 @@ class PreparedMotion:
         length_s = np.diff(self.time_s)
         unit_process_noise = self.dt_s * np.stack(continuous_noise_unit(length_s))
         prior_precision = np.zeros((len(self.time_s), 2))
-        prior_precision[self.segment_edges[:-1]] = START_PRECISION
+        prior_precision[self.segment_edges[:-1]] = SEGMENT_START_PRECISION
         column_count = 1 + len(CONSTANTS_PRIOR_SIGMA)
         dp, dv = np.zeros(
             (2, len(self.directions), len(time_offsets_s), column_count, len(length_s))

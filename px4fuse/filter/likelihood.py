@@ -228,7 +228,7 @@ def profile_interval(
 def profile_ends(
     score: Callable[[float, float], float],
     best_logs: tuple[float, float],
-    bounds: tuple[float, float],
+    parameter_bounds: tuple[float, float],
     variance_factor: float = 1.0,
 ) -> tuple[float | None, float | None]:
     """Return the 95 % profile-likelihood interval of a parameter; None for an end beyond a bound.
@@ -240,7 +240,7 @@ def profile_ends(
         which -ln p is minimised.
     best_logs : (float, float)
         Logarithms of both parameters at the minimum.
-    bounds : (float, float)
+    parameter_bounds : (float, float)
         Bounds of the first parameter, not of its logarithm.
     variance_factor : float
         Factor on the parameter's variance, for uncertainty that ``score`` does not include.
@@ -276,4 +276,4 @@ def profile_ends(
         )
         return float(np.exp(best_logs[0] + direction * log_distance))
 
-    return find_interval_end(-1.0, bounds[0]), find_interval_end(1.0, bounds[1])
+    return find_interval_end(-1.0, parameter_bounds[0]), find_interval_end(1.0, parameter_bounds[1])

@@ -196,10 +196,10 @@ class FittedPositions:
     degrees_of_freedom: int
     constants_prior_sigma: Array
 
-    def scaled(self, sigma: float) -> FittedPositions:
-        """Return the likelihood with all noises multiplied by ``sigma``."""
-        log_determinant = self.log_determinant + 2.0 * self.degrees_of_freedom * math.log(sigma)
-        return replace(self, gram=self.gram / sigma**2, log_determinant=log_determinant)
+    def scaled(self, factor: float) -> FittedPositions:
+        """Return the fit with the σ of all noises multiplied by ``factor``."""
+        log_determinant = self.log_determinant + 2.0 * self.degrees_of_freedom * math.log(factor)
+        return replace(self, gram=self.gram / factor**2, log_determinant=log_determinant)
 
     def information(self) -> Array:
         """Return the inverse covariance of the unknown constants, shape (s, T, c, c)."""
@@ -338,7 +338,7 @@ def products_by_segment(
     first_inputs: Sequence[Array],
     second_measured_m: Array,
 ) -> Array:
-    """Return the inner products of k pairs of inputs in each segment, shape (s, k).
+    """Return the inner products of k pairs of inputs in each of s segments, shape (s, k).
 
     The constants are eliminated, and the inner product is weighted by the inverse covariance.
 
@@ -350,9 +350,9 @@ def products_by_segment(
     variance_m2 : ndarray, shape (m,)
         Variance of each measurement.
     first_inputs : three ndarray, shape (a, k, m) and twice (a, k, m - 1)
-        Measurements, Δp and Δv of the first input of each pair.
+        Measurements, and changes of position and velocity, along a axes: first input of each pair.
     second_measured_m : ndarray, shape (a, k, m)
-        Measurements of the second input of each pair; its Δp and Δv are zero.
+        Measurements of the second input of each pair; its changes are zero.
     """
     first_measured_m, *increments = first_inputs
     constant_increments = (

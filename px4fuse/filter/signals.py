@@ -68,10 +68,12 @@ class Acceleration:
         Unit vector of the axis in NED.
     integral_m_s : ndarray, shape (n,)
         Integral of the acceleration along the axis from the first sample.
-    gap_time_s, gap_integral_s : ndarray, shape (k,)
-        Start and end of each IMU gap, and total length of all gaps up to each of these times.
+    gap_time_s : ndarray, shape (k,)
+        Start and end of each IMU gap.
+    gap_integral_s : ndarray, shape (k,)
+        Total length of the IMU gaps before each time in ``gap_time_s``.
     rms_m_s2 : float
-        RMS of the acceleration in the segment, which is the σ of the input in a gap.
+        RMS of the acceleration in the segment: standard deviation assumed in an IMU gap.
     """
 
     time_s: Array

@@ -93,9 +93,9 @@ class HeldOutCheck(Record):
 
 
 class AxisTuning(Record, kw_only=True):
-    """Estimated noises of one axis, or of north and east together, with 95 % intervals.
+    """Estimated noises of KF for one axis, or for north and east together, with 95 % intervals.
 
-    For missing values see :class:`Noise`; ``low`` = None is stored as 0.
+    None: no estimate in the search range. An interval that begins at 0: the noise may be zero.
 
     Attributes
     ----------

@@ -97,6 +97,6 @@ def _report_rank(group: list[Finding]) -> int:
     is_listed_first = CONVENTION in cause.evidence or role in ("unusable", "misleading", "first")
     if is_listed_first and cause.severity != "note":
         return -1
-    # warnings on the recording precede wrong noises (rank 2), whose estimates they falsify
+    # warnings on the recording (rank 1) precede wrong noises (2): bad data bias noise estimates
     rank_by_severity = {"error": 2 * (role == "noise"), "warning": 3 - 2 * (role == "recording")}
     return rank_by_severity.get(cause.severity, 4)

@@ -179,10 +179,10 @@ def _drift_finding(
 ) -> Finding:
     """Make the finding of a drift that the innovations of ``filter_labels`` do not show."""
     sensor, loop = source_name(analysis.source), analysis.loop
-    drift_size = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
+    drift_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
     rmse_sentence = ""
     if aligned_error is not None:
-        drift_size = (
+        drift_text = (
             f"horizontal position RMSE {format_metres(aligned_error.after_m)} m after the best "
             "alignment"
         )
@@ -195,7 +195,7 @@ def _drift_finding(
         rmse_sentence = (
             "" if aligned_error is None else f"Horizontal position RMSE {aligned_error}. "
         )
-        drift_size = (
+        drift_text = (
             f"loop closure error {format_metres(closure_error_m)} m, "
             f"{format_percent(closure_error_m / length_m, 1)} of a path of {length_m:.0f} m"
         )
@@ -203,7 +203,7 @@ def _drift_finding(
     noise_settings = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
     return error(
         "source_drift",
-        f"{sensor} drifts: {drift_size}. {rmse_sentence}The innovations of "
+        f"{sensor} drifts: {drift_text}. {rmse_sentence}The innovations of "
         f"{' and '.join(filter_labels)} do not show the drift, because the filter follows "
         f"{sensor}. Do not reduce {noise_settings}.",
         DRIFT_REMEDY,

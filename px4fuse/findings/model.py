@@ -54,7 +54,7 @@ GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging"
 TITLES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.items()}
 
 
-class Example(Record):
+class FindingExample(Record):
     """Example of a finding, with its false alarms and detection rates (tests/studies/rates.csv).
 
     Attributes
@@ -74,9 +74,9 @@ class Example(Record):
     detection: Mapping[str, float]
 
 
-def load_examples() -> Mapping[str, Example]:
+def load_examples() -> Mapping[str, FindingExample]:
     return msgspec.json.decode(
-        Path(__file__).with_name("examples.json").read_bytes(), type=dict[str, Example]
+        Path(__file__).with_name("examples.json").read_bytes(), type=dict[str, FindingExample]
     )
 
 

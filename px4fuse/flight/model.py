@@ -123,7 +123,7 @@ def with_orientation(origin: Origin, *, is_changing: bool) -> Origin:
 
 
 REPEATED_TIMESTAMPS = "most timestamps of the sender are repeated"
-# Name of the clock of a sender in a ULog: PX4 converts or replaces the sender's timestamps
+# Clock of timestamps in a ULog that an external sender set and PX4 converted or replaced
 SENDER_CLOCK = "sender timestamps"
 # Replaces all results of an assignment that would show its injected fault to the student
 DIAGNOSIS_WITHHELD = Unavailable(

@@ -37,7 +37,7 @@ from px4fuse.trajectory.model import Trajectory, cumulative_distance
 MIN_VARIANCE_GROWTH = 2.0
 # Minimum variance of an odometry edge, as fraction of the default variance: avoids a division by 0
 MIN_VARIANCE_FRACTION = 1e-2
-# Fraction of the poses at each end of the path over which the reported variance is averaged
+# Fraction of the poses at each end of the path for the median of the reported variance
 END_FRACTION = 0.1
 # Loop closure, and the true final pose if the closure connects take-off and landing (else None)
 ClosureAndLanding = tuple[GivenClosure, TrueEnd | None]
@@ -107,9 +107,9 @@ def _variance_growth(variance: Array | None, node_indices: IntArray) -> Array | 
     """
     if variance is None:
         return None
-    averaged_count = max(1, int(END_FRACTION * len(variance)))
-    start_variance_sum = float(np.median(variance[:averaged_count].sum(axis=1)))
-    end_variance_sum = float(np.median(variance[-averaged_count:].sum(axis=1)))
+    end_sample_count = max(1, int(END_FRACTION * len(variance)))
+    start_variance_sum = float(np.median(variance[:end_sample_count].sum(axis=1)))
+    end_variance_sum = float(np.median(variance[-end_sample_count:].sum(axis=1)))
     if not end_variance_sum > MIN_VARIANCE_GROWTH * start_variance_sum:
         return None
     return np.maximum(np.diff(variance[node_indices], axis=0), 0.0)

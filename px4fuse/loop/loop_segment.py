@@ -17,7 +17,7 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory, components_by_axis, 
 # Time (s) over which poses on the ground are averaged
 REST_TIME_S = 1.0
 # Maximum extent (m) of the positions of a vehicle at rest
-MAX_REST_RANGE_M = 0.15
+MAX_POSITION_EXTENT_AT_REST_M = 0.15
 # Maximum heading change (°) of the odometry for which the true heading change is assumed to be zero
 MAX_SAME_HEADING_DEG = 15.0
 
@@ -51,7 +51,8 @@ def cut_trajectory(
         # If the vehicle is not at rest, the single pose at this end of the segment is used
         if (
             not len(poses_at_rest)
-            or np.linalg.norm(np.ptp(poses_at_rest.position_m, axis=0)) > MAX_REST_RANGE_M
+            or np.linalg.norm(np.ptp(poses_at_rest.position_m, axis=0))
+            > MAX_POSITION_EXTENT_AT_REST_M
         ):
             continue
         position_m[index] = poses_at_rest.position_m.mean(axis=0)

@@ -28,8 +28,8 @@ ENVELOPE_INTERVAL_S = 2.0
 MAX_ENVELOPE_INTERVALS = 200
 # Minimum time span (s) to estimate a clock drift: in a shorter span the drift is assumed to be 0
 MIN_DRIFT_SPAN_S = 30.0
-# Maximum relative difference between the rates of two real clocks. A replayed recording has a
-# larger difference, which is estimated even below MIN_DRIFT_SPAN_S
+# Maximum relative difference between the rates of two real clocks. A larger one means that the
+# recording was replayed at another speed: it is estimated even in a time span < MIN_DRIFT_SPAN_S
 MAX_RELATIVE_RATE_DIFFERENCE = 0.01
 # Maximum valid ratio of the rates of two clocks: a wrong unit of time gives up to 1e9 (s for ns)
 MAX_RATE_RATIO = 1e12

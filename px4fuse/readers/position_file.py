@@ -356,7 +356,7 @@ def _select_body(
     if body is not None and not table.is_chosen_body:
         raise LogError(
             f"{table.file_name} contains only one body, which has no name",
-            "Omit the name of the body.",
+            "Omit the name after the file, and --body.",
         )
     return texts
 

@@ -48,7 +48,7 @@ EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo
 FIX_TYPE_3D = 3
 # Maximum delay (µs) from timestamp to publication if PX4 set the timestamp at the arrival
 MAX_ARRIVAL_DELAY_US = 100
-# Minimum fraction of timestamps that PX4 set at the arrival, to report missing measurement times
+# Minimum fraction of arrival times among the timestamps, to report missing measurement times
 MIN_ARRIVAL_FRACTION = 0.9
 # Maximum time difference (s) between a height and the horizontal position to which it is added:
 # 2.5 cm error at a climb rate of 0.5 m/s

@@ -1,4 +1,4 @@
-"""Diagnosis card as HTML, for the web pages and notebooks."""
+"""HTML of the diagnosis card, the summary of a report, for web pages and notebooks."""
 
 from collections.abc import Sequence
 
@@ -43,7 +43,7 @@ def card_of(analysis: Analysis) -> Card:
     """Return the diagnosis card of an analysis."""
     if analysis.request is None:
         raise SettingsError(
-            "The analysis was not made by px4fuse.compare, so its command is unknown.",
+            "The analysis was not made by px4fuse.compare, so the command to print is unknown.",
             "Create it with px4fuse.compare.",
         )
     card = build_card(analysis, analysis.request)

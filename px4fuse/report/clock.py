@@ -16,7 +16,7 @@ from px4fuse.results.contract import ComparisonResults
 
 CURVE_HEIGHT = 170.0  # height (points) of the axes of the log-likelihood
 MAX_DRAWN_DROP_NATS = 12.0  # maximum drawn decrease (nats) of the log-likelihood from its maximum
-# Half width of the log-likelihood plot, in half widths of the 95 % interval of the offset
+# Ratio of the plotted range of the time offset to its 95 % interval
 PLOT_HALF_WIDTH_INTERVALS = 2.5
 # Findings for which the report has an appendix on the time offset
 CLOCK_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf2_ev_delay_wrong")
@@ -87,16 +87,16 @@ def clock_advice(
 
 
 def _delay_advice(comparison: PreparedComparison, clock: ClockOffset, logged_ms: float) -> str:
-    name, ml_delay_ms = aid_of(comparison).delay, wrong_delay_ms(comparison, clock, logged_ms)
-    if ml_delay_ms is None:
+    name, delay_ms = aid_of(comparison).delay, wrong_delay_ms(comparison, clock, logged_ms)
+    if delay_ms is None:
         return f"{name} {logged_ms:g} ms agrees with the estimate."
-    if limit_text := delay_limit(name, ml_delay_ms, logged_ms):
+    if limit_text := delay_limit(name, delay_ms, logged_ms):
         return (
-            f"The maximum-likelihood {name} is {ml_delay_ms:.0f} ms, but {name} cannot "
+            f"The maximum-likelihood {name} is {delay_ms:.0f} ms, but {name} cannot "
             f"{limit_text}. Correct the sender's clock."
         )
     return (
-        f"Set {name} to {max(ml_delay_ms, 0.0):.0f} ms (now {logged_ms:g} ms), or correct the "
+        f"Set {name} to {max(delay_ms, 0.0):.0f} ms (now {logged_ms:g} ms), or correct the "
         "sender's clock."
     )
 

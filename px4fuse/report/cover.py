@@ -39,7 +39,7 @@ from px4fuse.results.contract import AidsResults, ComparisonResults
 
 FlightResults = ComparisonResults | AidsResults
 
-MAX_FILE_NAME_LENGTH = 56  # maximum number of characters of the file name in the head
+MAX_FILE_NAME_LENGTH = 56  # maximum number of characters of the file name in the page header
 TERMS_NOTE = (
     "Source: positions that KF and EKF2 fuse. σ and √S: standard deviations of position and "
     "innovation, as the filter reports them. KF: position and velocity along one axis, IMU "

@@ -157,7 +157,11 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
     for group in group_by_root(findings):
         write_finding(page, group)
     names = [reference.name for reference in loop.references]
-    head = ["path", "correction\nRMS / max (m)", *(f"ATE against\n{name} (m)" for name in names)]
+    head = [
+        "path",
+        "shift from odometry\nRMS / max (m)",
+        *(f"ATE against\n{name} (m)" for name in names),
+    ]
     rows = []
     for path in loop.reported_paths:
         correction_text = "–"
@@ -289,9 +293,9 @@ def missing_corrections(loop: Loop) -> list[str]:
     return list(reasons)
 
 
-def _format_error(translation: Statistics | Unavailable, interval: Interval | Unavailable) -> str:
+def _format_error(errors_m: Statistics | Unavailable, interval: Interval | Unavailable) -> str:
     interval_text = format_interval(interval)
-    return _format_rmse(translation) + (f" ({interval_text})" if interval_text else "")
+    return _format_rmse(errors_m) + (f" ({interval_text})" if interval_text else "")
 
 
 def _format_rmse(statistics: Statistics | Unavailable, digits: int = 3) -> str:

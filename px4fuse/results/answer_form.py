@@ -79,7 +79,7 @@ ACCEPTED_VALUES = {
     "when": '"whole flight", or an empty text with the times from_s and until_s',
     "ekf2_did": "a list of behaviours, each in quotes",
     "choices": "a letter from a to e in quotes",
-    "log_sha256": "the SHA-256 of the log, which px4fuse answers writes into an empty form",
+    "log_sha256": "the SHA-256 of the log, as in an empty form from the command px4fuse answers",
     **dict.fromkeys(("kind", "unit", "parameter", "value_unit", "panel"), "a short text in quotes"),
 }
 # Answer to a question about KF: a number, the numbers of KF updates, or None if left blank
@@ -133,7 +133,7 @@ class NamedFault(Record):
     panel: str = ""
 
     def size_in_first_unit(self) -> float | None:
-        """Convert the size to the first unit in ``form.toml``, as a factor of 1.05 to 5 %."""
+        """Return the size of the fault in the first unit of its kind, as 5 % for factor 1.05."""
         units = FAULT_KINDS[self.kind].units
         if self.size is None or not units:
             return None
@@ -402,8 +402,8 @@ def form_text(log_name: str, log_sha256: str, choices: Sequence[Choice] = ()) ->
 
 def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
     """Yield the questions of an answer form with the student's answers as texts."""
-    yield "Verdict on KF", answers.verdict_kf or EMPTY_CELL
-    yield "Verdict on EKF2", answers.verdict_ekf2 or EMPTY_CELL
+    yield "Consistency verdict on KF", answers.verdict_kf or EMPTY_CELL
+    yield "Consistency verdict on EKF2", answers.verdict_ekf2 or EMPTY_CELL
     yield "Behaviour of EKF2", ", ".join(answers.ekf2_did) or EMPTY_CELL
     for mistake in answers.mistakes:
         size_units = FAULT_KINDS.get(mistake.kind, FaultKind("")).units

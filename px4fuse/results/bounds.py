@@ -31,7 +31,7 @@ class _OutOfBoundsError(Exception):
 
 
 def bounds_of(name: str) -> tuple[float, float]:
-    """Return minimum and maximum of the numbers in a field of results, by name of the field.
+    """Return the valid minimum and maximum of numbers in results, by the name of their field.
 
     >>> bounds_of("nis_mean"), bounds_of("position_rmse_m"), bounds_of("start_s")
     ((0.0, 1000000.0), (-1000000000.0, 1000000000.0), (-inf, inf))

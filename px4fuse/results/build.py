@@ -36,7 +36,7 @@ def results(
 ) -> contract.ComparisonResults:
     """Return the results of ``px4fuse compare`` on a flight with positions for KF.
 
-    For an assigned flight, the card shows the student's answers instead of the diagnosis.
+    If the flight is a student assignment, the student's answers replace the diagnosis.
     """
     card = build_card(analysis, request.without_paths(), (student.name, student.id))
     if analysis.flight.log.is_assessed and isinstance(student.answers, Answers):

@@ -140,8 +140,8 @@ class SettingChange(Record):
     b: float | str | None = None
 
 
-class FindingChange(Record):
-    """Finding that the results of only one of the inputs A and B contain."""
+class UnsharedFinding(Record):
+    """Finding in the results of only one of two compared inputs, A or B."""
 
     id: str
     severity: Literal["error", "warning", "note"]
@@ -292,7 +292,7 @@ class ChangeResults(Record, kw_only=True):
     b: DiffInput
     settings: tuple[SettingChange, ...]
     numbers: tuple[NumberChange, ...]
-    findings: tuple[FindingChange, ...]
+    findings: tuple[UnsharedFinding, ...]
     worse: tuple[str, ...]
     provenance: Provenance
 

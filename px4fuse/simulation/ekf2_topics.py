@@ -71,11 +71,11 @@ class Ekf2Output:
         return sensors.timestamps(sample_us, self.time_us[steps + self.lag_steps] - sample_us)
 
     def logged_message_indices(
-        self, is_message: BoolArray, end_step: IntArray, rate_hz: float
+        self, is_message_event: BoolArray, end_step: IntArray, rate_hz: float
     ) -> IntArray:
         """Return the indices of the messages that a logger writes with a rate limit (Hz)."""
         is_published = end_step < len(self.time_us) - self.lag_steps
-        events = np.flatnonzero(is_message & is_published)
+        events = np.flatnonzero(is_message_event & is_published)
         times_s = sensors.seconds(self.time_us[end_step[events]])
         return events[sensors.keep_at_rate(times_s, rate_hz)]
 

@@ -136,7 +136,8 @@ def parse_mistakes(texts: Iterable[str]) -> Mistakes:
         typed_values = values_text.split(",") if separator else []
         if len(typed_values) > len(mistake.size_fields):
             raise SettingsError(
-                f"--mistake {option_text} has too many values: give {name}{mistake.usage}."
+                f"--mistake {option_text}: the fault has too many values. "
+                f"Use {name}{mistake.usage}."
             )
         value_by_field[mistake.fields[0]] = mistake.default
         for field_name, value in zip(mistake.size_fields, typed_values, strict=False):

@@ -164,7 +164,7 @@ class _PdfComparison:
 
     is_same_text: TextComparison
     # object number and generation in the submitted PDF, object number in the redrawn PDF
-    compared_pairs: set[tuple[int, int, int]] = field(default_factory=set)
+    compared_objects: set[tuple[int, int, int]] = field(default_factory=set)
     # parents of pages in both PDFs, to be compared after the document catalogue
     parent_pairs: list[tuple[Any, Any, str]] = field(default_factory=list)
     # fonts of the current page, by their names in the page content
@@ -213,9 +213,9 @@ class _PdfComparison:
                     yield PageDifference(page, description, True)
                 if isinstance(redrawn_value, IndirectObject):
                     pair = submitted_value.idnum, submitted_value.generation, redrawn_value.idnum
-                    if pair in self.compared_pairs:
+                    if pair in self.compared_objects:
                         continue
-                    self.compared_pairs.add(pair)
+                    self.compared_objects.add(pair)
             submitted_value, redrawn_value = map(
                 resolve_reference, (submitted_value, redrawn_value)
             )

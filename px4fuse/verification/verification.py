@@ -327,7 +327,7 @@ def _verify_with_log(
     else:
         reasons += page_sentences
     remedy = ORIGINAL_PDF_REMEDY if is_from_other_program else ""
-    if differing_libraries:  # other library versions may draw other pages
+    if differing_libraries:  # their pages may differ slightly
         versions_text = one_line(", ".join(map(" ".join, sorted(differing_libraries))), 300)
         reasons.append(
             f"the report was made with {versions_text}; this computer has other versions"

@@ -37,7 +37,7 @@ from px4fuse.classroom.assignment.truth import (
     InjectedFault,
     VerdictTruth,
     _ekf2_behaviour,
-    quantity_truth,
+    right_numeric_answer,
 )
 from px4fuse.classroom.grading.form_points import form_points
 from px4fuse.diagnose import analyse_loop_closure, diagnose
@@ -112,7 +112,7 @@ def copied(analysis: Analysis, kinds: list[str], log_sha256: str) -> FormTruth:
     sigma_z_m = (tuning.sigma_z.value if isinstance(tuning, AxisTuning) else None) or 0.1
     behaviour = _ekf2_behaviour(analysis, mistakes, sigma_z_m)
     numbers = tuple(
-        quantity_truth(analysis.main, question) for question in select_questions(log_sha256)
+        right_numeric_answer(analysis.main, question) for question in select_questions(log_sha256)
     )
     return FormTruth(mistakes, sigma_z_m, kf, ekf2, *behaviour, numbers)
 

@@ -121,7 +121,7 @@ def assign(
     with inputs_not_registered():
         key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
-    # some students may have left the class; a key without any of the students is of another class
+    # an answer key with none of the students belongs to another class
     is_same_class = not answers or not answers.keys().isdisjoint(
         normalise_text(student.student_id) for student in students
     )

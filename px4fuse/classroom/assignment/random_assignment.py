@@ -221,7 +221,7 @@ def random_scenario_numbers(
 
 
 def encode_secret(text: str, source_name: str) -> bytes:
-    """Derive the key of the random numbers from the instructor's secret.
+    """Return the instructor's secret as seed of the random numbers.
 
     Raises
     ------

@@ -125,7 +125,8 @@ def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
         _verdict(comparison, "ekf2"),
         *_ekf2_behaviour(comparison, mistakes, sigma_z_m),
         tuple(
-            quantity_truth(comparison.main, question) for question in select_questions(log_sha256)
+            right_numeric_answer(comparison.main, question)
+            for question in select_questions(log_sha256)
         ),
     )
 
@@ -215,7 +216,7 @@ def _ekf2_behaviour(
     return tuple(required), tuple(each for each in dict.fromkeys(allowed) if each not in required)
 
 
-def quantity_truth(
+def right_numeric_answer(
     axis_comparison: AxisComparison, question: FormQuestion
 ) -> float | tuple[float, ...] | None:
     """Compute the right answer to a question by a run of KF; None with too few measurements.

@@ -60,9 +60,9 @@ class RubricItem(
     points : float
         Maximum points.
     report : {"any", "compare", "loop"}
-        Kind of reports that get points for the item, by choice of the instructor.
+        Command whose reports get points for the item, chosen by the instructor.
     command : {"any", "compare", "loop"}
-        Kind of reports that the check can score.
+        Command whose reports contain the data for the check.
     needs_key : bool
         True if the item is used only with an answer key.
     by_hand : bool

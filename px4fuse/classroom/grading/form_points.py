@@ -55,7 +55,7 @@ FULL_POINTS_TOLERANCE = 0.02
 # Maximum relative error of a computed number for half of the points
 HALF_POINTS_TOLERANCE = 0.10
 # Maximum relative error of the size of an injected fault for half of the points
-HALF_POINTS_SIZE_TOLERANCE = 0.4
+HALF_POINTS_FAULT_SIZE_TOLERANCE = 0.4
 
 
 class _CorrectionRule(NamedTuple):
@@ -168,8 +168,8 @@ def describe_right_answer(fault: InjectedFault) -> str:
 def _answer_feedback(answers: Answers, truth: FormTruth) -> Iterator[str]:
     """Yield the right answer to each question with a wrong answer, except those on faults."""
     rows: list[tuple[str, object, object]] = [
-        ("verdict on KF", answers.verdict_kf, truth.kf.verdict or NOT_AVAILABLE),
-        ("verdict on EKF2", answers.verdict_ekf2, truth.ekf2.verdict or NOT_AVAILABLE),
+        ("consistency verdict on KF", answers.verdict_kf, truth.kf.verdict or NOT_AVAILABLE),
+        ("consistency verdict on EKF2", answers.verdict_ekf2, truth.ekf2.verdict or NOT_AVAILABLE),
     ]
     if _ekf2_behaviour_fraction(answers, truth) < 1.0:
         rows.append(("behaviour of EKF2", answers.ekf2_did, truth.ekf2_did))
@@ -261,7 +261,7 @@ def size_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
         is_right = fault.low <= named_size <= fault.high and first_units[0] == first_units[1]
         return is_right / 3.0
     deviation = abs(named_size - fault.size) / abs(fault.size)
-    close_fraction = 0.5 * (deviation <= HALF_POINTS_SIZE_TOLERANCE)
+    close_fraction = 0.5 * (deviation <= HALF_POINTS_FAULT_SIZE_TOLERANCE)
     if fault.kind in GUESSABLE_KINDS:
         tolerance = (fault.high - fault.low) / (2.0 * abs(fault.size))
         close_fraction = max(1.0 - (deviation - tolerance) / GUESSABLE_SIZE_RANGE, 0.0)
@@ -269,7 +269,7 @@ def size_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
 
 
 def time_and_panel_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
-    """Return the fraction of the points for a fault: 1/2 for the time, 1/2 for the report panel."""
+    """Return 1/2 for the right time of a fault, plus 1/2 for a plot in the report that shows it."""
     if fault.from_s is None and fault.until_s is None:
         is_time_right = named_fault.when == "whole flight"
     else:

@@ -55,8 +55,8 @@ def ask_about_form(form: Answers, truth: FormTruth) -> Iterator[Question]:
             continue
         blind_panels = [panel for panel in PANELS if panel not in panels_showing(fault.kind)]
         yield (
-            f"You named {fault.kind} ({description}). Show it in your report, and name a panel "
-            "that cannot show it, with the reason.",
+            f"You named the fault {fault.kind} ({description}). Show it in a panel of your report. "
+            "Which other panel cannot show this fault, and why?",
             f"{describe_right_answer(fault)}. Panels that cannot show the fault, for example: "
             f"{' or '.join(blind_panels[:2])}.",
         )

@@ -164,7 +164,7 @@ def _entry_identity(entry: Entry, use_file_stem: bool = False) -> str:
 
 
 def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
-    """Copy the redrawn report and its diagnosis to the output folder, for the class page."""
+    """Copy the report as drawn again by px4fuse, and its diagnosis, to the output folder."""
     report = entry.counted_report
     if report is None or not report.sha256:
         return entry

@@ -78,7 +78,7 @@ def load_or_verify(
         return *loaded, True
     results = read_report(pdf, "The file")
     dependencies = _dependencies(to_json(results), path_by_sha256, assigned_hashes)
-    # the status is "cannot verify" instead of "other log" if an assigned log is not available
+    # without the student's log, pass no log: the status is then "cannot verify"
     is_log_missing = dependencies.get(log_sha256(results)) == "assigned"
     verification = verify(results, pdf, {} if is_log_missing else path_by_sha256)
     files = {REDRAWN_SUFFIX: verification.redrawn_pdf} if verification.redrawn_pdf else {}
