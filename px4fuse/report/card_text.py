@@ -313,7 +313,7 @@ def rerun_note(reruns: Sequence[Rerun]) -> str:
     if not starts_s:
         return ""
     return (
-        "EKF2 (replay) is a prediction by px4fuse's model of EKF2. Both values exclude gaps and "
+        "EKF2 (replay) is a prediction by px4fuse's model of EKF2. The values before and after exclude gaps and "
         f"the time before {min(starts_s):.0f} s."
     )
 
