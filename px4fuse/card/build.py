@@ -328,7 +328,7 @@ def _worst_axis_sentences(analysis: Analysis) -> list[str]:
 
 
 def _format_difference(rms_m: float) -> str:
-    return f"Position difference KF − EKF2: {format_metres(rms_m)} m RMS"
+    return f"Position difference KF − EKF2 along the main axis: {format_metres(rms_m)} m RMS"
 
 
 def _lengths_by_filter(lengths_m: Mapping[FilterName, float]) -> str:
@@ -507,8 +507,8 @@ def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> st
     }
     if len(corrected_filters) == 2:
         return (
-            f"{difference_text}. The fault affects KF and EKF2 equally, so the position "
-            "difference does not show the fault."
+            f"{difference_text}. The fault affects both KF and EKF2, so the position difference "
+            "hardly shows the fault."
         )
     difference_after_by_filter = {
         trial.filter: trial.after.difference_rms_m for trial in reversed(trials)

@@ -191,8 +191,15 @@ def _make_actions(
         remedy = with_log_name(finding.remedy, request.log)
         sender_actions.append(Action(_target_of(finding, analysis.source), remedy))
     delay_trial = trials.get(("ekf2", "delay"))
-    delay_actions = [make_parameter_action(analysis, delay_trial.change)] if delay_trial else []
     offset_trial = trials.get(("ekf2", "time offset")) or trials.get(("kf", "time offset"))
+    delay_actions = []
+    if delay_trial:
+        # parameters that also the correction at the sender needs are a separate action
+        common_names = offset_trial.change.keys() if offset_trial else ()
+        delay_change = {
+            name: value for name, value in delay_trial.change.items() if name not in common_names
+        }
+        delay_actions = [make_parameter_action(analysis, delay_change)]
     # users cannot shift the timestamps of a GNSS receiver
     if offset_trial and not (analysis.source.origin.is_gnss and sender_actions):
         shift_s = offset_trial.change[CLOCK_OFFSET]
@@ -317,7 +324,7 @@ def _make_rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
 def _trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
     kind, label = trial.kinds[0], "KF" if trial.filter == "kf" else "EKF2 (replay)"
     if OUTLIERS in trial.change:
-        return f"{label} without the {trial.change[OUTLIERS]:.0f}"
+        return f"{label} without {trial.change[OUTLIERS]:.0f} outliers"
     if trial.filter == "kf":
         options = " ".join(
             f"{COMPARISON_OPTIONS[name]} {value:g}"
@@ -336,9 +343,9 @@ def _closing_sentence(
 ) -> str:
     if alternatives:
         return (
-            "Take only one of these actions, because both correct the same time offset. Their "
-            "signs are opposite: a delay parameter (ms) is the age of a position, and is "
-            "subtracted from the timestamp."
+            "Take only one of the two alternatives, because both correct the same time offset. "
+            "The other actions are necessary with both. A delay parameter (ms) is positive for "
+            "late timestamps, and --clock-offset (s) is negative."
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):
         return "KF is consistent with the default noises as well as with the estimated noises."

@@ -204,7 +204,7 @@ def _drift_finding(
     return error(
         "source_drift",
         f"{sensor} drifts: {drift_text}. {rmse_sentence}The innovations of "
-        f"{' and '.join(filter_labels)} do not show the drift, because the filter follows "
+        f"{' and '.join(filter_labels)} do not show the drift, because the estimates follow "
         f"{sensor}. Do not reduce {noise_settings}.",
         DRIFT_REMEDY,
         evidence,

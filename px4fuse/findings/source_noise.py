@@ -79,7 +79,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     yield make_finding(
         "source_noise_time_correlated",
         f"Time-correlated {name} error of {noise.slow_m:.2g} m, correlation time "
-        f"{correlation_time_text} ({interval_text}). In addition the source has white noise of "
+        f"{correlation_time_text} ({interval_text}). The rest of the error is white noise of "
         f"{noise.white_m:.2g} m (1 σ). KF and EKF2 assume independent errors. Both follow the "
         "correlated error and report a σ that is too small. Innovations do not show this error.",
         f"Check {source_words(analysis.source).errors}.",

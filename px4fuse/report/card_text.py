@@ -313,8 +313,8 @@ def rerun_note(reruns: Sequence[Rerun]) -> str:
     if not starts_s:
         return ""
     return (
-        "EKF2 (replay) is a prediction by px4fuse's model of EKF2. Both values exclude gaps and "
-        f"the time before {min(starts_s):.0f} s."
+        "EKF2 (replay) is a prediction by px4fuse's model of EKF2. Its values before and after "
+        f"exclude gaps and the time before {min(starts_s):.0f} s."
     )
 
 

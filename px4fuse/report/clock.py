@@ -87,16 +87,16 @@ def clock_advice(
 
 
 def _delay_advice(comparison: PreparedComparison, clock: ClockOffset, logged_ms: float) -> str:
-    name, delay_ms = aid_of(comparison).delay, wrong_delay_ms(comparison, clock, logged_ms)
-    if delay_ms is None:
+    name, fitted_delay_ms = aid_of(comparison).delay, wrong_delay_ms(comparison, clock, logged_ms)
+    if fitted_delay_ms is None:
         return f"{name} {logged_ms:g} ms agrees with the estimate."
-    if limit_text := delay_limit(name, delay_ms, logged_ms):
+    if limit_text := delay_limit(name, fitted_delay_ms, logged_ms):
         return (
-            f"The maximum-likelihood {name} is {delay_ms:.0f} ms, but {name} cannot "
+            f"The maximum-likelihood {name} is {fitted_delay_ms:.0f} ms, but {name} cannot "
             f"{limit_text}. Correct the sender's clock."
         )
     return (
-        f"Set {name} to {max(delay_ms, 0.0):.0f} ms (now {logged_ms:g} ms), or correct the "
+        f"Set {name} to {max(fitted_delay_ms, 0.0):.0f} ms (now {logged_ms:g} ms), or correct the "
         "sender's clock."
     )
 
