@@ -54,7 +54,7 @@ def test_terminal_output_with_invalid_columns_variable_succeeds(
     assert usual[1].startswith(LOG.name)
 
 
-def test_info_with_env_columns_0_prints_log_name(monkeypatch, capsys) -> None:
+def test_info_with_terminal_width_0_prints_log_name(monkeypatch, capsys) -> None:
     monkeypatch.setenv("COLUMNS", "0")
     monkeypatch.setenv("TTY_COMPATIBLE", "1")
     code, out, _ = run_main(monkeypatch, capsys, "info", LOG)
