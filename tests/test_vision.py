@@ -302,7 +302,7 @@ def test_vision_position_bias_restarts_after_a_gap() -> None:
     for gap_s, anew in ((0.9 * MAX_SAMPLE_GAP_S, False), (1.5 * MAX_SAMPLE_GAP_S, True)):
         remaining = (vision.timestamp_s < at_s) | (vision.timestamp_s > at_s + gap_s)
         moved = vision.position_m + 20.0 * (vision.timestamp_s > at_s)[:, None]
-        fields = ("stamp_s", "arrival_s", "variance_m2", "rejected", "reset")
+        fields = ("timestamp_s", "arrival_s", "variance_m2", "rejected", "reset")
         parts = {name: getattr(vision, name)[remaining] for name in fields}
         found = update_log(ran(flying(replace(vision, position_m=moved[remaining], **parts))))
         after = found.loc[at_s + gap_s :]
@@ -387,7 +387,7 @@ def test_second_vision_sample_in_one_step_is_dropped() -> None:
     stamps = np.repeat(vision.timestamp_s, 2)
     stamps[::2] -= 0.0005
     once, twice = (update_log(ran(flying(one))) for one in (
-        vision, replace(vision, stamp_s=stamps, **doubled)))  # fmt: skip
+        vision, replace(vision, timestamp_s=stamps, **doubled)))  # fmt: skip
     assert len(once) <= len(twice) <= 1.1 * len(once)
     horizon_s = flying(vision).horizon_s
     for age_s, remaining in ((horizon_s + 0.05, True), (horizon_s + 0.15, False)):

@@ -105,7 +105,9 @@ def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[s
     run_starts = np.flatnonzero(np.append(True, ~is_repeated))
     # longest run that is likely in a source that repeats positions at random
     repeated_fraction = np.clip(np.mean(is_repeated), 1e-6, 1.0 - 1e-6) if len(is_repeated) else 0.5
-    random_count = np.log(len(valid_rows) / MAX_RANDOM_RUN_PROBABILITY) / -np.log(repeated_fraction)
+    random_count = np.log(max(len(valid_rows), 1) / MAX_RANDOM_RUN_PROBABILITY) / -np.log(
+        repeated_fraction
+    )
     held_rows = [
         valid_rows[run_start + 1 : run_end]
         for run_start, run_end in zip(run_starts, [*run_starts[1:], len(valid_rows)], strict=True)
