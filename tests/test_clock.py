@@ -39,7 +39,7 @@ from px4fuse.filter.fitting import Noises
 from px4fuse.filter.imu_motion import (
     CONSTANTS_PRIOR_SIGMA,
     INTEGRATION_STEP_S,
-    START_PRECISION,
+    SEGMENT_START_PRECISION,
     SegmentMotion,
     make_segment_motion,
     prepare_motion,
@@ -205,8 +205,8 @@ class JointNormal:
         since = self.since
         short, long = np.minimum.outer(since, since), np.maximum.outer(since, since)
         one_axis = (
-            1.0 / START_PRECISION[0]
-            + np.multiply.outer(since, since) / START_PRECISION[1]
+            1.0 / SEGMENT_START_PRECISION[0]
+            + np.multiply.outer(since, since) / SEGMENT_START_PRECISION[1]
             + sigma_a**2 * DT * short**2 * (3.0 * long - short) / 6.0
             + sigma_z**2 * np.eye(len(since))
         )

@@ -304,11 +304,11 @@ def test_simulate_fault_option_is_formatted_and_parsed_back(name):
     ("dropout = 8s", "cannot inject the fault dropout "),
     ("nlos=5s", "give percent"),
     ("nlos=80%", "give 0 to 50 %"),
-    ("nlos=5%,1m,2", r"give nlos=PERCENT\[,SIZE\]"),
+    ("nlos=5%,1m,2", r"Use nlos=PERCENT\[,SIZE\]"),
     ("clock-offset=nan", "give seconds"),
     ("clock-offset=1e999", "out of range"),
     ("clock-offset=", "give seconds"),
-    ("no-motion=1", "give no-motion"),
+    ("no-motion=1", "Use no-motion"),
 ])  # fmt: skip
 def test_simulate_invalid_fault_option_raises_one_line_error(text, expected):
     with pytest.raises(SettingsError, match=expected) as error:
