@@ -244,8 +244,10 @@ FILES: dict[str, tuple[Change, str, str]] = {
     "ten thousand lines of notes": (
         set_value("a\n" * 10_000, "student", "notes"), "cannot verify", ASK,
     ),
-    # the cover prints the id, and its font contains the letters of the cover only
-    "the id of another student": (forge_owner, "cannot verify", "assigned to student s01"),
+    # the cover prints the id; the status depends on the letters that its fonts contain
+    "the id of another student": (
+        forge_owner, "page differs or cannot verify", "assigned to student s01",
+    ),
     "another student on the card": (
         set_value("Eve", "card", "identity", "student"), "numbers differ", "",
     ),
@@ -292,7 +294,7 @@ def test_grade_report_with_forged_results_is_not_verified(
     graded = flight.graded(report, verdict, rubric)
     assert graded.status != "verified"
     assert not graded.counted_points
-    assert graded.status == status, graded.verification.reasons
+    assert graded.status in status.split(" or "), graded.verification.reasons
     assert not any("Error" in reason for reason in graded.verification.reasons), (
         graded.verification.reasons
     )
