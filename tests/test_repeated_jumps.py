@@ -46,3 +46,16 @@ def test_single_outliers_are_not_reported_as_jumps() -> None:
 
 def test_precise_positions_without_jumps_report_no_jumps() -> None:
     assert not [*source_positions.detect_repeated_jumps(shifted(0.0 * time_s()))]
+
+
+def test_randomly_repeated_positions_are_not_reported_as_jumps() -> None:
+    analysis = shifted(0.0 * time_s())
+    track = analysis.source
+    rows, is_repeated = (
+        np.arange(len(track.samples)),
+        np.random.default_rng(1).random(len(track.samples)) < 0.7,
+    )
+    last_new_rows = np.maximum.accumulate(np.where(is_repeated, 0, rows))
+    samples = track.samples.iloc[last_new_rows].set_axis(track.samples.index)
+    repeated = replace(analysis, source=replace(track, samples=samples))
+    assert not [*source_positions.detect_repeated_jumps(repeated)]

@@ -312,6 +312,8 @@ def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
     position_m = cut_to_segment(analysis.source.samples, analysis.segment)[
         Columns.POSITION[:2]
     ].dropna()
+    # a repeated position makes the next step larger
+    position_m = position_m[(position_m.diff() != 0.0).any(axis=1)]
     time_s, steps_m = position_m.index.to_numpy(), np.diff(position_m.to_numpy(), axis=0)
     if len(steps_m) < MIN_POSITIONS_FOR_JUMPS:
         return [], False
