@@ -65,6 +65,15 @@ def test_invalid_positions_are_found_with_their_reason():
     assert invalid(samples) == {"NaN": [5, 6], "held": [*range(30, 45)], "zero": [10, 20]}
 
 
+def test_randomly_repeated_positions_are_not_lost_tracking():
+    """Of 700 positions with 60 % repetitions, about one run has more than ten."""
+    random = np.random.default_rng(3)
+    rows = np.maximum.accumulate(np.where(random.random(700) < 0.6, 0, np.arange(700)))
+    positions = random.normal(0.0, 1.0, (700, 3))[rows]
+    time_s = pd.Index(0.15 * np.arange(700.0))
+    assert invalid(pd.DataFrame(positions, time_s, ["x", "y", "z"])) == {}
+
+
 def test_zero_position_near_the_origin_is_valid():
     samples = track() - 8.0
     assert samples.iloc[30].abs().max() < 1e-9
