@@ -179,7 +179,7 @@ def test_two_students_with_equal_figure_answers_are_flagged() -> None:
     assert "figures" in flags["s1"][0]
 
 
-# ------------------------------------------------------------------ answers of honest students
+# ------------------------------------------------ students who analysed their flight
 
 OFF = InjectedFault("ekf2-off")
 OFF_TRUTH = FormTruth(
@@ -197,7 +197,7 @@ def first_mistake(truth: FormTruth, **values) -> Answers:
     return replace(form, mistakes=(replace(form.mistakes[0], **values), *form.mistakes[1:]))
 
 
-# Right answers, form of an honest student, and minimum points of 100
+# Right answers, form of a student who analysed the flight, and minimum points of 100
 HONEST_FORMS: dict[str, tuple[FormTruth, Answers, float]] = {
     "EKF2 never fused, verdict not available": (OFF_TRUTH, right(OFF_TRUTH), 100.0),
     "EKF2 never fused and followed": (

@@ -66,7 +66,7 @@ def test_invalid_positions_are_found_with_their_reason():
 
 
 def test_randomly_repeated_positions_are_not_lost_tracking():
-    """Of 700 positions with 60 % repetitions, about one run has more than ten."""
+    """One run of more than ten is expected in 700 positions with 60 % repetitions."""
     random = np.random.default_rng(3)
     rows = np.maximum.accumulate(np.where(random.random(700) < 0.6, 0, np.arange(700)))
     positions = random.normal(0.0, 1.0, (700, 3))[rows]

@@ -161,7 +161,7 @@ def _describe_worse_verdicts(
     results_a: Results, results_b: Results, findings: Iterable[contract.UnsharedFinding]
 ) -> Iterator[str]:
     """Yield a sentence on each consistency verdict that is worse in B, and on each new error."""
-    verdicts_a, verdicts_b = map(_verdicts_by_label, (results_a, results_b))
+    verdicts_a, verdicts_b = map(_mean_statistics_by_label, (results_a, results_b))
     for name, (value_a, was_consistent) in verdicts_a.items():
         value_b, is_consistent = verdicts_b.get(name, (value_a, True))
         if was_consistent and not is_consistent:
@@ -181,7 +181,7 @@ def _describe_worse_verdicts(
         yield f"New finding of severity error: {finding_id}."
 
 
-def _verdicts_by_label(results: Results) -> dict[str, tuple[float, bool]]:
+def _mean_statistics_by_label(results: Results) -> dict[str, tuple[float, bool]]:
     """Return each mean NIS and mean NEES, and True if it is consistent."""
     verdicts: dict[str, tuple[float, bool]] = {}
     for axis, result in (value_at(results, "axes") or {}).items():

@@ -38,7 +38,7 @@ class InputResults:
 def read_inputs(
     a: Path, b: Path, progress: Progress = lambda _: None
 ) -> tuple[InputResults, InputResults]:
-    """Read the inputs A and B; if one is a log, analyse it with the settings in the other.
+    """Read the inputs A and B; analyse a log with the settings of the other input.
 
     Raises
     ------

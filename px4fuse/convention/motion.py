@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy import constants
 
 from px4fuse.convention.model import HeadingSource
 from px4fuse.core.arrays import Array, BoolArray, cumulative_integral
@@ -31,8 +32,6 @@ from px4fuse.trajectory.rotation import (
     to_vector,
 )
 
-# Standard gravity (m/s²)
-GRAVITY_M_S2 = 9.80665
 # Time T (s) between the three positions of a second difference
 DIFFERENCE_WINDOW_S = 2.0
 # Sample interval (s) of the second differences
@@ -233,7 +232,7 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
     body_to_ned = to_matrix(
         middle_attitude / np.linalg.norm(middle_attitude, axis=1, keepdims=True)
     )
-    acceleration = body_to_ned @ inertial.force_m_s2[..., None] + [[0.0], [0.0], [GRAVITY_M_S2]]
+    acceleration = body_to_ned @ inertial.force_m_s2[..., None] + [[0.0], [0.0], [constants.g]]
     table = np.concatenate([acceleration, body_to_ned], axis=2)
     position_m = np.zeros((len(attitude), 3, 4))
     velocity_m_s = np.cumsum(table, axis=0) * INTEGRATION_STEP_S

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pandas as pd
+from scipy import constants
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import ErrorsAgainstTruth
@@ -37,7 +38,6 @@ MAX_REST_STDS = (0.04, 1.5)
 MAX_REST_CHANGE_RAD_S = 0.01
 # Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
 MIN_GYRO_BIAS_RAD_S = 0.05
-GRAVITY_M_S2 = 9.80665
 # Minimum difference (m/s²) between gravity and the specific force at rest that a message states
 MIN_GRAVITY_ERROR_M_S2 = 0.3
 # Maximum fraction of the flight without tilt or yaw alignment that is not reported
@@ -98,11 +98,11 @@ def _detect_limited_bias(
         )
         if sensor == "accelerometer" and rest_values is not None:
             force_m_s2 = float(np.linalg.norm(rest_values[Columns.SPECIFIC_FORCE]))
-            if abs(force_m_s2 - GRAVITY_M_S2) > MIN_GRAVITY_ERROR_M_S2:
+            if abs(force_m_s2 - constants.g) > MIN_GRAVITY_ERROR_M_S2:
                 message += (
                     f" At rest before take-off the accelerometer measures {force_m_s2:.2f} m/s² "
-                    f"instead of {GRAVITY_M_S2:.2f}. Its bias along the down axis is "
-                    f"{GRAVITY_M_S2 - force_m_s2:+.2f} m/s²."
+                    f"instead of {constants.g:.2f}. Its bias along the down axis is "
+                    f"{constants.g - force_m_s2:+.2f} m/s²."
                 )
         yield error(
             "ekf2_bias_at_limit",

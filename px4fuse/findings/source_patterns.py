@@ -4,6 +4,7 @@ With ground truth, also a time offset that varies in flight, and a scale factor 
 """
 
 import pandas as pd
+from scipy import constants
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.error_patterns import (
@@ -39,7 +40,6 @@ MIN_TRUE_SCALE_ERROR = 0.08
 MIN_JITTER_ERROR_S = 0.03
 # Minimum amplitude (m) of a periodic error for severity error: twice the noise of good UWB
 MIN_PERIODIC_ERROR_M = 0.2
-GRAVITY_M_S2 = 9.80665
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -138,7 +138,7 @@ def detect_attitude_delay(analysis: Analysis) -> Findings:
             "attitude_late",
             f"The logged attitude is {abs(delay_s):.2f} s {'late' if delay_s > 0.0 else 'early'} "
             "relative to the gyroscopes. KF rotates the acceleration by this attitude, so the "
-            f"acceleration is wrong by {format_ratio(abs(delay_s) * GRAVITY_M_S2)} m/s² for each "
+            f"acceleration is wrong by {format_ratio(abs(delay_s) * constants.g)} m/s² for each "
             "rad/s of roll or pitch rate.",
             "Check the timestamps of the attitude: IMU and attitude must have the same clock.",
             {"delay_s": delay_s},

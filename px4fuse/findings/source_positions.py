@@ -198,8 +198,8 @@ def detect_jumps(analysis: Analysis) -> Findings:
             max(step.sigma for step in largest_jump.step_m),
         )
         positions = positions_phrase(analysis.source)
-        words = source_words(analysis.source)
-        cause = f"Possible causes: {words.jump}."
+        texts = source_words(analysis.source)
+        cause = f"Possible causes: {texts.jump}."
         evidence = {"count": len(large_jumps), "size_m": size_m, "at_s": jump_s, "sigma_m": sigma_m}
         if np.any(np.abs(counter_changes_s - jump_s) < MAX_JUMP_TO_COUNTER_S):
             evidence[ANNOUNCED] = float(
@@ -221,7 +221,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
             f"{positions} {jump_text} at {jump_s:.1f} s and {end_text}. The IMU measures no such "
             f"motion (± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow the jump, and "
             "their innovations stay consistent.",
-            f"{words.jump_action} Analyse only the time before or after the jump (--start, --end).",
+            f"{texts.jump_action} Analyse only the time before or after the jump (--start, --end).",
             evidence,
             zero_length_spans(jump.time_s for jump in large_jumps),
         )
@@ -401,7 +401,7 @@ def detect_outliers(analysis: Analysis) -> Findings:
     outlier_count, outlier_fraction = len(outlier_times_s), len(outlier_times_s) / axis_tuning.count
     if outlier_fraction < MIN_OUTLIER_FRACTION or outlier_count < MIN_OUTLIERS:
         return
-    words = source_words(analysis.source)
+    texts = source_words(analysis.source)
     sizes_m, reference = outlier_sizes_m(analysis, np.array(outlier_times_s))
     yield finding(
         "error" if outlier_fraction >= MIN_OUTLIER_FRACTION_ERROR else "warning",
@@ -409,10 +409,10 @@ def detect_outliers(analysis: Analysis) -> Findings:
         f"{outlier_count} of {axis_tuning.count} {positions_phrase(analysis.source)} "
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
         f"{format_metres(float(sizes_m.max()))} m. Their median distance to {reference} is "
-        f"{format_metres(float(np.median(sizes_m)))} m. Possible cause: {words.outliers}. KF "
+        f"{format_metres(float(np.median(sizes_m)))} m. Possible cause: {texts.outliers}. KF "
         "rejects no outliers and follows each "
         f"outlier.{_rejected_outliers_sentence(analysis, outlier_times_s)}",
-        words.outliers_action,
+        texts.outliers_action,
         {
             "count": outlier_count,
             "share": outlier_fraction,

@@ -18,7 +18,7 @@ from px4fuse.results.model import SCHEMA_VERSION
 MAX_RESULTS_BYTES, MAX_INTEGER_BITS = 5_000_000, 64
 
 
-class _Schema(msgspec.Struct, frozen=True):
+class _SchemaVersion(msgspec.Struct, frozen=True):
     name: str
     version: str
 
@@ -26,7 +26,7 @@ class _Schema(msgspec.Struct, frozen=True):
 class _Head(msgspec.Struct, frozen=True):
     """Fields of results in all schema versions."""
 
-    schema: _Schema
+    schema: _SchemaVersion
     provenance: Any = None
 
 

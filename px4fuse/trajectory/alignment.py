@@ -17,9 +17,9 @@ from px4fuse.trajectory.model import MIN_POSES
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 
-# Minimum extent of the motion for an estimate of rotation, as fraction of the largest extent
+# Minimum extent of a path from which a rotation can be estimated, as fraction of its largest extent
 MIN_EXTENT_FRACTION = 1e-6
-# Minimum extent (m, RMS) of the motion for an estimate of rotation
+# Minimum extent (m, RMS) of a path from which a rotation can be estimated
 MIN_EXTENT_M = 1e-6
 # Maximum ratio of residual to horizontal motion for an estimate of yaw: two independent noise
 # tracks of equal variance have the ratio √2

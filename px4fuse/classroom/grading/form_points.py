@@ -241,7 +241,7 @@ def _fault_fractions(matches: list[Match], truth: FormTruth) -> dict[str, float]
         weight = (size_points if fault.kind in GUESSABLE_KINDS else 1.0) / len(matches)
         time_weight = weight if named_fault.kind == fault.kind else 0.5 * weight
         fractions["mistakes"] += fraction / len(matches)
-        fractions["time and panel"] += time_and_panel_fraction(fault, named_fault) * time_weight
+        fractions["time and panel"] += evidence_fraction(fault, named_fault) * time_weight
         fractions["correction"] += correction_fraction(fault, named_fault, truth) * weight
         fractions["sizes"] += size_points / max(sized_fault_count, 1)
     return fractions
@@ -268,7 +268,7 @@ def size_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
     return _value_fraction(named_size, fault.low, fault.high, close_fraction)
 
 
-def time_and_panel_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
+def evidence_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
     """Return 1/2 for the right time of a fault, plus 1/2 for a plot in the report that shows it."""
     if fault.from_s is None and fault.until_s is None:
         is_time_right = named_fault.when == "whole flight"
