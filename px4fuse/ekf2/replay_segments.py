@@ -637,7 +637,7 @@ def low_pass_weights(
 
     Parameters
     ----------
-    newest_s, count, interval_s : ndarray, shape (m,)
+    newest_sample_s, sample_count, interval_s : ndarray, shape (m,)
         Time of the newest sample, number of samples, and sample interval of each mean.
     new_sample_weight : float or ndarray, shape (m,)
         Weight of a new sample in the low-pass filter.

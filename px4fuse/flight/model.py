@@ -709,7 +709,7 @@ class Truth:
     __repr__ = one_line_repr
 
 
-# Flights are compared by identity (eq=False), because caches use flights as keys
+# Flights are compared by identity (eq=False), because frames have no single truth value of ==
 @dataclass(frozen=True, eq=False)
 class Flight:
     """One recorded flight.

@@ -26,6 +26,8 @@ MIN_HELD_S = 1.0
 MIN_HELD_COUNT = 5
 # Maximum fraction of frozen positions to reject them: with more, the vehicle may be at rest
 MAX_HELD_FRACTION = 0.5
+# Maximum probability that a source with random repetitions has a run that counts as lost tracking
+MAX_RANDOM_RUN_PROBABILITY = 0.01
 # Tolerance, in rounding steps, for a coordinate difference that is a whole number of steps
 MAX_STEP_ERROR = 0.01
 # Minimum norm of a valid quaternion: senders without attitude send zeros
@@ -61,10 +63,6 @@ def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
         f"the file ends within a {unit} after {duration_s:.1f} s{', in flight' * in_flight}; later "
         "data are missing"
     )
-
-
-# Maximum probability that a source with random repetitions has a run that counts as lost tracking
-MAX_RANDOM_RUN_PROBABILITY = 0.01
 
 
 def finite_rows(

@@ -521,7 +521,7 @@ def read_truth(
                 local_samples[column] += np.nan_to_num(shift_m)
     if len(local_samples):
         return Truth(local_layout.topic, local_samples, attitude)
-    mocap_truth = motion_capture_truth(positions, "vehicle_mocap_odometry")
+    mocap_truth = motion_capture_truth(positions)
     reason = "the log has neither simulation ground truth nor motion capture"
     remedy = px4.TRACKS["vehicle_mocap_odometry"].remedy
     if len(logged_local):
@@ -530,12 +530,14 @@ def read_truth(
     return mocap_truth or Unavailable("ground truth", reason, remedy)
 
 
-def motion_capture_truth(positions: tuple[PositionTrack, ...], topic: str) -> Truth | None:
+def motion_capture_truth(positions: tuple[PositionTrack, ...]) -> Truth | None:
     """Return motion capture as ground truth, if the log also contains external vision.
 
-    Without external vision, EKF2 may have fused motion capture.
+    Without external vision, EKF2 may have fused motion capture. The north of positions in FRD is
+    unknown.
     """
-    track = next((track for track in positions if track.topics[0] == topic), None)
+    tracks = (track for track in positions if track.origin.kind == "mocap")
+    track = next((track for track in tracks if track.frame != "FRD"), None)
     if track is None or not any(track.origin.is_vision for track in positions):
         return None
     samples = track.samples.reindex(columns=Columns.STATE)

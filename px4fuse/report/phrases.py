@@ -55,7 +55,7 @@ def format_settings(settings: Settings) -> str:
 def format_verdict(consistency: Consistency | Unavailable) -> str:
     """State whether a filter is consistent, or by which factor its reported σ is wrong."""
     if isinstance(consistency, Unavailable):
-        return "not logged"
+        return "not evaluated"
     return format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
 
 
