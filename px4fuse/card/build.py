@@ -18,7 +18,6 @@ from px4fuse.card.causes import (
     rank_causes,
 )
 from px4fuse.card.model import (
-    FILTER_NAMES,
     MAX_CAUSES,
     MAX_HEADLINE_LENGTH,
     Action,
@@ -27,14 +26,19 @@ from px4fuse.card.model import (
     CardSeverity,
     Cause,
     Effect,
-    FilterName,
     Identity,
     Note,
     Verdict,
 )
 from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.flight_events import MIN_GAP_S
-from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth, north_and_east
+from px4fuse.comparison.model import (
+    FILTER_NAMES,
+    AxisComparison,
+    ErrorsAgainstTruth,
+    FilterName,
+    north_and_east,
+)
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import improvement
 from px4fuse.core.reading import display_name, file_size, read_head

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import FILTER_NAMES, Action, Cause, FilterName, Rerun, Target, Verdict
+from px4fuse.card.model import Action, Cause, Rerun, Target, Verdict
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
+from px4fuse.comparison.model import FILTER_NAMES, FilterName
 from px4fuse.comparison.trials import (
     CLOCK_OFFSET,
     OUTLIERS,
@@ -230,7 +231,7 @@ def _make_actions(
     # KF actions are last, because the vehicle must be corrected first
     actions.sort(key=lambda action: action.target == "KF")
     targets = {action.target for group in (actions, *alternatives) for action in group}
-    reason_by_filter = {
+    reason_by_filter: dict[Target, str] = {
         name: reason
         for filter_name, name in FILTER_NAMES.items()
         if name not in targets

@@ -31,7 +31,7 @@ from px4fuse.flight.model import Flight, PositionTrack
 
 FilterName = Literal["kf", "ekf2"]
 Track: TypeAlias = pd.DataFrame | Unavailable
-FILTERS: tuple[FilterName, FilterName] = ("kf", "ekf2")
+FILTER_NAMES: Mapping[FilterName, Literal["KF", "EKF2"]] = {"kf": "KF", "ekf2": "EKF2"}
 
 
 class ErrorsAgainstTruth(Record, kw_only=True):

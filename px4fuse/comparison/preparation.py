@@ -34,7 +34,7 @@ from px4fuse.readers.px4_innovations import (
     has_fused_aid,
     with_gnss_innovations,
 )
-from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME
+from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME, SOURCE_TRACKS
 from px4fuse.request import ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
@@ -42,6 +42,7 @@ from px4fuse.trajectory.rotation import interpolate, to_matrix
 LOGGED_ORIGINS = ORIGIN_BY_TRACK_NAME | {
     source.track_name: source.origin for source in POSITION_INPUTS
 }
+POSITION_MESSAGES = dict.fromkeys(source.message for source in POSITION_INPUTS)
 GNSS_MESSAGES = {layout.topic for layout in GNSS_LAYOUTS}
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
@@ -271,13 +272,13 @@ def _use_barometer_height(
 def explain_missing_source(flight: Flight) -> Unavailable:
     """Return the reason why the log has no position source, and the action."""
     damage_text = "the file is damaged, and " if flight.log.damage else ""
-    topics = "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision"
+    topics = f"{', '.join(SOURCE_TRACKS)} or EKF2 innovations of external vision"
     remedy = (
         "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as VISION_POSITION_ESTIMATE, or "
         "give the position file with --position."
     )
     if flight.log.format.startswith("MAVLink"):
-        topics = "VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP"
+        topics = " or ".join(POSITION_MESSAGES)
         ulog_text = ", or read the ULog of this flight" if flight.log.has_ulog else ""
         remedy = (
             f"give the position file of the positioning system as argument `position`{ulog_text}."

@@ -12,7 +12,7 @@ from msgspec import structs
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.changes import MIN_RERUN_SIGMA_Z_M, SIGMA_A, SIGMA_Z, tuning_of_axis
 from px4fuse.comparison.estimates import first_axis_tuning
-from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
 from px4fuse.comparison.reruns import is_inconsistent
@@ -251,7 +251,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
 
 
 def detect_inconsistent_variances(analysis: Analysis) -> Findings:
-    for filter_name in FILTERS:
+    for filter_name in FILTER_NAMES:
         for is_underconfident in (True, False):
             first_id = None
             for axis_group, axes in AXIS_GROUPS.items():
@@ -317,7 +317,7 @@ def _variance_finding(
     return finding(
         severity,
         f"{filter_name}_{confidence}",
-        f"{filter_name.upper()} is {confidence} along {result.axis.label}: σ is "
+        f"{FILTER_NAMES[filter_name]} is {confidence} along {result.axis.label}: σ is "
         f"{format_ratio(sigma_factor)} times too {'large' if is_underconfident else 'small'}. The "
         f"mean NIS of this {axis_group} axis is {format_number(summary.nis_mean)}, expected "
         f"{low:.2f} to {high:.2f}.",

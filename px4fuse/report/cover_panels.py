@@ -13,9 +13,9 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import FILTER_NAMES, Card
+from px4fuse.card.model import Card
 from px4fuse.comparison.comparison import kf_state_and_variance, position_errors, reported_sigma
-from px4fuse.comparison.model import FILTERS, AxisComparison, north_and_east
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, north_and_east
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.signals import AISLE, cut_to_segment
@@ -175,7 +175,7 @@ def _position_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
     result, effect = analysis.main.in_flight, card.effect
     errors_by_filter = {
         filter_name: errors
-        for filter_name in FILTERS
+        for filter_name in FILTER_NAMES
         if isinstance(errors := position_errors(result, filter_name), pd.DataFrame)
         and errors["error_m"].notna().any()
     }

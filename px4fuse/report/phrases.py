@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from px4fuse.comparison.model import (
+    FILTER_NAMES,
     AxisComparison,
     Comparison,
     Difference,
@@ -71,11 +72,13 @@ def format_sigma_verdict(verdict: str, factor: float) -> str:
 
 
 def statistics_by_filter(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
-    """Return the statistics of KF, and of EKF2 if logged, by filter name."""
-    filters = {"KF": result.filters["kf"]}
-    if not isinstance(result.ekf2_state, Unavailable):
-        filters["EKF2"] = result.filters["ekf2"]
-    return filters
+    """Return the statistics of each filter, without EKF2 if it is not logged, by label."""
+    is_ekf2_missing = isinstance(result.ekf2_state, Unavailable)
+    return {
+        FILTER_NAMES[name]: statistics
+        for name, statistics in result.filters.items()
+        if not (name == "ekf2" and is_ekf2_missing)
+    }
 
 
 VERDICT_TABLE_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")

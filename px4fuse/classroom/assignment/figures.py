@@ -8,11 +8,10 @@ from io import BytesIO
 
 import pandas as pd
 
-from px4fuse.card.model import FILTER_NAMES
 from px4fuse.classroom.assignment.random_assignment import random_scenario_numbers
 from px4fuse.classroom.assignment.truth import compare_simulation
 from px4fuse.comparison.comparison import position_errors
-from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison, FilterName
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, Comparison, FilterName
 from px4fuse.core.record import Record, read_toml
 from px4fuse.flight.model import Ekf2, Truth
 from px4fuse.report import panels, style
@@ -110,7 +109,7 @@ def _figures_png(comparisons: Mapping[str, Comparison]) -> bytes:
             result = comparison.main.in_flight
             axes[0].set_title(f"{title}: innovations along the aisle and ±2√S (m)")
             panels.draw_innovations(axes[0], result)
-            for axis, filter_name in zip(axes[1:3], FILTERS, strict=True):
+            for axis, filter_name in zip(axes[1:3], FILTER_NAMES, strict=True):
                 _draw_errors(axis, result, filter_name)
             for axis in axes[:3]:
                 style.label_time_axis(axis, with_time_label=True)
