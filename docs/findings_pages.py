@@ -332,7 +332,7 @@ def save_picture(name: str, example: Example, folder: Path) -> str:
     axis_analysis = example.analysis.axes.get(str(axis)) or example.analysis.main
     figure, panels = pyplot.subplots(3, sharex=True, figsize=(8, 7), layout="constrained")
     for axes, panel in zip(panels, (POSITION, INNOVATIONS, SIGMA_P), strict=True):
-        panel.draw(axes, axis_analysis.in_flight)
+        panel.draw(axes, axis_analysis.with_flight_tracks())
         axes.set_ylabel(fill(panel.title, LABEL_LENGTH))
     panels[0].set_title(axis_analysis.axis.name)
     panels[-1].set_xlabel("time (s)")

@@ -49,15 +49,13 @@ class Analysis(Comparison, Estimates, Reruns):
         model = self.ekf2_model
         return model if isinstance(model, Unavailable) else model.baseline_replay
 
-    @property
-    def main_trials(self) -> list[Trial]:
-        """Re-runs along the main axis, except EKF2 re-runs that are not compared with the log."""
+    def select_main_trials(self) -> list[Trial]:
+        """Return re-runs along the main axis, without those of EKF2 that start from a replay."""
         main_axis = self.main.axis.name
         return [trial for trial in self.trials if trial.axis == main_axis and trial.is_logged]
 
-    @property
-    def secondary_axes(self) -> list[AxisComparison]:
-        """Comparisons along all axes except ``main``, the axis with the largest motion."""
+    def select_secondary_axes(self) -> list[AxisComparison]:
+        """Return comparisons along all axes except ``main``, the axis with the largest motion."""
         return [axis for axis in self.axes.values() if axis is not self.main]
 
 

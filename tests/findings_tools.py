@@ -133,7 +133,7 @@ def analysis(
         main=next(iter(axes), axis()), input_axes=tuple(each.axis for each in axes),
         segment=SEGMENT, settings=settings, notes=notes, missing=missing,
         **{"tuning": {}, "difference_steps": {}, "trials": (), **usual, **parts},
-        main_trials=[t for t in parts.get("trials", ()) if t.kinds],
+        select_main_trials=lambda: [t for t in parts.get("trials", ()) if t.kinds],
     )  # fmt: skip
 
 

@@ -301,7 +301,7 @@ def test_robust_pose_graph_removes_false_loop_closure() -> None:
             assert solution.converged or not robust
             off[robust].append(ate(solution.poses, truth) / known - 1.0)
             assert np.all((solution.weights >= 0.0) & (solution.weights <= 1.0))
-            assert np.all(solution.weights[graph.is_successive] == 1.0)
+            assert np.all(solution.weights[graph.find_successive()] == 1.0)
             squared = residuals(graph, solution.poses).chi2
             assert solution.cost == pytest.approx(0.5 * np.sum(solution.weights * squared))
             if robust:
@@ -384,7 +384,7 @@ def test_loop_closure_gate_distance_equals_gtsam(dimension: int, is_back: bool) 
     """For an exact closure the distance depends on the odometry covariance only."""
     gtsam = pytest.importorskip("gtsam")
     graph = odometry_graph(dimension, 1e-3)
-    chain = graph.select_edges(graph.is_successive)
+    chain = graph.select_edges(graph.find_successive())
     factors, values = gtsam_problem(gtsam, chain)
     kind, free = "Pose2" if dimension == 2 else "Pose3", TANGENT[dimension]
     held = getattr(values, f"at{kind}")(0)

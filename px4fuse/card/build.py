@@ -111,7 +111,7 @@ def build_card(
         analysis.flight.log,
         request,
         student,
-        source=f"{source_name(source)} {source.rate_hz:.1f} Hz",
+        source=f"{source_name(source)} {source.compute_rate_hz():.1f} Hz",
         settings=_settings_text(analysis, request),
         changed=_changed_setting_texts(request),
         parameters=_changed_parameter_texts(analysis),
@@ -317,7 +317,7 @@ def _effect_text(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Ve
 
 
 def _worst_axis_sentences(analysis: Analysis) -> list[str]:
-    results = (analysis.main, *analysis.secondary_axes)
+    results = (analysis.main, *analysis.select_secondary_axes())
     nees_with_results = [
         (truth.nees_position_mean, result, truth.position_rmse_m)
         for result in results

@@ -79,7 +79,7 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
     for finding in root_findings:
         if finding.severity == "note":
             continue
-        trials = confirming_trials(analysis.main_trials, finding)
+        trials = confirming_trials(analysis.select_main_trials(), finding)
         if CATALOGUE[finding.id].verdict == "repeated":
             trials = tuple(filter(is_useful, trials))
         elif trials and not any(

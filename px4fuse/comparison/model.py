@@ -144,9 +144,8 @@ class AxisComparison(Record, kw_only=True):
     truth: NotWritten[Track] = NOT_WRITTEN
     flight_tracks: NotWritten[Mapping[str, Track]] = NOT_WRITTEN
 
-    @property
-    def in_flight(self) -> "AxisComparison":
-        """Result with the tracks of the whole flight instead of the analysed segment, for plots."""
+    def with_flight_tracks(self) -> "AxisComparison":
+        """Return the result with tracks of the whole flight instead of the segment, for plots."""
         return structs.replace(self, **self.flight_tracks)
 
 

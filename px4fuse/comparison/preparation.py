@@ -311,7 +311,8 @@ def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
         missing.source
         for missing in flight.missing
         if missing.source in LOGGED_ORIGINS
-        and LOGGED_ORIGINS[missing.source].preference_rank < track.origin.preference_rank
+        and LOGGED_ORIGINS[missing.source].find_preference_rank()
+        < track.origin.find_preference_rank()
     ]
     if not better_sources:
         return f"chosen automatically: positions as received by PX4{origin_text}"

@@ -251,7 +251,7 @@ def _try_changes(
             after=after,
             from_s=None
             if tested_filter.model is None
-            else tested_filter.model.baseline_replay.evaluated_s[0][0],
+            else tested_filter.model.baseline_replay.find_evaluated_spans()[0][0],
         )
 
     trials = [make_trial(change, discrepancies) for change, discrepancies in changes]
@@ -274,7 +274,7 @@ def _unchanged_statistics(
     innovations = axis_result.ekf2_innovations
     if isinstance(logged_state, Unavailable) or isinstance(innovations, Unavailable):
         return replayed_statistics, False
-    compared_s = tested_filter.model.baseline_replay.evaluated_s
+    compared_s = tested_filter.model.baseline_replay.find_evaluated_spans()
     compared_state = rows_inside(logged_state, compared_s)
     innovations = rows_inside(innovations, compared_s)
     rejected_flags = innovations["rejected"].dropna()
@@ -409,7 +409,7 @@ def _replay_statistics(
     axis_result: AxisComparison,
     change: Change,
 ) -> RunStatistics:
-    compared_s, axis = model.baseline_replay.evaluated_s, axis_result.axis
+    compared_s, axis = model.baseline_replay.find_evaluated_spans(), axis_result.axis
     if ROTATION in change and comparison.source.origin.is_gnss:
         # the replay rotates GNSS positions and therefore EKF2's heading: rotate the axis back
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))

@@ -87,7 +87,8 @@ def check_convention(
         return None
     positions = _read_positions(flight, track, max_offset_s)
     motions = {
-        name: motion_from_imu(inertial, attitude) for name, attitude in inertial.attitudes.items()
+        name: motion_from_imu(inertial, attitude)
+        for name, attitude in inertial.compute_attitudes().items()
     }
     hypotheses = _search_hypotheses(positions, motions)
     if not hypotheses:

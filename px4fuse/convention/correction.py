@@ -194,7 +194,7 @@ def correct_convention(
     inertial = read_inertial(flight) if faults.affects_ekf2 else None
     if inertial is None:
         return flight, track
-    attitude = inertial.attitudes[convention.heading_from]
+    attitude = inertial.compute_attitudes()[convention.heading_from]
     # the axes of the positions are correct: rotate the attitude to the north of the positions
     if not faults.has_wrong_axes and not faults.rotation_deg:
         turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x)

@@ -103,7 +103,7 @@ def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
     position_samples = track.samples[Columns.POSITION[:2]].dropna()
     if inertial is None or len(position_samples) < 2:
         return None
-    attitude = inertial.attitudes["EKF2"]
+    attitude = inertial.compute_attitudes()["EKF2"]
     imu_motion = motion_from_imu(inertial, attitude)
     rotation = to_matrix(attitude)[:, :2, :2].reshape(-1, 4)
     arm_differences = SourceMotion.of(inertial.time_s, rotation, imu_motion.time_s).table.reshape(

@@ -71,9 +71,8 @@ class Inertial:
     gyro_attitude: Array
     valid_spans_s: tuple[tuple[float, float], ...]
 
-    @property
-    def attitudes(self) -> dict[HeadingSource, Array]:
-        """Attitudes with the tilt of ``gyro_attitude``, and the heading of EKF2 or gyroscopes."""
+    def compute_attitudes(self) -> dict[HeadingSource, Array]:
+        """Return the attitudes with the tilt of ``gyro_attitude``, by source of the heading."""
         return {
             "EKF2": replace_heading(self.gyro_attitude, heading(self.logged_attitude)),
             "gyroscopes": self.gyro_attitude,

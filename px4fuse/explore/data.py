@@ -166,8 +166,8 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Pa
         "bands": _nis_bands(len(result.axis.measurement_time_s), packer),
         # horizontal axes share their noise estimates if they exist
         "noises": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
-        "ekf2": _ekf2_data(analysis, result.in_flight, packer),
-        "truth": _truth_data(result.in_flight, packer),
+        "ekf2": _ekf2_data(analysis, result.with_flight_tracks(), packer),
+        "truth": _truth_data(result.with_flight_tracks(), packer),
     }
 
 

@@ -48,7 +48,7 @@ def is_refuted(analysis: Analysis, filter_name: FilterName, cause: Trial) -> boo
         (trial.filter, trial.change) == (filter_name, cause.change)
         and can_show_improvement(trial)
         and improvement(trial) == "nothing"
-        for trial in analysis.main_trials
+        for trial in analysis.select_main_trials()
     )
 
 

@@ -187,11 +187,11 @@ def format_estimate(name: str, setting: float, noise: Noise) -> str:
 
 
 def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
-    if trial := find_trial(analysis.main_trials, "kf", "noises", name):
+    if trial := find_trial(analysis.select_main_trials(), "kf", "noises", name):
         return format_kf_settings(trial.change)
     if any(
         trial.filter == "kf" and trial.change.keys() == {name} and can_show_improvement(trial)
-        for trial in analysis.main_trials
+        for trial in analysis.select_main_trials()
     ):
         return NO_IMPROVEMENT
     value = max(value, MIN_RERUN_SIGMA_Z_M) if name == SIGMA_Z else value

@@ -98,7 +98,7 @@ def detect_slow_patterns(analysis: Analysis, fit: ErrorFit) -> Findings:
         )
         return
     clock, variation = analysis.clock, find_offset_variation(fit)
-    if isinstance(clock, ClockOffset) and clock.changes:
+    if isinstance(clock, ClockOffset) and clock.has_changed():
         return  # source_clock reports the change
     if variation is not None:
         yield error(

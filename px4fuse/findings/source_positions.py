@@ -447,7 +447,7 @@ def _rejected_outliers_sentence(analysis: Analysis, outlier_times_s: Sequence[fl
     if len(innovations) < MIN_INNOVATION_FRACTION * len(analysis.main.axis.measurement_time_s):
         return ""
     rejected_s = innovations.index[innovations["rejected"] > 0.0].to_numpy()
-    tolerance_s = 0.5 / analysis.source.rate_hz
+    tolerance_s = 0.5 / analysis.source.compute_rate_hz()
     rejected_count = sum(
         bool(np.any(np.abs(rejected_s - time_s) < tolerance_s)) for time_s in outlier_times_s
     )

@@ -88,7 +88,7 @@ def split_tracks(
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Separate position tracks, best first, from the records of missing tracks."""
     available_tracks = [track for track in tracks if isinstance(track, PositionTrack)]
-    available_tracks.sort(key=lambda track: track.origin.preference_rank)
+    available_tracks.sort(key=lambda track: track.origin.find_preference_rank())
     missing_tracks = (track for track in tracks if isinstance(track, Unavailable))
     return tuple(available_tracks), tuple(missing_tracks)
 

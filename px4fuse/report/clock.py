@@ -64,7 +64,7 @@ def clock_advice(
         advice["Re-run"] = f"px4fuse compare LOG --clock-offset {option_s:.3f}"
     if (logged_ms := delay_ms(comparison)) is not None:
         advice["PX4"] = _delay_advice(comparison, clock, logged_ms)
-    if clock.changes:
+    if clock.has_changed():
         offset_texts = ", ".join(
             f"{part.offset_s:+.2f} s from {part.start_s:.0f} s" for part in clock.parts
         )

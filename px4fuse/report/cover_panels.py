@@ -96,8 +96,7 @@ class FlightMap(NamedTuple):
     right_labels: Sequence[str]
     up_label: str
 
-    @property
-    def is_long(self) -> bool:
+    def has_long_track(self) -> bool:
         length_m, width_m = (float(np.ptp(values)) for values in self.tracks["positions"])
         return length_m >= MIN_LONG_TRACK_RATIO * max(width_m, 1e-6)
 
@@ -119,7 +118,7 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free_height: floa
     innovation_height = float(
         np.clip(INNOVATION_HEIGHT_FRACTION * plots_height, *INNOVATION_HEIGHT_RANGE)
     )
-    if flight_map.is_long and plots_height >= min_long_map_height:
+    if flight_map.has_long_track() and plots_height >= min_long_map_height:
         map_height = float(np.clip(MAP_HEIGHT_FRACTION * plots_height, *MAP_HEIGHT_RANGE))
         _draw_map(page, analysis, flight_map, map_height)
         error_heights = _equal_heights(page, errors, plots_height - map_height - innovation_height)
@@ -172,7 +171,7 @@ def _title_height(page: Page, title: str) -> float:
 
 def _position_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
     """Return a plot of the position error of each filter, or one of KF - EKF2 if it is unknown."""
-    result, effect = analysis.main.in_flight, card.effect
+    result, effect = analysis.main.with_flight_tracks(), card.effect
     errors_by_filter = {
         filter_name: errors
         for filter_name in FILTER_NAMES

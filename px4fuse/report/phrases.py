@@ -99,7 +99,7 @@ def verdict_cells(result: AxisComparison, name: str) -> list[Cell]:
 
 def write_error_table(page: Page, analysis: Analysis) -> None:
     """Write the table of verdicts and position errors of all axes."""
-    axes = (analysis.main, *analysis.secondary_axes)
+    axes = (analysis.main, *analysis.select_secondary_axes())
     has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
     has_truth = isinstance(analysis.flight.truth, Truth)
 

@@ -179,9 +179,11 @@ def _flight_fields(
         **track.description_fields(),
         ekf2_parameters={} if origin.aid is None else origin.aid.logged_parameters(parameters),
         reason=comparison.source_reason,
-        rate_hz=track.rate_hz,
+        rate_hz=track.compute_rate_hz(),
         available=tuple(
-            AvailableTrack(a.name, a.origin.kind, a.origin.path, len(a.samples), a.rate_hz)
+            AvailableTrack(
+                a.name, a.origin.kind, a.origin.path, len(a.samples), a.compute_rate_hz()
+            )
             for a in comparison.flight.positions
         ),
         missing=tuple(part for part in comparison.missing if part.source),

@@ -106,7 +106,7 @@ def _figures_png(comparisons: Mapping[str, Comparison]) -> bytes:
         picture = Figure(figsize=(17.0, 3.6 * len(comparisons)), layout="constrained")
         rows = picture.subplots(len(comparisons), 4, squeeze=False)
         for (title, comparison), axes in zip(comparisons.items(), rows, strict=True):
-            result = comparison.main.in_flight
+            result = comparison.main.with_flight_tracks()
             axes[0].set_title(f"{title}: innovations along the aisle and ±2√S (m)")
             panels.draw_innovations(axes[0], result)
             for axis, filter_name in zip(axes[1:3], FILTER_NAMES, strict=True):

@@ -131,9 +131,8 @@ class PoseGraph:
         """Degrees of freedom of a pose: 3 in the plane, 6 in space."""
         return 3 if self.dimension == 2 else 6
 
-    @property
-    def is_successive(self) -> BoolArray:
-        """Mask of the edges between successive poses, which are odometry by default."""
+    def find_successive(self) -> BoolArray:
+        """Return the mask of the edges between successive poses, which are odometry by default."""
         return np.asarray(np.abs(self.first - self.second) == 1)
 
 
@@ -224,7 +223,7 @@ def odometry_chain(graph: PoseGraph, excluded_edges: IntArray | None = None) -> 
 
     Of several edges between two poses the first is used.
     """
-    odometry_edges = np.flatnonzero(graph.is_successive)
+    odometry_edges = np.flatnonzero(graph.find_successive())
     if excluded_edges is not None:
         odometry_edges = np.setdiff1d(odometry_edges, excluded_edges)
     next_edge = np.full(len(graph) - 1, -1, dtype=np.intp)

@@ -109,7 +109,7 @@ def solve(
         optimisation drops all edges to some poses.
     """
     model.require_connected(graph, np.ones(len(graph.first), bool), "the edges")
-    is_doubtful = ~graph.is_successive if is_closure is None else is_closure
+    is_doubtful = ~graph.find_successive() if is_closure is None else is_closure
     start_residuals = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start_residuals.chi2))
     if not np.isfinite(cost_initial):
@@ -312,7 +312,7 @@ def analyse_graph(
     TrajectoryError
         The graph is not connected.
     """
-    is_closure = ~graph.is_successive
+    is_closure = ~graph.find_successive()
     progress(f"optimising: {SOLUTIONS['all']}")
     solutions = {"all": solve(graph)}
     gates: tuple[GateResult, ...] | Unavailable
