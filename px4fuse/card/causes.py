@@ -54,7 +54,8 @@ TARGETS_BY_GROUP: Mapping[str, Target] = {
 TARGETS_BY_ID: Mapping[str, Target] = {
     "source_drift": "source",
     "source_lever_arm": "EKF2",
-    "source_height_only": "EKF2",
+    "source_coordinate_constant": "EKF2",
+    "source_height_constant": "EKF2",
     "ekf2_not_fusing": "sender",
 }
 
