@@ -17,7 +17,7 @@ from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Severity
-from px4fuse.findings.cause_grouping import ANNOUNCED, CAUSE, GROUND
+from px4fuse.findings.cause_grouping import ANNOUNCED, CAUSE, GROUND, REPORTED
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
 from px4fuse.findings.model import (
     Findings,
@@ -515,6 +515,7 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
                 "reported_sigma_m": reported_m,
                 "sigma_z_m": noise_m,
                 "variance_factor": variance_ratio,
+                CAUSE: REPORTED if severity != "note" else "",
             },
         )
 
