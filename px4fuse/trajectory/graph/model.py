@@ -183,6 +183,14 @@ def information_eigenvectors(information: Array) -> tuple[Array, Array]:
     return scale[:, None] * eigenvectors[:, is_observed], 1.0 / eigenvalues[is_observed]
 
 
+def observed_directions(information: Array) -> IntArray:
+    """Return the number of directions that each measurement observes."""
+    _, scaled_information = scale_to_unit_diagonal(information)
+    eigenvalues = np.linalg.eigvalsh(scaled_information)
+    counts: IntArray = np.count_nonzero(eigenvalues > MIN_OBSERVED_EIGENVALUE, axis=1)
+    return counts
+
+
 def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
     """Return the square roots of the diagonals, and the matrices scaled to unit diagonal."""
     scale = np.sqrt(np.clip(np.diagonal(matrices, axis1=-2, axis2=-1), 0.0, None))
