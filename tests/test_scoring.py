@@ -131,7 +131,7 @@ CHECKED = [
     ("clock", changed_results(**JUMPS), {}, 0.5, "State the time of the change"),
     ("clock", with_form(["clock-jump"], **JUMPS), {}, 1.0, "as your form states"),
     ("clock", with_form(["dropout"], **JUMPS), {}, 0.5, "State the time of the change"),
-    ("loop", LOOP, {}, 1.0, "the path was corrected"),
+    ("loop", LOOP, {}, 1.0, "drift of the path was corrected"),
     ("loop", changed_results(LOOP, **{AFTER: NONE}), {}, 0.5, "not corrected"),
     ("loop", EXAMPLE, {}, 0.0, "no external vision with orientation"),
     ("loop", changed_results(LOOP, loop__is_absolute_track=True), {}, 0.0, "does not drift"),

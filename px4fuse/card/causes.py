@@ -1,4 +1,4 @@
-"""Order and actions of the causes of a fault, and the re-runs of KF and EKF2 that test them."""
+"""Rank the possible causes of a fault by re-runs of KF and EKF2, and choose actions."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,10 +34,10 @@ from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
 SETTING_CHANGE_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
-# Kinds of changes that move KF and EKF2 together with the position source, so that only ground
-# truth shows the effect
+# Changes that shift the positions, and so the estimates of KF and EKF2: only ground truth shows
+# their effect
 TRUTH_ONLY_CHANGE_KINDS = frozenset({"time offset", "delay", "rotation"})
-# Endings of the names of PX4 parameters that are read only at boot (reboot_required)
+# Name endings of PX4 parameters that require a reboot (reboot_required)
 REBOOT_PARAMETER_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
 # Minimum fraction of rejected positions that the table of re-runs shows
 MIN_SHOWN_REJECTED_FRACTION = 0.005
@@ -50,7 +50,7 @@ TARGETS_BY_GROUP: Mapping[str, Target] = {
     "loops": "source",
     "logging": "logging",
 }
-# Devices to be changed that differ from TARGETS_BY_GROUP, by id of the finding
+# Devices to be changed, by finding id; exceptions from TARGETS_BY_GROUP
 TARGETS_BY_ID: Mapping[str, Target] = {
     "source_drift": "source",
     "source_lever_arm": "EKF2",
@@ -60,10 +60,10 @@ TARGETS_BY_ID: Mapping[str, Target] = {
 
 
 class RankedCause(NamedTuple):
-    """Finding with its re-runs, and with the keys that sort the causes on the card.
+    """Possible cause of a fault, with the re-runs that test it and its rank.
 
-    ``tier``: priority, 0 first. ``reduction``: approach of the σ ratio to 1 by the re-runs (change
-    of |ln σ ratio|), the largest first in each tier.
+    ``tier`` is the priority (0 first). Within a tier, the cause with the largest ``reduction`` of
+    |ln σ ratio| by its re-runs is first.
     """
 
     finding: Finding
@@ -73,7 +73,7 @@ class RankedCause(NamedTuple):
 
 
 def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[RankedCause]:
-    """Sort the errors and warnings that are not effects of other findings by importance."""
+    """Sort errors and warnings by importance; a cause that no re-run confirms is omitted."""
     ranked_causes = []
     for finding in root_findings:
         if finding.severity == "note":
@@ -97,7 +97,7 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
         fault_causes or ranked_causes,
         key=lambda cause: (
             cause.tier,
-            # settings after faults of the source, because a changed setting may only hide a fault
+            # faults of the source before settings: a changed setting may only hide a fault
             cause.tier in (1, 2, 3) and _is_setting_fault(cause.finding),
             -cause.reduction,
         ),
@@ -122,7 +122,7 @@ def _cause_tier(finding: Finding, trials: Iterable[Trial]) -> int:
 
 
 def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
-    """Return the re-runs that test a finding, for each filter and kind of change the best one."""
+    """Return the best re-run of each filter and kind of change that tests a finding."""
     kinds = CATALOGUE[finding.id].reruns
     kinds |= {"defaults"} if "noises" in kinds else set()
     best_trials: dict[tuple[FilterName, str], Trial] = {}
@@ -134,7 +134,7 @@ def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial,
 
 
 def can_show_effect(trial: Trial) -> bool:
-    """Return False if only ground truth could show the effect of a re-run, and the log has none."""
+    """Return False if only ground truth shows the effect of a re-run, and none is logged."""
     has_truth = trial.before.position_rmse_m is not None
     return has_truth or TRUTH_ONLY_CHANGE_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
 
@@ -149,7 +149,7 @@ def make_cause(
     sigma_verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> Cause:
-    """Describe a fault on the card, with actions for position source, KF and EKF2."""
+    """Describe a fault, with actions for position source, KF and EKF2."""
     finding, trials = ranked_cause.finding, ranked_cause.trials
     useful_trials = [trial for trial in trials if is_useful(trial)]
     alternatives, actions = _make_actions(
@@ -165,7 +165,7 @@ def make_cause(
 
 
 def make_plain_cause(finding: Finding) -> Cause:
-    """Describe a fault for which there are no re-runs."""
+    """Describe a fault without re-runs."""
     return Cause(
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",
@@ -183,7 +183,7 @@ def _make_actions(
     sigma_verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
-    """Return (groups of alternative actions, actions that are always necessary)."""
+    """Return groups of actions of which one is sufficient, and actions that are necessary."""
     finding = ranked_cause.finding
     trials = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
     sender_actions: list[Action] = []
@@ -194,7 +194,7 @@ def _make_actions(
     offset_trial = trials.get(("ekf2", "time offset")) or trials.get(("kf", "time offset"))
     delay_actions = []
     if delay_trial:
-        # parameters that also the correction at the sender needs are a separate action
+        # parameters that the correction at the sender needs as well are a separate action
         common_names = offset_trial.change.keys() if offset_trial else ()
         delay_change = {
             name: value for name, value in delay_trial.change.items() if name not in common_names
@@ -227,7 +227,7 @@ def _make_actions(
         elif filter_name == "ekf2" and kind != "delay":
             parameters = {name: value for name, value in trial.change.items() if name in PARAMETERS}
             actions += [make_parameter_action(analysis, parameters)] if parameters else []
-    # KF actions are last, because the vehicle must be corrected first
+    # actions on KF are last: first correct the vehicle
     actions.sort(key=lambda action: action.target == "KF")
     targets = {action.target for group in (actions, *alternatives) for action in group}
     reason_by_filter = {
@@ -279,7 +279,7 @@ def make_rerun_action(
 ) -> Action:
     """Return the command that runs KF with changed settings.
 
-    ``default_settings`` are defaults with which KF is consistent as well, or empty.
+    ``default_settings`` is not empty if KF is also consistent with these default settings.
     """
     command = command_line(structs.replace(request, **change))
     options = " and ".join(

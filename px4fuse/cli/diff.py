@@ -1,4 +1,4 @@
-"""Command ``px4fuse diff``: lists settings, numbers and findings that differ between two runs."""
+"""Command ``px4fuse diff``: lists the differences between the results of two flights."""
 
 import sys
 from pathlib import Path

@@ -178,8 +178,10 @@ def grade(
                 progress=partial(show_progress, "grading"),
             )
     except KeyboardInterrupt as interrupt:
-        message = f"results of verified reports are in {output}. Run the same command to continue."
-        raise Interrupted(interrupt, message) from None
+        interruption_note = (
+            f"results of verified reports are in {output}. Run the same command to continue."
+        )
+        raise Interrupted(interrupt, interruption_note) from None
     write_and_print({}, grading_page(outcome), written_files=outcome.written_paths)
 
 

@@ -1,4 +1,4 @@
-"""Command ``px4fuse verify``: repeats the analysis of a report, compares numbers and pages."""
+"""Command ``px4fuse verify``: repeats the analysis of a report, and compares the numbers."""
 
 import sys
 from functools import partial
