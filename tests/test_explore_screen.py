@@ -156,7 +156,8 @@ def test_explore_page_javascript_sigma_ratios_equal_python(
     headline = page.ask("document.querySelector('#card h2').textContent")
     assert f"KF is overconfident with these settings: σ is {format_ratio(truth.ratio)} " in headline
     rmse = format_metres(main.filters["kf"].truth.position_rmse_m)
-    assert f"KF {rmse} m (original settings" in page.ask("document.querySelector('#card').textContent")
+    card_text = page.ask("document.querySelector('#card').textContent")
+    assert f"KF {rmse} m (original settings" in card_text
     # the analysed ratio stays as a hollow mark
     was = "document.querySelector('#card [data-filter=kf] .was').getAttribute('display')"
     assert page.ask(was) == "inline"

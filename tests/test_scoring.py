@@ -18,7 +18,7 @@ from results_tools import (
 )
 
 from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
-from px4fuse.classroom.assignment.truth import FormTruth, InjectedFault, VerdictTruth
+from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers, RightVerdict
 from px4fuse.classroom.grading.flags import flag_equal_contents, flag_settings
 from px4fuse.classroom.grading.model import Entry, GradedReport
 from px4fuse.classroom.grading.outputs import feedback_text
@@ -157,9 +157,9 @@ def test_report_with_undeterminable_time_offset_earns_points():
 # ------------------------------------------------------------------ faults
 
 
-TRUTH = FormTruth(
-    (InjectedFault("dropout", 3.0, 2.55, 3.45, 50.0, 53.0),), 0.1, VerdictTruth("consistent"),
-    VerdictTruth("consistent"), ("dead-reckoned, then reset",), (), (0.5, 0.1, 0.2),
+TRUTH = RightFormAnswers(
+    (InjectedFault("dropout", 3.0, 2.55, 3.45, 50.0, 53.0),), 0.1, RightVerdict("consistent"),
+    RightVerdict("consistent"), ("dead-reckoned, then reset",), (), (0.5, 0.1, 0.2),
 )  # fmt: skip
 
 

@@ -128,7 +128,7 @@ def build_card(
         make_cause(analysis, ranked_finding, sigma_verdicts, request)
         for ranked_finding in ranked_causes[:MAX_CAUSES]
     )
-    sigma_verdicts, reconcile = _reconcile(analysis, sigma_verdicts, causes)
+    sigma_verdicts, explanation = _explain_verdict_differences(analysis, sigma_verdicts, causes)
     effect = _make_effect(analysis)
     has_fault = any(verdict.is_fault for verdict in sigma_verdicts)
     severity: CardSeverity = "note" if has_fault else "clean"
@@ -140,7 +140,7 @@ def build_card(
         effect_text=_effect_text(analysis, effect, sigma_verdicts),
         do_this=_action_sentences(causes),
         verdicts=sigma_verdicts,
-        reconcile=reconcile,
+        reconcile=explanation,
         difference=_difference_text(effect, ranked_causes),
         causes=causes,
         more_causes=max(len(ranked_causes) - MAX_CAUSES, 0),
@@ -261,11 +261,11 @@ def _position_rmse_m(result: AxisComparison) -> dict[FilterName, float]:
 
 
 def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
-    errors_m = [_position_rmse_m(result) for result in north_and_east(analysis)]
+    rmse_by_axis_m = [_position_rmse_m(result) for result in north_and_east(analysis)]
     return {
-        name: math.hypot(*(error_m[name] for error_m in errors_m))
+        name: math.hypot(*(rmse_m[name] for rmse_m in rmse_by_axis_m))
         for name in FILTER_NAMES
-        if len(errors_m) == 2 and all(name in error_m for error_m in errors_m)
+        if len(rmse_by_axis_m) == 2 and all(name in rmse_m for rmse_m in rmse_by_axis_m)
     }
 
 
@@ -369,8 +369,8 @@ def _action_sentence(action: Action) -> str:
         change_text = value_change if len(action.commands) == 1 else action.sentence
         return f"EKF2: {', '.join(action.commands)} ({change_text})"
     if action.where == "shell":
-        options = action.commands[0].partition(" --")[2]
-        return f"KF: {action.sentence or 'run again with'} --{options}"
+        options_text = action.commands[0].partition(" --")[2]
+        return f"KF: {action.sentence or 'run again with'} --{options_text}"
     text = lower_first(action.sentence.rstrip("."))
     return f"{capitalise_first(action.target)}: {text}"
 
@@ -405,7 +405,7 @@ def _mark_explained(
     )
 
 
-def _reconcile(
+def _explain_verdict_differences(
     analysis: Analysis, sigma_verdicts: tuple[Verdict, ...], causes: Sequence[Cause]
 ) -> tuple[tuple[Verdict, ...], str]:
     """Explain why innovations are consistent and errors are not, or vice versa."""

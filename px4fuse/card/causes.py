@@ -123,11 +123,11 @@ def _cause_tier(finding: Finding, trials: Iterable[Trial]) -> int:
 
 def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
     """Return the best re-run of each filter and kind of change that tests a finding."""
-    kinds = CATALOGUE[finding.id].reruns
-    kinds |= {"defaults"} if "noises" in kinds else set()
+    change_kinds = CATALOGUE[finding.id].reruns
+    change_kinds |= {"defaults"} if "noises" in change_kinds else set()
     best_trials: dict[tuple[FilterName, str], Trial] = {}
     for trial in trials:
-        if len(trial.kinds) == 1 and trial.kinds[0] in kinds:
+        if len(trial.kinds) == 1 and trial.kinds[0] in change_kinds:
             key = trial.filter, trial.kinds[0]
             best_trials[key] = min(trial, best_trials.get(key, trial), key=preference_key)
     return tuple(best_trials.values())
@@ -185,13 +185,15 @@ def _make_actions(
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
     """Return groups of actions of which one is sufficient, and actions that are necessary."""
     finding = ranked_cause.finding
-    trials = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
+    trial_by_change = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
     sender_actions: list[Action] = []
     if finding.remedy:
         remedy = with_log_name(finding.remedy, request.log)
         sender_actions.append(Action(_target_of(finding, analysis.source), remedy))
-    delay_trial = trials.get(("ekf2", "delay"))
-    offset_trial = trials.get(("ekf2", "time offset")) or trials.get(("kf", "time offset"))
+    delay_trial = trial_by_change.get(("ekf2", "delay"))
+    offset_trial = trial_by_change.get(("ekf2", "time offset")) or trial_by_change.get(
+        ("kf", "time offset")
+    )
     delay_actions = []
     if delay_trial:
         # parameters that the correction at the sender needs as well are a separate action
@@ -215,18 +217,18 @@ def _make_actions(
         not offset_trial and not delay_trial and _is_setting_fault(finding) and ranked_cause.trials
     ):
         actions = []
-    for (filter_name, kind), trial in trials.items():
+    for (filter_name, kind), trial in trial_by_change.items():
         if (
             filter_name == "kf"
             and kind != "defaults"
             and trial.change.keys() <= COMPARISON_OPTIONS.keys()
         ):
-            default_trial = trials.get(("kf", "defaults")) if kind == "noises" else None
+            default_trial = trial_by_change.get(("kf", "defaults")) if kind == "noises" else None
             default_settings = default_trial.change if default_trial else {}
             actions.append(make_rerun_action(request, trial.change, default_settings))
         elif filter_name == "ekf2" and kind != "delay":
-            parameters = {name: value for name, value in trial.change.items() if name in PARAMETERS}
-            actions += [make_parameter_action(analysis, parameters)] if parameters else []
+            changes = {name: value for name, value in trial.change.items() if name in PARAMETERS}
+            actions += [make_parameter_action(analysis, changes)] if changes else []
     # actions on KF are last: first correct the vehicle
     actions.sort(key=lambda action: action.target == "KF")
     targets = {action.target for group in (actions, *alternatives) for action in group}
@@ -253,8 +255,8 @@ def _no_change_reason(
     if not word_by_reference:
         return ""
     if set(word_by_reference.values()) == {"consistent"}:
-        is_hidden = CATALOGUE[finding.id].reruns & TRUTH_ONLY_CHANGE_KINDS
-        if is_hidden and "truth" not in word_by_reference:
+        needs_ground_truth = CATALOGUE[finding.id].reruns & TRUTH_ONLY_CHANGE_KINDS
+        if needs_ground_truth and "truth" not in word_by_reference:
             return "no change: only ground truth shows this fault, and the log has none"
         return "no change: the reported σ is consistent"
     if finding.id == "source_outliers":
@@ -264,8 +266,8 @@ def _no_change_reason(
             )
         if word_by_reference.get("truth", "consistent") == "consistent":
             return "no change: EKF2's gate rejects outliers, and the reported σ is consistent"
-    removed = "drift of the source" if finding.id == "source_drift" else "this fault"
-    return f"no setting removes {removed}"
+    fault_text = "drift of the source" if finding.id == "source_drift" else "this fault"
+    return f"no setting removes {fault_text}"
 
 
 def _target_of(finding: Finding, source: PositionTrack | None = None) -> Target:
@@ -282,11 +284,15 @@ def make_rerun_action(
     ``default_settings`` is not empty if KF is also consistent with these default settings.
     """
     command = command_line(structs.replace(request, **change))
-    options = " and ".join(
+    default_options_text = " and ".join(
         f"{COMPARISON_OPTIONS[name]} (default {value:g})"
         for name, value in default_settings.items()
     )
-    sentence = f"run again without {options}, or with the estimated noises" if options else ""
+    sentence = (
+        f"run again without {default_options_text}, or with the estimated noises"
+        if default_options_text
+        else ""
+    )
     return Action("KF", sentence, (command,), "shell")
 
 
@@ -326,13 +332,13 @@ def _trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
     if OUTLIERS in trial.change:
         return f"{label} without {trial.change[OUTLIERS]:.0f} outliers"
     if trial.filter == "kf":
-        options = " ".join(
+        options_text = " ".join(
             f"{COMPARISON_OPTIONS[name]} {value:g}"
             for name, value in trial.change.items()
             if name in (SIGMA_A, SIGMA_Z)
         )
         prefix = "default " if kind == "defaults" else ""
-        return f"{label}, {prefix}{options}" if options else label
+        return f"{label}, {prefix}{options_text}" if options_text else label
     if sum(other_trial.filter == "ekf2" for other_trial in trials) < 2:
         return label
     return f"{label}, {'sender' if kind == 'time offset' else 'parameters'}"

@@ -249,7 +249,7 @@ def _write_assignment(
     from px4fuse.classroom.terminal import assignment_page
 
     students = read_roster(roster)
-    answer_key_path = assignment.key_path(folder, answer_path)
+    answer_key_path = assignment.answer_key_path(folder, answer_path)
     check_targets([answer_key_path])
     check_output_folder(folder)
     with progress() as show_progress:

@@ -62,7 +62,7 @@ FINDING_ID_BY_MISTAKE = {
 NOISY_UWB = "noisy-uwb"
 
 
-class HiddenMistake(Record):
+class QuizFault(Record):
     """Injected fault that the user has to find.
 
     Attributes
@@ -87,23 +87,23 @@ class HiddenMistake(Record):
     has_either_sign: bool = False
 
 
-class MistakeTable(Record):
+class QuizTable(Record):
     """Answers of the quiz with their texts, and injected faults (``practice.toml``)."""
 
     choices: dict[str, str]
-    mistakes: tuple[HiddenMistake, ...]
+    mistakes: tuple[QuizFault, ...]
 
 
-_QUIZ = read_toml(__file__, MistakeTable)
-FAULT_CHOICES, HIDDEN_MISTAKES = _QUIZ.choices, _QUIZ.mistakes
+_QUIZ = read_toml(__file__, QuizTable)
+QUIZ_ANSWERS, QUIZ_FAULTS = _QUIZ.choices, _QUIZ.mistakes
 
 
 @dataclass(frozen=True)
-class PracticeFlight:
+class QuizFlight:
     """Simulated flight of the quiz, with its injected faults and their sizes."""
 
     scenario: Scenario
-    mistakes: tuple[HiddenMistake, ...]
+    mistakes: tuple[QuizFault, ...]
     sizes: tuple[str, ...]
 
     @property
@@ -111,7 +111,7 @@ class PracticeFlight:
         return sorted({mistake.choice for mistake in self.mistakes}) or ["nothing"]
 
 
-def draw_flights(seed: int, level: int, count: int) -> tuple[PracticeFlight, ...]:
+def draw_flights(seed: int, level: int, count: int) -> tuple[QuizFlight, ...]:
     """Choose the faults of all simulated flights at random; all faults are equally frequent.
 
     Parameters
@@ -126,17 +126,17 @@ def draw_flights(seed: int, level: int, count: int) -> tuple[PracticeFlight, ...
     rng = np.random.default_rng([seed, level, count])
     right_answers: list[str] = []
     while len(right_answers) < count:
-        right_answers += [str(name) for name in rng.permutation(list(FAULT_CHOICES))]
+        right_answers += [str(name) for name in rng.permutation(list(QUIZ_ANSWERS))]
     return tuple(_draw_flight(rng, answer, level) for answer in right_answers[:count])
 
 
-def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> PracticeFlight:
-    def draw_one(candidates: list[HiddenMistake]) -> list[HiddenMistake]:
+def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> QuizFlight:
+    def draw_one(candidates: list[QuizFault]) -> list[QuizFault]:
         return [candidates[rng.integers(len(candidates))]] if candidates else []
 
-    mistakes = draw_one([mistake for mistake in HIDDEN_MISTAKES if mistake.choice == right_answer])
+    mistakes = draw_one([mistake for mistake in QUIZ_FAULTS if mistake.choice == right_answer])
     if level == MAX_LEVEL and mistakes and rng.random() < 0.5:
-        candidates = ((mistake, {mistake.choice, right_answer}) for mistake in HIDDEN_MISTAKES)
+        candidates = ((mistake, {mistake.choice, right_answer}) for mistake in QUIZ_FAULTS)
         mistakes += draw_one(
             [mistake for mistake, pair in candidates if pair in COMBINABLE_CHOICES]
         )
@@ -153,7 +153,7 @@ def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> Pra
         sigma_uwb_m=noise_m,
         seed=int(rng.integers(MAX_SEED)),
     )
-    return PracticeFlight(scenario, tuple(mistakes), tuple(sizes))
+    return QuizFlight(scenario, tuple(mistakes), tuple(sizes))
 
 
 def practice_text(
@@ -179,11 +179,11 @@ def practice_text(
         title="simulated flights with known faults",
         about=f"seed {seed}, level {level}",
         flight_count=count,
-        choices=FAULT_CHOICES,
+        choices=QUIZ_ANSWERS,
     )
 
 
-def _flight_data(practice_flight: PracticeFlight, flight_index: int) -> tuple[dict[str, Any], str]:
+def _flight_data(practice_flight: QuizFlight, flight_index: int) -> tuple[dict[str, Any], str]:
     mistakes_and_sizes = [*zip(practice_flight.mistakes, practice_flight.sizes, strict=True)]
     options = [
         f"{mistake.mistake}={size}"
@@ -211,7 +211,7 @@ def _flight_data(practice_flight: PracticeFlight, flight_index: int) -> tuple[di
 
 
 def _describe_mistake(
-    mistake: HiddenMistake, size: str, findings: tuple[Finding, ...]
+    mistake: QuizFault, size: str, findings: tuple[Finding, ...]
 ) -> dict[str, Any]:
     finding_id = FINDING_ID_BY_MISTAKE.get(mistake.mistake)
     spans = [span for finding in findings if finding.id == finding_id for span in finding.spans_s]

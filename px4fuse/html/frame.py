@@ -92,11 +92,11 @@ def pairs_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
 
 def table_section(
     title: str,
-    heads: Sequence[str],
+    column_titles: Sequence[str],
     rows: Sequence[Sequence[str]],
     numeric_columns: Sequence[int] = (),
 ) -> Section:
-    return ["table", title, heads, rows, list(numeric_columns)]
+    return ["table", title, column_titles, rows, list(numeric_columns)]
 
 
 def links_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:

@@ -91,7 +91,7 @@ class Gaps:
 
 
 @dataclass(frozen=True)
-class Source:
+class LoggedData:
     """Data of one type in a log with topics, rate and gaps, or the reason why they are missing.
 
     Attributes
@@ -137,7 +137,7 @@ class Inventory:
         Flight with the EKF2 innovations of the default position source.
     start_utc : str or None
         UTC of the first data, ISO 8601.
-    sources : tuple of Source
+    sources : tuple of LoggedData
         Data by type. The position sources are in order of preference.
     source_reason : str
         Reason for the choice of the position source in ``px4fuse compare``, or why none is used.
@@ -151,7 +151,7 @@ class Inventory:
 
     flight: Flight
     start_utc: str | None
-    sources: tuple[Source, ...]
+    sources: tuple[LoggedData, ...]
     source_reason: str
     segment: Segment | None
     abilities: tuple[AnalysisOption, ...]
@@ -179,7 +179,7 @@ def take_inventory(flight: Flight) -> Inventory:
     return Inventory(
         flight=flight,
         start_utc=utc_time(log.start_unix_s),
-        sources=tuple(_list_sources(flight, comparison, reason)),
+        sources=tuple(_list_logged_data(flight, comparison, reason)),
         source_reason=reason,
         segment=None if comparison is None else comparison.segment,
         abilities=tuple(_list_analyses(flight, comparison, reason)),
@@ -225,15 +225,15 @@ def _data_by_stream(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unav
     return {**data_by_stream, "truth": samples, "airborne": flight.airborne}
 
 
-def _list_sources(
+def _list_logged_data(
     flight: Flight, comparison: PreparedComparison | None, reason: str
-) -> Iterator[Source]:
+) -> Iterator[LoggedData]:
     data_by_stream = _data_by_stream(flight)
     for key, name in DATA_LABELS.items():
         if key in data_by_stream:
-            yield _make_source(name, data_by_stream[key], flight.streams.get(key))
+            yield _make_logged_data(name, data_by_stream[key], flight.streams.get(key))
         for track in flight.positions if key == "position" else ():
-            yield _make_source(
+            yield _make_logged_data(
                 name,
                 track.samples,
                 track,
@@ -242,33 +242,33 @@ def _list_sources(
                 chosen=comparison is not None and track.name == comparison.source.name,
             )
         if key == "position" and not flight.positions:
-            yield Source(name, unavailable=reason)
+            yield LoggedData(name, unavailable=reason)
 
 
-def _make_source(
+def _make_logged_data(
     part: str,
     data: pd.DataFrame | TimeSpans | Unavailable,
     stream: Stream | PositionTrack | None,
-    **source_fields: Any,
-) -> Source:
+    **data_fields: Any,
+) -> LoggedData:
     if isinstance(data, Unavailable):
-        return Source(part, unavailable=data.reason)
+        return LoggedData(part, unavailable=data.reason)
     if stream is not None:
-        source_fields = {"name": stream.topics[0] if stream.topics else "", **source_fields}
-        source_fields |= {"topics": stream.topics, "clock": stream.clock, "log": stream.log}
+        data_fields = {"name": stream.topics[0] if stream.topics else "", **data_fields}
+        data_fields |= {"topics": stream.topics, "clock": stream.clock, "log": stream.log}
     if isinstance(data, pd.DataFrame):
-        source_fields["samples"] = len(data)
+        data_fields["samples"] = len(data)
         times_s = data.index.tolist()
     else:
         times_s = [time_s for span in data for time_s in span]
     if times_s:
-        source_fields |= {"start_s": times_s[0], "end_s": times_s[-1]}
+        data_fields |= {"start_s": times_s[0], "end_s": times_s[-1]}
     if isinstance(data, pd.DataFrame) and len(data) > 1:
-        source_fields |= {
+        data_fields |= {
             "rate_hz": sample_rate(data),
             "gaps": _measure_gaps(data, is_imu=part == DATA_LABELS["imu"]),
         }
-    return Source(part, **source_fields)
+    return LoggedData(part, **data_fields)
 
 
 def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:

@@ -141,11 +141,15 @@ def _check_or_replace(value: Any, annotation: Any, path: str, reasons: list[str]
     except _OutOfBoundsError as error:
         for unavailable_type in types_of(annotation):
             if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
-                texts = {"what": path, "reason": str(error), "remedy": CHECK_LOG_REMEDY}
+                text_fields = {
+                    "what": path,
+                    "reason": str(error),
+                    "remedy": CHECK_LOG_REMEDY,
+                }
                 other_fields = {
                     field.name: _check_value(getattr(value, field.name), field.type, path, reasons)
                     for field in fields(unavailable_type)
-                    if field.name not in texts and hasattr(value, field.name)
+                    if field.name not in text_fields and hasattr(value, field.name)
                 }
-                return unavailable_type(**texts, **other_fields)
+                return unavailable_type(**text_fields, **other_fields)
         raise

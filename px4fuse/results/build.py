@@ -40,12 +40,12 @@ def results(
     """
     card = build_card(analysis, request.without_paths(), (student.name, student.id))
     if analysis.flight.log.is_assessed and isinstance(student.answers, Answers):
-        texts = (
+        answer_texts = (
             f"{question}: {answer_text}"
             for question, answer_text in form_rows(student.answers)
             if answer_text != EMPTY_CELL
         )
-        card = msgspec.structs.replace(card, facts={"Answers": "; ".join(texts)})
+        card = msgspec.structs.replace(card, facts={"Answers": "; ".join(answer_texts)})
     fields = _flight_fields(contract.COMPARISON_SCHEMA, request, analysis) | {
         "aids": {} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
         "card": card,

@@ -375,7 +375,7 @@ def schema_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]], dict
     schemas: tuple[dict[str, Any], ...] = ()
     components: dict[str, Any] = {}
 
-    def describe(union_type: Any) -> dict[str, Any]:
+    def describe_union(union_type: Any) -> dict[str, Any]:
         if union_type is msgspec.UnsetType:  # an unset field is not written
             return {"not": {}}
         record_types.update(dict.fromkeys(union_type.union_members))
@@ -384,11 +384,11 @@ def schema_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]], dict
         }
 
     count = 0
-    # repeat, because `describe` finds further types that are nested
+    # repeat, because `describe_union` finds further types that are nested
     while count < len(record_types):
         count = len(record_types)
         schemas, components = msgspec.json.schema_components(
-            list(record_types), schema_hook=describe, ref_template="#/$defs/{name}"
+            list(record_types), schema_hook=describe_union, ref_template="#/$defs/{name}"
         )
     return list(schemas[: len(types)]), components
 

@@ -380,8 +380,8 @@ def _pdf_type_of(value: Any) -> type:
         return str
     if isinstance(value, int | float):
         return float
-    types = StreamObject, DictionaryObject, ArrayObject, NameObject
-    return next((pdf_type for pdf_type in types if isinstance(value, pdf_type)), type(value))
+    pdf_types = StreamObject, DictionaryObject, ArrayObject, NameObject
+    return next((pdf_type for pdf_type in pdf_types if isinstance(value, pdf_type)), type(value))
 
 
 def _compared_keys(value: DictionaryObject, key: str) -> set[str]:

@@ -293,10 +293,11 @@ def _verify_with_log(
         f"{RELATIVE_TOLERANCE:g}, estimates within {ESTIMATE_RELATIVE_TOLERANCE:g})"
     ]
     if mismatches:
-        paths = ", ".join(mismatch.path for mismatch in mismatches[:3])
-        paths += ", …" * (len(mismatches) > 3)
+        paths_text = ", ".join(mismatch.path for mismatch in mismatches[:3])
+        paths_text += ", …" * (len(mismatches) > 3)
         reasons = [
-            f"{len(mismatches)} of {value_count} values differ from a new run on the log: {paths}"
+            f"{len(mismatches)} of {value_count} values differ from a new run on the log: "
+            f"{paths_text}"
         ]
     is_same_text = partial(is_same_text_rounded, is_same_number=is_same_number)
     page_differences = compare_pages(pdf, redrawn_pdf, is_same_text)

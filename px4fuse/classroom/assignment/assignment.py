@@ -10,15 +10,20 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from px4fuse.classroom.assignment.figures import draw_figures, select_choices
-from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers, key_text, read_key
+from px4fuse.classroom.assignment.key import (
+    AnswerKey,
+    RightAnswers,
+    format_answer_key,
+    read_answer_key,
+)
 from px4fuse.classroom.assignment.random_assignment import (
     FlightKind,
     assign_random_flight,
-    derive_key,
+    derive_hmac_key,
     random_uniform,
 )
 from px4fuse.classroom.assignment.roster import Person, normalise_text
-from px4fuse.classroom.assignment.truth import form_truth
+from px4fuse.classroom.assignment.truth import right_form_answers
 from px4fuse.core.input_files import inputs_not_registered
 from px4fuse.core.text import to_json_types
 from px4fuse.core.writing import write_all
@@ -57,7 +62,7 @@ def simulate_assigned_flight(
     sha256 = hashlib.sha256(log).hexdigest()
     true_values = flights.answer(simulation)["truth"]
     choices = select_choices(partial(random_uniform, secret, student.student_id, kind))
-    right_form = replace(form_truth(simulation, sha256), choices=choices)
+    right_form = replace(right_form_answers(simulation, sha256), choices=choices)
     return log, RightAnswers(
         student_id=student.student_id,
         name=student.name,
@@ -71,7 +76,7 @@ def simulate_assigned_flight(
     )
 
 
-def key_path(folder: Path, key_option: Path | None) -> Path:
+def answer_key_path(folder: Path, key_option: Path | None) -> Path:
     """Return the path of the answer key, by default next to the students' folder.
 
     Raises
@@ -128,7 +133,7 @@ def assign(
         A file exists with other content, or cannot be written.
     """
     with inputs_not_registered():
-        key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
+        key = read_answer_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
     # an answer key without any of these students was written for another class
     is_same_class = not answers or not answers.keys().isdisjoint(
@@ -138,8 +143,8 @@ def assign(
     stored_secret = key.secret
     if secret is None:
         stored_secret = stored_secret or secrets.token_urlsafe(24)
-        secret = derive_key(stored_secret)
-    elif derive_key(stored_secret) != secret:
+        secret = derive_hmac_key(stored_secret)
+    elif derive_hmac_key(stored_secret) != secret:
         stored_secret = ""
     written_count = 0
     for finished_count, student in enumerate(students, start=1):
@@ -163,7 +168,7 @@ def assign(
             missing_content_by_path[figures_file] = draw_figures(random_number)
         key = AnswerKey(kind, tuple(answers.values()), stored_secret)
         # the secret must be stored before the log: a restart after an interruption needs it
-        write_all({key_file: key_text(key).encode()})
+        write_all({key_file: format_answer_key(key).encode()})
         key_file.chmod(0o600)  # only the instructor can read the answer key
         write_all(missing_content_by_path)
         written_count += folder / student.file in missing_content_by_path

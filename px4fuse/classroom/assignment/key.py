@@ -7,7 +7,7 @@ import msgspec
 from msgspec import Meta
 
 from px4fuse.classroom.assignment.roster import MAX_STUDENTS, Person, Register, normalise_text
-from px4fuse.classroom.assignment.truth import FormTruth
+from px4fuse.classroom.assignment.truth import RightFormAnswers
 from px4fuse.core.reading import read_text
 from px4fuse.errors import SettingsError
 from px4fuse.results.answer_form import update_renamed_values
@@ -52,7 +52,7 @@ class RightAnswers(
     mistakes: _Texts = ()
     true_values: dict[str, _Number] = {}
     difficulty: _Number | None = None
-    form: FormTruth | None = None
+    form: RightFormAnswers | None = None
 
 
 class _Schema(msgspec.Struct, frozen=True):
@@ -89,11 +89,11 @@ class AnswerKey(msgspec.Struct, frozen=True):
         return next((answer for answer in self.answers if answer.sha256 == sha256), None)
 
 
-def key_text(key: AnswerKey) -> str:
+def format_answer_key(key: AnswerKey) -> str:
     return msgspec.json.format(msgspec.json.encode(key), indent=1).decode() + "\n"
 
 
-def read_key(path: Path) -> AnswerKey:
+def read_answer_key(path: Path) -> AnswerKey:
     """Read the answer key of an assignment.
 
     Raises

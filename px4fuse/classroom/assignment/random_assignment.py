@@ -236,10 +236,10 @@ def encode_secret(text: str, source_name: str) -> bytes:
             f"Use {MIN_SECRET_LENGTH} or more characters, or omit the secret: px4fuse then "
             "generates a secret and stores it in the answer key.",
         )
-    return derive_key(secret)
+    return derive_hmac_key(secret)
 
 
-def derive_key(secret: str) -> bytes:
+def derive_hmac_key(secret: str) -> bytes:
     """Derive the HMAC key of the random numbers by scrypt (RFC 7914), so that guessing is slow."""
     text = secret.encode(errors="replace")
     return hashlib.scrypt(text, salt=HMAC_LABEL.encode(), n=2**14, r=8, p=1, dklen=32)

@@ -71,7 +71,7 @@ class InjectedFault(Record):
     until_s: float | None = None
 
 
-class VerdictTruth(Record):
+class RightVerdict(Record):
     """Consistency of a filter, and the factor by which its reported σ is too small or too large.
 
     ``verdict`` is "consistent", "overconfident" or "underconfident", or "" with too few data.
@@ -81,7 +81,7 @@ class VerdictTruth(Record):
     factor: float | None = None
 
 
-class FormTruth(Record):
+class RightFormAnswers(Record):
     """Right answers to the questions about one simulated flight.
 
     Attributes
@@ -101,15 +101,15 @@ class FormTruth(Record):
 
     mistakes: tuple[InjectedFault, ...]
     sigma_z_m: float
-    kf: VerdictTruth
-    ekf2: VerdictTruth
+    kf: RightVerdict
+    ekf2: RightVerdict
     ekf2_did: tuple[str, ...]
     ekf2_did_also: tuple[str, ...]
     quantities: tuple[float | tuple[float, ...] | None, ...]
     choices: tuple[tuple[Choice, ChoiceName], ...] = ()
 
 
-def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
+def right_form_answers(simulation: flights.Simulation, log_sha256: str) -> RightFormAnswers:
     """Compute the right answers from the simulated flight and its analysis by px4fuse."""
     answer = flights.answer(simulation)
     comparison = compare_simulation(simulation)
@@ -118,7 +118,7 @@ def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
         for name, values in answer["mistakes"].items()
     )
     sigma_z_m = answer["truth"]["sigma_z_m"]
-    return FormTruth(
+    return RightFormAnswers(
         mistakes,
         sigma_z_m,
         _verdict(comparison, "kf"),
@@ -173,13 +173,13 @@ def _injected_fault(
     return InjectedFault(name, size, low, high, from_s, until_s)
 
 
-def _verdict(comparison: Comparison, filter_name: FilterName) -> VerdictTruth:
+def _verdict(comparison: Comparison, filter_name: FilterName) -> RightVerdict:
     filter_summary = comparison.main.filters[filter_name]
     if not isinstance(filter_summary, FilterSummary):
-        return VerdictTruth("")
+        return RightVerdict("")
     is_consistent = filter_summary.verdict == "consistent"
     factor = None if is_consistent else filter_summary.sigma_error_factor
-    return VerdictTruth(filter_summary.verdict, factor)
+    return RightVerdict(filter_summary.verdict, factor)
 
 
 def _ekf2_behaviour(
@@ -187,7 +187,7 @@ def _ekf2_behaviour(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the behaviours of EKF2 that the student must report, and those that are accepted."""
     size_by_kind = {mistake.kind: mistake.size or 0.0 for mistake in mistakes}
-    required, allowed = (
+    required_behaviours, allowed_behaviours = (
         [
             behaviour
             for behaviour, kinds in BEHAVIOUR_RULES[rule].items()
@@ -196,24 +196,34 @@ def _ekf2_behaviour(
         for rule in ("required", "allowed")
     )
     if size_by_kind.get("ekf2-noise", 0.0) > sigma_z_m:
-        required.append("weighted the positions too little")
+        required_behaviours.append("weighted the positions too little")
     innovations = comparison.main.ekf2_innovations
     if not isinstance(innovations, Unavailable):
         has_bad_samples = "nlos" in size_by_kind or "jump" in size_by_kind
         if (innovations["rejected"] > 0).mean() > MIN_REJECTED_FRACTION:
-            required.append("rejected outliers" if has_bad_samples else "rejected good samples")
+            required_behaviours.append(
+                "rejected outliers" if has_bad_samples else "rejected good samples"
+            )
     ekf2 = comparison.flight.ekf2
     first_counted_reset_s = comparison.segment.start_s + IGNORED_RESETS_S
     for reset in ekf2.resets if isinstance(ekf2, Ekf2) else ():
         is_large = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > MIN_RESET_M
         if is_large and reset.time_s > first_counted_reset_s:
-            required.append("dead-reckoned, then reset")
-    if "never fused" in required:  # EKF2 cannot follow positions that it does not fuse
-        required, allowed = ["never fused"], [*required, *allowed]
-    if not required:
-        required, allowed = ["normal"], ["followed the positions", *allowed]
-    required = [*dict.fromkeys(required)]
-    return tuple(required), tuple(each for each in dict.fromkeys(allowed) if each not in required)
+            required_behaviours.append("dead-reckoned, then reset")
+    if "never fused" in required_behaviours:  # EKF2 cannot follow positions that it does not fuse
+        required_behaviours, allowed_behaviours = (
+            ["never fused"],
+            [*required_behaviours, *allowed_behaviours],
+        )
+    if not required_behaviours:
+        required_behaviours, allowed_behaviours = (
+            ["normal"],
+            ["followed the positions", *allowed_behaviours],
+        )
+    required_behaviours = [*dict.fromkeys(required_behaviours)]
+    return tuple(required_behaviours), tuple(
+        each for each in dict.fromkeys(allowed_behaviours) if each not in required_behaviours
+    )
 
 
 def right_numeric_answer(

@@ -271,10 +271,10 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
         fraction, number, path = min(numbers, key=lambda each: each[0])
         label = self.name or f"the number {shorten_text(path)}"
         bounds = (("at least", self.at_least), ("at most", self.at_most))
-        limits = [f"{word} {bound:.4g}" for word, bound in bounds if math.isfinite(bound)]
+        limit_texts = [f"{word} {bound:.4g}" for word, bound in bounds if math.isfinite(bound)]
         statement = f"{capitalise_first(label)} is {f'{number:.4g} {self.unit}'.strip()}"
         advice = f" {self.advice}" if fraction < 1.0 and self.advice else ""
-        return fraction, f"{statement}; required: {' and '.join(limits)}.{advice}"
+        return fraction, f"{statement}; required: {' and '.join(limit_texts)}.{advice}"
 
 
 class AnswersItem(RubricItem, frozen=True, tag="answers"):
@@ -283,16 +283,16 @@ class AnswersItem(RubricItem, frozen=True, tag="answers"):
     needs_key: ClassVar[bool] = True
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
-        form_result = check_input.form_points
-        if isinstance(form_result, str):
-            return 0.0, f"{capitalise_first(form_result)}."
+        points_or_reason = check_input.form_points
+        if isinstance(points_or_reason, str):
+            return 0.0, f"{capitalise_first(points_or_reason)}."
         points_text = ", ".join(
-            f"{name} {form_result.points_by_part[name]:.3g} of {max_points:g}"
-            for name, max_points in form_result.max_points_by_part.items()
+            f"{name} {points_or_reason.points_by_part[name]:.3g} of {max_points:g}"
+            for name, max_points in points_or_reason.max_points_by_part.items()
             if max_points
         )
-        feedback = capitalise_first("; ".join(form_result.feedback))
-        return form_result.fraction, f"Points of 100: {points_text}. {feedback}."
+        feedback = capitalise_first("; ".join(points_or_reason.feedback))
+        return points_or_reason.fraction, f"Points of 100: {points_text}. {feedback}."
 
 
 class TextItem(RubricItem, frozen=True, tag="text"):
@@ -346,13 +346,15 @@ class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"zero_points_fac
         if label == "SIGMA_Z" and check_input.has_finding("source_may_drift", "source_drift"):
             # the estimate of SIGMA_Z does not contain the drift, which is not in the innovations
             high = max(high, _largest_source_error_m(comparison))
-        deviation = max(chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0)
+        deviation_factor = max(
+            chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0
+        )
         relation, advice = "within", ""
-        if deviation > 1.0:
+        if deviation_factor > 1.0:
             side = "above" if chosen_value > high else "below"
-            relation = f"a factor of {format_factor(deviation)} {side}"
+            relation = f"a factor of {format_factor(deviation_factor)} {side}"
             advice = f" Set {option} within this interval."
-        return fraction_for_deviation(deviation, self.zero_points_factor), (
+        return fraction_for_deviation(deviation_factor, self.zero_points_factor), (
             f"Your {label} {chosen_value:.3g} {unit} is {relation} the 95 % interval of the "
             f"maximum-likelihood estimate ({low:.3g} to {high:.3g} {unit}).{advice}"
         )

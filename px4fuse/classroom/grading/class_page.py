@@ -39,14 +39,14 @@ FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "changed by i
 def class_page_html(entries: Sequence[Entry], title: str, made_with: str) -> str:
     """Format the web page of the class; ``made_with`` is name and version of px4fuse."""
     item_titles, number_titles = list_titles(entries)
-    counts = Counter(tag for entry in entries for tag in _entry_tags(entry))
-    tags = (*FILTER_TAGS, *sorted(tag for tag in counts if tag not in FILTER_TAGS))
-    options = [(tag, f"{tag} ({counts[tag]})") for tag in tags if counts[tag]]
+    count_by_tag = Counter(tag for entry in entries for tag in _entry_tags(entry))
+    tags = (*FILTER_TAGS, *sorted(tag for tag in count_by_tag if tag not in FILTER_TAGS))
+    options = [(tag, f"{tag} ({count_by_tag[tag]})") for tag in tags if count_by_tag[tag]]
     return frame.page(
         title=title,
         subtitle=f"{len(entries)} {'student' if len(entries) == 1 else 'students'}, graded with "
         f"{made_with}",
-        html_above=_statistics_html(entries, counts),
+        html_above=_statistics_html(entries, count_by_tag),
         row_nouns=("student", "students"),
         columns=(
             Column("Student"),
@@ -66,14 +66,14 @@ def class_page_html(entries: Sequence[Entry], title: str, made_with: str) -> str
     )
 
 
-def _statistics_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
+def _statistics_html(entries: Sequence[Entry], count_by_tag: Mapping[str, int]) -> str:
     """Format the statistics of the class: number of reports by status, and histograms of points."""
     totals = [entry.total for entry in entries if entry.total is not None]
     max_points = max((entry.max_points for entry in entries if entry.max_points > 0.0), default=1.0)
     reports = [report for entry in entries if (report := entry.counted_report)]
     return load_template("classroom/grading/above.html").render(
         students=len(entries),
-        counts=counts,
+        counts=count_by_tag,
         averages=(statistics.fmean(totals), statistics.median(totals)) if totals else (),
         totals=count_tenths(totals, max_points) if totals else (),
         max_points_text=format_cell_number(max_points),

@@ -179,22 +179,22 @@ def build_entries(
     if has_class_list:
         unknown_student_flag = "The student is not in the class list."
     rows += [replace(row, flags=(unknown_student_flag, *row.flags)) for *_, row in attempts[None]]
-    overrides_by_row, notes = match_overrides(overrides, rows)
+    overrides_by_entry, notes = match_overrides(overrides, rows)
     flags_by_submission = flag_equal_contents(
         [row.counted_report for row in rows if row.counted_report]
     )
-    submitted_rows = [row for row in rows if row.counted_report]
-    unknown_count = sum(row.late_s is None for row in submitted_rows)
+    entries_with_report = [row for row in rows if row.counted_report]
+    unknown_count = sum(row.late_s is None for row in entries_with_report)
     if course.late_rule and unknown_count:
         notes += (
-            f"The submission time is unknown for {unknown_count} of {len(submitted_rows)} "
+            f"The submission time is unknown for {unknown_count} of {len(entries_with_report)} "
             "students, so no points were deducted. Add the times with --worksheet.",
         )
-    final_rows = (
-        _apply_overrides(*row_and_overrides, flags_by_submission, course)
-        for row_and_overrides in zip(rows, overrides_by_row, strict=True)
+    final_entries = (
+        _apply_overrides(*entry_and_overrides, flags_by_submission, course)
+        for entry_and_overrides in zip(rows, overrides_by_entry, strict=True)
     )
-    return tuple(final_rows), notes
+    return tuple(final_entries), notes
 
 
 def _collect_students(
@@ -543,9 +543,9 @@ def parse_moodle_time(text: str) -> datetime | None:
     >>> parse_moodle_time("-")
     """
     if german_match := re.fullmatch(r"\w+, (\d+)\. (\w+) (\d{4}), (\d+:\d\d)", text.strip()):
-        day, month, year, clock = german_match.groups()
+        day, month, year, time_of_day = german_match.groups()
         if (month_start := month.casefold()[:3]) in GERMAN_MONTHS:
-            text = f"{year}-{GERMAN_MONTHS.index(month_start) + 1:02}-{day:>02} {clock:>05}"
+            text = f"{year}-{GERMAN_MONTHS.index(month_start) + 1:02}-{day:>02} {time_of_day:>05}"
     with suppress(ValueError):
         return datetime.fromisoformat(text.strip())
     for time_format in _MOODLE_FORMATS:

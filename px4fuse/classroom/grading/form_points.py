@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from px4fuse.classroom.assignment.truth import FormTruth, InjectedFault
+from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers
 from px4fuse.core.record import read_toml
 from px4fuse.results.answer_form import (
     CHOICE_NAMES,
@@ -97,36 +97,38 @@ class FormPoints:
         return max(points, 0.0) / sum(self.max_points_by_part.values())
 
 
-def form_points(answers: Answers, truth: FormTruth) -> FormPoints:
+def form_points(answers: Answers, right_answers: RightFormAnswers) -> FormPoints:
     """Compare a student's answers with the right answers, and compute the points."""
-    is_no_fault_right = not truth.mistakes and answers.names_no_fault
+    is_no_fault_right = not right_answers.mistakes and answers.names_no_fault
     weights = POINTS_TABLE["weights_clean" if is_no_fault_right else "weights"]
     fractions = dict.fromkeys(PART_NAMES, 0.0)
-    matches, false_faults = _match_faults(answers, truth)
-    if truth.mistakes and len(false_faults) < MIN_FALSE_FAULTS_WITHOUT_POINTS:
-        fractions |= _fault_fractions(matches, truth)
-    fractions["numbers"] = quantities_fraction = _quantities_fraction(answers, truth)
+    matches, false_faults = _match_faults(answers, right_answers)
+    if right_answers.mistakes and len(false_faults) < MIN_FALSE_FAULTS_WITHOUT_POINTS:
+        fractions |= _fault_fractions(matches, right_answers)
+    fractions["numbers"] = quantities_fraction = _quantities_fraction(answers, right_answers)
     # the consistency of KF and EKF2 can be guessed: half of its points without a right number
     is_guess_possible = not quantities_fraction and not is_no_fault_right
-    fractions["verdicts"] = _verdicts_fraction(answers, truth) * (0.5 if is_guess_possible else 1.0)
+    fractions["verdicts"] = _verdicts_fraction(answers, right_answers) * (
+        0.5 if is_guess_possible else 1.0
+    )
     points_by_part = {name: weights[name] * fraction for name, fraction in fractions.items()}
     if is_no_fault_right:
         points_by_part["mistakes"] = weights["mistakes"]
-    elif truth.mistakes and all(fault.size is None for fault in truth.mistakes):
+    elif right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
         # no fault of the flight has a size, so the points of "sizes" are added to "mistakes"
         points_by_part["mistakes"] += weights["sizes"] * fractions["mistakes"]
     points_by_part["mistakes"] -= FALSE_FAULT_POINTS * len(false_faults)
     points_by_part["mistakes"] = max(points_by_part["mistakes"], 0.0)
-    if truth.choices:
+    if right_answers.choices:
         weights = {name: FLIGHT_SHARE * points for name, points in weights.items()}
         weights["figures"] = 100.0 * (1.0 - FLIGHT_SHARE)
         points_by_part = {name: FLIGHT_SHARE * points for name, points in points_by_part.items()}
-        points_by_part["figures"] = weights["figures"] * _choices_fraction(answers, truth)
+        points_by_part["figures"] = weights["figures"] * _choices_fraction(answers, right_answers)
     named_kinds = [named_fault.kind for named_fault in answers.mistakes]
-    is_named_by_kind = {fault.kind: fault.kind in named_kinds for fault in truth.mistakes}
+    is_named_by_kind = {fault.kind: fault.kind in named_kinds for fault in right_answers.mistakes}
     feedback = (
         *_fault_feedback(matches, false_faults, is_no_fault_right),
-        *_answer_feedback(answers, truth),
+        *_answer_feedback(answers, right_answers),
     )
     return FormPoints(points_by_part, weights, feedback, is_named_by_kind)
 
@@ -167,23 +169,31 @@ def describe_right_answer(fault: InjectedFault) -> str:
     return ", ".join([*texts, f"shown in {' or '.join(panels_showing(fault.kind))}"])
 
 
-def _answer_feedback(answers: Answers, truth: FormTruth) -> Iterator[str]:
+def _answer_feedback(answers: Answers, right_answers: RightFormAnswers) -> Iterator[str]:
     """Yield feedback on wrong answers about consistency, EKF2, numbers and figures."""
     rows: list[tuple[str, object, object]] = [
-        ("consistency verdict on KF", answers.verdict_kf, truth.kf.verdict or NOT_AVAILABLE),
-        ("consistency verdict on EKF2", answers.verdict_ekf2, truth.ekf2.verdict or NOT_AVAILABLE),
+        (
+            "consistency verdict on KF",
+            answers.verdict_kf,
+            right_answers.kf.verdict or NOT_AVAILABLE,
+        ),
+        (
+            "consistency verdict on EKF2",
+            answers.verdict_ekf2,
+            right_answers.ekf2.verdict or NOT_AVAILABLE,
+        ),
     ]
-    if _ekf2_behaviour_fraction(answers, truth) < 1.0:
-        rows.append(("behaviour of EKF2", answers.ekf2_did, truth.ekf2_did))
+    if _ekf2_behaviour_fraction(answers, right_answers) < 1.0:
+        rows.append(("behaviour of EKF2", answers.ekf2_did, right_answers.ekf2_did))
     for question, given, right in zip_longest(
-        select_questions(answers.log_sha256), answers.quantities, truth.quantities
+        select_questions(answers.log_sha256), answers.quantities, right_answers.quantities
     ):
         if right not in (None, ()) and _quantity_fraction(given, right) < 1.0:
             rows.append(
                 (f"{question.text}, within {100.0 * FULL_POINTS_TOLERANCE:g} %", given, right)
             )
     for letter, (choice, right_letter) in zip_longest(
-        answers.choices[: len(truth.choices)], truth.choices
+        answers.choices[: len(right_answers.choices)], right_answers.choices
     ):
         given_text = choice.answer_text(letter) if letter else ""
         rows.append((choice.question, given_text, choice.answer_text(right_letter)))
@@ -198,7 +208,9 @@ def _format_answer(answer: object) -> str:
     return f"{answer:.4g}" if isinstance(answer, float | int) else f"'{answer or 'none'}'"
 
 
-def _match_faults(answers: Answers, truth: FormTruth) -> tuple[list[Match], list[NamedFault]]:
+def _match_faults(
+    answers: Answers, right_answers: RightFormAnswers
+) -> tuple[list[Match], list[NamedFault]]:
     """Match each injected fault with the named fault that gives the most points.
 
     Return the matches, and the named faults that match no injected fault.
@@ -209,7 +221,7 @@ def _match_faults(answers: Answers, truth: FormTruth) -> tuple[list[Match], list
     match_by_kind: dict[str, tuple[NamedFault, float]] = {}
     candidates = [
         (fraction_for_named_kind(fault.kind, named_fault.kind), fault.kind, named_fault)
-        for fault in truth.mistakes
+        for fault in right_answers.mistakes
         for named_fault in unmatched
     ]
     for fraction, kind, named_fault in sorted(candidates, key=lambda each: -each[0]):
@@ -217,7 +229,9 @@ def _match_faults(answers: Answers, truth: FormTruth) -> tuple[list[Match], list
             match_by_kind[kind] = named_fault, fraction
             unmatched.remove(named_fault)
     no_match = (None, 0.0)
-    matches = [(fault, *match_by_kind.get(fault.kind, no_match)) for fault in truth.mistakes]
+    matches = [
+        (fault, *match_by_kind.get(fault.kind, no_match)) for fault in right_answers.mistakes
+    ]
     return matches, unmatched
 
 
@@ -232,7 +246,7 @@ def fraction_for_named_kind(kind: str, named_kind: str) -> float:
     return EFFECT_FRACTION if named_kind in POINTS_TABLE["effects"].get(kind, ()) else 0.0
 
 
-def _fault_fractions(matches: list[Match], truth: FormTruth) -> dict[str, float]:
+def _fault_fractions(matches: list[Match], right_answers: RightFormAnswers) -> dict[str, float]:
     """Return the mean score (0 to 1) over all injected faults, by part of the answers."""
     sized_fault_count = sum(fault.size is not None for fault, _, _ in matches)
     fractions = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
@@ -244,7 +258,7 @@ def _fault_fractions(matches: list[Match], truth: FormTruth) -> dict[str, float]
         time_weight = weight if named_fault.kind == fault.kind else 0.5 * weight
         fractions["mistakes"] += fraction / len(matches)
         fractions["time and panel"] += evidence_fraction(fault, named_fault) * time_weight
-        fractions["correction"] += correction_fraction(fault, named_fault, truth) * weight
+        fractions["correction"] += correction_fraction(fault, named_fault, right_answers) * weight
         fractions["sizes"] += size_score / max(sized_fault_count, 1)
     return fractions
 
@@ -275,22 +289,24 @@ def evidence_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
     if fault.from_s is None and fault.until_s is None:
         is_time_right = named_fault.when == "whole flight"
     else:
-        times = (fault.from_s, named_fault.from_s), (fault.until_s, named_fault.until_s)
+        true_and_named_s = (fault.from_s, named_fault.from_s), (fault.until_s, named_fault.until_s)
         is_time_right = not named_fault.when and all(
             named_s is not None
             and abs(named_s - true_s) <= max(TIME_TOLERANCE_S, TIME_TOLERANCE_FRACTION * true_s)
-            for true_s, named_s in times
+            for true_s, named_s in true_and_named_s
             if true_s is not None
         )
     return 0.5 * is_time_right + 0.5 * (named_fault.panel in panels_showing(fault.kind))
 
 
 def panels_showing(fault_kind: str) -> list[str]:
-    shows = POINTS_TABLE["shows"].items()
-    return [*(panel for panel, kinds in shows if fault_kind in kinds), "cover"]
+    kinds_by_panel = POINTS_TABLE["shows"]
+    return [*(panel for panel, kinds in kinds_by_panel.items() if fault_kind in kinds), "cover"]
 
 
-def correction_fraction(fault: InjectedFault, named_fault: NamedFault, truth: FormTruth) -> float:
+def correction_fraction(
+    fault: InjectedFault, named_fault: NamedFault, right_answers: RightFormAnswers
+) -> float:
     """Return the fraction of the points for the parameter that corrects a fault, with its value."""
     named_value = named_fault.value_in_first_unit()
     fractions = [
@@ -298,7 +314,7 @@ def correction_fraction(fault: InjectedFault, named_fault: NamedFault, truth: Fo
         if (low, high) == NO_BOUNDS
         else fraction
         * (0.5 if named_value is None else _value_fraction(named_value, low, high, 0.5))
-        for parameter, (low, high), fraction in accepted_corrections(fault, truth)
+        for parameter, (low, high), fraction in accepted_corrections(fault, right_answers)
         if parameter == named_fault.parameter
     ]
     return max(fractions, default=0.0)
@@ -315,7 +331,9 @@ def _value_fraction(value: float, low: float, high: float, fraction_outside: flo
 AcceptedCorrection = tuple[str, tuple[float, float], float]
 
 
-def accepted_corrections(fault: InjectedFault, truth: FormTruth) -> tuple[AcceptedCorrection, ...]:
+def accepted_corrections(
+    fault: InjectedFault, right_answers: RightFormAnswers
+) -> tuple[AcceptedCorrection, ...]:
     size, low, high = (value or 0.0 for value in (fault.size, fault.low, fault.high))
     from_s = fault.from_s or 0.0
     until_s = from_s if fault.until_s is None else fault.until_s
@@ -325,7 +343,7 @@ def accepted_corrections(fault: InjectedFault, truth: FormTruth) -> tuple[Accept
         "late milliseconds": (1e3 * low, 1e3 * high),
         "twice": (2.0 * size, 1e4),
         "factors": (100.0 / (100.0 + high), 100.0 / (100.0 + low)),
-        "noise": (0.8 * truth.sigma_z_m, 1.25 * truth.sigma_z_m),
+        "noise": (0.8 * right_answers.sigma_z_m, 1.25 * right_answers.sigma_z_m),
         "after": (until_s - 1.0, until_s + 15.0),
         "before": (from_s - 15.0, from_s + 1.0),
     }
@@ -342,20 +360,20 @@ def accepted_corrections(fault: InjectedFault, truth: FormTruth) -> tuple[Accept
     )
 
 
-def _verdicts_fraction(answers: Answers, truth: FormTruth) -> float:
+def _verdicts_fraction(answers: Answers, right_answers: RightFormAnswers) -> float:
     """Return the mean score for the consistency of KF and of EKF2, and the behaviour of EKF2."""
     given_and_right = (
-        (answers.verdict_kf, truth.kf.verdict),
-        (answers.verdict_ekf2, truth.ekf2.verdict),
+        (answers.verdict_kf, right_answers.kf.verdict),
+        (answers.verdict_ekf2, right_answers.ekf2.verdict),
     )
     right_count = sum(answer == (right or NOT_AVAILABLE) for answer, right in given_and_right)
-    return (right_count + _ekf2_behaviour_fraction(answers, truth)) / 3.0
+    return (right_count + _ekf2_behaviour_fraction(answers, right_answers)) / 3.0
 
 
-def _ekf2_behaviour_fraction(answers: Answers, truth: FormTruth) -> float:
+def _ekf2_behaviour_fraction(answers: Answers, right_answers: RightFormAnswers) -> float:
     """Return 1 if the reported behaviour of EKF2 is right, 1/2 with one error, otherwise 0."""
-    stated_behaviours, required_behaviours = set(answers.ekf2_did), set(truth.ekf2_did)
-    also_allowed = set(truth.ekf2_did_also)
+    stated_behaviours, required_behaviours = set(answers.ekf2_did), set(right_answers.ekf2_did)
+    also_allowed = set(right_answers.ekf2_did_also)
     false_count = len(stated_behaviours - required_behaviours - also_allowed)
     if len(stated_behaviours) == false_count or false_count > 1:
         return 0.0
@@ -365,23 +383,23 @@ def _ekf2_behaviour_fraction(answers: Answers, truth: FormTruth) -> float:
     return 1.0 if is_complete and not false_count else 0.5
 
 
-def _choices_fraction(answers: Answers, truth: FormTruth) -> float:
+def _choices_fraction(answers: Answers, right_answers: RightFormAnswers) -> float:
     """Return the mean score of the multiple-choice questions; random answers give 0 on average."""
     wrong_points = -1.0 / (len(CHOICE_NAMES) - 1)
-    right_letters = (right_letter for _, right_letter in truth.choices)
+    right_letters = (right_letter for _, right_letter in right_answers.choices)
     points = (
         1.0 if letter == right_letter else wrong_points
         for letter, right_letter in zip(answers.choices, right_letters, strict=False)
         if letter
     )
-    return sum(points) / len(truth.choices)
+    return sum(points) / len(right_answers.choices)
 
 
-def _quantities_fraction(answers: Answers, truth: FormTruth) -> float:
+def _quantities_fraction(answers: Answers, right_answers: RightFormAnswers) -> float:
     """Return the mean score for the numbers that the student computed with KF."""
     # a right answer without a number is not scored, because it could be guessed
-    scored_count = sum(value not in (None, ()) for value in truth.quantities)
-    given_and_right = zip(answers.quantities, truth.quantities, strict=False)
+    scored_count = sum(value not in (None, ()) for value in right_answers.quantities)
+    given_and_right = zip(answers.quantities, right_answers.quantities, strict=False)
     return sum(_quantity_fraction(*pair) for pair in given_and_right) / max(scored_count, 1)
 
 

@@ -57,11 +57,11 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
             (0, "", report.items),
             (1, "Answer form: ", report.form_parts),
         ):
-            total = sum(item.points for item in items)
+            total_points = sum(item.points for item in items)
             for item in items:
                 if item.awaits_points:
                     continue
-                item_row = item.points, item.max_points, total - item.points
+                item_row = item.points, item.max_points, total_points - item.points
                 rows_by_item[group_index, f"{prefix}{item.title}"].append(item_row)
         for kind, is_named in report.mistakes.items():
             rows_by_item[2, f"Fault: {kind}"].append((float(is_named), 1.0, report.points))

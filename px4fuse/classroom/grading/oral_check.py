@@ -4,7 +4,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 
 from px4fuse.classroom.assignment.key import AnswerKey
-from px4fuse.classroom.assignment.truth import FormTruth
+from px4fuse.classroom.assignment.truth import RightFormAnswers
 from px4fuse.classroom.grading.form_points import describe_right_answer, panels_showing
 from px4fuse.classroom.grading.model import Entry
 from px4fuse.core.text import one_line
@@ -30,10 +30,10 @@ def questions_text(entries: Sequence[Entry], key: AnswerKey, count: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def ask_about_form(form: Answers, truth: FormTruth) -> Iterator[Question]:
+def ask_about_form(form: Answers, right_answers: RightFormAnswers) -> Iterator[Question]:
     """Yield questions about the faults and figures in a student's answers, wrong answers first."""
     named_kinds = [fault.kind for fault in form.mistakes]
-    true_kinds = [fault.kind for fault in truth.mistakes]
+    true_kinds = [fault.kind for fault in right_answers.mistakes]
     flight_text = ", ".join(true_kinds) or "no fault"
     for kind in named_kinds:
         if kind in (*true_kinds, NO_FAULT_KIND):
@@ -44,7 +44,7 @@ def ask_about_form(form: Answers, truth: FormTruth) -> Iterator[Question]:
             f"{' or '.join(panels_showing(kind))}. The plot does not show the fault. The flight "
             f"has {flight_text}.",
         )
-    for fault in truth.mistakes:
+    for fault in right_answers.mistakes:
         description = FAULT_KINDS[fault.kind].description
         if fault.kind not in named_kinds:
             yield (
@@ -61,7 +61,9 @@ def ask_about_form(form: Answers, truth: FormTruth) -> Iterator[Question]:
             f"{' or '.join(other_panels[:2])}.",
         )
     given_letters = dict(enumerate(form.choices))
-    questions = [(*each, given_letters.get(index)) for index, each in enumerate(truth.choices)]
+    questions = [
+        (*each, given_letters.get(index)) for index, each in enumerate(right_answers.choices)
+    ]
     for choice, right_letter, letter in sorted(questions, key=lambda each: each[1] == each[2]):
         answer_text = choice.answer_text(letter) if letter else "none"
         yield (

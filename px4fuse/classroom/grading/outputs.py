@@ -172,8 +172,8 @@ def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
     report = entry.counted_report
     if report is None or not report.sha256:
         return entry
-    record = output / RECORDS_FOLDER / report.sha256
-    redrawn_file, diagnosis_file = map(record.with_suffix, (REDRAWN_SUFFIX, DIAGNOSIS_SUFFIX))
+    record_path = output / RECORDS_FOLDER / report.sha256
+    redrawn_file, diagnosis_file = map(record_path.with_suffix, (REDRAWN_SUFFIX, DIAGNOSIS_SUFFIX))
     if diagnosis_file.exists():
         write_all({output / FEEDBACK_FOLDER / f"{stem}.pdf": diagnosis_file.read_bytes()})
     if not redrawn_file.exists():
@@ -342,25 +342,29 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         if not any(READ_ONLY_MARK in row[index] for row in sheet.rows[:3])
     }
     grade_index = sheet.column(GRADE_TITLES)
-    plain_titles = {
+    short_title_by_index = {
         index: _ASSIGNMENT_NUMBER.sub("", title) for index, title in title_by_index.items()
     }
-    assignments = [index for index, title in title_by_index.items() if plain_titles[index] != title]
-    matches = [
+    assignment_indices = [
+        index for index, title in title_by_index.items() if short_title_by_index[index] != title
+    ]
+    matching_indices = [
         index
         for index, title in title_by_index.items()
-        if normalise_text(column_title) in map(normalise_text, (title, plain_titles[index]))
+        if normalise_text(column_title) in map(normalise_text, (title, short_title_by_index[index]))
     ]
-    candidate_indices = assignments if grade_index is None else [grade_index]
+    candidate_indices = assignment_indices if grade_index is None else [grade_index]
     # a Moodle table has one grade column, so a --column without a match is for another table
-    if column_title and (matches or sheet.column(("identifier",)) is None):
-        candidate_indices = matches
+    if column_title and (matching_indices or sheet.column(("identifier",)) is None):
+        candidate_indices = matching_indices
     if len(candidate_indices) == 1:
         return candidate_indices[0]
     problem = (
         "the table has several grade columns" if candidate_indices else "no grade column was found"
     )
-    titles = ", ".join(one_line(plain_titles[index], 40) for index in assignments or title_by_index)
+    titles = ", ".join(
+        one_line(short_title_by_index[index], 40) for index in assignment_indices or title_by_index
+    )
     remedy = f"Choose the grade column with --column: {one_line(titles, 300)}."
     raise SettingsError(f"{sheet.path}: {problem}.", remedy)
 
