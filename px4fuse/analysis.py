@@ -54,7 +54,7 @@ class Analysis(Comparison, Estimates, Reruns):
 
     @property
     def main_trials(self) -> list[Trial]:
-        """Re-runs of KF and EKF2 along the main axis whose start is the logged result."""
+        """Re-runs of KF and EKF2 along the main axis that are compared with logged results."""
         main_axis = self.main.axis.name
         return [trial for trial in self.trials if trial.axis == main_axis and trial.is_logged]
 

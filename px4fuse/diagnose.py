@@ -212,7 +212,7 @@ def prepare_comparison(
 def rerun(
     comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
 ) -> Reruns:
-    """Replay EKF2, explain the difference KF - EKF2, and re-run filters without single errors."""
+    """Replay EKF2, explain the difference KF - EKF2, and re-run both with one error corrected."""
     progress("replaying EKF2")
     corrected = corrected_settings(comparison, estimates.tuning)
     # replay all parameter sets together, which is faster

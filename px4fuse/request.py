@@ -252,7 +252,7 @@ def _option_names(
 ) -> dict[str, str]:
     """Return the command-line option of each optional field, for example ``--max-gap``.
 
-    ``renamed_options`` are options that do not follow from the name of the field (``max_gap_s``).
+    ``renamed_options`` are exceptions from the rule ``max_gap_s`` → ``--max-gap``.
     """
     option_names = {
         field.name: "--" + re.sub(f"({'|'.join(SUFFIX_UNITS)})$", "", field.name).replace("_", "-")
@@ -304,8 +304,8 @@ def command_line(
     command : str, optional
         Name of the command; by default from the type of ``request``.
     for_shell : bool
-        True for paths, and quotes of the shell of this system. False for file names, and quotes of
-        a POSIX shell.
+        True: paths, quoted for the shell of this system. False: file names, quoted for a POSIX
+        shell.
     """
     shown_request = request if for_shell else request.without_paths()
     # required fields are input files, and all other fields are options

@@ -389,5 +389,5 @@ class TestCommand:
     def test_simulate_without_secret_stores_new_secret_in_answer_key(self, at):
         given = "--assignment", "roster.csv", "-o", "g", "--kind", "loop"
         kept = run_checked("simulate", *given).output
-        assert "stored in the answer key" in kept
+        assert "answer key contains a new secret" in kept
         assert read_answer_key(at / "g_answers.json").secret not in kept

@@ -40,7 +40,7 @@ class ComparedNumber:
 
 
 def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, ComparedNumber]:
-    """Return the numbers to compare, by their path in the results."""
+    """Return the numbers that ``px4fuse diff`` compares, by path (``clock.offset_s``)."""
     axes = {} if isinstance(results, AidsResults) else results.axes
     # EKF2 rejects north and east together: the rejected fraction of one axis is sufficient
     horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")

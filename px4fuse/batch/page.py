@@ -19,7 +19,7 @@ from px4fuse.html.safe import clean_text, load_template, local_link
 from px4fuse.report.card_html import MARK_PATHS
 from px4fuse.report.card_text import MARKS, SEVERITY_SIGNS, band_limits
 
-# Filter and reference of each σ ratio, in the order of the field `verdicts` of the diagnosis
+# Filter and reference of each σ ratio (source: innovations; truth: errors), as in Card.verdicts
 SIGMA_RATIO_COLUMNS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
 SEVERITIES = list(SEVERITY_SIGNS)
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))

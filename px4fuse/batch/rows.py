@@ -75,7 +75,7 @@ def axis_rows(results: ComparisonResults) -> list[Row]:
 
 
 def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
-    """Return the table columns about findings, and about the aiding sources of EKF2.
+    """Return the values of the table columns about findings and about EKF2's aiding sources.
 
     Findings that are an effect of another finding are omitted.
     """
@@ -91,7 +91,7 @@ def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) 
 
 
 def card_columns(card: Card) -> Row:
-    """Return the table columns about the diagnosis (summary on the first page of a report)."""
+    """Return the values of the table columns about the diagnosis of a flight."""
     rmse_m = card.effect.position_rmse_m.values() if card.effect else ()
     return {
         "severity": card.severity,

@@ -65,7 +65,7 @@ class BatchResult:
 
 
 class CachedRows(msgspec.Struct, frozen=True):
-    """Table rows of a log, cached for this version of px4fuse and these settings."""
+    """Table rows of a log in a cache file, valid for one version and set of settings of px4fuse."""
 
     sha256: str
     px4fuse: str
@@ -240,7 +240,7 @@ def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]
 
 
 def load_cached_rows(state: _RunState) -> Iterator[CachedRows]:
-    """Yield the table rows that earlier runs wrote with this version and these settings."""
+    """Yield the cached table rows that are valid for the version and the settings in ``state``."""
     for cache_file in sorted((state.output / "rows").glob("*.json")):
         try:
             cached_rows = msgspec.json.decode(cache_file.read_bytes(), type=CachedRows)

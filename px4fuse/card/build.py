@@ -385,7 +385,7 @@ def _action_sentence(action: Action) -> str:
 def _mark_explained(
     sigma_verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Set ``is_explained`` for inconsistent filters whose settings need no change."""
+    """Mark inconsistent filters whose settings need no change (``is_explained``)."""
     filters_without_change = {
         name
         for cause in causes
@@ -415,7 +415,7 @@ def _mark_explained(
 def _explain_verdict_differences(
     analysis: Analysis, sigma_verdicts: tuple[Verdict, ...], causes: Sequence[Cause]
 ) -> tuple[tuple[Verdict, ...], str]:
-    """Explain why innovations are consistent and errors are not, or vice versa."""
+    """Explain why the innovations of a filter are consistent and its errors not, or vice versa."""
     may_drift, ekf2_errors = analysis.source.origin.may_drift, analysis.main.filters["ekf2"].truth
     sigma_verdicts = _mark_explained(sigma_verdicts, causes, may_drift=may_drift)
     *other_verdicts, ekf2_verdict = sigma_verdicts

@@ -122,7 +122,7 @@ def _cause_tier(finding: Finding, trials: Iterable[Trial]) -> int:
 
 
 def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
-    """Return the best re-run of each filter and kind of change that tests a finding."""
+    """Return the re-runs of KF and EKF2 that test a finding, the best for each type of change."""
     change_kinds = CATALOGUE[finding.id].reruns
     change_kinds |= {"defaults"} if "noises" in change_kinds else set()
     best_trials: dict[tuple[FilterName, str], Trial] = {}
@@ -183,7 +183,7 @@ def _make_actions(
     sigma_verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
-    """Return groups of actions of which one is sufficient, and actions that are necessary."""
+    """Return (alternatives, actions): groups of which one is sufficient, and necessary actions."""
     finding = ranked_cause.finding
     trial_by_change = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
     sender_actions: list[Action] = []
@@ -196,7 +196,7 @@ def _make_actions(
     )
     delay_actions = []
     if delay_trial:
-        # parameters that the correction at the sender needs as well are a separate action
+        # parameters that both corrections need become a separate action
         common_names = offset_trial.change.keys() if offset_trial else ()
         delay_change = {
             name: value for name, value in delay_trial.change.items() if name not in common_names
@@ -281,7 +281,7 @@ def make_rerun_action(
 ) -> Action:
     """Return the command that runs KF with changed settings.
 
-    ``default_settings`` is not empty if KF is also consistent with these default settings.
+    ``default_settings`` are default noises with which KF is also consistent, or empty.
     """
     command = command_line(structs.replace(request, **change))
     default_options_text = " and ".join(

@@ -48,7 +48,7 @@ class Verdict(Record, kw_only=True):
     interval : (float, float) or None
         95 % interval of the ratio.
     reason : str
-        Reason for the word "not evaluated".
+        Reason if ``word`` is "not evaluated".
     is_explained : bool
         True if the filter is inconsistent, but its settings need no change.
     """

@@ -25,7 +25,7 @@ from px4fuse.core.reading import (
 )
 from px4fuse.errors import SettingsError
 
-# Name of a tool argument, if it differs from the name of the parameter in cli
+# Names of tool arguments that differ from the parameter of the command
 ARGUMENT_NAMES = {"finding": "finding_id", "parameter_texts": "parameters", "source": "log"}
 # Parameters of commands that are not offered in tools: outputs, exit codes and student
 HIDDEN_PARAMETERS = {

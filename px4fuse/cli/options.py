@@ -270,7 +270,9 @@ position_options = _combine_options(
         help="Recording of the positioning system (CSV or BAG:TOPIC), used instead of the "
         "positions in LOG.",
     ),
-    _position_option("body", "Body, tag or topic, if the file contains several.", metavar="NAME"),
+    _position_option(
+        "body", "Rigid body, tag or topic to use, if the file contains several.", metavar="NAME"
+    ),
     _position_option(
         "frame",
         "Coordinate frame of x, y, z in the position file.  [default: from the column names, else "

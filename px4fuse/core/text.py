@@ -153,7 +153,7 @@ def format_metres(length_m: float) -> str:
 
 
 def replace_unencodable(text: str) -> str:
-    """Replace bytes of a path or command line that are not valid UTF-8 by question marks."""
+    """Replace invalid UTF-8 bytes in a path or command line by question marks."""
     return text.encode(errors="replace").decode()
 
 

@@ -140,7 +140,7 @@ def poll_with_limits(
     try:
         while waiting_indices or workers:
             while waiting_indices and len(workers) < (processes or os.cpu_count() or 1):
-                # if the process does not start, only this job fails
+                # take the job first: if the process does not start, only this job fails
                 new_worker = _Worker(function, memory_bytes, waiting_indices.pop())
                 workers[new_worker.pipe] = new_worker
             # wait for the first deadline, or until a pipe has data

@@ -173,9 +173,9 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Pa
 
 
 def _nis_bands(innovation_count: int, packer: Packer) -> list[dict[str, int]]:
-    """Return the 95 % band of the mean NIS for each number of innovations up to twice the current.
+    """Return the 95 % band of the mean NIS for 1 to 2 · ``innovation_count`` innovations.
 
-    The number changes with the time offset.
+    The number of innovations changes with the time offset.
     """
     innovation_counts = np.arange(1, 2 * innovation_count + 1)
     probabilities = ((1.0 - CONFIDENCE_LEVEL) / 2.0, (1.0 + CONFIDENCE_LEVEL) / 2.0)

@@ -56,7 +56,7 @@ LINE_STYLES = {
 
 
 class Plot(Record):
-    """Plot over time.
+    """Plot of several quantities over time.
 
     Attributes
     ----------

@@ -153,7 +153,7 @@ def page(
     full_table_note : str
         Sentence about the file with all rows, for browsers without scripts.
     ratio_axis : mapping, optional
-        Axis of the ratio columns: ``ends``, ``bands`` and ``marks`` (SVG paths).
+        Axis of the ratio columns: ``ends`` (range), ``bands`` (shaded) and ``marks`` (SVG paths).
     """
     style = "".join(map(read_asset, ("colours.css", "base.css", "frame.css")))
     script = "".join(map(read_asset, ("dom.js", "frame.js")))

@@ -381,7 +381,7 @@ def _logging_advice(
     actions_and_purposes += [
         (finding.remedy, finding_title(finding.id)) for finding in findings if finding.remedy
     ]
-    # a MAVLink recording cannot contain other data, except positions
+    # data that a MAVLink recording can contain, in addition to positions
     mavlink_data = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
     actions_and_purposes += [
         (missing_data.remedy, missing_data.what)

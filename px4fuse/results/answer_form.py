@@ -1,4 +1,4 @@
-"""Form (TOML) with questions about a flight, in which a student also names the faults.
+"""Form (TOML) in which a student answers questions about a flight and names its faults.
 
 This module writes empty forms, and reads completed forms. It does not check if answers are right.
 """
@@ -36,9 +36,9 @@ class FaultKind(Record, rename={"size_quantity": "in"}):
     Attributes
     ----------
     size_quantity : str
-        Quantity of the size, for example "m"; "" for a fault without a size.
+        Key of the allowed units in ``form.toml``, for example "m"; "" for a fault without a size.
     range : (float, float)
-        Smallest and largest allowed size, in the first unit of the quantity.
+        Smallest and largest allowed size, in the first allowed unit.
     """
 
     description: str
@@ -415,8 +415,8 @@ def form_text(log_name: str, log_sha256: str, choices: Sequence[Choice] = ()) ->
 
 def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
     """Yield each question with the student's answer as texts."""
-    yield "Consistency verdict on KF", answers.verdict_kf or EMPTY_CELL
-    yield "Consistency verdict on EKF2", answers.verdict_ekf2 or EMPTY_CELL
+    yield "Consistency of KF", answers.verdict_kf or EMPTY_CELL
+    yield "Consistency of EKF2", answers.verdict_ekf2 or EMPTY_CELL
     yield "Behaviour of EKF2", ", ".join(answers.ekf2_did) or EMPTY_CELL
     for mistake in answers.mistakes:
         size_units = FAULT_KINDS.get(mistake.kind, FaultKind("")).units

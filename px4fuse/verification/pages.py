@@ -51,7 +51,7 @@ from px4fuse.verification.pdf_input import (
 # Tolerance (pt) of coordinates: different OpenBLAS kernels move points by at most 0.07 pt, and
 # 0.25 pt is not visible
 COORDINATE_TOLERANCE_PT = 0.25
-# Relative and absolute tolerance of other numbers in a PDF: some programs save 32-bit floats
+# Relative and absolute tolerance of PDF numbers except coordinates: programs may save 32-bit floats
 NUMBER_TOLERANCE = 1e-5
 # Maximum kerning (1/1000 em) of a text with tolerated numbers: a forger could change the order of
 # the digits by a larger kerning

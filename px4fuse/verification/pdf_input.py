@@ -183,7 +183,7 @@ def _inflated_bytes(pdf: bytes, start: int, limit_bytes: int) -> int:
         except zlib.error:  # not an error here: pypdf rejects this stream
             break
     input_bytes -= len(inflate.unused_data)
-    # at least 1000, because the start takes the time of 1000 bytes
+    # at least 1000 bytes, because each start of the decompression needs time
     return min(max(input_bytes, output_bytes, 1000), limit_bytes + 1)
 
 

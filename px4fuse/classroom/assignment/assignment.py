@@ -1,4 +1,4 @@
-"""Writing of an assignment: log and answer form for each student, and the answer key."""
+"""Writing of an assignment: log and question form for each student, and the answer key."""
 
 import hashlib
 import secrets

@@ -29,7 +29,7 @@ MIN_GREY_SPEED_M_S = 0.2
 # Questions about each figure, by the field of FigureFault that contains the right answer
 QUESTIONS = {
     "fault": "injected fault",
-    "evidence": "plots that show the fault, and that do not show it",
+    "evidence": "plots that show the fault, and plots that do not",
     "change": "smallest change that makes both filters consistent",
     "prediction": "effect if SIGMA_Z and EKF2_EVP_NOISE were three times as large",
     "useless": "change that does not help, and the reason",

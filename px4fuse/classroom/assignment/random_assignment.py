@@ -85,6 +85,7 @@ class AssignableFault(Record):
     ) -> str:
         """Return the value of the option ``px4fuse simulate --mistake`` for this fault.
 
+        ``difficulty`` is the smallest size that px4fuse detects, divided by the size in the flight.
         ``start_fraction`` is 0 for the earliest start and 1 for the latest start.
         """
         if self.detectable_size is None:

@@ -35,9 +35,9 @@ from px4fuse.simulation import flights
 from px4fuse.simulation.mistakes import MISTAKES as SIMULATED_MISTAKES
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 
-# Relative tolerance of the size of an injected fault in a right answer
+# Maximum relative error of the size of a fault in a student's answer
 SIZE_TOLERANCE = 0.15
-# Tolerance (m) of the loop closure error in a right answer
+# Maximum error (m) of the loop closure error in a student's answer
 CLOSURE_TOLERANCE_M = 0.3
 # Minimum fraction of positions rejected by EKF2 for which the student must report rejections
 MIN_REJECTED_FRACTION = 0.005

@@ -344,7 +344,7 @@ class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"zero_points_fac
             return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
         low, high = interval
         if label == "SIGMA_Z" and check_input.has_finding("source_may_drift", "source_drift"):
-            # the estimate of SIGMA_Z does not contain the drift, which is not in the innovations
+            # innovations, and so the estimate of SIGMA_Z, do not contain the drift of the source
             high = max(high, _largest_source_error_m(comparison))
         deviation_factor = max(
             chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0
@@ -386,7 +386,7 @@ class ConsistencyItem(
         nis_result = check_input.comparison.horizontal.get("kf")
         if not isinstance(nis_result, HorizontalNis):
             reason_text = check_input.missing_reason(f"{HORIZONTAL}.kf")
-            return 0.0, f"Your report has no consistency verdict on KF{reason_text}."
+            return 0.0, f"Your report has no result on the consistency of KF{reason_text}."
         if nis_result.verdict == "consistent":
             return 1.0, "KF is consistent."
         direction = "small" if nis_result.nis_mean > 1.0 else "large"
@@ -462,7 +462,7 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
     """Score the analysis of a loop.
 
     1/4 of the points for a loop closure error, 1/2 for an accepted loop closure, and all points for
-    a corrected path. If the vehicle did not land at the start, all points for no accepted closure.
+    a corrected path. If the vehicle did not return, all points if no loop closure was accepted.
     """
 
     def score(self, check_input: CheckInput) -> FractionAndReason:

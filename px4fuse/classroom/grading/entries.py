@@ -131,7 +131,7 @@ class Course:
         return Register(people, *people_by_sheet)
 
 
-# UNIX times of submission and of the zip entry, report, and grade if only this report counts
+# Sort key (UNIX times of submission and zip entry), report, and grade if only this report counts
 Attempt = tuple[tuple[float, float], GradedReport, Entry]
 
 
@@ -156,7 +156,7 @@ def build_entries(
     entries : tuple of Entry
         Grades of all students, then of reports of unknown students.
     notes : tuple of str
-        Sentences about overrides that match no student or item.
+        Sentences about points in ``overrides.csv`` without a matching student or item.
     """
     has_class_list = bool(course.register.people)
     register = course.register if has_class_list else _collect_students(reports, submissions)
@@ -416,7 +416,7 @@ def read_overrides(path: Path) -> Overrides:
             problem = f"student {one_line(student, 40)} has two rows for the item {item_text}"
         elif points and (parsed_points is None or parsed_points < 0.0 or not item_title):
             points_text = one_line(points, 20)
-            problem = f"points {points_text!r} must be a number of 0 or more for an item or total"
+            problem = f"points {points_text!r} must be 0 or more, in a row with an item or total"
         if problem:
             raise SettingsError(f"{path}: row {row_number}: {problem}.")
         overrides[student][item_title] = Override(

@@ -146,7 +146,7 @@ EQUAL_CONTENT_CHECKS: tuple[
         _student_identity,
     ),
     (
-        "The report has the numbers of {}, but another SHA-256 of the log: it is a copy.",
+        "The numbers are those of {}, but the SHA-256 of the log differs: this is a copy.",
         lambda report: (
             report.verification.status == "verified"
             and len(report.numbers) >= MIN_SAME_NUMBERS
@@ -155,7 +155,7 @@ EQUAL_CONTENT_CHECKS: tuple[
         attrgetter("log_sha256"),
     ),
     (
-        "The answers about the figures are those of {}, whose figures differ.",
+        "The answers about the figures are those of {}, although the figures differ.",
         lambda report: (
             report.form
             and sum(map(bool, report.form.choices)) >= MIN_ANSWERED_CHOICES

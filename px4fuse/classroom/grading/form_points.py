@@ -106,7 +106,7 @@ def form_points(answers: Answers, right_answers: RightFormAnswers) -> FormPoints
     if right_answers.mistakes and len(false_faults) < MIN_FALSE_FAULTS_WITHOUT_POINTS:
         fractions |= _fault_fractions(matches, right_answers)
     fractions["numbers"] = quantities_fraction = _quantities_fraction(answers, right_answers)
-    # the consistency of KF and EKF2 can be guessed: half of its points without a right number
+    # consistency can be guessed: without a right number, the answers give half of the points
     is_guess_possible = not quantities_fraction and not is_no_fault_right
     fractions["verdicts"] = _verdicts_fraction(answers, right_answers) * (
         0.5 if is_guess_possible else 1.0
@@ -115,7 +115,7 @@ def form_points(answers: Answers, right_answers: RightFormAnswers) -> FormPoints
     if is_no_fault_right:
         points_by_part["mistakes"] = weights["mistakes"]
     elif right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
-        # no fault of the flight has a size, so the points of "sizes" are added to "mistakes"
+        # the faults have no size: add the points for sizes to the points for naming the faults
         points_by_part["mistakes"] += weights["sizes"] * fractions["mistakes"]
     points_by_part["mistakes"] -= FALSE_FAULT_POINTS * len(false_faults)
     points_by_part["mistakes"] = max(points_by_part["mistakes"], 0.0)
@@ -173,12 +173,12 @@ def _answer_feedback(answers: Answers, right_answers: RightFormAnswers) -> Itera
     """Yield feedback on wrong answers about consistency, EKF2, numbers and figures."""
     rows: list[tuple[str, object, object]] = [
         (
-            "consistency verdict on KF",
+            "consistency of KF",
             answers.verdict_kf,
             right_answers.kf.verdict or NOT_AVAILABLE,
         ),
         (
-            "consistency verdict on EKF2",
+            "consistency of EKF2",
             answers.verdict_ekf2,
             right_answers.ekf2.verdict or NOT_AVAILABLE,
         ),
@@ -397,7 +397,7 @@ def _choices_fraction(answers: Answers, right_answers: RightFormAnswers) -> floa
 
 def _quantities_fraction(answers: Answers, right_answers: RightFormAnswers) -> float:
     """Return the mean score for the numbers that the student computed with KF."""
-    # a right answer without a number is not scored, because it could be guessed
+    # an empty list as right answer is not scored, because it could be guessed
     scored_count = sum(value not in (None, ()) for value in right_answers.quantities)
     given_and_right = zip(answers.quantities, right_answers.quantities, strict=False)
     return sum(_quantity_fraction(*pair) for pair in given_and_right) / max(scored_count, 1)

@@ -132,7 +132,7 @@ class GradedReport:
 
     @property
     def points(self) -> float:
-        """Sum of the points of all rubric items, which may wait for a decision."""
+        """Sum of the points of all rubric items, even if the instructor has not confirmed them."""
         return sum(item.points for item in self.items)
 
     @property

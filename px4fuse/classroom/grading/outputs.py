@@ -1,4 +1,4 @@
-"""Output files of grading: points of the class (CSV, HTML), feedback, and platform tables.
+"""Output files of grading: points of the class, feedback, and tables for learning platforms.
 
 px4fuse enters grades into copies of the tables that learning platforms export, and feedback if a
 table has a feedback column. All other cells stay unchanged. The row of a student without a grade is

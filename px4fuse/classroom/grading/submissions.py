@@ -83,7 +83,7 @@ class _EntryError(Exception):
 
 
 _BROKEN_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError)
-# BAD_VALUE_ERRORS contains RuntimeError, and so the NotImplementedError that zipfile raises
+# BAD_VALUE_ERRORS includes NotImplementedError (a RuntimeError), which zipfile raises
 _UNREADABLE_ERRORS = (_EntryError, *_BROKEN_ZIP_ERRORS, *BAD_VALUE_ERRORS)
 
 
