@@ -1,4 +1,4 @@
-"""Fit of a position track to a reference: lag by cross-correlation, then lag, yaw and origin."""
+"""Fit of positions to a reference: lag by cross-correlation, then lag, yaw and origin together."""
 
 from dataclasses import dataclass, replace
 
@@ -21,7 +21,7 @@ MIN_CONCORDANCE = {EKF2_POSITION: 0.7, IMU: 0.5}
 MIN_ONE_MINUS_CONCORDANCE = 1e-4
 # Minimum distance (s) between the lags of two separate correlation peaks
 MIN_PEAK_DISTANCE_S = 3.0
-# Residual (m) that the time grid causes even if both tracks match perfectly
+# Residual (m) of identical tracks, which is caused by interpolation on the time grid
 GRID_RESIDUAL_M = 0.05
 # Maximum residual (m): larger residuals are truncated, because they may be outliers
 MAX_RESIDUAL_M = 1.0

@@ -107,7 +107,7 @@ def resample_to_grid(track: SampledTrack) -> SampledTrack:
 
 
 def remove_spikes(track: SampledTrack, window_size: int = 3) -> SampledTrack:
-    """Remove outliers of up to half the window (in samples) by a median filter."""
+    """Remove outliers with a median filter over ``window_size`` samples."""
     return replace(track, position_m=median_filter(track.position_m, size=(window_size, 1)))
 
 
@@ -131,7 +131,7 @@ def mark_transients(track: SampledTrack) -> SampledTrack:
 
 
 def horizontal_range_m(track: SampledTrack) -> float:
-    """Return the larger of the ranges (m) of north and east, without outliers."""
+    """Return the larger of the position ranges (m) along north and east, without outliers."""
     return float(np.max(np.ptp(remove_spikes(track, 5).position_m[:, :2], axis=0)))
 
 

@@ -41,15 +41,14 @@ MIN_LIKELIHOOD_GAIN = 8.0
 # Minimum log-likelihood gain per independent sample: of an unambiguous convention, and of an
 # ambiguous one
 MIN_LIKELIHOOD_GAIN_PER_SAMPLE = (0.15, 0.4)
-# Range of the scale factor of the positions, relative to the displacement from the IMU, that is not
-# doubtful
+# Accepted range of the ratio of displacements, from the positions over from the IMU
 MIN_SCALE, MAX_SCALE = 0.88, 1.12
-# Maximum ratio of the residuals to the noise of source and IMU that is not doubtful
+# Maximum accepted ratio of the residuals to the noise of source and IMU
 MAX_RESIDUAL_RATIO = 2.4
 # σ (m) of the second differences of the position that are integrated from the IMU
 IMU_SIGMA_M = 0.05
-# EKF2's heading is used, because it is relative to north, unless its log likelihood is lower than
-# that of the gyroscopes' heading by more than this difference
+# EKF2's heading, which is relative to north, is preferred to the heading from the gyroscopes if its
+# log likelihood is at most this much lower
 MAX_LOGGED_HEADING_DEFICIT = 20.0
 # Minimum log-likelihood gain from a clock drift; a drift with a smaller gain is not corrected
 MIN_DRIFT_GAIN = 15.0
@@ -93,7 +92,7 @@ def check_convention(
     if not hypotheses:
         return None
     if clock_drift := _clock_drift(positions, motions[hypotheses[0].heading_from], hypotheses[0]):
-        positions_without_drift = positions.with_clock_drift(clock_drift)
+        positions_without_drift = positions.remove_clock_drift(clock_drift)
         hypotheses_without_drift = _search_hypotheses(positions_without_drift, motions)
         if (
             hypotheses_without_drift
@@ -129,7 +128,7 @@ def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -
 def _search_hypotheses(
     positions: SentPositions, motions: dict[HeadingSource, ImuMotion]
 ) -> list[Hypothesis]:
-    """Return the likely conventions, best first; the logged heading is preferred."""
+    """Return the likely hypotheses, best first; a hypothesis with EKF2's heading is preferred."""
     hypotheses = search(positions, motions)
     for hypothesis in hypotheses:
         if (
@@ -229,13 +228,13 @@ def _clock_drift(positions: SentPositions, imu: ImuMotion, best: Hypothesis) -> 
             for clock_drift in TESTED_CLOCK_DRIFTS.tolist()
             if (
                 candidates := find_candidates(
-                    positions.with_clock_drift(clock_drift).motion(imu), imu
+                    positions.remove_clock_drift(clock_drift).motion(imu), imu
                 )
             )
         ]
         best_candidate, start_drift = max(hypotheses, key=lambda pair: pair[0].score)
         best = replace(best_candidate, heading_from=best.heading_from)
-        positions = positions.with_clock_drift(start_drift)
+        positions = positions.remove_clock_drift(start_drift)
     hypothesis = refine_hypothesis(
         replace(best, has_clock_drift=True), positions, positions.motion(imu), imu
     )

@@ -1,4 +1,4 @@
-"""Records of the axes, unit, clock and orientation that a position source uses."""
+"""Records of the axes, unit, clock and orientation of a position source (UWB, vision, ...)."""
 
 from typing import Literal
 
@@ -9,12 +9,12 @@ Direction = Literal["north", "east", "south", "west", "up", "down"]
 Axes = tuple[Direction, Direction, Direction]
 Unit = Literal["m", "cm", "mm", "feet"]
 HeadingSource = Literal["EKF2", "gyroscopes"]
-Order = Literal["w x y z", "x y z w"]
-Frames = Literal["FRD to NED", "FLU to ENU", "FLU to NWU", "FLU to NED", "FRD to ENU"]
+QuaternionOrder = Literal["w x y z", "x y z w"]
+BodyAndWorldFrame = Literal["FRD to NED", "FLU to ENU", "FLU to NWU", "FLU to NED", "FRD to ENU"]
 
 
 class OrientationConvention(Record, kw_only=True, omit_defaults=False):
-    """Order and frames of the orientation of a position source.
+    """Quaternion order, body frame and world frame of a source's orientation.
 
     Attributes
     ----------
@@ -32,8 +32,8 @@ class OrientationConvention(Record, kw_only=True, omit_defaults=False):
     """
 
     verdict: Literal["determined", "ambiguous", "copied", "unrelated"]
-    order: Order = "w x y z"
-    frames: Frames = "FRD to NED"
+    order: QuaternionOrder = "w x y z"
+    frames: BodyAndWorldFrame = "FRD to NED"
     heading_error_deg: float | None = None
     tilt_difference_deg: NotNegative = 0.0
 
@@ -49,7 +49,7 @@ class Convention(Record, kw_only=True, omit_defaults=False):
     rotation_deg : float
         Rotation of the positions relative to the axes x, y, z, clockwise from above.
     heading_from : {"EKF2", "gyroscopes"}
-        Attitude that fits the positions: logged by EKF2, or integrated from the gyroscopes.
+        Source of the heading that fits the positions: logged by EKF2, or integrated gyroscopes.
     late_s : float
         Delay of the timestamps; negative if they are early.
     clock_drift : float
@@ -60,6 +60,8 @@ class Convention(Record, kw_only=True, omit_defaults=False):
         Log likelihood ratio (with priors) to the second best convention.
     log_likelihood_gain : float
         Log likelihood ratio to positions that are unrelated to the motion.
+    alternatives : tuple of str
+        Other conventions that fit nearly as well.
     """
 
     verdict: Verdict

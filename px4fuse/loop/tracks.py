@@ -188,7 +188,7 @@ class LoopSource:
 
 
 def file_name(source: Path) -> str:
-    """Return the start of output file names, such as ``flight_vio`` for ``flight.ulg:vio``."""
+    """Return the stem of output file names, such as ``flight_vio`` for ``flight.ulg:vio``."""
     path, track_name = split_path_and_part(str(source))
     return "_".join([path.stem, *(track_name or "").split("/")]).rstrip("_")
 

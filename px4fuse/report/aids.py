@@ -1,4 +1,4 @@
-"""Page on the aiding sources of EKF2: a table of verdicts, and plots of the innovations."""
+"""Report page on EKF2's aiding sources (GNSS, barometer, ...): statistics and innovation plots."""
 
 from collections.abc import Iterator, Mapping
 
@@ -23,7 +23,7 @@ LEAD_TEXT = (
 )
 AID_PANEL_HEIGHT = 21.0  # height (points) of the plot of one aiding source
 MAX_DRAWN_INNOVATION = 4.0  # maximum drawn ν/√S; larger values are triangles at the edge
-# Aiding sources for which the report of a comparison has a page on EKF2's aiding sources
+# Aiding sources of outdoor flights: a report has a page on all aiding sources if EKF2 fused one
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 

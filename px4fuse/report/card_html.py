@@ -1,4 +1,4 @@
-"""HTML of the diagnosis card, the summary of a report, for web pages and notebooks."""
+"""Diagnosis card (summary of faults, causes and actions) as HTML, for web pages and notebooks."""
 
 from collections.abc import Sequence
 
@@ -40,7 +40,7 @@ SCREEN_READER_QUANTITIES = {"source": "innovation over root S", "truth": "error 
 
 
 def card_of(analysis: Analysis) -> Card:
-    """Return the diagnosis card of an analysis."""
+    """Return the summary of faults, causes and actions of an analysis."""
     if analysis.request is None:
         raise SettingsError(
             "The analysis was not made by px4fuse.compare, so the command to print is unknown.",
@@ -51,7 +51,7 @@ def card_of(analysis: Analysis) -> Card:
 
 
 def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> str:
-    """Return the diagnosis card, the summary of a report, as an HTML element.
+    """Return a summary of faults, causes and actions as an HTML element.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> 
 def axis_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
     """Draw ratios "RMS of actual error ÷ reported σ" on a logarithmic axis as an HTML figure.
 
-    ``axis`` is the title of the spatial axis of the errors; ``name`` identifies it for scripts.
+    ``axis`` is the direction of the errors, as a text; ``name`` identifies the figure for scripts.
     """
     return load_template("report/card_axis.html").render(
         verdicts=verdicts,
@@ -101,7 +101,7 @@ def axis_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
 
 
 def axis_figures(analysis: Analysis) -> str:
-    """Return an HTML figure for each axis: KF and EKF2 against source and against ground truth."""
+    """Return HTML figures of the σ ratios of KF and EKF2, one figure for each axis."""
     return "".join(
         axis_html(make_sigma_verdicts(result), describe_axis(analysis, result), name)
         for name, result in analysis.axes.items()
@@ -109,12 +109,12 @@ def axis_figures(analysis: Analysis) -> str:
 
 
 def card_style() -> str:
-    """Return the style sheet of the diagnosis card, without its colours."""
+    """Return the CSS of the diagnosis card; the colours are in another style sheet."""
     return read_asset("card.css", "px4fuse.report")
 
 
 def notebook_html(card: Card) -> str:
-    """Return the diagnosis card with its style and colours, for a notebook."""
+    """Return the diagnosis card as HTML with its CSS, for a notebook."""
     colours = read_asset("colours.css").replace(":root", ".px4fuse-card")
     return f"<style>{colours}{card_style()}</style>{card_html(card, is_open=True)}"
 

@@ -1,4 +1,4 @@
-"""Diagnosis card as text: lines of at most 100 columns, for terminals, pipes and files."""
+"""Diagnosis card (summary of faults, causes and actions) as text of at most 100 columns."""
 
 import json
 import re
@@ -61,24 +61,24 @@ AIDS_HEADING = (
 
 
 class Line(NamedTuple):
-    """Text of a diagnosis card on the terminal, in a style of rich.
+    """Paragraph on the terminal, in a style of the rich package.
 
-    A text that ``wraps`` begins with ``first``; its other lines begin with ``indent``.
+    If ``wraps``, its first line begins with ``first_indent``, the other lines with ``indent``.
     """
 
     text: str
     style: str = ""
-    first: str = ""
+    first_indent: str = ""
     indent: str = ""
     wraps: bool = False
 
     def wrapped(self, width: int) -> list[str]:
         if not self.wraps:
-            return [f"{self.first}{self.text}"]
+            return [f"{self.first_indent}{self.text}"]
         return textwrap.wrap(
             self.text,
             width,
-            initial_indent=self.first,
+            initial_indent=self.first_indent,
             subsequent_indent=self.indent,
             break_long_words=False,
             break_on_hyphens=False,
@@ -119,7 +119,7 @@ def card_lines(card: Card) -> Iterator[Line]:
 
 
 def note_texts(card: Card, other_notes_place: str) -> list[str]:
-    """Format the first :data:`MAX_NOTES` notes of a card, and state where the others are listed."""
+    """Format up to :data:`MAX_NOTES` notes of a card, and state where the others are listed."""
     texts = [
         f"note[{note.id}]: {note.text} {note.action}".rstrip() for note in card.notes[:MAX_NOTES]
     ]
@@ -199,9 +199,9 @@ def axis_text(ratio: float | None, reference: Reference) -> str:
 def axis_marks(
     ratio: float, reference: Reference, interval: tuple[float, float] | None
 ) -> dict[str, Any]:
-    """Return the mark, the consistent band and the 95 % interval of a σ ratio on its axis.
+    """Return the positions of a σ ratio, its consistent band and its 95 % interval on the axis.
 
-    Places are fractions of the axis; ``mark`` is "below" or "above" for a ratio outside the axis.
+    Positions are fractions of the axis length. ``mark`` is "below" or "above" outside the axis.
     """
     fraction = axis_fraction(ratio)
     return {
@@ -289,7 +289,7 @@ def _rerun_table_lines(reruns: Sequence[Rerun]) -> Iterator[Line]:
 
 
 def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
-    """Return the columns of the table of re-runs with their headings; empty columns are omitted."""
+    """Return the columns (heading, cells) of the table of re-runs with changed settings."""
     rows = [
         {
             "re-run of this log": rerun.label,

@@ -1,4 +1,4 @@
-"""Time offset of the position source: an appendix page, or a line on the provenance page."""
+"""Texts and plot on the time offset of the position source."""
 
 from collections.abc import Iterable, Iterator
 
@@ -31,7 +31,7 @@ def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
 
 
 def has_clock_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
-    """Return True if the time offset is a finding or cannot be estimated."""
+    """Return True if the time offset is wrong, changes, or cannot be estimated."""
     clock = analysis.clock
     if isinstance(clock, Unavailable):
         return False
@@ -58,8 +58,8 @@ def clock_advice(
         ),
     }
     if clock.is_significant(offset_s):
-        side = "late" if offset_s < 0.0 else "early"
-        advice["Result"] = f"The position timestamps are {abs(offset_s):.3f} s {side}."
+        late_or_early = "late" if offset_s < 0.0 else "early"
+        advice["Result"] = f"The position timestamps are {abs(offset_s):.3f} s {late_or_early}."
         option_s = clock_offset_option_s(comparison, clock)
         advice["Re-run"] = f"px4fuse compare LOG --clock-offset {option_s:.3f}"
     if (logged_ms := delay_ms(comparison)) is not None:
@@ -102,7 +102,7 @@ def _delay_advice(comparison: PreparedComparison, clock: ClockOffset, logged_ms:
 
 
 def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
-    """Draw the appendix on the time offset of the position source if :func:`has_clock_page`."""
+    """Draw the appendix on a wrong or unknown time offset of the position source."""
     clock = analysis.clock
     if isinstance(clock, Unavailable) or not has_clock_page(analysis, results.findings):
         return

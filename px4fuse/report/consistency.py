@@ -114,15 +114,15 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 
 def _write_causes(page: Page, analysis: Analysis) -> None:
     axis = analysis.main.axis
-    tested_trials: list[tuple[Trial, Statistic]] = []
+    reruns_and_statistics: list[tuple[Trial, Statistic]] = []
     for filter_name, statistic in product(FILTERS, DISCREPANCIES):
         trials = find_trials(analysis.trials, filter_name, axis.name, statistic)
-        tested_trials += [(trial, statistic) for trial in trials]
+        reruns_and_statistics += [(trial, statistic) for trial in trials]
         cause = find_cause(trials, filter_name, axis.name, statistic)
         if cause and cause.before.difference_rms_m and cause.after.difference_rms_m:
-            tested_trials.append((cause, "difference"))
+            reruns_and_statistics.append((cause, "difference"))
     rows = []
-    for trial, statistic in tested_trials:
+    for trial, statistic in reruns_and_statistics:
         label, power = STATISTIC_LABELS_AND_POWERS[statistic]
         values = [outcome.value(statistic) or 0.0 for outcome in (trial.before, trial.after)]
         cells = [trial.filter.upper(), format_change(analysis, trial), label]

@@ -1,4 +1,4 @@
-"""First page of a report: the diagnosis card (a summary), and plots below it."""
+"""First page of a report: summary of faults, causes and actions (diagnosis card), and plots."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -51,7 +51,7 @@ ALL_FINDINGS = "All findings"
 
 
 def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
-    """Draw the cover: the diagnosis card, and plots in the space below it."""
+    """Draw the first page: the diagnosis card, and plots in the space below the card."""
     page = Page()
     block = add_card(page, results.card)
     if isinstance(analysis, Analysis):

@@ -36,7 +36,7 @@ from px4fuse.report.panels import add_legend, draw_dots, normalised_innovations
 from px4fuse.report.style import TRACK_LINES, Axes, draw_curve
 
 POINTS_PER_MM = 72.0 / 25.4
-# Minimum ratio of length to width of a track; maps of longer tracks fill the page width
+# Minimum ratio of length to width of a track whose map fills the page width
 MIN_LONG_TRACK_RATIO = 2.2
 # Minimum and maximum height (points) of the map, with title and labels
 MAP_HEIGHT_RANGE = 40.0 * POINTS_PER_MM, 53.0 * POINTS_PER_MM
@@ -74,13 +74,13 @@ MAX_MAP_MARGIN_FRACTION = 0.25
 MIN_MAP_LENGTH_M = 0.5
 # Maximum ratio of largest to smallest σ for which the title of a plot states only the median
 MAX_CONSTANT_SIGMA_RATIO = 1.5
-# Time (s) after the start of a filter that σ in titles of plots excludes
+# Time (s) after the start of a filter that is excluded from σ in plot titles
 SETTLING_S = 2.0
 Coordinates = tuple[Array, Array]
 
 
 class TimePlot(NamedTuple):
-    """Plot over time, and the function that draws it."""
+    """Title of a plot over time, and the function that draws the plot."""
 
     title: str
     draw: Callable[[Axes], None]
@@ -103,7 +103,7 @@ class FlightMap(NamedTuple):
 
 
 def write_panels(block: Block, analysis: Analysis, card: Card, free_height: float) -> None:
-    """Draw legend, map and plots over time on the cover; ``free_height`` in points."""
+    """Draw legend, map and plots over time on the first page; ``free_height`` is in points."""
     page = Page()
     block["blocks"] = page.blocks
     legend = add_legend(page, analysis)
@@ -171,7 +171,7 @@ def _title_height(page: Page, title: str) -> float:
 
 
 def _position_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
-    """Return a plot of the position error of each filter, or one of KF - EKF2 if it is unknown."""
+    """Return plots of the position errors of KF and EKF2, or of KF - EKF2 without ground truth."""
     result, effect = analysis.main.in_flight, card.effect
     errors_by_filter = {
         filter_name: errors
@@ -181,11 +181,11 @@ def _position_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
     }
     if errors_by_filter:
         half_range_m = 1.1 * max(map(_error_range_m, errors_by_filter.values()))
-        rmse_m = effect.position_rmse_m if effect else {}
+        rmse_by_filter_m = effect.position_rmse_m if effect else {}
         return [
             _error_plot(
                 f"{(name := FILTER_NAMES[filter_name])} error (m)",
-                ("RMSE", rmse_m.get(filter_name)),
+                ("RMSE", rmse_by_filter_m.get(filter_name)),
                 errors["error_m"],
                 {name: errors["sigma_m"]},
                 half_range_m,
@@ -211,12 +211,12 @@ def _position_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
 
 def _error_plot(
     label: str,
-    rms: tuple[str, float | None],
+    name_and_rms_m: tuple[str, float | None],
     error_m: pd.Series[float],
     sigmas: Mapping[str, pd.Series[float]],
     half_range_m: float,
 ) -> TimePlot:
-    rms_name, rms_m = rms
+    rms_name, rms_m = name_and_rms_m
     texts = [] if rms_m is None else [f"{rms_name} {format_metres(rms_m)}"]
     finite_sigmas = {
         name: finite_sigma

@@ -37,7 +37,7 @@ INCREASE_BAR_STYLE: dict[str, Any] = {"color": "white", "hatch": "////"}
 
 
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the part of each setting of EKF2 in the mean square difference KF - EKF2."""
+    """Draw the contribution of each EKF2 setting to the mean square difference KF - EKF2."""
     explanations = _explanations_by_axis(analysis)
     if not _has_explanation(explanations):
         return

@@ -274,10 +274,10 @@ def format_interval(interval: Interval | Unavailable) -> str:
     return f"{interval.low:.3f}–{interval.high:.3f}" if isinstance(interval, Interval) else ""
 
 
-def describe_track(path: Trajectory) -> str:
+def describe_track(track: Trajectory) -> str:
     return (
-        f"{path.name}: {path.kind}, {len(path)} poses over "
-        f"{path.time_s[-1] - path.time_s[0]:.1f} s, frame {path.frame}"
+        f"{track.name}: {track.kind}, {len(track)} poses over "
+        f"{track.time_s[-1] - track.time_s[0]:.1f} s, frame {track.frame}"
     )
 
 

@@ -71,7 +71,10 @@ def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> No
         if not len(spans_or_times):
             continue
         if height is None:
-            corners = [[(s, 0.0), (s, 1.0), (e, 1.0), (e, 0.0)] for s, e in spans_or_times]
+            corners = [
+                [(start_s, 0.0), (start_s, 1.0), (end_s, 1.0), (end_s, 0.0)]
+                for start_s, end_s in spans_or_times
+            ]
             bands = PolyCollection(corners, transform=x_transform, zorder=0.1 * order, **style)
             axes.add_collection(bands, autolim=False)
         else:
@@ -121,7 +124,7 @@ def legend_entries(analysis: Analysis) -> list[Artist]:
 
 
 def visible_times(times: Any, min_interval_s: float) -> Array:
-    """Return the first of the times (s) in each interval, so that markers do not overlap."""
+    """Return the first time (s) in each interval, so that markers do not overlap."""
     times_s = np.asarray(times, dtype=np.float64)
     visible_s: Array = times_s[np.unique(np.floor(times_s / min_interval_s), return_index=True)[1]]
     return visible_s

@@ -8,7 +8,7 @@ from px4fuse.report.page import Page
 
 
 def list_page() -> Page:
-    """List the ids of all findings with their titles, by group."""
+    """List the ids and titles of all findings (detectable faults), by group."""
     page = Page()
     for group in GROUPS:
         page.heading(capitalise_first(group))

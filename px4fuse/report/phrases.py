@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 # Minimum p value of the Ljung-Box test for white innovations: with eight tests per flight, less
 # than 1 % of the flights have a false alarm
 MIN_WHITE_P_VALUE = 0.001
-# Size of the reported σ compared with the actual error, by verdict
+# Deviation of the reported σ from the actual error of an inconsistent filter
 SIGMA_SIZES = {"underconfident": "too large", "overconfident": "too small"}
 DIFFERENCE_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
@@ -60,7 +60,7 @@ def format_verdict(consistency: Consistency | Unavailable) -> str:
 
 
 def format_sigma_verdict(verdict: str, factor: float) -> str:
-    """Format a verdict with the factor between reported and actual σ.
+    """Format a result of the consistency test with the factor between reported and actual σ.
 
     >>> format_sigma_verdict("overconfident", 2.41)
     'overconfident, σ 2.4× too small'
@@ -82,7 +82,7 @@ VERDICT_TABLE_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
 
 
 def verdict_cells(result: AxisComparison, name: str) -> list[Cell]:
-    """Return the cells for :data:`VERDICT_TABLE_HEAD` of an axis and a filter (KF or EKF2)."""
+    """Return the table row on the consistency of a filter (KF or EKF2) along an axis."""
     consistency = statistics_by_filter(result)[name]
     label = result.axis.label.removeprefix("the ") if name == "KF" else ""
     if isinstance(consistency, Unavailable):
@@ -95,7 +95,7 @@ def verdict_cells(result: AxisComparison, name: str) -> list[Cell]:
 
 
 def write_error_table(page: Page, analysis: Analysis) -> None:
-    """Write the table of verdicts and position errors of all axes."""
+    """Write a table of consistency tests and position errors of KF and EKF2 along all axes."""
     axes = (analysis.main, *analysis.secondary_axes)
     has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
     has_truth = isinstance(analysis.flight.truth, Truth)
@@ -118,7 +118,7 @@ def _format_rms(statistic: object, field: str) -> str:
 
 
 def verdict_notes(comparison: Comparison) -> list[str]:
-    """Return reservations about consistency verdicts: drifting source, correlated innovations."""
+    """Return limits of the consistency tests: drifting position source, correlated innovations."""
     consistencies = [
         (result.axis.label, filter_name, consistency)
         for result in comparison.axes.values()
@@ -261,12 +261,12 @@ def student_line(student: Student, separator: str) -> str:
 def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
     if not findings:
         page.write("None.")
-    for findings_of_cause in group_by_root(findings):
-        write_finding(page, findings_of_cause)
+    for cause_and_effects in group_by_root(findings):
+        write_finding(page, cause_and_effects)
 
 
-def write_finding(page: Page, group: list[Finding]) -> None:
-    finding, *effects = group
+def write_finding(page: Page, cause_and_effects: list[Finding]) -> None:
+    finding, *effects = cause_and_effects
     title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
     texts = [styled_text(title, 8.0, bold=True), styled_text(finding.message, 8.0)]
     if finding.remedy:

@@ -345,10 +345,10 @@ def _compute_output(
 def _hold_without_aiding(
     model_run: SegmentRun, state: Array
 ) -> tuple[list[tuple[int, Array]], BoolArray]:
-    """Set the position in ``state`` constant from NO_AID_TIMEOUT_S after the last fused sample.
+    """Hold the position in ``state`` constant without aiding, like PX4 (fake_pos_control.cpp).
 
-    PX4 does this (fake_pos_control.cpp). Return the resets of the position (step, size in m), and a
-    mask of the steps that are not held.
+    Return the position resets (step, size in m), and a mask of the steps with aiding in the last
+    NO_AID_TIMEOUT_S.
     """
     events, time_s = model_run.events[0], model_run.segment.time_s
     aid_events = np.flatnonzero(model_run.fused[:, 0] | model_run.reset[:, 0])

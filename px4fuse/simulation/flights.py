@@ -1,4 +1,4 @@
-"""Simulated flights as PX4 topics, ULog or Flight; injected faults and true values as answers."""
+"""Simulated flights as PX4 topics, ULog or Flight; answer key with injected faults and truth."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -109,7 +109,7 @@ def simulate_flight(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Fli
 def to_ulog(simulation: Simulation, *, is_assessed: bool = False) -> bytes:
     """Encode the flight as a ULog file, which contains no information about the injected faults.
 
-    ``is_assessed`` marks the log as an assignment, for which px4fuse withholds its diagnosis.
+    ``is_assessed`` marks the log as a student assignment, whose faults px4fuse does not show.
     """
     info: dict[str, int | str] = {
         "sys_name": "PX4",

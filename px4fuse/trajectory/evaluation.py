@@ -26,10 +26,11 @@ from px4fuse.trajectory.model import MIN_POSES, Trajectory, cumulative_distance
 from px4fuse.trajectory.scores import Delta, Interval, RelativeError, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset, clock_difference, estimate_time_offset
 
-# Maximum rotation (rad) relative to the first pose of an orientation that counts as constant: files
-# contain rounded digits
+# Maximum rotation (rad) from the first orientation of a trajectory with constant orientation: files
+# contain rounded numbers
 MAX_CONSTANT_ROTATION_RAD = 1e-6
-# Minimum number of poses and minimum motion (m) of a trajectory for removing a constant orientation
+# Minimum number of poses and minimum motion (m) for the conclusion that a constant orientation was
+# not measured
 MIN_CONSTANT_POSES, MIN_CONSTANT_MOTION_M = 10, 1.0
 # Minimum duration (s) of a repeated position for a warning, and minimum motion (m) of the reference
 # in this time
@@ -52,7 +53,7 @@ LEVER_ARM_ITERATIONS = 5
 
 
 def drop_constant_orientation(trajectory: Trajectory) -> tuple[Trajectory, tuple[str, ...]]:
-    """Remove a constant orientation of a moving trajectory as not measured; also return a note."""
+    """Remove the orientation if it is constant, because it was not measured; also return a note."""
     rotation, extent_m = trajectory.rotation, np.ptp(trajectory.position_m, axis=0).max()
     if (
         rotation is None
@@ -126,7 +127,7 @@ def find_jumps(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
 
 
 def has_other_body_axes(aligned_estimate: Trajectory, reference: Trajectory) -> bool:
-    """Return True if the orientations are of different body axes, such as those of a camera."""
+    """Return True if a constant rotation separates the body axes, as between camera and vehicle."""
     if aligned_estimate.rotation is None or reference.rotation is None:
         return False
     rotation_difference = aligned_estimate.rotation.inv() * reference.rotation
@@ -503,8 +504,8 @@ def _move_to_reference_body(
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """Convert the poses of the estimate to the body axes and body origin of the reference.
 
-    The rotation and the lever arm between the bodies are constant; they are fitted by turns with
-    the alignment.
+    The constant rotation and lever arm between the bodies are fitted alternately with the
+    alignment.
     """
     assert estimate.rotation is not None
     assert reference.rotation is not None
@@ -535,10 +536,7 @@ def _move_to_reference_body(
 def _with_reference_body_axes(
     aligned_estimate: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, tuple[str, ...]]:
-    """Rotate the camera axes of the estimate to the vehicle axes of the reference, or the reverse.
-
-    The constant rotation between camera and vehicle is estimated, so it is no error.
-    """
+    """Remove the constant rotation between camera and vehicle axes from the estimate."""
     vehicle_frames = (*_Z_DOWN_FRAMES, *_Z_UP_FRAMES)
     axes_differ = (aligned_estimate.frame == "camera") != (reference.frame == "camera") or any(
         track.kind == "slam"

@@ -20,8 +20,8 @@ from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 DeltaUnit = Literal["frames", "m", "s"]
 
-# Maximum relative difference between the distance of an RPE pair and the requested distance, if all
-# pairs are used: default of the evo package
+# Maximum relative error of the distance of an RPE pair, if all pairs are used: default of the evo
+# package
 DELTA_TOLERANCE = 0.1
 # Default distances (m) of RPE pairs
 DEFAULT_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
@@ -143,10 +143,12 @@ def rotation_statistics(a: Rotation, b: Rotation) -> Statistics:
 def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
     """Choose distances and times for the RPE that fit path length and duration of the flight."""
 
-    def choose(progress: Array, values: Sequence[float], min_fraction: float) -> list[float]:
-        total = float(np.ptp(progress))
+    def choose(
+        distance_or_time_s: Array, values: Sequence[float], min_fraction: float
+    ) -> list[float]:
+        total = float(np.ptp(distance_or_time_s))
         # The minimum distance or time of a pair is two median intervals between poses
-        minimum = max(min_fraction * total, 2.0 * median_interval(progress))
+        minimum = max(min_fraction * total, 2.0 * median_interval(distance_or_time_s))
         return [value for value in values if minimum <= value <= MAX_DELTA_FRACTION * total]
 
     distances_m = choose(distance_m, DEFAULT_DISTANCES_M, MIN_DELTA_FRACTION)

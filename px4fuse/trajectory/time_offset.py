@@ -41,21 +41,19 @@ FINE_SEARCH_WINDOW_S = 0.1
 MIN_PEAK_DISTANCE_S = 1.0
 # Minimum correlation of the speeds at a peak
 MIN_CORRELATION = 0.3
-# Minimum ratio of the residual (RMS) at another time offset to the best residual, for an
-# unambiguous time offset: 95 % limit of an F-test with 80 independent residuals, half a minute of
-# flight
+# Minimum ratio of the residuals (RMS) at the second best and the best time offset, for an
+# unambiguous result: 95 % limit of an F-test with 80 independent residuals (30 s of flight)
 MIN_SECOND_PEAK_RATIO = 1.2
 # Maximum number of poses in the least-squares fit of the time offset
 MAX_FITTED_POSES = 2000
 # Maximum ratio of residual to extent of the motion for accepting a fit of the time offset
 MAX_MISFIT = 0.5
-# Ratio of residual to extent of the motion below which two fits of the time offset are equally good
+# Ratio of residual to extent of the motion that no fit improves: two fits below it are equally good
 MIN_MISFIT = 1e-3
-# Minimum RMS of the velocity that shift, rotation and scale of the path cannot explain, as fraction
-# of the speed: a time offset is observable in this part of the velocity only
+# Minimum RMS of the velocity that no shift, rotation or scale of the path explains, as fraction of
+# the speed: only this part of the velocity makes a time offset observable
 MIN_UNEXPLAINED_SPEED_FRACTION = 0.05
-# Minimum correlation between two trajectories of the velocity that shift, rotation and scale cannot
-# explain: noise is not correlated
+# Minimum correlation of these unexplained velocities of two trajectories: noise is not correlated
 MIN_UNEXPLAINED_CORRELATION = 0.5
 # Number of lags in the variance of a sum of correlated residuals, in correlation lengths
 WINDOW_CORRELATION_LENGTHS = 4
@@ -114,7 +112,7 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
 
 
 def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOffset:
-    """Estimate the offset to add to the timestamps of the sparse trajectory."""
+    """Estimate the offset to add to the timestamps of the trajectory with fewer poses (sparse)."""
     clock_offset_s = clock_difference(sparse_track, dense_track)
     candidates = _find_candidates(sparse_track, dense_track)
     if clock_offset_s is not None:
