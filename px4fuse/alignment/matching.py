@@ -62,7 +62,7 @@ class AlignmentProblem:
 
 @dataclass(frozen=True)
 class Match:
-    """Best fit of the position file to a reference track: EKF2's position or the IMU's.
+    """Best fit of the position file to a reference track: EKF2's position or the integrated IMU.
 
     Attributes
     ----------

@@ -450,7 +450,7 @@ def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[fl
 
 
 def _log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float:
-    """Return the log prior odds of a hypothesis, plus the log likelihood ratio of its heights."""
+    """Return the log prior odds of a hypothesis, plus a log likelihood ratio from the barometer."""
     log_odds = hypothesis.assignment.log_odds(hypothesis.quarter_turns)
     log_odds += UNIT_ODDS * (hypothesis.unit != "m")
     log_odds += OFFSET_ODDS * (abs(hypothesis.offset_s) > SMALL_OFFSET_S)

@@ -204,8 +204,8 @@ def _describe_hypothesis(hypothesis: Hypothesis) -> str:
 def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
     """Return the ratio of the residuals to the noise of source and IMU.
 
-    The noise of the source is from third differences of the positions, which contain hardly any
-    motion.
+    The noise of the source is estimated from third differences of the positions, because they
+    contain hardly any motion.
     """
     third_differences = np.diff(positions.position_m, 3, axis=0)
     third_difference_sigma = 1.4826 * float(

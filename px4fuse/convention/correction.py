@@ -86,7 +86,7 @@ class Faults:
 
 
 def convention_faults(convention: Convention | None, flight: Flight, frame: str) -> Faults:
-    """Return the faults of a position source whose stated frame is ``frame``."""
+    """Return the deviations of a source from PX4's convention; ``frame`` is the logged frame."""
     if convention is None:
         return Faults()
     orientation_fault = _orientation_fault(convention)

@@ -49,7 +49,10 @@ class LeverArm(NamedTuple):
 
 
 def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
-    """Estimate the lever arm that remains after EKF2's parameters, with ground truth if logged."""
+    """Estimate the lever arm that EKF2's parameters do not contain, if it is significant.
+
+    Ground truth is used if logged, else the IMU.
+    """
     lever_arm = None
     if isinstance(flight.truth, Truth):
         lever_arm = _fit_to_truth(flight, flight.truth, track)

@@ -47,7 +47,7 @@ class Convention(Record, kw_only=True, omit_defaults=False):
         "ambiguous": several conventions fit; "doubtful": the residuals of the best convention are
         larger than the noise; "not determinable": too little data or motion.
     rotation_deg : float
-        Rotation of the positions relative to the axes x, y, z, clockwise from above.
+        Clockwise rotation of the positions in addition to the directions of x, y and z.
     heading_from : {"EKF2", "gyroscopes"}
         Source of the heading that fits the positions: logged by EKF2, or integrated gyroscopes.
     late_s : float
@@ -55,7 +55,7 @@ class Convention(Record, kw_only=True, omit_defaults=False):
     clock_drift : float
         Rate of the sender's clock minus 1.
     scale : float
-        Scale factor of the positions, relative to the displacement from the IMU.
+        Ratio of displacements, from the positions over from the IMU.
     log_odds : float or None
         Log likelihood ratio (with priors) to the second best convention.
     log_likelihood_gain : float

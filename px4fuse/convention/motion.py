@@ -73,7 +73,7 @@ class Inertial:
 
     @property
     def attitudes(self) -> dict[HeadingSource, Array]:
-        """Attitudes with the tilt of ``gyro_attitude``, and the heading of EKF2 or gyroscopes."""
+        """Attitudes with tilt from the gyroscopes, and heading from EKF2 or the gyroscopes."""
         return {
             "EKF2": replace_heading(self.gyro_attitude, heading(self.logged_attitude)),
             "gyroscopes": self.gyro_attitude,

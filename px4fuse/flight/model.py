@@ -482,7 +482,7 @@ def white_noise_m(position_m: Array) -> float:
 
 
 def kind_without_orientation(samples: pd.DataFrame) -> PositionKind:
-    """Return "uwb" for noisy positions at a low rate, else "unknown".
+    """Infer the kind of a source without orientation: noisy and slow is "uwb", else "unknown".
 
     Motion capture, odometry and other precise systems may also send positions only.
     """

@@ -201,7 +201,7 @@ def _is_drift_free(trajectory: Trajectory, flight: Flight) -> bool:
 
 
 def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
-    """Return the indices of the key frames, and the distance (m) along them at each pose."""
+    """Return the indices of the key frames, and the path length (m) along them at each pose."""
     _require_in_range("key_frames_m", spacing_m, 1e-3)
     key_frame_indices = choose_key_frames(path.position_m, spacing_m)
     distance_m = cumulative_distance(path.position_m[key_frame_indices])

@@ -186,7 +186,7 @@ class Loop(Record, kw_only=True):
 
     @property
     def reported_paths(self) -> tuple[CorrectedPath, ...]:
-        """Available paths without duplicates, which result if all closures were accepted."""
+        """Available paths that differ: without rejected closures, for example, two are equal."""
         duplicates: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
             duplicates.add("pose_graph_all")

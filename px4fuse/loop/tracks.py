@@ -181,7 +181,7 @@ def _complete_variances(samples: pd.DataFrame, columns: list[str]) -> Array | No
 
 @dataclass(frozen=True)
 class LoopSource:
-    """Trajectory, with the flight from whose log the trajectory is read; None for a file."""
+    """Trajectory, and the flight if the trajectory was read from a flight log."""
 
     trajectory: Trajectory
     flight: Flight | None

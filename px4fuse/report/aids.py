@@ -28,7 +28,7 @@ OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
 def draw_pages(analysis: Analysis | AidsOnlyAnalysis, _: object) -> Iterator[Page]:
-    """Draw EKF2's aiding sources; in a comparison only if EKF2 fused GNSS or optical flow."""
+    """Draw the page on aiding sources; in a comparison of KF and EKF2 only for outdoor flights."""
     is_comparison = isinstance(analysis, Analysis)
     if aids := outdoor_aids(analysis) if isinstance(analysis, Analysis) else analysis.aids:
         page = Page(appendix_title(TITLE) if is_comparison else TITLE, LEAD_TEXT)
@@ -38,7 +38,7 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, _: object) -> Iterator[Pag
 
 
 def outdoor_aids(analysis: Analysis) -> Mapping[str, AidResult]:
-    """Return EKF2's aiding sources if EKF2 fused GNSS or optical flow, else {}."""
+    """Return all aiding sources if EKF2 fused GNSS or optical flow (outdoor flight), else {}."""
     aids = {} if isinstance(analysis.aids, Unavailable) else analysis.aids
     fused_names = {name for name, aid in aids.items() if aid.verdict != "disabled"}
     return {} if fused_names.isdisjoint(OUTDOOR_AIDS) else aids

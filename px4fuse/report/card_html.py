@@ -58,7 +58,7 @@ def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> 
     is_open : bool
         True to show causes and notes without a click.
     has_apply : bool
-        True for a button beside each KF command, which applies it on the explore page.
+        True to show a button beside each KF command that applies the settings in the command.
     """
     return load_template("report/card.html").render(
         card=card,
@@ -120,7 +120,7 @@ def notebook_html(card: Card) -> str:
 
 
 def alternative_text(verdicts: Sequence[Verdict]) -> str:
-    """Describe the σ ratios and their verdicts for screen readers.
+    """Describe σ ratios and consistency of the filters for screen readers.
 
     >>> alternative_text([Verdict(filter="kf", against="truth", ratio=7.2, word="overconfident")])
     'KF, error over sigma: 7.2, overconfident.'

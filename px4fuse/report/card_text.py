@@ -119,7 +119,7 @@ def card_lines(card: Card) -> Iterator[Line]:
 
 
 def note_texts(card: Card, other_notes_place: str) -> list[str]:
-    """Format up to :data:`MAX_NOTES` notes of a card, and state where the others are listed."""
+    """Format at most :data:`MAX_NOTES` notes, and state where the other notes are listed."""
     texts = [
         f"note[{note.id}]: {note.text} {note.action}".rstrip() for note in card.notes[:MAX_NOTES]
     ]
@@ -129,7 +129,7 @@ def note_texts(card: Card, other_notes_place: str) -> list[str]:
 
 
 def closing_lines(card: Card) -> Iterator[Line]:
-    """Yield the last lines of a diagnosis card, which state where details are printed."""
+    """Yield the last lines of a diagnosis card: commands that print details."""
     actions = [action for cause in card.causes for _, action in marked_actions(cause)]
     text = "More: -v."
     if any(action.where == "console" for action in actions):
@@ -169,7 +169,7 @@ def to_ascii(text: str) -> str:
 
 
 def band_limits() -> str:
-    """Format the limits of the consistent ratios against source and ground truth.
+    """Format the σ ratios of a consistent filter, against position source and ground truth.
 
     >>> band_limits()
     '● 0.8 to 1.25, ◆ 0.67 to 1.5'
@@ -201,7 +201,8 @@ def axis_marks(
 ) -> dict[str, Any]:
     """Return the positions of a σ ratio, its consistent band and its 95 % interval on the axis.
 
-    Positions are fractions of the axis length. ``mark`` is "below" or "above" outside the axis.
+    Positions are fractions of the axis length. ``mark`` is "below" or "above" if the ratio is
+    outside the axis.
     """
     fraction = axis_fraction(ratio)
     return {
@@ -232,7 +233,7 @@ def _identity_lines(card: Card) -> Iterator[Line]:
 
 
 def headline_lines(card: Card) -> Iterator[Line]:
-    """Yield the line with severity, id and headline."""
+    """Yield the first line of a diagnosis card: severity, id and title of the worst fault."""
     label = "ok" if card.severity == "clean" else card.severity
     severity_and_id = f"{label}[{card.id}]" if card.id else label
     yield Line(f"{severity_and_id}: {card.headline}", SEVERITY_STYLES[card.severity])

@@ -41,7 +41,7 @@ def has_clock_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
 def clock_advice(
     comparison: PreparedComparison, clock: ClockOffset | Unavailable
 ) -> dict[str, str]:
-    """Return sentences on the time offset of the position source, by their label."""
+    """Return sentences on the time offset of the position source, by label such as "Action"."""
     if isinstance(clock, Unavailable):
         return {"Offset": f"The time offset cannot be estimated: {clock.reason}. {clock.remedy}"}
     if not clock.is_determinable:

@@ -160,7 +160,7 @@ def _add_panel(page: Page, title: str, axes_height: float) -> Axes:
 
 
 def _equal_heights(page: Page, plots: Sequence[TimePlot], total_height: float) -> list[float]:
-    """Return heights (points) of plots whose axes have equal height."""
+    """Return heights (points) of plots with equally high axes and titles of one or more lines."""
     title_heights = [_title_height(page, plot.title) for plot in plots]
     axes_height = (total_height - sum(title_heights)) / max(len(plots), 1)
     return [axes_height + title_height for title_height in title_heights]
@@ -301,7 +301,7 @@ def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
 
 
 def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
-    """Return the map with the main axis to the right; without a main axis, north is up."""
+    """Return the map with the main flight direction to the right; without it, north is up."""
     aisle_heading_deg = next(
         (line.heading_deg for line in analysis.input_axes if line.name == AISLE), None
     )

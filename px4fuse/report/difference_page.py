@@ -61,7 +61,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _explanations_by_axis(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
-    """Return the explanation along the aisle (main direction) if it exists, else along all axes."""
+    """Return explanations of KF - EKF2: of the main direction if available, else of all axes."""
     explanations = analysis.difference_steps
     return {AISLE: explanations[AISLE]} if AISLE in explanations else explanations
 

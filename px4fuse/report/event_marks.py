@@ -58,7 +58,7 @@ def _event_marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tup
 def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> None:
     """Draw gaps, resets, rejections and outliers on a time axis.
 
-    ``axis``: axis whose rejected measurements are drawn; None for the main axis, "" for none.
+    Rejections are those along ``axis``; None is the main axis, "" draws no rejections.
     """
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
     from matplotlib.lines import Line2D  # noqa: PLC0415
@@ -95,7 +95,7 @@ def add_panel(
     with_time_label: bool = True,
     **options: Any,
 ) -> Axes:
-    """Add a plot over time with the events of :func:`draw_marks`."""
+    """Add a plot over time that also shows gaps, resets, rejections and outliers."""
     axes = page.panel(title, height, **options)
     draw_marks(axes, analysis, axis=axis)
     label_time_axis(axes, with_time_label)
@@ -124,7 +124,7 @@ def legend_entries(analysis: Analysis) -> list[Artist]:
 
 
 def visible_times(times: Any, min_interval_s: float) -> Array:
-    """Return the first time (s) in each interval, so that markers do not overlap."""
+    """Keep one time (s) per interval, so that drawn markers do not overlap."""
     times_s = np.asarray(times, dtype=np.float64)
     visible_s: Array = times_s[np.unique(np.floor(times_s / min_interval_s), return_index=True)[1]]
     return visible_s

@@ -18,7 +18,7 @@ def list_page() -> Page:
 
 
 def finding_page(finding_id: str) -> Page:
-    """Format meaning, example, causes, effects and error rates of a finding.
+    """Format meaning, example, causes, effects and error rates of a finding (detectable fault).
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Page on a loop: closure error, corrected paths, and their errors against references."""
+"""Report page on a loop flight: closure error, corrected paths and errors against references."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -69,7 +69,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
-    """Draw the page of ``px4fuse loop``, with its findings."""
+    """Draw the report page of ``px4fuse loop``, with the detected faults (findings)."""
     page = Page(TITLE, LEAD_TEXT)
     if student := student_line(results.student, ", "):
         page.write_labelled("Student", student)
@@ -127,7 +127,7 @@ def _draw_reference(axes: Axes, loop: Loop) -> None:
 
 
 def loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:
-    """Make the terminal output on a loop: closure error, corrected paths and findings."""
+    """Make the terminal output on a loop: closure error, corrected paths and detected faults."""
     page = Page()
     write_loop(page, loop)
     write_scores(page, loop)

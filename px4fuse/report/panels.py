@@ -34,7 +34,7 @@ MAX_INNOVATION_AXIS_SIGMAS = 5.0
 
 
 class Quantity(NamedTuple):
-    """Position or velocity, with the names of its columns and of its statistics."""
+    """Position or velocity: unit, and names of its table columns and statistics."""
 
     unit: str
     column: str
@@ -52,7 +52,7 @@ VELOCITIES = Quantity(
 
 
 class Panel(NamedTuple):
-    """Plot over time along one axis; ``height`` of the axes in points."""
+    """Plot over time along one axis, with caption and statistics; ``height`` is in points."""
 
     title: str
     height: float

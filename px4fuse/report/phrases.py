@@ -118,7 +118,7 @@ def _format_rms(statistic: object, field: str) -> str:
 
 
 def verdict_notes(comparison: Comparison) -> list[str]:
-    """Return limits of the consistency tests: drifting position source, correlated innovations."""
+    """Return warnings about consistency tests: drifting position source, correlated innovations."""
     consistencies = [
         (result.axis.label, filter_name, consistency)
         for result in comparison.axes.values()
@@ -179,7 +179,7 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
 def tuning_advice(
     comparison: PreparedComparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
-    """Return recommendations after noise estimation, by their label."""
+    """Return recommendations after noise estimation, by label such as "SIGMA_Z"."""
     names = (HORIZONTAL, "aisle", *tuning_by_axis)
     axis_name = next(
         (name for name in names if isinstance(tuning_by_axis.get(name), AxisTuning)), ""

@@ -19,7 +19,7 @@ LABEL_WIDTH = 168.0  # width (points) of the labels
 
 
 def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
-    """Draw the findings, and the provenance of a flight."""
+    """Draw the page with all detected faults (findings), and the provenance page of a flight."""
     page = Page(ALL_FINDINGS)
     write_findings(page, results.findings)
     yield page
@@ -81,7 +81,7 @@ def _write_missing(page: Page, unavailable_parts: Iterable[Unavailable]) -> None
 
 
 def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
-    """Draw the provenance of ``px4fuse loop``."""
+    """Draw the provenance page of ``px4fuse loop``: choices, methods, versions and files."""
     page, odometry = Page("Provenance"), loop.odometry.trajectory
     file_facts = [
         (

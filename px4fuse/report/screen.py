@@ -43,9 +43,9 @@ _COMMAND_PATTERN = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(
 
 
 def show(console: Console, blocks: Iterable[Block], request: Request | None = None) -> None:
-    """Print texts, tables and cards of a page on the terminal.
+    """Print the blocks of a page (texts, tables, diagnosis card) on the terminal.
 
-    With ``request``, commands in texts are printed with the log and the options of the user.
+    With ``request``, commands in texts contain the log and the options of the user.
     """
     for block in blocks:
         match block["kind"]:

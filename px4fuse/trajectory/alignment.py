@@ -129,7 +129,7 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
 def _align_means(
     rotation: Rotation, estimate_m: Array, reference_m: Array, scale: float, degrees_of_freedom: int
 ) -> Transform:
-    """Return the transform with ``rotation`` and ``scale`` that aligns the means (eq. 41)."""
+    """Return the transform that also aligns the means of both trajectories (Umeyama eq. 41)."""
     translation_m = reference_m.mean(axis=0) - scale * rotation.apply(estimate_m.mean(axis=0))
     quaternion = tuple(rotation.as_quat(scalar_first=True).tolist())
     return Transform(quaternion, tuple(translation_m.tolist()), scale, degrees_of_freedom)

@@ -144,11 +144,11 @@ def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
     """Choose distances and times for the RPE that fit path length and duration of the flight."""
 
     def choose(
-        distance_or_time_s: Array, values: Sequence[float], min_fraction: float
+        distance_or_time: Array, values: Sequence[float], min_fraction: float
     ) -> list[float]:
-        total = float(np.ptp(distance_or_time_s))
+        total = float(np.ptp(distance_or_time))
         # The minimum distance or time of a pair is two median intervals between poses
-        minimum = max(min_fraction * total, 2.0 * median_interval(distance_or_time_s))
+        minimum = max(min_fraction * total, 2.0 * median_interval(distance_or_time))
         return [value for value in values if minimum <= value <= MAX_DELTA_FRACTION * total]
 
     distances_m = choose(distance_m, DEFAULT_DISTANCES_M, MIN_DELTA_FRACTION)

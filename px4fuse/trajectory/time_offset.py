@@ -83,7 +83,7 @@ class TimeOffset(Record, kw_only=True):
 
 
 def clock_difference(estimate: Trajectory, reference: Trajectory) -> float | None:
-    """Return the time offset (s) of the estimate from the UNIX times of both, if available."""
+    """Return the time offset (s) between two trajectories from their UNIX times, if available."""
     if estimate.unix_offset_s is None or reference.unix_offset_s is None:
         return None
     return estimate.unix_offset_s - reference.unix_offset_s
@@ -269,7 +269,7 @@ class _OffsetFit:
 
     @property
     def misfit(self) -> float:
-        """RMS of the residuals over RMS extent of the motion, to compare fits."""
+        """Ratio of RMS residual to RMS extent of the motion; the best fit has the smallest."""
         # Extent of the dense trajectory, because a bad fit shrinks the sparse one to a point
         extent_m = float(np.sqrt(self.target_m.var(axis=0).sum()))
         return max(self.rms_m / extent_m, MIN_MISFIT) if extent_m > 0.0 else float("inf")

@@ -72,7 +72,7 @@ def _solve_positions(
     edge_value: Array,
     first_pose: Array,
 ) -> Array:
-    """Solve :func:`normal_equations`; the result has the shape (n, d, k)."""
+    """Solve :func:`normal_equations` and prepend the first pose, shape (n, d, k)."""
     solution = solve_normal_equations(
         *normal_equations(
             graph, first_coefficient, second_coefficient, information, edge_value, first_pose

@@ -170,7 +170,7 @@ def _commutator(tangent: Array) -> Array:
 
 
 def chain(steps: Array) -> Array:
-    """Return the products of the first 0, 1, ..., n relative motions, in log2(n) operations.
+    """Compose n relative motions to n + 1 poses, of which the first is the identity.
 
     Parameters
     ----------

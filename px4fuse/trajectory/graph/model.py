@@ -237,7 +237,7 @@ def odometry_chain(graph: PoseGraph, excluded_edges: IntArray | None = None) -> 
 
 
 def odometry_steps(graph: PoseGraph, edge_indices: IntArray) -> Array:
-    """Return the measured relative poses of edges between successive poses, in flight direction."""
+    """Return the measurements of edges between successive poses, from earlier to later pose."""
     steps = graph.measurements[edge_indices].copy()
     is_backward = graph.first[edge_indices] > graph.second[edge_indices]
     steps[is_backward] = lie.inverse(steps[is_backward])
