@@ -32,22 +32,22 @@ MIN_SIGMA_DOWN_M = 0.08
 DEGREES_OF_FREEDOM = 4.0
 # Size of each length unit in metres
 UNIT_SIZES_M: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
-# Rotations (rad) of the frame about the vertical up to this angle are a misalignment
+# Maximum rotation (rad) of the frame about the vertical that is a misalignment
 SMALL_ROTATION_RAD = np.radians(8.0)
 # Maximum time offset (s) that does not lower the prior odds of a hypothesis
 SMALL_OFFSET_S = 0.3
 # Log prior odds of a frame that is rotated by more than SMALL_ROTATION_RAD
-ROTATION_ODDS = -1.0
+ROTATION_LOG_ODDS = -1.0
 # Log prior odds of a frame that is rotated by less than SMALL_ROTATION_RAD, but not by zero
-SMALL_ROTATION_ODDS = -0.5
+SMALL_ROTATION_LOG_ODDS = -0.5
 # Log prior odds of a time offset above SMALL_OFFSET_S
-OFFSET_ODDS = -2.0
+OFFSET_LOG_ODDS = -2.0
 # Log prior odds of a unit other than metres
-UNIT_ODDS = -2.0
+UNIT_LOG_ODDS = -2.0
 # Standard deviation (m) of barometer heights in the likelihood
 BAROMETER_SIGMA_M = 0.5
 # Assumed number of independent barometer heights
-BAROMETER_WEIGHT = 6.0
+INDEPENDENT_BAROMETER_COUNT = 6.0
 # Limit (m) of height errors in the likelihood, which limits the effect of outliers
 MAX_HEIGHT_ERROR_M = 20.0 * BAROMETER_SIGMA_M
 # Maximum number of hypotheses of the grid search that are refined
@@ -66,7 +66,7 @@ PARAMETER_PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2
 # Horizontal directions, clockwise from above
 CLOCKWISE_DIRECTIONS: tuple[Direction, ...] = ("north", "east", "south", "west")
 # Log prior odds of common directions of x, y, z
-AXES_ODDS: Final[dict[Axes, float]] = {
+AXES_LOG_ODDS: Final[dict[Axes, float]] = {
     ("north", "east", "down"): 1.0,  # convention of PX4
     ("east", "north", "up"): -0.5,
     ("north", "west", "up"): -1.0,
@@ -108,8 +108,8 @@ class AxisAssignment(NamedTuple):
 
     def log_odds(self, quarter_turns: int) -> float:
         axes = self.axes(quarter_turns)
-        other_axes_odds = -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
-        return AXES_ODDS.get(axes, -5.0 if self.is_mirrored else other_axes_odds)
+        other_axes_log_odds = -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
+        return AXES_LOG_ODDS.get(axes, -5.0 if self.is_mirrored else other_axes_log_odds)
 
 
 AXIS_ASSIGNMENTS = tuple(
@@ -204,7 +204,7 @@ def without_clock_drift(time_s: Array, clock_drift: float) -> Array:
     return mean_time_s + (time_s - mean_time_s) / (1.0 + clock_drift)
 
 
-def search(
+def search_hypotheses(
     positions: SentPositions, motions: Mapping[HeadingSource, ImuMotion]
 ) -> list[Hypothesis]:
     """Return the likely hypotheses on axes, unit and delay of the positions, best first.
@@ -305,7 +305,7 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
             total_score = (
                 scores_at_quarter[offset_index, assignment_index, unit_index]
                 + assignment.log_odds(quarter_turns)
-                + UNIT_ODDS * (unit_name != "m")
+                + UNIT_LOG_ODDS * (unit_name != "m")
             )
             parameters = np.array(
                 [offset_s[offset_index], rotation_rad[offset_index, assignment_index], *[0.0] * 5]
@@ -363,8 +363,8 @@ def _evaluate_hypothesis(
     ] + grid_fraction * imu_motion.table[grid_index + 1]
     sent_differences = source_motion.second_differences[rows[is_used]]
     vertical_axis, vertical_sign, axis_a, axis_b, handedness = hypothesis.assignment
-    unit_m = UNIT_SIZES_M[hypothesis.unit]
-    complex_rotation = unit_m * np.exp(1j * (rotation_rad + heading_drift_rad_s * elapsed_s))
+    unit_size_m = UNIT_SIZES_M[hypothesis.unit]
+    complex_rotation = unit_size_m * np.exp(1j * (rotation_rad + heading_drift_rad_s * elapsed_s))
     horizontal_m = complex_rotation * (
         sent_differences[:, axis_a] + 1j * handedness * sent_differences[:, axis_b]
     )
@@ -372,7 +372,7 @@ def _evaluate_hypothesis(
         [
             horizontal_m.real,
             horizontal_m.imag,
-            unit_m * vertical_sign * sent_differences[:, vertical_axis],
+            unit_size_m * vertical_sign * sent_differences[:, vertical_axis],
         ]
     )
     imu_ned_m = imu_differences[..., 0] - imu_differences[..., 1:] @ accelerometer_bias
@@ -382,7 +382,7 @@ def _evaluate_hypothesis(
     vertical_log_likelihood, sigma_down_m = student_score(residual_squares[1], 1, MIN_SIGMA_DOWN_M)
     is_axis_known = sent_differences.any(axis=0)  # False for the height if the source has none
     log_likelihood_gain += vertical_log_likelihood * is_axis_known[vertical_axis] + np.log(
-        unit_m
+        unit_size_m
     ) * np.count_nonzero(is_axis_known)
     log_likelihood_gain -= sum(
         student_score(column**2, 1, 1e-6)[0] for column in sent_differences.T[is_axis_known]
@@ -452,13 +452,13 @@ def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[fl
 def _log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float:
     """Return the log prior odds of a hypothesis, plus a log likelihood ratio from the barometer."""
     log_odds = hypothesis.assignment.log_odds(hypothesis.quarter_turns)
-    log_odds += UNIT_ODDS * (hypothesis.unit != "m")
-    log_odds += OFFSET_ODDS * (abs(hypothesis.offset_s) > SMALL_OFFSET_S)
+    log_odds += UNIT_LOG_ODDS * (hypothesis.unit != "m")
+    log_odds += OFFSET_LOG_ODDS * (abs(hypothesis.offset_s) > SMALL_OFFSET_S)
     if hypothesis.has_rotation:
         # Bayesian information criterion: one more estimated parameter costs ½ ln n
         log_odds -= 0.5 * float(np.log(max(hypothesis.independent_count, 2.0)))
         is_large = abs(hypothesis.remainder_rad) > SMALL_ROTATION_RAD
-        log_odds += ROTATION_ODDS if is_large else SMALL_ROTATION_ODDS
+        log_odds += ROTATION_LOG_ODDS if is_large else SMALL_ROTATION_LOG_ODDS
     if positions.barometer is not None:
         log_odds += _height_log_likelihood(hypothesis, positions, *positions.barometer)
     return log_odds
@@ -474,9 +474,9 @@ def _height_log_likelihood(
         * hypothesis.assignment.vertical_sign
         * positions.position_m[:, hypothesis.assignment.vertical_axis]
     )
-    # the height is positive upwards, so its sum with the vertical position is constant
+    # height is positive upwards, so down + height is constant for a correct hypothesis
     error_m = down_m - np.median(down_m) + height_m - np.median(height_m)
     error_m2 = float(np.mean(np.minimum(error_m**2, MAX_HEIGHT_ERROR_M**2)))
     min_m2 = BAROMETER_SIGMA_M**2
     variance_ratio = max(float(np.var(height_m)), min_m2) / max(error_m2, min_m2)
-    return 0.5 * BAROMETER_WEIGHT * float(np.log(variance_ratio))
+    return 0.5 * INDEPENDENT_BAROMETER_COUNT * float(np.log(variance_ratio))

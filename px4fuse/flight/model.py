@@ -125,7 +125,7 @@ def with_orientation(origin: Origin, *, is_changing: bool) -> Origin:
 REPEATED_TIMESTAMPS = "most timestamps of the sender are repeated"
 # Clock of timestamps in a ULog that an external sender set and PX4 converted or replaced
 SENDER_CLOCK = "sender timestamps"
-# Replaces all results of an assignment that would show its injected fault to the student
+# Replacement for results that would show a student the injected fault of an assignment
 DIAGNOSIS_WITHHELD = Unavailable(
     "diagnosis",
     "the flight is a student assignment, for which px4fuse shows no diagnosis",

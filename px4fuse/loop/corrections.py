@@ -38,7 +38,7 @@ MIN_VARIANCE_GROWTH = 2.0
 # Minimum variance of an odometry edge, as fraction of the default variance: avoids a division by 0
 MIN_VARIANCE_FRACTION = 1e-2
 # Fraction of the poses at each end of the path for the median of the reported variance
-END_FRACTION = 0.1
+END_POSES_FRACTION = 0.1
 # Loop closure, and the true final pose if the closure connects take-off and landing (else None)
 ClosureAndLanding = tuple[GivenClosure, TrueEnd | None]
 
@@ -107,7 +107,7 @@ def _variance_growth(variance: Array | None, node_indices: IntArray) -> Array | 
     """
     if variance is None:
         return None
-    end_sample_count = max(1, int(END_FRACTION * len(variance)))
+    end_sample_count = max(1, int(END_POSES_FRACTION * len(variance)))
     start_variance_sum = float(np.median(variance[:end_sample_count].sum(axis=1)))
     end_variance_sum = float(np.median(variance[-end_sample_count:].sum(axis=1)))
     if not end_variance_sum > MIN_VARIANCE_GROWTH * start_variance_sum:
@@ -369,7 +369,7 @@ def score_paths(
     """Compute ATE and RPE of odometry and corrected paths, all with the odometry's time offset."""
     offset_by_reference: dict[str, float] = {}
 
-    def score(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:
+    def evaluate_path(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:
         default_offset_s = 0.0 if reference.sha256 == path.sha256 else None
         offset_s = offset_by_reference.get(reference.name, default_offset_s)
         try:
@@ -394,7 +394,7 @@ def score_paths(
             trajectory=path,
             correction_max_m=float(displacement_m.max()),
             correction_rms_m=float(np.sqrt(np.mean(displacement_m**2))),
-            scores={reference.name: score(path, reference) for reference in references},
+            scores={reference.name: evaluate_path(path, reference) for reference in references},
             solution=solution,
             **solution_fields,
         )

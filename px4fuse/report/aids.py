@@ -22,7 +22,7 @@ LEAD_TEXT = (
     "Time-correlated errors, wrong delays and wrong headings hardly change the NIS."
 )
 AID_PANEL_HEIGHT = 21.0  # height (points) of the plot of one aiding source
-MAX_DRAWN_INNOVATION = 4.0  # maximum drawn ν/√S; larger values are triangles at the edge
+MAX_DRAWN_SIGMAS = 4.0  # maximum drawn ν/√S; larger values are triangles at the edge
 # Aiding sources of outdoor flights: a report has a page on all aiding sources if EKF2 fused one
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
@@ -76,9 +76,9 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
         for axis_cells in axis_rows:
             rows.append([*aid_cells, *axis_cells])
             aid_cells = [""] * 6
-    head = ["aiding source", "verdict", "enabled", "rejec-\nted", "longest\ngap (s)", "√R"]
-    head += ["axis", "n", "mean\nNIS", "95 %\nband", "mean\nν/√S"]
-    page.table(head, rows, right_aligned_columns=(2, 3, 4, 5, 7, 8, 10))
+    column_heads = ["aiding source", "verdict", "enabled", "rejec-\nted", "longest\ngap (s)", "√R"]
+    column_heads += ["axis", "n", "mean\nNIS", "95 %\nband", "mean\nν/√S"]
+    page.table(column_heads, rows, right_aligned_columns=(2, 3, 4, 5, 7, 8, 10))
     if disabled_labels := [aid.label for aid in aids.values() if aid.verdict == "disabled"]:
         page.write(
             f"Aiding sources that are logged but never fused: {', '.join(disabled_labels)}.",
@@ -101,7 +101,7 @@ def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) 
     page.write_small(
         "95 % of the normalised innovations ν/√S are expected within ±2 (lines). Hollow samples "
         "were not fused. Grey: fusion was disabled. Triangles: values beyond "
-        f"±{MAX_DRAWN_INNOVATION:g}."
+        f"±{MAX_DRAWN_SIGMAS:g}."
     )
     for name in fused_names:
         axes = page.panel(aids[name].label, AID_PANEL_HEIGHT, above=1.0)
@@ -119,7 +119,7 @@ def _draw_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:
             (~is_fused, style.REJECTED_DOTS),
         ):
             dots = dot_style | {"ms": 1.4}
-            draw_dots(axes, innovations[is_drawn], MAX_DRAWN_INNOVATION, dots)
+            draw_dots(axes, innovations[is_drawn], MAX_DRAWN_SIGMAS, dots)
     for limit in (-2.0, 2.0):
         axes.axhline(limit, color="black", lw=0.4, ls=(0, (1, 1.5)))
     if aid_log.enabled is not None:
@@ -128,14 +128,14 @@ def _draw_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:
         if is_disabled.any():
             axes.fill_between(
                 times_s,
-                -MAX_DRAWN_INNOVATION,
-                MAX_DRAWN_INNOVATION,
+                -MAX_DRAWN_SIGMAS,
+                MAX_DRAWN_SIGMAS,
                 where=is_disabled.tolist(),
                 zorder=0.1,
                 **GROUND_BAND,
             )
     axes.set(
         xlim=span_s,
-        ylim=(-1.1 * MAX_DRAWN_INNOVATION, 1.1 * MAX_DRAWN_INNOVATION),
+        ylim=(-1.1 * MAX_DRAWN_SIGMAS, 1.1 * MAX_DRAWN_SIGMAS),
         yticks=(-2.0, 2.0),
     )

@@ -19,13 +19,13 @@ from px4fuse.report.card_text import (
     LABELLED_TICKS,
     QUANTITIES,
     SEVERITY_SIGNS,
-    axis_marks,
-    band_limits,
+    format_consistent_ratios,
     format_spans,
     format_target,
     marked_actions,
     rerun_columns,
     rerun_note,
+    sigma_ratio_marks,
     with_typed_path,
 )
 
@@ -39,7 +39,7 @@ MARK_PATHS = {
 SCREEN_READER_QUANTITIES = {"source": "innovation over root S", "truth": "error over sigma"}
 
 
-def card_of(analysis: Analysis) -> Card:
+def make_diagnosis_card(analysis: Analysis) -> Card:
     """Return the summary of faults, causes and actions of an analysis."""
     if analysis.request is None:
         raise SettingsError(
@@ -64,7 +64,7 @@ def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> 
         card=card,
         open=is_open,
         apply=has_apply,
-        figure=axis_html(card.verdicts, card.effect.axis)
+        figure=sigma_ratio_html(card.verdicts, card.effect.axis)
         if card.verdicts and card.effect is not None
         else "",
         marked_actions=marked_actions,
@@ -76,7 +76,7 @@ def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> 
     )
 
 
-def axis_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
+def sigma_ratio_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
     """Draw ratios "RMS of actual error ÷ reported σ" on a logarithmic axis as an HTML figure.
 
     ``axis`` is the direction of the errors, as a text; ``name`` identifies the figure for scripts.
@@ -85,7 +85,7 @@ def axis_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
         verdicts=verdicts,
         axis=axis,
         name=name,
-        marks=axis_marks,
+        marks=sigma_ratio_marks,
         paths=MARK_PATHS,
         percent=_axis_percent,
         alternative=alternative_text(verdicts),
@@ -93,22 +93,22 @@ def axis_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
             (_axis_percent(axis_fraction(tick)), label, tick not in LABELLED_TICKS)
             for tick, label in RATIO_AXIS_TICKS.items()
         ],
-        limits=band_limits(),
+        limits=format_consistent_ratios(),
         names=FILTER_NAMES,
         quantities=QUANTITIES,
         format_ratio=format_ratio,
     )
 
 
-def axis_figures(analysis: Analysis) -> str:
+def sigma_ratio_figures(analysis: Analysis) -> str:
     """Return HTML figures of the σ ratios of KF and EKF2, one figure for each axis."""
     return "".join(
-        axis_html(make_sigma_verdicts(result), describe_axis(analysis, result), name)
+        sigma_ratio_html(make_sigma_verdicts(result), describe_axis(analysis, result), name)
         for name, result in analysis.axes.items()
     )
 
 
-def card_style() -> str:
+def card_css() -> str:
     """Return the CSS of the diagnosis card; the colours are in another style sheet."""
     return read_asset("card.css", "px4fuse.report")
 
@@ -116,7 +116,7 @@ def card_style() -> str:
 def notebook_html(card: Card) -> str:
     """Return the diagnosis card as HTML with its CSS, for a notebook."""
     colours = read_asset("colours.css").replace(":root", ".px4fuse-card")
-    return f"<style>{colours}{card_style()}</style>{card_html(card, is_open=True)}"
+    return f"<style>{colours}{card_css()}</style>{card_html(card, is_open=True)}"
 
 
 def alternative_text(verdicts: Sequence[Verdict]) -> str:
@@ -129,8 +129,8 @@ def alternative_text(verdicts: Sequence[Verdict]) -> str:
     for verdict in verdicts:
         verdict_text = f"not evaluated, {verdict.reason}"
         if verdict.ratio is not None:
-            suffix = ", explained" if verdict.is_explained else ""
-            verdict_text = f"{format_ratio(verdict.ratio)}, {verdict.word}{suffix}"
+            explained_suffix = ", explained" if verdict.is_explained else ""
+            verdict_text = f"{format_ratio(verdict.ratio)}, {verdict.word}{explained_suffix}"
         quantity = f"{FILTER_NAMES[verdict.filter]}, {SCREEN_READER_QUANTITIES[verdict.against]}"
         sentences.append(f"{quantity}: {verdict_text}.")
     return " ".join(sentences)

@@ -20,10 +20,10 @@ MAX_LISTED_CHARACTERS = 12
 @cache
 def font_of(character: str) -> str | None:
     """Return the name of an installed font with a character, preferably DejaVu Sans, or None."""
-    if ord(character) in _characters(font_manager.findfont(FONT)):
+    if ord(character) in _font_characters(font_manager.findfont(FONT)):
         return FONT
     return next(
-        (name for name, path in _other_fonts() if ord(character) in _characters(path)), None
+        (name for name, path in _other_fonts() if ord(character) in _font_characters(path)), None
     )
 
 
@@ -101,5 +101,5 @@ def _font_sort_key(entry: FontEntry) -> tuple[object, ...]:
 
 
 @cache
-def _characters(path: FontPath) -> frozenset[int]:
+def _font_characters(path: FontPath) -> frozenset[int]:
     return frozenset(font_manager.get_font(path).get_charmap())

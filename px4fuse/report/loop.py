@@ -109,8 +109,14 @@ def draw_map(axes: Axes, loop: Loop) -> None:
     axes.plot(*end, "s", **end_mark, label="end of odometry", zorder=5)
     if loop.closure_error_axes_m is not None:
         true_end = end - np.array(list(loop.closure_error_axes_m.values()))[[1, 0]]
-        arrow = {"arrowstyle": "->", "color": ERROR_COLOUR, "lw": 1.2, "shrinkA": 3, "shrinkB": 0}
-        axes.annotate("", xy=true_end, xytext=end, zorder=6, arrowprops=arrow)
+        arrow_style = {
+            "arrowstyle": "->",
+            "color": ERROR_COLOUR,
+            "lw": 1.2,
+            "shrinkA": 3,
+            "shrinkB": 0,
+        }
+        axes.annotate("", xy=true_end, xytext=end, zorder=6, arrowprops=arrow_style)
         label = f"closure error {loop.closure_error_m:.2f} m"
         axes.plot([], [], color=ERROR_COLOUR, lw=1.2, label=label)
         axes.plot(*true_end, "x", color=ERROR_COLOUR, ms=5, mew=1.2, zorder=6, label="true end")
@@ -252,10 +258,12 @@ def describe_closure_error(loop: Loop) -> str:
 
 
 def describe_gate(closure: Closure) -> str:
-    verdict = "accepted" if closure.accepted else "REJECTED, not consistent with the stated drift"
+    gate_decision = (
+        "accepted" if closure.accepted else "REJECTED, not consistent with the stated drift"
+    )
     return (
         f"d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of freedom, "
-        f"p {closure.p:.2g} (rejected below {GATE_ALPHA:g}): {verdict}"
+        f"p {closure.p:.2g} (rejected below {GATE_ALPHA:g}): {gate_decision}"
     )
 
 

@@ -29,7 +29,7 @@ from px4fuse.report.style import (
 NARROW_HEIGHT = 72.0  # height (points) of the axes in narrow columns
 # Ratio of the axis limit to the largest innovation in a plot of innovations
 INNOVATION_AXIS_MARGIN_FACTOR = 1.3
-# Maximum axis limit (multiple of the median √S) in a plot of innovations, without this margin
+# Maximum innovation (multiple of the median √S) for which the innovation plot is enlarged
 MAX_INNOVATION_AXIS_SIGMAS = 5.0
 
 

@@ -142,10 +142,10 @@ def simulate_ekf2(
         # the barometer is EKF2's only height source outdoors
         down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
         no_dead_zone, sample_weight = np.zeros(len(down_m)), np.ones(len(down_m))
-        samples = barometer_samples_inside(
+        barometer_samples = barometer_samples_inside(
             segment, barometer_s, down_m, no_dead_zone, sample_weight
         )
-        heights = HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples)
+        heights = HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *barometer_samples)
         segment = replace(segment, heights=heights)
         if not logged_values[MAG.switch]:
             segment = add_field_states(
@@ -214,7 +214,7 @@ def _make_segment(
         mistakes,
         motion,
         np.zeros(1),
-        sensors.Stream.REST,
+        sensors.RandomStream.REST,
         REST_BEFORE_LOG_S * scenario.imu_rate_hz,
     )
     state, covariance = _initial_state_at_rest(

@@ -11,7 +11,7 @@ from px4fuse.core.record import Count, NotNegative, Record
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
-Method = Literal["interpolate", "nearest"]
+AssociationMethod = Literal["interpolate", "nearest"]
 
 # Default maximum gap in the reference over which poses are interpolated, in median intervals
 MAX_GAP_INTERVALS = 3.0
@@ -40,7 +40,7 @@ class Association(Record):
         Fraction of the reference's time span that the used poses cover without long gaps.
     """
 
-    method: Method
+    method: AssociationMethod
     poses: Count
     max_gap_s: NotNegative
     outside: Count
@@ -53,7 +53,7 @@ def associate(
     estimate: Trajectory,
     reference: Trajectory,
     *,
-    method: Method = "interpolate",
+    method: AssociationMethod = "interpolate",
     max_gap_s: float | None = None,
     time_offset_s: float = 0.0,
 ) -> tuple[Trajectory, Trajectory, Association]:

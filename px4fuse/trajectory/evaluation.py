@@ -21,7 +21,7 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory import scores
 from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit_alignment, umeyama
-from px4fuse.trajectory.association import Association, Method, associate
+from px4fuse.trajectory.association import Association, AssociationMethod, associate
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, cumulative_distance
 from px4fuse.trajectory.scores import Delta, Interval, RelativeError, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset, clock_difference, estimate_time_offset
@@ -33,13 +33,12 @@ MAX_CONSTANT_ROTATION_RAD = 1e-6
 # not measured
 MIN_CONSTANT_POSES, MIN_CONSTANT_MOTION_M = 10, 1.0
 # Minimum duration (s) of a repeated position for a warning, and minimum motion (m) of the reference
-# in this time
-MIN_FROZEN_S, MIN_FROZEN_MOTION_M = 2.0, 0.5
-# Minimum difference (m) of the step lengths of estimate and reference at a jump, and minimum ratio
-# of this difference to its median
+# during the repetition
+MIN_FROZEN_DURATION_S, MIN_FROZEN_MOTION_M = 2.0, 0.5
+# Minimum difference (m) between the steps of estimate and reference at a jump, and minimum ratio to
+# the median difference
 MIN_JUMP_M, MIN_JUMP_RATIO = 0.5, 20.0
-# Maximum distance (m) of the position after a jump from the first position or from the origin, for
-# attributing the jump to a restart of the map
+# Maximum distance (m) from the first position or the origin after a jump that is a map restart
 MAX_RESTART_DISTANCE_M = 0.5
 # Maximum number of jump times in the warning about jumps
 MAX_STATED_JUMPS = 5
@@ -77,7 +76,7 @@ def find_frozen_poses(
         [*np.flatnonzero(is_new_position).tolist(), len(estimate)]
     ):
         start_s, end_s = estimate.time_s[[start_index, end_index - 1]].tolist()
-        if end_s - start_s < MIN_FROZEN_S:
+        if end_s - start_s < MIN_FROZEN_DURATION_S:
             continue
         reference_position_m = reference.between(
             start_s + time_offset_s, end_s + time_offset_s
@@ -149,7 +148,7 @@ MIN_COVERAGE = 0.5
 MIN_DOUBTFUL_OFFSET_S = 0.1
 # Maximum ratio of the pose interval of the reference to that of the estimate; above it, the user
 # probably interchanged reference and estimate
-MAX_INTERVAL_RATIO = 5.0
+MAX_POSE_INTERVAL_RATIO = 5.0
 
 # Frames with the z axis down
 _Z_DOWN_FRAMES = ("NED", "FRD")
@@ -221,7 +220,7 @@ def evaluate(
     reference: Trajectory,
     *,
     alignment: AlignmentKind | None = None,
-    association: Method = "interpolate",
+    association: AssociationMethod = "interpolate",
     max_gap_s: float | None = None,
     time_offset_s: float | Literal["auto"] | None = None,
     rpe_deltas: Sequence[Delta] | None = None,
@@ -266,7 +265,7 @@ def evaluate(
     alignment_reason, is_requested = "The user chose the alignment.", alignment is not None
     if alignment is None:
         alignment, alignment_reason = choose_alignment(matched_estimate, matched_reference)
-    transform, line_warnings = _fit_or_approximate(
+    transform, line_motion_warnings = _fit_or_approximate(
         matched_estimate, matched_reference, alignment, is_requested=is_requested
     )
     jump_warnings = find_jumps(matched_estimate, matched_reference)
@@ -320,7 +319,7 @@ def evaluate(
         warnings=(
             *frozen_warnings,
             *jump_warnings,
-            *line_warnings,
+            *line_motion_warnings,
             *_swap_warnings(estimate, reference),
             *offset_warnings,
             *_comparison_warnings(
@@ -344,7 +343,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     has_same_frame = estimate.frame == reference.frame != "unknown"
     if estimate.kind == "truth" and (has_same_frame or reference.kind == "truth"):
         return "none", "The estimate is not aligned, because the estimate is ground truth."
-    frames = f"{estimate.frame} and {reference.frame}"
+    frames_text = f"{estimate.frame} and {reference.frame}"
     is_upright = any(
         {estimate.frame, reference.frame} <= set(vertical_frames)
         for vertical_frames in (_Z_DOWN_FRAMES, _Z_UP_FRAMES)
@@ -352,7 +351,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     if is_upright and estimate.kind not in _KINDS_WITHOUT_VERTICAL:
         return "yaw", (
             "Yaw and position are aligned (4 degrees of freedom): z is vertical in both frames "
-            f"({frames}), so a tilt is an error."
+            f"({frames_text}), so a tilt is an error."
         )
     scale, scale_reason = 1.0, ""
     try:
@@ -361,7 +360,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
         if is_upright:
             return "yaw", (
                 "Yaw and position are aligned (4 degrees of freedom): the motion is along a line, "
-                f"and z is vertical in both frames ({frames})."
+                f"and z is vertical in both frames ({frames_text})."
             )
     if abs(scale - 1.0) > MAX_SCALE_ERROR:
         scale_reason = (
@@ -372,10 +371,12 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
             scale_reason = f"{track.name} is monocular according to the file name"
     for track in (estimate, reference):
         if track.kind in _KINDS_WITHOUT_VERTICAL:
-            cause = "the trajectory kind is unknown"
+            frame_cause = "the trajectory kind is unknown"
             if track.kind == "slam":
-                cause = "SLAM uses the frame of the first key frame"
-            frame_reason = f"the vertical direction of {track.name} is unknown, because {cause}"
+                frame_cause = "SLAM uses the frame of the first key frame"
+            frame_reason = (
+                f"the vertical direction of {track.name} is unknown, because {frame_cause}"
+            )
             if scale_reason:
                 return "sim3", (
                     "Rotation, position and scale are aligned (7 degrees of freedom): "
@@ -383,7 +384,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
                 )
             break
     else:
-        frame_reason = f"the frames {frames} have no common vertical direction"
+        frame_reason = f"the frames {frames_text} have no common vertical direction"
     return "se3", f"Rotation and position are aligned (6 degrees of freedom): {frame_reason}."
 
 
@@ -439,7 +440,7 @@ def _swap_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]
     action = "Check the order of the arguments: first the estimate, then the reference."
     if estimate.kind == "truth" != reference.kind:
         yield f"{estimate.name} is ground truth, but {reference.name} is not. {action}"
-    if reference_interval_s > MAX_INTERVAL_RATIO * estimate_interval_s:
+    if reference_interval_s > MAX_POSE_INTERVAL_RATIO * estimate_interval_s:
         yield (
             f"The reference has a pose every {reference_interval_s:.3g} s, the estimate every "
             f"{estimate_interval_s:.3g} s. {action}"

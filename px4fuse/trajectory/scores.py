@@ -143,7 +143,7 @@ def rotation_statistics(a: Rotation, b: Rotation) -> Statistics:
 def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
     """Choose distances and times for the RPE that fit path length and duration of the flight."""
 
-    def choose(
+    def choose_values(
         distance_or_time: Array, values: Sequence[float], min_fraction: float
     ) -> list[float]:
         total = float(np.ptp(distance_or_time))
@@ -151,8 +151,8 @@ def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
         minimum = max(min_fraction * total, 2.0 * median_interval(distance_or_time))
         return [value for value in values if minimum <= value <= MAX_DELTA_FRACTION * total]
 
-    distances_m = choose(distance_m, DEFAULT_DISTANCES_M, MIN_DELTA_FRACTION)
-    times_s = choose(time_s, DEFAULT_TIMES_S, 0.0)
+    distances_m = choose_values(distance_m, DEFAULT_DISTANCES_M, MIN_DELTA_FRACTION)
+    times_s = choose_values(time_s, DEFAULT_TIMES_S, 0.0)
     return (
         *(Delta(value, "m") for value in distances_m[-MAX_DISTANCE_DELTAS:]),
         *(Delta(value, "s") for value in times_s[-MAX_TIME_DELTAS:]),

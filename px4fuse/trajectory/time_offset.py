@@ -177,13 +177,15 @@ def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]
     """Compute smoothed velocities (m/s) on a regular time grid."""
     time_s = trajectory.time_s
     grid_s = time_s[0] + step_s * np.arange(int(np.ptp(time_s) / step_s) + 1)
-    return grid_s, _smooth(positions_at(trajectory, grid_s), time_s, step_s, order=1) / step_s
+    return grid_s, _smooth(
+        positions_at(trajectory, grid_s), time_s, step_s, derivative_order=1
+    ) / step_s
 
 
-def _smooth(grid_values: Array, time_s: Array, step_s: float, order: int = 0) -> Array:
-    """Smooth values on a time grid; with order 1, return their derivative per grid step."""
+def _smooth(grid_values: Array, time_s: Array, step_s: float, derivative_order: int = 0) -> Array:
+    """Smooth values on a time grid, or return their smoothed derivative per grid step (order 1)."""
     sigma_samples = max(SMOOTHING_S, median_interval(time_s)) / step_s
-    return np.asarray(gaussian_filter1d(grid_values, sigma_samples, axis=0, order=order))
+    return np.asarray(gaussian_filter1d(grid_values, sigma_samples, axis=0, order=derivative_order))
 
 
 def _velocity(trajectory: Trajectory, time_s: Array) -> Array:
@@ -224,13 +226,13 @@ def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[
     min_count = MIN_OVERLAP_FRACTION * shorter_span_s / step_s
     correlations = []
     # angular speeds are only compared if both trajectories have orientations
-    for a, b in zip(sparse_speeds, dense_speeds, strict=False):
-        speed_moments = moments(a, b, is_known_sparse, is_known_dense)
+    for sparse_values, dense_values in zip(sparse_speeds, dense_speeds, strict=False):
+        speed_moments = moments(sparse_values, dense_values, is_known_sparse, is_known_dense)
         # Exclude lags at which a trajectory is at rest: its variance is a rounding error
         is_usable = speed_moments.count >= min_count
         for values, is_known, power in (
-            (a, is_known_sparse, speed_moments.power_a),
-            (b, is_known_dense, speed_moments.power_b),
+            (sparse_values, is_known_sparse, speed_moments.power_a),
+            (dense_values, is_known_dense, speed_moments.power_b),
         ):
             total_power = float(np.var(values[is_known])) * np.count_nonzero(is_known)
             is_usable &= power > 1e-3 * total_power / len(values) * speed_moments.count
@@ -369,5 +371,8 @@ def _refine_offset(
     # tolerance of the optimiser would be seconds
     shifts_s = window_s * np.linspace(-1.0, 1.0, 21)
     best_index = int(np.argmin([cost(shift) for shift in shifts_s]))
-    bracket = (shifts_s[max(best_index - 1, 0)], shifts_s[min(best_index + 1, len(shifts_s) - 1)])
-    return fit_at(float(minimize_scalar(cost, bounds=bracket, method="bounded").x))
+    search_bracket = (
+        shifts_s[max(best_index - 1, 0)],
+        shifts_s[min(best_index + 1, len(shifts_s) - 1)],
+    )
+    return fit_at(float(minimize_scalar(cost, bounds=search_bracket, method="bounded").x))

@@ -111,7 +111,7 @@ class FormTruth(Record):
 
 def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
     """Compute the right answers from a simulation and its analysis with default settings."""
-    answer = flights.answer(simulation)
+    answer = flights.make_answer_key(simulation)
     comparison = compare_simulation(simulation)
     mistakes = tuple(
         _injected_fault(name, values, answer["truth"], comparison)
