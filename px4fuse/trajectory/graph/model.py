@@ -199,9 +199,9 @@ def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
 
 
 def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> None:
-    """Raise TrajectoryError if edges in the mask ``is_used`` do not connect all poses.
+    """Raise TrajectoryError if the used edges with information do not connect all poses.
 
-    Edges without information connect nothing. ``edges_name`` names the edges in the message.
+    ``edges_name`` names the edges in the error message.
     """
     if not len(graph.first):
         raise TrajectoryError("The pose graph has no edges", "Give a file with EDGE lines.")
@@ -244,9 +244,9 @@ def odometry_chain(graph: PoseGraph, excluded_edges: IntArray | None = None) -> 
     return next_edge
 
 
-def odometry_steps(graph: PoseGraph, chain: IntArray) -> Array:
-    """Return the relative poses of a chain of edges between successive poses."""
-    steps = graph.measurements[chain].copy()
-    is_backward = graph.first[chain] > graph.second[chain]
+def odometry_steps(graph: PoseGraph, edge_indices: IntArray) -> Array:
+    """Return the measurements of edges between successive poses, from earlier to later pose."""
+    steps = graph.measurements[edge_indices].copy()
+    is_backward = graph.first[edge_indices] > graph.second[edge_indices]
     steps[is_backward] = lie.inverse(steps[is_backward])
     return steps
