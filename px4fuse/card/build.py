@@ -276,8 +276,15 @@ def _effect_text(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Ve
             span_text = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s"
         if effect.horizontal_rmse_m:
             horizontal_text = f" (horizontal: {_lengths_by_filter(effect.horizontal_rmse_m)})"
+        is_track_direction = (
+            analysis.main.axis.name == AISLE
+            and analysis.request is not None
+            and analysis.request.heading_deg is None
+        )
+        axis_text = " (direction of most motion)" if is_track_direction else ""
         sentences.append(
-            f"Position RMSE against ground truth along {analysis.main.axis.label}{span_text}: "
+            f"Position RMSE against ground truth along {analysis.main.axis.label}{axis_text}"
+            f"{span_text}: "
             f"{_lengths_by_filter(effect.position_rmse_m)}{horizontal_text}."
         )
         sentences += [
@@ -352,7 +359,7 @@ def _action_sentences(causes: Sequence[Cause]) -> tuple[str, ...]:
             for action in cause.actions
             if action.commands or not action.sentence.startswith("no ")
         ]
-        label = f"({number}) " if len(causes) > 1 else ""
+        label = f"Cause {number}. " if len(causes) > 1 else ""
         numbered_sentences += [f"{label}{sentence}." for sentence in sentences]
     return tuple(dict.fromkeys(numbered_sentences))[:MAX_ACTIONS]
 
