@@ -235,7 +235,7 @@ def _fit_source_errors(
         sigma_z_m=value_or_bound(axis_tuning.sigma_z, settings.sigma_z_m),
         outlier_time_s=axis_tuning.outlier_time_s,
         clock_offset_s=offset_s,
-        announced_s=reset_times_s(comparison.source).tolist(),
+        source_resets_s=reset_times_s(comparison.source).tolist(),
     )
     jumps = systematic_errors.jumps if isinstance(systematic_errors, SystematicErrors) else ()
     # the exact time of a jump is unknown: exclude measurements just after the jump
