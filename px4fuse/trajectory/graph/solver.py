@@ -12,12 +12,7 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.graph import lie, model
 from px4fuse.trajectory.graph.covariance import GateResult, gate_edges
-from px4fuse.trajectory.graph.model import (
-    PoseGraph,
-    Residuals,
-    normal_equations,
-    solve_normal_equations,
-)
+from px4fuse.trajectory.graph.model import PoseGraph, Residuals
 
 # Maximum number of closures for robust optimisation by default: with more closures the optimisation
 # takes minutes
@@ -153,8 +148,7 @@ def _minimise(
         # x_j
         jacobian = lie.right_jacobian_inverse(residuals.residual)
         first_jacobian = jacobian @ lie.adjoint(lie.inverse(residuals.relative))
-        matrix, gradient = normal_equations(
-            graph,
+        values, gradient = graph.normal_equations.assemble(
             -first_jacobian,
             jacobian,
             weights[:, None, None] * graph.information,
@@ -164,12 +158,11 @@ def _minimise(
             cost_decrease = 0.0
             predicted_decrease = 0.0
             is_converged = False
-            step = solve_normal_equations(matrix, gradient, damping)
+            step = graph.normal_equations.solve(values, damping)
             if step is not None:
                 predicted_decrease = 0.5 * float(np.sum(step * (damping * step + gradient)))
-                tangent = np.concatenate([np.zeros(graph.degrees_of_freedom), step[:, 0]])
                 trial_residuals = model.residuals(
-                    graph, lie.compose(residuals.poses, lie.exp(tangent.reshape(len(graph), -1)))
+                    graph, lie.compose(residuals.poses, lie.exp(step[..., 0]))
                 )
                 cost_decrease = cost - float(np.sum(0.5 * weights * trial_residuals.chi2))
                 is_converged = abs(cost_decrease) < tolerance * cost
