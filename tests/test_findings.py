@@ -466,7 +466,7 @@ def test_positions_lost_by_logger_are_not_reported_as_source_gap(sample_flight: 
     assert finding.spans_s == (pytest.approx((40.0, 60.0), abs=0.2),)
 
 
-def test_step_of_positions_is_no_variation_of_time_offset() -> None:
+def test_position_jump_is_not_reported_as_time_offset_change() -> None:
     step = with_errors(lambda t, _: np.outer(t > 60.0, [0.87, 0.5]))
     assert "source_time_offset_changes" not in ids(found(compare(step(aisle_flight()))))
 

@@ -16,7 +16,7 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import parse_g2o, read_g2o
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.covariance import gate_edges
-from px4fuse.trajectory.graph.initialisation import _chordal, initialise
+from px4fuse.trajectory.graph.initialisation import _initialise_chordal, initialise
 from px4fuse.trajectory.graph.model import (
     FROM_CHORDAL,
     FROM_ODOMETRY,
@@ -104,7 +104,7 @@ def test_chordal_initialisation_equals_dense_least_squares(dimension: int, seed:
     values = [r @ rotation[i] @ pose[:d] for r, (i, _, pose, *_) in zip(roots, edges, strict=True)]
     weights = [(-root, root) for root in roots]
     position = least_squares(weights, values, graph.poses[0, :d]).reshape(n - 1, d)
-    made = _chordal(graph)
+    made = _initialise_chordal(graph)
     assert made.initialised == FROM_CHORDAL
     np.testing.assert_array_equal(made.poses[0], graph.poses[0])
     np.testing.assert_allclose(lie.rotation_matrix(made.poses), rotation, atol=1e-7)

@@ -95,7 +95,7 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
         )
     if (offset_s := change.pop(trials.CLOCK_OFFSET, None)) is not None:
         actions.append(f"{format_shift(offset_s)} the position timestamps before sending.")
-    settings = {name: change.pop(name) for name in changes.SETTING_CHANGES & change.keys()}
+    settings = {name: change.pop(name) for name in changes.KF_NOISES & change.keys()}
     if change:
         change = different_settings(change, _flown_settings(analysis))
         actions.append(f"Set {format_settings(change)}.")

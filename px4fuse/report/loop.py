@@ -1,4 +1,4 @@
-"""Page on a loop: closure error, corrected paths, and their errors against references."""
+"""Report page on a loop flight: closure error, corrected paths and errors against references."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -69,7 +69,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
-    """Draw the page of ``px4fuse loop``, with its findings."""
+    """Draw the report page of ``px4fuse loop``, with the detected faults (findings)."""
     page = Page(TITLE, LEAD_TEXT)
     if student := student_line(results.student, ", "):
         page.write_labelled("Student", student)
@@ -109,8 +109,14 @@ def draw_map(axes: Axes, loop: Loop) -> None:
     axes.plot(*end, "s", **end_mark, label="end of odometry", zorder=5)
     if loop.closure_error_axes_m is not None:
         true_end = end - np.array(list(loop.closure_error_axes_m.values()))[[1, 0]]
-        arrow = {"arrowstyle": "->", "color": ERROR_COLOUR, "lw": 1.2, "shrinkA": 3, "shrinkB": 0}
-        axes.annotate("", xy=true_end, xytext=end, zorder=6, arrowprops=arrow)
+        arrow_style = {
+            "arrowstyle": "->",
+            "color": ERROR_COLOUR,
+            "lw": 1.2,
+            "shrinkA": 3,
+            "shrinkB": 0,
+        }
+        axes.annotate("", xy=true_end, xytext=end, zorder=6, arrowprops=arrow_style)
         label = f"closure error {loop.closure_error_m:.2f} m"
         axes.plot([], [], color=ERROR_COLOUR, lw=1.2, label=label)
         axes.plot(*true_end, "x", color=ERROR_COLOUR, ms=5, mew=1.2, zorder=6, label="true end")
@@ -127,7 +133,7 @@ def _draw_reference(axes: Axes, loop: Loop) -> None:
 
 
 def loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:
-    """Make the terminal output on a loop: closure error, corrected paths and findings."""
+    """Make the terminal output on a loop: closure error, corrected paths and detected faults."""
     page = Page()
     write_loop(page, loop)
     write_scores(page, loop)
@@ -252,10 +258,12 @@ def describe_closure_error(loop: Loop) -> str:
 
 
 def describe_gate(closure: Closure) -> str:
-    verdict = "accepted" if closure.accepted else "REJECTED, not consistent with the stated drift"
+    gate_decision = (
+        "accepted" if closure.accepted else "REJECTED, not consistent with the stated drift"
+    )
     return (
         f"d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of freedom, "
-        f"p {closure.p:.2g} (rejected below {GATE_ALPHA:g}): {verdict}"
+        f"p {closure.p:.2g} (rejected below {GATE_ALPHA:g}): {gate_decision}"
     )
 
 

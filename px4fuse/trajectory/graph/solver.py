@@ -12,12 +12,7 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.graph import lie, model
 from px4fuse.trajectory.graph.covariance import GateResult, gate_edges
-from px4fuse.trajectory.graph.model import (
-    PoseGraph,
-    Residuals,
-    normal_equations,
-    solve_normal_equations,
-)
+from px4fuse.trajectory.graph.model import PoseGraph, Residuals
 
 # Maximum number of closures for robust optimisation by default: with more closures the optimisation
 # takes minutes
@@ -51,7 +46,7 @@ _MAX_STAGE_ITERATIONS = 20
 
 # Probability that graduated non-convexity does not truncate the residual of a true closure
 GNC_PROBABILITY = 0.99
-# Cost of dropping a closure, as quantile of χ²: the probability that a true closure costs less
+# Probability that the χ² of a true closure is below the cost of dropping the closure
 DROP_PROBABILITY = 0.999
 # Factor on the control parameter of graduated non-convexity per stage (Yang 2020, section V)
 _GNC_CONTROL_FACTOR = 1.4
@@ -153,8 +148,7 @@ def _minimise(
         # x_j
         jacobian = lie.right_jacobian_inverse(residuals.residual)
         first_jacobian = jacobian @ lie.adjoint(lie.inverse(residuals.relative))
-        matrix, gradient = normal_equations(
-            graph,
+        values, gradient = graph.normal_equations.assemble(
             -first_jacobian,
             jacobian,
             weights[:, None, None] * graph.information,
@@ -164,12 +158,11 @@ def _minimise(
             cost_decrease = 0.0
             predicted_decrease = 0.0
             is_converged = False
-            step = solve_normal_equations(matrix, gradient, damping)
+            step = graph.normal_equations.solve(values, damping)
             if step is not None:
                 predicted_decrease = 0.5 * float(np.sum(step * (damping * step + gradient)))
-                tangent = np.concatenate([np.zeros(graph.degrees_of_freedom), step[:, 0]])
                 trial_residuals = model.residuals(
-                    graph, lie.compose(residuals.poses, lie.exp(tangent.reshape(len(graph), -1)))
+                    graph, lie.compose(residuals.poses, lie.exp(step[..., 0]))
                 )
                 cost_decrease = cost - float(np.sum(0.5 * weights * trial_residuals.chi2))
                 is_converged = abs(cost_decrease) < tolerance * cost
@@ -193,11 +186,11 @@ def _minimise(
 
 
 def _solve_gnc(
-    graph: PoseGraph, start: Residuals, plain_minimum: _Minimum, is_doubtful: BoolArray
+    graph: PoseGraph, start: Residuals, unweighted_minimum: _Minimum, is_doubtful: BoolArray
 ) -> tuple[_Minimum, Array]:
-    """Minimise truncated least squares from ``plain_minimum`` and from ``start``.
+    """Drop false closures by graduated non-convexity from two starts; use the lower minimum.
 
-    In the result with the lower cost, each dropped closure is restored if this lowers the cost.
+    A dropped closure is restored if this lowers the truncated least-squares cost.
     """
     degrees_of_freedom = model.observed_directions(graph.information)
     chi2_bound = np.full(len(is_doubtful), np.inf)
@@ -213,10 +206,10 @@ def _solve_gnc(
     def truncated_cost(residuals: Residuals, edge_weights: Array) -> float:
         return 0.5 * float(np.sum(np.where(edge_weights > 0.0, residuals.chi2, drop_cost)))
 
-    iteration_count = plain_minimum.iterations
+    iteration_count = unweighted_minimum.iterations
     solutions = []
-    for start_residuals in (plain_minimum.residuals, start):
-        minimum, weights = _descend_graduated(graph, start_residuals, chi2_bound)
+    for start_residuals in (unweighted_minimum.residuals, start):
+        minimum, weights = _run_gnc(graph, start_residuals, chi2_bound)
         iteration_count += minimum.iterations
         solutions.append((truncated_cost(minimum.residuals, weights), minimum, weights))
     lowest_cost, minimum, weights = min(solutions, key=lambda solution: solution[0])
@@ -236,9 +229,7 @@ def _solve_gnc(
     return _Minimum(minimum.residuals, iteration_count, minimum.converged), weights
 
 
-def _descend_graduated(
-    graph: PoseGraph, start: Residuals, chi2_bound: Array
-) -> tuple[_Minimum, Array]:
+def _run_gnc(graph: PoseGraph, start: Residuals, chi2_bound: Array) -> tuple[_Minimum, Array]:
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
     residuals = start
     iteration_count = 0
