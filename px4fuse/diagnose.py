@@ -257,7 +257,7 @@ def diagnose_or_check_aids(
             f"checked: {aids.reason}",
             no_position.remedy,
         )
-    return AidsOnlyAnalysis(flight, aids, no_position, find_aids(aids, flight.ekf2))
+    return AidsOnlyAnalysis(flight, aids, no_position, find_aids(aids, flight))
 
 
 def run_what_if(

@@ -28,13 +28,14 @@ from px4fuse.flight.model import (
     Unavailable,
     join_flights,
 )
-from px4fuse.readers.mavlink_messages import GNSS_LAYOUTS, POSITION_INPUTS
+from px4fuse.readers.mavlink_messages import POSITION_INPUTS
 from px4fuse.readers.px4_innovations import (
     GNSS,
     GNSS_AND_BAROMETER,
     has_fused_aid,
     with_gnss_innovations,
 )
+from px4fuse.readers.px4_positions import NO_FIX_ACTION
 from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME, SOURCE_TRACKS
 from px4fuse.request import ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
@@ -44,7 +45,6 @@ LOGGED_ORIGINS = ORIGIN_BY_TRACK_NAME | {
     source.track_name: source.origin for source in POSITION_INPUTS
 }
 POSITION_MESSAGES = dict.fromkeys(source.message for source in POSITION_INPUTS)
-GNSS_MESSAGES = {layout.topic for layout in GNSS_LAYOUTS}
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
     "KF uses the only ground truth in the log as its position source",
@@ -298,9 +298,10 @@ def explain_missing_source(flight: Flight) -> Unavailable:
     height_only = next((item for item in flight.missing if item.reason == HEIGHT_ONLY_REASON), None)
     if height_only is not None:
         reason = f"{damage_text}{height_only.source}: {HEIGHT_ONLY_REASON}"
-    gnss = next((item for item in flight.missing if item.source in GNSS_MESSAGES), None)
+    gnss = next((item for item in flight.missing if item.remedy == NO_FIX_ACTION), None)
     if gnss is not None:
         reason += f"; {gnss.source}: {gnss.reason}"
+        remedy = f"{gnss.remedy} Or {remedy}"
     if flight.log.autopilot != "PX4":
         reason += f"; the autopilot is {flight.log.autopilot}, so there is no EKF2"
     return Unavailable("position source", reason, capitalise_first(remedy))

@@ -233,7 +233,7 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
     source, parameter = analysis.source, EV_POS.switch
     names = constant_coordinates(source)
     is_one = len(names) == 1
-    if not names or (is_one and source.step_m > 0.0):
+    if not (is_one or is_height_only(source)) or (is_one and source.step_m > 0.0):
         return  # rounded positions may stay within one step
     values_m = dict(zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True))
     name, bit, make_finding = "source_coordinate_constant", HORIZONTAL_CONTROL, error
@@ -241,7 +241,7 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
     if names == ["z"]:
         name, bit, make_finding = "source_height_constant", HEIGHT_CONTROL, warning
         consequence = "The height is not evaluated."
-    elif not is_one:
+    elif names == ["x", "y"]:
         make_finding = warning
         consequence = "Only the height is a measurement. The horizontal position is not evaluated."
     action, listed_names = "", " and ".join(names)

@@ -70,23 +70,31 @@ def detect(analysis: Analysis) -> Findings:
         yield warning(
             "companion_not_synchronised",
             f"The source of the {positions} never synchronised its clock (TIMESYNC). EKF2 used "
-            "arrival times as times of measurement. "
-            f"{kf_times_sentence}{_describe_bursts(analysis)}",
+            f"arrival times as times of measurement. {kf_times_sentence}",
             ANSWER_TIMESYNC,
             {"jitter_s": clock.jitter_s},
         )
 
 
-def _describe_bursts(analysis: Analysis) -> str:
-    """Return a sentence on positions that arrive in bursts; empty if they arrive one by one."""
+def detect_bursts(analysis: Analysis) -> Findings:
+    """Detect timestamps in bursts: arrival times of positions that wait for each other."""
     intervals_s = np.diff(analysis.source.samples.index.to_numpy())
     is_pause = intervals_s > intervals_s.mean()
     if not is_pause.any() or (burst_size := 1.0 / float(is_pause.mean())) < MIN_BURST_SIZE:
-        return ""
+        return
     pause_s = float(np.median(intervals_s[is_pause]))
     if np.median(intervals_s[~is_pause]) > MAX_BURST_INTERVAL_RATIO * pause_s:
-        return ""
-    return f" The positions arrive in bursts of {burst_size:.0f}, every {pause_s:.2g} s."
+        return
+    yield error(
+        "source_timestamp_jitter",
+        f"The timestamps of the {positions_phrase(analysis.source)} come in bursts of "
+        f"{burst_size:.0f}, every {pause_s:.2g} s ({analysis.source.compute_rate_hz():.3g} Hz on average). "
+        "They are arrival times of positions that were "
+        f"measured earlier, by up to {pause_s:.2g} s. At 1 m/s this is a position error of up to "
+        f"{format_metres(pause_s)} m along the motion.",
+        "Send each position at once, with its time of measurement.",
+        {"burst_size": burst_size, "interval_s": pause_s},
+    )
 
 
 def detect_shared_timestamps(

@@ -140,7 +140,7 @@ def _read_gnss(
         return px4_positions.unavailable_source(
             layout.topic,
             f"the recording has {message_count} {layout.topic}, {fix_count} with a 3D fix",
-            "Give the antenna a free view of the sky and wait for a fix.",
+            px4_positions.NO_FIX_ACTION,
         )
     samples = project_to_ned(fixes, local_origin(recording))
     variance = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2

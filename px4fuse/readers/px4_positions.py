@@ -46,6 +46,7 @@ from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 FIX_TYPE_3D = 3
+NO_FIX_ACTION = "Give the antenna a free view of the sky and wait for a fix."
 # Maximum delay (µs) from timestamp to publication if PX4 set the timestamp at the arrival
 MAX_ARRIVAL_DELAY_US = 100
 # If at least this fraction of the timestamps are arrival times, the log has no measurement times
@@ -413,10 +414,15 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     if layout is None:
         return unavailable_source(px4.GPS_POSITION)
     fixes = topics.read_instance(layout)
+    message_count = len(fixes)
     if "fix_type" in fixes:
         fixes = fixes[fixes["fix_type"] >= FIX_TYPE_3D]
     if fixes.empty:
-        return unavailable_source(px4.GPS_POSITION, "the GNSS receiver never had a 3D fix")
+        return unavailable_source(
+            px4.GPS_POSITION,
+            f"the log has {message_count} {px4.GPS_POSITION}, none with a 3D fix",
+            NO_FIX_ACTION,
+        )
     parameters = topics.ekf2_parameters
     published_s = (fixes["published_us"].to_numpy() - topics.zero_us) * 1e-6
     has_driver_times = GNSS_MODE_PARAMETER in parameters and bool(
