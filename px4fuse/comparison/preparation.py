@@ -48,7 +48,7 @@ NO_SEPARATE_TRUTH = Unavailable(
     "KF uses the only ground truth in the log as its position source",
     "Choose another position source for KF with --position-source.",
 )
-# Default axes for GNSS. The down axis is omitted: GNSS height is much noisier than one SIGMA_Z
+# Default axes for GNSS, without down: one SIGMA_Z does not fit the much noisier GNSS height
 GNSS_AXES = (AISLE, "north", "east")
 
 

@@ -159,7 +159,7 @@ def _check_switch(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
 
 
 def is_height_only(source: PositionTrack) -> bool:
-    """Return True if x and y of a position source are constant: it measures only the height."""
+    """Return True if x and y of a source are constant: only its height is measured."""
     return bool(np.ptp(source.samples[Columns.POSITION[:2]], axis=0).max() < MAX_CONSTANT_RANGE_M)
 
 
