@@ -11,6 +11,7 @@ from px4fuse.comparison.projection import observation_variance
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import convention_faults, correct_convention
 from px4fuse.core.text import capitalise_first
+from px4fuse.ekf2.fusion_conditions import constant_coordinates
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import SETTING_RANGES, requested_settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
@@ -48,8 +49,9 @@ NO_SEPARATE_TRUTH = Unavailable(
     "KF uses the only ground truth in the log as its position source",
     "Choose another position source for KF with --position-source.",
 )
-# Default axes for GNSS, without down: one SIGMA_Z does not fit the much noisier GNSS height
-GNSS_AXES = (AISLE, "north", "east")
+# Default axes for GNSS, because one SIGMA_Z does not fit the much noisier GNSS height, and for
+# sources whose height is constant
+HORIZONTAL_AXES = (AISLE, "north", "east")
 
 
 def prepare(
@@ -94,7 +96,10 @@ def prepare(
     flight = select_innovations(flight, source_track)
     missing = flight.missing
     segment = choose_segment(flight, source_track, request.start_s, request.end_s)
-    axis_names = request.axes or (GNSS_AXES if source_track.origin.fused_as_gnss else None)
+    has_height = not source_track.origin.fused_as_gnss and "z" not in constant_coordinates(
+        source_track
+    )
+    axis_names = request.axes or (None if has_height else HORIZONTAL_AXES)
     compared_axes = make_axes(
         flight, source_track, segment, names=axis_names, heading_deg=request.heading_deg
     )

@@ -215,6 +215,17 @@ def _reported_noise_m(ekf2_inputs: Inputs) -> float:
     return float(np.sqrt(np.median(ekf2_inputs.received.variance_m2[:, :2])))
 
 
+def different_settings(
+    changes: Mapping[str, float], flown: Mapping[str, float]
+) -> dict[str, float]:
+    """Return the changes of parameters that had another value in flight."""
+    return {
+        name: value
+        for name, value in changes.items()
+        if not math.isclose(value, flown.get(name, math.nan), rel_tol=1e-3)
+    }
+
+
 def format_settings(changes: Mapping[str, float]) -> str:
     """Format EKF2 parameters with their new values, for example "EKF2_EV_DELAY to 264 ms"."""
     parameter_texts = (

@@ -158,9 +158,16 @@ def _check_switch(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
     yield UnmetCondition("switch", f"{parameter_name} is {parameter_value}", reason, action)
 
 
+def constant_coordinates(source: PositionTrack) -> list[str]:
+    """Return the coordinates (x, y, z) of a source that never change, so they are not measured."""
+    ranges_m = np.ptp(source.samples[Columns.POSITION].to_numpy(), axis=0)
+    is_constant = ranges_m < MAX_CONSTANT_RANGE_M
+    return [name for name, constant in zip("xyz", is_constant, strict=True) if constant]
+
+
 def is_height_only(source: PositionTrack) -> bool:
-    """Return True if x and y of a source are constant: only its height is measured."""
-    return bool(np.ptp(source.samples[Columns.POSITION[:2]], axis=0).max() < MAX_CONSTANT_RANGE_M)
+    """Return True if x and y of a position source are constant: it measures only the height."""
+    return {"x", "y"} <= {*constant_coordinates(source)}
 
 
 def _check_frame(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
