@@ -31,14 +31,15 @@ from px4fuse.flight.model import (
     positions_phrase,
 )
 
-# Fraction of the time with fusion of the source by EKF2, below which the severity is error
+# The severity is error if EKF2 fuses the positions for a smaller fraction of the time
 MIN_FUSED_FRACTION_ERROR = 0.5
-# Fraction of the time with fusion of the source by EKF2, below which the severity is warning
+# The severity is warning if EKF2 fuses the positions for a smaller fraction of the time
 MIN_FUSED_FRACTION_WARNING = 0.98
-# Minimum interval (s) between positions at which jitter exceeds EV_START_INTERVAL_S
+# Minimum interval (s) between positions at which jitter may exceed EV_START_INTERVAL_S
 MIN_LIMITING_INTERVAL_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
-# Minimum distance (m) of EKF2's invalid position from ground truth or source, for a finding
+# An invalid position of EKF2 is reported if its distance from ground truth or position source
+# exceeds this limit (m)
 MIN_INVALID_DISTANCE_M = 1.0
 
 
@@ -113,7 +114,7 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
 
 
 def _received_source(analysis: PreparedComparison) -> PositionTrack | None:
-    """Return the positions that PX4 received; a position file did not reach PX4."""
+    """Return the positions that PX4 received, which are not those of a position file."""
     if analysis.source.origin != POSITION_FILE:
         return analysis.source
     tracks = (track for track in analysis.flight.positions if track.origin != POSITION_FILE)
@@ -150,7 +151,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
 
 
 def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...]) -> float:
-    """Return EKF2's largest horizontal distance (m) to ground truth or source in time spans."""
+    """Return EKF2's largest horizontal distance (m) from ground truth or source in time spans."""
     truth, columns = analysis.flight.truth, ["north_m", "east_m"]
     reference = truth.samples if isinstance(truth, Truth) else analysis.source.samples
     invalid_state = pd.concat([ekf2.state[columns].loc[start:end] for start, end in spans])

@@ -1,4 +1,4 @@
-"""Data missing from the log: EKF2, acceleration, innovations, or positions that PX4 received."""
+"""Missing data: EKF2 state, acceleration, innovations, or positions that PX4 received."""
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
@@ -43,7 +43,7 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
 
 
 def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
-    """Detect a log without the positions as PX4 received them."""
+    """Detect a log that does not contain the positions which PX4 received."""
     source, received_preference = analysis.source, RECEIVED.find_preference_rank()
     has_received_positions = any(
         track.origin.find_preference_rank() == received_preference
