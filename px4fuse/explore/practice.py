@@ -26,7 +26,7 @@ from px4fuse.findings import Finding
 from px4fuse.report.card_html import card_html
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import Scenario
 
 # Pairs of quiz answers whose injected faults do not hide each other in one flight
@@ -70,7 +70,7 @@ class HiddenMistake(Record):
     choice : str
         Right answer, a key of :data:`FAULT_CHOICES`.
     mistake : str
-        Name in :data:`px4fuse.simulation.mistakes.MISTAKES`, or :data:`NOISY_UWB`.
+        Name in :data:`px4fuse.simulation.faults.FAULT_TYPES`, or :data:`NOISY_UWB`.
     sizes : tuple of str
         Size at each level of difficulty, as in ``px4fuse simulate --mistake``.
     view : str
@@ -188,7 +188,7 @@ def _flight_data(practice_flight: PracticeFlight, flight_index: int) -> tuple[di
         for mistake, size in mistakes_and_sizes
         if mistake.mistake != NOISY_UWB
     ]
-    simulation = flights.simulate(practice_flight.scenario, parse_mistakes(options))
+    simulation = flights.simulate(practice_flight.scenario, parse_faults(options))
     flight = flights.to_flight(simulation, f"flight {flight_index + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     # as_sent: an automatic correction of the frame would hide the injected fault

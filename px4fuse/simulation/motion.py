@@ -17,7 +17,7 @@ from scipy.interpolate import BPoly, PPoly
 
 from px4fuse.core.arrays import Array
 from px4fuse.errors import SettingsError
-from px4fuse.simulation.mistakes import Mistakes
+from px4fuse.simulation.faults import FaultSizes
 from px4fuse.simulation.scenario import CORNER_DURATION_S, START_STOP_S, Scenario
 
 # Time (s) on the ground before take-off and after landing
@@ -198,7 +198,7 @@ def attitude(state: State) -> Attitude:
     return Attitude(np.stack([x, y, z], axis=2), rate_rad_s, force_m_s2)
 
 
-def plan_flight(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Motion:
+def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator) -> Motion:
     """Plan a flight: ground, climb, hover, aisle or square, hover, descent, ground.
 
     Raises
@@ -215,9 +215,9 @@ def plan_flight(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator
         -climb_velocity_m_s, CLIMB_RAMP_S, CLIMB_RAMP_S / 2.0 + scenario.pause_s
     )
     if scenario.kind == "aisle":
-        _fly_aisle(flight_plan, scenario, 0.0 if mistakes.no_motion else scenario.speed_m_s)
+        _fly_aisle(flight_plan, scenario, 0.0 if faults.no_motion else scenario.speed_m_s)
     else:
-        _fly_loop(flight_plan, scenario, mistakes)
+        _fly_loop(flight_plan, scenario, faults)
     flight_plan.add_velocity_change(-climb_velocity_m_s, CLIMB_RAMP_S, climb_time_s)
     touch_down_s = flight_plan.ramp_centre_s + CLIMB_RAMP_S / 2.0
     if touch_down_s > MAX_FLIGHT_S:
@@ -283,12 +283,12 @@ def _fly_aisle(flight_plan: _FlightPlan, scenario: Scenario, speed_m_s: float) -
             flight_plan.add_turn(np.pi, stop_s, TURN_ROUND_S)
 
 
-def _fly_loop(flight_plan: _FlightPlan, scenario: Scenario, mistakes: Mistakes) -> None:
-    speed_m_s = 0.0 if mistakes.no_motion else scenario.speed_m_s
-    last_side_m = scenario.length_m - mistakes.open_end_m
+def _fly_loop(flight_plan: _FlightPlan, scenario: Scenario, faults: FaultSizes) -> None:
+    speed_m_s = 0.0 if faults.no_motion else scenario.speed_m_s
+    last_side_m = scenario.length_m - faults.open_end_m
     if last_side_m < scenario.speed_m_s * CORNER_DURATION_S:
         raise SettingsError(
-            f"--mistake open-end={mistakes.open_end_m:g}: the last side is {last_side_m:g} m long. "
+            f"--mistake open-end={faults.open_end_m:g}: the last side is {last_side_m:g} m long. "
             f"Use at most {scenario.length_m - scenario.speed_m_s * CORNER_DURATION_S:g} m."
         )
     side_count = 4 * scenario.passes

@@ -25,7 +25,7 @@ from px4fuse.core.writing import write_all
 from px4fuse.errors import OutputError
 from px4fuse.results.answer_form import form_name, form_text
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 
 # True values of the simulation in the answer key
 TRUE_VALUE_NAMES = (
@@ -45,7 +45,7 @@ def simulate_assigned_flight(
     """Simulate the flight of one student; return the log (ULog) and the right answers."""
     assigned_flight = assign_random_flight(secret, student.student_id, kind, count, truth)
     simulation = flights.simulate(
-        assigned_flight.scenario, parse_mistakes(assigned_flight.mistake_options)
+        assigned_flight.scenario, parse_faults(assigned_flight.mistake_options)
     )
     log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()
