@@ -186,7 +186,7 @@ class Loop(Record, kw_only=True):
 
     @property
     def reported_paths(self) -> tuple[CorrectedPath, ...]:
-        """Available paths that differ: without rejected closures, for example, two are equal."""
+        """Available paths; of two paths that are equal by definition, only one."""
         duplicates: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
             duplicates.add("pose_graph_all")

@@ -278,7 +278,7 @@ def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions
 
     EKF2 ignores a position that is older than the previous one (estimator_interface.cpp).
     """
-    fields = source.topic.fields
+    topic_fields = source.topic.fields
     timestamp_s, arrival_s = (
         sensors.seconds(sensors.time_us(source.topic, name))
         for name in ("timestamp_sample", "timestamp")
@@ -287,11 +287,13 @@ def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions
     is_newer = timestamp_s > latest_timestamp_s
     velocity_m_s = source.velocity_m_s
     if velocity_m_s is not None:
-        sigmas_m = np.stack([fields["eph"], fields["eph"], fields["epv"]], axis=1)
+        sigmas_m = np.stack([topic_fields["eph"], topic_fields["eph"], topic_fields["epv"]], axis=1)
         position_variance = sigmas_m[is_newer] ** 2
-        velocity_variance = np.repeat(fields["s_variance_m_s"][is_newer, None] ** 2, 3, axis=1)
+        velocity_variance = np.repeat(
+            topic_fields["s_variance_m_s"][is_newer, None] ** 2, 3, axis=1
+        )
     else:
-        position_variance, velocity_variance = fields["position_variance"][is_newer], None
+        position_variance, velocity_variance = topic_fields["position_variance"][is_newer], None
     return ReceivedPositions(
         timestamp_s=timestamp_s[is_newer],
         arrival_s=arrival_s[is_newer],

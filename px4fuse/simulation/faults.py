@@ -84,7 +84,7 @@ class FaultType:
 
     @property
     def size_fields(self) -> tuple[str, ...]:
-        """Fields that are sizes or times; empty for a fault without a size."""
+        """Names of the fields with sizes and times; empty for a fault without a size."""
         return () if self.default is True else self.fields
 
     @property

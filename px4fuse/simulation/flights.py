@@ -147,7 +147,7 @@ def make_answer_key(simulation: Simulation) -> dict[str, Any]:
     scenario, faults = simulation.scenario, simulation.faults
     motion, source = simulation.motion, simulation.positions
     accelerometer_bias_m_s2, gyro_bias_rad_s = sensors.biases(scenario, faults)
-    first_m, last_m = motion.at(np.array([0.0, motion.duration_s])).position_m
+    first_position_m, last_position_m = motion.at(np.array([0.0, motion.duration_s])).position_m
     timestamps_us = sensors.time_us(source.topic, "timestamp_sample")
     outlier_indices = np.flatnonzero(source.is_outlier)
     answer_key: dict[str, Any] = to_json_types(
@@ -175,7 +175,7 @@ def make_answer_key(simulation: Simulation) -> dict[str, Any]:
                 "outlier_index": outlier_indices.tolist(),
                 "outlier_time_s": (timestamps_us[outlier_indices] * 1e-6).tolist(),
                 "path_length_m": source.distance_m,
-                "closure_error_m": float(np.linalg.norm((last_m - first_m)[:2])),
+                "closure_error_m": float(np.linalg.norm((last_position_m - first_position_m)[:2])),
                 "source_drift_m": source.drift_m.tolist(),
             },
         }

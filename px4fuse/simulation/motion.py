@@ -81,17 +81,17 @@ class Sines:
         amplitude = rms * np.sqrt(2.0 / SINE_COUNT)
         return cls(angular_frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
-    def at(self, time_s: Array, orders: int = 1) -> list[Array]:
-        """Return the sum and its first ``orders`` - 1 time derivatives, each of shape (t, k)."""
+    def at(self, time_s: Array, order_count: int = 1) -> list[Array]:
+        """Return the sum and its time derivatives: ``order_count`` arrays of shape (t, k)."""
         angle = np.outer(time_s, self.angular_frequency_rad_s)
         basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
         amplitudes = [np.concatenate([self.sine, self.cosine])]
         omega = self.angular_frequency_rad_s[:, None]
-        for _ in range(orders - 1):
+        for _ in range(order_count - 1):
             # d/dt (s sin ωt + c cos ωt) = -ωc sin ωt + ωs cos ωt
             sine, cosine = np.split(amplitudes[-1], 2)
             amplitudes.append(np.concatenate([-omega * cosine, omega * sine]))
-        return np.split(basis @ np.hstack(amplitudes), orders, axis=1)
+        return np.split(basis @ np.hstack(amplitudes), order_count, axis=1)
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ def _initialise_chordal(graph: PoseGraph) -> PoseGraph:
     )
     rotation = _nearest_rotations(relaxed_rotation.transpose(0, 2, 1))
     # Residual of an edge in the axes of the measured pose: (R_i Z)' (t_j - t_i - R_i z)
-    first_rotation = rotation[graph.first]
+    first_rotation = rotation[graph.first_nodes]
     edge_axes = first_rotation @ measured_rotation
     information = (
         edge_axes @ graph.information[:, :dimension, :dimension] @ edge_axes.transpose(0, 2, 1)
