@@ -273,11 +273,9 @@ def _check_orientation(
     if checked_orientation is None:
         return None
     convention, time_s, attitude = checked_orientation
-    is_convention_known = (
-        convention.verdict in ("determined", "ambiguous") and verdict == "determined"
-    )
     if (
-        not is_convention_known
+        verdict != "determined"
+        or convention.verdict not in ("determined", "ambiguous")
         or best_hypothesis.assignment.vertical_axis != 2
         or best_hypothesis.assignment.is_mirrored
     ):

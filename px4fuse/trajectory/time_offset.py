@@ -371,8 +371,5 @@ def _refine_offset(
     # tolerance of the optimiser would be seconds
     shifts_s = window_s * np.linspace(-1.0, 1.0, 21)
     best_index = int(np.argmin([cost(shift) for shift in shifts_s]))
-    search_bracket = (
-        shifts_s[max(best_index - 1, 0)],
-        shifts_s[min(best_index + 1, len(shifts_s) - 1)],
-    )
-    return fit_at(float(minimize_scalar(cost, bounds=search_bracket, method="bounded").x))
+    bounds_s = (shifts_s[max(best_index - 1, 0)], shifts_s[min(best_index + 1, len(shifts_s) - 1)])
+    return fit_at(float(minimize_scalar(cost, bounds=bounds_s, method="bounded").x))
