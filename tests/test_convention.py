@@ -28,8 +28,8 @@ from px4fuse.findings.model import finding
 from px4fuse.flight.model import RECEIVED, Columns, Flight, PositionTrack
 from px4fuse.readers import read_log
 from px4fuse.request import ComparisonRequest
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.trajectory.rotation import from_vector, interpolate, multiply
 
@@ -68,7 +68,7 @@ TOLERANCES = {"rotation_deg": 4.0, "heading_error_deg": 4.0, "late_s": 0.06, "cl
 
 @cache
 def flown(seed: int = 3, *mistakes: str) -> Flight:
-    return simulate_flight(Scenario(seed=seed, kind="loop", passes=2), parse_mistakes(mistakes))
+    return simulate_flight(Scenario(seed=seed, kind="loop", passes=2), parse_faults(mistakes))
 
 
 def sent(
@@ -397,7 +397,7 @@ def test_frame_detection_on_recorded_logs_finds_known_frame(name):
 
 
 def test_convention_check_without_heights_keeps_horizontal_positions() -> None:
-    flight = simulate_flight(Scenario(seed=5), parse_mistakes(["no-vvo"]))
+    flight = simulate_flight(Scenario(seed=5), parse_faults(["no-vvo"]))
     prepared = prepare(flight)
     assert prepared.source.samples[Columns.POSITION[:2]].notna().all(axis=None)
     assert prepared.source.samples["down_m"].isna().all()

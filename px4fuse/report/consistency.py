@@ -198,9 +198,9 @@ def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
         fill_colour = KF_COLOUR if name == "KF" else "white"
         dots = INNOVATION_DOTS[name] | {"ms": 3.0, "mew": 0.6, "mfc": fill_colour}
         axes.plot(lag_positions, correlations, **dots, label=name)
-        half_band = _whiteness_half_band(values)
-        axes.axhline(-half_band, **_thin_line_style(name))
-        axes.axhline(half_band, **_thin_line_style(name), label=f"95 % band {name}")
+        whiteness_half_band = _whiteness_half_band(values)
+        axes.axhline(-whiteness_half_band, **_thin_line_style(name))
+        axes.axhline(whiteness_half_band, **_thin_line_style(name), label=f"95 % band {name}")
     axes.axhline(0.0, color="black", lw=0.5)
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.3), -1.05), min(max(high, 0.3), 1.05))

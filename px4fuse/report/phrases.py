@@ -134,17 +134,17 @@ def verdict_notes(comparison: Comparison) -> list[str]:
             "The position source may drift. The verdicts compare each filter with the source, "
             "not with the true position. Check the error with ground truth or a loop."
         )
-    correlated_filters = [
+    correlated_filter_texts = [
         f"{filter_name} along {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"
         for axis, filter_name, consistency in consistencies
         if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITE_P_VALUE
     ]
-    if correlated_filters:
+    if correlated_filter_texts:
         notes.append(
             "Innovations are not white, although their variance is consistent (Ljung-Box test, p "
-            f"< {MIN_WHITE_P_VALUE:g}): {'; '.join(correlated_filters)}. If the autocorrelation is "
-            "positive, the filter lags and SIGMA_A may be too small. If it is negative, the filter "
-            "follows the measurement noise and SIGMA_A may be too large."
+            f"< {MIN_WHITE_P_VALUE:g}): {'; '.join(correlated_filter_texts)}. If the "
+            "autocorrelation is positive, the filter lags and SIGMA_A may be too small. If it is "
+            "negative, the filter follows the measurement noise and SIGMA_A may be too large."
         )
     return notes
 

@@ -218,15 +218,15 @@ def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArr
 
 def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[float]:
     """Find the time offsets with correlated speeds, best first (Padfield 2012, eqs. 3 to 9)."""
-    spans_s = [float(np.ptp(track.time_s)) for track in (sparse_track, dense_track)]
-    step_s = max(GRID_STEP_S, max(spans_s) / MAX_GRID_SAMPLES)
-    shorter_span_s = min(spans_s)
-    if shorter_span_s < 10 * step_s:
+    durations_s = [float(np.ptp(track.time_s)) for track in (sparse_track, dense_track)]
+    step_s = max(GRID_STEP_S, max(durations_s) / MAX_GRID_SAMPLES)
+    shorter_duration_s = min(durations_s)
+    if shorter_duration_s < 10 * step_s:
         return []
     (sparse_speeds, is_known_sparse), (dense_speeds, is_known_dense) = (
         _speeds(track, step_s) for track in (sparse_track, dense_track)
     )
-    min_count = MIN_OVERLAP_FRACTION * shorter_span_s / step_s
+    min_count = MIN_OVERLAP_FRACTION * shorter_duration_s / step_s
     correlations = []
     # angular speeds are only compared if both trajectories have orientations
     for sparse_values, dense_values in zip(sparse_speeds, dense_speeds, strict=False):
@@ -328,8 +328,8 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
 def _correlation_length(values: Array) -> int:
     """Return the first lag with autocorrelation below 1/e, at most n / 4."""
     covariance_by_lag = autocovariance(values - values.mean())
-    low_lags = np.flatnonzero(covariance_by_lag < covariance_by_lag[0] / np.e)
-    return int(low_lags[0]) if len(low_lags) else len(values) // 4
+    lags_below_limit = np.flatnonzero(covariance_by_lag < covariance_by_lag[0] / np.e)
+    return int(lags_below_limit[0]) if len(lags_below_limit) else len(values) // 4
 
 
 def _refine_offset(
@@ -372,8 +372,5 @@ def _refine_offset(
     # tolerance of the optimiser would be seconds
     shifts_s = window_s * np.linspace(-1.0, 1.0, 21)
     best_index = int(np.argmin([cost(shift) for shift in shifts_s]))
-    search_bracket = (
-        shifts_s[max(best_index - 1, 0)],
-        shifts_s[min(best_index + 1, len(shifts_s) - 1)],
-    )
-    return fit_at(float(minimize_scalar(cost, bounds=search_bracket, method="bounded").x))
+    bounds_s = (shifts_s[max(best_index - 1, 0)], shifts_s[min(best_index + 1, len(shifts_s) - 1)])
+    return fit_at(float(minimize_scalar(cost, bounds=bounds_s, method="bounded").x))

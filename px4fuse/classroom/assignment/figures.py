@@ -17,7 +17,7 @@ from px4fuse.flight.model import Ekf2, Truth
 from px4fuse.report import panels, style
 from px4fuse.results.answer_form import CHOICE_NAMES, Choice, ChoiceName
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import make_scenario
 
 FIGURE_COUNT = 3
@@ -92,8 +92,8 @@ def draw_figures(random_number: Callable[[str], float]) -> bytes:
         numbers = random_scenario_numbers("aisle", figure_random_number)
         seed = int(2**53 * figure_random_number("seed"))
         scenario = make_scenario("aisle", passes=PASSES, seed=seed, **numbers)
-        mistakes = parse_mistakes(tuple(filter(None, [FAULTS[kind].option])))
-        comparisons[title] = compare_simulation(flights.simulate(scenario, mistakes))
+        faults = parse_faults(tuple(filter(None, [FAULTS[kind].option])))
+        comparisons[title] = compare_simulation(flights.simulate(scenario, faults))
     return _figures_png(comparisons)
 
 
