@@ -67,7 +67,7 @@ CLASS = (
         id="1007",
         numbers={"mean NIS": 1.02},
         redrawn_path="reports/1007.pdf",
-        mistakes={"positions that jump": True},
+        is_found_by_fault={"positions that jump": True},
     ),
     row(
         "ada",
@@ -75,7 +75,7 @@ CLASS = (
         id="1001",
         status="numbers differ",
         flags=("The same log as Zoë.",),
-        mistakes={"positions that jump": False, "outliers": False},
+        is_found_by_fault={"positions that jump": False, "outliers": False},
         late_s=7200.0,
         deduction=1.0,
     ),
@@ -93,7 +93,7 @@ CLASS = (
         numbers={MARKUP: 1.0},
         instructor_action=MARKUP,
         form=FORM,
-        mistakes={MARKUP: False},
+        is_found_by_fault={MARKUP: False},
         redrawn_path="javascript:alert(1)",
         comment=BREAKOUT,
         items=(
@@ -129,7 +129,8 @@ def test_grades_page_escapes_html_in_student_text(text: str) -> None:
         one = row(
             word, 5.0, id=word, file=f"{word}.pdf", flags=(word,), reasons=(word,),
             notes=f"So: {word}",
-            numbers={word: 1.0}, items=(Item(word, 5.0, 20.0, word),), mistakes={word: False},
+            numbers={word: 1.0}, items=(Item(word, 5.0, 20.0, word),),
+            is_found_by_fault={word: False},
             instructor_action=word, form=FORM, comment=word,
         )  # fmt: skip
         return class_page_html([one], word, word)
@@ -187,7 +188,7 @@ def anonymous_class() -> list[Entry]:
             instructor_action=said,
             notes=f"{name} ({student_id}): {SAYS} 王小明", form=FORM,
             numbers={"mean NIS": 1.0}, items=(Item("Settings", 9.0, 20.0, said),),
-            mistakes={"positions that jump": False}, comment=said,
+            is_found_by_fault={"positions that jump": False}, comment=said,
             overrides={"Settings": Override(10.0, said)},
             other_reports=(graded(name, 3.0, file=f"old/{file}"),),
             redrawn_path=f"reports/{student_id}.pdf", sha256="ab" * 32,

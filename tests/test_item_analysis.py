@@ -49,7 +49,7 @@ def test_item_analysis_of_four_reports_omits_discrimination() -> None:
 
 def test_item_analysis_lists_answer_form_parts_and_faults() -> None:
     reports = [
-        replace(each, form_parts=(Item("sizes", n, 15.0, ""),), mistakes={"nlos": n > 1})
+        replace(each, form_parts=(Item("sizes", n, 15.0, ""),), is_found_by_fault={"nlos": n > 1})
         for n, each in enumerate(REPORTS)
     ]
     *_, sizes, fault = analyse_items(reports)
@@ -73,10 +73,10 @@ def test_oral_exam_asks_first_about_wrong_and_missed_faults() -> None:
     questions = [*ask_about_form(FORM, TRUTH)]
     assert "You named dropout" in questions[0][0]
     assert "nlos, yaw" in questions[0][1]
-    assert "You named the fault nlos" in questions[1][0]
+    assert "You named nlos" in questions[1][0]
     assert "accepted size 8.5 to 11.5 %" in questions[1][1]
     assert "Your flight also has this fault" in questions[2][0]
-    assert "your answer is: yaw" in questions[3][0]
+    assert "you answered: yaw" in questions[3][0]
     assert "Right: delay" in questions[3][1]
     assert len(questions) == 4
 

@@ -247,16 +247,16 @@ def _make_actions(
 def _no_change_reason(
     finding: Finding, filter_name: FilterName, sigma_verdicts: Sequence[Verdict]
 ) -> str:
-    word_by_reference = {
+    verdict_by_reference = {
         verdict.against: verdict.word
         for verdict in sigma_verdicts
         if verdict.filter == filter_name and verdict.ratio is not None
     }
-    if not word_by_reference:
+    if not verdict_by_reference:
         return ""
-    if set(word_by_reference.values()) == {"consistent"}:
+    if set(verdict_by_reference.values()) == {"consistent"}:
         needs_ground_truth = CATALOGUE[finding.id].reruns & TRUTH_ONLY_CHANGE_KINDS
-        if needs_ground_truth and "truth" not in word_by_reference:
+        if needs_ground_truth and "truth" not in verdict_by_reference:
             return "no change: only ground truth shows this fault, and the log has none"
         return "no change: the reported σ is consistent"
     if finding.id == "source_outliers":
@@ -264,7 +264,7 @@ def _no_change_reason(
             return (
                 "no option of KF rejects outliers, and a larger SIGMA_Z (--sigma-z) only hides them"
             )
-        if word_by_reference.get("truth", "consistent") == "consistent":
+        if verdict_by_reference.get("truth", "consistent") == "consistent":
             return "no change: EKF2's gate rejects outliers, and the reported σ is consistent"
     fault_text = "drift of the source" if finding.id == "source_drift" else "this fault"
     return f"no setting removes {fault_text}"

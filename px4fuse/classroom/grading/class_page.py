@@ -101,7 +101,9 @@ def _entry_tags(entry: Entry) -> list[str]:
     tags += ["flagged"] * bool(entry.flags) + ["late"] * bool(entry.late_s)
     if report:
         tags += ["pending"] * bool(report.instructor_action) + ["to read"] * report.awaits_points
-        tags += [f"missed: {kind}" for kind, is_named in report.mistakes.items() if not is_named]
+        tags += [
+            f"missed: {kind}" for kind, is_named in report.is_found_by_fault.items() if not is_named
+        ]
     return tags + ["changed by instructor"] * bool(entry.overrides or entry.comment)
 
 
@@ -161,7 +163,7 @@ def _entry_details(entry: Entry) -> Iterator[Section]:
     ]
     fault_texts = [
         f"{kind}: {'named' if is_named else 'not named'} in the answer form"
-        for kind, is_named in report.mistakes.items()
+        for kind, is_named in report.is_found_by_fault.items()
     ]
     attempts = [
         f"{other_report.submission}: {other_report.status}" for other_report in entry.other_reports

@@ -100,7 +100,7 @@ class GradedReport:
         Numbers of the report for the table of the class, by column title.
     version : str
         Version of px4fuse that wrote the report.
-    mistakes : mapping
+    is_found_by_fault : mapping
         For each injected fault of the student's flight: True if the student found the fault.
     form_parts : tuple of Item
         Points for each part of ``form``, 100 points in total.
@@ -121,7 +121,7 @@ class GradedReport:
     log_sha256: str = ""
     version: str = ""
     notes: str = field(default="", repr=False)
-    mistakes: Mapping[str, bool] = field(default_factory=dict)
+    is_found_by_fault: Mapping[str, bool] = field(default_factory=dict)
     form_parts: tuple[Item, ...] = ()
     redrawn_path: str = ""
 

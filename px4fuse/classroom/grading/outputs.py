@@ -233,7 +233,7 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
             and "The instructor has to decide on the points.",
             form=report.form,
             numbers=report.numbers,
-            mistakes=report.mistakes,
+            is_found_by_fault=report.is_found_by_fault,
             form_parts=report.form_parts,
         )
     return Entry(

@@ -171,7 +171,7 @@ def score_report(
             *([OTHER_FORM_ADVICE] if check_input.has_form_of_other_log else []),
         ),
         instructor_action=reason_or_action if points_rule == "pending" else "",
-        mistakes=form_result.is_named_by_kind,
+        is_found_by_fault=form_result.is_named_by_kind,
         form_parts=tuple(
             Item(name, form_result.points_by_part[name], max_points, "")
             for name, max_points in form_result.max_points_by_part.items()
