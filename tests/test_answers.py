@@ -152,7 +152,7 @@ def test_compare_with_answers_option_prints_answers_in_report(
     assert any("Answer form" in page.extract_text() for page in reader.pages)
 
 
-def test_student_answers_on_other_log_are_rejected(tmp_path: Path, sample_log: Path) -> None:
+def test_student_answers_about_another_log_are_rejected(tmp_path: Path, sample_log: Path) -> None:
     form = tmp_path / "f.toml"
     form.write_text(form_text(sample_log.name, SHA256), encoding="utf-8")
     for command in ("compare", "loop"):

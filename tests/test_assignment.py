@@ -136,7 +136,7 @@ class TestDraw:
             for n, one in enumerate(mixed)
         )
 
-    def test_two_faults_in_assigned_flight_are_compatible(self):
+    def test_two_faults_in_assignment_flight_are_compatible(self):
         signs = Counter()
         for n in range(300):
             drawn = assign_random_flight(SECRET, f"s{n}", "aisle", 2)
@@ -180,14 +180,14 @@ class TestDraw:
             larger = [s for s in sizes if (s < choice.detectable_size) == choice.is_smaller_easier]
             assert set(larger) <= {choice.detectable_size, *found}
 
-    def test_assigned_flights_cover_full_range_of_difficulty(self):
+    def test_assignment_flights_cover_full_range_of_difficulty(self):
         each = [assign_random_flight(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
         counts, _ = np.histogram(each, bins=4, range=(EASIEST_DIFFICULTY, HARDEST_DIFFICULTY))
         assert counts.min() > 65
         undetectable_count = sum(one > HARDEST_DIFFICULTY for one in each)
         assert undetectable_count / len(each) == pytest.approx(UNDETECTABLE_FRACTION, abs=0.06)
 
-    def test_assigned_flight_seeds_have_128_bits(self):
+    def test_assignment_flight_seeds_have_128_bits(self):
         seeds = [assign_random_flight(SECRET, f"s{n}", "aisle").scenario.seed for n in range(50)]
         assert max(seeds).bit_length() == 128
 
@@ -195,7 +195,7 @@ class TestDraw:
 @pytest.mark.parametrize(
     ("kind", "number", "count"), [("aisle", 0, 2), ("aisle", 2, 2), ("aisle", 2, 1), ("loop", 1, 1)]
 )
-def test_each_fault_in_assigned_log_is_detected_by_analysis(
+def test_each_fault_in_assignment_log_is_detected_by_analysis(
     tmp_path, monkeypatch, kind, number, count
 ):
     log, answer = assignment.simulate_assigned_flight(SECRET, CLASS[number], kind, count, True)

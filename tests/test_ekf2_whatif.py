@@ -68,7 +68,7 @@ def test_what_if_result_contains_logged_and_replayed_values(model):
     assert not made.notes
 
 
-def test_what_if_without_replay_agreement_is_unavailable(model):
+def test_what_if_is_unavailable_if_replay_differs_from_log(model):
     doubtful = replace(model, agreement=replace(model.agreement, good=False, reason="no reason"))
     for result in (what_if(doubtful, [{"EKF2_EVP_NOISE": 0.5}]), explain_by_steps(doubtful)):
         assert isinstance(result, Unavailable)

@@ -19,7 +19,7 @@ from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.diagnose import diagnose, prepare_comparison
 from px4fuse.explore.page import html_text
-from px4fuse.report.card_html import card_of
+from px4fuse.report.card_html import make_diagnosis_card
 from px4fuse.request import ComparisonRequest
 
 pytestmark = pytest.mark.usefixtures("cached_analyses")
@@ -121,7 +121,7 @@ ROWS = """Object.fromEntries([...document.querySelectorAll('#card [data-filter]'
 def test_explore_page_shows_report_diagnosis_before_any_change(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
-    card = card_of(explored[1])
+    card = make_diagnosis_card(explored[1])
     rows = page.ask(ROWS)
     for verdict in card.verdicts:
         ratio, word, place = rows[f"{verdict.filter} {verdict.against}"]

@@ -318,7 +318,7 @@ TESTED_ELSEWHERE = {
     "source_positions_rounded", "source_lever_arm", "source_timestamp_unit",
     "source_timestamps_shared", "source_position_held", "source_zero_positions",
     "source_without_position", "ekf2_bias_at_limit", "ekf2_not_aligned", "gyroscope_bias",
-    "parameter_changed", "source_height_only", "source_relocalises",
+    "parameter_changed", "source_coordinate_constant", "source_relocalises",
 }  # fmt: skip
 # Second finding of severity error that the fault causes
 ALSO_ERROR = {
@@ -466,7 +466,7 @@ def test_positions_lost_by_logger_are_not_reported_as_source_gap(sample_flight: 
     assert finding.spans_s == (pytest.approx((40.0, 60.0), abs=0.2),)
 
 
-def test_step_of_positions_is_no_variation_of_time_offset() -> None:
+def test_position_jump_is_not_reported_as_time_offset_change() -> None:
     step = with_errors(lambda t, _: np.outer(t > 60.0, [0.87, 0.5]))
     assert "source_time_offset_changes" not in ids(found(compare(step(aisle_flight()))))
 

@@ -168,7 +168,7 @@ def test_fault_named_on_clean_flight_earns_no_points_for_faults(kinds, tmp_path:
     assert named.fraction < 0.5 * form_points(right(CLEAN), CLEAN).fraction
 
 
-def test_two_students_with_equal_figure_answers_are_flagged() -> None:
+def test_two_students_with_equal_plot_answers_are_flagged() -> None:
     form = Answers(log_sha256=SHA256, choices=("a", "b", "", "c", "d", "e", "a"))
     reports = [
         graded_report(name, 5.0, student_id=name, form=replace(form, choices=choices))

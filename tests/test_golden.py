@@ -39,7 +39,7 @@ from px4fuse.explore.data import flight_data
 from px4fuse.explore.figures import document_json
 from px4fuse.explore.packing import Packer
 from px4fuse.report import pdf
-from px4fuse.simulation.flights import answer, simulate
+from px4fuse.simulation.flights import make_answer_key, simulate
 from px4fuse.simulation.mistakes import MISTAKES, parse_mistakes
 from px4fuse.simulation.scenario import KINDS, make_scenario
 
@@ -201,7 +201,7 @@ def spread(kind: str, *mistakes: str) -> list[str]:
         f"{topic.name} {field} {numbers(part)}"
         for topic in made.topics
         for field, part in topic.fields.items()
-    ] + list(of_values(answer(made)))
+    ] + list(of_values(make_answer_key(made)))
 
 
 @pytest.mark.parametrize("kind", KINDS)

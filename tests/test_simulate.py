@@ -22,7 +22,13 @@ from px4fuse.filter.signals import Segment, make_axes, mean_step_acceleration, p
 from px4fuse.findings import find
 from px4fuse.flight.model import Columns
 from px4fuse.simulation import sensors
-from px4fuse.simulation.flights import answer, simulate, simulate_flight, to_flight, to_ulog
+from px4fuse.simulation.flights import (
+    make_answer_key,
+    simulate,
+    simulate_flight,
+    to_flight,
+    to_ulog,
+)
 from px4fuse.simulation.mistakes import (
     MISTAKES,
     Mistakes,
@@ -30,7 +36,7 @@ from px4fuse.simulation.mistakes import (
     format_mistake,
     parse_mistakes,
 )
-from px4fuse.simulation.motion import attitude, direction, plan
+from px4fuse.simulation.motion import attitude, direction, plan_flight
 from px4fuse.simulation.scenario import DT_S, Scenario, bounds_by_field
 
 NO_MISTAKES = Mistakes()
@@ -51,7 +57,9 @@ def test_each_simulated_fault_size_has_limits() -> None:
 
 
 def motion_of(scenario, mistakes=NO_MISTAKES):
-    return plan(scenario, mistakes, sensors.random_stream(scenario, sensors.Stream.WANDER))
+    return plan_flight(
+        scenario, mistakes, sensors.random_stream(scenario, sensors.RandomStream.WANDER)
+    )
 
 
 def position_errors_m(simulation):
@@ -115,7 +123,7 @@ def test_simulated_open_loop_has_requested_closure_error(left_out, texts):
     first, last = flown.motion.at(np.array([0.0, flown.motion.duration_s])).position_m
     # the last side points back along heading + 270 degrees
     assert np.allclose(last - first, -left_out * direction(30.0 + 270.0), atol=1e-9)
-    error_m = answer(flown)["truth"]["closure_error_m"]
+    error_m = make_answer_key(flown)["truth"]["closure_error_m"]
     assert error_m == pytest.approx(left_out, abs=1e-9)
 
 
@@ -159,7 +167,7 @@ def test_simulated_imu_biases_are_constant_with_requested_sigma():
     simulation = simulate(Scenario(seed=9))
     imu = to_flight(simulation).imu
     truth = attitude(simulation.motion.at(imu.index.to_numpy()))
-    truth_values = answer(simulation)["truth"]
+    truth_values = make_answer_key(simulation)["truth"]
     bias = imu.to_numpy()[:, :3].astype(float) - truth.specific_force_m_s2
     assert bias.mean(axis=0) == pytest.approx(truth_values["accelerometer_bias_m_s2"], abs=0.025)
     bias = imu[Columns.ANGULAR_RATE].to_numpy(float) - truth.angular_rate_rad_s
@@ -200,7 +208,7 @@ class TestMistakes:
         assert np.allclose(stamps_s(late) - time, offset_s + share * time, atol=1e-6)
         arrivals = (s.positions.topic.fields["timestamp"] for s in (late, self.CLEAN))
         assert np.array_equal(*arrivals)
-        assert answer(late)["truth"]["clock_offset_to_add_s"] == -offset_s
+        assert make_answer_key(late)["truth"]["clock_offset_to_add_s"] == -offset_s
 
     def test_simulated_clock_jump_ends_at_timesync_convergence(self):
         jumping = simulate(Scenario(seed=4), parse_mistakes(["clock-jump=0.25"]))
@@ -225,7 +233,7 @@ class TestMistakes:
         assert np.mean(size[outlier]) == pytest.approx(3.0, rel=0.2)
         starts = np.count_nonzero(np.diff(outlier.astype(int)) == 1)
         assert np.count_nonzero(outlier) / starts > 1.5
-        truth_values = answer(simulation)["truth"]
+        truth_values = make_answer_key(simulation)["truth"]
         assert truth_values["outlier_index"] == np.flatnonzero(outlier).tolist()
         assert np.allclose(truth_values["outlier_time_s"], stamps_s(simulation)[outlier])
 

@@ -81,7 +81,7 @@ def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> N
         console = terminal()
         with console.capture() as captured:
             page = comparison_page(*document, verbose=True)
-            screen.show(console, page.blocks, document[0].request)
+            screen.print_blocks(console, page.blocks, document[0].request)
         summaries[width] = captured.get()
     whole = summaries[None]
     card = with_typed_path(document[1].card, document[0].request.log)
@@ -112,7 +112,7 @@ def test_table_on_narrow_terminal_keeps_words_whole(capsys) -> None:
     page = Page()
     topics = ["vehicle_visual_odometry", "estimator_aid_src_ev_pos"]
     page.table(["data", "topic", "samples"], [["position", topic, "650"] for topic in topics])
-    screen.show(Console(width=40, highlight=False), page.blocks)
+    screen.print_blocks(Console(width=40, highlight=False), page.blocks)
     words = capsys.readouterr().out.replace(",", "").split()
     assert [word for word in words if word in topics] == topics
 

@@ -17,7 +17,7 @@ from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, Section
 from px4fuse.html.safe import clean_text, load_template, local_link
 from px4fuse.report.card_html import MARK_PATHS
-from px4fuse.report.card_text import MARKS, SEVERITY_SIGNS, band_limits
+from px4fuse.report.card_text import REFERENCE_MARKS, SEVERITY_SIGNS, format_consistent_ratios
 
 # Filter and reference of each σ ratio (source: innovations; truth: errors), as in Card.verdicts
 SIGMA_RATIO_COLUMNS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
@@ -84,7 +84,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     return frame.page(
         title=title,
         subtitle=f"{count_noun(len(logs), 'log')}. Compared by {made_with}.",
-        html_above=load_template("batch/axis.html").render(limits=band_limits()),
+        html_above=load_template("batch/axis.html").render(limits=format_consistent_ratios()),
         row_nouns=("log", "logs"),
         columns=(
             Column("Sign", "rank"),
@@ -92,7 +92,9 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             Column("Diagnosis and first action", "full"),
             *(
                 Column(
-                    f"{filter_name.upper()} {MARKS[reference_name]}", "ratio", visible_from="tablet"
+                    f"{filter_name.upper()} {REFERENCE_MARKS[reference_name]}",
+                    "ratio",
+                    visible_from="tablet",
                 )
                 for filter_name, reference_name in (name.split("_") for name in SIGMA_RATIO_COLUMNS)
             ),

@@ -9,6 +9,7 @@ from msgspec import structs
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import FILTER_NAMES, Action, Cause, FilterName, Rerun, Target, Verdict
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
+from px4fuse.comparison.remedy import different_settings
 from px4fuse.comparison.trials import (
     CLOCK_OFFSET,
     OUTLIERS,
@@ -54,7 +55,8 @@ TARGETS_BY_GROUP: Mapping[str, Target] = {
 TARGETS_BY_ID: Mapping[str, Target] = {
     "source_drift": "source",
     "source_lever_arm": "EKF2",
-    "source_height_only": "EKF2",
+    "source_coordinate_constant": "EKF2",
+    "source_height_constant": "EKF2",
     "ekf2_not_fusing": "sender",
 }
 
@@ -300,6 +302,7 @@ def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Ac
     model = analysis.ekf2_model
     flown_settings = {} if isinstance(model, Unavailable) else model.inputs.settings
     change_texts, commands = [], []
+    change = different_settings(change, flown_settings)
     for name, value in change.items():
         change_text = f"{name} {flown_settings.get(name, math.nan):g} → {value:g}"
         change_texts.append(f"{change_text} {PARAMETERS[name].printed_unit}".rstrip())

@@ -321,14 +321,14 @@ def write_and_print(
     written_files : iterable of Path
         Files that are already written.
     """
-    from px4fuse.report.screen import print_line, show
+    from px4fuse.report.screen import print_blocks, print_line
 
     write_outputs(contents)
     files = [*contents, *written_files]
     if STANDARD_OUTPUT not in contents:
         console = terminal()
         if page is not None:
-            show(console, page.blocks, request)
+            print_blocks(console, page.blocks, request)
         for path in files:
             print_line(console, "Wrote", to_one_line(str(path)), "bold")
     openable_files = [
@@ -339,9 +339,9 @@ def write_and_print(
 
 
 def show_page(page: Page, *, is_error: bool = False) -> None:
-    from px4fuse.report.screen import show
+    from px4fuse.report.screen import print_blocks
 
-    show(terminal(is_error=is_error), page.blocks)
+    print_blocks(terminal(is_error=is_error), page.blocks)
 
 
 def terminal(*, is_error: bool = False) -> Console:

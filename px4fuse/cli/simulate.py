@@ -197,7 +197,7 @@ def simulate(
         show_progress("writing the log")
         contents = {output: flights.to_ulog(simulation)}
     if answer is not None:
-        contents[answer] = to_json(flights.answer(simulation)).encode()
+        contents[answer] = to_json(flights.make_answer_key(simulation)).encode()
     write_and_print(contents, terminal.summary(simulation, answer))
 
 

@@ -86,7 +86,7 @@ class Faults:
 
 
 def convention_faults(convention: Convention | None, flight: Flight, frame: str) -> Faults:
-    """Return the faults of a position source whose stated frame is ``frame``."""
+    """Return the deviations of a source from PX4's convention; ``frame`` is the logged frame."""
     if convention is None:
         return Faults()
     orientation_fault = _orientation_fault(convention)
@@ -195,7 +195,7 @@ def correct_convention(
     if inertial is None:
         return flight, track
     attitude = inertial.attitudes[convention.heading_from]
-    # the axes of the positions are correct: rotate the attitude to the north of the positions
+    # the axes of the positions are correct, so the attitude is rotated to their north direction
     if not faults.has_wrong_axes and not faults.rotation_deg:
         turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x)
         attitude = replace_heading(attitude, heading(attitude) + np.radians(turn_deg))
@@ -204,9 +204,9 @@ def correct_convention(
 
 
 def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:
-    unit_m = UNIT_SIZES_M[convention.unit]
+    unit_size_m = UNIT_SIZES_M[convention.unit]
     if not faults.has_wrong_axes and not faults.rotation_deg:
-        return unit_m * np.eye(3)
+        return unit_size_m * np.eye(3)
     permutation = [
         [(axis == name) - (OPPOSITE[axis] == name) for axis in convention.axes]
         for name in FRAME_AXES["NED"]
@@ -215,7 +215,7 @@ def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:
     rotation_rad = -np.radians(convention.rotation_deg) * is_rotated
     cosine, sine = np.cos(rotation_rad), np.sin(rotation_rad)
     rotation = from_elements((cosine, -sine, 0.0), (sine, cosine, 0.0), (0.0, 0.0, 1.0))
-    return np.asarray(unit_m * rotation @ np.array(permutation))
+    return np.asarray(unit_size_m * rotation @ np.array(permutation))
 
 
 def _transform_known(values: Array, matrix: Array) -> Array:

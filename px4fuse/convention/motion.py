@@ -73,7 +73,7 @@ class Inertial:
 
     @property
     def attitudes(self) -> dict[HeadingSource, Array]:
-        """Attitudes with the tilt of ``gyro_attitude``, and the heading of EKF2 or gyroscopes."""
+        """Attitudes with tilt from the gyroscopes, and heading from EKF2 or the gyroscopes."""
         return {
             "EKF2": replace_heading(self.gyro_attitude, heading(self.logged_attitude)),
             "gyroscopes": self.gyro_attitude,
@@ -85,16 +85,20 @@ class SourceMotion:
     """Second differences of positions, at a constant interval ``GRID_INTERVAL_S``."""
 
     time_s: Array
-    table: Array
+    second_differences: Array
     is_valid: BoolArray
 
     @classmethod
     def of(cls, time_s: Array, position: Array, grid_s: Array) -> "SourceMotion":
         """Compute the second differences of positions at the times ``grid_s``; invalid in gaps."""
         window_steps = round(DIFFERENCE_WINDOW_S / GRID_INTERVAL_S)
-        at_s = grid_s[0] + GRID_INTERVAL_S * np.arange(-window_steps, len(grid_s) + window_steps)
-        has_near_samples = is_bracketed(at_s, time_s, gap_limit(time_s, MIN_GAP_S))
-        columns = np.column_stack([np.interp(at_s, time_s, column) for column in position.T])
+        position_times_s = grid_s[0] + GRID_INTERVAL_S * np.arange(
+            -window_steps, len(grid_s) + window_steps
+        )
+        has_near_samples = is_bracketed(position_times_s, time_s, gap_limit(time_s, MIN_GAP_S))
+        columns = np.column_stack(
+            [np.interp(position_times_s, time_s, column) for column in position.T]
+        )
         is_valid = (
             has_near_samples[2 * window_steps :]
             & has_near_samples[window_steps:-window_steps]
@@ -124,7 +128,7 @@ class ImuMotion:
 
 
 def read_inertial(flight: Flight) -> Inertial | None:
-    """Integrate the gyroscopes of a flight to an attitude that EKF2 does not affect.
+    """Integrate the gyroscopes of a flight to an attitude without EKF2's corrections.
 
     Return None if IMU data and attitude overlap for less than 8 s.
     """
@@ -164,23 +168,23 @@ def read_inertial(flight: Flight) -> Inertial | None:
     )
 
 
-def _integrate_gyros(angle_rad: Array, logged_attitude: Array) -> Array:
+def _integrate_gyros(rotation_rad: Array, logged_attitude: Array) -> Array:
     """Integrate the gyroscopes without their bias, from the first logged attitude.
 
     The bias is the median rotation rate relative to the logged attitude, so heading resets have no
     effect.
     """
-    excess_rad = angle_rad - to_vector(
+    gyro_error_rad = rotation_rad - to_vector(
         multiply(conjugate(logged_attitude[:-1]), logged_attitude[1:])
     )
-    excess_sum_rad = np.cumsum(excess_rad, axis=0)
+    gyro_error_sum_rad = np.cumsum(gyro_error_rad, axis=0)
     window_steps = round(GYRO_BIAS_WINDOW_S / INTEGRATION_STEP_S)
     gyro_bias_rad = (
-        np.median(excess_sum_rad[window_steps:] - excess_sum_rad[:-window_steps], axis=0)
+        np.median(gyro_error_sum_rad[window_steps:] - gyro_error_sum_rad[:-window_steps], axis=0)
         / window_steps
     )
     return cumulative_product(
-        np.concatenate([logged_attitude[:1], from_vector(angle_rad - gyro_bias_rad)])
+        np.concatenate([logged_attitude[:1], from_vector(rotation_rad - gyro_bias_rad)])
     )
 
 
@@ -257,8 +261,8 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
 
 def replace_heading(attitude: Array, heading_rad: Array) -> Array:
     """Rotate an attitude about the vertical to another heading."""
-    half_turn_rad = np.unwrap(heading_rad - heading(attitude)) / 2.0
-    zeros = np.zeros_like(half_turn_rad)
+    half_angle_rad = np.unwrap(heading_rad - heading(attitude)) / 2.0
+    zeros = np.zeros_like(half_angle_rad)
     return multiply(
-        np.stack([np.cos(half_turn_rad), zeros, zeros, np.sin(half_turn_rad)], axis=-1), attitude
+        np.stack([np.cos(half_angle_rad), zeros, zeros, np.sin(half_angle_rad)], axis=-1), attitude
     )

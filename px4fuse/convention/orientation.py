@@ -1,4 +1,4 @@
-"""Convention of a source's orientation: order of the quaternion, frames, rotation of the body.
+"""Order of the quaternion components, body frame and world frame of a source's orientation.
 
 Each possible convention is compared with the attitude from the gyroscopes, in tilt and in heading
 changes.
@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from px4fuse.convention.model import Frames, Order, OrientationConvention
+from px4fuse.convention.model import BodyAndWorldFrame, OrientationConvention, QuaternionOrder
 from px4fuse.convention.motion import Inertial
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.replay import inside_spans
@@ -22,16 +22,16 @@ FLU_TO_FRD = np.array([0.0, 1.0, 0.0, 0.0])
 # Quaternion (w, x, y, z) from ENU to NED
 ENU_TO_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 # Quaternions that convert the world frame to NED and the body frame to FRD, by names of both frames
-FRAMES: Final[dict[Frames, tuple[Array, Array]]] = {
+FRAMES: Final[dict[BodyAndWorldFrame, tuple[Array, Array]]] = {
     "FRD to NED": (IDENTITY, IDENTITY),
     "FLU to ENU": (ENU_TO_NED, FLU_TO_FRD),
     "FLU to NWU": (FLU_TO_FRD, FLU_TO_FRD),
     "FLU to NED": (IDENTITY, FLU_TO_FRD),
     "FRD to ENU": (ENU_TO_NED, IDENTITY),
 }
-ORDERS: tuple[Order, Order] = ("w x y z", "x y z w")
-# Maximum median difference (°) from EKF2's attitude for a copy of it: copies differ by 0.03°, fused
-# motion capture by more than 0.2°
+ORDERS: tuple[QuaternionOrder, QuaternionOrder] = ("w x y z", "x y z w")
+# Maximum median difference (°) from EKF2's attitude of an orientation that is copied from EKF2:
+# copies differ by 0.03°, fused motion capture by more than 0.2°
 MAX_COPY_DIFFERENCE_DEG = 0.15
 # Tested delays (s) of a copy of EKF2's attitude
 COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
@@ -39,9 +39,9 @@ COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
 MAX_TILT_DIFFERENCE_DEG = 6.0
 # Maximum median heading difference (°) of a correct convention
 MAX_HEADING_DIFFERENCE_DEG = 12.0
-# Smaller tilt or heading differences (°) are noise and count as this value in the score
+# Minimum tilt and heading differences (°) in the score of a convention: smaller ones are noise
 MIN_SCORED_DIFFERENCE_DEG = 0.7
-# Decrease of a convention's score per second of flight and per unit of ln(angle difference)
+# Decrease of the score (log likelihood) of a convention per second and per ln(angle difference)
 SCORE_PER_S = 0.5
 # Minimum score difference between the best and the second best convention
 MIN_LOG_ODDS = 4.0
@@ -118,19 +118,19 @@ def to_attitude(sent_quaternions: Array, convention: OrientationConvention) -> A
 
 def _make_candidate(
     time_s: Array,
-    sent: Array,
-    reference: Array,
-    order: Order,
-    frames: Frames,
+    sent_quaternions: Array,
+    reference_attitude: Array,
+    order: QuaternionOrder,
+    frames: BodyAndWorldFrame,
     body_quarter_turns: int,
 ) -> Candidate:
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
     body_rotation = from_vector(np.array([0.0, 0.0, body_quarter_turns * np.pi / 2.0]))
-    attitude = multiply(to_attitude(sent, convention), body_rotation)
-    heading_difference = np.exp(1j * (heading(attitude) - heading(reference)))
+    attitude = multiply(to_attitude(sent_quaternions, convention), body_rotation)
+    heading_difference = np.exp(1j * (heading(attitude) - heading(reference_attitude)))
     offset_rad = np.angle(np.mean(heading_difference))
     heading_difference_rad = np.abs(np.angle(heading_difference * np.exp(-1j * offset_rad)))
-    tilt_cosine = np.sum(to_matrix(attitude)[:, 2] * to_matrix(reference)[:, 2], axis=1)
+    tilt_cosine = np.sum(to_matrix(attitude)[:, 2] * to_matrix(reference_attitude)[:, 2], axis=1)
     tilt_rad = np.arccos(np.clip(tilt_cosine, -1.0, 1.0))
     tilt_deg, heading_deg = np.degrees(
         np.median([tilt_rad, heading_difference_rad], axis=1)

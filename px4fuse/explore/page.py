@@ -10,7 +10,7 @@ from px4fuse.explore.data import PageData, flight_data, ranges
 from px4fuse.explore.figures import FIGURES, document_json, has_reference
 from px4fuse.explore.packing import Packer
 from px4fuse.html.safe import clean_values, csp_hash, inert_json, load_template, read_asset
-from px4fuse.report.card_html import axis_figures, card_html, card_of, card_style
+from px4fuse.report.card_html import card_css, card_html, make_diagnosis_card, sigma_ratio_figures
 
 # Maximum length (characters) of a text from a log on the web page
 MAX_LOG_TEXT_LENGTH = 2000
@@ -21,7 +21,7 @@ PACKAGE = "px4fuse.explore"
 def html_text(analysis: Analysis) -> str:
     """Make the interactive web page (HTML) of an analysis."""
     packer = Packer()
-    data, card = flight_data(analysis, packer), card_of(analysis)
+    data, card = flight_data(analysis, packer), make_diagnosis_card(analysis)
     identity = card.identity
     return page_text(
         data,
@@ -43,7 +43,7 @@ def data_scripts(data: PageData, analysis: Analysis, packer: Packer, suffix: str
         "packed": packer.array_specs,
         "places": name_by_plot_id,
     }
-    figures = f'<template id="figures{suffix}">{axis_figures(analysis)}</template>\n'
+    figures = f'<template id="figures{suffix}">{sigma_ratio_figures(analysis)}</template>\n'
     return figures + "\n".join(
         f'<script type="{kind}" id="{name}{suffix}">{text}</script>'
         for name, kind, text in (
@@ -89,7 +89,7 @@ def page_text(
         {f"{name}_hash": csp_hash(text) for name, text in scripts_by_name.items()},
         **scripts_by_name,
         style="".join(map(read_asset, ("colours.css", "base.css")))
-        + card_style()
+        + card_css()
         + read_asset("page.css", PACKAGE),
         command=command,
         made_from=f"px4fuse {command} {sha256}".rstrip(),

@@ -48,8 +48,8 @@ DataPath = Literal[
 class Origin(Record):
     """Kind of a position source, and the route by which its positions reach the log."""
 
-    # Estimated from the data, which do not contain the device: "vio" sends a changing orientation,
-    # "uwb" only noisy positions, "unknown" only precise positions (kind_without_orientation)
+    # Kind of device, inferred from the data: "vio" sends a changing orientation, "uwb" only noisy
+    # positions, "unknown" only precise positions
     kind: PositionKind
     path: DataPath
     # Aiding source of EKF2 for these positions; None if EKF2 never fuses them
@@ -106,7 +106,7 @@ ALIGNED = Origin("uwb", "aligned by EKF2", EV_POS)
 LOGGED_BY_EKF2 = Origin("uwb", "kept by EKF2", EV_POS)
 FROM_INNOVATIONS = Origin("uwb", "rebuilt from innovations", EV_POS)
 GNSS = Origin("gnss", "as received", GNSS_POS, is_automatic=False)
-# All origins in order of preference
+# All kinds of position sources, in the order of preference for the analysis
 ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS, GNSS)
 
 
@@ -125,7 +125,7 @@ def with_orientation(origin: Origin, *, is_changing: bool) -> Origin:
 REPEATED_TIMESTAMPS = "most timestamps of the sender are repeated"
 # Clock of timestamps in a ULog that an external sender set and PX4 converted or replaced
 SENDER_CLOCK = "sender timestamps"
-# Replaces all results of an assignment that would show its injected fault to the student
+# Replacement for results that would show a student the injected fault of an assignment
 DIAGNOSIS_WITHHELD = Unavailable(
     "diagnosis",
     "the flight is a student assignment, for which px4fuse shows no diagnosis",
@@ -275,7 +275,7 @@ class LogInfo(Record, omit_defaults=False):
     dropped: Mapping[str, Count] = {}
     # Firmware defaults of the changed EKF2 parameters; ULog only
     parameter_defaults: Mapping[str, int | float] = {}
-    # True if ``px4fuse simulate --assignment`` wrote the log: px4fuse withholds its diagnosis
+    # True for a student assignment (``px4fuse simulate --assignment``): px4fuse hides the faults
     is_assessed: Literal[True] | msgspec.UnsetType = msgspec.UNSET
 
     __repr__ = one_line_repr
@@ -482,7 +482,7 @@ def white_noise_m(position_m: Array) -> float:
 
 
 def kind_without_orientation(samples: pd.DataFrame) -> PositionKind:
-    """Return "uwb" for noisy positions at a low rate, else "unknown".
+    """Infer the kind of a source without orientation: noisy and slow is "uwb", else "unknown".
 
     Motion capture, odometry and other precise systems may also send positions only.
     """
@@ -599,7 +599,7 @@ class FusionRecord:
         return not np.isfinite(self.delayed["north_m"]).any()
 
     def was_in_state(self, state: str, times_s: Array) -> BoolArray:
-        """Return True for each time at which EKF2 was in one of its logged ``states``."""
+        """Return a mask of the times at which EKF2 reported a condition (key of ``states``)."""
         step_function = self.states.get(state)
         return (
             np.zeros(len(times_s), bool)

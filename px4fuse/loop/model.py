@@ -80,7 +80,7 @@ class OdometryNoise(Record, omit_defaults=False):
     # Random walk over time (m/√s, °/√s), also while hovering
     position_m_per_root_s: NotNegative = 0.01
     heading_deg_per_root_s: NotNegative = 0.03
-    # Drift of roll and pitch over drift of heading; small, because gravity shows roll and pitch
+    # Ratio of the drifts of tilt and heading; small, because gravity corrects the tilt
     tilt_share: NotNegative = 0.1
 
 
@@ -94,7 +94,7 @@ class Closure(Record, kw_only=True):
     sigma_m: NotNegative
     # "landing": closure between take-off and landing; "given": closure from ``--closure``
     source: str
-    # Closure error: displacement from odometry minus true displacement
+    # Length of the closure error: displacement by odometry minus true displacement
     distance_m: NotNegative
     # χ² gate: squared Mahalanobis distance, degrees of freedom, p-value, True for acceptance
     d2: NotNegative
@@ -186,7 +186,7 @@ class Loop(Record, kw_only=True):
 
     @property
     def reported_paths(self) -> tuple[CorrectedPath, ...]:
-        """Available paths, except paths that are equal to another one by definition."""
+        """Available paths that differ: without rejected closures, for example, two are equal."""
         duplicates: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
             duplicates.add("pose_graph_all")
@@ -196,7 +196,7 @@ class Loop(Record, kw_only=True):
 
     @property
     def best(self) -> CorrectedPath:
-        """First available path of: gated pose graph, distributed closure error, odometry."""
+        """Best available path: gated pose graph, else distributed closure error, else odometry."""
         names: tuple[CorrectionName, ...] = ("pose_graph_gated", "by_distance", "uncorrected")
         return next(self.paths[name] for name in names if name in self.paths)
 

@@ -151,7 +151,7 @@ def set_map_axes(axes: Axes, right_name: str, up_name: str) -> None:
 
 
 def decimate_series(times: Array, values: Array, max_points: int) -> tuple[Array, Array]:
-    """Reduce a series to ``limit`` points: the minimum and maximum of each interval."""
+    """Reduce a series to ``max_points`` points: the minimum and maximum of each interval."""
     if len(times) <= max_points:
         return times, values
     bucket_size, larger_bucket_count = divmod(len(times), max_points // 2)

@@ -34,9 +34,9 @@ def comparison_page(
     verbose: bool = False,
     quiet: bool = False,
 ) -> Page:
-    """Make the terminal output of ``px4fuse compare``: the diagnosis card.
+    """Make the terminal output of ``px4fuse compare``: faults, causes and actions.
 
-    ``quiet``: only the headline of the card; ``verbose``: also settings, axes and findings.
+    ``quiet``: only the headline; ``verbose``: also settings, statistics of all axes, and findings.
     """
     page = card_page("headline" if quiet else "card", results.card)
     if not verbose:

@@ -142,10 +142,10 @@ def simulate_ekf2(
         # the barometer is EKF2's only height source outdoors
         down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
         no_dead_zone, sample_weight = np.zeros(len(down_m)), np.ones(len(down_m))
-        samples = barometer_samples_inside(
+        barometer_samples = barometer_samples_inside(
             segment, barometer_s, down_m, no_dead_zone, sample_weight
         )
-        heights = HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples)
+        heights = HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *barometer_samples)
         segment = replace(segment, heights=heights)
         if not logged_values[MAG.switch]:
             segment = add_field_states(
@@ -214,7 +214,7 @@ def _make_segment(
         mistakes,
         motion,
         np.zeros(1),
-        sensors.Stream.REST,
+        sensors.RandomStream.REST,
         REST_BEFORE_LOG_S * scenario.imu_rate_hz,
     )
     state, covariance = _initial_state_at_rest(
@@ -345,10 +345,10 @@ def _compute_output(
 def _hold_without_aiding(
     model_run: SegmentRun, state: Array
 ) -> tuple[list[tuple[int, Array]], BoolArray]:
-    """Set the position in ``state`` constant from NO_AID_TIMEOUT_S after the last fused sample.
+    """Hold the position in ``state`` constant without aiding, like PX4 (fake_pos_control.cpp).
 
-    PX4 does this (fake_pos_control.cpp). Return the resets of the position (step, size in m), and a
-    mask of the steps that are not held.
+    Return the position resets (step, size in m), and a mask of the steps with aiding in the last
+    NO_AID_TIMEOUT_S.
     """
     events, time_s = model_run.events[0], model_run.segment.time_s
     aid_events = np.flatnonzero(model_run.fused[:, 0] | model_run.reset[:, 0])

@@ -1,4 +1,4 @@
-"""Simulated flights as PX4 topics, ULog or Flight; injected faults and true values as answers."""
+"""Simulated flights as PX4 topics, ULog or Flight; answer key with injected faults and truth."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -16,7 +16,7 @@ from px4fuse.readers.ulog_topics import ASSESSED_KEY, NOTE_KEY
 from px4fuse.simulation import ekf2, sensors
 from px4fuse.simulation.ekf2_topics import MAGNETOMETER_HZ
 from px4fuse.simulation.mistakes import MISTAKES, Mistakes, active_mistake_names, format_mistake
-from px4fuse.simulation.motion import Motion, plan
+from px4fuse.simulation.motion import Motion, plan_flight
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic, encode
 
@@ -68,7 +68,9 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
             f"EKF2 uses the larger of {GNSS_POS.noise} and the accuracy that the receiver reports "
             f"({reported_m:g} m). Use a larger value."
         )
-    motion = plan(scenario, mistakes, sensors.random_stream(scenario, sensors.Stream.WANDER))
+    motion = plan_flight(
+        scenario, mistakes, sensors.random_stream(scenario, sensors.RandomStream.WANDER)
+    )
     positions = sensors.positions(scenario, mistakes, motion)
     imu = sensors.imu(scenario, mistakes, motion)
     parameters = _parameters(scenario, mistakes)
@@ -109,7 +111,7 @@ def simulate_flight(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Fli
 def to_ulog(simulation: Simulation, *, is_assessed: bool = False) -> bytes:
     """Encode the flight as a ULog file, which contains no information about the injected faults.
 
-    ``is_assessed`` marks the log as an assignment, for which px4fuse withholds its diagnosis.
+    ``is_assessed`` marks the log as a student assignment, whose faults px4fuse does not show.
     """
     info: dict[str, int | str] = {
         "sys_name": "PX4",
@@ -140,7 +142,7 @@ def _parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float
     }
 
 
-def answer(simulation: Simulation) -> dict[str, Any]:
+def make_answer_key(simulation: Simulation) -> dict[str, Any]:
     """Return injected faults and true values of a flight for the instructor, as JSON types."""
     scenario, mistakes = simulation.scenario, simulation.mistakes
     motion, source = simulation.motion, simulation.positions
@@ -148,7 +150,7 @@ def answer(simulation: Simulation) -> dict[str, Any]:
     first_m, last_m = motion.at(np.array([0.0, motion.duration_s])).position_m
     timestamps_us = sensors.time_us(source.topic, "timestamp_sample")
     outlier_indices = np.flatnonzero(source.is_outlier)
-    answer_data: dict[str, Any] = to_json_types(
+    answer_key: dict[str, Any] = to_json_types(
         {
             "schema": ANSWER_SCHEMA,
             "scenario": asdict(scenario),
@@ -178,4 +180,4 @@ def answer(simulation: Simulation) -> dict[str, Any]:
             },
         }
     )
-    return answer_data
+    return answer_key

@@ -58,10 +58,10 @@ def _sum_of_ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
     return PPoly.from_bernstein_basis(BPoly.from_derivatives(times_s[is_used], derivatives))
 
 
-def _derivatives(function: PPoly, time_s: Array, orders: Sequence[int]) -> list[Array]:
+def _derivatives(ramp_function: PPoly, time_s: Array, orders: Sequence[int]) -> list[Array]:
     """Return derivatives of a :func:`_sum_of_ramps`, shape (t, k); order -1 is the integral."""
-    inside_s = np.clip(time_s, *function.x[[0, -1]])
-    return [np.asarray(function.derivative(order)(inside_s)) for order in orders]
+    inside_s = np.clip(time_s, *ramp_function.x[[0, -1]])
+    return [np.asarray(ramp_function.derivative(order)(inside_s)) for order in orders]
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def attitude(state: State) -> Attitude:
     return Attitude(np.stack([x, y, z], axis=2), rate_rad_s, force_m_s2)
 
 
-def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Motion:
+def plan_flight(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Motion:
     """Plan a flight: ground, climb, hover, aisle or square, hover, descent, ground.
 
     Raises
@@ -249,13 +249,13 @@ class _FlightPlan:
         self.yaw_ramps = [(-1.0, 1.0, np.radians([heading_deg]))]
 
     def add_velocity_change(
-        self, velocity_change_m_s: Array, duration_s: float, until_next_s: float
+        self, velocity_change_m_s: Array, duration_s: float, time_to_next_s: float
     ) -> None:
-        """Add a velocity ramp; the next ramp's centre is ``until_next_s`` later."""
+        """Add a velocity ramp; the next ramp's centre is ``time_to_next_s`` later."""
         self.velocity_ramps.append(
             (self.ramp_centre_s - duration_s / 2.0, duration_s, velocity_change_m_s)
         )
-        self.ramp_centre_s += until_next_s
+        self.ramp_centre_s += time_to_next_s
 
     def add_turn(self, angle_rad: float, start_s: float, duration_s: float) -> None:
         self.yaw_ramps.append((start_s, duration_s, np.array([angle_rad])))

@@ -67,15 +67,15 @@ LAND_DETECTOR_INTERVAL_US = 1_000_000
 
 # Independent random number streams, one for each sensor and kind of error. A fault of one sensor
 # therefore does not change the noise of the others
-Stream = IntEnum(
-    "Stream",
+RandomStream = IntEnum(
+    "RandomStream",
     "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST SLOW FIX_VELOCITY "
     "FIELD BAROMETER",
     start=0,
 )
 
 
-def random_stream(scenario: Scenario, stream: Stream) -> np.random.Generator:
+def random_stream(scenario: Scenario, stream: RandomStream) -> np.random.Generator:
     return np.random.default_rng([scenario.seed, stream])
 
 
@@ -108,7 +108,7 @@ class SimulatedPositions:
 
 def biases(scenario: Scenario, mistakes: Mistakes) -> tuple[Array, Array]:
     """Return accelerometer (m/s²) and gyro (rad/s) biases, body FRD, each of shape (3,)."""
-    rng = random_stream(scenario, Stream.BIAS)
+    rng = random_stream(scenario, RandomStream.BIAS)
     accelerometer_bias_m_s2 = rng.normal(0.0, scenario.accel_bias_sigma_m_s2, 3)
     accelerometer_bias_m_s2[0] += mistakes.accel_bias_m_s2
     return accelerometer_bias_m_s2, rng.normal(0.0, scenario.gyro_bias_sigma_rad_s, 3)
@@ -117,11 +117,13 @@ def biases(scenario: Scenario, mistakes: Mistakes) -> tuple[Array, Array]:
 def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     """Simulate sensor_combined (accelerometer and gyro) at the full rate, without gaps."""
     time_us = _grid_us(motion.duration_s, scenario.imu_rate_hz)
-    force_m_s2, rate_rad_s = measure_imu(scenario, mistakes, motion, seconds(time_us), Stream.IMU)
+    force_m_s2, rate_rad_s = measure_imu(
+        scenario, mistakes, motion, seconds(time_us), RandomStream.IMU
+    )
     if mistakes.vibration_m_s2:
         vibration_sigma_m_s2 = mistakes.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
         force_m_s2 += vibration_sigma_m_s2 * random_stream(
-            scenario, Stream.VIBRATION
+            scenario, RandomStream.VIBRATION
         ).standard_normal(force_m_s2.shape)
     interval_us = round(1e6 / scenario.imu_rate_hz)
     integral_fields = dict.fromkeys(("gyro_integral_dt", "accelerometer_integral_dt"), interval_us)
@@ -140,9 +142,9 @@ def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topi
     if mistakes.heading_deg:
         body_to_ned = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix() @ body_to_ned
     field_gauss = np.einsum("nji,j->ni", body_to_ned, EARTH_FIELD_GAUSS)
-    field_gauss += SIGMA_MAGNETOMETER_GAUSS * random_stream(scenario, Stream.FIELD).standard_normal(
-        field_gauss.shape
-    )
+    field_gauss += SIGMA_MAGNETOMETER_GAUSS * random_stream(
+        scenario, RandomStream.FIELD
+    ).standard_normal(field_gauss.shape)
     disturbance_start_s = (
         motion.duration_s / 2.0 if mistakes.mag_at_s is None else mistakes.mag_at_s
     )
@@ -154,14 +156,14 @@ def barometer(scenario: Scenario, motion: Motion) -> Topic:
     time_us = _grid_us(motion.duration_s, BAROMETER_RATE_HZ)
     height_m = HOME_POSITION[2] - motion.at(seconds(time_us)).position_m[:, 2]
     height_m -= height_error(scenario, seconds(time_us))
-    unit_noise = random_stream(scenario, Stream.BAROMETER).standard_normal(len(time_us))
+    unit_noise = random_stream(scenario, RandomStream.BAROMETER).standard_normal(len(time_us))
     height_m += SIGMA_BAROMETER_M * unit_noise
     return topic("vehicle_air_data", timestamps(time_us) | {"baro_alt_meter": height_m})
 
 
 def height_error(scenario: Scenario, time_s: Array) -> Array:
     """Simulate the slow height error (m, positive downward)."""
-    rng, rms = random_stream(scenario, Stream.HEIGHT), np.array([HEIGHT_ERROR_M])
+    rng, rms = random_stream(scenario, RandomStream.HEIGHT), np.array([HEIGHT_ERROR_M])
     return Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S).at(time_s)[0][:, 0]
 
 
@@ -174,8 +176,11 @@ def limit_rate(full_topic: Topic, rate_hz: float, is_kept: BoolArray | bool = Tr
 
 def logged_imu(full_topic: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
     """Return sensor_combined as logged, with the gap and the reduced rate of ``mistakes``."""
-    times_s, gap = seconds(time_us(full_topic)), (mistakes.imu_dropout_s, mistakes.imu_dropout_at_s)
-    is_outside_gap = _is_outside_gap(times_s, *gap, motion.duration_s)
+    times_s, gap_values = (
+        seconds(time_us(full_topic)),
+        (mistakes.imu_dropout_s, mistakes.imu_dropout_at_s),
+    )
+    is_outside_gap = _is_outside_gap(times_s, *gap_values, motion.duration_s)
     return limit_rate(full_topic, mistakes.imu_rate_hz, is_outside_gap)
 
 
@@ -189,12 +194,12 @@ def measure_imu(
     mistakes: Mistakes,
     motion: Motion,
     time_s: Array,
-    stream: Stream,
+    stream: RandomStream,
     mean_count: float = 1.0,
 ) -> ArrayPair:
     """Simulate specific force (m/s²) and angular rate (rad/s), mean of ``mean_count`` samples."""
     truth = attitude(motion.at(time_s))
-    rng, measured = random_stream(scenario, stream), []
+    rng, measurements = random_stream(scenario, stream), []
     for true_value, bias, sigma in zip(
         (truth.specific_force_m_s2, truth.angular_rate_rad_s),
         biases(scenario, mistakes),
@@ -202,8 +207,8 @@ def measure_imu(
         strict=True,
     ):
         noise = 1.0 / np.sqrt(mean_count) * sigma * rng.standard_normal(true_value.shape)
-        measured.append(true_value + bias + noise)
-    force_m_s2, rate_rad_s = measured
+        measurements.append(true_value + bias + noise)
+    force_m_s2, rate_rad_s = measurements
     return force_m_s2, rate_rad_s
 
 
@@ -237,7 +242,7 @@ def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rot
     """Simulate the error of the logged attitude, a rotation in NED."""
     tilt_rms_deg = scenario.tilt_error_deg
     rms_rad = np.radians([tilt_rms_deg, tilt_rms_deg, scenario.yaw_error_deg])
-    rng = random_stream(scenario, Stream.ATTITUDE)
+    rng = random_stream(scenario, RandomStream.ATTITUDE)
     error_rad = Sines.draw(rng, rms_rad, SLOW_ERROR_PERIODS_S).at(time_s)[0]
     if mistakes.heading_deg:
         heading_error_rad = np.radians(mistakes.heading_deg)
@@ -274,7 +279,7 @@ def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
 
 def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SimulatedPositions:
     """Simulate UWB (aisle), VIO (loop) or GNSS (outdoor) positions with injected faults."""
-    timing_rng = random_stream(scenario, Stream.TIMING)
+    timing_rng = random_stream(scenario, RandomStream.TIMING)
     interval_s = 1.0 / scenario.source_rate_hz
     position_count = int((motion.duration_s - FIRST_POSITION_S) / interval_s)
     nominal_s = FIRST_POSITION_S + interval_s * np.arange(position_count)
@@ -291,7 +296,9 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
     position_m += drift_m
     is_outdoor = scenario.kind == "outdoor"
     sigma_m = scenario.source_sigma_m * (GNSS_SIGMA_FACTORS if is_outdoor else 1.0)
-    position_m += sigma_m * random_stream(scenario, Stream.SOURCE).standard_normal(position_m.shape)
+    position_m += sigma_m * random_stream(scenario, RandomStream.SOURCE).standard_normal(
+        position_m.shape
+    )
     is_airborne = (time_s > motion.take_off_s) & (time_s < motion.touch_down_s)
     outlier_offset_m, is_outlier = outliers(scenario, mistakes, is_airborne)
     position_m += outlier_offset_m
@@ -312,7 +319,7 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
     reported_sigma = reported_sigma_m(scenario, mistakes)
     velocity_m_s = None
     if is_outdoor:
-        velocity_noise = random_stream(scenario, Stream.FIX_VELOCITY).standard_normal(
+        velocity_noise = random_stream(scenario, RandomStream.FIX_VELOCITY).standard_normal(
             position_m.shape
         )
         velocity_m_s = (
@@ -357,7 +364,7 @@ def slow_error(
 ) -> Array:
     """Simulate time-correlated noise (m), shape (n, 3): a first-order Gauss-Markov process."""
     noise_m = (
-        random_stream(scenario, Stream.SLOW).standard_normal((sample_count, 3))
+        random_stream(scenario, RandomStream.SLOW).standard_normal((sample_count, 3))
         * mistakes.slow_error_m
     )
     decay_factor = np.exp(-interval_s / mistakes.slow_error_s)
@@ -367,7 +374,7 @@ def slow_error(
 
 def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
     """Simulate the VIO drift (m, NED), shape (n, 3): proportional to distance, and random walk."""
-    rng = random_stream(scenario, Stream.DRIFT)
+    rng = random_stream(scenario, RandomStream.DRIFT)
     drift_per_metre = scenario.vio_drift * direction(rng.uniform(0.0, 360.0))
     step_sigmas = np.sqrt(np.diff(distance_m, prepend=0.0))[:, None]
     random_walk = np.cumsum(step_sigmas * rng.standard_normal((len(distance_m), 3)), axis=0)
@@ -382,13 +389,13 @@ def outliers(
     Outliers occur in bursts in one horizontal direction, as from an anchor without line of sight.
     The sizes are 0.5 to 1.5 times ``nlos_size_m``.
     """
-    offset_m = np.zeros((len(is_airborne), 3))
+    outlier_error_m = np.zeros((len(is_airborne), 3))
     is_outlier = np.zeros(len(is_airborne), np.bool_)
     airborne_indices = np.flatnonzero(is_airborne)
     outlier_count = round(len(airborne_indices) * mistakes.nlos_percent / 100.0)
     if outlier_count == 0:
-        return offset_m, is_outlier
-    rng = random_stream(scenario, Stream.NLOS)
+        return outlier_error_m, is_outlier
+    rng = random_stream(scenario, RandomStream.NLOS)
     burst_count = -(-outlier_count // MEAN_OUTLIER_BURST_LENGTH)
     burst_lengths = 1 + rng.multinomial(
         outlier_count - burst_count, np.full(burst_count, 1.0 / burst_count)
@@ -403,10 +410,10 @@ def outliers(
     ]
     angle_rad = rng.uniform(0.0, 2.0 * np.pi, burst_count)[burst_index]
     size_m = mistakes.nlos_size_m * rng.uniform(0.5, 1.5, outlier_count)
-    offset_m[outlier_indices, 0] = size_m * np.cos(angle_rad)
-    offset_m[outlier_indices, 1] = size_m * np.sin(angle_rad)
+    outlier_error_m[outlier_indices, 0] = size_m * np.cos(angle_rad)
+    outlier_error_m[outlier_indices, 1] = size_m * np.sin(angle_rad)
     is_outlier[outlier_indices] = True
-    return offset_m, is_outlier
+    return outlier_error_m, is_outlier
 
 
 def keep_at_rate(time_s: Array, rate_hz: float) -> BoolArray:

@@ -18,7 +18,13 @@ from measured import seconds
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 FOLDER = Path(__file__).parents[3] / "shared" / "pose_graphs"
-NAMED = ("SE-Sync_manhattan", "SE-Sync_sphere2500", "SE-Sync_parking-garage")
+NAMED = (
+    "SE-Sync_manhattan",
+    "SE-Sync_sphere2500",
+    "SE-Sync_parking-garage",
+    "SE-Sync_city10000",
+    "SE-Sync_torus3D",
+)
 SIZES = (100, 300, 1000, 3000, 10_000)
 
 

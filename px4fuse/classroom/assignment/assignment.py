@@ -60,7 +60,7 @@ def simulate_assigned_flight(
     )
     log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()
-    true_values = flights.answer(simulation)["truth"]
+    true_values = flights.make_answer_key(simulation)["truth"]
     choices = select_choices(partial(random_uniform, secret, student.student_id, kind))
     right_form = replace(right_form_answers(simulation, sha256), choices=choices)
     return log, RightAnswers(

@@ -111,7 +111,7 @@ class RightFormAnswers(Record):
 
 def right_form_answers(simulation: flights.Simulation, log_sha256: str) -> RightFormAnswers:
     """Compute the right answers from the simulated flight and its analysis by px4fuse."""
-    answer = flights.answer(simulation)
+    answer = flights.make_answer_key(simulation)
     comparison = compare_simulation(simulation)
     mistakes = tuple(
         _injected_fault(name, values, answer["truth"], comparison)

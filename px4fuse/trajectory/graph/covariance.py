@@ -1,4 +1,4 @@
-"""Test (gate) of loop closures against odometry, with the covariance of the odometry."""
+"""χ² test (gate) of loop closures against odometry, with the covariance of the odometry."""
 
 from collections.abc import Sequence
 
