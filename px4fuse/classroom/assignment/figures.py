@@ -121,11 +121,8 @@ def _figures_png(comparisons: Mapping[str, Comparison]) -> bytes:
 
 def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterName) -> None:
     """Plot the position error of a filter with ±2σ; grey background during motion."""
-    name, errors, truth = (
-        FILTER_NAMES[filter_name],
-        position_errors(result, filter_name),
-        result.truth,
-    )
+    name, truth = FILTER_NAMES[filter_name], result.truth
+    errors = position_errors(result, filter_name)
     axes.set_title(f"{name}: error along the aisle and ±2σ (m)")
     assert isinstance(errors, pd.DataFrame)
     assert isinstance(truth, pd.DataFrame)
