@@ -99,7 +99,9 @@ class TestDraw:
         # a loop contains no ground truth, which would show the landing
         assert scenario.truth
         assert not assign_random_flight(SECRET, "s1", "loop").scenario.truth
-        assert not assign_random_flight(SECRET, "s1", "aisle", logs_truth=False).scenario.truth
+        assert not assign_random_flight(
+            SECRET, "s1", "aisle", with_ground_truth=False
+        ).scenario.truth
         assert (scenario.seed, scenario.sigma_uwb_m, scenario.heading_deg) == PINNED[0]
         assert drawn.mistake_options == PINNED[1]
         loops = [

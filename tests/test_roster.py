@@ -175,16 +175,16 @@ def test_student_is_matched_by_id_before_name() -> None:
     said = (("42", "Max Roe"), ("", "Roe, Max"), ("99", "Jane Doe"), ("", ""))
     assert [CLASS.student_index(Person(*each)) for each in said] == [0, 1, 0, None]
     # an exact id has priority over one with leading zeros
-    register = ClassList([Person("042"), Person("42")])
-    assert [register.student_index(Person(each)) for each in ("42", "0042")] == [1, None]
+    class_list = ClassList([Person("042"), Person("42")])
+    assert [class_list.student_index(Person(each)) for each in ("42", "0042")] == [1, None]
 
 
 def test_class_list_is_completed_from_grading_worksheet() -> None:
-    register = ClassList(
+    class_list = ClassList(
         [Person("0042", "Jane Doe"), Person("43", "Max Roe")],
         [Person("42", "Doe J", "j@x.edu", "jdoe", {"moodle": "7"}), Person("9", "No One")],
     )
-    assert register.people == [
+    assert class_list.people == [
         Person("0042", "Jane Doe", "j@x.edu", "jdoe", {"moodle": "7"}), Person("43", "Max Roe"),
     ]  # fmt: skip
 
@@ -196,7 +196,7 @@ def rows(text: str, separator: str = ",") -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(text, newline=""), delimiter=separator))
 
 
-def register(sheet) -> ClassList:
+def class_list(sheet) -> ClassList:
     return ClassList(PEOPLE, read_people(sheet))
 
 
@@ -213,7 +213,7 @@ def test_fill_grades_changes_only_grade_and_feedback(
     tmp_path, text, column, title, feedback, encoding
 ) -> None:
     sheet = table(tmp_path, text, encoding)
-    made, notes = fill_grades(sheet, GRADES, register(sheet), column, TEXTS)
+    made, notes = fill_grades(sheet, GRADES, class_list(sheet), column, TEXTS)
     content = made.content()
     assert content[:2] == sheet.path.read_bytes()[:2]
     separator = "\t" if text is BLACKBOARD else ","
@@ -242,7 +242,7 @@ def test_fill_grades_matches_anonymous_row_by_participant_number(tmp_path) -> No
 
 def test_fill_grades_scales_points_to_the_platform_maximum(tmp_path) -> None:
     sheet = table(tmp_path, MOODLE)
-    scaled = fill_grades(sheet, GRADES, register(sheet), "", TEXTS, 50.0)[0]
+    scaled = fill_grades(sheet, GRADES, class_list(sheet), "", TEXTS, 50.0)[0]
     maximum = GRADES[0].max_points
     assert float(scaled.rows[0][5]) == round(87.5 * 50.0 / maximum, 2)
 
@@ -254,7 +254,7 @@ def test_read_class_list_reads_due_time_extension(tmp_path) -> None:
 
 def test_fill_grades_reports_a_student_missing_in_the_table(tmp_path) -> None:
     sheet = table(tmp_path, "\r\n".join(MOODLE.split("\r\n")[:2]) + "\r\n")
-    _, notes = fill_grades(sheet, GRADES, register(sheet), "", TEXTS)
+    _, notes = fill_grades(sheet, GRADES, class_list(sheet), "", TEXTS)
     assert notes == ("table.csv has no row for Max Roe. These grades were not entered.",)
 
 
@@ -265,7 +265,7 @@ def test_fill_grades_keeps_semicolon_and_decimal_comma(tmp_path) -> None:
     assert made.content() == b"Matrikelnummer;Name;Punkte;Kommentar\r\n0042;Jane Doe;87.5;\r\n"
     moodle = MOODLE.replace(",100.00,", ',"100,00",')
     sheet = table(tmp_path, moodle)
-    made, _ = fill_grades(sheet, GRADES, register(sheet), "", TEXTS)
+    made, _ = fill_grades(sheet, GRADES, class_list(sheet), "", TEXTS)
     assert made.rows[0][5] == "87,5"
 
 

@@ -42,7 +42,7 @@ TRUTH_ONLY_CHANGE_KINDS = frozenset({"time offset", "delay", "rotation"})
 REBOOT_PARAMETER_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
 # Minimum fraction of rejected positions that the table of re-runs shows
 MIN_SHOWN_REJECTED_FRACTION = 0.005
-TARGETS_BY_GROUP: Mapping[str, Target] = {
+TARGET_BY_GROUP: Mapping[str, Target] = {
     "position source": "sender",
     "time": "sender",
     "IMU": "flight",
@@ -51,8 +51,8 @@ TARGETS_BY_GROUP: Mapping[str, Target] = {
     "loops": "source",
     "logging": "logging",
 }
-# Devices to be changed, by finding id; exceptions from TARGETS_BY_GROUP
-TARGETS_BY_ID: Mapping[str, Target] = {
+# Devices to be changed, by finding id; exceptions from TARGET_BY_GROUP
+TARGET_BY_ID: Mapping[str, Target] = {
     "source_drift": "source",
     "source_lever_arm": "EKF2",
     "source_coordinate_constant": "EKF2",
@@ -273,7 +273,7 @@ def _no_change_reason(
 
 
 def _target_of(finding: Finding, source: PositionTrack | None = None) -> Target:
-    target = TARGETS_BY_ID.get(finding.id) or TARGETS_BY_GROUP[CATALOGUE[finding.id].group]
+    target = TARGET_BY_ID.get(finding.id) or TARGET_BY_GROUP[CATALOGUE[finding.id].group]
     is_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_receiver else target
 

@@ -148,7 +148,7 @@ def assign_random_flight(
     student_id: str,
     kind: FlightKind,
     fault_count: int | None = None,
-    logs_truth: bool = True,
+    with_ground_truth: bool = True,
 ) -> AssignedFlight:
     """Select injected faults and parameters of a student's simulated flight at random.
 
@@ -158,7 +158,7 @@ def assign_random_flight(
         "mixed" selects aisle or loop at random.
     fault_count : int, optional
         Number of injected faults; random by default.
-    logs_truth : bool
+    with_ground_truth : bool
         True to log the ground truth. The log of a loop never contains the ground truth, because
         students have to estimate the landing place.
 
@@ -204,7 +204,7 @@ def assign_random_flight(
         mistake_options.append(fault.format_option(difficulty, sign, random_number(f"at {name}")))
     scenario = make_scenario(
         kind,
-        truth=logs_truth and kind == "aisle",
+        truth=with_ground_truth and kind == "aisle",
         seed=random_bits(secret, student_id, kind, "seed"),
         **random_scenario_numbers(kind, random_number),
     )

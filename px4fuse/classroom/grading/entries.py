@@ -122,7 +122,7 @@ class Course:
     anonymous: bool = False
 
     @cached_property
-    def register(self) -> ClassList:
+    def class_list(self) -> ClassList:
         """Students of the class, with the data of all worksheets."""
         people_by_sheet = [read_people(sheet) for sheet in self.worksheets]
         answers = self.key.answers if self.key else ()
@@ -158,22 +158,22 @@ def build_grades(
     notes : tuple of str
         Sentences about points in ``overrides.csv`` without a matching student or item.
     """
-    has_class_list = bool(course.register.people)
-    register = course.register if has_class_list else _collect_students(reports, submissions)
+    has_class_list = bool(course.class_list.people)
+    class_list = course.class_list if has_class_list else _collect_students(reports, submissions)
     attempts_by_index: dict[int | None, list[Attempt]] = defaultdict(list)
     for report, submission in zip(reports, submissions, strict=True):
-        student_index = register.student_index(submission.origin.person)
+        student_index = class_list.student_index(submission.origin.person)
         if student_index is None:
-            student_index = register.student_index(Person(report.student_id, report.student))
+            student_index = class_list.student_index(Person(report.student_id, report.student))
         attempts_by_index[student_index].append(
-            _make_attempt(report, submission, course, student_index, register)
+            _make_attempt(report, submission, course, student_index, class_list)
         )
     max_points = max((report.max_points for report in reports), default=0.0)
     grades = [
         _choose_attempt(attempts_by_index[student_index], course)
         if attempts_by_index[student_index]
         else Grade(person.name, person.student_id, None, max_points=max_points)
-        for student_index, person in enumerate(register.people)
+        for student_index, person in enumerate(class_list.people)
     ]
     unknown_student_flag = "Neither the report nor the learning platform names a student."
     if has_class_list:
@@ -204,22 +204,22 @@ def _collect_students(
     reports: Sequence[GradedReport], submissions: Sequence[Submission]
 ) -> ClassList:
     """Make a class list of the students that learning platforms and reports name."""
-    register = ClassList()
+    class_list = ClassList()
     for report, submission in zip(reports, submissions, strict=True):
         person = submission.origin.person
-        reported_student_index = register.student_index(Person(report.student_id))
+        reported_student_index = class_list.student_index(Person(report.student_id))
         if person.numbers or person.login:
-            if register.student_index(person) is not None:
+            if class_list.student_index(person) is not None:
                 continue
             # ignore the id in the report if another student already has this id
             free_id = report.student_id if reported_student_index is None else ""
             student_id = person.student_id or free_id
             name = one_line(report.student if student_id else person.name, 200) or person.name
             student_id = next(filter(None, (student_id, person.login, *person.numbers.values())))
-            register.people.append(replace(person, student_id=student_id, name=name))
+            class_list.people.append(replace(person, student_id=student_id, name=name))
         elif report.student_id and reported_student_index is None:
-            register.people.append(Person(report.student_id, one_line(report.student, 200)))
-    return register
+            class_list.people.append(Person(report.student_id, one_line(report.student, 200)))
+    return class_list
 
 
 def _make_attempt(
@@ -227,11 +227,13 @@ def _make_attempt(
     submission: Submission,
     course: Course,
     student_index: int | None,
-    register: ClassList,
+    class_list: ClassList,
 ) -> Attempt:
     """Compute the grade of a student if only this report counts."""
     origin, platform = submission.origin, submission.origin.platform.capitalize()
-    person = Person(report.student_id) if student_index is None else register.people[student_index]
+    person = (
+        Person(report.student_id) if student_index is None else class_list.people[student_index]
+    )
     due_time = course.due
     if due_time is not None and person.extended_due:
         due_time = parse_due_time(
@@ -261,9 +263,11 @@ def _make_attempt(
             "The student imitated the file name of a learning platform "
             f"(platform of the export: {platform or 'none'})."
         )
-    reported_student_index = register.student_index(Person(report.student_id)) if platform else None
+    reported_student_index = (
+        class_list.student_index(Person(report.student_id)) if platform else None
+    )
     if reported_student_index is not None and student_index not in (None, reported_student_index):
-        reported_person = register.people[reported_student_index]
+        reported_person = class_list.people[reported_student_index]
         flags.append(
             f"The id in the report is that of {reported_person.student_id} "
             f"({reported_person.name or 'no name'}), but {platform} names another student."
@@ -404,7 +408,7 @@ def read_overrides(path: Path) -> Overrides:
         raise SettingsError(f"{path}: no column {', '.join(missing_titles)}.", remedy)
     overrides: dict[str, dict[str, Override]] = defaultdict(dict)
     for row_number, row in enumerate(sheet.rows, start=2):
-        if any(cell.strip() for cell in row[len(sheet.head) :]):
+        if any(cell.strip() for cell in row[len(sheet.column_titles) :]):
             raise SettingsError(
                 f"{path}: row {row_number} has more cells than the header.",
                 "Put a comment that contains a comma in double quotes.",

@@ -86,9 +86,9 @@ def grade(
     found_submissions, notes = submissions.find_submissions(paths)
     jobs = []
     for submission in found_submissions:
-        student_index = course.register.student_index(submission.origin.person)
+        student_index = course.class_list.student_index(submission.origin.person)
         submitter_id = (
-            "" if student_index is None else course.register.people[student_index].student_id
+            "" if student_index is None else course.class_list.people[student_index].student_id
         )
         jobs.append((submission, submitter_id))
     rubric_and_key, log_by_sha256 = (course.rubric, course.key), files_by_sha256(course.logs)

@@ -100,7 +100,7 @@ def write_class(
     Parameters
     ----------
     grades : sequence of Grade
-        Grades of the students in ``course.register``, then of unknown students.
+        Grades of the students in ``course.class_list``, then of unknown students.
 
     Returns
     -------
@@ -148,7 +148,7 @@ def write_class(
     table_names = make_unique((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
     for sheet, name in zip(course.worksheets, table_names, strict=True):
         filled_sheet, sheet_notes = fill_grades(
-            sheet, grades, course.register, course.column, feedback_texts, course.scale
+            sheet, grades, course.class_list, course.column, feedback_texts, course.scale
         )
         contents[f"{GRADES_FOLDER}/{name}"] = filled_sheet.content()
         notes += sheet_notes
@@ -338,7 +338,7 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
     """
     title_by_index = {
         index: title
-        for index, title in enumerate(sheet.head)
+        for index, title in enumerate(sheet.column_titles)
         if not any(READ_ONLY_MARK in row[index] for row in sheet.rows[:3])
     }
     grade_index = sheet.column(GRADE_TITLES)
@@ -372,7 +372,7 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
 def fill_grades(
     sheet: Sheet,
     grades: Sequence[Grade],
-    register: ClassList,
+    class_list: ClassList,
     column: str,
     feedback: Sequence[str],
     platform_max_points: float | None = None,
@@ -382,7 +382,7 @@ def fill_grades(
     Parameters
     ----------
     grades, feedback : sequences
-        Grade and feedback of each student in ``register``, then of unknown students.
+        Grade and feedback of each student in ``class_list``, then of unknown students.
     column : str
         Title of the grade column; "" if the table has only one.
     platform_max_points : float, optional
@@ -411,7 +411,7 @@ def fill_grades(
     notes, found_indices = [], set()
     for row in cells_by_row:
         person = read_student(sheet, row)
-        student_index = register.student_index(person) if person else None
+        student_index = class_list.student_index(person) if person else None
         if student_index is None:
             continue
         found_indices.add(student_index)
@@ -434,7 +434,7 @@ def fill_grades(
             row[feedback_index] = format_feedback(feedback[student_index])
     missing_names = [
         names[index]
-        for index in range(len(register.people))
+        for index in range(len(class_list.people))
         if index not in found_indices and grades[index].total is not None
     ]
     if missing_names:
