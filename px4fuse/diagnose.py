@@ -245,7 +245,7 @@ def diagnose_or_check_aids(
     flight = flight or read_flight(request, progress)
     if request.position_source or any(track.origin.is_automatic for track in flight.positions):
         return diagnose(request, progress, flight)
-    no_position, aids = explain_missing_source(flight), evaluate_aids(flight)
+    missing_source, aids = explain_missing_source(flight), evaluate_aids(flight)
     if isinstance(aids, Unavailable):
         if flight.airborne == ():
             raise MissingDataError(
@@ -253,11 +253,11 @@ def diagnose_or_check_aids(
                 f"({aids.reason}). px4fuse info {flight.log.name} lists the logged data."
             )
         raise MissingDataError(
-            f"{flight.log.name}: {no_position.reason}, and EKF2's aiding sources cannot be "
+            f"{flight.log.name}: {missing_source.reason}, and EKF2's aiding sources cannot be "
             f"checked: {aids.reason}",
-            no_position.remedy,
+            missing_source.remedy,
         )
-    return AidsOnlyAnalysis(flight, aids, no_position, find_aids(aids, flight))
+    return AidsOnlyAnalysis(flight, aids, missing_source, find_aids(aids, flight))
 
 
 def run_what_if(

@@ -43,7 +43,7 @@ TRUTH_ONLY_CHANGE_KINDS = frozenset({"time offset", "delay", "rotation"})
 REBOOT_PARAMETER_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
 # Minimum fraction of rejected positions that the table of re-runs shows
 MIN_SHOWN_REJECTED_FRACTION = 0.005
-TARGETS_BY_GROUP: Mapping[str, Target] = {
+TARGET_BY_GROUP: Mapping[str, Target] = {
     "position source": "sender",
     "time": "sender",
     "IMU": "flight",
@@ -52,8 +52,8 @@ TARGETS_BY_GROUP: Mapping[str, Target] = {
     "loops": "source",
     "logging": "logging",
 }
-# Devices to be changed, by finding id; exceptions from TARGETS_BY_GROUP
-TARGETS_BY_ID: Mapping[str, Target] = {
+# Devices to be changed, by finding id; exceptions from TARGET_BY_GROUP
+TARGET_BY_ID: Mapping[str, Target] = {
     "source_drift": "source",
     "source_lever_arm": "EKF2",
     "source_coordinate_constant": "EKF2",
@@ -250,16 +250,16 @@ def _make_actions(
 def _no_change_reason(
     finding: Finding, filter_name: FilterName, sigma_verdicts: Sequence[Verdict]
 ) -> str:
-    word_by_reference = {
+    verdict_by_reference = {
         verdict.against: verdict.word
         for verdict in sigma_verdicts
         if verdict.filter == filter_name and verdict.ratio is not None
     }
-    if not word_by_reference:
+    if not verdict_by_reference:
         return ""
-    if set(word_by_reference.values()) == {"consistent"}:
+    if set(verdict_by_reference.values()) == {"consistent"}:
         needs_ground_truth = CATALOGUE[finding.id].reruns & TRUTH_ONLY_CHANGE_KINDS
-        if needs_ground_truth and "truth" not in word_by_reference:
+        if needs_ground_truth and "truth" not in verdict_by_reference:
             return "no change: only ground truth shows this fault, and the log has none"
         return "no change: the reported σ is consistent"
     if finding.id == "source_outliers":
@@ -267,14 +267,14 @@ def _no_change_reason(
             return (
                 "no option of KF rejects outliers, and a larger SIGMA_Z (--sigma-z) only hides them"
             )
-        if word_by_reference.get("truth", "consistent") == "consistent":
+        if verdict_by_reference.get("truth", "consistent") == "consistent":
             return "no change: EKF2's gate rejects outliers, and the reported σ is consistent"
     fault_text = "drift of the source" if finding.id == "source_drift" else "this fault"
     return f"no setting removes {fault_text}"
 
 
 def _target_of(finding: Finding, source: PositionTrack | None = None) -> Target:
-    target = TARGETS_BY_ID.get(finding.id) or TARGETS_BY_GROUP[CATALOGUE[finding.id].group]
+    target = TARGET_BY_ID.get(finding.id) or TARGET_BY_GROUP[CATALOGUE[finding.id].group]
     is_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_receiver else target
 

@@ -22,7 +22,7 @@ from px4fuse.simulation.scenario import make_scenario
 
 FIGURE_COUNT = 3
 # Number of passes along the aisle in each simulated flight
-PASSES = 4
+PASS_COUNT = 4
 # Minimum speed (m/s) along the aisle for a grey background in the plots
 MIN_GREY_SPEED_M_S = 0.2
 # Questions about each figure, by the field of FigureFault that contains the right answer
@@ -91,7 +91,7 @@ def draw_figures(random_number: Callable[[str], float]) -> bytes:
 
         numbers = random_scenario_numbers("aisle", figure_random_number)
         seed = int(2**53 * figure_random_number("seed"))
-        scenario = make_scenario("aisle", passes=PASSES, seed=seed, **numbers)
+        scenario = make_scenario("aisle", passes=PASS_COUNT, seed=seed, **numbers)
         faults = parse_faults(tuple(filter(None, [FAULTS[kind].option])))
         comparisons[title] = compare_simulation(flights.simulate(scenario, faults))
     return _figures_png(comparisons)
@@ -103,8 +103,8 @@ def _figures_png(comparisons: Mapping[str, Comparison]) -> bytes:
 
     png_buffer = BytesIO()
     with style.report_style():
-        picture = Figure(figsize=(17.0, 3.6 * len(comparisons)), layout="constrained")
-        rows = picture.subplots(len(comparisons), 4, squeeze=False)
+        figure = Figure(figsize=(17.0, 3.6 * len(comparisons)), layout="constrained")
+        rows = figure.subplots(len(comparisons), 4, squeeze=False)
         for (title, comparison), axes in zip(comparisons.items(), rows, strict=True):
             result = comparison.main.with_flight_tracks()
             axes[0].set_title(f"{title}: innovations along the aisle and ±2√S (m)")
@@ -114,17 +114,14 @@ def _figures_png(comparisons: Mapping[str, Comparison]) -> bytes:
             for axis in axes[:3]:
                 style.label_time_axis(axis, with_time_label=True)
             _draw_map(axes[3], comparison)
-        picture.savefig(png_buffer, format="png", dpi=90, metadata={"Software": None})
+        figure.savefig(png_buffer, format="png", dpi=90, metadata={"Software": None})
     return png_buffer.getvalue()
 
 
 def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterName) -> None:
     """Plot the position error of a filter with ±2σ; grey background during motion."""
-    name, errors, truth = (
-        FILTER_NAMES[filter_name],
-        position_errors(result, filter_name),
-        result.truth,
-    )
+    name, truth = FILTER_NAMES[filter_name], result.truth
+    errors = position_errors(result, filter_name)
     axes.set_title(f"{name}: error along the aisle and ±2σ (m)")
     assert isinstance(errors, pd.DataFrame)
     assert isinstance(truth, pd.DataFrame)

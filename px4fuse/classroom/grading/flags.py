@@ -31,7 +31,7 @@ MIN_SEGMENT_FRACTION = 0.5
 MAX_DRIFT_FACTOR = 4.0
 MAX_LISTED_REPORTS = 4
 # Pairs of reports with equal contents
-Pairs = Iterator[tuple[GradedReport, GradedReport]]
+ReportPairs = Iterator[tuple[GradedReport, GradedReport]]
 
 
 def flag_pages(verification: Verification) -> Iterator[str]:
@@ -193,7 +193,7 @@ def _same_pairs(
     reports: Sequence[GradedReport],
     content_of: Callable[[GradedReport], object],
     owner_of: Callable[[GradedReport], str],
-) -> Pairs:
+) -> ReportPairs:
     reports_by_content: dict[object, list[GradedReport]] = defaultdict(list)
     for report in reports:
         reports_by_content[content_of(report)].append(report)
@@ -203,7 +203,7 @@ def _same_pairs(
                 yield report, other_report
 
 
-def _copied_forms(reports: Sequence[GradedReport]) -> Pairs:
+def _copied_forms(reports: Sequence[GradedReport]) -> ReportPairs:
     """Yield pairs of reports of different students whose answers have equal numbers."""
     numbers_by_report = [(report, _form_numbers(report)) for report in reports]
     for (report, numbers), (other_report, other_numbers) in combinations(numbers_by_report, 2):

@@ -300,8 +300,8 @@ def evidence_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
 
 
 def panels_showing(fault_kind: str) -> list[str]:
-    kinds_by_panel = POINTS_TABLE["shows"]
-    return [*(panel for panel, kinds in kinds_by_panel.items() if fault_kind in kinds), "cover"]
+    kinds_by_panel = POINTS_TABLE["shows"].items()
+    return [*(panel for panel, kinds in kinds_by_panel if fault_kind in kinds), "cover"]
 
 
 def correction_fraction(

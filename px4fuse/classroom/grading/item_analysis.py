@@ -63,7 +63,7 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
                     continue
                 item_row = item.points, item.max_points, total_points - item.points
                 rows_by_item[group_index, f"{prefix}{item.title}"].append(item_row)
-        for kind, is_named in report.mistakes.items():
+        for kind, is_named in report.is_found_by_fault.items():
             rows_by_item[2, f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
     statistics = []
     for (_, title), rows in sorted(rows_by_item.items(), key=lambda item: item[0][0]):
