@@ -306,7 +306,7 @@ TESTED_ELSEWHERE = {
     "ekf2_gps_delay_wrong", "ekf2_heading_error", "ekf2_noise_too_large", "ekf2_noise_too_small",
     "false_loop_closure", "loop_closure_inconsistent", "loop_drift_too_small",
     "loop_landing_assumed", "loop_on_absolute_positions", "sigma_a_too_large", "sigma_a_too_small",
-    "sigma_z_too_large", "sigma_z_too_small", "source_axes_wrong", "source_convention_ambiguous",
+    "sigma_z_too_large", "sigma_z_too_small", "source_axes_wrong", "source_convention_ambiguous", "source_height_constant",
     "source_downsampled",
     "source_frame_misaligned", "source_low_pass_filtered", "source_noise_time_correlated",
     "source_noise_unequal_axes", "source_noise_varies", "source_orientation_copied",

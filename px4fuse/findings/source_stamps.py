@@ -39,6 +39,8 @@ MIN_SAMPLES = 10
 MIN_CONSISTENT_FRACTION = 0.95
 # Minimum mean number of positions in a burst of positions that arrive together
 MIN_BURST_SIZE = 2.5
+# Minimum number of bursts: fewer pauses are gaps in the position source
+MIN_BURST_COUNT = 20
 # Maximum ratio of the interval within bursts of positions to the pause between bursts
 MAX_BURST_INTERVAL_RATIO = 0.1
 ANSWER_TIMESYNC = (
@@ -83,7 +85,10 @@ def detect_bursts(analysis: Analysis) -> Findings:
     if not is_pause.any() or (burst_size := 1.0 / float(is_pause.mean())) < MIN_BURST_SIZE:
         return
     pause_s = float(np.median(intervals_s[is_pause]))
-    if np.median(intervals_s[~is_pause]) > MAX_BURST_INTERVAL_RATIO * pause_s:
+    if (
+        is_pause.sum() < MIN_BURST_COUNT
+        or np.median(intervals_s[~is_pause]) > MAX_BURST_INTERVAL_RATIO * pause_s
+    ):
         return
     yield error(
         "source_timestamp_jitter",
