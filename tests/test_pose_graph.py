@@ -437,7 +437,9 @@ def test_common_factor_of_information_does_not_change_gate() -> None:
     ends = np.arange(4, 34)
     truth, information = graph.poses, np.tile(graph.information[:1], (len(ends), 1, 1))
     graph = simulated(replace(
-        graph, first_nodes=np.append(graph.first_nodes, ends), second_nodes=np.append(graph.second_nodes, ends - 4),
+        graph,
+        first_nodes=np.append(graph.first_nodes, ends),
+        second_nodes=np.append(graph.second_nodes, ends - 4),
         measurements=np.vstack([graph.measurements, lie.between(truth[ends], truth[ends - 4])]),
         information=np.concatenate([graph.information, information]),
     ), 3)  # fmt: skip
