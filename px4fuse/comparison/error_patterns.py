@@ -75,8 +75,6 @@ MIN_AMPLITUDE_SIGMAS = 1.0
 MIN_PERIODS = 5.0
 # Maximum tested frequency (Hz) of a sinusoidal error
 MAX_FREQUENCY_HZ = 2.0
-# A sinusoidal error is not reported if the motion contains more than this fraction of its mean
-# square at the frequency of the error
 # Distance of the tested frequencies, in periods in the flight
 FREQUENCY_STEP_PERIODS = 0.2
 # Minimum number of bins per period of the highest frequency: an amplitude is wrong by 0.2 %
