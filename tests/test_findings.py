@@ -313,7 +313,7 @@ TESTED_ELSEWHERE = {
     "source_orientation_wrong", "source_outliers", "source_position_jump",
     "source_reported_variance_wrong", "source_samples_repeated",
     "source_time_offset", "source_timestamps_are_arrival_times",
-    "attitude_late", "source_latency_grows",
+    "attitude_late", "source_latency_varies",
     "source_unit_wrong", "source_is_ekf2_estimate", "source_two_senders",
     "source_positions_rounded", "source_lever_arm", "source_timestamp_unit",
     "source_timestamps_shared", "source_position_held", "source_zero_positions",
