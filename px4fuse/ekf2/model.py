@@ -438,8 +438,8 @@ def _updates_by_aid(
         )
     )
 
-    def updates_along(axes: Sequence[AxisName], columns: slice, *more: Any) -> pd.DataFrame:
-        update_log = np.column_stack([nu[:, columns], S[:, columns], *more])
+    def updates_along(axes: Sequence[AxisName], columns: slice, *other_values: Any) -> pd.DataFrame:
+        update_log = np.column_stack([nu[:, columns], S[:, columns], *other_values])
         return update_table(update_log[:, None], events.time_s[:, None], end_s, axes)
 
     position_variance = variance_after[:, HORIZONTAL_POSITION]
@@ -513,8 +513,8 @@ def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Ar
     state = event_states[np.append(0, interval_index)]
 
     def sum_since_event(increments: Array) -> Array:
-        total = np.cumsum(increments, axis=0)
-        return np.asarray(total - (total - increments)[first_step])
+        cumulative_sum = np.cumsum(increments, axis=0)
+        return np.asarray(cumulative_sum - (cumulative_sum - increments)[first_step])
 
     def value_before_step(after_step: Array, rows: slice) -> Array:
         shifted = np.concatenate([after_step[:1], after_step[:-1]])
