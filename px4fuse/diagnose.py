@@ -84,9 +84,9 @@ def diagnose(
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
     flight = flight or read_flight(request, progress)
-    prepared = prepare_comparison(flight, request, progress, as_sent=as_sent)
-    kf_runs = run_kf(prepared, progress)
-    comparison = compare(prepared, kf_runs)
+    prepared_comparison = prepare_comparison(flight, request, progress, as_sent=as_sent)
+    kf_runs = run_kf(prepared_comparison, progress)
+    comparison = compare(prepared_comparison, kf_runs)
     return replace(find_faults(comparison, progress), request=request)
 
 
@@ -196,11 +196,11 @@ def prepare_comparison(
 
     For arguments and errors see :func:`diagnose`.
     """
-    prepared = prepare(flight, request, as_sent=as_sent)
+    prepared_comparison = prepare(flight, request, as_sent=as_sent)
     # read_flight has already corrected the time offset of a position file
     if request.clock_offset_s != AUTO or request.position is not None:
-        return prepared
-    _, clock = estimate_noises_and_clock(prepared, progress)
+        return prepared_comparison
+    _, clock = estimate_noises_and_clock(prepared_comparison, progress)
     if isinstance(clock, Unavailable) or not clock.is_determinable:
         raise MissingDataError(
             f"{flight.log.name}: the time offset cannot be estimated from this flight "
@@ -215,7 +215,7 @@ def prepare_comparison(
         )
         if clock.applied_s:
             note += f", in addition to {clock.applied_s:+.3f} s from the check of the timestamps"
-        return replace(prepared, notes=(*prepared.notes, note))
+        return replace(prepared_comparison, notes=(*prepared_comparison.notes, note))
     request = structs.replace(request, clock_offset_s=clock.offset_s)
     return prepare(flight, request, as_sent=as_sent)
 
@@ -225,17 +225,19 @@ def rerun(
 ) -> Reruns:
     """Replay EKF2, explain the difference KF - EKF2, and re-run both with one error corrected."""
     progress("replaying EKF2")
-    corrected = corrected_settings(comparison, estimates.tuning)
+    estimated_settings = corrected_settings(comparison, estimates.tuning)
     # EKF2 replays all parameter sets together, which is faster. The sets must be those that the two
     # following functions request; other sets are replayed again
     model = open_model(
         comparison.flight,
         lambda inputs: [
-            *explanation_configurations(comparison, inputs, corrected),
+            *explanation_configurations(comparison, inputs, estimated_settings),
             *planned_configurations(comparison, estimates, inputs),
         ],
     )
-    difference_steps = explain_ekf2_difference(comparison, model, estimates.clock, corrected)
+    difference_steps = explain_ekf2_difference(
+        comparison, model, estimates.clock, estimated_settings
+    )
     trials = rerun_filters(comparison, estimates, model)
     if isinstance(model, Model):  # to free memory
         model = replace(model, runs=(), intervals={})
@@ -312,8 +314,8 @@ def run_what_if(
             raise
     if comparison is not None:
         tuning, clock = estimate_noises_and_clock(comparison, progress)
-        corrected = corrected_settings(comparison, tuning)
-        difference_steps = explain_ekf2_difference(comparison, model, clock, corrected)
+        estimated_settings = corrected_settings(comparison, tuning)
+        difference_steps = explain_ekf2_difference(comparison, model, clock, estimated_settings)
         if is_default_change:
             changes = ml_ekf2_parameters(comparison, model, tuning, clock)
     parameter_sets = [changes] if changes or request.without else []

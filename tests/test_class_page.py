@@ -16,7 +16,7 @@ from golden_tools import assert_matches_golden, of_values
 from hypothesis import given
 from hypothesis import strategies as st
 
-from px4fuse.classroom.grading.class_page import class_page_html, count_tenths
+from px4fuse.classroom.grading.class_page import class_page_html, count_by_bin
 from px4fuse.classroom.grading.model import Grade, GradedReport, ItemScore, Override
 from px4fuse.classroom.grading.outputs import anonymise_grade
 from px4fuse.html.safe import MAX_TEXT_LENGTH
@@ -300,7 +300,7 @@ def test_grades_page_links_report_redrawn_from_the_log() -> None:
 
 
 def test_points_histogram_has_counts_and_lower_bin_edges() -> None:
-    assert count_tenths([0, 5, 5.5, 9, 99], 10) == [
+    assert count_by_bin([0, 5, 5.5, 9, 99], 10) == [
         (count, f"{edge}") for edge, count in enumerate((1, 0, 0, 0, 0, 2, 0, 0, 0, 2))
     ]
 

@@ -342,7 +342,7 @@ def test_instructor_overrides_csv_accepts_decimal_commas(tmp_path) -> None:
         ("1,A,-1,", "must be a number of 0 or more"),
         ("1,A,nan,", "must be a number of 0 or more"),
         ("1,A,1_5,", "must be a number of 0 or more"),
-        ("1,,5,", "for an item or total"),
+        ("1,,5,", "in a row that names an item or total"),
         ("1,A,5,\n1,A,6,", "student 1 has two rows for the item A"),
     ],
 )

@@ -192,17 +192,19 @@ def white_errors(comparison: Comparison) -> WhiteErrors | None:
     )
     weights = np.ones_like(elapsed_s)  # of Lagrange's interpolation at the time of the position
     for row in range(len(NEIGHBOURS)):
-        for other in set(range(len(NEIGHBOURS))) - {row}:
-            weights[:, row] *= elapsed_s[:, other] / (elapsed_s[:, other] - elapsed_s[:, row])
+        for other_row in set(range(len(NEIGHBOURS))) - {row}:
+            other_s = elapsed_s[:, other_row]
+            weights[:, row] *= other_s / (other_s - elapsed_s[:, row])
     noise_gain = np.sqrt(1.0 + np.sum(weights**2, axis=1))
     phase_s = time_s - interval_s * np.arange(len(time_s))
     late_s = phase_s - median_filter(phase_s, MEDIAN_TIMESTAMP_COUNT, mode="nearest")
     half_window_rows = max(2, round(HALF_VELOCITY_S / interval_s))
-    first, last = (
+    first_row, last_row = (
         np.clip(rows - half_window_rows, 0, None),
         np.clip(rows + half_window_rows, None, len(time_s) - 1),
     )
-    velocity_m_s = (position_m[last] - position_m[first]) / (time_s[last] - time_s[first])[:, None]
+    travelled_m = position_m[last_row] - position_m[first_row]
+    velocity_m_s = travelled_m / (time_s[last_row] - time_s[first_row])[:, None]
     is_accurate = noise_gain < MAX_RESIDUAL_NOISE_GAIN
 
     def residual(values: Array) -> Array:

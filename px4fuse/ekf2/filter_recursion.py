@@ -288,14 +288,14 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             means_by_interval = [
                 mean_by_event(segment, samples, end_steps) for end_steps in event_step_arrays
             ]
-            mean = EventSamples(*map(stack_configurations, zip(*means_by_interval, strict=True)))
+            means = EventSamples(*map(stack_configurations, zip(*means_by_interval, strict=True)))
             if aid == MAG:
                 R = np.maximum(parameters[MAG.noise], MIN_SIGMA_GAUSS) ** 2
-                mean = mean._replace(noise=mean.noise + R)
-            sample_count = mean.sample_count * is_enabled_by_aid[aid.name]
+                means = means._replace(noise=means.noise + R)
+            sample_count = means.sample_count * is_enabled_by_aid[aid.name]
             gate = parameters.get(aid.gate, np.full(configuration_count, samples.gate))
-            mean = mean._replace(sample_count=sample_count)
-            vector_means.append((mean, gate, samples.state_rows))
+            means = means._replace(sample_count=sample_count)
+            vector_means.append((means, gate, samples.state_rows))
     follows_log = [
         segment.heights is None
         or segment.is_acceleration_bad is None
@@ -435,9 +435,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             _limit_bias_variance(P, inputs.rules.min_bias_variance, has_biases)
         innovation[:, 2:] = 0.0
         R[:, 2:] = IGNORED_VARIANCE
-        for mean, gate, state_rows in vector_means:
-            if mean.sample_count[e].any():
-                event_mean = EventSamples(*(quantity[e] for quantity in mean))
+        for means, gate, state_rows in vector_means:
+            if means.sample_count[e].any():
+                event_mean = EventSamples(*(quantity[e] for quantity in means))
                 x, P, vector_updates = fuse_mean(x, P, event_mean, gate, *state_rows)
                 if EARTH_FIELD in state_rows:
                     magnetometer_updates[e] = vector_updates
@@ -715,7 +715,7 @@ def _variance_growth(
 
 
 def with_state_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegment:
-    """Estimate the correlations of the initial state of a segment, of which variances are logged.
+    """Estimate the correlations of the initial state of a segment; only its variances are logged.
 
     Without correlations, the first updates would correct tilt and accelerometer bias in a wrong
     ratio. The correlations are computed by a replay of the flight before the segment.

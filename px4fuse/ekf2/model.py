@@ -442,8 +442,8 @@ def _updates_by_aid(
         )
     )
 
-    def updates_along(axes: Sequence[NedAxis], columns: slice, *more: Any) -> pd.DataFrame:
-        update_log = np.column_stack([nu[:, columns], S[:, columns], *more])
+    def updates_along(axes: Sequence[NedAxis], columns: slice, *other_values: Any) -> pd.DataFrame:
+        update_log = np.column_stack([nu[:, columns], S[:, columns], *other_values])
         return update_table(update_log[:, None], events.time_s[:, None], end_s, axes)
 
     position_variance = variance_after[:, HORIZONTAL_POSITION]

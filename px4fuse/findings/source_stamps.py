@@ -212,10 +212,10 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
     position_age_s = _position_age_s(analysis)
     if position_age_s is None or find_synchronisation(analysis) is not None:
         return
-    part_count = max(MIN_SAMPLES, len(position_age_s) // 10)
+    sample_count = max(MIN_SAMPLES, len(position_age_s) // 10)
     start_s, end_s = (
-        float(part.median())
-        for part in (position_age_s.iloc[:part_count], position_age_s.iloc[-part_count:])
+        float(age_s.median())
+        for age_s in (position_age_s.iloc[:sample_count], position_age_s.iloc[-sample_count:])
     )
     change_text = "grows in flight"
     trend = rank_correlation(position_age_s.index.to_numpy(), position_age_s.to_numpy())

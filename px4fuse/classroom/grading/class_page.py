@@ -75,19 +75,19 @@ def _statistics_html(grades: Sequence[Grade], count_by_tag: Mapping[str, int]) -
         students=len(grades),
         counts=count_by_tag,
         averages=(statistics.fmean(totals), statistics.median(totals)) if totals else (),
-        totals=count_tenths(totals, max_points) if totals else (),
+        totals=count_by_bin(totals, max_points) if totals else (),
         max_points_text=format_cell_number(max_points),
         max_points_edge=format_number(max_points),
         pending_points=[report.points for report in reports if report.instructor_action],
         number=format_cell_number,
-        items=[(each, count_tenths(each.fractions, 1.0)) for each in analyse_items(reports)],
+        items=[(each, count_by_bin(each.fractions, 1.0)) for each in analyse_items(reports)],
     )
 
 
-def count_tenths(values: Sequence[float], maximum: float) -> list[tuple[int, str]]:
+def count_by_bin(values: Sequence[float], maximum: float) -> list[tuple[int, str]]:
     """Compute a histogram of ten bins from 0 to ``maximum``; return (count, lower edge) per bin.
 
-    >>> count_tenths([0.0, 5.0, 5.5, 9.0], 10.0)[5]
+    >>> count_by_bin([0.0, 5.0, 5.5, 9.0], 10.0)[5]
     (2, '5')
     """
     counts, edges = np.histogram(np.clip(values, 0.0, maximum), HISTOGRAM_BIN_COUNT, (0.0, maximum))
@@ -179,7 +179,7 @@ def _grade_details(grade: Grade) -> Iterator[Section]:
     yield frame.table_section(title, item_titles, items, (1, 2))
     yield comment
     yield frame.list_section("Injected faults of this flight", fault_texts)
-    yield frame.pairs_section("Answer form", [*form_rows(report.form)] if report.form else [])
+    yield frame.name_value_section("Answer form", [*form_rows(report.form)] if report.form else [])
     yield frame.prose_section("Text of the student", report.notes)
     yield frame.list_section("Other attempts", attempts)
 
@@ -222,4 +222,6 @@ def _point_boxes(grade: Grade) -> Section:
         if title not in max_by_title
     ]
     identity = grade.student_id or (report.submission if report else "")
-    return frame.boxes_section("Points and comments of the instructor", identity, rows, other_rows)
+    return frame.input_boxes_section(
+        "Points and comments of the instructor", identity, rows, other_rows
+    )

@@ -423,7 +423,10 @@ def read_overrides(path: Path) -> Overrides:
             problem = f"student {one_line(student, 40)} has two rows for the item {item_text}"
         elif points and (parsed_points is None or parsed_points < 0.0 or not item_title):
             points_text = one_line(points, 20)
-            problem = f"points {points_text!r} must be 0 or more, in a row with an item or total"
+            problem = (
+                f"points {points_text!r} must be a number of 0 or more, in a row that names an "
+                "item or total"
+            )
         if problem:
             raise SettingsError(f"{path}: row {row_number}: {problem}.")
         overrides[student][item_title] = Override(

@@ -21,7 +21,7 @@ from px4fuse.classroom.grading.checks import (
     format_reason,
     shorten_text,
 )
-from px4fuse.classroom.grading.flags import flag_pages, flag_settings
+from px4fuse.classroom.grading.flags import flag_page_differences, flag_settings
 from px4fuse.classroom.grading.form_points import FormPoints
 from px4fuse.classroom.grading.model import TOTAL_TITLE, GradedReport, ItemScore
 from px4fuse.core.reading import read_text
@@ -165,7 +165,7 @@ def score_report(
         verification,
         tuple(graded_items),
         flags=(
-            *flag_pages(verification),
+            *flag_page_differences(verification),
             *flag_settings(results, key is not None),
             *([] if check_input.is_own_log else [_foreign_log_advice(check_input)]),
             *([OTHER_FORM_ADVICE] if check_input.has_form_of_other_log else []),
