@@ -201,9 +201,10 @@ def fit_by_least_squares(
     if yaw_rad is not None:
         parameters[3] = yaw_rad
 
-    def residuals_at(free_parameters: Array) -> Array:
-        parameters[is_fitted] = free_parameters
-        north, east, lag_shift_s, yaw = parameters
+    def residuals_at(fitted_parameters: Array) -> Array:
+        all_parameters = parameters.copy()
+        all_parameters[is_fitted] = fitted_parameters
+        north, east, lag_shift_s, yaw = all_parameters
         target_m = np.interp(
             reference_time_s + lag_shift_s, reference.time_s, reference_horizontal_m
         )
@@ -218,6 +219,7 @@ def fit_by_least_squares(
         f_scale=_robust_scale(residuals_at(parameters[is_fitted])),
     )
     residuals = residuals_at(solution.x)
+    parameters[is_fitted] = solution.x
     north, east, lag_shift_s, yaw = parameters.tolist()
     complex_residuals = residuals[: len(file_position_m)] + 1j * residuals[len(file_position_m) :]
     jacobian = np.asarray(solution.jac)

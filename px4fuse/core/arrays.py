@@ -24,6 +24,17 @@ def cumulative_integral(values: Array, time_s: Array) -> Array:
     return integral
 
 
+def cumulative_sums(rows: Array) -> Array:
+    """Return the sums of the first 0, 1, ..., n rows, shape (n + 1, k)."""
+    return np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(rows, axis=0)])
+
+
+def intervals_where(time_s: Array, is_selected: BoolArray) -> list[tuple[float, float]]:
+    """Return start and end (s) of the selected intervals between successive times."""
+    starts_s, ends_s = time_s[:-1][is_selected], time_s[1:][is_selected]
+    return list(zip(starts_s.tolist(), ends_s.tolist(), strict=True))
+
+
 def rank_correlation(first: Array, second: Array) -> float:
     """Return Spearman's rank correlation (without scipy.stats, whose import is slow).
 

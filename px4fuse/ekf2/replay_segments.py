@@ -13,7 +13,14 @@ import numpy as np
 import pandas as pd
 from scipy.linalg import block_diag
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, median_interval
+from px4fuse.core.arrays import (
+    Array,
+    ArrayPair,
+    BoolArray,
+    IntArray,
+    cumulative_sums,
+    median_interval,
+)
 from px4fuse.core.record import Span
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.flight.ekf2_parameters import PARAMETERS
@@ -219,17 +226,13 @@ class ReplaySegment:
     def imu_velocity_m_s(self) -> Array:
         """Velocity change (m/s, NED) since the start, integrated from the IMU, shape (n + 1, 3)."""
         force = rotate(self.body_to_ned[1:], self.force_m_s2) + GRAVITY_M_S2
-        velocity_increments = np.cumsum(force * self.step_s[:, None], axis=0)
-        return np.concatenate([np.zeros((1, 3)), velocity_increments])
+        return cumulative_sums(force * self.step_s[:, None])
 
     @cached_property
     def imu_displacement_m(self) -> Array:
         """Displacement (m, NED) since the start, integrated from the IMU, shape (n + 1, 3)."""
         velocity = self.imu_velocity_m_s
-        displacement = np.cumsum(
-            0.5 * (velocity[1:] + velocity[:-1]) * self.step_s[:, None], axis=0
-        )
-        return np.concatenate([np.zeros((1, 3)), displacement])
+        return cumulative_sums(0.5 * (velocity[1:] + velocity[:-1]) * self.step_s[:, None])
 
 
 def samples_by_event(
@@ -753,7 +756,7 @@ def downsample_imu(
     The velocity change is in the body frame at the end of the step.
     """
     start_indices = np.append(0, step_end_indices[:-1])
-    summed_rotation = np.concatenate([np.zeros((1, 3)), np.cumsum(rotation_vectors, axis=0)])
+    summed_rotation = cumulative_sums(rotation_vectors)
     rotation_at_step_end_rad = np.repeat(
         summed_rotation[step_end_indices], step_end_indices - start_indices, axis=0
     )

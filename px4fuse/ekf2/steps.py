@@ -9,7 +9,7 @@ last replays use EKF2's logged rejections.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 
@@ -34,7 +34,7 @@ from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
-from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable
+from px4fuse.flight.model import Columns, Ekf2, Flight, Truth, Unavailable
 
 ANALYSIS_NAME = "difference KF - EKF2"
 NO_TRUTH_OVERLAP = Unavailable(
@@ -218,62 +218,79 @@ def explain_by_steps(
     longest_rejection = _longest_rejection(
         baseline_replay, track_without_gate, state_span_s, evaluated_spans
     )
-    truth = model.flight.truth
-    steps_by_axis = {}
-    no_truth = NO_TRUTH_OVERLAP if isinstance(truth, Truth) else truth
+    explanations = {}
     for axis_index, (axis, direction) in enumerate(directions.items()):
-        kf_state = (
-            state_at(kf_runs[axis], state_times_s) if kf_runs else tracks_by_step[0][axis_index]
+        axis_tracks = [step_tracks[axis_index] for step_tracks in tracks_by_step]
+        kf_state = state_at(kf_runs[axis], state_times_s) if kf_runs else axis_tracks[0]
+        explanations[axis] = _explain_axis(
+            model.flight,
+            direction,
+            (*configurations, OUTPUT),
+            state_times_s,
+            np.array([kf_state, *axis_tracks]),
+            spans,
+            longest_rejection,
         )
-        # Position and velocity of KF, of k replays, and of the logged EKF2, shape (k + 2, 2, n)
-        positions_by_step = np.array(
-            [kf_state, *(step_tracks[axis_index] for step_tracks in tracks_by_step)]
+    return explanations
+
+
+def _explain_axis(
+    flight: Flight,
+    direction: Array,
+    step_names: Sequence[str],
+    times_s: Array,
+    positions_by_step: Array,
+    spans_s: Spans,
+    longest_rejection: RejectionRun | None,
+) -> DifferenceExplanation:
+    """Explain the difference KF - EKF2 along one axis at the times of EKF2's states.
+
+    ``positions_by_step``, shape (k + 2, 2, n), contains position and velocity of KF, of the k
+    replays of EKF2, and of the logged EKF2.
+    """
+    difference_by_step_m = positions_by_step - positions_by_step[-1]
+    rmse_by_step = [
+        rms_to_truth(flight, track, direction, times_s) for track in positions_by_step[:, 0]
+    ]
+    mean_squares = np.mean(difference_by_step_m[:-1] ** 2, axis=2)
+    position_change = np.abs(np.diff(positions_by_step[:-1, 0], axis=0))
+    steps = tuple(
+        Step(
+            name=name,
+            position_mean_square_m2=position_reduction,
+            velocity_mean_square_m2_s2=velocity_reduction,
+            position_moved_m=float(position_change_m.max()),
+            moved_at_s=float(times_s[position_change_m.argmax()]),
+            position_rmse_to_truth_m=rmse_m,
         )
-        difference_by_step_m = positions_by_step - positions_by_step[-1]
-        rmse_by_step = [
-            rms_to_truth(model.flight, track, direction, state_times_s)
-            for track in positions_by_step[:, 0]
-        ]
-        mean_squares = np.mean(difference_by_step_m[:-1] ** 2, axis=2)
-        position_change = np.abs(np.diff(positions_by_step[:-1, 0], axis=0))
-        steps = tuple(
-            Step(
-                name=name,
-                position_mean_square_m2=position_reduction,
-                velocity_mean_square_m2_s2=velocity_reduction,
-                position_moved_m=float(position_change_m.max()),
-                moved_at_s=float(state_times_s[position_change_m.argmax()]),
-                position_rmse_to_truth_m=rmse_m,
-            )
-            for name, (position_reduction, velocity_reduction), position_change_m, rmse_m in zip(
-                (*configurations, OUTPUT),
-                (mean_squares[:-1] - mean_squares[1:]).tolist(),
-                position_change,
-                rmse_by_step[1:-1],
-                strict=True,
-            )
+        for name, (position_reduction, velocity_reduction), position_change_m, rmse_m in zip(
+            step_names,
+            (mean_squares[:-1] - mean_squares[1:]).tolist(),
+            position_change,
+            rmse_by_step[1:-1],
+            strict=True,
         )
-        total_mean_squares, *_, unexplained_mean_squares = mean_squares.tolist()
-        rmse_by_filter = {"kf": rmse_by_step[0], "ekf2": rmse_by_step[-1]}
-        steps_by_axis[axis] = DifferenceExplanation(
-            count=len(state_times_s),
-            position_mean_square_m2=total_mean_squares[0],
-            velocity_mean_square_m2_s2=total_mean_squares[1],
-            steps=steps,
-            unexplained_mean_square_m2=unexplained_mean_squares[0],
-            unexplained_velocity_mean_square_m2_s2=unexplained_mean_squares[1],
-            position_rmse_to_truth_m={
-                name: no_truth if rmse_m is None else rmse_m
-                for name, rmse_m in rmse_by_filter.items()
-            },
-            spans_s=spans,
-            longest_rejection=longest_rejection,
-            times_s=state_times_s,
-            # Copied, because a view would keep the tracks of all replays in memory
-            kf_minus_ekf2_m=difference_by_step_m[0, 0].copy(),
-            unexplained_m=difference_by_step_m[-2, 0].copy(),
-        )
-    return steps_by_axis
+    )
+    total_mean_squares, *_, unexplained_mean_squares = mean_squares.tolist()
+    no_truth = NO_TRUTH_OVERLAP if isinstance(flight.truth, Truth) else flight.truth
+    rmse_by_filter = {"kf": rmse_by_step[0], "ekf2": rmse_by_step[-1]}
+    return DifferenceExplanation(
+        count=len(times_s),
+        position_mean_square_m2=total_mean_squares[0],
+        velocity_mean_square_m2_s2=total_mean_squares[1],
+        steps=steps,
+        unexplained_mean_square_m2=unexplained_mean_squares[0],
+        unexplained_velocity_mean_square_m2_s2=unexplained_mean_squares[1],
+        position_rmse_to_truth_m={
+            name: no_truth if rmse_m is None else rmse_m for name, rmse_m in rmse_by_filter.items()
+        },
+        spans_s=spans_s,
+        longest_rejection=longest_rejection,
+        times_s=times_s,
+        # Copied, because a view would keep the tracks of all replays in memory
+        kf_minus_ekf2_m=difference_by_step_m[0, 0].copy(),
+        unexplained_m=difference_by_step_m[-2, 0].copy(),
+    )
 
 
 def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, FilterConfiguration]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, IntArray, cumulative_sums
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import NED_COMPONENTS, Frame, Trajectory, cumulative_distance
 
@@ -145,8 +145,8 @@ def correct_by_distance(
     middle_rotation = Rotation.from_rotvec(
         np.outer(-middle_fraction * misclosure_heading_rad, DOWN_DIRECTION)
     )
-    rotated_position_m = position_m[0] + np.concatenate(
-        [np.zeros((1, 3)), np.cumsum(middle_rotation.apply(np.diff(position_m, axis=0)), axis=0)]
+    rotated_position_m = position_m[0] + cumulative_sums(
+        middle_rotation.apply(np.diff(position_m, axis=0))
     )
     remaining_error_m = rotated_position_m[-1] - (position_m[-1] - misclosure_m)
     return trajectory.with_positions(

@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array, BoolArray, IntArray, cumulative_sums
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
     HORIZONTAL_POSITION,
@@ -322,9 +322,7 @@ def _compute_output(
         "nij,nj->ni", segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:]
     )
     attitude_error_steps_rad = -segment.correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
-    gyro_attitude_error_rad = state[0, THETA] + np.concatenate(
-        [np.zeros((1, 3)), np.cumsum(attitude_error_steps_rad, axis=0)]
-    )
+    gyro_attitude_error_rad = state[0, THETA] + cumulative_sums(attitude_error_steps_rad)
     attitude_error_rad = gyro_attitude_error_rad + follow_attitude(
         state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.mean_step_s, inputs.horizon_s
     )

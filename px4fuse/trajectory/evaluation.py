@@ -269,10 +269,9 @@ def evaluate(
         matched_estimate, matched_reference, alignment, is_requested=is_requested
     )
     jump_warnings = find_jumps(matched_estimate, matched_reference)
-    aligned_estimate = matched_estimate.with_positions(
-        transform.apply(matched_estimate.position_m), transform.to_rotation()
+    aligned_estimate, notes = _with_reference_body_axes(
+        _apply(transform, matched_estimate), matched_reference
     )
-    aligned_estimate, notes = _with_reference_body_axes(aligned_estimate, matched_reference)
     if not notes and has_other_body_axes(aligned_estimate, matched_reference):
         matched_estimate, notes = _move_to_reference_body(
             matched_estimate, matched_reference, alignment
@@ -280,9 +279,7 @@ def evaluate(
         transform = fit_alignment(
             matched_estimate.position_m, matched_reference.position_m, alignment
         )
-        aligned_estimate = matched_estimate.with_positions(
-            transform.apply(matched_estimate.position_m), transform.to_rotation()
-        )
+        aligned_estimate = _apply(transform, matched_estimate)
     distance_m = cumulative_distance(matched_reference.position_m)
     position_error_m = np.linalg.norm(
         aligned_estimate.position_m - matched_reference.position_m, axis=1
@@ -331,6 +328,10 @@ def evaluate(
             ),
         ),
     )
+
+
+def _apply(transform: Transform, estimate: Trajectory) -> Trajectory:
+    return estimate.with_positions(transform.apply(estimate.position_m), transform.to_rotation())
 
 
 def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[AlignmentKind, str]:
