@@ -211,7 +211,7 @@ def _kf_noise_changes(
 
 def _bias_changes(estimates: Estimates) -> list[Change]:
     systematic_errors = estimates.systematic_errors
-    if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_bias:
+    if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_significant_bias():
         return []
     biases = {
         FORWARD_BIAS: systematic_errors.forward_bias,

@@ -242,13 +242,12 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         else slice(None)
     )
 
-    def stack_configurations(name: str, rows: slice = slice(None)) -> Any:
-        interval_quantities = [
-            getattr(interval_arrays, name)[rows] for interval_arrays in distinct_intervals
-        ]
+    def stack_configurations(interval_quantities: Sequence[Any]) -> Any:
         return np.stack(interval_quantities, axis=1)[:, configuration_intervals]
 
-    event_table = stack_configurations("events")
+    event_table = stack_configurations(
+        [interval_arrays.events for interval_arrays in distinct_intervals]
+    )
     action = np.where(has_gate, event_table["action"], FUSE * event_table["usable"])
     event_steps = event_table["end_step"]
     is_active = action > IDLE
@@ -289,11 +288,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             means_by_interval = [
                 mean_by_event(segment, samples, end_steps) for end_steps in event_step_arrays
             ]
-            stacked_means = (
-                np.stack(quantities, axis=1)[:, configuration_intervals]
-                for quantities in zip(*means_by_interval, strict=True)
-            )
-            means = EventSamples(*stacked_means)
+            means = EventSamples(*map(stack_configurations, zip(*means_by_interval, strict=True)))
             if aid == MAG:
                 R = np.maximum(parameters[MAG.noise], MIN_SIGMA_GAUSS) ** 2
                 means = means._replace(noise=means.noise + R)
@@ -402,15 +397,17 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         reset_states.append((VELOCITY, VELOCITY_COLUMNS, 1.0))
     for e in range(event_count):
         batch_index = e % EVENT_BATCH_SIZE
-        if not batch_index:  # arrays of a few events are copied at once, to limit the memory
+        if not batch_index:
             event_batch = slice(e, e + EVENT_BATCH_SIZE)
-            transition = stack_configurations("transition", event_batch)
-            state_input = stack_configurations("acceleration_input", event_batch) + has_attitude[
-                :, None
-            ] * stack_configurations("correction_input", event_batch)
-            added_noise = gyro_variance * stack_configurations("gyro_noise", event_batch)
-            accelerometer_noise = stack_configurations("accelerometer_noise", event_batch)
-            added_noise = added_noise + acceleration_variance[event_batch] * accelerometer_noise
+            batches = [one_timing.transitions(event_batch) for one_timing in distinct_intervals]
+            transition, correction_input, acceleration_input, gyro_noise, accelerometer_noise = map(
+                stack_configurations, zip(*batches, strict=True)
+            )
+            state_input = acceleration_input + has_attitude[:, None] * correction_input
+            added_noise = (
+                gyro_variance * gyro_noise
+                + acceleration_variance[event_batch] * accelerometer_noise
+            )
             variance_growth = variance_increment * step_counts[event_batch]
         phi = transition[batch_index]
         # x = Φx + u, P = ΦPΦ' + Q

@@ -7,7 +7,9 @@ the files to change for a new finding.
 from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.flight_events import airborne_spans
 from px4fuse.ekf2.aids import AidResult
+from px4fuse.filter.signals import Segment
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings import (
     aids,
@@ -34,9 +36,10 @@ from px4fuse.findings import (
     source_values,
 )
 from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import TITLES, group_by_root
-from px4fuse.flight.model import Ekf2, Unavailable
+from px4fuse.findings.model import TITLES, group_by_root, warning
+from px4fuse.flight.model import Ekf2, Flight
 from px4fuse.loop.model import Loop
+from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
 __all__ = [
     "TITLES",
@@ -87,13 +90,21 @@ def find_loop(loop: Loop) -> tuple[Finding, ...]:
 
 
 def find_aids(
-    aid_results: Mapping[str, AidResult], ekf2: Ekf2 | Unavailable | None = None
+    aid_results: Mapping[str, AidResult], flight: Flight | None = None
 ) -> tuple[Finding, ...]:
     """Return the findings on EKF2 and its aiding sources, for a flight without position source."""
     findings = list(aids.detect_in_aids(aid_results))
-    if isinstance(ekf2, Ekf2):
-        span_s = ekf2.instances[0][0], ekf2.instances[-1][0]
-        findings += ekf2_resets.detect_instance_switches(ekf2, span_s)
+    for item in flight.missing if flight is not None else ():
+        if item.remedy == NO_FIX_ACTION:
+            message = f"The GNSS receiver had no position: {item.reason}."
+            findings.append(warning("source_without_position", message, item.remedy))
+    if flight is not None and isinstance(flight.ekf2, Ekf2):
+        spans_s = airborne_spans(flight) or ((0.0, flight.log.duration_s),)
+        segment = Segment(spans_s[0][0], spans_s[-1][1], "")
+        findings += ekf2_resets.detect_instance_switches(
+            flight.ekf2, (segment.start_s, segment.end_s)
+        )
+        findings += ekf2_state.detect_missing_alignment(flight, segment)
     return group_by_cause(findings)
 
 

@@ -50,19 +50,22 @@ def is_refuted(analysis: Analysis, filter_name: FilterName, cause: Trial) -> boo
         (trial.filter, trial.change) == (filter_name, cause.change)
         and can_show_improvement(trial)
         and improvement(trial) == "nothing"
-        for trial in analysis.main_trials
+        for trial in analysis.select_main_trials()
     )
 
 
 def format_change(analysis: Analysis, cause: Trial) -> str:
     """Format the changes of a re-run: "SIGMA_Z 0.1 m instead of 0.05 m"."""
-    model = analysis.ekf2_model
-    flown = {} if isinstance(model, Unavailable) else model.inputs.settings
-    change = different_settings(cause.change, flown)
+    change = different_settings(cause.change, _flown_settings(analysis))
     names = change.keys() - trials.ACCOMPANYING_CHANGES or change
     return " and ".join(
         _format_one_change(analysis, cause, name) for name in cause.change if name in names
     )
+
+
+def _flown_settings(analysis: Analysis) -> Mapping[str, float]:
+    model = analysis.ekf2_model
+    return {} if isinstance(model, Unavailable) else model.inputs.settings
 
 
 def format_explained_fraction(cause: Trial, statistic: Statistic) -> str:
@@ -96,8 +99,7 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
         actions.append(f"{format_shift(offset_s)} the position timestamps before sending.")
     settings = {name: change.pop(name) for name in changes.SETTING_CHANGES & change.keys()}
     if change:
-        assert not isinstance(analysis.ekf2_model, Unavailable)
-        change = different_settings(change, analysis.ekf2_model.inputs.settings)
+        change = different_settings(change, _flown_settings(analysis))
         actions.append(f"Set {format_settings(change)}.")
     if settings:
         actions.append(format_kf_settings(settings))

@@ -89,7 +89,7 @@ def detect(analysis: Analysis) -> Findings:
 
 def confirmed_noise_trial(analysis: Analysis) -> Trial | None:
     """Return the re-run with another EKF2 measurement noise, if it makes EKF2 consistent."""
-    trial = find_trial(analysis.main_trials, "ekf2", "noise", aid_of(analysis).noise)
+    trial = find_trial(analysis.select_main_trials(), "ekf2", "noise", aid_of(analysis).noise)
     is_confirmed = trial is not None and any(
         classify_sigma_ratio(ratio_before, reference) != "consistent"
         and classify_sigma_ratio(ratio_after, reference) == "consistent"

@@ -64,7 +64,7 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
     positions, aid = positions_phrase(source), source.origin.aid
     evidence: dict[str, float | str] = {
         "fused_fraction": fused_fraction,
-        "source_interval_s": 1.0 / source.rate_hz,
+        "source_interval_s": 1.0 / source.compute_rate_hz(),
     }
     if aid is None:
         if source.name == MOTION_CAPTURE_TOPIC and not fused_fraction:
@@ -167,13 +167,13 @@ def _detect_slow_restart(
     analysis: PreparedComparison, ekf2: Ekf2, fusion_flag: pd.Series
 ) -> Findings:
     """Detect a position rate so low that EKF2 restarts fusion late after a gap."""
-    source = analysis.source
+    source, rate_hz = analysis.source, analysis.source.compute_rate_hz()
     if (
         "EKF2_EV_CTRL" not in analysis.flight.log.parameters  # earlier than v1.14
         or not source.origin.is_vision
         or not source.origin.has_all_samples
         or source.alignment
-        or 1.0 / source.rate_hz < MIN_LIMITING_INTERVAL_S
+        or 1.0 / rate_hz < MIN_LIMITING_INTERVAL_S
     ):
         return
     time_s = source.samples.index.to_numpy()
@@ -196,9 +196,9 @@ def _detect_slow_restart(
         yield note(
             "source_rate_at_limit",
             f"After a gap EKF2 resumed fusion {longest_s:.1f} s late: {positions_phrase(source)} "
-            f"come at only {source.rate_hz:.1f} Hz. EKF2 (v1.14 and later) starts fusion when two "
+            f"come at only {rate_hz:.1f} Hz. EKF2 (v1.14 and later) starts fusion when two "
             f"positions arrive within {EV_START_INTERVAL_S:g} s.",
             "Send the position at 10 Hz.",
-            {"rate_hz": source.rate_hz, "longest_s": longest_s, "count": len(restart_delay_spans)},
+            {"rate_hz": rate_hz, "longest_s": longest_s, "count": len(restart_delay_spans)},
             tuple(restart_delay_spans),
         )

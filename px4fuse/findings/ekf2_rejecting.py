@@ -86,7 +86,9 @@ def _detect_rejections(analysis: Analysis) -> Findings:
 
 def _rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
     aid = aid_of(analysis, result.axis.name)
-    helpful_trials = [trial for trial in analysis.main_trials if _prevents_rejections(trial)]
+    helpful_trials = [
+        trial for trial in analysis.select_main_trials() if _prevents_rejections(trial)
+    ]
     if helpful_trials and result is analysis.main:
         return format_action(analysis, min(helpful_trials, key=preference_key).change)
     return (

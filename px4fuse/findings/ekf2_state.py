@@ -8,7 +8,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres
-from px4fuse.filter.signals import cut_to_segment
+from px4fuse.filter.signals import Segment, cut_to_segment
 from px4fuse.findings.model import (
     Findings,
     error,
@@ -17,7 +17,14 @@ from px4fuse.findings.model import (
     spans_with_value,
 )
 from px4fuse.flight.ekf2_parameters import BAROMETER, MAG, NO_MAGNETOMETER
-from px4fuse.flight.model import BODY_AXES, Columns, Ekf2, Flight, Unavailable
+from px4fuse.flight.model import (
+    BODY_AXES,
+    Columns,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Unavailable,
+)
 
 # For each bias state of EKF2: parameter with its limit, unit, sensor, and columns of the bias
 BIAS_STATES = (
@@ -42,6 +49,9 @@ MIN_GYRO_BIAS_RAD_S = 0.05
 MIN_GRAVITY_ERROR_M_S2 = 0.3
 # Missing tilt or yaw alignment is reported if it lasts for a larger fraction of the flight
 MAX_UNALIGNED_FRACTION = 0.02
+# Maximum time (s) from the alignment of the tilt to that of the heading that is not reported: the
+# heading is aligned after the tilt
+MAX_HEADING_ALIGNMENT_S = 5.0
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -54,7 +64,7 @@ def detect(analysis: Analysis) -> Findings:
         if len(bias_states):
             yield from _detect_limited_bias(analysis, ekf2, bias_states, imu_at_rest)
             yield from _detect_gyro_bias(bias_states, imu_at_rest)
-    yield from _detect_missing_alignment(analysis, ekf2)
+    yield from detect_missing_alignment(analysis.flight, analysis.segment, analysis.source)
 
 
 def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
@@ -150,38 +160,37 @@ def _detect_gyro_bias(bias_states: pd.DataFrame, imu_at_rest: pd.Series | None) 
     )
 
 
-def _detect_missing_alignment(analysis: Analysis, ekf2: Ekf2) -> Findings:
-    fusion_flags, segment = ekf2.fusion_flags, analysis.segment
-    fuses_source_yaw = analysis.source.frame == "FRD" or (
+def detect_missing_alignment(
+    flight: Flight, segment: Segment, source: PositionTrack | None = None
+) -> Findings:
+    """Detect that EKF2 aligned its tilt or its heading late or never.
+
+    Without ``source``, the flight has no positions of external vision.
+    """
+    ekf2 = flight.ekf2
+    if not isinstance(ekf2, Ekf2):
+        return
+    fusion_flags = ekf2.fusion_flags
+    fuses_source_yaw = (source is not None and source.frame == "FRD") or (
         isinstance(fusion_flags, pd.DataFrame)
         and fraction_of_ones(fusion_flags["yaw"], segment) > 0.0
     )
-    has_source_yaw = analysis.source.orientation is not None
-    mag_type = analysis.flight.log.parameters.get(MAG.switch)
-    magnetometer_action = "Calibrate the magnetometer"
-    if mag_type == NO_MAGNETOMETER:
-        magnetometer_action = f"Enable the magnetometer ({MAG.switch} 0)"
+    aligned_s = segment.start_s
     for flag, quantity, action in (
         ("tilt_align", "tilt", "Keep the vehicle at rest after boot until EKF2 is ready."),
-        (
-            "yaw_align",
-            "heading",
-            f"{magnetometer_action}. Alternatively, "
-            f"{'' if has_source_yaw else 'send the orientation of the source, and '}let EKF2 fuse "
-            "the yaw of the source.",
-        ),
+        ("yaw_align", "heading", _align_heading_action(flight, source)),
     ):
         alignment_flag = ekf2.states.get(flag)
         if alignment_flag is None or (flag == "yaw_align" and fuses_source_yaw):
             continue
+        spans = spans_with_value(0.0, alignment_flag, segment)
         unaligned_fraction = 1.0 - fraction_of_ones(alignment_flag, segment)
-        if unaligned_fraction > MAX_UNALIGNED_FRACTION:
-            spans = spans_with_value(0.0, alignment_flag, segment)
-            until_text = (
-                ""
-                if unaligned_fraction > 1.0 - MAX_UNALIGNED_FRACTION
-                else f" until {spans[-1][1]:.1f} s"
-            )
+        if (
+            unaligned_fraction > MAX_UNALIGNED_FRACTION
+            and spans[-1][1] > aligned_s + MAX_HEADING_ALIGNMENT_S
+        ):
+            aligned_s = spans[-1][1]
+            until_text = f" until {aligned_s:.1f} s" if aligned_s < segment.end_s else ""
             yield error(
                 "ekf2_not_aligned",
                 f"EKF2 has not aligned its {quantity}{until_text}. cs_{flag} is 0 for "
@@ -191,3 +200,17 @@ def _detect_missing_alignment(analysis: Analysis, ekf2: Ekf2) -> Findings:
                 {"unaligned_fraction": unaligned_fraction, "flag": flag},
                 spans,
             )
+
+
+def _align_heading_action(flight: Flight, source: PositionTrack | None) -> str:
+    """Return the action for a heading that EKF2 did not align, by the sensors of the vehicle."""
+    action = "Calibrate the magnetometer."
+    if flight.log.parameters.get(MAG.switch) == NO_MAGNETOMETER:
+        action = f"Enable the magnetometer ({MAG.switch} 0)."
+    if source is not None and source.origin.is_vision:
+        has_yaw = source.orientation is not None
+        action += (
+            f" Alternatively, {'' if has_yaw else 'send the orientation of the source, and '}let "
+            "EKF2 fuse the yaw of the source."
+        )
+    return action

@@ -12,7 +12,7 @@ import numpy as np
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import position_errors
 from px4fuse.comparison.model import (
-    FILTERS,
+    FILTER_NAMES,
     Comparison,
     ErrorsAgainstTruth,
     FilterName,
@@ -104,8 +104,8 @@ def make_hidden_error_finding(
     evidence: dict[str, float | str] = {"axis": main_axis, "filter": worst_filter}
     ratio_by_filter, sentences = dict[str, float](), list[str]()
     cause_by_filter = dict[FilterName, Trial]()
-    for filter_name in FILTERS:
-        label = filter_name.upper()
+    for filter_name in FILTER_NAMES:
+        label = FILTER_NAMES[filter_name]
         for _, axis, hidden_error in [entry for entry in hidden_errors if entry[0] == filter_name][
             :1
         ]:

@@ -71,8 +71,12 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
 def detect_bias(analysis: Analysis) -> Findings:
     """Detect an accelerometer bias, estimated from the positions or by EKF2."""
     fit, ekf2_bias = analysis.systematic_errors, _ekf2_bias(analysis)
-    if isinstance(fit, SystematicErrors) and fit.has_bias:
-        forward_bias, right_bias, bias_m_s2 = fit.forward_bias, fit.right_bias, fit.bias.value
+    if isinstance(fit, SystematicErrors) and fit.has_significant_bias():
+        forward_bias, right_bias, bias_m_s2 = (
+            fit.forward_bias,
+            fit.right_bias,
+            fit.compute_bias().value,
+        )
         message = (
             f"The accelerometer is biased by {forward_bias.value:+.2f} m/s² forward and "
             f"{right_bias.value:+.2f} m/s² right. The estimate is from the positions (± "
@@ -90,7 +94,7 @@ def detect_bias(analysis: Analysis) -> Findings:
             "accelerometer_bias",
             message,
             "Calibrate the accelerometers and the level horizon at the temperature of the flight.",
-            {"bias_m_s2": bias_m_s2, "sigma_m_s2": fit.bias.sigma},
+            {"bias_m_s2": bias_m_s2, "sigma_m_s2": fit.compute_bias().sigma},
         )
     elif ekf2_bias is not None:
         # If positions show no horizontal bias, only the vertical bias is reported

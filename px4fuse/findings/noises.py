@@ -12,7 +12,7 @@ from msgspec import structs
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.changes import MIN_RERUN_SIGMA_Z_M, SIGMA_A, SIGMA_Z, tuning_of_axis
 from px4fuse.comparison.estimates import first_axis_tuning
-from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
 from px4fuse.comparison.reruns import is_inconsistent
@@ -193,11 +193,11 @@ def format_estimate(name: str, setting: float, noise: Noise) -> str:
 
 
 def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
-    if trial := find_trial(analysis.main_trials, "kf", "noises", name):
+    if trial := find_trial(analysis.select_main_trials(), "kf", "noises", name):
         return format_kf_settings(trial.change)
     if any(
         trial.filter == "kf" and trial.change.keys() == {name} and can_show_improvement(trial)
-        for trial in analysis.main_trials
+        for trial in analysis.select_main_trials()
     ):
         return NO_IMPROVEMENT
     value = max(value, MIN_RERUN_SIGMA_Z_M) if name == SIGMA_Z else value
@@ -257,7 +257,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
 
 
 def detect_inconsistent_variances(analysis: Analysis) -> Findings:
-    for filter_name in FILTERS:
+    for filter_name in FILTER_NAMES:
         for is_underconfident in (True, False):
             first_id = None
             for axis_group, axes in AXIS_GROUPS.items():
@@ -323,7 +323,7 @@ def _variance_finding(
     return finding(
         severity,
         f"{filter_name}_{confidence}",
-        f"{filter_name.upper()} is {confidence} along {result.axis.label}: σ is "
+        f"{FILTER_NAMES[filter_name]} is {confidence} along {result.axis.label}: σ is "
         f"{format_ratio(sigma_factor)} times too {'large' if is_underconfident else 'small'}. The "
         f"mean NIS of this {axis_group} axis is {format_number(summary.nis_mean)}, expected "
         f"{low:.2f} to {high:.2f}.",

@@ -39,7 +39,7 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
         "interval_low_s": interval_low_s,
         "interval_high_s": interval_high_s,
     }
-    if clock.changes and clock.change_p_value is not None:
+    if clock.has_changed() and clock.change_p_value is not None:
         start_offset_s, end_offset_s = clock.parts[0].offset_s, clock.parts[-1].offset_s
         yield error(
             "source_time_offset_changes",
@@ -82,7 +82,7 @@ def _find_trial(analysis: Analysis, filter_name: FilterName, kind: str) -> Trial
     return next(
         (
             trial
-            for trial in analysis.main_trials
+            for trial in analysis.select_main_trials()
             if (trial.filter, trial.kinds) == (filter_name, (kind,))
         ),
         None,

@@ -148,8 +148,8 @@ def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
         or isinstance(attitude, Unavailable)
     ):
         return False
-    errors_deg = []
-    for part in heading.ends:
+    errors_deg, (first_part, last_part) = [], heading.find_ends()
+    for part in (first_part, last_part):
         samples = attitude.loc[part.start_s : part.end_s, Columns.QUATERNION]
         true_attitude = interpolate(
             samples.index.to_numpy(), truth.attitude.index.to_numpy(), truth.attitude.to_numpy()
@@ -157,13 +157,13 @@ def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
         error_rad = heading_of(samples.to_numpy()) - heading_of(true_attitude)
         wrapped_rad = np.arctan2(np.sin(error_rad), np.cos(error_rad))
         errors_deg.append(float(np.degrees(np.median(wrapped_rad))))
-    change_deg = abs(heading.ends[1].heading_error_deg - heading.ends[0].heading_error_deg)
+    change_deg = abs(last_part.heading_error_deg - first_part.heading_error_deg)
     return abs(errors_deg[1] - errors_deg[0]) < MIN_TRUE_DRIFT_RATIO * change_deg
 
 
 def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
-    first_part, last_part = heading.ends
-    errors_deg = [math.remainder(part.heading_error_deg, 360.0) for part in heading.ends]
+    first_part, last_part = heading.find_ends()
+    errors_deg = [math.remainder(part.heading_error_deg, 360.0) for part in (first_part, last_part)]
     change_deg = last_part.heading_error_deg - first_part.heading_error_deg
     estimation_basis = "positions and IMU"
     if heading.by == "orientation":

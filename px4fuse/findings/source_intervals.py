@@ -142,7 +142,7 @@ def _ekf2_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
     axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
     squares_m2 = []
     for result in axes if len(axes) == 2 else [analysis.main]:
-        tracks = result.in_flight
+        tracks = result.with_flight_tracks()
         if isinstance(tracks.ekf2_state, Unavailable):
             return {}
         position_m = tracks.ekf2_state["position_m"].loc[slice(*span_s)]
@@ -245,7 +245,10 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     source = analysis.source
     # The intervals are not those at which PX4 received the positions if px4fuse changed the
     # timestamps, or if PX4 logs the positions only after EKF2 used them (ALIGNED)
-    if source.clock_map is not None or source.origin.preference_rank >= ALIGNED.preference_rank:
+    if (
+        source.clock_map is not None
+        or source.origin.find_preference_rank() >= ALIGNED.find_preference_rank()
+    ):
         return
     intervals_s, _ = _position_intervals_s(analysis)
     period_and_counts = _find_period(intervals_s) if len(intervals_s) >= MIN_INTERVALS else None

@@ -235,7 +235,7 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
     source, parameter = analysis.source, EV_POS.switch
     names = constant_coordinates(source)
     is_one = len(names) == 1
-    if not names or (is_one and source.step_m > 0.0):
+    if not (is_one or is_height_only(source)) or (is_one and source.step_m > 0.0):
         return  # rounded positions may stay within one step
     values_m = dict(zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True))
     name, bit, make_finding = "source_coordinate_constant", HORIZONTAL_CONTROL, error
@@ -243,7 +243,7 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
     if names == ["z"]:
         name, bit, make_finding = "source_height_constant", HEIGHT_CONTROL, warning
         consequence = "The height is not evaluated."
-    elif not is_one:
+    elif names == ["x", "y"]:
         make_finding = warning
         consequence = "Only the height is a measurement. The horizontal position is not evaluated."
     action, listed_names = "", " and ".join(names)
@@ -472,7 +472,7 @@ def _rejected_outliers_sentence(analysis: Analysis, outlier_times_s: Sequence[fl
     if len(innovations) < MIN_INNOVATION_FRACTION * len(analysis.main.axis.measurement_time_s):
         return ""
     rejected_s = innovations.index[innovations["rejected"] > 0.0].to_numpy()
-    tolerance_s = 0.5 / analysis.source.rate_hz
+    tolerance_s = 0.5 / analysis.source.compute_rate_hz()
     rejected_count = sum(
         bool(np.any(np.abs(rejected_s - time_s) < tolerance_s)) for time_s in outlier_times_s
     )

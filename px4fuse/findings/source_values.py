@@ -105,7 +105,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         if len(spans) <= 3:
             times = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
         error_text, make_finding = "", note if reason == "NaN" else warning
-        if duration_s > max_interval_s(1.0 / source.rate_hz):
+        if duration_s > max_interval_s(1.0 / source.compute_rate_hz()):
             make_finding = warning
             valid_times_s = _valid_times_around(analysis, longest_span_s)
             error_text = f" {describe_errors_after_gap(analysis, valid_times_s)}"
@@ -202,7 +202,7 @@ def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | N
         return ""
     rmses_m = []
     for replay in (model.baseline_replay, *replay_settings(model, [change])):
-        replayed_track = rows_inside(replay.published, replay.evaluated_s)
+        replayed_track = rows_inside(replay.published, replay.find_evaluated_spans())
         axis_errors_m = [
             replayed_track[name]
             - np.interp(replayed_track.index, truth.samples.index, truth.samples[name])
@@ -219,7 +219,7 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     """Detect two senders whose positions alternate."""
     samples = cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION]
     samples = samples.dropna(axis=1, how="all").dropna()
-    window_count, rate_hz = (len(samples) - 2) // WINDOW_SAMPLES, analysis.source.rate_hz
+    window_count, rate_hz = (len(samples) - 2) // WINDOW_SAMPLES, analysis.source.compute_rate_hz()
     if window_count < MIN_WINDOWS:
         return
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
