@@ -47,27 +47,27 @@ def make_frame_finding(analysis: Analysis) -> Finding:
     """Make the finding that positions are in FRD, so that their x axis is not north."""
     ekf2, log = analysis.flight.ekf2, analysis.flight.log
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else None
-    sensor = source_name(analysis.source)
+    sensor_name = source_name(analysis.source)
     fault = (
         f"{positions_phrase(analysis.source)} are in FRD: their x axis points "
         "along the heading at the start, not north."
     )
-    fusion_sentence, action = "", f"In this report, north is the x axis of {sensor}."
+    fusion_sentence, action = "", f"In this report, north is the x axis of {sensor_name}."
     if isinstance(fusion_flags, Unavailable):
-        fusion_sentence = f"The log does not show whether EKF2 fused the yaw of {sensor}."
+        fusion_sentence = f"The log does not show whether EKF2 fused the yaw of {sensor_name}."
         if log.has_ulog:
             action += " Give the ULog of this flight as well: it shows the frame that EKF2 uses."
     elif (
         fusion_flags is not None
         and fraction_of_ones(fusion_flags["yaw"], analysis.segment) > MIN_FUSED_FRACTION_ERROR
     ):
-        fusion_sentence = f"EKF2 fused the yaw of {sensor}, so EKF2 uses the same frame."
+        fusion_sentence = f"EKF2 fused the yaw of {sensor_name}, so EKF2 uses the same frame."
     has_yaw = analysis.source.orientation is not None
     if fusion_sentence:
         return note("source_frame_frd", f"{fault} {fusion_sentence}", action)
     return warning(
         "source_frame_frd",
-        f"{fault} EKF2 did not fuse the yaw of {sensor}, so EKF2's axes are NED. The axes of "
+        f"{fault} EKF2 did not fuse the yaw of {sensor_name}, so EKF2's axes are NED. The axes of "
         "positions and EKF2 may differ.",
         "Send the position in NED"
         + (", or let EKF2 fuse the yaw (EKF2_EV_CTRL bit 3)." if has_yaw else "."),

@@ -429,7 +429,7 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     sample_count = np.rint((times_s[used_rows] - times_s[used_rows - 1]) / interval_s)
     filter_memory = ((1.0 - FLOW_FILTER_WEIGHT) ** sample_count)[:, None]
     filtered_velocity = flow_velocity[["forward_m_s", "right_m_s"]].to_numpy()
-    forward, right = (
+    forward_m_s, right_m_s = (
         (filtered_velocity[used_rows] - filter_memory * filtered_velocity[used_rows - 1])
         / (1.0 - filter_memory)
     ).T
@@ -443,8 +443,8 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     ).sum(axis=1)
     flow = pd.DataFrame(
         {
-            "forward_m_s": forward,
-            "right_m_s": right,
+            "forward_m_s": forward_m_s,
+            "right_m_s": right_m_s,
             "samples": sample_count,
             "interval_s": interval_s,
             "noise_m2_s2": squared_range
