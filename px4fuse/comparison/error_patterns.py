@@ -409,10 +409,10 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
 
     # the constants without the constant time offset, and the error
     columns = np.concatenate([fit.columns[..., :-1], fit.remaining_m[..., None]], axis=-1)
-    offsets_of_columns_s = fit_offsets(columns)
-    columns -= effect[:, :, None] * offsets_of_columns_s[parts, None]
+    offsets_by_column_s = fit_offsets(columns)
+    columns -= effect[:, :, None] * offsets_by_column_s[parts, None]
     parameters, remaining_m = _least_squares(columns[..., :-1], columns[..., -1])
-    offsets_s = (offsets_of_columns_s @ np.append(-parameters, 1.0))[moving_parts]
+    offsets_s = (offsets_by_column_s @ np.append(-parameters, 1.0))[moving_parts]
     remaining_square_m2 = float(np.mean(remaining_m**2, axis=0).sum()) - 2.0 * fit.white_m**2
     if (
         np.ptp(offsets_s) < MIN_OFFSET_RANGE_S

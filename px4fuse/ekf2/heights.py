@@ -237,9 +237,13 @@ class HeightFilter:
             )
         return x, P
 
-    def fuse_gnss(self, e: int, x: Array, P: Array, gnss_m: Array, gnss_m2: Array) -> ArrayPair:
-        """Fuse the GNSS height (m, down) of one event; ``gnss_m2`` is its R (m²)."""
-        return self._fuse_sample(e, len(self.down_m), x, P, gnss_m, np.zeros(1), gnss_m2)
+    def fuse_gnss(
+        self, e: int, x: Array, P: Array, gnss_down_m: Array, gnss_variance_m2: Array
+    ) -> ArrayPair:
+        """Fuse the GNSS height (m, down) of one event; ``gnss_variance_m2`` is its R (m²)."""
+        return self._fuse_sample(
+            e, len(self.down_m), x, P, gnss_down_m, np.zeros(1), gnss_variance_m2
+        )
 
     def update_bad_acceleration(self, e: int, time_s: Array) -> None:
         update_log = self.update_log[max(e - 1, 0) : e + 1]

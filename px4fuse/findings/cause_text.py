@@ -88,12 +88,12 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
     if change.pop(trials.FORWARD_BIAS, None) is not None:
         actions.append("Calibrate the accelerometer and the level horizon.")
         change.pop(trials.RIGHT_BIAS)
-    if turn_deg := change.pop(trials.ROTATION, None):
+    if rotation_deg := change.pop(trials.ROTATION, None):
         # GNSS positions refer to true north: if they are rotated, EKF2's heading is wrong
         actions.append(
             "Calibrate the magnetometer, away from metal."
             if is_gnss
-            else f"Rotate the positions by {turn_deg:+.0f}° before they are sent."
+            else f"Rotate the positions by {rotation_deg:+.0f}° before they are sent."
         )
     if (offset_s := change.pop(trials.CLOCK_OFFSET, None)) is not None:
         actions.append(f"{format_shift(offset_s)} the position timestamps before sending.")

@@ -175,7 +175,7 @@ def detect_missing_alignment(
         isinstance(fusion_flags, pd.DataFrame)
         and fraction_of_ones(fusion_flags["yaw"], segment) > 0.0
     )
-    aligned_s = segment.start_s
+    alignment_end_s = segment.start_s
     for flag, quantity, action in (
         ("tilt_align", "tilt", "Keep the vehicle at rest after boot until EKF2 is ready."),
         ("yaw_align", "heading", _align_heading_action(flight, source)),
@@ -187,10 +187,12 @@ def detect_missing_alignment(
         unaligned_fraction = 1.0 - fraction_of_ones(alignment_flag, segment)
         if (
             unaligned_fraction > MAX_UNALIGNED_FRACTION
-            and spans[-1][1] > aligned_s + MAX_HEADING_ALIGNMENT_S
+            and spans[-1][1] > alignment_end_s + MAX_HEADING_ALIGNMENT_S
         ):
-            aligned_s = spans[-1][1]
-            until_text = f" until {aligned_s:.1f} s" if aligned_s < segment.end_s else ""
+            alignment_end_s = spans[-1][1]
+            until_text = (
+                f" until {alignment_end_s:.1f} s" if alignment_end_s < segment.end_s else ""
+            )
             yield error(
                 "ekf2_not_aligned",
                 f"EKF2 has not aligned its {quantity}{until_text}. cs_{flag} is 0 for "

@@ -148,8 +148,8 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
         return None
     clock, correlated_noise = analysis.clock, analysis.time_correlated_noise
     # At a high rate, the time offset (negative for a lag) is more accurate than the correlation
-    limit_s = -MAX_LAG_RATIO * clock.interval_s[0] if isinstance(clock, ClockOffset) else 0.0
-    if isinstance(clock, ClockOffset) and low_pass.lag_s > limit_s >= MIN_LAG_S:
+    lag_limit_s = -MAX_LAG_RATIO * clock.interval_s[0] if isinstance(clock, ClockOffset) else 0.0
+    if isinstance(clock, ClockOffset) and low_pass.lag_s > lag_limit_s >= MIN_LAG_S:
         low_pass = replace(low_pass, lag_s=-clock.offset_s)
     # A low-pass filter delays positions: correlated errors without lag have another cause
     if (
