@@ -214,8 +214,8 @@ class HeightFilter:
         self.update_log = np.full((event_count, slot_count + 1, 4, configuration_count), np.nan)
         # Times of the samples in the order of fusion
         sample_s = np.where(self.has_sample, self.time_s, start_s)[biased_slots].swapaxes(0, 1)
-        latest_s = np.maximum.accumulate(sample_s.reshape(-1, configuration_count), axis=0)
-        interval_s = np.diff(latest_s, axis=0, prepend=start_s).reshape(sample_s.shape)
+        latest_sample_s = np.maximum.accumulate(sample_s.reshape(-1, configuration_count), axis=0)
+        interval_s = np.diff(latest_sample_s, axis=0, prepend=start_s).reshape(sample_s.shape)
         self.interval_s[biased_slots] = interval_s.swapaxes(0, 1)
         self.interval_s *= self.updates_bias
 

@@ -447,11 +447,13 @@ def match_updates(
     fused_at_s = updates["fused_at_s"].to_numpy()
     update_row = np.searchsorted(fused_at_s, logged_s + 1e-4, side="right") - 1
     age_s = logged_s - fused_at_s[np.maximum(update_row, 0)]
-    is_match = (update_row >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
+    is_matched = (update_row >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
     # A row that is logged in the prediction step of a fusion may contain the previous innovation
-    is_unambiguous = is_match & (age_s >= SAME_STEP_S)
+    is_unambiguous = is_matched & (age_s >= SAME_STEP_S)
     return np.where(
-        is_unambiguous if is_unambiguous.sum() > 0.5 * is_match.sum() else is_match, update_row, -1
+        is_unambiguous if is_unambiguous.sum() > 0.5 * is_matched.sum() else is_matched,
+        update_row,
+        -1,
     )
 
 

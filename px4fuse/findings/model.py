@@ -167,5 +167,7 @@ def spans_with_value(value: float, step_function: pd.Series, segment: Segment) -
 
 def fraction_of_ones(step_function: pd.Series, segment: Segment) -> float:
     """Return the fraction of the time in a segment at which a flag (0 or 1) is 1."""
-    ones_s = sum(end - start for start, end in spans_with_value(1.0, step_function, segment))
-    return ones_s / (segment.end_s - segment.start_s)
+    duration_of_ones_s = sum(
+        end - start for start, end in spans_with_value(1.0, step_function, segment)
+    )
+    return duration_of_ones_s / (segment.end_s - segment.start_s)
