@@ -199,11 +199,13 @@ def prepare_comparison(
             "State the offset (--clock-offset SECONDS), or omit --clock-offset.",
         )
     if not clock.is_significant(clock.remaining_s):
-        low, high = clock.interval_s
+        low, high = (limit_s - clock.applied_s for limit_s in clock.interval_s)
         note = (
-            f"--clock-offset auto: the time offset {clock.offset_s:+.3f} s (95 % {low:+.3f} to "
+            f"--clock-offset auto: the time offset {clock.remaining_s:+.3f} s (95 % {low:+.3f} to "
             f"{high:+.3f} s) is not significant and was not applied"
         )
+        if clock.applied_s:
+            note += f", in addition to {clock.applied_s:+.3f} s from the check of the timestamps"
         return replace(prepared_comparison, notes=(*prepared_comparison.notes, note))
     request = structs.replace(request, clock_offset_s=clock.offset_s)
     return prepare(flight, request, as_sent=as_sent)
@@ -257,7 +259,7 @@ def diagnose_or_check_aids(
             f"checked: {aids.reason}",
             missing_source.remedy,
         )
-    return AidsOnlyAnalysis(flight, aids, missing_source, find_aids(aids, flight.ekf2))
+    return AidsOnlyAnalysis(flight, aids, missing_source, find_aids(aids, flight))
 
 
 def run_what_if(

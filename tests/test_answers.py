@@ -24,7 +24,7 @@ from px4fuse.results.answer_form import (
 )
 from px4fuse.results.contract import ComparisonResults
 from px4fuse.results.reading import read_results
-from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
+from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED
 
 SHA256 = "b" * 64
 EMPTY = form_text("s07.ulg", SHA256)

@@ -41,7 +41,7 @@ from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.readers import ulog_topics
 from px4fuse.results.answer_form import Answers, read_answers
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 
 SECRET = b"a secret for tests"
 # Flight of student s1 with SECRET: seed, noise and heading, and the faults
@@ -145,7 +145,7 @@ class TestDraw:
             first, second = choices_of(drawn)
             assert first.is_detectable_with(second)
             assert second.is_detectable_with(first)
-            parse_mistakes(drawn.mistake_options)
+            parse_faults(drawn.mistake_options)
             ratios = [EASIEST_DIFFICULTY]
             for choice, text in zip(choices_of(drawn), drawn.mistake_options, strict=True):
                 if choice.detectable_size is None:

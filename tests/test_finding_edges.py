@@ -1082,3 +1082,11 @@ def test_fault_severity_changes_at_each_detection_limit(
     detect: Any, one: Any, expected: str | None
 ) -> None:
     assert severity(detect, one) == expected
+
+
+@pytest.mark.parametrize(("size", "is_reported"), [(5, True), (2, False), (1, False)])
+def test_timestamps_in_bursts_are_reported_as_jitter(size: int, is_reported: bool) -> None:
+    time_s = (0.25 * np.arange(40.0)[:, None] + 6e-4 * np.arange(size)).ravel()
+    found = [*source_stamps.detect_bursts(analysis(source=source(samples=positions(time_s))))]
+    assert [finding.id for finding in found] == ["source_timestamp_jitter"] * is_reported
+    assert not is_reported or "bursts of 5, every 0.25 s" in found[0].message

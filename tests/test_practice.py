@@ -29,8 +29,8 @@ from px4fuse.explore import practice
 from px4fuse.explore.practice import NOISY_UWB, QUIZ_ANSWERS, QuizFault, draw_flights
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Flight
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 # A set without a fault, with one of the source, and with one of the frame
@@ -79,7 +79,7 @@ def flown(mistake: QuizFault | None, level: int, seed: int) -> Flight:
         sigma_uwb_m=float(size) if noisy else 0.1,
     )
     options = [] if mistake is None or noisy else [f"{mistake.name}={size}"]
-    return simulate_flight(scenario, parse_mistakes(options))
+    return simulate_flight(scenario, parse_faults(options))
 
 
 def compared(flight: Flight, **settings: float) -> Comparison:

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import FILTER_NAMES, Action, Cause, FilterName, Rerun, Target, Verdict
+from px4fuse.card.model import Action, Cause, Rerun, Target, Verdict
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
+from px4fuse.comparison.model import FILTER_NAMES, FilterName
 from px4fuse.comparison.remedy import different_settings
 from px4fuse.comparison.trials import (
     CLOCK_OFFSET,
@@ -80,7 +81,7 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
     for finding in root_findings:
         if finding.severity == "note":
             continue
-        trials = confirming_trials(analysis.main_trials, finding)
+        trials = confirming_trials(analysis.select_main_trials(), finding)
         if CATALOGUE[finding.id].verdict == "repeated":
             trials = tuple(filter(is_useful, trials))
         elif trials and not any(
@@ -234,7 +235,7 @@ def _make_actions(
     # actions on KF are last: first correct the vehicle
     actions.sort(key=lambda action: action.target == "KF")
     targets = {action.target for group in (actions, *alternatives) for action in group}
-    reason_by_filter = {
+    reason_by_filter: dict[Target, str] = {
         name: reason
         for filter_name, name in FILTER_NAMES.items()
         if name not in targets

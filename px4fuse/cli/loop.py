@@ -190,7 +190,7 @@ def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict
 
     contents = {}
     if tum is not None:
-        best_path = loop_result.best
+        best_path = loop_result.choose_best_path()
         if best_path is loop_result.odometry:
             raise MissingDataError(
                 f"--tum {display_name(tum)}: the path is not corrected, as no loop closure was "

@@ -139,9 +139,8 @@ class ErrorFit(NamedTuple):
     scale: float
     scale_sigma: float
 
-    @property
-    def slow_square_m2(self) -> float:
-        """Mean square (m²) of the remaining error without white noise, summed over both axes."""
+    def compute_slow_square_m2(self) -> float:
+        """Return the mean square (m²) of the remaining error of both axes, without white noise."""
         return float(np.mean(self.remaining_m**2, axis=0).sum()) - 2.0 * self.white_m**2
 
 
@@ -351,7 +350,7 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     duration_s = fit.time_s[-1] - fit.time_s[0]
     highest_hz = min(MAX_FREQUENCY_HZ, 0.25 / float(np.median(np.diff(fit.time_s))))
     frequencies_hz = np.arange(MIN_PERIODS / duration_s, highest_hz, 0.2 / duration_s)
-    if not len(frequencies_hz) or fit.slow_square_m2 <= 0.0:
+    if not len(frequencies_hz) or fit.compute_slow_square_m2() <= 0.0:
         return None
 
     def mean_squares(values: Array, frequency_hz: float) -> float:
@@ -363,7 +362,10 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     motion_fraction = mean_squares(fit.path_m, frequency_hz) / np.mean(
         np.sum(fit.path_m**2, axis=1)
     )
-    amplitude_m, fraction = float(np.sqrt(2.0 * square_m2)), square_m2 / fit.slow_square_m2
+    amplitude_m, fraction = (
+        float(np.sqrt(2.0 * square_m2)),
+        square_m2 / fit.compute_slow_square_m2(),
+    )
     if (
         fraction < MIN_PERIODIC_FRACTION
         or amplitude_m < MIN_AMPLITUDE_SIGMAS * fit.white_m
@@ -396,8 +398,8 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     remaining_square_m2 = float(np.mean(remaining_m**2, axis=0).sum()) - 2.0 * fit.white_m**2
     if (
         np.ptp(offsets_s) < MIN_OFFSET_RANGE_S
-        or fit.slow_square_m2 < MIN_SLOW_RATIO * 2.0 * fit.white_m**2
-        or remaining_square_m2 > MAX_REMAINING_FRACTION * fit.slow_square_m2
+        or fit.compute_slow_square_m2() < MIN_SLOW_RATIO * 2.0 * fit.white_m**2
+        or remaining_square_m2 > MAX_REMAINING_FRACTION * fit.compute_slow_square_m2()
     ):
         return None
     times_s = fit.time_s[0] + OFFSET_PART_S * (moving_parts + 0.5)

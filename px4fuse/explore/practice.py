@@ -26,7 +26,7 @@ from px4fuse.findings import Finding
 from px4fuse.report.card_html import card_html
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import Scenario
 
 # Pairs of faults (as answers of the quiz) that do not hide each other in one flight
@@ -186,7 +186,7 @@ def _flight_data(practice_flight: QuizFlight, flight_index: int) -> tuple[dict[s
     options = [
         f"{fault.name}={size}" for fault, size in faults_and_sizes if fault.name != NOISY_UWB
     ]
-    simulation = flights.simulate(practice_flight.scenario, parse_mistakes(options))
+    simulation = flights.simulate(practice_flight.scenario, parse_faults(options))
     flight = flights.to_flight(simulation, f"flight {flight_index + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     # as_sent: the automatic correction of axes and timestamps would hide the injected fault

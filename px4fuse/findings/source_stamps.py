@@ -22,20 +22,20 @@ from px4fuse.flight.model import (
     positions_phrase,
 )
 
-# Maximum jitter (s) of receive times for no finding: a position error of 1 cm at 1 m/s
+# Jitter of receive times is reported above this value (s): a position error of 1 cm at 1 m/s
 MAX_RECEIPT_JITTER_S = 0.010
-# Maximum age (s), at publication by PX4, of a position whose timestamp is its arrival time
+# A timestamp is the arrival time if PX4 publishes the position within this time (s) after it
 MAX_ARRIVAL_AGE_S = 0.001
 # Minimum latency (s) for a warning: a position error of 2 cm at 1 m/s
 MIN_LATENCY_S = 0.02
 # Minimum latency (s) for severity error: a position error of 10 cm at 1 m/s
 MIN_LATENCY_ERROR_S = 0.10
-# Minimum rank correlation of latency and time, if the latency grows in flight
+# The latency grows in flight if its rank correlation with time exceeds this value
 MIN_LATENCY_TREND = 0.8
 # Minimum number of positions before the convergence of TIMESYNC, and minimum number after it
 MIN_SAMPLES = 10
-# Minimum fraction of timestamps that are arrival times before the convergence of TIMESYNC, and
-# measurement times after the convergence
+# Minimum fraction of arrival times among the timestamps before the convergence of TIMESYNC, and of
+# measurement times after it
 MIN_CONSISTENT_FRACTION = 0.95
 # Minimum mean number of positions in a burst of positions that arrive together
 MIN_BURST_SIZE = 2.5
@@ -70,23 +70,32 @@ def detect(analysis: Analysis) -> Findings:
         yield warning(
             "companion_not_synchronised",
             f"The source of the {positions} never synchronised its clock (TIMESYNC). EKF2 used "
-            "arrival times as times of measurement. "
-            f"{kf_times_sentence}{_describe_bursts(analysis)}",
+            f"arrival times as times of measurement. {kf_times_sentence}",
             ANSWER_TIMESYNC,
             {"jitter_s": clock.jitter_s},
         )
 
 
-def _describe_bursts(analysis: Analysis) -> str:
-    """Return a sentence on positions that arrive in bursts; empty if they arrive one by one."""
+def detect_bursts(analysis: Analysis) -> Findings:
+    """Detect timestamps in bursts: arrival times of positions that wait for each other."""
     intervals_s = np.diff(analysis.source.samples.index.to_numpy())
     is_pause = intervals_s > intervals_s.mean()
     if not is_pause.any() or (burst_size := 1.0 / float(is_pause.mean())) < MIN_BURST_SIZE:
-        return ""
+        return
     pause_s = float(np.median(intervals_s[is_pause]))
     if np.median(intervals_s[~is_pause]) > MAX_BURST_INTERVAL_RATIO * pause_s:
-        return ""
-    return f" The positions arrive in bursts of {burst_size:.0f}, every {pause_s:.2g} s."
+        return
+    yield error(
+        "source_timestamp_jitter",
+        f"The timestamps of the {positions_phrase(analysis.source)} come in bursts of "
+        f"{burst_size:.0f}, every {pause_s:.2g} s "
+        f"({analysis.source.compute_rate_hz():.3g} Hz on average). "
+        "They are arrival times of positions that were "
+        f"measured earlier, by up to {pause_s:.2g} s. At 1 m/s this is a position error of up to "
+        f"{format_metres(pause_s)} m along the motion.",
+        "Send each position at once, with its time of measurement.",
+        {"burst_size": burst_size, "interval_s": pause_s},
+    )
 
 
 def detect_shared_timestamps(
@@ -222,7 +231,7 @@ def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
     if position_age_s is None:
         return None
     is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
-    # for each position as the last one before convergence: number of timestamps that do not fit
+    # Number of timestamps that contradict a convergence directly after each position
     contradicting_count: Array = (
         np.cumsum(~is_arrival_time) + np.sum(is_arrival_time) - np.cumsum(is_arrival_time)
     )
@@ -242,7 +251,10 @@ def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
 
 
 def _position_age_s(analysis: Analysis) -> pd.Series | None:
-    """Return the publication time of each position minus its timestamp_sample (s), if logged."""
+    """Return the age (s) of each position at its publication, from timestamp_sample.
+
+    Return None if the log does not contain it.
+    """
     ekf2, source, segment = analysis.flight.ekf2, analysis.source, analysis.segment
     fusion_record = ekf2.record if isinstance(ekf2, Ekf2) else None
     if (

@@ -179,10 +179,14 @@ def _flight_fields(
         **track.description_fields(),
         ekf2_parameters={} if origin.aid is None else origin.aid.logged_parameters(parameters),
         reason=comparison.source_reason,
-        rate_hz=track.rate_hz,
+        rate_hz=track.compute_rate_hz(),
         available=tuple(
             AvailableTrack(
-                each.name, each.origin.kind, each.origin.path, len(each.samples), each.rate_hz
+                each.name,
+                each.origin.kind,
+                each.origin.path,
+                len(each.samples),
+                each.compute_rate_hz(),
             )
             for each in comparison.flight.positions
         ),

@@ -30,7 +30,7 @@ from px4fuse.core.writing import write_all
 from px4fuse.errors import OutputError
 from px4fuse.results.answer_form import form_name, form_text
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 
 # Fields of a simulation whose true values are written to the answer key
 TRUE_VALUE_NAMES = (
@@ -56,7 +56,7 @@ def simulate_assigned_flight(
         secret, student.student_id, kind, fault_count, with_ground_truth
     )
     simulation = flights.simulate(
-        assigned_flight.scenario, parse_mistakes(assigned_flight.mistake_options)
+        assigned_flight.scenario, parse_faults(assigned_flight.mistake_options)
     )
     log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()

@@ -32,7 +32,7 @@ from px4fuse.results.answer_form import (
     select_questions,
 )
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import MISTAKES as SIMULATED_MISTAKES
+from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED_MISTAKES
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 
 # Maximum relative error of the size of a fault in a student's answer

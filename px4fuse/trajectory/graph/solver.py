@@ -108,8 +108,8 @@ def solve(
         The graph has no edges, is not connected, contains a number that is not finite, or robust
         optimisation drops all edges to some poses.
     """
-    model.require_connected(graph, np.ones(len(graph.first), bool), "the edges")
-    is_doubtful = ~graph.is_successive if is_closure is None else is_closure
+    model.require_connected(graph, np.ones(len(graph.first_nodes), bool), "the edges")
+    is_doubtful = ~graph.find_successive() if is_closure is None else is_closure
     start_residuals = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start_residuals.chi2))
     if not np.isfinite(cost_initial):
@@ -315,7 +315,7 @@ def analyse_graph(
     TrajectoryError
         The graph is not connected.
     """
-    is_closure = ~graph.is_successive
+    is_closure = ~graph.find_successive()
     progress(f"optimising: {SOLUTIONS['all']}")
     solutions = {"all": solve(graph)}
     freedom = int(model.observed_directions(graph.information).sum())
@@ -348,7 +348,7 @@ def analyse_graph(
         name=name,
         dimension=graph.dimension,
         poses=len(graph),
-        edges=len(graph.first),
+        edges=len(graph.first_nodes),
         initialised=graph.initialised,
         chi2_ratio=chi2_ratio,
         chi2_ratio_interval=interval,
