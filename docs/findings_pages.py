@@ -116,7 +116,7 @@ def find_in_changed_timestamps() -> list[Finding]:
         attitude=flight.attitude.set_axis(flight.attitude.index + 0.2),
         ekf2=replace(flight.ekf2, record=record),
     )
-    faults = ("attitude_late", "source_latency_grows")
+    faults = ("attitude_late", "source_latency_varies")
     return [finding for finding in find(unexplained(compare(flight))) if finding.id in faults]
 
 

@@ -37,6 +37,7 @@ from px4fuse.comparison.preparation import explain_missing_source, prepare
 from px4fuse.comparison.remedy import ml_ekf2_parameters
 from px4fuse.comparison.reruns import Reruns, planned_configurations, rerun_filters
 from px4fuse.convention.correction import convention_faults
+from px4fuse.core.memory import release_free_memory
 from px4fuse.core.reading import display_name
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.model import Model, open_model
@@ -105,8 +106,10 @@ def find_faults(comparison: Comparison, progress: Progress = ignore_progress) ->
         }
         return Analysis(**withheld_fields | known_fields)
     estimates = estimate(comparison, progress)
+    release_free_memory()
     comparison = refine_delay(comparison, estimates.clock)
     reruns = rerun(comparison, estimates, progress)
+    release_free_memory()
     progress("measuring the loop closure error")
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
 
@@ -152,6 +155,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
     log_path = Path(request.log)
     progress(f"reading {display_name(log_path)}")
     flight = read_log(log_path, system=request.system)
+    release_free_memory()
     requested_file, offset_s = request.position, request.clock_offset_s
     if requested_file is None:
         return flight

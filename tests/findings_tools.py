@@ -88,7 +88,10 @@ def source(**parts: Any) -> Any:
         "invalid": NO_INVALID_ROWS,
     }  # fmt: skip
     made = {**usual, **parts}
-    return SimpleNamespace(aid=lambda axis: made["origin"].aid, **made)
+    rate_hz = made.pop("rate_hz")
+    return SimpleNamespace(
+        aid=lambda axis: made["origin"].aid, compute_rate_hz=lambda: rate_hz, **made
+    )
 
 
 def positions(time_s: Any, north_m: Any = 0.0, variance_m2: float = np.nan) -> pd.DataFrame:

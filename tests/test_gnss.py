@@ -495,7 +495,7 @@ def test_what_if_without_aiding_source_predicts_position_error(models):
 
     def without(*names: str) -> tuple[Summary, float]:
         found = what_if(models["nominal"], [{}], dict.fromkeys(names, 60.0))
-        assert found.find_evaluated_spans()[0][0] == 60.0
+        assert found.evaluated_s[0][0] == 60.0
         (after,) = found.whatif
         error = after.position_rmse_to_truth_m
         return after, error

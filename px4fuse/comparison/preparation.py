@@ -358,19 +358,21 @@ def choose_segment(
     elif not flight.airborne:
         reason = "whole duration of the position source (the vehicle never took off)"
     else:
-        flights = join_flights(flight.airborne)
+        flight_spans_s = join_flights(flight.airborne)
         chosen_start_s, chosen_end_s = max(
-            flights,
+            flight_spans_s,
             key=lambda span: min(span[1], available_end_s) - max(span[0], available_start_s),
         )
         reason = "positions available and vehicle airborne"
-        if len(flights) > 1:
+        if len(flight_spans_s) > 1:
             others_text = ", ".join(
                 f"{start_s:.1f} to {end_s:.1f} s (--start {start_s:.1f} --end {end_s:.1f})"
-                for start_s, end_s in flights
+                for start_s, end_s in flight_spans_s
                 if start_s != chosen_start_s
             )
-            reason += f"; this is the longest of {len(flights)} flights; the others: {others_text}"
+            reason += (
+                f"; this is the longest of {len(flight_spans_s)} flights; the others: {others_text}"
+            )
         if not max(chosen_start_s, available_start_s) < min(chosen_end_s, available_end_s):
             chosen_start_s = min(chosen_start_s, available_start_s)
             chosen_end_s = max(chosen_end_s, available_end_s)

@@ -107,7 +107,7 @@ class FusionAttempt:
 
     @property
     def has_switch(self) -> bool:
-        """True for PX4 v1.14 and later, with a separate parameter that enables the source."""
+        """True if a parameter of this source alone enables its fusion (PX4 v1.14 and later)."""
         return self.aid.switch in self.parameters
 
     @property

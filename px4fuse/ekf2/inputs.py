@@ -551,7 +551,7 @@ def _logged_decisions(
     arrival_s: Array,
     aid: Aid = EV_POS,
 ) -> tuple[Array, BoolArray]:
-    """Return for each position sample if EKF2 rejected it (1, 0 or NaN), and if it was reset to it.
+    """Return which position samples EKF2 rejected (1, else 0), and to which samples it was reset.
 
     The rejection is NaN if it is not logged.
     """

@@ -571,7 +571,7 @@ def _format_above(value: float, limit: float) -> str:
 
 
 def with_logged_rejections(agreement: Agreement, agreement_with_rejections: Agreement) -> Agreement:
-    """Return the agreement of a replay with EKF2's logged rejections.
+    """Return the agreement with the log of a replay that uses EKF2's logged rejections.
 
     If EKF2 rejects many samples, one sample near the gate makes a correct replay differ from the
     log. Rejected fraction and decisions are those of ``agreement``, the replay with a gate.

@@ -65,7 +65,7 @@ TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class Step(Record, kw_only=True):
-    """Effect of a property of EKF2 that replaces that of KF, such as the measurement noise.
+    """Effect of replacing one property of KF, such as the measurement noise, by that of EKF2.
 
     Attributes
     ----------

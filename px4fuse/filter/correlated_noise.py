@@ -385,7 +385,7 @@ def _fit_noises_at(
 def _best_of_grid(
     prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidate_noises: Sequence[Noises]
 ) -> tuple[float, Noises]:
-    """Return the lowest -ln p on a coarse grid of time offsets and noises, and its noises."""
+    """Search a coarse grid of time offsets and noises; return the lowest -ln p and its noises."""
     scored_noises = []
     for positions in map(prepared_motion.positions_at_offset, offsets_s):
         for candidate, sigma_a_factor in product(candidate_noises, COARSE_SIGMA_A_FACTORS):
@@ -400,6 +400,6 @@ def _best_of_grid(
                     noises,
                 )
             )
-    lowest_score, scale, noises = min(scored_noises, key=lambda result: result[0])
-    scaled_values = {name: value * scale for name, value in vars(noises).items() if name != "tau_s"}
-    return lowest_score, replace(noises, **scaled_values)
+    lowest_score, factor, noises = min(scored_noises, key=lambda scored: scored[0])
+    best_noises = {name: value * factor for name, value in vars(noises).items() if name != "tau_s"}
+    return lowest_score, replace(noises, **best_noises)

@@ -22,7 +22,8 @@ from px4fuse.flight.model import Ekf2, Unavailable
 REJECTED_FRACTION_WARNING = 0.01
 # Minimum fraction of rejected positions for severity error
 REJECTED_FRACTION_ERROR = 0.20
-# A change in a re-run prevents rejections if it reduces the rejected fraction below this ratio
+# A change in a re-run prevents rejections if it reduces the rejected fraction to less than this
+# multiple
 MAX_REJECTED_RATIO = 0.5
 
 

@@ -35,7 +35,8 @@ from px4fuse.trajectory.alignment import fit_alignment
 MIN_NEES_ERROR = 16.0
 # Only EKF2 has a fault if the ratio of KF's to EKF2's position RMSE is below this value
 MAX_KF_ERROR_RATIO = 0.7
-# The position frame is misaligned if an alignment reduces the position RMSE below this ratio
+# The position frame is misaligned if an alignment reduces the position RMSE to less than this
+# multiple
 MAX_ALIGNED_RMSE_RATIO = 0.5
 DRIFT_REMEDY = (
     "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "
@@ -244,7 +245,8 @@ def _rmse_after_alignment(comparison: Comparison, filter_name: FilterName) -> Al
     except TrajectoryError:  # the track is too short to determine a rotation
         return None
     rmse_m, aligned_rmse_m = (
-        float(np.linalg.norm(part)) / len(true_m) ** 0.5 for part in (error_m, aligned_m - true_m)
+        float(np.linalg.norm(errors)) / len(true_m) ** 0.5
+        for errors in (error_m, aligned_m - true_m)
     )
     return AlignedError(rmse_m, aligned_rmse_m)
 

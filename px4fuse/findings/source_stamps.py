@@ -11,7 +11,9 @@ from px4fuse.ekf2.fusion_conditions import (
     SET_TIMESTAMP_ACTION,
     SYNCHRONISE_ACTION,
 )
-from px4fuse.findings.model import Findings, error, fraction_of_ones, note, warning
+from px4fuse.ekf2.intervals import MAX_LATENESS_S
+from px4fuse.findings.model import Findings, error, format_percent, fraction_of_ones, note, warning
+from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
     ARRIVAL_METHODS,
     REPEATED_TIMESTAMPS,
@@ -32,6 +34,8 @@ MIN_LATENCY_S = 0.02
 MIN_LATENCY_ERROR_S = 0.10
 # The latency grows in flight if its rank correlation with time exceeds this value
 MIN_LATENCY_TREND = 0.8
+# Minimum fraction of positions that EKF2 drops because of their latency, for a finding
+MIN_DROPPED_FRACTION = 0.02
 # Minimum number of positions before the convergence of TIMESYNC, and minimum number after it
 MIN_SAMPLES = 10
 # Minimum fraction of arrival times among the timestamps before the convergence of TIMESYNC, and of
@@ -39,6 +43,8 @@ MIN_SAMPLES = 10
 MIN_CONSISTENT_FRACTION = 0.95
 # Minimum mean number of positions in a burst of positions that arrive together
 MIN_BURST_SIZE = 2.5
+# Minimum number of bursts: fewer pauses are gaps in the position source
+MIN_BURST_COUNT = 20
 # Maximum ratio of the interval within bursts of positions to the pause between bursts
 MAX_BURST_INTERVAL_RATIO = 0.1
 ANSWER_TIMESYNC = (
@@ -51,7 +57,7 @@ def detect(analysis: Analysis) -> Findings:
     clock, positions = analysis.source.clock_map, positions_phrase(analysis.source)
     if clock is None:
         yield from detect_arrival_times(analysis)
-        yield from detect_growing_latency(analysis)
+        yield from detect_varying_latency(analysis)
     elif clock.note == REPEATED_TIMESTAMPS and clock.distinct_stamps:
         yield from detect_shared_timestamps(analysis, clock.pairs, clock.distinct_stamps)
     elif clock.clock in AGE_BY_WRONG_TIMESTAMP:
@@ -83,7 +89,10 @@ def detect_bursts(analysis: Analysis) -> Findings:
     if not is_pause.any() or (burst_size := 1.0 / float(is_pause.mean())) < MIN_BURST_SIZE:
         return
     pause_s = float(np.median(intervals_s[is_pause]))
-    if np.median(intervals_s[~is_pause]) > MAX_BURST_INTERVAL_RATIO * pause_s:
+    if (
+        is_pause.sum() < MIN_BURST_COUNT
+        or np.median(intervals_s[~is_pause]) > MAX_BURST_INTERVAL_RATIO * pause_s
+    ):
         return
     yield error(
         "source_timestamp_jitter",
@@ -198,30 +207,39 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
         )
 
 
-def detect_growing_latency(analysis: Analysis) -> Findings:
-    """Detect positions that arrive later and later after their measurement."""
+def detect_varying_latency(analysis: Analysis) -> Findings:
+    """Detect positions that arrive later and later, or too late for EKF2's buffer."""
     position_age_s = _position_age_s(analysis)
     if position_age_s is None or find_synchronisation(analysis) is not None:
         return
-    part_count = max(MIN_SAMPLES, len(position_age_s) // 10)
+    sample_count = max(MIN_SAMPLES, len(position_age_s) // 10)
     start_s, end_s = (
-        float(part.median())
-        for part in (position_age_s.iloc[:part_count], position_age_s.iloc[-part_count:])
+        float(age_s.median())
+        for age_s in (position_age_s.iloc[:sample_count], position_age_s.iloc[-sample_count:])
     )
+    change_text = "grows in flight"
     trend = rank_correlation(position_age_s.index.to_numpy(), position_age_s.to_numpy())
-    if end_s - start_s < MIN_LATENCY_ERROR_S or trend < MIN_LATENCY_TREND:
-        return
-    ekf2, buffer_sentence, make_finding = analysis.flight.ekf2, "", warning
+    ekf2, buffer_sentence, dropped_fraction = analysis.flight.ekf2, "", 0.0
     if isinstance(ekf2, Ekf2) and isinstance(ekf2.horizon_s, float):
-        buffer_sentence = f" EKF2 fuses only positions younger than {ekf2.horizon_s:.2f} s."
-        make_finding = error if end_s > ekf2.horizon_s else warning
-    yield make_finding(
-        "source_latency_grows",
-        f"The latency of the {positions_phrase(analysis.source)} grows in flight from "
+        delay_s = 1e-3 * analysis.flight.log.parameters.get(EV_POS.delay, 0.0)
+        limit_s = ekf2.horizon_s + MAX_LATENESS_S - delay_s
+        dropped_fraction = float((position_age_s > limit_s).mean())
+        buffer_sentence = (
+            f" EKF2 drops positions that arrive later than {limit_s:.2f} s (here "
+            f"{format_percent(dropped_fraction)})."
+        )
+    if end_s - start_s < MIN_LATENCY_ERROR_S or trend < MIN_LATENCY_TREND:
+        if not MIN_DROPPED_FRACTION < dropped_fraction < 1.0 - MIN_DROPPED_FRACTION:
+            return
+        change_text = "varies"
+        start_s, end_s = position_age_s.quantile([0.05, 0.95]).tolist()
+    yield (error if dropped_fraction > MIN_DROPPED_FRACTION else warning)(
+        "source_latency_varies",
+        f"The latency of the {positions_phrase(analysis.source)} {change_text} from "
         f"{start_s:.2f} s to {end_s:.2f} s (time from measurement to arrival).{buffer_sentence}",
         "Find the queue that fills up: sender, bridge or link. Send fewer or smaller messages, and "
         "let the sender drop old positions.",
-        {"start_s": start_s, "end_s": end_s},
+        {"start_s": start_s, "end_s": end_s, "dropped_fraction": dropped_fraction},
     )
 
 

@@ -22,7 +22,8 @@ from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_ph
 
 # Minimum rounding step (m) to report it: the error of smaller steps is below the noise of UWB
 MIN_ROUNDING_STEP_M = 0.05
-# A lever arm is reported if a replay with it reduces EKF2's position RMSE below this ratio
+# A lever arm is reported if it reduces the position RMSE of an EKF2 replay to less than this
+# multiple
 MAX_LEVER_ARM_RMSE_RATIO = 0.7
 # Minimum distance (m) between the positions of two senders that alternate: the noise of good UWB
 MIN_SENDER_DISTANCE_M = 0.1
@@ -37,7 +38,8 @@ WINDOW_SAMPLES = 16
 MIN_WINDOWS = 10
 # Positions are a copy of EKF2's position if their median distance is below this limit (m)
 MAX_COPY_DISTANCE_M = 0.01
-# Limit (m) of the median distance of a copy that EKF2 fuses: smaller, as EKF2 follows any source
+# Maximum median distance (m) between EKF2 and a copy that EKF2 fuses. It is small, because EKF2
+# follows any source that it fuses
 MAX_FUSED_COPY_DISTANCE_M = 0.001
 # Positions are compared with EKF2's position above this speed (m/s): at rest, any source may agree
 MIN_COPY_SPEED_M_S = 0.2

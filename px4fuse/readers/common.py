@@ -17,8 +17,8 @@ MAX_IMU_VALUE = 1e4
 MIN_ZERO_DISTANCE_M = 0.3
 # A position is rejected as damaged if it is farther than this distance (m) from the median position
 MIN_FAR_DISTANCE_M = 1e4
-# Minimum ratio of a damaged position's distance from the median position to the median of these
-# distances
+# The distance of a damaged position from the median position also exceeds this multiple of the
+# median distance
 MIN_FAR_DISTANCE_RATIO = 100.0
 # Equal positions are rejected as frozen if they last at least this time (s): some sources send each
 # position several times within a shorter time

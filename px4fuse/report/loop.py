@@ -318,10 +318,10 @@ def pose_graph_page(solved_graph: Graph) -> Page:
         f"{solved_graph.name}: {solved_graph.dimension}-D, {solved_graph.poses} poses, "
         f"{solved_graph.edges} edges; initial poses: {solved_graph.initialised}",
     )
-    low, high = solved_graph.chi2_ratio_interval
+    low, high = solved_graph.reduced_chi2_interval
     if high > 0.0:
         fit_text = (
-            f"χ² per degree of freedom {format_number(solved_graph.chi2_ratio)} (95 % "
+            f"χ² per degree of freedom {format_number(solved_graph.reduced_chi2)} (95 % "
             f"{format_number(low)} to {format_number(high)} expected)"
         )
         if (factor := solved_graph.information_factor) > 1.0:
@@ -330,9 +330,9 @@ def pose_graph_page(solved_graph: Graph) -> Page:
                 f"{format_number(factor, 2)} times too large. Gate and robust optimisation use "
                 "the information divided by this factor."
             )
-        elif solved_graph.chi2_ratio > high:
+        elif solved_graph.reduced_chi2 > high:
             fit_text += ". Possible causes: false closures, or too large information matrices."
-        elif solved_graph.chi2_ratio < low:
+        elif solved_graph.reduced_chi2 < low:
             fit_text += ": the information matrices are too small, so the gate is too wide."
         page.write_labelled("Fit", fit_text)
     if isinstance(gates, Unavailable):
