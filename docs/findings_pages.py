@@ -68,7 +68,8 @@ IDS_FROM_LOGS = {
     "gyroscope_bias",
     "imu_values_impossible",
     "parameter_changed",
-    "source_height_only",
+    "source_coordinate_constant",
+    "source_height_constant",
     "source_relocalises",
 }
 LABEL_LENGTH = 26  # characters per line of an axis label

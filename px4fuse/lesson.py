@@ -44,7 +44,7 @@ def example_1() -> Replay:
 
 
 def kalman_lines() -> Iterator[str]:
-    """Yield the lines of Example 1 as the lesson prints them: the state after each UWB update."""
+    """Yield the lines of Example 1, as in the course: the state after each UWB update."""
     kf_run = example_1()
     for time, row in kf_run.steps.loc[kf_run.updates.index].iterrows():
         seconds = float(str(time))

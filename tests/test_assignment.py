@@ -16,8 +16,12 @@ from detector_rates import rates
 
 import px4fuse
 from px4fuse.classroom.assignment import assignment
-from px4fuse.classroom.assignment.assignment import assign, key_path, simulate_assigned_flight
-from px4fuse.classroom.assignment.key import AnswerKey, key_text, read_key
+from px4fuse.classroom.assignment.assignment import (
+    answer_key_path,
+    assign,
+    simulate_assigned_flight,
+)
+from px4fuse.classroom.assignment.key import AnswerKey, format_answer_key, read_answer_key
 from px4fuse.classroom.assignment.random_assignment import (
     EASIEST_DIFFICULTY,
     FAULT_COUNT_FRACTIONS,
@@ -27,7 +31,7 @@ from px4fuse.classroom.assignment.random_assignment import (
     UNDETECTABLE_DIFFICULTY,
     UNDETECTABLE_FRACTION,
     assign_random_flight,
-    derive_key,
+    derive_hmac_key,
 )
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.diagnose import find_faults
@@ -95,7 +99,7 @@ class TestDraw:
         # a loop contains no ground truth, which would show the landing
         assert scenario.truth
         assert not assign_random_flight(SECRET, "s1", "loop").scenario.truth
-        assert not assign_random_flight(SECRET, "s1", "aisle", truth=False).scenario.truth
+        assert not assign_random_flight(SECRET, "s1", "aisle", logs_truth=False).scenario.truth
         assert (scenario.seed, scenario.sigma_uwb_m, scenario.heading_deg) == PINNED[0]
         assert drawn.mistake_options == PINNED[1]
         loops = [
@@ -226,7 +230,7 @@ class TestAssign:
     def test_assign_flights_writes_logs_answer_forms_and_answer_key(self, tmp_path):
         folder, key_file = tmp_path / "a" / "flights", tmp_path / "key.json"
         made, written = assign(CLASS, folder, key_file, SECRET, "aisle", 2)
-        key = read_key(key_file)
+        key = read_answer_key(key_file)
         assert (key, written) == (made, 3)
         assert not key.secret
         assert SECRET.decode() not in key_file.read_text(encoding="utf-8")
@@ -255,8 +259,8 @@ class TestAssign:
         assert written == 1
         assert files(folder).items() >= {k: v for k, v in before.items() if k != "key"}.items()
         # the generated secret can be given later
-        assign(CLASS, folder, key_file, derive_key(key.secret), "aisle", 2)
-        assert read_key(key_file).secret == key.secret
+        assign(CLASS, folder, key_file, derive_hmac_key(key.secret), "aisle", 2)
+        assert read_answer_key(key_file).secret == key.secret
 
     def test_assign_flights_does_not_overwrite_other_files(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
@@ -286,8 +290,8 @@ class TestAssign:
         with pytest.raises(KeyboardInterrupt):
             assign(CLASS, folder, key_file, None, "aisle", 2)
         monkeypatch.undo()
-        assert len(read_key(key_file).answers) == 2
-        assert assign(CLASS, folder, key_file, None, "aisle", 2) == (read_key(key_file), 1)
+        assert len(read_answer_key(key_file).answers) == 2
+        assert assign(CLASS, folder, key_file, None, "aisle", 2) == (read_answer_key(key_file), 1)
 
     def test_assign_flights_after_failed_key_write_can_be_repeated(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
@@ -305,20 +309,20 @@ class TestAssign:
                 assign(CLASS[:1], where, key, secret, "aisle", 2)
         assert not any(path.is_file() for path in folder.rglob("*"))
         assert stat.S_IMODE(kept.stat().st_mode) == 0o600 or os.name == "nt"
-        assert assign(CLASS[:1], folder, kept, None, "aisle", 2) == (read_key(kept), 1)
+        assert assign(CLASS[:1], folder, kept, None, "aisle", 2) == (read_answer_key(kept), 1)
 
     def test_answer_key_path_inside_students_folder_is_rejected(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         flights = tmp_path / "flights"
-        assert key_path(flights, None) == tmp_path / "flights_answers.json"
+        assert answer_key_path(flights, None) == tmp_path / "flights_answers.json"
         flights.mkdir()
         monkeypatch.chdir(flights)
         for here in (".", "../flights", "../flights/."):
-            path = key_path(type(flights)(here), None)
+            path = answer_key_path(type(flights)(here), None)
             assert path.resolve() == tmp_path / "flights_answers.json"
         for inside in (flights / "key.json", flights / "a" / "key.json", flights):
             with pytest.raises(OutputError, match="students' folder"):
-                key_path(flights, inside)
+                answer_key_path(flights, inside)
 
 
 class TestKey:
@@ -331,12 +335,12 @@ class TestKey:
 
     def test_answer_key_written_to_file_is_read_back_equal(self, tmp_path):
         path = tmp_path / "key.json"
-        path.write_text(key_text(self.key()), encoding="utf-8")
-        assert read_key(path) == self.key()
+        path.write_text(format_answer_key(self.key()), encoding="utf-8")
+        assert read_answer_key(path) == self.key()
         assert "Do not hand it out" in path.read_text(encoding="utf-8")
 
     def test_read_invalid_answer_key_raises_one_line_error(self, tmp_path):
-        good = json.loads(key_text(self.key()))
+        good = json.loads(format_answer_key(self.key()))
 
         def with_values(**values):
             return json.dumps({**good, **values})
@@ -356,12 +360,12 @@ class TestKey:
         for text in texts:
             path.write_text(text, encoding="utf-8")
             with pytest.raises(SettingsError) as error:
-                read_key(path)
+                read_answer_key(path)
             assert "\n" not in str(error.value)
         for content in (b"\xff\xff", b" " * 20_000_001):
             path.write_bytes(content)
             with pytest.raises(SettingsError):
-                read_key(path)
+                read_answer_key(path)
 
 
 # ------------------------------------------------------------------ command
@@ -385,5 +389,5 @@ class TestCommand:
     def test_simulate_without_secret_stores_new_secret_in_answer_key(self, at):
         given = "--assignment", "roster.csv", "-o", "g", "--kind", "loop"
         kept = run_checked("simulate", *given).output
-        assert "stored in the answer key" in kept
-        assert read_key(at / "g_answers.json").secret not in kept
+        assert "answer key contains a new secret" in kept
+        assert read_answer_key(at / "g_answers.json").secret not in kept

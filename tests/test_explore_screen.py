@@ -156,7 +156,8 @@ def test_explore_page_javascript_sigma_ratios_equal_python(
     headline = page.ask("document.querySelector('#card h2').textContent")
     assert f"KF is overconfident with these settings: σ is {format_ratio(truth.ratio)} " in headline
     rmse = format_metres(main.filters["kf"].truth.position_rmse_m)
-    assert f"KF {rmse} m (as analysed" in page.ask("document.querySelector('#card').textContent")
+    card_text = page.ask("document.querySelector('#card').textContent")
+    assert f"KF {rmse} m (original settings" in card_text
     # the analysed ratio stays as a hollow mark
     was = "document.querySelector('#card [data-filter=kf] .was').getAttribute('display')"
     assert page.ask(was) == "inline"
@@ -178,7 +179,7 @@ def test_explore_page_apply_button_takes_recommended_values(
     value = browser.ask("document.getElementById('sigma-a-value').value")
     assert f"--sigma-a {value}" in command
     assert "KF is consistent with these settings" in text(browser, "card")
-    assert "Diagnosis with the analysed settings: ■ ERROR" in text(browser, "card")
+    assert "Diagnosis with the original settings: ■ ERROR" in text(browser, "card")
     assert browser.complaints() == []
 
 

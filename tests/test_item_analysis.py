@@ -9,7 +9,7 @@ import pytest
 from class_tools import entry, graded_report
 
 from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
-from px4fuse.classroom.assignment.truth import FormTruth, InjectedFault, VerdictTruth
+from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers, RightVerdict
 from px4fuse.classroom.grading.item_analysis import analyse_items
 from px4fuse.classroom.grading.model import Item
 from px4fuse.classroom.grading.oral_check import ask_about_form, questions_text
@@ -17,11 +17,11 @@ from px4fuse.results.answer_form import Answers, Choice, NamedFault
 
 POINTS = np.array([[9, 2, 1], [8, 4, 9], [5, 6, 3], [2, 8, 8], [1, 9, 2]], dtype=float)
 REPORTS = [graded_report(f"{n}.pdf", *row) for n, row in enumerate(POINTS.tolist())]
-TRUTH = FormTruth(
+TRUTH = RightFormAnswers(
     (InjectedFault("nlos", 10.0, 8.5, 11.5), InjectedFault("yaw", 20.0, 17.0, 23.0)),
     0.1,
-    VerdictTruth("overconfident", 2.0),
-    VerdictTruth("consistent"),
+    RightVerdict("overconfident", 2.0),
+    RightVerdict("consistent"),
     ("normal",),
     (),
     (1.0, 2.0, 3.0),

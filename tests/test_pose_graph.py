@@ -26,7 +26,7 @@ from px4fuse.trajectory.graph.model import (
     information_eigenvectors,
     residuals,
 )
-from px4fuse.trajectory.graph.solver import solve
+from px4fuse.trajectory.graph.solver import analyse_graph, solve
 
 TANGENT = {2: 3, 3: 6}
 SEEDS = 2
@@ -430,6 +430,27 @@ def test_loop_closure_gate_without_odometry_edge_raises_error() -> None:
         with pytest.raises(TrajectoryError, match=said):
             gate_edges(replace(graph, information=information), [edge])
     assert gate_edges(graph, []) == []
+
+
+def test_common_factor_of_information_does_not_change_gate() -> None:
+    graph = odometry_graph(2, 3e-3)
+    ends = np.arange(4, 34)
+    truth, information = graph.poses, np.tile(graph.information[:1], (len(ends), 1, 1))
+    graph = simulated(replace(
+        graph, first_nodes=np.append(graph.first_nodes, ends),
+        second_nodes=np.append(graph.second_nodes, ends - 4),
+        measurements=np.vstack([graph.measurements, lie.between(truth[ends], truth[ends - 4])]),
+        information=np.concatenate([graph.information, information]),
+    ), 3)  # fmt: skip
+    correct, _ = analyse_graph("g", graph)
+    low, high = correct.chi2_ratio_interval
+    assert low < correct.chi2_ratio < high
+    assert correct.information_factor == 1.0
+    wrong, _ = analyse_graph("g", replace(graph, information=8.0 * graph.information))
+    assert wrong.chi2_ratio == pytest.approx(8.0 * correct.chi2_ratio)
+    assert wrong.information_factor == pytest.approx(8.0, rel=0.5)
+    assert all(gate.accepted for gate in wrong.gates)
+    assert wrong.solutions["gnc"].dropped == 0
 
 
 def test_information_eigenvectors_restore_information_matrix() -> None:

@@ -193,6 +193,8 @@ def test_ekf2_noise_advice_with_logged_variance_sets_noise_mode(sample: Analysis
     used = reported.inputs.aid, settings, noise_used_m(reported.inputs)
     assert remedies.noise_change(*used, 0.05) == {"EKF2_EVP_NOISE": 0.05, "EKF2_EV_NOISE_MD": 1.0}
     assert remedies.noise_change(*used, 0.2) == {"EKF2_EVP_NOISE": 0.2}
+    changes = {"EKF2_EVP_NOISE": 0.02, "EKF2_EV_NOISE_MD": 1.0}
+    assert remedies.different_settings(changes, settings) == {"EKF2_EV_NOISE_MD": 1.0}
     assert remedies.delay_change(model.inputs, -40.0) == {}
     assert remedies.delay_change(model.inputs, 400.0) == {}
 

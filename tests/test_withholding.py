@@ -53,7 +53,7 @@ def test_report_on_student_assignment_contains_no_diagnosis(assigned: Assigned) 
     results = assigned.results
     assert results.log.is_assessed is True
     assert (results.findings, results.trials, results.card.causes) == ((), (), ())
-    assert results.card.facts == {"Answers": "Consistency verdict on KF: consistent"}
+    assert results.card.facts == {"Answers": "Consistency of KF: consistent"}
     assert {*results.tuning.values(), results.clock, results.heading, results.loop} == {
         DIAGNOSIS_WITHHELD
     }

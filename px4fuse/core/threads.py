@@ -1,9 +1,9 @@
-"""Environment variables for single-threaded linear algebra.
+"""Environment variables that limit linear algebra libraries to one thread.
 
-The matrices are small, so more threads would mostly wait for each other.
+Several threads are slower for the small matrices of px4fuse.
 """
 
-# Libraries read these variables when they are loaded
+# Must be set before the libraries are loaded
 ONE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",

@@ -24,6 +24,8 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
 WHITE_RATIO = "white_over_assumed"
 # Kind of cause: the aiding source of EKF2 is the sensor whose positions KF uses
 SENSOR = "the source's sensor"
+# Kind of cause: EKF2 uses the variance that the source reports
+REPORTED = "EKF2's noise"
 # Kind of cause: the mean innovation of the aiding source changes in flight
 CHANGE = "change"
 # Kind of cause: each position reset of EKF2 follows a gap in the position source

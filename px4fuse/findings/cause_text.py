@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import changes, trials
 from px4fuse.comparison.model import FilterName
-from px4fuse.comparison.remedy import aid_of, format_settings
+from px4fuse.comparison.remedy import aid_of, different_settings, format_settings
 from px4fuse.comparison.trials import (
     Statistic,
     Trial,
@@ -54,10 +54,12 @@ def is_refuted(analysis: Analysis, filter_name: FilterName, cause: Trial) -> boo
 
 def format_change(analysis: Analysis, cause: Trial) -> str:
     """Format the changes of a re-run: "SIGMA_Z 0.1 m instead of 0.05 m"."""
+    model = analysis.ekf2_model
+    flown = {} if isinstance(model, Unavailable) else model.inputs.settings
+    change = different_settings(cause.change, flown)
+    names = change.keys() - trials.ACCOMPANYING_CHANGES or change
     return " and ".join(
-        _format_one_change(analysis, cause, name)
-        for name in cause.change
-        if name not in trials.ACCOMPANYING_CHANGES
+        _format_one_change(analysis, cause, name) for name in cause.change if name in names
     )
 
 
@@ -90,8 +92,10 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
         )
     if (offset_s := change.pop(trials.CLOCK_OFFSET, None)) is not None:
         actions.append(f"{format_shift(offset_s)} the position timestamps before sending.")
-    settings = {name: change.pop(name) for name in changes.SETTING_CHANGES & change.keys()}
+    settings = {name: change.pop(name) for name in changes.KF_NOISES & change.keys()}
     if change:
+        assert not isinstance(analysis.ekf2_model, Unavailable)
+        change = different_settings(change, analysis.ekf2_model.inputs.settings)
         actions.append(f"Set {format_settings(change)}.")
     if settings:
         actions.append(format_kf_settings(settings))

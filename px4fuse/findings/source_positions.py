@@ -10,14 +10,14 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison, north_and_east
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_factor, format_metres
-from px4fuse.ekf2.fusion_conditions import is_height_only
+from px4fuse.ekf2.fusion_conditions import constant_coordinates, is_height_only
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, SystematicErrors
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.finding import Finding, Severity
-from px4fuse.findings.cause_grouping import ANNOUNCED, CAUSE, GROUND
+from px4fuse.finding import Severity
+from px4fuse.findings.cause_grouping import ANNOUNCED, CAUSE, GROUND, REPORTED
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
 from px4fuse.findings.model import (
     Findings,
@@ -25,6 +25,7 @@ from px4fuse.findings.model import (
     finding,
     format_count,
     format_percent,
+    note,
     source_words,
     warning,
     zero_length_spans,
@@ -92,7 +93,7 @@ MAX_LISTED_JUMPS = 8
 # Maximum rounding difference (s) between the time of a position and that of its reset_counter
 RESET_TOLERANCE_S = 1e-4
 # Bits of EKF2_EV_CTRL: horizontal position, and height
-HORIZONTAL_CONTROL, HEIGHT_ONLY_CONTROL = 1, 2
+HORIZONTAL_CONTROL, HEIGHT_CONTROL = 1, 2
 # Maximum time (s) between a jump and the increment of reset_counter: two intervals at 2 Hz
 MAX_JUMP_TO_COUNTER_S = 1.0
 # Minimum position jump (m) for severity error: five times the noise of good UWB (0.1 m)
@@ -118,8 +119,8 @@ MIN_VARIANCE_RATIO_ERROR = 3.0
 
 
 def detect(analysis: Analysis) -> Findings:
+    yield from detect_constant_coordinates(analysis)
     if is_height_only(analysis.source):
-        yield make_height_only_finding(analysis)
         return
     yield from detect_little_motion(analysis)
     yield from detect_repeated_jumps(analysis)
@@ -227,23 +228,42 @@ def detect_jumps(analysis: Analysis) -> Findings:
         )
 
 
-def make_height_only_finding(analysis: Analysis) -> Finding:
-    source, log = analysis.source, analysis.flight.log
-    x_m, y_m = source.samples[Columns.POSITION[:2]].median().tolist()
-    parameter = EV_POS.switch
-    control = int(log.parameters.get(parameter, HEIGHT_ONLY_CONTROL))
-    action = f"Leave {parameter} at {control}, so that EKF2 does not fuse x and y."
-    if control & HORIZONTAL_CONTROL:
-        action = (
-            f"Set {parameter} to {control & ~HORIZONTAL_CONTROL | HEIGHT_ONLY_CONTROL} (height "
-            "only), so that EKF2 does not fuse the constant x and y."
-        )
-    return warning(
-        "source_height_only",
-        f"The coordinates x and y of {source.name} are constant ({x_m:g}, {y_m:g} m). Only the "
-        "height is a measurement. The horizontal position is not evaluated.",
-        action,
-        {"x_m": x_m, "y_m": y_m},
+def detect_constant_coordinates(analysis: Analysis) -> Findings:
+    """Detect coordinates that never change, so that the source does not measure them."""
+    source, parameter = analysis.source, EV_POS.switch
+    names = constant_coordinates(source)
+    is_one = len(names) == 1
+    if not names or (is_one and source.step_m > 0.0):
+        return  # rounded positions may stay within one step
+    values_m = dict(zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True))
+    name, bit, make_finding = "source_coordinate_constant", HORIZONTAL_CONTROL, error
+    consequence = "px4fuse estimates nothing from these positions."
+    if names == ["z"]:
+        name, bit, make_finding = "source_height_constant", HEIGHT_CONTROL, warning
+        consequence = "The height is not evaluated."
+    elif not is_one:
+        make_finding = warning
+        consequence = "Only the height is a measurement. The horizontal position is not evaluated."
+    action, listed_names = "", " and ".join(names)
+    if parameter in analysis.flight.log.parameters:
+        control = int(analysis.flight.log.parameters[parameter])
+        action = f"Leave {parameter} at {control}"
+        if control & bit:
+            fused_bit = HORIZONTAL_CONTROL + HEIGHT_CONTROL - bit
+            action = f"Set {parameter} to {control & ~bit | fused_bit}"
+        elif names == ["z"]:
+            make_finding = note
+        action += f", so that EKF2 does not fuse {listed_names}. "
+    subject = f"coordinate {listed_names} of {source.name} is"
+    if not is_one:
+        subject = f"coordinates {listed_names} of {source.name} are"
+    values_text = ", ".join(f"{values_m[each]:g}" for each in names)
+    yield make_finding(
+        name,
+        f"The {subject} constant ({values_text} m): the source does not measure "
+        f"{'it' if is_one else 'them'}. {consequence}",
+        f"{action}Send NaN for a coordinate that is not measured.",
+        {f"{each}_m": value for each, value in values_m.items()},
     )
 
 
@@ -495,6 +515,7 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
                 "reported_sigma_m": reported_m,
                 "sigma_z_m": noise_m,
                 "variance_factor": variance_ratio,
+                CAUSE: REPORTED if severity != "note" else "",
             },
         )
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from px4fuse.core.text import join_first
 from px4fuse.flight.model import Unavailable
-from px4fuse.info.inventory import Inventory, Source
+from px4fuse.info.inventory import Inventory, LoggedData
 from px4fuse.report.page import Cell, Page
 from px4fuse.report.phrases import format_clock_map
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
@@ -135,7 +135,7 @@ def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
         )
 
 
-def _gaps_text(source: Source) -> str:
+def _gaps_text(source: LoggedData) -> str:
     if source.gaps is None:
         return ""
     if not source.gaps.count:
@@ -148,7 +148,7 @@ def _format_short(value: float) -> str:
     return f"{value:.{2 if value < 1 else 1 if value < 10 else 0}f}"
 
 
-def _span_text(source: Source) -> str:
+def _span_text(source: LoggedData) -> str:
     if source.start_s is None or source.end_s is None:
         return ""
     digits = 1 if source.end_s < 10 else 0

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.core.text import capitalise_first, format_p_value, join_first
+from px4fuse.core.text import capitalise_first, format_number, format_p_value, join_first
 from px4fuse.findings import Finding, group_by_root
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop import corrections
@@ -318,6 +318,23 @@ def pose_graph_page(solved_graph: Graph) -> Page:
         f"{solved_graph.name}: {solved_graph.dimension}-D, {solved_graph.poses} poses, "
         f"{solved_graph.edges} edges; initial poses: {solved_graph.initialised}",
     )
+    low, high = solved_graph.chi2_ratio_interval
+    if high > 0.0:
+        fit_text = (
+            f"χ² per degree of freedom {format_number(solved_graph.chi2_ratio)} (95 % "
+            f"{format_number(low)} to {format_number(high)} expected)"
+        )
+        if (factor := solved_graph.information_factor) > 1.0:
+            fit_text += (
+                ". Probable cause: all information matrices are about "
+                f"{format_number(factor, 2)} times too large. Gate and robust optimisation use "
+                "the information divided by this factor."
+            )
+        elif solved_graph.chi2_ratio > high:
+            fit_text += ". Possible causes: false closures, or too large information matrices."
+        elif solved_graph.chi2_ratio < low:
+            fit_text += ": the information matrices are too small, so the gate is too wide."
+        page.write_labelled("Fit", fit_text)
     if isinstance(gates, Unavailable):
         page.write_labelled("Gate", f"not applied: {gates.reason}")
     elif not gates:

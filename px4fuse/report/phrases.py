@@ -15,8 +15,8 @@ from px4fuse.comparison.model import (
     PreparedComparison,
     UntestedFilter,
 )
+from px4fuse.comparison.remedy import different_settings, noise_change
 from px4fuse.comparison.remedy import format_settings as format_parameters
-from px4fuse.comparison.remedy import noise_change
 from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import KF_NUMBERS, SETTING_RANGES, Settings
@@ -223,6 +223,7 @@ def tuning_advice(
             sigma_z.high or 0.0
         )
         if EV_POS.noise_mode in changes and reported_m > (sigma_z.high or np.inf):
+            changes = different_settings(changes, log.parameters)
             advice_by_label["PX4"] = (
                 f"Set {format_parameters(changes)}: EKF2 uses the reported σ, {reported_m:.2g} m."
             )

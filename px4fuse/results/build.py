@@ -1,4 +1,4 @@
-"""Conversion of analyses to the JSON results."""
+"""Conversion of the analyses of all commands to JSON results."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -34,24 +34,24 @@ from px4fuse.trajectory.graph.solver import Graph
 def results(
     request: ComparisonRequest, analysis: Analysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults:
-    """Return the results of ``px4fuse compare`` on a flight with positions for KF.
+    """Convert an analysis by KF and EKF2 to the results of ``px4fuse compare``.
 
-    If the flight is a student assignment, the student's answers replace the diagnosis.
+    If a student must find the faults of the flight, the student's answers replace the diagnosis.
     """
     card = build_card(analysis, request.without_paths(), (student.name, student.id))
     if analysis.flight.log.is_assessed and isinstance(student.answers, Answers):
-        texts = (
+        answer_texts = (
             f"{question}: {answer_text}"
             for question, answer_text in form_rows(student.answers)
             if answer_text != EMPTY_CELL
         )
-        card = msgspec.structs.replace(card, facts={"Answers": "; ".join(texts)})
+        card = msgspec.structs.replace(card, facts={"Answers": "; ".join(answer_texts)})
     fields = _flight_fields(contract.COMPARISON_SCHEMA, request, analysis) | {
         "aids": {} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
         "card": card,
         "student": student,
     }
-    # all other fields have the same name and content in the analysis
+    # the other fields of the results are copied from the analysis
     for name in contract.ComparisonResults.__struct_fields__:
         if name not in fields:
             fields[name] = to_serializable(getattr(analysis, name))
@@ -61,7 +61,7 @@ def results(
 def outcome_results(
     request: ComparisonRequest, outcome: Analysis | AidsOnlyAnalysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults | contract.AidsResults:
-    """Return the results of ``px4fuse compare``, also for a flight without positions for KF."""
+    """Return the results of ``px4fuse compare`` for a flight with or without positions."""
     if isinstance(outcome, Analysis):
         return results(request, outcome, student)
     return within_bounds(
@@ -181,18 +181,20 @@ def _flight_fields(
         reason=comparison.source_reason,
         rate_hz=track.rate_hz,
         available=tuple(
-            AvailableTrack(a.name, a.origin.kind, a.origin.path, len(a.samples), a.rate_hz)
-            for a in comparison.flight.positions
+            AvailableTrack(
+                each.name, each.origin.kind, each.origin.path, len(each.samples), each.rate_hz
+            )
+            for each in comparison.flight.positions
         ),
         missing=tuple(part for part in comparison.missing if part.source),
     )
-    setting_values: dict[str, Any] = asdict(settings) | {
+    kf_settings: dict[str, Any] = asdict(settings) | {
         "clock_offset_s": settings.clock_offset_s + file_offset_s
     }
     return _common_fields(name, request, comparison.flight, command) | {
         "source": source,
         "settings": ChosenSettings(
-            **setting_values,
+            **kf_settings,
             start_s=segment.start_s,
             end_s=segment.end_s,
             segment_reason=segment.reason,

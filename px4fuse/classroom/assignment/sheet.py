@@ -1,7 +1,7 @@
 """Reading and writing of CSV tables of learning platforms and instructors.
 
-The reader detects encoding (UTF-8 with and without byte order mark, UTF-16, Windows-1252) and
-separator, and a changed copy keeps both.
+The reader detects the encoding (UTF-8 with or without byte order mark, UTF-16, Windows-1252) and
+the separator. The writer uses the encoding and separator of the original file.
 """
 
 import codecs
@@ -22,7 +22,7 @@ COLUMN_SEPARATORS = ",;\t|"
 
 @dataclass(frozen=True)
 class Sheet:
-    """CSV table with column titles; each row has at least as many cells as there are titles."""
+    """CSV table with a header (column titles); short rows are filled with empty cells."""
 
     path: Path
     head: tuple[str, ...]
@@ -31,12 +31,12 @@ class Sheet:
     separator: str = ","
 
     def column(self, titles: Sequence[str]) -> int | None:
-        """Return the index of the column with the first of ``titles`` that exists, or None."""
+        """Return the index of the column with one of ``titles``, or None; earlier titles first."""
         plain_titles = [normalise_title(title) for title in self.head]
         return next((plain_titles.index(title) for title in titles if title in plain_titles), None)
 
     def cell(self, row: Sequence[str], titles: Sequence[str]) -> str:
-        """Return the cell in the column with the first of ``titles`` that exists, or ""."""
+        """Return the cell in the column with one of ``titles``, or ""; earlier titles first."""
         column_index = self.column(titles)
         return "" if column_index is None else row[column_index].strip()
 
@@ -50,7 +50,7 @@ class Sheet:
     def content(self) -> bytes:
         try:
             return self.text.encode(self.encoding)
-        except UnicodeEncodeError:  # Windows-1252 does not have all characters of a feedback text
+        except UnicodeEncodeError:  # Windows-1252 lacks some characters of the feedback
             return self.text.encode("utf-8-sig")
 
 
@@ -91,7 +91,7 @@ def read_sheet(path: Path) -> Sheet:
     if "\0" in text:
         raise SettingsError(f"{path} is not a text file.", "Give a CSV file with a header.")
     header = next((line for line in text.splitlines() if line.strip()), "")
-    # separators in quoted titles are not counted
+    # do not count separators in quoted column titles
     separator = max(COLUMN_SEPARATORS, key=re.sub(r'"[^"]*"', "", header).count)
     try:
         lines = [*csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)]
@@ -105,7 +105,7 @@ def read_sheet(path: Path) -> Sheet:
 
 
 def format_cell_number(value: float | None) -> str:
-    """Format a number for a cell; "" if the number is absent or not finite.
+    """Format a number for a table cell; "" for None, infinity and NaN.
 
     >>> format_cell_number(7.0), format_cell_number(0.1 + 0.2), format_cell_number(float("nan"))
     ('7', '0.3', '')

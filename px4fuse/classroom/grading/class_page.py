@@ -1,7 +1,4 @@
-"""Class page: a web page with statistics of the class, and a table with one row per student.
-
-The page links to the redrawn PDFs in the folder ``reports/``.
-"""
+"""Web page for the instructor: statistics of the class, and a table with one row per student."""
 
 import math
 import statistics
@@ -40,16 +37,16 @@ FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "changed by i
 
 
 def class_page_html(entries: Sequence[Entry], title: str, made_with: str) -> str:
-    """Format the class page as HTML; ``made_with`` is name and version of px4fuse."""
+    """Format the web page of the class; ``made_with`` is name and version of px4fuse."""
     item_titles, number_titles = list_titles(entries)
-    counts = Counter(tag for entry in entries for tag in _entry_tags(entry))
-    tags = (*FILTER_TAGS, *sorted(tag for tag in counts if tag not in FILTER_TAGS))
-    options = [(tag, f"{tag} ({counts[tag]})") for tag in tags if counts[tag]]
+    count_by_tag = Counter(tag for entry in entries for tag in _entry_tags(entry))
+    tags = (*FILTER_TAGS, *sorted(tag for tag in count_by_tag if tag not in FILTER_TAGS))
+    options = [(tag, f"{tag} ({count_by_tag[tag]})") for tag in tags if count_by_tag[tag]]
     return frame.page(
         title=title,
         subtitle=f"{len(entries)} {'student' if len(entries) == 1 else 'students'}, graded with "
         f"{made_with}",
-        html_above=_statistics_html(entries, counts),
+        html_above=_statistics_html(entries, count_by_tag),
         row_nouns=("student", "students"),
         columns=(
             Column("Student"),
@@ -69,14 +66,14 @@ def class_page_html(entries: Sequence[Entry], title: str, made_with: str) -> str
     )
 
 
-def _statistics_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
-    """Format the HTML above the class table: number of reports by status, and point histograms."""
+def _statistics_html(entries: Sequence[Entry], count_by_tag: Mapping[str, int]) -> str:
+    """Format the statistics of the class: number of reports by status, and histograms of points."""
     totals = [entry.total for entry in entries if entry.total is not None]
     max_points = max((entry.max_points for entry in entries if entry.max_points > 0.0), default=1.0)
     reports = [report for entry in entries if (report := entry.counted_report)]
     return load_template("classroom/grading/above.html").render(
         students=len(entries),
-        counts=counts,
+        counts=count_by_tag,
         averages=(statistics.fmean(totals), statistics.median(totals)) if totals else (),
         totals=count_tenths(totals, max_points) if totals else (),
         max_points_text=format_cell_number(max_points),
@@ -88,7 +85,7 @@ def _statistics_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str
 
 
 def count_tenths(values: Sequence[float], maximum: float) -> list[tuple[int, str]]:
-    """Count the values in each tenth of 0 to ``maximum``; return a (count, lower edge) per tenth.
+    """Compute a histogram of ten bins from 0 to ``maximum``; return (count, lower edge) per bin.
 
     >>> count_tenths([0.0, 5.0, 5.5, 9.0], 10.0)[5]
     (2, '5')
@@ -114,12 +111,12 @@ def _class_row(entry: Entry, item_titles: Sequence[str], number_titles: Sequence
     css_style, symbol = STATUS_STYLES[status]
     flag_count = len(entry.flags)
     flag_count_text = f"{flag_count} flag{'s' if flag_count > 1 else ''}" if flag_count else ""
-    file = report.submission if report else ""
+    file_name = report.submission if report else ""
     late_text = f"{math.ceil(entry.late_s / 60.0)} min late" if entry.late_s else ""
     points_by_title = {item.title: item.points for item in report.items} if report else {}
     number_values = report.numbers if report else {}
     cells = (
-        Cell(entry.display_name, entry.student or None, file),
+        Cell(entry.display_name, entry.student or None, file_name),
         frame.text_cell(entry.student_id),
         Cell(f"{symbol} {status}", float(STATUSES.index(status)), flag_count_text, css_style),
         _points_cell(entry),
@@ -128,9 +125,8 @@ def _class_row(entry: Entry, item_titles: Sequence[str], number_titles: Sequence
         *(frame.number_cell(points_by_title.get(title)) for title in item_titles),
         *(frame.number_cell(number_values.get(title)) for title in number_titles),
     )
-    # a row with pseudonym has neither id nor file, by which overrides.csv identifies students
-    point_boxes = (_point_boxes(entry),) if entry.student_id or file else ()
-    # a row with pseudonym has no link, because the file name may contain the student's name
+    # the points of an anonymous student cannot be entered: overrides.csv needs the id or the file
+    point_boxes = (_point_boxes(entry),) if entry.student_id or file_name else ()
     links = (
         [("Report redrawn from the log (PDF)", local_link(report.redrawn_path))] if report else []
     )
@@ -143,7 +139,7 @@ def _class_row(entry: Entry, item_titles: Sequence[str], number_titles: Sequence
 
 
 def _entry_details(entry: Entry) -> Iterator[Section]:
-    """Yield the details of a student, which the class page shows after a click on the row."""
+    """Yield the details of a student, which the web page shows after a click on the row."""
     report, comment = entry.counted_report, frame.prose_section("Your comment", entry.comment)
     if report is None:
         yield frame.list_section("Missing", ["No submission."])
@@ -204,7 +200,7 @@ def _points_cell(entry: Entry) -> Cell:
 
 
 def _point_boxes(entry: Entry) -> Section:
-    """Return input boxes for the rubric items that the instructor scores, and for the total."""
+    """Return input boxes for the points that the instructor can enter."""
     report = entry.counted_report
     max_by_title = {
         item.title: item.max_points
@@ -217,7 +213,7 @@ def _point_boxes(entry: Entry) -> Section:
         (title, max_by_title[title], override.points, override.comment)
         for title, override in override_by_title.items()
     ]
-    # the page writes a new overrides.csv, so it must also contain the overrides without boxes
+    # the page writes a complete overrides.csv, also with the points that have no input box
     other_rows = [
         (title, override.points, override.comment)
         for title, override in entry.overrides.items()

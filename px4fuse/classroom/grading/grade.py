@@ -1,4 +1,4 @@
-"""Grading of a class: parallel verification of all submissions, and output files."""
+"""Grading of a class: verify and score all submitted reports in parallel, and write the output."""
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
@@ -29,11 +29,11 @@ class GradeOutcome:
     Attributes
     ----------
     entries : tuple of Entry
-        Rows of the class table: students of the class list, then unknown students.
+        Grades: students of the class list, then unknown students.
     notes : tuple of str
-        Sentences about ignored files and overrides, and grades that could not be entered.
+        Sentences about ignored input, and grades that could not be entered.
     reused_count : int
-        Number of reports with a stored verification, which were not verified again.
+        Number of reports that were verified in an earlier run.
     written_paths : tuple of Path
     """
 
@@ -71,7 +71,7 @@ def grade(
     Raises
     ------
     SettingsError
-        No submission was found, or ``overrides.csv`` or a worksheet is not valid.
+        No submission was found, or a table is not valid.
     OutputError
         The folder cannot be written.
     """
@@ -91,10 +91,10 @@ def grade(
             "" if student_index is None else course.register.people[student_index].student_id
         )
         jobs.append((submission, submitter_id))
-    rubric_and_key, logs = (course.rubric, course.key), files_by_sha256(course.logs)
+    rubric_and_key, log_by_sha256 = (course.rubric, course.key), files_by_sha256(course.logs)
     records_folder = output / RECORDS_FOLDER
     grade_job = partial(
-        grade_submission, *rubric_and_key, logs, records_folder, max_log_bytes.get()
+        grade_submission, *rubric_and_key, log_by_sha256, records_folder, max_log_bytes.get()
     )
     graded_by_index: dict[int, GradedReport] = {}
     reused_count = 0
@@ -127,10 +127,22 @@ def grade_submission(
     max_bytes: int,
     job: tuple[Submission, str],
 ) -> tuple[GradedReport, bool]:
-    """Read, verify and score a submission.
+    """Read, verify and score a submitted report.
 
-    ``job`` is the submission and the student id on the learning platform. Return the graded report,
-    and True if a stored verification was loaded.
+    Parameters
+    ----------
+    records : Path
+        Folder of earlier verifications.
+    max_bytes : int
+        Maximum size of a log.
+    job : (Submission, str)
+        Submitted file, and student id on the learning platform.
+
+    Returns
+    -------
+    report : GradedReport
+    is_loaded : bool
+        True if the result of an earlier verification was loaded.
     """
     max_log_bytes.set(max_bytes)
     submission, submitter_id = job

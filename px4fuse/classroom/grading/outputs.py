@@ -1,9 +1,8 @@
-"""Output files of grading: class table and page, redrawn reports, feedback, platform tables.
+"""Output files of grading: points of the class, feedback, and tables for learning platforms.
 
 px4fuse enters grades into copies of the tables that learning platforms export, and feedback if a
-table has a column for it. All other cells stay unchanged. The row of a student without a grade (no
-submission, or points not decided yet) is not changed: platforms delete a grade if the cell is
-empty, and read 0 as a grade.
+table has a feedback column. All other cells stay unchanged. The row of a student without a grade is
+not changed: platforms delete a grade if the cell is empty, and read 0 as a grade.
 
 - Moodle: "Using Assignment", Offline grading worksheet, docs.moodle.org.
   ``mod/assign/feedback/offline/importgradeslib.php`` finds "Identifier" ("Participant 12"), "Grade"
@@ -49,14 +48,14 @@ from px4fuse.core.writing import write_all
 from px4fuse.errors import SettingsError
 from px4fuse.html.safe import load_template
 
-# Folder of the reports that px4fuse draws again from the logs, to be read instead of submitted PDFs
+# Folder of reports that px4fuse draws from the logs; safer to open than the submitted PDFs
 REPORTS_FOLDER = "reports"
 FEEDBACK_FOLDER = "feedback"
 GRADES_FOLDER = "grades"
 PSEUDONYMS_FILE = "names.csv"
 QUESTIONS_FILE = "questions.txt"
 PSEUDONYM_TITLES = ("pseudonym", "id", "name")
-# Columns of the class table, before and after the columns of rubric items and report numbers
+# Columns of class.csv before and after the columns of rubric items and numbers
 FIRST_COLUMNS = (
     "file",
     "student",
@@ -79,17 +78,17 @@ LAST_COLUMNS = (
     "log SHA-256",
 )
 LIST_SEPARATOR = " | "
-# Maximum number of reasons in the feedback why a report was not verified
+# Maximum number of reasons for a failed verification in the feedback
 MAX_REASONS = 4
 # Titles of grade columns in tables of learning platforms, as lower-case letters and digits
 GRADE_TITLES = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
 MAX_GRADE_TITLES = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
-# Titles of feedback columns that the learning platform reads as HTML
+# Titles of feedback columns that contain HTML (Moodle)
 HTML_COMMENT_TITLES = ("feedbackcomments", "feedbackalskommentar")
 # Titles of all feedback columns
 COMMENT_TITLES = (*HTML_COMMENT_TITLES, "feedbacktolearner", "feedback", "comment")
 _ASSIGNMENT_NUMBER = re.compile(r" \(\d+\)$")
-# Text in columns that Canvas computes and px4fuse therefore does not change
+# Mark of columns that Canvas computes: px4fuse must not change them
 READ_ONLY_MARK = "(read only)"
 
 
@@ -98,7 +97,10 @@ def write_class(
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Write all output files of grading. An existing ``overrides.csv`` is not overwritten.
 
-    The students in ``course.register`` are first in ``entries``, in the same order.
+    Parameters
+    ----------
+    entries : sequence of Entry
+        Grades of the students in ``course.register``, then of unknown students.
 
     Returns
     -------
@@ -113,9 +115,9 @@ def write_class(
         The folder cannot be written.
     """
     class_title = course.title or course.rubric.title or "Class"
-    stems = file_names([_entry_identity(entry, use_file_stem=True) for entry in entries])
+    file_stems = file_names([_entry_identity(entry, use_file_stem=True) for entry in entries])
     page_entries = [
-        _copy_redrawn(entry, stem, output) for entry, stem in zip(entries, stems, strict=True)
+        _copy_redrawn(entry, stem, output) for entry, stem in zip(entries, file_stems, strict=True)
     ]
     has_redrawn = any(
         entry.counted_report and entry.counted_report.redrawn_path for entry in page_entries
@@ -140,7 +142,7 @@ def write_class(
         contents[QUESTIONS_FILE] = text.encode()
     if not (output / OVERRIDES_NAME).exists():
         contents[OVERRIDES_NAME] = OVERRIDES_TEMPLATE.encode()
-    for stem, text in zip(stems, feedback_texts, strict=True):
+    for stem, text in zip(file_stems, feedback_texts, strict=True):
         contents[f"{FEEDBACK_FOLDER}/{stem}.txt"] = text.encode()
     notes: list[str] = []
     table_names = make_unique((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
@@ -151,27 +153,29 @@ def write_class(
         contents[f"{GRADES_FOLDER}/{name}"] = filled_sheet.content()
         notes += sheet_notes
     write_all({output / name: content for name, content in contents.items()})
-    outputs = dict.fromkeys([*(name.partition("/")[0] for name in contents), OVERRIDES_NAME])
+    output_names = dict.fromkeys([*(name.partition("/")[0] for name in contents), OVERRIDES_NAME])
     if has_redrawn:
-        outputs[REPORTS_FOLDER] = None
-    return tuple(output / name for name in outputs), tuple(notes)
+        output_names[REPORTS_FOLDER] = None
+    return tuple(output / name for name in output_names), tuple(notes)
 
 
 def _entry_identity(entry: Entry, use_file_stem: bool = False) -> str:
-    """Return the id of a student; without id the name, or the file name."""
-    file = entry.counted_report.submission if entry.counted_report else ""
-    return entry.student_id or (Path(file).stem if use_file_stem else entry.student or file)
+    """Return the id of a student; without an id, the name or the name of the submitted file."""
+    file_name = entry.counted_report.submission if entry.counted_report else ""
+    return entry.student_id or (
+        Path(file_name).stem if use_file_stem else entry.student or file_name
+    )
 
 
 def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
-    """Copy the report as drawn again by px4fuse, and its diagnosis, to the output folder."""
+    """Copy the PDF files that px4fuse drew from the log to the output folder."""
     report = entry.counted_report
     if report is None or not report.sha256:
         return entry
-    record = output / RECORDS_FOLDER / report.sha256
-    redrawn_file, diagnosis = map(record.with_suffix, (REDRAWN_SUFFIX, DIAGNOSIS_SUFFIX))
-    if diagnosis.exists():
-        write_all({output / FEEDBACK_FOLDER / f"{stem}.pdf": diagnosis.read_bytes()})
+    record_path = output / RECORDS_FOLDER / report.sha256
+    redrawn_file, diagnosis_file = map(record_path.with_suffix, (REDRAWN_SUFFIX, DIAGNOSIS_SUFFIX))
+    if diagnosis_file.exists():
+        write_all({output / FEEDBACK_FOLDER / f"{stem}.pdf": diagnosis_file.read_bytes()})
     if not redrawn_file.exists():
         return entry
     name = f"{REPORTS_FOLDER}/{stem}.pdf"
@@ -180,9 +184,10 @@ def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
 
 
 def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
-    """Replace names by pseudonyms and sort by pseudonym; also return the pseudonyms as CSV table.
+    """Replace names by pseudonyms, and sort by pseudonym.
 
-    Pseudonyms in an existing table at ``path`` are kept.
+    Return the anonymous entries and a CSV table of the pseudonyms. Pseudonyms in an existing table
+    at ``path`` are kept.
     """
     names_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
@@ -215,7 +220,7 @@ def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry
 
 
 def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
-    """Return a row with pseudonym, status, points and answer form, without the student's texts."""
+    """Replace the name by a pseudonym, and delete all texts that could identify the student."""
     report = entry.counted_report
     if report is not None:
         report = GradedReport(
@@ -248,7 +253,7 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
 
 
 def class_table_csv(entries: Sequence[Entry]) -> str:
-    """Format the class table as CSV for Excel and LibreOffice."""
+    """Format a table with one row per student as CSV for Excel and LibreOffice."""
     item_titles, number_titles = list_titles(entries)
     titles = (*FIRST_COLUMNS, *item_titles, *number_titles, *LAST_COLUMNS)
     rows = []
@@ -290,7 +295,7 @@ def class_table_csv(entries: Sequence[Entry]) -> str:
 
 
 def feedback_text(entry: Entry, class_name: str = "") -> str:
-    """Format the feedback for one student, without the flags for the instructor."""
+    """Format points, comments and reasons for one student as text."""
     report = entry.counted_report
     reasons = report.verification.reasons[:MAX_REASONS] if report else ()
     text = load_template("classroom/grading/feedback.j2").render(
@@ -323,13 +328,13 @@ def _wrap_text(text: str, indent: str = "") -> str:
 def find_grade_column(sheet: Sheet, column_title: str) -> int:
     """Return the index of the grade column in a table of a learning platform.
 
-    ``column_title`` is "" if the table has only one grade column. The title of a column in Canvas
-    may lack the number in brackets.
+    ``column_title`` is "" if the table has only one grade column. In a Canvas gradebook, the title
+    "Lab 3" also matches the column "Lab 3 (12345)".
 
     Raises
     ------
     SettingsError
-        No column matches, or several match.
+        No column matches, or several columns match.
     """
     title_by_index = {
         index: title
@@ -337,25 +342,29 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         if not any(READ_ONLY_MARK in row[index] for row in sheet.rows[:3])
     }
     grade_index = sheet.column(GRADE_TITLES)
-    plain_titles = {
+    short_title_by_index = {
         index: _ASSIGNMENT_NUMBER.sub("", title) for index, title in title_by_index.items()
     }
-    assignments = [index for index, title in title_by_index.items() if plain_titles[index] != title]
-    matches = [
+    assignment_indices = [
+        index for index, title in title_by_index.items() if short_title_by_index[index] != title
+    ]
+    matching_indices = [
         index
         for index, title in title_by_index.items()
-        if normalise_text(column_title) in map(normalise_text, (title, plain_titles[index]))
+        if normalise_text(column_title) in map(normalise_text, (title, short_title_by_index[index]))
     ]
-    candidate_indices = assignments if grade_index is None else [grade_index]
-    # Moodle's worksheets have only one grade column, so --column may concern another table
-    if column_title and (matches or sheet.column(("identifier",)) is None):
-        candidate_indices = matches
+    candidate_indices = assignment_indices if grade_index is None else [grade_index]
+    # a Moodle table has one grade column, so a --column without a match is for another table
+    if column_title and (matching_indices or sheet.column(("identifier",)) is None):
+        candidate_indices = matching_indices
     if len(candidate_indices) == 1:
         return candidate_indices[0]
     problem = (
         "the table has several grade columns" if candidate_indices else "no grade column was found"
     )
-    titles = ", ".join(one_line(plain_titles[index], 40) for index in assignments or title_by_index)
+    titles = ", ".join(
+        one_line(short_title_by_index[index], 40) for index in assignment_indices or title_by_index
+    )
     remedy = f"Choose the grade column with --column: {one_line(titles, 300)}."
     raise SettingsError(f"{sheet.path}: {problem}.", remedy)
 
@@ -370,13 +379,25 @@ def fill_grades(
 ) -> tuple[Sheet, tuple[str, ...]]:
     """Enter grades and feedback into a copy of a table of a learning platform.
 
-    The students in ``register`` are first in ``entries`` and ``feedback``, in the same order. The
-    notes are sentences about grades that were not entered, or that are above the maximum.
+    Parameters
+    ----------
+    entries, feedback : sequences
+        Grade and feedback of each student in ``register``, then of unknown students.
+    column : str
+        Title of the grade column; "" if the table has only one.
+    platform_max_points : float, optional
+        Maximum points on the platform; by default those of the rubric.
+
+    Returns
+    -------
+    filled_sheet : Sheet
+    notes : tuple of str
+        Sentences about grades that were not entered, or that are above the maximum.
 
     Raises
     ------
     SettingsError
-        The table does not have exactly one grade column with this title.
+        No grade column was found, or several.
     """
     grade_index, feedback_index = find_grade_column(sheet, column), sheet.column(COMMENT_TITLES)
     format_feedback = (
@@ -387,13 +408,13 @@ def fill_grades(
     has_decimal_comma = any(
         re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells_by_row for cell in row
     )
-    notes, found_people = [], set()
+    notes, found_indices = [], set()
     for row in cells_by_row:
         person = read_student(sheet, row)
         student_index = register.student_index(person) if person else None
         if student_index is None:
             continue
-        found_people.add(student_index)
+        found_indices.add(student_index)
         total_points, rubric_maximum = (
             entries[student_index].total,
             entries[student_index].max_points,
@@ -417,7 +438,7 @@ def fill_grades(
     missing_names = [
         names[index]
         for index in range(len(register.people))
-        if index not in found_people and entries[index].total is not None
+        if index not in found_indices and entries[index].total is not None
     ]
     if missing_names:
         notes.append(
@@ -435,7 +456,7 @@ def _max_points_in_table(sheet: Sheet, row: Sequence[str], grade_index: int) -> 
 
 
 def escape_html(text: str) -> str:
-    r"""Convert a text to HTML with the same line breaks.
+    r"""Convert a text to HTML; keep line breaks and indentation.
 
     >>> escape_html("a <b>\n 1")
     'a &lt;b&gt;<br>&nbsp;1'

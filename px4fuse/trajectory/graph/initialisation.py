@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 from px4fuse.core.arrays import Array
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie, model
-from px4fuse.trajectory.graph.model import PoseGraph, normal_equations, solve_normal_equations
+from px4fuse.trajectory.graph.model import PoseGraph
+from px4fuse.trajectory.graph.normal_equations import NormalEquations
 
 
 def initialise(graph: PoseGraph) -> PoseGraph:
@@ -74,17 +75,20 @@ def _solve_positions(
     edge_value: Array,
     first_pose: Array,
 ) -> Array:
-    """Solve :func:`normal_equations` and prepend the first pose, shape (n, d, k)."""
-    solution = solve_normal_equations(
-        *normal_equations(
-            graph, first_coefficient, second_coefficient, information, edge_value, first_pose
-        )
-    )
+    """Solve the :class:`NormalEquations` for a known first pose; the result has shape (n, d, k)."""
+    edges = np.stack([graph.first_nodes, graph.second_nodes])
+    equations = NormalEquations(edges, *first_pose.shape)
+    known = np.zeros((len(graph), *first_pose.shape))
+    known[0] = first_pose
+    for coefficient, nodes in zip((first_coefficient, second_coefficient), edges, strict=True):
+        edge_value = edge_value - coefficient @ known[nodes]
+    values, _ = equations.assemble(first_coefficient, second_coefficient, information, edge_value)
+    solution = equations.solve(values)
     if solution is None:
         raise TrajectoryError(
             "The edges do not determine the initial poses", "Give VERTEX lines with initial poses."
         )
-    return np.concatenate([first_pose[None], solution.reshape(-1, *first_pose.shape)])
+    return known + solution
 
 
 def _nearest_rotations(matrices: Array) -> Array:

@@ -3,89 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.core.record import one_line_repr
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
-
-# Option relax of SuperLU: 1 gives the least fill-in; above the default of 10 SuperLU writes outside
-# its workspace (scipy 1.17, shown by valgrind)
-_SUPERLU_RELAX = 1
-# Option panel_size of SuperLU: above the default of 20, SuperLU writes outside its workspace
-_SUPERLU_PANEL_SIZE = 4
-if TYPE_CHECKING:  # scipy before 1.16 has no generic arrays
-    Matrix = sparse.csc_array[np.float64]
-
-
-def normal_equations(
-    graph: PoseGraph,
-    first_coefficient: Array,
-    second_coefficient: Array,
-    information: Array,
-    edge_value: Array,
-    first_value: Array | float = 0.0,
-) -> tuple[Matrix, Array]:
-    """Return the normal equations of ``A x_i + B x_j = c`` over all edges (i, j), with x_0 fixed.
-
-    Parameters
-    ----------
-    graph : PoseGraph
-    first_coefficient, second_coefficient, information : ndarray, shape (m, d, d)
-        A, B, and the weight matrix of each equation.
-    edge_value : ndarray, shape (m, d, k)
-        Right sides c.
-    first_value : ndarray, shape (d, k), or 0
-        Value of x_0.
-
-    Returns
-    -------
-    matrix : csc_array, shape ((n - 1) d, (n - 1) d)
-    right_side : ndarray, shape ((n - 1) d, k)
-    """
-    edge_indices = np.arange(len(graph.first_nodes) + 1)
-    d = edge_value.shape[1]
-    edge_nodes = np.column_stack([graph.first_nodes, graph.second_nodes]).ravel()
-    blocks = np.stack([first_coefficient, second_coefficient], axis=1).reshape(-1, d, d)
-    design_matrix = sparse.bsr_array(
-        (blocks, edge_nodes, 2 * edge_indices), shape=(d * edge_indices[-1], d * len(graph))
-    ).tocsc()
-    weights = sparse.bsr_array((information, edge_indices[:-1], edge_indices))
-    first_columns = design_matrix[:, :d]
-    free_columns = design_matrix[:, d:]
-    weighted_transpose = free_columns.T @ weights
-    right_side = edge_value.reshape(-1, edge_value.shape[-1]) - first_columns @ np.broadcast_to(
-        first_value, edge_value.shape[1:]
-    )
-    return (weighted_transpose @ free_columns).tocsc(), weighted_transpose @ right_side
-
-
-def solve_normal_equations(matrix: Matrix, right_side: Array, damping: float = 0.0) -> Array | None:
-    """Solve normal equations with damping on the diagonal.
-
-    Return None if the matrix is singular.
-    """
-    try:
-        factors = splu(
-            matrix + damping * sparse.eye_array(matrix.shape[0], format="csc"),
-            # MMD_AT_PLUS_A has 1.1 to 1.9 times less fill-in than COLAMD on public benchmark graphs
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            relax=_SUPERLU_RELAX,
-            panel_size=_SUPERLU_PANEL_SIZE,
-            options={"SymmetricMode": True},
-        )
-    except RuntimeError:  # exactly singular
-        return None
-    solution: Array = factors.solve(right_side)
-    return solution if np.all(np.isfinite(solution)) else None
-
+from px4fuse.trajectory.graph.normal_equations import NormalEquations
 
 # A direction is not measured if the eigenvalue of the information matrix (scaled to unit diagonal)
 # is below this limit
@@ -130,6 +58,12 @@ class PoseGraph:
     def degrees_of_freedom(self) -> int:
         """Degrees of freedom of a pose: 3 in the plane, 6 in space."""
         return 3 if self.dimension == 2 else 6
+
+    @cached_property
+    def normal_equations(self) -> NormalEquations:
+        """Normal equations of the poses, with the first pose fixed."""
+        edges = np.stack([self.first_nodes, self.second_nodes])
+        return NormalEquations(edges, self.degrees_of_freedom)
 
     @property
     def is_successive(self) -> BoolArray:
@@ -181,6 +115,14 @@ def information_eigenvectors(information: Array) -> tuple[Array, Array]:
     eigenvalues, eigenvectors = np.linalg.eigh(scaled_information)
     is_observed = eigenvalues > MIN_OBSERVED_EIGENVALUE
     return scale[:, None] * eigenvectors[:, is_observed], 1.0 / eigenvalues[is_observed]
+
+
+def observed_directions(information: Array) -> IntArray:
+    """Return the number of directions that each measurement observes."""
+    _, scaled_information = scale_to_unit_diagonal(information)
+    eigenvalues = np.linalg.eigvalsh(scaled_information)
+    counts: IntArray = np.count_nonzero(eigenvalues > MIN_OBSERVED_EIGENVALUE, axis=1)
+    return counts
 
 
 def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
