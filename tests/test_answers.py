@@ -148,7 +148,7 @@ def test_compare_with_answers_option_prints_answers_in_report(
     reader = PdfReader(report)
     results = read_results(reader.attachments["results.json"][0])
     assert isinstance(results, ComparisonResults)
-    assert results.student.answers.names_no_fault  # type: ignore[union-attr]
+    assert results.student.answers.states_no_fault  # type: ignore[union-attr]
     assert any("Answer form" in page.extract_text() for page in reader.pages)
 
 

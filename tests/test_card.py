@@ -63,7 +63,11 @@ def analysis(*trials: Trial) -> Any:
     source = SimpleNamespace(origin=RECEIVED)
     model = SimpleNamespace(inputs=SimpleNamespace(settings={"EKF2_ACC_NOISE": 0.35}))
     return SimpleNamespace(
-        main_trials=trials, settings=Settings(), source=source, tuning={}, ekf2_model=model
+        select_main_trials=lambda: trials,
+        settings=Settings(),
+        source=source,
+        tuning={},
+        ekf2_model=model,
     )
 
 

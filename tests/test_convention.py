@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from functools import cache
 
@@ -18,7 +19,7 @@ from px4fuse.convention.axes import AXIS_ASSIGNMENTS, CLOCKWISE_DIRECTIONS, UNIT
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import Faults, convention_faults
 from px4fuse.convention.model import Axes, Convention, OrientationConvention
-from px4fuse.diagnose import refine_delay
+from px4fuse.diagnose import prepare_comparison, refine_delay
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.finding import Finding
 from px4fuse.findings import source_convention
@@ -26,6 +27,7 @@ from px4fuse.findings.cause_grouping import CONVENTION
 from px4fuse.findings.model import finding
 from px4fuse.flight.model import RECEIVED, Columns, Flight, PositionTrack
 from px4fuse.readers import read_log
+from px4fuse.request import ComparisonRequest
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.scenario import Scenario
@@ -333,6 +335,17 @@ def test_late_timestamps_report_states_refined_time_offset(estimate_s, reported_
     assert f"are {reported_s:.2f} s late" in found.message
     unclear = replace(clock, is_determinable=False)
     assert refine_delay(comparison, unclear) is comparison
+
+
+def test_clock_offset_auto_note_states_already_applied_delay():
+    late = replace(flown(), positions=(sent(flown(), late_s=0.7),))
+    request = ComparisonRequest(log="made", clock_offset_s="auto", axes=("north", "east"))
+    prepared = prepare_comparison(request, flight=late)
+    assert prepared.settings.clock_offset_s == pytest.approx(-0.7, abs=0.02)
+    (note,) = (note for note in prepared.notes if note.startswith("--clock-offset auto: "))
+    remaining_s, applied_s = map(float, re.findall(r"([+-]\d\.\d+) s(?: \(95| from)", note))
+    assert abs(remaining_s) < 0.1
+    assert applied_s == pytest.approx(prepared.settings.clock_offset_s, abs=0.001)
 
 
 def test_ambiguous_position_axes_report_lists_possible_axes():

@@ -120,7 +120,7 @@ def test_feedback_states_each_right_answer_that_was_not_given() -> None:
     truth = replace(TRUTH, choices=((choice, "c"), (choice, "e")))
     form = replace(RIGHT, verdict_kf="", ekf2_did=(), quantities=(0.5, (3.0, 8.0)), choices=("a",))
     feedback = "; ".join(form_points(form, truth).feedback)
-    assert "verdict on KF: 'overconfident' is right, you gave 'none'" in feedback
+    assert "consistency of KF: 'overconfident' is right, you gave 'none'" in feedback
     assert "'dead-reckoned, then reset' is right, you gave none" in feedback
     assert "3, 7 is right, you gave 3, 8" in feedback
     assert "-0.2 is right, you gave 'none'" in feedback

@@ -90,7 +90,7 @@ def test_drifting_heading_misalignment_is_estimated_over_time(by):
         expected = -np.interp(middle, flight.attitude.index, turn)
         within = 0.5 if by == "orientation" else 3.5 * part.sigma_deg
         assert part.heading_error_deg == pytest.approx(expected, abs=within)
-    first, last = found.ends
+    first, last = found.find_ends()
     assert first.start_s < last.start_s
     assert first.heading_error_deg > last.heading_error_deg
 

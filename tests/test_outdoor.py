@@ -79,7 +79,7 @@ def test_simulated_gnss_fixes_have_configured_noise_and_delay(
     flight = read_log(log)
     track, truth = flight.positions[0], flight.truth
     assert (track.name, track.origin.is_gnss) == ("vehicle_gps_position", True)
-    assert track.rate_hz == pytest.approx(5.0, rel=0.01)
+    assert track.compute_rate_hz() == pytest.approx(5.0, rel=0.01)
     assert track.velocity is not None
     for measured, columns, sigma in (
         (track.samples, Columns.POSITION, 0.4),

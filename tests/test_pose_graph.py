@@ -307,7 +307,7 @@ def test_robust_pose_graph_removes_false_loop_closure() -> None:
             assert solution.converged or not robust
             off[robust].append(ate(solution.poses, truth) / known - 1.0)
             assert np.all((solution.weights >= 0.0) & (solution.weights <= 1.0))
-            assert np.all(solution.weights[graph.is_successive] == 1.0)
+            assert np.all(solution.weights[graph.find_successive()] == 1.0)
             squared = residuals(graph, solution.poses).chi2
             assert solution.cost == pytest.approx(0.5 * np.sum(solution.weights * squared))
             if robust:
@@ -390,7 +390,7 @@ def test_loop_closure_gate_distance_equals_gtsam(dimension: int, is_back: bool) 
     """For an exact closure the distance depends on the odometry covariance only."""
     gtsam = pytest.importorskip("gtsam")
     graph = odometry_graph(dimension, 1e-3)
-    chain = graph.select_edges(graph.is_successive)
+    chain = graph.select_edges(graph.find_successive())
     factors, values = gtsam_problem(gtsam, chain)
     kind, free = "Pose2" if dimension == 2 else "Pose3", TANGENT[dimension]
     held = getattr(values, f"at{kind}")(0)
@@ -437,17 +437,18 @@ def test_common_factor_of_information_does_not_change_gate() -> None:
     ends = np.arange(4, 34)
     truth, information = graph.poses, np.tile(graph.information[:1], (len(ends), 1, 1))
     graph = simulated(replace(
-        graph, first_nodes=np.append(graph.first_nodes, ends),
+        graph,
+        first_nodes=np.append(graph.first_nodes, ends),
         second_nodes=np.append(graph.second_nodes, ends - 4),
         measurements=np.vstack([graph.measurements, lie.between(truth[ends], truth[ends - 4])]),
         information=np.concatenate([graph.information, information]),
     ), 3)  # fmt: skip
     correct, _ = analyse_graph("g", graph)
-    low, high = correct.chi2_ratio_interval
-    assert low < correct.chi2_ratio < high
+    low, high = correct.reduced_chi2_interval
+    assert low < correct.reduced_chi2 < high
     assert correct.information_factor == 1.0
     wrong, _ = analyse_graph("g", replace(graph, information=8.0 * graph.information))
-    assert wrong.chi2_ratio == pytest.approx(8.0 * correct.chi2_ratio)
+    assert wrong.reduced_chi2 == pytest.approx(8.0 * correct.reduced_chi2)
     assert wrong.information_factor == pytest.approx(8.0, rel=0.5)
     assert all(gate.accepted for gate in wrong.gates)
     assert wrong.solutions["gnc"].dropped == 0

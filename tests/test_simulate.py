@@ -280,7 +280,7 @@ class TestMistakes:
 
     def test_simulated_fault_no_vvo_removes_visual_odometry_topic(self):
         remaining = to_flight(simulate(AISLE, parse_faults(["no-vvo"]))).positions
-        assert [round(track.rate_hz) for track in remaining] == [2, 2]
+        assert [round(track.compute_rate_hz()) for track in remaining] == [2, 2]
         flight = to_flight(simulate(replace(AISLE, ekf2=False), parse_faults(["no-vvo"])))
         assert flight.positions == ()
         with pytest.raises(px4fuse.Px4FuseError, match="SDLOG_PROFILE"):

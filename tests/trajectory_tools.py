@@ -98,7 +98,8 @@ def gtsam_problem(gtsam: Any, graph: PoseGraph) -> tuple[Any, Any]:
         values.insert(k, gtsam_pose(gtsam, pose))
     for i, j, z, omega in zip(
         graph.first_nodes.tolist(), graph.second_nodes.tolist(), graph.measurements,
-        graph.information, strict=True,
+        graph.information,
+        strict=True,
     ):  # fmt: skip
         noise = gtsam.noiseModel.Gaussian.Information(omega[np.ix_(order, order)])
         factors.add(between(i, j, gtsam_pose(gtsam, z), noise))

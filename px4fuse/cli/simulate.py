@@ -242,7 +242,7 @@ def _write_assignment(
     secret: bytes | None,
     scenario_kind: Any,
     fault_count: int | None,
-    logs_truth: bool,
+    with_ground_truth: bool,
 ) -> None:
     from px4fuse.classroom.assignment import assignment
     from px4fuse.classroom.assignment.roster import read_roster
@@ -260,7 +260,7 @@ def _write_assignment(
             secret,
             scenario_kind,
             fault_count,
-            logs_truth,
+            with_ground_truth,
             partial(show_progress, "simulating"),
         )
     write_and_print({}, assignment_page(key, folder, answer_key_path, written_count))

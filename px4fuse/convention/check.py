@@ -87,7 +87,7 @@ def check_convention(
     positions = _read_positions(flight, track, max_offset_s)
     motions = {
         name: motion_from_imu(inertial_data, attitude)
-        for name, attitude in inertial_data.attitudes.items()
+        for name, attitude in inertial_data.compute_attitudes().items()
     }
     hypotheses = _rank_hypotheses(positions, motions)
     if not hypotheses:

@@ -196,7 +196,7 @@ def correct_convention(
     inertial_data = read_inertial(flight) if faults.affects_ekf2 else None
     if inertial_data is None:
         return flight, track
-    attitude = inertial_data.attitudes[convention.heading_from]
+    attitude = inertial_data.compute_attitudes()[convention.heading_from]
     # the axes of the positions are correct, so the attitude is rotated to their north direction
     if not faults.has_wrong_axes and not faults.rotation_deg:
         turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x)

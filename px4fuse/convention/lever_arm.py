@@ -106,7 +106,7 @@ def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
     position_samples = track.samples[Columns.POSITION[:2]].dropna()
     if inertial_data is None or len(position_samples) < 2:
         return None
-    attitude = inertial_data.attitudes["EKF2"]
+    attitude = inertial_data.compute_attitudes()["EKF2"]
     imu_motion = motion_from_imu(inertial_data, attitude)
     rotation = to_matrix(attitude)[:, :2, :2].reshape(-1, 4)
     arm_differences = SourceMotion.of(

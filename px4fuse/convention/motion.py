@@ -71,9 +71,8 @@ class InertialData:
     gyro_attitude: Array
     valid_spans_s: tuple[tuple[float, float], ...]
 
-    @property
-    def attitudes(self) -> dict[HeadingSource, Array]:
-        """Attitudes with tilt from the gyroscopes, and heading from EKF2 or the gyroscopes."""
+    def compute_attitudes(self) -> dict[HeadingSource, Array]:
+        """Return the attitudes with tilt from the gyroscopes, by source of the heading."""
         return {
             "EKF2": replace_heading(self.gyro_attitude, heading(self.logged_attitude)),
             "gyroscopes": self.gyro_attitude,

@@ -202,13 +202,13 @@ def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
     return np.hstack([poses[:, :3], poses[:, 3:] / quaternion_norms[:, None]])
 
 
-def _information_matrices(edges: Rows, numbers: Array, size: int) -> Array:
-    """Return the information matrices, shape (n, size, size).
+def _information_matrices(edges: Rows, numbers: Array, dimension: int) -> Array:
+    """Return the information matrices, shape (n, dimension, dimension).
 
     ``numbers`` contains the upper triangle of each matrix, row by row.
     """
-    row, column = np.triu_indices(size)
-    matrices = np.empty((len(numbers), size, size))
+    row, column = np.triu_indices(dimension)
+    matrices = np.empty((len(numbers), dimension, dimension))
     matrices[:, row, column] = matrices[:, column, row] = numbers
     magnitudes = np.abs(numbers)
     is_too_small = (row == column) & (magnitudes > 0.0) & (magnitudes < _MIN_INFORMATION)

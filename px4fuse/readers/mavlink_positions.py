@@ -140,7 +140,7 @@ def _read_gnss(
         return px4_positions.unavailable_source(
             layout.topic,
             f"the recording has {message_count} {layout.topic}, {fix_count} with a 3D fix",
-            "Give the antenna a free view of the sky and wait for a fix.",
+            px4_positions.NO_FIX_ACTION,
         )
     samples = project_to_ned(fixes, local_origin(recording))
     variance = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2
@@ -221,7 +221,7 @@ def read_truth(
         origin = local_origin(recording) if positions and positions[0].origin.is_gnss else None
         state = project_to_ned(samples, origin).join(samples[Columns.VELOCITY])
         return Truth(layout.topic, state[Columns.STATE], read_attitude(samples))
-    mocap_truth = px4_positions.motion_capture_truth(positions, "ATT_POS_MOCAP")
+    mocap_truth = px4_positions.motion_capture_truth(positions)
     for track in positions:
         if mocap_truth and track.name == mocap_truth.name:
             recording.record_stream("truth", *track.topics, clock=track.clock)

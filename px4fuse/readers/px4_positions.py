@@ -46,6 +46,7 @@ from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 FIX_TYPE_3D = 3
+NO_FIX_ACTION = "Give the antenna a free view of the sky and wait for a fix."
 # Maximum delay (µs) from timestamp to publication if PX4 set the timestamp at the arrival
 MAX_ARRIVAL_DELAY_US = 100
 # If at least this fraction of the timestamps are arrival times, the log has no measurement times
@@ -88,7 +89,7 @@ def split_tracks(
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Separate available positions, best source first, from missing position sources."""
     available_tracks = [track for track in tracks if isinstance(track, PositionTrack)]
-    available_tracks.sort(key=lambda track: track.origin.preference_rank)
+    available_tracks.sort(key=lambda track: track.origin.find_preference_rank())
     missing_tracks = (track for track in tracks if isinstance(track, Unavailable))
     return tuple(available_tracks), tuple(missing_tracks)
 
@@ -413,10 +414,15 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     if layout is None:
         return unavailable_source(px4.GPS_POSITION)
     fixes = topics.read_instance(layout)
+    message_count = len(fixes)
     if "fix_type" in fixes:
         fixes = fixes[fixes["fix_type"] >= FIX_TYPE_3D]
     if fixes.empty:
-        return unavailable_source(px4.GPS_POSITION, "the GNSS receiver never had a 3D fix")
+        return unavailable_source(
+            px4.GPS_POSITION,
+            f"the log has {message_count} {px4.GPS_POSITION}, none with a 3D fix",
+            NO_FIX_ACTION,
+        )
     parameters = topics.ekf2_parameters
     published_s = (fixes["published_us"].to_numpy() - topics.zero_us) * 1e-6
     has_driver_times = GNSS_MODE_PARAMETER in parameters and bool(
@@ -520,7 +526,7 @@ def read_truth(
                 local_samples[column] += np.nan_to_num(shift_m)
     if len(local_samples):
         return Truth(local_layout.topic, local_samples, attitude)
-    mocap_truth = motion_capture_truth(positions, "vehicle_mocap_odometry")
+    mocap_truth = motion_capture_truth(positions)
     reason = "the log has neither simulation ground truth nor motion capture"
     remedy = px4.TRACKS["vehicle_mocap_odometry"].remedy
     if len(logged_local):
@@ -529,12 +535,14 @@ def read_truth(
     return mocap_truth or Unavailable("ground truth", reason, remedy)
 
 
-def motion_capture_truth(positions: tuple[PositionTrack, ...], topic: str) -> Truth | None:
+def motion_capture_truth(positions: tuple[PositionTrack, ...]) -> Truth | None:
     """Return motion capture as ground truth, or None if EKF2 may have fused it.
 
-    EKF2 may have fused motion capture if the log contains no external vision.
+    EKF2 may have fused motion capture if the log contains no external vision. The
+    north of positions in FRD is unknown.
     """
-    track = next((track for track in positions if track.topics[0] == topic), None)
+    tracks = (track for track in positions if track.origin.kind == "mocap")
+    track = next((track for track in tracks if track.frame != "FRD"), None)
     if track is None or not any(track.origin.is_vision for track in positions):
         return None
     samples = track.samples.reindex(columns=Columns.STATE)

@@ -11,7 +11,6 @@ import numpy as np
 from msgspec import convert, to_builtins
 
 from px4fuse.card.model import (
-    FILTER_NAMES,
     MAX_NOTES,
     RATIO_AXIS_ENDS,
     RATIO_AXIS_TICKS,
@@ -23,6 +22,7 @@ from px4fuse.card.model import (
     Verdict,
     axis_fraction,
 )
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.consistency import CONSISTENT_RATIOS, Reference
 from px4fuse.request import quote_command

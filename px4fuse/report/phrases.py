@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from px4fuse.comparison.model import (
+    FILTER_NAMES,
     AxisComparison,
     Comparison,
     Difference,
@@ -55,7 +56,7 @@ def format_settings(settings: Settings) -> str:
 def format_verdict(consistency: Consistency | Unavailable) -> str:
     """State whether a filter is consistent, or by which factor its reported σ is wrong."""
     if isinstance(consistency, Unavailable):
-        return "not logged"
+        return "not evaluated"
     return format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
 
 
@@ -71,11 +72,13 @@ def format_sigma_verdict(verdict: str, factor: float) -> str:
 
 
 def statistics_by_filter(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
-    """Return the statistics of KF, and of EKF2 if logged, by filter name."""
-    filters = {"KF": result.filters["kf"]}
-    if not isinstance(result.ekf2_state, Unavailable):
-        filters["EKF2"] = result.filters["ekf2"]
-    return filters
+    """Return the statistics of each filter, without EKF2 if it is not logged, by label."""
+    is_ekf2_missing = isinstance(result.ekf2_state, Unavailable)
+    return {
+        FILTER_NAMES[name]: statistics
+        for name, statistics in result.filters.items()
+        if not (name == "ekf2" and is_ekf2_missing)
+    }
 
 
 VERDICT_TABLE_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
@@ -96,7 +99,7 @@ def verdict_cells(result: AxisComparison, name: str) -> list[Cell]:
 
 def write_error_table(page: Page, analysis: Analysis) -> None:
     """Write a table of consistency tests and position errors of KF and EKF2 along all axes."""
-    axes = (analysis.main, *analysis.secondary_axes)
+    axes = (analysis.main, *analysis.select_secondary_axes())
     has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
     has_truth = isinstance(analysis.flight.truth, Truth)
 

@@ -124,8 +124,8 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         )
     fits = (_refine_offset(sparse_track, dense_track, lag, SEARCH_WINDOW_S) for lag in candidates)
     accepted_fits = sorted(
-        (fit for fit in fits if fit is not None and fit.misfit <= MAX_MISFIT),
-        key=lambda fit: fit.misfit,
+        (fit for fit in fits if fit is not None and fit.compute_misfit() <= MAX_MISFIT),
+        key=lambda fit: fit.compute_misfit(),
     )
     if not accepted_fits:
         return _not_determinable(
@@ -134,7 +134,9 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         )
     best_fit = accepted_fits[0]
     similar_fits = [
-        fit for fit in accepted_fits if fit.misfit <= MIN_SECOND_PEAK_RATIO * best_fit.misfit
+        fit
+        for fit in accepted_fits
+        if fit.compute_misfit() <= MIN_SECOND_PEAK_RATIO * best_fit.compute_misfit()
     ]
     if clock_offset_s is not None:
         # Of several offsets that fit equally well, the nearest to the UNIX time is used
@@ -144,7 +146,8 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         if difference_s > MIN_PEAK_DISTANCE_S:
             return _not_determinable(
                 f"the motion is periodic: with a time offset that differs by {difference_s:.1f} s "
-                f"the ATE is {fit.rms_m:.3g} m instead of {best_fit.rms_m:.3g} m"
+                f"the ATE is {fit.compute_rms_m():.3g} m instead of "
+                f"{best_fit.compute_rms_m():.3g} m"
             )
     # The fit is repeated with a narrower window of offsets, within which more poses overlap in time
     best_fit = (
@@ -163,7 +166,7 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         interval_s=(best_fit.offset_s - half_interval_s, best_fit.offset_s + half_interval_s),
         is_determinable=True,
         reason="The time offset has the maximum speed correlation and the minimum ATE "
-        f"({best_fit.rms_m:.3g} m, {len(best_fit.time_s)} poses).",
+        f"({best_fit.compute_rms_m():.3g} m, {len(best_fit.time_s)} poses).",
     )
 
 
@@ -264,17 +267,15 @@ class _OffsetFit:
     aligned_m: Array
     target_m: Array
 
-    @property
-    def rms_m(self) -> float:
-        """RMS (m) of the residuals."""
+    def compute_rms_m(self) -> float:
+        """Return the RMS (m) of the residuals."""
         return rms_m(self.target_m - self.aligned_m)
 
-    @property
-    def misfit(self) -> float:
-        """Ratio of RMS residual to RMS extent of the motion; the best fit has the smallest."""
+    def compute_misfit(self) -> float:
+        """Return the ratio of RMS residual to RMS extent of the motion; the least is best."""
         # Extent of the dense trajectory, because a bad fit shrinks the sparse one to a point
         extent_m = float(np.sqrt(self.target_m.var(axis=0).sum()))
-        return max(self.rms_m / extent_m, MIN_MISFIT) if extent_m > 0.0 else float("inf")
+        return max(self.compute_rms_m() / extent_m, MIN_MISFIT) if extent_m > 0.0 else float("inf")
 
 
 def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _OffsetFit) -> float:
@@ -286,7 +287,7 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
     pose_count = len(fit.time_s)
     centred_m = fit.aligned_m - fit.aligned_m.mean(axis=0)
     dense_velocity = _velocity(dense_track, fit.time_s + fit.offset_s)
-    sparse_velocity = fit.transform.rotation.apply(
+    sparse_velocity = fit.transform.to_rotation().apply(
         fit.transform.scale * _velocity(sparse_track, fit.time_s)
     )
     # Remove the velocity that a translation, a small rotation or a scale factor can explain

@@ -65,8 +65,9 @@ def main() -> None:
             theirs[run] = seconds(optimiser.optimize)
         found, other = solve(graph), factors.error(optimiser.values())
         print(
-            f"{name}: {len(graph)} poses, {len(graph.first_nodes)} edges, {graph.initialised}, "
-            f"read in {reading:.2f} s; {np.median(ours / theirs):.2f} x GTSAM "
+            f"{name}: {len(graph)} poses, {len(graph.first_nodes)} edges, "
+            f"{graph.initialised}, read in "
+            f"{reading:.2f} s; {np.median(ours / theirs):.2f} x GTSAM "
             f"({np.median(ours):.3f} s / {np.median(theirs):.3f} s, {runs} pairs); "
             f"steps {found.iterations} / {optimiser.iterations()}; cost {cost(graph):.6g} -> "
             f"{found.cost:.9g}, {found.cost / other - 1.0:+.0e} of GTSAM's"

@@ -140,7 +140,8 @@ NEEDS = {
 }  # fmt: skip
 # Options that exclude each other
 EXCLUDED = (
-    {"opened", "landed_at"}, {"opened", "closures"}, {"sweep", "without"}, {"sweep", "changes"},
+    {"is_open_path", "landed_at"}, {"is_open_path", "closures"},
+    {"sweep", "without"}, {"sweep", "changes"},
     {"source_kind", "height"},
 )  # fmt: skip
 # Options that a desk has no value for, and those that only limit a run
@@ -195,7 +196,7 @@ def drawn_words(name: str, command: click.Command, rng: random.Random, out: Path
         if isinstance(one, click.Option) and one.expose_value and one.name not in NEVER
     }
     if name == "practice":
-        del options["opened"]  # it opens a browser
+        del options["opens_page"]  # it opens a browser
     arguments = rng.choice(ARGUMENTS.get(name, ("",)))
     chosen = set(rng.sample(sorted(options), min(rng.randrange(6), len(options))))
     chosen |= {NEEDS[one] for one in chosen if one in NEEDS}

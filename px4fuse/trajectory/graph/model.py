@@ -65,9 +65,8 @@ class PoseGraph:
         edges = np.stack([self.first_nodes, self.second_nodes])
         return NormalEquations(edges, self.degrees_of_freedom)
 
-    @property
-    def is_successive(self) -> BoolArray:
-        """Mask of the edges between successive poses, which are odometry by default."""
+    def find_successive(self) -> BoolArray:
+        """Return the mask of the edges between successive poses, which are odometry by default."""
         return np.asarray(np.abs(self.first_nodes - self.second_nodes) == 1)
 
 
@@ -166,7 +165,7 @@ def odometry_chain(graph: PoseGraph, excluded_edges: IntArray | None = None) -> 
 
     Of several edges between two poses the first is used.
     """
-    odometry_edges = np.flatnonzero(graph.is_successive)
+    odometry_edges = np.flatnonzero(graph.find_successive())
     if excluded_edges is not None:
         odometry_edges = np.setdiff1d(odometry_edges, excluded_edges)
     next_edge = np.full(len(graph) - 1, -1, dtype=np.intp)
