@@ -17,7 +17,7 @@ from flights import Estimator, Imu, Uwb, aisle_flight, given_placement, unexplai
 from golden_tools import assert_matches_golden, rounded, value
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.diagnose import prepare_comparison
+from px4fuse.diagnose import prepare_comparison, read_flight
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
@@ -436,7 +436,7 @@ def test_positions_missing_for_part_of_flight_are_reported_first(
     cases = shared_logs.parent / "cases"
     position = file and PositionFile(path=str(cases / file), frame="enu")
     request = ComparisonRequest(log=str(shared_logs / f"{log}.ulg"), position=position or None)
-    first, *_ = found(compare_prepared(prepare_comparison(request)))
+    first, *_ = found(compare_prepared(prepare_comparison(read_flight(request), request)))
     # EKF2 fused its own source besides the file
     assert (first.id, first.severity) == (finding, "warning" if file else "error")
     assert f"in flight at {at_s} s: EKF2's position error is " in first.title

@@ -56,8 +56,7 @@ from px4fuse.core.arrays import Array
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
-from px4fuse.ekf2.replay import HORIZONTAL as HORIZONTAL_AXES
-from px4fuse.ekf2.replay import Ekf2Replay, rows_inside
+from px4fuse.ekf2.replay import HORIZONTAL_AXES, Ekf2Replay, rows_inside
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings

@@ -35,7 +35,7 @@ from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, matching_sample_rows, pre
 from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.replay import (
-    HORIZONTAL,
+    HORIZONTAL_AXES,
     MAX_COMPARED_REJECTED_FRACTION,
     Agreement,
     Ekf2Replay,
@@ -66,7 +66,7 @@ from px4fuse.flight.ekf2_parameters import (
     PARAMETERS,
     check_parameters,
 )
-from px4fuse.flight.model import AXIS_NAMES, AxisName, Columns, Ekf2, Flight, Unavailable
+from px4fuse.flight.model import AXIS_NAMES, Columns, Ekf2, Flight, NedAxis, Unavailable
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.trajectory.rotation import rotate
 
@@ -442,14 +442,14 @@ def _updates_by_aid(
         )
     )
 
-    def updates_along(axes: Sequence[AxisName], columns: slice, *other_values: Any) -> pd.DataFrame:
+    def updates_along(axes: Sequence[NedAxis], columns: slice, *other_values: Any) -> pd.DataFrame:
         update_log = np.column_stack([nu[:, columns], S[:, columns], *other_values])
         return update_table(update_log[:, None], events.time_s[:, None], end_s, axes)
 
     position_variance = variance_after[:, HORIZONTAL_POSITION]
     updates_by_aid = {
         inputs.aid.name: updates_along(
-            HORIZONTAL,
+            HORIZONTAL_AXES,
             POSITION_COLUMNS,
             rejected,
             fused,
@@ -467,7 +467,7 @@ def _updates_by_aid(
         velocity_limit = (1.0 + 1e-9) * max(gate, MIN_GATE) ** 2
         is_outside_gate = (nu[:, :3] ** 2 > velocity_limit * S[:, :3]).any(axis=1)
         # Without GNSS height, the replay uses EKF2's logged height
-        axes = AXIS_NAMES if GNSS_HGT.name in updates_by_aid else HORIZONTAL
+        axes = AXIS_NAMES if GNSS_HGT.name in updates_by_aid else HORIZONTAL_AXES
         updates_by_aid[GNSS_VEL.name] = updates_along(axes, slice(len(axes)), is_outside_gate)
     if run.vision is not None:
         updates_by_aid[EV_POS.name] = run.vision.updates(configuration_index, end_s)

@@ -30,10 +30,10 @@ from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, FLOW, GNSS_VEL, MAG
 from px4fuse.flight.model import (
     AXIS_NAMES,
     AidLog,
-    AxisName,
     Columns,
     Ekf2,
     Flight,
+    NedAxis,
     Truth,
     Unavailable,
 )
@@ -41,7 +41,7 @@ from px4fuse.readers.px4_innovations import innovations_along
 
 Spans = tuple[Span, ...]
 T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
-HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")
+HORIZONTAL_AXES: tuple[NedAxis, NedAxis] = ("north", "east")
 # Minimum number of logged innovations for a comparison with the EKF2 replay
 MIN_COMPARED_INNOVATIONS = 20
 CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
@@ -401,16 +401,16 @@ def logged_aid_innovations(name: str, aid_log: AidLog) -> pd.DataFrame:
     return _columns_by_axis({axis: innovations_along(aid_log, axis, gate) for axis in axes})
 
 
-def axes_of(updates: pd.DataFrame) -> list[AxisName]:
+def axes_of(updates: pd.DataFrame) -> list[NedAxis]:
     return [axis for axis in AXIS_NAMES if f"innovation_{axis}_m" in updates]
 
 
 def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
     """Return the logged position innovations north and east, with S and rejections."""
-    return _columns_by_axis({axis: ekf2.innovations[axis] for axis in HORIZONTAL})
+    return _columns_by_axis({axis: ekf2.innovations[axis] for axis in HORIZONTAL_AXES})
 
 
-def _columns_by_axis(innovations: Mapping[AxisName, pd.DataFrame | Unavailable]) -> pd.DataFrame:
+def _columns_by_axis(innovations: Mapping[NedAxis, pd.DataFrame | Unavailable]) -> pd.DataFrame:
     columns = {}
     for axis, axis_innovations in innovations.items():
         if isinstance(axis_innovations, Unavailable):
@@ -458,7 +458,7 @@ def match_updates(
 
 
 def _axis_agreement(
-    axis: AxisName,
+    axis: NedAxis,
     logged_innovations: pd.DataFrame,
     replayed_innovations: pd.DataFrame,
     ekf2: Ekf2,

@@ -19,11 +19,11 @@ from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import (
     BAD_ACCELERATION,
-    AxisName,
     Columns,
     Ekf2,
     Flight,
     FusionRecord,
+    NedAxis,
     Unavailable,
     time_index,
 )
@@ -288,7 +288,7 @@ def samples_by_event(
 
 
 def update_table(
-    update_log: Array, measured_at_s: Array, end_s: Array, axes: Sequence[AxisName]
+    update_log: Array, measured_at_s: Array, end_s: Array, axes: Sequence[NedAxis]
 ) -> pd.DataFrame:
     """Return the updates with one aiding source as a table, indexed by measurement time (s).
 

@@ -81,7 +81,7 @@ def line_error(name: str, line_number: int, fault: str, remedy: str) -> Trajecto
     return TrajectoryError(f"{name}, line {line_number}: {fault}. {remedy}")
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)  # filled while the data are read
 class Rows:
     """Rows of a text table, with the line number of each row for error messages.
 
