@@ -52,15 +52,13 @@ class Analysis(Comparison, Estimates, Reruns):
         model = self.ekf2_model
         return model if isinstance(model, Unavailable) else model.baseline_replay
 
-    @property
-    def main_trials(self) -> list[Trial]:
-        """Re-runs of KF and EKF2 along the main axis that are compared with logged results."""
+    def select_main_trials(self) -> list[Trial]:
+        """Return the re-runs along the main axis that are compared with logged results."""
         main_axis = self.main.axis.name
         return [trial for trial in self.trials if trial.axis == main_axis and trial.is_logged]
 
-    @property
-    def secondary_axes(self) -> list[AxisComparison]:
-        """Comparisons along all axes except ``main``, the axis with the largest motion."""
+    def select_secondary_axes(self) -> list[AxisComparison]:
+        """Return comparisons along all axes except ``main``, the axis with the largest motion."""
         return [axis for axis in self.axes.values() if axis is not self.main]
 
 

@@ -37,6 +37,7 @@ from px4fuse.comparison.preparation import explain_missing_source, prepare
 from px4fuse.comparison.remedy import ml_ekf2_parameters
 from px4fuse.comparison.reruns import Reruns, planned_configurations, rerun_filters
 from px4fuse.convention.correction import convention_faults
+from px4fuse.core.memory import release_free_memory
 from px4fuse.core.reading import display_name
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.model import Model, open_model
@@ -81,9 +82,9 @@ def diagnose(
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
     flight = flight or read_flight(request, progress)
-    prepared = prepare_comparison(request, progress, flight, as_sent=as_sent)
-    kf_runs = run_kf(prepared, progress)
-    comparison = compare(prepared, kf_runs)
+    prepared_comparison = prepare_comparison(request, progress, flight, as_sent=as_sent)
+    kf_runs = run_kf(prepared_comparison, progress)
+    comparison = compare(prepared_comparison, kf_runs)
     return replace(find_faults(comparison, progress), request=request)
 
 
@@ -105,8 +106,10 @@ def find_faults(comparison: Comparison, progress: Progress = ignore_progress) ->
         }
         return Analysis(**withheld_fields | known_fields)
     estimates = estimate(comparison, progress)
+    release_free_memory()
     comparison = refine_delay(comparison, estimates.clock)
     reruns = rerun(comparison, estimates, progress)
+    release_free_memory()
     progress("measuring the loop closure error")
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
 
@@ -152,6 +155,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
     log_path = Path(request.log)
     progress(f"reading {display_name(log_path)}")
     flight = read_log(log_path, system=request.system)
+    release_free_memory()
     requested_file, offset_s = request.position, request.clock_offset_s
     if requested_file is None:
         return flight
@@ -187,11 +191,11 @@ def prepare_comparison(
     For arguments and errors see :func:`diagnose`.
     """
     flight = flight or read_flight(request, progress)
-    prepared = prepare(flight, request, as_sent=as_sent)
+    prepared_comparison = prepare(flight, request, as_sent=as_sent)
     # read_flight has already corrected the time offset of a position file
     if request.clock_offset_s != AUTO or request.position is not None:
-        return prepared
-    _, clock = estimate_noises_and_clock(prepared, progress)
+        return prepared_comparison
+    _, clock = estimate_noises_and_clock(prepared_comparison, progress)
     if isinstance(clock, Unavailable) or not clock.is_determinable:
         raise MissingDataError(
             f"{flight.log.name}: the time offset cannot be estimated from this flight "
@@ -199,12 +203,14 @@ def prepare_comparison(
             "State the offset (--clock-offset SECONDS), or omit --clock-offset.",
         )
     if not clock.is_significant(clock.remaining_s):
-        low, high = clock.interval_s
+        low, high = (limit_s - clock.applied_s for limit_s in clock.interval_s)
         note = (
-            f"--clock-offset auto: the time offset {clock.offset_s:+.3f} s (95 % {low:+.3f} to "
+            f"--clock-offset auto: the time offset {clock.remaining_s:+.3f} s (95 % {low:+.3f} to "
             f"{high:+.3f} s) is not significant and was not applied"
         )
-        return replace(prepared, notes=(*prepared.notes, note))
+        if clock.applied_s:
+            note += f", in addition to {clock.applied_s:+.3f} s from the check of the timestamps"
+        return replace(prepared_comparison, notes=(*prepared_comparison.notes, note))
     request = structs.replace(request, clock_offset_s=clock.offset_s)
     return prepare(flight, request, as_sent=as_sent)
 
@@ -214,16 +220,18 @@ def rerun(
 ) -> Reruns:
     """Replay EKF2, explain the difference KF - EKF2, and re-run both with one error corrected."""
     progress("replaying EKF2")
-    corrected = corrected_settings(comparison, estimates.tuning)
+    estimated_settings = corrected_settings(comparison, estimates.tuning)
     # replay all parameter sets together, which is faster
     model = open_model(
         comparison.flight,
         lambda inputs: [
-            *explanation_configurations(comparison, inputs, corrected),
+            *explanation_configurations(comparison, inputs, estimated_settings),
             *planned_configurations(comparison, estimates, inputs),
         ],
     )
-    difference_steps = explain_ekf2_difference(comparison, model, estimates.clock, corrected)
+    difference_steps = explain_ekf2_difference(
+        comparison, model, estimates.clock, estimated_settings
+    )
     trials = rerun_filters(comparison, estimates, model)
     if isinstance(model, Model):  # to free memory
         model = replace(model, runs=(), intervals={})
@@ -243,7 +251,7 @@ def diagnose_or_check_aids(
     flight = flight or read_flight(request, progress)
     if request.position_source or any(track.origin.is_automatic for track in flight.positions):
         return diagnose(request, progress, flight)
-    no_position, aids = explain_missing_source(flight), evaluate_aids(flight)
+    missing_source, aids = explain_missing_source(flight), evaluate_aids(flight)
     if isinstance(aids, Unavailable):
         if flight.airborne == ():
             raise MissingDataError(
@@ -251,11 +259,11 @@ def diagnose_or_check_aids(
                 f"({aids.reason}). px4fuse info {flight.log.name} lists the logged data."
             )
         raise MissingDataError(
-            f"{flight.log.name}: {no_position.reason}, and EKF2's aiding sources cannot be "
+            f"{flight.log.name}: {missing_source.reason}, and EKF2's aiding sources cannot be "
             f"checked: {aids.reason}",
-            no_position.remedy,
+            missing_source.remedy,
         )
-    return AidsOnlyAnalysis(flight, aids, no_position, find_aids(aids, flight))
+    return AidsOnlyAnalysis(flight, aids, missing_source, find_aids(aids, flight))
 
 
 def run_what_if(
@@ -300,8 +308,8 @@ def run_what_if(
             raise
     if comparison is not None:
         tuning, clock = estimate_noises_and_clock(comparison, progress)
-        corrected = corrected_settings(comparison, tuning)
-        difference_steps = explain_ekf2_difference(comparison, model, clock, corrected)
+        estimated_settings = corrected_settings(comparison, tuning)
+        difference_steps = explain_ekf2_difference(comparison, model, clock, estimated_settings)
         if is_default_change:
             changes = ml_ekf2_parameters(comparison, model, tuning, clock)
     parameter_sets = [changes] if changes or request.without else []

@@ -41,7 +41,7 @@ from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.readers import ulog_topics
 from px4fuse.results.answer_form import Answers, read_answers
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 
 SECRET = b"a secret for tests"
 # Flight of student s1 with SECRET: seed, noise and heading, and the faults
@@ -55,7 +55,7 @@ FINDINGS = {
     "ekf2-gate": "ekf2_rejects_positions", "ekf2-delay": "ekf2_ev_delay_wrong",
     "ekf2-off": "ekf2_not_fusing", "open-end": "false_loop_closure",
 }  # fmt: skip
-CHOICE = {choice.mistake: choice for rules in RULES_BY_KIND.values() for choice in rules.mistakes}
+CHOICE = {choice.name: choice for rules in RULES_BY_KIND.values() for choice in rules.faults}
 
 
 def choices_of(drawn):
@@ -99,7 +99,9 @@ class TestDraw:
         # a loop contains no ground truth, which would show the landing
         assert scenario.truth
         assert not assign_random_flight(SECRET, "s1", "loop").scenario.truth
-        assert not assign_random_flight(SECRET, "s1", "aisle", logs_truth=False).scenario.truth
+        assert not assign_random_flight(
+            SECRET, "s1", "aisle", with_ground_truth=False
+        ).scenario.truth
         assert (scenario.seed, scenario.sigma_uwb_m, scenario.heading_deg) == PINNED[0]
         assert drawn.mistake_options == PINNED[1]
         loops = [
@@ -124,8 +126,8 @@ class TestDraw:
         for count, share in enumerate(FAULT_COUNT_FRACTIONS[kind]):
             found = sum(len(one.mistake_options) == count for one in flights) / 1000
             assert found == pytest.approx(share, abs=0.05)
-        names = {choice.mistake for one in flights for choice in choices_of(one)}
-        assert names == {choice.mistake for choice in RULES_BY_KIND[kind].mistakes}
+        names = {choice.name for one in flights for choice in choices_of(one)}
+        assert names == {choice.name for choice in RULES_BY_KIND[kind].faults}
 
     def test_mixed_assignment_contains_straight_and_loop_flights(self):
         mixed = [assign_random_flight(SECRET, f"s{n}", "mixed") for n in range(1000)]
@@ -143,14 +145,14 @@ class TestDraw:
             first, second = choices_of(drawn)
             assert first.is_detectable_with(second)
             assert second.is_detectable_with(first)
-            parse_mistakes(drawn.mistake_options)
+            parse_faults(drawn.mistake_options)
             ratios = [EASIEST_DIFFICULTY]
             for choice, text in zip(choices_of(drawn), drawn.mistake_options, strict=True):
                 if choice.detectable_size is None:
-                    assert text == choice.mistake
+                    assert text == choice.name
                     continue
                 size = float(re.search(r"=([-+]?[\d.]+)", text)[1])
-                signs[choice.mistake, size > 0] += 1
+                signs[choice.name, size > 0] += 1
                 ratio = choice.detectable_size / abs(size)
                 ratios.append(1.0 / ratio if choice.is_smaller_easier else ratio)
                 if choice.start_range_s is not None:
@@ -158,18 +160,16 @@ class TestDraw:
                     assert choice.start_range_s[0] <= at <= choice.start_range_s[1]
             assert drawn.difficulty == pytest.approx(max(ratios), abs=0.011)
             assert EASIEST_DIFFICULTY <= drawn.difficulty <= UNDETECTABLE_DIFFICULTY
-        both = {
-            choice.mistake for choice in RULES_BY_KIND["aisle"].mistakes if choice.has_either_sign
-        }
+        both = {choice.name for choice in RULES_BY_KIND["aisle"].faults if choice.has_either_sign}
         assert {name for name, positive in signs if not positive} == both
 
     def test_minimum_fault_size_equals_smallest_detected_size(self):
         """From the limit on, 95 % of the flights of tests/studies/rates.csv have the finding."""
         table = rates()
         table = table[~table.condition.str.contains("outdoor")]
-        for choice in (choice for rules in RULES_BY_KIND.values() for choice in rules.mistakes):
-            plain = re.compile(rf"--mistake {choice.mistake}(=([\d.]+)\D*)?$")
-            rows = table[(table.finding == FINDINGS[choice.mistake]) & (table.flights >= 10)]
+        for choice in (choice for rules in RULES_BY_KIND.values() for choice in rules.faults):
+            plain = re.compile(rf"--mistake {choice.name}(=([\d.]+)\D*)?$")
+            rows = table[(table.finding == FINDINGS[choice.name]) & (table.flights >= 10)]
             matches = ((plain.search(row.condition), row) for row in rows.itertuples())
             sizes = {float(match[2] or 0.0): row for match, row in matches if match}
             found = {size: row for size, row in sizes.items() if row.rate >= 0.95}
@@ -211,7 +211,7 @@ def test_each_fault_in_assignment_log_is_detected_by_analysis(
     else:
         found = find_faults(compare(flight, axes=("north", "east"))).findings
     drawn = assign_random_flight(SECRET, CLASS[number].student_id, kind, count)
-    wanted = {FINDINGS[choice.mistake] for choice in choices_of(drawn)}
+    wanted = {FINDINGS[choice.name] for choice in choices_of(drawn)}
     assert len(wanted) == count
     assert wanted <= {finding.id for finding in found}
 

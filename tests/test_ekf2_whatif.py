@@ -39,8 +39,8 @@ from px4fuse.filter.signals import Axis
 from px4fuse.flight.ekf2_parameters import GNSS_POS
 from px4fuse.flight.model import Columns, Flight, Truth, Unavailable
 from px4fuse.readers import read_log
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate, to_ulog
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 
@@ -224,7 +224,7 @@ def flown(tmp_path: Path, mistake: str, seed: int) -> Model:
     """Return the model of a simulated flight with one wrong EKF2 parameter, read from its log."""
     log = tmp_path / f"{seed}{mistake.partition('=')[2]}.ulg"
     log.write_bytes(
-        to_ulog(simulate(Scenario(seed=seed), parse_mistakes([mistake] if mistake else [])))
+        to_ulog(simulate(Scenario(seed=seed), parse_faults([mistake] if mistake else [])))
     )
     return opened(read_log(log))
 

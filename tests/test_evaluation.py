@@ -154,7 +154,7 @@ def test_alignment_of_straight_line_allows_only_yaw(noise_m: float) -> None:
     for kind in ("se3", "sim3"):
         with pytest.raises(TrajectoryError, match=r"perpendicular.*`alignment` yaw"):
             fit_alignment(x, y, kind)  # type: ignore[arg-type]
-    assert fit_alignment(x, y, "yaw").rotation.magnitude() < 0.02
+    assert fit_alignment(x, y, "yaw").to_rotation().magnitude() < 0.02
 
 
 def test_trajectory_alignment_without_motion_is_rejected() -> None:

@@ -307,7 +307,7 @@ TESTED_ELSEWHERE = {
     "false_loop_closure", "loop_closure_inconsistent", "loop_drift_too_small",
     "loop_landing_assumed", "loop_on_absolute_positions", "sigma_a_too_large", "sigma_a_too_small",
     "sigma_z_too_large", "sigma_z_too_small", "source_axes_wrong", "source_convention_ambiguous",
-    "source_downsampled",
+    "source_downsampled", "source_height_constant",
     "source_frame_misaligned", "source_low_pass_filtered", "source_noise_time_correlated",
     "source_noise_unequal_axes", "source_noise_varies", "source_orientation_copied",
     "source_orientation_wrong", "source_outliers", "source_position_jump",

@@ -26,7 +26,7 @@ from px4fuse.results.answer_form import (
     NamedFault,
     read_answers,
 )
-from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
+from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED
 
 FIRST = 'kind = "clock-offset"\nsize = 0.19\nunit = "s"\nwhen = "whole flight"\n'
 HONEST = f"""log_sha256 = "{"a" * 64}"

@@ -39,8 +39,8 @@ from px4fuse.results.answer_form import (
     update_renamed_values,
 )
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import Scenario, make_scenario
 
 SHA256 = "a" * 64
@@ -120,7 +120,7 @@ def test_feedback_states_each_right_answer_that_was_not_given() -> None:
     truth = replace(TRUTH, choices=((choice, "c"), (choice, "e")))
     form = replace(RIGHT, verdict_kf="", ekf2_did=(), quantities=(0.5, (3.0, 8.0)), choices=("a",))
     feedback = "; ".join(form_points(form, truth).feedback)
-    assert "verdict on KF: 'overconfident' is right, you gave 'none'" in feedback
+    assert "consistency of KF: 'overconfident' is right, you gave 'none'" in feedback
     assert "'dead-reckoned, then reset' is right, you gave none" in feedback
     assert "3, 7 is right, you gave 3, 8" in feedback
     assert "-0.2 is right, you gave 'none'" in feedback
@@ -130,7 +130,7 @@ def test_feedback_states_each_right_answer_that_was_not_given() -> None:
 
 DELAY = {"parameter": "EKF2_EV_DELAY", "value": 200.0, "value_unit": "ms"}
 GATE = {"parameter": "EKF2_EVP_GATE", "value": 3.0, "value_unit": "sd"}
-NO_MISTAKES = {"mistakes": 0.0, "sizes": 0.0, "time and panel": 0.0, "correction": 0.0}
+NO_FAULTS = {"mistakes": 0.0, "sizes": 0.0, "time and panel": 0.0, "correction": 0.0}
 # A form, and its parts with reduced points
 HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
     # wrong sign: a third of the points for the size and the action of this fault
@@ -145,8 +145,8 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
     (with_claim(kind="ekf2-delay"), {"mistakes": 21.0, "sizes": 10.0, "time and panel": 7.5}),
     # each wrong fault costs 10 points
     (with_false("yaw"), {"mistakes": 20.0}),
-    (with_false("yaw", "nlos", "scale"), NO_MISTAKES),
-    (replace(RIGHT, mistakes=(NamedFault("none"),)), NO_MISTAKES),
+    (with_false("yaw", "nlos", "scale"), NO_FAULTS),
+    (replace(RIGHT, mistakes=(NamedFault("none"),)), NO_FAULTS),
     (replace(RIGHT, verdict_kf="consistent"), {"verdicts": 10.0}),
     (replace(RIGHT, verdict_ekf2="consistent"), {"verdicts": 10.0}),
     (replace(RIGHT, ekf2_did=("dead-reckoned, then reset",)), {"verdicts": 12.5}),
@@ -210,7 +210,7 @@ def test_expected_loop_closure_error_includes_odometry_drift() -> None:
     """A student cannot separate the drift from the measured closure error."""
     scenario = Scenario(kind="loop", passes=1, vio_drift=0.02, seed=4, truth=False)
     (wrong,) = right_form_answers(
-        flights.simulate(scenario, parse_mistakes(("open-end=5m",))), SHA256
+        flights.simulate(scenario, parse_faults(("open-end=5m",))), SHA256
     ).mistakes
     assert wrong.size is not None
     assert wrong.low is not None
@@ -227,7 +227,7 @@ def simulation_of(typed: str) -> flights.Simulation:
     names = {field.name for field in dataclasses.fields(Scenario)} - {"kind", "truth", "ekf2"}
     chosen = {name: given[name] for name in names if given.get(name) is not None}
     scenario = make_scenario(given["kind"], truth=not given["no_truth"], **chosen)
-    return flights.simulate(scenario, parse_mistakes(given["mistake"]))
+    return flights.simulate(scenario, parse_faults(given["mistake"]))
 
 
 def answers_of(form: dict[str, Any]) -> Answers:

@@ -17,8 +17,8 @@ from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 AXES = ("north", "east", "down")
@@ -31,7 +31,7 @@ LOOP = Scenario(kind="loop", passes=1, length_m=8.0, vio_rate_hz=10.0)
 @cache
 def flown(scenario: Scenario, settings: Settings, *mistakes: str) -> Analysis:
     return find_faults(
-        compare(simulate_flight(scenario, parse_mistakes(mistakes)), settings, axes=AXES)
+        compare(simulate_flight(scenario, parse_faults(mistakes)), settings, axes=AXES)
     )
 
 

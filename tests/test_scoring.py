@@ -20,7 +20,7 @@ from results_tools import (
 from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
 from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers, RightVerdict
 from px4fuse.classroom.grading.flags import flag_equal_contents, flag_settings
-from px4fuse.classroom.grading.model import Entry, GradedReport
+from px4fuse.classroom.grading.model import Grade, GradedReport
 from px4fuse.classroom.grading.outputs import feedback_text
 from px4fuse.classroom.grading.rubric import parse_rubric, read_rubric, score_report
 from px4fuse.errors import ResultsError
@@ -297,7 +297,7 @@ class TestScore:
 
 def feedback_words(one, title=""):
     """Return the feedback text without line ends."""
-    text = feedback_text(Entry(one.student, one.student_id, one), title)
+    text = feedback_text(Grade(one.student, one.student_id, one), title)
     assert all(len(line) <= 100 for line in text.splitlines())
     return " ".join(text.split())
 

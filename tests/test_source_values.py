@@ -32,8 +32,8 @@ from px4fuse.flight.model import REPEATED_TIMESTAMPS, ClockMap, Columns, Flight
 from px4fuse.readers import read_log
 from px4fuse.readers.common import find_invalid_rows, rounding_step
 from px4fuse.readers.position_file import read_position_file
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
@@ -322,7 +322,7 @@ def test_noise_along_one_axis_is_not_reported_as_two_senders():
 
 def mounted(arm_m: tuple[float, float]) -> Analysis:
     """Return a flight whose sensor is mounted away from the IMU."""
-    flight = simulate_flight(Scenario(seed=3, kind="loop", passes=2), parse_mistakes(()))
+    flight = simulate_flight(Scenario(seed=3, kind="loop", passes=2), parse_faults(()))
     source, attitude = flight.positions[0], flight.truth.attitude
     time = source.samples.index.to_numpy()
     rotation = to_matrix(interpolate(time, attitude.index.to_numpy(), attitude.to_numpy()))

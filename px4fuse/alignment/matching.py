@@ -189,17 +189,19 @@ def _require_unique_match(match: Match) -> None:
             f"coefficient is {fit.concordance:.2f} (at least {MIN_CONCORDANCE[reference_name]:g} "
             "is needed)"
         )
-    ambiguity = ""
+    ambiguity_text = ""
     if fit.second_peak_ratio < MIN_SECOND_PEAK_RATIO:
-        ambiguity = (
+        ambiguity_text = (
             f"two time offsets that differ by {abs(fit.second_peak_s):.1f} s fit equally well"
         )
     elif fit.lag_sigma_s is not None and fit.lag_sigma_s > MAX_CLOCK_SIGMA_S:
-        ambiguity = f"the standard deviation of the time offset exceeds {MAX_CLOCK_SIGMA_S:g} s"
-    if ambiguity:
+        ambiguity_text = (
+            f"the standard deviation of the time offset exceeds {MAX_CLOCK_SIGMA_S:g} s"
+        )
+    if ambiguity_text:
         raise NoMatchError(
             f"the time offset between position file and {reference_name} cannot be estimated: "
-            f"{ambiguity}",
+            f"{ambiguity_text}",
             "Give `clock_offset_s`",
         )
     if len(match.residuals_m) > 1:

@@ -103,7 +103,7 @@ def align_position_file(
     yaw_deg: float | Literal["auto"] | None = None,
     clock_offset_s: float | None = None,
 ) -> Flight:
-    """Convert the positions of a file to the frame and clock of a flight; return both together.
+    """Convert the positions of a file to a flight's frame and clock; return the combined flight.
 
     Parameters
     ----------

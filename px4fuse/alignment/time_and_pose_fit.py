@@ -96,7 +96,7 @@ def find_correlation_peak(
     if shorter_sample_count < min_count:
         raise NoMatchError("position file and reference have too few common samples for a match")
     track_moments = moments(
-        file_track.horizontal_m, reference.horizontal_m, file_track.is_valid, reference.is_valid
+        file_track.to_complex_m(), reference.to_complex_m(), file_track.is_valid, reference.is_valid
     )
     common_count = track_moments.count
     covariance = track_moments.covariance
@@ -177,7 +177,7 @@ def fit_by_least_squares(
             f"only {np.count_nonzero(is_used)} positions of the file overlap the reference in time"
         )
     reference_time_s = file_track.time_s[is_used] + peak.lag_s
-    file_position_m = file_track.horizontal_m[is_used]
+    file_position_m = file_track.to_complex_m()[is_used]
     reference_position_m = (reference_m[:, 0] + 1j * reference_m[:, 1])[is_used]
     centre_m = np.mean(file_position_m)
     # with a centred track, the errors of yaw and origin are uncorrelated
@@ -191,7 +191,7 @@ def fit_by_least_squares(
         else 0j
     )
     mean_variance_m2 = float(np.var(file_position_m) + np.var(reference_position_m)) / 2.0
-    reference_horizontal_m = reference.horizontal_m
+    reference_horizontal_m = reference.to_complex_m()
 
     # Parameters: origin north, origin east, lag relative to the peak, yaw
     reference_mean_m = reference_position_m.mean()

@@ -76,9 +76,8 @@ class SampledTrack:
     is_valid: BoolArray
     name: str = ""
 
-    @property
-    def horizontal_m(self) -> Complex:
-        """North + i·east, shape (n,)."""
+    def to_complex_m(self) -> Complex:
+        """Return North + i·east, shape (n,)."""
         return self.position_m[:, 0] + 1j * self.position_m[:, 1]
 
     def at(self, time_s: Array) -> tuple[Array, BoolArray]:

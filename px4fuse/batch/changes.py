@@ -8,13 +8,12 @@ from pathlib import Path
 from px4fuse.batch.inputs import InputResults, Progress, Results, read_inputs
 from px4fuse.batch.measures import (
     ABSOLUTE_TOLERANCE,
-    FILTER_LABELS,
     RELATIVE_TOLERANCE,
     ComparedNumber,
     collect_numbers,
 )
 from px4fuse.batch.rows import value_at
-from px4fuse.comparison.model import FilterSummary
+from px4fuse.comparison.model import FILTER_NAMES, FilterSummary
 from px4fuse.comparison.reruns import is_inconsistent
 from px4fuse.core.text import format_factor, format_number
 from px4fuse.filter.settings import SETTING_RANGES, Settings
@@ -185,7 +184,7 @@ def _mean_statistics_by_label(results: Results) -> dict[str, tuple[float, bool]]
     """Return each mean NIS and mean NEES by label, with True for a consistent filter."""
     statistics: dict[str, tuple[float, bool]] = {}
     for axis, result in (value_at(results, "axes") or {}).items():
-        for name, label in FILTER_LABELS.items():
+        for name, label in FILTER_NAMES.items():
             summary = result.filters[name]
             if isinstance(summary, FilterSummary):
                 is_consistent = not is_inconsistent(summary)

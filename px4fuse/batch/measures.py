@@ -9,19 +9,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from px4fuse.batch.rows import read_rows, value_at
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.results.contract import AidsResults, ComparisonResults, Interval
 
-FILTER_LABELS = {"kf": "KF", "ekf2": "EKF2"}
 # Rows of measures.csv; "interval" is the field in the results that contains the 95 % interval
 MEASURES = [
     row
     | {"path": row["path"].replace("FILTER", name), "label": row["label"].replace("FILTER", label)}
     for row in read_rows("measures.csv")
-    for name, label in (FILTER_LABELS.items() if "FILTER" in row["path"] else [("", "")])
+    for name, label in (FILTER_NAMES.items() if "FILTER" in row["path"] else [("", "")])
 ]
 # Maximum relative difference of two numbers that count as equal
 RELATIVE_TOLERANCE = 0.01

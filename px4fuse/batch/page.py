@@ -196,7 +196,7 @@ def _side_sections(log: LogSummary) -> tuple[Section, ...]:
         frame.links_section(
             "Files", [(label, local_link(log.get(name, ""))) for label, name in FILE_LINKS]
         ),
-        frame.pairs_section(
+        frame.name_value_section(
             "Flight", [(name, _format_value(log.get(name, ""))) for name in LOG_COLUMNS]
         ),
     )

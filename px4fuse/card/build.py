@@ -18,7 +18,6 @@ from px4fuse.card.causes import (
     rank_causes,
 )
 from px4fuse.card.model import (
-    FILTER_NAMES,
     MAX_CAUSES,
     MAX_HEADLINE_LENGTH,
     Action,
@@ -27,14 +26,19 @@ from px4fuse.card.model import (
     CardSeverity,
     Cause,
     Effect,
-    FilterName,
     Identity,
     Note,
     Verdict,
 )
 from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.flight_events import MIN_GAP_S
-from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth, north_and_east
+from px4fuse.comparison.model import (
+    FILTER_NAMES,
+    AxisComparison,
+    ErrorsAgainstTruth,
+    FilterName,
+    north_and_east,
+)
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import improvement
 from px4fuse.core.reading import display_name, file_size, read_head
@@ -113,7 +117,7 @@ def build_card(
         analysis.flight.log,
         request,
         student,
-        source=f"{source_name(source)} {source.rate_hz:.1f} Hz",
+        source=f"{source_name(source)} {source.compute_rate_hz():.1f} Hz",
         settings=_settings_text(analysis, request),
         changed=_changed_setting_texts(request),
         parameters=_changed_parameter_texts(analysis),
@@ -319,7 +323,7 @@ def _effect_text(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Ve
 
 
 def _worst_axis_sentences(analysis: Analysis) -> list[str]:
-    results = (analysis.main, *analysis.secondary_axes)
+    results = (analysis.main, *analysis.select_secondary_axes())
     nees_with_results = [
         (truth.nees_position_mean, result, truth.position_rmse_m)
         for result in results

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import FILTER_NAMES, Action, Cause, FilterName, Rerun, Target, Verdict
+from px4fuse.card.model import Action, Cause, Rerun, Target, Verdict
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
+from px4fuse.comparison.model import FILTER_NAMES, FilterName
 from px4fuse.comparison.remedy import different_settings
 from px4fuse.comparison.trials import (
     CLOCK_OFFSET,
@@ -42,7 +43,7 @@ TRUTH_ONLY_CHANGE_KINDS = frozenset({"time offset", "delay", "rotation"})
 REBOOT_PARAMETER_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
 # Minimum fraction of rejected positions that the table of re-runs shows
 MIN_SHOWN_REJECTED_FRACTION = 0.005
-TARGETS_BY_GROUP: Mapping[str, Target] = {
+TARGET_BY_GROUP: Mapping[str, Target] = {
     "position source": "sender",
     "time": "sender",
     "IMU": "flight",
@@ -51,8 +52,8 @@ TARGETS_BY_GROUP: Mapping[str, Target] = {
     "loops": "source",
     "logging": "logging",
 }
-# Devices to be changed, by finding id; exceptions from TARGETS_BY_GROUP
-TARGETS_BY_ID: Mapping[str, Target] = {
+# Devices to be changed, by finding id; exceptions from TARGET_BY_GROUP
+TARGET_BY_ID: Mapping[str, Target] = {
     "source_drift": "source",
     "source_lever_arm": "EKF2",
     "source_coordinate_constant": "EKF2",
@@ -80,7 +81,7 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
     for finding in root_findings:
         if finding.severity == "note":
             continue
-        trials = confirming_trials(analysis.main_trials, finding)
+        trials = confirming_trials(analysis.select_main_trials(), finding)
         if CATALOGUE[finding.id].verdict == "repeated":
             trials = tuple(filter(is_useful, trials))
         elif trials and not any(
@@ -234,7 +235,7 @@ def _make_actions(
     # actions on KF are last: first correct the vehicle
     actions.sort(key=lambda action: action.target == "KF")
     targets = {action.target for group in (actions, *alternatives) for action in group}
-    reason_by_filter = {
+    reason_by_filter: dict[Target, str] = {
         name: reason
         for filter_name, name in FILTER_NAMES.items()
         if name not in targets
@@ -249,16 +250,16 @@ def _make_actions(
 def _no_change_reason(
     finding: Finding, filter_name: FilterName, sigma_verdicts: Sequence[Verdict]
 ) -> str:
-    word_by_reference = {
+    verdict_by_reference = {
         verdict.against: verdict.word
         for verdict in sigma_verdicts
         if verdict.filter == filter_name and verdict.ratio is not None
     }
-    if not word_by_reference:
+    if not verdict_by_reference:
         return ""
-    if set(word_by_reference.values()) == {"consistent"}:
+    if set(verdict_by_reference.values()) == {"consistent"}:
         needs_ground_truth = CATALOGUE[finding.id].reruns & TRUTH_ONLY_CHANGE_KINDS
-        if needs_ground_truth and "truth" not in word_by_reference:
+        if needs_ground_truth and "truth" not in verdict_by_reference:
             return "no change: only ground truth shows this fault, and the log has none"
         return "no change: the reported σ is consistent"
     if finding.id == "source_outliers":
@@ -266,14 +267,14 @@ def _no_change_reason(
             return (
                 "no option of KF rejects outliers, and a larger SIGMA_Z (--sigma-z) only hides them"
             )
-        if word_by_reference.get("truth", "consistent") == "consistent":
+        if verdict_by_reference.get("truth", "consistent") == "consistent":
             return "no change: EKF2's gate rejects outliers, and the reported σ is consistent"
     fault_text = "drift of the source" if finding.id == "source_drift" else "this fault"
     return f"no setting removes {fault_text}"
 
 
 def _target_of(finding: Finding, source: PositionTrack | None = None) -> Target:
-    target = TARGETS_BY_ID.get(finding.id) or TARGETS_BY_GROUP[CATALOGUE[finding.id].group]
+    target = TARGET_BY_ID.get(finding.id) or TARGET_BY_GROUP[CATALOGUE[finding.id].group]
     is_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_receiver else target
 

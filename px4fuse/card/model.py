@@ -6,15 +6,14 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from px4fuse.comparison.model import FilterName
 from px4fuse.comparison.trials import Improvement
 from px4fuse.core.record import Count, NotNegative, Positive, Record, Share, Span
 from px4fuse.filter.consistency import Reference
 
-FilterName = Literal["kf", "ekf2"]
 CardSeverity = Literal["clean", "note", "warning", "error", "refused"]
 VerdictWord = Literal["consistent", "overconfident", "underconfident", "not evaluated"]
 Target = Literal["sender", "receiver", "source", "logging", "flight", "KF", "EKF2", "KF, EKF2"]
-FILTER_NAMES: Mapping[FilterName, Target] = {"kf": "KF", "ekf2": "EKF2"}
 
 # Limits of the logarithmic axis in plots of σ ratios
 RATIO_AXIS_ENDS = (0.1, 10.0)

@@ -6,9 +6,9 @@ against ground truth.
 
 import numpy as np
 
-from px4fuse.card.model import FilterName, Verdict
+from px4fuse.card.model import Verdict
 from px4fuse.comparison.comparison import normalised_position_errors
-from px4fuse.comparison.model import FILTERS, AxisComparison, FilterSummary
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import Reference, classify_sigma_ratio, sigma_ratio_interval
 from px4fuse.flight.model import Unavailable
@@ -24,7 +24,7 @@ def make_sigma_verdicts(result: AxisComparison) -> tuple[Verdict, ...]:
     """Evaluate the consistency of KF and EKF2 along one axis, from innovations and from errors."""
     return tuple(
         judge(result, filter_name)
-        for filter_name in FILTERS
+        for filter_name in FILTER_NAMES
         for judge in (_verdict_against_source, _verdict_against_truth)
     )
 

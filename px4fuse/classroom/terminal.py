@@ -50,31 +50,31 @@ def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count:
 def grading_page(outcome: GradeOutcome) -> Page:
     """Format a table of the students with their points, and the reasons for pending points."""
     page, rows = Page(), []
-    for entry in outcome.entries:
-        report = entry.counted_report
-        pending_text = ", pending" if report and entry.total is None else ""
+    for grade in outcome.grades:
+        report = grade.counted_report
+        pending_text = ", pending" if report and grade.total is None else ""
         status = report.status + pending_text if report else "missing"
         status_colour = GOOD_COLOUR if status == "verified" else SEVERITY_COLOURS["warning"]
-        points_text = "–" if entry.total is None else f"{entry.total:g}"
-        points_text += f" / {entry.max_points:g}"
-        name = one_line(entry.student or entry.student_id, 60)
-        file_name, flag_count = report.submission if report else "", f"{len(entry.flags) or ''}"
+        points_text = "–" if grade.total is None else f"{grade.total:g}"
+        points_text += f" / {grade.max_points:g}"
+        name = one_line(grade.student or grade.student_id, 60)
+        file_name, flag_count = report.submission if report else "", f"{len(grade.flags) or ''}"
         rows.append((name, file_name, (status, status_colour), points_text, flag_count))
     page.table(
         ("student", "submission", "status", "points", "flags"), rows, right_aligned_columns=(3, 4)
     )
     counts = Counter(report.status for report in outcome.reports)
     counts_text = ", ".join(f"{count} {status}" for status, count in counts.most_common())
-    missing_count = sum(entry.counted_report is None for entry in outcome.entries)
+    missing_count = sum(grade.counted_report is None for grade in outcome.grades)
     page.write(
         f"{len(outcome.reports)} submissions: {counts_text or 'none'}; no submission from "
-        f"{missing_count} of {len(outcome.entries)} students; verified in an earlier run: "
+        f"{missing_count} of {len(outcome.grades)} students; verified in an earlier run: "
         f"{outcome.reused_count} submissions"
     )
-    for entry in outcome.entries:
-        report = entry.counted_report
-        if report is not None and entry.total is None:
-            name = one_line(entry.display_name, 60)
+    for grade in outcome.grades:
+        report = grade.counted_report
+        if report is not None and grade.total is None:
+            name = one_line(grade.display_name, 60)
             page.write(f"{name}: {report.pending_reason}", colour=MUTED_COLOUR)
     for note in outcome.notes:
         page.write(note, colour=MUTED_COLOUR)

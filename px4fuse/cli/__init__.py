@@ -16,7 +16,7 @@ import click
 
 from px4fuse.cli.outputs import Interrupted, written_files_sentence
 from px4fuse.core.input_files import inputs_protected
-from px4fuse.core.threads import ONE_THREAD
+from px4fuse.core.threads import ONE_THREAD_ENVIRONMENT
 from px4fuse.errors import OutputError, Px4FuseError, SettingsError, suggest_name, to_one_line
 
 # Commands in the order of --help; command NAME is the function NAME in cli/NAME.py
@@ -199,7 +199,7 @@ def main() -> None:
 
 
 def _prepare_libraries() -> None:
-    for name, value in ONE_THREAD.items():
+    for name, value in ONE_THREAD_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     for name in IGNORED_VARIABLES:
         os.environ.pop(name, None)

@@ -65,7 +65,7 @@ _loop_option = partial(options.request_option, LoopRequest)
 )
 @options.flag_option(
     "--open",
-    "opened",
+    "is_open_path",
     help="Do not use the landing as a loop closure, because the vehicle did not return to the "
     "take-off place.",
 )
@@ -178,7 +178,7 @@ def loop(
 def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
     del option_values["robust"]
     return LoopRequest(
-        source=str(source), closed_loop=not option_values.pop("opened"), **option_values
+        source=str(source), closed_loop=not option_values.pop("is_open_path"), **option_values
     )
 
 
@@ -190,7 +190,7 @@ def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict
 
     contents = {}
     if tum is not None:
-        best_path = loop_result.best
+        best_path = loop_result.choose_best_path()
         if best_path is loop_result.odometry:
             raise MissingDataError(
                 f"--tum {display_name(tum)}: the path is not corrected, as no loop closure was "

@@ -20,7 +20,7 @@ from px4fuse.cli.outputs import check_targets, progress, write_and_print
 from px4fuse.core.input_files import check_output_folder
 from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, SettingsError
-from px4fuse.simulation.mistakes import MISTAKES, parse_mistakes
+from px4fuse.simulation.faults import FAULT_TYPES, parse_faults
 from px4fuse.simulation.scenario import (
     DEFAULTS_OF_KIND,
     Scenario,
@@ -74,7 +74,7 @@ class CommandWithFaultTable(click.Command):
                         f"{name}{mistake.usage}",
                         mistake.help + (f" [{mistake.default:g}]" if mistake.size_fields else ""),
                     )
-                    for name, mistake in MISTAKES.items()
+                    for name, mistake in FAULT_TYPES.items()
                 ]
             )
 
@@ -181,7 +181,7 @@ def simulate(
     if output.suffix.lower() != ".ulg":
         raise OutputError(f"{output}: the output is a ULog. Give a name ending in .ulg (-o).")
     check_targets([output, answer])
-    mistake_sizes = parse_mistakes(mistake)
+    mistake_sizes = parse_faults(mistake)
     scenario = make_scenario(
         kind,
         truth=not no_truth,
@@ -242,7 +242,7 @@ def _write_assignment(
     secret: bytes | None,
     scenario_kind: Any,
     fault_count: int | None,
-    logs_truth: bool,
+    with_ground_truth: bool,
 ) -> None:
     from px4fuse.classroom.assignment import assignment
     from px4fuse.classroom.assignment.roster import read_roster
@@ -260,7 +260,7 @@ def _write_assignment(
             secret,
             scenario_kind,
             fault_count,
-            logs_truth,
+            with_ground_truth,
             partial(show_progress, "simulating"),
         )
     write_and_print({}, assignment_page(key, folder, answer_key_path, written_count))

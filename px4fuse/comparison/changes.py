@@ -42,7 +42,8 @@ KF_KINDS = {
     FORWARD_BIAS: "bias",
     RIGHT_BIAS: "bias",
 }
-KF_NOISES = frozenset((SIGMA_A, SIGMA_Z))
+# Changes of KF's settings; all other changes correct the data
+SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
 # EKF2 is re-run with a larger EKF2_ACC_NOISE if the estimated SIGMA_A exceeds it by this factor. A
 # smaller factor may be due to tilt errors and biases, which SIGMA_A includes
@@ -123,7 +124,7 @@ def main_axis_changes(
         has_delay = any(ekf2_inputs.aid.delay in change for change in changes)
         offset_changes = _time_offset_changes(estimates, ekf2_inputs) if has_delay else []
         return unique_changes([*changes, *offset_changes])
-    noise_changes = [change for change in changes if change.keys() <= KF_NOISES]
+    noise_changes = [change for change in changes if change.keys() <= SETTING_CHANGES]
     if len(noise_changes) > 1:
         changes.append({name: value for change in noise_changes for name, value in change.items()})
     defaults = default_settings(comparison)
@@ -210,7 +211,7 @@ def _kf_noise_changes(
 
 def _bias_changes(estimates: Estimates) -> list[Change]:
     systematic_errors = estimates.systematic_errors
-    if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_bias:
+    if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_significant_bias():
         return []
     biases = {
         FORWARD_BIAS: systematic_errors.forward_bias,

@@ -106,7 +106,9 @@ def _compare_axis(
         replay=kf_run,
         ekf2_innovations=innovations,
         **tracks,
-        flight_tracks=project_tracks(ekf2, flight.truth, axis, segment.flight),
+        flight_tracks=tracks
+        if segment.flight_s in (None, (segment.start_s, segment.end_s))
+        else project_tracks(ekf2, flight.truth, axis, segment.flight),
     )
 
 

@@ -5,7 +5,6 @@ cubic polynomial through its four neighbours, which removes the motion. Slow err
 differences from ground truth, without constant, scale factor, rotation and time offset.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -76,8 +75,11 @@ MIN_AMPLITUDE_SIGMAS = 1.0
 MIN_PERIODS = 5.0
 # Maximum tested frequency (Hz) of a sinusoidal error
 MAX_FREQUENCY_HZ = 2.0
-# A sinusoidal error is not reported if the motion contains more than this fraction of its mean
-# square at the frequency of the error
+# Distance of the tested frequencies, in periods in the flight
+FREQUENCY_STEP_PERIODS = 0.2
+# Minimum number of bins per period of the highest frequency: an amplitude is wrong by 0.2 %
+MIN_BINS_PER_PERIOD = 30
+# Maximum fraction of the mean square motion at the frequency of a sinusoidal error
 MAX_MOTION_FRACTION = 0.1
 # Interval and maximum (s) of the tested delays of the logged attitude
 DELAY_STEP_S, MAX_ATTITUDE_DELAY_S = 0.01, 0.5
@@ -139,9 +141,8 @@ class ErrorFit(NamedTuple):
     scale: float
     scale_sigma: float
 
-    @property
-    def slow_square_m2(self) -> float:
-        """Mean square (m²) of the remaining error without white noise, summed over both axes."""
+    def compute_slow_square_m2(self) -> float:
+        """Return the mean square (m²) of the remaining error of both axes, without white noise."""
         return float(np.mean(self.remaining_m**2, axis=0).sum()) - 2.0 * self.white_m**2
 
 
@@ -191,17 +192,19 @@ def white_errors(comparison: Comparison) -> WhiteErrors | None:
     )
     weights = np.ones_like(elapsed_s)  # of Lagrange's interpolation at the time of the position
     for row in range(len(NEIGHBOURS)):
-        for other in set(range(len(NEIGHBOURS))) - {row}:
-            weights[:, row] *= elapsed_s[:, other] / (elapsed_s[:, other] - elapsed_s[:, row])
+        for other_row in set(range(len(NEIGHBOURS))) - {row}:
+            other_s = elapsed_s[:, other_row]
+            weights[:, row] *= other_s / (other_s - elapsed_s[:, row])
     noise_gain = np.sqrt(1.0 + np.sum(weights**2, axis=1))
     phase_s = time_s - interval_s * np.arange(len(time_s))
     late_s = phase_s - median_filter(phase_s, MEDIAN_TIMESTAMP_COUNT, mode="nearest")
     half_window_rows = max(2, round(HALF_VELOCITY_S / interval_s))
-    first, last = (
+    first_row, last_row = (
         np.clip(rows - half_window_rows, 0, None),
         np.clip(rows + half_window_rows, None, len(time_s) - 1),
     )
-    velocity_m_s = (position_m[last] - position_m[first]) / (time_s[last] - time_s[first])[:, None]
+    travelled_m = position_m[last_row] - position_m[first_row]
+    velocity_m_s = travelled_m / (time_s[last_row] - time_s[first_row])[:, None]
     is_accurate = noise_gain < MAX_RESIDUAL_NOISE_GAIN
 
     def residual(values: Array) -> Array:
@@ -350,20 +353,29 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     """
     duration_s = fit.time_s[-1] - fit.time_s[0]
     highest_hz = min(MAX_FREQUENCY_HZ, 0.25 / float(np.median(np.diff(fit.time_s))))
-    frequencies_hz = np.arange(MIN_PERIODS / duration_s, highest_hz, 0.2 / duration_s)
-    if not len(frequencies_hz) or fit.slow_square_m2 <= 0.0:
+    step_hz = FREQUENCY_STEP_PERIODS / duration_s
+    rows = slice(round(MIN_PERIODS / FREQUENCY_STEP_PERIODS), int(np.ceil(highest_hz / step_hz)))
+    if rows.stop <= rows.start or fit.compute_slow_square_m2() <= 0.0:
         return None
+    # errors in bins of equal length have the spectrum of all frequencies in one FFT
+    bin_count = 2 ** int(np.ceil(np.log2(MIN_BINS_PER_PERIOD * highest_hz / step_hz)))
+    bins = np.rint((fit.time_s - fit.time_s[0]) * step_hz * bin_count).astype(int)
+    spectrum = np.fft.rfft([np.bincount(bins, error, bin_count) for error in fit.remaining_m.T])
+    powers = np.sum(np.abs(spectrum[:, rows]) ** 2, axis=0)
+    frequency_hz = float(step_hz * (rows.start + np.argmax(powers)))
 
     def mean_squares(values: Array, frequency_hz: float) -> float:
         wave = np.exp(-2j * np.pi * frequency_hz * fit.time_s)
         return 2.0 * float(np.sum(np.abs(wave @ values / len(values)) ** 2))
 
-    frequency_hz = float(max(frequencies_hz, key=partial(mean_squares, fit.remaining_m)))
     square_m2 = mean_squares(fit.remaining_m, frequency_hz)
     motion_fraction = mean_squares(fit.path_m, frequency_hz) / np.mean(
         np.sum(fit.path_m**2, axis=1)
     )
-    amplitude_m, fraction = float(np.sqrt(2.0 * square_m2)), square_m2 / fit.slow_square_m2
+    amplitude_m, fraction = (
+        float(np.sqrt(2.0 * square_m2)),
+        square_m2 / fit.compute_slow_square_m2(),
+    )
     if (
         fraction < MIN_PERIODIC_FRACTION
         or amplitude_m < MIN_AMPLITUDE_SIGMAS * fit.white_m
@@ -385,19 +397,27 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     moving_parts = np.flatnonzero(square_speeds > MIN_OFFSET_SPEED_M_S**2)
     if len(moving_parts) < 2:
         return None
-    is_in_part = parts[:, None] == moving_parts
-    offset_columns = -fit.velocity_m_s[:, :, None] * is_in_part[:, None, :]
-    constant_columns = fit.columns[..., :-1]  # the last column is the constant time offset
-    parameters, remaining_m = _least_squares(
-        np.concatenate([constant_columns, offset_columns], axis=-1),
-        fit.remaining_m,
-    )
-    offsets_s = parameters[constant_columns.shape[-1] :]
+    # a time offset has an effect in its part only: it is eliminated there, before the constants
+    effect = -fit.velocity_m_s
+    inverse_squares = np.zeros_like(square_sums)
+    inverse_squares[moving_parts] = 1.0 / square_sums[moving_parts]
+
+    def fit_offsets(values: Array) -> Array:
+        sums = np.zeros((len(inverse_squares), values.shape[-1]))
+        np.add.at(sums, parts, np.einsum("na,nak->nk", effect, values))
+        return sums * inverse_squares[:, None]
+
+    # the constants without the constant time offset, and the error
+    columns = np.concatenate([fit.columns[..., :-1], fit.remaining_m[..., None]], axis=-1)
+    offsets_of_columns_s = fit_offsets(columns)
+    columns -= effect[:, :, None] * offsets_of_columns_s[parts, None]
+    parameters, remaining_m = _least_squares(columns[..., :-1], columns[..., -1])
+    offsets_s = (offsets_of_columns_s @ np.append(-parameters, 1.0))[moving_parts]
     remaining_square_m2 = float(np.mean(remaining_m**2, axis=0).sum()) - 2.0 * fit.white_m**2
     if (
         np.ptp(offsets_s) < MIN_OFFSET_RANGE_S
-        or fit.slow_square_m2 < MIN_SLOW_RATIO * 2.0 * fit.white_m**2
-        or remaining_square_m2 > MAX_REMAINING_FRACTION * fit.slow_square_m2
+        or fit.compute_slow_square_m2() < MIN_SLOW_RATIO * 2.0 * fit.white_m**2
+        or remaining_square_m2 > MAX_REMAINING_FRACTION * fit.compute_slow_square_m2()
     ):
         return None
     times_s = fit.time_s[0] + OFFSET_PART_S * (moving_parts + 0.5)

@@ -70,7 +70,7 @@ def collect_events(comparison: Comparison) -> Events:
     flight_edges_s = [start_s, *(edge_s for span in airborne for edge_s in span), end_s]
     resets = flight.ekf2.resets if isinstance(flight.ekf2, Ekf2) else ()
     return Events(
-        gaps=source_gaps(time_s, comparison.source.rate_hz),
+        gaps=source_gaps(time_s, comparison.source.compute_rate_hz()),
         dropouts=segment.cut(
             (dropout.start_s, dropout.start_s + dropout.duration_s)
             for dropout in flight.log.dropouts

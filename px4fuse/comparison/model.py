@@ -31,7 +31,7 @@ from px4fuse.flight.model import Flight, PositionTrack
 
 FilterName = Literal["kf", "ekf2"]
 Track: TypeAlias = pd.DataFrame | Unavailable
-FILTERS: tuple[FilterName, FilterName] = ("kf", "ekf2")
+FILTER_NAMES: Mapping[FilterName, Literal["KF", "EKF2"]] = {"kf": "KF", "ekf2": "EKF2"}
 
 
 class ErrorsAgainstTruth(Record, kw_only=True):
@@ -147,9 +147,8 @@ class AxisComparison(Record, kw_only=True):
     truth: NotWritten[Track] = NOT_WRITTEN
     flight_tracks: NotWritten[Mapping[str, Track]] = NOT_WRITTEN
 
-    @property
-    def in_flight(self) -> "AxisComparison":
-        """Comparison with tracks of the whole flight instead of the analysed segment, for plots."""
+    def with_flight_tracks(self) -> "AxisComparison":
+        """Return the result with tracks of the whole flight instead of the segment, for plots."""
         return structs.replace(self, **self.flight_tracks)
 
 

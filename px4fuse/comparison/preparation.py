@@ -36,7 +36,7 @@ from px4fuse.readers.px4_innovations import (
     with_gnss_innovations,
 )
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
-from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME
+from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME, SOURCE_TRACKS
 from px4fuse.request import ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
@@ -44,6 +44,7 @@ from px4fuse.trajectory.rotation import interpolate, to_matrix
 LOGGED_ORIGINS = ORIGIN_BY_TRACK_NAME | {
     source.track_name: source.origin for source in POSITION_INPUTS
 }
+POSITION_MESSAGES = dict.fromkeys(source.message for source in POSITION_INPUTS)
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
     "KF uses the only ground truth in the log as its position source",
@@ -276,13 +277,13 @@ def _use_barometer_height(
 def explain_missing_source(flight: Flight) -> Unavailable:
     """Return the reason why the log has no position source, and the action for the user."""
     damage_text = "the file is damaged, and " if flight.log.damage else ""
-    topics = "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision"
+    topics = f"{', '.join(SOURCE_TRACKS)} or EKF2 innovations of external vision"
     remedy = (
         "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as VISION_POSITION_ESTIMATE, or "
         "give the position file with --position."
     )
     if flight.log.format.startswith("MAVLink"):
-        topics = "VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP"
+        topics = " or ".join(POSITION_MESSAGES)
         ulog_text = ", or read the ULog of this flight" if flight.log.has_ulog else ""
         remedy = (
             f"give the position file of the positioning system as argument `position`{ulog_text}."
@@ -316,7 +317,8 @@ def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
         missing.source
         for missing in flight.missing
         if missing.source in LOGGED_ORIGINS
-        and LOGGED_ORIGINS[missing.source].preference_rank < track.origin.preference_rank
+        and LOGGED_ORIGINS[missing.source].find_preference_rank()
+        < track.origin.find_preference_rank()
     ]
     if not better_sources:
         return f"chosen automatically: positions as received by PX4{origin_text}"
@@ -356,19 +358,21 @@ def choose_segment(
     elif not flight.airborne:
         reason = "whole duration of the position source (the vehicle stayed on the ground)"
     else:
-        flights = join_flights(flight.airborne)
+        flight_spans_s = join_flights(flight.airborne)
         chosen_start_s, chosen_end_s = max(
-            flights,
+            flight_spans_s,
             key=lambda span: min(span[1], available_end_s) - max(span[0], available_start_s),
         )
         reason = "positions available and vehicle airborne"
-        if len(flights) > 1:
+        if len(flight_spans_s) > 1:
             others_text = ", ".join(
                 f"{start_s:.1f} to {end_s:.1f} s (--start {start_s:.1f} --end {end_s:.1f})"
-                for start_s, end_s in flights
+                for start_s, end_s in flight_spans_s
                 if start_s != chosen_start_s
             )
-            reason += f"; this is the longest of {len(flights)} flights; the others: {others_text}"
+            reason += (
+                f"; this is the longest of {len(flight_spans_s)} flights; the others: {others_text}"
+            )
         if not max(chosen_start_s, available_start_s) < min(chosen_end_s, available_end_s):
             chosen_start_s = min(chosen_start_s, available_start_s)
             chosen_end_s = max(chosen_end_s, available_end_s)

@@ -119,7 +119,9 @@ def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
     """Project positions, velocities and variances onto an axis."""
     rows = cut_to_segment(frame, segment)
     available_columns = {
-        name: part for name, part in PROJECTED_COLUMNS.items() if part[0][0] in frame
+        name: (columns, exponent)
+        for name, (columns, exponent) in PROJECTED_COLUMNS.items()
+        if columns[0] in frame
     }
     projected = {
         name: weighted_sum(rows, columns, axis.direction**exponent)

@@ -37,7 +37,7 @@ def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
     nis_sums = []
     for replay in replay_settings(model, [{GNSS_POS.delay: delay} for delay in GNSS_DELAYS_MS]):
         update_tables = [
-            rows_inside(updates, model.baseline_replay.evaluated_s)
+            rows_inside(updates, model.baseline_replay.find_evaluated_spans())
             for updates in (replay.updates, replay.other_aid_updates[GNSS_VEL.name])
         ]
         nis = [

@@ -254,7 +254,7 @@ def _try_changes(
             after=after,
             from_s=None
             if tested_filter.model is None
-            else tested_filter.model.baseline_replay.evaluated_s[0][0],
+            else tested_filter.model.baseline_replay.find_evaluated_spans()[0][0],
         )
 
     trials = [make_trial(change, discrepancies) for change, discrepancies in changes]
@@ -277,7 +277,7 @@ def _unchanged_statistics(
     innovations = axis_result.ekf2_innovations
     if isinstance(logged_state, Unavailable) or isinstance(innovations, Unavailable):
         return replayed_statistics, False
-    compared_s = tested_filter.model.baseline_replay.evaluated_s
+    compared_s = tested_filter.model.baseline_replay.find_evaluated_spans()
     compared_state = rows_inside(logged_state, compared_s)
     innovations = rows_inside(innovations, compared_s)
     rejected_flags = innovations["rejected"].dropna()
@@ -412,7 +412,7 @@ def _replay_statistics(
     axis_result: AxisComparison,
     change: Change,
 ) -> RunStatistics:
-    compared_s, axis = model.baseline_replay.evaluated_s, axis_result.axis
+    compared_s, axis = model.baseline_replay.find_evaluated_spans(), axis_result.axis
     if ROTATION in change and comparison.source.origin.is_gnss:
         # The rotation of GNSS positions also rotates EKF2's heading, so the axis is rotated back
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))

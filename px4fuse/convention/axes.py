@@ -320,15 +320,18 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
 
 
 def refine_hypothesis(
-    start: Hypothesis, positions: SentPositions, source_motion: SourceMotion, imu_motion: ImuMotion
+    initial_hypothesis: Hypothesis,
+    positions: SentPositions,
+    source_motion: SourceMotion,
+    imu_motion: ImuMotion,
 ) -> Hypothesis:
     """Refine the parameters of a hypothesis by robust least squares (Gauss-Newton)."""
     rows = np.flatnonzero(source_motion.is_valid)
     rows = rows[:: max(1, len(rows) // MAX_REFINEMENT_ROWS)]
-    best, parameters = replace(start, score=-np.inf), start.parameters
+    best, parameters = replace(initial_hypothesis, score=-np.inf), initial_hypothesis.parameters
     for _ in range(REFINEMENT_ITERATIONS):
         hypothesis, step = _evaluate_hypothesis(
-            replace(start, parameters=parameters), rows, source_motion, imu_motion
+            replace(initial_hypothesis, parameters=parameters), rows, source_motion, imu_motion
         )
         if hypothesis.score > best.score:
             best = hypothesis
@@ -457,8 +460,8 @@ def _log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float:
     if hypothesis.has_rotation:
         # Bayesian information criterion: one more estimated parameter costs ½ ln n
         log_odds -= 0.5 * float(np.log(max(hypothesis.independent_count, 2.0)))
-        is_large = abs(hypothesis.remainder_rad) > SMALL_ROTATION_RAD
-        log_odds += ROTATION_LOG_ODDS if is_large else SMALL_ROTATION_LOG_ODDS
+        is_large_rotation = abs(hypothesis.remainder_rad) > SMALL_ROTATION_RAD
+        log_odds += ROTATION_LOG_ODDS if is_large_rotation else SMALL_ROTATION_LOG_ODDS
     if positions.barometer is not None:
         log_odds += _height_log_likelihood(hypothesis, positions, *positions.barometer)
     return log_odds

@@ -24,7 +24,7 @@ from px4fuse.convention.model import (
 from px4fuse.convention.motion import (
     DIFFERENCE_WINDOW_S,
     ImuMotion,
-    Inertial,
+    InertialData,
     motion_from_imu,
     read_inertial,
     replace_heading,
@@ -81,12 +81,13 @@ def check_convention(
     -------
     Convention, or None without IMU data, attitude or enough motion at the same time.
     """
-    inertial = read_inertial(flight)
-    if inertial is None:
+    inertial_data = read_inertial(flight)
+    if inertial_data is None:
         return None
     positions = _read_positions(flight, track, max_offset_s)
     motions = {
-        name: motion_from_imu(inertial, attitude) for name, attitude in inertial.attitudes.items()
+        name: motion_from_imu(inertial_data, attitude)
+        for name, attitude in inertial_data.compute_attitudes().items()
     }
     hypotheses = _rank_hypotheses(positions, motions)
     if not hypotheses:
@@ -104,7 +105,9 @@ def check_convention(
     convention = _choose_convention(hypotheses, positions, clock_drift)
     if track.orientation is None:
         return convention
-    orientation = _check_orientation(inertial, track, positions, hypotheses[0], convention.verdict)
+    orientation = _check_orientation(
+        inertial_data, track, positions, hypotheses[0], convention.verdict
+    )
     return structs.replace(convention, orientation=orientation)
 
 
@@ -255,7 +258,7 @@ def _clock_drift(
 
 
 def _check_orientation(
-    inertial: Inertial,
+    inertial_data: InertialData,
     track: PositionTrack,
     positions: SentPositions,
     best_hypothesis: Hypothesis,
@@ -265,22 +268,22 @@ def _check_orientation(
     assert track.orientation is not None
     quaternions = track.orientation[Columns.QUATERNION].to_numpy()
     checked_orientation = check_orientation(
-        inertial, track.orientation.index.to_numpy(), quaternions
+        inertial_data, track.orientation.index.to_numpy(), quaternions
     )
     if checked_orientation is None:
         return None
     convention, time_s, attitude = checked_orientation
-    is_convention_known = (
-        convention.verdict in ("determined", "ambiguous") and verdict == "determined"
-    )
     if (
-        not is_convention_known
+        verdict != "determined"
+        or convention.verdict not in ("determined", "ambiguous")
         or best_hypothesis.assignment.vertical_axis != 2
         or best_hypothesis.assignment.is_mirrored
     ):
         return convention
-    source_heading = np.interp(inertial.time_s, time_s, heading(attitude))
-    imu_motion = motion_from_imu(inertial, replace_heading(inertial.gyro_attitude, source_heading))
+    source_heading = np.interp(inertial_data.time_s, time_s, heading(attitude))
+    imu_motion = motion_from_imu(
+        inertial_data, replace_heading(inertial_data.gyro_attitude, source_heading)
+    )
     is_covered = (imu_motion.time_s > time_s[0] + DIFFERENCE_WINDOW_S) & (
         imu_motion.time_s < time_s[-1] - DIFFERENCE_WINDOW_S
     )

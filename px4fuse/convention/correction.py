@@ -1,4 +1,4 @@
-"""Faults in the convention of a position source, and the conversion to PX4's convention."""
+"""Deviations of a source from PX4's convention (axes, unit, clock), and their correction."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -143,9 +143,11 @@ def _axes_and_rotation(convention: Convention) -> tuple[bool, float]:
     is_known_frame = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
     if convention.is_mirrored or is_known_frame or convention.z not in ("up", "down"):
         return True, rotation_deg * (abs(rotation_deg) > MIN_REMAINDER_DEG)
-    total_deg = rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x) + 90.0 * is_up
-    total_deg = (total_deg + 180.0) % 360.0 - 180.0
-    return is_up, total_deg * (abs(total_deg) > MIN_ROTATION_DEG)
+    total_rotation_deg = (
+        rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x) + 90.0 * is_up
+    )
+    total_rotation_deg = (total_rotation_deg + 180.0) % 360.0 - 180.0
+    return is_up, total_rotation_deg * (abs(total_rotation_deg) > MIN_ROTATION_DEG)
 
 
 def _orientation_fault(convention: Convention) -> OrientationFault:
@@ -191,15 +193,15 @@ def correct_convention(
         orientation = orientation.set_axis(_corrected_times(orientation.index, faults))
         orientation[Columns.QUATERNION] = to_attitude(quaternion, convention.orientation)
     track = replace(track, samples=samples, orientation=orientation, origin=origin)
-    inertial = read_inertial(flight) if faults.affects_ekf2 else None
-    if inertial is None:
+    inertial_data = read_inertial(flight) if faults.affects_ekf2 else None
+    if inertial_data is None:
         return flight, track
-    attitude = inertial.attitudes[convention.heading_from]
+    attitude = inertial_data.compute_attitudes()[convention.heading_from]
     # the axes of the positions are correct, so the attitude is rotated to their north direction
     if not faults.has_wrong_axes and not faults.rotation_deg:
         turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x)
         attitude = replace_heading(attitude, heading(attitude) + np.radians(turn_deg))
-    attitude_table = pd.DataFrame(attitude, time_index(inertial.time_s), Columns.QUATERNION)
+    attitude_table = pd.DataFrame(attitude, time_index(inertial_data.time_s), Columns.QUATERNION)
     return replace(flight, attitude=attitude_table), track
 
 

@@ -102,15 +102,15 @@ def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverAr
 
 
 def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
-    inertial = read_inertial(flight)
+    inertial_data = read_inertial(flight)
     position_samples = track.samples[Columns.POSITION[:2]].dropna()
-    if inertial is None or len(position_samples) < 2:
+    if inertial_data is None or len(position_samples) < 2:
         return None
-    attitude = inertial.attitudes["EKF2"]
-    imu_motion = motion_from_imu(inertial, attitude)
+    attitude = inertial_data.compute_attitudes()["EKF2"]
+    imu_motion = motion_from_imu(inertial_data, attitude)
     rotation = to_matrix(attitude)[:, :2, :2].reshape(-1, 4)
     arm_differences = SourceMotion.of(
-        inertial.time_s, rotation, imu_motion.time_s
+        inertial_data.time_s, rotation, imu_motion.time_s
     ).second_differences.reshape(-1, 2, 2)
     design = np.concatenate(
         [arm_differences, imu_motion.rate_m_s[:, :2, None], imu_motion.table[:, :2, 1:]], axis=2

@@ -49,7 +49,7 @@ MIN_GAP_S = 0.35
 
 
 @dataclass(frozen=True)
-class Inertial:
+class InertialData:
     """Specific force and attitude at a constant interval ``INTEGRATION_STEP_S``.
 
     Attributes
@@ -71,9 +71,8 @@ class Inertial:
     gyro_attitude: Array
     valid_spans_s: tuple[tuple[float, float], ...]
 
-    @property
-    def attitudes(self) -> dict[HeadingSource, Array]:
-        """Attitudes with tilt from the gyroscopes, and heading from EKF2 or the gyroscopes."""
+    def compute_attitudes(self) -> dict[HeadingSource, Array]:
+        """Return the attitudes with tilt from the gyroscopes, by source of the heading."""
         return {
             "EKF2": replace_heading(self.gyro_attitude, heading(self.logged_attitude)),
             "gyroscopes": self.gyro_attitude,
@@ -127,7 +126,7 @@ class ImuMotion:
     rate_m_s: Array
 
 
-def read_inertial(flight: Flight) -> Inertial | None:
+def read_inertial(flight: Flight) -> InertialData | None:
     """Integrate the gyroscopes of a flight to an attitude without EKF2's corrections.
 
     Return None if IMU data and attitude overlap for less than 8 s.
@@ -159,7 +158,7 @@ def read_inertial(flight: Flight) -> Inertial | None:
         for recorded_from_s, recorded_until_s in recorded_spans_s
         for flight_start_s, flight_end_s in airborne
     )
-    return Inertial(
+    return InertialData(
         time_s,
         force_m_s2,
         logged_attitude,
@@ -227,7 +226,7 @@ def second_difference(position: Array, window: int) -> Array:
     return position[2 * window :] - 2.0 * position[window:-window] + position[: -2 * window]
 
 
-def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
+def motion_from_imu(inertial_data: InertialData, attitude: Array) -> ImuMotion:
     """Integrate the specific force twice to second differences of the position in NED.
 
     ``attitude``, shape (n + 1, 4), is a quaternion (w, x, y, z; FRD to NED).
@@ -236,7 +235,7 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
     body_to_ned = to_matrix(
         middle_attitude / np.linalg.norm(middle_attitude, axis=1, keepdims=True)
     )
-    acceleration = body_to_ned @ inertial.force_m_s2[..., None] + [[0.0], [0.0], [constants.g]]
+    acceleration = body_to_ned @ inertial_data.force_m_s2[..., None] + [[0.0], [0.0], [constants.g]]
     table = np.concatenate([acceleration, body_to_ned], axis=2)
     position_m = np.zeros((len(attitude), 3, 4))
     velocity_m_s = np.cumsum(table, axis=0) * INTEGRATION_STEP_S
@@ -248,10 +247,10 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
     window_steps = round(DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S)
     stride = round(GRID_INTERVAL_S / INTEGRATION_STEP_S)
     second_differences = second_difference(position_m, window_steps)[::stride]
-    time_s = inertial.time_s[window_steps:-window_steps][::stride]
+    time_s = inertial_data.time_s[window_steps:-window_steps][::stride]
     # second differences within T of an IMU gap are invalid
-    is_valid = inside_spans(time_s, inertial.valid_spans_s)
-    for (_, end), (start, _) in pairwise(inertial.valid_spans_s):
+    is_valid = inside_spans(time_s, inertial_data.valid_spans_s)
+    for (_, end), (start, _) in pairwise(inertial_data.valid_spans_s):
         is_valid &= (time_s < end - DIFFERENCE_WINDOW_S) | (time_s > start + DIFFERENCE_WINDOW_S)
     filtered = high_pass(second_differences, is_valid)
     return ImuMotion(

@@ -11,7 +11,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from px4fuse.convention.model import BodyAndWorldFrame, OrientationConvention, QuaternionOrder
-from px4fuse.convention.motion import Inertial
+from px4fuse.convention.motion import InertialData
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.replay import inside_spans
 from px4fuse.trajectory.rotation import from_vector, heading, interpolate, multiply, to_matrix
@@ -60,30 +60,40 @@ class Candidate(NamedTuple):
 
     @property
     def order_and_frames(self) -> tuple[str, str]:
-        """Order and frames of the quaternion; ENU as NWU, because both differ only in heading."""
+        """Quaternion order and frames; ENU is replaced by NWU, which differs only in heading."""
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
 
 def check_orientation(
-    inertial: Inertial, time_s: Array, quaternion: Array
+    inertial_data: InertialData, time_s: Array, quaternion: Array
 ) -> tuple[OrientationConvention, Array, Array] | None:
-    """Determine quaternion order and frames of a source's orientation; None with few samples.
+    """Determine quaternion order and frames of a source's orientation (``quaternion`` as sent).
 
-    Return the convention without ``heading_error_deg``, at most MAX_SAMPLES of the times in flight,
-    and the attitudes (FRD to NED) at these times. ``quaternion``, shape (n, 4), is as sent.
+    Returns
+    -------
+    convention : OrientationConvention
+        Without ``heading_error_deg``.
+    time_s : ndarray, shape (m,)
+        Times in flight, at most MAX_SAMPLES.
+    attitude : ndarray, shape (m, 4)
+        FRD to NED.
+
+    The result is None for fewer than MIN_SAMPLES orientations.
     """
-    flight_rows = np.flatnonzero(inside_spans(time_s, inertial.valid_spans_s))
+    flight_rows = np.flatnonzero(inside_spans(time_s, inertial_data.valid_spans_s))
     if len(flight_rows) < MIN_SAMPLES:
         return None
     flight_rows = flight_rows[:: -(-len(flight_rows) // MAX_SAMPLES)]
     sample_s, sent_quaternions = time_s[flight_rows], quaternion[flight_rows]
     sent_quaternions = sent_quaternions / np.linalg.norm(sent_quaternions, axis=1, keepdims=True)
     for delay_s in COPY_DELAYS_S:
-        logged_attitude = interpolate(sample_s - delay_s, inertial.time_s, inertial.logged_attitude)
+        logged_attitude = interpolate(
+            sample_s - delay_s, inertial_data.time_s, inertial_data.logged_attitude
+        )
         cosine = np.clip(np.abs(np.sum(sent_quaternions * logged_attitude, axis=1)), 0.0, 1.0)
         if np.median(2.0 * np.arccos(cosine)) < np.radians(MAX_COPY_DIFFERENCE_DEG):
             return OrientationConvention(verdict="copied"), sample_s, sent_quaternions
-    reference_attitude = interpolate(sample_s, inertial.time_s, inertial.gyro_attitude)
+    reference_attitude = interpolate(sample_s, inertial_data.time_s, inertial_data.gyro_attitude)
     candidates = [
         _make_candidate(
             sample_s, sent_quaternions, reference_attitude, order, frames, quarter_turns

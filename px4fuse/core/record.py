@@ -152,21 +152,6 @@ def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
         raise ValueError(str(error)) from error  # msgspec adds the path of the value to the message
 
 
-def to_serializable(value: Any) -> Any:
-    """Remove the fields of type :class:`NotWritten` from a record and all nested records."""
-    if isinstance(value, Record):
-        written_names = (
-            field.name
-            for field in msgspec.structs.fields(value)
-            if field.type is not msgspec.UnsetType
-        )
-        fields = {name: to_serializable(getattr(value, name)) for name in written_names}
-        return type(value)(**fields)
-    if isinstance(value, Mapping):
-        return {key: to_serializable(child) for key, child in value.items()}
-    return tuple(map(to_serializable, value)) if isinstance(value, tuple) else value
-
-
 def read_toml(module_file: str, kind: type[T], name: str = "") -> T:
     """Read a TOML file in the folder of a module, and convert it to the type ``kind``.
 

@@ -21,7 +21,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
 from px4fuse.core.text import one_line
-from px4fuse.core.threads import ONE_THREAD
+from px4fuse.core.threads import ONE_THREAD_ENVIRONMENT
 from px4fuse.errors import Px4FuseError
 
 Job = TypeVar("Job")
@@ -35,7 +35,7 @@ TIMEOUT_S, MAX_MEMORY_BYTES = 120.0, 4_000_000_000
 START_TIMEOUT_S = 180.0
 # Environment variables of worker processes. With PYTHONSAFEPATH, Python does not import files from
 # the current folder, which may contain files of a student
-_WORKER_ENVIRONMENT = {"PYTHONSAFEPATH": "1", **ONE_THREAD}
+_WORKER_ENVIRONMENT = {"PYTHONSAFEPATH": "1", **ONE_THREAD_ENVIRONMENT}
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ def earth_rate_rad_s(fusion_record: FusionRecord) -> Array:
 
 def ekf2_metres_per_metre(fusion_record: FusionRecord) -> tuple[float, float, float]:
     """Return the ratio of EKF2's internal to its published position along north, east, down."""
-    if np.isnan(fusion_record.latitude_deg) or not fusion_record.stores_latitude:
+    if np.isnan(fusion_record.latitude_deg) or not fusion_record.stores_latitude():
         return 1.0, 1.0, 1.0
     eccentricity_squared = ECCENTRICITY**2
     q = 1.0 - eccentricity_squared * np.sin(np.radians(fusion_record.latitude_deg)) ** 2

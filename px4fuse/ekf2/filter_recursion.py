@@ -242,13 +242,12 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         else slice(None)
     )
 
-    def stack_configurations(name: str, rows: slice = slice(None)) -> Any:
-        interval_quantities = [
-            getattr(interval_arrays, name)[rows] for interval_arrays in distinct_intervals
-        ]
+    def stack_configurations(interval_quantities: Sequence[Any]) -> Any:
         return np.stack(interval_quantities, axis=1)[:, configuration_intervals]
 
-    event_table = stack_configurations("events")
+    event_table = stack_configurations(
+        [interval_arrays.events for interval_arrays in distinct_intervals]
+    )
     action = np.where(has_gate, event_table["action"], FUSE * event_table["usable"])
     event_steps = event_table["end_step"]
     is_active = action > IDLE
@@ -289,18 +288,14 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             means_by_interval = [
                 mean_by_event(segment, samples, end_steps) for end_steps in event_step_arrays
             ]
-            stacked_means = (
-                np.stack(quantities, axis=1)[:, configuration_intervals]
-                for quantities in zip(*means_by_interval, strict=True)
-            )
-            mean = EventSamples(*stacked_means)
+            means = EventSamples(*map(stack_configurations, zip(*means_by_interval, strict=True)))
             if aid == MAG:
                 R = np.maximum(parameters[MAG.noise], MIN_SIGMA_GAUSS) ** 2
-                mean = mean._replace(noise=mean.noise + R)
-            sample_count = mean.sample_count * is_enabled_by_aid[aid.name]
+                means = means._replace(noise=means.noise + R)
+            sample_count = means.sample_count * is_enabled_by_aid[aid.name]
             gate = parameters.get(aid.gate, np.full(configuration_count, samples.gate))
-            mean = mean._replace(sample_count=sample_count)
-            vector_means.append((mean, gate, samples.state_rows))
+            means = means._replace(sample_count=sample_count)
+            vector_means.append((means, gate, samples.state_rows))
     follows_log = [
         segment.heights is None
         or segment.is_acceleration_bad is None
@@ -402,15 +397,17 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         reset_states.append((VELOCITY, VELOCITY_COLUMNS, 1.0))
     for e in range(event_count):
         batch_index = e % EVENT_BATCH_SIZE
-        if not batch_index:  # arrays of a few events are copied at once, to limit the memory
+        if not batch_index:
             event_batch = slice(e, e + EVENT_BATCH_SIZE)
-            transition = stack_configurations("transition", event_batch)
-            state_input = stack_configurations("acceleration_input", event_batch) + has_attitude[
-                :, None
-            ] * stack_configurations("correction_input", event_batch)
-            added_noise = gyro_variance * stack_configurations("gyro_noise", event_batch)
-            accelerometer_noise = stack_configurations("accelerometer_noise", event_batch)
-            added_noise = added_noise + acceleration_variance[event_batch] * accelerometer_noise
+            batches = [one_timing.transitions(event_batch) for one_timing in distinct_intervals]
+            transition, correction_input, acceleration_input, gyro_noise, accelerometer_noise = map(
+                stack_configurations, zip(*batches, strict=True)
+            )
+            state_input = acceleration_input + has_attitude[:, None] * correction_input
+            added_noise = (
+                gyro_variance * gyro_noise
+                + acceleration_variance[event_batch] * accelerometer_noise
+            )
             variance_growth = variance_increment * step_counts[event_batch]
         phi = transition[batch_index]
         # x = Φx + u, P = ΦPΦ' + Q
@@ -438,9 +435,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             _limit_bias_variance(P, inputs.rules.min_bias_variance, has_biases)
         innovation[:, 2:] = 0.0
         R[:, 2:] = IGNORED_VARIANCE
-        for mean, gate, state_rows in vector_means:
-            if mean.sample_count[e].any():
-                event_mean = EventSamples(*(quantity[e] for quantity in mean))
+        for means, gate, state_rows in vector_means:
+            if means.sample_count[e].any():
+                event_mean = EventSamples(*(quantity[e] for quantity in means))
                 x, P, vector_updates = fuse_mean(x, P, event_mean, gate, *state_rows)
                 if EARTH_FIELD in state_rows:
                     magnetometer_updates[e] = vector_updates
@@ -718,7 +715,7 @@ def _variance_growth(
 
 
 def with_state_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegment:
-    """Estimate the correlations of the initial state of a segment, of which variances are logged.
+    """Estimate the correlations of the initial state of a segment; only its variances are logged.
 
     Without correlations, the first updates would correct tilt and accelerometer bias in a wrong
     ratio. The correlations are computed by a replay of the flight before the segment.

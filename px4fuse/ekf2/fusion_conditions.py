@@ -107,7 +107,7 @@ class FusionAttempt:
 
     @property
     def has_switch(self) -> bool:
-        """True for PX4 v1.14 and later, with a separate parameter that enables the source."""
+        """True if a parameter of this source alone enables its fusion (PX4 v1.14 and later)."""
         return self.aid.switch in self.parameters
 
     @property
@@ -119,7 +119,7 @@ class FusionAttempt:
 
     @property
     def interval_s(self) -> float:
-        return 1.0 / self.source.rate_hz
+        return 1.0 / self.source.compute_rate_hz()
 
     def samples_in_span(self, samples: pd.DataFrame, before_s: float = 0.0) -> pd.DataFrame:
         """Return the samples in ``span_s``, and up to ``before_s`` (s) before it."""
@@ -273,7 +273,7 @@ def _check_interval(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
     if is_interval_known and intervals_s.min() >= EV_START_INTERVAL_S - INTERVAL_TOLERANCE_S:
         yield UnmetCondition(
             "interval",
-            f"the positions come at {attempt.source.rate_hz:.2g} Hz",
+            f"the positions come at {attempt.source.compute_rate_hz():.2g} Hz",
             f"The interval between positions is {attempt.interval_s:.2f} s. EKF2 (v1.14 and later) "
             "starts to fuse external vision only when two positions come within "
             f"{EV_START_INTERVAL_S:g} s. No parameter changes this limit.",

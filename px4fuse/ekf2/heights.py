@@ -256,8 +256,8 @@ class HeightFilter:
             return x, P
         sensor_index = int(slot == len(self.down_m))
         # PH' and HPH'
-        column = P[:, :, DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
-        predicted_variance = column[:, DOWN] - age_s * column[:, VELOCITY_DOWN]
+        state_covariance = P[:, :, DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
+        predicted_variance = state_covariance[:, DOWN] - age_s * state_covariance[:, VELOCITY_DOWN]
         nu = down_m - x[:, DOWN] + age_s * x[:, VELOCITY_DOWN]
         sample_weight = self.weight[slot][e]
         if self.has_bias[sensor_index]:
@@ -282,5 +282,5 @@ class HeightFilter:
             nu = np.where(is_clipped, np.clip(nu, -innovation_limit, innovation_limit), nu)
             is_fused |= is_clipped
         self.update_log[e, slot] = np.where(has_sample, (nu, S, ~is_fused, is_fused), np.nan)
-        K = column * (is_fused / (predicted_variance + R / sample_weight))[:, None]
-        return x + K * nu[:, None], P - K[:, :, None] * column[:, None]
+        K = state_covariance * (is_fused / (predicted_variance + R / sample_weight))[:, None]
+        return x + K * nu[:, None], P - K[:, :, None] * state_covariance[:, None]

@@ -380,7 +380,7 @@ def _fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) 
     if is_gnss:
         # Since 2026, position and velocity have separate timeouts and separate resets in PX4 main
         rules = replace(GNSS_RULES, resets_velocity=GNSS_MODE_PARAMETER not in parameters)
-        if not fusion_record.stores_latitude:
+        if not fusion_record.stores_latitude():
             # The flag for a bad acceleration stays set for 10 s (BADACC_PROBATION, common.h)
             rules = replace(rules, reset_variance_factor=1.0, bad_acceleration_duration_s=10.0)
     elif uses_aid_mask(parameters):
@@ -426,10 +426,10 @@ def read_gnss(
         return Unavailable(
             ANALYSIS_NAME, "the log has no topic vehicle_gps_position", DEFAULT_PROFILE_REMEDY
         )
-    if track.rate_hz < MAX_DOWNSAMPLED_HZ:
+    if track.compute_rate_hz() < MAX_DOWNSAMPLED_HZ:
         return Unavailable(
             ANALYSIS_NAME,
-            f"GNSS is logged at {track.rate_hz:.1f} Hz, below the rate that EKF2 fused",
+            f"GNSS is logged at {track.compute_rate_hz():.1f} Hz, below the rate that EKF2 fused",
             "Set bit 1 of SDLOG_PROFILE to log all GNSS fixes.",
         )
     parameters = fusion_record.parameters
@@ -551,7 +551,7 @@ def _logged_decisions(
     arrival_s: Array,
     aid: Aid = EV_POS,
 ) -> tuple[Array, BoolArray]:
-    """Return for each position sample if EKF2 rejected it (1, 0 or NaN), and if it was reset to it.
+    """Return which position samples EKF2 rejected (1, else 0), and to which samples it was reset.
 
     The rejection is NaN if it is not logged.
     """

@@ -16,7 +16,7 @@ Sources: PX4-Autopilot ``EKF/python/ekf_derivation/derivation.py`` (predict_cova
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -62,6 +62,25 @@ EVENT = np.dtype(
 )
 
 
+class Transitions(NamedTuple):
+    """State transition and process noise of E intervals.
+
+    Attributes
+    ----------
+    transition : ndarray, shape (E, 15, 15)
+    correction_input, acceleration_input : ndarray, shape (E, 15)
+        State changes due to the correction of the nominal attitude, and to the acceleration.
+    gyro_noise, accelerometer_noise : ndarray, shape (E, 9, 9)
+        Process noise for a sensor noise of 1 rad/s or 1 m/s².
+    """
+
+    transition: Array
+    correction_input: Array
+    acceleration_input: Array
+    gyro_noise: Array
+    accelerometer_noise: Array
+
+
 @dataclass(frozen=True, eq=False)
 class Intervals:
     """State transition and process noise of each interval between the events of one segment.
@@ -70,19 +89,31 @@ class Intervals:
     ----------
     events : recarray, shape (events,)
         Event at the end of each interval, see :data:`EVENT`.
-    transition : ndarray, shape (events, 15, 15)
-    correction_input, acceleration_input : ndarray, shape (events, 15)
-        State changes due to the known change of the nominal attitude, and to the acceleration.
-    gyro_noise, accelerometer_noise : ndarray, shape (events, 9, 9)
-        Process noise for a sensor noise of 1 rad/s or 1 m/s².
+    step_counts, duration_s : ndarray, shape (E,)
+        Number of prediction steps, and length of each interval.
+    sensitivities : ndarray, shape (E, 9, SENSITIVITY_COLUMN_COUNT)
+        Sensitivity of attitude, velocity and position at the end of each interval.
     """
 
     events: Events
-    transition: Array
-    correction_input: Array
-    acceleration_input: Array
-    gyro_noise: Array
-    accelerometer_noise: Array
+    step_counts: Array
+    duration_s: Array
+    sensitivities: Array
+
+    def transitions(self, rows: slice) -> Transitions:
+        """Return the matrices of some intervals; those of a whole flight need much memory."""
+        sensitivities, duration_s = self.sensitivities[rows], self.duration_s[rows]
+        transition = np.tile(np.eye(STATE_COUNT), (len(duration_s), 1, 1))
+        correction_input, acceleration_input = np.zeros((2, len(duration_s), STATE_COUNT))
+        transition[:, :IMU_STATE_COUNT, THETA] = sensitivities[..., :3]
+        transition[:, :IMU_STATE_COUNT, BIASES] = sensitivities[..., 3:9]
+        correction_input[:, :IMU_STATE_COUNT] = sensitivities[..., CORRECTION_COLUMN]
+        acceleration_input[:, :IMU_STATE_COUNT] = sensitivities[..., INPUT_COLUMN]
+        transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
+        noises = _imu_noise_by_interval(
+            self.step_counts[rows], duration_s, transition[:, VELOCITY, THETA]
+        )
+        return Transitions(transition, correction_input, acceleration_input, *noises)
 
 
 @dataclass(frozen=True)
@@ -99,22 +130,14 @@ def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> In
     The number of intervals does not depend on ``timing``.
     """
     events = _make_events(inputs, segment, timing)
-    start_steps = np.append(0, events.end_step[:-1])
     end_steps = events.end_step
-    event_count = len(end_steps)
-    duration_s = segment.time_s[end_steps] - segment.time_s[start_steps]
-    transition = np.tile(np.eye(STATE_COUNT), (event_count, 1, 1))
-    correction_input, acceleration_input = np.zeros((2, event_count, STATE_COUNT))
-    sensitivities = _state_sensitivities(segment, start_steps, end_steps)
-    transition[:, :IMU_STATE_COUNT, THETA] = sensitivities[..., :3]
-    transition[:, :IMU_STATE_COUNT, BIASES] = sensitivities[..., 3:9]
-    correction_input[:, :IMU_STATE_COUNT] = sensitivities[..., CORRECTION_COLUMN]
-    acceleration_input[:, :IMU_STATE_COUNT] = sensitivities[..., INPUT_COLUMN]
-    transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
-    noise_by_interval = _imu_noise_by_interval(
-        (end_steps - start_steps).astype(float), duration_s, transition[:, VELOCITY, THETA]
+    start_steps = np.append(0, end_steps[:-1])
+    return Intervals(
+        events,
+        (end_steps - start_steps).astype(float),
+        segment.time_s[end_steps] - segment.time_s[start_steps],
+        _state_sensitivities(segment, start_steps, end_steps),
     )
-    return Intervals(events, transition, correction_input, acceleration_input, *noise_by_interval)
 
 
 def _make_events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:

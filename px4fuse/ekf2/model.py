@@ -11,7 +11,7 @@ All filter configurations (parameters, states, aiding sources, gate) run togethe
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, starmap
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ import pandas as pd
 from msgspec import structs
 from scipy.spatial.transform import Rotation
 
-from px4fuse.core.arrays import Array
+from px4fuse.core.arrays import Array, IntArray
 from px4fuse.core.record import Span
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
@@ -73,7 +73,11 @@ from px4fuse.trajectory.rotation import rotate
 # Maximum delay (s) of the fusion horizon: PX4's maximum of EKF2_DELAY_MAX
 MAX_HORIZON_S = 1.0
 
-# Names of fields of Agreement that are not PX4's name of the aiding source
+# Number of intervals whose states are computed at once, which limits memory
+BLOCK_EVENTS = 512
+
+# Field of Agreement with the result for an aiding source, where its name is not PX4's name of the
+# source
 AGREEMENT_FIELDS = {FLOW.name: "carried_difference_m"}
 
 RequestConfigurations = Callable[[Inputs], Sequence[FilterConfiguration]]
@@ -438,8 +442,8 @@ def _updates_by_aid(
         )
     )
 
-    def updates_along(axes: Sequence[AxisName], columns: slice, *more: Any) -> pd.DataFrame:
-        update_log = np.column_stack([nu[:, columns], S[:, columns], *more])
+    def updates_along(axes: Sequence[AxisName], columns: slice, *other_values: Any) -> pd.DataFrame:
+        update_log = np.column_stack([nu[:, columns], S[:, columns], *other_values])
         return update_table(update_log[:, None], events.time_s[:, None], end_s, axes)
 
     position_variance = variance_after[:, HORIZONTAL_POSITION]
@@ -506,44 +510,56 @@ def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Ar
     segment = run.segment
     event_states = run.state[:, configuration_index]
     step_count = len(segment.step_s)
-    body_to_ned = segment.body_to_ned[1:]
-    step_s = segment.step_s[:, None]
     interval_index = np.searchsorted(event_steps, np.arange(step_count), side="right")
-    first_step = np.searchsorted(interval_index, interval_index)
     state = event_states[np.append(0, interval_index)]
-
-    def sum_since_event(increments: Array) -> Array:
-        total = np.cumsum(increments, axis=0)
-        return np.asarray(total - (total - increments)[first_step])
-
-    def value_before_step(after_step: Array, rows: slice) -> Array:
-        shifted = np.concatenate([after_step[:1], after_step[:-1]])
-        return np.where(
-            (first_step == np.arange(step_count))[:, None],
-            event_states[interval_index, rows],
-            shifted,
-        )
-
-    # State equations of px4fuse.ekf2.intervals
-    rotation_steps = -rotate(body_to_ned, state[1:, GYRO_BIAS]) * step_s
-    if configuration.estimates_attitude:
-        rotation_steps -= segment.correction_rad
-    state[1:, THETA] += sum_since_event(rotation_steps)
-    force_ned_m_s2 = rotate(body_to_ned, segment.force_m_s2)
-    acceleration = (
-        np.cross(value_before_step(state[1:, THETA], THETA), force_ned_m_s2)
-        + force_ned_m_s2
-        + GRAVITY_M_S2
-    )
-    acceleration -= rotate(body_to_ned, state[1:, ACCELEROMETER_BIAS])
-    state[1:, VELOCITY] += sum_since_event(acceleration * step_s)
-    velocity_m_s = state[1:, VELOCITY]
-    state[1:, POSITION] += sum_since_event(
-        0.5 * step_s * (value_before_step(velocity_m_s, VELOCITY) + velocity_m_s)
-    )
+    # some intervals at a time, because the arrays of a whole flight need much memory
+    block_edges = np.searchsorted(interval_index, np.arange(0, len(event_steps) + 1, BLOCK_EVENTS))
+    for steps in starmap(slice, pairwise([*block_edges, step_count])):
+        _propagate_states(segment, configuration, state[1:], interval_index, steps)
     state[event_steps] = event_states[1:]
     reset_m = np.zeros((step_count + 1, 3))
     position_reset_m = run.position_reset_m[:, configuration_index]
     for event_index in np.flatnonzero(position_reset_m.any(axis=1)):
         reset_m[event_steps[event_index] :, :2] += position_reset_m[event_index]
     return state, reset_m
+
+
+def _propagate_states(
+    segment: ReplaySegment,
+    configuration: FilterConfiguration,
+    states: Array,
+    interval_index: IntArray,
+    steps: slice,
+) -> None:
+    """Replace the states at the start of the interval by the states after some of the steps.
+
+    ``steps`` are the prediction steps of whole intervals, and ``interval_index``, shape (n,), is
+    the interval of each step.
+    """
+    state, body_to_ned = states[steps], segment.body_to_ned[1:][steps]
+    start_state, step_s = state.copy(), segment.step_s[steps, None]
+    first_step = np.searchsorted(interval_index[steps], interval_index[steps])
+    is_first_step = (first_step == np.arange(len(first_step)))[:, None]
+
+    def sum_since_event(increments: Array) -> Array:
+        total = np.cumsum(increments, axis=0)
+        return np.asarray(total - (total - increments)[first_step])
+
+    def value_before_step(rows: slice) -> Array:
+        shifted = np.concatenate([state[:1, rows], state[:-1, rows]])
+        return np.where(is_first_step, start_state[:, rows], shifted)
+
+    # state equations of px4fuse.ekf2.intervals, evaluated for this state only
+    rotation_steps = -rotate(body_to_ned, state[:, GYRO_BIAS]) * step_s
+    if configuration.estimates_attitude:
+        rotation_steps -= segment.correction_rad[steps]
+    state[:, THETA] += sum_since_event(rotation_steps)
+    force_ned_m_s2 = rotate(body_to_ned, segment.force_m_s2[steps])
+    acceleration = (
+        np.cross(value_before_step(THETA), force_ned_m_s2) + force_ned_m_s2 + GRAVITY_M_S2
+    )
+    acceleration -= rotate(body_to_ned, state[:, ACCELEROMETER_BIAS])
+    state[:, VELOCITY] += sum_since_event(acceleration * step_s)
+    state[:, POSITION] += sum_since_event(
+        0.5 * step_s * (value_before_step(VELOCITY) + state[:, VELOCITY])
+    )

@@ -199,9 +199,8 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     other_aid_updates: NotWritten[Mapping[str, pd.DataFrame]] = NOT_WRITTEN
     flow_only_spans_s: NotWritten[Spans] = NOT_WRITTEN
 
-    @property
-    def evaluated_s(self) -> Spans:
-        """Evaluated time spans (s): without the first seconds, and without times of flow only."""
+    def find_evaluated_spans(self) -> Spans:
+        """Return the evaluated spans (s), without the first seconds and times of flow only."""
         evaluated_spans_s = []
         for start, end in self.stretches_s:
             begin = start + SETTLING_S
@@ -221,8 +220,7 @@ class _ComparedInnovations(NamedTuple):
     replayed: pd.DataFrame
     axes: dict[str, AxisAgreement]
 
-    @property
-    def rejected_fractions(self) -> tuple[float, float]:
+    def compute_rejected_fractions(self) -> tuple[float, float]:
         logged, replayed = (float(np.mean(each["rejected"] > 0.0)) for each in self[:2])
         return logged, replayed
 
@@ -231,7 +229,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     """Compare a replay with logged parameters to EKF2's logged innovations and state."""
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    if rows_inside(ekf2.state, replay.evaluated_s).empty:
+    if rows_inside(ekf2.state, replay.find_evaluated_spans()).empty:
         return Unavailable(
             ANALYSIS_NAME,
             "EKF2's position is not logged in the replayed time",
@@ -251,7 +249,9 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             position_agreement,
             "Record a longer flight with motion, with SDLOG_PROFILE bit 0 (default).",
         )
-    rejected_fraction_logged, rejected_fraction_replayed = position_agreement.rejected_fractions
+    rejected_fraction_logged, rejected_fraction_replayed = (
+        position_agreement.compute_rejected_fractions()
+    )
     is_good, reason = _agreement_verdict(
         position_agreement.axes, rejected_fraction_logged, rejected_fraction_replayed
     )
@@ -297,7 +297,9 @@ def _compare_innovations(
         logged_innovations.index.to_numpy(),
         has_measurement_times=has_measurement_times,
     )
-    is_used = (matched_updates >= 0) & inside_spans(logged_innovations.index, replay.evaluated_s)
+    is_used = (matched_updates >= 0) & inside_spans(
+        logged_innovations.index, replay.find_evaluated_spans()
+    )
     # If EKF2 resets its state to a sample, it logs innovation 0 for this sample
     is_used &= logged_innovations.filter(regex="innovation_[a-z]+_m$").any(axis=1)
     logged_innovations = logged_innovations[is_used]
@@ -347,7 +349,7 @@ def _replayed_minus_logged(replay: Ekf2Replay, logged_state: pd.DataFrame, name:
 def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     if MAG.noise not in replay.settings or isinstance(ekf2.record, Unavailable):
         return None
-    logged_state = rows_inside(ekf2.record.delayed, replay.evaluated_s)
+    logged_state = rows_inside(ekf2.record.delayed, replay.find_evaluated_spans())
     if logged_state.empty:
         return None
     replayed_heading_rad = replay.delayed["heading_rad"]
@@ -383,7 +385,9 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
             is_good, reason = name == GNSS_VEL.name and compared != CONSTANT_INNOVATIONS, compared
         else:
             agreements[name] = compared.axes
-            is_good, reason = _agreement_verdict(compared.axes, *compared.rejected_fractions)
+            is_good, reason = _agreement_verdict(
+                compared.axes, *compared.compute_rejected_fractions()
+            )
             is_good |= name == GNSS_VEL.name
         if not is_good:
             omitted_aids[name] = reason
@@ -464,7 +468,7 @@ def _axis_agreement(
         for innovations in (replayed_innovations, logged_innovations)
     )
     s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_log, [5, 50, 95]).tolist()
-    logged_state = rows_inside(ekf2.state, ekf2_replay.evaluated_s)
+    logged_state = rows_inside(ekf2.state, ekf2_replay.find_evaluated_spans())
     position_m, velocity_m_s = (
         _replayed_minus_logged(ekf2_replay, logged_state, f"{axis}_{unit}") for unit in ("m", "m_s")
     )
@@ -567,7 +571,7 @@ def _format_above(value: float, limit: float) -> str:
 
 
 def with_logged_rejections(agreement: Agreement, agreement_with_rejections: Agreement) -> Agreement:
-    """Return the agreement of a replay with EKF2's logged rejections.
+    """Return the agreement with the log of a replay that uses EKF2's logged rejections.
 
     If EKF2 rejects many samples, one sample near the gate makes a correct replay differ from the
     log. Rejected fraction and decisions are those of ``agreement``, the replay with a gate.

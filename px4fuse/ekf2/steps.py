@@ -65,7 +65,7 @@ TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class Step(Record, kw_only=True):
-    """Effect of a property of EKF2 that replaces that of KF, such as the measurement noise.
+    """Effect of replacing one property of KF, such as the measurement noise, by that of EKF2.
 
     Attributes
     ----------
@@ -179,7 +179,7 @@ def explain_by_steps(
     configurations = step_configurations(model.inputs, settings or Settings())
     delayed_positions = delayed_tracks(model, list(configurations.values()))
     baseline_replay = replay_with_logged_rejections(model)
-    evaluated_spans = model.baseline_replay.evaluated_s
+    evaluated_spans = model.baseline_replay.find_evaluated_spans()
     state_times_s = ekf2.state.index.to_numpy()
     is_inside = inside_spans(state_times_s, evaluated_spans)
     # Only times at which the EKF2 replay and all runs of KF have a state are compared

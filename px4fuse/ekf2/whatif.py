@@ -225,10 +225,11 @@ def what_if(
     without = without or {}
     replays = replay_settings(model, settings, without=without)
     flight = model.flight
-    evaluated_s = model.baseline_replay.evaluated_s
+    evaluated_s = model.baseline_replay.find_evaluated_spans()
     if without:
         disabled_s = min(without.values())
         # Later segments start from logged states, to which the disabled source contributed
+        replay_end_s = evaluated_s[-1][1]
         remaining_spans = [
             (max(start, disabled_s), end)
             for start, end in evaluated_s
@@ -238,7 +239,7 @@ def what_if(
         if not evaluated_s:
             raise SettingsError(
                 f"--from {disabled_s:g} s leaves less than {MIN_EVALUATED_S:g} s of the replayed "
-                f"flight, which ends at {model.baseline_replay.evaluated_s[-1][1]:.0f} s. "
+                f"flight, which ends at {replay_end_s:.0f} s. "
                 "Choose an earlier time."
             )
     is_gnss = model.inputs.aid == GNSS_POS

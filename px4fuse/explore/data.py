@@ -18,7 +18,7 @@ from px4fuse.comparison.remedy import aid_of
 from px4fuse.explore.packing import COARSE_SCALE, Packer
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL, CONSISTENT_RATIOS
 from px4fuse.filter.model import INITIAL_COVARIANCE
-from px4fuse.filter.settings import SETTING_RANGES, Settings
+from px4fuse.filter.settings import KF_NUMBERS, SETTING_RANGES, Settings
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -167,8 +167,8 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Pa
         "bands": _nis_bands(len(result.axis.measurement_time_s), packer),
         # key of the noise estimate: north and east may have a common estimate
         "noises": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
-        "ekf2": _ekf2_data(analysis, result.in_flight, packer),
-        "truth": _truth_data(result.in_flight, packer),
+        "ekf2": _ekf2_data(analysis, result.with_flight_tracks(), packer),
+        "truth": _truth_data(result.with_flight_tracks(), packer),
     }
 
 
@@ -275,9 +275,9 @@ def _command_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
     depends on the time offset, which the user can change.
     """
     offset_s = None if request.position is None else request.clock_offset_s
-    base_request = msgspec.structs.replace(
-        request, sigma_a_m_s2=0.5, sigma_z_m=None, dt_s=0.1, input=None, clock_offset_s=offset_s
-    )
+    defaults = ComparisonRequest(log=request.log)
+    kf_defaults = {name: getattr(defaults, name) for name in (*KF_NUMBERS, "input")}
+    base_request = msgspec.structs.replace(request, clock_offset_s=offset_s, **kf_defaults)
     heading_deg = request.heading_deg
     if heading_deg is None and AISLE in analysis.axes:
         heading_deg = analysis[AISLE].heading_deg

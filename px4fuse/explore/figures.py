@@ -114,7 +114,7 @@ def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
     for name, plot in FIGURES.plots.items():
         if name == "error" and not has_reference(data):
             continue
-        data_sources = _PlotSources(name)
+        data_sources = _PlotDataSources(name)
         plot_figure = plots[name] = _figure(
             name,
             215,
@@ -153,7 +153,7 @@ def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
     return plots
 
 
-class _PlotSources(dict[str, ColumnDataSource]):
+class _PlotDataSources(dict[str, ColumnDataSource]):
     """Bokeh data sources of one plot, created on first use."""
 
     def __init__(self, plot: str) -> None:

@@ -26,7 +26,7 @@ from px4fuse.findings import Finding
 from px4fuse.report.card_html import card_html
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import Scenario
 
 # Pairs of faults (as answers of the quiz) that do not hide each other in one flight
@@ -53,7 +53,7 @@ SCENARIO_VALUES: dict[str, Any] = {
 # Range of the random length (m) of a pass along the aisle
 AISLE_LENGTH_RANGE_M = (8.0, 12.0)
 # Id of the finding that detects an injected fault, by name of the fault
-FINDING_ID_BY_MISTAKE = {
+FINDING_ID_BY_FAULT = {
     "nlos": "source_outliers",
     "jump": "source_position_jump",
     "dropout": "source_gap",
@@ -69,7 +69,7 @@ class QuizFault(Record):
     ----------
     choice : str
         Right answer of the quiz.
-    mistake : str
+    name : str
         Name of the fault in ``px4fuse simulate --mistake``, or :data:`NOISY_UWB`.
     sizes : tuple of str
         Size at each level of difficulty, as in ``px4fuse simulate --mistake``.
@@ -78,9 +78,9 @@ class QuizFault(Record):
     """
 
     choice: str
-    mistake: str
+    name: str
     sizes: tuple[str, str, str]
-    fault: str
+    description: str
     symptom: str
     size_text: str = "{0}"
     view: str = "errors"
@@ -91,11 +91,11 @@ class QuizTable(Record):
     """Answers of the quiz with their texts, and injected faults (``practice.toml``)."""
 
     choices: dict[str, str]
-    mistakes: tuple[QuizFault, ...]
+    faults: tuple[QuizFault, ...]
 
 
 _QUIZ = read_toml(__file__, QuizTable)
-QUIZ_ANSWERS, QUIZ_FAULTS = _QUIZ.choices, _QUIZ.mistakes
+QUIZ_ANSWERS, QUIZ_FAULTS = _QUIZ.choices, _QUIZ.faults
 
 
 @dataclass(frozen=True)
@@ -103,12 +103,12 @@ class QuizFlight:
     """Simulated flight of the quiz, with its injected faults and their sizes."""
 
     scenario: Scenario
-    mistakes: tuple[QuizFault, ...]
+    faults: tuple[QuizFault, ...]
     sizes: tuple[str, ...]
 
     @property
     def correct_answers(self) -> list[str]:
-        return sorted({mistake.choice for mistake in self.mistakes}) or ["nothing"]
+        return sorted({fault.choice for fault in self.faults}) or ["nothing"]
 
 
 def draw_flights(seed: int, level: int, count: int) -> tuple[QuizFlight, ...]:
@@ -134,17 +134,15 @@ def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> Qui
     def draw_one(candidates: list[QuizFault]) -> list[QuizFault]:
         return [candidates[rng.integers(len(candidates))]] if candidates else []
 
-    mistakes = draw_one([mistake for mistake in QUIZ_FAULTS if mistake.choice == right_answer])
-    if level == MAX_LEVEL and mistakes and rng.random() < 0.5:
-        candidates = ((mistake, {mistake.choice, right_answer}) for mistake in QUIZ_FAULTS)
-        mistakes += draw_one(
-            [mistake for mistake, pair in candidates if pair in COMBINABLE_CHOICES]
-        )
+    faults = draw_one([fault for fault in QUIZ_FAULTS if fault.choice == right_answer])
+    if level == MAX_LEVEL and faults and rng.random() < 0.5:
+        candidates = ((fault, {fault.choice, right_answer}) for fault in QUIZ_FAULTS)
+        faults += draw_one([fault for fault, pair in candidates if pair in COMBINABLE_CHOICES])
     sizes, noise_m = [], SIGMA_Z_M
-    for mistake in mistakes:
-        sign = "-" if mistake.has_either_sign and rng.random() < 0.5 else ""
-        sizes.append(f"{sign}{mistake.sizes[level - 1]}")
-        if mistake.mistake == NOISY_UWB:
+    for fault in faults:
+        sign = "-" if fault.has_either_sign and rng.random() < 0.5 else ""
+        sizes.append(f"{sign}{fault.sizes[level - 1]}")
+        if fault.name == NOISY_UWB:
             noise_m = float(sizes[-1])
     scenario = Scenario(
         **SCENARIO_VALUES,
@@ -153,7 +151,7 @@ def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> Qui
         sigma_uwb_m=noise_m,
         seed=int(rng.integers(MAX_SEED)),
     )
-    return QuizFlight(scenario, tuple(mistakes), tuple(sizes))
+    return QuizFlight(scenario, tuple(faults), tuple(sizes))
 
 
 def practice_text(
@@ -184,19 +182,17 @@ def practice_text(
 
 
 def _flight_data(practice_flight: QuizFlight, flight_index: int) -> tuple[dict[str, Any], str]:
-    mistakes_and_sizes = [*zip(practice_flight.mistakes, practice_flight.sizes, strict=True)]
+    faults_and_sizes = [*zip(practice_flight.faults, practice_flight.sizes, strict=True)]
     options = [
-        f"{mistake.mistake}={size}"
-        for mistake, size in mistakes_and_sizes
-        if mistake.mistake != NOISY_UWB
+        f"{fault.name}={size}" for fault, size in faults_and_sizes if fault.name != NOISY_UWB
     ]
-    simulation = flights.simulate(practice_flight.scenario, parse_mistakes(options))
+    simulation = flights.simulate(practice_flight.scenario, parse_faults(options))
     flight = flights.to_flight(simulation, f"flight {flight_index + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     # as_sent: the automatic correction of axes and timestamps would hide the injected fault
     analysis, packer = diagnose(request, flight=flight, as_sent=True), Packer()
     data, card = flight_data(analysis, packer), build_card(analysis, request)
-    descriptions = [_describe_mistake(*pair, analysis.findings) for pair in mistakes_and_sizes]
+    descriptions = [_describe_fault(*pair, analysis.findings) for pair in faults_and_sizes]
     answer_key = {
         "right": practice_flight.correct_answers,
         "mistakes": descriptions,
@@ -210,18 +206,16 @@ def _flight_data(practice_flight: QuizFlight, flight_index: int) -> tuple[dict[s
     )
 
 
-def _describe_mistake(
-    mistake: QuizFault, size: str, findings: tuple[Finding, ...]
-) -> dict[str, Any]:
-    finding_id = FINDING_ID_BY_MISTAKE.get(mistake.mistake)
+def _describe_fault(fault: QuizFault, size: str, findings: tuple[Finding, ...]) -> dict[str, Any]:
+    finding_id = FINDING_ID_BY_FAULT.get(fault.name)
     spans = [span for finding in findings if finding.id == finding_id for span in finding.spans_s]
     time_text = f"{spans[0][0]:.1f} to {spans[-1][1]:.1f} s" if spans else "whole flight"
     return {
-        "fault": mistake.fault,
-        "size": mistake.size_text.format(*size_parts(size)),
+        "fault": fault.description,
+        "size": fault.size_text.format(*size_parts(size)),
         "time": time_text,
-        "symptom": mistake.symptom,
-        "view": mistake.view,
+        "symptom": fault.symptom,
+        "view": fault.view,
         "span": list(spans[0]) if spans else None,
     }
 
@@ -238,7 +232,7 @@ def size_parts(size: str) -> list[str]:
 def _with_fault_headline(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Card:
     if card.causes or not descriptions:
         return card
-    fault_text = "; ".join(f"{mistake['fault']}: {mistake['size']}" for mistake in descriptions)
+    fault_text = "; ".join(f"{fault['fault']}: {fault['size']}" for fault in descriptions)
     return structs.replace(
         card,
         severity="warning",

@@ -226,12 +226,12 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
                 (_fit_noises_at(prepared_motion, offset, start_noises), offset)
                 for offset in tested_offsets_s
             ),
-            key=lambda fit_and_offset: fit_and_offset[0].lowest_score,
+            key=lambda fit_and_offset: fit_and_offset[0].compute_score(),
         )
         for start_noises in (noises, correlated_start)
     )
-    white_full_score = white_fit.lowest_score
-    correlated_score = correlated_fit.lowest_score
+    white_full_score = white_fit.compute_score()
+    correlated_score = correlated_fit.compute_score()
     # A low-pass filter also looks like time-correlated noise. It is only fitted if time-correlated
     # noise is significant, or if the positions are too smooth for white noise
     is_correlated = white_full_score - correlated_score >= MIN_GAIN_NATS
@@ -243,7 +243,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         # Without low-pass filter, prepare_motion was successful at these measurement times
         assert not isinstance(prepared_motion, Unavailable)
         noise_fit = _fit_noises_at(prepared_motion, 0.0, white_fit.noises)
-        return noise_fit.lowest_score + jacobian_term, noise_fit.noises
+        return noise_fit.compute_score() + jacobian_term, noise_fit.noises
 
     low_log_tau, high_log_tau = np.log(LOW_PASS_TAU_S)
     log_tau = minimize_scalar(
@@ -385,7 +385,7 @@ def _fit_noises_at(
 def _best_of_grid(
     prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidate_noises: Sequence[Noises]
 ) -> tuple[float, Noises]:
-    """Return the lowest -ln p on a coarse grid of time offsets and noises, and its noises."""
+    """Search a coarse grid of time offsets and noises; return the lowest -ln p and its noises."""
     scored_noises = []
     for positions in map(prepared_motion.positions_at_offset, offsets_s):
         for candidate, sigma_a_factor in product(candidate_noises, COARSE_SIGMA_A_FACTORS):
@@ -400,6 +400,6 @@ def _best_of_grid(
                     noises,
                 )
             )
-    lowest_score, scale, noises = min(scored_noises, key=lambda result: result[0])
-    scaled_values = {name: value * scale for name, value in vars(noises).items() if name != "tau_s"}
-    return lowest_score, replace(noises, **scaled_values)
+    lowest_score, factor, noises = min(scored_noises, key=lambda scored: scored[0])
+    best_noises = {name: value * factor for name, value in vars(noises).items() if name != "tau_s"}
+    return lowest_score, replace(noises, **best_noises)

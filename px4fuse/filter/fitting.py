@@ -271,9 +271,8 @@ class NoiseFit:
     outlier_share: float
     outlier_width: float
 
-    @property
-    def lowest_score(self) -> float:
-        """-ln p at the maximum-likelihood noises."""
+    def compute_score(self) -> float:
+        """Return -ln p at the maximum-likelihood noises."""
         return self.score(self.noises)
 
 

@@ -100,9 +100,8 @@ class HeadingError(Record):
     drift_p: Share
     by: Literal["orientation", "positions"]
 
-    @property
-    def ends(self) -> tuple[HeadingPart, HeadingPart]:
-        """Flight parts with the smallest and the largest misalignment, in time order."""
+    def find_ends(self) -> tuple[HeadingPart, HeadingPart]:
+        """Return flight parts with the smallest and the largest misalignment, in time order."""
         angles_deg = [heading_part.heading_error_deg for heading_part in self.parts]
         first_index, last_index = sorted((int(np.argmin(angles_deg)), int(np.argmax(angles_deg))))
         return self.parts[first_index], self.parts[last_index]

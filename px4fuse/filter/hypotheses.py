@@ -118,17 +118,16 @@ class SystematicErrors:
     jumps: tuple[Jump, ...]
     sigma_a_m_s2: float
 
-    @property
-    def bias(self) -> Estimate:
-        """Magnitude of the horizontal accelerometer bias (m/s²)."""
+    def compute_bias(self) -> Estimate:
+        """Return the magnitude of the horizontal accelerometer bias (m/s²)."""
         forward, right = self.forward_bias, self.right_bias
         return Estimate(
             math.hypot(forward.value, right.value), math.hypot(forward.sigma, right.sigma)
         )
 
-    @property
-    def has_bias(self) -> bool:
-        return self.bias.value >= max(MIN_BIAS_M_S2, MIN_BIAS_SIGMAS * self.bias.sigma)
+    def has_significant_bias(self) -> bool:
+        bias = self.compute_bias()
+        return bias.value >= max(MIN_BIAS_M_S2, MIN_BIAS_SIGMAS * bias.sigma)
 
 
 def fit_systematic_errors(
@@ -332,7 +331,7 @@ def _step_chi_squares(
                 cross_product * (fit_without_jump.covariance @ cross_product), axis=0
             )
             chi_squares[batch] += (
-                axis_residual @ step_response / fit_without_jump.axis_rms[axis_index]
+                axis_residual @ step_response / fit_without_jump.compute_axis_rms()[axis_index]
             ) ** 2 / np.maximum(step_information, 1e-9)
     return chi_squares
 
@@ -386,7 +385,7 @@ def _test_step(
     design_fit = design.fit(sigma_a, is_skipped)
     jump_m = design_fit.coefficients[step_column_indices]
     step_covariance = design_fit.covariance[np.ix_(step_column_indices, step_column_indices)]
-    jump_m = jump_m / design_fit.axis_rms
+    jump_m = jump_m / design_fit.compute_axis_rms()
     chi_square = float(jump_m @ np.linalg.solve(step_covariance, jump_m))
     if chi_square < chdtri(len(step_column_indices), false_alarm_p):
         return None
@@ -424,9 +423,8 @@ class DesignFit:
     score: float
     residual_rms: float
 
-    @property
-    def axis_rms(self) -> Array:
-        """RMS residual along each axis in √S, but at least 1."""
+    def compute_axis_rms(self) -> Array:
+        """Return the RMS residual along each axis in √S, but at least 1."""
         mean_square = np.bincount(self.axis, self.residual**2) / np.bincount(self.axis)
         return np.sqrt(np.maximum(mean_square, 1.0))
 

@@ -37,8 +37,8 @@ UNIT_SCALE = np.ones(1)
 SMOOTHED_PATH_NOISES = 0.5, 0.1
 # An initial position with a prior precision (1/m²) above this limit is known
 MIN_KNOWN_START_PRECISION = 1e-3
-# Ratio of the position noise (σ) that is added to each interval to the measurement noise and to
-# √Q₀₀. The added noise makes a singular Q invertible
+# A position noise (σ) is added to Q of each interval, to make a singular Q invertible. This is its
+# ratio to the measurement noise and to √Q₀₀
 MIN_NOISE_RATIO = 1e-5
 # Number of pairs of inputs whose inner products are computed at once, to limit the memory
 INPUT_BATCH_SIZE = 8

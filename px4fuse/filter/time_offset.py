@@ -115,9 +115,8 @@ class ClockOffset(Record, kw_only=True):
     def three_sigma_s(self) -> float:
         return MIN_OFFSET_SIGMAS * self.sigma_s
 
-    @property
-    def changes(self) -> bool:
-        """True if the offset changes in flight, significantly and by at least ``MIN_CHANGE_S``."""
+    def has_changed(self) -> bool:
+        """Return True if the offset changes in flight significantly, by at least MIN_CHANGE_S."""
         if self.change_p_value is None or self.change_p_value >= MAX_CHANGE_P_VALUE:
             return False
         return abs(self.parts[-1].offset_s - self.parts[0].offset_s) >= MIN_CHANGE_S

@@ -1,7 +1,7 @@
-"""Findings: faults of a flight that the log shows.
+"""Findings: faults of a flight, its sensors and its settings that the log shows.
 
-Each module in :data:`DETECTORS` yields findings in its function ``detect``. docs/built.md lists the
-files to change for a new finding.
+Each module in :data:`DETECTORS` has a function ``detect`` that yields findings. docs/built.md lists
+the files to change for a new finding.
 """
 
 from collections.abc import Mapping
@@ -79,13 +79,13 @@ DETECTORS = (
 
 
 def find(analysis: Analysis) -> tuple[Finding, ...]:
-    """Return the findings, most severe first."""
+    """Return the findings of a comparison of KF with EKF2, most severe first."""
     findings = [found for module in DETECTORS for found in module.detect(analysis)]
     return group_by_cause(source_convention.apply_convention(analysis, findings))
 
 
 def find_loop(loop: Loop) -> tuple[Finding, ...]:
-    """Return the findings about a loop and its closures, most severe first."""
+    """Return the findings on the loop closures of a path, most severe first."""
     return () if loop.is_assessed else group_by_cause(loops.detect_in_loop(loop))
 
 
@@ -109,7 +109,7 @@ def find_aids(
 
 
 def finding_title(finding_id: str) -> str:
-    """Return the title of a finding, or its id with blanks if the id is unknown.
+    """Return the title of a finding. If its id is unknown, return the id with blanks.
 
     >>> finding_title("source_gap"), finding_title("of_a_later_version")
     ('Gap in the position source', 'of a later version')

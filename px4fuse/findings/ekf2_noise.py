@@ -13,15 +13,15 @@ from px4fuse.findings.cause_grouping import CAUSE, REPORTED
 from px4fuse.findings.model import Findings, finding, format_percent
 from px4fuse.flight.model import Unavailable, source_name
 
-# Minimum factor between EKF2's noise and its estimate for severity error: a smaller factor hardly
-# changes EKF2's position error
+# Minimum factor between EKF2's noise parameter and the estimate for severity error: a smaller
+# factor hardly changes EKF2's position error
 MIN_FACTOR_ERROR = 2.0
-# Minimum fraction of rejected positions that the title states
+# Minimum fraction of rejected positions that the first sentence of the message states
 MIN_NAMED_REJECTION = 0.05
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect a wrong measurement noise of EKF2: a replay with the estimate is consistent."""
+    """Detect a wrong noise parameter of EKF2, if EKF2 is consistent with the estimated noise."""
     trial, aid = confirmed_noise_trial(analysis), aid_of(analysis)
     if trial is None:
         return
@@ -88,8 +88,8 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def confirmed_noise_trial(analysis: Analysis) -> Trial | None:
-    """Return the re-run with another EKF2 noise, if its innovations become consistent."""
-    trial = find_trial(analysis.main_trials, "ekf2", "noise", aid_of(analysis).noise)
+    """Return the re-run with another EKF2 measurement noise, if it makes EKF2 consistent."""
+    trial = find_trial(analysis.select_main_trials(), "ekf2", "noise", aid_of(analysis).noise)
     is_confirmed = trial is not None and any(
         classify_sigma_ratio(ratio_before, reference) != "consistent"
         and classify_sigma_ratio(ratio_after, reference) == "consistent"

@@ -27,28 +27,28 @@ from px4fuse.flight.model import (
     Unavailable,
 )
 
-# Limit parameter, unit, sensor and columns of each bias state of EKF2
+# For each bias state of EKF2: parameter with its limit, unit, sensor, and columns of the bias
 BIAS_STATES = (
     ("EKF2_ABL_LIM", "m/s²", "accelerometer", Columns.ACCELEROMETER_BIAS),
     ("EKF2_GYR_B_LIM", "rad/s", "gyroscope", Columns.GYRO_BIAS),
 )
-# Minimum ratio of a bias state to its limit parameter if the bias is at the limit
+# A bias state is at its limit if its ratio to the limit parameter is above this value
 MIN_LIMIT_FRACTION = 0.98
-# Minimum fraction of the flight with a bias state at its limit for a finding
+# A bias is reported if it is at its limit for at least this fraction of the flight
 MIN_LIMITED_FRACTION = 0.5
-# Length (s) of the windows in which the IMU is tested for rest
+# Length (s) of the windows in which px4fuse tests if the vehicle is at rest
 REST_WINDOW_S = 1.0
-# Time (s) before take-off in which the motors run, so the IMU is not at rest
+# Time (s) before take-off in which the motors run, so that the IMU is not at rest
 RUN_UP_S = 0.5
 # Maximum standard deviation of angular rate (rad/s) and specific force (m/s²) at rest
 MAX_REST_STDS = (0.04, 1.5)
 # Maximum change (rad/s) of the mean angular rate between windows at rest
 MAX_REST_CHANGE_RAD_S = 0.01
-# Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
+# Minimum gyroscope bias (rad/s) to report it: the heading turns by 90° in 30 s
 MIN_GYRO_BIAS_RAD_S = 0.05
 # Minimum difference (m/s²) between gravity and the specific force at rest that a message states
 MIN_GRAVITY_ERROR_M_S2 = 0.3
-# Maximum fraction of the flight without tilt or yaw alignment that is not reported
+# Missing tilt or yaw alignment is reported if it lasts for a larger fraction of the flight
 MAX_UNALIGNED_FRACTION = 0.02
 # Maximum time (s) from the alignment of the tilt to that of the heading that is not reported: the
 # heading is aligned after the tilt
@@ -59,12 +59,12 @@ def detect(analysis: Analysis) -> Findings:
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2):
         return
-    rest_values = measure_imu_at_rest(analysis.flight)
+    imu_at_rest = measure_imu_at_rest(analysis.flight)
     if not isinstance(ekf2.record, Unavailable):
         bias_states = cut_to_segment(ekf2.record.delayed, analysis.segment)
         if len(bias_states):
-            yield from _detect_limited_bias(analysis, ekf2, bias_states, rest_values)
-            yield from _detect_gyro_bias(bias_states, rest_values)
+            yield from _detect_limited_bias(analysis, ekf2, bias_states, imu_at_rest)
+            yield from _detect_gyro_bias(bias_states, imu_at_rest)
     yield from detect_missing_alignment(analysis.flight, analysis.segment, analysis.source)
 
 
@@ -92,7 +92,7 @@ def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
 
 
 def _detect_limited_bias(
-    analysis: Analysis, ekf2: Ekf2, bias_states: pd.DataFrame, rest_values: pd.Series | None
+    analysis: Analysis, ekf2: Ekf2, bias_states: pd.DataFrame, imu_at_rest: pd.Series | None
 ) -> Findings:
     for parameter, unit, sensor, columns in BIAS_STATES:
         limit = ekf2.parameters.get(parameter, 0.0)
@@ -107,8 +107,8 @@ def _detect_limited_bias(
             f"{format_percent(limited_fraction)} of the flight. The estimate is {bias:+.3g} "
             f"{unit} {BODY_AXES[axis_index]}; EKF2 cannot estimate a larger bias."
         )
-        if sensor == "accelerometer" and rest_values is not None:
-            force_m_s2 = float(np.linalg.norm(rest_values[Columns.SPECIFIC_FORCE]))
+        if sensor == "accelerometer" and imu_at_rest is not None:
+            force_m_s2 = float(np.linalg.norm(imu_at_rest[Columns.SPECIFIC_FORCE]))
             if abs(force_m_s2 - constants.g) > MIN_GRAVITY_ERROR_M_S2:
                 message += (
                     f" At rest before take-off the accelerometer measures {force_m_s2:.2f} m/s² "
@@ -138,10 +138,10 @@ def _describe_height_error(analysis: Analysis, ekf2: Ekf2) -> str:
     return error_text
 
 
-def _detect_gyro_bias(bias_states: pd.DataFrame, rest_values: pd.Series | None) -> Findings:
-    if rest_values is None:
+def _detect_gyro_bias(bias_states: pd.DataFrame, imu_at_rest: pd.Series | None) -> Findings:
+    if imu_at_rest is None:
         return
-    measured_rad_s: Array = rest_values[Columns.ANGULAR_RATE].to_numpy()
+    measured_rad_s: Array = imu_at_rest[Columns.ANGULAR_RATE].to_numpy()
     estimated_rad_s: Array = bias_states[Columns.GYRO_BIAS].median().to_numpy()
     axis_index = int(np.argmax(np.abs(measured_rad_s - estimated_rad_s)))
     if abs(measured_rad_s[axis_index] - estimated_rad_s[axis_index]) < MIN_GYRO_BIAS_RAD_S:

@@ -24,27 +24,27 @@ from px4fuse.flight.model import (
     positions_phrase,
 )
 
-# Maximum jitter (s) of receive times for no finding: a position error of 1 cm at 1 m/s
+# Jitter of receive times is reported above this value (s): a position error of 1 cm at 1 m/s
 MAX_RECEIPT_JITTER_S = 0.010
-# Maximum age (s), at publication by PX4, of a position whose timestamp is its arrival time
+# A timestamp is the arrival time if PX4 publishes the position within this time (s) after it
 MAX_ARRIVAL_AGE_S = 0.001
 # Minimum latency (s) for a warning: a position error of 2 cm at 1 m/s
 MIN_LATENCY_S = 0.02
 # Minimum latency (s) for severity error: a position error of 10 cm at 1 m/s
 MIN_LATENCY_ERROR_S = 0.10
-# Minimum rank correlation of latency and time, if the latency grows in flight
+# The latency grows in flight if its rank correlation with time exceeds this value
 MIN_LATENCY_TREND = 0.8
 # Minimum fraction of positions that EKF2 drops because of their latency, for a finding
 MIN_DROPPED_FRACTION = 0.02
 # Minimum number of positions before the convergence of TIMESYNC, and minimum number after it
 MIN_SAMPLES = 10
-# Minimum fraction of timestamps that are arrival times before the convergence of TIMESYNC, and
-# measurement times after the convergence
+# Minimum fraction of arrival times among the timestamps before the convergence of TIMESYNC, and of
+# measurement times after it
 MIN_CONSISTENT_FRACTION = 0.95
 # Minimum mean number of positions in a burst of positions that arrive together
 MIN_BURST_SIZE = 2.5
-# Minimum number of bursts
-MIN_BURSTS = 10
+# Minimum number of bursts: fewer pauses are gaps in the position source
+MIN_BURST_COUNT = 20
 # Maximum ratio of the duration of a burst to the pause between bursts
 MAX_BURST_DURATION_RATIO = 0.3
 ANSWER_TIMESYNC = (
@@ -86,7 +86,7 @@ def detect_bursts(analysis: Analysis) -> Findings:
     """Detect timestamps in bursts: arrival times of positions that wait for each other."""
     intervals_s = np.diff(analysis.source.samples.index.to_numpy())
     is_pause = intervals_s > intervals_s.mean()
-    if np.count_nonzero(is_pause) < MIN_BURSTS:
+    if np.count_nonzero(is_pause) < MIN_BURST_COUNT:
         return
     burst_size, pause_s = 1.0 / float(is_pause.mean()), float(np.median(intervals_s[is_pause]))
     burst_s = burst_size * float(np.median(intervals_s[~is_pause]))
@@ -95,7 +95,8 @@ def detect_bursts(analysis: Analysis) -> Findings:
     yield error(
         "source_timestamp_jitter",
         f"The timestamps of the {positions_phrase(analysis.source)} come in bursts of "
-        f"{burst_size:.0f}, every {pause_s:.2g} s ({analysis.source.rate_hz:.3g} Hz on average). "
+        f"{burst_size:.0f}, every {pause_s:.2g} s "
+        f"({analysis.source.compute_rate_hz():.3g} Hz on average). "
         "They are arrival times of positions that were "
         f"measured earlier, by up to {pause_s:.2g} s. At 1 m/s this is a position error of up to "
         f"{format_metres(pause_s)} m along the motion.",
@@ -209,10 +210,10 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
     position_age_s = _position_age_s(analysis)
     if position_age_s is None or find_synchronisation(analysis) is not None:
         return
-    part_count = max(MIN_SAMPLES, len(position_age_s) // 10)
+    sample_count = max(MIN_SAMPLES, len(position_age_s) // 10)
     start_s, end_s = (
-        float(part.median())
-        for part in (position_age_s.iloc[:part_count], position_age_s.iloc[-part_count:])
+        float(age_s.median())
+        for age_s in (position_age_s.iloc[:sample_count], position_age_s.iloc[-sample_count:])
     )
     change_text = "grows in flight"
     trend = rank_correlation(position_age_s.index.to_numpy(), position_age_s.to_numpy())
@@ -246,7 +247,7 @@ def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
     if position_age_s is None:
         return None
     is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
-    # for each position as the last one before convergence: number of timestamps that do not fit
+    # Number of timestamps that contradict a convergence directly after each position
     contradicting_count: Array = (
         np.cumsum(~is_arrival_time) + np.sum(is_arrival_time) - np.cumsum(is_arrival_time)
     )
@@ -266,7 +267,10 @@ def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
 
 
 def _position_age_s(analysis: Analysis) -> pd.Series | None:
-    """Return the publication time of each position minus its timestamp_sample (s), if logged."""
+    """Return the age (s) of each position at its publication, from timestamp_sample.
+
+    Return None if the log does not contain it.
+    """
     ekf2, source, segment = analysis.flight.ekf2, analysis.source, analysis.segment
     fusion_record = ekf2.record if isinstance(ekf2, Ekf2) else None
     if (

@@ -93,9 +93,8 @@ class Origin(Record):
         """
         return self.kind == "gnss"
 
-    @property
-    def preference_rank(self) -> int:
-        """Rank of this kind of position source if px4fuse selects one; 0 is preferred."""
+    def find_preference_rank(self) -> int:
+        """Return the rank for the automatic choice of a position source; 0 is preferred."""
         return [(origin.aid, origin.path) for origin in ORIGINS].index((self.aid, self.path))
 
 
@@ -466,9 +465,8 @@ class PositionTrack:
             for name in names
         }
 
-    @property
-    def rate_hz(self) -> float:
-        """Sample rate (Hz) outside of gaps; NaN for fewer than two samples."""
+    def compute_rate_hz(self) -> float:
+        """Return the sample rate (Hz) outside of gaps; NaN for fewer than two samples."""
         return sample_rate(self.samples)
 
 
@@ -593,9 +591,8 @@ class FusionRecord:
 
     __repr__ = one_line_repr
 
-    @property
     def stores_latitude(self) -> bool:
-        """True if EKF2 stores the position as latitude and longitude (since v1.16)."""
+        """Return True if EKF2 stores the position as latitude and longitude (since v1.16)."""
         return not np.isfinite(self.delayed["north_m"]).any()
 
     def was_in_state(self, state: str, times_s: Array) -> BoolArray:
@@ -709,7 +706,7 @@ class Truth:
     __repr__ = one_line_repr
 
 
-# Flights are compared by identity (eq=False), because caches use flights as keys
+# Flights are compared by identity (eq=False), because frames have no single truth value of ==
 @dataclass(frozen=True, eq=False)
 class Flight:
     """One recorded flight.

@@ -85,7 +85,7 @@ def prose_section(title: str, text: str) -> Section:
     return ["prose", title, text]
 
 
-def pairs_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
+def name_value_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
     """Return a section with pairs (name, value); empty values are omitted."""
     return ["pairs", title, [row for row in rows if row[1]]]
 
@@ -103,7 +103,7 @@ def links_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
     return ["links", title, [row for row in rows if row[1]]]
 
 
-def boxes_section(
+def input_boxes_section(
     title: str,
     student_id: str,
     rows: Sequence[tuple[str, float, float | None, str]],

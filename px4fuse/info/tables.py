@@ -107,8 +107,8 @@ def description(flight: Flight) -> dict[str, Any]:
         "unused": flight.unused,
         "inputs": flight.inputs,
     }
-    data: dict[str, Any] = to_json_types(description_fields)
-    return data
+    json_description: dict[str, Any] = to_json_types(description_fields)
+    return json_description
 
 
 @cache

@@ -190,8 +190,8 @@ def build_pose_graph(
         dimension=3,
         ids=np.arange(len(node_indices)),
         poses=np.column_stack([node_position_m, node_rotation.as_quat()]),
-        first=first_nodes,
-        second=second_nodes,
+        first_nodes=first_nodes,
+        second_nodes=second_nodes,
         measurements=np.column_stack(
             [translation_measured, (first_inverse * second_rotation).as_quat()]
         ),
@@ -259,7 +259,9 @@ def gate_closures(
     """Test the loop closures, which are the last edges of the graph, against odometry."""
     if isinstance(graph, Unavailable):
         return ()
-    closure_edges = np.arange(len(graph.first) - len(closures_and_landings), len(graph.first))
+    closure_edges = np.arange(
+        len(graph.first_nodes) - len(closures_and_landings), len(graph.first_nodes)
+    )
     closures = []
     for gate_result, (closure, true_end) in zip(
         gate_edges(graph, closure_edges), closures_and_landings, strict=True
@@ -301,7 +303,7 @@ def solve_pose_graphs(
     if isinstance(graph, Unavailable):
         corrections = {f"pose_graph_{solution_name}": graph for solution_name in SOLUTIONS}
         return corrections, ()
-    edge_indices = np.arange(len(graph.first))
+    edge_indices = np.arange(len(graph.first_nodes))
     is_closure = edge_indices >= len(edge_indices) - len(closures)
     is_rejected = np.zeros(len(edge_indices), bool)
     is_rejected[is_closure] = [not closure.accepted for closure in closures]

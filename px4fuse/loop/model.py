@@ -175,30 +175,28 @@ class Loop(Record, kw_only=True):
     @property
     def odometry(self) -> CorrectedPath:
         """Odometry from take-off to landing, without correction, in a frame with z down."""
-        return self.paths["uncorrected"]
+        return self.find_paths()["uncorrected"]
 
-    @property
-    def paths(self) -> dict[CorrectionName, CorrectedPath]:
-        """Available paths by name, with the odometry first."""
+    def find_paths(self) -> dict[CorrectionName, CorrectedPath]:
+        """Return the available paths by name, with the odometry first."""
         return {
             name: path for name, path in self.corrections.items() if isinstance(path, CorrectedPath)
         }
 
-    @property
-    def reported_paths(self) -> tuple[CorrectedPath, ...]:
-        """Available paths that differ: without rejected closures, for example, two are equal."""
+    def select_reported_paths(self) -> tuple[CorrectedPath, ...]:
+        """Return the paths that differ: without rejected closures, for example, two are equal."""
         duplicates: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
             duplicates.add("pose_graph_all")
         if isinstance(self.heading_error_deg, Unavailable):
             duplicates.add("by_distance")
-        return tuple(path for name, path in self.paths.items() if name not in duplicates)
+        return tuple(path for name, path in self.find_paths().items() if name not in duplicates)
 
-    @property
-    def best(self) -> CorrectedPath:
-        """Best available path: gated pose graph, else distributed closure error, else odometry."""
+    def choose_best_path(self) -> CorrectedPath:
+        """Return the best path: gated pose graph, else distributed closure error, else odometry."""
         names: tuple[CorrectionName, ...] = ("pose_graph_gated", "by_distance", "uncorrected")
-        return next(self.paths[name] for name in names if name in self.paths)
+        paths = self.find_paths()
+        return next(paths[name] for name in names if name in paths)
 
     @property
     def is_end_assumed(self) -> bool:
@@ -215,6 +213,7 @@ class Loop(Record, kw_only=True):
         """
         if isinstance(self.graph, Unavailable):
             raise MissingDataError(f"{self.graph.what}: {self.graph.reason}.")
-        graph_path = self.paths.get("pose_graph_gated") or self.paths.get("pose_graph_all")
+        paths = self.find_paths()
+        graph_path = paths.get("pose_graph_gated") or paths.get("pose_graph_all")
         solution = None if graph_path is None else graph_path.solution
         return self.graph if solution is None else replace(self.graph, poses=solution.poses)

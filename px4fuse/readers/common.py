@@ -17,8 +17,8 @@ MAX_IMU_VALUE = 1e4
 MIN_ZERO_DISTANCE_M = 0.3
 # A position is rejected as damaged if it is farther than this distance (m) from the median position
 MIN_FAR_DISTANCE_M = 1e4
-# Minimum ratio of a damaged position's distance from the median position to the median of these
-# distances
+# The distance of a damaged position from the median position also exceeds this multiple of the
+# median distance
 MIN_FAR_DISTANCE_RATIO = 100.0
 # Equal positions are rejected as frozen if they last at least this time (s): some sources send each
 # position several times within a shorter time
@@ -27,6 +27,9 @@ MIN_FROZEN_S = 1.0
 MIN_FROZEN_COUNT = 5
 # If a larger fraction of the positions is frozen, none is rejected: the vehicle may be at rest
 MAX_FROZEN_FRACTION = 0.5
+# Maximum probability that a source which repeats positions at random has a run of equal positions
+# that is rejected as frozen
+MAX_RANDOM_RUN_PROBABILITY = 0.01
 # Maximum distance of a coordinate difference from a whole number of rounding steps, in steps
 MAX_STEP_ERROR = 0.01
 # Minimum norm of a valid quaternion: senders without attitude send zeros
@@ -62,11 +65,6 @@ def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
         f"the file ends within a {unit} after {duration_s:.1f} s{', in flight' * in_flight}; later "
         "data are missing"
     )
-
-
-# Maximum probability that a source which repeats positions at random has a run of equal positions
-# that is rejected as frozen
-MAX_RANDOM_RUN_PROBABILITY = 0.01
 
 
 def finite_rows(

@@ -100,8 +100,8 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         dimension=dimension,
         ids=ids,
         poses=poses,
-        first=vertex_index[:, 0],
-        second=vertex_index[:, 1],
+        first_nodes=vertex_index[:, 0],
+        second_nodes=vertex_index[:, 1],
         measurements=_normalise_quaternions(edges, edge_values[:, :pose_width]),
         information=_information_matrices(
             edges, edge_values[:, pose_width:], 3 if dimension == 2 else 6
@@ -130,7 +130,7 @@ def g2o_text(graph: PoseGraph) -> str:
     edge_values = np.hstack(
         [graph.measurements, graph.information[:, upper_triangle[0], upper_triangle[1]]]
     ).tolist()
-    edges = zip(graph.first.tolist(), graph.second.tolist(), edge_values, strict=True)
+    edges = zip(graph.first_nodes.tolist(), graph.second_nodes.tolist(), edge_values, strict=True)
     lines += [
         f"EDGE_{pose_type} {ids[i]} {ids[j]} {' '.join(map(repr, values))}"
         for i, j, values in edges
@@ -202,13 +202,13 @@ def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
     return np.hstack([poses[:, :3], poses[:, 3:] / quaternion_norms[:, None]])
 
 
-def _information_matrices(edges: Rows, numbers: Array, size: int) -> Array:
-    """Return the information matrices, shape (n, size, size).
+def _information_matrices(edges: Rows, numbers: Array, dimension: int) -> Array:
+    """Return the information matrices, shape (n, dimension, dimension).
 
     ``numbers`` contains the upper triangle of each matrix, row by row.
     """
-    row, column = np.triu_indices(size)
-    matrices = np.empty((len(numbers), size, size))
+    row, column = np.triu_indices(dimension)
+    matrices = np.empty((len(numbers), dimension, dimension))
     matrices[:, row, column] = matrices[:, column, row] = numbers
     magnitudes = np.abs(numbers)
     is_too_small = (row == column) & (magnitudes > 0.0) & (magnitudes < _MIN_INFORMATION)

@@ -110,7 +110,7 @@ def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
     # message with most samples is used
     layout, rows = layouts_with_rows[0]
     if len(rows) < 2:
-        layout, rows = max(layouts_with_rows, key=lambda pair: len(pair[1]))
+        layout, rows = max(layouts_with_rows, key=lambda layout_rows: len(layout_rows[1]))
     if len(rows) < 2:
         return Unavailable("IMU", "the recording has no HIGHRES_IMU or SCALED_IMU", remedy)
     table = recording.frames.table(layout.topic, rows)

@@ -221,7 +221,7 @@ def read_truth(
         origin = local_origin(recording) if positions and positions[0].origin.is_gnss else None
         state = project_to_ned(samples, origin).join(samples[Columns.VELOCITY])
         return Truth(layout.topic, state[Columns.STATE], read_attitude(samples))
-    mocap_truth = px4_positions.motion_capture_truth(positions, "ATT_POS_MOCAP")
+    mocap_truth = px4_positions.motion_capture_truth(positions)
     for track in positions:
         if mocap_truth and track.name == mocap_truth.name:
             recording.record_stream("truth", *track.topics, clock=track.clock)

@@ -225,9 +225,9 @@ def _read_boot_times(frames: Frames, address: Address) -> tuple[IntArray, Array]
     is_usable = is_boot_time if np.any(is_boot_time) else (times_s >= MIN_UNIX_TIME_S)
     if is_usable.sum() >= MIN_CONSTANT_TIMESTAMPS and not is_running_clock(times_s[is_usable]):
         is_usable &= False
-    usable = np.flatnonzero(is_usable)
-    usable = usable[np.argsort(rows[usable])]
-    return rows[usable], times_s[usable]
+    order = np.flatnonzero(is_usable)
+    order = order[np.argsort(rows[order])]
+    return rows[order], times_s[order]
 
 
 def read_recording(frames: Frames, address: Address) -> Recording:

@@ -205,7 +205,7 @@ def configured_step_s(topics: Topics) -> float:
 def _prediction_interval_s(topics: Topics) -> float:
     """Return EKF2's prediction interval (s): whole IMU intervals (ImuDownSampler.cpp)."""
     configured_s = configured_step_s(topics)
-    imu_s = topics.read(px4.IMU).index.to_numpy()
+    imu_s = topics.read(Layout(px4.IMU.topic, {"time": "timestamp"})).index.to_numpy()
     if len(imu_s) < 2 or (interval_s := median_interval(imu_s)) >= configured_s:
         return configured_s
     layout = Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})

@@ -89,7 +89,7 @@ def split_tracks(
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Separate available positions, best source first, from missing position sources."""
     available_tracks = [track for track in tracks if isinstance(track, PositionTrack)]
-    available_tracks.sort(key=lambda track: track.origin.preference_rank)
+    available_tracks.sort(key=lambda track: track.origin.find_preference_rank())
     missing_tracks = (track for track in tracks if isinstance(track, Unavailable))
     return tuple(available_tracks), tuple(missing_tracks)
 
@@ -526,7 +526,7 @@ def read_truth(
                 local_samples[column] += np.nan_to_num(shift_m)
     if len(local_samples):
         return Truth(local_layout.topic, local_samples, attitude)
-    mocap_truth = motion_capture_truth(positions, "vehicle_mocap_odometry")
+    mocap_truth = motion_capture_truth(positions)
     reason = "the log has neither simulation ground truth nor motion capture"
     remedy = px4.TRACKS["vehicle_mocap_odometry"].remedy
     if len(logged_local):
@@ -535,12 +535,14 @@ def read_truth(
     return mocap_truth or Unavailable("ground truth", reason, remedy)
 
 
-def motion_capture_truth(positions: tuple[PositionTrack, ...], topic: str) -> Truth | None:
+def motion_capture_truth(positions: tuple[PositionTrack, ...]) -> Truth | None:
     """Return motion capture as ground truth, or None if EKF2 may have fused it.
 
-    EKF2 may have fused motion capture if the log contains no external vision.
+    EKF2 may have fused motion capture if the log contains no external vision. The
+    north of positions in FRD is unknown.
     """
-    track = next((track for track in positions if track.topics[0] == topic), None)
+    tracks = (track for track in positions if track.origin.kind == "mocap")
+    track = next((track for track in tracks if track.frame != "FRD"), None)
     if track is None or not any(track.origin.is_vision for track in positions):
         return None
     samples = track.samples.reindex(columns=Columns.STATE)

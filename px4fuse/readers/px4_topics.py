@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
+from msgspec import structs
 
 from px4fuse.core.record import read_toml
 from px4fuse.flight.ekf2_parameters import AIDS
@@ -28,6 +29,8 @@ class TrackSource:
     description: str
     # Advice how to record these positions
     remedy: str
+    # False if EKF2 never fuses these positions
+    fused: bool = True
     # Coordinate frame of the positions. If "unknown", a field of the topic may contain it (FRAMES)
     frame: str = "unknown"
     # Keys in LAYOUTS, one for each format of the topic in PX4 releases; empty for positions that
@@ -36,7 +39,8 @@ class TrackSource:
 
     @property
     def origin(self) -> Origin:
-        return find_origin(self.kind, self.path)
+        origin = find_origin(self.kind, self.path)
+        return origin if self.fused else structs.replace(origin, aid=None)
 
 
 _TABLE = read_toml(__file__, dict[str, dict[str, Any]])

@@ -130,14 +130,21 @@ def _require_samples(
 
 def _read_imu(topics: Topics) -> pd.DataFrame:
     imu = topics.read(px4.IMU)
-    if "accelerometer_offset_us" in imu:
-        offset_us = imu.pop("accelerometer_offset_us")
-        imu = imu[offset_us != ACCELEROMETER_OFFSET_INVALID_US]
-        time_us = np.rint(imu.index.to_numpy() * 1e6 + offset_us[imu.index].to_numpy())
+    # single arrays instead of tables, because a copy of all samples needs much memory
+    columns = {name: values.to_numpy() for name, values in imu.items()}
+    time_s, rows = imu.index.to_numpy(), np.arange(len(imu))
+    if (offset_us := columns.pop("accelerometer_offset_us", None)) is not None:
+        rows = np.flatnonzero(offset_us != ACCELEROMETER_OFFSET_INVALID_US)
+        time_us = np.rint(time_s[rows] * 1e6 + offset_us[rows])
         kept_rows = longest_increasing_run(time_us.astype(np.int64) + topics.zero_us)
-        imu = imu.iloc[kept_rows].set_axis(time_index(time_us[kept_rows] * 1e-6))
-    columns = Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE
-    return common.finite_rows(imu, columns, common.MAX_IMU_VALUE)
+        time_s, rows = time_us[kept_rows] * 1e-6, rows[kept_rows]
+    for name in Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE:
+        is_valid = np.abs(columns[name][rows]) < common.MAX_IMU_VALUE
+        time_s, rows = time_s[is_valid], rows[is_valid]
+    samples = np.empty((len(columns), len(rows)))
+    for row, values in zip(samples, columns.values(), strict=True):
+        row[:] = values[rows]
+    return pd.DataFrame(samples.T, time_index(time_s), list(columns), copy=False)
 
 
 def _read_airborne(topics: Topics) -> Spans | Unavailable:

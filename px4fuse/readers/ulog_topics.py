@@ -220,22 +220,23 @@ class Topics:
         instance_numbers = self.instances(layout.topic)
         number = instance if instance in instance_numbers else instance_numbers[0]
         table = self.tables[layout.topic, number]
-        columns = {**layout.columns, **layout.optional}
+        fields = {
+            column: field_name
+            for column, field_name in {**layout.columns, **layout.optional}.items()
+            if field_name in table
+        }
         time_us = measurement_time_us(table)
         kept_rows = longest_increasing_run(time_us)
         if len(kept_rows) < len(time_us):
             self.dropped[layout.topic, instance] = len(time_us) - len(kept_rows)
+        values = np.empty((len(fields), len(kept_rows)))
         with np.errstate(invalid="ignore"):  # damaged bytes can be signalling NaNs
-            samples = pd.DataFrame(
-                {
-                    column: table[field_name][kept_rows].astype(np.float64)
-                    * layout.scale.get(column, 1.0)
-                    for column, field_name in columns.items()
-                    if field_name in table
-                },
-                index=time_index((time_us[kept_rows] - self.zero_us) * _MICROSECOND_S),
-            )
-        samples = samples.where(np.abs(samples) < MAX_FIELD_VALUE)  # damaged values become NaN
+            for row, (column, field_name) in zip(values, fields.items(), strict=True):
+                field_values, scale = table[field_name][kept_rows], layout.scale.get(column, 1.0)
+                np.multiply(field_values, scale, out=row, dtype=np.float64)
+                row[~(np.abs(row) < MAX_FIELD_VALUE)] = np.nan  # damaged values
+        index = time_index((time_us[kept_rows] - self.zero_us) * _MICROSECOND_S)
+        samples = pd.DataFrame(values.T, index, list(fields), copy=False)
         end_s = self.log.duration_s + MAX_OUTSIDE_S
         return samples if step else samples.loc[-MAX_OUTSIDE_S:end_s]
 

@@ -4,14 +4,9 @@ from collections.abc import Sequence
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, describe_axis
-from px4fuse.card.model import (
-    FILTER_NAMES,
-    RATIO_AXIS_TICKS,
-    Card,
-    Verdict,
-    axis_fraction,
-)
+from px4fuse.card.model import RATIO_AXIS_TICKS, Card, Verdict, axis_fraction
 from px4fuse.card.verdicts import make_sigma_verdicts
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_ratio
 from px4fuse.errors import SettingsError
 from px4fuse.html.safe import load_template, read_asset

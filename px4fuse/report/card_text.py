@@ -11,7 +11,6 @@ import numpy as np
 from msgspec import convert, to_builtins
 
 from px4fuse.card.model import (
-    FILTER_NAMES,
     MAX_NOTES,
     RATIO_AXIS_ENDS,
     RATIO_AXIS_TICKS,
@@ -23,6 +22,7 @@ from px4fuse.card.model import (
     Verdict,
     axis_fraction,
 )
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.consistency import CONSISTENT_RATIOS, Reference
 from px4fuse.request import quote_command
@@ -171,7 +171,7 @@ def to_ascii(text: str) -> str:
 def format_consistent_ratios() -> str:
     """Format the σ ratios of a consistent filter, against position source and ground truth.
 
-    >>> band_limits()
+    >>> format_consistent_ratios()
     '● 0.8 to 1.25, ◆ 0.67 to 1.5'
     """
     return ", ".join(
@@ -183,9 +183,9 @@ def format_consistent_ratios() -> str:
 def draw_sigma_ratio(ratio: float | None, reference: Reference) -> str:
     """Draw one σ ratio on a logarithmic axis with the band of consistent ratios.
 
-    >>> axis_text(0.93, "source")
+    >>> draw_sigma_ratio(0.93, "source")
     '────────────────░●░░░────────────────'
-    >>> axis_text(128.0, "truth")
+    >>> draw_sigma_ratio(128.0, "truth")
     '───────────────░░░░░░░──────────────▶'
     """
     low, high = (_axis_column(end) for end in CONSISTENT_RATIOS[reference])

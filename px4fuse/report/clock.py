@@ -68,7 +68,7 @@ def clock_advice(
         advice_by_label["Re-run"] = f"px4fuse compare LOG --clock-offset {new_option_s:.3f}"
     if (logged_ms := delay_ms(comparison)) is not None:
         advice_by_label["PX4"] = _delay_advice(comparison, clock, logged_ms)
-    if clock.changes:
+    if clock.has_changed():
         offset_texts = ", ".join(
             f"{part.offset_s:+.2f} s from {part.start_s:.0f} s" for part in clock.parts
         )

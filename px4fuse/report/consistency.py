@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import FILTERS, AxisComparison
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison
 from px4fuse.comparison.trials import DISCREPANCIES, Statistic, Trial, find_cause, find_trials
 from px4fuse.core.text import format_number, format_p_value
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
@@ -115,7 +115,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 def _write_causes(page: Page, analysis: Analysis) -> None:
     axis = analysis.main.axis
     reruns_and_statistics: list[tuple[Trial, Statistic]] = []
-    for filter_name, statistic in product(FILTERS, DISCREPANCIES):
+    for filter_name, statistic in product(FILTER_NAMES, DISCREPANCIES):
         trials = find_trials(analysis.trials, filter_name, axis.name, statistic)
         reruns_and_statistics += [(trial, statistic) for trial in trials]
         cause = find_cause(trials, filter_name, axis.name, statistic)
@@ -125,7 +125,7 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     for trial, statistic in reruns_and_statistics:
         label, exponent = STATISTIC_LABELS_AND_POWERS[statistic]
         values = [outcome.value(statistic) or 0.0 for outcome in (trial.before, trial.after)]
-        cells = [trial.filter.upper(), format_change(analysis, trial), label]
+        cells = [FILTER_NAMES[trial.filter], format_change(analysis, trial), label]
         cells += [format_number(value**exponent, 2) for value in values]
         rows.append([*cells, format_explained_fraction(trial, statistic)])
     if not rows:
@@ -198,9 +198,9 @@ def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
         fill_colour = KF_COLOUR if name == "KF" else "white"
         dots = INNOVATION_DOTS[name] | {"ms": 3.0, "mew": 0.6, "mfc": fill_colour}
         axes.plot(lag_positions, correlations, **dots, label=name)
-        half_band = _whiteness_half_band(values)
-        axes.axhline(-half_band, **_thin_line_style(name))
-        axes.axhline(half_band, **_thin_line_style(name), label=f"95 % band {name}")
+        whiteness_half_band = _whiteness_half_band(values)
+        axes.axhline(-whiteness_half_band, **_thin_line_style(name))
+        axes.axhline(whiteness_half_band, **_thin_line_style(name), label=f"95 % band {name}")
     axes.axhline(0.0, color="black", lw=0.5)
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.3), -1.05), min(max(high, 0.3), 1.05))

@@ -5,7 +5,6 @@ from typing import Any
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.card.model import (
-    FILTER_NAMES,
     RATIO_AXIS_ENDS,
     RATIO_AXIS_TICKS,
     Action,
@@ -15,6 +14,7 @@ from px4fuse.card.model import (
     Verdict,
     axis_fraction,
 )
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_ratio
 from px4fuse.filter.consistency import Reference
 from px4fuse.report import fonts

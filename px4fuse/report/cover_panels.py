@@ -13,9 +13,9 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import FILTER_NAMES, Card
+from px4fuse.card.model import Card
 from px4fuse.comparison.comparison import kf_state_and_variance, position_errors, reported_sigma
-from px4fuse.comparison.model import FILTERS, AxisComparison, north_and_east
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, north_and_east
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.signals import AISLE, cut_to_segment
@@ -96,8 +96,7 @@ class FlightMap(NamedTuple):
     right_labels: Sequence[str]
     up_label: str
 
-    @property
-    def is_elongated(self) -> bool:
+    def has_elongated_track(self) -> bool:
         map_length_m, width_m = (float(np.ptp(values)) for values in self.tracks["positions"])
         return map_length_m >= MIN_LONG_TRACK_RATIO * max(width_m, 1e-6)
 
@@ -119,7 +118,7 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free_height: floa
     innovation_height = float(
         np.clip(INNOVATION_HEIGHT_FRACTION * plots_height, *INNOVATION_HEIGHT_RANGE)
     )
-    if flight_map.is_elongated and plots_height >= min_long_map_height:
+    if flight_map.has_elongated_track() and plots_height >= min_long_map_height:
         map_height = float(np.clip(MAP_HEIGHT_FRACTION * plots_height, *MAP_HEIGHT_RANGE))
         _draw_map(page, analysis, flight_map, map_height)
         error_heights = _equal_heights(page, errors, plots_height - map_height - innovation_height)
@@ -172,10 +171,10 @@ def _title_height(page: Page, title: str) -> float:
 
 def _position_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
     """Return plots of the position errors of KF and EKF2, or of KF - EKF2 without ground truth."""
-    result, effect = analysis.main.in_flight, card.effect
+    result, effect = analysis.main.with_flight_tracks(), card.effect
     errors_by_filter = {
         filter_name: errors
-        for filter_name in FILTERS
+        for filter_name in FILTER_NAMES
         if isinstance(errors := position_errors(result, filter_name), pd.DataFrame)
         and errors["error_m"].notna().any()
     }

@@ -239,7 +239,8 @@ def unaligned_sentence(evaluation: Evaluation) -> str:
     shift_m = float(np.linalg.norm(alignment.apply(centre_m) - centre_m))
     return (
         f"RMSE before alignment {format_metres(rmse_m)} m. Alignment: rotation "
-        f"{np.degrees(alignment.rotation.magnitude()):.1f}°, translation {format_metres(shift_m)} m"
+        f"{np.degrees(alignment.to_rotation().magnitude()):.1f}°, translation "
+        f"{format_metres(shift_m)} m"
         f"{scale_text} (difference of the frames, not an error)."
     )
 

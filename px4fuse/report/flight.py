@@ -135,7 +135,7 @@ def zoom_sentence(result: AxisComparison) -> str:
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw one column for each axis other than the main axis."""
-    secondary_axes = analysis.secondary_axes
+    secondary_axes = analysis.select_secondary_axes()
     if not secondary_axes:
         return
     page = Page(

@@ -29,8 +29,7 @@ def font_of(character: str) -> str | None:
 
 def font_names(text: str) -> list[str]:
     """Return the names of the fonts for a text, DejaVu Sans first."""
-    names = [font_of(character) for character in _non_ascii(text)]
-    return list(dict.fromkeys([FONT, *(name for name in names if name is not None)]))
+    return list(dict.fromkeys([FONT, *filter(None, map(font_of, _non_ascii(text)))]))
 
 
 def font_folders(names: tuple[str, ...]) -> list[str]:

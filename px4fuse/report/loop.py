@@ -98,7 +98,7 @@ def draw_map(axes: Axes, loop: Loop) -> None:
     odometry_path = loop.odometry.trajectory
     axis_names = AXES_OF_FRAME[odometry_path.frame]
     _draw_reference(axes, loop)
-    for corrected_path in loop.reported_paths:
+    for corrected_path in loop.select_reported_paths():
         track, name = corrected_path.trajectory, corrected_path.name
         if name in PATH_STYLES:
             horizontal_m = track.position_m[:, (1, 0)]
@@ -125,7 +125,7 @@ def draw_map(axes: Axes, loop: Loop) -> None:
 
 def _draw_reference(axes: Axes, loop: Loop) -> None:
     for reference in loop.references[:1]:
-        evaluation = loop.best.scores.get(reference.name)
+        evaluation = loop.choose_best_path().scores.get(reference.name)
         if isinstance(evaluation, Evaluation):
             reference_m = evaluation.transform.apply_inverse(evaluation.reference_m)[:, (1, 0)]
             line = {"label": reference.name, "zorder": 4, **TRACK_LINES["ground truth"]}
@@ -169,7 +169,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
         *(f"ATE against\n{name} (m)" for name in names),
     ]
     rows = []
-    for path in loop.reported_paths:
+    for path in loop.select_reported_paths():
         correction_text = "–"
         if path.correction_max_m:
             correction_text = f"{path.correction_rms_m:.2f} / {path.correction_max_m:.2f}"
@@ -211,7 +211,7 @@ def write_scores(page: Page, loop: Loop) -> None:
     for reference in loop.references:
         page.heading(f"RPE against {reference.name}")
         evaluations, reasons = dict[str, Evaluation](), dict[str, None]()
-        for path in loop.reported_paths:
+        for path in loop.select_reported_paths():
             evaluation = path.scores[reference.name]
             if isinstance(evaluation, Unavailable):
                 reasons[evaluation.reason] = None
@@ -277,7 +277,7 @@ def closure_name(closure: Closure, loop: Loop) -> str:
 
 def correction_by_distance_sentence(loop: Loop) -> str:
     """Explain the correction of the path in proportion to distance; "" if it was not made."""
-    if "by_distance_plain" not in loop.paths:
+    if "by_distance_plain" not in loop.find_paths():
         return ""
     heading_deg = loop.heading_error_deg
     heading_sentence = (
@@ -318,10 +318,10 @@ def pose_graph_page(solved_graph: Graph) -> Page:
         f"{solved_graph.name}: {solved_graph.dimension}-D, {solved_graph.poses} poses, "
         f"{solved_graph.edges} edges; initial poses: {solved_graph.initialised}",
     )
-    low, high = solved_graph.chi2_ratio_interval
+    low, high = solved_graph.reduced_chi2_interval
     if high > 0.0:
         fit_text = (
-            f"χ² per degree of freedom {format_number(solved_graph.chi2_ratio)} (95 % "
+            f"χ² per degree of freedom {format_number(solved_graph.reduced_chi2)} (95 % "
             f"{format_number(low)} to {format_number(high)} expected)"
         )
         if (factor := solved_graph.information_factor) > 1.0:
@@ -330,9 +330,9 @@ def pose_graph_page(solved_graph: Graph) -> Page:
                 f"{format_number(factor, 2)} times too large. Gate and robust optimisation use "
                 "the information divided by this factor."
             )
-        elif solved_graph.chi2_ratio > high:
+        elif solved_graph.reduced_chi2 > high:
             fit_text += ". Possible causes: false closures, or too large information matrices."
-        elif solved_graph.chi2_ratio < low:
+        elif solved_graph.reduced_chi2 < low:
             fit_text += ": the information matrices are too small, so the gate is too wide."
         page.write_labelled("Fit", fit_text)
     if isinstance(gates, Unavailable):

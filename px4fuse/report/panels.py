@@ -87,7 +87,7 @@ class Panel(NamedTuple):
         )
         if is_narrow:
             axes.locator_params(axis="x", nbins=4)
-        self.draw(axes, result.in_flight)
+        self.draw(axes, result.with_flight_tracks())
         page.write_small(statistics_text)
 
 
@@ -275,7 +275,7 @@ def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
         return ""
     start_s, end_s = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])
     sigma_texts = []
-    for name, table in _variance_tables(result.in_flight).items():
+    for name, table in _variance_tables(result.with_flight_tracks()).items():
         variance_m2 = table.loc[start_s:end_s, "position_variance_m2"]
         if len(variance_m2) > 1 and np.isfinite(variance_m2.max()):
             sigma_texts.append(f"{np.sqrt(variance_m2.max()):.2g} m ({name})")

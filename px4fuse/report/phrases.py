@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from px4fuse.comparison.model import (
+    FILTER_NAMES,
     AxisComparison,
     Comparison,
     Difference,
@@ -55,7 +56,7 @@ def format_settings(settings: Settings) -> str:
 def format_verdict(consistency: Consistency | Unavailable) -> str:
     """State whether a filter is consistent, or by which factor its reported σ is wrong."""
     if isinstance(consistency, Unavailable):
-        return "not logged"
+        return "not evaluated"
     return format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
 
 
@@ -71,11 +72,13 @@ def format_sigma_verdict(verdict: str, factor: float) -> str:
 
 
 def statistics_by_filter(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
-    """Return the statistics of KF, and of EKF2 if logged, by filter name."""
-    filters = {"KF": result.filters["kf"]}
-    if not isinstance(result.ekf2_state, Unavailable):
-        filters["EKF2"] = result.filters["ekf2"]
-    return filters
+    """Return the statistics of each filter, without EKF2 if it is not logged, by label."""
+    is_ekf2_missing = isinstance(result.ekf2_state, Unavailable)
+    return {
+        FILTER_NAMES[name]: statistics
+        for name, statistics in result.filters.items()
+        if not (name == "ekf2" and is_ekf2_missing)
+    }
 
 
 VERDICT_TABLE_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
@@ -96,7 +99,7 @@ def verdict_cells(result: AxisComparison, name: str) -> list[Cell]:
 
 def write_error_table(page: Page, analysis: Analysis) -> None:
     """Write a table of consistency tests and position errors of KF and EKF2 along all axes."""
-    axes = (analysis.main, *analysis.secondary_axes)
+    axes = (analysis.main, *analysis.select_secondary_axes())
     has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
     has_truth = isinstance(analysis.flight.truth, Truth)
 
@@ -131,17 +134,17 @@ def verdict_notes(comparison: Comparison) -> list[str]:
             "The position source may drift. The verdicts compare each filter with the source, "
             "not with the true position. Check the error with ground truth or a loop."
         )
-    correlated_filters = [
+    correlated_filter_texts = [
         f"{filter_name} along {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"
         for axis, filter_name, consistency in consistencies
         if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITE_P_VALUE
     ]
-    if correlated_filters:
+    if correlated_filter_texts:
         notes.append(
             "Innovations are not white, although their variance is consistent (Ljung-Box test, p "
-            f"< {MIN_WHITE_P_VALUE:g}): {'; '.join(correlated_filters)}. If the autocorrelation is "
-            "positive, the filter lags and SIGMA_A may be too small. If it is negative, the filter "
-            "follows the measurement noise and SIGMA_A may be too large."
+            f"< {MIN_WHITE_P_VALUE:g}): {'; '.join(correlated_filter_texts)}. If the "
+            "autocorrelation is positive, the filter lags and SIGMA_A may be too small. If it is "
+            "negative, the filter follows the measurement noise and SIGMA_A may be too large."
         )
     return notes
 

@@ -47,7 +47,7 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) ->
 def _write_log(page: Page, flight: Flight, source: PositionTrack | None) -> None:
     log = flight.log
     other_positions = (
-        f"{track.name} ({track.rate_hz:.1f} Hz)"
+        f"{track.name} ({track.compute_rate_hz():.1f} Hz)"
         for track in flight.positions
         if track is not source
     )

@@ -75,7 +75,7 @@ def card_page(block_kind: str, card: Card) -> Page:
 def _describe_setup(comparison: Comparison) -> dict[str, str]:
     source, segment = comparison.source, comparison.segment
     position_text = (
-        f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, "
+        f"{source.name}: {source.description}, {source.compute_rate_hz():.1f} Hz, "
         f"{source.frame}; {comparison.source_reason}"
     )
     alignment = {} if source.alignment is None else describe_alignment(source.alignment)

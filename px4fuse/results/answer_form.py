@@ -185,7 +185,7 @@ class Answers(Record, kw_only=True):
     choices: Annotated[tuple[ChoiceName, ...], Meta(max_length=MAX_CHOICES)] = ()
 
     @property
-    def names_no_fault(self) -> bool:
+    def states_no_fault(self) -> bool:
         """True if the student states that the flight has no fault."""
         return [mistake.kind for mistake in self.mistakes] == [NO_FAULT_KIND]
 

@@ -41,7 +41,7 @@ def bounds_of(name: str) -> tuple[float, float]:
 
 
 def within_bounds(results: T) -> T:
-    """Remove numbers outside their valid range from results.
+    """Remove fields of type NotWritten and numbers outside their valid range from results.
 
     An optional number is set to None. If the number is required, the record that contains it is
     deleted or replaced by an Unavailable. The reasons are added to ``missing`` or ``notes``.
@@ -93,6 +93,8 @@ def _check_value(value: Any, annotation: Any, path: str, reasons: list[str]) -> 
 def _check_struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgspec.Struct:
     changes: dict[str, Any] = {}
     for field in fields(value):
+        if field.type is msgspec.UnsetType:  # NotWritten
+            continue
         element, field_path = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
         try:
             changes[field.name] = _check_or_replace(element, field.type, field_path, reasons)
@@ -101,7 +103,7 @@ def _check_struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgsp
                 raise
             reasons.append(str(error))
             changes[field.name] = None
-    return replace(value, **changes)
+    return type(value)(**changes)
 
 
 def _check_mapping(value: Mapping[str, Any], annotation: Any, path: str, reasons: list[str]) -> Any:

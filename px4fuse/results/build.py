@@ -9,7 +9,6 @@ import msgspec
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
 from px4fuse.card.build import build_aids_card, build_card
 from px4fuse.comparison.model import PreparedComparison
-from px4fuse.core.record import to_serializable
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import find_loop
@@ -54,7 +53,7 @@ def results(
     # the other fields of the results are copied from the analysis
     for name in contract.ComparisonResults.__struct_fields__:
         if name not in fields:
-            fields[name] = to_serializable(getattr(analysis, name))
+            fields[name] = getattr(analysis, name)
     return within_bounds(contract.ComparisonResults(**fields))
 
 
@@ -82,16 +81,14 @@ def tuning_results(
     tuning_by_axis: Mapping[str, AxisTuning | Unavailable],
 ) -> contract.TuningResults:
     common_fields = _flight_fields("px4fuse-tuning", request, comparison, "tune")
-    return within_bounds(
-        contract.TuningResults(**common_fields, tuning=to_serializable(tuning_by_axis))
-    )
+    return within_bounds(contract.TuningResults(**common_fields, tuning=dict(tuning_by_axis)))
 
 
 def sync_results(
     request: ComparisonRequest, comparison: PreparedComparison, clock: ClockOffset | Unavailable
 ) -> contract.SyncResults:
     common_fields = _flight_fields("px4fuse-sync", request, comparison, "sync")
-    return within_bounds(contract.SyncResults(**common_fields, clock=to_serializable(clock)))
+    return within_bounds(contract.SyncResults(**common_fields, clock=clock))
 
 
 def whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract.WhatIfResults:
@@ -118,7 +115,7 @@ def loop_results(request: LoopRequest, loop: Loop, student: Student) -> contract
             request=request.without_paths(),
             track=loop.odometry.trajectory.track(),
             references=tuple(reference.track() for reference in loop.references),
-            loop=to_serializable(loop),
+            loop=loop,
             findings=find_loop(loop),
             student=student,
             provenance=provenance(command_line(request)),
@@ -135,16 +132,14 @@ def evaluation_results(
             estimate=evaluation.estimate_track.track(),
             reference=evaluation.reference_track.track(),
             provenance=provenance(command_line(request)),
-            **msgspec.structs.asdict(to_serializable(evaluation)),
+            **msgspec.structs.asdict(evaluation),
         )
     )
 
 
 def graph_results(solved_graph: Graph, command: str) -> contract.GraphResults:
     return within_bounds(
-        contract.GraphResults(
-            schema_of("px4fuse-graph"), to_serializable(solved_graph), provenance(command)
-        )
+        contract.GraphResults(schema_of("px4fuse-graph"), solved_graph, provenance(command))
     )
 
 
@@ -179,10 +174,14 @@ def _flight_fields(
         **track.description_fields(),
         ekf2_parameters={} if origin.aid is None else origin.aid.logged_parameters(parameters),
         reason=comparison.source_reason,
-        rate_hz=track.rate_hz,
+        rate_hz=track.compute_rate_hz(),
         available=tuple(
             AvailableTrack(
-                each.name, each.origin.kind, each.origin.path, len(each.samples), each.rate_hz
+                each.name,
+                each.origin.kind,
+                each.origin.path,
+                len(each.samples),
+                each.compute_rate_hz(),
             )
             for each in comparison.flight.positions
         ),

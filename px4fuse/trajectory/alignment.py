@@ -49,19 +49,18 @@ class Transform(Record):
     scale: float
     degrees_of_freedom: Count
 
-    @property
-    def rotation(self) -> Rotation:
-        """Rotation R from the frame of the estimate to the frame of the reference."""
+    def to_rotation(self) -> Rotation:
+        """Return the rotation R from the frame of the estimate to the frame of the reference."""
         return Rotation.from_quat(self.quaternion_wxyz, scalar_first=True)
 
     def apply(self, position_m: Array) -> Array:
         """Transform positions to the frame of the reference, shape (n, 3) or (3,)."""
-        rotated: Array = self.rotation.apply(self.scale * position_m)
+        rotated: Array = self.to_rotation().apply(self.scale * position_m)
         return rotated + self.translation_m
 
     def apply_inverse(self, position_m: Array) -> Array:
         """Transform positions to the frame of the estimate, shape (n, 3) or (3,)."""
-        shifted: Array = self.rotation.inv().apply(position_m - np.array(self.translation_m))
+        shifted: Array = self.to_rotation().inv().apply(position_m - np.array(self.translation_m))
         return shifted / self.scale
 
 

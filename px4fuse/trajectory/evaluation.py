@@ -270,7 +270,7 @@ def evaluate(
     )
     jump_warnings = find_jumps(matched_estimate, matched_reference)
     aligned_estimate = matched_estimate.with_positions(
-        transform.apply(matched_estimate.position_m), transform.rotation
+        transform.apply(matched_estimate.position_m), transform.to_rotation()
     )
     aligned_estimate, notes = _with_reference_body_axes(aligned_estimate, matched_reference)
     if not notes and has_other_body_axes(aligned_estimate, matched_reference):
@@ -281,7 +281,7 @@ def evaluate(
             matched_estimate.position_m, matched_reference.position_m, alignment
         )
         aligned_estimate = matched_estimate.with_positions(
-            transform.apply(matched_estimate.position_m), transform.rotation
+            transform.apply(matched_estimate.position_m), transform.to_rotation()
         )
     distance_m = cumulative_distance(matched_reference.position_m)
     position_error_m = np.linalg.norm(
@@ -516,7 +516,9 @@ def _move_to_reference_body(
     for _ in range(LEVER_ARM_ITERATIONS):
         transform = fit_alignment(corrected_estimate.position_m, reference.position_m, alignment)
         # chordal mean (Hartley 2013, section 5.3)
-        body_rotation = ((transform.rotation * estimate.rotation).inv() * reference.rotation).mean()
+        body_rotation = (
+            (transform.to_rotation() * estimate.rotation).inv() * reference.rotation
+        ).mean()
         error_m = transform.apply(estimate.position_m) - reference.position_m
         centred_error_m = (error_m - error_m.mean(axis=0)).ravel()
         lever_arm_m = np.linalg.lstsq(centred_axes, centred_error_m, rcond=None)[0]

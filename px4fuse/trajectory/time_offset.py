@@ -124,8 +124,8 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         )
     fits = (_refine_offset(sparse_track, dense_track, lag, SEARCH_WINDOW_S) for lag in candidates)
     accepted_fits = sorted(
-        (fit for fit in fits if fit is not None and fit.misfit <= MAX_MISFIT),
-        key=lambda fit: fit.misfit,
+        (fit for fit in fits if fit is not None and fit.compute_misfit() <= MAX_MISFIT),
+        key=lambda fit: fit.compute_misfit(),
     )
     if not accepted_fits:
         return _not_determinable(
@@ -134,7 +134,9 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         )
     best_fit = accepted_fits[0]
     similar_fits = [
-        fit for fit in accepted_fits if fit.misfit <= MIN_SECOND_PEAK_RATIO * best_fit.misfit
+        fit
+        for fit in accepted_fits
+        if fit.compute_misfit() <= MIN_SECOND_PEAK_RATIO * best_fit.compute_misfit()
     ]
     if clock_offset_s is not None:
         # Of several offsets that fit equally well, the nearest to the UNIX time is used
@@ -144,7 +146,8 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         if difference_s > MIN_PEAK_DISTANCE_S:
             return _not_determinable(
                 f"the motion is periodic: with a time offset that differs by {difference_s:.1f} s "
-                f"the ATE is {fit.rms_m:.3g} m instead of {best_fit.rms_m:.3g} m"
+                f"the ATE is {fit.compute_rms_m():.3g} m instead of "
+                f"{best_fit.compute_rms_m():.3g} m"
             )
     # The fit is repeated with a narrower window of offsets, within which more poses overlap in time
     best_fit = (
@@ -163,7 +166,7 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         interval_s=(best_fit.offset_s - half_interval_s, best_fit.offset_s + half_interval_s),
         is_determinable=True,
         reason="The time offset has the maximum speed correlation and the minimum ATE "
-        f"({best_fit.rms_m:.3g} m, {len(best_fit.time_s)} poses).",
+        f"({best_fit.compute_rms_m():.3g} m, {len(best_fit.time_s)} poses).",
     )
 
 
@@ -215,15 +218,15 @@ def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArr
 
 def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[float]:
     """Find the time offsets with correlated speeds, best first (Padfield 2012, eqs. 3 to 9)."""
-    spans_s = [float(np.ptp(track.time_s)) for track in (sparse_track, dense_track)]
-    step_s = max(GRID_STEP_S, max(spans_s) / MAX_GRID_SAMPLES)
-    shorter_span_s = min(spans_s)
-    if shorter_span_s < 10 * step_s:
+    durations_s = [float(np.ptp(track.time_s)) for track in (sparse_track, dense_track)]
+    step_s = max(GRID_STEP_S, max(durations_s) / MAX_GRID_SAMPLES)
+    shorter_duration_s = min(durations_s)
+    if shorter_duration_s < 10 * step_s:
         return []
     (sparse_speeds, is_known_sparse), (dense_speeds, is_known_dense) = (
         _speeds(track, step_s) for track in (sparse_track, dense_track)
     )
-    min_count = MIN_OVERLAP_FRACTION * shorter_span_s / step_s
+    min_count = MIN_OVERLAP_FRACTION * shorter_duration_s / step_s
     correlations = []
     # angular speeds are only compared if both trajectories have orientations
     for sparse_values, dense_values in zip(sparse_speeds, dense_speeds, strict=False):
@@ -264,17 +267,15 @@ class _OffsetFit:
     aligned_m: Array
     target_m: Array
 
-    @property
-    def rms_m(self) -> float:
-        """RMS (m) of the residuals."""
+    def compute_rms_m(self) -> float:
+        """Return the RMS (m) of the residuals."""
         return rms_m(self.target_m - self.aligned_m)
 
-    @property
-    def misfit(self) -> float:
-        """Ratio of RMS residual to RMS extent of the motion; the best fit has the smallest."""
+    def compute_misfit(self) -> float:
+        """Return the ratio of RMS residual to RMS extent of the motion; the least is best."""
         # Extent of the dense trajectory, because a bad fit shrinks the sparse one to a point
         extent_m = float(np.sqrt(self.target_m.var(axis=0).sum()))
-        return max(self.rms_m / extent_m, MIN_MISFIT) if extent_m > 0.0 else float("inf")
+        return max(self.compute_rms_m() / extent_m, MIN_MISFIT) if extent_m > 0.0 else float("inf")
 
 
 def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _OffsetFit) -> float:
@@ -286,7 +287,7 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
     pose_count = len(fit.time_s)
     centred_m = fit.aligned_m - fit.aligned_m.mean(axis=0)
     dense_velocity = _velocity(dense_track, fit.time_s + fit.offset_s)
-    sparse_velocity = fit.transform.rotation.apply(
+    sparse_velocity = fit.transform.to_rotation().apply(
         fit.transform.scale * _velocity(sparse_track, fit.time_s)
     )
     # Remove the velocity that a translation, a small rotation or a scale factor can explain
@@ -327,8 +328,8 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
 def _correlation_length(values: Array) -> int:
     """Return the first lag with autocorrelation below 1/e, at most n / 4."""
     covariance_by_lag = autocovariance(values - values.mean())
-    low_lags = np.flatnonzero(covariance_by_lag < covariance_by_lag[0] / np.e)
-    return int(low_lags[0]) if len(low_lags) else len(values) // 4
+    lags_below_limit = np.flatnonzero(covariance_by_lag < covariance_by_lag[0] / np.e)
+    return int(lags_below_limit[0]) if len(lags_below_limit) else len(values) // 4
 
 
 def _refine_offset(
@@ -371,8 +372,5 @@ def _refine_offset(
     # tolerance of the optimiser would be seconds
     shifts_s = window_s * np.linspace(-1.0, 1.0, 21)
     best_index = int(np.argmin([cost(shift) for shift in shifts_s]))
-    search_bracket = (
-        shifts_s[max(best_index - 1, 0)],
-        shifts_s[min(best_index + 1, len(shifts_s) - 1)],
-    )
-    return fit_at(float(minimize_scalar(cost, bounds=search_bracket, method="bounded").x))
+    bounds_s = (shifts_s[max(best_index - 1, 0)], shifts_s[min(best_index + 1, len(shifts_s) - 1)])
+    return fit_at(float(minimize_scalar(cost, bounds=bounds_s, method="bounded").x))

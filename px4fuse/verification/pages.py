@@ -197,7 +197,7 @@ class _PdfComparison:
             yield PageDifference(0, SECOND_TABLE, True)
 
     def _compare(
-        self, submitted_value: Any, redrawn_value: Any, key: str, page: int
+        self, submitted_value: Any, redrawn_value: Any, key: str, page_number: int
     ) -> Iterator[PageDifference]:
         """Yield the differences of two PDF values, including all nested values."""
         remaining_values = [(submitted_value, redrawn_value, key)]
@@ -209,7 +209,7 @@ class _PdfComparison:
             if isinstance(submitted_value, IndirectObject):
                 if submitted_value.generation:  # some programs ignore generation numbers
                     description = f"the PDF entry {key} refers to an object of generation above 0"
-                    yield PageDifference(page, description, True)
+                    yield PageDifference(page_number, description, True)
                 if isinstance(redrawn_value, IndirectObject):
                     object_ids = (
                         submitted_value.idnum,
@@ -224,11 +224,13 @@ class _PdfComparison:
             )
             if _pdf_type_of(submitted_value) is not _pdf_type_of(redrawn_value):
                 yield PageDifference(
-                    page, f"the type of the PDF entry {key} differs from the redrawn report", True
+                    page_number,
+                    f"the type of the PDF entry {key} differs from the redrawn report",
+                    True,
                 )
             elif isinstance(redrawn_value, DictionaryObject):
                 yield from self._compare_dictionaries(
-                    submitted_value, redrawn_value, key, page, remaining_values
+                    submitted_value, redrawn_value, key, page_number, remaining_values
                 )
             elif isinstance(redrawn_value, ArrayObject):
                 if len(submitted_value) != len(redrawn_value):
@@ -236,21 +238,21 @@ class _PdfComparison:
                         f"the PDF array {key} has {len(submitted_value)} elements instead of "
                         f"{len(redrawn_value)}"
                     )
-                    yield PageDifference(page, description, True)
+                    yield PageDifference(page_number, description, True)
                     continue
                 pairs = zip(*map(list.__iter__, (submitted_value, redrawn_value)), strict=True)
                 remaining_values += [(*pair, key) for pair in pairs][::-1]
             elif not self._is_same_value(submitted_value, redrawn_value):
                 texts = [one_line(str(value), 60) for value in (submitted_value, redrawn_value)]
                 description = f"the PDF entry {key} is {texts[0]!r}; px4fuse writes {texts[1]!r}"
-                yield PageDifference(page, description)
+                yield PageDifference(page_number, description)
 
     def _compare_dictionaries(
         self,
         submitted_dictionary: DictionaryObject,
         redrawn_dictionary: DictionaryObject,
         key: str,
-        page: int,
+        page_number: int,
         remaining_values: list[tuple[Any, Any, str]],
     ) -> Iterator[PageDifference]:
         """Yield keys and streams that differ; append the values to ``remaining_values``."""
@@ -261,14 +263,18 @@ class _PdfComparison:
             description = f"{feature} is missing"
             if name in submitted_keys:
                 description = f"the PDF contains {feature}, which px4fuse does not write"
-            yield PageDifference(page, description, True)
+            yield PageDifference(page_number, description, True)
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
             values = submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name
-            (self.page_parents if page and name == "/Parent" else remaining_values).append(values)
+            (self.page_parents if page_number and name == "/Parent" else remaining_values).append(
+                values
+            )
         if isinstance(submitted_dictionary, StreamObject) and isinstance(
             redrawn_dictionary, StreamObject
         ):
-            yield from self._compare_streams(submitted_dictionary, redrawn_dictionary, key, page)
+            yield from self._compare_streams(
+                submitted_dictionary, redrawn_dictionary, key, page_number
+            )
 
     def _is_same_value(self, submitted_value: Any, redrawn_value: Any) -> bool:
         if _pdf_type_of(redrawn_value) is float:
@@ -284,7 +290,11 @@ class _PdfComparison:
         return all(map(_TYPST_VERSION_PATTERN.fullmatch, texts)) or self.is_same_text(*texts)
 
     def _compare_streams(
-        self, submitted_stream: StreamObject, redrawn_stream: StreamObject, key: str, page: int
+        self,
+        submitted_stream: StreamObject,
+        redrawn_stream: StreamObject,
+        key: str,
+        page_number: int,
     ) -> Iterator[PageDifference]:
         stream_type = redrawn_stream.get("/Type")
         if stream_type == "/EmbeddedFile":  # the attached results are compared as numbers
@@ -292,7 +302,7 @@ class _PdfComparison:
         filters = resolve_reference(submitted_stream.get("/Filter"))
         if filters not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
             yield PageDifference(
-                page, f"the compression of the PDF entry {key} is not supported", True
+                page_number, f"the compression of the PDF entry {key} is not supported", True
             )
             return
         submitted_data, redrawn_data = submitted_stream.get_data(), redrawn_stream.get_data()
@@ -303,9 +313,11 @@ class _PdfComparison:
             return
         is_drawing = key == "/Contents" or stream_type == "/Pattern"
         if not is_drawing or len(submitted_data) > MAX_CONTENT_RATIO * len(redrawn_data):
-            yield PageDifference(page, f"the content of {key} differs from the redrawn report")
+            yield PageDifference(
+                page_number, f"the content of {key} differs from the redrawn report"
+            )
         elif description := self._describe_operation_difference(submitted_data, redrawn_data):
-            yield PageDifference(page, description)
+            yield PageDifference(page_number, description)
 
     def _describe_operation_difference(
         self, submitted_content: bytes, redrawn_content: bytes

@@ -30,7 +30,7 @@ from px4fuse.core.writing import write_all
 from px4fuse.errors import OutputError
 from px4fuse.results.answer_form import form_name, form_text
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 
 # Fields of a simulation whose true values are written to the answer key
 TRUE_VALUE_NAMES = (
@@ -49,14 +49,14 @@ def simulate_assigned_flight(
     student: Person,
     kind: FlightKind,
     fault_count: int | None = None,
-    logs_truth: bool = True,
+    with_ground_truth: bool = True,
 ) -> tuple[bytes, RightAnswers]:
     """Simulate the flight of one student; return the log (ULog) and the right answers."""
     assigned_flight = assign_random_flight(
-        secret, student.student_id, kind, fault_count, logs_truth
+        secret, student.student_id, kind, fault_count, with_ground_truth
     )
     simulation = flights.simulate(
-        assigned_flight.scenario, parse_mistakes(assigned_flight.mistake_options)
+        assigned_flight.scenario, parse_faults(assigned_flight.mistake_options)
     )
     log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()
@@ -101,7 +101,7 @@ def assign(
     secret: bytes | None,
     kind: FlightKind,
     fault_count: int | None = None,
-    logs_truth: bool = True,
+    with_ground_truth: bool = True,
     progress: Callable[[int, int], None] = lambda *_: None,
 ) -> tuple[AnswerKey, int]:
     """Write log, answer form and figures of each student to a folder, and the answer key.
@@ -115,7 +115,7 @@ def assign(
         random secret.
     fault_count : int, optional
         Number of injected faults of each flight; random by default.
-    logs_truth : bool
+    with_ground_truth : bool
         True to log the ground truth.
 
     Returns
@@ -148,7 +148,9 @@ def assign(
         stored_secret = ""
     written_count = 0
     for finished_count, student in enumerate(students, start=1):
-        log, answer = simulate_assigned_flight(secret, student, kind, fault_count, logs_truth)
+        log, answer = simulate_assigned_flight(
+            secret, student, kind, fault_count, with_ground_truth
+        )
         stored_answer = answers.setdefault(normalise_text(student.student_id), answer)
         _require_same_flights(key_file, stored_answer.sha256 == answer.sha256)
         choices = stored_answer.form.choices if stored_answer.form else ()

@@ -8,22 +8,21 @@ from io import BytesIO
 
 import pandas as pd
 
-from px4fuse.card.model import FILTER_NAMES
 from px4fuse.classroom.assignment.random_assignment import random_scenario_numbers
 from px4fuse.classroom.assignment.truth import compare_simulation
 from px4fuse.comparison.comparison import position_errors
-from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison, FilterName
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, Comparison, FilterName
 from px4fuse.core.record import Record, read_toml
 from px4fuse.flight.model import Ekf2, Truth
 from px4fuse.report import panels, style
 from px4fuse.results.answer_form import CHOICE_NAMES, Choice, ChoiceName
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import make_scenario
 
 FIGURE_COUNT = 3
 # Number of passes along the aisle in each simulated flight
-PASSES = 4
+PASS_COUNT = 4
 # Minimum speed (m/s) along the aisle for a grey background in the plots
 MIN_GREY_SPEED_M_S = 0.2
 # Questions about each figure, by the field of FigureFault that contains the right answer
@@ -92,9 +91,9 @@ def draw_figures(random_number: Callable[[str], float]) -> bytes:
 
         numbers = random_scenario_numbers("aisle", figure_random_number)
         seed = int(2**53 * figure_random_number("seed"))
-        scenario = make_scenario("aisle", passes=PASSES, seed=seed, **numbers)
-        mistakes = parse_mistakes(tuple(filter(None, [FAULTS[kind].option])))
-        comparisons[title] = compare_simulation(flights.simulate(scenario, mistakes))
+        scenario = make_scenario("aisle", passes=PASS_COUNT, seed=seed, **numbers)
+        faults = parse_faults(tuple(filter(None, [FAULTS[kind].option])))
+        comparisons[title] = compare_simulation(flights.simulate(scenario, faults))
     return _figures_png(comparisons)
 
 
@@ -104,28 +103,25 @@ def _figures_png(comparisons: Mapping[str, Comparison]) -> bytes:
 
     png_buffer = BytesIO()
     with style.report_style():
-        picture = Figure(figsize=(17.0, 3.6 * len(comparisons)), layout="constrained")
-        rows = picture.subplots(len(comparisons), 4, squeeze=False)
+        figure = Figure(figsize=(17.0, 3.6 * len(comparisons)), layout="constrained")
+        rows = figure.subplots(len(comparisons), 4, squeeze=False)
         for (title, comparison), axes in zip(comparisons.items(), rows, strict=True):
-            result = comparison.main.in_flight
+            result = comparison.main.with_flight_tracks()
             axes[0].set_title(f"{title}: innovations along the aisle and ±2√S (m)")
             panels.draw_innovations(axes[0], result)
-            for axis, filter_name in zip(axes[1:3], FILTERS, strict=True):
+            for axis, filter_name in zip(axes[1:3], FILTER_NAMES, strict=True):
                 _draw_errors(axis, result, filter_name)
             for axis in axes[:3]:
                 style.label_time_axis(axis, with_time_label=True)
             _draw_map(axes[3], comparison)
-        picture.savefig(png_buffer, format="png", dpi=90, metadata={"Software": None})
+        figure.savefig(png_buffer, format="png", dpi=90, metadata={"Software": None})
     return png_buffer.getvalue()
 
 
 def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterName) -> None:
     """Plot the position error of a filter with ±2σ; grey background during motion."""
-    name, errors, truth = (
-        FILTER_NAMES[filter_name],
-        position_errors(result, filter_name),
-        result.truth,
-    )
+    name, truth = FILTER_NAMES[filter_name], result.truth
+    errors = position_errors(result, filter_name)
     axes.set_title(f"{name}: error along the aisle and ±2σ (m)")
     assert isinstance(errors, pd.DataFrame)
     assert isinstance(truth, pd.DataFrame)

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from px4fuse.classroom.assignment.roster import MAX_STUDENTS, Person, Register, normalise_text
+from px4fuse.classroom.assignment.roster import MAX_STUDENTS, ClassList, Person, normalise_text
 from px4fuse.classroom.assignment.truth import RightFormAnswers
 from px4fuse.core.reading import read_text
 from px4fuse.errors import SettingsError
@@ -80,8 +80,8 @@ class AnswerKey(msgspec.Struct, frozen=True):
 
     def of_student(self, student_id: str) -> RightAnswers | None:
         """Return the right answers for a student; the id may lack leading zeros."""
-        register = Register(Person(answer.student_id) for answer in self.answers)
-        student_index = register.student_index(Person(student_id))
+        class_list = ClassList(Person(answer.student_id) for answer in self.answers)
+        student_index = class_list.student_index(Person(student_id))
         return None if student_index is None else self.answers[student_index]
 
     def of_log(self, sha256: str) -> RightAnswers | None:

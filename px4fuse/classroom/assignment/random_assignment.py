@@ -49,7 +49,7 @@ class AssignableFault(Record):
 
     Attributes
     ----------
-    mistake : str
+    name : str
         Name of the fault in ``px4fuse simulate --mistake``.
     group : str
         Faults with equal groups hide each other, so a flight has at most one of them.
@@ -66,7 +66,7 @@ class AssignableFault(Record):
         Groups of faults that this fault hides.
     """
 
-    mistake: str
+    name: str
     group: str
     detectable_size: float | None = None
     unit: str = ""
@@ -89,11 +89,11 @@ class AssignableFault(Record):
         ``start_fraction`` is 0 for the earliest start and 1 for the latest start.
         """
         if self.detectable_size is None:
-            return self.mistake
+            return self.name
         size = self.detectable_size / difficulty
         if self.is_smaller_easier:
             size = self.detectable_size * difficulty
-        option_value = f"{self.mistake}={math.copysign(float(f'{size:.3g}'), sign):g}{self.unit}"
+        option_value = f"{self.name}={math.copysign(float(f'{size:.3g}'), sign):g}{self.unit}"
         if self.start_range_s is None:
             return option_value
         earliest_s, latest_s = self.start_range_s
@@ -106,7 +106,7 @@ class SamplingRules(Record):
     ``numbers`` are minimum, maximum and number of decimals of each parameter of the simulation.
     """
 
-    mistakes: tuple[AssignableFault, ...]
+    faults: tuple[AssignableFault, ...]
     numbers: dict[str, tuple[float, float, int]]
 
 
@@ -148,7 +148,7 @@ def assign_random_flight(
     student_id: str,
     kind: FlightKind,
     fault_count: int | None = None,
-    logs_truth: bool = True,
+    with_ground_truth: bool = True,
 ) -> AssignedFlight:
     """Select injected faults and parameters of a student's simulated flight at random.
 
@@ -158,7 +158,7 @@ def assign_random_flight(
         "mixed" selects aisle or loop at random.
     fault_count : int, optional
         Number of injected faults; random by default.
-    logs_truth : bool
+    with_ground_truth : bool
         True to log the ground truth. The log of a loop never contains the ground truth, because
         students have to estimate the landing place.
 
@@ -187,7 +187,7 @@ def assign_random_flight(
         )
     faults: list[AssignableFault] = []
     rules = RULES_BY_KIND[kind]
-    for fault in sorted(rules.mistakes, key=lambda each: random_number(f"order {each.mistake}")):
+    for fault in sorted(rules.faults, key=lambda each: random_number(f"order {each.name}")):
         if len(faults) < fault_count and all(map(fault.is_detectable_with, faults)):
             faults.append(fault)
     difficulty_range = EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
@@ -195,7 +195,7 @@ def assign_random_flight(
         difficulty_range = HARDEST_DIFFICULTY, UNDETECTABLE_DIFFICULTY
     difficulties, mistake_options = [], []
     for fault in faults:
-        name, difficulty = fault.mistake, EASIEST_DIFFICULTY
+        name, difficulty = fault.name, EASIEST_DIFFICULTY
         if fault.detectable_size is not None:
             easiest, hardest = difficulty_range
             difficulty = easiest + (hardest - easiest) * random_number(f"size {name}")
@@ -204,7 +204,7 @@ def assign_random_flight(
         mistake_options.append(fault.format_option(difficulty, sign, random_number(f"at {name}")))
     scenario = make_scenario(
         kind,
-        truth=logs_truth and kind == "aisle",
+        truth=with_ground_truth and kind == "aisle",
         seed=random_bits(secret, student_id, kind, "seed"),
         **random_scenario_numbers(kind, random_number),
     )

@@ -149,7 +149,7 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
     return person if student_id or name or numbers else None
 
 
-class Register:
+class ClassList:
     """Students of a class; missing fields are copied from the tables ``other_lists``."""
 
     def __init__(self, people: Iterable[Person] = (), *other_lists: Iterable[Person]) -> None:

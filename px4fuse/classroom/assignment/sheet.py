@@ -25,14 +25,14 @@ class Sheet:
     """CSV table with a header (column titles); short rows are filled with empty cells."""
 
     path: Path
-    head: tuple[str, ...]
+    column_titles: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     encoding: str = "utf-8"
     separator: str = ","
 
     def column(self, titles: Sequence[str]) -> int | None:
         """Return the index of the column with one of ``titles``, or None; earlier titles first."""
-        plain_titles = [normalise_title(title) for title in self.head]
+        plain_titles = [normalise_title(title) for title in self.column_titles]
         return next((plain_titles.index(title) for title in titles if title in plain_titles), None)
 
     def cell(self, row: Sequence[str], titles: Sequence[str]) -> str:
@@ -44,7 +44,7 @@ class Sheet:
     def text(self) -> str:
         """Table as CSV (RFC 4180), with the original separator."""
         csv_file = io.StringIO()
-        csv.writer(csv_file, delimiter=self.separator).writerows((self.head, *self.rows))
+        csv.writer(csv_file, delimiter=self.separator).writerows((self.column_titles, *self.rows))
         return csv_file.getvalue()
 
     def content(self) -> bytes:
@@ -97,11 +97,11 @@ def read_sheet(path: Path) -> Sheet:
         lines = [*csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)]
     except csv.Error as error:
         raise SettingsError(f"{path} is not a CSV file ({error}).") from error
-    head, *rows = [cells for cells in lines if any(map(str.strip, cells))] or [[]]
-    if not head:
+    column_titles, *rows = [cells for cells in lines if any(map(str.strip, cells))] or [[]]
+    if not column_titles:
         raise SettingsError(f"{path} is empty.", "Give a CSV file with a header.")
-    padded_rows = (tuple(cells + [""] * (len(head) - len(cells))) for cells in rows)
-    return Sheet(path, tuple(head), tuple(padded_rows), encoding, separator)
+    padded_rows = (tuple(cells + [""] * (len(column_titles) - len(cells))) for cells in rows)
+    return Sheet(path, tuple(column_titles), tuple(padded_rows), encoding, separator)
 
 
 def format_cell_number(value: float | None) -> str:

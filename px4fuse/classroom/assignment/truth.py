@@ -32,7 +32,7 @@ from px4fuse.results.answer_form import (
     select_questions,
 )
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import MISTAKES as SIMULATED_MISTAKES
+from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED_MISTAKES
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 
 # Maximum relative error of the size of a fault in a student's answer
@@ -211,15 +211,11 @@ def _ekf2_behaviour(
         if is_large and reset.time_s > first_counted_reset_s:
             required_behaviours.append("dead-reckoned, then reset")
     if "never fused" in required_behaviours:  # EKF2 cannot follow positions that it does not fuse
-        required_behaviours, allowed_behaviours = (
-            ["never fused"],
-            [*required_behaviours, *allowed_behaviours],
-        )
+        allowed_behaviours = [*required_behaviours, *allowed_behaviours]
+        required_behaviours = ["never fused"]
     if not required_behaviours:
-        required_behaviours, allowed_behaviours = (
-            ["normal"],
-            ["followed the positions", *allowed_behaviours],
-        )
+        required_behaviours.append("normal")
+        allowed_behaviours.insert(0, "followed the positions")
     required_behaviours = [*dict.fromkeys(required_behaviours)]
     return tuple(required_behaviours), tuple(
         each for each in dict.fromkeys(allowed_behaviours) if each not in required_behaviours
@@ -238,10 +234,7 @@ def right_numeric_answer(
     updates = kf_replay.updates.iloc[question.update - 1 :]
     if updates.empty:
         return None
-    update_row, covariance = (
-        updates.iloc[0],
-        kf_replay.steps.loc[updates.index[0], COVARIANCE_COLUMNS],
-    )
+    covariance = kf_replay.steps.loc[updates.index[0], COVARIANCE_COLUMNS]
     nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
     match question.kind:
         case "gate":
@@ -259,4 +252,4 @@ def right_numeric_answer(
             return float(nis.iloc[0])
         case "variance":
             return float(covariance.iloc[0])
-    return float(update_row["gain_position" if question.kind == "gain" else "innovation_m"])
+    return float(updates.iloc[0]["gain_position" if question.kind == "gain" else "innovation_m"])

@@ -16,14 +16,14 @@ from typing import Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from px4fuse.classroom.assignment.key import AnswerKey
-from px4fuse.classroom.assignment.roster import Person, Register, normalise_text, read_people
+from px4fuse.classroom.assignment.roster import ClassList, Person, normalise_text, read_people
 from px4fuse.classroom.assignment.sheet import Sheet, format_cell_number, parse_decimal, read_sheet
 from px4fuse.classroom.grading.flags import flag_equal_contents
 from px4fuse.classroom.grading.model import (
     TOTAL_TITLE,
-    Entry,
+    Grade,
     GradedReport,
-    Item,
+    ItemScore,
     Override,
     Submission,
 )
@@ -122,25 +122,25 @@ class Course:
     anonymous: bool = False
 
     @cached_property
-    def register(self) -> Register:
+    def class_list(self) -> ClassList:
         """Students of the class, with the data of all worksheets."""
         people_by_sheet = [read_people(sheet) for sheet in self.worksheets]
         answers = self.key.answers if self.key else ()
         assigned_people = tuple(Person(answer.student_id, answer.name) for answer in answers)
         people = self.roster or assigned_people or next(iter(people_by_sheet), ())
-        return Register(people, *people_by_sheet)
+        return ClassList(people, *people_by_sheet)
 
 
 # Sort key (UNIX times of submission and zip entry), report, and grade if only this report counts
-Attempt = tuple[tuple[float, float], GradedReport, Entry]
+Attempt = tuple[tuple[float, float], GradedReport, Grade]
 
 
-def build_entries(
+def build_grades(
     reports: Sequence[GradedReport],
     submissions: Sequence[Submission],
     course: Course,
     overrides: Overrides,
-) -> tuple[tuple[Entry, ...], tuple[str, ...]]:
+) -> tuple[tuple[Grade, ...], tuple[str, ...]]:
     """Assign the reports to students, and compute the grade of each student.
 
     The learning platform identifies the student, or else the id or the name in the report. Without
@@ -153,70 +153,73 @@ def build_entries(
 
     Returns
     -------
-    entries : tuple of Entry
+    grades : tuple of Grade
         Grades of all students, then of reports of unknown students.
     notes : tuple of str
         Sentences about points in ``overrides.csv`` without a matching student or item.
     """
-    has_class_list = bool(course.register.people)
-    register = course.register if has_class_list else _collect_students(reports, submissions)
-    attempts: dict[int | None, list[Attempt]] = defaultdict(list)
+    has_class_list = bool(course.class_list.people)
+    class_list = course.class_list if has_class_list else _collect_students(reports, submissions)
+    attempts_by_index: dict[int | None, list[Attempt]] = defaultdict(list)
     for report, submission in zip(reports, submissions, strict=True):
-        student_index = register.student_index(submission.origin.person)
+        student_index = class_list.student_index(submission.origin.person)
         if student_index is None:
-            student_index = register.student_index(Person(report.student_id, report.student))
-        attempts[student_index].append(
-            _make_attempt(report, submission, course, student_index, register)
+            student_index = class_list.student_index(Person(report.student_id, report.student))
+        attempts_by_index[student_index].append(
+            _make_attempt(report, submission, course, student_index, class_list)
         )
     max_points = max((report.max_points for report in reports), default=0.0)
-    rows = [
-        _choose_attempt(attempts[student_index], course)
-        if attempts[student_index]
-        else Entry(person.name, person.student_id, None, max_points=max_points)
-        for student_index, person in enumerate(register.people)
+    grades = [
+        _choose_attempt(attempts_by_index[student_index], course)
+        if attempts_by_index[student_index]
+        else Grade(person.name, person.student_id, None, max_points=max_points)
+        for student_index, person in enumerate(class_list.people)
     ]
     unknown_student_flag = "Neither the report nor the learning platform names a student."
     if has_class_list:
         unknown_student_flag = "The student is not in the class list."
-    rows += [replace(row, flags=(unknown_student_flag, *row.flags)) for *_, row in attempts[None]]
-    overrides_by_entry, notes = match_overrides(overrides, rows)
+    grades += [
+        replace(grade, flags=(unknown_student_flag, *grade.flags))
+        for *_, grade in attempts_by_index[None]
+    ]
+    overrides_by_grade, notes = match_overrides(overrides, grades)
     flags_by_submission = flag_equal_contents(
-        [row.counted_report for row in rows if row.counted_report]
+        [grade.counted_report for grade in grades if grade.counted_report]
     )
-    entries_with_report = [row for row in rows if row.counted_report]
-    unknown_count = sum(row.late_s is None for row in entries_with_report)
+    grades_with_report = [grade for grade in grades if grade.counted_report]
+    unknown_count = sum(grade.late_s is None for grade in grades_with_report)
     if course.late_rule and unknown_count:
         notes += (
-            f"The submission time is unknown for {unknown_count} of {len(entries_with_report)} "
+            f"The submission time is unknown for {unknown_count} of {len(grades_with_report)} "
             "students, so no points were deducted. Add the times with --worksheet.",
         )
-    final_entries = (
-        _apply_overrides(*entry_and_overrides, flags_by_submission, course)
-        for entry_and_overrides in zip(rows, overrides_by_entry, strict=True)
+    final_grades = (
+        _apply_overrides(*grade_and_overrides, flags_by_submission, course)
+        for grade_and_overrides in zip(grades, overrides_by_grade, strict=True)
     )
-    return tuple(final_entries), notes
+    return tuple(final_grades), notes
 
 
 def _collect_students(
     reports: Sequence[GradedReport], submissions: Sequence[Submission]
-) -> Register:
+) -> ClassList:
     """Make a class list of the students that learning platforms and reports name."""
-    register = Register()
+    class_list = ClassList()
     for report, submission in zip(reports, submissions, strict=True):
         person = submission.origin.person
-        reported_student_index = register.student_index(Person(report.student_id))
+        reported_student_index = class_list.student_index(Person(report.student_id))
         if person.numbers or person.login:
-            if register.student_index(person) is not None:
+            if class_list.student_index(person) is not None:
                 continue
             # ignore the id in the report if another student already has this id
             free_id = report.student_id if reported_student_index is None else ""
             student_id = person.student_id or free_id
             name = one_line(report.student if student_id else person.name, 200) or person.name
             student_id = next(filter(None, (student_id, person.login, *person.numbers.values())))
-            register.people.append(replace(person, student_id=student_id, name=name))
+            class_list.people.append(replace(person, student_id=student_id, name=name))
         elif report.student_id and reported_student_index is None:
-            register.people.append(Person(report.student_id, one_line(report.student, 200)))
-    return register
+            class_list.people.append(Person(report.student_id, one_line(report.student, 200)))
+    return class_list
 
 
 def _make_attempt(
@@ -224,11 +227,13 @@ def _make_attempt(
     submission: Submission,
     course: Course,
     student_index: int | None,
-    register: Register,
+    class_list: ClassList,
 ) -> Attempt:
     """Compute the grade of a student if only this report counts."""
     origin, platform = submission.origin, submission.origin.platform.capitalize()
-    person = Person(report.student_id) if student_index is None else register.people[student_index]
+    person = (
+        Person(report.student_id) if student_index is None else class_list.people[student_index]
+    )
     due_time = course.due
     if due_time is not None and person.extended_due:
         due_time = parse_due_time(
@@ -258,15 +263,17 @@ def _make_attempt(
             "The student imitated the file name of a learning platform "
             f"(platform of the export: {platform or 'none'})."
         )
-    reported_student_index = register.student_index(Person(report.student_id)) if platform else None
+    reported_student_index = (
+        class_list.student_index(Person(report.student_id)) if platform else None
+    )
     if reported_student_index is not None and student_index not in (None, reported_student_index):
-        reported_person = register.people[reported_student_index]
+        reported_person = class_list.people[reported_student_index]
         flags.append(
             f"The id in the report is that of {reported_person.student_id} "
             f"({reported_person.name or 'no name'}), but {platform} names another student."
         )
     late_rule = course.late_rule
-    entry = Entry(
+    grade = Grade(
         person.name or one_line(report.student or origin.person.name, 200),
         person.student_id,
         report,
@@ -280,15 +287,15 @@ def _make_attempt(
         submission_time.timestamp() if submission_time else 0.0,
         zip_time.timestamp() if zip_time else 0.0,
     )
-    return sort_key, report, entry
+    return sort_key, report, grade
 
 
 def _points_after_deduction(attempt: Attempt) -> float:
-    _, report, entry = attempt
-    return max(report.points - entry.deduction, 0.0)
+    _, report, grade = attempt
+    return max(report.points - grade.deduction, 0.0)
 
 
-def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
+def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Grade:
     """Choose the report of a student that counts; add flags if the choice is ambiguous."""
     # sort by time; reports with equal times by points
     sorted_attempts = sorted(
@@ -301,7 +308,7 @@ def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
         attempt for attempt in attempts_with_report if not attempt[1].instructor_action
     ]
     eligible_attempts = attempts_without_action or attempts_with_report or sorted_attempts
-    chosen_key, chosen_report, entry = {
+    chosen_key, chosen_report, grade = {
         "latest": eligible_attempts[-1],
         # several reports may have the earliest time: take the one with most points
         "first": [
@@ -309,7 +316,7 @@ def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
         ][-1],
         "best": max(reversed(eligible_attempts), key=_points_after_deduction),
     }[course.attempt]
-    flags = list(entry.flags)
+    flags = list(grade.flags)
     other_reports = tuple(report for _, report, _ in sorted_attempts if report is not chosen_report)
     forms = [report.form for sort_key, report, _ in eligible_attempts if sort_key == chosen_key]
     # without this rule, students could hand in several answer forms with different guesses
@@ -333,29 +340,29 @@ def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
                 f"The file {one_line(report.submission, 80)} does not count (status: {status})."
             )
     return replace(
-        entry, counted_report=chosen_report, other_reports=other_reports, flags=tuple(flags)
+        grade, counted_report=chosen_report, other_reports=other_reports, flags=tuple(flags)
     )
 
 
 def _apply_overrides(
-    entry: Entry,
+    grade: Grade,
     override_by_title: Mapping[str, Override],
     flags_by_submission: Mapping[str, Sequence[str]],
     course: Course,
-) -> Entry:
+) -> Grade:
     """Apply the instructor's points and comments, and compute the total points."""
-    report, total_points, flags = entry.counted_report, None, entry.flags
+    report, total_points, flags = grade.counted_report, None, grade.flags
     if report is not None:
         items = (_override_item(item, override_by_title.get(item.title)) for item in report.items)
         report = replace(report, items=tuple(items))
         flags = (*flags, *report.flags, *flags_by_submission.get(report.submission, ()))
         if report.counted_points is not None or course.include_pending:
-            total_points = round(max(report.points - entry.deduction, 0.0), 2)
+            total_points = round(max(report.points - grade.deduction, 0.0), 2)
     report_override, total_override = (
         override_by_title.get(title, Override()) for title in ("", TOTAL_TITLE)
     )
     return replace(
-        entry,
+        grade,
         counted_report=report,
         overrides=override_by_title,
         comment="\n".join(filter(None, (report_override.comment, total_override.comment))),
@@ -364,7 +371,7 @@ def _apply_overrides(
     )
 
 
-def _override_item(item: Item, override: Override | None) -> Item:
+def _override_item(item: ItemScore, override: Override | None) -> ItemScore:
     """Replace the points of a rubric item by the instructor's points, and append the comment."""
     if override is None:
         return item
@@ -401,7 +408,7 @@ def read_overrides(path: Path) -> Overrides:
         raise SettingsError(f"{path}: no column {', '.join(missing_titles)}.", remedy)
     overrides: dict[str, dict[str, Override]] = defaultdict(dict)
     for row_number, row in enumerate(sheet.rows, start=2):
-        if any(cell.strip() for cell in row[len(sheet.head) :]):
+        if any(cell.strip() for cell in row[len(sheet.column_titles) :]):
             raise SettingsError(
                 f"{path}: row {row_number} has more cells than the header.",
                 "Put a comment that contains a comma in double quotes.",
@@ -416,7 +423,10 @@ def read_overrides(path: Path) -> Overrides:
             problem = f"student {one_line(student, 40)} has two rows for the item {item_text}"
         elif points and (parsed_points is None or parsed_points < 0.0 or not item_title):
             points_text = one_line(points, 20)
-            problem = f"points {points_text!r} must be 0 or more, in a row with an item or total"
+            problem = (
+                f"points {points_text!r} must be a number of 0 or more, in a row that names an "
+                "item or total"
+            )
         if problem:
             raise SettingsError(f"{path}: row {row_number}: {problem}.")
         overrides[student][item_title] = Override(
@@ -426,24 +436,24 @@ def read_overrides(path: Path) -> Overrides:
 
 
 def match_overrides(
-    overrides: Overrides, entries: Sequence[Entry]
+    overrides: Overrides, grades: Sequence[Grade]
 ) -> tuple[list[dict[str, Override]], tuple[str, ...]]:
     """Assign the instructor's points and comments to students and rubric items.
 
     Returns
     -------
     matched_overrides : list of dict
-        Points and comments for each entry, by rubric item, "total", or "" (whole report).
+        Points and comments for each student, by rubric item, "total", or "" (whole report).
     notes : tuple of str
         Sentences about points and comments without a matching student or item.
     """
-    matched_overrides: list[dict[str, Override]] = [{} for _ in entries]
-    max_points_of_reports = (report.max_points for entry in entries for report in entry.reports)
+    matched_overrides: list[dict[str, Override]] = [{} for _ in grades]
+    max_points_of_reports = (report.max_points for grade in grades for report in grade.reports)
     max_total_points = max(max_points_of_reports, default=math.inf)
-    people = Register(
-        Person(entry.student_id, login=report.submission if report else "")
-        for entry in entries
-        for report in [entry.counted_report]
+    people = ClassList(
+        Person(grade.student_id, login=report.submission if report else "")
+        for grade in grades
+        for report in [grade.counted_report]
     )
     notes = []
     for student, override_by_item in overrides.items():
@@ -454,7 +464,7 @@ def match_overrides(
             notes.append(f"{OVERRIDES_NAME}: no student has the id {student_text}.")
             continue
         max_by_title = {TOTAL_TITLE: max_total_points, "": math.inf}
-        if report := entries[student_index].counted_report:
+        if report := grades[student_index].counted_report:
             max_by_title |= {item.title: item.max_points for item in report.items}
             max_by_title[TOTAL_TITLE] = report.max_points
         title_by_normalised = {normalise_text(title): title for title in max_by_title}

@@ -31,10 +31,10 @@ MIN_SEGMENT_FRACTION = 0.5
 MAX_DRIFT_FACTOR = 4.0
 MAX_LISTED_REPORTS = 4
 # Pairs of reports with equal contents
-Pairs = Iterator[tuple[GradedReport, GradedReport]]
+ReportPairs = Iterator[tuple[GradedReport, GradedReport]]
 
 
-def flag_pages(verification: Verification) -> Iterator[str]:
+def flag_page_differences(verification: Verification) -> Iterator[str]:
     """Yield the first difference between a PDF and the report drawn from its log, if any."""
     if verification.pages:
         first_difference, *further_differences = verification.pages
@@ -171,7 +171,7 @@ def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequenc
     flags_by_submission: dict[str, list[str]] = defaultdict(list)
     for flag_text, pairs in (
         *(
-            (flag_text, _same_pairs(reports, content_of, owner_of))
+            (flag_text, _equal_content_pairs(reports, content_of, owner_of))
             for flag_text, content_of, owner_of in EQUAL_CONTENT_CHECKS
         ),
         ("The answer form has the same numbers as the form of {}.", _copied_forms(reports)),
@@ -189,11 +189,11 @@ def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequenc
     return flags_by_submission
 
 
-def _same_pairs(
+def _equal_content_pairs(
     reports: Sequence[GradedReport],
     content_of: Callable[[GradedReport], object],
     owner_of: Callable[[GradedReport], str],
-) -> Pairs:
+) -> ReportPairs:
     reports_by_content: dict[object, list[GradedReport]] = defaultdict(list)
     for report in reports:
         reports_by_content[content_of(report)].append(report)
@@ -203,7 +203,7 @@ def _same_pairs(
                 yield report, other_report
 
 
-def _copied_forms(reports: Sequence[GradedReport]) -> Pairs:
+def _copied_forms(reports: Sequence[GradedReport]) -> ReportPairs:
     """Yield pairs of reports of different students whose answers have equal numbers."""
     numbers_by_report = [(report, _form_numbers(report)) for report in reports]
     for (report, numbers), (other_report, other_numbers) in combinations(numbers_by_report, 2):

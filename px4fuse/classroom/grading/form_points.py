@@ -99,7 +99,7 @@ class FormPoints:
 
 def form_points(answers: Answers, right_answers: RightFormAnswers) -> FormPoints:
     """Compare a student's answers with the right answers, and compute the points."""
-    is_no_fault_right = not right_answers.mistakes and answers.names_no_fault
+    is_no_fault_right = not right_answers.mistakes and answers.states_no_fault
     weights = POINTS_TABLE["weights_clean" if is_no_fault_right else "weights"]
     fractions = dict.fromkeys(PART_NAMES, 0.0)
     matches, false_faults = _match_faults(answers, right_answers)
@@ -300,8 +300,8 @@ def evidence_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
 
 
 def panels_showing(fault_kind: str) -> list[str]:
-    kinds_by_panel = POINTS_TABLE["shows"]
-    return [*(panel for panel, kinds in kinds_by_panel.items() if fault_kind in kinds), "cover"]
+    kinds_by_panel = POINTS_TABLE["shows"].items()
+    return [*(panel for panel, kinds in kinds_by_panel if fault_kind in kinds), "cover"]
 
 
 def correction_fraction(

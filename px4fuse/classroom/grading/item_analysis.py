@@ -49,7 +49,7 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
 
     Reports and items that wait for the instructor are omitted.
     """
-    rows_by_item: dict[tuple[int, str], list[tuple[float, float, float]]] = defaultdict(list)
+    scores_by_item: dict[tuple[int, str], list[tuple[float, float, float]]] = defaultdict(list)
     for report in reports:
         if report.instructor_action:
             continue
@@ -61,15 +61,15 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
             for item in items:
                 if item.awaits_points:
                     continue
-                item_row = item.points, item.max_points, total_points - item.points
-                rows_by_item[group_index, f"{prefix}{item.title}"].append(item_row)
-        for kind, is_named in report.mistakes.items():
-            rows_by_item[2, f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
+                score = item.points, item.max_points, total_points - item.points
+                scores_by_item[group_index, f"{prefix}{item.title}"].append(score)
+        for kind, is_named in report.is_found_by_fault.items():
+            scores_by_item[2, f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
     statistics = []
-    for (_, title), rows in sorted(rows_by_item.items(), key=lambda item: item[0][0]):
-        item_points, max_points, other_points = np.transpose(rows)
+    for (_, title), scores in sorted(scores_by_item.items(), key=lambda item: item[0][0]):
+        item_points, max_points, other_points = np.transpose(scores)
         discrimination = None
-        if len(rows) >= MIN_REPORTS and np.ptp(item_points) and np.ptp(other_points):
+        if len(scores) >= MIN_REPORTS and np.ptp(item_points) and np.ptp(other_points):
             discrimination = round(float(np.corrcoef(item_points, other_points)[0, 1]), 2)
         fractions = item_points / np.where(max_points > 0.0, max_points, 1.0)
         statistics.append(

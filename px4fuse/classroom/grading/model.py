@@ -68,7 +68,7 @@ class Submission:
 
 
 @dataclass(frozen=True)
-class Item:
+class ItemScore:
     """Points of a report for one rubric item, with a comment for the student.
 
     ``awaits_points`` is True if the instructor has not yet entered the points.
@@ -100,9 +100,9 @@ class GradedReport:
         Numbers of the report for the table of the class, by column title.
     version : str
         Version of px4fuse that wrote the report.
-    mistakes : mapping
+    is_found_by_fault : mapping
         For each injected fault of the student's flight: True if the student found the fault.
-    form_parts : tuple of Item
+    form_parts : tuple of ItemScore
         Points for each part of ``form``, 100 points in total.
     redrawn_path : str
         Relative path of the PDF that px4fuse draws from the log for comparison.
@@ -112,7 +112,7 @@ class GradedReport:
     student: str
     student_id: str
     verification: Verification
-    items: tuple[Item, ...] = ()
+    items: tuple[ItemScore, ...] = ()
     flags: tuple[str, ...] = ()
     instructor_action: str = ""
     form: Answers | None = None
@@ -121,8 +121,8 @@ class GradedReport:
     log_sha256: str = ""
     version: str = ""
     notes: str = field(default="", repr=False)
-    mistakes: Mapping[str, bool] = field(default_factory=dict)
-    form_parts: tuple[Item, ...] = ()
+    is_found_by_fault: Mapping[str, bool] = field(default_factory=dict)
+    form_parts: tuple[ItemScore, ...] = ()
     redrawn_path: str = ""
 
     @property
@@ -168,7 +168,7 @@ class Override:
 
 
 @dataclass(frozen=True)
-class Entry:
+class Grade:
     """Grade of a student, or of a report whose student is unknown.
 
     Attributes
@@ -209,9 +209,9 @@ class Entry:
         return self.student or self.student_id or "no name"
 
 
-def list_titles(entries: Sequence[Entry]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def list_titles(grades: Sequence[Grade]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the column titles for the points of rubric items, and for numbers of reports."""
-    reports = [report for entry in entries if (report := entry.counted_report)]
+    reports = [report for grade in grades if (report := grade.counted_report)]
     item_titles = dict.fromkeys(item.title for report in reports for item in report.items)
     number_titles = dict.fromkeys(title for report in reports for title in report.numbers)
     return tuple(item_titles), tuple(number_titles)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from px4fuse.classroom.assignment.key import AnswerKey
 from px4fuse.classroom.assignment.truth import RightFormAnswers
 from px4fuse.classroom.grading.form_points import describe_right_answer, panels_showing
-from px4fuse.classroom.grading.model import Entry
+from px4fuse.classroom.grading.model import Grade
 from px4fuse.core.text import one_line
 from px4fuse.results.answer_form import FAULT_KINDS, NO_FAULT_KIND, PANELS, Answers
 
@@ -14,15 +14,15 @@ from px4fuse.results.answer_form import FAULT_KINDS, NO_FAULT_KIND, PANELS, Answ
 Question = tuple[str, str]
 
 
-def questions_text(entries: Sequence[Entry], key: AnswerKey, count: int) -> str:
+def questions_text(grades: Sequence[Grade], key: AnswerKey, count: int) -> str:
     """Format ``count`` questions with expected answers for each student with answers."""
     lines = [f"Questions for an oral check: {count} per student, with the expected answers."]
-    for entry in entries:
-        report = entry.counted_report
+    for grade in grades:
+        report = grade.counted_report
         answer = key.of_log(report.log_sha256) if report else None
         if report is None or report.form is None or answer is None or answer.form is None:
             continue
-        lines += ["", one_line(f"{entry.display_name} {entry.student_id}", 100)]
+        lines += ["", one_line(f"{grade.display_name} {grade.student_id}", 100)]
         questions = [*ask_about_form(report.form, answer.form)][:count]
         for number, (question, expected) in enumerate(questions, start=1):
             for prefix, text in ((f"{number}. ", question), ("   Expected: ", expected)):

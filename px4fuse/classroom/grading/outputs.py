@@ -27,7 +27,7 @@ from operator import itemgetter
 from pathlib import Path
 
 from px4fuse.classroom.assignment.roster import (
-    Register,
+    ClassList,
     file_names,
     make_unique,
     normalise_text,
@@ -38,7 +38,7 @@ from px4fuse.classroom.grading.checks import shorten_text
 from px4fuse.classroom.grading.class_page import class_page_html
 from px4fuse.classroom.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
 from px4fuse.classroom.grading.item_analysis import ITEM_STATISTICS_TITLES, analyse_items
-from px4fuse.classroom.grading.model import TOTAL_TITLE, Entry, GradedReport, list_titles
+from px4fuse.classroom.grading.model import TOTAL_TITLE, Grade, GradedReport, list_titles
 from px4fuse.classroom.grading.oral_check import questions_text
 from px4fuse.classroom.grading.records import DIAGNOSIS_SUFFIX, RECORDS_FOLDER, REDRAWN_SUFFIX
 from px4fuse.core.input_files import inputs_not_registered
@@ -93,14 +93,14 @@ READ_ONLY_MARK = "(read only)"
 
 
 def write_class(
-    entries: Sequence[Entry], course: Course, output: Path
+    grades: Sequence[Grade], course: Course, output: Path
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Write all output files of grading. An existing ``overrides.csv`` is not overwritten.
 
     Parameters
     ----------
-    entries : sequence of Entry
-        Grades of the students in ``course.register``, then of unknown students.
+    grades : sequence of Grade
+        Grades of the students in ``course.class_list``, then of unknown students.
 
     Returns
     -------
@@ -115,30 +115,30 @@ def write_class(
         The folder cannot be written.
     """
     class_title = course.title or course.rubric.title or "Class"
-    file_stems = file_names([_entry_identity(entry, use_file_stem=True) for entry in entries])
-    page_entries = [
-        _copy_redrawn(entry, stem, output) for entry, stem in zip(entries, file_stems, strict=True)
+    file_stems = file_names([_student_identity(grade, use_file_stem=True) for grade in grades])
+    page_grades = [
+        _copy_redrawn(grade, stem, output) for grade, stem in zip(grades, file_stems, strict=True)
     ]
     has_redrawn = any(
-        entry.counted_report and entry.counted_report.redrawn_path for entry in page_entries
+        grade.counted_report and grade.counted_report.redrawn_path for grade in page_grades
     )
-    feedback_texts = [feedback_text(entry, class_title) for entry in entries]
-    reports = [report for entry in entries if (report := entry.counted_report)]
+    feedback_texts = [feedback_text(grade, class_title) for grade in grades]
+    reports = [report for grade in grades if (report := grade.counted_report)]
     item_rows = tuple(
         (neutralise_formulas(title), *numbers)
         for title, *numbers in (statistics.csv_row for statistics in analyse_items(reports))
     )
     contents = {
-        "class.csv": class_table_csv(entries).encode(),
+        "class.csv": class_table_csv(grades).encode(),
         "items.csv": ("\ufeff" + Sheet(Path(), ITEM_STATISTICS_TITLES, item_rows).text).encode(),
     }
     if course.anonymous:
-        page_entries, names_table = _anonymise_entries(page_entries, output / PSEUDONYMS_FILE)
+        page_grades, names_table = _anonymise_grades(page_grades, output / PSEUDONYMS_FILE)
         contents[PSEUDONYMS_FILE] = names_table.encode()
     made_with = f"px4fuse {metadata.version('px4fuse')}"
-    contents["class.html"] = class_page_html(page_entries, class_title, made_with).encode()
+    contents["class.html"] = class_page_html(page_grades, class_title, made_with).encode()
     if course.question_count and course.key is not None:
-        text = questions_text(entries, course.key, course.question_count)
+        text = questions_text(grades, course.key, course.question_count)
         contents[QUESTIONS_FILE] = text.encode()
     if not (output / OVERRIDES_NAME).exists():
         contents[OVERRIDES_NAME] = OVERRIDES_TEMPLATE.encode()
@@ -148,7 +148,7 @@ def write_class(
     table_names = make_unique((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
     for sheet, name in zip(course.worksheets, table_names, strict=True):
         filled_sheet, sheet_notes = fill_grades(
-            sheet, entries, course.register, course.column, feedback_texts, course.scale
+            sheet, grades, course.class_list, course.column, feedback_texts, course.scale
         )
         contents[f"{GRADES_FOLDER}/{name}"] = filled_sheet.content()
         notes += sheet_notes
@@ -159,34 +159,34 @@ def write_class(
     return tuple(output / name for name in output_names), tuple(notes)
 
 
-def _entry_identity(entry: Entry, use_file_stem: bool = False) -> str:
+def _student_identity(grade: Grade, use_file_stem: bool = False) -> str:
     """Return the id of a student; without an id, the name or the name of the submitted file."""
-    file_name = entry.counted_report.submission if entry.counted_report else ""
-    return entry.student_id or (
-        Path(file_name).stem if use_file_stem else entry.student or file_name
+    file_name = grade.counted_report.submission if grade.counted_report else ""
+    return grade.student_id or (
+        Path(file_name).stem if use_file_stem else grade.student or file_name
     )
 
 
-def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
+def _copy_redrawn(grade: Grade, stem: str, output: Path) -> Grade:
     """Copy the PDF files that px4fuse drew from the log to the output folder."""
-    report = entry.counted_report
+    report = grade.counted_report
     if report is None or not report.sha256:
-        return entry
+        return grade
     record_path = output / RECORDS_FOLDER / report.sha256
     redrawn_file, diagnosis_file = map(record_path.with_suffix, (REDRAWN_SUFFIX, DIAGNOSIS_SUFFIX))
     if diagnosis_file.exists():
         write_all({output / FEEDBACK_FOLDER / f"{stem}.pdf": diagnosis_file.read_bytes()})
     if not redrawn_file.exists():
-        return entry
+        return grade
     name = f"{REPORTS_FOLDER}/{stem}.pdf"
     write_all({output / name: redrawn_file.read_bytes()})
-    return replace(entry, counted_report=replace(report, redrawn_path=name))
+    return replace(grade, counted_report=replace(report, redrawn_path=name))
 
 
-def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
+def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade], str]:
     """Replace names by pseudonyms, and sort by pseudonym.
 
-    Return the anonymous entries and a CSV table of the pseudonyms. Pseudonyms in an existing table
+    Return the anonymous grades and a CSV table of the pseudonyms. Pseudonyms in an existing table
     at ``path`` are kept.
     """
     names_by_identity: dict[str, tuple[str, str]] = {}
@@ -203,7 +203,7 @@ def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry
     free_pseudonyms = (
         pseudonym for pseudonym in numbered_pseudonyms if pseudonym not in used_pseudonyms
     )
-    students = {_entry_identity(entry): entry.student for entry in entries}
+    students = {_student_identity(grade): grade.student for grade in grades}
     new_identities = [identity for identity in students if identity not in names_by_identity]
     random.SystemRandom().shuffle(new_identities)
     for identity in new_identities:
@@ -212,16 +212,16 @@ def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry
         (pseudonym, neutralise_id(identity), neutralise_formulas(student))
         for identity, (pseudonym, student) in sorted(names_by_identity.items(), key=itemgetter(1))
     )
-    anonymous_entries = [
-        anonymise_entry(entry, names_by_identity[_entry_identity(entry)][0]) for entry in entries
+    anonymous_grades = [
+        anonymise_grade(grade, names_by_identity[_student_identity(grade)][0]) for grade in grades
     ]
     names_table = "\ufeff" + Sheet(path, PSEUDONYM_TITLES, tuple(rows)).text
-    return sorted(anonymous_entries, key=lambda entry: entry.student), names_table
+    return sorted(anonymous_grades, key=lambda grade: grade.student), names_table
 
 
-def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
+def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
     """Replace the name by a pseudonym, and delete all texts that could identify the student."""
-    report = entry.counted_report
+    report = grade.counted_report
     if report is not None:
         report = GradedReport(
             "",
@@ -233,51 +233,51 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
             and "The instructor has to decide on the points.",
             form=report.form,
             numbers=report.numbers,
-            mistakes=report.mistakes,
+            is_found_by_fault=report.is_found_by_fault,
             form_parts=report.form_parts,
         )
-    return Entry(
+    return Grade(
         pseudonym,
         "",
         report,
-        submission_time=entry.submission_time,
-        late_s=entry.late_s,
-        deduction=entry.deduction,
-        total=entry.total,
-        max_points=entry.max_points,
-        flags=("This report is flagged.",) * bool(entry.flags),
+        submission_time=grade.submission_time,
+        late_s=grade.late_s,
+        deduction=grade.deduction,
+        total=grade.total,
+        max_points=grade.max_points,
+        flags=("This report is flagged.",) * bool(grade.flags),
     )
 
 
 # ------------------------------------------------------------------ the class table
 
 
-def class_table_csv(entries: Sequence[Entry]) -> str:
+def class_table_csv(grades: Sequence[Grade]) -> str:
     """Format a table with one row per student as CSV for Excel and LibreOffice."""
-    item_titles, number_titles = list_titles(entries)
+    item_titles, number_titles = list_titles(grades)
     titles = (*FIRST_COLUMNS, *item_titles, *number_titles, *LAST_COLUMNS)
     rows = []
-    for entry in entries:
-        report = entry.counted_report
+    for grade in grades:
+        report = grade.counted_report
         points_by_title = {item.title: item.points for item in report.items} if report else {}
         row: list[str | float | None] = [
             report.submission if report else "",
-            entry.student,
+            grade.student,
             None,
             report.status if report else "missing",
             report.counted_points if report else None,
             report.points if report and report.counted_points is None else None,
-            entry.max_points,
-            entry.deduction or None,
-            entry.total,
+            grade.max_points,
+            grade.deduction or None,
+            grade.total,
             *map(points_by_title.get, item_titles),
             *(report.numbers.get(title) if report else None for title in number_titles),
-            entry.submission_time,
-            None if entry.late_s is None else entry.late_s / 3600.0,
+            grade.submission_time,
+            None if grade.late_s is None else grade.late_s / 3600.0,
             report.pending_reason if report else "",
-            entry.comment,
-            LIST_SEPARATOR.join(entry.flags),
-            LIST_SEPARATOR.join(other_report.submission for other_report in entry.other_reports),
+            grade.comment,
+            LIST_SEPARATOR.join(grade.flags),
+            LIST_SEPARATOR.join(other_report.submission for other_report in grade.other_reports),
             LIST_SEPARATOR.join(report.verification.reasons) if report else "",
             report.log_sha256 if report else "",
         ]
@@ -285,7 +285,7 @@ def class_table_csv(entries: Sequence[Entry]) -> str:
             neutralise_formulas(value) if isinstance(value, str) else format_cell_number(value)
             for value in row
         ]
-        cells[FIRST_COLUMNS.index("id")] = neutralise_id(entry.student_id)
+        cells[FIRST_COLUMNS.index("id")] = neutralise_id(grade.student_id)
         rows.append(tuple(cells))
     # Excel detects UTF-8 by the byte order mark
     return "\ufeff" + Sheet(Path(), tuple(map(neutralise_formulas, titles)), tuple(rows)).text
@@ -294,16 +294,16 @@ def class_table_csv(entries: Sequence[Entry]) -> str:
 # ------------------------------------------------------------------ feedback
 
 
-def feedback_text(entry: Entry, class_name: str = "") -> str:
+def feedback_text(grade: Grade, class_name: str = "") -> str:
     """Format points, comments and reasons for one student as text."""
-    report = entry.counted_report
+    report = grade.counted_report
     reasons = report.verification.reasons[:MAX_REASONS] if report else ()
     text = load_template("classroom/grading/feedback.j2").render(
-        entry=entry,
+        grade=grade,
         report=report,
         class_name=class_name,
         reasons="; ".join(filter(None, (shorten_text(reason).rstrip(".") for reason in reasons))),
-        is_total_set=TOTAL_TITLE in entry.overrides,
+        is_total_set=TOTAL_TITLE in grade.overrides,
         line=shorten_text,
         number=format_cell_number,
         wrapped=_wrap_text,
@@ -338,7 +338,7 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
     """
     title_by_index = {
         index: title
-        for index, title in enumerate(sheet.head)
+        for index, title in enumerate(sheet.column_titles)
         if not any(READ_ONLY_MARK in row[index] for row in sheet.rows[:3])
     }
     grade_index = sheet.column(GRADE_TITLES)
@@ -371,8 +371,8 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
 
 def fill_grades(
     sheet: Sheet,
-    entries: Sequence[Entry],
-    register: Register,
+    grades: Sequence[Grade],
+    class_list: ClassList,
     column: str,
     feedback: Sequence[str],
     platform_max_points: float | None = None,
@@ -381,8 +381,8 @@ def fill_grades(
 
     Parameters
     ----------
-    entries, feedback : sequences
-        Grade and feedback of each student in ``register``, then of unknown students.
+    grades, feedback : sequences
+        Grade and feedback of each student in ``class_list``, then of unknown students.
     column : str
         Title of the grade column; "" if the table has only one.
     platform_max_points : float, optional
@@ -404,25 +404,22 @@ def fill_grades(
         neutralise_formulas if sheet.column(HTML_COMMENT_TITLES) is None else escape_html
     )
     cells_by_row = [list(row) for row in sheet.rows]
-    names = [one_line(entry.student or entry.student_id, 40) for entry in entries]
+    names = [one_line(grade.student or grade.student_id, 40) for grade in grades]
     has_decimal_comma = any(
         re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells_by_row for cell in row
     )
     notes, found_indices = [], set()
     for row in cells_by_row:
         person = read_student(sheet, row)
-        student_index = register.student_index(person) if person else None
+        student_index = class_list.student_index(person) if person else None
         if student_index is None:
             continue
         found_indices.add(student_index)
-        total_points, rubric_maximum = (
-            entries[student_index].total,
-            entries[student_index].max_points,
-        )
+        total_points = (grade := grades[student_index]).total
         if total_points is None:
             continue
-        if platform_max_points is not None and rubric_maximum:
-            total_points = round(total_points * platform_max_points / rubric_maximum, 2)
+        if platform_max_points is not None and grade.max_points:
+            total_points = round(total_points * platform_max_points / grade.max_points, 2)
         max_points = _max_points_in_table(sheet, row, grade_index)
         if max_points is not None and total_points > max_points:
             notes.append(
@@ -437,8 +434,8 @@ def fill_grades(
             row[feedback_index] = format_feedback(feedback[student_index])
     missing_names = [
         names[index]
-        for index in range(len(register.people))
-        if index not in found_indices and entries[index].total is not None
+        for index in range(len(class_list.people))
+        if index not in found_indices and grades[index].total is not None
     ]
     if missing_names:
         notes.append(

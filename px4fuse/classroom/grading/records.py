@@ -88,14 +88,14 @@ def load_or_verify(
     verification = verify(results, pdf, {} if is_log_missing else path_by_sha256)
     files = {REDRAWN_SUFFIX: verification.redrawn_pdf} if verification.redrawn_pdf else {}
     if verification.status == "verified" and log_sha256(results) in assigned_hashes:
-        results, files[DIAGNOSIS_SUFFIX] = diagnose_assigned(results, path_by_sha256)
+        results, files[DIAGNOSIS_SUFFIX] = repeat_with_diagnosis(results, path_by_sha256)
     stored_verification = replace(verification, redrawn_pdf=b"")
     record = VerificationRecord(dependencies, to_json(results), stored_verification)
     _write_record(records, sha256, record, files)
     return results, stored_verification, False
 
 
-def diagnose_assigned(
+def repeat_with_diagnosis(
     results: ReportedResults, path_by_sha256: Mapping[str, Path]
 ) -> tuple[ReportedResults, bytes]:
     """Repeat the analysis and include the faults that were hidden from the student.

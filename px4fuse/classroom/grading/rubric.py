@@ -21,9 +21,9 @@ from px4fuse.classroom.grading.checks import (
     format_reason,
     shorten_text,
 )
-from px4fuse.classroom.grading.flags import flag_pages, flag_settings
+from px4fuse.classroom.grading.flags import flag_page_differences, flag_settings
 from px4fuse.classroom.grading.form_points import FormPoints
-from px4fuse.classroom.grading.model import TOTAL_TITLE, GradedReport, Item
+from px4fuse.classroom.grading.model import TOTAL_TITLE, GradedReport, ItemScore
 from px4fuse.core.reading import read_text
 from px4fuse.core.text import one_line
 from px4fuse.errors import SettingsError
@@ -153,7 +153,7 @@ def score_report(
         awaits_points = item.by_hand and bool(student.notes.strip()) and points_rule != "zero"
         points = round(item.points * min(max(fraction, 0.0), 1.0), 2)
         graded_items.append(
-            Item(item.title, points, item.points, comment, item.by_hand, awaits_points)
+            ItemScore(item.title, points, item.points, comment, item.by_hand, awaits_points)
         )
     form_result, values = check_input.form_points, check_input.values
     if isinstance(form_result, str) or not check_input.is_own_log:
@@ -165,15 +165,15 @@ def score_report(
         verification,
         tuple(graded_items),
         flags=(
-            *flag_pages(verification),
+            *flag_page_differences(verification),
             *flag_settings(results, key is not None),
             *([] if check_input.is_own_log else [_foreign_log_advice(check_input)]),
             *([OTHER_FORM_ADVICE] if check_input.has_form_of_other_log else []),
         ),
         instructor_action=reason_or_action if points_rule == "pending" else "",
-        mistakes=form_result.is_named_by_kind,
+        is_found_by_fault=form_result.is_named_by_kind,
         form_parts=tuple(
-            Item(name, form_result.points_by_part[name], max_points, "")
+            ItemScore(name, form_result.points_by_part[name], max_points, "")
             for name, max_points in form_result.max_points_by_part.items()
             if max_points
         ),
@@ -243,7 +243,7 @@ def grade_unreadable(
     comment = f"No points: the file is not a px4fuse report ({shorten_text(reason).rstrip('.')})."
     verification, items = cannot_verify(reason, remedy), rubric.items
     graded_items = tuple(
-        Item(item.title, 0.0, item.points, comment)
+        ItemScore(item.title, 0.0, item.points, comment)
         for item in items
         if item.applies("compare", key)
     )

@@ -50,7 +50,7 @@ def _initialise_chordal(graph: PoseGraph) -> PoseGraph:
     )
     rotation = _nearest_rotations(relaxed_rotation.transpose(0, 2, 1))
     # Residual of an edge in the axes of the measured pose: (R_i Z)' (t_j - t_i - R_i z)
-    first_rotation = rotation[graph.first]
+    first_rotation = rotation[graph.first_nodes]
     edge_axes = first_rotation @ measured_rotation
     information = (
         edge_axes @ graph.information[:, :dimension, :dimension] @ edge_axes.transpose(0, 2, 1)
@@ -76,7 +76,7 @@ def _solve_positions(
     first_pose: Array,
 ) -> Array:
     """Solve the :class:`NormalEquations` for a known first pose; the result has shape (n, d, k)."""
-    edges = np.stack([graph.first, graph.second])
+    edges = np.stack([graph.first_nodes, graph.second_nodes])
     equations = NormalEquations(edges, *first_pose.shape)
     known = np.zeros((len(graph), *first_pose.shape))
     known[0] = first_pose

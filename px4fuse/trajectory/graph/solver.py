@@ -108,8 +108,8 @@ def solve(
         The graph has no edges, is not connected, contains a number that is not finite, or robust
         optimisation drops all edges to some poses.
     """
-    model.require_connected(graph, np.ones(len(graph.first), bool), "the edges")
-    is_doubtful = ~graph.is_successive if is_closure is None else is_closure
+    model.require_connected(graph, np.ones(len(graph.first_nodes), bool), "the edges")
+    is_doubtful = ~graph.find_successive() if is_closure is None else is_closure
     start_residuals = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start_residuals.chi2))
     if not np.isfinite(cost_initial):
@@ -273,10 +273,10 @@ class Graph(Record, kw_only=True):
     dimension, poses, edges : int
     initialised : str
         Source of the initial poses.
-    chi2_ratio : float
+    reduced_chi2 : float
         χ² of the least-squares solution ÷ degrees of freedom; 0 without degrees of freedom.
-    chi2_ratio_interval : tuple of float
-        95 % interval of ``chi2_ratio`` for correct information matrices and closures.
+    reduced_chi2_interval : tuple of float
+        95 % interval of ``reduced_chi2`` for correct information matrices and closures.
     information_factor : float
         Estimated factor by which all information matrices are too large; 1 if it is not large. Gate
         and robust optimisation use the information divided by it.
@@ -290,8 +290,8 @@ class Graph(Record, kw_only=True):
     poses: Count
     edges: Count
     initialised: str
-    chi2_ratio: NotNegative
-    chi2_ratio_interval: tuple[NotNegative, NotNegative]
+    reduced_chi2: NotNegative
+    reduced_chi2_interval: tuple[NotNegative, NotNegative]
     information_factor: NotNegative
     gates: tuple[GateResult, ...] | Unavailable
     solutions: Mapping[str, Solution]
@@ -315,21 +315,21 @@ def analyse_graph(
     TrajectoryError
         The graph is not connected.
     """
-    is_closure = ~graph.is_successive
+    is_closure = ~graph.find_successive()
     progress(f"optimising: {SOLUTIONS['all']}")
     solutions = {"all": solve(graph)}
     freedom = int(model.observed_directions(graph.information).sum())
     freedom -= (len(graph) - 1) * graph.information.shape[-1]
-    chi2_ratio, interval = 0.0, (0.0, 0.0)
+    reduced_chi2, interval = 0.0, (0.0, 0.0)
     if freedom > 0:
-        chi2_ratio = 2.0 * solutions["all"].cost / freedom
+        reduced_chi2 = 2.0 * solutions["all"].cost / freedom
         interval = tuple((chdtri(freedom, [0.975, 0.025]) / freedom).tolist())
     scaled_graph, information_factor = graph, 1.0
     gates: tuple[GateResult, ...] | Unavailable
     try:
         gates = tuple(gate_edges(graph, np.flatnonzero(is_closure)))
-        if chi2_ratio > interval[1] and len(gates) >= MIN_FACTOR_CLOSURES:
-            factor = min(chi2_ratio, _information_factor(gates))
+        if reduced_chi2 > interval[1] and len(gates) >= MIN_FACTOR_CLOSURES:
+            factor = min(reduced_chi2, _information_factor(gates))
             if factor >= MIN_INFORMATION_FACTOR:
                 information_factor = factor
                 scaled_graph = replace(graph, information=graph.information / factor)
@@ -348,10 +348,10 @@ def analyse_graph(
         name=name,
         dimension=graph.dimension,
         poses=len(graph),
-        edges=len(graph.first),
+        edges=len(graph.first_nodes),
         initialised=graph.initialised,
-        chi2_ratio=chi2_ratio,
-        chi2_ratio_interval=interval,
+        reduced_chi2=reduced_chi2,
+        reduced_chi2_interval=interval,
         information_factor=information_factor,
         gates=gates,
         solutions=solutions,
