@@ -18,7 +18,7 @@ from px4fuse.comparison.trials import (
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import SETTING_RANGES
 from px4fuse.findings import cause_grouping as kinds
-from px4fuse.findings.model import format_percent, source_words
+from px4fuse.findings.model import format_percent, magnetometer_advice, source_words
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
@@ -91,7 +91,7 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
     if rotation_deg := change.pop(trials.ROTATION, None):
         # GNSS positions refer to true north: if they are rotated, EKF2's heading is wrong
         actions.append(
-            "Calibrate the magnetometer, away from metal."
+            magnetometer_advice(analysis.flight) or "Check the heading source of EKF2."
             if is_gnss
             else f"Rotate the positions by {rotation_deg:+.0f}° before they are sent."
         )

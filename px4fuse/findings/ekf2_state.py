@@ -14,9 +14,10 @@ from px4fuse.findings.model import (
     error,
     format_percent,
     fraction_of_ones,
+    magnetometer_advice,
     spans_with_value,
 )
-from px4fuse.flight.ekf2_parameters import BAROMETER, MAG, NO_MAGNETOMETER
+from px4fuse.flight.ekf2_parameters import BAROMETER, MAG
 from px4fuse.flight.model import (
     BODY_AXES,
     Columns,
@@ -206,9 +207,7 @@ def detect_missing_alignment(
 
 def _align_heading_action(flight: Flight, source: PositionTrack | None) -> str:
     """Return the action for a heading that EKF2 did not align, by the sensors of the vehicle."""
-    action = "Calibrate the magnetometer."
-    if flight.log.parameters.get(MAG.switch) == NO_MAGNETOMETER:
-        action = f"Enable the magnetometer ({MAG.switch} 0)."
+    action = magnetometer_advice(flight) or f"Enable the magnetometer ({MAG.switch} 0)."
     if source is not None and source.origin.is_vision:
         has_yaw = source.orientation is not None
         action += (

@@ -13,7 +13,8 @@ from px4fuse.core.record import Record, Span, read_toml
 from px4fuse.core.text import capitalise_first
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import SEVERITIES, Finding, Severity
-from px4fuse.flight.model import PositionKind, PositionTrack
+from px4fuse.flight.ekf2_parameters import MAG, NO_MAGNETOMETER
+from px4fuse.flight.model import Flight, PositionKind, PositionTrack
 
 
 class CatalogueEntry(Record):
@@ -102,6 +103,13 @@ SOURCE_WORDS: Mapping[PositionKind, SourceWords] = {
 def source_words(source: PositionTrack) -> SourceWords:
     """Return the causes and actions in messages for the kind of a position source."""
     return SOURCE_WORDS[source.origin.kind]
+
+
+def magnetometer_advice(flight: Flight) -> str:
+    """Return the action for a wrong magnetic heading; empty if EKF2 uses no magnetometer."""
+    if flight.log.parameters.get(MAG.switch) == NO_MAGNETOMETER:
+        return ""
+    return "Calibrate the magnetometer away from metal and motors."
 
 
 Findings = Iterator[Finding]

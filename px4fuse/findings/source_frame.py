@@ -11,8 +11,15 @@ from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings.ekf2_noise import confirmed_noise_trial
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSED_FRACTION_ERROR
-from px4fuse.findings.model import Findings, finding, fraction_of_ones, note, warning
-from px4fuse.flight.ekf2_parameters import EV_POS, MAG, NO_MAGNETOMETER
+from px4fuse.findings.model import (
+    Findings,
+    finding,
+    fraction_of_ones,
+    magnetometer_advice,
+    note,
+    warning,
+)
+from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, positions_phrase, source_name
 from px4fuse.trajectory.rotation import heading as heading_of
 from px4fuse.trajectory.rotation import interpolate
@@ -28,7 +35,6 @@ MIN_SEVERE_HEADING_ERROR_DEG = 15.0
 MIN_TRUE_DRIFT_RATIO = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
-CALIBRATE_MAGNETOMETER = "Calibrate the magnetometer away from metal and motors."
 # Bit of EKF2_EV_CTRL that enables the fusion of the yaw of external vision
 YAW_CONTROL_BIT = 8
 CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also causes a heading error."
@@ -110,7 +116,9 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         action = f"Rotate the positions by {-rotation_deg:+.0f}° before they are sent."
         if analysis.source.alignment is not None:
             action = "Run again with --position-yaw auto."
-    if not analysis.source.origin.is_gnss and (calibration_advice := _calibration_advice(analysis)):
+    if not analysis.source.origin.is_gnss and (
+        calibration_advice := magnetometer_advice(analysis.flight)
+    ):
         action += f" Alternatively: {lower_first(calibration_advice)}"
     yield finding(
         "error" if abs(rotation_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
@@ -131,13 +139,9 @@ def _gnss_heading_fault(analysis: Analysis) -> tuple[str, str]:
             "heading"
         )
         return cause, f"Set {format_settings(trial.change)}. Then check the heading again."
-    cause = "a magnetometer near currents or steel"
-    return cause, f"{_calibration_advice(analysis)} {CHECK_GNSS_DELAY}".lstrip()
-
-
-def _calibration_advice(analysis: Analysis) -> str:
-    mag_type = analysis.flight.log.parameters.get(MAG.switch)
-    return "" if mag_type == NO_MAGNETOMETER else CALIBRATE_MAGNETOMETER
+    advice = magnetometer_advice(analysis.flight)
+    cause = "a magnetometer near currents or steel" if advice else "the heading source of EKF2"
+    return cause, f"{advice} {CHECK_GNSS_DELAY}".lstrip()
 
 
 def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
@@ -169,7 +173,7 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     if heading.by == "orientation":
         estimation_basis = f"the orientation of {source_name(analysis.source)}"
     calibration_advice, has_yaw = (
-        _calibration_advice(analysis),
+        magnetometer_advice(analysis.flight),
         analysis.source.orientation is not None,
     )
     possible_causes = [
