@@ -8,7 +8,7 @@ Verdict = Literal["determined", "ambiguous", "doubtful", "not determinable"]
 Direction = Literal["north", "east", "south", "west", "up", "down"]
 Axes = tuple[Direction, Direction, Direction]
 Unit = Literal["m", "cm", "mm", "feet"]
-HeadingSource = Literal["EKF2", "gyroscopes"]
+HeadingSource = Literal["EKF2", "gyroscopes", "GNSS"]
 Order = Literal["w x y z", "x y z w"]
 Frames = Literal["FRD to NED", "FLU to ENU", "FLU to NWU", "FLU to NED", "FRD to ENU"]
 
@@ -48,8 +48,9 @@ class Convention(Record, kw_only=True, omit_defaults=False):
         larger than the noise; "not determinable": too little data or motion.
     rotation_deg : float
         Rotation of the positions relative to the axes x, y, z, clockwise from above.
-    heading_from : {"EKF2", "gyroscopes"}
-        Attitude that fits the positions: logged by EKF2, or integrated from the gyroscopes.
+    heading_from : {"EKF2", "gyroscopes", "GNSS"}
+        Reference of the rotation: heading logged by EKF2, heading integrated from the gyroscopes,
+        or true north of the GNSS positions.
     late_s : float
         Delay of the timestamps; negative if they are early.
     clock_drift : float

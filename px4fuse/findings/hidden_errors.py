@@ -74,16 +74,19 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
 
     Return (filter, axis, error) for each error, sorted by decreasing mean NEES.
     """
-    alignment, frame_error_m = comparison.source.alignment, 0.0
-    # a position frame that was fitted to EKF2's track may contain EKF2's error
+    alignment, frame_error_m, is_frame_fitted = comparison.source.alignment, 0.0, False
+    # a position frame that was fitted to EKF2's track may contain EKF2's error, also of the height
     if alignment is not None and alignment.yaw_sigma_deg is not None:
-        frame_error_m = alignment.residual_rms_m or 0.0
+        frame_error_m, is_frame_fitted = alignment.residual_rms_m or 0.0, True
     errors = [
         (filter_name, name, error)
         for name, result in comparison.axes.items()
         for filter_name, summary in result.filters.items()
         if (error := error_above_reported_sigma(summary))
-        and (filter_name == "ekf2" or error.rmse_m > frame_error_m)
+        and (
+            filter_name == "ekf2"
+            or (error.rmse_m > frame_error_m and not (is_frame_fitted and name == "down"))
+        )
     ]
     return sorted(errors, key=lambda entry: -entry[2].nees)
 
