@@ -38,8 +38,8 @@ def vision_of(flight: Flight) -> pd.DataFrame:
 
 
 def test_ekf2_model_transition_equals_product_of_step_matrices(model: Model) -> None:
-    segment, made = model.inputs.segments[0], next(iter(model.intervals.values()))[0]
-    end = made.events.end_step
+    segment, intervals = model.inputs.segments[0], next(iter(model.intervals.values()))[0]
+    made, end = intervals.transitions(slice(None)), intervals.events.end_step
     starts = np.concatenate([[0], end[:-1]])
     gyro, force = (model.inputs.settings[f"EKF2_{name}_NOISE"] for name in ("GYR", "ACC"))
     noise = np.zeros_like(made.transition)

@@ -24,7 +24,7 @@ from flights import Imu, aisle_flight, unexplained
 from px4fuse.analysis import Analysis
 from px4fuse.cli.compare import compare as compare_command
 from px4fuse.cli.options import comparison_request, read_student
-from px4fuse.comparison.model import FILTERS, AxisComparison
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison
 from px4fuse.core.text import format_ratio
 from px4fuse.diagnose import prepare_comparison
 from px4fuse.explore import page as pages
@@ -126,10 +126,10 @@ def cells(result: AxisComparison) -> dict[str, list[str]]:
     names = ["● innovation ÷ √S, RMS", "◆ error ÷ σ, RMS",
              "Innovations outside ±2√S (expected 5 %)",
              "Lag-1 autocorrelation of the innovations", "Number of measurements"]  # fmt: skip
-    both = zip(*(statement(result.filters[name]) for name in FILTERS), strict=True)
+    both = zip(*(statement(result.filters[name]) for name in FILTER_NAMES), strict=True)
     expected = {name: list(pair) for name, pair in zip(names, both, strict=True)}
     difference: Any = result.difference
-    errors = [result.filters[name].truth for name in FILTERS]
+    errors = [result.filters[name].truth for name in FILTER_NAMES]
     expected["KF − EKF2 position difference, RMS"] = [f"{difference.position_rms_m:.3f} m", "–"]
     expected["KF − EKF2 velocity difference, RMS"] = [f"{difference.velocity_rms_m_s:.3f} m/s", "–"]
     for name, unit in (("Position", "m"), ("Velocity", "m/s")):

@@ -12,7 +12,7 @@ from px4fuse.classroom.assignment.random_assignment import random_uniform
 from px4fuse.results.answer_form import CHOICE_NAMES, MAX_CHOICES, MAX_FORM_BYTES, form_text
 
 
-def test_right_choices_of_one_figure_belong_to_one_fault() -> None:
+def test_right_answers_on_one_plot_belong_to_one_fault() -> None:
     for number in range(20):
         choices = select_choices(partial(random_uniform, b"secret", f"s{number}", "aisle"))
         assert len(choices) == len(QUESTIONS) * figures.FIGURE_COUNT <= MAX_CHOICES
@@ -32,12 +32,12 @@ def test_right_multiple_choice_letters_are_equally_frequent() -> None:
         assert letters.count(name) / len(letters) == pytest.approx(0.2, abs=0.03)
 
 
-def test_answers_to_figure_questions_differ_between_faults() -> None:
+def test_answers_to_plot_questions_differ_between_faults() -> None:
     for field in QUESTIONS:
         assert len({getattr(fault, field) for fault in FAULTS.values()}) == len(FAULTS)
 
 
-def test_figures_of_same_secret_and_student_are_equal(monkeypatch) -> None:
+def test_plot_questions_of_same_secret_and_student_are_equal(monkeypatch) -> None:
     monkeypatch.setattr(figures, "FIGURE_COUNT", 1)
     random_number = partial(random_uniform, b"secret", "s1", "aisle")
     content = draw_figures(random_number)

@@ -376,7 +376,7 @@ def test_compare_of_real_gnss_flights_equals_reference_numbers(name, shared_logs
         count, exact_m = re.findall(pattern, track.notes[1])[0]
         assert int(count) > FROM_INNOVATIONS[name]
         assert float(exact_m) < 0.1
-        assert track.rate_hz > 2.9
+        assert track.compute_rate_hz() > 2.9
 
 
 def as_in_the_log(found: dict[str, AidResult], truth: dict[str, Any]) -> int:
@@ -478,7 +478,7 @@ def test_what_if_with_correct_gnss_delay_reduces_heading_error(models):
             model.flight.ekf2.state["down_m"],
             model.baseline_replay.published["down_m"],
         )
-        state = state[inside_spans(state.index, model.baseline_replay.evaluated_s)]
+        state = state[inside_spans(state.index, model.baseline_replay.find_evaluated_spans())]
         assert rms(np.interp(state.index, replayed.index, replayed) - state.to_numpy()) < 0.05
     assert heading_deg("delay0", EKF2_GPS_DELAY=200.0) == pytest.approx((4.7, 1.5), abs=0.3)
     # 110 ms of delay error rotate the heading in proportion to 4.7° for 200 ms

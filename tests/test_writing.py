@@ -262,7 +262,7 @@ def test_stop_signal_after_writing_lists_the_written_files(desk, monkeypatch, ca
     def stopped(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(screen, "show", stopped)
+    monkeypatch.setattr(screen, "print_blocks", stopped)
     code, _, err = run_main(monkeypatch, capsys, *LOOP, "--json", "c.json")
     assert (code, err) == (130, "px4fuse: interrupted; outputs already written: c.tum, c.json.\n")
     assert names(desk) == ["c.json", "c.tum", "l.ulg", "s.tum"]

@@ -30,12 +30,12 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     with progress(json_path) as show_progress:
         comparison = prepare_comparison(request, show_progress)
         tunings = estimate_noises(comparison, progress=show_progress)
-    missing = [tuning for tuning in tunings.values() if isinstance(tuning, Unavailable)]
-    if len(missing) == len(tunings):
+    unavailable = [tuning for tuning in tunings.values() if isinstance(tuning, Unavailable)]
+    if len(unavailable) == len(tunings):
         raise MissingDataError(
             f"{comparison.flight.log.name}: SIGMA_A and SIGMA_Z cannot be estimated: "
-            f"{missing[0].reason}",
-            missing[0].remedy,
+            f"{unavailable[0].reason}",
+            unavailable[0].remedy,
         )
     results = tuning_results(request, comparison, tunings)
     write_and_print(result_files(results, json_path), tuning_page(comparison, tunings), request)

@@ -34,20 +34,20 @@ Frame = pd.DataFrame | Unavailable
 def run_kf(
     prepared: PreparedComparison, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Replay]:
-    """Run KF along each axis of a comparison, and return the runs by axis name."""
+    """Run KF along each axis of a comparison; return the runs by axis name."""
     progress(f"running KF along the axes {', '.join(axis.name for axis in prepared.input_axes)}")
     return {axis.name: replay(axis, prepared.settings) for axis in prepared.input_axes}
 
 
 def compare(prepared: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comparison:
-    """Compare KF with EKF2, and both with ground truth, along each axis that KF ran along."""
+    """Compare the runs of KF with EKF2, and both with ground truth, along each axis."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, note = projection.continuous_state(ekf2, prepared.source, prepared.segment)
         notes += [note] if note else []
         notes += ekf2.notes
         if not state.equals(ekf2.state):
-            # omit the states at the fusion horizon: their origin still moves with the resets
+            # The states at the fusion horizon are omitted: their origin still moves with the resets
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     axes = {name: _compare_axis(prepared, ekf2, kf_run) for name, kf_run in kf_runs.items()}
     innovations: dict[FilterName, dict[str, Frame]] = {
@@ -106,14 +106,16 @@ def _compare_axis(
         replay=kf_run,
         ekf2_innovations=innovations,
         **tracks,
-        flight_tracks=project_tracks(ekf2, flight.truth, axis, segment.flight),
+        flight_tracks=tracks
+        if segment.flight_s in (None, (segment.start_s, segment.end_s))
+        else project_tracks(ekf2, flight.truth, axis, segment.flight),
     )
 
 
 def project_tracks(
     ekf2: Ekf2 | Unavailable, truth: Truth | Unavailable, axis: Axis, segment: Segment
 ) -> dict[str, Frame]:
-    """Project EKF2's state, EKF2's variances and the ground truth onto an axis."""
+    """Project EKF2's state, EKF2's variances and ground truth onto an axis."""
     state: Frame
     variance: Frame
     if isinstance(ekf2, Unavailable):
@@ -186,14 +188,14 @@ def _rmse(error: Array) -> float:
 def kf_error_statistics(
     kf_run: Replay, truth: Frame, ekf2_state: Frame
 ) -> ErrorsAgainstTruth | Unavailable:
-    """Compute the errors of KF against ground truth, at EKF2's sample times if available."""
+    """Compute the errors of KF against ground truth, if possible at EKF2's sample times."""
     return error_statistics(*_kf_track(kf_run, ekf2_state), truth)
 
 
 def _kf_track(kf_run: Replay, ekf2_state: Frame) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return state and variances of KF at EKF2's sample times, else at KF's prediction times."""
-    time_frame = kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state
-    return kf_state_and_variance(kf_run, time_frame.index.to_numpy())
+    """Return state and variances of KF at EKF2's sample times; without EKF2, at KF's steps."""
+    timed_rows = kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state
+    return kf_state_and_variance(kf_run, timed_rows.index.to_numpy())
 
 
 def kf_state_and_variance(kf_run: Replay, times_s: Array) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -212,8 +214,8 @@ def error_statistics(
 ) -> ErrorsAgainstTruth | Unavailable:
     """Compute the errors of a filter against ground truth along one axis.
 
-    Variances are interpolated to the times of ``state``, because PX4 logs those of EKF2 at a tenth
-    of the rate.
+    Variances are interpolated to the times of ``state``, because PX4 logs them at a tenth of the
+    rate of EKF2's state.
     """
     if isinstance(state, Unavailable):
         return state
@@ -252,7 +254,7 @@ def _errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
 
 
 def reported_sigma(time_s: Array, variance: Frame, column: str) -> Array:
-    """Return the reported σ, interpolated to ``time_s``; NaN where unknown."""
+    """Interpolate the reported σ to the times ``time_s``; NaN if it is unknown."""
     known_variance = _known_values(variance, column)
     if known_variance.empty:
         return np.full(len(time_s), np.nan)
@@ -271,8 +273,8 @@ def _mean_nees(normalised_errors: Array) -> float | None:
 def position_errors(axis_result: AxisComparison, filter_name: FilterName) -> Frame:
     """Return position errors against ground truth and reported σ (m) of one filter along an axis.
 
-    The index is the time (s) of EKF2's published state or, without EKF2, of KF's predictions. The
-    columns are ``error_m`` and ``sigma_m``; NaN where unknown.
+    The columns are ``error_m`` and ``sigma_m``, NaN if unknown. The index is the time (s) of EKF2's
+    published state or, without EKF2, of KF's predictions.
     """
     if isinstance(axis_result.truth, Unavailable):
         return axis_result.truth
@@ -293,7 +295,7 @@ def position_errors(axis_result: AxisComparison, filter_name: FilterName) -> Fra
 def normalised_position_errors(
     axis_result: AxisComparison, filter_name: FilterName
 ) -> tuple[Array, Array] | Unavailable:
-    """Return the times (s), and the position errors against ground truth ÷ reported σ."""
+    """Return times (s), and ratios of position error against ground truth to reported σ."""
     errors = position_errors(axis_result, filter_name)
     if isinstance(errors, Unavailable):
         return errors
@@ -318,7 +320,7 @@ def _horizontal_nis(frames: Mapping[str, Frame]) -> HorizontalNis | None:
     ]
     if len(frames_of_axes) < 2:
         return None
-    # keep updates with innovations along both axes (same timestamp)
+    # Only updates with innovations along both axes (equal timestamps) are used
     north_and_east = pd.concat(frames_of_axes, axis=1, join="inner").to_numpy().T
     return assess_horizontal(
         (north_and_east[0], north_and_east[1]), (north_and_east[2], north_and_east[3])

@@ -15,15 +15,17 @@ from px4fuse.findings.model import Findings, finding, format_percent, note, warn
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.flight.model import BAD_ACCELERATION, Unavailable
 
-# External vision, which other modules test by replays of EKF2
+# Aiding sources of external vision: other modules test them by replays of EKF2
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
 # Time (s) after take-off in which EKF2 may ignore the barometer because of ground effect
 TAKE_OFF_S = 10.0
-# Minimum ratio of EKF2's largest height error in a barometer gap to its height RMSE outside the gap
+# EKF2's largest height error in a barometer gap is reported if it exceeds the height RMSE outside
+# the gap by this factor
 MIN_HEIGHT_ERROR_RATIO = 3.0
 # Aiding sources whose vertical innovations can set EKF2's flag for a bad vertical acceleration
 VERTICAL_AIDS = ("gnss_vel", "gnss_hgt", "baro_hgt")
-# Maximum fraction of the time with a bad vertical acceleration for severity note
+# If EKF2 reports a bad vertical acceleration for a larger fraction of the time, the severity is
+# warning instead of note
 MAX_BAD_FRACTION_NOTE = 0.3
 # Action if EKF2 does not fuse a sensor, by the PX4 parameter that enables its fusion
 CHECKS = {
@@ -38,7 +40,7 @@ DEFAULT_CHECK = "Check mounting and power supply of the sensor."
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect faults of EKF2's aiding sources in a compared flight."""
+    """Detect faults of EKF2's aiding sources."""
     if isinstance(analysis.aids, Unavailable):
         return
     aid = analysis.source.origin.aid
@@ -91,8 +93,8 @@ def detect_in_aids(
 ) -> Findings:
     """Detect faults of EKF2's aiding sources.
 
-    ``source_aid``: aiding source whose positions KF uses. ``take_off_s``: times (s) of take-offs.
-    ``height_error_m``: EKF2's largest height error in the longest barometer gap, if large.
+    ``source_aid`` is the aiding source whose positions KF uses, ``take_off_s`` are the times (s) of
+    take-off, ``height_error_m`` is EKF2's height error in a barometer gap, if large.
     """
     tested_aids = {name: aid for name, aid in aids.items() if name not in AIDS_OF_OTHER_DETECTORS}
     unfused_aids_by_switch: dict[str, list[AidResult]] = {}
@@ -144,8 +146,8 @@ def detect_in_aids(
                 ((time_s, time_s + CHANGE_WINDOW_S),),
             )
         elif aid.verdict == "overconfident" and name != source_aid:
-            # no noise value is proposed: innovations alone do not distinguish noise from a wrong
-            # delay
+            # No noise value is proposed, because innovations alone do not distinguish noise from a
+            # wrong delay
             action = "correct the accuracy that the sensor reports"
             if noise_parameter := AIDS[name].noise:
                 action = f"increase {noise_parameter}"

@@ -10,9 +10,9 @@ from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, GAP
 from px4fuse.findings.model import Findings, finding, format_count, warning, zero_length_spans
 from px4fuse.flight.model import Ekf2, Reset
 
-# Time (s) after take-off in which a height reset of EKF2 is usual
+# Time (s) after take-off in which a height reset of EKF2 is normal
 TAKE_OFF_S = 10.0
-# Maximum time (s) from the end of a gap in the source to a position reset caused by the gap
+# Maximum time (s) from the end of a gap in the position source to a reset that the gap causes
 MAX_RESET_DELAY_S = 5.0
 
 

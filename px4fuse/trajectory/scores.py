@@ -20,8 +20,8 @@ from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 DeltaUnit = Literal["frames", "m", "s"]
 
-# Maximum relative difference between the distance of an RPE pair and the requested distance, if all
-# pairs are used: default of the evo package
+# Maximum relative error of the distance of an RPE pair, if all pairs are used: default of the evo
+# package
 DELTA_TOLERANCE = 0.1
 # Default distances (m) of RPE pairs
 DEFAULT_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
@@ -143,14 +143,16 @@ def rotation_statistics(a: Rotation, b: Rotation) -> Statistics:
 def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
     """Choose distances and times for the RPE that fit path length and duration of the flight."""
 
-    def choose(progress: Array, values: Sequence[float], min_fraction: float) -> list[float]:
-        total = float(np.ptp(progress))
+    def choose_values(
+        distance_or_time: Array, values: Sequence[float], min_fraction: float
+    ) -> list[float]:
+        total = float(np.ptp(distance_or_time))
         # The minimum distance or time of a pair is two median intervals between poses
-        minimum = max(min_fraction * total, 2.0 * median_interval(progress))
+        minimum = max(min_fraction * total, 2.0 * median_interval(distance_or_time))
         return [value for value in values if minimum <= value <= MAX_DELTA_FRACTION * total]
 
-    distances_m = choose(distance_m, DEFAULT_DISTANCES_M, MIN_DELTA_FRACTION)
-    times_s = choose(time_s, DEFAULT_TIMES_S, 0.0)
+    distances_m = choose_values(distance_m, DEFAULT_DISTANCES_M, MIN_DELTA_FRACTION)
+    times_s = choose_values(time_s, DEFAULT_TIMES_S, 0.0)
     return (
         *(Delta(value, "m") for value in distances_m[-MAX_DISTANCE_DELTAS:]),
         *(Delta(value, "s") for value in times_s[-MAX_TIME_DELTAS:]),
