@@ -76,15 +76,18 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
     Return (filter, axis, error) for each error, largest mean NEES first.
     """
     alignment, frame_error_m = comparison.source.alignment, 0.0
-    # If the position frame is aligned with EKF2's track, it may contain EKF2's error
-    if alignment is not None and alignment.yaw_sigma_deg is not None:
+    # A position frame aligned with EKF2's track may contain EKF2's error, also in height
+    if is_frame_fitted := alignment is not None and alignment.yaw_sigma_deg is not None:
         frame_error_m = alignment.residual_rms_m or 0.0
     errors = [
         (filter_name, name, error)
         for name, result in comparison.axes.items()
         for filter_name, summary in result.filters.items()
         if (error := error_above_reported_sigma(summary))
-        and (filter_name == "ekf2" or error.rmse_m > frame_error_m)
+        and (
+            filter_name == "ekf2"
+            or (error.rmse_m > frame_error_m and not (is_frame_fitted and name == "down"))
+        )
     ]
     return sorted(errors, key=lambda entry: -entry[2].nees)
 

@@ -24,6 +24,9 @@ MIN_WHITE_NOISE_RATIO = 0.3
 # Minimum log likelihood ratio (nats) of time-correlated to white noise: 1 of 400 flights without
 # a fault exceeds it
 MIN_CORRELATION_GAIN_NATS = 5.0
+# Minimum time-correlated error (m, 1 σ): timestamps in ms cause 2 mm at 4 m/s, and the motion from
+# IMU or ground truth also has errors of some mm
+MIN_CORRELATED_SIGMA_M = 0.005
 # Minimum fraction of repeated positions for a warning
 MIN_REPEAT_FRACTION = 0.05
 # Minimum fraction of repeated positions for severity error
@@ -57,6 +60,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     if (
         not isinstance(noise, TimeCorrelatedNoise)
         or noise.gain_nats < MIN_CORRELATION_GAIN_NATS
+        or noise.slow_m < MIN_CORRELATED_SIGMA_M
         or noise.low_pass_gain_nats
         >= MIN_LAG_NATS  # a low-pass filtered source has its own finding
     ):
