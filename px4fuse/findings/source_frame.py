@@ -13,7 +13,15 @@ from px4fuse.findings.ekf2_noise import confirmed_noise_trial
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSED_FRACTION_ERROR
 from px4fuse.findings.model import Findings, finding, fraction_of_ones, note, warning
 from px4fuse.flight.ekf2_parameters import EV_POS, MAG, NO_MAGNETOMETER
-from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, positions_phrase, source_name
+from px4fuse.flight.model import (
+    Columns,
+    Ekf2,
+    Flight,
+    Unavailable,
+    positions_phrase,
+    rows_between,
+    source_name,
+)
 from px4fuse.trajectory.rotation import heading as heading_of
 from px4fuse.trajectory.rotation import interpolate
 
@@ -150,7 +158,7 @@ def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
         return False
     errors_deg = []
     for part in heading.ends:
-        samples = attitude.loc[part.start_s : part.end_s, Columns.QUATERNION]
+        samples = rows_between(attitude, part.start_s, part.end_s)[Columns.QUATERNION]
         true_attitude = interpolate(
             samples.index.to_numpy(), truth.attitude.index.to_numpy(), truth.attitude.to_numpy()
         )
