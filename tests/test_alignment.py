@@ -14,6 +14,7 @@ from exchange import replace
 from flights import Estimator, Imu, Span, Uwb, aisle_flight, table, unavailable
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from px4fuse.simulation.mistakes import parse_mistakes
 
 from px4fuse.alignment.placement import align_position_file
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU
@@ -33,7 +34,6 @@ from px4fuse.readers import read_log
 from px4fuse.readers.position_file import SAMPLE_COLUMNS, PositionRecording, read_position_file
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 BOOT_S = 2416.25

@@ -20,7 +20,15 @@ from px4fuse.findings.model import (
     warning,
 )
 from px4fuse.flight.ekf2_parameters import EV_POS
-from px4fuse.flight.model import Columns, Ekf2, Flight, Unavailable, positions_phrase, source_name
+from px4fuse.flight.model import (
+    Columns,
+    Ekf2,
+    Flight,
+    Unavailable,
+    positions_phrase,
+    rows_between,
+    source_name,
+)
 from px4fuse.trajectory.rotation import heading as heading_of
 from px4fuse.trajectory.rotation import interpolate
 
@@ -154,7 +162,7 @@ def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
         return False
     errors_deg, (first_part, last_part) = [], heading.find_ends()
     for part in (first_part, last_part):
-        samples = attitude.loc[part.start_s : part.end_s, Columns.QUATERNION]
+        samples = rows_between(attitude, part.start_s, part.end_s)[Columns.QUATERNION]
         true_attitude = interpolate(
             samples.index.to_numpy(), truth.attitude.index.to_numpy(), truth.attitude.to_numpy()
         )

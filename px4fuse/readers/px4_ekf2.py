@@ -216,10 +216,14 @@ def _prediction_interval_s(topics: Topics) -> float:
 
 
 def rows_of_timestamps(times_s: Array, wanted_times_s: ArrayLike) -> IntArray:
-    """Return the indices of the elements of ``times_s`` that are, in µs, in ``wanted_times_s``."""
-    return np.flatnonzero(
-        np.isin(np.rint(times_s * 1e6), np.rint(np.asarray(wanted_times_s, dtype=float) * 1e6))
+    """Return the indices of the increasing ``times_s`` in ``wanted_times_s``, compared in µs."""
+    times_us, wanted_us = (
+        np.rint(np.asarray(times, float) * 1e6) for times in (times_s, wanted_times_s)
     )
+    rows = np.searchsorted(times_us, wanted_us)
+    is_inside = rows < len(times_us)
+    rows, wanted_us = rows[is_inside], wanted_us[is_inside]
+    return np.unique(rows[times_us[rows] == wanted_us])
 
 
 def samples_per_step(
