@@ -35,7 +35,7 @@ from px4fuse.comparison.estimates import (
 )
 from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison, PreparedComparison
-from px4fuse.comparison.preparation import explain_missing_source, prepare
+from px4fuse.comparison.preparation import explain_missing_source, prepare, shift_clock
 from px4fuse.comparison.remedy import ml_ekf2_parameters
 from px4fuse.comparison.reruns import Reruns, planned_configurations, rerun_filters
 from px4fuse.convention.correction import convention_faults
@@ -50,6 +50,7 @@ from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import find, find_aids
+from px4fuse.findings.cause_grouping import CONVENTION
 from px4fuse.flight.ekf2_parameters import check_parameters
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
 from px4fuse.loop.model import Loop
@@ -84,10 +85,47 @@ def diagnose(
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
     flight = flight or read_flight(request, progress)
+    analysis = _diagnose_flight(request, progress, flight, as_sent=as_sent)
+    if refined_flight := _refine_file_clock(flight, analysis):
+        analysis = _diagnose_flight(request, progress, refined_flight, as_sent=as_sent)
+    return analysis
+
+
+def _diagnose_flight(
+    request: ComparisonRequest, progress: Progress, flight: Flight, *, as_sent: bool
+) -> Analysis:
     prepared_comparison = prepare_comparison(flight, request, progress, as_sent=as_sent)
     kf_runs = run_kf(prepared_comparison, progress)
     comparison = compare(prepared_comparison, kf_runs)
     return replace(find_faults(comparison, progress), request=request)
+
+
+def _refine_file_clock(flight: Flight, analysis: Analysis) -> Flight | None:
+    """Correct an estimated clock offset of a position file by that of the IMU, if they differ.
+
+    The first estimate is from EKF2's positions, which may be late.
+    """
+    alignment, clock = analysis.source.alignment, analysis.clock
+    if (
+        alignment is None
+        or alignment.clock_offset_sigma_s is None
+        or alignment.reference != "EKF2 position"
+        or not isinstance(clock, ClockOffset)
+        or all(found.id != "source_time_offset" for found in analysis.findings)
+        or any(CONVENTION in found.evidence for found in analysis.findings)
+    ):
+        return None
+    difference = f"{abs(clock.offset_s):.3f} s {'late' if clock.offset_s < 0 else 'early'}"
+    alignment = structs.replace(
+        alignment,
+        clock_offset_s=alignment.clock_offset_s + clock.offset_s,
+        clock_offset_sigma_s=clock.sigma_s,
+        clock_reason=f"the offset was estimated with the IMU, because EKF2's position is "
+        f"{difference} relative to the IMU",
+    )
+    file_track, *other_tracks = flight.positions
+    shifted_track = replace(shift_clock(file_track, clock.offset_s), alignment=alignment)
+    return replace(flight, positions=(shifted_track, *other_tracks))
 
 
 def find_faults(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:

@@ -354,6 +354,14 @@ PRECONDITIONS: list[tuple[str, Callable[[Comparison, Finding], bool]]] = [
     ("texture|marker|camera", lambda made, _: made.source.origin.kind in ("vio", "mocap")),
     ("--source-kind mocap", lambda made, _: made.source.origin.kind == "vio"),
     ("Calibrate the magnetometer", lambda made, _: parameter(made, "EKF2_MAG_TYPE") != 5.0),
+    ("[Aa]ntenna|receiver|sky|RTK", lambda made, _: made.source.origin.is_gnss),
+    ("EKF2_DELAY_MAX", lambda made, _: "EKF2_DELAY_MAX" in made.flight.log.parameters),
+    ("EKF2_EV_CTRL bit 3", lambda made, _: made.source.origin.is_vision),
+    ("EKF2_EV_NOISE_MD", lambda made, _: "EKF2_EV_NOISE_MD" in made.flight.log.parameters),
+    (
+        "sent|sending|[Ss]end (the|each|a|one|raw|nothing|NaN)",
+        lambda made, _: not made.source.origin.is_gnss,
+    ),
     ("SD card", lambda made, one: bool(made.flight.log.dropouts) or one.id in CORRUPT_LOG),
     (
         "let EKF2 fuse the yaw",

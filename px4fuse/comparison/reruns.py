@@ -394,13 +394,13 @@ def _replay_ekf2(
     changed_model = with_misaligned_positions(
         model, change.get(ROTATION, 0.0), change.get(CLOCK_OFFSET, 0.0)
     )
-    excluded_s, axis_tuning = None, tuning_of_axis(tuning, HORIZONTAL)
+    excluded_times_s, axis_tuning = None, tuning_of_axis(tuning, HORIZONTAL)
     if OUTLIERS in change and axis_tuning is not None:
-        excluded_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
+        excluded_times_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
         if comparison.source.origin.fused_as_gnss:
-            excluded_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
-        excluded_s += change.get(CLOCK_OFFSET, 0.0)
-    (replay,) = replay_settings(changed_model, [changed_parameters], excluded_s)
+            excluded_times_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
+        excluded_times_s += change.get(CLOCK_OFFSET, 0.0)
+    (replay,) = replay_settings(changed_model, [changed_parameters], excluded_times_s)
     return replay
 
 

@@ -447,11 +447,13 @@ def match_updates(
     fused_at_s = updates["fused_at_s"].to_numpy()
     update_row = np.searchsorted(fused_at_s, logged_s + 1e-4, side="right") - 1
     age_s = logged_s - fused_at_s[np.maximum(update_row, 0)]
-    is_match = (update_row >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
+    is_matched = (update_row >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
     # A row that is logged in the prediction step of a fusion may contain the previous innovation
-    is_unambiguous = is_match & (age_s >= SAME_STEP_S)
+    is_unambiguous = is_matched & (age_s >= SAME_STEP_S)
     return np.where(
-        is_unambiguous if is_unambiguous.sum() > 0.5 * is_match.sum() else is_match, update_row, -1
+        is_unambiguous if is_unambiguous.sum() > 0.5 * is_matched.sum() else is_matched,
+        update_row,
+        -1,
     )
 
 
@@ -462,23 +464,23 @@ def _axis_agreement(
     ekf2: Ekf2,
     ekf2_replay: Ekf2Replay,
 ) -> AxisAgreement:
-    nu, nu_log, S, S_log = (
+    nu, nu_logged, S, S_logged = (
         innovations[name].to_numpy()
         for name in (f"innovation_{axis}_m", f"innovation_variance_{axis}_m2")
         for innovations in (replayed_innovations, logged_innovations)
     )
-    s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_log, [5, 50, 95]).tolist()
+    s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_logged, [5, 50, 95]).tolist()
     logged_state = rows_inside(ekf2.state, ekf2_replay.find_evaluated_spans())
     position_m, velocity_m_s = (
         _replayed_minus_logged(ekf2_replay, logged_state, f"{axis}_{unit}") for unit in ("m", "m_s")
     )
     return AxisAgreement(
-        innovation_correlation=float(np.corrcoef(nu, nu_log)[0, 1]),
-        innovation_rms_difference=rms(nu - nu_log),
+        innovation_correlation=float(np.corrcoef(nu, nu_logged)[0, 1]),
+        innovation_rms_difference=rms(nu - nu_logged),
         s_ratio_median=s_ratio_median,
         s_ratio_p5=s_ratio_p5,
         s_ratio_p95=s_ratio_p95,
-        nis_mean_logged=float(np.mean(nu_log**2 / S_log)),
+        nis_mean_logged=float(np.mean(nu_logged**2 / S_logged)),
         nis_mean_replayed=float(np.mean(nu**2 / S)),
         position_rms_difference_m=rms(position_m),
         velocity_rms_difference_m_s=rms(velocity_m_s),

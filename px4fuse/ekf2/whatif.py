@@ -82,11 +82,11 @@ MAX_REJECTED_FRACTION = 0.35
 # EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# Maximum ratio between the mean NIS of repeated replays
+# Maximum ratio of the largest to the smallest mean NIS of repeated replays
 MAX_NIS_RATIO = 1.10
 # Maximum difference between the rejected fractions of repeated replays
 MAX_REJECTED_SPREAD = 0.03
-# Maximum ratio between the position RMSE of repeated replays
+# Maximum ratio of the largest to the smallest position RMSE of repeated replays
 MAX_RMSE_RATIO = 1.15
 
 

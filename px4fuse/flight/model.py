@@ -773,6 +773,16 @@ def time_index(time_s: NDArray[Any]) -> pd.Index[float]:
     return index
 
 
+def rows_between(samples: pd.DataFrame, start_s: float, end_s: float) -> pd.DataFrame:
+    """Return the rows from ``start_s`` to ``end_s`` of a table that is indexed by time (s).
+
+    ``samples.loc[start_s:end_s]`` would build a hash table of all times, as large as four columns.
+    """
+    time_s = samples.index.to_numpy()
+    first_row = int(np.searchsorted(time_s, start_s))
+    return samples.iloc[first_row : int(np.searchsorted(time_s, end_s, side="right"))]
+
+
 def sample_rate(samples: pd.DataFrame) -> float:
     """Return the sample rate (Hz) outside of gaps of a table that is indexed by time.
 

@@ -30,7 +30,14 @@ from px4fuse.flight.ekf2_parameters import (
     REPORTED_PARAMETERS,
     replace_invalid_parameters,
 )
-from px4fuse.flight.model import Dropout, LogInfo, ParameterChange, Stream, time_index
+from px4fuse.flight.model import (
+    Dropout,
+    LogInfo,
+    ParameterChange,
+    Stream,
+    rows_between,
+    time_index,
+)
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
 
@@ -238,7 +245,7 @@ class Topics:
         index = time_index((time_us[kept_rows] - self.zero_us) * _MICROSECOND_S)
         samples = pd.DataFrame(values.T, index, list(fields), copy=False)
         end_s = self.log.duration_s + MAX_OUTSIDE_S
-        return samples if step else samples.loc[-MAX_OUTSIDE_S:end_s]
+        return samples if step else rows_between(samples, -MAX_OUTSIDE_S, end_s)
 
     def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
         """Read the first layout whose required fields are in the log; empty without them."""
