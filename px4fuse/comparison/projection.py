@@ -63,6 +63,7 @@ def continuous_state(
         ("height", "position", Columns.POSITION[2:]),
         ("velocity", "velocity", Columns.VELOCITY),
     ):
+        # Indices in Reset.delta: 0 north, 1 east, 2 down
         axes = [Columns.STATE.index(column) % 3 for column in columns]
         resets = [
             reset
@@ -71,7 +72,7 @@ def continuous_state(
         ]
         if not resets:
             continue
-        reset_texts = kept_resets
+        group = kept_resets
         if quantity == "position":  # a velocity does not depend on the origin
             samples = cut_to_segment(track.samples, segment)[columns].dropna()
             distance_to_samples = partial(_median_square_distance, samples)
@@ -80,8 +81,8 @@ def continuous_state(
             if distance_to_samples(best_state) < MAX_DISTANCE_RATIO * distance_to_samples(
                 ekf2.state
             ):
-                state[columns], reset_texts = best_state, removed_resets
-        reset_texts.append(f"{len(resets)} of {label}")
+                state[columns], group = best_state, removed_resets
+        group.append(f"{len(resets)} of {label}")
     reset_statements = (
         f"EKF2 resets {treatment}: {', '.join(reset_texts)} ({reason})"
         for treatment, reset_texts, reason in (

@@ -411,6 +411,11 @@ def _replay_statistics(
     axis_result: AxisComparison,
     change: Change,
 ) -> RunStatistics:
+    """Compute the statistics of a replay of EKF2 along one axis, in the evaluated spans.
+
+    The errors are those of the published state. Its reported variance is the mean of the variances
+    before and after each update, because the replay contains no variance between updates.
+    """
     compared_s, axis = model.baseline_replay.find_evaluated_spans(), axis_result.axis
     if ROTATION in change and comparison.source.origin.is_gnss:
         # The rotation of GNSS positions also rotates EKF2's heading, so the axis is rotated back
@@ -432,6 +437,7 @@ def _replay_statistics(
     published = project(ekf2_replay.published, axis, comparison.segment)
     published = rows_inside(published, compared_s)
     logged_state, compared_track = axis_result.ekf2_state, published
+    # Without a change, the difference KF - EKF2 is that of the report: from the logged state
     if not change and not isinstance(logged_state, Unavailable):
         compared_track = rows_inside(logged_state, compared_s)
     return _run_statistics(

@@ -139,6 +139,7 @@ def effective_settings(
 
     Parameters of aiding sources that are not given are omitted.
     """
+    # aiding sources of one sensor have the same switch, such as position and velocity of GNSS
     used_switches = {fused_aid.switch for fused_aid in (aid, *other_aids)}
     excluded_names = {
         name

@@ -403,6 +403,7 @@ def _compared_keys(value: DictionaryObject, key: str) -> set[str]:
         compared_keys -= _COMPRESSION_KEYS
     if key == "/Info":
         compared_keys -= _WRITER_KEYS
+    # /Params of an attached file contains times and its size, and the file itself is compared
     return compared_keys - {"/Params"} if value.get("/Type") == "/EmbeddedFile" else compared_keys
 
 
