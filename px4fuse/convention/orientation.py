@@ -136,9 +136,9 @@ def _make_candidate(
 ) -> Candidate:
     """Score one convention of the quaternions by their distance from the reference attitude.
 
-    The score is a log-likelihood: the medians of tilt and heading difference, without the constant
-    heading offset. Usual conventions are preferred: quaternion order w x y z, FRD to NED, no
-    rotation of the body, and a heading offset of at most 8°.
+    The score decreases with the median differences of tilt and heading, without the constant
+    heading offset. It prefers usual conventions: quaternion order w x y z, FRD to NED, no rotation
+    of the body, and a heading offset of at most 8°.
     """
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
     body_rotation = from_vector(np.array([0.0, 0.0, body_quarter_turns * np.pi / 2.0]))

@@ -439,22 +439,10 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         interpolated_count = int(fixes["altitude_m"].isna().sum())
         # EKF2's topics lack some fields of a fix, which are copied from the previous fix
         fixes = fixes.assign(altitude_m=fixes["altitude_m"].interpolate("index")).ffill()
-    samples = project_to_ned(fixes, _local_origin(topics))
-    if {"eph_m", "epv_m"} <= {*fixes}:
-        # EKF2 uses the horizontal accuracy as σ of each horizontal axis (gps_control.cpp)
-        samples["north_m2"] = samples["east_m2"] = fixes["eph_m"].to_numpy() ** 2
-        samples["down_m2"] = fixes["epv_m"].to_numpy() ** 2
-    # The velocity is added here, so that it is dropped together with a damaged position. The
-    # variance of each velocity component is the reported speed accuracy squared
-    velocity = fixes.reindex(columns=Columns.VELOCITY).set_axis(samples.index)
-    speed_accuracy_m_s = fixes.get("speed_accuracy_m_s", pd.Series(np.nan, fixes.index)).to_numpy()
-    samples = samples.assign(
-        **velocity, **dict.fromkeys(Columns.VELOCITY_VARIANCE, speed_accuracy_m_s**2)
-    )
-    samples = finite_rows(samples, Columns.POSITION)
+    samples = _gnss_samples(fixes, _local_origin(topics))
     rate_hz = sample_rate(samples)
-    notes: list[str] = []
-    if rate_hz < MAX_DOWNSAMPLED_HZ:
+    notes, is_downsampled = list[str](), rate_hz < MAX_DOWNSAMPLED_HZ
+    if is_downsampled:
         notes.append(
             f"the logger dropped GNSS fixes (logged rate {rate_hz:.1f} Hz). Set SDLOG_PROFILE bit "
             "1 to log all fixes"
@@ -464,7 +452,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
             f"{len(unlogged_fixes)} GNSS fixes that were not logged are read from "
             f"estimator_aid_src_gnss_pos ({interpolated_count} with interpolated height)"
         )
-    elif notes:
+    elif is_downsampled:
         reconstructed_fixes, note = reconstruct_fixes(samples, ekf2, delay_ms * 1e-3)
         if note:
             samples = pd.concat([samples, reconstructed_fixes]).sort_index()
@@ -485,6 +473,23 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         is_automatic=has_fused_aid(ekf2),
         **track_fields,
     )
+
+
+def _gnss_samples(fixes: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
+    """Convert GNSS fixes to positions and velocities in NED with their variances."""
+    samples = project_to_ned(fixes, origin)
+    if {"eph_m", "epv_m"} <= {*fixes}:
+        # EKF2 uses the horizontal accuracy as σ of each horizontal axis (gps_control.cpp)
+        samples["north_m2"] = samples["east_m2"] = fixes["eph_m"].to_numpy() ** 2
+        samples["down_m2"] = fixes["epv_m"].to_numpy() ** 2
+    # The velocity is added here, so that it is dropped together with a damaged position. The
+    # variance of each velocity component is the reported speed accuracy squared
+    velocity = fixes.reindex(columns=Columns.VELOCITY).set_axis(samples.index)
+    speed_accuracy_m_s = fixes.get("speed_accuracy_m_s", pd.Series(np.nan, fixes.index)).to_numpy()
+    samples = samples.assign(
+        **velocity, **dict.fromkeys(Columns.VELOCITY_VARIANCE, speed_accuracy_m_s**2)
+    )
+    return finite_rows(samples, Columns.POSITION)
 
 
 def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFrame | None:
