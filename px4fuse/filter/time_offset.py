@@ -187,21 +187,10 @@ def estimate_time_offset(
     offset_variance_factor = _simulate_offset_variance_factor(
         prepared_motion, offset_s, noises, sigma_s**-2.0
     )
-    while True:
-        node_offsets_s, curve_s = (
-            _offset_grid(offset_s, half_width_s, offset_count)
-            for offset_count in (FINE_OFFSET_COUNT, CURVE_OFFSET_COUNT)
-        )
-        position_batches = prepared_motion.position_batches(node_offsets_s)
-        node_scores = fit_noises(position_batches, noises, prepared_motion.weight).scores()[0]
-        curve_scores = CubicSpline(node_offsets_s, node_scores)(curve_s)
-        low_s, high_s = profile_interval(
-            curve_s, curve_scores, PROFILE_DROP * offset_variance_factor
-        )
-        is_closed = low_s is not None and high_s is not None
-        if is_closed or half_width_s >= 2.0 * MAX_OFFSET_S:
-            break
-        half_width_s *= 2.0
+    curve_s, curve_scores, low_s, high_s = _profile(
+        prepared_motion, noises, offset_s, half_width_s, PROFILE_DROP * offset_variance_factor
+    )
+    is_closed = low_s is not None and high_s is not None
     offset_s = _minimum_and_sigma(curve_s, curve_scores)[0]
     # An IMU sample is the mean over one interval, and its timestamp may be any time in it
     resolution_s = 0.5 * prepared_motion.imu_interval_s
@@ -241,6 +230,27 @@ def estimate_time_offset(
         sigma_z_m=noises.sigma_z_m,
         count=len(prepared_motion.time_s),
     )
+
+
+def _profile(
+    motion: PreparedMotion, noises: Noises, offset_s: float, half_width_s: float, drop: float
+) -> tuple[Array, Array, float | None, float | None]:
+    """Return offsets (s), their -ln p, and the two offsets (s) at which -ln p rises by ``drop``.
+
+    The range of offsets around ``offset_s`` is doubled until it contains both; else None.
+    """
+    while True:
+        node_offsets_s, curve_s = (
+            _offset_grid(offset_s, half_width_s, offset_count)
+            for offset_count in (FINE_OFFSET_COUNT, CURVE_OFFSET_COUNT)
+        )
+        position_batches = motion.position_batches(node_offsets_s)
+        node_scores = fit_noises(position_batches, noises, motion.weight).scores()[0]
+        curve_scores = CubicSpline(node_offsets_s, node_scores)(curve_s)
+        low_s, high_s = profile_interval(curve_s, curve_scores, drop)
+        if None not in (low_s, high_s) or half_width_s >= 2.0 * MAX_OFFSET_S:
+            return curve_s, curve_scores, low_s, high_s
+        half_width_s *= 2.0
 
 
 def _offset_grid(centre_s: float, half_width_s: float, offset_count: int) -> Array:
