@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from px4fuse.convention.axes import UNIT_SIZES_M
 from px4fuse.convention.model import Axes, Direction, Unit
 
-# Directions ordered so that the reversed tuple contains the opposite of each direction
+# All directions: the opposite of each has the same index in the reversed tuple
 DIRECTIONS: tuple[Direction, ...] = ("north", "east", "down", "up", "west", "south")
 OPPOSITE = dict(zip(DIRECTIONS, DIRECTIONS[::-1], strict=True))
 FRAME_AXES: dict[str, Axes] = {
