@@ -1,19 +1,21 @@
-"""Diagnosis of one flight in seven steps, from files and settings to faults.
+"""Diagnosis of one flight, from a request (files and settings) to the faults.
 
 1. read: log → Flight
 2. prepare: position source, time span and axes
 3. filter: run KF along each axis
 4. compare: KF, EKF2 and ground truth
-5. estimate: noises, time offset, frame misalignment, biases
-6. rerun: re-run both filters with one change at a time
-7. find: faults of the flight, with their causes
+5. estimate: noises, time offset, frame misalignment, biases. The estimated time offset replaces a
+   delay that step 2 detected, in the report only
+6. rerun: replay EKF2, explain KF - EKF2, re-run both filters with one change at a time
+7. analyse the rest of the flight: loop closure, EKF2's other aiding sources, events
+8. find: faults of the flight, with their causes
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from msgspec import structs
 
@@ -33,7 +35,7 @@ from px4fuse.comparison.estimates import (
 )
 from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison, PreparedComparison
-from px4fuse.comparison.preparation import explain_missing_source, prepare
+from px4fuse.comparison.preparation import explain_missing_source, prepare, shift_clock
 from px4fuse.comparison.remedy import ml_ekf2_parameters
 from px4fuse.comparison.reruns import Reruns, planned_configurations, rerun_filters
 from px4fuse.convention.correction import convention_faults
@@ -48,6 +50,7 @@ from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import find, find_aids
+from px4fuse.findings.cause_grouping import CONVENTION
 from px4fuse.flight.ekf2_parameters import check_parameters
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
 from px4fuse.loop.model import Loop
@@ -64,7 +67,7 @@ def diagnose(
     *,
     as_sent: bool = False,
 ) -> Analysis:
-    """Read a flight, compare KF with EKF2, and find faults (steps 1 to 7).
+    """Read a flight, compare KF with EKF2, and find faults (steps 1 to 8).
 
     Parameters
     ----------
@@ -82,29 +85,70 @@ def diagnose(
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
     flight = flight or read_flight(request, progress)
-    prepared_comparison = prepare_comparison(request, progress, flight, as_sent=as_sent)
+    analysis = _diagnose_flight(request, progress, flight, as_sent=as_sent)
+    if refined_flight := _refine_file_clock(flight, analysis):
+        analysis = _diagnose_flight(request, progress, refined_flight, as_sent=as_sent)
+    return analysis
+
+
+def _diagnose_flight(
+    request: ComparisonRequest, progress: Progress, flight: Flight, *, as_sent: bool
+) -> Analysis:
+    prepared_comparison = prepare_comparison(flight, request, progress, as_sent=as_sent)
     kf_runs = run_kf(prepared_comparison, progress)
     comparison = compare(prepared_comparison, kf_runs)
     return replace(find_faults(comparison, progress), request=request)
 
 
+def _refine_file_clock(flight: Flight, analysis: Analysis) -> Flight | None:
+    """Correct an estimated clock offset of a position file by that of the IMU, if they differ.
+
+    The first estimate is from EKF2's positions, which may be late.
+    """
+    alignment, clock = analysis.source.alignment, analysis.clock
+    if (
+        alignment is None
+        or alignment.clock_offset_sigma_s is None
+        or alignment.reference != "EKF2 position"
+        or not isinstance(clock, ClockOffset)
+        or all(found.id != "source_time_offset" for found in analysis.findings)
+        or any(CONVENTION in found.evidence for found in analysis.findings)
+    ):
+        return None
+    difference = f"{abs(clock.offset_s):.3f} s {'late' if clock.offset_s < 0 else 'early'}"
+    alignment = structs.replace(
+        alignment,
+        clock_offset_s=alignment.clock_offset_s + clock.offset_s,
+        clock_offset_sigma_s=clock.sigma_s,
+        clock_reason=f"the offset was estimated with the IMU, because EKF2's position is "
+        f"{difference} relative to the IMU",
+    )
+    file_track, *other_tracks = flight.positions
+    shifted_track = replace(shift_clock(file_track, clock.offset_s), alignment=alignment)
+    return replace(flight, positions=(shifted_track, *other_tracks))
+
+
 def find_faults(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
-    """Estimate errors, re-run KF and EKF2, and find faults and their causes (steps 5 to 7).
+    """Estimate errors, re-run KF and EKF2, and find faults and their causes (steps 5 to 8).
 
     If students must find the faults of the flight, only the comparison is returned.
     """
     if comparison.flight.log.is_assessed:
-        withheld_fields: dict[str, Any] = {
-            field.name: DIAGNOSIS_WITHHELD for field in fields(Analysis) if field.default is MISSING
-        }
-        known_fields = {
+        return Analysis(
             **vars(comparison),
-            "tuning": {HORIZONTAL: DIAGNOSIS_WITHHELD},
-            "difference_steps": dict.fromkeys(comparison.axes, DIAGNOSIS_WITHHELD),
-            "trials": (),
-            "events": collect_events(comparison),
-        }
-        return Analysis(**withheld_fields | known_fields)
+            tuning={HORIZONTAL: DIAGNOSIS_WITHHELD},
+            clock=DIAGNOSIS_WITHHELD,
+            heading=DIAGNOSIS_WITHHELD,
+            systematic_errors=DIAGNOSIS_WITHHELD,
+            source_low_pass=DIAGNOSIS_WITHHELD,
+            time_correlated_noise=DIAGNOSIS_WITHHELD,
+            ekf2_model=DIAGNOSIS_WITHHELD,
+            difference_steps=dict.fromkeys(comparison.axes, DIAGNOSIS_WITHHELD),
+            trials=(),
+            events=collect_events(comparison),
+            aids=DIAGNOSIS_WITHHELD,
+            loop=DIAGNOSIS_WITHHELD,
+        )
     estimates = estimate(comparison, progress)
     release_free_memory()
     comparison = refine_delay(comparison, estimates.clock)
@@ -114,7 +158,7 @@ def find_faults(comparison: Comparison, progress: Progress = ignore_progress) ->
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
 
     flight = comparison.flight
-    analysis = Analysis(
+    analysis = Analysis(  # which has the fields of Comparison, Estimates and Reruns
         **vars(comparison),
         **vars(estimates),
         **vars(reruns),
@@ -138,7 +182,7 @@ def refine_delay(comparison: Comparison, clock: ClockOffset | Unavailable) -> Co
     # keep the first delay if the refined delay is too small to be a fault: the report must contain
     # the delay that was corrected
     is_fault = all(
-        convention_faults(convention, comparison.flight, comparison.source.frame).late_s
+        convention_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
         for convention in (comparison.convention, refined_convention)
     )
     return replace(comparison, convention=refined_convention) if is_fault else comparison
@@ -180,9 +224,9 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
 
 
 def prepare_comparison(
+    flight: Flight,
     request: ComparisonRequest,
     progress: Progress = ignore_progress,
-    flight: Flight | None = None,
     *,
     as_sent: bool = False,
 ) -> PreparedComparison:
@@ -190,7 +234,6 @@ def prepare_comparison(
 
     For arguments and errors see :func:`diagnose`.
     """
-    flight = flight or read_flight(request, progress)
     prepared_comparison = prepare(flight, request, as_sent=as_sent)
     # read_flight has already corrected the time offset of a position file
     if request.clock_offset_s != AUTO or request.position is not None:
@@ -221,7 +264,8 @@ def rerun(
     """Replay EKF2, explain the difference KF - EKF2, and re-run both with one error corrected."""
     progress("replaying EKF2")
     estimated_settings = corrected_settings(comparison, estimates.tuning)
-    # replay all parameter sets together, which is faster
+    # EKF2 replays all parameter sets together, which is faster. The sets must be those that the two
+    # following functions request; other sets are replayed again
     model = open_model(
         comparison.flight,
         lambda inputs: [

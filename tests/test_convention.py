@@ -25,7 +25,7 @@ from px4fuse.finding import Finding
 from px4fuse.findings import source_convention
 from px4fuse.findings.cause_grouping import CONVENTION
 from px4fuse.findings.model import finding
-from px4fuse.flight.model import RECEIVED, Columns, Flight, PositionTrack
+from px4fuse.flight.model import GNSS, RECEIVED, Columns, Flight, PositionTrack, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation.faults import parse_faults
@@ -140,6 +140,16 @@ def test_frame_detection_finds_yaw_rotation_of_positions(rotation_deg):
     assert not found.is_mirrored
     total = found.rotation_deg - 90.0 * quarter
     assert (total - rotation_deg + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=4.0)
+
+
+def test_yaw_rotation_refers_to_gnss_if_ekf2_heading_is_wrong():
+    attitude = flown().attitude.copy()
+    attitude[Columns.QUATERNION] = multiply(yaw(-14.0), attitude[Columns.QUATERNION].to_numpy())
+    gnss = replace(sent(flown(), late_s=0.2, sigma_m=0.3, seed=2), origin=GNSS)
+    no_ekf2 = Unavailable("EKF2", "not logged", "")
+    flight = replace(flown(), attitude=attitude, positions=(gnss,), ekf2=no_ekf2)
+    found = check_convention(flight, sent(flown(), rotation_deg=60.0))
+    assert convention_faults(found, flight, "NED").rotation_deg == pytest.approx(60.0, abs=2.0)
 
 
 @pytest.mark.parametrize("clock_drift", [-0.04, -0.01, 0.02])
@@ -340,7 +350,7 @@ def test_late_timestamps_report_states_refined_time_offset(estimate_s, reported_
 def test_clock_offset_auto_note_states_already_applied_delay():
     late = replace(flown(), positions=(sent(flown(), late_s=0.7),))
     request = ComparisonRequest(log="made", clock_offset_s="auto", axes=("north", "east"))
-    prepared = prepare_comparison(request, flight=late)
+    prepared = prepare_comparison(late, request)
     assert prepared.settings.clock_offset_s == pytest.approx(-0.7, abs=0.02)
     (note,) = (note for note in prepared.notes if note.startswith("--clock-offset auto: "))
     remaining_s, applied_s = map(float, re.findall(r"([+-]\d\.\d+) s(?: \(95| from)", note))

@@ -34,6 +34,7 @@ from findings_tools import (
     tuned,
     with_bias,
 )
+from flights import given_placement
 
 from px4fuse.comparison.flight_events import source_gaps
 from px4fuse.comparison.trials import RunStatistics, Trial
@@ -756,6 +757,14 @@ SOURCE_EDGES = [
        analysis(time_correlated_noise=slow(gain, lag)), expected)
       for gain, lag, expected in (
           (5.0, 0.9, "warning"), (4.9, 0.0, None), (99.0, 1.0, None))),
+    *((source_noise.detect_time_correlated_noise,
+       analysis(time_correlated_noise=slow(99.0, 0.0, slow_m)), expected)
+      for slow_m, expected in ((0.0049, None), (0.005, "warning"))),
+    # the height of a frame that was fitted to EKF2's track contains EKF2's height error
+    *((hidden_errors.detect, analysis(
+        axes=(hiding(name="down"),),
+        source=source(alignment=replace(given_placement(), yaw_sigma_deg=sigma_deg))), expected)
+      for sigma_deg, expected in ((None, "warning"), (0.1, None))),
     *((source_noise.detect_repeated_positions, repeating(again, count), expected)
       for again, count, expected in (
         (10, 200, "warning"), (9, 100, None), (10, 201, None), (30, 100, "error"),
@@ -1100,3 +1109,9 @@ def test_timestamps_in_bursts_are_reported_as_jitter(size: int, is_reported: boo
     found = [*source_stamps.detect_bursts(analysis(source=source(samples=positions(time_s))))]
     assert [finding.id for finding in found] == ["source_timestamp_jitter"] * is_reported
     assert not is_reported or "bursts of 5, every 0.25 s" in found[0].message
+
+
+def test_repeated_positions_of_odometry_are_reported() -> None:
+    one = repeating(50, 100)
+    one.source.orientation = object()
+    assert named(source_noise.detect, one) == {"source_samples_repeated": "error"}

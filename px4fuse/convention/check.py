@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 from msgspec import structs
 
 from px4fuse.convention.axes import (
@@ -17,12 +18,13 @@ from px4fuse.convention.axes import (
 )
 from px4fuse.convention.model import (
     Convention,
+    ConventionVerdict,
     HeadingSource,
     OrientationConvention,
-    Verdict,
 )
 from px4fuse.convention.motion import (
     DIFFERENCE_WINDOW_S,
+    MIN_GAP_S,
     ImuMotion,
     InertialData,
     motion_from_imu,
@@ -31,7 +33,8 @@ from px4fuse.convention.motion import (
 )
 from px4fuse.convention.orientation import check_orientation
 from px4fuse.convention.texts import format_axes
-from px4fuse.flight.model import Columns, Flight, PositionTrack
+from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack
+from px4fuse.trajectory.association import gap_limit, is_bracketed
 from px4fuse.trajectory.rotation import heading
 
 # Minimum log likelihood ratio to the second best convention for an unambiguous result
@@ -50,6 +53,10 @@ IMU_SIGMA_M = 0.05
 # EKF2's heading, which is relative to north, is preferred to the heading from the gyroscopes if its
 # log likelihood is at most this much lower
 MAX_LOGGED_HEADING_DEFICIT = 20.0
+# Minimum number of GNSS positions for an estimate of the rotation relative to them
+MIN_GNSS_POSITIONS = 30
+# Maximum ratio of the residuals to the GNSS positions for an estimate of the rotation: 0.1 rad
+MAX_GNSS_RESIDUAL_RATIO = 0.1
 # Minimum log-likelihood gain from a clock drift; a drift with a smaller gain is not corrected
 MIN_DRIFT_SCORE_GAIN = 15.0
 # Tested clock drifts (rate of the clock minus 1)
@@ -102,6 +109,8 @@ def check_convention(
             hypotheses, positions = hypotheses_without_drift, positions_without_drift
         else:
             clock_drift = 0.0
+    if not is_source_fused(flight):
+        hypotheses[0] = _rotate_to_gnss(hypotheses[0], positions, flight, track)
     convention = _choose_convention(hypotheses, positions, clock_drift)
     if track.orientation is None:
         return convention
@@ -144,6 +153,41 @@ def _rank_hypotheses(
     return hypotheses
 
 
+def is_source_fused(flight: Flight) -> bool:
+    """Return True if the fusion flags show that EKF2 fused the positions or the yaw."""
+    fusion_flags = flight.ekf2.fusion_flags if isinstance(flight.ekf2, Ekf2) else None
+    return isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags > 0).any(axis=None))
+
+
+def _rotate_to_gnss(
+    hypothesis: Hypothesis, positions: SentPositions, flight: Flight, track: PositionTrack
+) -> Hypothesis:
+    """Fit rotation and relative delay to GNSS positions, because EKF2's heading may be wrong."""
+    gnss_tracks = [other for other in flight.positions if other.origin.is_gnss]
+    if not gnss_tracks or track.origin.is_gnss or not hypothesis.has_rotation:
+        return hypothesis
+    gnss = gnss_tracks[0].samples[Columns.POSITION[:2]].dropna()
+    time_s = gnss.index.to_numpy() + hypothesis.offset_s
+    source_time_s = positions.time_s
+    is_near = is_bracketed(time_s, source_time_s, gap_limit(source_time_s, MIN_GAP_S))
+    if np.count_nonzero(is_near) < MIN_GNSS_POSITIONS:
+        return hypothesis
+    sent = UNIT_SIZES_M[hypothesis.unit] * positions.position_m
+    assignment = hypothesis.assignment
+    source_m = sent[:, assignment.axis_a] + 1j * assignment.handedness * sent[:, assignment.axis_b]
+    velocity_m_s = np.interp(time_s, source_time_s, np.gradient(source_m, source_time_s))
+    columns = np.column_stack([np.interp(time_s, source_time_s, source_m), velocity_m_s])[is_near]
+    columns -= columns.mean(axis=0)
+    north_east_m = (gnss.to_numpy() @ [1.0, 1j])[is_near]
+    north_east_m -= north_east_m.mean()
+    factors, residual_m2, *_ = np.linalg.lstsq(columns, north_east_m)
+    if not residual_m2 < (MAX_GNSS_RESIDUAL_RATIO * np.linalg.norm(north_east_m)) ** 2:
+        return hypothesis
+    parameters = hypothesis.parameters.copy()
+    parameters[1] = np.angle(factors[0])
+    return replace(hypothesis, parameters=parameters, heading_from="GNSS")
+
+
 def _choose_convention(
     hypotheses: list[Hypothesis], positions: SentPositions, clock_drift: float
 ) -> Convention:
@@ -160,7 +204,7 @@ def _choose_convention(
         ]
     log_odds = best_hypothesis.score - other_conventions[0].score if other_conventions else None
     is_ambiguous = log_odds is not None and log_odds < MIN_LOG_ODDS
-    verdict: Verdict = "ambiguous" if is_ambiguous else "determined"
+    verdict: ConventionVerdict = "ambiguous" if is_ambiguous else "determined"
     if best_hypothesis.score < MIN_LIKELIHOOD_GAIN:
         verdict = "not determinable"
     elif (
@@ -262,7 +306,7 @@ def _check_orientation(
     track: PositionTrack,
     positions: SentPositions,
     best_hypothesis: Hypothesis,
-    verdict: Verdict,
+    verdict: ConventionVerdict,
 ) -> OrientationConvention | None:
     """Determine the convention of the source's orientation, and its heading error."""
     assert track.orientation is not None

@@ -8,6 +8,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.convention.axes import CLOCKWISE_DIRECTIONS, UNIT_SIZES_M, without_clock_drift
+from px4fuse.convention.check import is_source_fused
 from px4fuse.convention.model import Convention
 from px4fuse.convention.motion import read_inertial, replace_heading
 from px4fuse.convention.orientation import to_attitude
@@ -15,7 +16,6 @@ from px4fuse.convention.texts import FRAME_AXES, OPPOSITE, format_axes
 from px4fuse.core.arrays import Array
 from px4fuse.flight.model import (
     Columns,
-    Ekf2,
     Flight,
     PositionTrack,
     kind_without_orientation,
@@ -103,8 +103,7 @@ def convention_faults(convention: Convention | None, flight: Flight, frame: str)
         return Faults(orientation=orientation_fault, is_ambiguous=not is_ned_likely)
     if convention.verdict != "determined":
         return Faults(orientation=orientation_fault)
-    fusion_flags = flight.ekf2.fusion_flags if isinstance(flight.ekf2, Ekf2) else None
-    is_fused = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags > 0).any(axis=None))
+    is_fused = is_source_fused(flight)
     has_wrong_axes, rotation_deg = _axes_and_rotation(convention)
     has_wrong_heading = orientation_fault in ("order", "heading")
     uses_gyro_heading = convention.heading_from == "gyroscopes"

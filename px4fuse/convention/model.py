@@ -4,11 +4,11 @@ from typing import Literal
 
 from px4fuse.core.record import NotNegative, Positive, Record
 
-Verdict = Literal["determined", "ambiguous", "doubtful", "not determinable"]
+ConventionVerdict = Literal["determined", "ambiguous", "doubtful", "not determinable"]
 Direction = Literal["north", "east", "south", "west", "up", "down"]
 Axes = tuple[Direction, Direction, Direction]
 Unit = Literal["m", "cm", "mm", "feet"]
-HeadingSource = Literal["EKF2", "gyroscopes"]
+HeadingSource = Literal["EKF2", "gyroscopes", "GNSS"]
 QuaternionOrder = Literal["w x y z", "x y z w"]
 BodyAndWorldFrame = Literal["FRD to NED", "FLU to ENU", "FLU to NWU", "FLU to NED", "FRD to ENU"]
 
@@ -48,8 +48,8 @@ class Convention(Record, kw_only=True, omit_defaults=False):
         larger than the noise; "not determinable": too little data or motion.
     rotation_deg : float
         Clockwise rotation of the positions in addition to the directions of x, y and z.
-    heading_from : {"EKF2", "gyroscopes"}
-        Source of the heading that fits the positions: logged by EKF2, or integrated gyroscopes.
+    heading_from : {"EKF2", "gyroscopes", "GNSS"}
+        Reference of the rotation: heading of EKF2, integrated gyroscopes, or GNSS positions.
     late_s : float
         Delay of the timestamps; negative if they are early.
     clock_drift : float
@@ -64,7 +64,7 @@ class Convention(Record, kw_only=True, omit_defaults=False):
         Other conventions that fit nearly as well.
     """
 
-    verdict: Verdict
+    verdict: ConventionVerdict
     x: Direction = "north"
     y: Direction = "east"
     z: Direction = "down"

@@ -76,15 +76,18 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
     Return (filter, axis, error) for each error, largest mean NEES first.
     """
     alignment, frame_error_m = comparison.source.alignment, 0.0
-    # If the position frame is aligned with EKF2's track, it may contain EKF2's error
-    if alignment is not None and alignment.yaw_sigma_deg is not None:
+    # A position frame aligned with EKF2's track may contain EKF2's error, also in height
+    if is_frame_fitted := alignment is not None and alignment.yaw_sigma_deg is not None:
         frame_error_m = alignment.residual_rms_m or 0.0
     errors = [
         (filter_name, name, error)
         for name, result in comparison.axes.items()
         for filter_name, summary in result.filters.items()
         if (error := error_above_reported_sigma(summary))
-        and (filter_name == "ekf2" or error.rmse_m > frame_error_m)
+        and (
+            filter_name == "ekf2"
+            or (error.rmse_m > frame_error_m and not (is_frame_fitted and name == "down"))
+        )
     ]
     return sorted(errors, key=lambda entry: -entry[2].nees)
 
@@ -182,7 +185,7 @@ def _drift_finding(
 
     The innovations of the filters ``filter_labels`` do not show the drift.
     """
-    sensor, loop = source_name(analysis.source), analysis.loop
+    sensor_name, loop = source_name(analysis.source), analysis.loop
     drift_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
     rmse_sentence = ""
     if aligned_error is not None:
@@ -207,9 +210,9 @@ def _drift_finding(
     noise_settings = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
     return error(
         "source_drift",
-        f"{sensor} drifts: {drift_text}. {rmse_sentence}The innovations of "
+        f"{sensor_name} drifts: {drift_text}. {rmse_sentence}The innovations of "
         f"{' and '.join(filter_labels)} do not show the drift, because the estimates follow "
-        f"{sensor}. Do not reduce {noise_settings}.",
+        f"{sensor_name}. Do not reduce {noise_settings}.",
         DRIFT_REMEDY,
         evidence,
     )
@@ -252,11 +255,11 @@ def _rmse_after_alignment(comparison: Comparison, filter_name: FilterName) -> Al
 
 
 def make_possible_drift_finding(analysis: Analysis) -> Finding:
-    sensor, loop = source_name(analysis.source), analysis.loop
+    sensor_name, loop = source_name(analysis.source), analysis.loop
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
-        f"{sensor} may drift: odometry sends a heading as these messages do. Filters follow a "
+        f"{sensor_name} may drift: odometry sends a heading as these messages do. Filters follow a "
         "drifting source, so innovations do not show the drift."
     )
     if isinstance(horizontal_tuning, AxisTuning) and (

@@ -135,13 +135,16 @@ def _position_faults(
             action += f" {describe_conversion(orientation.frames)}"
         yield "source_axes_wrong", "axes", f"{fault}. {basis_text} {usage_text}", action
     elif turn_deg:
-        heading_text = (
-            "EKF2's heading" if convention.heading_from == "EKF2" else "the heading at take-off"
-        )
+        heading_text = {
+            "EKF2": "EKF2's heading",
+            "gyroscopes": "the heading at take-off",
+            "GNSS": "the GNSS positions",
+        }[convention.heading_from]
+        doubt = "." if convention.heading_from == "GNSS" else f", or {heading_text} is wrong."
         message = (
             f"{positions} are rotated by {turn_deg:+.0f}° (clockwise from above) "
-            f"relative to {heading_text}. The x axis of the source does not point north, or "
-            f"{heading_text} is wrong. {basis_text} The analysis uses the positions rotated to NED."
+            f"relative to {heading_text}. The x axis of the source does not point north{doubt} "
+            f"{basis_text} The analysis uses the positions rotated to NED."
         )
         action = (
             "Align the frame of the positioning system with north, or rotate positions and "

@@ -24,6 +24,9 @@ MIN_WHITE_NOISE_RATIO = 0.3
 # Minimum log likelihood ratio (nats) of time-correlated to white noise: 1 of 400 flights without
 # a fault exceeds it
 MIN_CORRELATION_GAIN_NATS = 5.0
+# Minimum time-correlated error (m, 1 σ): timestamps in ms cause 2 mm at 4 m/s, and the motion from
+# IMU or ground truth also has errors of some mm
+MIN_CORRELATED_SIGMA_M = 0.005
 # Minimum fraction of repeated positions for a warning
 MIN_REPEAT_FRACTION = 0.05
 # Minimum fraction of repeated positions for severity error
@@ -42,9 +45,11 @@ MIN_PART_NOISE_RATIO_ERROR = 4.0
 
 
 def detect(analysis: Analysis) -> Findings:
-    if analysis.source.orientation is not None or analysis.source.origin.reconstructed:
+    if analysis.source.origin.reconstructed:
         return
     yield from detect_repeated_positions(analysis)
+    if analysis.source.orientation is not None:
+        return
     yield from detect_time_correlated_noise(analysis)
     yield from detect_unequal_noise(analysis)
     yield from detect_noise_variation(analysis)
@@ -55,6 +60,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     if (
         not isinstance(noise, TimeCorrelatedNoise)
         or noise.gain_nats < MIN_CORRELATION_GAIN_NATS
+        or noise.slow_m < MIN_CORRELATED_SIGMA_M
         or noise.low_pass_gain_nats
         >= MIN_LAG_NATS  # a low-pass filtered source has its own finding
     ):
