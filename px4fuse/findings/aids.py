@@ -147,15 +147,15 @@ def _not_fused(
 def _innovation_shift(name: str, aid: AidResult) -> Finding:
     label = _aid_label(aid)
     shifts_by_axis = {axis: result.change for axis, result in aid.axes.items() if result.change}
-    axis, (time_s, shift) = max(shifts_by_axis.items(), key=lambda item: abs(item[1][1]))
+    axis, (time_s, mean_change) = max(shifts_by_axis.items(), key=lambda item: abs(item[1][1]))
     s_sqrt = aid.axes[axis].s_sqrt_median
     return warning(
         "aid_innovation_shift",
-        f"{label}: the {axis} innovation shifts by {format_number(abs(shift) * s_sqrt, 2)} "
+        f"{label}: the {axis} innovation shifts by {format_number(abs(mean_change) * s_sqrt, 2)} "
         f"{aid.unit} at {time_s:.0f} s. The mean innovation before and after differs by "
-        f"{abs(shift):.1f} √S (√S {format_number(s_sqrt, 2)} {aid.unit}).",
+        f"{abs(mean_change):.1f} √S (√S {format_number(s_sqrt, 2)} {aid.unit}).",
         f"Check what was switched, moved or passed near the sensor at {time_s:.0f} s.",
-        {"aid": name, "axis": axis, "time_s": time_s, "moved": shift},
+        {"aid": name, "axis": axis, "time_s": time_s, "moved": mean_change},
         ((time_s, time_s + CHANGE_WINDOW_S),),
     )
 
