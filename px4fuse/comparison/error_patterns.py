@@ -349,7 +349,7 @@ def _least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
 def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     """Find a sinusoidal error that explains most of the slow error.
 
-    Return None if there is none, or if the motion contains its frequency.
+    Return None without such an error, or if the motion contains its frequency.
     """
     duration_s = fit.time_s[-1] - fit.time_s[0]
     highest_hz = min(MAX_FREQUENCY_HZ, 0.25 / float(np.median(np.diff(fit.time_s))))

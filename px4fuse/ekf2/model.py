@@ -387,7 +387,7 @@ def run_configurations(
 
 
 def _track(run: SegmentRun, position_m: Array, velocity_m_s: Array) -> pd.DataFrame:
-    """Return position and velocity at each prediction step, in published metres."""
+    """Return position and velocity at each prediction step, scaled as EKF2 publishes them."""
     states = np.hstack([position_m / run.segment.ekf2_metres_per_metre, velocity_m_s])
     return pd.DataFrame(states, time_index(run.segment.time_s), Columns.STATE, copy=False)
 

@@ -117,7 +117,7 @@ class Positions:
         """Divide all noises by SIGMA_Z; return the positions and the measurement variances.
 
         ``random_walk`` (1/√s) is the random walk of the source, divided by SIGMA_Z. The variance of
-        a measurement is 1 / weight. Without weight, the first measurement gets the weight 1.
+        a measurement is 1 / weight. If the first measurement has no weight, it gets the weight 1.
         """
         added_process_noise = self.added_process_noise / sigma_z_m**2
         added_process_noise[0] += self.length_s * random_walk**2
@@ -431,9 +431,9 @@ class BandedSystem:
     def whiten(self, measured_m: Array, dp: Array, dv: Array) -> ArrayPair:
         """Return whitened Δp and Δv of inputs, and the component that the states explain.
 
-        Inner product of two inputs, weighted by the inverse covariance = product of whitened Δp and
-        Δv - product of explained components + product of measurements / σ². ``measured_m``, shape
-        (..., k, m), contains the measurements of the first k inputs; other inputs have none.
+        They give the inner product of two inputs, weighted by the inverse covariance: the product
+        of whitened Δp and Δv, minus that of explained components, plus that of measurements / σ².
+        ``measured_m``, shape (..., k, m), contains the measurements of the first k inputs.
         """
         intervals, right_side = self._interval_sides(measured_m, dp, dv)
         # A unit diagonal is 30 % faster, because it needs no division in each row
