@@ -1,19 +1,21 @@
-"""Diagnosis of one flight in seven steps, from files and settings to faults.
+"""Diagnosis of one flight, from a request (files and settings) to the faults.
 
 1. read: log → Flight
 2. prepare: position source, time span and axes
 3. filter: run KF along each axis
 4. compare: KF, EKF2 and ground truth
-5. estimate: noises, time offset, frame misalignment, biases
-6. rerun: re-run both filters with one change at a time
-7. find: faults of the flight, with their causes
+5. estimate: noises, time offset, frame misalignment, biases. The estimated time offset replaces a
+   delay that step 2 detected, in the report only
+6. rerun: replay EKF2, explain KF - EKF2, re-run both filters with one change at a time
+7. analyse the rest of the flight: loop closure, EKF2's other aiding sources, events
+8. find: faults of the flight, with their causes
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from msgspec import structs
 
@@ -65,7 +67,7 @@ def diagnose(
     *,
     as_sent: bool = False,
 ) -> Analysis:
-    """Read a flight, compare KF with EKF2, and find faults (steps 1 to 7).
+    """Read a flight, compare KF with EKF2, and find faults (steps 1 to 8).
 
     Parameters
     ----------
@@ -92,7 +94,7 @@ def diagnose(
 def _diagnose_flight(
     request: ComparisonRequest, progress: Progress, flight: Flight, *, as_sent: bool
 ) -> Analysis:
-    prepared_comparison = prepare_comparison(request, progress, flight, as_sent=as_sent)
+    prepared_comparison = prepare_comparison(flight, request, progress, as_sent=as_sent)
     kf_runs = run_kf(prepared_comparison, progress)
     comparison = compare(prepared_comparison, kf_runs)
     return replace(find_faults(comparison, progress), request=request)
@@ -127,22 +129,26 @@ def _refine_file_clock(flight: Flight, analysis: Analysis) -> Flight | None:
 
 
 def find_faults(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
-    """Estimate errors, re-run KF and EKF2, and find faults and their causes (steps 5 to 7).
+    """Estimate errors, re-run KF and EKF2, and find faults and their causes (steps 5 to 8).
 
     If students must find the faults of the flight, only the comparison is returned.
     """
     if comparison.flight.log.is_assessed:
-        withheld_fields: dict[str, Any] = {
-            field.name: DIAGNOSIS_WITHHELD for field in fields(Analysis) if field.default is MISSING
-        }
-        known_fields = {
+        return Analysis(
             **vars(comparison),
-            "tuning": {HORIZONTAL: DIAGNOSIS_WITHHELD},
-            "difference_steps": dict.fromkeys(comparison.axes, DIAGNOSIS_WITHHELD),
-            "trials": (),
-            "events": collect_events(comparison),
-        }
-        return Analysis(**withheld_fields | known_fields)
+            tuning={HORIZONTAL: DIAGNOSIS_WITHHELD},
+            clock=DIAGNOSIS_WITHHELD,
+            heading=DIAGNOSIS_WITHHELD,
+            systematic_errors=DIAGNOSIS_WITHHELD,
+            source_low_pass=DIAGNOSIS_WITHHELD,
+            time_correlated_noise=DIAGNOSIS_WITHHELD,
+            ekf2_model=DIAGNOSIS_WITHHELD,
+            difference_steps=dict.fromkeys(comparison.axes, DIAGNOSIS_WITHHELD),
+            trials=(),
+            events=collect_events(comparison),
+            aids=DIAGNOSIS_WITHHELD,
+            loop=DIAGNOSIS_WITHHELD,
+        )
     estimates = estimate(comparison, progress)
     release_free_memory()
     comparison = refine_delay(comparison, estimates.clock)
@@ -152,7 +158,7 @@ def find_faults(comparison: Comparison, progress: Progress = ignore_progress) ->
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
 
     flight = comparison.flight
-    analysis = Analysis(
+    analysis = Analysis(  # which has the fields of Comparison, Estimates and Reruns
         **vars(comparison),
         **vars(estimates),
         **vars(reruns),
@@ -176,7 +182,7 @@ def refine_delay(comparison: Comparison, clock: ClockOffset | Unavailable) -> Co
     # keep the first delay if the refined delay is too small to be a fault: the report must contain
     # the delay that was corrected
     is_fault = all(
-        convention_faults(convention, comparison.flight, comparison.source.frame).late_s
+        convention_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
         for convention in (comparison.convention, refined_convention)
     )
     return replace(comparison, convention=refined_convention) if is_fault else comparison
@@ -218,9 +224,9 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
 
 
 def prepare_comparison(
+    flight: Flight,
     request: ComparisonRequest,
     progress: Progress = ignore_progress,
-    flight: Flight | None = None,
     *,
     as_sent: bool = False,
 ) -> PreparedComparison:
@@ -228,7 +234,6 @@ def prepare_comparison(
 
     For arguments and errors see :func:`diagnose`.
     """
-    flight = flight or read_flight(request, progress)
     prepared_comparison = prepare(flight, request, as_sent=as_sent)
     # read_flight has already corrected the time offset of a position file
     if request.clock_offset_s != AUTO or request.position is not None:
@@ -259,7 +264,8 @@ def rerun(
     """Replay EKF2, explain the difference KF - EKF2, and re-run both with one error corrected."""
     progress("replaying EKF2")
     estimated_settings = corrected_settings(comparison, estimates.tuning)
-    # replay all parameter sets together, which is faster
+    # EKF2 replays all parameter sets together, which is faster. The sets must be those that the two
+    # following functions request; other sets are replayed again
     model = open_model(
         comparison.flight,
         lambda inputs: [

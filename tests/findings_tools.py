@@ -107,7 +107,13 @@ def analysis(
 ) -> Analysis:  # fmt: skip
     """Make an analysis; fields that are not given are Unavailable."""
     if isinstance(ekf2, dict):
-        usual_ekf2 = {"states": {}, "parameters": {}, "aids": {}, "record": NONE}
+        usual_ekf2 = {
+            "states": {},
+            "parameters": {},
+            "aids": {},
+            "record": NONE,
+            "fusion_flags": NONE,
+        }
         ekf2 = made(Ekf2, **{**usual_ekf2, **ekf2})
     usual_flight = {
         "imu": NONE,

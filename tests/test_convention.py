@@ -350,7 +350,7 @@ def test_late_timestamps_report_states_refined_time_offset(estimate_s, reported_
 def test_clock_offset_auto_note_states_already_applied_delay():
     late = replace(flown(), positions=(sent(flown(), late_s=0.7),))
     request = ComparisonRequest(log="made", clock_offset_s="auto", axes=("north", "east"))
-    prepared = prepare_comparison(request, flight=late)
+    prepared = prepare_comparison(late, request)
     assert prepared.settings.clock_offset_s == pytest.approx(-0.7, abs=0.02)
     (note,) = (note for note in prepared.notes if note.startswith("--clock-offset auto: "))
     remaining_s, applied_s = map(float, re.findall(r"([+-]\d\.\d+) s(?: \(95| from)", note))

@@ -17,7 +17,7 @@ from px4fuse.ekf2.model import (
     replay_settings,
     run_configurations,
 )
-from px4fuse.ekf2.replay import HORIZONTAL
+from px4fuse.ekf2.replay import HORIZONTAL_AXES
 from px4fuse.flight.model import RECEIVED, Flight, Unavailable
 from px4fuse.readers import read_log
 
@@ -85,7 +85,7 @@ def test_ekf2_model_innovations_equal_reference_filter(model: Model) -> None:
     nu, S = plain_replay(model.inputs, model.inputs.segments[0], events[events.end_step < 3000])
     updates = model.baseline_replay.updates.iloc[: len(nu)]
     assert len(nu) > 100
-    for at, axis in enumerate(HORIZONTAL):
+    for at, axis in enumerate(HORIZONTAL_AXES):
         np.testing.assert_allclose(updates[f"innovation_{axis}_m"], nu[:, at], rtol=0, atol=5e-4)
         np.testing.assert_allclose(updates[f"innovation_variance_{axis}_m2"], S[:, at], rtol=3e-3)
 

@@ -25,7 +25,7 @@ from px4fuse.trajectory.model import Trajectory
 from px4fuse.trajectory.scores import (
     MIN_BOOTSTRAP_BLOCKS,
     Delta,
-    Interval,
+    RmseInterval,
     autocorrelation_time,
     find_pairs,
     relative_error,
@@ -552,7 +552,7 @@ def test_rmse_confidence_interval_contains_true_rmse(phi: float) -> None:
     white = random.normal(size=(n + 500, flights, 3)) * np.sqrt(1.0 - phi**2)
     errors = np.linalg.norm(lfilter([1.0], [1.0, -phi], white, axis=0)[500:], axis=2)
     got = [rmse_interval(errors[:, i], "ATE") for i in range(flights)]
-    known = [one for one in got if isinstance(one, Interval)]
+    known = [one for one in got if isinstance(one, RmseInterval)]
     assert len(known) == flights
     assert np.median([one.blocks for one in known]) > 20.0
     held = np.mean([one.low <= np.sqrt(3.0) <= one.high for one in known])

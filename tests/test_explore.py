@@ -26,7 +26,7 @@ from px4fuse.cli.compare import compare as compare_command
 from px4fuse.cli.options import comparison_request, read_student
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison
 from px4fuse.core.text import format_ratio
-from px4fuse.diagnose import prepare_comparison
+from px4fuse.diagnose import prepare_comparison, read_flight
 from px4fuse.explore import page as pages
 from px4fuse.explore.page import html_text
 from px4fuse.flight.model import Flight
@@ -165,7 +165,7 @@ def test_explore_page_sliders_equal_values_of_shown_command(
     segment = explored[1].segment
     assert (request.start_s, request.end_s) == pytest.approx((segment.start_s, segment.end_s))
     assert request.heading_deg == pytest.approx(explored[1].main.axis.heading_deg)
-    comparison = compare_prepared(prepare_comparison(request))
+    comparison = compare_prepared(prepare_comparison(read_flight(request), request))
     north = next(result for result in comparison.axes.values() if result.axis.name == "north")
     shown = page.ask(TABLE)
     assert shown != before

@@ -147,7 +147,7 @@ def test_explore_page_javascript_sigma_ratios_equal_python(
         start_s=analysis.segment.start_s, end_s=analysis.segment.end_s,
         heading_deg=analysis.main.axis.heading_deg,
     )  # fmt: skip
-    main = compare_prepared(prepare_comparison(request, flight=analysis.flight)).main
+    main = compare_prepared(prepare_comparison(analysis.flight, request)).main
     source, truth = make_sigma_verdicts(main)[:2]
     rows = page.ask(ROWS)
     for verdict in (source, truth):

@@ -7,7 +7,12 @@ from functools import partial
 import pytest
 
 from px4fuse.classroom.assignment import figures
-from px4fuse.classroom.assignment.figures import FAULTS, QUESTIONS, draw_figures, select_choices
+from px4fuse.classroom.assignment.figures import (
+    FIGURE_FAULTS,
+    QUESTIONS,
+    draw_figures,
+    select_choices,
+)
 from px4fuse.classroom.assignment.random_assignment import random_uniform
 from px4fuse.results.answer_form import CHOICE_NAMES, MAX_CHOICES, MAX_FORM_BYTES, form_text
 
@@ -19,7 +24,7 @@ def test_right_answers_on_one_plot_belong_to_one_fault() -> None:
         for first in range(0, len(choices), len(QUESTIONS)):
             rows = zip(choices[first:], QUESTIONS, strict=False)
             right = [(choice.answer_text(letter), field) for (choice, letter), field in rows]
-            fault = next(each for each in FAULTS.values() if each.fault == right[0][0])
+            fault = next(each for each in FIGURE_FAULTS.values() if each.fault == right[0][0])
             assert all(getattr(fault, field) == text for text, field in right)
         form = form_text("s.ulg", "0" * 64, [choice for choice, _ in choices])
         assert len(form.encode()) < MAX_FORM_BYTES
@@ -34,7 +39,9 @@ def test_right_multiple_choice_letters_are_equally_frequent() -> None:
 
 def test_answers_to_plot_questions_differ_between_faults() -> None:
     for field in QUESTIONS:
-        assert len({getattr(fault, field) for fault in FAULTS.values()}) == len(FAULTS)
+        assert len({getattr(fault, field) for fault in FIGURE_FAULTS.values()}) == len(
+            FIGURE_FAULTS
+        )
 
 
 def test_plot_questions_of_same_secret_and_student_are_equal(monkeypatch) -> None:

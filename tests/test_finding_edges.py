@@ -1109,3 +1109,9 @@ def test_timestamps_in_bursts_are_reported_as_jitter(size: int, is_reported: boo
     found = [*source_stamps.detect_bursts(analysis(source=source(samples=positions(time_s))))]
     assert [finding.id for finding in found] == ["source_timestamp_jitter"] * is_reported
     assert not is_reported or "bursts of 5, every 0.25 s" in found[0].message
+
+
+def test_repeated_positions_of_odometry_are_reported() -> None:
+    one = repeating(50, 100)
+    one.source.orientation = object()
+    assert named(source_noise.detect, one) == {"source_samples_repeated": "error"}

@@ -17,7 +17,7 @@ from flights import Estimator, Imu, Uwb, aisle_flight, given_placement, unexplai
 from golden_tools import assert_matches_golden, rounded, value
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.diagnose import prepare_comparison
+from px4fuse.diagnose import prepare_comparison, read_flight
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
@@ -354,6 +354,14 @@ PRECONDITIONS: list[tuple[str, Callable[[Comparison, Finding], bool]]] = [
     ("texture|marker|camera", lambda made, _: made.source.origin.kind in ("vio", "mocap")),
     ("--source-kind mocap", lambda made, _: made.source.origin.kind == "vio"),
     ("Calibrate the magnetometer", lambda made, _: parameter(made, "EKF2_MAG_TYPE") != 5.0),
+    ("[Aa]ntenna|receiver|sky|RTK", lambda made, _: made.source.origin.is_gnss),
+    ("EKF2_DELAY_MAX", lambda made, _: "EKF2_DELAY_MAX" in made.flight.log.parameters),
+    ("EKF2_EV_CTRL bit 3", lambda made, _: made.source.origin.is_vision),
+    ("EKF2_EV_NOISE_MD", lambda made, _: "EKF2_EV_NOISE_MD" in made.flight.log.parameters),
+    (
+        "sent|sending|[Ss]end (the|each|a|one|raw|nothing|NaN)",
+        lambda made, _: not made.source.origin.is_gnss,
+    ),
     ("SD card", lambda made, one: bool(made.flight.log.dropouts) or one.id in CORRUPT_LOG),
     (
         "let EKF2 fuse the yaw",
@@ -436,7 +444,7 @@ def test_positions_missing_for_part_of_flight_are_reported_first(
     cases = shared_logs.parent / "cases"
     position = file and PositionFile(path=str(cases / file), frame="enu")
     request = ComparisonRequest(log=str(shared_logs / f"{log}.ulg"), position=position or None)
-    first, *_ = found(compare_prepared(prepare_comparison(request)))
+    first, *_ = found(compare_prepared(prepare_comparison(read_flight(request), request)))
     # EKF2 fused its own source besides the file
     assert (first.id, first.severity) == (finding, "warning" if file else "error")
     assert f"in flight at {at_s} s: EKF2's position error is " in first.title

@@ -3,6 +3,7 @@
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -36,20 +37,6 @@ def steps_of(measured: Sequence[float], dt: float) -> list[float]:
     return sorted(kept)
 
 
-def mean_acceleration(
-    times: Sequence[float], values: Sequence[float], start: float, end: float
-) -> float:
-    """Return the mean over a step of a signal with piecewise constant means of two samples."""
-    total = 0.0
-    at = max(bisect_right(times, start) - 1, 0)
-    while at + 1 < len(times) and times[at] < end:
-        overlap = min(end, times[at + 1]) - max(start, times[at])
-        if overlap > 0:
-            total += overlap * (values[at] + values[at + 1]) / 2
-        at += 1
-    return total / (end - start)
-
-
 def plain_replay(axis: Axis, chosen: Settings) -> tuple[list[list[float]], list[list[float]]]:
     """The lesson's loop with an input and with Q(dt) = SIGMA_A² DT [[dt³/4, dt²/2], [dt²/2, dt]].
 
@@ -59,17 +46,14 @@ def plain_replay(axis: Axis, chosen: Settings) -> tuple[list[list[float]], list[
     z_at = dict(zip(measured, axis.measurement_m.tolist(), strict=True))
     steps = steps_of(measured, chosen.dt_s)
     if chosen.input == "imu":
-        imu = (
-            axis.acceleration.time_s.tolist(),
-            (axis.acceleration.ned_m_s2 @ axis.direction).tolist(),
-        )
+        imu = axis.acceleration.time_s, axis.acceleration.integral_m_s
     q, r = chosen.sigma_a_m_s2**2 * chosen.dt_s, chosen.sigma_z_m**2
     x = [z_at[measured[0]], 0.0]
     P = [[0.5**2, 0.0], [0.0, 1.0**2]]
     states, updates = [[*x, P[0][0], P[0][1], P[1][1]]], []
     for before, now in pairwise(steps):
         dt = now - before
-        a = mean_acceleration(*imu, before, now) if chosen.input == "imu" else 0.0
+        a = np.diff(np.interp([before, now], *imu))[0] / dt if chosen.input == "imu" else 0.0
         x = [x[0] + dt * x[1] + dt * dt / 2 * a, x[1] + dt * a]
         P = [
             [
@@ -176,8 +160,7 @@ def test_kf_state_does_not_depend_on_later_measurements(axis, chosen, data) -> N
     arrival = axis.measurement_time_s[changed]
     measured = axis.measurement_m.copy()
     measured[changed] += 100.0
-    imu = axis.acceleration.time_s, (axis.acceleration.ned_m_s2 @ axis.direction)
-    other = line(axis.measurement_time_s, measured, imu)
+    other = replace(axis, measurement_m=measured)
     times = np.append(np.linspace(axis.measurement_time_s[0], arrival - 1e-9, 50), arrival)
 
     before, after = (np.array(state_at(replay(one, chosen), times)) for one in (axis, other))

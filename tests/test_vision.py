@@ -21,7 +21,7 @@ from px4fuse.diagnose import find_faults, run_what_if
 from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun, run_segment
 from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
-from px4fuse.ekf2.intervals import Events, make_intervals
+from px4fuse.ekf2.intervals import StepEvents, make_intervals
 from px4fuse.ekf2.model import Model, modelled_aids, open_model, replay_settings, run_configurations
 from px4fuse.ekf2.replay_segments import ReplaySegment
 from px4fuse.ekf2.vision import MAX_SAMPLE_GAP_S
@@ -101,7 +101,7 @@ class PlainBias:
 
 
 def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
-    inputs: Inputs, segment: ReplaySegment, events: Events
+    inputs: Inputs, segment: ReplaySegment, events: StepEvents
 ) -> tuple[np.ndarray, np.ndarray]:
     """Run a plain EKF: one prediction at a time, each fix and each vision sample at its step.
 

@@ -159,7 +159,7 @@ def _finding_changes(results_a: Results, results_b: Results) -> Iterator[contrac
 def _describe_worse_verdicts(
     results_a: Results, results_b: Results, findings: Iterable[contract.UnsharedFinding]
 ) -> Iterator[str]:
-    """Yield a sentence on each filter that is consistent only in A, and each error only in B."""
+    """Yield sentences on filters that are consistent only in results A, and errors only in B."""
     statistics_a, statistics_b = map(_mean_statistics_by_label, (results_a, results_b))
     for label, (value_a, was_consistent) in statistics_a.items():
         value_b, is_consistent = statistics_b.get(label, (value_a, True))

@@ -40,7 +40,7 @@ from px4fuse.request import ComparisonRequest, command_line
 OUTPUT_FILE_COLUMNS = ("results", "report")
 RESUME_NOTE = "Results of finished logs are kept. Run the same command to continue."
 
-Progress = Callable[[str, int, int], None]
+BatchProgress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class CachedRows(msgspec.Struct, frozen=True):
         return f"rows/{self.sha256}.json"
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)  # filled during the run
 class _RunState:
     """Settings of ``px4fuse batch``, and logs that are finished."""
 
@@ -157,7 +157,7 @@ def run(
     scheduler: str | None = None,
     workers: int | None = None,
     memory_gb: float = MAX_MEMORY_BYTES / 1e9,
-    progress: Progress = lambda *_: None,
+    progress: BatchProgress = lambda *_: None,
     **settings: Any,
 ) -> BatchResult:
     """Compare KF and EKF2 on many logs, and write a table and the results to a folder.

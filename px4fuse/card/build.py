@@ -58,6 +58,7 @@ from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.model import format_count, format_percent, group_by_root
+from px4fuse.findings.source_positions import has_little_motion
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Ekf2, LogInfo, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
@@ -275,7 +276,7 @@ def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
 
 def _effect_text(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Verdict]) -> str:
     sentences, segment, flight = [], analysis.segment, analysis.segment.flight
-    if analysis.flight.airborne == ():
+    if analysis.flight.airborne == () and has_little_motion(analysis):
         return "The vehicle stayed on the ground, so the errors of KF and EKF2 are not evaluated."
     if is_height_only(analysis.source):
         return "The source measures only the height, so horizontal errors are not evaluated."

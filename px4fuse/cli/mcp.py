@@ -99,7 +99,7 @@ def run_command(
     out : Path or None
         Folder for reports.
     sender : Connection or None
-        Receiver of progress messages.
+        Pipe to the process that shows the progress.
     words : sequence of str
         Command line without ``px4fuse``.
     """

@@ -39,12 +39,12 @@ Choice = partial(click.Choice, case_sensitive=False)
 def _combine_options(*options: Option) -> Option:
     """Combine options into one decorator; --help lists them in this order."""
 
-    def add(command: Callable[..., None]) -> Callable[..., None]:
+    def add_options(command: Callable[..., None]) -> Callable[..., None]:
         for option in reversed(options):
             command = option(command)
         return command
 
-    return add
+    return add_options
 
 
 class NonEmptyPath(click.Path):

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 # Maximum length (bytes) of a default report name (file systems allow 255), and length to which a
 # longer name is cut
 MAX_NAME_BYTES, KEPT_STEM_BYTES = 200, 180
-# Name and id of the student in a report without a student
+# Empty name and id, for a report without a student
 NO_STUDENT_NAME = ("", "")
 # Line width (characters) in a pipe: longer than any paragraph
 UNWRAPPED_WIDTH = 10_000

@@ -33,7 +33,7 @@ MAX_RESIDUAL_NOISE_GAIN = 4.0
 MEDIAN_TIMESTAMP_COUNT = 9
 # Half of the time (s) over which the velocity is averaged
 HALF_VELOCITY_S = 0.3
-# Ratio of all residuals to independent_count residuals: successive residuals have common neighbours
+# Number of residuals for each independent residual: successive residuals have common neighbours
 SHARED_RESIDUALS = 3
 # Minimum timestamp jitter (s, 1 σ): an error of 1 cm at 1 m/s
 MIN_JITTER_S = 0.008
@@ -315,7 +315,7 @@ def fit_errors(comparison: Comparison, white: WhiteErrors) -> ErrorFit | None:
     )
     error_m = position_m - curve(time_s)
     parameters, remaining_m = _least_squares(columns, error_m)
-    # Successive errors are correlated, so that fewer errors are independent_count
+    # Successive errors are correlated, so fewer errors are independent
     interval_s = float(np.median(np.diff(time_s)))
     independent_count = len(time_s) / max(*map(autocorrelation_time, remaining_m.T), 1.0)
     sigma = np.sqrt(np.mean(remaining_m**2) / (path_square_m2 * independent_count))
@@ -409,10 +409,10 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
 
     # the constants without the constant time offset, and the error
     columns = np.concatenate([fit.columns[..., :-1], fit.remaining_m[..., None]], axis=-1)
-    offsets_of_columns_s = fit_offsets(columns)
-    columns -= effect[:, :, None] * offsets_of_columns_s[parts, None]
+    offsets_by_column_s = fit_offsets(columns)
+    columns -= effect[:, :, None] * offsets_by_column_s[parts, None]
     parameters, remaining_m = _least_squares(columns[..., :-1], columns[..., -1])
-    offsets_s = (offsets_of_columns_s @ np.append(-parameters, 1.0))[moving_parts]
+    offsets_s = (offsets_by_column_s @ np.append(-parameters, 1.0))[moving_parts]
     remaining_square_m2 = float(np.mean(remaining_m**2, axis=0).sum()) - 2.0 * fit.white_m**2
     if (
         np.ptp(offsets_s) < MIN_OFFSET_RANGE_S

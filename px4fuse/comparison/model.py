@@ -2,9 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal
 
-import pandas as pd
 from msgspec import structs
 
 from px4fuse.convention.model import Convention
@@ -27,10 +26,9 @@ from px4fuse.filter.consistency import Consistency, HorizontalNis, classify_sigm
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis, Segment
-from px4fuse.flight.model import Flight, PositionTrack
+from px4fuse.flight.model import Flight, PositionTrack, TableOrUnavailable
 
 FilterName = Literal["kf", "ekf2"]
-Track: TypeAlias = pd.DataFrame | Unavailable
 FILTER_NAMES: Mapping[FilterName, Literal["KF", "EKF2"]] = {"kf": "KF", "ekf2": "EKF2"}
 
 
@@ -141,11 +139,11 @@ class AxisComparison(Record, kw_only=True):
     rejected_fraction: Share | None = None
     axis: NotWritten[Axis] = NOT_WRITTEN
     replay: NotWritten[Replay] = NOT_WRITTEN
-    ekf2_state: NotWritten[Track] = NOT_WRITTEN
-    ekf2_variance: NotWritten[Track] = NOT_WRITTEN
-    ekf2_innovations: NotWritten[Track] = NOT_WRITTEN
-    truth: NotWritten[Track] = NOT_WRITTEN
-    flight_tracks: NotWritten[Mapping[str, Track]] = NOT_WRITTEN
+    ekf2_state: NotWritten[TableOrUnavailable] = NOT_WRITTEN
+    ekf2_variance: NotWritten[TableOrUnavailable] = NOT_WRITTEN
+    ekf2_innovations: NotWritten[TableOrUnavailable] = NOT_WRITTEN
+    truth: NotWritten[TableOrUnavailable] = NOT_WRITTEN
+    flight_tracks: NotWritten[Mapping[str, TableOrUnavailable]] = NOT_WRITTEN
 
     def with_flight_tracks(self) -> "AxisComparison":
         """Return the result with tracks of the whole flight instead of the segment, for plots."""

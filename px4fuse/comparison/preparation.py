@@ -356,7 +356,7 @@ def choose_segment(
     if isinstance(flight.airborne, Unavailable):
         reason = "whole duration of the position source (no land detector in the log)"
     elif not flight.airborne:
-        reason = "whole duration of the position source (the vehicle never took off)"
+        reason = "whole duration of the position source (the vehicle stayed on the ground)"
     else:
         flight_spans_s = join_flights(flight.airborne)
         chosen_start_s, chosen_end_s = max(

@@ -216,13 +216,13 @@ def _reported_noise_m(ekf2_inputs: Inputs) -> float:
 
 
 def different_settings(
-    changes: Mapping[str, float], flown: Mapping[str, float]
+    changes: Mapping[str, float], flight_settings: Mapping[str, float]
 ) -> dict[str, float]:
     """Return the changes of parameters that had another value in flight."""
     return {
         name: value
         for name, value in changes.items()
-        if not math.isclose(value, flown.get(name, math.nan), rel_tol=1e-3)
+        if not math.isclose(value, flight_settings.get(name, math.nan), rel_tol=1e-3)
     }
 
 

@@ -56,8 +56,7 @@ from px4fuse.core.arrays import Array
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
-from px4fuse.ekf2.replay import HORIZONTAL as HORIZONTAL_AXES
-from px4fuse.ekf2.replay import Ekf2Replay, rows_inside
+from px4fuse.ekf2.replay import HORIZONTAL_AXES, Ekf2Replay, rows_inside
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
@@ -395,13 +394,13 @@ def _replay_ekf2(
     changed_model = with_misaligned_positions(
         model, change.get(ROTATION, 0.0), change.get(CLOCK_OFFSET, 0.0)
     )
-    excluded_s, axis_tuning = None, tuning_of_axis(tuning, HORIZONTAL)
+    excluded_times_s, axis_tuning = None, tuning_of_axis(tuning, HORIZONTAL)
     if OUTLIERS in change and axis_tuning is not None:
-        excluded_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
+        excluded_times_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
         if comparison.source.origin.fused_as_gnss:
-            excluded_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
-        excluded_s += change.get(CLOCK_OFFSET, 0.0)
-    (replay,) = replay_settings(changed_model, [changed_parameters], excluded_s)
+            excluded_times_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
+        excluded_times_s += change.get(CLOCK_OFFSET, 0.0)
+    (replay,) = replay_settings(changed_model, [changed_parameters], excluded_times_s)
     return replay
 
 

@@ -18,9 +18,9 @@ from px4fuse.convention.axes import (
 )
 from px4fuse.convention.model import (
     Convention,
+    ConventionVerdict,
     HeadingSource,
     OrientationConvention,
-    Verdict,
 )
 from px4fuse.convention.motion import (
     DIFFERENCE_WINDOW_S,
@@ -204,7 +204,7 @@ def _choose_convention(
         ]
     log_odds = best_hypothesis.score - other_conventions[0].score if other_conventions else None
     is_ambiguous = log_odds is not None and log_odds < MIN_LOG_ODDS
-    verdict: Verdict = "ambiguous" if is_ambiguous else "determined"
+    verdict: ConventionVerdict = "ambiguous" if is_ambiguous else "determined"
     if best_hypothesis.score < MIN_LIKELIHOOD_GAIN:
         verdict = "not determinable"
     elif (
@@ -306,7 +306,7 @@ def _check_orientation(
     track: PositionTrack,
     positions: SentPositions,
     best_hypothesis: Hypothesis,
-    verdict: Verdict,
+    verdict: ConventionVerdict,
 ) -> OrientationConvention | None:
     """Determine the convention of the source's orientation, and its heading error."""
     assert track.orientation is not None

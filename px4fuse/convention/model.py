@@ -4,7 +4,7 @@ from typing import Literal
 
 from px4fuse.core.record import NotNegative, Positive, Record
 
-Verdict = Literal["determined", "ambiguous", "doubtful", "not determinable"]
+ConventionVerdict = Literal["determined", "ambiguous", "doubtful", "not determinable"]
 Direction = Literal["north", "east", "south", "west", "up", "down"]
 Axes = tuple[Direction, Direction, Direction]
 Unit = Literal["m", "cm", "mm", "feet"]
@@ -64,7 +64,7 @@ class Convention(Record, kw_only=True, omit_defaults=False):
         Other conventions that fit nearly as well.
     """
 
-    verdict: Verdict
+    verdict: ConventionVerdict
     x: Direction = "north"
     y: Direction = "east"
     z: Direction = "down"

@@ -16,18 +16,18 @@ from px4fuse.core.arrays import Array
 from px4fuse.ekf2.replay import inside_spans
 from px4fuse.trajectory.rotation import from_vector, heading, interpolate, multiply, to_matrix
 
-IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 # Quaternion (w, x, y, z) of half a turn about x, from FLU to FRD
 FLU_TO_FRD = np.array([0.0, 1.0, 0.0, 0.0])
 # Quaternion (w, x, y, z) from ENU to NED
 ENU_TO_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 # Quaternions that convert the world frame to NED and the body frame to FRD, by names of both frames
 FRAMES: Final[dict[BodyAndWorldFrame, tuple[Array, Array]]] = {
-    "FRD to NED": (IDENTITY, IDENTITY),
+    "FRD to NED": (IDENTITY_QUATERNION, IDENTITY_QUATERNION),
     "FLU to ENU": (ENU_TO_NED, FLU_TO_FRD),
     "FLU to NWU": (FLU_TO_FRD, FLU_TO_FRD),
-    "FLU to NED": (IDENTITY, FLU_TO_FRD),
-    "FRD to ENU": (ENU_TO_NED, IDENTITY),
+    "FLU to NED": (IDENTITY_QUATERNION, FLU_TO_FRD),
+    "FRD to ENU": (ENU_TO_NED, IDENTITY_QUATERNION),
 }
 ORDERS: tuple[QuaternionOrder, QuaternionOrder] = ("w x y z", "x y z w")
 # Maximum median difference (°) from EKF2's attitude of an orientation that is copied from EKF2:

@@ -17,7 +17,7 @@ from px4fuse.errors import OutputError
 _FileIdentity = tuple[int, int] | str
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)  # filled during the run
 class _InputRegister:
     """Input files and folders of the running command."""
 

@@ -62,7 +62,7 @@ class BadAcceleration:
     def flagged_fraction(self, begin_s: Array, end_s: Array) -> Array | None:
         """Return the fraction of an interval in which the flag is set, for each configuration.
 
-        Return None if it is not set. The intervals of successive calls follow each other. If the
+        Return None if the flag is not set. Successive calls have successive intervals. If the
         flag is set several times in one interval, only the last time is counted.
         """
         if len(self.logged_since_s):

@@ -40,8 +40,8 @@ MIN_WEIGHT_SUM = 1e-9
 def sample_interval_s(fusion_record: FusionRecord) -> float:
     """Return the interval (s) of the barometer samples that EKF2 fuses.
 
-    It is computed from EKF2's variance of the barometer bias. In the steady state, an update
-    reduces it as much as the random walk increases it: p' = p - p²/S and p = p' + q² Δt.
+    The interval is computed from the variance p of EKF2's barometer bias. In the steady state, an
+    update reduces p as much as the random walk increases p: p' = p - p²/S and p = p' + q² Δt.
     """
     bias_updates = fusion_record.height_bias.get(BAROMETER.name)
     if bias_updates is not None and len(bias_updates) > 1:

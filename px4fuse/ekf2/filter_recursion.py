@@ -28,7 +28,7 @@ from px4fuse.ekf2.heights import (
     barometer_samples,
 )
 from px4fuse.ekf2.inputs import FusionRules, Inputs
-from px4fuse.ekf2.intervals import FUSE, IDLE, START, Events, Intervals, Timing, make_intervals
+from px4fuse.ekf2.intervals import FUSE, IDLE, START, Intervals, StepEvents, Timing, make_intervals
 from px4fuse.ekf2.magnetometer import MIN_SIGMA_GAUSS, EventSamples, fuse_mean, mean_by_event
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
@@ -180,7 +180,7 @@ class SegmentRun:
 
     segment: ReplaySegment
     configurations: tuple[FilterConfiguration, ...]
-    events: tuple[Events, ...]
+    events: tuple[StepEvents, ...]
     innovation: Array
     innovation_variance: Array
     noise: Array

@@ -214,8 +214,8 @@ class HeightFilter:
         self.update_log = np.full((event_count, slot_count + 1, 4, configuration_count), np.nan)
         # Times of the samples in the order of fusion
         sample_s = np.where(self.has_sample, self.time_s, start_s)[biased_slots].swapaxes(0, 1)
-        latest_s = np.maximum.accumulate(sample_s.reshape(-1, configuration_count), axis=0)
-        interval_s = np.diff(latest_s, axis=0, prepend=start_s).reshape(sample_s.shape)
+        latest_sample_s = np.maximum.accumulate(sample_s.reshape(-1, configuration_count), axis=0)
+        interval_s = np.diff(latest_sample_s, axis=0, prepend=start_s).reshape(sample_s.shape)
         self.interval_s[biased_slots] = interval_s.swapaxes(0, 1)
         self.interval_s *= self.updates_bias
 
@@ -237,9 +237,13 @@ class HeightFilter:
             )
         return x, P
 
-    def fuse_gnss(self, e: int, x: Array, P: Array, gnss_m: Array, gnss_m2: Array) -> ArrayPair:
-        """Fuse the GNSS height (m, down) of one event; ``gnss_m2`` is its R (m²)."""
-        return self._fuse_sample(e, len(self.down_m), x, P, gnss_m, np.zeros(1), gnss_m2)
+    def fuse_gnss(
+        self, e: int, x: Array, P: Array, gnss_down_m: Array, gnss_variance_m2: Array
+    ) -> ArrayPair:
+        """Fuse the GNSS height (m, down) of one event; ``gnss_variance_m2`` is its R (m²)."""
+        return self._fuse_sample(
+            e, len(self.down_m), x, P, gnss_down_m, np.zeros(1), gnss_variance_m2
+        )
 
     def update_bad_acceleration(self, e: int, time_s: Array) -> None:
         update_log = self.update_log[max(e - 1, 0) : e + 1]

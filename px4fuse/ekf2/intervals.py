@@ -47,7 +47,7 @@ SENSITIVITY_COLUMN_COUNT = 11
 CORRECTION_COLUMN, INPUT_COLUMN = 9, 10
 
 # One row per event (end of an interval), in time order
-Events = np.recarray[Any, Any]
+StepEvents = np.recarray[Any, Any]
 EVENT = np.dtype(
     [
         ("end_step", np.intp),  # index of the prediction step after which the event occurs
@@ -95,7 +95,7 @@ class Intervals:
         Sensitivity of attitude, velocity and position at the end of each interval.
     """
 
-    events: Events
+    events: StepEvents
     step_counts: Array
     duration_s: Array
     sensitivities: Array
@@ -140,7 +140,7 @@ def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> In
     )
 
 
-def _make_events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
+def _make_events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> StepEvents:
     received = inputs.received
     time_s = segment.time_s
     first_row, last_row = np.searchsorted(received.timestamp_s, time_s[[0, -1]])

@@ -17,9 +17,9 @@ from px4fuse.trajectory.rotation import skew
 
 # Minimum magnetometer noise (gauss) that EKF2 uses
 MIN_SIGMA_GAUSS = 0.01
-IDENTITY = np.eye(3)
+IDENTITY_MATRIX = np.eye(3)
 # Matrix that gives the cross product matrix [v]× (flattened) of a vector v as v @ CROSS_PRODUCT
-CROSS_PRODUCT = skew(IDENTITY).reshape(3, 9)
+CROSS_PRODUCT = skew(IDENTITY_MATRIX).reshape(3, 9)
 
 
 class EventSamples(NamedTuple):
@@ -100,10 +100,10 @@ def fuse_mean(
     )
     H = np.zeros((len(x), sample_mean.value.shape[-1], x.shape[1]))
     H[:, :, THETA] = sample_mean.rotation_to_body @ cross_state
-    H[:, :, state_rows] = sample_mean.rotation_to_body @ (IDENTITY - cross_theta)
+    H[:, :, state_rows] = sample_mean.rotation_to_body @ (IDENTITY_MATRIX - cross_theta)
     predicted_value = (H[:, :, state_rows] @ measured_state[:, :, None])[:, :, 0]
     if bias_state_rows is not None:
-        H[:, :, bias_state_rows] = IDENTITY
+        H[:, :, bias_state_rows] = IDENTITY_MATRIX
         predicted_value += x[:, bias_state_rows]
     nu = sample_mean.value - predicted_value
     HP = H @ P

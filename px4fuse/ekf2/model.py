@@ -35,7 +35,7 @@ from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, matching_sample_rows, pre
 from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.replay import (
-    HORIZONTAL,
+    HORIZONTAL_AXES,
     MAX_COMPARED_REJECTED_FRACTION,
     Agreement,
     Ekf2Replay,
@@ -66,7 +66,15 @@ from px4fuse.flight.ekf2_parameters import (
     PARAMETERS,
     check_parameters,
 )
-from px4fuse.flight.model import AXIS_NAMES, AxisName, Columns, Ekf2, Flight, Unavailable
+from px4fuse.flight.model import (
+    AXIS_NAMES,
+    Columns,
+    Ekf2,
+    Flight,
+    NedAxis,
+    Unavailable,
+    time_index,
+)
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.trajectory.rotation import rotate
 
@@ -338,8 +346,12 @@ def delayed_tracks(
     """
     runs = _run_model(model, configurations)
     for configuration_index in map(runs[0].configurations.index, configurations):
-        yield pd.concat(
-            [_published_columns(run, delayed_states(run, configuration_index)[0]) for run in runs]
+        states = (delayed_states(run, configuration_index)[0] for run in runs)
+        yield _join_segments(
+            [
+                _track(run, state[:, POSITION], state[:, VELOCITY])
+                for run, state in zip(runs, states, strict=True)
+            ]
         )
 
 
@@ -374,10 +386,15 @@ def run_configurations(
     return segment_runs
 
 
-def _published_columns(run: SegmentRun, state: Array) -> pd.DataFrame:
-    index = pd.Index(run.segment.time_s, name="time_s")
-    position_m = state[:, POSITION] / run.segment.ekf2_metres_per_metre
-    return pd.DataFrame(np.hstack([position_m, state[:, VELOCITY]]), index, Columns.STATE)
+def _track(run: SegmentRun, position_m: Array, velocity_m_s: Array) -> pd.DataFrame:
+    """Return position and velocity at each prediction step, in published metres."""
+    states = np.hstack([position_m / run.segment.ekf2_metres_per_metre, velocity_m_s])
+    return pd.DataFrame(states, time_index(run.segment.time_s), Columns.STATE, copy=False)
+
+
+def _join_segments(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Concatenate the tables of all segments; a single table is not copied."""
+    return tables[0] if len(tables) == 1 else pd.concat(tables)
 
 
 def _make_replay(
@@ -387,7 +404,9 @@ def _make_replay(
     changed_parameters: Mapping[str, float],
 ) -> Ekf2Replay:
     configuration_index = runs[0].configurations.index(configuration)
-    tracks = [_delayed_and_published(inputs, run, configuration_index) for run in runs]
+    delayed, published = zip(
+        *(_delayed_and_published(inputs, run, configuration_index) for run in runs), strict=True
+    )
     updates_by_run = [_updates_by_aid(inputs, run, configuration_index) for run in runs]
     updates_by_aid = {
         name: pd.concat([updates[name] for updates in updates_by_run]) for name in updates_by_run[0]
@@ -402,8 +421,8 @@ def _make_replay(
             if run.segment.flow is not None
             for span in _flow_only_spans_s(updates[inputs.aid.name], run.segment)
         ),
-        delayed=pd.concat([delayed_track for delayed_track, _ in tracks]),
-        published=pd.concat([published_track for _, published_track in tracks]),
+        delayed=_join_segments(delayed),
+        published=_join_segments(published),
         other_aid_updates=updates_by_aid,
         stretches_s=tuple(tuple(run.segment.time_s[[0, -1]].tolist()) for run in runs),
         source=inputs.received.source,
@@ -442,14 +461,14 @@ def _updates_by_aid(
         )
     )
 
-    def updates_along(axes: Sequence[AxisName], columns: slice, *other_values: Any) -> pd.DataFrame:
+    def updates_along(axes: Sequence[NedAxis], columns: slice, *other_values: Any) -> pd.DataFrame:
         update_log = np.column_stack([nu[:, columns], S[:, columns], *other_values])
         return update_table(update_log[:, None], events.time_s[:, None], end_s, axes)
 
     position_variance = variance_after[:, HORIZONTAL_POSITION]
     updates_by_aid = {
         inputs.aid.name: updates_along(
-            HORIZONTAL,
+            HORIZONTAL_AXES,
             POSITION_COLUMNS,
             rejected,
             fused,
@@ -467,7 +486,7 @@ def _updates_by_aid(
         velocity_limit = (1.0 + 1e-9) * max(gate, MIN_GATE) ** 2
         is_outside_gate = (nu[:, :3] ** 2 > velocity_limit * S[:, :3]).any(axis=1)
         # Without GNSS height, the replay uses EKF2's logged height
-        axes = AXIS_NAMES if GNSS_HGT.name in updates_by_aid else HORIZONTAL
+        axes = AXIS_NAMES if GNSS_HGT.name in updates_by_aid else HORIZONTAL_AXES
         updates_by_aid[GNSS_VEL.name] = updates_along(axes, slice(len(axes)), is_outside_gate)
     if run.vision is not None:
         updates_by_aid[EV_POS.name] = run.vision.updates(configuration_index, end_s)
@@ -490,14 +509,16 @@ def _delayed_and_published(
         published_rotation = follow_attitude(
             attitude_difference, lag_steps, inputs.mean_step_s, horizon_s
         )
-    published_track = publish(
+    published_velocity, published_position = publish(
         segment, state, reset, published_rotation, lag_steps, configuration.settings
     )
     heading_rad = (
         np.arctan2(segment.body_to_ned[:, 1, 0], segment.body_to_ned[:, 0, 0]) + state[:, HEADING]
     )
-    delayed_track = _published_columns(run, state).assign(heading_rad=heading_rad)
-    return delayed_track, _published_columns(run, np.hstack([state[:, THETA], *published_track]))
+    delayed_track = _track(run, state[:, POSITION], state[:, VELOCITY])
+    return delayed_track.assign(heading_rad=heading_rad), _track(
+        run, published_position, published_velocity
+    )
 
 
 def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Array]:

@@ -118,9 +118,9 @@ def follow_attitude(error_rad: Array, lag_steps: int, step_s: float, horizon_s: 
 def _recursive_filter(numerator: Array, denominator: Array, values: Array) -> Array:
     """Apply a recursive (IIR) filter by solving a banded triangular system (LAPACK dtbtrs)."""
     value_count = len(values)
-    driven_values = np.zeros((values.shape[1], value_count))
+    weighted_inputs = np.zeros((values.shape[1], value_count))
     for delay in np.flatnonzero(numerator[:value_count]).tolist():
-        driven_values[:, delay:] += numerator[delay] * values[: value_count - delay].T
+        weighted_inputs[:, delay:] += numerator[delay] * values[: value_count - delay].T
     bands = np.broadcast_to(denominator, (value_count, len(denominator))).T
-    filtered, _ = lapack.dtbtrs(bands, driven_values.T, uplo="L", overwrite_b=1)
+    filtered, _ = lapack.dtbtrs(bands, weighted_inputs.T, uplo="L", overwrite_b=1)
     return np.asarray(filtered)

@@ -30,10 +30,10 @@ from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, FLOW, GNSS_VEL, MAG
 from px4fuse.flight.model import (
     AXIS_NAMES,
     AidLog,
-    AxisName,
     Columns,
     Ekf2,
     Flight,
+    NedAxis,
     Truth,
     Unavailable,
 )
@@ -41,7 +41,7 @@ from px4fuse.readers.px4_innovations import innovations_along
 
 Spans = tuple[Span, ...]
 T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
-HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")
+HORIZONTAL_AXES: tuple[NedAxis, NedAxis] = ("north", "east")
 # Minimum number of logged innovations for a comparison with the EKF2 replay
 MIN_COMPARED_INNOVATIONS = 20
 CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
@@ -401,16 +401,16 @@ def logged_aid_innovations(name: str, aid_log: AidLog) -> pd.DataFrame:
     return _columns_by_axis({axis: innovations_along(aid_log, axis, gate) for axis in axes})
 
 
-def axes_of(updates: pd.DataFrame) -> list[AxisName]:
+def axes_of(updates: pd.DataFrame) -> list[NedAxis]:
     return [axis for axis in AXIS_NAMES if f"innovation_{axis}_m" in updates]
 
 
 def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
     """Return the logged position innovations north and east, with S and rejections."""
-    return _columns_by_axis({axis: ekf2.innovations[axis] for axis in HORIZONTAL})
+    return _columns_by_axis({axis: ekf2.innovations[axis] for axis in HORIZONTAL_AXES})
 
 
-def _columns_by_axis(innovations: Mapping[AxisName, pd.DataFrame | Unavailable]) -> pd.DataFrame:
+def _columns_by_axis(innovations: Mapping[NedAxis, pd.DataFrame | Unavailable]) -> pd.DataFrame:
     columns = {}
     for axis, axis_innovations in innovations.items():
         if isinstance(axis_innovations, Unavailable):
@@ -447,38 +447,40 @@ def match_updates(
     fused_at_s = updates["fused_at_s"].to_numpy()
     update_row = np.searchsorted(fused_at_s, logged_s + 1e-4, side="right") - 1
     age_s = logged_s - fused_at_s[np.maximum(update_row, 0)]
-    is_match = (update_row >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
+    is_matched = (update_row >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
     # A row that is logged in the prediction step of a fusion may contain the previous innovation
-    is_unambiguous = is_match & (age_s >= SAME_STEP_S)
+    is_unambiguous = is_matched & (age_s >= SAME_STEP_S)
     return np.where(
-        is_unambiguous if is_unambiguous.sum() > 0.5 * is_match.sum() else is_match, update_row, -1
+        is_unambiguous if is_unambiguous.sum() > 0.5 * is_matched.sum() else is_matched,
+        update_row,
+        -1,
     )
 
 
 def _axis_agreement(
-    axis: AxisName,
+    axis: NedAxis,
     logged_innovations: pd.DataFrame,
     replayed_innovations: pd.DataFrame,
     ekf2: Ekf2,
     ekf2_replay: Ekf2Replay,
 ) -> AxisAgreement:
-    nu, nu_log, S, S_log = (
+    nu, nu_logged, S, S_logged = (
         innovations[name].to_numpy()
         for name in (f"innovation_{axis}_m", f"innovation_variance_{axis}_m2")
         for innovations in (replayed_innovations, logged_innovations)
     )
-    s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_log, [5, 50, 95]).tolist()
+    s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_logged, [5, 50, 95]).tolist()
     logged_state = rows_inside(ekf2.state, ekf2_replay.find_evaluated_spans())
     position_m, velocity_m_s = (
         _replayed_minus_logged(ekf2_replay, logged_state, f"{axis}_{unit}") for unit in ("m", "m_s")
     )
     return AxisAgreement(
-        innovation_correlation=float(np.corrcoef(nu, nu_log)[0, 1]),
-        innovation_rms_difference=rms(nu - nu_log),
+        innovation_correlation=float(np.corrcoef(nu, nu_logged)[0, 1]),
+        innovation_rms_difference=rms(nu - nu_logged),
         s_ratio_median=s_ratio_median,
         s_ratio_p5=s_ratio_p5,
         s_ratio_p95=s_ratio_p95,
-        nis_mean_logged=float(np.mean(nu_log**2 / S_log)),
+        nis_mean_logged=float(np.mean(nu_logged**2 / S_logged)),
         nis_mean_replayed=float(np.mean(nu**2 / S)),
         position_rms_difference_m=rms(position_m),
         velocity_rms_difference_m_s=rms(velocity_m_s),

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as record_field
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 import pandas as pd
@@ -19,12 +19,13 @@ from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import (
     BAD_ACCELERATION,
-    AxisName,
     Columns,
     Ekf2,
     Flight,
     FusionRecord,
+    NedAxis,
     Unavailable,
+    rows_between,
     time_index,
 )
 from px4fuse.readers.px4_ekf2 import rows_of_timestamps, samples_per_step
@@ -68,6 +69,8 @@ MIN_SEGMENT_S = 10.0
 MAX_RESET_DELAY_S = 0.5
 # An EKF2 replay is interrupted if a larger fraction of the IMU samples within 1 s is clipped
 MAX_CLIPPED_FRACTION = 0.05
+# Number of prediction steps whose IMU samples are averaged at once, which limits memory
+BLOCK_STEPS = 2**14
 # If a smaller fraction of the IMU samples is missing, the EKF2 replay ignores it
 MAX_LOST_IMU_FRACTION = 0.02
 
@@ -288,7 +291,7 @@ def samples_by_event(
 
 
 def update_table(
-    update_log: Array, measured_at_s: Array, end_s: Array, axes: Sequence[AxisName]
+    update_log: Array, measured_at_s: Array, end_s: Array, axes: Sequence[NedAxis]
 ) -> pd.DataFrame:
     """Return the updates with one aiding source as a table, indexed by measurement time (s).
 
@@ -479,15 +482,19 @@ def _make_segment(
     end_stamps = rows_of_timestamps(imu_s, fusion_record.delayed.index)
     step_end_indices = step_ends(imu_intervals_s, end_stamps, predict_s(fusion_record))
     accelerometer_bias = np.asarray(initial_row[Columns.ACCELEROMETER_BIAS])
-    rate_rad_s = imu[Columns.ANGULAR_RATE].to_numpy()[1:] - np.asarray(
-        initial_row[Columns.GYRO_BIAS]
-    )
-    force_m_s2 = imu[Columns.SPECIFIC_FORCE].to_numpy()[1:] - accelerometer_bias
-    rotation_vectors, velocity_increments = downsample_imu(
-        rate_rad_s * imu_intervals_s[:, None],
-        force_m_s2 * imu_intervals_s[:, None],
-        step_end_indices,
-    )
+    gyro_bias = np.asarray(initial_row[Columns.GYRO_BIAS])
+    rotation_vectors, velocity_increments = np.zeros((2, len(step_end_indices), 3))
+    # some steps at a time, because the arrays of a whole flight need much memory
+    for first_step in range(0, len(step_end_indices), BLOCK_STEPS):
+        steps = slice(first_step, first_step + BLOCK_STEPS)
+        first_row = step_end_indices[first_step - 1] if first_step else 0
+        rows = slice(first_row, step_end_indices[steps][-1])
+        samples, intervals_s = imu.iloc[rows.start + 1 : rows.stop + 1], imu_intervals_s[rows, None]
+        rotation_vectors[steps], velocity_increments[steps] = downsample_imu(
+            (samples[Columns.ANGULAR_RATE].to_numpy() - gyro_bias) * intervals_s,
+            (samples[Columns.SPECIFIC_FORCE].to_numpy() - accelerometer_bias) * intervals_s,
+            step_end_indices[steps] - first_row,
+        )
     step_times_s = imu_s[np.append(0, step_end_indices)]
     step_s = np.diff(step_times_s)
     gyro_attitude = cumulative_product(
@@ -497,7 +504,9 @@ def _make_segment(
     def relative_attitude(
         attitude_samples: pd.DataFrame, early_s: float, end_attitude: Array
     ) -> ArrayPair:
-        attitude_samples = attitude_samples.loc[step_times_s[0] - early_s : step_times_s[-1]]
+        attitude_samples = rows_between(
+            attitude_samples, step_times_s[0] - early_s, step_times_s[-1]
+        )
         at_s = attitude_samples.index.to_numpy()
         end_rotation = conjugate(interpolate(at_s, step_times_s, end_attitude))
         return at_s, multiply(attitude_samples[Columns.QUATERNION].to_numpy(), end_rotation)
@@ -731,8 +740,12 @@ def step_ends(interval_s: Array, logged_ends: IntArray, configured_step_s: float
     logged_end_set = set(logged_ends.tolist())
     end_indices = []
     accumulated_count = accumulated_s = 0.0
+    # lists of some samples at a time, because those of a whole flight need much memory
+    blocks = np.array_split(
+        np.stack([interval_s, sample_counts], axis=1), 1 + len(interval_s) // BLOCK_STEPS
+    )
     for sample, (interval, sample_count) in enumerate(
-        zip(interval_s.tolist(), sample_counts.tolist(), strict=True), start=1
+        chain.from_iterable(block.tolist() for block in blocks), start=1
     ):
         accumulated_count = accumulated_count + sample_count
         accumulated_s = accumulated_s + interval

@@ -22,7 +22,7 @@ from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_tracks, modelled_aids, replay_with_logged_rejections
 from px4fuse.ekf2.replay import (
-    HORIZONTAL,
+    HORIZONTAL_AXES,
     Ekf2Replay,
     Spans,
     component_along,
@@ -197,7 +197,7 @@ def explain_by_steps(
         )
     state_span_s = float(state_times_s[0]), float(state_times_s[-1])
     directions = {name: run.axis.direction for name, run in kf_runs.items()}
-    directions = directions or dict(zip(HORIZONTAL, np.eye(3), strict=False))
+    directions = directions or dict(zip(HORIZONTAL_AXES, np.eye(3), strict=False))
     tracks_by_step = []
     # Tracks are computed one at a time, to limit the memory
     tracks = chain(delayed_positions, (baseline_replay.published, ekf2.state))

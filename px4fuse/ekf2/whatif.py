@@ -18,7 +18,7 @@ from px4fuse.ekf2.heights import HEIGHT_SENSORS
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2.model import Model, modelled_aids, replay_settings, with_position_noise
 from px4fuse.ekf2.replay import (
-    HORIZONTAL,
+    HORIZONTAL_AXES,
     Agreement,
     Ekf2Replay,
     Spans,
@@ -34,7 +34,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, check_parameters
-from px4fuse.flight.model import AxisName, Columns, Ekf2, Flight, Unavailable
+from px4fuse.flight.model import Columns, Ekf2, Flight, NedAxis, Unavailable
 
 ANALYSIS_NAME = "EKF2 replay with other parameters"
 # The longest time between fusions is computed from the log only if it contains at least this
@@ -82,11 +82,11 @@ MAX_REJECTED_FRACTION = 0.35
 # EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# Maximum ratio between the mean NIS of repeated replays
+# Maximum ratio of the largest to the smallest mean NIS of repeated replays
 MAX_NIS_RATIO = 1.10
 # Maximum difference between the rejected fractions of repeated replays
 MAX_REJECTED_SPREAD = 0.03
-# Maximum ratio between the position RMSE of repeated replays
+# Maximum ratio of the largest to the smallest position RMSE of repeated replays
 MAX_RMSE_RATIO = 1.15
 
 
@@ -357,7 +357,9 @@ def _results_agree(summaries: Sequence[Summary]) -> bool:
         if isinstance(rmse_m := summary.position_rmse_to_truth_m, float)
     ]
     rejected_fractions = [summary.rejected_fraction for summary in summaries]
-    nis_by_axis = [[summary.axes[axis].nis_mean for summary in summaries] for axis in HORIZONTAL]
+    nis_by_axis = [
+        [summary.axes[axis].nis_mean for summary in summaries] for axis in HORIZONTAL_AXES
+    ]
     return (
         all(max(axis_nis) <= MAX_NIS_RATIO * min(axis_nis) for axis_nis in nis_by_axis)
         and max(rejected_fractions) - min(rejected_fractions) <= MAX_REJECTED_SPREAD
@@ -377,7 +379,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
         )
     # Position variance before and after each update
     variance = pd.DataFrame(index=np.column_stack([fused_at_s - 1e-6, fused_at_s]).ravel())
-    for axis in HORIZONTAL:
+    for axis in HORIZONTAL_AXES:
         innovation_variance, noise_variance = (
             updates[f"{quantity}_variance_{axis}_m2"] for quantity in ("innovation", "observation")
         )
@@ -474,7 +476,7 @@ def _make_summary(
         rmse_to_truth = rms_to_truth(flight, position_m, direction, evaluated_state_s)
         return NO_TRUTH if rmse_to_truth is None else rmse_to_truth
 
-    for axis, direction in zip(HORIZONTAL, np.eye(3), strict=False):
+    for axis, direction in zip(HORIZONTAL_AXES, np.eye(3), strict=False):
         median_sigma: float | Unavailable
         if isinstance(logged_variance, Unavailable):
             median_sigma = logged_variance
@@ -508,7 +510,7 @@ def _make_summary(
 
 
 def _innovation_statistics(
-    updates: pd.DataFrame, *axes: AxisName
+    updates: pd.DataFrame, *axes: NedAxis
 ) -> tuple[float, tuple[float, float], float]:
     nu = np.concatenate([updates[f"innovation_{axis}_m"] for axis in axes])
     S = np.concatenate([updates[f"innovation_variance_{axis}_m2"] for axis in axes])

@@ -29,7 +29,7 @@ TRUTH_LINE: BokehStyle = {"line_width": 1.2, "line_dash": [1, 3], "name": "truth
 HOLLOW_MARKER: BokehStyle = {"fill_color": None, "line_color": "black"}
 # Arrow head at the upper or lower edge of a plot, for a value outside the axis range
 ARROW_MARKER: BokehStyle = {"angle": "turn", "marker": "triangle"}
-# Shaded band in which the values of a consistent filter are
+# Style of the shaded band that contains the values of a consistent filter
 CONSISTENT_BAND: BokehStyle = {"level": "underlay", "fill_alpha": 1.0, "name": "consistent"}
 GAP_BAND: BokehStyle = {
     "level": "underlay",

@@ -58,7 +58,7 @@ FINDING_ID_BY_FAULT = {
     "jump": "source_position_jump",
     "dropout": "source_gap",
 }
-# Name of a fault that is not in the simulation: the measurement noise of KF is too small
+# Fault of the KF settings, not of the simulated flight: too small measurement noise
 NOISY_UWB = "noisy-uwb"
 
 

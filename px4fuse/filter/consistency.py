@@ -26,9 +26,9 @@ from px4fuse.core.text import count_noun
 
 # Result of a consistency test: "underconfident" if the reported σ is too large, "overconfident" if
 # it is too small
-Verdict = Literal["consistent", "underconfident", "overconfident"]
+SigmaVerdict = Literal["consistent", "underconfident", "overconfident"]
 
-Interval = tuple[float, float]
+Limits = tuple[float, float]
 # Minimum number of innovations in a consistency test: the 95 % band of their mean NIS is 0.3 to 2.1
 MIN_INNOVATIONS = 10
 CONFIDENCE_LEVEL = 0.95
@@ -37,7 +37,7 @@ LJUNG_BOX_LAGS = 10
 # Range of the ratio of actual to reported σ in which a filter is consistent. For errors against
 # ground truth it is wider, because EKF2's σ excludes the lag of its output predictor
 Reference = Literal["source", "truth"]
-CONSISTENT_RATIOS: Mapping[Reference, Interval] = {"source": (0.8, 1.25), "truth": (0.67, 1.5)}
+CONSISTENT_RATIOS: Mapping[Reference, Limits] = {"source": (0.8, 1.25), "truth": (0.67, 1.5)}
 # Innovation gate (√S) for KF and for logs without a gate parameter: default of EKF2_EVP_GATE
 DEFAULT_GATE = 5.0
 
@@ -59,7 +59,7 @@ class NisVerdict(Record, kw_only=True):
     nis_mean: Positive
     nis_band: tuple[NotNegative, NotNegative]
     sigma_ratio: Positive
-    verdict: Verdict
+    verdict: SigmaVerdict
 
     @property
     def sigma_error_factor(self) -> float:
@@ -103,7 +103,7 @@ class HorizontalNis(NisVerdict, kw_only=True):
     """
 
 
-def nis_band(count: int, dimensions: int = 1) -> Interval:
+def nis_band(count: int, dimensions: int = 1) -> Limits:
     """Return the two-sided 95 % chi-square band of the mean of ``count`` NIS values.
 
     Each NIS is divided by its number of ``dimensions``, so that the expected mean is 1.
@@ -122,8 +122,8 @@ def nis_band(count: int, dimensions: int = 1) -> Interval:
 
 
 def classify_sigma_ratio(
-    ratio: float, reference: Reference, interval: Interval | None = None
-) -> Verdict:
+    ratio: float, reference: Reference, interval: Limits | None = None
+) -> SigmaVerdict:
     """Classify a filter by the ratio of its actual to its reported σ.
 
     The filter is consistent if the ratio is inside :data:`CONSISTENT_RATIOS`, or if the 95 %
@@ -135,12 +135,12 @@ def classify_sigma_ratio(
     return "overconfident" if ratio > 1.0 else "underconfident"
 
 
-def sigma_ratio_interval(nis_mean: float, band: Interval) -> Interval:
+def sigma_ratio_interval(nis_mean: float, band: Limits) -> Limits:
     """Return the 95 % interval of √(mean NIS)."""
     return (nis_mean / band[1]) ** 0.5, (nis_mean / band[0]) ** 0.5
 
 
-def classify_mean_nis(nis_mean: float, band: Interval) -> Verdict:
+def classify_mean_nis(nis_mean: float, band: Limits) -> SigmaVerdict:
     return classify_sigma_ratio(nis_mean**0.5, "source", sigma_ratio_interval(nis_mean, band))
 
 

@@ -18,7 +18,6 @@ from functools import cache
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
 from scipy import constants
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
@@ -588,20 +587,23 @@ def make_design_matrix(
     shifted_axes = [replace(axis, measurement_time_s=time_s) for axis in axes]
     settings = replace(settings, input="imu")
     timeline = make_timeline(shifted_axes[0], settings)
-    error_accelerations = _error_accelerations(attitude, acceleration)
+    common_integrals = _common_integrals(attitude, acceleration)
     kf_inputs = [preintegrate(axis, settings) for axis in shifted_axes]
     column_pairs: list[ArrayPair] = []
     for axis, kf_input in zip(axes, kf_inputs, strict=True):
         column_pairs.append((kf_input.delta_position_m, kf_input.delta_velocity_m_s))
         column_pairs += [
-            _integrate_signal(value @ axis.direction, input_time_s, timeline)
-            for input_time_s, value in error_accelerations
+            _integrate_signal(integral @ axis.direction, input_time_s, timeline)
+            for input_time_s, integral in common_integrals
         ]
     time_s = axes[0].measurement_time_s[-len(kf_inputs[0].measurement_m) :]
     hat_time_s, hat_functions = _hat_functions(
         time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s
     )
-    column_pairs += [_integrate_signal(hat, hat_time_s, timeline) for hat in hat_functions]
+    column_pairs += [
+        _integrate_signal(cumulative_integral(hat, hat_time_s), hat_time_s, timeline)
+        for hat in hat_functions
+    ]
     dp, dv = (np.stack(arrays, axis=1) for arrays in zip(*column_pairs, strict=True))
     measured_m = np.zeros_like(dp)
     for index, kf_input in enumerate(kf_inputs):
@@ -625,28 +627,23 @@ def make_design_matrix(
     return DesignMatrix(time_s, len(axes), signals, prior_sigma, sigma_z, unit_steps(time_s, []))
 
 
-def _integrate_signal(acceleration_m_s2: Array, time_s: ArrayLike, timeline: Timeline) -> ArrayPair:
-    """Integrate an acceleration over the intervals between measurements: Δp (m) and Δv (m/s)."""
-    signal_time_s = np.asarray(time_s, dtype=np.float64)
-    velocity_m_s = np.interp(
-        timeline.time_s, signal_time_s, cumulative_integral(acceleration_m_s2, signal_time_s)
-    )
+def _integrate_signal(integral_m_s: Array, time_s: Array, timeline: Timeline) -> ArrayPair:
+    """Return Δp (m) and Δv (m/s) between the measurements, from an integrated acceleration."""
+    velocity_m_s = np.interp(timeline.time_s, time_s, integral_m_s)
     return integrate_acceleration(timeline, np.diff(velocity_m_s) / np.diff(timeline.time_s))
 
 
-def _error_accelerations(
-    attitude: pd.DataFrame, acceleration: Acceleration
-) -> list[tuple[Array, Array]]:
-    """Return the NED acceleration error, with times, for each of three errors of size 1.
-
-    The errors are 1 m/s² forward bias, 1 m/s² right bias and 1 rad yaw error.
-    """
+def _common_integrals(attitude: pd.DataFrame, acceleration: Acceleration) -> list[ArrayPair]:
+    """Return time and integrated NED error of 1 m/s² forward bias, right bias, and 1 rad yaw."""
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
     attitude_time_s = attitude.index.to_numpy()
-    biases = [(attitude_time_s, body_to_ned.apply(np.eye(3)[axis])) for axis in (FORWARD, RIGHT)]
-    north, east, _ = acceleration.ned_m_s2.T
-    return [*biases, (acceleration.time_s, np.column_stack([-east, north, 0.0 * north]))]
+    biases = [
+        (attitude_time_s, cumulative_integral(body_to_ned.apply(np.eye(3)[axis]), attitude_time_s))
+        for axis in (FORWARD, RIGHT)
+    ]
+    north, east, _ = acceleration.ned_integral_m_s
+    return [*biases, (acceleration.time_s, np.stack([-east, north, 0.0 * north]).T)]
 
 
 def _hat_functions(start_s: float, end_s: float) -> ArrayPair:

@@ -29,7 +29,7 @@ from px4fuse.filter.fitting import Noises, fit_ratios
 from px4fuse.filter.marginal_likelihood import Positions, centre_on_path
 from px4fuse.filter.model import continuous_noise_unit
 from px4fuse.filter.signals import imu_gaps
-from px4fuse.flight.model import Columns, Flight, Unavailable
+from px4fuse.flight.model import Columns, Flight, Unavailable, rows_between
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
@@ -399,7 +399,7 @@ def _large_gyro_bias(step_times_s: Array, angle_rad: Array, attitude: pd.DataFra
     A bias up to ``MAX_PRIOR_GYRO_BIAS_RAD_S`` is an unknown constant, so zero is returned. Zero is
     also returned above ``MAX_REMOVED_GYRO_BIAS_RAD_S``, because then the logged attitude is wrong.
     """
-    samples = attitude.loc[step_times_s[0] : step_times_s[-1], Columns.QUATERNION]
+    samples = rows_between(attitude, step_times_s[0], step_times_s[-1])[Columns.QUATERNION]
     if len(samples) < MIN_KEPT_MEASUREMENTS:
         return np.zeros(3)
     attitude_time_s, quaternions = samples.index.to_numpy(), samples.to_numpy()

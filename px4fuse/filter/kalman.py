@@ -25,7 +25,7 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import make_timeline
 
-Rows = list[tuple[float, ...]]
+StepRows = list[tuple[float, ...]]
 # Columns of ``Replay.updates``
 UPDATE_COLUMNS = [
     "measurement_m",
@@ -108,7 +108,7 @@ def replay(
 
 def _run_filterpy(
     initial: InitialState, measurement_variance: float, *inputs: Sequence[Any]
-) -> tuple[Rows, Rows]:
+) -> tuple[StepRows, StepRows]:
     """Run KF with filterpy; return the rows of :attr:`Replay.steps` and :attr:`Replay.updates`.
 
     ``inputs`` are four sequences, one value for each step: length (s), acceleration (m/s²), noise
@@ -122,8 +122,8 @@ def _run_filterpy(
     kalman.H = np.array([[1.0, 0.0]])
     kalman.R = np.array([[measurement_variance]])
     kalman.inv = np.reciprocal  # S is 1 by 1
-    states: Rows = [(initial.position_m, initial.velocity_m_s, *model.INITIAL_COVARIANCE)]
-    updates: Rows = []
+    states: StepRows = [(initial.position_m, initial.velocity_m_s, *model.INITIAL_COVARIANCE)]
+    updates: StepRows = []
     for dt_s, acceleration, noise_density, measured_m in zip(*inputs, strict=True):
         kalman.predict(
             u=np.array([[acceleration]]),
@@ -153,15 +153,15 @@ def _run_filterpy(
 
 def _run_floats(
     initial: InitialState, measurement_variance: float, *inputs: Sequence[Any]
-) -> tuple[Rows, Rows]:
+) -> tuple[StepRows, StepRows]:
     """Run KF with Python floats; arguments and results are those of :func:`_run_filterpy`."""
     position, velocity, covariance = (
         initial.position_m,
         initial.velocity_m_s,
         model.INITIAL_COVARIANCE,
     )
-    states: Rows = [(position, velocity, *covariance)]
-    updates: Rows = []
+    states: StepRows = [(position, velocity, *covariance)]
+    updates: StepRows = []
     for dt_s, acceleration, noise_density, measured_m in zip(*inputs, strict=True):
         position, velocity, covariance = model.predict_step(
             position, velocity, covariance, acceleration, noise_density, dt_s

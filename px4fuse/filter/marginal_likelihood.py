@@ -186,6 +186,7 @@ class FittedPositions:
     gram : ndarray, shape (s, T, 1 + c, 1 + c)
         Inner products of the data and their derivatives, weighted by the inverse covariance.
     log_determinant : float
+        Logarithm of the determinant of the covariance.
     degrees_of_freedom : int
         Number of measured positions minus the number that determines the initial states.
     constants_prior_sigma : ndarray, shape (c,)

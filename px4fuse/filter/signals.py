@@ -18,7 +18,14 @@ from scipy.spatial.transform import Rotation, Slerp
 from px4fuse.core.arrays import Array, BoolArray, cumulative_integral
 from px4fuse.core.record import Span, one_line_repr
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.flight.model import AXIS_NAMES, Columns, Flight, PositionTrack, Unavailable
+from px4fuse.flight.model import (
+    AXIS_NAMES,
+    Columns,
+    Flight,
+    PositionTrack,
+    Unavailable,
+    rows_between,
+)
 
 AISLE = "aisle"
 # Minimum length (s) of a gap in the IMU
@@ -30,6 +37,8 @@ MIN_IMU_GAP_INTERVALS = 5.0
 MAX_INDEPENDENT_HZ = 25.0
 # Minimum number of position measurements along an axis
 MIN_MEASUREMENTS = 3
+# Number of IMU samples that are rotated at once, which limits memory
+ROTATED_SAMPLES = 2**15
 
 
 @dataclass(frozen=True)
@@ -62,29 +71,37 @@ class Acceleration:
     Attributes
     ----------
     time_s : ndarray, shape (n,)
-    ned_m_s2 : ndarray, shape (n, 3)
-        Acceleration in NED without gravity, for the whole flight.
+    ned_integral_m_s : ndarray, shape (3, n)
+        Integral of the acceleration in NED without gravity, from the first sample of the flight;
+        all axes share it.
+    mean_products_m2_s4 : ndarray, shape (3, 3)
+        Mean products of the components of the acceleration in the segment.
     direction : ndarray, shape (3,)
         Unit vector of the axis in NED.
-    integral_m_s : ndarray, shape (n,)
-        Integral of the acceleration along the axis from the first sample.
     gap_time_s : ndarray, shape (k,)
         Start and end of each IMU gap.
     gap_integral_s : ndarray, shape (k,)
-        Total length (s) of all IMU gaps before each time in ``gap_time_s``.
-    rms_m_s2 : float
-        RMS of the acceleration in the segment: standard deviation assumed in an IMU gap.
+        Total length of the IMU gaps before each time in ``gap_time_s``.
     """
 
     time_s: Array
-    ned_m_s2: Array
+    ned_integral_m_s: Array
+    mean_products_m2_s4: Array
     direction: Array
-    integral_m_s: Array
     gap_time_s: Array
     gap_integral_s: Array
-    rms_m_s2: float
 
     __repr__ = one_line_repr
+
+    @property
+    def integral_m_s(self) -> Array:
+        """Integral of the acceleration along the axis (m/s), shape (n,)."""
+        return np.asarray(self.direction @ self.ned_integral_m_s)
+
+    @property
+    def rms_m_s2(self) -> float:
+        """RMS of the acceleration in the segment: standard deviation assumed in an IMU gap."""
+        return float(np.sqrt(self.direction @ self.mean_products_m2_s4 @ self.direction))
 
 
 @dataclass(frozen=True)
@@ -136,7 +153,7 @@ def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unav
         return imu
     if isinstance(attitude, Unavailable):
         return attitude
-    imu = imu.loc[attitude.index[0] : attitude.index[-1]]
+    imu = rows_between(imu, attitude.index[0], attitude.index[-1])
     if len(imu) < 2:
         return Unavailable(
             "acceleration in NED",
@@ -157,10 +174,16 @@ def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     imu, attitude = recorded
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     rotations = Rotation.from_quat(quaternions, scalar_first=True)
-    body_to_ned = Slerp(attitude.index.to_numpy(), rotations)(imu.index.to_numpy())
-    acceleration = body_to_ned.apply(imu[Columns.SPECIFIC_FORCE].to_numpy(copy=True))
+    body_to_ned = Slerp(attitude.index.to_numpy(), rotations)
+    force_m_s2 = imu[Columns.SPECIFIC_FORCE].to_numpy()
+    acceleration = np.empty(force_m_s2.shape)
+    # some samples at a time, because scipy's rotations of a long flight need much memory
+    for first_row in range(0, len(imu), ROTATED_SAMPLES):
+        rows = slice(first_row, first_row + ROTATED_SAMPLES)
+        rotation = body_to_ned(imu.index.to_numpy()[rows])
+        acceleration[rows] = rotation.apply(force_m_s2[rows].astype(np.float64))
     acceleration[:, 2] += constants.g
-    return pd.DataFrame(acceleration, index=imu.index, columns=list(AXIS_NAMES))
+    return pd.DataFrame(acceleration, imu.index, list(AXIS_NAMES), copy=False)
 
 
 def aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]:
@@ -210,7 +233,7 @@ def make_axes(
     SettingsError
         An axis has an unknown name, or the heading is not between 0 and 360.
     """
-    acceleration = ned_acceleration(flight)
+    acceleration = project_acceleration(ned_acceleration(flight), np.zeros(3), segment)
     valid_names = (*AXIS_NAMES, AISLE)
     axis_names = tuple(dict.fromkeys(valid_names if names is None else names))
     if heading_deg is not None and not 0.0 <= heading_deg <= 360.0:
@@ -236,7 +259,6 @@ def make_axes(
             raise MissingDataError(
                 f"{source_label} has no position along the axis {name} in the analysed segment."
             )
-        projected_acceleration = project_acceleration(acceleration, direction, segment)
         axes.append(
             Axis(
                 name,
@@ -245,7 +267,9 @@ def make_axes(
                 note,
                 track_samples.index.to_numpy()[is_finite],
                 projected[is_finite],
-                projected_acceleration,
+                acceleration
+                if isinstance(acceleration, Unavailable)
+                else replace(acceleration, direction=direction),
             )
         )
     if not axes:
@@ -300,10 +324,8 @@ def project_acceleration(
     if isinstance(acceleration, Unavailable):
         return acceleration
     time_s = acceleration.index.to_numpy()
-    acceleration_ned_m_s2 = acceleration.to_numpy()
-    along_m_s2 = acceleration_ned_m_s2 @ direction
-    is_inside = (time_s >= segment.start_s) & (time_s <= segment.end_s)
-    if np.count_nonzero(is_inside) < 2:
+    inside_m_s2 = rows_between(acceleration, segment.start_s, segment.end_s).to_numpy()
+    if len(inside_m_s2) < 2:
         return Unavailable(
             "IMU",
             "the analysed segment contains no IMU samples",
@@ -315,12 +337,13 @@ def project_acceleration(
     gap_ends = np.unique([0, *gap_rows, *(gap_rows + 1), len(time_s) - 1])
     return Acceleration(
         time_s=time_s,
-        ned_m_s2=acceleration_ned_m_s2,
+        ned_integral_m_s=np.array(
+            [cumulative_integral(values.to_numpy(), time_s) for _, values in acceleration.items()]
+        ),
+        mean_products_m2_s4=inside_m_s2.T @ inside_m_s2 / len(inside_m_s2),
         direction=direction,
-        integral_m_s=cumulative_integral(along_m_s2, time_s),
         gap_time_s=time_s[gap_ends],
         gap_integral_s=np.append(0.0, gap_sum_s)[gap_ends],
-        rms_m_s2=float(np.sqrt(np.mean(along_m_s2[is_inside] ** 2))),
     )
 
 
@@ -339,7 +362,12 @@ def mean_step_acceleration(
     """
     step_edges_s = np.asarray(step_edges_s, dtype=np.float64)
     length_s = np.diff(step_edges_s)
-    velocity_m_s = np.interp(step_edges_s, acceleration.time_s, acceleration.integral_m_s)
+    velocity_m_s = np.zeros(len(step_edges_s))
+    for component, integral_m_s in zip(
+        acceleration.direction, acceleration.ned_integral_m_s, strict=True
+    ):
+        if component != 0.0:
+            velocity_m_s += component * np.interp(step_edges_s, acceleration.time_s, integral_m_s)
     gap_s = np.interp(step_edges_s, acceleration.gap_time_s, acceleration.gap_integral_s)
     covered_s = np.clip(step_edges_s, acceleration.time_s[0], acceleration.time_s[-1])
     outside_fraction = 1.0 - np.diff(covered_s) / length_s

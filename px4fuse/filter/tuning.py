@@ -294,7 +294,7 @@ def tune_axes(
 
 def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
     """Return SIGMA_A (``noise_index`` 0) or SIGMA_Z (1) of a fit with its 95 % interval."""
-    sigmas = fit.noises.sigma_a_m_s2, fit.noises.sigma_z_m
+    best_noises = fit.noises.sigma_a_m_s2, fit.noises.sigma_z_m
 
     def score(log_value: float, log_other: float) -> float:
         log_noises = (log_value, log_other) if noise_index == 0 else (log_other, log_value)
@@ -305,7 +305,7 @@ def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
     variance_factor = (1.0, fit.sigma_z_variance_factor)[noise_index]
     return _noise_with_interval(
         score,
-        (np.log(sigmas[noise_index]), np.log(sigmas[1 - noise_index])),
+        (np.log(best_noises[noise_index]), np.log(best_noises[1 - noise_index])),
         search_range,
         variance_factor,
     )

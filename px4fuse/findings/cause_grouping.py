@@ -85,7 +85,7 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 def _with_action_of(cause: Finding, finding: Finding) -> Finding:
     """Replace the action of an effect by that of its cause.
 
-    For example, a larger noise would only hide outliers.
+    The action of an effect may be wrong, such as a larger noise setting that hides outliers.
     """
     if (
         finding.caused_by is None

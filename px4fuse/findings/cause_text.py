@@ -18,7 +18,7 @@ from px4fuse.comparison.trials import (
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import SETTING_RANGES
 from px4fuse.findings import cause_grouping as kinds
-from px4fuse.findings.model import format_percent, source_words
+from px4fuse.findings.model import format_percent, magnetometer_advice, source_words
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
@@ -88,12 +88,12 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
     if change.pop(trials.FORWARD_BIAS, None) is not None:
         actions.append("Calibrate the accelerometer and the level horizon.")
         change.pop(trials.RIGHT_BIAS)
-    if turn_deg := change.pop(trials.ROTATION, None):
+    if rotation_deg := change.pop(trials.ROTATION, None):
         # GNSS positions refer to true north: if they are rotated, EKF2's heading is wrong
         actions.append(
-            "Calibrate the magnetometer, away from metal."
+            magnetometer_advice(analysis.flight) or "Check the heading source of EKF2."
             if is_gnss
-            else f"Rotate the positions by {turn_deg:+.0f}° before they are sent."
+            else f"Rotate the positions by {rotation_deg:+.0f}° before they are sent."
         )
     if (offset_s := change.pop(trials.CLOCK_OFFSET, None)) is not None:
         actions.append(f"{format_shift(offset_s)} the position timestamps before sending.")

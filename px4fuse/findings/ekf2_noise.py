@@ -32,14 +32,14 @@ def detect(analysis: Analysis) -> Findings:
     is_reported = flown_m > inputs.settings[aid.noise]
     ratio, is_small = estimate_m / flown_m, estimate_m > flown_m
     factor, direction = max(ratio, 1.0 / ratio), "small" if is_small else "large"
-    sensor = source_name(analysis.source)
+    sensor_name = source_name(analysis.source)
     has_kf_same_noise = analysis.source.origin.is_gnss and math.isclose(
         analysis.settings.sigma_z_m, flown_m, rel_tol=1e-2
     )
     rejected_fraction = analysis.main.rejected_fraction or 0.0
     if rejected_fraction >= MIN_NAMED_REJECTION:
         effect_text = f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"
-        reason = f"EKF2 rejects normal {sensor} noise as outliers and relies on the IMU."
+        reason = f"EKF2 rejects normal {sensor_name} noise as outliers and relies on the IMU."
     else:
         effect_text, opposite = "", "large" if is_small else "small"
         reason = f"EKF2's gain is therefore too {opposite}, and its reported σ too {direction}."
@@ -49,7 +49,7 @@ def detect(analysis: Analysis) -> Findings:
     if is_small and is_default:  # PX4's default fits usual sensors, so the sensor is at fault
         filters = "KF and EKF2" if has_kf_same_noise else "EKF2"
         title = (
-            f"{sensor} noise is {format_factor(factor)} times the noise setting of "
+            f"{sensor_name} noise is {format_factor(factor)} times the noise setting of "
             f"{filters}{effect_text}"
         )
     source_text = ""
@@ -58,7 +58,7 @@ def detect(analysis: Analysis) -> Findings:
         report_text = f", or report a variance of {estimate_m**2:.2g} m² with each position"
         mode_text = f" ({aid.noise_mode} 0)" if aid.noise_mode else ""
         source_text = (
-            f", the σ that {sensor} reports{mode_text}, because {aid.noise} is only "
+            f", the σ that {sensor_name} reports{mode_text}, because {aid.noise} is only "
             f"{inputs.settings[aid.noise]:g} m"
         )
     interval_text, horizontal_tuning = "", analysis.tuning.get(HORIZONTAL)

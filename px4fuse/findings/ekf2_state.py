@@ -14,9 +14,10 @@ from px4fuse.findings.model import (
     error,
     format_percent,
     fraction_of_ones,
+    magnetometer_advice,
     spans_with_value,
 )
-from px4fuse.flight.ekf2_parameters import BAROMETER, MAG, NO_MAGNETOMETER
+from px4fuse.flight.ekf2_parameters import BAROMETER, MAG
 from px4fuse.flight.model import (
     BODY_AXES,
     Columns,
@@ -175,7 +176,7 @@ def detect_missing_alignment(
         isinstance(fusion_flags, pd.DataFrame)
         and fraction_of_ones(fusion_flags["yaw"], segment) > 0.0
     )
-    aligned_s = segment.start_s
+    alignment_end_s = segment.start_s
     for flag, quantity, action in (
         ("tilt_align", "tilt", "Keep the vehicle at rest after boot until EKF2 is ready."),
         ("yaw_align", "heading", _align_heading_action(flight, source)),
@@ -187,10 +188,12 @@ def detect_missing_alignment(
         unaligned_fraction = 1.0 - fraction_of_ones(alignment_flag, segment)
         if (
             unaligned_fraction > MAX_UNALIGNED_FRACTION
-            and spans[-1][1] > aligned_s + MAX_HEADING_ALIGNMENT_S
+            and spans[-1][1] > alignment_end_s + MAX_HEADING_ALIGNMENT_S
         ):
-            aligned_s = spans[-1][1]
-            until_text = f" until {aligned_s:.1f} s" if aligned_s < segment.end_s else ""
+            alignment_end_s = spans[-1][1]
+            until_text = (
+                f" until {alignment_end_s:.1f} s" if alignment_end_s < segment.end_s else ""
+            )
             yield error(
                 "ekf2_not_aligned",
                 f"EKF2 has not aligned its {quantity}{until_text}. cs_{flag} is 0 for "
@@ -204,9 +207,7 @@ def detect_missing_alignment(
 
 def _align_heading_action(flight: Flight, source: PositionTrack | None) -> str:
     """Return the action for a heading that EKF2 did not align, by the sensors of the vehicle."""
-    action = "Calibrate the magnetometer."
-    if flight.log.parameters.get(MAG.switch) == NO_MAGNETOMETER:
-        action = f"Enable the magnetometer ({MAG.switch} 0)."
+    action = magnetometer_advice(flight) or f"Enable the magnetometer ({MAG.switch} 0)."
     if source is not None and source.origin.is_vision:
         has_yaw = source.orientation is not None
         action += (

@@ -185,7 +185,7 @@ def _drift_finding(
 
     The innovations of the filters ``filter_labels`` do not show the drift.
     """
-    sensor, loop = source_name(analysis.source), analysis.loop
+    sensor_name, loop = source_name(analysis.source), analysis.loop
     drift_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
     rmse_sentence = ""
     if aligned_error is not None:
@@ -210,9 +210,9 @@ def _drift_finding(
     noise_settings = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
     return error(
         "source_drift",
-        f"{sensor} drifts: {drift_text}. {rmse_sentence}The innovations of "
+        f"{sensor_name} drifts: {drift_text}. {rmse_sentence}The innovations of "
         f"{' and '.join(filter_labels)} do not show the drift, because the estimates follow "
-        f"{sensor}. Do not reduce {noise_settings}.",
+        f"{sensor_name}. Do not reduce {noise_settings}.",
         DRIFT_REMEDY,
         evidence,
     )
@@ -255,11 +255,11 @@ def _rmse_after_alignment(comparison: Comparison, filter_name: FilterName) -> Al
 
 
 def make_possible_drift_finding(analysis: Analysis) -> Finding:
-    sensor, loop = source_name(analysis.source), analysis.loop
+    sensor_name, loop = source_name(analysis.source), analysis.loop
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
-        f"{sensor} may drift: odometry sends a heading as these messages do. Filters follow a "
+        f"{sensor_name} may drift: odometry sends a heading as these messages do. Filters follow a "
         "drifting source, so innovations do not show the drift."
     )
     if isinstance(horizontal_tuning, AxisTuning) and (

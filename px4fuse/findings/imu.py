@@ -22,7 +22,7 @@ MIN_BIAS_ERROR_M_S2 = 0.3
 # Tilt error (°) that has the same effect as an accelerometer bias of 1 m/s²
 TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
 # Minimum time (s) without IMU samples to report it: two prediction steps of KF
-MIN_IMU_GAP_S = 0.2
+MIN_REPORTED_IMU_GAP_S = 0.2
 # Minimum IMU rate (Hz): 5 samples in each DT of 0.1 s, so that vibration is not aliased
 MIN_IMU_RATE_HZ = 50.0
 # Minimum attitude rate (Hz) for interpolation of the attitude to the times of IMU samples
@@ -162,7 +162,7 @@ def detect_clipping(analysis: Analysis) -> Findings:
 def detect_imu_gaps(analysis: Analysis) -> Findings:
     gap_s, imu = analysis.main.replay.input_gap_s, analysis.flight.imu
     interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
-    if gap_s > max(MIN_IMU_GAP_S, 2.0 * interval_s):
+    if gap_s > max(MIN_REPORTED_IMU_GAP_S, 2.0 * interval_s):
         log = analysis.flight.log
         spans = _gap_spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else ()
         # KF needs IMU and attitude, so without an IMU gap the attitude has a gap

@@ -13,7 +13,8 @@ from px4fuse.core.record import Record, Span, read_toml
 from px4fuse.core.text import capitalise_first
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import SEVERITIES, Finding, Severity
-from px4fuse.flight.model import PositionKind, PositionTrack
+from px4fuse.flight.ekf2_parameters import MAG, NO_MAGNETOMETER
+from px4fuse.flight.model import Flight, PositionKind, PositionTrack
 
 
 class CatalogueEntry(Record):
@@ -104,6 +105,13 @@ def source_words(source: PositionTrack) -> SourceWords:
     return SOURCE_WORDS[source.origin.kind]
 
 
+def magnetometer_advice(flight: Flight) -> str:
+    """Return the action for a wrong magnetic heading; empty if EKF2 uses no magnetometer."""
+    if flight.log.parameters.get(MAG.switch) == NO_MAGNETOMETER:
+        return ""
+    return "Calibrate the magnetometer away from metal and motors."
+
+
 Findings = Iterator[Finding]
 
 
@@ -167,5 +175,7 @@ def spans_with_value(value: float, step_function: pd.Series, segment: Segment) -
 
 def fraction_of_ones(step_function: pd.Series, segment: Segment) -> float:
     """Return the fraction of the time in a segment at which a flag (0 or 1) is 1."""
-    ones_s = sum(end - start for start, end in spans_with_value(1.0, step_function, segment))
-    return ones_s / (segment.end_s - segment.start_s)
+    duration_of_ones_s = sum(
+        end - start for start, end in spans_with_value(1.0, step_function, segment)
+    )
+    return duration_of_ones_s / (segment.end_s - segment.start_s)

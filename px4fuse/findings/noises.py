@@ -311,7 +311,7 @@ def _variance_finding(
     ):
         severity, remedy_text, cause = "note", minimum_text, ELSEWHERE
     elif is_underconfident and any(
-        name_with_error == filter_name for name_with_error, *_ in find_hidden_errors(analysis)
+        filter_with_error == filter_name for filter_with_error, *_ in find_hidden_errors(analysis)
     ):
         remedy_text, cause = KEEP_NOISES_TRUTH, ELSEWHERE
     else:

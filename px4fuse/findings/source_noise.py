@@ -45,9 +45,11 @@ MIN_PART_NOISE_RATIO_ERROR = 4.0
 
 
 def detect(analysis: Analysis) -> Findings:
-    if analysis.source.orientation is not None or analysis.source.origin.reconstructed:
+    if analysis.source.origin.reconstructed:
         return
     yield from detect_repeated_positions(analysis)
+    if analysis.source.orientation is not None:
+        return
     yield from detect_time_correlated_noise(analysis)
     yield from detect_unequal_noise(analysis)
     yield from detect_noise_variation(analysis)

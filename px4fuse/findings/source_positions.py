@@ -148,8 +148,8 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
         return None
     clock, correlated_noise = analysis.clock, analysis.time_correlated_noise
     # At a high rate, the time offset (negative for a lag) is more accurate than the correlation
-    limit_s = -MAX_LAG_RATIO * clock.interval_s[0] if isinstance(clock, ClockOffset) else 0.0
-    if isinstance(clock, ClockOffset) and low_pass.lag_s > limit_s >= MIN_LAG_S:
+    lag_limit_s = -MAX_LAG_RATIO * clock.interval_s[0] if isinstance(clock, ClockOffset) else 0.0
+    if isinstance(clock, ClockOffset) and low_pass.lag_s > lag_limit_s >= MIN_LAG_S:
         low_pass = replace(low_pass, lag_s=-clock.offset_s)
     # A low-pass filter delays positions: correlated errors without lag have another cause
     if (
@@ -234,8 +234,10 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
     """Detect coordinates that never change, so that the source does not measure them."""
     source, parameter = analysis.source, EV_POS.switch
     names = constant_coordinates(source)
-    is_one = len(names) == 1
-    if not (is_one or is_height_only(source)) or (is_one and source.step_m > 0.0):
+    is_single_coordinate = len(names) == 1
+    if not (is_single_coordinate or is_height_only(source)) or (
+        is_single_coordinate and source.step_m > 0.0
+    ):
         return  # rounded positions may stay within one step
     values_m = dict(zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True))
     name, bit, make_finding = "source_coordinate_constant", HORIZONTAL_CONTROL, error
@@ -257,13 +259,13 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
             make_finding = note
         action += f", so that EKF2 does not fuse {listed_names}. "
     subject = f"coordinate {listed_names} of {source.name} is"
-    if not is_one:
+    if not is_single_coordinate:
         subject = f"coordinates {listed_names} of {source.name} are"
     values_text = ", ".join(f"{values_m[each]:g}" for each in names)
     yield make_finding(
         name,
         f"The {subject} constant ({values_text} m): the source does not measure "
-        f"{'it' if is_one else 'them'}. {consequence}",
+        f"{'it' if is_single_coordinate else 'them'}. {consequence}",
         f"{action}Send NaN for a coordinate that is not measured.",
         {f"{each}_m": value for each, value in values_m.items()},
     )
@@ -301,14 +303,14 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
             f"{np.median(jump_to_reset_s):.1f} s later."
         )
     listed_times = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
-    is_return = np.sum(steps_m[1:] * steps_m[:-1], axis=1) < 0.0
+    is_reversal = np.sum(steps_m[1:] * steps_m[:-1], axis=1) < 0.0
     counter_text = "and its reset_counter increases at each jump"
     cause_sentence = "The source (VIO or SLAM) drifts and corrects its drift."
     if not is_announced:
         counter_text = "without a change of its reset_counter"
         cause_sentence = f"Possible causes: {source_words(analysis.source).jump}."
     action = "Improve the tracking of the source, or correct the drift in smaller steps."
-    if is_return.mean() >= MIN_RETURN_FRACTION:
+    if is_reversal.mean() >= MIN_RETURN_FRACTION:
         cause_sentence = (
             "The source alternately sends the positions of two points, "
             f"{np.median(sizes_m):.2f} m apart."

@@ -45,8 +45,8 @@ MIN_CONSISTENT_FRACTION = 0.95
 MIN_BURST_SIZE = 2.5
 # Minimum number of bursts: fewer pauses are gaps in the position source
 MIN_BURST_COUNT = 20
-# Maximum ratio of the interval within bursts of positions to the pause between bursts
-MAX_BURST_INTERVAL_RATIO = 0.1
+# Maximum ratio of the duration of a burst to the pause between bursts
+MAX_BURST_DURATION_RATIO = 0.3
 ANSWER_TIMESYNC = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
     "every request). Send positions only after 500 answers, which take 50 s at 10 Hz."
@@ -86,13 +86,11 @@ def detect_bursts(analysis: Analysis) -> Findings:
     """Detect timestamps in bursts: arrival times of positions that wait for each other."""
     intervals_s = np.diff(analysis.source.samples.index.to_numpy())
     is_pause = intervals_s > intervals_s.mean()
-    if not is_pause.any() or (burst_size := 1.0 / float(is_pause.mean())) < MIN_BURST_SIZE:
+    if np.count_nonzero(is_pause) < MIN_BURST_COUNT:
         return
-    pause_s = float(np.median(intervals_s[is_pause]))
-    if (
-        is_pause.sum() < MIN_BURST_COUNT
-        or np.median(intervals_s[~is_pause]) > MAX_BURST_INTERVAL_RATIO * pause_s
-    ):
+    burst_size, pause_s = 1.0 / float(is_pause.mean()), float(np.median(intervals_s[is_pause]))
+    burst_s = burst_size * float(np.median(intervals_s[~is_pause]))
+    if burst_size < MIN_BURST_SIZE or burst_s > MAX_BURST_DURATION_RATIO * pause_s:
         return
     yield error(
         "source_timestamp_jitter",

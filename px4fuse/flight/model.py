@@ -289,7 +289,7 @@ class LogInfo(Record, omit_defaults=False):
         return self.autopilot != "ArduPilot"
 
 
-AxisName = Literal["north", "east", "down"]
+NedAxis = Literal["north", "east", "down"]
 TableOrUnavailable = pd.DataFrame | Unavailable
 # Step functions of flight time by name: values are valid until the next index
 StepFunctions: TypeAlias = "Mapping[str, pd.Series[float]]"
@@ -313,7 +313,7 @@ MAX_UWB_RATE_HZ = 25.0
 # Minimum time (s) on the ground between two flights: the land detector may report short landings
 MIN_LANDED_S = 5.0
 BODY_AXES = ("forward", "right", "down")
-AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
+AXIS_NAMES: tuple[NedAxis, NedAxis, NedAxis] = ("north", "east", "down")
 SOURCE_NAMES: Mapping[PositionKind, str] = {
     "uwb": "UWB",
     "vio": "VIO",
@@ -653,7 +653,7 @@ class Ekf2:
     # Columns ``innovation_m`` (measurement minus prediction, opposite to PX4's sign),
     # ``innovation_variance_m2``, ``observation_variance_m2``, ``test_ratio``, ``fused`` and
     # ``rejected`` (1 or 0); NaN if not logged
-    innovations: Mapping[AxisName, TableOrUnavailable]
+    innovations: Mapping[NedAxis, TableOrUnavailable]
     innovation_topics: tuple[str, ...]
     # 1 while EKF2 reports fusion of the external vision components ``horizontal``, ``vertical`` and
     # ``yaw``
@@ -771,6 +771,16 @@ def time_index(time_s: NDArray[Any]) -> pd.Index[float]:
     """Return times (s) as the index "time_s" of a DataFrame."""
     index: pd.Index[float] = pd.Index(time_s, name="time_s")
     return index
+
+
+def rows_between(samples: pd.DataFrame, start_s: float, end_s: float) -> pd.DataFrame:
+    """Return the rows from ``start_s`` to ``end_s`` of a table that is indexed by time (s).
+
+    ``samples.loc[start_s:end_s]`` would build a hash table of all times, as large as four columns.
+    """
+    time_s = samples.index.to_numpy()
+    first_row = int(np.searchsorted(time_s, start_s))
+    return samples.iloc[first_row : int(np.searchsorted(time_s, end_s, side="right"))]
 
 
 def sample_rate(samples: pd.DataFrame) -> float:

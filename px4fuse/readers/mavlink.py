@@ -220,8 +220,10 @@ def _variance_from_accuracy(recording: Recording) -> pd.DataFrame:
     (``get_ekf_lpos_accuracy``).
     """
     accuracy = recording.read(messages.MESSAGE_LAYOUTS["accuracy"])
-    horizontal_m2 = accuracy["horizontal_m"] ** 2 / 2.0
-    variance = pd.concat([horizontal_m2, horizontal_m2, accuracy["vertical_m"] ** 2], axis=1)
+    horizontal_variance_m2 = accuracy["horizontal_m"] ** 2 / 2.0
+    variance = pd.concat(
+        [horizontal_variance_m2, horizontal_variance_m2, accuracy["vertical_m"] ** 2], axis=1
+    )
     variance = variance[(variance > 0.0).all(axis=1)].set_axis(Columns.POSITION_VARIANCE, axis=1)
     return variance.reindex(columns=VARIANCE_COLUMNS)
 

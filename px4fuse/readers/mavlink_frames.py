@@ -61,7 +61,7 @@ _BYTE_CHECKSUMS = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], d
 
 
 @dataclass(frozen=True)
-class Frames:
+class MavlinkFrames:
     """MAVLink frames of one recording with valid checksums, in file order."""
 
     name: str
@@ -144,7 +144,7 @@ def wire_layout(message_id: int) -> np.dtype[Any]:
     return np.dtype(fields)
 
 
-def read_frames(name: str, content: bytes) -> Frames:
+def read_frames(name: str, content: bytes) -> MavlinkFrames:
     """Find all frames with valid checksums in a ``.tlog`` or a raw stream.
 
     Raises
@@ -178,7 +178,7 @@ def read_frames(name: str, content: bytes) -> Frames:
         if receive_time_bytes
         else (None, 0)
     )
-    return Frames(
+    return MavlinkFrames(
         name=name,
         content=content,
         sha256=hashlib.sha256(content).hexdigest(),

@@ -21,7 +21,7 @@ from px4fuse.readers.mavlink_clocks import (
 from px4fuse.readers.mavlink_frames import (
     MAX_FRAME_BYTES,
     Address,
-    Frames,
+    MavlinkFrames,
     message_name,
     wire_layout,
 )
@@ -47,11 +47,11 @@ MAX_STRAY_BYTE_FRACTION = 0.002
 MIN_CONSTANT_TIMESTAMPS = 10
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)  # filled while the data are read
 class Recording:
     """MAVLink recording of one flight, with the relation of receive time to the boot clock."""
 
-    frames: Frames
+    frames: MavlinkFrames
     # Address of the autopilot of this flight
     address: Address
     # Analysed frames: the longest part of the recording between two restarts of the autopilot
@@ -202,7 +202,7 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     return ned_samples
 
 
-def _read_boot_times(frames: Frames, address: Address) -> tuple[IntArray, Array]:
+def _read_boot_times(frames: MavlinkFrames, address: Address) -> tuple[IntArray, Array]:
     """Return the indices of the autopilot's frames with a time since boot, and these times (s)."""
     is_from_autopilot = frames.sent_by(address)
     all_rows = [np.zeros(0, dtype=np.intp)]
@@ -230,7 +230,7 @@ def _read_boot_times(frames: Frames, address: Address) -> tuple[IntArray, Array]
     return rows[order], times_s[order]
 
 
-def read_recording(frames: Frames, address: Address) -> Recording:
+def read_recording(frames: MavlinkFrames, address: Address) -> Recording:
     """Choose the longest time span between two restarts, and relate receive time to boot time."""
     notes: list[str] = []
     rows, boot_s = _read_boot_times(frames, address)

@@ -16,7 +16,7 @@ from px4fuse.readers.mavlink_clocks import (
     is_running_clock,
     map_clock,
 )
-from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, Address, Frames, Int64Array
+from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, Address, Int64Array, MavlinkFrames
 from px4fuse.readers.mavlink_recording import MIN_RESTART_STEP_S, Recording, map_boot_to_unix
 
 # Maximum number of senders that are read; senders with more messages are preferred
@@ -30,19 +30,19 @@ MAX_LATE_MESSAGES = 16
 MAX_SAME_CLOCK_DISTANCE_S = 1e5
 
 
-def _read_vehicle_types(frames: Frames) -> dict[Address, tuple[int, int]]:
+def _read_vehicle_types(frames: MavlinkFrames) -> dict[Address, tuple[int, int]]:
     rows = frames.rows("HEARTBEAT")
     heartbeats = frames.table("HEARTBEAT", rows)
     type_pairs = zip(heartbeats["type"].tolist(), heartbeats["autopilot"].tolist(), strict=True)
     return dict([*zip(_read_addresses(frames, rows), type_pairs, strict=True)][::-1])
 
 
-def _read_addresses(frames: Frames, rows: IntArray | slice) -> Iterator[Address]:
+def _read_addresses(frames: MavlinkFrames, rows: IntArray | slice) -> Iterator[Address]:
     return zip(frames.system[rows].tolist(), frames.component[rows].tolist(), strict=True)
 
 
 def _count_frames(
-    frames: Frames, rows: IntArray | slice = slice(None)
+    frames: MavlinkFrames, rows: IntArray | slice = slice(None)
 ) -> list[tuple[Address, int]]:
     """Count frames by sender, most frames first."""
     counts = Counter(_read_addresses(frames, rows))
@@ -53,7 +53,7 @@ def _is_vehicle(vehicle_type: int, autopilot: int) -> bool:
     return autopilot != messages.INVALID_AUTOPILOT and vehicle_type != messages.GROUND_STATION_TYPE
 
 
-def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
+def choose_autopilot(frames: MavlinkFrames, system: int | None) -> tuple[Address, str]:
     """Return the address of an autopilot, and its type: "PX4", "ArduPilot" or another.
 
     ``system`` is its MAVLink system id; None selects the autopilot with the most messages.
@@ -234,7 +234,7 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
     return tuple(sender_descriptions)
 
 
-def _lost_fraction(frames: Frames, address: Address) -> float | None:
+def _lost_fraction(frames: MavlinkFrames, address: Address) -> float | None:
     """Return the fraction of a sender's messages that are lost, from gaps in the sequence numbers.
 
     Return None if the sender does not count its messages, or counts them separately on two links.

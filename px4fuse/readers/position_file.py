@@ -78,7 +78,7 @@ class PositionRecording:
     samples: pd.DataFrame
     # "UNIX" if the timestamps are between 2000 and 2100
     clock: Literal["UNIX", "local"]
-    # Possible coordinate frames by column names and format; empty if all are possible
+    # Coordinate frames that column names and format allow; empty if all are possible
     frames: tuple[str, ...]
     # Sentences about the detected format, such as unit or frame
     detected: tuple[str, ...]

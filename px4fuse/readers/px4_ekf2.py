@@ -203,7 +203,7 @@ def configured_step_s(topics: Topics) -> float:
 
 
 def _prediction_interval_s(topics: Topics) -> float:
-    """Return EKF2's prediction interval (s): whole IMU intervals (ImuDownSampler.cpp)."""
+    """Return EKF2's prediction interval (s), a multiple of the IMU interval (ImuDownSampler)."""
     configured_s = configured_step_s(topics)
     imu_s = topics.read(Layout(px4.IMU.topic, {"time": "timestamp"})).index.to_numpy()
     if len(imu_s) < 2 or (interval_s := median_interval(imu_s)) >= configured_s:
@@ -216,10 +216,14 @@ def _prediction_interval_s(topics: Topics) -> float:
 
 
 def rows_of_timestamps(times_s: Array, wanted_times_s: ArrayLike) -> IntArray:
-    """Return the indices of the elements of ``times_s`` that are, in µs, in ``wanted_times_s``."""
-    return np.flatnonzero(
-        np.isin(np.rint(times_s * 1e6), np.rint(np.asarray(wanted_times_s, dtype=float) * 1e6))
+    """Return the indices of the increasing ``times_s`` in ``wanted_times_s``, compared in µs."""
+    times_us, wanted_us = (
+        np.rint(np.asarray(times, float) * 1e6) for times in (times_s, wanted_times_s)
     )
+    rows = np.searchsorted(times_us, wanted_us)
+    is_inside = rows < len(times_us)
+    rows, wanted_us = rows[is_inside], wanted_us[is_inside]
+    return np.unique(rows[times_us[rows] == wanted_us])
 
 
 def samples_per_step(
@@ -429,7 +433,7 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     sample_count = np.rint((times_s[used_rows] - times_s[used_rows - 1]) / interval_s)
     filter_memory = ((1.0 - FLOW_FILTER_WEIGHT) ** sample_count)[:, None]
     filtered_velocity = flow_velocity[["forward_m_s", "right_m_s"]].to_numpy()
-    forward, right = (
+    forward_m_s, right_m_s = (
         (filtered_velocity[used_rows] - filter_memory * filtered_velocity[used_rows - 1])
         / (1.0 - filter_memory)
     ).T
@@ -443,8 +447,8 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     ).sum(axis=1)
     flow = pd.DataFrame(
         {
-            "forward_m_s": forward,
-            "right_m_s": right,
+            "forward_m_s": forward_m_s,
+            "right_m_s": right_m_s,
             "samples": sample_count,
             "interval_s": interval_s,
             "noise_m2_s2": squared_range

@@ -106,13 +106,15 @@ def reconstruct_fixes(
     # An innovation belongs to the last fix before it. This fix came a whole number of receiver
     # intervals after the last logged fix, 0 if the fix itself is logged
     previous_fix_index = np.searchsorted(logged_fix_s, fused_s) - 1
-    intervals_passed = (fused_s - logged_fix_s[previous_fix_index]) / receiver_interval_s
+    elapsed_intervals = (fused_s - logged_fix_s[previous_fix_index]) / receiver_interval_s
     is_between_fixes = (previous_fix_index >= 0) & (previous_fix_index < len(logged_fix_s) - 1)
     # Skip innovations within one EKF2 step after a fix: they may also belong to the fix before
-    is_unambiguous = is_between_fixes & (intervals_passed % 1.0 > ekf2.step_s / receiver_interval_s)
+    is_unambiguous = is_between_fixes & (
+        elapsed_intervals % 1.0 > ekf2.step_s / receiver_interval_s
+    )
     previous_fix_index = previous_fix_index[is_unambiguous]
-    intervals_passed = np.floor(intervals_passed[is_unambiguous])
-    reconstructed_fix_s = logged_fix_s[previous_fix_index] + intervals_passed * receiver_interval_s
+    elapsed_intervals = np.floor(elapsed_intervals[is_unambiguous])
+    reconstructed_fix_s = logged_fix_s[previous_fix_index] + elapsed_intervals * receiver_interval_s
     reconstructed_fixes = pd.DataFrame(
         {
             column: interpolate_inside(
@@ -123,7 +125,7 @@ def reconstruct_fixes(
         },
         index=time_index(reconstructed_fix_s),
     )
-    is_logged = intervals_passed == 0.0
+    is_logged = elapsed_intervals == 0.0
     position_error = (
         reconstructed_fixes - fixes[reconstructed_fixes.columns].to_numpy()[previous_fix_index]
     )

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETER_TABLES
-from px4fuse.flight.model import AXIS_NAMES, AidLog, AxisName, Ekf2, TableOrUnavailable, Unavailable
+from px4fuse.flight.model import AXIS_NAMES, AidLog, Ekf2, NedAxis, TableOrUnavailable, Unavailable
 
-Innovations = dict[AxisName, TableOrUnavailable]
+Innovations = dict[NedAxis, TableOrUnavailable]
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def innovations_by_axis(
     return innovations, tuple(used_topics)
 
 
-def innovations_along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
+def innovations_along(log: AidLog, axis: NedAxis, gate: float) -> pd.DataFrame:
     """Return the innovations of an aiding source along one axis which EKF2 fused or rejected.
 
     EKF2 rejects a sample along all axes if one axis exceeds the ``gate`` (√S).

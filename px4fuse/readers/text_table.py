@@ -20,11 +20,13 @@ _FORMATS = read_toml(__file__, dict[str, list[dict[str, Any]]], "formats.toml")
 STREAM_FORMATS = _FORMATS["streams"]
 
 
-def refuse_foreign_format(path: Path, head: bytes, error_type: type[Px4FuseError]) -> None:
+def refuse_foreign_format(path: Path, first_bytes: bytes, error_type: type[Px4FuseError]) -> None:
     """Raise an error with the name of the file format if px4fuse does not support it."""
     name = display_name(path)
     for foreign_format in _FORMATS["foreign"]:
-        if any(head.startswith(start.encode("latin-1")) for start in foreign_format["starts"]):
+        if any(
+            first_bytes.startswith(start.encode("latin-1")) for start in foreign_format["starts"]
+        ):
             remedy = foreign_format["remedy"].format(name=name)
             raise error_type(f"{name}: the file is {foreign_format['name']}", remedy)
 
@@ -79,7 +81,7 @@ def line_error(name: str, line_number: int, fault: str, remedy: str) -> Trajecto
     return TrajectoryError(f"{name}, line {line_number}: {fault}. {remedy}")
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)  # filled while the data are read
 class Rows:
     """Rows of a text table, with the line number of each row for error messages.
 

@@ -24,7 +24,7 @@ from px4fuse.readers.ulog_topics import Topics, dropped_notes, longest_increasin
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
 # IMU samples are missing if the interval (s) between two samples is longer; normal are 4 ms
-MIN_IMU_GAP_S = 0.2
+MIN_MISSING_IMU_S = 0.2
 # Minimum and maximum valid UTC (UNIX time, s) of a GNSS receiver: GPS_EPOCH_SECS of PX4
 # (gps_helper.h), and the year 2100
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
@@ -95,7 +95,7 @@ def _describe_damage(
         missing_imu_s = duration_s
         if not isinstance(imu, Unavailable):
             steps_s = np.diff(imu.index.to_numpy())
-            missing_imu_s = float(steps_s[steps_s > MIN_IMU_GAP_S].sum())
+            missing_imu_s = float(steps_s[steps_s > MIN_MISSING_IMU_S].sum())
         damage_sentences.append(
             f"the file is damaged: {missing_imu_s:.1f} s of {duration_s:.1f} s of IMU data are "
             "missing"

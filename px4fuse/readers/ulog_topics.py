@@ -30,7 +30,14 @@ from px4fuse.flight.ekf2_parameters import (
     REPORTED_PARAMETERS,
     replace_invalid_parameters,
 )
-from px4fuse.flight.model import Dropout, LogInfo, ParameterChange, Stream, time_index
+from px4fuse.flight.model import (
+    Dropout,
+    LogInfo,
+    ParameterChange,
+    Stream,
+    rows_between,
+    time_index,
+)
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
 
@@ -56,9 +63,9 @@ MAX_FIELDS = 200_000
 HEADER_BYTES = 3
 
 # Samples of one topic instance: an array for each PX4 field
-Table = dict[str, NDArray[Any]]
+TopicArrays = dict[str, NDArray[Any]]
 # Tables by topic name and instance number
-Tables = dict[tuple[str, int], Table]
+Tables = dict[tuple[str, int], TopicArrays]
 # For each change of the primary EKF2 instance: time (s) and number of the new primary instance
 Instances = tuple[tuple[float, int], ...]
 # Without the selector topic there is one EKF2 instance
@@ -149,7 +156,7 @@ class _Reader(ULog):  # type: ignore[misc]
         return ULog._MessageAddLogged(data, header, formats)
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)  # filled while the data are read
 class Topics:
     """Decoded topics of one ULog, and its description."""
 
@@ -175,7 +182,7 @@ class Topics:
         """Return the instance numbers of a topic that contain samples, in ascending order."""
         return sorted(instance for name, instance in self.tables if name == topic)
 
-    def tables_of(self, topic: str) -> list[Table]:
+    def tables_of(self, topic: str) -> list[TopicArrays]:
         """Return the tables of all instances of a topic, in order of the instance number."""
         return [self.tables[topic, number] for number in self.instances(topic)]
 
@@ -238,7 +245,7 @@ class Topics:
         index = time_index((time_us[kept_rows] - self.zero_us) * _MICROSECOND_S)
         samples = pd.DataFrame(values.T, index, list(fields), copy=False)
         end_s = self.log.duration_s + MAX_OUTSIDE_S
-        return samples if step else samples.loc[-MAX_OUTSIDE_S:end_s]
+        return samples if step else rows_between(samples, -MAX_OUTSIDE_S, end_s)
 
     def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
         """Read the first layout whose required fields are in the log; empty without them."""
@@ -299,7 +306,7 @@ def _empty_frame(layout: Layout) -> pd.DataFrame:
     )
 
 
-def measurement_time_us(table: Table) -> NDArray[np.int64]:
+def measurement_time_us(table: TopicArrays) -> NDArray[np.int64]:
     """Return the measurement time since boot (µs) of each sample: ``timestamp_sample``.
 
     If it is missing or not boot time, return the publication time: ``timestamp``. In EKF2 topics,
@@ -467,7 +474,7 @@ def _read_tables(ulog: ULog) -> Tables:
     """
     tables: Tables = {}
     for subscription in ulog.data_list:
-        table: Table = subscription.data
+        table: TopicArrays = subscription.data
         if "timestamp" not in table:
             continue
         key = (subscription.name, subscription.multi_id)

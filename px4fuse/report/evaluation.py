@@ -14,7 +14,7 @@ from px4fuse.report.page import Page, two_columns
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Artist, Axes
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
-from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
+from px4fuse.trajectory.scores import RelativeError, RmseInterval, Statistics
 
 # Indices of the position axes that are drawn to the right and upwards on a map
 MAP_AXIS_INDICES: Mapping[Frame, tuple[int, int]] = {
@@ -145,7 +145,7 @@ def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) ->
 
 def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
     for index, (error, statistics) in enumerate(rpe_statistics := _rpe_statistics(evaluation)):
-        if isinstance(error.interval_m, Interval):
+        if isinstance(error.interval_m, RmseInterval):
             interval = error.interval_m.low, error.interval_m.high
             axes.plot([index] * 2, interval, color=KF_COLOUR, lw=1.6, solid_capstyle="butt")
         axes.plot(index, statistics.rmse, "D", color=EKF2_COLOUR, mec="black", mew=0.5, ms=3.6)
@@ -271,8 +271,8 @@ def rpe_growth_sentence(rpe: tuple[RelativeError, ...]) -> str:
     )
 
 
-def format_interval(interval: Interval | Unavailable) -> str:
-    return f"{interval.low:.3f}–{interval.high:.3f}" if isinstance(interval, Interval) else ""
+def format_interval(interval: RmseInterval | Unavailable) -> str:
+    return f"{interval.low:.3f}–{interval.high:.3f}" if isinstance(interval, RmseInterval) else ""
 
 
 def describe_track(track: Trajectory) -> str:

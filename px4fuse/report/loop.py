@@ -31,7 +31,7 @@ from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 from px4fuse.trajectory.graph.solver import MAX_ROBUST_CLOSURES, SOLUTIONS, Graph
 from px4fuse.trajectory.model import AXES_OF_FRAME, format_vector
-from px4fuse.trajectory.scores import Interval, Statistics
+from px4fuse.trajectory.scores import RmseInterval, Statistics
 
 LEAD_TEXT = (
     "The closure error is the distance between the end of the odometry and the true end. Each "
@@ -301,7 +301,7 @@ def missing_corrections(loop: Loop) -> list[str]:
     return list(reasons)
 
 
-def _format_error(errors_m: Statistics | Unavailable, interval: Interval | Unavailable) -> str:
+def _format_error(errors_m: Statistics | Unavailable, interval: RmseInterval | Unavailable) -> str:
     interval_text = format_interval(interval)
     return _format_rmse(errors_m) + (f" ({interval_text})" if interval_text else "")
 

@@ -23,7 +23,7 @@ from px4fuse.trajectory import scores
 from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit_alignment, umeyama
 from px4fuse.trajectory.association import Association, AssociationMethod, associate
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, cumulative_distance
-from px4fuse.trajectory.scores import Delta, Interval, RelativeError, Statistics
+from px4fuse.trajectory.scores import Delta, RelativeError, RmseInterval, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset, clock_difference, estimate_time_offset
 
 # Maximum rotation (rad) from the first orientation of a trajectory with constant orientation: files
@@ -164,7 +164,7 @@ class AbsoluteError(Record):
     """ATE of position (m), with the 95 % interval of its RMSE, and of orientation (degrees)."""
 
     translation_m: Statistics
-    interval_m: OrUnavailable[Interval]
+    interval_m: OrUnavailable[RmseInterval]
     rotation_deg: OrUnavailable[Statistics]
 
 

@@ -73,7 +73,7 @@ class Statistics(Record):
     max: float
 
 
-class Interval(Record):
+class RmseInterval(Record):
     """95 % interval of an RMSE by block bootstrap.
 
     Attributes
@@ -113,7 +113,7 @@ class RelativeError(Record):
     all_pairs: bool
     pairs_from: Literal["reference"]
     translation_m: OrUnavailable[Statistics]
-    interval_m: OrUnavailable[Interval]
+    interval_m: OrUnavailable[RmseInterval]
     rotation_deg: OrUnavailable[Statistics]
 
     @property
@@ -305,7 +305,7 @@ def get_rotations(
 
 def rmse_interval(
     errors: Array, analysis_name: str, *, min_block_length: int = 1
-) -> Interval | Unavailable:
+) -> RmseInterval | Unavailable:
     """Compute the 95 % interval of the RMSE of correlated errors by circular block bootstrap.
 
     The method is that of Politis & Romano (1992), with blocks of three integrated autocorrelation
@@ -342,7 +342,7 @@ def rmse_interval(
     low, high = np.sqrt(
         np.maximum(np.quantile(resampled_means, [tail_probability, 1.0 - tail_probability]), 0.0)
     )
-    return Interval(float(low), float(high), block_length, block_count)
+    return RmseInterval(float(low), float(high), block_length, block_count)
 
 
 def autocorrelation_time(values: Array) -> float:

@@ -63,7 +63,7 @@ TIMEOUT_S = 12.0
 # Maximum memory (bytes) for comparing two PDFs; the largest report needs 0.3 GB
 MAX_MEMORY_BYTES = 1_000_000_000
 MAX_LISTED_DIFFERENCES = 20
-SECOND_TABLE = "the file has a second cross-reference table"
+SECOND_TABLE_REASON = "the file has a second cross-reference table"
 # PDF dictionary keys that are not compared, because programs that save a PDF change them
 _COMPRESSION_KEYS = frozenset(("/Length", "/Filter"))
 _WRITER_KEYS = frozenset(("/Producer", "/CreationDate", "/ModDate"))
@@ -194,7 +194,7 @@ class _PdfComparison:
             yield from self._compare(*values, 0)
         # old programs (PDF 1.4) would use another cross-reference table than new ones
         if "/XRefStm" in submitted_pdf.trailer:
-            yield PageDifference(0, SECOND_TABLE, True)
+            yield PageDifference(0, SECOND_TABLE_REASON, True)
 
     def _compare(
         self, submitted_value: Any, redrawn_value: Any, key: str, page_number: int
@@ -377,7 +377,7 @@ def _find_ambiguities(pdf: bytes) -> Iterator[str]:
         # the position at the end of the file must be that of the first cross-reference table
         table_start = pdf.find(b"endobj") + len(b"endobj")
         if pdf[table_start : int(end_match[1])].strip():
-            yield SECOND_TABLE
+            yield SECOND_TABLE_REASON
 
 
 def _get_page_references(reader: pypdf.PdfReader) -> list[Any]:

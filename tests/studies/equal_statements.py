@@ -93,7 +93,7 @@ def flight_outputs(request: ComparisonRequest, flight: Flight | None = None) -> 
         "json": to_json_dict(build.results(request, analysis)),
         "parameters": {n: v for n, v in flight.log.parameters.items() if n in PARAMETERS},
     }
-    comparison = prepare_comparison(request, flight=flight)
+    comparison = prepare_comparison(flight, request)
     noises = estimate_noises(comparison)
     outputs["tune"] = phrases.tuning_advice(comparison, noises)
     outputs["tune_json"] = to_json_dict(build.tuning_results(request, comparison, noises))

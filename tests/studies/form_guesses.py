@@ -18,7 +18,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
-from px4fuse.classroom.assignment.figures import FAULTS, QUESTIONS
+from px4fuse.classroom.assignment.figures import FIGURE_FAULTS, QUESTIONS
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers
 from px4fuse.classroom.grading.form_points import accepted_corrections, form_points, panels_showing
@@ -52,7 +52,7 @@ def guess_choices(rng: np.random.Generator, one: RightFormAnswers) -> tuple[str,
     letters, count = [], len(QUESTIONS)
     for first in range(0, len(one.choices), count):
         guess = rng.choice(one.choices[first][0].options)
-        fault = next(each for each in FAULTS.values() if each.fault == guess)
+        fault = next(each for each in FIGURE_FAULTS.values() if each.fault == guess)
         for (choice, _), field in zip(one.choices[first : first + count], QUESTIONS, strict=True):
             letters.append(CHOICE_NAMES[choice.options.index(getattr(fault, field))])
     return tuple(letters)

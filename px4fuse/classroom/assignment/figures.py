@@ -49,7 +49,7 @@ class FigureFault(Record):
     option: str = ""
 
 
-FAULTS = read_toml(__file__, dict[str, FigureFault])
+FIGURE_FAULTS = read_toml(__file__, dict[str, FigureFault])
 
 
 def _shuffle(names: Iterable[str], prefix: str, random_number: Callable[[str], float]) -> list[str]:
@@ -58,7 +58,7 @@ def _shuffle(names: Iterable[str], prefix: str, random_number: Callable[[str], f
 
 def _select_kinds(random_number: Callable[[str], float]) -> dict[str, str]:
     """Select the injected fault of each figure at random; return the fault by figure title."""
-    kinds = _shuffle(FAULTS, "figures", random_number)[:FIGURE_COUNT]
+    kinds = _shuffle(FIGURE_FAULTS, "figures", random_number)[:FIGURE_COUNT]
     return {f"Figure {number}": kind for number, kind in enumerate(kinds, start=1)}
 
 
@@ -71,11 +71,11 @@ def select_choices(
     """
     choices = []
     for title, kind in _select_kinds(random_number).items():
-        other_kinds = _shuffle(FAULTS.keys() - {kind}, f"{title} other", random_number)
+        other_kinds = _shuffle(FIGURE_FAULTS.keys() - {kind}, f"{title} other", random_number)
         kinds = [kind, *other_kinds[: len(CHOICE_NAMES) - 1]]
         for field, question in QUESTIONS.items():
             shuffled_kinds = _shuffle(kinds, f"{title} {field}", random_number)
-            options = tuple(getattr(FAULTS[each], field) for each in shuffled_kinds)
+            options = tuple(getattr(FIGURE_FAULTS[each], field) for each in shuffled_kinds)
             right_letter = CHOICE_NAMES[shuffled_kinds.index(kind)]
             choices.append((Choice(f"{title}: {question}", options), right_letter))
     return tuple(choices)
@@ -92,7 +92,7 @@ def draw_figures(random_number: Callable[[str], float]) -> bytes:
         numbers = random_scenario_numbers("aisle", figure_random_number)
         seed = int(2**53 * figure_random_number("seed"))
         scenario = make_scenario("aisle", passes=PASS_COUNT, seed=seed, **numbers)
-        faults = parse_faults(tuple(filter(None, [FAULTS[kind].option])))
+        faults = parse_faults(tuple(filter(None, [FIGURE_FAULTS[kind].option])))
         comparisons[title] = compare_simulation(flights.simulate(scenario, faults))
     return _figures_png(comparisons)
 

@@ -71,7 +71,7 @@ def read_people(sheet: Sheet) -> tuple[Person, ...]:
     SettingsError
         No column identifies the students, or two rows have the same id.
     """
-    if all(sheet.column(titles) is None for titles in TITLES_BY_FIELD.values()):
+    if all(sheet.column_index(titles) is None for titles in TITLES_BY_FIELD.values()):
         raise SettingsError(
             f"{sheet.path}: no column identifies the student.",
             "Give one column the title id, email or name.",
@@ -132,7 +132,7 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
     numbers = {}
     if participant := re.search(r"\d+$", sheet.cell(row, ("identifier",))):
         numbers["moodle"] = participant[0]
-    if sheet.column(("sisuserid", "sisloginid")) is not None:
+    if sheet.column_index(("sisuserid", "sisloginid")) is not None:
         numbers |= {"canvas": number} if (number := sheet.cell(row, ("id",))) else {}
         cells["student_id"] = one_line(sheet.cell(row, ("sisuserid",)), MAX_NAME_LENGTH)
     student_id = cells["student_id"] or cells["login"] or cells["email"]

@@ -30,14 +30,14 @@ class Sheet:
     encoding: str = "utf-8"
     separator: str = ","
 
-    def column(self, titles: Sequence[str]) -> int | None:
+    def column_index(self, titles: Sequence[str]) -> int | None:
         """Return the index of the column with one of ``titles``, or None; earlier titles first."""
         plain_titles = [normalise_title(title) for title in self.column_titles]
         return next((plain_titles.index(title) for title in titles if title in plain_titles), None)
 
     def cell(self, row: Sequence[str], titles: Sequence[str]) -> str:
         """Return the cell in the column with one of ``titles``, or ""; earlier titles first."""
-        column_index = self.column(titles)
+        column_index = self.column_index(titles)
         return "" if column_index is None else row[column_index].strip()
 
     @property

@@ -37,7 +37,7 @@ from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 
 # Maximum relative error of the size of a fault in a student's answer
 SIZE_TOLERANCE = 0.15
-# Maximum error (m) of the loop closure error in a student's answer
+# Maximum deviation (m) of a student's loop closure error from the right value
 CLOSURE_TOLERANCE_M = 0.3
 # Minimum fraction of positions rejected by EKF2 for which the student must report rejections
 MIN_REJECTED_FRACTION = 0.005

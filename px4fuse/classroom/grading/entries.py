@@ -402,7 +402,7 @@ def read_overrides(path: Path) -> Overrides:
     if not path.exists():
         return {}
     sheet = read_sheet(path)
-    missing_titles = [title for title in OVERRIDE_TITLES if sheet.column((title,)) is None]
+    missing_titles = [title for title in OVERRIDE_TITLES if sheet.column_index((title,)) is None]
     if missing_titles:
         remedy = f"Required columns: {', '.join(OVERRIDE_TITLES)}."
         raise SettingsError(f"{path}: no column {', '.join(missing_titles)}.", remedy)

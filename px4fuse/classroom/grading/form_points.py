@@ -273,8 +273,8 @@ def size_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
     if fault.size is None or fault.low is None or fault.high is None or named_size is None:
         return 0.0
     if named_fault.kind != fault.kind:
-        first_units = [[*FAULT_KINDS[kind].units][:1] for kind in (named_fault.kind, fault.kind)]
-        is_right = fault.low <= named_size <= fault.high and first_units[0] == first_units[1]
+        units = [[*FAULT_KINDS[kind].units][:1] for kind in (named_fault.kind, fault.kind)]
+        is_right = fault.low <= named_size <= fault.high and units[0] == units[1]
         return is_right / 3.0
     deviation = abs(named_size - fault.size) / abs(fault.size)
     close_fraction = 0.5 * (deviation <= HALF_POINTS_FAULT_SIZE_TOLERANCE)

@@ -341,7 +341,7 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         for index, title in enumerate(sheet.column_titles)
         if not any(READ_ONLY_MARK in row[index] for row in sheet.rows[:3])
     }
-    grade_index = sheet.column(GRADE_TITLES)
+    grade_index = sheet.column_index(GRADE_TITLES)
     short_title_by_index = {
         index: _ASSIGNMENT_NUMBER.sub("", title) for index, title in title_by_index.items()
     }
@@ -355,7 +355,7 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
     ]
     candidate_indices = assignment_indices if grade_index is None else [grade_index]
     # a Moodle table has one grade column, so a --column without a match is for another table
-    if column_title and (matching_indices or sheet.column(("identifier",)) is None):
+    if column_title and (matching_indices or sheet.column_index(("identifier",)) is None):
         candidate_indices = matching_indices
     if len(candidate_indices) == 1:
         return candidate_indices[0]
@@ -399,9 +399,12 @@ def fill_grades(
     SettingsError
         No grade column was found, or several.
     """
-    grade_index, feedback_index = find_grade_column(sheet, column), sheet.column(COMMENT_TITLES)
+    grade_index, feedback_index = (
+        find_grade_column(sheet, column),
+        sheet.column_index(COMMENT_TITLES),
+    )
     format_feedback = (
-        neutralise_formulas if sheet.column(HTML_COMMENT_TITLES) is None else escape_html
+        neutralise_formulas if sheet.column_index(HTML_COMMENT_TITLES) is None else escape_html
     )
     cells_by_row = [list(row) for row in sheet.rows]
     names = [one_line(grade.student or grade.student_id, 40) for grade in grades]

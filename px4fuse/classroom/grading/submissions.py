@@ -289,7 +289,7 @@ def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
             resolved_path = file.resolve(strict=True)
             # only regular files: reading a named pipe would wait forever
             is_inside = resolved_path.is_relative_to(root) and resolved_path.is_file()
-        except (OSError, RuntimeError):  # symbolic link without target, or circular
+        except (OSError, RuntimeError):  # broken or circular symbolic link
             is_inside = False
         if is_inside:
             yield Submission(resolved_path, "", name.as_posix())
