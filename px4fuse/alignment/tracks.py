@@ -77,7 +77,7 @@ class SampledTrack:
     name: str = ""
 
     def to_complex_m(self) -> Complex:
-        """Return North + i·east, shape (n,)."""
+        """Return the horizontal positions as complex numbers north + i·east, shape (n,)."""
         return self.position_m[:, 0] + 1j * self.position_m[:, 1]
 
     def at(self, time_s: Array) -> tuple[Array, BoolArray]:
