@@ -318,7 +318,8 @@ TESTED_ELSEWHERE = {
     "source_positions_rounded", "source_lever_arm", "source_timestamp_unit",
     "source_timestamps_shared", "source_position_held", "source_zero_positions",
     "source_without_position", "ekf2_bias_at_limit", "ekf2_not_aligned", "gyroscope_bias",
-    "parameter_changed", "source_coordinate_constant", "source_relocalises",
+    "parameter_changed", "source_coordinate_constant", "source_height_constant",
+    "source_relocalises",
 }  # fmt: skip
 # Second finding of severity error that the fault causes
 ALSO_ERROR = {
@@ -357,7 +358,7 @@ PRECONDITIONS: list[tuple[str, Callable[[Comparison, Finding], bool]]] = [
     ("[Aa]ntenna|receiver|sky|RTK", lambda made, _: made.source.origin.is_gnss),
     ("EKF2_DELAY_MAX", lambda made, _: "EKF2_DELAY_MAX" in made.flight.log.parameters),
     ("EKF2_EV_CTRL bit 3", lambda made, _: made.source.origin.is_vision),
-    ("EKF2_EV_NOISE_MD", lambda made, _: "EKF2_EV_NOISE_MD" in made.flight.log.parameters),
+    ("EKF2_EV_NOISE_MD", lambda made, _: made.source.origin.is_vision),
     (
         "sent|sending|[Ss]end (the|each|a|one|raw|nothing|NaN)",
         lambda made, _: not made.source.origin.is_gnss,
