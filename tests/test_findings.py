@@ -318,8 +318,7 @@ TESTED_ELSEWHERE = {
     "source_positions_rounded", "source_lever_arm", "source_timestamp_unit",
     "source_timestamps_shared", "source_position_held", "source_zero_positions",
     "source_without_position", "ekf2_bias_at_limit", "ekf2_not_aligned", "gyroscope_bias",
-    "parameter_changed", "source_coordinate_constant", "source_height_constant",
-    "source_relocalises",
+    "parameter_changed", "source_coordinate_constant", "source_relocalises",
 }  # fmt: skip
 # Second finding of severity error that the fault causes
 ALSO_ERROR = {
