@@ -17,7 +17,7 @@ from px4fuse.findings.model import (
     magnetometer_advice,
     spans_with_value,
 )
-from px4fuse.flight.ekf2_parameters import BAROMETER, MAG
+from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, MAG, YAW_CONTROL_BIT
 from px4fuse.flight.model import (
     BODY_AXES,
     Columns,
@@ -209,9 +209,13 @@ def _align_heading_action(flight: Flight, source: PositionTrack | None) -> str:
     """Return the action for a heading that EKF2 did not align, by the sensors of the vehicle."""
     action = magnetometer_advice(flight) or f"Enable the magnetometer ({MAG.switch} 0)."
     if source is not None and source.origin.is_vision:
-        has_yaw = source.orientation is not None
-        action += (
-            f" Alternatively, {'' if has_yaw else 'send the orientation of the source, and '}let "
-            "EKF2 fuse the yaw of the source."
-        )
+        alternative = "let EKF2 fuse the yaw of the source"
+        if source.orientation is None:
+            alternative = f"send the orientation of the source, and {alternative}"
+            if int(flight.log.parameters.get(EV_POS.switch, 0)) & YAW_CONTROL_BIT:
+                alternative = (
+                    f"send the orientation of the source: {EV_POS.switch} bit 3 is set, but the "
+                    "orientation is missing or constant"
+                )
+        action += f" Alternatively, {alternative}."
     return action
