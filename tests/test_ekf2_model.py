@@ -42,8 +42,9 @@ def test_ekf2_model_transition_equals_product_of_step_matrices(model: Model) -> 
     end = made.events.end_step
     starts = np.concatenate([[0], end[:-1]])
     gyro, force = (model.inputs.settings[f"EKF2_{name}_NOISE"] for name in ("GYR", "ACC"))
-    noise = np.zeros_like(made.transition)
-    noise[:, :9, :9] = gyro**2 * made.gyro_noise + force**2 * made.accelerometer_noise
+    transition, correction_input, acceleration_input, gyro_noise, force_noise = made.dynamics()
+    noise = np.zeros_like(transition)
+    noise[:, :9, :9] = gyro**2 * gyro_noise + force**2 * force_noise
     for at in (0, 1, 57, 300, len(end) - 1):
         F, Q = np.eye(15), np.zeros((15, 15))
         x = x0 = np.random.default_rng(at).normal(0.0, 0.01, 15)
@@ -52,8 +53,8 @@ def test_ekf2_model_transition_equals_product_of_step_matrices(model: Model) -> 
             old = step_matrix(segment, k, trapezoid=False)
             Q = old @ Q @ old.T + step_noise(segment, k, gyro, force)
             x = step_state(segment, k, x)
-        assert made.transition[at] == pytest.approx(F, abs=1e-12)
-        moved = made.transition[at] @ x0 + made.correction_input[at] + made.acceleration_input[at]
+        assert transition[at] == pytest.approx(F, abs=1e-12)
+        moved = transition[at] @ x0 + correction_input[at] + acceleration_input[at]
         assert moved == pytest.approx(x, abs=1e-12)
         # closed forms assume equal steps and a mean force; the real ones vary
         part = slice(0, 9)
@@ -111,9 +112,9 @@ def test_ekf2_replay_of_several_settings_equals_separate_runs(model: Model) -> N
         {"EKF2_EVP_NOISE": 0.02}, {"EKF2_EV_DELAY": 80.0},
         {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_DELAY": 40.0, "EKF2_EVP_GATE": 2.0}, {},
     ]  # fmt: skip
-    together = replay_settings(model, settings)
+    together = list(replay_settings(model, settings))
     for change, found in zip(settings, together, strict=True):
-        alone = replay_settings(model, [change])[0]
+        (alone,) = replay_settings(model, [change])
         for part in ("updates", "delayed", "published"):
             joint, separate = getattr(found, part), getattr(alone, part)
             pd.testing.assert_frame_equal(joint, separate, rtol=0.0, atol=1e-9)
@@ -131,7 +132,7 @@ def test_ekf2_replay_counts_late_and_lost_vision_samples(model: Model) -> None:
     def arriving(after_s: float, **settings: float) -> Any:
         slow = replace(vision, arrival_s=vision.timestamp_s + after_s)
         made = replace(model, inputs=replace(model.inputs, received=slow))
-        return replay_settings(made, [{"EKF2_EV_DELAY": 1.0, **settings}])[0]
+        return next(replay_settings(made, [{"EKF2_EV_DELAY": 1.0, **settings}]))
 
     in_time, late, lost = (arriving(after_s) for after_s in (0.20, 0.28, 0.36))
     assert (in_time.late, in_time.lost) == (0, 0)

@@ -48,7 +48,7 @@ from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 
 # Minimum state variance, to avoid a division by zero
 MIN_STATE_VARIANCE = 1e-30
-# Number of events whose transition matrices are copied at once, which limits memory
+# Number of events whose transition matrices are computed at once, which limits memory
 EVENT_BATCH_SIZE = 64
 # Measurement variance (m² or rad²) of a measurement without effect
 IGNORED_VARIANCE = 1e9
@@ -242,13 +242,10 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         else slice(None)
     )
 
-    def stack_configurations(name: str, rows: slice = slice(None)) -> Any:
-        interval_quantities = [
-            getattr(interval_arrays, name)[rows] for interval_arrays in distinct_intervals
-        ]
+    def stack_configurations(interval_quantities: Sequence[Any]) -> Any:
         return np.stack(interval_quantities, axis=1)[:, configuration_intervals]
 
-    event_table = stack_configurations("events")
+    event_table = stack_configurations([each.events for each in distinct_intervals])
     action = np.where(has_gate, event_table["action"], FUSE * event_table["usable"])
     event_steps = event_table["end_step"]
     is_active = action > IDLE
@@ -289,11 +286,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             means_by_interval = [
                 mean_by_event(segment, samples, end_steps) for end_steps in event_step_arrays
             ]
-            stacked_means = (
-                np.stack(quantities, axis=1)[:, configuration_intervals]
-                for quantities in zip(*means_by_interval, strict=True)
-            )
-            mean = EventSamples(*stacked_means)
+            mean = EventSamples(*map(stack_configurations, zip(*means_by_interval, strict=True)))
             if aid == MAG:
                 R = np.maximum(parameters[MAG.noise], MIN_SIGMA_GAUSS) ** 2
                 mean = mean._replace(noise=mean.noise + R)
@@ -402,15 +395,15 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         reset_states.append((VELOCITY, VELOCITY_COLUMNS, 1.0))
     for e in range(event_count):
         batch_index = e % EVENT_BATCH_SIZE
-        if not batch_index:  # copy the arrays of a few events at a time, to limit memory
+        if not batch_index:  # compute the arrays of a few events at a time, to limit memory
             event_batch = slice(e, e + EVENT_BATCH_SIZE)
-            transition = stack_configurations("transition", event_batch)
-            state_input = stack_configurations("acceleration_input", event_batch) + has_attitude[
-                :, None
-            ] * stack_configurations("correction_input", event_batch)
-            added_noise = gyro_variance * stack_configurations("gyro_noise", event_batch)
-            accelerometer_noise = stack_configurations("accelerometer_noise", event_batch)
-            added_noise = added_noise + acceleration_variance[event_batch] * accelerometer_noise
+            dynamics = [each.dynamics(event_batch) for each in distinct_intervals]
+            transition, correction_input, acceleration_input, gyro_noise, accelerometer_noise = map(
+                stack_configurations, zip(*dynamics, strict=True)
+            )
+            state_input = acceleration_input + has_attitude[:, None] * correction_input
+            added_noise = gyro_variance * gyro_noise
+            added_noise += acceleration_variance[event_batch] * accelerometer_noise
             variance_growth = variance_increment * step_counts[event_batch]
         phi = transition[batch_index]
         # x = Φx + u, P = ΦPΦ' + Q

@@ -70,19 +70,39 @@ class Intervals:
     ----------
     events : recarray, shape (E,)
         Event at the end of each interval, see :data:`EVENT`.
-    transition : ndarray, shape (E, 15, 15)
-    correction_input, acceleration_input : ndarray, shape (E, 15)
-        State changes due to the correction of the nominal attitude, and to the acceleration.
-    gyro_noise, accelerometer_noise : ndarray, shape (E, 9, 9)
-        Process noise for a sensor noise of 1 rad/s or 1 m/s².
+    step_counts, duration_s : ndarray, shape (E,)
+    sensitivities : ndarray, shape (E, 9, SENSITIVITY_COLUMN_COUNT)
+        Sensitivities of attitude, velocity and position at the end of each interval.
     """
 
     events: Events
-    transition: Array
-    correction_input: Array
-    acceleration_input: Array
-    gyro_noise: Array
-    accelerometer_noise: Array
+    step_counts: Array
+    duration_s: Array
+    sensitivities: Array
+
+    def dynamics(self, rows: slice = slice(None)) -> tuple[Array, Array, Array, Array, Array]:
+        """Return the arrays of the prediction over m intervals; computed on demand to save memory.
+
+        Returns
+        -------
+        transition : ndarray, shape (m, 15, 15)
+        correction_input, acceleration_input : ndarray, shape (m, 15)
+            State changes due to the correction of the nominal attitude, and to the acceleration.
+        gyro_noise, accelerometer_noise : ndarray, shape (m, 9, 9)
+            Process noise for a sensor noise of 1 rad/s or 1 m/s².
+        """
+        duration_s, sensitivities = self.duration_s[rows], self.sensitivities[rows]
+        transition = np.tile(np.eye(STATE_COUNT), (len(duration_s), 1, 1))
+        correction_input, acceleration_input = np.zeros((2, len(duration_s), STATE_COUNT))
+        transition[:, :IMU_STATE_COUNT, THETA] = sensitivities[..., :3]
+        transition[:, :IMU_STATE_COUNT, BIASES] = sensitivities[..., 3:9]
+        correction_input[:, :IMU_STATE_COUNT] = sensitivities[..., CORRECTION_COLUMN]
+        acceleration_input[:, :IMU_STATE_COUNT] = sensitivities[..., INPUT_COLUMN]
+        transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
+        noise = _imu_noise_by_interval(
+            self.step_counts[rows], duration_s, transition[:, VELOCITY, THETA]
+        )
+        return transition, correction_input, acceleration_input, *noise
 
 
 @dataclass(frozen=True)
@@ -98,20 +118,12 @@ def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> In
     events = _make_events(inputs, segment, timing)
     start_steps = np.append(0, events.end_step[:-1])
     end_steps = events.end_step
-    event_count = len(end_steps)
-    duration_s = segment.time_s[end_steps] - segment.time_s[start_steps]
-    transition = np.tile(np.eye(STATE_COUNT), (event_count, 1, 1))
-    correction_input, acceleration_input = np.zeros((2, event_count, STATE_COUNT))
-    sensitivities = _state_sensitivities(segment, start_steps, end_steps)
-    transition[:, :IMU_STATE_COUNT, THETA] = sensitivities[..., :3]
-    transition[:, :IMU_STATE_COUNT, BIASES] = sensitivities[..., 3:9]
-    correction_input[:, :IMU_STATE_COUNT] = sensitivities[..., CORRECTION_COLUMN]
-    acceleration_input[:, :IMU_STATE_COUNT] = sensitivities[..., INPUT_COLUMN]
-    transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
-    noise_by_interval = _imu_noise_by_interval(
-        (end_steps - start_steps).astype(float), duration_s, transition[:, VELOCITY, THETA]
+    return Intervals(
+        events,
+        (end_steps - start_steps).astype(float),
+        segment.time_s[end_steps] - segment.time_s[start_steps],
+        _state_sensitivities(segment, start_steps, end_steps),
     )
-    return Intervals(events, transition, correction_input, acceleration_input, *noise_by_interval)
 
 
 def _make_events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
