@@ -277,8 +277,10 @@ def _replays(
     excluded_s: Array | None,
 ) -> Iterator[Ekf2Replay]:
     inputs = model.inputs
+    runs: Sequence[SegmentRun] = ()
     for index, (configuration, change) in enumerate(zip(configurations, changes, strict=True)):
         if index % REPLAY_BATCH_SIZE == 0:
+            runs = ()  # free the memory before the next batch
             runs = _run_model(model, configurations[index : index + REPLAY_BATCH_SIZE])
         replay = _make_replay(inputs, runs, configuration, change)
         updates = replay.updates
