@@ -1,5 +1,6 @@
 """EKF2 model against its equations in plain form, and against the log."""
 
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -105,6 +106,22 @@ def test_ekf2_model_of_sample_flight_agrees_with_log(model: Model) -> None:
         assert axis.position_rms_difference_m < 0.007
         assert axis.velocity_rms_difference_m_s < 0.010
         assert axis.nis_mean_replayed == pytest.approx(axis.nis_mean_logged, rel=0.02)
+
+
+def test_ekf2_replay_memory_does_not_grow_with_setting_count(
+    model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("px4fuse.ekf2.model.REPLAY_BATCH_SIZE", 2)
+
+    def peak(count: int) -> int:
+        tracemalloc.start()
+        for _ in replay_settings(model, [{"EKF2_EV_DELAY": 20.0 + at} for at in range(count)]):
+            pass
+        found = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return found
+
+    assert peak(6) < 1.15 * peak(2)
 
 
 def test_ekf2_replay_of_several_settings_equals_separate_runs(model: Model) -> None:
