@@ -18,7 +18,7 @@ from px4fuse.ekf2.model import (
     replay_settings,
     run_configurations,
 )
-from px4fuse.ekf2.replay import HORIZONTAL
+from px4fuse.ekf2.replay import HORIZONTAL_AXES
 from px4fuse.flight.model import RECEIVED, Flight, Unavailable
 from px4fuse.readers import read_log
 
@@ -39,13 +39,12 @@ def vision_of(flight: Flight) -> pd.DataFrame:
 
 
 def test_ekf2_model_transition_equals_product_of_step_matrices(model: Model) -> None:
-    segment, made = model.inputs.segments[0], next(iter(model.intervals.values()))[0]
-    end = made.events.end_step
+    segment, intervals = model.inputs.segments[0], next(iter(model.intervals.values()))[0]
+    made, end = intervals.transitions(slice(None)), intervals.events.end_step
     starts = np.concatenate([[0], end[:-1]])
     gyro, force = (model.inputs.settings[f"EKF2_{name}_NOISE"] for name in ("GYR", "ACC"))
-    transition, correction_input, acceleration_input, gyro_noise, force_noise = made.dynamics()
-    noise = np.zeros_like(transition)
-    noise[:, :9, :9] = gyro**2 * gyro_noise + force**2 * force_noise
+    noise = np.zeros_like(made.transition)
+    noise[:, :9, :9] = gyro**2 * made.gyro_noise + force**2 * made.accelerometer_noise
     for at in (0, 1, 57, 300, len(end) - 1):
         F, Q = np.eye(15), np.zeros((15, 15))
         x = x0 = np.random.default_rng(at).normal(0.0, 0.01, 15)
@@ -54,8 +53,8 @@ def test_ekf2_model_transition_equals_product_of_step_matrices(model: Model) -> 
             old = step_matrix(segment, k, trapezoid=False)
             Q = old @ Q @ old.T + step_noise(segment, k, gyro, force)
             x = step_state(segment, k, x)
-        assert transition[at] == pytest.approx(F, abs=1e-12)
-        moved = transition[at] @ x0 + correction_input[at] + acceleration_input[at]
+        assert made.transition[at] == pytest.approx(F, abs=1e-12)
+        moved = made.transition[at] @ x0 + made.correction_input[at] + made.acceleration_input[at]
         assert moved == pytest.approx(x, abs=1e-12)
         # closed forms assume equal steps and a mean force; the real ones vary
         part = slice(0, 9)
@@ -87,7 +86,7 @@ def test_ekf2_model_innovations_equal_reference_filter(model: Model) -> None:
     nu, S = plain_replay(model.inputs, model.inputs.segments[0], events[events.end_step < 3000])
     updates = model.baseline_replay.updates.iloc[: len(nu)]
     assert len(nu) > 100
-    for at, axis in enumerate(HORIZONTAL):
+    for at, axis in enumerate(HORIZONTAL_AXES):
         np.testing.assert_allclose(updates[f"innovation_{axis}_m"], nu[:, at], rtol=0, atol=5e-4)
         np.testing.assert_allclose(updates[f"innovation_variance_{axis}_m2"], S[:, at], rtol=3e-3)
 

@@ -49,7 +49,7 @@ def outcome(request: ComparisonRequest) -> str:
     """Return inputs and results of a comparison as text, or its error."""
     flight = gnss_flight() if request.log == gnss_flight().log.name else None
     try:
-        prepared = prepare_comparison(request, flight=flight)
+        prepared = prepare_comparison(flight, request)
     except Px4FuseError as error:
         return str(error)
     compared, source = compare(prepared, run_kf(prepared)), prepared.source

@@ -1,4 +1,4 @@
-"""Faults in the convention of a position source, and the conversion to PX4's convention."""
+"""Deviations of a source from PX4's convention (axes, unit, clock), and their correction."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -86,7 +86,7 @@ class Faults:
 
 
 def convention_faults(convention: Convention | None, flight: Flight, frame: str) -> Faults:
-    """Return the faults of a position source whose stated frame is ``frame``."""
+    """Return the deviations of a source from PX4's convention; ``frame`` is the logged frame."""
     if convention is None:
         return Faults()
     orientation_fault = _orientation_fault(convention)
@@ -143,9 +143,11 @@ def _axes_and_rotation(convention: Convention) -> tuple[bool, float]:
     is_known_frame = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
     if convention.is_mirrored or is_known_frame or convention.z not in ("up", "down"):
         return True, rotation_deg * (abs(rotation_deg) > MIN_REMAINDER_DEG)
-    total_deg = rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x) + 90.0 * is_up
-    total_deg = (total_deg + 180.0) % 360.0 - 180.0
-    return is_up, total_deg * (abs(total_deg) > MIN_ROTATION_DEG)
+    total_rotation_deg = (
+        rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x) + 90.0 * is_up
+    )
+    total_rotation_deg = (total_rotation_deg + 180.0) % 360.0 - 180.0
+    return is_up, total_rotation_deg * (abs(total_rotation_deg) > MIN_ROTATION_DEG)
 
 
 def _orientation_fault(convention: Convention) -> OrientationFault:
@@ -191,22 +193,22 @@ def correct_convention(
         orientation = orientation.set_axis(_corrected_times(orientation.index, faults))
         orientation[Columns.QUATERNION] = to_attitude(quaternion, convention.orientation)
     track = replace(track, samples=samples, orientation=orientation, origin=origin)
-    inertial = read_inertial(flight) if faults.affects_ekf2 else None
-    if inertial is None:
+    inertial_data = read_inertial(flight) if faults.affects_ekf2 else None
+    if inertial_data is None:
         return flight, track
-    attitude = inertial.attitudes[convention.heading_from]
-    # the axes of the positions are correct: rotate the attitude to the north of the positions
+    attitude = inertial_data.compute_attitudes()[convention.heading_from]
+    # the axes of the positions are correct, so the attitude is rotated to their north direction
     if not faults.has_wrong_axes and not faults.rotation_deg:
         turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x)
         attitude = replace_heading(attitude, heading(attitude) + np.radians(turn_deg))
-    attitude_table = pd.DataFrame(attitude, time_index(inertial.time_s), Columns.QUATERNION)
+    attitude_table = pd.DataFrame(attitude, time_index(inertial_data.time_s), Columns.QUATERNION)
     return replace(flight, attitude=attitude_table), track
 
 
 def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:
-    unit_m = UNIT_SIZES_M[convention.unit]
+    unit_size_m = UNIT_SIZES_M[convention.unit]
     if not faults.has_wrong_axes and not faults.rotation_deg:
-        return unit_m * np.eye(3)
+        return unit_size_m * np.eye(3)
     permutation = [
         [(axis == name) - (OPPOSITE[axis] == name) for axis in convention.axes]
         for name in FRAME_AXES["NED"]
@@ -215,7 +217,7 @@ def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:
     rotation_rad = -np.radians(convention.rotation_deg) * is_rotated
     cosine, sine = np.cos(rotation_rad), np.sin(rotation_rad)
     rotation = from_elements((cosine, -sine, 0.0), (sine, cosine, 0.0), (0.0, 0.0, 1.0))
-    return np.asarray(unit_m * rotation @ np.array(permutation))
+    return np.asarray(unit_size_m * rotation @ np.array(permutation))
 
 
 def _transform_known(values: Array, matrix: Array) -> Array:

@@ -34,7 +34,7 @@ def axes_as_sent(axes: Axes, frame: str) -> Axes:
     Parameters
     ----------
     axes : tuple of str
-        True directions of north, east, down as the reader understood the file.
+        True directions of the three components that were read as north, east, down.
     frame : {"NED", "ENU", "NWU"}
         Frame that the reader assumed.
     """

@@ -17,7 +17,7 @@ def median_interval(time_s: Array) -> float:
 
 
 def cumulative_integral(values: Array, time_s: Array) -> Array:
-    """Integrate values over time up to each sample (trapezoidal rule, first axis, from zero)."""
+    """Integrate values over time up to each sample (trapezoidal rule, axis 0)."""
     integral = np.zeros_like(values)
     intervals_s = np.diff(time_s).reshape(-1, *[1] * (values.ndim - 1))
     np.cumsum((values[1:] + values[:-1]) / 2.0 * intervals_s, axis=0, out=integral[1:])
@@ -25,7 +25,7 @@ def cumulative_integral(values: Array, time_s: Array) -> Array:
 
 
 def rank_correlation(first: Array, second: Array) -> float:
-    """Return Spearman's rank correlation, without the slow import of scipy.stats.
+    """Return Spearman's rank correlation (without scipy.stats, whose import is slow).
 
     >>> rank_correlation(np.array([1.0, 2.0, 3.0]), np.array([1.0, 4.0, 9.0]))
     1.0

@@ -1,16 +1,17 @@
-"""Replay of EKF2 with logged or other parameters, from a log with PX4's default profile.
+"""Replay of EKF2 with logged or changed parameters, from a log with PX4's default profile.
 
 The model has 15 error states, linearised about the published attitude, and starts from the logged
-``estimator_states``. Inputs are the logged IMU and positions; in a flight with GNSS also velocities
-and, if logged, the magnetometer (21 states). Other measurements are replaced by EKF2's published
-height and heading. :mod:`px4fuse.ekf2.replay` tests for each log if the model agrees with EKF2.
+``estimator_states``. Inputs are the logged IMU data and positions. In a flight with GNSS, the model
+also uses velocities and, if logged, the magnetometer (21 states). EKF2's published height and
+heading replace all other measurements. :mod:`px4fuse.ekf2.replay` compares each replay with the
+log.
 
 All filter configurations (parameters, states, aiding sources, gate) run together, to save time.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, starmap
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ import pandas as pd
 from msgspec import structs
 from scipy.spatial.transform import Rotation
 
-from px4fuse.core.arrays import Array
+from px4fuse.core.arrays import Array, IntArray
 from px4fuse.core.record import Span
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
@@ -34,7 +35,7 @@ from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, matching_sample_rows, pre
 from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.replay import (
-    HORIZONTAL,
+    HORIZONTAL_AXES,
     MAX_COMPARED_REJECTED_FRACTION,
     Agreement,
     Ekf2Replay,
@@ -65,7 +66,7 @@ from px4fuse.flight.ekf2_parameters import (
     PARAMETERS,
     check_parameters,
 )
-from px4fuse.flight.model import AXIS_NAMES, AxisName, Columns, Ekf2, Flight, Unavailable
+from px4fuse.flight.model import AXIS_NAMES, Columns, Ekf2, Flight, NedAxis, Unavailable
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.trajectory.rotation import rotate
 
@@ -74,6 +75,9 @@ MAX_HORIZON_S = 1.0
 
 # Number of replays that run together: more take less time for each, but more memory
 REPLAY_BATCH_SIZE = 10
+# Number of intervals whose states are computed at once, which limits memory
+BLOCK_EVENTS = 512
+
 # Field of Agreement with the result for an aiding source, where its name is not PX4's name of the
 # source
 AGREEMENT_FIELDS = {FLOW.name: "carried_difference_m"}
@@ -83,16 +87,16 @@ RequestConfigurations = Callable[[Inputs], Sequence[FilterConfiguration]]
 
 @dataclass(frozen=True)
 class Model:
-    """Flight prepared for EKF2 replays.
+    """Flight that is prepared for replays of EKF2 with other parameters.
 
     Attributes
     ----------
     intervals : mapping from Timing to tuple of Intervals
-        Intervals of each segment that were already computed.
+        Intervals of each segment that are already computed.
     baseline_replay : Ekf2Replay
         Replay with the logged parameters; ``agreement`` compares it with the log.
     runs : tuple of SegmentRun
-        Results of the filter configurations that were already run, per segment.
+        Results of the filter configurations that are already run, for each segment.
     """
 
     flight: Flight
@@ -108,8 +112,8 @@ def open_model(
 ) -> Model | Unavailable:
     """Prepare a flight for EKF2 replays, and replay it with the logged parameters.
 
-    ``request_configurations`` returns further filter configurations that will be needed. Running
-    all together saves time.
+    ``request_configurations`` returns filter configurations that will be needed later. They run
+    together with the logged parameters, to save time.
     """
     failed_agreements: dict[str, Agreement] = {}
     while not isinstance(
@@ -126,10 +130,10 @@ def _open_without_aids(
     request_configurations: RequestConfigurations,
     failed_agreements: Mapping[str, Agreement],
 ) -> Model | Unavailable:
-    """Prepare the replay without some aiding sources.
+    """Prepare a replay that omits some aiding sources.
 
-    ``failed_agreements`` contains, for each omitted source (PX4's name), the agreement with the log
-    of the replay that fused it.
+    ``failed_agreements`` contains the name of each omitted source, and the agreement with the log
+    of the replay that fused this source.
     """
     omitted_aids = {name: agreement.doubtful[name] for name, agreement in failed_agreements.items()}
     inputs = prepare_inputs(flight, omitted_aids)
@@ -154,15 +158,17 @@ def _open_without_aids(
     if isinstance(agreement, Unavailable):
         return agreement
     model = Model(flight, inputs, intervals_by_timing, baseline_replay, agreement, tuple(runs))
-    rejected_share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
+    rejected_fraction = max(
+        agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed
+    )
     if (
-        rejected_share > MAX_COMPARED_REJECTED_FRACTION
+        rejected_fraction > MAX_COMPARED_REJECTED_FRACTION
         and np.isfinite(inputs.received.rejected).any()
     ):
-        rejecting_agreement = agreement_with_log(flight, replay_with_logged_rejections(model))
-        if isinstance(rejecting_agreement, Agreement):
-            agreement = with_logged_rejections(agreement, rejecting_agreement)
-    # the agreement of an omitted aiding source is from the replay that contained this source
+        agreement_with_rejections = agreement_with_log(flight, replay_with_logged_rejections(model))
+        if isinstance(agreement_with_rejections, Agreement):
+            agreement = with_logged_rejections(agreement, agreement_with_rejections)
+    # The agreement of an omitted aiding source is from the replay that fused this source
     failed_results = {
         (field_name := AGREEMENT_FIELDS.get(name, name)): getattr(failed_agreement, field_name)
         for name, failed_agreement in failed_agreements.items()
@@ -178,7 +184,7 @@ def _open_without_aids(
 
 
 def replay_with_logged_rejections(model: Model) -> Ekf2Replay:
-    """Replay EKF2 with logged parameters, rejections and resets."""
+    """Replay EKF2 with the logged parameters, rejections and resets."""
     configuration = FilterConfiguration(model.inputs.settings, uses_logged_decisions=True)
     return _make_replay(model.inputs, _run_model(model, [configuration]), configuration, {})
 
@@ -199,7 +205,7 @@ def replay_settings(
     settings : sequence of mapping
         Changed parameters of each replay, by PX4 name and in PX4's units.
     excluded_s : ndarray, optional
-        Timestamps of position samples that are neither fused nor listed as updates.
+        Timestamps of position samples that are not used.
     without : mapping from PX4's name of an aiding source to float, optional
         Time (s) from which the aiding source is not fused.
 
@@ -294,7 +300,7 @@ def _replays(
 
 
 def modelled_aids(inputs: Inputs) -> list[str]:
-    """Return PX4's names of the aiding sources that the EKF2 replay fuses."""
+    """Return PX4's names of the aiding sources that the EKF2 model fuses."""
     segment = inputs.segments[0]
     is_fused = {
         inputs.aid: True,
@@ -308,7 +314,7 @@ def modelled_aids(inputs: Inputs) -> list[str]:
 
 
 def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
-    """Return the model with noise of standard deviation ``sigma_m`` (m) added to every position."""
+    """Add normal noise with standard deviation ``sigma_m`` (m) to each position in the inputs."""
     inputs = model.inputs
     rng = np.random.default_rng(seed)
     new_inputs: dict[str, Any] = {}
@@ -316,12 +322,12 @@ def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
         if samples is not None:
             position_noise_m = rng.normal(scale=sigma_m, size=samples.position_m.shape)
             new_inputs[name] = replace(samples, position_m=samples.position_m + position_noise_m)
-    # the noise changes positions only, not their times, so the intervals remain valid
+    # The noise does not change the times of the positions, so the intervals remain valid
     return replace(model, inputs=replace(inputs, **new_inputs), runs=())
 
 
 def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float) -> Model:
-    """Return the model with positions rotated (clockwise from above) and timestamps delayed."""
+    """Rotate the positions in the inputs (clockwise from above), and delay their timestamps."""
     if not rotation_deg and not delay_s:
         return model
     received = model.inputs.received
@@ -341,9 +347,9 @@ def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float)
 def delayed_tracks(
     model: Model, configurations: Sequence[FilterConfiguration]
 ) -> Iterator[pd.DataFrame]:
-    """Yield position and velocity of each filter configuration at the fusion horizon.
+    """Yield position and velocity at the fusion horizon for each filter configuration.
 
-    One track at a time limits memory.
+    The tracks are computed one at a time, to limit the memory.
     """
     runs = _run_model(model, configurations)
     for configuration_index in map(runs[0].configurations.index, configurations):
@@ -365,7 +371,10 @@ def run_configurations(
     configurations: Sequence[FilterConfiguration],
     computed_intervals: Mapping[Timing, Sequence[Intervals]],
 ) -> list[SegmentRun]:
-    """Run filter configurations through every segment; ``computed_intervals`` are reused."""
+    """Run filter configurations through all segments.
+
+    ``computed_intervals`` contains intervals that need not be computed again.
+    """
     timings = [configuration.timing(inputs) for configuration in configurations]
     segment_runs = []
     for segment_index, segment in enumerate(inputs.segments):
@@ -419,7 +428,7 @@ def _make_replay(
 
 
 def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Span]:
-    """Return the spans (s) longer than RESTART_GAP_S without a fused position."""
+    """Return start and end (s) of each time longer than RESTART_GAP_S without a fused position."""
     is_used = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
     fusion_times_s = [*updates.loc[is_used, "fused_at_s"], float(segment.time_s[-1])]
     return [
@@ -432,7 +441,7 @@ def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Sp
 def _updates_by_aid(
     inputs: Inputs, run: SegmentRun, configuration_index: int
 ) -> dict[str, pd.DataFrame]:
-    """Return the updates with each aiding source, by PX4's name."""
+    """Return the updates with each aiding source; the keys are PX4's names of the sources."""
     events, heights = run.events[configuration_index], run.heights
     end_s = run.segment.time_s[events.end_step]
     nu, S, R, rejected, fused, reset, variance_after = (
@@ -448,14 +457,14 @@ def _updates_by_aid(
         )
     )
 
-    def updates_along(axes: Sequence[AxisName], columns: slice, *more: Any) -> pd.DataFrame:
-        update_log = np.column_stack([nu[:, columns], S[:, columns], *more])
+    def updates_along(axes: Sequence[NedAxis], columns: slice, *other_values: Any) -> pd.DataFrame:
+        update_log = np.column_stack([nu[:, columns], S[:, columns], *other_values])
         return update_table(update_log[:, None], events.time_s[:, None], end_s, axes)
 
     position_variance = variance_after[:, HORIZONTAL_POSITION]
     updates_by_aid = {
         inputs.aid.name: updates_along(
-            HORIZONTAL,
+            HORIZONTAL_AXES,
             POSITION_COLUMNS,
             rejected,
             fused,
@@ -469,11 +478,11 @@ def _updates_by_aid(
             updates_by_aid[name] = heights.updates(name, configuration_index, end_s)
     if inputs.received.velocity_m_s is not None:
         gate = run.configurations[configuration_index].settings[GNSS_VEL.gate]
-        # innovations exactly at the gate were clipped and fused; the factor covers rounding
+        # Clipped innovations are at the gate and fused; the factor allows for rounding errors
         velocity_limit = (1.0 + 1e-9) * max(gate, MIN_GATE) ** 2
         is_outside_gate = (nu[:, :3] ** 2 > velocity_limit * S[:, :3]).any(axis=1)
-        # without GNSS height the replay uses the logged EKF2 height
-        axes = AXIS_NAMES if GNSS_HGT.name in updates_by_aid else HORIZONTAL
+        # Without GNSS height, the replay uses EKF2's logged height
+        axes = AXIS_NAMES if GNSS_HGT.name in updates_by_aid else HORIZONTAL_AXES
         updates_by_aid[GNSS_VEL.name] = updates_along(axes, slice(len(axes)), is_outside_gate)
     if run.vision is not None:
         updates_by_aid[EV_POS.name] = run.vision.updates(configuration_index, end_s)
@@ -483,14 +492,14 @@ def _updates_by_aid(
 def _delayed_and_published(
     inputs: Inputs, run: SegmentRun, configuration_index: int
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the state at the fusion horizon and the published state at each prediction step."""
+    """Return the state at the fusion horizon, and the published state, after each step."""
     segment = run.segment
     configuration = run.configurations[configuration_index]
     state, reset = delayed_states(run, configuration_index)
     horizon_s = min(configuration.timing(inputs).horizon_s, MAX_HORIZON_S)
     lag_steps = max(round(horizon_s / inputs.mean_step_s), 1)
     published_rotation = np.zeros((len(state), 3))
-    # without attitude states, the nominal (published) attitude already is EKF2's logged attitude
+    # Without attitude states, the nominal attitude is EKF2's published attitude
     if configuration.estimates_attitude:
         attitude_difference = state[:, THETA] - segment.attitude_error_rad
         published_rotation = follow_attitude(
@@ -507,7 +516,7 @@ def _delayed_and_published(
 
 
 def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Array]:
-    """Return the state and the sum of position resets (m) at each of n prediction steps.
+    """Return state and sum of position resets (m) at the fusion horizon after each of n steps.
 
     Shapes (n + 1, 15) and (n + 1, 3).
     """
@@ -516,44 +525,56 @@ def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Ar
     segment = run.segment
     event_states = run.state[:, configuration_index]
     step_count = len(segment.step_s)
-    body_to_ned = segment.body_to_ned[1:]
-    step_s = segment.step_s[:, None]
     interval_index = np.searchsorted(event_steps, np.arange(step_count), side="right")
-    first_step = np.searchsorted(interval_index, interval_index)
     state = event_states[np.append(0, interval_index)]
-
-    def sum_since_event(increments: Array) -> Array:
-        total = np.cumsum(increments, axis=0)
-        return np.asarray(total - (total - increments)[first_step])
-
-    def value_before_step(after_step: Array, rows: slice) -> Array:
-        shifted = np.concatenate([after_step[:1], after_step[:-1]])
-        return np.where(
-            (first_step == np.arange(step_count))[:, None],
-            event_states[interval_index, rows],
-            shifted,
-        )
-
-    # state equations of px4fuse.ekf2.intervals, evaluated for this state only
-    rotation_steps = -rotate(body_to_ned, state[1:, GYRO_BIAS]) * step_s
-    if configuration.estimates_attitude:
-        rotation_steps -= segment.correction_rad
-    state[1:, THETA] += sum_since_event(rotation_steps)
-    force_ned_m_s2 = rotate(body_to_ned, segment.force_m_s2)
-    acceleration = (
-        np.cross(value_before_step(state[1:, THETA], THETA), force_ned_m_s2)
-        + force_ned_m_s2
-        + GRAVITY_M_S2
-    )
-    acceleration -= rotate(body_to_ned, state[1:, ACCELEROMETER_BIAS])
-    state[1:, VELOCITY] += sum_since_event(acceleration * step_s)
-    velocity_m_s = state[1:, VELOCITY]
-    state[1:, POSITION] += sum_since_event(
-        0.5 * step_s * (value_before_step(velocity_m_s, VELOCITY) + velocity_m_s)
-    )
+    # some intervals at a time, because the arrays of a whole flight need much memory
+    block_edges = np.searchsorted(interval_index, np.arange(0, len(event_steps) + 1, BLOCK_EVENTS))
+    for steps in starmap(slice, pairwise([*block_edges, step_count])):
+        _propagate_states(segment, configuration, state[1:], interval_index, steps)
     state[event_steps] = event_states[1:]
     reset_m = np.zeros((step_count + 1, 3))
     position_reset_m = run.position_reset_m[:, configuration_index]
     for event_index in np.flatnonzero(position_reset_m.any(axis=1)):
         reset_m[event_steps[event_index] :, :2] += position_reset_m[event_index]
     return state, reset_m
+
+
+def _propagate_states(
+    segment: ReplaySegment,
+    configuration: FilterConfiguration,
+    states: Array,
+    interval_index: IntArray,
+    steps: slice,
+) -> None:
+    """Replace the states at the start of the interval by the states after some of the steps.
+
+    ``steps`` are the prediction steps of whole intervals, and ``interval_index``, shape (n,), is
+    the interval of each step.
+    """
+    state, body_to_ned = states[steps], segment.body_to_ned[1:][steps]
+    start_state, step_s = state.copy(), segment.step_s[steps, None]
+    first_step = np.searchsorted(interval_index[steps], interval_index[steps])
+    is_first_step = (first_step == np.arange(len(first_step)))[:, None]
+
+    def sum_since_event(increments: Array) -> Array:
+        total = np.cumsum(increments, axis=0)
+        return np.asarray(total - (total - increments)[first_step])
+
+    def value_before_step(rows: slice) -> Array:
+        shifted = np.concatenate([state[:1, rows], state[:-1, rows]])
+        return np.where(is_first_step, start_state[:, rows], shifted)
+
+    # state equations of px4fuse.ekf2.intervals, evaluated for this state only
+    rotation_steps = -rotate(body_to_ned, state[:, GYRO_BIAS]) * step_s
+    if configuration.estimates_attitude:
+        rotation_steps -= segment.correction_rad[steps]
+    state[:, THETA] += sum_since_event(rotation_steps)
+    force_ned_m_s2 = rotate(body_to_ned, segment.force_m_s2[steps])
+    acceleration = (
+        np.cross(value_before_step(THETA), force_ned_m_s2) + force_ned_m_s2 + GRAVITY_M_S2
+    )
+    acceleration -= rotate(body_to_ned, state[:, ACCELEROMETER_BIAS])
+    state[:, VELOCITY] += sum_since_event(acceleration * step_s)
+    state[:, POSITION] += sum_since_event(
+        0.5 * step_s * (value_before_step(VELOCITY) + state[:, VELOCITY])
+    )

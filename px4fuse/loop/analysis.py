@@ -43,7 +43,7 @@ def analyse(
     reference: Trajectory | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Loop:
-    """Measure and correct the loop of a trajectory or of a flight.
+    """Compute the loop closure error of a trajectory or flight, and correct the path.
 
     Parameters
     ----------
@@ -81,8 +81,10 @@ def analyse(
         truth_end = loop_segment.read_end_from_truth(path, truth, segment, rests_at_ends)
     true_end = _find_true_end(path, request, truth_end, segment, is_assessed=is_assessed)
     given_closures = [
-        GivenClosure(to_track_time(c.time_1_s), to_track_time(c.time_2_s), c.sigma_m)
-        for c in request.closures
+        GivenClosure(
+            to_track_time(closure.time_1_s), to_track_time(closure.time_2_s), closure.sigma_m
+        )
+        for closure in request.closures
     ]
     for closure in given_closures:
         _require_valid_closure(closure, path)
@@ -199,7 +201,7 @@ def _is_drift_free(trajectory: Trajectory, flight: Flight) -> bool:
 
 
 def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
-    """Return the indices of the key frames, and the distance (m) along them at each pose."""
+    """Return the indices of the key frames, and the path length (m) along them at each pose."""
     _require_in_range("key_frames_m", spacing_m, 1e-3)
     key_frame_indices = choose_key_frames(path.position_m, spacing_m)
     distance_m = cumulative_distance(path.position_m[key_frame_indices])

@@ -65,7 +65,8 @@ def main() -> None:
             theirs[run] = seconds(optimiser.optimize)
         found, other = solve(graph), factors.error(optimiser.values())
         print(
-            f"{name}: {len(graph)} poses, {len(graph.first)} edges, {graph.initialised}, read in "
+            f"{name}: {len(graph)} poses, {len(graph.first_nodes)} edges, "
+            f"{graph.initialised}, read in "
             f"{reading:.2f} s; {np.median(ours / theirs):.2f} x GTSAM "
             f"({np.median(ours):.3f} s / {np.median(theirs):.3f} s, {runs} pairs); "
             f"steps {found.iterations} / {optimiser.iterations()}; cost {cost(graph):.6g} -> "

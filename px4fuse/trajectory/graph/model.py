@@ -34,9 +34,9 @@ class PoseGraph:
     # Poses: x, y, heading in the plane; x, y, z, qx, qy, qz, qw in space
     poses: Array
     # Indices into ``poses`` of the two vertices of each edge
-    first: IntArray
-    second: IntArray
-    # Measured pose of ``second`` relative to ``first``, in the axes of ``first``
+    first_nodes: IntArray
+    second_nodes: IntArray
+    # Measured pose of the second node relative to the first, in the axes of the first
     measurements: Array
     # Inverse covariance of each measurement, translation before rotation, in the axes of the
     # measured pose; zero in directions that are not measured
@@ -51,7 +51,7 @@ class PoseGraph:
 
     def select_edges(self, is_selected: BoolArray) -> PoseGraph:
         """Return the graph with only the edges in the mask, shape (m,)."""
-        edge_fields = ("first", "second", "measurements", "information")
+        edge_fields = ("first_nodes", "second_nodes", "measurements", "information")
         return replace(self, **{name: getattr(self, name)[is_selected] for name in edge_fields})
 
     @property
@@ -62,13 +62,12 @@ class PoseGraph:
     @cached_property
     def normal_equations(self) -> NormalEquations:
         """Normal equations of the poses, with the first pose fixed."""
-        edges = np.stack([self.first, self.second])
+        edges = np.stack([self.first_nodes, self.second_nodes])
         return NormalEquations(edges, self.degrees_of_freedom)
 
-    @property
-    def is_successive(self) -> BoolArray:
-        """Mask of the edges between successive poses, which are odometry by default."""
-        return np.asarray(np.abs(self.first - self.second) == 1)
+    def find_successive(self) -> BoolArray:
+        """Return the mask of the edges between successive poses, which are odometry by default."""
+        return np.asarray(np.abs(self.first_nodes - self.second_nodes) == 1)
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ class Residuals:
 
 def residuals(graph: PoseGraph, poses: Array) -> Residuals:
     """Compute the residuals of all edges at the poses, shape (n, 3) or (n, 7)."""
-    relative = lie.between(poses[graph.first], poses[graph.second])
+    relative = lie.between(poses[graph.first_nodes], poses[graph.second_nodes])
     residual = lie.log(lie.between(graph.measurements, relative))
     weighted_residual = (graph.information @ residual[..., None])[..., 0]
     return Residuals(poses, relative, residual, np.sum(residual * weighted_residual, axis=-1))
@@ -117,6 +116,14 @@ def information_eigenvectors(information: Array) -> tuple[Array, Array]:
     return scale[:, None] * eigenvectors[:, is_observed], 1.0 / eigenvalues[is_observed]
 
 
+def observed_directions(information: Array) -> IntArray:
+    """Return the number of directions that each measurement observes."""
+    _, scaled_information = scale_to_unit_diagonal(information)
+    eigenvalues = np.linalg.eigvalsh(scaled_information)
+    counts: IntArray = np.count_nonzero(eigenvalues > MIN_OBSERVED_EIGENVALUE, axis=1)
+    return counts
+
+
 def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
     """Return the square roots of the diagonals, and the matrices scaled to unit diagonal."""
     scale = np.sqrt(np.clip(np.diagonal(matrices, axis1=-2, axis2=-1), 0.0, None))
@@ -125,14 +132,14 @@ def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
 
 
 def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> None:
-    """Raise TrajectoryError if edges in the mask ``is_used`` do not connect all poses.
+    """Raise TrajectoryError if the used edges with information do not connect all poses.
 
-    Edges without information connect nothing. ``edges_name`` names the edges in the message.
+    ``edges_name`` names the edges in the error message.
     """
-    if not len(graph.first):
+    if not len(graph.first_nodes):
         raise TrajectoryError("The pose graph has no edges", "Give a file with EDGE lines.")
     is_informative = is_used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
-    connected_nodes = (graph.first[is_informative], graph.second[is_informative])
+    connected_nodes = (graph.first_nodes[is_informative], graph.second_nodes[is_informative])
     node_count = len(graph)
     adjacency = sparse.coo_array(
         (np.ones(len(connected_nodes[0])), connected_nodes), shape=(node_count, node_count)
@@ -158,21 +165,21 @@ def odometry_chain(graph: PoseGraph, excluded_edges: IntArray | None = None) -> 
 
     Of several edges between two poses the first is used.
     """
-    odometry_edges = np.flatnonzero(graph.is_successive)
+    odometry_edges = np.flatnonzero(graph.find_successive())
     if excluded_edges is not None:
         odometry_edges = np.setdiff1d(odometry_edges, excluded_edges)
     next_edge = np.full(len(graph) - 1, -1, dtype=np.intp)
     # Assigned in reverse order, so that the first of several edges remains
     odometry_edges = odometry_edges[::-1]
-    next_edge[np.minimum(graph.first[odometry_edges], graph.second[odometry_edges])] = (
+    next_edge[np.minimum(graph.first_nodes[odometry_edges], graph.second_nodes[odometry_edges])] = (
         odometry_edges
     )
     return next_edge
 
 
-def odometry_steps(graph: PoseGraph, chain: IntArray) -> Array:
-    """Return the relative poses of a chain of edges between successive poses."""
-    steps = graph.measurements[chain].copy()
-    is_backward = graph.first[chain] > graph.second[chain]
+def odometry_steps(graph: PoseGraph, edge_indices: IntArray) -> Array:
+    """Return the measurements of edges between successive poses, from earlier to later pose."""
+    steps = graph.measurements[edge_indices].copy()
+    is_backward = graph.first_nodes[edge_indices] > graph.second_nodes[edge_indices]
     steps[is_backward] = lie.inverse(steps[is_backward])
     return steps
