@@ -17,7 +17,7 @@ from px4fuse.findings.model import (
     spans_with_value,
 )
 from px4fuse.flight.ekf2_parameters import BAROMETER, MAG, NO_MAGNETOMETER
-from px4fuse.flight.model import BODY_AXES, Columns, Ekf2, Flight, Unavailable
+from px4fuse.flight.model import BODY_AXES, Columns, Ekf2, Flight, Unavailable, rows_between
 
 # Limit parameter, unit, sensor and columns of each bias state of EKF2
 BIAS_STATES = (
@@ -63,7 +63,7 @@ def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
         return None
     if isinstance(flight.airborne, Unavailable):
         return None
-    imu = flight.imu.loc[: flight.airborne[0][0] - RUN_UP_S]
+    imu = rows_between(flight.imu, -np.inf, flight.airborne[0][0] - RUN_UP_S).astype(np.float64)
     windows = imu.groupby(np.floor(imu.index / REST_WINDOW_S))
     window_means, window_stds = windows.mean(), windows.std()
     is_at_rest = np.ones(len(window_means), bool)
