@@ -517,12 +517,11 @@ def _delayed_and_published(
     state, reset = delayed_states(run, configuration_index)
     horizon_s = min(configuration.timing(inputs).horizon_s, MAX_HORIZON_S)
     lag_steps = max(round(horizon_s / inputs.mean_step_s), 1)
+    # without attitude states, the nominal (published) attitude already is EKF2's logged attitude
     published_rotation = np.zeros((len(state), 3))
-    # Without attitude states, the nominal attitude is EKF2's published attitude
     if configuration.estimates_attitude:
-        attitude_difference = state[:, THETA] - segment.attitude_error_rad
         published_rotation = follow_attitude(
-            attitude_difference, lag_steps, inputs.mean_step_s, horizon_s
+            state[:, THETA] - segment.attitude_error_rad, lag_steps, inputs.mean_step_s, horizon_s
         )
     published_velocity, published_position = publish(
         segment, state, reset, published_rotation, lag_steps, configuration.settings

@@ -25,6 +25,7 @@ from px4fuse.flight.model import (
     Flight,
     PositionTrack,
     Unavailable,
+    rows_between,
 )
 
 # For each bias state of EKF2: parameter with its limit, unit, sensor, and columns of the bias
@@ -74,7 +75,7 @@ def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
         return None
     if isinstance(flight.airborne, Unavailable):
         return None
-    imu = flight.imu.loc[: flight.airborne[0][0] - RUN_UP_S]
+    imu = rows_between(flight.imu, -np.inf, flight.airborne[0][0] - RUN_UP_S).astype(np.float64)
     windows = imu.groupby(np.floor(imu.index / REST_WINDOW_S))
     window_means, window_stds = windows.mean(), windows.std()
     is_at_rest = np.ones(len(window_means), bool)
