@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from cli_tools import run, run_main
 from exchange import replace
-from findings_tools import NONE, log, made
+from findings_tools import NONE, SEGMENT, log, made, source
 from flights import aisle_flight
 from pypdf import PdfReader
 from ulog_tools import gnss_log, seconds_of, stamps
@@ -18,7 +18,7 @@ from px4fuse.analysis import AidsOnlyAnalysis, failed_checks
 from px4fuse.ekf2.aids import AidResult, evaluate_aids
 from px4fuse.errors import MissingDataError
 from px4fuse.findings import aids as aids_detector
-from px4fuse.findings import find_aids
+from px4fuse.findings import ekf2_state, find_aids
 from px4fuse.findings.aids import detect_in_aids
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
 from px4fuse.flight.ekf2_parameters import AIDS
@@ -342,3 +342,11 @@ def test_gnss_without_fix_is_reported() -> None:
     (finding,) = find_aids({}, flight)
     assert finding.id == "source_without_position"
     assert "none with a 3D fix" in finding.message
+
+
+def test_yaw_fusion_without_orientation_is_named_in_the_action() -> None:
+    flight = aids_only(states={"yaw_align": pd.Series([0.0], [0.0])})
+    flight.log = log(parameters={"EKF2_EV_CTRL": 9, "EKF2_MAG_TYPE": 5})
+    (finding,) = ekf2_state.detect_missing_alignment(flight, SEGMENT, source())
+    assert "EKF2_EV_CTRL bit 3 is set, but the orientation is missing" in finding.remedy
+    assert "Calibrate the magnetometer" not in finding.remedy

@@ -522,8 +522,8 @@ def test_align_position_file_of_sitl_log_recovers_clock_offset(
 
 
 def test_file_aligned_with_late_ekf2_track_is_aligned_with_imu():
-    mistakes = parse_faults(["clock-offset=-0.25", "ekf2-delay=0.001"])
-    late = simulate_flight(Scenario(seed=3, passes=4), mistakes)
+    faults = parse_faults(["clock-offset=-0.25", "ekf2-delay=0.001"])
+    late = simulate_flight(Scenario(seed=3, passes=4), faults)
     truth = late.truth.samples[Columns.POSITION]
     time_s = np.arange(truth.index[0] + 1.0, truth.index[-1] - 1.0, 0.1)
     n, e, d = (np.interp(time_s, truth.index, truth[name]) for name in truth)

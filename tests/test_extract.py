@@ -65,7 +65,7 @@ def rich_flight() -> Flight:
 def test_extracted_csv_read_again_gives_identical_floats(written, sample_flight):
     ekf2 = sample_flight.ekf2
     expected = {
-        "imu": sample_flight.imu, "attitude": sample_flight.attitude,
+        "imu": sample_flight.imu.astype(float), "attitude": sample_flight.attitude,
         "acceleration_ned": ned_acceleration(sample_flight), "ekf2_state": ekf2.state,
         "ekf2_variance": ekf2.variance, "ekf2_fusing": ekf2.fusion_flags,
         "truth": sample_flight.truth.samples,

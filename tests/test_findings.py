@@ -357,7 +357,7 @@ PRECONDITIONS: list[tuple[str, Callable[[Comparison, Finding], bool]]] = [
     ("[Aa]ntenna|receiver|sky|RTK", lambda made, _: made.source.origin.is_gnss),
     ("EKF2_DELAY_MAX", lambda made, _: "EKF2_DELAY_MAX" in made.flight.log.parameters),
     ("EKF2_EV_CTRL bit 3", lambda made, _: made.source.origin.is_vision),
-    ("EKF2_EV_NOISE_MD", lambda made, _: "EKF2_EV_NOISE_MD" in made.flight.log.parameters),
+    ("EKF2_EV_NOISE_MD", lambda made, _: made.source.origin.is_vision),
     (
         "sent|sending|[Ss]end (the|each|a|one|raw|nothing|NaN)",
         lambda made, _: not made.source.origin.is_gnss,

@@ -157,7 +157,7 @@ def test_ekf2_rerun_equals_what_if_with_the_same_parameters() -> None:
         analysis, analysis, model.inputs
     )
     once, other = (
-        replay_settings(of, [change])[0] for of in (model, with_position_noise(model, 0.01, 1))
+        next(replay_settings(of, [change])) for of in (model, with_position_noise(model, 0.01, 1))
     )
     assert not once.updates.equals(other.updates)
 

@@ -58,7 +58,7 @@ def compare(prepared: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comp
         "ekf2": {name: axis.ekf2_innovations for name, axis in axes.items()},
     }
     horizontal = {
-        name: nis for name, frames in innovations.items() if (nis := _horizontal_nis(frames))
+        name: nis for name, tables in innovations.items() if (nis := _horizontal_nis(tables))
     }
     prepared = replace(prepared, notes=tuple(notes))
     return Comparison(**vars(prepared), axes=axes, horizontal=horizontal)
@@ -157,8 +157,8 @@ def _summarise_filter(
     return UntestedFilter(**structs.asdict(innovations), **sigmas, truth=truth)
 
 
-def _known_values(frame: TableOrUnavailable, column: str) -> pd.Series:
-    return pd.Series(dtype=float) if isinstance(frame, Unavailable) else frame[column].dropna()
+def _known_values(table: TableOrUnavailable, column: str) -> pd.Series:
+    return pd.Series(dtype=float) if isinstance(table, Unavailable) else table[column].dropna()
 
 
 def difference_statistics(
@@ -319,17 +319,17 @@ def normalised_position_errors(
     return normalised_errors.index.to_numpy(), normalised_errors.to_numpy()
 
 
-def _horizontal_nis(frames: Mapping[str, TableOrUnavailable]) -> HorizontalNis | None:
+def _horizontal_nis(axis_innovations: Mapping[str, TableOrUnavailable]) -> HorizontalNis | None:
     columns = ["innovation_m", "innovation_variance_m2"]
-    frames_of_axes = [
-        frame[columns]
+    tables = [
+        table[columns]
         for name in ("north", "east")
-        if isinstance(frame := frames.get(name), pd.DataFrame)
+        if isinstance(table := axis_innovations.get(name), pd.DataFrame)
     ]
-    if len(frames_of_axes) < 2:
+    if len(tables) < 2:
         return None
     # Only updates with innovations along both axes (equal timestamps) are used
-    north_and_east = pd.concat(frames_of_axes, axis=1, join="inner").to_numpy().T
+    north_and_east = pd.concat(tables, axis=1, join="inner").to_numpy().T
     return assess_horizontal(
         (north_and_east[0], north_and_east[1]), (north_and_east[2], north_and_east[3])
     )

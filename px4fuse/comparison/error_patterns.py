@@ -15,7 +15,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from px4fuse.comparison.model import Comparison
 from px4fuse.core.arrays import Array, cumulative_integral, rank_correlation
 from px4fuse.filter.signals import cut_to_segment
-from px4fuse.flight.model import Columns, Ekf2, Unavailable
+from px4fuse.flight.model import Columns, Ekf2, Unavailable, rows_between
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_vector
 from px4fuse.trajectory.scores import autocorrelation_time
 
@@ -349,7 +349,7 @@ def _least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
 def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     """Find a sinusoidal error that explains most of the slow error.
 
-    Return None if there is none, or if the motion contains its frequency.
+    Return None without such an error, or if the motion contains its frequency.
     """
     duration_s = fit.time_s[-1] - fit.time_s[0]
     highest_hz = min(MAX_FREQUENCY_HZ, 0.25 / float(np.median(np.diff(fit.time_s))))
@@ -439,6 +439,10 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     step_rows = round(ROTATION_STEP_S / DELAY_STEP_S)
     if len(time_s) < MIN_POSITIONS:
         return None
+    imu = rows_between(
+        imu, time_s[0] - 2.0 * MAX_ATTITUDE_DELAY_S, time_s[-1] + 2.0 * MAX_ATTITUDE_DELAY_S
+    )
+    imu_time_s = imu.index.to_numpy()
     quaternions = interpolate(time_s, attitude_time_s, attitude[Columns.QUATERNION].to_numpy())
     rotation_rad = to_vector(multiply(conjugate(quaternions[:-step_rows]), quaternions[step_rows:]))
     angle_rad = cumulative_integral(imu[Columns.ANGULAR_RATE].to_numpy(), imu_time_s)

@@ -116,13 +116,13 @@ def _median_square_distance(samples: pd.DataFrame, state: pd.DataFrame) -> float
     return float(np.median(distance_m2)) if len(distance_m2) else float("inf")
 
 
-def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
+def project(table: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
     """Project positions, velocities and variances onto an axis."""
-    rows = cut_to_segment(frame, segment)
+    rows = cut_to_segment(table, segment)
     available_columns = {
         name: (columns, exponent)
         for name, (columns, exponent) in PROJECTED_COLUMNS.items()
-        if columns[0] in frame
+        if columns[0] in table
     }
     projected = {
         name: weighted_sum(rows, columns, axis.direction**exponent)
@@ -205,14 +205,14 @@ def project_innovations(
             f"EKF2 never fuses {track.name}, so its logged innovations are of another source",
             "Choose the source that EKF2 fused (--position-source).",
         )
-    frames = []
+    axis_innovations = []
     for name in ("north", "east") if axis.name == AISLE else (axis.name,):
-        if isinstance(frame := ekf2.innovations[name], Unavailable):
-            return frame
-        frames.append(frame)
-    rows = cut_to_segment(frames[0], segment).copy()
+        if isinstance(innovations := ekf2.innovations[name], Unavailable):
+            return innovations
+        axis_innovations.append(innovations)
+    rows = cut_to_segment(axis_innovations[0], segment).copy()
     if axis.name == AISLE:
-        rows = _innovations_along(rows, frames[1], axis.direction)
+        rows = _innovations_along(rows, axis_innovations[1], axis.direction)
     if rows.empty:
         return _no_samples("EKF2 innovations")
     noise_variance = rows["observation_variance_m2"].fillna(

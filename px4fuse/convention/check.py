@@ -162,23 +162,25 @@ def is_source_fused(flight: Flight) -> bool:
 def _rotate_to_gnss(
     hypothesis: Hypothesis, positions: SentPositions, flight: Flight, track: PositionTrack
 ) -> Hypothesis:
-    """Fit rotation and relative delay to GNSS positions, because EKF2's heading may be wrong."""
+    """Fit the rotation of a hypothesis to GNSS positions, because EKF2's heading may be wrong."""
     gnss_tracks = [other for other in flight.positions if other.origin.is_gnss]
     if not gnss_tracks or track.origin.is_gnss or not hypothesis.has_rotation:
         return hypothesis
-    gnss = gnss_tracks[0].samples[Columns.POSITION[:2]].dropna()
-    time_s = gnss.index.to_numpy() + hypothesis.offset_s
+    gnss_positions = gnss_tracks[0].samples[Columns.POSITION[:2]].dropna()
+    time_s = gnss_positions.index.to_numpy() + hypothesis.offset_s
     source_time_s = positions.time_s
     is_near = is_bracketed(time_s, source_time_s, gap_limit(source_time_s, MIN_GAP_S))
     if np.count_nonzero(is_near) < MIN_GNSS_POSITIONS:
         return hypothesis
-    sent = UNIT_SIZES_M[hypothesis.unit] * positions.position_m
+    sent_m = UNIT_SIZES_M[hypothesis.unit] * positions.position_m
     assignment = hypothesis.assignment
-    source_m = sent[:, assignment.axis_a] + 1j * assignment.handedness * sent[:, assignment.axis_b]
+    source_m = (
+        sent_m[:, assignment.axis_a] + 1j * assignment.handedness * sent_m[:, assignment.axis_b]
+    )
     velocity_m_s = np.interp(time_s, source_time_s, np.gradient(source_m, source_time_s))
     columns = np.column_stack([np.interp(time_s, source_time_s, source_m), velocity_m_s])[is_near]
     columns -= columns.mean(axis=0)
-    north_east_m = (gnss.to_numpy() @ [1.0, 1j])[is_near]
+    north_east_m = (gnss_positions.to_numpy() @ [1.0, 1j])[is_near]
     north_east_m -= north_east_m.mean()
     factors, residual_m2, *_ = np.linalg.lstsq(columns, north_east_m)
     if not residual_m2 < (MAX_GNSS_RESIDUAL_RATIO * np.linalg.norm(north_east_m)) ** 2:

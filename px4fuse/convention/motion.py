@@ -141,8 +141,8 @@ def read_inertial(flight: Flight) -> InertialData | None:
     if len(time_s) < 4 * DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S:
         return None
     columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
-    imu_integral = cumulative_integral(imu[columns].to_numpy(), imu_s)
-    integral_steps = np.diff([np.interp(time_s, imu_s, column) for column in imu_integral.T]).T
+    integrals = (cumulative_integral(imu[name].to_numpy(), imu_s) for name in columns)
+    integral_steps = np.diff([np.interp(time_s, imu_s, integral) for integral in integrals]).T
     force_m_s2 = integral_steps[:, :3] / INTEGRATION_STEP_S
     logged_attitude = interpolate(time_s, attitude_s, attitude[Columns.QUATERNION].to_numpy())
     gyro_attitude = _level_attitude(

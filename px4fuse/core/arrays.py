@@ -5,6 +5,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
 Complex = NDArray[np.complex128]
 ArrayPair = tuple[Array, Array]
 IntArray = NDArray[np.intp]
@@ -18,7 +19,7 @@ def median_interval(time_s: Array) -> float:
 
 def cumulative_integral(values: Array, time_s: Array) -> Array:
     """Integrate values over time up to each sample (trapezoidal rule, axis 0)."""
-    integral = np.zeros_like(values)
+    integral = np.zeros(values.shape)
     intervals_s = np.diff(time_s).reshape(-1, *[1] * (values.ndim - 1))
     np.cumsum((values[1:] + values[:-1]) / 2.0 * intervals_s, axis=0, out=integral[1:])
     return integral

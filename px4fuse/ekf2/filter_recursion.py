@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
+from px4fuse.core.arrays import Array, Array32, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.bad_acceleration import BadAcceleration
 from px4fuse.ekf2.heights import (
     GNSS_HEIGHT_NOISE_FACTOR,
@@ -182,14 +182,14 @@ class SegmentRun:
     configurations: tuple[FilterConfiguration, ...]
     events: tuple[StepEvents, ...]
     innovation: Array
-    innovation_variance: Array
-    noise: Array
+    innovation_variance: Array32
+    noise: Array32
     rejected: BoolArray
     fused: BoolArray
     reset: BoolArray
     position_reset_m: Array
     state: Array
-    variance: Array
+    variance: Array32
     covariance: Array
     magnetometer_updates: Array
     heights: HeightFilter | None = None
@@ -379,13 +379,15 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         inputs.received.reset[sample_index],
         inputs.received.has_all_resets,
     )
-    innovations, variances = np.full((2, event_count, configuration_count, 6), np.nan)
+    innovations = np.full((event_count, configuration_count, 6), np.nan)
+    variances = innovations.astype(np.float32)
     magnetometer_updates = np.full(
         (event_count * has_magnetometer, 3, configuration_count, 3), np.nan
     )
     is_rejected, is_fused, is_reset = np.zeros((3, event_count, configuration_count), bool)
     position_reset_m = np.zeros((event_count, configuration_count, 2))
-    states, state_variances = np.empty((2, event_count + 1, configuration_count, x.shape[1]))
+    states = np.empty((event_count + 1, configuration_count, x.shape[1]))
+    state_variances = np.empty(states.shape, np.float32)
     states[0] = x
     state_variances[0] = _diagonal(P)
     innovation, R = np.empty((2, configuration_count, 4))
@@ -542,7 +544,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         tuple(interval_arrays.events for interval_arrays in intervals),
         innovations,
         variances,
-        measurement_variance,
+        measurement_variance.astype(np.float32),
         is_rejected,
         is_fused,
         is_reset,

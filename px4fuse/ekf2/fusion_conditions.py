@@ -314,13 +314,17 @@ def _check_gnss(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
     parameters, source = attempt.parameters, attempt.source
     # Bit n of EKF2_GPS_CHECK enables the check of bit n + 1; bit 0, the fix, is always checked
     checked_mask = int(parameters.get("EKF2_GPS_CHECK", -1)) << 1 | 1
-    fractions = {bit: attempt.fraction_set("failed_checks", bit) for bit in range(len(GNSS_CHECKS))}
+    failed_fractions = {
+        bit: attempt.fraction_set("failed_checks", bit) for bit in range(len(GNSS_CHECKS))
+    }
     failed_bits = [
-        bit for bit in fractions if checked_mask >> bit & 1 and fractions[bit] > MIN_FAILED_FRACTION
+        bit
+        for bit in failed_fractions
+        if checked_mask >> bit & 1 and failed_fractions[bit] > MIN_FAILED_FRACTION
     ]
     if not failed_bits:
         return
-    failed_bits.sort(key=lambda bit: -fractions[bit])
+    failed_bits.sort(key=lambda bit: -failed_fractions[bit])
     samples = attempt.samples_in_span(source.samples)
     reported_variances = {3: samples["north_m2"], 4: samples["down_m2"]}
     if source.velocity is not None:
@@ -328,7 +332,7 @@ def _check_gnss(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
     check_texts = []
     for bit in failed_bits[:3]:
         name, parameter, unit = GNSS_CHECKS[bit]
-        check_details = [f"{100.0 * fractions[bit]:.0f} % of the time"]
+        check_details = [f"{100.0 * failed_fractions[bit]:.0f} % of the time"]
         if np.isfinite(limit := parameters.get(parameter, np.nan)):
             # The samples contain only positions with a fix, so their median may be below the limit
             if bit in reported_variances:

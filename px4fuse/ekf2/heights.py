@@ -203,9 +203,9 @@ class HeightFilter:
         self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
         self.has_bias = [aid.name != heights.reference for aid in HEIGHT_SENSORS]
         self.weight = [*np.maximum(weight, 1.0), np.ones_like(fix_s)]
-        bias_m, bias_m2 = np.tile(heights.initial_bias, (configuration_count, 1)).T
+        bias_m, bias_variance_m2 = np.tile(heights.initial_bias, (configuration_count, 1)).T
         start_s = segment.time_s[0]
-        self.bias = BiasEstimator(bias_m, bias_m2, segment.step_s)
+        self.bias = BiasEstimator(bias_m, bias_variance_m2, segment.step_s)
         self.updates_bias = self.has_sample & is_enabled_by_aid[heights.reference]
         biased_slots = slice(0, -1) if self.has_bias[0] else slice(-1, None)
         self.interval_s = np.zeros(self.has_sample.shape)

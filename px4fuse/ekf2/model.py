@@ -81,6 +81,8 @@ from px4fuse.trajectory.rotation import rotate
 # Maximum delay (s) of the fusion horizon: PX4's maximum of EKF2_DELAY_MAX
 MAX_HORIZON_S = 1.0
 
+# Number of replays that run together: more take less time for each, but more memory
+REPLAY_BATCH_SIZE = 10
 # Number of intervals whose states are computed at once, which limits memory
 BLOCK_EVENTS = 512
 
@@ -153,6 +155,8 @@ def _open_without_aids(
     segments = tuple(with_state_correlation(inputs, segment) for segment in inputs.segments)
     inputs = replace(inputs, segments=segments)
     configurations = [baseline_configuration]
+    if np.mean(inputs.received.rejected > 0.0) > MAX_COMPARED_REJECTED_FRACTION:
+        configurations.append(FilterConfiguration(inputs.settings, uses_logged_decisions=True))
     for configuration in request_configurations(inputs):
         configurations += [] if configuration in configurations else [configuration]
     intervals_by_timing = {timing: intervals}
@@ -198,8 +202,10 @@ def replay_settings(
     settings: Sequence[Mapping[str, float]],
     excluded_s: Array | None = None,
     without: Mapping[str, float] | None = None,
-) -> tuple[Ekf2Replay, ...]:
+) -> Iterator[Ekf2Replay]:
     """Replay EKF2 with several sets of changed parameters.
+
+    The result yields one replay at a time and runs a few together, to limit memory.
 
     Parameters
     ----------
@@ -255,8 +261,6 @@ def replay_settings(
             f"{min(unknown_aids)} cannot be omitted: the replay of this log fuses only "
             f"{fused_text}."
         )
-    if not changes:
-        return ()
     if excluded_s is not None:
         excluded_rows = matching_sample_rows(inputs.received.timestamp_s, excluded_s)
         rejected_flags = np.full(len(inputs.received.timestamp_s), np.nan)
@@ -277,9 +281,21 @@ def replay_settings(
         )
         for change in changes
     ]
-    runs = _run_model(model, configurations)
-    replays = []
-    for configuration, change in zip(configurations, changes, strict=True):
+    return _replays(model, configurations, changes, excluded_s)
+
+
+def _replays(
+    model: Model,
+    configurations: Sequence[FilterConfiguration],
+    changes: Sequence[Mapping[str, float]],
+    excluded_s: Array | None,
+) -> Iterator[Ekf2Replay]:
+    inputs = model.inputs
+    runs: Sequence[SegmentRun] = ()
+    for index, (configuration, change) in enumerate(zip(configurations, changes, strict=True)):
+        if index % REPLAY_BATCH_SIZE == 0:
+            runs = ()  # free the memory before the next batch
+            runs = _run_model(model, configurations[index : index + REPLAY_BATCH_SIZE])
         replay = _make_replay(inputs, runs, configuration, change)
         updates = replay.updates
         if excluded_s is not None:
@@ -288,8 +304,7 @@ def replay_settings(
             updates = updates.iloc[
                 np.delete(np.arange(len(updates)), excluded_rows[excluded_rows >= 0])
             ]
-        replays.append(structs.replace(replay, updates=updates, agreement=model.agreement))
-    return tuple(replays)
+        yield structs.replace(replay, updates=updates, agreement=model.agreement)
 
 
 def modelled_aids(inputs: Inputs) -> list[str]:
@@ -387,7 +402,7 @@ def run_configurations(
 
 
 def _track(run: SegmentRun, position_m: Array, velocity_m_s: Array) -> pd.DataFrame:
-    """Return position and velocity at each prediction step, in published metres."""
+    """Return position and velocity at each prediction step, scaled as EKF2 publishes them."""
     states = np.hstack([position_m / run.segment.ekf2_metres_per_metre, velocity_m_s])
     return pd.DataFrame(states, time_index(run.segment.time_s), Columns.STATE, copy=False)
 
@@ -502,12 +517,11 @@ def _delayed_and_published(
     state, reset = delayed_states(run, configuration_index)
     horizon_s = min(configuration.timing(inputs).horizon_s, MAX_HORIZON_S)
     lag_steps = max(round(horizon_s / inputs.mean_step_s), 1)
+    # without attitude states, the nominal (published) attitude already is EKF2's logged attitude
     published_rotation = np.zeros((len(state), 3))
-    # Without attitude states, the nominal attitude is EKF2's published attitude
     if configuration.estimates_attitude:
-        attitude_difference = state[:, THETA] - segment.attitude_error_rad
         published_rotation = follow_attitude(
-            attitude_difference, lag_steps, inputs.mean_step_s, horizon_s
+            state[:, THETA] - segment.attitude_error_rad, lag_steps, inputs.mean_step_s, horizon_s
         )
     published_velocity, published_position = publish(
         segment, state, reset, published_rotation, lag_steps, configuration.settings

@@ -25,6 +25,8 @@ from px4fuse.trajectory.rotation import rotate
 
 # Gain of the integrated error in the corrections of velocity and position (output_predictor.cpp)
 INTEGRAL_GAIN = 0.1
+# Number of steps that are filtered at once, which limits memory
+BLOCK_STEPS = 4096
 # Gain of the attitude correction, times step / delay of the fusion horizon (output_predictor.cpp)
 ATTITUDE_GAIN = 0.5
 
@@ -56,22 +58,25 @@ def publish(
     step_s = segment.step_s[:, None]
     mean_step = float(np.mean(segment.step_s))
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
-    force_m_s2 = segment.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag_steps)[1:]
-    force_m_s2 = rotate(segment.body_to_ned[1:], force_m_s2)
-    velocity_increments = (
-        force_m_s2 + np.cross(attitude_difference_rad[1:], force_m_s2) + GRAVITY_M_S2
-    ) * step_s
+    increments = segment.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag_steps)[1:]
+    increments = rotate(segment.body_to_ned[1:], increments)
+    increments += np.cross(attitude_difference_rad[1:], increments)
+    increments += GRAVITY_M_S2
+    increments *= step_s
     velocity_m_s = _follow_state(
-        state[:, VELOCITY], velocity_increments, lag_steps, mean_step, settings["EKF2_TAU_VEL"]
+        state[:, VELOCITY], increments, lag_steps, mean_step, settings["EKF2_TAU_VEL"]
     )
-    # The IMU changes the velocity during a step. Corrections are made at the end of the step
-    position_increments = (velocity_m_s[:-1] + 0.5 * velocity_increments) * step_s
-    # Resets are subtracted, because EKF2 shifts its whole buffer at a reset
+    # the IMU changes the velocity within a step; corrections apply at the end of the step
+    increments *= 0.5
+    increments += velocity_m_s[:-1]
+    increments *= step_s
+    # a reset is removed, because EKF2 shifts the whole buffer with a reset
     position_without_resets = state[:, POSITION] - reset_m
     position_m = _follow_state(
-        position_without_resets, position_increments, lag_steps, mean_step, settings["EKF2_TAU_POS"]
+        position_without_resets, increments, lag_steps, mean_step, settings["EKF2_TAU_POS"]
     )
-    return velocity_m_s, position_m + delay_by(reset_m, lag_steps)
+    position_m += delay_by(reset_m, lag_steps)
+    return velocity_m_s, position_m
 
 
 def _follow_state(
@@ -83,17 +88,20 @@ def _follow_state(
     the sum of increments, and c is the sum of corrections: a correction shifts the whole buffer.
     With gain g, c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
     """
-    dead_reckoned = np.cumsum(np.concatenate([state[:1], increments]), axis=0)
+    dead_reckoned = np.concatenate([state[:1], increments])
+    np.cumsum(dead_reckoned, axis=0, out=dead_reckoned)
     offset = state - dead_reckoned
+    offset -= (start_offset := offset[0].copy())
     gain = step_s / np.clip(tau_s, step_s, 10.0)
     integral_gain = INTEGRAL_GAIN * gain**2
-    delayed_offset = delay_by(offset - offset[0], lag_steps)
     correction_sum = _recursive_filter(
         np.array([gain + integral_gain, -gain]),
         np.array([1.0, gain + integral_gain - 2.0, 1.0 - gain]),
-        delayed_offset,
+        delay_by(offset, lag_steps),
     )
-    return np.asarray(dead_reckoned + (correction_sum + offset[0]))
+    correction_sum += start_offset
+    dead_reckoned += correction_sum
+    return dead_reckoned
 
 
 def delay_by(values: Array, lag_steps: int) -> Array:
@@ -116,11 +124,21 @@ def follow_attitude(error_rad: Array, lag_steps: int, step_s: float, horizon_s: 
 
 
 def _recursive_filter(numerator: Array, denominator: Array, values: Array) -> Array:
-    """Apply a recursive (IIR) filter by solving a banded triangular system (LAPACK dtbtrs)."""
+    """Apply a recursive (IIR) filter by solving banded triangular systems (LAPACK dtbtrs).
+
+    The system of the whole flight would need much memory, so it is solved in blocks.
+    """
     value_count = len(values)
-    weighted_inputs = np.zeros((values.shape[1], value_count))
+    filtered = np.zeros(values.shape)
     for delay in np.flatnonzero(numerator[:value_count]).tolist():
-        weighted_inputs[:, delay:] += numerator[delay] * values[: value_count - delay].T
-    bands = np.broadcast_to(denominator, (value_count, len(denominator))).T
-    filtered, _ = lapack.dtbtrs(bands, weighted_inputs.T, uplo="L", overwrite_b=1)
-    return np.asarray(filtered)
+        filtered[delay:] += numerator[delay] * values[: value_count - delay]
+    block_length = max(BLOCK_STEPS, len(denominator))
+    bands = np.tile(denominator, (block_length, 1)).T
+    for first in range(0, value_count, block_length):
+        block = filtered[first : first + block_length]
+        if first:
+            for delay in np.flatnonzero(denominator[1:]).tolist():
+                past = filtered[first - delay - 1 : first][: len(block)]
+                block[: delay + 1] -= denominator[delay + 1] * past
+        block[:] = lapack.dtbtrs(bands[:, : len(block)], block, uplo="L")[0]
+    return filtered

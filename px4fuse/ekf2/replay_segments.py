@@ -529,10 +529,11 @@ def _make_segment(
     return ReplaySegment(
         time_s=step_times_s,
         step_s=step_s,
-        body_to_ned=to_matrix(nominal_attitude),
+        # float32 as in PX4, because these are the largest arrays
+        body_to_ned=to_matrix(nominal_attitude).astype(np.float32),
         correction_rad=to_vector(
             multiply(published_relative_to_gyro[1:], conjugate(published_relative_to_gyro[:-1]))
-        ),
+        ).astype(np.float32),
         force_m_s2=velocity_increments / step_s[:, None],
         accelerometer_bias_m_s2=accelerometer_bias,
         state=np.concatenate(
@@ -542,11 +543,11 @@ def _make_segment(
         down_m=_interpolate(ekf2.state[["down_m"]], step_times_s)[:, 0],
         attitude_variance_rad2=_interpolate(
             fusion_record.delayed[Columns.DELAYED_VARIANCE[:3]], step_times_s
-        ),
+        ).astype(np.float32),
         down_variance_m2=_interpolate(fusion_record.delayed[["down_m2"]], step_times_s)[:, 0],
         attitude_error_rad=_interpolate(
             pd.DataFrame(attitude_error_rad, state_times_s), step_times_s
-        ),
+        ).astype(np.float32),
         state_correlation=np.eye(15),
         is_acceleration_bad=(
             fusion_record.was_in_state(BAD_ACCELERATION, step_times_s)

@@ -242,26 +242,25 @@ def what_if(
                 f"flight, which ends at {replay_end_s:.0f} s. "
                 "Choose an earlier time."
             )
+    summaries: list[Summary] = []
+    notes: list[str] = []
+    deviation_notes: list[str] = []
+    for replay in replays:
+        summaries.append(_summarise_replay(flight, replay, evaluated_s))
+        notes += _notes(model, replay)
+        if without:
+            deviation_notes.append(_deviation_note(model, replay, without, evaluated_s))
     is_gnss = model.inputs.aid == GNSS_POS
     return WhatIf(
         agreement=model.agreement,
         logged=_summarise_log(flight, model.baseline_replay, evaluated_s),
         replayed=_summarise_replay(flight, model.baseline_replay, evaluated_s),
-        whatif=_mark_unpredictable(
-            model,
-            [_summarise_replay(flight, replay, evaluated_s) for replay in replays],
-            evaluated_s,
-            without,
-        ),
+        whatif=_mark_unpredictable(model, summaries, evaluated_s, without),
         evaluated_s=evaluated_s,
         notes=(
-            *(_heading_and_height_notes(model) if replays and is_gnss else ()),
-            *(note for replay in replays for note in _notes(model, replay)),
-            *(
-                _deviation_note(model, replay, without, evaluated_s)
-                for replay in replays
-                if without
-            ),
+            *(_heading_and_height_notes(model) if summaries and is_gnss else ()),
+            *notes,
+            *deviation_notes,
         ),
     )
 

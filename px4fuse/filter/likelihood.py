@@ -34,8 +34,8 @@ from px4fuse.filter.steps import Timeline, make_timeline
 PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
 # Distance in ln σ from the maximum at which the search for the end of a 95 % interval starts
 START_LOG_DISTANCE = 0.05
-# In the likelihood profile of one noise (SIGMA_A), the other noise (SIGMA_Z) changes by at most
-# this factor (ln σ) between two points
+# In the likelihood profile of one noise (SIGMA_A), ln σ of the other noise (SIGMA_Z) changes by at
+# most this value between two points
 MAX_OTHER_LOG_STEP = 1.0
 # Tolerance of ln σ in the optimisation of the other noise at each point of a likelihood profile
 OTHER_LOG_TOLERANCE = 2e-3

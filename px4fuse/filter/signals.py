@@ -377,5 +377,5 @@ def mean_step_acceleration(
 
 
 def cut_to_segment(samples: pd.DataFrame, segment: Segment) -> pd.DataFrame:
-    """Return the samples within a segment, including its start and end."""
-    return samples[(samples.index >= segment.start_s) & (samples.index <= segment.end_s)]
+    """Return the rows of a time-indexed table inside a segment, both ends included."""
+    return rows_between(samples, segment.start_s, segment.end_s)

@@ -259,7 +259,7 @@ def _offset_grid(centre_s: float, half_width_s: float, offset_count: int) -> Arr
 
 
 def _simulate_offset_variance_factor(
-    prepared_motion: PreparedMotion, offset_s: float, noises: Noises, information: float
+    prepared_motion: PreparedMotion, offset_s: float, noises: Noises, fisher_information: float
 ) -> float:
     """Simulate the ratio of the time offset's variance to the variance from the curvature of -ln p.
 
@@ -303,7 +303,7 @@ def _simulate_offset_variance_factor(
         offset_positions, noises.sigma_a_m_s2, scaled_variance, (error_m, dp, dv), velocity_noise
     )
     variances = np.add.reduceat(noise_products, first_segments).var(axis=1)
-    return 1.0 + float(variances.sum()) / information
+    return 1.0 + float(variances.sum()) / fisher_information
 
 
 def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:

@@ -106,18 +106,18 @@ def detect_in_aids(
         if aid.verdict == "not_fused" and not is_take_off_gap:
             unfused_aids_by_switch.setdefault(AIDS[name].switch or name, []).append(aid)
     for switch, aids_of_sensor in unfused_aids_by_switch.items():
-        yield _not_fused(switch, aids_of_sensor, source_aid, height_error_m)
+        yield _not_fused_finding(switch, aids_of_sensor, source_aid, height_error_m)
     for name, aid in tested_aids.items():
         sensor_cause = _sensor_cause(AIDS[name].switch, source_aid)
         if not sensor_cause and any(result.change for result in aid.axes.values()):
-            yield _innovation_shift(name, aid)
+            yield _innovation_shift_finding(name, aid)
         elif aid.verdict == "overconfident" and name != source_aid:
-            yield _overconfident(name, aid, sensor_cause)
+            yield _overconfident_finding(name, aid, sensor_cause)
         elif aid.verdict == "biased":
-            yield _biased(name, aid)
+            yield _biased_finding(name, aid)
 
 
-def _not_fused(
+def _not_fused_finding(
     switch: str, aids_of_sensor: list[AidResult], source_aid: str, height_error_m: float | None
 ) -> Finding:
     longest_unfused = max(aids_of_sensor, key=lambda aid: aid.longest_gap_duration_s)
@@ -144,23 +144,23 @@ def _not_fused(
     )
 
 
-def _innovation_shift(name: str, aid: AidResult) -> Finding:
+def _innovation_shift_finding(name: str, aid: AidResult) -> Finding:
     label = _aid_label(aid)
     shifts_by_axis = {axis: result.change for axis, result in aid.axes.items() if result.change}
-    axis, (time_s, shift) = max(shifts_by_axis.items(), key=lambda item: abs(item[1][1]))
+    axis, (time_s, mean_change) = max(shifts_by_axis.items(), key=lambda item: abs(item[1][1]))
     s_sqrt = aid.axes[axis].s_sqrt_median
     return warning(
         "aid_innovation_shift",
-        f"{label}: the {axis} innovation shifts by {format_number(abs(shift) * s_sqrt, 2)} "
+        f"{label}: the {axis} innovation shifts by {format_number(abs(mean_change) * s_sqrt, 2)} "
         f"{aid.unit} at {time_s:.0f} s. The mean innovation before and after differs by "
-        f"{abs(shift):.1f} √S (√S {format_number(s_sqrt, 2)} {aid.unit}).",
+        f"{abs(mean_change):.1f} √S (√S {format_number(s_sqrt, 2)} {aid.unit}).",
         f"Check what was switched, moved or passed near the sensor at {time_s:.0f} s.",
-        {"aid": name, "axis": axis, "time_s": time_s, "moved": shift},
+        {"aid": name, "axis": axis, "time_s": time_s, "moved": mean_change},
         ((time_s, time_s + CHANGE_WINDOW_S),),
     )
 
 
-def _overconfident(name: str, aid: AidResult, sensor_cause: str) -> Finding:
+def _overconfident_finding(name: str, aid: AidResult, sensor_cause: str) -> Finding:
     # No noise value is proposed, because innovations alone do not distinguish noise from a
     # wrong delay
     action = "correct the accuracy that the sensor reports"
@@ -186,7 +186,7 @@ def _overconfident(name: str, aid: AidResult, sensor_cause: str) -> Finding:
     )
 
 
-def _biased(name: str, aid: AidResult) -> Finding:
+def _biased_finding(name: str, aid: AidResult) -> Finding:
     axis, worst_axis = max(
         aid.axes.items(), key=lambda item: abs(item[1].mean_normalised_innovation)
     )

@@ -93,9 +93,9 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
         f"{title}{unmet_condition.fault and ': '}{unmet_condition.fault}. {unmet_condition.reason}"
     )
     if fused_fraction < MIN_FUSED_FRACTION_ERROR:
-        is_reference = source.origin.fused_as_gnss and unmet_condition.condition == "switch"
+        is_disabled_gnss = source.origin.fused_as_gnss and unmet_condition.condition == "switch"
         yield finding(
-            "note" if is_reference else "error",
+            "note" if is_disabled_gnss else "error",
             "ekf2_not_fusing",
             message,
             action,

@@ -17,7 +17,7 @@ from px4fuse.findings.model import (
     magnetometer_advice,
     spans_with_value,
 )
-from px4fuse.flight.ekf2_parameters import BAROMETER, MAG
+from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, MAG, YAW_CONTROL_BIT
 from px4fuse.flight.model import (
     BODY_AXES,
     Columns,
@@ -25,6 +25,7 @@ from px4fuse.flight.model import (
     Flight,
     PositionTrack,
     Unavailable,
+    rows_between,
 )
 
 # For each bias state of EKF2: parameter with its limit, unit, sensor, and columns of the bias
@@ -74,7 +75,7 @@ def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
         return None
     if isinstance(flight.airborne, Unavailable):
         return None
-    imu = flight.imu.loc[: flight.airborne[0][0] - RUN_UP_S]
+    imu = rows_between(flight.imu, -np.inf, flight.airborne[0][0] - RUN_UP_S).astype(np.float64)
     windows = imu.groupby(np.floor(imu.index / REST_WINDOW_S))
     window_means, window_stds = windows.mean(), windows.std()
     is_at_rest = np.ones(len(window_means), bool)
@@ -209,9 +210,13 @@ def _align_heading_action(flight: Flight, source: PositionTrack | None) -> str:
     """Return the action for a heading that EKF2 did not align, by the sensors of the vehicle."""
     action = magnetometer_advice(flight) or f"Enable the magnetometer ({MAG.switch} 0)."
     if source is not None and source.origin.is_vision:
-        has_yaw = source.orientation is not None
-        action += (
-            f" Alternatively, {'' if has_yaw else 'send the orientation of the source, and '}let "
-            "EKF2 fuse the yaw of the source."
-        )
+        alternative = "let EKF2 fuse the yaw of the source"
+        if source.orientation is None:
+            alternative = f"send the orientation of the source, and {alternative}"
+            if int(flight.log.parameters.get(EV_POS.switch, 0)) & YAW_CONTROL_BIT:
+                alternative = (
+                    f"send the orientation of the source: {EV_POS.switch} bit 3 is set, but the "
+                    "orientation is missing or constant"
+                )
+        action += f" Alternatively, {alternative}."
     return action

@@ -19,7 +19,7 @@ from px4fuse.findings.model import (
     note,
     warning,
 )
-from px4fuse.flight.ekf2_parameters import EV_POS
+from px4fuse.flight.ekf2_parameters import EV_POS, YAW_CONTROL_BIT
 from px4fuse.flight.model import (
     Columns,
     Ekf2,
@@ -43,8 +43,6 @@ MIN_SEVERE_HEADING_ERROR_DEG = 15.0
 MIN_TRUE_DRIFT_RATIO = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
-# Bit of EKF2_EV_CTRL that enables the fusion of the yaw of external vision
-YAW_CONTROL_BIT = 8
 CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also causes a heading error."
 
 

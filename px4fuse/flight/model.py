@@ -310,7 +310,7 @@ MIN_NOISE_SAMPLES = 10
 MIN_UWB_NOISE_M = 0.03
 # Maximum rate (Hz) of UWB positions
 MAX_UWB_RATE_HZ = 25.0
-# Minimum time (s) on the ground between two flights: the land detector may report short landings
+# Minimum time (s) on the ground between two flights: shorter landings are detector errors
 MIN_LANDED_S = 5.0
 BODY_AXES = ("forward", "right", "down")
 AXIS_NAMES: tuple[NedAxis, NedAxis, NedAxis] = ("north", "east", "down")

@@ -166,7 +166,10 @@ def _with_time_column(data: pd.DataFrame) -> pd.DataFrame:
 
 
 def _described_tables(flight: Flight) -> Iterator[DescribedTable]:
-    yield from _stream_table(flight, "imu", flight.imu)
+    imu = flight.imu
+    yield from _stream_table(
+        flight, "imu", imu if isinstance(imu, Unavailable) else imu.astype(np.float64)
+    )
     yield from _stream_table(flight, "attitude", flight.attitude)
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, pd.DataFrame):

@@ -107,11 +107,11 @@ def analyse(
         path, node_indices, graph, gated_closures, progress
     )
     end_from_start_m = path.position_m[-1] - path.position_m[0]
-    heading_deg = loop_segment.heading_change_deg(path)
+    odometry_heading_change_deg = loop_segment.heading_change_deg(path)
     misclosure_m = (
         true_end if isinstance(true_end, Unavailable) else end_from_start_m - true_end.displacement
     )
-    heading_error_deg = _compute_heading_error(true_end, heading_deg)
+    heading_error_deg = _compute_heading_error(true_end, odometry_heading_change_deg)
     landing_closure = next((c for c in gated_closures if c.source == LANDING_CLOSURE_SOURCE), None)
     distance_corrections = correct_paths_by_distance(
         path, distance_m, misclosure_m, heading_error_deg, landing_closure
@@ -134,7 +134,7 @@ def analyse(
         key_frame_spacing_m=spacing_m,
         path_length_m=float(distance_m[-1]),
         end_from_start_m=components_by_axis(path.frame, end_from_start_m),
-        heading_change_deg=heading_deg,
+        heading_change_deg=odometry_heading_change_deg,
         true_end=true_end,
         closure_error_m=closure_error_m,
         closure_percent=closure_percent,

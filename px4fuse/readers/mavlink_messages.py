@@ -52,7 +52,7 @@ class PositionInput:
     # Coordinate frame of the positions. If "unknown", the message may contain the MAV_FRAME
     frame: str = "unknown"
     # Field with the sender's timestamp (µs)
-    stamp: str = "time_usec"
+    timestamp_field: str = "time_usec"
     # Required MAV_ESTIMATOR_TYPE, if any
     estimator: int | None = None
     # True if PX4 ignores the covariance: MAV_ESTIMATOR_TYPE_NAIVE (mavlink_receiver.cpp)

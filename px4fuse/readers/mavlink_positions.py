@@ -85,10 +85,10 @@ def _read_track(
     if not len(rows):
         return None
     track_name = source.track_name + (f"_{sender[0]}_{sender[1]}" if len(senders) > 1 else "")
-    stamp_s = table[source.stamp] * 1e-6
+    timestamp_s = table[source.timestamp_field] * 1e-6
     sample_boot_s = recording.receipt_boot_s(rows)
     if clock.sender_to_boot is not None:
-        sample_boot_s = np.where(stamp_s > 0.0, clock.sender_to_boot.at(stamp_s), np.nan)
+        sample_boot_s = np.where(timestamp_s > 0.0, clock.sender_to_boot.at(timestamp_s), np.nan)
     samples = recording.read(source.layout, rows, sample_boot_s, track_name)
     frame = source.frame
     if "frame_id" in samples and len(samples):

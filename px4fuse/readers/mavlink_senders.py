@@ -139,7 +139,7 @@ def _map_sender_clock(
     received_s = []
     for source in messages.POSITION_INPUTS:
         rows = recording.rows(source.message, sender)
-        timestamps_s.append(frames.table(source.message, rows)[source.stamp] * 1e-6)
+        timestamps_s.append(frames.table(source.message, rows)[source.timestamp_field] * 1e-6)
         received_s.append(recording.received_s[rows])
     median_timestamp_s = float(np.median(np.concatenate(timestamps_s)))
     has_running_clock = is_running_clock(np.concatenate(timestamps_s))

@@ -141,7 +141,7 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
     for name in Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE:
         is_valid = np.abs(columns[name][rows]) < common.MAX_IMU_VALUE
         time_s, rows = time_s[is_valid], rows[is_valid]
-    samples = np.empty((len(columns), len(rows)))
+    samples = np.empty((len(columns), len(rows)), np.float32)  # as in the log
     for row, values in zip(samples, columns.values(), strict=True):
         row[:] = values[rows]
     return pd.DataFrame(samples.T, time_index(time_s), list(columns), copy=False)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array, Array32, BoolArray, IntArray
 from px4fuse.ekf2.filter_recursion import HORIZONTAL_POSITION, POSITION_COLUMNS, SegmentRun
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.replay_segments import POSITION
@@ -285,15 +285,15 @@ def _aid_source_topic(
     settings: Mapping[str, float],
     timestamps: Mapping[str, Any],
     observation: Array,
-    innovation_values: tuple[Array, Array, Array],
+    innovation_and_variances: tuple[Array | Array32, ...],
     rejected_and_fused: tuple[BoolArray, BoolArray],
 ) -> Topic:
     """Return estimator_aid_src_* of an aiding source.
 
-    ``innovation_values`` are innovation, its variance S, and the measurement variance R.
+    ``innovation_and_variances`` are innovation, its variance S, and the measurement variance R.
     ``rejected_and_fused`` are masks of rejected and of fused samples.
     """
-    innovation, innovation_variance, noise_variance = innovation_values
+    innovation, innovation_variance, noise_variance = innovation_and_variances
     test_ratio = innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * innovation_variance)
     fields = {
         **timestamps,
