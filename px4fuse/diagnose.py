@@ -95,7 +95,8 @@ def _diagnose_flight(
     request: ComparisonRequest, progress: Progress, flight: Flight, *, as_sent: bool
 ) -> Analysis:
     prepared_comparison = prepare_comparison(flight, request, progress, as_sent=as_sent)
-    kf_runs = run_kf(prepared_comparison, progress)
+    progress("running KF")
+    kf_runs = run_kf(prepared_comparison)
     comparison = compare(prepared_comparison, kf_runs)
     return replace(find_faults(comparison, progress), request=request)
 
