@@ -162,7 +162,7 @@ def follow(analysis: Analysis, request: ComparisonRequest) -> list[Fix]:
             if kind == "KF":
                 fixed = apply_options(request, change)
                 fixed_flight = read_flight(fixed) if request.position else flight
-                again = compare(prepare_comparison(fixed_flight, fixed))
+                again = compare_with_kf(prepare_comparison(fixed_flight, fixed))
                 before_m, after_m = rmse_m(analysis), rmse_m(again)
             elif isinstance(model, Model) and kind == "EKF2":
                 before_m, after_m = replayed_m(model, change)
