@@ -227,6 +227,7 @@ def rerun(
             *planned_configurations(comparison, estimates, inputs),
         ],
     )
+    release_free_memory()
     difference_steps = explain_ekf2_difference(comparison, model, estimates.clock, corrected)
     trials = rerun_filters(comparison, estimates, model)
     if isinstance(model, Model):  # frees memory; later replays are computed again
