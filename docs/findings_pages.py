@@ -48,8 +48,8 @@ from px4fuse.findings.cause_grouping import CONSEQUENCES, effect_ids  # noqa: E4
 from px4fuse.findings.model import CATALOGUE, GROUPS, load_examples  # noqa: E402
 from px4fuse.flight.model import Columns  # noqa: E402
 from px4fuse.report.panels import INNOVATIONS, POSITION, SIGMA_P  # noqa: E402
+from px4fuse.simulation.faults import parse_faults  # noqa: E402
 from px4fuse.simulation.flights import simulate_flight  # noqa: E402
-from px4fuse.simulation.mistakes import parse_mistakes  # noqa: E402
 from px4fuse.simulation.scenario import Scenario  # noqa: E402
 
 slow_errors, larger_errors = (
@@ -68,7 +68,8 @@ IDS_FROM_LOGS = {
     "gyroscope_bias",
     "imu_values_impossible",
     "parameter_changed",
-    "source_height_only",
+    "source_coordinate_constant",
+    "source_height_constant",
     "source_relocalises",
 }
 LABEL_LENGTH = 26  # characters per line of an axis label
@@ -115,7 +116,7 @@ def find_in_changed_timestamps() -> list[Finding]:
         attitude=flight.attitude.set_axis(flight.attitude.index + 0.2),
         ekf2=replace(flight.ekf2, record=record),
     )
-    faults = ("attitude_late", "source_latency_grows")
+    faults = ("attitude_late", "source_latency_varies")
     return [finding for finding in find(unexplained(compare(flight))) if finding.id in faults]
 
 
@@ -128,7 +129,7 @@ def examples() -> dict[str, Example]:
             example_by_id.setdefault(finding.id, Example(finding, flight, analysis))
 
     for name, (faults, settings) in SIMULATED.items():
-        flight = simulate_flight(Scenario(passes=4, seed=2), parse_mistakes(faults))
+        flight = simulate_flight(Scenario(passes=4, seed=2), parse_faults(faults))
         analysis = find_faults(compare(flight, Settings(**settings)))
         command = " ".join(["px4fuse simulate", *(f"--mistake {fault}" for fault in faults)])
         options = [f"--{key[:7].replace('_', '-')} {value:g}" for key, value in settings.items()]
@@ -332,7 +333,7 @@ def save_picture(name: str, example: Example, folder: Path) -> str:
     axis_analysis = example.analysis.axes.get(str(axis)) or example.analysis.main
     figure, panels = pyplot.subplots(3, sharex=True, figsize=(8, 7), layout="constrained")
     for axes, panel in zip(panels, (POSITION, INNOVATIONS, SIGMA_P), strict=True):
-        panel.draw(axes, axis_analysis.in_flight)
+        panel.draw(axes, axis_analysis.with_flight_tracks())
         axes.set_ylabel(fill(panel.title, LABEL_LENGTH))
     panels[0].set_title(axis_analysis.axis.name)
     panels[-1].set_xlabel("time (s)")

@@ -9,7 +9,7 @@
 import importlib as _importlib
 import typing as _typing
 
-# Module of each public name; a module is imported at first use, so that ``px4fuse --help`` is fast
+# Module of each public name. A module is imported at the first use of a name, which saves time
 _MODULES = {
     "Analysis": "analysis",
     "Px4FuseError": "errors",

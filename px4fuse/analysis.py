@@ -1,4 +1,4 @@
-"""Records with the results of an analysis, computed by :mod:`px4fuse.diagnose`."""
+"""Data classes for the results of :mod:`px4fuse.diagnose`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,17 +21,20 @@ from px4fuse.request import ComparisonRequest
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Analysis(Comparison, Estimates, Reruns):
-    """Comparison of KF and EKF2, with parameter estimates, re-runs of both filters and faults.
+    """Comparison of KF and EKF2 on one flight, with parameter estimates, filter re-runs and faults.
 
     Attributes
     ----------
+    events : Events
+        Gaps, dropouts, resets and times on the ground.
     aids : mapping from PX4's name to AidResult, or Unavailable
         Innovation statistics of each aiding source of EKF2.
     loop : Loop or Unavailable
-        Loop closure error of the flight's odometry, and corrected paths.
+        Loop closure error of the odometry in the log, and corrected paths.
     findings : tuple of Finding
         Faults of the flight, most severe first, each cause followed by its effects.
     request : ComparisonRequest or None
+        Files and settings of the analysis.
     """
 
     events: Events
@@ -49,28 +52,26 @@ class Analysis(Comparison, Estimates, Reruns):
         model = self.ekf2_model
         return model if isinstance(model, Unavailable) else model.baseline_replay
 
-    @property
-    def main_trials(self) -> list[Trial]:
-        """Re-runs along the main axis, except EKF2 re-runs that are not compared with the log."""
+    def select_main_trials(self) -> list[Trial]:
+        """Return the re-runs along the main axis that are compared with logged results."""
         main_axis = self.main.axis.name
         return [trial for trial in self.trials if trial.axis == main_axis and trial.is_logged]
 
-    @property
-    def secondary_axes(self) -> list[AxisComparison]:
-        """Comparisons along all axes except ``main``, the axis with the largest motion."""
+    def select_secondary_axes(self) -> list[AxisComparison]:
+        """Return comparisons along all axes except ``main``, the axis with the largest motion."""
         return [axis for axis in self.axes.values() if axis is not self.main]
 
 
 @dataclass(frozen=True)
 class AidsOnlyAnalysis:
-    """Evaluation of EKF2's aiding sources in a flight without positions for the filter KF.
+    """Evaluation of EKF2's aiding sources, for a flight without positions for KF.
 
     Attributes
     ----------
     flight : Flight
     aids : mapping from PX4's name to AidResult
     missing_data : Unavailable
-        Reason why KF cannot be run, and advice for logging positions.
+        Reason why KF cannot run, and advice to log positions.
     findings : tuple of Finding
         Faults of the aiding sources.
     """
@@ -90,13 +91,13 @@ class WhatIfAnalysis:
     Attributes
     ----------
     changes : mapping from PX4 name to value
-        Changed parameters of EKF2; empty if the user requested only a sweep of one parameter.
+        Changed parameters of EKF2; empty if only a range of values of one parameter is replayed.
     uses_estimates : bool
-        True if the changes are the maximum-likelihood estimates.
+        True if ``changes`` are maximum-likelihood estimates.
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
-        Causes of the difference between KF (default settings) and EKF2 as flown.
+        Causes of the difference between KF (default settings) and EKF2 (logged).
     without : mapping from PX4's name of an aiding source to float
-        Aiding sources switched off in the replays, each with the time (s) of switching off.
+        Time (s) from which EKF2 does not fuse the aiding source in the replays.
     """
 
     flight: Flight
@@ -110,15 +111,14 @@ class WhatIfAnalysis:
 
     @property
     def sweep_start_index(self) -> int:
-        """Number of replays before the sweep: 1 with ``changes`` or ``without``, else 0."""
+        """Index of the first replay that belongs to a parameter sweep."""
         return int(bool(self.changes or self.without))
 
 
 def failed_checks(analysis: Analysis | AidsOnlyAnalysis) -> dict[str, str]:
-    """Return the consistency verdicts of failed EKF2 checks, by axis or aiding source.
+    """Return the axes and aiding sources for which EKF2 is not consistent, with the reason.
 
-    A check fails if EKF2 is overconfident along an axis, or if an aiding source is overconfident,
-    biased or not fused for too long.
+    Reasons are: overconfident, or (only aiding sources) biased or not fused for a long time.
     """
     failed_verdicts = {}
     if isinstance(analysis, Analysis):

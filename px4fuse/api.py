@@ -1,4 +1,4 @@
-"""The px4fuse commands as Python functions."""
+"""Python functions of px4fuse that correspond to its commands."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -28,7 +28,7 @@ from px4fuse.trajectory.model import Trajectory
 
 Pathlike = str | Path
 Progress = Callable[[str], None]
-# Columns of table(): floats, except for "count" and "verdict"
+# Columns of the table that table() returns: numbers, except "verdict"
 SUMMARY_COLUMNS = (
     "count",
     "nis_mean",
@@ -64,7 +64,7 @@ def compare(
     system: int | None = None,
     progress: Progress = lambda _: None,
 ) -> Analysis:
-    """Compare KF with EKF2 on one flight, as ``px4fuse compare`` does.
+    """Compare KF (two-state Kalman filter) with EKF2 on one flight, as ``px4fuse compare`` does.
 
     Parameters
     ----------
@@ -77,13 +77,13 @@ def compare(
         Time offset to add to the timestamps of the position source; "auto" estimates it. Default:
         0, or "auto" with ``position``.
     axes : str or sequence of str
-        "north", "east", "down" or "aisle"; default: all axes of the position source.
+        "north", "east", "down" or "aisle" (main direction of the track); default: all axes.
     heading_deg : float, optional
         Heading of the axis "aisle", clockwise from north; default: main direction of the track.
     start_s, end_s : float, optional
         Analysed time span, in seconds after the first data; default: take-off and landing.
     position_source : str, optional
-        Name of the position track for KF; default: the track closest to the raw measurement.
+        Name of the position source for KF; default: the source closest to the raw measurement.
     source_kind : {"uwb", "vio", "mocap", "gnss"}, optional
         Kind of the position source; default: from its messages.
     height : {"gnss", "barometer"}, optional
@@ -93,12 +93,12 @@ def compare(
     system : int, optional
         MAVLink system id of the vehicle; default: the id with the most messages.
     progress : callable
-        Function that receives the name of each step of the computation.
+        Called with the name of each step of the computation.
 
     Returns
     -------
     Analysis
-        Argument of :func:`px4fuse.table`, :func:`px4fuse.find`, :func:`px4fuse.write_report` and
+        Use it with :func:`px4fuse.table`, :func:`px4fuse.find`, :func:`px4fuse.write_report` and
         :func:`px4fuse.write_page`.
 
     Raises
@@ -106,7 +106,7 @@ def compare(
     LogError, MissingDataError, SettingsError
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
-    arguments = locals()  # names equal the fields of ComparisonRequest
+    arguments = locals()  # the names are fields of ComparisonRequest
     known_axes = get_args(request.AxisName)
     axis_names = (axes,) if isinstance(axes, str) else tuple(axes)
     if unknown_axes := set(axis_names).difference(known_axes):
@@ -223,7 +223,7 @@ def close_loop(
     closed_loop : bool
         False if the vehicle did not return to the take-off place.
     closures : sequence of px4fuse.request.GivenClosure
-        Other loop closures: pairs of times at which the vehicle was at the same place.
+        Further loop closures: two times at which the vehicle was at the same place.
     reference : str, Path or Trajectory, optional
         Reference for the ATE and RPE of each path, in addition to the ground truth of the log.
     position_drift_m, heading_drift_deg : float
@@ -233,7 +233,7 @@ def close_loop(
     frame : str, optional
         Frame of a trajectory file: "NED", "FRD", "ENU" or "camera"; default: detected.
     progress : callable
-        Function that receives the name of each step of the computation.
+        Called with the name of each step of the computation.
 
     Raises
     ------
@@ -293,9 +293,9 @@ def write_page(analysis: Analysis, path: Pathlike) -> Path:
 
 @display_html.register
 def _display_card(analysis: Analysis) -> str | None:
-    from px4fuse.report.card_html import card_of, notebook_html  # noqa: PLC0415 - slow import
+    from px4fuse.report.card_html import make_diagnosis_card, notebook_html  # noqa: PLC0415 - slow import
 
-    return None if analysis.request is None else notebook_html(card_of(analysis))
+    return None if analysis.request is None else notebook_html(make_diagnosis_card(analysis))
 
 
 def _require_suffix(path: Pathlike, suffix: str) -> Path:
@@ -310,7 +310,7 @@ def _require_suffix(path: Pathlike, suffix: str) -> Path:
 def _require_request(analysis: Analysis) -> request.ComparisonRequest:
     if analysis.request is None:
         raise SettingsError(
-            "This analysis was not made by px4fuse.compare, so the command to print is unknown.",
+            "This analysis was not made by px4fuse.compare. The report needs its command line.",
             "Make the analysis with px4fuse.compare.",
         )
     return analysis.request
@@ -321,7 +321,7 @@ def what_if(
     changes: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
     without: Mapping[str, float] | None = None,
 ) -> WhatIf:
-    """Replay EKF2 with other parameters.
+    """Replay EKF2 with changed parameters, or without some aiding sources.
 
     Parameters
     ----------
@@ -331,7 +331,7 @@ def what_if(
         Parameter values by PX4 name, in PX4's units; one replay per mapping. Default: the
         maximum-likelihood estimates of noise and delay of the position source.
     without : mapping of str to float, optional
-        Time (s) from which EKF2 does not fuse an aiding source, such as ``{"gnss_pos": 60.0}``.
+        Time (s) from which EKF2 does not fuse an aiding source, for example ``{"gnss_pos": 60.0}``.
 
     Raises
     ------

@@ -1,19 +1,21 @@
-"""Diagnosis of one flight: from a request (files and settings) to the faults, in seven steps.
+"""Diagnosis of one flight, from a request (files and settings) to the faults.
 
 1. read: log → Flight
 2. prepare: position source, time span and axes
 3. filter: run KF along each axis
 4. compare: KF, EKF2 and ground truth
-5. estimate: noises, time offset, frame misalignment, biases
-6. rerun: re-run both filters with one change at a time
-7. find: faults of the flight, with their causes
+5. estimate: noises, time offset, frame misalignment, biases. The estimated time offset replaces a
+   delay that step 2 detected, in the report only
+6. rerun: replay EKF2, explain KF - EKF2, re-run both filters with one change at a time
+7. analyse the rest of the flight: loop closure, EKF2's other aiding sources, events
+8. find: faults of the flight, with their causes
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from msgspec import structs
 
@@ -33,7 +35,7 @@ from px4fuse.comparison.estimates import (
 )
 from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison, PreparedComparison
-from px4fuse.comparison.preparation import explain_missing_source, prepare
+from px4fuse.comparison.preparation import explain_missing_source, prepare, shift_clock
 from px4fuse.comparison.remedy import ml_ekf2_parameters
 from px4fuse.comparison.reruns import Reruns, planned_configurations, rerun_filters
 from px4fuse.convention.correction import convention_faults
@@ -48,6 +50,7 @@ from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.findings import find, find_aids
+from px4fuse.findings.cause_grouping import CONVENTION
 from px4fuse.flight.ekf2_parameters import check_parameters
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
 from px4fuse.loop.model import Loop
@@ -64,17 +67,17 @@ def diagnose(
     *,
     as_sent: bool = False,
 ) -> Analysis:
-    """Read a flight, compare KF with EKF2, and find faults (steps 1 to 7).
+    """Read a flight, compare KF with EKF2, and find faults (steps 1 to 8).
 
     Parameters
     ----------
     request : ComparisonRequest
     progress : callable
-        Function that receives the name of each step of the computation.
+        Called with the name of each step of the computation.
     flight : Flight, optional
-        Flight from the files of the request; without it, the files are read.
+        Flight that was already read from the files of the request.
     as_sent : bool
-        True to use axes, unit and timestamps of the positions as sent to PX4, without a check.
+        True to skip the check and correction of axes, unit and timestamps of the positions.
 
     Raises
     ------
@@ -82,29 +85,70 @@ def diagnose(
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
     flight = flight or read_flight(request, progress)
-    prepared = prepare_comparison(request, progress, flight, as_sent=as_sent)
-    kf_runs = run_kf(prepared, progress)
-    comparison = compare(prepared, kf_runs)
+    analysis = _diagnose_flight(request, progress, flight, as_sent=as_sent)
+    if refined_flight := _refine_file_clock(flight, analysis):
+        analysis = _diagnose_flight(request, progress, refined_flight, as_sent=as_sent)
+    return analysis
+
+
+def _diagnose_flight(
+    request: ComparisonRequest, progress: Progress, flight: Flight, *, as_sent: bool
+) -> Analysis:
+    prepared_comparison = prepare_comparison(flight, request, progress, as_sent=as_sent)
+    kf_runs = run_kf(prepared_comparison, progress)
+    comparison = compare(prepared_comparison, kf_runs)
     return replace(find_faults(comparison, progress), request=request)
 
 
-def find_faults(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
-    """Find the faults of a flight (steps 5 to 7): estimate errors, re-run filters, find causes.
+def _refine_file_clock(flight: Flight, analysis: Analysis) -> Flight | None:
+    """Correct an estimated clock offset of a position file by that of the IMU, if they differ.
 
-    For a flight that is an assignment, the result contains only the comparison.
+    The first estimate is from EKF2's positions, which may be late.
+    """
+    alignment, clock = analysis.source.alignment, analysis.clock
+    if (
+        alignment is None
+        or alignment.clock_offset_sigma_s is None
+        or alignment.reference != "EKF2 position"
+        or not isinstance(clock, ClockOffset)
+        or all(found.id != "source_time_offset" for found in analysis.findings)
+        or any(CONVENTION in found.evidence for found in analysis.findings)
+    ):
+        return None
+    difference = f"{abs(clock.offset_s):.3f} s {'late' if clock.offset_s < 0 else 'early'}"
+    alignment = structs.replace(
+        alignment,
+        clock_offset_s=alignment.clock_offset_s + clock.offset_s,
+        clock_offset_sigma_s=clock.sigma_s,
+        clock_reason=f"the offset was estimated with the IMU, because EKF2's position is "
+        f"{difference} relative to the IMU",
+    )
+    file_track, *other_tracks = flight.positions
+    shifted_track = replace(shift_clock(file_track, clock.offset_s), alignment=alignment)
+    return replace(flight, positions=(shifted_track, *other_tracks))
+
+
+def find_faults(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
+    """Estimate errors, re-run KF and EKF2, and find faults and their causes (steps 5 to 8).
+
+    If students must find the faults of the flight, only the comparison is returned.
     """
     if comparison.flight.log.is_assessed:
-        withheld_fields: dict[str, Any] = {
-            field.name: DIAGNOSIS_WITHHELD for field in fields(Analysis) if field.default is MISSING
-        }
-        known_fields = {
+        return Analysis(
             **vars(comparison),
-            "tuning": {HORIZONTAL: DIAGNOSIS_WITHHELD},
-            "difference_steps": dict.fromkeys(comparison.axes, DIAGNOSIS_WITHHELD),
-            "trials": (),
-            "events": collect_events(comparison),
-        }
-        return Analysis(**withheld_fields | known_fields)
+            tuning={HORIZONTAL: DIAGNOSIS_WITHHELD},
+            clock=DIAGNOSIS_WITHHELD,
+            heading=DIAGNOSIS_WITHHELD,
+            systematic_errors=DIAGNOSIS_WITHHELD,
+            source_low_pass=DIAGNOSIS_WITHHELD,
+            time_correlated_noise=DIAGNOSIS_WITHHELD,
+            ekf2_model=DIAGNOSIS_WITHHELD,
+            difference_steps=dict.fromkeys(comparison.axes, DIAGNOSIS_WITHHELD),
+            trials=(),
+            events=collect_events(comparison),
+            aids=DIAGNOSIS_WITHHELD,
+            loop=DIAGNOSIS_WITHHELD,
+        )
     estimates = estimate(comparison, progress)
     release_free_memory()
     comparison = refine_delay(comparison, estimates.clock)
@@ -114,7 +158,7 @@ def find_faults(comparison: Comparison, progress: Progress = ignore_progress) ->
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
 
     flight = comparison.flight
-    analysis = Analysis(
+    analysis = Analysis(  # which has the fields of Comparison, Estimates and Reruns
         **vars(comparison),
         **vars(estimates),
         **vars(reruns),
@@ -126,26 +170,26 @@ def find_faults(comparison: Comparison, progress: Progress = ignore_progress) ->
 
 
 def refine_delay(comparison: Comparison, clock: ClockOffset | Unavailable) -> Comparison:
-    """Replace the delay of the timestamps in the finding by the more precise estimate ``clock``.
+    """Replace the detected delay of the position timestamps by the more precise estimate ``clock``.
 
-    KF is not run again: :func:`prepare` has already subtracted the first estimate of the delay, and
-    the re-runs test the remaining offset, ``clock.remaining_s``.
+    KF is not run again: :func:`prepare` has already corrected the detected delay, and later re-runs
+    test the remaining offset ``clock.remaining_s``.
     """
     if comparison.convention is None or isinstance(clock, Unavailable) or not clock.is_determinable:
         return comparison
-    # a time offset is negative if the timestamps are late
+    # a time offset is negative for late timestamps
     refined_convention = structs.replace(comparison.convention, late_s=-clock.offset_s)
-    # If the refined delay is too small for a finding, the first estimate is kept: the report must
-    # contain the delay that prepare subtracted
+    # keep the first delay if the refined delay is too small to be a fault: the report must contain
+    # the delay that was corrected
     is_fault = all(
-        convention_faults(convention, comparison.flight, comparison.source.frame).late_s
+        convention_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
         for convention in (comparison.convention, refined_convention)
     )
     return replace(comparison, convention=refined_convention) if is_fault else comparison
 
 
 def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress) -> Flight:
-    """Read the log of a request, and add the positions of its position file.
+    """Read a log, and add the positions in a separate position file, if any.
 
     Raises
     ------
@@ -159,7 +203,7 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
     requested_file, offset_s = request.position, request.clock_offset_s
     if requested_file is None:
         return flight
-    # imported on demand, as alignment imports scipy.signal and scipy.ndimage, which takes 0.2 s
+    # imported on demand: scipy.signal and scipy.ndimage need 0.2 s
     from px4fuse.alignment.placement import align_position_file  # noqa: PLC0415
     from px4fuse.readers.position_file import read_position_file  # noqa: PLC0415
 
@@ -180,22 +224,21 @@ def read_flight(request: ComparisonRequest, progress: Progress = ignore_progress
 
 
 def prepare_comparison(
+    flight: Flight,
     request: ComparisonRequest,
     progress: Progress = ignore_progress,
-    flight: Flight | None = None,
     *,
     as_sent: bool = False,
 ) -> PreparedComparison:
-    """Choose position source, time span, axes and time offset of a flight, before KF runs.
+    """Choose position source, time span, axes and time offset, before KF runs.
 
-    Arguments and errors are those of :func:`diagnose`.
+    For arguments and errors see :func:`diagnose`.
     """
-    flight = flight or read_flight(request, progress)
-    prepared = prepare(flight, request, as_sent=as_sent)
-    # read_flight has already estimated the time offset of a position file
+    prepared_comparison = prepare(flight, request, as_sent=as_sent)
+    # read_flight has already corrected the time offset of a position file
     if request.clock_offset_s != AUTO or request.position is not None:
-        return prepared
-    _, clock = estimate_noises_and_clock(prepared, progress)
+        return prepared_comparison
+    _, clock = estimate_noises_and_clock(prepared_comparison, progress)
     if isinstance(clock, Unavailable) or not clock.is_determinable:
         raise MissingDataError(
             f"{flight.log.name}: the time offset cannot be estimated from this flight "
@@ -203,12 +246,14 @@ def prepare_comparison(
             "State the offset (--clock-offset SECONDS), or omit --clock-offset.",
         )
     if not clock.is_significant(clock.remaining_s):
-        low, high = clock.interval_s
+        low, high = (limit_s - clock.applied_s for limit_s in clock.interval_s)
         note = (
-            f"--clock-offset auto: the time offset {clock.offset_s:+.3f} s (95 % {low:+.3f} to "
+            f"--clock-offset auto: the time offset {clock.remaining_s:+.3f} s (95 % {low:+.3f} to "
             f"{high:+.3f} s) is not significant and was not applied"
         )
-        return replace(prepared, notes=(*prepared.notes, note))
+        if clock.applied_s:
+            note += f", in addition to {clock.applied_s:+.3f} s from the check of the timestamps"
+        return replace(prepared_comparison, notes=(*prepared_comparison.notes, note))
     request = structs.replace(request, clock_offset_s=clock.offset_s)
     return prepare(flight, request, as_sent=as_sent)
 
@@ -216,21 +261,24 @@ def prepare_comparison(
 def rerun(
     comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
 ) -> Reruns:
-    """Replay EKF2, explain the difference KF - EKF2, and re-run with single errors corrected."""
+    """Replay EKF2, explain the difference KF - EKF2, and re-run both with one error corrected."""
     progress("replaying EKF2")
-    corrected = corrected_settings(comparison, estimates.tuning)
-    # all parameter sets of this step are replayed together, which is faster than one by one
+    estimated_settings = corrected_settings(comparison, estimates.tuning)
+    # EKF2 replays all parameter sets together, which is faster. The sets must be those that the two
+    # following functions request; other sets are replayed again
     model = open_model(
         comparison.flight,
         lambda inputs: [
-            *explanation_configurations(comparison, inputs, corrected),
+            *explanation_configurations(comparison, inputs, estimated_settings),
             *planned_configurations(comparison, estimates, inputs),
         ],
     )
     release_free_memory()
-    difference_steps = explain_ekf2_difference(comparison, model, estimates.clock, corrected)
+    difference_steps = explain_ekf2_difference(
+        comparison, model, estimates.clock, estimated_settings
+    )
     trials = rerun_filters(comparison, estimates, model)
-    if isinstance(model, Model):  # frees memory; later replays are computed again
+    if isinstance(model, Model):  # to free memory
         model = replace(model, runs=(), intervals={})
     return Reruns(ekf2_model=model, difference_steps=difference_steps, trials=trials)
 
@@ -238,17 +286,17 @@ def rerun(
 def diagnose_or_check_aids(
     request: ComparisonRequest, progress: Progress = ignore_progress, flight: Flight | None = None
 ) -> Analysis | AidsOnlyAnalysis:
-    """Run :func:`diagnose`, or check only EKF2's aiding sources if the flight has no positions.
+    """Run :func:`diagnose`; for a flight without positions, check only EKF2's aiding sources.
 
     Raises
     ------
     LogError, MissingDataError, SettingsError
-        See :func:`diagnose`; also if the flight has no positions and no innovations of EKF2.
+        See :func:`diagnose`. MissingDataError also if EKF2's innovations are missing.
     """
     flight = flight or read_flight(request, progress)
     if request.position_source or any(track.origin.is_automatic for track in flight.positions):
         return diagnose(request, progress, flight)
-    no_position, aids = explain_missing_source(flight), evaluate_aids(flight)
+    missing_source, aids = explain_missing_source(flight), evaluate_aids(flight)
     if isinstance(aids, Unavailable):
         if flight.airborne == ():
             raise MissingDataError(
@@ -256,23 +304,23 @@ def diagnose_or_check_aids(
                 f"({aids.reason}). px4fuse info {flight.log.name} lists the logged data."
             )
         raise MissingDataError(
-            f"{flight.log.name}: {no_position.reason}, and EKF2's aiding sources cannot be "
+            f"{flight.log.name}: {missing_source.reason}, and EKF2's aiding sources cannot be "
             f"checked: {aids.reason}",
-            no_position.remedy,
+            missing_source.remedy,
         )
-    return AidsOnlyAnalysis(flight, aids, no_position, find_aids(aids, flight.ekf2))
+    return AidsOnlyAnalysis(flight, aids, missing_source, find_aids(aids, flight))
 
 
 def run_what_if(
     request: WhatIfRequest, progress: Progress = ignore_progress, flight: Flight | None = None
 ) -> WhatIfAnalysis:
-    """Read a flight and replay EKF2 with other parameters; arguments as in :func:`diagnose`.
+    """Read a flight, and replay EKF2 with changed parameters.
 
     Raises
     ------
     LogError, MissingDataError, SettingsError
-        A file cannot be read, EKF2 cannot be replayed from it or the replay does not agree with
-        the log, or a parameter is unknown or out of PX4's range.
+        The log cannot be read, EKF2 cannot be replayed or the replay does not agree with the log,
+        or a parameter is unknown or out of range.
     """
     changes, sweep = check_parameters(request.changes), request.sweep
     swept_settings: list[dict[str, float]] = []
@@ -300,13 +348,13 @@ def run_what_if(
             comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
             prepared_comparison = prepare(flight, comparison_request)
             comparison = compare(prepared_comparison, run_kf(prepared_comparison))
-    except MissingDataError:  # only the default changes are computed from the comparison
+    except MissingDataError:  # an error only if the parameters are estimated from the comparison
         if is_default_change:
             raise
     if comparison is not None:
         tuning, clock = estimate_noises_and_clock(comparison, progress)
-        corrected = corrected_settings(comparison, tuning)
-        difference_steps = explain_ekf2_difference(comparison, model, clock, corrected)
+        estimated_settings = corrected_settings(comparison, tuning)
+        difference_steps = explain_ekf2_difference(comparison, model, clock, estimated_settings)
         if is_default_change:
             changes = ml_ekf2_parameters(comparison, model, tuning, clock)
     parameter_sets = [changes] if changes or request.without else []
@@ -319,7 +367,7 @@ def run_what_if(
 
 
 def require_available(result: Result | Unavailable, flight: Flight) -> Result:
-    """Return ``result``, or raise MissingDataError with the reason why it is unavailable."""
+    """Return ``result``; raise MissingDataError with the reason if it is unavailable."""
     if isinstance(result, Unavailable):
         reason = f"{flight.log.name}: {result.what}: {result.reason}"
         raise MissingDataError(reason, result.remedy)
@@ -327,7 +375,7 @@ def require_available(result: Result | Unavailable, flight: Flight) -> Result:
 
 
 def analyse_loop_closure(request: LoopRequest, progress: Progress = ignore_progress) -> Loop:
-    """Read a flight or a trajectory, measure its loop closure error and correct the path.
+    """Read a flight or a trajectory, measure the loop closure error, and correct the path.
 
     Raises
     ------

@@ -3,24 +3,22 @@
 ::
 
     Px4FuseError
-    ├── LogError           the log cannot be read, or is not one
-    ├── MissingDataError   the log can be read, but the required data are not in it
+    ├── LogError           the file cannot be read, or is not a flight log
+    ├── MissingDataError   the log does not contain the required data
     ├── TrajectoryError    a trajectory or pose graph cannot be read or used
-    ├── SettingsError      a setting is outside its documented range
-    ├── ResultsError       a file contains no results of px4fuse that this version reads
+    ├── SettingsError      a setting is not valid
+    ├── ResultsError       a file contains no results that this px4fuse version can read
     └── OutputError        a result cannot be written
 
-The text is one line: the error, the file or setting, and advice. The command line replaces Python
-arguments in backticks (`sigma_z_m`) by options (--sigma-z), and ends with exit code 2.
+The text is one line: the error, the file or setting, and advice. On the command line, Python
+arguments in backticks (`sigma_z_m`) are replaced by options (--sigma-z); the exit code is 2.
 """
 
 from collections.abc import Iterable
 
 
 def suggest_name(name: str, known_names: Iterable[str]) -> str:
-    """Return "Did you mean X? " with the most similar known name X.
-
-    Return an empty string if there is no similar name.
+    """Return "Did you mean X? " with the most similar known name X, or "".
 
     >>> suggest_name("EKF2_EVP_NOIS", ["EKF2_EVP_GATE", "EKF2_EVP_NOISE"]), suggest_name("x", ["y"])
     ('Did you mean EKF2_EVP_NOISE? ', '')
@@ -32,9 +30,7 @@ def suggest_name(name: str, known_names: Iterable[str]) -> str:
 
 
 def to_one_line(text: str) -> str:
-    r"""Replace characters that would break or change the line on which the text is printed.
-
-    File names may contain line feeds and escape sequences of a terminal.
+    r"""Replace line feeds and control characters, which file names may contain.
 
     >>> to_one_line("a\nb\x1b[2J")
     'a b?[2J'
@@ -48,9 +44,9 @@ class Px4FuseError(Exception):
     Parameters
     ----------
     reason : str
-        The error, with the file or setting that causes it.
+        Error, with the file or setting that causes it.
     remedy : str
-        Advice to the user, one or more sentences; empty if the reason contains it.
+        Advice to the user; "" if ``reason`` already contains it.
     """
 
     def __init__(self, reason: str, remedy: str = "") -> None:
@@ -60,27 +56,27 @@ class Px4FuseError(Exception):
 
 
 class LogError(Px4FuseError):
-    """The log cannot be read, or is not a flight log."""
+    """The file cannot be read, or is not a flight log."""
 
     id = "log_unreadable"
 
 
 class MissingDataError(Px4FuseError):
-    """The log was read, but the required data are not in it."""
+    """The log does not contain the required data."""
 
     id = "data_missing"
 
 
 class TrajectoryError(Px4FuseError):
-    """A trajectory or pose graph cannot be read, or the required data are not in it."""
+    """A trajectory or pose graph cannot be read or used."""
 
 
 class SettingsError(Px4FuseError):
-    """A setting is outside its documented range."""
+    """A setting is not valid, for example out of range."""
 
 
 class ResultsError(Px4FuseError):
-    """A file contains no results of px4fuse, or none that this version reads."""
+    """A file contains no results that this px4fuse version can read."""
 
 
 class OutputError(Px4FuseError):

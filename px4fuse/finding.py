@@ -1,4 +1,4 @@
-"""Record of a finding, which the detectors in :mod:`px4fuse.findings` make."""
+"""Data class for a fault that the detectors in :mod:`px4fuse.findings` report."""
 
 from collections.abc import Mapping
 from typing import Annotated, Literal
@@ -9,30 +9,29 @@ from px4fuse.core.record import Record, Span
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, Severity, Severity] = ("error", "warning", "note")
-MAX_LISTED_SPANS = 3  # maximum number of printed time spans; more are printed as one range
-MIN_SPAN_S = 0.05  # minimum duration (s) of a span; a shorter span is printed as one time
+MAX_LISTED_SPANS = 3  # maximum number of time spans in a text; more are printed as one range
+MIN_SPAN_S = 0.05  # minimum duration (s) of a time span; a shorter span is printed as one time
 
 
 class Finding(Record, omit_defaults=False):
-    """Fault or condition of a flight that the log shows.
+    """Fault or remark about a flight, detected in its log.
 
     Attributes
     ----------
     id : str
-        Key in ``catalogue.toml``; it does not change between versions.
+        Identifier, for example "source_outliers"; it does not change between versions.
     severity : {"error", "warning", "note"}
-        error: the results are not usable; warning: a result is wrong or missing; note:
-        information on the report.
+        error: the results are not usable; warning: a result is wrong or missing; note: remark.
     message : str
-        The fault, then its effect with numbers.
+        Fault and its effect, with numbers.
     remedy : str
-        Action: a command, a parameter with its value, or a check.
+        Recommended action: a command, a parameter with its value, or a check.
     evidence : dict
-        Numbers by name with unit.
+        Measured numbers that show the fault; the names contain the units.
     title : str
         First sentence of the message: the fault with its numbers.
     caused_by : str or None
-        Id of the finding that causes this one.
+        Id of the finding that causes this finding.
     spans_s : tuple of (float, float)
         Start and end of each occurrence (s from the first data); empty for the whole flight.
     """
@@ -48,7 +47,7 @@ class Finding(Record, omit_defaults=False):
 
     @property
     def when(self) -> str:
-        """Time spans of the finding as text; empty if the finding concerns the whole flight."""
+        """Times of the fault as text; "" for the whole flight."""
         if len(self.spans_s) > MAX_LISTED_SPANS:
             return f"from {self.spans_s[0][0]:.1f} s to {self.spans_s[-1][1]:.1f} s"
         return ", ".join(

@@ -26,7 +26,7 @@ ODOMETRY_M = ((0.0, 0.0), (20.3, 0.2), (20.6, 20.4), (0.8, 20.9), (1.2, 0.8))
 def example_1() -> Replay:
     """Run Example 1: UWB every 0.5 s along an aisle at 1 m/s, initial velocity unknown."""
     settings = Settings(sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input="zero")
-    time = settings.dt_s * np.arange(
+    time_s = settings.dt_s * np.arange(
         PREDICTIONS_PER_UPDATE, PREDICTION_COUNT + 1, PREDICTIONS_PER_UPDATE, dtype=np.float64
     )
     axis = Axis(
@@ -34,8 +34,8 @@ def example_1() -> Replay:
         direction=np.array([1.0, 0.0, 0.0]),
         heading_deg=0.0,
         note="aisle of Example 1 in the course UAT 366",
-        measurement_time_s=time,
-        measurement_m=TRUE_VELOCITY_M_S * time + np.array(UWB_NOISE_M),
+        measurement_time_s=time_s,
+        measurement_m=TRUE_VELOCITY_M_S * time_s + np.array(UWB_NOISE_M),
         acceleration=Unavailable(
             "acceleration", "Example 1 has no acceleration", "No action is needed for Example 1."
         ),
@@ -44,15 +44,15 @@ def example_1() -> Replay:
 
 
 def kalman_lines() -> Iterator[str]:
-    """Yield the lines of Example 1 as the lesson prints them: the state after each UWB update."""
+    """Yield the lines of Example 1, as in the course: the state after each UWB update."""
     kf_run = example_1()
-    for time, row in kf_run.steps.loc[kf_run.updates.index].iterrows():
-        seconds = float(str(time))
+    for index, state in kf_run.steps.loc[kf_run.updates.index].iterrows():
+        time_s = float(str(index))
         yield (
-            f"t {seconds:.1f} s: p {row['position_m']:.2f} (true "
-            f"{TRUE_VELOCITY_M_S * seconds:.2f}), v {row['velocity_m_s']:.2f}, "
-            f"sigma_p {np.sqrt(row['position_variance_m2']):.3f} m, "
-            f"sigma_v {np.sqrt(row['velocity_variance_m2_s2']):.3f} m/s"
+            f"t {time_s:.1f} s: p {state['position_m']:.2f} (true "
+            f"{TRUE_VELOCITY_M_S * time_s:.2f}), v {state['velocity_m_s']:.2f}, "
+            f"sigma_p {np.sqrt(state['position_variance_m2']):.3f} m, "
+            f"sigma_v {np.sqrt(state['velocity_variance_m2_s2']):.3f} m/s"
         )
 
 

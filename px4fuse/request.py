@@ -20,7 +20,7 @@ AUTO: Literal["auto"] = "auto"
 SIGMA_A_M_S2, SIGMA_Z_M, DT_S = 0.5, 0.10, 0.1
 AxisName = Literal["north", "east", "down", "aisle"]
 InputName = Literal["imu", "zero"]
-# Kinds of position source that the user can choose, because the messages in a log are ambiguous
+# Kinds of position source that the user can state if the messages in the log are ambiguous
 SourceKind = Literal["uwb", "vio", "mocap", "gnss"]
 # Directions of x, y and z in a position file, such as east, up and south
 PositionFrame = Literal["ned", "enu", "nwu", "eus", "edn"]
@@ -31,15 +31,15 @@ FrameName = Literal["NED", "FRD", "ENU", "camera"]
 SystemId = Annotated[int, msgspec.Meta(ge=0, le=255)]
 
 
-# Fields of requests that contain a path
+# Fields of the request classes that contain a path
 _PATH_FIELDS = ("log", "path", "source", "estimate", "reference")
 
 
 class _BaseRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Base class of all requests and of the position file."""
+    """Base class of the settings of all commands."""
 
     def without_paths(self) -> Self:
-        """Return the request with file names instead of paths, for the results."""
+        """Replace paths by file names."""
         paths = {name: getattr(self, name, None) for name in _PATH_FIELDS}
         changes: dict[str, Any] = {
             field_name: _file_name(path) for field_name, path in paths.items() if path is not None
@@ -51,13 +51,13 @@ class _BaseRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PositionFile(_BaseRequest, frozen=True, kw_only=True):
-    """Recording of the positioning system, with its frame, columns and units.
+    """File with positions that the positioning system recorded, and its frame, columns and units.
 
     Attributes
     ----------
     path : str
     body : str or None
-        Body or tag in the file, or topic of a ROS bag; None: the only one.
+        Rigid body or tag in the file, or topic of a ROS bag; None if the file has only one.
     frame : {"ned", "enu", "nwu", "eus", "edn"} or None
         Coordinate frame; None: from the column names, else the frame with the best fit to EKF2.
     yaw_deg : float, "auto" or None
@@ -82,9 +82,9 @@ class PositionFile(_BaseRequest, frozen=True, kw_only=True):
 class ComparisonRequest(
     _BaseRequest, frozen=True, kw_only=True, tag_field="command", tag="compare"
 ):
-    """Request to compare KF with EKF2: ``px4fuse compare``, ``tune`` or ``sync``.
+    """Files and settings of ``px4fuse compare``, ``tune`` or ``sync``.
 
-    The fields are the arguments of :func:`px4fuse.compare`. In results, paths are file names.
+    The fields are the arguments of :func:`px4fuse.compare`.
     """
 
     log: str
@@ -105,12 +105,12 @@ class ComparisonRequest(
 
 
 class Landing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Landing place and final heading relative to take-off, measured by the user.
+    """Landing place and heading relative to take-off, as measured by the user.
 
     Attributes
     ----------
     forward_m, right_m : float
-        Distances from the take-off place along the vehicle's nose at take-off, and to its right.
+        Distances of the landing place forward and right of the vehicle at take-off.
     turned_deg : float or None
         Clockwise rotation of the vehicle between take-off and landing; None if unknown.
     """
@@ -121,7 +121,7 @@ class Landing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class GivenClosure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Loop closure from the user: two times at the same place within ``sigma_m`` (1 σ)."""
+    """Loop closure that the user states: equal positions (σ ``sigma_m``) at two times."""
 
     time_1_s: float
     time_2_s: float
@@ -129,12 +129,12 @@ class GivenClosure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LoopRequest(_BaseRequest, frozen=True, kw_only=True, tag_field="command", tag="loop"):
-    """Request to measure and correct a loop closure error: ``px4fuse loop``.
+    """File and settings of ``px4fuse loop``, which corrects a loop closure error.
 
     Attributes
     ----------
     source : str
-        Path of a trajectory or a flight log (``FILE`` or ``LOG:TRACK``); in results its file name.
+        Path of a trajectory or a flight log (``FILE`` or ``LOG:TRACK``).
     frame : str or None
         Coordinate frame of a trajectory file; None: detected.
     system : int or None
@@ -148,6 +148,7 @@ class LoopRequest(_BaseRequest, frozen=True, kw_only=True, tag_field="command", 
     closed_loop : bool
         False if the vehicle did not return to the take-off place.
     closures : tuple of GivenClosure
+        Further loop closures.
     position_drift_m, heading_drift_deg : float
         Drift of the odometry after 100 m (1 σ).
     key_frames_m : float or None
@@ -169,7 +170,7 @@ class LoopRequest(_BaseRequest, frozen=True, kw_only=True, tag_field="command", 
 
 
 class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Values of an EKF2 parameter for replays, spaced logarithmically if ``low`` is above 0."""
+    """Range of an EKF2 parameter for replays; the spacing is logarithmic if ``low`` is above 0."""
 
     parameter: str
     low: float
@@ -178,17 +179,17 @@ class Sweep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class WhatIfRequest(_BaseRequest, frozen=True, kw_only=True, tag_field="command", tag="whatif"):
-    """Request to replay EKF2 with changed parameters: ``px4fuse whatif``.
+    """Log and settings of ``px4fuse whatif``, which replays EKF2 with changed parameters.
 
     Attributes
     ----------
     log : str
-        Path of the ULog; in results its file name.
+        Path of the ULog.
     system : int or None
         MAVLink system id of the vehicle; None: the id with the most messages.
     changes : mapping from PX4 name to value
-        Changed parameters in PX4's units; without any change, the maximum-likelihood estimates of
-        noise and delay are used.
+        Changed parameters in PX4's units; by default the maximum-likelihood estimates of noise and
+        delay.
     sweep : Sweep or None
         Values of one parameter, in addition to ``changes``.
     without : mapping from PX4's name of an aiding source to float
@@ -203,7 +204,7 @@ class WhatIfRequest(_BaseRequest, frozen=True, kw_only=True, tag_field="command"
 
 
 class EvaluationRequest(_BaseRequest, frozen=True, kw_only=True):
-    """Request to compute ATE and RPE of a trajectory: ``px4fuse evaluate``.
+    """Files and settings of ``px4fuse evaluate``, which computes ATE and RPE of a trajectory.
 
     Attributes
     ----------
@@ -233,7 +234,7 @@ class EvaluationRequest(_BaseRequest, frozen=True, kw_only=True):
 Request = ComparisonRequest | LoopRequest | WhatIfRequest
 
 
-# Unit of a field of a request, by the end of the field name
+# Unit of a field, by the suffix of its name
 SUFFIX_UNITS = {"_m_s2": "m/s²", "_m": "m", "_s": "s", "_deg": "°"}
 _POSITION_OPTIONS = {
     "path": "--position",
@@ -249,9 +250,9 @@ _POSITION_OPTIONS = {
 def _option_names(
     request_type: type[msgspec.Struct], excluded: Sequence[str] = (), **renamed_options: str
 ) -> dict[str, str]:
-    """Return the command line option of each optional field of a request, by field name.
+    """Return the command-line option of each optional field, for example ``--max-gap``.
 
-    For example, the option of ``max_gap_s`` is ``--max-gap``. ``renamed_options`` are exceptions.
+    ``renamed_options`` are exceptions from the rule ``max_gap_s`` → ``--max-gap``.
     """
     option_names = {
         field.name: "--" + re.sub(f"({'|'.join(SUFFIX_UNITS)})$", "", field.name).replace("_", "-")
@@ -261,7 +262,7 @@ def _option_names(
     return option_names | renamed_options
 
 
-# Command line options of the fields of requests, except positional arguments such as LOG
+# Command-line options of the optional fields of each request class
 OPTION_NAMES: Mapping[type[msgspec.Struct], Mapping[str, str]] = {
     ComparisonRequest: _option_names(ComparisonRequest, ["position"], axes="--axis")
     | _POSITION_OPTIONS,
@@ -278,12 +279,12 @@ OPTION_NAMES: Mapping[type[msgspec.Struct], Mapping[str, str]] = {
     EvaluationRequest: _option_names(EvaluationRequest),
 }
 COMPARISON_OPTIONS = OPTION_NAMES[ComparisonRequest]
-# Options of arguments that occur in the error messages of several commands
+# Options that occur in the error messages of several commands, by Python argument
 _SHARED_OPTION_NAMES = {"position": "--position", "changes": "--set", "scheduler": "--scheduler"}
 
 
 def with_options(text: str, option_names: Mapping[str, str] = COMPARISON_OPTIONS) -> str:
-    """Replace names of Python arguments in backticks by options of the command line.
+    """Replace Python arguments in backticks by command-line options.
 
     >>> with_options("`sigma_z_m` 0 is out of range: give 0.0001 to 100 m.")
     '--sigma-z 0 is out of range: give 0.0001 to 100 m.'
@@ -295,25 +296,25 @@ def with_options(text: str, option_names: Mapping[str, str] = COMPARISON_OPTIONS
 def command_line(
     request: Request | EvaluationRequest, command: str | None = None, *, for_shell: bool = False
 ) -> str:
-    """Format the command line that repeats an analysis, without options at their defaults.
+    """Format the command line that repeats an analysis; options with default values are omitted.
 
     Parameters
     ----------
     request : Request or EvaluationRequest
     command : str, optional
-        Name of the command; by default ``compare``, ``loop``, ``whatif`` or ``evaluate``.
+        Name of the command; by default from the type of ``request``.
     for_shell : bool
-        True: with paths and quotes for the shell of this system. False: with file names and quotes
-        for a POSIX shell.
+        True: paths, quoted for the shell of this system. False: file names, quoted for a POSIX
+        shell.
     """
     shown_request = request if for_shell else request.without_paths()
-    # required fields of a request are input files, and all other fields are options
+    # required fields are input files, and all other fields are options
     files = [
         getattr(shown_request, field.name)
         for field in msgspec.structs.fields(shown_request)
         if field.required
     ]
-    # a path that begins with "-" would be read as an option
+    # without "./", a path that begins with "-" is read as an option
     files = [f"./{path}" if path.startswith("-") else path for path in files]
     arguments = [command or str(type(shown_request).__struct_config__.tag or "evaluate"), *files]
     arguments += [word for pair in _all_options(shown_request) for word in pair if word is not None]
@@ -337,7 +338,7 @@ def quote_command(words: Sequence[str]) -> str:
 
 
 def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) -> str:
-    """Format the settings that differ from their defaults as a part of a file name.
+    """Format the settings that differ from their defaults, as the end of a file name.
 
     >>> file = PositionFile(path="b/c.csv")
     >>> settings_name(ComparisonRequest(log="a.ulg", sigma_z_m=0.05, position=file))
@@ -351,7 +352,7 @@ def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) 
 
 
 def _all_options(request: msgspec.Struct) -> Iterator[tuple[str, str | None]]:
-    """Yield options with values (None for a flag) of fields that differ from their defaults."""
+    """Yield each option that differs from its default, with its value (None for a flag)."""
     option_names = OPTION_NAMES[type(request)]
     for field in msgspec.structs.fields(request):
         value = getattr(request, field.name)
@@ -374,9 +375,6 @@ def _option_text(value: Any) -> str:
 
 
 def _file_name(path: str) -> str:
-    """Return the file name in a path, with the topic of a ROS bag (``BAG:/TOPIC``).
-
-    Bytes that are not UTF-8 become question marks.
-    """
+    """Return the file name in a path, including the topic of a ROS bag (``BAG:/TOPIC``)."""
     file, topic, _ = re.split(r"((?<=..):/.*|$)", path, maxsplit=1, flags=re.DOTALL)
     return replace_unencodable(PurePath(file).name) + topic

@@ -13,7 +13,7 @@ from conftest import REPORT, blank_page
 
 from px4fuse.classroom.grading import grade as grading
 from px4fuse.classroom.grading import records
-from px4fuse.classroom.grading.model import Entry, GradedReport, Item
+from px4fuse.classroom.grading.model import Grade, GradedReport, ItemScore
 from px4fuse.core import workers
 from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import log_sha256, verify
@@ -42,7 +42,7 @@ def skip_verification(monkeypatch) -> list[str]:
         return VERIFIED if log_sha256(results) in logs else verify(results, pdf, logs)
 
     monkeypatch.setattr(records, "verify", verify_by_log)
-    monkeypatch.setattr(records, "diagnose_assigned", lambda results, _: (results, b""))
+    monkeypatch.setattr(records, "repeat_with_diagnosis", lambda results, _: (results, b""))
     in_this_process(monkeypatch)
     return verified_ids
 
@@ -76,14 +76,14 @@ def graded_report(
 ) -> GradedReport:
     """Return a graded report with items A, B, … of 10 points each."""
     items = tuple(
-        Item(chr(ord("A") + at), each, 10.0, "Because.") for at, each in enumerate(points)
+        ItemScore(chr(ord("A") + at), each, 10.0, "Because.") for at, each in enumerate(points)
     )
     values = {"sha256": name, "version": "0.2.0"} | more
     return GradedReport(name, student, student_id, VERIFIED, items, **values)
 
 
-def entry(student_id: str, name: str, total: float | None, **more) -> Entry:
+def grade(student_id: str, name: str, total: float | None, **more) -> Grade:
     one = (
         None if total is None else graded_report(f"{student_id}.pdf", total, student_id=student_id)
     )
-    return Entry(name, student_id, one, total=total, **({"max_points": 10.0} | more))
+    return Grade(name, student_id, one, total=total, **({"max_points": 10.0} | more))

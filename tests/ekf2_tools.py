@@ -3,7 +3,7 @@
 import numpy as np
 
 from px4fuse.ekf2.inputs import FusionRules, Inputs
-from px4fuse.ekf2.intervals import Events
+from px4fuse.ekf2.intervals import StepEvents
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment
 from px4fuse.flight.model import Flight
@@ -50,7 +50,7 @@ def step_state(segment: ReplaySegment, k: int, x: np.ndarray) -> np.ndarray:
 
 
 def plain_replay(
-    inputs: Inputs, segment: ReplaySegment, events: Events
+    inputs: Inputs, segment: ReplaySegment, events: StepEvents
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return innovations and variances of a flight as flown, without rejections.
 

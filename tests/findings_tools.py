@@ -11,7 +11,7 @@ import pandas as pd
 from exchange import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import FILTERS, ErrorsAgainstTruth, FilterSummary, UntestedFilter
+from px4fuse.comparison.model import FILTER_NAMES, ErrorsAgainstTruth, FilterSummary, UntestedFilter
 from px4fuse.comparison.trials import RunStatistics, Trial
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.hypotheses import Estimate, Jump, SystematicErrors
@@ -88,7 +88,10 @@ def source(**parts: Any) -> Any:
         "invalid": NO_INVALID_ROWS,
     }  # fmt: skip
     made = {**usual, **parts}
-    return SimpleNamespace(aid=lambda axis: made["origin"].aid, **made)
+    rate_hz = made.pop("rate_hz")
+    return SimpleNamespace(
+        aid=lambda axis: made["origin"].aid, compute_rate_hz=lambda: rate_hz, **made
+    )
 
 
 def positions(time_s: Any, north_m: Any = 0.0, variance_m2: float = np.nan) -> pd.DataFrame:
@@ -104,7 +107,13 @@ def analysis(
 ) -> Analysis:  # fmt: skip
     """Make an analysis; fields that are not given are Unavailable."""
     if isinstance(ekf2, dict):
-        usual_ekf2 = {"states": {}, "parameters": {}, "aids": {}, "record": NONE}
+        usual_ekf2 = {
+            "states": {},
+            "parameters": {},
+            "aids": {},
+            "record": NONE,
+            "fusion_flags": NONE,
+        }
         ekf2 = made(Ekf2, **{**usual_ekf2, **ekf2})
     usual_flight = {
         "imu": NONE,
@@ -133,7 +142,7 @@ def analysis(
         main=next(iter(axes), axis()), input_axes=tuple(each.axis for each in axes),
         segment=SEGMENT, settings=settings, notes=notes, missing=missing,
         **{"tuning": {}, "difference_steps": {}, "trials": (), **usual, **parts},
-        main_trials=[t for t in parts.get("trials", ()) if t.kinds],
+        select_main_trials=lambda: [t for t in parts.get("trials", ()) if t.kinds],
     )  # fmt: skip
 
 
@@ -141,7 +150,8 @@ def axis(name: str = "north", **parts: Any) -> Any:
     """Make the result of one axis; filters that are not given have no consistency test."""
     usual = dict.fromkeys(("ekf2_innovations", "ekf2_state", "ekf2_variance", "truth"), NONE)
     filters = {
-        key: _with_truth(parts.pop(key, NONE), parts.pop(f"{key}_truth", NONE)) for key in FILTERS
+        key: _with_truth(parts.pop(key, NONE), parts.pop(f"{key}_truth", NONE))
+        for key in FILTER_NAMES
     }
     axis = SimpleNamespace(
         name=name, label="the main axis" if name == "aisle" else name,

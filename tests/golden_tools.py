@@ -44,7 +44,7 @@ def assert_matches_golden(name: str, lines: list[str], paragraph: int | None = N
         at = paragraph or 0
         kept[at : at + 1] = [found]
         path.write_text("\n\n".join(kept) + "\n", encoding="utf-8")
-    text = path.read_text(encoding="utf-8") if paragraph is None else kept[paragraph]
+    text = path.read_text(encoding="utf-8") if paragraph is None else [*kept, ""][paragraph]
     kept, found = text.splitlines(), f"{found}\n".splitlines()
     if len(kept) == len(found):
         pairs = zip(kept, found, strict=True)

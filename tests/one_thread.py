@@ -2,6 +2,6 @@
 
 import os
 
-from px4fuse.core.threads import ONE_THREAD
+from px4fuse.core.threads import ONE_THREAD_ENVIRONMENT
 
-os.environ.update(ONE_THREAD)
+os.environ.update(ONE_THREAD_ENVIRONMENT)

@@ -14,7 +14,7 @@ from class_tools import make_report
 from conftest import REPORT, SAMPLES
 from ulog_tools import make_log
 
-from px4fuse.classroom.assignment.key import AnswerKey, key_text
+from px4fuse.classroom.assignment.key import AnswerKey, format_answer_key
 from px4fuse.results.answer_form import form_text
 
 # Command, its inputs, its options for an output file (with the required ending), and the names that
@@ -67,7 +67,7 @@ def make_desk(folder: Path) -> Path:
         "a.tum": (SAMPLES / "loop_slam.tum").read_bytes(),
         "b.tum": (SAMPLES / "loop_slam.tum").read_bytes(),
         "g.g2o": b"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n",
-        "key.json": key_text(AnswerKey("aisle", ())).encode(), "rubric.toml": b"",
+        "key.json": format_answer_key(AnswerKey("aisle", ())).encode(), "rubric.toml": b"",
         "secret.txt": b"a secret that is long enough",
         "tables/roster.csv": b"id,name\n1,Ada\n", "tables/sheet.csv": b"id,name,grade\n1,Ada,\n",
     }.items():  # fmt: skip

@@ -15,7 +15,7 @@ from px4fuse.trajectory.alignment import Transform
 from px4fuse.trajectory.association import Association
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import Track
-from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
+from px4fuse.trajectory.scores import RelativeError, RmseInterval, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset
 
 SHIPPED = Path(__file__).parent.parent / "reports" / "example" / "aisle_uwb.json"
@@ -33,7 +33,7 @@ def correction(rmse: float, moved_m: float) -> CorrectedPath:
         transform=Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 6),
         association=Association("interpolate", 9, 0.1, 0, 0, 1.0, 1.0),
         time_offset=TimeOffset(offset_s=0.0, is_determinable=True, reason=""),
-        ate=AbsoluteError(statistics, Interval(rmse, rmse, 1, 9.0), NONE),
+        ate=AbsoluteError(statistics, RmseInterval(rmse, rmse, 1, 9.0), NONE),
         rpe=(RelativeError(5.0, "m", True, "reference", statistics, NONE, NONE),),
         notes=(),
         warnings=(),

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from cli_tools import run, run_main
 from exchange import replace
-from findings_tools import made
+from findings_tools import NONE, SEGMENT, log, made, source
 from flights import aisle_flight
 from pypdf import PdfReader
 from ulog_tools import gnss_log, seconds_of, stamps
@@ -18,12 +18,13 @@ from px4fuse.analysis import AidsOnlyAnalysis, failed_checks
 from px4fuse.ekf2.aids import AidResult, evaluate_aids
 from px4fuse.errors import MissingDataError
 from px4fuse.findings import aids as aids_detector
-from px4fuse.findings import find_aids
+from px4fuse.findings import ekf2_state, find_aids
 from px4fuse.findings.aids import detect_in_aids
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import AidLog, Ekf2, Flight, Unavailable
 from px4fuse.readers import read_log
+from px4fuse.readers.px4_positions import NO_FIX_ACTION
 from px4fuse.results.reading import read_results
 
 # --------------------------------------------------------------------------- evaluation
@@ -312,8 +313,40 @@ def test_compare_of_log_without_take_off_raises_an_error(tmp_path: Path) -> None
     assert not (tmp_path / "a.pdf").exists()
 
 
+def aids_only(**ekf2: Any) -> Any:
+    """Make a flight without positions."""
+    usual = {"instances": ((0.5, 0),), "states": {}, "fusion_flags": NONE}
+    return SimpleNamespace(
+        ekf2=made(Ekf2, **{**usual, **ekf2}), airborne=((5.0, 50.0),), log=log(), missing=()
+    )
+
+
 def test_aiding_source_report_lists_ekf2_instance_changes() -> None:
-    ekf2 = made(Ekf2, instances=((0.5, 0), (12.0, 1), (13.5, 0)))
-    (finding,) = find_aids({}, ekf2)
+    (finding,) = find_aids({}, aids_only(instances=((0.5, 0), (12.0, 1), (13.5, 0))))
     assert (finding.id, finding.evidence["count"]) == ("ekf2_instance_switch", 2)
-    assert not find_aids({}, made(Ekf2, instances=((0.5, 0),)))
+    assert not find_aids({}, aids_only())
+
+
+def test_missing_heading_alignment_without_positions_is_reported() -> None:
+    states = {"tilt_align": pd.Series([1.0], [0.0]), "yaw_align": pd.Series([0.0], [0.0])}
+    (finding,) = find_aids({}, aids_only(states=states))
+    assert finding.id == "ekf2_not_aligned"
+    assert "heading" in finding.title
+    assert finding.remedy.startswith("Calibrate the magnetometer")
+
+
+def test_gnss_without_fix_is_reported() -> None:
+    flight = aids_only()
+    reason = "the log has 9 vehicle_gps_position, none with a 3D fix"
+    flight.missing = (Unavailable("", reason, NO_FIX_ACTION, "vehicle_gps_position"),)
+    (finding,) = find_aids({}, flight)
+    assert finding.id == "source_without_position"
+    assert "none with a 3D fix" in finding.message
+
+
+def test_yaw_fusion_without_orientation_is_named_in_the_action() -> None:
+    flight = aids_only(states={"yaw_align": pd.Series([0.0], [0.0])})
+    flight.log = log(parameters={"EKF2_EV_CTRL": 9, "EKF2_MAG_TYPE": 5})
+    (finding,) = ekf2_state.detect_missing_alignment(flight, SEGMENT, source())
+    assert "EKF2_EV_CTRL bit 3 is set, but the orientation is missing" in finding.remedy
+    assert "Calibrate the magnetometer" not in finding.remedy

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from px4fuse.alignment.placement import align_position_file
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU
 from px4fuse.core.arrays import Array
+from px4fuse.diagnose import diagnose
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import (
     POSITION_FILE,
@@ -30,6 +31,10 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers import read_log
 from px4fuse.readers.position_file import SAMPLE_COLUMNS, PositionRecording, read_position_file
+from px4fuse.request import ComparisonRequest
+from px4fuse.simulation.faults import parse_faults
+from px4fuse.simulation.flights import simulate_flight
+from px4fuse.simulation.scenario import Scenario
 
 BOOT_S = 2416.25
 OFFSET_S = -1795251250.2  # boot clock minus a UNIX clock
@@ -514,3 +519,19 @@ def test_align_position_file_of_sitl_log_recovers_clock_offset(
         assert np.median(np.abs(error_m)) < 0.08
     alignment, _ = align(replace(flight, ekf2=unavailable("EKF2")), file, frame="ned")
     assert clock_error_s(alignment, true_s) < 2.0 * (alignment.clock_offset_sigma_s or 0.0)
+
+
+def test_file_aligned_with_late_ekf2_track_is_aligned_with_imu():
+    faults = parse_faults(["clock-offset=-0.25", "ekf2-delay=0.001"])
+    late = simulate_flight(Scenario(seed=3, passes=4), faults)
+    truth = late.truth.samples[Columns.POSITION]
+    time_s = np.arange(truth.index[0] + 1.0, truth.index[-1] - 1.0, 0.1)
+    n, e, d = (np.interp(time_s, truth.index, truth[name]) for name in truth)
+    noise = np.random.default_rng(1).normal(0.0, 0.05, (len(time_s), 3))
+    xyz = np.column_stack([e, n, -d]) + noise
+    file = position_file(time_s + late.log.boot_time_s - OFFSET_S, xyz, frame="enu")
+    aligned = align_position_file(late, file)
+    assert clock_error_s(aligned.positions[0].alignment) > 0.1
+    analysis = diagnose(ComparisonRequest(log="late.ulg"), flight=aligned)
+    assert clock_error_s(analysis.source.alignment) < 0.03
+    assert not {"source_time_offset"} & {found.id for found in analysis.findings}

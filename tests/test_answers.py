@@ -24,7 +24,7 @@ from px4fuse.results.answer_form import (
 )
 from px4fuse.results.contract import ComparisonResults
 from px4fuse.results.reading import read_results
-from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
+from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED
 
 SHA256 = "b" * 64
 EMPTY = form_text("s07.ulg", SHA256)
@@ -148,11 +148,11 @@ def test_compare_with_answers_option_prints_answers_in_report(
     reader = PdfReader(report)
     results = read_results(reader.attachments["results.json"][0])
     assert isinstance(results, ComparisonResults)
-    assert results.student.answers.names_no_fault  # type: ignore[union-attr]
+    assert results.student.answers.states_no_fault  # type: ignore[union-attr]
     assert any("Answer form" in page.extract_text() for page in reader.pages)
 
 
-def test_student_answers_on_other_log_are_rejected(tmp_path: Path, sample_log: Path) -> None:
+def test_student_answers_about_another_log_are_rejected(tmp_path: Path, sample_log: Path) -> None:
     form = tmp_path / "f.toml"
     form.write_text(form_text(sample_log.name, SHA256), encoding="utf-8")
     for command in ("compare", "loop"):

@@ -16,8 +16,12 @@ from detector_rates import rates
 
 import px4fuse
 from px4fuse.classroom.assignment import assignment
-from px4fuse.classroom.assignment.assignment import assign, key_path, simulate_assigned_flight
-from px4fuse.classroom.assignment.key import AnswerKey, key_text, read_key
+from px4fuse.classroom.assignment.assignment import (
+    answer_key_path,
+    assign,
+    simulate_assigned_flight,
+)
+from px4fuse.classroom.assignment.key import AnswerKey, format_answer_key, read_answer_key
 from px4fuse.classroom.assignment.random_assignment import (
     EASIEST_DIFFICULTY,
     FAULT_COUNT_FRACTIONS,
@@ -27,7 +31,7 @@ from px4fuse.classroom.assignment.random_assignment import (
     UNDETECTABLE_DIFFICULTY,
     UNDETECTABLE_FRACTION,
     assign_random_flight,
-    derive_key,
+    derive_hmac_key,
 )
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.diagnose import find_faults
@@ -37,7 +41,7 @@ from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.readers import ulog_topics
 from px4fuse.results.answer_form import Answers, read_answers
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 
 SECRET = b"a secret for tests"
 # Flight of student s1 with SECRET: seed, noise and heading, and the faults
@@ -51,7 +55,7 @@ FINDINGS = {
     "ekf2-gate": "ekf2_rejects_positions", "ekf2-delay": "ekf2_ev_delay_wrong",
     "ekf2-off": "ekf2_not_fusing", "open-end": "false_loop_closure",
 }  # fmt: skip
-CHOICE = {choice.mistake: choice for rules in RULES_BY_KIND.values() for choice in rules.mistakes}
+CHOICE = {choice.name: choice for rules in RULES_BY_KIND.values() for choice in rules.faults}
 
 
 def choices_of(drawn):
@@ -95,7 +99,9 @@ class TestDraw:
         # a loop contains no ground truth, which would show the landing
         assert scenario.truth
         assert not assign_random_flight(SECRET, "s1", "loop").scenario.truth
-        assert not assign_random_flight(SECRET, "s1", "aisle", truth=False).scenario.truth
+        assert not assign_random_flight(
+            SECRET, "s1", "aisle", with_ground_truth=False
+        ).scenario.truth
         assert (scenario.seed, scenario.sigma_uwb_m, scenario.heading_deg) == PINNED[0]
         assert drawn.mistake_options == PINNED[1]
         loops = [
@@ -120,8 +126,8 @@ class TestDraw:
         for count, share in enumerate(FAULT_COUNT_FRACTIONS[kind]):
             found = sum(len(one.mistake_options) == count for one in flights) / 1000
             assert found == pytest.approx(share, abs=0.05)
-        names = {choice.mistake for one in flights for choice in choices_of(one)}
-        assert names == {choice.mistake for choice in RULES_BY_KIND[kind].mistakes}
+        names = {choice.name for one in flights for choice in choices_of(one)}
+        assert names == {choice.name for choice in RULES_BY_KIND[kind].faults}
 
     def test_mixed_assignment_contains_straight_and_loop_flights(self):
         mixed = [assign_random_flight(SECRET, f"s{n}", "mixed") for n in range(1000)]
@@ -132,21 +138,21 @@ class TestDraw:
             for n, one in enumerate(mixed)
         )
 
-    def test_two_faults_in_assigned_flight_are_compatible(self):
+    def test_two_faults_in_assignment_flight_are_compatible(self):
         signs = Counter()
         for n in range(300):
             drawn = assign_random_flight(SECRET, f"s{n}", "aisle", 2)
             first, second = choices_of(drawn)
             assert first.is_detectable_with(second)
             assert second.is_detectable_with(first)
-            parse_mistakes(drawn.mistake_options)
+            parse_faults(drawn.mistake_options)
             ratios = [EASIEST_DIFFICULTY]
             for choice, text in zip(choices_of(drawn), drawn.mistake_options, strict=True):
                 if choice.detectable_size is None:
-                    assert text == choice.mistake
+                    assert text == choice.name
                     continue
                 size = float(re.search(r"=([-+]?[\d.]+)", text)[1])
-                signs[choice.mistake, size > 0] += 1
+                signs[choice.name, size > 0] += 1
                 ratio = choice.detectable_size / abs(size)
                 ratios.append(1.0 / ratio if choice.is_smaller_easier else ratio)
                 if choice.start_range_s is not None:
@@ -154,18 +160,16 @@ class TestDraw:
                     assert choice.start_range_s[0] <= at <= choice.start_range_s[1]
             assert drawn.difficulty == pytest.approx(max(ratios), abs=0.011)
             assert EASIEST_DIFFICULTY <= drawn.difficulty <= UNDETECTABLE_DIFFICULTY
-        both = {
-            choice.mistake for choice in RULES_BY_KIND["aisle"].mistakes if choice.has_either_sign
-        }
+        both = {choice.name for choice in RULES_BY_KIND["aisle"].faults if choice.has_either_sign}
         assert {name for name, positive in signs if not positive} == both
 
     def test_minimum_fault_size_equals_smallest_detected_size(self):
         """From the limit on, 95 % of the flights of tests/studies/rates.csv have the finding."""
         table = rates()
         table = table[~table.condition.str.contains("outdoor")]
-        for choice in (choice for rules in RULES_BY_KIND.values() for choice in rules.mistakes):
-            plain = re.compile(rf"--mistake {choice.mistake}(=([\d.]+)\D*)?$")
-            rows = table[(table.finding == FINDINGS[choice.mistake]) & (table.flights >= 10)]
+        for choice in (choice for rules in RULES_BY_KIND.values() for choice in rules.faults):
+            plain = re.compile(rf"--mistake {choice.name}(=([\d.]+)\D*)?$")
+            rows = table[(table.finding == FINDINGS[choice.name]) & (table.flights >= 10)]
             matches = ((plain.search(row.condition), row) for row in rows.itertuples())
             sizes = {float(match[2] or 0.0): row for match, row in matches if match}
             found = {size: row for size, row in sizes.items() if row.rate >= 0.95}
@@ -178,14 +182,14 @@ class TestDraw:
             larger = [s for s in sizes if (s < choice.detectable_size) == choice.is_smaller_easier]
             assert set(larger) <= {choice.detectable_size, *found}
 
-    def test_assigned_flights_cover_full_range_of_difficulty(self):
+    def test_assignment_flights_cover_full_range_of_difficulty(self):
         each = [assign_random_flight(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
         counts, _ = np.histogram(each, bins=4, range=(EASIEST_DIFFICULTY, HARDEST_DIFFICULTY))
         assert counts.min() > 65
         undetectable_count = sum(one > HARDEST_DIFFICULTY for one in each)
         assert undetectable_count / len(each) == pytest.approx(UNDETECTABLE_FRACTION, abs=0.06)
 
-    def test_assigned_flight_seeds_have_128_bits(self):
+    def test_assignment_flight_seeds_have_128_bits(self):
         seeds = [assign_random_flight(SECRET, f"s{n}", "aisle").scenario.seed for n in range(50)]
         assert max(seeds).bit_length() == 128
 
@@ -193,7 +197,7 @@ class TestDraw:
 @pytest.mark.parametrize(
     ("kind", "number", "count"), [("aisle", 0, 2), ("aisle", 2, 2), ("aisle", 2, 1), ("loop", 1, 1)]
 )
-def test_each_fault_in_assigned_log_is_detected_by_analysis(
+def test_each_fault_in_assignment_log_is_detected_by_analysis(
     tmp_path, monkeypatch, kind, number, count
 ):
     log, answer = assignment.simulate_assigned_flight(SECRET, CLASS[number], kind, count, True)
@@ -207,7 +211,7 @@ def test_each_fault_in_assigned_log_is_detected_by_analysis(
     else:
         found = find_faults(compare(flight, axes=("north", "east"))).findings
     drawn = assign_random_flight(SECRET, CLASS[number].student_id, kind, count)
-    wanted = {FINDINGS[choice.mistake] for choice in choices_of(drawn)}
+    wanted = {FINDINGS[choice.name] for choice in choices_of(drawn)}
     assert len(wanted) == count
     assert wanted <= {finding.id for finding in found}
 
@@ -226,7 +230,7 @@ class TestAssign:
     def test_assign_flights_writes_logs_answer_forms_and_answer_key(self, tmp_path):
         folder, key_file = tmp_path / "a" / "flights", tmp_path / "key.json"
         made, written = assign(CLASS, folder, key_file, SECRET, "aisle", 2)
-        key = read_key(key_file)
+        key = read_answer_key(key_file)
         assert (key, written) == (made, 3)
         assert not key.secret
         assert SECRET.decode() not in key_file.read_text(encoding="utf-8")
@@ -255,8 +259,8 @@ class TestAssign:
         assert written == 1
         assert files(folder).items() >= {k: v for k, v in before.items() if k != "key"}.items()
         # the generated secret can be given later
-        assign(CLASS, folder, key_file, derive_key(key.secret), "aisle", 2)
-        assert read_key(key_file).secret == key.secret
+        assign(CLASS, folder, key_file, derive_hmac_key(key.secret), "aisle", 2)
+        assert read_answer_key(key_file).secret == key.secret
 
     def test_assign_flights_does_not_overwrite_other_files(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
@@ -286,8 +290,8 @@ class TestAssign:
         with pytest.raises(KeyboardInterrupt):
             assign(CLASS, folder, key_file, None, "aisle", 2)
         monkeypatch.undo()
-        assert len(read_key(key_file).answers) == 2
-        assert assign(CLASS, folder, key_file, None, "aisle", 2) == (read_key(key_file), 1)
+        assert len(read_answer_key(key_file).answers) == 2
+        assert assign(CLASS, folder, key_file, None, "aisle", 2) == (read_answer_key(key_file), 1)
 
     def test_assign_flights_after_failed_key_write_can_be_repeated(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
@@ -305,20 +309,20 @@ class TestAssign:
                 assign(CLASS[:1], where, key, secret, "aisle", 2)
         assert not any(path.is_file() for path in folder.rglob("*"))
         assert stat.S_IMODE(kept.stat().st_mode) == 0o600 or os.name == "nt"
-        assert assign(CLASS[:1], folder, kept, None, "aisle", 2) == (read_key(kept), 1)
+        assert assign(CLASS[:1], folder, kept, None, "aisle", 2) == (read_answer_key(kept), 1)
 
     def test_answer_key_path_inside_students_folder_is_rejected(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         flights = tmp_path / "flights"
-        assert key_path(flights, None) == tmp_path / "flights_answers.json"
+        assert answer_key_path(flights, None) == tmp_path / "flights_answers.json"
         flights.mkdir()
         monkeypatch.chdir(flights)
         for here in (".", "../flights", "../flights/."):
-            path = key_path(type(flights)(here), None)
+            path = answer_key_path(type(flights)(here), None)
             assert path.resolve() == tmp_path / "flights_answers.json"
         for inside in (flights / "key.json", flights / "a" / "key.json", flights):
             with pytest.raises(OutputError, match="students' folder"):
-                key_path(flights, inside)
+                answer_key_path(flights, inside)
 
 
 class TestKey:
@@ -331,12 +335,12 @@ class TestKey:
 
     def test_answer_key_written_to_file_is_read_back_equal(self, tmp_path):
         path = tmp_path / "key.json"
-        path.write_text(key_text(self.key()), encoding="utf-8")
-        assert read_key(path) == self.key()
+        path.write_text(format_answer_key(self.key()), encoding="utf-8")
+        assert read_answer_key(path) == self.key()
         assert "Do not hand it out" in path.read_text(encoding="utf-8")
 
     def test_read_invalid_answer_key_raises_one_line_error(self, tmp_path):
-        good = json.loads(key_text(self.key()))
+        good = json.loads(format_answer_key(self.key()))
 
         def with_values(**values):
             return json.dumps({**good, **values})
@@ -356,12 +360,12 @@ class TestKey:
         for text in texts:
             path.write_text(text, encoding="utf-8")
             with pytest.raises(SettingsError) as error:
-                read_key(path)
+                read_answer_key(path)
             assert "\n" not in str(error.value)
         for content in (b"\xff\xff", b" " * 20_000_001):
             path.write_bytes(content)
             with pytest.raises(SettingsError):
-                read_key(path)
+                read_answer_key(path)
 
 
 # ------------------------------------------------------------------ command
@@ -385,5 +389,5 @@ class TestCommand:
     def test_simulate_without_secret_stores_new_secret_in_answer_key(self, at):
         given = "--assignment", "roster.csv", "-o", "g", "--kind", "loop"
         kept = run_checked("simulate", *given).output
-        assert "stored in the answer key" in kept
-        assert read_key(at / "g_answers.json").secret not in kept
+        assert "answer key contains a new secret" in kept
+        assert read_answer_key(at / "g_answers.json").secret not in kept

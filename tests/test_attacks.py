@@ -29,7 +29,7 @@ from forgery import (
 from results_tools import LOOP, changed_results, decode_results
 
 from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
-from px4fuse.classroom.assignment.truth import form_truth
+from px4fuse.classroom.assignment.truth import right_form_answers
 from px4fuse.classroom.grading.model import GradedReport
 from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable, read_rubric, score_report
 from px4fuse.errors import ResultsError
@@ -37,7 +37,7 @@ from px4fuse.report import pdf as pdf_module
 from px4fuse.results.answer_form import form_text
 from px4fuse.results.contract import ReportedResults
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.verification import pages
 from px4fuse.verification.model import Verification
@@ -48,7 +48,7 @@ ASK = "Ask the author how the report was made"  # beginning of the action for a 
 
 pytestmark = pytest.mark.usefixtures("cached_analyses", "_compare_pages_in_process")
 
-MISTAKES = ("nlos=3%", "dropout=5s,30s")
+FAULT_TYPES = ("nlos=3%", "dropout=5s,30s")
 GAP = '[[mistake]]\nkind = "dropout"\nsize = 5\nfrom_s = 30\nuntil_s = 35\npanel = "innovations"\n'
 HONEST = """
 I compared my filter with EKF2 on four passes of the aisle. The innovations leave their band
@@ -112,7 +112,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     folder = tmp_path_factory.mktemp("flight")
     scenario = Scenario(passes=4, seed=11, truth=False)
     log, notes, pdf = (folder / name for name in ("s01.ulg", "notes.md", "report.pdf"))
-    simulation = flights.simulate(scenario, parse_mistakes(MISTAKES))
+    simulation = flights.simulate(scenario, parse_faults(FAULT_TYPES))
     log.write_bytes(flights.to_ulog(simulation))
     form = form_text(log.name, hashlib.sha256(log.read_bytes()).hexdigest())
     form = form.replace('kind = ""', 'kind = "nlos"', 1) + GAP
@@ -124,10 +124,10 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
         run_checked("compare", log, "-o", pdf, *own)
     honest = make_verified_report(pdf.read_bytes(), log)
     (sha256,) = honest.files
-    truth = form_truth(simulation, sha256)
+    truth = right_form_answers(simulation, sha256)
     answers = (
         RightAnswers(
-            "s01", "Ada", "s01.ulg", sha256, {}, MISTAKES, {"duration_s": 70.0}, None, truth
+            "s01", "Ada", "s01.ulg", sha256, {}, FAULT_TYPES, {"duration_s": 70.0}, None, truth
         ),
         RightAnswers("s02", "Bob", "s02.ulg", "b" * 64),
     )

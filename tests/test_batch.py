@@ -42,7 +42,7 @@ from px4fuse.cli.outputs import terminal
 from px4fuse.core import workers
 from px4fuse.core.workers import JobFailure, run_with_limits
 from px4fuse.errors import OutputError, SettingsError
-from px4fuse.report.screen import show
+from px4fuse.report.screen import print_blocks
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.contract import schema, to_json
 from px4fuse.results.reading import read_results
@@ -178,7 +178,7 @@ def test_batch_table_has_numbers_or_failure_reason_per_log(tmp_path):
 
 def test_batch_summary_counts_logs_by_failure_reason(capsys):
     table = artificial_logs(60).fillna({"axis": "", "change": ""})
-    show(terminal(), format_summary(BatchResult(table, 3, frozenset(), ())).blocks)
+    print_blocks(terminal(), format_summary(BatchResult(table, 3, frozenset(), ())).blocks)
     said = " ".join(capsys.readouterr().out.split())
     failed = table[table["status"] == "failed"]
     first_log = failed["log"].iloc[0]

@@ -23,8 +23,8 @@ from px4fuse.flight.model import RECEIVED
 from px4fuse.readers import read_log
 from px4fuse.report.card_text import card_lines
 from px4fuse.request import ComparisonRequest
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 REQUEST = ComparisonRequest(log="a.ulg")
@@ -63,7 +63,11 @@ def analysis(*trials: Trial) -> Any:
     source = SimpleNamespace(origin=RECEIVED)
     model = SimpleNamespace(inputs=SimpleNamespace(settings={"EKF2_ACC_NOISE": 0.35}))
     return SimpleNamespace(
-        main_trials=trials, settings=Settings(), source=source, tuning={}, ekf2_model=model
+        select_main_trials=lambda: trials,
+        settings=Settings(),
+        source=source,
+        tuning={},
+        ekf2_model=model,
     )
 
 
@@ -180,7 +184,7 @@ def test_diagnosis_of_clean_flight_advises_no_change(sample: Analysis) -> None:
 
 
 def test_diagnosis_explains_differing_nis_and_nees_verdicts() -> None:
-    flight = simulate_flight(Scenario(seed=8), parse_mistakes(("ekf2-delay=0.25",)))
+    flight = simulate_flight(Scenario(seed=8), parse_faults(("ekf2-delay=0.25",)))
     explained = find_faults(compare(flight, Settings()))
     card = build_card(explained, REQUEST)
     assert (card.id, card.causes[0].reruns[0].improves) == (

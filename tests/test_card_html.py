@@ -18,9 +18,9 @@ from px4fuse.core.text import format_ratio
 from px4fuse.report.card_html import (
     MARK_PATHS,
     alternative_text,
-    axis_html,
     card_html,
     notebook_html,
+    sigma_ratio_html,
 )
 
 HOSTILE = '<img src=x onerror="window.alive=1"></style><script>window.alive=2</script>\u202e'
@@ -50,7 +50,7 @@ def test_sigma_ratio_html_plot_shows_ratio_and_interval() -> None:
                          (None, "not evaluated")))  # fmt: skip
     four[1] = structs.replace(four[1], interval=(0.8, 1.2))
     four[3] = structs.replace(four[3], reason="the log has no <ground> truth")
-    html = axis_html(four, "along the aisle")
+    html = sigma_ratio_html(four, "along the aisle")
     marks = re.findall(r'class="mark" y="10" x="([\d.]+)%"><path d="([^"]+)"', html)
     middle = f"{100.0 * axis_fraction(0.9):.2f}"
     assert marks == [
@@ -71,7 +71,7 @@ def test_sigma_ratio_html_plot_shows_ratio_and_interval() -> None:
 
 def test_diagnosis_html_verdict_with_known_cause_is_not_bold() -> None:
     one = structs.replace(verdicts(*[(2.2, "overconfident")] * 4)[2], is_explained=True)
-    html = axis_html([one], "along the aisle")
+    html = sigma_ratio_html([one], "along the aisle")
     assert "loud" not in html
     assert "2.2, overconfident, explained" in html
 

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from px4fuse.card.model import Action, Card, Note
 from px4fuse.report import card_text
-from px4fuse.report.card_text import axis_text, to_ascii, with_typed_path
+from px4fuse.report.card_text import draw_sigma_ratio, to_ascii, with_typed_path
 
 SENDER = Action("sender", "subtract 0.264 s from the timestamp of each position")
 DELAY = Action("EKF2", "EKF2_EV_DELAY 0 → 264 ms", ("param set EKF2_EV_DELAY 264",), "console")
@@ -25,13 +25,13 @@ def text_of(card: Card) -> list[str]:
     [(1.0, 18, "●"), (0.1, 0, "●"), (10.0, 36, "●"), (0.01, 0, "◀"), (128.0, 36, "▶")],
 )
 def test_sigma_ratio_text_plot_has_marker_at_column_of_ratio(ratio, column, mark) -> None:
-    drawn = axis_text(ratio, "source")
+    drawn = draw_sigma_ratio(ratio, "source")
     assert (len(drawn), drawn.index(mark)) == (37, column)
 
 
 def test_sigma_ratio_text_plot_without_ratio_shows_only_band() -> None:
-    assert re.fullmatch("─{16}░{5}─{16}", axis_text(None, "source"))
-    assert re.fullmatch("─{15}░{7}─{15}", axis_text(None, "truth"))
+    assert re.fullmatch("─{16}░{5}─{16}", draw_sigma_ratio(None, "source"))
+    assert re.fullmatch("─{15}░{7}─{15}", draw_sigma_ratio(None, "truth"))
 
 
 def test_diagnosis_text_has_at_most_40_lines() -> None:

@@ -16,9 +16,9 @@ from golden_tools import assert_matches_golden, of_values
 from hypothesis import given
 from hypothesis import strategies as st
 
-from px4fuse.classroom.grading.class_page import class_page_html, count_tenths
-from px4fuse.classroom.grading.model import Entry, GradedReport, Item, Override
-from px4fuse.classroom.grading.outputs import anonymise_entry
+from px4fuse.classroom.grading.class_page import class_page_html, count_by_bin
+from px4fuse.classroom.grading.model import Grade, GradedReport, ItemScore, Override
+from px4fuse.classroom.grading.outputs import anonymise_grade
 from px4fuse.html.safe import MAX_TEXT_LENGTH
 from px4fuse.results.answer_form import Answers, NamedFault
 from px4fuse.verification.model import Mismatch, PageDifference, Verification
@@ -35,7 +35,8 @@ def graded(name: str, points: float | None, **more: Any) -> GradedReport:
     status, reasons = more.pop("status", "verified"), more.pop("reasons", ("All agrees.",))
     verdict = Verification(status, reasons, True, pages=more.pop("pages", ()))
     items = () if points is None else (
-        Item("Pages", min(points, 4.0), 4.0, "There."), Item("Notes", points - 4, 16.0, "–")
+        ItemScore("Pages", min(points, 4.0), 4.0, "There."),
+        ItemScore("Notes", points - 4, 16.0, "–")
     )  # fmt: skip
     return GradedReport(
         more.pop("file", f"{name.lower()}.pdf"), name, more.pop("id", ""), verdict,
@@ -47,13 +48,13 @@ OF_ENTRY = ("submitted_at", "late_s", "deduction", "overrides", "comment", "tota
             "other_reports")  # fmt: skip
 
 
-def row(name: str, points: float | None, **more: Any) -> Entry:
-    """Make the entry of a student with one report; other arguments are for the report."""
+def row(name: str, points: float | None, **more: Any) -> Grade:
+    """Make the grade of a student with one report; other arguments are for the report."""
     own = {key: more.pop(key) for key in OF_ENTRY if key in more}
     one = graded(name, points, **more)
     own["submission_time"] = own.pop("submitted_at", "")
     own.setdefault("total", None if points is None else one.counted_points)
-    return Entry(name, one.student_id, one, max_points=one.max_points, flags=one.flags, **own)
+    return Grade(name, one.student_id, one, max_points=one.max_points, flags=one.flags, **own)
 
 
 FORM = Answers(
@@ -67,7 +68,7 @@ CLASS = (
         id="1007",
         numbers={"mean NIS": 1.02},
         redrawn_path="reports/1007.pdf",
-        mistakes={"positions that jump": True},
+        is_found_by_fault={"positions that jump": True},
     ),
     row(
         "ada",
@@ -75,7 +76,7 @@ CLASS = (
         id="1001",
         status="numbers differ",
         flags=("The same log as Zoë.",),
-        mistakes={"positions that jump": False, "outliers": False},
+        is_found_by_fault={"positions that jump": False, "outliers": False},
         late_s=7200.0,
         deduction=1.0,
     ),
@@ -93,18 +94,20 @@ CLASS = (
         numbers={MARKUP: 1.0},
         instructor_action=MARKUP,
         form=FORM,
-        mistakes={MARKUP: False},
+        is_found_by_fault={MARKUP: False},
         redrawn_path="javascript:alert(1)",
         comment=BREAKOUT,
         items=(
-            Item(BREAKOUT, 5.0, 20.0, MARKUP, is_scored_by_instructor=True, awaits_points=True),
+            ItemScore(
+                BREAKOUT, 5.0, 20.0, MARKUP, is_scored_by_instructor=True, awaits_points=True
+            ),
         ),
         submitted_at=MARKUP,
         overrides={BREAKOUT: Override(None, MARKUP)},
     ),
     row(REVERSED, 8.0, id="5"),
     row(LONG, 7.0, id="6"),
-    Entry("Mia", "1011", None),
+    Grade("Mia", "1011", None),
 )
 
 
@@ -129,7 +132,8 @@ def test_grades_page_escapes_html_in_student_text(text: str) -> None:
         one = row(
             word, 5.0, id=word, file=f"{word}.pdf", flags=(word,), reasons=(word,),
             notes=f"So: {word}",
-            numbers={word: 1.0}, items=(Item(word, 5.0, 20.0, word),), mistakes={word: False},
+            numbers={word: 1.0}, items=(ItemScore(word, 5.0, 20.0, word),),
+            is_found_by_fault={word: False},
             instructor_action=word, form=FORM, comment=word,
         )  # fmt: skip
         return class_page_html([one], word, word)
@@ -142,10 +146,10 @@ def test_grades_page_escapes_html_in_student_text(text: str) -> None:
 
 def test_grades_page_mean_excludes_pending_points() -> None:
     said = {"Notes": Override(9.0, "Good.")}
-    entries = [row("Ada", 10.0, late_s=61), row("Bo", 20.0),
+    grades = [row("Ada", 10.0, late_s=61), row("Bo", 20.0),
                row("Cy", 12.0, instructor_action="Run 0.1.1."),
                row("Di", 13.0, overrides=said, total=13.0)]  # fmt: skip
-    text = class_page_html(entries, "Class", "px4fuse 1")
+    text = class_page_html(grades, "Class", "px4fuse 1")
     assert "2 min late" in text  # 61 s are rounded up
     assert "14.3 <small>of 20" in text  # mean of 10, 20 and 13
     assert "1 <small>12 points, not counted" in text
@@ -163,7 +167,7 @@ def test_grades_page_shortens_long_text_and_omits_nan() -> None:
     assert len(text) < 16 * MAX_TEXT_LENGTH
     apart = (Mismatch("axes.49", "1.0", "2.0"),)
     one = GradedReport("a.pdf", "Ada", "1", Verification("numbers differ", ("60.",), True, apart))
-    text = class_page_html([Entry("Ada", "1", one)], "Class", "px4fuse 1")
+    text = class_page_html([Grade("Ada", "1", one)], "Class", "px4fuse 1")
     assert '["axes.49","1.0","2.0"]' in text
 
 
@@ -176,25 +180,25 @@ PEOPLE = (
 SAYS = "Ada and LOVELACE, s-2031 and 30044; by E\u0301mile du Cha\u0302telet, see lab_Ada_2."
 
 
-def anonymous_class() -> list[Entry]:
-    entries = []
+def anonymous_class() -> list[Grade]:
+    grades = []
     for number, (name, student_id, file) in enumerate(PEOPLE):
         others = [one for one in PEOPLE if one[0] != name]
         flag = f"The same log as {others[0][0]}, {others[0][1]} ({others[0][2] or 'x'}). {SAYS}"
         said = f"Your report names {name}, {student_id}. {SAYS}"
-        entry = row(
+        grade = row(
             name, 9.0, id=student_id, file=file, flags=(flag,), reasons=(said,),
             instructor_action=said,
             notes=f"{name} ({student_id}): {SAYS} 王小明", form=FORM,
-            numbers={"mean NIS": 1.0}, items=(Item("Settings", 9.0, 20.0, said),),
-            mistakes={"positions that jump": False}, comment=said,
+            numbers={"mean NIS": 1.0}, items=(ItemScore("Settings", 9.0, 20.0, said),),
+            is_found_by_fault={"positions that jump": False}, comment=said,
             overrides={"Settings": Override(10.0, said)},
             other_reports=(graded(name, 3.0, file=f"old/{file}"),),
             redrawn_path=f"reports/{student_id}.pdf", sha256="ab" * 32,
         )  # fmt: skip
-        entry = entry if file else Entry(name, student_id, None)
-        entries.append(anonymise_entry(entry, f"Student {(7 * number) % 4 + 1:03}"))
-    return entries
+        grade = grade if file else Grade(name, student_id, None)
+        grades.append(anonymise_grade(grade, f"Student {(7 * number) % 4 + 1:03}"))
+    return grades
 
 
 def test_grades_page_in_anonymous_mode_contains_no_names() -> None:
@@ -296,7 +300,7 @@ def test_grades_page_links_report_redrawn_from_the_log() -> None:
 
 
 def test_points_histogram_has_counts_and_lower_bin_edges() -> None:
-    assert count_tenths([0, 5, 5.5, 9, 99], 10) == [
+    assert count_by_bin([0, 5, 5.5, 9, 99], 10) == [
         (count, f"{edge}") for edge, count in enumerate((1, 0, 0, 0, 0, 2, 0, 0, 0, 2))
     ]
 

@@ -12,7 +12,7 @@ from exchange import replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from px4fuse.classroom.grading.model import Entry, GradedReport, Item
+from px4fuse.classroom.grading.model import Grade, GradedReport, ItemScore
 from px4fuse.classroom.grading.outputs import FIRST_COLUMNS, LAST_COLUMNS, class_table_csv
 from px4fuse.core.spreadsheet import MAX_CELL_LENGTH, neutralise_formulas, neutralise_id
 from px4fuse.verification.model import Verification
@@ -30,16 +30,16 @@ texts = (
 finite = st.floats(allow_nan=False, allow_infinity=False, width=32)
 
 
-def entry(graded: GradedReport, **more) -> Entry:
+def entry(graded: GradedReport, **more) -> Grade:
     values = {"total": graded.points, "max_points": graded.max_points} | more
-    return Entry(graded.student, graded.student_id, graded, **values)
+    return Grade(graded.student, graded.student_id, graded, **values)
 
 
-def graded(text: str, numbers: dict[str, float] | None = None, points: float = 1.0) -> Entry:
+def graded(text: str, numbers: dict[str, float] | None = None, points: float = 1.0) -> Grade:
     one = GradedReport(
         submission=text, student=text, student_id=text,
         verification=Verification("cannot verify", (text, text), with_log=False),
-        items=(Item(text, points, 2.0, text),), flags=(text, text), numbers=numbers or {},
+        items=(ItemScore(text, points, 2.0, text),), flags=(text, text), numbers=numbers or {},
         log_sha256="ab" * 32,
     )  # fmt: skip
     return entry(one, other_reports=(one,), submission_time=text, comment=text, flags=(text, text))
@@ -135,10 +135,10 @@ def test_grades_csv_begins_with_bom_and_has_crlf_line_ends() -> None:
 
 
 def test_grades_csv_lists_late_and_missing_students() -> None:
-    one = GradedReport("a.pdf", "A", "1", VERIFIED, (Item("notes", 1.5, 2.0, ""),))
+    one = GradedReport("a.pdf", "A", "1", VERIFIED, (ItemScore("notes", 1.5, 2.0, ""),))
     late = entry(one, late_s=5400.0, deduction=0.4, total=1.1, comment="see me")
     pending = entry(replace(one, instructor_action="Run 0.1.1."), total=None)
-    head, *rest = cells(class_table_csv([late, pending, Entry("C", "-17", None, max_points=4.0)]))
+    head, *rest = cells(class_table_csv([late, pending, Grade("C", "-17", None, max_points=4.0)]))
     asked = ("id", "status", "points", "pending points", "deducted", "total", "hours late",
              "pending", "comment")  # fmt: skip
     assert [[dict(zip(head, row, strict=True))[name] for name in asked] for row in rest] == [

@@ -178,7 +178,7 @@ class TestSimulatedFlight:
         assert other == pytest.approx(one, rel=0.1)
 
     @pytest.mark.parametrize(("heading", "name"), [(0.0, "north"), (90.0, "east")])
-    def test_aisle_axis_with_heading_0_equals_north_and_90_east(self, made, heading, name) -> None:
+    def test_axis_at_heading_0_or_90_equals_north_or_east(self, made, heading, name) -> None:
         aisle = compare(made.flight, axes=("aisle",), heading_deg=heading).main
         same = made[name]
         assert asdict(aisle.difference) == pytest.approx(asdict(same.difference))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from functools import cache
 
@@ -18,16 +19,17 @@ from px4fuse.convention.axes import AXIS_ASSIGNMENTS, CLOCKWISE_DIRECTIONS, UNIT
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import Faults, convention_faults
 from px4fuse.convention.model import Axes, Convention, OrientationConvention
-from px4fuse.diagnose import refine_delay
+from px4fuse.diagnose import prepare_comparison, refine_delay
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.finding import Finding
 from px4fuse.findings import source_convention
 from px4fuse.findings.cause_grouping import CONVENTION
 from px4fuse.findings.model import finding
-from px4fuse.flight.model import RECEIVED, Columns, Flight, PositionTrack
+from px4fuse.flight.model import GNSS, RECEIVED, Columns, Flight, PositionTrack, Unavailable
 from px4fuse.readers import read_log
+from px4fuse.request import ComparisonRequest
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.trajectory.rotation import from_vector, interpolate, multiply
 
@@ -66,7 +68,7 @@ TOLERANCES = {"rotation_deg": 4.0, "heading_error_deg": 4.0, "late_s": 0.06, "cl
 
 @cache
 def flown(seed: int = 3, *mistakes: str) -> Flight:
-    return simulate_flight(Scenario(seed=seed, kind="loop", passes=2), parse_mistakes(mistakes))
+    return simulate_flight(Scenario(seed=seed, kind="loop", passes=2), parse_faults(mistakes))
 
 
 def sent(
@@ -138,6 +140,16 @@ def test_frame_detection_finds_yaw_rotation_of_positions(rotation_deg):
     assert not found.is_mirrored
     total = found.rotation_deg - 90.0 * quarter
     assert (total - rotation_deg + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=4.0)
+
+
+def test_yaw_rotation_refers_to_gnss_if_ekf2_heading_is_wrong():
+    attitude = flown().attitude.copy()
+    attitude[Columns.QUATERNION] = multiply(yaw(-14.0), attitude[Columns.QUATERNION].to_numpy())
+    gnss = replace(sent(flown(), late_s=0.2, sigma_m=0.3, seed=2), origin=GNSS)
+    no_ekf2 = Unavailable("EKF2", "not logged", "")
+    flight = replace(flown(), attitude=attitude, positions=(gnss,), ekf2=no_ekf2)
+    found = check_convention(flight, sent(flown(), rotation_deg=60.0))
+    assert convention_faults(found, flight, "NED").rotation_deg == pytest.approx(60.0, abs=2.0)
 
 
 @pytest.mark.parametrize("clock_drift", [-0.04, -0.01, 0.02])
@@ -335,6 +347,17 @@ def test_late_timestamps_report_states_refined_time_offset(estimate_s, reported_
     assert refine_delay(comparison, unclear) is comparison
 
 
+def test_clock_offset_auto_note_states_already_applied_delay():
+    late = replace(flown(), positions=(sent(flown(), late_s=0.7),))
+    request = ComparisonRequest(log="made", clock_offset_s="auto", axes=("north", "east"))
+    prepared = prepare_comparison(late, request)
+    assert prepared.settings.clock_offset_s == pytest.approx(-0.7, abs=0.02)
+    (note,) = (note for note in prepared.notes if note.startswith("--clock-offset auto: "))
+    remaining_s, applied_s = map(float, re.findall(r"([+-]\d\.\d+) s(?: \(95| from)", note))
+    assert abs(remaining_s) < 0.1
+    assert applied_s == pytest.approx(prepared.settings.clock_offset_s, abs=0.001)
+
+
 def test_ambiguous_position_axes_report_lists_possible_axes():
     (found,) = source_convention.detect(replace(compared(sent(flown())), convention=AMBIGUOUS))
     assert found.id == "source_convention_ambiguous"
@@ -384,7 +407,7 @@ def test_frame_detection_on_recorded_logs_finds_known_frame(name):
 
 
 def test_convention_check_without_heights_keeps_horizontal_positions() -> None:
-    flight = simulate_flight(Scenario(seed=5), parse_mistakes(["no-vvo"]))
+    flight = simulate_flight(Scenario(seed=5), parse_faults(["no-vvo"]))
     prepared = prepare(flight)
     assert prepared.source.samples[Columns.POSITION[:2]].notna().all(axis=None)
     assert prepared.source.samples["down_m"].isna().all()

@@ -205,7 +205,7 @@ def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis
     updates = eventful.main.replay.updates
     normalised = updates["innovation_m"] / np.sqrt(updates["innovation_variance_m2"])
     largest = float(normalised.abs().max())
-    assert largest > cover_panels.MAX_DRAWN_INNOVATION
+    assert largest > cover_panels.MAX_DRAWN_SIGMAS
     assert f"outside ±4, up to KF {largest:.0f}" in plot.title
     axes = panels_by_title(drawn(eventful))[plot.title]
     edges = [

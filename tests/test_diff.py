@@ -17,8 +17,8 @@ from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
 from px4fuse.results.contract import ChangeResults, ComparisonResults, to_json
 from px4fuse.results.reading import read_results
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 
@@ -53,7 +53,7 @@ def test_diff_lists_numbers_present_in_only_one_input():
 
 def flown(seed: int, *mistakes: str, **scenario) -> InputResults:
     """Compare a simulated flight, as an input of diff."""
-    flight = simulate_flight(Scenario(seed=seed, **scenario), parse_mistakes(mistakes))
+    flight = simulate_flight(Scenario(seed=seed, **scenario), parse_faults(mistakes))
     request = ComparisonRequest(
         log="f.ulg", sigma_a_m_s2=RIGHT.sigma_a_m_s2, sigma_z_m=RIGHT.sigma_z_m
     )

@@ -55,12 +55,12 @@ def test_ekf2_replay_updates_are_matched_by_measurement_time():
 
 def test_ekf2_replay_evaluation_excludes_first_5_s_of_segments():
     replay = made(Ekf2Replay, stretches_s=((10.0, 30.0), (40.0, 60.0)), flow_only_spans_s=())
-    evaluated_spans = replay.evaluated_s
+    evaluated_spans = replay.find_evaluated_spans()
     assert evaluated_spans == ((15.0, 30.0), (45.0, 60.0))
     # times with flow as the only aiding source, and the seconds after them, are excluded
     carried = made(Ekf2Replay, stretches_s=replay.stretches_s,
                    flow_only_spans_s=((20.0, 23.0), (52.0, 58.0)))  # fmt: skip
-    assert carried.evaluated_s == ((15.0, 20.0), (28.0, 30.0), (45.0, 52.0))
+    assert carried.find_evaluated_spans() == ((15.0, 20.0), (28.0, 30.0), (45.0, 52.0))
     times = np.array([15.0, 15.1, 29.9, 30.0, 45.0, 50.0, 60.0])
     assert inside_spans(times, evaluated_spans).tolist() == [
         False,
@@ -148,7 +148,7 @@ def test_ekf2_replay_agreement_statistics_equal_their_formulas():
     index = pd.Index([16.0, 17.0, 99.0])
     still = pd.DataFrame(0.0, index=index, columns=Columns.STATE)
     off = still.assign(**{Columns.STATE[1]: [3.0, 4.0, 50.0], Columns.STATE[4]: 0.25})
-    replay = SimpleNamespace(published=off, evaluated_s=((15.0, 20.0),))
+    replay = SimpleNamespace(published=off, find_evaluated_spans=lambda: ((15.0, 20.0),))
     found = _axis_agreement("east", pd.DataFrame(frame), model, made(Ekf2, state=still), replay)  # type: ignore[arg-type]
     assert found.innovation_correlation == pytest.approx(1.0)
     assert found.innovation_rms_difference == pytest.approx(0.5)
@@ -172,14 +172,18 @@ def test_correlation_of_constant_innovations_is_unavailable():
     log = made(AidLog, samples=samples, axes=axes, topics=("estimator_aid_src_gnss_vel",),
                parameters={})  # fmt: skip
     ekf2 = made(Ekf2, aids={"gnss_vel": log})
-    replay = SimpleNamespace(evaluated_s=((0.0, 99.0),), other_aid_updates={"gnss_vel": updates})
+    replay = SimpleNamespace(
+        find_evaluated_spans=lambda: ((0.0, 99.0),), other_aid_updates={"gnss_vel": updates}
+    )
     assert _other_agreements(ekf2, replay) == ({}, {"gnss_vel": CONSTANT_INNOVATIONS})
 
 
 def test_ekf2_replay_heading_error_without_logged_state_is_none():
     delayed = pd.DataFrame(index=pd.Index([1.0]))
     ekf2 = made(Ekf2, record=made(FusionRecord, delayed=delayed))
-    replay = SimpleNamespace(settings={"EKF2_MAG_NOISE": 0.05}, evaluated_s=((5.0, 9.0),))
+    replay = SimpleNamespace(
+        settings={"EKF2_MAG_NOISE": 0.05}, find_evaluated_spans=lambda: ((5.0, 9.0),)
+    )
     assert _heading_error_deg(ekf2, replay) is None
 
 
@@ -215,7 +219,7 @@ def compared(
     replay = SimpleNamespace(
         updates=updates,
         published=state,
-        evaluated_s=((14.5, 999.0),),
+        find_evaluated_spans=lambda: ((14.5, 999.0),),
         settings={},
         other_aid_updates={},
         flow_only_spans_s=(),

@@ -1,5 +1,6 @@
 """EKF2 model against its equations in plain form, and against the log."""
 
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from px4fuse.ekf2.model import (
     replay_settings,
     run_configurations,
 )
-from px4fuse.ekf2.replay import HORIZONTAL
+from px4fuse.ekf2.replay import HORIZONTAL_AXES
 from px4fuse.flight.model import RECEIVED, Flight, Unavailable
 from px4fuse.readers import read_log
 
@@ -85,7 +86,7 @@ def test_ekf2_model_innovations_equal_reference_filter(model: Model) -> None:
     nu, S = plain_replay(model.inputs, model.inputs.segments[0], events[events.end_step < 3000])
     updates = model.baseline_replay.updates.iloc[: len(nu)]
     assert len(nu) > 100
-    for at, axis in enumerate(HORIZONTAL):
+    for at, axis in enumerate(HORIZONTAL_AXES):
         np.testing.assert_allclose(updates[f"innovation_{axis}_m"], nu[:, at], rtol=0, atol=5e-4)
         np.testing.assert_allclose(updates[f"innovation_variance_{axis}_m2"], S[:, at], rtol=3e-3)
 
@@ -106,14 +107,30 @@ def test_ekf2_model_of_sample_flight_agrees_with_log(model: Model) -> None:
         assert axis.nis_mean_replayed == pytest.approx(axis.nis_mean_logged, rel=0.02)
 
 
+def test_ekf2_replay_memory_does_not_grow_with_setting_count(
+    model: Model, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("px4fuse.ekf2.model.REPLAY_BATCH_SIZE", 2)
+
+    def peak(count: int) -> int:
+        tracemalloc.start()
+        for _ in replay_settings(model, [{"EKF2_EV_DELAY": 20.0 + at} for at in range(count)]):
+            pass
+        found = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return found
+
+    assert peak(6) < 1.15 * peak(2)
+
+
 def test_ekf2_replay_of_several_settings_equals_separate_runs(model: Model) -> None:
     settings = [
         {"EKF2_EVP_NOISE": 0.02}, {"EKF2_EV_DELAY": 80.0},
         {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_DELAY": 40.0, "EKF2_EVP_GATE": 2.0}, {},
     ]  # fmt: skip
-    together = replay_settings(model, settings)
+    together = list(replay_settings(model, settings))
     for change, found in zip(settings, together, strict=True):
-        alone = replay_settings(model, [change])[0]
+        (alone,) = replay_settings(model, [change])
         for part in ("updates", "delayed", "published"):
             joint, separate = getattr(found, part), getattr(alone, part)
             pd.testing.assert_frame_equal(joint, separate, rtol=0.0, atol=1e-9)
@@ -131,7 +148,7 @@ def test_ekf2_replay_counts_late_and_lost_vision_samples(model: Model) -> None:
     def arriving(after_s: float, **settings: float) -> Any:
         slow = replace(vision, arrival_s=vision.timestamp_s + after_s)
         made = replace(model, inputs=replace(model.inputs, received=slow))
-        return replay_settings(made, [{"EKF2_EV_DELAY": 1.0, **settings}])[0]
+        return next(replay_settings(made, [{"EKF2_EV_DELAY": 1.0, **settings}]))
 
     in_time, late, lost = (arriving(after_s) for after_s in (0.20, 0.28, 0.36))
     assert (in_time.late, in_time.lost) == (0, 0)

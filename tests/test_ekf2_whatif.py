@@ -39,8 +39,8 @@ from px4fuse.filter.signals import Axis
 from px4fuse.flight.ekf2_parameters import GNSS_POS
 from px4fuse.flight.model import Columns, Flight, Truth, Unavailable
 from px4fuse.readers import read_log
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate, to_ulog
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 
@@ -68,7 +68,7 @@ def test_what_if_result_contains_logged_and_replayed_values(model):
     assert not made.notes
 
 
-def test_what_if_without_replay_agreement_is_unavailable(model):
+def test_what_if_is_unavailable_if_replay_differs_from_log(model):
     doubtful = replace(model, agreement=replace(model.agreement, good=False, reason="no reason"))
     for result in (what_if(doubtful, [{"EKF2_EVP_NOISE": 0.5}]), explain_by_steps(doubtful)):
         assert isinstance(result, Unavailable)
@@ -224,7 +224,7 @@ def flown(tmp_path: Path, mistake: str, seed: int) -> Model:
     """Return the model of a simulated flight with one wrong EKF2 parameter, read from its log."""
     log = tmp_path / f"{seed}{mistake.partition('=')[2]}.ulg"
     log.write_bytes(
-        to_ulog(simulate(Scenario(seed=seed), parse_mistakes([mistake] if mistake else [])))
+        to_ulog(simulate(Scenario(seed=seed), parse_faults([mistake] if mistake else [])))
     )
     return opened(read_log(log))
 

@@ -1,4 +1,4 @@
-"""One entry per student: counting attempt, deduction if late, overrides by the instructor."""
+"""One grade per student: counting attempt, deduction if late, overrides by the instructor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from px4fuse.classroom.grading.class_page import _point_boxes
 from px4fuse.classroom.grading.entries import (
     Course,
     add_time_zone,
-    build_entries,
+    build_grades,
     parse_due_time,
     parse_late_rule,
     parse_moodle_time,
@@ -35,12 +35,12 @@ LATEST = Course(RUBRIC)
 PEOPLE = (Person("1", "Ada Lovelace", login="ada"), Person("2", "Grace Hopper", login="grace"))
 
 
-def make_entries(files, term=LATEST, overrides=None, people=PEOPLE, packed=None):
-    """Make the entries of reports, given by file name."""
+def make_grades(files, term=LATEST, overrides=None, people=PEOPLE, packed=None):
+    """Make the grades of reports, given by file name."""
     reports = [replace(one, submission=name, sha256=name) for name, one in files.items()]
     zipped, times = Path("x.zip"), packed or {}
     found = [Submission(zipped, name, name, times.get(name), parse_origin(name)) for name in files]
-    return build_entries(reports, found, replace(term, roster=people), overrides or {})
+    return build_grades(reports, found, replace(term, roster=people), overrides or {})
 
 
 def blackboard(login: str, stamp: str, name: str = "r.pdf") -> str:
@@ -56,7 +56,7 @@ THREE = {
 
 @pytest.mark.parametrize(("attempt", "points"), [("latest", 7.0), ("first", 4.0), ("best", 9.0)])
 def test_grade_attempt_option_selects_the_report_that_counts(attempt, points) -> None:
-    (ada, grace), _ = make_entries(THREE, Course(RUBRIC, attempt=attempt))
+    (ada, grace), _ = make_grades(THREE, Course(RUBRIC, attempt=attempt))
     assert ada.counted_report.points == ada.total == points
     assert len(ada.other_reports) == 2
     assert ada.counted_report not in ada.other_reports
@@ -65,13 +65,13 @@ def test_grade_attempt_option_selects_the_report_that_counts(attempt, points) ->
 
 def test_grade_of_late_report_has_points_deducted() -> None:
     term = Course(RUBRIC, due=DUE, late_rule=parse_late_rule("10%/day"))
-    (ada, _), _ = make_entries(THREE, term)
+    (ada, _), _ = make_grades(THREE, term)
     assert (ada.late_s, ada.deduction, ada.total) == (46 * 3600.0, 2.0, 5.0)
     assert ada.submission_time == "2026-11-22 10:00"
     # the best attempt is the one after deduction
     files = {blackboard("ada", "20-11-00-00"): graded_report("", 6.0),
              blackboard("ada", "22-10-00-00"): graded_report("", 7.0)}  # fmt: skip
-    (ada, _), _ = make_entries(files, replace(term, attempt="best"))
+    (ada, _), _ = make_grades(files, replace(term, attempt="best"))
     assert (ada.late_s, ada.deduction, ada.total) == (0.0, 0.0, 6.0)
 
 
@@ -89,7 +89,7 @@ def test_grade_of_late_report_has_points_deducted() -> None:
     ],
 )
 def test_grade_of_very_late_report_is_not_below_zero(due, rule, late_s, off) -> None:
-    (ada, _), _ = make_entries(THREE, Course(RUBRIC, due=due, late_rule=parse_late_rule(rule)))
+    (ada, _), _ = make_grades(THREE, Course(RUBRIC, due=due, late_rule=parse_late_rule(rule)))
     assert (ada.late_s, ada.deduction) == (late_s, off)
     assert ada.total == 0.0
 
@@ -99,11 +99,11 @@ def test_grade_uses_zip_entry_time_only_to_order_reports() -> None:
     packed = {first: datetime(2026, 11, 24), second: datetime(2026, 11, 25)}
     files = {second: graded_report("", 7.0), first: graded_report("", 9.0)}
     term = Course(RUBRIC, due=DUE, late_rule=parse_late_rule("10%/day"))
-    (_, grace), _ = make_entries(files, term, packed=packed)
+    (_, grace), _ = make_grades(files, term, packed=packed)
     assert (grace.total, grace.late_s, grace.submission_time) == (7.0, None, "")
     assert "no points" in grace.flags[0]
     # a late mark without a time has no deduction either
-    (_, grace), _ = make_entries({"hoppergrace_LATE_7_8_r.pdf": graded_report("", 7.0)}, term)
+    (_, grace), _ = make_grades({"hoppergrace_LATE_7_8_r.pdf": graded_report("", 7.0)}, term)
     assert (grace.late_s, grace.total) == (None, 7.0)
     assert "Canvas marks the file as late" in grace.flags[0]
 
@@ -120,14 +120,14 @@ def test_grade_uses_zip_entry_time_only_to_order_reports() -> None:
 def test_due_date_extension_and_grace_period_reduce_lateness(extension, grace_s, late_s) -> None:
     term = Course(RUBRIC, due=DUE, grace_s=grace_s, late_rule=parse_late_rule("10%/day"))
     people = (replace(PEOPLE[0], extended_due=extension), *PEOPLE[1:])
-    (ada, _), _ = make_entries(THREE, term, people=people)
+    (ada, _), _ = make_grades(THREE, term, people=people)
     assert (ada.late_s, ada.deduction > 0.0) == (late_s, late_s > 0.0)
 
 
 def test_invalid_due_date_extension_error_names_the_student() -> None:
     people = (replace(PEOPLE[0], extended_due="two days"), *PEOPLE[1:])
     with pytest.raises(SettingsError, match=r"extension of .*'two days' is not a valid time"):
-        make_entries(THREE, Course(RUBRIC, due=DUE), people=people)
+        make_grades(THREE, Course(RUBRIC, due=DUE), people=people)
 
 
 def test_grade_ignores_other_file_submitted_beside_a_report() -> None:
@@ -138,10 +138,10 @@ def test_grade_ignores_other_file_submitted_beside_a_report() -> None:
     )
     files = {blackboard("ada", "19-10-00-00"): graded_report("", 4.0),
              blackboard("ada", "20-10-00-00"): essay}  # fmt: skip
-    (ada, _), _ = make_entries(files)
+    (ada, _), _ = make_grades(files)
     assert ada.total == 4.0
     assert "status: no report" in ada.flags[0]
-    (ada, _), _ = make_entries({blackboard("ada", "20-10-00-00"): essay})
+    (ada, _), _ = make_grades({blackboard("ada", "20-10-00-00"): essay})
     assert ada.total == 0.0
 
 
@@ -153,16 +153,16 @@ def of_form(points: float, kind: str, **more):
 def test_grade_with_two_different_answer_forms_is_pending() -> None:
     """None of the files submitted together counts until the instructor selects one."""
     files = {"a.pdf": of_form(4.0, "yaw"), "b.pdf": of_form(9.0, "nlos")}
-    (ada, _), _ = make_entries(files)
+    (ada, _), _ = make_grades(files)
     assert ada.total is None
     assert (
         ada.counted_report.instructor_action
         == "Ask the student which of 2 reports counts: the answer forms differ."
     )
     assert len(ada.other_reports) == 1
-    assert make_entries(files, Course(RUBRIC, attempt="best"))[0][0].total == 9.0
+    assert make_grades(files, Course(RUBRIC, attempt="best"))[0][0].total == 9.0
     # equal forms are not pending
-    (ada, _), _ = make_entries({name: of_form(4.0, "yaw") for name in files})
+    (ada, _), _ = make_grades({name: of_form(4.0, "yaw") for name in files})
     assert ada.total == 4.0
 
 
@@ -174,7 +174,7 @@ def test_grade_keeps_first_report_if_later_one_needs_review() -> None:
     }
     packed = {"a.pdf": datetime(2026, 11, 18), "z.pdf": datetime(2026, 11, 19)}
     for times in (None, packed):
-        (ada, _), _ = make_entries(files, packed=times)
+        (ada, _), _ = make_grades(files, packed=times)
         assert ada.total == 9.0
         assert [one.submission for one in ada.other_reports] == ["z.pdf"]
         assert ada.flags == ("The file z.pdf does not count (status: pending).",)
@@ -182,13 +182,13 @@ def test_grade_keeps_first_report_if_later_one_needs_review() -> None:
         files["a.pdf"].items[0], awaits_points=True
     )  # waits for the points of the notes
     files["a.pdf"] = replace(files["a.pdf"], items=(waiting,))
-    (ada, _), _ = make_entries(files)
+    (ada, _), _ = make_grades(files)
     assert ada.counted_report.submission == "a.pdf"
 
 
 def test_submission_name_that_imitates_platform_is_flagged() -> None:
     name = blackboard("ada", "20-10-00-00", "ada_attempt_2026-11-18-10-00-00_r.pdf")
-    (ada, _), _ = make_entries({name: graded_report("", 4.0)})
+    (ada, _), _ = make_grades({name: graded_report("", 4.0)})
     assert ada.submission_time == "2026-11-20 10:00"
     assert ada.flags == (
         "The student imitated the file name of a learning platform "
@@ -200,7 +200,7 @@ def test_grade_with_several_reports_in_attempt_uses_best() -> None:
     files = {blackboard("ada", "19-10-00-00", "a.pdf"): graded_report("", 8.0),
              blackboard("ada", "19-10-00-00", "b.pdf"): graded_report("", 2.0)}  # fmt: skip
     for attempt in ("first", "latest", "best"):
-        (ada, _), _ = make_entries(files, Course(RUBRIC, attempt=attempt))
+        (ada, _), _ = make_grades(files, Course(RUBRIC, attempt=attempt))
         assert ada.total == 8.0, attempt
 
 
@@ -208,7 +208,7 @@ def test_learning_platform_id_overrides_id_in_report() -> None:
     files = {
         blackboard("grace", "19-10-00-00"): graded_report("", 8.0, student="Ada", student_id="1")
     }
-    (ada, grace), _ = make_entries(files)
+    (ada, grace), _ = make_grades(files)
     assert ada.counted_report is None
     assert grace.total == 8.0
     assert "is that of 1 (Ada Lovelace)" in grace.flags[0]
@@ -219,7 +219,7 @@ def test_student_missing_in_class_list_is_flagged() -> None:
         "report.pdf": graded_report("", 8.0, student="Mallory", student_id="9"),
         "other.pdf": graded_report("", 3.0, student="lovelace ADA"),
     }
-    (ada, grace, stranger), _ = make_entries(files)
+    (ada, grace, stranger), _ = make_grades(files)
     assert (ada.total, grace.total) == (3.0, None)
     assert (stranger.student, stranger.student_id, stranger.total) == ("Mallory", "9", 8.0)
     assert stranger.flags[0] == "The student is not in the class list."
@@ -237,8 +237,8 @@ def test_grades_without_class_list_have_one_row_per_student() -> None:
         "c.pdf": graded_report("", 4.0, student="Kim", student_id="44"),
         "d.pdf": graded_report("", 5.0),
     }
-    entries, _ = make_entries(files, people=())
-    assert [(one.student, one.student_id, one.total) for one in entries] == [
+    grades, _ = make_grades(files, people=())
+    assert [(one.student, one.student_id, one.total) for one in grades] == [
         ("Jane", "42", 1.0), ("Roe Max", "6", 2.0), ("Kim", "44", 4.0), ("", "", 5.0)
     ]  # fmt: skip
 
@@ -264,7 +264,7 @@ def test_instructor_overrides_replace_points_and_add_comments(tmp_path) -> None:
         tmp_path, "1,a,9.5,A good idea.", '01,,,"Come and', 'see me."', "1,total,8,Agreed.",
         "2,total,3,", "3,total,1,", "1,C,1,", '2,B,2,"x"',
     )  # fmt: skip
-    (ada, grace), notes = make_entries(TWO, overrides=rows)
+    (ada, grace), notes = make_grades(TWO, overrides=rows)
     assert ada.overrides == {
         "A": Override(9.5, "A good idea."), "total": Override(8.0, "Agreed."),
         "": Override(None, "Come and\nsee me."),
@@ -293,7 +293,7 @@ def test_instructor_overrides_replace_points_and_add_comments(tmp_path) -> None:
 def test_instructor_override_above_maximum_points_gives_a_note(
     rows, points, told, tmp_path
 ) -> None:
-    (ada, _), notes = make_entries(TWO, overrides=write_overrides(tmp_path, *rows))
+    (ada, _), notes = make_grades(TWO, overrides=write_overrides(tmp_path, *rows))
     assert (ada.counted_report.points, ada.total) == points
     assert notes == tuple(f"overrides.csv: {one}." for one in told)
 
@@ -303,9 +303,9 @@ def test_grades_download_includes_students_without_report(tmp_path) -> None:
     rows = write_overrides(
         tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown."
     )
-    entries, notes = make_entries({"1.pdf": TWO["1.pdf"]}, overrides=rows)
+    grades, notes = make_grades({"1.pdf": TWO["1.pdf"]}, overrides=rows)
     again: dict[str, dict[str, Override]] = {}
-    for _, _, owner, boxes, kept in map(_point_boxes, entries):
+    for _, _, owner, boxes, kept in map(_point_boxes, grades):
         for item, points, comment in (*((a, c, d) for a, _, c, d in boxes), *kept):
             if points is not None or comment:
                 again.setdefault(owner, {})[item] = Override(points, comment)
@@ -314,19 +314,19 @@ def test_grades_download_includes_students_without_report(tmp_path) -> None:
 
 def test_instructor_total_points_clear_pending_status(tmp_path) -> None:
     files = {"1.pdf": graded_report("", 4.0, student_id="1", instructor_action="Run 0.1.1.")}
-    (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,A,9,"))
+    (ada, _), _ = make_grades(files, overrides=write_overrides(tmp_path, "1,A,9,"))
     assert ada.total is None
-    (ada, _), _ = make_entries(files, overrides=write_overrides(tmp_path, "1,total,9,"))
+    (ada, _), _ = make_grades(files, overrides=write_overrides(tmp_path, "1,total,9,"))
     assert ada.total == 9.0
 
 
 def test_instructor_override_without_submission_gives_points(tmp_path) -> None:
-    (_, grace), notes = make_entries(
+    (_, grace), notes = make_grades(
         {}, overrides=write_overrides(tmp_path, "2,Total,5,Shown in class.")
     )
     assert (grace.total, notes) == (5.0, ())
     assert "Shown in class." in feedback_text(grace)
-    (_, grace), notes = make_entries(TWO_OF_ONE, overrides=write_overrides(tmp_path, "2,total,50,"))
+    (_, grace), notes = make_grades(TWO_OF_ONE, overrides=write_overrides(tmp_path, "2,total,50,"))
     assert (grace.total, len(notes)) == (None, 1)
 
 
@@ -342,7 +342,7 @@ def test_instructor_overrides_csv_accepts_decimal_commas(tmp_path) -> None:
         ("1,A,-1,", "must be a number of 0 or more"),
         ("1,A,nan,", "must be a number of 0 or more"),
         ("1,A,1_5,", "must be a number of 0 or more"),
-        ("1,,5,", "for an item or total"),
+        ("1,,5,", "in a row that names an item or total"),
         ("1,A,5,\n1,A,6,", "student 1 has two rows for the item A"),
     ],
 )

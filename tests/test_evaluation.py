@@ -19,13 +19,13 @@ from trajectory_tools import NAMES, PUBLISHED, SHIFT, TURN, flight, read_public,
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.alignment import AlignmentKind, fit_alignment
-from px4fuse.trajectory.association import Method, associate
+from px4fuse.trajectory.association import AssociationMethod, associate
 from px4fuse.trajectory.evaluation import choose_alignment, evaluate
 from px4fuse.trajectory.model import Trajectory
 from px4fuse.trajectory.scores import (
     MIN_BOOTSTRAP_BLOCKS,
     Delta,
-    Interval,
+    RmseInterval,
     autocorrelation_time,
     find_pairs,
     relative_error,
@@ -154,7 +154,7 @@ def test_alignment_of_straight_line_allows_only_yaw(noise_m: float) -> None:
     for kind in ("se3", "sim3"):
         with pytest.raises(TrajectoryError, match=r"perpendicular.*`alignment` yaw"):
             fit_alignment(x, y, kind)  # type: ignore[arg-type]
-    assert fit_alignment(x, y, "yaw").rotation.magnitude() < 0.02
+    assert fit_alignment(x, y, "yaw").to_rotation().magnitude() < 0.02
 
 
 def test_trajectory_alignment_without_motion_is_rejected() -> None:
@@ -240,7 +240,7 @@ def test_nearest_pose_association_equals_exhaustive_search(denser: bool) -> None
 
 
 @pytest.mark.parametrize("method", ["interpolate", "nearest"])
-def test_evaluate_without_overlap_states_both_time_spans(method: Method) -> None:
+def test_evaluate_without_overlap_states_both_time_spans(method: AssociationMethod) -> None:
     reference = flight()
     estimate = replace(reference, name="boot.tum", time_s=reference.time_s + 500.0)
     said = r"0 poses match.*500.000 to 559.950 s.*0.000 to 59.950 s.*`time_offset_s` auto"
@@ -552,7 +552,7 @@ def test_rmse_confidence_interval_contains_true_rmse(phi: float) -> None:
     white = random.normal(size=(n + 500, flights, 3)) * np.sqrt(1.0 - phi**2)
     errors = np.linalg.norm(lfilter([1.0], [1.0, -phi], white, axis=0)[500:], axis=2)
     got = [rmse_interval(errors[:, i], "ATE") for i in range(flights)]
-    known = [one for one in got if isinstance(one, Interval)]
+    known = [one for one in got if isinstance(one, RmseInterval)]
     assert len(known) == flights
     assert np.median([one.blocks for one in known]) > 20.0
     held = np.mean([one.low <= np.sqrt(3.0) <= one.high for one in known])

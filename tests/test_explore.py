@@ -24,9 +24,9 @@ from flights import Imu, aisle_flight, unexplained
 from px4fuse.analysis import Analysis
 from px4fuse.cli.compare import compare as compare_command
 from px4fuse.cli.options import comparison_request, read_student
-from px4fuse.comparison.model import FILTERS, AxisComparison
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison
 from px4fuse.core.text import format_ratio
-from px4fuse.diagnose import prepare_comparison
+from px4fuse.diagnose import prepare_comparison, read_flight
 from px4fuse.explore import page as pages
 from px4fuse.explore.page import html_text
 from px4fuse.flight.model import Flight
@@ -126,10 +126,10 @@ def cells(result: AxisComparison) -> dict[str, list[str]]:
     names = ["● innovation ÷ √S, RMS", "◆ error ÷ σ, RMS",
              "Innovations outside ±2√S (expected 5 %)",
              "Lag-1 autocorrelation of the innovations", "Number of measurements"]  # fmt: skip
-    both = zip(*(statement(result.filters[name]) for name in FILTERS), strict=True)
+    both = zip(*(statement(result.filters[name]) for name in FILTER_NAMES), strict=True)
     expected = {name: list(pair) for name, pair in zip(names, both, strict=True)}
     difference: Any = result.difference
-    errors = [result.filters[name].truth for name in FILTERS]
+    errors = [result.filters[name].truth for name in FILTER_NAMES]
     expected["KF − EKF2 position difference, RMS"] = [f"{difference.position_rms_m:.3f} m", "–"]
     expected["KF − EKF2 velocity difference, RMS"] = [f"{difference.velocity_rms_m_s:.3f} m/s", "–"]
     for name, unit in (("Position", "m"), ("Velocity", "m/s")):
@@ -165,7 +165,7 @@ def test_explore_page_sliders_equal_values_of_shown_command(
     segment = explored[1].segment
     assert (request.start_s, request.end_s) == pytest.approx((segment.start_s, segment.end_s))
     assert request.heading_deg == pytest.approx(explored[1].main.axis.heading_deg)
-    comparison = compare_prepared(prepare_comparison(request))
+    comparison = compare_prepared(prepare_comparison(read_flight(request), request))
     north = next(result for result in comparison.axes.values() if result.axis.name == "north")
     shown = page.ask(TABLE)
     assert shown != before

@@ -19,7 +19,7 @@ from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.diagnose import diagnose, prepare_comparison
 from px4fuse.explore.page import html_text
-from px4fuse.report.card_html import card_of
+from px4fuse.report.card_html import make_diagnosis_card
 from px4fuse.request import ComparisonRequest
 
 pytestmark = pytest.mark.usefixtures("cached_analyses")
@@ -121,7 +121,7 @@ ROWS = """Object.fromEntries([...document.querySelectorAll('#card [data-filter]'
 def test_explore_page_shows_report_diagnosis_before_any_change(
     page: Browser, explored: tuple[Path, Analysis]
 ) -> None:
-    card = card_of(explored[1])
+    card = make_diagnosis_card(explored[1])
     rows = page.ask(ROWS)
     for verdict in card.verdicts:
         ratio, word, place = rows[f"{verdict.filter} {verdict.against}"]
@@ -147,7 +147,7 @@ def test_explore_page_javascript_sigma_ratios_equal_python(
         start_s=analysis.segment.start_s, end_s=analysis.segment.end_s,
         heading_deg=analysis.main.axis.heading_deg,
     )  # fmt: skip
-    main = compare_prepared(prepare_comparison(request, flight=analysis.flight)).main
+    main = compare_prepared(prepare_comparison(analysis.flight, request)).main
     source, truth = make_sigma_verdicts(main)[:2]
     rows = page.ask(ROWS)
     for verdict in (source, truth):
@@ -156,7 +156,8 @@ def test_explore_page_javascript_sigma_ratios_equal_python(
     headline = page.ask("document.querySelector('#card h2').textContent")
     assert f"KF is overconfident with these settings: σ is {format_ratio(truth.ratio)} " in headline
     rmse = format_metres(main.filters["kf"].truth.position_rmse_m)
-    assert f"KF {rmse} m (as analysed" in page.ask("document.querySelector('#card').textContent")
+    card_text = page.ask("document.querySelector('#card').textContent")
+    assert f"KF {rmse} m (original settings" in card_text
     # the analysed ratio stays as a hollow mark
     was = "document.querySelector('#card [data-filter=kf] .was').getAttribute('display')"
     assert page.ask(was) == "inline"
@@ -178,7 +179,7 @@ def test_explore_page_apply_button_takes_recommended_values(
     value = browser.ask("document.getElementById('sigma-a-value').value")
     assert f"--sigma-a {value}" in command
     assert "KF is consistent with these settings" in text(browser, "card")
-    assert "Diagnosis with the analysed settings: ■ ERROR" in text(browser, "card")
+    assert "Diagnosis with the original settings: ■ ERROR" in text(browser, "card")
     assert browser.complaints() == []
 
 

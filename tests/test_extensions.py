@@ -61,20 +61,23 @@ fields = dict(zip("xyz", position(seconds_of(at)).T, strict=True))
 log = make_log().add(topic("beacon_position", at, fields))
 tracks = {track.name: track for track in read_log(log.write(Path("wind.ulg"))).positions}
 assert tracks["beacon_position"].frame == "NED", tracks
+assert tracks["beacon_position"].origin.aid is None
 assert len(tracks["beacon_position"].samples) == 200
 """,
     "mavlink": """
 from pathlib import Path
 from mavlink_tools import Aisle, COMPANION, message, unix, us, xyz
 from px4fuse.readers import read_log
-aisle = Aisle(uwb=None)
+aisle = Aisle()
 recorder = aisle.record()
 for boot_s in aisle.times(5.0):
     fields = xyz(aisle.path(boot_s)[0])
     sent = message("VICON_POSITION_ESTIMATE", usec=us(unix(boot_s)), **fields)
     recorder.hear(unix(boot_s + 0.01), COMPANION, sent)
 Path("wind.tlog").write_bytes(recorder.tlog())
-(track,) = read_log(Path("wind.tlog")).positions
+flight = read_log(Path("wind.tlog"))
+track = next(track for track in flight.positions if track.name.startswith("VICON"))
+assert flight.truth.name == "VICON_POSITION_ESTIMATE"
 assert (track.name, track.frame, track.origin.kind) == ("VICON_POSITION_ESTIMATE", "NED", "mocap")
 assert len(track.samples) == 200
 """,

@@ -7,19 +7,24 @@ from functools import partial
 import pytest
 
 from px4fuse.classroom.assignment import figures
-from px4fuse.classroom.assignment.figures import FAULTS, QUESTIONS, draw_figures, select_choices
+from px4fuse.classroom.assignment.figures import (
+    FIGURE_FAULTS,
+    QUESTIONS,
+    draw_figures,
+    select_choices,
+)
 from px4fuse.classroom.assignment.random_assignment import random_uniform
 from px4fuse.results.answer_form import CHOICE_NAMES, MAX_CHOICES, MAX_FORM_BYTES, form_text
 
 
-def test_right_choices_of_one_figure_belong_to_one_fault() -> None:
+def test_right_answers_on_one_plot_belong_to_one_fault() -> None:
     for number in range(20):
         choices = select_choices(partial(random_uniform, b"secret", f"s{number}", "aisle"))
         assert len(choices) == len(QUESTIONS) * figures.FIGURE_COUNT <= MAX_CHOICES
         for first in range(0, len(choices), len(QUESTIONS)):
             rows = zip(choices[first:], QUESTIONS, strict=False)
             right = [(choice.answer_text(letter), field) for (choice, letter), field in rows]
-            fault = next(each for each in FAULTS.values() if each.fault == right[0][0])
+            fault = next(each for each in FIGURE_FAULTS.values() if each.fault == right[0][0])
             assert all(getattr(fault, field) == text for text, field in right)
         form = form_text("s.ulg", "0" * 64, [choice for choice, _ in choices])
         assert len(form.encode()) < MAX_FORM_BYTES
@@ -32,12 +37,14 @@ def test_right_multiple_choice_letters_are_equally_frequent() -> None:
         assert letters.count(name) / len(letters) == pytest.approx(0.2, abs=0.03)
 
 
-def test_answers_to_figure_questions_differ_between_faults() -> None:
+def test_answers_to_plot_questions_differ_between_faults() -> None:
     for field in QUESTIONS:
-        assert len({getattr(fault, field) for fault in FAULTS.values()}) == len(FAULTS)
+        assert len({getattr(fault, field) for fault in FIGURE_FAULTS.values()}) == len(
+            FIGURE_FAULTS
+        )
 
 
-def test_figures_of_same_secret_and_student_are_equal(monkeypatch) -> None:
+def test_plot_questions_of_same_secret_and_student_are_equal(monkeypatch) -> None:
     monkeypatch.setattr(figures, "FIGURE_COUNT", 1)
     random_number = partial(random_uniform, b"secret", "s1", "aisle")
     content = draw_figures(random_number)

@@ -34,6 +34,7 @@ from findings_tools import (
     tuned,
     with_bias,
 )
+from flights import given_placement
 
 from px4fuse.comparison.flight_events import source_gaps
 from px4fuse.comparison.trials import RunStatistics, Trial
@@ -756,6 +757,14 @@ SOURCE_EDGES = [
        analysis(time_correlated_noise=slow(gain, lag)), expected)
       for gain, lag, expected in (
           (5.0, 0.9, "warning"), (4.9, 0.0, None), (99.0, 1.0, None))),
+    *((source_noise.detect_time_correlated_noise,
+       analysis(time_correlated_noise=slow(99.0, 0.0, slow_m)), expected)
+      for slow_m, expected in ((0.0049, None), (0.005, "warning"))),
+    # the height of a frame that was fitted to EKF2's track contains EKF2's height error
+    *((hidden_errors.detect, analysis(
+        axes=(hiding(name="down"),),
+        source=source(alignment=replace(given_placement(), yaw_sigma_deg=sigma_deg))), expected)
+      for sigma_deg, expected in ((None, "warning"), (0.1, None))),
     *((source_noise.detect_repeated_positions, repeating(again, count), expected)
       for again, count, expected in (
         (10, 200, "warning"), (9, 100, None), (10, 201, None), (30, 100, "error"),
@@ -855,10 +864,20 @@ def test_growing_latency_of_positions_is_reported(growth_s: float, severity: str
     time_s = np.arange(20.0, 60.0)
     record = ages(0, len(time_s))["record"]
     record.vision_age_s[:] = 0.03 + growth_s * np.linspace(0.0, 1.0, len(time_s))
-    one = analysis(ekf2={"record": record})
-    findings = list(source_stamps.detect_growing_latency(one))
+    one = analysis(ekf2={"record": record, "horizon_s": NONE})
+    findings = list(source_stamps.detect_varying_latency(one))
     assert [finding.severity for finding in findings] == ([severity] if severity else [])
     assert all("from 0.05 s to 0.21 s" in finding.message for finding in findings)
+
+
+@pytest.mark.parametrize(("late_share", "is_reported"), [(0.05, True), (0.01, False), (1.0, False)])
+def test_positions_too_late_for_ekf2_buffer_are_reported(late_share, is_reported) -> None:
+    record = ages(0, 400)["record"]
+    record.vision_age_s[:] = np.where(np.arange(400) % 100 < 100 * late_share, 0.31, 0.2)
+    one = analysis(ekf2={"record": record, "horizon_s": 0.2})
+    findings = list(source_stamps.detect_varying_latency(one))
+    assert [finding.severity for finding in findings] == ["error"] * is_reported
+    assert all("later than 0.30 s (here 5 %)" in finding.message for finding in findings)
 
 
 def test_position_sample_interval_is_found_despite_jitter() -> None:
@@ -1082,3 +1101,17 @@ def test_fault_severity_changes_at_each_detection_limit(
     detect: Any, one: Any, expected: str | None
 ) -> None:
     assert severity(detect, one) == expected
+
+
+@pytest.mark.parametrize(("size", "is_reported"), [(5, True), (2, False), (1, False)])
+def test_timestamps_in_bursts_are_reported_as_jitter(size: int, is_reported: bool) -> None:
+    time_s = (0.25 * np.arange(40.0)[:, None] + 6e-4 * np.arange(size)).ravel()
+    found = [*source_stamps.detect_bursts(analysis(source=source(samples=positions(time_s))))]
+    assert [finding.id for finding in found] == ["source_timestamp_jitter"] * is_reported
+    assert not is_reported or "bursts of 5, every 0.25 s" in found[0].message
+
+
+def test_repeated_positions_of_odometry_are_reported() -> None:
+    one = repeating(50, 100)
+    one.source.orientation = object()
+    assert named(source_noise.detect, one) == {"source_samples_repeated": "error"}

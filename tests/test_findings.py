@@ -17,7 +17,7 @@ from flights import Estimator, Imu, Uwb, aisle_flight, given_placement, unexplai
 from golden_tools import assert_matches_golden, rounded, value
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.diagnose import prepare_comparison
+from px4fuse.diagnose import prepare_comparison, read_flight
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
@@ -307,18 +307,18 @@ TESTED_ELSEWHERE = {
     "false_loop_closure", "loop_closure_inconsistent", "loop_drift_too_small",
     "loop_landing_assumed", "loop_on_absolute_positions", "sigma_a_too_large", "sigma_a_too_small",
     "sigma_z_too_large", "sigma_z_too_small", "source_axes_wrong", "source_convention_ambiguous",
-    "source_downsampled",
+    "source_downsampled", "source_height_constant",
     "source_frame_misaligned", "source_low_pass_filtered", "source_noise_time_correlated",
     "source_noise_unequal_axes", "source_noise_varies", "source_orientation_copied",
     "source_orientation_wrong", "source_outliers", "source_position_jump",
     "source_reported_variance_wrong", "source_samples_repeated",
     "source_time_offset", "source_timestamps_are_arrival_times",
-    "attitude_late", "source_latency_grows",
+    "attitude_late", "source_latency_varies",
     "source_unit_wrong", "source_is_ekf2_estimate", "source_two_senders",
     "source_positions_rounded", "source_lever_arm", "source_timestamp_unit",
     "source_timestamps_shared", "source_position_held", "source_zero_positions",
     "source_without_position", "ekf2_bias_at_limit", "ekf2_not_aligned", "gyroscope_bias",
-    "parameter_changed", "source_height_only", "source_relocalises",
+    "parameter_changed", "source_coordinate_constant", "source_relocalises",
 }  # fmt: skip
 # Second finding of severity error that the fault causes
 ALSO_ERROR = {
@@ -354,6 +354,14 @@ PRECONDITIONS: list[tuple[str, Callable[[Comparison, Finding], bool]]] = [
     ("texture|marker|camera", lambda made, _: made.source.origin.kind in ("vio", "mocap")),
     ("--source-kind mocap", lambda made, _: made.source.origin.kind == "vio"),
     ("Calibrate the magnetometer", lambda made, _: parameter(made, "EKF2_MAG_TYPE") != 5.0),
+    ("[Aa]ntenna|receiver|sky|RTK", lambda made, _: made.source.origin.is_gnss),
+    ("EKF2_DELAY_MAX", lambda made, _: "EKF2_DELAY_MAX" in made.flight.log.parameters),
+    ("EKF2_EV_CTRL bit 3", lambda made, _: made.source.origin.is_vision),
+    ("EKF2_EV_NOISE_MD", lambda made, _: made.source.origin.is_vision),
+    (
+        "sent|sending|[Ss]end (the|each|a|one|raw|nothing|NaN)",
+        lambda made, _: not made.source.origin.is_gnss,
+    ),
     ("SD card", lambda made, one: bool(made.flight.log.dropouts) or one.id in CORRUPT_LOG),
     (
         "let EKF2 fuse the yaw",
@@ -436,7 +444,7 @@ def test_positions_missing_for_part_of_flight_are_reported_first(
     cases = shared_logs.parent / "cases"
     position = file and PositionFile(path=str(cases / file), frame="enu")
     request = ComparisonRequest(log=str(shared_logs / f"{log}.ulg"), position=position or None)
-    first, *_ = found(compare_prepared(prepare_comparison(request)))
+    first, *_ = found(compare_prepared(prepare_comparison(read_flight(request), request)))
     # EKF2 fused its own source besides the file
     assert (first.id, first.severity) == (finding, "warning" if file else "error")
     assert f"in flight at {at_s} s: EKF2's position error is " in first.title
@@ -466,7 +474,7 @@ def test_positions_lost_by_logger_are_not_reported_as_source_gap(sample_flight: 
     assert finding.spans_s == (pytest.approx((40.0, 60.0), abs=0.2),)
 
 
-def test_step_of_positions_is_no_variation_of_time_offset() -> None:
+def test_position_jump_is_not_reported_as_time_offset_change() -> None:
     step = with_errors(lambda t, _: np.outer(t > 60.0, [0.87, 0.5]))
     assert "source_time_offset_changes" not in ids(found(compare(step(aisle_flight()))))
 

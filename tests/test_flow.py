@@ -18,8 +18,8 @@ from px4fuse.ekf2.whatif import what_if
 from px4fuse.flight.model import Columns, Flight, Reset
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_innovations import with_gnss_innovations
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import make_scenario
 
 # interval (s) and weight of a new sample in EKF2's low-pass filter, ekf.h
@@ -36,7 +36,7 @@ def low_pass_weights(raw: np.ndarray) -> np.ndarray:
 
 @cache
 def model() -> Model:
-    return opened(simulate_flight(make_scenario("outdoor", seed=3, passes=3), parse_mistakes(())))
+    return opened(simulate_flight(make_scenario("outdoor", seed=3, passes=3), parse_faults(())))
 
 
 def true_velocity(times: np.ndarray) -> np.ndarray:

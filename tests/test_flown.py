@@ -10,7 +10,7 @@ from comparisons import compare
 from flights import with_noises
 
 from px4fuse.card.build import build_card
-from px4fuse.comparison.model import FILTERS
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.diagnose import find_faults
 from px4fuse.filter.time_offset import MAX_CHANGE_P_VALUE
 from px4fuse.findings import find
@@ -109,7 +109,7 @@ def test_recorded_flight_with_known_fault_reports_this_fault(shared_logs, name):
         assert severity in (None, first.severity)
         assert {key: first.evidence[key] for key in evidence} == evidence
     if name.endswith("hwlog"):
-        assert {analysis.main.filters[owner].verdict for owner in FILTERS} == {"consistent"}
+        assert {analysis.main.filters[owner].verdict for owner in FILTER_NAMES} == {"consistent"}
     if name.endswith("nominal"):
         assert {item.severity for item in found} <= {"note"}
     if flown.first or flown.elsewhere or name.endswith("clock_late"):

@@ -15,7 +15,7 @@ from exchange import replace
 from form_guesses import SHA256, right
 from test_form_points import CLEAN, GAP, RIGHT, TRUTH
 
-from px4fuse.classroom.assignment.truth import FormTruth, InjectedFault, VerdictTruth
+from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers, RightVerdict
 from px4fuse.classroom.grading.flags import flag_equal_contents
 from px4fuse.classroom.grading.form_points import form_points
 from px4fuse.errors import SettingsError
@@ -26,7 +26,7 @@ from px4fuse.results.answer_form import (
     NamedFault,
     read_answers,
 )
-from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
+from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED
 
 FIRST = 'kind = "clock-offset"\nsize = 0.19\nunit = "s"\nwhen = "whole flight"\n'
 HONEST = f"""log_sha256 = "{"a" * 64}"
@@ -168,7 +168,7 @@ def test_fault_named_on_clean_flight_earns_no_points_for_faults(kinds, tmp_path:
     assert named.fraction < 0.5 * form_points(right(CLEAN), CLEAN).fraction
 
 
-def test_two_students_with_equal_figure_answers_are_flagged() -> None:
+def test_two_students_with_equal_plot_answers_are_flagged() -> None:
     form = Answers(log_sha256=SHA256, choices=("a", "b", "", "c", "d", "e", "a"))
     reports = [
         graded_report(name, 5.0, student_id=name, form=replace(form, choices=choices))
@@ -182,8 +182,8 @@ def test_two_students_with_equal_figure_answers_are_flagged() -> None:
 # ------------------------------------------------ students who analysed their flight
 
 OFF = InjectedFault("ekf2-off")
-OFF_TRUTH = FormTruth(
-    (OFF,), 0.1, VerdictTruth("consistent"), VerdictTruth(""), ("never fused",),
+OFF_TRUTH = RightFormAnswers(
+    (OFF,), 0.1, RightVerdict("consistent"), RightVerdict(""), ("never fused",),
     ("followed wrong positions",), (0.5, 0.1, 0.2),
 )  # fmt: skip
 NLOS_TRUTH = replace(TRUTH, mistakes=(InjectedFault("nlos", 3.0, 2.5, 3.5, 10.0, 60.0), GAP))
@@ -191,14 +191,14 @@ COMPASS_TRUTH = replace(TRUTH, mistakes=(InjectedFault("heading", 20.0, 17.0, 23
 END_TRUTH = replace(TRUTH, mistakes=(InjectedFault("open-end", 5.0, 4.7, 5.3, 60.0),))
 
 
-def first_mistake(truth: FormTruth, **values) -> Answers:
+def first_mistake(truth: RightFormAnswers, **values) -> Answers:
     """Return the right form with other values of its first fault."""
     form = right(truth)
     return replace(form, mistakes=(replace(form.mistakes[0], **values), *form.mistakes[1:]))
 
 
 # Right answers, form of a student who analysed the flight, and minimum points of 100
-HONEST_FORMS: dict[str, tuple[FormTruth, Answers, float]] = {
+HONEST_FORMS: dict[str, tuple[RightFormAnswers, Answers, float]] = {
     "EKF2 never fused, verdict not available": (OFF_TRUTH, right(OFF_TRUTH), 100.0),
     "EKF2 never fused and followed": (
         OFF_TRUTH,

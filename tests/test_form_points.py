@@ -15,7 +15,12 @@ from form_guesses import at_random, constants
 from scipy.stats import spearmanr
 
 from px4fuse.classroom.assignment.random_assignment import assign_random_flight
-from px4fuse.classroom.assignment.truth import FormTruth, InjectedFault, VerdictTruth, form_truth
+from px4fuse.classroom.assignment.truth import (
+    InjectedFault,
+    RightFormAnswers,
+    RightVerdict,
+    right_form_answers,
+)
 from px4fuse.classroom.grading.form_points import (
     PART_NAMES,
     POINTS_TABLE,
@@ -34,15 +39,15 @@ from px4fuse.results.answer_form import (
     update_renamed_values,
 )
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import MISTAKES as SIMULATED
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import Scenario, make_scenario
 
 SHA256 = "a" * 64
 LATE = InjectedFault("clock-offset", 0.2, 0.17, 0.23)
 GAP = InjectedFault("dropout", 3.0, 2.55, 3.45, 50.0, 53.0)
-TRUTH = FormTruth(
-    (LATE, GAP), 0.1, VerdictTruth("overconfident", 2.0), VerdictTruth("underconfident", 1.3),
+TRUTH = RightFormAnswers(
+    (LATE, GAP), 0.1, RightVerdict("overconfident", 2.0), RightVerdict("underconfident", 1.3),
     ("followed wrong positions", "dead-reckoned, then reset"), ("fused at the wrong time",),
     (0.5, (3.0, 7.0), -0.2),
 )  # fmt: skip
@@ -68,8 +73,8 @@ RIGHT = Answers(
     ekf2_did=("followed wrong positions", "dead-reckoned, then reset"),
     quantities=(0.505, (3.0, 7.0), -0.2),
 )
-CLEAN = FormTruth(
-    (), 0.1, VerdictTruth("consistent"), VerdictTruth("consistent"), ("normal",),
+CLEAN = RightFormAnswers(
+    (), 0.1, RightVerdict("consistent"), RightVerdict("consistent"), ("normal",),
     ("followed the positions",), (0.5, 0.1, 0.2),
 )  # fmt: skip
 
@@ -85,7 +90,7 @@ def with_false(*kinds: str) -> Answers:
     return replace(RIGHT, mistakes=(*RIGHT.mistakes, *map(NamedFault, kinds)))
 
 
-def parts(answers: Answers, truth: FormTruth = TRUTH) -> list[float]:
+def parts(answers: Answers, truth: RightFormAnswers = TRUTH) -> list[float]:
     found = form_points(answers, truth).points_by_part
     return [round(found[name], 2) for name in PART_NAMES]
 
@@ -115,7 +120,7 @@ def test_feedback_states_each_right_answer_that_was_not_given() -> None:
     truth = replace(TRUTH, choices=((choice, "c"), (choice, "e")))
     form = replace(RIGHT, verdict_kf="", ekf2_did=(), quantities=(0.5, (3.0, 8.0)), choices=("a",))
     feedback = "; ".join(form_points(form, truth).feedback)
-    assert "verdict on KF: 'overconfident' is right, you gave 'none'" in feedback
+    assert "consistency of KF: 'overconfident' is right, you gave 'none'" in feedback
     assert "'dead-reckoned, then reset' is right, you gave none" in feedback
     assert "3, 7 is right, you gave 3, 8" in feedback
     assert "-0.2 is right, you gave 'none'" in feedback
@@ -125,7 +130,7 @@ def test_feedback_states_each_right_answer_that_was_not_given() -> None:
 
 DELAY = {"parameter": "EKF2_EV_DELAY", "value": 200.0, "value_unit": "ms"}
 GATE = {"parameter": "EKF2_EVP_GATE", "value": 3.0, "value_unit": "sd"}
-NO_MISTAKES = {"mistakes": 0.0, "sizes": 0.0, "time and panel": 0.0, "correction": 0.0}
+NO_FAULTS = {"mistakes": 0.0, "sizes": 0.0, "time and panel": 0.0, "correction": 0.0}
 # A form, and its parts with reduced points
 HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
     # wrong sign: a third of the points for the size and the action of this fault
@@ -140,8 +145,8 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
     (with_claim(kind="ekf2-delay"), {"mistakes": 21.0, "sizes": 10.0, "time and panel": 7.5}),
     # each wrong fault costs 10 points
     (with_false("yaw"), {"mistakes": 20.0}),
-    (with_false("yaw", "nlos", "scale"), NO_MISTAKES),
-    (replace(RIGHT, mistakes=(NamedFault("none"),)), NO_MISTAKES),
+    (with_false("yaw", "nlos", "scale"), NO_FAULTS),
+    (replace(RIGHT, mistakes=(NamedFault("none"),)), NO_FAULTS),
     (replace(RIGHT, verdict_kf="consistent"), {"verdicts": 10.0}),
     (replace(RIGHT, verdict_ekf2="consistent"), {"verdicts": 10.0}),
     (replace(RIGHT, ekf2_did=("dead-reckoned, then reset",)), {"verdicts": 12.5}),
@@ -191,8 +196,10 @@ def test_guessed_answers_for_all_loop_flights_earn_few_points() -> None:
         sizes = [float(typed.partition("=")[2].rstrip("m")) for typed in drawn.mistake_options]
         measured = [size + rng.normal(0.0, 0.4) for size in sizes]
         wrong = [InjectedFault("open-end", size, size - 0.3, size + 0.3, 65.0) for size in measured]
-        verdicts = VerdictTruth("underconfident", 7.0), VerdictTruth("overconfident", 1.1)
-        truths.append(FormTruth(tuple(wrong), 0.01, *verdicts, ("normal",), (), (0.5, 0.1, ())))
+        verdicts = RightVerdict("underconfident", 7.0), RightVerdict("overconfident", 1.1)
+        truths.append(
+            RightFormAnswers(tuple(wrong), 0.01, *verdicts, ("normal",), (), (0.5, 0.1, ()))
+        )
     for kind in ("open-end", "none"):
         for each in constants(truths, kind):
             form = replace(each, quantities=(None, None, ()))
@@ -202,8 +209,8 @@ def test_guessed_answers_for_all_loop_flights_earn_few_points() -> None:
 def test_expected_loop_closure_error_includes_odometry_drift() -> None:
     """A student cannot separate the drift from the measured closure error."""
     scenario = Scenario(kind="loop", passes=1, vio_drift=0.02, seed=4, truth=False)
-    (wrong,) = form_truth(
-        flights.simulate(scenario, parse_mistakes(("open-end=5m",))), SHA256
+    (wrong,) = right_form_answers(
+        flights.simulate(scenario, parse_faults(("open-end=5m",))), SHA256
     ).mistakes
     assert wrong.size is not None
     assert wrong.low is not None
@@ -220,7 +227,7 @@ def simulation_of(typed: str) -> flights.Simulation:
     names = {field.name for field in dataclasses.fields(Scenario)} - {"kind", "truth", "ekf2"}
     chosen = {name: given[name] for name in names if given.get(name) is not None}
     scenario = make_scenario(given["kind"], truth=not given["no_truth"], **chosen)
-    return flights.simulate(scenario, parse_mistakes(given["mistake"]))
+    return flights.simulate(scenario, parse_faults(given["mistake"]))
 
 
 def answers_of(form: dict[str, Any]) -> Answers:
@@ -261,13 +268,13 @@ VERDICT_WORDS = {
 }  # fmt: skip
 
 
-def verdicts_by_hand(flight: dict[str, Any]) -> tuple[VerdictTruth, VerdictTruth]:
+def verdicts_by_hand(flight: dict[str, Any]) -> tuple[RightVerdict, RightVerdict]:
     """Return the verdicts on KF and EKF2 with which the forms were judged.
 
     They are of the 95 % band of the mean NIS, without a band for the ratio.
     """
     words = (VERDICT_WORDS[flight[name]["verdict"]] for name in ("verdict_ours", "verdict_ekf2"))
-    kf, ekf2 = map(VerdictTruth, words)
+    kf, ekf2 = map(RightVerdict, words)
     return kf, ekf2
 
 
@@ -275,7 +282,7 @@ def verdicts_by_hand(flight: dict[str, Any]) -> tuple[VerdictTruth, VerdictTruth
 def test_answer_form_points_agree_with_manual_grading(shared_logs: Path) -> None:
     bank = json.loads((shared_logs.parent / "grading" / "bank.json").read_text(encoding="utf-8"))
     truths = {
-        flight["flight"]: form_truth(simulation_of(flight["simulate"]), SHA256)
+        flight["flight"]: right_form_answers(simulation_of(flight["simulate"]), SHA256)
         for flight in bank["flights"]
     }
     by_hand = {flight["flight"]: verdicts_by_hand(flight) for flight in bank["flights"]}

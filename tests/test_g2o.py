@@ -26,7 +26,7 @@ SPACE = (
 
 
 def assert_equal_graphs(a: PoseGraph, b: PoseGraph) -> None:
-    for name in ("ids", "poses", "first", "second", "measurements", "information"):
+    for name in ("ids", "poses", "first_nodes", "second_nodes", "measurements", "information"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), strict=True)
 
 

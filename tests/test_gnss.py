@@ -187,10 +187,10 @@ def test_default_source_is_gnss_only_if_ekf2_fused_it(tmp_path):
 def test_default_sigma_z_of_gnss_equals_ekf2_noise(eph_m, least_m, axes, expected_m, tmp_path):
     flight = flight_of(outdoors(eph_m=eph_m, EKF2_GPS_P_NOISE=least_m), tmp_path)
     request = ComparisonRequest(log="a.ulg", axes=axes)
-    prepared = prepare_comparison(request, flight=flight)
+    prepared = prepare_comparison(flight, request)
     assert prepared.settings.sigma_z_m == pytest.approx(expected_m, rel=1e-3)
     requested = ComparisonRequest(log="a.ulg", axes=axes, sigma_z_m=0.3)
-    assert prepare_comparison(requested, flight=flight).settings.sigma_z_m == 0.3
+    assert prepare_comparison(flight, requested).settings.sigma_z_m == 0.3
 
 
 def test_compare_of_gnss_flight_uses_gnss_innovations(tmp_path):
@@ -232,7 +232,7 @@ def with_barometer(log: Log, *, fused: bool = True) -> Log:
 def test_down_axis_of_gnss_flight_uses_fused_barometer(tmp_path):
     flight = flight_of(with_barometer(outdoors()), tmp_path)
     request = ComparisonRequest(log="a.ulg", axes=("down", "north"))
-    prepared = prepare_comparison(request, flight=flight)
+    prepared = prepare_comparison(flight, request)
     down, north = prepared.input_axes
     at = down.measurement_time_s
     np.testing.assert_allclose(at % 0.2, 0.1, atol=1e-6)  # barometer times, not fix times
@@ -242,7 +242,7 @@ def test_down_axis_of_gnss_flight_uses_fused_barometer(tmp_path):
     assert prepared.settings.sigma_z_m == pytest.approx(0.4)  # EKF2_BARO_NOISE
     innovations = prepared.flight.ekf2.innovations["down"]  # type: ignore[union-attr]
     np.testing.assert_allclose(innovations["innovation_m"], -0.2, rtol=1e-6)
-    fused_as_gnss = prepare_comparison(replace(request, height="gnss"), flight=flight)
+    fused_as_gnss = prepare_comparison(flight, replace(request, height="gnss"))
     assert not np.isin(fused_as_gnss.input_axes[0].measurement_time_s, at).any()
     assert isinstance(fused_as_gnss.flight.ekf2.innovations["down"], Unavailable)  # type: ignore[union-attr]
 
@@ -376,7 +376,7 @@ def test_compare_of_real_gnss_flights_equals_reference_numbers(name, shared_logs
         count, exact_m = re.findall(pattern, track.notes[1])[0]
         assert int(count) > FROM_INNOVATIONS[name]
         assert float(exact_m) < 0.1
-        assert track.rate_hz > 2.9
+        assert track.compute_rate_hz() > 2.9
 
 
 def as_in_the_log(found: dict[str, AidResult], truth: dict[str, Any]) -> int:
@@ -478,7 +478,7 @@ def test_what_if_with_correct_gnss_delay_reduces_heading_error(models):
             model.flight.ekf2.state["down_m"],
             model.baseline_replay.published["down_m"],
         )
-        state = state[inside_spans(state.index, model.baseline_replay.evaluated_s)]
+        state = state[inside_spans(state.index, model.baseline_replay.find_evaluated_spans())]
         assert rms(np.interp(state.index, replayed.index, replayed) - state.to_numpy()) < 0.05
     assert heading_deg("delay0", EKF2_GPS_DELAY=200.0) == pytest.approx((4.7, 1.5), abs=0.3)
     # 110 ms of delay error rotate the heading in proportion to 4.7° for 200 ms

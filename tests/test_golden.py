@@ -39,8 +39,8 @@ from px4fuse.explore.data import flight_data
 from px4fuse.explore.figures import document_json
 from px4fuse.explore.packing import Packer
 from px4fuse.report import pdf
-from px4fuse.simulation.flights import answer, simulate
-from px4fuse.simulation.mistakes import MISTAKES, parse_mistakes
+from px4fuse.simulation.faults import FAULT_TYPES, parse_faults
+from px4fuse.simulation.flights import make_answer_key, simulate
 from px4fuse.simulation.scenario import KINDS, make_scenario
 
 NOTES = """# What I saw
@@ -196,12 +196,12 @@ def test_mcp_session_in_documentation_has_current_answers(
 def spread(kind: str, *mistakes: str) -> list[str]:
     """Summarise the fields of a simulated flight's topics, and its answer key."""
     size = {} if kind == "outdoor" else {"length_m": 6.0}
-    made = simulate(make_scenario(kind, passes=1, seed=3, **size), parse_mistakes(mistakes))
+    made = simulate(make_scenario(kind, passes=1, seed=3, **size), parse_faults(mistakes))
     return [
         f"{topic.name} {field} {numbers(part)}"
         for topic in made.topics
         for field, part in topic.fields.items()
-    ] + list(of_values(answer(made)))
+    ] + list(of_values(make_answer_key(made)))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -209,7 +209,7 @@ def test_simulated_flight_values_match_reference_file(kind: str) -> None:
     """Flight without faults, then the lines that differ with each fault."""
     clean = spread(kind)
     lines = [*clean]
-    for name, mistake in MISTAKES.items():
+    for name, mistake in FAULT_TYPES.items():
         if kind in mistake.kinds:
             # EKF2 ignores a GNSS noise below the receiver's accuracy
             typed = f"{name}=2" if (kind, name) == ("outdoor", "ekf2-noise") else name

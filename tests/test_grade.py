@@ -21,7 +21,7 @@ from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
 from px4fuse.classroom.assignment.roster import file_names
 from px4fuse.classroom.grading.entries import Course, parse_late_rule
 from px4fuse.classroom.grading.grade import GradeOutcome, grade
-from px4fuse.classroom.grading.model import Entry, GradedReport
+from px4fuse.classroom.grading.model import Grade, GradedReport
 from px4fuse.classroom.grading.rubric import read_rubric
 from px4fuse.cli.outputs import Interrupted
 from px4fuse.core.reading import files_by_sha256
@@ -207,10 +207,10 @@ def test_interrupted_grade_command_prints_how_to_continue(tmp_path, monkeypatch)
     import px4fuse.classroom.grading.grade as module
 
     one = GradedReport("a.pdf", "Ada\nPoints 120\n" + "A" * 100_000, "1", UNKNOWN)
-    entry = Entry(one.student, one.student_id, one)
+    grade = Grade(one.student, one.student_id, one)
     monkeypatch.chdir(tmp_path)
     shutil.copy(REPORT, "a.pdf")
-    monkeypatch.setattr(module, "grade", lambda *_, **__: GradeOutcome((entry,), (), 0, ()))
+    monkeypatch.setattr(module, "grade", lambda *_, **__: GradeOutcome((grade,), (), 0, ()))
     said = run_checked("grade", "a.pdf", "-o", "out").output
     assert len(said) < 3000
     assert not any(line.lstrip().startswith("Points 120") for line in said.splitlines())
@@ -244,7 +244,7 @@ def test_grade_command_applies_all_course_options(tmp_path, monkeypatch) -> None
     course, processes = noted.call_args.args[1], noted.call_args.kwargs["processes"]
     assert (course.title, processes) == ("Lab", 3)
     assert [person.student_id for person in course.roster] == ["0042"]
-    assert course.worksheets[0].head == ("id", "Grade")
+    assert course.worksheets[0].column_titles == ("id", "Grade")
     assert (course.column, course.anonymous, course.attempt) == ("Grade", True, "best")
     assert course.due.isoformat() == "2026-11-20T23:59:59+01:00"
     assert (course.late_rule, course.include_pending) == (parse_late_rule("5%/hour"), False)

@@ -21,8 +21,8 @@ from px4fuse.filter.frame_rotation import (
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.readers import read_log
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 SIGMA_UWB_M = 0.03
@@ -32,7 +32,7 @@ HEADING_DRIFT_DEG = 40.0
 @cache
 def simulated(*mistakes: str, seed: int = 3, **scenario: float) -> Flight:
     made = Scenario(seed=seed, **{"sigma_uwb_m": SIGMA_UWB_M, "passes": 4, **scenario})
-    return simulate_flight(made, parse_mistakes(mistakes))
+    return simulate_flight(made, parse_faults(mistakes))
 
 
 def estimate(flight: Flight, sigma_z_m: float = SIGMA_UWB_M) -> HeadingError | Unavailable:
@@ -90,7 +90,7 @@ def test_drifting_heading_misalignment_is_estimated_over_time(by):
         expected = -np.interp(middle, flight.attitude.index, turn)
         within = 0.5 if by == "orientation" else 3.5 * part.sigma_deg
         assert part.heading_error_deg == pytest.approx(expected, abs=within)
-    first, last = found.ends
+    first, last = found.find_ends()
     assert first.start_s < last.start_s
     assert first.heading_error_deg > last.heading_error_deg
 

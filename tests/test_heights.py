@@ -30,8 +30,8 @@ from px4fuse.request import WhatIfRequest
 from px4fuse.results.build import whatif_results
 from px4fuse.results.contract import schema, to_json
 from px4fuse.simulation import ekf2 as simulated
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import make_scenario
 
 BOTH = ("baro_hgt", "gnss_hgt")
@@ -194,7 +194,7 @@ def outdoors(baro_noise_m: float = 0.4) -> Flight:
     noise = {"EKF2_BARO_NOISE": baro_noise_m}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulated, "parameters", lambda *of: usual(*of) | noise)
-        return simulate_flight(make_scenario("outdoor", seed=3, passes=3), parse_mistakes(()))
+        return simulate_flight(make_scenario("outdoor", seed=3, passes=3), parse_faults(()))
 
 
 @cache

@@ -25,8 +25,8 @@ from px4fuse.findings import source_intervals as intervals
 from px4fuse.findings import source_positions as sent
 from px4fuse.findings import source_stamps as stamps
 from px4fuse.flight.model import Columns, Flight, Unavailable
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
@@ -53,7 +53,7 @@ def analysed(flight: Flight, settings: Settings = RIGHT, **span: float) -> Analy
 @cache
 def flight(*mistakes: str, passes: int = 4) -> Flight:
     size = Scenario(ekf2=False, truth=False, seed=3, passes=passes)
-    return simulate_flight(size, parse_mistakes(mistakes))
+    return simulate_flight(size, parse_faults(mistakes))
 
 
 @cache
@@ -239,7 +239,7 @@ def test_time_offset_is_not_reported_as_low_pass_filter() -> None:
 @cache
 def with_ekf2(*mistakes: str) -> Analysis:
     return unexplained(
-        compare(simulate_flight(Scenario(seed=3), parse_mistakes(mistakes)), axes=("north",))
+        compare(simulate_flight(Scenario(seed=3), parse_faults(mistakes)), axes=("north",))
     )
 
 

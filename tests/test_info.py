@@ -18,7 +18,13 @@ from px4fuse.comparison.preparation import choose_source
 from px4fuse.diagnose import find_faults
 from px4fuse.errors import Px4FuseError
 from px4fuse.flight.model import GNSS, Dropout, Flight, Sender, Unavailable
-from px4fuse.info.inventory import AnalysisOption, Inventory, Source, take_inventory, to_json_dict
+from px4fuse.info.inventory import (
+    AnalysisOption,
+    Inventory,
+    LoggedData,
+    take_inventory,
+    to_json_dict,
+)
 from px4fuse.readers import read_log
 
 WIDTH = 80
@@ -46,7 +52,7 @@ def inventory_of(log: Log, tmp_path: Path) -> Inventory:
     return take_inventory(read_log(log.write(tmp_path / "made.ulg")))
 
 
-def source(inventory: Inventory, part: str) -> Source:
+def source(inventory: Inventory, part: str) -> LoggedData:
     return next(source for source in inventory.sources if source.part == part)
 
 

@@ -6,22 +6,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from class_tools import entry, graded_report
+from class_tools import grade, graded_report
 
 from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
-from px4fuse.classroom.assignment.truth import FormTruth, InjectedFault, VerdictTruth
+from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers, RightVerdict
 from px4fuse.classroom.grading.item_analysis import analyse_items
-from px4fuse.classroom.grading.model import Item
+from px4fuse.classroom.grading.model import ItemScore
 from px4fuse.classroom.grading.oral_check import ask_about_form, questions_text
 from px4fuse.results.answer_form import Answers, Choice, NamedFault
 
 POINTS = np.array([[9, 2, 1], [8, 4, 9], [5, 6, 3], [2, 8, 8], [1, 9, 2]], dtype=float)
 REPORTS = [graded_report(f"{n}.pdf", *row) for n, row in enumerate(POINTS.tolist())]
-TRUTH = FormTruth(
+TRUTH = RightFormAnswers(
     (InjectedFault("nlos", 10.0, 8.5, 11.5), InjectedFault("yaw", 20.0, 17.0, 23.0)),
     0.1,
-    VerdictTruth("overconfident", 2.0),
-    VerdictTruth("consistent"),
+    RightVerdict("overconfident", 2.0),
+    RightVerdict("consistent"),
     ("normal",),
     (),
     (1.0, 2.0, 3.0),
@@ -49,7 +49,9 @@ def test_item_analysis_of_four_reports_omits_discrimination() -> None:
 
 def test_item_analysis_lists_answer_form_parts_and_faults() -> None:
     reports = [
-        replace(each, form_parts=(Item("sizes", n, 15.0, ""),), mistakes={"nlos": n > 1})
+        replace(
+            each, form_parts=(ItemScore("sizes", n, 15.0, ""),), is_found_by_fault={"nlos": n > 1}
+        )
         for n, each in enumerate(REPORTS)
     ]
     *_, sizes, fault = analyse_items(reports)
@@ -59,7 +61,7 @@ def test_item_analysis_lists_answer_form_parts_and_faults() -> None:
 
 
 def test_item_analysis_excludes_items_that_await_points() -> None:
-    text = Item("Text", 0.0, 20.0, "", True, True)
+    text = ItemScore("Text", 0.0, 20.0, "", True, True)
     reports = [replace(each, items=(*each.items, text)) for each in REPORTS]
     assert [item.title for item in analyse_items(reports)] == ["A", "B", "C"]
 
@@ -73,10 +75,10 @@ def test_oral_exam_asks_first_about_wrong_and_missed_faults() -> None:
     questions = [*ask_about_form(FORM, TRUTH)]
     assert "You named dropout" in questions[0][0]
     assert "nlos, yaw" in questions[0][1]
-    assert "You named the fault nlos" in questions[1][0]
+    assert "You named nlos" in questions[1][0]
     assert "accepted size 8.5 to 11.5 %" in questions[1][1]
     assert "Your flight also has this fault" in questions[2][0]
-    assert "your answer is: yaw" in questions[3][0]
+    assert "you answered: yaw" in questions[3][0]
     assert "Right: delay" in questions[3][1]
     assert len(questions) == 4
 
@@ -84,7 +86,7 @@ def test_oral_exam_asks_first_about_wrong_and_missed_faults() -> None:
 def test_oral_exam_page_lists_n_questions_per_student() -> None:
     key = AnswerKey("aisle", (RightAnswers("s1", "Ada", "s1.ulg", "a" * 64, form=TRUTH),))
     report = graded_report("r.pdf", 5.0, form=FORM, log_sha256="a" * 64)
-    rows = (replace(entry("s1", "Ada", 5.0), counted_report=report), entry("s2", "Max", None))
+    rows = (replace(grade("s1", "Ada", 5.0), counted_report=report), grade("s2", "Max", None))
     text = questions_text(rows, key, 2)
     assert text.count("Expected:") == 2
     assert "Ada s1" in text

@@ -155,13 +155,13 @@ def test_loop_correction_with_heading_does_not_increase_rpe(sample_loop: Loop) -
 
 
 def test_loop_correction_methods_agree_without_heading_error(sample, sample_loop) -> None:
-    assert [part.name for part in sample_loop.reported_paths[1:3]] == [
+    assert [part.name for part in sample_loop.select_reported_paths()[1:3]] == [
         POSITIONS_CORRECTED_LABEL,
         HEADINGS_CORRECTED_LABEL,
     ]
     found = analyse_loop(sample, landed_at=Landing(0.0, 0.0))
     assert isinstance(found.heading_error_deg, Unavailable)
-    names = [part.name for part in found.reported_paths]
+    names = [part.name for part in found.select_reported_paths()]
     assert POSITIONS_CORRECTED_LABEL in names
     assert HEADINGS_CORRECTED_LABEL not in names
     plain, turned = (path(found, way).trajectory for way in ("by_distance_plain", "by_distance"))

@@ -69,7 +69,7 @@ def test_mavlink_clock_fit_with_random_delay_recovers_offset(offset, drift_ppm, 
 def test_mavlink_clock_fit_of_messages_without_delay_is_exact(span, slope):
     x = np.linspace(0.0, span, 500)
     line = fit_least_delay(x, 7.0 + 1.00005 * x)
-    assert (line.pairs, line.slope) == (500, pytest.approx(slope, abs=1e-12))
+    assert (line.pair_count, line.slope) == (500, pytest.approx(slope, abs=1e-12))
     np.testing.assert_allclose(line.at(x), 7.0 + 1.00005 * x, atol=1e-9 if span > 30 else 1e-3)
     np.testing.assert_allclose(line.inverse().at(line.at(x)), x, atol=1e-9)
     assert line.jitter < 1e-3
@@ -411,7 +411,7 @@ def map_unix_timestamps(received, *exchanges):
     """Return UNIX timestamps at 10 Hz and their clock map for given receive times."""
     stamps = UNIX_S + 0.1 * np.arange(len(received))
     line = ClockLine(0.0, 0.0, 1.0, 0.0, 9)
-    return stamps, map_clock("x", stamps, received, line, *exchanges, None, has_receipt=True)
+    return stamps, map_clock("x", stamps, received, line, *exchanges, None, has_receive_times=True)
 
 
 def test_timesync_that_contradicts_receive_time_is_ignored():

@@ -30,7 +30,7 @@ from mavlink_tools import (
 from px4fuse.errors import LogError
 from px4fuse.flight.model import Flight
 from px4fuse.readers import mavlink_frames, read_log
-from px4fuse.readers.mavlink_frames import Frames, message_name, read_frames
+from px4fuse.readers.mavlink_frames import MavlinkFrames, message_name, read_frames
 
 START_US = 1_700_000_000_000_000
 # valid frames that pymavlink skips after invalid bytes, because it uses a wrong length there
@@ -61,7 +61,7 @@ SENDER_BYTES = 10_000_000
 def read(tmp_path):
     """Write bytes and read their frames."""
 
-    def write_and_read(content: bytes) -> Frames:
+    def write_and_read(content: bytes) -> MavlinkFrames:
         path = tmp_path / "made.tlog"
         path.write_bytes(content)
         return read_frames(path.name, path.read_bytes())
@@ -69,7 +69,7 @@ def read(tmp_path):
     return write_and_read
 
 
-def names(frames: Frames) -> list[str]:
+def names(frames: MavlinkFrames) -> list[str]:
     return [message_name(number) for number in frames.message_id.tolist()]
 
 
@@ -82,7 +82,7 @@ def beats(count: int, sender: tuple[int, int] = AUTOPILOT) -> list[bytes]:
     return [frame(heartbeat(), sender, number) for number in range(count)]
 
 
-def decoded(frames: Frames, name: str) -> np.ndarray:
+def decoded(frames: MavlinkFrames, name: str) -> np.ndarray:
     return frames.table(name, frames.rows(name))
 
 

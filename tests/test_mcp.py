@@ -430,7 +430,7 @@ def test_mcp_server_repeats_analysis_if_log_file_changed(tmp_path: Path, monkeyp
 
 
 @pytest.mark.process
-def test_mcp_server_withholds_diagnosis_of_assigned_flight(tmp_path: Path) -> None:
+def test_mcp_server_hides_diagnosis_of_student_assignment(tmp_path: Path) -> None:
     content, _ = simulate_assigned_flight(b"a secret for tests", Person("s01"), "aisle", 2)
     (tmp_path / "s01.ulg").write_bytes(content)
 

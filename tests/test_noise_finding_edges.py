@@ -428,7 +428,10 @@ def test_wrong_ekf2_noise_report_names_parameter_or_sensor(
     change = {aid.noise: estimate_m}
     rerun = Trial(filter="ekf2", axis="north", kinds=("noise",), change=change, before=outcome,
                   after=RunStatistics(nis_mean=1.0))  # fmt: skip
-    model = SimpleNamespace(inputs=SimpleNamespace(settings={aid.noise: flown_m}))
+    settings = {aid.noise: flown_m, "EKF2_EV_NOISE_MD": 0.0}
+    received = SimpleNamespace(variance_m2=np.zeros((9, 3)))
+    inputs = SimpleNamespace(aid=aid, settings=settings, received=received)
+    model = SimpleNamespace(inputs=inputs)
     result = axis("north", rejected_fraction=rejected)
     origin = GNSS if kind == "gnss" else RECEIVED
     one = analysis(
@@ -439,6 +442,10 @@ def test_wrong_ekf2_noise_report_names_parameter_or_sensor(
     assert (finding.id, finding.severity, finding.title) == expected
     assert finding.remedy == f"Set {aid.noise} to {estimate_m:.3g} m."
     assert finding.message.endswith(f"KF takes SIGMA_Z from {aid.noise}.") is (kind == "gnss")
+    received.variance_m2[:] = 9.0
+    if kind == "uwb" and estimate_m < flown_m:
+        rerun.change["EKF2_EV_NOISE_MD"] = 1.0
+        assert "the σ that UWB reports (EKF2_EV_NOISE_MD 0)" in only(ekf2_noise.detect, one).message
     # innovations outside their band after the change, or a change of EKF2_ACC_NOISE
     worse = replace(rerun, after=RunStatistics(nis_mean=2.0))
     other = replace(rerun, kinds=("process noise",))

@@ -10,7 +10,7 @@ from conftest import SAMPLES
 from exchange import replace
 
 from px4fuse.comparison.comparison import compare, run_kf
-from px4fuse.diagnose import prepare_comparison
+from px4fuse.diagnose import prepare_comparison, read_flight
 from px4fuse.errors import Px4FuseError
 from px4fuse.flight.model import ORIGINS, Flight, find_origin
 from px4fuse.request import ComparisonRequest, PositionFile
@@ -47,9 +47,10 @@ def gnss_flight() -> Flight:
 @cache
 def outcome(request: ComparisonRequest) -> str:
     """Return inputs and results of a comparison as text, or its error."""
-    flight = gnss_flight() if request.log == gnss_flight().log.name else None
+    is_simulated = request.log == gnss_flight().log.name
     try:
-        prepared = prepare_comparison(request, flight=flight)
+        flight = gnss_flight() if is_simulated else read_flight(request)
+        prepared = prepare_comparison(flight, request)
     except Px4FuseError as error:
         return str(error)
     compared, source = compare(prepared, run_kf(prepared)), prepared.source

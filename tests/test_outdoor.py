@@ -39,8 +39,8 @@ from px4fuse.flight.model import Columns
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_positions import project, unproject
 from px4fuse.simulation import sensors
+from px4fuse.simulation.faults import FaultSizes, parse_faults
 from px4fuse.simulation.flights import simulate, simulate_flight, to_ulog
-from px4fuse.simulation.mistakes import Mistakes, parse_mistakes
 from px4fuse.simulation.scenario import Scenario, make_scenario
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
@@ -49,7 +49,7 @@ OUTDOOR = make_scenario("outdoor", seed=5)
 
 @cache
 def flown(*texts: str) -> Analysis:
-    flight = simulate_flight(OUTDOOR, parse_mistakes(texts))
+    flight = simulate_flight(OUTDOOR, parse_faults(texts))
     return find_faults(compare(flight, Settings(0.27, 0.4)))
 
 
@@ -79,7 +79,7 @@ def test_simulated_gnss_fixes_have_configured_noise_and_delay(
     flight = read_log(log)
     track, truth = flight.positions[0], flight.truth
     assert (track.name, track.origin.is_gnss) == ("vehicle_gps_position", True)
-    assert track.rate_hz == pytest.approx(5.0, rel=0.01)
+    assert track.compute_rate_hz() == pytest.approx(5.0, rel=0.01)
     assert track.velocity is not None
     for measured, columns, sigma in (
         (track.samples, Columns.POSITION, 0.4),
@@ -97,7 +97,7 @@ def test_simulated_gnss_fixes_have_configured_noise_and_delay(
 def test_simulated_magnetometer_and_height_noise_equal_settings(tmp_path: Path) -> None:
     """Includes EKF2's height, and its attitude published as vehicle_attitude."""
     log = tmp_path / "outdoor.ulg"
-    log.write_bytes(to_ulog(simulate(OUTDOOR, parse_mistakes(["mag=0.3,60"]))))
+    log.write_bytes(to_ulog(simulate(OUTDOOR, parse_faults(["mag=0.3,60"]))))
     flight = read_log(log)
     truth, record = flight.truth.samples, flight.ekf2.record
     down = flight.barometer["down_m"] + sensors.HOME_POSITION[2]
@@ -215,7 +215,7 @@ def test_what_if_with_correct_gnss_delay_equals_correct_flight() -> None:
 def test_what_if_without_magnetometer_replay_uses_logged_heading(tmp_path: Path) -> None:
     log = tmp_path / "a.ulg"  # a log file has the true attitude, a flight in memory has not
     # with a heading fault EKF2 fuses the magnetic heading only
-    log.write_bytes(to_ulog(simulate(OUTDOOR, parse_mistakes(["ekf2-delay=0", "heading=3"]))))
+    log.write_bytes(to_ulog(simulate(OUTDOOR, parse_faults(["ekf2-delay=0", "heading=3"]))))
     model = opened(read_log(log))
     result = what_if(model, [{"EKF2_GPS_DELAY": 110.0}])
     assert result.notes[0] == HEADING_LOGGED_NOTE
@@ -250,13 +250,13 @@ def test_magnetometer_disturbance_is_cause_of_missing_fusion() -> None:
 
 def test_simulate_ekf2_noise_below_reported_one_raises_error() -> None:
     with pytest.raises(SettingsError, match=r"the larger of EKF2_GPS_P_NOISE .*0\.4 m"):
-        simulate(OUTDOOR, parse_mistakes(["ekf2-noise=0.05"]))
-    parameters = simulate(OUTDOOR, parse_mistakes(["ekf2-noise=0.8"])).parameters
+        simulate(OUTDOOR, parse_faults(["ekf2-noise=0.05"]))
+    parameters = simulate(OUTDOOR, parse_faults(["ekf2-noise=0.8"])).parameters
     assert parameters["EKF2_GPS_P_NOISE"] == 0.8
 
 
 def test_simulated_correlated_error_has_requested_sigma_and_tau() -> None:
-    mistakes = Mistakes(slow_error_m=0.5, slow_error_s=4.0)
+    mistakes = FaultSizes(slow_error_m=0.5, slow_error_s=4.0)
     drawn = sensors.slow_error(OUTDOOR, mistakes, 100_000, 0.2)
     assert drawn.std(axis=0) == pytest.approx(0.5, rel=0.05)
     lag = int(4.0 / 0.2)
@@ -269,8 +269,8 @@ def test_simulated_correlated_error_has_requested_sigma_and_tau() -> None:
 
 def test_simulated_heading_error_builds_up_with_a_lag() -> None:
     time_s = np.array([0.0, 39.9, 43.0, 100.0])
-    clean = sensors.attitude_error(OUTDOOR, Mistakes(), time_s).as_rotvec()
-    wrong = sensors.attitude_error(OUTDOOR, parse_mistakes(["heading=25,40"]), time_s).as_rotvec()
+    clean = sensors.attitude_error(OUTDOOR, FaultSizes(), time_s).as_rotvec()
+    wrong = sensors.attitude_error(OUTDOOR, parse_faults(["heading=25,40"]), time_s).as_rotvec()
     turned = np.degrees(wrong - clean)[:, 2]
     assert turned == pytest.approx([0.0, 0.0, 25.0 * (1.0 - np.exp(-1.0)), 25.0], abs=0.01)
 

@@ -16,7 +16,7 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import parse_g2o, read_g2o
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.covariance import gate_edges
-from px4fuse.trajectory.graph.initialisation import _chordal, initialise
+from px4fuse.trajectory.graph.initialisation import _initialise_chordal, initialise
 from px4fuse.trajectory.graph.model import (
     FROM_CHORDAL,
     FROM_ODOMETRY,
@@ -26,7 +26,7 @@ from px4fuse.trajectory.graph.model import (
     information_eigenvectors,
     residuals,
 )
-from px4fuse.trajectory.graph.solver import solve
+from px4fuse.trajectory.graph.solver import analyse_graph, solve
 
 TANGENT = {2: 3, 3: 6}
 SEEDS = 2
@@ -74,10 +74,16 @@ def noisy_graph(dimension: int, seed: int, poses: int = 30, sigma: float = 0.05)
 def test_chordal_initialisation_equals_dense_least_squares(dimension: int, seed: int) -> None:
     """Carlone et al. (2015), IV-C, with dense equations; pose 0 is fixed."""
     d, graph = dimension, random_graph(dimension, seed)
-    assert (graph.second == 0).any()
+    assert (graph.second_nodes == 0).any()
     n, measured = len(graph), lie.rotation_matrix(graph.measurements)
     held = lie.rotation_matrix(graph.poses[:1])[0]
-    edge_arrays = graph.first, graph.second, graph.measurements, measured, graph.information
+    edge_arrays = (
+        graph.first_nodes,
+        graph.second_nodes,
+        graph.measurements,
+        measured,
+        graph.information,
+    )
     edges = list(zip(*edge_arrays, strict=True))
 
     def least_squares(weights: list[Any], values: list[Any], at_0: np.ndarray) -> np.ndarray:
@@ -104,7 +110,7 @@ def test_chordal_initialisation_equals_dense_least_squares(dimension: int, seed:
     values = [r @ rotation[i] @ pose[:d] for r, (i, _, pose, *_) in zip(roots, edges, strict=True)]
     weights = [(-root, root) for root in roots]
     position = least_squares(weights, values, graph.poses[0, :d]).reshape(n - 1, d)
-    made = _chordal(graph)
+    made = _initialise_chordal(graph)
     assert made.initialised == FROM_CHORDAL
     np.testing.assert_array_equal(made.poses[0], graph.poses[0])
     np.testing.assert_allclose(lie.rotation_matrix(made.poses), rotation, atol=1e-7)
@@ -197,11 +203,11 @@ def test_pose_graph_cost_does_not_depend_on_frame(values: list[float], dimension
 
 def test_pose_graph_cost_does_not_depend_on_edge_order() -> None:
     graph = noisy_graph(3, 4)
-    shuffled = graph.select_edges(np.random.default_rng(0).permutation(len(graph.first)))
+    shuffled = graph.select_edges(np.random.default_rng(0).permutation(len(graph.first_nodes)))
     # inverted edge with the same information: Z^-1 exp(-Ad(Z) r)
     back = np.linalg.inv(lie.adjoint(graph.measurements))
     turned = replace(
-        graph, first=graph.second, second=graph.first,
+        graph, first_nodes=graph.second_nodes, second_nodes=graph.first_nodes,
         measurements=lie.inverse(graph.measurements),
         information=back.transpose(0, 2, 1) @ graph.information @ back,
     )  # fmt: skip
@@ -217,10 +223,10 @@ def test_solve_invalid_pose_graph_states_reason() -> None:
     poses = graph.poses.copy()
     poses[4, 1] = np.nan
     for bad, said in (
-        (graph.select_edges((graph.second < 10) | (graph.first >= 10)),
+        (graph.select_edges((graph.second_nodes < 10) | (graph.first_nodes >= 10)),
          "2 disconnected parts: vertex 10 is not connected to"),
         (replace(graph, information=graph.information * 0.0), "30 disconnected parts"),
-        (graph.select_edges(np.zeros(len(graph.first), dtype=bool)), "has no edges"),
+        (graph.select_edges(np.zeros(len(graph.first_nodes), dtype=bool)), "has no edges"),
         (replace(graph, poses=poses), "not finite"),
     ):  # fmt: skip
         with pytest.raises(TrajectoryError, match=said):
@@ -279,7 +285,7 @@ def laps(seed: int, false: int = 1) -> tuple[PoseGraph, np.ndarray, np.ndarray]:
         3, np.arange(n), odometry, np.concatenate([chain, i]), np.concatenate([chain + 1, j]),
         np.vstack([steps, closures]), information, FROM_ODOMETRY,
     )  # fmt: skip
-    true = np.ones(len(graph.first), dtype=bool)
+    true = np.ones(len(graph.first_nodes), dtype=bool)
     true[n - 1 + count :] = False
     return graph, truth, true
 
@@ -301,7 +307,7 @@ def test_robust_pose_graph_removes_false_loop_closure() -> None:
             assert solution.converged or not robust
             off[robust].append(ate(solution.poses, truth) / known - 1.0)
             assert np.all((solution.weights >= 0.0) & (solution.weights <= 1.0))
-            assert np.all(solution.weights[graph.is_successive] == 1.0)
+            assert np.all(solution.weights[graph.find_successive()] == 1.0)
             squared = residuals(graph, solution.poses).chi2
             assert solution.cost == pytest.approx(0.5 * np.sum(solution.weights * squared))
             if robust:
@@ -352,7 +358,7 @@ def odometry_graph(dimension: int, sigma: float, poses: int = 40) -> PoseGraph:
 def simulated(graph: PoseGraph, seed: int) -> PoseGraph:
     """Draw measurements Z with X_i^-1 X_j = Z exp(r), r by the information."""
     rng = np.random.default_rng(seed)
-    noise = np.zeros((len(graph.first), TANGENT[graph.dimension]))
+    noise = np.zeros((len(graph.first_nodes), TANGENT[graph.dimension]))
     for row, omega in zip(noise, graph.information, strict=True):
         values, vectors = np.linalg.eigh(omega)
         seen = values > 1e-9 * values.max()
@@ -369,7 +375,7 @@ POSITION_AND_YAW = np.diag([1e4, 1e4, 1e4, 0.0, 0.0, 4e4])
 ])  # fmt: skip
 def test_p_value_of_true_loop_closures_is_uniform(dimension, information, freedom) -> None:
     graph = odometry_graph(dimension, 3e-3)
-    edge = len(graph.first) - 1
+    edge = len(graph.first_nodes) - 1
     if information is not None:
         graph.information[edge] = information
     found = [gate_edges(simulated(graph, seed), [edge])[0] for seed in range(300)]
@@ -384,7 +390,7 @@ def test_loop_closure_gate_distance_equals_gtsam(dimension: int, is_back: bool) 
     """For an exact closure the distance depends on the odometry covariance only."""
     gtsam = pytest.importorskip("gtsam")
     graph = odometry_graph(dimension, 1e-3)
-    chain = graph.select_edges(graph.is_successive)
+    chain = graph.select_edges(graph.find_successive())
     factors, values = gtsam_problem(gtsam, chain)
     kind, free = "Pose2" if dimension == 2 else "Pose3", TANGENT[dimension]
     held = getattr(values, f"at{kind}")(0)
@@ -398,21 +404,21 @@ def test_loop_closure_gate_distance_equals_gtsam(dimension: int, is_back: bool) 
         measured = lie.compose(pose, lie.exp(-off))
         closure = replace(
             chain,
-            first=np.append(chain.first, len(graph) - 1 if is_back else 0),
-            second=np.append(chain.second, 0 if is_back else len(graph) - 1),
+            first_nodes=np.append(chain.first_nodes, len(graph) - 1 if is_back else 0),
+            second_nodes=np.append(chain.second_nodes, 0 if is_back else len(graph) - 1),
             measurements=np.vstack([
                 chain.measurements, lie.inverse(measured) if is_back else measured
             ]),
             information=np.concatenate([chain.information, 1e18 * np.eye(free)[None]]),
         )  # fmt: skip
-        found = gate_edges(closure, [len(chain.first)])[0]
+        found = gate_edges(closure, [len(chain.first_nodes)])[0]
         assert found.d2 == pytest.approx(off @ np.linalg.solve(covariance, off), rel=1e-4)
 
 
 def test_loop_closure_gate_without_odometry_edge_raises_error() -> None:
     graph = odometry_graph(2, 1e-3)
-    edge = len(graph.first) - 1
-    gap = graph.select_edges(np.arange(len(graph.first)) != 10)
+    edge = len(graph.first_nodes) - 1
+    gap = graph.select_edges(np.arange(len(graph.first_nodes)) != 10)
     with pytest.raises(TrajectoryError, match="no odometry edge connects vertices 10 and 11"):
         gate_edges(gap, [edge - 1])
     for at, direction, said in (
@@ -424,6 +430,28 @@ def test_loop_closure_gate_without_odometry_edge_raises_error() -> None:
         with pytest.raises(TrajectoryError, match=said):
             gate_edges(replace(graph, information=information), [edge])
     assert gate_edges(graph, []) == []
+
+
+def test_common_factor_of_information_does_not_change_gate() -> None:
+    graph = odometry_graph(2, 3e-3)
+    ends = np.arange(4, 34)
+    truth, information = graph.poses, np.tile(graph.information[:1], (len(ends), 1, 1))
+    graph = simulated(replace(
+        graph,
+        first_nodes=np.append(graph.first_nodes, ends),
+        second_nodes=np.append(graph.second_nodes, ends - 4),
+        measurements=np.vstack([graph.measurements, lie.between(truth[ends], truth[ends - 4])]),
+        information=np.concatenate([graph.information, information]),
+    ), 3)  # fmt: skip
+    correct, _ = analyse_graph("g", graph)
+    low, high = correct.reduced_chi2_interval
+    assert low < correct.reduced_chi2 < high
+    assert correct.information_factor == 1.0
+    wrong, _ = analyse_graph("g", replace(graph, information=8.0 * graph.information))
+    assert wrong.reduced_chi2 == pytest.approx(8.0 * correct.reduced_chi2)
+    assert wrong.information_factor == pytest.approx(8.0, rel=0.5)
+    assert all(gate.accepted for gate in wrong.gates)
+    assert wrong.solutions["gnc"].dropped == 0
 
 
 def test_information_eigenvectors_restore_information_matrix() -> None:

@@ -26,11 +26,11 @@ from msgspec import structs
 
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.explore import practice
-from px4fuse.explore.practice import FAULT_CHOICES, NOISY_UWB, HiddenMistake, draw_flights
+from px4fuse.explore.practice import NOISY_UWB, QUIZ_ANSWERS, QuizFault, draw_flights
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Flight
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 # A set without a fault, with one of the source, and with one of the frame
@@ -47,30 +47,30 @@ def test_practice_flights_contain_each_fault_equally_often(
     rounds = draw_flights(seed, level, count)
     assert draw_flights(seed, level, count) == rounds
     assert len(rounds) == count
-    first = Counter(one.mistakes[0].choice if one.mistakes else "nothing" for one in rounds)
-    assert max(first.values()) - min(first[name] for name in FAULT_CHOICES) <= 1
+    first = Counter(one.faults[0].choice if one.faults else "nothing" for one in rounds)
+    assert max(first.values()) - min(first[name] for name in QUIZ_ANSWERS) <= 1
     for one in rounds:
-        assert set(one.correct_answers) <= set(FAULT_CHOICES)
-        assert len(one.correct_answers) == max(len(one.mistakes), 1)
-        assert len(one.mistakes) <= (2 if level == 3 else 1)
-        for mistake, size in zip(one.mistakes, one.sizes, strict=True):
+        assert set(one.correct_answers) <= set(QUIZ_ANSWERS)
+        assert len(one.correct_answers) == max(len(one.faults), 1)
+        assert len(one.faults) <= (2 if level == 3 else 1)
+        for mistake, size in zip(one.faults, one.sizes, strict=True):
             assert size.removeprefix("-") == mistake.sizes[level - 1]
             assert mistake.has_either_sign or not size.startswith("-")
 
 
 def test_practice_level_3_has_some_flights_with_two_faults() -> None:
     rounds = [one for seed in range(5) for one in draw_flights(seed, 3, 12)]
-    two = sum(len(one.mistakes) == 2 for one in rounds)
+    two = sum(len(one.faults) == 2 for one in rounds)
     assert 0.15 * len(rounds) < two < 0.5 * len(rounds)
 
 
 # ------------------------------------------------------------------ symptoms
 
 
-def flown(mistake: HiddenMistake | None, level: int, seed: int) -> Flight:
+def flown(mistake: QuizFault | None, level: int, seed: int) -> Flight:
     """Simulate a practice flight with one fault of a level, or without a fault."""
     size = "" if mistake is None else mistake.sizes[level - 1]
-    noisy = mistake is not None and mistake.mistake == NOISY_UWB
+    noisy = mistake is not None and mistake.name == NOISY_UWB
     scenario = Scenario(
         **practice.SCENARIO_VALUES,
         length_m=9.0 + 0.7 * seed,
@@ -78,8 +78,8 @@ def flown(mistake: HiddenMistake | None, level: int, seed: int) -> Flight:
         seed=seed,
         sigma_uwb_m=float(size) if noisy else 0.1,
     )
-    options = [] if mistake is None or noisy else [f"{mistake.mistake}={size}"]
-    return simulate_flight(scenario, parse_mistakes(options))
+    options = [] if mistake is None or noisy else [f"{mistake.name}={size}"]
+    return simulate_flight(scenario, parse_faults(options))
 
 
 def compared(flight: Flight, **settings: float) -> Comparison:
@@ -95,9 +95,9 @@ def kf_statistics(flight: Flight, **settings: float) -> Any:
 LEVELS_AND_SEEDS = [(1, 1), (3, 3)]
 
 
-def hidden(name: str) -> HiddenMistake:
+def hidden(name: str) -> QuizFault:
     """Return the fault with this name in px4fuse simulate."""
-    return next(one for one in practice.HIDDEN_MISTAKES if one.mistake == name)
+    return next(one for one in practice.QUIZ_FAULTS if one.name == name)
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -256,7 +256,7 @@ def test_practice_page_scores_right_and_wrong_answers(browser: Browser, quiz: Pa
             page.click("#quiz-check")
             assert element_text(page, "quiz-message") == "Select at least one fault, or “no fault”."
         right = number % 3 != 1
-        wrong = next(name for name in FAULT_CHOICES if name not in key["right"])
+        wrong = next(name for name in QUIZ_ANSWERS if name not in key["right"])
         choose(page, *(key["right"] if right else [wrong]))
         points += right
         heading = page.ask("document.querySelector('#quiz-solution h2').textContent")

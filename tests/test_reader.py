@@ -84,7 +84,7 @@ def test_read_ulog_of_each_px4_release_reads_external_vision(read, generation):
     assert (track.name, track.origin.path) == ("vehicle_visual_odometry", RECEIVED.path)
     assert_equals_external_vision(track)
     assert track.frame == ("unknown" if generation == "v1.9" else "NED")
-    assert track.rate_hz == pytest.approx(5.0)
+    assert track.compute_rate_hz() == pytest.approx(5.0)
 
 
 @pytest.mark.parametrize("generation", GENERATIONS)

@@ -14,7 +14,10 @@ import px4fuse
 from px4fuse.results.contract import schema
 
 # Mutable buffers, which are filled while reading, writing or replaying
-BUFFERS = {"Packer", "_Fusion", "_PdfComparison"}
+BUFFERS = {
+    "Packer", "Recording", "Rows", "Topics", "_Fusion", "_InputRegister", "_PdfComparison",
+    "_RunState",
+}  # fmt: skip
 
 
 def classes() -> Iterator[type]:

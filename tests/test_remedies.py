@@ -17,8 +17,8 @@ from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 AXES = ("north", "east", "down")
@@ -31,7 +31,7 @@ LOOP = Scenario(kind="loop", passes=1, length_m=8.0, vio_rate_hz=10.0)
 @cache
 def flown(scenario: Scenario, settings: Settings, *mistakes: str) -> Analysis:
     return find_faults(
-        compare(simulate_flight(scenario, parse_mistakes(mistakes)), settings, axes=AXES)
+        compare(simulate_flight(scenario, parse_faults(mistakes)), settings, axes=AXES)
     )
 
 
@@ -193,6 +193,8 @@ def test_ekf2_noise_advice_with_logged_variance_sets_noise_mode(sample: Analysis
     used = reported.inputs.aid, settings, noise_used_m(reported.inputs)
     assert remedies.noise_change(*used, 0.05) == {"EKF2_EVP_NOISE": 0.05, "EKF2_EV_NOISE_MD": 1.0}
     assert remedies.noise_change(*used, 0.2) == {"EKF2_EVP_NOISE": 0.2}
+    changes = {"EKF2_EVP_NOISE": 0.02, "EKF2_EV_NOISE_MD": 1.0}
+    assert remedies.different_settings(changes, settings) == {"EKF2_EV_NOISE_MD": 1.0}
     assert remedies.delay_change(model.inputs, -40.0) == {}
     assert remedies.delay_change(model.inputs, 400.0) == {}
 

@@ -52,9 +52,11 @@ def _fresh(monkeypatch: pytest.MonkeyPatch) -> Any:
 def with_font(monkeypatch: pytest.MonkeyPatch, name: str, characters: str) -> None:
     """Pretend that one more font with these characters is installed."""
     monkeypatch.setattr(fonts, "_other_fonts", lambda: ((name, "path"),))
-    own = fonts._characters
+    own = fonts._font_characters
     with_one_more = {"path": frozenset(map(ord, characters))}
-    monkeypatch.setattr(fonts, "_characters", lambda path: with_one_more.get(path) or own(path))
+    monkeypatch.setattr(
+        fonts, "_font_characters", lambda path: with_one_more.get(path) or own(path)
+    )
 
 
 @pytest.mark.usefixtures("_fresh")

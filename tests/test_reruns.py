@@ -34,8 +34,8 @@ from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Columns, Unavailable
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 RIGHT = Settings(0.27, 0.10)
@@ -44,7 +44,7 @@ LATE = "clock-offset=0.25"
 
 @cache
 def flown(*mistakes: str, sigma_a=0.27, sigma_z=0.10, passes=4) -> Analysis:
-    flight = simulate_flight(Scenario(seed=5, passes=passes), parse_mistakes(mistakes))
+    flight = simulate_flight(Scenario(seed=5, passes=passes), parse_faults(mistakes))
     return find_faults(compare(flight, Settings(sigma_a, sigma_z), axes=("aisle", "north", "east")))
 
 
@@ -157,7 +157,7 @@ def test_ekf2_rerun_equals_what_if_with_the_same_parameters() -> None:
         analysis, analysis, model.inputs
     )
     once, other = (
-        replay_settings(of, [change])[0] for of in (model, with_position_noise(model, 0.01, 1))
+        next(replay_settings(of, [change])) for of in (model, with_position_noise(model, 0.01, 1))
     )
     assert not once.updates.equals(other.updates)
 

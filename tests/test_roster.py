@@ -7,9 +7,9 @@ import io
 from pathlib import Path
 
 import pytest
-from class_tools import entry
+from class_tools import grade
 
-from px4fuse.classroom.assignment.roster import Person, Register, read_people, read_roster
+from px4fuse.classroom.assignment.roster import ClassList, Person, read_people, read_roster
 from px4fuse.classroom.assignment.sheet import Sheet, read_sheet
 from px4fuse.classroom.grading.model import ExportOrigin
 from px4fuse.classroom.grading.outputs import fill_grades, find_grade_column
@@ -47,10 +47,10 @@ PEOPLE = [
     Person("43", "Max Roe", "max@x.edu", "mroe"),
     Person("44", "Pending Pat", "pat@x.edu", "ppat"),
 ]
-ENTRIES = (
-    entry("0042", "Jane Doe", 87.5, max_points=120.0),
-    entry("43", "Max Roe", 104.0, max_points=120.0),
-    entry("44", "Pending Pat", None, max_points=120.0),
+GRADES = (
+    grade("0042", "Jane Doe", 87.5, max_points=120.0),
+    grade("43", "Max Roe", 104.0, max_points=120.0),
+    grade("44", "Pending Pat", None, max_points=120.0),
 )
 TEXTS = ("Points 87.5\n  <b>=1+1</b>\n", "Well done.\n", "Pending.\n")
 
@@ -134,7 +134,7 @@ def test_read_invalid_class_list_raises_one_line_error(tmp_path, content, said) 
 # -- owner of a file -------------------------------------------------------------------------------
 
 
-CLASS = Register(
+CLASS = ClassList(
     [
         Person("0042", "Jane Doe", "jane@x.edu", "jdoe", {"moodle": "4711", "canvas": "12345"}),
         Person("43", "Max Roe", numbers={"moodle": "42"}), Person("44", "Zoë Doe"),
@@ -175,16 +175,16 @@ def test_student_is_matched_by_id_before_name() -> None:
     said = (("42", "Max Roe"), ("", "Roe, Max"), ("99", "Jane Doe"), ("", ""))
     assert [CLASS.student_index(Person(*each)) for each in said] == [0, 1, 0, None]
     # an exact id has priority over one with leading zeros
-    register = Register([Person("042"), Person("42")])
-    assert [register.student_index(Person(each)) for each in ("42", "0042")] == [1, None]
+    class_list = ClassList([Person("042"), Person("42")])
+    assert [class_list.student_index(Person(each)) for each in ("42", "0042")] == [1, None]
 
 
 def test_class_list_is_completed_from_grading_worksheet() -> None:
-    register = Register(
+    class_list = ClassList(
         [Person("0042", "Jane Doe"), Person("43", "Max Roe")],
         [Person("42", "Doe J", "j@x.edu", "jdoe", {"moodle": "7"}), Person("9", "No One")],
     )
-    assert register.people == [
+    assert class_list.people == [
         Person("0042", "Jane Doe", "j@x.edu", "jdoe", {"moodle": "7"}), Person("43", "Max Roe"),
     ]  # fmt: skip
 
@@ -196,8 +196,8 @@ def rows(text: str, separator: str = ",") -> list[dict[str, str]]:
     return list(csv.DictReader(io.StringIO(text, newline=""), delimiter=separator))
 
 
-def register(sheet) -> Register:
-    return Register(PEOPLE, read_people(sheet))
+def class_list(sheet) -> ClassList:
+    return ClassList(PEOPLE, read_people(sheet))
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
@@ -213,7 +213,7 @@ def test_fill_grades_changes_only_grade_and_feedback(
     tmp_path, text, column, title, feedback, encoding
 ) -> None:
     sheet = table(tmp_path, text, encoding)
-    made, notes = fill_grades(sheet, ENTRIES, register(sheet), column, TEXTS)
+    made, notes = fill_grades(sheet, GRADES, class_list(sheet), column, TEXTS)
     content = made.content()
     assert content[:2] == sheet.path.read_bytes()[:2]
     separator = "\t" if text is BLACKBOARD else ","
@@ -236,14 +236,14 @@ def test_fill_grades_changes_only_grade_and_feedback(
 def test_fill_grades_matches_anonymous_row_by_participant_number(tmp_path) -> None:
     hidden = MOODLE.replace("Doe Jane", "").replace("0042,jane@x.edu", ",")
     sheet = table(tmp_path, hidden)
-    people = Register([Person("0042", numbers={"moodle": "4711"}), *PEOPLE[1:]])
-    assert fill_grades(sheet, ENTRIES, people, "", TEXTS)[0].rows[0][5] == "87.5"
+    people = ClassList([Person("0042", numbers={"moodle": "4711"}), *PEOPLE[1:]])
+    assert fill_grades(sheet, GRADES, people, "", TEXTS)[0].rows[0][5] == "87.5"
 
 
 def test_fill_grades_scales_points_to_the_platform_maximum(tmp_path) -> None:
     sheet = table(tmp_path, MOODLE)
-    scaled = fill_grades(sheet, ENTRIES, register(sheet), "", TEXTS, 50.0)[0]
-    maximum = ENTRIES[0].max_points
+    scaled = fill_grades(sheet, GRADES, class_list(sheet), "", TEXTS, 50.0)[0]
+    maximum = GRADES[0].max_points
     assert float(scaled.rows[0][5]) == round(87.5 * 50.0 / maximum, 2)
 
 
@@ -254,18 +254,18 @@ def test_read_class_list_reads_due_time_extension(tmp_path) -> None:
 
 def test_fill_grades_reports_a_student_missing_in_the_table(tmp_path) -> None:
     sheet = table(tmp_path, "\r\n".join(MOODLE.split("\r\n")[:2]) + "\r\n")
-    _, notes = fill_grades(sheet, ENTRIES, register(sheet), "", TEXTS)
+    _, notes = fill_grades(sheet, GRADES, class_list(sheet), "", TEXTS)
     assert notes == ("table.csv has no row for Max Roe. These grades were not entered.",)
 
 
 def test_fill_grades_keeps_semicolon_and_decimal_comma(tmp_path) -> None:
     text = "Matrikelnummer;Name;Punkte;Kommentar\n0042;Jane Doe;;\n"
     sheet = table(tmp_path, text, "cp1252")
-    made, _ = fill_grades(sheet, ENTRIES, Register(PEOPLE), "", TEXTS)
+    made, _ = fill_grades(sheet, GRADES, ClassList(PEOPLE), "", TEXTS)
     assert made.content() == b"Matrikelnummer;Name;Punkte;Kommentar\r\n0042;Jane Doe;87.5;\r\n"
     moodle = MOODLE.replace(",100.00,", ',"100,00",')
     sheet = table(tmp_path, moodle)
-    made, _ = fill_grades(sheet, ENTRIES, register(sheet), "", TEXTS)
+    made, _ = fill_grades(sheet, GRADES, class_list(sheet), "", TEXTS)
     assert made.rows[0][5] == "87,5"
 
 

@@ -18,9 +18,9 @@ from results_tools import (
 )
 
 from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
-from px4fuse.classroom.assignment.truth import FormTruth, InjectedFault, VerdictTruth
+from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers, RightVerdict
 from px4fuse.classroom.grading.flags import flag_equal_contents, flag_settings
-from px4fuse.classroom.grading.model import Entry, GradedReport
+from px4fuse.classroom.grading.model import Grade, GradedReport
 from px4fuse.classroom.grading.outputs import feedback_text
 from px4fuse.classroom.grading.rubric import parse_rubric, read_rubric, score_report
 from px4fuse.errors import ResultsError
@@ -131,7 +131,7 @@ CHECKED = [
     ("clock", changed_results(**JUMPS), {}, 0.5, "State the time of the change"),
     ("clock", with_form(["clock-jump"], **JUMPS), {}, 1.0, "as your form states"),
     ("clock", with_form(["dropout"], **JUMPS), {}, 0.5, "State the time of the change"),
-    ("loop", LOOP, {}, 1.0, "the path was corrected"),
+    ("loop", LOOP, {}, 1.0, "drift of the path was corrected"),
     ("loop", changed_results(LOOP, **{AFTER: NONE}), {}, 0.5, "not corrected"),
     ("loop", EXAMPLE, {}, 0.0, "no external vision with orientation"),
     ("loop", changed_results(LOOP, loop__is_absolute_track=True), {}, 0.0, "does not drift"),
@@ -157,9 +157,9 @@ def test_report_with_undeterminable_time_offset_earns_points():
 # ------------------------------------------------------------------ faults
 
 
-TRUTH = FormTruth(
-    (InjectedFault("dropout", 3.0, 2.55, 3.45, 50.0, 53.0),), 0.1, VerdictTruth("consistent"),
-    VerdictTruth("consistent"), ("dead-reckoned, then reset",), (), (0.5, 0.1, 0.2),
+TRUTH = RightFormAnswers(
+    (InjectedFault("dropout", 3.0, 2.55, 3.45, 50.0, 53.0),), 0.1, RightVerdict("consistent"),
+    RightVerdict("consistent"), ("dead-reckoned, then reset",), (), (0.5, 0.1, 0.2),
 )  # fmt: skip
 
 
@@ -297,7 +297,7 @@ class TestScore:
 
 def feedback_words(one, title=""):
     """Return the feedback text without line ends."""
-    text = feedback_text(Entry(one.student, one.student_id, one), title)
+    text = feedback_text(Grade(one.student, one.student_id, one), title)
     assert all(len(line) <= 100 for line in text.splitlines())
     return " ".join(text.split())
 

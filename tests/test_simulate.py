@@ -22,18 +22,24 @@ from px4fuse.filter.signals import Segment, make_axes, mean_step_acceleration, p
 from px4fuse.findings import find
 from px4fuse.flight.model import Columns
 from px4fuse.simulation import sensors
-from px4fuse.simulation.flights import answer, simulate, simulate_flight, to_flight, to_ulog
-from px4fuse.simulation.mistakes import (
-    MISTAKES,
-    Mistakes,
-    active_mistake_names,
-    format_mistake,
-    parse_mistakes,
+from px4fuse.simulation.faults import (
+    FAULT_TYPES,
+    FaultSizes,
+    format_fault,
+    injected_fault_names,
+    parse_faults,
 )
-from px4fuse.simulation.motion import attitude, direction, plan
+from px4fuse.simulation.flights import (
+    make_answer_key,
+    simulate,
+    simulate_flight,
+    to_flight,
+    to_ulog,
+)
+from px4fuse.simulation.motion import attitude, direction, plan_flight
 from px4fuse.simulation.scenario import DT_S, Scenario, bounds_by_field
 
-NO_MISTAKES = Mistakes()
+NO_FAULTS = FaultSizes()
 AISLE = Scenario(passes=2, seed=4)
 UNFILTERED = replace(AISLE, ekf2=False)
 LOOP = Scenario(kind="loop", passes=1, length_m=8.0, seed=4)
@@ -46,12 +52,14 @@ IDEAL = {
 
 
 def test_each_simulated_fault_size_has_limits() -> None:
-    numbers = {item.name for item in fields(Mistakes) if "float" in str(item.type)}
-    assert set(bounds_by_field(Mistakes)) == numbers
+    numbers = {item.name for item in fields(FaultSizes) if "float" in str(item.type)}
+    assert set(bounds_by_field(FaultSizes)) == numbers
 
 
-def motion_of(scenario, mistakes=NO_MISTAKES):
-    return plan(scenario, mistakes, sensors.random_stream(scenario, sensors.Stream.WANDER))
+def motion_of(scenario, mistakes=NO_FAULTS):
+    return plan_flight(
+        scenario, mistakes, sensors.random_stream(scenario, sensors.RandomStream.WANDER)
+    )
 
 
 def position_errors_m(simulation):
@@ -111,11 +119,11 @@ class TestMotion:
 @pytest.mark.parametrize(("left_out", "texts"), [(0.0, []), (2.5, ["open-end=2.5m"])])
 def test_simulated_open_loop_has_requested_closure_error(left_out, texts):
     scenario = replace(LOOP, passes=2)
-    flown = simulate(scenario, parse_mistakes(texts))
+    flown = simulate(scenario, parse_faults(texts))
     first, last = flown.motion.at(np.array([0.0, flown.motion.duration_s])).position_m
     # the last side points back along heading + 270 degrees
     assert np.allclose(last - first, -left_out * direction(30.0 + 270.0), atol=1e-9)
-    error_m = answer(flown)["truth"]["closure_error_m"]
+    error_m = make_answer_key(flown)["truth"]["closure_error_m"]
     assert error_m == pytest.approx(left_out, abs=1e-9)
 
 
@@ -140,7 +148,7 @@ def test_simulated_aisle_flight_has_requested_length_and_yaw(yaw):
 @pytest.mark.parametrize("texts", [[], ["vibration=0.5"]])
 def test_simulated_imu_noise_averaged_over_dt_equals_sigma_a(texts):
     scenario = Scenario(seed=3, passes=4, wander_m=0.0, **IDEAL)
-    simulation = simulate(scenario, parse_mistakes(texts))
+    simulation = simulate(scenario, parse_faults(texts))
     imu = to_flight(simulation).imu
     time = imu.index.to_numpy()
     truth = attitude(simulation.motion.at(time))
@@ -159,12 +167,12 @@ def test_simulated_imu_biases_are_constant_with_requested_sigma():
     simulation = simulate(Scenario(seed=9))
     imu = to_flight(simulation).imu
     truth = attitude(simulation.motion.at(imu.index.to_numpy()))
-    truth_values = answer(simulation)["truth"]
+    truth_values = make_answer_key(simulation)["truth"]
     bias = imu.to_numpy()[:, :3].astype(float) - truth.specific_force_m_s2
     assert bias.mean(axis=0) == pytest.approx(truth_values["accelerometer_bias_m_s2"], abs=0.025)
     bias = imu[Columns.ANGULAR_RATE].to_numpy(float) - truth.angular_rate_rad_s
     assert bias.mean(axis=0) == pytest.approx(truth_values["gyro_bias_rad_s"], abs=3e-4)
-    drawn = [sensors.biases(Scenario(seed=seed), NO_MISTAKES) for seed in range(400)]
+    drawn = [sensors.biases(Scenario(seed=seed), NO_FAULTS) for seed in range(400)]
     assert np.std([b[0] for b in drawn]) == pytest.approx(0.03, rel=0.1)
     assert np.std([b[1] for b in drawn]) == pytest.approx(0.002, rel=0.1)
 
@@ -174,7 +182,7 @@ def test_simulated_vio_drift_has_requested_rate():
     for seed in range(40):
         scenario = Scenario(kind="loop", passes=1, length_m=8.0, seed=seed, sigma_vio_m=0.0)
         motion = motion_of(scenario)
-        source = sensors.positions(scenario, NO_MISTAKES, motion)
+        source = sensors.positions(scenario, NO_FAULTS, motion)
         errors_m = source.position_m - motion.at(source.measured_s).position_m
         assert np.allclose(errors_m[-1], source.drift_m, atol=1e-9)
         ends.append(source.drift_m)
@@ -195,15 +203,15 @@ class TestMistakes:
         ("clock-offset=80ms", 0.08, 0), ("clock-drift=500ppm", 0, 5e-4),
     ])  # fmt: skip
     def test_simulated_clock_error_shifts_only_timestamps(self, text, offset_s, share):
-        late = simulate(UNFILTERED, parse_mistakes([text]))
+        late = simulate(UNFILTERED, parse_faults([text]))
         time = late.positions.measured_s
         assert np.allclose(stamps_s(late) - time, offset_s + share * time, atol=1e-6)
         arrivals = (s.positions.topic.fields["timestamp"] for s in (late, self.CLEAN))
         assert np.array_equal(*arrivals)
-        assert answer(late)["truth"]["clock_offset_to_add_s"] == -offset_s
+        assert make_answer_key(late)["truth"]["clock_offset_to_add_s"] == -offset_s
 
     def test_simulated_clock_jump_ends_at_timesync_convergence(self):
-        jumping = simulate(Scenario(seed=4), parse_mistakes(["clock-jump=0.25"]))
+        jumping = simulate(Scenario(seed=4), parse_faults(["clock-jump=0.25"]))
         fields, time = jumping.positions.topic.fields, jumping.positions.measured_s
         before = time < 50.0
         assert 0.0 < before.mean() < 1.0
@@ -213,7 +221,7 @@ class TestMistakes:
         assert np.allclose(late[~before], 0.0, atol=1e-6)
 
     def test_simulated_nlos_outliers_have_exact_fraction(self):
-        simulation = simulate(Scenario(seed=6, sigma_uwb_m=0.0), parse_mistakes(["nlos=5%,3m"]))
+        simulation = simulate(Scenario(seed=6, sigma_uwb_m=0.0), parse_faults(["nlos=5%,3m"]))
         outlier, motion = simulation.positions.is_outlier, simulation.motion
         time = simulation.positions.measured_s
         flying = (time > motion.take_off_s) & (time < motion.touch_down_s)
@@ -225,7 +233,7 @@ class TestMistakes:
         assert np.mean(size[outlier]) == pytest.approx(3.0, rel=0.2)
         starts = np.count_nonzero(np.diff(outlier.astype(int)) == 1)
         assert np.count_nonzero(outlier) / starts > 1.5
-        truth_values = answer(simulation)["truth"]
+        truth_values = make_answer_key(simulation)["truth"]
         assert truth_values["outlier_index"] == np.flatnonzero(outlier).tolist()
         assert np.allclose(truth_values["outlier_time_s"], stamps_s(simulation)[outlier])
 
@@ -233,7 +241,7 @@ class TestMistakes:
         ("text", "start", "end"), [("dropout=6s,12s", 12.0, 18.0), ("dropout=6", None, None)]
     )
     def test_simulated_dropout_removes_position_samples(self, text, start, end):
-        with_gap = simulate(UNFILTERED, parse_mistakes([text]))
+        with_gap = simulate(UNFILTERED, parse_faults([text]))
         middle = with_gap.motion.duration_s / 2.0
         start, end = start or middle - 3.0, end or middle + 3.0
         clean = self.CLEAN.positions.measured_s
@@ -242,7 +250,7 @@ class TestMistakes:
 
     @pytest.mark.parametrize("rate", [2.0, 4.0])
     def test_simulated_decimation_reduces_position_and_imu_rate(self, rate):
-        mistakes = parse_mistakes(
+        mistakes = parse_faults(
             [f"decimate={rate}Hz", f"imu-rate={10 * rate}", "imu-dropout=2s,10s"]
         )
         decimated, clean = (to_flight(s) for s in (simulate(AISLE, mistakes), self.CLEAN))
@@ -257,7 +265,7 @@ class TestMistakes:
 
     def test_simulated_low_pass_positions_lag_by_time_constant(self):
         scenario = Scenario(seed=4, sigma_uwb_m=0.0, uwb_rate_hz=50.0, wander_m=0.0)
-        simulation = simulate(scenario, parse_mistakes(["smoothed=0.5s"]))
+        simulation = simulate(scenario, parse_faults(["smoothed=0.5s"]))
         truth = simulation.motion.at(simulation.positions.measured_s)
         along = truth.velocity_m_s @ direction(30.0)
         lag = -(position_errors_m(simulation) @ direction(30.0))
@@ -265,15 +273,15 @@ class TestMistakes:
         settled = fast & np.roll(fast, 150)  # 3 s are six time constants
         assert np.any(settled)
         assert np.allclose(lag[settled] / along[settled], 0.5, atol=0.02)
-        noisy = simulate(replace(AISLE, ekf2=False), parse_mistakes(["smoothed=1s"]))
+        noisy = simulate(replace(AISLE, ekf2=False), parse_faults(["smoothed=1s"]))
         assert (
             np.std(position_errors_m(noisy)[:25]) < 0.07
         )  # on the ground; 0.10 m without the filter
 
     def test_simulated_fault_no_vvo_removes_visual_odometry_topic(self):
-        remaining = to_flight(simulate(AISLE, parse_mistakes(["no-vvo"]))).positions
-        assert [round(track.rate_hz) for track in remaining] == [2, 2]
-        flight = to_flight(simulate(replace(AISLE, ekf2=False), parse_mistakes(["no-vvo"])))
+        remaining = to_flight(simulate(AISLE, parse_faults(["no-vvo"]))).positions
+        assert [round(track.compute_rate_hz()) for track in remaining] == [2, 2]
+        flight = to_flight(simulate(replace(AISLE, ekf2=False), parse_faults(["no-vvo"])))
         assert flight.positions == ()
         with pytest.raises(px4fuse.Px4FuseError, match="SDLOG_PROFILE"):
             compare(flight)
@@ -288,15 +296,15 @@ class TestMistakes:
     ("no-motion", "no_motion", True),
 ])  # fmt: skip
 def test_simulate_fault_option_converts_units(text, field, value):
-    assert getattr(parse_mistakes([text]), field) == pytest.approx(value)
+    assert getattr(parse_faults([text]), field) == pytest.approx(value)
 
 
-@pytest.mark.parametrize("name", MISTAKES)
+@pytest.mark.parametrize("name", FAULT_TYPES)
 def test_simulate_fault_option_is_formatted_and_parsed_back(name):
-    parsed = parse_mistakes([name])
-    assert active_mistake_names(parsed) == (name,)
-    assert parse_mistakes([format_mistake(name, parsed)]) == parsed
-    assert active_mistake_names(parse_mistakes(["clock-offset=0", "nlos=0"])) == ()
+    parsed = parse_faults([name])
+    assert injected_fault_names(parsed) == (name,)
+    assert parse_faults([format_fault(name, parsed)]) == parsed
+    assert injected_fault_names(parse_faults(["clock-offset=0", "nlos=0"])) == ()
 
 
 @pytest.mark.parametrize(("text", "expected"), [
@@ -312,7 +320,7 @@ def test_simulate_fault_option_is_formatted_and_parsed_back(name):
 ])  # fmt: skip
 def test_simulate_invalid_fault_option_raises_one_line_error(text, expected):
     with pytest.raises(SettingsError, match=expected) as error:
-        parse_mistakes([text])
+        parse_faults([text])
     assert "\n" not in str(error.value)
 
 
@@ -333,16 +341,19 @@ def test_simulation_scenario_with_invalid_value_raises_error(changes):
 ])  # fmt: skip
 def test_simulate_with_unsuitable_fault_raises_error(scenario, texts, expected):
     with pytest.raises(SettingsError, match=expected):
-        simulate(scenario, parse_mistakes(texts))
+        simulate(scenario, parse_faults(texts))
 
 
 # --- ULog and memory
 
 
 def test_simulated_ulog_contains_no_names_of_faults():
-    texts = [name for name, one in MISTAKES.items() if "aisle" in one.kinds and name != "no-vvo"]
-    content = to_ulog(simulate(AISLE, parse_mistakes(texts)))
-    for name in (*MISTAKES, *(field for mistake in MISTAKES.values() for field in mistake.fields)):
+    texts = [name for name, one in FAULT_TYPES.items() if "aisle" in one.kinds and name != "no-vvo"]
+    content = to_ulog(simulate(AISLE, parse_faults(texts)))
+    for name in (
+        *FAULT_TYPES,
+        *(field for mistake in FAULT_TYPES.values() for field in mistake.fields),
+    ):
         # these names occur in the log for other reasons
         if name not in ("yaw", "scale", "jump", "heading", "mag"):
             assert name.encode() not in content

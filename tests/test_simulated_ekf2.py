@@ -19,8 +19,8 @@ from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_ekf2 import samples_per_step
 from px4fuse.simulation import ekf2, sensors
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate, simulate_flight, to_ulog
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 
 AISLE = Scenario(passes=3, seed=5)
@@ -28,7 +28,7 @@ RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
 
 
 def flown(*texts: str, scenario: Scenario = AISLE) -> Flight:
-    return simulate_flight(scenario, parse_mistakes(texts))
+    return simulate_flight(scenario, parse_faults(texts))
 
 
 def fused(flight: Flight, axis: str = "north") -> pd.DataFrame:
@@ -114,7 +114,7 @@ def test_simulated_ekf2_is_consistent_at_its_fusion_horizon(clean):
     later = record.delayed[record.delayed.index > 15.0]
     error = later["north_m_s"] - np.interp(later.index, truth.index, truth["north_m_s"])
     assert 0.5 < np.mean(error**2 / later["north_m2_s2"]) < 2.5
-    bias, gyro_bias = sensors.biases(AISLE, parse_mistakes([]))
+    bias, gyro_bias = sensors.biases(AISLE, parse_faults([]))
     last = later.iloc[-1]
     names = [f"gyro_bias_{axis}_rad_s" for axis in ("forward", "right")]
     assert last[names].to_numpy(float) == pytest.approx(gyro_bias[:2], abs=0.002)
@@ -185,7 +185,7 @@ def test_imu_samples_per_ekf2_step_near_2_5_are_read_from_log():
 
 
 def test_simulated_ekf2_ignores_samples_with_older_timestamps():
-    simulation = simulate(Scenario(passes=4, seed=5), parse_mistakes(["clock-jump=400ms"]))
+    simulation = simulate(Scenario(passes=4, seed=5), parse_faults(["clock-jump=400ms"]))
     topics = {topic.name: topic.fields for topic in simulation.topics}
     sent = topics["vehicle_visual_odometry"]["timestamp_sample"].astype(np.int64)
     taken = topics["estimator_aid_src_ev_pos"]["timestamp_sample"].astype(np.int64)

@@ -22,6 +22,7 @@ from px4fuse.findings import (
     ekf2_not_fusing,
     source_convention,
     source_intervals,
+    source_positions,
     source_stamps,
     source_values,
 )
@@ -31,8 +32,8 @@ from px4fuse.flight.model import REPEATED_TIMESTAMPS, ClockMap, Columns, Flight
 from px4fuse.readers import read_log
 from px4fuse.readers.common import find_invalid_rows, rounding_step
 from px4fuse.readers.position_file import read_position_file
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
@@ -101,6 +102,22 @@ def test_rounding_step_of_float32_positions_is_found(origin, step):
 
 def test_rounding_step_with_denormal_difference_is_zero():
     assert rounding_step(np.array([0.0, 5e-324, 1e10])) == 0.0
+
+
+@pytest.mark.parametrize(("column", "name", "severity", "control"), [
+    ("down_m", "source_height_constant", "note", 1),
+    ("north_m", "source_coordinate_constant", "error", 2),
+])  # fmt: skip
+def test_constant_coordinate_is_reported_and_not_fused(column, name, severity, control):
+    flight = simulate_flight(Scenario(passes=1, seed=2))
+    source = flight.positions[0]
+    source = replace(source, samples=source.samples.assign(**{column: 1.25}))
+    comparison = compare(replace(flight, positions=(source,)))
+    (found,) = source_positions.detect_constant_coordinates(comparison)
+    assert (found.id, found.severity) == (name, severity)
+    assert "constant (1.25 m)" in found.message
+    assert f"EKF2_EV_CTRL {'to' if control == 2 else 'at'} {control}" in found.remedy
+    assert ("down" in comparison.axes) is (column != "down_m")
 
 
 @pytest.mark.parametrize(("stamp", "clock"), [
@@ -305,7 +322,7 @@ def test_noise_along_one_axis_is_not_reported_as_two_senders():
 
 def mounted(arm_m: tuple[float, float]) -> Analysis:
     """Return a flight whose sensor is mounted away from the IMU."""
-    flight = simulate_flight(Scenario(seed=3, kind="loop", passes=2), parse_mistakes(()))
+    flight = simulate_flight(Scenario(seed=3, kind="loop", passes=2), parse_faults(()))
     source, attitude = flight.positions[0], flight.truth.attitude
     time = source.samples.index.to_numpy()
     rotation = to_matrix(interpolate(time, attitude.index.to_numpy(), attitude.to_numpy()))

@@ -18,7 +18,7 @@ from px4fuse.classroom.assignment.roster import read_people
 from px4fuse.classroom.assignment.sheet import read_sheet
 from px4fuse.classroom.grading.entries import Course, parse_due_time, parse_late_rule
 from px4fuse.classroom.grading.grade import GradeOutcome, grade
-from px4fuse.classroom.grading.model import Entry
+from px4fuse.classroom.grading.model import Grade
 from px4fuse.classroom.grading.rubric import read_rubric, rubric_text
 
 STUDENTS = range(1, 41)
@@ -146,12 +146,12 @@ def lab(tmp_path: Path) -> Lab:
     return Lab(tmp_path)
 
 
-def entry_of(outcome: GradeOutcome, number: int) -> Entry:
-    return next(one for one in outcome.entries if one.student_id == student_id(number))
+def grade_of(outcome: GradeOutcome, number: int) -> Grade:
+    return next(one for one in outcome.grades if one.student_id == student_id(number))
 
 
 def points(outcome: GradeOutcome) -> dict[str, float | None]:
-    return {one.student_id: one.total for one in outcome.entries}
+    return {one.student_id: one.total for one in outcome.grades}
 
 
 def test_second_grade_run_applies_changed_rubric_and_overrides(lab, monkeypatch) -> None:
@@ -181,12 +181,12 @@ def check_other_rubric(lab: Lab, outcome: GradeOutcome) -> None:
     (lab.folder / "lab.toml").write_text(doubled, encoding="utf-8")
     second = lab.grade(read_rubric(lab.folder / "lab.toml"))
     assert second.reused_count == 38  # two files are not reports
-    assert entry_of(second, 1).total == pytest.approx(2 * entry_of(outcome, 1).total, abs=0.2)
+    assert grade_of(second, 1).total == pytest.approx(2 * grade_of(outcome, 1).total, abs=0.2)
 
 
 def check_overrides(lab: Lab, outcome: GradeOutcome) -> None:
     """Check that overrides are applied, not overwritten, and kept when grading again."""
-    usual = entry_of(outcome, 1)
+    usual = grade_of(outcome, 1)
     item = usual.counted_report.items[0].title
     said = lab.output / "overrides.csv"
     assert said.read_text(encoding="utf-8-sig") == "id,item,points,comment\n"
@@ -199,8 +199,8 @@ def check_overrides(lab: Lab, outcome: GradeOutcome) -> None:
     third = lab.grade()
     assert said.read_bytes() == before
     expected = usual.total - usual.counted_report.items[0].points + 1.0
-    assert entry_of(third, 1).total == pytest.approx(expected)
-    assert entry_of(third, 40).total == 12.0
+    assert grade_of(third, 1).total == pytest.approx(expected)
+    assert grade_of(third, 40).total == 12.0
     assert "overrides.csv: no student has the id 0099." in third.notes
     changed = {key for key, value in points(third).items() if value != points(outcome)[key]}
     assert changed == {"0001", "0040"}
@@ -209,7 +209,7 @@ def check_overrides(lab: Lab, outcome: GradeOutcome) -> None:
     assert "Well argued." in words
     assert "Your instructor: Not shown." in words
     fleet_table = (lab.output / "class.csv").read_bytes()
-    assert lab.grade().entries == third.entries
+    assert lab.grade().grades == third.grades
     assert (lab.output / "class.csv").read_bytes() == fleet_table
 
 
@@ -217,6 +217,6 @@ def check_pseudonyms(lab: Lab, outcome: GradeOutcome) -> None:
     """Check the table of pseudonyms."""
     text = (lab.output / "names.csv").read_text(encoding="utf-8-sig")
     rows = list(csv.DictReader(io.StringIO(text, newline="")))
-    assert {row["id"] for row in rows} == {one.student_id for one in outcome.entries}
+    assert {row["id"] for row in rows} == {one.student_id for one in outcome.grades}
     assert len({row["pseudonym"] for row in rows}) == 40
     assert [row["id"] for row in rows] != sorted(row["id"] for row in rows)

@@ -31,7 +31,7 @@ from px4fuse.results.build import results
 from px4fuse.results.contract import ComparisonResults, to_json
 from px4fuse.results.model import Student
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import Scenario
 
 pytestmark = pytest.mark.usefixtures("cached_analyses")
@@ -48,7 +48,7 @@ def commands(text: str) -> list[str]:
 def flown() -> bytes:
     """Log of a short flight with late timestamps."""
     scenario = Scenario(passes=2, seed=3)
-    return flights.to_ulog(flights.simulate(scenario, parse_mistakes(("clock-offset=250ms",))))
+    return flights.to_ulog(flights.simulate(scenario, parse_faults(("clock-offset=250ms",))))
 
 
 @pytest.fixture
@@ -81,11 +81,11 @@ def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> N
         console = terminal()
         with console.capture() as captured:
             page = comparison_page(*document, verbose=True)
-            screen.show(console, page.blocks, document[0].request)
+            screen.print_blocks(console, page.blocks, document[0].request)
         summaries[width] = captured.get()
     whole = summaries[None]
     card = with_typed_path(document[1].card, document[0].request.log)
-    drawn = [f"{line.first}{line.text}" for line in card_lines(card) if not line.wraps]
+    drawn = [f"{line.first_indent}{line.text}" for line in card_lines(card) if not line.wraps]
     for width in (WIDTH, 60):
         assert "…" not in summaries[width]
         assert "--sigma-z" in summaries[width]
@@ -112,7 +112,7 @@ def test_table_on_narrow_terminal_keeps_words_whole(capsys) -> None:
     page = Page()
     topics = ["vehicle_visual_odometry", "estimator_aid_src_ev_pos"]
     page.table(["data", "topic", "samples"], [["position", topic, "650"] for topic in topics])
-    screen.show(Console(width=40, highlight=False), page.blocks)
+    screen.print_blocks(Console(width=40, highlight=False), page.blocks)
     words = capsys.readouterr().out.replace(",", "").split()
     assert [word for word in words if word in topics] == topics
 

@@ -21,7 +21,7 @@ from px4fuse.diagnose import find_faults, run_what_if
 from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun, run_segment
 from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
-from px4fuse.ekf2.intervals import Events, make_intervals
+from px4fuse.ekf2.intervals import StepEvents, make_intervals
 from px4fuse.ekf2.model import Model, modelled_aids, open_model, replay_settings, run_configurations
 from px4fuse.ekf2.replay_segments import ReplaySegment
 from px4fuse.ekf2.vision import MAX_SAMPLE_GAP_S
@@ -36,8 +36,8 @@ from px4fuse.request import WhatIfRequest
 from px4fuse.results.build import whatif_results
 from px4fuse.results.contract import schema, to_json
 from px4fuse.simulation import ekf2 as simulated
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import make_scenario
 
 OUTDOOR = make_scenario("outdoor", seed=3, passes=2)
@@ -51,7 +51,7 @@ FRAME_M = np.array([5.0, -3.0, 0.0])  # origin of the vision frame
 
 @cache
 def on_gnss() -> Model:
-    return opened(simulate_flight(OUTDOOR, parse_mistakes(())))
+    return opened(simulate_flight(OUTDOOR, parse_faults(())))
 
 
 def sent(
@@ -101,7 +101,7 @@ class PlainBias:
 
 
 def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
-    inputs: Inputs, segment: ReplaySegment, events: Events
+    inputs: Inputs, segment: ReplaySegment, events: StepEvents
 ) -> tuple[np.ndarray, np.ndarray]:
     """Run a plain EKF: one prediction at a time, each fix and each vision sample at its step.
 
@@ -426,7 +426,7 @@ def flown(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulated, "parameters", lambda *of: usual(*of) | OF_VISION | changed)
         patch.setattr(simulated, "run_configurations", both)
-        flight = simulate_flight(OUTDOOR, parse_mistakes(()))
+        flight = simulate_flight(OUTDOOR, parse_faults(()))
     updates = update_log(runs[0])
     enabled = pd.Series([1.0, 0.0], index=[0.0, off_from_s])
     samples = pd.DataFrame({

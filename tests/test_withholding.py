@@ -49,11 +49,11 @@ def assigned(tmp_path_factory: pytest.TempPathFactory) -> Assigned:
     return Assigned(log, report, results)
 
 
-def test_report_on_assigned_flight_contains_no_diagnosis(assigned: Assigned) -> None:
+def test_report_on_student_assignment_contains_no_diagnosis(assigned: Assigned) -> None:
     results = assigned.results
     assert results.log.is_assessed is True
     assert (results.findings, results.trials, results.card.causes) == ((), (), ())
-    assert results.card.facts == {"Answers": "Consistency verdict on KF: consistent"}
+    assert results.card.facts == {"Answers": "Consistency of KF: consistent"}
     assert {*results.tuning.values(), results.clock, results.heading, results.loop} == {
         DIAGNOSIS_WITHHELD
     }
@@ -70,13 +70,13 @@ def test_report_on_assigned_flight_contains_no_diagnosis(assigned: Assigned) -> 
         "compare {log} --clock-offset auto",
     ],
 )
-def test_parameter_estimate_for_assigned_flight_is_refused(
+def test_parameter_estimate_for_student_assignment_is_refused(
     assigned: Assigned, command: str
 ) -> None:
     assert DIAGNOSIS_WITHHELD.reason in error_line(*command.format(log=assigned.log).split())
 
 
-def test_loop_report_on_assigned_flight_has_no_loop_closure(
+def test_loop_report_on_student_assignment_has_no_loop_closure(
     assigned: Assigned, tmp_path: Path
 ) -> None:
     run_checked("loop", assigned.log, "--json", tmp_path / "loop.json")
@@ -85,7 +85,7 @@ def test_loop_report_on_assigned_flight_has_no_loop_closure(
     assert (data["loop"]["closures"], data["findings"]) == ([], [])
 
 
-def test_grade_adds_diagnosis_to_report_on_assigned_flight(
+def test_grade_adds_diagnosis_to_report_on_student_assignment(
     assigned: Assigned, tmp_path: Path
 ) -> None:
     logs, pdf = files_by_sha256([assigned.log]), assigned.report.read_bytes()

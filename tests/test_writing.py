@@ -24,7 +24,7 @@ from ulog_tools import make_log
 
 from px4fuse.core import writing
 from px4fuse.core.writing import STANDARD_OUTPUT, write_all
-from px4fuse.diagnose import prepare_comparison
+from px4fuse.diagnose import prepare_comparison, read_flight
 from px4fuse.errors import OutputError
 from px4fuse.report import fonts, pdf
 from px4fuse.request import ComparisonRequest
@@ -262,7 +262,7 @@ def test_stop_signal_after_writing_lists_the_written_files(desk, monkeypatch, ca
     def stopped(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(screen, "show", stopped)
+    monkeypatch.setattr(screen, "print_blocks", stopped)
     code, _, err = run_main(monkeypatch, capsys, *LOOP, "--json", "c.json")
     assert (code, err) == (130, "px4fuse: interrupted; outputs already written: c.tum, c.json.\n")
     assert names(desk) == ["c.json", "c.tum", "l.ulg", "s.tum"]
@@ -372,7 +372,7 @@ def test_terminal_output_to_closed_pipe_exits_with_0(desk, command) -> None:
 
 def test_option_clock_offset_auto_applies_0_if_not_significant(sample_log) -> None:
     request = ComparisonRequest(log=str(sample_log), clock_offset_s="auto", axes=("north", "east"))
-    found = compare_prepared(prepare_comparison(request))
+    found = compare_prepared(prepare_comparison(read_flight(request), request))
     assert found.settings.clock_offset_s == 0.0
     (said,) = (note for note in found.notes if note.startswith("--clock-offset auto: "))
     low, high = re.search(r"95 % (\S+)(?: s)? to (\S+)", said).groups()
@@ -385,7 +385,9 @@ def test_option_clock_offset_auto_corrects_late_timestamps(shared_logs) -> None:
         log=str(shared_logs / "simulated" / "v1.16.1_aisle_clock_late.ulg"), axes=("aisle",)
     )
     late, found = (
-        compare_prepared(prepare_comparison(replace(request, clock_offset_s=offset_s)))
+        compare_prepared(
+            prepare_comparison(read_flight(request), replace(request, clock_offset_s=offset_s))
+        )
         for offset_s in (0.0, "auto")
     )
     assert found.settings.clock_offset_s == pytest.approx(-0.25, abs=0.05)

@@ -97,7 +97,8 @@ def gtsam_problem(gtsam: Any, graph: PoseGraph) -> tuple[Any, Any]:
     for k, pose in enumerate(graph.poses):
         values.insert(k, gtsam_pose(gtsam, pose))
     for i, j, z, omega in zip(
-        graph.first.tolist(), graph.second.tolist(), graph.measurements, graph.information,
+        graph.first_nodes.tolist(), graph.second_nodes.tolist(), graph.measurements,
+        graph.information,
         strict=True,
     ):  # fmt: skip
         noise = gtsam.noiseModel.Gaussian.Information(omega[np.ix_(order, order)])

@@ -1,4 +1,4 @@
-"""Matching of a position file with EKF2 or the IMU: choice of frame, yaw and time offset."""
+"""Frame, yaw and time offset at which a position file matches EKF2's position or the IMU best."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,20 +17,19 @@ from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTr
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_PEAK_RATIO
 
-# Frames tried for a position file with estimated yaw: nwu is the same as enu rotated by 90°
+# Frames to try if the yaw is estimated; without nwu, which is enu rotated by 90°
 ESTIMATED_YAW_FRAMES = ("ned", "enu")
-# Frames tried for a position file with the user's yaw. Frames with y up or down (eus, edn) are not
-# tried: a level flight along one axis cannot distinguish them from frames with z up
+# Frames to try if the user gives the yaw; without eus and edn (y up or down), because a level
+# flight along one axis cannot distinguish them from frames with z up
 GIVEN_YAW_FRAMES = ("ned", "enu", "nwu")
-# Maximum time span (s) of a position file: matching a day of positions takes five seconds
+# Maximum time span (s) of a position file, which limits the computing time to five seconds
 MAX_SPAN_S = 86400.0
-# Minimum of Lin's concordance correlation coefficient (1989), by reference, for a match without a
-# warning and for a check of the user's yaw
+# Minimum concordance correlation coefficient (Lin 1989) of a good match with each reference
 MIN_GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
 # Maximum standard deviation (s) of an accepted time offset
 MAX_CLOCK_SIGMA_S = 0.5
-# Minimum ratio of the residual in the second best frame to the residual in the best frame, for
-# accepting the best frame
+# Minimum ratio of the residuals in the second best and the best frame; with a smaller ratio, the
+# frame is ambiguous
 MIN_FRAME_RESIDUAL_RATIO = 1.3
 # Minimum ratio of the residual with the user's yaw to the residual with estimated yaw and origin,
 # to report a misaligned frame
@@ -63,7 +62,7 @@ class AlignmentProblem:
 
 @dataclass(frozen=True)
 class Match:
-    """Best fit of the position file to a reference track: EKF2's position or the IMU's.
+    """Best fit of the position file to a reference track: EKF2's position or the integrated IMU.
 
     Attributes
     ----------
@@ -73,7 +72,7 @@ class Match:
     residuals_m : dict from frame to float
         RMS residual in each tried frame, best first.
     fit : Fit
-        Fit with the user's yaw; equal to ``free_yaw_fit`` without it.
+        Fit with the yaw from the user; equal to ``free_yaw_fit`` if the user gave no yaw.
     free_yaw_fit : Fit
         Fit with estimated yaw.
     is_rotated : bool
@@ -89,7 +88,7 @@ class Match:
 
     @property
     def time_offset_fit(self) -> Fit:
-        """Fit whose time offset is used. A wrong yaw from the user would bias the time offset."""
+        """Fit from which the time offset is taken: a wrong yaw would bias the time offset."""
         return self.free_yaw_fit if self.is_rotated else self.fit
 
     @property
@@ -117,14 +116,14 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     }
     missing_options = [f"`{name}`" for name, value in value_by_option.items() if value is None]
     reasons = []
-    reference_functions = [tracks.make_ekf2_references]
+    make_reference_functions = [tracks.make_ekf2_references]
     # Parameters that the user gave are only checked against EKF2, because the band-pass filtered
     # motion of the IMU is not accurate enough for a check
     if missing_options:
-        reference_functions.append(tracks.make_imu_references)
-    for make_references in reference_functions:
+        make_reference_functions.append(tracks.make_imu_references)
+    for make_references in make_reference_functions:
         try:
-            match = _match(make_references(flight), problem)
+            match = _best_match(make_references(flight), problem)
             _require_unique_match(match)
             return _refit_with_corrected_resets(flight, match, problem)
         except NoMatchError as error:
@@ -138,7 +137,7 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     return None
 
 
-def _match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
+def _best_match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
     samples = problem.samples
     yaw_rad = problem.yaw_rad
     if samples.index[-1] - samples.index[0] > MAX_SPAN_S:
@@ -190,17 +189,19 @@ def _require_unique_match(match: Match) -> None:
             f"coefficient is {fit.concordance:.2f} (at least {MIN_CONCORDANCE[reference_name]:g} "
             "is needed)"
         )
-    ambiguity = ""
+    ambiguity_text = ""
     if fit.second_peak_ratio < MIN_SECOND_PEAK_RATIO:
-        ambiguity = (
+        ambiguity_text = (
             f"two time offsets that differ by {abs(fit.second_peak_s):.1f} s fit equally well"
         )
     elif fit.lag_sigma_s is not None and fit.lag_sigma_s > MAX_CLOCK_SIGMA_S:
-        ambiguity = f"the standard deviation of the time offset exceeds {MAX_CLOCK_SIGMA_S:g} s"
-    if ambiguity:
+        ambiguity_text = (
+            f"the standard deviation of the time offset exceeds {MAX_CLOCK_SIGMA_S:g} s"
+        )
+    if ambiguity_text:
         raise NoMatchError(
             f"the time offset between position file and {reference_name} cannot be estimated: "
-            f"{ambiguity}",
+            f"{ambiguity_text}",
             "Give `clock_offset_s`",
         )
     if len(match.residuals_m) > 1:

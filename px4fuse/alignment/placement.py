@@ -41,8 +41,9 @@ from px4fuse.readers.common import finite_rows
 from px4fuse.readers.position_file import PositionRecording
 from px4fuse.trajectory.model import NED_COMPONENTS
 
-# Maximum time span (s) of file and log in which a mismatch is explained: takes 1 s per hour of data
-MAX_EXPLAINED_SPAN_S = 7200.0
+# Maximum time span (s) of the data for a comparison of axes and unit with the IMU, which takes 1 s
+# per hour of data
+MAX_CONVENTION_CHECK_SPAN_S = 7200.0
 
 
 def _explain_mismatch(
@@ -51,7 +52,7 @@ def _explain_mismatch(
     """Return error message and advice if the IMU contradicts axes or unit of the file."""
     samples = problem.samples
     span_s = max(float(samples.index[-1] - samples.index[0]), flight.log.duration_s)
-    if span_s > MAX_EXPLAINED_SPAN_S:
+    if span_s > MAX_CONVENTION_CHECK_SPAN_S:
         return None
     time_s = samples.index - samples.index[0] + (problem.lag_s or 0.0)
     positions = samples[["x_m", "y_m", "z_m"]] / metres_per_unit
@@ -81,17 +82,17 @@ def _explain_mismatch(
     return "; ".join(fault_texts), " ".join(actions)
 
 
-# Maximum ratio of the second best to the best residual for a warning about an ambiguous time
-# offset, by reference. Correct matches with the noisy IMU have ratios of 1.4 to 1.7
+# Maximum ratio of the residuals at the second best and the best time offset for a warning about an
+# ambiguous time offset, by reference. Correct matches with the noisy IMU have ratios of 1.4 to 1.7
 MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight
 MAX_UNIX_DIFFERENCE_S = 60.0
 # Minimum rotation (°) of the frame of a position file for a message about a misaligned frame
-MIN_NAMED_YAW_DEG = 1.0
+MIN_REPORTED_YAW_DEG = 1.0
 # Minimum distance (m) between the origins of position file and EKF2 for a message about a
 # misaligned frame
-MIN_NAMED_SHIFT_M = 1.0
+MIN_REPORTED_SHIFT_M = 1.0
 
 
 def align_position_file(
@@ -102,7 +103,7 @@ def align_position_file(
     yaw_deg: float | Literal["auto"] | None = None,
     clock_offset_s: float | None = None,
 ) -> Flight:
-    """Convert the positions of a file to the frame and clock of a flight, and add them to it.
+    """Convert the positions of a file to a flight's frame and clock; return the combined flight.
 
     Parameters
     ----------
@@ -161,7 +162,7 @@ def align_position_file(
     yaw_reason = "the yaw was given with --position-yaw"
     if yaw_deg is None:
         yaw_reason = "the position file is assumed to have the yaw of EKF2's frame"
-    alignment, aligned_samples = _describe_alignment(
+    alignment, aligned_samples = _apply_alignment(
         flight, recording, problem, match, frame_reason, yaw_reason, clock_offset_s
     )
     clock_source = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
@@ -210,7 +211,7 @@ def _check_options(
             raise SettingsError(f"`{name}` {value:g} is not a finite number.")
 
 
-def _describe_alignment(
+def _apply_alignment(
     flight: Flight,
     recording: PositionRecording,
     problem: AlignmentProblem,
@@ -339,7 +340,7 @@ def _describe_frame_conflict(match: Match, distance_m: Array | None, yaw_rad: fl
         return ""
     yaw_deg = np.degrees(np.angle(np.exp(1j * (fit.yaw_rad - yaw_rad))))
     # A smaller shift is not reported, because GNSS determines EKF2's origin to about 1 m
-    if shift_text and abs(yaw_deg) < MIN_NAMED_YAW_DEG and shift_m < MIN_NAMED_SHIFT_M:
+    if shift_text and abs(yaw_deg) < MIN_REPORTED_YAW_DEG and shift_m < MIN_REPORTED_SHIFT_M:
         return ""
     return (
         f"The frame of the position file is rotated by {yaw_deg:.1f}° against the "

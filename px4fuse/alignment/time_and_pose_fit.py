@@ -1,4 +1,4 @@
-"""Fit of a position track to a reference: lag by cross-correlation, then lag, yaw and origin."""
+"""Fit of positions to a reference: lag by cross-correlation, then lag, yaw and origin together."""
 
 from dataclasses import dataclass, replace
 
@@ -21,7 +21,7 @@ MIN_CONCORDANCE = {EKF2_POSITION: 0.7, IMU: 0.5}
 MIN_ONE_MINUS_CONCORDANCE = 1e-4
 # Minimum distance (s) between the lags of two separate correlation peaks
 MIN_PEAK_DISTANCE_S = 3.0
-# Residual (m) that the time grid causes even if both tracks match perfectly
+# Residual (m) of identical tracks, which is caused by interpolation on the time grid
 GRID_RESIDUAL_M = 0.05
 # Maximum residual (m): larger residuals are truncated, because they may be outliers
 MAX_RESIDUAL_M = 1.0
@@ -87,12 +87,16 @@ def find_correlation_peak(
     NoMatchError
         No lag has sufficient overlap.
     """
-    shorter_count = min(np.count_nonzero(file_track.is_valid), np.count_nonzero(reference.is_valid))
-    min_count = max(tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / GRID_STEP_S, shorter_count / 2))
-    if shorter_count < min_count:
+    shorter_sample_count = min(
+        np.count_nonzero(file_track.is_valid), np.count_nonzero(reference.is_valid)
+    )
+    min_count = max(
+        tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / GRID_STEP_S, shorter_sample_count / 2)
+    )
+    if shorter_sample_count < min_count:
         raise NoMatchError("position file and reference have too few common samples for a match")
     track_moments = moments(
-        file_track.horizontal_m, reference.horizontal_m, file_track.is_valid, reference.is_valid
+        file_track.to_complex_m(), reference.to_complex_m(), file_track.is_valid, reference.is_valid
     )
     common_count = track_moments.count
     covariance = track_moments.covariance
@@ -173,7 +177,7 @@ def fit_by_least_squares(
             f"only {np.count_nonzero(is_used)} positions of the file overlap the reference in time"
         )
     reference_time_s = file_track.time_s[is_used] + peak.lag_s
-    file_position_m = file_track.horizontal_m[is_used]
+    file_position_m = file_track.to_complex_m()[is_used]
     reference_position_m = (reference_m[:, 0] + 1j * reference_m[:, 1])[is_used]
     centre_m = np.mean(file_position_m)
     # with a centred track, the errors of yaw and origin are uncorrelated
@@ -187,21 +191,24 @@ def fit_by_least_squares(
         else 0j
     )
     mean_variance_m2 = float(np.var(file_position_m) + np.var(reference_position_m)) / 2.0
-    reference_horizontal_m = reference.horizontal_m
+    reference_horizontal_m = reference.to_complex_m()
 
     # Parameters: origin north, origin east, lag relative to the peak, yaw
-    mean_m = reference_position_m.mean()
-    parameters = np.array([mean_m.real, mean_m.imag, 0.0, np.angle(coherence)])
+    reference_mean_m = reference_position_m.mean()
+    parameters = np.array([reference_mean_m.real, reference_mean_m.imag, 0.0, np.angle(coherence)])
     bounds = np.array([np.inf, np.inf, MAX_LAG_SHIFT_S, np.inf])
     is_fitted = np.array([True, True, is_lag_free, yaw_rad is None])
     if yaw_rad is not None:
         parameters[3] = yaw_rad
 
-    def residuals_at(free_parameters: Array) -> Array:
-        parameters[is_fitted] = free_parameters
-        north, east, lag_shift_s, yaw = parameters
-        target = np.interp(reference_time_s + lag_shift_s, reference.time_s, reference_horizontal_m)
-        residuals = np.exp(1j * yaw) * file_position_m + complex(north, east) - target
+    def residuals_at(fitted_parameters: Array) -> Array:
+        all_parameters = parameters.copy()
+        all_parameters[is_fitted] = fitted_parameters
+        north, east, lag_shift_s, yaw = all_parameters
+        target_m = np.interp(
+            reference_time_s + lag_shift_s, reference.time_s, reference_horizontal_m
+        )
+        residuals = np.exp(1j * yaw) * file_position_m + complex(north, east) - target_m
         return np.concatenate([residuals.real, residuals.imag])
 
     solution = least_squares(
@@ -212,6 +219,7 @@ def fit_by_least_squares(
         f_scale=_robust_scale(residuals_at(parameters[is_fitted])),
     )
     residuals = residuals_at(solution.x)
+    parameters[is_fitted] = solution.x
     north, east, lag_shift_s, yaw = parameters.tolist()
     complex_residuals = residuals[: len(file_position_m)] + 1j * residuals[len(file_position_m) :]
     jacobian = np.asarray(solution.jac)

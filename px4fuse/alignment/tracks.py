@@ -37,10 +37,10 @@ MIN_SAMPLES = 10
 # Minimum overlap (s) of two tracks for a match, or half of the shorter track if that is less
 MIN_OVERLAP_S = 10.0
 # σ (s) of the Gaussian filter that smooths the steps of EKF2's position at updates
-SMOOTHING_S = 0.2
+SMOOTHING_SIGMA_S = 0.2
 # Frequency band in which acceleration integrated twice equals position; at lower frequencies the
 # integral drifts
-BAND_HZ = (0.1, 1.0)
+BAND_PASS_HZ = (0.1, 1.0)
 # Length (s) of the transients of the band-pass filter
 TRANSIENT_S = 2.0
 # Length (s) of the padding at both ends of a track that is band-pass filtered
@@ -76,9 +76,8 @@ class SampledTrack:
     is_valid: BoolArray
     name: str = ""
 
-    @property
-    def horizontal_m(self) -> Complex:
-        """North + i·east, shape (n,)."""
+    def to_complex_m(self) -> Complex:
+        """Return North + i·east, shape (n,)."""
         return self.position_m[:, 0] + 1j * self.position_m[:, 1]
 
     def at(self, time_s: Array) -> tuple[Array, BoolArray]:
@@ -107,13 +106,13 @@ def resample_to_grid(track: SampledTrack) -> SampledTrack:
 
 
 def remove_spikes(track: SampledTrack, window_size: int = 3) -> SampledTrack:
-    """Remove outliers of up to half the window (in samples) by a median filter."""
+    """Remove outliers with a median filter over ``window_size`` samples."""
     return replace(track, position_m=median_filter(track.position_m, size=(window_size, 1)))
 
 
 def band_pass(position_m: Array) -> Array:
     """Band-pass filter positions on the time grid, without delay."""
-    filter_sections = butter(2, BAND_HZ, "bandpass", fs=1.0 / GRID_STEP_S, output="sos")
+    filter_sections = butter(2, BAND_PASS_HZ, "bandpass", fs=1.0 / GRID_STEP_S, output="sos")
     return sosfiltfilt(
         filter_sections,
         position_m,
@@ -131,7 +130,7 @@ def mark_transients(track: SampledTrack) -> SampledTrack:
 
 
 def horizontal_range_m(track: SampledTrack) -> float:
-    """Return the larger of the ranges (m) of north and east, without outliers."""
+    """Return the larger of the position ranges (m) along north and east, without outliers."""
     return float(np.max(np.ptp(remove_spikes(track, 5).position_m[:, :2], axis=0)))
 
 
@@ -141,7 +140,9 @@ def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
         raise NoMatchError(f"the log has fewer than {MIN_SAMPLES} horizontal EKF2 positions")
     position_m = finite_state[Columns.POSITION].to_numpy()
     grid = resample_to_grid(_track_without_gaps(finite_state.index.to_numpy(), position_m))
-    smooth_m = gaussian_filter1d(grid.position_m, SMOOTHING_S / GRID_STEP_S, axis=0, mode="nearest")
+    smooth_m = gaussian_filter1d(
+        grid.position_m, SMOOTHING_SIGMA_S / GRID_STEP_S, axis=0, mode="nearest"
+    )
     return replace(grid, position_m=smooth_m, name=EKF2_POSITION)
 
 

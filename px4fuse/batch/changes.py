@@ -1,4 +1,4 @@
-"""Differences between two comparisons in settings, numbers and findings: ``px4fuse diff``."""
+"""Differences in settings, numbers and findings between two results (``px4fuse diff``)."""
 
 import math
 import shlex
@@ -8,21 +8,20 @@ from pathlib import Path
 from px4fuse.batch.inputs import InputResults, Progress, Results, read_inputs
 from px4fuse.batch.measures import (
     ABSOLUTE_TOLERANCE,
-    FILTER_LABELS,
     RELATIVE_TOLERANCE,
     ComparedNumber,
     collect_numbers,
 )
 from px4fuse.batch.rows import value_at
-from px4fuse.comparison.model import FilterSummary
+from px4fuse.comparison.model import FILTER_NAMES, FilterSummary
 from px4fuse.comparison.reruns import is_inconsistent
 from px4fuse.core.text import format_factor, format_number
 from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.results import contract
 from px4fuse.results.model import provenance, schema_of
 
-# A filter is consistent if √(mean NEES) along an axis is between 1/2 and 2. The limits are wide,
-# because errors in a flight are correlated and EKF2's output predictor delays its position
+# Maximum √(mean NEES) of a consistent filter (minimum: 1/2). The limits are wide, because the
+# errors in a flight are correlated and the output predictor of EKF2 delays its position
 MAX_NEES_SIGMA_RATIO = 2.0
 # Settings and flight properties that px4fuse diff compares
 SETTING_PATHS_BY_LABEL = {
@@ -45,7 +44,7 @@ SETTING_PATHS_BY_LABEL = {
 def diff(
     a: str | Path, b: str | Path, *, progress: Progress = lambda _: None
 ) -> contract.ChangeResults:
-    """List the settings, numbers and findings that differ from A to B.
+    """List the settings, numbers and findings that differ between A and B.
 
     Parameters
     ----------
@@ -53,7 +52,7 @@ def diff(
         Flight logs, or reports (PDF) or results (JSON) of ``px4fuse compare``. If one input is a
         log, it is analysed with the settings in the other input.
     progress : callable
-        Function that receives the name of each step of the computation.
+        Called with the name of each step of the computation.
 
     Raises
     ------
@@ -101,7 +100,7 @@ def _setting_changes(results_a: Results, results_b: Results) -> Iterator[contrac
 
 
 def _parameters(results: Results) -> dict[str, float]:
-    """Return the PX4 parameters in the results, rounded to 6 digits because they are float32."""
+    """Return the PX4 parameters in the results, rounded to the 6 digits of a float32."""
     parameters = (value_at(results, "ekf2_replay.settings") or {}) | dict(results.log.parameters)
     return {name: float(f"{parameters[name]:.6g}") for name in sorted(parameters)}
 
@@ -114,7 +113,7 @@ def compare_numbers(
     Parameters
     ----------
     numbers_a, numbers_b : mapping
-        Numbers of A and B, by their path in the results.
+        Numbers by their path in the results.
     """
     for path in {**numbers_a, **numbers_b}:
         number_a, number_b = numbers_a.get(path), numbers_b.get(path)
@@ -160,19 +159,19 @@ def _finding_changes(results_a: Results, results_b: Results) -> Iterator[contrac
 def _describe_worse_verdicts(
     results_a: Results, results_b: Results, findings: Iterable[contract.UnsharedFinding]
 ) -> Iterator[str]:
-    """Yield a sentence on each consistency verdict that is worse in B, and on each new error."""
-    verdicts_a, verdicts_b = map(_mean_statistics_by_label, (results_a, results_b))
-    for name, (value_a, was_consistent) in verdicts_a.items():
-        value_b, is_consistent = verdicts_b.get(name, (value_a, True))
+    """Yield sentences on filters that are consistent only in results A, and errors only in B."""
+    statistics_a, statistics_b = map(_mean_statistics_by_label, (results_a, results_b))
+    for label, (value_a, was_consistent) in statistics_a.items():
+        value_b, is_consistent = statistics_b.get(label, (value_a, True))
         if was_consistent and not is_consistent:
             ratio = value_b**0.5
             factor = format_factor(max(ratio, 1.0 / ratio))
-            verdict = "overconfident, σ {} times too small"
+            verdict_text = f"overconfident, σ {factor} times too small"
             if ratio < 1.0:
-                verdict = "underconfident, σ {} times too large"
+                verdict_text = f"underconfident, σ {factor} times too large"
             yield (
-                f"{name}: {format_number(value_a)} (consistent) → {format_number(value_b)} "
-                f"({verdict.format(factor)})."
+                f"{label}: {format_number(value_a)} (consistent) → {format_number(value_b)} "
+                f"({verdict_text})."
             )
     error_ids = [
         finding.id for finding in findings if (finding.only_in, finding.severity) == ("B", "error")
@@ -182,15 +181,15 @@ def _describe_worse_verdicts(
 
 
 def _mean_statistics_by_label(results: Results) -> dict[str, tuple[float, bool]]:
-    """Return each mean NIS and mean NEES, and True if it is consistent."""
-    verdicts: dict[str, tuple[float, bool]] = {}
+    """Return each mean NIS and mean NEES by label, with True for a consistent filter."""
+    statistics: dict[str, tuple[float, bool]] = {}
     for axis, result in (value_at(results, "axes") or {}).items():
-        for name, label in FILTER_LABELS.items():
+        for name, label in FILTER_NAMES.items():
             summary = result.filters[name]
             if isinstance(summary, FilterSummary):
                 is_consistent = not is_inconsistent(summary)
-                verdicts[f"Mean NIS of {label}, {axis}"] = summary.nis_mean, is_consistent
+                statistics[f"Mean NIS of {label}, {axis}"] = summary.nis_mean, is_consistent
             if (nees := value_at(summary, "truth.nees_position_mean")) is not None:
                 is_consistent = MAX_NEES_SIGMA_RATIO**-2 <= nees <= MAX_NEES_SIGMA_RATIO**2
-                verdicts[f"Mean NEES of {label}, {axis}"] = nees, is_consistent
-    return verdicts
+                statistics[f"Mean NEES of {label}, {axis}"] = nees, is_consistent
+    return statistics

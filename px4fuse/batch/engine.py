@@ -1,7 +1,7 @@
-"""Execution of the jobs of ``px4fuse batch`` on this computer or on a Dask cluster.
+"""Parallel analysis of many logs on this computer or on a Dask cluster.
 
-Each job analyses one log in a process of :mod:`px4fuse.core.workers`, with limits of time and
-memory. On a cluster, the Dask workers start these processes.
+Each log is analysed in a process of :mod:`px4fuse.core.workers`, with limits of time and memory. On
+a cluster, the Dask workers start these processes.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from px4fuse.errors import Px4FuseError, SettingsError
 if TYPE_CHECKING:
     from distributed import Client
 
-# Maximum time (s) until the Dask scheduler answers, and until it has a worker
+# Maximum time (s) to connect to the Dask scheduler, and to wait for its first worker
 CONNECT_TIMEOUT_S = 15.0
-# Number of logs per Dask task, which share one process because its imports take 2 s
+# Number of logs per Dask task: one process analyses all of them, because its start takes 2 s
 JOBS_PER_TASK = 4
 
 
 @contextmanager
 def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
-    """Connect to the Dask cluster with the scheduler at this address.
+    """Connect to a Dask cluster; ``scheduler`` is the address of its scheduler.
 
-    Without an address, provide None instead of a client: the jobs then run on this computer.
+    Without an address, provide None instead of a client, so that jobs run on this computer.
 
     Raises
     ------
@@ -50,14 +50,14 @@ def connect_cluster(scheduler: str | None = None) -> Iterator[Client | None]:
             "--scheduler requires Dask.", 'Run pip install "px4fuse[batch]".'
         ) from error
     try:
-        # a client whose connection fails must not become the Dask client of this Python session
+        # if the connection fails, Dask must not keep this client as its default
         client = Client(scheduler, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise SettingsError(
             f"--scheduler {scheduler}: no Dask scheduler answers ({one_line(str(error), 120)}).",
             "Start a Dask scheduler with: dask scheduler",
         ) from error
-    # Dask would print tracebacks when the scheduler ends
+    # without this, Dask prints tracebacks when the scheduler ends
     with silence_logging_cmgr(logging.CRITICAL), client, client.as_current():
         _check_workers(client)
         yield client
@@ -92,7 +92,7 @@ def run_jobs(
     """Run jobs on a Dask cluster, or on this computer if ``client`` is None.
 
     ``run_job_list`` runs a list of jobs in ``processes`` processes (default: the number of cores).
-    Each job is yielded with its result as soon as it is finished.
+    Yield each job with its result as soon as it is finished.
 
     Raises
     ------
@@ -120,7 +120,7 @@ def run_jobs(
             task_jobs = futures.pop(future)
             if future.status not in ("finished", "error"):
                 raise Px4FuseError("the connection to the Dask scheduler was lost.")
-            # an error means that the worker process died repeatedly or cannot unpickle the jobs
+            # an exception here is a failure of the worker process: jobs catch their own errors
             error = future.exception()
             failure = JobFailure(one_line(f"{type(error).__name__}: {error}", 300))
             results = [failure] * len(task_jobs) if error else future.result()

@@ -20,15 +20,15 @@ from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_attached_results
 InputKind = Literal["log", "report", "results"]
 Progress = Callable[[str], None]
 Results = ComparisonResults | AidsResults
-# Settings that are copied from results to the analysis of another log
+# Settings that are copied from the results of A to the analysis of a log B, or vice versa
 _FILTER_SETTINGS = {*Settings.__dataclass_fields__, "axes"}
-# Settings that are not copied even to an analysis of the same log
+# Options that describe input files; they are never copied
 _INPUT_FILE_SETTINGS = {"log", "system", "position"}
 
 
 @dataclass(frozen=True)
 class InputResults:
-    """Results of the input A or B of ``px4fuse diff``."""
+    """Results of one of the two inputs of ``px4fuse diff``."""
 
     file_name: str
     kind: InputKind
@@ -38,7 +38,7 @@ class InputResults:
 def read_inputs(
     a: Path, b: Path, progress: Progress = lambda _: None
 ) -> tuple[InputResults, InputResults]:
-    """Read the inputs A and B; analyse a log with the settings of the other input.
+    """Read two logs, reports or results; analyse a log with the settings of the other input.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def _analyse_log(path: Path, other_input: InputResults | None, progress: Progres
             **{name: getattr(other_input.results.request, name) for name in copied_settings},
         )
     analysis = diagnose_or_check_aids(request, progress)
-    # to_json rounds the numbers as in a report
+    # to_json rounds all numbers, as in the results of a report
     results_json = to_json(outcome_results(request, analysis))
     results = read_results(results_json.encode())
     assert isinstance(results, Results)

@@ -1,4 +1,4 @@
-"""Job of ``px4fuse batch``: analysis of one log, with its table rows, results and report."""
+"""Analysis of one log for ``px4fuse batch``, with table rows, results and report."""
 
 import re
 from dataclasses import dataclass
@@ -15,10 +15,16 @@ from px4fuse.request import ComparisonRequest, with_options
 
 @dataclass(frozen=True)
 class Job:
-    """Log to analyse and settings of the analysis.
+    """Log to analyse, and settings of the analysis.
 
-    ``address`` is an absolute path or URL. A log with a SHA-256 in ``finished_hashes`` is not
-    analysed.
+    Attributes
+    ----------
+    address : str
+        Absolute path or URL of the log.
+    max_bytes : int
+        Maximum size of the log.
+    finished_hashes : frozenset of str
+        SHA-256 of logs that were analysed in an earlier run and are not analysed again.
     """
 
     address: str
@@ -42,7 +48,7 @@ class Outcome:
 
 
 def analyse(job: Job) -> Outcome:
-    """Compare one log as ``px4fuse compare`` does."""
+    """Compare KF and EKF2 on one log, as ``px4fuse compare`` does."""
     sha256 = ""
     max_log_bytes.set(job.max_bytes)
     try:
@@ -60,13 +66,13 @@ def analyse(job: Job) -> Outcome:
 
 
 def failure_row(error: Px4FuseError, status: str, name: str = "") -> Row:
-    """Return the table row of a log that could not be compared, with reason and action."""
+    """Return the columns with status, reason and action for a log without results."""
     reason = with_options(error.reason).removeprefix(f"{name}: ")
     return {"status": status, "reason": reason, "remedy": with_options(error.remedy)}
 
 
 def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
-    # imported here, because only worker processes need these modules
+    # slow imports, which only the worker processes need
     from px4fuse.analysis import AidsOnlyAnalysis  # noqa: PLC0415
     from px4fuse.diagnose import diagnose_or_check_aids, read_flight  # noqa: PLC0415
     from px4fuse.results.build import log_record, results  # noqa: PLC0415
@@ -102,7 +108,7 @@ def _sha256(path: Path) -> str:
 
 
 def file_stem(name: str, sha256: str) -> str:
-    """Return a file name for the outputs of a log: its name and the start of its SHA-256.
+    """Return an output file name: name of the log and first digits of its SHA-256.
 
     >>> file_stem("Flug 3.ulg", "ab" * 32)
     'Flug_3-abababababab'

@@ -18,15 +18,23 @@ from px4fuse.errors import LogError, SettingsError
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
 
-#: Suffixes by which logs are found in a folder; a log given as a file may have any suffix
+#: Suffixes of logs in a folder; a single file may have any suffix
 LOG_SUFFIXES = (".ulg", ".tlog", ".bin", ".ulg.gz", ".ulg.zst")
 
 
 @dataclass(frozen=True, order=True)
 class LogAddress:
-    """Log that is not read yet: file name, path or URL in the table, and size if known.
+    """Location of a log.
 
-    ``address`` is the absolute path or URL with which a worker process opens the log.
+    Attributes
+    ----------
+    name : str
+        File name.
+    table_path : str
+        Path or URL in the table, as the user gave it.
+    address : str
+        Absolute path or URL.
+    size_bytes : int or None
     """
 
     name: str
@@ -36,7 +44,7 @@ class LogAddress:
 
 
 def find_logs(patterns: Iterable[str]) -> list[LogAddress]:
-    """Find the logs among files, folders, globs and URLs, each log once and sorted by name.
+    """Find logs in files, folders, globs and URLs; return each log once, sorted by name.
 
     Raises
     ------
@@ -58,7 +66,7 @@ def _logs_in(pattern: str) -> list[LogAddress]:
         if file_system.isdir(root_path):
             suffixes = LOG_SUFFIXES
             info_by_path = file_system.find(root_path, detail=True)
-        # devices and pipes are included: the worker process that opens them reports an error
+        # a device or pipe is not excluded here: the worker process reports it
         elif file_system.exists(root_path):
             is_file = file_system.isfile(root_path)
             info_by_path = {root_path: file_system.info(root_path) if is_file else {}}
@@ -69,7 +77,7 @@ def _logs_in(pattern: str) -> list[LogAddress]:
             for path, file_info in info_by_path.items()
             if path.lower().endswith(suffixes) and file_info.get("type", "file") == "file"
         }
-    # fsspec raises other exceptions than OSError for URLs, such as an unknown account
+    # fsspec raises exceptions of many types, for example for an unknown account
     except Exception as error:
         raise SettingsError(
             f"{pattern}: cannot be read ({one_line(str(error), 200) or type(error).__name__})."
@@ -92,7 +100,7 @@ def _logs_in(pattern: str) -> list[LogAddress]:
 
 @contextmanager
 def local_file(address: str) -> Iterator[Path]:
-    """Provide the path of a log on this computer; the log of a URL is downloaded temporarily.
+    """Provide the local path of a log; a log at a URL is downloaded to a temporary file.
 
     Raises
     ------
@@ -122,7 +130,7 @@ def _file_system(address: str) -> tuple[AbstractFileSystem, str]:
 
     try:
         file_system, path = url_to_fs(address)
-    except ImportError as error:  # __cause__ is the error that names the missing package
+    except ImportError as error:  # only __cause__ names the missing package
         package = getattr(error.__cause__, "name", None) or "fsspec[full]"
         raise SettingsError(
             f"{address}: this type of URL requires {package}.", f'Run pip install "{package}".'

@@ -1,37 +1,37 @@
 """Numbers that ``px4fuse diff`` compares, with 95 % intervals.
 
 ``measures.csv`` lists the path of each number in the results, such as
-``axes.*.rejected_fraction``: ``*`` stands for any axis, noise estimate or aiding source, FILTER for
-KF and EKF2. The unit "share" is a fraction from 0 to 1.
+``axes.*.rejected_fraction``. ``*`` stands for any key, and FILTER for KF and EKF2. The unit "share"
+is a fraction from 0 to 1.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from px4fuse.batch.rows import read_rows, value_at
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.results.contract import AidsResults, ComparisonResults, Interval
 
-FILTER_LABELS = {"kf": "KF", "ekf2": "EKF2"}
-# Rows of measures.csv; "interval" is the name of the field with the 95 % interval
+# Rows of measures.csv; "interval" is the field in the results that contains the 95 % interval
 MEASURES = [
     row
     | {"path": row["path"].replace("FILTER", name), "label": row["label"].replace("FILTER", label)}
     for row in read_rows("measures.csv")
-    for name, label in (FILTER_LABELS.items() if "FILTER" in row["path"] else [("", "")])
+    for name, label in (FILTER_NAMES.items() if "FILTER" in row["path"] else [("", "")])
 ]
-# Minimum relative difference of two numbers that px4fuse diff lists
+# Maximum relative difference of two numbers that count as equal
 RELATIVE_TOLERANCE = 0.01
-# Minimum difference of two numbers that px4fuse diff lists, in the unit of the numbers
+# Maximum difference of two numbers that count as equal, in the unit of the numbers
 ABSOLUTE_TOLERANCE = 0.001
 
 
 @dataclass(frozen=True)
 class ComparedNumber:
-    """Number in the results, with its 95 % interval if the results contain one."""
+    """Number in the results, with its 95 % interval if it is an estimate."""
 
     label: str
     unit: str
@@ -40,11 +40,11 @@ class ComparedNumber:
 
 
 def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, ComparedNumber]:
-    """Return the numbers to compare, by their path in the results."""
+    """Return the numbers that ``px4fuse diff`` compares, by path (``clock.offset_s``)."""
     axes = {} if isinstance(results, AidsResults) else results.axes
-    # EKF2 rejects north and east together, so px4fuse diff lists the rejections of one axis only
+    # EKF2 rejects north and east together: the rejected fraction of one axis is sufficient
     horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
-    # the numbers of these aiding sources are already in the results of each axis
+    # the results of each axis already contain the numbers of the position source
     position_source_aids: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
     if value_at(results, "source.kind") == "gnss":
         position_source_aids = ("gnss_pos",)
@@ -75,7 +75,7 @@ def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, Compa
 def _matching_paths(
     results: ComparisonResults | AidsResults, pattern: str
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield the paths that match a pattern, each with the names that replace ``*``."""
+    """Yield the paths that match a pattern, each with the keys that replace ``*``."""
     parent, has_wildcard, pattern_end = pattern.partition(".*")
     if not has_wildcard:
         yield pattern, ()

@@ -17,15 +17,15 @@ from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, Section
 from px4fuse.html.safe import clean_text, load_template, local_link
 from px4fuse.report.card_html import MARK_PATHS
-from px4fuse.report.card_text import MARKS, SEVERITY_SIGNS, band_limits
+from px4fuse.report.card_text import REFERENCE_MARKS, SEVERITY_SIGNS, format_consistent_ratios
 
-# σ ratios in the order of Card.verdicts
+# Filter and reference of each σ ratio (source: innovations; truth: errors), as in Card.verdicts
 SIGMA_RATIO_COLUMNS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
 SEVERITIES = list(SEVERITY_SIGNS)
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
-# Columns with one value per axis, which the page shows after a click on a row
+# Columns with one value per axis; the page shows them after a click on a row
 AXIS_COLUMNS = [name for name, path in RESULT_PATHS.items() if "{" in path]
-# Columns with one value per log, which the page shows after a click on a row
+# Columns with one value per log; the page shows them after a click on a row
 LOG_COLUMNS = [
     name
     for name, path in RESULT_PATHS.items()
@@ -48,8 +48,8 @@ LOG_COLUMNS = [
 ]
 # Name of the group of columns that the page shows on request
 EXTRA_COLUMN_GROUP = "numbers"
-# Label of each drop-down list that selects logs, by the start of its tags ("severity:error")
-SELECTION_LABELS = {
+# Labels of the drop-down lists that filter logs; each key is the prefix of tags ("status:done")
+DROP_DOWN_LABELS = {
     "severity": "Diagnosis",
     "status": "Status",
     "vehicle": "Vehicle",
@@ -57,23 +57,22 @@ SELECTION_LABELS = {
     "finding": "Finding",
     "remedy": "Action",
 }
-# Axes with the numbers in the row of a log: the first group that the log contains
+# Axes whose numbers the table shows: the first group that the log contains
 MAIN_AXES_BY_PREFERENCE = (("aisle",), ("north", "east"), ("down",))
 
-#: Table columns of one log, and the columns that :func:`_summarise_log` adds
+#: Values of one log by column name, with the columns that :func:`_summarise_log` adds
 LogSummary = Mapping[str, Any]
 
 
 def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
-    """Return the table of logs as an HTML page.
+    """Format the table of logs as an HTML page.
 
     Parameters
     ----------
     table : DataFrame
-        One row per log and axis, with the columns of :data:`px4fuse.batch.rows.COLUMN_TYPES`; a log
-        that could not be read has one row without axis.
+        One row per log and axis, with the columns of :data:`px4fuse.batch.rows.COLUMN_TYPES`. A log
+        that could not be read has one row.
     title : str
-        Title of the page.
     made_with : str
         Name and version of px4fuse.
     """
@@ -85,7 +84,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     return frame.page(
         title=title,
         subtitle=f"{count_noun(len(logs), 'log')}. Compared by {made_with}.",
-        html_above=load_template("batch/axis.html").render(limits=band_limits()),
+        html_above=load_template("batch/axis.html").render(limits=format_consistent_ratios()),
         row_nouns=("log", "logs"),
         columns=(
             Column("Sign", "rank"),
@@ -93,7 +92,9 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             Column("Diagnosis and first action", "full"),
             *(
                 Column(
-                    f"{filter_name.upper()} {MARKS[reference_name]}", "ratio", visible_from="tablet"
+                    f"{filter_name.upper()} {REFERENCE_MARKS[reference_name]}",
+                    "ratio",
+                    visible_from="tablet",
                 )
                 for filter_name, reference_name in (name.split("_") for name in SIGMA_RATIO_COLUMNS)
             ),
@@ -107,7 +108,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             Column("Findings", "rank", EXTRA_COLUMN_GROUP),
         ),
         rows=rows,
-        filters=_selections(logs),
+        filters=_drop_down_lists(logs),
         groups=[(EXTRA_COLUMN_GROUP, "more columns")],
         placeholder="search by name, vehicle, firmware or finding",
         full_table_note="The table fleet.csv contains all rows.",
@@ -118,11 +119,11 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
 def _log_cells(log: LogSummary) -> tuple[Cell, ...]:
     finding_titles = [finding_title(finding) for finding in log["findings"]]
     severity, action = log["severity"], log.get("action", "")
-    style = "command" if action.startswith(("px4fuse ", "param ")) else ""
+    css_style = "command" if action.startswith(("px4fuse ", "param ")) else ""
     return (
         Cell(SEVERITY_SIGNS[severity], SEVERITIES.index(severity), style_class=f"sign {severity}"),
         Cell(log["name"], log["name"], log.get("changed", "")),
-        Cell(log["headline"], log["headline"], action, style_class=style),
+        Cell(log["headline"], log["headline"], action, style_class=css_style),
         *(
             _ratio_cell(log.get(f"{name}_ratio"), name, verdict)
             for name, verdict in zip(SIGMA_RATIO_COLUMNS, log["verdict_texts"], strict=True)
@@ -150,7 +151,7 @@ def _ratio_cell(ratio: float | None, name: str, verdict: str) -> Cell:
 
 
 def sort_logs(logs: Iterable[LogSummary]) -> list[LogSummary]:
-    """Sort logs by severity, then |ln(actual σ / reported σ)|, then position RMSE."""
+    """Sort logs by severity, then |ln(σ ratio)|, then position RMSE, largest first."""
 
     def sort_key(log: LogSummary) -> tuple[float, ...]:
         ratios = [log[key] for name in SIGMA_RATIO_COLUMNS if log.get(key := f"{name}_ratio")]
@@ -195,7 +196,7 @@ def _side_sections(log: LogSummary) -> tuple[Section, ...]:
         frame.links_section(
             "Files", [(label, local_link(log.get(name, ""))) for label, name in FILE_LINKS]
         ),
-        frame.pairs_section(
+        frame.name_value_section(
             "Flight", [(name, _format_value(log.get(name, ""))) for name in LOG_COLUMNS]
         ),
     )
@@ -205,14 +206,14 @@ def _format_value(value: str | float) -> str:
     return value if isinstance(value, str) else format_number(float(value))
 
 
-def _selections(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return the label and the options of each drop-down list, most frequent option first."""
+def _drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Return label and options of the drop-down lists that filter logs, by frequency."""
     count_by_tag = Counter(tag for log in logs for tag in log["tags"])
     label_by_tag: Mapping[str, str] = {
         tag: label for log in logs for tag, label in log["tags"].items()
     }
     drop_down_lists = []
-    for kind, label in SELECTION_LABELS.items():
+    for kind, label in DROP_DOWN_LABELS.items():
         options = [
             (tag, f"{clean_text(label_by_tag[tag], 60)} ({count})")
             for tag, count in count_by_tag.most_common()
@@ -227,7 +228,7 @@ def _selections(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, s
 
 
 def logs_from_table(table: pd.DataFrame) -> list[LogSummary]:
-    """Combine the table rows of each log into one summary, in the order of the table."""
+    """Combine the table rows (one per axis) of each log into one summary."""
     rows_by_log: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in table.to_dict("records"):
         rows_by_log[row["log"]].append(
@@ -237,7 +238,7 @@ def logs_from_table(table: pd.DataFrame) -> list[LogSummary]:
 
 
 def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
-    """Combine the table rows of one log; values of the main axes replace those of other axes."""
+    """Combine the table rows (one per axis) of a log, with the values of its main axis."""
     axis_rows = [row for row in rows if "axis" in row]
     main_rows = next(
         (

@@ -1,4 +1,4 @@
-"""Rows of the table of ``px4fuse batch``: one row per axis of a log, from its results."""
+"""Rows of the table of ``px4fuse batch``: one row per log and axis."""
 
 import csv
 import shlex
@@ -20,7 +20,7 @@ from px4fuse.results.contract import ComparisonResults, Log
 
 DONE, NOT_COMPARED, FAILED = "done", "not compared", "failed"
 FINDING_SEPARATOR = ";"
-# Noise estimate of an axis: north and east have a common estimate
+# Key of the noise estimate of an axis: north and east have a common estimate
 _NOISE_ESTIMATE_BY_AXIS = {"north": "horizontal", "east": "horizontal"}
 
 
@@ -31,7 +31,7 @@ def read_rows(name: str) -> list[dict[str, str]]:
 
 
 _COLUMNS = read_rows("columns.csv")
-#: Path of each table column in the results; empty for a column made of several results
+#: Path of each table column in the results; "" for a column that is computed
 RESULT_PATHS = {row["column"]: row["path"] for row in _COLUMNS}
 #: Data type of each table column; missing numbers are NA, and missing texts are empty
 COLUMN_TYPES = {row["column"]: row["type"] for row in _COLUMNS}
@@ -51,7 +51,7 @@ def value_at(results: object, path: str) -> Any:
 
 
 def axis_rows(results: ComparisonResults) -> list[Row]:
-    """Return the table rows of one log, one per axis; columns without a value are absent."""
+    """Return the table rows of one log, one per axis, as dicts without missing values."""
     common_columns = log_columns(results.log) | finding_columns(results.findings, results.aids)
     common_columns |= card_columns(results.card)
     has_time_offset = bool(value_at(results, "clock.is_determinable"))
@@ -75,9 +75,9 @@ def axis_rows(results: ComparisonResults) -> list[Row]:
 
 
 def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
-    """Return the table columns with findings and with verdicts on EKF2's aiding sources.
+    """Return the values of the table columns about findings and about EKF2's aiding sources.
 
-    A finding that is the effect of another finding is omitted.
+    Findings that are an effect of another finding are omitted.
     """
     cause_findings = [finding for finding in findings if finding.caused_by is None]
     aid_verdicts = [
@@ -91,7 +91,7 @@ def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) 
 
 
 def card_columns(card: Card) -> Row:
-    """Return the table columns with the diagnosis card, the summary of a report."""
+    """Return the values of the table columns about the diagnosis of a flight."""
     rmse_m = card.effect.position_rmse_m.values() if card.effect else ()
     return {
         "severity": card.severity,
@@ -109,7 +109,7 @@ def card_columns(card: Card) -> Row:
 
 
 def first_action(card: Card) -> str:
-    """Return the commands of the first action; the text of an action without commands."""
+    """Return the commands of the first recommended action, or its text if it has no command."""
     if not card.causes:
         return ""
     first_cause = card.causes[0]
@@ -125,7 +125,7 @@ def first_action(card: Card) -> str:
 
 
 def with_log_path(row: Row, path: str) -> Row:
-    """Replace the file name in the command of a table row by the path of the log.
+    """Replace the file name of the log by its path, in the command of a table row.
 
     >>> row = {"name": "a.ulg", "action": "px4fuse compare a.ulg --sigma-a 0.4"}
     >>> with_log_path(row, "my logs/a.ulg")["action"]
@@ -154,7 +154,7 @@ def make_table(rows: Iterable[Row]) -> pd.DataFrame:
 
 
 def clean_row(row: Row) -> Row:
-    """Remove missing values from a row, and replace bytes of file names that are not UTF-8."""
+    """Remove missing values, and replace bytes of file names that are not UTF-8."""
     return {
         name: replace_unencodable(value) if isinstance(value, str) else value
         for name, value in row.items()

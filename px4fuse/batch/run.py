@@ -40,12 +40,12 @@ from px4fuse.request import ComparisonRequest, command_line
 OUTPUT_FILE_COLUMNS = ("results", "report")
 RESUME_NOTE = "Results of finished logs are kept. Run the same command to continue."
 
-Progress = Callable[[str, int, int], None]
+BatchProgress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
 class BatchResult:
-    """Table of a run of ``px4fuse batch``, with the severities of all findings.
+    """Result of ``px4fuse batch``.
 
     Attributes
     ----------
@@ -53,8 +53,9 @@ class BatchResult:
         One row per log and axis, with the columns of :data:`px4fuse.batch.rows.COLUMN_TYPES`.
     reused_count : int
         Number of logs whose results are from an earlier run.
+    severities : frozenset of str
+        Severities of all findings.
     written_paths : tuple of Path
-        Files of the table.
     """
 
     table: pd.DataFrame
@@ -64,7 +65,7 @@ class BatchResult:
 
 
 class CachedRows(msgspec.Struct, frozen=True):
-    """Table rows of a log in a cache file, for one version of px4fuse and one set of settings."""
+    """Table rows of a log in a cache file, valid for one version and set of settings of px4fuse."""
 
     sha256: str
     px4fuse: str
@@ -77,19 +78,19 @@ class CachedRows(msgspec.Struct, frozen=True):
         return f"rows/{self.sha256}.json"
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)  # filled during the run
 class _RunState:
-    """State of a run of ``px4fuse batch``: settings, and the logs that are finished so far."""
+    """Settings of ``px4fuse batch``, and logs that are finished."""
 
     output: Path
     version: str
     settings: str
-    # SHA-256 of logs that did not fail, by address
+    # SHA-256 of finished logs
     hash_by_address: dict[str, str] = field(default_factory=dict)
-    # first of identical logs, by SHA-256; the others get no table rows with results
+    # of several identical logs, only the first has results in the table
     first_log_by_hash: dict[str, LogAddress] = field(default_factory=dict)
     failed_row_by_address: dict[str, Row] = field(default_factory=dict)
-    # SHA-256 of logs with results from an earlier run
+    # SHA-256 of logs that were finished in an earlier run
     reused_hashes: set[str] = field(default_factory=set)
 
 
@@ -100,15 +101,15 @@ def run_batch(
     reports: bool = False,
     **settings: Any,
 ) -> pd.DataFrame:
-    """Compare many logs as :func:`px4fuse.compare` does, on this computer or a Dask cluster.
+    """Compare KF and EKF2 on many logs, on this computer or on a Dask cluster.
 
     Parameters
     ----------
     paths : str, Path or iterable of them
         Files, folders, globs and URLs.
     output : str or Path, optional
-        Folder for the table and the results of each log; a second run processes only new and
-        failed logs. By default no file is written.
+        Folder for the table and the results of each log. By default no file is written. A second
+        run with this folder processes only new and failed logs.
     reports : bool
         True to write a PDF report for each log.
     timeout_s : float
@@ -120,9 +121,9 @@ def run_batch(
     memory_gb : float
         Maximum address space for one log, only on Linux; libraries use 0.6 GB of it.
     progress : callable
-        Function that receives the activity and the numbers of finished and of all logs.
+        Called with the activity, the number of finished logs and the number of all logs.
     **settings
-        The arguments above, and the arguments of :func:`px4fuse.compare`, such as ``sigma_z_m``.
+        Arguments of :func:`px4fuse.compare`, such as ``sigma_z_m``, and the arguments above.
 
     Returns
     -------
@@ -156,13 +157,13 @@ def run(
     scheduler: str | None = None,
     workers: int | None = None,
     memory_gb: float = MAX_MEMORY_BYTES / 1e9,
-    progress: Progress = lambda *_: None,
+    progress: BatchProgress = lambda *_: None,
     **settings: Any,
 ) -> BatchResult:
-    """Compare many logs as :func:`run_batch` does, and write table and results to a folder.
+    """Compare KF and EKF2 on many logs, and write a table and the results to a folder.
 
-    If the run ends early (Ctrl-C, full disk, lost cluster), the folder contains the finished
-    results, and a table of them if the table can be written.
+    For the parameters see :func:`run_batch`. If the run ends early (Ctrl-C, full disk, lost
+    cluster), the results of finished logs are kept.
 
     Raises
     ------
@@ -226,7 +227,7 @@ def run(
 
 
 def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]]:
-    """Return the SHA-256 of finished logs by size, as only logs of equal size may be identical."""
+    """Return the SHA-256 of the logs that earlier runs finished, by size of the log in bytes."""
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
     for cached_rows in load_cached_rows(state):
         first_row = cached_rows.rows[0]
@@ -239,18 +240,18 @@ def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]
 
 
 def load_cached_rows(state: _RunState) -> Iterator[CachedRows]:
-    """Yield the cached table rows in the output folder for the version and settings of a run."""
+    """Yield the cached table rows that are valid for the version and the settings in ``state``."""
     for cache_file in sorted((state.output / "rows").glob("*.json")):
         try:
             cached_rows = msgspec.json.decode(cache_file.read_bytes(), type=CachedRows)
         except (OSError, msgspec.MsgspecError):
-            continue  # no cache file of this px4fuse version, so the log is compared again
+            continue  # an unreadable file is ignored, and the log is compared again
         if (cached_rows.px4fuse, cached_rows.settings) == (state.version, state.settings):
             yield cached_rows
 
 
 def _cache_outcome(state: _RunState, log: LogAddress, outcome: Outcome | JobFailure) -> None:
-    """Add the outcome of a log to the state of the run, and write its results to the folder."""
+    """Register a finished log in ``state``, and write its results."""
     if isinstance(outcome, JobFailure):
         remedy = "Increase --timeout or --memory, or run px4fuse compare on this log."
         outcome = Outcome("", (failure_row(LogError(outcome.reason.rstrip("."), remedy), FAILED),))
@@ -283,7 +284,7 @@ def _write_log(state: _RunState, log: LogAddress, outcome: Outcome) -> None:
 
 
 def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
-    """Write the table of the logs that are finished so far, as CSV, Parquet and web page."""
+    """Write the table of the finished logs as CSV, Parquet and web page."""
     severities: set[str] = set()
     rows_by_hash = {cached_rows.sha256: cached_rows.rows for cached_rows in load_cached_rows(state)}
 

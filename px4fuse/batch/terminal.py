@@ -24,20 +24,20 @@ NUMBER_TABLE_TITLES = ("number", "A", "95 %", "B", "95 %", "unit")
 
 
 def format_summary(batch_result: BatchResult) -> Page:
-    """Format a run of ``px4fuse batch``: reasons for missing results, and diagnoses of all logs."""
+    """Format a summary of all logs: diagnoses, σ ratios, and reasons for missing results."""
     page, logs = Page(), batch_result.table.drop_duplicates("log")
     uncompared_logs = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)[
         "log"
     ]
-    reasons = uncompared_logs.agg(["count", "first"]).reset_index()
-    sorted_reasons = reasons.sort_values("count", ascending=False, kind="stable")
+    reason_table = uncompared_logs.agg(["count", "first"]).reset_index()
+    sorted_reasons = reason_table.sort_values("count", ascending=False, kind="stable")
     for reason in sorted_reasons.head(MAX_LISTED_REASONS).to_dict("records"):
         template = "{first}: {status}: {reason}. {remedy}"
         if reason["count"] > 1:
             template = f"{{count}} logs without results, for example {template}"
         colour = ERROR_COLOUR if reason["status"] == FAILED else WARNING_COLOUR
         page.write(template.format_map(reason).rstrip(), colour=colour)
-    if (unlisted_count := len(reasons) - MAX_LISTED_REASONS) > 0:
+    if (unlisted_count := len(reason_table) - MAX_LISTED_REASONS) > 0:
         page.write(f"fleet.html lists {unlisted_count} more reasons for logs without a result.")
     sorted_logs = sort_logs(logs_from_table(batch_result.table))
     if sorted_logs:
@@ -51,10 +51,10 @@ def format_summary(batch_result: BatchResult) -> Page:
     if len(sorted_logs) > MAX_LISTED_LOGS:
         page.write(f"fleet.html lists {len(sorted_logs) - MAX_LISTED_LOGS} more logs.")
     counts = logs["status"].value_counts()
-    status_counts = ", ".join(f"{count} {status}" for status, count in counts.items())
+    counts_text = ", ".join(f"{count} {status}" for status, count in counts.items())
     retry_note = " Run the same command to repeat failed logs." if FAILED in counts else ""
     page.write(
-        f"{len(logs)} logs: {status_counts}; from an earlier run: {batch_result.reused_count}."
+        f"{len(logs)} logs: {counts_text}; from an earlier run: {batch_result.reused_count}."
         f"{retry_note}"
     )
     return page
@@ -72,12 +72,14 @@ def _log_row(log: LogSummary) -> tuple[Cell, ...]:
 
 
 def format_differences(results: ChangeResults) -> Page:
-    """Format the output of ``px4fuse diff``: differences, and verdicts that are worse in B."""
+    """Format the differences between two inputs A and B, for ``px4fuse diff``."""
     page = Page()
     for name, diff_input in (("A", results.a), ("B", results.b)):
         log_text = f" of {diff_input.log}" * (diff_input.given != diff_input.log)
-        versions = f"SHA-256 {diff_input.log_sha256[:12]}, px4fuse {diff_input.px4fuse}"
-        page.write_labelled(name, f"{diff_input.given} ({diff_input.kind}{log_text}), {versions}")
+        version_text = f"SHA-256 {diff_input.log_sha256[:12]}, px4fuse {diff_input.px4fuse}"
+        page.write_labelled(
+            name, f"{diff_input.given} ({diff_input.kind}{log_text}), {version_text}"
+        )
     settings = [
         (setting.name, _format_setting(setting.a), _format_setting(setting.b))
         for setting in results.settings

@@ -1,1 +1,1 @@
-"""Diagnosis card: short summary of the faults and filter verdicts of one flight."""
+"""Diagnosis card: one-page summary of the faults and the filter consistency of a flight."""

@@ -1,4 +1,4 @@
-"""Build the diagnosis card: short summary of the faults and filter verdicts of one flight."""
+"""Build the diagnosis card: one-page summary of the faults and filter consistency of a flight."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,6 @@ from px4fuse.card.causes import (
     rank_causes,
 )
 from px4fuse.card.model import (
-    FILTER_NAMES,
     MAX_CAUSES,
     MAX_HEADLINE_LENGTH,
     Action,
@@ -27,14 +26,19 @@ from px4fuse.card.model import (
     CardSeverity,
     Cause,
     Effect,
-    FilterName,
     Identity,
     Note,
     Verdict,
 )
 from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.flight_events import MIN_GAP_S
-from px4fuse.comparison.model import AxisComparison, ErrorsAgainstTruth, north_and_east
+from px4fuse.comparison.model import (
+    FILTER_NAMES,
+    AxisComparison,
+    ErrorsAgainstTruth,
+    FilterName,
+    north_and_east,
+)
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.comparison.trials import improvement
 from px4fuse.core.reading import display_name, file_size, read_head
@@ -54,29 +58,30 @@ from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.model import format_count, format_percent, group_by_root
+from px4fuse.findings.source_positions import has_little_motion
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Ekf2, LogInfo, Unavailable, source_name
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line, with_options
 
 MAX_ACTIONS = 3
-# Minimum fraction of positions rejected by EKF2 for a sentence on rejections in the summary
+# Minimum fraction of positions rejected by EKF2 for a sentence about rejections
 MIN_NAMED_REJECTED_FRACTION = 0.01
-# Aiding sources whose √S is usually too large with PX4's default noises: this is not a fault
+# Aiding sources whose √S is usually too large with PX4's default noises, which is not a fault
 USUALLY_UNDERCONFIDENT = frozenset({"baro_hgt", "mag", "gravity"})
-DRIFT_HIDES_ERROR = (
+DRIFT_EXPLANATION = (
     "A σ that is too large against the source is not a fault here: the source may drift, and "
     "innovations do not show drift. Do not reduce noise settings because of it."
 )
-HEAD_BYTE_COUNT = 4  # number of printed bytes from the start of an unreadable log
-ULOG_HEAD_BYTES = "55 4C 6F 67"  # first bytes of each ULog file (hexadecimal)
-HEADING_HIDES_ERROR = (
+PRINTED_BYTE_COUNT = 4  # number of bytes printed from the start of an unreadable log
+ULOG_FIRST_BYTES = "55 4C 6F 67"  # first bytes of each ULog file (hexadecimal)
+HEADING_ERROR_EXPLANATION = (
     "KF and EKF2 rotate the measured acceleration by the wrong heading. Each measurement corrects "
     "the position, so innovations show little of the position error."
 )
 UNEXPLAINED_DIFFERENCE = (
     "The verdicts against source and ground truth differ, and no tested change explains it."
 )
-# Explanation of different verdicts against source and ground truth, by ids of findings
+# Reasons why innovations are consistent but errors against ground truth are not, by finding ids
 SENTENCES_BY_SOURCE_FAULTS = (
     (
         {"source_axes_wrong", "source_orientation_wrong", "source_unit_wrong"},
@@ -98,16 +103,21 @@ SENTENCES_BY_SOURCE_FAULTS = (
 def build_card(
     analysis: Analysis, request: ComparisonRequest, student: tuple[str, str] = ("", "")
 ) -> Card:
-    """Build the diagnosis card of a comparison.
+    """Build the diagnosis card of a flight.
 
-    The recommended commands contain the options of ``request``. ``student``: name and id.
+    Parameters
+    ----------
+    request : ComparisonRequest
+        Options that recommended commands repeat.
+    student : (str, str)
+        Name and id.
     """
     source, segment = analysis.source, analysis.segment
     identity = _make_identity(
         analysis.flight.log,
         request,
         student,
-        source=f"{source_name(source)} {source.rate_hz:.1f} Hz",
+        source=f"{source_name(source)} {source.compute_rate_hz():.1f} Hz",
         settings=_settings_text(analysis, request),
         changed=_changed_setting_texts(request),
         parameters=_changed_parameter_texts(analysis),
@@ -123,7 +133,7 @@ def build_card(
         make_cause(analysis, ranked_finding, sigma_verdicts, request)
         for ranked_finding in ranked_causes[:MAX_CAUSES]
     )
-    sigma_verdicts, reconcile = _reconcile(analysis, sigma_verdicts, causes)
+    sigma_verdicts, explanation = _explain_verdict_differences(analysis, sigma_verdicts, causes)
     effect = _make_effect(analysis)
     has_fault = any(verdict.is_fault for verdict in sigma_verdicts)
     severity: CardSeverity = "note" if has_fault else "clean"
@@ -135,7 +145,7 @@ def build_card(
         effect_text=_effect_text(analysis, effect, sigma_verdicts),
         do_this=_action_sentences(causes),
         verdicts=sigma_verdicts,
-        reconcile=reconcile,
+        reconcile=explanation,
         difference=_difference_text(effect, ranked_causes),
         causes=causes,
         more_causes=max(len(ranked_causes) - MAX_CAUSES, 0),
@@ -147,7 +157,7 @@ def build_card(
 def build_aids_card(
     analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str]
 ) -> Card:
-    """Build the diagnosis card of a flight without a position source, on EKF2's aiding sources."""
+    """Build the diagnosis card of a flight without positions, about the aiding sources of EKF2."""
     root_findings = [group[0] for group in group_by_root(analysis.findings)]
     faults = [finding for finding in root_findings if finding.severity != "note"]
     causes = tuple(make_plain_cause(finding) for finding in faults[:MAX_CAUSES])
@@ -176,13 +186,13 @@ def build_aids_card(
 
 
 def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
-    """Build the diagnosis card of a log that cannot be analysed: fault and fix."""
+    """Build the diagnosis card of a log that cannot be analysed, with reason and action."""
     facts = {}
-    with suppress(LogError):  # the headline states the reason if the file cannot be read
-        first_bytes = read_head(path, HEAD_BYTE_COUNT, LogError).hex(" ").upper()
+    with suppress(LogError):  # the headline already contains the reason of an unreadable file
+        first_bytes = read_head(path, PRINTED_BYTE_COUNT, LogError).hex(" ").upper()
         size_bytes = file_size(path, LogError)
         facts["read"] = (
-            f"{size_bytes:,} bytes; first bytes {first_bytes} (of a ULog: {ULOG_HEAD_BYTES})"
+            f"{size_bytes:,} bytes; first bytes {first_bytes} (of a ULog: {ULOG_FIRST_BYTES})"
         )
     if error.remedy:
         facts["fix"] = with_options(with_log_name(error.remedy, str(path)))
@@ -239,7 +249,7 @@ def _make_effect(analysis: Analysis) -> Effect:
 
 
 def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
-    """Describe the direction of an axis: "along the main axis, 30° from north"."""
+    """Describe the direction of an axis, for example "along the main axis, 30° from north"."""
     direction, heading, source = f"along {result.axis.label}", result.heading_deg, analysis.source
     if result.axis.name != AISLE or heading is None:
         return direction
@@ -256,17 +266,17 @@ def _position_rmse_m(result: AxisComparison) -> dict[FilterName, float]:
 
 
 def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
-    errors_m = [_position_rmse_m(result) for result in north_and_east(analysis)]
+    rmse_by_axis_m = [_position_rmse_m(result) for result in north_and_east(analysis)]
     return {
-        name: math.hypot(*(error_m[name] for error_m in errors_m))
+        name: math.hypot(*(rmse_m[name] for rmse_m in rmse_by_axis_m))
         for name in FILTER_NAMES
-        if len(errors_m) == 2 and all(name in error_m for error_m in errors_m)
+        if len(rmse_by_axis_m) == 2 and all(name in rmse_m for rmse_m in rmse_by_axis_m)
     }
 
 
 def _effect_text(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Verdict]) -> str:
     sentences, segment, flight = [], analysis.segment, analysis.segment.flight
-    if analysis.flight.airborne == ():
+    if analysis.flight.airborne == () and has_little_motion(analysis):
         return "The vehicle stayed on the ground, so the errors of KF and EKF2 are not evaluated."
     if is_height_only(analysis.source):
         return "The source measures only the height, so horizontal errors are not evaluated."
@@ -276,8 +286,15 @@ def _effect_text(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Ve
             span_text = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s"
         if effect.horizontal_rmse_m:
             horizontal_text = f" (horizontal: {_lengths_by_filter(effect.horizontal_rmse_m)})"
+        is_track_direction = (
+            analysis.main.axis.name == AISLE
+            and analysis.request is not None
+            and analysis.request.heading_deg is None
+        )
+        axis_text = " (direction of most motion)" if is_track_direction else ""
         sentences.append(
-            f"Position RMSE against ground truth along {analysis.main.axis.label}{span_text}: "
+            f"Position RMSE against ground truth along {analysis.main.axis.label}{axis_text}"
+            f"{span_text}: "
             f"{_lengths_by_filter(effect.position_rmse_m)}{horizontal_text}."
         )
         sentences += [
@@ -306,7 +323,7 @@ def _effect_text(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Ve
 
 
 def _worst_axis_sentences(analysis: Analysis) -> list[str]:
-    results = (analysis.main, *analysis.secondary_axes)
+    results = (analysis.main, *analysis.select_secondary_axes())
     nees_with_results = [
         (truth.nees_position_mean, result, truth.position_rmse_m)
         for result in results
@@ -352,20 +369,20 @@ def _action_sentences(causes: Sequence[Cause]) -> tuple[str, ...]:
             for action in cause.actions
             if action.commands or not action.sentence.startswith("no ")
         ]
-        label = f"({number}) " if len(causes) > 1 else ""
+        label = f"Cause {number}. " if len(causes) > 1 else ""
         numbered_sentences += [f"{label}{sentence}." for sentence in sentences]
     return tuple(dict.fromkeys(numbered_sentences))[:MAX_ACTIONS]
 
 
 def _action_sentence(action: Action) -> str:
     if action.where == "console":
-        # the command already contains the name of the parameter
+        # do not repeat the parameter name, which is in the command
         value_change = action.sentence.partition(" ")[2]
         change_text = value_change if len(action.commands) == 1 else action.sentence
         return f"EKF2: {', '.join(action.commands)} ({change_text})"
     if action.where == "shell":
-        options = action.commands[0].partition(" --")[2]
-        return f"KF: {action.sentence or 'run again with'} --{options}"
+        options_text = action.commands[0].partition(" --")[2]
+        return f"KF: {action.sentence or 'run again with'} --{options_text}"
     text = lower_first(action.sentence.rstrip("."))
     return f"{capitalise_first(action.target)}: {text}"
 
@@ -373,8 +390,8 @@ def _action_sentence(action: Action) -> str:
 def _mark_explained(
     sigma_verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Set ``is_explained`` for filters that are inconsistent, but need no change of settings."""
-    unchanged_filters = {
+    """Mark inconsistent filters whose settings need no change (``is_explained``)."""
+    filters_without_change = {
         name
         for cause in causes
         for action in cause.actions
@@ -390,9 +407,9 @@ def _mark_explained(
         replace(verdict, is_explained=True)
         if verdict.is_fault
         and (
-            FILTER_NAMES[verdict.filter] in unchanged_filters
+            FILTER_NAMES[verdict.filter] in filters_without_change
             or verdict.filter in filters_consistent_with_truth
-            # innovations do not show drift, so a small NIS does not prove a too large σ
+            # a small NIS does not prove a too large σ: innovations do not show drift
             or (may_drift and (verdict.against, verdict.word) == ("source", "underconfident"))
         )
         else verdict
@@ -400,10 +417,10 @@ def _mark_explained(
     )
 
 
-def _reconcile(
+def _explain_verdict_differences(
     analysis: Analysis, sigma_verdicts: tuple[Verdict, ...], causes: Sequence[Cause]
 ) -> tuple[tuple[Verdict, ...], str]:
-    """Explain why verdicts against source and ground truth differ."""
+    """Explain why the innovations of a filter are consistent and its errors not, or vice versa."""
     may_drift, ekf2_errors = analysis.source.origin.may_drift, analysis.main.filters["ekf2"].truth
     sigma_verdicts = _mark_explained(sigma_verdicts, causes, may_drift=may_drift)
     *other_verdicts, ekf2_verdict = sigma_verdicts
@@ -423,7 +440,7 @@ def _reconcile(
     if explanation == UNEXPLAINED_DIFFERENCE:
         sigma_verdicts = tuple(replace(verdict, is_explained=False) for verdict in sigma_verdicts)
     elif not explanation and may_drift and any(verdict.is_explained for verdict in sigma_verdicts):
-        explanation = DRIFT_HIDES_ERROR
+        explanation = DRIFT_EXPLANATION
     return sigma_verdicts, explanation
 
 
@@ -477,14 +494,14 @@ def _explain_differing_verdicts(
             "errors; only ground truth does."
         )
     has_heading_error = "ekf2_heading_error" in finding_ids
-    explanation = HEADING_HIDES_ERROR if has_heading_error else UNEXPLAINED_DIFFERENCE
+    explanation = HEADING_ERROR_EXPLANATION if has_heading_error else UNEXPLAINED_DIFFERENCE
     rejects_outliers = "source_outliers" in finding_ids and "ekf2" in differing_filters
     return _gate_sentence(analysis) if rejects_outliers else explanation
 
 
 def _gate_sentence(analysis: Analysis) -> str:
     innovations = analysis.main.ekf2_innovations
-    assert not isinstance(innovations, Unavailable)  # the caller has a verdict from innovations
+    assert not isinstance(innovations, Unavailable)  # the caller has checked this
     is_rejected = innovations["rejected"] > 0.0
     accepted = innovations[~is_rejected]
     nis = float((accepted["innovation_m"] ** 2 / accepted["innovation_variance_m2"]).mean())

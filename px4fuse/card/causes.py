@@ -1,4 +1,4 @@
-"""Order and actions of the causes of a fault, and the re-runs of KF and EKF2 that test them."""
+"""Rank the possible causes of a fault by re-runs of KF and EKF2, and choose actions."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import FILTER_NAMES, Action, Cause, FilterName, Rerun, Target, Verdict
+from px4fuse.card.model import Action, Cause, Rerun, Target, Verdict
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
+from px4fuse.comparison.model import FILTER_NAMES, FilterName
+from px4fuse.comparison.remedy import different_settings
 from px4fuse.comparison.trials import (
     CLOCK_OFFSET,
     OUTLIERS,
@@ -34,14 +36,14 @@ from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
 SETTING_CHANGE_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
-# Kinds of changes that move KF and EKF2 together with the position source, so that only ground
-# truth shows the effect
+# Changes that shift the positions, and so the estimates of KF and EKF2: only ground truth shows
+# their effect
 TRUTH_ONLY_CHANGE_KINDS = frozenset({"time offset", "delay", "rotation"})
-# Endings of the names of PX4 parameters that are read only at boot (reboot_required)
+# Name endings of PX4 parameters that require a reboot (reboot_required)
 REBOOT_PARAMETER_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
 # Minimum fraction of rejected positions that the table of re-runs shows
 MIN_SHOWN_REJECTED_FRACTION = 0.005
-TARGETS_BY_GROUP: Mapping[str, Target] = {
+TARGET_BY_GROUP: Mapping[str, Target] = {
     "position source": "sender",
     "time": "sender",
     "IMU": "flight",
@@ -50,20 +52,21 @@ TARGETS_BY_GROUP: Mapping[str, Target] = {
     "loops": "source",
     "logging": "logging",
 }
-# Devices to be changed that differ from TARGETS_BY_GROUP, by id of the finding
-TARGETS_BY_ID: Mapping[str, Target] = {
+# Devices to be changed, by finding id; exceptions from TARGET_BY_GROUP
+TARGET_BY_ID: Mapping[str, Target] = {
     "source_drift": "source",
     "source_lever_arm": "EKF2",
-    "source_height_only": "EKF2",
+    "source_coordinate_constant": "EKF2",
+    "source_height_constant": "EKF2",
     "ekf2_not_fusing": "sender",
 }
 
 
 class RankedCause(NamedTuple):
-    """Finding with its re-runs, and with the keys that sort the causes on the card.
+    """Possible cause of a fault, with the re-runs that test it and its rank.
 
-    ``tier``: priority, 0 first. ``reduction``: approach of the σ ratio to 1 by the re-runs (change
-    of |ln σ ratio|), the largest first in each tier.
+    ``tier`` is the priority (0 first). Within a tier, the cause with the largest ``reduction`` of
+    |ln σ ratio| by its re-runs is first.
     """
 
     finding: Finding
@@ -73,12 +76,12 @@ class RankedCause(NamedTuple):
 
 
 def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[RankedCause]:
-    """Sort the errors and warnings that are not effects of other findings by importance."""
+    """Sort errors and warnings by importance; a cause that no re-run confirms is omitted."""
     ranked_causes = []
     for finding in root_findings:
         if finding.severity == "note":
             continue
-        trials = confirming_trials(analysis.main_trials, finding)
+        trials = confirming_trials(analysis.select_main_trials(), finding)
         if CATALOGUE[finding.id].verdict == "repeated":
             trials = tuple(filter(is_useful, trials))
         elif trials and not any(
@@ -97,7 +100,7 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
         fault_causes or ranked_causes,
         key=lambda cause: (
             cause.tier,
-            # settings after faults of the source, because a changed setting may only hide a fault
+            # faults of the source before settings: a changed setting may only hide a fault
             cause.tier in (1, 2, 3) and _is_setting_fault(cause.finding),
             -cause.reduction,
         ),
@@ -122,19 +125,19 @@ def _cause_tier(finding: Finding, trials: Iterable[Trial]) -> int:
 
 
 def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
-    """Return the re-runs that test a finding, for each filter and kind of change the best one."""
-    kinds = CATALOGUE[finding.id].reruns
-    kinds |= {"defaults"} if "noises" in kinds else set()
+    """Return the re-runs of KF and EKF2 that test a finding, the best for each type of change."""
+    change_kinds = CATALOGUE[finding.id].reruns
+    change_kinds |= {"defaults"} if "noises" in change_kinds else set()
     best_trials: dict[tuple[FilterName, str], Trial] = {}
     for trial in trials:
-        if len(trial.kinds) == 1 and trial.kinds[0] in kinds:
+        if len(trial.kinds) == 1 and trial.kinds[0] in change_kinds:
             key = trial.filter, trial.kinds[0]
             best_trials[key] = min(trial, best_trials.get(key, trial), key=preference_key)
     return tuple(best_trials.values())
 
 
 def can_show_effect(trial: Trial) -> bool:
-    """Return False if only ground truth could show the effect of a re-run, and the log has none."""
+    """Return False if only ground truth shows the effect of a re-run, and none is logged."""
     has_truth = trial.before.position_rmse_m is not None
     return has_truth or TRUTH_ONLY_CHANGE_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
 
@@ -149,7 +152,7 @@ def make_cause(
     sigma_verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> Cause:
-    """Describe a fault on the card, with actions for position source, KF and EKF2."""
+    """Describe a fault, with actions for position source, KF and EKF2."""
     finding, trials = ranked_cause.finding, ranked_cause.trials
     useful_trials = [trial for trial in trials if is_useful(trial)]
     alternatives, actions = _make_actions(
@@ -165,7 +168,7 @@ def make_cause(
 
 
 def make_plain_cause(finding: Finding) -> Cause:
-    """Describe a fault for which there are no re-runs."""
+    """Describe a fault without re-runs."""
     return Cause(
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",
@@ -183,18 +186,20 @@ def _make_actions(
     sigma_verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
-    """Return (groups of alternative actions, actions that are always necessary)."""
+    """Return (alternatives, actions): groups of which one is sufficient, and necessary actions."""
     finding = ranked_cause.finding
-    trials = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
+    trial_by_change = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
     sender_actions: list[Action] = []
     if finding.remedy:
         remedy = with_log_name(finding.remedy, request.log)
         sender_actions.append(Action(_target_of(finding, analysis.source), remedy))
-    delay_trial = trials.get(("ekf2", "delay"))
-    offset_trial = trials.get(("ekf2", "time offset")) or trials.get(("kf", "time offset"))
+    delay_trial = trial_by_change.get(("ekf2", "delay"))
+    offset_trial = trial_by_change.get(("ekf2", "time offset")) or trial_by_change.get(
+        ("kf", "time offset")
+    )
     delay_actions = []
     if delay_trial:
-        # parameters that also the correction at the sender needs are a separate action
+        # parameters that both corrections need become a separate action
         common_names = offset_trial.change.keys() if offset_trial else ()
         delay_change = {
             name: value for name, value in delay_trial.change.items() if name not in common_names
@@ -215,22 +220,22 @@ def _make_actions(
         not offset_trial and not delay_trial and _is_setting_fault(finding) and ranked_cause.trials
     ):
         actions = []
-    for (filter_name, kind), trial in trials.items():
+    for (filter_name, kind), trial in trial_by_change.items():
         if (
             filter_name == "kf"
             and kind != "defaults"
             and trial.change.keys() <= COMPARISON_OPTIONS.keys()
         ):
-            default_trial = trials.get(("kf", "defaults")) if kind == "noises" else None
+            default_trial = trial_by_change.get(("kf", "defaults")) if kind == "noises" else None
             default_settings = default_trial.change if default_trial else {}
             actions.append(make_rerun_action(request, trial.change, default_settings))
         elif filter_name == "ekf2" and kind != "delay":
-            parameters = {name: value for name, value in trial.change.items() if name in PARAMETERS}
-            actions += [make_parameter_action(analysis, parameters)] if parameters else []
-    # KF actions are last, because the vehicle must be corrected first
+            changes = {name: value for name, value in trial.change.items() if name in PARAMETERS}
+            actions += [make_parameter_action(analysis, changes)] if changes else []
+    # actions on KF are last: first correct the vehicle
     actions.sort(key=lambda action: action.target == "KF")
     targets = {action.target for group in (actions, *alternatives) for action in group}
-    reason_by_filter = {
+    reason_by_filter: dict[Target, str] = {
         name: reason
         for filter_name, name in FILTER_NAMES.items()
         if name not in targets
@@ -245,16 +250,16 @@ def _make_actions(
 def _no_change_reason(
     finding: Finding, filter_name: FilterName, sigma_verdicts: Sequence[Verdict]
 ) -> str:
-    word_by_reference = {
+    verdict_by_reference = {
         verdict.against: verdict.word
         for verdict in sigma_verdicts
         if verdict.filter == filter_name and verdict.ratio is not None
     }
-    if not word_by_reference:
+    if not verdict_by_reference:
         return ""
-    if set(word_by_reference.values()) == {"consistent"}:
-        is_hidden = CATALOGUE[finding.id].reruns & TRUTH_ONLY_CHANGE_KINDS
-        if is_hidden and "truth" not in word_by_reference:
+    if set(verdict_by_reference.values()) == {"consistent"}:
+        needs_ground_truth = CATALOGUE[finding.id].reruns & TRUTH_ONLY_CHANGE_KINDS
+        if needs_ground_truth and "truth" not in verdict_by_reference:
             return "no change: only ground truth shows this fault, and the log has none"
         return "no change: the reported σ is consistent"
     if finding.id == "source_outliers":
@@ -262,14 +267,14 @@ def _no_change_reason(
             return (
                 "no option of KF rejects outliers, and a larger SIGMA_Z (--sigma-z) only hides them"
             )
-        if word_by_reference.get("truth", "consistent") == "consistent":
+        if verdict_by_reference.get("truth", "consistent") == "consistent":
             return "no change: EKF2's gate rejects outliers, and the reported σ is consistent"
-    removed = "drift of the source" if finding.id == "source_drift" else "this fault"
-    return f"no setting removes {removed}"
+    fault_text = "drift of the source" if finding.id == "source_drift" else "this fault"
+    return f"no setting removes {fault_text}"
 
 
 def _target_of(finding: Finding, source: PositionTrack | None = None) -> Target:
-    target = TARGETS_BY_ID.get(finding.id) or TARGETS_BY_GROUP[CATALOGUE[finding.id].group]
+    target = TARGET_BY_ID.get(finding.id) or TARGET_BY_GROUP[CATALOGUE[finding.id].group]
     is_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_receiver else target
 
@@ -279,14 +284,18 @@ def make_rerun_action(
 ) -> Action:
     """Return the command that runs KF with changed settings.
 
-    ``default_settings`` are defaults with which KF is consistent as well, or empty.
+    ``default_settings`` are default noises with which KF is also consistent, or empty.
     """
     command = command_line(structs.replace(request, **change))
-    options = " and ".join(
+    default_options_text = " and ".join(
         f"{COMPARISON_OPTIONS[name]} (default {value:g})"
         for name, value in default_settings.items()
     )
-    sentence = f"run again without {options}, or with the estimated noises" if options else ""
+    sentence = (
+        f"run again without {default_options_text}, or with the estimated noises"
+        if default_options_text
+        else ""
+    )
     return Action("KF", sentence, (command,), "shell")
 
 
@@ -294,6 +303,7 @@ def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Ac
     model = analysis.ekf2_model
     flown_settings = {} if isinstance(model, Unavailable) else model.inputs.settings
     change_texts, commands = [], []
+    change = different_settings(change, flown_settings)
     for name, value in change.items():
         change_text = f"{name} {flown_settings.get(name, math.nan):g} → {value:g}"
         change_texts.append(f"{change_text} {PARAMETERS[name].printed_unit}".rstrip())
@@ -326,13 +336,13 @@ def _trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
     if OUTLIERS in trial.change:
         return f"{label} without {trial.change[OUTLIERS]:.0f} outliers"
     if trial.filter == "kf":
-        options = " ".join(
+        options_text = " ".join(
             f"{COMPARISON_OPTIONS[name]} {value:g}"
             for name, value in trial.change.items()
             if name in (SIGMA_A, SIGMA_Z)
         )
         prefix = "default " if kind == "defaults" else ""
-        return f"{label}, {prefix}{options}" if options else label
+        return f"{label}, {prefix}{options_text}" if options_text else label
     if sum(other_trial.filter == "ekf2" for other_trial in trials) < 2:
         return label
     return f"{label}, {'sender' if kind == 'time offset' else 'parameters'}"

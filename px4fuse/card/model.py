@@ -1,4 +1,4 @@
-"""Records of the diagnosis card (headline, verdicts, causes, actions), part of the JSON results."""
+"""Data of the diagnosis card, the one-page summary of a flight, as in the JSON results."""
 
 import math
 from collections.abc import Mapping
@@ -6,17 +6,16 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from px4fuse.comparison.model import FilterName
 from px4fuse.comparison.trials import Improvement
 from px4fuse.core.record import Count, NotNegative, Positive, Record, Share, Span
 from px4fuse.filter.consistency import Reference
 
-FilterName = Literal["kf", "ekf2"]
 CardSeverity = Literal["clean", "note", "warning", "error", "refused"]
 VerdictWord = Literal["consistent", "overconfident", "underconfident", "not evaluated"]
 Target = Literal["sender", "receiver", "source", "logging", "flight", "KF", "EKF2", "KF, EKF2"]
-FILTER_NAMES: Mapping[FilterName, Target] = {"kf": "KF", "ekf2": "EKF2"}
 
-# Limits of the logarithmic axis of σ ratios
+# Limits of the logarithmic axis in plots of σ ratios
 RATIO_AXIS_ENDS = (0.1, 10.0)
 RATIO_AXIS_TICKS = {0.1: "1/10", 0.2: "1/5", 0.5: "1/2", 1.0: "1", 2.0: "2", 5.0: "5", 10.0: "10"}
 # Maximum number of causes on a diagnosis card
@@ -27,7 +26,7 @@ MAX_HEADLINE_LENGTH = 84
 
 
 def axis_fraction(ratio: float) -> float:
-    """Map a σ ratio of 0.1 to 10 to a fraction of 0 to 1 of the logarithmic axis.
+    """Map a σ ratio from 0.1 to 10 to a position from 0 to 1 on a logarithmic axis.
 
     >>> axis_fraction(0.1), axis_fraction(1.0), axis_fraction(10.0)
     (0.0, 0.5, 1.0)
@@ -37,18 +36,18 @@ def axis_fraction(ratio: float) -> float:
 
 
 class Verdict(Record, kw_only=True):
-    """Verdict on the reported σ of KF or EKF2, from its innovations or its errors.
+    """Consistency of KF or EKF2: ratio of actual to reported σ.
 
     Attributes
     ----------
     against : {"source", "truth"}
-        "source": innovations; "truth": errors against ground truth.
+        "source": from innovations; "truth": from errors against ground truth.
     ratio : float or None
         √(mean NIS) or √(mean NEES); above 1 the reported σ is too small.
     interval : (float, float) or None
         95 % interval of the ratio.
     reason : str
-        Reason why the verdict is "not evaluated".
+        Reason if ``word`` is "not evaluated".
     is_explained : bool
         True if the filter is inconsistent, but its settings need no change.
     """
@@ -68,16 +67,22 @@ class Verdict(Record, kw_only=True):
 
 
 class Effect(Record, kw_only=True):
-    """Effect of faults: position errors of KF and EKF2, rejections and resets of EKF2.
+    """Errors in a flight: position RMSE of KF and EKF2, rejections and resets of EKF2.
 
     Attributes
     ----------
     axis : str
         Evaluated axis, for example "along the main axis, 30° from north".
     position_rmse_m : mapping
-        Position RMSE against ground truth along this axis, of "kf" and "ekf2".
+        Position RMSE of "kf" and "ekf2" against ground truth along ``axis``.
+    horizontal_rmse_m : mapping
+        Horizontal position RMSE of "kf" and "ekf2" against ground truth.
     difference_rms_m : float or None
-        Position difference KF - EKF2 along this axis.
+        RMS of the position difference KF - EKF2 along ``axis``.
+    rejected_fraction : float or None
+        Fraction of the positions that EKF2 rejected.
+    horizontal_resets : int or None
+        Number of resets of EKF2's horizontal position.
     """
 
     axis: str
@@ -89,7 +94,7 @@ class Effect(Record, kw_only=True):
 
 
 class Action(Record):
-    """Action against a fault: commands to paste, or a sentence.
+    """Recommended action against a fault: commands to paste, or a sentence.
 
     Attributes
     ----------
@@ -113,11 +118,14 @@ class Rerun(Record, kw_only=True):
     Attributes
     ----------
     label : str
-        Filter and change: "KF without the 26 outliers", "EKF2 (replay)".
+        Filter and change, for example "KF without 26 outliers".
     is_prediction : bool
         True for a replay of EKF2, False for a run of KF.
     from_s : float or None
         Start of the replay (s).
+    position_rmse_m, source_ratio, truth_ratio, rejected_fraction : (float, float) or None
+        Before and after the change: position RMSE, σ ratio from innovations, σ ratio from errors,
+        and fraction of rejected positions.
     """
 
     label: str
@@ -131,7 +139,7 @@ class Rerun(Record, kw_only=True):
 
 
 class Cause(Record, kw_only=True):
-    """Fault of the flight with its effect, actions and re-runs.
+    """Fault in a flight, with its effect, recommended actions and re-runs.
 
     Attributes
     ----------
@@ -140,11 +148,13 @@ class Cause(Record, kw_only=True):
     spans_s : tuple of (float, float)
         Times of the fault (s); empty for the whole flight.
     alternatives : tuple of tuple of Action
-        Groups of actions, of which the user selects one group.
+        Groups of actions; the user chooses one group.
     actions : tuple of Action
-        Actions that are always necessary.
+        Necessary actions.
+    reruns : tuple of Rerun
+        Runs of KF and replays of EKF2 without the fault.
     after : str
-        Sentence below the table of re-runs.
+        Sentence about the re-runs.
     """
 
     id: Annotated[str, Meta(pattern="^[a-z0-9_]+$")]
@@ -159,7 +169,7 @@ class Cause(Record, kw_only=True):
 
 
 class Note(Record):
-    """Finding of severity "note"."""
+    """Remark about the flight that is neither an error nor a warning."""
 
     id: str
     text: str
@@ -167,7 +177,7 @@ class Note(Record):
 
 
 class Identity(Record, kw_only=True):
-    """Flight, software versions and settings of a diagnosis card.
+    """Log, software versions and settings of an analysis.
 
     Attributes
     ----------
@@ -199,10 +209,10 @@ class Identity(Record, kw_only=True):
 
 
 class AidRow(Record, kw_only=True):
-    """RMS of innovation ÷ √S along one axis of an EKF2 aiding source.
+    """Consistency of one component of an EKF2 aiding source: RMS of innovation ÷ √S.
 
-    ``is_usual`` is True if a small ratio is no fault: PX4's default noise of this aiding source is
-    larger than the noise of usual sensors.
+    ``is_usual`` is True if a small ratio is not a fault, because PX4's default noise is larger than
+    the noise of usual sensors.
     """
 
     label: str
@@ -212,20 +222,23 @@ class AidRow(Record, kw_only=True):
 
 
 class Card(Record, kw_only=True):
-    """Diagnosis of a flight: headline, effect, actions, verdicts and causes.
+    """Diagnosis of a flight: headline, errors, recommended actions, filter consistency and causes.
 
     Attributes
     ----------
     do_this : tuple of str
-        The most important actions.
+        Most important actions.
+    verdicts : tuple of Verdict
+        Consistency of KF and EKF2.
     reconcile : str
-        Explanation if two verdicts on one filter differ.
+        Explanation of a filter that is consistent with the position source but not with ground
+        truth, or vice versa.
     difference : str
-        Position difference KF - EKF2, and its value in a re-run with the first cause corrected.
+        Position difference KF - EKF2, before and after the first cause is corrected.
     more_causes : int
-        Number of causes beyond :data:`MAX_CAUSES`, which ``causes`` does not contain.
+        Number of causes that are not in ``causes``, which contains at most :data:`MAX_CAUSES`.
     facts : mapping from label to str
-        Texts without own field, for example "fix" for a log that cannot be read.
+        Further texts, for example the label "fix" for a log that cannot be read.
     """
 
     severity: CardSeverity

@@ -1,4 +1,4 @@
-"""Verdicts on the reported σ of KF and EKF2.
+"""Consistency of the σ that KF and EKF2 report.
 
 The ratio of actual to reported σ is √(mean NIS) against the position source, and √(mean NEES)
 against ground truth.
@@ -6,9 +6,9 @@ against ground truth.
 
 import numpy as np
 
-from px4fuse.card.model import FilterName, Verdict
+from px4fuse.card.model import Verdict
 from px4fuse.comparison.comparison import normalised_position_errors
-from px4fuse.comparison.model import FILTERS, AxisComparison, FilterSummary
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import Reference, classify_sigma_ratio, sigma_ratio_interval
 from px4fuse.flight.model import Unavailable
@@ -21,10 +21,10 @@ MIN_BOOTSTRAP_BLOCKS = 4
 
 
 def make_sigma_verdicts(result: AxisComparison) -> tuple[Verdict, ...]:
-    """Return the verdicts along one axis: KF and EKF2, each against source and ground truth."""
+    """Evaluate the consistency of KF and EKF2 along one axis, from innovations and from errors."""
     return tuple(
         judge(result, filter_name)
-        for filter_name in FILTERS
+        for filter_name in FILTER_NAMES
         for judge in (_verdict_against_source, _verdict_against_truth)
     )
 
@@ -79,11 +79,14 @@ def block_bootstrap_rms(time_s: Array, values: Array) -> tuple[float, float] | N
     block_count = int((time_s[-1] - time_s[0]) / BOOTSTRAP_BLOCK_S) if len(time_s) > 1 else 0
     if block_count < MIN_BOOTSTRAP_BLOCKS:
         return None
-    starts = np.arange(np.searchsorted(time_s, time_s[-1] - BOOTSTRAP_BLOCK_S, side="right"))
-    ends = np.searchsorted(time_s, time_s[starts] + BOOTSTRAP_BLOCK_S)
+    start_indices = np.arange(np.searchsorted(time_s, time_s[-1] - BOOTSTRAP_BLOCK_S, side="right"))
+    end_indices = np.searchsorted(time_s, time_s[start_indices] + BOOTSTRAP_BLOCK_S)
     cumulative_squares = np.concatenate(([0.0], np.cumsum(np.square(values))))
-    block_squares = cumulative_squares[ends] - cumulative_squares[starts]
-    drawn = np.random.default_rng(0).integers(len(starts), size=(BOOTSTRAP_RESAMPLES, block_count))
-    mean_squares = block_squares[drawn].sum(axis=1) / (ends - starts)[drawn].sum(axis=1)
+    block_squares = cumulative_squares[end_indices] - cumulative_squares[start_indices]
+    drawn_blocks = np.random.default_rng(0).integers(
+        len(start_indices), size=(BOOTSTRAP_RESAMPLES, block_count)
+    )
+    sample_counts = (end_indices - start_indices)[drawn_blocks].sum(axis=1)
+    mean_squares = block_squares[drawn_blocks].sum(axis=1) / sample_counts
     rms_low, rms_high = np.percentile(np.sqrt(mean_squares), (2.5, 97.5))
     return float(rms_low), float(rms_high)

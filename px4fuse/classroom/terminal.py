@@ -16,8 +16,8 @@ from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 
 
 def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count: int) -> Page:
-    """Format the faults and difficulties of the flights, and the written files."""
-    counts = Counter(
+    """Summarise the assigned flights (injected faults, difficulty) and the written files."""
+    flight_count_by_fault = Counter(
         mistake.partition("=")[0]
         for answer in key.answers
         for mistake in answer.mistakes or ("none",)
@@ -25,9 +25,11 @@ def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count:
     difficulties = [answer.difficulty for answer in key.answers if answer.difficulty is not None]
     folder_text, key_text = (to_one_line(str(path)) for path in (folder, key_file))
     flight_count = len(key.answers)
-    texts = {
+    text_by_label = {
         "Class": f"{count_noun(flight_count, 'student')}, {key.kind}",
-        "Faults": ", ".join(f"{name} {number}" for name, number in sorted(counts.items())),
+        "Faults": ", ".join(
+            f"{name} {number}" for name, number in sorted(flight_count_by_fault.items())
+        ),
         "Level": f"difficulty {min(difficulties):.2f} to {max(difficulties):.2f}, from the range "
         f"{EASIEST_DIFFICULTY:g} to {UNDETECTABLE_DIFFICULTY:g}. The difficulty is the smallest "
         "size that px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
@@ -36,42 +38,43 @@ def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count:
         "Answers": f"{key_text} (not for students: the file lists the injected faults)",
     }
     if key.secret:
-        texts["Secret"] = (
-            "a new secret is stored in the answer key. Use --secret-file to write the same "
+        text_by_label["Secret"] = (
+            "The answer key contains a new secret. Use --secret-file to write the same "
             "flights again, or to add students."
         )
     page = Page()
-    page.write_labelled_texts(texts)
+    page.write_labelled_texts(text_by_label)
     return page
 
 
 def grading_page(outcome: GradeOutcome) -> Page:
-    """Format the table of the students, and the reports whose grading is pending."""
+    """Format a table of the students with their points, and the reasons for pending points."""
     page, rows = Page(), []
-    for entry in outcome.entries:
-        attempt = entry.counted_report
-        pending = ", pending" if attempt and entry.total is None else ""
-        status = attempt.status + pending if attempt else "missing"
+    for grade in outcome.grades:
+        report = grade.counted_report
+        pending_text = ", pending" if report and grade.total is None else ""
+        status = report.status + pending_text if report else "missing"
         status_colour = GOOD_COLOUR if status == "verified" else SEVERITY_COLOURS["warning"]
-        total = "–" if entry.total is None else f"{entry.total:g}"
-        name = one_line(entry.student or entry.student_id, 60)
-        file, flags = attempt.submission if attempt else "", f"{len(entry.flags) or ''}"
-        rows.append((name, file, (status, status_colour), f"{total} / {entry.max_points:g}", flags))
+        points_text = "–" if grade.total is None else f"{grade.total:g}"
+        points_text += f" / {grade.max_points:g}"
+        name = one_line(grade.student or grade.student_id, 60)
+        file_name, flag_count = report.submission if report else "", f"{len(grade.flags) or ''}"
+        rows.append((name, file_name, (status, status_colour), points_text, flag_count))
     page.table(
         ("student", "submission", "status", "points", "flags"), rows, right_aligned_columns=(3, 4)
     )
-    counts = Counter(attempt.status for attempt in outcome.reports)
-    status_counts = ", ".join(f"{count} {status}" for status, count in counts.most_common())
-    missing_count = sum(entry.counted_report is None for entry in outcome.entries)
+    counts = Counter(report.status for report in outcome.reports)
+    counts_text = ", ".join(f"{count} {status}" for status, count in counts.most_common())
+    missing_count = sum(grade.counted_report is None for grade in outcome.grades)
     page.write(
-        f"{len(outcome.reports)} submissions: {status_counts or 'none'}; no submission from "
-        f"{missing_count} of {len(outcome.entries)} students; verified in an earlier run: "
+        f"{len(outcome.reports)} submissions: {counts_text or 'none'}; no submission from "
+        f"{missing_count} of {len(outcome.grades)} students; verified in an earlier run: "
         f"{outcome.reused_count} submissions"
     )
-    for entry in outcome.entries:
-        report = entry.counted_report
-        if report is not None and entry.total is None:
-            name = one_line(entry.display_name, 60)
+    for grade in outcome.grades:
+        report = grade.counted_report
+        if report is not None and grade.total is None:
+            name = one_line(grade.display_name, 60)
             page.write(f"{name}: {report.pending_reason}", colour=MUTED_COLOUR)
     for note in outcome.notes:
         page.write(note, colour=MUTED_COLOUR)

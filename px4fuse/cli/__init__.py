@@ -16,10 +16,10 @@ import click
 
 from px4fuse.cli.outputs import Interrupted, written_files_sentence
 from px4fuse.core.input_files import inputs_protected
-from px4fuse.core.threads import ONE_THREAD
+from px4fuse.core.threads import ONE_THREAD_ENVIRONMENT
 from px4fuse.errors import OutputError, Px4FuseError, SettingsError, suggest_name, to_one_line
 
-# Commands in the order of --help; each command NAME is the function NAME in cli/NAME.py
+# Commands in the order of --help; command NAME is the function NAME in cli/NAME.py
 COMMANDS = (
     "compare",
     "batch",
@@ -53,17 +53,17 @@ TERMINATION_SIGNALS = (
 
 HELP_OPTIONS = ["-h", "--help"]
 # Environment variables that px4fuse removes: an invalid value stops the import of matplotlib or
-# pymavlink, and no output depends on them (figures are SVG without a date)
+# pymavlink. No output depends on them
 IGNORED_VARIABLES = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
 # Minimum address space (bytes) for a run: the report of the sample log needs 0.7 GB
 MIN_ADDRESS_SPACE_BYTES = 800_000_000
 
-# Commands that need pyarrow; other commands do not import it, which saves 70 MB of memory
+# Commands that need pyarrow; without its import, other commands need 70 MB less memory
 PARQUET_COMMANDS = ("batch", "extract")
 
 
 class LazyGroup(click.Group):
-    """Group of commands of click, each imported when it is called."""
+    """Commands of px4fuse; the module of a command is imported when the command runs."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -85,7 +85,7 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: click.Context) -> object:
-        """Run a command; convert system errors and Ctrl-C to errors with a message of px4fuse."""
+        """Run a command; convert system errors and Ctrl-C to exceptions of px4fuse."""
         try:
             with inputs_protected():
                 return super().invoke(ctx)
@@ -146,7 +146,7 @@ def _make_system_error(error: MemoryError | OSError, files_sentence: str) -> Px4
 
 
 def _check_memory() -> None:
-    # below MIN_ADDRESS_SPACE_BYTES, libraries end the process without a message
+    # with less memory, libraries end the process without a message
     try:
         import resource
     except ImportError:  # Windows has no memory limit for a process
@@ -162,18 +162,18 @@ def _check_memory() -> None:
 
 def main() -> None:
     """Run the command line; print an error as one line on standard error, and exit with code 2."""
-    # garbage collection takes 10 % of the run time of a short command, and 10 % more at exit
+    # garbage collection needs 10 % of the run time of a short command, and 10 % more at exit
     gc.disable()
     atexit.register(gc.freeze)
     _prepare_libraries()
     _redirect_closed_streams()
     for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):  # legacy Windows code pages have no σ and ν
+        if hasattr(stream, "reconfigure"):  # old Windows code pages lack σ and ν
             stream.reconfigure(errors="replace")
     for signal_number in TERMINATION_SIGNALS:
         if signal.getsignal(signal_number) is signal.SIG_DFL:  # under nohup, SIGHUP is ignored
             signal.signal(signal_number, _raise_interrupt)
-    if hasattr(signal, "pthread_kill"):  # Windows does not have it
+    if hasattr(signal, "pthread_kill"):  # not on Windows
         sys.unraisablehook = _raise_signal_again
     try:
         if not {*HELP_OPTIONS, "--version"} & set(sys.argv):
@@ -199,24 +199,24 @@ def main() -> None:
 
 
 def _prepare_libraries() -> None:
-    for name, value in ONE_THREAD.items():
+    for name, value in ONE_THREAD_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     for name in IGNORED_VARIABLES:
         os.environ.pop(name, None)
     # matplotlib warns if the home folder is read-only, which has no effect on px4fuse
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     if not set(PARQUET_COMMANDS) & set(sys.argv[1:2]):
-        # with None, pandas assumes that pyarrow is not installed
+        # so that pandas does not import pyarrow
         sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]
 
 
 def _flush_output(exit_code: int) -> int:
-    """Flush standard output; return the exit code, or 2 if standard output cannot be written."""
+    """Flush standard output; return 2 if this fails, otherwise ``exit_code``."""
     try:
         sys.stdout.flush()
     except OSError as error:
         _discard_output()
-        if exit_code == 0:  # with another exit code, px4fuse has already printed an error
+        if exit_code == 0:  # otherwise px4fuse has already printed an error
             _print_error(f"standard output cannot be written ({error.strerror}).")
             return 2
     return exit_code
@@ -249,16 +249,16 @@ def _print_error(text: str) -> None:
 
 
 def _raise_interrupt(signal_number: int, _: object) -> None:
-    # a termination signal has the effect of Ctrl-C, so that temporary files are deleted
+    # handle a termination signal like Ctrl-C, so that temporary files are deleted
     raise KeyboardInterrupt(signal_number)
 
 
 def _raise_signal_again(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Raise a signal again if it arrived in a finaliser, whose exceptions Python ignores."""
+    """Send a signal again if it arrived in a finaliser, because Python ignores exceptions there."""
     error = unraisable.exc_value
     if isinstance(error, KeyboardInterrupt):
         signal_number = error.args[0] if error.args else signal.SIGINT
-        # after 0.1 s the finaliser has ended; a signal also ends a blocking call of the main thread
+        # after 0.1 s the finaliser has ended
         threading.Timer(
             0.1, signal.pthread_kill, [threading.main_thread().ident, signal_number]
         ).start()
@@ -267,5 +267,5 @@ def _raise_signal_again(unraisable: "sys.UnraisableHookArgs") -> None:
 
 
 def _discard_output() -> None:
-    # discards the buffered output, so that Python prints no error at exit
+    # without buffered output, Python prints no error at exit
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""Command ``px4fuse answers``: writes the answer form of a student for a flight."""
+"""Command ``px4fuse answers``: writes a form with questions about a flight for a student."""
 
 import hashlib
 from pathlib import Path

@@ -57,7 +57,7 @@ def batch(
     from px4fuse.batch.run import run
     from px4fuse.batch.terminal import format_summary
 
-    gc.enable()  # Dask leaves reference cycles, which would fill the memory in a long run
+    gc.enable()  # otherwise the reference cycles of Dask fill the memory in a long run
     try:
         with outputs.progress() as show_progress:
             batch_result = run(

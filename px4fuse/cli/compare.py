@@ -62,7 +62,7 @@ def compare(
         with outputs.progress(json_path) as show_progress:
             outcome = diagnose_or_check_aids(request, show_progress)
             results = outcome_results(request, outcome, student)
-            release_free_memory()  # the report modules, imported next, need memory
+            release_free_memory()  # the import of the report modules needs memory
             contents = outputs.result_files(
                 results,
                 json_path,
@@ -72,7 +72,7 @@ def compare(
                 log.stem + settings_name(request),
             )
     except (LogError, MissingDataError) as error:
-        if not sys.stderr.isatty():  # programs that read standard error expect one line
+        if not sys.stderr.isatty():  # print one line if a program reads standard error
             raise
         outputs.show_page(card_page("card", build_refusal_card(error, log)), is_error=True)
         sys.exit(2)
@@ -85,5 +85,7 @@ def compare(
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)
     if failed_verdicts:
         sys.exit(1)
-    cause_findings = [finding for finding in results.findings if finding.caused_by is None]
-    options.exit_for_severity(fail_on, SEVERITIES, {finding.severity for finding in cause_findings})
+    independent_findings = [finding for finding in results.findings if finding.caused_by is None]
+    options.exit_for_severity(
+        fail_on, SEVERITIES, {finding.severity for finding in independent_findings}
+    )

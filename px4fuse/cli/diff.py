@@ -1,4 +1,4 @@
-"""Command ``px4fuse diff``: lists settings, numbers and findings that differ between two runs."""
+"""Command ``px4fuse diff``: lists the differences between the results of two flights."""
 
 import sys
 from pathlib import Path
@@ -18,11 +18,10 @@ def diff(a: Path, b: Path, json_path: Path | None) -> None:
 
     A and B are flight logs, reports (PDF) of px4fuse compare, or their results (JSON).
 
-    The exit code is 1 if a verdict is worse in B: the mean NIS or mean NEES of KF or EKF2 along an
-    axis is consistent in A and not in B, or B has a new finding of severity error. A mean NIS is
-    consistent inside its 95 % band, or if √S is wrong by a factor below 1.25. A mean NEES is
-    consistent if the position σ is wrong by a factor of at most 2. The exit code is 2 for invalid
-    input, otherwise 0.
+    Exit code 0: B is not worse; 1: B is worse; 2: invalid input. B is worse if KF or EKF2 is
+    consistent along an axis in A but not in B, or if B has a new finding of severity error. A
+    filter is consistent if its mean NIS is in the 95 % band or √S is wrong by a factor below 1.25,
+    and if the position σ is wrong by a factor of at most 2 (mean NEES).
     """
     from px4fuse.batch.changes import diff as compare_inputs
     from px4fuse.batch.terminal import format_differences

@@ -22,7 +22,7 @@ _DELTA_PATTERN = re.compile(r"(\d+\.?\d*|\.\d+) ?(m|s|frames|f)")
 
 
 def parse_delta(text: str) -> Delta:
-    """Parse an RPE delta: a distance, a time or a number of frames (``5m``, ``10s``, ``1f``)."""
+    """Parse the delta of the RPE: a distance (``5m``), time (``10s``) or frame count (``1f``)."""
     from px4fuse.trajectory.scores import Delta
 
     match = _DELTA_PATTERN.fullmatch(text.strip())

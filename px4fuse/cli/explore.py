@@ -33,7 +33,7 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
     with outputs.progress(target) as show_progress:
         analysis = diagnose(request, show_progress)
         show_progress("writing the page")
-        # imported after the analysis, because errors of the analysis need no slow import of Bokeh
+        # a slow import (Bokeh), which is not needed if the analysis fails
         from px4fuse.explore.page import html_text
 
         page = html_text(analysis)

@@ -19,7 +19,7 @@ from px4fuse.core.input_files import check_output_folder, inputs_not_registered
 from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, to_one_line
 
-# Maximum size (bytes) of flight.json of an earlier run
+# Maximum size (bytes) of an existing flight.json
 MAX_DESCRIPTION_BYTES = 50_000_000
 
 
@@ -80,7 +80,7 @@ def _require_same_flight(folder: Path, sha256: str) -> None:
             text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
         earlier_log = json.loads(text)["log"]
         name, earlier_sha256 = earlier_log["name"], earlier_log["sha256"]
-    # the file does not exist, or is not a flight.json of px4fuse
+    # without a valid flight.json, the folder contains no tables of another log
     except (OutputError, ValueError, KeyError, TypeError):
         return
     if earlier_sha256 != sha256:

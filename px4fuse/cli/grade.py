@@ -133,7 +133,7 @@ def grade(
     (id, item or total, points, comment) replace computed points. A second run verifies only changed
     reports. Submitted files are never executed, and are read with limits of time and memory.
     """
-    from px4fuse.classroom.assignment.key import read_key
+    from px4fuse.classroom.assignment.key import read_answer_key
     from px4fuse.classroom.assignment.roster import read_people
     from px4fuse.classroom.assignment.sheet import read_sheet
     from px4fuse.classroom.grading.entries import Course, parse_due_time, parse_late_rule
@@ -156,7 +156,7 @@ def grade(
     _require_output_outside(output, (*submissions, *logs))
     course = Course(
         read_rubric(rubric),
-        None if key is None else read_key(key),
+        None if key is None else read_answer_key(key),
         logs,
         option_values.pop("title") or "",
         roster=None if roster is None else read_people(read_sheet(roster)),
@@ -178,8 +178,10 @@ def grade(
                 progress=partial(show_progress, "grading"),
             )
     except KeyboardInterrupt as interrupt:
-        message = f"results of verified reports are in {output}. Run the same command to continue."
-        raise Interrupted(interrupt, message) from None
+        interruption_note = (
+            f"results of verified reports are in {output}. Run the same command to continue."
+        )
+        raise Interrupted(interrupt, interruption_note) from None
     write_and_print({}, grading_page(outcome), written_files=outcome.written_paths)
 
 

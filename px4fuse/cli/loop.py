@@ -18,7 +18,7 @@ from px4fuse.request import GivenClosure, Landing, LoopRequest, command_line, se
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop
 
-# Maximum distance (m) from take-off to landing place (--landed-at): a larger one is a typing error
+# Maximum distance (m) from take-off to landing place (--landed-at); more is a typing error
 MAX_LANDING_DISTANCE_M = 10_000.0
 # Parameters of the command that are allowed if SOURCE is a pose graph
 GRAPH_PARAMETERS = ("source", "json_path", "g2o", "robust")
@@ -65,7 +65,7 @@ _loop_option = partial(options.request_option, LoopRequest)
 )
 @options.flag_option(
     "--open",
-    "opened",
+    "is_open_path",
     help="Do not use the landing as a loop closure, because the vehicle did not return to the "
     "take-off place.",
 )
@@ -153,7 +153,7 @@ def loop(
     from px4fuse.report.loop import loop_page
     from px4fuse.results.build import loop_results
 
-    log = split_path_and_part(str(source))[0]  # without the name of the track
+    log = split_path_and_part(str(source))[0]  # LOG of LOG:TRACK
     student = options.read_student(option_values, log)
     for name, path in (("--tum", tum), ("--g2o", g2o)):
         if path == STANDARD_OUTPUT:
@@ -178,19 +178,19 @@ def loop(
 def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
     del option_values["robust"]
     return LoopRequest(
-        source=str(source), closed_loop=not option_values.pop("opened"), **option_values
+        source=str(source), closed_loop=not option_values.pop("is_open_path"), **option_values
     )
 
 
 def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:
-    """Return the corrected path (TUM) and the pose graph (g2o) by their paths."""
+    """Return the contents of the TUM file (corrected path) and the g2o file (pose graph)."""
     from px4fuse.loop.closure import from_z_down
     from px4fuse.readers.g2o import g2o_text
     from px4fuse.readers.trajectory import tum_text
 
     contents = {}
     if tum is not None:
-        best_path = loop_result.best
+        best_path = loop_result.choose_best_path()
         if best_path is loop_result.odometry:
             raise MissingDataError(
                 f"--tum {display_name(tum)}: the path is not corrected, as no loop closure was "

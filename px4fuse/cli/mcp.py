@@ -1,4 +1,4 @@
-"""Command ``px4fuse mcp``: serves the other commands as tools of the Model Context Protocol."""
+"""Command ``px4fuse mcp``: provides the other commands as tools of the Model Context Protocol."""
 
 import gc
 import io
@@ -25,9 +25,9 @@ from px4fuse.core.reading import (
 )
 from px4fuse.errors import SettingsError
 
-# Names of tool arguments that differ from the name of the command's parameter
+# Names of tool arguments that differ from the parameter of the command
 ARGUMENT_NAMES = {"finding": "finding_id", "parameter_texts": "parameters", "source": "log"}
-# Parameters of commands that tools do not have: outputs, exit codes and student
+# Parameters of commands that are not offered in tools: outputs, exit codes and student
 HIDDEN_PARAMETERS = {
     *("output", "json_path", "tum", "g2o", "fail_on", "checks"),
     *("student", "student_id", "notes", "answers"),
@@ -67,7 +67,7 @@ def mcp(roots: tuple[Path, ...], out: Path | None, timeout_s: float, memory_gb: 
 
     gc.enable()  # the server runs for a long time
     for signal_number in TERMINATION_SIGNALS:
-        # no exception, because the thread that reads standard input would not end
+        # an exception would not end the thread that reads standard input
         signal.signal(signal_number, lambda number, _: os._exit(128 + number))
     folders = tuple(root.resolve() for root in roots)
     if out is not None:
@@ -97,38 +97,37 @@ def run_command(
     max_bytes : int
         Maximum size of a log (bytes).
     out : Path or None
-        Current folder of the command, in which it writes reports.
+        Folder for reports.
     sender : Connection or None
-        Connection to which progress messages are sent.
+        Pipe to the process that shows the progress.
     words : sequence of str
-        Command line, without ``px4fuse``.
+        Command line without ``px4fuse``.
     """
     readable_folders.set(folders)
     max_log_bytes.set(max_bytes)
-    if out and sender:  # a worker process: commands in the server process write no files
+    if out and sender:  # in a worker process; commands in the server process write no files
         os.chdir(out)
-    text, results = io.StringIO(), list[str]()
+    output, results_json = io.StringIO(), list[str]()
     try:
-        with redirect_stdout(text), redirect_stderr(io.StringIO()):
-            # with "-" the command makes no report
+        with redirect_stdout(output), redirect_stderr(io.StringIO()):
+            # "-" (standard output): the command writes no report
             default_options = {words[0]: {"json_path": None if out else "-"}}
             with cli.make_context("px4fuse", [*words], default_map=default_options) as context:
                 context.meta[outputs.SEND_PROGRESS_KEY] = sender and sender.send
-                context.meta[outputs.RESULTS_KEY] = results
+                context.meta[outputs.RESULTS_KEY] = results_json
                 cli.invoke(context)
     except click.UsageError as error:
         raise SettingsError(error.format_message()) from error
-    if not results:
-        return text.getvalue(), None
-    results_data = json.loads(results[0])
-    return text.getvalue(), results_data["card"] if words[0] == "compare" else results_data
+    if not results_json:
+        return output.getvalue(), None
+    results = json.loads(results_json[0])
+    return output.getvalue(), results["card"] if words[0] == "compare" else results
 
 
 def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
-    """Return the tools of the server, and for each the function that parses its arguments.
+    """Return the tools of the server, each with the function that parses its arguments.
 
-    The input schemas are made from the options of the commands, the output schemas from the types
-    of the results.
+    The options of a command define the input schema, and the type of its results the output schema.
     """
     from mcp.types import Tool
 
@@ -164,7 +163,7 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
 
 
 def _parameters_of(command_name: str) -> dict[str, click.Parameter]:
-    """Return the parameters of a command by the names of its tool's arguments."""
+    """Return the parameters of a command, by the name of the tool argument."""
     return {
         ARGUMENT_NAMES.get(name, name): parameter
         for parameter in find_command(command_name).params
@@ -207,7 +206,7 @@ def _parse_arguments(
     folders: Sequence[Path],
     arguments: Mapping[str, Any],
 ) -> tuple[list[str], list[Path]]:
-    """Return the command line of a tool call, and its input files.
+    """Convert the arguments of a tool to a command line; also return the input files.
 
     Raises
     ------

@@ -1,6 +1,7 @@
 """Option types of the command line, and options that several commands share.
 
-Users type numbers without a unit. If a unit is typed, the error shows the converted number.
+The value of an option is a number without a unit. A value with a unit is rejected; the message
+contains the converted number.
 """
 
 from __future__ import annotations
@@ -38,16 +39,16 @@ Choice = partial(click.Choice, case_sensitive=False)
 def _combine_options(*options: Option) -> Option:
     """Combine options into one decorator; --help lists them in this order."""
 
-    def add(command: Callable[..., None]) -> Callable[..., None]:
+    def add_options(command: Callable[..., None]) -> Callable[..., None]:
         for option in reversed(options):
             command = option(command)
         return command
 
-    return add
+    return add_options
 
 
 class NonEmptyPath(click.Path):
-    """Path of a file or folder; an empty name is rejected, as it would mean the current folder."""
+    """Path of a file or folder; an empty name (the current folder) is rejected."""
 
     def __init__(self, path_type: type[Path | str] = Path) -> None:
         super().__init__(path_type=path_type)
@@ -59,10 +60,7 @@ class NonEmptyPath(click.Path):
 
 
 class InputPath(NonEmptyPath):
-    """Input file or folder, which no output may overwrite.
-
-    A log may be followed by the name of a track: ``LOG:vio``.
-    """
+    """Input file, input folder, or a track of a log (``LOG:vio``); no output may overwrite it."""
 
     def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         path = super().convert(value, param, ctx)
@@ -72,7 +70,7 @@ class InputPath(NonEmptyPath):
 
 
 class TypedQuantity(click.ParamType["float | str"]):
-    """Option type of a number in a fixed unit of :data:`px4fuse.core.units.UNIT_NAMES`.
+    """Number in a fixed unit, as type of a command-line option.
 
     ``example`` is a valid value for the error message. If ``auto`` is True, the text "auto" is also
     accepted.
@@ -84,7 +82,7 @@ class TypedQuantity(click.ParamType["float | str"]):
         self.unit, self.example, self.auto = unit, example, auto
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
-        """Return the unit in capital letters, as --help shows the value of the option."""
+        """Return the unit in capital letters, for --help."""
         unit = "DEG" if self.unit == "°" else self.unit.upper() or "NUMBER"
         return f"{unit}|auto" if self.auto else unit
 
@@ -133,7 +131,7 @@ memory_option = click.option(
     default=4.0,
     help="Maximum memory for one log (GB, Linux only); a log that needs more fails.",
 )
-# Not a field of the recorded settings, because the size limit does not affect results
+# Not part of the settings in a report, because the size limit does not affect results
 max_size_option = click.option(
     "--max-size",
     type=click.IntRange(1),
@@ -171,14 +169,14 @@ def input_option(name: str, metavar: str, help_text: str, **details: Any) -> Opt
 
 
 def output_option(metavar: str, help_text: str, **details: Any) -> Option:
-    """Declare -o for an output file or folder; ``details`` are arguments of ``click.option``."""
+    """Make the option -o for an output file or folder."""
     return click.option(
         "-o", "--output", type=NonEmptyPath(), metavar=metavar, help=help_text, **details
     )
 
 
 def report_options(help_text: str) -> Option:
-    """Declare -o for the PDF report and --json for its results."""
+    """Make the option -o for the PDF report, and the option --json for the results."""
     json_text = " With --json and without -o, no report is written.  [default: beside the report]"
     return _combine_options(output_option("FILE.pdf", help_text), _json_option(json_text))
 
@@ -190,7 +188,7 @@ def fail_option(levels: tuple[str, ...], help_text: str) -> Option:
 def exit_for_severity(
     fail_on: str | None, levels: Sequence[str], reached_levels: Iterable[str]
 ) -> None:
-    """Exit with code 1 if the level of --fail-on or a more severe level is reached."""
+    """Exit with code 1 if ``reached_levels`` contains the level --fail-on or a higher level."""
     if fail_on is not None and {*reached_levels} & {*levels[: levels.index(fail_on) + 1]}:
         sys.exit(1)
 
@@ -232,7 +230,7 @@ system_option = click.option(
 def request_option(
     request_type: type[Struct], name: str, help_text: str, example: float = 0.1, **details: Any
 ) -> Option:
-    """Declare the option for a field of ``request_type``, with its type, unit and default.
+    """Make the option for a field of ``request_type``, with its type, unit and default.
 
     RANGE in ``help_text`` is replaced by the range of the KF setting. ``example`` is a valid value
     for the error message. ``details`` are arguments of ``click.option``.
@@ -249,7 +247,7 @@ def request_option(
         details["default"] = field.default
     if name in SETTING_RANGES:
         help_text = help_text.replace("RANGE", "{:g} to {:g} {}".format(*SETTING_RANGES[name]))
-    # for a position file, click derives the parameter name from the option (position_frame)
+    # without a name, click derives it from the option: --position-frame gives position_frame
     parameter_names = () if request_type is PositionFile else (name,)
     return click.option(
         OPTION_NAMES[request_type][name], *parameter_names, help=help_text, **details
@@ -272,7 +270,9 @@ position_options = _combine_options(
         help="Recording of the positioning system (CSV or BAG:TOPIC), used instead of the "
         "positions in LOG.",
     ),
-    _position_option("body", "Body, tag or topic, if the file contains several.", metavar="NAME"),
+    _position_option(
+        "body", "Rigid body, tag or topic to use, if the file contains several.", metavar="NAME"
+    ),
     _position_option(
         "frame",
         "Coordinate frame of x, y, z in the position file.  [default: from the column names, else "
@@ -348,7 +348,7 @@ filter_options = _combine_options(
         "fused, GNSS first]",
     ),
 )
-#: Options for the recordings of one flight, the position file and the clock offset
+#: Options for the input files and the clock offset of one flight
 flight_options = _combine_options(system_option, position_options, _clock_option, max_size_option)
 #: Options of commands that run KF on one flight
 analysis_options = _combine_options(filter_options, flight_options)
@@ -388,13 +388,14 @@ def typed_parameters() -> Iterator[click.Parameter]:
 
 
 def read_student(option_values: dict[str, Any], log: Path) -> Student:
-    """Remove the values of ``student_options`` from the option values, and read their files.
+    """Read name, notes and answer form of a student, from the values of ``student_options``.
+
+    These values are removed from ``option_values``.
 
     Raises
     ------
     SettingsError
-        The notes or the answer form cannot be read, the form is for another log, or the notes
-        cannot be printed.
+        The notes or the answer form cannot be read, or the form is about another log.
     """
     from msgspec import UNSET
 

@@ -27,38 +27,37 @@ if TYPE_CHECKING:
     from px4fuse.request import Request
     from px4fuse.results.contract import Results
 
-# Maximum length (bytes) of a default report name (file systems allow 255), and length of the part
-# that is kept of a longer name
+# Maximum length (bytes) of a default report name (file systems allow 255), and length to which a
+# longer name is cut
 MAX_NAME_BYTES, KEPT_STEM_BYTES = 200, 180
-# Name and id in a report without a student
+# Empty name and id, for a report without a student
 NO_STUDENT_NAME = ("", "")
 # Line width (characters) in a pipe: longer than any paragraph
 UNWRAPPED_WIDTH = 10_000
-# Key in the context of click for the list of files that this run has written
+# Key in the click context of the list of written files
 WRITTEN_FILES_KEY = "px4fuse.written"
-# Key in the context of click: True if the command opens its output in the default program
+# Key in the click context of a bool: True to open the output in its default program
 OPENS_OUTPUT_KEY = "px4fuse.opens_output"
-# Key in the context of click for the function that reports progress to px4fuse mcp
+# Key in the click context of the function that sends progress messages to px4fuse mcp
 SEND_PROGRESS_KEY = "px4fuse.send"
-# Key in the context of click for the list of results (JSON text) that px4fuse mcp returns
+# Key in the click context of the list of results (JSON text) that px4fuse mcp returns
 RESULTS_KEY = "px4fuse.results"
-# Suffixes of files that --open can open, the preferred suffix first
+# Suffixes of files that --open can open, in order of preference
 OPENABLE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
-# HTML element that contains the command and the SHA-256 of the log of a web page
+# HTML element with the command that made a web page, and the SHA-256 of its log
 GENERATOR_PATTERN = re.compile('<meta name="generator" content="([^"]*)">')
 
 
-# Function that receives the current activity of a run and, if known, the counts of finished and all
-# items
+# Function (activity, number of finished items, number of all items) that shows the progress
 ShowProgress = Callable[..., None]
 
 
 class Interrupted(Exception):  # noqa: N818 - no error, because the user ends the run
-    """End of a run by Ctrl-C or a termination signal, with a sentence on the written files."""
+    """Ctrl-C or a termination signal, with a sentence about the written files."""
 
     def __init__(self, interrupt: KeyboardInterrupt, files_sentence: str) -> None:
         super().__init__(f"interrupted; {files_sentence}")
-        # the argument of the interrupt is the number of the signal, except for Ctrl-C
+        # _raise_interrupt stores the signal number in args; Ctrl-C has no args
         self.exit_code = 128 + (interrupt.args[0] if interrupt.args else signal.SIGINT)
 
 
@@ -81,7 +80,7 @@ def progress(*targets: Path | None) -> Iterator[ShowProgress]:
     from rich.console import Console
 
     console = Console(stderr=True)
-    # even a disabled progress bar prints an empty line in older versions of rich
+    # no progress bar at all: in older versions of rich, a disabled bar prints an empty line
     if not console.is_terminal or STANDARD_OUTPUT in targets:
         yield lambda *_: None
         return
@@ -108,12 +107,12 @@ def progress(*targets: Path | None) -> Iterator[ShowProgress]:
 
 
 def default_report_path(name: str, results: Results) -> Path:
-    """Return the path of a report without -o; a long name is cut.
+    """Return the path of a report if the user gives none (-o); a long name is cut.
 
     Raises
     ------
     OutputError
-        The path is a file that is not a report for the same input files and student.
+        A file with this path exists, and is not a report on these input files and this student.
     """
     from px4fuse.results.reading import read_results
     from px4fuse.verification.pdf_input import read_attached_results
@@ -136,7 +135,7 @@ def check_default_page(path: Path, page: str) -> None:
     Raises
     ------
     OutputError
-        The path is a file that is not a web page of the same command and log.
+        A file with this path exists, and is not a web page of this command and log.
     """
     generator = GENERATOR_PATTERN.findall(page)
     _check_default(
@@ -163,7 +162,7 @@ def _check_default(
 def _is_same_report(
     new_results: Results, read: Callable[[bytes, str], Results], existing_content: bytes
 ) -> bool:
-    """Return True if an existing report has the same input files, and no other student."""
+    """Return True if both reports have the same input files, and not two different students."""
     from px4fuse.results.contract import file_hashes_in, to_json
 
     existing_results = read(existing_content, "report")
@@ -179,7 +178,7 @@ def _student_name_and_id(results: Results) -> tuple[str, str]:
 
 
 def web_page_path(output: Path | None, default: Path) -> Path:
-    """Return the value of -o, or else the default path, and check the path.
+    """Return the path of a web page (value of -o, or the default), and check it.
 
     Raises
     ------
@@ -196,7 +195,7 @@ def web_page_path(output: Path | None, default: Path) -> Path:
 def report_paths(output: Path | None, json_path: Path | None) -> list[Path]:
     """Return the paths of a report (PDF) and its results (JSON), from the values of -o and --json.
 
-    Without -o, the list does not contain the report, whose name is determined after the analysis.
+    Without -o, the path of the report is missing: it depends on the analysis.
 
     Raises
     ------
@@ -221,9 +220,9 @@ def result_files(
     show_progress: ShowProgress = lambda *_: None,
     default_name: str = "",
 ) -> dict[Path, bytes]:
-    """Return the contents of the results (JSON) and of the report (PDF) by their paths.
+    """Return the contents of the results (JSON) and of the report (PDF) by path.
 
-    Without --json and -o, the report has the ``default_name``; if it is empty, no report is made.
+    Without -o and --json, the report is named ``default_name``, or not made if this is "".
     """
     from px4fuse.results.contract import to_json
 
@@ -248,7 +247,7 @@ def result_files(
 
 
 def write_outputs(contents: Mapping[Path, bytes]) -> None:
-    """Write all outputs of a command, and add them to the list of written files.
+    """Write all outputs of a command, and register them as written files.
 
     Raises
     ------
@@ -309,29 +308,27 @@ def write_and_print(
     request: Request | None = None,
     written_files: Iterable[Path] = (),
 ) -> None:
-    """Write all outputs, and print the results and the file names.
-
-    With --open, open the file whose suffix is first in OPENABLE_SUFFIXES.
+    """Write all outputs, print the results and the file names, and open a file (--open).
 
     Parameters
     ----------
     contents : mapping from Path to bytes
-        Outputs. If one of the paths is standard output, nothing else is printed.
+        Contents by path. If a path is standard output, nothing else is printed.
     page : Page, optional
         Results to print.
     request : Request, optional
-        Settings from which printed commands take their files and options.
+        Settings that commands in ``page`` repeat.
     written_files : iterable of Path
-        Files that the command has already written.
+        Files that are already written.
     """
-    from px4fuse.report.screen import print_line, show
+    from px4fuse.report.screen import print_blocks, print_line
 
     write_outputs(contents)
     files = [*contents, *written_files]
     if STANDARD_OUTPUT not in contents:
         console = terminal()
         if page is not None:
-            show(console, page.blocks, request)
+            print_blocks(console, page.blocks, request)
         for path in files:
             print_line(console, "Wrote", to_one_line(str(path)), "bold")
     openable_files = [
@@ -342,15 +339,15 @@ def write_and_print(
 
 
 def show_page(page: Page, *, is_error: bool = False) -> None:
-    from px4fuse.report.screen import show
+    from px4fuse.report.screen import print_blocks
 
-    show(terminal(is_error=is_error), page.blocks)
+    print_blocks(terminal(is_error=is_error), page.blocks)
 
 
 def terminal(*, is_error: bool = False) -> Console:
-    """Return a console that raises BrokenPipeError if the reader of standard output has ended.
+    """Return a console that raises BrokenPipeError if the reader of a pipe has ended.
 
-    In a pipe, a paragraph is one line unless the environment variable COLUMNS contains a width.
+    In a pipe, lines are not wrapped unless the environment variable COLUMNS contains a width.
     """
     from rich.console import Console
 

@@ -13,7 +13,7 @@ INSTALL_COMMAND = 'pip install "px4fuse[samples]"'
 
 
 def sample_log() -> Path:
-    """Return the path of the sample log, from ./sample_logs or else from the installed package.
+    """Return the path of the sample log, in ./sample_logs or in the installed package.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def sample(output: Path) -> None:
                 "file, or choose another folder (-o)."
             )
     first_log = next(path for path in contents if path.suffix == ".ulg")
-    command = command_line(ComparisonRequest(log=str(first_log)), "compare", for_shell=True)
+    compare_command = command_line(ComparisonRequest(log=str(first_log)), "compare", for_shell=True)
     page = Page()
-    page.add("command", text=command, label="Run")
+    page.add("command", text=compare_command, label="Run")
     write_and_print(contents, page)

@@ -20,7 +20,7 @@ from px4fuse.cli.outputs import check_targets, progress, write_and_print
 from px4fuse.core.input_files import check_output_folder
 from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, SettingsError
-from px4fuse.simulation.mistakes import MISTAKES, parse_mistakes
+from px4fuse.simulation.faults import FAULT_TYPES, parse_faults
 from px4fuse.simulation.scenario import (
     DEFAULTS_OF_KIND,
     Scenario,
@@ -35,7 +35,7 @@ MIXED_KIND = "mixed"
 OUTDOOR_KIND: ScenarioKind = "outdoor"
 # Options that require --assignment
 ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "mistakes")
-# All options that can be combined with --assignment
+# Options that can be combined with --assignment
 ASSIGNMENT_OPTIONS = (
     "output",
     "assignment",
@@ -48,7 +48,7 @@ MAX_SECRET_BYTES = 10_000
 
 
 def _scenario_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add an option for each numeric field of Scenario, with its default and meaning."""
+    """Add a command-line option for each numeric field of Scenario."""
     for field, quantity in reversed(bounds_by_field(Scenario).items()):
         if not quantity.meaning:
             continue
@@ -64,7 +64,7 @@ def _scenario_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 class CommandWithFaultTable(click.Command):
-    """Command of click whose help ends with the table of injected faults."""
+    """Command whose help ends with a table of the faults that can be injected."""
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Injected faults for --mistake [the default VALUE is in brackets]"):
@@ -74,7 +74,7 @@ class CommandWithFaultTable(click.Command):
                         f"{name}{mistake.usage}",
                         mistake.help + (f" [{mistake.default:g}]" if mistake.size_fields else ""),
                     )
-                    for name, mistake in MISTAKES.items()
+                    for name, mistake in FAULT_TYPES.items()
                 ]
             )
 
@@ -181,7 +181,7 @@ def simulate(
     if output.suffix.lower() != ".ulg":
         raise OutputError(f"{output}: the output is a ULog. Give a name ending in .ulg (-o).")
     check_targets([output, answer])
-    mistake_sizes = parse_mistakes(mistake)
+    mistake_sizes = parse_faults(mistake)
     scenario = make_scenario(
         kind,
         truth=not no_truth,
@@ -197,7 +197,7 @@ def simulate(
         show_progress("writing the log")
         contents = {output: flights.to_ulog(simulation)}
     if answer is not None:
-        contents[answer] = to_json(flights.answer(simulation)).encode()
+        contents[answer] = to_json(flights.make_answer_key(simulation)).encode()
     write_and_print(contents, terminal.summary(simulation, answer))
 
 
@@ -242,25 +242,25 @@ def _write_assignment(
     secret: bytes | None,
     scenario_kind: Any,
     fault_count: int | None,
-    has_truth: bool,
+    with_ground_truth: bool,
 ) -> None:
     from px4fuse.classroom.assignment import assignment
     from px4fuse.classroom.assignment.roster import read_roster
     from px4fuse.classroom.terminal import assignment_page
 
     students = read_roster(roster)
-    answer_key_path = assignment.key_path(folder, answer_path)
+    answer_key_path = assignment.answer_key_path(folder, answer_path)
     check_targets([answer_key_path])
     check_output_folder(folder)
     with progress() as show_progress:
-        key, written_files = assignment.assign(
+        key, written_count = assignment.assign(
             students,
             folder,
             answer_key_path,
             secret,
             scenario_kind,
             fault_count,
-            has_truth,
+            with_ground_truth,
             partial(show_progress, "simulating"),
         )
-    write_and_print({}, assignment_page(key, folder, answer_key_path, written_files))
+    write_and_print({}, assignment_page(key, folder, answer_key_path, written_count))

@@ -21,7 +21,7 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
     recording.
     """
     from px4fuse.comparison.estimates import estimate_noises_and_clock
-    from px4fuse.diagnose import prepare_comparison
+    from px4fuse.diagnose import prepare_comparison, read_flight
     from px4fuse.errors import MissingDataError
     from px4fuse.flight.model import Unavailable
     from px4fuse.report.clock import clock_advice
@@ -30,7 +30,8 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
 
     request = comparison_request(log, option_values)
     with progress(json_path) as show_progress:
-        comparison = prepare_comparison(request, show_progress)
+        flight = read_flight(request, show_progress)
+        comparison = prepare_comparison(flight, request, show_progress)
         _, clock_result = estimate_noises_and_clock(comparison, show_progress)
     advice = clock_advice(comparison, clock_result)
     if isinstance(clock_result, Unavailable) or not clock_result.is_determinable:

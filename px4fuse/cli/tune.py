@@ -21,21 +21,22 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     --sigma-z. LOG is a PX4 ULog or a MAVLink recording.
     """
     from px4fuse.comparison.estimates import estimate_noises
-    from px4fuse.diagnose import prepare_comparison
+    from px4fuse.diagnose import prepare_comparison, read_flight
     from px4fuse.errors import MissingDataError
     from px4fuse.report.tuning import tuning_page
     from px4fuse.results.build import tuning_results
 
     request = comparison_request(log, option_values)
     with progress(json_path) as show_progress:
-        comparison = prepare_comparison(request, show_progress)
+        flight = read_flight(request, show_progress)
+        comparison = prepare_comparison(flight, request, show_progress)
         tunings = estimate_noises(comparison, progress=show_progress)
-    missing = [tuning for tuning in tunings.values() if isinstance(tuning, Unavailable)]
-    if len(missing) == len(tunings):
+    unavailable = [tuning for tuning in tunings.values() if isinstance(tuning, Unavailable)]
+    if len(unavailable) == len(tunings):
         raise MissingDataError(
             f"{comparison.flight.log.name}: SIGMA_A and SIGMA_Z cannot be estimated: "
-            f"{missing[0].reason}",
-            missing[0].remedy,
+            f"{unavailable[0].reason}",
+            unavailable[0].remedy,
         )
     results = tuning_results(request, comparison, tunings)
     write_and_print(result_files(results, json_path), tuning_page(comparison, tunings), request)

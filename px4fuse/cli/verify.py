@@ -1,4 +1,4 @@
-"""Command ``px4fuse verify``: repeats the analysis of a report, compares numbers and pages."""
+"""Command ``px4fuse verify``: repeats the analysis of a report, and compares the numbers."""
 
 import sys
 from functools import partial
@@ -35,7 +35,7 @@ def verify(
     Exit code 0: verified; 1: differences, another log, or not verifiable; 2: invalid input.
     """
     from px4fuse.core.workers import JobFailure, run_one_with_limits
-    from px4fuse.verification.output import verdict_data, verdict_page
+    from px4fuse.verification.output import verification_data, verification_page
     from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_report
     from px4fuse.verification.verification import verify as verify_report
 
@@ -58,6 +58,6 @@ def verify(
     report_files = (
         {} if output is None or not verification.redrawn_pdf else {output: verification.redrawn_pdf}
     )
-    contents = report_files | result_files(verdict_data(content, verification), json_path)
-    write_and_print(contents, verdict_page(display_name(report), verification, output))
+    contents = report_files | result_files(verification_data(content, verification), json_path)
+    write_and_print(contents, verification_page(display_name(report), verification, output))
     sys.exit(0 if verification.outcome == "verified" else 1)

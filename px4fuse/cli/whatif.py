@@ -114,8 +114,8 @@ def _parse_number(option_text: str, name: str, value: str) -> float:
     try:
         return float(value)
     except ValueError as error:
-        expected_text = ""
+        advice_text = ""
         unit = PARAMETERS[name].printed_unit if name in PARAMETERS else ""
         if unit and (number := convert_to_unit(value, unit)) is not None:
-            expected_text = f" in {UNIT_NAMES.get(unit, unit)}. Give {number:g}"
-        raise SettingsError(f"{option_text}: {value!r} is not a number{expected_text}.") from error
+            advice_text = f" in {UNIT_NAMES.get(unit, unit)}. Give {number:g}"
+        raise SettingsError(f"{option_text}: {value!r} is not a number{advice_text}.") from error

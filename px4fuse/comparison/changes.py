@@ -1,6 +1,7 @@
-"""Changes of KF, of EKF2 or of their data that re-runs of the filter test one at a time.
+"""Changes of filter parameters or data that may make KF or EKF2 consistent.
 
-The argument ``ekf2_inputs`` is None for changes of KF.
+Re-runs of the filters test one change at a time. In all functions, ``ekf2_inputs`` is None for
+changes of KF.
 """
 
 from collections.abc import Iterable
@@ -28,10 +29,10 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.ekf2_parameters import GNSS_VEL, PARAMETERS
 from px4fuse.flight.model import LogInfo, Unavailable
 
-# Minimum SIGMA_Z (m) of a KF re-run: noise of motion capture, the most accurate position source
+# Minimum SIGMA_Z (m) in a re-run of KF: noise of motion capture, the most accurate position source
 MIN_RERUN_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
-# Label in :attr:`Trial.kinds` of each KF setting or data correction that a re-run changes
+# Kind of change in :attr:`Trial.kinds`, for each KF setting and each correction of the data
 KF_KINDS = {
     SIGMA_A: "noises",
     SIGMA_Z: "noises",
@@ -41,12 +42,13 @@ KF_KINDS = {
     FORWARD_BIAS: "bias",
     RIGHT_BIAS: "bias",
 }
+# Changes of KF's settings; all other changes correct the data
 SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
-# EKF2 is re-run with a larger EKF2_ACC_NOISE if the estimated SIGMA_A exceeds it by this factor:
-# SIGMA_A also covers tilt error and bias
+# EKF2 is re-run with a larger EKF2_ACC_NOISE if the estimated SIGMA_A exceeds it by this factor. A
+# smaller factor may be due to tilt errors and biases, which SIGMA_A includes
 MIN_VIBRATION_RATIO = 3.0
-# EKF2 parameters that a re-run sets to PX4's default if the log has another value
+# EKF2 parameters that a re-run sets to PX4's default
 RESTORED_PARAMETERS = (
     ACC_NOISE,
     "EKF2_GYR_NOISE",
@@ -55,7 +57,7 @@ RESTORED_PARAMETERS = (
     GNSS_VEL.noise,
     GNSS_VEL.gate,
 )
-# Minimum yaw misalignment, in σ of its estimate, that a re-run corrects
+# A re-run corrects the yaw misalignment only if it exceeds this multiple of its σ
 MIN_MISALIGNMENT_SIGMAS = 3.0
 
 
@@ -72,8 +74,8 @@ def candidate_changes(
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
     axis_tuning = tuning_of_axis(estimates.tuning, axis_result.axis.name)
     changes = list[Change]()
-    # innovations do not show slow errors of GNSS and odometry: small innovations do not justify a
-    # smaller noise
+    # Innovations do not show the slow errors of GNSS and odometry, so small innovations do not
+    # justify a smaller noise
     origin = comparison.source.origin
     hides_slow_errors = origin.may_drift or origin.is_gnss
     if axis_tuning is not None and not (is_underconfident and hides_slow_errors):
@@ -106,9 +108,9 @@ def candidate_changes(
 def main_axis_changes(
     comparison: Comparison, estimates: Estimates, ekf2_inputs: Inputs | None
 ) -> list[Change]:
-    """Return the changes to test along the main axis: more than along the other axes.
+    """Return the changes to test along the main axis, where more changes are tested.
 
-    KF is also re-run with both noises changed and with its default noises. EKF2 is also re-run with
+    In addition, KF is re-run with both noises changed and with its default noises, and EKF2 with
     shifted timestamps if its delay parameter is wrong.
     """
     changes = unique_changes(
@@ -130,6 +132,7 @@ def main_axis_changes(
 
 
 def unique_changes(changes: Iterable[Change]) -> list[Change]:
+    """Remove repeated changes; the order of the others is kept."""
     return list({frozenset(change.items()): change for change in changes}.values())
 
 
@@ -153,24 +156,24 @@ def change_kinds(
 
 def default_settings(comparison: Comparison) -> Change:
     """Return the default of each KF noise for which the user chose another value."""
-    chosen_settings, px4fuse_default = comparison.settings, Settings()
+    user_settings, px4fuse_default = comparison.settings, Settings()
     setting_names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
     return {
         name: getattr(px4fuse_default, name)
         for name in setting_names
-        if getattr(chosen_settings, name) != getattr(px4fuse_default, name)
+        if getattr(user_settings, name) != getattr(px4fuse_default, name)
     }
 
 
 def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
-    """Return the noise estimate of an axis; north and east share one estimate."""
+    """Return the noise estimate of an axis. North and east have a common estimate."""
     return first_axis_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
 def _time_offset_changes(estimates: Estimates, ekf2_inputs: Inputs | None) -> list[Change]:
-    """Return the estimated time offset if the filter does not yet correct a significant part of it.
+    """Return the estimated time offset, if a significant part of it is not corrected yet.
 
-    For EKF2, EKF2_DELAY_MAX is increased if the shifted positions would be too old to be fused.
+    For EKF2, EKF2_DELAY_MAX is increased if the shifted positions are too old to be fused.
     """
     clock_offset = estimates.clock
     if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
@@ -192,7 +195,7 @@ def _kf_noise_changes(
     """Return the estimates of SIGMA_A and SIGMA_Z that differ significantly from KF's settings."""
     changes = list[Change]()
     for name, noise in ((SIGMA_A, axis_tuning.sigma_a_two_state), (SIGMA_Z, axis_tuning.sigma_z)):
-        chosen_sigma = getattr(settings, name)
+        current_sigma = getattr(settings, name)
         ml_sigma = noise.value or (noise.high if is_underconfident else None) or 0.0
         noise_bound = noise.high if is_underconfident else noise.low
         if noise.value is None and name == SIGMA_Z:
@@ -200,7 +203,7 @@ def _kf_noise_changes(
         if (
             ml_sigma
             and noise_bound is not None
-            and (chosen_sigma > noise_bound if is_underconfident else chosen_sigma < noise_bound)
+            and (current_sigma > noise_bound if is_underconfident else current_sigma < noise_bound)
         ):
             changes.append({name: float(f"{ml_sigma:.3g}")})
     return changes
@@ -208,7 +211,7 @@ def _kf_noise_changes(
 
 def _bias_changes(estimates: Estimates) -> list[Change]:
     systematic_errors = estimates.systematic_errors
-    if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_bias:
+    if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_significant_bias():
         return []
     biases = {
         FORWARD_BIAS: systematic_errors.forward_bias,
@@ -220,7 +223,7 @@ def _bias_changes(estimates: Estimates) -> list[Change]:
 def _ekf2_noise_changes(
     ekf2_inputs: Inputs, summary: FilterSummary, axis_tuning: AxisTuning
 ) -> list[Change]:
-    """Return EKF2 parameters for the estimated position noise if EKF2's differs significantly."""
+    """Return the EKF2 parameters for the estimated position noise, if significantly different."""
     noise_m = axis_tuning.sigma_z.value
     if noise_m is None:  # the RMS innovation is an upper bound of the noise
         noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
@@ -229,7 +232,7 @@ def _ekf2_noise_changes(
 
 
 def _px4_default_changes(log: LogInfo, ekf2_inputs: Inputs) -> list[Change]:
-    """Return PX4's default of each EKF2 noise that the log changes.
+    """Return PX4's default of each EKF2 noise that has another value in the log.
 
     PX4's default of the gate is included if the logged gate is smaller.
     """
@@ -247,10 +250,10 @@ def _px4_default_changes(log: LogInfo, ekf2_inputs: Inputs) -> list[Change]:
 def _vibration_noise_changes(
     settings: Settings, ekf2_inputs: Inputs, axis_tuning: AxisTuning
 ) -> list[Change]:
-    """Return the EKF2_ACC_NOISE that corresponds to the estimated SIGMA_A, if it is much larger.
+    """Return the EKF2_ACC_NOISE for the estimated SIGMA_A, if it is much larger than logged.
 
-    EKF2 adds (EKF2_ACC_NOISE · step)² to the velocity variance in each step; KF adds SIGMA_A² · DT²
-    in each DT.
+    In each prediction, EKF2 adds (EKF2_ACC_NOISE · step)² to the velocity variance, and KF adds
+    SIGMA_A² · DT².
     """
     steps_per_dt = settings.dt_s / ekf2_inputs.mean_step_s
     logged_noise, px4_maximum = ekf2_inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum

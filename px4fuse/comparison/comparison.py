@@ -23,39 +23,45 @@ from px4fuse.comparison.model import (
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import DEFAULT_GATE, HorizontalNis, assess, assess_horizontal
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
+from px4fuse.filter.model import STATE_COLUMNS
 from px4fuse.filter.signals import Axis, Segment
-from px4fuse.flight.model import RECORD_NOT_LOGGED, Ekf2, Truth, Unavailable, sample_rate
+from px4fuse.flight.model import (
+    RECORD_NOT_LOGGED,
+    Ekf2,
+    TableOrUnavailable,
+    Truth,
+    Unavailable,
+    sample_rate,
+)
 
-STATE_COLUMNS = ("position_m", "velocity_m_s")
 VARIANCE_COLUMNS = ("position_variance_m2", "velocity_variance_m2_s2")
-Frame = pd.DataFrame | Unavailable
 
 
 def run_kf(
     prepared: PreparedComparison, progress: Callable[[str], None] = lambda _: None
 ) -> dict[str, Replay]:
-    """Run KF along each axis of a comparison, and return the runs by axis name."""
+    """Run KF along each axis of a comparison; return the runs by axis name."""
     progress(f"running KF along the axes {', '.join(axis.name for axis in prepared.input_axes)}")
     return {axis.name: replay(axis, prepared.settings) for axis in prepared.input_axes}
 
 
 def compare(prepared: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comparison:
-    """Compare KF with EKF2, and both with ground truth, along each axis that KF ran along."""
+    """Compare the runs of KF with EKF2, and both with ground truth, along each axis."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
         state, note = projection.continuous_state(ekf2, prepared.source, prepared.segment)
         notes += [note] if note else []
         notes += ekf2.notes
         if not state.equals(ekf2.state):
-            # omit the states at the fusion horizon: their origin still moves with the resets
+            # The states at the fusion horizon are omitted: their origin still moves with the resets
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     axes = {name: _compare_axis(prepared, ekf2, kf_run) for name, kf_run in kf_runs.items()}
-    innovations: dict[FilterName, dict[str, Frame]] = {
+    innovations: dict[FilterName, dict[str, TableOrUnavailable]] = {
         "kf": {name: axis.replay.updates for name, axis in axes.items()},
         "ekf2": {name: axis.ekf2_innovations for name, axis in axes.items()},
     }
     horizontal = {
-        name: nis for name, frames in innovations.items() if (nis := _horizontal_nis(frames))
+        name: nis for name, tables in innovations.items() if (nis := _horizontal_nis(tables))
     }
     prepared = replace(prepared, notes=tuple(notes))
     return Comparison(**vars(prepared), axes=axes, horizontal=horizontal)
@@ -67,7 +73,7 @@ def _compare_axis(
     axis, segment, flight = kf_run.axis, prepared.segment, prepared.flight
     tracks = project_tracks(ekf2, flight.truth, axis, segment)
     ekf2_state, ekf2_variance, truth = tracks.values()
-    innovations: Frame
+    innovations: TableOrUnavailable
     if isinstance(ekf2, Unavailable):
         innovations, gate = ekf2, DEFAULT_GATE
     else:
@@ -114,10 +120,10 @@ def _compare_axis(
 
 def project_tracks(
     ekf2: Ekf2 | Unavailable, truth: Truth | Unavailable, axis: Axis, segment: Segment
-) -> dict[str, Frame]:
-    """Project EKF2's state, EKF2's variances and the ground truth onto an axis."""
-    state: Frame
-    variance: Frame
+) -> dict[str, TableOrUnavailable]:
+    """Project EKF2's state, EKF2's variances and ground truth onto an axis."""
+    state: TableOrUnavailable
+    variance: TableOrUnavailable
     if isinstance(ekf2, Unavailable):
         state = variance = ekf2
     else:
@@ -128,7 +134,10 @@ def project_tracks(
 
 
 def _summarise_filter(
-    innovations: Frame, variance: Frame, truth: ErrorsAgainstTruth | Unavailable, gate: float
+    innovations: TableOrUnavailable,
+    variance: TableOrUnavailable,
+    truth: ErrorsAgainstTruth | Unavailable,
+    gate: float,
 ) -> FilterSummary | UntestedFilter:
     sigmas: dict[str, Any] = {
         name: float(np.sqrt(values.median())) if len(values) else None
@@ -151,17 +160,19 @@ def _summarise_filter(
     return UntestedFilter(**structs.asdict(innovations), **sigmas, truth=truth)
 
 
-def _known_values(frame: Frame, column: str) -> pd.Series:
-    return pd.Series(dtype=float) if isinstance(frame, Unavailable) else frame[column].dropna()
+def _known_values(table: TableOrUnavailable, column: str) -> pd.Series:
+    return pd.Series(dtype=float) if isinstance(table, Unavailable) else table[column].dropna()
 
 
-def difference_statistics(kf_run: Replay, ekf2_state: Frame) -> Difference | Unavailable:
+def difference_statistics(
+    kf_run: Replay, ekf2_state: TableOrUnavailable
+) -> Difference | Unavailable:
     """Compute the difference KF - EKF2 along one axis at EKF2's sample times."""
     if isinstance(ekf2_state, Unavailable):
         return ekf2_state
     kf_minus_ekf2 = (
         np.array(state_at(kf_run, ekf2_state.index.to_numpy()))
-        - ekf2_state[[*STATE_COLUMNS]].to_numpy().T
+        - ekf2_state[STATE_COLUMNS].to_numpy().T
     )
     position_m, velocity_m_s = kf_minus_ekf2[:, np.isfinite(kf_minus_ekf2).all(axis=0)]
     if len(position_m) < projection.MIN_COMMON_SAMPLES:
@@ -186,16 +197,16 @@ def _rmse(error: Array) -> float:
 
 
 def kf_error_statistics(
-    kf_run: Replay, truth: Frame, ekf2_state: Frame
+    kf_run: Replay, truth: TableOrUnavailable, ekf2_state: TableOrUnavailable
 ) -> ErrorsAgainstTruth | Unavailable:
-    """Compute the errors of KF against ground truth, at EKF2's sample times if available."""
+    """Compute the errors of KF against ground truth, if possible at EKF2's sample times."""
     return error_statistics(*_kf_track(kf_run, ekf2_state), truth)
 
 
-def _kf_track(kf_run: Replay, ekf2_state: Frame) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return state and variances of KF at EKF2's sample times, else at KF's prediction times."""
-    time_frame = kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state
-    return kf_state_and_variance(kf_run, time_frame.index.to_numpy())
+def _kf_track(kf_run: Replay, ekf2_state: TableOrUnavailable) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return state and variances of KF at EKF2's sample times; without EKF2, at KF's steps."""
+    timed_rows = kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state
+    return kf_state_and_variance(kf_run, timed_rows.index.to_numpy())
 
 
 def kf_state_and_variance(kf_run: Replay, times_s: Array) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -210,12 +221,12 @@ def kf_state_and_variance(kf_run: Replay, times_s: Array) -> tuple[pd.DataFrame,
 
 
 def error_statistics(
-    state: Frame, variance: Frame, truth: Frame
+    state: TableOrUnavailable, variance: TableOrUnavailable, truth: TableOrUnavailable
 ) -> ErrorsAgainstTruth | Unavailable:
     """Compute the errors of a filter against ground truth along one axis.
 
-    Variances are interpolated to the times of ``state``, because PX4 logs those of EKF2 at a tenth
-    of the rate.
+    Variances are interpolated to the times of ``state``, because PX4 logs them at a tenth of the
+    rate of EKF2's state.
     """
     if isinstance(state, Unavailable):
         return state
@@ -241,7 +252,7 @@ def error_statistics(
     )
 
 
-def _horizon_nees(horizon_state: pd.DataFrame | None, truth: Frame) -> float | None:
+def _horizon_nees(horizon_state: pd.DataFrame | None, truth: TableOrUnavailable) -> float | None:
     if horizon_state is None or isinstance(truth, Unavailable):
         return None
     errors_m = _errors(horizon_state, truth, "position_m")
@@ -253,8 +264,8 @@ def _errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
     return np.asarray(state[column].to_numpy() - true_values)
 
 
-def reported_sigma(time_s: Array, variance: Frame, column: str) -> Array:
-    """Return the reported σ, interpolated to ``time_s``; NaN where unknown."""
+def reported_sigma(time_s: Array, variance: TableOrUnavailable, column: str) -> Array:
+    """Interpolate the reported σ to the times ``time_s``; NaN if it is unknown."""
     known_variance = _known_values(variance, column)
     if known_variance.empty:
         return np.full(len(time_s), np.nan)
@@ -270,16 +281,16 @@ def _mean_nees(normalised_errors: Array) -> float | None:
     )
 
 
-def position_errors(axis_result: AxisComparison, filter_name: FilterName) -> Frame:
+def position_errors(axis_result: AxisComparison, filter_name: FilterName) -> TableOrUnavailable:
     """Return position errors against ground truth and reported σ (m) of one filter along an axis.
 
-    The index is the time (s) of EKF2's published state or, without EKF2, of KF's predictions. The
-    columns are ``error_m`` and ``sigma_m``; NaN where unknown.
+    The columns are ``error_m`` and ``sigma_m``, NaN if unknown. The index is the time (s) of EKF2's
+    published state or, without EKF2, of KF's predictions.
     """
     if isinstance(axis_result.truth, Unavailable):
         return axis_result.truth
     state: pd.DataFrame
-    variance: Frame
+    variance: TableOrUnavailable
     if filter_name == "kf":
         state, variance = _kf_track(axis_result.replay, axis_result.ekf2_state)
     elif isinstance(axis_result.ekf2_state, Unavailable):
@@ -295,7 +306,7 @@ def position_errors(axis_result: AxisComparison, filter_name: FilterName) -> Fra
 def normalised_position_errors(
     axis_result: AxisComparison, filter_name: FilterName
 ) -> tuple[Array, Array] | Unavailable:
-    """Return the times (s), and the position errors against ground truth ÷ reported σ."""
+    """Return times (s), and ratios of position error against ground truth to reported σ."""
     errors = position_errors(axis_result, filter_name)
     if isinstance(errors, Unavailable):
         return errors
@@ -311,17 +322,17 @@ def normalised_position_errors(
     return normalised_errors.index.to_numpy(), normalised_errors.to_numpy()
 
 
-def _horizontal_nis(frames: Mapping[str, Frame]) -> HorizontalNis | None:
+def _horizontal_nis(axis_innovations: Mapping[str, TableOrUnavailable]) -> HorizontalNis | None:
     columns = ["innovation_m", "innovation_variance_m2"]
-    frames_of_axes = [
-        frame[columns]
+    tables = [
+        table[columns]
         for name in ("north", "east")
-        if isinstance(frame := frames.get(name), pd.DataFrame)
+        if isinstance(table := axis_innovations.get(name), pd.DataFrame)
     ]
-    if len(frames_of_axes) < 2:
+    if len(tables) < 2:
         return None
-    # keep updates with innovations along both axes (same timestamp)
-    north_and_east = pd.concat(frames_of_axes, axis=1, join="inner").to_numpy().T
+    # Only updates with innovations along both axes (equal timestamps) are used
+    north_and_east = pd.concat(tables, axis=1, join="inner").to_numpy().T
     return assess_horizontal(
         (north_and_east[0], north_and_east[1]), (north_and_east[2], north_and_east[3])
     )

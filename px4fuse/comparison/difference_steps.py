@@ -1,8 +1,8 @@
 """Explanation of the difference KF - EKF2 along each horizontal axis, in sentences.
 
-KF's settings and equations are replaced by those of EKF2, one property at a time
-(:mod:`px4fuse.ekf2.steps`). The sentences describe the two properties of EKF2 that reduce the
-difference most.
+Settings and equations of KF are replaced by those of EKF2, one property at a time
+(:mod:`px4fuse.ekf2.steps`). The sentences describe the two properties that reduce the difference
+most.
 """
 
 from collections.abc import Mapping
@@ -30,14 +30,15 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
-# The report calls the position RMSEs of KF and EKF2 equal up to this relative difference
+# The position RMSEs of KF and EKF2 are reported as equal up to this relative difference
 EQUAL_RMSE_TOLERANCE = 0.05
-# Minimum fraction of the mean square difference KF - EKF2 that a reported second cause explains
+# The second largest contribution is reported if it explains at least this fraction of the mean
+# square difference KF - EKF2
 MIN_NOTABLE_FRACTION = 0.05
-# A KF noise setting that differs from its estimate by this factor is replaced by the estimate
-# before the difference KF - EKF2 is explained
+# If a noise setting of KF differs from its estimate by at least this factor, the difference KF -
+# EKF2 is explained for KF with the estimate
 MIN_SETTING_RATIO = 4.0
-# Minimum effect (m) on KF's position of a property of EKF2 that the report lists
+# The report omits properties of EKF2 that change KF's position by less than this distance (m)
 MIN_STEP_EFFECT_M = 1e-6
 # Position differences KF - EKF2 outside the replayed times are reported above this value (m)
 MIN_DIFFERENCE_OUTSIDE_REPLAY_M = 0.5
@@ -54,8 +55,8 @@ def explain_ekf2_difference(
 ) -> dict[str, DifferenceExplanation | Unavailable]:
     """Explain the difference KF - EKF2 along each horizontal axis of a comparison.
 
-    ``estimated_noises`` are the noise estimates from :func:`corrected_settings`. If only the down
-    axis was analysed, return the reason why its difference is not explained.
+    ``estimated_noises`` contains the noise estimates from :func:`corrected_settings`. If only the
+    down axis is analysed, return the reason why its difference is not explained.
     """
     axis_results = {
         name: axis_result for name, axis_result in comparison.axes.items() if name != "down"
@@ -93,9 +94,9 @@ def explain_ekf2_difference(
 
 
 def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, float]:
-    """Return noise estimates for the KF settings that are wrong by a large factor.
+    """Return noise estimates for those KF settings that are wrong by a large factor.
 
-    With a very wrong setting, each property of EKF2 alone would remove nearly the whole difference.
+    With a very wrong setting, each property of EKF2 alone would remove most of the difference.
     """
     axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     if axis_tuning is None or comparison.source.origin.is_gnss:
@@ -105,10 +106,10 @@ def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, floa
         ("sigma_a_m_s2", axis_tuning.sigma_a_two_state),
         ("sigma_z_m", axis_tuning.sigma_z),
     ):
-        chosen_value = getattr(comparison.settings, name)
-        if noise.value is None or chosen_value == getattr(Settings(), name):
+        current_value = getattr(comparison.settings, name)
+        if noise.value is None or current_value == getattr(Settings(), name):
             continue
-        if max(chosen_value / noise.value, noise.value / chosen_value) >= MIN_SETTING_RATIO:
+        if max(current_value / noise.value, noise.value / current_value) >= MIN_SETTING_RATIO:
             corrected[name] = float(f"{noise.value:.3g}")
     return corrected
 
@@ -116,7 +117,7 @@ def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, floa
 def explanation_configurations(
     comparison: Comparison, ekf2_inputs: Inputs, estimated_noises: Mapping[str, Any]
 ) -> list[FilterConfiguration]:
-    """Return the EKF2 parameter sets that :func:`explain_ekf2_difference` replays."""
+    """Return the EKF2 configurations that :func:`explain_ekf2_difference` replays."""
     return list(
         steps.step_configurations(
             ekf2_inputs, _comparable_settings(comparison, ekf2_inputs, estimated_noises)
@@ -159,9 +160,9 @@ def add_sentences(
     ----------
     explanation : DifferenceExplanation
     axis_label : str
-        For example "the main axis".
+        Name of the axis, for example "the main axis".
     step_reasons : dict
-        How KF and EKF2 differ in each property, by the name of the property.
+        Text on the difference between KF and EKF2 in each property, such as the measurement noise.
     """
     step_reasons = {
         **step_reasons,
@@ -207,15 +208,15 @@ def add_sentences(
 
 
 def _effect_text(step: Step, explanation: DifferenceExplanation) -> str:
-    explained_share = step.position_mean_square_m2 / explanation.position_mean_square_m2
-    # the fractions of all properties add up to 100 %: above 100 %, others increase the difference
+    explained_fraction = step.position_mean_square_m2 / explanation.position_mean_square_m2
+    # The fractions of all properties add up to 1. If one is above 1, others are negative
     increase_text = (
-        " Other properties of EKF2 increase the difference." if explained_share > 1.0 else ""
+        " Other properties of EKF2 increase the difference." if explained_fraction > 1.0 else ""
     )
     return (
         f"With EKF2's {step.name}, KF's position changes by up to {step.position_moved_m:.2f} m "
         f"(at {step.moved_at_s:.1f} s), and the mean square difference KF - EKF2 decreases by "
-        f"{100 * explained_share:.0f} %.{increase_text}"
+        f"{100 * explained_fraction:.0f} %.{increase_text}"
     )
 
 

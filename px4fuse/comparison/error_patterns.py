@@ -1,8 +1,8 @@
-"""Patterns in the errors of a position source: jitter, noise that grows with speed, and others.
+"""Patterns in the errors of a position source: jitter, noise that increases with speed, and others.
 
-White noise and timestamp jitter are found without ground truth: each position is compared with the
-cubic through its four neighbours, which removes the motion. Slow errors are compared with ground
-truth: a fit removes a constant, a scale factor, a rotation and a time offset.
+White noise and timestamp jitter are found without ground truth: each position is compared with a
+cubic polynomial through its four neighbours, which removes the motion. Slow errors are the
+differences from ground truth, without constant, scale factor, rotation and time offset.
 """
 
 from typing import NamedTuple
@@ -19,35 +19,38 @@ from px4fuse.flight.model import Columns, Ekf2, Unavailable, rows_between
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_vector
 from px4fuse.trajectory.scores import autocorrelation_time
 
-# Minimum number of positions in which error patterns are searched
+# Minimum number of positions for a search of error patterns
 MIN_POSITIONS = 100
 # Rows of the neighbours of a position, relative to its row
 NEIGHBOURS = np.array([-2, -1, 1, 2])
-# Maximum time from the first to the last neighbour, in median intervals: across gaps the cubic
-# interpolation is inaccurate
+# Maximum time from the first to the last neighbour of a position, in median intervals: cubic
+# interpolation across a gap is inaccurate
 MAX_NEIGHBOUR_SPAN = 8.0
-# Residuals whose σ exceeds this multiple of the position σ are not used
+# Residuals are not used if the interpolation increases their σ to more than this multiple of the σ
+# of a position
 MAX_RESIDUAL_NOISE_GAIN = 4.0
-# Number of timestamps in the running median: it follows lost positions, but not jitter
+# Number of timestamps in the running median, which removes missing positions but not jitter
 MEDIAN_TIMESTAMP_COUNT = 9
 # Half of the time (s) over which the velocity is averaged
 HALF_VELOCITY_S = 0.3
-# Number of residuals per independent residual: successive residuals share neighbours
+# Number of residuals for each independent residual: successive residuals have common neighbours
 SHARED_RESIDUALS = 3
 # Minimum timestamp jitter (s, 1 σ): an error of 1 cm at 1 m/s
 MIN_JITTER_S = 0.008
-# Jitter causes the residuals if their ratio to jitter · velocity is in this range
+# Jitter is confirmed if the ratio of position residuals to timestamp residual · velocity is in this
+# range
 JITTER_RATIOS = 0.6, 1.5
-# Minimum fraction of the white errors (RMS) that jitter must explain
+# Minimum ratio of the errors due to jitter to all white errors (RMS) to report jitter
 MIN_JITTER_FRACTION = 0.4
-# Minimum significance (σ) of jitter, and of noise that grows with speed
+# Minimum significance (σ) of jitter, and of noise that increases with speed
 MIN_PATTERN_SIGMAS = 6.0
-# Number of flight parts in which the growth with speed is tested, and its minimum median
-# significance (σ)
+# Number of flight parts in each of which the increase of noise with speed is tested, and minimum
+# median of its significance (σ)
 PART_COUNT, MIN_PART_SIGMAS = 5, 1.2
-# Speed quantiles: below the first the vehicle is slow, above the second it is fast
+# Quantiles of the speed: below the first, the vehicle is slow; above the second, it is fast
 SLOW_FRACTION, FAST_FRACTION = 0.3, 0.7
-# Noise grows with speed if it is larger by this factor at high speed, along and across the motion
+# Minimum ratio of the noise at high speed to the noise at low speed, both along and across the
+# motion, to report noise that increases with speed
 MIN_SPEED_NOISE_RATIO = 1.6
 # Minimum extent (m, RMS) of a path whose errors are fitted to ground truth
 MIN_PATH_RMS_M = 0.5
@@ -57,20 +60,20 @@ DRIFT_WINDOW_S = 12.0
 OFFSET_PART_S = 4.0
 # Minimum RMS speed (m/s) of a flight part whose time offset is estimated
 MIN_OFFSET_SPEED_M_S = 0.3
-# Minimum range (s) of a time offset that varies: an error of 8 cm at 1 m/s
+# Minimum range (s) of a varying time offset to report it: a position error of 8 cm at 1 m/s
 MIN_OFFSET_RANGE_S = 0.08
-# Minimum ratio of the mean square slow error to that of the white noise: below, the fit of many
-# offsets only fits noise
+# Minimum ratio of the mean square slow error to the variance of white noise: otherwise the time
+# offsets of many flight parts would only fit noise
 MIN_SLOW_RATIO = 0.25
-# Maximum fraction of the mean square slow error that remains after a fit of varying time offsets
+# Varying time offsets explain the slow error if at most this fraction of its mean square remains
 MAX_REMAINING_FRACTION = 0.2
-# Minimum fraction of the mean square slow error that a sinusoid explains
+# A sinusoidal error is reported if it explains at least this fraction of the mean square slow error
 MIN_PERIODIC_FRACTION = 0.88
-# Minimum amplitude of a sinusoid, in σ of the white noise
+# Minimum ratio of the amplitude of a sinusoidal error to the σ of white noise
 MIN_AMPLITUDE_SIGMAS = 1.0
-# Minimum number of periods in the flight
+# Minimum number of periods of a sinusoidal error in the flight
 MIN_PERIODS = 5.0
-# Maximum tested frequency (Hz)
+# Maximum tested frequency (Hz) of a sinusoidal error
 MAX_FREQUENCY_HZ = 2.0
 # Distance of the tested frequencies, in periods in the flight
 FREQUENCY_STEP_PERIODS = 0.2
@@ -78,19 +81,22 @@ FREQUENCY_STEP_PERIODS = 0.2
 MIN_BINS_PER_PERIOD = 30
 # Maximum fraction of the mean square motion at the frequency of a sinusoidal error
 MAX_MOTION_FRACTION = 0.1
-# Interval (s) and limit (s) of the tested delays of the logged attitude
+# Interval and maximum (s) of the tested delays of the logged attitude
 DELAY_STEP_S, MAX_ATTITUDE_DELAY_S = 0.01, 0.5
 # Minimum delay (s) of the logged attitude that is reported
 MIN_ATTITUDE_DELAY_S = 0.04
-# Maximum number of compared rotations, which limits the time for a long flight
+# Maximum number of rotations from attitude and gyroscopes that are compared, to limit the computing
+# time
 MAX_ROTATIONS = 20_000
-# Interval (s) of the compared rotations
+# Time (s) over which a rotation from attitude is compared with the rotation from gyroscopes
 ROTATION_STEP_S = 0.1
-# Maximum difference (rad) of rotations: larger differences are resets of the attitude
+# Larger differences (rad) of these rotations are due to resets of the attitude
 MAX_ROTATION_RAD = 0.2
-# A delay of the attitude must reduce the mean square rotation difference to this fraction
+# A delay of the attitude is reported if its correction reduces the mean square rotation difference
+# to less than this fraction
 MAX_DELAYED_RATIO = 0.5
-# Minimum speed (m/s), and minimum noise (m) at this speed, for noise that grows with speed
+# Minimum speed (m/s) of the fast part of a flight, and minimum noise (m) at this speed, to report
+# noise that increases with speed
 MIN_FAST_M_S, MIN_FAST_NOISE_M = 0.3, 0.02
 # Ratio of the standard deviation to the median absolute value of normal noise
 SIGMA_PER_MEDIAN = 1.4826
@@ -106,11 +112,11 @@ class SpeedNoise(NamedTuple):
 
 
 class WhiteErrors(NamedTuple):
-    """Residuals of positions and timestamps against the cubic through their neighbours.
+    """Residuals of positions and timestamps against a cubic polynomial through their neighbours.
 
-    ``residual_m``, shape (n, 2), is divided by the noise gain of the cubic: its σ is that of a
-    position. ``late_s``, divided by the same gain, is the residual of the deviation (s) of the
-    timestamps from a constant rate. ``ekf2_speed_m_s`` is the horizontal speed from EKF2.
+    ``residual_m``, shape (n, 2), contains the residuals of the positions, and ``late_s`` those of
+    the timestamps' deviation (s) from a constant rate. Both are scaled so that their σ is that of a
+    single position or timestamp. ``ekf2_speed_m_s`` is EKF2's horizontal speed.
     """
 
     residual_m: Array
@@ -120,10 +126,10 @@ class WhiteErrors(NamedTuple):
 
 
 class ErrorFit(NamedTuple):
-    """Errors of a source against ground truth, explained by constants.
+    """Fit of a constant, scale factor, rotation and time offset to the errors of a source.
 
-    ``remaining_m``, shape (n, 2), is the error without constant, scale factor, rotation and time
-    offset; ``columns``, shape (n, 2, 5), are their effects.
+    ``remaining_m``, shape (n, 2), is the error against ground truth that the fit does not explain.
+    ``columns``, shape (n, 2, 5), contains the effects of the fitted parameters.
     """
 
     time_s: Array
@@ -135,14 +141,13 @@ class ErrorFit(NamedTuple):
     scale: float
     scale_sigma: float
 
-    @property
-    def slow_square_m2(self) -> float:
-        """Mean square slow error (m²), summed over both axes; the white noise is subtracted."""
+    def compute_slow_square_m2(self) -> float:
+        """Return the mean square (m²) of the remaining error of both axes, without white noise."""
         return float(np.mean(self.remaining_m**2, axis=0).sum()) - 2.0 * self.white_m**2
 
 
 class PeriodicError(NamedTuple):
-    """Sinusoidal position error; ``fraction`` is its share of the mean square slow error."""
+    """Sinusoidal position error; it explains ``fraction`` of the mean square slow error."""
 
     period_s: float
     amplitude_m: float
@@ -170,7 +175,10 @@ def _positions(comparison: Comparison) -> tuple[Array, Array]:
 
 
 def white_errors(comparison: Comparison) -> WhiteErrors | None:
-    """Compare each position with the cubic through its neighbours; None with too few positions."""
+    """Compare each position with a cubic polynomial through its neighbours.
+
+    Return None with too few positions.
+    """
     time_s, position_m = _positions(comparison)
     if len(time_s) < MIN_POSITIONS:
         return None
@@ -184,17 +192,19 @@ def white_errors(comparison: Comparison) -> WhiteErrors | None:
     )
     weights = np.ones_like(elapsed_s)  # of Lagrange's interpolation at the time of the position
     for row in range(len(NEIGHBOURS)):
-        for other in set(range(len(NEIGHBOURS))) - {row}:
-            weights[:, row] *= elapsed_s[:, other] / (elapsed_s[:, other] - elapsed_s[:, row])
+        for other_row in set(range(len(NEIGHBOURS))) - {row}:
+            other_s = elapsed_s[:, other_row]
+            weights[:, row] *= other_s / (other_s - elapsed_s[:, row])
     noise_gain = np.sqrt(1.0 + np.sum(weights**2, axis=1))
     phase_s = time_s - interval_s * np.arange(len(time_s))
     late_s = phase_s - median_filter(phase_s, MEDIAN_TIMESTAMP_COUNT, mode="nearest")
     half_window_rows = max(2, round(HALF_VELOCITY_S / interval_s))
-    first, last = (
+    first_row, last_row = (
         np.clip(rows - half_window_rows, 0, None),
         np.clip(rows + half_window_rows, None, len(time_s) - 1),
     )
-    velocity_m_s = (position_m[last] - position_m[first]) / (time_s[last] - time_s[first])[:, None]
+    travelled_m = position_m[last_row] - position_m[first_row]
+    velocity_m_s = travelled_m / (time_s[last_row] - time_s[first_row])[:, None]
     is_accurate = noise_gain < MAX_RESIDUAL_NOISE_GAIN
 
     def residual(values: Array) -> Array:
@@ -217,8 +227,7 @@ def white_errors(comparison: Comparison) -> WhiteErrors | None:
 def find_timestamp_jitter(errors: WhiteErrors) -> float | None:
     """Return the jitter (s, 1 σ) of the timestamps if the position errors confirm it.
 
-    A position that is measured at a constant interval, but has a late timestamp, lies behind the
-    position of its neighbours by delay · velocity.
+    If a position has a late timestamp, it is behind the interpolated position by delay · velocity.
     """
     expected_m = -errors.velocity_m_s * errors.late_s[:, None]
     expected_square_m2 = float(np.sum(expected_m**2))
@@ -226,8 +235,8 @@ def find_timestamp_jitter(errors: WhiteErrors) -> float | None:
     if jitter_s < MIN_JITTER_S or not expected_square_m2:
         return None
     ratio = float(np.sum(errors.residual_m * expected_m)) / expected_square_m2
-    rest_m = errors.residual_m - ratio * expected_m
-    sigma = np.sqrt(SHARED_RESIDUALS * np.mean(rest_m**2) / expected_square_m2)
+    unexplained_m = errors.residual_m - ratio * expected_m
+    sigma = np.sqrt(SHARED_RESIDUALS * np.mean(unexplained_m**2) / expected_square_m2)
     fraction = np.sqrt(expected_square_m2 / np.sum(errors.residual_m**2))
     is_jitter = (
         JITTER_RATIOS[0] < ratio < JITTER_RATIOS[1]
@@ -238,13 +247,13 @@ def find_timestamp_jitter(errors: WhiteErrors) -> float | None:
 
 
 def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
-    """Return the noise at low and high speed if it grows with speed in all directions."""
-    # differences of the positions would give a speed that contains their noise
+    """Return the noise at low and high speed if it increases with speed in all directions."""
+    # The speed is from EKF2, because a speed from the positions would contain their noise
     speed_m_s = errors.ekf2_speed_m_s
     if speed_m_s is None:
         return None
     sizes_m = np.linalg.norm(errors.residual_m, axis=1)
-    # noise that is larger in one part of the flight correlates with speed in a few parts only
+    # If the noise is only larger in one part of the flight, few parts show a correlation with speed
     significances = [
         rank_correlation(sizes_m[part], speed_m_s[part]) * np.sqrt(len(part) / SHARED_RESIDUALS)
         for part in (np.arange(len(sizes_m)), *np.array_split(np.arange(len(sizes_m)), PART_COUNT))
@@ -262,7 +271,7 @@ def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
     direction = errors.velocity_m_s / np.maximum(source_speed_m_s, 1e-6)
     along_m = np.abs(np.sum(errors.residual_m * direction, axis=1))
     across_m = np.abs(np.sum(errors.residual_m * _rotate_90(direction), axis=1))
-    # jitter of the timestamps causes errors along the motion only
+    # Jitter of the timestamps causes errors along the motion only
     if any(
         np.median(part_m[is_fast]) < MIN_SPEED_NOISE_RATIO * np.median(part_m[is_slow])
         for part_m in (along_m, across_m)
@@ -306,10 +315,10 @@ def fit_errors(comparison: Comparison, white: WhiteErrors) -> ErrorFit | None:
     )
     error_m = position_m - curve(time_s)
     parameters, remaining_m = _least_squares(columns, error_m)
-    # successive errors are correlated
+    # Successive errors are correlated, so fewer errors are independent
     interval_s = float(np.median(np.diff(time_s)))
-    independent = len(time_s) / max(*map(autocorrelation_time, remaining_m.T), 1.0)
-    sigma = np.sqrt(np.mean(remaining_m**2) / (path_square_m2 * independent))
+    independent_count = len(time_s) / max(*map(autocorrelation_time, remaining_m.T), 1.0)
+    sigma = np.sqrt(np.mean(remaining_m**2) / (path_square_m2 * independent_count))
     if comparison.source.origin.may_drift:
         width = max(1, round(DRIFT_WINDOW_S / interval_s))
 
@@ -331,19 +340,22 @@ def fit_errors(comparison: Comparison, white: WhiteErrors) -> ErrorFit | None:
 
 
 def _least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
-    """Return the parameters and the residuals of a fit; ``columns`` has the shape (n, 2, k)."""
+    """Fit ``columns``, shape (n, 2, k), to values; return the k parameters and the residuals."""
     rows = columns.reshape(-1, columns.shape[-1])
     parameters = np.asarray(np.linalg.lstsq(rows, values.ravel(), rcond=None)[0], dtype=np.float64)
     return parameters, values - columns @ parameters
 
 
 def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
-    """Return the sinusoid that explains most of the slow errors; None if the motion contains it."""
+    """Find a sinusoidal error that explains most of the slow error.
+
+    Return None without such an error, or if the motion contains its frequency.
+    """
     duration_s = fit.time_s[-1] - fit.time_s[0]
     highest_hz = min(MAX_FREQUENCY_HZ, 0.25 / float(np.median(np.diff(fit.time_s))))
     step_hz = FREQUENCY_STEP_PERIODS / duration_s
     rows = slice(round(MIN_PERIODS / FREQUENCY_STEP_PERIODS), int(np.ceil(highest_hz / step_hz)))
-    if rows.stop <= rows.start or fit.slow_square_m2 <= 0.0:
+    if rows.stop <= rows.start or fit.compute_slow_square_m2() <= 0.0:
         return None
     # errors in bins of equal length have the spectrum of all frequencies in one FFT
     bin_count = 2 ** int(np.ceil(np.log2(MIN_BINS_PER_PERIOD * highest_hz / step_hz)))
@@ -360,7 +372,10 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     motion_fraction = mean_squares(fit.path_m, frequency_hz) / np.mean(
         np.sum(fit.path_m**2, axis=1)
     )
-    amplitude_m, fraction = float(np.sqrt(2.0 * square_m2)), square_m2 / fit.slow_square_m2
+    amplitude_m, fraction = (
+        float(np.sqrt(2.0 * square_m2)),
+        square_m2 / fit.compute_slow_square_m2(),
+    )
     if (
         fraction < MIN_PERIODIC_FRACTION
         or amplitude_m < MIN_AMPLITUDE_SIGMAS * fit.white_m
@@ -371,10 +386,10 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
 
 
 def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
-    """Return the range of the time offset if its variation explains the slow errors.
+    """Return the range of the time offset in flight if its variation explains the slow error.
 
-    The time offsets of all flight parts and the constants of :class:`ErrorFit` are fitted together.
-    At rest a time offset causes no error, so jumps and slow errors are not explained.
+    The time offsets of all flight parts and the parameters of :class:`ErrorFit` are fitted
+    together. A time offset causes no error at rest, so it does not explain a jump or drift.
     """
     parts = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_S).astype(int)
     square_sums = np.bincount(parts, np.sum(fit.velocity_m_s**2, axis=1))
@@ -394,15 +409,15 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
 
     # the constants without the constant time offset, and the error
     columns = np.concatenate([fit.columns[..., :-1], fit.remaining_m[..., None]], axis=-1)
-    offsets_of_columns_s = fit_offsets(columns)
-    columns -= effect[:, :, None] * offsets_of_columns_s[parts, None]
+    offsets_by_column_s = fit_offsets(columns)
+    columns -= effect[:, :, None] * offsets_by_column_s[parts, None]
     parameters, remaining_m = _least_squares(columns[..., :-1], columns[..., -1])
-    offsets_s = (offsets_of_columns_s @ np.append(-parameters, 1.0))[moving_parts]
+    offsets_s = (offsets_by_column_s @ np.append(-parameters, 1.0))[moving_parts]
     remaining_square_m2 = float(np.mean(remaining_m**2, axis=0).sum()) - 2.0 * fit.white_m**2
     if (
         np.ptp(offsets_s) < MIN_OFFSET_RANGE_S
-        or fit.slow_square_m2 < MIN_SLOW_RATIO * 2.0 * fit.white_m**2
-        or remaining_square_m2 > MAX_REMAINING_FRACTION * fit.slow_square_m2
+        or fit.compute_slow_square_m2() < MIN_SLOW_RATIO * 2.0 * fit.white_m**2
+        or remaining_square_m2 > MAX_REMAINING_FRACTION * fit.compute_slow_square_m2()
     ):
         return None
     times_s = fit.time_s[0] + OFFSET_PART_S * (moving_parts + 0.5)
@@ -438,7 +453,7 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
             rotation_rad - (np.array(angles)[:, step_rows:] - np.array(angles)[:, :-step_rows]).T
         )
         differences_rad -= np.median(differences_rad, axis=0)  # the gyroscope bias
-        # limit each difference: resets of the attitude exceed the rotations of a multicopter
+        # Each difference is limited, because resets of the attitude cause large differences
         sizes_rad = np.minimum(np.linalg.norm(differences_rad, axis=1), MAX_ROTATION_RAD)
         return float(np.mean(sizes_rad**2))
 

@@ -1,7 +1,7 @@
 """Estimates of noises, time offset, yaw misalignment and errors of the position source.
 
-A source that may drift (odometry) has a smooth but wrong path: innovations are small although the
-position error is large. Its noise estimates do not contain the drift (``Origin.may_drift``).
+If the source drifts (odometry), innovations are small, although the position error is large. The
+noise estimates do not contain the drift.
 """
 
 from collections.abc import Callable, Mapping
@@ -39,14 +39,15 @@ MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
 # Minimum IMU rate (Hz) of telemetry: PX4 publishes vehicle_imu at 200 Hz (IMU_INTEG_RATE), and
 # slower telemetry skips samples
 MIN_TELEMETRY_IMU_HZ = 200.0
-# Minimum ratio of the measured IMU rate to the needed one: measured rates are up to 2 % lower
+# Minimum ratio of the measured IMU rate to the required rate: measured rates are up to 2 % lower
 MIN_IMU_RATE_RATIO = 0.98
 TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
-# Minimum number of time offset estimates before and after a tested change in flight
+# A change of the time offset in flight is tested with at least this number of estimates before and
+# after it
 MIN_PARTS_PER_SIDE = 2
 
-# Axes with a noise estimate in the report; north and east share one estimate
+# Axes with a noise estimate in the report; north and east have a common estimate
 REPORTED_AXES = (HORIZONTAL, "down")
 
 Progress = Callable[[str], None]
@@ -66,7 +67,7 @@ class Estimates:
     heading : HeadingError or Unavailable
         Yaw misalignment of the position frame.
     tuning_by_axis : tuple of AxisTuning
-        Noises along north and along east if they differ; empty for GNSS and odometry.
+        Separate noises along north and east, if they differ; empty for GNSS and odometry.
     noisy_part : NoisyPart or None
         Time span in which most innovations are larger; None for odometry.
     """
@@ -86,7 +87,7 @@ def ignore_progress(_: str) -> None:
 
 
 def first_axis_tuning(tuning: Tuning, *names: str) -> AxisTuning | None:
-    """Return the first noise estimate that exists, in the order of the axis names."""
+    """Return the noise estimate of the first of the named axes that has one."""
     axis_tunings = map(tuning.get, names)
     return next(
         (axis_tuning for axis_tuning in axis_tunings if isinstance(axis_tuning, AxisTuning)), None
@@ -94,7 +95,7 @@ def first_axis_tuning(tuning: Tuning, *names: str) -> AxisTuning | None:
 
 
 def value_or_bound(noise: Noise, fallback: float) -> float:
-    """Return the estimate of a noise, else its upper bound, else ``fallback``."""
+    """Return the estimate of a noise. Without estimate, its upper bound, or else ``fallback``."""
     return noise.value or noise.high or fallback
 
 
@@ -235,10 +236,10 @@ def _fit_source_errors(
         sigma_z_m=value_or_bound(axis_tuning.sigma_z, settings.sigma_z_m),
         outlier_time_s=axis_tuning.outlier_time_s,
         clock_offset_s=offset_s,
-        announced_s=reset_times_s(comparison.source).tolist(),
+        source_resets_s=reset_times_s(comparison.source).tolist(),
     )
     jumps = systematic_errors.jumps if isinstance(systematic_errors, SystematicErrors) else ()
-    # the exact time of a jump is unknown: exclude measurements just after the jump
+    # The exact time of a jump is unknown, so the measurements directly after it are excluded
     time_s, excluded_s = axes[0].measurement_time_s, axis_tuning.outlier_time_s
     for jump in jumps:
         is_after_jump = (time_s >= jump.time_s) & (time_s < jump.time_s + OUTLIERS_AFTER_STEP_S)
@@ -280,29 +281,29 @@ def _horizontal_axes(
 
 
 def missing_imu_rate(flight: Flight) -> Unavailable | None:
-    """Return the reason if the IMU rate is too low to estimate a time offset.
+    """Return a reason if the IMU rate is too low to estimate a time offset, otherwise None.
 
-    A ULog sample is the mean over its interval. Telemetry sends only the newest of several samples,
-    corrected by EKF2's bias estimate (``HIGHRES_IMU.hpp``), which depends on the tested positions.
+    Telemetry needs a higher rate than a ULog: it sends only the newest of several samples, and
+    subtracts EKF2's bias estimate (``HIGHRES_IMU.hpp``). A ULog sample is the mean of its interval.
     """
     if isinstance(flight.imu, Unavailable) or len(flight.imu) < 2:
         return None
     stream = flight.streams.get("imu")
     is_telemetry = stream is not None and stream.topics[0] in TELEMETRY_IMU
-    needed_hz = MIN_TELEMETRY_IMU_HZ if is_telemetry else MIN_CLOCK_IMU_HZ
+    required_hz = MIN_TELEMETRY_IMU_HZ if is_telemetry else MIN_CLOCK_IMU_HZ
     rate_hz = 1.0 / float(np.median(np.diff(flight.imu.index.to_numpy())))
-    if rate_hz >= MIN_IMU_RATE_RATIO * needed_hz:
+    if rate_hz >= MIN_IMU_RATE_RATIO * required_hz:
         return None
     rate_note = f"the IMU was logged at {rate_hz:.3g} Hz"
     remedy = "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate."
     if is_telemetry:
         rate_note = f"telemetry contains only some of the IMU samples ({rate_hz:.3g} Hz)"
-        remedy = f"Request the IMU message at {needed_hz:g} Hz."
+        remedy = f"Request the IMU message at {required_hz:g} Hz."
         if flight.log.has_ulog:
             remedy = "Give the ULog of this flight as argument LOG."
     return Unavailable(
         "time offset",
-        f"{rate_note}, but an estimate of the time offset needs {needed_hz:g} Hz",
+        f"{rate_note}, but an estimate of the time offset needs {required_hz:g} Hz",
         remedy,
     )
 
@@ -310,8 +311,8 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
 def widen_for_drift(clock_offset: ClockOffset) -> ClockOffset:
     """Widen the 95 % interval of the time offset of a source that may drift (odometry).
 
-    Drift makes the estimates of different parts of the flight differ by more than noise, so the
-    interval is widened by their scatter.
+    Drift increases the scatter of the estimates from different flight parts. The interval is
+    widened by the ratio of this scatter to the σ of the estimates.
     """
     offsets_s = np.array([part.offset_s for part in clock_offset.parts])
     weights = np.array([part.sigma_s**-2.0 for part in clock_offset.parts])
@@ -351,8 +352,8 @@ def _weighted_square_sum(offsets_s: Array, weights: Array) -> float:
 def _largest_step_p_value(offsets_s: Array, weights: Array) -> float | None:
     """Return the p-value of the largest change of the time offset; None for a short flight.
 
-    Student's t-test of the mean offsets before and after each time, with Bonferroni correction.
-    Changes below ``MIN_CHANGE_S`` are ignored.
+    Method: Student's t-test of the mean offsets before and after each time, with Bonferroni
+    correction. Changes below ``MIN_CHANGE_S`` are ignored.
     """
     part_count = len(offsets_s)
     split_rows = range(MIN_PARTS_PER_SIDE, part_count - MIN_PARTS_PER_SIDE + 1)

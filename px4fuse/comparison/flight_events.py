@@ -1,4 +1,4 @@
-"""Events of a flight (gaps, rejections, resets), which the charts mark on their time axes."""
+"""Events of a flight for marks in charts: gaps, rejections, resets, take-off and landing."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,11 +7,11 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.core.arrays import Array
+from px4fuse.core.arrays import Array, intervals_where
 from px4fuse.core.record import Span
 from px4fuse.flight.model import Ekf2, Flight, Unavailable
 
-# Minimum length (s) of a gap in the position source: jitter causes shorter gaps
+# Minimum length (s) of a gap in the position source: jitter causes longer intervals, too
 MIN_GAP_S = 1.0
 # Minimum length of a gap in the position source, in sample intervals
 MIN_GAP_INTERVALS = 5.0
@@ -50,18 +50,18 @@ def max_interval_s(interval_s: float) -> float:
 
 
 def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
-    """Return the time spans (s) without positions; ``rate_hz`` is the rate between gaps."""
+    """Return start and end (s) of each gap in the positions; ``rate_hz`` is their normal rate."""
     is_gap = np.diff(time_s) > max_interval_s(1.0 / rate_hz)
-    return tuple(zip(time_s[:-1][is_gap].tolist(), time_s[1:][is_gap].tolist(), strict=True))
+    return tuple(intervals_where(time_s, is_gap))
 
 
 def airborne_spans(flight: Flight) -> tuple[Span, ...]:
-    """Return the time spans (s) in the air; empty without a land detector."""
+    """Return take-off and landing (s) of each flight; empty without a land detector."""
     return () if isinstance(flight.airborne, Unavailable) else flight.airborne
 
 
 def collect_events(comparison: Comparison) -> Events:
-    """Collect gaps, rejections and resets of a flight."""
+    """Collect the events of a flight."""
     flight, segment = comparison.flight, comparison.segment.flight
     start_s, end_s = segment.start_s, segment.end_s
     time_s = np.concatenate([[start_s], comparison.input_axes[0].measurement_time_s, [end_s]])
@@ -70,7 +70,7 @@ def collect_events(comparison: Comparison) -> Events:
     flight_edges_s = [start_s, *(edge_s for span in airborne for edge_s in span), end_s]
     resets = flight.ekf2.resets if isinstance(flight.ekf2, Ekf2) else ()
     return Events(
-        gaps=source_gaps(time_s, comparison.source.rate_hz),
+        gaps=source_gaps(time_s, comparison.source.compute_rate_hz()),
         dropouts=segment.cut(
             (dropout.start_s, dropout.start_s + dropout.duration_s)
             for dropout in flight.log.dropouts

@@ -1,10 +1,9 @@
-"""Records of a comparison: inputs, results along each axis, and the tracks of both filters."""
+"""Records of a comparison of KF with EKF2: inputs, and results along each axis."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal
 
-import pandas as pd
 from msgspec import structs
 
 from px4fuse.convention.model import Convention
@@ -27,18 +26,17 @@ from px4fuse.filter.consistency import Consistency, HorizontalNis, classify_sigm
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE, Axis, Segment
-from px4fuse.flight.model import Flight, PositionTrack
+from px4fuse.flight.model import Flight, PositionTrack, TableOrUnavailable
 
 FilterName = Literal["kf", "ekf2"]
-Track: TypeAlias = pd.DataFrame | Unavailable
-FILTERS: tuple[FilterName, FilterName] = ("kf", "ekf2")
+FILTER_NAMES: Mapping[FilterName, Literal["KF", "EKF2"]] = {"kf": "KF", "ekf2": "EKF2"}
 
 
 class ErrorsAgainstTruth(Record, kw_only=True):
     """Errors of one filter against ground truth, at the times of EKF2's published state.
 
-    The mean NEES (expected 1) is None without a reported variance. It has no chi-square band,
-    because the errors of one flight are correlated.
+    The mean NEES (expected 1) is None without a reported variance. No chi-square band is given,
+    because the errors in one flight are correlated.
     """
 
     count: Count
@@ -63,7 +61,7 @@ class FilterSummary(Consistency, kw_only=True):
     sigma_p_median_m, sigma_v_median_m_s : float or None
         Median reported σ of position and velocity; None if not logged.
     sigma_p_before_update_m, sigma_p_after_update_m : float or None
-        Median reported position σ before and after an update; for EKF2 from P⁻ = S - R, P⁺ = P⁻R/S.
+        Median reported position σ before and after an update. EKF2: P⁻ = S - R, P⁺ = P⁻R/S.
     truth : ErrorsAgainstTruth or Unavailable
     """
 
@@ -75,7 +73,7 @@ class FilterSummary(Consistency, kw_only=True):
 
 
 class UntestedFilter(Unavailable, kw_only=True):
-    """Reason why a filter was not tested for consistency, with its reported σ and errors."""
+    """Filter that could not be tested for consistency: the reason, its reported σ and errors."""
 
     sigma_p_median_m: Positive | None = None
     sigma_v_median_m_s: Positive | None = None
@@ -97,7 +95,10 @@ class Difference(Record, kw_only=True):
 
 
 class Updates(Record, kw_only=True):
-    """Number and times of KF's updates along one axis; ``input_gap_s``: time without IMU data."""
+    """Number and times of KF's updates along one axis.
+
+    ``input_gap_s`` is the time without IMU data.
+    """
 
     count: Count
     first_s: float
@@ -107,7 +108,7 @@ class Updates(Record, kw_only=True):
 
 
 class AxisComparison(Record, kw_only=True):
-    """Result of the comparison along one axis, with the KF run and the tracks.
+    """Comparison of KF with EKF2 along one axis.
 
     Attributes
     ----------
@@ -116,7 +117,7 @@ class AxisComparison(Record, kw_only=True):
     direction : (float, float, float)
         Unit vector in NED.
     note : str
-        How the axis direction was chosen, for the user.
+        Text for the user on the choice of the axis direction.
     rejected_fraction : float or None
         Fraction of the positions that EKF2 rejected; None if not logged.
     ekf2_state : DataFrame or Unavailable
@@ -125,8 +126,8 @@ class AxisComparison(Record, kw_only=True):
         :attr:`Ekf2.innovations` along the axis, with the position variance before (P⁻ = S - R) and
         after (P⁺ = P⁻R/S) each update.
     flight_tracks : mapping from attribute name to DataFrame or Unavailable
-        EKF2's state and variance and the ground truth over the whole flight; the attributes of the
-        same names cover the analysed segment only.
+        ``ekf2_state``, ``ekf2_variance`` and ``truth`` over the whole flight. The attributes with
+        these names contain only the analysed segment.
     """
 
     heading_deg: float | None = None
@@ -138,21 +139,20 @@ class AxisComparison(Record, kw_only=True):
     rejected_fraction: Share | None = None
     axis: NotWritten[Axis] = NOT_WRITTEN
     replay: NotWritten[Replay] = NOT_WRITTEN
-    ekf2_state: NotWritten[Track] = NOT_WRITTEN
-    ekf2_variance: NotWritten[Track] = NOT_WRITTEN
-    ekf2_innovations: NotWritten[Track] = NOT_WRITTEN
-    truth: NotWritten[Track] = NOT_WRITTEN
-    flight_tracks: NotWritten[Mapping[str, Track]] = NOT_WRITTEN
+    ekf2_state: NotWritten[TableOrUnavailable] = NOT_WRITTEN
+    ekf2_variance: NotWritten[TableOrUnavailable] = NOT_WRITTEN
+    ekf2_innovations: NotWritten[TableOrUnavailable] = NOT_WRITTEN
+    truth: NotWritten[TableOrUnavailable] = NOT_WRITTEN
+    flight_tracks: NotWritten[Mapping[str, TableOrUnavailable]] = NOT_WRITTEN
 
-    @property
-    def in_flight(self) -> "AxisComparison":
-        """Result with the tracks of the whole flight instead of the analysed segment, for plots."""
+    def with_flight_tracks(self) -> "AxisComparison":
+        """Return the result with tracks of the whole flight instead of the segment, for plots."""
         return structs.replace(self, **self.flight_tracks)
 
 
 @dataclass(frozen=True)
 class PreparedComparison:
-    """Inputs of a comparison, before KF runs.
+    """Inputs of a comparison of KF with EKF2, before KF runs.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class PreparedComparison:
     notes : tuple of str
         Notes for the user about the log and about automatic choices.
     convention : Convention or None
-        Detected axes, unit and clock of the sent positions; ``source`` is already converted.
+        Detected axes, unit and clock of the positions as sent; ``source`` is already converted.
     """
 
     flight: Flight
@@ -181,7 +181,7 @@ class PreparedComparison:
 
 @dataclass(frozen=True, repr=False)
 class Comparison(PreparedComparison):
-    """Results of a comparison along each axis, with its inputs.
+    """Results of a comparison of KF with EKF2 along each axis, and its inputs.
 
     Attributes
     ----------

@@ -13,14 +13,14 @@ from px4fuse.flight.model import Unavailable
 
 # Noises are estimated separately along north and east if their mean NIS differ by this factor
 MIN_AXIS_NIS_RATIO = 1.7
-# Maximum number of equal flight parts whose innovations are compared
+# Maximum number of flight parts of equal length whose innovations are compared
 MAX_PART_COUNT = 12
 # Minimum number of measurements in each compared flight part
 MIN_PART_MEASUREMENTS = 25
 
 
 class NoisyPart(NamedTuple):
-    """Time span (s) with larger innovations, and their σ ÷ σ in the rest of the flight."""
+    """Time span (s) with larger innovations than the rest of the flight; ratio of both σ."""
 
     start_s: float
     end_s: float
@@ -53,7 +53,7 @@ def find_noisy_part(
     settings = comparison.settings
     if axis_tuning is None:
         return None
-    # with many noisy measurements the noises cannot be estimated: use the settings of KF
+    # Many noisy measurements prevent an estimate of the noises. KF's settings are then used
     sigma_a: float | None = settings.sigma_a_m_s2
     sigma_z: float | None = settings.sigma_z_m
     outlier_time_s = np.zeros(0)
@@ -71,7 +71,7 @@ def find_noisy_part(
     part_edges = np.linspace(0, len(time_s), part_count + 1).astype(int)
 
     def relative_innovations(is_excluded: BoolArray | None) -> Array:
-        # use sizes relative to the median, because wrong noise settings scale all innovations
+        # Innovations are divided by their median, because wrong noise settings scale all of them
         axis_innovations = [
             innovations(kf_input, sigma_a, sigma_z, is_excluded) for kf_input in kf_inputs
         ]

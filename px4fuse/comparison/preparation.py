@@ -11,6 +11,7 @@ from px4fuse.comparison.projection import observation_variance
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import convention_faults, correct_convention
 from px4fuse.core.text import capitalise_first
+from px4fuse.ekf2.fusion_conditions import constant_coordinates
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
 from px4fuse.filter.settings import SETTING_RANGES, requested_settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
@@ -27,14 +28,15 @@ from px4fuse.flight.model import (
     Unavailable,
     join_flights,
 )
-from px4fuse.readers.mavlink_messages import GNSS_LAYOUTS, POSITION_INPUTS
+from px4fuse.readers.mavlink_messages import POSITION_INPUTS
 from px4fuse.readers.px4_innovations import (
     GNSS,
     GNSS_AND_BAROMETER,
     has_fused_aid,
     with_gnss_innovations,
 )
-from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME
+from px4fuse.readers.px4_positions import NO_FIX_ACTION
+from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME, SOURCE_TRACKS
 from px4fuse.request import ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
@@ -42,22 +44,23 @@ from px4fuse.trajectory.rotation import interpolate, to_matrix
 LOGGED_ORIGINS = ORIGIN_BY_TRACK_NAME | {
     source.track_name: source.origin for source in POSITION_INPUTS
 }
-GNSS_MESSAGES = {layout.topic for layout in GNSS_LAYOUTS}
+POSITION_MESSAGES = dict.fromkeys(source.message for source in POSITION_INPUTS)
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
     "KF uses the only ground truth in the log as its position source",
     "Choose another position source for KF with --position-source.",
 )
-# Default axes for GNSS, without down: one SIGMA_Z does not fit the much noisier GNSS height
-GNSS_AXES = (AISLE, "north", "east")
+# Default axes for GNSS, because one SIGMA_Z does not fit the much noisier GNSS height, and for
+# sources whose height is constant
+HORIZONTAL_AXES = (AISLE, "north", "east")
 
 
 def prepare(
     flight: Flight, request: ComparisonRequest, *, as_sent: bool = False
 ) -> PreparedComparison:
-    """Choose position source, segment and axes of a flight.
+    """Choose position source, segment and axes of a flight for the comparison of KF with EKF2.
 
-    With ``as_sent``, do not check or correct the axes, unit and clock of the source.
+    With ``as_sent``, axes, unit and clock of the positions are neither checked nor corrected.
 
     Raises
     ------
@@ -78,12 +81,12 @@ def prepare(
         )
     source_track = shift_clock(source_track, settings.clock_offset_s)
     is_in_ned = source_track.origin.is_gnss or source_track.origin.path == ALIGNED.path
-    is_withheld = as_sent or is_in_ned or flight.log.is_assessed
-    convention = None if is_withheld else check_convention(flight, source_track)
+    has_no_check = as_sent or is_in_ned or flight.log.is_assessed
+    convention = None if has_no_check else check_convention(flight, source_track)
     if convention is not None and settings.clock_offset_s:  # the user chose the time offset
         convention = structs.replace(convention, late_s=0.0)
     late_s = convention_faults(convention, flight, source_track.frame).late_s
-    # clip to the valid range: a larger offset is then estimated at the edge of the search range
+    # The offset is clipped to its valid range; the estimate of a larger offset is at its limit
     limits_s = SETTING_RANGES["clock_offset_s"][:2]
     clock_offset_s = float(np.clip(settings.clock_offset_s - late_s, *limits_s))
     settings = replace(settings, clock_offset_s=clock_offset_s)
@@ -94,7 +97,10 @@ def prepare(
     flight = select_innovations(flight, source_track)
     missing = flight.missing
     segment = choose_segment(flight, source_track, request.start_s, request.end_s)
-    axis_names = request.axes or (GNSS_AXES if source_track.origin.fused_as_gnss else None)
+    has_height = not source_track.origin.fused_as_gnss and "z" not in constant_coordinates(
+        source_track
+    )
+    axis_names = request.axes or (None if has_height else HORIZONTAL_AXES)
     compared_axes = make_axes(
         flight, source_track, segment, names=axis_names, heading_deg=request.heading_deg
     )
@@ -131,10 +137,10 @@ def prepare(
 
 
 def select_innovations(flight: Flight, track: PositionTrack) -> Flight:
-    """Select EKF2's innovations of the same sensor as the positions: GNSS or external vision."""
+    """Use EKF2's GNSS innovations if the position source is GNSS, otherwise those of vision."""
     if isinstance(flight.ekf2, Unavailable) or not track.origin.fused_as_gnss:
         return flight
-    # do not report missing external vision: KF and EKF2 use GNSS in this flight
+    # KF and EKF2 use GNSS in this flight, so missing external vision is not reported
     missing_vision, streams = _missing_innovations(flight.ekf2), dict(flight.streams)
     ekf2 = with_gnss_innovations(
         flight.ekf2, GNSS if track.barometer is None else GNSS_AND_BAROMETER
@@ -154,10 +160,10 @@ def _missing_innovations(ekf2: Ekf2) -> tuple[Unavailable, ...]:
 
 
 def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrack, str]:
-    """Return the position source and, for the user, the reason for the choice.
+    """Return a position source of the log, and the reason for its choice.
 
-    Without a ``name``, choose the source that was converted least before it was logged; GNSS only
-    if EKF2 fused it.
+    Without a ``name``, a topic with positions as received is preferred to positions that are
+    computed from EKF2's topics. GNSS is chosen only if EKF2 fused it.
 
     Raises
     ------
@@ -183,7 +189,7 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
 
 
 def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
-    """Move the positions from the sensor to the vehicle by EKF2's lever arm."""
+    """Subtract EKF2's lever arm of the sensor, so that positions are those of the vehicle."""
     attitude = flight.attitude
     if not any(track.lever_arm_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
         return track
@@ -202,9 +208,9 @@ def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
 
 
 def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
-    """Shift vision positions to EKF2's origin if EKF2 fused GNSS as well.
+    """Shift vision positions to EKF2's origin if EKF2 also fused GNSS.
 
-    EKF2 then estimates the constant offset of vision, so KF must not see it as a position error.
+    EKF2 then estimates the constant offset of vision, so it is not an error for KF either.
     """
     ekf2 = flight.ekf2
     if not (track.origin.is_vision and isinstance(ekf2, Ekf2) and has_fused_aid(ekf2)):
@@ -232,9 +238,9 @@ def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
 def _use_barometer_height(
     track: PositionTrack, flight: Flight, height_sensor: HeightName | None
 ) -> PositionTrack:
-    """Use the barometer height instead of GNSS height, if requested or if EKF2 did.
+    """Replace GNSS height by barometer height, if requested or if EKF2 fused the barometer only.
 
-    A barometer has no absolute zero, so the median difference to EKF2's height is removed.
+    The zero of a barometer is arbitrary, so its median difference to EKF2's height is removed.
     """
     ekf2, heights, log_name = flight.ekf2, flight.barometer, flight.log.name
     if height_sensor and not track.origin.fused_as_gnss:
@@ -269,15 +275,15 @@ def _use_barometer_height(
 
 
 def explain_missing_source(flight: Flight) -> Unavailable:
-    """Return the reason why the log has no position source, and the action."""
+    """Return the reason why the log has no position source, and the action for the user."""
     damage_text = "the file is damaged, and " if flight.log.damage else ""
-    topics = "vehicle_visual_odometry, motion capture or EKF2 innovations of external vision"
+    topics = f"{', '.join(SOURCE_TRACKS)} or EKF2 innovations of external vision"
     remedy = (
         "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as VISION_POSITION_ESTIMATE, or "
         "give the position file with --position."
     )
     if flight.log.format.startswith("MAVLink"):
-        topics = "VISION_POSITION_ESTIMATE, ODOMETRY or ATT_POS_MOCAP"
+        topics = " or ".join(POSITION_MESSAGES)
         ulog_text = ", or read the ULog of this flight" if flight.log.has_ulog else ""
         remedy = (
             f"give the position file of the positioning system as argument `position`{ulog_text}."
@@ -292,9 +298,10 @@ def explain_missing_source(flight: Flight) -> Unavailable:
     height_only = next((item for item in flight.missing if item.reason == HEIGHT_ONLY_REASON), None)
     if height_only is not None:
         reason = f"{damage_text}{height_only.source}: {HEIGHT_ONLY_REASON}"
-    gnss = next((item for item in flight.missing if item.source in GNSS_MESSAGES), None)
+    gnss = next((item for item in flight.missing if item.remedy == NO_FIX_ACTION), None)
     if gnss is not None:
         reason += f"; {gnss.source}: {gnss.reason}"
+        remedy = f"{gnss.remedy} Or {remedy}"
     if flight.log.autopilot != "PX4":
         reason += f"; the autopilot is {flight.log.autopilot}, so there is no EKF2"
     return Unavailable("position source", reason, capitalise_first(remedy))
@@ -310,7 +317,8 @@ def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
         missing.source
         for missing in flight.missing
         if missing.source in LOGGED_ORIGINS
-        and LOGGED_ORIGINS[missing.source].preference_rank < track.origin.preference_rank
+        and LOGGED_ORIGINS[missing.source].find_preference_rank()
+        < track.origin.find_preference_rank()
     ]
     if not better_sources:
         return f"chosen automatically: positions as received by PX4{origin_text}"
@@ -318,6 +326,7 @@ def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
+    """Add a time offset (s) to all timestamps of a position track."""
     if clock_offset_s == 0.0:
         return track
     shifted_frames = {
@@ -331,9 +340,9 @@ def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
 def choose_segment(
     flight: Flight, track: PositionTrack, start_s: float | None = None, end_s: float | None = None
 ) -> Segment:
-    """Choose the time span to analyse: by default, positions available and vehicle airborne.
+    """Choose the time span to analyse: by default, the longest flight with positions.
 
-    ``start_s`` and ``end_s`` are times that the user chose (seconds from the first data).
+    ``start_s`` and ``end_s`` are the user's limits (seconds from the first data), if any.
 
     Raises
     ------
@@ -347,21 +356,23 @@ def choose_segment(
     if isinstance(flight.airborne, Unavailable):
         reason = "whole duration of the position source (no land detector in the log)"
     elif not flight.airborne:
-        reason = "whole duration of the position source (the vehicle never took off)"
+        reason = "whole duration of the position source (the vehicle stayed on the ground)"
     else:
-        flights = join_flights(flight.airborne)
+        flight_spans_s = join_flights(flight.airborne)
         chosen_start_s, chosen_end_s = max(
-            flights,
+            flight_spans_s,
             key=lambda span: min(span[1], available_end_s) - max(span[0], available_start_s),
         )
         reason = "positions available and vehicle airborne"
-        if len(flights) > 1:
+        if len(flight_spans_s) > 1:
             others_text = ", ".join(
                 f"{start_s:.1f} to {end_s:.1f} s (--start {start_s:.1f} --end {end_s:.1f})"
-                for start_s, end_s in flights
+                for start_s, end_s in flight_spans_s
                 if start_s != chosen_start_s
             )
-            reason += f"; this is the longest of {len(flights)} flights; the others: {others_text}"
+            reason += (
+                f"; this is the longest of {len(flight_spans_s)} flights; the others: {others_text}"
+            )
         if not max(chosen_start_s, available_start_s) < min(chosen_end_s, available_end_s):
             chosen_start_s = min(chosen_start_s, available_start_s)
             chosen_end_s = max(chosen_end_s, available_end_s)

@@ -1,4 +1,4 @@
-"""Projection of EKF2 and ground truth onto one axis, and removal of EKF2 resets."""
+"""Projection of EKF2's data and ground truth onto one axis, and removal of EKF2's resets."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -24,7 +24,7 @@ from px4fuse.flight.model import (
 
 # Minimum measurement noise √R (m) that EKF2 uses (ev_pos_control.cpp, EKF2.cpp)
 EKF2_MIN_NOISE_M = 0.01
-# Minimum number of common samples of two tracks whose difference is evaluated
+# Minimum number of common times of two tracks to compute statistics of their difference
 MIN_COMMON_SAMPLES = 3
 # NED columns of each projected quantity, and exponent of the direction cosines (2 for variances)
 PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
@@ -33,25 +33,25 @@ PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
     "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
 }
-# Resets are removed if this lowers EKF2's median squared distance to the positions to at most this
-# fraction
+# Resets are removed if this reduces EKF2's median squared distance from the positions to less than
+# this fraction
 MAX_DISTANCE_RATIO = 0.95
 
 
 def continuous_state(
     ekf2: Ekf2, track: PositionTrack, segment: Segment
 ) -> tuple[pd.DataFrame, str]:
-    """Remove the resets that only move the origin of EKF2's frame.
+    """Remove the resets of EKF2's position that only move the origin of its frame.
 
-    Resets are removed if EKF2 is closer to the measurements without them (median distance). All
-    other resets correct an error of EKF2 and remain.
+    Resets are removed if this reduces the median distance of EKF2 from the measured positions. All
+    other resets correct an error of EKF2 and are not removed.
 
     Returns
     -------
     state : DataFrame
         Position and velocity as in :attr:`Ekf2.state`.
     statement : str
-        Numbers of removed and of remaining resets, for the user; empty without a reset.
+        Text for the user with the numbers of removed and other resets; empty without a reset.
     """
     resets_inside = [
         reset for reset in ekf2.resets if segment.start_s < reset.time_s <= segment.end_s
@@ -63,6 +63,7 @@ def continuous_state(
         ("height", "position", Columns.POSITION[2:]),
         ("velocity", "velocity", Columns.VELOCITY),
     ):
+        # Indices in Reset.delta: 0 north, 1 east, 2 down
         axes = [Columns.STATE.index(column) % 3 for column in columns]
         resets = [
             reset
@@ -71,17 +72,17 @@ def continuous_state(
         ]
         if not resets:
             continue
-        reset_texts = kept_resets
-        if quantity == "position":  # velocities do not depend on the origin
+        group = kept_resets
+        if quantity == "position":  # a velocity does not depend on the origin
             samples = cut_to_segment(track.samples, segment)[columns].dropna()
             distance_to_samples = partial(_median_square_distance, samples)
-            candidates = _continuous_candidates(ekf2.state[columns], resets, axes)
+            candidates = _states_without_resets(ekf2.state[columns], resets, axes)
             best_state = min(candidates, key=distance_to_samples)
             if distance_to_samples(best_state) < MAX_DISTANCE_RATIO * distance_to_samples(
                 ekf2.state
             ):
-                state[columns], reset_texts = best_state, removed_resets
-        reset_texts.append(f"{len(resets)} of {label}")
+                state[columns], group = best_state, removed_resets
+        group.append(f"{len(resets)} of {label}")
     reset_statements = (
         f"EKF2 resets {treatment}: {', '.join(reset_texts)} ({reason})"
         for treatment, reset_texts, reason in (
@@ -93,14 +94,15 @@ def continuous_state(
     return state, "; ".join(reset_statements)
 
 
-def _continuous_candidates(
+def _states_without_resets(
     published: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
-    """Yield EKF2's position without resets, once with the origin of each span between resets."""
+    """Yield EKF2's position without resets, for each of its origins before and after a reset."""
     reset_m = np.array([reset.delta for reset in resets])[:, axes]
     is_after = np.array([published.index >= reset.time_s for reset in resets]).T
     for earlier_count in range(len(resets) + 1):
-        # keep the origin after this number of resets: add earlier resets, subtract later ones
+        # The origin after earlier_count resets is kept: earlier resets are added to the positions
+        # before them, later resets are subtracted from the positions after them
         shift_m = (~is_after[:, :earlier_count]) @ reset_m[:earlier_count] - is_after[
             :, earlier_count:
         ] @ reset_m[earlier_count:]
@@ -114,11 +116,13 @@ def _median_square_distance(samples: pd.DataFrame, state: pd.DataFrame) -> float
     return float(np.median(distance_m2)) if len(distance_m2) else float("inf")
 
 
-def project(frame: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
+def project(table: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
     """Project positions, velocities and variances onto an axis."""
-    rows = cut_to_segment(frame, segment)
+    rows = cut_to_segment(table, segment)
     available_columns = {
-        name: part for name, part in PROJECTED_COLUMNS.items() if part[0][0] in frame
+        name: (columns, exponent)
+        for name, (columns, exponent) in PROJECTED_COLUMNS.items()
+        if columns[0] in table
     }
     projected = {
         name: weighted_sum(rows, columns, axis.direction**exponent)
@@ -133,7 +137,7 @@ def _no_samples(quantity_name: str) -> Unavailable:
 
 
 def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | Unavailable:
-    """Project EKF2's variances onto an axis; PX4 logs no covariances between axes."""
+    """Project EKF2's variances onto an axis. Covariances between axes are not logged."""
     if isinstance(ekf2.variance, Unavailable):
         return ekf2.variance
     projected = project(ekf2.variance, axis, segment)
@@ -143,15 +147,15 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
 
 
 def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | None:
-    """Return EKF2's position (m) and variance (m²) at the fusion horizon, if logged.
+    """Return EKF2's position (m) and its variance (m²) at the fusion horizon, if logged.
 
-    The logged variance belongs to this position, not to the published one, which the output
-    predictor extrapolates to the present. EKF2 logs no covariance between axes, so it is neglected.
+    EKF2's variance belongs to this position. The published position is extrapolated to the present
+    by the output predictor. Covariances between axes are neglected, because they are not logged.
     """
     weights = dict(zip(AXIS_NAMES, axis.direction.tolist(), strict=True))
     aid = ekf2.aids.get("ev_hgt" if axis.name == "down" else "ev_pos")
     if aid is not None and f"observation_{aid.axes[0]}" in aid.samples:
-        # state before an update: position = observation - innovation, P⁻ = S - R
+        # State before an update: position = observation - innovation, P⁻ = S - R
         samples = cut_to_segment(aid.samples, segment)
         position, variance = (
             sum(
@@ -170,16 +174,16 @@ def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | 
         return horizon[horizon["position_variance_m2"] > 0.0]
     if isinstance(ekf2.record, Unavailable):
         return None
-    # before PX4 v1.16 the log contains the state at the fusion horizon
+    # Before PX4 v1.16, the log contains the state at the fusion horizon
     projected = project(ekf2.record.delayed, axis, segment)
     horizon = projected[["position_m", "position_variance_m2"]].dropna()
     return horizon if len(horizon) else None
 
 
 def _altitude_offset_m(ekf2: Ekf2, down_m: pd.Series) -> float:
-    """Return the altitude (m) of the origin if logged heights are altitudes, else 0.
+    """Return the altitude (m) of EKF2's origin if logged heights are altitudes, else 0.
 
-    Since PX4 v1.16, EKF2 fuses altitudes above sea level once it has an origin.
+    Since PX4 v1.16, EKF2 fuses altitudes above sea level as soon as it has an origin.
     """
     published_m = np.interp(down_m.index, ekf2.state.index, ekf2.state["down_m"])
     altitude_m = 0.0 if isinstance(ekf2.record, Unavailable) else ekf2.record.altitude_m
@@ -201,14 +205,14 @@ def project_innovations(
             f"EKF2 never fuses {track.name}, so its logged innovations are of another source",
             "Choose the source that EKF2 fused (--position-source).",
         )
-    frames = []
+    axis_innovations = []
     for name in ("north", "east") if axis.name == AISLE else (axis.name,):
-        if isinstance(frame := ekf2.innovations[name], Unavailable):
-            return frame
-        frames.append(frame)
-    rows = cut_to_segment(frames[0], segment).copy()
+        if isinstance(innovations := ekf2.innovations[name], Unavailable):
+            return innovations
+        axis_innovations.append(innovations)
+    rows = cut_to_segment(axis_innovations[0], segment).copy()
     if axis.name == AISLE:
-        rows = _innovations_along(rows, frames[1], axis.direction)
+        rows = _innovations_along(rows, axis_innovations[1], axis.direction)
     if rows.empty:
         return _no_samples("EKF2 innovations")
     noise_variance = rows["observation_variance_m2"].fillna(
@@ -234,7 +238,7 @@ def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array
     projected = cosine * cosine * north + sine * sine * east  # correct only for variances
     projected["innovation_m"] = cosine * north["innovation_m"] + sine * east["innovation_m"]
     for column in ("test_ratio", "fused", "rejected"):
-        # EKF2 fuses or rejects both axes together: take the larger value
+        # EKF2 fuses or rejects both axes together, so the larger value is used
         projected[column] = np.fmax(north[column], east[column])
     return projected
 
@@ -248,8 +252,8 @@ def observation_variance(
 ) -> float:
     """Return the R (m²) that EKF2 used for the position source; NaN if unknown.
 
-    R is the square of EKF2's noise parameter, or the reported variance if EKF2 uses it and it is
-    larger. ``default_noise_m`` is used if the log lacks the parameter. Sources: PX4 EKF2.cpp,
+    R is the square of EKF2's noise parameter, or a larger variance that the source reports.
+    ``default_noise_m`` replaces a parameter that is not logged. Sources: PX4 EKF2.cpp,
     ev_pos_control.cpp, gps_control.cpp, gnss_height_control.cpp, baro_height_control.cpp.
     """
     aid, parameters, ekf2 = track.aid(axis.name), flight.log.parameters, flight.ekf2

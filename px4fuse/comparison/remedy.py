@@ -1,4 +1,4 @@
-"""EKF2 parameters that agree with the estimated noise and delay of the position source."""
+"""EKF2 parameters for the estimated noise and delay of the position source."""
 
 import math
 from collections.abc import Mapping
@@ -19,16 +19,16 @@ from px4fuse.flight.model import Unavailable
 
 # Values of EKF2_GPS_DELAY (ms) in the re-runs that estimate the delay of GNSS
 GNSS_DELAYS_MS = (0.0, 150.0, 300.0)
-# Transmission time (ms) of a position message, which EKF2_DELAY_MAX must include
+# Transmission time (ms) of a position message: EKF2_DELAY_MAX includes it
 TRANSMISSION_MS = 30.0
 # EKF2_DELAY_MAX is rounded up to a multiple of this value (ms)
 DELAY_MAX_STEP_MS = 50.0
 
 
 def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
-    """Estimate the delay of GNSS and its σ (ms), if EKF2 fused vision and GNSS velocity.
+    """Estimate the delay of GNSS and its σ (ms) in a flight with vision and GNSS velocity.
 
-    The delay minimises the NIS of GNSS in re-runs of EKF2 with other values of EKF2_GPS_DELAY.
+    The delay minimises the NIS of GNSS in re-runs of EKF2 with several values of EKF2_GPS_DELAY.
     Return None if it does not differ significantly from the logged delay.
     """
     received = model.inputs.received
@@ -37,7 +37,7 @@ def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
     nis_sums = []
     for replay in replay_settings(model, [{GNSS_POS.delay: delay} for delay in GNSS_DELAYS_MS]):
         update_tables = [
-            rows_inside(updates, model.baseline_replay.evaluated_s)
+            rows_inside(updates, model.baseline_replay.find_evaluated_spans())
             for updates in (replay.updates, replay.other_aid_updates[GNSS_VEL.name])
         ]
         nis = [
@@ -45,7 +45,8 @@ def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
             for axis in ("north", "east")
             for updates in update_tables
         ]
-        # mean NIS times a fixed count: the number of evaluated samples depends on the delay
+        # The mean NIS is multiplied by a constant number of samples, because the number of samples
+        # in a re-run depends on the delay
         nis_sums.append(float(np.mean(nis)) * len(nis) * len(received.timestamp_s))
     quadratic_coefficient, linear_coefficient, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
     if quadratic_coefficient <= 0.0:
@@ -65,18 +66,17 @@ def ml_ekf2_parameters(
     tuning: Tuning,
     clock_offset: ClockOffset | Unavailable,
 ) -> dict[str, float]:
-    """Return the maximum-likelihood values of EKF2's noise and delay parameters.
+    """Return the maximum-likelihood values of those EKF2 noises and delays that are wrong.
 
-    A parameter is included only if it differs significantly from the logged value. A smaller noise
-    is not included for GNSS and odometry, because innovations do not show their slow errors. Empty
-    if EKF2 did not fuse the analysed source.
+    A value is wrong if it differs significantly from the estimate. For GNSS and odometry, a noise
+    is not reduced, because innovations do not show their slow errors.
     """
     changes: dict[str, float] = {}
     ekf2_inputs, min_vision_noise_m = model.inputs, 0.0
     if ekf2_inputs.vision is not None and comparison.source.name == ekf2_inputs.vision.source:
         if (gnss_delay := wrong_gnss_delay_ms(model)) is not None:
             changes |= delay_change(ekf2_inputs, gnss_delay[0])
-        # while EKF2 fuses GNSS, the noise of vision is at least that of GNSS
+        # While EKF2 fuses GNSS, it increases the noise of vision at least to that of GNSS
         min_vision_noise_m = ekf2_inputs.settings[GNSS_POS.noise]
         ekf2_inputs = replace(ekf2_inputs, aid=EV_POS, received=ekf2_inputs.vision)
     if not is_source_fused(comparison, ekf2_inputs):
@@ -97,7 +97,7 @@ def ml_ekf2_parameters(
 
 
 def is_source_fused(comparison: Comparison, ekf2_inputs: Inputs) -> bool:
-    """Return True if EKF2 fused the analysed source."""
+    """Return True if EKF2 fused the position source that KF uses."""
     source = comparison.source
     return source.name == ekf2_inputs.received.source and source.alignment is None
 
@@ -116,7 +116,10 @@ def ml_delay_change(
 def wrong_delay_ms(
     comparison: PreparedComparison, clock_offset: ClockOffset, logged_delay_ms: float
 ) -> float | None:
-    """Return EKF2's maximum-likelihood delay (ms) if the logged delay differs significantly."""
+    """Return the estimated delay (ms) of the positions if it differs from the logged delay.
+
+    Return None if the difference is not significant.
+    """
     ml_delay_ms = 1e3 * (comparison.source.assumed_delay_s - clock_offset.offset_s)
     return (
         ml_delay_ms if clock_offset.is_significant(1e-3 * (logged_delay_ms - ml_delay_ms)) else None
@@ -124,7 +127,7 @@ def wrong_delay_ms(
 
 
 def delay_limit(parameter_name: str, ml_delay_ms: float, logged_delay_ms: float) -> str:
-    """Return how a delay violates PX4's limits, for a sentence: "exceed 300 ms", "be negative"."""
+    """Return a text if PX4 does not permit a delay: "exceed 300 ms", "be negative", or ""."""
     if ml_delay_ms > (maximum_ms := PARAMETERS[parameter_name].maximum):
         return f"exceed {maximum_ms:g} ms"
     return "be negative" if round(ml_delay_ms) <= 0.0 == logged_delay_ms else ""
@@ -138,7 +141,7 @@ def aid_of(comparison: PreparedComparison, axis: str = "") -> Aid:
 def delay_ms(comparison: PreparedComparison) -> float | None:
     """Return the logged delay (ms) that EKF2 subtracts from the timestamps of the positions.
 
-    None if the delay parameter is not logged or EKF2 does not use it.
+    Return None if the parameter is not logged, or if EKF2 does not use it.
     """
     source = comparison.source
     if source.origin.aid is None or source.alignment is not None:
@@ -152,7 +155,10 @@ def delay_ms(comparison: PreparedComparison) -> float | None:
 
 
 def ml_noise_change(ekf2_inputs: Inputs, ml_noise: Noise, noise_m: float) -> dict[str, float]:
-    """Return EKF2 parameters for the noise ``noise_m``; empty if EKF2's is in the 95 % interval."""
+    """Return the EKF2 parameters for the position noise ``noise_m``.
+
+    The mapping is empty if EKF2's noise is inside the 95 % interval of the estimate ``ml_noise``.
+    """
     if (ml_noise.low or 0.0) <= noise_used_m(ekf2_inputs) <= (ml_noise.high or math.inf):
         return {}
     return noise_change(
@@ -165,7 +171,7 @@ def noise_change(
 ) -> dict[str, float]:
     """Return the EKF2 parameters that set the position noise to ``noise_m``.
 
-    If the sender reports a larger noise (``reported_m``), EKF2 must also ignore the reported one.
+    If the sender reports a larger noise (``reported_m``), a parameter makes EKF2 ignore it.
     """
     changes = {aid.noise: max(float(f"{noise_m:.2g}"), PARAMETERS[aid.noise].minimum)}
     if aid.noise_mode and settings.get(aid.noise_mode, 0.0) == 0.0 and noise_m < reported_m:
@@ -174,9 +180,9 @@ def noise_change(
 
 
 def delay_change(ekf2_inputs: Inputs, delay_ms: float) -> dict[str, float]:
-    """Return the EKF2 parameters for a position delay; a negative delay is set to 0.
+    """Return the EKF2 parameters for a delay of the positions. A negative delay is set to 0.
 
-    Empty if the delay exceeds PX4's maximum, or if EKF2 ignores the delay parameter.
+    The mapping is empty if PX4 does not permit the delay, or if EKF2 ignores the parameter.
     """
     delay_name = ekf2_inputs.aid.delay
     parameter = PARAMETERS[delay_name]
@@ -188,11 +194,14 @@ def delay_change(ekf2_inputs: Inputs, delay_ms: float) -> dict[str, float]:
 
 
 def horizon_change(settings: Mapping[str, float], age_ms: float) -> dict[str, float]:
-    """Return a larger EKF2_DELAY_MAX (PX4 v1.14 and later) if positions of this age need it."""
-    needed_ms = age_ms + TRANSMISSION_MS
-    if needed_ms <= settings.get("EKF2_DELAY_MAX", math.inf):
+    """Return a larger EKF2_DELAY_MAX if positions of this age (ms) are otherwise too old.
+
+    PX4 has this parameter since v1.14.
+    """
+    required_ms = age_ms + TRANSMISSION_MS
+    if required_ms <= settings.get("EKF2_DELAY_MAX", math.inf):
         return {}
-    return {"EKF2_DELAY_MAX": DELAY_MAX_STEP_MS * math.ceil(needed_ms / DELAY_MAX_STEP_MS)}
+    return {"EKF2_DELAY_MAX": DELAY_MAX_STEP_MS * math.ceil(required_ms / DELAY_MAX_STEP_MS)}
 
 
 def noise_used_m(ekf2_inputs: Inputs) -> float:
@@ -204,6 +213,17 @@ def noise_used_m(ekf2_inputs: Inputs) -> float:
 
 def _reported_noise_m(ekf2_inputs: Inputs) -> float:
     return float(np.sqrt(np.median(ekf2_inputs.received.variance_m2[:, :2])))
+
+
+def different_settings(
+    changes: Mapping[str, float], flight_settings: Mapping[str, float]
+) -> dict[str, float]:
+    """Return the changes of parameters that had another value in flight."""
+    return {
+        name: value
+        for name, value in changes.items()
+        if not math.isclose(value, flight_settings.get(name, math.nan), rel_tol=1e-3)
+    }
 
 
 def format_settings(changes: Mapping[str, float]) -> str:

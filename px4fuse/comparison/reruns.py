@@ -1,7 +1,7 @@
-"""Search for the cause of an inconsistent filter: re-run the filter with one change at a time.
+"""Search for the cause of an inconsistent filter by re-runs with one change at a time.
 
 KF and EKF2 are re-run with each candidate change (:mod:`px4fuse.comparison.changes`). If no single
-change makes the filter consistent, the best change is combined with each other one.
+change makes the filter consistent, the best change is combined with each of the others.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -56,8 +56,7 @@ from px4fuse.core.arrays import Array
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
-from px4fuse.ekf2.replay import HORIZONTAL as HORIZONTAL_AXES
-from px4fuse.ekf2.replay import Ekf2Replay, rows_inside
+from px4fuse.ekf2.replay import HORIZONTAL_AXES, Ekf2Replay, rows_inside
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
@@ -72,7 +71,7 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable
 
-# Mean NIS up to which innovations count as normal
+# Innovations are normal if the mean NIS is below this limit
 MAX_NORMAL_NIS = 1.5
 INNOVATIONS = [f"innovation_{axis}_m" for axis in HORIZONTAL_AXES]
 INNOVATION_VARIANCES = [f"innovation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
@@ -81,13 +80,13 @@ OBSERVATION_VARIANCES = [f"observation_variance_{axis}_m2" for axis in HORIZONTA
 NO_DIFFERENCE = Unavailable(
     "difference KF - EKF2", "with this change KF and EKF2 use different frames", ""
 )
-# Re-runs are compared with the log if the RMSE and the σ ratios of EKF2's replay agree with the log
-# within this factor, else with the replay
+# Re-runs of EKF2 are compared with the log if position RMSE and σ ratios of the replay agree with
+# the log within this factor. Otherwise they are compared with the replay
 MAX_REPLAY_TO_LOGGED_RATIO = 1.10
 
 
 class ErrorAboveSigma(NamedTuple):
-    """Position error of a filter against ground truth that is larger than its reported σ."""
+    """Position error of a filter against ground truth that exceeds its reported σ."""
 
     nees: float
     rmse_m: float
@@ -98,9 +97,9 @@ class ErrorAboveSigma(NamedTuple):
 def error_above_reported_sigma(
     summary: FilterSummary | UntestedFilter,
 ) -> ErrorAboveSigma | None:
-    """Return the position error of a filter if it exceeds the reported σ and the NIS is normal.
+    """Return the position error of a filter if it exceeds the reported σ although NIS is normal.
 
-    A filter without innovations along the axis has no NIS, which counts as normal.
+    Without innovations along the axis, NIS is assumed to be normal.
     """
     truth = summary.truth
     if isinstance(truth, Unavailable):
@@ -123,7 +122,7 @@ class Reruns:
     ekf2_model : Model or Unavailable
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
     trials : tuple of Trial
-        Re-runs along the main axis and along each axis with an inconsistent filter.
+        Re-runs along the main axis, and along each axis with an inconsistent filter.
     """
 
     ekf2_model: Model | Unavailable
@@ -132,7 +131,10 @@ class Reruns:
 
 
 class _Filter(NamedTuple):
-    """KF or EKF2, and the function that re-runs it with a change; ``model`` is None for KF."""
+    """KF or EKF2, and a function that re-runs the filter with a change.
+
+    ``model`` is the EKF2 model; None for KF.
+    """
 
     name: FilterName
     rerun: Callable[[AxisComparison, Change], RunStatistics]
@@ -176,7 +178,7 @@ def rerun_filters(
 def planned_configurations(
     comparison: Comparison, estimates: Estimates, ekf2_inputs: Inputs
 ) -> list[FilterConfiguration]:
-    """Return the EKF2 parameter sets that :func:`rerun_filters` will replay."""
+    """Return the EKF2 configurations that :func:`rerun_filters` will replay."""
     if not is_source_fused(comparison, ekf2_inputs):
         return []
     logged_parameters = ekf2_inputs.settings
@@ -199,7 +201,7 @@ def _changes_along(
     ekf2_inputs: Inputs | None,
     axis_result: AxisComparison,
 ) -> list[tuple[Change, tuple[Statistic, ...]]]:
-    """Return each change to try along an axis, with the statistics that it may correct."""
+    """Return each change to test along an axis, and the statistics that it may correct."""
     summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
     if not isinstance(summary, FilterSummary) or (
         ekf2_inputs is not None and axis_result.axis.name == "down"
@@ -251,7 +253,7 @@ def _try_changes(
             after=after,
             from_s=None
             if tested_filter.model is None
-            else tested_filter.model.baseline_replay.evaluated_s[0][0],
+            else tested_filter.model.baseline_replay.find_evaluated_spans()[0][0],
         )
 
     trials = [make_trial(change, discrepancies) for change, discrepancies in changes]
@@ -267,14 +269,14 @@ def _try_changes(
 def _unchanged_statistics(
     tested_filter: _Filter, axis_result: AxisComparison
 ) -> tuple[RunStatistics, bool]:
-    """Return the statistics without a change, and True if they are from the log."""
+    """Return the statistics of a filter without change, and True if they are from the log."""
     replayed_statistics, logged_state = tested_filter.rerun(axis_result, {}), axis_result.ekf2_state
     if tested_filter.model is None:
         return replayed_statistics, True
     innovations = axis_result.ekf2_innovations
     if isinstance(logged_state, Unavailable) or isinstance(innovations, Unavailable):
         return replayed_statistics, False
-    compared_s = tested_filter.model.baseline_replay.evaluated_s
+    compared_s = tested_filter.model.baseline_replay.find_evaluated_spans()
     compared_state = rows_inside(logged_state, compared_s)
     innovations = rows_inside(innovations, compared_s)
     rejected_flags = innovations["rejected"].dropna()
@@ -343,7 +345,7 @@ def _rerun_kf(
         )
         axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
         if is_gnss_rotation:
-            # rotating GNSS positions and ground truth has the effect of a corrected heading
+            # The rotation of GNSS positions and ground truth has the effect of a corrected heading
             rotated_axis = replace(axis, direction=rotated_direction)
             truth = project_truth(comparison.flight.truth, rotated_axis, segment)
     if FORWARD_BIAS in change:
@@ -392,13 +394,13 @@ def _replay_ekf2(
     changed_model = with_misaligned_positions(
         model, change.get(ROTATION, 0.0), change.get(CLOCK_OFFSET, 0.0)
     )
-    excluded_s, axis_tuning = None, tuning_of_axis(tuning, HORIZONTAL)
+    excluded_times_s, axis_tuning = None, tuning_of_axis(tuning, HORIZONTAL)
     if OUTLIERS in change and axis_tuning is not None:
-        excluded_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
+        excluded_times_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
         if comparison.source.origin.fused_as_gnss:
-            excluded_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
-        excluded_s += change.get(CLOCK_OFFSET, 0.0)
-    (replay,) = replay_settings(changed_model, [changed_parameters], excluded_s)
+            excluded_times_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
+        excluded_times_s += change.get(CLOCK_OFFSET, 0.0)
+    (replay,) = replay_settings(changed_model, [changed_parameters], excluded_times_s)
     return replay
 
 
@@ -409,9 +411,14 @@ def _replay_statistics(
     axis_result: AxisComparison,
     change: Change,
 ) -> RunStatistics:
-    compared_s, axis = model.baseline_replay.evaluated_s, axis_result.axis
+    """Compute the statistics of a replay of EKF2 along one axis, in the evaluated spans.
+
+    The errors are those of the published state. Its reported variance is the mean of the variances
+    before and after each update, because the replay contains no variance between updates.
+    """
+    compared_s, axis = model.baseline_replay.find_evaluated_spans(), axis_result.axis
     if ROTATION in change and comparison.source.origin.is_gnss:
-        # the replay rotates GNSS positions and therefore EKF2's heading: rotate the axis back
+        # The rotation of GNSS positions also rotates EKF2's heading, so the axis is rotated back
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))
     direction_cosines, ekf2_updates = axis.direction[:2], ekf2_replay.updates
     ekf2_updates = rows_inside(ekf2_updates, compared_s)
@@ -430,6 +437,7 @@ def _replay_statistics(
     published = project(ekf2_replay.published, axis, comparison.segment)
     published = rows_inside(published, compared_s)
     logged_state, compared_track = axis_result.ekf2_state, published
+    # Without a change, the difference KF - EKF2 is that of the report: from the logged state
     if not change and not isinstance(logged_state, Unavailable):
         compared_track = rows_inside(logged_state, compared_s)
     return _run_statistics(

@@ -1,4 +1,4 @@
-"""Re-runs of KF or EKF2 along one axis with a change, and the statistics that they improve."""
+"""Re-runs of KF or EKF2 with a change along one axis, and their effect on the statistics."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -12,26 +12,27 @@ from px4fuse.filter.consistency import Reference, classify_sigma_ratio, nis_band
 from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
-# Statistics of an inconsistent filter that a change in a re-run may correct
+# Statistics of an inconsistent filter that a change may correct
 DISCREPANCIES: tuple[Statistic, Statistic] = ("nees", "nis")
 Change = Mapping[str, float]
-# Keys of Trial.change that are not EKF2 parameters
+# Keys of Trial.change for corrections of the data, not of parameters
 CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
 FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
-# Mean NEES from which an error is reported (2 reported σ): flights without a fault stay below 3
+# Position errors are reported if the mean NEES exceeds this limit (2 reported σ): flights without a
+# fault have a mean NEES below 3
 MIN_REPORTED_NEES = 4.0
-# Limit of the mean NEES if a smaller noise corrects the NIS of a filter whose NEES is above 1
+# Maximum mean NEES of a re-run with a smaller noise, if the mean NEES is above 1 before
 MAX_NEES_AFTER_CHANGE = 2.0
-# A change is a cause if its explained_fraction differs from 1 by at most this value
+# Maximum difference of explained_fraction from 1 for which a change is a cause
 CAUSE_TOLERANCE = 0.5
-# A sensor fault is the only cause if its explained_fraction differs from 1 by at most this value
+# Maximum difference of explained_fraction from 1 for which a sensor fault is the only cause
 SENSOR_CAUSE_TOLERANCE = 0.25
-# Changes are combined in one re-run if their explained_fraction differs from 1 by less than this
+# Maximum difference of explained_fraction from 1 for which changes are combined in one re-run
 COMBINED_CAUSE_TOLERANCE = 0.9
 # Keys of Trial.change that correct a sensor fault instead of a setting
 SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
-# Keys of Trial.change that have no effect alone: a re-run sets them together with another change
+# Keys of Trial.change that have an effect only together with another change
 ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
 # A re-run has an effect if it changes a ratio of actual to reported σ by at least this factor
 MIN_RATIO_CHANGE = 1.10
@@ -74,9 +75,9 @@ class Trial(Record, kw_only=True):
     discrepancies : tuple of {"nis", "nees"}
         Statistics outside their limits that the change may correct.
     before, after : RunStatistics
-        Statistics without and with the change, over the same samples.
+        Statistics without and with the change, over equal times.
     is_logged : bool
-        False if ``before`` is from a replay of EKF2 instead of the log.
+        True if ``before`` is from the log, False if from a replay of EKF2.
     from_s : float or None
         Start of the evaluated time; None for the whole segment.
     """
@@ -100,8 +101,8 @@ class Trial(Record, kw_only=True):
 def explained_fraction(trial: Trial, statistic: Statistic) -> float:
     """Return the fraction of ln(mean NIS) or ln(mean NEES) that a change removes.
 
-    For the statistic "difference": the removed fraction of the mean square difference KF - EKF2.
-    A value above 1 means that the change is too large; 0 means unknown.
+    For the statistic "difference", it is the fraction of the mean square difference KF - EKF2.
+    Above 1, the change is too large. The fraction is 0 if it is unknown.
     """
     before, after = trial.before.value(statistic), trial.after.value(statistic)
     if not before or not after:
@@ -153,7 +154,7 @@ def find_cause(
 ) -> Trial | None:
     """Return the re-run that best corrects a mean NIS or mean NEES outside its limits.
 
-    Single changes are preferred to pairs, and corrected sensor faults to settings.
+    A single change is preferred to two, and a corrected sensor fault to a changed setting.
     """
 
     def rank(trial: Trial) -> tuple[bool, int, bool, float]:
@@ -178,7 +179,7 @@ def find_cause(
 def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]:
     """Return the re-runs that correct a statistic only partly, best first.
 
-    Empty if one re-run brings the statistic inside its limits.
+    The list is empty if one re-run brings the statistic inside its limits.
     """
     helpful = [
         trial
@@ -191,7 +192,7 @@ def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]
 
 
 def log_ratio_sum(statistics: RunStatistics) -> float:
-    """Return the sum of |ln σ ratio| against source and ground truth."""
+    """Return the sum of |ln σ ratio| against position source and ground truth."""
     squared_ratios = [
         squared_ratio
         for squared_ratio in (statistics.nis_mean, statistics.nees_mean)
@@ -201,7 +202,7 @@ def log_ratio_sum(statistics: RunStatistics) -> float:
 
 
 def preference_key(trial: Trial) -> tuple[bool, int, float]:
-    """Return a sort key for re-runs with one kind of change; the best re-run has the smallest."""
+    """Return a key to sort re-runs with one kind of change: the best re-run is the first."""
     is_solved = becomes_consistent(trial)
     return (
         not is_solved,
@@ -211,7 +212,7 @@ def preference_key(trial: Trial) -> tuple[bool, int, float]:
 
 
 def sigma_ratios(statistics: RunStatistics) -> dict[Reference, float]:
-    """Return the ratios of actual to reported σ against source and ground truth."""
+    """Return the ratios of actual to reported σ against position source and ground truth."""
     squared_ratios: dict[Reference, float | None] = {
         "source": statistics.nis_mean,
         "truth": statistics.nees_mean,
@@ -220,12 +221,15 @@ def sigma_ratios(statistics: RunStatistics) -> dict[Reference, float]:
 
 
 def log_ratio_reduction(trial: Trial) -> float:
-    """Return by how much a re-run reduces the sum of |ln σ ratio| (:func:`log_ratio_sum`)."""
+    """Return the decrease of the sum of |ln σ ratio| by a re-run (:func:`log_ratio_sum`)."""
     return log_ratio_sum(trial.before) - log_ratio_sum(trial.after)
 
 
 def sigma_ratio_changes(trial: Trial) -> list[tuple[Reference, float, float]]:
-    """Return (reference, σ ratio before, σ ratio after the change) for source and ground truth."""
+    """Return the σ ratios before and after the change, against "source" and against "truth".
+
+    An element is (reference, σ ratio before, σ ratio after).
+    """
     ratios_before, ratios_after = sigma_ratios(trial.before), sigma_ratios(trial.after)
     return [
         (reference, ratios_before[reference], ratios_after[reference])
@@ -234,7 +238,7 @@ def sigma_ratio_changes(trial: Trial) -> list[tuple[Reference, float, float]]:
 
 
 def becomes_consistent(trial: Trial) -> bool:
-    """Return True if a re-run makes a σ ratio consistent."""
+    """Return True if the change makes an inconsistent filter consistent."""
     return any(
         classify_sigma_ratio(before, reference) != "consistent"
         and classify_sigma_ratio(after, reference) == "consistent"
@@ -252,7 +256,7 @@ def halves_discrepancy(trial: Trial) -> bool:
 
 
 def remains_overconfident(trial: Trial) -> bool:
-    """Return True if a re-run leaves the filter nearly as overconfident against ground truth."""
+    """Return True if a re-run hardly reduces the overconfidence against ground truth."""
     return any(
         reference == "truth"
         and classify_sigma_ratio(before, reference)
@@ -311,8 +315,8 @@ def can_show_improvement(trial: Trial) -> bool:
 def improvement(trial: Trial) -> Improvement:
     """Return the quantities that a re-run improves: position, σ, both or nothing.
 
-    The position RMSE must decrease by 20 %. A σ ratio must become consistent, or its |ln| must
-    halve, without making the other one worse.
+    Position: the RMSE decreases by at least 20 %. σ: a σ ratio becomes consistent or its |ln| is
+    halved, and no σ ratio becomes worse.
     """
     before_m, after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
     is_position_better = bool(

@@ -32,22 +32,22 @@ MIN_SIGMA_DOWN_M = 0.08
 DEGREES_OF_FREEDOM = 4.0
 # Size of each length unit in metres
 UNIT_SIZES_M: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
-# Rotations (rad) of the frame about the vertical up to this angle are a misalignment
+# Maximum rotation (rad) of the frame about the vertical that is a misalignment
 SMALL_ROTATION_RAD = np.radians(8.0)
 # Maximum time offset (s) that does not lower the prior odds of a hypothesis
 SMALL_OFFSET_S = 0.3
 # Log prior odds of a frame that is rotated by more than SMALL_ROTATION_RAD
-ROTATION_ODDS = -1.0
+ROTATION_LOG_ODDS = -1.0
 # Log prior odds of a frame that is rotated by less than SMALL_ROTATION_RAD, but not by zero
-SMALL_ROTATION_ODDS = -0.5
+SMALL_ROTATION_LOG_ODDS = -0.5
 # Log prior odds of a time offset above SMALL_OFFSET_S
-OFFSET_ODDS = -2.0
+OFFSET_LOG_ODDS = -2.0
 # Log prior odds of a unit other than metres
-UNIT_ODDS = -2.0
+UNIT_LOG_ODDS = -2.0
 # Standard deviation (m) of barometer heights in the likelihood
 BAROMETER_SIGMA_M = 0.5
 # Assumed number of independent barometer heights
-BAROMETER_WEIGHT = 6.0
+INDEPENDENT_BAROMETER_COUNT = 6.0
 # Limit (m) of height errors in the likelihood, which limits the effect of outliers
 MAX_HEIGHT_ERROR_M = 20.0 * BAROMETER_SIGMA_M
 # Maximum number of hypotheses of the grid search that are refined
@@ -66,7 +66,7 @@ PARAMETER_PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2
 # Horizontal directions, clockwise from above
 CLOCKWISE_DIRECTIONS: tuple[Direction, ...] = ("north", "east", "south", "west")
 # Log prior odds of common directions of x, y, z
-AXES_ODDS: Final[dict[Axes, float]] = {
+AXES_LOG_ODDS: Final[dict[Axes, float]] = {
     ("north", "east", "down"): 1.0,  # convention of PX4
     ("east", "north", "up"): -0.5,
     ("north", "west", "up"): -1.0,
@@ -77,7 +77,7 @@ AXES_ODDS: Final[dict[Axes, float]] = {
 
 
 class AxisAssignment(NamedTuple):
-    """Assignment of x, y, z to a vertical axis and two horizontal axes; rotation is separate.
+    """Vertical axis and pair of horizontal axes among x, y, z, without the rotation of the pair.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class AxisAssignment(NamedTuple):
         return (self.vertical_sign * self.handedness < 0) != (self.vertical_axis == 1)
 
     def axes(self, quarter_turns: int) -> Axes:
-        """Return the directions of x, y, z for ``axis_a`` at 90° · ``quarter_turns`` from north."""
+        """Return the directions of x, y, z if the heading of ``axis_a`` is 90° · quarter_turns."""
         directions: list[Direction] = ["down" if self.vertical_sign > 0 else "up"] * 3
         directions[self.axis_a] = CLOCKWISE_DIRECTIONS[quarter_turns % 4]
         directions[self.axis_b] = CLOCKWISE_DIRECTIONS[(quarter_turns + self.handedness) % 4]
@@ -108,8 +108,8 @@ class AxisAssignment(NamedTuple):
 
     def log_odds(self, quarter_turns: int) -> float:
         axes = self.axes(quarter_turns)
-        other_axes_odds = -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
-        return AXES_ODDS.get(axes, -5.0 if self.is_mirrored else other_axes_odds)
+        other_axes_log_odds = -2.0 if self.vertical_axis == 2 or axes[1] == "up" else -4.0
+        return AXES_LOG_ODDS.get(axes, -5.0 if self.is_mirrored else other_axes_log_odds)
 
 
 AXIS_ASSIGNMENTS = tuple(
@@ -120,14 +120,14 @@ AXIS_ASSIGNMENTS = tuple(
 
 @dataclass(frozen=True)
 class SentPositions:
-    """Positions of a source as sent, and barometer times (s) and heights (m)."""
+    """Positions of a source as sent, unconverted, and barometer times (s) and heights (m)."""
 
     time_s: Array
     position_m: Array
     max_offset_s: float
     barometer: tuple[Array, Array] | None = None
 
-    def with_clock_drift(self, clock_drift: float) -> "SentPositions":
+    def remove_clock_drift(self, clock_drift: float) -> "SentPositions":
         return replace(self, time_s=without_clock_drift(self.time_s, clock_drift))
 
     def motion(self, imu: ImuMotion) -> SourceMotion:
@@ -141,7 +141,7 @@ class SentPositions:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Assumed convention of the positions of a source, with its likelihood.
+    """Hypothesis on the axes, unit, rotation and delay of a source's positions.
 
     Attributes
     ----------
@@ -179,7 +179,7 @@ class Hypothesis:
 
     @property
     def quarter_turns(self) -> int:
-        """Rotation of ``axis_a`` from north, in quarter turns (rounded)."""
+        """Heading of ``axis_a``, rounded to multiples of 90° (1: east)."""
         return round(float(self.parameters[1]) / (np.pi / 2.0))
 
     @property
@@ -189,7 +189,7 @@ class Hypothesis:
 
     @property
     def remainder_rad(self) -> float:
-        """Rotation (rad) minus the quarter turns."""
+        """Heading (rad) of ``axis_a`` minus the nearest multiple of 90°."""
         return float(self.parameters[1] - self.quarter_turns * np.pi / 2.0)
 
     def is_similar_to(self, other: "Hypothesis", max_turn_rad: float = np.pi / 4.0) -> bool:
@@ -204,12 +204,12 @@ def without_clock_drift(time_s: Array, clock_drift: float) -> Array:
     return mean_time_s + (time_s - mean_time_s) / (1.0 + clock_drift)
 
 
-def search(
+def search_hypotheses(
     positions: SentPositions, motions: Mapping[HeadingSource, ImuMotion]
 ) -> list[Hypothesis]:
-    """Return all likely conventions of the positions, best first.
+    """Return the likely hypotheses on axes, unit and delay of the positions, best first.
 
-    Empty without motion, or if positions and IMU data overlap for less than ``MIN_OVERLAP_S``.
+    The list is empty without motion, or with an overlap of less than ``MIN_OVERLAP_S``.
     """
     hypotheses = []
     for heading_from, imu_motion in motions.items():
@@ -235,12 +235,13 @@ def search(
 
 
 def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[Hypothesis]:
-    """Find likely conventions on a grid of time offsets.
-
-    For each unit, axes and quarter turn, only the best time offset is kept.
-    """
+    """Return the most likely hypotheses of a search over axes, units and time offsets."""
     source_columns = np.column_stack(
-        [source_motion.table, source_motion.table**2, source_motion.is_valid]
+        [
+            source_motion.second_differences,
+            source_motion.second_differences**2,
+            source_motion.is_valid,
+        ]
     )
     imu_columns = np.column_stack(
         [imu_motion.table[..., 0], imu_motion.table[..., 0] ** 2, imu_motion.is_valid]
@@ -249,8 +250,8 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
     moments = np.stack(
         [source_columns[step : step + len(imu_columns)].T @ imu_columns for step in offset_steps]
     )
-    # sums of products of source and IMU columns at each time offset. Column 6 is 1 for a valid
-    # sample, so [6, 6] is the number of samples
+    # each moment is a sum of products of a source column and an IMU column. Column 6 is 1 for a
+    # valid sample, so the moment [6, 6] is the number of samples
     has_overlap = moments[:, 6, 6] * GRID_INTERVAL_S >= MIN_OVERLAP_S
     if not has_overlap.any():
         return []
@@ -263,22 +264,30 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
         moments[:, axis_a, 0] + handedness * moments[:, axis_b, 1] + 1j * moments[:, axis_a, 1]
     )
     correlation -= 1j * handedness * moments[:, axis_b, 0]
-    source_square = np.maximum(moments[:, 3:6, 6, None], 1e-12)
+    source_mean_square = np.maximum(moments[:, 3:6, 6, None], 1e-12)
     unit_sizes_m = np.array([*UNIT_SIZES_M.values()])
-    north_square, east_square, imu_down_square = np.moveaxis(moments[:, 6, 3:6, None, None], 1, 0)
-    horizontal_square = (
-        unit_sizes_m**2 * (source_square[:, axis_a] + source_square[:, axis_b])
-        + north_square
-        + east_square
+    north_mean_square, east_mean_square, down_mean_square = np.moveaxis(
+        moments[:, 6, 3:6, None, None], 1, 0
     )
-    horizontal_square = (
-        horizontal_square - 2.0 * unit_sizes_m * np.abs(correlation)[..., None]
+    horizontal_residual_m2 = (
+        unit_sizes_m**2 * (source_mean_square[:, axis_a] + source_mean_square[:, axis_b])
+        + north_mean_square
+        + east_mean_square
+    )
+    horizontal_residual_m2 = (
+        horizontal_residual_m2 - 2.0 * unit_sizes_m * np.abs(correlation)[..., None]
     ) / 2.0
-    down_square = unit_sizes_m**2 * source_square[:, vertical_axis] + imu_down_square
-    down_square -= 2.0 * unit_sizes_m * (vertical_sign * moments[:, vertical_axis, 2])[..., None]
-    score = np.sum(np.log(source_square), axis=1)[:, None] + 6.0 * np.log(unit_sizes_m)
-    score = score - 2.0 * np.log(np.maximum(horizontal_square, MIN_SIGMA_M**2))
-    score = 0.5 * independent_count * (score - np.log(np.maximum(down_square, MIN_SIGMA_DOWN_M**2)))
+    down_residual_m2 = unit_sizes_m**2 * source_mean_square[:, vertical_axis] + down_mean_square
+    down_residual_m2 -= (
+        2.0 * unit_sizes_m * (vertical_sign * moments[:, vertical_axis, 2])[..., None]
+    )
+    score = np.sum(np.log(source_mean_square), axis=1)[:, None] + 6.0 * np.log(unit_sizes_m)
+    score = score - 2.0 * np.log(np.maximum(horizontal_residual_m2, MIN_SIGMA_M**2))
+    score = (
+        0.5
+        * independent_count
+        * (score - np.log(np.maximum(down_residual_m2, MIN_SIGMA_DOWN_M**2)))
+    )
     rotation_rad = np.angle(correlation)
     nearest_quarter_turns = np.round(rotation_rad / (np.pi / 2.0)).astype(int) % 4
     hypotheses = []
@@ -291,12 +300,12 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
         ):
             unit_name, assignment = [*UNIT_SIZES_M][unit_index], AXIS_ASSIGNMENTS[assignment_index]
             # without heights, only the third axis can be vertical
-            if assignment.vertical_axis != 2 and not source_motion.table[:, 2].any():
+            if assignment.vertical_axis != 2 and not source_motion.second_differences[:, 2].any():
                 continue
             total_score = (
                 scores_at_quarter[offset_index, assignment_index, unit_index]
                 + assignment.log_odds(quarter_turns)
-                + UNIT_ODDS * (unit_name != "m")
+                + UNIT_LOG_ODDS * (unit_name != "m")
             )
             parameters = np.array(
                 [offset_s[offset_index], rotation_rad[offset_index, assignment_index], *[0.0] * 5]
@@ -311,15 +320,18 @@ def find_candidates(source_motion: SourceMotion, imu_motion: ImuMotion) -> list[
 
 
 def refine_hypothesis(
-    start: Hypothesis, positions: SentPositions, source_motion: SourceMotion, imu_motion: ImuMotion
+    initial_hypothesis: Hypothesis,
+    positions: SentPositions,
+    source_motion: SourceMotion,
+    imu_motion: ImuMotion,
 ) -> Hypothesis:
     """Refine the parameters of a hypothesis by robust least squares (Gauss-Newton)."""
     rows = np.flatnonzero(source_motion.is_valid)
     rows = rows[:: max(1, len(rows) // MAX_REFINEMENT_ROWS)]
-    best, parameters = replace(start, score=-np.inf), start.parameters
+    best, parameters = replace(initial_hypothesis, score=-np.inf), initial_hypothesis.parameters
     for _ in range(REFINEMENT_ITERATIONS):
         hypothesis, step = _evaluate_hypothesis(
-            replace(start, parameters=parameters), rows, source_motion, imu_motion
+            replace(initial_hypothesis, parameters=parameters), rows, source_motion, imu_motion
         )
         if hypothesis.score > best.score:
             best = hypothesis
@@ -349,13 +361,13 @@ def _evaluate_hypothesis(
     grid_index, time_s = grid_index[is_used], time_s[is_used]
     elapsed_s = time_s - time_s[0]
     grid_fraction = (grid_position[is_used] - grid_index)[:, None, None]
-    imu_table = (1.0 - grid_fraction) * imu_motion.table[
+    imu_differences = (1.0 - grid_fraction) * imu_motion.table[
         grid_index
     ] + grid_fraction * imu_motion.table[grid_index + 1]
-    sent_differences = source_motion.table[rows[is_used]]
+    sent_differences = source_motion.second_differences[rows[is_used]]
     vertical_axis, vertical_sign, axis_a, axis_b, handedness = hypothesis.assignment
-    unit_m = UNIT_SIZES_M[hypothesis.unit]
-    complex_rotation = unit_m * np.exp(1j * (rotation_rad + heading_drift_rad_s * elapsed_s))
+    unit_size_m = UNIT_SIZES_M[hypothesis.unit]
+    complex_rotation = unit_size_m * np.exp(1j * (rotation_rad + heading_drift_rad_s * elapsed_s))
     horizontal_m = complex_rotation * (
         sent_differences[:, axis_a] + 1j * handedness * sent_differences[:, axis_b]
     )
@@ -363,17 +375,17 @@ def _evaluate_hypothesis(
         [
             horizontal_m.real,
             horizontal_m.imag,
-            unit_m * vertical_sign * sent_differences[:, vertical_axis],
+            unit_size_m * vertical_sign * sent_differences[:, vertical_axis],
         ]
     )
-    imu_ned_m = imu_table[..., 0] - imu_table[..., 1:] @ accelerometer_bias
+    imu_ned_m = imu_differences[..., 0] - imu_differences[..., 1:] @ accelerometer_bias
     residual = source_ned_m - imu_ned_m
     residual_squares = np.stack([np.sum(residual[:, :2] ** 2, axis=1), residual[:, 2] ** 2])
     log_likelihood_gain, sigma_m = student_score(residual_squares[0], 2, MIN_SIGMA_M)
     vertical_log_likelihood, sigma_down_m = student_score(residual_squares[1], 1, MIN_SIGMA_DOWN_M)
     is_axis_known = sent_differences.any(axis=0)  # False for the height if the source has none
     log_likelihood_gain += vertical_log_likelihood * is_axis_known[vertical_axis] + np.log(
-        unit_m
+        unit_size_m
     ) * np.count_nonzero(is_axis_known)
     log_likelihood_gain -= sum(
         student_score(column**2, 1, 1e-6)[0] for column in sent_differences.T[is_axis_known]
@@ -398,7 +410,7 @@ def _evaluate_hypothesis(
     jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal_m.imag, horizontal_m.real
     jacobian[..., 2] = jacobian[..., 1] * elapsed_s[:, None]
     jacobian[..., 3] = jacobian[..., 0] * (time_s - mean_time_s)[:, None]
-    jacobian[..., 4:] = imu_table[..., 1:]
+    jacobian[..., 4:] = imu_differences[..., 1:]
     uses_gyro_heading = hypothesis.heading_from != "EKF2"
     is_free = np.array(
         [True, hypothesis.has_rotation, uses_gyro_heading, hypothesis.has_clock_drift, *[True] * 3]
@@ -441,15 +453,15 @@ def student_score(squares: Array, dimensions: int, min_sigma: float) -> tuple[fl
 
 
 def _log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float:
-    """Return the log prior odds of a hypothesis, plus the log likelihood ratio of its heights."""
+    """Return the log prior odds of a hypothesis, plus a log likelihood ratio from the barometer."""
     log_odds = hypothesis.assignment.log_odds(hypothesis.quarter_turns)
-    log_odds += UNIT_ODDS * (hypothesis.unit != "m")
-    log_odds += OFFSET_ODDS * (abs(hypothesis.offset_s) > SMALL_OFFSET_S)
+    log_odds += UNIT_LOG_ODDS * (hypothesis.unit != "m")
+    log_odds += OFFSET_LOG_ODDS * (abs(hypothesis.offset_s) > SMALL_OFFSET_S)
     if hypothesis.has_rotation:
         # Bayesian information criterion: one more estimated parameter costs ½ ln n
         log_odds -= 0.5 * float(np.log(max(hypothesis.independent_count, 2.0)))
-        is_large = abs(hypothesis.remainder_rad) > SMALL_ROTATION_RAD
-        log_odds += ROTATION_ODDS if is_large else SMALL_ROTATION_ODDS
+        is_large_rotation = abs(hypothesis.remainder_rad) > SMALL_ROTATION_RAD
+        log_odds += ROTATION_LOG_ODDS if is_large_rotation else SMALL_ROTATION_LOG_ODDS
     if positions.barometer is not None:
         log_odds += _height_log_likelihood(hypothesis, positions, *positions.barometer)
     return log_odds
@@ -458,16 +470,16 @@ def _log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float:
 def _height_log_likelihood(
     hypothesis: Hypothesis, positions: SentPositions, time_s: Array, barometer_m: Array
 ) -> float:
-    """Return the log likelihood ratio of the barometer heights: sent heights against a constant."""
+    """Return the log likelihood ratio of a source's heights: barometer against constant height."""
     height_m = np.interp(positions.time_s - hypothesis.offset_s, time_s, barometer_m)
     down_m = (
         UNIT_SIZES_M[hypothesis.unit]
         * hypothesis.assignment.vertical_sign
         * positions.position_m[:, hypothesis.assignment.vertical_axis]
     )
-    # the height is positive upwards, so its sum with the vertical position is constant
+    # height is positive upwards, so down + height is constant for a correct hypothesis
     error_m = down_m - np.median(down_m) + height_m - np.median(height_m)
     error_m2 = float(np.mean(np.minimum(error_m**2, MAX_HEIGHT_ERROR_M**2)))
     min_m2 = BAROMETER_SIGMA_M**2
     variance_ratio = max(float(np.var(height_m)), min_m2) / max(error_m2, min_m2)
-    return 0.5 * BAROMETER_WEIGHT * float(np.log(variance_ratio))
+    return 0.5 * INDEPENDENT_BAROMETER_COUNT * float(np.log(variance_ratio))

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 from msgspec import structs
 
 from px4fuse.convention.axes import (
@@ -13,46 +14,51 @@ from px4fuse.convention.axes import (
     SentPositions,
     find_candidates,
     refine_hypothesis,
-    search,
+    search_hypotheses,
 )
 from px4fuse.convention.model import (
     Convention,
+    ConventionVerdict,
     HeadingSource,
     OrientationConvention,
-    Verdict,
 )
 from px4fuse.convention.motion import (
     DIFFERENCE_WINDOW_S,
+    MIN_GAP_S,
     ImuMotion,
-    Inertial,
+    InertialData,
     motion_from_imu,
     read_inertial,
     replace_heading,
 )
 from px4fuse.convention.orientation import check_orientation
 from px4fuse.convention.texts import format_axes
-from px4fuse.flight.model import Columns, Flight, PositionTrack
+from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack
+from px4fuse.trajectory.association import gap_limit, is_bracketed
 from px4fuse.trajectory.rotation import heading
 
 # Minimum log likelihood ratio to the second best convention for an unambiguous result
 MIN_LOG_ODDS = 4.0
 # Minimum log-likelihood gain of a convention over positions unrelated to the motion
 MIN_LIKELIHOOD_GAIN = 8.0
-# Minimum log-likelihood gain per independent sample: of an unambiguous convention, and of an
-# ambiguous one
+# Minimum log-likelihood gain per independent sample, for an unambiguous and for an ambiguous
+# convention
 MIN_LIKELIHOOD_GAIN_PER_SAMPLE = (0.15, 0.4)
-# Range of the scale factor of the positions, relative to the displacement from the IMU, that is not
-# doubtful
+# Accepted range of the ratio of displacements, from the positions over from the IMU
 MIN_SCALE, MAX_SCALE = 0.88, 1.12
-# Maximum ratio of the residuals to the noise of source and IMU that is not doubtful
+# Maximum accepted ratio of the residuals to the noise of source and IMU
 MAX_RESIDUAL_RATIO = 2.4
 # σ (m) of the second differences of the position that are integrated from the IMU
 IMU_SIGMA_M = 0.05
-# EKF2's heading is used, because it is relative to north, unless its log likelihood is lower than
-# that of the gyroscopes' heading by more than this difference
+# EKF2's heading, which is relative to north, is preferred to the heading from the gyroscopes if its
+# log likelihood is at most this much lower
 MAX_LOGGED_HEADING_DEFICIT = 20.0
+# Minimum number of GNSS positions for an estimate of the rotation relative to them
+MIN_GNSS_POSITIONS = 30
+# Maximum ratio of the residuals to the GNSS positions for an estimate of the rotation: 0.1 rad
+MAX_GNSS_RESIDUAL_RATIO = 0.1
 # Minimum log-likelihood gain from a clock drift; a drift with a smaller gain is not corrected
-MIN_DRIFT_GAIN = 15.0
+MIN_DRIFT_SCORE_GAIN = 15.0
 # Tested clock drifts (rate of the clock minus 1)
 TESTED_CLOCK_DRIFTS = np.linspace(-0.05, 0.05, 21)
 # Repeated positions are removed if they are less than this fraction of all positions
@@ -82,30 +88,35 @@ def check_convention(
     -------
     Convention, or None without IMU data, attitude or enough motion at the same time.
     """
-    inertial = read_inertial(flight)
-    if inertial is None:
+    inertial_data = read_inertial(flight)
+    if inertial_data is None:
         return None
     positions = _read_positions(flight, track, max_offset_s)
     motions = {
-        name: motion_from_imu(inertial, attitude) for name, attitude in inertial.attitudes.items()
+        name: motion_from_imu(inertial_data, attitude)
+        for name, attitude in inertial_data.compute_attitudes().items()
     }
-    hypotheses = _search_hypotheses(positions, motions)
+    hypotheses = _rank_hypotheses(positions, motions)
     if not hypotheses:
         return None
     if clock_drift := _clock_drift(positions, motions[hypotheses[0].heading_from], hypotheses[0]):
-        positions_without_drift = positions.with_clock_drift(clock_drift)
-        hypotheses_without_drift = _search_hypotheses(positions_without_drift, motions)
+        positions_without_drift = positions.remove_clock_drift(clock_drift)
+        hypotheses_without_drift = _rank_hypotheses(positions_without_drift, motions)
         if (
             hypotheses_without_drift
-            and hypotheses_without_drift[0].score > hypotheses[0].score + MIN_DRIFT_GAIN
+            and hypotheses_without_drift[0].score > hypotheses[0].score + MIN_DRIFT_SCORE_GAIN
         ):
             hypotheses, positions = hypotheses_without_drift, positions_without_drift
         else:
             clock_drift = 0.0
+    if not is_source_fused(flight):
+        hypotheses[0] = _rotate_to_gnss(hypotheses[0], positions, flight, track)
     convention = _choose_convention(hypotheses, positions, clock_drift)
     if track.orientation is None:
         return convention
-    orientation = _check_orientation(inertial, track, positions, hypotheses[0], convention.verdict)
+    orientation = _check_orientation(
+        inertial_data, track, positions, hypotheses[0], convention.verdict
+    )
     return structs.replace(convention, orientation=orientation)
 
 
@@ -126,11 +137,11 @@ def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -
     )
 
 
-def _search_hypotheses(
+def _rank_hypotheses(
     positions: SentPositions, motions: dict[HeadingSource, ImuMotion]
 ) -> list[Hypothesis]:
-    """Return the likely conventions, best first; the logged heading is preferred."""
-    hypotheses = search(positions, motions)
+    """Return the likely hypotheses, best first; a hypothesis with EKF2's heading is preferred."""
+    hypotheses = search_hypotheses(positions, motions)
     for hypothesis in hypotheses:
         if (
             hypothesis.heading_from == "EKF2"
@@ -140,6 +151,43 @@ def _search_hypotheses(
             other_hypotheses = [other for other in hypotheses if other is not hypothesis]
             return [replace(hypothesis, score=hypotheses[0].score), *other_hypotheses]
     return hypotheses
+
+
+def is_source_fused(flight: Flight) -> bool:
+    """Return True if the fusion flags show that EKF2 fused the positions or the yaw."""
+    fusion_flags = flight.ekf2.fusion_flags if isinstance(flight.ekf2, Ekf2) else None
+    return isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags > 0).any(axis=None))
+
+
+def _rotate_to_gnss(
+    hypothesis: Hypothesis, positions: SentPositions, flight: Flight, track: PositionTrack
+) -> Hypothesis:
+    """Fit the rotation of a hypothesis to GNSS positions, because EKF2's heading may be wrong."""
+    gnss_tracks = [other for other in flight.positions if other.origin.is_gnss]
+    if not gnss_tracks or track.origin.is_gnss or not hypothesis.has_rotation:
+        return hypothesis
+    gnss_positions = gnss_tracks[0].samples[Columns.POSITION[:2]].dropna()
+    time_s = gnss_positions.index.to_numpy() + hypothesis.offset_s
+    source_time_s = positions.time_s
+    is_near = is_bracketed(time_s, source_time_s, gap_limit(source_time_s, MIN_GAP_S))
+    if np.count_nonzero(is_near) < MIN_GNSS_POSITIONS:
+        return hypothesis
+    sent_m = UNIT_SIZES_M[hypothesis.unit] * positions.position_m
+    assignment = hypothesis.assignment
+    source_m = (
+        sent_m[:, assignment.axis_a] + 1j * assignment.handedness * sent_m[:, assignment.axis_b]
+    )
+    velocity_m_s = np.interp(time_s, source_time_s, np.gradient(source_m, source_time_s))
+    columns = np.column_stack([np.interp(time_s, source_time_s, source_m), velocity_m_s])[is_near]
+    columns -= columns.mean(axis=0)
+    north_east_m = (gnss_positions.to_numpy() @ [1.0, 1j])[is_near]
+    north_east_m -= north_east_m.mean()
+    factors, residual_m2, *_ = np.linalg.lstsq(columns, north_east_m)
+    if not residual_m2 < (MAX_GNSS_RESIDUAL_RATIO * np.linalg.norm(north_east_m)) ** 2:
+        return hypothesis
+    parameters = hypothesis.parameters.copy()
+    parameters[1] = np.angle(factors[0])
+    return replace(hypothesis, parameters=parameters, heading_from="GNSS")
 
 
 def _choose_convention(
@@ -158,7 +206,7 @@ def _choose_convention(
         ]
     log_odds = best_hypothesis.score - other_conventions[0].score if other_conventions else None
     is_ambiguous = log_odds is not None and log_odds < MIN_LOG_ODDS
-    verdict: Verdict = "ambiguous" if is_ambiguous else "determined"
+    verdict: ConventionVerdict = "ambiguous" if is_ambiguous else "determined"
     if best_hypothesis.score < MIN_LIKELIHOOD_GAIN:
         verdict = "not determinable"
     elif (
@@ -205,8 +253,8 @@ def _describe_hypothesis(hypothesis: Hypothesis) -> str:
 def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
     """Return the ratio of the residuals to the noise of source and IMU.
 
-    The noise of the source is from third differences of the positions, which contain hardly any
-    motion.
+    The noise of the source is estimated from third differences of the positions, because they
+    contain hardly any motion.
     """
     third_differences = np.diff(positions.position_m, 3, axis=0)
     third_difference_sigma = 1.4826 * float(
@@ -220,52 +268,68 @@ def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
     return float(hypothesis.residual_sigma_m / np.hypot(noise_m, IMU_SIGMA_M))
 
 
-def _clock_drift(positions: SentPositions, imu: ImuMotion, best: Hypothesis) -> float:
+def _clock_drift(
+    positions: SentPositions, imu_motion: ImuMotion, best_hypothesis: Hypothesis
+) -> float:
     """Return the drift of the source's clock (rate minus 1), or 0 if it is not significant."""
     start_drift = 0.0
-    if best.score < MIN_LIKELIHOOD_GAIN or residual_ratio(best, positions) > MAX_RESIDUAL_RATIO:
+    if (
+        best_hypothesis.score < MIN_LIKELIHOOD_GAIN
+        or residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_RATIO
+    ):
         hypotheses = [
             (candidates[0], clock_drift)
             for clock_drift in TESTED_CLOCK_DRIFTS.tolist()
             if (
                 candidates := find_candidates(
-                    positions.with_clock_drift(clock_drift).motion(imu), imu
+                    positions.remove_clock_drift(clock_drift).motion(imu_motion), imu_motion
                 )
             )
         ]
         best_candidate, start_drift = max(hypotheses, key=lambda pair: pair[0].score)
-        best = replace(best_candidate, heading_from=best.heading_from)
-        positions = positions.with_clock_drift(start_drift)
+        best_hypothesis = replace(best_candidate, heading_from=best_hypothesis.heading_from)
+        positions = positions.remove_clock_drift(start_drift)
     hypothesis = refine_hypothesis(
-        replace(best, has_clock_drift=True), positions, positions.motion(imu), imu
+        replace(best_hypothesis, has_clock_drift=True),
+        positions,
+        positions.motion(imu_motion),
+        imu_motion,
     )
     clock_drift = (1.0 + start_drift) / (1.0 - float(hypothesis.parameters[3])) - 1.0
-    return clock_drift if start_drift or hypothesis.score > best.score + MIN_DRIFT_GAIN else 0.0
+    return (
+        clock_drift
+        if start_drift or hypothesis.score > best_hypothesis.score + MIN_DRIFT_SCORE_GAIN
+        else 0.0
+    )
 
 
 def _check_orientation(
-    inertial: Inertial,
+    inertial_data: InertialData,
     track: PositionTrack,
     positions: SentPositions,
-    best: Hypothesis,
-    verdict: Verdict,
+    best_hypothesis: Hypothesis,
+    verdict: ConventionVerdict,
 ) -> OrientationConvention | None:
     """Determine the convention of the source's orientation, and its heading error."""
     assert track.orientation is not None
     quaternions = track.orientation[Columns.QUATERNION].to_numpy()
     checked_orientation = check_orientation(
-        inertial, track.orientation.index.to_numpy(), quaternions
+        inertial_data, track.orientation.index.to_numpy(), quaternions
     )
     if checked_orientation is None:
         return None
     convention, time_s, attitude = checked_orientation
-    is_convention_known = (
-        convention.verdict in ("determined", "ambiguous") and verdict == "determined"
-    )
-    if not is_convention_known or best.assignment.vertical_axis != 2 or best.assignment.is_mirrored:
+    if (
+        verdict != "determined"
+        or convention.verdict not in ("determined", "ambiguous")
+        or best_hypothesis.assignment.vertical_axis != 2
+        or best_hypothesis.assignment.is_mirrored
+    ):
         return convention
-    source_heading = np.interp(inertial.time_s, time_s, heading(attitude))
-    imu_motion = motion_from_imu(inertial, replace_heading(inertial.gyro_attitude, source_heading))
+    source_heading = np.interp(inertial_data.time_s, time_s, heading(attitude))
+    imu_motion = motion_from_imu(
+        inertial_data, replace_heading(inertial_data.gyro_attitude, source_heading)
+    )
     is_covered = (imu_motion.time_s > time_s[0] + DIFFERENCE_WINDOW_S) & (
         imu_motion.time_s < time_s[-1] - DIFFERENCE_WINDOW_S
     )
@@ -275,12 +339,12 @@ def _check_orientation(
     correct_headings_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(
         convention.frames, [0.0, 90.0]
     )
-    if best.assignment.vertical_sign > 0:
+    if best_hypothesis.assignment.vertical_sign > 0:
         correct_headings_deg = [0.0]
-    for hypothesis in search(positions, {"EKF2": imu_motion}):
+    for hypothesis in search_hypotheses(positions, {"EKF2": imu_motion}):
         if (hypothesis.assignment, hypothesis.unit, hypothesis.has_rotation) == (
-            best.assignment,
-            best.unit,
+            best_hypothesis.assignment,
+            best_hypothesis.unit,
             True,
         ):
             x_heading_deg = float(np.degrees(hypothesis.parameters[1]))

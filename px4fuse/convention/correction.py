@@ -1,4 +1,4 @@
-"""Faults in the convention of a position source, and the conversion to PX4's convention."""
+"""Deviations of a source from PX4's convention (axes, unit, clock), and their correction."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -8,6 +8,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.convention.axes import CLOCKWISE_DIRECTIONS, UNIT_SIZES_M, without_clock_drift
+from px4fuse.convention.check import is_source_fused
 from px4fuse.convention.model import Convention
 from px4fuse.convention.motion import read_inertial, replace_heading
 from px4fuse.convention.orientation import to_attitude
@@ -15,7 +16,6 @@ from px4fuse.convention.texts import FRAME_AXES, OPPOSITE, format_axes
 from px4fuse.core.arrays import Array
 from px4fuse.flight.model import (
     Columns,
-    Ekf2,
     Flight,
     PositionTrack,
     kind_without_orientation,
@@ -86,7 +86,7 @@ class Faults:
 
 
 def convention_faults(convention: Convention | None, flight: Flight, frame: str) -> Faults:
-    """Return the faults of a position source whose stated frame is ``frame``."""
+    """Return the deviations of a source from PX4's convention; ``frame`` is the logged frame."""
     if convention is None:
         return Faults()
     orientation_fault = _orientation_fault(convention)
@@ -103,8 +103,7 @@ def convention_faults(convention: Convention | None, flight: Flight, frame: str)
         return Faults(orientation=orientation_fault, is_ambiguous=not is_ned_likely)
     if convention.verdict != "determined":
         return Faults(orientation=orientation_fault)
-    fusion_flags = flight.ekf2.fusion_flags if isinstance(flight.ekf2, Ekf2) else None
-    is_fused = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags > 0).any(axis=None))
+    is_fused = is_source_fused(flight)
     has_wrong_axes, rotation_deg = _axes_and_rotation(convention)
     has_wrong_heading = orientation_fault in ("order", "heading")
     uses_gyro_heading = convention.heading_from == "gyroscopes"
@@ -143,9 +142,11 @@ def _axes_and_rotation(convention: Convention) -> tuple[bool, float]:
     is_known_frame = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
     if convention.is_mirrored or is_known_frame or convention.z not in ("up", "down"):
         return True, rotation_deg * (abs(rotation_deg) > MIN_REMAINDER_DEG)
-    total_deg = rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x) + 90.0 * is_up
-    total_deg = (total_deg + 180.0) % 360.0 - 180.0
-    return is_up, total_deg * (abs(total_deg) > MIN_ROTATION_DEG)
+    total_rotation_deg = (
+        rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x) + 90.0 * is_up
+    )
+    total_rotation_deg = (total_rotation_deg + 180.0) % 360.0 - 180.0
+    return is_up, total_rotation_deg * (abs(total_rotation_deg) > MIN_ROTATION_DEG)
 
 
 def _orientation_fault(convention: Convention) -> OrientationFault:
@@ -191,22 +192,22 @@ def correct_convention(
         orientation = orientation.set_axis(_corrected_times(orientation.index, faults))
         orientation[Columns.QUATERNION] = to_attitude(quaternion, convention.orientation)
     track = replace(track, samples=samples, orientation=orientation, origin=origin)
-    inertial = read_inertial(flight) if faults.affects_ekf2 else None
-    if inertial is None:
+    inertial_data = read_inertial(flight) if faults.affects_ekf2 else None
+    if inertial_data is None:
         return flight, track
-    attitude = inertial.attitudes[convention.heading_from]
-    # the axes of the positions are correct: rotate the attitude to the north of the positions
+    attitude = inertial_data.compute_attitudes()[convention.heading_from]
+    # the axes of the positions are correct, so the attitude is rotated to their north direction
     if not faults.has_wrong_axes and not faults.rotation_deg:
         turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x)
         attitude = replace_heading(attitude, heading(attitude) + np.radians(turn_deg))
-    attitude_table = pd.DataFrame(attitude, time_index(inertial.time_s), Columns.QUATERNION)
+    attitude_table = pd.DataFrame(attitude, time_index(inertial_data.time_s), Columns.QUATERNION)
     return replace(flight, attitude=attitude_table), track
 
 
 def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:
-    unit_m = UNIT_SIZES_M[convention.unit]
+    unit_size_m = UNIT_SIZES_M[convention.unit]
     if not faults.has_wrong_axes and not faults.rotation_deg:
-        return unit_m * np.eye(3)
+        return unit_size_m * np.eye(3)
     permutation = [
         [(axis == name) - (OPPOSITE[axis] == name) for axis in convention.axes]
         for name in FRAME_AXES["NED"]
@@ -215,7 +216,7 @@ def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:
     rotation_rad = -np.radians(convention.rotation_deg) * is_rotated
     cosine, sine = np.cos(rotation_rad), np.sin(rotation_rad)
     rotation = from_elements((cosine, -sine, 0.0), (sine, cosine, 0.0), (0.0, 0.0, 1.0))
-    return np.asarray(unit_m * rotation @ np.array(permutation))
+    return np.asarray(unit_size_m * rotation @ np.array(permutation))
 
 
 def _transform_known(values: Array, matrix: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Position of the source's sensor relative to the IMU, from ground truth or from turns."""
+"""Lever arm (sensor of the position source relative to the IMU) from ground truth or from turns."""
 
 from typing import NamedTuple
 
@@ -49,7 +49,10 @@ class LeverArm(NamedTuple):
 
 
 def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
-    """Estimate the lever arm that is not in EKF2's parameters, from ground truth if logged."""
+    """Estimate the lever arm that EKF2's parameters do not contain, if it is significant.
+
+    Ground truth is used if logged, else the IMU.
+    """
     lever_arm = None
     if isinstance(flight.truth, Truth):
         lever_arm = _fit_to_truth(flight, flight.truth, track)
@@ -99,16 +102,16 @@ def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverAr
 
 
 def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
-    inertial = read_inertial(flight)
+    inertial_data = read_inertial(flight)
     position_samples = track.samples[Columns.POSITION[:2]].dropna()
-    if inertial is None or len(position_samples) < 2:
+    if inertial_data is None or len(position_samples) < 2:
         return None
-    attitude = inertial.attitudes["EKF2"]
-    imu_motion = motion_from_imu(inertial, attitude)
+    attitude = inertial_data.compute_attitudes()["EKF2"]
+    imu_motion = motion_from_imu(inertial_data, attitude)
     rotation = to_matrix(attitude)[:, :2, :2].reshape(-1, 4)
-    arm_differences = SourceMotion.of(inertial.time_s, rotation, imu_motion.time_s).table.reshape(
-        -1, 2, 2
-    )
+    arm_differences = SourceMotion.of(
+        inertial_data.time_s, rotation, imu_motion.time_s
+    ).second_differences.reshape(-1, 2, 2)
     design = np.concatenate(
         [arm_differences, imu_motion.rate_m_s[:, :2, None], imu_motion.table[:, :2, 1:]], axis=2
     )
@@ -116,10 +119,10 @@ def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
     for _ in range(FIT_COUNT):
         source_motion = SourceMotion.of(time_s, position_samples.to_numpy(), imu_motion.time_s)
         is_used = is_used & source_motion.is_valid
-        difference_m = source_motion.table - imu_motion.table[:, :2, 0]
+        difference_m = source_motion.second_differences - imu_motion.table[:, :2, 0]
         design_rows = design[is_used].reshape(-1, design.shape[2])
         used_differences_m = difference_m[is_used].ravel()
-        # second differences overlap over twice the window, so only these are independent
+        # second differences within twice the window contain common positions, so are correlated
         independent_count = len(used_differences_m) * GRID_INTERVAL_S / (2.0 * DIFFERENCE_WINDOW_S)
         if independent_count < 2 * design_rows.shape[1]:
             return None

@@ -1,20 +1,20 @@
-"""Records of the axes, unit, clock and orientation that a position source uses."""
+"""Records of the axes, unit, clock and orientation of a position source (UWB, vision, ...)."""
 
 from typing import Literal
 
 from px4fuse.core.record import NotNegative, Positive, Record
 
-Verdict = Literal["determined", "ambiguous", "doubtful", "not determinable"]
+ConventionVerdict = Literal["determined", "ambiguous", "doubtful", "not determinable"]
 Direction = Literal["north", "east", "south", "west", "up", "down"]
 Axes = tuple[Direction, Direction, Direction]
 Unit = Literal["m", "cm", "mm", "feet"]
-HeadingSource = Literal["EKF2", "gyroscopes"]
-Order = Literal["w x y z", "x y z w"]
-Frames = Literal["FRD to NED", "FLU to ENU", "FLU to NWU", "FLU to NED", "FRD to ENU"]
+HeadingSource = Literal["EKF2", "gyroscopes", "GNSS"]
+QuaternionOrder = Literal["w x y z", "x y z w"]
+BodyAndWorldFrame = Literal["FRD to NED", "FLU to ENU", "FLU to NWU", "FLU to NED", "FRD to ENU"]
 
 
 class OrientationConvention(Record, kw_only=True, omit_defaults=False):
-    """Order and frames of the orientation of a position source.
+    """Quaternion order, body frame and world frame of a source's orientation.
 
     Attributes
     ----------
@@ -32,8 +32,8 @@ class OrientationConvention(Record, kw_only=True, omit_defaults=False):
     """
 
     verdict: Literal["determined", "ambiguous", "copied", "unrelated"]
-    order: Order = "w x y z"
-    frames: Frames = "FRD to NED"
+    order: QuaternionOrder = "w x y z"
+    frames: BodyAndWorldFrame = "FRD to NED"
     heading_error_deg: float | None = None
     tilt_difference_deg: NotNegative = 0.0
 
@@ -47,22 +47,24 @@ class Convention(Record, kw_only=True, omit_defaults=False):
         "ambiguous": several conventions fit; "doubtful": the residuals of the best convention are
         larger than the noise; "not determinable": too little data or motion.
     rotation_deg : float
-        Rotation of the positions relative to the axes x, y, z, clockwise from above.
-    heading_from : {"EKF2", "gyroscopes"}
-        Attitude that fits the positions: logged by EKF2, or integrated from the gyroscopes.
+        Clockwise rotation of the positions in addition to the directions of x, y and z.
+    heading_from : {"EKF2", "gyroscopes", "GNSS"}
+        Reference of the rotation: heading of EKF2, integrated gyroscopes, or GNSS positions.
     late_s : float
         Delay of the timestamps; negative if they are early.
     clock_drift : float
         Rate of the sender's clock minus 1.
     scale : float
-        Scale factor of the positions, relative to the displacement from the IMU.
+        Ratio of displacements, from the positions over from the IMU.
     log_odds : float or None
         Log likelihood ratio (with priors) to the second best convention.
     log_likelihood_gain : float
         Log likelihood ratio to positions that are unrelated to the motion.
+    alternatives : tuple of str
+        Other conventions that fit nearly as well.
     """
 
-    verdict: Verdict
+    verdict: ConventionVerdict
     x: Direction = "north"
     y: Direction = "east"
     z: Direction = "down"

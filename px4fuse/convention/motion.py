@@ -49,7 +49,7 @@ MIN_GAP_S = 0.35
 
 
 @dataclass(frozen=True)
-class Inertial:
+class InertialData:
     """Specific force and attitude at a constant interval ``INTEGRATION_STEP_S``.
 
     Attributes
@@ -71,9 +71,8 @@ class Inertial:
     gyro_attitude: Array
     valid_spans_s: tuple[tuple[float, float], ...]
 
-    @property
-    def attitudes(self) -> dict[HeadingSource, Array]:
-        """Attitudes with the tilt of ``gyro_attitude``, and the heading of EKF2 or gyroscopes."""
+    def compute_attitudes(self) -> dict[HeadingSource, Array]:
+        """Return the attitudes with tilt from the gyroscopes, by source of the heading."""
         return {
             "EKF2": replace_heading(self.gyro_attitude, heading(self.logged_attitude)),
             "gyroscopes": self.gyro_attitude,
@@ -85,16 +84,20 @@ class SourceMotion:
     """Second differences of positions, at a constant interval ``GRID_INTERVAL_S``."""
 
     time_s: Array
-    table: Array
+    second_differences: Array
     is_valid: BoolArray
 
     @classmethod
     def of(cls, time_s: Array, position: Array, grid_s: Array) -> "SourceMotion":
         """Compute the second differences of positions at the times ``grid_s``; invalid in gaps."""
         window_steps = round(DIFFERENCE_WINDOW_S / GRID_INTERVAL_S)
-        at_s = grid_s[0] + GRID_INTERVAL_S * np.arange(-window_steps, len(grid_s) + window_steps)
-        has_near_samples = is_bracketed(at_s, time_s, gap_limit(time_s, MIN_GAP_S))
-        columns = np.column_stack([np.interp(at_s, time_s, column) for column in position.T])
+        position_times_s = grid_s[0] + GRID_INTERVAL_S * np.arange(
+            -window_steps, len(grid_s) + window_steps
+        )
+        has_near_samples = is_bracketed(position_times_s, time_s, gap_limit(time_s, MIN_GAP_S))
+        columns = np.column_stack(
+            [np.interp(position_times_s, time_s, column) for column in position.T]
+        )
         is_valid = (
             has_near_samples[2 * window_steps :]
             & has_near_samples[window_steps:-window_steps]
@@ -123,8 +126,8 @@ class ImuMotion:
     rate_m_s: Array
 
 
-def read_inertial(flight: Flight) -> Inertial | None:
-    """Integrate the gyroscopes of a flight to an attitude that EKF2 does not affect.
+def read_inertial(flight: Flight) -> InertialData | None:
+    """Integrate the gyroscopes of a flight to an attitude without EKF2's corrections.
 
     Return None if IMU data and attitude overlap for less than 8 s.
     """
@@ -155,7 +158,7 @@ def read_inertial(flight: Flight) -> Inertial | None:
         for recorded_from_s, recorded_until_s in recorded_spans_s
         for flight_start_s, flight_end_s in airborne
     )
-    return Inertial(
+    return InertialData(
         time_s,
         force_m_s2,
         logged_attitude,
@@ -164,23 +167,23 @@ def read_inertial(flight: Flight) -> Inertial | None:
     )
 
 
-def _integrate_gyros(angle_rad: Array, logged_attitude: Array) -> Array:
+def _integrate_gyros(rotation_rad: Array, logged_attitude: Array) -> Array:
     """Integrate the gyroscopes without their bias, from the first logged attitude.
 
     The bias is the median rotation rate relative to the logged attitude, so heading resets have no
     effect.
     """
-    excess_rad = angle_rad - to_vector(
+    gyro_error_rad = rotation_rad - to_vector(
         multiply(conjugate(logged_attitude[:-1]), logged_attitude[1:])
     )
-    excess_sum_rad = np.cumsum(excess_rad, axis=0)
+    gyro_error_sum_rad = np.cumsum(gyro_error_rad, axis=0)
     window_steps = round(GYRO_BIAS_WINDOW_S / INTEGRATION_STEP_S)
     gyro_bias_rad = (
-        np.median(excess_sum_rad[window_steps:] - excess_sum_rad[:-window_steps], axis=0)
+        np.median(gyro_error_sum_rad[window_steps:] - gyro_error_sum_rad[:-window_steps], axis=0)
         / window_steps
     )
     return cumulative_product(
-        np.concatenate([logged_attitude[:1], from_vector(angle_rad - gyro_bias_rad)])
+        np.concatenate([logged_attitude[:1], from_vector(rotation_rad - gyro_bias_rad)])
     )
 
 
@@ -223,7 +226,7 @@ def second_difference(position: Array, window: int) -> Array:
     return position[2 * window :] - 2.0 * position[window:-window] + position[: -2 * window]
 
 
-def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
+def motion_from_imu(inertial_data: InertialData, attitude: Array) -> ImuMotion:
     """Integrate the specific force twice to second differences of the position in NED.
 
     ``attitude``, shape (n + 1, 4), is a quaternion (w, x, y, z; FRD to NED).
@@ -232,7 +235,7 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
     body_to_ned = to_matrix(
         middle_attitude / np.linalg.norm(middle_attitude, axis=1, keepdims=True)
     )
-    acceleration = body_to_ned @ inertial.force_m_s2[..., None] + [[0.0], [0.0], [constants.g]]
+    acceleration = body_to_ned @ inertial_data.force_m_s2[..., None] + [[0.0], [0.0], [constants.g]]
     table = np.concatenate([acceleration, body_to_ned], axis=2)
     position_m = np.zeros((len(attitude), 3, 4))
     velocity_m_s = np.cumsum(table, axis=0) * INTEGRATION_STEP_S
@@ -244,10 +247,10 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
     window_steps = round(DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S)
     stride = round(GRID_INTERVAL_S / INTEGRATION_STEP_S)
     second_differences = second_difference(position_m, window_steps)[::stride]
-    time_s = inertial.time_s[window_steps:-window_steps][::stride]
+    time_s = inertial_data.time_s[window_steps:-window_steps][::stride]
     # second differences within T of an IMU gap are invalid
-    is_valid = inside_spans(time_s, inertial.valid_spans_s)
-    for (_, end), (start, _) in pairwise(inertial.valid_spans_s):
+    is_valid = inside_spans(time_s, inertial_data.valid_spans_s)
+    for (_, end), (start, _) in pairwise(inertial_data.valid_spans_s):
         is_valid &= (time_s < end - DIFFERENCE_WINDOW_S) | (time_s > start + DIFFERENCE_WINDOW_S)
     filtered = high_pass(second_differences, is_valid)
     return ImuMotion(
@@ -257,8 +260,8 @@ def motion_from_imu(inertial: Inertial, attitude: Array) -> ImuMotion:
 
 def replace_heading(attitude: Array, heading_rad: Array) -> Array:
     """Rotate an attitude about the vertical to another heading."""
-    half_turn_rad = np.unwrap(heading_rad - heading(attitude)) / 2.0
-    zeros = np.zeros_like(half_turn_rad)
+    half_angle_rad = np.unwrap(heading_rad - heading(attitude)) / 2.0
+    zeros = np.zeros_like(half_angle_rad)
     return multiply(
-        np.stack([np.cos(half_turn_rad), zeros, zeros, np.sin(half_turn_rad)], axis=-1), attitude
+        np.stack([np.cos(half_angle_rad), zeros, zeros, np.sin(half_angle_rad)], axis=-1), attitude
     )

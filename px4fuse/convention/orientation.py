@@ -1,4 +1,4 @@
-"""Convention of a source's orientation: order of the quaternion, frames, rotation of the body.
+"""Order of the quaternion components, body frame and world frame of a source's orientation.
 
 Each possible convention is compared with the attitude from the gyroscopes, in tilt and in heading
 changes.
@@ -10,28 +10,28 @@ from typing import Final, NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from px4fuse.convention.model import Frames, Order, OrientationConvention
-from px4fuse.convention.motion import Inertial
+from px4fuse.convention.model import BodyAndWorldFrame, OrientationConvention, QuaternionOrder
+from px4fuse.convention.motion import InertialData
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.replay import inside_spans
 from px4fuse.trajectory.rotation import from_vector, heading, interpolate, multiply, to_matrix
 
-IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 # Quaternion (w, x, y, z) of half a turn about x, from FLU to FRD
 FLU_TO_FRD = np.array([0.0, 1.0, 0.0, 0.0])
 # Quaternion (w, x, y, z) from ENU to NED
 ENU_TO_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 # Quaternions that convert the world frame to NED and the body frame to FRD, by names of both frames
-FRAMES: Final[dict[Frames, tuple[Array, Array]]] = {
-    "FRD to NED": (IDENTITY, IDENTITY),
+FRAMES: Final[dict[BodyAndWorldFrame, tuple[Array, Array]]] = {
+    "FRD to NED": (IDENTITY_QUATERNION, IDENTITY_QUATERNION),
     "FLU to ENU": (ENU_TO_NED, FLU_TO_FRD),
     "FLU to NWU": (FLU_TO_FRD, FLU_TO_FRD),
-    "FLU to NED": (IDENTITY, FLU_TO_FRD),
-    "FRD to ENU": (ENU_TO_NED, IDENTITY),
+    "FLU to NED": (IDENTITY_QUATERNION, FLU_TO_FRD),
+    "FRD to ENU": (ENU_TO_NED, IDENTITY_QUATERNION),
 }
-ORDERS: tuple[Order, Order] = ("w x y z", "x y z w")
-# Maximum median difference (°) from EKF2's attitude for a copy of it: copies differ by 0.03°, fused
-# motion capture by more than 0.2°
+ORDERS: tuple[QuaternionOrder, QuaternionOrder] = ("w x y z", "x y z w")
+# Maximum median difference (°) from EKF2's attitude of an orientation that is copied from EKF2:
+# copies differ by 0.03°, fused motion capture by more than 0.2°
 MAX_COPY_DIFFERENCE_DEG = 0.15
 # Tested delays (s) of a copy of EKF2's attitude
 COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
@@ -39,9 +39,9 @@ COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
 MAX_TILT_DIFFERENCE_DEG = 6.0
 # Maximum median heading difference (°) of a correct convention
 MAX_HEADING_DIFFERENCE_DEG = 12.0
-# Smaller tilt or heading differences (°) are noise and count as this value in the score
+# Minimum tilt and heading differences (°) in the score of a convention: smaller ones are noise
 MIN_SCORED_DIFFERENCE_DEG = 0.7
-# Decrease of a convention's score per second of flight and per unit of ln(angle difference)
+# Decrease of the score (log likelihood) of a convention per second and per ln(angle difference)
 SCORE_PER_S = 0.5
 # Minimum score difference between the best and the second best convention
 MIN_LOG_ODDS = 4.0
@@ -60,30 +60,40 @@ class Candidate(NamedTuple):
 
     @property
     def order_and_frames(self) -> tuple[str, str]:
-        """Order and frames of the quaternion; ENU as NWU, because both differ only in heading."""
+        """Quaternion order and frames; ENU is replaced by NWU, which differs only in heading."""
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
 
 def check_orientation(
-    inertial: Inertial, time_s: Array, quaternion: Array
+    inertial_data: InertialData, time_s: Array, quaternion: Array
 ) -> tuple[OrientationConvention, Array, Array] | None:
-    """Determine quaternion order and frames of a source's orientation; None with few samples.
+    """Determine quaternion order and frames of a source's orientation (``quaternion`` as sent).
 
-    Return the convention without ``heading_error_deg``, at most MAX_SAMPLES of the times in flight,
-    and the attitudes (FRD to NED) at these times. ``quaternion``, shape (n, 4), is as sent.
+    Returns
+    -------
+    convention : OrientationConvention
+        Without ``heading_error_deg``.
+    time_s : ndarray, shape (m,)
+        Times in flight, at most MAX_SAMPLES.
+    attitude : ndarray, shape (m, 4)
+        FRD to NED.
+
+    The result is None for fewer than MIN_SAMPLES orientations.
     """
-    flight_rows = np.flatnonzero(inside_spans(time_s, inertial.valid_spans_s))
+    flight_rows = np.flatnonzero(inside_spans(time_s, inertial_data.valid_spans_s))
     if len(flight_rows) < MIN_SAMPLES:
         return None
     flight_rows = flight_rows[:: -(-len(flight_rows) // MAX_SAMPLES)]
     sample_s, sent_quaternions = time_s[flight_rows], quaternion[flight_rows]
     sent_quaternions = sent_quaternions / np.linalg.norm(sent_quaternions, axis=1, keepdims=True)
     for delay_s in COPY_DELAYS_S:
-        logged_attitude = interpolate(sample_s - delay_s, inertial.time_s, inertial.logged_attitude)
+        logged_attitude = interpolate(
+            sample_s - delay_s, inertial_data.time_s, inertial_data.logged_attitude
+        )
         cosine = np.clip(np.abs(np.sum(sent_quaternions * logged_attitude, axis=1)), 0.0, 1.0)
         if np.median(2.0 * np.arccos(cosine)) < np.radians(MAX_COPY_DIFFERENCE_DEG):
             return OrientationConvention(verdict="copied"), sample_s, sent_quaternions
-    reference_attitude = interpolate(sample_s, inertial.time_s, inertial.gyro_attitude)
+    reference_attitude = interpolate(sample_s, inertial_data.time_s, inertial_data.gyro_attitude)
     candidates = [
         _make_candidate(
             sample_s, sent_quaternions, reference_attitude, order, frames, quarter_turns
@@ -118,19 +128,25 @@ def to_attitude(sent_quaternions: Array, convention: OrientationConvention) -> A
 
 def _make_candidate(
     time_s: Array,
-    sent: Array,
-    reference: Array,
-    order: Order,
-    frames: Frames,
+    sent_quaternions: Array,
+    reference_attitude: Array,
+    order: QuaternionOrder,
+    frames: BodyAndWorldFrame,
     body_quarter_turns: int,
 ) -> Candidate:
+    """Score one convention of the quaternions by their distance from the reference attitude.
+
+    The score decreases with the median differences of tilt and heading, without the constant
+    heading offset. It prefers usual conventions: quaternion order w x y z, FRD to NED, no rotation
+    of the body, and a heading offset of at most 8°.
+    """
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
     body_rotation = from_vector(np.array([0.0, 0.0, body_quarter_turns * np.pi / 2.0]))
-    attitude = multiply(to_attitude(sent, convention), body_rotation)
-    heading_difference = np.exp(1j * (heading(attitude) - heading(reference)))
+    attitude = multiply(to_attitude(sent_quaternions, convention), body_rotation)
+    heading_difference = np.exp(1j * (heading(attitude) - heading(reference_attitude)))
     offset_rad = np.angle(np.mean(heading_difference))
     heading_difference_rad = np.abs(np.angle(heading_difference * np.exp(-1j * offset_rad)))
-    tilt_cosine = np.sum(to_matrix(attitude)[:, 2] * to_matrix(reference)[:, 2], axis=1)
+    tilt_cosine = np.sum(to_matrix(attitude)[:, 2] * to_matrix(reference_attitude)[:, 2], axis=1)
     tilt_rad = np.arccos(np.clip(tilt_cosine, -1.0, 1.0))
     tilt_deg, heading_deg = np.degrees(
         np.median([tilt_rad, heading_difference_rad], axis=1)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from px4fuse.convention.axes import UNIT_SIZES_M
 from px4fuse.convention.model import Axes, Direction, Unit
 
-# Directions ordered so that the reversed tuple contains the opposite of each direction
+# All directions: the opposite of each has the same index in the reversed tuple
 DIRECTIONS: tuple[Direction, ...] = ("north", "east", "down", "up", "west", "south")
 OPPOSITE = dict(zip(DIRECTIONS, DIRECTIONS[::-1], strict=True))
 FRAME_AXES: dict[str, Axes] = {
@@ -34,7 +34,7 @@ def axes_as_sent(axes: Axes, frame: str) -> Axes:
     Parameters
     ----------
     axes : tuple of str
-        True directions of north, east, down as the reader understood the file.
+        True directions of the three components that were read as north, east, down.
     frame : {"NED", "ENU", "NWU"}
         Frame that the reader assumed.
     """
@@ -68,8 +68,8 @@ def describe_axes(
         title = "y points up"
     fault = f"{title}: x is {x}, y {y}, z {z}{' (left-handed frame)' if is_mirrored else ''}"
     source_axes = dict(zip(with_opposites(axes), ("x", "y", "z", "-z", "-y", "-x"), strict=True))
-    ned_axes = ", ".join(source_axes[direction] for direction in FRAME_AXES["NED"])
-    ned_text = f"(north, east, down) = ({ned_axes})"
+    ned_axes_text = ", ".join(source_axes[direction] for direction in FRAME_AXES["NED"])
+    ned_text = f"(north, east, down) = ({ned_axes_text})"
     if is_file and frame_name:
         return fault, f"Run again with --position-frame {frame_name.lower()}."
     if is_file:

@@ -1,1 +1,1 @@
-"""Utilities of all packages: result records, file access, text formatting, worker processes."""
+"""Utilities for all packages: result records, file access, text formatting, worker processes."""

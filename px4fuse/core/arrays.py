@@ -18,15 +18,26 @@ def median_interval(time_s: Array) -> float:
 
 
 def cumulative_integral(values: Array, time_s: Array) -> Array:
-    """Integrate values over time up to each sample (trapezoidal rule, first axis, from zero)."""
+    """Integrate values over time up to each sample (trapezoidal rule, axis 0)."""
     integral = np.zeros(values.shape)
     intervals_s = np.diff(time_s).reshape(-1, *[1] * (values.ndim - 1))
     np.cumsum((values[1:] + values[:-1]) / 2.0 * intervals_s, axis=0, out=integral[1:])
     return integral
 
 
+def cumulative_sums(rows: Array) -> Array:
+    """Return the sums of the first 0, 1, ..., n rows, shape (n + 1, k)."""
+    return np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(rows, axis=0)])
+
+
+def intervals_where(time_s: Array, is_selected: BoolArray) -> list[tuple[float, float]]:
+    """Return start and end (s) of the selected intervals between successive times."""
+    starts_s, ends_s = time_s[:-1][is_selected], time_s[1:][is_selected]
+    return list(zip(starts_s.tolist(), ends_s.tolist(), strict=True))
+
+
 def rank_correlation(first: Array, second: Array) -> float:
-    """Return Spearman's rank correlation, without the slow import of scipy.stats.
+    """Return Spearman's rank correlation (without scipy.stats, whose import is slow).
 
     >>> rank_correlation(np.array([1.0, 2.0, 3.0]), np.array([1.0, 4.0, 9.0]))
     1.0

@@ -1,8 +1,7 @@
-"""Register of the input files of a command, so that no output overwrites an input.
+"""Protection of the input files of a command from being overwritten by its outputs.
 
-Readers register each file that they open. Files are compared by device and inode, because a link or
-another spelling of the path leads to the same file. Worker processes have no register: the main
-process adds their files.
+Each file that is read is registered. Files are compared by device and inode, because different
+paths may lead to one file. Worker processes have no register: the main process adds their files.
 """
 
 import os
@@ -18,9 +17,9 @@ from px4fuse.errors import OutputError
 _FileIdentity = tuple[int, int] | str
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)  # filled during the run
 class _InputRegister:
-    """Input files and folders of a command that is running."""
+    """Input files and folders of the running command."""
 
     inputs: set[_FileIdentity] = field(default_factory=set)
     input_by_folder: dict[_FileIdentity, Path] = field(default_factory=dict)
@@ -32,7 +31,7 @@ _register: ContextVar[_InputRegister | None] = ContextVar("register", default=No
 
 @contextmanager
 def inputs_protected() -> Iterator[None]:
-    """Register all files that are read inside the context, and reject writing to them."""
+    """Register all files that are read inside this context; outputs cannot overwrite them."""
     previous_register = _register.set(_InputRegister())
     try:
         yield
@@ -42,7 +41,7 @@ def inputs_protected() -> Iterator[None]:
 
 @contextmanager
 def inputs_not_registered() -> Iterator[None]:
-    """Do not register files that are read inside the context; outputs may overwrite them."""
+    """Do not register files that are read inside this context; outputs may overwrite them."""
     previous_register = _register.set(None)
     try:
         yield
@@ -75,7 +74,7 @@ def check_outputs(targets: Iterable[Path]) -> None:
 
 
 def check_output_folder(folder: Path) -> None:
-    """Raise an OutputError if the output folder is a file, or contains an input of the command."""
+    """Raise an OutputError if the output folder is a file, or contains a registered input."""
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"the output folder {folder} is a file. Choose another name.")
     register = _register.get() or _InputRegister()

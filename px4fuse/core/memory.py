@@ -5,7 +5,7 @@ import sys
 
 
 def release_free_memory() -> None:
-    """Return freed memory to the operating system, because the C library (glibc) keeps it."""
+    """Return freed memory, which the C library (glibc) keeps, to the operating system."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
     if trim is not None:
         trim(0)

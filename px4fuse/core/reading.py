@@ -1,8 +1,8 @@
 """Reading of input files: regular files only, up to a size limit.
 
-Each file is registered as an input, so that no output replaces it. Type and size are checked before
-a file is opened, because reading a device, named pipe or socket may never end, and a sparse file
-may be larger than the memory.
+Type and size are checked before a file is opened: reading a device or named pipe may never end, and
+a sparse file may be larger than the memory. Each file is registered as an input, so that no output
+replaces it.
 """
 
 import gzip
@@ -33,7 +33,7 @@ LOG_SIZE_REMEDY = "Shorten the log to the flight, or increase the size limit wit
 
 
 def display_name(path: Path) -> str:
-    r"""Return the file name in a path for messages, as one line that is not empty.
+    r"""Return the file name in a path for messages, on one line.
 
     >>> display_name(Path("logs/a.ulg")), display_name(Path(".")), display_name(Path("a\nb"))
     ('a.ulg', '.', 'a b')
@@ -42,7 +42,7 @@ def display_name(path: Path) -> str:
 
 
 def split_path_and_part(argument: str) -> tuple[Path, str | None]:
-    """Split ``FILE:PART``; a part is a track, a body in a motion-capture file, or a ROS topic."""
+    """Split ``FILE:PART`` (part: track, body in a motion-capture file, or ROS topic)."""
     path, colon, part = argument.rpartition(":")
     if colon and not Path(argument).exists() and (part.isidentifier() or Path(path).exists()):
         return Path(path), part
@@ -50,9 +50,9 @@ def split_path_and_part(argument: str) -> tuple[Path, str | None]:
 
 
 def check_readable(path: Path, folders: Sequence[Path]) -> None:
-    """Raise a LogError if a path, with symbolic links resolved, is outside of all folders.
+    """Raise a LogError if a file is outside of all ``folders`` (after resolving symbolic links).
 
-    ``folders`` are resolved paths; without folders, each path is accepted.
+    Without folders, each path is accepted.
     """
     resolved_path = Path(os.path.realpath(path))
     if folders and not any(map(resolved_path.is_relative_to, folders)):
@@ -92,7 +92,7 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
 
 
 def read_head(path: Path, byte_count: int, error_type: type[Px4FuseError]) -> bytes:
-    """Read at most ``byte_count`` first bytes of a regular file."""
+    """Read the first ``byte_count`` bytes of a regular file."""
     file_size(path, error_type)
     return _read_bytes(path, byte_count, error_type, display_name(path))
 
@@ -121,7 +121,7 @@ def read_bytes_limited(
     content = (
         b"" if size_bytes > limit_bytes else _read_bytes(path, size_bytes + 1, error_type, name)
     )
-    if len(content) > size_bytes:  # the file grows, or is in /proc, where files report size 0
+    if len(content) > size_bytes:  # a growing file, or a file in /proc (size 0)
         content = _read_bytes(path, limit_bytes + 1, error_type, name)
     if (actual_size_bytes := max(size_bytes, len(content))) > limit_bytes:
         raise error_type(format_size_limit(name, actual_size_bytes, limit_bytes), size_remedy)
@@ -172,10 +172,10 @@ def read_text(
 
 
 def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
-    """Return the paths of files by their SHA-256, with all regular files in folders.
+    """Return files, and all regular files in folders, by their SHA-256.
 
-    Files in folders are ignored if they are larger than :data:`max_log_bytes`. Of files with the
-    same content, the first is returned.
+    Files in folders that are larger than :data:`max_log_bytes` are ignored. Of identical files,
+    only the first is returned.
 
     Raises
     ------
@@ -208,10 +208,9 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
 
 
 def files_below(folder: Path) -> list[Path]:
-    """Return all files in a folder and its subfolders, sorted.
+    """Return all files in a folder and its subfolders, sorted; links to folders are not followed.
 
-    Links to folders are not followed. A folder that cannot be listed is returned as a file, so that
-    its reading raises the error.
+    A folder that cannot be listed is returned like a file, so that the caller gets an error.
     """
     files: list[Path] = []
     pending_folders = [folder]
@@ -237,7 +236,7 @@ def _read_bytes(path: Path, byte_count: int, error_type: type[Px4FuseError], nam
 
 
 def _open_decompressed(path: Path) -> Any:
-    """Open a file; if gzip or zstd compressed it, its decompressed content is read."""
+    """Open a file; decompress a file that was compressed by gzip or zstd."""
     with path.open("rb") as file:
         compression_module = {b"\x1f\x8b\x08": gzip, b"\x28\xb5\x2f": zstd}.get(file.read(3))
     return compression_module.open(path) if compression_module else path.open("rb")
@@ -251,7 +250,7 @@ def _read_error(
 
 
 def format_size_limit(name: str, size_bytes: int, limit_bytes: int) -> str:
-    """Format the error of a file whose size (bytes) exceeds the limit (bytes)."""
+    """Format the error message for a file that is too large."""
     size_mb, limit_mb = (
         f"{byte_count / 1e6:,.{0 if byte_count >= 10_000_000 else 2}f}"
         for byte_count in (size_bytes, limit_bytes)

@@ -1,7 +1,4 @@
-"""Base class of the records in results, their display, and :class:`Unavailable` for missing data.
-
-Field names contain the unit.
-"""
+"""Base class for immutable data classes (records), and :class:`Unavailable` for missing data."""
 
 from __future__ import annotations
 
@@ -14,18 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, Union, dat
 import msgspec
 from msgspec import Meta, UnsetType
 
-# Maximum length (characters) of a text field in the representation of a record
+# Maximum length (characters) of a text in ``repr`` of a record
 MAX_TEXT_LENGTH = 60
 
 
 @singledispatch
 def display_html(result: object) -> str | None:
-    """Return a result as HTML for notebooks; None for types without a registered function."""
+    """Return a result as HTML for Jupyter notebooks; None for types without HTML."""
     return None
 
 
 def one_line_repr(result: Any) -> str:
-    """Format a record on one line, with the shapes of tables and arrays instead of their values.
+    """Format a record on one line; arrays and tables are replaced by their shape.
 
     >>> import pandas as pd
     >>> from px4fuse.flight.model import Truth
@@ -66,35 +63,34 @@ Span = tuple[float, float]
 Vector = tuple[float, float, float]
 
 
-# Default value of a field that is not written to the results
+# Default value of a field that is not written to the JSON results
 NOT_WRITTEN: Any = msgspec.UNSET
 
 
-# Subclasses inherit frozen=True; type checkers need the decorator to know this
+# the decorator informs type checkers that subclasses are frozen, too
 @dataclass_transform(frozen_default=True)
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Immutable record; fields that are None are not written to the results.
+    """Immutable data class; fields that are None are not written to the JSON results.
 
-    Fields of the type :class:`NotWritten` (arrays, tables) are not written either, and are missing
-    in records that were read from results.
+    Fields of the type :class:`NotWritten` (arrays, tables) are not written either.
     """
 
     __repr__ = one_line_repr
 
 
 class Unavailable(Record):
-    """Missing data with cause and advice, used in place of a record.
+    """Reason why data are missing, returned instead of the data.
 
     Attributes
     ----------
     what : str
-        Missing data as a noun phrase ("EKF2 innovations").
+        Missing data, for example "EKF2 innovations".
     reason : str
-        Cause in the log ("no topic vehicle_attitude").
+        Cause in the log, for example "no topic vehicle_attitude".
     remedy : str
         Advice to the user, for example a setting to log the data.
     source : str
-        Name of the missing position source; empty if other data are missing.
+        Name of the missing position source; "" for other data.
     """
 
     what: str
@@ -115,7 +111,7 @@ if TYPE_CHECKING:
 else:
 
     class NotWritten:
-        """``NotWritten[T]``: a value T that results do not contain."""
+        """``NotWritten[T]``: a field of type T that is not written to the JSON results."""
 
         def __class_getitem__(cls, kind: object) -> type:
             return msgspec.UnsetType
@@ -123,8 +119,8 @@ else:
     class RecordOrUnavailable:
         """``RecordOrUnavailable[T, A]``: a record T, or a subclass A of :class:`Unavailable`.
 
-        msgspec decodes unions of tagged records only, so :func:`decode_record_or_unavailable`
-        decodes these untagged records.
+        Decoded by :func:`decode_record_or_unavailable`, because msgspec requires a tag field for
+        unions.
         """
 
         def __class_getitem__(cls, kinds: tuple[type, type]) -> type:
@@ -143,7 +139,7 @@ else:
 
 
 def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
-    """Decode a :class:`RecordOrUnavailable` for msgspec (argument ``dec_hook``)."""
+    """Decode a :class:`RecordOrUnavailable` (argument ``dec_hook`` of msgspec)."""
     record_type, unavailable_type = union_type.union_members
     record_class = (
         unavailable_type
@@ -156,30 +152,15 @@ def decode_record_or_unavailable(union_type: Any, value: Any) -> Any:
         raise ValueError(str(error)) from error  # msgspec adds the path of the value to the message
 
 
-def to_serializable(value: Any) -> Any:
-    """Remove from a record, and the records in it, the fields that are not written."""
-    if isinstance(value, Record):
-        written_names = (
-            field.name
-            for field in msgspec.structs.fields(value)
-            if field.type is not msgspec.UnsetType
-        )
-        fields = {name: to_serializable(getattr(value, name)) for name in written_names}
-        return type(value)(**fields)
-    if isinstance(value, Mapping):
-        return {key: to_serializable(child) for key, child in value.items()}
-    return tuple(map(to_serializable, value)) if isinstance(value, tuple) else value
-
-
 def read_toml(module_file: str, kind: type[T], name: str = "") -> T:
-    """Read a TOML file of px4fuse as the type ``kind``.
+    """Read a TOML file in the folder of a module, and convert it to the type ``kind``.
 
     Parameters
     ----------
     module_file : str
-        ``__file__`` of a module in the same folder.
+        ``__file__`` of the module.
     name : str
-        Name of the TOML file; by default that of the module.
+        Name of the TOML file; by default the module name with the suffix .toml.
     """
     path = Path(module_file).with_suffix(".toml")
     return msgspec.toml.decode((path.with_name(name) if name else path).read_bytes(), type=kind)

@@ -1,4 +1,4 @@
-"""Neutralisation of untrusted text for spreadsheets, which could execute it as a formula."""
+"""Protection of spreadsheets from untrusted text that could be executed as a formula."""
 
 import re
 import unicodedata
@@ -9,19 +9,19 @@ MAX_CELL_LENGTH = 32_000
 
 
 def neutralise_formulas(text: str) -> str:
-    r"""Return text that a spreadsheet shows as text (OWASP, CSV injection).
+    r"""Escape text so that a spreadsheet does not execute it as a formula (OWASP, CSV injection).
 
     >>> [neutralise_formulas(text) for text in ("=1+1", " \uff0b1", "a;=1+1", "3 - 2")]
     ["'=1+1", "' ＋1", "a;'=1+1", '3 - 2']
     """
-    # in some regions Excel splits cells at semicolons, even within quotes
+    # with some regional settings, Excel splits cells at semicolons, even inside quotes
     cells = (f"'{cell}" if _is_formula(cell) else cell for cell in text.split(";"))
     safe_text = "".join(map(_replace_control_character, ";".join(cells)))
     return safe_text if len(safe_text) <= MAX_CELL_LENGTH else safe_text[:MAX_CELL_LENGTH] + "…"
 
 
 def neutralise_id(text: str) -> str:
-    """Neutralise an id by :func:`neutralise_formulas` only if it can be a formula.
+    """Escape an id only if a spreadsheet could execute it as a formula.
 
     >>> neutralise_id("0042"), neutralise_id("-17"), neutralise_id("a.b@c.de"), neutralise_id("=1")
     ('0042', '-17', 'a.b@c.de', "'=1")
@@ -30,7 +30,7 @@ def neutralise_id(text: str) -> str:
 
 
 def _is_formula(text: str) -> bool:
-    """Return True if the first visible character after quotes may begin a formula."""
+    """Return True if the first visible character (without quotes) can begin a formula."""
     if text.startswith(("\t", "\r")):
         return True
     for character in text:

@@ -1,4 +1,4 @@
-"""Formatting of numbers and short texts, and conversion of records to JSON types."""
+"""Formatting of numbers and texts, and conversion of data classes for JSON."""
 
 import math
 import re
@@ -15,9 +15,9 @@ import msgspec
 
 
 def to_json_types(value: object) -> Any:
-    """Convert records, mappings and tuples to dicts and lists for JSON.
+    """Convert data classes, mappings and tuples to dicts and lists for JSON.
 
-    None, UNSET, NaN and infinity in a dict are omitted.
+    Dict entries with None, UNSET, NaN or infinity are omitted.
 
     >>> to_json_types({"rate_hz": float("nan"), "topics": ("a", "b")})
     {'topics': ['a', 'b']}
@@ -97,7 +97,7 @@ def capitalise_first(text: str) -> str:
 
 
 def lower_first(text: str) -> str:
-    """Begin a sentence in lower case, unless the first word is an acronym such as UWB."""
+    """Change the first letter to lower case, except in an acronym such as UWB."""
     return text if text[1:2].isupper() else text[:1].lower() + text[1:]
 
 
@@ -153,7 +153,7 @@ def format_metres(length_m: float) -> str:
 
 
 def replace_unencodable(text: str) -> str:
-    """Replace bytes of a path or command line that are not valid UTF-8 by question marks."""
+    """Replace invalid UTF-8 bytes in a path or command line by question marks."""
     return text.encode(errors="replace").decode()
 
 
@@ -169,9 +169,7 @@ def with_log_name(text: str, log_name: str) -> str:
 def clean_text(text: str) -> str:
     r"""Remove characters that control a terminal, a page layout or the text direction.
 
-    These are control characters other than newline and tab, bidirectional embeddings, overrides
-    and isolates, line and paragraph separators, tag characters, noncharacters and lone surrogates.
-    Letters and symbols of all languages remain.
+    Letters and symbols of all languages, newline and tab remain.
 
     >>> clean_text("Zo\u00eb\x1b[2J \u202egnp.exe\ud800")
     'Zoë[2J gnp.exe'
@@ -187,7 +185,7 @@ def one_line(text: str, max_length: int) -> str:
     >>> one_line("a\nb\t c", 4)
     'a b…'
     """
-    # the text is cut first, because cleaning millions of characters would be slow
+    # shorten first: cleaning millions of characters is slow
     line = " ".join(clean_text(text[: 10 * max_length]).split())
     return line if len(line) <= max_length else line[: max_length - 1].rstrip() + "…"
 

@@ -1,10 +1,10 @@
-"""Environment variables for single-threaded linear algebra.
+"""Environment variables that limit linear algebra libraries to one thread.
 
-The matrices are small, so more threads would mostly wait for each other.
+Several threads are slower for the small matrices of px4fuse.
 """
 
-# Libraries read these variables when they are loaded
-ONE_THREAD = {
+# Environment variables, to be set before the libraries are loaded
+ONE_THREAD_ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",

@@ -1,4 +1,4 @@
-"""Parsing of numbers that users type with a unit."""
+"""Parsing of numbers with a unit, for example "10cm"."""
 
 import re
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from px4fuse.core.record import read_toml
 _UNIT_TABLES = read_toml(__file__, dict[str, dict[str, Any]])
 # Full name of each unit, by its symbol
 UNIT_NAMES: Mapping[str, str] = _UNIT_TABLES["names"]
-# Conversion factors to one unit of each quantity, by quantity and unit (lower case)
+# Conversion factors to a base unit, by quantity and unit (lower case)
 _UNIT_FACTORS: Mapping[str, Mapping[str, float]] = _UNIT_TABLES["typed"]
 _NUMBER_WITH_UNIT = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNORECASE)
 
@@ -18,7 +18,7 @@ _NUMBER_WITH_UNIT = re.compile(r"([-+]?[\d.,]+(?:e[-+]?\d+)?)\s*(\S*)", re.IGNOR
 def convert_to_unit(text: str, unit: str) -> float | None:
     """Parse a number with or without a unit, and convert it to ``unit``.
 
-    Return None if the text is no number or has another kind of unit.
+    Return None if the text is not a number, or has a unit of another quantity.
 
     >>> convert_to_unit("10cm", "m"), convert_to_unit("0,5", "s"), convert_to_unit("10 apples", "m")
     (0.1, 0.5, None)

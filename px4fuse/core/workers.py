@@ -21,38 +21,37 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
 from px4fuse.core.text import one_line
-from px4fuse.core.threads import ONE_THREAD
+from px4fuse.core.threads import ONE_THREAD_ENVIRONMENT
 from px4fuse.errors import Px4FuseError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-# Maximum number of jobs of a worker process, because caches of libraries grow; a lower number would
-# cost time, because the imports of a new process take 2 s
+# Maximum number of jobs of a worker process: caches of libraries grow, but a new process takes 2 s
 MAX_JOBS_PER_WORKER = 80
-# Default maximum time (s) and memory (bytes) of a job; a report of a 10-minute flight takes 60 s
+# Default limits of time (s) and memory (bytes) of a job; a report on 10 minutes takes 60 s
 TIMEOUT_S, MAX_MEMORY_BYTES = 120.0, 4_000_000_000
-# Maximum time (s) for the imports of a new process on a slow and busy computer
+# Maximum time (s) for the start of a process on a slow and busy computer
 START_TIMEOUT_S = 180.0
-# Environment variables of worker processes. PYTHONSAFEPATH prevents that Python imports a file of a
-# student, such as functools.py, from the current folder
-_WORKER_ENVIRONMENT = {"PYTHONSAFEPATH": "1", **ONE_THREAD}
+# Environment variables of worker processes. With PYTHONSAFEPATH, Python does not import files from
+# the current folder, which may contain files of a student
+_WORKER_ENVIRONMENT = {"PYTHONSAFEPATH": "1", **ONE_THREAD_ENVIRONMENT}
 
 
 @dataclass(frozen=True)
 class JobFailure:
-    """Failure of a job in a worker process, with the reason in one line; replaces its result."""
+    """Reason why a job in a worker process failed, returned instead of its result."""
 
     reason: str
 
 
 class _Worker:
-    """Worker process with its current job, and the pipe through which it is controlled."""
+    """Worker process with its current job, and the pipe for jobs and results."""
 
     def __init__(
         self, function: Callable[[Any], Any], memory_bytes: int | None, job_index: int
     ) -> None:
-        # spawn works on all systems and does not copy the memory of the parent
+        # spawn works on all systems and does not copy the memory of this process
         context = multiprocessing.get_context("spawn")
         self.pipe, child_pipe = context.Pipe()
         self.process = context.Process(
@@ -66,7 +65,7 @@ class _Worker:
         finally:
             os.environ.clear()
             os.environ.update(previous_environment)
-        child_pipe.close()  # else the pipe would stay open after the worker process has died
+        child_pipe.close()  # otherwise the pipe stays open after the end of the worker process
         self.is_ready = False
         self.job_index = job_index
         self.finished_count = 0
@@ -81,7 +80,7 @@ class _Worker:
 
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Block Ctrl-C; processes that start meanwhile ignore Ctrl-C, too, and print no traceback."""
+    """Block Ctrl-C in this process and in processes that start meanwhile."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
@@ -101,7 +100,7 @@ def run_with_limits(
     timeout_s: float = TIMEOUT_S,
     memory_bytes: int | None = MAX_MEMORY_BYTES,
 ) -> Generator[tuple[int, Result | JobFailure]]:
-    """Call a function on every job in worker processes, with limits of time and memory for a job.
+    """Call a function on every job in worker processes, with limits of time and memory.
 
     A process that hangs, dies or uses too much memory is replaced, and the other jobs continue. All
     processes end when this generator ends (error, Ctrl-C, ``close``).
@@ -109,19 +108,19 @@ def run_with_limits(
     Parameters
     ----------
     function : callable
-        Function at the top level of a module, because function, jobs and results are pickled.
+        Function at the top level of a module. Function, jobs and results are pickled.
     processes : int, optional
         Number of parallel processes; by default the number of cores.
     timeout_s : float
         Maximum time for one job, without the start of its process.
     memory_bytes : int or None
-        Maximum address space of one process (RLIMIT_AS), of which libraries use about 0.6 GB; None
-        for no limit. The limit has no effect on Windows and macOS.
+        Maximum address space of one process on Linux (RLIMIT_AS), of which libraries use about
+        0.6 GB; None for no limit.
 
     Yields
     ------
     (int, object)
-        Index of a job and its result or :class:`JobFailure`, in the order in which jobs finish.
+        Index of a finished job, and its result or :class:`JobFailure`.
     """
     with closing(poll_with_limits(function, jobs, processes, timeout_s, memory_bytes)) as outcomes:
         yield from (outcome for outcome in outcomes if outcome is not None)
@@ -135,16 +134,16 @@ def poll_with_limits(
     memory_bytes: int | None,
     max_wait_s: float = math.inf,
 ) -> Generator[tuple[int, Result | JobFailure] | None]:
-    """Run jobs as :func:`run_with_limits`; yield None if no job finishes within ``max_wait_s``."""
+    """Run jobs like :func:`run_with_limits`; yield None if none finishes within ``max_wait_s``."""
     waiting_indices = list(range(len(jobs)))[::-1]
     workers: dict[Connection, _Worker] = {}
     try:
         while waiting_indices or workers:
             while waiting_indices and len(workers) < (processes or os.cpu_count() or 1):
-                # assigned before the process starts, so that a failed start fails only this job
+                # take the job first: if the process does not start, only this job fails
                 new_worker = _Worker(function, memory_bytes, waiting_indices.pop())
                 workers[new_worker.pipe] = new_worker
-            # the wait ends at the first deadline or if a pipe has data
+            # wait for the first deadline, or until a pipe has data
             first_deadline = min(worker.deadline for worker in workers.values())
             remaining_s = max(0.0, first_deadline - time.monotonic())
             ready_pipes = wait(workers, min(remaining_s, max_wait_s))
@@ -167,7 +166,7 @@ def poll_with_limits(
                             continue
                         worker.job_index = waiting_indices.pop()
                     worker.deadline = time.monotonic() + timeout_s
-                    # the next read of the pipe detects that the worker process has died
+                    # if the worker process has died, the next read of the pipe fails
                     with suppress(BrokenPipeError, ConnectionResetError):
                         pipe.send(jobs[worker.job_index])
                 elif time.monotonic() >= worker.deadline:
@@ -188,7 +187,7 @@ def run_one_with_limits(
     timeout_s: float,
     memory_bytes: int = MAX_MEMORY_BYTES,
 ) -> Result | JobFailure:
-    """Call a function on one job in a worker process, with limits as in :func:`run_with_limits`."""
+    """Call a function on one job in a worker process, with limits of time and memory."""
     [(_, outcome)] = run_with_limits(
         function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes
     )
@@ -205,14 +204,14 @@ def _receive_result(worker: _Worker) -> tuple[bool, Any]:
         return False, JobFailure(
             f"the worker process ended during {phase} (exit code {exit_code})."
         )
-    # unpickling runs code of the classes of the result, which may raise any exception
+    # unpickling may raise any exception
     except Exception as error:  # noqa: BLE001
         return False, JobFailure(f"the result of the job cannot be read ({type(error).__name__}).")
     return message
 
 
 def _run_worker(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int | None) -> None:
-    """Run jobs in a worker process in sequence, until its pipe is closed."""
+    """Receive and run jobs in a worker process, until its pipe is closed."""
     # the parent process handles Ctrl-C and ends its worker processes
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -224,11 +223,11 @@ def _run_worker(pipe: Connection, function: Callable[[Any], Any], memory_bytes: 
 
 
 def _pickled_result(function: Callable[[Any], Any], job: Any) -> bytes:
-    """Run a job in a worker process and pickle its result for :func:`_receive_result`."""
+    """Run a job; return (True if the process can run further jobs, result) as pickled bytes."""
     try:
         return pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
     except MemoryError:
-        # the next job would not have enough memory, so the process ends
+        # end the process: the next job would not have enough memory
         failure = JobFailure("the job exceeded the memory limit for one file.")
         return pickle.dumps((False, failure))
     except Exception as error:  # noqa: BLE001 - the failure of a job is its result
@@ -249,7 +248,7 @@ def _limit_memory(memory_bytes: int | None) -> None:
         import resource  # noqa: PLC0415 - not on Windows
     except ImportError:
         return
-    # no core dump, because it would contain the file of a student
+    # no core dump, which would contain data of a student
     for resource_kind, limit in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, memory_bytes)):
         if limit is not None:
             with suppress(ValueError, OSError):  # macOS rejects some limits

@@ -16,31 +16,31 @@ from px4fuse.errors import OutputError
 STANDARD_OUTPUT = Path("-")
 # Maximum time (s) to wait for a program that reads a named pipe
 PIPE_READER_TIMEOUT_S = 5.0
-# True on Windows, on which a file cannot be replaced while another program has it open
+# True on Windows: a file that another program has open cannot be replaced
 LOCKS_OPEN_FILES = sys.platform == "win32"
 # Advice to the user if an output cannot be written, by error number
 REMEDY_BY_ERRNO = {
     errno.ENOSPC: "Free disk space, or choose another disk.",
     errno.EROFS: "Choose a folder that can be written.",
 }
-# Maximum number of output paths in a message; more paths are replaced by their number
+# Maximum number of paths in a message; a longer list is replaced by its length
 _MAX_LISTED_PATHS = 4
 
 
 def write_all(
     contents: Mapping[Path, bytes], on_written: Callable[[Path], None] = lambda _: None
 ) -> None:
-    """Write output files in the order of ``contents``; create missing folders.
+    """Write output files; create missing folders.
 
-    Regular files are written under a temporary name and renamed, so that a path always leads to
-    the old or the complete new file. ``on_written`` is called with each path after its writing.
+    Each file is written under a temporary name and renamed, so that an interruption leaves no
+    incomplete file. ``on_written`` is called with the path of each written file.
 
     Raises
     ------
     OutputError
         An output is an input of this command, or cannot be written.
     BrokenPipeError
-        The reader of a pipe has ended; all other outputs are written.
+        The program that reads a pipe has ended; all other outputs are written.
     """
     check_outputs(path for path in contents if path != STANDARD_OUTPUT)
     written_files: list[Path] = []
@@ -60,7 +60,7 @@ def write_all(
 
 
 def format_written_outputs(paths: Sequence[Path]) -> str:
-    """Format the list of the outputs that a run wrote before it ended early.
+    """List the files that were written before an error or an interruption.
 
     >>> format_written_outputs([Path("a.pdf"), Path("a.json")])
     'outputs already written: a.pdf, a.json'
@@ -99,7 +99,7 @@ def _file_mode(path: Path) -> int:
 def _replace_file(target: Path, content: bytes) -> None:
     is_new_folder = not target.parent.exists()
     target.parent.mkdir(parents=True, exist_ok=True)
-    # the temporary name is short, because the target's name may have the maximum length
+    # a short name, because the name of the target may already have the maximum length
     temporary_path = target.with_name(f".px4fuse-{secrets.token_hex(8)}")
     try:
         with temporary_path.open("xb") as file:
@@ -107,12 +107,12 @@ def _replace_file(target: Path, content: bytes) -> None:
         temporary_path.replace(target)
     finally:
         temporary_path.unlink(missing_ok=True)
-        if is_new_folder and not target.exists():  # for example on a full disk
+        if is_new_folder and not target.exists():  # writing failed
             target.parent.rmdir()
 
 
 def _open_pipe(path: Path) -> IO[bytes]:
-    """Open a named pipe after waiting at most PIPE_READER_TIMEOUT_S for a program that reads it."""
+    """Open a named pipe; wait at most PIPE_READER_TIMEOUT_S for a program that reads the pipe."""
     deadline = time.monotonic() + PIPE_READER_TIMEOUT_S
     while True:
         try:

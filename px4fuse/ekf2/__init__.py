@@ -1,1 +1,1 @@
-"""Replay of PX4's EKF2 from a log, with the logged or with other parameters."""
+"""Model of PX4's EKF2 that replays a flight from a log, with logged or changed parameters."""

@@ -1,4 +1,4 @@
-"""Consistency of each aiding source of EKF2, tested with the logged innovations.
+"""Consistency tests of each aiding source of EKF2 with its logged innovations.
 
 Statistics: :mod:`px4fuse.filter.consistency`. Logged fields: PX4's ``EKF/aid_sources`` and
 ``EKF/ekf_helper.cpp``, v1.13 to main.
@@ -27,9 +27,9 @@ AidVerdict = Literal[
     "disabled",
     "too few samples",
 ]
-# Minimum |mean innovation| of a biased aiding source, relative to the RMS innovation
+# Minimum ratio of |mean innovation| to RMS innovation of a biased aiding source
 MIN_BIAS_RATIO = 0.5
-# Minimum |mean innovation| (√S) of a biased aiding source
+# Minimum |mean normalised innovation| (√S) of a biased aiding source
 MIN_BIAS_IN_SIGMA = 0.2
 # Length (s) of the windows in which normalised innovations ν/√S are averaged to detect a change
 CHANGE_WINDOW_S = 10.0
@@ -39,7 +39,8 @@ MIN_WINDOW_SAMPLES = 5
 MIN_WINDOWS_BEFORE = 2
 # Minimum change (√S) of the mean normalised innovation
 MIN_CHANGE_IN_SIGMA = 0.5
-# Minimum change of the mean innovation, in standard deviations of the earlier window means
+# Minimum ratio of a change of the mean innovation to the standard deviation of the window means
+# before it
 MIN_CHANGE_SCATTER_RATIO = 6.0
 # Maximum time (s) without a fused sample of an enabled aiding source. EKF2 resets its state to the
 # source after 7 s (reset_timeout_max)
@@ -48,8 +49,8 @@ MAX_NOT_FUSED_S = 5.0
 MAX_NOT_FUSED_INTERVALS = 10.0
 # Maximum relative difference between √R and the noise parameter from which R is computed
 NOISE_TOLERANCE = 0.02
-# Minimum height (m) above ground for statistics of aiding sources, because rotor downwash
-# disturbs the barometer
+# Aiding sources are evaluated above this height (m): near the ground, rotor downwash disturbs the
+# barometer
 MIN_HEIGHT_M = 2.0
 # Number of barometer samples in the running median of the height
 HEIGHT_MEDIAN_SAMPLES = 11
@@ -98,7 +99,7 @@ class AidResult(Record, kw_only=True):
     fused_fraction, rejected_fraction : float
         Fractions of the samples while the source was enabled.
     fused_logged : bool
-        False if px4fuse applied the gate, because the log lacks EKF2's decisions.
+        False if the log contains no fusion flags: px4fuse then applies the gate.
     longest_gap_s : (float, float)
         Start and end of the longest time without a fused sample, while enabled.
     resets : int
@@ -108,7 +109,7 @@ class AidResult(Record, kw_only=True):
     noise : float or None
         Median √R.
     noise_from : str
-        Parameter that sets R, or the reported accuracy.
+        Parameter from which R is computed, or "reported accuracy".
     """
 
     label: str
@@ -134,7 +135,7 @@ class AidResult(Record, kw_only=True):
     def is_faulty(self) -> bool:
         """True if the source is biased, overconfident, or enabled but not fused.
 
-        PX4's default settings are underconfident, so this is not a fault.
+        An underconfident source is not faulty: PX4's default noises are too large.
         """
         return self.verdict in ("not_fused", "biased", "overconfident")
 
@@ -145,13 +146,13 @@ class AidResult(Record, kw_only=True):
 
 
 def flight_span(flight: Flight) -> Span | Unavailable:
-    """Return start and end of the flight (s), without take-off and landing close to the ground."""
+    """Return start and end (s) of the longest flight, without the time close to the ground."""
     if isinstance(flight.airborne, Unavailable):
         return 0.0, flight.log.duration_s
     if not flight.airborne:
         return Unavailable("EKF2 aids", "the vehicle never took off", "Record a flight.")
     start, end = longest_flight(flight.airborne)
-    # use the barometer, because EKF2's height may be faulty
+    # The barometer is used, because EKF2's height may be wrong
     if flight.barometer is not None:
         down_m = flight.barometer["down_m"].loc[start:end].rolling(HEIGHT_MEDIAN_SAMPLES).median()
         height_m = (down_m.dropna().iloc[0] if down_m.notna().any() else 0.0) - down_m
@@ -162,7 +163,7 @@ def flight_span(flight: Flight) -> Span | Unavailable:
 
 
 def evaluate_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
-    """Evaluate all logged aiding sources of EKF2 in flight, by PX4's name."""
+    """Evaluate all logged aiding sources of EKF2 in flight; the keys are PX4's names."""
     if isinstance(flight.ekf2, Unavailable):
         return flight.ekf2
     if not flight.ekf2.aids:
@@ -188,10 +189,10 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
     sample_s = samples.index.to_numpy()
     gate = _effective_gate(aid, aid_log)
 
-    def quantities(name: str) -> Array:
+    def values_by_axis(name: str) -> Array:
         return samples[[f"{name}_{axis}" for axis in aid_log.axes]].to_numpy()
 
-    innovation, innovation_variance = quantities("innovation"), quantities("variance")
+    innovation, innovation_variance = values_by_axis("innovation"), values_by_axis("variance")
     is_enabled = np.ones(len(samples), bool)
     enabled_fraction = None
     if aid_log.enabled is not None:
@@ -203,7 +204,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
     noise_median = None
     if fused_logged:
         is_fused, is_rejected = samples[["fused", "rejected"]].to_numpy().T > 0.0
-        noise_sigma = quantities("noise")
+        noise_sigma = values_by_axis("noise")
         # If EKF2 resets its state to a sample, it logs innovation 0 and S = R for this sample
         is_reset = ((innovation == 0.0) & np.isclose(innovation_variance, noise_sigma)).all(axis=1)
         if is_fused.any():
@@ -262,8 +263,8 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
 def _largest_mean_change(time_s: Array, normalised_innovations: Array) -> Span | None:
     """Return time (s) and size (√S) of the largest change of the mean; None if not significant.
 
-    The mean before each window is compared with the mean of the two windows after it. The change
-    starts in the window if the mean of the window already contains a third of the change.
+    For each window of CHANGE_WINDOW_S, the mean before it is compared with the mean of the two
+    windows after it. The change starts in this window if its mean shows a third of the change.
     """
     window_index = np.floor((time_s - time_s[0]) / CHANGE_WINDOW_S)
     windows = pd.Series(normalised_innovations).groupby(window_index).agg(["mean", "size"])
@@ -290,7 +291,7 @@ def _fraction_within(is_selected: BoolArray, is_counted: BoolArray) -> float:
 
 
 def _effective_gate(aid: Aid, aid_log: AidLog) -> float:
-    """Return EKF2's gate (√S) from the logged test ratios ν²/(gate² S), or from the parameter."""
+    """Return EKF2's gate (√S) from logged test ratios ν²/(gate² S), or from its parameter."""
     axis = aid_log.axes[0]
     if f"ratio_{axis}" in aid_log.samples:
         rows_with_ratio = aid_log.samples[aid_log.samples[f"ratio_{axis}"] > 0.0]
@@ -301,7 +302,7 @@ def _effective_gate(aid: Aid, aid_log: AidLog) -> float:
 
 
 def _noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
-    """Return the parameter that √R equals, or another origin of R (the reported accuracy)."""
+    """Return the parameter from which R is computed, or another origin, like reported accuracy."""
     parameter_value = aid_log.parameters.get(aid.noise)
     if noise_sigma is None or parameter_value is None:
         return "" if noise_sigma is None else aid.noise_origin

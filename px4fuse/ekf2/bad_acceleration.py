@@ -14,21 +14,21 @@ import numpy as np
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.ekf2.replay_segments import ReplaySegment
 
-# Minimum of the larger one of the height innovations (√S) of barometer and GNSS that sets the flag
+# EKF2 sets the flag if the larger height innovation (√S) of barometer and GNSS exceeds this value
 # (vert_innov_test_lim, common.h)
 MIN_LARGER_INNOVATION = 3.0
-# Minimum of the smaller one of the height innovations (√S) of barometer and GNSS that sets the flag
+# EKF2 sets the flag if the smaller height innovation (√S) of barometer and GNSS exceeds this value
 # (vert_innov_test_min, common.h)
 MIN_SMALLER_INNOVATION = 1.0
 
 
 class BadAcceleration:
-    """Flag for a bad vertical acceleration in S filter configurations.
+    """EKF2's flag for a bad vertical acceleration, for each of several filter configurations.
 
     Parameters
     ----------
-    follows_log : ndarray of bool, shape (S,)
-        True for configurations that use the logged flag.
+    follows_log : ndarray of bool, shape (filters,)
+        True for filter configurations that use the logged flag.
     flag_duration_s : float
         Time for which the flag remains set after the last innovation that sets it.
     segment : ReplaySegment
@@ -36,10 +36,10 @@ class BadAcceleration:
 
     Attributes
     ----------
-    since_s, until_s : ndarray, shape (S,)
-        Start and end of the latest time with the flag.
+    since_s, until_s : ndarray, shape (filters,)
+        Start and end of the latest time span in which the flag is set.
     models_flag : bool
-        True if any configuration does not use the logged flag.
+        True if a filter configuration does not use the logged flag.
     """
 
     def __init__(
@@ -60,10 +60,10 @@ class BadAcceleration:
         )
 
     def flagged_fraction(self, begin_s: Array, end_s: Array) -> Array | None:
-        """Return the fraction of an interval with the flag, per configuration; None without a flag.
+        """Return the fraction of an interval in which the flag is set, for each configuration.
 
-        Call for successive intervals: the flag is kept from call to call. If it is set several
-        times in an interval, only the last time counts.
+        Return None if the flag is not set. Successive calls have successive intervals. If the
+        flag is set several times in one interval, only the last time is counted.
         """
         if len(self.logged_since_s):
             last_row = np.searchsorted(self.logged_since_s, end_s) - 1
@@ -80,13 +80,13 @@ class BadAcceleration:
 
         Parameters
         ----------
-        time_s : ndarray, shape (S,) or (1,)
+        time_s : ndarray, shape (filters,) or (1,)
             Time of the event.
-        previous_innovations, innovations : ndarray, shape (k + 1, S)
+        previous_innovations, innovations : ndarray, shape (k + 1, filters)
             Normalised height innovations (√S, positive upwards) of the previous and of the current
             event: k rows for barometer samples, one row for GNSS. NaN without a sample.
         """
-        # an innovation is valid until the next innovation of the same sensor
+        # An innovation is valid until the next innovation of its sensor
         gnss_innovation = previous_innovations[-1]
         barometer_innovation = np.full(len(gnss_innovation), np.nan)
         for sample_innovation in previous_innovations[:-1]:

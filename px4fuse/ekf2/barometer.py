@@ -1,9 +1,9 @@
 """Barometer samples that EKF2 fused, including samples that the logger dropped.
 
-PX4's default profile logs 5 of 10 or 20 samples per second. Further samples are found in two EKF2
-topics: ``estimator_aid_src_baro_hgt`` and ``estimator_baro_bias`` (as innovation). From PX4 v1.16
-on, the logged low-pass filtered innovation gives the mean of the samples that are still missing;
-only their scatter is simulated.
+PX4's default profile logs 5 of 10 or 20 samples per second. Two EKF2 topics contain more samples:
+``estimator_aid_src_baro_hgt`` and ``estimator_baro_bias`` (as innovation). Since PX4 v1.16, the
+logged low-pass filtered innovation contains the mean of the samples that are still missing. Only
+the scatter of these samples is simulated.
 
 Sources: PX4-Autopilot ``EKF/ekf_helper.cpp`` (updateAidSourceStatus),
 ``EKF/aid_sources/barometer/baro_height_control.cpp``, ``EKF/bias_estimator/bias_estimator.cpp``.
@@ -23,13 +23,15 @@ from px4fuse.flight.model import GROUND_EFFECT, Ekf2, FusionRecord
 BAROMETER_HZ = 10.0
 # Rate (Hz) at which EKF2 fuses the barometer before PX4 v1.15
 OLD_BAROMETER_HZ = 15.0
-# Maximum interquartile range ÷ median of barometer intervals computed from the bias variance
+# Maximum ratio of interquartile range to median of the barometer intervals that are computed from
+# the bias variance
 MAX_INTERVAL_SCATTER = 0.1
-# Maximum time difference, as fraction of the sample interval, of times of the same sample
+# Two logged times belong to one barometer sample if they differ by less than this fraction of the
+# sample interval
 MATCH_TOLERANCE = 0.3
-# Maximum number of barometer samples that are reconstructed between two logged rows
+# Maximum number of barometer samples that are reconstructed between two rows of the log
 MAX_SAMPLES_PER_ROW = 30
-# Maximum weight of a barometer sample that stands for missing neighbours
+# Maximum weight of a barometer sample that represents missing samples before and after it
 MAX_SAMPLE_WEIGHT = 4.0
 # Minimum sum of weights of missing barometer samples, to avoid a division by zero
 MIN_WEIGHT_SUM = 1e-9
@@ -38,8 +40,8 @@ MIN_WEIGHT_SUM = 1e-9
 def sample_interval_s(fusion_record: FusionRecord) -> float:
     """Return the interval (s) of the barometer samples that EKF2 fuses.
 
-    In the steady state, an update reduces the variance of the barometer bias as much as the random
-    walk increases it between samples: p' = p - p²/S and p = p' + q² Δt.
+    The interval is computed from the variance p of EKF2's barometer bias. In the steady state, an
+    update reduces p as much as the random walk increases p: p' = p - p²/S and p = p' + q² Δt.
     """
     bias_updates = fusion_record.height_bias.get(BAROMETER.name)
     if bias_updates is not None and len(bias_updates) > 1:
@@ -69,13 +71,13 @@ def fused_samples(
 ) -> pd.DataFrame:
     """Return the barometer samples that EKF2 fused, indexed by EKF2's measurement time.
 
-    Columns: ``down_m`` (height) and ``weight``, which is above 1 if samples beside it are missing.
-    ``logged_down_m`` is the logged height (m, down) at measurement times.
+    Columns: ``down_m`` (height), and ``weight``, which is above 1 if neighbouring samples are
+    missing. ``logged_down_m`` is the logged height (m, down) at measurement times.
     """
     interval_s = sample_interval_s(fusion_record)
     samples = _known_and_simulated_samples(ekf2, fusion_record, logged_down_m, interval_s)
     distance_s = np.diff(np.pad(samples.index.to_numpy(), 1, mode="edge"))
-    # each sample stands for half of the missing samples before and half of those after it
+    # Each sample represents half of the missing samples before it and half of those after it
     weight = 0.5 * np.rint((distance_s[1:] + distance_s[:-1]) / interval_s)
     return pd.DataFrame({"down_m": samples, "weight": np.clip(weight, 1.0, MAX_SAMPLE_WEIGHT)})
 
@@ -103,7 +105,7 @@ def _known_and_simulated_samples(
         _bias_gain(bias_updates) * bias_updates["innovation_m"]
     ).fillna(0.0)
     fused_bias_m = np.column_stack([previous_bias_m, bias_updates["bias_m"]]).ravel()
-    # innovations in ground effect are not used: EKF2 reduces them by the dead zone
+    # Innovations in ground effect are not used: EKF2 subtracts a dead zone from them
     rows_outside_ground_effect = logged_rows[
         ~fusion_record.was_in_state(GROUND_EFFECT, row_times_s)
     ]
@@ -119,13 +121,13 @@ def _known_and_simulated_samples(
         return np.asarray(np.interp(time_s, bias_times_s, fused_bias_m))
 
     def prediction_m(time_s: Array) -> Array:
-        """Return EKF2's prediction of the measured height."""
+        """Return the height (m, down) that EKF2 predicts for the barometer."""
         state_m = np.interp(
             time_s, rows_outside_ground_effect.index, height_without_motion_m
         ) + np.interp(time_s, velocity_times_s, displacement_m)
         return np.asarray(state_m - bias_m(time_s))
 
-    # arrays have one row per row of the log, and one column per sample since the previous row
+    # Arrays have one row for each row of the log, and a column for each sample since the row before
     span_s = np.diff(row_times_s)
     sample_count = np.maximum(np.rint(span_s / interval_s), 1.0).astype(int)
     is_regular = np.abs(span_s - sample_count * interval_s) < MATCH_TOLERANCE * interval_s
@@ -133,7 +135,7 @@ def _known_and_simulated_samples(
     sample_interval_by_row_s = span_s / sample_count
     sample_column = np.arange(sample_count[is_regular].max(initial=1))
     innovation_m = np.full((len(sample_count), len(sample_column)), np.nan)
-    # a sample may be in several topics; later topics overwrite earlier ones
+    # If several topics contain a sample, the last of them is used
     time_s = np.concatenate([bias_updates.index, logged_down_m.index, row_times_s])
     down_m = np.concatenate(
         [
@@ -155,7 +157,7 @@ def _known_and_simulated_samples(
         row_index[is_matched], np.rint(position_in_interval[is_matched]).astype(int) - 1
     ] = (down_m - prediction_m(time_s))[is_matched]
     if "filtered_down" in logged_rows:
-        # the sign is reversed, because PX4 logs state minus measurement
+        # The sign is changed, because PX4 logs state minus measurement
         filtered_m = -logged_rows["filtered_down"].to_numpy()
         age_samples = sample_count[:, None] - 1.0 - sample_column
         is_missing = np.isnan(innovation_m) & (age_samples >= 0.0) & is_regular[:, None]
@@ -184,7 +186,7 @@ def _with_missing_innovations(
     age_samples: Array,
     filtered_m: Array,
 ) -> Array:
-    """Simulate missing innovations that agree with the logged low-pass filtered innovation.
+    """Simulate missing innovations so that they give the logged low-pass filtered innovation.
 
     Parameters
     ----------
@@ -193,9 +195,9 @@ def _with_missing_innovations(
     interval_s : ndarray, shape (n, 1)
         Time between two samples.
     age_samples : ndarray, shape (n, k)
-        Number of samples from each sample to its row.
+        Number of samples from each sample to the next logged row.
     filtered_m : ndarray, shape (n + 1,)
-        Low-pass filtered innovation, at the start and at each row.
+        Low-pass filtered innovation at the start and at each logged row.
     """
     new_sample_weight = interval_s / (interval_s + INNOVATION_FILTER_S)
     filter_weight = new_sample_weight * (1.0 - new_sample_weight) ** np.maximum(age_samples, 0.0)

@@ -1,6 +1,6 @@
-"""Bias of a height or vision sensor relative to EKF2's reference sensor.
+"""EKF2's estimate of the bias of a height or vision sensor relative to its reference sensor.
 
-EKF2 estimates this bias with a separate scalar Kalman filter for each axis.
+EKF2 uses a separate scalar Kalman filter for each axis.
 
 Source: PX4-Autopilot ``EKF/bias_estimator`` (``bias_estimator.cpp``; before v1.15
 ``EKF/bias_estimator.cpp``).
@@ -18,17 +18,17 @@ MIN_BIAS_VARIANCE_M2 = 1e-8
 BIAS_GATE = 3.0
 # Maximum |mean of test ratio · sign of the innovation| of a correct bias (isOffsetDetected)
 MAX_MEAN_SIGNED_RATIO = 0.2
-# Factor on the random walk variance of the bias above MAX_MEAN_SIGNED_RATIO
+# Factor on the random walk variance of the bias if MAX_MEAN_SIGNED_RATIO is exceeded
 RANDOM_WALK_FACTOR = 1e3
-# Time constant (s) of the low-pass filter that averages the signed test ratio
+# Time constant (s) of the low-pass filter for the test ratio with the sign of the innovation
 TEST_RATIO_FILTER_S = 10.0
 
 
 class BiasEstimator:
-    """Bias of one sensor along k axes in S filter configurations, updated with each sample.
+    """Bias of one sensor in each of several filter configurations, updated with each sample.
 
-    ``value_m`` (added to innovations) and ``variance_m2`` have shape (S,) or (S, k); ``steps_s``
-    are EKF2's prediction steps.
+    ``value_m`` is added to innovations. ``value_m`` and ``variance_m2`` have the shape (filters,)
+    or (filters, axes). ``steps_s`` contains the lengths of EKF2's prediction steps.
     """
 
     def __init__(self, value_m: Array, variance_m2: Array, steps_s: Array) -> None:
@@ -47,7 +47,7 @@ class BiasEstimator:
         updates_bias: BoolArray,
         weight: Array | float = 1.0,
     ) -> tuple[Array, Array]:
-        """Return innovation and R corrected for the current bias, then update the bias.
+        """Update the bias with a sample; return innovation and R that the old bias corrects.
 
         Parameters
         ----------
@@ -56,8 +56,8 @@ class BiasEstimator:
         interval_s : ndarray
             Time (s) since the previous sample; 0 if the bias is not updated.
         updates_bias : ndarray of bool
-        weight : float or ndarray, shape (S,)
-            Number of samples that EKF2 fused per known sample.
+        weight : float or ndarray, shape (filters,)
+            Number of samples fused by EKF2 that this sample represents.
         """
         has_offset = np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO
         variance_rate = np.where(

@@ -1,10 +1,9 @@
-"""Filter recursion of the EKF2 replay: several filter configurations run through one segment.
+"""Recursion of the EKF2 model: several filter configurations run through one flight segment.
 
-The flight is divided into intervals. At the end of an interval (an "event") the filter fuses a
+The segment is divided into intervals. At the end of an interval (an "event"), the filter fuses a
 position or, in a gap of the position source, only height and heading.
 
-Symbols: E events, S filter configurations, n states in array shapes; x, P: state and covariance; R:
-measurement noise; S in an equation: innovation variance.
+Symbols: x, P: state and covariance; R: measurement noise; S: innovation variance.
 
 Sources: PX4-Autopilot ``EKF/covariance.cpp`` (limits of the biases), ``EKF/position_fusion.cpp``
 and ``EKF/vel_pos_fusion.cpp`` (gate, fusion), ``ev_pos_control.cpp`` (noise, resets).
@@ -29,7 +28,7 @@ from px4fuse.ekf2.heights import (
     barometer_samples,
 )
 from px4fuse.ekf2.inputs import FusionRules, Inputs
-from px4fuse.ekf2.intervals import FUSE, IDLE, START, Events, Intervals, Timing, make_intervals
+from px4fuse.ekf2.intervals import FUSE, IDLE, START, Intervals, StepEvents, Timing, make_intervals
 from px4fuse.ekf2.magnetometer import MIN_SIGMA_GAUSS, EventSamples, fuse_mean, mean_by_event
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
@@ -48,9 +47,9 @@ from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 
 # Minimum state variance, to avoid a division by zero
 MIN_STATE_VARIANCE = 1e-30
-# Number of events whose transition matrices are computed at once, which limits memory
+# Number of events whose transition matrices are copied at once, to limit the memory
 EVENT_BATCH_SIZE = 64
-# Measurement variance (m² or rad²) of a measurement without effect
+# Measurement variance (m² or rad²) so large that the measurement has no effect
 IGNORED_VARIANCE = 1e9
 # Acceleration noise (m/s²) while EKF2 reports a bad or clipped acceleration (BADACC_BIAS_PNOISE,
 # common.h; covariance.cpp)
@@ -64,7 +63,7 @@ HEIGHT_NEUTRAL_PREFIXES = (
     "EKF2_GPS_P_GATE",
     "EKF2_GPS_DELAY",
 )
-# Initial σ (m/s²) of the accelerometer bias, which EKF2 has estimated on the ground
+# Initial σ (m/s²) of the accelerometer bias: EKF2 has estimated it on the ground
 INITIAL_BIAS_SIGMA_M_S2 = 0.01
 # Factors on the GNSS velocity variance, NED: EKF2 multiplies the vertical σ by 1.5
 # (gps_control.cpp)
@@ -75,10 +74,11 @@ MAX_BIAS_SIGMA_M_S2 = 0.1 * GRAVITY
 # Minimum accelerometer bias variance of an axis, relative to the largest of the three axes
 # (covariance.cpp)
 MIN_BIAS_VARIANCE_RATIO = 0.01
-# Indices of heading error and position in the state
+# State indices of heading error and position
 HEADING, NORTH, EAST, DOWN = 2, 6, 7, 8
 # State indices of the accelerometer bias, rotated to NED
 BIAS_NORTH, BIAS_EAST, BIAS_DOWN = 12, 13, 14
+# State indices of the measurements that are fused together, in this order
 JOINTLY_MEASURED_STATES = np.array([HEADING, DOWN, NORTH, EAST])
 # State indices of heading error and height: a slice, because an index array would copy the states
 LOGGED_STATES = slice(HEADING, DOWN + 1, DOWN - HEADING)
@@ -92,7 +92,7 @@ POSITION_COLUMNS = slice(3, 5)
 
 @dataclass(frozen=True)
 class FilterConfiguration:
-    """Configuration of the modelled EKF2: parameters, estimated states and fused aiding sources.
+    """Configuration of the EKF2 model: parameters, estimated states and fused aiding sources.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class FilterConfiguration:
     timestamp_offset_s: float | None = None
 
     def keeps_logged_bad_acceleration(self, inputs: Inputs) -> bool:
-        """Return True if the logged flag for a bad acceleration is valid with these parameters."""
+        """Return True if the logged flag for a bad acceleration is valid for this configuration."""
         has_same_height_parameters = not self.without and all(
             value == inputs.settings[name] or name.startswith(HEIGHT_NEUTRAL_PREFIXES)
             for name, value in self.settings.items()
@@ -135,42 +135,42 @@ class FilterConfiguration:
         return self.uses_logged_decisions or has_same_height_parameters
 
     def timing(self, inputs: Inputs) -> Timing:
-        """Return the delay of a position, and the delay of the fusion horizon."""
+        """Return the delay of the position source, and the delay of the fusion horizon."""
         if self.timestamp_offset_s is not None:
             return Timing(-self.timestamp_offset_s - 0.5 * inputs.mean_step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         max_delay_ms = max(self.settings.get(aid.delay, 0.0) for aid in (GNSS_POS, EV_POS))
-        if inputs.rules.uses_delay_as_horizon:  # the length of the IMU buffer is the largest delay
+        if inputs.rules.uses_delay_as_horizon:  # the largest delay is the length of the IMU buffer
             buffer_length = math.ceil(max_delay_ms * 1e-3 / inputs.configured_step_s)
             return Timing(delay_s, max(inputs.horizon_s, (buffer_length - 1) * inputs.mean_step_s))
-        # at its start EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
+        # At its start, EKF2 increases EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
         longest_delay_ms = max(self.settings["EKF2_DELAY_MAX"], max_delay_ms)
         if longest_delay_ms == inputs.settings["EKF2_DELAY_MAX"]:
             return Timing(delay_s, inputs.horizon_s)
-        # number of samples in the IMU buffer (initialise_interface, estimator_interface.cpp)
+        # Number of samples in the IMU buffer (initialise_interface, estimator_interface.cpp)
         buffer_length = max(math.ceil(longest_delay_ms * 1e-3 / inputs.configured_step_s), 2)
         return Timing(delay_s, (buffer_length - 1) * inputs.mean_step_s)
 
 
 @dataclass(frozen=True)
 class SegmentRun:
-    """Results of S filter configurations in one segment with E events.
+    """Results of several filter configurations in one flight segment.
 
     Attributes
     ----------
     events : tuple of recarray
         Events of each configuration, see :data:`~px4fuse.ekf2.intervals.EVENT`.
-    innovation, innovation_variance, noise : ndarray, shape (E, S, 6)
+    innovation, innovation_variance, noise : ndarray, shape (events, filters, 6)
         ν (measurement minus state), S and R of velocity (m/s) and position (m), NED.
-    rejected, fused, reset : ndarray of bool, shape (E, S)
+    rejected, fused, reset : ndarray of bool, shape (events, filters)
         True if the position sample of each event was rejected, fused, or used for a reset.
-    position_reset_m : ndarray, shape (E, S, 2)
+    position_reset_m : ndarray, shape (events, filters, 2)
         Change of the position by resets, north and east.
-    state, variance : ndarray, shape (E + 1, S, n)
+    state, variance : ndarray, shape (events + 1, filters, states)
         State and its variance at the start and after each event.
-    covariance : ndarray, shape (S, n, n)
+    covariance : ndarray, shape (filters, states, states)
         Covariance at the end.
-    magnetometer_updates : ndarray, shape (E, 3, S, 3)
+    magnetometer_updates : ndarray, shape (events, 3, filters, 3)
         Innovation (gauss, body FRD), its variance, and 1 if fused.
     heights : HeightFilter or None
         None if the logged EKF2 height is used.
@@ -180,7 +180,7 @@ class SegmentRun:
 
     segment: ReplaySegment
     configurations: tuple[FilterConfiguration, ...]
-    events: tuple[Events, ...]
+    events: tuple[StepEvents, ...]
     innovation: Array
     innovation_variance: Array32
     noise: Array32
@@ -202,9 +202,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     configurations: Sequence[FilterConfiguration],
     intervals: Sequence[Intervals],
 ) -> SegmentRun:
-    """Run filter configurations through one segment.
+    """Run several filter configurations through one flight segment.
 
-    ``intervals`` contains the intervals between events, one element per configuration.
+    ``intervals`` contains, for each configuration, the intervals between events.
     """
     configuration_count = len(configurations)
     event_count = len(intervals[0].events)
@@ -271,7 +271,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         parameters[inputs.aid.gate],
     ]
     gate_squared = np.maximum(np.repeat(np.stack(gates, axis=1), 3, axis=1), MIN_GATE) ** 2
-    # logged EKF2 values are used as measurements of height and, without magnetometer, of heading
+    # EKF2's logged height, and without magnetometer its logged heading, are used as measurements
     logged_values = np.stack(
         [segment.attitude_error_rad[event_steps, HEADING], segment.down_m[event_steps]], axis=-1
     )
@@ -288,14 +288,14 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             means_by_interval = [
                 mean_by_event(segment, samples, end_steps) for end_steps in event_step_arrays
             ]
-            mean = EventSamples(*map(stack_configurations, zip(*means_by_interval, strict=True)))
+            means = EventSamples(*map(stack_configurations, zip(*means_by_interval, strict=True)))
             if aid == MAG:
                 R = np.maximum(parameters[MAG.noise], MIN_SIGMA_GAUSS) ** 2
-                mean = mean._replace(noise=mean.noise + R)
-            sample_count = mean.sample_count * is_enabled_by_aid[aid.name]
+                means = means._replace(noise=means.noise + R)
+            sample_count = means.sample_count * is_enabled_by_aid[aid.name]
             gate = parameters.get(aid.gate, np.full(configuration_count, samples.gate))
-            mean = mean._replace(sample_count=sample_count)
-            vector_means.append((mean, gate, samples.state_rows))
+            means = means._replace(sample_count=sample_count)
+            vector_means.append((means, gate, samples.state_rows))
     follows_log = [
         segment.heights is None
         or segment.is_acceleration_bad is None
@@ -345,7 +345,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         parameters["EKF2_ACC_NOISE"][:, None, None] ** 2, (event_count, 1, 1, 1)
     )
     if (clipped_fraction := segment.clipped_fraction) is not None:
-        # mean fraction of clipped axes in each interval; they have BAD_ACCELERATION_NOISE
+        # Mean fraction of clipped axes in each interval; their noise is BAD_ACCELERATION_NOISE
         clipped_fraction_sums = np.diff(
             np.cumsum(clipped_fraction)[event_steps], axis=0, prepend=clipped_fraction[0]
         )
@@ -356,8 +356,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         )
     x, P = _start_state(segment, has_biases, has_attitude)
     if bad_acceleration.until_s[0] > segment.time_s[0]:
-        # while EKF2 reports a bad acceleration, its bias is not logged: start with the mean bias,
-        # computed from the published velocity
+        # While EKF2 reports a bad acceleration, its accelerometer bias is not logged. The initial
+        # bias is the mean bias, which is computed from the published velocity
         set_states(
             x,
             P,
@@ -437,9 +437,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             _limit_bias_variance(P, inputs.rules.min_bias_variance, has_biases)
         innovation[:, 2:] = 0.0
         R[:, 2:] = IGNORED_VARIANCE
-        for mean, gate, state_rows in vector_means:
-            if mean.sample_count[e].any():
-                event_mean = EventSamples(*(quantity[e] for quantity in mean))
+        for means, gate, state_rows in vector_means:
+            if means.sample_count[e].any():
+                event_mean = EventSamples(*(quantity[e] for quantity in means))
                 x, P, vector_updates = fuse_mean(x, P, event_mean, gate, *state_rows)
                 if EARTH_FIELD in state_rows:
                     magnetometer_updates[e] = vector_updates
@@ -471,8 +471,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             )
             if inputs.aid == GNSS_POS:
                 if not has_magnetometer:
-                    # without logged magnetometer samples the correction of the tilt is unknown, so
-                    # only the tilt variance is set to the logged value
+                    # Without logged magnetometer samples, the correction of the tilt is unknown.
+                    # Only the tilt variance is set to its logged value
                     for tilt_row in range(HEADING):
                         _, P = _reduce_variance_to(P, tilt_row, attitude_variance[e, :, tilt_row])
                 is_component_fused[:, VELOCITY_COLUMNS] = is_velocity_fused[:, None]
@@ -493,7 +493,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             x, P = heights.fuse_gnss(
                 e, x, P, measured_values[e, :, 5], measurement_variance[e, :, 5]
             )
-        # the magnetometer corrects the heading, so only the height is set to EKF2's logged value
+        # The magnetometer corrects the heading, so only the height is set to EKF2's logged value
         elif has_magnetometer:
             K, P = _reduce_variance_to(P, DOWN, logged_variance[e, :, 1])
             x = x + K * (logged_values[e, :, 1] - x[:, DOWN])[:, None]
@@ -570,7 +570,7 @@ def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
 
 
 def _reduce_variance_to(P: Array, state_index: int, target_variance: Array) -> ArrayPair:
-    """Return gain and covariance after an update that reduces a state's variance to a target."""
+    """Return gain and covariance of an update that reduces the variance of a state to a target."""
     state_variance = P[:, state_index, state_index]
     R = _noise_for_variance(state_variance, target_variance)
     K = P[:, :, state_index] / (state_variance + R)[:, None]
@@ -580,9 +580,9 @@ def _reduce_variance_to(P: Array, state_index: int, target_variance: Array) -> A
 def _sequential_update(
     x: Array, P: Array, nu: Array, S: Array, R: Array, components: slice, is_fused: BoolArray
 ) -> ArrayPair:
-    """Fuse the components of a measurement one after the other, like EKF2.
+    """Fuse the components of a measurement one after the other, as EKF2 does.
 
-    All components use the innovations and innovation variances from before the first update
+    Innovations and innovation variances of all components are computed before the first update
     (fuseDirectStateMeasurement, ``ekf_helper.cpp``). With c = PH' and K = wc, the Joseph form is P
     - KHP - (KHP)' + K(HPH' + R)K' = P - bcc', b = w(2 - w(HPH' + R)).
     """
@@ -606,10 +606,10 @@ def _sequential_update(
 
 @dataclass
 class _Fusion:
-    """Rejection, fusion and reset of the position, for S configurations and E events.
+    """Decisions on each position sample: rejected, fused, or used to reset the position.
 
-    After a time without fusion the position is reset; after several resets in a row fusion stops
-    until a sample with which EKF2 may start (``can_start``). ``logged_rejected`` and
+    After a time without fusion, the position is reset. After several successive resets, fusion
+    stops until a sample with which EKF2 may start (``can_start``). ``logged_rejected`` and
     ``logged_reset`` are EKF2's logged decisions. Source: updateEvPosFusion, startEvPosFusion
     (``ev_pos_control.cpp``).
     """
@@ -639,9 +639,9 @@ class _Fusion:
     def decide(
         self, e: int, is_outside_gate: BoolArray, is_velocity_fused: BoolArray
     ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
-        """Decide on the samples of one event, for each configuration.
+        """Decide for each filter configuration on the position and velocity of one event.
 
-        Return masks: position rejected, position fused, position reset, velocity fused.
+        Return four masks: position rejected, position fused, position reset, velocity fused.
         ``is_velocity_fused`` is True if the velocity is inside its gate.
         """
         rules = self.rules
@@ -664,7 +664,7 @@ class _Fusion:
         )
         since_fusion_s = now_s - self.last_position_s
         if self.has_all_resets and not is_decision_logged:
-            # if the log has no reset at the next event, EKF2 fused the last sample before the limit
+            # Without a logged reset at the next event, EKF2 fused the last sample before the limit
             next_event = min(e + 1, len(self.time_s) - 1)
             is_last_before_limit = (
                 self.time_s[next_event] - self.last_position_s > rules.reset_timeout_s
@@ -699,9 +699,9 @@ def _variance_growth(
     has_biases: BoolArray,
     has_attitude: BoolArray,
 ) -> ArrayPair:
-    """Return the process noise of biases and magnetic fields in one step, and its upper limits.
+    """Return the process noise of biases and magnetic fields per prediction step, and limits.
 
-    EKF2 adds no process noise to a state variance above the limit.
+    EKF2 adds no process noise to a state whose variance is above its limit.
     """
     initial_and_process_names = {"GYR_B": "GYR", "ACC_B": "ACC"}
     if segment.field is not None:
@@ -717,10 +717,10 @@ def _variance_growth(
 
 
 def with_state_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegment:
-    """Estimate the correlations of the initial state of a segment; the log has variances only.
+    """Estimate the correlations of the initial state of a segment; only its variances are logged.
 
-    Without correlations, the first updates would divide the error differently than EKF2 between
-    tilt and accelerometer bias. The correlations are estimated from the flight before the segment.
+    Without correlations, the first updates would correct tilt and accelerometer bias in a wrong
+    ratio. The correlations are computed by a replay of the flight before the segment.
     """
     state_correlation = _settled_state_correlation(segment)
     if history := segment.history:
@@ -732,7 +732,7 @@ def with_state_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegm
             run_segment(inputs, history, [configuration], [intervals]).covariance[0]
         )
     if segment.field is not None:
-        # EKF2 has just reset heading and fields, so these states are uncorrelated with all others
+        # EKF2 has just reset heading and magnetic fields, so they are uncorrelated with all states
         state_correlation = block_diag(
             state_correlation[:STATE_COUNT, :STATE_COUNT], np.eye(len(segment.state) - STATE_COUNT)
         )
@@ -743,15 +743,15 @@ def with_state_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegm
 
 
 def _correlation_of_covariance(P: Array) -> Array:
-    # the lower limit avoids a division by zero: a bias that is not estimated has variance 0
+    # The lower limit prevents a division by zero: a bias that is not estimated has variance 0
     sigma = np.sqrt(np.maximum(np.diagonal(P), MIN_STATE_VARIANCE))
     return np.asarray(P / sigma[:, None] / sigma)
 
 
 def _settled_state_correlation(segment: ReplaySegment) -> Array:
-    """Return the correlations of tilt and accelerometer bias after long velocity fusion.
+    """Return the correlations of tilt and accelerometer bias after a long fusion of velocity.
 
-    Their effects on the acceleration cancel: θ × f = Rb.
+    The effects of both errors on the acceleration cancel each other: θ × f = Rb.
     """
     to_earth = np.eye(STATE_COUNT)
     to_earth[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.body_to_ned[0]
@@ -768,7 +768,7 @@ def _settled_state_correlation(segment: ReplaySegment) -> Array:
 
 
 def _diagonal(P: Array) -> Array:
-    """Return the state variances of all configurations as a view of P."""
+    """Return the state variances of all filter configurations, as a view of P."""
     return P.reshape(len(P), -1)[:, :: P.shape[1] + 1]
 
 
@@ -789,10 +789,10 @@ def _start_state(
 
 
 def _noise_for_variance(variance: Array, target_variance: Array) -> Array:
-    """Return the R of an update that reduces a state variance to a target.
+    """Return the R of an update that reduces the variance of a state to a target.
 
-    1/R = 1/target - 1/variance. EKF2's published height and heading are fused with this R to
-    reproduce their logged variances.
+    1/R = 1/target - 1/variance. With this R, the fusion of EKF2's published height and heading
+    gives their logged variances.
     """
     excess_variance = variance - target_variance
     noise_variance = np.full(excess_variance.shape, IGNORED_VARIANCE)
@@ -803,7 +803,7 @@ def _noise_for_variance(variance: Array, target_variance: Array) -> Array:
 
 
 def _limit_bias_variance(P: Array, absolute_minimum: float, has_biases: BoolArray) -> None:
-    """Limit the accelerometer bias variance like PX4 up to v1.14 (fixCovarianceErrors)."""
+    """Limit the accelerometer bias variance as PX4 does up to v1.14 (fixCovarianceErrors)."""
     bias_variance = _diagonal(P)[:, ACCELEROMETER_BIAS]
     min_variance = np.maximum(
         MIN_BIAS_VARIANCE_RATIO * bias_variance.max(axis=1, keepdims=True), absolute_minimum
@@ -821,7 +821,7 @@ def _measurements_by_event(
     parameters: dict[str, Array],
     uses_reported_noise: BoolArray,
 ) -> ArrayPair:
-    """Return measured velocity and position (NED), and their variances, each of shape (E, S, 6)."""
+    """Return measured velocity and position (NED), and variances, shape (events, filters, 6)."""
     received = inputs.received
     aid = inputs.aid
     sensor_offset_m = (
@@ -841,7 +841,7 @@ def _measurements_by_event(
         reported_variance, np.maximum(parameters[aid.noise], MIN_SIGMA)[:, None] ** 2
     )
     if received.velocity_m_s is not None and received.velocity_variance_m2_s2 is not None:
-        # velocity of the antenna relative to the IMU during rotation
+        # Velocity of the antenna relative to the IMU while the vehicle rotates
         rotation_rate = (
             np.diff(segment.body_to_ned, axis=0)[event_steps - 1]
             / segment.step_s[event_steps - 1, None, None]

@@ -1,8 +1,8 @@
 """Fusion of optical flow in the EKF2 replay, as horizontal velocity in the body frame.
 
-The logged velocity is low-pass filtered. It is converted to the mean velocity between two logged
-samples, propagated with the IMU to the next event (:mod:`px4fuse.ekf2.filter_recursion`) and fused
-there. The range to the ground is EKF2's logged range.
+The logged velocity is low-pass filtered. The mean velocity between two logged samples is computed
+from it, propagated with the IMU to the next event (:mod:`px4fuse.ekf2.filter_recursion`) and fused.
+The range to the ground is EKF2's logged range.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/optical_flow`` (``optical_flow_control.cpp``: velocity and
 low-pass filter; ``optical_flow_fusion.cpp``: R and gate).
@@ -18,7 +18,10 @@ from px4fuse.flight.model import FLOW_FILTER_WEIGHT
 
 
 def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) -> ReplaySegment:
-    """Add the logged optical flow (:attr:`FusionRecord.flow`) to a segment; ``gate`` is in √S."""
+    """Add the logged optical flow to a segment of the replay; ``gate`` is the innovation gate (√S).
+
+    ``flow`` is :attr:`FusionRecord.flow`.
+    """
     begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
     flow = flow[(begin_s > segment.time_s[0]) & (flow.index <= segment.time_s[-1])]
     sample_count = flow["samples"].to_numpy()

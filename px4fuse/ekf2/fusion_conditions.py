@@ -1,4 +1,4 @@
-"""Conditions under which EKF2 fuses positions of external vision or GNSS, in EKF2's order.
+"""Conditions under which EKF2 fuses positions of external vision or GNSS, as EKF2 checks them.
 
 Source: PX4-Autopilot ``src/modules/ekf2``, v1.13.3 to main: ``RingBuffer.h``, ``ev_control.cpp``,
 ``ev_pos_control.cpp``, ``gnss_checks.cpp`` (``control.cpp``, ``gps_checks.cpp`` before v1.15).
@@ -26,15 +26,15 @@ EV_STOP_INTERVAL_S = 0.4
 FUSION_STOP_S = 7.0
 # Maximum delay (s) of EKF2's fusion horizon, from the delay parameters
 MAX_HORIZON_S = 1.0
-# Number of position samples in EKF2's buffer
+# Maximum number of position samples in EKF2's buffer
 BUFFER_COUNT = 20
 # Tolerance (s) of a sample interval: half of the timestamp resolution of 1 µs
 INTERVAL_TOLERANCE_S = 5e-7
-# Time (s) with all samples rejected after which EKF2 stops fusion: no_aid_timeout_max
+# EKF2 stops fusion after it has rejected all samples for this time (s): no_aid_timeout_max
 MAX_REJECTED_S = 1.0
-# Maximum variation (m) of x and y that are placeholders instead of measurements
+# If x and y vary by less than this range (m), they are not measured
 MAX_CONSTANT_RANGE_M = 1e-3
-# Minimum fraction of the time with a failed GNSS check that explains missing GNSS fusion
+# A failed GNSS check explains missing GNSS fusion if it fails in this fraction of the time
 MIN_FAILED_FRACTION = 0.1
 SET_TIMESTAMP_ACTION = (
     "Set timestamp_sample to the time of measurement in microseconds since the autopilot's boot."
@@ -43,20 +43,21 @@ SYNCHRONISE_ACTION = (
     "Synchronise the clocks: UXRCE_DDS_SYNCT 1 with the uXRCE-DDS agent, or answer TIMESYNC of "
     "MAVLink. Send microseconds."
 )
-# Age that EKF2 computes for positions, by the wrong clock of their timestamps
+# Wrong clocks of timestamps, and the age of positions that EKF2 computes from them
 AGE_BY_WRONG_CLOCK = {
     **dict.fromkeys(
         ("another clock", "an unknown clock", "UNIX time in seconds"), "too old or in the future"
     ),
     **{f"UNIX time in {unit}seconds": "in the future" for unit in ("nano", "micro", "milli")},
 }
-# Age that EKF2 computes for positions, by the wrong clock or unit of their timestamps
+# Wrong clocks or units of timestamps, and the age of positions that EKF2 computes from them
 AGE_BY_WRONG_TIMESTAMP = {
     **dict.fromkeys(("0", "milliseconds", "seconds"), "too old"),
     **AGE_BY_WRONG_CLOCK,
     "nanoseconds": "in the future",
 }
-# GNSS checks (by bit of gps_check_fail_flags) with the parameter and unit of the limit
+# GNSS checks in the order of their bits in gps_check_fail_flags: name, parameter with the limit,
+# unit of the limit
 GNSS_CHECKS = (
     ("3D fix", "", ""),
     ("number of satellites", "EKF2_REQ_NSATS", ""),
@@ -74,7 +75,7 @@ GNSS_CHECKS = (
 
 
 class UnmetCondition(NamedTuple):
-    """Condition of EKF2 that is not met: its name, a title, an explanation and the action."""
+    """Condition for fusion in EKF2 that is not met: name, fault, explanation, and action."""
 
     condition: str
     fault: str
@@ -106,7 +107,7 @@ class FusionAttempt:
 
     @property
     def has_switch(self) -> bool:
-        """True for PX4 v1.14 and later, with a separate parameter that enables the source."""
+        """True if a parameter of this source alone enables its fusion (PX4 v1.14 and later)."""
         return self.aid.switch in self.parameters
 
     @property
@@ -118,7 +119,7 @@ class FusionAttempt:
 
     @property
     def interval_s(self) -> float:
-        return 1.0 / self.source.rate_hz
+        return 1.0 / self.source.compute_rate_hz()
 
     def samples_in_span(self, samples: pd.DataFrame, before_s: float = 0.0) -> pd.DataFrame:
         """Return the samples in ``span_s``, and up to ``before_s`` (s) before it."""
@@ -134,7 +135,7 @@ class FusionAttempt:
 
 
 def find_unmet(attempt: FusionAttempt) -> UnmetCondition:
-    """Return the first condition of EKF2 that is not met; UNKNOWN_CONDITION if all are met."""
+    """Return the first condition for fusion that is not met; UNKNOWN_CONDITION if all are met."""
     conditions = VISION_CONDITIONS if attempt.is_vision else GNSS_CONDITIONS
     return next((unmet for check in conditions for unmet in check(attempt)), UNKNOWN_CONDITION)
 
@@ -157,9 +158,16 @@ def _check_switch(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
     yield UnmetCondition("switch", f"{parameter_name} is {parameter_value}", reason, action)
 
 
+def constant_coordinates(source: PositionTrack) -> list[str]:
+    """Return the coordinates (x, y, z) of a source that never change, so they are not measured."""
+    ranges_m = np.ptp(source.samples[Columns.POSITION].to_numpy(), axis=0)
+    is_constant = ranges_m < MAX_CONSTANT_RANGE_M
+    return [name for name, constant in zip("xyz", is_constant, strict=True) if constant]
+
+
 def is_height_only(source: PositionTrack) -> bool:
-    """Return True if x and y of a source are constant: only its height is measured."""
-    return bool(np.ptp(source.samples[Columns.POSITION[:2]], axis=0).max() < MAX_CONSTANT_RANGE_M)
+    """Return True if x and y of a position source are constant: it measures only the height."""
+    return {"x", "y"} <= {*constant_coordinates(source)}
 
 
 def _check_frame(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
@@ -179,7 +187,7 @@ def _check_gap(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
     stop_timeout_s = EV_STOP_INTERVAL_S if has_short_timeout else FUSION_STOP_S
     times_s = attempt.source.samples.index.to_numpy()
     start_s, end_s = attempt.span_s
-    # EKF2 stops fusion when no position has arrived for limit_s
+    # EKF2 stops fusion if no position arrives for stop_timeout_s
     last_position_s = max(times_s[times_s < start_s], default=start_s)
     duration_s = np.min(times_s[times_s >= start_s], initial=end_s) - last_position_s
     if duration_s > stop_timeout_s + attempt.interval_s:
@@ -235,8 +243,8 @@ def _check_quality(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
     if min_quality <= 0.0 or "quality" not in status:
         return
     quality = attempt.samples_in_span(status)["quality"]
-    # EKF2 needs a good quality of the sample, of the sample before, and of the newest sample in the
-    # buffer
+    # EKF2 checks the quality of the fused sample, of the sample before it, and of the newest sample
+    # in the buffer
     sample_count = int(np.ceil(attempt.horizon_s / attempt.interval_s)) + 2
     is_good = (quality >= min_quality).astype(float)
     if is_good.rolling(min(sample_count, max(len(quality), 1))).min().max() == 1.0:
@@ -258,15 +266,14 @@ def _check_quality(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
 
 def _check_interval(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
     intervals_s = np.diff(attempt.samples_in_span(attempt.source.samples).index)
-    # a source that is reconstructed from EKF2 topics has the rate of the logger, not of the
-    # positioning system
+    # Positions that are reconstructed from EKF2 topics have the rate of the logger
     is_interval_known = (
         attempt.has_switch and not attempt.source.origin.reconstructed and len(intervals_s)
     )
     if is_interval_known and intervals_s.min() >= EV_START_INTERVAL_S - INTERVAL_TOLERANCE_S:
         yield UnmetCondition(
             "interval",
-            f"the positions come at {attempt.source.rate_hz:.2g} Hz",
+            f"the positions come at {attempt.source.compute_rate_hz():.2g} Hz",
             f"The interval between positions is {attempt.interval_s:.2f} s. EKF2 (v1.14 and later) "
             "starts to fuse external vision only when two positions come within "
             f"{EV_START_INTERVAL_S:g} s. No parameter changes this limit.",
@@ -305,15 +312,19 @@ def _check_gnss(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
             "Compare both sources. EKF2_GPS_MODE 1 permits a reset to GNSS.",
         )
     parameters, source = attempt.parameters, attempt.source
-    # bits of EKF2_GPS_CHECK are lower by one; the fix is always checked
+    # Bit n of EKF2_GPS_CHECK enables the check of bit n + 1; bit 0, the fix, is always checked
     checked_mask = int(parameters.get("EKF2_GPS_CHECK", -1)) << 1 | 1
-    fractions = {bit: attempt.fraction_set("failed_checks", bit) for bit in range(len(GNSS_CHECKS))}
+    failed_fractions = {
+        bit: attempt.fraction_set("failed_checks", bit) for bit in range(len(GNSS_CHECKS))
+    }
     failed_bits = [
-        bit for bit in fractions if checked_mask >> bit & 1 and fractions[bit] > MIN_FAILED_FRACTION
+        bit
+        for bit in failed_fractions
+        if checked_mask >> bit & 1 and failed_fractions[bit] > MIN_FAILED_FRACTION
     ]
     if not failed_bits:
         return
-    failed_bits.sort(key=lambda bit: -fractions[bit])
+    failed_bits.sort(key=lambda bit: -failed_fractions[bit])
     samples = attempt.samples_in_span(source.samples)
     reported_variances = {3: samples["north_m2"], 4: samples["down_m2"]}
     if source.velocity is not None:
@@ -321,9 +332,9 @@ def _check_gnss(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
     check_texts = []
     for bit in failed_bits[:3]:
         name, parameter, unit = GNSS_CHECKS[bit]
-        check_details = [f"{100.0 * fractions[bit]:.0f} % of the time"]
+        check_details = [f"{100.0 * failed_fractions[bit]:.0f} % of the time"]
         if np.isfinite(limit := parameters.get(parameter, np.nan)):
-            # the samples contain only positions with a fix, so their median may be below the limit
+            # The samples contain only positions with a fix, so their median may be below the limit
             if bit in reported_variances:
                 median_value = float(np.sqrt(reported_variances[bit].median()))
                 if median_value > limit:
@@ -356,7 +367,7 @@ def _check_gate(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
         )
 
 
-# Vision checks in EKF2's order; first the parameter that enables vision
+# Checks for external vision, in EKF2's order
 VISION_CONDITIONS = (
     _check_switch,
     _check_frame,
@@ -367,6 +378,6 @@ VISION_CONDITIONS = (
     _check_alignment,
     _check_gate,
 )
-# GNSS checks. _check_gnss precedes _check_gap, because the log contains no positions without a fix:
-# failed receiver checks would look like a gap
+# Checks for GNSS. _check_gnss is before _check_gap, because positions without a fix are not logged
+# and look like a gap
 GNSS_CONDITIONS = (_check_switch, _check_gnss, _check_gap, _check_alignment, _check_gate)

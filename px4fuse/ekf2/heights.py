@@ -1,10 +1,8 @@
 """Fusion of GNSS and barometer heights in the EKF2 replay.
 
 Barometer samples between two events (:mod:`px4fuse.ekf2.filter_recursion`) are fused at the later
-event; the vertical motion in between is computed from the state and the IMU. EKF2 estimates a bias
-of the sensor that is not the height reference.
-
-Array shapes: E events, S filter configurations, k samples per event.
+event. The vertical motion in between is computed from the state and the IMU. EKF2 estimates a bias
+of the height sensor that is not the height reference.
 
 Sources: PX4-Autopilot ``EKF/aid_sources`` (``barometer/baro_height_control.cpp``,
 ``gnss/gnss_height_control.cpp``), before v1.16 ``EKF/baro_height_control.cpp`` and
@@ -33,7 +31,7 @@ from px4fuse.ekf2.replay_segments import (
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, uses_aid_mask
 from px4fuse.flight.model import GROUND_EFFECT, Ekf2, Flight, FusionRecord, step_values_at
 
-# Indices of vertical velocity and height in the state
+# State indices of vertical velocity and height
 VELOCITY_DOWN, DOWN = 5, 8
 HEIGHT_SENSORS = (BAROMETER, GNSS_HGT)
 HEIGHT_AIDS = (*HEIGHT_SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
@@ -56,7 +54,7 @@ GNSS_HEIGHT_NOISE_FACTOR = 1.5
 def add_heights(
     flight: Flight, ekf2: Ekf2, fusion_record: FusionRecord, segments: Sequence[ReplaySegment]
 ) -> tuple[ReplaySegment, ...] | str:
-    """Add height measurements to the segments, or return the reason why the log is insufficient."""
+    """Add height measurements to the replay segments; without them in the log, return a reason."""
     parameters = fusion_record.parameters
     replayed_s = np.concatenate([segment.time_s for segment in segments])
     if uses_aid_mask(parameters):
@@ -71,7 +69,7 @@ def add_heights(
         if enabled_fractions.get(aid.name) and aid.name not in fused_aids:
             return f"EKF2 also fused {aid.label} in part of the flight"
     reference = HEIGHT_REFERENCES.get(int(parameters.get("EKF2_HGT_REF", 1.0)))
-    # a single height sensor is the reference
+    # A single height sensor is the height reference
     if len(fused_aids) == 1:
         (reference,) = fused_aids
     if reference not in fused_aids:
@@ -121,16 +119,17 @@ def add_heights(
 def barometer_samples_inside(
     segment: ReplaySegment, measured_at_s: Array, *quantities: Array
 ) -> tuple[Any, ...]:
-    """Return prediction step, time (s) and other quantities of the samples inside a segment."""
+    """Select the samples inside a segment: return prediction step, time (s) and ``quantities``."""
     step, is_inside = sample_steps(segment, measured_at_s)
     return step, *(values[is_inside] for values in (measured_at_s, *quantities))
 
 
 def barometer_samples(segment: ReplaySegment, event_step_arrays: Sequence[IntArray]) -> list[Array]:
-    """Return the barometer samples that are fused at each event, for each array of event steps.
+    """Return the barometer samples that are fused at each event.
 
-    Rows of each result, shape (6, k, E): height (m, down), age (s), time (s), dead zone (m),
-    weight, and a mask (0 for an empty slot).
+    ``event_step_arrays`` contains the prediction steps of the events, one array for each set of
+    events. Each result has the shape (6, k, events), with the rows height (m, down), age (s), time
+    (s), dead zone (m), weight, and 1 for a sample (0 for an empty slot).
     """
     heights = segment.heights
     assert heights is not None
@@ -152,23 +151,23 @@ def barometer_samples(segment: ReplaySegment, event_step_arrays: Sequence[IntArr
 
 
 class HeightFilter:
-    """Height fusion in S filter configurations through one segment, event by event.
+    """Height fusion in several filter configurations, event by event through one segment.
 
     Parameters
     ----------
     segment : ReplaySegment
-    barometer : ndarray, shape (6, k, E, S) or (6, k, E, 1)
+    barometer : ndarray, shape (6, k, events, filters) or (6, k, events, 1)
         Result of :func:`barometer_samples`.
-    fix_s, has_fix : ndarray, shape (E, S) or (E, 1)
+    fix_s, has_fix : ndarray, shape (events, filters) or (events, 1)
         Time of the GNSS fix of each event, and mask of the events with a fix.
-    is_enabled_by_aid : mapping from PX4's name of an aiding source to ndarray of bool, shape (E, S)
-    parameters : mapping from parameter name to ndarray, shape (S,)
-    has_gate : ndarray of bool, shape (S,)
+    is_enabled_by_aid : mapping from PX4's name of a source to ndarray of bool, (events, filters)
+    parameters : mapping from parameter name to ndarray, shape (filters,)
+    has_gate : ndarray of bool, shape (filters,)
     bad_acceleration : BadAcceleration
 
     Attributes
     ----------
-    update_log : ndarray, shape (E, k + 2, 4, S)
+    update_log : ndarray, shape (events, k + 2, 4, filters)
         Rows of :func:`~px4fuse.ekf2.replay_segments.update_table` for k barometer samples, GNSS
         height and GNSS velocity.
     """
@@ -204,26 +203,26 @@ class HeightFilter:
         self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
         self.has_bias = [aid.name != heights.reference for aid in HEIGHT_SENSORS]
         self.weight = [*np.maximum(weight, 1.0), np.ones_like(fix_s)]
-        bias_m, bias_m2 = np.tile(heights.initial_bias, (configuration_count, 1)).T
+        bias_m, bias_variance_m2 = np.tile(heights.initial_bias, (configuration_count, 1)).T
         start_s = segment.time_s[0]
-        self.bias = BiasEstimator(bias_m, bias_m2, segment.step_s)
+        self.bias = BiasEstimator(bias_m, bias_variance_m2, segment.step_s)
         self.updates_bias = self.has_sample & is_enabled_by_aid[heights.reference]
         biased_slots = slice(0, -1) if self.has_bias[0] else slice(-1, None)
         self.interval_s = np.zeros(self.has_sample.shape)
         self.time_s = np.stack(np.broadcast_arrays(*measured_at_s, fix_s, self.has_sample[0])[:-1])
         slot_count, event_count, _ = self.time_s.shape
         self.update_log = np.full((event_count, slot_count + 1, 4, configuration_count), np.nan)
-        # times of the samples in the order of fusion, event after event
+        # Times of the samples in the order of fusion
         sample_s = np.where(self.has_sample, self.time_s, start_s)[biased_slots].swapaxes(0, 1)
-        latest_s = np.maximum.accumulate(sample_s.reshape(-1, configuration_count), axis=0)
-        interval_s = np.diff(latest_s, axis=0, prepend=start_s).reshape(sample_s.shape)
+        latest_sample_s = np.maximum.accumulate(sample_s.reshape(-1, configuration_count), axis=0)
+        interval_s = np.diff(latest_sample_s, axis=0, prepend=start_s).reshape(sample_s.shape)
         self.interval_s[biased_slots] = interval_s.swapaxes(0, 1)
         self.interval_s *= self.updates_bias
 
     def updates(self, sensor: str, configuration_index: int, end_s: Array) -> pd.DataFrame:
-        """Return the updates of one filter configuration with one sensor.
+        """Return the updates of one filter configuration with one height sensor.
 
-        ``end_s`` is the time of each event.
+        ``end_s`` contains the time (s) of each event.
         """
         gnss_slot = len(self.down_m)
         slots = slice(gnss_slot, gnss_slot + 1) if sensor == GNSS_HGT.name else slice(gnss_slot)
@@ -238,9 +237,13 @@ class HeightFilter:
             )
         return x, P
 
-    def fuse_gnss(self, e: int, x: Array, P: Array, gnss_m: Array, gnss_m2: Array) -> ArrayPair:
-        """Fuse the GNSS height (m, down) of one event; ``gnss_m2`` is its R (m²)."""
-        return self._fuse_sample(e, len(self.down_m), x, P, gnss_m, np.zeros(1), gnss_m2)
+    def fuse_gnss(
+        self, e: int, x: Array, P: Array, gnss_down_m: Array, gnss_variance_m2: Array
+    ) -> ArrayPair:
+        """Fuse the GNSS height (m, down) of one event; ``gnss_variance_m2`` is its R (m²)."""
+        return self._fuse_sample(
+            e, len(self.down_m), x, P, gnss_down_m, np.zeros(1), gnss_variance_m2
+        )
 
     def update_bad_acceleration(self, e: int, time_s: Array) -> None:
         update_log = self.update_log[max(e - 1, 0) : e + 1]
@@ -257,8 +260,8 @@ class HeightFilter:
             return x, P
         sensor_index = int(slot == len(self.down_m))
         # PH' and HPH'
-        column = P[:, :, DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
-        predicted_variance = column[:, DOWN] - age_s * column[:, VELOCITY_DOWN]
+        state_covariance = P[:, :, DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
+        predicted_variance = state_covariance[:, DOWN] - age_s * state_covariance[:, VELOCITY_DOWN]
         nu = down_m - x[:, DOWN] + age_s * x[:, VELOCITY_DOWN]
         sample_weight = self.weight[slot][e]
         if self.has_bias[sensor_index]:
@@ -283,5 +286,5 @@ class HeightFilter:
             nu = np.where(is_clipped, np.clip(nu, -innovation_limit, innovation_limit), nu)
             is_fused |= is_clipped
         self.update_log[e, slot] = np.where(has_sample, (nu, S, ~is_fused, is_fused), np.nan)
-        K = column * (is_fused / (predicted_variance + R / sample_weight))[:, None]
-        return x + K * nu[:, None], P - K[:, :, None] * column[:, None]
+        K = state_covariance * (is_fused / (predicted_variance + R / sample_weight))[:, None]
+        return x + K * nu[:, None], P - K[:, :, None] * state_covariance[:, None]

@@ -1,4 +1,4 @@
-"""Inputs of the EKF2 replay, read from a flight, or the reason why the log is insufficient.
+"""Inputs of the EKF2 replay from the log of a flight.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/external_vision/ev_pos_control.cpp`` and, before v1.15,
 ``EKF/ev_pos_control.cpp`` (frames), ``logged_topics.cpp`` (logging rates).
@@ -55,7 +55,7 @@ from px4fuse.readers.px4_topics import DEFAULT_PROFILE_REMEDY
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, rotate, to_matrix
 
 ANALYSIS_NAME = "EKF2 replay"
-# Text that marks simulated logs
+# Note in the log of a simulated flight
 MODEL_NOTE = (
     "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
 )
@@ -86,13 +86,13 @@ MAX_LOST_FRACTION = 0.1
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
 # Number of successive position resets in PX4 releases without a limit
 UNLIMITED_RESETS = 1_000_000
-# Maximum interval (s) between height and heading updates in a gap of the position source
+# Maximum interval (s) between updates with height and heading in a gap of the position source
 MAX_INTERVAL_S = 0.25
 
 
 @dataclass(frozen=True)
 class ReceivedPositions:
-    """The m position samples that EKF2 received, in time order.
+    """Position samples that EKF2 received, in time order.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class ReceivedPositions:
     reset : ndarray of bool, shape (m,)
         True if EKF2 reset its position to the sample.
     uses_sender_times : bool
-        True if EKF2 ignores its delay parameter.
+        True if EKF2 uses measurement times of the sender and ignores its delay parameter.
     reset_s : ndarray
         Timestamps of the samples with a new ``reset_counter``: EKF2 resets its position to them.
     has_all_resets : bool
@@ -130,7 +130,7 @@ class ReceivedPositions:
 
 @dataclass(frozen=True)
 class FusionRules:
-    """Rules for start, stop and reset of horizontal position fusion in one PX4 release.
+    """Rules of one PX4 release for start, stop and reset of horizontal position fusion.
 
     Attributes
     ----------
@@ -139,15 +139,15 @@ class FusionRules:
     stop_timeout_s : float
         Fusion stops after this time without a sample.
     reset_timeout_s : float
-        The position is reset after this time of rejections.
+        The position is reset after all samples are rejected for this time.
     max_resets : int
-        Fusion stops after this number of resets in a row.
+        Fusion stops after this number of successive resets.
     min_bias_variance : float or None
         Minimum accelerometer bias variance (m²/s⁴).
     uses_delay_as_horizon : bool
         True if the largest delay parameter is the fusion horizon, not EKF2_DELAY_MAX (v1.15).
     reset_variance_factor : float
-        Position variance after a reset ÷ measurement variance.
+        Ratio of the position variance after a reset to the measurement variance.
     resets_velocity : bool
         True if velocity is reset together with position.
     bad_acceleration_duration_s : float
@@ -193,7 +193,7 @@ class Inputs:
     received : ReceivedPositions
         Samples of the horizontal position source ``aid``.
     mean_step_s, configured_step_s : float
-        Prediction step: mean of the log, and EKF2_PREDICT_US.
+        Length of a prediction step: mean in the log, and EKF2_PREDICT_US.
     horizon_s : float
         Delay of the fusion horizon.
     fuses_vision_height : bool
@@ -205,7 +205,7 @@ class Inputs:
     logged_height_reason : str
         Reason why EKF2's logged height is used in a flight with GNSS.
     vision : ReceivedPositions or None
-        Vision that EKF2 fused in addition to GNSS; NaN while disabled.
+        Vision positions that EKF2 fused in addition to GNSS; NaN while vision is disabled.
     """
 
     settings: dict[str, float]
@@ -228,8 +228,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
 ) -> Inputs | Unavailable:
     """Return the inputs of the EKF2 replay, or the reason why the log is insufficient.
 
-    ``omitted_aids`` are aiding sources, by PX4's name, that the model cannot reproduce, with the
-    reason. The replay omits them.
+    ``omitted_aids`` contains aiding sources (PX4's names) that the replay omits, with the reasons.
     """
     imu = flight.imu
     attitude = flight.attitude
@@ -249,7 +248,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     horizon_s = ekf2.horizon_s
     if isinstance(fusion_record, Unavailable):
         return fusion_record
-    # the simulated earth is a sphere without rotation
+    # The earth in px4fuse's simulation is a sphere without rotation
     if MODEL_NOTE in flight.log.notes:
         fusion_record = replace(fusion_record, latitude_deg=np.nan)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
@@ -287,7 +286,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     )
     if isinstance(vision, Unavailable):
         return vision
-    # from PX4 v1.17 on each GNSS receiver has a separate lever arm, logged in the GNSS messages
+    # Since PX4 v1.17, each GNSS receiver has a separate lever arm, which its messages contain
     gnss_track = _gnss_track(flight) if is_gnss else None
     lever_arm = (
         {} if gnss_track is None else dict(zip(aid.lever_arm, gnss_track.lever_arm_m, strict=True))
@@ -295,7 +294,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(FIRST_RELEASE_WITH_HORIZON_TIMES):
             return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
-        # the fusion horizon has no delay if EKF2_EV_DELAY is at most one prediction step
+        # The fusion horizon has no delay if EKF2_EV_DELAY is at most one prediction step
         horizon_s = 0.0
     aiding_times_s = received.timestamp_s
     flow_samples = fusion_record.flow if is_gnss else fusion_record.flow.iloc[:0]
@@ -337,7 +336,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         mean_step_s=ekf2.step_s,
         horizon_s=horizon_s,
         configured_step_s=predict_s(fusion_record),
-        # EKF2 clips vision heights while it reports a bad acceleration; the model does not
+        # While EKF2 reports a bad acceleration, it clips vision heights, which the model does not
         fuses_vision_height=not is_gnss
         and isinstance(ekf2.fusion_flags, pd.DataFrame)
         and bool(ekf2.fusion_flags["vertical"].mean() > 0.5)
@@ -352,7 +351,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
 
 
 def lost_imu_fraction(time_s: Array) -> float:
-    """Return the fraction of IMU samples that are missing from the log, outside gaps."""
+    """Return the fraction of IMU samples that are missing from the log, not counting gaps."""
     intervals_s = np.diff(time_s)
     lost_counts = np.rint(intervals_s[intervals_s <= IMU_GAP_S] / np.median(intervals_s)) - 1.0
     lost_count = lost_counts.clip(0.0).sum()
@@ -379,10 +378,10 @@ def _explain_missing_imu(time_s: Array) -> Unavailable | None:
 def _fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
     rules, parameters = VISION_RULES, fusion_record.parameters
     if is_gnss:
-        # in PX4 main since 2026, position and velocity have separate timeouts and separate resets
+        # Since 2026, position and velocity have separate timeouts and separate resets in PX4 main
         rules = replace(GNSS_RULES, resets_velocity=GNSS_MODE_PARAMETER not in parameters)
-        if not fusion_record.stores_latitude:
-            # the flag stays set for 10 s (BADACC_PROBATION, common.h)
+        if not fusion_record.stores_latitude():
+            # The flag for a bad acceleration stays set for 10 s (BADACC_PROBATION, common.h)
             rules = replace(rules, reset_variance_factor=1.0, bad_acceleration_duration_s=10.0)
     elif uses_aid_mask(parameters):
         rules = FusionRules(np.inf, 7.0, 7.0, UNLIMITED_RESETS)
@@ -394,7 +393,7 @@ def _fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) 
 
 
 def replayed_aid(ekf2: Ekf2) -> Aid:
-    """Return the position source to replay: GNSS if EKF2 fused GNSS, else external vision."""
+    """Return the position source of the replay: GNSS if EKF2 fused GNSS, else external vision."""
     vision = ekf2.aids.get(EV_POS.name)
     is_vision_used = bool(vision and (vision.enabled is None or vision.enabled.any()))
     has_gnss = _enabled_log(ekf2, GNSS_POS) is not None
@@ -402,7 +401,10 @@ def replayed_aid(ekf2: Ekf2) -> Aid:
 
 
 def _enabled_log(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
-    """Return the times at which a source is enabled (1) or disabled (0); None if never enabled."""
+    """Return the times at which EKF2 enables (1) or disables (0) an aiding source.
+
+    Return None if the source is never enabled.
+    """
     aid_log = ekf2.aids.get(aid.name)
     return (
         aid_log.enabled
@@ -424,10 +426,10 @@ def read_gnss(
         return Unavailable(
             ANALYSIS_NAME, "the log has no topic vehicle_gps_position", DEFAULT_PROFILE_REMEDY
         )
-    if track.rate_hz < MAX_DOWNSAMPLED_HZ:
+    if track.compute_rate_hz() < MAX_DOWNSAMPLED_HZ:
         return Unavailable(
             ANALYSIS_NAME,
-            f"GNSS is logged at {track.rate_hz:.1f} Hz, below the rate that EKF2 fused",
+            f"GNSS is logged at {track.compute_rate_hz():.1f} Hz, below the rate that EKF2 fused",
             "Set bit 1 of SDLOG_PROFILE to log all GNSS fixes.",
         )
     parameters = fusion_record.parameters
@@ -438,11 +440,11 @@ def read_gnss(
         is_enabled = step_values_at(enabled_log, position_samples.index) > 0.0
         position_samples = position_samples[is_enabled]
         velocity_samples = velocity_samples[is_enabled]
-    # the track has measurement times, from which the replay subtracts the delay again
+    # The delay is added to measurement times, because the replay subtracts it
     logged_settings = effective_settings(parameters, GNSS_POS)
     logged_delay_s = logged_settings[GNSS_POS.delay] * 1e-3
     timestamp_s = position_samples.index.to_numpy() + logged_delay_s
-    # upper limit (m) of the reported position noise in EKF2 (gps_control.cpp)
+    # Maximum reported position noise (m) that EKF2 uses (gps_control.cpp)
     max_noise_m = max(parameters.get("EKF2_NOAID_NOISE", 10.0), 1.0)
     reported_variance = (
         position_samples[Columns.POSITION_VARIANCE].fillna(0.0).clip(upper=max_noise_m**2)
@@ -470,7 +472,7 @@ def read_vision(
 ) -> ReceivedPositions | Unavailable:
     """Return the vision positions that EKF2 received (NED), or the reason why they are incomplete.
 
-    The published ``attitude`` rotates positions from an FRD frame to NED.
+    Positions in an FRD frame are rotated to NED with EKF2's published ``attitude``.
     """
     track = _vision_track(flight)
     if isinstance(track, Unavailable):
@@ -504,7 +506,7 @@ def read_vision(
         position_m = rotate(rotation, position_m)
         variance_m2 = rotate(rotation**2, variance_m2)
     vision_age_s = fusion_record.vision_age_s
-    # without arrival times no sample is treated as late
+    # Without arrival times, no sample is late
     arrival_s = np.full(len(timestamp_s), -np.inf)
     if len(vision_age_s) and "vehicle_visual_odometry" in track.topics:
         arrival_s = timestamp_s + np.interp(timestamp_s, vision_age_s.index, vision_age_s)
@@ -549,7 +551,10 @@ def _logged_decisions(
     arrival_s: Array,
     aid: Aid = EV_POS,
 ) -> tuple[Array, BoolArray]:
-    """Return EKF2's logged rejection and reset at each position sample."""
+    """Return which position samples EKF2 rejected (1, else 0), and to which samples it was reset.
+
+    The rejection is NaN if it is not logged.
+    """
     rejected_flags = np.full(len(timestamp_s), np.nan)
     is_reset = np.zeros(len(timestamp_s), dtype=bool)
     innovations = ekf2.innovations["north"]
@@ -565,8 +570,8 @@ def _logged_decisions(
     # EKF2 fuses a sample at the first step after its measurement time, or after a late arrival
     due_s = np.maximum.accumulate(np.maximum(measured_s, arrival_s - horizon_s))
     aid_rows = ekf2.aids[aid.name].samples
-    # EKF2 rejected all samples between the last fusion or reset and each logged row, and all in
-    # dead reckoning
+    # EKF2 rejected all samples between its last fusion or reset and each logged row, and all
+    # samples in dead reckoning
     fusions = aid_rows.reindex(columns=["last_fused_s"]).dropna()
     fusion_to_row_s = np.column_stack([fusions, fusions.index])
     dead_reckoning_s = (
@@ -581,13 +586,13 @@ def _logged_decisions(
     sample_row = matching_sample_rows(innovations.index.to_numpy(), measured_s)
     sample_innovations = innovations.iloc[sample_row[sample_row >= 0]]
     rejected_flags[sample_row >= 0] = sample_innovations["rejected"]
-    # a sample to which EKF2 resets its position is logged with innovation 0, and not as rejected
+    # If EKF2 resets its position to a sample, it logs innovation 0, and not a rejection
     is_reset_possible[sample_row >= 0] &= (sample_innovations["rejected"] > 0.0) | (
         sample_innovations["innovation_m"] == 0.0
     )
     last_fused_rows = rejection_rows[: len(fusion_to_row_s), 0] - 1
     dead_reckoning_ends = rejection_rows[len(fusion_to_row_s) :, 1] - 1
-    # a reset is visible in the next published state, one fusion horizon later than the measurement
+    # A reset is visible in the next published state, one fusion horizon after the measurement
     published_s = due_s + horizon_s
     for reset_s in horizontal_resets_s(ekf2):
         is_recent = (published_s <= reset_s) & (published_s > reset_s - MAX_RESET_PUBLICATION_S)
@@ -603,10 +608,10 @@ def _logged_decisions(
 
 
 def _dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array:
-    """Return the times (s) without fusion of vision; each ends with a fusion or a reset.
+    """Return start and end (s) of each time span without fusion of vision.
 
     EKF2 reports inertial dead reckoning after DEAD_RECKONING_TIMEOUT_S without fusion, and
-    immediately if vision is disabled.
+    immediately if vision is disabled. Dead reckoning ends with a fusion or a reset.
     """
     dead_reckoning_changes = fusion_record.states.get(DEAD_RECKONING)
     vision_enabled_changes = ekf2.states.get(EV_POS.name)
@@ -645,7 +650,7 @@ def horizontal_resets_s(ekf2: Ekf2) -> Array:
 
 
 def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
-    """Return the track with all vision positions that EKF2 received."""
+    """Return the position track that contains all vision positions EKF2 received."""
     missing_reasons = ["the log has no topic vehicle_visual_odometry"]
     for track in sorted(flight.positions, key=lambda track: track.origin == POSITION_FILE):
         if track.origin.is_vision and track.origin.has_all_samples:

@@ -1,12 +1,12 @@
-"""Intervals between events in the EKF2 replay, with state transition and process noise.
+"""State transition and process noise between the fusions of the EKF2 replay.
 
 An interval ends with an event: the fusion of a position or, in a gap of the position source, of
-height and heading only. The transitions are linearised about the published attitude, so they are
-computed once for all parameters.
+height and heading only. The transition is linearised about the published attitude, so it does not
+depend on EKF2's parameters and is computed once.
 
-Error state: attitude error δθ (earth frame, estimate = exp(δθ) · nominal), velocity, position,
-errors of gyro bias b_g and accelerometer bias b_a. Δt is the prediction step, a = R f the specific
-force in NED:
+Error states are attitude error δθ (earth frame, estimate = exp(δθ) · nominal), velocity v, position
+p, and errors of gyro bias b_g and accelerometer bias b_a. With prediction step Δt, specific force a
+= R f in NED, and gravity g:
 
     δθ ← δθ - R Δt δb_g            v ← v - [a]× Δt δθ - R Δt δb_a + (a + g) Δt
     p ← p + (v_before + v_after) Δt / 2
@@ -34,12 +34,12 @@ from px4fuse.ekf2.replay_segments import (
 )
 from px4fuse.trajectory.rotation import rotate, skew
 
-# Maximum delay (s) of a fused sample after the fusion horizon (RingBuffer.h,
-# pop_first_older_than)
+# EKF2 does not fuse a sample that is older than the fusion horizon by more than this time (s):
+# pop_first_older_than (RingBuffer.h)
 MAX_LATENESS_S = 0.1
-# Minimum delay (s) of a sample after the fusion horizon to count as late: 3 cm at 1 m/s
+# A sample is late if it is older than the fusion horizon by more than this time (s): 3 cm at 1 m/s
 MIN_LATENESS_S = 0.03
-# Actions on a position sample: none, update of the state, start of fusion with a reset
+# Actions on a position sample: none, update of the state, or reset of the state to the sample
 IDLE, FUSE, START = 0, 1, 2
 # Columns of the sensitivities of the EKF2 states: 0 to 2 initial attitude error, 3 to 5 gyro bias,
 # 6 to 8 accelerometer bias, 9 known change of the nominal attitude, 10 measured acceleration
@@ -47,7 +47,7 @@ SENSITIVITY_COLUMN_COUNT = 11
 CORRECTION_COLUMN, INPUT_COLUMN = 9, 10
 
 # One row per event (end of an interval), in time order
-Events = np.recarray[Any, Any]
+StepEvents = np.recarray[Any, Any]
 EVENT = np.dtype(
     [
         ("end_step", np.intp),  # index of the prediction step after which the event occurs
@@ -83,11 +83,11 @@ class Transitions(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """Intervals between the E events of one segment.
+    """State transition and process noise of each interval between the events of one segment.
 
     Attributes
     ----------
-    events : recarray, shape (E,)
+    events : recarray, shape (events,)
         Event at the end of each interval, see :data:`EVENT`.
     step_counts, duration_s : ndarray, shape (E,)
         Number of prediction steps, and length of each interval.
@@ -95,7 +95,7 @@ class Intervals:
         Sensitivity of attitude, velocity and position at the end of each interval.
     """
 
-    events: Events
+    events: StepEvents
     step_counts: Array
     duration_s: Array
     sensitivities: Array
@@ -118,14 +118,17 @@ class Intervals:
 
 @dataclass(frozen=True)
 class Timing:
-    """Delay (s) of a position, and delay (s) of EKF2's fusion horizon."""
+    """Delay (s) of the position source, and delay (s) of EKF2's fusion horizon."""
 
     delay_s: float
     horizon_s: float
 
 
 def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Intervals:
-    """Compute the intervals of a segment; the number of events does not depend on ``timing``."""
+    """Compute state transition and process noise of all intervals in a segment.
+
+    The number of intervals does not depend on ``timing``.
+    """
     events = _make_events(inputs, segment, timing)
     end_steps = events.end_step
     start_steps = np.append(0, end_steps[:-1])
@@ -137,15 +140,15 @@ def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> In
     )
 
 
-def _make_events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Events:
+def _make_events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> StepEvents:
     received = inputs.received
     time_s = segment.time_s
     first_row, last_row = np.searchsorted(received.timestamp_s, time_s[[0, -1]])
     timestamp_s = received.timestamp_s[first_row:last_row]
     last_step = len(time_s) - 1
     measured_s = timestamp_s - timing.delay_s - 0.5 * inputs.mean_step_s
-    # a sample that arrives after the fusion horizon has passed its measurement time is fused late
-    # or never
+    # If a sample arrives after the fusion horizon has passed its measurement time, EKF2 fuses it
+    # late or never
     due_s = np.maximum(measured_s, received.arrival_s[first_row:last_row] - timing.horizon_s)
     end_steps = np.searchsorted(time_s, due_s - 1e-9)
     is_inside = (end_steps > 0) & (end_steps <= last_step)
@@ -156,8 +159,8 @@ def _make_events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Even
     is_usable[:-1] &= end_steps[1:] > end_steps[:-1]
     action, can_start = _sample_actions(inputs, segment, measured_s, end_steps, is_usable)
     action[np.isin(timestamp_s, received.reset_s) & (action == FUSE)] = START
-    # in gaps of the position source there are additional events; their number does not depend on
-    # the delay
+    # Gaps of the position source contain additional events. Their number does not depend on the
+    # delay
     gap_s = np.diff(np.r_[time_s[0], timestamp_s, time_s[-1]])
     extra_event_counts = np.maximum(np.ceil(gap_s / inputs.max_interval_s).astype(int) - 1, 0)
     sample_event_rows = np.cumsum(extra_event_counts[:-1] + 1) - 1
@@ -188,9 +191,9 @@ def _sample_actions(
     end_steps: IntArray,
     is_usable: BoolArray,
 ) -> tuple[IntArray, BoolArray]:
-    """Return IDLE, FUSE or START for each sample, and a mask of samples that may start fusion.
+    """Return the action of EKF2 on each sample, and True for samples that may start fusion.
 
-    Source: PX4-Autopilot ``ev_control.cpp``.
+    The actions are IDLE, FUSE and START. Source: PX4-Autopilot ``ev_control.cpp``.
     """
     rules = inputs.rules
     action = np.full(len(measured_at_s), IDLE)
@@ -198,7 +201,7 @@ def _sample_actions(
     usable_rows = np.flatnonzero(is_usable)
     intervals_s = np.diff(measured_at_s[usable_rows], prepend=-np.inf)
     can_start[usable_rows] = intervals_s < rules.start_interval_s
-    # time (s) without a usable sample before each sample
+    # Time (s) from the previous usable sample to each sample
     sample_gaps_s = segment.time_s[end_steps[usable_rows] - 1] - np.concatenate(
         [[np.inf], measured_at_s[usable_rows[:-1]]]
     )
@@ -216,13 +219,14 @@ def _sample_actions(
 
 
 def _state_sensitivities(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
-    """Return the sensitivity of attitude, velocity and position at the end of each interval.
+    """Return the derivatives of attitude, velocity and position at the end of each interval.
 
-    Shape (E, 9, SENSITIVITY_COLUMN_COUNT).
+    The shape is (events, 9, SENSITIVITY_COLUMN_COUNT). The derivatives are with respect to initial
+    attitude and biases; two more columns contain the effect of the inputs.
     """
     step_counts = end - start
-    # integrate the first prediction step of all intervals, then the second step, and so on. Longer
-    # intervals are sorted first, so the intervals with a next step are the first rows
+    # The first prediction step of all intervals is integrated, then the second step, and so on.
+    # Intervals are sorted by length, so that the intervals with a next step are the first rows
     longest_first = np.argsort(-step_counts, kind="stable")
     first_start_steps = start[longest_first]
     attitude, velocity, position = sensitivities = np.zeros(
@@ -238,7 +242,7 @@ def _state_sensitivities(segment: ReplaySegment, start: IntArray, end: IntArray)
         rows = slice(count)
         dt = segment.step_s[step][:, None, None]
         force = force_m_s2[step]
-        # sensitivity of attitude to gyro bias, and of velocity to accelerometer bias, in one step
+        # Derivative of attitude by gyro bias, and of velocity by accelerometer bias, in one step
         bias_sensitivity_step = -segment.body_to_ned[1:][step] * dt
         position[rows] += 0.5 * dt * velocity[rows]
         velocity[rows] += (-skew(force) * dt) @ attitude[rows]
@@ -254,15 +258,15 @@ def _state_sensitivities(segment: ReplaySegment, start: IntArray, end: IntArray)
 def _imu_noise_by_interval(
     step_counts: Array, duration_s: Array, velocity_per_attitude_error: Array
 ) -> tuple[Array, Array]:
-    """Return the process noise of each interval for unit gyro noise and unit accelerometer noise.
+    """Return the process noise of each interval for 1 rad/s gyro and 1 m/s² accelerometer noise.
 
-    The noise is summed over the prediction steps: a step of length d adds d² to the variance of
-    attitude or velocity. The specific force is the mean of the interval. For velocity and position,
-    only the leading terms of the gyro noise are used.
+    A prediction step of length d adds d² to the variance of attitude or velocity. The specific
+    force is assumed to be constant in the interval. For the effect of gyro noise on velocity and
+    position, only the leading terms are used.
     """
     n = np.maximum(step_counts, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n
-    # velocity change per attitude error in one of n equal prediction steps
+    # Velocity change per attitude error in one of n equal prediction steps
     m = velocity_per_attitude_error / n
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)

@@ -1,9 +1,7 @@
 """Fusion of all three magnetometer axes in the EKF2 replay, with earth and body fields as states.
 
-The samples between two events (:mod:`px4fuse.ekf2.filter_recursion`) are averaged, and their mean
-is fused at the later event, because the attitude error hardly changes in between.
-
-Array shapes: E events, S filter configurations.
+The samples between two events (:mod:`px4fuse.ekf2.filter_recursion`) are averaged, and the mean is
+fused at the later event: the attitude error hardly changes in between.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/magnetometer`` (``mag_fusion.cpp``: fuseMag;
 ``mag_control.cpp``: R and its lower limit), ``EKF/covariance.cpp`` (process noise of the fields).
@@ -19,13 +17,15 @@ from px4fuse.trajectory.rotation import skew
 
 # Minimum magnetometer noise (gauss) that EKF2 uses
 MIN_SIGMA_GAUSS = 0.01
-IDENTITY = np.eye(3)
-# Matrix with which v @ CROSS_PRODUCT is the cross product matrix [v]× of a vector v
-CROSS_PRODUCT = skew(IDENTITY).reshape(3, 9)
+IDENTITY_MATRIX = np.eye(3)
+# Matrix that gives the cross product matrix [v]× (flattened) of a vector v as v @ CROSS_PRODUCT
+CROSS_PRODUCT = skew(IDENTITY_MATRIX).reshape(3, 9)
 
 
 class EventSamples(NamedTuple):
-    """Mean of the sensor samples that are fused at each event; shape (E, ...) or (E, S, ...).
+    """Mean of the magnetometer or optical flow samples that are fused at each event.
+
+    The shapes of the arrays begin with (events,) or (events, filters).
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class EventSamples(NamedTuple):
 def mean_by_event(
     segment: ReplaySegment, sensor_samples: SensorSamples, event_steps: IntArray
 ) -> EventSamples:
-    """Return the mean of the sensor samples that are fused at each event."""
+    """Average the magnetometer or optical flow samples that are fused at each event."""
     event_index = np.searchsorted(event_steps, sensor_samples.step)
     is_inside = event_index < len(event_steps)
     event_count = len(event_steps)
@@ -77,21 +77,21 @@ def fuse_mean(
     state_rows: slice,
     bias_state_rows: slice | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Fuse the mean of a sensor's samples at one event in all filter configurations.
+    """Fuse the mean of magnetometer or optical flow samples in all filter configurations.
 
-    Return state, covariance, and an array of shape (3, S, components): innovation, its variance for
-    one sample, and 1 if fused; NaN without a sample.
+    Return state, covariance, and an array of shape (3, filters, components): innovation, its
+    variance for one sample, and 1 if fused. The array is NaN without a sample.
 
     Parameters
     ----------
     sample_mean : EventSamples
         Mean of one event.
-    gate : ndarray, shape (S,)
+    gate : ndarray, shape (filters,)
         Innovation gate in √S.
     state_rows : slice
-        State (NED vector) that the sensor measures in the body frame.
+        Indices of the state vector (NED) that the sensor measures in the body frame.
     bias_state_rows : slice, optional
-        State (body frame) that is added to the measurement.
+        Indices of the state vector (body frame) that is added to the measurement.
     """
     measured_state = x[:, state_rows]
     sample_count, R = sample_mean.sample_count, sample_mean.noise
@@ -100,15 +100,15 @@ def fuse_mean(
     )
     H = np.zeros((len(x), sample_mean.value.shape[-1], x.shape[1]))
     H[:, :, THETA] = sample_mean.rotation_to_body @ cross_state
-    H[:, :, state_rows] = sample_mean.rotation_to_body @ (IDENTITY - cross_theta)
+    H[:, :, state_rows] = sample_mean.rotation_to_body @ (IDENTITY_MATRIX - cross_theta)
     predicted_value = (H[:, :, state_rows] @ measured_state[:, :, None])[:, :, 0]
     if bias_state_rows is not None:
-        H[:, :, bias_state_rows] = IDENTITY
+        H[:, :, bias_state_rows] = IDENTITY_MATRIX
         predicted_value += x[:, bias_state_rows]
     nu = sample_mean.value - predicted_value
     HP = H @ P
     S = HP @ H.transpose(0, 2, 1)
-    # diagonal is a view of S: adding R changes S in place
+    # diagonal is a view of S: adding R to it changes S
     diagonal = S.reshape(len(S), -1)[:, :: nu.shape[1] + 1]
     innovation_record = np.empty((3, *nu.shape))
     innovation_record[0] = nu

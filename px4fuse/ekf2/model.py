@@ -1,9 +1,10 @@
-"""Replay of EKF2 with logged or other parameters, from a log with PX4's default profile.
+"""Replay of EKF2 with logged or changed parameters, from a log with PX4's default profile.
 
 The model has 15 error states, linearised about the published attitude, and starts from the logged
-``estimator_states``. Inputs are the logged IMU and positions; in a flight with GNSS also velocities
-and, if logged, the magnetometer (21 states). Other measurements are replaced by EKF2's published
-height and heading. :mod:`px4fuse.ekf2.replay` tests for each log if the model agrees with EKF2.
+``estimator_states``. Inputs are the logged IMU data and positions. In a flight with GNSS, the model
+also uses velocities and, if logged, the magnetometer (21 states). EKF2's published height and
+heading replace all other measurements. :mod:`px4fuse.ekf2.replay` compares each replay with the
+log.
 
 All filter configurations (parameters, states, aiding sources, gate) run together, to save time.
 """
@@ -34,7 +35,7 @@ from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, matching_sample_rows, pre
 from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
 from px4fuse.ekf2.output_predictor import follow_attitude, publish
 from px4fuse.ekf2.replay import (
-    HORIZONTAL,
+    HORIZONTAL_AXES,
     MAX_COMPARED_REJECTED_FRACTION,
     Agreement,
     Ekf2Replay,
@@ -67,10 +68,10 @@ from px4fuse.flight.ekf2_parameters import (
 )
 from px4fuse.flight.model import (
     AXIS_NAMES,
-    AxisName,
     Columns,
     Ekf2,
     Flight,
+    NedAxis,
     Unavailable,
     time_index,
 )
@@ -80,6 +81,8 @@ from px4fuse.trajectory.rotation import rotate
 # Maximum delay (s) of the fusion horizon: PX4's maximum of EKF2_DELAY_MAX
 MAX_HORIZON_S = 1.0
 
+# Number of replays that run together: more take less time for each, but more memory
+REPLAY_BATCH_SIZE = 10
 # Number of intervals whose states are computed at once, which limits memory
 BLOCK_EVENTS = 512
 
@@ -92,16 +95,16 @@ RequestConfigurations = Callable[[Inputs], Sequence[FilterConfiguration]]
 
 @dataclass(frozen=True)
 class Model:
-    """Flight prepared for EKF2 replays.
+    """Flight that is prepared for replays of EKF2 with other parameters.
 
     Attributes
     ----------
     intervals : mapping from Timing to tuple of Intervals
-        Intervals of each segment that were already computed.
+        Intervals of each segment that are already computed.
     baseline_replay : Ekf2Replay
         Replay with the logged parameters; ``agreement`` compares it with the log.
     runs : tuple of SegmentRun
-        Results of the filter configurations that were already run, per segment.
+        Results of the filter configurations that are already run, for each segment.
     """
 
     flight: Flight
@@ -117,8 +120,8 @@ def open_model(
 ) -> Model | Unavailable:
     """Prepare a flight for EKF2 replays, and replay it with the logged parameters.
 
-    ``request_configurations`` returns further filter configurations that will be needed. Running
-    all together saves time.
+    ``request_configurations`` returns filter configurations that will be needed later. They run
+    together with the logged parameters, to save time.
     """
     failed_agreements: dict[str, Agreement] = {}
     while not isinstance(
@@ -135,10 +138,10 @@ def _open_without_aids(
     request_configurations: RequestConfigurations,
     failed_agreements: Mapping[str, Agreement],
 ) -> Model | Unavailable:
-    """Prepare the replay without some aiding sources.
+    """Prepare a replay that omits some aiding sources.
 
-    ``failed_agreements`` contains, for each omitted source (PX4's name), the agreement with the log
-    of the replay that fused it.
+    ``failed_agreements`` contains the name of each omitted source, and the agreement with the log
+    of the replay that fused this source.
     """
     omitted_aids = {name: agreement.doubtful[name] for name, agreement in failed_agreements.items()}
     inputs = prepare_inputs(flight, omitted_aids)
@@ -152,6 +155,8 @@ def _open_without_aids(
     segments = tuple(with_state_correlation(inputs, segment) for segment in inputs.segments)
     inputs = replace(inputs, segments=segments)
     configurations = [baseline_configuration]
+    if np.mean(inputs.received.rejected > 0.0) > MAX_COMPARED_REJECTED_FRACTION:
+        configurations.append(FilterConfiguration(inputs.settings, uses_logged_decisions=True))
     for configuration in request_configurations(inputs):
         configurations += [] if configuration in configurations else [configuration]
     intervals_by_timing = {timing: intervals}
@@ -161,15 +166,17 @@ def _open_without_aids(
     if isinstance(agreement, Unavailable):
         return agreement
     model = Model(flight, inputs, intervals_by_timing, baseline_replay, agreement, tuple(runs))
-    rejected_share = max(agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed)
+    rejected_fraction = max(
+        agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed
+    )
     if (
-        rejected_share > MAX_COMPARED_REJECTED_FRACTION
+        rejected_fraction > MAX_COMPARED_REJECTED_FRACTION
         and np.isfinite(inputs.received.rejected).any()
     ):
-        rejecting_agreement = agreement_with_log(flight, replay_with_logged_rejections(model))
-        if isinstance(rejecting_agreement, Agreement):
-            agreement = with_logged_rejections(agreement, rejecting_agreement)
-    # the agreement of an omitted aiding source is from the replay that contained this source
+        agreement_with_rejections = agreement_with_log(flight, replay_with_logged_rejections(model))
+        if isinstance(agreement_with_rejections, Agreement):
+            agreement = with_logged_rejections(agreement, agreement_with_rejections)
+    # The agreement of an omitted aiding source is from the replay that fused this source
     failed_results = {
         (field_name := AGREEMENT_FIELDS.get(name, name)): getattr(failed_agreement, field_name)
         for name, failed_agreement in failed_agreements.items()
@@ -185,7 +192,7 @@ def _open_without_aids(
 
 
 def replay_with_logged_rejections(model: Model) -> Ekf2Replay:
-    """Replay EKF2 with logged parameters, rejections and resets."""
+    """Replay EKF2 with the logged parameters, rejections and resets."""
     configuration = FilterConfiguration(model.inputs.settings, uses_logged_decisions=True)
     return _make_replay(model.inputs, _run_model(model, [configuration]), configuration, {})
 
@@ -195,8 +202,10 @@ def replay_settings(
     settings: Sequence[Mapping[str, float]],
     excluded_s: Array | None = None,
     without: Mapping[str, float] | None = None,
-) -> tuple[Ekf2Replay, ...]:
+) -> Iterator[Ekf2Replay]:
     """Replay EKF2 with several sets of changed parameters.
+
+    The result yields one replay at a time and runs a few together, to limit memory.
 
     Parameters
     ----------
@@ -204,7 +213,7 @@ def replay_settings(
     settings : sequence of mapping
         Changed parameters of each replay, by PX4 name and in PX4's units.
     excluded_s : ndarray, optional
-        Timestamps of position samples that are neither fused nor listed as updates.
+        Timestamps of position samples that are not used.
     without : mapping from PX4's name of an aiding source to float, optional
         Time (s) from which the aiding source is not fused.
 
@@ -252,8 +261,6 @@ def replay_settings(
             f"{min(unknown_aids)} cannot be omitted: the replay of this log fuses only "
             f"{fused_text}."
         )
-    if not changes:
-        return ()
     if excluded_s is not None:
         excluded_rows = matching_sample_rows(inputs.received.timestamp_s, excluded_s)
         rejected_flags = np.full(len(inputs.received.timestamp_s), np.nan)
@@ -274,9 +281,21 @@ def replay_settings(
         )
         for change in changes
     ]
-    runs = _run_model(model, configurations)
-    replays = []
-    for configuration, change in zip(configurations, changes, strict=True):
+    return _replays(model, configurations, changes, excluded_s)
+
+
+def _replays(
+    model: Model,
+    configurations: Sequence[FilterConfiguration],
+    changes: Sequence[Mapping[str, float]],
+    excluded_s: Array | None,
+) -> Iterator[Ekf2Replay]:
+    inputs = model.inputs
+    runs: Sequence[SegmentRun] = ()
+    for index, (configuration, change) in enumerate(zip(configurations, changes, strict=True)):
+        if index % REPLAY_BATCH_SIZE == 0:
+            runs = ()  # free the memory before the next batch
+            runs = _run_model(model, configurations[index : index + REPLAY_BATCH_SIZE])
         replay = _make_replay(inputs, runs, configuration, change)
         updates = replay.updates
         if excluded_s is not None:
@@ -285,12 +304,11 @@ def replay_settings(
             updates = updates.iloc[
                 np.delete(np.arange(len(updates)), excluded_rows[excluded_rows >= 0])
             ]
-        replays.append(structs.replace(replay, updates=updates, agreement=model.agreement))
-    return tuple(replays)
+        yield structs.replace(replay, updates=updates, agreement=model.agreement)
 
 
 def modelled_aids(inputs: Inputs) -> list[str]:
-    """Return PX4's names of the aiding sources that the EKF2 replay fuses."""
+    """Return PX4's names of the aiding sources that the EKF2 model fuses."""
     segment = inputs.segments[0]
     is_fused = {
         inputs.aid: True,
@@ -304,7 +322,7 @@ def modelled_aids(inputs: Inputs) -> list[str]:
 
 
 def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
-    """Return the model with noise of standard deviation ``sigma_m`` (m) added to every position."""
+    """Add normal noise with standard deviation ``sigma_m`` (m) to each position in the inputs."""
     inputs = model.inputs
     rng = np.random.default_rng(seed)
     new_inputs: dict[str, Any] = {}
@@ -312,12 +330,12 @@ def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
         if samples is not None:
             position_noise_m = rng.normal(scale=sigma_m, size=samples.position_m.shape)
             new_inputs[name] = replace(samples, position_m=samples.position_m + position_noise_m)
-    # the noise changes positions only, not their times, so the intervals remain valid
+    # The noise does not change the times of the positions, so the intervals remain valid
     return replace(model, inputs=replace(inputs, **new_inputs), runs=())
 
 
 def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float) -> Model:
-    """Return the model with positions rotated (clockwise from above) and timestamps delayed."""
+    """Rotate the positions in the inputs (clockwise from above), and delay their timestamps."""
     if not rotation_deg and not delay_s:
         return model
     received = model.inputs.received
@@ -337,9 +355,9 @@ def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float)
 def delayed_tracks(
     model: Model, configurations: Sequence[FilterConfiguration]
 ) -> Iterator[pd.DataFrame]:
-    """Yield position and velocity of each filter configuration at the fusion horizon.
+    """Yield position and velocity at the fusion horizon for each filter configuration.
 
-    One track at a time limits memory.
+    The tracks are computed one at a time, to limit the memory.
     """
     runs = _run_model(model, configurations)
     for configuration_index in map(runs[0].configurations.index, configurations):
@@ -365,7 +383,10 @@ def run_configurations(
     configurations: Sequence[FilterConfiguration],
     computed_intervals: Mapping[Timing, Sequence[Intervals]],
 ) -> list[SegmentRun]:
-    """Run filter configurations through every segment; ``computed_intervals`` are reused."""
+    """Run filter configurations through all segments.
+
+    ``computed_intervals`` contains intervals that need not be computed again.
+    """
     timings = [configuration.timing(inputs) for configuration in configurations]
     segment_runs = []
     for segment_index, segment in enumerate(inputs.segments):
@@ -381,7 +402,7 @@ def run_configurations(
 
 
 def _track(run: SegmentRun, position_m: Array, velocity_m_s: Array) -> pd.DataFrame:
-    """Return position and velocity at each prediction step, in published metres."""
+    """Return position and velocity at each prediction step, scaled as EKF2 publishes them."""
     states = np.hstack([position_m / run.segment.ekf2_metres_per_metre, velocity_m_s])
     return pd.DataFrame(states, time_index(run.segment.time_s), Columns.STATE, copy=False)
 
@@ -426,7 +447,7 @@ def _make_replay(
 
 
 def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Span]:
-    """Return the spans (s) longer than RESTART_GAP_S without a fused position."""
+    """Return start and end (s) of each time longer than RESTART_GAP_S without a fused position."""
     is_used = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
     fusion_times_s = [*updates.loc[is_used, "fused_at_s"], float(segment.time_s[-1])]
     return [
@@ -439,7 +460,7 @@ def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Sp
 def _updates_by_aid(
     inputs: Inputs, run: SegmentRun, configuration_index: int
 ) -> dict[str, pd.DataFrame]:
-    """Return the updates with each aiding source, by PX4's name."""
+    """Return the updates with each aiding source; the keys are PX4's names of the sources."""
     events, heights = run.events[configuration_index], run.heights
     end_s = run.segment.time_s[events.end_step]
     nu, S, R, rejected, fused, reset, variance_after = (
@@ -455,14 +476,14 @@ def _updates_by_aid(
         )
     )
 
-    def updates_along(axes: Sequence[AxisName], columns: slice, *more: Any) -> pd.DataFrame:
-        update_log = np.column_stack([nu[:, columns], S[:, columns], *more])
+    def updates_along(axes: Sequence[NedAxis], columns: slice, *other_values: Any) -> pd.DataFrame:
+        update_log = np.column_stack([nu[:, columns], S[:, columns], *other_values])
         return update_table(update_log[:, None], events.time_s[:, None], end_s, axes)
 
     position_variance = variance_after[:, HORIZONTAL_POSITION]
     updates_by_aid = {
         inputs.aid.name: updates_along(
-            HORIZONTAL,
+            HORIZONTAL_AXES,
             POSITION_COLUMNS,
             rejected,
             fused,
@@ -476,11 +497,11 @@ def _updates_by_aid(
             updates_by_aid[name] = heights.updates(name, configuration_index, end_s)
     if inputs.received.velocity_m_s is not None:
         gate = run.configurations[configuration_index].settings[GNSS_VEL.gate]
-        # innovations exactly at the gate were clipped and fused; the factor covers rounding
+        # Clipped innovations are at the gate and fused; the factor allows for rounding errors
         velocity_limit = (1.0 + 1e-9) * max(gate, MIN_GATE) ** 2
         is_outside_gate = (nu[:, :3] ** 2 > velocity_limit * S[:, :3]).any(axis=1)
-        # without GNSS height the replay uses the logged EKF2 height
-        axes = AXIS_NAMES if GNSS_HGT.name in updates_by_aid else HORIZONTAL
+        # Without GNSS height, the replay uses EKF2's logged height
+        axes = AXIS_NAMES if GNSS_HGT.name in updates_by_aid else HORIZONTAL_AXES
         updates_by_aid[GNSS_VEL.name] = updates_along(axes, slice(len(axes)), is_outside_gate)
     if run.vision is not None:
         updates_by_aid[EV_POS.name] = run.vision.updates(configuration_index, end_s)
@@ -490,7 +511,7 @@ def _updates_by_aid(
 def _delayed_and_published(
     inputs: Inputs, run: SegmentRun, configuration_index: int
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the state at the fusion horizon and the published state at each prediction step."""
+    """Return the state at the fusion horizon, and the published state, after each step."""
     segment = run.segment
     configuration = run.configurations[configuration_index]
     state, reset = delayed_states(run, configuration_index)
@@ -515,7 +536,7 @@ def _delayed_and_published(
 
 
 def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Array]:
-    """Return the state and the sum of position resets (m) at each of n prediction steps.
+    """Return state and sum of position resets (m) at the fusion horizon after each of n steps.
 
     Shapes (n + 1, 15) and (n + 1, 3).
     """

@@ -1,8 +1,8 @@
-"""Output predictor of EKF2: from the state at the fusion horizon to the published state.
+"""Output predictor of EKF2, which computes the published state from the fusion horizon.
 
 The output predictor propagates the delayed state to the present with the IMU. In each prediction
-step it compares its buffered output with the state at the fusion horizon, and corrects velocity and
-position by gain · error + 0.1 · gain² · Σ error, with gain = step / τ. This is a linear recursion,
+step, it compares its buffered output with the state at the fusion horizon, and corrects velocity
+and position by gain · error + 0.1 · gain² · Σ error, with gain = step / τ. This linear recursion is
 computed as a recursive (IIR) filter.
 
 Source: PX4-Autopilot ``EKF/output_predictor/output_predictor.cpp`` (``EKF/ekf.cpp`` before v1.14).
@@ -47,7 +47,7 @@ def publish(
     state : ndarray, shape (n + 1, 15) or more
         State at the fusion horizon.
     reset_m : ndarray, shape (n + 1, 3)
-        Sum of position resets up to each state.
+        Sum of all position resets before each state.
     attitude_difference_rad : ndarray, shape (n + 1, 3)
         Published minus nominal attitude.
     lag_steps : int
@@ -82,10 +82,10 @@ def publish(
 def _follow_state(
     state: Array, increments: Array, lag_steps: int, step_s: float, tau_s: float
 ) -> Array:
-    """Return the output: the sum of the IMU's ``increments`` and of the corrections.
+    """Return the output of the predictor: sum of IMU ``increments`` and of corrections.
 
-    A correction shifts the whole buffer. In step k the error at the fusion horizon is therefore e_k
-    = o_(k-lag) - c_k, with the state minus the uncorrected output o and the sum of corrections c.
+    In step k, the error at the fusion horizon is e_k = o_(k-lag) - c_k. Here o is the state minus
+    the sum of increments, and c is the sum of corrections: a correction shifts the whole buffer.
     With gain g, c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
     """
     dead_reckoned = np.concatenate([state[:1], increments])
@@ -105,7 +105,7 @@ def _follow_state(
 
 
 def delay_by(values: Array, lag_steps: int) -> Array:
-    """Delay values by ``lag_steps``; the first value is repeated."""
+    """Delay a series by ``lag_steps``; its first value is repeated."""
     return np.concatenate([np.repeat(values[:1], lag_steps, axis=0), values])[: len(values)]
 
 

@@ -30,10 +30,10 @@ from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, FLOW, GNSS_VEL, MAG
 from px4fuse.flight.model import (
     AXIS_NAMES,
     AidLog,
-    AxisName,
     Columns,
     Ekf2,
     Flight,
+    NedAxis,
     Truth,
     Unavailable,
 )
@@ -41,13 +41,13 @@ from px4fuse.readers.px4_innovations import innovations_along
 
 Spans = tuple[Span, ...]
 T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
-HORIZONTAL: tuple[AxisName, AxisName] = ("north", "east")
+HORIZONTAL_AXES: tuple[NedAxis, NedAxis] = ("north", "east")
 # Minimum number of logged innovations for a comparison with the EKF2 replay
 MIN_COMPARED_INNOVATIONS = 20
 CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
 # Maximum time (s) from an update to its logged innovation (estimator_innovations)
 MAX_INNOVATION_AGE_S = 0.5
-# Maximum difference (s) of two times in the same prediction step
+# Two times are in one prediction step if they differ by less than this time (s)
 SAME_STEP_S = 0.002
 # Minimum correlation of replayed and logged innovations: above 0.997 with complete logs, below 0.9
 # with a downsampled source or IMU dropouts (tests/benchmarks/bench_ekf2.py)
@@ -60,11 +60,11 @@ MAX_PUBLISHED_DIFFERENCE_M = 0.10
 # Maximum position difference (m) while optical flow, which is logged at a reduced rate, is the only
 # horizontal aiding source
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
-# Maximum rejected fraction for a comparison of single innovations; with more rejections, one
+# Single innovations are compared only if a smaller fraction is rejected: with more rejections, one
 # sample near the gate changes many later innovations
 MAX_COMPARED_REJECTED_FRACTION = 0.05
-# Maximum rejected fraction for a comparison of the published position, which is otherwise mostly
-# integrated from the IMU
+# Published positions are compared only if a smaller fraction is rejected: with more rejections,
+# EKF2 integrates most of its position from the IMU
 MOSTLY_REJECTED_FRACTION = 0.5
 # Minimum correlation of replayed and logged innovations if most positions are rejected
 MIN_IMU_CORRELATION = 0.99
@@ -77,7 +77,7 @@ REJECTING_TOLERANCE_FACTOR = 3.0
 
 
 class AxisAgreement(Record, kw_only=True):
-    """Agreement of the EKF2 replay (with logged parameters) with the log, along one axis.
+    """Agreement of the EKF2 replay (with logged parameters) with the log along one axis.
 
     Attributes
     ----------
@@ -86,9 +86,9 @@ class AxisAgreement(Record, kw_only=True):
     innovation_rms_difference : float
         RMS of replayed minus logged innovations, in their unit.
     s_ratio_median, s_ratio_p5, s_ratio_p95 : float
-        Replayed ÷ logged innovation variance: median, 5 and 95 % quantiles.
+        Ratio of replayed to logged innovation variance: median, 5 and 95 % quantiles.
     position_rms_difference_m, velocity_rms_difference_m_s : float
-        RMS of the difference of the published state.
+        RMS difference between the replayed and the logged published state.
     """
 
     innovation_correlation: Correlation
@@ -112,7 +112,7 @@ class Agreement(Record, kw_only=True):
     ev_pos, gnss_pos, gnss_vel, gnss_hgt, baro_hgt : mapping from axis to AxisAgreement
         Innovations of each aiding source, by PX4's name.
     samples : int
-        Number of compared innovations, without the first seconds of each segment.
+        Number of compared innovations, which do not include the first seconds of a segment.
     decisions_same : float
         Fraction of the samples that EKF2 and replay both rejected or both accepted.
     published_rms_difference_m : float
@@ -122,10 +122,11 @@ class Agreement(Record, kw_only=True):
     carried_difference_m : float or None
         Largest position difference while optical flow was the only horizontal aiding source.
     doubtful : mapping from PX4's name of an aiding source to str
-        Sources that the replay omits, because it does not agree with the log, and the reasons.
+        Aiding sources whose replay does not agree with the log, and the reasons.
     good : bool
+        True if the replay agrees with the log.
     reason : str
-        Numbers on which ``good`` is based.
+        Statistics on which ``good`` is based.
     """
 
     north: AxisAgreement
@@ -168,7 +169,7 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     Attributes
     ----------
     source : str
-        Position track that was fused.
+        Name of the position source that was fused.
     stretches_s : tuple of (float, float)
         Replayed segments of the flight.
     settings : mapping
@@ -198,9 +199,8 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     other_aid_updates: NotWritten[Mapping[str, pd.DataFrame]] = NOT_WRITTEN
     flow_only_spans_s: NotWritten[Spans] = NOT_WRITTEN
 
-    @property
-    def evaluated_s(self) -> Spans:
-        """Spans (s) of the replay, without the first seconds and times with optical flow only."""
+    def find_evaluated_spans(self) -> Spans:
+        """Return the evaluated spans (s), without the first seconds and times of flow only."""
         evaluated_spans_s = []
         for start, end in self.stretches_s:
             begin = start + SETTLING_S
@@ -214,23 +214,22 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
 
 
 class _ComparedInnovations(NamedTuple):
-    """Logged and replayed innovations of the same samples, and their agreement by axis."""
+    """Logged innovations, replayed innovations of these samples, and agreement along each axis."""
 
     logged: pd.DataFrame
     replayed: pd.DataFrame
     axes: dict[str, AxisAgreement]
 
-    @property
-    def rejected_fractions(self) -> tuple[float, float]:
+    def compute_rejected_fractions(self) -> tuple[float, float]:
         logged, replayed = (float(np.mean(each["rejected"] > 0.0)) for each in self[:2])
         return logged, replayed
 
 
 def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
-    """Compare a replay (with logged parameters) with EKF2's logged innovations and state."""
+    """Compare a replay with logged parameters to EKF2's logged innovations and state."""
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    if rows_inside(ekf2.state, replay.evaluated_s).empty:
+    if rows_inside(ekf2.state, replay.find_evaluated_spans()).empty:
         return Unavailable(
             ANALYSIS_NAME,
             "EKF2's position is not logged in the replayed time",
@@ -250,7 +249,9 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             position_agreement,
             "Record a longer flight with motion, with SDLOG_PROFILE bit 0 (default).",
         )
-    rejected_fraction_logged, rejected_fraction_replayed = position_agreement.rejected_fractions
+    rejected_fraction_logged, rejected_fraction_replayed = (
+        position_agreement.compute_rejected_fractions()
+    )
     is_good, reason = _agreement_verdict(
         position_agreement.axes, rejected_fraction_logged, rejected_fraction_replayed
     )
@@ -290,14 +291,16 @@ def _compare_innovations(
     logged_innovations: pd.DataFrame,
     has_measurement_times: bool,
 ) -> _ComparedInnovations | str:
-    """Compare innovations in the evaluated times, or return the reason why this is impossible."""
+    """Compare replayed with logged innovations; return a reason if this is not possible."""
     matched_updates = match_updates(
         replayed_innovations,
         logged_innovations.index.to_numpy(),
         has_measurement_times=has_measurement_times,
     )
-    is_used = (matched_updates >= 0) & inside_spans(logged_innovations.index, replay.evaluated_s)
-    # a sample to which EKF2 resets its state is logged with innovation 0
+    is_used = (matched_updates >= 0) & inside_spans(
+        logged_innovations.index, replay.find_evaluated_spans()
+    )
+    # If EKF2 resets its state to a sample, it logs innovation 0 for this sample
     is_used &= logged_innovations.filter(regex="innovation_[a-z]+_m$").any(axis=1)
     logged_innovations = logged_innovations[is_used]
     replayed_innovations = replayed_innovations.iloc[matched_updates[is_used]]
@@ -324,7 +327,10 @@ def _compare_innovations(
 
 
 def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
-    """Return the largest horizontal position difference (m) with flow only; None without it."""
+    """Return the largest position difference (m) while optical flow was the only horizontal aid.
+
+    Return None if the flight contains no such time.
+    """
     logged_state = rows_inside(ekf2.state, replay.flow_only_spans_s)
     if logged_state.empty:
         return None
@@ -335,7 +341,7 @@ def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
 
 
 def _replayed_minus_logged(replay: Ekf2Replay, logged_state: pd.DataFrame, name: str) -> Array:
-    """Return the difference of a column of the published state at the times of the log."""
+    """Return replayed minus logged values of one column of the published state."""
     replayed = np.interp(logged_state.index, replay.published.index, replay.published[name])
     return np.asarray(replayed - logged_state[name])
 
@@ -343,7 +349,7 @@ def _replayed_minus_logged(replay: Ekf2Replay, logged_state: pd.DataFrame, name:
 def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     if MAG.noise not in replay.settings or isinstance(ekf2.record, Unavailable):
         return None
-    logged_state = rows_inside(ekf2.record.delayed, replay.evaluated_s)
+    logged_state = rows_inside(ekf2.record.delayed, replay.find_evaluated_spans())
     if logged_state.empty:
         return None
     replayed_heading_rad = replay.delayed["heading_rad"]
@@ -355,13 +361,16 @@ def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
 
 
 def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the agreement of aiding sources except the position, and reasons of disagreement."""
+    """Return the agreement of all aiding sources except the position source.
+
+    The second mapping contains the sources that do not agree with the log, and the reasons.
+    """
     agreements: dict[str, Any] = {}
     omitted_aids = {}
     for name, updates in replay.other_aid_updates.items():
         if (aid_log := ekf2.aids.get(name)) is None:
             continue
-        # the replay fuses a barometer sample at the next event, EKF2 at the time of the sample
+        # The replay fuses a barometer sample at the next event, EKF2 at the time of the sample
         matched_updates = (
             updates.assign(fused_at_s=updates.index) if name == BAROMETER.name else updates
         )
@@ -376,7 +385,9 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
             is_good, reason = name == GNSS_VEL.name and compared != CONSTANT_INNOVATIONS, compared
         else:
             agreements[name] = compared.axes
-            is_good, reason = _agreement_verdict(compared.axes, *compared.rejected_fractions)
+            is_good, reason = _agreement_verdict(
+                compared.axes, *compared.compute_rejected_fractions()
+            )
             is_good |= name == GNSS_VEL.name
         if not is_good:
             omitted_aids[name] = reason
@@ -384,22 +395,22 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
 
 
 def logged_aid_innovations(name: str, aid_log: AidLog) -> pd.DataFrame:
-    """Return logged innovations, S and rejections of an aiding source (PX4's name)."""
+    """Return the logged innovations, S and rejections of an aiding source, by PX4's name."""
     gate = aid_log.parameters.get(AIDS[name].gate, AIDS[name].default_gate)
     axes = [axis for axis in AXIS_NAMES if axis in aid_log.axes]
     return _columns_by_axis({axis: innovations_along(aid_log, axis, gate) for axis in axes})
 
 
-def axes_of(updates: pd.DataFrame) -> list[AxisName]:
+def axes_of(updates: pd.DataFrame) -> list[NedAxis]:
     return [axis for axis in AXIS_NAMES if f"innovation_{axis}_m" in updates]
 
 
 def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
     """Return the logged position innovations north and east, with S and rejections."""
-    return _columns_by_axis({axis: ekf2.innovations[axis] for axis in HORIZONTAL})
+    return _columns_by_axis({axis: ekf2.innovations[axis] for axis in HORIZONTAL_AXES})
 
 
-def _columns_by_axis(innovations: Mapping[AxisName, pd.DataFrame | Unavailable]) -> pd.DataFrame:
+def _columns_by_axis(innovations: Mapping[NedAxis, pd.DataFrame | Unavailable]) -> pd.DataFrame:
     columns = {}
     for axis, axis_innovations in innovations.items():
         if isinstance(axis_innovations, Unavailable):
@@ -411,7 +422,7 @@ def _columns_by_axis(innovations: Mapping[AxisName, pd.DataFrame | Unavailable])
 
 
 def inside_spans(times_s: ArrayLike, spans_s: Spans) -> BoolArray:
-    """Return True for each time inside one of the spans."""
+    """Return True for each time that is inside one of the time spans."""
     times_array_s = np.asarray(times_s)
     is_inside = np.zeros(times_array_s.shape, bool)
     for start, end in spans_s:
@@ -420,55 +431,56 @@ def inside_spans(times_s: ArrayLike, spans_s: Spans) -> BoolArray:
 
 
 def rows_inside(table: T, spans_s: Spans) -> T:
-    """Return the rows of a table, indexed by time (s), inside one of the spans."""
+    """Return the rows of a table (indexed by time in s) that are inside one of the time spans."""
     return table[inside_spans(table.index, spans_s)]
 
 
 def match_updates(
     updates: pd.DataFrame, logged_s: Array, *, has_measurement_times: bool
 ) -> IntArray:
-    """Return the index of the update of each logged innovation; -1 without an update.
+    """Return for each logged innovation the index of its replayed update, or -1.
 
-    ``has_measurement_times`` is True for estimator_aid_src topics.
+    ``has_measurement_times`` is True if the innovations are from estimator_aid_src topics.
     """
     if has_measurement_times:
         return matching_sample_rows(updates.index.to_numpy(), logged_s)
     fused_at_s = updates["fused_at_s"].to_numpy()
     update_row = np.searchsorted(fused_at_s, logged_s + 1e-4, side="right") - 1
     age_s = logged_s - fused_at_s[np.maximum(update_row, 0)]
-    is_match = (update_row >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
-    # a row that is logged in the prediction step of a fusion may still contain the previous
-    # innovation
-    is_unambiguous = is_match & (age_s >= SAME_STEP_S)
+    is_matched = (update_row >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
+    # A row that is logged in the prediction step of a fusion may contain the previous innovation
+    is_unambiguous = is_matched & (age_s >= SAME_STEP_S)
     return np.where(
-        is_unambiguous if is_unambiguous.sum() > 0.5 * is_match.sum() else is_match, update_row, -1
+        is_unambiguous if is_unambiguous.sum() > 0.5 * is_matched.sum() else is_matched,
+        update_row,
+        -1,
     )
 
 
 def _axis_agreement(
-    axis: AxisName,
+    axis: NedAxis,
     logged_innovations: pd.DataFrame,
     replayed_innovations: pd.DataFrame,
     ekf2: Ekf2,
     ekf2_replay: Ekf2Replay,
 ) -> AxisAgreement:
-    nu, nu_log, S, S_log = (
+    nu, nu_logged, S, S_logged = (
         innovations[name].to_numpy()
         for name in (f"innovation_{axis}_m", f"innovation_variance_{axis}_m2")
         for innovations in (replayed_innovations, logged_innovations)
     )
-    s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_log, [5, 50, 95]).tolist()
-    logged_state = rows_inside(ekf2.state, ekf2_replay.evaluated_s)
+    s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_logged, [5, 50, 95]).tolist()
+    logged_state = rows_inside(ekf2.state, ekf2_replay.find_evaluated_spans())
     position_m, velocity_m_s = (
         _replayed_minus_logged(ekf2_replay, logged_state, f"{axis}_{unit}") for unit in ("m", "m_s")
     )
     return AxisAgreement(
-        innovation_correlation=float(np.corrcoef(nu, nu_log)[0, 1]),
-        innovation_rms_difference=rms(nu - nu_log),
+        innovation_correlation=float(np.corrcoef(nu, nu_logged)[0, 1]),
+        innovation_rms_difference=rms(nu - nu_logged),
         s_ratio_median=s_ratio_median,
         s_ratio_p5=s_ratio_p5,
         s_ratio_p95=s_ratio_p95,
-        nis_mean_logged=float(np.mean(nu_log**2 / S_log)),
+        nis_mean_logged=float(np.mean(nu_logged**2 / S_logged)),
         nis_mean_replayed=float(np.mean(nu**2 / S)),
         position_rms_difference_m=rms(position_m),
         velocity_rms_difference_m_s=rms(velocity_m_s),
@@ -486,7 +498,7 @@ def component_along(
 def rms_to_truth(
     flight: Flight, position_m: Array, direction: Array, times_s: Array
 ) -> float | None:
-    """Return the position RMSE (m) along a direction; None without ground truth."""
+    """Return the position RMSE (m) against ground truth along a direction; None without truth."""
     if not isinstance(flight.truth, Truth):
         return None
     samples = flight.truth.samples
@@ -511,7 +523,7 @@ def _agreement_verdict(
     rejected_fraction_replayed: float,
     published_factor: float = 1.0,
 ) -> tuple[bool, str]:
-    """Return True if the replay agrees with the log, and the reason with numbers."""
+    """Return True if the replay agrees with the log, and the statistics as a reason."""
     s_ratios = (axis.s_ratio_median for axis in axes.values())
     worst_s_ratio = max(s_ratios, key=lambda s_ratio: abs(s_ratio - 1.0))
     if abs(worst_s_ratio - 1.0) > MAX_S_DIFFERENCE:
@@ -556,21 +568,23 @@ def _agreement_verdict(
 
 
 def _format_above(value: float, limit: float) -> str:
-    """Format a value with at least two decimals, so that it is visibly above the limit."""
+    """Format a value with two decimals, or more if it would otherwise equal the limit."""
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 
 
-def with_logged_rejections(agreement: Agreement, rejecting_agreement: Agreement) -> Agreement:
-    """Return the agreement of a replay with EKF2's logged rejections, ``rejecting_agreement``.
+def with_logged_rejections(agreement: Agreement, agreement_with_rejections: Agreement) -> Agreement:
+    """Return the agreement with the log of a replay that uses EKF2's logged rejections.
 
-    With many rejections, one sample near the gate makes a correct replay differ from the log. The
-    rejected fraction and the decisions are from ``agreement``: a replay that applies the gate.
+    If EKF2 rejects many samples, one sample near the gate makes a correct replay differ from the
+    log. Rejected fraction and decisions are those of ``agreement``, the replay with a gate.
     """
     rejected_fraction = agreement.rejected_fraction_logged
     relies_on_imu = rejected_fraction > MOSTLY_REJECTED_FRACTION
     published_factor = np.inf if relies_on_imu else REJECTING_TOLERANCE_FACTOR
-    is_good, reason = _agreement_verdict(rejecting_agreement.axes, 0.0, 0.0, published_factor)
-    min_correlation = min(axis.innovation_correlation for axis in rejecting_agreement.axes.values())
+    is_good, reason = _agreement_verdict(agreement_with_rejections.axes, 0.0, 0.0, published_factor)
+    min_correlation = min(
+        axis.innovation_correlation for axis in agreement_with_rejections.axes.values()
+    )
     if is_good and relies_on_imu and min_correlation < MIN_IMU_CORRELATION:
         is_good = False
         reason = (
@@ -584,7 +598,7 @@ def with_logged_rejections(agreement: Agreement, rejecting_agreement: Agreement)
             "IMU. The frame of the source is probably wrong"
         )
     return replace(
-        rejecting_agreement,
+        agreement_with_rejections,
         rejected_fraction_replayed=agreement.rejected_fraction_replayed,
         decisions_same=agreement.decisions_same,
         good=is_good,

@@ -1,4 +1,4 @@
-"""Segments of a flight without gaps for the EKF2 replay: prediction steps and initial state.
+"""Flight segments without gaps for the EKF2 replay: prediction steps and initial state.
 
 Source: PX4-Autopilot ``EKF/imu_down_sampler/imu_down_sampler.cpp``.
 """
@@ -13,17 +13,24 @@ import numpy as np
 import pandas as pd
 from scipy.linalg import block_diag
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, median_interval
+from px4fuse.core.arrays import (
+    Array,
+    ArrayPair,
+    BoolArray,
+    IntArray,
+    cumulative_sums,
+    median_interval,
+)
 from px4fuse.core.record import Span
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import (
     BAD_ACCELERATION,
-    AxisName,
     Columns,
     Ekf2,
     Flight,
     FusionRecord,
+    NedAxis,
     Unavailable,
     rows_between,
     time_index,
@@ -40,20 +47,20 @@ from px4fuse.trajectory.rotation import (
     to_vector,
 )
 
-# After a longer gap (s) in the position source, the replay restarts from the logged state, because
-# the model lacks the gravity, fake positions or zero velocity that EKF2 fuses in the gap
+# After a longer gap (s) in the position source, the replay restarts from the logged state: EKF2
+# fuses gravity, fake positions or zero velocity in the gap, which the model does not contain
 RESTART_GAP_S = 2.0
 # Maximum IMU interval (s): EKF2 limits a prediction step to 2 EKF2_PREDICT_US
 IMU_GAP_S = 0.05
 # Minimum time (s) from EKF2's first position fusion to the start of the replay
 MIN_FUSION_S = 1.0
-# Minimum time (s) from take-off to the start of the replay: on the ground EKF2 also fuses zero
+# Minimum time (s) from take-off to the start of the replay: on the ground, EKF2 also fuses zero
 # velocity and gravity
 MIN_AIRBORNE_S = 4.0
 # Time (s) from the start of a replay to the start of the evaluation
 SETTLING_S = 5.0
-# Time (s) from the first fusion of all magnetometer axes until the log contains the reset field
-# states
+# Time (s) from the first fusion of all magnetometer axes to the first logged field states: EKF2
+# resets them at the first fusion
 FIELD_RESET_S = 1.0
 # Flight time (s) before the replay that is used to estimate correlations of the initial state
 CORRELATION_HISTORY_S = 20.0
@@ -67,11 +74,11 @@ INNOVATION_FILTER_S = 0.5
 MIN_SEGMENT_S = 10.0
 # Maximum delay (s) from a reset to its publication
 MAX_RESET_DELAY_S = 0.5
-# Maximum fraction of clipped IMU samples within 1 s in an EKF2 replay
+# An EKF2 replay is interrupted if a larger fraction of the IMU samples within 1 s is clipped
 MAX_CLIPPED_FRACTION = 0.05
 # Number of prediction steps whose IMU samples are averaged at once, which limits memory
 BLOCK_STEPS = 2**14
-# Maximum fraction of missing IMU samples that is ignored in an EKF2 replay
+# If a smaller fraction of the IMU samples is missing, the EKF2 replay ignores it
 MAX_LOST_IMU_FRACTION = 0.02
 
 # Gravity in NED (CONSTANTS_ONE_G in PX4)
@@ -90,15 +97,15 @@ EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)
 
 @dataclass(frozen=True)
 class SensorSamples:
-    """Magnetometer or optical flow data of one segment: means of successive samples.
+    """Magnetometer or optical flow data of one segment, as means of successive samples.
 
     Attributes
     ----------
     step : ndarray of int, shape (m,)
         Prediction step that fuses the last sample of each mean.
     value : ndarray, shape (m, k)
-        Field (gauss, FRD), or flow velocity forward and right (m/s) minus the velocity change from
-        the IMU since the start of the segment.
+        Magnetic field (gauss, FRD), or velocity forward and right (m/s) from optical flow, minus
+        the velocity change from the IMU since the start of the segment.
     rotation_to_body : ndarray, shape (m, k, 3)
         Mean rotation from NED to the body axes.
     sample_count : ndarray, shape (m,)
@@ -107,8 +114,8 @@ class SensorSamples:
     gate : float
         Innovation gate in √S; infinite if the gate is a parameter.
     state_rows : tuple of slice
-        State (NED vector) that the sensor measures in the body frame and, optionally, state (body
-        frame) that is added to the measurement.
+        State indices of the vector (NED) that the sensor measures in the body frame; optionally
+        state indices of a vector (body frame) that is added to the measurement.
     """
 
     step: IntArray
@@ -129,15 +136,16 @@ class HeightSamples:
     fused_sensors : tuple of str
         PX4's names of the fused height sensors.
     reference : str
-        Sensor without a bias.
+        PX4's name of the height reference, which has no bias.
     initial_bias : (float, float)
-        Initial bias of the other sensor (m, positive: too high), and its variance (m²).
+        Initial bias of the sensor that is not the reference (m, positive: too high), and its
+        variance (m²).
     step, measured_at_s, down_m : ndarray, shape (m,)
         Prediction step, measurement time, and height (m, down) of each barometer sample.
     dead_zone_m : ndarray, shape (m,)
         EKF2 ignores heights below the state by less than this distance (ground effect).
     weight : ndarray, shape (m,)
-        Number of barometer samples that EKF2 fused per known sample.
+        Number of barometer samples fused by EKF2 that each sample represents.
     """
 
     fused_sensors: tuple[str, ...]
@@ -152,15 +160,15 @@ class HeightSamples:
 
 @dataclass(frozen=True)
 class ReplaySegment:
-    """Part of a flight without gaps, replayed in one run of n prediction steps.
+    """Part of a flight without gaps, which is replayed with n prediction steps.
 
-    The model estimates the error of the nominal attitude, EKF2's published attitude. Vectors are in
-    NED unless noted.
+    The model estimates the error of a nominal attitude, which is EKF2's published attitude. Vectors
+    are in NED, if not stated otherwise.
 
     Attributes
     ----------
     time_s : ndarray, shape (n + 1,)
-        Start, then end of each step.
+        Start of the first step, then end of each step.
     body_to_ned : ndarray, shape (n + 1, 3, 3)
         Nominal attitude.
     correction_rad : ndarray, shape (n, 3)
@@ -168,9 +176,9 @@ class ReplaySegment:
     force_m_s2 : ndarray, shape (n, 3)
         Specific force minus nominal bias, in the body frame at the end of the step.
     accelerometer_bias_m_s2 : ndarray, shape (3,)
-        Nominal bias: logged at the start.
+        Nominal accelerometer bias: the logged bias at the start.
     state, variance : ndarray, shape (15,) or (21,)
-        Initial attitude error, velocity, position, gyro and accelerometer bias errors, and fields.
+        Initial attitude error, velocity, position, bias errors, and magnetic fields.
     down_m, down_variance_m2 : ndarray, shape (n + 1,)
         Published height (positive down), and its variance.
     attitude_error_rad, attitude_variance_rad2 : ndarray, shape (n + 1, 3)
@@ -184,9 +192,9 @@ class ReplaySegment:
     is_acceleration_bad : ndarray of bool, shape (n + 1,), or None
         Logged flag for a bad vertical acceleration.
     mean_bias_down_m_s2 : float
-        Mean vertical accelerometer bias, from the published velocity.
+        Mean vertical accelerometer bias, computed from the published velocity.
     ekf2_metres_per_metre : (float, float, float)
-        EKF2's internal metres per published metre.
+        Ratio of EKF2's internal to its published position along each axis.
     history : ReplaySegment or None
         Flight before the start, from which the correlations are estimated.
     changed : mapping from PX4's name to float
@@ -219,19 +227,15 @@ class ReplaySegment:
 
     @cached_property
     def imu_velocity_m_s(self) -> Array:
-        """Velocity change since the start from the IMU (m/s, NED), shape (n + 1, 3)."""
+        """Velocity change (m/s, NED) since the start, integrated from the IMU, shape (n + 1, 3)."""
         force = rotate(self.body_to_ned[1:], self.force_m_s2) + GRAVITY_M_S2
-        velocity_increments = np.cumsum(force * self.step_s[:, None], axis=0)
-        return np.concatenate([np.zeros((1, 3)), velocity_increments])
+        return cumulative_sums(force * self.step_s[:, None])
 
     @cached_property
     def imu_displacement_m(self) -> Array:
-        """Displacement since the start from the IMU (m, NED), shape (n + 1, 3)."""
+        """Displacement (m, NED) since the start, integrated from the IMU, shape (n + 1, 3)."""
         velocity = self.imu_velocity_m_s
-        displacement = np.cumsum(
-            0.5 * (velocity[1:] + velocity[:-1]) * self.step_s[:, None], axis=0
-        )
-        return np.concatenate([np.zeros((1, 3)), displacement])
+        return cumulative_sums(0.5 * (velocity[1:] + velocity[:-1]) * self.step_s[:, None])
 
 
 def samples_by_event(
@@ -242,12 +246,12 @@ def samples_by_event(
     axes: slice,
     *quantities: Array,
 ) -> Array:
-    """Sort samples by the event at which they are fused: k slots for each of E events.
+    """Assign position samples to the events at which they are fused: up to k samples per event.
 
     Parameters
     ----------
     segment : ReplaySegment
-    event_steps : ndarray of int, shape (E,)
+    event_steps : ndarray of int, shape (events,)
         Prediction step of each event.
     measurement_step : ndarray of int, shape (m,)
         Prediction step of each sample, increasing.
@@ -259,9 +263,9 @@ def samples_by_event(
 
     Returns
     -------
-    ndarray, shape (a + 2 + len(quantities), k, E)
-        Position moved to the event by the IMU acceleration, age (s), further quantities, and a mask
-        (0 for an empty slot).
+    ndarray, shape (a + 2 + len(quantities), k, events)
+        Position, propagated to the event with the IMU; age (s); further quantities; and 1 for a
+        sample, 0 for an empty slot.
     """
     event_index = np.searchsorted(event_steps, measurement_step)
     event_index = event_index[event_index < len(event_steps)]
@@ -290,17 +294,17 @@ def samples_by_event(
 
 
 def update_table(
-    update_log: Array, measured_at_s: Array, end_s: Array, axes: Sequence[AxisName]
+    update_log: Array, measured_at_s: Array, end_s: Array, axes: Sequence[NedAxis]
 ) -> pd.DataFrame:
-    """Return the updates with one aiding source, in the order of fusion, at measurement times.
+    """Return the updates with one aiding source as a table, indexed by measurement time (s).
 
     Parameters
     ----------
-    update_log : ndarray, shape (E, k, ...)
-        Columns of the result for k samples of each event; the last columns may be missing. NaN
-        without a sample.
-    measured_at_s : ndarray, shape (E, k)
-    end_s : ndarray, shape (E,)
+    update_log : ndarray, shape (events, k, ...)
+        Columns of the table for k samples of each event, NaN without a sample. The last columns of
+        the table may be missing.
+    measured_at_s : ndarray, shape (events, k)
+    end_s : ndarray, shape (events,)
         Time of each event.
     axes : sequence of str
     """
@@ -323,7 +327,7 @@ def update_table(
 
 
 def pad_samples(sample_arrays: Sequence[Array]) -> list[Array]:
-    """Pad the arrays of :func:`samples_by_event` to the same number of slots."""
+    """Extend the arrays of :func:`samples_by_event` by zeros to one number of slots."""
     max_slots = max(samples.shape[1] for samples in sample_arrays)
     return [
         np.pad(samples, ((0, 0), (0, max_slots - samples.shape[1]), (0, 0)))
@@ -343,7 +347,7 @@ def find_replay_segments(
 ) -> tuple[ReplaySegment, ...]:
     """Find the parts of a flight without gaps in IMU and positions, after EKF2's first fusion.
 
-    ``source_s`` are the timestamps of the positions.
+    ``source_s`` contains the timestamps of the positions.
     """
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
@@ -360,7 +364,7 @@ def find_replay_segments(
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     field_span = _field_span(fusion_record) if is_gnss else None
     cut_times_s += field_span[1:] if field_span else ()
-    # another primary EKF2 instance has another state
+    # The replay restarts when another EKF2 instance becomes primary, because its state differs
     cut_times_s += [time_s for time_s, _ in ekf2.instances[1:]]
     parameter_changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
     cut_times_s += [change.time_s for change in parameter_changes]
@@ -374,8 +378,7 @@ def find_replay_segments(
         fused_inside = fused_s[(fused_s >= part_start_s) & (fused_s <= part_end_s)]
         if not len(fused_inside):
             continue
-        # the replay starts MIN_AIRBORNE_S after the first take-off, if this is before the end of
-        # the segment
+        # The replay starts MIN_AIRBORNE_S after the first take-off, if this is before part_end_s
         earliest_starts_s = [
             start_s + MIN_AIRBORNE_S for start_s, _ in airborne[:1] if start_s < part_end_s
         ]
@@ -414,7 +417,7 @@ def find_replay_segments(
 def _with_gnss_model(
     segment: ReplaySegment, imu: pd.DataFrame, ekf2: Ekf2, fusion_record: FusionRecord
 ) -> ReplaySegment:
-    """Add earth rotation, EKF2's position scale, clipping, and mean vertical bias to a segment."""
+    """Add earth rotation, position scale, clipping, and mean vertical bias to a segment."""
     metres_per_metre = ekf2_metres_per_metre(fusion_record)
     initial_state = segment.state.copy()
     initial_state[POSITION] *= metres_per_metre
@@ -452,7 +455,7 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
 
 
 def _clipped_fraction(imu: pd.DataFrame, time_s: Array) -> Array:
-    """Return the fraction of the accelerometer axes that are clipped in the step before a time."""
+    """Return for each prediction step the fraction of the accelerometer axes that are clipped."""
     fraction_by_step = np.zeros(len(time_s))
     # "clipped" has one bit per axis
     if "clipped" in imu:
@@ -511,7 +514,7 @@ def _make_segment(
         end_rotation = conjugate(interpolate(at_s, step_times_s, end_attitude))
         return at_s, multiply(attitude_samples[Columns.QUATERNION].to_numpy(), end_rotation)
 
-    # published attitude relative to the integrated gyro, in NED
+    # Published attitude relative to the attitude integrated from the gyro, in NED
     published_relative_to_gyro = interpolate(
         step_times_s, *relative_attitude(attitude, 0.0, gyro_attitude)
     )
@@ -521,7 +524,7 @@ def _make_segment(
     published_m = _interpolate(ekf2.state[Columns.POSITION], step_times_s[:1])[0]
     position_m = initial_row[Columns.POSITION].to_numpy()
     position_m = np.where(np.isfinite(position_m), position_m, published_m)
-    # from PX4 v1.16 on, the height of the state has another origin than the published height
+    # Since PX4 v1.16, the height of the state and the published height have different origins
     position_m[2] = published_m[2]
     return ReplaySegment(
         time_s=step_times_s,
@@ -555,7 +558,10 @@ def _make_segment(
 
 
 def _field_span(fusion_record: FusionRecord) -> Span | None:
-    """Return start and end (s) of EKF2's fusion of all magnetometer axes; None if interrupted."""
+    """Return start and end (s) of EKF2's fusion of all three magnetometer axes.
+
+    Return None without such a fusion, or if it is interrupted.
+    """
     is_fused_3d = (
         fusion_record.field_gauss["fused_3d"]
         if len(fusion_record.field_gauss)
@@ -600,9 +606,10 @@ def _add_field(
 def _mean_field(
     segment: ReplaySegment, delayed_state: pd.DataFrame, measured_at_s: Array, filtered_gauss: Array
 ) -> SensorSamples:
-    """Return the mean magnetic field between logged rows, from low-pass filtered innovations.
+    """Compute the mean measured magnetic field between two logged rows (FRD, gauss).
 
-    Field = field predicted from the logged states - innovation (FRD, gauss).
+    It is the field predicted from the logged states, minus the innovation. The innovation is
+    computed from EKF2's logged low-pass filtered innovation.
     """
     between_s = np.diff(measured_at_s)
     is_inside = (measured_at_s[:-1] > segment.time_s[0]) & (measured_at_s[1:] <= segment.time_s[-1])
@@ -643,16 +650,16 @@ def low_pass_weights(
     interval_s: Array,
     new_sample_weight: Array | float,
 ) -> tuple[IntArray, Array]:
-    """Return prediction step and weight of each sample in low-pass filtered means, shape (m, k).
+    """Return prediction step and weight of each of k samples in m low-pass filtered means.
 
     Parameters
     ----------
-    newest_s, count, interval_s : ndarray, shape (m,)
+    newest_sample_s, sample_count, interval_s : ndarray, shape (m,)
         Time of the newest sample, number of samples, and sample interval of each mean.
     new_sample_weight : float or ndarray, shape (m,)
         Weight of a new sample in the low-pass filter.
     """
-    # age of a sample, in sample intervals
+    # Age of each sample, in sample intervals
     sample_age = np.arange(int(sample_count.max(initial=1.0)))
     weight = np.where(
         sample_age < sample_count[:, None],
@@ -672,14 +679,14 @@ def add_field_states(
     fields_gauss: Array,
     field_variance_gauss2: Array,
 ) -> ReplaySegment:
-    """Add the magnetic fields of earth and body to the states, uncorrelated with other states.
+    """Add the magnetic fields of earth and body to the states of a segment.
 
     Parameters
     ----------
     measured_at_s, gauss : ndarray, shape (m,) and (m, 3)
         Magnetometer samples (body FRD) at EKF2's measurement time.
     sample_weight : float
-        Number of samples that EKF2 fused per logged sample.
+        Number of samples fused by EKF2 that each logged sample represents.
     fields_gauss, field_variance_gauss2 : ndarray, shape (6,)
         Initial fields of earth (NED) and body (FRD), and their variances.
     """
@@ -702,7 +709,10 @@ def add_field_states(
 
 
 def sample_steps(segment: ReplaySegment, measured_at_s: Array) -> tuple[IntArray, BoolArray]:
-    """Return the prediction step that fuses each sample, and a mask of samples in the segment."""
+    """Return the prediction step at which each sample is fused, for samples in the segment.
+
+    The second array is True for each sample in the segment.
+    """
     step_index = np.searchsorted(segment.time_s, measured_at_s - 1e-9)
     is_inside = (step_index > 0) & (step_index < len(segment.time_s))
     return step_index[is_inside], is_inside
@@ -725,7 +735,7 @@ def step_ends(interval_s: Array, logged_ends: IntArray, configured_step_s: float
     logged end of a step.
     """
     median_s = float(np.median(interval_s))
-    # number of samples in each interval; a single gap may be a gap of the IMU itself
+    # Number of IMU samples in each interval. A single gap may be a gap of the IMU itself
     sample_counts = np.maximum(np.rint(interval_s / median_s), 1.0)
     if sample_counts.mean() <= 1.0 + MAX_LOST_IMU_FRACTION:
         sample_counts[:] = 1.0
@@ -755,9 +765,12 @@ def step_ends(interval_s: Array, logged_ends: IntArray, configured_step_s: float
 def downsample_imu(
     rotation_vectors: Array, velocity_increments: Array, step_end_indices: IntArray
 ) -> ArrayPair:
-    """Return rotation and velocity change of each prediction step, body frame at the step's end."""
+    """Sum IMU samples to the rotation (rad) and velocity change (m/s) of each prediction step.
+
+    The velocity change is in the body frame at the end of the step.
+    """
     start_indices = np.append(0, step_end_indices[:-1])
-    summed_rotation = np.concatenate([np.zeros((1, 3)), np.cumsum(rotation_vectors, axis=0)])
+    summed_rotation = cumulative_sums(rotation_vectors)
     rotation_at_step_end_rad = np.repeat(
         summed_rotation[step_end_indices], step_end_indices - start_indices, axis=0
     )

@@ -1,15 +1,15 @@
 """Explanation of the difference between KF (position and velocity states) and EKF2, step by step.
 
-The flight is replayed with KF, then with one more property of EKF2 each time: sample times, noises,
-estimated states, gate, and output predictor. Each replacement is called a step. It reduces or
-increases the mean square difference from the logged EKF2.
+The flight is replayed with KF. In each step, one more property of KF is replaced by that of EKF2:
+sample times, noises, estimated states, gate, and output predictor. A step reduces or increases the
+mean square difference from the logged EKF2.
 
-Bias states are added before EKF2's process noise: this noise is small, so it would increase the
-error of a filter without them. The last replays use EKF2's logged rejections.
+Bias states are added before EKF2's process noise, which is too small for a filter without them. The
+last replays use EKF2's logged rejections.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 
@@ -22,7 +22,7 @@ from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, delayed_tracks, modelled_aids, replay_with_logged_rejections
 from px4fuse.ekf2.replay import (
-    HORIZONTAL,
+    HORIZONTAL_AXES,
     Ekf2Replay,
     Spans,
     component_along,
@@ -34,7 +34,7 @@ from px4fuse.filter.kalman import Replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
-from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable
+from px4fuse.flight.model import Columns, Ekf2, Flight, Truth, Unavailable
 
 ANALYSIS_NAME = "difference KF - EKF2"
 NO_TRUTH_OVERLAP = Unavailable(
@@ -55,17 +55,17 @@ FLOW_STEP = "optical flow"
 VISION_STEP = "external vision"
 GATE = "rejections and resets"
 OUTPUT = "output predictor"
-# Step of each further aiding source of the position, by PX4's name of the source
+# Aiding sources (PX4's names) that EKF2 may fuse in addition to its position source
 FURTHER_STEPS = {FLOW.name: FLOW_STEP, EV_POS.name: VISION_STEP}
-# Order in which properties of KF are replaced by properties of EKF2; steps of further aiding
-# sources are inserted before GATE
+# Order in which properties of KF are replaced by those of EKF2. Additional aiding sources are
+# inserted before GATE
 REPLACEMENT_STEPS = (SAMPLES, TIMESTAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
 TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class Step(Record, kw_only=True):
-    """Effect of replacing one property of KF by the same property of EKF2.
+    """Effect of replacing one property of KF, such as the measurement noise, by that of EKF2.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Step(Record, kw_only=True):
     position_mean_square_m2, velocity_mean_square_m2_s2 : float
         Reduction of the mean square difference from the logged EKF2; negative for an increase.
     position_moved_m, moved_at_s : float
-        Largest change of the position, and its time.
+        Largest position change by the replacement, and its time.
     position_rmse_to_truth_m : float or None
         Position RMSE after the replacement.
     """
@@ -88,14 +88,14 @@ class Step(Record, kw_only=True):
 
 
 class RejectionRun(Record, kw_only=True):
-    """Longest run of consecutive position samples that EKF2 rejected in flight.
+    """Longest run of successive position samples that EKF2 rejected in flight.
 
     Attributes
     ----------
     duration_s : float
-        Time until a sample was fused again.
+        Time from the first rejected sample to the next fused sample.
     distance_m : float
-        Largest position difference between EKF2 and the same filter without a gate.
+        Largest position difference between EKF2 and EKF2 without a gate.
     """
 
     start_s: float
@@ -105,7 +105,7 @@ class RejectionRun(Record, kw_only=True):
 
 
 class UnreplayedDifference(Record):
-    """Largest position difference KF - EKF2 at times that the replay does not cover."""
+    """Largest position difference KF - EKF2 outside the replayed times, and its time."""
 
     maximum_m: NotNegative
     at_s: float
@@ -114,7 +114,7 @@ class UnreplayedDifference(Record):
 class DifferenceExplanation(Record, kw_only=True):
     """Explanation of the mean square difference KF - EKF2 along one axis.
 
-    The mean square is the sum of the reductions by all ``steps`` and of the unexplained remainder.
+    The mean square is the sum of its reductions by all ``steps`` and an unexplained remainder.
 
     Attributes
     ----------
@@ -161,13 +161,13 @@ class DifferenceExplanation(Record, kw_only=True):
 def explain_by_steps(
     model: Model, settings: Settings | None = None, kf_runs: Mapping[str, Replay] | None = None
 ) -> dict[str, DifferenceExplanation] | Unavailable:
-    """Replace properties of KF by those of EKF2, one after the other, and compare with EKF2.
+    """Replace properties of KF by those of EKF2, one after the other, and compare with the log.
 
     Parameters
     ----------
     model : Model
     settings : Settings, optional
-        Settings of KF; their time offset is that of the position source that EKF2 fused.
+        Settings of KF, with the time offset of the position source that EKF2 fused.
     kf_runs : mapping from axis name to Replay, optional
         Runs of KF along horizontal axes; default: north and east, with EKF2's sample times.
     """
@@ -179,10 +179,10 @@ def explain_by_steps(
     configurations = step_configurations(model.inputs, settings or Settings())
     delayed_positions = delayed_tracks(model, list(configurations.values()))
     baseline_replay = replay_with_logged_rejections(model)
-    evaluated_spans = model.baseline_replay.evaluated_s
+    evaluated_spans = model.baseline_replay.find_evaluated_spans()
     state_times_s = ekf2.state.index.to_numpy()
     is_inside = inside_spans(state_times_s, evaluated_spans)
-    # compare only at times that the replay and all KF runs cover
+    # Only times at which the EKF2 replay and all runs of KF have a state are compared
     for index in (
         baseline_replay.delayed.index,
         *(run.steps.index for run in kf_runs.values()),
@@ -197,9 +197,9 @@ def explain_by_steps(
         )
     state_span_s = float(state_times_s[0]), float(state_times_s[-1])
     directions = {name: run.axis.direction for name, run in kf_runs.items()}
-    directions = directions or dict(zip(HORIZONTAL, np.eye(3), strict=False))
+    directions = directions or dict(zip(HORIZONTAL_AXES, np.eye(3), strict=False))
     tracks_by_step = []
-    # tracks are computed one at a time, to limit memory
+    # Tracks are computed one at a time, to limit the memory
     tracks = chain(delayed_positions, (baseline_replay.published, ekf2.state))
     for step_name, track in zip((*configurations, OUTPUT, "EKF2 as logged"), tracks, strict=True):
         tracks_by_step.append(
@@ -211,79 +211,96 @@ def explain_by_steps(
                 for direction in directions.values()
             ]
         )
-        # all EKF2 properties but gate and output predictor
+        # This track has all properties of EKF2 except gate and output predictor
         if step_name == [*configurations][-2]:
             track_without_gate = track
     spans = Segment(*state_span_s, "").cut(evaluated_spans)
     longest_rejection = _longest_rejection(
         baseline_replay, track_without_gate, state_span_s, evaluated_spans
     )
-    truth = model.flight.truth
-    steps_by_axis = {}
-    no_truth = NO_TRUTH_OVERLAP if isinstance(truth, Truth) else truth
+    explanations = {}
     for axis_index, (axis, direction) in enumerate(directions.items()):
-        kf_state = (
-            state_at(kf_runs[axis], state_times_s) if kf_runs else tracks_by_step[0][axis_index]
+        axis_tracks = [step_tracks[axis_index] for step_tracks in tracks_by_step]
+        kf_state = state_at(kf_runs[axis], state_times_s) if kf_runs else axis_tracks[0]
+        explanations[axis] = _explain_axis(
+            model.flight,
+            direction,
+            (*configurations, OUTPUT),
+            state_times_s,
+            np.array([kf_state, *axis_tracks]),
+            spans,
+            longest_rejection,
         )
-        # position and velocity of KF, of k replays, and of the logged EKF2: shape (k + 2, 2, n)
-        positions_by_step = np.array(
-            [kf_state, *(step_tracks[axis_index] for step_tracks in tracks_by_step)]
+    return explanations
+
+
+def _explain_axis(
+    flight: Flight,
+    direction: Array,
+    step_names: Sequence[str],
+    times_s: Array,
+    positions_by_step: Array,
+    spans_s: Spans,
+    longest_rejection: RejectionRun | None,
+) -> DifferenceExplanation:
+    """Explain the difference KF - EKF2 along one axis at the times of EKF2's states.
+
+    ``positions_by_step``, shape (k + 2, 2, n), contains position and velocity of KF, of the k
+    replays of EKF2, and of the logged EKF2.
+    """
+    difference_by_step_m = positions_by_step - positions_by_step[-1]
+    rmse_by_step = [
+        rms_to_truth(flight, track, direction, times_s) for track in positions_by_step[:, 0]
+    ]
+    mean_squares = np.mean(difference_by_step_m[:-1] ** 2, axis=2)
+    position_change = np.abs(np.diff(positions_by_step[:-1, 0], axis=0))
+    steps = tuple(
+        Step(
+            name=name,
+            position_mean_square_m2=position_reduction,
+            velocity_mean_square_m2_s2=velocity_reduction,
+            position_moved_m=float(position_change_m.max()),
+            moved_at_s=float(times_s[position_change_m.argmax()]),
+            position_rmse_to_truth_m=rmse_m,
         )
-        difference_by_step_m = positions_by_step - positions_by_step[-1]
-        rmse_by_step = [
-            rms_to_truth(model.flight, track, direction, state_times_s)
-            for track in positions_by_step[:, 0]
-        ]
-        mean_squares = np.mean(difference_by_step_m[:-1] ** 2, axis=2)
-        position_change = np.abs(np.diff(positions_by_step[:-1, 0], axis=0))
-        steps = tuple(
-            Step(
-                name=name,
-                position_mean_square_m2=position_reduction,
-                velocity_mean_square_m2_s2=velocity_reduction,
-                position_moved_m=float(position_change_m.max()),
-                moved_at_s=float(state_times_s[position_change_m.argmax()]),
-                position_rmse_to_truth_m=rmse_m,
-            )
-            for name, (position_reduction, velocity_reduction), position_change_m, rmse_m in zip(
-                (*configurations, OUTPUT),
-                (mean_squares[:-1] - mean_squares[1:]).tolist(),
-                position_change,
-                rmse_by_step[1:-1],
-                strict=True,
-            )
+        for name, (position_reduction, velocity_reduction), position_change_m, rmse_m in zip(
+            step_names,
+            (mean_squares[:-1] - mean_squares[1:]).tolist(),
+            position_change,
+            rmse_by_step[1:-1],
+            strict=True,
         )
-        total_mean_squares, *_, unexplained_mean_squares = mean_squares.tolist()
-        rmse_by_filter = {"kf": rmse_by_step[0], "ekf2": rmse_by_step[-1]}
-        steps_by_axis[axis] = DifferenceExplanation(
-            count=len(state_times_s),
-            position_mean_square_m2=total_mean_squares[0],
-            velocity_mean_square_m2_s2=total_mean_squares[1],
-            steps=steps,
-            unexplained_mean_square_m2=unexplained_mean_squares[0],
-            unexplained_velocity_mean_square_m2_s2=unexplained_mean_squares[1],
-            position_rmse_to_truth_m={
-                name: no_truth if rmse_m is None else rmse_m
-                for name, rmse_m in rmse_by_filter.items()
-            },
-            spans_s=spans,
-            longest_rejection=longest_rejection,
-            times_s=state_times_s,
-            # copies, because a view would keep the tracks of all replays in memory
-            kf_minus_ekf2_m=difference_by_step_m[0, 0].copy(),
-            unexplained_m=difference_by_step_m[-2, 0].copy(),
-        )
-    return steps_by_axis
+    )
+    total_mean_squares, *_, unexplained_mean_squares = mean_squares.tolist()
+    no_truth = NO_TRUTH_OVERLAP if isinstance(flight.truth, Truth) else flight.truth
+    rmse_by_filter = {"kf": rmse_by_step[0], "ekf2": rmse_by_step[-1]}
+    return DifferenceExplanation(
+        count=len(times_s),
+        position_mean_square_m2=total_mean_squares[0],
+        velocity_mean_square_m2_s2=total_mean_squares[1],
+        steps=steps,
+        unexplained_mean_square_m2=unexplained_mean_squares[0],
+        unexplained_velocity_mean_square_m2_s2=unexplained_mean_squares[1],
+        position_rmse_to_truth_m={
+            name: no_truth if rmse_m is None else rmse_m for name, rmse_m in rmse_by_filter.items()
+        },
+        spans_s=spans_s,
+        longest_rejection=longest_rejection,
+        times_s=times_s,
+        # Copied, because a view would keep the tracks of all replays in memory
+        kf_minus_ekf2_m=difference_by_step_m[0, 0].copy(),
+        unexplained_m=difference_by_step_m[-2, 0].copy(),
+    )
 
 
 def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, FilterConfiguration]:
-    """Return the filter configuration after each step; the output predictor needs none."""
+    """Return the EKF2 configuration after each step, from KF to EKF2 without output predictor."""
     logged_settings = inputs.settings
     aid = inputs.aid
     acceleration_noise = kf_settings.sigma_a_m_s2 * math.sqrt(kf_settings.dt_s / inputs.mean_step_s)
     kf_process_noise = {**logged_settings, "EKF2_ACC_NOISE": acceleration_noise}
     kf_parameters = {**kf_process_noise, aid.noise: kf_settings.sigma_z_m}
-    # the delay is already subtracted from the timestamps of GNSS positions
+    # The delay is already subtracted from the timestamps of GNSS positions
     applied_delay_s = logged_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     time_offset_s = kf_settings.clock_offset_s - applied_delay_s
     without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.lever_arm, 0.0)}
@@ -338,7 +355,7 @@ def _longest_rejection(
     fused_at_s = updates["fused_at_s"].to_numpy()
     if not is_rejected.any():
         return None
-    # a run of rejections lasts from the first rejected sample to the next fused sample
+    # A run of rejections lasts from the first rejected sample to the next fused sample
     rejection_change = np.diff(is_rejected.astype(int), prepend=0, append=0)
     run_starts = np.flatnonzero(rejection_change == 1)
     run_ends = np.flatnonzero(rejection_change == -1)

@@ -1,11 +1,9 @@
-"""Fusion of external vision in addition to GNSS in the EKF2 replay, with a vision frame bias.
+"""Fusion of external vision in addition to GNSS in the EKF2 replay.
 
-The bias adapts within seconds, so vision determines the relative motion and GNSS the position.
-Without GNSS there is no bias: EKF2 then resets its position to the vision position. Samples between
-two events (:mod:`px4fuse.ekf2.filter_recursion`) are fused at the later event; the motion in
-between is computed from the state and the IMU.
-
-Array shapes: E events, S filter configurations, k samples per event.
+EKF2 estimates a bias of the vision frame, which adapts within seconds. Vision therefore determines
+the relative motion, and GNSS the position. Without GNSS, the bias is zero, and EKF2 resets its
+position to vision. Samples between two events (:mod:`px4fuse.ekf2.filter_recursion`) are fused at
+the later event. The motion in between is computed from the state and the IMU.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/external_vision`` (``ev_pos_control.cpp``; before v1.16
 ``EKF/ev_pos_control.cpp``), ``EKF/control.cpp`` (vision is fused after GNSS and heights).
@@ -31,7 +29,7 @@ from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 
 # State indices of horizontal velocity and horizontal position
 HORIZONTAL_VELOCITY, HORIZONTAL_POSITION = slice(3, 5), slice(6, 8)
-# Maximum time (s) without a vision sample before fusion stops (2 EV_MAX_INTERVAL, ev_control.cpp)
+# EKF2 stops vision fusion after this time (s) without a sample (2 EV_MAX_INTERVAL, ev_control.cpp)
 MAX_SAMPLE_GAP_S = 0.4
 # Time (s) with all vision samples outside the gate after which EKF2 resets the vision bias or the
 # position (no_aid_timeout_max, common.h)
@@ -45,11 +43,10 @@ def vision_samples(
     settings: Mapping[str, float],
     horizon_s: float,
 ) -> Array:
-    """Return the vision samples that are fused at each event, shape (8, k, E).
+    """Return the vision samples that are fused at each event, shape (8, k, events).
 
     Rows: position north and east (m), age, measurement time, fusion time (s), reported variances
-    north and east (m²), and 1 for a sample; see
-    :func:`~px4fuse.ekf2.replay_segments.samples_by_event`.
+    north and east (m²), and 1 for a sample, 0 for an empty slot.
     """
     vision = inputs.vision
     time_s = segment.time_s
@@ -79,24 +76,24 @@ def vision_samples(
 
 
 class VisionFilter:
-    """Vision fusion in S filter configurations through one segment, event by event.
+    """Vision fusion in several filter configurations, event by event through one segment.
 
     Parameters
     ----------
     segment : ReplaySegment
-    sample_arrays : sequence of S ndarrays, shape (8, k, E)
-        Results of :func:`vision_samples`.
-    is_enabled_by_aid : mapping from PX4's name of an aiding source to ndarray of bool, shape (E, S)
-    parameters : mapping from parameter name to ndarray, shape (S,)
-    has_gate, uses_reported_noise : ndarray of bool, shape (S,)
+    sample_arrays : sequence of ndarray, shape (8, k, events)
+        Result of :func:`vision_samples` for each filter configuration.
+    is_enabled_by_aid : mapping from PX4's name of a source to ndarray of bool, (events, filters)
+    parameters : mapping from parameter name to ndarray, shape (filters,)
+    has_gate, uses_reported_noise : ndarray of bool, shape (filters,)
 
     Attributes
     ----------
-    update_log : ndarray, shape (E, k, 7, S)
+    update_log : ndarray, shape (events, k, 7, filters)
         Rows of :func:`~px4fuse.ekf2.replay_segments.update_table` for each sample.
-    position_reset_m : ndarray, shape (E, S, 2)
+    position_reset_m : ndarray, shape (events, filters, 2)
         Change of the position by a reset at each event, north and east.
-    fused_s : ndarray, shape (S,)
+    fused_s : ndarray, shape (filters,)
         Time of the last position fusion or reset.
     """
 
@@ -116,8 +113,8 @@ class VisionFilter:
         self.update_log = np.full((event_count, sample_count, 7, configuration_count), np.nan)
         self.position_reset_m = np.zeros((event_count, configuration_count, 2))
         has_sample = (samples[7] > 0.0) & is_enabled_by_aid[EV_POS.name]
-        # EKF2 fuses GNSS before vision in the same prediction step: samples of an interval's last
-        # step are fused after GNSS, earlier samples before GNSS
+        # In one prediction step, EKF2 fuses GNSS before vision. Samples of the last step before an
+        # event are therefore fused after GNSS, earlier samples before GNSS
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
         self.has_gate = has_gate
         self.without_gnss = ~is_enabled_by_aid[GNSS_POS.name]
@@ -137,7 +134,7 @@ class VisionFilter:
         self.was_without_gnss = self.without_gnss[0]
 
     def updates(self, configuration_index: int, end_s: Array) -> pd.DataFrame:
-        """Return the updates of one filter configuration; ``end_s`` is the time of each event."""
+        """Return the updates of one configuration; ``end_s`` contains the time of each event."""
         measured_at_s = self.measured_at_s[..., configuration_index].T
         return update_table(
             self.update_log[..., configuration_index], measured_at_s, end_s, ["north", "east"]
@@ -146,9 +143,8 @@ class VisionFilter:
     def fuse(self, e: int, x: Array, P: Array, at_event: bool, gnss_fused_s: Array) -> ArrayPair:
         """Fuse the vision samples of one event.
 
-        ``at_event`` is True for the samples of the last prediction step before the event (EKF2
-        fuses these after GNSS), and False for earlier samples. ``gnss_fused_s`` is the time of the
-        last position fusion from GNSS.
+        ``at_event`` selects the samples of the last prediction step (True), which EKF2 fuses after
+        GNSS, or earlier samples (False). ``gnss_fused_s`` is the time of the last GNSS fusion.
         """
         for slot, has_sample in enumerate(self.has_sample[at_event][:, e]):
             if has_sample.any():
@@ -164,7 +160,7 @@ class VisionFilter:
         noise_m2 = self.noise_m2[slot, e]
         HP = P[:, HORIZONTAL_POSITION] - age_s[:, None] * P[:, HORIZONTAL_VELOCITY]
         S = HP[:, :, HORIZONTAL_POSITION] - age_s[:, None] * HP[:, :, HORIZONTAL_VELOCITY]
-        # diagonal is a view of S: `diagonal += R` changes S
+        # diagonal is a view of S: adding R to it changes S
         diagonal = S.reshape(len(S), -1)[:, ::3]
         position_innovation_m = (
             self.position_m[slot, e] - x[:, HORIZONTAL_POSITION] + age_s * x[:, HORIZONTAL_VELOCITY]
@@ -192,7 +188,7 @@ class VisionFilter:
             without_gnss | (is_failing & (fusion_time_s - gnss_fused_s > MAX_REJECTED_S))
         )
         is_evaluated = has_sample & ~has_restarted | is_position_reset
-        # if EKF2 resets its position to a sample, it logs innovation 0 for this sample
+        # If EKF2 resets its position to a sample, it logs innovation 0 for this sample
         update_log = (
             *np.where(is_position_reset, 0.0, nu.T),
             *diagonal.T,
@@ -236,7 +232,10 @@ class VisionFilter:
 def set_states(
     x: Array, P: Array, is_selected: BoolArray, rows: slice, value: Array, variance: Array
 ) -> None:
-    """Set ``rows`` of the states to measured values, uncorrelated with the other states."""
+    """Set the states ``rows`` of selected configurations to a value that is uncorrelated.
+
+    ``value`` and ``variance`` have the shape (filters, states).
+    """
     x[is_selected, rows] = value[is_selected]
     P[is_selected, :, rows] = 0.0
     P[is_selected, rows, :] = 0.0

@@ -1,6 +1,6 @@
 """Statistics of EKF2 as logged, replayed, and replayed with other parameters.
 
-The parameter table has one column per set of parameters; all are evaluated over the same times.
+All statistics are evaluated over equal times.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,7 +18,7 @@ from px4fuse.ekf2.heights import HEIGHT_SENSORS
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.ekf2.model import Model, modelled_aids, replay_settings, with_position_noise
 from px4fuse.ekf2.replay import (
-    HORIZONTAL,
+    HORIZONTAL_AXES,
     Agreement,
     Ekf2Replay,
     Spans,
@@ -34,11 +34,11 @@ from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import nis_band
 from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, check_parameters
-from px4fuse.flight.model import AxisName, Columns, Ekf2, Flight, Unavailable
+from px4fuse.flight.model import Columns, Ekf2, Flight, NedAxis, Unavailable
 
 ANALYSIS_NAME = "EKF2 replay with other parameters"
-# Minimum fraction of the innovations that must be logged for computing the longest time between
-# fusions from the log
+# The longest time between fusions is computed from the log only if it contains at least this
+# fraction of the innovations
 MIN_COMPLETE_FRACTION = 0.9
 NO_TRUTH = Unavailable(
     "RMSE against ground truth",
@@ -68,30 +68,30 @@ HEIGHT_NOT_REPLAYED = Unavailable(
 HEIGHT_NAMES = {aid.name for aid in HEIGHT_SENSORS}
 # Minimum evaluated flight time (s) after an aiding source is disabled
 MIN_EVALUATED_S = 5.0
-# Default number and maximum number of parameter values in a sweep
+# Default and maximum number of parameter values in a sweep
 SWEEP_VALUE_COUNT = 9
 MAX_SWEEP_VALUES = 200
-# Position noise (m) that is added in repeated replays
+# Position noise (m, 1 σ) that is added in repeated replays
 ADDED_NOISE_M = 0.002
 # Number of repeated replays with added position noise
 NOISY_REPLAY_COUNT = 4
-# Minimum rejected fraction of a replay that is repeated with added position noise
+# A replay is repeated with added position noise if it rejects more than this fraction
 MIN_REJECTED_FRACTION = 0.02
-# Maximum rejected fraction of a replay with predictable statistics
+# The statistics of a replay are not predictable if it rejects more than this fraction
 MAX_REJECTED_FRACTION = 0.35
 # EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# Maximum ratio between the mean NIS of repeated replays
+# Maximum ratio of the largest to the smallest mean NIS of repeated replays
 MAX_NIS_RATIO = 1.10
 # Maximum difference between the rejected fractions of repeated replays
 MAX_REJECTED_SPREAD = 0.03
-# Maximum ratio between the position RMSE of repeated replays
+# Maximum ratio of the largest to the smallest position RMSE of repeated replays
 MAX_RMSE_RATIO = 1.15
 
 
 class AxisSummary(Record):
-    """EKF2 statistics along one axis in one column of the parameter table.
+    """EKF2 statistics along one axis, with one set of parameters.
 
     ``nis_mean`` includes rejected samples; ``sigma_p_median_m`` is the median reported σ.
     """
@@ -114,13 +114,13 @@ class HeightSummary(Record):
 
     @property
     def is_predictable(self) -> bool:
-        """False with many rejections or with a height reset, which the replay does not model."""
+        """False with many rejections, or with a height reset, which the model does not contain."""
         has_reset = self.longest_without_fusion_s > HEIGHT_TIMEOUT_S
         return not has_reset and self.rejected_fraction <= MAX_REJECTED_FRACTION
 
 
 class Summary(Record, kw_only=True, omit_defaults=False):
-    """EKF2 statistics in one column of the parameter table: logged, replayed, or changed.
+    """EKF2 statistics with one set of parameters: as logged, replayed, or changed.
 
     Attributes
     ----------
@@ -184,7 +184,7 @@ class WhatIf:
     agreement : Agreement
         Agreement of the replay with the log.
     whatif : tuple of Summary
-        One column per set of changed parameters.
+        Statistics with each set of changed parameters.
     evaluated_s : tuple of (float, float)
     notes : tuple of str
         Limitations of the replay.
@@ -225,10 +225,11 @@ def what_if(
     without = without or {}
     replays = replay_settings(model, settings, without=without)
     flight = model.flight
-    evaluated_s = model.baseline_replay.evaluated_s
+    evaluated_s = model.baseline_replay.find_evaluated_spans()
     if without:
         disabled_s = min(without.values())
-        # later segments start from logged states, which the source affected
+        # Later segments start from logged states, to which the disabled source contributed
+        replay_end_s = evaluated_s[-1][1]
         remaining_spans = [
             (max(start, disabled_s), end)
             for start, end in evaluated_s
@@ -238,29 +239,28 @@ def what_if(
         if not evaluated_s:
             raise SettingsError(
                 f"--from {disabled_s:g} s leaves less than {MIN_EVALUATED_S:g} s of the replayed "
-                f"flight, which ends at {model.baseline_replay.evaluated_s[-1][1]:.0f} s. "
+                f"flight, which ends at {replay_end_s:.0f} s. "
                 "Choose an earlier time."
             )
+    summaries: list[Summary] = []
+    notes: list[str] = []
+    deviation_notes: list[str] = []
+    for replay in replays:
+        summaries.append(_summarise_replay(flight, replay, evaluated_s))
+        notes += _notes(model, replay)
+        if without:
+            deviation_notes.append(_deviation_note(model, replay, without, evaluated_s))
     is_gnss = model.inputs.aid == GNSS_POS
     return WhatIf(
         agreement=model.agreement,
         logged=_summarise_log(flight, model.baseline_replay, evaluated_s),
         replayed=_summarise_replay(flight, model.baseline_replay, evaluated_s),
-        whatif=_mark_unpredictable(
-            model,
-            [_summarise_replay(flight, r, evaluated_s) for r in replays],
-            evaluated_s,
-            without,
-        ),
+        whatif=_mark_unpredictable(model, summaries, evaluated_s, without),
         evaluated_s=evaluated_s,
         notes=(
-            *(_heading_and_height_notes(model) if replays and is_gnss else ()),
-            *(note for replay in replays for note in _notes(model, replay)),
-            *(
-                _deviation_note(model, replay, without, evaluated_s)
-                for replay in replays
-                if without
-            ),
+            *(_heading_and_height_notes(model) if summaries and is_gnss else ()),
+            *notes,
+            *deviation_notes,
         ),
     )
 
@@ -315,7 +315,10 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUE_CO
 def _mark_unpredictable(
     model: Model, summaries: Sequence[Summary], evaluated_s: Spans, without: Mapping[str, float]
 ) -> tuple[Summary, ...]:
-    """Set ``is_predictable`` to False where added position noise changes the statistics."""
+    """Set ``is_predictable`` to False if added position noise changes the statistics of a replay.
+
+    It is also False with many rejections or a height reset.
+    """
     repeated_summaries = [[summary] for summary in summaries]
     uncertain_summaries = [
         replay_summaries
@@ -353,7 +356,9 @@ def _results_agree(summaries: Sequence[Summary]) -> bool:
         if isinstance(rmse_m := summary.position_rmse_to_truth_m, float)
     ]
     rejected_fractions = [summary.rejected_fraction for summary in summaries]
-    nis_by_axis = [[summary.axes[axis].nis_mean for summary in summaries] for axis in HORIZONTAL]
+    nis_by_axis = [
+        [summary.axes[axis].nis_mean for summary in summaries] for axis in HORIZONTAL_AXES
+    ]
     return (
         all(max(axis_nis) <= MAX_NIS_RATIO * min(axis_nis) for axis_nis in nis_by_axis)
         and max(rejected_fractions) - min(rejected_fractions) <= MAX_REJECTED_SPREAD
@@ -371,9 +376,9 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
             f"{replay.lost} samples arrive after the fusion horizon",
             "Choose another parameter value.",
         )
-    # position variance before and after each update
+    # Position variance before and after each update
     variance = pd.DataFrame(index=np.column_stack([fused_at_s - 1e-6, fused_at_s]).ravel())
-    for axis in HORIZONTAL:
+    for axis in HORIZONTAL_AXES:
         innovation_variance, noise_variance = (
             updates[f"{quantity}_variance_{axis}_m2"] for quantity in ("innovation", "observation")
         )
@@ -452,9 +457,9 @@ def _make_summary(
     variance: pd.DataFrame | None,
     other_aid_updates: Mapping[str, pd.DataFrame],
     headings_rad: pd.Series,
-    **more: Any,
+    **other_fields: Any,
 ) -> Summary:
-    """Compute one column of the parameter table; ``more`` are further fields of :class:`Summary`.
+    """Compute EKF2's statistics; ``other_fields`` are fields of :class:`Summary` to add.
 
     Without ``variance``, the logged position variance is used.
     """
@@ -470,7 +475,7 @@ def _make_summary(
         rmse_to_truth = rms_to_truth(flight, position_m, direction, evaluated_state_s)
         return NO_TRUTH if rmse_to_truth is None else rmse_to_truth
 
-    for axis, direction in zip(HORIZONTAL, np.eye(3), strict=False):
+    for axis, direction in zip(HORIZONTAL_AXES, np.eye(3), strict=False):
         median_sigma: float | Unavailable
         if isinstance(logged_variance, Unavailable):
             median_sigma = logged_variance
@@ -480,7 +485,7 @@ def _make_summary(
             median_sigma = float(
                 np.sqrt(np.median(np.interp(variance_s, axis_variance.index, axis_variance)))
             )
-        more[axis] = AxisSummary(
+        other_fields[axis] = AxisSummary(
             *_innovation_statistics(evaluated_updates, axis), median_sigma, error_m(direction)
         )
     aids = {
@@ -489,22 +494,22 @@ def _make_summary(
         if len(evaluated := rows_inside(updates, evaluated_s))
     }
     if velocity := aids.pop(GNSS_VEL.name, None):
-        more["velocity_rejected_fraction"] = velocity.rejected_fraction
+        other_fields["velocity_rejected_fraction"] = velocity.rejected_fraction
     if vision := aids.pop(EV_POS.name, None):
-        more["others"] = {EV_POS.name: vision}
+        other_fields["others"] = {EV_POS.name: vision}
     if other_aid_updates.keys() & HEIGHT_NAMES:
-        more["heights"] = aids
-        more["height_rmse_to_truth_m"] = error_m(np.eye(3)[2])
+        other_fields["heights"] = aids
+        other_fields["height_rmse_to_truth_m"] = error_m(np.eye(3)[2])
     return Summary(
         samples=len(evaluated_updates),
         rejected_fraction=float(evaluated_updates["rejected"].mean()),
         heading_error_mean_deg=_heading_error(flight, replay, headings_rad, evaluated_s),
-        **more,
+        **other_fields,
     )
 
 
 def _innovation_statistics(
-    updates: pd.DataFrame, *axes: AxisName
+    updates: pd.DataFrame, *axes: NedAxis
 ) -> tuple[float, tuple[float, float], float]:
     nu = np.concatenate([updates[f"innovation_{axis}_m"] for axis in axes])
     S = np.concatenate([updates[f"innovation_variance_{axis}_m2"] for axis in axes])
@@ -526,7 +531,7 @@ def _summarise_aid(evaluated_updates: pd.DataFrame, evaluated_s: Spans) -> Heigh
 def _heading_error(
     flight: Flight, replay: Ekf2Replay, headings_rad: pd.Series, evaluated_s: Spans
 ) -> float | Unavailable:
-    """Return the mean of ``headings_rad`` (rad) minus true heading, in degrees."""
+    """Return the mean difference (°) of ``headings_rad`` (rad) minus true heading."""
     if GNSS_POS.noise not in replay.settings:
         return HEADING_NOT_REPLAYED
     true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude
@@ -546,7 +551,7 @@ def _longest_between_fusions(fused_s: ArrayLike, evaluated_s: Spans) -> float:
 
 
 def _deviation_note(
-    model: Model, replay: Ekf2Replay, replays_without: Mapping[str, float], evaluated_s: Spans
+    model: Model, replay: Ekf2Replay, disabled_aids: Mapping[str, float], evaluated_s: Spans
 ) -> str:
     """Describe the position difference between replays with and without an aiding source."""
     position_difference_m = rows_inside(
@@ -555,7 +560,7 @@ def _deviation_note(
     )
     *horizontal_m, down_difference_m = np.abs(position_difference_m.to_numpy()).T
     horizontal_distance_m, max_down_m = np.hypot(*horizontal_m), down_difference_m.max()
-    aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in replays_without.items())
+    aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in disabled_aids.items())
     height_aids = HEIGHT_NAMES & model.baseline_replay.other_aid_updates.keys()
     horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - height_aids
     at_s = position_difference_m.index[horizontal_distance_m.argmax()]
@@ -564,9 +569,9 @@ def _deviation_note(
         f"sources by at most {horizontal_distance_m.max():.3g} m (at {at_s:.1f} s), and by "
         f"{horizontal_distance_m[-1]:.3g} m at the end"
     )
-    if height_aids & {*replays_without}:
+    if height_aids & {*disabled_aids}:
         note = f"{note}. The heights of the two replays differ by at most {max_down_m:.3g} m"
-    if horizontal_aids <= replays_without.keys():
+    if horizontal_aids <= disabled_aids.keys():
         note = (
             f"{note}. The replay continues with the IMU alone; EKF2 stops publishing a position "
             "after EKF2_NOAID_TOUT (5 s)"
@@ -582,8 +587,8 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
             f"({min_noise_m:g} m)"
         )
     if replay.late or replay.lost:
-        # there may be fewer updates than samples: EKF2 fuses only the newer of two samples in a
-        # prediction step
+        # EKF2 fuses only the newer of two samples in one prediction step, so that there may be
+        # fewer updates than samples
         received_count = max(len(replay.updates), replay.late) + replay.lost
         note = (
             f"{_change_text(replay)}: {replay.late + replay.lost} of {received_count} samples "

@@ -1,1 +1,1 @@
-"""Interactive HTML page of one flight: KF re-runs in the browser with other settings."""
+"""Interactive web page about one flight: KF re-runs in the browser with other settings."""

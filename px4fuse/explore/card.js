@@ -77,7 +77,7 @@ const Card = (() => {
       recorded.hidden = !isChanged;
       // its advice is for the analysed settings
       query("#card .do")?.toggleAttribute("hidden", isChanged);
-      recorded.textContent = `Diagnosis with the analysed settings: ${analysed.sign} ${analysed.headline}`;
+      recorded.textContent = `Diagnosis with the original settings: ${analysed.sign} ${analysed.headline}`;
     }
     return { showAxis, moveMarks, showTexts, verdicts };
   }

@@ -1,4 +1,4 @@
-"""Data of one flight for the interactive page of ``px4fuse explore``."""
+"""Data of one flight for the interactive web page of ``px4fuse explore``."""
 
 from dataclasses import asdict
 from typing import Any
@@ -18,7 +18,7 @@ from px4fuse.comparison.remedy import aid_of
 from px4fuse.explore.packing import COARSE_SCALE, Packer
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL, CONSISTENT_RATIOS
 from px4fuse.filter.model import INITIAL_COVARIANCE
-from px4fuse.filter.settings import SETTING_RANGES, Settings
+from px4fuse.filter.settings import KF_NUMBERS, SETTING_RANGES, Settings
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -27,14 +27,14 @@ from px4fuse.flight.model import Columns, PositionTrack, Unavailable
 from px4fuse.report.card_html import MARK_PATHS
 from px4fuse.request import ComparisonRequest, command_line
 
-# Data of the explore page, encoded as JSON
+# Data for the web page, in JSON types
 PageData = dict[str, Any]
-# Half the range (s) of the slider of the time offset, which is centred at the analysed value
+# Half the range (s) of the slider for the time offset; its centre is the value in the analysis
 OFFSET_SLIDER_HALF_RANGE_S = 0.6
 
 
 def flight_data(analysis: Analysis, packer: Packer) -> PageData:
-    """Return the data of one flight for JSON, with placeholders for the arrays in the packer."""
+    """Return the data of one flight for JSON; arrays are added to the packer."""
     signals = kf_inputs(analysis, packer)
     events, request = analysis.events, analysis.request
     assert request is not None
@@ -62,7 +62,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> PageData:
 
 
 def kf_inputs(comparison: Comparison, packer: Packer) -> PageData:
-    """Return the inputs of KF in the browser: positions, accelerations and initial covariance."""
+    """Return the inputs of KF: positions, accelerations and initial covariance."""
     source = raw_source(comparison)
     return {
         "segment": [comparison.segment.start_s, comparison.segment.end_s],
@@ -73,7 +73,7 @@ def kf_inputs(comparison: Comparison, packer: Packer) -> PageData:
 
 
 def ranges() -> PageData:
-    """Return minimum, maximum and default of each KF setting, and the axis of σ ratios."""
+    """Return the range and default of each KF setting, and constants for drawing σ ratios."""
     return {
         "settings": {name: (low, high) for name, (low, high, *_) in SETTING_RANGES.items()},
         "lesson": asdict(Settings()),
@@ -84,12 +84,12 @@ def ranges() -> PageData:
 
 
 def raw_source(comparison: Comparison) -> PositionTrack:
-    """Return the position source without the applied time offset."""
+    """Return the positions with their original timestamps, without the applied time offset."""
     return shift_clock(comparison.source, -comparison.settings.clock_offset_s)
 
 
 def _offset_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
-    """Return range and estimate of the time offset, or the reason why the slider is disabled."""
+    """Return range and estimate of the time offset, or the reason why it cannot be changed."""
     if request.position is not None:
         return {"why": "the time offset aligns the position file with the log"}
     analysed_offset_s, clock = analysis.settings.clock_offset_s, analysis.clock
@@ -109,20 +109,20 @@ def _imu_data(comparison: Comparison, packer: Packer) -> PageData | str:
     if isinstance(acceleration, Unavailable):
         return acceleration.reason
     time_s = acceleration.time_s
-    gap_starts = np.flatnonzero(imu_gaps(time_s))
-    gap_edges_s = np.stack([time_s[gap_starts], time_s[gap_starts + 1]], 1)
+    gap_start_indices = np.flatnonzero(imu_gaps(time_s))
+    gap_edges_s = np.stack([time_s[gap_start_indices], time_s[gap_start_indices + 1]], 1)
     gap_sum_s = np.cumsum(np.diff(gap_edges_s, prepend=gap_edges_s[:, :1]))
     return {
         "time": packer.add_times(time_s[_segment_slice(comparison, acceleration)]),
         "span": [time_s[0], time_s[-1]],
         "gapEdges": gap_edges_s.ravel().tolist(),
-        # total duration (s) of all gaps up to each edge of a gap
+        # total duration (s) of all gaps before each gap edge
         "gapSum": gap_sum_s.tolist(),
     }
 
 
 def _segment_slice(comparison: Comparison, acceleration: Acceleration) -> slice:
-    """Return the IMU samples of the segment as a slice, with one more sample at each end."""
+    """Return the slice of IMU samples in the analysed time span, plus one sample at each end."""
     segment, time_s = comparison.segment, acceleration.time_s
     first_row = int(np.searchsorted(time_s, segment.start_s, side="right")) - 1
     end_row = int(np.searchsorted(time_s, segment.end_s)) + 1
@@ -132,9 +132,10 @@ def _segment_slice(comparison: Comparison, acceleration: Acceleration) -> slice:
 def _axis_signals(
     comparison: Comparison, axis: Axis, raw_source: PositionTrack, packer: Packer
 ) -> PageData:
-    """Return position measurements (m) along an axis, and the integral of its acceleration (m/s).
+    """Return position measurements (m) and integrated acceleration (m/s) along an axis.
 
-    Measurements outside the segment are included if a time offset can move them into it.
+    Measurements shortly before and after the analysed time span are included, because a changed
+    time offset can move them into the time span.
     """
     segment = comparison.segment
     time_s = raw_source.samples.index.to_numpy()
@@ -164,17 +165,17 @@ def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Pa
         "ratios": [verdict.ratio for verdict in make_sigma_verdicts(result)],
         "note": result.axis.note,
         "bands": _nis_bands(len(result.axis.measurement_time_s), packer),
-        # horizontal axes share their noise estimates if they exist
+        # key of the noise estimate: north and east may have a common estimate
         "noises": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
-        "ekf2": _ekf2_data(analysis, result.in_flight, packer),
-        "truth": _truth_data(result.in_flight, packer),
+        "ekf2": _ekf2_data(analysis, result.with_flight_tracks(), packer),
+        "truth": _truth_data(result.with_flight_tracks(), packer),
     }
 
 
 def _nis_bands(innovation_count: int, packer: Packer) -> list[dict[str, int]]:
-    """Return the 95 % band of the mean NIS for each possible number of innovations.
+    """Return the 95 % band of the mean NIS for 1 to 2 · ``innovation_count`` innovations.
 
-    The number changes because the time offset moves measurements into or out of the segment.
+    The number of innovations changes with the time offset.
     """
     innovation_counts = np.arange(1, 2 * innovation_count + 1)
     probabilities = ((1.0 - CONFIDENCE_LEVEL) / 2.0, (1.0 + CONFIDENCE_LEVEL) / 2.0)
@@ -258,7 +259,7 @@ def _ml_noises_by_axis(analysis: Analysis) -> PageData:
 
 
 def _ekf2_settings(analysis: Analysis) -> dict[str, str]:
-    """Return EKF2's noise, delay and gate of the position source, with units, by parameter."""
+    """Return the EKF2 parameters for noise, delay and gate of the position source, with units."""
     aid, logged_parameters = aid_of(analysis), analysis.flight.log.parameters
     return {
         name: f"{logged_parameters[name]:.4g} {PARAMETERS[name].unit}".rstrip()
@@ -268,27 +269,27 @@ def _ekf2_settings(analysis: Analysis) -> dict[str, str]:
 
 
 def _command_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
-    """Return the `compare` command with automatic ("base") and with stated segment and main axis.
+    """Return the ``px4fuse compare`` command of this analysis in two forms.
 
-    px4fuse chooses them by the time offset. With a changed time offset the command states them
-    ("fixed"), so it analyses the same data.
+    "base" lets px4fuse choose time span and main axis. "fixed" states both, because the choice
+    depends on the time offset, which the user can change.
     """
     offset_s = None if request.position is None else request.clock_offset_s
-    request_with_automatic_segment = msgspec.structs.replace(
-        request, sigma_a_m_s2=0.5, sigma_z_m=None, dt_s=0.1, input=None, clock_offset_s=offset_s
-    )
+    defaults = ComparisonRequest(log=request.log)
+    kf_defaults = {name: getattr(defaults, name) for name in (*KF_NUMBERS, "input")}
+    base_request = msgspec.structs.replace(request, clock_offset_s=offset_s, **kf_defaults)
     heading_deg = request.heading_deg
     if heading_deg is None and AISLE in analysis.axes:
         heading_deg = analysis[AISLE].heading_deg
-    request_with_stated_segment = msgspec.structs.replace(
-        request_with_automatic_segment,
+    fixed_request = msgspec.structs.replace(
+        base_request,
         start_s=analysis.segment.start_s,
         end_s=analysis.segment.end_s,
         heading_deg=heading_deg,
     )
     return {
-        "base": command_line(request_with_automatic_segment, for_shell=True),
-        "fixed": command_line(request_with_stated_segment, for_shell=True),
+        "base": command_line(base_request, for_shell=True),
+        "fixed": command_line(fixed_request, for_shell=True),
         "input": request.input,
         "default_input": "zero"
         if isinstance(analysis.main.axis.acceleration, Unavailable)

@@ -1,5 +1,5 @@
 // KF of px4fuse.filter.kalman in JavaScript, with the same results as px4fuse.replay: the same time
-// steps, the same mean acceleration per step, the same Joseph update.
+// steps, the same mean acceleration per step, the same P = (I - KH)P.
 "use strict";
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 /* Response with the decompressed bytes of a base64 text */
@@ -23,7 +23,7 @@ const Engine = (() => {
     return out;
   }
 
-  /* Mean acceleration of each step, and the fraction of the step within a gap (signals.step_means) */
+  /* Mean acceleration of each step, and the fraction of the step within a gap (signals.mean_step_acceleration) */
   function stepMeans(imu, axis, edges) {
     const velocity = interp(edges, imu.time, axis.integral);
     const gap = interp(edges, imu.gapEdges, imu.gapSum);
@@ -48,7 +48,7 @@ const Engine = (() => {
     return { time, z };
   }
 
-  /* Time steps of KF: grid of DT and measurement times (kalman.timeline) */
+  /* Time steps of KF: grid of DT and measurement times (steps.make_timeline) */
   function timeline(flight, axis, settings) {
     const { time: all, z } = measured(axis, flight.segment, settings.clock_offset_s);
     if (all.length < MIN_MEASUREMENTS) return null;

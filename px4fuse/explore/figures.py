@@ -1,4 +1,4 @@
-"""Bokeh plots of the explore page; JavaScript adds the data."""
+"""Bokeh plots of the web page of ``px4fuse explore``; JavaScript adds the data."""
 
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -22,14 +22,14 @@ SOURCE_COLUMNS = (
     "z turn "  # measured position, angle of an arrow head (rad)
     "row left right"  # row, start and end of an event
 )
-# JavaScript sets the colours by `name`. Shapes distinguish the filters without colour
+# JavaScript sets the colours by `name`. Line styles distinguish the filters without colour
 KF_LINE: BokehStyle = {"line_width": 1.6, "name": "kf"}
 EKF2_LINE: BokehStyle = {"line_width": 1.6, "line_dash": [6, 3], "name": "ekf2"}
 TRUTH_LINE: BokehStyle = {"line_width": 1.2, "line_dash": [1, 3], "name": "truth"}
 HOLLOW_MARKER: BokehStyle = {"fill_color": None, "line_color": "black"}
-# Arrow head at the upper or lower edge of a plot, for a value outside the plot
+# Arrow head at the upper or lower edge of a plot, for a value outside the axis range
 ARROW_MARKER: BokehStyle = {"angle": "turn", "marker": "triangle"}
-# Band around the values of a consistent filter
+# Style of the shaded band that contains the values of a consistent filter
 CONSISTENT_BAND: BokehStyle = {"level": "underlay", "fill_alpha": 1.0, "name": "consistent"}
 GAP_BAND: BokehStyle = {
     "level": "underlay",
@@ -45,7 +45,7 @@ CONSISTENT_LIMIT = 2.0
 INNOVATION_AXIS_LIMIT = 4.6
 # Left margin (pixels) of a plot
 LEFT_MARGIN_PIXELS = 50
-# Left margin (pixels) of the event plot and of the position plot above it: event labels are long
+# Left margin (pixels) of the event plot, which has long labels, and of the plot above
 EVENT_LEFT_MARGIN_PIXELS = 82
 LINE_STYLES = {
     "kf": KF_LINE,
@@ -56,7 +56,7 @@ LINE_STYLES = {
 
 
 class Plot(Record):
-    """Plot over time.
+    """Plot of several quantities over time.
 
     Attributes
     ----------
@@ -70,14 +70,14 @@ class Plot(Record):
 
 
 class View(Record):
-    """Tab of the page; ``plots`` are the titles of its plots by name."""
+    """Tab of the web page, with the titles of its plots by name."""
 
     title: str
     plots: Mapping[str, str]
 
 
 class Figures(Record):
-    """Views and plots of ``figures.toml``: titles, lines and colours."""
+    """Tabs and plots of the web page (``figures.toml``)."""
 
     event_rows: list[str]
     views: dict[str, View]
@@ -88,7 +88,7 @@ FIGURES = read_toml(__file__, Figures)
 
 
 def document_json(data: PageData) -> tuple[Any, dict[str, str]]:
-    """Return Bokeh's document with all plots, and the name of each plot by its id."""
+    """Return a Bokeh document with all plots as JSON, and the name of each plot by its id."""
     document = Document()
     time_range = _axis_range("time")
     plots = _make_plots(data, time_range)
@@ -100,7 +100,7 @@ def document_json(data: PageData) -> tuple[Any, dict[str, str]]:
 
 
 def has_reference(data: PageData) -> bool:
-    """Return True if KF can be compared with ground truth or EKF2 along some axis."""
+    """Return True if the log contains ground truth or EKF2 along at least one axis."""
     return _has_track(data, "truth") or _has_track(data, "ekf2")
 
 
@@ -114,7 +114,7 @@ def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
     for name, plot in FIGURES.plots.items():
         if name == "error" and not has_reference(data):
             continue
-        data_sources = _PlotSources(name)
+        data_sources = _PlotDataSources(name)
         plot_figure = plots[name] = _figure(
             name,
             215,
@@ -145,7 +145,7 @@ def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
                 _add_hover(
                     plot_figure, line_renderer, (hover_name, f"@{column}{{0.000}} {plot.unit}")
                 )
-        if name == "error":  # the initial 2σ band is too wide for scaling the axis
+        if name == "error":  # scale the axis without the 2σ band, which is very wide at the start
             plot_figure.y_range.renderers = line_renderers
         _add_cursor(plot_figure, name="cursor")
         for low, high in data["events"]["gap"]:
@@ -153,7 +153,7 @@ def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
     return plots
 
 
-class _PlotSources(dict[str, ColumnDataSource]):
+class _PlotDataSources(dict[str, ColumnDataSource]):
     """Bokeh data sources of one plot, created on first use."""
 
     def __init__(self, plot: str) -> None:
@@ -187,7 +187,7 @@ def _draw_innovations(
 
 def _add_hover(plot_figure: Any, renderer: Any, *rows: tuple[str, str]) -> None:
     tooltip_rows = [("time", "@t{0.00} s"), *rows]
-    # on different sides, so that tooltips do not overlap
+    # place tooltips on different sides, so that they do not overlap
     side: Any = {"EKF2": "right", "ground truth": "above"}.get(rows[0][0], "left")
     plot_figure.add_tools(
         HoverTool(renderers=[renderer], tooltips=tooltip_rows, mode="vline", attachment=side)
@@ -248,7 +248,7 @@ def _draw_dots(
 
 
 def _phase_plot() -> Any:
-    """Make the phase plane: KF position and velocity, their 2σ ellipse, and the measurement."""
+    """Make the plot of KF position and velocity with 2σ ellipse and measurement."""
     plot_figure = _figure(
         "step",
         330,

@@ -1,7 +1,7 @@
-"""Compact encoding of arrays for the page.
+"""Compact encoding of arrays for the web page.
 
-Numbers are rounded to integers; their differences are split into planes of lower and upper bytes,
-compressed by deflate and encoded as base64.
+Numbers are scaled and rounded to integers. The bytes of their differences are sorted by
+significance, compressed by deflate and encoded as base64.
 """
 
 import base64
@@ -12,10 +12,10 @@ import numpy as np
 
 from px4fuse.core.arrays import Array
 
-# Inputs of KF (m, m/s or s) are multiplied by this factor and rounded to integers. The rounding
-# error is 1 % of the tolerance between KF in JavaScript and KF in Python
+# Factor by which inputs of KF (m, m/s or s) are multiplied before rounding. The rounding error is
+# 1 % of the tolerance between KF in JavaScript and KF in Python
 FINE_SCALE = 2.0**36
-# Values (m, m/s or s) that are only drawn or averaged are multiplied by this factor and rounded
+# Factor before rounding for values (m, m/s or s) that are only drawn or averaged
 COARSE_SCALE = 1e6
 # Limit of the rounded values: half of the largest integer that JavaScript represents exactly
 MAX_EXACT_INTEGER = 2.0**52
@@ -23,20 +23,20 @@ MAX_EXACT_INTEGER = 2.0**52
 
 @dataclass
 class Packer:
-    """Encoder of arrays; ``array_specs`` are length, bytes per value and scale of each array."""
+    """Encoder of arrays; ``array_specs`` are (length, bytes per value, scale) of each array."""
 
     array_specs: list[tuple[int, int, float]] = field(default_factory=list)
     _bytes: list[bytes] = field(default_factory=list)
 
     def add(self, values: Array, scale: float = FINE_SCALE) -> dict[str, int]:
-        """Add an array, and return its placeholder ``{"array": index}`` for the page's data."""
+        """Add an array; return ``{"array": index}``, which replaces the array in the JSON data."""
         values = np.asarray(values, dtype=np.float64)
         largest_value = float(np.max(np.abs(values), initial=1.0))
         while largest_value * scale > MAX_EXACT_INTEGER:
             scale /= 2.0
         integers = np.rint(values * scale).astype(np.int64)
         differences = np.diff(integers, prepend=0)
-        # the lowest bit is the sign, so small negative numbers have few bits too
+        # store the sign in the lowest bit, so that small negative numbers need few bytes
         signed_integers = ((differences << 1) ^ (differences >> 63)).astype("<u8")
         byte_count = max(1, (int(signed_integers.max(initial=0)).bit_length() + 7) // 8)
         self._bytes.append(
@@ -50,5 +50,5 @@ class Packer:
         return self.add(time_s, 1e6 if is_microseconds else FINE_SCALE)
 
     def text(self) -> str:
-        """Return all arrays as one base64 text."""
+        """Return all arrays, compressed, as one base64 text."""
         return base64.b64encode(zlib.compress(b"".join(self._bytes), 9)).decode()

@@ -246,7 +246,7 @@ const Explore = (async () => {
   // ------------------------------------------------------------------ card and table
   const card = Card.start(ranges, Practice.suffix);
   function effect({ axis, numbers: kf }) {
-    const value = (now, before) => `KF ${Card.formatMetres(now)}${before ? ` (as analysed ${Card.formatMetres(before)})` : ""}`;
+    const value = (now, before) => `KF ${Card.formatMetres(now)}${before ? ` (original settings: ${Card.formatMetres(before)})` : ""}`;
     const before = axis.name === flight.main ? analysedNumbers : null;
     if (kf?.truthP) {
       const { truthP } = ekf2Of(axis);
@@ -299,7 +299,7 @@ const Explore = (async () => {
       row.hidden = (left ?? right) === undefined && i > 4;
     });
     const missing = [];
-    if (kf === null) missing.push("KF is not evaluated: the segment has too few measurements.");
+    if (kf === null) missing.push("KF is not evaluated: the analysed time span has too few measurements.");
     if (ekf2.why) missing.push(`EKF2 is not evaluated: ${ekf2.why}.`);
     if (isText(axis.truth)) missing.push(`Ground truth is missing: ${axis.truth}.`);
     $("why").textContent = missing.join(" ");
@@ -445,7 +445,7 @@ const Explore = (async () => {
   const keys = { n: stepper.next, p: stepper.previous, " ": () => { open("step"); stepper.play(); } };
   const times = Times.start({ flight, model, setSource, timeRange, figures, redraw, keys });
   for (const [name, value] of Object.entries(flight.flown)) $("flown").append(make("dt", name), make("dd", value));
-  if (!Object.keys(flight.flown).length) $("flown").append(make("dt", "The log contains none of the EKF2 parameters of this source."));
+  if (!Object.keys(flight.flown).length) $("flown").append(make("dt", "The log does not contain the EKF2 parameters for noise, delay and gate of the position source."));
   addEventListener("hashchange", () => { fromAddress(); axisShown = null; show(); });
   open(view, false);
   fromAddress();

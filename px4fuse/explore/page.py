@@ -1,4 +1,4 @@
-"""Explore page as one HTML file: Bokeh, data of the flight, KF in JavaScript, user interface."""
+"""Interactive web page (one HTML file) with the data of a flight, KF in JavaScript, and Bokeh."""
 
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -10,18 +10,18 @@ from px4fuse.explore.data import PageData, flight_data, ranges
 from px4fuse.explore.figures import FIGURES, document_json, has_reference
 from px4fuse.explore.packing import Packer
 from px4fuse.html.safe import clean_values, csp_hash, inert_json, load_template, read_asset
-from px4fuse.report.card_html import axis_figures, card_html, card_of, card_style
+from px4fuse.report.card_html import card_css, card_html, make_diagnosis_card, sigma_ratio_figures
 
-# Maximum length (characters) of a text from a log on the explore page
+# Maximum length (characters) of a text from a log on the web page
 MAX_LOG_TEXT_LENGTH = 2000
 SCRIPT_NAMES = ("card", "step", "times")
 PACKAGE = "px4fuse.explore"
 
 
 def html_text(analysis: Analysis) -> str:
-    """Make the explore page (HTML) of an analysis."""
+    """Make the interactive web page (HTML) of an analysis."""
     packer = Packer()
-    data, card = flight_data(analysis, packer), card_of(analysis)
+    data, card = flight_data(analysis, packer), make_diagnosis_card(analysis)
     identity = card.identity
     return page_text(
         data,
@@ -36,14 +36,19 @@ def html_text(analysis: Analysis) -> str:
 
 def data_scripts(data: PageData, analysis: Analysis, packer: Packer, suffix: str = "") -> str:
     """Return HTML elements with the data of one flight; ``suffix`` makes their ids unique."""
-    document, places = document_json(data)
-    content = {"flight": data, "ranges": ranges(), "packed": packer.array_specs, "places": places}
-    figures = f'<template id="figures{suffix}">{axis_figures(analysis)}</template>\n'
+    bokeh_document, name_by_plot_id = document_json(data)
+    content = {
+        "flight": data,
+        "ranges": ranges(),
+        "packed": packer.array_specs,
+        "places": name_by_plot_id,
+    }
+    figures = f'<template id="figures{suffix}">{sigma_ratio_figures(analysis)}</template>\n'
     return figures + "\n".join(
         f'<script type="{kind}" id="{name}{suffix}">{text}</script>'
         for name, kind, text in (
             ("content", "application/json", inert_json(clean_values(content, MAX_LOG_TEXT_LENGTH))),
-            ("document", "application/json", inert_json(document)),
+            ("document", "application/json", inert_json(bokeh_document)),
             ("arrays", "text/plain", packer.text()),
         )
     )
@@ -57,22 +62,24 @@ def page_text(
     choices: Mapping[str, str] = {},
     **fields: object,
 ) -> str:
-    """Make the HTML page of one flight, or of a practice set.
+    """Make the web page (HTML) of one flight, or of a quiz with several flights.
 
     Parameters
     ----------
     data : dict
         Data of one of the flights.
+    command : str
+        Command of px4fuse that makes the page.
+    sha256 : str
+        SHA-256 of the log.
     choices : mapping
-        Answers of a practice set and their texts.
+        Answers of the quiz and their texts; empty without a quiz.
     fields
-        Fields of ``page.html``: title, description ("about"), elements with the data of each flight
-        (:func:`data_scripts`), and the diagnosis card (HTML) or the number of flights.
+        Further fields of the template ``page.html``.
     """
     practice = "practice" if choices else "no_practice"
     scripts_by_name = {
-        # the core of BokehJS, without widgets, tables and formulas; the second script only sets
-        # the log level
+        # BokehJS without widgets, tables and formulas; the second script only sets the log level
         "bokeh": Resources(mode="inline", components=["bokeh"]).js_raw[0],
         "engine": read_asset("engine.js", PACKAGE),
         "script": read_asset("dom.js")
@@ -82,7 +89,7 @@ def page_text(
         {f"{name}_hash": csp_hash(text) for name, text in scripts_by_name.items()},
         **scripts_by_name,
         style="".join(map(read_asset, ("colours.css", "base.css")))
-        + card_style()
+        + card_css()
         + read_asset("page.css", PACKAGE),
         command=command,
         made_from=f"px4fuse {command} {sha256}".rstrip(),

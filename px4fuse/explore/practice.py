@@ -1,6 +1,6 @@
-"""Practice page: simulated flights with injected faults that the student has to identify.
+"""Quiz page (``px4fuse practice``): simulated flights whose injected faults the user must find.
 
-The page contains the right answers, compressed so that students do not read them by accident.
+The page contains the right answers, compressed so that users do not read them by accident.
 """
 
 import base64
@@ -26,10 +26,10 @@ from px4fuse.findings import Finding
 from px4fuse.report.card_html import card_html
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import Scenario
 
-# Pairs of quiz answers whose injected faults do not hide each other in one flight
+# Pairs of faults (as answers of the quiz) that do not hide each other in one flight
 COMBINABLE_CHOICES = (
     {"clock", "source"},
     {"clock", "gate"},
@@ -39,8 +39,8 @@ COMBINABLE_CHOICES = (
 MAX_LEVEL = 3
 MAX_SEED = 2**32 - 1
 SIGMA_A_M_S2, SIGMA_Z_M = 0.10, 0.10
-# Scenario of the simulated flights: less than a minute, with two turns. Large IMU errors would
-# resemble a time offset or a misaligned position frame
+# Settings of the simulated flights: less than a minute, with two turns. IMU errors are small,
+# because large errors resemble a time offset or a misaligned position frame
 SCENARIO_VALUES: dict[str, Any] = {
     "passes": 3,
     "speed_m_s": 1.5,
@@ -52,72 +52,72 @@ SCENARIO_VALUES: dict[str, Any] = {
 }
 # Range of the random length (m) of a pass along the aisle
 AISLE_LENGTH_RANGE_M = (8.0, 12.0)
-# Id of the finding that reports the time of an injected fault, by name of the fault
-FINDING_ID_BY_MISTAKE = {
+# Id of the finding that detects an injected fault, by name of the fault
+FINDING_ID_BY_FAULT = {
     "nlos": "source_outliers",
     "jump": "source_position_jump",
     "dropout": "source_gap",
 }
-# Name of the injected fault "SIGMA_Z of KF is too small", a wrong setting of KF
+# Fault of the KF settings, not of the simulated flight: too small measurement noise
 NOISY_UWB = "noisy-uwb"
 
 
-class HiddenMistake(Record):
-    """Injected fault in a practice flight.
+class QuizFault(Record):
+    """Injected fault that the user has to find.
 
     Attributes
     ----------
     choice : str
-        Right answer, a key of :data:`FAULT_CHOICES`.
-    mistake : str
-        Name in :data:`px4fuse.simulation.mistakes.MISTAKES`, or :data:`NOISY_UWB`.
+        Right answer of the quiz.
+    name : str
+        Name of the fault in ``px4fuse simulate --mistake``, or :data:`NOISY_UWB`.
     sizes : tuple of str
         Size at each level of difficulty, as in ``px4fuse simulate --mistake``.
     view : str
-        Tab of the page that shows the fault.
+        Tab of the web page that shows the fault.
     """
 
     choice: str
-    mistake: str
+    name: str
     sizes: tuple[str, str, str]
-    fault: str
+    description: str
     symptom: str
     size_text: str = "{0}"
     view: str = "errors"
     has_either_sign: bool = False
 
 
-class MistakeTable(Record):
-    """Answers of the quiz with their texts, and the injected faults (``practice.toml``)."""
+class QuizTable(Record):
+    """Answers of the quiz with their texts, and injected faults (``practice.toml``)."""
 
     choices: dict[str, str]
-    mistakes: tuple[HiddenMistake, ...]
+    faults: tuple[QuizFault, ...]
 
 
-_QUIZ = read_toml(__file__, MistakeTable)
-FAULT_CHOICES, HIDDEN_MISTAKES = _QUIZ.choices, _QUIZ.mistakes
+_QUIZ = read_toml(__file__, QuizTable)
+QUIZ_ANSWERS, QUIZ_FAULTS = _QUIZ.choices, _QUIZ.faults
 
 
 @dataclass(frozen=True)
-class PracticeFlight:
-    """Simulated flight of the practice page, with the sizes of its injected faults."""
+class QuizFlight:
+    """Simulated flight of the quiz, with its injected faults and their sizes."""
 
     scenario: Scenario
-    mistakes: tuple[HiddenMistake, ...]
+    faults: tuple[QuizFault, ...]
     sizes: tuple[str, ...]
 
     @property
     def correct_answers(self) -> list[str]:
-        return sorted({mistake.choice for mistake in self.mistakes}) or ["nothing"]
+        return sorted({fault.choice for fault in self.faults}) or ["nothing"]
 
 
-def draw_flights(seed: int, level: int, count: int) -> tuple[PracticeFlight, ...]:
-    """Draw random practice flights, in which all faults are equally frequent.
+def draw_flights(seed: int, level: int, count: int) -> tuple[QuizFlight, ...]:
+    """Choose the faults of all simulated flights at random; all faults are equally frequent.
 
     Parameters
     ----------
     seed : int
-        Random seed; the same seed, level and count give the same flights.
+        Seed of the random numbers.
     level : {1, 2, 3}
         Difficulty: one large fault (1), one smaller fault (2), or up to two small faults (3).
     count : int
@@ -126,23 +126,23 @@ def draw_flights(seed: int, level: int, count: int) -> tuple[PracticeFlight, ...
     rng = np.random.default_rng([seed, level, count])
     right_answers: list[str] = []
     while len(right_answers) < count:
-        right_answers += [str(name) for name in rng.permutation(list(FAULT_CHOICES))]
+        right_answers += [str(name) for name in rng.permutation(list(QUIZ_ANSWERS))]
     return tuple(_draw_flight(rng, answer, level) for answer in right_answers[:count])
 
 
-def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> PracticeFlight:
-    def draw_one(candidates: list[HiddenMistake]) -> list[HiddenMistake]:
+def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> QuizFlight:
+    def draw_one(candidates: list[QuizFault]) -> list[QuizFault]:
         return [candidates[rng.integers(len(candidates))]] if candidates else []
 
-    mistakes = draw_one([mistake for mistake in HIDDEN_MISTAKES if mistake.choice == right_answer])
-    if level == MAX_LEVEL and mistakes and rng.random() < 0.5:
-        pairs = ((mistake, {mistake.choice, right_answer}) for mistake in HIDDEN_MISTAKES)
-        mistakes += draw_one([mistake for mistake, pair in pairs if pair in COMBINABLE_CHOICES])
+    faults = draw_one([fault for fault in QUIZ_FAULTS if fault.choice == right_answer])
+    if level == MAX_LEVEL and faults and rng.random() < 0.5:
+        candidates = ((fault, {fault.choice, right_answer}) for fault in QUIZ_FAULTS)
+        faults += draw_one([fault for fault, pair in candidates if pair in COMBINABLE_CHOICES])
     sizes, noise_m = [], SIGMA_Z_M
-    for mistake in mistakes:
-        sign = "-" if mistake.has_either_sign and rng.random() < 0.5 else ""
-        sizes.append(f"{sign}{mistake.sizes[level - 1]}")
-        if mistake.mistake == NOISY_UWB:
+    for fault in faults:
+        sign = "-" if fault.has_either_sign and rng.random() < 0.5 else ""
+        sizes.append(f"{sign}{fault.sizes[level - 1]}")
+        if fault.name == NOISY_UWB:
             noise_m = float(sizes[-1])
     scenario = Scenario(
         **SCENARIO_VALUES,
@@ -151,7 +151,7 @@ def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> Pra
         sigma_uwb_m=noise_m,
         seed=int(rng.integers(MAX_SEED)),
     )
-    return PracticeFlight(scenario, tuple(mistakes), tuple(sizes))
+    return QuizFlight(scenario, tuple(faults), tuple(sizes))
 
 
 def practice_text(
@@ -160,7 +160,7 @@ def practice_text(
     count: int,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> str:
-    """Simulate the flights of :func:`draw_flights`, and return the practice page (HTML).
+    """Simulate and analyse ``count`` flights, and return the quiz page (HTML).
 
     ``progress`` is called with a text, the number of finished flights, and the number of flights.
     """
@@ -177,24 +177,22 @@ def practice_text(
         title="simulated flights with known faults",
         about=f"seed {seed}, level {level}",
         flight_count=count,
-        choices=FAULT_CHOICES,
+        choices=QUIZ_ANSWERS,
     )
 
 
-def _flight_data(practice_flight: PracticeFlight, flight_index: int) -> tuple[dict[str, Any], str]:
-    mistakes_and_sizes = [*zip(practice_flight.mistakes, practice_flight.sizes, strict=True)]
+def _flight_data(practice_flight: QuizFlight, flight_index: int) -> tuple[dict[str, Any], str]:
+    faults_and_sizes = [*zip(practice_flight.faults, practice_flight.sizes, strict=True)]
     options = [
-        f"{mistake.mistake}={size}"
-        for mistake, size in mistakes_and_sizes
-        if mistake.mistake != NOISY_UWB
+        f"{fault.name}={size}" for fault, size in faults_and_sizes if fault.name != NOISY_UWB
     ]
-    simulation = flights.simulate(practice_flight.scenario, parse_mistakes(options))
+    simulation = flights.simulate(practice_flight.scenario, parse_faults(options))
     flight = flights.to_flight(simulation, f"flight {flight_index + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
-    # as_sent: an automatic correction of the frame would hide the injected fault
+    # as_sent: the automatic correction of axes and timestamps would hide the injected fault
     analysis, packer = diagnose(request, flight=flight, as_sent=True), Packer()
     data, card = flight_data(analysis, packer), build_card(analysis, request)
-    descriptions = [_describe_mistake(*pair, analysis.findings) for pair in mistakes_and_sizes]
+    descriptions = [_describe_fault(*pair, analysis.findings) for pair in faults_and_sizes]
     answer_key = {
         "right": practice_flight.correct_answers,
         "mistakes": descriptions,
@@ -208,24 +206,22 @@ def _flight_data(practice_flight: PracticeFlight, flight_index: int) -> tuple[di
     )
 
 
-def _describe_mistake(
-    mistake: HiddenMistake, size: str, findings: tuple[Finding, ...]
-) -> dict[str, Any]:
-    finding_id = FINDING_ID_BY_MISTAKE.get(mistake.mistake)
+def _describe_fault(fault: QuizFault, size: str, findings: tuple[Finding, ...]) -> dict[str, Any]:
+    finding_id = FINDING_ID_BY_FAULT.get(fault.name)
     spans = [span for finding in findings if finding.id == finding_id for span in finding.spans_s]
     time_text = f"{spans[0][0]:.1f} to {spans[-1][1]:.1f} s" if spans else "whole flight"
     return {
-        "fault": mistake.fault,
-        "size": mistake.size_text.format(*size_parts(size)),
+        "fault": fault.description,
+        "size": fault.size_text.format(*size_parts(size)),
         "time": time_text,
-        "symptom": mistake.symptom,
-        "view": mistake.view,
+        "symptom": fault.symptom,
+        "view": fault.view,
         "span": list(spans[0]) if spans else None,
     }
 
 
 def size_parts(size: str) -> list[str]:
-    """Split the size of an injected fault at commas, and add a blank before each unit.
+    """Split the size of an injected fault at commas, and separate numbers and units by blanks.
 
     >>> size_parts("5%,2m"), size_parts("-400ms"), size_parts("0.3")
     (['5 %', '2 m'], ['-400 ms'], ['0.3'])
@@ -236,7 +232,7 @@ def size_parts(size: str) -> list[str]:
 def _with_fault_headline(card: Card, descriptions: Sequence[Mapping[str, Any]]) -> Card:
     if card.causes or not descriptions:
         return card
-    fault_text = "; ".join(f"{mistake['fault']}: {mistake['size']}" for mistake in descriptions)
+    fault_text = "; ".join(f"{fault['fault']}: {fault['size']}" for fault in descriptions)
     return structs.replace(
         card,
         severity="warning",

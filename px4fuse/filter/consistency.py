@@ -1,6 +1,6 @@
-"""Consistency of innovations with their reported variance: NIS, bias and whiteness.
+"""Tests of innovations against the innovation variance that KF or EKF2 reports.
 
-The same functions evaluate KF and EKF2.
+The tests are the mean NIS, the mean innovation (bias), and the autocorrelation (whiteness).
 
 Definitions: Bar-Shalom, Li and Kirubarajan (2001), Estimation with Applications to Tracking and
 Navigation, section 5.4; Ljung and Box (1978), Biometrika 65(2).
@@ -24,26 +24,26 @@ from px4fuse.core.record import (
 )
 from px4fuse.core.text import count_noun
 
-# Consistency of a filter: "underconfident" if its reported σ is too large, "overconfident" if it is
-# too small
-Verdict = Literal["consistent", "underconfident", "overconfident"]
+# Result of a consistency test: "underconfident" if the reported σ is too large, "overconfident" if
+# it is too small
+SigmaVerdict = Literal["consistent", "underconfident", "overconfident"]
 
-Interval = tuple[float, float]
-# Minimum number of innovations for a test of consistency; the 95 % band of their NIS is 0.3 to 2.1
+Limits = tuple[float, float]
+# Minimum number of innovations in a consistency test: the 95 % band of their mean NIS is 0.3 to 2.1
 MIN_INNOVATIONS = 10
 CONFIDENCE_LEVEL = 0.95
 # Number of lags of the Ljung-Box whiteness test
 LJUNG_BOX_LAGS = 10
-# A filter is consistent if the ratio of actual to reported σ is in this range. The range for ground
-# truth is wider, because EKF2's σ excludes the lag of its output predictor
+# Range of the ratio of actual to reported σ in which a filter is consistent. For errors against
+# ground truth it is wider, because EKF2's σ excludes the lag of its output predictor
 Reference = Literal["source", "truth"]
-CONSISTENT_RATIOS: Mapping[Reference, Interval] = {"source": (0.8, 1.25), "truth": (0.67, 1.5)}
+CONSISTENT_RATIOS: Mapping[Reference, Limits] = {"source": (0.8, 1.25), "truth": (0.67, 1.5)}
 # Innovation gate (√S) for KF and for logs without a gate parameter: default of EKF2_EVP_GATE
 DEFAULT_GATE = 5.0
 
 
 class NisVerdict(Record, kw_only=True):
-    """Mean NIS with its 95 % band, and the consistency verdict on the reported σ.
+    """Mean NIS with its 95 % band, and the classification of the filter as consistent or not.
 
     Attributes
     ----------
@@ -59,11 +59,11 @@ class NisVerdict(Record, kw_only=True):
     nis_mean: Positive
     nis_band: tuple[NotNegative, NotNegative]
     sigma_ratio: Positive
-    verdict: Verdict
+    verdict: SigmaVerdict
 
     @property
     def sigma_error_factor(self) -> float:
-        """Factor, at least 1, between reported and actual σ."""
+        """Ratio of reported and actual σ, the larger over the smaller: at least 1."""
         return float(max(self.nis_mean, 1.0 / self.nis_mean) ** 0.5)
 
 
@@ -103,16 +103,16 @@ class HorizontalNis(NisVerdict, kw_only=True):
     """
 
 
-def nis_band(count: int, dimensions: int = 1) -> Interval:
-    """Return the two-sided 95 % band of the mean of ``count`` NIS values, per dimension.
+def nis_band(count: int, dimensions: int = 1) -> Limits:
+    """Return the two-sided 95 % chi-square band of the mean of ``count`` NIS values.
 
-    The expected mean is 1 for any number of ``dimensions``.
+    Each NIS is divided by its number of ``dimensions``, so that the expected mean is 1.
 
     >>> low, high = nis_band(128, 2)
     >>> round(2 * low, 2), round(2 * high, 2)
     (1.67, 2.36)
     """
-    # half of the sum of all NIS has a gamma distribution with this shape parameter
+    # Half of the sum of all NIS values has a gamma distribution with this shape parameter
     gamma_shape = 0.5 * count * dimensions
     low, high = (
         float(gammaincinv(gamma_shape, (1 + sign * CONFIDENCE_LEVEL) / 2)) / gamma_shape
@@ -122,12 +122,12 @@ def nis_band(count: int, dimensions: int = 1) -> Interval:
 
 
 def classify_sigma_ratio(
-    ratio: float, reference: Reference, interval: Interval | None = None
-) -> Verdict:
-    """Return the consistency verdict on a ratio of actual to reported σ.
+    ratio: float, reference: Reference, interval: Limits | None = None
+) -> SigmaVerdict:
+    """Classify a filter by the ratio of its actual to its reported σ.
 
-    The filter is consistent inside :data:`CONSISTENT_RATIOS`, or if the 95 % ``interval`` of the
-    ratio contains 1.
+    The filter is consistent if the ratio is inside :data:`CONSISTENT_RATIOS`, or if the 95 %
+    ``interval`` of the ratio contains 1.
     """
     low, high = CONSISTENT_RATIOS[reference]
     if low <= ratio <= high or (interval is not None and interval[0] <= 1.0 <= interval[1]):
@@ -135,12 +135,12 @@ def classify_sigma_ratio(
     return "overconfident" if ratio > 1.0 else "underconfident"
 
 
-def sigma_ratio_interval(nis_mean: float, band: Interval) -> Interval:
+def sigma_ratio_interval(nis_mean: float, band: Limits) -> Limits:
     """Return the 95 % interval of √(mean NIS)."""
     return (nis_mean / band[1]) ** 0.5, (nis_mean / band[0]) ** 0.5
 
 
-def classify_mean_nis(nis_mean: float, band: Interval) -> Verdict:
+def classify_mean_nis(nis_mean: float, band: Limits) -> SigmaVerdict:
     return classify_sigma_ratio(nis_mean**0.5, "source", sigma_ratio_interval(nis_mean, band))
 
 
@@ -159,7 +159,7 @@ def _nis_verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
 def autocorrelation(values: Array, lag_count: int) -> Array:
     """Return the autocorrelation of a series at lags 1 to ``lag_count``: Σ ν(k) ν(k+l) / Σ ν(k)².
 
-    The mean is not subtracted, because ``bias_p`` tests the mean separately.
+    The mean is not subtracted, because another test (``bias_p``) is used for the mean.
     """
     square_sum = float(np.dot(values, values))
     return np.array(
@@ -172,7 +172,7 @@ def assess(
 ) -> Consistency | Unavailable:
     """Test innovations (in time order) against the innovation variances S that the filter reports.
 
-    Return Unavailable with fewer than ten finite innovations. ``gate`` is in √S.
+    ``gate`` is the innovation gate in √S. At least ten finite innovations are needed.
     """
     is_usable = np.isfinite(innovation_m) & (innovation_variance_m2 > 0)
     nu_m = innovation_m[is_usable]
@@ -215,10 +215,9 @@ def assess(
 
 
 def assess_horizontal(north: ArrayPair, east: ArrayPair) -> HorizontalNis | None:
-    """Test the innovations of north and east together; both have the same timestamps.
+    """Test the innovations along north and east together; None if there are fewer than ten.
 
-    ``north`` and ``east`` contain innovations (m) and innovation variances (m²), shape (n,) each.
-    Return None with fewer than ten innovations.
+    ``north`` and ``east`` contain innovations (m) and innovation variances (m²) at equal times.
     """
     is_usable = (north[1] > 0) & (east[1] > 0) & np.isfinite(north[0]) & np.isfinite(east[0])
     nis = np.sum([nu[is_usable] ** 2 / s[is_usable] for nu, s in (north, east)], axis=0)

@@ -8,7 +8,7 @@ Both models are compared with white noise by the likelihood of the positions giv
 - Time-correlated noise: z = p + c + v with c_k = ρ c_(k-1) + √(1 - ρ²) σ_c w. It causes no lag.
   Its fit may shift the timestamps, because a time offset also looks like a lag.
 
-The IMU determines only a lower bound of a τ above a second. With ground truth, τ is fitted to the
+If τ is above 1 s, the IMU determines only a lower bound of τ. With ground truth, τ is fitted to the
 position errors by restricted likelihood (Patterson and Thompson 1971).
 """
 
@@ -31,9 +31,10 @@ from px4fuse.filter.signals import Axis, too_few_measurements
 from px4fuse.flight.model import Flight, Unavailable
 
 MIN_MEASUREMENTS = 100
-# Maximum number of positions in a noise fit; of a longer flight only the middle is used
+# Maximum number of positions in a noise fit. If the flight has more, only its middle is used
 MAX_MEASUREMENTS = 2000
-# The noise of two positions is uncorrelated if their interval exceeds this multiple of the median
+# The noise of two successive positions is uncorrelated if the interval between them exceeds this
+# multiple of the median interval
 MAX_INTERVAL_RATIO = 3.0
 # Time constants (s) in the coarse search for time-correlated noise
 COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
@@ -41,13 +42,13 @@ COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
 COARSE_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
 # Tested multiples of SIGMA_A in the coarse search for time-correlated noise
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
-# Tested common factors on all noises in the coarse search for time-correlated noise
+# In the coarse search for time-correlated noise, all noises are multiplied by these factors
 COARSE_NOISE_FACTORS = np.geomspace(0.7, 1.6, 12)
 # Approximate number of position measurements in the coarse search for time-correlated noise
 COARSE_MEASUREMENTS = 1000
 # Minimum gain of log-likelihood over white noise in the coarse search for which a full fit is run
 MIN_COARSE_GAIN_NATS = 0.5
-# Maximum SIGMA_Z (m) of positions that are probably low-pass filtered
+# Positions with a smaller SIGMA_Z (m) are probably low-pass filtered
 MAX_SMOOTH_SIGMA_M = 0.01
 # Minimum gain of log-likelihood over white noise in the full fit of time-correlated noise
 MIN_GAIN_NATS = 2.0
@@ -57,36 +58,36 @@ OFFSET_PENALTY_NATS = 2.0
 LOW_PASS_TAU_S = (0.02, 3.0)
 # Tolerance of ln τ in the search for the time constant τ of a low pass
 LOG_TAU_TOLERANCE = 0.05
-# Maximum number of fitted position errors against ground truth, which limits the computing time
+# Maximum number of position errors against ground truth in the noise fit, to limit computing time
 MAX_TRUTH_MEASUREMENTS = 300
 # Minimum gain of log-likelihood over white noise in the noise fit to ground truth
 MIN_TRUTH_GAIN_NATS = 5.0
-# Minimum error (m) of a source against ground truth: a copy of the ground truth has rounding errors
+# Positions with smaller errors (m) against ground truth are a copy of the ground truth
 MIN_TRUTH_RESIDUAL_M = 1e-5
-# Maximum time (s) between a measurement and the nearest ground truth: error of 1 cm at 2 m/s²
+# Maximum time (s) from a position to the nearest ground truth sample: error of 1 cm at 2 m/s²
 MAX_TRUTH_DISTANCE_S = 0.1
-# Number of parts of the flight with separate time offsets in the fit to ground truth
+# Number of flight parts that have separate time offsets in the noise fit to ground truth
 OFFSET_PART_COUNT = 12
-# Time constants (s) of the noise that are tested in the fit to ground truth
+# Tested time constants (s) of time-correlated noise in the noise fit to ground truth
 TRUTH_TAUS_S = np.geomspace(0.3, 80.0, 17)
-# Time-correlated fractions of the error variance that are tested in the fit to ground truth
+# Tested time-correlated fractions of the error variance in the noise fit to ground truth
 CORRELATED_FRACTIONS = np.linspace(0.05, 0.999, 20)
 
 
 @dataclass(frozen=True)
 class SourceLowPass:
-    """Low-pass filter of the position source.
+    """Low-pass filter that the position source applied to its positions, as estimated.
 
     Attributes
     ----------
     correlation : float
-        Correlation of the noise of successive positions; 0 without a low pass.
+        Correlation of the noise of successive positions; 0 without a low-pass filter.
     lag_s : float
-        Lag of the positions in steady motion.
+        Lag of the positions at constant velocity.
     gain_nats : float
-        Gain of log-likelihood over white noise.
+        Gain of log-likelihood over the model with white noise.
     sigma_z_m : float
-        Standard deviation of the white noise of a position before the low pass.
+        Standard deviation of the white position noise before the low-pass filter.
     """
 
     correlation: float
@@ -108,7 +109,7 @@ class TimeCorrelatedNoise:
     gain_nats : float
         Gain of log-likelihood over white noise alone.
     low_pass_gain_nats : float
-        Log-likelihood of a low pass minus that of time-correlated noise.
+        Log-likelihood of the model with a low-pass filter minus that with time-correlated noise.
     """
 
     tau_s: float
@@ -139,13 +140,13 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         Axes with the same measurement times.
     settings : Settings
     noises : Noises
-        Initial values: estimates of the model with white noise.
+        Initial values: estimates with white noise.
     outlier_time_s : ndarray
         Timestamps of measurements to exclude.
     clock_offset_s : float
-        Time offset estimated with the white-noise model.
+        Time offset (s) estimated with white noise.
     jumps : sequence of Jump
-        Jumps of the source along ``axes``, to be subtracted.
+        Jumps of the positions along ``axes``, which are subtracted.
     """
     time_s = axes[0].measurement_time_s
     if len(time_s) < MIN_MEASUREMENTS:
@@ -169,13 +170,13 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     motion_cache = MotionCache()
 
     def undo_low_pass(tau_s: float) -> tuple[PreparedMotion | Unavailable, float]:
-        """Return the positions before the low pass, and -ln of the Jacobian of the inverse."""
+        """Return the positions before the low-pass filter, and -ln of the Jacobian Π 1/(1 - ρ)."""
         rho = np.zeros(len(time_s))
         if tau_s:
             rho[is_short_interval] = np.exp(-interval_s[is_short_interval] / tau_s)
         previous_m = np.concatenate([measured_m[:1], measured_m[:-1]])
         unfiltered_m = (measured_m - rho[:, None] * previous_m) / (1.0 - rho)[:, None]
-        # the inverse of the low pass spreads an outlier to the next position, so both are excluded
+        # The inverse filter spreads an outlier to the next position, so both are excluded
         is_used_position = ~(is_outlier | (is_short_interval & np.append(False, is_outlier[:-1])))
         prepared_motion = prepare_motion(
             flight,
@@ -187,7 +188,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         )
         if isinstance(prepared_motion, Unavailable):
             return prepared_motion, 0.0
-        # the likelihood omits the first position of each IMU segment, which is its initial state
+        # The likelihood omits the first position of each IMU segment: it is the initial state
         is_used = np.isin(
             time_s, np.delete(prepared_motion.time_s, prepared_motion.segment_edges[:-1])
         )
@@ -225,24 +226,24 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
                 (_fit_noises_at(prepared_motion, offset, start_noises), offset)
                 for offset in tested_offsets_s
             ),
-            key=lambda fit_and_offset: fit_and_offset[0].lowest_score,
+            key=lambda fit_and_offset: fit_and_offset[0].compute_score(),
         )
         for start_noises in (noises, correlated_start)
     )
-    white_full_score = white_fit.lowest_score
-    correlated_score = correlated_fit.lowest_score
-    # time-correlated noise explains much of the effect of a low pass, so a low pass is only fitted
-    # if time-correlated noise is significant, or the positions are too smooth for white noise
+    white_full_score = white_fit.compute_score()
+    correlated_score = correlated_fit.compute_score()
+    # A low-pass filter also looks like time-correlated noise. It is only fitted if time-correlated
+    # noise is significant, or if the positions are too smooth for white noise
     is_correlated = white_full_score - correlated_score >= MIN_GAIN_NATS
     if not (is_correlated or is_smooth):
         return source_low_pass, no_correlation
 
     def fit_low_pass(log_tau: float) -> tuple[float, Noises]:
         prepared_motion, jacobian_term = undo_low_pass(float(np.exp(log_tau)))
-        # prepare_motion succeeded with the same measurement times before
+        # Without low-pass filter, prepare_motion was successful at these measurement times
         assert not isinstance(prepared_motion, Unavailable)
         noise_fit = _fit_noises_at(prepared_motion, 0.0, white_fit.noises)
-        return noise_fit.lowest_score + jacobian_term, noise_fit.noises
+        return noise_fit.compute_score() + jacobian_term, noise_fit.noises
 
     low_log_tau, high_log_tau = np.log(LOW_PASS_TAU_S)
     log_tau = minimize_scalar(
@@ -283,8 +284,9 @@ def fit_time_correlation_to_truth(
 ) -> TimeCorrelatedNoise | Unavailable:
     """Fit time-correlated noise to the position errors against ground truth.
 
-    Frame errors and time offsets are removed from the errors first. ``imu_fit`` and ``low_pass``
-    are the results of :func:`fit_time_correlation`; return ``imu_fit`` if its gain is larger.
+    Frame errors and time offsets are removed from the errors. ``imu_fit`` and ``low_pass`` are the
+    results of :func:`fit_time_correlation`. ``imu_fit`` is returned if its gain of log-likelihood
+    is larger.
     """
     min_gain_nats = MIN_TRUTH_GAIN_NATS
     low_pass_gain_nats = low_pass.gain_nats
@@ -326,7 +328,7 @@ def fit_time_correlation_to_truth(
     ]
     residuals = residual_basis.T @ (measured_m - true_m)
     if np.abs(residuals).max() < MIN_TRUTH_RESIDUAL_M:
-        return imu_fit  # the source was logged as ground truth, too
+        return imu_fit  # the log contains the positions a second time, as ground truth
     grid_scores = []
     half_counts = 0.5 * np.array([len(axes), len(residuals)])
     for tested_tau_s in TRUTH_TAUS_S:
@@ -345,7 +347,7 @@ def fit_time_correlation_to_truth(
             np.log(mean_squares).sum(axis=0),
         ]
         grid_scores.append((scores, mean_squares.mean(axis=0)))
-    # both have the shape (time constants, correlated fractions)
+    # Both arrays have the shape (time constants, correlated fractions)
     scores, mean_squares = np.transpose(grid_scores, (1, 0, 2))
     tau_index, fraction_index = divmod(int(np.argmin(scores)), len(CORRELATED_FRACTIONS))
     gains_nats = half_counts[1] * np.log(np.mean(residuals**2, axis=0)).sum() - scores.min(axis=1)
@@ -354,7 +356,7 @@ def fit_time_correlation_to_truth(
     first_tau_index, last_tau_index = np.flatnonzero(gains_nats > gains_nats.max() - PROFILE_DROP)[
         [0, -1]
     ]
-    # the 95 % interval ends between grid points, so the next outer grid points are returned
+    # The 95 % interval of τ ends between two tested values, of which the outer one is returned
     tau_s = np.append(TRUTH_TAUS_S, np.inf)[
         [tau_index, max(first_tau_index - 1, 0), last_tau_index + 1]
     ]
@@ -383,7 +385,7 @@ def _fit_noises_at(
 def _best_of_grid(
     prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidate_noises: Sequence[Noises]
 ) -> tuple[float, Noises]:
-    """Return the lowest -ln p on a coarse grid of time offsets and noises, and these noises."""
+    """Search a coarse grid of time offsets and noises; return the lowest -ln p and its noises."""
     scored_noises = []
     for positions in map(prepared_motion.positions_at_offset, offsets_s):
         for candidate, sigma_a_factor in product(candidate_noises, COARSE_SIGMA_A_FACTORS):
@@ -398,6 +400,6 @@ def _best_of_grid(
                     noises,
                 )
             )
-    lowest_score, scale, noises = min(scored_noises, key=lambda result: result[0])
-    scaled_values = {name: value * scale for name, value in vars(noises).items() if name != "tau_s"}
-    return lowest_score, replace(noises, **scaled_values)
+    lowest_score, factor, noises = min(scored_noises, key=lambda scored: scored[0])
+    best_noises = {name: value * factor for name, value in vars(noises).items() if name != "tau_s"}
+    return lowest_score, replace(noises, **best_noises)

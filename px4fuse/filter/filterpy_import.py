@@ -10,7 +10,7 @@ from typing import Any
 
 
 class _LazyDistribution:
-    """Distribution of scipy.stats, which is imported at the first use of an attribute."""
+    """Distribution of scipy.stats that imports scipy.stats at the first use of an attribute."""
 
     def __init__(self, name: str) -> None:
         self._name = name

@@ -45,6 +45,7 @@ START_OUTLIER_WIDTH = 10.0
 # Maximum fraction of outliers
 MAX_OUTLIER_FRACTION = 0.4
 # While outliers are estimated, SIGMA_Z is limited to this multiple of its estimate from the median
+# squared error
 MAX_SIGMA_Z_RATIO = 1.2
 # Expectation maximisation has converged if no outlier probability changes by more than this
 MAX_PROBABILITY_CHANGE = 0.01
@@ -98,19 +99,19 @@ SEARCH_RANGES = {
 class Likelihood:
     """-ln p of the measurements (without a constant) as a function of the noises.
 
-    For white noise, -ln p is a smooth function of ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z. It is
-    computed at the nodes of a grid and interpolated by polynomials, as exactly as rounding allows.
+    For white noise, -ln p is computed at the nodes of a grid over ln(SIGMA_A/SIGMA_Z) and ln
+    SIGMA_Z, and interpolated by polynomials to the accuracy of rounding.
 
     Parameters
     ----------
     axis_positions : sequence of Positions
-        Positions with one time offset only.
+        Positions with one time offset.
     weight : ndarray, shape (m,)
         Weight of each measurement: its variance is SIGMA_Z² / weight.
     sigma_z_m : float
-        Approximate SIGMA_Z, the unit of all noises.
+        Approximate SIGMA_Z, which all noises are divided by.
     is_coarse : bool
-        True for fewer nodes, if an approximate maximum is sufficient.
+        True for a grid with fewer nodes, if an approximate maximum is sufficient.
     """
 
     def __init__(
@@ -171,9 +172,9 @@ def _barycentric_signs(node_count: int) -> Array:
 
 
 def _interpolation_weights(node_position: float, node_count: int) -> Array:
-    """Return the weights of the values at 0, 1, ... for barycentric interpolation at a position.
+    """Return the weights of the values at nodes 0, 1, ... to interpolate at ``node_position``.
 
-    Berrut and Trefethen (2004).
+    Method: barycentric interpolation, Berrut and Trefethen (2004).
     """
     node_distances = node_position - np.arange(node_count)
     if not node_distances.all():
@@ -189,10 +190,10 @@ def fit_ratios(
     measurement_weights: Array,
     sigma_z_m: float,
 ) -> list[FittedPositions]:
-    """Fit positions for several ratios SIGMA_A / SIGMA_Z (1/s²), in units of SIGMA_Z.
+    """Compute the likelihood of positions for several ratios SIGMA_A / SIGMA_Z (1/s²).
 
-    ``position_batches`` are the same positions with different time offsets; ``random_walk`` is the
-    random walk of the source / SIGMA_Z, per √s.
+    ``position_batches`` contains the positions with different time offsets. ``random_walk`` (1/√s)
+    is the random walk of the source, divided by SIGMA_Z.
     """
     scaled_batches = (
         positions.in_sigma_z_units(sigma_z_m, random_walk, measurement_weights)
@@ -213,7 +214,10 @@ def fit_ratios(
 def fit_noises(
     position_batches: Iterable[Positions], noises: Noises, measurement_weights: Array
 ) -> FittedPositions:
-    """Fit positions with one set of noises; the variance of a measurement is SIGMA_Z² / weight."""
+    """Compute the likelihood of positions for given noises.
+
+    The variance of a measurement is SIGMA_Z² / weight.
+    """
     sigma_z_m = noises.sigma_z_m
     if noises.correlated_sigma_m:
         position_batches = (
@@ -244,7 +248,7 @@ def negative_log_likelihood(
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """Maximum-likelihood noises with the weights of the measurements.
+    """Maximum-likelihood noises, and the outliers among the measurements.
 
     Attributes
     ----------
@@ -254,9 +258,9 @@ class NoiseFit:
     score : Likelihood
         -ln p as a function of the noises.
     sigma_z_variance_factor : float
-        Factor on the variance of ln SIGMA_Z, at least 1, because the outliers are uncertain.
+        Factor (at least 1) by which unknown outliers increase the variance of ln SIGMA_Z.
     outlier_share, outlier_width : float
-        Fraction of outliers, and their σ over SIGMA_Z.
+        Fraction of outliers, and ratio of their σ to SIGMA_Z.
     """
 
     noises: Noises
@@ -267,16 +271,15 @@ class NoiseFit:
     outlier_share: float
     outlier_width: float
 
-    @property
-    def lowest_score(self) -> float:
-        """-ln p at the maximum-likelihood noises."""
+    def compute_score(self) -> float:
+        """Return -ln p at the maximum-likelihood noises."""
         return self.score(self.noises)
 
 
 def filter_positions(kf_input: Preintegrated) -> Positions:
-    """Return KF's measurements and integrated input as Positions with one segment.
+    """Convert KF's measurements and integrated acceleration to Positions with one segment.
 
-    Its unknown constants are the errors of the initial position and velocity.
+    The unknown constants of the segment are the errors of the initial position and velocity.
     """
     measurement_count = len(kf_input.measurement_m)
     prior_precision = np.zeros((measurement_count + 1, 2))
@@ -285,7 +288,7 @@ def filter_positions(kf_input: Preintegrated) -> Positions:
     dp, dv = np.zeros((2, 1, 1, 3, measurement_count))
     dp[0, 0, 0] = kf_input.delta_position_m
     dv[0, 0, 0] = kf_input.delta_velocity_m_s
-    # an initial position or velocity error changes only the first increment
+    # An error of the initial position or velocity changes only the first interval
     dp[0, 0, 1:, 0] = (1.0, kf_input.length_s[0])
     dv[0, 0, 2, 0] = 1.0
     return centre_on_path(
@@ -309,15 +312,15 @@ def maximise_likelihood(
     weight: Array,
     fits_outliers: bool = True,
 ) -> NoiseFit:
-    """Estimate the noises and, if ``fits_outliers`` is True, the outliers by maximum likelihood.
+    """Estimate the noises and the outliers by maximum likelihood.
 
-    A long flight starts from the fit of its first measurements, so that fewer nodes and iterations
-    are sufficient.
+    The initial values for a long flight are estimated from its first measurements, to reduce
+    computing time.
 
     Parameters
     ----------
     axis_positions : sequence of Positions
-        Axes of the same measurements.
+        Positions along each axis, at equal times.
     start_noises : Noises
         Initial values. A random walk or time-correlated noise of zero stays zero.
     weight : ndarray, shape (m,)
@@ -347,13 +350,13 @@ def maximise_likelihood(
         expected_squared_errors_m2, axis_counts = _expected_squared_errors(
             axis_positions, noises, weight
         )
-        # outliers increase the estimated SIGMA_Z, which would hide the outliers; they hardly change
-        # the median
+        # Outliers increase the estimated SIGMA_Z and would hide themselves. They hardly change the
+        # median of the squared errors
         median_square = float(
             np.median(expected_squared_errors_m2 / axis_counts)
             / (chdtri(axis_counts[0], 0.5) / axis_counts[0])
         )
-        # if the median error is above the search range, large errors are noise, not outliers
+        # If the median error is above the search range of SIGMA_Z, large errors are no outliers
         if median_square > SIGMA_Z_SEARCH_M[1] ** 2:
             break
         sigma_z_variance_m2 = min(noises.sigma_z_m**2, MAX_SIGMA_Z_RATIO**2 * median_square)
@@ -406,7 +409,10 @@ def maximise_likelihood(
 
 
 def outlier_probability(axis_positions: Sequence[Positions], fit: NoiseFit, count: int) -> Array:
-    """Return the outlier probability of ``count`` measurements, with the noises of ``fit``."""
+    """Return the probability that each of ``count`` measurements is an outlier.
+
+    Noises and outlier fraction are those of ``fit``.
+    """
     probability = np.zeros(count)
     for _ in range(MAX_COARSE_ITERATIONS):
         weight = 1.0 - probability * (1.0 - fit.outlier_width**-2.0)
@@ -420,7 +426,7 @@ def outlier_probability(axis_positions: Sequence[Positions], fit: NoiseFit, coun
 def _expected_squared_errors(
     axis_positions: Sequence[Positions], noises: Noises, measurement_weights: Array
 ) -> tuple[Array, Array]:
-    """Return the expected squared error (m²) and the number of axes of each measurement."""
+    """Return for each measurement the expected squared error (m²) and the number of its axes."""
     squares_and_counts = []
     for positions in axis_positions:
         constants = fit_noises([positions], noises, measurement_weights).constants()[:, 0]
@@ -446,7 +452,7 @@ def _outlier_probability(
 def outlier_variance_factor(
     normalised_squares: Array, axis_counts: Array, outlier_probability: Array, outlier_width: float
 ) -> float:
-    """Return the variance of ln SIGMA_Z, relative to its variance with known outliers.
+    """Return the factor by which unknown outliers increase the variance of ln SIGMA_Z.
 
     Observed information = complete information - missing information (Louis 1982), for the
     parameters ln σ, ln width and the log odds of an outlier. ``normalised_squares`` is the squared
@@ -468,8 +474,7 @@ def outlier_variance_factor(
     )
     missing_information = (scores * (outlier_probability * (1.0 - outlier_probability))) @ scores.T
     observed_information = complete_information - missing_information
-    # if the data have hardly any outliers, the information matrix is singular, and the uncertainty
-    # of the outliers is negligible
+    # With hardly any outliers, the information matrix is singular, and their effect is negligible
     if np.linalg.eigvalsh(observed_information)[0] <= 0.0:
         return 1.0
     return max(1.0, sigma_information * float(np.linalg.inv(observed_information)[0, 0]))
@@ -483,10 +488,10 @@ def _maximise_by_gradient(
     measurement_count = len(likelihood.weight)
 
     def score_per_measurement(logs: Array) -> float:
-        # divide by the number of measurements, so that the gradient and the first step are about 1
+        # The score per measurement gives a gradient and a first step of about 1
         try:
             return likelihood(to_noises(logs)) / measurement_count
-        # where rounding errors dominate, a large value makes L-BFGS-B shorten its step
+        # If rounding errors dominate, a large value makes L-BFGS-B shorten its step
         except np.linalg.LinAlgError:
             return UNCOMPUTABLE_SCORE
 

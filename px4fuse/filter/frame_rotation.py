@@ -1,11 +1,11 @@
 """Misalignment in yaw between the position source's frame and EKF2's heading, over the flight.
 
-Indoors a disturbed magnetometer may rotate EKF2's heading by tens of degrees within one flight, so
-the misalignment is estimated for each part of the flight:
+Indoors, a disturbed magnetometer may rotate EKF2's heading by tens of degrees within one flight.
+The misalignment is therefore estimated for each part of the flight:
 
-- If the source measures an orientation, its heading is compared with EKF2's heading.
-- Otherwise the heading is integrated from the gyroscopes, and its error in each part is estimated
-  from positions and acceleration (:mod:`px4fuse.filter.imu_motion`).
+- If the position source measures an orientation, its heading is compared with EKF2's heading.
+- Otherwise the heading is integrated from the gyroscopes. Its error in each part of the flight is
+  estimated from positions and acceleration (:mod:`px4fuse.filter.imu_motion`).
 
 A chi-square test decides if the misalignment changes.
 """
@@ -43,21 +43,21 @@ MIN_FLIGHT_PARTS = 3
 MIN_MEASUREMENTS = 50
 # Minimum number of orientation samples in a flight part
 MIN_PART_SAMPLES = 3
-# Maximum number of positions for the heading error; longer tracks are downsampled
+# Maximum number of positions in the estimate of the heading error; more are downsampled
 MAX_MEASUREMENTS = 1000
 # The heading error changes in flight if the p-value of a constant error is below this limit
 MAX_DRIFT_P_VALUE = 0.002
 # Minimum reported change (°) of the heading error in flight
 MIN_DRIFT_DEG = 5.5
-# Headings are compared below this yaw rate (°/s): a delay of 0.2 s then causes an error of 2°
+# Headings are compared only below this yaw rate (°/s), at which a delay of 0.2 s causes 2° error
 MAX_YAW_RATE_DEG_S = 10.0
 # Minimum σ (°) of a heading difference between source and EKF2
 MIN_SIGMA_DEG = 0.5
 # Maximum median interval (s) between logged attitudes for estimating the heading error
 MAX_ATTITUDE_INTERVAL_S = 0.11
-# Maximum number of linearisations in the fit of the heading error
+# Maximum number of iterations in the fit of the heading error
 MAX_LINEARISATIONS = 5
-# The linearised fit has converged if the heading error changes by less than this (rad)
+# The fit has converged if an iteration changes the heading error by less than this angle (rad)
 MAX_CONVERGED_CHANGE_RAD = 0.01
 # Prior σ (rad) of the heading error
 HEADING_SIGMA_RAD = 1.0
@@ -77,12 +77,12 @@ class HeadingPart(Record):
 
 
 class HeadingError(Record):
-    """Misalignment in yaw between the source's frame and the logged attitude.
+    """Misalignment in yaw between the position source's frame and the logged attitude.
 
     Attributes
     ----------
     misalignment_deg, sigma_deg : float
-        Mean over the flight, and its σ; the errors of all parts are correlated.
+        Mean over the flight, and its σ.
     drifts : bool
         True if the angle changes significantly and by at least ``MIN_DRIFT_DEG``.
     parts : tuple of HeadingPart
@@ -100,9 +100,8 @@ class HeadingError(Record):
     drift_p: Share
     by: Literal["orientation", "positions"]
 
-    @property
-    def ends(self) -> tuple[HeadingPart, HeadingPart]:
-        """Parts with the smallest and the largest angle, in time order."""
+    def find_ends(self) -> tuple[HeadingPart, HeadingPart]:
+        """Return flight parts with the smallest and the largest misalignment, in time order."""
         angles_deg = [heading_part.heading_error_deg for heading_part in self.parts]
         first_index, last_index = sorted((int(np.argmin(angles_deg)), int(np.argmax(angles_deg))))
         return self.parts[first_index], self.parts[last_index]
@@ -130,7 +129,7 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     sigma_z_m: float,
     offset_s: float = 0.0,
 ) -> HeadingError | Unavailable:
-    """Estimate the misalignment in yaw between the source's frame and the logged attitude.
+    """Estimate the misalignment in yaw between the position source's frame and the attitude.
 
     Parameters
     ----------
@@ -171,8 +170,8 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     ]
     position_samples = position_samples.set_axis(position_samples.index.to_numpy() + offset_s)
     noises = Noises(settings.sigma_a_m_s2, sigma_z_m)
-    # the mounting angle of the source is unknown: orientations only show that the misalignment is
-    # constant
+    # The mounting angle of the source is unknown, so orientations do not give the misalignment.
+    # They show only that it is constant
     return _estimate_from_positions(
         flight,
         position_samples,
@@ -183,12 +182,12 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
 
 
 def _mean_per_part(time_s: Array, rotation_rad: Array, sigma_rad: Array) -> tuple[HeadingPart, ...]:
-    """Average rotation and σ (rad) over parts of equal duration; convert to degrees.
+    """Average yaw misalignment and σ (rad) over flight parts of equal duration.
 
-    Parts with fewer than ``MIN_PART_SAMPLES`` samples are omitted. Errors are correlated, so σ of
-    a mean is the RMS of the samples' σ.
+    Parts with fewer than ``MIN_PART_SAMPLES`` samples are omitted. The errors in one part are
+    correlated, so σ of the mean is the RMS of the samples' σ.
     """
-    # parts of a long, downsampled track may exceed PART_LENGTH_S, to contain enough samples
+    # If samples are rare, parts are longer than PART_LENGTH_S, to contain enough samples
     part_count = max(
         int(min((time_s[-1] - time_s[0]) / PART_LENGTH_S, len(time_s) / (2 * MIN_PART_SAMPLES))), 1
     )
@@ -213,7 +212,7 @@ def heading_rad(quaternions: pd.DataFrame) -> Array:
 def _compare_orientations(
     attitude: pd.DataFrame, orientation: pd.DataFrame, segment: Segment, offset_s: float
 ) -> HeadingError | None:
-    """Compare the source's heading with EKF2's logged heading; None with too few samples."""
+    """Compare the position source's heading with EKF2's; None with too few samples."""
     orientation_samples = cut_to_segment(orientation, segment)
     time_s = orientation_samples.index.to_numpy() + offset_s
     attitude_time_s = attitude.index.to_numpy()
@@ -225,12 +224,12 @@ def _compare_orientations(
     yaw_rad = np.interp(time_s, attitude_time_s, heading_rad(attitude))
     rotation_rad = source_yaw_rad - yaw_rad
     rotation_rad -= 2.0 * np.pi * np.round(np.median(rotation_rad) / (2.0 * np.pi))
-    is_calm = np.abs(np.gradient(yaw_rad, time_s)) < np.radians(MAX_YAW_RATE_DEG_S)
-    if np.count_nonzero(is_calm) < MIN_FLIGHT_PARTS * MIN_PART_SAMPLES:
+    has_low_yaw_rate = np.abs(np.gradient(yaw_rad, time_s)) < np.radians(MAX_YAW_RATE_DEG_S)
+    if np.count_nonzero(has_low_yaw_rate) < MIN_FLIGHT_PARTS * MIN_PART_SAMPLES:
         return None
-    time_s = time_s[is_calm]
-    rotation_rad = rotation_rad[is_calm]
-    # σ from the median difference of successive samples
+    time_s = time_s[has_low_yaw_rate]
+    rotation_rad = rotation_rad[has_low_yaw_rate]
+    # Robust σ from the median absolute difference of successive samples
     noise_rad = 1.4826 * np.median(np.abs(np.diff(rotation_rad))) / np.sqrt(2.0)
     sigma_rad = np.full(len(time_s), max(float(noise_rad), np.radians(MIN_SIGMA_DEG)))
     part_headings = _mean_per_part(time_s, rotation_rad, sigma_rad)
@@ -281,12 +280,12 @@ def _estimate_from_positions(
             return Unavailable(
                 "heading error",
                 "the longest part of the flight without an IMU gap is shorter than "
-                f"{MIN_POSITION_PART_S:g} sine",
+                f"{MIN_POSITION_PART_S:g} s",
                 "Analyse a longer segment.",
             )
         part_positions = motion.positions_at_offset(0.0)
-        # use the path without IMU noise as sensitivity to the heading: noise would bias the
-        # estimate to zero (errors in variables)
+        # The sensitivity to the heading is the smoothed path: IMU noise in the sensitivity would
+        # bias the estimate towards zero (errors in variables)
         for increments in (part_positions.delta_position_m, part_positions.delta_velocity_m_s):
             north_m, east_m = increments[:, :, -1]
             increments[:, :, HEADING_ERROR_INDEX] = -east_m, north_m
@@ -296,7 +295,7 @@ def _estimate_from_positions(
         fitted_positions = fit_noises([part_positions], noises, motion.weight)
         constants = fitted_positions.constants()[is_long, 0]
         constant_covariance = np.linalg.inv(fitted_positions.information())[is_long, 0]
-        # the sensitivity to heading is computed from positions: divide by their estimated scale
+        # The sensitivity is from positions, so the result is divided by their estimated scale
         position_scale = np.maximum(1.0 + constants[:, -1], MIN_POSITION_SCALE)
         error_rad = constants[:, HEADING_ERROR_INDEX] / position_scale
         heading_variance = (
@@ -307,10 +306,10 @@ def _estimate_from_positions(
         if abs(step_rad) < MAX_CONVERGED_CHANGE_RAD:
             break
     difference_rad = error_rad - step_rad
-    # the variance of the estimates is that of the true heading error plus that of estimation errors
+    # Variance of the estimates = variance of the true heading errors + estimation variance
     excess_variance = max(float(np.mean(difference_rad**2 - heading_variance)), 0.0)
     drift_variance = 0.0 if has_constant_heading else excess_variance
-    # shrink each estimate towards the mean: the more, the larger its estimation error
+    # An estimate with a large variance is moved towards the mean (shrinkage)
     drift_fraction = drift_variance / (drift_variance + heading_variance)
     rotation_rad = float(np.angle(np.exp(1j * rotation_rad)))
     parts = [

@@ -1,12 +1,12 @@
-"""Biases, scale factor error and jumps that explain the innovations better than noise.
+"""Estimate of biases, scale factor error and jumps from KF's innovations.
 
-KF is linear, so an error of the measurements or of the acceleration adds its response to the
-innovations. The response to a unit error is a column of a design matrix. Least squares, weighted by
-S, estimates all errors together (generalised likelihood ratio, Willsky and Jones 1976):
-accelerometer biases, a rotation of the frame, a slow tilt error and jumps.
+KF is linear: an error of the positions or of the acceleration adds its response to the innovations.
+The response to an error of size 1 is a column of a design matrix. Least squares, weighted by S,
+estimates all errors together (generalised likelihood ratio, Willsky and Jones 1976): accelerometer
+biases, a rotation of the frame, a slow tilt error and jumps of the positions.
 
-A scale factor also multiplies the noise of the acceleration, which would bias the regression
-(errors in variables). It is therefore found by fits with several scales (Deming 1943).
+A scale factor also multiplies the acceleration noise, which would bias the regression (errors in
+variables). The scale factor is therefore found by fits with several scale factors (Deming 1943).
 """
 
 from __future__ import annotations
@@ -41,34 +41,34 @@ ANALYSIS_NAME = "biases, scale factor error and jumps"
 MIN_MEASUREMENTS = 50
 # Prior σ (rad) of the slow tilt error of the logged attitude
 TILT_SIGMA_RAD = 0.002
-# Interval (s) between the knots of the linearly interpolated slow acceleration error
+# Interval (s) between the knots of the slow acceleration error, which is piecewise linear
 KNOT_SPACING_S = 15.0
 MAX_KNOTS = 40
 # Columns of the design matrix: accelerometer bias forward, accelerometer bias right, frame rotation
 FORWARD, RIGHT, ROTATION = range(3)
 CONSTANT_COUNT = 3
-# Tested multiples of KF's SIGMA_A: with biases and tilt fitted, the acceleration noise is smaller
+# Tested multiples of KF's SIGMA_A. If biases and tilt are estimated, less noise remains
 TESTED_SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 # Tested scale factors of the position source
 SCALE_GRID = np.linspace(0.7, 1.3, 7)
 # Maximum number of times at which a jump of the positions is tested
 MAX_TESTED_TIMES = 800
-# Number of tested jump times per batch, which limits memory
+# Number of jump times that are tested at once, to limit the memory
 STEP_BATCH_SIZE = 40
-# Measurements within this time (s) after a tested jump are ignored: a burst of outliers is no jump
+# Positions within this time (s) after a tested jump are ignored: a burst of outliers is no jump
 OUTLIER_BURST_S = 1.0
-# Outliers within this time (s) after a jump are tested again: they may be shifted positions
+# Outliers within this time (s) after a jump are tested again: the jump may have shifted them
 OUTLIERS_AFTER_STEP_S = 6.0
 # Maximum probability of a false detection of a jump, per flight
 MAX_STEP_FALSE_ALARM_P = 1e-3
-# Maximum probability that a good measurement near a jump is classified as an outlier
+# Probability that a good measurement near a jump is classified as an outlier
 MAX_FALSE_OUTLIER_P = 1e-3
-# Maximum number of candidates for the exact time of a jump
+# Maximum number of tested times when a detected jump is located exactly
 MAX_CANDIDATE_TIMES = 6
 MAX_JUMPS = 3
 # Minimum accelerometer bias (m/s²) that is reported: half of EKF2_ABL_LIM
 MIN_BIAS_M_S2 = 0.2
-# Minimum accelerometer bias, in σ of its estimate, that is reported: false alarm rate 6e-5
+# Minimum ratio of an accelerometer bias to its σ to report it: false alarm rate 6e-5
 MIN_BIAS_SIGMAS = 4.0
 # Minimum number of measurements before and after a jump
 MIN_SIDE_MEASUREMENTS = 8
@@ -84,7 +84,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Jump:
-    """Lasting jump of the positions, with its length along each axis (m) and its test statistic."""
+    """Lasting jump of the positions: time, length along each axis (m), and test statistic χ²."""
 
     time_s: float
     step_m: tuple[Estimate, ...]
@@ -97,16 +97,16 @@ class Jump:
 
 @dataclass(frozen=True)
 class SystematicErrors:
-    """Biases, scale factor error and jumps, fitted to the innovations of horizontal axes.
+    """Biases, scale factor error and jumps, estimated from the innovations of horizontal axes.
 
     Attributes
     ----------
     forward_bias, right_bias : Estimate
-        Accelerometer bias (m/s²). At constant heading, tilt has the same effect.
+        Accelerometer bias (m/s²). At constant heading, a tilt error has an equal effect.
     rotation : Estimate
-        Rotation of the source's frame relative to the attitude (rad, clockwise from above).
+        Yaw of the position source's frame relative to the attitude (rad, clockwise from above).
     scale : Estimate
-        Distances of the source over distances of the IMU, minus 1.
+        Scale factor error: distances from positions over distances from the IMU, minus 1.
     sigma_a_m_s2 : float
         White noise of the acceleration that remains after the fit.
     """
@@ -118,17 +118,16 @@ class SystematicErrors:
     jumps: tuple[Jump, ...]
     sigma_a_m_s2: float
 
-    @property
-    def bias(self) -> Estimate:
-        """Magnitude of the horizontal accelerometer bias (m/s²)."""
+    def compute_bias(self) -> Estimate:
+        """Return the magnitude of the horizontal accelerometer bias (m/s²)."""
         forward, right = self.forward_bias, self.right_bias
         return Estimate(
             math.hypot(forward.value, right.value), math.hypot(forward.sigma, right.sigma)
         )
 
-    @property
-    def has_bias(self) -> bool:
-        return self.bias.value >= max(MIN_BIAS_M_S2, MIN_BIAS_SIGMAS * self.bias.sigma)
+    def has_significant_bias(self) -> bool:
+        bias = self.compute_bias()
+        return bias.value >= max(MIN_BIAS_M_S2, MIN_BIAS_SIGMAS * bias.sigma)
 
 
 def fit_systematic_errors(
@@ -140,9 +139,9 @@ def fit_systematic_errors(
     sigma_z_m: float,
     outlier_time_s: Array,
     clock_offset_s: float,
-    announced_s: Sequence[float] = (),
+    source_resets_s: Sequence[float] = (),
 ) -> SystematicErrors | Unavailable:
-    """Estimate accelerometer biases and scale factor error, and detect jumps of the source.
+    """Estimate accelerometer biases and scale factor error, and detect jumps of the positions.
 
     Parameters
     ----------
@@ -156,8 +155,8 @@ def fit_systematic_errors(
         Timestamps of measurements to exclude.
     clock_offset_s : float
         Time offset added to the timestamps.
-    announced_s : sequence of float
-        Timestamps of jumps that the source announced (``reset_counter``).
+    source_resets_s : sequence of float
+        Timestamps at which the position source reports a reset (``reset_counter``).
     """
     design = make_design_matrix(flight, axes, settings, sigma_z_m, clock_offset_s)
     if isinstance(design, Unavailable):
@@ -168,7 +167,7 @@ def fit_systematic_errors(
     sigma_a_grid = sigma_a_m_s2 * TESTED_SIGMA_A_FACTORS
     sigma_a, design_fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
     jumps, is_skipped = _find_jumps(
-        design, sigma_a, is_skipped, [time_s + clock_offset_s for time_s in announced_s]
+        design, sigma_a, is_skipped, [time_s + clock_offset_s for time_s in source_resets_s]
     )
     if jumps:
         design = replace(
@@ -189,14 +188,17 @@ def fit_systematic_errors(
 def _fit_sigma_a(
     design: DesignMatrix, sigma_a_grid: Array, is_skipped: BoolArray
 ) -> tuple[float, DesignFit]:
-    """Return the maximum-likelihood SIGMA_A on a grid, and the fit with it."""
+    """Return the maximum-likelihood SIGMA_A on a grid, and the least squares fit with it."""
     fit_at = cache(lambda index: design.fit(float(sigma_a_grid[index]), is_skipped))
     best_index = _index_of_minimum(lambda index: fit_at(index).score, len(sigma_a_grid))
     return float(sigma_a_grid[best_index]), fit_at(best_index)
 
 
 def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
-    """Return the index of the minimum of a sequence with one minimum; search from the middle."""
+    """Find the minimum of ``score(0)`` to ``score(count - 1)``, which has no second minimum.
+
+    The search starts in the middle, because each value takes time.
+    """
     index = count // 2
     direction = 1 if index + 1 < count and score(index + 1) < score(index) else -1
     while 0 <= index + direction < count and score(index + direction) < score(index):
@@ -205,7 +207,7 @@ def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
 
 
 def _fit_scale(design: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> Estimate:
-    """Estimate the scale factor error of the positions from fits with scales on a grid."""
+    """Estimate the scale factor error of the positions from fits with several scale factors."""
     fit_at = cache(
         lambda grid_index: design.fit(sigma_a, is_skipped, float(SCALE_GRID[grid_index]))
     )
@@ -214,10 +216,10 @@ def _fit_scale(design: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> E
         lambda grid_index: fit_at(grid_index).square_sum, len(SCALE_GRID)
     )
     grid_index = int(np.clip(lowest_index, 1, len(SCALE_GRID) - 2))
-    scores_beside_minimum = [
+    scores_at_minimum = [
         fit_at(grid_index + grid_shift).square_sum / 2.0 for grid_shift in (-1, 0, 1)
     ]
-    vertex_shift, curvature = parabola_vertex(np.array(scores_beside_minimum), 1)
+    vertex_shift, curvature = parabola_vertex(np.array(scores_at_minimum), 1)
     grid_step = float(SCALE_GRID[1] - SCALE_GRID[0])
     if curvature <= 0.0:
         return Estimate(0.0, float("inf"))
@@ -228,18 +230,18 @@ def _fit_scale(design: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> E
 
 
 def _find_jumps(
-    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, announced_s: Sequence[float]
+    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, source_resets_s: Sequence[float]
 ) -> tuple[tuple[Jump, ...], BoolArray]:
-    """Detect lasting jumps of the positions; return the jumps in time order, and an outlier mask.
+    """Detect lasting jumps of the positions; return them in time order, and a mask of outliers.
 
-    Jumps are tested at ``announced_s`` (resets that the source reports), at the most likely time of
-    the flight, and at the start of each run of outliers, as data after a jump look like outliers.
+    A jump is tested at each reset that the source reports, at the most likely time of the flight,
+    and at each first outlier, because the positions after a jump look like outliers.
     """
     jumps: list[Jump] = []
 
     def skip_burst_after(jump_s: float) -> BoolArray:
-        # an announced jump is no burst of outliers, so the positions after it are used
-        if jump_s in announced_s:
+        # The positions after a reset of the source are used: they are no burst of outliers
+        if jump_s in source_resets_s:
             return is_skipped & ~_is_in_window(design.time_s, jump_s, OUTLIERS_AFTER_STEP_S)
         return is_skipped | _is_in_window(design.time_s, jump_s, OUTLIER_BURST_S)
 
@@ -251,7 +253,7 @@ def _find_jumps(
             np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
         jump_times = [
-            *announced_s,
+            *source_resets_s,
             *_significant_step_times(design, sigma_a, is_skipped, outlier_run_starts),
             *_significant_step_times(design, sigma_a, is_skipped)[:1],
         ]
@@ -268,10 +270,10 @@ def _find_jumps(
         best_jump = max(significant_jumps, key=lambda jump: jump.chi_square)
         best_jump, is_skipped = _locate_jump(design, sigma_a, is_skipped, best_jump)
         jumps.append(best_jump)
-        announced_s = [
-            announced_time_s
-            for announced_time_s in announced_s
-            if abs(announced_time_s - best_jump.time_s) > OUTLIER_BURST_S
+        source_resets_s = [
+            reset_time_s
+            for reset_time_s in source_resets_s
+            if abs(reset_time_s - best_jump.time_s) > OUTLIER_BURST_S
         ]
     return tuple(sorted(jumps, key=lambda jump: jump.time_s)), is_skipped
 
@@ -286,7 +288,10 @@ def _significant_step_times(
     is_skipped: BoolArray,
     candidate_times_s: Array | None = None,
 ) -> list[float]:
-    """Return the times of significant jumps, largest χ² first; by default all times are tested."""
+    """Return the times at which a jump is significant, largest χ² first.
+
+    By default, all measurement times are tested.
+    """
     if candidate_times_s is None:
         candidate_times_s = design.time_s[MIN_SIDE_MEASUREMENTS:-MIN_SIDE_MEASUREMENTS]
         candidate_times_s = candidate_times_s[
@@ -309,7 +314,7 @@ def _step_chi_squares(
 ) -> Array:
     """Return χ² of a jump at each time: the decrease of the sum of squared residuals."""
     whitened_innovations, columns, log_variance_sum = design.whitened_design(sigma_a, is_skipped)
-    base_fit = design.regress(whitened_innovations, columns, log_variance_sum, is_skipped)
+    fit_without_jump = design.regress(whitened_innovations, columns, log_variance_sum, is_skipped)
     columns = columns[:, ~is_skipped]
     gains = compute_gains(design.signals, sigma_a, design.sigma_z_m, is_skipped)
     chi_squares = np.zeros(len(candidate_times_s))
@@ -322,13 +327,13 @@ def _step_chi_squares(
             zero_signal, zero_signal, step_signals, sigma_a, is_skipped, gains
         )[0][~is_skipped]
         for axis_index in range(design.axis_count):
-            axis_residual = base_fit.residual[base_fit.axis == axis_index]
+            axis_residual = fit_without_jump.residual[fit_without_jump.axis == axis_index]
             cross_product = columns[axis_index].T @ step_response
             step_information = np.sum(step_response**2, axis=0) - np.sum(
-                cross_product * (base_fit.covariance @ cross_product), axis=0
+                cross_product * (fit_without_jump.covariance @ cross_product), axis=0
             )
             chi_squares[batch] += (
-                axis_residual @ step_response / base_fit.axis_rms[axis_index]
+                axis_residual @ step_response / fit_without_jump.compute_axis_rms()[axis_index]
             ) ** 2 / np.maximum(step_information, 1e-9)
     return chi_squares
 
@@ -338,7 +343,7 @@ def _locate_jump(
 ) -> tuple[Jump, BoolArray]:
     """Return a detected jump with its exact time and length, and a mask of outliers."""
     is_near = np.abs(design.time_s - jump.time_s) <= OUTLIER_BURST_S
-    # exclude the measurements near the jump; use later outliers again if they agree with the jump
+    # Measurements near the jump are excluded. Later outliers are used if they agree with the jump
     residual_squares = design.with_step(jump.time_s)[0].residual_squares(
         sigma_a, is_skipped | is_near
     )
@@ -357,8 +362,7 @@ def _locate_jump(
         outliers_by_time[jump_s] = np.where(
             is_near, residual_squares > max_residual_square, is_skipped
         )
-    # with a wrong jump time, good measurements look like outliers: choose the time with the fewest
-    # outliers
+    # A wrong jump time makes outliers of good measurements: the time with fewest outliers is used
     best_time_s = min(
         outliers_by_time, key=lambda jump_s: np.count_nonzero(outliers_by_time[jump_s])
     )
@@ -372,7 +376,7 @@ def _locate_jump(
 def _test_step(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, time_s: float, false_alarm_p: float
 ) -> Jump | None:
-    """Return the jump at ``time_s`` if it is significant without the skipped measurements."""
+    """Test for a jump at ``time_s``, and return it if it is significant."""
     design, step_column_indices = design.with_step(time_s)
     count_before = np.count_nonzero(~is_skipped & (design.time_s < time_s))
     if (
@@ -383,7 +387,7 @@ def _test_step(
     design_fit = design.fit(sigma_a, is_skipped)
     jump_m = design_fit.coefficients[step_column_indices]
     step_covariance = design_fit.covariance[np.ix_(step_column_indices, step_column_indices)]
-    jump_m = jump_m / design_fit.axis_rms
+    jump_m = jump_m / design_fit.compute_axis_rms()
     chi_square = float(jump_m @ np.linalg.solve(step_covariance, jump_m))
     if chi_square < chdtri(len(step_column_indices), false_alarm_p):
         return None
@@ -396,14 +400,14 @@ def _test_step(
 
 @dataclass(frozen=True)
 class DesignFit:
-    """Least squares fit of whitened innovations with the columns of a design matrix.
+    """Least squares fit of normalised innovations by the columns of a design matrix.
 
     Attributes
     ----------
     axis : ndarray of int, shape (n,)
         Axis index of each row; rows are sorted by axis.
     residual : ndarray, shape (n,)
-        Whitened innovations minus the fit.
+        Normalised innovations minus the fit.
     coefficients, covariance : ndarray, shape (k,) and (k, k)
     square_sum : float
         Sum of the squared residuals and of the squared prior deviations.
@@ -421,14 +425,13 @@ class DesignFit:
     score: float
     residual_rms: float
 
-    @property
-    def axis_rms(self) -> Array:
-        """RMS residual along each axis in √S, but at least 1."""
+    def compute_axis_rms(self) -> Array:
+        """Return the RMS residual along each axis in √S, but at least 1."""
         mean_square = np.bincount(self.axis, self.residual**2) / np.bincount(self.axis)
         return np.sqrt(np.maximum(mean_square, 1.0))
 
     def estimate(self, column: int) -> Estimate:
-        """Return one coefficient; its σ includes a ``residual_rms`` above 1."""
+        """Return a coefficient with its σ, multiplied by ``residual_rms`` if this is above 1."""
         coefficient_sigma = float(np.sqrt(self.covariance[column, column])) * max(
             self.residual_rms, 1.0
         )
@@ -437,15 +440,15 @@ class DesignFit:
 
 @dataclass(frozen=True)
 class DesignMatrix:
-    """Innovations of several axes and the columns of all hypothetical errors, before whitening.
+    """Inputs of KF along several axes: the data, and the effect of each tested error of size 1.
 
     Attributes
     ----------
     time_s : ndarray, shape (m,)
         Timestamps of the measurements.
     signals : Preintegrated
-        Columns of each axis: data, response to unit biases forward and right, and to a unit
-        rotation. Last columns, for all axes: response to a slow acceleration error (hat functions).
+        Four columns for each axis: data, and effects of 1 m/s² forward bias, 1 m/s² right bias and
+        1 rad rotation. Last columns, for all axes: slow acceleration error (hat functions).
     prior_sigma : ndarray, shape (k,)
         Prior σ of the coefficients, except those of jumps.
     step_columns : ndarray, shape (m, j)
@@ -460,7 +463,7 @@ class DesignMatrix:
     step_columns: Array
 
     def with_step(self, time_s: float) -> tuple[DesignMatrix, IntArray]:
-        """Return the design matrix with one more jump, and the column of the jump for each axis."""
+        """Add a jump; return the design matrix, and the column of the jump for each axis."""
         design = replace(
             self, step_columns=np.hstack([self.step_columns, unit_steps(self.time_s, [time_s])])
         )
@@ -477,7 +480,7 @@ class DesignMatrix:
         is_skipped: BoolArray,
         gains: Array | None = None,
     ) -> tuple[Array, float]:
-        """Return ν/√S of k inputs, shape (m, k), and Σ ln S of the fused measurements."""
+        """Run KF with k inputs; return ν/√S, shape (m, k), and Σ ln S of the fused measurements."""
         signals = replace(
             self.signals, delta_position_m=dp, delta_velocity_m_s=dv, measurement_m=measured_m
         )
@@ -486,9 +489,9 @@ class DesignMatrix:
         return nu, float(np.sum(np.log(s[~is_skipped])))
 
     def fit(self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0) -> DesignFit:
-        """Fit all columns; ``scale`` multiplies the acceleration and its noise.
+        """Fit all errors by least squares; ``scale`` multiplies the acceleration and its noise.
 
-        ``is_skipped``, shape (m,), is True for measurements that KF and the fit exclude.
+        ``is_skipped``, shape (m,), is True for measurements that are not used.
         """
         return self.regress(*self.whitened_design(sigma_a, is_skipped, scale), is_skipped)
 
@@ -499,7 +502,7 @@ class DesignMatrix:
         log_variance_sum: float,
         is_skipped: BoolArray,
     ) -> DesignFit:
-        """Fit whitened innovations with whitened columns (from :meth:`whitened_design`)."""
+        """Fit normalised innovations by least squares; inputs from :meth:`whitened_design`."""
         axis_indices = np.repeat(np.arange(len(innovations_by_axis)), np.count_nonzero(~is_skipped))
         innovations_by_axis = innovations_by_axis[:, ~is_skipped].ravel()
         columns = columns[:, ~is_skipped].reshape(len(axis_indices), -1)
@@ -508,7 +511,7 @@ class DesignMatrix:
             self.prior_sigma, np.full(column_count - len(self.prior_sigma), np.inf)
         )
         information = np.diag(prior_sigma**-2.0) + columns.T @ columns
-        # a small diagonal keeps the matrix regular if a column is zero (frame rotation in hover)
+        # A small diagonal prevents a singular matrix if a column is zero (frame rotation in hover)
         information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(column_count)
         moment = columns.T @ innovations_by_axis
         information_factor = cho_factor(information)
@@ -527,7 +530,7 @@ class DesignMatrix:
         )
 
     def residual_squares(self, sigma_a: float, is_skipped: BoolArray) -> Array:
-        """Return the squared normalised residual of each measurement, summed over axes."""
+        """Return the sum over axes of each measurement's squared normalised residual."""
         whitened_innovations, columns, log_variance_sum = self.whitened_design(sigma_a, is_skipped)
         design_fit = self.regress(whitened_innovations, columns, log_variance_sum, is_skipped)
         residual = whitened_innovations - columns @ design_fit.coefficients
@@ -536,22 +539,22 @@ class DesignMatrix:
     def whitened_design(
         self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
-        """Return whitened innovations, their design matrix, and Σ ln S.
+        """Return the normalised innovations, the columns of the design matrix, and Σ ln S.
 
-        The arrays have the shapes (axes, measurements) and (axes, measurements, columns).
+        Shapes: (axes, measurements) and (axes, measurements, columns).
         """
         signals, axis_count, step_count = self.signals, self.axis_count, self.step_columns.shape[1]
         column_count = len(self.prior_sigma)
         whitened_innovations = np.empty((axis_count, len(is_skipped)))
         columns = np.zeros((axis_count, len(is_skipped), column_count + axis_count * step_count))
-        # the scale multiplies data and rotation, not the biases
+        # The scale factor multiplies the data and the effect of the rotation, not the biases
         data_columns = (1 + CONSTANT_COUNT) * np.arange(axis_count)
-        column_scales = np.ones(signals.measurement_m.shape[1])
-        column_scales[np.append(data_columns, data_columns + 1 + ROTATION)] = scale
+        column_factors = np.ones(signals.measurement_m.shape[1])
+        column_factors[np.append(data_columns, data_columns + 1 + ROTATION)] = scale
         no_motion = 0.0 * self.step_columns
         normalised, log_variance_sum = self.whitened(
-            np.hstack([column_scales * signals.delta_position_m, no_motion]),
-            np.hstack([column_scales * signals.delta_velocity_m_s, no_motion]),
+            np.hstack([column_factors * signals.delta_position_m, no_motion]),
+            np.hstack([column_factors * signals.delta_velocity_m_s, no_motion]),
             np.hstack([signals.measurement_m, self.step_columns]),
             scale * sigma_a,
             is_skipped,
@@ -579,7 +582,7 @@ def make_design_matrix(
     sigma_z: float,
     clock_offset_s: float,
 ) -> DesignMatrix | Unavailable:
-    """Build the design matrix without jumps; ``clock_offset_s`` is added to the timestamps."""
+    """Make the design matrix without jumps; ``clock_offset_s`` is added to the timestamps."""
     acceleration, attitude = axes[0].acceleration, flight.attitude
     if isinstance(acceleration, Unavailable):
         return acceleration
@@ -613,7 +616,7 @@ def make_design_matrix(
     dp, dv = (np.stack(arrays, axis=1) for arrays in zip(*column_pairs, strict=True))
     measured_m = np.zeros_like(dp)
     for index, kf_input in enumerate(kf_inputs):
-        # positions relative to the first measurement, which is KF's initial position
+        # Positions are relative to the first measurement, which is KF's initial position
         measured_m[:, index * (1 + CONSTANT_COUNT)] = (
             kf_input.measurement_m - kf_input.initial.position_m
         )
@@ -622,7 +625,7 @@ def make_design_matrix(
         delta_position_m=dp,
         delta_velocity_m_s=dv,
         measurement_m=measured_m,
-        # all axes share one process noise, also the additional one in gaps of the IMU
+        # All axes share one process noise, including the additional noise in IMU gaps
         added_process_noise=np.mean(
             [kf_input.added_process_noise for kf_input in kf_inputs], axis=0
         ),
@@ -653,7 +656,7 @@ def _common_integrals(attitude: pd.DataFrame, acceleration: Acceleration) -> lis
 
 
 def _hat_functions(start_s: float, end_s: float) -> ArrayPair:
-    """Return times (s), and at these times the linear interpolation weight of each knot."""
+    """Return times (s), and the weight of each knot at these times in linear interpolation."""
     knot_count = int(np.clip(np.ceil((end_s - start_s) / KNOT_SPACING_S), 1, MAX_KNOTS)) + 1
     hat_time_s = np.linspace(start_s, end_s, 20 * (knot_count - 1) + 1)
     knot_times_s = np.linspace(start_s, end_s, knot_count)
@@ -663,5 +666,5 @@ def _hat_functions(start_s: float, end_s: float) -> ArrayPair:
 
 
 def unit_steps(time_s: Array, starts_s: Iterable[float]) -> Array:
-    """Return unit step functions that start at ``starts_s``, shape (m, j)."""
+    """Return step functions from 0 to 1 at the times ``starts_s``, shape (m, j)."""
     return np.asarray(time_s[:, None] >= np.fromiter(starts_s, float)[None, :], dtype=np.float64)

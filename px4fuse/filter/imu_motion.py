@@ -1,16 +1,16 @@
-"""Motion from the IMU alone, and its sensitivity to constant errors of IMU, attitude and scale.
+"""Motion integrated from the IMU, and its derivatives with respect to constant errors.
 
 A segment is a part of the flight, at most 30 s long, without a gap in IMU or attitude. The attitude
 is integrated from the gyroscopes, starting at EKF2's attitude. EKF2's later attitude is not used,
-because it was corrected with the positions to be tested.
+because EKF2 corrected it with the positions to be tested.
 
-Unknown constants of each segment: errors of the initial attitude (rad, NED), gyro biases (rad/s,
+Unknown constants of each segment are errors of the initial attitude (rad, NED), gyro biases (rad/s,
 body), accelerometer biases (m/s², body) and the scale of the positions. The motion is linear in
-small constants. Its sensitivities are integrated once and interpolated for any time offset.
+small constants. Its derivatives are integrated once and interpolated for any time offset.
 
-The sensitivity to the scale is the smooth path of
-:func:`px4fuse.filter.marginal_likelihood.centre_on_path`. IMU motion would not be suitable, because
-its noise would be explained as scale (errors in variables, Fuller 1987).
+The derivative with respect to the scale is the smooth path of
+:func:`px4fuse.filter.marginal_likelihood.centre_on_path`. With the IMU motion instead, the IMU
+noise would bias the estimated scale (errors in variables, Fuller 1987).
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ HEADING_SIGMA_RAD = 0.05
 # Prior σ of the unknown constants, wide for consumer sensors: initial tilt and heading (rad), gyro
 # bias (rad/s), accelerometer bias (m/s²), scale of the positions (1)
 CONSTANTS_PRIOR_SIGMA = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
-# Maximum gyro bias (rad/s) that the prior of the constants covers (5 σ); a larger bias is removed,
-# as estimated from EKF2's attitude
+# Maximum gyro bias (rad/s) within the prior of the constants (5 σ). A larger bias is estimated from
+# EKF2's attitude and removed
 MAX_PRIOR_GYRO_BIAS_RAD_S = 0.02
 # Maximum gyro bias (rad/s) that EKF2 can remove from its attitude: the maximum of EKF2_GYR_B_LIM
 MAX_REMOVED_GYRO_BIAS_RAD_S = 0.4
@@ -59,7 +59,7 @@ MAX_OFFSET_S = 0.6
 COARSE_OFFSET_COUNT = 25
 # Approximate number of position measurements in the coarse search for a time offset
 COARSE_MEASUREMENTS = 600
-# Maximum number of array elements per batch of time offsets, which limits memory
+# Maximum number of array elements for time offsets that are computed at once, to limit the memory
 MAX_BATCH_ELEMENTS = 2**16
 # Minimum number of position measurements in all segments together
 MIN_MEASUREMENTS = 30
@@ -69,8 +69,8 @@ MIN_SEGMENT_MEASUREMENTS = 15
 MIN_KEPT_MEASUREMENTS = 5
 # Interval (s) over which the IMU is averaged before integration
 INTEGRATION_STEP_S = 0.02
-# Prior precision of position (1/m²) and velocity (s²/m²) at the start of a segment: negligible, it
-# only avoids a singular matrix
+# Prior precision of position (1/m²) and velocity (s²/m²) at the start of a segment: so small that
+# it only prevents a singular matrix
 SEGMENT_START_PRECISION = 1e-6, 1e-4
 # Maximum median interval (s) between IMU samples for an estimate of the motion
 MAX_IMU_INTERVAL_S = 0.025
@@ -78,11 +78,11 @@ MAX_IMU_INTERVAL_S = 0.025
 
 @dataclass(frozen=True)
 class SegmentMotion:
-    """Motion of one segment from the IMU, and its sensitivity to constant errors.
+    """Motion of one segment from the IMU, and its derivative with respect to constant errors.
 
-    ``table``, shape (n, 2, 3, 1 + constants), contains position and velocity (second dimension)
-    along NED (third). The last dimension is the motion without errors, then its derivative with
-    respect to each constant. Between two times the acceleration is constant.
+    ``table`` has the shape (times, 2, 3, 1 + constants): position and velocity, along NED. The last
+    dimension contains the motion without errors, then its derivative with respect to each constant.
+    The acceleration is constant between two times.
     """
 
     time_s: Array
@@ -100,13 +100,13 @@ class SegmentMotion:
         return position, velocity
 
 
-# Motion that was computed for the segments of a flight, by time span (s)
+# Motion that is already computed for segments of a flight, by start and end time (s)
 MotionCache = dict[Span, SegmentMotion]
 
 
 @dataclass(frozen=True)
 class PreparedMotion:
-    """Position measurements and IMU motion of s segments; m measurements along a axes.
+    """Position measurements and IMU motion; s segments, m measurements, a axes.
 
     Attributes
     ----------
@@ -136,7 +136,10 @@ class PreparedMotion:
     heading_sigma_rad: float = HEADING_SIGMA_RAD
 
     def downsample(self, max_count: int) -> PreparedMotion:
-        """Keep about ``max_count`` measurements; keep all if no segment would have enough."""
+        """Keep about ``max_count`` measurements, and the segments that still have enough.
+
+        If no segment had enough, all measurements are kept.
+        """
         is_kept = np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / max_count)) == 0
         kept_counts = np.add.reduceat(is_kept.astype(int), self.segment_edges[:-1])
         has_enough_kept = kept_counts >= MIN_KEPT_MEASUREMENTS
@@ -157,7 +160,7 @@ class PreparedMotion:
         )
 
     def positions(self, time_offsets_s: Array) -> Positions:
-        """Return positions and integrated IMU data for each time offset; the scale is 1."""
+        """Return positions and integrated IMU data for each time offset, with a scale of 1."""
         length_s = np.diff(self.time_s)
         unit_process_noise = self.dt_s * np.stack(continuous_noise_unit(length_s))
         prior_precision = np.zeros((len(self.time_s), 2))
@@ -170,7 +173,7 @@ class PreparedMotion:
             self.segment_edges, self.segment_edges[1:], self.segment_motions, strict=False
         ):
             measurement_time_s = self.time_s[begin:end]
-            # both arrays have the shape (axes, time offsets, constants, times)
+            # Both arrays have the shape (axes, time offsets, constants, times)
             position, velocity = (
                 np.moveaxis(self.directions @ signal, (2, 0, 3, 1), range(4))
                 for signal in segment_motion.interpolate(
@@ -195,7 +198,7 @@ class PreparedMotion:
         )
 
     def positions_at_offset(self, offset_s: float) -> Positions:
-        """Return positions and integrated IMU data for one time offset; the scale is unknown."""
+        """Return positions and integrated IMU data for one time offset, with unknown scale."""
         return next(self.position_batches(np.array([offset_s])))
 
     def position_batches(
@@ -216,8 +219,8 @@ class PreparedMotion:
     ) -> tuple[float, Noises]:
         """Return the time offset and SIGMA_A with the maximum likelihood on a coarse grid.
 
-        ``sigma_a_factors`` are the tested multiples of SIGMA_A; ``has_scale`` is True for an
-        unknown scale.
+        ``sigma_a_factors`` are the tested multiples of SIGMA_A. ``has_scale`` is True if the scale
+        of the positions is estimated.
         """
         tested_offsets_s = np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSET_COUNT)
         sigma_z_m = noises.sigma_z_m
@@ -255,7 +258,7 @@ def prepare_motion(
     heading_sigma_rad: float = HEADING_SIGMA_RAD,
     max_segment_s: float = MAX_SEGMENT_S,
 ) -> PreparedMotion | Unavailable:
-    """Cut measurements into segments without a gap in IMU or attitude.
+    """Divide measurements into segments without IMU gap, and compute their motion from the IMU.
 
     Parameters
     ----------
@@ -265,7 +268,7 @@ def prepare_motion(
     directions, dt_s, weight, heading_sigma_rad
         See :class:`PreparedMotion`; weights are 1 by default.
     motion_cache : dict, optional
-        IMU motion of this flight that was already computed; new motion is added.
+        IMU motion of this flight that is already computed; new motion is added.
     max_segment_s : float
         Maximum length of a segment.
     """
@@ -310,7 +313,8 @@ def prepare_motion(
             "Analyse a longer segment.",
         )
     segment_edges = np.cumsum([0, *map(len, rows_by_segment)])
-    # subtract the first position, which is unknown anyway: small numbers limit rounding errors
+    # The initial position of a segment is unknown. Its first position is subtracted, because
+    # smaller numbers have smaller rounding errors
     measured_m = pd.DataFrame(measurement_m[used_rows])
     segment_index = np.repeat(np.arange(len(rows_by_segment)), np.diff(segment_edges))
     first_m = measured_m.groupby(segment_index).transform("first")
@@ -338,7 +342,7 @@ def _covered_spans(imu_time_s: Array, attitude_time_s: Array) -> list[Span]:
 
 
 def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> SegmentMotion:
-    """Compute the motion in NED from the IMU, and its sensitivity to each constant."""
+    """Compute the motion in NED from the IMU, and its derivative for each constant error."""
     imu_time_s = imu.index.to_numpy()
     first_row, end_row = np.searchsorted(
         imu_time_s,
@@ -357,7 +361,7 @@ def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -
     angle_rad = integrals_at_steps[:, 3:]
     angle_rad -= np.outer(step_times_s, _large_gyro_bias(step_times_s, angle_rad, attitude))
     attitude_quaternion = _integrate_gyros(step_times_s, angle_rad, attitude)
-    # the mean specific force of each step is rotated by the attitude in the middle of the step
+    # The mean specific force of each step is rotated by the attitude in the middle of the step
     mean_specific_force_m_s2 = np.diff(specific_force_integral_m_s, axis=0) / INTEGRATION_STEP_S
     body_to_ned = to_matrix(
         multiply(attitude_quaternion[:-1], from_vector(np.diff(angle_rad, axis=0) / 2.0))
@@ -368,8 +372,8 @@ def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -
     acceleration = np.zeros_like(velocity)
     acceleration[:, :, 0] = specific_force_ned_m_s2
     acceleration[:, 2, 0] += constants.g
-    # a rotation of the attitude by a small angle θ adds θ × f to the acceleration; a gyro bias b
-    # causes the rotation θ = -∫ R b dt
+    # A small attitude error θ adds θ × f to the acceleration. A gyro bias b causes the attitude
+    # error θ = -∫ R b dt
     gyro_bias_rotation = -INTEGRATION_STEP_S * (np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0)
     for axis in range(3):
         next_axis = (axis + 1) % 3
@@ -390,10 +394,10 @@ def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -
 
 
 def _large_gyro_bias(step_times_s: Array, angle_rad: Array, attitude: pd.DataFrame) -> Array:
-    """Return the gyro bias (rad/s) from the logged attitude.
+    """Estimate the gyro bias (rad/s) from the logged attitude.
 
-    Zero up to ``MAX_PRIOR_GYRO_BIAS_RAD_S``, because the prior of the unknown constants covers it,
-    and above ``MAX_REMOVED_GYRO_BIAS_RAD_S``, because then the logged attitude is wrong.
+    A bias up to ``MAX_PRIOR_GYRO_BIAS_RAD_S`` is an unknown constant, so zero is returned. Zero is
+    also returned above ``MAX_REMOVED_GYRO_BIAS_RAD_S``, because then the logged attitude is wrong.
     """
     samples = rows_between(attitude, step_times_s[0], step_times_s[-1])[Columns.QUATERNION]
     if len(samples) < MIN_KEPT_MEASUREMENTS:
@@ -402,18 +406,19 @@ def _large_gyro_bias(step_times_s: Array, angle_rad: Array, attitude: pd.DataFra
     angle_at_attitude = np.column_stack(
         [np.interp(attitude_time_s, step_times_s, column) for column in angle_rad.T]
     )
-    excess_rad = np.diff(angle_at_attitude, axis=0) - to_vector(
+    drift_rad = np.diff(angle_at_attitude, axis=0) - to_vector(
         multiply(conjugate(quaternions[:-1]), quaternions[1:])
     )
-    bias = np.asarray(np.median(excess_rad / np.diff(attitude_time_s)[:, None], axis=0))
+    bias = np.asarray(np.median(drift_rad / np.diff(attitude_time_s)[:, None], axis=0))
     is_removed = MAX_PRIOR_GYRO_BIAS_RAD_S < np.abs(bias).max() <= MAX_REMOVED_GYRO_BIAS_RAD_S
     return bias if is_removed else np.zeros(3)
 
 
 def _integrate_gyros(step_times_s: Array, angle_rad: Array, attitude: pd.DataFrame) -> Array:
-    """Integrate the gyroscopes from the logged attitude at the start of a segment.
+    """Integrate the gyroscopes, starting at the logged attitude.
 
-    ``angle_rad`` is the integrated angular rate (rad). Return quaternions body to NED, w first.
+    ``angle_rad`` is the integral of the angular rate (rad). Return quaternions from body to NED, w
+    first.
     """
     attitude_time_s = attitude.index.to_numpy()
     near_rows = slice(

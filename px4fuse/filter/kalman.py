@@ -25,7 +25,7 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import make_timeline
 
-Rows = list[tuple[float, ...]]
+StepRows = list[tuple[float, ...]]
 # Columns of ``Replay.updates``
 UPDATE_COLUMNS = [
     "measurement_m",
@@ -41,14 +41,14 @@ UPDATE_COLUMNS = [
 
 @dataclass(frozen=True)
 class Replay:
-    """Run of KF along one axis.
+    """Results of KF along one axis.
 
     Attributes
     ----------
     steps : DataFrame, shape (n, 7)
-        State, covariance, and input of the next step, after each prediction and update.
+        State and covariance after each step, and the acceleration of the next step.
     updates : DataFrame, shape (m, 8)
-        Innovation ν = z - Hx⁻, S = HP⁻Hᵀ + R, gains and prior state at each measurement.
+        Innovation ν = z - Hx⁻, S = HP⁻Hᵀ + R, gains and predicted state at each measurement.
     input_gap_s : float
         Time without IMU data, in which Q is increased.
     """
@@ -74,7 +74,7 @@ def replay(
     initial : InitialState, optional
         Default: the first measurement (which is then not fused) and velocity zero.
     fast : bool
-        True to compute with floats instead of filterpy; the results are equal to 1e-9.
+        True to compute with Python floats instead of filterpy; results are equal to 1e-9.
 
     Raises
     ------
@@ -108,11 +108,11 @@ def replay(
 
 def _run_filterpy(
     initial: InitialState, measurement_variance: float, *inputs: Sequence[Any]
-) -> tuple[Rows, Rows]:
-    """Run KF with filterpy, and return the rows of :attr:`Replay.steps` and ``updates``.
+) -> tuple[StepRows, StepRows]:
+    """Run KF with filterpy; return the rows of :attr:`Replay.steps` and :attr:`Replay.updates`.
 
-    ``inputs`` are sequences over the steps: length (s), acceleration (m/s²), noise density SIGMA_A²
-    · DT (m²/s³), and measured position (m) or None.
+    ``inputs`` are four sequences, one value for each step: length (s), acceleration (m/s²), noise
+    density SIGMA_A² · DT (m²/s³), and measured position (m) or None.
     """
     from px4fuse.filter.filterpy_import import KalmanFilter  # noqa: PLC0415 - takes 0.1 s
 
@@ -122,8 +122,8 @@ def _run_filterpy(
     kalman.H = np.array([[1.0, 0.0]])
     kalman.R = np.array([[measurement_variance]])
     kalman.inv = np.reciprocal  # S is 1 by 1
-    states: Rows = [(initial.position_m, initial.velocity_m_s, *model.INITIAL_COVARIANCE)]
-    updates: Rows = []
+    states: StepRows = [(initial.position_m, initial.velocity_m_s, *model.INITIAL_COVARIANCE)]
+    updates: StepRows = []
     dt_s, acceleration, noise_density = (np.array(values)[:, None, None] for values in inputs[:3])
     matrices = (
         acceleration,
@@ -155,15 +155,15 @@ def _run_filterpy(
 
 def _run_floats(
     initial: InitialState, measurement_variance: float, *inputs: Sequence[Any]
-) -> tuple[Rows, Rows]:
-    """Run KF with floats, as :func:`_run_filterpy`."""
+) -> tuple[StepRows, StepRows]:
+    """Run KF with Python floats; arguments and results are those of :func:`_run_filterpy`."""
     position, velocity, covariance = (
         initial.position_m,
         initial.velocity_m_s,
         model.INITIAL_COVARIANCE,
     )
-    states: Rows = [(position, velocity, *covariance)]
-    updates: Rows = []
+    states: StepRows = [(position, velocity, *covariance)]
+    updates: StepRows = []
     for dt_s, acceleration, noise_density, measured_m in zip(*inputs, strict=True):
         position, velocity, covariance = model.predict_step(
             position, velocity, covariance, acceleration, noise_density, dt_s
@@ -181,7 +181,10 @@ def _run_floats(
 
 
 def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
-    """Return the last step before each time, the time since it (s), and a mask of times outside."""
+    """Return for each time the index of the last step before it, and the time (s) since this step.
+
+    The third array is True for times outside the run of KF.
+    """
     step_times_s = run.steps.index.to_numpy()
     step_index = np.clip(
         np.searchsorted(step_times_s, times_s, side="right") - 1, 0, len(step_times_s) - 1
@@ -196,7 +199,7 @@ def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArra
 def state_at(run: Replay, times_s: Array) -> Array:
     """Predict position (m) and velocity (m/s) at each time from KF's last step before it.
 
-    Interpolation would use a measurement before it is received. NaN outside the run.
+    Interpolation would use a measurement before its time. Times outside the run of KF give NaN.
     """
     step_index, elapsed_s, is_outside = _step_before(run, times_s)
     position, velocity, acceleration = (

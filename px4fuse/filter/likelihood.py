@@ -1,7 +1,8 @@
-"""KF with one prediction per position measurement, and 95 % intervals from the likelihood.
+"""Fast innovations of KF, and 95 % intervals of its noises from the likelihood.
 
-The input is integrated between measurements, so KF needs no prediction per DT. With SIGMA_A
-and SIGMA_Z of at least 1e-3 the results equal those of :mod:`px4fuse.filter.kalman` to 1e-9.
+The acceleration is integrated between measurements, so KF needs only one prediction per
+measurement. If SIGMA_A and SIGMA_Z are at least 1e-3, the innovations equal those of
+:mod:`px4fuse.filter.kalman` to 1e-9.
 """
 
 from __future__ import annotations
@@ -28,26 +29,29 @@ from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.steps import Timeline, make_timeline
 
-# Drop of the log-likelihood (nats) at the ends of a 95 % interval: half of the 95 % point of χ²(1)
+# Decrease of the log-likelihood (nats) from its maximum to the ends of a 95 % interval: half of the
+# 95 % point of χ²(1)
 PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
 # Distance in ln σ from the maximum at which the search for the end of a 95 % interval starts
 START_LOG_DISTANCE = 0.05
-# Maximum change of ln σ of the second noise (SIGMA_Z in the profile of SIGMA_A) between two points
-# of a likelihood profile
+# In the likelihood profile of one noise (SIGMA_A), ln σ of the other noise (SIGMA_Z) changes by at
+# most this value between two points
 MAX_OTHER_LOG_STEP = 1.0
-# Tolerance of ln σ of the second noise at each point of a likelihood profile
+# Tolerance of ln σ in the optimisation of the other noise at each point of a likelihood profile
 OTHER_LOG_TOLERANCE = 2e-3
 
 
 @dataclass(frozen=True)
 class Preintegrated:
-    """Input of KF, integrated over each interval between measurements; arrays have shape (m,).
+    """Measurements of KF, and its acceleration integrated over the intervals between them.
+
+    Arrays have the shape (m,), if not stated otherwise.
 
     Attributes
     ----------
     length_s : ndarray
     delta_position_m, delta_velocity_m_s : ndarray
-        Δp and Δv due to the acceleration.
+        Δp and Δv in each interval due to the acceleration.
     unit_process_noise, added_process_noise : ndarray, shape (m, 3)
         Elements 00, 01, 11 of Q for SIGMA_A = 1 m/s², and of the additional Q in gaps of the IMU.
     measurement_m : ndarray
@@ -64,7 +68,7 @@ class Preintegrated:
 
 
 def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
-    """Integrate the input of one axis between measurements, over the prediction steps of KF.
+    """Integrate the acceleration and process noise of KF between measurements.
 
     Raises
     ------
@@ -96,9 +100,9 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
 
 
 def integrate_acceleration(timeline: Timeline, acceleration_m_s2: Array) -> ArrayPair:
-    """Integrate an acceleration to Δp (m) and Δv (m/s) between the measurements.
+    """Integrate an acceleration over the intervals between measurements: Δp (m) and Δv (m/s).
 
-    ``acceleration_m_s2``, shape (n - 1,), is the acceleration of each prediction step.
+    ``acceleration_m_s2``, shape (n - 1,), contains the acceleration in each prediction step.
     """
     _, interval_index, remaining_s = _interval_index(timeline)
     zeros = np.zeros(len(remaining_s))
@@ -112,10 +116,16 @@ def integrate_acceleration(timeline: Timeline, acceleration_m_s2: Array) -> Arra
 
 
 def _interval_index(timeline: Timeline) -> tuple[IntArray, IntArray, Array]:
-    """Assign the prediction steps to the intervals between measurements.
+    """Assign each prediction step to an interval between measurements.
 
-    Return the last step of each interval, then for each step the index of its interval and the time
-    (s) from the end of the step to the end of the interval.
+    Returns
+    -------
+    last_steps : ndarray
+        Index of the last step of each interval.
+    interval_index : ndarray
+        Index of the interval that contains each step.
+    remaining_s : ndarray
+        Time from the end of each step to the end of its interval.
     """
     last_steps = np.flatnonzero(timeline.measurement_index >= 0)
     interval_index = np.searchsorted(last_steps, np.arange(1, len(timeline.time_s)))
@@ -132,23 +142,23 @@ def innovations(
 ) -> ArrayPair:
     """Run KF; return ν (m) and S (m²) of each measurement, shape (m,).
 
-    Δp, Δv and the measurements may have k columns; then ν has the shape (m, k). KF is linear, so k
-    inputs can be filtered with the same gains.
+    If Δp, Δv and the measurements have k columns, KF filters each column, and ν has the shape
+    (m, k).
 
     Parameters
     ----------
     kf_input : Preintegrated
     sigma_a_m_s2, sigma_z_m : float
     is_skipped : ndarray of bool, shape (m,), optional
-        Measurements with an innovation but without an update.
+        True for measurements without update; their innovation is computed.
     variances_and_gains : ndarray, shape (3, m), optional
         Result of :func:`compute_gains` with the same arguments, if known.
     """
     if variances_and_gains is None:
         variances_and_gains = compute_gains(kf_input, sigma_a_m_s2, sigma_z_m, is_skipped)
     s, k0, k1 = variances_and_gains
-    # The states before the updates solve a system with a unit lower band matrix: the state at the
-    # next measurement is x = F(x + K(z - Hx)) + [Δp, Δv]
+    # The predicted states solve linear equations with a unit lower band matrix: the predicted state
+    # at the next measurement is F(x + K(z - Hx)) + [Δp, Δv]
     dt = kf_input.length_s[1:]
     position_gain = k0[:-1] + dt * k1[:-1]
     measured_m = np.ascontiguousarray(kf_input.measurement_m.T)
@@ -205,10 +215,10 @@ def compute_gains(
 
 
 def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
-    """Fit a parabola to a point of a profile and its two neighbours.
+    """Fit a parabola to ``profile[index]`` and its two neighbours.
 
-    Return the distance from the point to the minimum, in steps of the grid (0 without a minimum),
-    and the second difference of the profile.
+    Return the distance from ``index`` to the minimum (0 without a minimum), and the second
+    difference of the profile.
     """
     left_value, middle_value, right_value = profile[index - 1 : index + 2]
     curvature = left_value - 2.0 * middle_value + right_value
@@ -220,7 +230,8 @@ def profile_interval(
 ) -> tuple[float | None, float | None]:
     """Return the 95 % interval of a parameter from its negative log-likelihood on a grid.
 
-    An end outside the grid is None. ``max_drop`` is the drop of the log-likelihood at the ends.
+    None replaces an end outside the grid. ``max_drop`` is the decrease of the log-likelihood from
+    its maximum to the ends.
     """
     score_drops = profile - profile.min()
     first_index, last_index = np.flatnonzero(score_drops <= max_drop)[[0, -1]]
@@ -266,7 +277,7 @@ def profile_ends(
     def find_interval_end(direction: float, bound: float) -> float | None:
         other_log = best_logs[1]
 
-        # the square root of the drop is nearly linear in the distance, which helps brentq
+        # The square root of the decrease is nearly linear in the distance, so brentq is fast
         @cache
         def root_drop_minus_limit(log_distance: float) -> float:
             nonlocal other_log

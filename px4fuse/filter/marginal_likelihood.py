@@ -1,7 +1,7 @@
-"""Likelihood of positions along a few axes, with unknown constant errors of each segment.
+"""Likelihood of positions along several axes, with unknown constant errors.
 
-A segment is a part of the flight without a gap in the IMU data. It has its own initial state and
-its own constants (biases and other constant errors).
+A segment is a part of the flight without a gap in the IMU data. Each segment has an unknown initial
+state and unknown constants (biases and other constant errors).
 
 Given the acceleration, -2 ln p of the states x_k = [p, v] at the measurements is a sum of squares:
 
@@ -12,9 +12,9 @@ The matrix A of this quadratic form has three bands below the diagonal, so LAPAC
 flight in a millisecond. log|A| and the squared residuals at the minimum give the likelihood, which
 equals that of KF's innovations (Schweppe 1965).
 
-The data and their sensitivity to each constant are inputs of the same linear system. The constants
-are eliminated by the Schur complement of the inner products of the inputs.
-Time-correlated noise is a third state, c_{k+1} = ρ c_k + noise, in the measurement: z - p - c.
+The data, and their derivative with respect to each constant, are inputs of one linear system. The
+Schur complement of the inner products of the inputs eliminates the constants. Time-correlated noise
+is a third state, c_{k+1} = ρ c_k + noise, in the measurement: z - p - c.
 
 Symbols in shapes: m measurements, a axes, s segments, T time offsets, c constants.
 """
@@ -33,14 +33,14 @@ from scipy.linalg import lapack
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 
 UNIT_SCALE = np.ones(1)
-# SIGMA_A (m/s²) and SIGMA_Z (m) of the smoother whose path is subtracted from the positions
+# SIGMA_A (m/s²) and SIGMA_Z (m) with which positions are smoothed to a path
 SMOOTHED_PATH_NOISES = 0.5, 0.1
-# Minimum prior precision (1/m²) for which an initial position is treated as known
+# An initial position with a prior precision (1/m²) above this limit is known
 MIN_KNOWN_START_PRECISION = 1e-3
-# Position noise (σ) added to each interval, relative to the measurement noise and to Q: it makes a
-# singular Q invertible
+# A position noise (σ) is added to Q of each interval, to make a singular Q invertible. This is its
+# ratio to the measurement noise and to √Q₀₀
 MIN_NOISE_RATIO = 1e-5
-# Number of pairs of inputs per batch, which limits memory
+# Number of pairs of inputs whose inner products are computed at once, to limit the memory
 INPUT_BATCH_SIZE = 8
 # A determinant of Q below this fraction of the product of its diagonal is a rounding error
 MIN_Q_DETERMINANT_RATIO = 1e-12
@@ -48,7 +48,7 @@ MIN_Q_DETERMINANT_RATIO = 1e-12
 
 @dataclass(frozen=True)
 class Positions:
-    """Positions of one source along a few axes, with the integrated acceleration.
+    """Positions of one source along several axes, with the integrated acceleration.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Positions:
     segment_starts : ndarray of int, shape (s,)
         Index of the first measurement of each segment.
     length_s : ndarray, shape (m - 1,)
-        Intervals between measurements; like Δp and Δv, ignored between segments.
+        Intervals between measurements; not used between two segments.
     unit_process_noise, added_process_noise : ndarray, shape (3, m - 1)
         Elements 00, 01, 11 of Q for SIGMA_A = 1 m/s², and of additional process noise.
     prior_precision : ndarray, shape (m, 2)
@@ -65,7 +65,7 @@ class Positions:
     constants_prior_sigma : ndarray, shape (c,)
         Prior σ of the unknown constants of each segment.
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + c, m - 1)
-        Δp and Δv of each interval, then their sensitivity to each constant.
+        Δp and Δv of each interval, then their derivative with respect to each constant.
     correlated_noise : (float, float) or None
         Standard deviation (m) and time constant (s) of time-correlated noise.
     """
@@ -83,16 +83,16 @@ class Positions:
 
     @cached_property
     def segments(self) -> list[tuple[int, int]]:
-        """Slice bounds of each segment: index of its first measurement, and of its last plus 1."""
+        """Index of the first measurement of each segment, and of its last measurement plus 1."""
         return list(pairwise([*self.segment_starts.tolist(), len(self.measurement_m)]))
 
     @cached_property
     def is_joined(self) -> BoolArray:
-        """Mask of the intervals inside a segment, shape (m - 1,)."""
+        """True for the intervals between two measurements of one segment, shape (m - 1,)."""
         return ~np.isin(np.arange(1, len(self.measurement_m)), self.segment_starts)
 
     def first(self, count: int) -> Positions:
-        """Return the positions cut to the first ``count`` measurements."""
+        """Keep the first ``count`` measurements only."""
         interval_rows = np.s_[..., : count - 1]
         return replace(
             self,
@@ -114,10 +114,10 @@ class Positions:
     def in_sigma_z_units(
         self, sigma_z_m: float, random_walk: float, measurement_weights: Array
     ) -> tuple[Positions, Array]:
-        """Return the positions with noises in units of SIGMA_Z, and the measurement variances.
+        """Divide all noises by SIGMA_Z; return the positions and the measurement variances.
 
-        ``random_walk`` is the random walk of the source / SIGMA_Z (1/√s). ``measurement_weights``
-        may omit the first measurement, which is KF's initial state and gets weight 1.
+        ``random_walk`` (1/√s) is the random walk of the source, divided by SIGMA_Z. The variance of
+        a measurement is 1 / weight. If the first measurement has no weight, it gets the weight 1.
         """
         added_process_noise = self.added_process_noise / sigma_z_m**2
         added_process_noise[0] += self.length_s * random_walk**2
@@ -138,7 +138,7 @@ class Positions:
     ) -> Iterator[tuple[list[int], BandedSystem, int]]:
         """Yield (axes, factorised normal equations, degrees of freedom of one axis).
 
-        Axes that are measured at the same times have the same equations.
+        Axes that are measured at equal times are yielded together: their equations are equal.
         """
         is_measured = np.isfinite(self.measurement_m)
         process_noise = sigma_a_m_s2**2 * self.unit_process_noise + self.added_process_noise
@@ -150,8 +150,8 @@ class Positions:
             ]
             axes_left = [axis for axis in axes_left if axis not in axes]
             state_precision = self.prior_precision.copy()
-            # fewer than two measurements do not determine the initial state of a segment: it gets a
-            # prior and does not contribute to the likelihood
+            # Fewer than two measurements do not determine the initial state of a segment. A prior
+            # determines it, and the segment does not contribute to the likelihood
             has_too_few = np.add.reduceat(is_axis_measured.astype(int), self.segment_starts) < 2
             is_used = is_axis_measured & ~np.repeat(
                 has_too_few, np.diff([*self.segment_starts, len(is_measured)])
@@ -169,7 +169,7 @@ class Positions:
                 state_precision,
                 self.correlated_noise,
             )
-            # the weak prior of an unknown initial state must not contribute to the likelihood
+            # The weak prior of an unknown initial state must not contribute to the likelihood
             log_unknown_precision = float(
                 np.sum(np.log(state_precision[(state_precision > 0.0) & ~is_known]))
             )
@@ -184,8 +184,9 @@ class FittedPositions:
     Attributes
     ----------
     gram : ndarray, shape (s, T, 1 + c, 1 + c)
-        Inner products of the data and their sensitivities, weighted by the inverse covariance.
+        Inner products of the data and their derivatives, weighted by the inverse covariance.
     log_determinant : float
+        Logarithm of the determinant of the covariance.
     degrees_of_freedom : int
         Number of measured positions minus the number that determines the initial states.
     constants_prior_sigma : ndarray, shape (c,)
@@ -197,7 +198,7 @@ class FittedPositions:
     constants_prior_sigma: Array
 
     def scaled(self, factor: float) -> FittedPositions:
-        """Return the fit with the σ of all noises multiplied by ``factor``."""
+        """Return the likelihood if the σ of all noises is multiplied by ``factor``."""
         log_determinant = self.log_determinant + 2.0 * self.degrees_of_freedom * math.log(factor)
         return replace(self, gram=self.gram / factor**2, log_determinant=log_determinant)
 
@@ -210,9 +211,9 @@ class FittedPositions:
         return np.asarray(-np.linalg.solve(self.information(), self.gram[..., 1:, :1])[..., 0])
 
     def scores_by_segment(self, scales: Array = UNIT_SCALE) -> Array:
-        """Return -ln p of each segment for k factors on all noises, shape (k, s, T).
+        """Return -ln p of each segment, shape (k, s, T), without the log-determinant.
 
-        The log-determinant is omitted.
+        The σ of all noises is multiplied by each of k ``scales``.
         """
         scaled_gram = self.gram / scales[:, None, None, None, None] ** 2
         prior_sigma = self.constants_prior_sigma
@@ -227,7 +228,10 @@ class FittedPositions:
         return np.asarray(0.5 * square_sum + log_diagonal)
 
     def scores(self, scales: Array = UNIT_SCALE) -> Array:
-        """Return -ln p (without a constant) for k factors on all noises, shape (k, T)."""
+        """Return -ln p, shape (k, T), without a constant.
+
+        The σ of all noises is multiplied by each of k ``scales``.
+        """
         determinant_terms = 0.5 * self.log_determinant + self.degrees_of_freedom * np.log(scales)
         return np.asarray(self.scores_by_segment(scales).sum(axis=1) + determinant_terms[:, None])
 
@@ -237,8 +241,8 @@ def fit_positions(
 ) -> FittedPositions:
     """Compute the likelihood of positions for one SIGMA_A and one variance of each measurement.
 
-    ``measured_m``, shape (a, 1 or T, k, m), replaces the measured positions by those of the first k
-    inputs (data, then sensitivities).
+    ``measured_m``, shape (a, 1 or T, k, m), replaces the measured positions of the first k inputs.
+    The inputs are the data, then their derivatives.
     """
     if measured_m is None:
         measured_m = np.nan_to_num(positions.measurement_m.T)[:, None, None]
@@ -269,15 +273,15 @@ def fit_positions(
 
 
 def _inner_products(whitened: Array) -> Array:
-    """Return the Gram matrix of whitened inputs, summed over the axes."""
+    """Return the inner products of all pairs of whitened inputs, summed over the axes."""
     return np.asarray((whitened @ np.swapaxes(whitened, -1, -2)).sum(axis=0))
 
 
 def centre_on_path(positions: Positions, *, has_scale: bool = False) -> Positions:
     """Subtract a smooth path through the positions from positions and IMU increments.
 
-    This does not change the likelihood, but its rounding errors are smaller. With ``has_scale``,
-    the path also becomes the sensitivity to the last constant, the scale of the positions.
+    The likelihood stays equal, but its rounding errors decrease. With ``has_scale``, the path also
+    becomes the derivative with respect to the last constant, the scale of the positions.
     """
     measured_m = positions.measurement_m.copy()
     dp = positions.delta_position_m.copy()
@@ -293,7 +297,7 @@ def centre_on_path(positions: Positions, *, has_scale: bool = False) -> Position
         path_velocity_m_s = smoothed_state[..., 1]
         measured_m[:, axes] -= path_m[:, 0].T
         path_delta_position_m = np.diff(path_m) - positions.length_s * path_velocity_m_s[..., :-1]
-        # subtract the path for the first time offset from the increments for all time offsets
+        # The path for the first time offset is subtracted for all time offsets
         for array, increment in ((dp, path_delta_position_m), (dv, np.diff(path_velocity_m_s))):
             array[axes, :, 0] -= increment[:, :1]
             if has_scale:
@@ -309,7 +313,7 @@ def expected_squared_errors(
     Parameters
     ----------
     positions : Positions
-        Positions with one time offset only.
+        Positions with one time offset.
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
         Variance of each measurement.
@@ -317,7 +321,7 @@ def expected_squared_errors(
         Maximum-likelihood values of the unknown constants.
     """
     coefficients = np.concatenate([np.ones((len(constants), 1)), constants], axis=1)
-    # correct Δp and Δv for the constants of the segment in which each interval ends
+    # Δp and Δv are corrected with the constants of the segment in which the interval ends
     interval_coefficients = np.repeat(
         coefficients, np.diff([*positions.segment_starts, len(variance_m2)]), axis=0
     )[1:]
@@ -341,7 +345,8 @@ def products_by_segment(
 ) -> Array:
     """Return the inner products of k pairs of inputs in each of s segments, shape (s, k).
 
-    The constants are eliminated, and the inner product is weighted by the inverse covariance.
+    An input consists of measurements and of changes of position and velocity. The inner product is
+    weighted by the inverse covariance. Parts that the unknown constants explain are removed.
 
     Parameters
     ----------
@@ -363,7 +368,7 @@ def products_by_segment(
     batch_products = []
     for begin in range(0, second_measured_m.shape[1], INPUT_BATCH_SIZE):
         batch = np.s_[:, begin : begin + INPUT_BATCH_SIZE]
-        # order: first inputs of the pairs, second inputs, sensitivities to the constants
+        # Order: first inputs of the pairs, second inputs, derivatives for the constants
         dp, dv = (
             np.concatenate([increment[batch], 0.0 * increment[batch], constant_increment], axis=1)[
                 :, None
@@ -398,7 +403,7 @@ class BandedSystem:
     Attributes
     ----------
     precision : ndarray, shape (m, 2)
-        Precision of the measured position (1/m²) and of a prior velocity (s²/m²); 0 if unknown.
+        Precision of position (1/m²) and velocity (s²/m²) from measurement or prior; else 0.
     length_s : ndarray, shape (m - 1,)
         Intervals between successive states.
     inverse_q : ndarray, shape (3, m - 1)
@@ -439,15 +444,14 @@ class BandedSystem:
         )
 
     def whiten(self, measured_m: Array, dp: Array, dv: Array) -> ArrayPair:
-        """Return whitened Δp and Δv, and the component of the inputs that the states explain.
+        """Return whitened Δp and Δv of inputs, and the component that the states explain.
 
-        The inner product of two inputs, weighted by the inverse covariance, is the product of their
-        whitened increments, minus that of their explained components, plus that of their
-        measurements over σ. ``measured_m``, shape (..., k, m), are the measurements of the first k
-        inputs; the remaining inputs have none.
+        They give the inner product of two inputs, weighted by the inverse covariance: the product
+        of whitened Δp and Δv, minus that of explained components, plus that of measurements / σ².
+        ``measured_m``, shape (..., k, m), contains the measurements of the first k inputs.
         """
         intervals, right_side = self._interval_sides(measured_m, dp, dv)
-        # a unit diagonal is 30 % faster, because it needs no division in each row
+        # A unit diagonal is 30 % faster, because it needs no division in each row
         diagonal = self.cholesky_factor[0]
         unit_factor = self.cholesky_factor / diagonal
         explained, _ = lapack.dtbtrs(unit_factor, right_side.T, uplo="L", diag="U", overwrite_b=1)
@@ -486,12 +490,12 @@ class BandedSystem:
         )
 
     def position_variance(self) -> Array:
-        """Return the variance of each state's position given all data (m²), shape (m,).
+        """Return the variance (m²) of the position at each measurement, given all measurements.
 
-        The information of earlier and of later measurements adds up. Both are blocks of Cholesky
-        factors: of A, and of A in reversed order (Fraser and Potter 1969).
+        The information from earlier and from later measurements is added. Both are blocks of
+        Cholesky factors: of A, and of A in reversed order (Fraser and Potter 1969).
         """
-        # reverse the order of the rows and columns of A
+        # The order of the rows and columns of A is reversed
         reversed_bands = np.zeros_like(self.bands)
         size = self.bands.shape[1]
         for below in range(4):
@@ -499,7 +503,7 @@ class BandedSystem:
         reversed_lower, _ = lapack.dpbtrf(reversed_bands, lower=1, overwrite_ab=1)
         (a, c) = (self.cholesky_factor[0, first_row::2] for first_row in (0, 1))
         b = self.cholesky_factor[1, 0::2]
-        # in reversed order, velocity stands before position
+        # In reversed order, velocity is before position
         (d, f) = (reversed_lower[0, first_row::2][::-1] for first_row in (0, 1))
         e = reversed_lower[1, 0::2][::-1]
         p00 = a**2 + e**2 + f**2 - self.bands[0, 0::2]
@@ -540,8 +544,8 @@ def factorise(
     min_noise = MIN_NOISE_RATIO**2 * (
         1.0 / np.median(measured_precision[measured_precision > 0.0]) + q00
     )
-    # Q of a single prediction step has rank one. Rounding errors of its determinant must not hide
-    # min_noise, which makes Q invertible
+    # Q of one prediction step is singular. min_noise makes it invertible, if rounding errors of the
+    # determinant are removed
     variance_product = q00 * q11
     raw_determinant = variance_product - q01**2
     determinant = (
@@ -552,7 +556,7 @@ def factorise(
     i00, i01, i11 = inverse_q
     velocity_weight = i00 * length_s
     cross_weight = velocity_weight + i01
-    # A = Σ precision + [-F I]ᵀ Q⁻¹ [-F I], by columns as in LAPACK's band storage
+    # A = Σ precision + [-F I]ᵀ Q⁻¹ [-F I], in the columns of LAPACK's band storage
     state_count = 2 if correlated_noise is None else 3
     band_columns = np.zeros((len(state_precision), state_count, state_count + 2))
     position_rows = band_columns[:, 0]
@@ -572,7 +576,7 @@ def factorise(
     if correlated_noise is not None:
         correlated_sigma_m, tau_s = correlated_noise
         rho = np.where(is_joined, np.exp(-length_s / tau_s), 0.0)
-        # variance that is added to the time-correlated noise at each time
+        # Variance of the white noise that drives the time-correlated noise at each time
         correlated_variance = correlated_sigma_m**2 * np.append(1.0, 1.0 - rho**2)
         correlated_rows = band_columns[:, 2]
         position_rows[:, 2] = measured_precision

@@ -1,16 +1,16 @@
-"""Formulas of KF along one axis, used by the replay and by all estimates.
+"""Formulas of KF along one axis.
 
 State x = [position, velocity]; input a, the acceleration averaged over the step::
 
     F = [[1, dt], [0, 1]]    B = [dt²/2, dt]    H = [1, 0]    R = SIGMA_Z²
     Q(dt) = SIGMA_A² · DT · [[dt³/4, dt²/2], [dt²/2, dt]]
 
-With dt = DT, Q equals SIGMA_A² · [[dt⁴/4, dt³/2], [dt³/2, dt²]] of the lesson UAT 366, module 2.
-For any other dt the velocity noise per second is the same, so SIGMA_A does not depend on the
-measurement rate.
+With dt = DT, Q is SIGMA_A² · [[dt⁴/4, dt³/2], [dt³/2, dt²]], as in the lesson UAT 366, module 2.
+The velocity noise per second does not depend on dt, so SIGMA_A does not depend on the measurement
+rate.
 
-The functions accept floats (one filter) and arrays (many filters); floats are fifty times faster
-than arrays of one element. A covariance is the tuple of its elements 00, 01, 11.
+The functions accept floats (one filter) and arrays (many filters). Floats are fifty times faster
+than arrays of one element. A covariance is a tuple of its elements 00, 01, 11.
 """
 
 from typing import TypeVar
@@ -31,7 +31,7 @@ Symmetric = tuple[T, T, T]
 
 
 def symmetric_matrix(covariance: Symmetric[float] | Symmetric[Array]) -> Array:
-    """Return the 2 × 2 matrix with the elements 00, 01, 11 of a covariance."""
+    """Return a symmetric 2 × 2 matrix from its elements 00, 01, 11."""
     p00, p01, p11 = covariance
     return from_elements((p00, p01), (p01, p11))
 
@@ -47,10 +47,9 @@ def process_noise_unit(dt_s: T) -> Symmetric[T]:
 
 
 def continuous_noise_unit(dt_s: T) -> Symmetric[T]:
-    """Return Q / (SIGMA_A² · DT) of many short prediction steps: elements 00, 01, 11.
+    """Return Q / (SIGMA_A² · DT) over ``dt_s`` for continuous acceleration noise.
 
-    Element 00 is dt³/3 instead of dt³/4 of a single step, because the acceleration may change
-    within the interval.
+    Element 00 is dt³/3. In one prediction step with constant acceleration error, it is dt³/4.
     """
     return dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s
 
@@ -86,7 +85,8 @@ def update_step(
 ) -> tuple[tuple[T, T, T, T], tuple[T, T, Symmetric[T]]]:
     """Update with a measurement: ν = z - Hx, S = HPHᵀ + R, K = PHᵀS⁻¹, x = x + Kν, P = (I - KH)P.
 
-    Return (ν in m, S in m², both gains), then position, velocity and covariance after the update.
+    Return (ν in m, S in m², gain of position, gain of velocity), and the updated (position,
+    velocity, covariance).
     """
     p00, p01, p11 = covariance
     nu = measured_m - position

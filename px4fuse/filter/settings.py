@@ -17,7 +17,7 @@ INPUT_NAMES: tuple[InputName, ...] = get_args(InputName)
 
 
 class Range(NamedTuple):
-    """Valid range of a numeric setting, with the unit and name in messages."""
+    """Valid range of a numeric setting, and its unit and name for messages."""
 
     low: float
     high: float
@@ -31,7 +31,7 @@ SETTING_RANGES = {
     "dt_s": Range(1e-3, 1.0, "s", "DT"),
     "clock_offset_s": Range(-10.0, 10.0, "s", "time offset added to the source timestamps"),
 }
-# Numeric settings of KF; the time offset is a setting of the position source
+# Numeric settings of KF, without the time offset, which is a property of the position source
 KF_NUMBERS = tuple(name for name in SETTING_RANGES if name != "clock_offset_s")
 
 
@@ -78,7 +78,7 @@ class Settings:
 
 
 def requested_settings(request: ComparisonRequest) -> Settings:
-    """Return KF's settings from a request; a field that is None keeps its default."""
+    """Return the KF settings that the user requested, and defaults for all others."""
     values = {name: getattr(request, name) for name in Settings.__dataclass_fields__}
     # "auto" is estimated later, and the reader of a position file already adds the time offset
     if request.clock_offset_s == AUTO or request.position is not None:

@@ -1,6 +1,6 @@
-"""Positions and acceleration of a flight along its axes: north, east, down and aisle.
+"""Positions and acceleration of a flight along the axes north, east, down and aisle.
 
-The aisle is the main horizontal direction of the flight. Acceleration in NED = R(q) · specific
+The aisle is the main horizontal direction of the flight. The acceleration in NED is R(q) · specific
 force + [0, 0, g] (Groves 2013, eq. 5.52 without earth rate).
 """
 
@@ -32,8 +32,8 @@ AISLE = "aisle"
 MIN_IMU_GAP_S = 0.1
 # Minimum length of a gap in the IMU, as multiple of the median sample interval
 MIN_IMU_GAP_INTERVALS = 5.0
-# Minimum rate (Hz) of downsampled positions in estimates by likelihood: errors of a faster source
-# are time-correlated, so more positions would add computing time but no information
+# Positions are downsampled to at least this rate (Hz) before the noises are estimated: errors of
+# faster positions are time-correlated, so that more positions add no information
 MAX_INDEPENDENT_HZ = 25.0
 # Minimum number of position measurements along an axis
 MIN_MEASUREMENTS = 3
@@ -43,9 +43,9 @@ ROTATED_SAMPLES = 2**15
 
 @dataclass(frozen=True)
 class Segment:
-    """Analysed time span (s), and the reason for choosing it.
+    """Analysed time span (s) of a flight, and the reason why it was chosen.
 
-    ``flight_s`` is the whole flight, including times without positions; None if it is the same.
+    ``flight_s`` is the time span of the whole flight; None if it is analysed completely.
     """
 
     start_s: float
@@ -55,11 +55,11 @@ class Segment:
 
     @property
     def flight(self) -> Segment:
-        """Segment extended to the whole flight."""
+        """Time span of the whole flight."""
         return Segment(*(self.flight_s or (self.start_s, self.end_s)), self.reason)
 
     def cut(self, spans_s: Iterable[Span]) -> tuple[Span, ...]:
-        """Return the parts of time spans (s) that are inside the segment."""
+        """Cut time spans (s) to the analysed segment, and drop those outside."""
         clipped_spans = ((max(start, self.start_s), min(end, self.end_s)) for start, end in spans_s)
         return tuple((start, end) for start, end in clipped_spans if end > start)
 
@@ -116,7 +116,7 @@ class Axis:
     heading_deg : float or None
         Heading of a horizontal axis, clockwise from north.
     note : str
-        How the heading of the aisle was chosen, for the user.
+        Text for the user on the choice of the aisle's heading.
     measurement_time_s, measurement_m : ndarray, shape (n,)
     acceleration : Acceleration or Unavailable
         Input of KF.
@@ -133,7 +133,7 @@ class Axis:
     __repr__ = one_line_repr
 
     def keep_rows(self, rows: slice) -> Axis:
-        """Return the axis with the measurements of the given rows only."""
+        """Return the axis with a part of its measurements."""
         return replace(
             self,
             measurement_time_s=self.measurement_time_s[rows],
@@ -147,7 +147,7 @@ class Axis:
 
 
 def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unavailable:
-    """Return the IMU samples with a known attitude, and the attitude."""
+    """Return the attitude, and the IMU samples between its first and last sample."""
     imu, attitude = flight.imu, flight.attitude
     if isinstance(imu, Unavailable):
         return imu
@@ -164,10 +164,10 @@ def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unav
 
 
 def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
-    """Return the acceleration in NED without gravity (m/s²), at the IMU's timestamps.
+    """Return the acceleration in NED without gravity (m/s²) for each IMU sample.
 
-    The attitude is interpolated (slerp, Shoemake 1985): PX4's default profile logs it at a tenth of
-    the IMU's rate.
+    The attitude is interpolated (slerp, Shoemake 1985), because PX4 by default logs it at a tenth
+    of the IMU rate.
     """
     if isinstance(recorded := imu_and_attitude(flight), Unavailable):
         return recorded
@@ -187,14 +187,14 @@ def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
 
 
 def aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]:
-    """Return the main horizontal direction of the track.
+    """Return the main horizontal direction of the positions.
 
     Returns
     -------
     heading_deg : float
-        0 to 180: both directions along an aisle are equivalent.
+        0 to 180, because both directions along an aisle are equivalent.
     elongation : float
-        Standard deviation along this direction ÷ standard deviation across it.
+        Ratio of the standard deviations of the positions along and across this direction.
     """
     position_m = cut_to_segment(track.samples, segment)[Columns.POSITION[:2]].dropna().to_numpy()
     centred_m = position_m - position_m.mean(axis=0)
@@ -214,7 +214,7 @@ def make_axes(
     names: tuple[str, ...] | None = None,
     heading_deg: float | None = None,
 ) -> tuple[Axis, ...]:
-    """Project positions and acceleration of a flight onto its axes.
+    """Project positions and acceleration of a flight onto north, east, down and aisle.
 
     Parameters
     ----------
@@ -222,9 +222,9 @@ def make_axes(
     track : PositionTrack
     segment : Segment
     names : tuple of str, optional
-        Some of "north", "east", "down", "aisle"; by default all for which the source has positions.
+        Names of the axes; by default all four, without those that have no positions.
     heading_deg : float, optional
-        Heading of the aisle, clockwise from north; default: main direction of the track.
+        Heading of the aisle, clockwise from north; default: main direction of the positions.
 
     Raises
     ------
@@ -278,13 +278,13 @@ def make_axes(
 
 
 def independent_rows(time_s: Array) -> slice:
-    """Return a slice that downsamples a fast source to 1 to 2 times ``MAX_INDEPENDENT_HZ``."""
+    """Return a slice that downsamples fast positions to 1 to 2 times ``MAX_INDEPENDENT_HZ``."""
     interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else np.inf
     return slice(None, None, max(1, int(1.0 / (interval_s * MAX_INDEPENDENT_HZ))))
 
 
 def too_few_measurements(name: str, count: int, min_count: int) -> Unavailable:
-    """Return Unavailable for an analysis with too few measurements."""
+    """Return the message that an analysis has too few measurements."""
     return Unavailable(
         name,
         f"only {count} measurements (at least {min_count} are needed)",
@@ -293,7 +293,7 @@ def too_few_measurements(name: str, count: int, min_count: int) -> Unavailable:
 
 
 def weighted_sum(samples: pd.DataFrame, columns: list[str], weights: Array) -> Array:
-    """Return the weighted sum of columns; columns with weight zero may be NaN."""
+    """Return the weighted sum of columns. A column with weight zero may contain NaN."""
     weighted_total = np.zeros(len(samples))
     for column, weight in zip(columns, weights, strict=True):
         if weight != 0.0:
@@ -320,7 +320,7 @@ def _axis_direction(
 def project_acceleration(
     acceleration: pd.DataFrame | Unavailable, direction: Array, segment: Segment
 ) -> Acceleration | Unavailable:
-    """Project the acceleration (m/s², NED) onto a direction."""
+    """Project the acceleration (m/s², NED) onto a unit vector, and integrate it."""
     if isinstance(acceleration, Unavailable):
         return acceleration
     time_s = acceleration.index.to_numpy()
@@ -348,7 +348,7 @@ def project_acceleration(
 
 
 def imu_gaps(time_s: Array) -> BoolArray:
-    """Return a mask of the intervals between IMU samples that are gaps, shape (n - 1,)."""
+    """Return True for each interval between IMU samples that is a gap, shape (n - 1,)."""
     interval_s = np.diff(time_s)
     return interval_s > max(MIN_IMU_GAP_S, MIN_IMU_GAP_INTERVALS * float(np.median(interval_s)))
 
@@ -356,9 +356,9 @@ def imu_gaps(time_s: Array) -> BoolArray:
 def mean_step_acceleration(
     acceleration: Acceleration, step_edges_s: ArrayLike
 ) -> tuple[Array, Array]:
-    """Return the mean acceleration of each prediction step, and the fraction of it in an IMU gap.
+    """Return for each prediction step the mean acceleration, and its fraction in an IMU gap.
 
-    ``step_edges_s`` are the start and end times (s) of the steps.
+    ``step_edges_s`` contains the start of the first step, and the end (s) of each step.
     """
     step_edges_s = np.asarray(step_edges_s, dtype=np.float64)
     length_s = np.diff(step_edges_s)

@@ -1,4 +1,4 @@
-"""Prediction steps of KF, which end at each time of the DT grid and at each measurement time."""
+"""Prediction steps of KF: a step ends at each multiple of DT and at each measurement."""
 
 from dataclasses import dataclass
 
@@ -16,14 +16,14 @@ MAX_SAME_TIME_S = 5e-7
 
 @dataclass(frozen=True)
 class Timeline:
-    """Prediction steps of KF, with their inputs.
+    """Prediction steps of KF, and the acceleration in each step.
 
     Attributes
     ----------
     time_s : ndarray, shape (n,)
         Time of the initial state, then end of each step.
     measurement_index : ndarray of int, shape (n,)
-        Index of the measurement at each time; -1 without a measurement.
+        Index of the measurement at each time, or -1.
     acceleration_m_s2 : ndarray, shape (n - 1,)
         Mean acceleration over each step.
     input_variance_m2_s4 : ndarray, shape (n - 1,)
@@ -59,7 +59,7 @@ def make_timeline(
         )
     grid_count = int(np.floor((measurement_time_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
     grid_s = start_s + settings.dt_s * np.arange(grid_count)
-    # omit grid times at which there is a measurement
+    # Multiples of DT at which there is a measurement are omitted
     next_index = np.searchsorted(measurement_time_s, grid_s)
     neighbours = np.clip([next_index - 1, next_index], 0, len(measurement_time_s) - 1)
     distance_s = np.abs(measurement_time_s[neighbours] - grid_s).min(axis=0)
@@ -77,12 +77,12 @@ def make_timeline(
         )
     mean_m_s2, gap_fraction = mean_step_acceleration(axis.acceleration, time_s)
     gap_s = gap_fraction * np.diff(time_s)
-    # In a gap of T seconds the unknown acceleration is assumed constant. The velocity error is then
-    # rms·T, not rms·√(DT·T) as for white noise, so the variance is scaled by T/DT.
+    # The unknown acceleration in an IMU gap of T seconds is assumed to be constant. The velocity
+    # error is rms·T instead of rms·√(DT·T) for white noise, so the variance is multiplied by T/DT
     interval_index = np.searchsorted(
         np.flatnonzero(measurement_index >= 0), np.arange(1, len(time_s))
     )
-    gap_of_interval = np.bincount(interval_index, weights=gap_s)[interval_index]
-    variance_scale = np.maximum(gap_of_interval / settings.dt_s, 1.0)
+    gap_in_interval_s = np.bincount(interval_index, weights=gap_s)[interval_index]
+    variance_scale = np.maximum(gap_in_interval_s / settings.dt_s, 1.0)
     gap_variance = gap_fraction * variance_scale * axis.acceleration.rms_m_s2**2
     return Timeline(time_s, measurement_index, mean_m_s2, gap_variance, float(np.sum(gap_s)))

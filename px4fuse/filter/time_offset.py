@@ -1,12 +1,12 @@
-"""Time offset between position source and IMU, by joint maximum likelihood.
+"""Time offset between position source and IMU, estimated by maximum likelihood.
 
 KF follows late positions, so a time offset τ hardly increases the innovations. Only the comparison
 of positions with the acceleration shows it. The likelihood of the positions given the acceleration
-is maximised over τ and over the noises. Constant errors with a similar effect (biases, tilt, scale;
-:mod:`px4fuse.filter.imu_motion`) are estimated too.
+is maximised over τ and the noises. Constant errors with a similar effect are estimated too: biases,
+tilt and scale (:mod:`px4fuse.filter.imu_motion`).
 
-The noise of the IMU increases the variance of τ above the value from the curvature of the
-likelihood. The factor is simulated and widens the interval (sandwich estimate, White 1982).
+IMU noise makes the variance of τ larger than the curvature of the likelihood shows. The ratio of
+both variances is simulated, and widens the 95 % interval (sandwich estimate, White 1982).
 """
 
 from collections.abc import Callable
@@ -34,27 +34,27 @@ from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment, independent_rows
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 
-# Number of time offsets at which the likelihood is computed near its maximum
+# Number of time offsets near the maximum at which the likelihood is computed
 FINE_OFFSET_COUNT = 11
-# Number of time offsets of the interpolated likelihood curve
+# Number of time offsets to which the likelihood is interpolated
 CURVE_OFFSET_COUNT = 121
-# Prior σ (rad) of EKF2's heading with GNSS: wide, because a GNSS delay that is wrong by 0.2 s
-# rotates EKF2's heading by 5°
+# Prior σ (rad) of EKF2's heading with GNSS: large, because a wrong GNSS delay (0.2 s) rotates
+# EKF2's heading (5°)
 GNSS_HEADING_SIGMA_RAD = 0.2
 # Maximum half-width (s) of the 95 % interval of an accepted time offset
 MAX_HALF_INTERVAL_S = 0.15
-# Maximum σ (s) of the time offset of a flight part in the test for a change
+# Flight parts whose time offset has a larger σ (s) are not used to test for a change
 MAX_PART_OFFSET_SIGMA_S = 0.15
 # The time offset changes in flight if the p-value of a constant offset is below this limit
 MAX_CHANGE_P_VALUE = 0.005
 # Minimum change (s) of the time offset in flight: a smaller change may be drift of the source
 MIN_CHANGE_S = 0.10
-# A time offset is significant above this multiple of its σ: false alarm probability 0.3 %
+# A time offset is significant if it exceeds this multiple of its σ: false alarm probability 0.3 %
 MIN_OFFSET_SIGMAS = 3.0
-# A time offset is significant above this value (s): a position error of 3 cm at 1 m/s
+# A time offset is significant if it exceeds this time (s): position error of 3 cm at 1 m/s
 MIN_OFFSET_S = 0.03
-# The variance of the time offset is simulated with 96 series of IMU noise for a flight of up to 12
-# segments; a longer flight needs fewer, because its groups of 12 segments are independent
+# The variance of the time offset is simulated with 96 series of IMU noise. A flight of more than 12
+# segments needs fewer, because each group of 12 segments is independent
 SIMULATION_COUNT, SIMULATED_SEGMENTS = 96, 12
 
 
@@ -79,7 +79,7 @@ class ClockOffset(Record, kw_only=True):
     applied_s : float
         Time offset that was already added to the timestamps before the estimate.
     is_determinable : bool
-        True if the 95 % interval is narrow; ``reason`` is then empty.
+        True if the 95 % interval is narrow; otherwise ``reason`` contains the cause.
     parts : tuple of PartOffset
         Offsets of consecutive parts of the flight.
     drift_ppm, drift_sigma_ppm : float or None
@@ -115,9 +115,8 @@ class ClockOffset(Record, kw_only=True):
     def three_sigma_s(self) -> float:
         return MIN_OFFSET_SIGMAS * self.sigma_s
 
-    @property
-    def changes(self) -> bool:
-        """True if the offset changes in flight, significantly and by at least ``MIN_CHANGE_S``."""
+    def has_changed(self) -> bool:
+        """Return True if the offset changes in flight significantly, by at least MIN_CHANGE_S."""
         if self.change_p_value is None or self.change_p_value >= MAX_CHANGE_P_VALUE:
             return False
         return abs(self.parts[-1].offset_s - self.parts[0].offset_s) >= MIN_CHANGE_S
@@ -136,7 +135,7 @@ def estimate_time_offset(
     progress: Callable[[str], None] = lambda _: None,
     motion_cache: MotionCache | None = None,
 ) -> ClockOffset | Unavailable:
-    """Estimate the time offset to add to the timestamps of a position track.
+    """Estimate the time offset to add to the timestamps of a position source.
 
     Parameters
     ----------
@@ -144,9 +143,9 @@ def estimate_time_offset(
     track : PositionTrack
     segment : Segment
     settings : Settings
-        ``clock_offset_s`` is the offset that was already added.
+        ``clock_offset_s`` is a time offset that was already added.
     noises : Noises
-        Initial values; the random walk is not zero if the source may drift (odometry).
+        Initial values. The random walk is above zero if the source may drift (odometry).
     outlier_time_s : ndarray, optional
         Timestamps of measurements to exclude.
     progress : callable
@@ -154,7 +153,7 @@ def estimate_time_offset(
     motion_cache : dict, optional
         IMU motion that several estimates share.
     """
-    # the height of GNSS is not used: it is noisier, and all axes share one SIGMA_Z
+    # The height of GNSS is not used: it is noisier, but all axes have one SIGMA_Z
     axis_count = 2 if track.origin.is_gnss else 3
     position_samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:axis_count]]
     position_samples = position_samples.dropna(subset=Columns.POSITION[:2])
@@ -188,23 +187,12 @@ def estimate_time_offset(
     offset_variance_factor = _simulate_offset_variance_factor(
         prepared_motion, offset_s, noises, sigma_s**-2.0
     )
-    while True:
-        node_offsets_s, curve_s = (
-            _offset_grid(offset_s, half_width_s, offset_count)
-            for offset_count in (FINE_OFFSET_COUNT, CURVE_OFFSET_COUNT)
-        )
-        position_batches = prepared_motion.position_batches(node_offsets_s)
-        node_scores = fit_noises(position_batches, noises, prepared_motion.weight).scores()[0]
-        curve_scores = CubicSpline(node_offsets_s, node_scores)(curve_s)
-        low_s, high_s = profile_interval(
-            curve_s, curve_scores, PROFILE_DROP * offset_variance_factor
-        )
-        is_closed = low_s is not None and high_s is not None
-        if is_closed or half_width_s >= 2.0 * MAX_OFFSET_S:
-            break
-        half_width_s *= 2.0
+    curve_s, curve_scores, low_s, high_s = _profile(
+        prepared_motion, noises, offset_s, half_width_s, PROFILE_DROP * offset_variance_factor
+    )
+    is_closed = low_s is not None and high_s is not None
     offset_s = _minimum_and_sigma(curve_s, curve_scores)[0]
-    # an IMU sample is the mean over an interval; its timestamp may be anywhere in this interval
+    # An IMU sample is the mean over one interval, and its timestamp may be any time in it
     resolution_s = 0.5 * prepared_motion.imu_interval_s
     ends_s = curve_s[0] if low_s is None else low_s, curve_s[-1] if high_s is None else high_s
     half_intervals_s = np.hypot(np.array(ends_s) - offset_s, 1.96 * resolution_s)
@@ -244,19 +232,40 @@ def estimate_time_offset(
     )
 
 
+def _profile(
+    motion: PreparedMotion, noises: Noises, offset_s: float, half_width_s: float, drop: float
+) -> tuple[Array, Array, float | None, float | None]:
+    """Return offsets (s), their -ln p, and the two offsets (s) at which -ln p rises by ``drop``.
+
+    The range of offsets around ``offset_s`` is doubled until it contains both; else None.
+    """
+    while True:
+        node_offsets_s, curve_s = (
+            _offset_grid(offset_s, half_width_s, offset_count)
+            for offset_count in (FINE_OFFSET_COUNT, CURVE_OFFSET_COUNT)
+        )
+        position_batches = motion.position_batches(node_offsets_s)
+        node_scores = fit_noises(position_batches, noises, motion.weight).scores()[0]
+        curve_scores = CubicSpline(node_offsets_s, node_scores)(curve_s)
+        low_s, high_s = profile_interval(curve_s, curve_scores, drop)
+        if None not in (low_s, high_s) or half_width_s >= 2.0 * MAX_OFFSET_S:
+            return curve_s, curve_scores, low_s, high_s
+        half_width_s *= 2.0
+
+
 def _offset_grid(centre_s: float, half_width_s: float, offset_count: int) -> Array:
     low_s = max(centre_s - half_width_s, -MAX_OFFSET_S)
     return np.linspace(low_s, min(centre_s + half_width_s, MAX_OFFSET_S), offset_count)
 
 
 def _simulate_offset_variance_factor(
-    prepared_motion: PreparedMotion, offset_s: float, noises: Noises, information: float
+    prepared_motion: PreparedMotion, offset_s: float, noises: Noises, fisher_information: float
 ) -> float:
-    """Return the simulated variance of the time offset ÷ its variance from the curvature.
+    """Simulate the ratio of the time offset's variance to the variance from the curvature of -ln p.
 
     The derivative of -ln p with respect to the time offset is eᵀM(v + n), with residuals e, inverse
-    covariance M, velocity v and velocity noise n of the IMU. The term eᵀMn is random even at rest,
-    because e contains the same noise n.
+    covariance M, velocity v and velocity noise n of the IMU. The term eᵀMn increases the variance:
+    e also contains n.
     """
     offset_positions = prepared_motion.positions_at_offset(offset_s)
     is_joined = offset_positions.is_joined
@@ -276,11 +285,11 @@ def _simulate_offset_variance_factor(
     dv[..., is_joined] = np.sqrt(q11 - q01**2 / q00) * draw_normal(interval_count)
     dv[..., is_joined] += q01 / q00 * dp[..., is_joined]
     error_m = noises.sigma_z_m * draw_normal(measurement_count)
-    # the velocity noise is the sum of the increments since the start of the segment
+    # The velocity noise is the sum of Δv since the start of the segment
     velocity_noise = np.zeros_like(error_m)
     for begin, end in offset_positions.segments:
         np.cumsum(dv[..., begin : end - 1], axis=-1, out=velocity_noise[..., begin + 1 : end])
-    # the random walk of the source is added after the velocity noise, which contains IMU noise only
+    # The random walk of the source is added to Δp only, not to the velocity noise of the IMU
     if noises.random_walk_m:
         dp[..., is_joined] += (
             noises.random_walk_m
@@ -294,11 +303,11 @@ def _simulate_offset_variance_factor(
         offset_positions, noises.sigma_a_m_s2, scaled_variance, (error_m, dp, dv), velocity_noise
     )
     variances = np.add.reduceat(noise_products, first_segments).var(axis=1)
-    return 1.0 + float(variances.sum()) / information
+    return 1.0 + float(variances.sum()) / fisher_information
 
 
 def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
-    """Return the minimum of a profile (-ln p on a grid), and σ from the curvature of a parabola."""
+    """Fit a parabola to -ln p on a grid; return the minimum, and σ from the curvature."""
     minimum_index = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
     grid_step = grid[1] - grid[0]
     vertex_shift, curvature = parabola_vertex(profile, minimum_index)
@@ -312,7 +321,10 @@ def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
 def _offset_per_part(
     prepared_motion: PreparedMotion, offset_s: float, noises: Noises, offset_variance_factor: float
 ) -> tuple[tuple[PartOffset, ...], float | None]:
-    """Estimate the time offset of each segment, and the p-value of a constant offset."""
+    """Estimate the time offset in each segment of the flight, and test for a constant offset.
+
+    The second value is the p-value of the test; None with fewer than two offsets.
+    """
     coarse_s = offset_s + np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSET_COUNT)
     coarse_s = coarse_s[np.abs(coarse_s) <= MAX_OFFSET_S]
     coarse_profiles = fit_noises(
@@ -341,7 +353,10 @@ def _offset_per_part(
 
 
 def _fit_clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None, float | None]:
-    """Return the drift of the source's clock and its σ (ppm), from the offsets of the parts."""
+    """Return the clock drift of the position source and its σ (ppm).
+
+    Return None with fewer than three flight parts.
+    """
     if len(part_offsets) < 3:
         return None, None
     weighted_offsets = [

@@ -1,8 +1,8 @@
-"""Maximum-likelihood SIGMA_A and SIGMA_Z with 95 % intervals and a held-out check.
+"""Maximum-likelihood SIGMA_A and SIGMA_Z with 95 % intervals.
 
-Constant errors are not noise, so biases, tilt and time offset are estimated too
-(:mod:`px4fuse.filter.imu_motion`). SIGMA_A is then the noise of the acceleration alone. KF has no
-states for biases and needs a larger SIGMA_A, which is estimated separately.
+Two values of SIGMA_A are estimated. The first is the noise of the acceleration alone: biases, tilt
+and time offset are estimated too (:mod:`px4fuse.filter.imu_motion`). The second is for KF, which
+needs a larger SIGMA_A because it has no states for biases.
 """
 
 from __future__ import annotations
@@ -41,21 +41,22 @@ HORIZONTAL = "horizontal"
 NoiseInterval = tuple[NotNegative, NotNegative | None]
 # Minimum number of positions from which SIGMA_A and SIGMA_Z are estimated
 MIN_MEASUREMENTS = 30
-# SIGMA_A and SIGMA_Z are not estimated if the fraction of outliers is above this limit
+# SIGMA_A and SIGMA_Z are not estimated if a larger fraction of the positions are outliers
 MAX_OUTLIER_FRACTION = 0.3
-# Multiples of KF's SIGMA_A from which the noise fit with IMU biases starts
+# Initial values of SIGMA_A in the estimate with IMU biases, as multiples of KF's SIGMA_A
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value of the random walk (m/√s) of a source that may drift
 START_RANDOM_WALK_M = 0.02
-# A noise estimate within this factor of an end of its search range is only a bound
+# If the ratio of a noise estimate to an end of its search range is smaller, the estimate is only a
+# bound
 MAX_SEARCH_END_RATIO = 1.001
 
 
 class Noise(Record):
     """Maximum-likelihood estimate of one noise parameter, with its 95 % interval.
 
-    ``value`` is None if the maximum is outside the search range, ``low`` if the noise may be zero,
-    and ``high`` without an upper bound.
+    ``value`` is None if the maximum is outside the search range. ``low`` is None if the noise may
+    be zero, ``high`` is None without an upper bound.
     """
 
     value: float | None
@@ -64,26 +65,26 @@ class Noise(Record):
 
     @classmethod
     def from_fields(cls, value: float | None, interval: NoiseInterval | None) -> Noise:
-        """Return a noise with the value and interval in the fields of :class:`AxisTuning`."""
+        """Make a noise from its value and interval in :class:`AxisTuning`."""
         low, high = interval or (0.0, None)
         return cls(value, low or None, high)
 
     def as_fields(self, name: str) -> dict[str, Any]:
-        """Return value and interval as fields of :class:`AxisTuning`."""
+        """Return value and interval as keyword arguments for :class:`AxisTuning`."""
         is_bounded = self.low is not None or self.high is not None
         interval = (self.low or 0.0, self.high) if is_bounded else None
         return {name: self.value, f"{name}_interval": interval}
 
 
 class HeldOutCheck(Record):
-    """Noises estimated from the first half of the flight and tested with the second half.
+    """Noises that are estimated from the first half of the flight and tested on the second half.
 
     Attributes
     ----------
     count : int
         Number of measurements in the second half.
     log_likelihood_gain_per_measurement : float
-        Gain over the chosen settings in the second half, which was not used for tuning.
+        Gain in the second half over KF's current settings.
     """
 
     sigma_a_m_s2: NotNegative
@@ -95,20 +96,22 @@ class HeldOutCheck(Record):
 class AxisTuning(Record, kw_only=True):
     """Estimated noises of KF for one axis, or for north and east together, with 95 % intervals.
 
-    None: no estimate in the search range. An interval that begins at 0: the noise may be zero.
+    A noise is None if its estimate is outside the search range. An interval begins at 0 if the
+    noise may be zero.
 
     Attributes
     ----------
     sigma_a_two_state_m_s2 : float or None
         SIGMA_A that KF needs, because it has no states for biases.
     log_likelihood_gain_per_measurement : float
-        Gain of the estimates over the chosen settings of KF.
+        Gain of the estimated over the current settings of KF.
     before, after : Consistency or Unavailable
-        Consistency of KF with the chosen and the estimated settings, along the first axis.
+        Consistency of KF along the first axis, with its current and with the estimated settings.
     outliers : int
         Number of measurements with an outlier probability above 0.5.
     biases_fitted : bool
-        False if the IMU rate is too low; KF's SIGMA_A is then an upper bound of the noise.
+        False if the IMU rate is too low to estimate biases. KF's SIGMA_A is then only an upper
+        bound of the acceleration noise.
     noises : Noises
         Maximum-likelihood noises, including the random walk of a drifting source.
     """
@@ -137,7 +140,7 @@ class AxisTuning(Record, kw_only=True):
 
     @property
     def sigma_a_two_state(self) -> Noise:
-        """SIGMA_A of KF, which has no states for biases (m/s²)."""
+        """SIGMA_A (m/s²) that KF needs, because it has no states for biases."""
         return Noise.from_fields(self.sigma_a_two_state_m_s2, self.sigma_a_two_state_m_s2_interval)
 
     @property
@@ -160,7 +163,7 @@ def tune(
     ----------
     axes : tuple of Axis
     settings : Settings
-        Settings of KF, which are compared with the estimates.
+        Current settings of KF, with which the estimates are compared.
     names : tuple of str, optional
         Axis names and "horizontal"; default: all.
     progress : callable
@@ -207,7 +210,10 @@ def tune_axes(
     may_drift: bool = False,
     motion_cache: MotionCache | None = None,
 ) -> AxisTuning | Unavailable:
-    """Estimate the common noises of axes with the same measurement times; see :func:`tune`."""
+    """Estimate the noises that several axes with equal measurement times have in common.
+
+    See :func:`tune` for the parameters.
+    """
     kf_inputs = [preintegrate(axis, settings) for axis in axes]
     all_time_s = axes[0].measurement_time_s[-len(kf_inputs[0].measurement_m) :]
     axes = tuple(axis.keep_rows(independent_rows(axis.measurement_time_s)) for axis in axes)
@@ -217,13 +223,13 @@ def tune_axes(
         return too_few_measurements(
             f"estimate of the noises ({name})", measurement_count, MIN_MEASUREMENTS
         )
-    chosen_noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
-    kf_fit = maximise_likelihood(axis_positions, chosen_noises, np.ones(measurement_count))
-    # the fit that includes biases, tilt and time offset needs IMU data
+    current_noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
+    kf_fit = maximise_likelihood(axis_positions, current_noises, np.ones(measurement_count))
+    # The estimate with biases, tilt and time offset needs IMU data
     motion_fit = None
     if flight is not None and settings.input == "imu":
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
-        # KF's fit has no weight for the first measurement, its initial state
+        # KF's fit contains no weight of the first measurement: it is the initial state
         axis_weights = np.concatenate([np.ones(len(measured_m) - measurement_count), kf_fit.weight])
         prepared_motion = prepare_motion(
             flight,
@@ -238,7 +244,7 @@ def tune_axes(
             start_noises = replace(
                 kf_fit.noises, random_walk_m=START_RANDOM_WALK_M if may_drift else 0.0
             )
-            # a coarse time offset is enough: a finer value hardly changes the noises
+            # An approximate time offset is sufficient: it hardly changes the noises
             offset_s, start_noises = prepared_motion.search_offset(
                 start_noises, START_SIGMA_A_FACTORS, has_scale=False
             )
@@ -263,32 +269,32 @@ def tune_axes(
     final_sigma_z_m = sigma_z.value or sigma_z.high or best_fit.noises.sigma_z_m
     kf_sigma_a = sigma_a if motion_fit is None else _estimate_kf_sigma_a(kf_fit, final_sigma_z_m)
     if motion_fit is None and flight is not None and settings.input == "imu":
-        # without biases and tilt the noise cannot be estimated; KF's SIGMA_A is an upper bound
+        # Without estimates of biases and tilt, KF's SIGMA_A is only an upper bound of the noise
         sigma_a = Noise(None, None, kf_sigma_a.high)
     final_noises = Noises(
         kf_sigma_a.value or kf_sigma_a.high or kf_fit.noises.sigma_a_m_s2, final_sigma_z_m
     )
-    gain_nats = kf_fit.score(chosen_noises) - kf_fit.score(final_noises)
+    gain_nats = kf_fit.score(current_noises) - kf_fit.score(final_noises)
     return AxisTuning(
         name=name,
         **sigma_a.as_fields("sigma_a_m_s2"),
         **sigma_z.as_fields("sigma_z_m"),
         **kf_sigma_a.as_fields("sigma_a_two_state_m_s2"),
         log_likelihood_gain_per_measurement=gain_nats / measurement_count,
-        before=_assess_innovations(kf_inputs[0], chosen_noises, is_outlier),
+        before=_assess_innovations(kf_inputs[0], current_noises, is_outlier),
         after=_assess_innovations(kf_inputs[0], final_noises, is_outlier),
         outlier_time_s=all_time_s[is_outlier],
         count=len(all_time_s),
         outliers=int(np.count_nonzero(is_outlier)),
-        held_out=_check_held_out(name, chosen_noises, kf_fit),
+        held_out=_check_held_out(name, current_noises, kf_fit),
         noises=best_fit.noises,
         biases_fitted=motion_fit is not None,
     )
 
 
 def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
-    """Estimate SIGMA_A (index 0) or SIGMA_Z (index 1) with its 95 % interval."""
-    sigmas = fit.noises.sigma_a_m_s2, fit.noises.sigma_z_m
+    """Return SIGMA_A (``noise_index`` 0) or SIGMA_Z (1) of a fit with its 95 % interval."""
+    best_noises = fit.noises.sigma_a_m_s2, fit.noises.sigma_z_m
 
     def score(log_value: float, log_other: float) -> float:
         log_noises = (log_value, log_other) if noise_index == 0 else (log_other, log_value)
@@ -299,7 +305,7 @@ def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
     variance_factor = (1.0, fit.sigma_z_variance_factor)[noise_index]
     return _noise_with_interval(
         score,
-        (np.log(sigmas[noise_index]), np.log(sigmas[1 - noise_index])),
+        (np.log(best_noises[noise_index]), np.log(best_noises[1 - noise_index])),
         search_range,
         variance_factor,
     )
@@ -338,7 +344,7 @@ def _assess_innovations(
     return assess(nu[~is_outlier], s[~is_outlier])
 
 
-def _check_held_out(name: str, chosen_noises: Noises, fit: NoiseFit) -> HeldOutCheck | Unavailable:
+def _check_held_out(name: str, current_noises: Noises, fit: NoiseFit) -> HeldOutCheck | Unavailable:
     half_count = len(fit.weight) // 2
     if half_count < MIN_MEASUREMENTS:
         return Unavailable(
@@ -347,20 +353,20 @@ def _check_held_out(name: str, chosen_noises: Noises, fit: NoiseFit) -> HeldOutC
             f"{MIN_MEASUREMENTS} are needed)",
             "Analyse a longer segment.",
         )
-    # row 0 is KF's initial state
+    # The first measurement is KF's initial state
     first_half = [positions.first(1 + half_count) for positions in fit.score.axis_positions]
     first_fit = maximise_likelihood(
         first_half, fit.noises, fit.weight[:half_count], fits_outliers=False
     )
     tuned_noises = first_fit.noises
     # -ln p of the second half: whole flight minus first half
-    chosen_score, tuned_score = (
-        fit.score(noises) - first_fit.score(noises) for noises in (chosen_noises, tuned_noises)
+    current_score, tuned_score = (
+        fit.score(noises) - first_fit.score(noises) for noises in (current_noises, tuned_noises)
     )
     count = len(fit.weight) - half_count
     return HeldOutCheck(
         tuned_noises.sigma_a_m_s2,
         tuned_noises.sigma_z_m,
         count,
-        (chosen_score - tuned_score) / count,
+        (current_score - tuned_score) / count,
     )

@@ -1,13 +1,15 @@
-"""Findings: faults of a flight that the log shows.
+"""Findings: faults of a flight, its sensors and its settings that the log shows.
 
-Each module in :data:`DETECTORS` yields findings in its function ``detect``. docs/built.md lists the
-files to change for a new finding.
+Each module in :data:`DETECTORS` has a function ``detect`` that yields findings. docs/built.md lists
+the files to change for a new finding.
 """
 
 from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
+from px4fuse.comparison.flight_events import airborne_spans
 from px4fuse.ekf2.aids import AidResult
+from px4fuse.filter.signals import Segment
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings import (
     aids,
@@ -34,9 +36,10 @@ from px4fuse.findings import (
     source_values,
 )
 from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import TITLES, group_by_root
-from px4fuse.flight.model import Ekf2, Unavailable
+from px4fuse.findings.model import TITLES, group_by_root, warning
+from px4fuse.flight.model import Ekf2, Flight
 from px4fuse.loop.model import Loop
+from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
 __all__ = [
     "TITLES",
@@ -76,29 +79,37 @@ DETECTORS = (
 
 
 def find(analysis: Analysis) -> tuple[Finding, ...]:
-    """Return the findings, most severe first."""
+    """Return the findings of a comparison of KF with EKF2, most severe first."""
     findings = [found for module in DETECTORS for found in module.detect(analysis)]
     return group_by_cause(source_convention.apply_convention(analysis, findings))
 
 
 def find_loop(loop: Loop) -> tuple[Finding, ...]:
-    """Return the findings about a loop and its closures, most severe first."""
+    """Return the findings on the loop closures of a path, most severe first."""
     return () if loop.is_assessed else group_by_cause(loops.detect_in_loop(loop))
 
 
 def find_aids(
-    aid_results: Mapping[str, AidResult], ekf2: Ekf2 | Unavailable | None = None
+    aid_results: Mapping[str, AidResult], flight: Flight | None = None
 ) -> tuple[Finding, ...]:
     """Return the findings on EKF2 and its aiding sources, for a flight without position source."""
     findings = list(aids.detect_in_aids(aid_results))
-    if isinstance(ekf2, Ekf2):
-        span_s = ekf2.instances[0][0], ekf2.instances[-1][0]
-        findings += ekf2_resets.detect_instance_switches(ekf2, span_s)
+    for item in flight.missing if flight is not None else ():
+        if item.remedy == NO_FIX_ACTION:
+            message = f"The GNSS receiver had no position: {item.reason}."
+            findings.append(warning("source_without_position", message, item.remedy))
+    if flight is not None and isinstance(flight.ekf2, Ekf2):
+        spans_s = airborne_spans(flight) or ((0.0, flight.log.duration_s),)
+        segment = Segment(spans_s[0][0], spans_s[-1][1], "")
+        findings += ekf2_resets.detect_instance_switches(
+            flight.ekf2, (segment.start_s, segment.end_s)
+        )
+        findings += ekf2_state.detect_missing_alignment(flight, segment)
     return group_by_cause(findings)
 
 
 def finding_title(finding_id: str) -> str:
-    """Return the title of a finding, or its id with blanks if the id is unknown.
+    """Return the title of a finding. If its id is unknown, return the id with blanks.
 
     >>> finding_title("source_gap"), finding_title("of_a_later_version")
     ('Gap in the position source', 'of a later version')

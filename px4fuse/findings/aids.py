@@ -10,20 +10,23 @@ from px4fuse.comparison.flight_events import airborne_spans
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_number, format_ratio
 from px4fuse.ekf2.aids import CHANGE_WINDOW_S, AidResult
+from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.flight.model import BAD_ACCELERATION, Unavailable
 
-# External vision, which other modules test by replays of EKF2
+# Aiding sources of external vision: other modules test them by replays of EKF2
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
 # Time (s) after take-off in which EKF2 may ignore the barometer because of ground effect
 TAKE_OFF_S = 10.0
-# Minimum ratio of EKF2's largest height error in a barometer gap to its height RMSE outside the gap
+# EKF2's largest height error in a barometer gap is reported if it exceeds the height RMSE outside
+# the gap by this factor
 MIN_HEIGHT_ERROR_RATIO = 3.0
 # Aiding sources whose vertical innovations can set EKF2's flag for a bad vertical acceleration
 VERTICAL_AIDS = ("gnss_vel", "gnss_hgt", "baro_hgt")
-# Maximum fraction of the time with a bad vertical acceleration for severity note
+# If EKF2 reports a bad vertical acceleration for a larger fraction of the time, the severity is
+# warning instead of note
 MAX_BAD_FRACTION_NOTE = 0.3
 # Action if EKF2 does not fuse a sensor, by the PX4 parameter that enables its fusion
 CHECKS = {
@@ -38,7 +41,7 @@ DEFAULT_CHECK = "Check mounting and power supply of the sensor."
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect faults of EKF2's aiding sources in a compared flight."""
+    """Detect faults of EKF2's aiding sources."""
     if isinstance(analysis.aids, Unavailable):
         return
     aid = analysis.source.origin.aid
@@ -91,8 +94,8 @@ def detect_in_aids(
 ) -> Findings:
     """Detect faults of EKF2's aiding sources.
 
-    ``source_aid``: aiding source whose positions KF uses. ``take_off_s``: times (s) of take-offs.
-    ``height_error_m``: EKF2's largest height error in the longest barometer gap, if large.
+    ``source_aid`` is the aiding source whose positions KF uses, ``take_off_s`` are the times (s) of
+    take-off, ``height_error_m`` is EKF2's height error in a barometer gap, if large.
     """
     tested_aids = {name: aid for name, aid in aids.items() if name not in AIDS_OF_OTHER_DETECTORS}
     unfused_aids_by_switch: dict[str, list[AidResult]] = {}
@@ -103,88 +106,104 @@ def detect_in_aids(
         if aid.verdict == "not_fused" and not is_take_off_gap:
             unfused_aids_by_switch.setdefault(AIDS[name].switch or name, []).append(aid)
     for switch, aids_of_sensor in unfused_aids_by_switch.items():
-        longest_unfused = max(aids_of_sensor, key=lambda aid: aid.longest_gap_duration_s)
-        aid_labels = ", ".join(_aid_label(aid) for aid in aids_of_sensor)
-        has_innovation_shift = any(
-            axis.change for aid in aids_of_sensor for axis in aid.axes.values()
-        )
-        is_barometer, height_error_text = switch == BAROMETER.switch, ""
-        if is_barometer and height_error_m is not None:
-            height_error_text = f": EKF2's height error is {height_error_m:.2f} m"
-        yield finding(
-            "note" if is_barometer and not height_error_text else "warning",
-            "aid_not_fused",
-            f"EKF2 fused no sample of {aid_labels} for "
-            f"{longest_unfused.longest_gap_duration_s:.0f} s{height_error_text}. EKF2 rejected "
-            f"{format_percent(longest_unfused.rejected_fraction)} of the samples, and relied on "
-            "the IMU and other aiding sources.",
-            CHECKS.get(switch, DEFAULT_CHECK),
-            {
-                "aid": aid_labels,
-                "longest_gap_s": longest_unfused.longest_gap_duration_s,
-                "rejected_fraction": longest_unfused.rejected_fraction,
-                CAUSE: _sensor_cause(switch, source_aid)
-                or (CHANGE if has_innovation_shift else ""),
-            },
-            (longest_unfused.longest_gap_s,),
-        )
+        yield _not_fused_finding(switch, aids_of_sensor, source_aid, height_error_m)
     for name, aid in tested_aids.items():
-        shifts_by_axis = {axis: result.change for axis, result in aid.axes.items() if result.change}
-        label, switch = _aid_label(aid), AIDS[name].switch
-        if shifts_by_axis and not _sensor_cause(switch, source_aid):
-            axis, (time_s, shift) = max(shifts_by_axis.items(), key=lambda item: abs(item[1][1]))
-            s_sqrt = aid.axes[axis].s_sqrt_median
-            yield warning(
-                "aid_innovation_shift",
-                f"{label}: the {axis} innovation shifts by {format_number(abs(shift) * s_sqrt, 2)} "
-                f"{aid.unit} at {time_s:.0f} s. The mean innovation before and after differs by "
-                f"{abs(shift):.1f} √S (√S {format_number(s_sqrt, 2)} {aid.unit}).",
-                f"Check what was switched, moved or passed near the sensor at {time_s:.0f} s.",
-                {"aid": name, "axis": axis, "time_s": time_s, "moved": shift},
-                ((time_s, time_s + CHANGE_WINDOW_S),),
-            )
+        sensor_cause = _sensor_cause(AIDS[name].switch, source_aid)
+        if not sensor_cause and any(result.change for result in aid.axes.values()):
+            yield _innovation_shift_finding(name, aid)
         elif aid.verdict == "overconfident" and name != source_aid:
-            # no noise value is proposed: innovations alone do not distinguish noise from a wrong
-            # delay
-            action = "correct the accuracy that the sensor reports"
-            if noise_parameter := AIDS[name].noise:
-                action = f"increase {noise_parameter}"
-            noise_text = ""
-            if aid.noise is not None:
-                noise_text = f" ({format_number(aid.noise)} {aid.unit}, from {aid.noise_from})"
-            yield warning(
-                "aid_overconfident",
-                f"EKF2 is overconfident about {label}: σ is {format_ratio(aid.nis_mean**0.5)} "
-                f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1). "
-                f"EKF2 rejects {format_percent(aid.rejected_fraction)} of the samples. Possible "
-                f"causes: errors of this sensor larger than its √R{noise_text}, or errors of "
-                "another sensor.",
-                f"Check delay and mounting of the sensor first. Then {action}.",
-                {
-                    "aid": name,
-                    "nis_mean": aid.nis_mean,
-                    "rejected_fraction": aid.rejected_fraction,
-                    CAUSE: _sensor_cause(switch, source_aid),
-                },
-            )
+            yield _overconfident_finding(name, aid, sensor_cause)
         elif aid.verdict == "biased":
-            axis, worst_axis = max(
-                aid.axes.items(), key=lambda item: abs(item[1].mean_normalised_innovation)
-            )
-            yield note(
-                "aid_innovation_bias",
-                f"{label}: the {axis} innovation has a mean of "
-                f"{format_number(worst_axis.innovation_mean)} {aid.unit} (√S "
-                f"{format_number(worst_axis.s_sqrt_median)} {aid.unit}). This aiding source "
-                "contradicts another one.",
-                "Calibrate the sensor. Changed noise settings do not correct a bias.",
-                {
-                    "aid": name,
-                    "axis": axis,
-                    "innovation_mean": worst_axis.innovation_mean,
-                    "s_sqrt_median": worst_axis.s_sqrt_median,
-                },
-            )
+            yield _biased_finding(name, aid)
+
+
+def _not_fused_finding(
+    switch: str, aids_of_sensor: list[AidResult], source_aid: str, height_error_m: float | None
+) -> Finding:
+    longest_unfused = max(aids_of_sensor, key=lambda aid: aid.longest_gap_duration_s)
+    aid_labels = ", ".join(_aid_label(aid) for aid in aids_of_sensor)
+    has_innovation_shift = any(axis.change for aid in aids_of_sensor for axis in aid.axes.values())
+    is_barometer, height_error_text = switch == BAROMETER.switch, ""
+    if is_barometer and height_error_m is not None:
+        height_error_text = f": EKF2's height error is {height_error_m:.2f} m"
+    return finding(
+        "note" if is_barometer and not height_error_text else "warning",
+        "aid_not_fused",
+        f"EKF2 fused no sample of {aid_labels} for "
+        f"{longest_unfused.longest_gap_duration_s:.0f} s{height_error_text}. EKF2 rejected "
+        f"{format_percent(longest_unfused.rejected_fraction)} of the samples, and relied on "
+        "the IMU and other aiding sources.",
+        CHECKS.get(switch, DEFAULT_CHECK),
+        {
+            "aid": aid_labels,
+            "longest_gap_s": longest_unfused.longest_gap_duration_s,
+            "rejected_fraction": longest_unfused.rejected_fraction,
+            CAUSE: _sensor_cause(switch, source_aid) or (CHANGE if has_innovation_shift else ""),
+        },
+        (longest_unfused.longest_gap_s,),
+    )
+
+
+def _innovation_shift_finding(name: str, aid: AidResult) -> Finding:
+    label = _aid_label(aid)
+    shifts_by_axis = {axis: result.change for axis, result in aid.axes.items() if result.change}
+    axis, (time_s, mean_change) = max(shifts_by_axis.items(), key=lambda item: abs(item[1][1]))
+    s_sqrt = aid.axes[axis].s_sqrt_median
+    return warning(
+        "aid_innovation_shift",
+        f"{label}: the {axis} innovation shifts by {format_number(abs(mean_change) * s_sqrt, 2)} "
+        f"{aid.unit} at {time_s:.0f} s. The mean innovation before and after differs by "
+        f"{abs(mean_change):.1f} √S (√S {format_number(s_sqrt, 2)} {aid.unit}).",
+        f"Check what was switched, moved or passed near the sensor at {time_s:.0f} s.",
+        {"aid": name, "axis": axis, "time_s": time_s, "moved": mean_change},
+        ((time_s, time_s + CHANGE_WINDOW_S),),
+    )
+
+
+def _overconfident_finding(name: str, aid: AidResult, sensor_cause: str) -> Finding:
+    # No noise value is proposed, because innovations alone do not distinguish noise from a
+    # wrong delay
+    action = "correct the accuracy that the sensor reports"
+    if noise_parameter := AIDS[name].noise:
+        action = f"increase {noise_parameter}"
+    noise_text = ""
+    if aid.noise is not None:
+        noise_text = f" ({format_number(aid.noise)} {aid.unit}, from {aid.noise_from})"
+    return warning(
+        "aid_overconfident",
+        f"EKF2 is overconfident about {_aid_label(aid)}: σ is {format_ratio(aid.nis_mean**0.5)} "
+        f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1). "
+        f"EKF2 rejects {format_percent(aid.rejected_fraction)} of the samples. Possible "
+        f"causes: errors of this sensor larger than its √R{noise_text}, or errors of "
+        "another sensor.",
+        f"Check delay and mounting of the sensor first. Then {action}.",
+        {
+            "aid": name,
+            "nis_mean": aid.nis_mean,
+            "rejected_fraction": aid.rejected_fraction,
+            CAUSE: sensor_cause,
+        },
+    )
+
+
+def _biased_finding(name: str, aid: AidResult) -> Finding:
+    axis, worst_axis = max(
+        aid.axes.items(), key=lambda item: abs(item[1].mean_normalised_innovation)
+    )
+    return note(
+        "aid_innovation_bias",
+        f"{_aid_label(aid)}: the {axis} innovation has a mean of "
+        f"{format_number(worst_axis.innovation_mean)} {aid.unit} (√S "
+        f"{format_number(worst_axis.s_sqrt_median)} {aid.unit}). This aiding source "
+        "contradicts another one.",
+        "Calibrate the sensor. Changed noise settings do not correct a bias.",
+        {
+            "aid": name,
+            "axis": axis,
+            "innovation_mean": worst_axis.innovation_mean,
+            "s_sqrt_median": worst_axis.s_sqrt_median,
+        },
+    )
 
 
 def _large_height_error_m(analysis: Analysis, span_s: Span) -> float | None:

@@ -8,7 +8,8 @@ from px4fuse.core.record import read_toml
 from px4fuse.finding import SEVERITIES, Finding
 from px4fuse.findings.model import CATALOGUE, group_by_root
 
-# Key in Finding.evidence for the kind of cause; its values follow (ELSEWHERE: none of the others)
+# Key in Finding.evidence for the kind of cause. The next constants are its values; ELSEWHERE is any
+# other cause
 CAUSE = "cause"
 NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "measurement noise",
@@ -24,6 +25,8 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
 WHITE_RATIO = "white_over_assumed"
 # Kind of cause: the aiding source of EKF2 is the sensor whose positions KF uses
 SENSOR = "the source's sensor"
+# Kind of cause: EKF2 uses the variance that the source reports
+REPORTED = "EKF2's noise"
 # Kind of cause: the mean innovation of the aiding source changes in flight
 CHANGE = "change"
 # Kind of cause: each position reset of EKF2 follows a gap in the position source
@@ -34,13 +37,13 @@ GROUND = "never took off"
 CONVENTION = "convention"
 # Key in Finding.evidence: time (s) of a position jump that the source announces by reset_counter
 ANNOUNCED = "reset_at_s"
-# Findings that explain other findings only if their severity is warning or error
-CORRECTED_FIRST = ("ekf2_not_aligned", "parameter_changed")
-# Effects whose own action is shown: it corrects their cause as well
-ALTERNATIVE_FIXES = ("ekf2_ev_delay_wrong",)
+# Findings that are causes of other findings only if their severity is warning or error
+CAUSES_ABOVE_NOTE = ("ekf2_not_aligned", "parameter_changed")
+# Effects that keep their own action, because it also corrects their cause
+EFFECTS_WITH_OWN_ACTION = ("ekf2_ev_delay_wrong",)
 
 _KF_VARIANCES = ("kf_underconfident", "kf_overconfident")
-# Ids of the findings that each finding causes, one per line
+# Effects of each finding: ids of other findings, one per line
 CONSEQUENCES: Mapping[str, str] = read_toml(__file__, dict[str, str], "consequences.toml")
 
 
@@ -52,7 +55,7 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         cause_group = next((group for group in groups if group[0].id == cause), None)
         if (
             cause_group is None
-            or (cause_group[0].severity == "note" and cause in CORRECTED_FIRST)
+            or (cause_group[0].severity == "note" and cause in CAUSES_ABOVE_NOTE)
             or WHITE_RATIO in cause_group[0].evidence
         ):
             continue
@@ -80,8 +83,15 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def _with_action_of(cause: Finding, finding: Finding) -> Finding:
-    """Give an effect the action of its cause; for example a larger noise only hides outliers."""
-    if finding.caused_by is None or cause.severity == "note" or finding.id in ALTERNATIVE_FIXES:
+    """Replace the action of an effect by that of its cause.
+
+    The action of an effect may be wrong, such as a larger noise setting that hides outliers.
+    """
+    if (
+        finding.caused_by is None
+        or cause.severity == "note"
+        or finding.id in EFFECTS_WITH_OWN_ACTION
+    ):
         return finding
     return replace(finding, remedy=cause.remedy)
 
@@ -97,6 +107,6 @@ def _report_rank(group: list[Finding]) -> int:
     is_listed_first = CONVENTION in cause.evidence or role in ("unusable", "misleading", "first")
     if is_listed_first and cause.severity != "note":
         return -1
-    # warnings on the recording (rank 1) precede wrong noises (2): bad data bias noise estimates
+    # Warnings on the recording (rank 1) are before wrong noises (2), as bad data bias the estimates
     rank_by_severity = {"error": 2 * (role == "noise"), "warning": 3 - 2 * (role == "recording")}
     return rank_by_severity.get(cause.severity, 4)

@@ -1,11 +1,11 @@
-"""Texts about a re-run with a changed setting or corrected data: kind of cause, change, action."""
+"""Texts on a re-run of KF or EKF2 with a change: kind of cause, change, effect, action."""
 
 from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import changes, trials
 from px4fuse.comparison.model import FilterName
-from px4fuse.comparison.remedy import aid_of, format_settings
+from px4fuse.comparison.remedy import aid_of, different_settings, format_settings
 from px4fuse.comparison.trials import (
     Statistic,
     Trial,
@@ -18,13 +18,14 @@ from px4fuse.comparison.trials import (
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import SETTING_RANGES
 from px4fuse.findings import cause_grouping as kinds
-from px4fuse.findings.model import format_percent, source_words
+from px4fuse.findings.model import format_percent, magnetometer_advice, source_words
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
 
 def kind_of_cause(analysis: Analysis, cause: Trial | None) -> str:
+    """Return the kind of fault that a re-run corrects, such as "measurement noise"."""
     if cause is None:
         return kinds.ELSEWHERE
     aid = aid_of(analysis)
@@ -44,25 +45,31 @@ def kind_of_cause(analysis: Analysis, cause: Trial | None) -> str:
 
 
 def is_refuted(analysis: Analysis, filter_name: FilterName, cause: Trial) -> bool:
+    """Return True if the change of a re-run improves nothing along the main axis."""
     return any(
         (trial.filter, trial.change) == (filter_name, cause.change)
         and can_show_improvement(trial)
         and improvement(trial) == "nothing"
-        for trial in analysis.main_trials
+        for trial in analysis.select_main_trials()
     )
 
 
 def format_change(analysis: Analysis, cause: Trial) -> str:
     """Format the changes of a re-run: "SIGMA_Z 0.1 m instead of 0.05 m"."""
+    change = different_settings(cause.change, _flown_settings(analysis))
+    names = change.keys() - trials.ACCOMPANYING_CHANGES or change
     return " and ".join(
-        _format_one_change(analysis, cause, name)
-        for name in cause.change
-        if name not in trials.ACCOMPANYING_CHANGES
+        _format_one_change(analysis, cause, name) for name in cause.change if name in names
     )
 
 
+def _flown_settings(analysis: Analysis) -> Mapping[str, float]:
+    model = analysis.ekf2_model
+    return {} if isinstance(model, Unavailable) else model.inputs.settings
+
+
 def format_explained_fraction(cause: Trial, statistic: Statistic) -> str:
-    """Format how much a change moves ln(mean NIS or NEES) towards 0, its value for a correct σ."""
+    """Format the fraction of ln(mean NIS) or ln(mean NEES) that a change removes."""
     if makes_overconfident(cause, statistic):
         return "contradicts ground truth"
     if statistic != "difference" and is_sufficient(cause, statistic):
@@ -81,17 +88,18 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
     if change.pop(trials.FORWARD_BIAS, None) is not None:
         actions.append("Calibrate the accelerometer and the level horizon.")
         change.pop(trials.RIGHT_BIAS)
-    if turn_deg := change.pop(trials.ROTATION, None):
-        # GNSS positions refer to true north, so a rotation is an error of EKF2's heading
+    if rotation_deg := change.pop(trials.ROTATION, None):
+        # GNSS positions refer to true north: if they are rotated, EKF2's heading is wrong
         actions.append(
-            "Calibrate the magnetometer, away from metal."
+            magnetometer_advice(analysis.flight) or "Check the heading source of EKF2."
             if is_gnss
-            else f"Rotate the positions by {turn_deg:+.0f}° before they are sent."
+            else f"Rotate the positions by {rotation_deg:+.0f}° before they are sent."
         )
     if (offset_s := change.pop(trials.CLOCK_OFFSET, None)) is not None:
         actions.append(f"{format_shift(offset_s)} the position timestamps before sending.")
     settings = {name: change.pop(name) for name in changes.SETTING_CHANGES & change.keys()}
     if change:
+        change = different_settings(change, _flown_settings(analysis))
         actions.append(f"Set {format_settings(change)}.")
     if settings:
         actions.append(format_kf_settings(settings))
@@ -103,7 +111,7 @@ def format_shift(shift_s: float) -> str:
 
 
 def format_kf_settings(settings: Mapping[str, float]) -> str:
-    """Format the action "Set SIGMA_Z to 0.1 m (--sigma-z 0.1)."."""
+    """Format an action for KF settings: "Set SIGMA_Z to 0.1 m (--sigma-z 0.1)."."""
     setting_texts = (
         f"{SETTING_RANGES[name].label} to {value:g} {SETTING_RANGES[name].unit} "
         f"({COMPARISON_OPTIONS[name]} {value:g})"

@@ -3,49 +3,63 @@
 import math
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.remedy import aid_of, format_settings
+from px4fuse.comparison.remedy import aid_of, different_settings, format_settings, noise_used_m
 from px4fuse.comparison.trials import Trial, find_trial, sigma_ratio_changes
 from px4fuse.core.text import format_factor
 from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Severity
+from px4fuse.findings.cause_grouping import CAUSE, REPORTED
 from px4fuse.findings.model import Findings, finding, format_percent
 from px4fuse.flight.model import Unavailable, source_name
 
-# Minimum factor between EKF2's noise and its estimate for severity error: a smaller factor hardly
-# changes EKF2's position error
+# Minimum factor between EKF2's noise parameter and the estimate for severity error: a smaller
+# factor hardly changes EKF2's position error
 MIN_FACTOR_ERROR = 2.0
-# Minimum fraction of rejected positions that the title states
+# Minimum fraction of rejected positions that the first sentence of the message states
 MIN_NAMED_REJECTION = 0.05
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect a wrong measurement noise of EKF2: a replay with the estimate is consistent."""
+    """Detect a wrong noise parameter of EKF2, if EKF2 is consistent with the estimated noise."""
     trial, aid = confirmed_noise_trial(analysis), aid_of(analysis)
     if trial is None:
         return
     assert not isinstance(analysis.ekf2_model, Unavailable)
-    flown_m, estimate_m = analysis.ekf2_model.inputs.settings[aid.noise], trial.change[aid.noise]
+    inputs = analysis.ekf2_model.inputs
+    flown_m, estimate_m = noise_used_m(inputs), trial.change[aid.noise]
+    # EKF2 uses the σ that the source reports if this is the larger one
+    is_reported = flown_m > inputs.settings[aid.noise]
     ratio, is_small = estimate_m / flown_m, estimate_m > flown_m
     factor, direction = max(ratio, 1.0 / ratio), "small" if is_small else "large"
-    sensor = source_name(analysis.source)
+    sensor_name = source_name(analysis.source)
     has_kf_same_noise = analysis.source.origin.is_gnss and math.isclose(
         analysis.settings.sigma_z_m, flown_m, rel_tol=1e-2
     )
     rejected_fraction = analysis.main.rejected_fraction or 0.0
     if rejected_fraction >= MIN_NAMED_REJECTION:
         effect_text = f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"
-        reason = f"EKF2 rejects normal {sensor} noise as outliers and relies on the IMU."
+        reason = f"EKF2 rejects normal {sensor_name} noise as outliers and relies on the IMU."
     else:
         effect_text, opposite = "", "large" if is_small else "small"
         reason = f"EKF2's gain is therefore too {opposite}, and its reported σ too {direction}."
-    title = f"{aid.noise} is {format_factor(factor)} times too {direction}{effect_text}"
+    name = "EKF2's position noise" if is_reported else aid.noise
+    title = f"{name} is {format_factor(factor)} times too {direction}{effect_text}"
     is_default = flown_m == analysis.flight.log.default_of(aid.noise)
     if is_small and is_default:  # PX4's default fits usual sensors, so the sensor is at fault
         filters = "KF and EKF2" if has_kf_same_noise else "EKF2"
         title = (
-            f"{sensor} noise is {format_factor(factor)} times the noise setting of "
+            f"{sensor_name} noise is {format_factor(factor)} times the noise setting of "
             f"{filters}{effect_text}"
+        )
+    source_text = ""
+    report_text = ""
+    if is_reported:
+        report_text = f", or report a variance of {estimate_m**2:.2g} m² with each position"
+        mode_text = f" ({aid.noise_mode} 0)" if aid.noise_mode else ""
+        source_text = (
+            f", the σ that {sensor_name} reports{mode_text}, because {aid.noise} is only "
+            f"{inputs.settings[aid.noise]:g} m"
         )
     interval_text, horizontal_tuning = "", analysis.tuning.get(HORIZONTAL)
     if (
@@ -60,17 +74,22 @@ def detect(analysis: Analysis) -> Findings:
     yield finding(
         severity,
         f"ekf2_noise_too_{direction}",
-        f"{title}. {aid.noise} is {flown_m:g} m; the maximum-likelihood estimate is "
+        f"{title}. {name} is {flown_m:.3g} m{source_text}; the maximum-likelihood estimate is "
         f"{estimate_m:.3g} m{interval_text}. "
         f"{reason}{f' KF takes SIGMA_Z from {aid.noise}.' if has_kf_same_noise else ''}",
-        f"Set {format_settings(trial.change)}.",
-        {"flown_m": flown_m, "estimate_m": estimate_m, "factor": ratio},
+        f"Set {format_settings(different_settings(trial.change, inputs.settings))}{report_text}.",
+        {
+            "flown_m": flown_m,
+            "estimate_m": estimate_m,
+            "factor": ratio,
+            CAUSE: REPORTED if is_reported else "",
+        },
     )
 
 
 def confirmed_noise_trial(analysis: Analysis) -> Trial | None:
-    """Return the re-run with another EKF2 noise, if its innovations become consistent."""
-    trial = find_trial(analysis.main_trials, "ekf2", "noise", aid_of(analysis).noise)
+    """Return the re-run with another EKF2 measurement noise, if it makes EKF2 consistent."""
+    trial = find_trial(analysis.select_main_trials(), "ekf2", "noise", aid_of(analysis).noise)
     is_confirmed = trial is not None and any(
         classify_sigma_ratio(ratio_before, reference) != "consistent"
         and classify_sigma_ratio(ratio_after, reference) == "consistent"

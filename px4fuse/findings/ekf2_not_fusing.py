@@ -31,14 +31,15 @@ from px4fuse.flight.model import (
     positions_phrase,
 )
 
-# Fraction of the time with fusion of the source by EKF2, below which the severity is error
+# The severity is error if EKF2 fuses the positions for a smaller fraction of the time
 MIN_FUSED_FRACTION_ERROR = 0.5
-# Fraction of the time with fusion of the source by EKF2, below which the severity is warning
+# The severity is warning if EKF2 fuses the positions for a smaller fraction of the time
 MIN_FUSED_FRACTION_WARNING = 0.98
-# Minimum interval (s) between positions at which jitter exceeds EV_START_INTERVAL_S
+# Minimum interval (s) between positions at which jitter may exceed EV_START_INTERVAL_S
 MIN_LIMITING_INTERVAL_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
-# Minimum distance (m) of EKF2's invalid position from ground truth or source, for a finding
+# An invalid position of EKF2 is reported if its distance from ground truth or position source
+# exceeds this limit (m)
 MIN_INVALID_DISTANCE_M = 1.0
 
 
@@ -63,7 +64,7 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
     positions, aid = positions_phrase(source), source.origin.aid
     evidence: dict[str, float | str] = {
         "fused_fraction": fused_fraction,
-        "source_interval_s": 1.0 / source.rate_hz,
+        "source_interval_s": 1.0 / source.compute_rate_hz(),
     }
     if aid is None:
         if source.name == MOTION_CAPTURE_TOPIC and not fused_fraction:
@@ -92,9 +93,9 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
         f"{title}{unmet_condition.fault and ': '}{unmet_condition.fault}. {unmet_condition.reason}"
     )
     if fused_fraction < MIN_FUSED_FRACTION_ERROR:
-        is_reference = source.origin.fused_as_gnss and unmet_condition.condition == "switch"
+        is_disabled_gnss = source.origin.fused_as_gnss and unmet_condition.condition == "switch"
         yield finding(
-            "note" if is_reference else "error",
+            "note" if is_disabled_gnss else "error",
             "ekf2_not_fusing",
             message,
             action,
@@ -113,7 +114,7 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
 
 
 def _received_source(analysis: PreparedComparison) -> PositionTrack | None:
-    """Return the positions that PX4 received; a position file did not reach PX4."""
+    """Return the positions that PX4 received, which are not those of a position file."""
     if analysis.source.origin != POSITION_FILE:
         return analysis.source
     tracks = (track for track in analysis.flight.positions if track.origin != POSITION_FILE)
@@ -150,7 +151,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
 
 
 def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...]) -> float:
-    """Return EKF2's largest horizontal distance (m) to ground truth or source in time spans."""
+    """Return EKF2's largest horizontal distance (m) from ground truth or source in time spans."""
     truth, columns = analysis.flight.truth, ["north_m", "east_m"]
     reference = truth.samples if isinstance(truth, Truth) else analysis.source.samples
     invalid_state = pd.concat([ekf2.state[columns].loc[start:end] for start, end in spans])
@@ -166,13 +167,13 @@ def _detect_slow_restart(
     analysis: PreparedComparison, ekf2: Ekf2, fusion_flag: pd.Series
 ) -> Findings:
     """Detect a position rate so low that EKF2 restarts fusion late after a gap."""
-    source = analysis.source
+    source, rate_hz = analysis.source, analysis.source.compute_rate_hz()
     if (
         "EKF2_EV_CTRL" not in analysis.flight.log.parameters  # earlier than v1.14
         or not source.origin.is_vision
         or not source.origin.has_all_samples
         or source.alignment
-        or 1.0 / source.rate_hz < MIN_LIMITING_INTERVAL_S
+        or 1.0 / rate_hz < MIN_LIMITING_INTERVAL_S
     ):
         return
     time_s = source.samples.index.to_numpy()
@@ -195,9 +196,9 @@ def _detect_slow_restart(
         yield note(
             "source_rate_at_limit",
             f"After a gap EKF2 resumed fusion {longest_s:.1f} s late: {positions_phrase(source)} "
-            f"come at only {source.rate_hz:.1f} Hz. EKF2 (v1.14 and later) starts fusion when two "
+            f"come at only {rate_hz:.1f} Hz. EKF2 (v1.14 and later) starts fusion when two "
             f"positions arrive within {EV_START_INTERVAL_S:g} s.",
             "Send the position at 10 Hz.",
-            {"rate_hz": source.rate_hz, "longest_s": longest_s, "count": len(restart_delay_spans)},
+            {"rate_hz": rate_hz, "longest_s": longest_s, "count": len(restart_delay_spans)},
             tuple(restart_delay_spans),
         )

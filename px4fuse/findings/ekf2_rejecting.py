@@ -1,4 +1,4 @@
-"""EKF2's innovation gate rejects measurements, or is too small for a good source."""
+"""Positions that EKF2's innovation gate rejects, and a gate that is too small."""
 
 import math
 
@@ -17,12 +17,13 @@ from px4fuse.findings.model import (
 )
 from px4fuse.flight.model import Ekf2, Unavailable
 
-# Minimum fraction of rejected samples for a warning: a consistent filter with a gate of 5 √S
+# Minimum fraction of rejected positions for a warning: a consistent filter with a gate of 5 √S
 # rejects 6e-7
 REJECTED_FRACTION_WARNING = 0.01
-# Minimum fraction of rejected samples for severity error
+# Minimum fraction of rejected positions for severity error
 REJECTED_FRACTION_ERROR = 0.20
-# A change prevents rejections if the rejected fraction with it ÷ without it is below this ratio
+# A change in a re-run prevents rejections if it reduces the rejected fraction to less than this
+# multiple
 MAX_REJECTED_RATIO = 0.5
 
 
@@ -33,10 +34,10 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> Findings:
-    """Detect a gate so small that a consistent filter would lose 1 % of its samples."""
+    """Detect a gate so small that a consistent filter would reject 1 % of the positions."""
     ekf2 = analysis.flight.ekf2
     if isinstance(ekf2, Ekf2) and rejections:
-        # EKF2 accepts a sample if the innovations north and east are inside the gate: erf(gate/√2)²
+        # Probability that both innovations, north and east, are inside the gate: erf(gate/√2)²
         expected_fraction = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
         if expected_fraction >= REJECTED_FRACTION_WARNING:
             aid = aid_of(analysis)
@@ -55,7 +56,7 @@ def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> F
 
 def _detect_rejections(analysis: Analysis) -> Findings:
     ekf2, down_comparison = analysis.flight.ekf2, analysis.axes.get("down")
-    # EKF2 rejects the north and east innovation of a position together: the main axis is enough
+    # EKF2 rejects both horizontal axes of a position together, so one axis is sufficient
     for result in (
         analysis.main,
         *([down_comparison] if down_comparison and down_comparison is not analysis.main else []),
@@ -85,7 +86,9 @@ def _detect_rejections(analysis: Analysis) -> Findings:
 
 def _rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
     aid = aid_of(analysis, result.axis.name)
-    helpful_trials = [trial for trial in analysis.main_trials if _prevents_rejections(trial)]
+    helpful_trials = [
+        trial for trial in analysis.select_main_trials() if _prevents_rejections(trial)
+    ]
     if helpful_trials and result is analysis.main:
         return format_action(analysis, min(helpful_trials, key=preference_key).change)
     return (

@@ -1,6 +1,7 @@
 """Resets of EKF2's position, and changes of the primary EKF2 instance."""
 
 import numpy as np
+import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import airborne_spans
@@ -10,16 +11,24 @@ from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, GAP
 from px4fuse.findings.model import Findings, finding, format_count, warning, zero_length_spans
 from px4fuse.flight.model import Ekf2, Reset
 
-# Time (s) after take-off in which a height reset of EKF2 is usual
+# Time (s) after take-off in which a height reset of EKF2 is normal
 TAKE_OFF_S = 10.0
-# Maximum time (s) from the end of a gap in the source to a position reset caused by the gap
+# Maximum time (s) from the end of a gap in the position source to a reset that the gap causes
 MAX_RESET_DELAY_S = 5.0
+# Maximum time (s) from the logged start of fusion to the reset to the first position: flags are
+# logged at 1 Hz
+MAX_START_S = 1.0
 
 
 def detect(analysis: Analysis) -> Findings:
     ekf2, segment = analysis.flight.ekf2, analysis.segment.flight
     if not isinstance(ekf2, Ekf2):
         return
+    # the first fused position resets EKF2's position
+    start_s = -np.inf
+    if isinstance(ekf2.fusion_flags, pd.DataFrame):
+        is_fused = ekf2.fusion_flags["horizontal"] > 0.0
+        start_s = is_fused.index[is_fused].min() + MAX_START_S
     position_resets = [
         reset
         for reset in ekf2.resets
@@ -27,6 +36,7 @@ def detect(analysis: Analysis) -> Findings:
         and reset.quantity == "position"
         and any(reset.delta)
         and not _is_take_off_height_reset(analysis, reset)
+        and not reset.time_s <= start_s  # NaN without fusion
     ]
     if position_resets:
         horizontal_resets = [reset for reset in position_resets if any(reset.delta[:2])]

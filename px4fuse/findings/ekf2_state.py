@@ -8,53 +8,65 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres
-from px4fuse.filter.signals import cut_to_segment
+from px4fuse.filter.signals import Segment, cut_to_segment
 from px4fuse.findings.model import (
     Findings,
     error,
     format_percent,
     fraction_of_ones,
+    magnetometer_advice,
     spans_with_value,
 )
-from px4fuse.flight.ekf2_parameters import BAROMETER, MAG, NO_MAGNETOMETER
-from px4fuse.flight.model import BODY_AXES, Columns, Ekf2, Flight, Unavailable, rows_between
+from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, MAG, YAW_CONTROL_BIT
+from px4fuse.flight.model import (
+    BODY_AXES,
+    Columns,
+    Ekf2,
+    Flight,
+    PositionTrack,
+    Unavailable,
+    rows_between,
+)
 
-# Limit parameter, unit, sensor and columns of each bias state of EKF2
+# For each bias state of EKF2: parameter with its limit, unit, sensor, and columns of the bias
 BIAS_STATES = (
     ("EKF2_ABL_LIM", "m/s²", "accelerometer", Columns.ACCELEROMETER_BIAS),
     ("EKF2_GYR_B_LIM", "rad/s", "gyroscope", Columns.GYRO_BIAS),
 )
-# Minimum ratio of a bias state to its limit parameter if the bias is at the limit
+# A bias state is at its limit if its ratio to the limit parameter is above this value
 MIN_LIMIT_FRACTION = 0.98
-# Minimum fraction of the flight with a bias state at its limit for a finding
+# A bias is reported if it is at its limit for at least this fraction of the flight
 MIN_LIMITED_FRACTION = 0.5
-# Length (s) of the windows in which the IMU is tested for rest
+# Length (s) of the windows in which px4fuse tests if the vehicle is at rest
 REST_WINDOW_S = 1.0
-# Time (s) before take-off in which the motors run, so the IMU is not at rest
+# Time (s) before take-off in which the motors run, so that the IMU is not at rest
 RUN_UP_S = 0.5
 # Maximum standard deviation of angular rate (rad/s) and specific force (m/s²) at rest
 MAX_REST_STDS = (0.04, 1.5)
 # Maximum change (rad/s) of the mean angular rate between windows at rest
 MAX_REST_CHANGE_RAD_S = 0.01
-# Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
+# Minimum gyroscope bias (rad/s) to report it: the heading turns by 90° in 30 s
 MIN_GYRO_BIAS_RAD_S = 0.05
 # Minimum difference (m/s²) between gravity and the specific force at rest that a message states
 MIN_GRAVITY_ERROR_M_S2 = 0.3
-# Maximum fraction of the flight without tilt or yaw alignment that is not reported
+# Missing tilt or yaw alignment is reported if it lasts for a larger fraction of the flight
 MAX_UNALIGNED_FRACTION = 0.02
+# Maximum time (s) from the alignment of the tilt to that of the heading that is not reported: the
+# heading is aligned after the tilt
+MAX_HEADING_ALIGNMENT_S = 5.0
 
 
 def detect(analysis: Analysis) -> Findings:
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2):
         return
-    rest_values = measure_imu_at_rest(analysis.flight)
+    imu_at_rest = measure_imu_at_rest(analysis.flight)
     if not isinstance(ekf2.record, Unavailable):
         bias_states = cut_to_segment(ekf2.record.delayed, analysis.segment)
         if len(bias_states):
-            yield from _detect_limited_bias(analysis, ekf2, bias_states, rest_values)
-            yield from _detect_gyro_bias(bias_states, rest_values)
-    yield from _detect_missing_alignment(analysis, ekf2)
+            yield from _detect_limited_bias(analysis, ekf2, bias_states, imu_at_rest)
+            yield from _detect_gyro_bias(bias_states, imu_at_rest)
+    yield from detect_missing_alignment(analysis.flight, analysis.segment, analysis.source)
 
 
 def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
@@ -81,7 +93,7 @@ def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
 
 
 def _detect_limited_bias(
-    analysis: Analysis, ekf2: Ekf2, bias_states: pd.DataFrame, rest_values: pd.Series | None
+    analysis: Analysis, ekf2: Ekf2, bias_states: pd.DataFrame, imu_at_rest: pd.Series | None
 ) -> Findings:
     for parameter, unit, sensor, columns in BIAS_STATES:
         limit = ekf2.parameters.get(parameter, 0.0)
@@ -96,8 +108,8 @@ def _detect_limited_bias(
             f"{format_percent(limited_fraction)} of the flight. The estimate is {bias:+.3g} "
             f"{unit} {BODY_AXES[axis_index]}; EKF2 cannot estimate a larger bias."
         )
-        if sensor == "accelerometer" and rest_values is not None:
-            force_m_s2 = float(np.linalg.norm(rest_values[Columns.SPECIFIC_FORCE]))
+        if sensor == "accelerometer" and imu_at_rest is not None:
+            force_m_s2 = float(np.linalg.norm(imu_at_rest[Columns.SPECIFIC_FORCE]))
             if abs(force_m_s2 - constants.g) > MIN_GRAVITY_ERROR_M_S2:
                 message += (
                     f" At rest before take-off the accelerometer measures {force_m_s2:.2f} m/s² "
@@ -127,10 +139,10 @@ def _describe_height_error(analysis: Analysis, ekf2: Ekf2) -> str:
     return error_text
 
 
-def _detect_gyro_bias(bias_states: pd.DataFrame, rest_values: pd.Series | None) -> Findings:
-    if rest_values is None:
+def _detect_gyro_bias(bias_states: pd.DataFrame, imu_at_rest: pd.Series | None) -> Findings:
+    if imu_at_rest is None:
         return
-    measured_rad_s: Array = rest_values[Columns.ANGULAR_RATE].to_numpy()
+    measured_rad_s: Array = imu_at_rest[Columns.ANGULAR_RATE].to_numpy()
     estimated_rad_s: Array = bias_states[Columns.GYRO_BIAS].median().to_numpy()
     axis_index = int(np.argmax(np.abs(measured_rad_s - estimated_rad_s)))
     if abs(measured_rad_s[axis_index] - estimated_rad_s[axis_index]) < MIN_GYRO_BIAS_RAD_S:
@@ -150,37 +162,38 @@ def _detect_gyro_bias(bias_states: pd.DataFrame, rest_values: pd.Series | None) 
     )
 
 
-def _detect_missing_alignment(analysis: Analysis, ekf2: Ekf2) -> Findings:
-    fusion_flags, segment = ekf2.fusion_flags, analysis.segment
-    fuses_source_yaw = analysis.source.frame == "FRD" or (
+def detect_missing_alignment(
+    flight: Flight, segment: Segment, source: PositionTrack | None = None
+) -> Findings:
+    """Detect that EKF2 aligned its tilt or its heading late or never.
+
+    Without ``source``, the flight has no positions of external vision.
+    """
+    ekf2 = flight.ekf2
+    if not isinstance(ekf2, Ekf2):
+        return
+    fusion_flags = ekf2.fusion_flags
+    fuses_source_yaw = (source is not None and source.frame == "FRD") or (
         isinstance(fusion_flags, pd.DataFrame)
         and fraction_of_ones(fusion_flags["yaw"], segment) > 0.0
     )
-    has_source_yaw = analysis.source.orientation is not None
-    mag_type = analysis.flight.log.parameters.get(MAG.switch)
-    magnetometer_action = "Calibrate the magnetometer"
-    if mag_type == NO_MAGNETOMETER:
-        magnetometer_action = f"Enable the magnetometer ({MAG.switch} 0)"
+    alignment_end_s = segment.start_s
     for flag, quantity, action in (
         ("tilt_align", "tilt", "Keep the vehicle at rest after boot until EKF2 is ready."),
-        (
-            "yaw_align",
-            "heading",
-            f"{magnetometer_action}. Alternatively, "
-            f"{'' if has_source_yaw else 'send the orientation of the source, and '}let EKF2 fuse "
-            "the yaw of the source.",
-        ),
+        ("yaw_align", "heading", _align_heading_action(flight, source)),
     ):
         alignment_flag = ekf2.states.get(flag)
         if alignment_flag is None or (flag == "yaw_align" and fuses_source_yaw):
             continue
+        spans = spans_with_value(0.0, alignment_flag, segment)
         unaligned_fraction = 1.0 - fraction_of_ones(alignment_flag, segment)
-        if unaligned_fraction > MAX_UNALIGNED_FRACTION:
-            spans = spans_with_value(0.0, alignment_flag, segment)
+        if (
+            unaligned_fraction > MAX_UNALIGNED_FRACTION
+            and spans[-1][1] > alignment_end_s + MAX_HEADING_ALIGNMENT_S
+        ):
+            alignment_end_s = spans[-1][1]
             until_text = (
-                ""
-                if unaligned_fraction > 1.0 - MAX_UNALIGNED_FRACTION
-                else f" until {spans[-1][1]:.1f} s"
+                f" until {alignment_end_s:.1f} s" if alignment_end_s < segment.end_s else ""
             )
             yield error(
                 "ekf2_not_aligned",
@@ -191,3 +204,19 @@ def _detect_missing_alignment(analysis: Analysis, ekf2: Ekf2) -> Findings:
                 {"unaligned_fraction": unaligned_fraction, "flag": flag},
                 spans,
             )
+
+
+def _align_heading_action(flight: Flight, source: PositionTrack | None) -> str:
+    """Return the action for a heading that EKF2 did not align, by the sensors of the vehicle."""
+    action = magnetometer_advice(flight) or f"Enable the magnetometer ({MAG.switch} 0)."
+    if source is not None and source.origin.is_vision:
+        alternative = "let EKF2 fuse the yaw of the source"
+        if source.orientation is None:
+            alternative = f"send the orientation of the source, and {alternative}"
+            if int(flight.log.parameters.get(EV_POS.switch, 0)) & YAW_CONTROL_BIT:
+                alternative = (
+                    f"send the orientation of the source: {EV_POS.switch} bit 3 is set, but the "
+                    "orientation is missing or constant"
+                )
+        action += f" Alternatively, {alternative}."
+    return action

@@ -1,7 +1,7 @@
 """Position errors that innovations do not show: errors against ground truth, drift of the source.
 
-Innovations compare a filter with its position source, so they do not show an error of the source
-that the filter follows.
+Innovations compare a filter with its position source. They do not show errors of the source that
+the filter follows.
 """
 
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ import numpy as np
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import position_errors
 from px4fuse.comparison.model import (
-    FILTERS,
+    FILTER_NAMES,
     Comparison,
     ErrorsAgainstTruth,
     FilterName,
@@ -33,9 +33,10 @@ from px4fuse.trajectory.alignment import fit_alignment
 
 # Minimum mean NEES for severity error: the RMS position error is 4 reported σ
 MIN_NEES_ERROR = 16.0
-# Maximum position RMSE of KF ÷ that of EKF2 if only EKF2 has a fault
+# Only EKF2 has a fault if the ratio of KF's to EKF2's position RMSE is below this value
 MAX_KF_ERROR_RATIO = 0.7
-# Maximum position RMSE after alignment ÷ before alignment if the frame is misaligned
+# The position frame is misaligned if an alignment reduces the position RMSE to less than this
+# multiple
 MAX_ALIGNED_RMSE_RATIO = 0.5
 DRIFT_REMEDY = (
     "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "
@@ -70,20 +71,23 @@ class AlignedError(NamedTuple):
 
 
 def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, ErrorAboveSigma]]:
-    """Find position errors larger than the reported σ that innovations do not show.
+    """Find position errors that exceed the reported σ, but that innovations do not show.
 
-    Return (filter, axis, error) for each error, sorted by decreasing mean NEES.
+    Return (filter, axis, error) for each error, largest mean NEES first.
     """
     alignment, frame_error_m = comparison.source.alignment, 0.0
-    # a position frame that was fitted to EKF2's track may contain EKF2's error
-    if alignment is not None and alignment.yaw_sigma_deg is not None:
+    # A position frame aligned with EKF2's track may contain EKF2's error, also in height
+    if is_frame_fitted := alignment is not None and alignment.yaw_sigma_deg is not None:
         frame_error_m = alignment.residual_rms_m or 0.0
     errors = [
         (filter_name, name, error)
         for name, result in comparison.axes.items()
         for filter_name, summary in result.filters.items()
         if (error := error_above_reported_sigma(summary))
-        and (filter_name == "ekf2" or error.rmse_m > frame_error_m)
+        and (
+            filter_name == "ekf2"
+            or (error.rmse_m > frame_error_m and not (is_frame_fitted and name == "down"))
+        )
     ]
     return sorted(errors, key=lambda entry: -entry[2].nees)
 
@@ -103,8 +107,8 @@ def make_hidden_error_finding(
     evidence: dict[str, float | str] = {"axis": main_axis, "filter": worst_filter}
     ratio_by_filter, sentences = dict[str, float](), list[str]()
     cause_by_filter = dict[FilterName, Trial]()
-    for filter_name in FILTERS:
-        label = filter_name.upper()
+    for filter_name in FILTER_NAMES:
+        label = FILTER_NAMES[filter_name]
         for _, axis, hidden_error in [entry for entry in hidden_errors if entry[0] == filter_name][
             :1
         ]:
@@ -177,8 +181,11 @@ def _drift_finding(
     evidence: Mapping[str, float | str],
     filter_labels: tuple[str, ...],
 ) -> Finding:
-    """Make the finding of a drift that the innovations of ``filter_labels`` do not show."""
-    sensor, loop = source_name(analysis.source), analysis.loop
+    """Make the finding that the position source drifts.
+
+    The innovations of the filters ``filter_labels`` do not show the drift.
+    """
+    sensor_name, loop = source_name(analysis.source), analysis.loop
     drift_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
     rmse_sentence = ""
     if aligned_error is not None:
@@ -203,9 +210,9 @@ def _drift_finding(
     noise_settings = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
     return error(
         "source_drift",
-        f"{sensor} drifts: {drift_text}. {rmse_sentence}The innovations of "
+        f"{sensor_name} drifts: {drift_text}. {rmse_sentence}The innovations of "
         f"{' and '.join(filter_labels)} do not show the drift, because the estimates follow "
-        f"{sensor}. Do not reduce {noise_settings}.",
+        f"{sensor_name}. Do not reduce {noise_settings}.",
         DRIFT_REMEDY,
         evidence,
     )
@@ -218,7 +225,10 @@ def _known_closure_error_m(loop: Loop) -> float | None:
 
 
 def _rmse_after_alignment(comparison: Comparison, filter_name: FilterName) -> AlignedError | None:
-    """Return the horizontal RMSE before and after a fit of position and yaw to ground truth."""
+    """Return the horizontal position RMSE before and after alignment with ground truth.
+
+    The alignment is a shift and a rotation about the vertical axis.
+    """
     axis_errors_m, true_positions_m = [], []
     for result in north_and_east(comparison):
         errors, truth = position_errors(result, filter_name), result.truth
@@ -238,17 +248,18 @@ def _rmse_after_alignment(comparison: Comparison, filter_name: FilterName) -> Al
     except TrajectoryError:  # the track is too short to determine a rotation
         return None
     rmse_m, aligned_rmse_m = (
-        float(np.linalg.norm(part)) / len(true_m) ** 0.5 for part in (error_m, aligned_m - true_m)
+        float(np.linalg.norm(errors)) / len(true_m) ** 0.5
+        for errors in (error_m, aligned_m - true_m)
     )
     return AlignedError(rmse_m, aligned_rmse_m)
 
 
 def make_possible_drift_finding(analysis: Analysis) -> Finding:
-    sensor, loop = source_name(analysis.source), analysis.loop
+    sensor_name, loop = source_name(analysis.source), analysis.loop
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
-        f"{sensor} may drift: odometry sends a heading as these messages do. Filters follow a "
+        f"{sensor_name} may drift: odometry sends a heading as these messages do. Filters follow a "
         "drifting source, so innovations do not show the drift."
     )
     if isinstance(horizontal_tuning, AxisTuning) and (

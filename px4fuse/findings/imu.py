@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
+from px4fuse.core.arrays import intervals_where
 from px4fuse.core.record import Span
 from px4fuse.ekf2.inputs import MAX_LOST_FRACTION, lost_imu_fraction
 from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, SystematicErrors
@@ -15,25 +16,25 @@ from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
 MAX_SPECIFIC_FORCE_M_S2 = 343.0
-# Minimum number of samples with impossible values for a finding
+# Minimum number of impossible samples to report them
 MIN_IMPOSSIBLE_SAMPLES = 3
 # Minimum accelerometer bias (m/s²) for severity error: a position error of 0.15 m after 1 s
 MIN_BIAS_ERROR_M_S2 = 0.3
 # Tilt error (°) that has the same effect as an accelerometer bias of 1 m/s²
 TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
-# Minimum time (s) without IMU samples for a finding: two prediction steps of KF
-MIN_IMU_GAP_S = 0.2
+# Minimum time (s) without IMU samples to report it: two prediction steps of KF
+MIN_REPORTED_IMU_GAP_S = 0.2
 # Minimum IMU rate (Hz): 5 samples in each DT of 0.1 s, so that vibration is not aliased
 MIN_IMU_RATE_HZ = 50.0
 # Minimum attitude rate (Hz) for interpolation of the attitude to the times of IMU samples
 MIN_ATTITUDE_RATE_HZ = 10.0
-# Maximum time (s) of clipping without a finding: a touch-down clips one or two samples
+# Clipping is reported if it lasts longer than this time (s): a touch-down clips one or two samples
 MAX_CLIPPED_S = 0.1
-# Time (s) without clipped samples that separates two reported time spans
+# Minimum time (s) without clipped samples between two reported time spans of clipping
 MIN_CLIPPING_PAUSE_S = 2.0
 # Bit 4 of SDLOG_PROFILE: full IMU rate (logged_topics.cpp)
 HIGH_RATE_BIT = 16
-# Minimum measured ÷ required sample rate: sensors are up to 2 % slower than their nominal rate
+# Minimum ratio of measured to required sample rate: sensors are up to 2 % slower than nominal
 MIN_RATE_RATIO = 0.98
 
 
@@ -48,7 +49,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_impossible_acceleration(analysis: Analysis) -> Findings:
-    """Detect accelerations beyond the range of any accelerometer of an autopilot."""
+    """Detect accelerations that no accelerometer of an autopilot can measure."""
     imu = analysis.flight.imu
     if not isinstance(imu, pd.DataFrame):
         return
@@ -71,8 +72,12 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
 def detect_bias(analysis: Analysis) -> Findings:
     """Detect an accelerometer bias, estimated from the positions or by EKF2."""
     fit, ekf2_bias = analysis.systematic_errors, _ekf2_bias(analysis)
-    if isinstance(fit, SystematicErrors) and fit.has_bias:
-        forward_bias, right_bias, bias_m_s2 = fit.forward_bias, fit.right_bias, fit.bias.value
+    if isinstance(fit, SystematicErrors) and fit.has_significant_bias():
+        forward_bias, right_bias, bias_m_s2 = (
+            fit.forward_bias,
+            fit.right_bias,
+            fit.compute_bias().value,
+        )
         message = (
             f"The accelerometer is biased by {forward_bias.value:+.2f} m/s² forward and "
             f"{right_bias.value:+.2f} m/s² right. The estimate is from the positions (± "
@@ -90,10 +95,10 @@ def detect_bias(analysis: Analysis) -> Findings:
             "accelerometer_bias",
             message,
             "Calibrate the accelerometers and the level horizon at the temperature of the flight.",
-            {"bias_m_s2": bias_m_s2, "sigma_m_s2": fit.bias.sigma},
+            {"bias_m_s2": bias_m_s2, "sigma_m_s2": fit.compute_bias().sigma},
         )
     elif ekf2_bias is not None:
-        # the fit shows no horizontal bias, so only the vertical bias is reported
+        # If positions show no horizontal bias, only the vertical bias is reported
         bias_m_s2 = float(
             np.linalg.norm(ekf2_bias[2:] if isinstance(fit, SystematicErrors) else ekf2_bias)
         )
@@ -158,10 +163,10 @@ def detect_clipping(analysis: Analysis) -> Findings:
 def detect_imu_gaps(analysis: Analysis) -> Findings:
     gap_s, imu = analysis.main.replay.input_gap_s, analysis.flight.imu
     interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
-    if gap_s > max(MIN_IMU_GAP_S, 2.0 * interval_s):
+    if gap_s > max(MIN_REPORTED_IMU_GAP_S, 2.0 * interval_s):
         log = analysis.flight.log
         spans = _gap_spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else ()
-        # KF needs IMU and attitude
+        # KF needs IMU and attitude, so without an IMU gap the attitude has a gap
         missing_data = "IMU" if spans else "Attitude"
         action = ""
         if log.format.startswith("MAVLink"):
@@ -179,7 +184,7 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
 
 
 def detect_missing_imu_samples(analysis: Analysis) -> Findings:
-    """Detect a log in which single IMU samples are missing all the time."""
+    """Detect IMU samples that are missing one by one during the whole flight."""
     imu, log = analysis.flight.imu, analysis.flight.log
     if not isinstance(imu, pd.DataFrame) or log.format.startswith("MAVLink"):
         return
@@ -205,30 +210,29 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
 
 
 def _gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
-    """Return the time spans (s) without IMU samples in a segment, also at its start and end."""
+    """Return start and end (s) of each IMU gap in a segment, including its start and end."""
     time_s = imu.index.to_numpy()
-    is_gap = imu_gaps(time_s)
-    gaps = list(zip(time_s[:-1][is_gap].tolist(), time_s[1:][is_gap].tolist(), strict=True))
+    gaps = intervals_where(time_s, imu_gaps(time_s))
     end_spans = ((segment.start_s, float(time_s[0])), (float(time_s[-1]), segment.end_s))
     gaps += [(start, end) for start, end in end_spans if end - start > MIN_SPAN_S]
     gaps_inside = (span for span in gaps if span[1] > segment.start_s and span[0] < segment.end_s)
     return tuple(sorted(gaps_inside))
 
 
-def is_rate_too_low(samples: pd.DataFrame, needed_hz: float) -> bool:
-    return sample_rate(samples) < MIN_RATE_RATIO * needed_hz
+def is_rate_too_low(samples: pd.DataFrame, required_hz: float) -> bool:
+    return sample_rate(samples) < MIN_RATE_RATIO * required_hz
 
 
 def detect_low_rates(flight: Flight) -> Findings:
     """Detect an IMU or attitude rate too low to compute the acceleration in NED."""
     log = flight.log
-    for samples, name, label, default_topic, needed_hz in (
+    for samples, name, label, default_topic, required_hz in (
         (flight.imu, "imu", "IMU", "sensor_combined", MIN_IMU_RATE_HZ),
         (flight.attitude, "attitude", "attitude", "vehicle_attitude", MIN_ATTITUDE_RATE_HZ),
     ):
         topic = flight.streams[name].topics[0] if name in flight.streams else default_topic
-        if isinstance(samples, pd.DataFrame) and is_rate_too_low(samples, needed_hz):
-            rate_hz, requested_hz = sample_rate(samples), 2.0 * needed_hz
+        if isinstance(samples, pd.DataFrame) and is_rate_too_low(samples, required_hz):
+            rate_hz, requested_hz = sample_rate(samples), 2.0 * required_hz
             sdlog_profile = (
                 int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE)) | HIGH_RATE_BIT
             )
@@ -241,8 +245,8 @@ def detect_low_rates(flight: Flight) -> Findings:
                 )
             yield warning(
                 "imu_rate_too_low",
-                f"The {label} was logged at {rate_hz:.1f} Hz, but {needed_hz:g} Hz are needed. "
+                f"The {label} was logged at {rate_hz:.1f} Hz, but {required_hz:g} Hz are needed. "
                 "Motion between samples is lost, and vibration is aliased.",
                 action,
-                {"rate_hz": rate_hz, "needed_hz": needed_hz, "topic": topic},
+                {"rate_hz": rate_hz, "needed_hz": required_hz, "topic": topic},
             )

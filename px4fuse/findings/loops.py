@@ -1,4 +1,4 @@
-"""Detect false loop closures, a stated odometry drift that is too small, and wrong assumptions."""
+"""False loop closures, a stated odometry drift that is too small, and wrong assumptions."""
 
 from px4fuse.analysis import Analysis
 from px4fuse.finding import Finding
@@ -6,7 +6,8 @@ from px4fuse.findings.model import Findings, error, note, warning
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 
-# Maximum fraction of loop closures that robust optimisation rejects if the stated drift is correct
+# The stated odometry drift is too small if robust optimisation rejects a larger fraction of the
+# loop closures
 MAX_REJECTED_CLOSURE_FRACTION = 0.5
 CLOSURE_FIELDS = ("time_1_s", "time_2_s", "distance_m", "d2", "degrees_of_freedom", "p")
 # Minimum weight of a loop closure that graduated non-convexity (GNC) accepts; final weights are
@@ -26,7 +27,7 @@ def detect_in_loop(loop: Loop) -> Findings:
 
 
 def detect_inconsistent_closures(loop: Loop) -> Findings:
-    """Detect loop closures that do not fit the odometry drift or the other loop closures."""
+    """Detect loop closures that contradict the odometry drift or other loop closures."""
     gnc_weights = [
         1.0 if closure.weight_gnc is None else closure.weight_gnc for closure in loop.closures
     ]

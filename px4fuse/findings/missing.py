@@ -1,4 +1,4 @@
-"""Data missing from the log: EKF2, acceleration, innovations, or positions that PX4 received."""
+"""Missing data: EKF2 state, acceleration, innovations, or positions that PX4 received."""
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
@@ -43,14 +43,15 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
 
 
 def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
-    """Detect a log without the positions as PX4 received them."""
-    source, received_preference = analysis.source, RECEIVED.preference_rank
+    """Detect a log that does not contain the positions which PX4 received."""
+    source, received_preference = analysis.source, RECEIVED.find_preference_rank()
     has_received_positions = any(
-        track.origin.preference_rank == received_preference for track in analysis.flight.positions
+        track.origin.find_preference_rank() == received_preference
+        for track in analysis.flight.positions
     )
     if source.origin.has_all_samples or has_received_positions:
         return
-    rate_hz, parameters = source.rate_hz, analysis.flight.log.parameters
+    rate_hz, parameters = source.compute_rate_hz(), analysis.flight.log.parameters
     sdlog_profile = int(parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE))
     reasons = (
         missing_data.reason

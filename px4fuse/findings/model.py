@@ -1,4 +1,4 @@
-"""Catalogue of all findings, and functions that several detectors use."""
+"""Catalogue of all findings, and functions to make them."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
@@ -13,28 +13,28 @@ from px4fuse.core.record import Record, Span, read_toml
 from px4fuse.core.text import capitalise_first
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import SEVERITIES, Finding, Severity
-from px4fuse.flight.model import PositionKind, PositionTrack
+from px4fuse.flight.ekf2_parameters import MAG, NO_MAGNETOMETER
+from px4fuse.flight.model import Flight, PositionKind, PositionTrack
 
 
 class CatalogueEntry(Record):
-    """Texts of a finding, and its place among other findings.
+    """Title and meaning of a finding, and its relation to other findings.
 
     Attributes
     ----------
     group : str
         One of :data:`GROUPS`.
     role : str
-        "unusable": all positions of the source make estimates invalid; "misleading": some positions
-        do. Both and "first" are listed first, "noise" after other errors, "recording" before other
+        Effect on estimates and order. "unusable": all positions are wrong; "misleading": some are.
+        These and "first" are listed first, "noise" after other errors, "recording" before other
         warnings.
     verdict : str
-        Relation to the verdicts on σ. "meaningless": they are invalid, and the card shows this
-        cause first. "repeated": the finding is the same statement as a verdict; the card shows it
-        only if there is no other cause.
+        Relation to the statements that KF or EKF2 is consistent, over- or underconfident.
+        "meaningless": these statements are invalid. "repeated": the finding is such a statement.
     reruns : frozenset of str
         Kinds of re-runs (``Trial.kinds``) that test the finding.
     after_wrong_convention : str
-        If the source has wrong axes, unit or clock, the finding is an "effect" or "withdrawn".
+        If axes, unit or clock of the positions are wrong: "effect" or "withdrawn".
     """
 
     title: str
@@ -46,7 +46,7 @@ class CatalogueEntry(Record):
     after_wrong_convention: Literal["", "effect", "withdrawn"] = ""
 
 
-# All findings by id; findings of equal severity are listed in this order
+# All possible findings by id; findings of equal severity are listed in this order
 CATALOGUE: Mapping[str, CatalogueEntry] = read_toml(
     __file__, dict[str, CatalogueEntry], "catalogue.toml"
 )
@@ -55,7 +55,7 @@ TITLES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.item
 
 
 class FindingExample(Record):
-    """Example of a finding, with its false alarms and detection rates (tests/studies/rates.csv).
+    """Example of a finding, with its rates of false alarm and detection (tests/studies/rates.csv).
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ def load_examples() -> Mapping[str, FindingExample]:
 
 
 class SourceWords(Record):
-    """Causes and actions of findings about the position source, for one kind of source."""
+    """Causes and actions in findings on the position source, for one kind, such as UWB."""
 
     smoothing_action: str
     jump: str
@@ -101,8 +101,15 @@ SOURCE_WORDS: Mapping[PositionKind, SourceWords] = {
 
 
 def source_words(source: PositionTrack) -> SourceWords:
-    """Return the parts of messages and actions for the kind of sensor of a position source."""
+    """Return the causes and actions in messages for the kind of a position source."""
     return SOURCE_WORDS[source.origin.kind]
+
+
+def magnetometer_advice(flight: Flight) -> str:
+    """Return the action for a wrong magnetic heading; empty if EKF2 uses no magnetometer."""
+    if flight.log.parameters.get(MAG.switch) == NO_MAGNETOMETER:
+        return ""
+    return "Calibrate the magnetometer away from metal and motors."
 
 
 Findings = Iterator[Finding]
@@ -117,7 +124,7 @@ def finding(
     spans_s: tuple[Span, ...] = (),
 ) -> Finding:
     """Make a finding; its title is the first sentence of the message."""
-    if message[1:2] != " ":  # "x and y are exchanged" begins with an axis
+    if message[1:2] != " ":  # a message such as "x and y are exchanged" begins with an axis
         message = capitalise_first(message)
     title = message.partition(". ")[0].removesuffix(".")
     return Finding(name, severity, message, remedy, evidence, title, spans_s=spans_s)
@@ -127,6 +134,7 @@ error, warning, note = (partial(finding, severity) for severity in SEVERITIES)
 
 
 def group_by_root(findings: Iterable[Finding]) -> list[list[Finding]]:
+    """Group findings: each group begins with a cause, which is followed by its effects."""
     groups: list[list[Finding]] = []
     for entry in findings:
         if entry.caused_by is None:
@@ -136,6 +144,7 @@ def group_by_root(findings: Iterable[Finding]) -> list[list[Finding]]:
 
 
 def zero_length_spans(times_s: Iterable[float]) -> tuple[Span, ...]:
+    """Convert times (s) to time spans of length zero."""
     return tuple((float(time), float(time)) for time in times_s)
 
 
@@ -152,7 +161,7 @@ def format_percent(fraction: float, digits: int = 0) -> str:
 
 
 def spans_with_value(value: float, step_function: pd.Series, segment: Segment) -> tuple[Span, ...]:
-    """Return the time spans of a segment in which a step function has a value."""
+    """Return start and end (s) of each time in a segment at which a step function has a value."""
     step_times_s = np.clip(
         np.append(step_function.index.to_numpy(), np.inf), segment.start_s, segment.end_s
     )
@@ -165,6 +174,8 @@ def spans_with_value(value: float, step_function: pd.Series, segment: Segment) -
 
 
 def fraction_of_ones(step_function: pd.Series, segment: Segment) -> float:
-    """Return the fraction of a segment in which a 0/1 step function is 1."""
-    ones_s = sum(end - start for start, end in spans_with_value(1.0, step_function, segment))
-    return ones_s / (segment.end_s - segment.start_s)
+    """Return the fraction of the time in a segment at which a flag (0 or 1) is 1."""
+    duration_of_ones_s = sum(
+        end - start for start, end in spans_with_value(1.0, step_function, segment)
+    )
+    return duration_of_ones_s / (segment.end_s - segment.start_s)

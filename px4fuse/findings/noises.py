@@ -1,7 +1,7 @@
-"""Findings about wrong SIGMA_Z or SIGMA_A of KF, and about over- or underconfident KF or EKF2.
+"""Wrong SIGMA_Z or SIGMA_A of KF, and over- or underconfidence of KF or EKF2.
 
-SIGMA_A and SIGMA_Z are estimated together by maximum likelihood, because the mean NIS cannot
-separate them.
+SIGMA_A and SIGMA_Z are estimated together by maximum likelihood, because the mean NIS does not
+distinguish them.
 """
 
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from msgspec import structs
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.changes import MIN_RERUN_SIGMA_Z_M, SIGMA_A, SIGMA_Z, tuning_of_axis
 from px4fuse.comparison.estimates import first_axis_tuning
-from px4fuse.comparison.model import FILTERS, AxisComparison, FilterName, FilterSummary
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
 from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
 from px4fuse.comparison.reruns import is_inconsistent
@@ -49,21 +49,24 @@ from px4fuse.request import COMPARISON_OPTIONS
 MIN_NOISE_FACTOR = 1.5
 # Minimum factor between a noise setting and its estimate for severity error
 MIN_NOISE_FACTOR_ERROR = 4.0
-# A KF with a larger time constant (s) ignores new positions: vehicles turn faster
+# KF ignores new positions if its time constant (s) is larger: vehicles turn faster
 MIN_TIME_CONSTANT_S = 2.5
-# Factor on the width of the 95 % interval of ln(noise estimate): 0.3 % of correct settings are
-# outside
+# The 95 % interval of ln(noise estimate) is widened by this factor: 0.3 % of correct settings are
+# outside the widened interval
 INTERVAL_WIDENING = 1.5
-# Minimum lag-1 autocorrelation of the innovations of a KF that lags; white innovations reach 0.2
+# KF lags if the lag-1 autocorrelation of its innovations exceeds this value; white innovations
+# reach 0.2
 MIN_LAG1_AUTOCORRELATION = 0.3
 
 # Minimum factor between actual and reported σ for severity error
 MIN_SIGMA_FACTOR_ERROR = 2.0
-# Two noises are equal up to this ratio: two standard errors of a median of 100 values
+# Two noises are equal if their ratio is below this value: two standard errors of a median of 100
+# values
 NOISE_RATIO_TOLERANCE = 1.25
-# EKF2 takes R from the position messages if √R ÷ EKF2_EVP_NOISE is above this ratio
+# EKF2 uses the variance in the position messages if the ratio of √R to EKF2_EVP_NOISE exceeds this
+# value
 MIN_REPORTED_NOISE_RATIO = 1.25
-# Action if no re-run explains the wrong σ
+# Action if no change in a re-run corrects the wrong σ
 UNEXPLAINED_SIGMA = (
     "No tested change of noise, time offset, frame or outliers explains the wrong σ. Check the "
     "IMU (rate, gaps, vibration)."
@@ -81,7 +84,7 @@ KEEP_NOISES_CORRELATED = (
 KEEP_NOISES_TRUTH = (
     "Do not reduce noise settings: ground truth shows that a smaller σ would be too small."
 )
-# Effect of a wrong noise setting on KF, and its reason
+# Effect of a noise setting that is too small or too large on KF, and the reason
 SETTING_EFFECTS = {
     (SIGMA_Z, "small"): ("KF follows the measurement noise", "The gain is too large."),
     (SIGMA_Z, "large"): ("KF corrects slowly", "The gain is too small."),
@@ -99,7 +102,10 @@ InconsistentAxis = tuple[AxisComparison, FilterSummary]
 
 
 class SettingDeviation(NamedTuple):
-    """Factor (at least 1) between a noise setting and its estimate or its upper bound."""
+    """Deviation of a noise setting from its estimate, or from an upper bound of the estimate.
+
+    ``factor`` is the ratio of setting and estimate, the larger over the smaller.
+    """
 
     estimate: float
     factor: float
@@ -126,8 +132,8 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
         for name, noise in ml_noises.items()
         if (deviation := setting_deviation(name, settings[name], noise))
     }
-    # innovations do not show drift or time-correlated errors, so they cannot show that a noise is
-    # too large
+    # Innovations do not show drift or time-correlated errors, so they do not show if a noise is too
+    # large
     may_drift = analysis.source.origin.may_drift
     if (
         may_drift
@@ -187,11 +193,11 @@ def format_estimate(name: str, setting: float, noise: Noise) -> str:
 
 
 def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
-    if trial := find_trial(analysis.main_trials, "kf", "noises", name):
+    if trial := find_trial(analysis.select_main_trials(), "kf", "noises", name):
         return format_kf_settings(trial.change)
     if any(
         trial.filter == "kf" and trial.change.keys() == {name} and can_show_improvement(trial)
-        for trial in analysis.main_trials
+        for trial in analysis.select_main_trials()
     ):
         return NO_IMPROVEMENT
     value = max(value, MIN_RERUN_SIGMA_Z_M) if name == SIGMA_Z else value
@@ -199,7 +205,7 @@ def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
 
 
 def setting_deviation(name: str, setting: float, ml_noise: Noise) -> SettingDeviation | None:
-    """Return the deviation of a noise setting from its estimate; None if not significant."""
+    """Return the deviation of a noise setting from its estimate; None if it is not significant."""
     if not (estimate := ml_noise.value or ml_noise.high):
         return None
     low, high = (
@@ -212,7 +218,7 @@ def setting_deviation(name: str, setting: float, ml_noise: Noise) -> SettingDevi
     if low <= setting <= high or factor < MIN_NOISE_FACTOR:
         return None
     severity: Severity = "error" if factor >= MIN_NOISE_FACTOR_ERROR else "warning"
-    if setting == getattr(Settings(), name):  # a default is not a mistake of the user
+    if setting == getattr(Settings(), name):  # the user did not choose the default
         severity = lower_severity(severity)
     return SettingDeviation(estimate, factor, severity)
 
@@ -221,15 +227,15 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     """Detect a SIGMA_A so small that KF ignores new positions."""
     for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
         updates, summary = result.replay.updates, result.filters["kf"]
-        # without motion such a filter is correct, and its innovations are small and white
+        # Without motion, a small SIGMA_A is correct, and innovations are small and white
         if (
             isinstance(summary, Unavailable)
             or summary.verdict != "overconfident"
             or summary.lag1_autocorrelation < MIN_LAG1_AUTOCORRELATION
         ):
             continue
-        settled_gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
-        time_constant_s = 1.0 / (sample_rate(updates) * settled_gain)
+        final_gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
+        time_constant_s = 1.0 / (sample_rate(updates) * final_gain)
         if time_constant_s < MIN_TIME_CONSTANT_S:
             continue
         sigma_a = analysis.settings.sigma_a_m_s2
@@ -243,15 +249,15 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
         yield error(
             "process_noise_near_zero",
             f"{title}: KF ignores new positions. {estimate_text}KF's position gain decreases to "
-            f"{settled_gain:.2g}, so KF needs {time_constant_s:.0f} s to follow a position change.",
+            f"{final_gain:.2g}, so KF needs {time_constant_s:.0f} s to follow a position change.",
             action,
-            {"gain": settled_gain, "response_s": time_constant_s, "axis": result.axis.name},
+            {"gain": final_gain, "response_s": time_constant_s, "axis": result.axis.name},
         )
         return
 
 
 def detect_inconsistent_variances(analysis: Analysis) -> Findings:
-    for filter_name in FILTERS:
+    for filter_name in FILTER_NAMES:
         for is_underconfident in (True, False):
             first_id = None
             for axis_group, axes in AXIS_GROUPS.items():
@@ -305,7 +311,7 @@ def _variance_finding(
     ):
         severity, remedy_text, cause = "note", minimum_text, ELSEWHERE
     elif is_underconfident and any(
-        name_with_error == filter_name for name_with_error, *_ in find_hidden_errors(analysis)
+        filter_with_error == filter_name for filter_with_error, *_ in find_hidden_errors(analysis)
     ):
         remedy_text, cause = KEEP_NOISES_TRUTH, ELSEWHERE
     else:
@@ -317,7 +323,7 @@ def _variance_finding(
     return finding(
         severity,
         f"{filter_name}_{confidence}",
-        f"{filter_name.upper()} is {confidence} along {result.axis.label}: σ is "
+        f"{FILTER_NAMES[filter_name]} is {confidence} along {result.axis.label}: σ is "
         f"{format_ratio(sigma_factor)} times too {'large' if is_underconfident else 'small'}. The "
         f"mean NIS of this {axis_group} axis is {format_number(summary.nis_mean)}, expected "
         f"{low:.2f} to {high:.2f}.",
@@ -367,7 +373,7 @@ def _format_noise_minimum(analysis: Analysis) -> str:
 def _has_default_noises(
     analysis: Analysis, filter_name: FilterName, result: AxisComparison
 ) -> bool:
-    """Return True if a filter uses px4fuse's default noises (KF) or PX4's default R (EKF2)."""
+    """Return True if a filter has default noises: those of px4fuse (KF) or of PX4 (EKF2)."""
     if filter_name == "kf":
         settings, defaults = analysis.settings, Settings()
         return all(
@@ -377,7 +383,7 @@ def _has_default_noises(
     log = analysis.flight.log
     default = log.default_of(noise_parameter)
     is_parameter_default = log.parameters.get(noise_parameter, default) == default
-    # a variance that the sender reports is a choice of the user, not a default
+    # If EKF2 uses a variance that the sender reports, the user has chosen it
     return is_parameter_default and not abs(np.log(ekf2_noise_m(result) / default)) > np.log(
         NOISE_RATIO_TOLERANCE
     )
@@ -438,7 +444,7 @@ def _variance_remedy_without_replay(
 
 
 def ekf2_noise_m(result: AxisComparison) -> float:
-    """Return the median √R (m) that EKF2 used; NaN if unknown."""
+    """Return EKF2's median measurement noise √R (m) along an axis; NaN if unknown."""
     innovations = result.ekf2_innovations
     if isinstance(innovations, Unavailable):
         return float("nan")

@@ -1,4 +1,4 @@
-"""EKF2 parameters that change in flight, with the consistency of EKF2 before and after."""
+"""EKF2 parameters that are changed in flight, and EKF2's consistency before and after."""
 
 import math
 from typing import NamedTuple
@@ -14,12 +14,16 @@ from px4fuse.findings.model import Findings, note, warning
 from px4fuse.flight.ekf2_parameters import AID_MASK, PARAMETERS
 from px4fuse.flight.model import Ekf2, Unavailable
 
-# Minimum factor by which σ ratio or position RMSE differ before and after a change, for a warning
+# A change of a parameter has an effect if σ ratio or position RMSE differ by at least this factor
+# before and after it
 MIN_CHANGE_RATIO = 1.5
 
 
 class PartConsistency(NamedTuple):
-    """Consistency and position RMSE of EKF2 in one part of the flight; NaN or "" if unknown."""
+    """Consistency and position RMSE of EKF2 in one part of the flight.
+
+    Unknown values are NaN or "".
+    """
 
     verdict: str
     sigma_ratio: float
@@ -27,7 +31,7 @@ class PartConsistency(NamedTuple):
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect changes of the EKF2 parameters that px4fuse uses."""
+    """Detect changes in flight of the EKF2 parameters that px4fuse uses."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment
     fusion_parameters = (aid_of(analysis).switch, AID_MASK)
     changes = [

@@ -1,4 +1,4 @@
-"""Faults of the recording: lost data, restarts, clock jumps, and estimators other than EKF2."""
+"""Faults of the log: lost data, restarts, clock jumps, and estimators other than EKF2."""
 
 import pandas as pd
 
@@ -18,7 +18,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_dropouts(analysis: PreparedComparison) -> Findings:
-    """Detect logger dropouts in the segment."""
+    """Detect dropouts of PX4's logger in the analysed time."""
     segment = analysis.segment
     dropouts = [
         dropout
@@ -82,7 +82,7 @@ def detect_lost_data(flight: Flight) -> Findings:
 
 
 def detect_clocks_set_back(flight: Flight) -> Findings:
-    """Detect restarts of the autopilot and receive times that go back."""
+    """Detect restarts of the autopilot, and decreasing receive times."""
     log = flight.log
     if log.restarts:
         yield warning(

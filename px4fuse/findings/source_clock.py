@@ -16,7 +16,8 @@ from px4fuse.flight.model import Unavailable
 
 # Minimum time offset (s) for severity error: a position error of 0.1 m at 1 m/s
 MIN_OFFSET_ERROR_S = 0.10
-# Maximum position RMSE of KF with ÷ without correction of a time offset, if the offset is reported
+# A time offset is reported if its correction does not increase KF's position RMSE by more than this
+# ratio
 MAX_RMSE_RATIO = 1.005
 CORRECT_AT_SENDER = "Correct the position timestamps before sending."
 
@@ -30,7 +31,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
-    if find_low_pass(analysis) is not None:  # a low pass delays positions, not timestamps
+    if find_low_pass(analysis) is not None:  # a low-pass filter delays positions, not timestamps
         return
     interval_low_s, interval_high_s = clock.interval_s
     evidence = {
@@ -38,7 +39,7 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
         "interval_low_s": interval_low_s,
         "interval_high_s": interval_high_s,
     }
-    if clock.changes and clock.change_p_value is not None:
+    if clock.has_changed() and clock.change_p_value is not None:
         start_offset_s, end_offset_s = clock.parts[0].offset_s, clock.parts[-1].offset_s
         yield error(
             "source_time_offset_changes",
@@ -52,7 +53,7 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
         )
         return
     offset_size_s = abs(clock.remaining_s)
-    # one offset cannot correct timestamps that are arrival times in part of the flight
+    # If timestamps are arrival times in a part of the flight, one offset cannot correct them
     if (
         not clock.is_significant(clock.remaining_s)
         or find_synchronisation(analysis) is not None
@@ -81,7 +82,7 @@ def _find_trial(analysis: Analysis, filter_name: FilterName, kind: str) -> Trial
     return next(
         (
             trial
-            for trial in analysis.main_trials
+            for trial in analysis.select_main_trials()
             if (trial.filter, trial.kinds) == (filter_name, (kind,))
         ),
         None,
@@ -89,7 +90,7 @@ def _find_trial(analysis: Analysis, filter_name: FilterName, kind: str) -> Trial
 
 
 def _rmse_ratio(trial: Trial | None) -> float:
-    """Return the position RMSE of a re-run ÷ the position RMSE as flown; NaN if unknown."""
+    """Return the ratio of the position RMSE with and without a change; NaN if unknown."""
     if trial is None or not trial.before.position_rmse_m or trial.after.position_rmse_m is None:
         return math.nan
     return trial.after.position_rmse_m / trial.before.position_rmse_m
@@ -126,14 +127,14 @@ def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
 
 
 def clock_offset_option_s(comparison: PreparedComparison, clock: ClockOffset) -> float:
-    """Return the value (s) for ``--clock-offset``."""
+    """Return the value (s) of ``--clock-offset`` that corrects a time offset."""
     # --clock-offset replaces the time offset that the alignment of a position file applied
     alignment = comparison.source.alignment
     return clock.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
 
 
 def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
-    # for GNSS, the time offset already includes an error of EKF2_GPS_DELAY
+    # For GNSS, the time offset already includes an error of EKF2_GPS_DELAY
     delay_ms = remedy.delay_ms(analysis) if analysis.source.origin.is_vision else None
     ml_delay_ms = -1e3 * clock.offset_s
     if delay_ms is None or remedy.wrong_delay_ms(analysis, clock, delay_ms) is None:
@@ -167,7 +168,7 @@ def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
 
 
 def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
-    """Detect a wrong EKF2_GPS_DELAY if EKF2 also fuses vision."""
+    """Detect a wrong EKF2_GPS_DELAY in a flight in which EKF2 also fuses vision."""
     model = analysis.ekf2_model
     if isinstance(model, Unavailable) or not model.agreement.good:
         return

@@ -1,4 +1,4 @@
-"""Convention of the source: axes, unit, clock and orientation differ from what PX4 expects.
+"""Positions with another convention than PX4's: wrong axes, unit, clock or orientation.
 
 Sources: MAVROS ``vision_pose`` (``transform_frame_enu_ned``), PX4 ``VehicleOdometry.msg``, REP 103.
 """
@@ -24,11 +24,11 @@ from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION
 from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_phrase, source_name
 
-# Groups of findings that do not depend on the position source
+# Groups of findings to which wrong positions do not matter
 UNAFFECTED_GROUPS = ("logging", "IMU")
 
 
-# Id of the finding, kind of fault, message and action
+# Id of the finding, kind of fault, message, and action
 ConventionFault = tuple[str, str, str, str]
 
 
@@ -49,9 +49,9 @@ def detect(analysis: Comparison) -> Findings:
 
 
 def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[Finding]:
-    """Remove the findings that are only effects of wrong axes, unit, clock or orientation.
+    """Remove findings that are only effects of wrong axes, unit, clock or orientation.
 
-    Those on EKF2 remain, because EKF2 used the positions as sent, and px4fuse corrects them.
+    Findings on EKF2 remain as effects, because EKF2 used the positions without correction.
     """
     faults = _convention_faults(analysis)
     root_findings = [item for item in findings if CONVENTION in item.evidence]
@@ -135,13 +135,16 @@ def _position_faults(
             action += f" {describe_conversion(orientation.frames)}"
         yield "source_axes_wrong", "axes", f"{fault}. {basis_text} {usage_text}", action
     elif turn_deg:
-        heading_text = (
-            "EKF2's heading" if convention.heading_from == "EKF2" else "the heading at take-off"
-        )
+        heading_text = {
+            "EKF2": "EKF2's heading",
+            "gyroscopes": "the heading at take-off",
+            "GNSS": "the GNSS positions",
+        }[convention.heading_from]
+        doubt = "." if convention.heading_from == "GNSS" else f", or {heading_text} is wrong."
         message = (
             f"{positions} are rotated by {turn_deg:+.0f}° (clockwise from above) "
-            f"relative to {heading_text}. The x axis of the source does not point north, or "
-            f"{heading_text} is wrong. {basis_text} The analysis uses the positions rotated to NED."
+            f"relative to {heading_text}. The x axis of the source does not point north{doubt} "
+            f"{basis_text} The analysis uses the positions rotated to NED."
         )
         action = (
             "Align the frame of the positioning system with north, or rotate positions and "

@@ -11,8 +11,15 @@ from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
 from px4fuse.findings.ekf2_noise import confirmed_noise_trial
 from px4fuse.findings.ekf2_not_fusing import MIN_FUSED_FRACTION_ERROR
-from px4fuse.findings.model import Findings, finding, fraction_of_ones, note, warning
-from px4fuse.flight.ekf2_parameters import EV_POS, MAG, NO_MAGNETOMETER
+from px4fuse.findings.model import (
+    Findings,
+    finding,
+    fraction_of_ones,
+    magnetometer_advice,
+    note,
+    warning,
+)
+from px4fuse.flight.ekf2_parameters import EV_POS, YAW_CONTROL_BIT
 from px4fuse.flight.model import (
     Columns,
     Ekf2,
@@ -25,20 +32,17 @@ from px4fuse.flight.model import (
 from px4fuse.trajectory.rotation import heading as heading_of
 from px4fuse.trajectory.rotation import interpolate
 
-# Minimum yaw misalignment, in σ of its estimate, for a finding: flights without a fault reach 3.2
+# Minimum ratio of yaw misalignment to its σ to report it: flights without a fault reach 3.2
 MIN_HEADING_SIGMAS = 4.0
-# Minimum yaw misalignment (°) for a finding: magnetic headings of real flights are wrong by 3 to 4°
+# Minimum yaw misalignment (°) to report it: magnetic headings of real flights are wrong by 3 to 4°
 MIN_HEADING_ERROR_DEG = 5.0
 # Minimum yaw misalignment (°) for severity error: 26 % of the motion appears on the other axis
 MIN_SEVERE_HEADING_ERROR_DEG = 15.0
-# EKF2's heading drifts only if its drift against ground truth ÷ that against the positions is above
-# this ratio; otherwise the positions drift
+# EKF2's heading drifts if the ratio of its drift against ground truth to that against the positions
+# exceeds this value; otherwise the positions drift
 MIN_TRUE_DRIFT_RATIO = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
-CALIBRATE_MAGNETOMETER = "Calibrate the magnetometer away from metal and motors."
-# Bit of EKF2_EV_CTRL that fuses the yaw of the source
-YAW_CONTROL_BIT = 8
 CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also causes a heading error."
 
 
@@ -52,30 +56,30 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def make_frame_finding(analysis: Analysis) -> Finding:
-    """Make the finding of positions in FRD, whose x axis is not north."""
+    """Make the finding that positions are in FRD, so that their x axis is not north."""
     ekf2, log = analysis.flight.ekf2, analysis.flight.log
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else None
-    sensor = source_name(analysis.source)
+    sensor_name = source_name(analysis.source)
     fault = (
         f"{positions_phrase(analysis.source)} are in FRD: their x axis points "
         "along the heading at the start, not north."
     )
-    fusion_sentence, action = "", f"In this report, north is the x axis of {sensor}."
+    fusion_sentence, action = "", f"In this report, north is the x axis of {sensor_name}."
     if isinstance(fusion_flags, Unavailable):
-        fusion_sentence = f"The log does not show whether EKF2 fused the yaw of {sensor}."
+        fusion_sentence = f"The log does not show whether EKF2 fused the yaw of {sensor_name}."
         if log.has_ulog:
             action += " Give the ULog of this flight as well: it shows the frame that EKF2 uses."
     elif (
         fusion_flags is not None
         and fraction_of_ones(fusion_flags["yaw"], analysis.segment) > MIN_FUSED_FRACTION_ERROR
     ):
-        fusion_sentence = f"EKF2 fused the yaw of {sensor}, so EKF2 uses the same frame."
+        fusion_sentence = f"EKF2 fused the yaw of {sensor_name}, so EKF2 uses the same frame."
     has_yaw = analysis.source.orientation is not None
     if fusion_sentence:
         return note("source_frame_frd", f"{fault} {fusion_sentence}", action)
     return warning(
         "source_frame_frd",
-        f"{fault} EKF2 did not fuse the yaw of {sensor}, so EKF2's axes are NED. The axes of "
+        f"{fault} EKF2 did not fuse the yaw of {sensor_name}, so EKF2's axes are NED. The axes of "
         "positions and EKF2 may differ.",
         "Send the position in NED"
         + (", or let EKF2 fuse the yaw (EKF2_EV_CTRL bit 3)." if has_yaw else "."),
@@ -83,7 +87,7 @@ def make_frame_finding(analysis: Analysis) -> Finding:
 
 
 def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
-    """Detect positions that move in another direction than the IMU measures."""
+    """Detect a yaw misalignment between positions and IMU."""
     rotation_deg, sigma_deg = math.remainder(heading.misalignment_deg, 360.0), heading.sigma_deg
     if heading.drifts:
         if not _is_drift_refuted(analysis.flight, heading):
@@ -118,7 +122,9 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         action = f"Rotate the positions by {-rotation_deg:+.0f}° before they are sent."
         if analysis.source.alignment is not None:
             action = "Run again with --position-yaw auto."
-    if not analysis.source.origin.is_gnss and (calibration_advice := _calibration_advice(analysis)):
+    if not analysis.source.origin.is_gnss and (
+        calibration_advice := magnetometer_advice(analysis.flight)
+    ):
         action += f" Alternatively: {lower_first(calibration_advice)}"
     yield finding(
         "error" if abs(rotation_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
@@ -139,13 +145,9 @@ def _gnss_heading_fault(analysis: Analysis) -> tuple[str, str]:
             "heading"
         )
         return cause, f"Set {format_settings(trial.change)}. Then check the heading again."
-    cause = "a magnetometer near currents or steel"
-    return cause, f"{_calibration_advice(analysis)} {CHECK_GNSS_DELAY}".lstrip()
-
-
-def _calibration_advice(analysis: Analysis) -> str:
-    mag_type = analysis.flight.log.parameters.get(MAG.switch)
-    return "" if mag_type == NO_MAGNETOMETER else CALIBRATE_MAGNETOMETER
+    advice = magnetometer_advice(analysis.flight)
+    cause = "a magnetometer near currents or steel" if advice else "the heading source of EKF2"
+    return cause, f"{advice} {CHECK_GNSS_DELAY}".lstrip()
 
 
 def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
@@ -156,8 +158,8 @@ def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
         or isinstance(attitude, Unavailable)
     ):
         return False
-    errors_deg = []
-    for part in heading.ends:
+    errors_deg, (first_part, last_part) = [], heading.find_ends()
+    for part in (first_part, last_part):
         samples = rows_between(attitude, part.start_s, part.end_s)[Columns.QUATERNION]
         true_attitude = interpolate(
             samples.index.to_numpy(), truth.attitude.index.to_numpy(), truth.attitude.to_numpy()
@@ -165,19 +167,19 @@ def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
         error_rad = heading_of(samples.to_numpy()) - heading_of(true_attitude)
         wrapped_rad = np.arctan2(np.sin(error_rad), np.cos(error_rad))
         errors_deg.append(float(np.degrees(np.median(wrapped_rad))))
-    change_deg = abs(heading.ends[1].heading_error_deg - heading.ends[0].heading_error_deg)
+    change_deg = abs(last_part.heading_error_deg - first_part.heading_error_deg)
     return abs(errors_deg[1] - errors_deg[0]) < MIN_TRUE_DRIFT_RATIO * change_deg
 
 
 def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
-    first_part, last_part = heading.ends
-    errors_deg = [math.remainder(part.heading_error_deg, 360.0) for part in heading.ends]
+    first_part, last_part = heading.find_ends()
+    errors_deg = [math.remainder(part.heading_error_deg, 360.0) for part in (first_part, last_part)]
     change_deg = last_part.heading_error_deg - first_part.heading_error_deg
     estimation_basis = "positions and IMU"
     if heading.by == "orientation":
         estimation_basis = f"the orientation of {source_name(analysis.source)}"
     calibration_advice, has_yaw = (
-        _calibration_advice(analysis),
+        magnetometer_advice(analysis.flight),
         analysis.source.orientation is not None,
     )
     possible_causes = [

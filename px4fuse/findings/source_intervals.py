@@ -1,4 +1,4 @@
-"""Findings about gaps in the position source, lost positions, and a downsampled source."""
+"""Gaps in the position source, lost positions, and a downsampled source."""
 
 import numpy as np
 import pandas as pd
@@ -19,26 +19,26 @@ from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
 from px4fuse.flight.model import ALIGNED, Ekf2, Unavailable, positions_phrase, step_values_at
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
-# Minimum fraction of lost positions for a finding: PX4 v1.14 and later loses 0.3 %
+# Minimum fraction of lost positions to report it: PX4 v1.14 and later loses 0.3 %
 MIN_LOST_FRACTION = 0.02
-# Minimum number of intervals between positions for the detection of downsampling
+# Minimum number of intervals between positions to detect downsampling
 MIN_INTERVALS = 50
-# Minimum fraction of missing positions for downsampling: a radio link loses less
+# Minimum fraction of missing positions to report downsampling: a radio link loses fewer
 MIN_DOWNSAMPLED_FRACTION = 0.25
-# Minimum fraction of intervals that are n or n + 1 periods of the source, with the commonest n.
-# Downsampling from 30 Hz to 20 Hz alternates between 1 and 2 periods; lost messages do not
+# The intervals of downsampled positions alternate between n and n + 1 periods of the source, for
+# example 1 and 2 from 30 Hz to 20 Hz. Minimum fraction of intervals with one of both lengths
 MIN_MULTIPLE_PAIR_FRACTION = 0.85
-# Minimum fraction of the rarer one of the two intervals of a downsampled source
+# Minimum fraction of intervals with the rarer of both lengths
 MIN_RARER_MULTIPLE_FRACTION = 0.1
 # Maximum RMS distance (periods) of intervals from whole periods: jitter causes 0.03, random
 # intervals cause 0.29
 MAX_MULTIPLE_RMS_ERROR = 0.06
 # Maximum number of periods of the source in the median interval between positions
 MAX_PERIOD_COUNT = 4
-# Minimum gap (s) at the start or end of the flight for a finding: the land detector is seconds
-# late
+# Minimum length (s) of a gap at the start or end of the flight to report it: the land detector is
+# seconds late
 MIN_END_GAP_S = 3.0
-# Time (s) before a position at which KF has not yet been updated with this position
+# KF's state before an update is its state this time (s) before the position
 BEFORE_UPDATE_S = 1e-6
 
 
@@ -49,7 +49,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_source_gaps(analysis: Analysis) -> Findings:
-    """Detect times without positions."""
+    """Detect gaps in the position source."""
     flight, source, ekf2 = analysis.segment.flight, analysis.source, analysis.flight.ekf2
     gap_spans, fused_gap_spans = list[Span](), list[Span]()
     invalid_s = analysis.source.invalid.index
@@ -135,14 +135,14 @@ def _partial_source_finding(analysis: Analysis, span_s: Span, fused_aids: list[A
 
 
 def _ekf2_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
-    """Return EKF2's horizontal error against ground truth and reported σ (m) at the end of a span.
+    """Return EKF2's horizontal position error and reported σ (m) at the end of a time span.
 
-    Unknown values are missing.
+    The mapping does not contain unknown values.
     """
     axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
     squares_m2 = []
     for result in axes if len(axes) == 2 else [analysis.main]:
-        tracks = result.in_flight
+        tracks = result.with_flight_tracks()
         if isinstance(tracks.ekf2_state, Unavailable):
             return {}
         position_m = tracks.ekf2_state["position_m"].loc[slice(*span_s)]
@@ -201,7 +201,7 @@ def _has_aids(ekf2: Ekf2 | Unavailable) -> bool:
 
 
 def _continuously_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[Aid]:
-    """Return the horizontal aiding sources that EKF2 fused all over a time span."""
+    """Return the horizontal aiding sources that EKF2 fused during a whole time span."""
     aids, (start_s, end_s) = list[Aid](), span_s
     for name in (EV_POS.name, *OTHER_HORIZONTAL_AIDS):
         aid_log = None if isinstance(ekf2, Unavailable) else ekf2.aids.get(name)
@@ -243,9 +243,12 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
-    # the intervals of received positions are unknown if px4fuse changed the timestamps, or if PX4
-    # logs the positions only after EKF2 used them (ALIGNED)
-    if source.clock_map is not None or source.origin.preference_rank >= ALIGNED.preference_rank:
+    # The intervals are not those at which PX4 received the positions if px4fuse changed the
+    # timestamps, or if PX4 logs the positions only after EKF2 used them (ALIGNED)
+    if (
+        source.clock_map is not None
+        or source.origin.find_preference_rank() >= ALIGNED.find_preference_rank()
+    ):
         return
     intervals_s, _ = _position_intervals_s(analysis)
     period_and_counts = _find_period(intervals_s) if len(intervals_s) >= MIN_INTERVALS else None
@@ -298,7 +301,7 @@ def _position_intervals_s(analysis: Analysis) -> tuple[Array, float]:
 
 def _find_period(intervals_s: Array) -> tuple[float, Array] | None:
     """Return the period (s) of the source, and the number of periods in each interval."""
-    # the upper median is a measured interval, not a mean of two
+    # The upper median is one of the intervals, not the mean of two intervals
     median_interval_s = float(np.sort(intervals_s)[len(intervals_s) // 2])
     for median_count in range(1, MAX_PERIOD_COUNT + 1):
         period_counts = np.rint(intervals_s * median_count / median_interval_s)

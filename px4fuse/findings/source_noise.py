@@ -1,6 +1,6 @@
 """Position noise that is time-correlated, unequal between axes or varying; repeated positions.
 
-R describes white noise of constant σ, so neither KF nor EKF2 can model such noise.
+Neither KF nor EKF2 can model this noise, because R describes white noise with constant σ.
 """
 
 from dataclasses import asdict
@@ -19,31 +19,37 @@ from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, has_little_motion
 from px4fuse.flight.model import Columns, positions_phrase, source_name
 
-# Minimum white ÷ time-correlated noise from which white noise is treated as a separate fault
+# White noise is a separate fault if its ratio to the time-correlated noise exceeds this value
 MIN_WHITE_NOISE_RATIO = 0.3
 # Minimum log likelihood ratio (nats) of time-correlated to white noise: 1 of 400 flights without
 # a fault exceeds it
 MIN_CORRELATION_GAIN_NATS = 5.0
+# Minimum time-correlated error (m, 1 σ): timestamps in ms cause 2 mm at 4 m/s, and the motion from
+# IMU or ground truth also has errors of some mm
+MIN_CORRELATED_SIGMA_M = 0.005
 # Minimum fraction of repeated positions for a warning
 MIN_REPEAT_FRACTION = 0.05
 # Minimum fraction of repeated positions for severity error
 MIN_REPEAT_FRACTION_ERROR = 0.3
-# Minimum number of repeated positions for a finding
+# Minimum number of repeated positions to report them
 MIN_REPEATS = 10
-# Minimum ratio of the position noises (σ) along north and east for a finding
+# Minimum ratio of the position noises (σ) along north and east to report them as unequal
 MIN_AXIS_NOISE_RATIO = 1.5
-# Minimum noise in one part of the flight ÷ noise in the rest, for a warning
+# Minimum ratio of the noise in one part of the flight to the noise in the rest, for a warning
 MIN_PART_NOISE_RATIO = 2.0
-# The same minimum after removal of the outliers, for a warning
+# Minimum ratio of the noise in one part of the flight to the noise in the rest, without outliers,
+# for a warning
 MIN_PART_NOISE_RATIO_WITHOUT_OUTLIERS = 1.5
-# Minimum noise in one part of the flight ÷ noise in the rest, for severity error
+# Minimum ratio of the noise in one part of the flight to the noise in the rest, for severity error
 MIN_PART_NOISE_RATIO_ERROR = 4.0
 
 
 def detect(analysis: Analysis) -> Findings:
-    if analysis.source.orientation is not None or analysis.source.origin.reconstructed:
+    if analysis.source.origin.reconstructed:
         return
     yield from detect_repeated_positions(analysis)
+    if analysis.source.orientation is not None:
+        return
     yield from detect_time_correlated_noise(analysis)
     yield from detect_unequal_noise(analysis)
     yield from detect_noise_variation(analysis)
@@ -54,6 +60,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     if (
         not isinstance(noise, TimeCorrelatedNoise)
         or noise.gain_nats < MIN_CORRELATION_GAIN_NATS
+        or noise.slow_m < MIN_CORRELATED_SIGMA_M
         or noise.low_pass_gain_nats
         >= MIN_LAG_NATS  # a low-pass filtered source has its own finding
     ):
@@ -74,7 +81,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         and noise.white_m > MIN_WHITE_NOISE_RATIO * noise.slow_m
     ):
         evidence[WHITE_RATIO] = white_noise_ratio
-    # time-correlated errors are normal for GNSS, so those within the reported σ are only a note
+    # Time-correlated errors are normal for GNSS: if they are within the reported σ, they are a note
     make_finding = note if is_gnss and not _has_error_above_reported_sigma(analysis) else warning
     yield make_finding(
         "source_noise_time_correlated",
@@ -128,7 +135,7 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
 def detect_unequal_noise(analysis: Analysis) -> Findings:
     """Detect different position noise along north and east."""
     if analysis.source.origin.is_gnss:
-        return  # SIGMA_Z estimates only the white part of GNSS errors
+        return  # the estimate of SIGMA_Z contains only the white noise of GNSS
     noises_m = sorted(
         (noise.value, noise.low, noise.high, axis_tuning.name)
         for axis_tuning in analysis.tuning_by_axis
@@ -155,7 +162,7 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     if (
         noisy_part is None
         or noisy_part.sigma_ratio < MIN_PART_NOISE_RATIO
-        # a fused outlier increases later innovations
+        # An outlier that is fused also increases the next innovations
         or noisy_part.sigma_ratio_without_outliers < MIN_PART_NOISE_RATIO_WITHOUT_OUTLIERS
     ):
         return

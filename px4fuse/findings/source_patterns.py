@@ -1,6 +1,7 @@
-"""Position errors with a pattern: timestamp jitter, noise that grows with speed, and periods.
+"""Position errors with a pattern: timestamp jitter, and noise that increases with speed.
 
-With ground truth, also a time offset that varies in flight, and a scale factor error.
+Ground truth also shows periodic errors, a time offset that varies in flight, and a scale factor
+error.
 """
 
 import pandas as pd
@@ -32,9 +33,10 @@ from px4fuse.findings.source_positions import (
     MIN_SCALE_ERROR_SEVERE,
     MIN_SCALE_ERROR_SIGMAS,
 )
+from px4fuse.findings.source_stamps import detect_bursts
 from px4fuse.flight.model import positions_phrase, source_name
 
-# Minimum scale error (ratio minus 1) against ground truth: 0.8 m in a distance of 10 m
+# Minimum scale factor error (ratio minus 1) against ground truth to report it: 0.8 m in 10 m
 MIN_TRUE_SCALE_ERROR = 0.08
 # Minimum jitter (s) for severity error: a position error of 3 cm at 1 m/s
 MIN_JITTER_ERROR_S = 0.03
@@ -44,7 +46,9 @@ MIN_PERIODIC_ERROR_M = 0.2
 
 def detect(analysis: Analysis) -> Findings:
     yield from detect_attitude_delay(analysis)
-    white = None if analysis.source.origin.reconstructed else white_errors(analysis)
+    bursts = [*detect_bursts(analysis)]
+    yield from bursts
+    white = None if bursts or analysis.source.origin.reconstructed else white_errors(analysis)
     if white is None:
         return
     yield from detect_white_patterns(analysis, white)
@@ -98,7 +102,7 @@ def detect_slow_patterns(analysis: Analysis, fit: ErrorFit) -> Findings:
         )
         return
     clock, variation = analysis.clock, find_offset_variation(fit)
-    if isinstance(clock, ClockOffset) and clock.changes:
+    if isinstance(clock, ClockOffset) and clock.has_changed():
         return  # source_clock reports the change
     if variation is not None:
         yield error(

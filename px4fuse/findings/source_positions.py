@@ -10,14 +10,14 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import Comparison, north_and_east
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_factor, format_metres
-from px4fuse.ekf2.fusion_conditions import is_height_only
+from px4fuse.ekf2.fusion_conditions import constant_coordinates, is_height_only
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, SystematicErrors
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
-from px4fuse.finding import Finding, Severity
-from px4fuse.findings.cause_grouping import ANNOUNCED, CAUSE, GROUND
+from px4fuse.finding import Severity
+from px4fuse.findings.cause_grouping import ANNOUNCED, CAUSE, GROUND, REPORTED
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
 from px4fuse.findings.model import (
     Findings,
@@ -25,6 +25,7 @@ from px4fuse.findings.model import (
     finding,
     format_count,
     format_percent,
+    note,
     source_words,
     warning,
     zero_length_spans,
@@ -42,48 +43,50 @@ from px4fuse.flight.model import (
     white_noise_m,
 )
 
-# Minimum extent (m) of the positions (5th to 95th percentile) of a vehicle that moves
+# Minimum extent (m) of the positions (5th to 95th percentile) if the vehicle moves
 MIN_MOTION_RANGE_M = 0.5
-# Minimum extent (σ of the noise) of the positions of a vehicle that moves: white noise extends
-# over 3.29 σ (5th to 95th percentile), and the margin is 25 %
+# Minimum ratio of the extent of the positions to the σ of their noise if the vehicle moves: white
+# noise extends over 3.29 σ (5th to 95th percentile), and the margin is 25 %
 MIN_MOTION_RANGE_SIGMAS = 1.25 * 3.29
-# Minimum log likelihood ratio (nats) of low-pass filtered to white noise; without a low pass the
-# ratio is 0 to 2
+# Minimum log likelihood ratio (nats) of low-pass filtered to white noise; for positions that are
+# not filtered it is 0 to 2
 MIN_LOW_PASS_GAIN_NATS = 6.0
-# Minimum log likelihood ratio (nats) of noise after a low pass to time-correlated noise without lag
+# Minimum log likelihood ratio (nats) of low-pass filtered noise to time-correlated noise without
+# lag
 MIN_LAG_NATS = 1.0
-# Maximum lag of a low pass ÷ upper end of the 95 % interval of the delay; above this ratio the
-# estimated delay is used as lag
+# If the lag of the low-pass filter exceeds this multiple of the upper end of the 95 % interval of
+# the delay, the delay is reported as lag
 MAX_LAG_RATIO = 4.0
-# Minimum lag (s) by a low pass, for a warning: a position error of 5 cm at 1 m/s
+# Minimum lag (s) due to a low-pass filter, for a warning: a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
-# Minimum lag (s) by a low pass, for severity error: a position error of 10 cm at 1 m/s
+# Minimum lag (s) due to a low-pass filter, for severity error: a position error of 10 cm at 1 m/s
 MIN_LAG_ERROR_S = 0.10
 # Minimum position jump (m) for a warning: twice the noise of good UWB (0.1 m)
 MIN_JUMP_M = 0.2
-# Minimum position jump (σ of the time-correlated noise) for a warning
+# Minimum ratio of a position jump to the σ of time-correlated noise, for a warning
 MIN_JUMP_SIGMAS = 5.0
-# Minimum number of jumps of a source that jumps repeatedly, with a change of reset_counter
+# Minimum number of jumps with a change of reset_counter to report repeated jumps
 MIN_ANNOUNCED_JUMPS = 2
-# Minimum number of jumps of a source that jumps repeatedly, without a change of reset_counter
+# Minimum number of jumps without a change of reset_counter to report repeated jumps
 MIN_UNANNOUNCED_JUMPS = 3
-# Minimum size (m) of each of several jumps without a change of reset_counter
+# Minimum size (m) of a jump without a change of reset_counter
 MIN_UNANNOUNCED_JUMP_M = 0.1
-# Minimum size of a jump without a change of reset_counter ÷ median change between nearby steps
+# Minimum ratio of a jump without a change of reset_counter to the median of other position changes
 MIN_UNANNOUNCED_JUMP_RATIO = 8.0
 # Number of position changes in the median with which a jump is compared
 MEDIAN_CHANGE_COUNT = 61
-# Minimum number of positions for the detection of jumps
+# Minimum number of positions to detect jumps
 MIN_POSITIONS_FOR_JUMPS = 100
-# Minimum duration (s), and minimum number of positions, of the shift by a jump: outliers are
-# shorter
+# Minimum time (s) and number of positions for which a jump lasts: outliers are shorter
 MIN_LASTING_S, MIN_LASTING_SAMPLES = 0.6, 9
-# A jump lasts if the medians of the positions before and after it differ by the size of the jump,
-# to within this fraction of the size
+# A jump lasts if the medians of the positions before and after it differ by its size, with an error
+# below this fraction of the size
 MAX_LASTING_RATIO = 0.5
-# Maximum interval (median intervals) before a jump: in a longer gap the vehicle moves
+# Maximum ratio of the interval before a jump to the median interval: in a longer interval, the
+# vehicle moves
 MAX_JUMP_INTERVAL_RATIO = 1.5
-# Minimum fraction of jumps opposite to the previous jump, if the positions alternate
+# The positions alternate between two points if at least this fraction of the jumps is opposite to
+# the previous jump
 MIN_RETURN_FRACTION = 0.7
 # Maximum time (s) from a position jump to the reset of EKF2 that the jump causes
 MAX_JUMP_TO_RESET_S = 5.0
@@ -92,22 +95,22 @@ MAX_LISTED_JUMPS = 8
 # Maximum rounding difference (s) between the time of a position and that of its reset_counter
 RESET_TOLERANCE_S = 1e-4
 # Bits of EKF2_EV_CTRL: horizontal position, and height
-HORIZONTAL_CONTROL, HEIGHT_ONLY_CONTROL = 1, 2
+HORIZONTAL_CONTROL, HEIGHT_CONTROL = 1, 2
 # Maximum time (s) between a jump and the increment of reset_counter: two intervals at 2 Hz
 MAX_JUMP_TO_COUNTER_S = 1.0
 # Minimum position jump (m) for severity error: five times the noise of good UWB (0.1 m)
 MIN_JUMP_ERROR_M = 0.5
-# Minimum scale error (ratio minus 1) for a warning: simulated flights without a fault reach 0.11
+# Minimum scale factor error (ratio minus 1) for a warning: flights without a fault reach 0.11
 MIN_SCALE_ERROR_WARNING = 0.12
-# Minimum scale error (ratio minus 1) for severity error: 1 m in a distance of 7 m
+# Minimum scale factor error (ratio minus 1) for severity error: 1 m in a distance of 7 m
 MIN_SCALE_ERROR_SEVERE = 0.15
-# Minimum scale error (σ of its estimate) for a warning: 0.3 % of correct sources exceed it
+# Minimum ratio of a scale factor error to its σ for a warning: 0.3 % of correct sources exceed it
 MIN_SCALE_ERROR_SIGMAS = 3.0
 # Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
 MIN_OUTLIER_FRACTION = 0.005
 # Minimum fraction of outliers for severity error: one in 10 s at 5 Hz
 MIN_OUTLIER_FRACTION_ERROR = 0.02
-# Minimum number of outliers for a finding
+# Minimum number of outliers to report them
 MIN_OUTLIERS = 3
 # Rejected outliers are counted only if the log has the innovations of this fraction of positions
 MIN_INNOVATION_FRACTION = 0.75
@@ -118,8 +121,8 @@ MIN_VARIANCE_RATIO_ERROR = 3.0
 
 
 def detect(analysis: Analysis) -> Findings:
+    yield from detect_constant_coordinates(analysis)
     if is_height_only(analysis.source):
-        yield make_height_only_finding(analysis)
         return
     yield from detect_little_motion(analysis)
     yield from detect_repeated_jumps(analysis)
@@ -132,7 +135,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
-    """Return the low-pass filter of the position source, if it has one."""
+    """Return the low-pass filter of the position source; None if its positions are not filtered."""
     source, low_pass = analysis.source, analysis.source_low_pass
     if (
         source.orientation is not None  # drift of odometry also correlates successive errors
@@ -144,11 +147,11 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     ):
         return None
     clock, correlated_noise = analysis.clock, analysis.time_correlated_noise
-    # at a high rate, the time offset (negative for a lag) is more accurate than the correlation
-    limit_s = -MAX_LAG_RATIO * clock.interval_s[0] if isinstance(clock, ClockOffset) else 0.0
-    if isinstance(clock, ClockOffset) and low_pass.lag_s > limit_s >= MIN_LAG_S:
+    # At a high rate, the time offset (negative for a lag) is more accurate than the correlation
+    lag_limit_s = -MAX_LAG_RATIO * clock.interval_s[0] if isinstance(clock, ClockOffset) else 0.0
+    if isinstance(clock, ClockOffset) and low_pass.lag_s > lag_limit_s >= MIN_LAG_S:
         low_pass = replace(low_pass, lag_s=-clock.offset_s)
-    # a low pass delays positions: correlated errors without a lag have another cause
+    # A low-pass filter delays positions: correlated errors without lag have another cause
     if (
         isinstance(correlated_noise, TimeCorrelatedNoise)
         and correlated_noise.low_pass_gain_nats < MIN_LAG_NATS
@@ -180,13 +183,13 @@ def detect_low_pass(analysis: Analysis) -> Findings:
 def detect_jumps(analysis: Analysis) -> Findings:
     """Detect position jumps that the IMU does not measure."""
     fit = analysis.systematic_errors
-    # a change of the time offset also shifts the positions of a moving vehicle
+    # A change of the time offset also shifts the positions of a moving vehicle
     if not isinstance(fit, SystematicErrors) or any(detect_arrival_times(analysis)):
         return
     correlated_noise = analysis.time_correlated_noise
     min_jump_m = MIN_JUMP_M
     if not isinstance(correlated_noise, Unavailable):
-        # time-correlated noise changes by up to √2 σ within seconds, which resembles a jump
+        # Time-correlated noise changes by up to √2 σ within seconds, which resembles a jump
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
     large_jumps = [jump for jump in fit.jumps if jump.size_m >= min_jump_m]
     counter_changes_s = reset_times_s(analysis.source)
@@ -227,23 +230,44 @@ def detect_jumps(analysis: Analysis) -> Findings:
         )
 
 
-def make_height_only_finding(analysis: Analysis) -> Finding:
-    source, log = analysis.source, analysis.flight.log
-    x_m, y_m = source.samples[Columns.POSITION[:2]].median().tolist()
-    parameter = EV_POS.switch
-    control = int(log.parameters.get(parameter, HEIGHT_ONLY_CONTROL))
-    action = f"Leave {parameter} at {control}, so that EKF2 does not fuse x and y."
-    if control & HORIZONTAL_CONTROL:
-        action = (
-            f"Set {parameter} to {control & ~HORIZONTAL_CONTROL | HEIGHT_ONLY_CONTROL} (height "
-            "only), so that EKF2 does not fuse the constant x and y."
-        )
-    return warning(
-        "source_height_only",
-        f"The coordinates x and y of {source.name} are constant ({x_m:g}, {y_m:g} m). Only the "
-        "height is a measurement. The horizontal position is not evaluated.",
-        action,
-        {"x_m": x_m, "y_m": y_m},
+def detect_constant_coordinates(analysis: Analysis) -> Findings:
+    """Detect coordinates that never change, so that the source does not measure them."""
+    source, parameter = analysis.source, EV_POS.switch
+    names = constant_coordinates(source)
+    is_single_coordinate = len(names) == 1
+    if not (is_single_coordinate or is_height_only(source)) or (
+        is_single_coordinate and source.step_m > 0.0
+    ):
+        return  # rounded positions may stay within one step
+    values_m = dict(zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True))
+    name, bit, make_finding = "source_coordinate_constant", HORIZONTAL_CONTROL, error
+    consequence = "px4fuse estimates nothing from these positions."
+    if names == ["z"]:
+        name, bit, make_finding = "source_height_constant", HEIGHT_CONTROL, warning
+        consequence = "The height is not evaluated."
+    elif names == ["x", "y"]:
+        make_finding = warning
+        consequence = "Only the height is a measurement. The horizontal position is not evaluated."
+    action, listed_names = "", " and ".join(names)
+    if parameter in analysis.flight.log.parameters:
+        control = int(analysis.flight.log.parameters[parameter])
+        action = f"Leave {parameter} at {control}"
+        if control & bit:
+            fused_bit = HORIZONTAL_CONTROL + HEIGHT_CONTROL - bit
+            action = f"Set {parameter} to {control & ~bit | fused_bit}"
+        elif names == ["z"]:
+            make_finding = note
+        action += f", so that EKF2 does not fuse {listed_names}. "
+    subject = f"coordinate {listed_names} of {source.name} is"
+    if not is_single_coordinate:
+        subject = f"coordinates {listed_names} of {source.name} are"
+    values_text = ", ".join(f"{values_m[each]:g}" for each in names)
+    yield make_finding(
+        name,
+        f"The {subject} constant ({values_text} m): the source does not measure "
+        f"{'it' if is_single_coordinate else 'them'}. {consequence}",
+        f"{action}Send NaN for a coordinate that is not measured.",
+        {f"{each}_m": value for each, value in values_m.items()},
     )
 
 
@@ -279,14 +303,14 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
             f"{np.median(jump_to_reset_s):.1f} s later."
         )
     listed_times = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
-    is_return = np.sum(steps_m[1:] * steps_m[:-1], axis=1) < 0.0
+    is_reversal = np.sum(steps_m[1:] * steps_m[:-1], axis=1) < 0.0
     counter_text = "and its reset_counter increases at each jump"
     cause_sentence = "The source (VIO or SLAM) drifts and corrects its drift."
     if not is_announced:
         counter_text = "without a change of its reset_counter"
         cause_sentence = f"Possible causes: {source_words(analysis.source).jump}."
     action = "Improve the tracking of the source, or correct the drift in smaller steps."
-    if is_return.mean() >= MIN_RETURN_FRACTION:
+    if is_reversal.mean() >= MIN_RETURN_FRACTION:
         cause_sentence = (
             "The source alternately sends the positions of two points, "
             f"{np.median(sizes_m):.2f} m apart."
@@ -304,15 +328,15 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
 
 
 def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
-    """Return time (s) and step (m) of the jumps, and True if ``reset_counter`` changes with them.
+    """Return time (s) and step (m) of each jump, and True if ``reset_counter`` changes with them.
 
-    Jumps without a change of the counter count only if they last for :data:`MIN_LASTING_S` and are
-    :data:`MIN_UNANNOUNCED_JUMP_RATIO` times larger than other changes.
+    If it does not change, a jump must last for :data:`MIN_LASTING_S`, and must be
+    :data:`MIN_UNANNOUNCED_JUMP_RATIO` times larger than other position changes.
     """
     position_m = cut_to_segment(analysis.source.samples, analysis.segment)[
         Columns.POSITION[:2]
     ].dropna()
-    # a repeated position makes the next step larger
+    # Repeated positions are dropped, because they make the next step larger
     position_m = position_m[(position_m.diff() != 0.0).any(axis=1)]
     time_s, steps_m = position_m.index.to_numpy(), np.diff(position_m.to_numpy(), axis=0)
     if len(steps_m) < MIN_POSITIONS_FOR_JUMPS:
@@ -353,7 +377,7 @@ def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
 
 
 def detect_scale_error(analysis: Analysis) -> Findings:
-    """Detect a scale factor error of the source relative to the IMU."""
+    """Detect a scale factor error of the positions relative to the IMU."""
     imu, fit = analysis.flight.imu, analysis.systematic_errors
     if not isinstance(imu, pd.DataFrame) or is_rate_too_low(imu, MIN_IMU_RATE_HZ):
         return
@@ -424,7 +448,10 @@ def detect_outliers(analysis: Analysis) -> Findings:
 
 
 def outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, str]:
-    """Return the horizontal errors (m) of outliers, and the name of their reference."""
+    """Return the horizontal distances (m) of outliers from a reference, and its name.
+
+    The reference is ground truth or, without it, the neighbouring positions.
+    """
     axes = north_and_east(analysis) or [analysis.main]
     has_truth = all(isinstance(result.truth, pd.DataFrame) for result in axes)
     squares_m2 = np.zeros(len(outlier_time_s))
@@ -447,7 +474,7 @@ def _rejected_outliers_sentence(analysis: Analysis, outlier_times_s: Sequence[fl
     if len(innovations) < MIN_INNOVATION_FRACTION * len(analysis.main.axis.measurement_time_s):
         return ""
     rejected_s = innovations.index[innovations["rejected"] > 0.0].to_numpy()
-    tolerance_s = 0.5 / analysis.source.rate_hz
+    tolerance_s = 0.5 / analysis.source.compute_rate_hz()
     rejected_count = sum(
         bool(np.any(np.abs(rejected_s - time_s) < tolerance_s)) for time_s in outlier_times_s
     )
@@ -472,7 +499,7 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     reported_m = float(np.sqrt(reported_variance_m2.to_numpy().mean(axis=1)).mean())
     variance_ratio = (reported_m / noise_m) ** 2
     ratio = max(variance_ratio, 1.0 / variance_ratio)
-    # R also has to include time-correlated errors, which innovations do not show
+    # R has to include time-correlated errors, too, which innovations do not show
     rmse_m = _rmse_per_axis_m(analysis) if variance_ratio > 1.0 else None
     if rmse_m is not None and reported_m**2 < MIN_VARIANCE_RATIO * rmse_m**2:
         return
@@ -495,6 +522,7 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
                 "reported_sigma_m": reported_m,
                 "sigma_z_m": noise_m,
                 "variance_factor": variance_ratio,
+                CAUSE: REPORTED if severity != "note" else "",
             },
         )
 

@@ -11,7 +11,9 @@ from px4fuse.ekf2.fusion_conditions import (
     SET_TIMESTAMP_ACTION,
     SYNCHRONISE_ACTION,
 )
-from px4fuse.findings.model import Findings, error, fraction_of_ones, note, warning
+from px4fuse.ekf2.intervals import MAX_LATENESS_S
+from px4fuse.findings.model import Findings, error, format_percent, fraction_of_ones, note, warning
+from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
     ARRIVAL_METHODS,
     REPEATED_TIMESTAMPS,
@@ -22,25 +24,29 @@ from px4fuse.flight.model import (
     positions_phrase,
 )
 
-# Maximum jitter (s) of receive times for no finding: a position error of 1 cm at 1 m/s
+# Jitter of receive times is reported above this value (s): a position error of 1 cm at 1 m/s
 MAX_RECEIPT_JITTER_S = 0.010
-# Maximum age (s), at publication by PX4, of a position whose timestamp is its arrival time
+# A timestamp is the arrival time if PX4 publishes the position within this time (s) after it
 MAX_ARRIVAL_AGE_S = 0.001
 # Minimum latency (s) for a warning: a position error of 2 cm at 1 m/s
 MIN_LATENCY_S = 0.02
 # Minimum latency (s) for severity error: a position error of 10 cm at 1 m/s
 MIN_LATENCY_ERROR_S = 0.10
-# Minimum rank correlation of latency and time, if the latency grows in flight
+# The latency grows in flight if its rank correlation with time exceeds this value
 MIN_LATENCY_TREND = 0.8
+# Minimum fraction of positions that EKF2 drops because of their latency, for a finding
+MIN_DROPPED_FRACTION = 0.02
 # Minimum number of positions before the convergence of TIMESYNC, and minimum number after it
 MIN_SAMPLES = 10
-# Minimum fraction of timestamps that are arrival times before the convergence of TIMESYNC, and
-# measurement times after the convergence
+# Minimum fraction of arrival times among the timestamps before the convergence of TIMESYNC, and of
+# measurement times after it
 MIN_CONSISTENT_FRACTION = 0.95
 # Minimum mean number of positions in a burst of positions that arrive together
 MIN_BURST_SIZE = 2.5
-# Maximum ratio of the interval within bursts of positions to the pause between bursts
-MAX_BURST_INTERVAL_RATIO = 0.1
+# Minimum number of bursts: fewer pauses are gaps in the position source
+MIN_BURST_COUNT = 20
+# Maximum ratio of the duration of a burst to the pause between bursts
+MAX_BURST_DURATION_RATIO = 0.3
 ANSWER_TIMESYNC = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
     "every request). Send positions only after 500 answers, which take 50 s at 10 Hz."
@@ -51,7 +57,7 @@ def detect(analysis: Analysis) -> Findings:
     clock, positions = analysis.source.clock_map, positions_phrase(analysis.source)
     if clock is None:
         yield from detect_arrival_times(analysis)
-        yield from detect_growing_latency(analysis)
+        yield from detect_varying_latency(analysis)
     elif clock.note == REPEATED_TIMESTAMPS and clock.distinct_stamps:
         yield from detect_shared_timestamps(analysis, clock.pairs, clock.distinct_stamps)
     elif clock.clock in AGE_BY_WRONG_TIMESTAMP:
@@ -70,23 +76,33 @@ def detect(analysis: Analysis) -> Findings:
         yield warning(
             "companion_not_synchronised",
             f"The source of the {positions} never synchronised its clock (TIMESYNC). EKF2 used "
-            "arrival times as times of measurement. "
-            f"{kf_times_sentence}{_describe_bursts(analysis)}",
+            f"arrival times as times of measurement. {kf_times_sentence}",
             ANSWER_TIMESYNC,
             {"jitter_s": clock.jitter_s},
         )
 
 
-def _describe_bursts(analysis: Analysis) -> str:
-    """Return a sentence on positions that arrive in bursts; empty if they arrive one by one."""
+def detect_bursts(analysis: Analysis) -> Findings:
+    """Detect timestamps in bursts: arrival times of positions that wait for each other."""
     intervals_s = np.diff(analysis.source.samples.index.to_numpy())
     is_pause = intervals_s > intervals_s.mean()
-    if not is_pause.any() or (burst_size := 1.0 / float(is_pause.mean())) < MIN_BURST_SIZE:
-        return ""
-    pause_s = float(np.median(intervals_s[is_pause]))
-    if np.median(intervals_s[~is_pause]) > MAX_BURST_INTERVAL_RATIO * pause_s:
-        return ""
-    return f" The positions arrive in bursts of {burst_size:.0f}, every {pause_s:.2g} s."
+    if np.count_nonzero(is_pause) < MIN_BURST_COUNT:
+        return
+    burst_size, pause_s = 1.0 / float(is_pause.mean()), float(np.median(intervals_s[is_pause]))
+    burst_s = burst_size * float(np.median(intervals_s[~is_pause]))
+    if burst_size < MIN_BURST_SIZE or burst_s > MAX_BURST_DURATION_RATIO * pause_s:
+        return
+    yield error(
+        "source_timestamp_jitter",
+        f"The timestamps of the {positions_phrase(analysis.source)} come in bursts of "
+        f"{burst_size:.0f}, every {pause_s:.2g} s "
+        f"({analysis.source.compute_rate_hz():.3g} Hz on average). "
+        "They are arrival times of positions that were "
+        f"measured earlier, by up to {pause_s:.2g} s. At 1 m/s this is a position error of up to "
+        f"{format_metres(pause_s)} m along the motion.",
+        "Send each position at once, with its time of measurement.",
+        {"burst_size": burst_size, "interval_s": pause_s},
+    )
 
 
 def detect_shared_timestamps(
@@ -189,30 +205,39 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
         )
 
 
-def detect_growing_latency(analysis: Analysis) -> Findings:
-    """Detect positions that arrive later and later after their measurement."""
+def detect_varying_latency(analysis: Analysis) -> Findings:
+    """Detect positions that arrive later and later, or too late for EKF2's buffer."""
     position_age_s = _position_age_s(analysis)
     if position_age_s is None or find_synchronisation(analysis) is not None:
         return
-    part_count = max(MIN_SAMPLES, len(position_age_s) // 10)
+    sample_count = max(MIN_SAMPLES, len(position_age_s) // 10)
     start_s, end_s = (
-        float(part.median())
-        for part in (position_age_s.iloc[:part_count], position_age_s.iloc[-part_count:])
+        float(age_s.median())
+        for age_s in (position_age_s.iloc[:sample_count], position_age_s.iloc[-sample_count:])
     )
+    change_text = "grows in flight"
     trend = rank_correlation(position_age_s.index.to_numpy(), position_age_s.to_numpy())
-    if end_s - start_s < MIN_LATENCY_ERROR_S or trend < MIN_LATENCY_TREND:
-        return
-    ekf2, buffer_sentence, make_finding = analysis.flight.ekf2, "", warning
+    ekf2, buffer_sentence, dropped_fraction = analysis.flight.ekf2, "", 0.0
     if isinstance(ekf2, Ekf2) and isinstance(ekf2.horizon_s, float):
-        buffer_sentence = f" EKF2 fuses only positions younger than {ekf2.horizon_s:.2f} s."
-        make_finding = error if end_s > ekf2.horizon_s else warning
-    yield make_finding(
-        "source_latency_grows",
-        f"The latency of the {positions_phrase(analysis.source)} grows in flight from "
+        delay_s = 1e-3 * analysis.flight.log.parameters.get(EV_POS.delay, 0.0)
+        limit_s = ekf2.horizon_s + MAX_LATENESS_S - delay_s
+        dropped_fraction = float((position_age_s > limit_s).mean())
+        buffer_sentence = (
+            f" EKF2 drops positions that arrive later than {limit_s:.2f} s (here "
+            f"{format_percent(dropped_fraction)})."
+        )
+    if end_s - start_s < MIN_LATENCY_ERROR_S or trend < MIN_LATENCY_TREND:
+        if not MIN_DROPPED_FRACTION < dropped_fraction < 1.0 - MIN_DROPPED_FRACTION:
+            return
+        change_text = "varies"
+        start_s, end_s = position_age_s.quantile([0.05, 0.95]).tolist()
+    yield (error if dropped_fraction > MIN_DROPPED_FRACTION else warning)(
+        "source_latency_varies",
+        f"The latency of the {positions_phrase(analysis.source)} {change_text} from "
         f"{start_s:.2f} s to {end_s:.2f} s (time from measurement to arrival).{buffer_sentence}",
         "Find the queue that fills up: sender, bridge or link. Send fewer or smaller messages, and "
         "let the sender drop old positions.",
-        {"start_s": start_s, "end_s": end_s},
+        {"start_s": start_s, "end_s": end_s, "dropped_fraction": dropped_fraction},
     )
 
 
@@ -222,7 +247,7 @@ def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
     if position_age_s is None:
         return None
     is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
-    # for each position as the last one before convergence: number of timestamps that do not fit
+    # Number of timestamps that contradict a convergence directly after each position
     contradicting_count: Array = (
         np.cumsum(~is_arrival_time) + np.sum(is_arrival_time) - np.cumsum(is_arrival_time)
     )
@@ -242,7 +267,10 @@ def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
 
 
 def _position_age_s(analysis: Analysis) -> pd.Series | None:
-    """Return the publication time of each position minus its timestamp_sample (s), if logged."""
+    """Return the age (s) of each position at its publication, from timestamp_sample.
+
+    Return None if the log does not contain it.
+    """
     ekf2, source, segment = analysis.flight.ekf2, analysis.source, analysis.segment
     fusion_record = ekf2.record if isinstance(ekf2, Ekf2) else None
     if (

@@ -20,30 +20,33 @@ from px4fuse.findings.model import Findings, error, note, source_words, warning
 from px4fuse.findings.source_intervals import describe_errors_after_gap
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_phrase, source_name
 
-# Minimum rounding step (m) for a finding: the error of smaller steps is below the noise of UWB
+# Minimum rounding step (m) to report it: the error of smaller steps is below the noise of UWB
 MIN_ROUNDING_STEP_M = 0.05
-# Maximum ratio of EKF2's position RMSE with the estimated lever arm to that as flown
+# A lever arm is reported if it reduces the position RMSE of an EKF2 replay to less than this
+# multiple
 MAX_LEVER_ARM_RMSE_RATIO = 0.7
 # Minimum distance (m) between the positions of two senders that alternate: the noise of good UWB
 MIN_SENDER_DISTANCE_M = 0.1
-# Minimum distance (σ) between the positions of two senders: white noise of one sender reaches 2 σ
+# Minimum ratio of the distance between the positions of two senders to the noise σ: the noise of
+# one sender reaches 2 σ
 MIN_SENDER_DISTANCE_SIGMAS = 4.0
-# Number of samples in a window for detecting two senders: short, because a lost sample exchanges
-# the senders of odd and even samples
+# Number of samples in a window to detect two senders: few, because a lost sample exchanges the
+# senders of odd and even samples
 WINDOW_SAMPLES = 16
-# Minimum number of windows for detecting two senders: in fewer windows, outliers of one sender
-# resemble a second sender
+# Minimum number of windows to detect two senders: in fewer windows, outliers of one sender resemble
+# a second sender
 MIN_WINDOWS = 10
-# Maximum median distance (m) between EKF2's position and a source that sends this position back
+# Positions are a copy of EKF2's position if their median distance is below this limit (m)
 MAX_COPY_DISTANCE_M = 0.01
-# The same maximum (m) if EKF2 fuses the source, because EKF2 then follows any source
+# Maximum median distance (m) between EKF2 and a copy that EKF2 fuses. It is small, because EKF2
+# follows any source that it fuses
 MAX_FUSED_COPY_DISTANCE_M = 0.001
-# Minimum speed (m/s) for detecting a copy: at rest any source may equal EKF2's position
+# Positions are compared with EKF2's position above this speed (m/s): at rest, any source may agree
 MIN_COPY_SPEED_M_S = 0.2
-# Tested delays (s) of a source that is a copy of EKF2's position
+# Tested delays (s) of a copy of EKF2's position
 COPY_DELAYS_S = np.arange(0.0, 0.305, 0.005)
 NO_ESTIMATES = "px4fuse estimates nothing from these positions."
-# Id of the finding, fault and action for each kind of invalid position
+# For each reason of an invalid position: id of the finding, fault, and action
 INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
     "zero": (
         "source_zero_positions",
@@ -77,7 +80,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _consecutive_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
-    # a span ends at the next valid sample, so its rows have the same number of valid samples before
+    # A span ends at the next valid sample: the number of valid samples before its rows is constant
     valid_count_before = np.searchsorted(valid_s, time_s)
     starts = np.flatnonzero(np.diff(valid_count_before, prepend=-1))
     ends = np.append(starts[1:], len(time_s)) - 1
@@ -102,7 +105,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         if len(spans) <= 3:
             times = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
         error_text, make_finding = "", note if reason == "NaN" else warning
-        if duration_s > max_interval_s(1.0 / source.rate_hz):
+        if duration_s > max_interval_s(1.0 / source.compute_rate_hz()):
             make_finding = warning
             valid_times_s = _valid_times_around(analysis, longest_span_s)
             error_text = f" {describe_errors_after_gap(analysis, valid_times_s)}"
@@ -122,7 +125,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
 
 
 def _valid_times_around(analysis: Analysis, span_s: Span) -> Span:
-    """Return the times (s) of the last measurement before a span and of the first after it."""
+    """Return the times (s) of the last position before a time span and of the first after it."""
     time_s = analysis.input_axes[0].measurement_time_s
     indices = np.clip(np.searchsorted(time_s, span_s), 1, len(time_s) - 1)
     return float(time_s[indices[0] - 1]), float(time_s[indices[1]])
@@ -153,7 +156,7 @@ def detect_rounding(analysis: Analysis) -> Findings:
 
 
 def detect_lever_arm(analysis: Analysis) -> Findings:
-    """Detect a sensor that is mounted away from the IMU without a lever arm in EKF2."""
+    """Detect a position sensor whose lever arm from the IMU is wrong in EKF2's parameters."""
     source, convention = analysis.source, analysis.convention
     has_truth = isinstance(analysis.flight.truth, Truth)
     is_convention_determined = convention is not None and convention.verdict == "determined"
@@ -187,10 +190,10 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
 
 
 def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | None:
-    """Return a sentence on EKF2's horizontal error in replays without and with a change.
+    """Return a sentence on EKF2's position RMSE in replays without and with a change.
 
-    Return an empty text without a replay, and None if the change hardly reduces the error: the
-    position error then has another cause.
+    The sentence is "" without a replay. Return None if the change hardly reduces the RMSE, because
+    the position error then has another cause.
     """
     model, truth = analysis.ekf2_model, analysis.flight.truth
     if isinstance(model, Unavailable) or isinstance(truth, Unavailable):
@@ -199,7 +202,7 @@ def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | N
         return ""
     rmses_m = []
     for replay in (model.baseline_replay, *replay_settings(model, [change])):
-        replayed_track = rows_inside(replay.published, replay.evaluated_s)
+        replayed_track = rows_inside(replay.published, replay.find_evaluated_spans())
         axis_errors_m = [
             replayed_track[name]
             - np.interp(replayed_track.index, truth.samples.index, truth.samples[name])
@@ -216,7 +219,7 @@ def detect_two_senders(analysis: Analysis) -> Findings:
     """Detect two senders whose positions alternate."""
     samples = cut_to_segment(analysis.source.samples, analysis.segment)[Columns.POSITION]
     samples = samples.dropna(axis=1, how="all").dropna()
-    window_count, rate_hz = (len(samples) - 2) // WINDOW_SAMPLES, analysis.source.rate_hz
+    window_count, rate_hz = (len(samples) - 2) // WINDOW_SAMPLES, analysis.source.compute_rate_hz()
     if window_count < MIN_WINDOWS:
         return
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
@@ -249,7 +252,7 @@ def detect_two_senders(analysis: Analysis) -> Findings:
 
 
 def detect_copied_estimate(analysis: Analysis) -> Findings:
-    """Detect a source that is EKF2's own position, sent back to the autopilot."""
+    """Detect positions that are EKF2's own position, sent back to the autopilot."""
     source, ekf2, segment = analysis.source, analysis.flight.ekf2, analysis.segment
     if not isinstance(ekf2, Ekf2) or source.alignment is not None or source.origin.reconstructed:
         return

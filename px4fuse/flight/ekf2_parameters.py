@@ -126,6 +126,8 @@ PARAMETER_RANGES = PARAMETERS | _LOGGED_PARAMETERS
 MAGNETIC_FIELD_NOISE_PARAMETERS = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # EKF2_MAG_TYPE without magnetometer
 NO_MAGNETOMETER = 5
+# Bit of EKF2_EV_CTRL that enables the fusion of the yaw of external vision
+YAW_CONTROL_BIT = 8
 # Defaults of PX4 up to v1.13 that differ from the defaults of later releases (ekf2_params.c)
 OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
 # Names of the logged parameters that the results contain
@@ -139,6 +141,7 @@ def effective_settings(
 
     Parameters of aiding sources that are not given are omitted.
     """
+    # aiding sources of one sensor have the same switch, such as position and velocity of GNSS
     used_switches = {fused_aid.switch for fused_aid in (aid, *other_aids)}
     excluded_names = {
         name

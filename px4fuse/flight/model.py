@@ -48,8 +48,8 @@ DataPath = Literal[
 class Origin(Record):
     """Kind of a position source, and the route by which its positions reach the log."""
 
-    # Estimated from the data, which do not contain the device: "vio" sends a changing orientation,
-    # "uwb" only noisy positions, "unknown" only precise positions (kind_without_orientation)
+    # Kind of device, inferred from the data: "vio" sends a changing orientation, "uwb" only noisy
+    # positions, "unknown" only precise positions
     kind: PositionKind
     path: DataPath
     # Aiding source of EKF2 for these positions; None if EKF2 never fuses them
@@ -93,9 +93,8 @@ class Origin(Record):
         """
         return self.kind == "gnss"
 
-    @property
-    def preference_rank(self) -> int:
-        """Rank of this kind of position source if px4fuse selects one; 0 is preferred."""
+    def find_preference_rank(self) -> int:
+        """Return the rank for the automatic choice of a position source; 0 is preferred."""
         return [(origin.aid, origin.path) for origin in ORIGINS].index((self.aid, self.path))
 
 
@@ -106,7 +105,7 @@ ALIGNED = Origin("uwb", "aligned by EKF2", EV_POS)
 LOGGED_BY_EKF2 = Origin("uwb", "kept by EKF2", EV_POS)
 FROM_INNOVATIONS = Origin("uwb", "rebuilt from innovations", EV_POS)
 GNSS = Origin("gnss", "as received", GNSS_POS, is_automatic=False)
-# All origins in order of preference
+# All kinds of position sources, in the order of preference for the analysis
 ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS, GNSS)
 
 
@@ -125,7 +124,7 @@ def with_orientation(origin: Origin, *, is_changing: bool) -> Origin:
 REPEATED_TIMESTAMPS = "most timestamps of the sender are repeated"
 # Clock of timestamps in a ULog that an external sender set and PX4 converted or replaced
 SENDER_CLOCK = "sender timestamps"
-# Replaces all results of an assignment that would show its injected fault to the student
+# Replacement for results that would show a student the injected fault of an assignment
 DIAGNOSIS_WITHHELD = Unavailable(
     "diagnosis",
     "the flight is a student assignment, for which px4fuse shows no diagnosis",
@@ -275,7 +274,7 @@ class LogInfo(Record, omit_defaults=False):
     dropped: Mapping[str, Count] = {}
     # Firmware defaults of the changed EKF2 parameters; ULog only
     parameter_defaults: Mapping[str, int | float] = {}
-    # True if ``px4fuse simulate --assignment`` wrote the log: px4fuse withholds its diagnosis
+    # True for a student assignment (``px4fuse simulate --assignment``): px4fuse hides the faults
     is_assessed: Literal[True] | msgspec.UnsetType = msgspec.UNSET
 
     __repr__ = one_line_repr
@@ -290,7 +289,7 @@ class LogInfo(Record, omit_defaults=False):
         return self.autopilot != "ArduPilot"
 
 
-AxisName = Literal["north", "east", "down"]
+NedAxis = Literal["north", "east", "down"]
 TableOrUnavailable = pd.DataFrame | Unavailable
 # Step functions of flight time by name: values are valid until the next index
 StepFunctions: TypeAlias = "Mapping[str, pd.Series[float]]"
@@ -311,10 +310,10 @@ MIN_NOISE_SAMPLES = 10
 MIN_UWB_NOISE_M = 0.03
 # Maximum rate (Hz) of UWB positions
 MAX_UWB_RATE_HZ = 25.0
-# Minimum time (s) on the ground between two flights: the land detector may report short landings
+# Minimum time (s) on the ground between two flights: shorter landings are detector errors
 MIN_LANDED_S = 5.0
 BODY_AXES = ("forward", "right", "down")
-AXIS_NAMES: tuple[AxisName, AxisName, AxisName] = ("north", "east", "down")
+AXIS_NAMES: tuple[NedAxis, NedAxis, NedAxis] = ("north", "east", "down")
 SOURCE_NAMES: Mapping[PositionKind, str] = {
     "uwb": "UWB",
     "vio": "VIO",
@@ -466,9 +465,8 @@ class PositionTrack:
             for name in names
         }
 
-    @property
-    def rate_hz(self) -> float:
-        """Sample rate (Hz) outside of gaps; NaN for fewer than two samples."""
+    def compute_rate_hz(self) -> float:
+        """Return the sample rate (Hz) outside of gaps; NaN for fewer than two samples."""
         return sample_rate(self.samples)
 
 
@@ -482,7 +480,7 @@ def white_noise_m(position_m: Array) -> float:
 
 
 def kind_without_orientation(samples: pd.DataFrame) -> PositionKind:
-    """Return "uwb" for noisy positions at a low rate, else "unknown".
+    """Infer the kind of a source without orientation: noisy and slow is "uwb", else "unknown".
 
     Motion capture, odometry and other precise systems may also send positions only.
     """
@@ -593,13 +591,12 @@ class FusionRecord:
 
     __repr__ = one_line_repr
 
-    @property
     def stores_latitude(self) -> bool:
-        """True if EKF2 stores the position as latitude and longitude (since v1.16)."""
+        """Return True if EKF2 stores the position as latitude and longitude (since v1.16)."""
         return not np.isfinite(self.delayed["north_m"]).any()
 
     def was_in_state(self, state: str, times_s: Array) -> BoolArray:
-        """Return True for each time at which EKF2 was in one of its logged ``states``."""
+        """Return a mask of the times at which EKF2 reported a condition (key of ``states``)."""
         step_function = self.states.get(state)
         return (
             np.zeros(len(times_s), bool)
@@ -656,7 +653,7 @@ class Ekf2:
     # Columns ``innovation_m`` (measurement minus prediction, opposite to PX4's sign),
     # ``innovation_variance_m2``, ``observation_variance_m2``, ``test_ratio``, ``fused`` and
     # ``rejected`` (1 or 0); NaN if not logged
-    innovations: Mapping[AxisName, TableOrUnavailable]
+    innovations: Mapping[NedAxis, TableOrUnavailable]
     innovation_topics: tuple[str, ...]
     # 1 while EKF2 reports fusion of the external vision components ``horizontal``, ``vertical`` and
     # ``yaw``
@@ -709,7 +706,7 @@ class Truth:
     __repr__ = one_line_repr
 
 
-# Flights are compared by identity (eq=False), because caches use flights as keys
+# Flights are compared by identity (eq=False), because frames have no single truth value of ==
 @dataclass(frozen=True, eq=False)
 class Flight:
     """One recorded flight.

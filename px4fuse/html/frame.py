@@ -18,12 +18,12 @@ class Column:
     Attributes
     ----------
     kind : str
-        "name": click to unfold the row; "full": text that is never cut; "line": text on one line;
-        "rank": text sorted by a number; "ratio": number drawn on an axis.
+        "name": a click unfolds the row; "full": text that is never cut; "line": text on one line;
+        "rank": text that is sorted by a number; "ratio": number that is drawn on an axis.
     group : str
-        Check box that shows the column; "" for a column that is always shown.
+        Check box with which users show or hide the column; "" for a column that is always shown.
     visible_from : str
-        Smallest screen with this column.
+        Smallest screen size on which the column is shown.
     """
 
     title: str
@@ -34,7 +34,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Cell:
-    """Cell of a row, with its sort key ``value`` and a second line ``below``."""
+    """Cell of the table: text, second line ``below``, and sort key ``value``."""
 
     text: str = ""
     value: float | str | None = None
@@ -51,7 +51,7 @@ def number_cell(
     format_value: Callable[[float], str] = "{:.4g}".format,
     text_below: str = "",
 ) -> Cell:
-    """Return a cell sorted by a number; an empty cell if the value is None or not finite."""
+    """Return a cell with a number; empty if the number is None or not finite."""
     if value is None or not math.isfinite(value):
         return Cell()
     return Cell(format_value(value), value, text_below)
@@ -62,9 +62,9 @@ Section = list[Any]
 
 @dataclass(frozen=True)
 class Row:
-    """Row of the table; filters select rows by ``tags``.
+    """Row of the table; drop-down lists filter rows by ``tags``.
 
-    The unfolded row shows ``details`` at the left and ``side_sections`` at the right.
+    After a click, the page shows ``details`` on the left and ``side_sections`` on the right.
     """
 
     cells: tuple[Cell, ...]
@@ -81,38 +81,42 @@ def list_section(title: str, texts: Sequence[str], is_warning: bool = False) -> 
 
 
 def prose_section(title: str, text: str) -> Section:
-    """Return a section with a text that keeps its line breaks."""
+    """Return a section with a text, whose line breaks are kept."""
     return ["prose", title, text]
 
 
-def pairs_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
-    """Return a section with names and values; rows without a value are omitted."""
+def name_value_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
+    """Return a section with pairs (name, value); empty values are omitted."""
     return ["pairs", title, [row for row in rows if row[1]]]
 
 
 def table_section(
     title: str,
-    heads: Sequence[str],
+    column_titles: Sequence[str],
     rows: Sequence[Sequence[str]],
     numeric_columns: Sequence[int] = (),
 ) -> Section:
-    return ["table", title, heads, rows, list(numeric_columns)]
+    return ["table", title, column_titles, rows, list(numeric_columns)]
 
 
 def links_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
     return ["links", title, [row for row in rows if row[1]]]
 
 
-def boxes_section(
+def input_boxes_section(
     title: str,
     student_id: str,
     rows: Sequence[tuple[str, float, float | None, str]],
     other_rows: Sequence[tuple[str, float | None, str]],
 ) -> Section:
-    """Return a section in which the instructor enters points and comments of a student.
+    """Return a section with input boxes, in which an instructor enters points and comments.
 
-    ``rows`` are (item, maximum, points, comment). The page exports them and ``other_rows`` (item,
-    points, comment), which cannot be edited, as CSV.
+    Parameters
+    ----------
+    rows : sequence of (item, maximum, points, comment)
+        Rows with input boxes.
+    other_rows : sequence of (item, points, comment)
+        Rows without input boxes; the page writes all rows to a CSV file.
     """
     return ["boxes", title, student_id, rows, other_rows]
 
@@ -141,14 +145,15 @@ def page(
     row_nouns : (str, str)
         Name of a row, singular and plural.
     filters : sequence of (label, ((tag, text), ...))
+        Drop-down lists that filter rows by a tag.
     groups : sequence of (group, label)
-        Check boxes for groups of columns.
+        Check boxes that show or hide groups of columns.
     placeholder : str
         Hint in the search field.
     full_table_note : str
-        Sentence on the file with all rows, for browsers without scripts.
+        Sentence about the file with all rows, for browsers without scripts.
     ratio_axis : mapping, optional
-        Axis of the ratio columns: ``ends``, ``bands`` and ``marks`` (SVG paths).
+        Axis of the ratio columns: ``ends`` (range), ``bands`` (shaded) and ``marks`` (SVG paths).
     """
     style = "".join(map(read_asset, ("colours.css", "base.css", "frame.css")))
     script = "".join(map(read_asset, ("dom.js", "frame.js")))
@@ -190,7 +195,7 @@ def page(
 
 
 def _compact_cell(cell: Cell) -> list[Any]:
-    # short fields keep the page small: True replaces a sort key that is equal to the text
+    # to keep the page small, True replaces a sort key that equals the text
     value = True if cell.value == cell.text else "" if cell.value is None else cell.value
     cell_fields = [cell.text, value, cell.below, cell.style_class]
     while cell_fields and cell_fields[-1] == "":

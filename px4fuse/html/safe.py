@@ -1,4 +1,4 @@
-"""Escaping of text and numbers from data, so they cannot execute in a web page."""
+"""Escaping of untrusted data, so that they cannot run scripts in a web page."""
 
 import base64
 import hashlib
@@ -15,8 +15,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from px4fuse.core.text import convert_nested
 
 MAX_TEXT_LENGTH = 20_000
-# Control characters except tab and line feed, surrogates, and bidirectional overrides, which would
-# reverse the text after them
+# Control characters except tab and line feed, surrogates, and characters that change the text
+# direction
 HARMFUL_CHARACTERS = re.compile(
     "[\0-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]"
 )
@@ -42,18 +42,18 @@ def clean_values(value: Any, max_length: int = MAX_TEXT_LENGTH) -> Any:
 
 
 def inert_json(value: object) -> str:
-    """Encode as JSON without <, > and &, so that it contains no HTML tags."""
+    """Encode as JSON without the characters <, > and &, so that it cannot contain HTML tags."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
 
 
 def csp_hash(text: str) -> str:
-    """Return the SHA-256 hash of a script or style for the content security policy."""
+    """Return the SHA-256 of a script or style for the Content-Security-Policy of a page."""
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
 def local_link(path: str) -> str:
-    r"""Return a relative path as a URL; "" for an absolute path, which could leave the folder.
+    r"""Convert a relative path to a URL; return "" for an absolute path.
 
     >>> local_link("results/a b.json"), local_link("javascript:alert(1)")
     ('results/a%20b.json', 'javascript%3Aalert%281%29')
@@ -67,7 +67,7 @@ def local_link(path: str) -> str:
 
 @cache
 def load_template(name: str) -> Template:
-    """Load a template that cleans and escapes all inserted text."""
+    """Load a Jinja template that cleans and escapes all inserted text."""
     environment = Environment(
         loader=PackageLoader("px4fuse", ""),
         autoescape=True,

@@ -38,9 +38,9 @@ from px4fuse.request import ComparisonRequest, with_options
 
 SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
-# Fields of Flight in the JSON output of px4fuse info
+# Fields of the class Flight that px4fuse info writes to JSON
 FLIGHT_FIELDS = ("log", "airborne", "clocks", "missing", "unused", "inputs")
-# Labels of the names in Flight.streams
+# Label of each type of data in a log
 DATA_LABELS = {
     "imu": "IMU",
     "attitude": "attitude",
@@ -52,7 +52,7 @@ DATA_LABELS = {
     "truth": "ground truth",
     "airborne": "land detector",
 }
-# Samples that each analysis of px4fuse compare needs
+# Type of samples that an analysis of px4fuse compare requires
 SAMPLES_BY_ANALYSIS = {
     "EKF2 states": "samples of EKF2's position and velocity",
     "EKF2 variances": "samples of EKF2's variances",
@@ -65,7 +65,7 @@ TimeSpans = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class AnalysisOption:
-    """Analysis that px4fuse offers; ``reason`` states its data, or why it is not possible."""
+    """Analysis of a log: data that it uses (``reason``), or reason why it is not possible."""
 
     name: str
     possible: bool
@@ -74,7 +74,7 @@ class AnalysisOption:
 
 @dataclass(frozen=True)
 class LoggingAdvice:
-    """Action before the next flight, and the analyses or data that it makes possible."""
+    """Change before the next flight (``remedy``), and data or analyses that it makes possible."""
 
     remedy: str
     improves: tuple[str, ...]
@@ -82,7 +82,7 @@ class LoggingAdvice:
 
 @dataclass(frozen=True)
 class Gaps:
-    """Sample intervals that are longer than ``limit_s``: number, sum and maximum."""
+    """Sample intervals longer than ``limit_s``: number, sum (s) and maximum (s)."""
 
     count: int
     total_s: float
@@ -91,23 +91,25 @@ class Gaps:
 
 
 @dataclass(frozen=True)
-class Source:
-    """Kind of data in a flight with topics, rate and gaps, or the reason why it is missing.
+class LoggedData:
+    """Data of one type in a log with topics, rate and gaps, or the reason why they are missing.
 
     Attributes
     ----------
     part : str
-        Kind of data: a value of :data:`DATA_LABELS`.
+        Type of data, for example "IMU"; a value of :data:`DATA_LABELS`.
     name : str
-        Name of a position track, or else of the first topic.
+        Name of the position source, or of the first topic.
+    log : str
+        Name of the file that contains the data.
     samples : int or None
         Number of samples; None for the land detector.
     start_s, end_s : float or None
-        Times of the first and last sample, after the first data.
+        Times (s) of the first and last sample since the first data.
     chosen : bool
         True for the position source that ``px4fuse compare`` uses by default.
     unavailable : str
-        Reason why the data are missing; empty if they are available.
+        Reason why the data are missing; "" for available data.
     """
 
     part: str
@@ -135,19 +137,21 @@ class Inventory:
         Flight with the EKF2 innovations of the default position source.
     start_utc : str or None
         UTC of the first data, ISO 8601.
-    sources : tuple of Source
-        All kinds of data in the flight, and all position tracks in order of preference.
+    sources : tuple of LoggedData
+        Data by type. The position sources are in order of preference.
     source_reason : str
-        Reason for the position source that ``px4fuse compare`` uses, or why there is none.
+        Reason for the choice of the position source in ``px4fuse compare``, or why none is used.
     segment : Segment or None
         Time span that ``px4fuse compare`` analyses by default.
     abilities : tuple of AnalysisOption
-        Possible and impossible analyses.
+        Analyses, with the reason if one is not possible.
+    advice : tuple of LoggingAdvice
+        Changes for the next flight.
     """
 
     flight: Flight
     start_utc: str | None
-    sources: tuple[Source, ...]
+    sources: tuple[LoggedData, ...]
     source_reason: str
     segment: Segment | None
     abilities: tuple[AnalysisOption, ...]
@@ -156,7 +160,7 @@ class Inventory:
 
 
 def take_inventory(flight: Flight) -> Inventory:
-    """List the contents of a flight, the possible analyses and the advice on logging."""
+    """List the data in a log, the possible analyses, and changes for the next flight."""
     comparison, reason, position_remedy = None, "", ""
     try:
         comparison = prepare(flight, ComparisonRequest(log=flight.log.name), as_sent=True)
@@ -175,7 +179,7 @@ def take_inventory(flight: Flight) -> Inventory:
     return Inventory(
         flight=flight,
         start_utc=utc_time(log.start_unix_s),
-        sources=tuple(_list_sources(flight, comparison, reason)),
+        sources=tuple(_list_logged_data(flight, comparison, reason)),
         source_reason=reason,
         segment=None if comparison is None else comparison.segment,
         abilities=tuple(_list_analyses(flight, comparison, reason)),
@@ -191,7 +195,7 @@ def take_inventory(flight: Flight) -> Inventory:
 
 
 def to_json_dict(inventory: Inventory) -> dict[str, Any]:
-    """Convert the inventory of a log to JSON types, without unknown values."""
+    """Convert an inventory to dicts and lists for JSON; None and NaN are omitted."""
     inventory_fields = {**vars(inventory)}
     flight: Flight = inventory_fields.pop("flight")
     flight_fields = {name: getattr(flight, name) for name in FLIGHT_FIELDS}
@@ -204,13 +208,13 @@ def to_json_dict(inventory: Inventory) -> dict[str, Any]:
 
 
 def _data_by_stream(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavailable]:
-    """Return all data of a flight except positions, by their names in Flight.streams."""
+    """Return all data of a flight except positions, by the keys of :data:`DATA_LABELS`."""
     ekf2, truth = flight.ekf2, flight.truth
     data_by_stream = {"imu": flight.imu, "attitude": flight.attitude}
     if isinstance(ekf2, Unavailable):
         data_by_stream["ekf2_state"] = ekf2
     else:
-        # innovations along the axis with the most samples
+        # the axis with most innovations
         innovations = max(
             ekf2.innovations.values(),
             key=lambda samples: len(samples) if isinstance(samples, pd.DataFrame) else -1,
@@ -221,15 +225,15 @@ def _data_by_stream(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unav
     return {**data_by_stream, "truth": samples, "airborne": flight.airborne}
 
 
-def _list_sources(
+def _list_logged_data(
     flight: Flight, comparison: PreparedComparison | None, reason: str
-) -> Iterator[Source]:
+) -> Iterator[LoggedData]:
     data_by_stream = _data_by_stream(flight)
     for key, name in DATA_LABELS.items():
         if key in data_by_stream:
-            yield _make_source(name, data_by_stream[key], flight.streams.get(key))
+            yield _make_logged_data(name, data_by_stream[key], flight.streams.get(key))
         for track in flight.positions if key == "position" else ():
-            yield _make_source(
+            yield _make_logged_data(
                 name,
                 track.samples,
                 track,
@@ -238,37 +242,37 @@ def _list_sources(
                 chosen=comparison is not None and track.name == comparison.source.name,
             )
         if key == "position" and not flight.positions:
-            yield Source(name, unavailable=reason)
+            yield LoggedData(name, unavailable=reason)
 
 
-def _make_source(
+def _make_logged_data(
     part: str,
     data: pd.DataFrame | TimeSpans | Unavailable,
     stream: Stream | PositionTrack | None,
-    **source_fields: Any,
-) -> Source:
+    **data_fields: Any,
+) -> LoggedData:
     if isinstance(data, Unavailable):
-        return Source(part, unavailable=data.reason)
+        return LoggedData(part, unavailable=data.reason)
     if stream is not None:
-        source_fields = {"name": stream.topics[0] if stream.topics else "", **source_fields}
-        source_fields |= {"topics": stream.topics, "clock": stream.clock, "log": stream.log}
+        data_fields = {"name": stream.topics[0] if stream.topics else "", **data_fields}
+        data_fields |= {"topics": stream.topics, "clock": stream.clock, "log": stream.log}
     if isinstance(data, pd.DataFrame):
-        source_fields["samples"] = len(data)
+        data_fields["samples"] = len(data)
         times_s = data.index.tolist()
     else:
         times_s = [time_s for span in data for time_s in span]
     if times_s:
-        source_fields |= {"start_s": times_s[0], "end_s": times_s[-1]}
+        data_fields |= {"start_s": times_s[0], "end_s": times_s[-1]}
     if isinstance(data, pd.DataFrame) and len(data) > 1:
-        source_fields |= {
+        data_fields |= {
             "rate_hz": sample_rate(data),
             "gaps": _measure_gaps(data, is_imu=part == DATA_LABELS["imu"]),
         }
-    return Source(part, **source_fields)
+    return LoggedData(part, **data_fields)
 
 
 def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
-    """Measure sample intervals above five median intervals and above 0.1 s (IMU) or 1 s."""
+    """Find sample intervals that are longer than a limit, which differs for IMU and other data."""
     intervals_s = np.diff(samples.index.to_numpy())
     limit_s = (
         max(MIN_IMU_GAP_S, MIN_IMU_GAP_INTERVALS * float(np.median(intervals_s)))
@@ -330,7 +334,7 @@ def _make_analysis_option(name: str, data: object, description: str) -> Analysis
 def _analyses_against_ekf2_and_truth(
     flight: Flight, comparison: PreparedComparison | None
 ) -> Iterator[AnalysisOption]:
-    """Yield the analyses that compare KF with EKF2 and with ground truth."""
+    """Yield the analyses that need EKF2 data or ground truth."""
     data_by_analysis: dict[str, object] = dict.fromkeys(SAMPLES_BY_ANALYSIS, flight.ekf2)
     data_by_analysis["error"] = flight.truth
     if comparison is not None:
@@ -359,9 +363,9 @@ def _analyses_against_ekf2_and_truth(
 def _logging_advice(
     flight: Flight, comparison: PreparedComparison | None, position_remedy: str
 ) -> tuple[LoggingAdvice, ...]:
-    """Collect the actions against faults of the recording and missing data, each action once.
+    """Collect the changes that avoid missing data and recording faults in the next flight.
 
-    ``position_remedy`` is the action if there is no position source.
+    ``position_remedy`` is the change for a log without positions.
     """
     if flight.log.is_assessed:
         return (LoggingAdvice("None", (DIAGNOSIS_WITHHELD.reason,)),)
@@ -377,7 +381,7 @@ def _logging_advice(
     actions_and_purposes += [
         (finding.remedy, finding_title(finding.id)) for finding in findings if finding.remedy
     ]
-    # a MAVLink recording can contain only these data and positions
+    # data that a MAVLink recording can contain, in addition to positions
     mavlink_data = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
     actions_and_purposes += [
         (missing_data.remedy, missing_data.what)

@@ -20,14 +20,14 @@ from px4fuse.flight.model import Ekf2, Flight, PositionTrack, Truth, Unavailable
 
 SCHEMA_NAME = "px4fuse-flight"
 SCHEMA_VERSION = "1.0"
-# Names that replace each placeholder in columns.csv: each name makes one row
+# Names that replace a placeholder in columns.csv: one row of the file gives one row for each name
 PLACEHOLDER_NAMES = {
     "{axis}": ("north", "east", "down"),
     "{body_axis}": ("forward", "right", "down"),
     "{element}": ("w", "x", "y", "z"),
 }
 DICTIONARY_COLUMNS = ["table", "column", "unit", "frame", "meaning", "source_topic", "clock"]
-# Characters of a track name that are replaced in file names: some systems do not allow them
+# Characters that are replaced in file names, because some systems do not allow them
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9_-]+")
 # Maximum length (characters) of a table name, which is a file name
 MAX_TABLE_NAME_LENGTH = 80
@@ -40,7 +40,7 @@ NO_POSITION = Unavailable(
 
 @dataclass(frozen=True)
 class DescribedTable:
-    """Exported table, and the rows of the data dictionary on its columns."""
+    """Exported table with a description of its columns."""
 
     name: str
     data: pd.DataFrame
@@ -64,7 +64,7 @@ def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
 
 
 def data_dictionary(flight: Flight) -> pd.DataFrame:
-    """Return the data dictionary (:data:`DICTIONARY_COLUMNS`), with one row per table column."""
+    """Describe each column of all tables: unit, frame, meaning, topic and clock."""
     descriptions = [table.column_descriptions for table in _described_tables(flight)]
     if not descriptions:
         return pd.DataFrame(columns=DICTIONARY_COLUMNS)
@@ -72,14 +72,14 @@ def data_dictionary(flight: Flight) -> pd.DataFrame:
 
 
 def to_bytes(table: pd.DataFrame, file_format: str) -> bytes:
-    """Encode a table as Parquet or CSV; pandas writes numbers without rounding."""
+    """Encode a table as Parquet or CSV, without rounding of numbers."""
     if file_format == "parquet":
         return table.to_parquet(engine="pyarrow", index=False)
     return table.to_csv(index=False, lineterminator="\n").encode()
 
 
 def list_missing_data(flight: Flight) -> tuple[Unavailable, ...]:
-    """List the data that a flight lacks, with the reasons."""
+    """List the data that are missing in a log, with the reasons."""
     ekf2 = flight.ekf2
     flight_data: list[object] = [flight.imu, flight.attitude, ekf2]
     if isinstance(ekf2, Ekf2):
@@ -92,7 +92,7 @@ def list_missing_data(flight: Flight) -> tuple[Unavailable, ...]:
 
 
 def description(flight: Flight) -> dict[str, Any]:
-    """Return log, topics, clocks and missing data of a flight, in JSON types for flight.json."""
+    """Describe log, topics, clocks and missing data of a flight, for flight.json."""
     ekf2 = flight.ekf2
     description_fields: dict[str, Any] = {
         "schema": {"name": SCHEMA_NAME, "version": SCHEMA_VERSION},
@@ -107,13 +107,13 @@ def description(flight: Flight) -> dict[str, Any]:
         "unused": flight.unused,
         "inputs": flight.inputs,
     }
-    data: dict[str, Any] = to_json_types(description_fields)
-    return data
+    json_description: dict[str, Any] = to_json_types(description_fields)
+    return json_description
 
 
 @cache
 def _read_column_descriptions() -> pd.DataFrame:
-    """Read columns.csv, indexed by table."""
+    """Read the descriptions of all columns (columns.csv), indexed by table name."""
     csv_lines = files("px4fuse.info").joinpath("columns.csv").read_text("utf-8").splitlines()
     for placeholder, names in PLACEHOLDER_NAMES.items():
         csv_lines = [
@@ -131,9 +131,14 @@ def _describe_table(
     name_in_csv: str = "",
     **placeholder_values: str,
 ) -> DescribedTable:
-    """Make a table with the columns that columns.csv lists for ``name_in_csv`` (default ``name``).
+    """Select the columns of a table that columns.csv describes, and add their descriptions.
 
-    ``placeholder_values`` replace the names in braces in columns.csv.
+    Parameters
+    ----------
+    name_in_csv : str
+        Name of the table in columns.csv; by default ``name``.
+    placeholder_values : str
+        Replacements for names in braces in columns.csv.
     """
     tables_in_csv = ["any table"] * ("time_s" in data) + [name_in_csv or name]
     column_descriptions = (
@@ -208,12 +213,12 @@ def _described_tables(flight: Flight) -> Iterator[DescribedTable]:
         )
     if flight.clocks:
         clock_table = pd.DataFrame([structs.asdict(clock) for clock in flight.clocks])
-        # float, because distinct_stamps is NaN for a clock that was mapped
+        # float, because the number of distinct timestamps is NaN for some clocks
         yield _describe_table("clocks", clock_table.astype({"distinct_stamps": np.float64}))
 
 
 def _logged_parameters(flight: Flight) -> dict[str, float]:
-    """Return the logged values of the PX4 parameters for logging and fusion."""
+    """Return the values of the PX4 parameters in the log."""
     logged_values = dict(flight.log.parameters)
     if isinstance(flight.ekf2, Ekf2):
         for record_or_aid in (flight.ekf2.record, *flight.ekf2.aids.values()):
@@ -245,7 +250,7 @@ def _ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
     reset_table["time_s"] = np.array([reset.time_s for reset in ekf2.resets], np.float64)
     reset_table["quantity"] = np.array([reset.quantity for reset in ekf2.resets], object)
     yield _describe_table("resets", reset_table, topics_and_clock)
-    # the start time of the first EKF2 instance is minus infinity in a Flight
+    # the first EKF2 instance of a Flight has the start time minus infinity
     first_time_s = min(float(ekf2.state.index[0]), 0.0)
     instance_rows = [(max(time_s, first_time_s), instance) for time_s, instance in ekf2.instances]
     instance_table = _numeric_table(["time_s", "instance"], instance_rows).astype(
@@ -255,10 +260,10 @@ def _ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
 
 
 def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
-    """Yield each position track with a table name that is unique even in lower case."""
+    """Yield each position track with a table name, which is also unique in lower case."""
     used_names: set[str] = set()
     for track in flight.positions:
-        # the prefix avoids names that Windows reserves (con, aux, ...)
+        # a name with this prefix is never reserved on Windows (con, aux, ...)
         stem = _UNSAFE_CHARACTERS.sub("_", f"position_{track.name}")[:MAX_TABLE_NAME_LENGTH].rstrip(
             "_"
         )

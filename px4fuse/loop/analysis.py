@@ -43,7 +43,7 @@ def analyse(
     reference: Trajectory | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Loop:
-    """Measure and correct the loop of a trajectory or of a flight.
+    """Compute the loop closure error of a trajectory or flight, and correct the path.
 
     Parameters
     ----------
@@ -81,8 +81,10 @@ def analyse(
         truth_end = loop_segment.read_end_from_truth(path, truth, segment, rests_at_ends)
     true_end = _find_true_end(path, request, truth_end, segment, is_assessed=is_assessed)
     given_closures = [
-        GivenClosure(to_track_time(c.time_1_s), to_track_time(c.time_2_s), c.sigma_m)
-        for c in request.closures
+        GivenClosure(
+            to_track_time(closure.time_1_s), to_track_time(closure.time_2_s), closure.sigma_m
+        )
+        for closure in request.closures
     ]
     for closure in given_closures:
         _require_valid_closure(closure, path)
@@ -105,11 +107,11 @@ def analyse(
         path, node_indices, graph, gated_closures, progress
     )
     end_from_start_m = path.position_m[-1] - path.position_m[0]
-    heading_deg = loop_segment.heading_change_deg(path)
+    odometry_heading_change_deg = loop_segment.heading_change_deg(path)
     misclosure_m = (
         true_end if isinstance(true_end, Unavailable) else end_from_start_m - true_end.displacement
     )
-    heading_error_deg = _compute_heading_error(true_end, heading_deg)
+    heading_error_deg = _compute_heading_error(true_end, odometry_heading_change_deg)
     landing_closure = next((c for c in gated_closures if c.source == LANDING_CLOSURE_SOURCE), None)
     distance_corrections = correct_paths_by_distance(
         path, distance_m, misclosure_m, heading_error_deg, landing_closure
@@ -132,7 +134,7 @@ def analyse(
         key_frame_spacing_m=spacing_m,
         path_length_m=float(distance_m[-1]),
         end_from_start_m=components_by_axis(path.frame, end_from_start_m),
-        heading_change_deg=heading_deg,
+        heading_change_deg=odometry_heading_change_deg,
         true_end=true_end,
         closure_error_m=closure_error_m,
         closure_percent=closure_percent,
@@ -199,7 +201,7 @@ def _is_drift_free(trajectory: Trajectory, flight: Flight) -> bool:
 
 
 def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
-    """Return the indices of the key frames, and the distance (m) along them at each pose."""
+    """Return the indices of the key frames, and the path length (m) along them at each pose."""
     _require_in_range("key_frames_m", spacing_m, 1e-3)
     key_frame_indices = choose_key_frames(path.position_m, spacing_m)
     distance_m = cumulative_distance(path.position_m[key_frame_indices])

@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from px4fuse.core.arrays import Array, IntArray
+from px4fuse.core.arrays import Array, IntArray, cumulative_sums
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.model import NED_COMPONENTS, Frame, Trajectory, cumulative_distance
 
 DOWN_DIRECTION = np.array([0.0, 0.0, 1.0])
-# Conversions to z down by frame: key of NED_COMPONENTS (in FRD, forward and right replace north and
-# east), new frame, and note to the user
+# Conversion of each frame to z down: key of NED_COMPONENTS, new frame, and note to the user
 _Z_DOWN_CONVERSIONS: dict[Frame, tuple[str, Frame, str]] = {
     "ENU": ("enu", "NED", "the axes were converted from east, north, up to north, east, down"),
     "camera": (
@@ -106,7 +105,7 @@ def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
 def distribute_by_distance(
     position_m: Array, misclosure_m: Array, cumulative_distance_m: Array | None = None
 ) -> Array:
-    """Subtract a part of the loop closure error from each position, in proportion to the distance.
+    """Subtract a part of the loop closure error from each position, in proportion to path length.
 
     ``misclosure_m`` is the final position minus the true final position. The method is the compass
     rule of surveying (Bowditch 1808; UAT 366 module 2, Example 2).
@@ -134,8 +133,8 @@ def correct_by_distance(
 ) -> Trajectory:
     """Distribute the loop closure errors of position and heading in proportion to the distance.
 
-    The errors are final minus true final values. Orientations, and displacements between poses, are
-    rotated about the vertical; then :func:`distribute_by_distance` corrects the position error.
+    The errors are final minus true final values. First, orientations and displacements between
+    poses are rotated about the vertical. Then the remaining position error is distributed.
     """
     position_m = trajectory.position_m
     distance_fraction = cumulative_distance_m / cumulative_distance_m[-1]
@@ -146,8 +145,8 @@ def correct_by_distance(
     middle_rotation = Rotation.from_rotvec(
         np.outer(-middle_fraction * misclosure_heading_rad, DOWN_DIRECTION)
     )
-    rotated_position_m = position_m[0] + np.concatenate(
-        [np.zeros((1, 3)), np.cumsum(middle_rotation.apply(np.diff(position_m, axis=0)), axis=0)]
+    rotated_position_m = position_m[0] + cumulative_sums(
+        middle_rotation.apply(np.diff(position_m, axis=0))
     )
     remaining_error_m = rotated_position_m[-1] - (position_m[-1] - misclosure_m)
     return trajectory.with_positions(

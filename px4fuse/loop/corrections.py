@@ -38,7 +38,7 @@ MIN_VARIANCE_GROWTH = 2.0
 # Minimum variance of an odometry edge, as fraction of the default variance: avoids a division by 0
 MIN_VARIANCE_FRACTION = 1e-2
 # Fraction of the poses at each end of the path for the median of the reported variance
-END_FRACTION = 0.1
+END_POSES_FRACTION = 0.1
 # Loop closure, and the true final pose if the closure connects take-off and landing (else None)
 ClosureAndLanding = tuple[GivenClosure, TrueEnd | None]
 
@@ -75,7 +75,7 @@ def odometry_variances(
     tilt_rad2 = noise.tilt_share**2 * heading_rad2
     rotation_rad2 = np.column_stack([tilt_rad2, tilt_rad2, heading_rad2])
     drift_origin = "default" if noise == OdometryNoise() else "from options"
-    origin_texts = [
+    variance_sources = [
         f"the odometry drift after 100 m is {noise.position_m:g} m in position and "
         f"{noise.heading_deg:g}° in heading (1 σ, {drift_origin})"
     ]
@@ -84,20 +84,20 @@ def odometry_variances(
         translation_m2 = np.maximum(
             position_growth.mean(axis=1), MIN_VARIANCE_FRACTION * translation_m2
         )
-        origin_texts.append(
+        variance_sources.append(
             "the translation variances of the odometry are computed from the increase of the "
             "logged position variances"
         )
     elif path.position_variance_m2 is not None:
-        origin_texts.append("the logged position variances do not grow, so they are not used")
+        variance_sources.append("the logged position variances do not grow, so they are not used")
     rotation_growth = _variance_growth(path.rotation_variance_rad2, node_indices)
     if rotation_growth is not None:
         rotation_rad2 = np.maximum(rotation_growth, MIN_VARIANCE_FRACTION * rotation_rad2)
-        origin_texts.append(
+        variance_sources.append(
             "the rotation variances of the odometry are computed from the increase of the logged "
             "orientation variances"
         )
-    return translation_m2, rotation_rad2, "; ".join(origin_texts)
+    return translation_m2, rotation_rad2, "; ".join(variance_sources)
 
 
 def _variance_growth(variance: Array | None, node_indices: IntArray) -> Array | None:
@@ -107,7 +107,7 @@ def _variance_growth(variance: Array | None, node_indices: IntArray) -> Array | 
     """
     if variance is None:
         return None
-    end_sample_count = max(1, int(END_FRACTION * len(variance)))
+    end_sample_count = max(1, int(END_POSES_FRACTION * len(variance)))
     start_variance_sum = float(np.median(variance[:end_sample_count].sum(axis=1)))
     end_variance_sum = float(np.median(variance[-end_sample_count:].sum(axis=1)))
     if not end_variance_sum > MIN_VARIANCE_GROWTH * start_variance_sum:
@@ -190,8 +190,8 @@ def build_pose_graph(
         dimension=3,
         ids=np.arange(len(node_indices)),
         poses=np.column_stack([node_position_m, node_rotation.as_quat()]),
-        first=first_nodes,
-        second=second_nodes,
+        first_nodes=first_nodes,
+        second_nodes=second_nodes,
         measurements=np.column_stack(
             [translation_measured, (first_inverse * second_rotation).as_quat()]
         ),
@@ -229,7 +229,7 @@ def correct_paths_by_distance(
 ) -> dict[CorrectionName, CorrectionOutcome]:
     """Distribute the loop closure error over positions only, and over positions and headings."""
     if landing_closure is not None and not landing_closure.accepted:
-        misclosure_m = _unavailable_by_gate("distribution of the closure error", landing_closure)
+        misclosure_m = _rejected_by_gate("distribution of the closure error", landing_closure)
     if isinstance(misclosure_m, Unavailable):
         return {"by_distance_plain": misclosure_m, "by_distance": misclosure_m}
     corrected_position_m = distribute_by_distance(path.position_m, misclosure_m, distance_m)
@@ -243,7 +243,7 @@ def correct_paths_by_distance(
     }
 
 
-def _unavailable_by_gate(correction_name: str, closure: Closure) -> Unavailable:
+def _rejected_by_gate(correction_name: str, closure: Closure) -> Unavailable:
     return Unavailable(
         correction_name,
         f"the gate rejects {closure} (squared Mahalanobis distance {closure.d2:.1f}, "
@@ -259,7 +259,9 @@ def gate_closures(
     """Test the loop closures, which are the last edges of the graph, against odometry."""
     if isinstance(graph, Unavailable):
         return ()
-    closure_edges = np.arange(len(graph.first) - len(closures_and_landings), len(graph.first))
+    closure_edges = np.arange(
+        len(graph.first_nodes) - len(closures_and_landings), len(graph.first_nodes)
+    )
     closures = []
     for gate_result, (closure, true_end) in zip(
         gate_edges(graph, closure_edges), closures_and_landings, strict=True
@@ -287,7 +289,7 @@ def solve_pose_graphs(
     closures: tuple[Closure, ...],
     progress: Callable[[str], None],
 ) -> tuple[dict[CorrectionName, CorrectionOutcome], tuple[Closure, ...]]:
-    """Optimise the pose graph with all closures, with closures that pass the gate, and robustly.
+    """Optimise the pose graph with all closures, with accepted closures only, and robustly.
 
     Return the corrected paths, and the closures with their weights from robust optimisation.
     """
@@ -301,7 +303,7 @@ def solve_pose_graphs(
     if isinstance(graph, Unavailable):
         corrections = {f"pose_graph_{solution_name}": graph for solution_name in SOLUTIONS}
         return corrections, ()
-    edge_indices = np.arange(len(graph.first))
+    edge_indices = np.arange(len(graph.first_nodes))
     is_closure = edge_indices >= len(edge_indices) - len(closures)
     is_rejected = np.zeros(len(edge_indices), bool)
     is_rejected[is_closure] = [not closure.accepted for closure in closures]
@@ -315,7 +317,7 @@ def solve_pose_graphs(
                 label, SINGLE_CLOSURE_REASON, "Give more loop closures with --closure."
             )
         elif is_gated and is_rejected[is_closure].all():
-            corrections[name] = _unavailable_by_gate("pose graph", closures[0])
+            corrections[name] = _rejected_by_gate("pose graph", closures[0])
         elif is_gated and not is_rejected.any():
             corrections[name] = corrections["pose_graph_all"]
         else:
@@ -369,7 +371,7 @@ def score_paths(
     """Compute ATE and RPE of odometry and corrected paths, all with the odometry's time offset."""
     offset_by_reference: dict[str, float] = {}
 
-    def score(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:
+    def evaluate_path(path: Trajectory, reference: Trajectory) -> Evaluation | Unavailable:
         default_offset_s = 0.0 if reference.sha256 == path.sha256 else None
         offset_s = offset_by_reference.get(reference.name, default_offset_s)
         try:
@@ -394,7 +396,7 @@ def score_paths(
             trajectory=path,
             correction_max_m=float(displacement_m.max()),
             correction_rms_m=float(np.sqrt(np.mean(displacement_m**2))),
-            scores={reference.name: score(path, reference) for reference in references},
+            scores={reference.name: evaluate_path(path, reference) for reference in references},
             solution=solution,
             **solution_fields,
         )

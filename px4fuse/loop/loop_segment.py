@@ -25,7 +25,7 @@ MAX_SAME_HEADING_DEG = 15.0
 def cut_trajectory(
     trajectory: Trajectory, segment: Segment, rests_at_ends: bool = False
 ) -> Trajectory:
-    """Cut a trajectory to a segment.
+    """Return the part of a trajectory in a time segment.
 
     If ``rests_at_ends``, the first and last pose are averages over REST_TIME_S on the ground.
 

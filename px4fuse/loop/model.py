@@ -80,7 +80,7 @@ class OdometryNoise(Record, omit_defaults=False):
     # Random walk over time (m/√s, °/√s), also while hovering
     position_m_per_root_s: NotNegative = 0.01
     heading_deg_per_root_s: NotNegative = 0.03
-    # Drift of roll and pitch over drift of heading; small, because gravity shows roll and pitch
+    # Ratio of the drifts of tilt and heading; small, because gravity corrects the tilt
     tilt_share: NotNegative = 0.1
 
 
@@ -94,7 +94,7 @@ class Closure(Record, kw_only=True):
     sigma_m: NotNegative
     # "landing": closure between take-off and landing; "given": closure from ``--closure``
     source: str
-    # Closure error: displacement from odometry minus true displacement
+    # Length of the closure error: displacement by odometry minus true displacement
     distance_m: NotNegative
     # χ² gate: squared Mahalanobis distance, degrees of freedom, p-value, True for acceptance
     d2: NotNegative
@@ -175,30 +175,28 @@ class Loop(Record, kw_only=True):
     @property
     def odometry(self) -> CorrectedPath:
         """Odometry from take-off to landing, without correction, in a frame with z down."""
-        return self.paths["uncorrected"]
+        return self.find_paths()["uncorrected"]
 
-    @property
-    def paths(self) -> dict[CorrectionName, CorrectedPath]:
-        """Available paths by name, with the odometry first."""
+    def find_paths(self) -> dict[CorrectionName, CorrectedPath]:
+        """Return the available paths by name, with the odometry first."""
         return {
             name: path for name, path in self.corrections.items() if isinstance(path, CorrectedPath)
         }
 
-    @property
-    def reported_paths(self) -> tuple[CorrectedPath, ...]:
-        """Available paths, except paths that are equal to another one by definition."""
+    def select_reported_paths(self) -> tuple[CorrectedPath, ...]:
+        """Return the paths that differ: without rejected closures, for example, two are equal."""
         duplicates: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
             duplicates.add("pose_graph_all")
         if isinstance(self.heading_error_deg, Unavailable):
             duplicates.add("by_distance")
-        return tuple(path for name, path in self.paths.items() if name not in duplicates)
+        return tuple(path for name, path in self.find_paths().items() if name not in duplicates)
 
-    @property
-    def best(self) -> CorrectedPath:
-        """First available path of: gated pose graph, distributed closure error, odometry."""
+    def choose_best_path(self) -> CorrectedPath:
+        """Return the best path: gated pose graph, else distributed closure error, else odometry."""
         names: tuple[CorrectionName, ...] = ("pose_graph_gated", "by_distance", "uncorrected")
-        return next(self.paths[name] for name in names if name in self.paths)
+        paths = self.find_paths()
+        return next(paths[name] for name in names if name in paths)
 
     @property
     def is_end_assumed(self) -> bool:
@@ -215,6 +213,7 @@ class Loop(Record, kw_only=True):
         """
         if isinstance(self.graph, Unavailable):
             raise MissingDataError(f"{self.graph.what}: {self.graph.reason}.")
-        graph_path = self.paths.get("pose_graph_gated") or self.paths.get("pose_graph_all")
+        paths = self.find_paths()
+        graph_path = paths.get("pose_graph_gated") or paths.get("pose_graph_all")
         solution = None if graph_path is None else graph_path.solution
         return self.graph if solution is None else replace(self.graph, poses=solution.poses)

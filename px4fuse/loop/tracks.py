@@ -181,14 +181,14 @@ def _complete_variances(samples: pd.DataFrame, columns: list[str]) -> Array | No
 
 @dataclass(frozen=True)
 class LoopSource:
-    """Trajectory, with the flight from whose log the trajectory is read; None for a file."""
+    """Trajectory, and the flight if the trajectory was read from a flight log."""
 
     trajectory: Trajectory
     flight: Flight | None
 
 
 def file_name(source: Path) -> str:
-    """Return the start of output file names, such as ``flight_vio`` for ``flight.ulg:vio``."""
+    """Return the stem of output file names, such as ``flight_vio`` for ``flight.ulg:vio``."""
     path, track_name = split_path_and_part(str(source))
     return "_".join([path.stem, *(track_name or "").split("/")]).rstrip("_")
 

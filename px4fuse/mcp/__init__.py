@@ -1,1 +1,1 @@
-"""Model Context Protocol server (``px4fuse mcp``), with which assistants call px4fuse."""
+"""Model Context Protocol server (``px4fuse mcp``), so that AI assistants can call px4fuse."""

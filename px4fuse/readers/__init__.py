@@ -7,7 +7,7 @@ from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import Flight
 from px4fuse.readers.text_table import refuse_foreign_format
 
-# Number of bytes at the start of a file that identify its format
+# Number of bytes at the start of a file that are read to detect its format
 _FORMAT_BYTES = 100
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
 # Text files that users give instead of a flight log: suffixes, kind of file and advice
@@ -56,10 +56,10 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
 
         return read_ulog(name, read_log_bytes(path))
     refuse_foreign_format(path, first_bytes, LogError)
-    for suffixes, (file_kind, remedy) in _TEXT_FILES.items():
+    for suffixes, (file_kind, advice) in _TEXT_FILES.items():
         if path.suffix.lower() in suffixes and first_bytes.isascii():
             raise LogError(
-                f"{name}: the file is a {file_kind}, not a flight log", remedy.format(name=name)
+                f"{name}: the file is a {file_kind}, not a flight log", advice.format(name=name)
             )
     from px4fuse.readers.mavlink import read_mavlink  # noqa: PLC0415
 

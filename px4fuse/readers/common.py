@@ -1,4 +1,4 @@
-"""Utilities of all readers: valid rows, time intervals, missing data."""
+"""Functions for all log readers: valid samples, time intervals, missing data."""
 
 import numpy as np
 import pandas as pd
@@ -12,21 +12,25 @@ MAX_VALID_VALUE = 1e9
 # Maximum absolute value (m/s², rad/s) of valid IMU data: above the range of accelerometers (400 g)
 # and gyros (4000 °/s)
 MAX_IMU_VALUE = 1e4
-# Minimum distance (m) from the neighbours to reject a position 0, 0, 0 as a placeholder: 3 σ of
-# accurate UWB (0.1 m)
+# A position 0, 0, 0 is rejected if it is farther than this distance (m) from the previous and the
+# next position: 3 σ of accurate UWB (0.1 m)
 MIN_ZERO_DISTANCE_M = 0.3
-# Minimum distance (m) from the median position to reject a position as damaged
+# A position is rejected as damaged if it is farther than this distance (m) from the median position
 MIN_FAR_DISTANCE_M = 1e4
-# The same minimum distance, as multiple of the median distance of all positions
+# The distance of a damaged position from the median position also exceeds this multiple of the
+# median distance
 MIN_FAR_DISTANCE_RATIO = 100.0
-# Minimum duration (s) of frozen positions, which are not measured: sources that send each position
-# several times repeat it for a shorter time
-MIN_HELD_S = 1.0
-# Minimum number of successive equal positions that are frozen
-MIN_HELD_COUNT = 5
-# Maximum fraction of frozen positions to reject them: with more, the vehicle may be at rest
-MAX_HELD_FRACTION = 0.5
-# Tolerance, in rounding steps, for a coordinate difference that is a whole number of steps
+# Equal positions are rejected as frozen if they last at least this time (s): some sources send each
+# position several times within a shorter time
+MIN_FROZEN_S = 1.0
+# Minimum number of successive equal positions that are rejected as frozen
+MIN_FROZEN_COUNT = 5
+# If a larger fraction of the positions is frozen, none is rejected: the vehicle may be at rest
+MAX_FROZEN_FRACTION = 0.5
+# Maximum probability that a source which repeats positions at random has a run of equal positions
+# that is rejected as frozen
+MAX_RANDOM_RUN_PROBABILITY = 0.01
+# Maximum distance of a coordinate difference from a whole number of rounding steps, in steps
 MAX_STEP_ERROR = 0.01
 # Minimum norm of a valid quaternion: senders without attitude send zeros
 MIN_QUATERNION_NORM = 0.5
@@ -41,7 +45,7 @@ def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
 
 
 def flight_spans(landed: pd.Series, duration_s: float) -> Spans:
-    """Return the intervals (s) in flight, in which ``landed`` is 0 or False."""
+    """Return start and end (s) of each flight: the intervals in which ``landed`` is 0 or False."""
     landed_changes = landed[landed.ne(landed.shift())]
     start_times_s = np.maximum.accumulate(np.maximum(landed_changes.index.to_numpy(), 0.0)).tolist()
     spans = zip(start_times_s, [*start_times_s[1:], duration_s], landed_changes, strict=False)
@@ -49,37 +53,33 @@ def flight_spans(landed: pd.Series, duration_s: float) -> Spans:
 
 
 def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:
-    """Return True if the last interval in flight lasts until the end of the data."""
+    """Return True if the vehicle is still in flight at the end of the data."""
     return not isinstance(airborne, Unavailable) and any(
         end_s >= duration_s for _, end_s in airborne
     )
 
 
 def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
-    """Return a note on a file that ends within a ``unit`` ("frame" or "message")."""
+    """Return a note that the file ends in the middle of a ``unit``: a "frame" or "message"."""
     return (
         f"the file ends within a {unit} after {duration_s:.1f} s{', in flight' * in_flight}; later "
         "data are missing"
     )
 
 
-# Maximum probability that a source with random repetitions has a run that counts as lost tracking
-MAX_RANDOM_RUN_PROBABILITY = 0.01
-
-
 def finite_rows(
     samples: pd.DataFrame, columns: list[str], limit: float = MAX_VALID_VALUE
 ) -> pd.DataFrame:
-    """Return the rows in which all ``columns`` are finite and absolutely smaller than ``limit``."""
+    """Return the rows in which the absolute values of all ``columns`` are below ``limit``."""
     is_valid: BoolArray = (np.abs(samples[columns].to_numpy()) < limit).all(axis=1)
     return samples[is_valid]
 
 
 def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
-    """Return the reason for each row that is not a measurement, and "" for all others.
+    """Return for each position the reason why it is not a measurement, or "" if it is.
 
-    "NaN": a coordinate is not finite. "zero": 0, 0, 0 is sent instead of a position. "far": the
-    position is damaged. "held": the last position is sent again.
+    "NaN": a coordinate is not finite. "zero": the source sent 0, 0, 0 instead of a position. "far":
+    the position is damaged. "held": the source sent its last position again.
     """
     values, time_s = samples[columns].to_numpy(), samples.index.to_numpy()
     reasons = pd.Series("", index=samples.index)
@@ -103,18 +103,20 @@ def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[s
         valid_rows = valid_rows[~is_far]
     is_repeated = np.all(np.diff(values[valid_rows], axis=0) == 0.0, axis=1)
     run_starts = np.flatnonzero(np.append(True, ~is_repeated))
-    # longest run that is likely in a source that repeats positions at random
+    # Longest run of equal positions that is likely if the source repeats positions at random
     repeated_fraction = np.clip(np.mean(is_repeated), 1e-6, 1.0 - 1e-6) if len(is_repeated) else 0.5
-    random_count = np.log(max(len(valid_rows), 1) / MAX_RANDOM_RUN_PROBABILITY) / -np.log(
+    random_run_length = np.log(max(len(valid_rows), 1) / MAX_RANDOM_RUN_PROBABILITY) / -np.log(
         repeated_fraction
     )
-    held_rows = [
+    frozen_rows = [
         valid_rows[run_start + 1 : run_end]
         for run_start, run_end in zip(run_starts, [*run_starts[1:], len(valid_rows)], strict=True)
-        if run_end - run_start >= max(MIN_HELD_COUNT, random_count)
-        and np.ptp(time_s[valid_rows[run_start:run_end]]) >= MIN_HELD_S
+        if run_end - run_start >= max(MIN_FROZEN_COUNT, random_run_length)
+        and np.ptp(time_s[valid_rows[run_start:run_end]]) >= MIN_FROZEN_S
     ]
-    if held_rows and len(rows := np.concatenate(held_rows)) < MAX_HELD_FRACTION * len(valid_rows):
+    if frozen_rows and len(rows := np.concatenate(frozen_rows)) < MAX_FROZEN_FRACTION * len(
+        valid_rows
+    ):
         reasons.iloc[rows] = "held"
     return reasons
 
@@ -131,14 +133,17 @@ def rounding_step(values: Array) -> float:
 
 
 def interpolate_inside(time_s: pd.Index | Array, values: "pd.Series[float]") -> Array:
-    """Interpolate a time series at times; NaN outside its time span."""
+    """Interpolate a time series at the times ``time_s``; NaN outside its time span."""
     return np.asarray(np.interp(time_s, values.index, values, left=np.nan, right=np.nan))
 
 
 def join_nearest(
     samples: pd.DataFrame, other_samples: pd.DataFrame, tolerance_s: float
 ) -> pd.DataFrame:
-    """Join each row with the nearest row in time of ``other_samples``; NaN beyond the tolerance."""
+    """Join each sample with the sample of ``other_samples`` that is nearest in time.
+
+    The joined columns are NaN if the time difference exceeds the tolerance.
+    """
     return pd.merge_asof(
         samples,
         other_samples,

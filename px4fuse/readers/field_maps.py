@@ -1,6 +1,6 @@
-"""Maps from message fields to DataFrame columns, as two TOML files define them.
+"""Conversion of message fields to DataFrame columns.
 
-The files are ``px4_topics.toml`` (PX4 topics) and ``mavlink_messages.toml`` (MAVLink messages).
+``px4_topics.toml`` (PX4 topics) and ``mavlink_messages.toml`` (MAVLink messages) define it.
 """
 
 import re
@@ -19,36 +19,36 @@ MAX_FIELD_VALUE = 1e17
 
 @dataclass(frozen=True)
 class Layout:
-    """Fields of a topic or message, and the DataFrame columns to which they are converted."""
+    """Fields of a PX4 topic or MAVLink message, and the DataFrame columns that they become."""
 
-    # PX4 topic or MAVLink message; empty if the table row has another key for it
+    # PX4 topic or MAVLink message; if empty, the name of the position source is the topic
     topic: str = ""
-    # Required fields, by column; ``name[i]`` is an array element
+    # Required field of each column; ``name[i]`` is an array element
     columns: Mapping[str, str] = field(default_factory=dict)
-    # Optional fields, by column; none for MAVLink messages, which contain all their fields
+    # Optional field of each column; only for PX4 topics, because MAVLink messages have all fields
     optional: Mapping[str, str] = field(default_factory=dict)
-    # Factor from field value to column value, by column; 1 if absent
+    # Factor of each column, by which the field is multiplied; 1 if absent
     scale: Mapping[str, float] = field(default_factory=dict)
 
 
-def expand_layouts(rows: Mapping[str, Any]) -> dict[str, Layout]:
-    """Return a :class:`Layout` for each table row, with all column names in full."""
+def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, Layout]:
+    """Convert TOML tables to layouts in which each column has its own field."""
     return {
         name: replace(
-            row,
-            columns=expand_columns(row.columns),
-            optional=expand_columns(row.optional),
-            scale=expand_columns(row.scale),
+            layout,
+            columns=expand_columns(layout.columns),
+            optional=expand_columns(layout.optional),
+            scale=expand_columns(layout.scale),
         )
-        for name, row in msgspec.convert(rows, dict[str, Layout]).items()
+        for name, layout in msgspec.convert(toml_tables, dict[str, Layout]).items()
     }
 
 
 def expand_columns(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Expand groups of columns to one entry per column.
+    """Assign a message field, or a number, to each DataFrame column.
 
-    A key is a list in :class:`Columns`, or names separated by blanks. A value is a number for all
-    columns, field names, an array ``q[]``, or elements of an array ``covariance[0 6]``.
+    A key of ``fields`` contains column names, or the name of a list in :class:`Columns`. A value
+    contains field names, an array ``q[]``, array elements ``covariance[0 6]``, or one number.
 
     Examples
     --------

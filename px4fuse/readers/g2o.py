@@ -21,7 +21,7 @@ _COUNTS_BY_TAG = {
     "EDGE_SE2": (2, 3 + 6),
     "EDGE_SE3:QUAT": (2, 7 + 21),
 }
-# Tags of lines that are skipped, or prefixes of these tags: laser scans and parameters
+# Lines whose tag begins with one of these words are ignored: parameters and laser scans
 _SKIPPED_TAGS = ("PARAMS", "ROBOTLASER", "RAWLASER", "FLASER", "RLASER")
 _FORMAT_REMEDY = (
     "Give poses as VERTEX_SE2 or VERTEX_SE3:QUAT, and edges as EDGE_SE2 or EDGE_SE3:QUAT. Remove "
@@ -30,19 +30,20 @@ _FORMAT_REMEDY = (
 _VERTEX_ID = re.compile("[+-]?[0-9]{1,19}")
 # Maximum vertex id: GTSAM writes 64-bit symbols, such as 6989586621679009792 for a0
 _MAX_VERTEX_ID = 2**63 - 1
-# Maximum ratio of a negative eigenvalue of an information matrix to its largest eigenvalue, due to
-# rounding of the printed digits
+# A negative eigenvalue of an information matrix is accepted as a rounding error if its ratio to the
+# largest eigenvalue is below this limit
 _EIGENVALUE_TOLERANCE = 1e-9
-# Minimum and maximum valid entry (1/m², 1/rad²) of an information matrix: products of two
-# entries neither overflow nor become zero
+# Minimum and maximum valid element (1/m², 1/rad²) of an information matrix: the product of two
+# elements neither overflows nor becomes zero
 _MIN_INFORMATION, _MAX_INFORMATION = 1e-50, 1e50
 
 
 def read_g2o(path: str | Path) -> PoseGraph:
-    """Read a pose graph; without vertices in the file, the edges initialise the poses.
+    """Read a pose graph from a g2o file.
 
-    VERTEX_SE2, EDGE_SE2, VERTEX_SE3:QUAT and EDGE_SE3:QUAT are read. FIX is ignored, because
-    px4fuse always fixes the first pose.
+    If the file contains no vertices, the initial poses are computed from the edges. VERTEX_SE2,
+    EDGE_SE2, VERTEX_SE3:QUAT and EDGE_SE3:QUAT are read. FIX is ignored, because px4fuse always
+    fixes the first pose.
 
     Raises
     ------
@@ -58,24 +59,24 @@ def read_g2o(path: str | Path) -> PoseGraph:
 
 
 def parse_g2o(text: str, name: str) -> PoseGraph:
-    """Parse the text of a g2o file with the file name ``name``."""
+    """Parse the text of a g2o file. ``name`` is the file name, for error messages."""
     rows_by_tag = _rows_by_tag(text, name)
     is_in_plane = any(rows.lines for tag, rows in rows_by_tag.items() if tag.endswith("SE2"))
-    dimension, tag_kind, pose_width = (2, "SE2", 3) if is_in_plane else (3, "SE3:QUAT", 7)
+    dimension, pose_type, pose_width = (2, "SE2", 3) if is_in_plane else (3, "SE3:QUAT", 7)
     for tag, rows in rows_by_tag.items():
-        if rows.lines and not tag.endswith(tag_kind):
+        if rows.lines and not tag.endswith(pose_type):
             fault = "the file contains SE2 and SE3 poses"
             raise rows.row_error(0, fault, "Use only SE2 or only SE3.")
-    vertices = rows_by_tag[f"VERTEX_{tag_kind}"]
-    edges = rows_by_tag[f"EDGE_{tag_kind}"]
+    vertices = rows_by_tag[f"VERTEX_{pose_type}"]
+    edges = rows_by_tag[f"EDGE_{pose_type}"]
     if not edges.lines:
         raise TrajectoryError(f"{name} contains no edges", _FORMAT_REMEDY)
-    edge_vertex_ids, edge_values = _parse_rows(edges, f"EDGE_{tag_kind}")
+    edge_vertex_ids, edge_values = _parse_rows(edges, f"EDGE_{pose_type}")
     ids = np.unique(edge_vertex_ids)
     poses = np.zeros((len(ids), pose_width))
     poses[:, 6:] = 1.0  # the identity rotation has w = 1
     if vertices.lines:
-        vertex_ids, poses = _parse_rows(vertices, f"VERTEX_{tag_kind}")
+        vertex_ids, poses = _parse_rows(vertices, f"VERTEX_{pose_type}")
         id_order = np.argsort(vertex_ids[:, 0], kind="stable")
         ids = vertex_ids[id_order, 0]
         poses = _normalise_quaternions(vertices, poses)[id_order]
@@ -99,8 +100,8 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         dimension=dimension,
         ids=ids,
         poses=poses,
-        first=vertex_index[:, 0],
-        second=vertex_index[:, 1],
+        first_nodes=vertex_index[:, 0],
+        second_nodes=vertex_index[:, 1],
         measurements=_normalise_quaternions(edges, edge_values[:, :pose_width]),
         information=_information_matrices(
             edges, edge_values[:, pose_width:], 3 if dimension == 2 else 6
@@ -114,24 +115,25 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
 
 
 def g2o_text(graph: PoseGraph) -> str:
-    """Return the pose graph as the text of a g2o file, with all digits of float64.
+    """Return the text of a g2o file with the vertices, a FIX of the first vertex, and the edges.
 
-    The text contains the vertices, a FIX of the first vertex, and the edges.
+    Numbers have all digits of float64.
     """
-    tag_kind = "SE2" if graph.dimension == 2 else "SE3:QUAT"
+    pose_type = "SE2" if graph.dimension == 2 else "SE3:QUAT"
     ids = graph.ids.tolist()
     upper_triangle = np.triu_indices(graph.degrees_of_freedom)
     poses = zip(ids, graph.poses.tolist(), strict=True)
     lines = [
-        f"VERTEX_{tag_kind} {vertex_id} {' '.join(map(repr, pose))}" for vertex_id, pose in poses
+        f"VERTEX_{pose_type} {vertex_id} {' '.join(map(repr, pose))}" for vertex_id, pose in poses
     ]
     lines.append(f"FIX {ids[0]}")
     edge_values = np.hstack(
         [graph.measurements, graph.information[:, upper_triangle[0], upper_triangle[1]]]
     ).tolist()
-    edges = zip(graph.first.tolist(), graph.second.tolist(), edge_values, strict=True)
+    edges = zip(graph.first_nodes.tolist(), graph.second_nodes.tolist(), edge_values, strict=True)
     lines += [
-        f"EDGE_{tag_kind} {ids[i]} {ids[j]} {' '.join(map(repr, values))}" for i, j, values in edges
+        f"EDGE_{pose_type} {ids[i]} {ids[j]} {' '.join(map(repr, values))}"
+        for i, j, values in edges
     ]
     return "\n".join(lines) + "\n"
 
@@ -162,12 +164,12 @@ def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
 
 
 def _parse_rows(rows: Rows, tag: str) -> tuple[IntArray, Array]:
-    """Return the vertex ids, shape (n, 1 or 2), and the numbers of all lines with one tag."""
+    """Return the numbers of all lines with one tag, and the vertex ids, shape (n, 1 or 2)."""
     vertex_count, value_count = _COUNTS_BY_TAG[tag]
     cells, numbers = rows.parse(1 + vertex_count, value_count)
     is_invalid_id = [
-        _VERTEX_ID.fullmatch(word) is None or abs(int(word)) > _MAX_VERTEX_ID
-        for word in cells[:, 1:].flat
+        _VERTEX_ID.fullmatch(id_text) is None or abs(int(id_text)) > _MAX_VERTEX_ID
+        for id_text in cells[:, 1:].flat
     ]
     rows.raise_where(
         np.reshape(is_invalid_id, (-1, vertex_count)),
@@ -200,10 +202,13 @@ def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
     return np.hstack([poses[:, :3], poses[:, 3:] / quaternion_norms[:, None]])
 
 
-def _information_matrices(edges: Rows, numbers: Array, size: int) -> Array:
-    """Return the information matrices, (n, size, size), from upper triangles in row order."""
-    row, column = np.triu_indices(size)
-    matrices = np.empty((len(numbers), size, size))
+def _information_matrices(edges: Rows, numbers: Array, dimension: int) -> Array:
+    """Return the information matrices, shape (n, dimension, dimension).
+
+    ``numbers`` contains the upper triangle of each matrix, row by row.
+    """
+    row, column = np.triu_indices(dimension)
+    matrices = np.empty((len(numbers), dimension, dimension))
     matrices[:, row, column] = matrices[:, column, row] = numbers
     magnitudes = np.abs(numbers)
     is_too_small = (row == column) & (magnitudes > 0.0) & (magnitudes < _MIN_INFORMATION)

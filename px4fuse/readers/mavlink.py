@@ -1,7 +1,7 @@
-"""Reader of MAVLink recordings (``.tlog`` and raw streams); returns a flight.
+"""Reader of MAVLink recordings of a flight: ``.tlog`` files and raw streams.
 
-Meaning, direction and clock of each message follow PX4's ``src/modules/mavlink`` (v1.13 to v1.16)
-and MAVLink's ``common.xml``. They are tabulated in ``mavlink_messages.toml``.
+``mavlink_messages.toml`` defines the fields of the messages. Sources: PX4's ``src/modules/mavlink``
+(v1.13 to v1.16) and MAVLink's ``common.xml``.
 """
 
 from collections.abc import Mapping
@@ -52,8 +52,8 @@ REAL32_PARAMETER_TYPE = 9
 def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight:
     """Read a MAVLink recording: a ``.tlog``, or a raw stream of MAVLink 1 and 2.
 
-    ``system`` is the MAVLink system id of the vehicle, by default of the autopilot with the most
-    messages.
+    ``system`` is the MAVLink system id of the vehicle. By default, the autopilot with the most
+    messages is read.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
     # message with most samples is used
     layout, rows = layouts_with_rows[0]
     if len(rows) < 2:
-        layout, rows = max(layouts_with_rows, key=lambda pair: len(pair[1]))
+        layout, rows = max(layouts_with_rows, key=lambda layout_rows: len(layout_rows[1]))
     if len(rows) < 2:
         return Unavailable("IMU", "the recording has no HIGHRES_IMU or SCALED_IMU", remedy)
     table = recording.frames.table(layout.topic, rows)
@@ -144,12 +144,12 @@ def _read_ekf2(
 ) -> Ekf2 | Unavailable:
     remedies, replay_unavailable = messages.remedies_of_autopilot(autopilot)
     odometry, local_position = messages.STATE_LAYOUTS
-    odometry_count, other_count = (
+    odometry_count, local_position_count = (
         len(recording.rows(layout.topic)) for layout in messages.STATE_LAYOUTS
     )
     # ODOMETRY has variances, so it is preferred unless its message rate is below half of the rate
     # of LOCAL_POSITION_NED
-    layout = odometry if 2 * odometry_count >= other_count else local_position
+    layout = odometry if 2 * odometry_count >= local_position_count else local_position
     message_name = layout.topic
     if len(recording.rows(message_name)) < 2:
         return Unavailable(
@@ -220,8 +220,10 @@ def _variance_from_accuracy(recording: Recording) -> pd.DataFrame:
     (``get_ekf_lpos_accuracy``).
     """
     accuracy = recording.read(messages.MESSAGE_LAYOUTS["accuracy"])
-    horizontal_m2 = accuracy["horizontal_m"] ** 2 / 2.0
-    variance = pd.concat([horizontal_m2, horizontal_m2, accuracy["vertical_m"] ** 2], axis=1)
+    horizontal_variance_m2 = accuracy["horizontal_m"] ** 2 / 2.0
+    variance = pd.concat(
+        [horizontal_variance_m2, horizontal_variance_m2, accuracy["vertical_m"] ** 2], axis=1
+    )
     variance = variance[(variance > 0.0).all(axis=1)].set_axis(Columns.POSITION_VARIANCE, axis=1)
     return variance.reindex(columns=VARIANCE_COLUMNS)
 
@@ -321,6 +323,6 @@ def _start_unix_s(recording: Recording) -> float | None:
     if boot_to_unix is not None:
         return float(boot_to_unix.at(recording.zero_s))
     received_us = recording.frames.received_us
-    if received_us is None or not recording.receipt_to_boot.pairs:
+    if received_us is None or not recording.receipt_to_boot.pair_count:
         return None
     return float(received_us[0] * 1e-6 + recording.receipt_to_boot.inverse().at(recording.zero_s))

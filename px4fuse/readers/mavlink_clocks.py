@@ -1,9 +1,9 @@
-"""Clock mapping of a MAVLink recording: boot clock, sender clocks and receive time.
+"""Conversion of sender clocks and receive times to the autopilot's boot clock (MAVLink).
 
-The delay between a message's timestamp and its receive time is never negative and often large.
-Only the messages with the smallest delay therefore determine the map between two clocks: the lower
-envelope of receive time minus timestamp. The pairs of clock readings in TIMESYNC messages (MAVLink
-"Time Synchronization Protocol v2") are used in the same way.
+The delay between a message's timestamp and its receive time is never negative and often large. A
+line is therefore fitted to the messages with the smallest delay: the lower envelope of receive time
+minus timestamp. Clock readings in TIMESYNC messages (MAVLink "Time Synchronization Protocol v2")
+are fitted by the same method.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from px4fuse.flight.model import ClockMap
 
 # Maximum median difference (s) between timestamps on the boot clock and their receive times
 MAX_BOOT_CLOCK_DISTANCE_S = 10.0
-# Minimum reduction (s) of the difference between timestamps and receive times by TIMESYNC that
-# shows that the sender has its own clock, not the boot clock
+# If TIMESYNC reduces the difference between timestamps and receive times by at least this time (s),
+# the sender has its own clock, not the autopilot's boot clock
 MIN_TIMESYNC_IMPROVEMENT_S = 0.1
 # Minimum UNIX time (s), 2001-09-09: smaller times are times since boot
 MIN_UNIX_TIME_S = 1e9
-# Length (s) of an interval. The clock fit uses the message with the least delay of each interval
+# The clock fit uses one message per interval of this length (s): the one with the least delay
 ENVELOPE_INTERVAL_S = 2.0
 MAX_ENVELOPE_INTERVALS = 200
-# Minimum time span (s) to estimate a clock drift: in a shorter span the drift is assumed to be 0
+# Minimum time span (s) to estimate a clock drift; for a shorter span, the drift is assumed to be 0
 MIN_DRIFT_SPAN_S = 30.0
-# Maximum relative difference between the rates of two real clocks. A larger one means that the
-# recording was replayed at another speed: it is estimated even in a time span < MIN_DRIFT_SPAN_S
+# Maximum relative difference between the rates of two clocks. If the difference is larger, the
+# recording was replayed faster or slower than real time
 MAX_RELATIVE_RATE_DIFFERENCE = 0.01
 # Maximum valid ratio of the rates of two clocks: a wrong unit of time gives up to 1e9 (s for ns)
 MAX_RATE_RATIO = 1e12
 MIN_TIMESYNC_PAIRS = 3
-# Minimum fraction of distinct timestamps of a running clock
+# Minimum fraction of distinct timestamps; with fewer distinct timestamps, a clock does not run
 MIN_DISTINCT_FRACTION = 0.1
 # Maximum regular interval (s) between positions: a longer interval is a gap
 MAX_REGULAR_INTERVAL_S = 1.0
@@ -42,17 +42,17 @@ MAX_REGULAR_INTERVAL_S = 1.0
 
 @dataclass(frozen=True)
 class ClockLine:
-    """Linear map between two clocks: y = y0 + slope · (x - x0).
+    """Linear relation between the readings x and y of two clocks: y = y0 + slope · (x - x0).
 
-    ``pairs`` is the number of simultaneous readings of both clocks. ``jitter`` (unit of y) is their
-    standard deviation from the line, 1.4826 · median absolute deviation.
+    ``pair_count`` is the number of pairs x, y to which the line is fitted. ``jitter`` (unit of y)
+    is their robust standard deviation from the line, 1.4826 · median absolute deviation.
     """
 
     x0: float
     y0: float
     slope: float
     jitter: float
-    pairs: int
+    pair_count: int
 
     def at(self, x: Array | float) -> Array:
         """Return the readings y of the second clock at readings x of the first."""
@@ -60,13 +60,16 @@ class ClockLine:
 
     def inverse(self) -> ClockLine:
         """Return the inverse map, from y to x."""
-        return ClockLine(self.y0, self.x0, 1.0 / self.slope, self.jitter / self.slope, self.pairs)
+        return ClockLine(
+            self.y0, self.x0, 1.0 / self.slope, self.jitter / self.slope, self.pair_count
+        )
 
 
 def fit_least_delay(x: Array, y: Array) -> ClockLine:
-    """Fit a line to pairs of clock readings (s) with the least delay: y is read later than x.
+    """Fit a line to clock readings (s), of which y is read after x with an unknown delay.
 
-    The slope is 1 if the span is too short to estimate a drift.
+    The pairs x, y with the least delay determine the line. Its slope is 1 if the time span is too
+    short to estimate a drift.
     """
     time_order = np.argsort(x, kind="stable")
     x = x[time_order]
@@ -108,9 +111,9 @@ def _is_rate_ratio(slope: float) -> bool:
     return 1.0 / MAX_RATE_RATIO < slope < MAX_RATE_RATIO
 
 
-def is_running_clock(stamp_s: Array) -> bool:
+def is_running_clock(timestamp_s: Array) -> bool:
     """Return True if at least MIN_DISTINCT_FRACTION of the timestamps are distinct."""
-    return len(np.unique(stamp_s)) >= max(MIN_DISTINCT_FRACTION * len(stamp_s), 2)
+    return len(np.unique(timestamp_s)) >= max(MIN_DISTINCT_FRACTION * len(timestamp_s), 2)
 
 
 def robust_std(values: Array) -> float:
@@ -120,9 +123,9 @@ def robust_std(values: Array) -> float:
 
 @dataclass(frozen=True)
 class ClockMapping:
-    """Map from the timestamps of a sender to the boot clock, with a description for results.
+    """Conversion of a sender's timestamps to the autopilot's boot clock, with its description.
 
-    ``sender_to_boot`` is None if most timestamps are equal; receive times then replace them.
+    ``sender_to_boot`` is None if receive times replace the timestamps, most of which are equal.
     """
 
     sender_to_boot: ClockLine | None
@@ -131,77 +134,81 @@ class ClockMapping:
 
 def map_clock(
     name: str,
-    stamp_s: Array,
+    timestamp_s: Array,
     received_s: Array,
     receipt_to_boot: ClockLine,
-    replies: tuple[Array, Array],
-    answers: tuple[Array, Array],
+    sender_replies: tuple[Array, Array],
+    autopilot_replies: tuple[Array, Array],
     boot_to_unix: ClockLine | None,
     *,
-    has_receipt: bool,
+    has_receive_times: bool,
 ) -> ClockMapping:
-    """Map a sender's clock to the boot clock by TIMESYNC, SYSTEM_TIME or receive time.
+    """Find the relation of a sender's clock to the autopilot's boot clock.
+
+    TIMESYNC is preferred, then SYSTEM_TIME, then the receive times.
 
     Parameters
     ----------
     receipt_to_boot : ClockLine
-        Map from receive time to boot clock.
-    replies : tuple of ndarray
+        Conversion of receive times to the boot clock.
+    sender_replies : tuple of ndarray
         Times (s) of the autopilot's TIMESYNC requests, and of the sender's replies.
-    answers : tuple of ndarray
+    autopilot_replies : tuple of ndarray
         Times (s) of the sender's TIMESYNC requests, and of the autopilot's replies.
-    map_boot_to_unix : ClockLine or None
-        Map from boot clock to UNIX time by the autopilot's SYSTEM_TIME.
-    has_receipt : bool
-        False if the recording contains only the order of the messages, no receive times.
+    boot_to_unix : ClockLine or None
+        Conversion of the boot clock to UNIX time, from the autopilot's SYSTEM_TIME.
+    has_receive_times : bool
+        True if the recording contains receive times, False if only the order of the messages.
     """
-    time_source = "receive time" if has_receipt else "message order"
+    time_source = "receive time" if has_receive_times else "message order"
     boot_at_receipt = receipt_to_boot.at(received_s)
-    if not is_running_clock(stamp_s):
-        distinct_count = len(np.unique(stamp_s))
+    if not is_running_clock(timestamp_s):
+        distinct_count = len(np.unique(timestamp_s))
         note = (
-            f"the {len(stamp_s)} timestamps have only {distinct_count} distinct values, so "
+            f"the {len(timestamp_s)} timestamps have only {distinct_count} distinct values, so "
             f"px4fuse uses the {time_source}"
         )
-        # Jitter of the receive time if samples are sent at regular intervals; gaps are excluded
+        # Jitter of the receive time, assuming that the sender sends at regular intervals
         intervals_s = np.diff(received_s)
         intervals_s = intervals_s[intervals_s < MAX_REGULAR_INTERVAL_S]
         jitter_s = float(np.std(intervals_s) / np.sqrt(2.0)) if len(intervals_s) else 0.0
         description = ClockMap(
-            name, time_source, len(stamp_s), 0.0, 0.0, jitter_s, note, distinct_count
+            name, time_source, len(timestamp_s), 0.0, 0.0, jitter_s, note, distinct_count
         )
         return ClockMapping(None, description)
 
     def distance_s(boot_s: Array) -> float:
         return abs(float(np.median(boot_at_receipt - boot_s)))
 
-    timesync_line = _fit_timesync(replies, answers)
-    unmapped_distance_s = distance_s(stamp_s)
+    timesync_line = _fit_timesync(sender_replies, autopilot_replies)
+    unmapped_distance_s = distance_s(timestamp_s)
     # A separate clock that started only seconds after the autopilot's clock looks like the boot
     # clock; only TIMESYNC distinguishes them
     improvement_s = 0.0
     if timesync_line is not None:
-        improvement_s = unmapped_distance_s - distance_s(timesync_line.at(stamp_s))
+        improvement_s = unmapped_distance_s - distance_s(timesync_line.at(timestamp_s))
     if (
         unmapped_distance_s <= MAX_BOOT_CLOCK_DISTANCE_S
         and improvement_s < MIN_TIMESYNC_IMPROVEMENT_S
     ):
-        sender_to_boot = ClockLine(float(stamp_s[0]), float(stamp_s[0]), 1.0, 0.0, len(stamp_s))
+        sender_to_boot = ClockLine(
+            float(timestamp_s[0]), float(timestamp_s[0]), 1.0, 0.0, len(timestamp_s)
+        )
         note = "the timestamps of the sender are boot times of the autopilot"
         return ClockMapping(
-            sender_to_boot, ClockMap(name, "boot clock", len(stamp_s), 0.0, 0.0, 0.0, note)
+            sender_to_boot, ClockMap(name, "boot clock", len(timestamp_s), 0.0, 0.0, 0.0, note)
         )
-    clock_kind = "UNIX time" if float(np.median(stamp_s)) > MIN_UNIX_TIME_S else "clock"
+    clock_kind = "UNIX time" if float(np.median(timestamp_s)) > MIN_UNIX_TIME_S else "clock"
     clock_name = f"{clock_kind} of {name}"
     candidate_maps = [] if timesync_line is None else [("TIMESYNC", timesync_line, "")]
     if clock_kind == "UNIX time" and boot_to_unix is not None:
         unix_note = "sender and autopilot are assumed to have the same UNIX time"
         candidate_maps.append(("SYSTEM_TIME", boot_to_unix.inverse(), unix_note))
     for method, sender_to_boot, note in candidate_maps:
-        # TIMESYNC or SYSTEM_TIME of another clock gives boot times far from the receive times
-        if distance_s(sender_to_boot.at(stamp_s)) <= MAX_BOOT_CLOCK_DISTANCE_S:
-            return _clock_mapping(clock_name, method, sender_to_boot, stamp_s, note)
-    sender_to_boot = fit_least_delay(stamp_s, received_s)
+        # If TIMESYNC or SYSTEM_TIME are from another clock, boot times differ from receive times
+        if distance_s(sender_to_boot.at(timestamp_s)) <= MAX_BOOT_CLOCK_DISTANCE_S:
+            return _clock_mapping(clock_name, method, sender_to_boot, timestamp_s, note)
+    sender_to_boot = fit_least_delay(timestamp_s, received_s)
     slope = sender_to_boot.slope * receipt_to_boot.slope
     y0 = float(receipt_to_boot.at(sender_to_boot.y0))
     sender_to_boot = replace(sender_to_boot, y0=y0, slope=slope)
@@ -209,30 +216,32 @@ def map_clock(
         "the recording has no usable TIMESYNC or SYSTEM_TIME, so the boot times of the samples are "
         "too late by the unknown minimum link delay"
     )
-    return _clock_mapping(clock_name, time_source, sender_to_boot, stamp_s, note)
+    return _clock_mapping(clock_name, time_source, sender_to_boot, timestamp_s, note)
 
 
-def _fit_timesync(replies: tuple[Array, Array], answers: tuple[Array, Array]) -> ClockLine | None:
-    """Map the clock of a sender to the boot clock by TIMESYNC, averaged over both directions."""
+def _fit_timesync(
+    sender_replies: tuple[Array, Array], autopilot_replies: tuple[Array, Array]
+) -> ClockLine | None:
+    """Fit the relation of sender clock to boot clock by TIMESYNC, averaged over both directions."""
     lines = []
-    if len(replies[0]) >= MIN_TIMESYNC_PAIRS:
-        # The autopilot reads its clock first, so the fit gives the map from boot clock to sender
-        lines.append(fit_least_delay(*replies).inverse())
-    if len(answers[0]) >= MIN_TIMESYNC_PAIRS:
-        lines.append(fit_least_delay(*answers))
+    if len(sender_replies[0]) >= MIN_TIMESYNC_PAIRS:
+        # The autopilot reads its clock first, so the fitted line converts boot to sender times
+        lines.append(fit_least_delay(*sender_replies).inverse())
+    if len(autopilot_replies[0]) >= MIN_TIMESYNC_PAIRS:
+        lines.append(fit_least_delay(*autopilot_replies))
     if not lines:
         return None
     x0 = lines[0].x0
     line_values = [(float(line.at(x0)), line.slope, line.jitter) for line in lines]
     y0, slope, jitter = np.mean(line_values, axis=0).tolist()
-    return ClockLine(x0, y0, slope, jitter, sum(line.pairs for line in lines))
+    return ClockLine(x0, y0, slope, jitter, sum(line.pair_count for line in lines))
 
 
 def _clock_mapping(
-    clock: str, method: str, line: ClockLine, stamp_s: Array, note: str
+    clock: str, method: str, line: ClockLine, timestamp_s: Array, note: str
 ) -> ClockMapping:
-    middle_s = float(0.5 * (stamp_s.min() + stamp_s.max()))
+    middle_s = float(0.5 * (timestamp_s.min() + timestamp_s.max()))
     offset_s = float(line.at(middle_s)) - middle_s
     drift_ppm = (line.slope - 1.0) * 1e6
-    description = ClockMap(clock, method, line.pairs, offset_s, drift_ppm, line.jitter, note)
+    description = ClockMap(clock, method, line.pair_count, offset_s, drift_ppm, line.jitter, note)
     return ClockMapping(line, description)

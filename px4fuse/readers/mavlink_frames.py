@@ -1,8 +1,8 @@
-"""Decoder of the MAVLink wire format: bytes to frames (packets), and frames to columns.
+"""Decoder of the MAVLink wire format: bytes to frames (packets), and frames to arrays of fields.
 
-At every byte at which a frame of a known message could begin, the checksum is tested. Invalid bytes
-and incomplete frames are skipped and counted, without loss of valid frames. All frames of one
-message type are decoded at once with the field tables of pymavlink's dialect.
+The checksum is tested at every byte at which a frame of a known message could begin. Invalid bytes
+and incomplete frames are skipped and counted, so no valid frame is lost. All frames of one message
+type are decoded at once, with the field definitions of pymavlink.
 
 Sources: MAVLink developer guide, "Packet Serialization"; pymavlink's generated dialects.
 """
@@ -34,15 +34,14 @@ SIGNED_FLAG = 0x01
 MAX_FRAME_BYTES = HEADER_BYTES_V2 + 255 + CHECKSUM_BYTES + SIGNATURE_BYTES
 # Receive time that QGroundControl and MAVProxy write before each frame: µs, big-endian
 RECEIVE_TIME_BYTES = 8
-# Number of bytes in which frames are searched at once, to limit the memory for malicious files
+# Frames are searched in blocks of this number of bytes, so that malicious files need little memory
 BLOCK_BYTES = 1 << 16
 # Number of frames that are decoded at once, to limit the memory
 DECODE_BATCH_SIZE = 1 << 12
-# Minimum fraction of a MAVLink recording's bytes that are in valid frames: random data contain one
-# valid frame in about eight million bytes
+# Minimum fraction of the bytes of a MAVLink recording that are in frames with a valid checksum. In
+# random data, one such frame is expected in about eight million bytes
 MIN_VALID_FRACTION = 0.01
-# Maximum difference (µs) of a receive time from the median receive time (limit of pymavlink): a
-# receive time with a larger difference is damaged
+# A receive time is damaged if it differs by more than this time (µs) from the median (pymavlink)
 MAX_RECEIVE_TIME_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
 MESSAGE_IDS: Mapping[str, int] = {
     message.msgname: number for number, message in dialect.mavlink_map.items()
@@ -57,12 +56,12 @@ _CRC_EXTRA = np.full(
     max(1 << 16, *(number + 1 for number in dialect.mavlink_map)), -1, dtype=np.int16
 )
 _CRC_EXTRA[[*dialect.mavlink_map]] = [message.crc_extra for message in dialect.mavlink_map.values()]
-# Checksums of single bytes, for the last step of the checksum with CRC_EXTRA
+# CRC of each possible byte, with which the byte CRC_EXTRA is appended to the CRC of a frame
 _BYTE_CHECKSUMS = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], dtype=np.uint16)
 
 
 @dataclass(frozen=True)
-class Frames:
+class MavlinkFrames:
     """MAVLink frames of one recording with valid checksums, in file order."""
 
     name: str
@@ -91,18 +90,18 @@ class Frames:
         return len(self.start_offsets)
 
     def rows(self, message: str) -> IntArray:
-        """Return the indices of the frames with one message; ``message`` is the MAVLink name."""
+        """Return the indices of the frames that contain a message, by its MAVLink name."""
         return np.flatnonzero(self.message_id == MESSAGE_IDS[message])
 
     def sent_by(self, address: Address, rows: IntArray | slice = slice(None)) -> BoolArray:
-        """Return a mask of the frames (all by default) from one system and component."""
+        """Return True for each frame in ``rows`` (default: all) that ``address`` sent."""
         system, component = address
         return np.asarray((self.system[rows] == system) & (self.component[rows] == component))
 
     def table(self, message: str, rows: IntArray) -> NDArray[Any]:
-        """Decode frames of one message to a structured array of its fields, in MAVLink units.
+        """Decode frames of one message to a structured array with its fields, in MAVLink units.
 
-        Trailing zeros of the payload, which MAVLink 2 omits, are restored.
+        MAVLink 2 omits trailing zero bytes of the payload; they are added again.
         """
         layout = wire_layout(MESSAGE_IDS[message])
         payload = np.zeros((len(rows), layout.itemsize), dtype=np.uint8)
@@ -130,7 +129,7 @@ def message_name(message_id: int) -> str:
 
 @cache
 def wire_layout(message_id: int) -> np.dtype[Any]:
-    """Return the payload layout of a message id as a packed structured dtype."""
+    """Return the fields in the payload of a message as a structured dtype without padding."""
     message = dialect.mavlink_map[message_id]
     # pymavlink and numpy have the same type codes
     type_codes = message.native_format.decode().removeprefix("<")
@@ -145,7 +144,7 @@ def wire_layout(message_id: int) -> np.dtype[Any]:
     return np.dtype(fields)
 
 
-def read_frames(name: str, content: bytes) -> Frames:
+def read_frames(name: str, content: bytes) -> MavlinkFrames:
     """Find all frames with valid checksums in a ``.tlog`` or a raw stream.
 
     Raises
@@ -154,7 +153,7 @@ def read_frames(name: str, content: bytes) -> Frames:
         The content is not MAVLink.
     """
     start_offsets, end_offsets, message_id = _remove_nested_frames(_find_valid_frames(content)).T
-    time_bytes = (
+    receive_time_bytes = (
         RECEIVE_TIME_BYTES
         if len(start_offsets) and _has_receive_times(start_offsets, end_offsets)
         else 0
@@ -172,12 +171,14 @@ def read_frames(name: str, content: bytes) -> Frames:
     # Three consecutive header bytes: sequence, system, component
     sequence_offset = start_offsets + np.where(is_version_2, 4, 2)
     unknown_frame_count, bad_byte_count, ends_in_frame = _count_other_bytes(
-        content, start_offsets - time_bytes, end_offsets, time_bytes
+        content, start_offsets - receive_time_bytes, end_offsets, receive_time_bytes
     )
     received_us, damaged_receive_time_count = (
-        _read_receive_times(content_bytes, start_offsets, end_offsets) if time_bytes else (None, 0)
+        _read_receive_times(content_bytes, start_offsets, end_offsets)
+        if receive_time_bytes
+        else (None, 0)
     )
-    return Frames(
+    return MavlinkFrames(
         name=name,
         content=content,
         sha256=hashlib.sha256(content).hexdigest(),
@@ -197,15 +198,15 @@ def read_frames(name: str, content: bytes) -> Frames:
 
 
 def _find_valid_frames(content: bytes) -> Int64Array:
-    """Return start, end and message id, shape (n, 3), of all frames with valid checksums."""
+    """Return first byte, end and message id of each frame with a valid checksum, shape (n, 3)."""
     content_bytes = np.frombuffer(content, dtype=np.uint8)
     content_view = memoryview(content)
     valid_frames = [np.zeros((0, 3), dtype=np.int64)]
     for block_start in range(0, len(content_bytes), BLOCK_BYTES):
         possible_frames, crc_end = _find_possible_frames(content_bytes, block_start)
-        checked_ranges = zip((possible_frames[:, 0] + 1).tolist(), crc_end.tolist(), strict=True)
+        byte_ranges = zip((possible_frames[:, 0] + 1).tolist(), crc_end.tolist(), strict=True)
         crc = np.array(
-            [mcrf4xx(content_view[first_byte:end_byte]) for first_byte, end_byte in checked_ranges],
+            [mcrf4xx(content_view[first_byte:end_byte]) for first_byte, end_byte in byte_ranges],
             dtype=np.uint16,
         )
         crc = (crc >> 8) ^ _BYTE_CHECKSUMS[
@@ -217,10 +218,11 @@ def _find_valid_frames(content: bytes) -> Int64Array:
 
 
 def _remove_nested_frames(frames: Int64Array) -> Int64Array:
-    """Remove false frames, which overlap with another frame.
+    """Remove frames that overlap with another frame.
 
-    The payload of TUNNEL may contain a frame, and a receive time may look like a frame header. The
-    frame that begins directly after the previous frame, or after its receive time, is kept.
+    The payload of TUNNEL may contain a frame, and a receive time may look like a frame header. Of
+    two overlapping frames, the one that begins where the previous frame or its receive time ends is
+    kept.
     """
     if not np.any(frames[1:, 0] < frames[:-1, 1]):
         return frames
@@ -242,7 +244,10 @@ def _remove_nested_frames(frames: Int64Array) -> Int64Array:
 def _find_possible_frames(
     content_bytes: ByteArray, block_start: int
 ) -> tuple[Int64Array, Int64Array]:
-    """Return start, end and message id of possible frames in a block, and checksum offsets."""
+    """Return first byte, end and message id of possible frames, and the offset of each checksum.
+
+    Only the block of BLOCK_BYTES from ``block_start`` is searched.
+    """
     block = content_bytes[block_start : block_start + BLOCK_BYTES]
     start_offsets = block_start + np.flatnonzero(
         (block == MAGIC_BYTE_V1) | (block == MAGIC_BYTE_V2)
@@ -276,7 +281,7 @@ def _find_possible_frames(
 
 
 def _has_receive_times(start_offsets: Int64Array, end_offsets: Int64Array) -> bool:
-    """Return True if most frames are separated by the eight bytes of a receive time."""
+    """Return True if a receive time of eight bytes precedes most frames, as in a ``.tlog``."""
     gap_bytes = start_offsets[1:] - end_offsets[:-1]
     with_time_count = int(np.count_nonzero(gap_bytes == RECEIVE_TIME_BYTES))
     without_time_count = int(np.count_nonzero(gap_bytes == 0))
@@ -286,12 +291,12 @@ def _has_receive_times(start_offsets: Int64Array, end_offsets: Int64Array) -> bo
 
 
 def _count_other_bytes(
-    content: bytes, start_offsets: Int64Array, end_offsets: Int64Array, time_bytes: int
+    content: bytes, start_offsets: Int64Array, end_offsets: Int64Array, receive_time_bytes: int
 ) -> tuple[int, int, bool]:
-    """Count unknown frames and other bytes between the valid frames.
+    """Count the frames of unknown messages, and all other bytes that are not in valid frames.
 
-    Return also True if the file ends within a frame. The ``time_bytes`` of a receive time are part
-    of each frame.
+    The third value is True if the file ends within a frame. ``receive_time_bytes`` is the length of
+    the receive time before each frame: 8, or 0 without receive times.
     """
     unknown_frame_count = 0
     bad_byte_count = 0
@@ -302,22 +307,32 @@ def _count_other_bytes(
         gap_starts < gap_ends
     ].tolist():
         offset = gap_start
-        for size in _unknown_frames(content, gap_start, gap_end, time_bytes):
+        for size in _unknown_frames(content, gap_start, gap_end, receive_time_bytes):
             unknown_frame_count += 1
             offset += size
         bad_byte_count += gap_end - offset
         last_bytes = content[offset:gap_end] if gap_end == len(content) else b""
-    begins_frame = {*last_bytes[time_bytes : time_bytes + 1]} <= {MAGIC_BYTE_V1, MAGIC_BYTE_V2}
-    ends_in_frame = 0 < len(last_bytes) < time_bytes + MAX_FRAME_BYTES and begins_frame
+    begins_frame = {*last_bytes[receive_time_bytes : receive_time_bytes + 1]} <= {
+        MAGIC_BYTE_V1,
+        MAGIC_BYTE_V2,
+    }
+    ends_in_frame = 0 < len(last_bytes) < receive_time_bytes + MAX_FRAME_BYTES and begins_frame
     return unknown_frame_count, bad_byte_count, ends_in_frame
 
 
-def _unknown_frames(content: bytes, offset: int, gap_end: int, time_bytes: int) -> Iterator[int]:
-    """Yield the sizes (bytes) of consecutive frames of unknown messages, from their headers."""
-    while offset + time_bytes + HEADER_BYTES_V1 + CHECKSUM_BYTES <= gap_end:
-        header = content[offset + time_bytes : offset + time_bytes + HEADER_BYTES_V2]
+def _unknown_frames(
+    content: bytes, offset: int, gap_end: int, receive_time_bytes: int
+) -> Iterator[int]:
+    """Yield the size (bytes) of each frame with an unknown message in a gap between valid frames.
+
+    ``receive_time_bytes`` is the length of the receive time before each frame.
+    """
+    while offset + receive_time_bytes + HEADER_BYTES_V1 + CHECKSUM_BYTES <= gap_end:
+        header = content[
+            offset + receive_time_bytes : offset + receive_time_bytes + HEADER_BYTES_V2
+        ]
         message_id = header[5]
-        size = time_bytes + header[1] + HEADER_BYTES_V1 + CHECKSUM_BYTES
+        size = receive_time_bytes + header[1] + HEADER_BYTES_V1 + CHECKSUM_BYTES
         if header[0] == MAGIC_BYTE_V2:
             message_id = int.from_bytes(header[7:10], "little")
             size += HEADER_BYTES_V2 - HEADER_BYTES_V1 + SIGNATURE_BYTES * (header[2] & SIGNED_FLAG)
@@ -334,7 +349,7 @@ def _unknown_frames(content: bytes, offset: int, gap_end: int, time_bytes: int) 
 def _read_receive_times(
     content_bytes: ByteArray, start_offsets: Int64Array, end_offsets: Int64Array
 ) -> tuple[Int64Array, int]:
-    """Return the receive times (UNIX, µs) and the number of damaged receive times."""
+    """Return the receive time (UNIX, µs) of each frame, and the number of damaged receive times."""
     is_usable = start_offsets >= RECEIVE_TIME_BYTES
     is_usable[1:] &= start_offsets[1:] - end_offsets[:-1] >= RECEIVE_TIME_BYTES
     time_windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)

@@ -22,7 +22,7 @@ ARDUPILOT_REPLAY = Unavailable(
     "px4fuse has no model of ArduPilot's estimator (EKF3)",
     "Give a PX4 ULog. px4fuse replays only PX4's EKF2.",
 )
-# Messages with the boot time in time_usec; in other messages time_usec may be from another clock
+# Messages whose field time_usec is boot time; in other messages it may be from another clock
 BOOT_CLOCK_MESSAGES = ("HIGHRES_IMU", "ODOMETRY", "ESTIMATOR_STATUS")
 # Messages that only an autopilot sends; they identify the autopilot among the senders
 AUTOPILOT_MESSAGES = (
@@ -43,19 +43,19 @@ AUTOPILOT_MESSAGES = (
 class PositionInput:
     """Message that sends an external position to the autopilot."""
 
-    # Key of the message in MESSAGE_LAYOUTS
+    # Key in MESSAGE_LAYOUTS, which defines the fields of the message
     row: str
     description: str
-    # Name of the track for ``--position-source``
+    # Name of the position source for the option --position-source
     track_name: str = ""
     kind: str = "uwb"
-    # Frame of the positions; "unknown": MAV_FRAME in the column frame_id, if the layout has it
+    # Coordinate frame of the positions. If "unknown", the message may contain the MAV_FRAME
     frame: str = "unknown"
-    # Field with the sender's time (µs)
-    stamp: str = "time_usec"
+    # Field with the sender's timestamp (µs)
+    timestamp_field: str = "time_usec"
     # Required MAV_ESTIMATOR_TYPE, if any
     estimator: int | None = None
-    # True for a naive estimator: PX4 ignores its covariance (mavlink_receiver.cpp)
+    # True if PX4 ignores the covariance: MAV_ESTIMATOR_TYPE_NAIVE (mavlink_receiver.cpp)
     drops_covariance: bool = False
 
     @property
@@ -83,19 +83,19 @@ class FrameOfReference:
 
 _TABLE = read_toml(__file__, dict[str, dict[str, Any]])
 MESSAGE_LAYOUTS = expand_layouts(_TABLE["layouts"])
-assert not any(row.optional for row in MESSAGE_LAYOUTS.values()), (
+assert not any(layout.optional for layout in MESSAGE_LAYOUTS.values()), (
     "a MAVLink layout has optional fields"
 )
 _INPUTS = msgspec.convert(_TABLE["positions"], dict[str, PositionInput])
 FRAMES_OF_REFERENCE = msgspec.convert(_TABLE["frames"], dict[int, FrameOfReference], strict=False)
 AUTOPILOTS = msgspec.convert(_TABLE["autopilots"], dict[int, str], strict=False)
 UNUSED_MESSAGES: Mapping[str, str] = _TABLE["unused"]
-POSITION_INPUTS = tuple(replace(row, track_name=name) for name, row in _INPUTS.items())
+POSITION_INPUTS = tuple(replace(message, track_name=name) for name, message in _INPUTS.items())
 _SCALED_IMU_LAYOUTS = (
-    replace(MESSAGE_LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{n}") for n in ("", "2", "3")
+    replace(MESSAGE_LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{number}") for number in ("", "2", "3")
 )
 IMU_LAYOUTS = (MESSAGE_LAYOUTS["highres_imu"], *_SCALED_IMU_LAYOUTS)
-# Attitude messages, in order of preference for equal message counts
+# Attitude messages. The one with most samples is used; if equal, the first
 ATTITUDE_LAYOUTS = (
     MESSAGE_LAYOUTS["quaternion"],
     MESSAGE_LAYOUTS["angles"],
@@ -109,7 +109,7 @@ GNSS_LAYOUTS = (MESSAGE_LAYOUTS["gnss"], replace(MESSAGE_LAYOUTS["gnss"], topic=
 
 
 def remedies_of_autopilot(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
-    """Return advice how to record missing messages, and the reason why EKF2 cannot be replayed."""
+    """Return advice on recording each missing kind of data, and why EKF2 cannot be replayed."""
     if autopilot == "ArduPilot":
         return _TABLE["remedies"][autopilot], ARDUPILOT_REPLAY
     return _TABLE["remedies"]["PX4"], RECORD_NOT_LOGGED

@@ -1,4 +1,4 @@
-"""External positions sent to the autopilot over MAVLink, GNSS positions, and ground truth."""
+"""Reader of external positions, GNSS positions and ground truth in a MAVLink recording."""
 
 from __future__ import annotations
 
@@ -20,27 +20,32 @@ from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recordi
 from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unproject
 
-# Maximum median difference (s) between GNSS timestamps and the receive time since boot: with a
-# larger difference the timestamps are not boot time
+# GNSS timestamps are not boot time if their median difference from the receive time since boot
+# exceeds this time (s)
 MAX_BOOT_CLOCK_DISTANCE_S = 5.0
-# Maximum time difference (s) between a global and a local position to compute the origin from both;
-# at 1 m/s the error of the origin is 5 cm
+# Maximum time difference (s) of the global and local position from which the origin of the local
+# frame is computed; at 1 m/s, the error of the origin is 5 cm
 MAX_ORIGIN_TIME_DIFFERENCE_S = 0.05
 
 
 def read_positions(
     recording: Recording, clocks: dict[Address, ClockMapping], remedy: str, delay_s: float
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Read all external positions sent to the autopilot, in order of preference.
+    """Read the external positions sent to the autopilot, best first, and the GNSS positions.
 
     Parameters
     ----------
     clocks : mapping from address to ClockMapping
-        Clock of every sender.
+        Conversion of each sender's clock to the boot clock.
     remedy : str
         Advice to the user if no positions were recorded.
     delay_s : float
-        Delay between a GNSS fix and its timestamp that the autopilot assumes.
+        Delay (s) from GNSS measurement to timestamp that the autopilot assumes.
+
+    Returns
+    -------
+    positions : tuple of PositionTrack
+    missing : tuple of Unavailable
     """
     tracks_and_missing: list[PositionTrack | Unavailable] = []
     for message in dict.fromkeys(source.message for source in messages.POSITION_INPUTS):
@@ -70,7 +75,7 @@ def _read_track(
     remedy: str,
     senders: list[Address],
 ) -> PositionTrack | Unavailable | None:
-    """Read the positions in one message type from one sender, if it sent such messages."""
+    """Read the positions in one message type from one sender; None if it sent no such message."""
     rows = recording.rows(source.message, sender)
     table = recording.frames.table(source.message, rows)
     if source.estimator is not None:
@@ -80,10 +85,10 @@ def _read_track(
     if not len(rows):
         return None
     track_name = source.track_name + (f"_{sender[0]}_{sender[1]}" if len(senders) > 1 else "")
-    stamp_s = table[source.stamp] * 1e-6
+    timestamp_s = table[source.timestamp_field] * 1e-6
     sample_boot_s = recording.receipt_boot_s(rows)
     if clock.sender_to_boot is not None:
-        sample_boot_s = np.where(stamp_s > 0.0, clock.sender_to_boot.at(stamp_s), np.nan)
+        sample_boot_s = np.where(timestamp_s > 0.0, clock.sender_to_boot.at(timestamp_s), np.nan)
     samples = recording.read(source.layout, rows, sample_boot_s, track_name)
     frame = source.frame
     if "frame_id" in samples and len(samples):
@@ -114,9 +119,9 @@ def _read_track(
 def _read_gnss(
     recording: Recording, layout: Layout, delay_s: float
 ) -> PositionTrack | Unavailable | None:
-    """Read the fixes of a GNSS receiver as NED positions from the autopilot's origin.
+    """Read GNSS fixes as NED positions from the autopilot's local origin; None without messages.
 
-    The autopilot repeats each fix until the next one. Return None without messages.
+    The autopilot repeats each fix until the next one; repeated fixes are dropped.
     """
     rows = recording.rows(layout.topic)
     if not len(rows):
@@ -135,7 +140,7 @@ def _read_gnss(
         return px4_positions.unavailable_source(
             layout.topic,
             f"the recording has {message_count} {layout.topic}, {fix_count} with a 3D fix",
-            "Give the antenna a free view of the sky and wait for a fix.",
+            px4_positions.NO_FIX_ACTION,
         )
     samples = project_to_ned(fixes, local_origin(recording))
     variance = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2
@@ -164,8 +169,8 @@ def pressure_altitude(pressure_hpa: pd.Series[float]) -> pd.Series[float]:
 def local_origin(recording: Recording) -> GeodeticPosition | None:
     """Return latitude, longitude (degrees) and altitude (m) of the autopilot's local origin.
 
-    The origin is from GPS_GLOBAL_ORIGIN, or else computed from global and local positions. None if
-    the recording contains neither.
+    The origin is read from GPS_GLOBAL_ORIGIN, or computed from global and local positions. Return
+    None if the recording contains none of them.
     """
     sent_origin = recording.read(messages.MESSAGE_LAYOUTS["origin"]).dropna()
     if len(sent_origin):
@@ -195,10 +200,9 @@ def read_truth(
 ) -> Truth | Unavailable:
     """Read ground truth from the simulation, or from motion capture if EKF2 uses another source.
 
-    1. Simulation ground truth has no usable timestamps (``HIL_STATE_QUATERNION.time_usec`` is 0 in
-       PX4), so receive times are used.
-    2. True latitude and longitude are projected from the autopilot's origin if the source is GNSS,
-       otherwise from the first sample, the start of the simulated vehicle.
+    Simulation ground truth has receive times, because ``HIL_STATE_QUATERNION.time_usec`` is 0 in
+    PX4. If the position source is GNSS, NED positions refer to the autopilot's origin, otherwise to
+    the first sample, the start of the simulated vehicle.
     """
     for layout in messages.TRUTH_LAYOUTS:
         rows = recording.rows(layout.topic)
@@ -217,7 +221,7 @@ def read_truth(
         origin = local_origin(recording) if positions and positions[0].origin.is_gnss else None
         state = project_to_ned(samples, origin).join(samples[Columns.VELOCITY])
         return Truth(layout.topic, state[Columns.STATE], read_attitude(samples))
-    mocap_truth = px4_positions.motion_capture_truth(positions, "ATT_POS_MOCAP")
+    mocap_truth = px4_positions.motion_capture_truth(positions)
     for track in positions:
         if mocap_truth and track.name == mocap_truth.name:
             recording.record_stream("truth", *track.topics, clock=track.clock)

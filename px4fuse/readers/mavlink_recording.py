@@ -21,7 +21,7 @@ from px4fuse.readers.mavlink_clocks import (
 from px4fuse.readers.mavlink_frames import (
     MAX_FRAME_BYTES,
     Address,
-    Frames,
+    MavlinkFrames,
     message_name,
     wire_layout,
 )
@@ -33,24 +33,25 @@ BOOT_CLOCK = "autopilot boot clock"
 RECEIPT_CLOCK = "autopilot boot clock, estimated from receive times"
 # Minimum backward step (s) of the boot clock at a restart; a smaller step is a late packet
 MIN_RESTART_STEP_S = 5.0
-# Number of messages before and after a backward step whose boot times have to confirm a restart
+# Number of messages before and after a backward step of the boot clock that have to confirm a
+# restart
 RESTART_CHECK_MESSAGES = 20
-# Minimum size of a group of timestamps between two gaps, as fraction of the largest group: smaller
-# groups are damaged timestamps
+# Timestamps between two gaps are damaged if their number is below this fraction of the largest
+# number of timestamps between two gaps
 MIN_GROUP_FRACTION = 0.01
-# Maximum distance (s) of a valid timestamp from the analysed session, or from the next timestamp
+# Maximum distance (s) of a valid timestamp from the analysed time span, or from the next timestamp
 MAX_OUTSIDE_S = 60.0
-# Maximum fraction of bytes outside of MAVLink frames in a file without damage
+# A file is damaged if a larger fraction of its bytes is outside of MAVLink frames
 MAX_STRAY_BYTE_FRACTION = 0.002
-# Minimum number of boot timestamps to reject them as no clock if almost all are equal
+# Minimum number of timestamps to conclude from mostly equal timestamps that the clock does not run
 MIN_CONSTANT_TIMESTAMPS = 10
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)  # filled while the data are read
 class Recording:
-    """MAVLink recording with the map from receive time to the autopilot's boot clock."""
+    """MAVLink recording of one flight, with the relation of receive time to the boot clock."""
 
-    frames: Frames
+    frames: MavlinkFrames
     # Address of the autopilot of this flight
     address: Address
     # Analysed frames: the longest part of the recording between two restarts of the autopilot
@@ -58,7 +59,7 @@ class Recording:
     # Receive time of each frame (s since the first frame). If the file contains no receive times,
     # the boot time of the last autopilot message before the frame replaces them
     received_s: Array
-    # Map from receive time to boot clock
+    # Conversion of receive times to the boot clock
     receipt_to_boot: ClockLine
     # Boot time at the start of the session, which is time zero of the flight
     zero_s: float
@@ -74,12 +75,15 @@ class Recording:
     streams: dict[str, Stream] = field(default_factory=dict)
 
     def rows_of_all_senders(self, message: str) -> IntArray:
-        """Return the frame indices of one message within the session, from all senders."""
+        """Return the indices of the analysed frames with one message, from all senders."""
         rows = self.frames.rows(message)
         return np.asarray(rows[(rows >= self.session.start) & (rows < self.session.stop)])
 
     def rows(self, message: str, address: Address | None = None) -> IntArray:
-        """Return the frame indices of one message from one sender (default: autopilot)."""
+        """Return the indices of the analysed frames with one message from ``address``.
+
+        The default of ``address`` is the autopilot.
+        """
         rows = self.rows_of_all_senders(message)
         return rows[self.frames.sent_by(address or self.address, rows)]
 
@@ -90,16 +94,19 @@ class Recording:
         boot_s: Array | None = None,
         name: str = "",
     ) -> pd.DataFrame:
-        """Read one message as a DataFrame with strictly increasing times (s since ``zero_s``).
+        """Read one message as a DataFrame with strictly increasing flight times (s).
+
+        Euler angles are converted to quaternions, other coordinate frames to NED (or FRD).
 
         Parameters
         ----------
         layout : Layout
-            Fields to read. Euler angles are converted to quaternions, MAV_FRAMEs to NED (or FRD).
+            Message and fields to read.
         rows : ndarray, shape (n,), optional
             Frame indices from :meth:`rows`; by default all from the autopilot.
         boot_s : ndarray, shape (n,), optional
-            Times since boot; NaN drops a sample. By default the timestamps of the messages.
+            Times since boot, by default the timestamps of the messages. Samples with NaN are
+            dropped.
         name : str, optional
             Key in :attr:`dropped`; by default the message name.
         """
@@ -140,12 +147,12 @@ class Recording:
         return np.asarray(rows[first_copy_rows[increasing_rows]])
 
     def receipt_boot_s(self, rows: IntArray) -> Array:
-        """Return the receive time since boot (s) of frames, minus the minimum link delay."""
+        """Return the receive time since boot (s) of frames, without the minimum link delay."""
         return self.receipt_to_boot.at(self.received_s[rows])
 
     def boot_s(self, table: NDArray[Any], rows: IntArray) -> Array:
-        """Return the time since boot (s) of autopilot messages, else their receive time."""
-        if not self.receipt_to_boot.pairs:  # no message contains the boot clock
+        """Return the time since boot (s) of each message, or its receive time if it has none."""
+        if not self.receipt_to_boot.pair_count:  # no message contains the boot clock
             return self.receipt_boot_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
             return np.asarray(table["time_boot_ms"] * 1e-3)
@@ -195,7 +202,7 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     return ned_samples
 
 
-def _read_boot_times(frames: Frames, address: Address) -> tuple[IntArray, Array]:
+def _read_boot_times(frames: MavlinkFrames, address: Address) -> tuple[IntArray, Array]:
     """Return the indices of the autopilot's frames with a time since boot, and these times (s)."""
     is_from_autopilot = frames.sent_by(address)
     all_rows = [np.zeros(0, dtype=np.intp)]
@@ -218,13 +225,13 @@ def _read_boot_times(frames: Frames, address: Address) -> tuple[IntArray, Array]
     is_usable = is_boot_time if np.any(is_boot_time) else (times_s >= MIN_UNIX_TIME_S)
     if is_usable.sum() >= MIN_CONSTANT_TIMESTAMPS and not is_running_clock(times_s[is_usable]):
         is_usable &= False
-    usable = np.flatnonzero(is_usable)
-    usable = usable[np.argsort(rows[usable])]
-    return rows[usable], times_s[usable]
+    order = np.flatnonzero(is_usable)
+    order = order[np.argsort(rows[order])]
+    return rows[order], times_s[order]
 
 
-def read_recording(frames: Frames, address: Address) -> Recording:
-    """Choose the longest session between restarts, and map the receive time to the boot clock."""
+def read_recording(frames: MavlinkFrames, address: Address) -> Recording:
+    """Choose the longest time span between two restarts, and relate receive time to boot time."""
     notes: list[str] = []
     rows, boot_s = _read_boot_times(frames, address)
     session = slice(0, len(frames))
@@ -306,10 +313,10 @@ def read_recording(frames: Frames, address: Address) -> Recording:
 
 
 def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
-    """Remove small groups of timestamps before the first and after the last large group.
+    """Remove small groups of timestamps at the beginning and at the end of a recording.
 
-    A group ends at a gap of more than MAX_OUTSIDE_S. A large group has at least MIN_GROUP_FRACTION
-    of the timestamps of the largest group.
+    Groups are separated by gaps of more than MAX_OUTSIDE_S. A group is small if it has less than
+    MIN_GROUP_FRACTION of the timestamps of the largest group.
     """
     groups = np.split(rows, np.flatnonzero(np.diff(times_s[rows]) > MAX_OUTSIDE_S) + 1)
     min_count = MIN_GROUP_FRACTION * max(len(group) for group in groups)
@@ -318,7 +325,7 @@ def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
 
 
 def map_boot_to_unix(recording: Recording) -> ClockLine | None:
-    """Map the boot clock to UNIX time by SYSTEM_TIME, if it contains UNIX time."""
+    """Return the relation of boot clock to UNIX time; None if SYSTEM_TIME has no UNIX time."""
     table = recording.frames.table("SYSTEM_TIME", recording.rows("SYSTEM_TIME"))
     table = table[table["time_unix_usec"] * 1e-6 > MIN_UNIX_TIME_S]
     if not len(table):

@@ -16,33 +16,33 @@ from px4fuse.readers.mavlink_clocks import (
     is_running_clock,
     map_clock,
 )
-from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, Address, Frames, Int64Array
+from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, Address, Int64Array, MavlinkFrames
 from px4fuse.readers.mavlink_recording import MIN_RESTART_STEP_S, Recording, map_boot_to_unix
 
-# Maximum number of senders that are read and described: the senders with the most messages
+# Maximum number of senders that are read; senders with more messages are preferred
 MAX_SENDERS = 32
-# Maximum fraction of lost messages; a larger fraction means that the sender does not number them
+# Maximum fraction of lost messages: above it, the sender does not number its messages in sequence
 MAX_LOST_FRACTION = 0.9
-# Maximum number of sequence numbers by which a message may be late, on a slower link
+# Maximum number of later messages of a sender that may arrive before a message, on a faster link
 MAX_LATE_MESSAGES = 16
 # Maximum difference (s) of TIMESYNC timestamps from a sender's position timestamps: a larger
 # difference shows another clock
 MAX_SAME_CLOCK_DISTANCE_S = 1e5
 
 
-def _read_vehicle_types(frames: Frames) -> dict[Address, tuple[int, int]]:
+def _read_vehicle_types(frames: MavlinkFrames) -> dict[Address, tuple[int, int]]:
     rows = frames.rows("HEARTBEAT")
     heartbeats = frames.table("HEARTBEAT", rows)
     type_pairs = zip(heartbeats["type"].tolist(), heartbeats["autopilot"].tolist(), strict=True)
     return dict([*zip(_read_addresses(frames, rows), type_pairs, strict=True)][::-1])
 
 
-def _read_addresses(frames: Frames, rows: IntArray | slice) -> Iterator[Address]:
+def _read_addresses(frames: MavlinkFrames, rows: IntArray | slice) -> Iterator[Address]:
     return zip(frames.system[rows].tolist(), frames.component[rows].tolist(), strict=True)
 
 
 def _count_frames(
-    frames: Frames, rows: IntArray | slice = slice(None)
+    frames: MavlinkFrames, rows: IntArray | slice = slice(None)
 ) -> list[tuple[Address, int]]:
     """Count frames by sender, most frames first."""
     counts = Counter(_read_addresses(frames, rows))
@@ -53,10 +53,10 @@ def _is_vehicle(vehicle_type: int, autopilot: int) -> bool:
     return autopilot != messages.INVALID_AUTOPILOT and vehicle_type != messages.GROUND_STATION_TYPE
 
 
-def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
-    """Return the address and the type of the autopilot with a system id.
+def choose_autopilot(frames: MavlinkFrames, system: int | None) -> tuple[Address, str]:
+    """Return the address of an autopilot, and its type: "PX4", "ArduPilot" or another.
 
-    Without a system id, the autopilot with the most messages is chosen.
+    ``system`` is its MAVLink system id; None selects the autopilot with the most messages.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def choose_autopilot(frames: Frames, system: int | None) -> tuple[Address, str]:
 
 
 def senders_of(recording: Recording, message: str) -> list[Address]:
-    """Return the senders of a message that are not autopilots, such as companion computers."""
+    """Return the senders of a message, such as companion computers, without autopilots."""
     frames = recording.frames
     autopilot_address = recording.address
     other_vehicles = {
@@ -122,7 +122,7 @@ def senders_of(recording: Recording, message: str) -> list[Address]:
 
 
 def map_senders(recording: Recording) -> dict[Address, ClockMapping]:
-    """Map the clock of every sender of an external position to the boot clock."""
+    """Return the relation of each position sender's clock to the autopilot's boot clock."""
     message_names = {source.message for source in messages.POSITION_INPUTS}
     senders = {address for message in message_names for address in senders_of(recording, message)}
     boot_to_unix = map_boot_to_unix(recording)
@@ -139,47 +139,49 @@ def _map_sender_clock(
     received_s = []
     for source in messages.POSITION_INPUTS:
         rows = recording.rows(source.message, sender)
-        timestamps_s.append(frames.table(source.message, rows)[source.stamp] * 1e-6)
+        timestamps_s.append(frames.table(source.message, rows)[source.timestamp_field] * 1e-6)
         received_s.append(recording.received_s[rows])
     median_timestamp_s = float(np.median(np.concatenate(timestamps_s)))
     has_running_clock = is_running_clock(np.concatenate(timestamps_s))
     rows = recording.rows("TIMESYNC", sender)
     timesync = frames.table("TIMESYNC", rows)
-    reply_s = timesync["tc1"] * 1e-9
+    sender_reply_s = timesync["tc1"] * 1e-9
     request_s = timesync["ts1"] * 1e-9
     # In a reply, ts1 is the clock of the requester: the boot clock only in replies to the autopilot
-    is_reply = (reply_s != 0.0) & (
+    is_sender_reply = (sender_reply_s != 0.0) & (
         np.abs(request_s - recording.receipt_boot_s(rows)) <= MIN_RESTART_STEP_S
     )
     # A TIMESYNC request is sent as soon as its clock is read, so it has the smallest delay
     is_request = (
         has_running_clock
-        & (reply_s == 0.0)
+        & (sender_reply_s == 0.0)
         & (np.abs(request_s - median_timestamp_s) < MAX_SAME_CLOCK_DISTANCE_S)
     )
     timestamps_s.append(request_s[is_request])
     received_s.append(recording.received_s[rows][is_request])
     autopilot_timesync = frames.table("TIMESYNC", recording.rows("TIMESYNC"))
-    answer_s = autopilot_timesync["tc1"] * 1e-9
-    answered_request_s = autopilot_timesync["ts1"] * 1e-9
-    is_answer = (answer_s != 0.0) & (
-        np.abs(answered_request_s - median_timestamp_s) < MAX_SAME_CLOCK_DISTANCE_S
+    autopilot_reply_s = autopilot_timesync["tc1"] * 1e-9
+    sender_request_s = autopilot_timesync["ts1"] * 1e-9
+    is_autopilot_reply = (autopilot_reply_s != 0.0) & (
+        np.abs(sender_request_s - median_timestamp_s) < MAX_SAME_CLOCK_DISTANCE_S
     )
-    is_answer &= ~np.isin(autopilot_timesync["ts1"], _requests_of_other_senders(recording, sender))
+    is_autopilot_reply &= ~np.isin(
+        autopilot_timesync["ts1"], _requests_of_other_senders(recording, sender)
+    )
     return map_clock(
         f"system {sender[0]}, component {sender[1]}",
         np.concatenate(timestamps_s),
         np.concatenate(received_s),
         recording.receipt_to_boot,
-        (request_s[is_reply], reply_s[is_reply]),
-        (answered_request_s[is_answer], answer_s[is_answer]),
+        (request_s[is_sender_reply], sender_reply_s[is_sender_reply]),
+        (sender_request_s[is_autopilot_reply], autopilot_reply_s[is_autopilot_reply]),
         boot_to_unix,
-        has_receipt=frames.received_us is not None,
+        has_receive_times=frames.received_us is not None,
     )
 
 
 def _requests_of_other_senders(recording: Recording, sender: Address) -> Int64Array:
-    """Return the field ``ts1`` of the TIMESYNC requests of all other senders."""
+    """Return the request times (ns) in TIMESYNC of all senders except ``sender``: field ``ts1``."""
     frames = recording.frames
     rows = frames.rows("TIMESYNC")
     timesync = frames.table("TIMESYNC", rows[~frames.sent_by(sender, rows)])
@@ -189,11 +191,11 @@ def _requests_of_other_senders(recording: Recording, sender: Address) -> Int64Ar
 def clock_maps(
     recording: Recording, clock_mappings: dict[Address, ClockMapping]
 ) -> tuple[ClockMap, ...]:
-    """Return the maps from sender clocks and receive time to the boot clock."""
+    """Describe the conversions of sender clocks and of the receive time to the boot clock."""
     clocks = [mapping.description for mapping in clock_mappings.values()]
     received_us = recording.frames.received_us
     receipt_to_boot = recording.receipt_to_boot
-    if received_us is not None and receipt_to_boot.pairs:
+    if received_us is not None and receipt_to_boot.pair_count:
         note = "the recorded link was replayed faster or slower than real time"
         if abs(receipt_to_boot.slope - 1.0) < MAX_RELATIVE_RATE_DIFFERENCE:
             note = (
@@ -204,7 +206,7 @@ def clock_maps(
             ClockMap(
                 clock="receive time (UNIX time of the recording computer)",
                 method="receive time",
-                pairs=receipt_to_boot.pairs,
+                pairs=receipt_to_boot.pair_count,
                 offset_s=receipt_to_boot.y0 - receipt_to_boot.x0 - float(received_us[0]) * 1e-6,
                 drift_ppm=(receipt_to_boot.slope - 1.0) * 1e6,
                 jitter_s=receipt_to_boot.jitter,
@@ -227,16 +229,15 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
             if autopilot != messages.INVALID_AUTOPILOT:
                 description = f"{messages.AUTOPILOTS.get(autopilot, 'autopilot')} {description}"
         lost_fraction = _lost_fraction(frames, address)
-        is_chosen = address == recording.address
-        sender_descriptions.append(Sender(*address, description, count, lost_fraction, is_chosen))
+        is_analysed = address == recording.address
+        sender_descriptions.append(Sender(*address, description, count, lost_fraction, is_analysed))
     return tuple(sender_descriptions)
 
 
-def _lost_fraction(frames: Frames, address: Address) -> float | None:
-    """Return the fraction of a sender's messages that are missing, from the sequence numbers.
+def _lost_fraction(frames: MavlinkFrames, address: Address) -> float | None:
+    """Return the fraction of a sender's messages that are lost, from gaps in the sequence numbers.
 
-    Repeated and slightly late messages are not lost. Return None if the sender does not set
-    sequence numbers, or sets them separately on two links.
+    Return None if the sender does not count its messages, or counts them separately on two links.
     """
     sequence = frames.sequence[frames.sent_by(address)].astype(np.int64)
     sequence_steps = np.mod(np.diff(sequence) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES
@@ -244,5 +245,5 @@ def _lost_fraction(frames: Frames, address: Address) -> float | None:
     lost_fraction = float(
         1.0 - len(np.unique(unwrapped_sequence)) / (np.ptp(unwrapped_sequence) + 1)
     )
-    is_counted = len(unwrapped_sequence) == 1 or bool(unwrapped_sequence.any())
-    return lost_fraction if is_counted and lost_fraction < MAX_LOST_FRACTION else None
+    has_sequence_numbers = len(unwrapped_sequence) == 1 or bool(unwrapped_sequence.any())
+    return lost_fraction if has_sequence_numbers and lost_fraction < MAX_LOST_FRACTION else None

@@ -1,8 +1,9 @@
-"""Reader of positions from positioning systems, in the clock and frame of the recording.
+"""Reader of position files from UWB, motion capture and other positioning systems.
 
 The standard format is a header and the columns ``time, x, y, z`` in seconds and metres, optionally
 ``sigma`` or ``sigma_x, sigma_y, sigma_z``. Other formats, separators, column names and units are
-detected and reported. Options override the detected columns and units.
+detected and reported. Options override the detected columns and units. The positions keep the clock
+and the coordinate frame of the file.
 """
 
 import hashlib
@@ -43,23 +44,23 @@ from px4fuse.readers.ulog_topics import longest_increasing_run
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 
-# Maximum number of tags in a column: a column with more values is a counter
+# A column of UWB tag numbers has at most this number of different values; a counter has more
 MAX_TAGS = 100
 MIN_USABLE_ROWS = 3
-# Minimum fraction of rows with increasing times, or with whole seconds, in a column of times
+# Minimum fraction of rows with increasing times in a time column, or with whole seconds if another
+# column contains the nanoseconds
 MIN_USABLE_FRACTION = 0.9
 # Minimum plausible median interval (s): UWB systems send at most 200 positions per second, ±10 %
 MIN_INTERVAL_S = 0.9 / 200
 # Maximum plausible median interval (s): UWB systems send a position every 5 s or more often, ±10 %
 MAX_INTERVAL_S = 1.1 / 0.2
-# Plausible time units of positions, and limits of their median interval (s)
+# Plausible units of the timestamps of positions, and plausible median intervals (s)
 POSITION_TIME_LIMITS = tuple(TIME_UNITS), (MIN_INTERVAL_S, MAX_INTERVAL_S)
-# Plausible time units of trajectories, and limits of their median interval (s)
+# Plausible units of the timestamps of trajectories, and plausible median intervals (s)
 TRAJECTORY_TIME_LIMITS = ("s", "ns"), (1e-3, 1e3)
-# Maximum median interval (s) of UNIX times: boot times in µs may be equally large numbers, but as
-# UNIX times they would have larger intervals
+# Timestamps with a longer median interval (s) are not UNIX times in seconds, but boot times in µs
 MAX_UNIX_TIME_INTERVAL_S = 60.0
-# Maximum extent (m) of an indoor flight: a larger extent shows that the unit of length is mm
+# Maximum extent (m) of an indoor flight. Positions with a larger extent are probably in mm
 MAX_INDOOR_EXTENT_M = 200.0
 # Maximum absolute coordinate in any unit of length: larger values are timestamps or damaged text
 MAX_COORDINATE = 1e9
@@ -72,12 +73,12 @@ class PositionRecording:
     name: str
     sha256: str
     size_bytes: int
-    # Columns SAMPLE_COLUMNS; NaN if not in the file. Times are strictly increasing. In frame "ned"
-    # x is north, y east, z down; in "enu" x is east, y north, z up
+    # Position and σ (SAMPLE_COLUMNS), indexed by increasing time (s); NaN if not in the file. Axes
+    # x, y, z in frame "ned": north, east, down; in "enu": east, north, up
     samples: pd.DataFrame
     # "UNIX" if the timestamps are between 2000 and 2100
     clock: Literal["UNIX", "local"]
-    # Coordinate frames that the column names or the format allow; empty if all are possible
+    # Coordinate frames that column names and format allow; empty if all are possible
     frames: tuple[str, ...]
     # Sentences about the detected format, such as unit or frame
     detected: tuple[str, ...]
@@ -85,15 +86,15 @@ class PositionRecording:
     notes: tuple[str, ...]
     # Number of rows with an invalid timestamp
     dropped: int = 0
-    # Factor that was applied to the positions
+    # Factor that converted the positions of the file to metres
     metres_per_unit: float = 1.0
-    # Reason for each row that is not a measurement, see :func:`find_invalid_rows`
+    # Dropped rows, each with the reason from :func:`find_invalid_rows`
     invalid: "pd.Series[str]" = field(default_factory=lambda: NO_INVALID_ROWS)
     # Quantisation step of the horizontal position; 0 if it is not quantised
     step_m: float = 0.0
     # Name of the format; "" for a table with a header
     format: str = ""
-    # Number of rows of the body in the file
+    # Number of rows in the file that contain the body or tag which is read
     row_count: int = 0
     # Orientation of each sample (x, y, z, w)
     quaternions: Array | None = None
@@ -112,23 +113,22 @@ def read_position_file(
     body: str | None = None,
     is_trajectory: bool = False,
 ) -> PositionRecording:
-    """Read the recording of a positioning system.
+    """Read positions and their σ from a file that a positioning system recorded.
 
     Parameters
     ----------
     path : str or Path
         File, or ``FILE:BODY`` and ``BAG:TOPIC``.
     columns : tuple of str, optional
-        Columns of time, x, y, z and optionally sigma, each a name or number (from 1). Without
-        sigma, z may also be omitted.
+        Names or numbers (from 1) of the columns time, x, y, optionally z, and optionally sigma.
     time_unit : {"s", "ms", "us", "ns"}, optional
         Unit of the time column; overrides detection.
     length_unit : {"m", "cm", "mm"}, optional
         Unit of positions and sigmas; overrides detection.
     body : str, optional
-        Body or tag in the file, or topic of a ROS bag.
+        Rigid body or UWB tag whose positions are read, or topic of a ROS bag.
     is_trajectory : bool
-        True for a trajectory: its extent may be large, and zeros are valid positions.
+        True if the extent may be large, and 0, 0, 0 is a valid position.
 
     Raises
     ------
@@ -142,14 +142,14 @@ def read_position_file(
     table, sha256, size_bytes = _open_table(path, columns, body or body_in_path)
     notes = [*table.notes]
     meanings = [read_column_name(name) for name in table.names]
-    chosen_columns = _column_indices(table, columns or ())
+    given_columns = _column_indices(table, columns or ())
     quaternion_columns = find_quaternion(table.names)
     numbers, has_time_zone = _read_numbers(
-        table, meanings, chosen_columns, quaternion_columns, body or body_in_path
+        table, meanings, given_columns, quaternion_columns, body or body_in_path
     )
     row_count = len(numbers)
     time_column, axis_columns, sigma_columns, frame, time_text = _choose_columns(
-        table, meanings, chosen_columns, numbers
+        table, meanings, given_columns, numbers
     )
     position_columns = [index for index in axis_columns if index is not None]
     # pandas reads numbers such as 1e999 as infinite
@@ -178,8 +178,8 @@ def read_position_file(
             "number of dropped rows with timestamps that repeat, decrease or are after 2100: "
             f"{dropped_count}"
         )
-    is_not_time = table.format == NO_HEADER and len(kept_rows) < MIN_USABLE_FRACTION * row_count
-    if is_not_time or len(kept_rows) < MIN_USABLE_ROWS:
+    has_no_times = table.format == NO_HEADER and len(kept_rows) < MIN_USABLE_FRACTION * row_count
+    if has_no_times or len(kept_rows) < MIN_USABLE_ROWS:
         raise LogError(
             "; ".join(
                 (
@@ -255,7 +255,7 @@ def read_position_file(
 def _open_table(
     path: Path, columns: tuple[str, ...] | None, body: str | None
 ) -> tuple[Table, str, int]:
-    """Return the table of a file or bag, with SHA-256 and size (bytes)."""
+    """Return the table of positions in a file or ROS bag, and the SHA-256 and size (bytes)."""
     if is_bag(path):
         return read_bag(path, body)
     content = read_bytes_limited(
@@ -267,7 +267,7 @@ def _open_table(
 
 
 def _increasing_rows(times_s: Array) -> IntArray:
-    """Return the indices of rows whose times increase and are before 2100."""
+    """Return the indices of the rows with strictly increasing times before 2100."""
     usable_rows = np.flatnonzero(np.abs(times_s) < UNIX_END_S)
     # Ranks are used instead of times, because longest_increasing_run requires positive values
     ranks = np.unique(times_s[usable_rows], return_inverse=True)[1].astype(np.int64)
@@ -277,7 +277,7 @@ def _increasing_rows(times_s: Array) -> IntArray:
 def _check_options(
     columns: tuple[str, ...] | None, time_unit: str | None, length_unit: str | None
 ) -> None:
-    """Raise SettingsError for option values that are invalid for every file."""
+    """Raise SettingsError if the units or the number of columns are not valid."""
     for name, value, units in (
         ("time_unit", time_unit, TIME_UNITS),
         ("length_unit", length_unit, LENGTH_UNITS),
@@ -295,22 +295,23 @@ def _check_options(
 def _read_numbers(
     table: Table,
     meanings: list[ColumnMeaning],
-    chosen_columns: list[int],
+    given_columns: list[int],
     quaternion_columns: list[int],
     body: str | None,
 ) -> tuple[pd.DataFrame, bool]:
-    """Return columns as numbers, and False if ISO 8601 times lack the time zone (else True).
+    """Convert the text of the needed columns to numbers.
 
-    The unit of columns with ISO 8601 times becomes "s" in ``meanings``.
+    Dates in ISO 8601 become UNIX times, and their unit in ``meanings`` becomes "s". The second
+    value is False for dates without time zone, otherwise True.
     """
-    named_columns = [index for index, meaning in enumerate(meanings) if meaning.kind]
-    texts = table.texts([*chosen_columns, *quaternion_columns, *named_columns])
+    known_columns = [index for index, meaning in enumerate(meanings) if meaning.kind]
+    texts = table.texts([*given_columns, *quaternion_columns, *known_columns])
     texts = _select_body(table, texts, meanings, body)
     is_comma_decimal = table.separator != ","
     # apply on an empty table returns the dtype object
     numbers = texts.apply(_to_numbers, is_comma_decimal=is_comma_decimal).astype(np.float64)
     has_time_zone = True
-    for index in chosen_columns[:1] or [i for i in named_columns if meanings[i].kind == "time"]:
+    for index in given_columns[:1] or [i for i in known_columns if meanings[i].kind == "time"]:
         if numbers[index].isna().mean() > 0.5 and texts[index].notna().any():
             numbers[index], has_time_zone = _read_dates(texts[index])
             meanings[index] = replace(meanings[index], unit="s")
@@ -318,7 +319,7 @@ def _read_numbers(
 
 
 def _drop_invalid_sigmas(samples: pd.DataFrame) -> list[str]:
-    """Replace zero and negative sigmas by NaN, and return a note on them."""
+    """Replace zero and negative sigmas in ``samples`` by NaN; return a note with their number."""
     is_not_positive = samples[SIGMA_COLUMNS] <= 0.0
     samples[SIGMA_COLUMNS] = samples[SIGMA_COLUMNS].mask(is_not_positive)
     count = int(is_not_positive.any(axis=1).sum())
@@ -337,7 +338,7 @@ def _to_numbers(texts: "pd.Series[str]", *, is_comma_decimal: bool) -> "pd.Serie
 
 
 def _read_dates(texts: "pd.Series[str]") -> tuple["pd.Series[float]", bool]:
-    """Convert ISO 8601 times to UNIX time (s); also return True if they have a time zone."""
+    """Convert dates in ISO 8601 to UNIX time (s), and return True if they have a time zone."""
     texts = texts.str.replace(",", ".", regex=False)
     dates = pd.to_datetime(texts, format="ISO8601", utc=True, errors="coerce")
     unix_s = (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
@@ -347,7 +348,7 @@ def _read_dates(texts: "pd.Series[str]") -> tuple["pd.Series[float]", bool]:
 def _select_body(
     table: Table, texts: pd.DataFrame, meanings: Sequence[ColumnMeaning], body: str | None
 ) -> pd.DataFrame:
-    """Return the rows of the chosen body, if a column contains tags of several bodies."""
+    """Return the rows of one rigid body or UWB tag, if a column contains their names."""
     for index, meaning in enumerate(meanings):
         if meaning.kind == "tag":
             tags = texts[index].dropna().unique().tolist()
@@ -363,7 +364,7 @@ def _select_body(
 
 def _column_indices(table: Table, wanted_columns: tuple[str, ...]) -> list[int]:
     names = [name.casefold() for name in table.names]
-    # A name is preferred to the number of a column
+    # A number is the name of a column, or else its position in the header
     names += [str(index + 1) for index in range(len(names))]
     indices = []
     for column in wanted_columns:
@@ -385,31 +386,31 @@ def _column_indices(table: Table, wanted_columns: tuple[str, ...]) -> list[int]:
 def _choose_columns(
     table: Table,
     meanings: Sequence[ColumnMeaning],
-    chosen_columns: list[int],
+    given_columns: list[int],
     numbers: pd.DataFrame,
 ) -> tuple[int, _Columns, _Columns, str | None, str]:
-    """Return the columns of time, position and sigma, the frame, and the name of the time column.
+    """Choose the columns of time, position and sigma; return also the frame and a text on the time.
 
-    The time of measurement is preferred to the time of recording.
+    A column with the time of measurement is preferred to the time of recording.
     """
-    if chosen_columns:
-        time_column = chosen_columns[0]
+    if given_columns:
+        time_column = given_columns[0]
         time_text = table.label(time_column)
         frame = None
-        axis_columns: _Columns = (*chosen_columns[1:4], None)[:3]
+        axis_columns: _Columns = (*given_columns[1:4], None)[:3]
         # The column names may contain the frame, which determines the order of the axes
-        chosen_meanings = [
+        given_meanings = [
             meaning if index in axis_columns else ColumnMeaning()
             for index, meaning in enumerate(meanings)
         ]
-        named_axis_columns = position_names.find_position(chosen_meanings)
+        named_axis_columns = position_names.find_position(given_meanings)
         if named_axis_columns and {*named_axis_columns[1]} == {*axis_columns}:
             frame, axis_columns = named_axis_columns
     else:
         time_columns = [index for index, column in enumerate(meanings) if column.kind == "time"]
         is_mostly_empty = numbers[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
         kind_rank = position_names.TIME_KINDS.index
-        time_column, *other_times = sorted(
+        time_column, *other_time_columns = sorted(
             time_columns,
             key=lambda index: (
                 is_mostly_empty[index],
@@ -418,20 +419,22 @@ def _choose_columns(
             ),
         )
         time_text = table.label(time_column)
-        for index in [*other_times]:
+        for index in [*other_time_columns]:
             are_whole_seconds = (numbers[time_column] % 1.0 == 0.0).mean() > MIN_USABLE_FRACTION
             if are_whole_seconds and meanings[index].unit == "ns" and numbers[index].max() < 1e9:
                 numbers[time_column] += numbers[index] * 1e-9
-                other_times.remove(index)
+                other_time_columns.remove(index)
                 time_text += f" plus {table.label(index)}"
-        if other_times:
-            time_text += f" ({meanings[time_column].key}; not used: {table.label(*other_times)})"
+        if other_time_columns:
+            time_text += (
+                f" ({meanings[time_column].key}; not used: {table.label(*other_time_columns)})"
+            )
         frame, axis_columns = position_names.find_position(meanings) or (None, ())
     if axis_columns[2] is not None and numbers[axis_columns[2]].isna().all():
         axis_columns = (*axis_columns[:2], None)
     sigma_columns = (
-        (chosen_columns[4],) * 3
-        if len(chosen_columns) > 4
+        (given_columns[4],) * 3
+        if len(given_columns) > 4
         else position_names.find_sigma(meanings, frame)
     )
     return time_column, axis_columns, sigma_columns, frame, time_text
@@ -444,10 +447,10 @@ def _time_unit(
     units: Container[str],
     interval_range_s: tuple[float, float],
 ) -> tuple[str, str]:
-    """Return the unit of the time column, and the reason for this unit.
+    """Return the unit of the timestamps, and the reason for this unit.
 
-    A unit is plausible if it gives UNIX times, or if it is in ``units`` and gives a median interval
-    in ``interval_range_s``.
+    Without a unit from the user or in the column name, the unit is chosen that gives UNIX times
+    after 2000, or the first in ``units`` that gives a median interval in ``interval_range_s``.
     """
     if given_unit is not None:
         return given_unit, "the unit was given with --position-time-unit"
@@ -482,13 +485,17 @@ def _length_units(
     given_unit: str | None,
     max_extent_m: float,
 ) -> tuple[dict[int, float], str]:
-    """Return metres per unit of each column, and a text with the unit of the positions."""
+    """Return the length in metres of each column's unit, and a text on the unit of the positions.
+
+    Without a unit from the user or in the column names, positions are in mm if their extent in
+    metres exceeds ``max_extent_m``.
+    """
     name_units = {
         index: meaning.unit
         for index, meaning in enumerate(meanings)
         if meaning.unit in LENGTH_UNITS
     }
-    # Extent from 5 % to 95 % of the coordinates, because outliers must not determine the unit
+    # The extent is the range from 5 % to 95 %, so that outliers do not determine the unit
     extents = numbers[position_columns].quantile(0.95) - numbers[position_columns].quantile(0.05)
     max_extent = float(extents.max())
     unit = "m"

@@ -1,4 +1,4 @@
-"""Meaning of column names in position files, such as "x_m", "East [mm]" or "bag_time"."""
+"""Interpretation of column names in position files, such as "x_m", "East [mm]" or "bag_time"."""
 
 import re
 import unicodedata
@@ -25,12 +25,12 @@ _ROLES = {role: {*column_words.split(",")} for role, column_words in _TABLE["rol
 _TIME_ROLES = _ROLES["time"] | _ROLES["measured"] | _ROLES["recorded"] | _ROLES["context"]
 # Kinds of time columns, in order of preference
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
-# Column names without separator, such as "px" (position, x) and "xstd" (x, sigma)
-_GLUED_NAMES = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
+# Column names of two words without separator, such as "px" (position, x) and "xstd" (x, sigma)
+_JOINED_NAMES = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
 # Quaternion components, such as "qx", "q_RS_w []" and "pose.orientation.x"
 _QUATERNION_NAME = re.compile(r"(?:\bq|orientation|rotation|quat)(?:\w*_|[ .])?([wxyz])\b")
-# Coordinate frames with the names of their axes. px4fuse uses the first frame of which the file has
-# columns for both horizontal axes
+# Coordinate frame and names of its axes. The first frame is used of which the file has columns for
+# both horizontal axes
 _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
     ("ned", ("north", "east", "down")),
     ("enu", ("east", "north", "up")),
@@ -42,17 +42,17 @@ _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
 
 @dataclass(frozen=True)
 class ColumnMeaning:
-    """Meaning of one column name; all fields are empty strings if the name is unknown.
+    """Quantity, axis and unit in one column name; empty texts if the name is unknown.
 
     Attributes
     ----------
     kind : str
-        "time", "position", "sigma" or "tag".
+        "time", "position", "sigma" or "tag" (number of a UWB tag).
     key : str
         Name of the axis, or an element of :data:`TIME_KINDS`.
     unit : str
     group : str
-        Name without axis and unit, which is the same for x, y and z of one position.
+        Column name without axis and unit. The columns x, y and z of one position have one group.
     """
 
     kind: str = ""
@@ -62,7 +62,7 @@ class ColumnMeaning:
 
 
 def read_column_name(name: str) -> ColumnMeaning:
-    """Derive kind, axis, unit and group from a column name."""
+    """Find quantity, axis and unit in a column name."""
     plain_name = unicodedata.normalize("NFKC", name).replace("μ", "u")
     plain_name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", plain_name).lower()
     column_words = re.findall(r"[^\W_]+", plain_name)
@@ -84,7 +84,7 @@ def read_column_name(name: str) -> ColumnMeaning:
     position_words = _ROLES["sigma"] | _ROLES["context"]
     split_words: list[str] = []
     for word in column_words:
-        match = None if word in position_words else _GLUED_NAMES.fullmatch(word)
+        match = None if word in position_words else _JOINED_NAMES.fullmatch(word)
         split_words += [group for group in match.groups() if group] if match else [word]
     axes = [_AXES[word] for word in split_words if word in _AXES]
     other_words = [word for word in split_words if word not in _AXES]
@@ -98,10 +98,9 @@ def read_column_name(name: str) -> ColumnMeaning:
 
 
 def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, PositionColumns] | None:
-    """Return frame and column indices of the position.
+    """Return the coordinate frame of the position, and the column indices of its axes.
 
-    A position with height is preferred to a position without height. Return None if the file has no
-    position.
+    A position with height is preferred. Return None if no column contains a position.
     """
     columns_by_group: dict[str, dict[str, int]] = {}
     for index, column in enumerate(meanings):
@@ -116,7 +115,7 @@ def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Positi
 
 
 def find_sigma(meanings: Sequence[ColumnMeaning], frame: str | None) -> tuple[int | None, ...]:
-    """Return the index of the sigma column of each axis, or of the sigma column for all axes."""
+    """Return the index of each axis's sigma column; one column may apply to all axes."""
     sigma_columns: dict[str, int] = {}
     for index, meaning in enumerate(meanings):
         if meaning.kind == "sigma":

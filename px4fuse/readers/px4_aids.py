@@ -1,4 +1,4 @@
-"""Innovations, variances and fusion results of all aiding sources of EKF2 in a ULog.
+"""Reader of the innovations of all EKF2 aiding sources in a ULog, with variances and rejections.
 
 Source: PX4-Autopilot ``EKF2.cpp`` (PublishInnovations, PublishAidSourceStatus), v1.8 to main. The
 field names are in ``ekf2_parameters.toml``.
@@ -19,8 +19,8 @@ from px4fuse.readers.common import join_nearest
 from px4fuse.readers.field_maps import Layout, expand_columns
 from px4fuse.readers.ulog_topics import Topics
 
-# Maximum time difference (s) between an innovation and the logged variance S: the default logging
-# profile logs both topics every 0.5 s, and S changes little in that time
+# Maximum time difference (s) between a logged innovation and its logged variance S. By default, PX4
+# logs each topic every 0.5 s, and S changes little in this time
 JOIN_TOLERANCE_S = 0.6
 # Field of estimator_aid_src topics with the time of the last fusion, by column name
 LAST_FUSED = {"last_fused_us": "time_last_fuse"}
@@ -33,10 +33,10 @@ OPTIONAL_FIELDS = {
 
 
 def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
-    """Read all aiding sources with innovations in the log, by PX4 name.
+    """Read the innovations of each aiding source of EKF2; the keys are PX4's names of the sources.
 
-    A topic ``estimator_aid_src_...`` contains each fusion attempt. Older topics contain all aiding
-    sources, and repeat each value until the next fusion.
+    Since v1.14, a topic ``estimator_aid_src_...`` contains each fusion attempt. Older topics
+    contain all aiding sources, and repeat each innovation until the next fusion.
     """
     log_by_aid = {}
     for name, aid in AIDS.items():
@@ -54,10 +54,10 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
 
 
 def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
-    """Read a step function for each aiding source: 1 while EKF2 enables fusion, otherwise 0.
+    """Read for each aiding source the times at which EKF2 enables its fusion: 1, otherwise 0.
 
-    The source is ``estimator_status_flags``, or the control bits of ``estimator_status`` in older
-    logs.
+    The flags are in ``estimator_status_flags``; in older logs, in the control bits of
+    ``estimator_status``.
     """
     enabled_aids = {}
     tables = topics.tables_of(px4.STATUS_FLAGS)
@@ -107,6 +107,7 @@ def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) 
 def _read_common_topics(
     topics: Topics, aid: Aid, enabled: pd.Series[float] | None
 ) -> AidLog | None:
+    """Read the innovations of an aiding source from the topics that contain all aiding sources."""
     is_in_gauss = aid.name == "mag_heading" and any(
         "cs_mag" in table for table in topics.tables_of(px4.STATUS_FLAGS)
     )
@@ -132,7 +133,8 @@ def _read_common_topics(
             topics.primary_samples(variance_layout)[f"variance_{aid.axes[0]}"],
         )
         if variance_layout is not value_layout:
-            # Nearest rows, because the logger decimates each topic separately, and S changes slowly
+            # The logger downsamples both topics separately. S changes slowly, so that the nearest
+            # logged S is used
             variance_samples = topics.primary_samples(variance_layout).dropna()
             samples = join_nearest(samples, variance_samples, JOIN_TOLERANCE_S)
         excluded_count = len(samples) - len(samples := samples.dropna())
@@ -153,8 +155,11 @@ def _drop_repeats(samples: pd.DataFrame) -> pd.DataFrame:
 
 
 def _unknown_fusion_times(innovation: pd.Series, variance: pd.Series) -> Array:
-    # EKF2 logs the innovation 0 if it had no sample. It computes S only to fuse a sample, so a new
-    # S shows a fusion even if the logged innovation is repeated from an older sample
+    """Return the times (s) at which EKF2 had no sample, or fused a sample with unlogged innovation.
+
+    Without a sample, EKF2 logs the innovation 0. A new variance S shows that EKF2 fused a sample,
+    even if the logged innovation belongs to an older sample.
+    """
     is_changed = (variance > 0.0) & variance.ne(variance.shift())
     return np.union1d(innovation.index[innovation == 0.0], variance.index[is_changed])
 
@@ -171,9 +176,9 @@ def _make_aid_log(
     enabled: pd.Series[float] | None,
     excluded_count: int = 0,
 ) -> AidLog | None:
-    """Make the record of an aiding source from the rows with positive innovation variance.
+    """Return the innovations of an aiding source; None without a positive innovation variance.
 
-    Innovations are negated, because PX4 logs predicted minus measured.
+    The sign is changed, because PX4 logs predicted minus measured.
     """
     samples = samples[(samples[[f"variance_{axis}" for axis in aid.axes]] > 0.0).all(axis=1)]
     if samples.empty:

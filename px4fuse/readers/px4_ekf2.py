@@ -1,4 +1,4 @@
-"""EKF2 data of a ULog: state, variances, innovations, resets, and state at the fusion horizon.
+"""Reader of EKF2 data in a ULog: state, variances, innovations, resets, fusion horizon.
 
 Sources: PX4-Autopilot ``EKF2.cpp`` (PublishStates), ``EKF/common.h`` (order of the states),
 ``msg/EstimatorStatusFlags.msg`` and ``msg/EstimatorStatus.msg`` (flags of aiding sources).
@@ -35,21 +35,23 @@ from px4fuse.readers.px4_innovations import innovations_by_axis
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 VISION_TOPIC = "vehicle_visual_odometry"
-# Fields of vehicle_local_position: 1 while EKF2 declares its horizontal position valid
+# Fields of vehicle_local_position that are 1 while EKF2 reports a valid horizontal position
 VALIDITY_FLAGS = ("xy_valid", "xy_global")
-# Number of EKF2 states that are read: attitude, velocity, position, biases and magnetic fields, but
-# not wind and terrain
+# Number of EKF2 states that are read: attitude, velocity, position, biases and magnetic fields.
+# Wind and terrain are not read
 STATE_COUNT = 22
 # Bit of filter_control_status_u (common.h) that is set while EKF2 fuses the 3D magnetic field
 MAG_3D_BIT = 5
-# Minimum logged rate (Hz) of a magnetometer topic with all samples: EKF2 uses 14 per second
+# Minimum logged rate (Hz) of magnetometer samples to assume that no sample is missing: EKF2 uses 14
+# samples per second
 MIN_COMPLETE_FIELD_HZ = 10.0
-# EKF2 may round the ratio of prediction interval to IMU interval up or down if its distance from
-# n + 0.5 is smaller
+# EKF2 rounds the ratio of prediction interval to IMU interval to a whole number. If the ratio is
+# closer to n + 0.5 than this limit, both whole numbers are possible
 MAX_HALF_RATIO_DISTANCE = 0.05
-# Maximum interval (s) between two logged rows of optical flow to undo EKF2's low-pass filter
+# Maximum interval (s) between two logged samples of low-pass filtered optical flow from which the
+# unfiltered flow is computed
 MAX_FLOW_INTERVAL_S = 0.5
-# Aiding sources of horizontal position and velocity other than external vision position
+# Aiding sources of horizontal position and velocity, except for the external vision position
 OTHER_HORIZONTAL_AIDS = (
     "gnss_pos",
     "gnss_vel",
@@ -150,10 +152,9 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
 
 
 def _state_vector(topics: Topics) -> tuple[str, int]:
-    """Return the topic with EKF2's state vector, and the number of attitude variances in it.
+    """Return the topic with EKF2's state vector, and its number of attitude variances (3 or 4).
 
-    The topic is an empty string if it is not logged. The number is 0 if the array lengths are
-    unknown.
+    The topic is "" if it is not logged. The number is 0 if no PX4 release has this state vector.
     """
     for topic in px4.STATE_VECTOR_TOPICS:
         for table in topics.tables_of(topic)[:1]:
@@ -165,10 +166,10 @@ def _state_vector(topics: Topics) -> tuple[str, int]:
 
 
 def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
-    """Read EKF2's state and variances at the fusion horizon, with equal columns for all releases.
+    """Read EKF2's state and variances at the fusion horizon.
 
-    ``step_s`` is the prediction interval (s). It is needed for releases that log biases as
-    increments per prediction.
+    The columns are equal for all PX4 releases. Older releases log the IMU biases as increments per
+    prediction; they are divided by the prediction interval ``step_s`` (s).
     """
     topic, attitude_variance_count = _state_vector(topics)
     if not topic:
@@ -202,7 +203,7 @@ def configured_step_s(topics: Topics) -> float:
 
 
 def _prediction_interval_s(topics: Topics) -> float:
-    """Return the prediction interval (s), a whole number of IMU intervals (ImuDownSampler.cpp)."""
+    """Return EKF2's prediction interval (s), a multiple of the IMU interval (ImuDownSampler)."""
     configured_s = configured_step_s(topics)
     imu_s = topics.read(Layout(px4.IMU.topic, {"time": "timestamp"})).index.to_numpy()
     if len(imu_s) < 2 or (interval_s := median_interval(imu_s)) >= configured_s:
@@ -228,10 +229,10 @@ def rows_of_timestamps(times_s: Array, wanted_times_s: ArrayLike) -> IntArray:
 def samples_per_step(
     configured_step_s: float, imu_interval_s: float, step_ends: ArrayLike = ()
 ) -> int:
-    """Return the number of IMU samples per EKF2 prediction: the nearest whole number.
+    """Return the number of IMU samples in one EKF2 prediction.
 
-    EKF2 may round a ratio near n + 0.5 up or down. It is rounded up here, unless only the smaller
-    number agrees with ``step_ends``, the indices of IMU samples at which logged predictions end.
+    This is the ratio of both intervals, rounded. A ratio near n + 0.5 is rounded down if only n
+    agrees with ``step_ends``, the indices of the IMU samples at which logged predictions end.
 
     >>> samples_per_step(0.010, 0.00375), samples_per_step(0.010, 0.004)
     (3, 3)
@@ -264,10 +265,10 @@ def _accelerometer_bias(topics: Topics, delayed_state: TableOrUnavailable) -> Ta
 
 
 def _horizon_delay_s(topics: Topics, step_s: float) -> float | Unavailable:
-    """Return the median delay (s) from EKF2's fusion horizon to publication.
+    """Return the median delay (s) from EKF2's fusion horizon to the publication of its state.
 
-    Before v1.13, timestamp_sample is the time of the newest IMU sample. The delay is then below one
-    prediction interval, and the horizon is unavailable.
+    The delay is not available before v1.13, where timestamp_sample is the time of the newest IMU
+    sample instead of the fusion horizon.
     """
     age_s = _publication_age_s(topics, _state_vector(topics)[0])
     if len(age_s) and (median_age_s := float(age_s.median())) > step_s:
@@ -276,7 +277,10 @@ def _horizon_delay_s(topics: Topics, step_s: float) -> float | Unavailable:
 
 
 def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
-    """Return the delay (s) from measurement to publication, indexed by measurement time (s)."""
+    """Return the delay (s) from measurement to publication of each sample of a topic.
+
+    The index is the measurement time (s).
+    """
     for table in topics.tables_of(topic)[:1]:
         if "timestamp_sample" in table:
             measured_us = measurement_time_us(table)
@@ -287,7 +291,7 @@ def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
 
 
 def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUnavailable:
-    """Read the fusion flags of external vision: horizontal and vertical position, and yaw."""
+    """Read EKF2's fusion flags of external vision: horizontal position, height and yaw."""
     aid_by_group = {"horizontal": "ev_pos", "vertical": "ev_hgt", "yaw": "ev_yaw"}
     if not {*aid_by_group.values()} <= enabled_aids.keys():
         return Unavailable(
@@ -306,7 +310,10 @@ def _read_fusion_flags(topics: Topics, enabled_aids: StepFunctions) -> TableOrUn
 
 
 def read_resets(local_samples: pd.DataFrame) -> tuple[Reset, ...]:
-    """Read the resets of the published state from its counters (uint8, wrapping) and deltas."""
+    """Return the resets of EKF2's position and velocity: time, and change along each axis.
+
+    A reset increments a counter in ``vehicle_local_position`` (uint8).
+    """
     resets = []
     for quantity, counter_field, delta_fields in _RESET_FIELDS:
         if counter_field not in local_samples:
@@ -330,9 +337,9 @@ def _read_fusion_record(
     enabled_aids: StepFunctions,
     step_s: float,
 ) -> FusionRecord | Unavailable:
-    """Read the data for a replay of EKF2 from the fusion horizon.
+    """Read the data that the replay of EKF2 needs.
 
-    ``local_samples`` are the samples of EKF2's published local position.
+    ``local_samples`` contains ``vehicle_local_position``, EKF2's published position.
     """
     topic, attitude_variance_count = _state_vector(topics)
     if topic != px4.STATE_VECTOR_TOPICS[0] or isinstance(delayed_state, Unavailable):
@@ -379,9 +386,9 @@ def _last_finite_value(samples: pd.DataFrame, column: str, default: float) -> fl
 
 
 def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
-    """Read the magnetic field from the magnetometer topic or from EKF2's observations.
+    """Read the measured magnetic field from the magnetometer topic or from EKF2's observations.
 
-    A topic with all samples is preferred, then EKF2's observations with filtered innovations.
+    A topic without missing samples is preferred, then a topic with innovations.
     """
     field_candidates = [
         topics.primary_samples(layout).dropna() for layout in px4.MAGNETIC_FIELD_LAYOUTS
@@ -406,7 +413,10 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
 
 
 def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
-    """Undo EKF2's low-pass filter: return the mean optical flow between successive logged rows."""
+    """Compute the mean unfiltered optical flow between successive logged samples.
+
+    EKF2 logs low-pass filtered flow.
+    """
     flow_velocity, flow_intervals, flow_noise = (
         topics.primary_samples(px4.LAYOUTS[f"flow_{quantity}"]).dropna()
         for quantity in ("velocity", "interval", "noise")
@@ -415,7 +425,7 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     if not interval_s > 0.0 or flow_noise.empty:
         return pd.DataFrame()
     times_s = flow_velocity.index.to_numpy()
-    # After longer intervals the low-pass filter no longer contains the samples of the previous row
+    # After a longer interval, the previous logged flow no longer affects the filtered flow
     steps_s = np.diff(times_s)
     used_rows = np.flatnonzero((steps_s > 0.5 * interval_s) & (steps_s <= MAX_FLOW_INTERVAL_S)) + 1
     if FLOW.name in enabled_aids:
@@ -423,7 +433,7 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     sample_count = np.rint((times_s[used_rows] - times_s[used_rows - 1]) / interval_s)
     filter_memory = ((1.0 - FLOW_FILTER_WEIGHT) ** sample_count)[:, None]
     filtered_velocity = flow_velocity[["forward_m_s", "right_m_s"]].to_numpy()
-    forward, right = (
+    forward_m_s, right_m_s = (
         (filtered_velocity[used_rows] - filter_memory * filtered_velocity[used_rows - 1])
         / (1.0 - filter_memory)
     ).T
@@ -437,8 +447,8 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     ).sum(axis=1)
     flow = pd.DataFrame(
         {
-            "forward_m_s": forward,
-            "right_m_s": right,
+            "forward_m_s": forward_m_s,
+            "right_m_s": right_m_s,
             "samples": sample_count,
             "interval_s": interval_s,
             "noise_m2_s2": squared_range
@@ -450,9 +460,10 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
 
 
 def _attitude_variance(quaternion: Array, variance: Array) -> Array:
-    """Convert quaternion variances to variances (rad²) of the attitude error about NED axes.
+    """Convert quaternion variances to variances (rad²) of the attitude error about the NED axes.
 
-    δθ = 2 Im(δq ⊗ q*). Correlations of the quaternion elements are not logged; zero is assumed.
+    The attitude error is δθ = 2 Im(δq ⊗ q*). Correlations of the quaternion elements are assumed to
+    be zero, because they are not logged.
     """
     w, x, y, z = quaternion.T
     error_per_quaternion = np.array([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])

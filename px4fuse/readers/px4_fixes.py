@@ -10,32 +10,33 @@ from px4fuse.readers.common import interpolate_inside
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.readers.ulog_topics import Topics
 
-# Maximum time difference (s) between a logged fix and EKF2's observation of it: receivers
-# send a fix every 0.05 s or less often
+# A logged fix and an EKF2 observation are from one GNSS measurement if their times differ by less
+# than this limit (s): receivers send at most 20 fixes per second
 MAX_SAME_FIX_S = 0.01
-# Maximum difference (°) of EKF2's observation from the logged latitude: above it (100 km), the
-# observation is a local position (m), not a latitude
+# EKF2's observation is a latitude (°) if it differs by less than this limit from the logged
+# latitude, otherwise a local position (m)
 MAX_LATITUDE_DISTANCE_DEG = 1.0
-# Possible intervals (s) of a GNSS receiver: receivers send 4 to 20 fixes per second
+# Possible intervals (s) between the fixes of a GNSS receiver: 4 to 20 fixes per second
 FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
-# Maximum deviation (s) of a logged interval from a multiple of the receiver's interval: half of an
-# EKF2 prediction interval, plus clock jitter
+# Maximum deviation (s) of a logged interval between fixes from a multiple of the receiver's
+# interval: half of an EKF2 prediction interval, plus clock jitter
 MAX_MULTIPLE_ERROR_S = 0.006
-# Minimum number of logged fixes to measure the error of reconstructed fixes
+# Minimum number of fixes that are both logged and reconstructed, to measure the error
 MIN_LOGGED_FIXES = 10
-# Minimum number of logged intervals with a length of n receiver intervals, and of those with n + 1:
-# otherwise n is unknown
+# Minimum number of logged intervals that are n receiver intervals long, and of those that are n + 1
+# long: with fewer, n is uncertain
 MIN_REPEATED_INTERVALS = 3
-# Maximum error (m, RMS) of reconstructed fixes, measured at fixes that are also logged
+# Maximum RMS error (m) of reconstructed fixes, measured at fixes that are both logged and
+# reconstructed
 MAX_RECONSTRUCTION_ERROR_M = 0.1
 
 
 def read_unlogged_fixes(
-    topics: Topics, gps: pd.DataFrame, ekf2: Ekf2 | Unavailable
+    topics: Topics, logged_fixes: pd.DataFrame, ekf2: Ekf2 | Unavailable
 ) -> pd.DataFrame:
-    """Read the fixes that are missing in ``gps`` from EKF2's GNSS topics (PX4 v1.16 and newer).
+    """Read GNSS fixes from EKF2's topics that are not in ``logged_fixes`` (PX4 v1.16 and newer).
 
-    ``gps`` contains the logged fixes. The logger drops fixes above its limit of 10 per second.
+    The logger writes at most 10 fixes per second.
     """
     layouts = px4.LAYOUTS["fused_position"], px4.LAYOUTS["fused_velocity"]
     if isinstance(ekf2, Unavailable) or not all(map(topics.find, layouts)):
@@ -51,16 +52,21 @@ def read_unlogged_fixes(
     if topics.find(height_layout) and topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
         fixes = fixes.join(topics.primary_samples(height_layout))
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
-    next_row = np.clip(np.searchsorted(gps.index, fixes.index), 1, len(gps) - 1)
+    next_row = np.clip(np.searchsorted(logged_fixes.index, fixes.index), 1, len(logged_fixes) - 1)
     distance_s = np.minimum(
-        *(np.abs(gps.index.to_numpy()[next_row - offset] - fixes.index) for offset in (0, 1))
+        *(
+            np.abs(logged_fixes.index.to_numpy()[next_row - offset] - fixes.index)
+            for offset in (0, 1)
+        )
     )
-    is_between_fixes = (fixes.index > gps.index[0]) & (fixes.index < gps.index[-1])
-    logged_fixes = fixes[distance_s <= MAX_SAME_FIX_S]
+    is_between_fixes = (fixes.index > logged_fixes.index[0]) & (
+        fixes.index < logged_fixes.index[-1]
+    )
+    matched_fixes = fixes[distance_s <= MAX_SAME_FIX_S]
     unlogged_fixes = fixes[(distance_s > MAX_SAME_FIX_S) & is_between_fixes]
     # Before v1.16 the observation is a local position in m
     is_in_degrees = (
-        logged_fixes["latitude_deg"].sub(gps["latitude_deg"].median()).abs().median()
+        matched_fixes["latitude_deg"].sub(logged_fixes["latitude_deg"].median()).abs().median()
         < MAX_LATITUDE_DISTANCE_DEG
     )
     return unlogged_fixes if is_in_degrees else pd.DataFrame()
@@ -69,10 +75,10 @@ def read_unlogged_fixes(
 def reconstruct_fixes(
     fixes: pd.DataFrame, ekf2: Ekf2 | Unavailable, delay_s: float
 ) -> tuple[pd.DataFrame, str]:
-    """Reconstruct unlogged fixes as EKF2 position plus innovation (PX4 up to v1.15).
+    """Reconstruct GNSS fixes that are not logged as EKF2 position plus innovation (up to v1.15).
 
-    Return the fixes, with interpolated heights, and a note; both are empty if the error at logged
-    fixes exceeds MAX_RECONSTRUCTION_ERROR_M.
+    Return the fixes, with interpolated heights, and a note for the user. Both are empty if the
+    error of reconstructed fixes exceeds MAX_RECONSTRUCTION_ERROR_M.
 
     Parameters
     ----------
@@ -94,19 +100,21 @@ def reconstruct_fixes(
         or isinstance(east, Unavailable)
     ):
         return no_fixes
-    # A fix older than the fusion horizon is fused at the horizon, so later (RingBuffer.h)
+    # EKF2 fuses a fix that is older than the fusion horizon at the horizon (RingBuffer.h)
     delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
     fused_s = north.index.to_numpy() - delay_beyond_horizon_s
     # An innovation belongs to the last fix before it. This fix came a whole number of receiver
     # intervals after the last logged fix, 0 if the fix itself is logged
     previous_fix_index = np.searchsorted(logged_fix_s, fused_s) - 1
-    intervals_passed = (fused_s - logged_fix_s[previous_fix_index]) / receiver_interval_s
+    elapsed_intervals = (fused_s - logged_fix_s[previous_fix_index]) / receiver_interval_s
     is_between_fixes = (previous_fix_index >= 0) & (previous_fix_index < len(logged_fix_s) - 1)
     # Skip innovations within one EKF2 step after a fix: they may also belong to the fix before
-    is_unambiguous = is_between_fixes & (intervals_passed % 1.0 > ekf2.step_s / receiver_interval_s)
+    is_unambiguous = is_between_fixes & (
+        elapsed_intervals % 1.0 > ekf2.step_s / receiver_interval_s
+    )
     previous_fix_index = previous_fix_index[is_unambiguous]
-    intervals_passed = np.floor(intervals_passed[is_unambiguous])
-    reconstructed_fix_s = logged_fix_s[previous_fix_index] + intervals_passed * receiver_interval_s
+    elapsed_intervals = np.floor(elapsed_intervals[is_unambiguous])
+    reconstructed_fix_s = logged_fix_s[previous_fix_index] + elapsed_intervals * receiver_interval_s
     reconstructed_fixes = pd.DataFrame(
         {
             column: interpolate_inside(
@@ -117,7 +125,7 @@ def reconstruct_fixes(
         },
         index=time_index(reconstructed_fix_s),
     )
-    is_logged = intervals_passed == 0.0
+    is_logged = elapsed_intervals == 0.0
     position_error = (
         reconstructed_fixes - fixes[reconstructed_fixes.columns].to_numpy()[previous_fix_index]
     )
@@ -141,9 +149,10 @@ def reconstruct_fixes(
 
 
 def _receiver_interval_s(times: Array) -> float | None:
-    """Return the longest interval (s) of which all logged intervals are multiples.
+    """Estimate the interval (s) of a GNSS receiver of which the log contains only some fixes.
 
-    Return None if all logged intervals are equal, because the multiple is then unknown.
+    It is the longest interval of which all logged intervals are multiples. Return None if all
+    logged intervals are equal, because the multiple is then unknown.
     """
     logged_intervals_s = np.diff(times)[:, None]
     multiples = logged_intervals_s / FIX_INTERVALS_S

@@ -1,4 +1,4 @@
-"""Innovations of a position source along each axis, from EKF2's aiding sources."""
+"""Innovations of external vision or GNSS along each axis, from EKF2's aiding sources."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -8,14 +8,14 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETER_TABLES
-from px4fuse.flight.model import AXIS_NAMES, AidLog, AxisName, Ekf2, TableOrUnavailable, Unavailable
+from px4fuse.flight.model import AXIS_NAMES, AidLog, Ekf2, NedAxis, TableOrUnavailable, Unavailable
 
-Innovations = dict[AxisName, TableOrUnavailable]
+Innovations = dict[NedAxis, TableOrUnavailable]
 
 
 @dataclass(frozen=True)
 class Ekf2Source:
-    """Position source of EKF2: external vision or GNSS, with its aiding sources."""
+    """External vision or GNSS as position source, and the EKF2 aiding sources that belong to it."""
 
     name: str
     # PX4's names of the aiding sources for horizontal position and height
@@ -25,7 +25,7 @@ class Ekf2Source:
     remedies: Mapping[str, str]
     # Advice to the user if the innovations are not logged
     to_log: str
-    # Name of a separate height sensor, if any
+    # Name of the height sensor, if it is not the position source itself
     height: str = ""
 
 
@@ -47,7 +47,7 @@ GNSS_AND_BAROMETER = replace(
 def has_fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
     """Return True if EKF2 fused the aiding source at any time.
 
-    If the log contains no fusion flags, return True if EKF2 enabled the aiding source.
+    If the log contains no fusion flags, EKF2 is assumed to fuse an enabled aiding source.
     """
     if isinstance(ekf2, Unavailable):
         return False
@@ -63,7 +63,7 @@ def has_fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
 
 
 def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
-    """Replace the innovations of external vision by the GNSS innovations."""
+    """Return the EKF2 data with GNSS innovations in place of external vision innovations."""
     enabled_flags = {
         group: ekf2.states[name]
         for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))
@@ -131,10 +131,10 @@ def innovations_by_axis(
     return innovations, tuple(used_topics)
 
 
-def innovations_along(log: AidLog, axis: AxisName, gate: float) -> pd.DataFrame:
-    """Return the fused and rejected innovations of an aiding source along one axis.
+def innovations_along(log: AidLog, axis: NedAxis, gate: float) -> pd.DataFrame:
+    """Return the innovations of an aiding source along one axis which EKF2 fused or rejected.
 
-    EKF2 rejects all axes of a sample together.
+    EKF2 rejects a sample along all axes if one axis exceeds the ``gate`` (√S).
     """
     samples = log.samples
     nis_by_axis = {

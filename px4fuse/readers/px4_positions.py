@@ -1,4 +1,4 @@
-"""External position tracks and ground truth of a ULog."""
+"""Reader of the positions and the ground truth in a ULog."""
 
 from __future__ import annotations
 
@@ -46,19 +46,20 @@ from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
 MIN_TRACK_SAMPLES = 3
 EARTH_RADIUS_M = 6_371_000.0  # PX4's CONSTANTS_RADIUS_OF_EARTH, src/lib/geo/geo.h
 FIX_TYPE_3D = 3
+NO_FIX_ACTION = "Give the antenna a free view of the sky and wait for a fix."
 # Maximum delay (µs) from timestamp to publication if PX4 set the timestamp at the arrival
 MAX_ARRIVAL_DELAY_US = 100
-# Minimum fraction of arrival times among the timestamps, to report missing measurement times
+# If at least this fraction of the timestamps are arrival times, the log has no measurement times
 MIN_ARRIVAL_FRACTION = 0.9
-# Maximum time difference (s) between a height and the horizontal position to which it is added:
-# 2.5 cm error at a climb rate of 0.5 m/s
+# Maximum time difference (s) between a height and the horizontal position to which it is joined:
+# at a climb rate of 0.5 m/s, the height error is 2.5 cm
 MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
-# Maximum logged rate (Hz) to report that the logger dropped GNSS fixes: receivers send 5 to 20 Hz
+# If the logged GNSS rate (Hz) is lower, the logger dropped fixes: receivers send 5 to 20 Hz
 MAX_DOWNSAMPLED_HZ = 4.0
 STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
-# Length (µs) of each unit of timestamps
+# Length (µs) of each possible unit of timestamps
 STAMP_UNITS = {"microseconds": 1.0, "milliseconds": 1e3, "seconds": 1e6, "nanoseconds": 1e-3}
-# Maximum relative clock error with which the unit of timestamps is recognised from their rate
+# Maximum relative difference of a clock's rate from the boot clock to recognise its unit
 MAX_RATE_ERROR = 0.05
 AUTOPILOT_CLOCK = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude in degrees, optionally altitude in m
@@ -68,10 +69,10 @@ GeodeticPosition = tuple[float, ...]
 def read_positions(
     topics: Topics, ekf2: Ekf2 | Unavailable
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Read all external position tracks, best first, and the reasons for missing tracks."""
+    """Read the positions of all sources in the log, best first, and the missing sources."""
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
-    # EKF2's position observations contain no orientation; if EKF2 also fused the source's yaw, the
-    # source is odometry
+    # EKF2's position observations contain no orientation. If EKF2 also fused yaw from the position
+    # source, the source is odometry
     is_odometry = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
     return split_tracks(
         [
@@ -86,15 +87,15 @@ def read_positions(
 def split_tracks(
     tracks: list[PositionTrack | Unavailable],
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
-    """Separate position tracks, best first, from the records of missing tracks."""
+    """Separate available positions, best source first, from missing position sources."""
     available_tracks = [track for track in tracks if isinstance(track, PositionTrack)]
-    available_tracks.sort(key=lambda track: track.origin.preference_rank)
+    available_tracks.sort(key=lambda track: track.origin.find_preference_rank())
     missing_tracks = (track for track in tracks if isinstance(track, Unavailable))
     return tuple(available_tracks), tuple(missing_tracks)
 
 
 def unavailable_source(name: str, reason: str = "", remedy: str = "") -> Unavailable:
-    """Describe a missing position source; by default its topic is not logged."""
+    """Make the record of a missing position source. The default reason: its topic is not logged."""
     return Unavailable(
         f"position source {name}",
         reason or f"{name} is not logged",
@@ -112,15 +113,15 @@ def make_track(
     remedy: str = "",
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a position track from the valid samples, of which three are needed.
+    """Make a position track from the valid samples, or its reason if there are fewer than three.
 
     Parameters
     ----------
     samples : DataFrame
-        Columns of a track. Missing columns and variances of 0 become NaN: PX4 treats a variance of
-        0 as "not sent" (``EKF2.cpp``).
+        Positions (m) and variances (m²). Missing columns and variances of 0 become NaN: in PX4, a
+        variance of 0 means "not sent" (``EKF2.cpp``).
     needed_columns : list of str
-        Columns in which a valid sample must be finite.
+        Columns that are finite in a valid sample.
     track_fields
         Other fields of :class:`~px4fuse.flight.model.PositionTrack`.
     """
@@ -163,10 +164,10 @@ def _make_ulog_track(
     is_automatic: bool = True,
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a position track of the ULog topics ``topic_names``.
+    """Make a position track with the properties of the source ``name`` in ``px4_topics.toml``.
 
-    ``is_odometry`` is True if the orientation changes, ``is_automatic`` if px4fuse may select the
-    track without ``--position-source``.
+    ``is_odometry``: the source sends a changing orientation. ``is_automatic``: px4fuse may use the
+    source without the option ``--position-source``.
     """
     source = px4.TRACKS[name]
     origin = with_orientation(source.origin, is_changing=is_odometry)
@@ -213,10 +214,10 @@ def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable
 
 
 def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
-    """Describe the clock of a topic whose timestamps are not measurement times, else return None.
+    """Describe the clock of a topic whose timestamps are not measurement times, or return None.
 
-    PX4 uses the arrival time until it has received 500 TIMESYNC replies (``Timesync.cpp``). px4fuse
-    uses the arrival time if ``timestamp_sample`` is not boot time in microseconds.
+    PX4 replaces timestamps by arrival times until it has received 500 TIMESYNC replies
+    (``Timesync.cpp``). px4fuse does so if ``timestamp_sample`` is not boot time in microseconds.
     """
     table = topics.tables_of(topic)[0]
     if "timestamp_sample" not in table or len(table["timestamp"]) < MIN_TRACK_SAMPLES:
@@ -238,7 +239,7 @@ def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
 
 
 def _timestamp_clock(published_us: IntArray, sampled_us: IntArray) -> str:
-    """Return the clock of timestamps that are not boot time in microseconds."""
+    """Describe timestamps that are not boot time in µs, for example "UNIX time in milliseconds"."""
     if not sampled_us.any():
         return "0"
     rate_ratio = float(np.ptp(published_us)) / max(float(np.ptp(sampled_us)), 1.0)
@@ -277,10 +278,10 @@ def _make_derived_track(
     shift_s: float = 0.0,
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a track from positions in EKF2's topics, each with the height nearest in time.
+    """Make a position track from horizontal positions and heights in EKF2's topics.
 
-    Height and horizontal position of a vision sample have the same timestamp, but the logger
-    decimates both topics separately. EKF2 subtracted EKF2_EV_DELAY from the sender's timestamps.
+    The logger downsamples both topics separately, so the height that is nearest in time is used.
+    EKF2_EV_DELAY is added to the times, because EKF2 subtracts it from the sender's timestamps.
     """
     notes: tuple[str, ...] = ()
     if height is not None:
@@ -309,10 +310,9 @@ def _shift_times(samples: pd.DataFrame, shift_s: float) -> pd.DataFrame:
 def _reconstruct_track(
     topics: Topics, ekf2: Ekf2 | Unavailable, is_odometry: bool
 ) -> PositionTrack | Unavailable:
-    """Reconstruct the source's positions as EKF2 position plus innovation.
+    """Reconstruct external vision positions that are not logged: EKF2 position plus innovation.
 
-    The source's timestamps are not logged. The times of the innovations are used, which are late by
-    up to one interval of the source.
+    The times of the innovations are used. They are late by up to one interval of the source.
     """
     if isinstance(ekf2, Unavailable):
         return unavailable_source(px4.RECONSTRUCTION, "the log contains no EKF2 state")
@@ -388,10 +388,10 @@ def _local_origin(topics: Topics) -> GeodeticPosition | None:
 
 
 def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
-    """Convert latitude, longitude and altitude to north, east, down (m) from the origin.
+    """Convert latitude, longitude and altitude to north, east and down (m) from the origin.
 
-    If ``origin`` is None, the first sample is the origin. A receiver without a fix may report
-    latitude and longitude 0: these samples become NaN.
+    If ``origin`` is None, the first sample is the origin. Samples with latitude and longitude 0
+    become NaN, because receivers without a fix may report them.
     """
     global_positions = global_positions[Columns.GEODETIC]
     is_missing = (global_positions.iloc[:, :2] == 0.0).all(axis=1)
@@ -404,20 +404,25 @@ def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | No
 
 
 def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
-    """Read GNSS positions, with the measurement times that EKF2 assumes.
+    """Read GNSS positions with the measurement times that EKF2 assumes.
 
-    The measurement times are the timestamps minus EKF2_GPS_DELAY. PX4 since 2026 uses the driver's
-    measurement times if they differ from the timestamps (EKF2.cpp UpdateGpsSample,
+    EKF2 subtracts EKF2_GPS_DELAY from the timestamps. Since 2026, PX4 uses the measurement times of
+    the GNSS driver if they differ from the timestamps (EKF2.cpp UpdateGpsSample,
     estimator_interface.cpp).
     """
     layout = topics.find(*px4.layouts_of_track(px4.GPS_POSITION))
     if layout is None:
         return unavailable_source(px4.GPS_POSITION)
     fixes = topics.read_instance(layout)
+    message_count = len(fixes)
     if "fix_type" in fixes:
         fixes = fixes[fixes["fix_type"] >= FIX_TYPE_3D]
     if fixes.empty:
-        return unavailable_source(px4.GPS_POSITION, "the GNSS receiver never had a 3D fix")
+        return unavailable_source(
+            px4.GPS_POSITION,
+            f"the log has {message_count} {px4.GPS_POSITION}, none with a 3D fix",
+            NO_FIX_ACTION,
+        )
     parameters = topics.ekf2_parameters
     published_s = (fixes["published_us"].to_numpy() - topics.zero_us) * 1e-6
     has_driver_times = GNSS_MODE_PARAMETER in parameters and bool(
@@ -432,24 +437,12 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     if len(unlogged_fixes):
         fixes = pd.concat([fixes, unlogged_fixes]).sort_index()
         interpolated_count = int(fixes["altitude_m"].isna().sum())
-        # The added fixes lack some fields, which are copied from the previous fix
+        # EKF2's topics lack some fields of a fix, which are copied from the previous fix
         fixes = fixes.assign(altitude_m=fixes["altitude_m"].interpolate("index")).ffill()
-    samples = project_to_ned(fixes, _local_origin(topics))
-    if {"eph_m", "epv_m"} <= {*fixes}:
-        # EKF2 uses the horizontal accuracy as σ of each horizontal axis (gps_control.cpp)
-        samples["north_m2"] = samples["east_m2"] = fixes["eph_m"].to_numpy() ** 2
-        samples["down_m2"] = fixes["epv_m"].to_numpy() ** 2
-    # The velocity is added before the check, so that it is dropped together with a damaged
-    # position. Its variance per axis is the reported accuracy squared
-    velocity = fixes.reindex(columns=Columns.VELOCITY).set_axis(samples.index)
-    speed_accuracy_m_s = fixes.get("speed_accuracy_m_s", pd.Series(np.nan, fixes.index)).to_numpy()
-    samples = samples.assign(
-        **velocity, **dict.fromkeys(Columns.VELOCITY_VARIANCE, speed_accuracy_m_s**2)
-    )
-    samples = finite_rows(samples, Columns.POSITION)
+    samples = _gnss_samples(fixes, _local_origin(topics))
     rate_hz = sample_rate(samples)
-    notes: list[str] = []
-    if rate_hz < MAX_DOWNSAMPLED_HZ:
+    notes, is_downsampled = list[str](), rate_hz < MAX_DOWNSAMPLED_HZ
+    if is_downsampled:
         notes.append(
             f"the logger dropped GNSS fixes (logged rate {rate_hz:.1f} Hz). Set SDLOG_PROFILE bit "
             "1 to log all fixes"
@@ -459,13 +452,13 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
             f"{len(unlogged_fixes)} GNSS fixes that were not logged are read from "
             f"estimator_aid_src_gnss_pos ({interpolated_count} with interpolated height)"
         )
-    elif notes:
+    elif is_downsampled:
         reconstructed_fixes, note = reconstruct_fixes(samples, ekf2, delay_ms * 1e-3)
         if note:
             samples = pd.concat([samples, reconstructed_fixes]).sort_index()
             notes.append(note)
     track_fields: dict[str, Any] = {}
-    # the lever arm of each receiver is logged since v1.17
+    # Since v1.17, the lever arm of each receiver is logged
     if {*px4.ANTENNA_COLUMNS} <= {*fixes}:
         track_fields["lever_arm_m"] = tuple(fixes[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
     return _make_ulog_track(
@@ -482,8 +475,25 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     )
 
 
+def _gnss_samples(fixes: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
+    """Convert GNSS fixes to positions and velocities in NED with their variances."""
+    samples = project_to_ned(fixes, origin)
+    if {"eph_m", "epv_m"} <= {*fixes}:
+        # EKF2 uses the horizontal accuracy as σ of each horizontal axis (gps_control.cpp)
+        samples["north_m2"] = samples["east_m2"] = fixes["eph_m"].to_numpy() ** 2
+        samples["down_m2"] = fixes["epv_m"].to_numpy() ** 2
+    # The velocity is added here, so that it is dropped together with a damaged position. The
+    # variance of each velocity component is the reported speed accuracy squared
+    velocity = fixes.reindex(columns=Columns.VELOCITY).set_axis(samples.index)
+    speed_accuracy_m_s = fixes.get("speed_accuracy_m_s", pd.Series(np.nan, fixes.index)).to_numpy()
+    samples = samples.assign(
+        **velocity, **dict.fromkeys(Columns.VELOCITY_VARIANCE, speed_accuracy_m_s**2)
+    )
+    return finite_rows(samples, Columns.POSITION)
+
+
 def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFrame | None:
-    """Return the barometer height as column ``down_m``, with times that are ``delay_s`` earlier.
+    """Convert barometer altitude to the column ``down_m`` (m), at times minus ``delay_s``.
 
     Return None with fewer than three samples.
     """
@@ -498,8 +508,8 @@ def read_truth(
 ) -> Truth | Unavailable:
     """Read ground truth from the simulation, or from motion capture if EKF2 uses another source.
 
-    Up to v1.13 the simulation logs only latitude and longitude. If EKF2 fused GNSS, its origin
-    differs from the origin of the simulation, so the ground truth is shifted to EKF2's origin.
+    Up to v1.13, the simulation logs latitude and longitude only. If EKF2 fused GNSS, the ground
+    truth is shifted from the origin of the simulation to EKF2's origin.
     """
     attitude = read_attitude(topics.read(px4.LAYOUTS["truth_attitude"]))
     local_layout, global_layout = px4.LAYOUTS["truth_local"], px4.LAYOUTS["truth_global"]
@@ -521,7 +531,7 @@ def read_truth(
                 local_samples[column] += np.nan_to_num(shift_m)
     if len(local_samples):
         return Truth(local_layout.topic, local_samples, attitude)
-    mocap_truth = motion_capture_truth(positions, "vehicle_mocap_odometry")
+    mocap_truth = motion_capture_truth(positions)
     reason = "the log has neither simulation ground truth nor motion capture"
     remedy = px4.TRACKS["vehicle_mocap_odometry"].remedy
     if len(logged_local):
@@ -530,12 +540,14 @@ def read_truth(
     return mocap_truth or Unavailable("ground truth", reason, remedy)
 
 
-def motion_capture_truth(positions: tuple[PositionTrack, ...], topic: str) -> Truth | None:
-    """Return motion capture as ground truth, if the log also contains external vision.
+def motion_capture_truth(positions: tuple[PositionTrack, ...]) -> Truth | None:
+    """Return motion capture as ground truth, or None if EKF2 may have fused it.
 
-    Without external vision, EKF2 may have fused motion capture.
+    EKF2 may have fused motion capture if the log contains no external vision. The
+    north of positions in FRD is unknown.
     """
-    track = next((track for track in positions if track.topics[0] == topic), None)
+    tracks = (track for track in positions if track.origin.kind == "mocap")
+    track = next((track for track in tracks if track.frame != "FRD"), None)
     if track is None or not any(track.origin.is_vision for track in positions):
         return None
     samples = track.samples.reindex(columns=Columns.STATE)

@@ -1,9 +1,9 @@
 """PX4 topic and field names of all supported PX4 releases.
 
-``px4_topics.toml`` contains the layouts (topic, fields and DataFrame columns) of each quantity. A
-reader uses the first layout whose topic contains all ``columns``; ``optional`` columns are read if
-they exist. Names are from PX4-Autopilot's ``msg/*.msg`` at the release tags in the comments of
-``px4_topics.toml``. The names of EKF2's aids are in ``ekf2_parameters.toml``.
+``px4_topics.toml`` contains one or more layouts of each quantity: topic, fields and DataFrame
+columns. The first layout is read of which the log contains the topic and all required fields. The
+names are from PX4-Autopilot's ``msg/*.msg`` at the releases in the comments of ``px4_topics.toml``.
+The names of EKF2's aiding sources are in ``ekf2_parameters.toml``.
 """
 
 from collections.abc import Mapping
@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import msgspec
+from msgspec import structs
 
 from px4fuse.core.record import read_toml
 from px4fuse.flight.ekf2_parameters import AIDS
@@ -20,22 +21,26 @@ from px4fuse.readers.field_maps import Layout, expand_layouts
 
 @dataclass(frozen=True)
 class TrackSource:
-    """Position track that a ULog may contain; its key in TRACKS is the ``--position-source``."""
+    """Position source that a ULog may contain, as ``px4_topics.toml`` describes it."""
 
-    # Kind of the position source, and route by which its positions reach the log (see Origin)
+    # Kind of the source, such as "uwb", and the way of its positions into the log (see Origin)
     kind: str
     path: str
     description: str
     # Advice how to record these positions
     remedy: str
-    # Frame of the positions; "unknown": value of the topic's frame field (FRAMES), if it has one
+    # False if EKF2 never fuses these positions
+    fused: bool = True
+    # Coordinate frame of the positions. If "unknown", a field of the topic may contain it (FRAMES)
     frame: str = "unknown"
-    # Keys in LAYOUTS of its topic in different PX4 releases; empty if no topic contains the track
+    # Keys in LAYOUTS, one for each format of the topic in PX4 releases; empty for positions that
+    # are computed from several topics
     layouts: tuple[str, ...] = ()
 
     @property
     def origin(self) -> Origin:
-        return find_origin(self.kind, self.path)
+        origin = find_origin(self.kind, self.path)
+        return origin if self.fused else structs.replace(origin, aid=None)
 
 
 _TABLE = read_toml(__file__, dict[str, dict[str, Any]])
@@ -45,14 +50,14 @@ FRAMES = msgspec.convert(_TABLE["frames"], dict[str, dict[int, str]], strict=Fal
 UNUSED_TOPICS: Mapping[str, str] = _TABLE["unused"]
 IMU, LOCAL_POSITION = LAYOUTS["imu"], LAYOUTS["local_position"]
 HEIGHT_BIAS_LAYOUTS = {name: LAYOUTS[f"bias_of_{name}"] for name in ("baro_hgt", "gnss_hgt")}
-# Advice if topics of the default logging profile are not logged
+# Advice to the user if a topic of the default logging profile is not logged
 DEFAULT_PROFILE_REMEDY = "Record with SDLOG_PROFILE bit 0 (default)."
 # Topics with EKF2's state vector and variances, in order of preference
 STATE_VECTOR_TOPICS = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
 # Layouts of the measured magnetic field: magnetometer, and EKF2's observation (since v1.14)
 MAGNETIC_FIELD_LAYOUTS = LAYOUTS["magnetometer"], LAYOUTS["observed_field"]
-# Number of attitude variances, by the numbers of logged states and variances: 4 for a filter with
-# quaternion states, 3 for an error-state filter (generated/state.h, v1.15.4 and v1.16)
+# Number of attitude variances of EKF2, by the number of logged states and of logged variances: 4
+# for quaternion states, 3 for an error-state filter (generated/state.h, v1.15.4 and v1.16)
 ATTITUDE_VARIANCE_COUNTS: Mapping[tuple[int, int], int] = {
     (24, 24): 4,
     (24, 23): 3,
@@ -61,16 +66,16 @@ ATTITUDE_VARIANCE_COUNTS: Mapping[tuple[int, int], int] = {
 }
 QUATERNION_VARIANCE_COUNT = 4
 ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]
-# Names for ``--position-source``: EKF2's observations, reconstruction from innovations, GNSS
+# Names in the option --position-source: EKF2's observations, EKF2 position plus innovation, GNSS
 FUSED_OBSERVATION = "estimator_aid_src_ev_pos"
 RECONSTRUCTION = "ekf2_state_plus_innovation"
 GPS_POSITION = "vehicle_gps_position"
-# Tracks of external vision and motion capture that have a separate topic
+# Position sources, other than GNSS, with a topic that contains the positions
 SOURCE_TRACKS = [name for name, track in TRACKS.items() if track.layouts and name != GPS_POSITION]
 ORIGIN_BY_TRACK_NAME = {name: track.origin for name, track in TRACKS.items()}
-# Aiding sources whose flag "fused" is always set in v1.15 and v1.16, so it is not used
+# Aiding sources whose flag "fused" is always set in v1.15 and v1.16. The flag is not used
 AIDS_ALWAYS_FUSED = ("gravity", "drag")
-# Aiding sources with a local position as logged observation (GNSS has latitude and longitude)
+# Aiding sources whose logged observation is a local position; that of GNSS is a latitude
 AIDS_WITH_OBSERVATION = ("ev_pos", "ev_hgt")
 STATUS_FLAGS, STATUS_TOPIC = "estimator_status_flags", "estimator_status"
 # Topics with the innovations and the innovation variances of all aiding sources (since v1.12)
@@ -78,13 +83,13 @@ INNOVATION_TOPICS = "estimator_innovations", "estimator_innovation_variances"
 OLD_INNOVATION_TOPIC = "ekf2_innovations"
 
 
-def layouts_of_track(track: str) -> list[Layout]:
-    """Return the possible topics and fields of a position track, best first.
+def layouts_of_track(source_name: str) -> list[Layout]:
+    """Return the possible topics and fields of a position source, best first.
 
-    If a layout has no topic, the name of the track is the topic.
+    If a layout contains no topic, the topic has the name of the position source.
     """
-    layouts = [LAYOUTS[name] for name in TRACKS[track].layouts]
-    return [replace(layout, topic=layout.topic or track) for layout in layouts]
+    layouts = [LAYOUTS[name] for name in TRACKS[source_name].layouts]
+    return [replace(layout, topic=layout.topic or source_name) for layout in layouts]
 
 
 def topics() -> list[str]:

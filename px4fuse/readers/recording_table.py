@@ -1,8 +1,8 @@
-"""Tables in recordings of positions: each format is converted to columns with names.
+"""Detection of the table in a position file, whose format is converted to named columns.
 
 A table with a header is found by its column names. Other formats are recognised by their
-structure: group headers of Motive and Vicon Nexus, JSON lines, KITTI matrices, tables without a
-header, and the streams of ``formats.toml``.
+structure: headers of Motive and Vicon Nexus, JSON lines, KITTI matrices, tables without a header,
+and the text formats of UWB systems in ``formats.toml``.
 """
 
 import csv
@@ -22,7 +22,7 @@ from px4fuse.readers import position_names
 from px4fuse.readers.position_names import read_column_name
 from px4fuse.readers.text_table import STREAM_FORMATS, decode_text, is_number, quote
 
-# Maximum size (bytes) of a recording: several days of UWB positions
+# Maximum size (bytes) of a position file: several days of UWB positions
 MAX_FILE_BYTES = 500_000_000
 # Number of lines at the beginning of the file in which the header is searched
 MAX_HEADER_LINES = 1000
@@ -37,27 +37,28 @@ _ISO_DATE = re.compile(r"\d{4}-\d\d-\d\d")
 
 @dataclass(frozen=True)
 class Table:
-    """Table of positions in a recording."""
+    """Table of positions in a file, as text with named columns."""
 
     file_name: str
     # Name of the format; "" for a table with a header
     format: str
     names: list[str]
-    # Lines below the header
+    # Text of the rows, without the header
     data_text: str
     separator: str = ","
-    # Line number of the header, 0 without a header; None if the rows are not lines of the file
+    # Line number of the header, 0 without a header. None if rows of the table are not lines of the
+    # file, as in JSON
     header_line: int | None = None
     # Coordinate frames that are possible for the format; empty if all are
     frames: tuple[str, ...] = ()
     # Frame rate, if the time column contains frame numbers instead of times
     rate_hz: float | None = None
-    # True if the columns belong to one body that was chosen from several
+    # True if the table contains only the rigid body, tag or topic that the user selected
     is_chosen_body: bool = False
     notes: tuple[str, ...] = ()
 
     def label(self, *columns: int | None) -> str:
-        """Join the names of columns for messages, without repeated columns and None."""
+        """Join the names of columns for a message; repeated indices and None are omitted."""
         labels = dict.fromkeys(
             quote(self.names[index]) if self.names[index] else f"column {index + 1}"
             for index in columns
@@ -66,13 +67,13 @@ class Table:
         return ", ".join([*labels][:12]) + (", ..." if len(labels) > 12 else "")
 
     def first_line(self, rows: pd.Index) -> str:
-        """Format the line number of the first of some rows; "" if rows are not lines."""
+        """Return the line number of the first row for a message; "" if rows are not lines."""
         return (
             "" if self.header_line is None else f" (first: line {self.header_line + 1 + rows[0]})"
         )
 
     def texts(self, columns: Iterable[int]) -> pd.DataFrame:
-        """Return the cells of the columns as text, without rows in which all cells are empty."""
+        """Return the text in each cell of the given columns, without empty rows."""
         column_indices = sorted({*columns})
         try:
             texts = pd.read_csv(
@@ -96,14 +97,14 @@ class Table:
 
 
 def choose_body(file_name: str, bodies: Iterable[str], wanted_body: str | None) -> str:
-    """Return the body to use: the wanted one, or the only one of the file.
+    """Return the name of the rigid body whose positions are read.
 
-    Vicon Nexus repeats the name of the subject, as in ``drone:drone``.
+    ``drone`` also selects ``drone:drone``, because Vicon Nexus repeats the name of a body.
 
     Raises
     ------
     LogError
-        The file contains several bodies and none is wanted, or it does not contain the wanted one.
+        The file does not contain ``wanted_body``, or this is None and the file has several bodies.
     """
     names = [*dict.fromkeys(bodies)]
     matches = names if wanted_body is None else [name for name in names if name == wanted_body]
@@ -118,17 +119,18 @@ def choose_body(file_name: str, bodies: Iterable[str], wanted_body: str | None) 
 def find_table(
     path: Path, content: bytes, columns: tuple[str, ...] | None, body: str | None
 ) -> Table:
-    """Find the table of positions in a recording.
+    """Find the table of positions in a file.
 
     Parameters
     ----------
     path : Path
-        Path of the recording; times of KITTI poses are read from a file in the same folder.
+        Path of the file. The times of KITTI poses are read from another file in its folder.
     content : bytes
+        Content of the file.
     columns : tuple of str or None
-        Names or numbers of the columns that the header must contain.
+        Names or numbers of the columns that the table must contain.
     body : str or None
-        Body to choose from group headers.
+        Rigid body whose positions are read, if the file contains several.
 
     Raises
     ------
@@ -177,7 +179,7 @@ def find_table(
 
 
 def _is_complete_line(line: str, line_before: str) -> bool:
-    """Return True if the last line has as many columns and decimals as the line before."""
+    """Return True if a line has as many columns and decimals as the line before it."""
     cells, cells_before = (re.split(r"[\s,;]+", text.strip()) for text in (line, line_before))
     decimals, decimals_before = (
         row_cells[-1].partition(".")[2] for row_cells in (cells, cells_before)
@@ -194,7 +196,10 @@ def _split_line(line: str, separator: str) -> list[str]:
 def _find_header_table(
     file_name: str, text: str, lines: Sequence[str], wanted_names: set[str]
 ) -> Table | None:
-    """Find the first line that names time and position, or contains the wanted names."""
+    """Find the header: the first line with column names for time and position.
+
+    If ``wanted_names`` is not empty, the header is the first line with these column names.
+    """
     for index, line in enumerate(lines):
         for separator in SEPARATORS:
             names = _split_line(line.strip("#% "), separator)
@@ -215,7 +220,7 @@ def _is_header(fields: list[str], wanted_names: set[str]) -> bool:
 def _find_body_table(
     file_name: str, text: str, lines: Sequence[str], wanted_body: str | None
 ) -> Table | None:
-    """Find the columns of one body below the group headers of Motive or Vicon Nexus."""
+    """Find the columns of one rigid body in a CSV export of Motive or Vicon Nexus."""
     header_index = next((i for i, line in enumerate(lines[:12]) if line.startswith("Frame,")), 0)
     rows = [_split_line(line, ",") for line in lines[: header_index + 2]]
     is_motive = header_index >= 3 and rows[0][0] == "Format Version"
@@ -228,7 +233,7 @@ def _find_body_table(
         row_by_title = {row[1]: row for row in rows[2:header_index]}
         body_names, body_types = (row_by_title.get(title, axes) for title in ("Name", "Type"))
         used_types = {"Rigid Body"} if "Rigid Body" in body_types else {*body_types}
-        # A name "" omits a column. Rotations are omitted: the axes of a rigid body are not FRD
+        # Columns without a name are not read: rotations, because a rigid body's axes are not FRD
         names = [
             f"{axis}_{unit}" if group == "Position" and body_type in used_types else ""
             for axis, group, body_type in zip(
@@ -266,24 +271,24 @@ def _find_body_table(
 
 
 def _find_stream_table(file_name: str, text: str, lines: Sequence[str]) -> Table | None:
-    """Convert the positions of a known stream format to a table."""
-    for stream in STREAM_FORMATS:
-        pattern = re.compile(stream["row"], re.MULTILINE)
+    """Find the positions in a text format of ``formats.toml``, such as the output of a UWB tag."""
+    for stream_format in STREAM_FORMATS:
+        pattern = re.compile(stream_format["row"], re.MULTILINE)
         first_row = next((line for line in lines if pattern.match(line)), None)
         if first_row is not None:
             rows = pattern.findall(text)
-            range_count = len(re.findall(stream["ranges"], first_row))
+            range_count = len(re.findall(stream_format["ranges"], first_row))
             notes = [f"px4fuse does not use the {range_count} UWB ranges in each line"]
             if lost_count := text.count("\n") - len(rows):
                 notes.append(f"lines without a position: {lost_count}")
             csv_text = "".join(f"{','.join(row)}\n" for row in rows)
             names = [*pattern.groupindex]
-            return Table(file_name, stream["name"], names, csv_text, notes=tuple(notes))
+            return Table(file_name, stream_format["name"], names, csv_text, notes=tuple(notes))
     return None
 
 
 def _find_json_table(file_name: str, text: str) -> Table | None:
-    """Convert JSON lines to a table; column names are paths such as ``data.coordinates.x``."""
+    """Convert a file of JSON lines to a table with column names like ``data.coordinates.x``."""
     if not text.lstrip().startswith(("{", "[{")):
         return None
     try:
@@ -312,7 +317,7 @@ def _find_json_table(file_name: str, text: str) -> Table | None:
 
 
 def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Table | None:
-    """Read a table without header as time, x, y, z, or as the matrices of KITTI."""
+    """Read a table without header: columns time, x, y, z, or 3x4 matrices in KITTI files."""
     plain_lines = (line.partition("#")[0] for line in lines)
     first_row = next((line for line in plain_lines if line.strip(" \t%")), "")
     for separator in SEPARATORS:
@@ -341,7 +346,7 @@ def _without_comments(text: str) -> str:
 
 
 def _kitti_table(path: Path, text: str) -> Table:
-    """Read KITTI poses (rows of 3x4 matrices), and their times from a file in the same folder."""
+    """Read poses from the 3x4 matrices of a KITTI file, and times from a file in its folder."""
     # imported here, because most recordings need no rotations
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 

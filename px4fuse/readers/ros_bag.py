@@ -1,4 +1,4 @@
-"""Positions in ROS bags: bags of ROS 1 and 2 (SQLite, MCAP), read with the library rosbags."""
+"""Reader of positions in ROS bags of ROS 1 and 2 (SQLite, MCAP), with the library rosbags."""
 
 import hashlib
 from collections import deque
@@ -24,7 +24,7 @@ _FRAME_NED = 1  # VehicleOdometry.POSE_FRAME_NED
 _POSE_COLUMNS = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "sigma_x_m", "sigma_y_m", "sigma_z_m"]
 
 
-# Messages with a position; VehicleOdometry also has the frame
+# Message types that contain a position
 _POSITION_TYPES = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
@@ -62,7 +62,7 @@ def is_bag(path: Path) -> bool:
 
 
 def read_bag(path: Path, topic: str | None) -> tuple[Table, str, int]:
-    """Read the poses of one topic of a bag; return also its SHA-256 and size (bytes).
+    """Read the poses in one topic of a bag; return also the SHA-256 and size (bytes) of the bag.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def read_bag(path: Path, topic: str | None) -> tuple[Table, str, int]:
     """
     name = display_name(path)
     try:
-        # imported here, because this library is optional
+        # Imported here, because the library rosbags is optional
         from rosbags.highlevel import AnyReader  # noqa: PLC0415
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
     except ImportError:

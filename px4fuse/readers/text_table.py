@@ -1,6 +1,6 @@
-"""Functions for text files: foreign formats, decoding, numbers, errors with the line number.
+"""Functions to read text files: unsupported formats, decoding, numbers, errors with line number.
 
-Used by the readers of recordings and pose graphs (g2o).
+The readers of position files and pose graphs (g2o) use them.
 """
 
 import re
@@ -16,25 +16,27 @@ from px4fuse.core.record import read_toml
 from px4fuse.errors import Px4FuseError, TrajectoryError
 
 _FORMATS = read_toml(__file__, dict[str, list[dict[str, Any]]], "formats.toml")
-# Formats of streams with positions: name, pattern of a row and pattern of the ranges
+# Text formats of UWB systems: name, and regular expressions of a position and of the ranges
 STREAM_FORMATS = _FORMATS["streams"]
 
 
-def refuse_foreign_format(path: Path, head: bytes, error_type: type[Px4FuseError]) -> None:
-    """Raise an error with the name of the format if px4fuse does not read it."""
+def refuse_foreign_format(path: Path, first_bytes: bytes, error_type: type[Px4FuseError]) -> None:
+    """Raise an error with the name of the file format if px4fuse does not support it."""
     name = display_name(path)
     for foreign_format in _FORMATS["foreign"]:
-        if any(head.startswith(start.encode("latin-1")) for start in foreign_format["starts"]):
+        if any(
+            first_bytes.startswith(start.encode("latin-1")) for start in foreign_format["starts"]
+        ):
             remedy = foreign_format["remedy"].format(name=name)
             raise error_type(f"{name}: the file is {foreign_format['name']}", remedy)
 
 
 # Minimum and maximum valid UNIX time (s): the years 2000 and 2100
 UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0
-# Number of characters at the beginning of a file in which a control character shows a binary file;
-# a NUL character shows a binary file at any position
+# A file with a control character among this number of characters at its beginning is binary; a file
+# with a NUL character is always binary
 _CHECKED_CHARS = 100_000
-# Byte order marks of UTF-16, which Windows shells write
+# Byte order marks of UTF-16, the encoding of texts from Windows shells
 _UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _CONTROL_CHARACTER = re.compile("[\x00-\x08\x0e-\x1b]")
 _NUMBER = re.compile(
@@ -43,10 +45,9 @@ _NUMBER = re.compile(
 
 
 def decode_text(content: bytes) -> str | None:
-    """Decode text and convert its line ends to line feeds.
+    """Decode a text in UTF-8, UTF-16 with byte order mark, or Latin-1; None if it is binary.
 
-    The encoding is UTF-8, UTF-16 with byte order mark, otherwise Latin-1. Return None if the
-    content is binary.
+    All line ends become line feeds.
     """
     if content.startswith(_UTF_16_MARKS):
         text = content[: len(content) // 2 * 2].decode("utf-16", errors="replace")
@@ -62,17 +63,17 @@ def decode_text(content: bytes) -> str | None:
 
 
 def is_number(text: str) -> bool:
-    """Return True for an integer or a number with decimal point or exponent, NaN or infinity."""
+    """Return True if the text is a number, also with decimal point or exponent, NaN or infinity."""
     return _NUMBER.fullmatch(text) is not None
 
 
 def quote(text: str) -> str:
-    """Quote a text from a file, shortened to 40 characters."""
+    """Put a text in quotation marks, shortened to 40 characters."""
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
 def line_error(name: str, line_number: int, fault: str, remedy: str) -> TrajectoryError:
-    """Make an error about one line of a file.
+    """Make an error message with the file name and the line number of the fault.
 
     >>> str(line_error("uwb.csv", 7, "'x' is not a number", "Correct or remove this line."))
     "uwb.csv, line 7: 'x' is not a number. Correct or remove this line."
@@ -80,14 +81,14 @@ def line_error(name: str, line_number: int, fault: str, remedy: str) -> Trajecto
     return TrajectoryError(f"{name}, line {line_number}: {fault}. {remedy}")
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)  # filled while the data are read
 class Rows:
-    """Rows of a text table, for error messages with the file name and the line number.
+    """Rows of a text table, with the line number of each row for error messages.
 
     Attributes
     ----------
     file_name : str
-        File name for messages.
+        File name for error messages.
     lines : list of (int, str)
         Line number in the file, and text of the line.
     """
@@ -96,11 +97,11 @@ class Rows:
     lines: list[tuple[int, str]] = field(default_factory=list)
 
     def row_error(self, row: int, description: str, remedy: str) -> TrajectoryError:
-        """Make an error with the line number of a row."""
+        """Make an error message with the line number of a row."""
         return line_error(self.file_name, self.lines[row][0], description, remedy)
 
     def raise_where(self, is_invalid: BoolArray, description: str, remedy: str) -> None:
-        """Raise TrajectoryError for the first row with a True in the mask, shape (n,) or (n, k)."""
+        """Raise TrajectoryError for the first invalid row; ``is_invalid``: shape (n,) or (n, k)."""
         invalid_indices = np.argwhere(is_invalid)
         if len(invalid_indices):
             raise self.row_error(int(invalid_indices[0, 0]), description, remedy)
@@ -123,8 +124,7 @@ class Rows:
         Raises
         ------
         TrajectoryError
-            A row has another number of columns, or no number in a number column. The message
-            contains the first such line.
+            A row has too few or too many columns, or a cell in a number column is not a number.
         """
         lines = [text for _, text in self.lines]
         columns = [("texts", "U80", (text_count,)), ("numbers", "f8", (number_count,))]

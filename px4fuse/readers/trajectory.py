@@ -1,7 +1,7 @@
-"""Reader of trajectories: TUM, EuRoC, ORB-SLAM3, KITTI, ROS bags and all recordings of positions.
+"""Reader of trajectories: TUM, EuRoC, ORB-SLAM3, KITTI, ROS bags, and all position files.
 
-ORB-SLAM3's ``SaveTrajectoryEuRoC`` writes TUM columns with nanoseconds and omits frames without
-tracking. The format is detected from the content and reported in the notes.
+The format is detected from the content. ORB-SLAM3's ``SaveTrajectoryEuRoC`` writes TUM columns with
+nanoseconds, and omits frames without tracking.
 """
 
 import math
@@ -23,29 +23,33 @@ from px4fuse.trajectory.model import Frame, Trajectory, TrajectoryKind
 MAX_NORM_ERROR = 0.1
 # Maximum absolute coordinate (m): larger values are timestamps or damaged text
 MAX_COORDINATE_M = 1e9
-# Maximum deviation of a quaternion from norm 1 that is not corrected: a rounding error of float64
+# Quaternions are normalised if their norm deviates by more than this from 1 (rounding of float64)
 UNIT_NORM_TOLERANCE = 1e-15
-# Maximum fraction of rows that are dropped. More rows are dropped if rounded timestamps repeat, or
-# if the file contains several recordings
+# A file in which a larger fraction of the rows is invalid is rejected: its timestamps are probably
+# rounded, or it contains several recordings
 MAX_DROPPED_FRACTION = 0.01
-# Maximum coordinate (m) and rotation angle (rad) to accept the first pose as the identity
+# Maximum coordinate (m) and rotation angle (rad) of a first pose that is the identity: SLAM begins
+# at the identity
 MAX_IDENTITY_DISTANCE = 1e-6
-# Maximum ratio of thickness to width of a planar motion (RMS extents along the principal axes)
+# Maximum ratio of the smallest to the second RMS extent along the principal axes, for a motion in a
+# plane
 MAX_THICKNESS_RATIO = 1 / 3
-# Minimum ratio of width to length of a planar motion: a straight motion is in many planes
+# Minimum ratio of the second to the largest RMS extent along the principal axes, for a motion in a
+# plane: a straight motion has no unique plane
 MIN_WIDTH_RATIO = 0.1
 # Maximum angle (rad) between the normal of the plane of motion and the y axis of a camera frame
 MAX_TILT_RAD = math.radians(20.0)
-# Minimum fraction of intervals between poses near the median interval, for a regular frame rate
+# Minimum fraction of pose intervals that are near the median interval, for a regular frame rate
 MIN_REGULAR_FRACTION = 0.9
-# Maximum relative deviation of a regular interval from the median interval
+# Maximum relative deviation of a pose interval that is near the median interval
 MAX_INTERVAL_DEVIATION = 0.5
 # Minimum interval between two poses that counts as a gap, in median intervals
 MIN_GAP_INTERVALS = 2.5
 # Minimum interval (s) between two poses that counts as a gap
 MIN_GAP_S = 0.3
 
-# Words of comments and file names that indicate ground truth; b_w is the gyro bias in EuRoC files
+# Words in comments and file names that indicate ground truth; b_w_RS_S is the column of the gyro
+# bias in EuRoC ground truth
 _TRUTH_WORDS = re.compile(r"truth|vicon|leica|mocap|(?<![a-z])gt(?![a-z])|b_w_RS_S", re.IGNORECASE)
 # Number of bytes at the start of a file in which comments are searched
 _HEAD_BYTES = 4096
@@ -53,9 +57,9 @@ _FRAMES: dict[tuple[str, ...], Frame] = {("ned",): "NED", ("enu",): "ENU", ("edn
 
 
 def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
-    """Read a trajectory file, and detect its kind and frame.
+    """Read a trajectory file, and detect whether it is ground truth or SLAM, and its frame.
 
-    ``body`` is a body or tag in the file, or a topic of a ROS bag.
+    ``body`` selects a rigid body or UWB tag in the file, or a topic of a ROS bag.
 
     Raises
     ------
@@ -111,17 +115,14 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
 
 
 def tum_text(trajectory: Trajectory) -> str:
-    """Return the trajectory as the text of a TUM file, with all digits of float64.
+    """Return the text of a TUM file with the trajectory; numbers have all digits of float64.
 
-    Parameters
-    ----------
-    trajectory : Trajectory
-        Trajectory with orientation. Timestamps are UNIX time if ``unix_offset_s`` is known.
+    Timestamps are UNIX time if ``trajectory.unix_offset_s`` is known.
 
     Raises
     ------
     TrajectoryError
-        The trajectory has no orientation, which the format requires.
+        The trajectory has no orientations, which a TUM file must contain.
     """
     if trajectory.rotation is None:
         raise TrajectoryError(
@@ -188,7 +189,7 @@ def _detect_frame(kind: TrajectoryKind, position_m: Array) -> tuple[Frame, str]:
 
 
 def _describe_gaps(time_s: Array) -> str:
-    """Return a note on gaps between poses or an irregular pose rate, else an empty text."""
+    """Return a note on gaps or irregular intervals between poses; "" if there are none."""
     intervals_s = np.diff(time_s)
     median_s = float(np.median(intervals_s))
     is_regular: BoolArray = np.abs(intervals_s - median_s) <= MAX_INTERVAL_DEVIATION * median_s

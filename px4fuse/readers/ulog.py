@@ -1,4 +1,4 @@
-"""Reader of PX4 ULog files, PX4 v1.9 and newer; returns a flight."""
+"""Reader of a flight from a PX4 ULog file of PX4 v1.9 or newer."""
 
 import numpy as np
 import pandas as pd
@@ -23,8 +23,8 @@ from px4fuse.readers.px4_positions import FIX_TYPE_3D, barometer, read_positions
 from px4fuse.readers.ulog_topics import Topics, dropped_notes, longest_increasing_run, read_topics
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
-# Minimum interval (s) between two IMU samples that counts as a gap: normal intervals are 4 ms
-MIN_IMU_GAP_S = 0.2
+# IMU samples are missing if the interval (s) between two samples is longer; normal are 4 ms
+MIN_MISSING_IMU_S = 0.2
 # Minimum and maximum valid UTC (UNIX time, s) of a GNSS receiver: GPS_EPOCH_SECS of PX4
 # (gps_helper.h), and the year 2100
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
@@ -95,7 +95,7 @@ def _describe_damage(
         missing_imu_s = duration_s
         if not isinstance(imu, Unavailable):
             steps_s = np.diff(imu.index.to_numpy())
-            missing_imu_s = float(steps_s[steps_s > MIN_IMU_GAP_S].sum())
+            missing_imu_s = float(steps_s[steps_s > MIN_MISSING_IMU_S].sum())
         damage_sentences.append(
             f"the file is damaged: {missing_imu_s:.1f} s of {duration_s:.1f} s of IMU data are "
             "missing"
@@ -104,7 +104,7 @@ def _describe_damage(
 
 
 def _start_unix_s(topics: Topics) -> float | None:
-    """Return the UNIX time (s) at flight time zero: the median over the GNSS fixes."""
+    """Return the UNIX time (s) at flight time zero, from the GNSS fixes; None without UTC."""
     gps = topics.read(*px4.layouts_of_track(px4.GPS_POSITION))
     if "utc_us" not in gps:
         return None
@@ -118,7 +118,7 @@ def _start_unix_s(topics: Topics) -> float | None:
 def _require_samples(
     topics: Topics, samples: pd.DataFrame, name: str, layout: Layout, remedy: str
 ) -> TableOrUnavailable:
-    """Return the samples, or the reason why the log has fewer than two."""
+    """Return the samples of a topic, or the reason why the log contains fewer than two."""
     topic = layout.topic
     if topics.find(layout) is None:
         return Unavailable(name, f"{topic} is not logged", px4.DEFAULT_PROFILE_REMEDY)

@@ -1,7 +1,7 @@
-"""Topic tables of a ULog file with valid timestamps; the only module that uses pyulog.
+"""Topics of a ULog file as tables with valid timestamps.
 
-pyulog parses the file. This module removes invalid samples, because real logs contain timestamps
-that are zero, go back or jump by hours. It also merges two subscriptions to the same topic.
+pyulog parses the file. This module removes samples with invalid timestamps: in real logs,
+timestamps may be zero, decrease or jump by hours. It also merges two subscriptions to one topic.
 """
 
 import contextlib
@@ -42,44 +42,45 @@ from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
 
 _MICROSECOND_S = 1e-6
-# Maximum delay (s) from measurement to publication: with a longer delay the measurement time is not
-# boot time (GPS topics before v1.16 have receiver time, ground truth in v1.13 has 0)
+# Maximum delay (s) from measurement to publication. With a longer delay, the measurement time is
+# not boot time: GPS topics before v1.16 contain receiver time, ground truth in v1.13 contains 0
 MAX_PUBLICATION_LAG_S = 10.0
-# Maximum distance (s) of valid samples from the time span of the IMU data: samples further away are
-# outdated
+# Maximum distance (s) of valid samples from the time span of the IMU data
 MAX_OUTSIDE_S = 2.0
 # ULog info message with a note from the author of the log to its users
 NOTE_KEY = "px4fuse_note"
-# Key of the information that a simulated log is an assignment for a student
+# ULog info message which states that the log is an assignment for a student
 ASSESSED_KEY = "px4fuse_assessed"
-# True while the instructor's commands read logs: the diagnosis of an assignment is not withheld
+# True while an instructor's command reads logs: the diagnosis of a student's assignment is then
+# shown
 ignores_assessed = ContextVar("ignores_assessed", default=False)
-# Maximum interval (s) between IMU timestamps of one flight: samples after a longer interval are
-# from another boot
+# Maximum interval (s) between IMU timestamps of one flight: after a longer interval, the autopilot
+# was restarted
 MAX_DATA_GAP_S = 600.0
-# Maximum number of fields of all subscriptions (300 bytes of memory each); real logs have 3,300
+# Maximum number of fields of all topics (300 bytes of memory each); real logs have 3,300
 MAX_FIELDS = 200_000
 # Length (bytes) of a ULog message header
 HEADER_BYTES = 3
 
-# Arrays of one topic instance by PX4 field name, and all topics by name and instance
-Table = dict[str, NDArray[Any]]
-Tables = dict[tuple[str, int], Table]
-# Start time (s) and number of each primary EKF2 instance
+# Samples of one topic instance: an array for each PX4 field
+TopicArrays = dict[str, NDArray[Any]]
+# Tables by topic name and instance number
+Tables = dict[tuple[str, int], TopicArrays]
+# For each change of the primary EKF2 instance: time (s) and number of the new primary instance
 Instances = tuple[tuple[float, int], ...]
 # Without the selector topic there is one EKF2 instance
 NO_SELECTOR: Instances = ((-np.inf, 0),)
 
 
 class _CountingContent(io.BytesIO):
-    """Content of a ULog that counts the bytes that pyulog skips.
+    """Content of a ULog file that counts the bytes which pyulog skips.
 
-    pyulog reads a header of 3 bytes, then the message. After an invalid header it advances by one
-    byte, or to the next synchronisation message.
+    pyulog reads a message header of 3 bytes, then the message. After an invalid header, pyulog
+    skips one byte, or all bytes until the next synchronisation message.
     """
 
-    # Byte offsets, except for the number of skipped bytes
-    skipped_bytes = header_start = read_end = position = 0
+    skipped_bytes = 0  # number of bytes
+    header_start = read_end = position = 0  # byte offsets in the file
 
     def read(self, size: int, /) -> bytes:  # type: ignore[override]  # pyulog gives a size
         start = self.position
@@ -100,9 +101,9 @@ class _CountingContent(io.BytesIO):
 
 
 def _skip_if_short(parse: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a message parser to raise ValueError instead of struct.error for short messages.
+    """Decorate a message parser to raise ValueError for messages that are too short.
 
-    pyulog skips a message after ValueError, but stops reading the file after struct.error.
+    pyulog then skips the message. After struct.error, pyulog would not read the rest of the file.
     """
 
     def parse_checked(*arguments: Any, **keywords: Any) -> Any:
@@ -119,10 +120,9 @@ class _MessageData(ULog._MessageData):  # type: ignore[misc]  # pyulog has no ty
 
 
 class _Reader(ULog):  # type: ignore[misc]
-    """pyulog reader with better recovery from damage and a limit on the number of fields.
+    """ULog parser of pyulog that continues after damaged bytes and limits the number of fields.
 
-    A format definition of 20 bytes can declare 65,535 fields, and nested formats multiply this
-    number.
+    A format definition of 20 bytes can define 65,535 fields, and nested formats multiply them.
     """
 
     fields = 0
@@ -156,11 +156,11 @@ class _Reader(ULog):  # type: ignore[misc]
         return ULog._MessageAddLogged(data, header, formats)
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)  # filled while the data are read
 class Topics:
-    """Decoded topics of one log."""
+    """Decoded topics of one ULog, and its description."""
 
-    # Description of the log, without notes on single topics
+    # Description of the log
     log: LogInfo
     tables: Tables
     # Boot time (µs) at flight time zero
@@ -179,10 +179,10 @@ class Topics:
     parameter_changes: tuple[ParameterChange, ...] = ()
 
     def instances(self, topic: str) -> list[int]:
-        """Return the sorted instance numbers of a topic with data."""
+        """Return the instance numbers of a topic that contain samples, in ascending order."""
         return sorted(instance for name, instance in self.tables if name == topic)
 
-    def tables_of(self, topic: str) -> list[Table]:
+    def tables_of(self, topic: str) -> list[TopicArrays]:
         """Return the tables of all instances of a topic, in order of the instance number."""
         return [self.tables[topic, number] for number in self.instances(topic)]
 
@@ -197,7 +197,7 @@ class Topics:
         return tuple(zip(switch_times_s, numbers, strict=False)) or NO_SELECTOR
 
     def find(self, *layouts: Layout) -> Layout | None:
-        """Return the first layout whose required fields are in a topic of the log, else None."""
+        """Return the first layout whose required fields are in the log, or None."""
         for layout in layouts:
             if any(
                 {*layout.columns.values()} <= table.keys() for table in self.tables_of(layout.topic)
@@ -215,9 +215,9 @@ class Topics:
         layout : Layout
             A layout that :meth:`find` returned.
         instance : int
-            Topic instance; if it does not exist, the lowest instance is read.
+            Number of the topic instance; if it is not in the log, the lowest number is read.
         step : bool
-            True for a step function: samples before time zero are kept, because they remain valid.
+            True if a value is valid until the next sample: samples before time zero are then kept.
 
         Returns
         -------
@@ -248,7 +248,7 @@ class Topics:
         return samples if step else rows_between(samples, -MAX_OUTSIDE_S, end_s)
 
     def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
-        """Read the first layout whose fields are in the log, else return an empty table."""
+        """Read the first layout whose required fields are in the log; empty without them."""
         layout = self.find(*layouts)
         return _empty_frame(layouts[0]) if layout is None else self.read_instance(layout, step=step)
 
@@ -259,16 +259,16 @@ class Topics:
         step: bool = False,
         select: Callable[[pd.DataFrame], pd.DataFrame] | None = None,
     ) -> pd.DataFrame:
-        """Read an EKF2 topic from the instance that was primary at each time.
+        """Read an EKF2 topic from the EKF2 instance that was primary at each time.
 
-        The result is empty if the topic is not in the log.
+        The table is empty if the topic is not in the log.
 
         Parameters
         ----------
         layout, step
             See :meth:`read_instance`.
         select : callable, optional
-            Filter for the rows of each instance; by default all rows are used.
+            Function that selects rows from the samples of each instance.
         """
         if self.find(layout) is None:
             return _empty_frame(layout)
@@ -287,7 +287,7 @@ class Topics:
         return joined_tables[~joined_tables.index.duplicated()]
 
     def record_stream(self, data_kind: str, *topics: str) -> None:
-        """Record topics and clock (measurement or publication time) of data such as "imu"."""
+        """Store topics and clock (measurement or publication time) of data such as "imu"."""
         # The timestamp of sensor_combined is the gyro's measurement time
         has_measurement_time = data_kind == "imu" or any(
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
@@ -306,11 +306,11 @@ def _empty_frame(layout: Layout) -> pd.DataFrame:
     )
 
 
-def measurement_time_us(table: Table) -> NDArray[np.int64]:
-    """Return the measurement time since boot (µs) of each row: ``timestamp_sample``.
+def measurement_time_us(table: TopicArrays) -> NDArray[np.int64]:
+    """Return the measurement time since boot (µs) of each sample: ``timestamp_sample``.
 
-    If ``timestamp_sample`` is not boot time, return the publication time ``timestamp``, which is up
-    to 0.2 s later in EKF2 topics.
+    If it is missing or not boot time, return the publication time: ``timestamp``. In EKF2 topics,
+    the publication is up to 0.2 s later.
     """
     published_us = table["timestamp"].astype(np.int64)
     sampled_us = table.get("timestamp_sample")
@@ -328,14 +328,14 @@ def measurement_time_us(table: Table) -> NDArray[np.int64]:
 def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     """Return the indices of the longest strictly increasing subsequence of positive timestamps.
 
-    A timestamp that is hours ahead is removed as a single sample; a running maximum would remove
-    all later samples instead. Method: patience sorting, Fredman 1975.
+    If one timestamp is hours too late, only this sample is removed. A running maximum would remove
+    all samples after it. Method: patience sorting, Fredman 1975.
     """
     positive_indices = np.flatnonzero(time_us > 0)
     positive_times = time_us[positive_indices]
     if len(positive_times) < 2 or np.all(np.diff(positive_times) > 0):
         return positive_indices
-    # Smallest last timestamp of an increasing subsequence of each length, and its index
+    # Element k: smallest timestamp (and its index) that ends an increasing subsequence of k + 1
     last_times: list[int] = []
     last_indices: list[int] = []
     previous_index = np.empty(len(positive_times), dtype=np.intp)
@@ -353,7 +353,7 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
 
 
 def dropped_notes(topic_counts: Iterable[tuple[str, int]]) -> tuple[str, ...]:
-    """Format the notes on samples that were dropped because of invalid timestamps."""
+    """Return one note per topic on the samples that were dropped, with their number."""
     return tuple(
         f"number of samples of {topic} dropped because of an invalid timestamp: {count}"
         for topic, count in topic_counts
@@ -361,7 +361,7 @@ def dropped_notes(topic_counts: Iterable[tuple[str, int]]) -> tuple[str, ...]:
 
 
 def read_topics(name: str, content: bytes) -> Topics:
-    """Decode the topics of a ULog that px4fuse uses.
+    """Decode those topics of a ULog that px4fuse uses.
 
     Raises
     ------
@@ -441,10 +441,7 @@ def read_topics(name: str, content: bytes) -> Topics:
 def _read_parameters(
     ulog: ULog, tables: Tables, zero_us: int
 ) -> tuple[dict[str, float], tuple[ParameterChange, ...]]:
-    """Return the parameters at take-off, and the later changes of EKF2_ parameters.
-
-    Without a take-off in the log, the parameters are those at its start.
-    """
+    """Return the parameters at take-off (or at the start of the log), and later EKF2_ changes."""
     parameter_values = {
         name: float(value)
         for name, value in ulog.initial_parameters.items()
@@ -471,13 +468,13 @@ def _read_parameters(
 
 
 def _read_tables(ulog: ULog) -> Tables:
-    """Return the topic tables.
+    """Return the samples of each topic instance.
 
-    Two subscriptions to one topic are merged to the fields that both have.
+    Two subscriptions to one instance are merged; only the fields that both have are kept.
     """
     tables: Tables = {}
     for subscription in ulog.data_list:
-        table: Table = subscription.data
+        table: TopicArrays = subscription.data
         if "timestamp" not in table:
             continue
         key = (subscription.name, subscription.multi_id)
@@ -494,14 +491,14 @@ def _read_tables(ulog: ULog) -> Tables:
 
 
 def _data_span_us(tables: Tables, name: str) -> tuple[int, int]:
-    """Return first and last time (µs) of the IMU data, or else of the topic with most samples."""
+    """Return first and last time (µs) of the IMU data; without IMU, of the largest topic."""
     for key in sorted(
         tables, key=lambda key: (key[0] != IMU.topic, -len(tables[key]["timestamp"]))
     ):
         time_us = tables[key]["timestamp"].astype(np.int64)
         increasing_us = time_us[longest_increasing_run(time_us)]
         if len(increasing_us):
-            # Timestamps hours away from the others are outdated, so only the longest run is used
+            # Only the longest run without a gap is used: timestamps hours away are invalid
             gap_rows = np.flatnonzero(np.diff(increasing_us) > MAX_DATA_GAP_S / _MICROSECOND_S) + 1
             longest_us = max(np.split(increasing_us, gap_rows), key=len)
             return int(longest_us[0]), int(longest_us[-1])

@@ -1,4 +1,4 @@
-"""Page on the aiding sources of EKF2: a table of verdicts, and plots of the innovations."""
+"""Report page on EKF2's aiding sources (GNSS, barometer, ...): statistics and innovation plots."""
 
 from collections.abc import Iterator, Mapping
 
@@ -22,13 +22,13 @@ LEAD_TEXT = (
     "Time-correlated errors, wrong delays and wrong headings hardly change the NIS."
 )
 AID_PANEL_HEIGHT = 21.0  # height (points) of the plot of one aiding source
-MAX_DRAWN_INNOVATION = 4.0  # maximum drawn ν/√S; larger values are triangles at the edge
-# Aiding sources for which the report of a comparison has a page on EKF2's aiding sources
+MAX_DRAWN_SIGMAS = 4.0  # maximum drawn ν/√S; larger values are triangles at the edge
+# Aiding sources of outdoor flights: a report has a page on all aiding sources if EKF2 fused one
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 
 
 def draw_pages(analysis: Analysis | AidsOnlyAnalysis, _: object) -> Iterator[Page]:
-    """Draw EKF2's aiding sources; in a comparison only if EKF2 fused GNSS or optical flow."""
+    """Draw the page on aiding sources; in a comparison of KF and EKF2 only for outdoor flights."""
     is_comparison = isinstance(analysis, Analysis)
     if aids := outdoor_aids(analysis) if isinstance(analysis, Analysis) else analysis.aids:
         page = Page(appendix_title(TITLE) if is_comparison else TITLE, LEAD_TEXT)
@@ -38,7 +38,7 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, _: object) -> Iterator[Pag
 
 
 def outdoor_aids(analysis: Analysis) -> Mapping[str, AidResult]:
-    """Return EKF2's aiding sources if EKF2 fused GNSS or optical flow, else {}."""
+    """Return all aiding sources if EKF2 fused GNSS or optical flow (outdoor flight), else {}."""
     aids = {} if isinstance(analysis.aids, Unavailable) else analysis.aids
     fused_names = {name for name, aid in aids.items() if aid.verdict != "disabled"}
     return {} if fused_names.isdisjoint(OUTDOOR_AIDS) else aids
@@ -76,9 +76,9 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
         for axis_cells in axis_rows:
             rows.append([*aid_cells, *axis_cells])
             aid_cells = [""] * 6
-    head = ["aiding source", "verdict", "enabled", "rejec-\nted", "longest\ngap (s)", "√R"]
-    head += ["axis", "n", "mean\nNIS", "95 %\nband", "mean\nν/√S"]
-    page.table(head, rows, right_aligned_columns=(2, 3, 4, 5, 7, 8, 10))
+    column_heads = ["aiding source", "verdict", "enabled", "rejec-\nted", "longest\ngap (s)", "√R"]
+    column_heads += ["axis", "n", "mean\nNIS", "95 %\nband", "mean\nν/√S"]
+    page.table(column_heads, rows, right_aligned_columns=(2, 3, 4, 5, 7, 8, 10))
     if disabled_labels := [aid.label for aid in aids.values() if aid.verdict == "disabled"]:
         page.write(
             f"Aiding sources that are logged but never fused: {', '.join(disabled_labels)}.",
@@ -101,7 +101,7 @@ def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) 
     page.write_small(
         "95 % of the normalised innovations ν/√S are expected within ±2 (lines). Hollow samples "
         "were not fused. Grey: fusion was disabled. Triangles: values beyond "
-        f"±{MAX_DRAWN_INNOVATION:g}."
+        f"±{MAX_DRAWN_SIGMAS:g}."
     )
     for name in fused_names:
         axes = page.panel(aids[name].label, AID_PANEL_HEIGHT, above=1.0)
@@ -119,7 +119,7 @@ def _draw_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:
             (~is_fused, style.REJECTED_DOTS),
         ):
             dots = dot_style | {"ms": 1.4}
-            draw_dots(axes, innovations[is_drawn], MAX_DRAWN_INNOVATION, dots)
+            draw_dots(axes, innovations[is_drawn], MAX_DRAWN_SIGMAS, dots)
     for limit in (-2.0, 2.0):
         axes.axhline(limit, color="black", lw=0.4, ls=(0, (1, 1.5)))
     if aid_log.enabled is not None:
@@ -128,14 +128,14 @@ def _draw_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:
         if is_disabled.any():
             axes.fill_between(
                 times_s,
-                -MAX_DRAWN_INNOVATION,
-                MAX_DRAWN_INNOVATION,
+                -MAX_DRAWN_SIGMAS,
+                MAX_DRAWN_SIGMAS,
                 where=is_disabled.tolist(),
                 zorder=0.1,
                 **GROUND_BAND,
             )
     axes.set(
         xlim=span_s,
-        ylim=(-1.1 * MAX_DRAWN_INNOVATION, 1.1 * MAX_DRAWN_INNOVATION),
+        ylim=(-1.1 * MAX_DRAWN_SIGMAS, 1.1 * MAX_DRAWN_SIGMAS),
         yticks=(-2.0, 2.0),
     )

@@ -1,17 +1,12 @@
-"""HTML of the diagnosis card, the summary of a report, for web pages and notebooks."""
+"""Diagnosis card (summary of faults, causes and actions) as HTML, for web pages and notebooks."""
 
 from collections.abc import Sequence
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, describe_axis
-from px4fuse.card.model import (
-    FILTER_NAMES,
-    RATIO_AXIS_TICKS,
-    Card,
-    Verdict,
-    axis_fraction,
-)
+from px4fuse.card.model import RATIO_AXIS_TICKS, Card, Verdict, axis_fraction
 from px4fuse.card.verdicts import make_sigma_verdicts
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_ratio
 from px4fuse.errors import SettingsError
 from px4fuse.html.safe import load_template, read_asset
@@ -19,13 +14,13 @@ from px4fuse.report.card_text import (
     LABELLED_TICKS,
     QUANTITIES,
     SEVERITY_SIGNS,
-    axis_marks,
-    band_limits,
+    format_consistent_ratios,
     format_spans,
     format_target,
     marked_actions,
     rerun_columns,
     rerun_note,
+    sigma_ratio_marks,
     with_typed_path,
 )
 
@@ -39,8 +34,8 @@ MARK_PATHS = {
 SCREEN_READER_QUANTITIES = {"source": "innovation over root S", "truth": "error over sigma"}
 
 
-def card_of(analysis: Analysis) -> Card:
-    """Return the diagnosis card of an analysis."""
+def make_diagnosis_card(analysis: Analysis) -> Card:
+    """Return the summary of faults, causes and actions of an analysis."""
     if analysis.request is None:
         raise SettingsError(
             "The analysis was not made by px4fuse.compare, so the command to print is unknown.",
@@ -51,20 +46,20 @@ def card_of(analysis: Analysis) -> Card:
 
 
 def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> str:
-    """Return the diagnosis card, the summary of a report, as an HTML element.
+    """Return a summary of faults, causes and actions as an HTML element.
 
     Parameters
     ----------
     is_open : bool
         True to show causes and notes without a click.
     has_apply : bool
-        True for a button beside each KF command, which applies it on the explore page.
+        True to show a button beside each KF command that applies the settings in the command.
     """
     return load_template("report/card.html").render(
         card=card,
         open=is_open,
         apply=has_apply,
-        figure=axis_html(card.verdicts, card.effect.axis)
+        figure=sigma_ratio_html(card.verdicts, card.effect.axis)
         if card.verdicts and card.effect is not None
         else "",
         marked_actions=marked_actions,
@@ -76,16 +71,16 @@ def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> 
     )
 
 
-def axis_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
+def sigma_ratio_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
     """Draw ratios "RMS of actual error ÷ reported σ" on a logarithmic axis as an HTML figure.
 
-    ``axis`` is the title of the spatial axis of the errors; ``name`` identifies it for scripts.
+    ``axis`` is the direction of the errors, as a text; ``name`` identifies the figure for scripts.
     """
     return load_template("report/card_axis.html").render(
         verdicts=verdicts,
         axis=axis,
         name=name,
-        marks=axis_marks,
+        marks=sigma_ratio_marks,
         paths=MARK_PATHS,
         percent=_axis_percent,
         alternative=alternative_text(verdicts),
@@ -93,34 +88,34 @@ def axis_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
             (_axis_percent(axis_fraction(tick)), label, tick not in LABELLED_TICKS)
             for tick, label in RATIO_AXIS_TICKS.items()
         ],
-        limits=band_limits(),
+        limits=format_consistent_ratios(),
         names=FILTER_NAMES,
         quantities=QUANTITIES,
         format_ratio=format_ratio,
     )
 
 
-def axis_figures(analysis: Analysis) -> str:
-    """Return an HTML figure for each axis: KF and EKF2 against source and against ground truth."""
+def sigma_ratio_figures(analysis: Analysis) -> str:
+    """Return HTML figures of the σ ratios of KF and EKF2, one figure for each axis."""
     return "".join(
-        axis_html(make_sigma_verdicts(result), describe_axis(analysis, result), name)
+        sigma_ratio_html(make_sigma_verdicts(result), describe_axis(analysis, result), name)
         for name, result in analysis.axes.items()
     )
 
 
-def card_style() -> str:
-    """Return the style sheet of the diagnosis card, without its colours."""
+def card_css() -> str:
+    """Return the CSS of the diagnosis card; the colours are in another style sheet."""
     return read_asset("card.css", "px4fuse.report")
 
 
 def notebook_html(card: Card) -> str:
-    """Return the diagnosis card with its style and colours, for a notebook."""
+    """Return the diagnosis card as HTML with its CSS, for a notebook."""
     colours = read_asset("colours.css").replace(":root", ".px4fuse-card")
-    return f"<style>{colours}{card_style()}</style>{card_html(card, is_open=True)}"
+    return f"<style>{colours}{card_css()}</style>{card_html(card, is_open=True)}"
 
 
 def alternative_text(verdicts: Sequence[Verdict]) -> str:
-    """Describe the σ ratios and their verdicts for screen readers.
+    """Describe σ ratios and consistency of the filters for screen readers.
 
     >>> alternative_text([Verdict(filter="kf", against="truth", ratio=7.2, word="overconfident")])
     'KF, error over sigma: 7.2, overconfident.'
@@ -129,8 +124,8 @@ def alternative_text(verdicts: Sequence[Verdict]) -> str:
     for verdict in verdicts:
         verdict_text = f"not evaluated, {verdict.reason}"
         if verdict.ratio is not None:
-            suffix = ", explained" if verdict.is_explained else ""
-            verdict_text = f"{format_ratio(verdict.ratio)}, {verdict.word}{suffix}"
+            explained_suffix = ", explained" if verdict.is_explained else ""
+            verdict_text = f"{format_ratio(verdict.ratio)}, {verdict.word}{explained_suffix}"
         quantity = f"{FILTER_NAMES[verdict.filter]}, {SCREEN_READER_QUANTITIES[verdict.against]}"
         sentences.append(f"{quantity}: {verdict_text}.")
     return " ".join(sentences)

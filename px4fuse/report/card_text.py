@@ -1,4 +1,4 @@
-"""Diagnosis card as text: lines of at most 100 columns, for terminals, pipes and files."""
+"""Diagnosis card (summary of faults, causes and actions) as text of at most 100 columns."""
 
 import json
 import re
@@ -11,7 +11,6 @@ import numpy as np
 from msgspec import convert, to_builtins
 
 from px4fuse.card.model import (
-    FILTER_NAMES,
     MAX_NOTES,
     RATIO_AXIS_ENDS,
     RATIO_AXIS_TICKS,
@@ -23,19 +22,20 @@ from px4fuse.card.model import (
     Verdict,
     axis_fraction,
 )
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.consistency import CONSISTENT_RATIOS, Reference
 from px4fuse.request import quote_command
 
-CARD_WIDTH = 100  # number of characters
+CARD_WIDTH = 100  # maximum number of characters per line
 AXIS_WIDTH = 37  # number of characters of the axis of σ ratios
 AXIS_INDENT = 58  # number of characters left of the axis of σ ratios
-TEXT_INDENT = 11  # number of characters left of a text beside a label
+TEXT_INDENT = 11  # number of characters of a label with the blanks around it
 # Maximum length (characters) of a command beside its label; longer commands get their own line
 MAX_COMMAND_LENGTH = 74
 # Labelled ticks of the axis of σ ratios
 LABELLED_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
-MARKS = {"source": "●", "truth": "◆"}
+REFERENCE_MARKS = {"source": "●", "truth": "◆"}
 QUANTITIES = {"source": "● source: innovation ÷ √S", "truth": "◆ ground truth: error ÷ σ"}
 SEVERITY_SIGNS = {
     "error": "■ ERROR",
@@ -61,24 +61,24 @@ AIDS_HEADING = (
 
 
 class Line(NamedTuple):
-    """Text of a diagnosis card on the terminal, in a style of rich.
+    """Paragraph on the terminal, in a style of the rich package.
 
-    A text that ``wraps`` begins with ``first``; its other lines begin with ``indent``.
+    If ``wraps``, its first line begins with ``first_indent``, the other lines with ``indent``.
     """
 
     text: str
     style: str = ""
-    first: str = ""
+    first_indent: str = ""
     indent: str = ""
     wraps: bool = False
 
     def wrapped(self, width: int) -> list[str]:
         if not self.wraps:
-            return [f"{self.first}{self.text}"]
+            return [f"{self.first_indent}{self.text}"]
         return textwrap.wrap(
             self.text,
             width,
-            initial_indent=self.first,
+            initial_indent=self.first_indent,
             subsequent_indent=self.indent,
             break_long_words=False,
             break_on_hyphens=False,
@@ -119,7 +119,7 @@ def card_lines(card: Card) -> Iterator[Line]:
 
 
 def note_texts(card: Card, other_notes_place: str) -> list[str]:
-    """Format the first :data:`MAX_NOTES` notes of a card, and state where the others are listed."""
+    """Format at most :data:`MAX_NOTES` notes, and state where the other notes are listed."""
     texts = [
         f"note[{note.id}]: {note.text} {note.action}".rstrip() for note in card.notes[:MAX_NOTES]
     ]
@@ -129,7 +129,7 @@ def note_texts(card: Card, other_notes_place: str) -> list[str]:
 
 
 def closing_lines(card: Card) -> Iterator[Line]:
-    """Yield the last lines of a diagnosis card, which state where details are printed."""
+    """Yield the last lines of a diagnosis card: commands that print details."""
     actions = [action for cause in card.causes for _, action in marked_actions(cause)]
     text = "More: -v."
     if any(action.where == "console" for action in actions):
@@ -168,40 +168,42 @@ def to_ascii(text: str) -> str:
     return text.translate(ASCII_REPLACEMENTS)
 
 
-def band_limits() -> str:
-    """Format the limits of the consistent ratios against source and ground truth.
+def format_consistent_ratios() -> str:
+    """Format the σ ratios of a consistent filter, against position source and ground truth.
 
-    >>> band_limits()
+    >>> format_consistent_ratios()
     '● 0.8 to 1.25, ◆ 0.67 to 1.5'
     """
     return ", ".join(
-        f"{MARKS[name]} {low:g} to {high:g}" for name, (low, high) in CONSISTENT_RATIOS.items()
+        f"{REFERENCE_MARKS[name]} {low:g} to {high:g}"
+        for name, (low, high) in CONSISTENT_RATIOS.items()
     )
 
 
-def axis_text(ratio: float | None, reference: Reference) -> str:
+def draw_sigma_ratio(ratio: float | None, reference: Reference) -> str:
     """Draw one σ ratio on a logarithmic axis with the band of consistent ratios.
 
-    >>> axis_text(0.93, "source")
+    >>> draw_sigma_ratio(0.93, "source")
     '────────────────░●░░░────────────────'
-    >>> axis_text(128.0, "truth")
+    >>> draw_sigma_ratio(128.0, "truth")
     '───────────────░░░░░░░──────────────▶'
     """
     low, high = (_axis_column(end) for end in CONSISTENT_RATIOS[reference])
     characters = ["░" if low <= column <= high else "─" for column in range(AXIS_WIDTH)]
     if ratio is not None:
         column, last_column = _axis_column(ratio), AXIS_WIDTH - 1
-        symbol = "◀" if column < 0 else "▶" if column > last_column else MARKS[reference]
+        symbol = "◀" if column < 0 else "▶" if column > last_column else REFERENCE_MARKS[reference]
         characters[min(max(column, 0), last_column)] = symbol
     return "".join(characters)
 
 
-def axis_marks(
+def sigma_ratio_marks(
     ratio: float, reference: Reference, interval: tuple[float, float] | None
 ) -> dict[str, Any]:
-    """Return the mark, the consistent band and the 95 % interval of a σ ratio on its axis.
+    """Return the positions of a σ ratio, its consistent band and its 95 % interval on the axis.
 
-    Places are fractions of the axis; ``mark`` is "below" or "above" for a ratio outside the axis.
+    Positions are fractions of the axis length. ``mark`` is "below" or "above" if the ratio is
+    outside the axis.
     """
     fraction = axis_fraction(ratio)
     return {
@@ -232,7 +234,7 @@ def _identity_lines(card: Card) -> Iterator[Line]:
 
 
 def headline_lines(card: Card) -> Iterator[Line]:
-    """Yield the line with severity, id and headline."""
+    """Yield the first line of a diagnosis card: severity, id and title of the worst fault."""
     label = "ok" if card.severity == "clean" else card.severity
     severity_and_id = f"{label}[{card.id}]" if card.id else label
     yield Line(f"{severity_and_id}: {card.headline}", SEVERITY_STYLES[card.severity])
@@ -241,7 +243,7 @@ def headline_lines(card: Card) -> Iterator[Line]:
 def _cause_lines(cause: Cause) -> Iterator[Line]:
     yield from _labelled_lines("when", format_spans(cause))
     actions = marked_actions(cause)
-    labels = [f"{mark}{format_target(action)}" for mark, action in actions]
+    labels = [f"{prefix}{format_target(action)}" for prefix, action in actions]
     label_width = max(map(len, labels), default=0) + 2
     for label, (_, action) in zip(labels, actions, strict=True):
         yield from _action_lines(label, label_width, action)
@@ -289,7 +291,7 @@ def _rerun_table_lines(reruns: Sequence[Rerun]) -> Iterator[Line]:
 
 
 def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
-    """Return the columns of the table of re-runs with their headings; empty columns are omitted."""
+    """Return the columns (heading, cells) of the table of re-runs with changed settings."""
     rows = [
         {
             "re-run of this log": rerun.label,
@@ -337,8 +339,8 @@ def _verdict_axis_lines(card: Card) -> Iterator[Line]:
     yield Line("")
     heading = "Reported uncertainty: RMS of actual error ÷ reported σ"
     yield from _wrapped_lines(f"{heading}{direction_text}", "", "  ")
-    legend, side_label = f"  ░ consistent ({band_limits()})", "σ too large"
-    yield Line(f"{'':{AXIS_INDENT}}{side_label}{'σ too small':>{AXIS_WIDTH - len(side_label)}}")
+    legend, left_label = f"  ░ consistent ({format_consistent_ratios()})", "σ too large"
+    yield Line(f"{'':{AXIS_INDENT}}{left_label}{'σ too small':>{AXIS_WIDTH - len(left_label)}}")
     yield Line(f"{legend:{AXIS_INDENT}}{_ticks_line()}")
     if any(verdict.is_explained for verdict in card.verdicts):
         yield Line("  Verdicts in brackets are not faults of the filter: the causes explain them.")
@@ -354,7 +356,7 @@ def _verdict_line(verdict: Verdict) -> Line:
     word = f"({verdict.word})" if verdict.is_explained else verdict.word
     text = f"{label_text}{format_ratio(verdict.ratio):>7}  {word}"
     style = "bold" if verdict.is_fault else ""
-    return Line(f"{text:{AXIS_INDENT}}{axis_text(verdict.ratio, verdict.against)}", style)
+    return Line(f"{text:{AXIS_INDENT}}{draw_sigma_ratio(verdict.ratio, verdict.against)}", style)
 
 
 def _ticks_line() -> str:
@@ -377,7 +379,7 @@ def _aid_axis_lines(aids: Sequence[AidRow]) -> Iterator[Line]:
         label = "" if previous_row and row.label == previous_row.label else row.label
         ratio_text = "–" if row.ratio is None else format_ratio(row.ratio)
         label_text = f"  {label:13}{row.component:6}{ratio_text:>7}"
-        yield Line(f"{label_text:{indent}}{axis_text(row.ratio, 'source')}")
+        yield Line(f"{label_text:{indent}}{draw_sigma_ratio(row.ratio, 'source')}")
 
 
 def format_spans(cause: Cause) -> str:

@@ -1,4 +1,4 @@
-"""Time offset of the position source: an appendix page, or a line on the provenance page."""
+"""Texts and plot on the time offset of the position source."""
 
 from collections.abc import Iterable, Iterator
 
@@ -17,7 +17,7 @@ from px4fuse.results.contract import ComparisonResults
 CURVE_HEIGHT = 170.0  # height (points) of the axes of the log-likelihood
 MAX_DRAWN_DROP_NATS = 12.0  # maximum drawn decrease (nats) of the log-likelihood from its maximum
 # Ratio of the plotted range of the time offset to its 95 % interval
-PLOT_HALF_WIDTH_INTERVALS = 2.5
+PLOT_WIDTH_IN_INTERVALS = 2.5
 # Findings for which the report has an appendix on the time offset
 CLOCK_FINDINGS = ("source_time_offset_changes", "source_time_offset", "ekf2_ev_delay_wrong")
 
@@ -26,12 +26,14 @@ def summarise_offset(analysis: Analysis, findings: Iterable[Finding]) -> str:
     """Summarise the time offset of the position source in one line."""
     if has_clock_page(analysis, findings):
         return "The appendix on the time offset contains the estimate."
-    advice = clock_advice(analysis, analysis.clock)
-    return " ".join(advice[label] for label in ("Result", "Offset") if label in advice)
+    advice_by_label = clock_advice(analysis, analysis.clock)
+    return " ".join(
+        advice_by_label[label] for label in ("Result", "Offset") if label in advice_by_label
+    )
 
 
 def has_clock_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
-    """Return True if the time offset is a finding or cannot be estimated."""
+    """Return True if the time offset is wrong, changes, or cannot be estimated."""
     clock = analysis.clock
     if isinstance(clock, Unavailable):
         return False
@@ -41,7 +43,7 @@ def has_clock_page(analysis: Analysis, findings: Iterable[Finding]) -> bool:
 def clock_advice(
     comparison: PreparedComparison, clock: ClockOffset | Unavailable
 ) -> dict[str, str]:
-    """Return sentences on the time offset of the position source, by their label."""
+    """Return sentences on the time offset of the position source, by label such as "Action"."""
     if isinstance(clock, Unavailable):
         return {"Offset": f"The time offset cannot be estimated: {clock.reason}. {clock.remedy}"}
     if not clock.is_determinable:
@@ -50,7 +52,7 @@ def clock_advice(
             "Action": "Fly passes of 5 m or more, and stop after each pass.",
         }
     offset_s, (low_s, high_s) = clock.offset_s, clock.interval_s
-    advice = {
+    advice_by_label = {
         "Result": "The position source has no significant time offset.",
         "Offset": (
             f"Add {offset_s:+.3f} s (95 % {low_s:+.3f} to {high_s:+.3f} s) to the timestamps of "
@@ -58,20 +60,22 @@ def clock_advice(
         ),
     }
     if clock.is_significant(offset_s):
-        side = "late" if offset_s < 0.0 else "early"
-        advice["Result"] = f"The position timestamps are {abs(offset_s):.3f} s {side}."
-        option_s = clock_offset_option_s(comparison, clock)
-        advice["Re-run"] = f"px4fuse compare LOG --clock-offset {option_s:.3f}"
+        late_or_early = "late" if offset_s < 0.0 else "early"
+        advice_by_label["Result"] = (
+            f"The position timestamps are {abs(offset_s):.3f} s {late_or_early}."
+        )
+        new_option_s = clock_offset_option_s(comparison, clock)
+        advice_by_label["Re-run"] = f"px4fuse compare LOG --clock-offset {new_option_s:.3f}"
     if (logged_ms := delay_ms(comparison)) is not None:
-        advice["PX4"] = _delay_advice(comparison, clock, logged_ms)
-    if clock.changes:
+        advice_by_label["PX4"] = _delay_advice(comparison, clock, logged_ms)
+    if clock.has_changed():
         offset_texts = ", ".join(
             f"{part.offset_s:+.2f} s from {part.start_s:.0f} s" for part in clock.parts
         )
-        advice["Changes"] = f"The offset changes during the flight: {offset_texts}."
+        advice_by_label["Changes"] = f"The offset changes during the flight: {offset_texts}."
     faults = convention_faults(comparison.convention, comparison.flight, comparison.source.frame)
     if clock_drift := faults.clock_drift:
-        advice["Drift"] = (
+        advice_by_label["Drift"] = (
             f"The clock of the timestamps is {abs(100.0 * clock_drift):.1f} % "
             f"{'fast' if clock_drift > 0.0 else 'slow'}. The offset applies to the middle of the "
             "data."
@@ -79,11 +83,11 @@ def clock_advice(
     elif clock.drift_ppm is not None and clock.drift_sigma_ppm is not None:
         half_width_ppm = 1.96 * clock.drift_sigma_ppm
         significance_text = ", not significant" if abs(clock.drift_ppm) < half_width_ppm else ""
-        advice["Drift"] = (
+        advice_by_label["Drift"] = (
             f"The clock of the source drifts by {clock.drift_ppm:+.0f} ± {half_width_ppm:.0f} ppm "
             f"(95 %){significance_text}."
         )
-    return advice
+    return advice_by_label
 
 
 def _delay_advice(comparison: PreparedComparison, clock: ClockOffset, logged_ms: float) -> str:
@@ -102,7 +106,7 @@ def _delay_advice(comparison: PreparedComparison, clock: ClockOffset, logged_ms:
 
 
 def draw_pages(analysis: Analysis, results: ComparisonResults) -> Iterator[Page]:
-    """Draw the appendix on the time offset of the position source if :func:`has_clock_page`."""
+    """Draw the appendix on a wrong or unknown time offset of the position source."""
     clock = analysis.clock
     if isinstance(clock, Unavailable) or not has_clock_page(analysis, results.findings):
         return
@@ -136,7 +140,7 @@ def draw_offset_likelihood(axes: Axes, clock: ClockOffset) -> None:
     axes.set_ylim(
         min(MAX_DRAWN_DROP_NATS, float(clock.curve_log_likelihood_drop.max()) * 1.05), 0.0
     )
-    half_width_s = PLOT_HALF_WIDTH_INTERVALS * max(high_s - estimate_s, estimate_s - low_s)
+    half_width_s = PLOT_WIDTH_IN_INTERVALS * max(high_s - estimate_s, estimate_s - low_s)
     margin_s = 0.1 * half_width_s
     axes.set_xlim(
         min(max(estimate_s - half_width_s, clock.curve_s[0]), applied_s - margin_s),

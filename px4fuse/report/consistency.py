@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import FILTERS, AxisComparison
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison
 from px4fuse.comparison.trials import DISCREPANCIES, Statistic, Trial, find_cause, find_trials
 from px4fuse.core.text import format_number, format_p_value
 from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
@@ -39,8 +39,8 @@ from px4fuse.report.style import (
 )
 
 MAX_AUTOCORRELATION_LAG = 20
-MAX_DRAWN_INNOVATION = 4.0
-HISTOGRAM_EDGES = np.linspace(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION, 33)
+MAX_DRAWN_SIGMAS = 4.0
+HISTOGRAM_EDGES = np.linspace(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS, 33)
 # Upper limit of the density axis; a higher one would make the normal density (up to 0.4) flat
 MAX_DENSITY = 1.6
 # Maximum p value of the Ljung-Box test for the text "not white"
@@ -48,7 +48,7 @@ MAX_NON_WHITE_P = 0.01
 RUNNING_NIS_HEIGHT = 140.0  # height (points) of the axes of the running mean NIS
 DISTRIBUTION_HEIGHT = 150.0  # height (points) of the axes of distribution and autocorrelation
 LEGEND_HEIGHT = 14.0  # height (points) of a legend above the axes
-# Label of each statistic, and power of the statistic that is printed (0.5: square root)
+# Label of each statistic, and exponent that is applied before printing (0.5: square root)
 STATISTIC_LABELS_AND_POWERS: Mapping[Statistic, tuple[str, float]] = {
     "nis": ("mean NIS", 1.0),
     "nees": ("√NEES", 0.5),
@@ -92,13 +92,13 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         reason = getattr(result.filters["kf"], "reason", "too few innovations")
         page.write(f"The consistency along {axis_text} is not tested: {reason}.")
     page.heading("All axes")
-    head = [*VERDICT_TABLE_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
+    column_heads = [*VERDICT_TABLE_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
     rows = [
         [*verdict_cells(axis_result, name), *_statistic_cells(consistency)]
         for axis_result in analysis.axes.values()
         for name, consistency in statistics_by_filter(axis_result).items()
     ]
-    page.table(head, rows, right_aligned_columns=(2, 5, 6, 7, 8))
+    page.table(column_heads, rows, right_aligned_columns=(2, 5, 6, 7, 8))
     noise_rows = [
         [name, *map(format_noise_estimate, (tuning.sigma_a_two_state, tuning.sigma_z))]
         for name, tuning in analysis.tuning.items()
@@ -114,25 +114,25 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 
 def _write_causes(page: Page, analysis: Analysis) -> None:
     axis = analysis.main.axis
-    tested_trials: list[tuple[Trial, Statistic]] = []
-    for filter_name, statistic in product(FILTERS, DISCREPANCIES):
+    reruns_and_statistics: list[tuple[Trial, Statistic]] = []
+    for filter_name, statistic in product(FILTER_NAMES, DISCREPANCIES):
         trials = find_trials(analysis.trials, filter_name, axis.name, statistic)
-        tested_trials += [(trial, statistic) for trial in trials]
+        reruns_and_statistics += [(trial, statistic) for trial in trials]
         cause = find_cause(trials, filter_name, axis.name, statistic)
         if cause and cause.before.difference_rms_m and cause.after.difference_rms_m:
-            tested_trials.append((cause, "difference"))
+            reruns_and_statistics.append((cause, "difference"))
     rows = []
-    for trial, statistic in tested_trials:
-        label, power = STATISTIC_LABELS_AND_POWERS[statistic]
+    for trial, statistic in reruns_and_statistics:
+        label, exponent = STATISTIC_LABELS_AND_POWERS[statistic]
         values = [outcome.value(statistic) or 0.0 for outcome in (trial.before, trial.after)]
-        cells = [trial.filter.upper(), format_change(analysis, trial), label]
-        cells += [format_number(value**power, 2) for value in values]
+        cells = [FILTER_NAMES[trial.filter], format_change(analysis, trial), label]
+        cells += [format_number(value**exponent, 2) for value in values]
         rows.append([*cells, format_explained_fraction(trial, statistic)])
     if not rows:
         return
     page.heading(f"Tested causes along {axis.label}")
-    head = ["filter", "change", "quantity", "as flown", "with change", "explains"]
-    page.table(head, rows, right_aligned_columns=(3, 4))
+    column_heads = ["filter", "change", "quantity", "as flown", "with change", "explains"]
+    page.table(column_heads, rows, right_aligned_columns=(3, 4))
     page.write(
         "Each row is a re-run with one changed setting. 'explains' is the share of ln(quantity) "
         "(of KF - EKF2: of its mean square) that the change removes; 'all' means that the "
@@ -174,16 +174,16 @@ def _draw_running_nis(axes: Axes, innovations: InnovationsByFilter) -> None:
 
 
 def _draw_histogram(axes: Axes, innovations: InnovationsByFilter) -> None:
-    grid = np.linspace(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION, 81)
-    normal_density = np.exp(-0.5 * grid**2) / np.sqrt(2.0 * np.pi)
-    axes.fill_between(grid, normal_density, color="#dcdcdc", lw=0, label="normal")
+    density_grid = np.linspace(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS, 81)
+    normal_density = np.exp(-0.5 * density_grid**2) / np.sqrt(2.0 * np.pi)
+    axes.fill_between(density_grid, normal_density, color="#dcdcdc", lw=0, label="normal")
     density_limit = 0.4
     for name, values in innovations.items():
-        drawn_values = values.clip(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION)
+        drawn_values = values.clip(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS)
         density, _ = np.histogram(drawn_values, HISTOGRAM_EDGES, density=True)
         axes.stairs(density, HISTOGRAM_EDGES, **TRACK_LINES[name], label=name)
         density_limit = max(density_limit, float(density.max()))
-    axes.set_xlim(-MAX_DRAWN_INNOVATION, MAX_DRAWN_INNOVATION)
+    axes.set_xlim(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS)
     axes.set_ylim(0.0, min(1.15 * density_limit, MAX_DENSITY))
     axes.set_yticks([])
     axes.set_xlabel("ν / √S")
@@ -198,9 +198,9 @@ def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
         fill_colour = KF_COLOUR if name == "KF" else "white"
         dots = INNOVATION_DOTS[name] | {"ms": 3.0, "mew": 0.6, "mfc": fill_colour}
         axes.plot(lag_positions, correlations, **dots, label=name)
-        half_band = _whiteness_half_band(values)
-        axes.axhline(-half_band, **_thin_line_style(name))
-        axes.axhline(half_band, **_thin_line_style(name), label=f"95 % band {name}")
+        whiteness_half_band = _whiteness_half_band(values)
+        axes.axhline(-whiteness_half_band, **_thin_line_style(name))
+        axes.axhline(whiteness_half_band, **_thin_line_style(name), label=f"95 % band {name}")
     axes.axhline(0.0, color="black", lw=0.5)
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.3), -1.05), min(max(high, 0.3), 1.05))

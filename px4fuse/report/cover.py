@@ -1,11 +1,10 @@
-"""First page of a report: the diagnosis card (a summary), and plots below it."""
+"""First page of a report: summary of faults, causes and actions (diagnosis card), and plots."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.card.model import (
-    FILTER_NAMES,
     RATIO_AXIS_ENDS,
     RATIO_AXIS_TICKS,
     Action,
@@ -15,6 +14,7 @@ from px4fuse.card.model import (
     Verdict,
     axis_fraction,
 )
+from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_ratio
 from px4fuse.filter.consistency import Reference
 from px4fuse.report import fonts
@@ -23,13 +23,13 @@ from px4fuse.report.card_text import (
     MAX_COMMAND_LENGTH,
     QUANTITIES,
     SEVERITY_SIGNS,
-    axis_marks,
-    band_limits,
+    format_consistent_ratios,
     format_spans,
     marked_actions,
     note_texts,
     rerun_columns,
     rerun_note,
+    sigma_ratio_marks,
 )
 from px4fuse.report.cover_panels import write_panels
 from px4fuse.report.page import Block, Page, to_typst_data
@@ -46,12 +46,12 @@ TERMS_NOTE = (
     "acceleration as input, no gate. Replay: px4fuse's model of EKF2, run on this log."
 )
 AIDS_TERMS = "√S: standard deviation of an innovation as EKF2 reports it. Source: an aiding sensor."
-PLACE_NAMES = {"shell": "your computer", "console": "MAVLink Console of QGroundControl"}
+COMMAND_PLACES = {"shell": "your computer", "console": "MAVLink Console of QGroundControl"}
 ALL_FINDINGS = "All findings"
 
 
 def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
-    """Draw the cover: the diagnosis card, and plots in the space below it."""
+    """Draw the first page: the diagnosis card, and plots in the space below the card."""
     page = Page()
     block = add_card(page, results.card)
     if isinstance(analysis, Analysis):
@@ -60,7 +60,7 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) ->
 
 
 def add_card(page: Page, card: Card) -> Block:
-    """Add a diagnosis card to a page."""
+    """Add a summary of faults, causes and actions to a page."""
     identity, duration_text = card.identity, f"{card.identity.duration_s:.1f} s"
     flight_texts = identity.firmware, identity.hardware, duration_text, identity.source
     more_causes_text = f"{card.more_causes} more causes are listed in {ALL_FINDINGS}"
@@ -119,7 +119,8 @@ def _axis_data(card: Card) -> dict[str, Any]:
         "axis_title": "Is the reported uncertainty right?",
         "axis_text": AIDS_HEADING if card.aids else axis_text,
         "axis_legend": (
-            f"grey: consistent ({band_limits()}){interval_legend} · ◀ ▶ outside {ends_text}"
+            f"grey: consistent ({format_consistent_ratios()}){interval_legend} · "
+            f"◀ ▶ outside {ends_text}"
         ),
         "ticks": [
             {"fraction": axis_fraction(tick), "label": label}
@@ -161,12 +162,12 @@ def _ratio_data(
 ) -> dict[str, Any]:
     if ratio is None:
         return {"ratio": ""}
-    return {"ratio": format_ratio(ratio), **axis_marks(ratio, reference, interval)}
+    return {"ratio": format_ratio(ratio), **sigma_ratio_marks(ratio, reference, interval)}
 
 
 def _causes_legend(causes: Sequence[Cause]) -> str:
     places = {action.where for cause in causes for _, action in marked_actions(cause)}
-    texts = [f"{place}: {text}" for place, text in PLACE_NAMES.items() if place in places]
+    texts = [f"{place}: {text}" for place, text in COMMAND_PLACES.items() if place in places]
     return " · ".join([*texts, "[id]: `px4fuse explain ID` explains the finding"])
 
 
@@ -178,16 +179,16 @@ def _cause_data(number: int, cause: Cause) -> dict[str, Any]:
         "title": cause.title,
         "when": f"{cause.severity} · {format_spans(cause) or 'whole flight'}",
         "why": cause.why,
-        "actions": [_action_data(mark, action) for mark, action in marked_actions(cause)],
+        "actions": [_action_data(prefix, action) for prefix, action in marked_actions(cause)],
         "reruns": {"head": head, "rows": rows},
         "after": " ".join(filter(None, (rerun_note(cause.reruns), cause.after))),
         "id": cause.id,
     }
 
 
-def _action_data(mark: str, action: Action) -> dict[str, Any]:
+def _action_data(prefix: str, action: Action) -> dict[str, Any]:
     return {
-        "label": f"{mark}{action.target}",
+        "label": f"{prefix}{action.target}",
         "where": action.where,
         "sentence": action.sentence,
         "commands": action.commands,

@@ -13,9 +13,9 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import FILTER_NAMES, Card
+from px4fuse.card.model import Card
 from px4fuse.comparison.comparison import kf_state_and_variance, position_errors, reported_sigma
-from px4fuse.comparison.model import FILTERS, AxisComparison, north_and_east
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, north_and_east
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.signals import AISLE, cut_to_segment
@@ -36,20 +36,20 @@ from px4fuse.report.panels import add_legend, draw_dots, normalised_innovations
 from px4fuse.report.style import TRACK_LINES, Axes, draw_curve
 
 POINTS_PER_MM = 72.0 / 25.4
-# Minimum ratio of length to width of a track; maps of longer tracks fill the page width
+# Minimum ratio of length to width of a track whose map fills the page width
 MIN_LONG_TRACK_RATIO = 2.2
 # Minimum and maximum height (points) of the map, with title and labels
 MAP_HEIGHT_RANGE = 40.0 * POINTS_PER_MM, 53.0 * POINTS_PER_MM
-# Minimum free height (points) below the diagnosis card for the plots
+# Minimum free height (points) on the first page for plots; otherwise they are on the next page
 MIN_PLOTS_HEIGHT = 38.0 * POINTS_PER_MM
-# Minimum free height (points) below the diagnosis card for a plot of the innovations
+# Minimum free height (points) on the first page for a plot of the innovations
 MIN_INNOVATIONS_HEIGHT = 50.0 * POINTS_PER_MM
 # Minimum and maximum height (points) of the innovation plot, with title and labels
 INNOVATION_HEIGHT_RANGE = 27.0 * POINTS_PER_MM, 38.0 * POINTS_PER_MM
 # Minimum height (points) of each plot of a position error
 MIN_ERROR_HEIGHT = 17.0 * POINTS_PER_MM
-# Total height (points) of the plots on the page after the diagnosis card
-NEXT_PAGE_HEIGHT = 160.0 * POINTS_PER_MM
+# Total height (points) of the plots if they are on the next page
+NEXT_PAGE_PLOTS_HEIGHT = 160.0 * POINTS_PER_MM
 TITLE_HEIGHT = 16.5  # height (points) of a title of one line, with its gaps
 TITLE_LINE_HEIGHT = 10.5  # height (points) of each further line of a title
 # Unused height (points): gap above the legend, and gap below the last plot
@@ -64,23 +64,23 @@ INNOVATION_HEIGHT_FRACTION = 0.22
 # Fraction of the height of all plots that the map fills
 MAP_HEIGHT_FRACTION = 0.25
 # Maximum innovation ÷ √S in the innovation plot; larger values are triangles at the edge
-MAX_DRAWN_INNOVATION = 4.0
+MAX_DRAWN_SIGMAS = 4.0
 # Height (points) below a plot, without and with labels of the time axis
 HEIGHT_BELOW_AXES = UNLABELLED_HEIGHT, TICKS_HEIGHT + AXIS_LABEL_HEIGHT
 # Ratio of the extent of the map to the extent of the tracks
 MAP_MARGIN_FACTOR = 1.08
 # Maximum margin of the map around the positions, as a fraction of their extent
 MAX_MAP_MARGIN_FRACTION = 0.25
-MIN_MAP_LENGTH_M = 0.5
+MIN_MAP_EXTENT_M = 0.5
 # Maximum ratio of largest to smallest σ for which the title of a plot states only the median
 MAX_CONSTANT_SIGMA_RATIO = 1.5
-# Time (s) after the start of a filter that σ in titles of plots excludes
-SETTLING_S = 2.0
+# Time (s) after the start of a filter that is excluded from σ in plot titles
+SIGMA_SETTLING_S = 2.0
 Coordinates = tuple[Array, Array]
 
 
 class TimePlot(NamedTuple):
-    """Plot over time, and the function that draws it."""
+    """Title of a plot over time, and the function that draws the plot."""
 
     title: str
     draw: Callable[[Axes], None]
@@ -96,14 +96,13 @@ class FlightMap(NamedTuple):
     right_labels: Sequence[str]
     up_label: str
 
-    @property
-    def is_long(self) -> bool:
-        length_m, width_m = (float(np.ptp(values)) for values in self.tracks["positions"])
-        return length_m >= MIN_LONG_TRACK_RATIO * max(width_m, 1e-6)
+    def has_elongated_track(self) -> bool:
+        map_length_m, width_m = (float(np.ptp(values)) for values in self.tracks["positions"])
+        return map_length_m >= MIN_LONG_TRACK_RATIO * max(width_m, 1e-6)
 
 
 def write_panels(block: Block, analysis: Analysis, card: Card, free_height: float) -> None:
-    """Draw legend, map and plots over time on the cover; ``free_height`` in points."""
+    """Draw legend, map and plots over time on the first page; ``free_height`` is in points."""
     page = Page()
     block["blocks"] = page.blocks
     legend = add_legend(page, analysis)
@@ -111,7 +110,7 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free_height: floa
     flight_map = _flight_map(analysis, card)
     plots_height = free_height - legend["height"] - UNUSED_HEIGHT
     if plots_height < MIN_PLOTS_HEIGHT:
-        plots_height = NEXT_PAGE_HEIGHT
+        plots_height = NEXT_PAGE_PLOTS_HEIGHT
         page.blocks.insert(0, {"kind": "break"})
     min_long_map_height = (
         MAP_HEIGHT_RANGE[0] + INNOVATION_HEIGHT_RANGE[0] + len(errors) * MIN_ERROR_HEIGHT
@@ -119,7 +118,7 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free_height: floa
     innovation_height = float(
         np.clip(INNOVATION_HEIGHT_FRACTION * plots_height, *INNOVATION_HEIGHT_RANGE)
     )
-    if flight_map.is_long and plots_height >= min_long_map_height:
+    if flight_map.has_elongated_track() and plots_height >= min_long_map_height:
         map_height = float(np.clip(MAP_HEIGHT_FRACTION * plots_height, *MAP_HEIGHT_RANGE))
         _draw_map(page, analysis, flight_map, map_height)
         error_heights = _equal_heights(page, errors, plots_height - map_height - innovation_height)
@@ -160,7 +159,7 @@ def _add_panel(page: Page, title: str, axes_height: float) -> Axes:
 
 
 def _equal_heights(page: Page, plots: Sequence[TimePlot], total_height: float) -> list[float]:
-    """Return heights (points) of plots whose axes have equal height."""
+    """Return heights (points) of plots with equally high axes and titles of one or more lines."""
     title_heights = [_title_height(page, plot.title) for plot in plots]
     axes_height = (total_height - sum(title_heights)) / max(len(plots), 1)
     return [axes_height + title_height for title_height in title_heights]
@@ -171,21 +170,21 @@ def _title_height(page: Page, title: str) -> float:
 
 
 def _position_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
-    """Return a plot of the position error of each filter, or one of KF - EKF2 if it is unknown."""
-    result, effect = analysis.main.in_flight, card.effect
+    """Return plots of the position errors of KF and EKF2, or of KF - EKF2 without ground truth."""
+    result, effect = analysis.main.with_flight_tracks(), card.effect
     errors_by_filter = {
         filter_name: errors
-        for filter_name in FILTERS
+        for filter_name in FILTER_NAMES
         if isinstance(errors := position_errors(result, filter_name), pd.DataFrame)
         and errors["error_m"].notna().any()
     }
     if errors_by_filter:
-        half_range_m = 1.1 * max(map(_error_range_m, errors_by_filter.values()))
-        rmse_m = effect.position_rmse_m if effect else {}
+        half_range_m = 1.1 * max(map(_error_axis_limit_m, errors_by_filter.values()))
+        rmse_by_filter_m = effect.position_rmse_m if effect else {}
         return [
             _error_plot(
                 f"{(name := FILTER_NAMES[filter_name])} error (m)",
-                ("RMSE", rmse_m.get(filter_name)),
+                ("RMSE", rmse_by_filter_m.get(filter_name)),
                 errors["error_m"],
                 {name: errors["sigma_m"]},
                 half_range_m,
@@ -211,13 +210,13 @@ def _position_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
 
 def _error_plot(
     label: str,
-    rms: tuple[str, float | None],
+    name_and_rms_m: tuple[str, float | None],
     error_m: pd.Series[float],
     sigmas: Mapping[str, pd.Series[float]],
     half_range_m: float,
 ) -> TimePlot:
-    rms_name, rms_m = rms
-    texts = [] if rms_m is None else [f"{rms_name} {format_metres(rms_m)}"]
+    rms_name, rms_m = name_and_rms_m
+    statistic_texts = [] if rms_m is None else [f"{rms_name} {format_metres(rms_m)}"]
     finite_sigmas = {
         name: finite_sigma
         for name, sigma in sigmas.items()
@@ -228,7 +227,7 @@ def _error_plot(
         for name, sigma in finite_sigmas.items()
     ]
     if sigma_texts:
-        texts.append(f"σ {', '.join(sigma_texts)}")
+        statistic_texts.append(f"σ {', '.join(sigma_texts)}")
     line = TRACK_LINES[next(iter(sigmas))] if len(sigmas) == 1 else style.line_style("black", 1.0)
 
     def draw(axes: Axes) -> None:
@@ -238,10 +237,10 @@ def _error_plot(
         axes.axhline(0.0, color="black", lw=0.5)
         draw_curve(axes, error_m, **line)
 
-    return TimePlot(f"{label}: {', '.join(texts)}", draw)
+    return TimePlot(f"{label}: {', '.join(statistic_texts)}", draw)
 
 
-def _error_range_m(errors: pd.DataFrame) -> float:
+def _error_axis_limit_m(errors: pd.DataFrame) -> float:
     largest_error, sigma = float(errors["error_m"].abs().max()), errors["sigma_m"].median()
     return max(
         largest_error, 1e-3, min(2.2 * sigma, 3.0 * largest_error) if np.isfinite(sigma) else 0.0
@@ -249,7 +248,7 @@ def _error_range_m(errors: pd.DataFrame) -> float:
 
 
 def _format_sigma(sigma: pd.Series[float]) -> str:
-    settled_sigma = sigma[sigma.index >= min(sigma.index[0] + SETTLING_S, sigma.index[-1])]
+    settled_sigma = sigma[sigma.index >= min(sigma.index[0] + SIGMA_SETTLING_S, sigma.index[-1])]
     low, high = float(settled_sigma.min()), float(settled_sigma.max())
     if high < MAX_CONSTANT_SIGMA_RATIO * low:
         return format_metres(float(settled_sigma.median()))
@@ -260,22 +259,27 @@ def _innovation_plot(result: AxisComparison) -> TimePlot:
     innovations = normalised_innovations(result)
     legend = ", ".join(f"{sign} {name}" for name, sign in zip(innovations, "●■", strict=False))
     titles = [f"Innovations ÷ √S ({legend}): 95 % expected within ±2"]
-    largest_texts = [
+    outside_texts = [
         f"{name} {format_ratio(ratio)}"
         for name, values in innovations.items()
-        if (ratio := float(values.abs().max())) > MAX_DRAWN_INNOVATION
+        if (ratio := float(values.abs().max())) > MAX_DRAWN_SIGMAS
     ]
-    if largest_texts:
-        titles.append(f"▲▼ outside ±{MAX_DRAWN_INNOVATION:g}, up to {', '.join(largest_texts)}")
+    if outside_texts:
+        titles.append(f"▲▼ outside ±{MAX_DRAWN_SIGMAS:g}, up to {', '.join(outside_texts)}")
 
     def draw(axes: Axes) -> None:
-        axes.set_ylim(-1.12 * MAX_DRAWN_INNOVATION, 1.12 * MAX_DRAWN_INNOVATION)
+        axes.set_ylim(-1.12 * MAX_DRAWN_SIGMAS, 1.12 * MAX_DRAWN_SIGMAS)
         height = axes.bbox.height * 72.0 / axes.figure.dpi
         axes.set_yticks(np.arange(-4.0, 4.1, 2.0 if height >= MIN_HEIGHT_WITH_TICKS_AT_2 else 4.0))
         axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.05)
         axes.axhline(0.0, color="black", lw=0.5)
         for name in reversed(innovations):
-            draw_dots(axes, innovations[name], MAX_DRAWN_INNOVATION, style.INNOVATION_DOTS[name])
+            draw_dots(
+                axes,
+                innovations[name],
+                MAX_DRAWN_SIGMAS,
+                style.INNOVATION_DOTS[name],
+            )
 
     return TimePlot("; ".join(titles), draw)
 
@@ -301,7 +305,7 @@ def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
 
 
 def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
-    """Return the map with the main axis to the right; without a main axis, north is up."""
+    """Return the map with the main flight direction to the right; without it, north is up."""
     aisle_heading_deg = next(
         (line.heading_deg for line in analysis.input_axes if line.name == AISLE), None
     )
@@ -355,29 +359,31 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
         (analysis.events.take_off_s, event_marks.TAKE_OFF_MARK),
         (analysis.events.landing_s, event_marks.LANDING_MARK),
     ):
-        rows = position_times.get_indexer(pd.Index(times, dtype=float), method="nearest")
+        position_rows = position_times.get_indexer(pd.Index(times, dtype=float), method="nearest")
         large_mark = mark | {"ms": 9.0, "mec": "white", "mew": 0.8}
-        axes.plot(right_m[rows], up_m[rows], **large_mark)
+        axes.plot(right_m[position_rows], up_m[position_rows], **large_mark)
 
 
 def _map_limits(tracks: Mapping[str, Coordinates], aspect_ratio: float) -> tuple[Array, Array]:
     """Return the lower left and the upper right corner of the map (m)."""
-    # limited, so that a large error of a filter does not reduce the scale of the map
+    # large errors of a filter are outside of the map, because they would reduce its scale
     middles_m, sizes_m = [], []
     for axis_index in (0, 1):
-        ends_m = [np.percentile(tracks["positions"][axis_index], (1.0, 99.0))]
+        range_ends_m = [np.percentile(tracks["positions"][axis_index], (1.0, 99.0))]
         if "ground truth" in tracks:
-            ends_m.append(_range_of(tracks["ground truth"][axis_index]))
-        low_m, high_m = _range_of(ends_m)
+            range_ends_m.append(_range_of(tracks["ground truth"][axis_index]))
+        low_m, high_m = _range_of(range_ends_m)
         margin_m = MAX_MAP_MARGIN_FRACTION * (high_m - low_m)
         limits_m = low_m - margin_m, high_m + margin_m
-        ends_m += [np.clip(_range_of(track[axis_index]), *limits_m) for track in tracks.values()]
-        low_m, high_m = _range_of(ends_m)
+        range_ends_m += [
+            np.clip(_range_of(track[axis_index]), *limits_m) for track in tracks.values()
+        ]
+        low_m, high_m = _range_of(range_ends_m)
         middles_m.append(0.5 * (low_m + high_m))
-        sizes_m.append(max(MAP_MARGIN_FACTOR * (high_m - low_m), MIN_MAP_LENGTH_M))
-    length_m = max(sizes_m[0], sizes_m[1] * aspect_ratio)
-    half_size = 0.5 * np.array([length_m, length_m / aspect_ratio])
-    return np.array(middles_m) - half_size, np.array(middles_m) + half_size
+        sizes_m.append(max(MAP_MARGIN_FACTOR * (high_m - low_m), MIN_MAP_EXTENT_M))
+    map_length_m = max(sizes_m[0], sizes_m[1] * aspect_ratio)
+    half_size_m = 0.5 * np.array([map_length_m, map_length_m / aspect_ratio])
+    return np.array(middles_m) - half_size_m, np.array(middles_m) + half_size_m
 
 
 def _range_of(values: ArrayLike) -> Array:

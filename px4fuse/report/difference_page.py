@@ -37,7 +37,7 @@ INCREASE_BAR_STYLE: dict[str, Any] = {"color": "white", "hatch": "////"}
 
 
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
-    """Draw the part of each setting of EKF2 in the mean square difference KF - EKF2."""
+    """Draw the contribution of each EKF2 setting to the mean square difference KF - EKF2."""
     explanations = _explanations_by_axis(analysis)
     if not _has_explanation(explanations):
         return
@@ -61,7 +61,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _explanations_by_axis(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
-    """Return the explanation along the aisle (main direction) if it exists, else along all axes."""
+    """Return explanations of KF - EKF2: of the main direction if available, else of all axes."""
     explanations = analysis.difference_steps
     return {AISLE: explanations[AISLE]} if AISLE in explanations else explanations
 
@@ -132,9 +132,11 @@ def _draw_axis_explanation(
     for column, left_edge, (quantity, unit, squared_unit, unexplained) in zip(
         columns, (LABEL_WIDTH, 4.0), quantities, strict=True
     ):
-        field = f"{quantity}_mean_square_{squared_unit}"
-        total_mean_square = getattr(explanation, field)
-        mean_square_reductions = np.array([getattr(step, field) for step in explanation.steps])
+        mean_square_field = f"{quantity}_mean_square_{squared_unit}"
+        total_mean_square = getattr(explanation, mean_square_field)
+        mean_square_reductions = np.array(
+            [getattr(step, mean_square_field) for step in explanation.steps]
+        )
         title = f"{quantity} difference, {np.sqrt(total_mean_square):.3f} {unit} RMS"
         height = BAR_ROW_HEIGHT * (len(setting_names) + 2)
         axes = column.panel(title, height, left=left_edge)
@@ -168,16 +170,16 @@ def _draw_waterfall(
     """Draw the mean square of KF - EKF2 and its reduction by each replaced setting (%)."""
     bar_ends = 100.0 - np.concatenate([[0.0], np.cumsum(reductions_percent)])
     row_count, right_end = len(setting_names) + 2, max(100.0, float(bar_ends.max()))
-    kf_bar: dict[str, Any] = {"height": 0.7, "edgecolor": KF_COLOUR, "lw": 0.6}
-    axes.barh(0, 100.0, **kf_bar, color=KF_COLOUR)
+    kf_bar_style: dict[str, Any] = {"height": 0.7, "edgecolor": KF_COLOUR, "lw": 0.6}
+    axes.barh(0, 100.0, **kf_bar_style, color=KF_COLOUR)
     for row, (reduction, bar_start) in enumerate(
         zip(reductions_percent, bar_ends, strict=False), start=1
     ):
         bar_style = INCREASE_BAR_STYLE if reduction < 0.0 else {"color": KF_BAND_COLOUR}
-        axes.barh(row, -reduction, left=bar_start, **kf_bar, **bar_style)
+        axes.barh(row, -reduction, left=bar_start, **kf_bar_style, **bar_style)
         axes.plot([bar_start] * 2, [row - 1.35, row + 0.35], color=MUTED_COLOUR, lw=0.5)
-    ekf2_bar = kf_bar | {"color": EKF2_BAND_COLOUR, "edgecolor": EKF2_COLOUR}
-    axes.barh(row_count - 1, unexplained_percent, **ekf2_bar)
+    ekf2_bar_style = kf_bar_style | {"color": EKF2_BAND_COLOUR, "edgecolor": EKF2_COLOUR}
+    axes.barh(row_count - 1, unexplained_percent, **ekf2_bar_style)
     for row, percent in enumerate((100.0, *reductions_percent, unexplained_percent)):
         digits = 1 if 0.05 <= abs(percent) < 9.95 else 0
         axes.text(1.03 * right_end, row, f"{percent:z.{digits}f} %", va="center", size=8.0)

@@ -14,7 +14,7 @@ from px4fuse.report.page import Page, two_columns
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Artist, Axes
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
 from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
-from px4fuse.trajectory.scores import Interval, RelativeError, Statistics
+from px4fuse.trajectory.scores import RelativeError, RmseInterval, Statistics
 
 # Indices of the position axes that are drawn to the right and upwards on a map
 MAP_AXIS_INDICES: Mapping[Frame, tuple[int, int]] = {
@@ -24,10 +24,10 @@ MAP_AXIS_INDICES: Mapping[Frame, tuple[int, int]] = {
     "camera": (0, 2),
     "unknown": (0, 1),
 }
-# Ratio of an interval between poses to the median interval above which it is drawn as a gap
+# Minimum ratio of a pose interval to the median pose interval for a gap in the drawn path
 MIN_GAP_INTERVAL_RATIO = 10.0
 MAX_PATH_POINTS = 1200  # maximum number of drawn points of a path
-MIN_ERROR_RANGE_M = 1e-3  # minimum range (m) of an error axis: rounding errors look small
+MIN_ERROR_RANGE_M = 1e-3  # minimum range (m) of an error axis, so that rounding errors look small
 PANEL_HEIGHT = 76.0  # height (points) of the axes of APE and RPE
 MAP_HEIGHT = 128.0  # height (points) of the axes of a map
 LABEL_MARGIN = 34.0  # width (points) of the labels of the vertical axis of a map
@@ -105,9 +105,9 @@ def _draw_path(axes: Axes, evaluation: Evaluation, axis_indices: list[int]) -> N
     axes.plot(*path_m[0], "o", color="white", mec="black", ms=5, mew=1.0, label="start", zorder=5)
     worst_point = path_m[np.argmax(error_m)]
     axes.plot(*worst_point, "x", color="black", ms=7, mew=1.6, label="largest error", zorder=5)
-    bar = axes.figure.colorbar(dots, cax=axes.inset_axes((1.02, 0.0, 0.03, 1.0)))
-    bar.set_label("APE (m)", labelpad=1)
-    bar.outline.set_linewidth(0.5)
+    colour_bar = axes.figure.colorbar(dots, cax=axes.inset_axes((1.02, 0.0, 0.03, 1.0)))
+    colour_bar.set_label("APE (m)", labelpad=1)
+    colour_bar.outline.set_linewidth(0.5)
 
 
 def _draw_ape_and_rpe(page: Page, evaluation: Evaluation) -> None:
@@ -132,8 +132,8 @@ def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) ->
     error_m, x_start, x_end = evaluation.position_error_m, float(x_values[0]), float(x_values[-1])
     drawn_x, drawn_errors_m = style.decimate_series(x_values, error_m, style.MAX_NARROW_POINTS)
     gap_indices = np.searchsorted(drawn_x, x_values[_gap_indices(evaluation.time_s)])
-    curve = np.insert([drawn_x, drawn_errors_m], gap_indices, np.nan, axis=1)
-    axes.plot(*curve, color=KF_COLOUR, lw=0.8)
+    curve_with_gaps = np.insert([drawn_x, drawn_errors_m], gap_indices, np.nan, axis=1)
+    axes.plot(*curve_with_gaps, color=KF_COLOUR, lw=0.8)
     for name, title, line_style in STATISTIC_LINES:
         value = getattr(evaluation.ate.translation_m, name)
         axes.axhline(value, label=f"{title} {format_metres(value)} m", zorder=3, **line_style)
@@ -145,7 +145,7 @@ def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) ->
 
 def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
     for index, (error, statistics) in enumerate(rpe_statistics := _rpe_statistics(evaluation)):
-        if isinstance(error.interval_m, Interval):
+        if isinstance(error.interval_m, RmseInterval):
             interval = error.interval_m.low, error.interval_m.high
             axes.plot([index] * 2, interval, color=KF_COLOUR, lw=1.6, solid_capstyle="butt")
         axes.plot(index, statistics.rmse, "D", color=EKF2_COLOUR, mec="black", mew=0.5, ms=3.6)
@@ -169,8 +169,8 @@ def _gap_indices(time_s: Array) -> IntArray:
 def plot_path(axes: Axes, positions_m: Array, time_s: Array, **style: Any) -> None:
     """Draw a path, shape (n, 2), with gaps where the time has gaps."""
     gap_indices, count = _gap_indices(time_s), len(positions_m)
-    evenly_spaced = np.linspace(0, count - 1, min(count, MAX_PATH_POINTS)).astype(np.intp)
-    drawn_indices = np.unique(np.concatenate([evenly_spaced, gap_indices]))
+    evenly_spaced_indices = np.linspace(0, count - 1, min(count, MAX_PATH_POINTS)).astype(np.intp)
+    drawn_indices = np.unique(np.concatenate([evenly_spaced_indices, gap_indices]))
     gap_rows = np.searchsorted(drawn_indices, gap_indices)
     axes.plot(*np.insert(positions_m[drawn_indices], gap_rows, np.nan, axis=0).T, **style)
 
@@ -205,10 +205,10 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
 
 
 def error_rows(evaluation: Evaluation) -> list[list[str]]:
-    errors: dict[str, AbsoluteError | RelativeError] = {"ATE (m)": evaluation.ate}
-    errors |= {f"RPE {error.delta_text} (m)": error for error in evaluation.rpe}
+    error_by_name: dict[str, AbsoluteError | RelativeError] = {"ATE (m)": evaluation.ate}
+    error_by_name |= {f"RPE {error.delta_text} (m)": error for error in evaluation.rpe}
     rows = []
-    for name, error in errors.items():
+    for name, error in error_by_name.items():
         errors_m, errors_deg = error.translation_m, error.rotation_deg
         cells = ["–", *[""] * 6]
         if isinstance(errors_m, Statistics):
@@ -235,11 +235,12 @@ def unaligned_sentence(evaluation: Evaluation) -> str:
     rmse_m = float(np.sqrt(((estimate_m - reference_m) ** 2).sum(axis=1).mean()))
     alignment = evaluation.transform
     scale_text = f", scale {alignment.scale:.3g}" if alignment.degrees_of_freedom == 7 else ""
-    middle_m = estimate_m.mean(axis=0)
-    shift_m = float(np.linalg.norm(alignment.apply(middle_m) - middle_m))
+    centre_m = estimate_m.mean(axis=0)
+    shift_m = float(np.linalg.norm(alignment.apply(centre_m) - centre_m))
     return (
         f"RMSE before alignment {format_metres(rmse_m)} m. Alignment: rotation "
-        f"{np.degrees(alignment.rotation.magnitude()):.1f}°, translation {format_metres(shift_m)} m"
+        f"{np.degrees(alignment.to_rotation().magnitude()):.1f}°, translation "
+        f"{format_metres(shift_m)} m"
         f"{scale_text} (difference of the frames, not an error)."
     )
 
@@ -270,14 +271,14 @@ def rpe_growth_sentence(rpe: tuple[RelativeError, ...]) -> str:
     )
 
 
-def format_interval(interval: Interval | Unavailable) -> str:
-    return f"{interval.low:.3f}–{interval.high:.3f}" if isinstance(interval, Interval) else ""
+def format_interval(interval: RmseInterval | Unavailable) -> str:
+    return f"{interval.low:.3f}–{interval.high:.3f}" if isinstance(interval, RmseInterval) else ""
 
 
-def describe_track(path: Trajectory) -> str:
+def describe_track(track: Trajectory) -> str:
     return (
-        f"{path.name}: {path.kind}, {len(path)} poses over "
-        f"{path.time_s[-1] - path.time_s[0]:.1f} s, frame {path.frame}"
+        f"{track.name}: {track.kind}, {len(track)} poses over "
+        f"{track.time_s[-1] - track.time_s[0]:.1f} s, frame {track.frame}"
     )
 
 

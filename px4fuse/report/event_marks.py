@@ -58,7 +58,7 @@ def _event_marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tup
 def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> None:
     """Draw gaps, resets, rejections and outliers on a time axis.
 
-    ``axis``: axis whose rejected measurements are drawn; None for the main axis, "" for none.
+    Rejections are those along ``axis``; None is the main axis, "" draws no rejections.
     """
     from matplotlib.collections import PolyCollection  # noqa: PLC0415
     from matplotlib.lines import Line2D  # noqa: PLC0415
@@ -71,7 +71,10 @@ def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> No
         if not len(spans_or_times):
             continue
         if height is None:
-            corners = [[(s, 0.0), (s, 1.0), (e, 1.0), (e, 0.0)] for s, e in spans_or_times]
+            corners = [
+                [(start_s, 0.0), (start_s, 1.0), (end_s, 1.0), (end_s, 0.0)]
+                for start_s, end_s in spans_or_times
+            ]
             bands = PolyCollection(corners, transform=x_transform, zorder=0.1 * order, **style)
             axes.add_collection(bands, autolim=False)
         else:
@@ -92,7 +95,7 @@ def add_panel(
     with_time_label: bool = True,
     **options: Any,
 ) -> Axes:
-    """Add a plot over time with the events of :func:`draw_marks`."""
+    """Add a plot over time that also shows gaps, resets, rejections and outliers."""
     axes = page.panel(title, height, **options)
     draw_marks(axes, analysis, axis=axis)
     label_time_axis(axes, with_time_label)
@@ -121,7 +124,7 @@ def legend_entries(analysis: Analysis) -> list[Artist]:
 
 
 def visible_times(times: Any, min_interval_s: float) -> Array:
-    """Return the first of the times (s) in each interval, so that markers do not overlap."""
+    """Keep one time (s) per interval, so that drawn markers do not overlap."""
     times_s = np.asarray(times, dtype=np.float64)
     visible_s: Array = times_s[np.unique(np.floor(times_s / min_interval_s), return_index=True)[1]]
     return visible_s

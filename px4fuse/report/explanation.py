@@ -8,17 +8,19 @@ from px4fuse.report.page import Page
 
 
 def list_page() -> Page:
-    """List the ids of all findings with their titles, by group."""
+    """List the ids and titles of all findings (detectable faults), by group."""
     page = Page()
     for group in GROUPS:
         page.heading(capitalise_first(group))
-        rows = [(name, entry.title) for name, entry in CATALOGUE.items() if entry.group == group]
+        rows = [
+            (name, finding.title) for name, finding in CATALOGUE.items() if finding.group == group
+        ]
         page.table(("id", "finding"), rows)
     return page
 
 
 def finding_page(finding_id: str) -> Page:
-    """Format meaning, example, causes, effects and error rates of a finding.
+    """Format meaning, example, causes, effects and error rates of a finding (detectable fault).
 
     Raises
     ------
@@ -31,25 +33,25 @@ def finding_page(finding_id: str) -> Page:
             f"{finding_id!r} is not a finding",
             f"{suggest_name(name, CATALOGUE)}For a list of findings, run px4fuse explain.",
         )
-    entry, example = CATALOGUE[name], load_examples()[name]
+    finding, example = CATALOGUE[name], load_examples()[name]
     causes = [cause for cause in CONSEQUENCES if name in effect_ids(cause)]
     page = Page()
-    page.write(f"{entry.title}  [{name}]", bold=True)
-    page.write_labelled("Meaning", entry.meaning)
+    page.write(f"{finding.title}  [{name}]", bold=True)
+    page.write_labelled("Meaning", finding.meaning)
     if example.message:
         page.write_labelled("Example", example.message)
         page.write_labelled("Action", example.remedy)
     for label, names in {"Causes": causes, "Effects": effect_ids(name)}.items():
         if names:
             page.write_labelled(label, ", ".join(names))
-    rates = ["False alarms and detection are not measured for this finding."]
+    rate_sentences = ["False alarms and detection are not measured for this finding."]
     if example.clean_flights:
         rate_texts = [f"{name}: {100.0 * rate:.0f} %" for name, rate in example.detection.items()]
-        rates = [
+        rate_sentences = [
             f"False alarms occurred on {example.false_alarms} of {example.clean_flights} simulated "
             "flights without an injected fault.",
             "Fraction of simulated flights on which the injected fault is detected: "
             f"{'; '.join(rate_texts)}.",
         ]
-    page.write_labelled("Rates", *rates)
+    page.write_labelled("Rates", *rate_sentences)
     return page

@@ -16,9 +16,9 @@ from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
 from px4fuse.report.phrases import statistics_by_filter, verdict_notes
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, Axes
 
-ZOOM_UPDATE_COUNT = 15  # number of updates in the plot of a few updates
-MIN_ZOOM_S = 1.0  # minimum duration (s) of the plot of a few updates
-ZOOM_HEIGHT = 125.0  # height (points) of the axes of the plot of a few updates
+ZOOM_UPDATE_COUNT = 15  # number of updates in the enlarged plot of σ_p
+MIN_ZOOM_S = 1.0  # minimum duration (s) of the enlarged plot of σ_p
+ZOOM_HEIGHT = 125.0  # height (points) of the axes of the enlarged plot of σ_p
 
 
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
@@ -69,7 +69,7 @@ def _draw_zoom(page: Page, analysis: Analysis) -> None:
 
 
 def zoom_window(result: AxisComparison, segment: Segment) -> Span:
-    """Return start and end (s) of the plot of a few updates in the middle of the flight."""
+    """Return start and end (s) of a few updates in the middle of the flight."""
     update_times_s = result.replay.updates.index.to_numpy()
     if len(update_times_s) < 2:
         return segment.start_s, min(segment.start_s + MIN_ZOOM_S, segment.end_s)
@@ -93,11 +93,13 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, zoom_span_s: Span) -> Non
     dots = style.dot_style(KF_COLOUR, ".", 2.4) | {"ls": "-", "lw": 1.1}
     axes.plot(variances_m2.index, np.sqrt(variances_m2), **dots)
     if isinstance(result.ekf2_innovations, pd.DataFrame):
-        ekf2 = result.ekf2_innovations.loc[slice(*zoom_span_s)].dropna(subset=["prior_variance_m2"])
-        sigma_before, sigma_after = (
-            np.sqrt(ekf2[f"{side}_variance_m2"]) for side in ("prior", "posterior")
+        ekf2_updates = result.ekf2_innovations.loc[slice(*zoom_span_s)].dropna(
+            subset=["prior_variance_m2"]
         )
-        axes.vlines(ekf2.index, sigma_after, sigma_before, color=EKF2_COLOUR, lw=1.0)
+        sigma_before, sigma_after = (
+            np.sqrt(ekf2_updates[f"{side}_variance_m2"]) for side in ("prior", "posterior")
+        )
+        axes.vlines(ekf2_updates.index, sigma_after, sigma_before, color=EKF2_COLOUR, lw=1.0)
         axes.plot(sigma_before, **style.dot_style(EKF2_COLOUR, "^", 3.6, 0.7), mfc="none")
         axes.plot(sigma_after, **style.dot_style(EKF2_COLOUR, "v", 3.6))
     if isinstance(result.ekf2_variance, pd.DataFrame):
@@ -133,7 +135,7 @@ def zoom_sentence(result: AxisComparison) -> str:
 
 def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw one column for each axis other than the main axis."""
-    secondary_axes = analysis.secondary_axes
+    secondary_axes = analysis.select_secondary_axes()
     if not secondary_axes:
         return
     page = Page(

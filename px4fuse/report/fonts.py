@@ -19,18 +19,17 @@ MAX_LISTED_CHARACTERS = 12
 
 @cache
 def font_of(character: str) -> str | None:
-    """Return the name of a font with the character, if possible DejaVu Sans; else None."""
-    if ord(character) in _characters(font_manager.findfont(FONT)):
+    """Return the name of an installed font with a character, preferably DejaVu Sans, or None."""
+    if ord(character) in _font_characters(font_manager.findfont(FONT)):
         return FONT
     return next(
-        (name for name, path in _other_fonts() if ord(character) in _characters(path)), None
+        (name for name, path in _other_fonts() if ord(character) in _font_characters(path)), None
     )
 
 
 def font_names(text: str) -> list[str]:
     """Return the names of the fonts for a text, DejaVu Sans first."""
-    names = [font_of(character) for character in _non_ascii(text)]
-    return list(dict.fromkeys([FONT, *(name for name in names if name is not None)]))
+    return list(dict.fromkeys([FONT, *filter(None, map(font_of, _non_ascii(text)))]))
 
 
 def font_folders(names: tuple[str, ...]) -> list[str]:
@@ -61,7 +60,7 @@ def _non_ascii(text: str) -> list[str]:
 
 @cache
 def _other_fonts() -> tuple[tuple[str, FontPath], ...]:
-    """Return names and paths of the other installed fonts, preferred ones first."""
+    """Return names and paths of installed fonts except DejaVu Sans, in order of preference."""
     manager = font_manager.fontManager
     known_paths = {str(entry.fname) for entry in manager.ttflist}
     for path in sorted(set(font_manager.findSystemFonts()) - known_paths):
@@ -101,5 +100,5 @@ def _font_sort_key(entry: FontEntry) -> tuple[object, ...]:
 
 
 @cache
-def _characters(path: FontPath) -> frozenset[int]:
+def _font_characters(path: FontPath) -> frozenset[int]:
     return frozenset(font_manager.get_font(path).get_charmap())

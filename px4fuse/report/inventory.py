@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from px4fuse.core.text import join_first
 from px4fuse.flight.model import Unavailable
-from px4fuse.info.inventory import Inventory, Source
+from px4fuse.info.inventory import Inventory, LoggedData
 from px4fuse.report.page import Cell, Page
 from px4fuse.report.phrases import format_clock_map
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
@@ -54,21 +54,25 @@ def log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
 
 def _describe_log(inventory: Inventory) -> list[tuple[str, str]]:
     log = inventory.flight.log
-    size = f"{log.bytes / 1e6:.1f} MB" if log.bytes >= 1e5 else f"{log.bytes} bytes"
-    version = log.firmware if log.firmware != "unknown" else f"{log.autopilot}, version unknown"
-    git = "" if log.firmware_hash == "unknown" else f" (git {log.firmware_hash[:8]})"
-    hardware = "hardware unknown" if log.hardware == "unknown" else log.hardware
+    size_text = f"{log.bytes / 1e6:.1f} MB" if log.bytes >= 1e5 else f"{log.bytes} bytes"
+    firmware_text = (
+        log.firmware if log.firmware != "unknown" else f"{log.autopilot}, version unknown"
+    )
+    git_text = "" if log.firmware_hash == "unknown" else f" (git {log.firmware_hash[:8]})"
+    hardware_text = "hardware unknown" if log.hardware == "unknown" else log.hardware
     labelled_texts = [
-        ("Log", f"{log.format}, {size}, SHA-256 {log.sha256[:12]}"),
-        ("Vehicle", f"{version}{git}, {hardware}"),
+        ("Log", f"{log.format}, {size_text}, SHA-256 {log.sha256[:12]}"),
+        ("Vehicle", f"{firmware_text}{git_text}, {hardware_text}"),
         ("Data", f"{_duration_text(log.duration_s)}, {_start_text(inventory)}"),
         ("Airborne", _airborne_text(inventory)),
     ]
     if log.dropouts:
         lost_s = sum(dropout.duration_s for dropout in log.dropouts)
         longest_s = max(dropout.duration_s for dropout in log.dropouts)
-        count = len(log.dropouts)
-        text = f"{count} logger dropouts of {lost_s:.2f} s in total, at most {longest_s:.2f} s"
+        dropout_count = len(log.dropouts)
+        text = (
+            f"{dropout_count} logger dropouts of {lost_s:.2f} s in total, at most {longest_s:.2f} s"
+        )
         labelled_texts.append(("Dropouts", text))
     labelled_texts += [
         (file.role.capitalize(), f"{file.name}, SHA-256 {file.sha256[:12]}")
@@ -131,7 +135,7 @@ def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
         )
 
 
-def _gaps_text(source: Source) -> str:
+def _gaps_text(source: LoggedData) -> str:
     if source.gaps is None:
         return ""
     if not source.gaps.count:
@@ -144,7 +148,7 @@ def _format_short(value: float) -> str:
     return f"{value:.{2 if value < 1 else 1 if value < 10 else 0}f}"
 
 
-def _span_text(source: Source) -> str:
+def _span_text(source: LoggedData) -> str:
     if source.start_s is None or source.end_s is None:
         return ""
     digits = 1 if source.end_s < 10 else 0

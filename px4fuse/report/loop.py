@@ -1,4 +1,4 @@
-"""Page on a loop: closure error, corrected paths, and their errors against references."""
+"""Report page on a loop flight: closure error, corrected paths and errors against references."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.core.text import capitalise_first, format_p_value, join_first
+from px4fuse.core.text import capitalise_first, format_number, format_p_value, join_first
 from px4fuse.findings import Finding, group_by_root
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop import corrections
@@ -31,7 +31,7 @@ from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
 from px4fuse.trajectory.graph.solver import MAX_ROBUST_CLOSURES, SOLUTIONS, Graph
 from px4fuse.trajectory.model import AXES_OF_FRAME, format_vector
-from px4fuse.trajectory.scores import Interval, Statistics
+from px4fuse.trajectory.scores import RmseInterval, Statistics
 
 LEAD_TEXT = (
     "The closure error is the distance between the end of the odometry and the true end. Each "
@@ -69,7 +69,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
-    """Draw the page of ``px4fuse loop``, with its findings."""
+    """Draw the report page of ``px4fuse loop``, with the detected faults (findings)."""
     page = Page(TITLE, LEAD_TEXT)
     if student := student_line(results.student, ", "):
         page.write_labelled("Student", student)
@@ -98,7 +98,7 @@ def draw_map(axes: Axes, loop: Loop) -> None:
     odometry_path = loop.odometry.trajectory
     axis_names = AXES_OF_FRAME[odometry_path.frame]
     _draw_reference(axes, loop)
-    for corrected_path in loop.reported_paths:
+    for corrected_path in loop.select_reported_paths():
         track, name = corrected_path.trajectory, corrected_path.name
         if name in PATH_STYLES:
             horizontal_m = track.position_m[:, (1, 0)]
@@ -109,8 +109,14 @@ def draw_map(axes: Axes, loop: Loop) -> None:
     axes.plot(*end, "s", **end_mark, label="end of odometry", zorder=5)
     if loop.closure_error_axes_m is not None:
         true_end = end - np.array(list(loop.closure_error_axes_m.values()))[[1, 0]]
-        arrow = {"arrowstyle": "->", "color": ERROR_COLOUR, "lw": 1.2, "shrinkA": 3, "shrinkB": 0}
-        axes.annotate("", xy=true_end, xytext=end, zorder=6, arrowprops=arrow)
+        arrow_style = {
+            "arrowstyle": "->",
+            "color": ERROR_COLOUR,
+            "lw": 1.2,
+            "shrinkA": 3,
+            "shrinkB": 0,
+        }
+        axes.annotate("", xy=true_end, xytext=end, zorder=6, arrowprops=arrow_style)
         label = f"closure error {loop.closure_error_m:.2f} m"
         axes.plot([], [], color=ERROR_COLOUR, lw=1.2, label=label)
         axes.plot(*true_end, "x", color=ERROR_COLOUR, ms=5, mew=1.2, zorder=6, label="true end")
@@ -119,7 +125,7 @@ def draw_map(axes: Axes, loop: Loop) -> None:
 
 def _draw_reference(axes: Axes, loop: Loop) -> None:
     for reference in loop.references[:1]:
-        evaluation = loop.best.scores.get(reference.name)
+        evaluation = loop.choose_best_path().scores.get(reference.name)
         if isinstance(evaluation, Evaluation):
             reference_m = evaluation.transform.apply_inverse(evaluation.reference_m)[:, (1, 0)]
             line = {"label": reference.name, "zorder": 4, **TRACK_LINES["ground truth"]}
@@ -127,7 +133,7 @@ def _draw_reference(axes: Axes, loop: Loop) -> None:
 
 
 def loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:
-    """Make the terminal output on a loop: closure error, corrected paths and findings."""
+    """Make the terminal output on a loop: closure error, corrected paths and detected faults."""
     page = Page()
     write_loop(page, loop)
     write_scores(page, loop)
@@ -163,7 +169,7 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
         *(f"ATE against\n{name} (m)" for name in names),
     ]
     rows = []
-    for path in loop.reported_paths:
+    for path in loop.select_reported_paths():
         correction_text = "–"
         if path.correction_max_m:
             correction_text = f"{path.correction_rms_m:.2f} / {path.correction_max_m:.2f}"
@@ -205,7 +211,7 @@ def write_scores(page: Page, loop: Loop) -> None:
     for reference in loop.references:
         page.heading(f"RPE against {reference.name}")
         evaluations, reasons = dict[str, Evaluation](), dict[str, None]()
-        for path in loop.reported_paths:
+        for path in loop.select_reported_paths():
             evaluation = path.scores[reference.name]
             if isinstance(evaluation, Unavailable):
                 reasons[evaluation.reason] = None
@@ -252,10 +258,12 @@ def describe_closure_error(loop: Loop) -> str:
 
 
 def describe_gate(closure: Closure) -> str:
-    verdict = "accepted" if closure.accepted else "REJECTED, not consistent with the stated drift"
+    gate_decision = (
+        "accepted" if closure.accepted else "REJECTED, not consistent with the stated drift"
+    )
     return (
         f"d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of freedom, "
-        f"p {closure.p:.2g} (rejected below {GATE_ALPHA:g}): {verdict}"
+        f"p {closure.p:.2g} (rejected below {GATE_ALPHA:g}): {gate_decision}"
     )
 
 
@@ -269,7 +277,7 @@ def closure_name(closure: Closure, loop: Loop) -> str:
 
 def correction_by_distance_sentence(loop: Loop) -> str:
     """Explain the correction of the path in proportion to distance; "" if it was not made."""
-    if "by_distance_plain" not in loop.paths:
+    if "by_distance_plain" not in loop.find_paths():
         return ""
     heading_deg = loop.heading_error_deg
     heading_sentence = (
@@ -293,7 +301,7 @@ def missing_corrections(loop: Loop) -> list[str]:
     return list(reasons)
 
 
-def _format_error(errors_m: Statistics | Unavailable, interval: Interval | Unavailable) -> str:
+def _format_error(errors_m: Statistics | Unavailable, interval: RmseInterval | Unavailable) -> str:
     interval_text = format_interval(interval)
     return _format_rmse(errors_m) + (f" ({interval_text})" if interval_text else "")
 
@@ -310,6 +318,23 @@ def pose_graph_page(solved_graph: Graph) -> Page:
         f"{solved_graph.name}: {solved_graph.dimension}-D, {solved_graph.poses} poses, "
         f"{solved_graph.edges} edges; initial poses: {solved_graph.initialised}",
     )
+    low, high = solved_graph.reduced_chi2_interval
+    if high > 0.0:
+        fit_text = (
+            f"χ² per degree of freedom {format_number(solved_graph.reduced_chi2)} (95 % "
+            f"{format_number(low)} to {format_number(high)} expected)"
+        )
+        if (factor := solved_graph.information_factor) > 1.0:
+            fit_text += (
+                ". Probable cause: all information matrices are about "
+                f"{format_number(factor, 2)} times too large. Gate and robust optimisation use "
+                "the information divided by this factor."
+            )
+        elif solved_graph.reduced_chi2 > high:
+            fit_text += ". Possible causes: false closures, or too large information matrices."
+        elif solved_graph.reduced_chi2 < low:
+            fit_text += ": the information matrices are too small, so the gate is too wide."
+        page.write_labelled("Fit", fit_text)
     if isinstance(gates, Unavailable):
         page.write_labelled("Gate", f"not applied: {gates.reason}")
     elif not gates:

@@ -1,4 +1,4 @@
-"""Page with the answer form and the notes (Markdown) of the student.
+"""Report page with a student's answers to an assignment and notes (Markdown).
 
 HTML tags are removed, and pictures are not loaded.
 """
@@ -31,7 +31,7 @@ TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
 
 
 def draw_pages(subject: object, results: FlightResults | LoopResults) -> Iterator[Page]:
-    """Draw the answer form and the notes of the student, if there are any."""
+    """Draw the student's answers to an assignment and the student's notes, if there are any."""
     title, answers = "Student notes", results.student.answers
     page = Page(appendix_title(title) if isinstance(subject, Analysis) else title)
     if isinstance(answers, Answers):

@@ -27,14 +27,14 @@ from px4fuse.report.style import (
 )
 
 NARROW_HEIGHT = 72.0  # height (points) of the axes in narrow columns
-# Ratio of the limit of the axis of innovations to the largest drawn innovation
+# Ratio of the axis limit to the largest innovation in a plot of innovations
 INNOVATION_AXIS_MARGIN_FACTOR = 1.3
-# Maximum innovation (multiple of the median √S) that enlarges the axis of innovations
+# Maximum innovation (multiple of the median √S) for which the innovation plot is enlarged
 MAX_INNOVATION_AXIS_SIGMAS = 5.0
 
 
 class Quantity(NamedTuple):
-    """Position or velocity, with the names of its columns and of its statistics."""
+    """Position or velocity: unit, and names of its table columns and statistics."""
 
     unit: str
     column: str
@@ -52,7 +52,7 @@ VELOCITIES = Quantity(
 
 
 class Panel(NamedTuple):
-    """Plot over time along one axis; ``height`` of the axes in points."""
+    """Plot over time along one axis, with caption and statistics; ``height`` is in points."""
 
     title: str
     height: float
@@ -87,7 +87,7 @@ class Panel(NamedTuple):
         )
         if is_narrow:
             axes.locator_params(axis="x", nbins=4)
-        self.draw(axes, result.in_flight)
+        self.draw(axes, result.with_flight_tracks())
         page.write_small(statistics_text)
 
 
@@ -211,8 +211,8 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     innovations_and_styles = [(kf_innovations, INNOVATION_DOTS["KF"])]
     if isinstance(ekf2_innovations, pd.DataFrame):
         two_sigma = 2.0 * np.sqrt(ekf2_innovations["innovation_variance_m2"])
-        for side in (two_sigma, -two_sigma):
-            draw_curve(axes, side, **TRACK_LINES["EKF2"])
+        for limit in (two_sigma, -two_sigma):
+            draw_curve(axes, limit, **TRACK_LINES["EKF2"])
         is_rejected = ekf2_innovations["rejected"] > 0
         innovations = ekf2_innovations["innovation_m"]
         innovations_and_styles = [
@@ -275,7 +275,7 @@ def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
         return ""
     start_s, end_s = max(analysis.events.gaps, key=lambda gap: gap[1] - gap[0])
     sigma_texts = []
-    for name, table in _variance_tables(result.in_flight).items():
+    for name, table in _variance_tables(result.with_flight_tracks()).items():
         variance_m2 = table.loc[start_s:end_s, "position_variance_m2"]
         if len(variance_m2) > 1 and np.isfinite(variance_m2.max()):
             sigma_texts.append(f"{np.sqrt(variance_m2.max()):.2g} m ({name})")

@@ -83,7 +83,7 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
     title, name, sha256 = _title_name_hash(results)
     blocks, written_text = list[Any](), ""
     with report_style():
-        # each page is converted at once, because the figures of all pages need much memory
+        # each page is converted immediately, because the figures of all pages need much memory
         for page in (page for draw in PAGES[type(results)] for page in draw(content, results)):
             written_text += json.dumps(page.blocks, ensure_ascii=False, default=repr)
             blocks += to_typst_data(page.blocks, name)

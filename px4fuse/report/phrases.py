@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from px4fuse.comparison.model import (
+    FILTER_NAMES,
     AxisComparison,
     Comparison,
     Difference,
@@ -15,8 +16,8 @@ from px4fuse.comparison.model import (
     PreparedComparison,
     UntestedFilter,
 )
+from px4fuse.comparison.remedy import different_settings, noise_change
 from px4fuse.comparison.remedy import format_settings as format_parameters
-from px4fuse.comparison.remedy import noise_change
 from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import KF_NUMBERS, SETTING_RANGES, Settings
@@ -35,8 +36,8 @@ if TYPE_CHECKING:
 # Minimum p value of the Ljung-Box test for white innovations: with eight tests per flight, less
 # than 1 % of the flights have a false alarm
 MIN_WHITE_P_VALUE = 0.001
-# Size of the reported σ compared with the actual error, by verdict
-SIGMA_SIZES = {"underconfident": "too large", "overconfident": "too small"}
+# Deviation of the reported σ from the actual error of an inconsistent filter
+SIGMA_DEVIATIONS = {"underconfident": "too large", "overconfident": "too small"}
 DIFFERENCE_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
 
@@ -45,44 +46,46 @@ def format_settings(settings: Settings) -> str:
     offset_text = (
         f", clock offset {settings.clock_offset_s:+g} s" if settings.clock_offset_s else ""
     )
-    numbers = (
+    setting_texts = (
         f"{SETTING_RANGES[name].label} {getattr(settings, name):g} {SETTING_RANGES[name].unit}"
         for name in KF_NUMBERS
     )
-    return f"{', '.join(numbers)}, input {settings.input}{offset_text}"
+    return f"{', '.join(setting_texts)}, input {settings.input}{offset_text}"
 
 
 def format_verdict(consistency: Consistency | Unavailable) -> str:
     """State whether a filter is consistent, or by which factor its reported σ is wrong."""
     if isinstance(consistency, Unavailable):
-        return "not logged"
+        return "not evaluated"
     return format_sigma_verdict(consistency.verdict, consistency.sigma_error_factor)
 
 
 def format_sigma_verdict(verdict: str, factor: float) -> str:
-    """Format a verdict with the factor between reported and actual σ.
+    """Format a result of the consistency test with the factor between reported and actual σ.
 
     >>> format_sigma_verdict("overconfident", 2.41)
     'overconfident, σ 2.4× too small'
     """
-    if verdict not in SIGMA_SIZES:
+    if verdict not in SIGMA_DEVIATIONS:
         return verdict
-    return f"{verdict}, σ {format_factor(factor)}× {SIGMA_SIZES[verdict]}"
+    return f"{verdict}, σ {format_factor(factor)}× {SIGMA_DEVIATIONS[verdict]}"
 
 
 def statistics_by_filter(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
-    """Return the statistics of KF, and of EKF2 if logged, by filter name."""
-    filters = {"KF": result.filters["kf"]}
-    if not isinstance(result.ekf2_state, Unavailable):
-        filters["EKF2"] = result.filters["ekf2"]
-    return filters
+    """Return the statistics of each filter, without EKF2 if it is not logged, by label."""
+    is_ekf2_missing = isinstance(result.ekf2_state, Unavailable)
+    return {
+        FILTER_NAMES[name]: statistics
+        for name, statistics in result.filters.items()
+        if not (name == "ekf2" and is_ekf2_missing)
+    }
 
 
 VERDICT_TABLE_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
 
 
 def verdict_cells(result: AxisComparison, name: str) -> list[Cell]:
-    """Return the cells for :data:`VERDICT_TABLE_HEAD` of an axis and a filter (KF or EKF2)."""
+    """Return the table row on the consistency of a filter (KF or EKF2) along an axis."""
     consistency = statistics_by_filter(result)[name]
     label = result.axis.label.removeprefix("the ") if name == "KF" else ""
     if isinstance(consistency, Unavailable):
@@ -95,8 +98,8 @@ def verdict_cells(result: AxisComparison, name: str) -> list[Cell]:
 
 
 def write_error_table(page: Page, analysis: Analysis) -> None:
-    """Write the table of verdicts and position errors of all axes."""
-    axes = (analysis.main, *analysis.secondary_axes)
+    """Write a table of consistency tests and position errors of KF and EKF2 along all axes."""
+    axes = (analysis.main, *analysis.select_secondary_axes())
     has_ekf2 = any(isinstance(result.difference, Difference) for result in axes)
     has_truth = isinstance(analysis.flight.truth, Truth)
 
@@ -118,7 +121,7 @@ def _format_rms(statistic: object, field: str) -> str:
 
 
 def verdict_notes(comparison: Comparison) -> list[str]:
-    """Return reservations about consistency verdicts: drifting source, correlated innovations."""
+    """Return warnings about consistency tests: drifting position source, correlated innovations."""
     consistencies = [
         (result.axis.label, filter_name, consistency)
         for result in comparison.axes.values()
@@ -131,17 +134,17 @@ def verdict_notes(comparison: Comparison) -> list[str]:
             "The position source may drift. The verdicts compare each filter with the source, "
             "not with the true position. Check the error with ground truth or a loop."
         )
-    correlated_filters = [
+    correlated_filter_texts = [
         f"{filter_name} along {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"
         for axis, filter_name, consistency in consistencies
         if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITE_P_VALUE
     ]
-    if correlated_filters:
+    if correlated_filter_texts:
         notes.append(
             "Innovations are not white, although their variance is consistent (Ljung-Box test, p "
-            f"< {MIN_WHITE_P_VALUE:g}): {'; '.join(correlated_filters)}. If the autocorrelation is "
-            "positive, the filter lags and SIGMA_A may be too small. If it is negative, the filter "
-            "follows the measurement noise and SIGMA_A may be too large."
+            f"< {MIN_WHITE_P_VALUE:g}): {'; '.join(correlated_filter_texts)}. If the "
+            "autocorrelation is positive, the filter lags and SIGMA_A may be too small. If it is "
+            "negative, the filter follows the measurement noise and SIGMA_A may be too large."
         )
     return notes
 
@@ -179,7 +182,7 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
 def tuning_advice(
     comparison: PreparedComparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
-    """Return recommendations after noise estimation, by their label."""
+    """Return recommendations after noise estimation, by label such as "SIGMA_Z"."""
     names = (HORIZONTAL, "aisle", *tuning_by_axis)
     axis_name = next(
         (name for name in names if isinstance(tuning_by_axis.get(name), AxisTuning)), ""
@@ -187,10 +190,10 @@ def tuning_advice(
     tuning = tuning_by_axis.get(axis_name)
     if not isinstance(tuning, AxisTuning):
         return {}
-    advice, sigma_a, sigma_z = {}, tuning.sigma_a_two_state, tuning.sigma_z
+    advice_by_label, sigma_a, sigma_z = {}, tuning.sigma_a_two_state, tuning.sigma_z
     may_drift, log = comparison.source.origin.may_drift, comparison.flight.log
     if may_drift:
-        advice["Drift"] = (
+        advice_by_label["Drift"] = (
             "The position source may drift. The estimates describe the noise without the drift. Do "
             "not set SIGMA_Z or EKF2_EVP_NOISE below the error shown by ground truth or a loop."
         )
@@ -201,14 +204,14 @@ def tuning_advice(
     ]
     if option_texts:
         command = f"px4fuse compare LOG{''.join(option_texts)}"
-        advice["Action"] = f"Re-run with the estimates of {axis_name}: {command}"
+        advice_by_label["Action"] = f"Re-run with the estimates of {axis_name}: {command}"
     if sigma_z.value is None and sigma_z.low is not None:
-        advice["SIGMA_Z"] = (
+        advice_by_label["SIGMA_Z"] = (
             f"SIGMA_Z is at least {sigma_z.low:.2g} m: the source may not measure this position."
         )
     elif sigma_z.value is None:
         bound_text = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
-        advice["SIGMA_Z"] = (
+        advice_by_label["SIGMA_Z"] = (
             f"SIGMA_Z cannot be estimated at this logging rate{bound_text}: it is masked by the "
             "process noise between samples. Log the source at a higher rate."
         )
@@ -218,18 +221,19 @@ def tuning_advice(
         reported_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
         changes = noise_change(EV_POS, log.parameters, reported_m, sigma_z.value)
         logged_text = "" if logged_m is None else f" (now {logged_m:g} m)"
-        advice["PX4"] = f"Set {name} to {changes[name]:g} m{logged_text}."
+        advice_by_label["PX4"] = f"Set {name} to {changes[name]:g} m{logged_text}."
         is_logged_within_interval = logged_m is not None and (sigma_z.low or 0.0) <= logged_m <= (
             sigma_z.high or 0.0
         )
         if EV_POS.noise_mode in changes and reported_m > (sigma_z.high or np.inf):
-            advice["PX4"] = (
+            changes = different_settings(changes, log.parameters)
+            advice_by_label["PX4"] = (
                 f"Set {format_parameters(changes)}: EKF2 uses the reported σ, {reported_m:.2g} m."
             )
         elif is_logged_within_interval:
-            advice["PX4"] = f"{name} {logged_m:g} m is within the 95 % interval."
+            advice_by_label["PX4"] = f"{name} {logged_m:g} m is within the 95 % interval."
     if sigma_a.value is None:
-        advice["SIGMA_A"] = (
+        advice_by_label["SIGMA_A"] = (
             "SIGMA_A cannot be estimated: the flight has too little motion, or is too short."
             if sigma_a.low is None
             else f"SIGMA_A is at least {sigma_a.low:.2g} m/s²: logged acceleration and positions "
@@ -240,18 +244,18 @@ def tuning_advice(
         and (accelerometer_noise := tuning.sigma_a.value or tuning.sigma_a.high) is not None
     ):
         bound_text = "" if tuning.sigma_a.value is not None else "at most "
-        advice["SIGMA_A"] = (
+        advice_by_label["SIGMA_A"] = (
             f"Accelerometer noise alone is {bound_text}{accelerometer_noise:.2g} m/s². KF has no "
             "state for accelerometer bias and tilt error. To include both, SIGMA_A must be "
             f"{sigma_a.value:.2g} m/s²."
         )
     if len(tuning.outlier_time_s):
-        advice["Outliers"] = (
+        advice_by_label["Outliers"] = (
             f"{len(tuning.outlier_time_s)} of {tuning.count} measurements ({axis_name}) are "
             f"outliers, the first at {tuning.outlier_time_s[0]:.1f} s. The noise estimates exclude "
             "them."
         )
-    return advice
+    return advice_by_label
 
 
 def student_line(student: Student, separator: str) -> str:
@@ -261,12 +265,12 @@ def student_line(student: Student, separator: str) -> str:
 def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
     if not findings:
         page.write("None.")
-    for findings_of_cause in group_by_root(findings):
-        write_finding(page, findings_of_cause)
+    for cause_and_effects in group_by_root(findings):
+        write_finding(page, cause_and_effects)
 
 
-def write_finding(page: Page, group: list[Finding]) -> None:
-    finding, *effects = group
+def write_finding(page: Page, cause_and_effects: list[Finding]) -> None:
+    finding, *effects = cause_and_effects
     title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
     texts = [styled_text(title, 8.0, bold=True), styled_text(finding.message, 8.0)]
     if finding.remedy:

@@ -19,7 +19,7 @@ LABEL_WIDTH = 168.0  # width (points) of the labels
 
 
 def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
-    """Draw the findings, and the provenance of a flight."""
+    """Draw the page with all detected faults (findings), and the provenance page of a flight."""
     page = Page(ALL_FINDINGS)
     write_findings(page, results.findings)
     yield page
@@ -47,41 +47,41 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) ->
 def _write_log(page: Page, flight: Flight, source: PositionTrack | None) -> None:
     log = flight.log
     other_positions = (
-        f"{track.name} ({track.rate_hz:.1f} Hz)"
+        f"{track.name} ({track.compute_rate_hz():.1f} Hz)"
         for track in flight.positions
         if track is not source
     )
     parameters = (f"{name} {value:g}" for name, value in log.parameters.items())
-    facts = {
+    text_by_label = {
         "firmware": f"{log.firmware}, git {log.firmware_hash}",
         "time zero": f"{log.boot_time_s:.6f} s after boot (first data sample)",
     }
     if source is not None:
-        facts["position source"] = (
+        text_by_label["position source"] = (
             f"{source.name} ({source.origin.kind}, {source.origin.path}) from "
             f"{', '.join(source.topics)}; clock: {source.clock}"
         )
-    facts["other positions"] = ", ".join(other_positions) or "none"
-    facts["parameters"] = ", ".join(parameters) or "none"
+    text_by_label["other positions"] = ", ".join(other_positions) or "none"
+    text_by_label["parameters"] = ", ".join(parameters) or "none"
     for file in flight.inputs:
-        facts[file.role] = f"{file.name}, {file.bytes} bytes, SHA-256 {file.sha256}"
-    facts["file"] = f"{log.name}, {log.bytes} bytes, {log.format}"
-    facts["SHA-256"] = log.sha256
+        text_by_label[file.role] = f"{file.name}, {file.bytes} bytes, SHA-256 {file.sha256}"
+    text_by_label["file"] = f"{log.name}, {log.bytes} bytes, {log.format}"
+    text_by_label["SHA-256"] = log.sha256
     section = Page()
-    _write_section(section, "Log", facts.items())
+    _write_section(section, "Log", text_by_label.items())
     page.add_columns(section)  # Typst does not split a column between pages
 
 
 def _write_missing(page: Page, unavailable_parts: Iterable[Unavailable]) -> None:
-    missing = [
+    missing_data_texts = [
         (part.source or part.what, f"{part.reason}. {with_options(part.remedy)}")
         for part in unavailable_parts
     ]
-    _write_section(page, "Missing data", missing or ["none"])
+    _write_section(page, "Missing data", missing_data_texts or ["none"])
 
 
 def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
-    """Draw the provenance of ``px4fuse loop``."""
+    """Draw the provenance page of ``px4fuse loop``: choices, methods, versions and files."""
     page, odometry = Page("Provenance"), loop.odometry.trajectory
     file_facts = [
         (
@@ -100,13 +100,13 @@ def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 def _write_versions(page: Page, results: FlightResults | LoopResults) -> None:
     versions = results.provenance
-    facts = {
+    text_by_label = {
         "command": versions.command,
         "px4fuse": f"{versions.px4fuse} on Python {versions.python}",
         "libraries": ", ".join(f"{name} {version}" for name, version in versions.libraries.items()),
         "results": "attached to this PDF as results.json",
     }
-    _write_section(page, "Made with", facts.items())
+    _write_section(page, "Made with", text_by_label.items())
 
 
 def _write_section(page: Page, title: str, texts: Iterable[str | tuple[str, str]]) -> None:

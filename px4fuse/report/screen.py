@@ -42,10 +42,10 @@ STYLES_BY_COLOUR = {
 _COMMAND_PATTERN = re.compile(r"px4fuse (\w+) LOG(?![\w.])((?: --[a-z-]+ [-\w]+(?:\.\d+)?)*)")
 
 
-def show(console: Console, blocks: Iterable[Block], request: Request | None = None) -> None:
-    """Print texts, tables and cards of a page on the terminal.
+def print_blocks(console: Console, blocks: Iterable[Block], request: Request | None = None) -> None:
+    """Print the blocks of a page (texts, tables, diagnosis card) on the terminal.
 
-    With ``request``, commands in texts are printed with the log and the options of the user.
+    With ``request``, commands in texts contain the log and the options of the user.
     """
     for block in blocks:
         match block["kind"]:
@@ -157,10 +157,10 @@ def _rich_table(
     **_: object,
 ) -> Table:
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    vertical: Literal["bottom", "top"] = "bottom" if "\n" in "".join(head) else "top"
+    vertical_alignment: Literal["bottom", "top"] = "bottom" if "\n" in "".join(head) else "top"
     for index, title in enumerate(head):
-        side: Literal["right", "left"] = "right" if index in right else "left"
-        table.add_column(Text(title), justify=side, overflow="fold", vertical=vertical)
+        justify: Literal["right", "left"] = "right" if index in right else "left"
+        table.add_column(Text(title), justify=justify, overflow="fold", vertical=vertical_alignment)
     for row in rows:
         texts = [(cell, "") if isinstance(cell, str) else cell for cell in row]
         table.add_row(*(Text(text, STYLES_BY_COLOUR.get(colour, "")) for text, colour in texts))

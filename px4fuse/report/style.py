@@ -146,12 +146,11 @@ def set_map_axes(axes: Axes, right_name: str, up_name: str) -> None:
     axes.set_aspect("equal", adjustable="datalim", anchor="W")
     axes.grid(True, axis="both")
     axes.set(xlabel=f"{right_name} (m)", ylabel=f"{up_name} (m)")
-    axes.locator_params(axis="x", nbins=6)
-    axes.locator_params(axis="y", nbins=6)
+    axes.locator_params(nbins=6)
 
 
 def decimate_series(times: Array, values: Array, max_points: int) -> tuple[Array, Array]:
-    """Reduce a series to ``limit`` points: the minimum and maximum of each interval."""
+    """Reduce a series to ``max_points`` points: the minimum and maximum of each interval."""
     if len(times) <= max_points:
         return times, values
     bucket_size, larger_bucket_count = divmod(len(times), max_points // 2)

@@ -34,9 +34,9 @@ def comparison_page(
     verbose: bool = False,
     quiet: bool = False,
 ) -> Page:
-    """Make the terminal output of ``px4fuse compare``: the diagnosis card.
+    """Make the terminal output of ``px4fuse compare``: faults, causes and actions.
 
-    ``quiet``: only the headline of the card; ``verbose``: also settings, axes and findings.
+    ``quiet``: only the headline; ``verbose``: also settings, statistics of all axes, and findings.
     """
     page = card_page("headline" if quiet else "card", results.card)
     if not verbose:
@@ -75,7 +75,7 @@ def card_page(block_kind: str, card: Card) -> Page:
 def _describe_setup(comparison: Comparison) -> dict[str, str]:
     source, segment = comparison.source, comparison.segment
     position_text = (
-        f"{source.name}: {source.description}, {source.rate_hz:.1f} Hz, "
+        f"{source.name}: {source.description}, {source.compute_rate_hz():.1f} Hz, "
         f"{source.frame}; {comparison.source_reason}"
     )
     alignment = {} if source.alignment is None else describe_alignment(source.alignment)

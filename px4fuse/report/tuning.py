@@ -36,7 +36,10 @@ def tuning_page(
         if not isinstance(tuning.held_out, Unavailable):
             held_out_gain = f"{tuning.held_out.log_likelihood_gain_per_measurement:+.3f}"
         if not isinstance(tuning.before, Unavailable) and not isinstance(tuning.after, Unavailable):
-            before, after = tuning.before.lag1_autocorrelation, tuning.after.lag1_autocorrelation
+            before, after = (
+                tuning.before.lag1_autocorrelation,
+                tuning.after.lag1_autocorrelation,
+            )
             correlation_text = f"{before:+.2f} {after:+.2f}"
         rows.append(
             [

@@ -30,8 +30,8 @@ def measure_free_height(blocks: Any, font_names: Sequence[str]) -> float:
     report = dict.fromkeys(("title", "author", "head", "student", "foot"), "")
     data = {**report, "fonts": font_names, "blocks": blocks, "results": None}
     with TemporaryDirectory() as empty_folder:
-        answer = _compiler(data, None, empty_folder).query("<free>", field="value", one=True)
-    return float(json.loads(answer))
+        query_result = _compiler(data, None, empty_folder).query("<free>", field="value", one=True)
+    return float(json.loads(query_result))
 
 
 def _compiler(report: Mapping[str, Any], template: str | None, empty_folder: str) -> typst.Compiler:

@@ -31,8 +31,8 @@ def column_heads(analysis: WhatIfAnalysis) -> list[str]:
     ]
     heads = ["logged", "replayed"]
     if change_texts:
-        ml_note = " (maximum-likelihood estimate)" if analysis.uses_estimates else ""
-        heads.append(f"replayed with {', '.join(change_texts)}{ml_note}")
+        estimate_note = " (maximum-likelihood estimate)" if analysis.uses_estimates else ""
+        heads.append(f"replayed with {', '.join(change_texts)}{estimate_note}")
     return heads
 
 
@@ -54,23 +54,25 @@ def statistic_rows(analysis: WhatIfAnalysis) -> list[list[str]]:
 
 
 def _statistic_texts(summary: Summary, replayed: Summary) -> dict[str, str]:
-    texts = dict[str, str]()
+    text_by_label = dict[str, str]()
     for name, axis in summary.axes.items():
-        texts |= _nis_texts(name, axis) | {
+        text_by_label |= _nis_texts(name, axis) | {
             f"{name}: median σ_p (m)": _format_number(axis.sigma_p_median_m),
             f"{name}: position RMSE (m)": _format_number(axis.position_rmse_to_truth_m),
         }
-    texts |= {"samples": f"{summary.samples}", **_fusion_texts(summary)}
+    text_by_label |= {"samples": f"{summary.samples}", **_fusion_texts(summary)}
     if summary.velocity_rejected_fraction is not None:
-        texts["GNSS velocities rejected"] = f"{summary.velocity_rejected_fraction:.1%}"
+        text_by_label["GNSS velocities rejected"] = f"{summary.velocity_rejected_fraction:.1%}"
     if isinstance(replayed.heading_error_mean_deg, float):
-        texts["mean heading error (°)"] = _format_number(summary.heading_error_mean_deg, 1)
+        text_by_label["mean heading error (°)"] = _format_number(summary.heading_error_mean_deg, 1)
     if replayed.heights:
-        texts["height RMSE (m)"] = _format_number(summary.height_rmse_to_truth_m)
+        text_by_label["height RMSE (m)"] = _format_number(summary.height_rmse_to_truth_m)
     for name, aid in {**summary.heights, **summary.others}.items():
         label = AIDS[name].label
-        texts |= _nis_texts(label, aid) | {f"{label}: rejected": f"{aid.rejected_fraction:.1%}"}
-    return texts
+        text_by_label |= _nis_texts(label, aid) | {
+            f"{label}: rejected": f"{aid.rejected_fraction:.1%}"
+        }
+    return text_by_label
 
 
 def _nis_texts(name: str, statistics: AxisSummary | HeightSummary) -> dict[str, str]:

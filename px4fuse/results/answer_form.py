@@ -1,6 +1,6 @@
-"""Writing and reading of the answer form, in which a student names the faults of a flight.
+"""Form (TOML) in which a student answers questions about a flight and names its faults.
 
-Reading checks that the answers are allowed (``form.toml``), not whether they are right.
+This module writes empty forms, and reads completed forms. It does not check if answers are right.
 """
 
 import hashlib
@@ -21,8 +21,8 @@ from px4fuse.errors import SettingsError
 
 # Maximum size (bytes) of an answer form
 MAX_FORM_BYTES = 20_000
-# Maximum length (characters) of a line of an answer form: tomllib needs seconds and gigabytes for a
-# dotted key of 64 kB
+# Maximum length (characters) of a line of an answer form: tomllib needs seconds and gigabytes for
+# very long keys with dots
 MAX_LINE_LENGTH = 500
 MAX_MISTAKES = 20
 NO_FAULT_KIND = "none"
@@ -31,9 +31,14 @@ EMPTY_CELL = "\u2013"
 
 
 class FaultKind(Record, rename={"size_quantity": "in"}):
-    """Kind of fault that a student can name, with the quantity of its size.
+    """Kind of fault that a student can name.
 
-    ``range`` is the smallest and the largest allowed size, in the first unit of the quantity.
+    Attributes
+    ----------
+    size_quantity : str
+        Key of the allowed units in ``form.toml``, for example "m"; "" for a fault without a size.
+    range : (float, float)
+        Smallest and largest allowed size, in the first allowed unit.
     """
 
     description: str
@@ -42,12 +47,12 @@ class FaultKind(Record, rename={"size_quantity": "in"}):
 
     @property
     def units(self) -> Mapping[str, float]:
-        """Factors that convert each unit of the size to the first unit; empty without a size."""
+        """Allowed units of the size, each with the factor that converts to the first unit."""
         return _UNITS_BY_QUANTITY[self.size_quantity]
 
 
 class AllowedAnswers(Record, rename={"new_by_old_name": "renamed"}):
-    """Allowed answers of the answer form (``form.toml``), and new names of former answers."""
+    """Allowed answers (``form.toml``), and new names of answers that were renamed."""
 
     behaviours: tuple[str, ...]
     panels: tuple[str, ...]
@@ -60,11 +65,11 @@ class AllowedAnswers(Record, rename={"new_by_old_name": "renamed"}):
 _ALLOWED = read_toml(__file__, AllowedAnswers, "form.toml")
 _UNITS_BY_QUANTITY: Mapping[str, Mapping[str, float]] = {"": {}, **_ALLOWED.units}
 FAULT_KINDS, EKF2_BEHAVIOURS, PANELS = _ALLOWED.mistakes, _ALLOWED.behaviours, _ALLOWED.panels
-# Units of the value of a correction (empty without a value), by name of the correction
+# Allowed units for the new value of a parameter that corrects a fault, by parameter
 CORRECTIONS = {
     name: _UNITS_BY_QUANTITY[quantity] for name, quantity in _ALLOWED.corrections.items()
 }
-# Verdict on a filter without innovations
+# Answer if the consistency of a filter cannot be evaluated
 NOT_AVAILABLE = "not available"
 
 Number = Annotated[float, Meta(gt=-1e9, lt=1e9)]
@@ -73,7 +78,7 @@ VerdictWord = Literal["", "consistent", "overconfident", "underconfident", "not 
 VERDICTS = get_args(VerdictWord)[1:]
 ChoiceName = Literal["", "a", "b", "c", "d", "e"]
 NUMBER_HELP = "a number with a decimal point, without quotes and unit (0.2), or a list ([61, 64])"
-# Description of the accepted values of a field of the answer form, by field name
+# Description of the accepted answers, by field of the form
 ACCEPTED_VALUES = {
     **dict.fromkeys(("verdict_kf", "verdict_ekf2"), f"one of {', '.join(VERDICTS)}"),
     "when": '"whole flight", or an empty text with the times from_s and until_s',
@@ -82,7 +87,7 @@ ACCEPTED_VALUES = {
     "log_sha256": "the SHA-256 of the log, as in an empty form from the command px4fuse answers",
     **dict.fromkeys(("kind", "unit", "parameter", "value_unit", "panel"), "a short text in quotes"),
 }
-# Answer to a question about KF: a number, the numbers of KF updates, or None if left blank
+# Answer to a question about KF: a number, a list of KF updates, or None if left blank
 QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | None
 
 
@@ -116,9 +121,14 @@ class Choice(Record):
 class NamedFault(Record):
     """Fault that a student names in the answer form.
 
-    ``from_s`` and ``until_s`` are its start and end (s since the first data). ``parameter`` is the
-    correction of the fault, with the new ``value``. ``panel`` is the part of the report that shows
-    the fault.
+    Attributes
+    ----------
+    from_s, until_s : float or None
+        Start and end of the fault (s since the first data).
+    parameter, value : str and float
+        Parameter that corrects the fault, and its new value.
+    panel : str
+        Part of the report that shows the fault, for example "innovations".
     """
 
     kind: str
@@ -133,7 +143,7 @@ class NamedFault(Record):
     panel: str = ""
 
     def size_in_first_unit(self) -> float | None:
-        """Return the size of the fault in the first unit of its kind, as 5 % for factor 1.05."""
+        """Convert the size to the first allowed unit, for example factor 1.05 to 5 %."""
         units = FAULT_KINDS[self.kind].units
         if self.size is None or not units:
             return None
@@ -142,7 +152,7 @@ class NamedFault(Record):
         return self.size * (units[self.unit] if self.unit else next(iter(units.values())))
 
     def value_in_first_unit(self) -> float | None:
-        """Convert the value of the correction to the first unit in ``form.toml``, as cm to m."""
+        """Convert the new parameter value to the first allowed unit, for example cm to m."""
         units = CORRECTIONS.get(self.parameter, {})
         if self.value is None or not units:
             return self.value
@@ -150,17 +160,20 @@ class NamedFault(Record):
 
 
 class Answers(Record, kw_only=True):
-    """Student's answers about one flight; answers left blank are absent.
+    """Student's answers about a flight.
 
     Attributes
     ----------
+    mistakes : tuple of NamedFault
+        Faults that the student names.
+    verdict_kf, verdict_ekf2 : str
+        Consistency of KF and EKF2.
     ekf2_did : tuple of str
         Behaviours of EKF2, from :data:`EKF2_BEHAVIOURS`.
     quantities : tuple of (float, tuple of float, or None)
-        Answers to the questions of :func:`select_questions`; for the question about the innovation
-        gate, the numbers of the KF updates with an innovation outside the gate.
+        Answers to the numeric questions of :func:`select_questions`.
     choices : tuple of str
-        Letter that the student chose for each question about a figure; "" if left blank.
+        Answers (letters) to the multiple-choice questions; "" if left blank.
     """
 
     log_sha256: Sha256
@@ -172,13 +185,13 @@ class Answers(Record, kw_only=True):
     choices: Annotated[tuple[ChoiceName, ...], Meta(max_length=MAX_CHOICES)] = ()
 
     @property
-    def names_no_fault(self) -> bool:
-        """True if the form states that the flight has no injected fault."""
+    def states_no_fault(self) -> bool:
+        """True if the student states that the flight has no fault."""
         return [mistake.kind for mistake in self.mistakes] == [NO_FAULT_KIND]
 
 
 QuestionKind = Literal["gain", "variance", "innovation", "nis", "prediction", "gate"]
-# Kinds of the three questions of an answer form: one kind of each pair is selected at random
+# Kinds of the three questions about KF: one kind of each pair is selected at random
 _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
     ("gain", "variance"),
     ("innovation", "nis"),
@@ -187,14 +200,14 @@ _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
 
 
 class FormQuestion(Record):
-    """Question about KF along the main axis, which the student answers with a self-written filter.
+    """Question about KF along the main axis; the student programs this filter to find the answer.
 
     Attributes
     ----------
     update : int
-        Number of the KF update, from 1. The first measurement sets the state and has no number.
+        Number of the KF update, from 1. The first measurement only sets the state.
     duration_or_gate : float
-        For the kind "prediction" the time without measurement (s), for "gate" the gate (in √S).
+        Kind "prediction": duration without update (s). Kind "gate": innovation gate (in √S).
     """
 
     kind: QuestionKind
@@ -218,7 +231,7 @@ class FormQuestion(Record):
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
 
-# Number of KF updates in a question about the innovation gate, without the first one
+# Number of KF updates after the first one, in a question about the innovation gate
 GATE_QUESTION_UPDATES = 20
 
 
@@ -241,7 +254,7 @@ def select_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
 
 
 def read_answers(path: Path) -> Answers:
-    """Read the answer form of a student and check its syntax.
+    """Read a completed answer form, and check that the answers are allowed.
 
     Raises
     ------
@@ -263,7 +276,7 @@ def read_answers(path: Path) -> Answers:
 
 
 def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
-    """Describe the invalid answer with the accepted values, or the line that is not TOML."""
+    """Describe an invalid answer and the accepted answers, or a line that is not TOML."""
     message = str(error)
     if line_match := re.search(r"\(at line (\d+), column \d+\)", message):
         line = line_match[1]
@@ -313,7 +326,7 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
 
 
 def update_renamed_values(value: Any) -> Any:
-    """Rename fields and values of answer forms and answer keys from before schema version 4."""
+    """Rename fields and values in answer forms and answer keys of older px4fuse versions."""
     return convert_nested(value, lambda element: _ALLOWED.new_by_old_name.get(element, element))
 
 
@@ -326,7 +339,7 @@ def _without_blanks(value: Any) -> Any:
 
 
 def check_answers(answers: Answers) -> None:
-    """Raise ValueError if an answer is not allowed or out of range, or a fault is repeated."""
+    """Raise ValueError for an answer that is not allowed, out of range, or repeated."""
     kinds = [named_fault.kind for named_fault in answers.mistakes]
     for kind in kinds:
         _require_choice("kind", kind, FAULT_KINDS)
@@ -365,7 +378,7 @@ def _require_choice(field: str, value: str, choices: Any) -> None:
 
 
 def form_name(log_name: str) -> str:
-    """Return the file name of the answer form of a log.
+    """Return the file name of the answer form for a log.
 
     >>> form_name("s07.ulg")
     's07.answers.toml'
@@ -401,9 +414,9 @@ def form_text(log_name: str, log_sha256: str, choices: Sequence[Choice] = ()) ->
 
 
 def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
-    """Yield the questions of an answer form with the student's answers as texts."""
-    yield "Consistency verdict on KF", answers.verdict_kf or EMPTY_CELL
-    yield "Consistency verdict on EKF2", answers.verdict_ekf2 or EMPTY_CELL
+    """Yield each question with the student's answer as texts."""
+    yield "Consistency of KF", answers.verdict_kf or EMPTY_CELL
+    yield "Consistency of EKF2", answers.verdict_ekf2 or EMPTY_CELL
     yield "Behaviour of EKF2", ", ".join(answers.ekf2_did) or EMPTY_CELL
     for mistake in answers.mistakes:
         size_units = FAULT_KINDS.get(mistake.kind, FaultKind("")).units

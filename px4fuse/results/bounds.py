@@ -1,4 +1,4 @@
-"""Bounds of the numbers in results, by the name of their field, which has quantity and unit."""
+"""Valid range of each number in the JSON results, from the name of its field."""
 
 import math
 import re
@@ -12,9 +12,9 @@ from msgspec.structs import fields, replace
 from px4fuse.core.record import Unavailable
 from px4fuse.errors import ResultsError
 
-# Maximum absolute value of a length (m), and of a ratio, in results
+# Maximum absolute values in results: length (m) and ratio
 MAX_LENGTH_M, MAX_RATIO = 1e9, 1e6
-# Minimum and maximum of a number by pattern of its field name; the first match applies
+# Valid range of a number, by pattern of its field name; the first match applies
 BOUNDS = {
     r"(^|_)(nis|nees)($|_)": (0.0, MAX_RATIO),
     r"(enabled|fused|lost|rejected)_fraction($|_)": (0.0, 1.0),
@@ -27,11 +27,11 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 
 class _OutOfBoundsError(Exception):
-    """Number in results outside its bounds; the message contains the path of the number."""
+    """Number in results outside its valid range."""
 
 
 def bounds_of(name: str) -> tuple[float, float]:
-    """Return the valid minimum and maximum of numbers in results, by the name of their field.
+    """Return the smallest and the largest valid value of a field in the results.
 
     >>> bounds_of("nis_mean"), bounds_of("position_rmse_m"), bounds_of("start_s")
     ((0.0, 1000000.0), (-1000000000.0, 1000000000.0), (-inf, inf))
@@ -41,15 +41,15 @@ def bounds_of(name: str) -> tuple[float, float]:
 
 
 def within_bounds(results: T) -> T:
-    """Remove numbers outside their bounds from results.
+    """Remove fields of type NotWritten and numbers outside their valid range from results.
 
-    An optional number is set to None. For a required number, the record that contains it is
+    An optional number is set to None. If the number is required, the record that contains it is
     deleted or replaced by an Unavailable. The reasons are added to ``missing`` or ``notes``.
 
     Raises
     ------
     ResultsError
-        A required number is outside its bounds, and no record that contains it is optional.
+        The results are not valid without the number.
     """
     reasons: list[str] = []
     try:
@@ -67,7 +67,7 @@ def within_bounds(results: T) -> T:
 
 
 def types_of(annotation: Any) -> tuple[Any, ...]:
-    """Return the types that the annotation of a field accepts."""
+    """Return the types in a type annotation, for example float and None for ``float | None``."""
     if get_origin(annotation) is Annotated:
         return types_of(get_args(annotation)[0])
     if get_origin(annotation) in (Union, UnionType):
@@ -93,6 +93,8 @@ def _check_value(value: Any, annotation: Any, path: str, reasons: list[str]) -> 
 def _check_struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgspec.Struct:
     changes: dict[str, Any] = {}
     for field in fields(value):
+        if field.type is msgspec.UnsetType:  # NotWritten
+            continue
         element, field_path = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
         try:
             changes[field.name] = _check_or_replace(element, field.type, field_path, reasons)
@@ -101,7 +103,7 @@ def _check_struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgsp
                 raise
             reasons.append(str(error))
             changes[field.name] = None
-    return replace(value, **changes)
+    return type(value)(**changes)
 
 
 def _check_mapping(value: Mapping[str, Any], annotation: Any, path: str, reasons: list[str]) -> Any:
@@ -122,7 +124,7 @@ def _check_mapping(value: Mapping[str, Any], annotation: Any, path: str, reasons
 
 
 def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple[Any, ...]:
-    # a vector is deleted as a whole if one of its numbers is outside its bounds
+    # of a tuple of numbers, one invalid number invalidates the whole tuple
     checked_elements = []
     for element in value:
         try:
@@ -135,17 +137,21 @@ def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple
 
 
 def _check_or_replace(value: Any, annotation: Any, path: str, reasons: list[str]) -> Any:
-    """Return the value, or an Unavailable if it contains a number outside its bounds."""
+    """Return the value, or an Unavailable if a number in the value is outside its valid range."""
     try:
         return _check_value(value, annotation, path, reasons)
     except _OutOfBoundsError as error:
         for unavailable_type in types_of(annotation):
             if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
-                texts = {"what": path, "reason": str(error), "remedy": CHECK_LOG_REMEDY}
+                text_fields = {
+                    "what": path,
+                    "reason": str(error),
+                    "remedy": CHECK_LOG_REMEDY,
+                }
                 other_fields = {
                     field.name: _check_value(getattr(value, field.name), field.type, path, reasons)
                     for field in fields(unavailable_type)
-                    if field.name not in texts and hasattr(value, field.name)
+                    if field.name not in text_fields and hasattr(value, field.name)
                 }
-                return unavailable_type(**texts, **other_fields)
+                return unavailable_type(**text_fields, **other_fields)
         raise

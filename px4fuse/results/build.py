@@ -1,4 +1,4 @@
-"""Conversion of analyses to the JSON results."""
+"""Conversion of the analyses of all commands to JSON results."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -9,7 +9,6 @@ import msgspec
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
 from px4fuse.card.build import build_aids_card, build_card
 from px4fuse.comparison.model import PreparedComparison
-from px4fuse.core.record import to_serializable
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import find_loop
@@ -34,34 +33,34 @@ from px4fuse.trajectory.graph.solver import Graph
 def results(
     request: ComparisonRequest, analysis: Analysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults:
-    """Return the results of ``px4fuse compare`` on a flight with positions for KF.
+    """Convert an analysis by KF and EKF2 to the results of ``px4fuse compare``.
 
-    If the flight is a student assignment, the student's answers replace the diagnosis.
+    If a student must find the faults of the flight, the student's answers replace the diagnosis.
     """
     card = build_card(analysis, request.without_paths(), (student.name, student.id))
     if analysis.flight.log.is_assessed and isinstance(student.answers, Answers):
-        texts = (
+        answer_texts = (
             f"{question}: {answer_text}"
             for question, answer_text in form_rows(student.answers)
             if answer_text != EMPTY_CELL
         )
-        card = msgspec.structs.replace(card, facts={"Answers": "; ".join(texts)})
+        card = msgspec.structs.replace(card, facts={"Answers": "; ".join(answer_texts)})
     fields = _flight_fields(contract.COMPARISON_SCHEMA, request, analysis) | {
         "aids": {} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
         "card": card,
         "student": student,
     }
-    # all other fields have the same name and content in the analysis
+    # the other fields of the results are copied from the analysis
     for name in contract.ComparisonResults.__struct_fields__:
         if name not in fields:
-            fields[name] = to_serializable(getattr(analysis, name))
+            fields[name] = getattr(analysis, name)
     return within_bounds(contract.ComparisonResults(**fields))
 
 
 def outcome_results(
     request: ComparisonRequest, outcome: Analysis | AidsOnlyAnalysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults | contract.AidsResults:
-    """Return the results of ``px4fuse compare``, also for a flight without positions for KF."""
+    """Return the results of ``px4fuse compare`` for a flight with or without positions."""
     if isinstance(outcome, Analysis):
         return results(request, outcome, student)
     return within_bounds(
@@ -82,16 +81,14 @@ def tuning_results(
     tuning_by_axis: Mapping[str, AxisTuning | Unavailable],
 ) -> contract.TuningResults:
     common_fields = _flight_fields("px4fuse-tuning", request, comparison, "tune")
-    return within_bounds(
-        contract.TuningResults(**common_fields, tuning=to_serializable(tuning_by_axis))
-    )
+    return within_bounds(contract.TuningResults(**common_fields, tuning=dict(tuning_by_axis)))
 
 
 def sync_results(
     request: ComparisonRequest, comparison: PreparedComparison, clock: ClockOffset | Unavailable
 ) -> contract.SyncResults:
     common_fields = _flight_fields("px4fuse-sync", request, comparison, "sync")
-    return within_bounds(contract.SyncResults(**common_fields, clock=to_serializable(clock)))
+    return within_bounds(contract.SyncResults(**common_fields, clock=clock))
 
 
 def whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract.WhatIfResults:
@@ -118,7 +115,7 @@ def loop_results(request: LoopRequest, loop: Loop, student: Student) -> contract
             request=request.without_paths(),
             track=loop.odometry.trajectory.track(),
             references=tuple(reference.track() for reference in loop.references),
-            loop=to_serializable(loop),
+            loop=loop,
             findings=find_loop(loop),
             student=student,
             provenance=provenance(command_line(request)),
@@ -135,16 +132,14 @@ def evaluation_results(
             estimate=evaluation.estimate_track.track(),
             reference=evaluation.reference_track.track(),
             provenance=provenance(command_line(request)),
-            **msgspec.structs.asdict(to_serializable(evaluation)),
+            **msgspec.structs.asdict(evaluation),
         )
     )
 
 
 def graph_results(solved_graph: Graph, command: str) -> contract.GraphResults:
     return within_bounds(
-        contract.GraphResults(
-            schema_of("px4fuse-graph"), to_serializable(solved_graph), provenance(command)
-        )
+        contract.GraphResults(schema_of("px4fuse-graph"), solved_graph, provenance(command))
     )
 
 
@@ -179,20 +174,26 @@ def _flight_fields(
         **track.description_fields(),
         ekf2_parameters={} if origin.aid is None else origin.aid.logged_parameters(parameters),
         reason=comparison.source_reason,
-        rate_hz=track.rate_hz,
+        rate_hz=track.compute_rate_hz(),
         available=tuple(
-            AvailableTrack(a.name, a.origin.kind, a.origin.path, len(a.samples), a.rate_hz)
-            for a in comparison.flight.positions
+            AvailableTrack(
+                each.name,
+                each.origin.kind,
+                each.origin.path,
+                len(each.samples),
+                each.compute_rate_hz(),
+            )
+            for each in comparison.flight.positions
         ),
         missing=tuple(part for part in comparison.missing if part.source),
     )
-    setting_values: dict[str, Any] = asdict(settings) | {
+    kf_settings: dict[str, Any] = asdict(settings) | {
         "clock_offset_s": settings.clock_offset_s + file_offset_s
     }
     return _common_fields(name, request, comparison.flight, command) | {
         "source": source,
         "settings": ChosenSettings(
-            **setting_values,
+            **kf_settings,
             start_s=segment.start_s,
             end_s=segment.end_s,
             segment_reason=segment.reason,

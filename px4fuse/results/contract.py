@@ -1,7 +1,7 @@
-"""Types of the results (one JSON object per command), their JSON Schema, and writing.
+"""Types of the JSON results of all commands, their JSON Schema, and writing.
 
-px4fuse reads results with the same major version of the schema, and ignores fields that a newer
-minor version has added.
+px4fuse reads results with an equal major version of the schema, and ignores fields of a newer minor
+version.
 """
 
 import json
@@ -45,7 +45,7 @@ SIGNIFICANT_DIGITS = 10
 
 
 class Log(LogInfo, kw_only=True):
-    """Log of a flight, its further input files, and the clocks mapped to the boot clock."""
+    """Log of a flight, further input files, and clocks that were converted to the boot clock."""
 
     joined: tuple[InputFile, ...]
     clocks: tuple[ClockMap, ...]
@@ -60,11 +60,24 @@ class AvailableTrack(Record):
 
 
 class PositionSource(Record, kw_only=True):
-    """Position source with which KF and EKF2 are compared.
+    """Source (UWB, vision, GNSS, ...) of the positions that KF fuses.
 
-    ``kind`` is the type of sensor, and ``path`` how the positions reached the log.
-    ``ekf2_parameters`` are the logged EKF2 parameters for this source, in units of PX4. ``log`` is
-    the name of the file that contains the positions.
+    Attributes
+    ----------
+    kind : str
+        Type of sensor.
+    path : str
+        Way of the positions into the log, for example "as received".
+    ekf2_parameters : mapping
+        Logged EKF2 parameters for this source, in units of PX4.
+    reason : str
+        Reason for the choice of this source.
+    reconstructed : bool
+        True if the positions were computed from other data in the log.
+    available : tuple of AvailableTrack
+        All position sources in the log.
+    log : str
+        Name of the file that contains the positions.
     """
 
     name: str
@@ -85,7 +98,7 @@ class PositionSource(Record, kw_only=True):
 
 
 class ChosenSettings(Record, kw_only=True):
-    """Settings of KF and time span; ``clock_offset_s`` was added to the source's timestamps."""
+    """Settings of KF, analysed time span, and time offset added to the position timestamps."""
 
     sigma_a_m_s2: Positive
     sigma_z_m: Positive
@@ -107,7 +120,7 @@ Interval = tuple[float, float | None]
 
 
 class DiffInput(Record, kw_only=True):
-    """Input A or B of ``px4fuse diff``: file name (``given``), and the analysed log."""
+    """Input A or B of ``px4fuse diff``: file name (``given``), and its log."""
 
     given: str
     kind: Literal["log", "report", "results"]
@@ -119,8 +132,14 @@ class DiffInput(Record, kw_only=True):
 class NumberChange(Record, kw_only=True):
     """Number that differs between the inputs A and B of ``px4fuse diff``, with 95 % intervals.
 
-    ``path`` is the place in the results, such as ``axes.aisle.filters.ekf2.nis_mean``. The unit
-    "share" is a fraction from 0 to 1. ``a`` or ``b`` is None if that input lacks the number.
+    Attributes
+    ----------
+    path : str
+        Field of the results, for example ``axes.aisle.filters.ekf2.nis_mean``.
+    unit : str
+        "share" is a fraction from 0 to 1.
+    a, b : float or None
+        Values in A and B; None for a missing number.
     """
 
     path: str
@@ -150,7 +169,7 @@ class UnsharedFinding(Record):
 
 
 class _FlightResults(Record):
-    """Base class of the results for one flight with positions for KF."""
+    """Base class of the results for a flight with positions, on which KF can run."""
 
     schema: Schema
     request: ComparisonRequest
@@ -160,24 +179,24 @@ class _FlightResults(Record):
 
 
 class ComparisonResults(_FlightResults):
-    """Results of ``px4fuse compare``, attached to its report.
+    """Results of ``px4fuse compare``.
 
     Attributes
     ----------
     tuning : mapping of axis name to AxisTuning
-        The key "horizontal" is one estimate for the axes north and east together.
+        Estimated noises. The key "horizontal" is one estimate for north and east together.
     heading : HeadingError
         Yaw misalignment between the position frame and the heading of the vehicle.
     ekf2_replay : Ekf2Replay
         Replay of EKF2 from the log, and its agreement with the logged EKF2.
     difference_steps : mapping of axis name to DifferenceExplanation
-        Difference KF - EKF2 while the settings of KF are replaced by those of EKF2 one at a time.
+        Difference KF - EKF2 after each step that replaces one setting of KF by that of EKF2.
     trials : tuple of Trial
-        Re-runs of both filters, each with one change.
+        Re-runs of KF and EKF2, each with one change of a setting or of the data.
     card : Card
-        Summary of the diagnosis, on cover, terminal, web page and batch table.
+        Summary of the diagnosis.
     convention : Convention
-        Axes, unit, clock and orientation of the positions as sent. None for GNSS, and for a log
+        Detected axes, unit, clock and orientation of the positions. None for GNSS, and for a log
         without IMU or attitude.
     """
 
@@ -201,7 +220,7 @@ class ComparisonResults(_FlightResults):
 
 
 class AidsResults(Record):
-    """Results of ``px4fuse compare`` without positions for KF: EKF2's aiding sources only."""
+    """Results of ``px4fuse compare`` for a log without positions: EKF2's aiding sources only."""
 
     schema: Schema
     request: ComparisonRequest
@@ -250,7 +269,7 @@ class GraphResults(Record):
 
 
 class EvaluationResults(Evaluation, kw_only=True):
-    """Results of ``px4fuse evaluate``: errors of the estimate against the reference."""
+    """Results of ``px4fuse evaluate``: errors of a trajectory against a reference trajectory."""
 
     schema: Schema
     estimate: Track
@@ -259,11 +278,20 @@ class EvaluationResults(Evaluation, kw_only=True):
 
 
 class WhatIfResults(Record, kw_only=True, rename={"uses_estimates": "asked"}):
-    """Results of ``px4fuse whatif``: EKF2 as logged, as replayed, and with other parameters.
+    """Results of ``px4fuse whatif``: statistics of EKF2 with logged and with changed parameters.
 
-    All statistics are over the time spans ``evaluated_s``. ``uses_estimates`` is True if ``whatif``
-    has maximum-likelihood estimates, because the user gave no parameters. ``sweep`` has one summary
-    for each value of the swept parameter.
+    Attributes
+    ----------
+    agreement : Agreement
+        Agreement of the replay (logged parameters) with the logged EKF2.
+    evaluated_s : tuple of (float, float)
+        Time spans (s) of all statistics.
+    uses_estimates : bool
+        True if the changed parameters are maximum-likelihood estimates, because the user gave none.
+    logged, replayed, whatif : Summary
+        EKF2 as logged, replay with logged parameters, replay with changed parameters.
+    sweep : tuple of Summary
+        Replays with several values of one parameter.
     """
 
     schema: Schema
@@ -281,10 +309,10 @@ class WhatIfResults(Record, kw_only=True, rename={"uses_estimates": "asked"}):
 
 
 class ChangeResults(Record, kw_only=True):
-    """Results of ``px4fuse diff``: differences from A to B.
+    """Results of ``px4fuse diff``: differences between the inputs A and B.
 
-    ``worse`` has a sentence for each consistency verdict that is worse in B, and for each error
-    that only B has. The exit code is then 1.
+    ``worse`` contains a sentence for each filter that is consistent only in A, and for each finding
+    of severity error that is only in B. The exit code is 1 if ``worse`` is not empty.
     """
 
     schema: Schema
@@ -308,7 +336,7 @@ Results = (
     | WhatIfResults
     | ChangeResults
 )
-# Type of the results by the name of their schema
+# Type of the results, by name of the JSON schema
 RESULTS_BY_SCHEMA: dict[str, type[Results]] = {
     COMPARISON_SCHEMA: ComparisonResults,
     LOOP_SCHEMA: LoopResults,
@@ -342,12 +370,12 @@ def schema() -> dict[str, Any]:
 
 
 def schema_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Return the JSON Schema of each type, and the definitions to which these schemas refer."""
+    """Return the JSON Schema of each type, and the definitions (``$defs``) that they use."""
     record_types = dict.fromkeys(types)
     schemas: tuple[dict[str, Any], ...] = ()
     components: dict[str, Any] = {}
 
-    def describe(union_type: Any) -> dict[str, Any]:
+    def describe_union(union_type: Any) -> dict[str, Any]:
         if union_type is msgspec.UnsetType:  # an unset field is not written
             return {"not": {}}
         record_types.update(dict.fromkeys(union_type.union_members))
@@ -356,17 +384,17 @@ def schema_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]], dict
         }
 
     count = 0
-    # repeat until the schemas contain no further nested type
+    # repeat, because `describe_union` finds further types that are nested
     while count < len(record_types):
         count = len(record_types)
         schemas, components = msgspec.json.schema_components(
-            list(record_types), schema_hook=describe, ref_template="#/$defs/{name}"
+            list(record_types), schema_hook=describe_union, ref_template="#/$defs/{name}"
         )
     return list(schemas[: len(types)]), components
 
 
 def to_json_dict(results: msgspec.Struct) -> dict[str, Any]:
-    """Convert results to dicts, lists and numbers, with the field names of the JSON file."""
+    """Convert results to dicts, lists and numbers, as in the JSON file."""
     plain_results: dict[str, Any] = msgspec.to_builtins(results, enc_hook=_to_builtin)
     return plain_results
 
@@ -374,8 +402,7 @@ def to_json_dict(results: msgspec.Struct) -> dict[str, Any]:
 def round_number(value: float) -> float:
     """Round a number to ten significant digits, or to six decimals if that is more precise.
 
-    UNIX times (s) need the six decimals. Further digits depend on the processor, because linear
-    algebra libraries sum in different orders.
+    UNIX times (s) need the six decimals. Further digits depend on the processor.
 
     >>> round_number(0.1 + 0.2), round_number(1795251250.2020123)
     (0.3, 1795251250.202012)

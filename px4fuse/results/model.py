@@ -10,7 +10,7 @@ from msgspec import Meta
 from px4fuse.core.record import Record
 from px4fuse.results.answer_form import Answers
 
-# Version of the results schema: new fields increase the minor version, other changes the major
+# Version of the JSON schema: new fields increase the minor version, other changes the major version
 SCHEMA_VERSION = "4.0"
 # Libraries that affect the numbers in the results
 LIBRARIES = ("numpy", "scipy", "pandas", "pyulog", "pymavlink", "filterpy", "matplotlib", "pypdf")
@@ -21,14 +21,14 @@ Version = Annotated[str, Meta(pattern="^[0-9A-Za-z.+!_-]{1,60}$")]
 
 
 class Schema(Record):
-    """Name and version of the schema of results."""
+    """Name and version of the JSON schema of results."""
 
     name: str
     version: Annotated[str, Meta(pattern=r"^4\.[0-9]{1,4}$")]
 
 
 class Student(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Student who made a report, with notes (Markdown) and the completed answer form."""
+    """Student who wrote a report, with notes (Markdown) and answers to questions on the flight."""
 
     name: Annotated[str, Meta(max_length=MAX_STUDENT_NAME_LENGTH)] = ""
     id: Annotated[str, Meta(max_length=MAX_STUDENT_NAME_LENGTH)] = ""
@@ -40,7 +40,7 @@ NO_STUDENT = Student()
 
 
 class Provenance(Record):
-    """Versions and command line with which results were made.
+    """Software versions and command that produced the results.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Provenance(Record):
     libraries : mapping of str to str
         Versions of the libraries that affect the numbers in the results.
     command : str
-        Command line for readers. Programs use the field ``request`` of the results instead.
+        Command line for users. Programs should read the field ``request`` instead.
     """
 
     px4fuse: Version

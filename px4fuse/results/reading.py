@@ -14,7 +14,7 @@ from px4fuse.results.bounds import types_of
 from px4fuse.results.contract import RESULTS_BY_SCHEMA, Results
 from px4fuse.results.model import SCHEMA_VERSION
 
-# Maximum size of results (bytes), and of an integer in them (bits)
+# Maximum size of a results file (bytes) and of an integer in the file (bits)
 MAX_RESULTS_BYTES, MAX_INTEGER_BITS = 5_000_000, 64
 
 
@@ -24,24 +24,21 @@ class _SchemaVersion(msgspec.Struct, frozen=True):
 
 
 class _Head(msgspec.Struct, frozen=True):
-    """Fields of results in all schema versions."""
+    """Fields that results of all schema versions contain."""
 
     schema: _SchemaVersion
     provenance: Any = None
 
 
 def read_results(data: bytes, name: str = "results.json") -> Results:
-    """Read results of px4fuse from untrusted bytes; ``name`` is the file name for messages.
+    """Read results of px4fuse from untrusted bytes; clean all texts by :func:`clean_text`.
 
-    Returns
-    -------
-    Results
-        Results whose texts are cleaned by :func:`clean_text`.
+    ``name`` is the file name for messages.
 
     Raises
     ------
     ResultsError
-        The data are too large, not JSON, nested too deeply, or not results of this major version.
+        The data are too large, not JSON, nested too deeply, or have another major schema version.
     """
     if len(data) > MAX_RESULTS_BYTES:
         raise ResultsError(f"{name} is larger than {MAX_RESULTS_BYTES // 1_000_000} MB.")
@@ -83,7 +80,7 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
 
 
 def _remove_unknown_fields(value: Any, annotation: Any) -> Any:
-    """Remove the fields that the schema of this version does not have from decoded JSON."""
+    """Remove fields that are unknown to this version from decoded JSON."""
     types = types_of(annotation)
     if isinstance(value, dict):
         record_types = [record for record in types if hasattr(record, "__struct_fields__")]
@@ -101,7 +98,7 @@ def _remove_unknown_fields(value: Any, annotation: Any) -> Any:
 
 
 def _require_unique_keys(pairs: list[tuple[str, Any]]) -> None:
-    # programs may read different values of a repeated key
+    # some programs read the first value of a repeated key, others the last
     if len(dict(pairs)) < len(pairs):
         raise ValueError("a JSON key is repeated")
 

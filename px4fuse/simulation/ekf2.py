@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from px4fuse.core.arrays import Array, BoolArray, IntArray
+from px4fuse.core.arrays import Array, BoolArray, IntArray, cumulative_sums
 from px4fuse.ekf2.filter_recursion import (
     HEADING,
     HORIZONTAL_POSITION,
@@ -48,7 +48,7 @@ from px4fuse.flight.ekf2_parameters import (
 )
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ekf2_topics import VEHICLE_AID_SOURCE_HZ, Ekf2Output, ekf2_topics
-from px4fuse.simulation.mistakes import Mistakes
+from px4fuse.simulation.faults import FaultSizes
 from px4fuse.simulation.motion import Motion, attitude
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic
@@ -89,27 +89,27 @@ def _fused_aids(scenario: Scenario) -> tuple[Aid, ...]:
     return (scenario.aid, MAG, BAROMETER) if scenario.aid == GNSS_POS else (scenario.aid,)
 
 
-def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]:
+def parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | float]:
     """Return the values of all EKF2 parameters that the model uses, by PX4 name."""
     aid = scenario.aid
     is_gnss = aid == GNSS_POS
     defaults = effective_settings({}, *_fused_aids(scenario))
-    delay_ms = defaults[aid.delay] if mistakes.ekf2_delay_s is None else 1e3 * mistakes.ekf2_delay_s
+    delay_ms = defaults[aid.delay] if faults.ekf2_delay_s is None else 1e3 * faults.ekf2_delay_s
     aid_values: dict[str, float] = {aid.noise_mode: 1}
     if is_gnss:
         # with EKF2_MAG_TYPE 1 EKF2 fuses the magnetic heading only, with 0 all axes
-        mag_type = int(bool(mistakes.heading_deg))
+        mag_type = int(bool(faults.heading_deg))
         aid_values = {GNSS_VEL.noise: scenario.sigma_gnss_m_s, MAG.switch: mag_type}
         aid_values |= {BAROMETER.noise: sensors.SIGMA_BAROMETER_M}
     return (
         defaults
         | aid_values
         | {
-            aid.noise: mistakes.ekf2_noise_m or sensors.reported_sigma_m(scenario, mistakes),
-            aid.gate: mistakes.ekf2_gate,
+            aid.noise: faults.ekf2_noise_m or sensors.reported_sigma_m(scenario, faults),
+            aid.gate: faults.ekf2_gate,
             aid.delay: delay_ms,
             # EKF2 does not fuse samples that are older than EKF2_DELAY_MAX
-            "EKF2_DELAY_MAX": max(defaults["EKF2_DELAY_MAX"], 100.0 + 1e3 * mistakes.clock_jump_s),
+            "EKF2_DELAY_MAX": max(defaults["EKF2_DELAY_MAX"], 100.0 + 1e3 * faults.clock_jump_s),
             "EKF2_PREDICT_US": PREDICTION_STEP_US,
         }
     )
@@ -117,7 +117,7 @@ def parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]
 
 def simulate_ekf2(
     scenario: Scenario,
-    mistakes: Mistakes,
+    faults: FaultSizes,
     motion: Motion,
     imu: Topic,
     source: sensors.SimulatedPositions,
@@ -131,7 +131,7 @@ def simulate_ekf2(
     the log, by PX4 name.
     """
     aid, fused_aids = scenario.aid, _fused_aids(scenario)
-    segment, time_us, true_quaternions = _make_segment(scenario, mistakes, motion, imu)
+    segment, time_us, true_quaternions = _make_segment(scenario, faults, motion, imu)
     logged_values = {name: float(np.float32(value)) for name, value in log_parameters.items()}
     step_s = float(np.median(segment.step_s))
     if other_sensors:
@@ -142,10 +142,10 @@ def simulate_ekf2(
         # the barometer is EKF2's only height source outdoors
         down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
         no_dead_zone, sample_weight = np.zeros(len(down_m)), np.ones(len(down_m))
-        samples = barometer_samples_inside(
+        barometer_samples = barometer_samples_inside(
             segment, barometer_s, down_m, no_dead_zone, sample_weight
         )
-        heights = HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *samples)
+        heights = HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *barometer_samples)
         segment = replace(segment, heights=heights)
         if not logged_values[MAG.switch]:
             segment = add_field_states(
@@ -179,12 +179,12 @@ def simulate_ekf2(
     )
     model_run = run_configurations(inputs, [FilterConfiguration(settings)], {})[0]
     output = _compute_output(inputs, model_run, time_us, true_quaternions)
-    aid_source_hz = VEHICLE_AID_SOURCE_HZ if mistakes.no_vvo else 0.0
+    aid_source_hz = VEHICLE_AID_SOURCE_HZ if faults.no_vvo else 0.0
     return ekf2_topics(inputs, model_run, output, scenario.attitude_rate_hz, aid_source_hz)
 
 
 def _make_segment(
-    scenario: Scenario, mistakes: Mistakes, motion: Motion, imu: Topic
+    scenario: Scenario, faults: FaultSizes, motion: Motion, imu: Topic
 ) -> tuple[ReplaySegment, IntArray, Array]:
     """Prepare the input of the EKF2 model, and the times (µs) and true attitudes of its steps."""
     time_us = sensors.time_us(imu)
@@ -206,15 +206,15 @@ def _make_segment(
     )
     attitude_difference = multiply(true_quaternions, conjugate(integrated_attitude))
     attitude_error_rad = np.zeros((len(time_s), 3))
-    attitude_error_rad[:, HEADING] = sensors.attitude_error(scenario, mistakes, time_s).as_rotvec()[
+    attitude_error_rad[:, HEADING] = sensors.attitude_error(scenario, faults, time_s).as_rotvec()[
         :, HEADING
     ]
     force_m_s2, rate_rad_s = sensors.measure_imu(
         scenario,
-        mistakes,
+        faults,
         motion,
         np.zeros(1),
-        sensors.Stream.REST,
+        sensors.RandomStream.REST,
         REST_BEFORE_LOG_S * scenario.imu_rate_hz,
     )
     state, covariance = _initial_state_at_rest(
@@ -278,7 +278,7 @@ def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions
 
     EKF2 ignores a position that is older than the previous one (estimator_interface.cpp).
     """
-    fields = source.topic.fields
+    topic_fields = source.topic.fields
     timestamp_s, arrival_s = (
         sensors.seconds(sensors.time_us(source.topic, name))
         for name in ("timestamp_sample", "timestamp")
@@ -287,11 +287,13 @@ def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions
     is_newer = timestamp_s > latest_timestamp_s
     velocity_m_s = source.velocity_m_s
     if velocity_m_s is not None:
-        sigmas_m = np.stack([fields["eph"], fields["eph"], fields["epv"]], axis=1)
+        sigmas_m = np.stack([topic_fields["eph"], topic_fields["eph"], topic_fields["epv"]], axis=1)
         position_variance = sigmas_m[is_newer] ** 2
-        velocity_variance = np.repeat(fields["s_variance_m_s"][is_newer, None] ** 2, 3, axis=1)
+        velocity_variance = np.repeat(
+            topic_fields["s_variance_m_s"][is_newer, None] ** 2, 3, axis=1
+        )
     else:
-        position_variance, velocity_variance = fields["position_variance"][is_newer], None
+        position_variance, velocity_variance = topic_fields["position_variance"][is_newer], None
     return ReceivedPositions(
         timestamp_s=timestamp_s[is_newer],
         arrival_s=arrival_s[is_newer],
@@ -320,9 +322,7 @@ def _compute_output(
         "nij,nj->ni", segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:]
     )
     attitude_error_steps_rad = -segment.correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
-    gyro_attitude_error_rad = state[0, THETA] + np.concatenate(
-        [np.zeros((1, 3)), np.cumsum(attitude_error_steps_rad, axis=0)]
-    )
+    gyro_attitude_error_rad = state[0, THETA] + cumulative_sums(attitude_error_steps_rad)
     attitude_error_rad = gyro_attitude_error_rad + follow_attitude(
         state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.mean_step_s, inputs.horizon_s
     )
@@ -345,10 +345,10 @@ def _compute_output(
 def _hold_without_aiding(
     model_run: SegmentRun, state: Array
 ) -> tuple[list[tuple[int, Array]], BoolArray]:
-    """Set the position in ``state`` constant from NO_AID_TIMEOUT_S after the last fused sample.
+    """Hold the position in ``state`` constant without aiding, like PX4 (fake_pos_control.cpp).
 
-    PX4 does this (fake_pos_control.cpp). Return the resets of the position (step, size in m), and a
-    mask of the steps that are not held.
+    Return the position resets (step, size in m), and a mask of the steps with aiding in the last
+    NO_AID_TIMEOUT_S.
     """
     events, time_s = model_run.events[0], model_run.segment.time_s
     aid_events = np.flatnonzero(model_run.fused[:, 0] | model_run.reset[:, 0])

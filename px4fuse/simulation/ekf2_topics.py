@@ -285,15 +285,15 @@ def _aid_source_topic(
     settings: Mapping[str, float],
     timestamps: Mapping[str, Any],
     observation: Array,
-    innovation_values: tuple[Array | Array32, ...],
-    decisions: tuple[BoolArray, BoolArray],
+    innovation_and_variances: tuple[Array | Array32, ...],
+    rejected_and_fused: tuple[BoolArray, BoolArray],
 ) -> Topic:
     """Return estimator_aid_src_* of an aiding source.
 
-    ``innovation_values`` are innovation, its variance S, and the measurement variance R.
-    ``decisions`` are masks of rejected and of fused samples.
+    ``innovation_and_variances`` are innovation, its variance S, and the measurement variance R.
+    ``rejected_and_fused`` are masks of rejected and of fused samples.
     """
-    innovation, innovation_variance, noise_variance = innovation_values
+    innovation, innovation_variance, noise_variance = innovation_and_variances
     test_ratio = innovation**2 / (max(settings[aid.gate], 1.0) ** 2 * innovation_variance)
     fields = {
         **timestamps,
@@ -302,8 +302,8 @@ def _aid_source_topic(
         "innovation": -innovation,
         "innovation_variance": innovation_variance,
         "test_ratio": test_ratio,
-        "innovation_rejected": decisions[0],
-        "fused": decisions[1],
+        "innovation_rejected": rejected_and_fused[0],
+        "fused": rejected_and_fused[1],
     }
     return topic(f"estimator_aid_src_{aid.name}", fields)
 

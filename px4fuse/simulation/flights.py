@@ -1,4 +1,4 @@
-"""Simulated flights as PX4 topics, ULog or Flight; injected faults and true values as answers."""
+"""Simulated flights as PX4 topics, ULog or Flight; answer key with injected faults and truth."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -15,12 +15,12 @@ from px4fuse.readers.ulog import read_ulog
 from px4fuse.readers.ulog_topics import ASSESSED_KEY, NOTE_KEY
 from px4fuse.simulation import ekf2, sensors
 from px4fuse.simulation.ekf2_topics import MAGNETOMETER_HZ
-from px4fuse.simulation.mistakes import MISTAKES, Mistakes, active_mistake_names, format_mistake
-from px4fuse.simulation.motion import Motion, plan
+from px4fuse.simulation.faults import FAULT_TYPES, FaultSizes, format_fault, injected_fault_names
+from px4fuse.simulation.motion import Motion, plan_flight
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic, encode
 
-NO_MISTAKES = Mistakes()
+NO_FAULTS = FaultSizes()
 # PX4 parameter values with which EKF2 fuses positions (GNSS: positions and velocities)
 FUSION_ON_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}
 # SDLOG_PROFILE that logs the topics of external vision
@@ -38,14 +38,14 @@ class Simulation:
     """Simulated flight: logged topics and parameters, and values that the log does not contain."""
 
     scenario: Scenario
-    mistakes: Mistakes
+    faults: FaultSizes
     motion: Motion
     positions: sensors.SimulatedPositions
     topics: tuple[Topic, ...]
     parameters: Mapping[str, int | float]
 
 
-def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation:
+def simulate(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Simulation:
     """Simulate a flight with injected faults.
 
     Raises
@@ -53,36 +53,38 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
     SettingsError
         An injected fault is not possible in this scenario.
     """
-    for name in active_mistake_names(mistakes):
-        if scenario.kind not in (kinds := MISTAKES[name].kinds):
+    for name in injected_fault_names(faults):
+        if scenario.kind not in (kinds := FAULT_TYPES[name].kinds):
             raise SettingsError(f"--mistake {name} requires --kind {' or '.join(kinds)}.")
-        if MISTAKES[name].changes_ekf2 and not scenario.ekf2:
+        if FAULT_TYPES[name].changes_ekf2 and not scenario.ekf2:
             raise SettingsError(
                 f"--mistake {name} changes EKF2, which --no-ekf2 does not simulate. Omit --no-ekf2."
             )
-    if scenario.aid == GNSS_POS and 0.0 < mistakes.ekf2_noise_m < (
-        reported_m := sensors.reported_sigma_m(scenario, mistakes)
+    if scenario.aid == GNSS_POS and 0.0 < faults.ekf2_noise_m < (
+        reported_m := sensors.reported_sigma_m(scenario, faults)
     ):
         raise SettingsError(
-            f"--mistake ekf2-noise={mistakes.ekf2_noise_m:g} has no effect outdoors: "
+            f"--mistake ekf2-noise={faults.ekf2_noise_m:g} has no effect outdoors: "
             f"EKF2 uses the larger of {GNSS_POS.noise} and the accuracy that the receiver reports "
             f"({reported_m:g} m). Use a larger value."
         )
-    motion = plan(scenario, mistakes, sensors.random_stream(scenario, sensors.Stream.WANDER))
-    positions = sensors.positions(scenario, mistakes, motion)
-    imu = sensors.imu(scenario, mistakes, motion)
-    parameters = _parameters(scenario, mistakes)
+    motion = plan_flight(
+        scenario, faults, sensors.random_stream(scenario, sensors.RandomStream.WANDER)
+    )
+    positions = sensors.positions(scenario, faults, motion)
+    imu = sensors.imu(scenario, faults, motion)
+    parameters = _parameters(scenario, faults)
     topics = [
-        sensors.logged_imu(imu, mistakes, motion),
-        sensors.logged_attitude(scenario, mistakes, motion),
+        sensors.logged_imu(imu, faults, motion),
+        sensors.logged_attitude(scenario, faults, motion),
         sensors.land_detector(motion),
     ]
-    if not mistakes.no_vvo:
+    if not faults.no_vvo:
         topics.append(positions.topic)
     other_sensors: tuple[Topic, ...] = ()
     if scenario.aid == GNSS_POS:
         barometer = sensors.barometer(scenario, motion)
-        other_sensors = (sensors.magnetometer(scenario, mistakes, motion), barometer)
+        other_sensors = (sensors.magnetometer(scenario, faults, motion), barometer)
         topics += [sensors.limit_rate(other_sensors[0], MAGNETOMETER_HZ), barometer]
     if scenario.truth:
         topics.append(sensors.ground_truth(scenario, motion))
@@ -93,23 +95,23 @@ def simulate(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Simulation
             )
     if scenario.ekf2:
         ekf2_topics = ekf2.simulate_ekf2(
-            scenario, mistakes, motion, imu, positions, other_sensors, parameters
+            scenario, faults, motion, imu, positions, other_sensors, parameters
         )
         ekf2_topic_names = {topic.name for topic in ekf2_topics}
         topics = [*(topic for topic in topics if topic.name not in ekf2_topic_names), *ekf2_topics]
     if scenario.truth:
         topics.append(sensors.true_attitude(scenario, motion))
-    return Simulation(scenario, mistakes, motion, positions, tuple(topics), parameters)
+    return Simulation(scenario, faults, motion, positions, tuple(topics), parameters)
 
 
-def simulate_flight(scenario: Scenario, mistakes: Mistakes = NO_MISTAKES) -> Flight:
-    return to_flight(simulate(scenario, mistakes))
+def simulate_flight(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Flight:
+    return to_flight(simulate(scenario, faults))
 
 
 def to_ulog(simulation: Simulation, *, is_assessed: bool = False) -> bytes:
     """Encode the flight as a ULog file, which contains no information about the injected faults.
 
-    ``is_assessed`` marks the log as an assignment, for which px4fuse withholds its diagnosis.
+    ``is_assessed`` marks the log as a student assignment, whose faults px4fuse does not show.
     """
     info: dict[str, int | str] = {
         "sys_name": "PX4",
@@ -126,56 +128,56 @@ def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
     return read_ulog(name, to_ulog(simulation))
 
 
-def _parameters(scenario: Scenario, mistakes: Mistakes) -> dict[str, int | float]:
-    switch_value = 0 if mistakes.ekf2_off else FUSION_ON_VALUES[scenario.aid.switch]
+def _parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | float]:
+    switch_value = 0 if faults.ekf2_off else FUSION_ON_VALUES[scenario.aid.switch]
     return {
-        **ekf2.parameters(scenario, mistakes),
+        **ekf2.parameters(scenario, faults),
         "EKF2_EN": int(scenario.ekf2),
         **dict.fromkeys(FUSION_ON_VALUES, 0),
         scenario.aid.switch: switch_value,
         "EKF2_HGT_REF": 0,
         "SDLOG_PROFILE": PROFILE_WITHOUT_VISION
-        if mistakes.no_vvo or scenario.aid == GNSS_POS
+        if faults.no_vvo or scenario.aid == GNSS_POS
         else PROFILE_WITH_VISION,
     }
 
 
-def answer(simulation: Simulation) -> dict[str, Any]:
+def make_answer_key(simulation: Simulation) -> dict[str, Any]:
     """Return injected faults and true values of a flight for the instructor, as JSON types."""
-    scenario, mistakes = simulation.scenario, simulation.mistakes
+    scenario, faults = simulation.scenario, simulation.faults
     motion, source = simulation.motion, simulation.positions
-    accelerometer_bias_m_s2, gyro_bias_rad_s = sensors.biases(scenario, mistakes)
-    first_m, last_m = motion.at(np.array([0.0, motion.duration_s])).position_m
+    accelerometer_bias_m_s2, gyro_bias_rad_s = sensors.biases(scenario, faults)
+    first_position_m, last_position_m = motion.at(np.array([0.0, motion.duration_s])).position_m
     timestamps_us = sensors.time_us(source.topic, "timestamp_sample")
     outlier_indices = np.flatnonzero(source.is_outlier)
-    answer_data: dict[str, Any] = to_json_types(
+    answer_key: dict[str, Any] = to_json_types(
         {
             "schema": ANSWER_SCHEMA,
             "scenario": asdict(scenario),
             "mistakes": {
                 name: {
-                    "typed": format_mistake(name, mistakes),
-                    "help": MISTAKES[name].help,
-                    "finding": MISTAKES[name].finding,
-                    **{field: getattr(mistakes, field) for field in MISTAKES[name].size_fields},
+                    "typed": format_fault(name, faults),
+                    "help": FAULT_TYPES[name].help,
+                    "finding": FAULT_TYPES[name].finding,
+                    **{field: getattr(faults, field) for field in FAULT_TYPES[name].size_fields},
                 }
-                for name in active_mistake_names(mistakes)
+                for name in injected_fault_names(faults)
             },
             "truth": {
                 "duration_s": motion.duration_s,
                 "airborne_s": [motion.take_off_s, motion.touch_down_s],
                 "sigma_z_m": scenario.source_sigma_m,
-                "sigma_a_m_s2": float(np.hypot(scenario.sigma_a_m_s2, mistakes.vibration_m_s2)),
-                "reported_sigma_m": sensors.reported_sigma_m(scenario, mistakes),
+                "sigma_a_m_s2": float(np.hypot(scenario.sigma_a_m_s2, faults.vibration_m_s2)),
+                "reported_sigma_m": sensors.reported_sigma_m(scenario, faults),
                 "accelerometer_bias_m_s2": accelerometer_bias_m_s2.tolist(),
                 "gyro_bias_rad_s": gyro_bias_rad_s.tolist(),
-                "clock_offset_to_add_s": 0.0 - mistakes.clock_offset_s,
+                "clock_offset_to_add_s": 0.0 - faults.clock_offset_s,
                 "outlier_index": outlier_indices.tolist(),
                 "outlier_time_s": (timestamps_us[outlier_indices] * 1e-6).tolist(),
                 "path_length_m": source.distance_m,
-                "closure_error_m": float(np.linalg.norm((last_m - first_m)[:2])),
+                "closure_error_m": float(np.linalg.norm((last_position_m - first_position_m)[:2])),
                 "source_drift_m": source.drift_m.tolist(),
             },
         }
     )
-    return answer_data
+    return answer_key

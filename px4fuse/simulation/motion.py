@@ -17,7 +17,7 @@ from scipy.interpolate import BPoly, PPoly
 
 from px4fuse.core.arrays import Array
 from px4fuse.errors import SettingsError
-from px4fuse.simulation.mistakes import Mistakes
+from px4fuse.simulation.faults import FaultSizes
 from px4fuse.simulation.scenario import CORNER_DURATION_S, START_STOP_S, Scenario
 
 # Time (s) on the ground before take-off and after landing
@@ -58,10 +58,10 @@ def _sum_of_ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
     return PPoly.from_bernstein_basis(BPoly.from_derivatives(times_s[is_used], derivatives))
 
 
-def _derivatives(function: PPoly, time_s: Array, orders: Sequence[int]) -> list[Array]:
+def _derivatives(ramp_function: PPoly, time_s: Array, orders: Sequence[int]) -> list[Array]:
     """Return derivatives of a :func:`_sum_of_ramps`, shape (t, k); order -1 is the integral."""
-    inside_s = np.clip(time_s, *function.x[[0, -1]])
-    return [np.asarray(function.derivative(order)(inside_s)) for order in orders]
+    inside_s = np.clip(time_s, *ramp_function.x[[0, -1]])
+    return [np.asarray(ramp_function.derivative(order)(inside_s)) for order in orders]
 
 
 @dataclass(frozen=True)
@@ -81,17 +81,17 @@ class Sines:
         amplitude = rms * np.sqrt(2.0 / SINE_COUNT)
         return cls(angular_frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
-    def at(self, time_s: Array, orders: int = 1) -> list[Array]:
-        """Return the sum and its first ``orders`` - 1 time derivatives, each of shape (t, k)."""
+    def at(self, time_s: Array, order_count: int = 1) -> list[Array]:
+        """Return the sum and its time derivatives: ``order_count`` arrays of shape (t, k)."""
         angle = np.outer(time_s, self.angular_frequency_rad_s)
         basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
         amplitudes = [np.concatenate([self.sine, self.cosine])]
         omega = self.angular_frequency_rad_s[:, None]
-        for _ in range(orders - 1):
+        for _ in range(order_count - 1):
             # d/dt (s sin ωt + c cos ωt) = -ωc sin ωt + ωs cos ωt
             sine, cosine = np.split(amplitudes[-1], 2)
             amplitudes.append(np.concatenate([-omega * cosine, omega * sine]))
-        return np.split(basis @ np.hstack(amplitudes), orders, axis=1)
+        return np.split(basis @ np.hstack(amplitudes), order_count, axis=1)
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ def attitude(state: State) -> Attitude:
     return Attitude(np.stack([x, y, z], axis=2), rate_rad_s, force_m_s2)
 
 
-def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Motion:
+def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator) -> Motion:
     """Plan a flight: ground, climb, hover, aisle or square, hover, descent, ground.
 
     Raises
@@ -215,9 +215,9 @@ def plan(scenario: Scenario, mistakes: Mistakes, rng: np.random.Generator) -> Mo
         -climb_velocity_m_s, CLIMB_RAMP_S, CLIMB_RAMP_S / 2.0 + scenario.pause_s
     )
     if scenario.kind == "aisle":
-        _fly_aisle(flight_plan, scenario, 0.0 if mistakes.no_motion else scenario.speed_m_s)
+        _fly_aisle(flight_plan, scenario, 0.0 if faults.no_motion else scenario.speed_m_s)
     else:
-        _fly_loop(flight_plan, scenario, mistakes)
+        _fly_loop(flight_plan, scenario, faults)
     flight_plan.add_velocity_change(-climb_velocity_m_s, CLIMB_RAMP_S, climb_time_s)
     touch_down_s = flight_plan.ramp_centre_s + CLIMB_RAMP_S / 2.0
     if touch_down_s > MAX_FLIGHT_S:
@@ -249,13 +249,13 @@ class _FlightPlan:
         self.yaw_ramps = [(-1.0, 1.0, np.radians([heading_deg]))]
 
     def add_velocity_change(
-        self, velocity_change_m_s: Array, duration_s: float, until_next_s: float
+        self, velocity_change_m_s: Array, duration_s: float, time_to_next_s: float
     ) -> None:
-        """Add a velocity ramp; the next ramp's centre is ``until_next_s`` later."""
+        """Add a velocity ramp; the next ramp's centre is ``time_to_next_s`` later."""
         self.velocity_ramps.append(
             (self.ramp_centre_s - duration_s / 2.0, duration_s, velocity_change_m_s)
         )
-        self.ramp_centre_s += until_next_s
+        self.ramp_centre_s += time_to_next_s
 
     def add_turn(self, angle_rad: float, start_s: float, duration_s: float) -> None:
         self.yaw_ramps.append((start_s, duration_s, np.array([angle_rad])))
@@ -283,12 +283,12 @@ def _fly_aisle(flight_plan: _FlightPlan, scenario: Scenario, speed_m_s: float) -
             flight_plan.add_turn(np.pi, stop_s, TURN_ROUND_S)
 
 
-def _fly_loop(flight_plan: _FlightPlan, scenario: Scenario, mistakes: Mistakes) -> None:
-    speed_m_s = 0.0 if mistakes.no_motion else scenario.speed_m_s
-    last_side_m = scenario.length_m - mistakes.open_end_m
+def _fly_loop(flight_plan: _FlightPlan, scenario: Scenario, faults: FaultSizes) -> None:
+    speed_m_s = 0.0 if faults.no_motion else scenario.speed_m_s
+    last_side_m = scenario.length_m - faults.open_end_m
     if last_side_m < scenario.speed_m_s * CORNER_DURATION_S:
         raise SettingsError(
-            f"--mistake open-end={mistakes.open_end_m:g}: the last side is {last_side_m:g} m long. "
+            f"--mistake open-end={faults.open_end_m:g}: the last side is {last_side_m:g} m long. "
             f"Use at most {scenario.length_m - scenario.speed_m_s * CORNER_DURATION_S:g} m."
         )
     side_count = 4 * scenario.passes

@@ -15,7 +15,7 @@ from px4fuse.core.arrays import Array, ArrayPair, BoolArray
 from px4fuse.flight.ekf2_parameters import GNSS_POS, PARAMETERS
 from px4fuse.readers.px4_positions import unproject
 from px4fuse.readers.px4_topics import GPS_POSITION
-from px4fuse.simulation.mistakes import Mistakes
+from px4fuse.simulation.faults import FaultSizes
 from px4fuse.simulation.motion import Motion, Sines, attitude, direction
 from px4fuse.simulation.scenario import DT_S, Scenario
 from px4fuse.simulation.ulog_writer import Topic, topic
@@ -67,15 +67,15 @@ LAND_DETECTOR_INTERVAL_US = 1_000_000
 
 # Independent random number streams, one for each sensor and kind of error. A fault of one sensor
 # therefore does not change the noise of the others
-Stream = IntEnum(
-    "Stream",
+RandomStream = IntEnum(
+    "RandomStream",
     "WANDER BIAS IMU ATTITUDE TIMING SOURCE DRIFT NLOS VIBRATION HEIGHT REST SLOW FIX_VELOCITY "
     "FIELD BAROMETER",
     start=0,
 )
 
 
-def random_stream(scenario: Scenario, stream: Stream) -> np.random.Generator:
+def random_stream(scenario: Scenario, stream: RandomStream) -> np.random.Generator:
     return np.random.default_rng([scenario.seed, stream])
 
 
@@ -106,22 +106,24 @@ class SimulatedPositions:
     drift_m: Array
 
 
-def biases(scenario: Scenario, mistakes: Mistakes) -> tuple[Array, Array]:
+def biases(scenario: Scenario, faults: FaultSizes) -> tuple[Array, Array]:
     """Return accelerometer (m/s²) and gyro (rad/s) biases, body FRD, each of shape (3,)."""
-    rng = random_stream(scenario, Stream.BIAS)
+    rng = random_stream(scenario, RandomStream.BIAS)
     accelerometer_bias_m_s2 = rng.normal(0.0, scenario.accel_bias_sigma_m_s2, 3)
-    accelerometer_bias_m_s2[0] += mistakes.accel_bias_m_s2
+    accelerometer_bias_m_s2[0] += faults.accel_bias_m_s2
     return accelerometer_bias_m_s2, rng.normal(0.0, scenario.gyro_bias_sigma_rad_s, 3)
 
 
-def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
+def imu(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
     """Simulate sensor_combined (accelerometer and gyro) at the full rate, without gaps."""
     time_us = _grid_us(motion.duration_s, scenario.imu_rate_hz)
-    force_m_s2, rate_rad_s = measure_imu(scenario, mistakes, motion, seconds(time_us), Stream.IMU)
-    if mistakes.vibration_m_s2:
-        vibration_sigma_m_s2 = mistakes.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
+    force_m_s2, rate_rad_s = measure_imu(
+        scenario, faults, motion, seconds(time_us), RandomStream.IMU
+    )
+    if faults.vibration_m_s2:
+        vibration_sigma_m_s2 = faults.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
         force_m_s2 += vibration_sigma_m_s2 * random_stream(
-            scenario, Stream.VIBRATION
+            scenario, RandomStream.VIBRATION
         ).standard_normal(force_m_s2.shape)
     interval_us = round(1e6 / scenario.imu_rate_hz)
     integral_fields = dict.fromkeys(("gyro_integral_dt", "accelerometer_integral_dt"), interval_us)
@@ -133,20 +135,18 @@ def imu(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
     return topic("sensor_combined", sample_fields | integral_fields)
 
 
-def magnetometer(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
+def magnetometer(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
     time_us = _grid_us(motion.duration_s, MAGNETOMETER_RATE_HZ)
     body_to_ned = attitude(motion.at(seconds(time_us))).body_to_ned
     # The measured field is rotated, which causes EKF2's heading error outdoors
-    if mistakes.heading_deg:
-        body_to_ned = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix() @ body_to_ned
+    if faults.heading_deg:
+        body_to_ned = attitude_error(scenario, faults, seconds(time_us)).as_matrix() @ body_to_ned
     field_gauss = np.einsum("nji,j->ni", body_to_ned, EARTH_FIELD_GAUSS)
-    field_gauss += SIGMA_MAGNETOMETER_GAUSS * random_stream(scenario, Stream.FIELD).standard_normal(
-        field_gauss.shape
-    )
-    disturbance_start_s = (
-        motion.duration_s / 2.0 if mistakes.mag_at_s is None else mistakes.mag_at_s
-    )
-    field_gauss[seconds(time_us) >= disturbance_start_s, 1] += mistakes.mag_gauss
+    field_gauss += SIGMA_MAGNETOMETER_GAUSS * random_stream(
+        scenario, RandomStream.FIELD
+    ).standard_normal(field_gauss.shape)
+    disturbance_start_s = motion.duration_s / 2.0 if faults.mag_at_s is None else faults.mag_at_s
+    field_gauss[seconds(time_us) >= disturbance_start_s, 1] += faults.mag_gauss
     return topic("vehicle_magnetometer", timestamps(time_us) | {"magnetometer_ga": field_gauss})
 
 
@@ -154,14 +154,14 @@ def barometer(scenario: Scenario, motion: Motion) -> Topic:
     time_us = _grid_us(motion.duration_s, BAROMETER_RATE_HZ)
     height_m = HOME_POSITION[2] - motion.at(seconds(time_us)).position_m[:, 2]
     height_m -= height_error(scenario, seconds(time_us))
-    unit_noise = random_stream(scenario, Stream.BAROMETER).standard_normal(len(time_us))
+    unit_noise = random_stream(scenario, RandomStream.BAROMETER).standard_normal(len(time_us))
     height_m += SIGMA_BAROMETER_M * unit_noise
     return topic("vehicle_air_data", timestamps(time_us) | {"baro_alt_meter": height_m})
 
 
 def height_error(scenario: Scenario, time_s: Array) -> Array:
     """Simulate the slow height error (m, positive downward)."""
-    rng, rms = random_stream(scenario, Stream.HEIGHT), np.array([HEIGHT_ERROR_M])
+    rng, rms = random_stream(scenario, RandomStream.HEIGHT), np.array([HEIGHT_ERROR_M])
     return Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S).at(time_s)[0][:, 0]
 
 
@@ -172,11 +172,14 @@ def limit_rate(full_topic: Topic, rate_hz: float, is_kept: BoolArray | bool = Tr
     return Topic(full_topic.name, logged_fields)
 
 
-def logged_imu(full_topic: Topic, mistakes: Mistakes, motion: Motion) -> Topic:
-    """Return sensor_combined as logged, with the gap and the reduced rate of ``mistakes``."""
-    times_s, gap = seconds(time_us(full_topic)), (mistakes.imu_dropout_s, mistakes.imu_dropout_at_s)
-    is_outside_gap = _is_outside_gap(times_s, *gap, motion.duration_s)
-    return limit_rate(full_topic, mistakes.imu_rate_hz, is_outside_gap)
+def logged_imu(full_topic: Topic, faults: FaultSizes, motion: Motion) -> Topic:
+    """Return sensor_combined as logged, with the gap and the reduced rate of ``faults``."""
+    times_s, gap_values = (
+        seconds(time_us(full_topic)),
+        (faults.imu_dropout_s, faults.imu_dropout_at_s),
+    )
+    is_outside_gap = _is_outside_gap(times_s, *gap_values, motion.duration_s)
+    return limit_rate(full_topic, faults.imu_rate_hz, is_outside_gap)
 
 
 def time_us(topic: Topic, field: str = "timestamp") -> NDArray[np.int64]:
@@ -186,32 +189,32 @@ def time_us(topic: Topic, field: str = "timestamp") -> NDArray[np.int64]:
 
 def measure_imu(
     scenario: Scenario,
-    mistakes: Mistakes,
+    faults: FaultSizes,
     motion: Motion,
     time_s: Array,
-    stream: Stream,
+    stream: RandomStream,
     mean_count: float = 1.0,
 ) -> ArrayPair:
     """Simulate specific force (m/s²) and angular rate (rad/s), mean of ``mean_count`` samples."""
     truth = attitude(motion.at(time_s))
-    rng, measured = random_stream(scenario, stream), []
+    rng, measurements = random_stream(scenario, stream), []
     for true_value, bias, sigma in zip(
         (truth.specific_force_m_s2, truth.angular_rate_rad_s),
-        biases(scenario, mistakes),
+        biases(scenario, faults),
         (scenario.accelerometer_noise_m_s2, scenario.gyro_noise_rad_s),
         strict=True,
     ):
         noise = 1.0 / np.sqrt(mean_count) * sigma * rng.standard_normal(true_value.shape)
-        measured.append(true_value + bias + noise)
-    force_m_s2, rate_rad_s = measured
+        measurements.append(true_value + bias + noise)
+    force_m_s2, rate_rad_s = measurements
     return force_m_s2, rate_rad_s
 
 
-def logged_attitude(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Topic:
+def logged_attitude(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
     """Simulate vehicle_attitude without the EKF2 model: true attitude with a slow error."""
     time_us = _grid_us(motion.duration_s, scenario.attitude_rate_hz)
     true_rotation = attitude(motion.at(seconds(time_us))).body_to_ned
-    error_rotation = attitude_error(scenario, mistakes, seconds(time_us)).as_matrix()
+    error_rotation = attitude_error(scenario, faults, seconds(time_us)).as_matrix()
     logged_quaternions = quaternions(error_rotation @ true_rotation)
     return attitude_topic("vehicle_attitude", time_us, ATTITUDE_LATENCY_US, logged_quaternions)
 
@@ -233,17 +236,17 @@ def attitude_topic(
     return topic(name, timestamps(time_us, delay_us) | {"q": quaternion})
 
 
-def attitude_error(scenario: Scenario, mistakes: Mistakes, time_s: Array) -> Rotation:
+def attitude_error(scenario: Scenario, faults: FaultSizes, time_s: Array) -> Rotation:
     """Simulate the error of the logged attitude, a rotation in NED."""
     tilt_rms_deg = scenario.tilt_error_deg
     rms_rad = np.radians([tilt_rms_deg, tilt_rms_deg, scenario.yaw_error_deg])
-    rng = random_stream(scenario, Stream.ATTITUDE)
+    rng = random_stream(scenario, RandomStream.ATTITUDE)
     error_rad = Sines.draw(rng, rms_rad, SLOW_ERROR_PERIODS_S).at(time_s)[0]
-    if mistakes.heading_deg:
-        heading_error_rad = np.radians(mistakes.heading_deg)
-        if mistakes.heading_at_s is not None:
+    if faults.heading_deg:
+        heading_error_rad = np.radians(faults.heading_deg)
+        if faults.heading_at_s is not None:
             heading_error_rad *= -np.expm1(
-                -np.maximum(time_s - mistakes.heading_at_s, 0.0) / HEADING_TIME_CONSTANT_S
+                -np.maximum(time_s - faults.heading_at_s, 0.0) / HEADING_TIME_CONSTANT_S
             )
         error_rad[:, 2] += heading_error_rad
     return Rotation.from_rotvec(error_rad)
@@ -272,9 +275,9 @@ def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
     return topic("vehicle_local_position_groundtruth", fields)
 
 
-def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> SimulatedPositions:
+def positions(scenario: Scenario, faults: FaultSizes, motion: Motion) -> SimulatedPositions:
     """Simulate UWB (aisle), VIO (loop) or GNSS (outdoor) positions with injected faults."""
-    timing_rng = random_stream(scenario, Stream.TIMING)
+    timing_rng = random_stream(scenario, RandomStream.TIMING)
     interval_s = 1.0 / scenario.source_rate_hz
     position_count = int((motion.duration_s - FIRST_POSITION_S) / interval_s)
     nominal_s = FIRST_POSITION_S + interval_s * np.arange(position_count)
@@ -291,28 +294,30 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
     position_m += drift_m
     is_outdoor = scenario.kind == "outdoor"
     sigma_m = scenario.source_sigma_m * (GNSS_SIGMA_FACTORS if is_outdoor else 1.0)
-    position_m += sigma_m * random_stream(scenario, Stream.SOURCE).standard_normal(position_m.shape)
+    position_m += sigma_m * random_stream(scenario, RandomStream.SOURCE).standard_normal(
+        position_m.shape
+    )
     is_airborne = (time_s > motion.take_off_s) & (time_s < motion.touch_down_s)
-    outlier_offset_m, is_outlier = outliers(scenario, mistakes, is_airborne)
+    outlier_offset_m, is_outlier = outliers(scenario, faults, is_airborne)
     position_m += outlier_offset_m
-    if mistakes.slow_error_m:
-        position_m += slow_error(scenario, mistakes, len(time_s), interval_s)
-    if mistakes.smoothed_s:
-        position_m = _low_pass(position_m, interval_s, mistakes.smoothed_s)
-    position_m *= 1.0 + mistakes.scale_percent / 100.0
-    if mistakes.yaw_deg:
-        position_m = Rotation.from_euler("z", mistakes.yaw_deg, degrees=True).apply(position_m)
-    if mistakes.jump_m:
-        jump_start_s = motion.duration_s / 1.5 if mistakes.jump_at_s is None else mistakes.jump_at_s
-        position_m[time_s >= jump_start_s] += mistakes.jump_m * direction(scenario.heading_deg)
+    if faults.slow_error_m:
+        position_m += slow_error(scenario, faults, len(time_s), interval_s)
+    if faults.smoothed_s:
+        position_m = _low_pass(position_m, interval_s, faults.smoothed_s)
+    position_m *= 1.0 + faults.scale_percent / 100.0
+    if faults.yaw_deg:
+        position_m = Rotation.from_euler("z", faults.yaw_deg, degrees=True).apply(position_m)
+    if faults.jump_m:
+        jump_start_s = motion.duration_s / 1.5 if faults.jump_at_s is None else faults.jump_at_s
+        position_m[time_s >= jump_start_s] += faults.jump_m * direction(scenario.heading_deg)
     is_logged = _is_outside_gap(
-        time_s, mistakes.dropout_s, mistakes.dropout_at_s, motion.duration_s
-    ) & keep_at_rate(time_s, mistakes.decimate_hz)
-    arrival_us, timestamp_us = _source_times_us(mistakes, time_s, timing_rng)
-    reported_sigma = reported_sigma_m(scenario, mistakes)
+        time_s, faults.dropout_s, faults.dropout_at_s, motion.duration_s
+    ) & keep_at_rate(time_s, faults.decimate_hz)
+    arrival_us, timestamp_us = _source_times_us(faults, time_s, timing_rng)
+    reported_sigma = reported_sigma_m(scenario, faults)
     velocity_m_s = None
     if is_outdoor:
-        velocity_noise = random_stream(scenario, Stream.FIX_VELOCITY).standard_normal(
+        velocity_noise = random_stream(scenario, RandomStream.FIX_VELOCITY).standard_normal(
             position_m.shape
         )
         velocity_m_s = (
@@ -346,28 +351,28 @@ def positions(scenario: Scenario, mistakes: Mistakes, motion: Motion) -> Simulat
     )
 
 
-def reported_sigma_m(scenario: Scenario, mistakes: Mistakes) -> float:
+def reported_sigma_m(scenario: Scenario, faults: FaultSizes) -> float:
     """Return the σ (m) that the source reports."""
     # EKF2.cpp uses at least 0.01 m
-    return max(scenario.source_sigma_m, 0.01) * float(np.sqrt(mistakes.r_scale))
+    return max(scenario.source_sigma_m, 0.01) * float(np.sqrt(faults.r_scale))
 
 
 def slow_error(
-    scenario: Scenario, mistakes: Mistakes, sample_count: int, interval_s: float
+    scenario: Scenario, faults: FaultSizes, sample_count: int, interval_s: float
 ) -> Array:
     """Simulate time-correlated noise (m), shape (n, 3): a first-order Gauss-Markov process."""
     noise_m = (
-        random_stream(scenario, Stream.SLOW).standard_normal((sample_count, 3))
-        * mistakes.slow_error_m
+        random_stream(scenario, RandomStream.SLOW).standard_normal((sample_count, 3))
+        * faults.slow_error_m
     )
-    decay_factor = np.exp(-interval_s / mistakes.slow_error_s)
+    decay_factor = np.exp(-interval_s / faults.slow_error_s)
     noise_m[1:] *= np.sqrt(1.0 - decay_factor**2)
     return np.asarray(lfilter([1.0], [1.0, -decay_factor], noise_m, axis=0))
 
 
 def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
     """Simulate the VIO drift (m, NED), shape (n, 3): proportional to distance, and random walk."""
-    rng = random_stream(scenario, Stream.DRIFT)
+    rng = random_stream(scenario, RandomStream.DRIFT)
     drift_per_metre = scenario.vio_drift * direction(rng.uniform(0.0, 360.0))
     step_sigmas = np.sqrt(np.diff(distance_m, prepend=0.0))[:, None]
     random_walk = np.cumsum(step_sigmas * rng.standard_normal((len(distance_m), 3)), axis=0)
@@ -375,20 +380,20 @@ def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
 
 
 def outliers(
-    scenario: Scenario, mistakes: Mistakes, is_airborne: BoolArray
+    scenario: Scenario, faults: FaultSizes, is_airborne: BoolArray
 ) -> tuple[Array, BoolArray]:
     """Simulate outliers; return the errors (m, NED), shape (n, 3), and a mask of the outliers.
 
     Outliers occur in bursts in one horizontal direction, as from an anchor without line of sight.
     The sizes are 0.5 to 1.5 times ``nlos_size_m``.
     """
-    offset_m = np.zeros((len(is_airborne), 3))
+    outlier_error_m = np.zeros((len(is_airborne), 3))
     is_outlier = np.zeros(len(is_airborne), np.bool_)
     airborne_indices = np.flatnonzero(is_airborne)
-    outlier_count = round(len(airborne_indices) * mistakes.nlos_percent / 100.0)
+    outlier_count = round(len(airborne_indices) * faults.nlos_percent / 100.0)
     if outlier_count == 0:
-        return offset_m, is_outlier
-    rng = random_stream(scenario, Stream.NLOS)
+        return outlier_error_m, is_outlier
+    rng = random_stream(scenario, RandomStream.NLOS)
     burst_count = -(-outlier_count // MEAN_OUTLIER_BURST_LENGTH)
     burst_lengths = 1 + rng.multinomial(
         outlier_count - burst_count, np.full(burst_count, 1.0 / burst_count)
@@ -402,11 +407,11 @@ def outliers(
         np.arange(outlier_count) + np.cumsum(gap_lengths)[burst_index]
     ]
     angle_rad = rng.uniform(0.0, 2.0 * np.pi, burst_count)[burst_index]
-    size_m = mistakes.nlos_size_m * rng.uniform(0.5, 1.5, outlier_count)
-    offset_m[outlier_indices, 0] = size_m * np.cos(angle_rad)
-    offset_m[outlier_indices, 1] = size_m * np.sin(angle_rad)
+    size_m = faults.nlos_size_m * rng.uniform(0.5, 1.5, outlier_count)
+    outlier_error_m[outlier_indices, 0] = size_m * np.cos(angle_rad)
+    outlier_error_m[outlier_indices, 1] = size_m * np.sin(angle_rad)
     is_outlier[outlier_indices] = True
-    return offset_m, is_outlier
+    return outlier_error_m, is_outlier
 
 
 def keep_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
@@ -418,17 +423,17 @@ def keep_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
 
 
 def _source_times_us(
-    mistakes: Mistakes, time_s: Array, rng: np.random.Generator
+    faults: FaultSizes, time_s: Array, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Simulate arrival time and timestamp of each position (µs from the first data)."""
-    mean_latency_s = mistakes.clock_jump_s or POSITION_LATENCY_S
+    mean_latency_s = faults.clock_jump_s or POSITION_LATENCY_S
     latency_s = np.maximum(
         rng.normal(mean_latency_s, POSITION_LATENCY_SIGMA_S, len(time_s)), MIN_LATENCY_S
     )
     arrival_us = np.maximum.accumulate(np.rint((time_s + latency_s) * 1e6).astype(np.int64))
-    offset_s = mistakes.clock_offset_s + mistakes.clock_drift_ppm * 1e-6 * time_s
+    offset_s = faults.clock_offset_s + faults.clock_drift_ppm * 1e-6 * time_s
     timestamp_us = np.rint((time_s + offset_s) * 1e6).astype(np.int64)
-    if mistakes.clock_jump_s:
+    if faults.clock_jump_s:
         timestamp_us = np.where(time_s < TIMESYNC_CONVERGED_S, arrival_us, timestamp_us)
     return arrival_us, timestamp_us
 

@@ -5,8 +5,8 @@ from pathlib import Path
 from px4fuse.core.text import count_noun
 from px4fuse.errors import to_one_line
 from px4fuse.report.page import Page
+from px4fuse.simulation.faults import FAULT_TYPES, format_fault, injected_fault_names
 from px4fuse.simulation.flights import Simulation
-from px4fuse.simulation.mistakes import MISTAKES, active_mistake_names, format_mistake
 
 SOURCE_BY_KIND = {"aisle": "UWB", "loop": "VIO", "outdoor": "GNSS"}
 
@@ -28,11 +28,11 @@ def summary(simulation: Simulation, answer: Path | None) -> Page:
         texts["VIO drift"] = f"{scenario.vio_drift:.1%} of the distance flown"
     texts["IMU"] = f"{scenario.imu_rate_hz:g} Hz, SIGMA_A {scenario.sigma_a_m_s2:g} m/s²"
     page.write_labelled_texts(texts)
-    mistake_texts = [
-        f"{format_mistake(name, simulation.mistakes)}: {MISTAKES[name].help}"
-        for name in active_mistake_names(simulation.mistakes)
+    fault_texts = [
+        f"{format_fault(name, simulation.faults)}: {FAULT_TYPES[name].help}"
+        for name in injected_fault_names(simulation.faults)
     ]
-    page.write_labelled("Faults", *(mistake_texts or ["none"]))
+    page.write_labelled("Faults", *(fault_texts or ["none"]))
     texts = {
         "Truth": "logged" if scenario.truth else "not logged",
         "EKF2": "EKF2 data are from px4fuse's model of EKF2"

@@ -77,8 +77,8 @@ def encode(
         struct.pack("<Q", start_us),
         _message("B", _FLAG_BITS_MESSAGE),
     ]
-    formats = dict.fromkeys(_format_text(topic) for topic in topics)
-    content += [_message("F", format_text.encode()) for format_text in formats]
+    format_texts = dict.fromkeys(_format_text(topic) for topic in topics)
+    content += [_message("F", format_text.encode()) for format_text in format_texts]
     for name, info_value in info.items():
         if isinstance(info_value, str):
             info_bytes = info_value.encode()
@@ -106,12 +106,12 @@ def encode(
     return b"".join(content)
 
 
-def _message(kind: str, content: bytes) -> bytes:
-    return struct.pack("<HB", len(content), ord(kind)) + content
+def _message(message_type: str, content: bytes) -> bytes:
+    return struct.pack("<HB", len(content), ord(message_type)) + content
 
 
-def _keyed_message(kind: str, key: str, value: bytes) -> bytes:
-    return _message(kind, bytes([len(key)]) + key.encode() + value)
+def _keyed_message(message_type: str, key: str, value: bytes) -> bytes:
+    return _message(message_type, bytes([len(key)]) + key.encode() + value)
 
 
 def _format_text(topic: Topic) -> str:
@@ -130,7 +130,9 @@ def _data_messages(topic: Topic, topic_id: int) -> list[bytes]:
         for name, values in topic.fields.items()
     ]
     # the underscore avoids conflicts of header names with PX4 fields
-    dtype = np.dtype([(f"_{name}", kind) for name, kind in header_fields] + topic_fields)
+    dtype = np.dtype(
+        [(f"_{name}", message_type) for name, message_type in header_fields] + topic_fields
+    )
     records = np.zeros(len(topic.fields["timestamp"]), dtype)
     records["_size"] = dtype.itemsize - 3  # the size excludes 3 bytes: size and message type
     records["_kind"] = ord("D")

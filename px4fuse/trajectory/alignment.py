@@ -17,9 +17,9 @@ from px4fuse.trajectory.model import MIN_POSES
 
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 
-# Minimum extent of a path from which a rotation can be estimated, as fraction of its largest extent
+# Minimum extent of a path for an estimate of the rotation, as fraction of its largest extent
 MIN_EXTENT_FRACTION = 1e-6
-# Minimum extent (m, RMS) of a path from which a rotation can be estimated
+# Minimum extent (m, RMS) of a path for an estimate of the rotation
 MIN_EXTENT_M = 1e-6
 # Maximum ratio of residual to horizontal motion for an estimate of yaw: two independent noise
 # tracks of equal variance have the ratio √2
@@ -49,19 +49,18 @@ class Transform(Record):
     scale: float
     degrees_of_freedom: Count
 
-    @property
-    def rotation(self) -> Rotation:
-        """Rotation R from the frame of the estimate to the frame of the reference."""
+    def to_rotation(self) -> Rotation:
+        """Return the rotation R from the frame of the estimate to the frame of the reference."""
         return Rotation.from_quat(self.quaternion_wxyz, scalar_first=True)
 
     def apply(self, position_m: Array) -> Array:
         """Transform positions to the frame of the reference, shape (n, 3) or (3,)."""
-        rotated: Array = self.rotation.apply(self.scale * position_m)
+        rotated: Array = self.to_rotation().apply(self.scale * position_m)
         return rotated + self.translation_m
 
     def apply_inverse(self, position_m: Array) -> Array:
         """Transform positions to the frame of the estimate, shape (n, 3) or (3,)."""
-        shifted: Array = self.rotation.inv().apply(position_m - np.array(self.translation_m))
+        shifted: Array = self.to_rotation().inv().apply(position_m - np.array(self.translation_m))
         return shifted / self.scale
 
 
@@ -99,7 +98,7 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
         centred_estimate_m = estimate_xy_m - estimate_xy_m.mean()
         yaw_rad = np.angle(np.vdot(centred_estimate_m, reference_xy_m - reference_xy_m.mean()))
         transform = _align_means(Rotation.from_euler("z", yaw_rad), estimate_m, reference_m, 1.0, 4)
-    _require_determined(transform, estimate_m, reference_m, kind)
+    _require_sufficient_motion(transform, estimate_m, reference_m, kind)
     return umeyama(estimate_m, reference_m, with_scale=False) if kind == "se3" else transform
 
 
@@ -129,7 +128,7 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
 def _align_means(
     rotation: Rotation, estimate_m: Array, reference_m: Array, scale: float, degrees_of_freedom: int
 ) -> Transform:
-    """Return the transform with ``rotation`` and ``scale`` that aligns the means (eq. 41)."""
+    """Return the transform that also aligns the means of both trajectories (Umeyama eq. 41)."""
     translation_m = reference_m.mean(axis=0) - scale * rotation.apply(estimate_m.mean(axis=0))
     quaternion = tuple(rotation.as_quat(scalar_first=True).tolist())
     return Transform(quaternion, tuple(translation_m.tolist()), scale, degrees_of_freedom)
@@ -146,7 +145,7 @@ def rms_m(difference_m: Array) -> float:
     return float(np.sqrt((difference_m * difference_m).sum(axis=1).mean()))
 
 
-def _require_determined(
+def _require_sufficient_motion(
     transform: Transform, estimate_m: Array, reference_m: Array, kind: str
 ) -> None:
     """Raise TrajectoryError if the motion is too small to estimate the rotation."""

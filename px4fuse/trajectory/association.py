@@ -11,7 +11,7 @@ from px4fuse.core.record import Count, NotNegative, Record
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
-Method = Literal["interpolate", "nearest"]
+AssociationMethod = Literal["interpolate", "nearest"]
 
 # Default maximum gap in the reference over which poses are interpolated, in median intervals
 MAX_GAP_INTERVALS = 3.0
@@ -40,7 +40,7 @@ class Association(Record):
         Fraction of the reference's time span that the used poses cover without long gaps.
     """
 
-    method: Method
+    method: AssociationMethod
     poses: Count
     max_gap_s: NotNegative
     outside: Count
@@ -53,7 +53,7 @@ def associate(
     estimate: Trajectory,
     reference: Trajectory,
     *,
-    method: Method = "interpolate",
+    method: AssociationMethod = "interpolate",
     max_gap_s: float | None = None,
     time_offset_s: float = 0.0,
 ) -> tuple[Trajectory, Trajectory, Association]:
@@ -83,16 +83,14 @@ def associate(
     time_s = estimate.time_s + time_offset_s
     reference_start_s, reference_end_s = reference.time_s[[0, -1]]
     if method == "nearest":
-        gap_limit_s = reference_end_tolerance_s = (
-            MAX_NEAREST_DIFFERENCE_S if max_gap_s is None else max_gap_s
-        )
+        gap_limit_s = end_tolerance_s = MAX_NEAREST_DIFFERENCE_S if max_gap_s is None else max_gap_s
         pose_indices, reference_indices = _pair_nearest(
             estimate.time_s, reference.time_s, gap_limit_s, time_offset_s
         )
         matched_reference = reference[reference_indices]
     else:
         gap_limit_s = gap_limit(reference.time_s) if max_gap_s is None else max_gap_s
-        reference_end_tolerance_s = 0.0
+        end_tolerance_s = 0.0
         pose_indices = np.flatnonzero(is_bracketed(time_s, reference.time_s, gap_limit_s))
         matched_reference = _interpolate_poses(reference, time_s[pose_indices])
     if len(pose_indices) < MIN_POSES:
@@ -104,12 +102,12 @@ def associate(
             "Check that both trajectories are of the same flight. If clocks differ, give "
             "`time_offset_s` auto.",
         )
-    is_outside = (time_s < reference_start_s - reference_end_tolerance_s) | (
-        time_s > reference_end_s + reference_end_tolerance_s
+    is_outside = (time_s < reference_start_s - end_tolerance_s) | (
+        time_s > reference_end_s + end_tolerance_s
     )
     outside_count = int(is_outside.sum())
-    used_steps_s = np.diff(time_s[pose_indices])
-    used_steps_s = used_steps_s[used_steps_s <= max(5.0 * estimate_interval_s, 0.5)]
+    used_intervals_s = np.diff(time_s[pose_indices])
+    used_intervals_s = used_intervals_s[used_intervals_s <= max(5.0 * estimate_interval_s, 0.5)]
     used_count, pose_count = len(np.unique(pose_indices)), len(estimate)
     association = Association(
         method=method,
@@ -119,7 +117,7 @@ def associate(
         in_gaps=pose_count - outside_count - used_count,
         coverage_estimate=used_count / pose_count,
         coverage_reference=min(
-            float(used_steps_s.sum() / (reference_end_s - reference_start_s)), 1.0
+            float(used_intervals_s.sum() / (reference_end_s - reference_start_s)), 1.0
         ),
     )
     return estimate[pose_indices], matched_reference, association

@@ -74,10 +74,10 @@ def _correlate(a: Array | Complex, b: Array | Complex) -> Complex:
 
     The result equals that of ``scipy.signal.correlate``, whose import takes 0.3 s.
     """
-    size = len(a) + len(b) - 1
+    lag_count = len(a) + len(b) - 1
     is_complex = np.iscomplexobj(a) or np.iscomplexobj(b)
     transform: Any = fft.fft if is_complex else fft.rfft
     inverse: Any = fft.ifft if is_complex else fft.irfft
-    padded_size = fft.next_fast_len(size, not is_complex)
+    padded_size = fft.next_fast_len(lag_count, not is_complex)
     spectrum = transform(a, padded_size) * transform(np.conj(b[::-1]), padded_size)
-    return np.asarray(inverse(spectrum, padded_size)[:size])
+    return np.asarray(inverse(spectrum, padded_size)[:lag_count])

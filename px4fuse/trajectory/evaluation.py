@@ -21,24 +21,24 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory import scores
 from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit_alignment, umeyama
-from px4fuse.trajectory.association import Association, Method, associate
+from px4fuse.trajectory.association import Association, AssociationMethod, associate
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, cumulative_distance
-from px4fuse.trajectory.scores import Delta, Interval, RelativeError, Statistics
+from px4fuse.trajectory.scores import Delta, RelativeError, RmseInterval, Statistics
 from px4fuse.trajectory.time_offset import TimeOffset, clock_difference, estimate_time_offset
 
-# Maximum rotation (rad) relative to the first pose of an orientation that counts as constant: files
-# contain rounded digits
+# Maximum rotation (rad) from the first orientation of a trajectory with constant orientation: files
+# contain rounded numbers
 MAX_CONSTANT_ROTATION_RAD = 1e-6
-# Minimum number of poses and minimum motion (m) of a trajectory for removing a constant orientation
+# Minimum number of poses and minimum motion (m) for the conclusion that a constant orientation was
+# not measured
 MIN_CONSTANT_POSES, MIN_CONSTANT_MOTION_M = 10, 1.0
 # Minimum duration (s) of a repeated position for a warning, and minimum motion (m) of the reference
-# in this time
-MIN_FROZEN_S, MIN_FROZEN_MOTION_M = 2.0, 0.5
-# Minimum difference (m) of the step lengths of estimate and reference at a jump, and minimum ratio
-# of this difference to its median
+# during the repetition
+MIN_FROZEN_DURATION_S, MIN_FROZEN_MOTION_M = 2.0, 0.5
+# Minimum difference (m) between the steps of estimate and reference at a jump, and minimum ratio to
+# the median difference
 MIN_JUMP_M, MIN_JUMP_RATIO = 0.5, 20.0
-# Maximum distance (m) of the position after a jump from the first position or from the origin, for
-# attributing the jump to a restart of the map
+# Maximum distance (m) from the first position or the origin after a jump that is a map restart
 MAX_RESTART_DISTANCE_M = 0.5
 # Maximum number of jump times in the warning about jumps
 MAX_STATED_JUMPS = 5
@@ -52,7 +52,7 @@ LEVER_ARM_ITERATIONS = 5
 
 
 def drop_constant_orientation(trajectory: Trajectory) -> tuple[Trajectory, tuple[str, ...]]:
-    """Remove a constant orientation of a moving trajectory as not measured; also return a note."""
+    """Remove the orientation if it is constant, because it was not measured; also return a note."""
     rotation, extent_m = trajectory.rotation, np.ptp(trajectory.position_m, axis=0).max()
     if (
         rotation is None
@@ -76,7 +76,7 @@ def find_frozen_poses(
         [*np.flatnonzero(is_new_position).tolist(), len(estimate)]
     ):
         start_s, end_s = estimate.time_s[[start_index, end_index - 1]].tolist()
-        if end_s - start_s < MIN_FROZEN_S:
+        if end_s - start_s < MIN_FROZEN_DURATION_S:
             continue
         reference_position_m = reference.between(
             start_s + time_offset_s, end_s + time_offset_s
@@ -126,7 +126,7 @@ def find_jumps(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
 
 
 def has_other_body_axes(aligned_estimate: Trajectory, reference: Trajectory) -> bool:
-    """Return True if the orientations are of different body axes, such as those of a camera."""
+    """Return True if a constant rotation separates the body axes, as between camera and vehicle."""
     if aligned_estimate.rotation is None or reference.rotation is None:
         return False
     rotation_difference = aligned_estimate.rotation.inv() * reference.rotation
@@ -148,7 +148,7 @@ MIN_COVERAGE = 0.5
 MIN_DOUBTFUL_OFFSET_S = 0.1
 # Maximum ratio of the pose interval of the reference to that of the estimate; above it, the user
 # probably interchanged reference and estimate
-MAX_INTERVAL_RATIO = 5.0
+MAX_POSE_INTERVAL_RATIO = 5.0
 
 # Frames with the z axis down
 _Z_DOWN_FRAMES = ("NED", "FRD")
@@ -164,7 +164,7 @@ class AbsoluteError(Record):
     """ATE of position (m), with the 95 % interval of its RMSE, and of orientation (degrees)."""
 
     translation_m: Statistics
-    interval_m: OrUnavailable[Interval]
+    interval_m: OrUnavailable[RmseInterval]
     rotation_deg: OrUnavailable[Statistics]
 
 
@@ -220,7 +220,7 @@ def evaluate(
     reference: Trajectory,
     *,
     alignment: AlignmentKind | None = None,
-    association: Method = "interpolate",
+    association: AssociationMethod = "interpolate",
     max_gap_s: float | None = None,
     time_offset_s: float | Literal["auto"] | None = None,
     rpe_deltas: Sequence[Delta] | None = None,
@@ -265,14 +265,13 @@ def evaluate(
     alignment_reason, is_requested = "The user chose the alignment.", alignment is not None
     if alignment is None:
         alignment, alignment_reason = choose_alignment(matched_estimate, matched_reference)
-    transform, line_warnings = _fit_or_approximate(
+    transform, line_motion_warnings = _fit_or_approximate(
         matched_estimate, matched_reference, alignment, is_requested=is_requested
     )
     jump_warnings = find_jumps(matched_estimate, matched_reference)
-    aligned_estimate = matched_estimate.with_positions(
-        transform.apply(matched_estimate.position_m), transform.rotation
+    aligned_estimate, notes = _with_reference_body_axes(
+        _apply(transform, matched_estimate), matched_reference
     )
-    aligned_estimate, notes = _with_reference_body_axes(aligned_estimate, matched_reference)
     if not notes and has_other_body_axes(aligned_estimate, matched_reference):
         matched_estimate, notes = _move_to_reference_body(
             matched_estimate, matched_reference, alignment
@@ -280,9 +279,7 @@ def evaluate(
         transform = fit_alignment(
             matched_estimate.position_m, matched_reference.position_m, alignment
         )
-        aligned_estimate = matched_estimate.with_positions(
-            transform.apply(matched_estimate.position_m), transform.rotation
-        )
+        aligned_estimate = _apply(transform, matched_estimate)
     distance_m = cumulative_distance(matched_reference.position_m)
     position_error_m = np.linalg.norm(
         aligned_estimate.position_m - matched_reference.position_m, axis=1
@@ -319,7 +316,7 @@ def evaluate(
         warnings=(
             *frozen_warnings,
             *jump_warnings,
-            *line_warnings,
+            *line_motion_warnings,
             *_swap_warnings(estimate, reference),
             *offset_warnings,
             *_comparison_warnings(
@@ -333,6 +330,10 @@ def evaluate(
     )
 
 
+def _apply(transform: Transform, estimate: Trajectory) -> Trajectory:
+    return estimate.with_positions(transform.apply(estimate.position_m), transform.to_rotation())
+
+
 def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[AlignmentKind, str]:
     """Choose the alignment by the kinds of the trajectories; also return the reason, a sentence.
 
@@ -343,7 +344,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     has_same_frame = estimate.frame == reference.frame != "unknown"
     if estimate.kind == "truth" and (has_same_frame or reference.kind == "truth"):
         return "none", "The estimate is not aligned, because the estimate is ground truth."
-    frames = f"{estimate.frame} and {reference.frame}"
+    frames_text = f"{estimate.frame} and {reference.frame}"
     is_upright = any(
         {estimate.frame, reference.frame} <= set(vertical_frames)
         for vertical_frames in (_Z_DOWN_FRAMES, _Z_UP_FRAMES)
@@ -351,7 +352,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     if is_upright and estimate.kind not in _KINDS_WITHOUT_VERTICAL:
         return "yaw", (
             "Yaw and position are aligned (4 degrees of freedom): z is vertical in both frames "
-            f"({frames}), so a tilt is an error."
+            f"({frames_text}), so a tilt is an error."
         )
     scale, scale_reason = 1.0, ""
     try:
@@ -360,7 +361,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
         if is_upright:
             return "yaw", (
                 "Yaw and position are aligned (4 degrees of freedom): the motion is along a line, "
-                f"and z is vertical in both frames ({frames})."
+                f"and z is vertical in both frames ({frames_text})."
             )
     if abs(scale - 1.0) > MAX_SCALE_ERROR:
         scale_reason = (
@@ -371,10 +372,12 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
             scale_reason = f"{track.name} is monocular according to the file name"
     for track in (estimate, reference):
         if track.kind in _KINDS_WITHOUT_VERTICAL:
-            cause = "the trajectory kind is unknown"
+            frame_cause = "the trajectory kind is unknown"
             if track.kind == "slam":
-                cause = "SLAM uses the frame of the first key frame"
-            frame_reason = f"the vertical direction of {track.name} is unknown, because {cause}"
+                frame_cause = "SLAM uses the frame of the first key frame"
+            frame_reason = (
+                f"the vertical direction of {track.name} is unknown, because {frame_cause}"
+            )
             if scale_reason:
                 return "sim3", (
                     "Rotation, position and scale are aligned (7 degrees of freedom): "
@@ -382,7 +385,7 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
                 )
             break
     else:
-        frame_reason = f"the frames {frames} have no common vertical direction"
+        frame_reason = f"the frames {frames_text} have no common vertical direction"
     return "se3", f"Rotation and position are aligned (6 degrees of freedom): {frame_reason}."
 
 
@@ -438,7 +441,7 @@ def _swap_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]
     action = "Check the order of the arguments: first the estimate, then the reference."
     if estimate.kind == "truth" != reference.kind:
         yield f"{estimate.name} is ground truth, but {reference.name} is not. {action}"
-    if reference_interval_s > MAX_INTERVAL_RATIO * estimate_interval_s:
+    if reference_interval_s > MAX_POSE_INTERVAL_RATIO * estimate_interval_s:
         yield (
             f"The reference has a pose every {reference_interval_s:.3g} s, the estimate every "
             f"{estimate_interval_s:.3g} s. {action}"
@@ -503,8 +506,8 @@ def _move_to_reference_body(
 ) -> tuple[Trajectory, tuple[str, ...]]:
     """Convert the poses of the estimate to the body axes and body origin of the reference.
 
-    The rotation and the lever arm between the bodies are constant; they are fitted by turns with
-    the alignment.
+    The constant rotation and lever arm between the bodies are fitted alternately with the
+    alignment.
     """
     assert estimate.rotation is not None
     assert reference.rotation is not None
@@ -514,7 +517,9 @@ def _move_to_reference_body(
     for _ in range(LEVER_ARM_ITERATIONS):
         transform = fit_alignment(corrected_estimate.position_m, reference.position_m, alignment)
         # chordal mean (Hartley 2013, section 5.3)
-        body_rotation = ((transform.rotation * estimate.rotation).inv() * reference.rotation).mean()
+        body_rotation = (
+            (transform.to_rotation() * estimate.rotation).inv() * reference.rotation
+        ).mean()
         error_m = transform.apply(estimate.position_m) - reference.position_m
         centred_error_m = (error_m - error_m.mean(axis=0)).ravel()
         lever_arm_m = np.linalg.lstsq(centred_axes, centred_error_m, rcond=None)[0]
@@ -535,10 +540,7 @@ def _move_to_reference_body(
 def _with_reference_body_axes(
     aligned_estimate: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, tuple[str, ...]]:
-    """Rotate the camera axes of the estimate to the vehicle axes of the reference, or the reverse.
-
-    The constant rotation between camera and vehicle is estimated, so it is no error.
-    """
+    """Remove the constant rotation between camera and vehicle axes from the estimate."""
     vehicle_frames = (*_Z_DOWN_FRAMES, *_Z_UP_FRAMES)
     axes_differ = (aligned_estimate.frame == "camera") != (reference.frame == "camera") or any(
         track.kind == "slam"

@@ -96,10 +96,15 @@ def cumulative_product(quaternions: Array) -> Array:
 
 def interpolate(times: Array, known_times: Array, quaternions: Array) -> Array:
     """Interpolate quaternions linearly and normalise them, for small angles between them."""
-    signs_between = np.sign(np.sum(quaternions[1:] * quaternions[:-1], axis=1))
-    signs = np.concatenate([[1.0], np.cumprod(np.where(signs_between == 0.0, 1.0, signs_between))])
-    continuous = quaternions * signs[:, None]
-    q = np.stack([np.interp(times, known_times, component) for component in continuous.T], axis=-1)
+    relative_signs = np.sign(np.sum(quaternions[1:] * quaternions[:-1], axis=1))
+    signs = np.concatenate(
+        [[1.0], np.cumprod(np.where(relative_signs == 0.0, 1.0, relative_signs))]
+    )
+    continuous_quaternions = quaternions * signs[:, None]
+    q = np.stack(
+        [np.interp(times, known_times, component) for component in continuous_quaternions.T],
+        axis=-1,
+    )
     return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
 
 

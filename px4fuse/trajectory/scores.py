@@ -20,8 +20,8 @@ from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
 DeltaUnit = Literal["frames", "m", "s"]
 
-# Maximum relative difference between the distance of an RPE pair and the requested distance, if all
-# pairs are used: default of the evo package
+# Maximum relative error of the distance of an RPE pair, if all pairs are used: default of the evo
+# package
 DELTA_TOLERANCE = 0.1
 # Default distances (m) of RPE pairs
 DEFAULT_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
@@ -73,7 +73,7 @@ class Statistics(Record):
     max: float
 
 
-class Interval(Record):
+class RmseInterval(Record):
     """95 % interval of an RMSE by block bootstrap.
 
     Attributes
@@ -113,7 +113,7 @@ class RelativeError(Record):
     all_pairs: bool
     pairs_from: Literal["reference"]
     translation_m: OrUnavailable[Statistics]
-    interval_m: OrUnavailable[Interval]
+    interval_m: OrUnavailable[RmseInterval]
     rotation_deg: OrUnavailable[Statistics]
 
     @property
@@ -143,14 +143,16 @@ def rotation_statistics(a: Rotation, b: Rotation) -> Statistics:
 def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
     """Choose distances and times for the RPE that fit path length and duration of the flight."""
 
-    def choose(progress: Array, values: Sequence[float], min_fraction: float) -> list[float]:
-        total = float(np.ptp(progress))
+    def choose_values(
+        distance_or_time: Array, values: Sequence[float], min_fraction: float
+    ) -> list[float]:
+        total = float(np.ptp(distance_or_time))
         # The minimum distance or time of a pair is two median intervals between poses
-        minimum = max(min_fraction * total, 2.0 * median_interval(progress))
+        minimum = max(min_fraction * total, 2.0 * median_interval(distance_or_time))
         return [value for value in values if minimum <= value <= MAX_DELTA_FRACTION * total]
 
-    distances_m = choose(distance_m, DEFAULT_DISTANCES_M, MIN_DELTA_FRACTION)
-    times_s = choose(time_s, DEFAULT_TIMES_S, 0.0)
+    distances_m = choose_values(distance_m, DEFAULT_DISTANCES_M, MIN_DELTA_FRACTION)
+    times_s = choose_values(time_s, DEFAULT_TIMES_S, 0.0)
     return (
         *(Delta(value, "m") for value in distances_m[-MAX_DISTANCE_DELTAS:]),
         *(Delta(value, "s") for value in times_s[-MAX_TIME_DELTAS:]),
@@ -303,7 +305,7 @@ def get_rotations(
 
 def rmse_interval(
     errors: Array, analysis_name: str, *, min_block_length: int = 1
-) -> Interval | Unavailable:
+) -> RmseInterval | Unavailable:
     """Compute the 95 % interval of the RMSE of correlated errors by circular block bootstrap.
 
     The method is that of Politis & Romano (1992), with blocks of three integrated autocorrelation
@@ -340,7 +342,7 @@ def rmse_interval(
     low, high = np.sqrt(
         np.maximum(np.quantile(resampled_means, [tail_probability, 1.0 - tail_probability]), 0.0)
     )
-    return Interval(float(low), float(high), block_length, block_count)
+    return RmseInterval(float(low), float(high), block_length, block_count)
 
 
 def autocorrelation_time(values: Array) -> float:

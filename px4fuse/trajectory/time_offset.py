@@ -41,21 +41,19 @@ FINE_SEARCH_WINDOW_S = 0.1
 MIN_PEAK_DISTANCE_S = 1.0
 # Minimum correlation of the speeds at a peak
 MIN_CORRELATION = 0.3
-# Minimum ratio of the residual (RMS) at another time offset to the best residual, for an
-# unambiguous time offset: 95 % limit of an F-test with 80 independent residuals, half a minute of
-# flight
+# Minimum ratio of the residuals (RMS) at the second best and the best time offset, for an
+# unambiguous result: 95 % limit of an F-test with 80 independent residuals (30 s of flight)
 MIN_SECOND_PEAK_RATIO = 1.2
 # Maximum number of poses in the least-squares fit of the time offset
 MAX_FITTED_POSES = 2000
 # Maximum ratio of residual to extent of the motion for accepting a fit of the time offset
 MAX_MISFIT = 0.5
-# Ratio of residual to extent of the motion below which two fits of the time offset are equally good
+# Ratio of residual to extent of the motion that no fit improves: two fits below it are equally good
 MIN_MISFIT = 1e-3
-# Minimum RMS of the velocity that shift, rotation and scale of the path cannot explain, as fraction
-# of the speed: a time offset is observable in this part of the velocity only
+# Minimum RMS of the velocity that no shift, rotation or scale of the path explains, as fraction of
+# the speed: only this part of the velocity makes a time offset observable
 MIN_UNEXPLAINED_SPEED_FRACTION = 0.05
-# Minimum correlation between two trajectories of the velocity that shift, rotation and scale cannot
-# explain: noise is not correlated
+# Minimum correlation of these unexplained velocities of two trajectories: noise is not correlated
 MIN_UNEXPLAINED_CORRELATION = 0.5
 # Number of lags in the variance of a sum of correlated residuals, in correlation lengths
 WINDOW_CORRELATION_LENGTHS = 4
@@ -85,7 +83,7 @@ class TimeOffset(Record, kw_only=True):
 
 
 def clock_difference(estimate: Trajectory, reference: Trajectory) -> float | None:
-    """Return the time offset (s) of the estimate from the UNIX times of both, if available."""
+    """Return the time offset (s) between two trajectories from their UNIX times, if available."""
     if estimate.unix_offset_s is None or reference.unix_offset_s is None:
         return None
     return estimate.unix_offset_s - reference.unix_offset_s
@@ -114,7 +112,7 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
 
 
 def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOffset:
-    """Estimate the offset to add to the timestamps of the sparse trajectory."""
+    """Estimate the offset to add to the timestamps of the trajectory with fewer poses (sparse)."""
     clock_offset_s = clock_difference(sparse_track, dense_track)
     candidates = _find_candidates(sparse_track, dense_track)
     if clock_offset_s is not None:
@@ -126,8 +124,8 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         )
     fits = (_refine_offset(sparse_track, dense_track, lag, SEARCH_WINDOW_S) for lag in candidates)
     accepted_fits = sorted(
-        (fit for fit in fits if fit is not None and fit.misfit <= MAX_MISFIT),
-        key=lambda fit: fit.misfit,
+        (fit for fit in fits if fit is not None and fit.compute_misfit() <= MAX_MISFIT),
+        key=lambda fit: fit.compute_misfit(),
     )
     if not accepted_fits:
         return _not_determinable(
@@ -136,7 +134,9 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         )
     best_fit = accepted_fits[0]
     similar_fits = [
-        fit for fit in accepted_fits if fit.misfit <= MIN_SECOND_PEAK_RATIO * best_fit.misfit
+        fit
+        for fit in accepted_fits
+        if fit.compute_misfit() <= MIN_SECOND_PEAK_RATIO * best_fit.compute_misfit()
     ]
     if clock_offset_s is not None:
         # Of several offsets that fit equally well, the nearest to the UNIX time is used
@@ -146,7 +146,8 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         if difference_s > MIN_PEAK_DISTANCE_S:
             return _not_determinable(
                 f"the motion is periodic: with a time offset that differs by {difference_s:.1f} s "
-                f"the ATE is {fit.rms_m:.3g} m instead of {best_fit.rms_m:.3g} m"
+                f"the ATE is {fit.compute_rms_m():.3g} m instead of "
+                f"{best_fit.compute_rms_m():.3g} m"
             )
     # The fit is repeated with a narrower window of offsets, within which more poses overlap in time
     best_fit = (
@@ -165,7 +166,7 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
         interval_s=(best_fit.offset_s - half_interval_s, best_fit.offset_s + half_interval_s),
         is_determinable=True,
         reason="The time offset has the maximum speed correlation and the minimum ATE "
-        f"({best_fit.rms_m:.3g} m, {len(best_fit.time_s)} poses).",
+        f"({best_fit.compute_rms_m():.3g} m, {len(best_fit.time_s)} poses).",
     )
 
 
@@ -179,13 +180,15 @@ def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]
     """Compute smoothed velocities (m/s) on a regular time grid."""
     time_s = trajectory.time_s
     grid_s = time_s[0] + step_s * np.arange(int(np.ptp(time_s) / step_s) + 1)
-    return grid_s, _smooth(positions_at(trajectory, grid_s), time_s, step_s, order=1) / step_s
+    return grid_s, _smooth(
+        positions_at(trajectory, grid_s), time_s, step_s, derivative_order=1
+    ) / step_s
 
 
-def _smooth(grid_values: Array, time_s: Array, step_s: float, order: int = 0) -> Array:
-    """Smooth values on a time grid; with order 1, return their derivative per grid step."""
+def _smooth(grid_values: Array, time_s: Array, step_s: float, derivative_order: int = 0) -> Array:
+    """Smooth values on a time grid, or return their smoothed derivative per grid step (order 1)."""
     sigma_samples = max(SMOOTHING_S, median_interval(time_s)) / step_s
-    return np.asarray(gaussian_filter1d(grid_values, sigma_samples, axis=0, order=order))
+    return np.asarray(gaussian_filter1d(grid_values, sigma_samples, axis=0, order=derivative_order))
 
 
 def _velocity(trajectory: Trajectory, time_s: Array) -> Array:
@@ -215,24 +218,24 @@ def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArr
 
 def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[float]:
     """Find the time offsets with correlated speeds, best first (Padfield 2012, eqs. 3 to 9)."""
-    spans_s = [float(np.ptp(track.time_s)) for track in (sparse_track, dense_track)]
-    step_s = max(GRID_STEP_S, max(spans_s) / MAX_GRID_SAMPLES)
-    shorter_span_s = min(spans_s)
-    if shorter_span_s < 10 * step_s:
+    durations_s = [float(np.ptp(track.time_s)) for track in (sparse_track, dense_track)]
+    step_s = max(GRID_STEP_S, max(durations_s) / MAX_GRID_SAMPLES)
+    shorter_duration_s = min(durations_s)
+    if shorter_duration_s < 10 * step_s:
         return []
     (sparse_speeds, is_known_sparse), (dense_speeds, is_known_dense) = (
         _speeds(track, step_s) for track in (sparse_track, dense_track)
     )
-    min_count = MIN_OVERLAP_FRACTION * shorter_span_s / step_s
+    min_count = MIN_OVERLAP_FRACTION * shorter_duration_s / step_s
     correlations = []
     # angular speeds are only compared if both trajectories have orientations
-    for a, b in zip(sparse_speeds, dense_speeds, strict=False):
-        speed_moments = moments(a, b, is_known_sparse, is_known_dense)
+    for sparse_values, dense_values in zip(sparse_speeds, dense_speeds, strict=False):
+        speed_moments = moments(sparse_values, dense_values, is_known_sparse, is_known_dense)
         # Exclude lags at which a trajectory is at rest: its variance is a rounding error
         is_usable = speed_moments.count >= min_count
         for values, is_known, power in (
-            (a, is_known_sparse, speed_moments.power_a),
-            (b, is_known_dense, speed_moments.power_b),
+            (sparse_values, is_known_sparse, speed_moments.power_a),
+            (dense_values, is_known_dense, speed_moments.power_b),
         ):
             total_power = float(np.var(values[is_known])) * np.count_nonzero(is_known)
             is_usable &= power > 1e-3 * total_power / len(values) * speed_moments.count
@@ -264,17 +267,15 @@ class _OffsetFit:
     aligned_m: Array
     target_m: Array
 
-    @property
-    def rms_m(self) -> float:
-        """RMS (m) of the residuals."""
+    def compute_rms_m(self) -> float:
+        """Return the RMS (m) of the residuals."""
         return rms_m(self.target_m - self.aligned_m)
 
-    @property
-    def misfit(self) -> float:
-        """RMS of the residuals over RMS extent of the motion, to compare fits."""
+    def compute_misfit(self) -> float:
+        """Return the ratio of RMS residual to RMS extent of the motion; the least is best."""
         # Extent of the dense trajectory, because a bad fit shrinks the sparse one to a point
         extent_m = float(np.sqrt(self.target_m.var(axis=0).sum()))
-        return max(self.rms_m / extent_m, MIN_MISFIT) if extent_m > 0.0 else float("inf")
+        return max(self.compute_rms_m() / extent_m, MIN_MISFIT) if extent_m > 0.0 else float("inf")
 
 
 def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _OffsetFit) -> float:
@@ -286,7 +287,7 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
     pose_count = len(fit.time_s)
     centred_m = fit.aligned_m - fit.aligned_m.mean(axis=0)
     dense_velocity = _velocity(dense_track, fit.time_s + fit.offset_s)
-    sparse_velocity = fit.transform.rotation.apply(
+    sparse_velocity = fit.transform.to_rotation().apply(
         fit.transform.scale * _velocity(sparse_track, fit.time_s)
     )
     # Remove the velocity that a translation, a small rotation or a scale factor can explain
@@ -327,8 +328,8 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
 def _correlation_length(values: Array) -> int:
     """Return the first lag with autocorrelation below 1/e, at most n / 4."""
     covariance_by_lag = autocovariance(values - values.mean())
-    low_lags = np.flatnonzero(covariance_by_lag < covariance_by_lag[0] / np.e)
-    return int(low_lags[0]) if len(low_lags) else len(values) // 4
+    lags_below_limit = np.flatnonzero(covariance_by_lag < covariance_by_lag[0] / np.e)
+    return int(lags_below_limit[0]) if len(lags_below_limit) else len(values) // 4
 
 
 def _refine_offset(
@@ -371,5 +372,5 @@ def _refine_offset(
     # tolerance of the optimiser would be seconds
     shifts_s = window_s * np.linspace(-1.0, 1.0, 21)
     best_index = int(np.argmin([cost(shift) for shift in shifts_s]))
-    bracket = (shifts_s[max(best_index - 1, 0)], shifts_s[min(best_index + 1, len(shifts_s) - 1)])
-    return fit_at(float(minimize_scalar(cost, bounds=bracket, method="bounded").x))
+    bounds_s = (shifts_s[max(best_index - 1, 0)], shifts_s[min(best_index + 1, len(shifts_s) - 1)])
+    return fit_at(float(minimize_scalar(cost, bounds=bounds_s, method="bounded").x))

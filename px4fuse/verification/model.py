@@ -1,9 +1,9 @@
-"""Results of verification: verdict, and differences of numbers and pages."""
+"""Result of verifying a report (PDF) against its log."""
 
 from dataclasses import dataclass, field
 from typing import Literal
 
-# Python errors that missing or invalid values in a damaged file can raise
+# Exceptions that missing or invalid values in a damaged file can raise
 BAD_VALUE_ERRORS = (
     ArithmeticError,
     AssertionError,
@@ -13,16 +13,16 @@ BAD_VALUE_ERRORS = (
     TypeError,
     ValueError,
 )
-# Result of comparing the numbers (Status) and the pages (PageStatus) of a report with a new run
+# Result of comparing numbers (Status) and pages (PageStatus) of a report with a new analysis
 Status = Literal["verified", "numbers differ", "other log", "cannot verify"]
 PageStatus = Literal["same", "differ", "not compared"]
 
 
 @dataclass(frozen=True)
 class Mismatch:
-    """Value in a report that a new run of the analysis does not reproduce.
+    """Value in a report that differs from a new analysis of the log.
 
-    ``path`` is the place in the results, such as ``axes.north.filters.kf.nis_mean``. A missing
+    ``path`` is the field in the results, for example ``axes.north.filters.kf.nis_mean``. A missing
     value is "absent".
     """
 
@@ -33,10 +33,14 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class PageDifference:
-    """Difference between a submitted PDF and the report that px4fuse draws again.
+    """Difference between a submitted PDF and the report that px4fuse draws from the log.
 
-    ``page`` is 0 for the whole document. ``is_structural`` is True if the difference shows that
-    another program wrote the file, as added or missing PDF objects do.
+    Attributes
+    ----------
+    page : int
+        Page number; 0 for the whole document.
+    is_structural : bool
+        True for added or missing PDF objects: another program wrote the file.
     """
 
     page: int
@@ -55,12 +59,11 @@ class Verification:
     Attributes
     ----------
     reasons : tuple of str
-        Sentences with the differences, the reason for "cannot verify", or the successful checks.
+        Differences, reason for "cannot verify", or successful checks, as sentences.
     with_log : bool
         True if the analysis was repeated on the log.
     redrawn_pdf : bytes
-        Report from the repeated analysis, to be read instead of the submitted PDF; empty if the
-        analysis was not repeated.
+        Report of the repeated analysis; empty if the analysis was not repeated.
     remedy : str
         Action of the user if the report was not verified.
     missing : str
@@ -79,6 +82,6 @@ class Verification:
 
     @property
     def outcome(self) -> str:
-        """Status of the numbers, or "page differs" if only pages of the report differ."""
+        """``status``, or "page differs" if the numbers are right but pages were changed."""
         has_different_pages = self.status == "verified" and self.page_status == "differ"
         return "page differs" if has_different_pages else self.status

@@ -13,7 +13,7 @@ from px4fuse.verification.verification import LIMIT_NOTE
 SCHEMA = {"name": "px4fuse-verification", "version": "3.0"}
 
 
-def verdict_data(pdf: bytes, verification: Verification) -> dict[str, object]:
+def verification_data(pdf: bytes, verification: Verification) -> dict[str, object]:
     """Return the JSON output of ``px4fuse verify``."""
     values = asdict(verification)
     for name in ("redrawn_pdf", "remedy", "missing"):  # only px4fuse grade uses these fields
@@ -27,7 +27,7 @@ def verdict_data(pdf: bytes, verification: Verification) -> dict[str, object]:
     }
 
 
-def verdict_page(name: str, verification: Verification, output: Path | None) -> Page:
+def verification_page(name: str, verification: Verification, output: Path | None) -> Page:
     """Format the terminal output of ``px4fuse verify``."""
     page = Page()
     colours = {"verified": GOOD_COLOUR, "cannot verify": SEVERITY_COLOURS["warning"]}

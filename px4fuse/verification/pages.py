@@ -1,16 +1,18 @@
-"""Comparison of a submitted PDF with the report that px4fuse draws again from the log.
+"""Comparison of a submitted PDF with the report that px4fuse draws from the log ("redrawn").
 
-Starting from each page, the document information and the catalogue, all objects of both files are
-compared pairwise. They have to be equal in keys, names, numbers, texts and decoded streams:
-content, fonts with widths, encodings and ToUnicode, bookmarks, structure tree, metadata. Anything
-that px4fuse does not write is a difference, so no list of possible forgeries is needed.
+All objects of both files are compared pairwise, starting from the pages, the document information
+and the catalogue. Anything that px4fuse does not write is a difference, so no list of possible
+forgeries is needed.
 
-Tolerated, because programs that save a PDF again change it: object numbers, compression, the
-trailer's ``/ID``, the header, unused objects, the spelling of numbers and strings, ``/Producer``
-and dates of the document information, and the same fields and the identifiers of XMP. Tolerated,
-because processors differ in the last digits: coordinates by COORDINATE_TOLERANCE_PT, and numbers in
-texts if they are roundings of results that are equal within the tolerances. The attached results
-are compared as numbers, see :mod:`px4fuse.verification.verification`.
+Two kinds of differences are tolerated:
+
+- Programs that save a PDF again change object numbers, compression, ``/ID``, the header, unused
+  objects, the notation of numbers and strings, and the name of the program, dates and identifiers
+  in the metadata.
+- Processors differ in the last digits: coordinates may differ by COORDINATE_TOLERANCE_PT, and
+  printed numbers if the results agree within their tolerances.
+
+The attached results are compared in :mod:`px4fuse.verification.verification`.
 """
 
 import math
@@ -49,22 +51,20 @@ from px4fuse.verification.pdf_input import (
 # Tolerance (pt) of coordinates: different OpenBLAS kernels move points by at most 0.07 pt, and
 # 0.25 pt is not visible
 COORDINATE_TOLERANCE_PT = 0.25
-# Relative and absolute tolerance of PDF numbers that are not coordinates: other programs save them
-# as 32-bit floats
+# Relative and absolute tolerance of PDF numbers except coordinates: programs may save 32-bit floats
 NUMBER_TOLERANCE = 1e-5
-# Maximum kerning (1/1000 em) of a text whose numbers may differ by rounding: a wider shift in a
-# submitted PDF could place digits in another order
+# Maximum kerning (1/1000 em) of a text with tolerated numbers: a forger could change the order of
+# the digits by a larger kerning
 MAX_KERNING = 200.0
-# Maximum ratio of submitted to redrawn page content (bytes): a PDF may escape a character with
-# four bytes
+# Maximum ratio of submitted to redrawn page content (bytes): an escaped character has four bytes
 MAX_CONTENT_RATIO = 4
 # Maximum time (s) for comparing two PDFs; the comparison of the largest report takes 3 s
 TIMEOUT_S = 12.0
 # Maximum memory (bytes) for comparing two PDFs; the largest report needs 0.3 GB
 MAX_MEMORY_BYTES = 1_000_000_000
 MAX_LISTED_DIFFERENCES = 20
-SECOND_TABLE = "the file has a second cross-reference table"
-# PDF dictionary keys that are not compared: programs that save a PDF again change the values
+SECOND_TABLE_REASON = "the file has a second cross-reference table"
+# PDF dictionary keys that are not compared, because programs that save a PDF change them
 _COMPRESSION_KEYS = frozenset(("/Length", "/Filter"))
 _WRITER_KEYS = frozenset(("/Producer", "/CreationDate", "/ModDate"))
 _XMP_WRITER_FIELDS = re.compile(
@@ -72,7 +72,7 @@ _XMP_WRITER_FIELDS = re.compile(
     r"|stEvt:(?:when|instanceID))( [^>]*)?>[^<]*</\1>"
 )
 MAX_XMP_BYTES = 100_000
-# Typst version in the PDF, which is not compared: 0.15.0 and 0.15.2 produce the same pages
+# Typst version in the PDF; not compared, because different versions produce equal pages
 _TYPST_VERSION_PATTERN = re.compile(r"Typst \d+(\.\d+)*")
 _END_OF_FILE_PATTERN = re.compile(rb"startxref\s+(\d{1,10})\s+%%EOF\s*\Z")
 _FEATURE_NAMES = {
@@ -108,7 +108,7 @@ _ESCAPED_CHARACTERS = {
 # PDF drawing operators with coordinates, and index of the first coordinate among their operands
 _FIRST_COORDINATE_INDEX = {"m": 0, "l": 0, "c": 0, "v": 0, "y": 0, "re": 0, "cm": 4, "Tm": 4}
 _TEXT_OPERATORS = frozenset(("Tj", "TJ"))
-# Entry of a font's ToUnicode map: glyph number and UTF-16 characters, in hexadecimal digits
+# Entry of a font's ToUnicode map: glyph number and UTF-16 text, in hexadecimal digits
 _TO_UNICODE_ENTRY_PATTERN = re.compile(r"<([0-9A-Fa-f]{4})> <((?:[0-9A-Fa-f]{4})+)>\n")
 
 TextComparison = Callable[[str, str], bool]
@@ -120,11 +120,10 @@ Operation = tuple[str, tuple[Operand, ...]]
 def compare_pages(
     submitted_pdf: bytes, redrawn_pdf: bytes, is_same_text: TextComparison
 ) -> tuple[PageDifference, ...]:
-    """Compare a submitted PDF with the redrawn report, in a process with limits.
+    """Compare two PDFs in a process with limits of time and memory.
 
-    ``is_same_text`` returns True if two texts are equal up to the rounding of a number. At most
-    MAX_LISTED_DIFFERENCES are returned, in page order; only one if the comparison exceeds its
-    limits.
+    ``is_same_text`` returns True if two texts are equal up to the rounding of numbers. At most
+    MAX_LISTED_DIFFERENCES are returned, in page order.
     """
     job = submitted_pdf, redrawn_pdf, is_same_text
     differences = run_one_with_limits(_compare_pdfs, job, TIMEOUT_S, MAX_MEMORY_BYTES)
@@ -165,11 +164,11 @@ class _PdfComparison:
     is_same_text: TextComparison
     # object number and generation in the submitted PDF, object number in the redrawn PDF
     compared_objects: set[tuple[int, int, int]] = field(default_factory=set)
-    # parents of pages in both PDFs, to be compared after the document catalogue
-    parent_pairs: list[tuple[Any, Any, str]] = field(default_factory=list)
-    # fonts of the current page, by their names in the page content
+    # entries "/Parent" of pages; compared last, after the document catalogue
+    page_parents: list[tuple[Any, Any, str]] = field(default_factory=list)
+    # fonts of the current page by name
     fonts: Mapping[str, Any] = field(default_factory=dict)
-    # number of compared values: a malicious PDF may contain millions
+    # number of compared values, which is limited because a malicious PDF may contain millions
     value_count: int = 0
 
     def differences(
@@ -191,16 +190,16 @@ class _PdfComparison:
                 dict.get(reader.trailer, key) for reader in (submitted_pdf, redrawn_pdf)
             )
             yield from self._compare(submitted_value, redrawn_value, key, 0)
-        for pair in self.parent_pairs:
-            yield from self._compare(*pair, 0)
-        # readers of PDF 1.4 and of PDF 1.5 use different cross-reference tables
+        for values in self.page_parents:
+            yield from self._compare(*values, 0)
+        # old programs (PDF 1.4) would use another cross-reference table than new ones
         if "/XRefStm" in submitted_pdf.trailer:
-            yield PageDifference(0, SECOND_TABLE, True)
+            yield PageDifference(0, SECOND_TABLE_REASON, True)
 
     def _compare(
-        self, submitted_value: Any, redrawn_value: Any, key: str, page: int
+        self, submitted_value: Any, redrawn_value: Any, key: str, page_number: int
     ) -> Iterator[PageDifference]:
-        """Yield the differences of two PDF values and of all values that they contain."""
+        """Yield the differences of two PDF values, including all nested values."""
         remaining_values = [(submitted_value, redrawn_value, key)]
         while remaining_values:
             submitted_value, redrawn_value, key = remaining_values.pop()
@@ -210,22 +209,28 @@ class _PdfComparison:
             if isinstance(submitted_value, IndirectObject):
                 if submitted_value.generation:  # some programs ignore generation numbers
                     description = f"the PDF entry {key} refers to an object of generation above 0"
-                    yield PageDifference(page, description, True)
+                    yield PageDifference(page_number, description, True)
                 if isinstance(redrawn_value, IndirectObject):
-                    pair = submitted_value.idnum, submitted_value.generation, redrawn_value.idnum
-                    if pair in self.compared_objects:
+                    object_ids = (
+                        submitted_value.idnum,
+                        submitted_value.generation,
+                        redrawn_value.idnum,
+                    )
+                    if object_ids in self.compared_objects:
                         continue
-                    self.compared_objects.add(pair)
+                    self.compared_objects.add(object_ids)
             submitted_value, redrawn_value = map(
                 resolve_reference, (submitted_value, redrawn_value)
             )
             if _pdf_type_of(submitted_value) is not _pdf_type_of(redrawn_value):
                 yield PageDifference(
-                    page, f"the type of the PDF entry {key} differs from the redrawn report", True
+                    page_number,
+                    f"the type of the PDF entry {key} differs from the redrawn report",
+                    True,
                 )
             elif isinstance(redrawn_value, DictionaryObject):
                 yield from self._compare_dictionaries(
-                    submitted_value, redrawn_value, key, page, remaining_values
+                    submitted_value, redrawn_value, key, page_number, remaining_values
                 )
             elif isinstance(redrawn_value, ArrayObject):
                 if len(submitted_value) != len(redrawn_value):
@@ -233,27 +238,24 @@ class _PdfComparison:
                         f"the PDF array {key} has {len(submitted_value)} elements instead of "
                         f"{len(redrawn_value)}"
                     )
-                    yield PageDifference(page, description, True)
+                    yield PageDifference(page_number, description, True)
                     continue
                 pairs = zip(*map(list.__iter__, (submitted_value, redrawn_value)), strict=True)
                 remaining_values += [(*pair, key) for pair in pairs][::-1]
             elif not self._is_same_value(submitted_value, redrawn_value):
                 texts = [one_line(str(value), 60) for value in (submitted_value, redrawn_value)]
                 description = f"the PDF entry {key} is {texts[0]!r}; px4fuse writes {texts[1]!r}"
-                yield PageDifference(page, description)
+                yield PageDifference(page_number, description)
 
     def _compare_dictionaries(
         self,
         submitted_dictionary: DictionaryObject,
         redrawn_dictionary: DictionaryObject,
         key: str,
-        page: int,
+        page_number: int,
         remaining_values: list[tuple[Any, Any, str]],
     ) -> Iterator[PageDifference]:
-        """Yield keys and streams that differ between two PDF dictionaries.
-
-        Values to compare later are appended to ``remaining_values``.
-        """
+        """Yield keys and streams that differ; append the values to ``remaining_values``."""
         submitted_keys = _compared_keys(submitted_dictionary, key)
         redrawn_keys = _compared_keys(redrawn_dictionary, key)
         for name in sorted(submitted_keys ^ redrawn_keys):
@@ -261,14 +263,18 @@ class _PdfComparison:
             description = f"{feature} is missing"
             if name in submitted_keys:
                 description = f"the PDF contains {feature}, which px4fuse does not write"
-            yield PageDifference(page, description, True)
+            yield PageDifference(page_number, description, True)
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
-            pair = submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name
-            (self.parent_pairs if page and name == "/Parent" else remaining_values).append(pair)
+            values = submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name
+            (self.page_parents if page_number and name == "/Parent" else remaining_values).append(
+                values
+            )
         if isinstance(submitted_dictionary, StreamObject) and isinstance(
             redrawn_dictionary, StreamObject
         ):
-            yield from self._compare_streams(submitted_dictionary, redrawn_dictionary, key, page)
+            yield from self._compare_streams(
+                submitted_dictionary, redrawn_dictionary, key, page_number
+            )
 
     def _is_same_value(self, submitted_value: Any, redrawn_value: Any) -> bool:
         if _pdf_type_of(redrawn_value) is float:
@@ -284,7 +290,11 @@ class _PdfComparison:
         return all(map(_TYPST_VERSION_PATTERN.fullmatch, texts)) or self.is_same_text(*texts)
 
     def _compare_streams(
-        self, submitted_stream: StreamObject, redrawn_stream: StreamObject, key: str, page: int
+        self,
+        submitted_stream: StreamObject,
+        redrawn_stream: StreamObject,
+        key: str,
+        page_number: int,
     ) -> Iterator[PageDifference]:
         stream_type = redrawn_stream.get("/Type")
         if stream_type == "/EmbeddedFile":  # the attached results are compared as numbers
@@ -292,7 +302,7 @@ class _PdfComparison:
         filters = resolve_reference(submitted_stream.get("/Filter"))
         if filters not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
             yield PageDifference(
-                page, f"the compression of the PDF entry {key} is not supported", True
+                page_number, f"the compression of the PDF entry {key} is not supported", True
             )
             return
         submitted_data, redrawn_data = submitted_stream.get_data(), redrawn_stream.get_data()
@@ -303,14 +313,16 @@ class _PdfComparison:
             return
         is_drawing = key == "/Contents" or stream_type == "/Pattern"
         if not is_drawing or len(submitted_data) > MAX_CONTENT_RATIO * len(redrawn_data):
-            yield PageDifference(page, f"the content of {key} differs from the redrawn report")
+            yield PageDifference(
+                page_number, f"the content of {key} differs from the redrawn report"
+            )
         elif description := self._describe_operation_difference(submitted_data, redrawn_data):
-            yield PageDifference(page, description)
+            yield PageDifference(page_number, description)
 
     def _describe_operation_difference(
         self, submitted_content: bytes, redrawn_content: bytes
     ) -> str:
-        """Describe the first drawing operation of a page that differs; "" if there is none."""
+        """Describe the first drawing operation that differs; "" if all are equal."""
         operation_lists = map(_drawing_operations, (submitted_content, redrawn_content))
         font_name = ""
         for operation_number, operations in enumerate(
@@ -342,7 +354,7 @@ class _PdfComparison:
         return ""
 
     def _decode_text(self, operands: tuple[Operand, ...], font: str) -> str:
-        """Decode the text of a Tj or TJ operation with the font's ToUnicode map; ? if unknown."""
+        """Decode a PDF text (operator Tj or TJ) with the ToUnicode map of its font."""
         to_unicode = self.fonts[font].get_object()["/ToUnicode"].get_data().decode("latin-1")
         text_by_glyph = {
             int(glyph, 16): bytes.fromhex(utf16_text)
@@ -357,46 +369,47 @@ class _PdfComparison:
 
 
 def _find_ambiguities(pdf: bytes) -> Iterator[str]:
-    """Describe structures of a PDF that make different programs read different objects."""
+    """Describe file structures for which PDF programs could display different contents."""
     end_match = _END_OF_FILE_PATTERN.search(pdf[-1024:])
     if end_match is None:
         yield "the file has bytes after the end of the PDF"
     elif b"/Linearized" in pdf[:1024]:
-        # the end of the file must refer to the first cross-reference table
+        # the position at the end of the file must be that of the first cross-reference table
         table_start = pdf.find(b"endobj") + len(b"endobj")
         if pdf[table_start : int(end_match[1])].strip():
-            yield SECOND_TABLE
+            yield SECOND_TABLE_REASON
 
 
 def _get_page_references(reader: pypdf.PdfReader) -> list[Any]:
-    """Return references to the pages of a page tree with one level, as px4fuse writes it."""
+    """Return references to the pages, which px4fuse writes in one level of the page tree."""
     page_tree: Any = reader.root_object["/Pages"]
     return [*list.__iter__(page_tree["/Kids"])]
 
 
 def _pdf_type_of(value: Any) -> type:
-    """Return the type of a PDF value: a name is not a string, a stream is not a dictionary."""
+    """Return the type of a PDF value; distinguish names from strings, streams from dictionaries."""
     if isinstance(value, TextStringObject | ByteStringObject):
         return str
     if isinstance(value, int | float):
         return float
-    types = StreamObject, DictionaryObject, ArrayObject, NameObject
-    return next((pdf_type for pdf_type in types if isinstance(value, pdf_type)), type(value))
+    pdf_types = StreamObject, DictionaryObject, ArrayObject, NameObject
+    return next((pdf_type for pdf_type in pdf_types if isinstance(value, pdf_type)), type(value))
 
 
 def _compared_keys(value: DictionaryObject, key: str) -> set[str]:
-    """Return the keys of a PDF dictionary that are compared; a null value is ignored."""
+    """Return the keys of a PDF dictionary that must be equal, without null values."""
     compared_keys = {name for name in value if not isinstance(value.raw_get(name), NullObject)}
     if isinstance(value, StreamObject):
         compared_keys -= _COMPRESSION_KEYS
     if key == "/Info":
         compared_keys -= _WRITER_KEYS
+    # /Params of an attached file contains times and its size, and the file itself is compared
     return compared_keys - {"/Params"} if value.get("/Type") == "/EmbeddedFile" else compared_keys
 
 
 def _xmp_metadata(xmp_bytes: bytes) -> str:
-    """Return XMP metadata in canonical form, without fields that other programs change."""
-    # an XML document type ("<!") may contain entities that expand to huge texts
+    """Return XMP metadata in canonical form, without the fields that differ between programs."""
+    # do not parse a document type ("<!"): its entities may expand to huge texts
     if len(xmp_bytes) > MAX_XMP_BYTES or b"<!" in xmp_bytes:
         return xmp_bytes.decode("latin-1")
     xmp_text = re.sub(r"<\?.*?\?>", "", xmp_bytes.decode("utf-8", "replace"))
@@ -405,7 +418,7 @@ def _xmp_metadata(xmp_bytes: bytes) -> str:
 
 
 def _drawing_operations(content: bytes) -> Iterator[Operation]:
-    """Parse the content of a PDF page; yield each drawing operator with its operands."""
+    """Parse the content of a PDF page into drawing operators with their operands."""
     operands: list[Operand] = []
     for match in _TOKEN_PATTERN.finditer(content.decode("latin-1")):
         string_text, hex_digits, token = match.groups("")
@@ -427,7 +440,7 @@ def _drawing_operations(content: bytes) -> Iterator[Operation]:
 
 def _unescape(match: re.Match[str]) -> str:
     escaped = match[1]
-    if escaped is None:  # an end of line in a PDF string is a line feed
+    if escaped is None:  # each end of line in a PDF string means a line feed
         return "\n"
     if escaped[0] in "01234567":
         return chr(int(escaped, 8) & 255)

@@ -1,12 +1,8 @@
-"""Reading of the results from submitted PDFs, which may be malicious.
+"""Reading of the results attached to a submitted PDF, which may be malicious.
 
 Nothing in the PDF is executed, no link is followed, and nothing is written to disk. This module
 checks sizes before pypdf reads the PDF, and sets the limits of pypdf. :mod:`px4fuse.core.workers`
-limits time and memory.
-
-Only the attached results are read. The pages are counted but not read, because px4fuse draws the
-report again. A PDF that another program saved again is therefore accepted if it still contains the
-attached results.
+limits time and memory. The pages are counted but not read.
 """
 
 import io
@@ -30,9 +26,9 @@ from px4fuse.verification.model import BAD_VALUE_ERRORS
 
 MAX_PDF_BYTES = 25_000_000
 MAX_PAGES = 100
-# Maximum size (bytes) of one inflated PDF stream
+# Maximum size (bytes) of a decompressed PDF stream
 MAX_CONTENT_BYTES = 20_000_000
-# Maximum size (bytes) of all inflated streams of a PDF together
+# Maximum total size (bytes) of all decompressed streams of a PDF
 MAX_DOCUMENT_BYTES = 100_000_000
 MAX_PDF_OBJECTS = 20_000
 MAX_PDF_VALUES = 1_000_000
@@ -43,20 +39,20 @@ _DAMAGED_REASON = "the PDF is damaged. Hand in the file that px4fuse wrote."
 _ENCRYPTED_REASON = "the PDF is encrypted. Hand in the file that px4fuse wrote."
 _COSTLY_REASON = "the PDF needs more memory or time to read than a report of px4fuse."
 
-# Exceptions that pypdf raises for damaged PDFs; AttributeError occurred in a test of 900 PDFs with
-# changed bytes. Other exceptions are errors of px4fuse and are not caught
+# Exceptions that pypdf raises for damaged PDFs; AttributeError occurred in a test with 900 damaged
+# PDFs
 BROKEN_PDF_ERRORS = (*BAD_VALUE_ERRORS, PyPdfError, AttributeError, zlib.error)
 
-# Keys of PDF dictionaries with active content. Links, comments, forms without scripts and the
-# initial view are allowed, because programs add them when they save a PDF
+# Keys of PDF dictionaries with active content. Links, comments, forms and the initial view are
+# allowed, because programs add them when they save a PDF
 _ACTIVE_KEYS = re.compile("/(JS|JavaScript|XFA|RichMediaContent|RichMediaSettings|Collection|RF)")
 # Types of PDF actions that run programs or open other files and addresses
 _ACTIVE_ACTIONS = re.compile(
     "/(JavaScript|Launch|SubmitForm|ImportData|GoToR|GoToE|Rendition|RichMediaExecute|Movie|Sound)"
 )
 
-# Limits of pypdf, stricter than its defaults: reports of px4fuse need no recovery of broken
-# streams, no filters except Flate, no chains of filters and no external JBIG2 decoder
+# Limits of pypdf, stricter than its defaults: reports of px4fuse contain only undamaged streams
+# with one filter (Flate)
 PYPDF_LIMITS: dict[str, Any] = {
     "maximum_declared_stream_length": MAX_PDF_BYTES,
     "array_based_stream_maximum_output_length": MAX_CONTENT_BYTES,
@@ -73,7 +69,7 @@ PYPDF_LIMITS: dict[str, Any] = {
     "page_tree_maximum_page_entries": 100 * MAX_PAGES,
 }
 
-# PDF stream filters that _check_file can test for decompression bombs
+# PDF compression methods (filters) for which _check_file limits the decompressed size
 _ALLOWED_FILTERS = frozenset(("/FlateDecode", "/DCTDecode"))
 
 _STREAM_START = re.compile(rb"(?<!end)stream *\r?\n?")
@@ -84,7 +80,7 @@ logging.getLogger("pypdf").setLevel(logging.CRITICAL + 1)
 
 
 def read_report(pdf: bytes, name: str) -> ReportedResults:
-    """Read the results of compare or loop that a submitted report contains.
+    """Read the results in a report of ``px4fuse compare`` or ``px4fuse loop``.
 
     ``name`` is the file name for messages.
 
@@ -132,7 +128,7 @@ def read_attached_results(pdf: bytes, name: str) -> Results:
 
 
 def open_strictly(pdf: bytes) -> pypdf.PdfReader:
-    """Open a PDF without repair of damage, which programs repair differently."""
+    """Open a PDF without repair, because other programs may repair the PDF differently."""
     max_entries = 10 * MAX_PDF_OBJECTS
     return pypdf.PdfReader(io.BytesIO(pdf), strict=True, xref_stream_maximum_entries=max_entries)
 
@@ -146,10 +142,10 @@ def _check_file(pdf: bytes) -> None:
         raise ResultsError("the file is not a PDF. Hand in the file that px4fuse wrote.")
     if b"%%EOF" not in pdf[-2048:]:
         raise ResultsError("the end of the PDF is missing. Hand in the complete file.")
-    # every stream is inflated and discarded here, so that no decompression bomb reaches pypdf
+    # find decompression bombs before pypdf reads the file
     remaining_bytes = MAX_DOCUMENT_BYTES
     for stream_match in _STREAM_START.finditer(pdf):
-        # each occurrence of the word "stream" is tested, also inside of the data of a stream
+        # test each word "stream" in the file, even inside other data
         inflated_bytes = _inflated_bytes(
             pdf, stream_match.end(), min(remaining_bytes, MAX_CONTENT_BYTES)
         )
@@ -162,10 +158,10 @@ def _check_file(pdf: bytes) -> None:
 
 
 def _inflated_bytes(pdf: bytes, start: int, limit_bytes: int) -> int:
-    """Return the size (bytes) of the zlib data at ``start``; 0 if there are none.
+    """Return the size (bytes) of the zlib data at ``start``; 0 without zlib data.
 
-    The size is the maximum of compressed, inflated and 1000 bytes, so that a limit of the size also
-    limits the time. Inflating stops at ``limit_bytes`` + 1.
+    The size is the maximum of the compressed size, the decompressed size, and 1000. It is at most
+    ``limit_bytes`` + 1.
     """
     zlib_header = pdf[start : start + 2]
     if (
@@ -184,18 +180,15 @@ def _inflated_bytes(pdf: bytes, start: int, limit_bytes: int) -> int:
             break
         try:
             output_bytes += len(inflate.decompress(chunk, 1_000_000))
-        except zlib.error:  # pypdf rejects this stream, because repair is disabled
+        except zlib.error:  # not an error here: pypdf rejects this stream
             break
     input_bytes -= len(inflate.unused_data)
-    # the start of inflating takes the time of 1000 bytes
+    # at least 1000 bytes, because each start of the decompression needs time
     return min(max(input_bytes, output_bytes, 1000), limit_bytes + 1)
 
 
 def _all_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, bool]]:
-    """Yield all PDF dictionaries that a viewer can reach, each once, without decoding streams.
-
-    The flag is True if the dictionary is reached only by a click on a link or bookmark.
-    """
+    """Yield each PDF dictionary, with True if it is reached by a click on a link or bookmark."""
     visited: set[tuple[IndirectObject, bool]] = set()
     missing_count = value_count = 0
     remaining_values: list[tuple[Any, bool]] = [(reader.trailer, False)]
@@ -206,14 +199,14 @@ def _all_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObjec
             if (value, is_reached_by_click) in visited:
                 continue
             visited.add((value, is_reached_by_click))
-            # pypdf searches the whole file for objects that the cross-reference table does not list
+            # count unlisted objects, because pypdf would search the whole file for each
             number, generation = value.idnum, value.generation
             is_packed = generation == 0 and number in reader.xref_objStm
             is_listed = is_packed or number in reader.xref.get(generation, {})
             missing_count += not is_listed
             if len(visited) > MAX_PDF_OBJECTS or missing_count > MAX_UNRESOLVED_REFERENCES:
                 raise ResultsError(_COSTLY_REASON)
-            # ISO 32000-1, 7.3.10: a reference to a missing object is null
+            # a reference to a missing object is null (ISO 32000-1, 7.3.10)
             value = value.get_object() if is_listed else None
         if value_count > MAX_PDF_VALUES:
             raise ResultsError(_COSTLY_REASON)
@@ -225,7 +218,7 @@ def _all_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObjec
 
 
 def _foreign_features(dictionary: DictionaryObject, is_reached_by_click: bool) -> Iterator[str]:
-    """Yield the features of a PDF dictionary that reports of px4fuse do not have."""
+    """Yield features that reports of px4fuse do not have: active content, links to files, ..."""
     yield from (key[1:] for key in dictionary if _ACTIVE_KEYS.fullmatch(key))
     action, dictionary_type = (_pdf_name(dictionary.get(key)) or "" for key in ("/S", "/Type"))
     if _ACTIVE_ACTIONS.fullmatch(action):
@@ -251,7 +244,7 @@ def _foreign_features(dictionary: DictionaryObject, is_reached_by_click: bool) -
 
 
 def resolve_reference(value: Any) -> Any:
-    """Return the object to which a PDF reference points; other values are returned unchanged."""
+    """Return the object to which a PDF reference points, or ``value`` if it is not a reference."""
     return value.get_object() if isinstance(value, IndirectObject) else value
 
 
@@ -261,7 +254,7 @@ def _pdf_name(value: object) -> str | None:
 
 
 def _read_attachment(reader: pypdf.PdfReader) -> bytes:
-    """Return the content of the file attached to a report: one file with the name RESULTS_NAME."""
+    """Return the content of the attached file RESULTS_NAME; other attachments are an error."""
     file_specifications: list[DictionaryObject] = []
     streams: dict[int, StreamObject] = {}
     features: set[str] = set()

@@ -1,13 +1,13 @@
-"""Verification: repeat the analysis of a report on its log, and compare numbers and pages.
+"""Verification of a report (PDF): repeat its analysis on the log, and compare numbers and pages.
 
-The results of the new run are compared with the results attached to the PDF. This confirms that the
-numbers follow from the log. It does not confirm the author: each person with the log can make the
-same report under another name.
+The new results are compared with the results attached to the PDF. This confirms that the numbers
+follow from the log. It does not confirm the author: each person with the log can make the same
+report under another name.
 
-The report is drawn again from the new results, and the submitted PDF is compared with it
+The report is also drawn from the new results, and its pages are compared with the submitted PDF
 (:mod:`px4fuse.verification.pages`). No number is read from the submitted pages.
 
-The recorded request may be forged. It is decoded strictly with the ranges of all values, and it
+The settings in the PDF may be forged. They are decoded strictly with the ranges of all values, and
 cannot name an output file. Input files are found by SHA-256, never by name.
 """
 
@@ -39,26 +39,24 @@ ASK_AUTHOR_REMEDY = (
     "Ask the author how the report was made, and for its log and all other input files."
 )
 FOREIGN_REQUEST_REASON = "the recorded command was not written by px4fuse"
-# Minimum KF prediction step DT (s) of a report: for ten minutes of flight, 60,000 steps take half a
-# minute
+# Minimum KF prediction interval DT (s): 60,000 steps for a flight of ten minutes take half a minute
 MIN_DT_S = 0.01
 ORIGINAL_PDF_REMEDY = "Ask the author of the report for the PDF that px4fuse wrote."
 LIMIT_NOTE = (
     "Verification confirms that the numbers follow from the log. It does not confirm the author."
 )
 NO_LOG_REASON = "no log was given, so the analysis could not be repeated"
-# Relative tolerance of recorded numbers: the results of four OpenBLAS kernels differ by at most
-# 3e-8 (six flights)
+# Relative tolerance of numbers in a report: the results on four types of processors (OpenBLAS
+# kernels) differ by at most 3e-8 (six flights)
 RELATIVE_TOLERANCE = 1e-6
-# Absolute tolerance of recorded numbers near zero
+# Absolute tolerance of numbers in a report
 ABSOLUTE_TOLERANCE = 1e-9
-# Relative tolerance of recorded estimates. The minimum of the cost is flat: if the cost differs in
-# its 12th digit, the ends of the 95 % interval differ in the 4th digit. Pages print up to three
-# digits
+# Relative tolerance of maximum-likelihood estimates in a report. The cost is flat at its minimum: a
+# change in its 12th digit changes the 4th digit of the estimate. Reports print up to three digits
 ESTIMATE_RELATIVE_TOLERANCE = 1e-3
-# Absolute tolerance of recorded estimates near zero
+# Absolute tolerance of maximum-likelihood estimates in a report
 ESTIMATE_ABSOLUTE_TOLERANCE = 1e-5
-# Starts of the paths of estimated quantities in the results
+# Fields of the results that contain maximum-likelihood estimates, or depend on them
 ESTIMATE_PATHS = (
     "tuning",
     "clock",
@@ -72,29 +70,28 @@ ESTIMATE_PATHS = (
     "source.alignment",
     "settings.clock_offset_s",
 )
-# Results field with the number of iterations of a solver
+# Field of the results with the number of iterations of a solver
 ITERATIONS_FIELD = "iterations"
-# Maximum difference of two numbers of iterations: the solver stops at another step on other
-# processors
+# Maximum difference between numbers of iterations: a solver may stop earlier on another processor
 MAX_ITERATION_DIFFERENCE = 2
-# Results fields that are not compared, because they describe the computer that made the report
+# Fields of the results that are not compared, because they describe the computer
 MACHINE_PATHS = ("provenance.python", "provenance.libraries")
 MAX_LISTED_DIFFERENCES = 20
 MAX_LISTED_PAGE_DIFFERENCES = 5
 MAX_TEXT_LENGTH = 120
-# Factors from a result to its printed number: none, to per cent, to thousandths (mm, ms)
+# Factors by which a result is multiplied before it is printed (per cent; mm or ms)
 PRINTED_SCALES = (1.0, 100.0, 1000.0)
 # Maximum number of lines of a student's notes in a report; a page has 60 lines
 MAX_NOTES_LINES = 5_000
 _NUMBER_PATTERN = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
-# Results of the new run, and a function that draws a report with these results
+# Results of the new analysis, and a function that draws the report with these results
 Recomputed = tuple[ReportedResults, Callable[[], bytes]]
 _LinkFile = Callable[[str, str | None, str], str]
 
 
 class NotRepeatableError(Exception):
-    """Error of an analysis that cannot be repeated; arguments: reason, remedy, missing file."""
+    """Reason why an analysis cannot be repeated, with the action of the user and a missing file."""
 
 
 def log_sha256(results: ReportedResults) -> str:
@@ -108,10 +105,10 @@ def log_name(results: ReportedResults) -> str:
 
 
 def recompute(results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed | Verification:
-    """Repeat the analysis of a report on the files in ``logs`` (by SHA-256).
+    """Repeat the analysis of a report with the settings in ``results``.
 
-    Return the verdict "cannot verify" if the recorded command is not possible, a file is missing,
-    or the analysis fails.
+    Return the status "cannot verify" if the settings are not valid, a file is missing, or the
+    analysis fails. ``logs`` are paths of input files by SHA-256.
     """
     try:
         if tuple(results.provenance.libraries) != LIBRARIES:
@@ -125,7 +122,7 @@ def recompute(results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed 
             else:
                 analysis, new_results = _repeat_comparison(results, link_file)
         return new_results, partial(_draw_report, analysis, new_results, results.provenance)
-    except SettingsError as error:  # px4fuse rejects these settings, so no report can contain them
+    except SettingsError as error:  # px4fuse cannot have made a report with invalid settings
         return cannot_verify(f"{FOREIGN_REQUEST_REASON}: {error}", ASK_AUTHOR_REMEDY)
     except NotRepeatableError as error:
         return cannot_verify(*error.args)
@@ -141,7 +138,8 @@ def _link_file(
 ) -> str:
     """Link the file with this SHA-256 into a temporary folder, and return the path of the link.
 
-    The link has the recorded name, because the report prints it. ``file_label`` is for errors.
+    The link has the file name in the report, which the new report must also print. ``file_label``
+    is for error messages.
     """
     path = None if sha256 is None else logs.get(sha256)
     if path is None:
@@ -151,7 +149,7 @@ def _link_file(
     if name != Path(name).name or name == ".." or "\\" in name or not name.isprintable():
         reason = f"{FOREIGN_REQUEST_REASON}: it contains a path instead of a file name"
         raise NotRepeatableError(reason, ASK_AUTHOR_REMEDY)
-    # each link has a separate folder, because two files may have the same name
+    # a separate folder for each link, because file names may be equal
     target = Path(tempfile.mkdtemp(dir=folder), name)
     try:
         target.symlink_to(path.resolve())
@@ -161,7 +159,7 @@ def _link_file(
 
 
 def split_track(source: str) -> tuple[str, str]:
-    """Split ``LOG:vio`` into the file ``LOG`` and the track ``:vio``, which may be missing."""
+    """Split ``LOG:vio`` into the file ``LOG`` and the track ``:vio`` ("" without a track)."""
     from px4fuse.loop.tracks import TRACK_NAMES  # noqa: PLC0415
 
     file_name, separator, track = source.rpartition(":")
@@ -211,7 +209,7 @@ def _repeat_loop(
 def _draw_report(
     analysis: object, results: ReportedResults, submitted_provenance: Provenance
 ) -> bytes:
-    """Draw the report with the library versions that the submitted report states."""
+    """Draw the report, with the library versions in the submitted report."""
     from px4fuse.report.pdf import render_pdf  # noqa: PLC0415
 
     new_provenance = replace(submitted_provenance, command=results.provenance.command)
@@ -270,7 +268,7 @@ def verify(
 
 
 def cannot_verify(reason: str, remedy: str = "", missing_input: str = "") -> Verification:
-    """Return the verdict "cannot verify", with the reason and the name of a missing input file."""
+    """Return the status "cannot verify" with its reason."""
     reasons = (one_line(reason, 400),)
     return Verification("cannot verify", reasons, False, remedy=remedy, missing=missing_input)
 
@@ -295,10 +293,11 @@ def _verify_with_log(
         f"{RELATIVE_TOLERANCE:g}, estimates within {ESTIMATE_RELATIVE_TOLERANCE:g})"
     ]
     if mismatches:
-        paths = ", ".join(mismatch.path for mismatch in mismatches[:3])
-        paths += ", …" * (len(mismatches) > 3)
+        paths_text = ", ".join(mismatch.path for mismatch in mismatches[:3])
+        paths_text += ", …" * (len(mismatches) > 3)
         reasons = [
-            f"{len(mismatches)} of {value_count} values differ from a new run on the log: {paths}"
+            f"{len(mismatches)} of {value_count} values differ from a new run on the log: "
+            f"{paths_text}"
         ]
     is_same_text = partial(is_same_text_rounded, is_same_number=is_same_number)
     page_differences = compare_pages(pdf, redrawn_pdf, is_same_text)
@@ -309,7 +308,7 @@ def _verify_with_log(
         if page_differences
         else ()
     )
-    # pages from another program or from other library versions may differ without a forgery
+    # another PDF program or other library versions may change pages without a forgery
     is_comparable = not (is_from_other_program or differing_libraries)
     page_status: PageStatus = "same"
     if page_differences:
@@ -321,13 +320,13 @@ def _verify_with_log(
     page_sentences = difference_sentences[:MAX_LISTED_PAGE_DIFFERENCES]
     if unlisted_count := len(difference_sentences) - len(page_sentences):
         page_sentences.append(f"the PDF has {unlisted_count} more differences")
-    # the class table shows only the first reason, so the decisive reasons are first
+    # the decisive reason is first: some tables show only one reason
     if status == "cannot verify":
         reasons = page_sentences + reasons
     else:
         reasons += page_sentences
     remedy = ORIGINAL_PDF_REMEDY if is_from_other_program else ""
-    if differing_libraries:  # their pages may differ slightly
+    if differing_libraries:
         versions_text = one_line(", ".join(map(" ".join, sorted(differing_libraries))), 300)
         reasons.append(
             f"the report was made with {versions_text}; this computer has other versions"
@@ -349,9 +348,10 @@ def _verify_with_log(
 def is_same_number_rounded(
     agreeing_pairs: Iterable[tuple[float, float]], submitted_number: str, redrawn_number: str
 ) -> bool:
-    """Return True if two printed numbers are roundings of results that agree.
+    """Return True if two printed numbers are roundings of one pair of results that agree.
 
-    ``agreeing_pairs`` are recorded and recomputed results that are equal within the tolerances.
+    ``agreeing_pairs`` are results in the report and in the new analysis that differ by less than
+    the tolerance.
     """
     decimals = _decimal_count(submitted_number)
     printed_pair = float(submitted_number), float(redrawn_number)
@@ -365,20 +365,19 @@ def is_same_number_rounded(
 def compare_results(
     recorded_results: Mapping[str, Any], new_results: Mapping[str, Any]
 ) -> tuple[tuple[Mismatch, ...], TextComparison, int]:
-    """Compare all values of the recorded results with those of a new run.
+    """Compare all values in the results of a report with the results of a new analysis.
 
     Returns
     -------
     mismatches : tuple of Mismatch
         Values that differ by more than the tolerances.
     is_same_number : callable
-        Returns True if two printed numbers are roundings of the same result.
+        Returns True if two printed numbers are roundings of results that agree.
     value_count : int
         Number of compared values.
     """
     command = str(new_results["provenance"]["command"])
-    # with the value "auto" or the option --position, all numbers depend on an estimated time offset
-    # or frame alignment
+    # "auto" and --position estimate time offset or frame alignment, on which all numbers depend
     are_all_estimated = not {"auto", "--position"}.isdisjoint(command.split())
     recorded_values, new_values = dict(flatten(recorded_results)), dict(flatten(new_results))
     pair_by_path = {
@@ -407,12 +406,12 @@ def compare_results(
     return tuple(mismatches), is_same_number, len(pair_by_path)
 
 
-# Placeholder of a value that only one of two results contains
+# Mark of a value that is missing in one of two results
 _ABSENT = object()
 
 
 def flatten(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield path and value of each element of nested mappings and lists; dots join the keys.
+    """Yield path and value of each element of nested mappings and lists.
 
     >>> [*flatten({"a": {"b.c": [1, 2]}})]
     [('a.b.c.0', 1), ('a.b.c.1', 2)]
@@ -427,7 +426,7 @@ def flatten(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def is_number(value: object) -> bool:
-    """Return True for a number, False for a bool."""
+    """Return True for int and float, but not for bool."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -457,7 +456,7 @@ def is_same_text_rounded(first_text: str, second_text: str, is_same_number: Text
     """
     if first_text == second_text:
         return True
-    # the split lists contain texts and numbers in turn
+    # elements 1, 3, 5, ... are numbers
     first_parts, second_parts = map(_NUMBER_PATTERN.split, (first_text, second_text))
     number_pairs = zip(first_parts[1::2], second_parts[1::2], strict=False)
     return first_parts[::2] == second_parts[::2] and all(

@@ -211,7 +211,7 @@ def speed(flight: Flight, model: Model) -> None:
         ("EKF2_EV_DELAY", np.linspace(5.0, 150.0, count)),
     ):
         settings = [{name: float(value)} for value in values]
-        each = cpu_s(lambda settings=settings: replay_settings(model, settings), 3) / count
+        each = cpu_s(lambda settings=settings: list(replay_settings(model, settings)), 3) / count
         print(f"{count} values of {name}: {each:.4f} s of CPU each (aim 0.03 s)")
     for share in (0.25, 0.5, 1.0):
         assert not isinstance(flight.imu, Unavailable)

@@ -18,7 +18,13 @@ from measured import seconds
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 FOLDER = Path(__file__).parents[3] / "shared" / "pose_graphs"
-NAMED = ("SE-Sync_manhattan", "SE-Sync_sphere2500", "SE-Sync_parking-garage")
+NAMED = (
+    "SE-Sync_manhattan",
+    "SE-Sync_sphere2500",
+    "SE-Sync_parking-garage",
+    "SE-Sync_city10000",
+    "SE-Sync_torus3D",
+)
 SIZES = (100, 300, 1000, 3000, 10_000)
 
 
@@ -59,7 +65,8 @@ def main() -> None:
             theirs[run] = seconds(optimiser.optimize)
         found, other = solve(graph), factors.error(optimiser.values())
         print(
-            f"{name}: {len(graph)} poses, {len(graph.first)} edges, {graph.initialised}, read in "
+            f"{name}: {len(graph)} poses, {len(graph.first_nodes)} edges, "
+            f"{graph.initialised}, read in "
             f"{reading:.2f} s; {np.median(ours / theirs):.2f} x GTSAM "
             f"({np.median(ours):.3f} s / {np.median(theirs):.3f} s, {runs} pairs); "
             f"steps {found.iterations} / {optimiser.iterations()}; cost {cost(graph):.6g} -> "

@@ -34,8 +34,8 @@ from px4fuse.findings import find, find_loop
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.analysis import analyse, analyse_flight_loop
 from px4fuse.loop.tracks import LoopSource, trajectory_of
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import Scenario, make_scenario
 
 TABLE = Path(__file__).with_name("rates.csv")
@@ -188,7 +188,7 @@ def _fly(job: Job) -> list[tuple[str, ...]]:
     """Return the findings for each condition of one flight."""
     first = job.conditions[0]
     scenario = first.flight(job.seed)
-    mistakes = parse_mistakes(first.mistakes)
+    mistakes = parse_faults(first.mistakes)
     named: list[tuple[str, ...]] = []
     of_loop: tuple[str, ...] = ()
     if scenario.kind == "loop":

@@ -41,8 +41,8 @@ from px4fuse.report import clock, phrases
 from px4fuse.request import ComparisonRequest, WhatIfRequest
 from px4fuse.results import build
 from px4fuse.results.contract import to_json_dict
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import make_scenario
 
 ROOT = Path(__file__).parents[2]
@@ -93,7 +93,7 @@ def flight_outputs(request: ComparisonRequest, flight: Flight | None = None) -> 
         "json": to_json_dict(build.results(request, analysis)),
         "parameters": {n: v for n, v in flight.log.parameters.items() if n in PARAMETERS},
     }
-    comparison = prepare_comparison(request, flight=flight)
+    comparison = prepare_comparison(flight, request)
     noises = estimate_noises(comparison)
     outputs["tune"] = phrases.tuning_advice(comparison, noises)
     outputs["tune_json"] = to_json_dict(build.tuning_results(request, comparison, noises))
@@ -354,7 +354,7 @@ class Job(NamedTuple):
         """Return the request and the flight."""
         if self.kind:
             flight = simulate_flight(
-                make_scenario(self.kind, seed=self.seed), parse_mistakes(self.mistakes)
+                make_scenario(self.kind, seed=self.seed), parse_faults(self.mistakes)
             )
             return ComparisonRequest(log=flight.log.name), flight
         os.chdir(SHARED / "cases")  # arguments of cases are relative to it

@@ -35,7 +35,7 @@ from msgspec import structs
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare
 from px4fuse.comparison.model import Comparison, ErrorsAgainstTruth
-from px4fuse.diagnose import diagnose, prepare_comparison
+from px4fuse.diagnose import diagnose, prepare_comparison, read_flight
 from px4fuse.ekf2.model import Model, open_model, with_misaligned_positions
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.errors import Px4FuseError
@@ -156,11 +156,9 @@ def follow(analysis: Analysis, request: ComparisonRequest) -> list[Fix]:
         change, before_m, after_m = dict(items), math.nan, math.nan
         try:
             if kind == "KF":
-                again = compare(
-                    prepare_comparison(
-                        apply_options(request, change), flight=None if request.position else flight
-                    )
-                )
+                fixed = apply_options(request, change)
+                fixed_flight = read_flight(fixed) if request.position else flight
+                again = compare(prepare_comparison(fixed_flight, fixed))
                 before_m, after_m = rmse_m(analysis), rmse_m(again)
             elif isinstance(model, Model) and kind == "EKF2":
                 before_m, after_m = replayed_m(model, change)
@@ -180,7 +178,7 @@ def follow(analysis: Analysis, request: ComparisonRequest) -> list[Fix]:
         try:
             sent = compare(
                 prepare_comparison(
-                    request, flight=None if request.position else flight, as_sent=True
+                    read_flight(request) if request.position else flight, request, as_sent=True
                 )
             )
             fixes.append(

@@ -18,9 +18,9 @@ import numpy as np
 from msgspec.structs import replace
 
 from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
-from px4fuse.classroom.assignment.figures import FAULTS, QUESTIONS
+from px4fuse.classroom.assignment.figures import FIGURE_FAULTS, QUESTIONS
 from px4fuse.classroom.assignment.roster import Person
-from px4fuse.classroom.assignment.truth import FormTruth, InjectedFault
+from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers
 from px4fuse.classroom.grading.form_points import accepted_corrections, form_points, panels_showing
 from px4fuse.results.answer_form import (
     CHOICE_NAMES,
@@ -39,7 +39,7 @@ SHA256 = "0" * 64
 GUESSES = 20
 
 
-def truth(number: int) -> FormTruth:
+def truth(number: int) -> RightFormAnswers:
     """Return the correct answers for the flight of one student of a mixed class."""
     student = Person(f"s{number}")
     _, answer = simulate_assigned_flight(SECRET, student, "mixed")
@@ -47,18 +47,18 @@ def truth(number: int) -> FormTruth:
     return answer.form
 
 
-def guess_choices(rng: np.random.Generator, one: FormTruth) -> tuple[str, ...]:
+def guess_choices(rng: np.random.Generator, one: RightFormAnswers) -> tuple[str, ...]:
     """Guess the fault of each figure, and give the answers to all questions for this fault."""
     letters, count = [], len(QUESTIONS)
     for first in range(0, len(one.choices), count):
         guess = rng.choice(one.choices[first][0].options)
-        fault = next(each for each in FAULTS.values() if each.fault == guess)
+        fault = next(each for each in FIGURE_FAULTS.values() if each.fault == guess)
         for (choice, _), field in zip(one.choices[first : first + count], QUESTIONS, strict=True):
             letters.append(CHOICE_NAMES[choice.options.index(getattr(fault, field))])
     return tuple(letters)
 
 
-def at_random(rng: np.random.Generator, one: FormTruth) -> Answers:
+def at_random(rng: np.random.Generator, one: RightFormAnswers) -> Answers:
     """Return a form with random valid answers."""
     named = [name for name in FAULT_KINDS if name != "none"]
     kinds = rng.choice(named, int(rng.integers(1, 4)), replace=False)
@@ -81,7 +81,7 @@ def at_random(rng: np.random.Generator, one: FormTruth) -> Answers:
     )
 
 
-def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
+def constants(truths: Sequence[RightFormAnswers], kind: str) -> Iterator[Answers]:
     """Yield constant forms: one fault of several sizes, and the most frequent other answers."""
 
     def common(values: list[str]) -> str:
@@ -114,7 +114,7 @@ def constants(truths: Sequence[FormTruth], kind: str) -> Iterator[Answers]:
             yield replace(blank, mistakes=(claim,))
 
 
-def right(one: FormTruth) -> Answers:
+def right(one: RightFormAnswers) -> Answers:
     """Return the correct form."""
     claims = []
     for wrong in one.mistakes:

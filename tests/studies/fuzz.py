@@ -39,7 +39,12 @@ import ulog_tools  # noqa: E402
 from class_tools import run_in_turn  # noqa: E402
 from conftest import blank_page  # noqa: E402
 
-from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers, key_text, read_key  # noqa: E402
+from px4fuse.classroom.assignment.key import (  # noqa: E402
+    AnswerKey,
+    RightAnswers,
+    format_answer_key,
+    read_answer_key,
+)
 from px4fuse.classroom.assignment.roster import read_people, read_roster  # noqa: E402
 from px4fuse.classroom.assignment.sheet import read_sheet  # noqa: E402
 from px4fuse.classroom.grading import grade as grading  # noqa: E402
@@ -207,7 +212,7 @@ def _key() -> list[bytes]:
         RightAnswers("s1", "Ada", "s1.ulg", "0" * 64),
         RightAnswers("s2", "山田", "s2.ulg", "1" * 64),
     )
-    return [key_text(AnswerKey("aisle", people)).encode()]
+    return [format_answer_key(AnswerKey("aisle", people)).encode()]
 
 
 def _class_list(path: Path) -> object:
@@ -234,7 +239,7 @@ TARGETS = (
     Target("overrides", _text(_OVERRIDES), read_overrides, ".csv", True, 900, 6.0),
     Target("roster", _text(_ROSTER, _MOODLE), read_roster, ".csv", True, 900, 6.0),
     Target("class list", _text(_ROSTER, _MOODLE), _class_list, ".csv", True, 900, 6.0),
-    Target("answer key", _key, read_key, ".json", True, 300, 2.0),
+    Target("answer key", _key, read_answer_key, ".json", True, 300, 2.0),
 )  # fmt: skip
 
 

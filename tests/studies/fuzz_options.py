@@ -45,7 +45,7 @@ from fuzz_fields import (  # noqa: E402
 )
 from ulog_tools import load  # noqa: E402
 
-from px4fuse.classroom.assignment.key import AnswerKey, key_text  # noqa: E402
+from px4fuse.classroom.assignment.key import AnswerKey, format_answer_key  # noqa: E402
 from px4fuse.classroom.grading import grade as grading  # noqa: E402
 from px4fuse.classroom.grading.rubric import rubric_text  # noqa: E402
 from px4fuse.cli import COMMANDS, cli  # noqa: E402
@@ -53,7 +53,7 @@ from px4fuse.core import workers  # noqa: E402
 from px4fuse.errors import Px4FuseError  # noqa: E402
 from px4fuse.findings.model import CATALOGUE  # noqa: E402
 from px4fuse.report import pdf  # noqa: E402
-from px4fuse.simulation.mistakes import MISTAKES  # noqa: E402
+from px4fuse.simulation.faults import FAULT_TYPES  # noqa: E402
 
 LOGS = ("aisle.ulg", "aisle.ulg", "gnss.ulg", "vio.ulg", "m.tlog")
 # Arguments by command; one of the rows is drawn
@@ -119,7 +119,7 @@ VALUES: dict[str, Draw] = {
     "sigma_uwb_m": between(0.001, 5.0), "vio_drift": between(0.0, 0.1),
     "sigma_gnss_m": between(0.01, 10.0), "accel_bias_sigma_m_s2": between(0.0, 1.0),
     "simulate sigma_a_m_s2": between(0.01, 5.0),
-    "mistake": lambda rng: rng.choice(sorted(MISTAKES)), "mistakes": one_of("0", "1", "2"),
+    "mistake": lambda rng: rng.choice(sorted(FAULT_TYPES)), "mistakes": one_of("0", "1", "2"),
     "assignment": one_of("roster.csv"), "secret_file": one_of("secret.txt"),
     "logs": one_of("logs", "aisle.ulg"), "rubric": one_of("rubric.toml"), "key": one_of("key.json"),
     "roster": one_of("roster.csv"), "worksheet": one_of("sheet.csv"), "column": one_of("grade"),
@@ -140,7 +140,8 @@ NEEDS = {
 }  # fmt: skip
 # Options that exclude each other
 EXCLUDED = (
-    {"opened", "landed_at"}, {"opened", "closures"}, {"sweep", "without"}, {"sweep", "changes"},
+    {"is_open_path", "landed_at"}, {"is_open_path", "closures"},
+    {"sweep", "without"}, {"sweep", "changes"},
     {"source_kind", "height"},
 )  # fmt: skip
 # Options that a desk has no value for, and those that only limit a run
@@ -175,7 +176,7 @@ def make_desk(folder: Path) -> None:
         "notes.md": "# Title\n\n* words **bold** $x^2$\n",
         "secret.txt": "a secret of enough letters",
         "roster.csv": "id,name\n1,Ada\n2,山田\n", "sheet.csv": "id,name,grade\n1,Ada,\n",
-        "rubric.toml": rubric_text(), "key.json": key_text(AnswerKey("aisle", ())),
+        "rubric.toml": rubric_text(), "key.json": format_answer_key(AnswerKey("aisle", ())),
     }.items():  # fmt: skip
         (folder / name).write_text(text, encoding="utf-8")
     os.chdir(folder)
@@ -195,7 +196,7 @@ def drawn_words(name: str, command: click.Command, rng: random.Random, out: Path
         if isinstance(one, click.Option) and one.expose_value and one.name not in NEVER
     }
     if name == "practice":
-        del options["opened"]  # it opens a browser
+        del options["opens_page"]  # it opens a browser
     arguments = rng.choice(ARGUMENTS.get(name, ("",)))
     chosen = set(rng.sample(sorted(options), min(rng.randrange(6), len(options))))
     chosen |= {NEEDS[one] for one in chosen if one in NEEDS}

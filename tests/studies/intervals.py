@@ -21,8 +21,8 @@ from detector_rates import DEFAULT, SCENARIOS, clean
 from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.filter.time_offset import MAX_CHANGE_P_VALUE, MIN_OFFSET_S, ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 
 FIRST_SEED = 2000
 OUTLIERS = ("nlos=2%", "nlos=7%", "nlos=12%", "nlos=6%,0.5m")
@@ -38,7 +38,7 @@ def measured(job: Job) -> tuple[float, ...] | None:
     """Return the estimates of one flight; None without an estimate."""
     seed, scenario, mistake = job
     flown = replace(clean(scenario).flight(seed), ekf2=False, truth=False)
-    flight = simulate_flight(flown, parse_mistakes((mistake,) if mistake else ()))
+    flight = simulate_flight(flown, parse_faults((mistake,) if mistake else ()))
     comparison = compare(flight, axes=("north", "east"))
     tuning, clock = estimate_noises_and_clock(comparison)
     tuned = tuning[HORIZONTAL]

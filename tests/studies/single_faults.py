@@ -30,8 +30,8 @@ from scipy.spatial.transform import Rotation
 from px4fuse.diagnose import diagnose
 from px4fuse.errors import Px4FuseError
 from px4fuse.request import ComparisonRequest
+from px4fuse.simulation.faults import FaultSizes
 from px4fuse.simulation.flights import simulate, to_flight
-from px4fuse.simulation.mistakes import Mistakes
 from px4fuse.simulation.scenario import Scenario, make_scenario
 
 TOPIC = "vehicle_visual_odometry"
@@ -259,7 +259,7 @@ def fly(job: Job) -> tuple[Job, list[tuple[str, str]]]:
     """Return id and title of the findings above notes of one flight, causes first."""
     kind = KINDS[job.kind]
     scenario = scenario_of(job)
-    simulation = simulate(scenario, Mistakes())
+    simulation = simulate(scenario, FaultSizes())
     (topic,) = (one for one in simulation.topics if one.name == TOPIC)
     fields = {name: np.array(value) for name, value in topic.fields.items()}
     time_s = np.asarray(fields["timestamp_sample"], float) * 1e-6

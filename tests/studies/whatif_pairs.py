@@ -17,8 +17,8 @@ from concurrent.futures import ProcessPoolExecutor
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.flight.model import Unavailable
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
-from px4fuse.simulation.mistakes import parse_mistakes
 from px4fuse.simulation.scenario import ScenarioKind, make_scenario
 
 NIS_WITHIN, REJECTED_WITHIN, ERROR_WITHIN = 0.10, 0.03, 0.10
@@ -54,7 +54,7 @@ def pairs(seeds: int, kind: ScenarioKind = "aisle") -> Iterator[Pair]:
 def opened(kind: ScenarioKind, seed: int, mistake: str) -> Model | Unavailable:
     """Open the EKF2 model of a flight with a fault."""
     scenario = make_scenario(kind, seed=seed, passes=3)
-    return open_model(simulate_flight(scenario, parse_mistakes((mistake,) if mistake else ())))
+    return open_model(simulate_flight(scenario, parse_faults((mistake,) if mistake else ())))
 
 
 def flown(kind: ScenarioKind, seed: int, mistake: str) -> WhatIf | Unavailable:

@@ -1,4 +1,4 @@
-"""Writing of an assignment: log and answer form for each student, and the answer key."""
+"""Writing of an assignment: log and question form for each student, and the answer key."""
 
 import hashlib
 import secrets
@@ -10,24 +10,29 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from px4fuse.classroom.assignment.figures import draw_figures, select_choices
-from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers, key_text, read_key
+from px4fuse.classroom.assignment.key import (
+    AnswerKey,
+    RightAnswers,
+    format_answer_key,
+    read_answer_key,
+)
 from px4fuse.classroom.assignment.random_assignment import (
     FlightKind,
     assign_random_flight,
-    derive_key,
+    derive_hmac_key,
     random_uniform,
 )
 from px4fuse.classroom.assignment.roster import Person, normalise_text
-from px4fuse.classroom.assignment.truth import form_truth
+from px4fuse.classroom.assignment.truth import right_form_answers
 from px4fuse.core.input_files import inputs_not_registered
 from px4fuse.core.text import to_json_types
 from px4fuse.core.writing import write_all
 from px4fuse.errors import OutputError
 from px4fuse.results.answer_form import form_name, form_text
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 
-# True values of the simulation in the answer key
+# Fields of a simulation whose true values are written to the answer key
 TRUE_VALUE_NAMES = (
     "duration_s",
     "sigma_z_m",
@@ -40,18 +45,24 @@ TRUE_VALUE_NAMES = (
 
 
 def simulate_assigned_flight(
-    secret: bytes, student: Person, kind: FlightKind, count: int | None = None, truth: bool = True
+    secret: bytes,
+    student: Person,
+    kind: FlightKind,
+    fault_count: int | None = None,
+    with_ground_truth: bool = True,
 ) -> tuple[bytes, RightAnswers]:
     """Simulate the flight of one student; return the log (ULog) and the right answers."""
-    assigned_flight = assign_random_flight(secret, student.student_id, kind, count, truth)
+    assigned_flight = assign_random_flight(
+        secret, student.student_id, kind, fault_count, with_ground_truth
+    )
     simulation = flights.simulate(
-        assigned_flight.scenario, parse_mistakes(assigned_flight.mistake_options)
+        assigned_flight.scenario, parse_faults(assigned_flight.mistake_options)
     )
     log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()
-    true_values = flights.answer(simulation)["truth"]
+    true_values = flights.make_answer_key(simulation)["truth"]
     choices = select_choices(partial(random_uniform, secret, student.student_id, kind))
-    form = replace(form_truth(simulation, sha256), choices=choices)
+    right_form = replace(right_form_answers(simulation, sha256), choices=choices)
     return log, RightAnswers(
         student_id=student.student_id,
         name=student.name,
@@ -61,17 +72,17 @@ def simulate_assigned_flight(
         mistakes=assigned_flight.mistake_options,
         true_values={name: float(true_values[name]) for name in TRUE_VALUE_NAMES},
         difficulty=assigned_flight.difficulty,
-        form=form,
+        form=right_form,
     )
 
 
-def key_path(folder: Path, key_option: Path | None) -> Path:
-    """Return the path of the answer key, by default beside the folder for the students.
+def answer_key_path(folder: Path, key_option: Path | None) -> Path:
+    """Return the path of the answer key, by default next to the students' folder.
 
     Raises
     ------
     OutputError
-        The path is inside the folder for the students.
+        The path is inside the students' folder, so that students could read the answers.
     """
     resolved_folder = folder.resolve()
     path = key_option or resolved_folder.parent / f"{resolved_folder.name}_answers.json"
@@ -89,57 +100,65 @@ def assign(
     key_file: Path,
     secret: bytes | None,
     kind: FlightKind,
-    count: int | None = None,
-    truth: bool = True,
+    fault_count: int | None = None,
+    with_ground_truth: bool = True,
     progress: Callable[[int, int], None] = lambda *_: None,
 ) -> tuple[AnswerKey, int]:
     """Write log, answer form and figures of each student to a folder, and the answer key.
 
-    Students can be added to an existing key. Existing files must have the same content.
+    Existing files are not overwritten. A later call can add students to the answer key.
 
     Parameters
     ----------
     secret : bytes or None
-        None for the secret in the existing key, or for a new random secret.
-    count, truth
-        See :func:`~px4fuse.classroom.assignment.random_assignment.assign_random_flight`.
+        Seed of the random numbers; None for the secret in the existing answer key, or for a new
+        random secret.
+    fault_count : int, optional
+        Number of injected faults of each flight; random by default.
+    with_ground_truth : bool
+        True to log the ground truth.
 
     Returns
     -------
     key : AnswerKey
         Right answers for all students.
     written_count : int
-        Number of written logs; the other logs existed already.
+        Number of new logs.
 
     Raises
     ------
     SettingsError
-        One flight cannot have this many injected faults.
+        A flight cannot have ``fault_count`` injected faults.
     OutputError
         A file exists with other content, or cannot be written.
     """
     with inputs_not_registered():
-        key = read_key(key_file) if key_file.exists() else AnswerKey(kind, ())
+        key = read_answer_key(key_file) if key_file.exists() else AnswerKey(kind, ())
     answers = {normalise_text(answer.student_id): answer for answer in key.answers}
-    # an answer key with none of the students belongs to another class
+    # an answer key without any of these students was written for another class
     is_same_class = not answers or not answers.keys().isdisjoint(
         normalise_text(student.student_id) for student in students
     )
-    _require_extension(key_file, key.kind == kind and is_same_class)
+    _require_same_flights(key_file, key.kind == kind and is_same_class)
     stored_secret = key.secret
     if secret is None:
         stored_secret = stored_secret or secrets.token_urlsafe(24)
-        secret = derive_key(stored_secret)
-    elif derive_key(stored_secret) != secret:
+        secret = derive_hmac_key(stored_secret)
+    elif derive_hmac_key(stored_secret) != secret:
         stored_secret = ""
     written_count = 0
     for finished_count, student in enumerate(students, start=1):
-        log, answer = simulate_assigned_flight(secret, student, kind, count, truth)
+        log, answer = simulate_assigned_flight(
+            secret, student, kind, fault_count, with_ground_truth
+        )
         stored_answer = answers.setdefault(normalise_text(student.student_id), answer)
-        _require_extension(key_file, stored_answer.sha256 == answer.sha256)
+        _require_same_flights(key_file, stored_answer.sha256 == answer.sha256)
         choices = stored_answer.form.choices if stored_answer.form else ()
-        form = form_text(student.file, answer.sha256, [choice for choice, _ in choices]).encode()
-        content_by_path = {folder / student.file: log, folder / form_name(student.file): form}
+        empty_form = form_text(student.file, answer.sha256, [choice for choice, _ in choices])
+        content_by_path = {
+            folder / student.file: log,
+            folder / form_name(student.file): empty_form.encode(),
+        }
         missing_content_by_path = {
             path: content
             for path, content in content_by_path.items()
@@ -150,8 +169,8 @@ def assign(
             random_number = partial(random_uniform, secret, student.student_id, kind)
             missing_content_by_path[figures_file] = draw_figures(random_number)
         key = AnswerKey(kind, tuple(answers.values()), stored_secret)
-        # the answer key is written before the log, because an interrupted run needs its secret
-        write_all({key_file: key_text(key).encode()})
+        # the secret must be stored before the log: a restart after an interruption needs it
+        write_all({key_file: format_answer_key(key).encode()})
         key_file.chmod(0o600)  # only the instructor can read the answer key
         write_all(missing_content_by_path)
         written_count += folder / student.file in missing_content_by_path
@@ -160,7 +179,7 @@ def assign(
 
 
 def _is_written(path: Path, content: bytes) -> bool:
-    """Return True if the file exists with this content; raise OutputError if it has another."""
+    """Return True if the file exists; raise OutputError if its content differs."""
     if not path.exists() and not path.is_symlink():
         return False
     if path.is_file() and path.stat().st_size == len(content) and path.read_bytes() == content:
@@ -171,8 +190,8 @@ def _is_written(path: Path, content: bytes) -> bool:
     )
 
 
-def _require_extension(key_file: Path, is_extension: bool) -> None:
-    if not is_extension:
+def _require_same_flights(key_file: Path, has_same_flights: bool) -> None:
+    if not has_same_flights:
         raise OutputError(
             f"{key_file} is the answer key of other flights and was not overwritten. Use the "
             "secret, options and students of the existing key (you can add students), or another "

@@ -1,6 +1,6 @@
-"""Figures of further simulated flights, about which the answer form asks questions.
+"""Multiple-choice questions about figures of simulated flights.
 
-The student does not get the logs of these flights, so that px4fuse cannot answer the questions.
+The student gets the figures but not the logs, so that px4fuse cannot answer the questions.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -8,28 +8,27 @@ from io import BytesIO
 
 import pandas as pd
 
-from px4fuse.card.model import FILTER_NAMES
 from px4fuse.classroom.assignment.random_assignment import random_scenario_numbers
 from px4fuse.classroom.assignment.truth import compare_simulation
 from px4fuse.comparison.comparison import position_errors
-from px4fuse.comparison.model import FILTERS, AxisComparison, Comparison, FilterName
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, Comparison, FilterName
 from px4fuse.core.record import Record, read_toml
 from px4fuse.flight.model import Ekf2, Truth
 from px4fuse.report import panels, style
 from px4fuse.results.answer_form import CHOICE_NAMES, Choice, ChoiceName
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import parse_mistakes
+from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import make_scenario
 
 FIGURE_COUNT = 3
-# Number of passes along the aisle in the flight of a figure
-PASSES = 4
-# The background of the plots is grey while the speed (m/s) along the aisle is above this value
+# Number of passes along the aisle in each simulated flight
+PASS_COUNT = 4
+# Minimum speed (m/s) along the aisle for a grey background in the plots
 MIN_GREY_SPEED_M_S = 0.2
-# Questions about each figure, by the field of FigureFault with the right answer
+# Questions about each figure, by the field of FigureFault that contains the right answer
 QUESTIONS = {
     "fault": "injected fault",
-    "evidence": "plots that show the fault, and that do not show it",
+    "evidence": "plots that show the fault, and plots that do not",
     "change": "smallest change that makes both filters consistent",
     "prediction": "effect if SIGMA_Z and EKF2_EVP_NOISE were three times as large",
     "useless": "change that does not help, and the reason",
@@ -37,7 +36,7 @@ QUESTIONS = {
 
 
 class FigureFault(Record):
-    """Injected fault of a flight in a figure (``figures.toml``), and right answers about it.
+    """Injected fault of a simulated flight, and right answers to the questions about its figure.
 
     ``option`` is the value of ``px4fuse simulate --mistake``, or "" without a fault.
     """
@@ -50,82 +49,79 @@ class FigureFault(Record):
     option: str = ""
 
 
-FAULTS = read_toml(__file__, dict[str, FigureFault])
+FIGURE_FAULTS = read_toml(__file__, dict[str, FigureFault])
 
 
-def _shuffle(names: Iterable[str], label: str, random_number: Callable[[str], float]) -> list[str]:
-    return sorted(names, key=lambda name: random_number(f"{label} {name}"))
+def _shuffle(names: Iterable[str], prefix: str, random_number: Callable[[str], float]) -> list[str]:
+    return sorted(names, key=lambda name: random_number(f"{prefix} {name}"))
 
 
 def _select_kinds(random_number: Callable[[str], float]) -> dict[str, str]:
-    """Select the fault of each figure at random; return its kind by title of the figure."""
-    kinds = _shuffle(FAULTS, "figures", random_number)[:FIGURE_COUNT]
+    """Select the injected fault of each figure at random; return the fault by figure title."""
+    kinds = _shuffle(FIGURE_FAULTS, "figures", random_number)[:FIGURE_COUNT]
     return {f"Figure {number}": kind for number, kind in enumerate(kinds, start=1)}
 
 
 def select_choices(
     random_number: Callable[[str], float],
 ) -> tuple[tuple[Choice, ChoiceName], ...]:
-    """Select the answers to the questions about the figures; return the right letters, too.
+    """Make multiple-choice questions about the figures; return each with its right letter.
 
-    ``random_number`` returns the random number in [0, 1) that belongs to a label.
+    ``random_number`` returns a random number in [0, 1) that depends only on its argument.
     """
     choices = []
     for title, kind in _select_kinds(random_number).items():
-        other_kinds = _shuffle(FAULTS.keys() - {kind}, f"{title} other", random_number)
+        other_kinds = _shuffle(FIGURE_FAULTS.keys() - {kind}, f"{title} other", random_number)
         kinds = [kind, *other_kinds[: len(CHOICE_NAMES) - 1]]
         for field, question in QUESTIONS.items():
             shuffled_kinds = _shuffle(kinds, f"{title} {field}", random_number)
-            options = tuple(getattr(FAULTS[each], field) for each in shuffled_kinds)
+            options = tuple(getattr(FIGURE_FAULTS[each], field) for each in shuffled_kinds)
             right_letter = CHOICE_NAMES[shuffled_kinds.index(kind)]
             choices.append((Choice(f"{title}: {question}", options), right_letter))
     return tuple(choices)
 
 
 def draw_figures(random_number: Callable[[str], float]) -> bytes:
-    """Simulate and analyse the flights of the figures; return the plots as a PNG file."""
+    """Simulate, analyse and plot the flights of the figures; return a PNG file."""
     comparisons = {}
     for title, kind in _select_kinds(random_number).items():
 
-        def figure_random_number(label: str, title: str = title) -> float:
-            return random_number(f"{title} {label}")
+        def figure_random_number(quantity: str, title: str = title) -> float:
+            return random_number(f"{title} {quantity}")
 
         numbers = random_scenario_numbers("aisle", figure_random_number)
         seed = int(2**53 * figure_random_number("seed"))
-        scenario = make_scenario("aisle", passes=PASSES, seed=seed, **numbers)
-        mistakes = parse_mistakes(tuple(filter(None, [FAULTS[kind].option])))
-        comparisons[title] = compare_simulation(flights.simulate(scenario, mistakes))
+        scenario = make_scenario("aisle", passes=PASS_COUNT, seed=seed, **numbers)
+        faults = parse_faults(tuple(filter(None, [FIGURE_FAULTS[kind].option])))
+        comparisons[title] = compare_simulation(flights.simulate(scenario, faults))
     return _figures_png(comparisons)
 
 
 def _figures_png(comparisons: Mapping[str, Comparison]) -> bytes:
-    """Plot innovations, position errors and map of each flight in one row."""
+    """Plot each flight in one row: innovations, position errors of KF and EKF2, and map."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - slow import
 
     png_buffer = BytesIO()
     with style.report_style():
-        picture = Figure(figsize=(17.0, 3.6 * len(comparisons)), layout="constrained")
-        rows = picture.subplots(len(comparisons), 4, squeeze=False)
+        figure = Figure(figsize=(17.0, 3.6 * len(comparisons)), layout="constrained")
+        rows = figure.subplots(len(comparisons), 4, squeeze=False)
         for (title, comparison), axes in zip(comparisons.items(), rows, strict=True):
-            result = comparison.main.in_flight
+            result = comparison.main.with_flight_tracks()
             axes[0].set_title(f"{title}: innovations along the aisle and ±2√S (m)")
             panels.draw_innovations(axes[0], result)
-            for axis, filter_name in zip(axes[1:3], FILTERS, strict=True):
+            for axis, filter_name in zip(axes[1:3], FILTER_NAMES, strict=True):
                 _draw_errors(axis, result, filter_name)
             for axis in axes[:3]:
                 style.label_time_axis(axis, with_time_label=True)
             _draw_map(axes[3], comparison)
-        picture.savefig(png_buffer, format="png", dpi=90, metadata={"Software": None})
+        figure.savefig(png_buffer, format="png", dpi=90, metadata={"Software": None})
     return png_buffer.getvalue()
 
 
 def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterName) -> None:
-    """Plot the position error of a filter with ±2σ, grey while the vehicle flies down the aisle."""
-    name, errors, truth = (
-        FILTER_NAMES[filter_name],
-        position_errors(result, filter_name),
-        result.truth,
-    )
+    """Plot the position error of a filter with ±2σ; grey background during motion."""
+    name, truth = FILTER_NAMES[filter_name], result.truth
+    errors = position_errors(result, filter_name)
     axes.set_title(f"{name}: error along the aisle and ±2σ (m)")
     assert isinstance(errors, pd.DataFrame)
     assert isinstance(truth, pd.DataFrame)

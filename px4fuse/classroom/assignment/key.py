@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from px4fuse.classroom.assignment.roster import MAX_STUDENTS, Person, Register, normalise_text
-from px4fuse.classroom.assignment.truth import FormTruth
+from px4fuse.classroom.assignment.roster import MAX_STUDENTS, ClassList, Person, normalise_text
+from px4fuse.classroom.assignment.truth import RightFormAnswers
 from px4fuse.core.reading import read_text
 from px4fuse.errors import SettingsError
 from px4fuse.results.answer_form import update_renamed_values
@@ -28,7 +28,7 @@ _Texts = Annotated[
 class RightAnswers(
     msgspec.Struct, frozen=True, rename={"student_id": "id", "true_values": "truth"}
 ):
-    """Assigned flight of one student, with its injected faults and the right answers.
+    """Simulated flight of one student, with its injected faults and the right answers.
 
     Attributes
     ----------
@@ -37,9 +37,11 @@ class RightAnswers(
     scenario : dict
         Fields of :class:`px4fuse.simulation.scenario.Scenario`.
     mistakes : tuple of str
-        Values of ``px4fuse simulate --mistake``; empty for a flight without an injected fault.
+        Injected faults, as values of ``px4fuse simulate --mistake``.
     true_values : dict
-        Values of the simulation that the log does not contain, for example ``sigma_z_m``.
+        Parameters of the simulation that the log does not contain, for example ``sigma_z_m``.
+    difficulty : float or None
+        Smallest size that px4fuse detects, divided by the size of the injected fault.
     """
 
     student_id: Annotated[str, Meta(max_length=1000, pattern=r"\S")]
@@ -50,7 +52,7 @@ class RightAnswers(
     mistakes: _Texts = ()
     true_values: dict[str, _Number] = {}
     difficulty: _Number | None = None
-    form: FormTruth | None = None
+    form: RightFormAnswers | None = None
 
 
 class _Schema(msgspec.Struct, frozen=True):
@@ -59,10 +61,10 @@ class _Schema(msgspec.Struct, frozen=True):
 
 
 class AnswerKey(msgspec.Struct, frozen=True):
-    """Right answers for all students of a class, as a JSON file.
+    """Right answers for all students of a class (JSON file of the instructor).
 
-    ``kind`` is "aisle", "loop" or "mixed". ``secret`` is the random secret that determines the
-    flights; "" if the instructor chose a secret, which is then not stored.
+    ``kind`` is the kind of flight: "aisle", "loop" or "mixed". ``secret`` is the seed of the
+    simulated flights; "" if the instructor keeps the secret in another file.
     """
 
     kind: _Text
@@ -77,21 +79,21 @@ class AnswerKey(msgspec.Struct, frozen=True):
         return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"
 
     def of_student(self, student_id: str) -> RightAnswers | None:
-        """Return flight and right answers of a student; the id may lack leading zeros."""
-        register = Register(Person(answer.student_id) for answer in self.answers)
-        student_index = register.student_index(Person(student_id))
+        """Return the right answers for a student; the id may lack leading zeros."""
+        class_list = ClassList(Person(answer.student_id) for answer in self.answers)
+        student_index = class_list.student_index(Person(student_id))
         return None if student_index is None else self.answers[student_index]
 
     def of_log(self, sha256: str) -> RightAnswers | None:
-        """Return flight and right answers for the log with this SHA-256; None if not assigned."""
+        """Return the right answers for the log with this SHA-256, or None."""
         return next((answer for answer in self.answers if answer.sha256 == sha256), None)
 
 
-def key_text(key: AnswerKey) -> str:
+def format_answer_key(key: AnswerKey) -> str:
     return msgspec.json.format(msgspec.json.encode(key), indent=1).decode() + "\n"
 
 
-def read_key(path: Path) -> AnswerKey:
+def read_answer_key(path: Path) -> AnswerKey:
     """Read the answer key of an assignment.
 
     Raises

@@ -1,7 +1,7 @@
-"""Random assignment of a flight with injected faults to each student.
+"""Random choice of a simulated flight with injected faults for each student.
 
 Random numbers are the HMAC (RFC 2104) of the student id with the instructor's secret as key.
-Students cannot predict them without the secret, and a second run gives the same flights.
+Students without the secret cannot predict them, and a second run gives the same flights.
 """
 
 from __future__ import annotations
@@ -21,50 +21,52 @@ from px4fuse.core.record import Record, read_toml
 from px4fuse.errors import SettingsError
 from px4fuse.simulation.scenario import Scenario, ScenarioKind, make_scenario
 
-# Kind of the flights of a class; for "mixed", each student gets an aisle or a loop at random
+# Kind of the simulated flights: along an aisle, around a loop, or one of both at random
 FlightKind = Literal["aisle", "loop", "mixed"]
 
 # Minimum length (characters) of the instructor's secret: a shorter secret can be guessed
 MIN_SECRET_LENGTH = 16
 # First part of each HMAC message. Another label would change the flights of existing answer keys
 HMAC_LABEL = "px4fuse assignment 2"
-# Fractions of flights with 0, 1 and 2 injected faults, by kind of flight. Many loops have no
-# injected fault, so that students cannot guess "open-end", the only possible fault of a loop
+# Fractions of the flights that have 0, 1 and 2 injected faults. A loop has at most the fault
+# "open-end" (landing far from the start), which students could guess if most loops had it
 FAULT_COUNT_FRACTIONS: dict[ScenarioKind, tuple[float, ...]] = {
     "aisle": (0.1, 0.5, 0.4),
     "loop": (0.4, 0.6),
 }
-# Fraction of the students of a "mixed" class who get a loop; the others get an aisle flight
+# Fraction of loops if the kind of flight is "mixed"; the other flights are along an aisle
 LOOP_FRACTION = 1 / 3
-# Range of the difficulty of an injected fault: smallest detectable size, divided by the size in
-# the flight
+# Range of the difficulty of an injected fault. Difficulty: smallest size that px4fuse detects,
+# divided by the size in the flight
 EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
-# Fraction of the flights with faults that are too small for detection by px4fuse, so that students
-# cannot copy its findings, and the maximum difficulty of these faults
+# Fraction of the flights whose faults are too small to be detected by px4fuse, and the maximum
+# difficulty of these faults: students must analyse them without the findings of px4fuse
 UNDETECTABLE_FRACTION, UNDETECTABLE_DIFFICULTY = 0.25, 1.5
 
 
 class AssignableFault(Record):
-    """Injected fault of a simulated flight that can be assigned to a student.
+    """Type of fault that can be injected into a student's simulated flight.
 
     Attributes
     ----------
+    name : str
+        Name of the fault in ``px4fuse simulate --mistake``.
     group : str
-        A flight has at most one fault of a group, because one fault would hide the other.
+        Faults with equal groups hide each other, so a flight has at most one of them.
     detectable_size : float or None
-        Smallest size, in ``unit``, that px4fuse detects in 19 of 20 flights
-        (tests/studies/rates.csv); None for a fault without a size.
+        Size (in ``unit``) that px4fuse detects in 19 of 20 flights (tests/studies/rates.csv); None
+        for a fault without a size.
     is_smaller_easier : bool
-        True if a smaller number is easier to detect.
+        True if a fault with a smaller size is easier to detect.
     has_either_sign : bool
         True if the sign of the size is random.
     start_range_s : (float, float) or None
-        Earliest and latest start (s); None for a fault that lasts the whole flight.
+        Earliest and latest start (s); None for a fault of the whole flight.
     hidden_groups : tuple of str
         Groups of faults that this fault hides.
     """
 
-    mistake: str
+    name: str
     group: str
     detectable_size: float | None = None
     unit: str = ""
@@ -81,29 +83,30 @@ class AssignableFault(Record):
     def format_option(
         self, difficulty: float, sign: float = 1.0, start_fraction: float = 0.5
     ) -> str:
-        """Format the value of ``px4fuse simulate --mistake`` that gives this difficulty.
+        """Return the value of the option ``px4fuse simulate --mistake`` for this fault.
 
-        ``start_fraction`` selects the start time: 0 for the earliest start, 1 for the latest.
+        ``difficulty`` is the smallest size that px4fuse detects, divided by the size in the flight.
+        ``start_fraction`` is 0 for the earliest start and 1 for the latest start.
         """
         if self.detectable_size is None:
-            return self.mistake
+            return self.name
         size = self.detectable_size / difficulty
         if self.is_smaller_easier:
             size = self.detectable_size * difficulty
-        text = f"{self.mistake}={math.copysign(float(f'{size:.3g}'), sign):g}{self.unit}"
+        option_value = f"{self.name}={math.copysign(float(f'{size:.3g}'), sign):g}{self.unit}"
         if self.start_range_s is None:
-            return text
+            return option_value
         earliest_s, latest_s = self.start_range_s
-        return f"{text},{earliest_s + start_fraction * (latest_s - earliest_s):.0f}s"
+        return f"{option_value},{earliest_s + start_fraction * (latest_s - earliest_s):.0f}s"
 
 
 class SamplingRules(Record):
-    """Injected faults that a kind of flight can have, and ranges of its random numbers.
+    """Possible faults and random parameters of one kind of simulated flight.
 
-    ``numbers`` are minimum, maximum and number of decimals of each random field of the scenario.
+    ``numbers`` are minimum, maximum and number of decimals of each parameter of the simulation.
     """
 
-    mistakes: tuple[AssignableFault, ...]
+    faults: tuple[AssignableFault, ...]
     numbers: dict[str, tuple[float, float, int]]
 
 
@@ -112,17 +115,15 @@ RULES_BY_KIND = read_toml(__file__, dict[ScenarioKind, SamplingRules], "drawn.to
 
 @dataclass(frozen=True)
 class AssignedFlight:
-    """Flight that is assigned to a student.
+    """Settings of the simulated flight of one student.
 
     Attributes
     ----------
-    scenario : Scenario
-        Settings of the simulation.
     mistake_options : tuple of str
-        Values of ``px4fuse simulate --mistake``.
+        Injected faults, as values of ``px4fuse simulate --mistake``.
     difficulty : float
-        Largest ratio of the smallest detectable size of an injected fault to its size in the
-        flight; 1 without a fault. px4fuse may not detect a fault with a ratio above 1.
+        Difficulty of the fault that is hardest to detect: smallest size that px4fuse detects,
+        divided by the size in the flight. 1 without a fault.
     """
 
     scenario: Scenario
@@ -130,16 +131,16 @@ class AssignedFlight:
     difficulty: float
 
 
-def random_bits(secret: bytes, student_id: str, kind: FlightKind, label: str) -> int:
-    """Return the random integer (128 bits) of a student for a label."""
-    message = "\0".join((HMAC_LABEL, kind, normalise_text(student_id), label))
+def random_bits(secret: bytes, student_id: str, kind: FlightKind, quantity: str) -> int:
+    """Return a random integer (128 bits) for a quantity of a student's flight."""
+    message = "\0".join((HMAC_LABEL, kind, normalise_text(student_id), quantity))
     digest = hmac.new(secret, message.encode(errors="replace"), hashlib.sha256).digest()
     return int.from_bytes(digest[:16], "big")
 
 
-def random_uniform(secret: bytes, student_id: str, kind: FlightKind, label: str) -> float:
-    """Return the random number in [0, 1) of a student for a label."""
-    return (random_bits(secret, student_id, kind, label) >> 75) / 2**53
+def random_uniform(secret: bytes, student_id: str, kind: FlightKind, quantity: str) -> float:
+    """Return a uniform random number in [0, 1) for a quantity of a student's flight."""
+    return (random_bits(secret, student_id, kind, quantity) >> 75) / 2**53
 
 
 def assign_random_flight(
@@ -147,9 +148,9 @@ def assign_random_flight(
     student_id: str,
     kind: FlightKind,
     fault_count: int | None = None,
-    truth: bool = True,
+    with_ground_truth: bool = True,
 ) -> AssignedFlight:
-    """Select injected faults and scenario of one student's flight at random.
+    """Select injected faults and parameters of a student's simulated flight at random.
 
     Parameters
     ----------
@@ -157,14 +158,14 @@ def assign_random_flight(
         "mixed" selects aisle or loop at random.
     fault_count : int, optional
         Number of injected faults; random by default.
-    truth : bool
-        True to log the ground truth of aisle flights. The log of a loop never contains it, because
-        the ground truth shows the landing place.
+    with_ground_truth : bool
+        True to log the ground truth. The log of a loop never contains the ground truth, because
+        students have to estimate the landing place.
 
     Raises
     ------
     SettingsError
-        One flight cannot have this many injected faults.
+        A flight cannot have ``fault_count`` injected faults.
     """
     possible_kinds = FAULT_COUNT_FRACTIONS if kind == "mixed" else (kind,)
     max_fault_count = (
@@ -186,34 +187,35 @@ def assign_random_flight(
         )
     faults: list[AssignableFault] = []
     rules = RULES_BY_KIND[kind]
-    for fault in sorted(rules.mistakes, key=lambda each: random_number(f"order {each.mistake}")):
+    for fault in sorted(rules.faults, key=lambda each: random_number(f"order {each.name}")):
         if len(faults) < fault_count and all(map(fault.is_detectable_with, faults)):
             faults.append(fault)
-    low, high = EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
+    difficulty_range = EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
     if random_number("undetectable") < UNDETECTABLE_FRACTION:
-        low, high = HARDEST_DIFFICULTY, UNDETECTABLE_DIFFICULTY
+        difficulty_range = HARDEST_DIFFICULTY, UNDETECTABLE_DIFFICULTY
     difficulties, mistake_options = [], []
     for fault in faults:
-        name, difficulty = fault.mistake, EASIEST_DIFFICULTY
+        name, difficulty = fault.name, EASIEST_DIFFICULTY
         if fault.detectable_size is not None:
-            difficulty = low + (high - low) * random_number(f"size {name}")
+            easiest, hardest = difficulty_range
+            difficulty = easiest + (hardest - easiest) * random_number(f"size {name}")
         sign = -1.0 if fault.has_either_sign and random_number(f"sign {name}") < 0.5 else 1.0
         difficulties.append(difficulty)
         mistake_options.append(fault.format_option(difficulty, sign, random_number(f"at {name}")))
     scenario = make_scenario(
         kind,
-        truth=truth and kind == "aisle",
+        truth=with_ground_truth and kind == "aisle",
         seed=random_bits(secret, student_id, kind, "seed"),
         **random_scenario_numbers(kind, random_number),
     )
-    difficulty = max(difficulties, default=HARDEST_DIFFICULTY)
-    return AssignedFlight(scenario, tuple(mistake_options), round(difficulty, 2))
+    max_difficulty = max(difficulties, default=HARDEST_DIFFICULTY)
+    return AssignedFlight(scenario, tuple(mistake_options), round(max_difficulty, 2))
 
 
 def random_scenario_numbers(
     kind: ScenarioKind, random_number: Callable[[str], float]
 ) -> dict[str, Any]:
-    """Return random values for the numeric fields of a scenario."""
+    """Return random values for the numeric fields of :class:`Scenario`."""
     return {
         name: round(low + (high - low) * random_number(name), decimals)
         for name, (low, high, decimals) in RULES_BY_KIND[kind].numbers.items()
@@ -221,12 +223,12 @@ def random_scenario_numbers(
 
 
 def encode_secret(text: str, source_name: str) -> bytes:
-    """Return the instructor's secret as seed of the random numbers.
+    """Derive the seed of the random numbers from the instructor's secret.
 
     Raises
     ------
     SettingsError
-        The secret is shorter than MIN_SECRET_LENGTH; the message names the file of the secret.
+        The secret is shorter than MIN_SECRET_LENGTH; the message begins with ``source_name``.
     """
     secret = text.strip()
     if len(secret) < MIN_SECRET_LENGTH:
@@ -235,10 +237,10 @@ def encode_secret(text: str, source_name: str) -> bytes:
             f"Use {MIN_SECRET_LENGTH} or more characters, or omit the secret: px4fuse then "
             "generates a secret and stores it in the answer key.",
         )
-    return derive_key(secret)
+    return derive_hmac_key(secret)
 
 
-def derive_key(secret: str) -> bytes:
-    """Derive the key of the random numbers by scrypt (RFC 7914), so that guessing is slow."""
+def derive_hmac_key(secret: str) -> bytes:
+    """Derive the HMAC key of the random numbers by scrypt (RFC 7914), so that guessing is slow."""
     text = secret.encode(errors="replace")
     return hashlib.scrypt(text, salt=HMAC_LABEL.encode(), n=2**14, r=8, p=1, dklen=32)

@@ -1,4 +1,4 @@
-"""Class list: reading of tables of learning platforms, and identification of students."""
+"""Class list: students in the CSV tables of learning platforms (Moodle, Canvas, ...)."""
 
 import re
 import unicodedata
@@ -16,17 +16,17 @@ from px4fuse.errors import SettingsError
 
 MAX_NAME_LENGTH = 200
 MAX_STUDENTS = 1000
-# Maximum length (characters) of a file name without suffix: systems allow 255 bytes, and a
-# character has up to 4 bytes
+# Maximum length (characters) of a file name without suffix: operating systems allow 255 bytes, and
+# a character has up to 4 bytes
 MAX_STEM_LENGTH = 48
 # File names that Windows does not allow
 WINDOWS_RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
     f"{n}{i}" for n in ("com", "lpt") for i in range(10)
 }
 TITLES_BY_FIELD = read_toml(__file__, dict[str, tuple[str, ...]], "columns.toml")
-# Fields of a student that are copied from other tables if the class list lacks them
+# Fields of a student that are copied from other tables if they are missing in the class list
 FIELDS_OF_OTHER_LISTS = ("name", "email", "login", "submission_time", "extended_due")
-# Names of rows in Canvas gradebooks that are not students, as lower-case letters
+# Names in Canvas gradebooks that are not students ("Points Possible", "Student, Test")
 NOT_STUDENT_NAMES = ("pointspossible", "studenttest")
 
 
@@ -34,9 +34,16 @@ NOT_STUDENT_NAMES = ("pointspossible", "studenttest")
 class Person:
     """Student of the class.
 
-    ``login`` is the login on Blackboard or ILIAS, and ``numbers`` the number of the student by
-    learning platform. ``submission_time`` is the time in Moodle's worksheet, and ``extended_due``
-    the extended due time of the student, both as text.
+    Attributes
+    ----------
+    login : str
+        Login on Blackboard or ILIAS.
+    numbers : dict
+        Number of the student on each learning platform, by name of the platform.
+    submission_time : str
+        Submission time in Moodle's worksheet.
+    extended_due : str
+        Due time of this student, if the instructor extended it.
     """
 
     student_id: str
@@ -56,30 +63,30 @@ class Person:
 def read_people(sheet: Sheet) -> tuple[Person, ...]:
     """Read the students from a class list, Moodle worksheet or Canvas gradebook.
 
-    Titles of the columns: id (Student ID, ID number, Matrikelnummer, SIS User ID), login (Username,
-    SIS Login ID), email, name (or first and last name).
+    The table needs at least one of these columns: id (Student ID, ID number, Matrikelnummer, SIS
+    User ID), login (Username, SIS Login ID), email, name (or first and last name).
 
     Raises
     ------
     SettingsError
         No column identifies the students, or two rows have the same id.
     """
-    if all(sheet.column(titles) is None for titles in TITLES_BY_FIELD.values()):
+    if all(sheet.column_index(titles) is None for titles in TITLES_BY_FIELD.values()):
         raise SettingsError(
             f"{sheet.path}: no column identifies the student.",
             "Give one column the title id, email or name.",
         )
-    row_by_id: dict[str, int] = {}
+    row_number_by_id: dict[str, int] = {}
     people = []
     for row_number, row in enumerate(sheet.rows, start=2):
         person = read_student(sheet, row)
         if person is None:
             continue
         normalised_id = normalise_text(person.student_id)
-        if normalised_id and row_by_id.setdefault(normalised_id, row_number) != row_number:
+        if normalised_id and row_number_by_id.setdefault(normalised_id, row_number) != row_number:
             raise SettingsError(
-                f"{sheet.path}: rows {row_by_id[normalised_id]} and {row_number} have the same id "
-                f"{one_line(person.student_id, 40)!r}.",
+                f"{sheet.path}: rows {row_number_by_id[normalised_id]} and {row_number} have the "
+                f"same id {one_line(person.student_id, 40)!r}.",
                 "Give each student a unique id.",
             )
         people.append(person)
@@ -114,7 +121,7 @@ def read_roster(path: Path) -> tuple[Person, ...]:
 
 
 def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
-    """Return the student in a table row, or None."""
+    """Return the student in a table row; None for a row without a student."""
     cells = {
         field_name: one_line(sheet.cell(row, titles), MAX_NAME_LENGTH)
         for field_name, titles in TITLES_BY_FIELD.items()
@@ -125,7 +132,7 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
     numbers = {}
     if participant := re.search(r"\d+$", sheet.cell(row, ("identifier",))):
         numbers["moodle"] = participant[0]
-    if sheet.column(("sisuserid", "sisloginid")) is not None:
+    if sheet.column_index(("sisuserid", "sisloginid")) is not None:
         numbers |= {"canvas": number} if (number := sheet.cell(row, ("id",))) else {}
         cells["student_id"] = one_line(sheet.cell(row, ("sisuserid",)), MAX_NAME_LENGTH)
     student_id = cells["student_id"] or cells["login"] or cells["email"]
@@ -142,8 +149,8 @@ def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
     return person if student_id or name or numbers else None
 
 
-class Register:
-    """Students of a class; fields that the class list lacks are filled from other tables."""
+class ClassList:
+    """Students of a class; missing fields are copied from the tables ``other_lists``."""
 
     def __init__(self, people: Iterable[Person] = (), *other_lists: Iterable[Person]) -> None:
         self.people = list(people)
@@ -159,10 +166,11 @@ class Register:
                 self.people[student_index] = replace(student, numbers=numbers, **fields)
 
     def student_index(self, other: Person) -> int | None:
-        """Return the index of a person in the class; None for an unknown person.
+        """Return the index of a person in ``people``; None for an unknown person.
 
-        The first of these fields that matches exactly one student decides: platform number, id,
-        email, login, name. Leading zeros of ids may be missing, because spreadsheets delete them.
+        The fields are compared in this order until exactly one student matches: number on the
+        learning platform, id, email, login, name. Ids may lack leading zeros, because spreadsheets
+        delete them.
         """
         match_rules: tuple[tuple[Callable[[str, str], bool], Callable[[Person], str], str], ...] = (
             *(
@@ -172,7 +180,7 @@ class Register:
             (_is_same_text, attrgetter("student_id"), other.student_id),
             (is_same_id, attrgetter("student_id"), other.student_id),
             (_is_same_text, attrgetter("email"), other.email),
-            # in a class list without logins, the ids may be the logins
+            # a class list without a login column may contain logins in its id column
             (_is_same_text, lambda person: person.login or person.student_id, other.login),
             (is_same_name, attrgetter("name"), other.name),
         )
@@ -206,7 +214,7 @@ def is_same_id(student_id: str, other_id: str) -> bool:
 
 
 def is_same_name(name: str, other_name: str) -> bool:
-    """Return True if two names have the same words in any order, or joined as in Canvas.
+    """Return True if two names have equal words, in any order or joined (as Canvas does).
 
     >>> is_same_name("Ada Lovelace", "Lovelace, Ada"), is_same_name("Ada Lovelace", "lovelaceada")
     (True, True)
@@ -225,7 +233,7 @@ def is_same_name(name: str, other_name: str) -> bool:
 
 
 def file_stem(student_id: str) -> str | None:
-    """Convert a student id to a file name that all systems allow; None without letter or digit.
+    """Convert a student id to a portable file name; None if it has no letter or digit.
 
     >>> file_stem("s01/2026"), file_stem("../../x"), file_stem("nul"), file_stem("=;")
     ('s01_2026', '_.._x', '_nul', None)
@@ -241,7 +249,7 @@ def file_stem(student_id: str) -> str | None:
 
 
 def make_unique(names: Iterable[str], pattern: str = "{} ({})") -> list[str]:
-    """Append numbers to repeated names, so that all names differ in more than case.
+    """Append numbers to repeated names; names that differ only in case count as repeated.
 
     >>> make_unique(["notes", "cover", "Notes"])
     ['notes', 'cover', 'Notes (2)']
@@ -258,5 +266,5 @@ def make_unique(names: Iterable[str], pattern: str = "{} ({})") -> list[str]:
 
 
 def file_names(stems: Iterable[str]) -> list[str]:
-    """Convert texts to unique file names that all systems allow."""
+    """Convert texts to unique, portable file names."""
     return make_unique((file_stem(stem) or "report" for stem in stems), "{}-{}")

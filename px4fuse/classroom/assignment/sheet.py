@@ -1,7 +1,7 @@
 """Reading and writing of CSV tables of learning platforms and instructors.
 
-The reader detects encoding (UTF-8 with and without byte order mark, UTF-16, Windows-1252) and
-separator, and a changed copy keeps both.
+The reader detects the encoding (UTF-8 with or without byte order mark, UTF-16, Windows-1252) and
+the separator. The writer uses the encoding and separator of the original file.
 """
 
 import codecs
@@ -22,35 +22,35 @@ COLUMN_SEPARATORS = ",;\t|"
 
 @dataclass(frozen=True)
 class Sheet:
-    """CSV table with column titles; each row has at least as many cells as there are titles."""
+    """CSV table with a header (column titles); short rows are filled with empty cells."""
 
     path: Path
-    head: tuple[str, ...]
+    column_titles: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     encoding: str = "utf-8"
     separator: str = ","
 
-    def column(self, titles: Sequence[str]) -> int | None:
-        """Return the index of the column with the first of ``titles`` that exists, or None."""
-        plain_titles = [normalise_title(title) for title in self.head]
+    def column_index(self, titles: Sequence[str]) -> int | None:
+        """Return the index of the column with one of ``titles``, or None; earlier titles first."""
+        plain_titles = [normalise_title(title) for title in self.column_titles]
         return next((plain_titles.index(title) for title in titles if title in plain_titles), None)
 
     def cell(self, row: Sequence[str], titles: Sequence[str]) -> str:
-        """Return the cell in the column with the first of ``titles`` that exists, or ""."""
-        column_index = self.column(titles)
+        """Return the cell in the column with one of ``titles``, or ""; earlier titles first."""
+        column_index = self.column_index(titles)
         return "" if column_index is None else row[column_index].strip()
 
     @property
     def text(self) -> str:
         """Table as CSV (RFC 4180), with the original separator."""
         csv_file = io.StringIO()
-        csv.writer(csv_file, delimiter=self.separator).writerows((self.head, *self.rows))
+        csv.writer(csv_file, delimiter=self.separator).writerows((self.column_titles, *self.rows))
         return csv_file.getvalue()
 
     def content(self) -> bytes:
         try:
             return self.text.encode(self.encoding)
-        except UnicodeEncodeError:  # Windows-1252 does not have all characters of a feedback text
+        except UnicodeEncodeError:  # Windows-1252 lacks some characters of the feedback
             return self.text.encode("utf-8-sig")
 
 
@@ -91,21 +91,21 @@ def read_sheet(path: Path) -> Sheet:
     if "\0" in text:
         raise SettingsError(f"{path} is not a text file.", "Give a CSV file with a header.")
     header = next((line for line in text.splitlines() if line.strip()), "")
-    # separators in quoted titles are not counted
+    # do not count separators in quoted column titles
     separator = max(COLUMN_SEPARATORS, key=re.sub(r'"[^"]*"', "", header).count)
     try:
         lines = [*csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)]
     except csv.Error as error:
         raise SettingsError(f"{path} is not a CSV file ({error}).") from error
-    head, *rows = [cells for cells in lines if any(map(str.strip, cells))] or [[]]
-    if not head:
+    column_titles, *rows = [cells for cells in lines if any(map(str.strip, cells))] or [[]]
+    if not column_titles:
         raise SettingsError(f"{path} is empty.", "Give a CSV file with a header.")
-    padded_rows = (tuple(cells + [""] * (len(head) - len(cells))) for cells in rows)
-    return Sheet(path, tuple(head), tuple(padded_rows), encoding, separator)
+    padded_rows = (tuple(cells + [""] * (len(column_titles) - len(cells))) for cells in rows)
+    return Sheet(path, tuple(column_titles), tuple(padded_rows), encoding, separator)
 
 
 def format_cell_number(value: float | None) -> str:
-    """Format a number for a cell; "" if the number is absent or not finite.
+    """Format a number for a table cell; "" for None, infinity and NaN.
 
     >>> format_cell_number(7.0), format_cell_number(0.1 + 0.2), format_cell_number(float("nan"))
     ('7', '0.3', '')

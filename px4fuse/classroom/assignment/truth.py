@@ -1,4 +1,4 @@
-"""Right answers to the answer form about a simulated flight."""
+"""Right answers to the questions that a student answers about a simulated flight."""
 
 import math
 from collections.abc import Mapping
@@ -32,33 +32,33 @@ from px4fuse.results.answer_form import (
     select_questions,
 )
 from px4fuse.simulation import flights
-from px4fuse.simulation.mistakes import MISTAKES as SIMULATED_MISTAKES
+from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED_MISTAKES
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
 
-# Relative tolerance of the size of an injected fault in a right answer
+# Maximum relative error of the size of a fault in a student's answer
 SIZE_TOLERANCE = 0.15
-# Tolerance (m) of the loop closure error in a right answer
+# Maximum deviation (m) of a student's loop closure error from the right value
 CLOSURE_TOLERANCE_M = 0.3
-# Minimum fraction of rejected positions for which the student must name rejections by EKF2
+# Minimum fraction of positions rejected by EKF2 for which the student must report rejections
 MIN_REJECTED_FRACTION = 0.005
-# Minimum size (m) of a position reset of EKF2 that the student must name
+# Minimum size (m) of an EKF2 position reset that the student must report
 MIN_RESET_M = 0.2
-# Time (s) after the start of the flight in which position resets do not count: EKF2 resets to the
+# Duration (s) at the start of the flight in which position resets are ignored: EKF2 resets to the
 # first position
 IGNORED_RESETS_S = 5.0
-# Injected faults for which the form must ("required") or may ("allowed") name a behaviour of EKF2
+# Faults for which the student must ("required") or may ("allowed") report a behaviour of EKF2
 BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, set[str]]], "did.toml")
 
 
 class InjectedFault(Record):
-    """Injected fault of a simulated flight, with the bounds of right answers.
+    """Injected fault of a simulated flight, with the accepted range of its size.
 
     Attributes
     ----------
     size : float or None
-        Size in the first unit of the fault in ``form.toml``.
+        True size, in the first unit that ``form.toml`` lists for the fault.
     low, high : float or None
-        Smallest and largest size that is a right answer.
+        Smallest and largest size that is accepted as a right answer.
     from_s, until_s : float or None
         Start and end (s since the first data); both None for the whole flight.
     """
@@ -71,54 +71,54 @@ class InjectedFault(Record):
     until_s: float | None = None
 
 
-class VerdictTruth(Record):
-    """Right consistency verdict on a filter, and the factor by which its reported σ is wrong.
+class RightVerdict(Record):
+    """Consistency of a filter, and the factor by which its reported σ is too small or too large.
 
-    ``verdict`` is "" if the flight has too few data for a verdict.
+    ``verdict`` is "consistent", "overconfident" or "underconfident", or "" with too few data.
     """
 
     verdict: str
     factor: float | None = None
 
 
-class FormTruth(Record):
-    """Right answers to the answer form about one flight.
+class RightFormAnswers(Record):
+    """Right answers to the questions about one simulated flight.
 
     Attributes
     ----------
+    mistakes : tuple of InjectedFault
     sigma_z_m : float
         True noise of the position source (m, 1 σ).
     ekf2_did : tuple of str
-        Behaviours of EKF2 that the student has to name.
+        Behaviours of EKF2 that the student must report, for example "never fused".
     ekf2_did_also : tuple of str
-        Behaviours of EKF2 that the student may name without losing points.
+        Behaviours of EKF2 that the student may report.
     quantities : tuple
-        Answers to the questions of :func:`~px4fuse.results.answer_form.select_questions`; None if
-        the flight is too short.
+        Numeric answers; None if the flight is too short for a question.
     choices : tuple
-        Questions about the figures, each with the letter of the right answer.
+        Multiple-choice questions about figures, each with the letter of the right answer.
     """
 
     mistakes: tuple[InjectedFault, ...]
     sigma_z_m: float
-    kf: VerdictTruth
-    ekf2: VerdictTruth
+    kf: RightVerdict
+    ekf2: RightVerdict
     ekf2_did: tuple[str, ...]
     ekf2_did_also: tuple[str, ...]
     quantities: tuple[float | tuple[float, ...] | None, ...]
     choices: tuple[tuple[Choice, ChoiceName], ...] = ()
 
 
-def form_truth(simulation: flights.Simulation, log_sha256: str) -> FormTruth:
-    """Compute the right answers from a simulation and its analysis with default settings."""
-    answer = flights.answer(simulation)
+def right_form_answers(simulation: flights.Simulation, log_sha256: str) -> RightFormAnswers:
+    """Compute the right answers from the simulated flight and its analysis by px4fuse."""
+    answer = flights.make_answer_key(simulation)
     comparison = compare_simulation(simulation)
     mistakes = tuple(
         _injected_fault(name, values, answer["truth"], comparison)
         for name, values in answer["mistakes"].items()
     )
     sigma_z_m = answer["truth"]["sigma_z_m"]
-    return FormTruth(
+    return RightFormAnswers(
         mistakes,
         sigma_z_m,
         _verdict(comparison, "kf"),
@@ -137,7 +137,7 @@ def compare_simulation(simulation: flights.Simulation) -> Comparison:
     prepared = prepare(
         flight,
         ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M),
-        as_sent=True,  # without corrections of frame and clock, as for the students' logs
+        as_sent=True,  # do not correct frame and clock: the student has to find these faults
     )
     return compare(prepared, run_kf(prepared))
 
@@ -155,7 +155,7 @@ def _injected_fault(
         measured_m = analyse(LoopSource(odometry, comparison.flight)).closure_error_m
         size, tolerance = measured_m if isinstance(measured_m, float) else size, CLOSURE_TOLERANCE_M
     low, high = size - tolerance, size + tolerance
-    if name == "clock-offset":  # all values in the 95 % interval of the estimate are right
+    if name == "clock-offset":  # each value in the 95 % interval of the estimate is accepted
         _, time_offset = estimate_noises_and_clock(comparison)
         if isinstance(time_offset, ClockOffset) and time_offset.is_determinable:
             low, high = min(low, -time_offset.interval_s[1]), max(high, -time_offset.interval_s[0])
@@ -173,21 +173,21 @@ def _injected_fault(
     return InjectedFault(name, size, low, high, from_s, until_s)
 
 
-def _verdict(comparison: Comparison, filter_name: FilterName) -> VerdictTruth:
+def _verdict(comparison: Comparison, filter_name: FilterName) -> RightVerdict:
     filter_summary = comparison.main.filters[filter_name]
     if not isinstance(filter_summary, FilterSummary):
-        return VerdictTruth("")
+        return RightVerdict("")
     is_consistent = filter_summary.verdict == "consistent"
     factor = None if is_consistent else filter_summary.sigma_error_factor
-    return VerdictTruth(filter_summary.verdict, factor)
+    return RightVerdict(filter_summary.verdict, factor)
 
 
 def _ekf2_behaviour(
     comparison: Comparison, mistakes: tuple[InjectedFault, ...], sigma_z_m: float
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the behaviours of EKF2 that the student must name, and those that are allowed."""
+    """Return the behaviours of EKF2 that the student must report, and those that are accepted."""
     size_by_kind = {mistake.kind: mistake.size or 0.0 for mistake in mistakes}
-    required, allowed = (
+    required_behaviours, allowed_behaviours = (
         [
             behaviour
             for behaviour, kinds in BEHAVIOUR_RULES[rule].items()
@@ -196,49 +196,51 @@ def _ekf2_behaviour(
         for rule in ("required", "allowed")
     )
     if size_by_kind.get("ekf2-noise", 0.0) > sigma_z_m:
-        required.append("weighted the positions too little")
+        required_behaviours.append("weighted the positions too little")
     innovations = comparison.main.ekf2_innovations
     if not isinstance(innovations, Unavailable):
         has_bad_samples = "nlos" in size_by_kind or "jump" in size_by_kind
         if (innovations["rejected"] > 0).mean() > MIN_REJECTED_FRACTION:
-            required.append("rejected outliers" if has_bad_samples else "rejected good samples")
+            required_behaviours.append(
+                "rejected outliers" if has_bad_samples else "rejected good samples"
+            )
     ekf2 = comparison.flight.ekf2
-    min_reset_time_s = comparison.segment.start_s + IGNORED_RESETS_S
+    first_counted_reset_s = comparison.segment.start_s + IGNORED_RESETS_S
     for reset in ekf2.resets if isinstance(ekf2, Ekf2) else ():
         is_large = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > MIN_RESET_M
-        if is_large and reset.time_s > min_reset_time_s:
-            required.append("dead-reckoned, then reset")
-    if "never fused" in required:  # EKF2 cannot follow positions that it does not fuse
-        required, allowed = ["never fused"], [*required, *allowed]
-    if not required:
-        required, allowed = ["normal"], ["followed the positions", *allowed]
-    required = [*dict.fromkeys(required)]
-    return tuple(required), tuple(each for each in dict.fromkeys(allowed) if each not in required)
+        if is_large and reset.time_s > first_counted_reset_s:
+            required_behaviours.append("dead-reckoned, then reset")
+    if "never fused" in required_behaviours:  # EKF2 cannot follow positions that it does not fuse
+        allowed_behaviours = [*required_behaviours, *allowed_behaviours]
+        required_behaviours = ["never fused"]
+    if not required_behaviours:
+        required_behaviours.append("normal")
+        allowed_behaviours.insert(0, "followed the positions")
+    required_behaviours = [*dict.fromkeys(required_behaviours)]
+    return tuple(required_behaviours), tuple(
+        each for each in dict.fromkeys(allowed_behaviours) if each not in required_behaviours
+    )
 
 
 def right_numeric_answer(
     axis_comparison: AxisComparison, question: FormQuestion
 ) -> float | tuple[float, ...] | None:
-    """Compute the right answer to a question by a run of KF; None with too few measurements.
+    """Run KF to compute the right answer to a question; None with too few measurements.
 
-    For the kind "prediction", the answer is the position σ (m) after predictions in steps of DT
-    without an update.
+    For the kind "prediction", the answer is the position σ (m) after a prediction without updates.
     """
     settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)
     kf_replay = replay(axis_comparison.axis, settings)
     updates = kf_replay.updates.iloc[question.update - 1 :]
     if updates.empty:
         return None
-    update_row, covariance = (
-        updates.iloc[0],
-        kf_replay.steps.loc[updates.index[0], COVARIANCE_COLUMNS],
-    )
+    covariance = kf_replay.steps.loc[updates.index[0], COVARIANCE_COLUMNS]
     nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
     match question.kind:
         case "gate":
             is_outside = nis.iloc[: GATE_QUESTION_UPDATES + 1] > question.duration_or_gate**2
-            outside_numbers = np.flatnonzero(is_outside) + question.update
-            return tuple(outside_numbers.astype(float).tolist())
+            rejected_update_numbers = np.flatnonzero(is_outside) + question.update
+            return tuple(rejected_update_numbers.astype(float).tolist())
         case "prediction":
             p, f = symmetric_matrix(tuple(covariance)), transition(settings.dt_s)
             q = symmetric_matrix(process_noise_unit(settings.dt_s))
@@ -250,4 +252,4 @@ def right_numeric_answer(
             return float(nis.iloc[0])
         case "variance":
             return float(covariance.iloc[0])
-    return float(update_row["gain_position" if question.kind == "gain" else "innovation_m"])
+    return float(updates.iloc[0]["gain_position" if question.kind == "gain" else "innovation_m"])

@@ -1,6 +1,6 @@
-"""Checks that score a report: one class per check, with the parameters of the check as fields.
+"""Checks that give points to a student's report; ``rubric.toml`` explains them.
 
-``rubric.toml`` explains all checks for the instructor.
+The fields of each class are the parameters of the check.
 """
 
 from __future__ import annotations
@@ -46,27 +46,27 @@ Title = Annotated[
 ]
 Bound = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Factor = Annotated[float, Meta(ge=1.0, le=1000.0)]
-# Fraction of the maximum points (0 to 1), and sentences for the student with the reason
+# Fraction of the maximum points (0 to 1), and reason for the student
 FractionAndReason = tuple[float, str]
 
 
 class RubricItem(
     msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="check"
 ):
-    """Item of the rubric for which a report gets points; each subclass is one check.
+    """Item of the rubric (the instructor's list of checks); each subclass is one type of check.
 
     Attributes
     ----------
     points : float
         Maximum points.
     report : {"any", "compare", "loop"}
-        Command whose reports get points for the item, chosen by the instructor.
+        Only reports of this px4fuse command are scored (choice of the instructor).
     command : {"any", "compare", "loop"}
-        Command whose reports contain the data for the check.
+        Only reports of this px4fuse command contain the data for the check.
     needs_key : bool
-        True if the item is used only with an answer key.
+        True if the check requires an answer key.
     by_hand : bool
-        True if the instructor scores the item.
+        True if the instructor enters the points.
     """
 
     command: ClassVar[str] = "any"
@@ -78,11 +78,11 @@ class RubricItem(
     report: Literal["any", "compare", "loop"] = "any"
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
-        """Return the fraction of the maximum points (0 to 1), and sentences with the reason."""
+        """Return the fraction of the maximum points (0 to 1), and the reason as sentences."""
         raise NotImplementedError
 
     def applies(self, command_name: str, key: AnswerKey | None) -> bool:
-        """Return True if the item is used for reports of ``command_name`` (compare or loop)."""
+        """Return True if the check is used for reports of ``px4fuse compare`` or ``loop``."""
         has_key = key is not None or not self.needs_key
         return has_key and {self.report, self.command} <= {"any", command_name}
 
@@ -90,8 +90,7 @@ class RubricItem(
 def fraction_for_deviation(deviation_factor: float, zero_points_factor: float) -> float:
     """Return the fraction of the points for a value that is wrong by ``deviation_factor``.
 
-    The fraction decreases linearly with the logarithm of the deviation, to 0 at
-    ``zero_points_factor``.
+    The fraction is 1 - ln(deviation_factor) / ln(zero_points_factor), between 0 and 1.
 
     >>> [round(fraction_for_deviation(deviation, 4.0), 2) for deviation in (1.0, 2.0, 4.0, 9.0)]
     [1.0, 0.5, 0.0, 0.0]
@@ -105,9 +104,9 @@ def fraction_for_deviation(deviation_factor: float, zero_points_factor: float) -
 
 @dataclass(frozen=True)
 class CheckInput:
-    """Data for scoring one report: results, result of the verification, and answer key.
+    """Input of the checks: results and verification of one report, and answer key.
 
-    ``submitter_id`` is the student id according to the learning platform.
+    ``submitter_id`` is the student id on the learning platform.
     """
 
     results: ReportedResults
@@ -122,20 +121,17 @@ class CheckInput:
 
     @cached_property
     def values(self) -> dict[str, Any]:
-        """Values of the results by path, for example ``settings.sigma_z_m``."""
+        """Numbers and texts in the results by path, for example ``settings.sigma_z_m``."""
         return dict(flatten(to_json_dict(self.results)))
 
     @cached_property
     def right_answers(self) -> RightAnswers | None:
-        """Right answers for the log of the report; None if the log was not assigned."""
+        """Right answers for the log of the report; None if the log is not in the answer key."""
         return None if self.key is None else self.key.of_log(log_sha256(self.results))
 
     @cached_property
     def assigned_answer(self) -> RightAnswers | None:
-        """Right answers for the flight that was assigned to the student.
-
-        The id on the learning platform identifies the student, or else the id in the report.
-        """
+        """Right answers for the log that the instructor gave to the student."""
         if self.key is None:
             return None
         stated_id = shorten_text(self.results.student.id)
@@ -143,13 +139,13 @@ class CheckInput:
 
     @cached_property
     def is_own_log(self) -> bool:
-        """True if the log was assigned to this student, or there is no answer key."""
+        """True if the report is about the log that the instructor gave to the student."""
         assigned_sha256 = self.assigned_answer and self.assigned_answer.sha256
         return self.key is None or assigned_sha256 == log_sha256(self.results)
 
     @cached_property
     def form(self) -> Answers | str:
-        """Answer form of the student, or the reason why it is missing."""
+        """Answers of the student, or the reason why they are missing."""
         answers = self.results.student.answers
         if not isinstance(answers, Answers):
             return "your report contains no answer form. Make the report with --answers FILE"
@@ -161,13 +157,13 @@ class CheckInput:
 
     @property
     def has_form_of_other_log(self) -> bool:
-        """True if the answer form in the report was made for another log."""
+        """True if the answers in the report are about another log than the report."""
         answers = self.results.student.answers
         return isinstance(answers, Answers) and answers.log_sha256 != log_sha256(self.results)
 
     @cached_property
     def form_points(self) -> FormPoints | str:
-        """Points of the answer form, or the reason why the form has no points."""
+        """Points for the student's answers, or the reason for no points."""
         assigned_answer = self.assigned_answer
         if self.right_answers is None or (assigned_answer and not self.is_own_log):
             file_text = format_reason(assigned_answer.file if assigned_answer else "")
@@ -185,7 +181,7 @@ class CheckInput:
         return any(finding.id in ids for finding in self.results.findings)
 
     def missing_reason(self, path: str) -> str:
-        """Return the reason why a value is missing, in brackets; "" if the results state none."""
+        """Return the reason (in brackets) why the results do not contain a value, or ""."""
         parent_path = path
         while parent_path:
             for _, reason in find_values(self.values, f"{parent_path}.reason"):
@@ -195,7 +191,7 @@ class CheckInput:
 
 
 def find_values(values: Mapping[str, Any], path_pattern: str) -> list[tuple[str, Any]]:
-    """Return the values of the results whose path matches a pattern, as (path, value).
+    """Return (path, value) of all values whose path matches a pattern.
 
     In the pattern, ``*`` matches any key, and quotes enclose a key that contains dots.
 
@@ -211,7 +207,7 @@ def shorten_text(value: str) -> str:
 
 
 def format_reason(reason: str) -> str:
-    """Format a reason in brackets, with a leading blank; "" without a reason."""
+    """Format a reason in brackets with a leading blank; "" without a reason."""
     text = shorten_text(reason).rstrip(".")
     return f" ({text})" if text else ""
 
@@ -220,7 +216,7 @@ def format_reason(reason: str) -> str:
 
 
 class VerifiedItem(RubricItem, frozen=True, tag="verified"):
-    """Check that the numbers of the report agree with a re-run of the analysis on its log."""
+    """Check that a re-run of the analysis on the log reproduces the numbers of the report."""
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
         verification = check_input.verification
@@ -230,9 +226,9 @@ class VerifiedItem(RubricItem, frozen=True, tag="verified"):
 
 
 class NumberItem(RubricItem, frozen=True, tag="number"):
-    """Check that a number of the report is within bounds.
+    """Check that a number of the report is between ``at_least`` and ``at_most``.
 
-    Outside the bounds, the points decrease linearly to zero at ``zero_at``. If ``path`` matches
+    Outside, the points decrease linearly to zero at the value ``zero_at``. If ``path`` matches
     several numbers, the lowest score counts.
     """
 
@@ -275,32 +271,32 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
         fraction, number, path = min(numbers, key=lambda each: each[0])
         label = self.name or f"the number {shorten_text(path)}"
         bounds = (("at least", self.at_least), ("at most", self.at_most))
-        limits = [f"{word} {bound:.4g}" for word, bound in bounds if math.isfinite(bound)]
+        limit_texts = [f"{word} {bound:.4g}" for word, bound in bounds if math.isfinite(bound)]
         statement = f"{capitalise_first(label)} is {f'{number:.4g} {self.unit}'.strip()}"
         advice = f" {self.advice}" if fraction < 1.0 and self.advice else ""
-        return fraction, f"{statement}; required: {' and '.join(limits)}.{advice}"
+        return fraction, f"{statement}; required: {' and '.join(limit_texts)}.{advice}"
 
 
 class AnswersItem(RubricItem, frozen=True, tag="answers"):
-    """Compare the student's answer form with the answer key."""
+    """Compare the student's answers with the answer key."""
 
     needs_key: ClassVar[bool] = True
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
-        form_result = check_input.form_points
-        if isinstance(form_result, str):
-            return 0.0, f"{capitalise_first(form_result)}."
+        points_or_reason = check_input.form_points
+        if isinstance(points_or_reason, str):
+            return 0.0, f"{capitalise_first(points_or_reason)}."
         points_text = ", ".join(
-            f"{name} {form_result.points_by_part[name]:.3g} of {max_points:g}"
-            for name, max_points in form_result.max_points_by_part.items()
+            f"{name} {points_or_reason.points_by_part[name]:.3g} of {max_points:g}"
+            for name, max_points in points_or_reason.max_points_by_part.items()
             if max_points
         )
-        feedback = capitalise_first("; ".join(form_result.feedback))
-        return form_result.fraction, f"Points of 100: {points_text}. {feedback}."
+        feedback = capitalise_first("; ".join(points_or_reason.feedback))
+        return points_or_reason.fraction, f"Points of 100: {points_text}. {feedback}."
 
 
 class TextItem(RubricItem, frozen=True, tag="text"):
-    """Text that the student writes about the flight (``--notes``); the instructor scores it."""
+    """Let the instructor score the student's text about the flight (option ``--notes``)."""
 
     needs_key: ClassVar[bool] = True
     by_hand: ClassVar[bool] = True
@@ -314,10 +310,10 @@ class TextItem(RubricItem, frozen=True, tag="text"):
 # ------------------------------------------------------------------ checks of the settings of KF
 
 
-# Ids of the findings that report a time offset which changes during the flight
+# Finding ids that report a change of the time offset during the flight
 CHANGING_CLOCK_FINDINGS = ("source_time_offset_changes", "source_timestamps_are_arrival_times")
 Sigma = Literal["sigma_z_m", "sigma_a_m_s2"]
-# Name in messages, unit and command-line option of the measurement noise and process noise of KF
+# Name, unit and command-line option of the measurement noise and the process noise of KF
 NOISE_SETTINGS: dict[Sigma, tuple[str, str, str]] = {
     "sigma_z_m": ("SIGMA_Z", "m", "--sigma-z"),
     "sigma_a_m_s2": ("SIGMA_A", "m/s²", "--sigma-a"),
@@ -327,7 +323,7 @@ NOISE_SETTINGS: dict[Sigma, tuple[str, str, str]] = {
 class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"zero_points_factor": "factor"}):
     """Check that SIGMA_A or SIGMA_Z is within the 95 % interval of its estimate.
 
-    Outside the interval, the points decrease to zero at a ``zero_points_factor`` from its bound.
+    Outside, the points decrease to zero at ``zero_points_factor`` times the interval bound.
     """
 
     command: ClassVar[str] = "compare"
@@ -348,22 +344,24 @@ class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"zero_points_fac
             return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
         low, high = interval
         if label == "SIGMA_Z" and check_input.has_finding("source_may_drift", "source_drift"):
-            # the estimate is too small, because the innovations do not show the drift of the source
+            # innovations, and so the estimate of SIGMA_Z, do not contain the drift of the source
             high = max(high, _largest_source_error_m(comparison))
-        deviation = max(chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0)
+        deviation_factor = max(
+            chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0
+        )
         relation, advice = "within", ""
-        if deviation > 1.0:
+        if deviation_factor > 1.0:
             side = "above" if chosen_value > high else "below"
-            relation = f"a factor of {format_factor(deviation)} {side}"
+            relation = f"a factor of {format_factor(deviation_factor)} {side}"
             advice = f" Set {option} within this interval."
-        return fraction_for_deviation(deviation, self.zero_points_factor), (
+        return fraction_for_deviation(deviation_factor, self.zero_points_factor), (
             f"Your {label} {chosen_value:.3g} {unit} is {relation} the 95 % interval of the "
             f"maximum-likelihood estimate ({low:.3g} to {high:.3g} {unit}).{advice}"
         )
 
 
 def _largest_source_error_m(comparison: ComparisonResults) -> float:
-    """Return the error (m) of a source that drifts: position RMSE of KF, or loop closure error."""
+    """Return the position RMSE of KF or the loop closure error (m), whichever is larger."""
     truths = [axis.filters["kf"].truth for axis in comparison.axes.values()]
     errors_m = [truth.position_rmse_m for truth in truths if isinstance(truth, ErrorsAgainstTruth)]
     if isinstance(comparison.loop, Loop):
@@ -374,10 +372,10 @@ def _largest_source_error_m(comparison: ComparisonResults) -> float:
 class ConsistencyItem(
     RubricItem, frozen=True, tag="consistent", rename={"zero_points_factor": "factor"}
 ):
-    """Check that KF is consistent, by the joint NIS of KF along north and east.
+    """Check that KF is consistent, by the mean NIS of north and east together.
 
-    Otherwise, the points decrease to zero at a σ that is wrong by ``zero_points_factor``, unless
-    both SIGMA_A and SIGMA_Z are within the 95 % intervals of their estimates.
+    The points decrease to zero if the reported σ is wrong by ``zero_points_factor``. A report with
+    SIGMA_A and SIGMA_Z within the 95 % intervals of their estimates gets all points.
     """
 
     command: ClassVar[str] = "compare"
@@ -388,7 +386,7 @@ class ConsistencyItem(
         nis_result = check_input.comparison.horizontal.get("kf")
         if not isinstance(nis_result, HorizontalNis):
             reason_text = check_input.missing_reason(f"{HORIZONTAL}.kf")
-            return 0.0, f"Your report has no consistency verdict on KF{reason_text}."
+            return 0.0, f"Your report has no result on the consistency of KF{reason_text}."
         if nis_result.verdict == "consistent":
             return 1.0, "KF is consistent."
         direction = "small" if nis_result.nis_mean > 1.0 else "large"
@@ -416,9 +414,9 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
     Attributes
     ----------
     margin_s : float
-        Maximum distance (s) of the applied offset from the 95 % interval of the estimate.
+        Maximum distance (s) of the applied time offset from the 95 % interval of the estimate.
     undeterminable : float
-        Fraction of the points if the student's own flight does not determine the offset.
+        Fraction of the points if the time offset cannot be estimated from the flight.
     """
 
     command: ClassVar[str] = "compare"
@@ -432,7 +430,7 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
             fraction = self.undeterminable if isinstance(clock, ClockOffset) else 0.0
             reason_text = format_reason(clock.reason or "")
             statement = f"The time offset cannot be estimated from your flight{reason_text}."
-            # the student could not choose the flight if the log was assigned
+            # all points for a simulated log, because the student could not choose the flight
             return 1.0 if check_input.right_answers is not None else fraction, statement
         (low, high), applied_s = clock.interval_s, clock.applied_s
         statement = (
@@ -461,11 +459,10 @@ CORRECTIONS: tuple[CorrectionName, ...] = ("by_distance_plain", "by_distance", "
 
 
 class LoopItem(RubricItem, frozen=True, tag="loop"):
-    """Score a loop: 1/4 of the points for a measured loop closure error.
+    """Score the analysis of a loop.
 
-    A report gets 1/2 with an accepted loop closure, and all points with a corrected path. It also
-    gets all points without an accepted closure if the vehicle landed at another place according to
-    the answer key.
+    1/4 of the points for a loop closure error, 1/2 for an accepted loop closure, and all points for
+    a corrected path. If the vehicle did not return, all points if no loop closure was accepted.
     """
 
     def score(self, check_input: CheckInput) -> FractionAndReason:
@@ -494,7 +491,7 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
             is_corrected = any(isinstance(path, CorrectedPath) for path in corrected_paths)
             fraction = 1.0 if is_corrected else 0.5
             comment = (
-                "A loop closure was accepted, and the path was "
+                "A loop closure was accepted, and the drift of the path was "
                 f"{'' if is_corrected else 'not '}corrected."
             )
         error_text, path_text = map(format_length, (loop.closure_error_m, loop.path_length_m))

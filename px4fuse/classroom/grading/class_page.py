@@ -1,7 +1,4 @@
-"""Class page: a web page with statistics of the class, and a table with one row per student.
-
-The page links to the redrawn PDFs in the folder ``reports/``.
-"""
+"""Web page for the instructor: statistics of the class, and a table with one row per student."""
 
 import math
 import statistics
@@ -14,7 +11,7 @@ from px4fuse.classroom.assignment.sheet import format_cell_number
 from px4fuse.classroom.grading.item_analysis import analyse_items
 from px4fuse.classroom.grading.model import (
     TOTAL_TITLE,
-    Entry,
+    Grade,
     Override,
     list_titles,
 )
@@ -39,17 +36,17 @@ STATUSES = tuple(STATUS_STYLES)
 FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "changed by instructor")
 
 
-def class_page_html(entries: Sequence[Entry], title: str, made_with: str) -> str:
-    """Format the class page as HTML; ``made_with`` is name and version of px4fuse."""
-    item_titles, number_titles = list_titles(entries)
-    counts = Counter(tag for entry in entries for tag in _entry_tags(entry))
-    tags = (*FILTER_TAGS, *sorted(tag for tag in counts if tag not in FILTER_TAGS))
-    options = [(tag, f"{tag} ({counts[tag]})") for tag in tags if counts[tag]]
+def class_page_html(grades: Sequence[Grade], title: str, made_with: str) -> str:
+    """Format the web page of the class; ``made_with`` is name and version of px4fuse."""
+    item_titles, number_titles = list_titles(grades)
+    count_by_tag = Counter(tag for grade in grades for tag in _grade_tags(grade))
+    tags = (*FILTER_TAGS, *sorted(tag for tag in count_by_tag if tag not in FILTER_TAGS))
+    options = [(tag, f"{tag} ({count_by_tag[tag]})") for tag in tags if count_by_tag[tag]]
     return frame.page(
         title=title,
-        subtitle=f"{len(entries)} {'student' if len(entries) == 1 else 'students'}, graded with "
+        subtitle=f"{len(grades)} {'student' if len(grades) == 1 else 'students'}, graded with "
         f"{made_with}",
-        html_above=_statistics_html(entries, counts),
+        html_above=_statistics_html(grades, count_by_tag),
         row_nouns=("student", "students"),
         columns=(
             Column("Student"),
@@ -61,36 +58,36 @@ def class_page_html(entries: Sequence[Entry], title: str, made_with: str) -> str
             *(Column(title, "number", "items") for title in item_titles),
             *(Column(title, "number", "numbers") for title in number_titles),
         ),
-        rows=[_class_row(entry, item_titles, number_titles) for entry in entries],
-        filters=[("Status", [("", f"Everyone ({len(entries)})"), *options])],
+        rows=[_class_row(grade, item_titles, number_titles) for grade in grades],
+        filters=[("Status", [("", f"Everyone ({len(grades)})"), *options])],
         groups=(("items", "Points of each rubric item"), ("numbers", "Numbers")),
         placeholder="search for name, id, file or flag",
         full_table_note="The table class.csv contains all rows.",
     )
 
 
-def _statistics_html(entries: Sequence[Entry], counts: Mapping[str, int]) -> str:
-    """Format the HTML above the class table: number of reports by status, and point histograms."""
-    totals = [entry.total for entry in entries if entry.total is not None]
-    max_points = max((entry.max_points for entry in entries if entry.max_points > 0.0), default=1.0)
-    reports = [report for entry in entries if (report := entry.counted_report)]
+def _statistics_html(grades: Sequence[Grade], count_by_tag: Mapping[str, int]) -> str:
+    """Format the statistics of the class: number of reports by status, and histograms of points."""
+    totals = [grade.total for grade in grades if grade.total is not None]
+    max_points = max((grade.max_points for grade in grades if grade.max_points > 0.0), default=1.0)
+    reports = [report for grade in grades if (report := grade.counted_report)]
     return load_template("classroom/grading/above.html").render(
-        students=len(entries),
-        counts=counts,
+        students=len(grades),
+        counts=count_by_tag,
         averages=(statistics.fmean(totals), statistics.median(totals)) if totals else (),
-        totals=count_tenths(totals, max_points) if totals else (),
+        totals=count_by_bin(totals, max_points) if totals else (),
         max_points_text=format_cell_number(max_points),
         max_points_edge=format_number(max_points),
         pending_points=[report.points for report in reports if report.instructor_action],
         number=format_cell_number,
-        items=[(each, count_tenths(each.fractions, 1.0)) for each in analyse_items(reports)],
+        items=[(each, count_by_bin(each.fractions, 1.0)) for each in analyse_items(reports)],
     )
 
 
-def count_tenths(values: Sequence[float], maximum: float) -> list[tuple[int, str]]:
-    """Count the values in each tenth of 0 to ``maximum``; return a (count, lower edge) per tenth.
+def count_by_bin(values: Sequence[float], maximum: float) -> list[tuple[int, str]]:
+    """Compute a histogram of ten bins from 0 to ``maximum``; return (count, lower edge) per bin.
 
-    >>> count_tenths([0.0, 5.0, 5.5, 9.0], 10.0)[5]
+    >>> count_by_bin([0.0, 5.0, 5.5, 9.0], 10.0)[5]
     (2, '5')
     """
     counts, edges = np.histogram(np.clip(values, 0.0, maximum), HISTOGRAM_BIN_COUNT, (0.0, maximum))
@@ -98,53 +95,54 @@ def count_tenths(values: Sequence[float], maximum: float) -> list[tuple[int, str
     return list(zip(counts.tolist(), lower_edges, strict=False))
 
 
-def _entry_tags(entry: Entry) -> list[str]:
-    report = entry.counted_report
+def _grade_tags(grade: Grade) -> list[str]:
+    report = grade.counted_report
     tags = [report.status if report else NO_SUBMISSION_STATUS]
-    tags += ["flagged"] * bool(entry.flags) + ["late"] * bool(entry.late_s)
+    tags += ["flagged"] * bool(grade.flags) + ["late"] * bool(grade.late_s)
     if report:
         tags += ["pending"] * bool(report.instructor_action) + ["to read"] * report.awaits_points
-        tags += [f"missed: {kind}" for kind, is_named in report.mistakes.items() if not is_named]
-    return tags + ["changed by instructor"] * bool(entry.overrides or entry.comment)
+        tags += [
+            f"missed: {kind}" for kind, is_named in report.is_found_by_fault.items() if not is_named
+        ]
+    return tags + ["changed by instructor"] * bool(grade.overrides or grade.comment)
 
 
-def _class_row(entry: Entry, item_titles: Sequence[str], number_titles: Sequence[str]) -> Row:
-    report = entry.counted_report
+def _class_row(grade: Grade, item_titles: Sequence[str], number_titles: Sequence[str]) -> Row:
+    report = grade.counted_report
     status = report.status if report else NO_SUBMISSION_STATUS
     css_style, symbol = STATUS_STYLES[status]
-    flag_count = len(entry.flags)
+    flag_count = len(grade.flags)
     flag_count_text = f"{flag_count} flag{'s' if flag_count > 1 else ''}" if flag_count else ""
-    file = report.submission if report else ""
-    late_text = f"{math.ceil(entry.late_s / 60.0)} min late" if entry.late_s else ""
+    file_name = report.submission if report else ""
+    late_text = f"{math.ceil(grade.late_s / 60.0)} min late" if grade.late_s else ""
     points_by_title = {item.title: item.points for item in report.items} if report else {}
     number_values = report.numbers if report else {}
     cells = (
-        Cell(entry.display_name, entry.student or None, file),
-        frame.text_cell(entry.student_id),
+        Cell(grade.display_name, grade.student or None, file_name),
+        frame.text_cell(grade.student_id),
         Cell(f"{symbol} {status}", float(STATUSES.index(status)), flag_count_text, css_style),
-        _points_cell(entry),
-        frame.text_cell(entry.submission_time, late_text),
-        Cell("\n".join(entry.flags), float(flag_count), "", "flags"),
+        _points_cell(grade),
+        frame.text_cell(grade.submission_time, late_text),
+        Cell("\n".join(grade.flags), float(flag_count), "", "flags"),
         *(frame.number_cell(points_by_title.get(title)) for title in item_titles),
         *(frame.number_cell(number_values.get(title)) for title in number_titles),
     )
-    # a row with pseudonym has neither id nor file, by which overrides.csv identifies students
-    point_boxes = (_point_boxes(entry),) if entry.student_id or file else ()
-    # a row with pseudonym has no link, because the file name may contain the student's name
+    # the points of an anonymous student cannot be entered: overrides.csv needs the id or the file
+    point_boxes = (_point_boxes(grade),) if grade.student_id or file_name else ()
     links = (
         [("Report redrawn from the log (PDF)", local_link(report.redrawn_path))] if report else []
     )
     return Row(
         cells,
-        tuple(_entry_tags(entry)),
-        (*_entry_details(entry), *point_boxes),
+        tuple(_grade_tags(grade)),
+        (*_grade_details(grade), *point_boxes),
         (frame.links_section("Report", links),),
     )
 
 
-def _entry_details(entry: Entry) -> Iterator[Section]:
-    """Yield the details of a student, which the class page shows after a click on the row."""
-    report, comment = entry.counted_report, frame.prose_section("Your comment", entry.comment)
+def _grade_details(grade: Grade) -> Iterator[Section]:
+    """Yield the details of a student, which the web page shows after a click on the row."""
+    report, comment = grade.counted_report, frame.prose_section("Your comment", grade.comment)
     if report is None:
         yield frame.list_section("Missing", ["No submission."])
         yield comment
@@ -165,12 +163,12 @@ def _entry_details(entry: Entry) -> Iterator[Section]:
     ]
     fault_texts = [
         f"{kind}: {'named' if is_named else 'not named'} in the answer form"
-        for kind, is_named in report.mistakes.items()
+        for kind, is_named in report.is_found_by_fault.items()
     ]
     attempts = [
-        f"{other_report.submission}: {other_report.status}" for other_report in entry.other_reports
+        f"{other_report.submission}: {other_report.status}" for other_report in grade.other_reports
     ]
-    yield frame.list_section("Flags", entry.flags, is_warning=True)
+    yield frame.list_section("Flags", grade.flags, is_warning=True)
     actions = [report.instructor_action] if report.instructor_action else []
     yield frame.list_section("Required decision of the instructor", actions, is_warning=True)
     yield frame.list_section("Verification", verification.reasons)
@@ -181,47 +179,49 @@ def _entry_details(entry: Entry) -> Iterator[Section]:
     yield frame.table_section(title, item_titles, items, (1, 2))
     yield comment
     yield frame.list_section("Injected faults of this flight", fault_texts)
-    yield frame.pairs_section("Answer form", [*form_rows(report.form)] if report.form else [])
+    yield frame.name_value_section("Answer form", [*form_rows(report.form)] if report.form else [])
     yield frame.prose_section("Text of the student", report.notes)
     yield frame.list_section("Other attempts", attempts)
 
 
-def _points_cell(entry: Entry) -> Cell:
-    report = entry.counted_report
-    if entry.total is None:
+def _points_cell(grade: Grade) -> Cell:
+    report = grade.counted_report
+    if grade.total is None:
         proposed_text = (
             f"{format_cell_number(report.points)} proposed"
             if report and report.counted_points is None
             else ""
         )
         return Cell("pending" if proposed_text else "–", None, proposed_text)
-    notes = [f"{format_cell_number(entry.deduction)} deducted (late)"] * bool(entry.deduction)
+    notes = [f"{format_cell_number(grade.deduction)} deducted (late)"] * bool(grade.deduction)
     notes += ["changed by instructor"] * any(
-        override.points is not None for override in entry.overrides.values()
+        override.points is not None for override in grade.overrides.values()
     )
-    text = f"{format_cell_number(entry.total)} / {format_cell_number(entry.max_points)}"
-    return Cell(text, entry.total, ", ".join(notes))
+    text = f"{format_cell_number(grade.total)} / {format_cell_number(grade.max_points)}"
+    return Cell(text, grade.total, ", ".join(notes))
 
 
-def _point_boxes(entry: Entry) -> Section:
-    """Return input boxes for the rubric items that the instructor scores, and for the total."""
-    report = entry.counted_report
+def _point_boxes(grade: Grade) -> Section:
+    """Return input boxes for the points that the instructor can enter."""
+    report = grade.counted_report
     max_by_title = {
         item.title: item.max_points
         for item in (report.items if report else ())
         if item.is_scored_by_instructor
     }
-    max_by_title[TOTAL_TITLE] = entry.max_points
-    override_by_title = {title: entry.overrides.get(title, Override()) for title in max_by_title}
+    max_by_title[TOTAL_TITLE] = grade.max_points
+    override_by_title = {title: grade.overrides.get(title, Override()) for title in max_by_title}
     rows = [
         (title, max_by_title[title], override.points, override.comment)
         for title, override in override_by_title.items()
     ]
-    # the page writes a new overrides.csv, so it must also contain the overrides without boxes
+    # the page writes a complete overrides.csv, also with the points that have no input box
     other_rows = [
         (title, override.points, override.comment)
-        for title, override in entry.overrides.items()
+        for title, override in grade.overrides.items()
         if title not in max_by_title
     ]
-    identity = entry.student_id or (report.submission if report else "")
-    return frame.boxes_section("Points and comments of the instructor", identity, rows, other_rows)
+    identity = grade.student_id or (report.submission if report else "")
+    return frame.input_boxes_section(
+        "Points and comments of the instructor", identity, rows, other_rows
+    )

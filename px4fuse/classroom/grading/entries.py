@@ -1,4 +1,4 @@
-"""Rows of the class table: the report that counts, late deduction, and the instructor's points.
+"""Grade of each student: report that counts, deduction for lateness, and instructor's points.
 
 Points that the instructor writes into ``overrides.csv`` replace the computed points.
 """
@@ -16,14 +16,14 @@ from typing import Literal
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from px4fuse.classroom.assignment.key import AnswerKey
-from px4fuse.classroom.assignment.roster import Person, Register, normalise_text, read_people
+from px4fuse.classroom.assignment.roster import ClassList, Person, normalise_text, read_people
 from px4fuse.classroom.assignment.sheet import Sheet, format_cell_number, parse_decimal, read_sheet
 from px4fuse.classroom.grading.flags import flag_equal_contents
 from px4fuse.classroom.grading.model import (
     TOTAL_TITLE,
-    Entry,
+    Grade,
     GradedReport,
-    Item,
+    ItemScore,
     Override,
     Submission,
 )
@@ -38,14 +38,14 @@ OVERRIDE_TITLES = ("id", "item", "points", "comment")
 OVERRIDES_TEMPLATE = "\ufeff" + ",".join(OVERRIDE_TITLES) + "\r\n"
 MAX_COMMENT_LENGTH = 10_000
 
-# Points and comment of the instructor, by student id and item title ("": the whole report)
+# Points and comment of the instructor, by student id and rubric item ("" for the whole report)
 Overrides = Mapping[str, Mapping[str, Override]]
 # Syntax of the option --late, for example "10 % / day up to 50 %"
 _LATE_RULE = re.compile(
     r"(?P<rate>\d+(?:\.\d+)?)\s*%\s*/\s*(?P<unit>day|hour)"
     r"(?:\s+up to\s+(?P<most>\d+(?:\.\d+)?)\s*%)?"
 )
-# Formats of submission times in Moodle's worksheets (English), with a 12-hour and a 24-hour clock
+# Formats of submission times in English tables of Moodle, with a 12-hour and a 24-hour clock
 _MOODLE_FORMATS = ("%A, %d %B %Y, %I:%M %p", "%A, %d %B %Y, %H:%M")
 # First letters of the German names of months, January first
 GERMAN_MONTHS = ("jan", "feb", "mär", "apr", "mai", "jun", "jul", "aug", "sep", "okt", "nov", "dez")
@@ -53,10 +53,10 @@ GERMAN_MONTHS = ("jan", "feb", "mär", "apr", "mai", "jun", "jul", "aug", "sep",
 
 @dataclass(frozen=True)
 class LateRule:
-    """Deduction of points for late submissions, as fraction of the maximum points.
+    """Deduction of points for late submissions.
 
-    ``fraction_per_unit`` is deducted for each started day or hour (``unit_s``), but at most
-    ``max_fraction``.
+    For each started day or hour (``unit_s``), ``fraction_per_unit`` of the maximum points is
+    deducted, but at most ``max_fraction``.
     """
 
     fraction_per_unit: float
@@ -84,23 +84,25 @@ class Course:
     logs : sequence of Path
         Flight logs, and folders of logs.
     roster : tuple of Person or None
-        Class list; None for the students of the answer key, or else of the first worksheet.
+        Class list; None to use the students in the answer key or in the first worksheet.
     worksheets : tuple of Sheet
         Tables of learning platforms, into which the grades are entered.
     column : str
-        Title of the grade column in the worksheets; "" if each has only one grade column.
+        Title of the grade column in the worksheets; "" if each worksheet has only one.
     attempt : {"latest", "best", "first"}
-        Report of a student that counts.
+        Report that counts if a student submitted several.
+    due : datetime or None
+        Due time of the submission.
     grace_s : float
         Maximum delay (s) without a deduction.
     scale : float or None
-        Maximum points on the learning platform; None to enter the points of the rubric.
+        Maximum points on the learning platform; None for the maximum of the rubric.
     question_count : int
         Number of questions per student for an oral check.
     include_pending : bool
-        True to count the points of reports on which the instructor still has to decide.
+        True to count points that wait for a decision of the instructor.
     anonymous : bool
-        True to show pseudonyms instead of names on the class page.
+        True to show pseudonyms instead of names on the web page.
     """
 
     rubric: Rubric
@@ -120,102 +122,104 @@ class Course:
     anonymous: bool = False
 
     @cached_property
-    def register(self) -> Register:
+    def class_list(self) -> ClassList:
         """Students of the class, with the data of all worksheets."""
         people_by_sheet = [read_people(sheet) for sheet in self.worksheets]
         answers = self.key.answers if self.key else ()
         assigned_people = tuple(Person(answer.student_id, answer.name) for answer in answers)
         people = self.roster or assigned_people or next(iter(people_by_sheet), ())
-        return Register(people, *people_by_sheet)
+        return ClassList(people, *people_by_sheet)
 
 
-# Sort key of a report (UNIX times of submission and of the zip entry), report, and its table row
-Attempt = tuple[tuple[float, float], GradedReport, Entry]
+# Sort key (UNIX times of submission and zip entry), report, and grade if only this report counts
+Attempt = tuple[tuple[float, float], GradedReport, Grade]
 
 
-def build_entries(
+def build_grades(
     reports: Sequence[GradedReport],
     submissions: Sequence[Submission],
     course: Course,
     overrides: Overrides,
-) -> tuple[tuple[Entry, ...], tuple[str, ...]]:
-    """Make the rows of the class table: all students, then the reports of unknown students.
+) -> tuple[tuple[Grade, ...], tuple[str, ...]]:
+    """Assign the reports to students, and compute the grade of each student.
 
-    A report belongs to the student that the platform names. If the class list does not contain this
-    student, the id in the report decides, then the name in the report. Without a class list, each
-    student that a report or a platform names has a row.
+    The learning platform identifies the student, or else the id or the name in the report. Without
+    a class list, the students in reports and on platforms are the class.
 
     Parameters
     ----------
     reports, submissions : sequences
-        Graded reports and their files, in the same order.
+        Graded report and file of each submission.
 
     Returns
     -------
-    entries : tuple of Entry
-        Rows of the class table.
+    grades : tuple of Grade
+        Grades of all students, then of reports of unknown students.
     notes : tuple of str
-        Sentences about overrides that match no student or item.
+        Sentences about points in ``overrides.csv`` without a matching student or item.
     """
-    has_list = bool(course.register.people)
-    register = course.register if has_list else _collect_students(reports, submissions)
-    attempts: dict[int | None, list[Attempt]] = defaultdict(list)
+    has_class_list = bool(course.class_list.people)
+    class_list = course.class_list if has_class_list else _collect_students(reports, submissions)
+    attempts_by_index: dict[int | None, list[Attempt]] = defaultdict(list)
     for report, submission in zip(reports, submissions, strict=True):
-        student_index = register.student_index(submission.origin.person)
+        student_index = class_list.student_index(submission.origin.person)
         if student_index is None:
-            student_index = register.student_index(Person(report.student_id, report.student))
-        attempts[student_index].append(
-            _make_attempt(report, submission, course, student_index, register)
+            student_index = class_list.student_index(Person(report.student_id, report.student))
+        attempts_by_index[student_index].append(
+            _make_attempt(report, submission, course, student_index, class_list)
         )
     max_points = max((report.max_points for report in reports), default=0.0)
-    rows = [
-        _choose_attempt(attempts[student_index], course)
-        if attempts[student_index]
-        else Entry(person.name, person.student_id, None, max_points=max_points)
-        for student_index, person in enumerate(register.people)
+    grades = [
+        _choose_attempt(attempts_by_index[student_index], course)
+        if attempts_by_index[student_index]
+        else Grade(person.name, person.student_id, None, max_points=max_points)
+        for student_index, person in enumerate(class_list.people)
     ]
     unknown_student_flag = "Neither the report nor the learning platform names a student."
-    if has_list:
+    if has_class_list:
         unknown_student_flag = "The student is not in the class list."
-    rows += [replace(row, flags=(unknown_student_flag, *row.flags)) for *_, row in attempts[None]]
-    overrides_by_row, notes = match_overrides(overrides, rows)
+    grades += [
+        replace(grade, flags=(unknown_student_flag, *grade.flags))
+        for *_, grade in attempts_by_index[None]
+    ]
+    overrides_by_grade, notes = match_overrides(overrides, grades)
     flags_by_submission = flag_equal_contents(
-        [row.counted_report for row in rows if row.counted_report]
+        [grade.counted_report for grade in grades if grade.counted_report]
     )
-    submitted_rows = [row for row in rows if row.counted_report]
-    unknown_count = sum(row.late_s is None for row in submitted_rows)
+    grades_with_report = [grade for grade in grades if grade.counted_report]
+    unknown_count = sum(grade.late_s is None for grade in grades_with_report)
     if course.late_rule and unknown_count:
         notes += (
-            f"The submission time is unknown for {unknown_count} of {len(submitted_rows)} "
+            f"The submission time is unknown for {unknown_count} of {len(grades_with_report)} "
             "students, so no points were deducted. Add the times with --worksheet.",
         )
-    final_rows = (
-        _apply_overrides(*row_and_overrides, flags_by_submission, course)
-        for row_and_overrides in zip(rows, overrides_by_row, strict=True)
+    final_grades = (
+        _apply_overrides(*grade_and_overrides, flags_by_submission, course)
+        for grade_and_overrides in zip(grades, overrides_by_grade, strict=True)
     )
-    return tuple(final_rows), notes
+    return tuple(final_grades), notes
 
 
 def _collect_students(
     reports: Sequence[GradedReport], submissions: Sequence[Submission]
-) -> Register:
-    """Collect the students that learning platforms and reports name, without a class list."""
-    register = Register()
+) -> ClassList:
+    """Make a class list of the students that learning platforms and reports name."""
+    class_list = ClassList()
     for report, submission in zip(reports, submissions, strict=True):
         person = submission.origin.person
-        reported_student_index = register.student_index(Person(report.student_id))
+        reported_student_index = class_list.student_index(Person(report.student_id))
         if person.numbers or person.login:
-            if register.student_index(person) is not None:
+            if class_list.student_index(person) is not None:
                 continue
-            # the id in the report is not used if another student has this id
+            # ignore the id in the report if another student already has this id
             free_id = report.student_id if reported_student_index is None else ""
             student_id = person.student_id or free_id
             name = one_line(report.student if student_id else person.name, 200) or person.name
             student_id = next(filter(None, (student_id, person.login, *person.numbers.values())))
-            register.people.append(replace(person, student_id=student_id, name=name))
+            class_list.people.append(replace(person, student_id=student_id, name=name))
         elif report.student_id and reported_student_index is None:
-            register.people.append(Person(report.student_id, one_line(report.student, 200)))
-    return register
+            class_list.people.append(Person(report.student_id, one_line(report.student, 200)))
+    return class_list
 
 
 def _make_attempt(
@@ -223,11 +227,13 @@ def _make_attempt(
     submission: Submission,
     course: Course,
     student_index: int | None,
-    register: Register,
+    class_list: ClassList,
 ) -> Attempt:
-    """Make the row of the class table for a student with only this report."""
+    """Compute the grade of a student if only this report counts."""
     origin, platform = submission.origin, submission.origin.platform.capitalize()
-    person = Person(report.student_id) if student_index is None else register.people[student_index]
+    person = (
+        Person(report.student_id) if student_index is None else class_list.people[student_index]
+    )
     due_time = course.due
     if due_time is not None and person.extended_due:
         due_time = parse_due_time(
@@ -240,7 +246,7 @@ def _make_attempt(
     )
     late_s, flags = None, []
     if due_time is not None and submission_time is not None:
-        # UNIX times, because differences of datetimes ignore daylight saving within a time zone
+        # UNIX times, because differences of datetime objects ignore daylight saving time
         late_s = submission_time.timestamp() - due_time.timestamp()
         late_s = late_s if late_s > course.grace_s else 0.0
     elif origin.is_late:
@@ -257,15 +263,17 @@ def _make_attempt(
             "The student imitated the file name of a learning platform "
             f"(platform of the export: {platform or 'none'})."
         )
-    reported_student_index = register.student_index(Person(report.student_id)) if platform else None
+    reported_student_index = (
+        class_list.student_index(Person(report.student_id)) if platform else None
+    )
     if reported_student_index is not None and student_index not in (None, reported_student_index):
-        reported_person = register.people[reported_student_index]
+        reported_person = class_list.people[reported_student_index]
         flags.append(
             f"The id in the report is that of {reported_person.student_id} "
             f"({reported_person.name or 'no name'}), but {platform} names another student."
         )
     late_rule = course.late_rule
-    entry = Entry(
+    grade = Grade(
         person.name or one_line(report.student or origin.person.name, 200),
         person.student_id,
         report,
@@ -279,39 +287,39 @@ def _make_attempt(
         submission_time.timestamp() if submission_time else 0.0,
         zip_time.timestamp() if zip_time else 0.0,
     )
-    return sort_key, report, entry
+    return sort_key, report, grade
 
 
 def _points_after_deduction(attempt: Attempt) -> float:
-    _, report, entry = attempt
-    return max(report.points - entry.deduction, 0.0)
+    _, report, grade = attempt
+    return max(report.points - grade.deduction, 0.0)
 
 
-def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
+def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Grade:
     """Choose the report of a student that counts; add flags if the choice is ambiguous."""
-    # reports with the same time are sorted by points
+    # sort by time; reports with equal times by points
     sorted_attempts = sorted(
         attempts,
         key=lambda attempt: (attempt[0], _points_after_deduction(attempt), attempt[1].submission),
     )
-    # prefer reports that need no decision of the instructor, then readable reports, then the rest
+    # prefer reports that need no decision of the instructor, then readable reports
     attempts_with_report = [attempt for attempt in sorted_attempts if attempt[1].version]
     attempts_without_action = [
         attempt for attempt in attempts_with_report if not attempt[1].instructor_action
     ]
     eligible_attempts = attempts_without_action or attempts_with_report or sorted_attempts
-    chosen_key, chosen_report, entry = {
+    chosen_key, chosen_report, grade = {
         "latest": eligible_attempts[-1],
-        # the report with most points of the first submission
+        # several reports may have the earliest time: take the one with most points
         "first": [
             attempt for attempt in eligible_attempts if attempt[0] == eligible_attempts[0][0]
         ][-1],
         "best": max(reversed(eligible_attempts), key=_points_after_deduction),
     }[course.attempt]
-    flags = list(entry.flags)
+    flags = list(grade.flags)
     other_reports = tuple(report for _, report, _ in sorted_attempts if report is not chosen_report)
     forms = [report.form for sort_key, report, _ in eligible_attempts if sort_key == chosen_key]
-    # otherwise students could hand in several forms with different guesses
+    # without this rule, students could hand in several answer forms with different guesses
     if course.attempt != "best" and len(set(forms)) > 1:
         action = f"Ask the student which of {len(forms)} reports counts: the answer forms differ."
         chosen_report = replace(chosen_report, instructor_action=action)
@@ -332,29 +340,29 @@ def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Entry:
                 f"The file {one_line(report.submission, 80)} does not count (status: {status})."
             )
     return replace(
-        entry, counted_report=chosen_report, other_reports=other_reports, flags=tuple(flags)
+        grade, counted_report=chosen_report, other_reports=other_reports, flags=tuple(flags)
     )
 
 
 def _apply_overrides(
-    entry: Entry,
+    grade: Grade,
     override_by_title: Mapping[str, Override],
     flags_by_submission: Mapping[str, Sequence[str]],
     course: Course,
-) -> Entry:
-    """Apply the instructor's points and comments, compute the total, and add flags."""
-    report, total_points, flags = entry.counted_report, None, entry.flags
+) -> Grade:
+    """Apply the instructor's points and comments, and compute the total points."""
+    report, total_points, flags = grade.counted_report, None, grade.flags
     if report is not None:
         items = (_override_item(item, override_by_title.get(item.title)) for item in report.items)
         report = replace(report, items=tuple(items))
         flags = (*flags, *report.flags, *flags_by_submission.get(report.submission, ()))
         if report.counted_points is not None or course.include_pending:
-            total_points = round(max(report.points - entry.deduction, 0.0), 2)
+            total_points = round(max(report.points - grade.deduction, 0.0), 2)
     report_override, total_override = (
         override_by_title.get(title, Override()) for title in ("", TOTAL_TITLE)
     )
     return replace(
-        entry,
+        grade,
         counted_report=report,
         overrides=override_by_title,
         comment="\n".join(filter(None, (report_override.comment, total_override.comment))),
@@ -363,8 +371,8 @@ def _apply_overrides(
     )
 
 
-def _override_item(item: Item, override: Override | None) -> Item:
-    """Replace the points of a rubric item by those of the instructor, and append the comment."""
+def _override_item(item: ItemScore, override: Override | None) -> ItemScore:
+    """Replace the points of a rubric item by the instructor's points, and append the comment."""
     if override is None:
         return item
     comment = item.comment
@@ -394,13 +402,13 @@ def read_overrides(path: Path) -> Overrides:
     if not path.exists():
         return {}
     sheet = read_sheet(path)
-    missing_titles = [title for title in OVERRIDE_TITLES if sheet.column((title,)) is None]
+    missing_titles = [title for title in OVERRIDE_TITLES if sheet.column_index((title,)) is None]
     if missing_titles:
         remedy = f"Required columns: {', '.join(OVERRIDE_TITLES)}."
         raise SettingsError(f"{path}: no column {', '.join(missing_titles)}.", remedy)
     overrides: dict[str, dict[str, Override]] = defaultdict(dict)
     for row_number, row in enumerate(sheet.rows, start=2):
-        if any(cell.strip() for cell in row[len(sheet.head) :]):
+        if any(cell.strip() for cell in row[len(sheet.column_titles) :]):
             raise SettingsError(
                 f"{path}: row {row_number} has more cells than the header.",
                 "Put a comment that contains a comma in double quotes.",
@@ -415,7 +423,10 @@ def read_overrides(path: Path) -> Overrides:
             problem = f"student {one_line(student, 40)} has two rows for the item {item_text}"
         elif points and (parsed_points is None or parsed_points < 0.0 or not item_title):
             points_text = one_line(points, 20)
-            problem = f"points {points_text!r} must be a number of 0 or more for an item or total"
+            problem = (
+                f"points {points_text!r} must be a number of 0 or more, in a row that names an "
+                "item or total"
+            )
         if problem:
             raise SettingsError(f"{path}: row {row_number}: {problem}.")
         overrides[student][item_title] = Override(
@@ -425,24 +436,24 @@ def read_overrides(path: Path) -> Overrides:
 
 
 def match_overrides(
-    overrides: Overrides, entries: Sequence[Entry]
+    overrides: Overrides, grades: Sequence[Grade]
 ) -> tuple[list[dict[str, Override]], tuple[str, ...]]:
-    """Match the instructor's points and comments with the rows of the class table.
+    """Assign the instructor's points and comments to students and rubric items.
 
     Returns
     -------
     matched_overrides : list of dict
-        Points and comments for each row, by title of an item, "total", or "" (the whole report).
+        Points and comments for each student, by rubric item, "total", or "" (whole report).
     notes : tuple of str
-        Sentences about points and comments that match no row or item.
+        Sentences about points and comments without a matching student or item.
     """
-    matched_overrides: list[dict[str, Override]] = [{} for _ in entries]
-    max_points_of_reports = (report.max_points for entry in entries for report in entry.reports)
+    matched_overrides: list[dict[str, Override]] = [{} for _ in grades]
+    max_points_of_reports = (report.max_points for grade in grades for report in grade.reports)
     max_total_points = max(max_points_of_reports, default=math.inf)
-    people = Register(
-        Person(entry.student_id, login=report.submission if report else "")
-        for entry in entries
-        for report in [entry.counted_report]
+    people = ClassList(
+        Person(grade.student_id, login=report.submission if report else "")
+        for grade in grades
+        for report in [grade.counted_report]
     )
     notes = []
     for student, override_by_item in overrides.items():
@@ -453,7 +464,7 @@ def match_overrides(
             notes.append(f"{OVERRIDES_NAME}: no student has the id {student_text}.")
             continue
         max_by_title = {TOTAL_TITLE: max_total_points, "": math.inf}
-        if report := entries[student_index].counted_report:
+        if report := grades[student_index].counted_report:
             max_by_title |= {item.title: item.max_points for item in report.items}
             max_by_title[TOTAL_TITLE] = report.max_points
         title_by_normalised = {normalise_text(title): title for title in max_by_title}
@@ -496,9 +507,8 @@ def parse_late_rule(text: str) -> LateRule:
 def parse_due_time(text: str, name: str = "--due", default_zone: tzinfo | None = None) -> datetime:
     """Parse a due time: ``2026-11-20 23:59``, optionally with ``+01:00`` or ``Europe/Berlin``.
 
-    A date without a time means the end of the day, and a time without seconds the end of the
-    minute. The default time zone is ``default_zone``, or else that of this computer. Errors contain
-    ``name``, the name of the option.
+    A date without a time means the end of the day. The default time zone is that of this computer.
+    ``name`` is the option, for error messages.
 
     Raises
     ------
@@ -525,14 +535,14 @@ def parse_due_time(text: str, name: str = "--due", default_zone: tzinfo | None =
 
 
 def add_time_zone(time: datetime, due: datetime | None) -> datetime:
-    """Add the time zone of the due time, or of this computer, to a time without time zone."""
+    """Add the time zone of ``due``, or of this computer, to a time without a time zone."""
     if time.tzinfo is not None:
         return time
     return time.replace(tzinfo=due.tzinfo) if due is not None else time.astimezone()
 
 
 def parse_moodle_time(text: str) -> datetime | None:
-    """Parse the submission time in Moodle's worksheet; None for an unsupported format.
+    """Parse the submission time in a table of Moodle; None for an unsupported format.
 
     >>> parse_moodle_time("Friday, 20 November 2026, 11:58 PM").isoformat()
     '2026-11-20T23:58:00'
@@ -543,9 +553,9 @@ def parse_moodle_time(text: str) -> datetime | None:
     >>> parse_moodle_time("-")
     """
     if german_match := re.fullmatch(r"\w+, (\d+)\. (\w+) (\d{4}), (\d+:\d\d)", text.strip()):
-        day, month, year, clock = german_match.groups()
+        day, month, year, time_of_day = german_match.groups()
         if (month_start := month.casefold()[:3]) in GERMAN_MONTHS:
-            text = f"{year}-{GERMAN_MONTHS.index(month_start) + 1:02}-{day:>02} {clock:>05}"
+            text = f"{year}-{GERMAN_MONTHS.index(month_start) + 1:02}-{day:>02} {time_of_day:>05}"
     with suppress(ValueError):
         return datetime.fromisoformat(text.strip())
     for time_format in _MOODLE_FORMATS:

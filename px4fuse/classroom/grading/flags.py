@@ -1,4 +1,4 @@
-"""Flags: sentences for the instructor about suspicious reports, without effect on points.
+"""Sentences ("flags") for the instructor about suspicious reports, without effect on points.
 
 A flag does not prove a copy: two students may have the same flight, and students who follow the
 advice of px4fuse get the same settings.
@@ -19,23 +19,23 @@ from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.simulation import flights
 from px4fuse.verification.model import Verification
 
-# Minimum number of equal numbers in two answer forms for a flag
+# Minimum number of equal numbers in the answers of two students that is suspicious
 MIN_SAME_NUMBERS = 3
-# Minimum number of answered figure questions for comparing the answers of two students
+# Minimum number of answered multiple-choice questions for comparing two students
 MIN_ANSWERED_CHOICES = 6
 # Maximum relative difference of numbers that count as equal: a copy may have small changes
 SAME_NUMBER_TOLERANCE = 0.02
-# Minimum fraction of the log between --start and --end; less is flagged
+# Minimum fraction of the log between --start and --end that is not suspicious
 MIN_SEGMENT_FRACTION = 0.5
-# Maximum factor between --drift or --heading-drift and its default; more is flagged
+# Maximum factor between --drift or --heading-drift and its default that is not suspicious
 MAX_DRIFT_FACTOR = 4.0
 MAX_LISTED_REPORTS = 4
-# Pairs of reports with equal contents, for example the same answer form
-Pairs = Iterator[tuple[GradedReport, GradedReport]]
+# Pairs of reports with equal contents
+ReportPairs = Iterator[tuple[GradedReport, GradedReport]]
 
 
-def flag_pages(verification: Verification) -> Iterator[str]:
-    """Yield a flag with the first difference between a PDF and the redrawn report, if any."""
+def flag_page_differences(verification: Verification) -> Iterator[str]:
+    """Yield the first difference between a PDF and the report drawn from its log, if any."""
     if verification.pages:
         first_difference, *further_differences = verification.pages
         count = len(further_differences)
@@ -47,9 +47,9 @@ def flag_pages(verification: Verification) -> Iterator[str]:
 
 
 def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[str]:
-    """Yield flags about unusual settings of one report.
+    """Yield sentences about unusual settings of a report.
 
-    ``has_key`` is True with an answer key: simulated logs are then expected.
+    ``has_key`` is True if the instructor handed out simulated logs, with an answer key.
     """
     if isinstance(results, LoopResults):
         yield from _flag_drift(results.request)
@@ -79,10 +79,7 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
 
 
 def _flag_drift(request: LoopRequest) -> Iterator[str]:
-    """Yield flags about --drift and --heading-drift values that are far from the default.
-
-    The chi-square test of a loop closure depends on these values.
-    """
+    """Yield sentences about --drift and --heading-drift values that are far from the default."""
     defaults = LoopRequest(source="")
     for option, unit, drift, default in (
         ("--drift", "m", request.position_drift_m, defaults.position_drift_m),
@@ -96,7 +93,7 @@ def _flag_drift(request: LoopRequest) -> Iterator[str]:
 
 
 def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
-    """Return the numbers in an answer form by fault kind (or "") and field."""
+    """Return the numbers in a student's answers, by fault kind (or "") and field name."""
     if report.form is None:
         return {}
     answers: dict[tuple[str, str], object] = {
@@ -105,7 +102,7 @@ def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
         for name in ("size", "value")
     }
     answers |= {("", f"q{index}"): number for index, number in enumerate(report.form.quantities)}
-    # the digits of a list of update numbers are joined to one number for the comparison
+    # join the digits of a list of numbers, so that lists are compared like numbers
     answers |= {
         (f"q{index}", "value"): float("".join(f"{number:.0f}" for number in numbers))
         for index, numbers in enumerate(report.form.quantities)
@@ -115,10 +112,9 @@ def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
 
 
 def _count_same_numbers(numbers: Mapping[Any, float], other_numbers: Mapping[Any, float]) -> int:
-    """Count the equal numbers of two answer forms; numbers with one digit do not count.
+    """Count the equal numbers of two students; numbers with one digit do not count.
 
-    Parameter values and lists of update numbers must be exactly equal, all other numbers within
-    SAME_NUMBER_TOLERANCE.
+    Values with the key "value" must be exactly equal, others within SAME_NUMBER_TOLERANCE.
     """
     return sum(
         _count_digits(number) > 1
@@ -129,12 +125,12 @@ def _count_same_numbers(numbers: Mapping[Any, float], other_numbers: Mapping[Any
     )
 
 
-def _student_key(report: GradedReport) -> str:
+def _student_identity(report: GradedReport) -> str:
     return normalise_text(report.student_id) or normalise_text(report.student) or report.submission
 
 
-# Checks for equal contents of two reports: text of the flag, and functions that return the compared
-# content and the owner of a report. Reports of the same owner are not compared
+# Checks for equal contents of two reports: sentence for the instructor, function for the compared
+# content, and function for the owner. Reports of one owner are not compared with each other
 EQUAL_CONTENT_CHECKS: tuple[
     tuple[str, Callable[[GradedReport], object], Callable[[GradedReport], str]], ...
 ] = (
@@ -147,10 +143,10 @@ EQUAL_CONTENT_CHECKS: tuple[
     (
         "This report is about the same log as the report of {}.",
         attrgetter("log_sha256"),
-        _student_key,
+        _student_identity,
     ),
     (
-        "The report has the numbers of {}, but another SHA-256 of the log: it is a copy.",
+        "The numbers are those of {}, but the SHA-256 of the log differs: this is a copy.",
         lambda report: (
             report.verification.status == "verified"
             and len(report.numbers) >= MIN_SAME_NUMBERS
@@ -159,32 +155,32 @@ EQUAL_CONTENT_CHECKS: tuple[
         attrgetter("log_sha256"),
     ),
     (
-        "The answers about the figures are those of {}, whose figures differ.",
+        "The answers about the figures are those of {}, although the figures differ.",
         lambda report: (
             report.form
             and sum(map(bool, report.form.choices)) >= MIN_ANSWERED_CHOICES
             and report.form.choices
         ),
-        _student_key,
+        _student_identity,
     ),
 )
 
 
 def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequence[str]]:
-    """Return the flags about equal contents of two reports, by name of the submission."""
+    """Return sentences about reports with equal contents, by name of the submitted file."""
     flags_by_submission: dict[str, list[str]] = defaultdict(list)
     for flag_text, pairs in (
         *(
-            (flag_text, _same_pairs(reports, content_of, owner_of))
+            (flag_text, _equal_content_pairs(reports, content_of, owner_of))
             for flag_text, content_of, owner_of in EQUAL_CONTENT_CHECKS
         ),
         ("The answer form has the same numbers as the form of {}.", _copied_forms(reports)),
     ):
         students_by_submission: dict[str, list[str]] = defaultdict(list)
         for report, other_report in chain.from_iterable(map(permutations, pairs)):
-            file = one_line(other_report.submission, 80)
+            file_name = one_line(other_report.submission, 80)
             students_by_submission[report.submission].append(
-                f"{_student_text(other_report)} ({file})"
+                f"{_student_text(other_report)} ({file_name})"
             )
         for submission_name, student_texts in students_by_submission.items():
             flags_by_submission[submission_name].append(
@@ -193,11 +189,11 @@ def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequenc
     return flags_by_submission
 
 
-def _same_pairs(
+def _equal_content_pairs(
     reports: Sequence[GradedReport],
     content_of: Callable[[GradedReport], object],
     owner_of: Callable[[GradedReport], str],
-) -> Pairs:
+) -> ReportPairs:
     reports_by_content: dict[object, list[GradedReport]] = defaultdict(list)
     for report in reports:
         reports_by_content[content_of(report)].append(report)
@@ -207,12 +203,12 @@ def _same_pairs(
                 yield report, other_report
 
 
-def _copied_forms(reports: Sequence[GradedReport]) -> Pairs:
-    """Yield pairs of reports of different students whose answer forms have the same numbers."""
+def _copied_forms(reports: Sequence[GradedReport]) -> ReportPairs:
+    """Yield pairs of reports of different students whose answers have equal numbers."""
     numbers_by_report = [(report, _form_numbers(report)) for report in reports]
     for (report, numbers), (other_report, other_numbers) in combinations(numbers_by_report, 2):
         is_copied = _count_same_numbers(numbers, other_numbers) >= MIN_SAME_NUMBERS
-        if is_copied and _student_key(report) != _student_key(other_report):
+        if is_copied and _student_identity(report) != _student_identity(other_report):
             yield report, other_report
 
 

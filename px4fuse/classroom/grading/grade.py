@@ -1,4 +1,4 @@
-"""Grading of a class: parallel verification of all submissions, and output files."""
+"""Grading of a class: verify and score all submitted reports in parallel, and write the output."""
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
@@ -9,8 +9,8 @@ from pathlib import Path
 
 from px4fuse.classroom.assignment.key import AnswerKey
 from px4fuse.classroom.grading import submissions
-from px4fuse.classroom.grading.entries import OVERRIDES_NAME, Course, build_entries, read_overrides
-from px4fuse.classroom.grading.model import Entry, GradedReport, Submission
+from px4fuse.classroom.grading.entries import OVERRIDES_NAME, Course, build_grades, read_overrides
+from px4fuse.classroom.grading.model import Grade, GradedReport, Submission
 from px4fuse.classroom.grading.outputs import find_grade_column, write_class
 from px4fuse.classroom.grading.records import RECORDS_FOLDER, load_or_verify
 from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable, score_report
@@ -28,23 +28,23 @@ class GradeOutcome:
 
     Attributes
     ----------
-    entries : tuple of Entry
-        Rows of the class table: students of the class list, then unknown students.
+    grades : tuple of Grade
+        Grades: students of the class list, then unknown students.
     notes : tuple of str
-        Sentences about ignored files and overrides, and grades that could not be entered.
+        Sentences about ignored input, and grades that could not be entered.
     reused_count : int
-        Number of reports with a stored verification, which were not verified again.
+        Number of reports that were verified in an earlier run.
     written_paths : tuple of Path
     """
 
-    entries: tuple[Entry, ...]
+    grades: tuple[Grade, ...]
     notes: tuple[str, ...]
     reused_count: int
     written_paths: tuple[Path, ...]
 
     @property
     def reports(self) -> tuple[GradedReport, ...]:
-        return tuple(report for entry in self.entries for report in entry.reports)
+        return tuple(report for grade in self.grades for report in grade.reports)
 
 
 def grade(
@@ -71,7 +71,7 @@ def grade(
     Raises
     ------
     SettingsError
-        No submission was found, or ``overrides.csv`` or a worksheet is not valid.
+        No submission was found, or a table is not valid.
     OutputError
         The folder cannot be written.
     """
@@ -86,15 +86,15 @@ def grade(
     found_submissions, notes = submissions.find_submissions(paths)
     jobs = []
     for submission in found_submissions:
-        student_index = course.register.student_index(submission.origin.person)
+        student_index = course.class_list.student_index(submission.origin.person)
         submitter_id = (
-            "" if student_index is None else course.register.people[student_index].student_id
+            "" if student_index is None else course.class_list.people[student_index].student_id
         )
         jobs.append((submission, submitter_id))
-    rubric_and_key, logs = (course.rubric, course.key), files_by_sha256(course.logs)
+    rubric_and_key, log_by_sha256 = (course.rubric, course.key), files_by_sha256(course.logs)
     records_folder = output / RECORDS_FOLDER
     grade_job = partial(
-        grade_submission, *rubric_and_key, logs, records_folder, max_log_bytes.get()
+        grade_submission, *rubric_and_key, log_by_sha256, records_folder, max_log_bytes.get()
     )
     graded_by_index: dict[int, GradedReport] = {}
     reused_count = 0
@@ -113,10 +113,10 @@ def grade(
             reused_count += is_loaded
             progress(len(graded_by_index), len(found_submissions))
     graded_reports = [graded_by_index[index] for index in range(len(found_submissions))]
-    entries, override_notes = build_entries(graded_reports, found_submissions, course, overrides)
-    written_paths, class_notes = write_class(entries, course, output)
+    grades, override_notes = build_grades(graded_reports, found_submissions, course, overrides)
+    written_paths, class_notes = write_class(grades, course, output)
     all_notes = *notes, *unread_notes, *override_notes, *class_notes
-    return GradeOutcome(entries, all_notes, reused_count, written_paths)
+    return GradeOutcome(grades, all_notes, reused_count, written_paths)
 
 
 def grade_submission(
@@ -127,10 +127,22 @@ def grade_submission(
     max_bytes: int,
     job: tuple[Submission, str],
 ) -> tuple[GradedReport, bool]:
-    """Read, verify and score a submission.
+    """Read, verify and score a submitted report.
 
-    ``job`` is the submission and the student id on the learning platform. Return the graded report,
-    and True if a stored verification was loaded.
+    Parameters
+    ----------
+    records : Path
+        Folder of earlier verifications.
+    max_bytes : int
+        Maximum size of a log.
+    job : (Submission, str)
+        Submitted file, and student id on the learning platform.
+
+    Returns
+    -------
+    report : GradedReport
+    is_loaded : bool
+        True if the result of an earlier verification was loaded.
     """
     max_log_bytes.set(max_bytes)
     submission, submitter_id = job

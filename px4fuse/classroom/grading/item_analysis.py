@@ -1,4 +1,4 @@
-"""Difficulty and discrimination of each rubric item, form part and injected fault."""
+"""Statistics of the class: difficulty and discrimination of each rubric item and fault."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -16,15 +16,15 @@ ITEM_STATISTICS_TITLES = ("item", "reports", "mean_fraction", "discrimination", 
 
 @dataclass(frozen=True)
 class ItemStatistics:
-    """Points of all reports for a rubric item, a part of the answer form, or an injected fault.
+    """Points of all reports for a rubric item, part of the answers, or injected fault.
 
     Attributes
     ----------
     fractions : tuple of float
-        Points of each report divided by the maximum; for a fault, 1 if the form names the fault.
+        Points of each report divided by the maximum; for a fault, 1 if the student found the fault.
     discrimination : float or None
-        Correlation with the other points of the same reports. Good students do not get more points
-        for an item with a value near or below 0.
+        Correlation between the points for this item and the points for all other items. The item
+        does not distinguish good students if the value is near or below 0.
     """
 
     title: str
@@ -45,11 +45,11 @@ class ItemStatistics:
 
 
 def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
-    """Compute statistics of rubric items, parts of the answer form, and faults, in this order.
+    """Compute statistics of rubric items, parts of the answers, and faults, in this order.
 
-    Reports that need a decision of the instructor, and items that await points, do not count.
+    Reports and items that wait for the instructor are omitted.
     """
-    rows_by_item: dict[tuple[int, str], list[tuple[float, float, float]]] = defaultdict(list)
+    scores_by_item: dict[tuple[int, str], list[tuple[float, float, float]]] = defaultdict(list)
     for report in reports:
         if report.instructor_action:
             continue
@@ -57,19 +57,19 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
             (0, "", report.items),
             (1, "Answer form: ", report.form_parts),
         ):
-            total = sum(item.points for item in items)
+            total_points = sum(item.points for item in items)
             for item in items:
                 if item.awaits_points:
                     continue
-                item_row = item.points, item.max_points, total - item.points
-                rows_by_item[group_index, f"{prefix}{item.title}"].append(item_row)
-        for kind, is_named in report.mistakes.items():
-            rows_by_item[2, f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
+                score = item.points, item.max_points, total_points - item.points
+                scores_by_item[group_index, f"{prefix}{item.title}"].append(score)
+        for kind, is_named in report.is_found_by_fault.items():
+            scores_by_item[2, f"Fault: {kind}"].append((float(is_named), 1.0, report.points))
     statistics = []
-    for (_, title), rows in sorted(rows_by_item.items(), key=lambda item: item[0][0]):
-        item_points, max_points, other_points = np.transpose(rows)
+    for (_, title), scores in sorted(scores_by_item.items(), key=lambda item: item[0][0]):
+        item_points, max_points, other_points = np.transpose(scores)
         discrimination = None
-        if len(rows) >= MIN_REPORTS and np.ptp(item_points) and np.ptp(other_points):
+        if len(scores) >= MIN_REPORTS and np.ptp(item_points) and np.ptp(other_points):
             discrimination = round(float(np.corrcoef(item_points, other_points)[0, 1]), 2)
         fractions = item_points / np.where(max_points > 0.0, max_points, 1.0)
         statistics.append(

@@ -1,4 +1,4 @@
-"""Records of grading: submitted files, graded reports, and rows of the class table."""
+"""Data classes for grading: submitted files, graded reports, and points per student."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from px4fuse.classroom.assignment.roster import Person
 from px4fuse.results.answer_form import Answers
 from px4fuse.verification.model import Verification
 
-# Title of the sum over all rubric items, in overrides.csv and messages
+# Name of the sum of all points, in overrides.csv and messages
 TOTAL_TITLE = "total"
 
 UNKNOWN_PERSON = Person("")
@@ -17,21 +17,21 @@ UNKNOWN_PERSON = Person("")
 
 @dataclass(frozen=True)
 class ExportOrigin:
-    """Student and submission time of a file, as a learning platform encodes them in its name.
+    """Student and submission time that a learning platform writes into a file name.
 
     Attributes
     ----------
     platform : str
-        Learning platform (``platforms.toml``); "" if no platform wrote the file name.
+        Name of the learning platform; "" if no platform wrote the file name.
     person : Person
-        Student. ``numbers`` contains the number of the participant (Moodle), the user (Canvas,
-        ILIAS) or the submission (Gradescope).
+        Student, with the number of the participant (Moodle), the user (Canvas, ILIAS) or the
+        submission (Gradescope).
     time : datetime or None
         Submission time; without time zone if the platform omits it.
     is_late : bool
         True if the platform marks the file as late.
     is_imitated : bool
-        True if the student imitated the file name of a platform.
+        True if the student imitated a file name of another platform.
     """
 
     platform: str = ""
@@ -55,9 +55,9 @@ class Submission:
     zip_entry : str
         Name of the entry in the zip file; "" for a file.
     name : str
-        Unique name for messages, with at most 200 characters.
+        Unique, shortened name for messages.
     time : datetime or None
-        Time of the zip entry (submission or download), in an unknown time zone.
+        Time of the zip entry, in an unknown time zone. It may be the time of the download.
     """
 
     file: Path
@@ -68,10 +68,10 @@ class Submission:
 
 
 @dataclass(frozen=True)
-class Item:
-    """Points of a report for one item of the rubric, with a comment for the student.
+class ItemScore:
+    """Points of a report for one rubric item, with a comment for the student.
 
-    ``awaits_points`` is True until the instructor scores an item that px4fuse cannot score.
+    ``awaits_points`` is True if the instructor has not yet entered the points.
     """
 
     title: str
@@ -93,24 +93,26 @@ class GradedReport:
     student, student_id : str
         Name and id in the report.
     instructor_action : str
-        Decision that the instructor has to make before the points count; "" if they count.
+        Decision that the instructor must make before the points count; "" if none is needed.
+    form : Answers or None
+        Answers of the student to the questions about the flight.
     numbers : mapping
-        Numbers of the report for the class table, by column title.
+        Numbers of the report for the table of the class, by column title.
     version : str
-        Version of px4fuse that made the report.
-    mistakes : mapping
-        True for each injected fault of the assigned flight that the answer form names.
-    form_parts : tuple of Item
-        Points for each part of the answer form, of 100 points in total.
+        Version of px4fuse that wrote the report.
+    is_found_by_fault : mapping
+        For each injected fault of the student's flight: True if the student found the fault.
+    form_parts : tuple of ItemScore
+        Points for each part of ``form``, 100 points in total.
     redrawn_path : str
-        Path of the PDF that px4fuse drew again from the log, relative to the class page.
+        Relative path of the PDF that px4fuse draws from the log for comparison.
     """
 
     submission: str
     student: str
     student_id: str
     verification: Verification
-    items: tuple[Item, ...] = ()
+    items: tuple[ItemScore, ...] = ()
     flags: tuple[str, ...] = ()
     instructor_action: str = ""
     form: Answers | None = None
@@ -119,23 +121,23 @@ class GradedReport:
     log_sha256: str = ""
     version: str = ""
     notes: str = field(default="", repr=False)
-    mistakes: Mapping[str, bool] = field(default_factory=dict)
-    form_parts: tuple[Item, ...] = ()
+    is_found_by_fault: Mapping[str, bool] = field(default_factory=dict)
+    form_parts: tuple[ItemScore, ...] = ()
     redrawn_path: str = ""
 
     @property
     def status(self) -> str:
-        """Status of the verification; "page differs" if only pages differ."""
+        """Status of the verification, for example "verified" or "numbers differ"."""
         return self.verification.outcome
 
     @property
     def points(self) -> float:
-        """Sum of the points of all items, with those that do not count yet."""
+        """Sum of the points of all rubric items, even if the instructor has not confirmed them."""
         return sum(item.points for item in self.items)
 
     @property
     def counted_points(self) -> float | None:
-        """Sum of the points; None while the instructor has to decide or to score an item."""
+        """Sum of the points; None while a decision or points of the instructor are missing."""
         return None if self.instructor_action or self.awaits_points else self.points
 
     @property
@@ -144,7 +146,7 @@ class GradedReport:
 
     @property
     def pending_reason(self) -> str:
-        """Actions of the instructor before the points count; "" if they count."""
+        """Actions required of the instructor before the points count; "" for none."""
         actions = [
             f"Enter the points of the item {item.title}."
             for item in self.items
@@ -159,30 +161,30 @@ class GradedReport:
 
 @dataclass(frozen=True)
 class Override:
-    """Points of the instructor, which replace those of px4fuse, and an additional comment."""
+    """Points and comment of the instructor; the points replace those computed by px4fuse."""
 
     points: float | None = None
     comment: str = ""
 
 
 @dataclass(frozen=True)
-class Entry:
-    """Row of the class table: a student, or a report of an unknown student.
+class Grade:
+    """Grade of a student, or of a report whose student is unknown.
 
     Attributes
     ----------
     counted_report : GradedReport or None
-        Report that counts, with the instructor's points; None without a submission.
+        Report that counts; None without a submission.
     other_reports : tuple of GradedReport
-        Reports of the same student that do not count, earliest first.
+        Reports of the student that do not count, earliest first.
     late_s : float or None
         Submission time minus due time (s), 0 if in time; None if unknown.
     deduction : float
         Points deducted for late submission.
     overrides : mapping
-        Points and comments of the instructor, by item title, "total", or "" (the whole report).
+        Points and comments of the instructor, by rubric item, "total", or "" (whole report).
     total : float or None
-        Grade in points; None without a submission, and while the instructor has to decide.
+        Points after deductions; None without a submission or with a pending decision.
     """
 
     student: str
@@ -207,9 +209,9 @@ class Entry:
         return self.student or self.student_id or "no name"
 
 
-def list_titles(entries: Sequence[Entry]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the titles of all rubric items, and of all numbers of reports."""
-    reports = [report for entry in entries if (report := entry.counted_report)]
-    items = dict.fromkeys(item.title for report in reports for item in report.items)
-    numbers = dict.fromkeys(title for report in reports for title in report.numbers)
-    return tuple(items), tuple(numbers)
+def list_titles(grades: Sequence[Grade]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the column titles for the points of rubric items, and for numbers of reports."""
+    reports = [report for grade in grades if (report := grade.counted_report)]
+    item_titles = dict.fromkeys(item.title for report in reports for item in report.items)
+    number_titles = dict.fromkeys(title for report in reports for title in report.numbers)
+    return tuple(item_titles), tuple(number_titles)

@@ -1,9 +1,8 @@
-"""Output files of grading: class table and page, redrawn reports, feedback, platform tables.
+"""Output files of grading: points of the class, feedback, and tables for learning platforms.
 
 px4fuse enters grades into copies of the tables that learning platforms export, and feedback if a
-table has a column for it. All other cells stay unchanged. The row of a student without a grade (no
-submission, or points not decided yet) is not changed: platforms delete a grade if the cell is
-empty, and read 0 as a grade.
+table has a feedback column. All other cells stay unchanged. The row of a student without a grade is
+not changed: platforms delete a grade if the cell is empty, and read 0 as a grade.
 
 - Moodle: "Using Assignment", Offline grading worksheet, docs.moodle.org.
   ``mod/assign/feedback/offline/importgradeslib.php`` finds "Identifier" ("Participant 12"), "Grade"
@@ -28,7 +27,7 @@ from operator import itemgetter
 from pathlib import Path
 
 from px4fuse.classroom.assignment.roster import (
-    Register,
+    ClassList,
     file_names,
     make_unique,
     normalise_text,
@@ -39,7 +38,7 @@ from px4fuse.classroom.grading.checks import shorten_text
 from px4fuse.classroom.grading.class_page import class_page_html
 from px4fuse.classroom.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
 from px4fuse.classroom.grading.item_analysis import ITEM_STATISTICS_TITLES, analyse_items
-from px4fuse.classroom.grading.model import TOTAL_TITLE, Entry, GradedReport, list_titles
+from px4fuse.classroom.grading.model import TOTAL_TITLE, Grade, GradedReport, list_titles
 from px4fuse.classroom.grading.oral_check import questions_text
 from px4fuse.classroom.grading.records import DIAGNOSIS_SUFFIX, RECORDS_FOLDER, REDRAWN_SUFFIX
 from px4fuse.core.input_files import inputs_not_registered
@@ -49,14 +48,14 @@ from px4fuse.core.writing import write_all
 from px4fuse.errors import SettingsError
 from px4fuse.html.safe import load_template
 
-# Folder of the reports that px4fuse draws again from the logs, to be read instead of submitted PDFs
+# Folder of reports that px4fuse draws from the logs; safer to open than the submitted PDFs
 REPORTS_FOLDER = "reports"
 FEEDBACK_FOLDER = "feedback"
 GRADES_FOLDER = "grades"
 PSEUDONYMS_FILE = "names.csv"
 QUESTIONS_FILE = "questions.txt"
 PSEUDONYM_TITLES = ("pseudonym", "id", "name")
-# Columns of the class table, before and after the columns of rubric items and report numbers
+# Columns of class.csv before and after the columns of rubric items and numbers
 FIRST_COLUMNS = (
     "file",
     "student",
@@ -79,26 +78,29 @@ LAST_COLUMNS = (
     "log SHA-256",
 )
 LIST_SEPARATOR = " | "
-# Maximum number of reasons in the feedback why a report was not verified
+# Maximum number of reasons for a failed verification in the feedback
 MAX_REASONS = 4
 # Titles of grade columns in tables of learning platforms, as lower-case letters and digits
 GRADE_TITLES = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
 MAX_GRADE_TITLES = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
-# Titles of feedback columns that the learning platform reads as HTML
+# Titles of feedback columns that contain HTML (Moodle)
 HTML_COMMENT_TITLES = ("feedbackcomments", "feedbackalskommentar")
 # Titles of all feedback columns
 COMMENT_TITLES = (*HTML_COMMENT_TITLES, "feedbacktolearner", "feedback", "comment")
 _ASSIGNMENT_NUMBER = re.compile(r" \(\d+\)$")
-# Text in columns that Canvas computes and px4fuse therefore does not change
+# Mark of columns that Canvas computes: px4fuse must not change them
 READ_ONLY_MARK = "(read only)"
 
 
 def write_class(
-    entries: Sequence[Entry], course: Course, output: Path
+    grades: Sequence[Grade], course: Course, output: Path
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Write all output files of grading. An existing ``overrides.csv`` is not overwritten.
 
-    The students in ``course.register`` are first in ``entries``, in the same order.
+    Parameters
+    ----------
+    grades : sequence of Grade
+        Grades of the students in ``course.class_list``, then of unknown students.
 
     Returns
     -------
@@ -113,76 +115,79 @@ def write_class(
         The folder cannot be written.
     """
     class_title = course.title or course.rubric.title or "Class"
-    stems = file_names([_entry_identity(entry, use_file_stem=True) for entry in entries])
-    page_entries = [
-        _copy_redrawn(entry, stem, output) for entry, stem in zip(entries, stems, strict=True)
+    file_stems = file_names([_student_identity(grade, use_file_stem=True) for grade in grades])
+    page_grades = [
+        _copy_redrawn(grade, stem, output) for grade, stem in zip(grades, file_stems, strict=True)
     ]
     has_redrawn = any(
-        entry.counted_report and entry.counted_report.redrawn_path for entry in page_entries
+        grade.counted_report and grade.counted_report.redrawn_path for grade in page_grades
     )
-    feedback_texts = [feedback_text(entry, class_title) for entry in entries]
-    reports = [report for entry in entries if (report := entry.counted_report)]
+    feedback_texts = [feedback_text(grade, class_title) for grade in grades]
+    reports = [report for grade in grades if (report := grade.counted_report)]
     item_rows = tuple(
         (neutralise_formulas(title), *numbers)
         for title, *numbers in (statistics.csv_row for statistics in analyse_items(reports))
     )
     contents = {
-        "class.csv": class_table_csv(entries).encode(),
+        "class.csv": class_table_csv(grades).encode(),
         "items.csv": ("\ufeff" + Sheet(Path(), ITEM_STATISTICS_TITLES, item_rows).text).encode(),
     }
     if course.anonymous:
-        page_entries, names_table = _anonymise_entries(page_entries, output / PSEUDONYMS_FILE)
+        page_grades, names_table = _anonymise_grades(page_grades, output / PSEUDONYMS_FILE)
         contents[PSEUDONYMS_FILE] = names_table.encode()
     made_with = f"px4fuse {metadata.version('px4fuse')}"
-    contents["class.html"] = class_page_html(page_entries, class_title, made_with).encode()
+    contents["class.html"] = class_page_html(page_grades, class_title, made_with).encode()
     if course.question_count and course.key is not None:
-        text = questions_text(entries, course.key, course.question_count)
+        text = questions_text(grades, course.key, course.question_count)
         contents[QUESTIONS_FILE] = text.encode()
     if not (output / OVERRIDES_NAME).exists():
         contents[OVERRIDES_NAME] = OVERRIDES_TEMPLATE.encode()
-    for stem, text in zip(stems, feedback_texts, strict=True):
+    for stem, text in zip(file_stems, feedback_texts, strict=True):
         contents[f"{FEEDBACK_FOLDER}/{stem}.txt"] = text.encode()
     notes: list[str] = []
     table_names = make_unique((sheet.path.name for sheet in course.worksheets), "{1}-{0}")
     for sheet, name in zip(course.worksheets, table_names, strict=True):
         filled_sheet, sheet_notes = fill_grades(
-            sheet, entries, course.register, course.column, feedback_texts, course.scale
+            sheet, grades, course.class_list, course.column, feedback_texts, course.scale
         )
         contents[f"{GRADES_FOLDER}/{name}"] = filled_sheet.content()
         notes += sheet_notes
     write_all({output / name: content for name, content in contents.items()})
-    outputs = dict.fromkeys([*(name.partition("/")[0] for name in contents), OVERRIDES_NAME])
+    output_names = dict.fromkeys([*(name.partition("/")[0] for name in contents), OVERRIDES_NAME])
     if has_redrawn:
-        outputs[REPORTS_FOLDER] = None
-    return tuple(output / name for name in outputs), tuple(notes)
+        output_names[REPORTS_FOLDER] = None
+    return tuple(output / name for name in output_names), tuple(notes)
 
 
-def _entry_identity(entry: Entry, use_file_stem: bool = False) -> str:
-    """Return the id of a student; without id the name, or the file name."""
-    file = entry.counted_report.submission if entry.counted_report else ""
-    return entry.student_id or (Path(file).stem if use_file_stem else entry.student or file)
+def _student_identity(grade: Grade, use_file_stem: bool = False) -> str:
+    """Return the id of a student; without an id, the name or the name of the submitted file."""
+    file_name = grade.counted_report.submission if grade.counted_report else ""
+    return grade.student_id or (
+        Path(file_name).stem if use_file_stem else grade.student or file_name
+    )
 
 
-def _copy_redrawn(entry: Entry, stem: str, output: Path) -> Entry:
-    """Copy the report as drawn again by px4fuse, and its diagnosis, to the output folder."""
-    report = entry.counted_report
+def _copy_redrawn(grade: Grade, stem: str, output: Path) -> Grade:
+    """Copy the PDF files that px4fuse drew from the log to the output folder."""
+    report = grade.counted_report
     if report is None or not report.sha256:
-        return entry
-    record = output / RECORDS_FOLDER / report.sha256
-    redrawn_file, diagnosis = map(record.with_suffix, (REDRAWN_SUFFIX, DIAGNOSIS_SUFFIX))
-    if diagnosis.exists():
-        write_all({output / FEEDBACK_FOLDER / f"{stem}.pdf": diagnosis.read_bytes()})
+        return grade
+    record_path = output / RECORDS_FOLDER / report.sha256
+    redrawn_file, diagnosis_file = map(record_path.with_suffix, (REDRAWN_SUFFIX, DIAGNOSIS_SUFFIX))
+    if diagnosis_file.exists():
+        write_all({output / FEEDBACK_FOLDER / f"{stem}.pdf": diagnosis_file.read_bytes()})
     if not redrawn_file.exists():
-        return entry
+        return grade
     name = f"{REPORTS_FOLDER}/{stem}.pdf"
     write_all({output / name: redrawn_file.read_bytes()})
-    return replace(entry, counted_report=replace(report, redrawn_path=name))
+    return replace(grade, counted_report=replace(report, redrawn_path=name))
 
 
-def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry], str]:
-    """Replace names by pseudonyms and sort by pseudonym; also return the pseudonyms as CSV table.
+def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade], str]:
+    """Replace names by pseudonyms, and sort by pseudonym.
 
-    Pseudonyms in an existing table at ``path`` are kept.
+    Return the anonymous grades and a CSV table of the pseudonyms. Pseudonyms in an existing table
+    at ``path`` are kept.
     """
     names_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
@@ -198,7 +203,7 @@ def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry
     free_pseudonyms = (
         pseudonym for pseudonym in numbered_pseudonyms if pseudonym not in used_pseudonyms
     )
-    students = {_entry_identity(entry): entry.student for entry in entries}
+    students = {_student_identity(grade): grade.student for grade in grades}
     new_identities = [identity for identity in students if identity not in names_by_identity]
     random.SystemRandom().shuffle(new_identities)
     for identity in new_identities:
@@ -207,16 +212,16 @@ def _anonymise_entries(entries: Sequence[Entry], path: Path) -> tuple[list[Entry
         (pseudonym, neutralise_id(identity), neutralise_formulas(student))
         for identity, (pseudonym, student) in sorted(names_by_identity.items(), key=itemgetter(1))
     )
-    anonymous_entries = [
-        anonymise_entry(entry, names_by_identity[_entry_identity(entry)][0]) for entry in entries
+    anonymous_grades = [
+        anonymise_grade(grade, names_by_identity[_student_identity(grade)][0]) for grade in grades
     ]
     names_table = "\ufeff" + Sheet(path, PSEUDONYM_TITLES, tuple(rows)).text
-    return sorted(anonymous_entries, key=lambda entry: entry.student), names_table
+    return sorted(anonymous_grades, key=lambda grade: grade.student), names_table
 
 
-def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
-    """Return a row with pseudonym, status, points and answer form, without the student's texts."""
-    report = entry.counted_report
+def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
+    """Replace the name by a pseudonym, and delete all texts that could identify the student."""
+    report = grade.counted_report
     if report is not None:
         report = GradedReport(
             "",
@@ -228,51 +233,51 @@ def anonymise_entry(entry: Entry, pseudonym: str) -> Entry:
             and "The instructor has to decide on the points.",
             form=report.form,
             numbers=report.numbers,
-            mistakes=report.mistakes,
+            is_found_by_fault=report.is_found_by_fault,
             form_parts=report.form_parts,
         )
-    return Entry(
+    return Grade(
         pseudonym,
         "",
         report,
-        submission_time=entry.submission_time,
-        late_s=entry.late_s,
-        deduction=entry.deduction,
-        total=entry.total,
-        max_points=entry.max_points,
-        flags=("This report is flagged.",) * bool(entry.flags),
+        submission_time=grade.submission_time,
+        late_s=grade.late_s,
+        deduction=grade.deduction,
+        total=grade.total,
+        max_points=grade.max_points,
+        flags=("This report is flagged.",) * bool(grade.flags),
     )
 
 
 # ------------------------------------------------------------------ the class table
 
 
-def class_table_csv(entries: Sequence[Entry]) -> str:
-    """Format the class table as CSV for Excel and LibreOffice."""
-    item_titles, number_titles = list_titles(entries)
+def class_table_csv(grades: Sequence[Grade]) -> str:
+    """Format a table with one row per student as CSV for Excel and LibreOffice."""
+    item_titles, number_titles = list_titles(grades)
     titles = (*FIRST_COLUMNS, *item_titles, *number_titles, *LAST_COLUMNS)
     rows = []
-    for entry in entries:
-        report = entry.counted_report
+    for grade in grades:
+        report = grade.counted_report
         points_by_title = {item.title: item.points for item in report.items} if report else {}
         row: list[str | float | None] = [
             report.submission if report else "",
-            entry.student,
+            grade.student,
             None,
             report.status if report else "missing",
             report.counted_points if report else None,
             report.points if report and report.counted_points is None else None,
-            entry.max_points,
-            entry.deduction or None,
-            entry.total,
+            grade.max_points,
+            grade.deduction or None,
+            grade.total,
             *map(points_by_title.get, item_titles),
             *(report.numbers.get(title) if report else None for title in number_titles),
-            entry.submission_time,
-            None if entry.late_s is None else entry.late_s / 3600.0,
+            grade.submission_time,
+            None if grade.late_s is None else grade.late_s / 3600.0,
             report.pending_reason if report else "",
-            entry.comment,
-            LIST_SEPARATOR.join(entry.flags),
-            LIST_SEPARATOR.join(other_report.submission for other_report in entry.other_reports),
+            grade.comment,
+            LIST_SEPARATOR.join(grade.flags),
+            LIST_SEPARATOR.join(other_report.submission for other_report in grade.other_reports),
             LIST_SEPARATOR.join(report.verification.reasons) if report else "",
             report.log_sha256 if report else "",
         ]
@@ -280,7 +285,7 @@ def class_table_csv(entries: Sequence[Entry]) -> str:
             neutralise_formulas(value) if isinstance(value, str) else format_cell_number(value)
             for value in row
         ]
-        cells[FIRST_COLUMNS.index("id")] = neutralise_id(entry.student_id)
+        cells[FIRST_COLUMNS.index("id")] = neutralise_id(grade.student_id)
         rows.append(tuple(cells))
     # Excel detects UTF-8 by the byte order mark
     return "\ufeff" + Sheet(Path(), tuple(map(neutralise_formulas, titles)), tuple(rows)).text
@@ -289,16 +294,16 @@ def class_table_csv(entries: Sequence[Entry]) -> str:
 # ------------------------------------------------------------------ feedback
 
 
-def feedback_text(entry: Entry, class_name: str = "") -> str:
-    """Format the feedback for one student, without the flags for the instructor."""
-    report = entry.counted_report
+def feedback_text(grade: Grade, class_name: str = "") -> str:
+    """Format points, comments and reasons for one student as text."""
+    report = grade.counted_report
     reasons = report.verification.reasons[:MAX_REASONS] if report else ()
     text = load_template("classroom/grading/feedback.j2").render(
-        entry=entry,
+        grade=grade,
         report=report,
         class_name=class_name,
         reasons="; ".join(filter(None, (shorten_text(reason).rstrip(".") for reason in reasons))),
-        is_total_set=TOTAL_TITLE in entry.overrides,
+        is_total_set=TOTAL_TITLE in grade.overrides,
         line=shorten_text,
         number=format_cell_number,
         wrapped=_wrap_text,
@@ -323,85 +328,101 @@ def _wrap_text(text: str, indent: str = "") -> str:
 def find_grade_column(sheet: Sheet, column_title: str) -> int:
     """Return the index of the grade column in a table of a learning platform.
 
-    ``column_title`` is "" if the table has only one grade column. The title of a column in Canvas
-    may lack the number in brackets.
+    ``column_title`` is "" if the table has only one grade column. In a Canvas gradebook, the title
+    "Lab 3" also matches the column "Lab 3 (12345)".
 
     Raises
     ------
     SettingsError
-        No column matches, or several match.
+        No column matches, or several columns match.
     """
     title_by_index = {
         index: title
-        for index, title in enumerate(sheet.head)
+        for index, title in enumerate(sheet.column_titles)
         if not any(READ_ONLY_MARK in row[index] for row in sheet.rows[:3])
     }
-    grade_index = sheet.column(GRADE_TITLES)
-    plain_titles = {
+    grade_index = sheet.column_index(GRADE_TITLES)
+    short_title_by_index = {
         index: _ASSIGNMENT_NUMBER.sub("", title) for index, title in title_by_index.items()
     }
-    assignments = [index for index, title in title_by_index.items() if plain_titles[index] != title]
-    matches = [
+    assignment_indices = [
+        index for index, title in title_by_index.items() if short_title_by_index[index] != title
+    ]
+    matching_indices = [
         index
         for index, title in title_by_index.items()
-        if normalise_text(column_title) in map(normalise_text, (title, plain_titles[index]))
+        if normalise_text(column_title) in map(normalise_text, (title, short_title_by_index[index]))
     ]
-    candidate_indices = assignments if grade_index is None else [grade_index]
-    # Moodle's worksheets have only one grade column, so --column may concern another table
-    if column_title and (matches or sheet.column(("identifier",)) is None):
-        candidate_indices = matches
+    candidate_indices = assignment_indices if grade_index is None else [grade_index]
+    # a Moodle table has one grade column, so a --column without a match is for another table
+    if column_title and (matching_indices or sheet.column_index(("identifier",)) is None):
+        candidate_indices = matching_indices
     if len(candidate_indices) == 1:
         return candidate_indices[0]
     problem = (
         "the table has several grade columns" if candidate_indices else "no grade column was found"
     )
-    titles = ", ".join(one_line(plain_titles[index], 40) for index in assignments or title_by_index)
+    titles = ", ".join(
+        one_line(short_title_by_index[index], 40) for index in assignment_indices or title_by_index
+    )
     remedy = f"Choose the grade column with --column: {one_line(titles, 300)}."
     raise SettingsError(f"{sheet.path}: {problem}.", remedy)
 
 
 def fill_grades(
     sheet: Sheet,
-    entries: Sequence[Entry],
-    register: Register,
+    grades: Sequence[Grade],
+    class_list: ClassList,
     column: str,
     feedback: Sequence[str],
     platform_max_points: float | None = None,
 ) -> tuple[Sheet, tuple[str, ...]]:
     """Enter grades and feedback into a copy of a table of a learning platform.
 
-    The students in ``register`` are first in ``entries`` and ``feedback``, in the same order. The
-    notes are sentences about grades that were not entered, or that are above the maximum.
+    Parameters
+    ----------
+    grades, feedback : sequences
+        Grade and feedback of each student in ``class_list``, then of unknown students.
+    column : str
+        Title of the grade column; "" if the table has only one.
+    platform_max_points : float, optional
+        Maximum points on the platform; by default those of the rubric.
+
+    Returns
+    -------
+    filled_sheet : Sheet
+    notes : tuple of str
+        Sentences about grades that were not entered, or that are above the maximum.
 
     Raises
     ------
     SettingsError
-        The table does not have exactly one grade column with this title.
+        No grade column was found, or several.
     """
-    grade_index, feedback_index = find_grade_column(sheet, column), sheet.column(COMMENT_TITLES)
+    grade_index, feedback_index = (
+        find_grade_column(sheet, column),
+        sheet.column_index(COMMENT_TITLES),
+    )
     format_feedback = (
-        neutralise_formulas if sheet.column(HTML_COMMENT_TITLES) is None else escape_html
+        neutralise_formulas if sheet.column_index(HTML_COMMENT_TITLES) is None else escape_html
     )
     cells_by_row = [list(row) for row in sheet.rows]
-    names = [one_line(entry.student or entry.student_id, 40) for entry in entries]
+    names = [one_line(grade.student or grade.student_id, 40) for grade in grades]
     has_decimal_comma = any(
         re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells_by_row for cell in row
     )
-    notes, found_people = [], set()
+    notes, found_indices = [], set()
     for row in cells_by_row:
         person = read_student(sheet, row)
-        student_index = register.student_index(person) if person else None
+        student_index = class_list.student_index(person) if person else None
         if student_index is None:
             continue
-        found_people.add(student_index)
-        total_points, rubric_maximum = (
-            entries[student_index].total,
-            entries[student_index].max_points,
-        )
+        found_indices.add(student_index)
+        total_points = (grade := grades[student_index]).total
         if total_points is None:
             continue
-        if platform_max_points is not None and rubric_maximum:
-            total_points = round(total_points * platform_max_points / rubric_maximum, 2)
+        if platform_max_points is not None and grade.max_points:
+            total_points = round(total_points * platform_max_points / grade.max_points, 2)
         max_points = _max_points_in_table(sheet, row, grade_index)
         if max_points is not None and total_points > max_points:
             notes.append(
@@ -416,8 +437,8 @@ def fill_grades(
             row[feedback_index] = format_feedback(feedback[student_index])
     missing_names = [
         names[index]
-        for index in range(len(register.people))
-        if index not in found_people and entries[index].total is not None
+        for index in range(len(class_list.people))
+        if index not in found_indices and grades[index].total is not None
     ]
     if missing_names:
         notes.append(
@@ -435,7 +456,7 @@ def _max_points_in_table(sheet: Sheet, row: Sequence[str], grade_index: int) -> 
 
 
 def escape_html(text: str) -> str:
-    r"""Convert a text to HTML with the same line breaks.
+    r"""Convert a text to HTML; keep line breaks and indentation.
 
     >>> escape_html("a <b>\n 1")
     'a &lt;b&gt;<br>&nbsp;1'

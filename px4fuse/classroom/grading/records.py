@@ -1,7 +1,6 @@
-"""Stored verifications of reports, by the SHA-256 of the PDF.
+"""Cache for the verification of submitted reports (PDF).
 
-A stored verification is valid while library versions and available input files are unchanged. It
-contains no points, so a new rubric needs no new verification.
+A cached result is valid while library versions and available input files are unchanged.
 """
 
 import hashlib
@@ -23,19 +22,25 @@ from px4fuse.verification.model import Verification
 from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import log_sha256, recompute, verify
 
-# Subfolder of the output folder for stored verifications
+# Subfolder of the output folder for the cached results
 RECORDS_FOLDER = "records"
-# Suffix of a redrawn report, whose name is the SHA-256 of the submitted PDF
+# Suffix of the report that px4fuse draws from the log, to be compared with the submitted PDF
 REDRAWN_SUFFIX = ".pdf"
-# Suffix of the report with px4fuse's diagnosis, which is feedback on an assigned flight
+# Suffix of the report with the faults that px4fuse found, as feedback for the student
 DIAGNOSIS_SUFFIX = ".diagnosis.pdf"
 
 
 @dataclass(frozen=True)
 class VerificationRecord:
-    """Results attached to a PDF (JSON), and result of its verification without the redrawn PDF.
+    """Result of the verification of a PDF, for the cache.
 
-    The record is valid while its ``dependencies`` are unchanged.
+    Attributes
+    ----------
+    dependencies : dict
+        Versions of libraries, and availability of input files by SHA-256. The result is valid while
+        they are unchanged.
+    results : str
+        Results (JSON) that are attached to the PDF.
     """
 
     dependencies: dict[str, str]
@@ -46,12 +51,12 @@ class VerificationRecord:
 def load_or_verify(
     records: Path, pdf: bytes, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
 ) -> tuple[ReportedResults, Verification, bool]:
-    """Read and verify a report, or load its stored verification.
+    """Read and verify a report, or load the result of an earlier verification.
 
     Parameters
     ----------
     records : Path
-        Folder of the stored verifications.
+        Folder of earlier results.
     pdf : bytes
         Content of the submitted file.
     path_by_sha256 : mapping
@@ -62,11 +67,11 @@ def load_or_verify(
     Returns
     -------
     results : ComparisonResults or LoopResults
-        Results attached to the PDF; for a verified report on an assigned log, the results with
-        px4fuse's diagnosis.
+        Results attached to the PDF. For a verified report on a log in the answer key, the results
+        contain the faults that px4fuse found.
     verification : Verification
     is_loaded : bool
-        True if a stored verification was loaded.
+        True if an earlier result was loaded.
 
     Raises
     ------
@@ -78,22 +83,25 @@ def load_or_verify(
         return *loaded, True
     results = read_report(pdf, "The file")
     dependencies = _dependencies(to_json(results), path_by_sha256, assigned_hashes)
-    # without the student's log, pass no log: the status is then "cannot verify"
+    # the log is in the answer key but not available: the status must be "cannot verify"
     is_log_missing = dependencies.get(log_sha256(results)) == "assigned"
     verification = verify(results, pdf, {} if is_log_missing else path_by_sha256)
     files = {REDRAWN_SUFFIX: verification.redrawn_pdf} if verification.redrawn_pdf else {}
     if verification.status == "verified" and log_sha256(results) in assigned_hashes:
-        results, files[DIAGNOSIS_SUFFIX] = diagnose_assigned(results, path_by_sha256)
+        results, files[DIAGNOSIS_SUFFIX] = repeat_with_diagnosis(results, path_by_sha256)
     stored_verification = replace(verification, redrawn_pdf=b"")
     record = VerificationRecord(dependencies, to_json(results), stored_verification)
     _write_record(records, sha256, record, files)
     return results, stored_verification, False
 
 
-def diagnose_assigned(
+def repeat_with_diagnosis(
     results: ReportedResults, path_by_sha256: Mapping[str, Path]
 ) -> tuple[ReportedResults, bytes]:
-    """Repeat the analysis of an assigned log with diagnosis; return results and report."""
+    """Repeat the analysis and include the faults that were hidden from the student.
+
+    Return results and report (PDF).
+    """
     token = ignores_assessed.set(True)
     try:
         outcome = recompute(results, path_by_sha256)
@@ -129,7 +137,7 @@ def _write_record(
     records: Path, sha256: str, record: VerificationRecord, files: Mapping[str, bytes]
 ) -> None:
     for old_file in records.glob(f"{sha256}.*"):
-        # the JSON record is not deleted: another process may read it for an identical PDF
+        # keep the JSON file: another process may read it for an identical PDF
         if old_file.suffix != ".json":
             old_file.unlink(missing_ok=True)
     contents = {**files, ".json": msgspec.json.encode(record)}
@@ -139,14 +147,14 @@ def _write_record(
 def _load_record(
     records: Path, sha256: str, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
 ) -> tuple[ReportedResults, Verification] | None:
-    """Load a stored verification; None if there is none, or its dependencies have changed."""
+    """Load an earlier result; None if there is none or its dependencies have changed."""
     try:
         content = (records / f"{sha256}.json").read_bytes()
         record = msgspec.json.decode(content, type=VerificationRecord)
         if record.dependencies != _dependencies(record.results, path_by_sha256, assigned_hashes):
             return None
         results = read_results(record.results.encode())
-    # if the stored verification cannot be read, the report is verified again
+    # an unreadable result is ignored, and the report is verified again
     except (OSError, msgspec.MsgspecError, ResultsError):
         return None
     return (results, record.verification) if isinstance(results, ReportedResults) else None

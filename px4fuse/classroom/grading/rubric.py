@@ -1,8 +1,4 @@
-"""Reading of a rubric, the instructor's list of items that give points, and scoring of reports.
-
-An item has a title, points, a check of :mod:`px4fuse.classroom.grading.checks` and parameters of
-the check.
-"""
+"""Scoring of reports by a rubric, the instructor's list of checks that give points."""
 
 from __future__ import annotations
 
@@ -25,9 +21,9 @@ from px4fuse.classroom.grading.checks import (
     format_reason,
     shorten_text,
 )
-from px4fuse.classroom.grading.flags import flag_pages, flag_settings
+from px4fuse.classroom.grading.flags import flag_page_differences, flag_settings
 from px4fuse.classroom.grading.form_points import FormPoints
-from px4fuse.classroom.grading.model import TOTAL_TITLE, GradedReport, Item
+from px4fuse.classroom.grading.model import TOTAL_TITLE, GradedReport, ItemScore
 from px4fuse.core.reading import read_text
 from px4fuse.core.text import one_line
 from px4fuse.errors import SettingsError
@@ -40,7 +36,7 @@ DEFAULT_RUBRIC_NAME = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000
 RUBRIC_HELP = "Write a commented example with px4fuse grade --write-rubric FILE.toml."
 
-# Numbers of a report in the class table: column title, and path in the results
+# Numbers of a report in the table of the class: column title, and path in the results
 TABLE_NUMBERS = (
     ("SIGMA_A (m/s²)", "settings.sigma_a_m_s2"),
     ("SIGMA_Z (m)", "settings.sigma_z_m"),
@@ -56,23 +52,23 @@ TABLE_NUMBERS = (
 if TYPE_CHECKING:
     AnyRubricItem = RubricItem
 else:
-    # union of the item classes of all checks; the field "check" of the TOML file selects one
+    # union of all subclasses; the field "check" in the TOML file selects the subclass
     AnyRubricItem = Union[tuple(RubricItem.__subclasses__())]  # noqa: UP007
-# Rule for the points of a report. "pending": the instructor decides whether they count
+# Rule for the points of a report. "pending": the instructor decides
 PointsRule = Literal["pending", "zero", "count"]
 
 
 class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Items that give points to a report, and rules for reports that are not fully verified.
+    """Instructor's list of checks that give points to a report.
 
     Attributes
     ----------
     unverified : {"pending", "zero"}
-        Rule for a report that could not be verified.
+        Points of a report that could not be verified.
     others_log : {"pending", "zero", "count"}
-        Rule for a report on a log that was not given to the student.
+        Points of a report on the log of another student.
     pages : {"count", "pending", "zero"}
-        Rule for a verified report with pages that differ from the redrawn report.
+        Points of a report whose numbers are verified, but whose pages were changed.
     """
 
     title: Text = ""
@@ -121,7 +117,7 @@ def parse_rubric(text: str, source_name: str) -> Rubric:
 
 
 def _describe_place(path: re.Match[str]) -> str:
-    """Convert the path in an error of msgspec to item number (from 1) and field."""
+    """Convert the path in an error of msgspec to item number and field."""
     return f"item {int(path[1]) + 1}{f', {path[2]}' * bool(path[2])}"
 
 
@@ -139,25 +135,25 @@ def score_report(
     key: AnswerKey | None,
     submitter_id: str = "",
 ) -> GradedReport:
-    """Score a report, and add flags and the action that the instructor has to take.
+    """Compute the points of a report, and add sentences about suspicious contents.
 
-    ``submitter_id`` is the student id according to the learning platform. It takes precedence over
-    the id in the report.
+    ``submitter_id`` is the student id on the learning platform, which is used instead of the id in
+    the report.
     """
     check_input = CheckInput(results, verification, key, submitter_id)
-    points_rule, rule_text = _points_rule(check_input, rubric)
+    points_rule, reason_or_action = _points_rule(check_input, rubric)
     student, command = results.student, "loop" if isinstance(results, LoopResults) else "compare"
     graded_items = []
     for item in rubric.items:
         if not item.applies(command, key):
             continue
-        fraction, comment = 0.0, f"No points: {rule_text}."
+        fraction, comment = 0.0, f"No points: {reason_or_action}."
         if points_rule != "zero":
             fraction, comment = item.score(check_input)
         awaits_points = item.by_hand and bool(student.notes.strip()) and points_rule != "zero"
         points = round(item.points * min(max(fraction, 0.0), 1.0), 2)
         graded_items.append(
-            Item(item.title, points, item.points, comment, item.by_hand, awaits_points)
+            ItemScore(item.title, points, item.points, comment, item.by_hand, awaits_points)
         )
     form_result, values = check_input.form_points, check_input.values
     if isinstance(form_result, str) or not check_input.is_own_log:
@@ -169,15 +165,15 @@ def score_report(
         verification,
         tuple(graded_items),
         flags=(
-            *flag_pages(verification),
+            *flag_page_differences(verification),
             *flag_settings(results, key is not None),
             *([] if check_input.is_own_log else [_foreign_log_advice(check_input)]),
             *([OTHER_FORM_ADVICE] if check_input.has_form_of_other_log else []),
         ),
-        instructor_action=rule_text if points_rule == "pending" else "",
-        mistakes=form_result.is_named_by_kind,
+        instructor_action=reason_or_action if points_rule == "pending" else "",
+        is_found_by_fault=form_result.is_named_by_kind,
         form_parts=tuple(
-            Item(name, form_result.points_by_part[name], max_points, "")
+            ItemScore(name, form_result.points_by_part[name], max_points, "")
             for name, max_points in form_result.max_points_by_part.items()
             if max_points
         ),
@@ -190,15 +186,15 @@ def score_report(
 
 
 def _points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, str]:
-    """Decide whether the points of a report count.
+    """Decide if the points of a report count.
 
-    Return the rule, with the reason for zero points or the action of the instructor.
+    Return the decision, and the reason for zero points or the required action of the instructor.
     """
     verification = check_input.verification
     first_reason = format_reason("".join(verification.reasons[:1]))
     if verification.status == "numbers differ":
         return "zero", f"the numbers of your report differ from those of its log{first_reason}"
-    # problems of the report: rule of the rubric, reason for the student, action of the instructor
+    # each problem has a rule, a reason for the student, and an action of the instructor
     problems: list[tuple[PointsRule, str, str]] = []
     if verification.status != "verified":
         action = (
@@ -229,7 +225,7 @@ def _points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, s
 
 
 def _foreign_log_advice(check_input: CheckInput) -> str:
-    """Return the instructor's action for a report on a log of another student."""
+    """Return the action of the instructor for a report on the log of another student."""
     student_id = shorten_text(check_input.results.student.id)
     id_text = f"the id in the report is {student_id}" if student_id else "the report has no id"
     if check_input.submitter_id:
@@ -243,11 +239,11 @@ def _foreign_log_advice(check_input: CheckInput) -> str:
 def grade_unreadable(
     rubric: Rubric, key: AnswerKey | None, reason: str, remedy: str = ""
 ) -> GradedReport:
-    """Return a graded report with zero points, for a file that is not a report."""
+    """Return zero points for a file that is not a report."""
     comment = f"No points: the file is not a px4fuse report ({shorten_text(reason).rstrip('.')})."
     verification, items = cannot_verify(reason, remedy), rubric.items
     graded_items = tuple(
-        Item(item.title, 0.0, item.points, comment)
+        ItemScore(item.title, 0.0, item.points, comment)
         for item in items
         if item.applies("compare", key)
     )

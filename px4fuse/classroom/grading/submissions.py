@@ -1,8 +1,8 @@
-"""Search for submitted PDFs in folders and in zip files of learning platforms, with their students.
+"""Search for submitted PDFs in folders and in zip files that learning platforms export.
 
 Zip files are not unpacked to disk, and the names in them are never used as paths. The platform
-writes the beginning of a path, and students choose the rest. Therefore the first part of a path
-that matches a pattern of ``platforms.toml`` identifies the student.
+writes the beginning of a path, and students choose the rest. Therefore the first folder or file
+name that matches a pattern in ``platforms.toml`` identifies the student.
 
 Sources of the patterns:
 
@@ -44,12 +44,11 @@ from px4fuse.verification.pdf_input import MAX_PDF_BYTES
 
 # Maximum number of entries of a submitted zip file
 MAX_ZIP_ENTRIES = 10_000
-# Maximum size (bytes) of the central directory of a zip file, which zipfile reads completely
+# Maximum size (bytes) of the central directory of a zip file; zipfile reads it into memory
 MAX_DIRECTORY_BYTES = 4_000_000
-# Maximum sum (bytes) of the unpacked sizes of the entries of a zip file: entries of a zip bomb
-# overlap
+# Maximum total size (bytes) of the unpacked entries of a zip file: protection from zip bombs
 MAX_UNPACKED_BYTES = 4_000_000_000
-# Maximum ratio of unpacked to packed size of a zip entry; near 1 for a PDF, which is compressed
+# Maximum ratio of unpacked to packed size of a zip entry; near 1 for a PDF
 MAX_COMPRESSION_RATIO = 100
 # Maximum length (characters) of a file name in messages
 MAX_NAME_LENGTH = 200
@@ -70,7 +69,7 @@ PLATFORMS = {
     name: re.compile(pattern)
     for name, pattern in read_toml(__file__, dict[str, str], "platforms.toml").items()
 }
-# Texts that a platform writes once into a path: a second occurrence is from the student
+# Texts that a platform writes once into a path: a second one was written by the student
 _PLATFORM_NAMES = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
 BLACKBOARD_TIME_FORMAT = "%Y-%m-%d-%H-%M-%S"
 _SUBMISSION_BLOCK = re.compile(
@@ -80,16 +79,15 @@ _SUBMITTERS_BLOCK = re.compile(r"^  :submitters:\s*\n((?:  - .*\n?|    .*\n?)*)"
 
 
 class _EntryError(Exception):
-    """Zip entry or file that is not read; the argument is the reason."""
+    """Reason why a zip entry or file is not read."""
 
 
 _BROKEN_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError)
-# BAD_VALUE_ERRORS contains RuntimeError, and so the NotImplementedError that zipfile raises
+# BAD_VALUE_ERRORS includes NotImplementedError (a RuntimeError), which zipfile raises
 _UNREADABLE_ERRORS = (_EntryError, *_BROKEN_ZIP_ERRORS, *BAD_VALUE_ERRORS)
 
 
 def _unread_reason(error: Exception) -> str:
-    """Return the reason why a file was not read."""
     if isinstance(error, _EntryError):
         return str(error)
     reason = error.strerror if isinstance(error, OSError) and error.strerror else "damaged"
@@ -97,19 +95,18 @@ def _unread_reason(error: Exception) -> str:
 
 
 def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tuple[str, ...]]:
-    """Find the PDFs in files, folders and zip files, and identify the students by the file names.
+    """Find PDFs in folders and zip files, and identify the students by the file names.
 
     Parameters
     ----------
     paths : sequence of Path
-        PDFs, folders (searched with their subfolders), and zip files exported by platforms. A zip
-        file inside a folder or a zip file was written by a student and is not opened. Gradescope's
-        ``submission_metadata.yml`` is read unless it is inside a submission.
+        PDFs, folders, and zip files exported by learning platforms. A zip file inside a folder or
+        inside a zip file is from a student and is not opened.
 
     Returns
     -------
     submissions : tuple of Submission
-        Submitted PDFs sorted by name, with unreadable ones.
+        Submitted PDFs, sorted by name; they may be unreadable.
     notes : tuple of str
         Sentences about ignored files.
 
@@ -168,9 +165,9 @@ def add_origins(
 ) -> Iterator[Submission]:
     """Add student and learning platform to submissions.
 
-    All files of an export (zip file or top-level folder) are from the platform whose pattern
-    matches most of them, so that a student cannot imitate the file names of another platform.
-    ``origin_by_submission_number`` contains students and times by Gradescope's submission number.
+    The platform is the same for all files of a zip file or folder: the one that matches most file
+    names. So a student cannot imitate the file names of another platform.
+    ``origin_by_submission_number`` contains students and times of Gradescope.
     """
     exports = [
         submission.file if submission.zip_entry else submission.name.partition("/")[0]
@@ -183,7 +180,7 @@ def add_origins(
         platforms = [platform for platform, _ in platform_counts[export].most_common(1)]
         origin = parse_origin(submission.name, platforms)
         if origin.platform in ("gradescope", ""):
-            # Gradescope exports PDF assignments as 123456.pdf
+            # Gradescope exports PDFs as SUBMISSION_NUMBER.pdf
             stem = submission.name.rpartition("/")[2].casefold().removesuffix(".pdf")
             origin = origin_by_submission_number.get(
                 origin.person.numbers.get("gradescope", stem), origin
@@ -221,7 +218,7 @@ def _is_gradescope_metadata(name: str) -> bool:
 
 
 class _LimitedFile:
-    """Zip file whose ``read`` returns at most MAX_DIRECTORY_BYTES."""
+    """Zip file that can be read only in blocks of at most MAX_DIRECTORY_BYTES."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -231,7 +228,7 @@ class _LimitedFile:
     def read(self, size: int = -1) -> bytes:
         if size > MAX_DIRECTORY_BYTES:
             raise zipfile.BadZipFile("the central directory of the zip file is too large")
-        # zipfile calls read() without a size only to find the end of the archive
+        # zipfile calls read() without a size only to search for the end of the archive
         return self._file.read(size if size >= 0 else MAX_DIRECTORY_BYTES)
 
 
@@ -244,11 +241,11 @@ def _open_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
 
 
 def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
-    """Return the files in a zip file; if it cannot be read, return none and add a note."""
+    """Return the files in a zip file; for an unreadable zip file, add a note and return []."""
     try:
         with path.open("rb") as file, _open_zip(file) as archive:
             entries = [entry for entry in archive.infolist() if not entry.is_dir()]
-        # zipfile never returns more than the declared size of an entry
+        # the declared sizes are sufficient: zipfile never unpacks more
         if sum(entry.file_size for entry in entries) > MAX_UNPACKED_BYTES:
             raise _EntryError(
                 f"the zip file unpacks to more than {MAX_UNPACKED_BYTES // 10**9} GB."
@@ -292,7 +289,7 @@ def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
             resolved_path = file.resolve(strict=True)
             # only regular files: reading a named pipe would wait forever
             is_inside = resolved_path.is_relative_to(root) and resolved_path.is_file()
-        except (OSError, RuntimeError):  # symbolic link without target, or circular
+        except (OSError, RuntimeError):  # broken or circular symbolic link
             is_inside = False
         if is_inside:
             yield Submission(resolved_path, "", name.as_posix())
@@ -309,7 +306,7 @@ def _is_hidden(name: str) -> bool:
 
 
 def _entry_time(entry: zipfile.ZipInfo) -> datetime | None:
-    """Return the time of a zip entry, in an unknown time zone; None without a valid time."""
+    """Return the time of a zip entry (unknown time zone), or None."""
     try:
         time = datetime(*entry.date_time)
     except ValueError:
@@ -333,7 +330,7 @@ def _entry_label(entry: zipfile.ZipInfo) -> str:
 
 
 def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
-    """Read a zip entry; reject kinds of entries that learning platforms do not write."""
+    """Read a zip entry; reject encrypted, linked and very large entries."""
     entry = archive.getinfo(name)
     max_unpacked_bytes = max(1_000_000, MAX_COMPRESSION_RATIO * entry.compress_size)
     rejection_reason = ""
@@ -351,7 +348,6 @@ def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
         )
     if rejection_reason:
         raise _EntryError(rejection_reason)
-    # zipfile returns at most the declared size
     return archive.read(entry)
 
 
@@ -367,7 +363,7 @@ def _short_name(name: str) -> str:
 
 
 def parse_origin(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportOrigin:
-    """Return student and submission time of a file, from its path in an export.
+    """Return student and submission time from a file path that a learning platform wrote.
 
     >>> parse_origin("Doe Jane_4711_assignsubmission_file_/report.pdf").person.name
     'Doe Jane'
@@ -388,7 +384,7 @@ def parse_origin(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> Expo
             time_text = name_parts.get("time", "")
             try:
                 time = datetime.strptime(time_text, BLACKBOARD_TIME_FORMAT) if time_text else None
-            except ValueError:  # a platform writes valid times, so a student wrote this name
+            except ValueError:  # a platform writes only valid times
                 continue
             person_names = (name_parts.get(key) for key in ("name", "first", "last"))
             numbers = {platform: name_parts["number"]} if "number" in name_parts else {}
@@ -404,8 +400,8 @@ def parse_origin(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> Expo
 def read_gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
     r"""Read students and times from Gradescope's ``submission_metadata.yml``, by submission number.
 
-    Only keys at the indentation that Gradescope writes are read; texts of students are indented
-    further. A group submission belongs to its first member.
+    A group submission belongs to the first student. Keys with a larger indentation are not read,
+    because they are texts of students.
 
     >>> text = "submission_7:\n  :submitters:\n  - :name: Ada\n    :sid: '12'\n"
     >>> read_gradescope_metadata(text)["7"].person.student_id
@@ -430,7 +426,7 @@ def _yaml_value(block: str, key: str) -> str:
 
 
 def _parse_time(value: str) -> datetime | None:
-    """Parse a time in Gradescope's YAML file; UTC without time zone, None if not valid.
+    """Parse a time in Gradescope's YAML file (default time zone UTC); None for an invalid time.
 
     >>> _parse_time("2026-11-20 12:34:56.123456000 Z").isoformat()
     '2026-11-20T12:34:56.123456+00:00'

@@ -1,4 +1,4 @@
-"""Test (gate) of loop closures against odometry, with the covariance of the odometry."""
+"""χ² test (gate) of loop closures against odometry, with the covariance of the odometry."""
 
 from collections.abc import Sequence
 
@@ -58,8 +58,8 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     if not len(tested_edges):
         return []
     odometry_edges = model.odometry_chain(graph, tested_edges)
-    first_nodes = graph.first[tested_edges]
-    second_nodes = graph.second[tested_edges]
+    first_nodes = graph.first_nodes[tested_edges]
+    second_nodes = graph.second_nodes[tested_edges]
     first_pose_index = int(min(first_nodes.min(), second_nodes.min()))
     connecting_edges = odometry_edges[
         first_pose_index : int(max(first_nodes.max(), second_nodes.max()))
@@ -102,7 +102,10 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
 def _test_edge(
     graph: model.PoseGraph, edge_index: int, residual: Array, covariance: Array
 ) -> GateResult:
-    vertices = int(graph.ids[graph.first[edge_index]]), int(graph.ids[graph.second[edge_index]])
+    vertices = (
+        int(graph.ids[graph.first_nodes[edge_index]]),
+        int(graph.ids[graph.second_nodes[edge_index]]),
+    )
     directions, closure_variance = model.information_eigenvectors(graph.information[edge_index])
     degrees_of_freedom = len(closure_variance)
     projected_residual = directions.T @ residual
@@ -130,12 +133,12 @@ def _covariances(graph: model.PoseGraph, odometry_edges: IntArray) -> Array:
     if not np.all(is_full_rank):
         edge_index = odometry_edges[int(np.argmin(is_full_rank))]
         raise TrajectoryError(
-            f"The odometry edge from vertex {graph.ids[graph.first[edge_index]]} to "
-            f"{graph.ids[graph.second[edge_index]]} has no information in one direction",
+            f"The odometry edge from vertex {graph.ids[graph.first_nodes[edge_index]]} to "
+            f"{graph.ids[graph.second_nodes[edge_index]]} has no information in one direction",
             "Give each edge an information matrix of full rank.",
         )
     covariance = np.linalg.inv(scaled_information) / (scale[:, :, None] * scale[:, None, :])
-    is_backward = graph.first[odometry_edges] > graph.second[odometry_edges]
+    is_backward = graph.first_nodes[odometry_edges] > graph.second_nodes[odometry_edges]
     # An edge from a later to an earlier pose is inverted: (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r)
     measured_adjoint = lie.adjoint(graph.measurements[odometry_edges[is_backward]])
     covariance[is_backward] = (

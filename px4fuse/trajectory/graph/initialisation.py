@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 from px4fuse.core.arrays import Array
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie, model
-from px4fuse.trajectory.graph.model import PoseGraph, normal_equations, solve_normal_equations
+from px4fuse.trajectory.graph.model import PoseGraph
+from px4fuse.trajectory.graph.normal_equations import NormalEquations
 
 
 def initialise(graph: PoseGraph) -> PoseGraph:
@@ -23,15 +24,15 @@ def initialise(graph: PoseGraph) -> PoseGraph:
         The graph is not connected, or its edges do not determine its poses.
     """
     if np.any(model.odometry_chain(graph) < 0):
-        return _chordal(graph)
+        return _initialise_chordal(graph)
     composed_graph = model.compose_odometry(graph)
     try:
-        return min(composed_graph, _chordal(graph), key=model.cost)
+        return min(composed_graph, _initialise_chordal(graph), key=model.cost)
     except TrajectoryError:  # some edges have no rotation
         return composed_graph
 
 
-def _chordal(graph: PoseGraph) -> PoseGraph:
+def _initialise_chordal(graph: PoseGraph) -> PoseGraph:
     """Fit rotation matrices and then translations, both by linear least squares."""
     dimension = graph.dimension
     rotation_information = np.trace(graph.information[:, dimension:, dimension:], axis1=1, axis2=2)
@@ -49,9 +50,11 @@ def _chordal(graph: PoseGraph) -> PoseGraph:
     )
     rotation = _nearest_rotations(relaxed_rotation.transpose(0, 2, 1))
     # Residual of an edge in the axes of the measured pose: (R_i Z)' (t_j - t_i - R_i z)
-    first_rotation = rotation[graph.first]
-    axes = first_rotation @ measured_rotation
-    information = axes @ graph.information[:, :dimension, :dimension] @ axes.transpose(0, 2, 1)
+    first_rotation = rotation[graph.first_nodes]
+    edge_axes = first_rotation @ measured_rotation
+    information = (
+        edge_axes @ graph.information[:, :dimension, :dimension] @ edge_axes.transpose(0, 2, 1)
+    )
     translation = first_rotation @ graph.measurements[:, :dimension, None]
     position = _solve_positions(
         graph, -eye, eye, information, translation, graph.poses[0, :dimension, None]
@@ -72,21 +75,24 @@ def _solve_positions(
     edge_value: Array,
     first_pose: Array,
 ) -> Array:
-    """Solve :func:`normal_equations`; the result has the shape (n, d, k)."""
-    solution = solve_normal_equations(
-        *normal_equations(
-            graph, first_coefficient, second_coefficient, information, edge_value, first_pose
-        )
-    )
+    """Solve the :class:`NormalEquations` for a known first pose; the result has shape (n, d, k)."""
+    edges = np.stack([graph.first_nodes, graph.second_nodes])
+    equations = NormalEquations(edges, *first_pose.shape)
+    known = np.zeros((len(graph), *first_pose.shape))
+    known[0] = first_pose
+    for coefficient, nodes in zip((first_coefficient, second_coefficient), edges, strict=True):
+        edge_value = edge_value - coefficient @ known[nodes]
+    values, _ = equations.assemble(first_coefficient, second_coefficient, information, edge_value)
+    solution = equations.solve(values)
     if solution is None:
         raise TrajectoryError(
             "The edges do not determine the initial poses", "Give VERTEX lines with initial poses."
         )
-    return np.concatenate([first_pose[None], solution.reshape(-1, *first_pose.shape)])
+    return known + solution
 
 
 def _nearest_rotations(matrices: Array) -> Array:
     """Return the nearest rotations to matrices, shape (n, d, d), in the Frobenius norm."""
-    left, _, right = np.linalg.svd(matrices)
-    left[:, :, -1] *= np.sign(np.linalg.det(left @ right))[:, None]
-    return np.asarray(left @ right)
+    left_vectors, _, right_vectors = np.linalg.svd(matrices)
+    left_vectors[:, :, -1] *= np.sign(np.linalg.det(left_vectors @ right_vectors))[:, None]
+    return np.asarray(left_vectors @ right_vectors)

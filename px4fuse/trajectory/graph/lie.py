@@ -170,7 +170,7 @@ def _commutator(tangent: Array) -> Array:
 
 
 def chain(steps: Array) -> Array:
-    """Return the products of the first 0, 1, ..., n relative motions, in log2(n) operations.
+    """Compose n relative motions to n + 1 poses, of which the first is the identity.
 
     Parameters
     ----------
@@ -216,13 +216,13 @@ def _left_jacobian_inverse(phi: Array) -> Array:
 def _cot_term(theta: Array) -> Array:
     """Return (1 - theta/2 cot(theta/2)) / theta^2."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
-    exact = (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2
-    return np.where(theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_SERIES), exact)
+    exact_value = (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2
+    return np.where(theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_SERIES), exact_value)
 
 
 def _cot_term_slope(theta: Array) -> Array:
     """Return the derivative of :func:`_cot_term` by theta, divided by theta."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     g_slope = 0.5 / np.tan(0.5 * t) - 0.25 * t / np.sin(0.5 * t) ** 2
-    exact = -(g_slope + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3
-    return np.where(theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_SLOPE_SERIES), exact)
+    exact_value = -(g_slope + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3
+    return np.where(theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_SLOPE_SERIES), exact_value)

@@ -3,89 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray
 from px4fuse.core.record import one_line_repr
 from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
-
-# Option relax of SuperLU: 1 gives the least fill-in; above the default of 10 SuperLU writes outside
-# its workspace (scipy 1.17, shown by valgrind)
-_SUPERLU_RELAX = 1
-# Option panel_size of SuperLU: above the default of 20, SuperLU writes outside its workspace
-_SUPERLU_PANEL_SIZE = 4
-if TYPE_CHECKING:  # scipy before 1.16 has no generic arrays
-    Matrix = sparse.csc_array[np.float64]
-
-
-def normal_equations(
-    graph: PoseGraph,
-    first_coefficient: Array,
-    second_coefficient: Array,
-    information: Array,
-    edge_value: Array,
-    first_value: Array | float = 0.0,
-) -> tuple[Matrix, Array]:
-    """Return the normal equations of ``A x_i + B x_j = c`` over all edges (i, j), with x_0 fixed.
-
-    Parameters
-    ----------
-    graph : PoseGraph
-    first_coefficient, second_coefficient, information : ndarray, shape (m, d, d)
-        A, B, and the weight matrix of each equation.
-    edge_value : ndarray, shape (m, d, k)
-        Right sides c.
-    first_value : ndarray, shape (d, k), or 0
-        Value of x_0.
-
-    Returns
-    -------
-    matrix : csc_array, shape ((n - 1) d, (n - 1) d)
-    right_side : ndarray, shape ((n - 1) d, k)
-    """
-    edge_indices = np.arange(len(graph.first) + 1)
-    d = edge_value.shape[1]
-    edge_nodes = np.column_stack([graph.first, graph.second]).ravel()
-    blocks = np.stack([first_coefficient, second_coefficient], axis=1).reshape(-1, d, d)
-    design_matrix = sparse.bsr_array(
-        (blocks, edge_nodes, 2 * edge_indices), shape=(d * edge_indices[-1], d * len(graph))
-    ).tocsc()
-    weights = sparse.bsr_array((information, edge_indices[:-1], edge_indices))
-    first_columns = design_matrix[:, :d]
-    free_columns = design_matrix[:, d:]
-    weighted_transpose = free_columns.T @ weights
-    right_side = edge_value.reshape(-1, edge_value.shape[-1]) - first_columns @ np.broadcast_to(
-        first_value, edge_value.shape[1:]
-    )
-    return (weighted_transpose @ free_columns).tocsc(), weighted_transpose @ right_side
-
-
-def solve_normal_equations(matrix: Matrix, right_side: Array, damping: float = 0.0) -> Array | None:
-    """Solve normal equations with damping on the diagonal.
-
-    Return None if the matrix is singular.
-    """
-    try:
-        factors = splu(
-            matrix + damping * sparse.eye_array(matrix.shape[0], format="csc"),
-            # MMD_AT_PLUS_A has 1.1 to 1.9 times less fill-in than COLAMD on public benchmark graphs
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            relax=_SUPERLU_RELAX,
-            panel_size=_SUPERLU_PANEL_SIZE,
-            options={"SymmetricMode": True},
-        )
-    except RuntimeError:  # exactly singular
-        return None
-    solution: Array = factors.solve(right_side)
-    return solution if np.all(np.isfinite(solution)) else None
-
+from px4fuse.trajectory.graph.normal_equations import NormalEquations
 
 # A direction is not measured if the eigenvalue of the information matrix (scaled to unit diagonal)
 # is below this limit
@@ -106,9 +34,9 @@ class PoseGraph:
     # Poses: x, y, heading in the plane; x, y, z, qx, qy, qz, qw in space
     poses: Array
     # Indices into ``poses`` of the two vertices of each edge
-    first: IntArray
-    second: IntArray
-    # Measured pose of ``second`` relative to ``first``, in the axes of ``first``
+    first_nodes: IntArray
+    second_nodes: IntArray
+    # Measured pose of the second node relative to the first, in the axes of the first
     measurements: Array
     # Inverse covariance of each measurement, translation before rotation, in the axes of the
     # measured pose; zero in directions that are not measured
@@ -123,7 +51,7 @@ class PoseGraph:
 
     def select_edges(self, is_selected: BoolArray) -> PoseGraph:
         """Return the graph with only the edges in the mask, shape (m,)."""
-        edge_fields = ("first", "second", "measurements", "information")
+        edge_fields = ("first_nodes", "second_nodes", "measurements", "information")
         return replace(self, **{name: getattr(self, name)[is_selected] for name in edge_fields})
 
     @property
@@ -131,10 +59,15 @@ class PoseGraph:
         """Degrees of freedom of a pose: 3 in the plane, 6 in space."""
         return 3 if self.dimension == 2 else 6
 
-    @property
-    def is_successive(self) -> BoolArray:
-        """Mask of the edges between successive poses, which are odometry by default."""
-        return np.asarray(np.abs(self.first - self.second) == 1)
+    @cached_property
+    def normal_equations(self) -> NormalEquations:
+        """Normal equations of the poses, with the first pose fixed."""
+        edges = np.stack([self.first_nodes, self.second_nodes])
+        return NormalEquations(edges, self.degrees_of_freedom)
+
+    def find_successive(self) -> BoolArray:
+        """Return the mask of the edges between successive poses, which are odometry by default."""
+        return np.asarray(np.abs(self.first_nodes - self.second_nodes) == 1)
 
 
 @dataclass(frozen=True)
@@ -160,7 +93,7 @@ class Residuals:
 
 def residuals(graph: PoseGraph, poses: Array) -> Residuals:
     """Compute the residuals of all edges at the poses, shape (n, 3) or (n, 7)."""
-    relative = lie.between(poses[graph.first], poses[graph.second])
+    relative = lie.between(poses[graph.first_nodes], poses[graph.second_nodes])
     residual = lie.log(lie.between(graph.measurements, relative))
     weighted_residual = (graph.information @ residual[..., None])[..., 0]
     return Residuals(poses, relative, residual, np.sum(residual * weighted_residual, axis=-1))
@@ -183,6 +116,14 @@ def information_eigenvectors(information: Array) -> tuple[Array, Array]:
     return scale[:, None] * eigenvectors[:, is_observed], 1.0 / eigenvalues[is_observed]
 
 
+def observed_directions(information: Array) -> IntArray:
+    """Return the number of directions that each measurement observes."""
+    _, scaled_information = scale_to_unit_diagonal(information)
+    eigenvalues = np.linalg.eigvalsh(scaled_information)
+    counts: IntArray = np.count_nonzero(eigenvalues > MIN_OBSERVED_EIGENVALUE, axis=1)
+    return counts
+
+
 def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
     """Return the square roots of the diagonals, and the matrices scaled to unit diagonal."""
     scale = np.sqrt(np.clip(np.diagonal(matrices, axis1=-2, axis2=-1), 0.0, None))
@@ -191,14 +132,14 @@ def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
 
 
 def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> None:
-    """Raise TrajectoryError if edges in the mask ``is_used`` do not connect all poses.
+    """Raise TrajectoryError if the used edges with information do not connect all poses.
 
-    Edges without information connect nothing. ``edges_name`` names the edges in the message.
+    ``edges_name`` names the edges in the error message.
     """
-    if not len(graph.first):
+    if not len(graph.first_nodes):
         raise TrajectoryError("The pose graph has no edges", "Give a file with EDGE lines.")
     is_informative = is_used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
-    connected_nodes = (graph.first[is_informative], graph.second[is_informative])
+    connected_nodes = (graph.first_nodes[is_informative], graph.second_nodes[is_informative])
     node_count = len(graph)
     adjacency = sparse.coo_array(
         (np.ones(len(connected_nodes[0])), connected_nodes), shape=(node_count, node_count)
@@ -224,21 +165,21 @@ def odometry_chain(graph: PoseGraph, excluded_edges: IntArray | None = None) -> 
 
     Of several edges between two poses the first is used.
     """
-    odometry_edges = np.flatnonzero(graph.is_successive)
+    odometry_edges = np.flatnonzero(graph.find_successive())
     if excluded_edges is not None:
         odometry_edges = np.setdiff1d(odometry_edges, excluded_edges)
     next_edge = np.full(len(graph) - 1, -1, dtype=np.intp)
     # Assigned in reverse order, so that the first of several edges remains
     odometry_edges = odometry_edges[::-1]
-    next_edge[np.minimum(graph.first[odometry_edges], graph.second[odometry_edges])] = (
+    next_edge[np.minimum(graph.first_nodes[odometry_edges], graph.second_nodes[odometry_edges])] = (
         odometry_edges
     )
     return next_edge
 
 
-def odometry_steps(graph: PoseGraph, chain: IntArray) -> Array:
-    """Return the relative poses of a chain of edges between successive poses."""
-    steps = graph.measurements[chain].copy()
-    is_backward = graph.first[chain] > graph.second[chain]
+def odometry_steps(graph: PoseGraph, edge_indices: IntArray) -> Array:
+    """Return the measurements of edges between successive poses, from earlier to later pose."""
+    steps = graph.measurements[edge_indices].copy()
+    is_backward = graph.first_nodes[edge_indices] > graph.second_nodes[edge_indices]
     steps[is_backward] = lie.inverse(steps[is_backward])
     return steps

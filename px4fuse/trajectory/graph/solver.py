@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import gammaincinv
+from scipy.special import chdtri, gammaincinv
 
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Record
@@ -12,12 +12,7 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory.graph import lie, model
 from px4fuse.trajectory.graph.covariance import GateResult, gate_edges
-from px4fuse.trajectory.graph.model import (
-    PoseGraph,
-    Residuals,
-    normal_equations,
-    solve_normal_equations,
-)
+from px4fuse.trajectory.graph.model import PoseGraph, Residuals
 
 # Maximum number of closures for robust optimisation by default: with more closures the optimisation
 # takes minutes
@@ -51,7 +46,7 @@ _MAX_STAGE_ITERATIONS = 20
 
 # Probability that graduated non-convexity does not truncate the residual of a true closure
 GNC_PROBABILITY = 0.99
-# Cost of dropping a closure, as quantile of χ²: the probability that a true closure costs less
+# Probability that the χ² of a true closure is below the cost of dropping the closure
 DROP_PROBABILITY = 0.999
 # Factor on the control parameter of graduated non-convexity per stage (Yang 2020, section V)
 _GNC_CONTROL_FACTOR = 1.4
@@ -59,6 +54,11 @@ _MAX_GNC_STAGES = 100
 # Maximum number of dropped closures that are tested again, each by an optimisation
 _MAX_RETRIED_CLOSURES = 20
 _MAX_TRUNCATION_ROUNDS = 20
+# Minimum factor by which information matrices are divided before the gate; if 40 % of the closures
+# are false, the estimated factor of correct matrices is 2.1
+MIN_INFORMATION_FACTOR = 2.5
+# Minimum number of closures for estimating the factor
+MIN_FACTOR_CLOSURES = 10
 
 
 class Solution(Record, kw_only=True):
@@ -108,8 +108,8 @@ def solve(
         The graph has no edges, is not connected, contains a number that is not finite, or robust
         optimisation drops all edges to some poses.
     """
-    model.require_connected(graph, np.ones(len(graph.first), bool), "the edges")
-    is_doubtful = ~graph.is_successive if is_closure is None else is_closure
+    model.require_connected(graph, np.ones(len(graph.first_nodes), bool), "the edges")
+    is_doubtful = ~graph.find_successive() if is_closure is None else is_closure
     start_residuals = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start_residuals.chi2))
     if not np.isfinite(cost_initial):
@@ -148,8 +148,7 @@ def _minimise(
         # x_j
         jacobian = lie.right_jacobian_inverse(residuals.residual)
         first_jacobian = jacobian @ lie.adjoint(lie.inverse(residuals.relative))
-        matrix, gradient = normal_equations(
-            graph,
+        values, gradient = graph.normal_equations.assemble(
             -first_jacobian,
             jacobian,
             weights[:, None, None] * graph.information,
@@ -159,12 +158,11 @@ def _minimise(
             cost_decrease = 0.0
             predicted_decrease = 0.0
             is_converged = False
-            step = solve_normal_equations(matrix, gradient, damping)
+            step = graph.normal_equations.solve(values, damping)
             if step is not None:
                 predicted_decrease = 0.5 * float(np.sum(step * (damping * step + gradient)))
-                tangent = np.concatenate([np.zeros(graph.degrees_of_freedom), step[:, 0]])
                 trial_residuals = model.residuals(
-                    graph, lie.compose(residuals.poses, lie.exp(tangent.reshape(len(graph), -1)))
+                    graph, lie.compose(residuals.poses, lie.exp(step[..., 0]))
                 )
                 cost_decrease = cost - float(np.sum(0.5 * weights * trial_residuals.chi2))
                 is_converged = abs(cost_decrease) < tolerance * cost
@@ -188,16 +186,13 @@ def _minimise(
 
 
 def _solve_gnc(
-    graph: PoseGraph, start: Residuals, plain_minimum: _Minimum, is_doubtful: BoolArray
+    graph: PoseGraph, start: Residuals, unweighted_minimum: _Minimum, is_doubtful: BoolArray
 ) -> tuple[_Minimum, Array]:
-    """Minimise truncated least squares from ``plain_minimum`` and from ``start``.
+    """Drop false closures by graduated non-convexity from two starts; use the lower minimum.
 
-    In the result with the lower cost, each dropped closure is restored if this lowers the cost.
+    A dropped closure is restored if this lowers the truncated least-squares cost.
     """
-    _, scaled_information = model.scale_to_unit_diagonal(graph.information)
-    degrees_of_freedom = np.sum(
-        np.linalg.eigvalsh(scaled_information) > model.MIN_OBSERVED_EIGENVALUE, axis=1
-    )
+    degrees_of_freedom = model.observed_directions(graph.information)
     chi2_bound = np.full(len(is_doubtful), np.inf)
     drop_cost = np.zeros(len(is_doubtful))
     is_testable = is_doubtful & (degrees_of_freedom > 0)
@@ -211,10 +206,10 @@ def _solve_gnc(
     def truncated_cost(residuals: Residuals, edge_weights: Array) -> float:
         return 0.5 * float(np.sum(np.where(edge_weights > 0.0, residuals.chi2, drop_cost)))
 
-    iteration_count = plain_minimum.iterations
+    iteration_count = unweighted_minimum.iterations
     solutions = []
-    for start_residuals in (plain_minimum.residuals, start):
-        minimum, weights = _descend_graduated(graph, start_residuals, chi2_bound)
+    for start_residuals in (unweighted_minimum.residuals, start):
+        minimum, weights = _run_gnc(graph, start_residuals, chi2_bound)
         iteration_count += minimum.iterations
         solutions.append((truncated_cost(minimum.residuals, weights), minimum, weights))
     lowest_cost, minimum, weights = min(solutions, key=lambda solution: solution[0])
@@ -234,9 +229,7 @@ def _solve_gnc(
     return _Minimum(minimum.residuals, iteration_count, minimum.converged), weights
 
 
-def _descend_graduated(
-    graph: PoseGraph, start: Residuals, chi2_bound: Array
-) -> tuple[_Minimum, Array]:
+def _run_gnc(graph: PoseGraph, start: Residuals, chi2_bound: Array) -> tuple[_Minimum, Array]:
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
     residuals = start
     iteration_count = 0
@@ -280,6 +273,13 @@ class Graph(Record, kw_only=True):
     dimension, poses, edges : int
     initialised : str
         Source of the initial poses.
+    reduced_chi2 : float
+        χ² of the least-squares solution ÷ degrees of freedom; 0 without degrees of freedom.
+    reduced_chi2_interval : tuple of float
+        95 % interval of ``reduced_chi2`` for correct information matrices and closures.
+    information_factor : float
+        Estimated factor by which all information matrices are too large; 1 if it is not large. Gate
+        and robust optimisation use the information divided by it.
     gates : tuple of GateResult, or Unavailable
         Tests of all edges that are not odometry.
     solutions : mapping from key of :data:`SOLUTIONS` to Solution
@@ -290,6 +290,9 @@ class Graph(Record, kw_only=True):
     poses: Count
     edges: Count
     initialised: str
+    reduced_chi2: NotNegative
+    reduced_chi2_interval: tuple[NotNegative, NotNegative]
+    information_factor: NotNegative
     gates: tuple[GateResult, ...] | Unavailable
     solutions: Mapping[str, Solution]
 
@@ -312,12 +315,25 @@ def analyse_graph(
     TrajectoryError
         The graph is not connected.
     """
-    is_closure = ~graph.is_successive
+    is_closure = ~graph.find_successive()
     progress(f"optimising: {SOLUTIONS['all']}")
     solutions = {"all": solve(graph)}
+    freedom = int(model.observed_directions(graph.information).sum())
+    freedom -= (len(graph) - 1) * graph.information.shape[-1]
+    reduced_chi2, interval = 0.0, (0.0, 0.0)
+    if freedom > 0:
+        reduced_chi2 = 2.0 * solutions["all"].cost / freedom
+        interval = tuple((chdtri(freedom, [0.975, 0.025]) / freedom).tolist())
+    scaled_graph, information_factor = graph, 1.0
     gates: tuple[GateResult, ...] | Unavailable
     try:
         gates = tuple(gate_edges(graph, np.flatnonzero(is_closure)))
+        if reduced_chi2 > interval[1] and len(gates) >= MIN_FACTOR_CLOSURES:
+            factor = min(reduced_chi2, _information_factor(gates))
+            if factor >= MIN_INFORMATION_FACTOR:
+                information_factor = factor
+                scaled_graph = replace(graph, information=graph.information / factor)
+                gates = tuple(gate_edges(scaled_graph, np.flatnonzero(is_closure)))
     except TrajectoryError as error:
         gates = Unavailable(
             "gate", str(error), "Give an odometry edge between all successive vertices."
@@ -327,14 +343,26 @@ def analyse_graph(
         closure_count <= MAX_ROBUST_CLOSURES if run_robust is None else run_robust
     ):
         progress(f"optimising: {SOLUTIONS[ROBUST]}")
-        solutions[ROBUST] = solve(graph, robust=True, is_closure=is_closure)
+        solutions[ROBUST] = solve(scaled_graph, robust=True, is_closure=is_closure)
     results = Graph(
         name=name,
         dimension=graph.dimension,
         poses=len(graph),
-        edges=len(graph.first),
+        edges=len(graph.first_nodes),
         initialised=graph.initialised,
+        reduced_chi2=reduced_chi2,
+        reduced_chi2_interval=interval,
+        information_factor=information_factor,
         gates=gates,
         solutions=solutions,
     )
     return results, replace(graph, poses=solutions["all"].poses)
+
+
+def _information_factor(gates: tuple[GateResult, ...]) -> float:
+    """Estimate a common factor of all information matrices from the distances of the closures.
+
+    The median is robust against false closures if they are a minority.
+    """
+    medians = chdtri([gate.degrees_of_freedom for gate in gates], 0.5)
+    return float(np.median(np.divide([gate.d2 for gate in gates], medians)))

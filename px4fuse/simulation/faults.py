@@ -1,4 +1,4 @@
-"""Injected faults of a simulated flight; ``mistakes.toml`` describes them.
+"""Injected faults of a simulated flight; ``faults.toml`` describes them.
 
 Examples of sizes on the command line: ``0.08``, ``80ms``, ``5%``, ``8s,40s``. Without a size, the
 fault has a default size that px4fuse detects easily.
@@ -14,8 +14,8 @@ from px4fuse.simulation.scenario import KINDS, ScenarioKind, bounded_number, bou
 
 
 @dataclass(frozen=True)
-class Mistakes:
-    """Sizes of the faults to inject into a simulated flight; ``mistakes.toml`` explains each fault.
+class FaultSizes:
+    """Sizes of the faults to inject into a simulated flight; ``faults.toml`` explains each fault.
 
     By default, no fault is injected. An EKF2 noise of 0 and a delay of None are the correct values.
     """
@@ -54,14 +54,14 @@ class Mistakes:
     ekf2_off: bool = False
 
 
-BOUNDS_BY_FIELD = bounds_by_field(Mistakes)
+BOUNDS_BY_FIELD = bounds_by_field(FaultSizes)
 # ASCII spelling of units, for sizes of injected faults on the command line
 _ASCII_UNITS = {"°": "deg", "m/s²": "m/s2"}
 
 
 @dataclass(frozen=True)
-class Mistake:
-    """Fault that can be injected into a simulated flight, from ``mistakes.toml``.
+class FaultType:
+    """Fault that can be injected into a simulated flight, from ``faults.toml``.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Mistake:
     changes_ekf2 : bool
         True if the fault changes EKF2 parameters.
     fields : tuple of str
-        Fields of :class:`Mistakes` that the fault sets: the size, then optional values.
+        Fields of :class:`FaultSizes` that the fault sets: the size, then optional values.
     """
 
     default: float | bool
@@ -84,7 +84,7 @@ class Mistake:
 
     @property
     def size_fields(self) -> tuple[str, ...]:
-        """Fields that are sizes or times; empty for a fault without a size."""
+        """Names of the fields with sizes and times; empty for a fault without a size."""
         return () if self.default is True else self.fields
 
     @property
@@ -96,22 +96,22 @@ class Mistake:
         return required + "".join(f"[,{placeholder[1:]}]" for placeholder in optional)
 
 
-MISTAKES: Mapping[str, Mistake] = {
+FAULT_TYPES: Mapping[str, FaultType] = {
     name: replace(
-        mistake,
+        fault_type,
         # the names of the fields begin with the name of the fault
         fields=tuple(
-            field for field in vars(Mistakes()) if field.startswith(name.replace("-", "_"))
+            field for field in vars(FaultSizes()) if field.startswith(name.replace("-", "_"))
         ),
     )
-    for name, mistake in read_toml(__file__, dict[str, Mistake]).items()
+    for name, fault_type in read_toml(__file__, dict[str, FaultType]).items()
 }
 
 
-def parse_mistakes(texts: Iterable[str]) -> Mistakes:
+def parse_faults(texts: Iterable[str]) -> FaultSizes:
     """Parse injected faults from the command line.
 
-    >>> parse_mistakes(["clock-offset=80ms", "nlos=5%,3m"]).clock_offset_s
+    >>> parse_faults(["clock-offset=80ms", "nlos=5%,3m"]).clock_offset_s
     0.08
 
     Parameters
@@ -127,51 +127,51 @@ def parse_mistakes(texts: Iterable[str]) -> Mistakes:
     value_by_field: dict[str, float] = {}
     for option_text in texts:
         name, separator, values_text = option_text.strip().partition("=")
-        if name not in MISTAKES:
+        if name not in FAULT_TYPES:
             raise SettingsError(
                 f"--mistake {option_text}: px4fuse cannot inject the fault {name}",
-                f"{suggest_name(name, MISTAKES)}Choose from {', '.join(MISTAKES)}.",
+                f"{suggest_name(name, FAULT_TYPES)}Choose from {', '.join(FAULT_TYPES)}.",
             )
-        mistake = MISTAKES[name]
+        fault_type = FAULT_TYPES[name]
         typed_values = values_text.split(",") if separator else []
-        if len(typed_values) > len(mistake.size_fields):
+        if len(typed_values) > len(fault_type.size_fields):
             raise SettingsError(
                 f"--mistake {option_text}: the fault has too many values. "
-                f"Use {name}{mistake.usage}."
+                f"Use {name}{fault_type.usage}."
             )
-        value_by_field[mistake.fields[0]] = mistake.default
-        for field_name, value in zip(mistake.size_fields, typed_values, strict=False):
+        value_by_field[fault_type.fields[0]] = fault_type.default
+        for field_name, value in zip(fault_type.size_fields, typed_values, strict=False):
             bounds = BOUNDS_BY_FIELD[field_name]
             typed_size = convert_to_unit(value, bounds.unit)
             if typed_size is None:
                 raise SettingsError(
                     f"--mistake {option_text}: {value!r} is not a valid value: give "
-                    f"{UNIT_NAMES[bounds.unit]}, as in {name}{mistake.usage}."
+                    f"{UNIT_NAMES[bounds.unit]}, as in {name}{fault_type.usage}."
                 )
             bounds.check(typed_size, f"--mistake {option_text}: {bounds.cli_name}")
             value_by_field[field_name] = typed_size
-    return Mistakes(**value_by_field)  # type: ignore[arg-type]
+    return FaultSizes(**value_by_field)  # type: ignore[arg-type]
 
 
-def active_mistake_names(mistakes: Mistakes) -> tuple[str, ...]:
+def injected_fault_names(faults: FaultSizes) -> tuple[str, ...]:
     """Return the names of the faults with a size that is not the default."""
-    defaults = Mistakes()
+    defaults = FaultSizes()
     return tuple(
         name
-        for name, mistake in MISTAKES.items()
-        if getattr(mistakes, mistake.fields[0]) != getattr(defaults, mistake.fields[0])
+        for name, fault_type in FAULT_TYPES.items()
+        if getattr(faults, fault_type.fields[0]) != getattr(defaults, fault_type.fields[0])
     )
 
 
-def format_mistake(name: str, mistakes: Mistakes) -> str:
+def format_fault(name: str, faults: FaultSizes) -> str:
     """Format one injected fault with its values, in the notation of the option --mistake.
 
-    >>> format_mistake("nlos", parse_mistakes(["nlos=5"]))
+    >>> format_fault("nlos", parse_faults(["nlos=5"]))
     'nlos=5%,2m'
     """
     value_texts = [
         f"{value:g}{_ASCII_UNITS.get(unit := BOUNDS_BY_FIELD[field_name].unit, unit)}"
-        for field_name in MISTAKES[name].size_fields
-        if (value := getattr(mistakes, field_name)) is not None
+        for field_name in FAULT_TYPES[name].size_fields
+        if (value := getattr(faults, field_name)) is not None
     ]
     return f"{name}={','.join(value_texts)}" if value_texts else name
