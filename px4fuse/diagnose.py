@@ -274,6 +274,7 @@ def rerun(
             *planned_configurations(comparison, estimates, inputs),
         ],
     )
+    release_free_memory()
     difference_steps = explain_ekf2_difference(
         comparison, model, estimates.clock, estimated_settings
     )
