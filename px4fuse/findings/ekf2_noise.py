@@ -7,6 +7,7 @@ from px4fuse.comparison.remedy import (
     aid_of,
     different_settings,
     format_settings,
+    height_noise_advice,
     noise_used_m,
 )
 from px4fuse.comparison.trials import Trial, find_trial, sigma_ratio_changes
