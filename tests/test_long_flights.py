@@ -12,6 +12,7 @@ from px4fuse.comparison.error_patterns import (
     find_offset_variation,
     find_periodic_error,
 )
+from px4fuse.core import arrays
 from px4fuse.ekf2 import output_predictor
 from px4fuse.flight.model import rows_between, time_index
 
@@ -76,7 +77,7 @@ def test_periodic_error_of_any_length_has_injected_period(count):
 def test_output_predictor_blocks_equal_recursion(monkeypatch, lag_steps):
     error_rad = np.random.default_rng(lag_steps).standard_normal((500, 3))
     whole = output_predictor.follow_attitude(error_rad, lag_steps, 0.01, 0.2)
-    monkeypatch.setattr(output_predictor, "BLOCK_STEPS", 64)
+    monkeypatch.setattr(arrays, "BLOCK_ROWS", 64)
     in_blocks = output_predictor.follow_attitude(error_rad, lag_steps, 0.01, 0.2)
     np.testing.assert_allclose(in_blocks, whole, atol=1e-12)
 
