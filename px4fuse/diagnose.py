@@ -95,7 +95,8 @@ def _diagnose_flight(
     request: ComparisonRequest, progress: Progress, flight: Flight, *, as_sent: bool
 ) -> Analysis:
     prepared_comparison = prepare_comparison(flight, request, progress, as_sent=as_sent)
-    kf_runs = run_kf(prepared_comparison, progress)
+    progress("running KF")
+    kf_runs = run_kf(prepared_comparison)
     comparison = compare(prepared_comparison, kf_runs)
     return replace(find_faults(comparison, progress), request=request)
 
@@ -273,6 +274,7 @@ def rerun(
             *planned_configurations(comparison, estimates, inputs),
         ],
     )
+    release_free_memory()
     difference_steps = explain_ekf2_difference(
         comparison, model, estimates.clock, estimated_settings
     )

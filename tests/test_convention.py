@@ -236,7 +236,7 @@ def turned(flight: Flight) -> PositionTrack:
 
 
 # By id of the finding, and kind of the fault
-FAULTS = {
+CONVENTION_FAULTS = {
     ("source_axes_wrong", "axes"): lambda flight: sent(flight, ENU),
     ("source_unit_wrong", "unit"): lambda flight: sent(flight, unit="cm"),
     ("source_frame_misaligned", "rotation"): lambda flight: sent(flight, rotation_deg=60.0),
@@ -256,7 +256,7 @@ def compared(track: PositionTrack) -> Comparison:
 
 def examples() -> Iterator[Finding]:
     """Return examples of the findings about the convention, for their pages."""
-    for change in FAULTS.values():
+    for change in CONVENTION_FAULTS.values():
         yield from source_convention.detect(compared(change(flown())))
     unclear = replace(compared(sent(flown())), convention=AMBIGUOUS)
     yield from source_convention.detect(unclear)
@@ -268,15 +268,17 @@ AMBIGUOUS = Convention(
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "kind"), FAULTS)
+@pytest.mark.parametrize(("name", "kind"), CONVENTION_FAULTS)
 def test_wrong_axes_unit_or_clock_is_the_only_reported_fault(name, kind):
-    found = list(source_convention.detect(compared(FAULTS[name, kind](flown()))))
+    found = list(source_convention.detect(compared(CONVENTION_FAULTS[name, kind](flown()))))
     assert [(one.id, one.evidence[CONVENTION]) for one in found] == [(name, kind)]
 
 
-@pytest.mark.parametrize("name", [name for name, _ in FAULTS if "orientation" not in name])
+@pytest.mark.parametrize(
+    "name", [name for name, _ in CONVENTION_FAULTS if "orientation" not in name]
+)
 def test_compare_converts_positions_in_wrong_frame_to_ned(name):
-    track = next(FAULTS[one](flown()) for one in FAULTS if one[0] == name)
+    track = next(CONVENTION_FAULTS[one](flown()) for one in CONVENTION_FAULTS if one[0] == name)
     samples, truth = compared(track).source.samples, flown().truth.samples
     error = [
         samples[column] - np.interp(samples.index, truth.index, truth[column])

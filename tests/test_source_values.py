@@ -222,7 +222,7 @@ def with_clock(flight: Flight, name: str, note: str = "", distinct: int | None =
     return with_track(flight, clock_map=clock)
 
 
-FAULTS = {
+VALUE_FAULTS = {
     "source_is_ekf2_estimate": copied,
     "source_two_senders": alternating,
     "source_positions_rounded": lambda flight: with_track(flight, step_m=0.5),
@@ -245,14 +245,14 @@ def detected(flight: Flight) -> tuple[Finding, ...]:
 
 def examples() -> Iterator[Finding]:
     """Return examples of the findings about values and timestamps, for their pages."""
-    for name, change in FAULTS.items():
+    for name, change in VALUE_FAULTS.items():
         yield from (one for one in detected(change(aisle_flight())) if one.id == name)
     yield from source_values.detect_lever_arm(mounted((0.4, -0.3)))
 
 
-@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("name", VALUE_FAULTS)
 def test_invalid_position_values_are_the_only_reported_fault(name):
-    assert [one.id for one in detected(FAULTS[name](aisle_flight()))] == [name]
+    assert [one.id for one in detected(VALUE_FAULTS[name](aisle_flight()))] == [name]
 
 
 @pytest.mark.parametrize("lost", [0, 1])

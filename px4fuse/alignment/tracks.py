@@ -77,7 +77,7 @@ class SampledTrack:
     name: str = ""
 
     def to_complex_m(self) -> Complex:
-        """Return North + i·east, shape (n,)."""
+        """Return the horizontal positions as complex numbers north + i·east, shape (n,)."""
         return self.position_m[:, 0] + 1j * self.position_m[:, 1]
 
     def at(self, time_s: Array) -> tuple[Array, BoolArray]:
@@ -155,11 +155,7 @@ def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
         raise NoMatchError("the log has no EKF2 position")
     state = flight.ekf2.state
     states = [state]
-    resets = [
-        reset
-        for reset in flight.ekf2.resets
-        if reset.quantity == "position" and any(reset.delta[:2])
-    ]
+    resets = flight.ekf2.find_horizontal_resets()
     if resets:
         is_after_reset = state.index.to_numpy()[:, None] >= [reset.time_s for reset in resets]
         reset_sum_m = is_after_reset @ np.array([(*reset.delta[:2], 0.0) for reset in resets])

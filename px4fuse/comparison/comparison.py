@@ -1,6 +1,6 @@
 """Comparison of KF with EKF2, and of both with ground truth, axis by axis."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -37,11 +37,8 @@ from px4fuse.flight.model import (
 VARIANCE_COLUMNS = ("position_variance_m2", "velocity_variance_m2_s2")
 
 
-def run_kf(
-    prepared: PreparedComparison, progress: Callable[[str], None] = lambda _: None
-) -> dict[str, Replay]:
-    """Run KF along each axis of a comparison; return the runs by axis name."""
-    progress(f"running KF along the axes {', '.join(axis.name for axis in prepared.input_axes)}")
+def run_kf(prepared: PreparedComparison) -> dict[str, Replay]:
+    """Run KF along each axis of a comparison, and return the runs by axis name."""
     return {axis.name: replay(axis, prepared.settings) for axis in prepared.input_axes}
 
 

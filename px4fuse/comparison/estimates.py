@@ -108,11 +108,12 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
     )
     tuning, clock_offset = estimate_noises_and_clock(comparison, progress, tuned_axes)
     fit, low_pass, correlated_noise = _fit_source_errors(comparison, tuning, clock_offset)
+    progress("heading")
     source, is_odometry = comparison.source, comparison.source.orientation is not None
     return Estimates(
         tuning=tuning,
         clock=clock_offset,
-        heading=estimate_frame_rotation(comparison, tuning, clock_offset, progress),
+        heading=estimate_frame_rotation(comparison, tuning, clock_offset),
         systematic_errors=fit,
         source_low_pass=low_pass,
         time_correlated_noise=correlated_noise,
@@ -189,10 +190,8 @@ def estimate_frame_rotation(
     comparison: Comparison,
     tuning: Tuning,
     clock_offset: ClockOffset | Unavailable,
-    progress: Progress = ignore_progress,
 ) -> HeadingError | Unavailable:
     """Estimate the yaw misalignment of the position frame."""
-    progress("heading")
     axis_tuning, sigma_z_m = first_axis_tuning(tuning, HORIZONTAL), comparison.settings.sigma_z_m
     if axis_tuning is not None:
         sigma_z_m = value_or_bound(axis_tuning.sigma_z, sigma_z_m)

@@ -44,7 +44,6 @@ from px4fuse.trajectory.rotation import interpolate, to_matrix
 LOGGED_ORIGINS = ORIGIN_BY_TRACK_NAME | {
     source.track_name: source.origin for source in POSITION_INPUTS
 }
-POSITION_MESSAGES = dict.fromkeys(source.message for source in POSITION_INPUTS)
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
     "KF uses the only ground truth in the log as its position source",
@@ -283,7 +282,7 @@ def explain_missing_source(flight: Flight) -> Unavailable:
         "give the position file with --position."
     )
     if flight.log.format.startswith("MAVLink"):
-        topics = " or ".join(POSITION_MESSAGES)
+        topics = " or ".join(dict.fromkeys(source.message for source in POSITION_INPUTS))
         ulog_text = ", or read the ULog of this flight" if flight.log.has_ulog else ""
         remedy = (
             f"give the position file of the positioning system as argument `position`{ulog_text}."

@@ -640,13 +640,7 @@ def matching_sample_rows(sample_s: Array, measurement_s: Array) -> IntArray:
 
 def horizontal_resets_s(ekf2: Ekf2) -> Array:
     """Return the times (s) of horizontal position resets in the published state."""
-    return np.array(
-        [
-            reset.time_s
-            for reset in ekf2.resets
-            if reset.quantity == "position" and any(reset.delta[:2])
-        ]
-    )
+    return np.array([reset.time_s for reset in ekf2.find_horizontal_resets()])
 
 
 def _vision_track(flight: Flight) -> PositionTrack | Unavailable:

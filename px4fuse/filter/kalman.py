@@ -124,13 +124,15 @@ def _run_filterpy(
     kalman.inv = np.reciprocal  # S is 1 by 1
     states: StepRows = [(initial.position_m, initial.velocity_m_s, *model.INITIAL_COVARIANCE)]
     updates: StepRows = []
-    for dt_s, acceleration, noise_density, measured_m in zip(*inputs, strict=True):
-        kalman.predict(
-            u=np.array([[acceleration]]),
-            B=np.array([[dt_s**2 / 2.0], [dt_s]]),
-            F=model.transition(dt_s),
-            Q=noise_density * model.symmetric_matrix(model.process_noise_unit(dt_s)),
-        )
+    dt_s, acceleration, noise_density = (np.array(values)[:, None, None] for values in inputs[:3])
+    matrices = (
+        acceleration,
+        np.concatenate([dt_s**2 / 2.0, dt_s], axis=1),
+        model.transition(dt_s[:, 0, 0]),
+        noise_density * model.symmetric_matrix(model.process_noise_unit(dt_s[:, 0, 0])),
+    )
+    for u, B, F, Q, measured_m in zip(*matrices, inputs[3], strict=True):
+        kalman.predict(u=u, B=B, F=F, Q=Q)
         if measured_m is not None:
             kalman.update(measured_m)
             x, P, K = kalman.x_prior, kalman.P_prior, kalman.K

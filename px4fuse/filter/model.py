@@ -15,9 +15,8 @@ than arrays of one element. A covariance is a tuple of its elements 00, 01, 11.
 
 from typing import TypeVar
 
-import numpy as np
-
 from px4fuse.core.arrays import Array
+from px4fuse.trajectory.rotation import from_elements
 
 STATE_COLUMNS = ["position_m", "velocity_m_s"]
 COVARIANCE_COLUMNS = ["position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2"]
@@ -31,15 +30,15 @@ T = TypeVar("T", float, Array)
 Symmetric = tuple[T, T, T]
 
 
-def symmetric_matrix(covariance: Symmetric[float]) -> Array:
+def symmetric_matrix(covariance: Symmetric[float] | Symmetric[Array]) -> Array:
     """Return a symmetric 2 × 2 matrix from its elements 00, 01, 11."""
     p00, p01, p11 = covariance
-    return np.array([[p00, p01], [p01, p11]])
+    return from_elements((p00, p01), (p01, p11))
 
 
-def transition(dt_s: float) -> Array:
+def transition(dt_s: float | Array) -> Array:
     """Return KF's transition matrix F, shape (2, 2)."""
-    return np.array([[1.0, dt_s], [0.0, 1.0]])
+    return from_elements((1.0, dt_s), (0.0, 1.0))
 
 
 def process_noise_unit(dt_s: T) -> Symmetric[T]:

@@ -684,6 +684,12 @@ class Ekf2:
 
     __repr__ = one_line_repr
 
+    def find_horizontal_resets(self) -> list[Reset]:
+        """Return the resets of the horizontal position."""
+        return [
+            reset for reset in self.resets if reset.quantity == "position" and any(reset.delta[:2])
+        ]
+
 
 @dataclass(frozen=True)
 class Truth:

@@ -184,7 +184,7 @@ class Loop(Record, kw_only=True):
         }
 
     def select_reported_paths(self) -> tuple[CorrectedPath, ...]:
-        """Return the paths that differ: without rejected closures, for example, two are equal."""
+        """Return the available paths; of two paths that are equal by definition, only one."""
         duplicates: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
             duplicates.add("pose_graph_all")

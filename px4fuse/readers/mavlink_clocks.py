@@ -87,15 +87,18 @@ def fit_least_delay(x: Array, y: Array) -> ClockLine:
             initial_slope
         ):
             slope = initial_slope
-    residual_s = y - slope * (x - x0)
-    envelope_rows = [rows[np.argmin(residual_s[rows])] for rows in interval_rows]
+
+    def find_envelope(slope: float) -> tuple[Array, list[int]]:
+        residual_s = y - slope * (x - x0)
+        return residual_s, [rows[np.argmin(residual_s[rows])] for rows in interval_rows]
+
+    residual_s, envelope_rows = find_envelope(slope)
     if span_s >= MIN_DRIFT_SPAN_S and len(envelope_rows) > 1:
         # Two iterations, because a new slope may change which messages have the smallest delay
         for _ in range(2):
             corrected_slope = slope + _median_slope(x[envelope_rows], residual_s[envelope_rows])
             slope = corrected_slope if _is_rate_ratio(corrected_slope) else 1.0
-            residual_s = y - slope * (x - x0)
-            envelope_rows = [rows[np.argmin(residual_s[rows])] for rows in interval_rows]
+            residual_s, envelope_rows = find_envelope(slope)
     return ClockLine(
         x0, float(np.median(residual_s[envelope_rows])), slope, robust_std(residual_s), len(x)
     )

@@ -33,8 +33,8 @@ from equal_statements import NUMBER, PARAMETER, Job, jobs, texts_of
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import compare
-from px4fuse.comparison.model import Comparison, ErrorsAgainstTruth
+from px4fuse.comparison.comparison import compare, run_kf
+from px4fuse.comparison.model import Comparison, ErrorsAgainstTruth, PreparedComparison
 from px4fuse.diagnose import diagnose, prepare_comparison, read_flight
 from px4fuse.ekf2.model import Model, open_model, with_misaligned_positions
 from px4fuse.ekf2.whatif import what_if
@@ -76,6 +76,10 @@ def rmse_m(comparison: Comparison) -> float:
     if not all(isinstance(error, ErrorsAgainstTruth) for error in errors):
         return math.nan
     return math.hypot(*(error.position_rmse_m for error in errors))
+
+
+def compare_with_kf(prepared: PreparedComparison) -> Comparison:
+    return compare(prepared, run_kf(prepared))
 
 
 def limit_m(before_m: float, duration_s: float) -> float:
@@ -158,7 +162,7 @@ def follow(analysis: Analysis, request: ComparisonRequest) -> list[Fix]:
             if kind == "KF":
                 fixed = apply_options(request, change)
                 fixed_flight = read_flight(fixed) if request.position else flight
-                again = compare(prepare_comparison(fixed_flight, fixed))
+                again = compare_with_kf(prepare_comparison(fixed_flight, fixed))
                 before_m, after_m = rmse_m(analysis), rmse_m(again)
             elif isinstance(model, Model) and kind == "EKF2":
                 before_m, after_m = replayed_m(model, change)
@@ -176,7 +180,7 @@ def follow(analysis: Analysis, request: ComparisonRequest) -> list[Fix]:
     faults = [one for one in analysis.findings if "convention" in one.evidence]
     if faults:
         try:
-            sent = compare(
+            sent = compare_with_kf(
                 prepare_comparison(
                     read_flight(request) if request.position else flight, request, as_sent=True
                 )

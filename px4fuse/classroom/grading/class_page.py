@@ -118,11 +118,11 @@ def _class_row(grade: Grade, item_titles: Sequence[str], number_titles: Sequence
     points_by_title = {item.title: item.points for item in report.items} if report else {}
     number_values = report.numbers if report else {}
     cells = (
-        Cell(grade.display_name, grade.student or None, file_name),
-        frame.text_cell(grade.student_id),
+        Cell(grade.display_name, below=file_name),
+        Cell(grade.student_id),
         Cell(f"{symbol} {status}", float(STATUSES.index(status)), flag_count_text, css_style),
         _points_cell(grade),
-        frame.text_cell(grade.submission_time, late_text),
+        Cell(grade.submission_time, below=late_text),
         Cell("\n".join(grade.flags), float(flag_count), "", "flags"),
         *(frame.number_cell(points_by_title.get(title)) for title in item_titles),
         *(frame.number_cell(number_values.get(title)) for title in number_titles),
@@ -172,11 +172,11 @@ def _grade_details(grade: Grade) -> Iterator[Section]:
     actions = [report.instructor_action] if report.instructor_action else []
     yield frame.list_section("Required decision of the instructor", actions, is_warning=True)
     yield frame.list_section("Verification", verification.reasons)
-    titles = ("Value", "Report", "New run") if differences else ()
-    yield frame.table_section("Numbers that differ in the new run", titles, differences)
+    yield frame.table_section(
+        "Numbers that differ in the new run", differences, ("Value", "Report", "New run")
+    )
     title = "Points (proposed)" if report.instructor_action else "Points"
-    item_titles = ("Item", "Points", "Of", "Comment") if items else ()
-    yield frame.table_section(title, item_titles, items, (1, 2))
+    yield frame.table_section(title, items, ("Item", "Points", "Of", "Comment"), (1, 2))
     yield comment
     yield frame.list_section("Injected faults of this flight", fault_texts)
     yield frame.name_value_section("Answer form", [*form_rows(report.form)] if report.form else [])
