@@ -256,10 +256,8 @@ def _use_barometer_height(
         if height_sensor == "barometer":
             raise MissingDataError(f"{log_name}: no barometer height in the log.", GNSS.to_log)
         return track
-    zero_height_down_m, zero_text = (
-        barometer_heights["down_m"].iloc[0],
-        "the first barometer height",
-    )
+    zero_height_down_m = barometer_heights["down_m"].iloc[0]
+    zero_text = "the first barometer height"
     if isinstance(ekf2, Ekf2):
         ekf2_down_m = np.interp(
             barometer_heights.index, ekf2.state.index, ekf2.state["down_m"], np.nan, np.nan
@@ -297,13 +295,15 @@ def explain_missing_source(flight: Flight) -> Unavailable:
             f"or {remedy}"
         )
     reason = f"{damage_text}no external position in this log (no {topics})"
-    height_only = next((item for item in flight.missing if item.reason == HEIGHT_ONLY_REASON), None)
-    if height_only is not None:
-        reason = f"{damage_text}{height_only.source}: {HEIGHT_ONLY_REASON}"
-    gnss = next((item for item in flight.missing if item.remedy == NO_FIX_ACTION), None)
-    if gnss is not None:
-        reason += f"; {gnss.source}: {gnss.reason}"
-        remedy = f"{gnss.remedy} Or {remedy}"
+    height_only_source = next(
+        (item for item in flight.missing if item.reason == HEIGHT_ONLY_REASON), None
+    )
+    if height_only_source is not None:
+        reason = f"{damage_text}{height_only_source.source}: {HEIGHT_ONLY_REASON}"
+    gnss_without_fix = next((item for item in flight.missing if item.remedy == NO_FIX_ACTION), None)
+    if gnss_without_fix is not None:
+        reason += f"; {gnss_without_fix.source}: {gnss_without_fix.reason}"
+        remedy = f"{gnss_without_fix.remedy} Or {remedy}"
     if flight.log.autopilot != "PX4":
         reason += f"; the autopilot is {flight.log.autopilot}, so there is no EKF2"
     return Unavailable("position source", reason, capitalise_first(remedy))
