@@ -120,7 +120,9 @@ def prepare(
                 f"{flight.log.name}: `input` imu needs acceleration: {acceleration}"
             )
         settings = replace(settings, input="zero")
-        notes += (f"no acceleration ({acceleration.reason}): KF assumes constant velocity",)
+        notes += (
+            f"KF assumes constant velocity, because acceleration is missing: {acceleration.reason}",
+        )
         missing += () if acceleration in missing else (acceleration,)
     return PreparedComparison(
         flight,
@@ -254,7 +256,9 @@ def _use_barometer_height(
     )
     if not uses_barometer or barometer_heights is None:
         if height_sensor == "barometer":
-            raise MissingDataError(f"{log_name}: no barometer height in the log.", GNSS.to_log)
+            raise MissingDataError(
+                f"{log_name}: the log contains no barometer height.", GNSS.to_log
+            )
         return track
     zero_height_down_m = barometer_heights["down_m"].iloc[0]
     zero_text = "the first barometer height"
@@ -392,7 +396,7 @@ def choose_segment(
     if not chosen_start_s < chosen_end_s:
         raise SettingsError(
             f"{flight.log.name}: no positions between {chosen_start_s:.6g} s and "
-            f"{chosen_end_s:.6g} s; the position source runs from "
+            f"{chosen_end_s:.6g} s; the positions are from "
             f"{source_span_s[0]:.2f} s to {source_span_s[1]:.2f} s. Change --start or --end."
         )
     segment_start_s = max(chosen_start_s, available_start_s)
