@@ -29,6 +29,7 @@ from px4fuse.classroom.grading.form_points import (
     panels_showing,
 )
 from px4fuse.cli.simulate import simulate
+from px4fuse.core.text import convert_nested
 from px4fuse.results.answer_form import (
     CORRECTIONS,
     FAULT_KINDS,
@@ -36,7 +37,6 @@ from px4fuse.results.answer_form import (
     Answers,
     Choice,
     NamedFault,
-    update_renamed_values,
 )
 from px4fuse.simulation import flights
 from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED
@@ -231,7 +231,9 @@ def simulation_of(typed: str) -> flights.Simulation:
 
 
 def answers_of(form: dict[str, Any]) -> Answers:
-    form = update_renamed_values(form)  # the forms use the values before schema 4
+    form = convert_nested(
+        form, lambda word: NEW_WORDS.get(word, word)
+    )  # the forms use the values before schema 4
     claims = []
     for one in form["mistakes"] or []:
         when = one["when"]
@@ -263,6 +265,27 @@ def to_tuple(value: Any) -> Any:
     return tuple(map(float, value)) if isinstance(value, list) else value
 
 
+# Answers before schema 4, in the forms of the study
+NEW_WORDS = {
+    "calibrate the magnetometer": "calibrate the compass",
+    "verdict_ours": "verdict_kf",
+    "ours": "kf",
+    "overstated": "underconfident",
+    "understated": "overconfident",
+    "nothing unusual": "normal",
+    "followed the wrong positions": "followed wrong positions",
+    "rejected the bad samples": "rejected outliers",
+    "coasted, then reset": "dead-reckoned, then reset",
+    "trusted the positions too little": "weighted the positions too little",
+    "error to truth": "error against ground truth",
+    "why EKF2 differs": "differences KF - EKF2",
+    "correct the stamps at the sender": "correct the timestamps at the sender",
+    "multiply the positions at the sender": "scale the positions at the sender",
+    "turn the positions at the sender": "rotate the positions at the sender",
+    "one set of anchors": "use one set of anchors",
+    "line of sight and link": "improve line of sight and link",
+    "switch the smoothing off": "disable the low-pass filter",
+}
 VERDICT_WORDS = {
     "consistent": "consistent", "overstated": "underconfident", "understated": "overconfident",
 }  # fmt: skip

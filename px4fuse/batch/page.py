@@ -185,9 +185,7 @@ def _log_details(log: LogSummary) -> tuple[Section, ...]:
             "Findings",
             [f"{finding_title(finding_id)} ({finding_id})" for finding_id in log["findings"]],
         ),
-        frame.table_section(
-            "Axes", value_rows, column_titles, range(1, len(column_titles))
-        ),
+        frame.table_section("Axes", value_rows, column_titles, range(1, len(column_titles))),
     )
 
 
