@@ -85,6 +85,8 @@ MAX_HORIZON_S = 1.0
 REPLAY_BATCH_SIZE = 10
 # Number of intervals whose states are computed at once, which limits memory
 BLOCK_EVENTS = 512
+# State indices of velocity and position
+MOTION = slice(VELOCITY.start, POSITION.stop)
 
 # Field of Agreement with the result for an aiding source, where its name is not PX4's name of the
 # source
@@ -361,13 +363,11 @@ def delayed_tracks(
     """
     runs = _run_model(model, configurations)
     for configuration_index in map(runs[0].configurations.index, configurations):
-        states = (delayed_states(run, configuration_index)[0] for run in runs)
-        yield _join_segments(
-            [
-                _track(run, state[:, POSITION], state[:, VELOCITY])
-                for run, state in zip(runs, states, strict=True)
-            ]
-        )
+        tracks = []
+        for run in runs:
+            motion = _states_after_steps(run, configuration_index, MOTION)
+            tracks.append(_track(run, motion[:, 3:], motion[:, :3]))
+        yield _join_segments(tracks)
 
 
 def _run_model(model: Model, configurations: Sequence[FilterConfiguration]) -> Sequence[SegmentRun]:
@@ -541,39 +541,40 @@ def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Ar
     Shapes (n + 1, 15) and (n + 1, 3).
     """
     event_steps = run.events[configuration_index].end_step
-    configuration = run.configurations[configuration_index]
-    segment = run.segment
-    event_states = run.state[:, configuration_index]
-    step_count = len(segment.step_s)
-    interval_index = np.searchsorted(event_steps, np.arange(step_count), side="right")
-    state = event_states[np.append(0, interval_index)]
-    # some intervals at a time, because the arrays of a whole flight need much memory
-    block_edges = np.searchsorted(interval_index, np.arange(0, len(event_steps) + 1, BLOCK_EVENTS))
-    for steps in starmap(slice, pairwise([*block_edges, step_count])):
-        _propagate_states(segment, configuration, state[1:], interval_index, steps)
-    state[event_steps] = event_states[1:]
-    reset_m = np.zeros((step_count + 1, 3))
+    reset_m = np.zeros((len(run.segment.time_s), 3))
     position_reset_m = run.position_reset_m[:, configuration_index]
     for event_index in np.flatnonzero(position_reset_m.any(axis=1)):
         reset_m[event_steps[event_index] :, :2] += position_reset_m[event_index]
-    return state, reset_m
+    return _states_after_steps(run, configuration_index, slice(None)), reset_m
+
+
+def _states_after_steps(run: SegmentRun, configuration_index: int, rows: slice) -> Array:
+    """Return some rows of the state at the fusion horizon after each of n steps."""
+    event_steps = run.events[configuration_index].end_step
+    event_states = run.state[:, configuration_index]
+    step_count = len(run.segment.step_s)
+    interval_index = np.searchsorted(event_steps, np.arange(step_count), side="right")
+    states = np.empty((step_count + 1, event_states[0, rows].size))
+    states[0] = event_states[0, rows]
+    # some intervals at a time, because the arrays of a whole flight need much memory
+    block_edges = np.searchsorted(interval_index, np.arange(0, len(event_steps) + 1, BLOCK_EVENTS))
+    for steps in starmap(slice, pairwise([*block_edges, step_count])):
+        states[1:][steps] = _propagate_states(
+            run, configuration_index, interval_index[steps], steps
+        )[:, rows]
+    states[event_steps] = event_states[1:, rows]
+    return states
 
 
 def _propagate_states(
-    segment: ReplaySegment,
-    configuration: FilterConfiguration,
-    states: Array,
-    interval_index: IntArray,
-    steps: slice,
-) -> None:
-    """Replace the states at the start of the interval by the states after some of the steps.
-
-    ``steps`` are the prediction steps of whole intervals, and ``interval_index``, shape (n,), is
-    the interval of each step.
-    """
-    state, body_to_ned = states[steps], segment.body_to_ned[1:][steps]
-    start_state, step_s = state.copy(), segment.step_s[steps, None]
-    first_step = np.searchsorted(interval_index[steps], interval_index[steps])
+    run: SegmentRun, configuration_index: int, interval_index: IntArray, steps: slice
+) -> Array:
+    """Return the states after some steps: those of whole intervals, given the interval of each."""
+    segment, configuration = run.segment, run.configurations[configuration_index]
+    start_state: Array = run.state[interval_index, configuration_index]
+    state, body_to_ned = start_state.copy(), segment.body_to_ned[1:][steps]
+    step_s = segment.step_s[steps, None]
+    first_step = np.searchsorted(interval_index, interval_index)
     is_first_step = (first_step == np.arange(len(first_step)))[:, None]
 
     def sum_since_event(increments: Array) -> Array:
@@ -598,3 +599,4 @@ def _propagate_states(
     state[:, POSITION] += sum_since_event(
         0.5 * step_s * (value_before_step(VELOCITY) + state[:, VELOCITY])
     )
+    return state

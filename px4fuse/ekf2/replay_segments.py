@@ -20,6 +20,7 @@ from px4fuse.core.arrays import (
     IntArray,
     cumulative_sums,
     median_interval,
+    row_blocks,
 )
 from px4fuse.core.record import Span
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
@@ -76,8 +77,6 @@ MIN_SEGMENT_S = 10.0
 MAX_RESET_DELAY_S = 0.5
 # An EKF2 replay is interrupted if a larger fraction of the IMU samples within 1 s is clipped
 MAX_CLIPPED_FRACTION = 0.05
-# Number of prediction steps whose IMU samples are averaged at once, which limits memory
-BLOCK_STEPS = 2**14
 # If a smaller fraction of the IMU samples is missing, the EKF2 replay ignores it
 MAX_LOST_IMU_FRACTION = 0.02
 
@@ -487,10 +486,8 @@ def _make_segment(
     accelerometer_bias = np.asarray(initial_row[Columns.ACCELEROMETER_BIAS])
     gyro_bias = np.asarray(initial_row[Columns.GYRO_BIAS])
     rotation_vectors, velocity_increments = np.zeros((2, len(step_end_indices), 3))
-    # some steps at a time, because the arrays of a whole flight need much memory
-    for first_step in range(0, len(step_end_indices), BLOCK_STEPS):
-        steps = slice(first_step, first_step + BLOCK_STEPS)
-        first_row = step_end_indices[first_step - 1] if first_step else 0
+    for steps in row_blocks(len(step_end_indices)):
+        first_row = step_end_indices[steps.start - 1] if steps.start else 0
         rows = slice(first_row, step_end_indices[steps][-1])
         samples, intervals_s = imu.iloc[rows.start + 1 : rows.stop + 1], imu_intervals_s[rows, None]
         rotation_vectors[steps], velocity_increments[steps] = downsample_imu(
@@ -744,12 +741,9 @@ def step_ends(interval_s: Array, logged_ends: IntArray, configured_step_s: float
     logged_end_set = set(logged_ends.tolist())
     end_indices = []
     accumulated_count = accumulated_s = 0.0
-    # lists of some samples at a time, because those of a whole flight need much memory
-    blocks = np.array_split(
-        np.stack([interval_s, sample_counts], axis=1), 1 + len(interval_s) // BLOCK_STEPS
-    )
+    samples = np.stack([interval_s, sample_counts], axis=1)
     for sample, (interval, sample_count) in enumerate(
-        chain.from_iterable(block.tolist() for block in blocks), start=1
+        chain.from_iterable(samples[rows].tolist() for rows in row_blocks(len(samples))), start=1
     ):
         accumulated_count = accumulated_count + sample_count
         accumulated_s = accumulated_s + interval

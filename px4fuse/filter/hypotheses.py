@@ -26,7 +26,6 @@ from scipy.special import chdtri
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, cumulative_integral
 from px4fuse.filter.likelihood import (
     Preintegrated,
-    compute_gains,
     innovations,
     integrate_acceleration,
     parabola_vertex,
@@ -54,7 +53,7 @@ SCALE_GRID = np.linspace(0.7, 1.3, 7)
 # Maximum number of times at which a jump of the positions is tested
 MAX_TESTED_TIMES = 800
 # Number of jump times that are tested at once, to limit the memory
-STEP_BATCH_SIZE = 40
+STEP_BATCH_SIZE = 80
 # Positions within this time (s) after a tested jump are ignored: a burst of outliers is no jump
 OUTLIER_BURST_S = 1.0
 # Outliers within this time (s) after a jump are tested again: the jump may have shifted them
@@ -316,7 +315,6 @@ def _step_chi_squares(
     whitened_innovations, columns, log_variance_sum = design.whitened_design(sigma_a, is_skipped)
     fit_without_jump = design.regress(whitened_innovations, columns, log_variance_sum, is_skipped)
     columns = columns[:, ~is_skipped]
-    gains = compute_gains(design.signals, sigma_a, design.sigma_z_m, is_skipped)
     chi_squares = np.zeros(len(candidate_times_s))
     for batch in np.array_split(
         np.arange(len(candidate_times_s)), -(-len(candidate_times_s) // STEP_BATCH_SIZE)
@@ -324,7 +322,7 @@ def _step_chi_squares(
         step_signals = unit_steps(design.time_s, candidate_times_s[batch])
         zero_signal = np.broadcast_to(0.0, step_signals.shape)
         step_response = design.whitened(
-            zero_signal, zero_signal, step_signals, sigma_a, is_skipped, gains
+            zero_signal, zero_signal, step_signals, sigma_a, is_skipped
         )[0][~is_skipped]
         for axis_index in range(design.axis_count):
             axis_residual = fit_without_jump.residual[fit_without_jump.axis == axis_index]
@@ -472,19 +470,13 @@ class DesignMatrix:
         return design, first_step_column + step_count * (1 + np.arange(self.axis_count)) - 1
 
     def whitened(
-        self,
-        dp: Array,
-        dv: Array,
-        measured_m: Array,
-        sigma_a: float,
-        is_skipped: BoolArray,
-        gains: Array | None = None,
+        self, dp: Array, dv: Array, measured_m: Array, sigma_a: float, is_skipped: BoolArray
     ) -> tuple[Array, float]:
         """Run KF with k inputs; return ν/√S, shape (m, k), and Σ ln S of the fused measurements."""
         signals = replace(
             self.signals, delta_position_m=dp, delta_velocity_m_s=dv, measurement_m=measured_m
         )
-        nu, s = innovations(signals, sigma_a, self.sigma_z_m, is_skipped, gains)
+        nu, s = innovations(signals, sigma_a, self.sigma_z_m, is_skipped)
         nu /= np.sqrt(s)[:, None]
         return nu, float(np.sum(np.log(s[~is_skipped])))
 

@@ -31,7 +31,7 @@ class Column(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """Cell of the table: text, second line ``below``, and sort key ``value`` of a number."""
+    """Cell of the table: text, second line ``below``, sort key ``value`` of a numeric column."""
 
     text: str = ""
     value: float | None = None

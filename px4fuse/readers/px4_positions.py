@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -414,9 +415,10 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     if layout is None:
         return unavailable_source(px4.GPS_POSITION)
     fixes = topics.read_instance(layout)
-    message_count = len(fixes)
+    message_count, no_fix = len(fixes), fixes.iloc[:0]
     if "fix_type" in fixes:
-        fixes = fixes[fixes["fix_type"] >= FIX_TYPE_3D]
+        has_fix = fixes["fix_type"] >= FIX_TYPE_3D
+        fixes, no_fix = fixes[has_fix], fixes[~has_fix]
     if fixes.empty:
         return unavailable_source(
             px4.GPS_POSITION,
@@ -461,7 +463,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     # Since v1.17, the lever arm of each receiver is logged
     if {*px4.ANTENNA_COLUMNS} <= {*fixes}:
         track_fields["lever_arm_m"] = tuple(fixes[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
-    return _make_ulog_track(
+    track = _make_ulog_track(
         topics,
         px4.GPS_POSITION,
         samples,
@@ -473,6 +475,10 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         is_automatic=has_fused_aid(ekf2),
         **track_fields,
     )
+    if isinstance(track, Unavailable):
+        return track
+    no_fix_s = (no_fix["published_us"].to_numpy() - topics.zero_us) * 1e-6 - delay_ms * 1e-3
+    return replace(track, invalid=pd.Series("no fix", time_index(no_fix_s), dtype=object))
 
 
 def _gnss_samples(fixes: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
