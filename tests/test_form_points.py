@@ -90,9 +90,13 @@ def with_false(*kinds: str) -> Answers:
     return replace(RIGHT, mistakes=(*RIGHT.mistakes, *map(NamedFault, kinds)))
 
 
+def points_by_part(answers: Answers, truth: RightFormAnswers = TRUTH) -> dict[str, float]:
+    return {part.title: part.points for part in form_points(answers, truth).parts}
+
+
 def parts(answers: Answers, truth: RightFormAnswers = TRUTH) -> list[float]:
-    found = form_points(answers, truth).points_by_part
-    return [round(found[name], 2) for name in PART_NAMES]
+    found = points_by_part(answers, truth)
+    return [round(found.get(name, 0.0), 2) for name in PART_NAMES]
 
 
 def test_answer_form_offers_correct_answers_for_each_fault() -> None:
@@ -106,7 +110,7 @@ def test_answer_form_offers_correct_answers_for_each_fault() -> None:
 
 
 def test_correct_answer_form_earns_all_and_empty_form_no_points() -> None:
-    assert form_points(RIGHT, TRUTH).points_by_part == FULL
+    assert points_by_part(RIGHT) == FULL
     assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
     assert form_points(RIGHT, TRUTH).is_named_by_kind == {"clock-offset": True, "dropout": True}
 
@@ -159,7 +163,7 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
 def test_partly_correct_answer_form_has_partial_points(
     answers: Answers, less: dict[str, float]
 ) -> None:
-    assert form_points(answers, TRUTH).points_by_part == pytest.approx({**FULL, **less}, abs=0.01)
+    assert points_by_part(answers) == pytest.approx({**FULL, **less}, abs=0.01)
 
 
 def test_answer_that_names_a_fault_of_clean_flight_has_no_points() -> None:
@@ -315,7 +319,7 @@ def test_answer_form_points_agree_with_manual_grading(shared_logs: Path) -> None
         kf, ekf2 = by_hand[form["flight"]]
         truth = replace(truths[form["flight"]], quantities=known, kf=kf, ekf2=ekf2)
         made = form_points(answers_of(form), truth)
-        ours.append(sum(made.points_by_part.values()))
+        ours.append(sum(part.points for part in made.parts))
         theirs.append(form["judgement"]["points"])
     assert len(ours) >= 30
     assert np.abs(np.subtract(ours, theirs)).mean() <= 2.0
