@@ -23,8 +23,8 @@ from px4fuse.filter.fitting import (
     NoiseFit,
     Noises,
     _outlier_probability,
-    filter_positions,
     fit_noises,
+    kf_positions,
     maximise_likelihood,
     negative_log_likelihood,
     outlier_variance_factor,
@@ -298,7 +298,7 @@ def test_likelihood_is_unchanged_if_imu_path_is_subtracted() -> None:
 @pytest.mark.parametrize("which", ["filter", "constants"])
 def test_interpolated_likelihood_equals_computed_likelihood(which: str) -> None:
     """Equal over four decades of the ratio and of SIGMA_Z, except for a constant."""
-    parts = [filter_positions(preintegrate(modelled(seed, COUNT), TRUE)) for seed in (1, 2)]
+    parts = [kf_positions(preintegrate(modelled(seed, COUNT), TRUE)) for seed in (1, 2)]
     if which == "constants":
         part = with_constants(offsets=1)
         parts = [replace(part, added_process_noise=0.0 * part.added_process_noise)]
@@ -341,7 +341,7 @@ def test_banded_likelihood_equals_that_of_kf_innovations(interval: float | None)
     weight = np.ones(len(legs.measurement_m))
     assert np.ptp(expected) > 50.0
     np.testing.assert_allclose(score_grid([legs], a, z, weight), expected, rtol=1e-9)
-    part = [filter_positions(legs)]
+    part = [kf_positions(legs)]
     found_values = np.array(
         [negative_log_likelihood(part, Noises(*pair), weight) for pair in pairs]
     )
@@ -401,7 +401,7 @@ def bursts(seed: int, share: float, length: int) -> Array:
 
 
 def noises_of(*axes: Axis) -> NoiseFit:
-    parts = [filter_positions(preintegrate(axis, TRUE)) for axis in axes]
+    parts = [kf_positions(preintegrate(axis, TRUE)) for axis in axes]
     return maximise_likelihood(parts, Noises(TRUE.sigma_a_m_s2, TRUE.sigma_z_m), np.ones(MANY))
 
 
@@ -472,7 +472,7 @@ def test_sigma_of_noise_estimate_equals_likelihood_curvature(axes, share, width)
 
 def test_maximum_likelihood_without_outlier_model_keeps_weights() -> None:
     weight = np.random.default_rng(1).uniform(0.2, 1.0, MANY)
-    parts = [filter_positions(preintegrate(pair(1)[0], TRUE))]
+    parts = [kf_positions(preintegrate(pair(1)[0], TRUE))]
     found = maximise_likelihood(parts, Noises(0.5, 0.1), weight, fits_outliers=False)
     np.testing.assert_array_equal(found.weight, weight)
     assert not found.outlier_probability.any()

@@ -53,7 +53,7 @@ from px4fuse.ekf2.fusion_conditions import is_height_only
 from px4fuse.ekf2.inputs import horizontal_resets_s
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_sigma_ratio
-from px4fuse.filter.settings import KF_NUMBERS, SETTING_RANGES, Settings
+from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
@@ -559,7 +559,7 @@ def _make_identity(
 def _settings_text(analysis: Analysis, request: ComparisonRequest) -> str:
     settings = analysis.settings
     setting_texts = []
-    for name in KF_NUMBERS:
+    for name in KF_NUMERIC_SETTINGS:
         value, value_origin = getattr(settings, name), "set by the user"
         unit, label = SETTING_RANGES[name][2:]
         if name == "sigma_z_m" and request.sigma_z_m is None and analysis.source.origin.is_gnss:
@@ -574,7 +574,7 @@ def _changed_setting_texts(request: ComparisonRequest) -> tuple[str, ...]:
     defaults = Settings()
     return tuple(
         f"{COMPARISON_OPTIONS[name]} {value:g} (default {getattr(defaults, name):g})"
-        for name in KF_NUMBERS
+        for name in KF_NUMERIC_SETTINGS
         if (value := getattr(request, name)) is not None and value != getattr(defaults, name)
     )
 

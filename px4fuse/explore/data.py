@@ -18,7 +18,7 @@ from px4fuse.comparison.remedy import aid_of
 from px4fuse.explore.packing import COARSE_SCALE, Packer
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL, CONSISTENT_RATIOS
 from px4fuse.filter.model import INITIAL_COVARIANCE
-from px4fuse.filter.settings import KF_NUMBERS, SETTING_RANGES, Settings
+from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
 from px4fuse.filter.signals import AISLE, Acceleration, Axis, imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -270,7 +270,7 @@ def _command_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
     """
     offset_s = None if request.position is None else request.clock_offset_s
     defaults = ComparisonRequest(log=request.log)
-    kf_defaults = {name: getattr(defaults, name) for name in (*KF_NUMBERS, "input")}
+    kf_defaults = {name: getattr(defaults, name) for name in (*KF_NUMERIC_SETTINGS, "input")}
     base_request = msgspec.structs.replace(request, clock_offset_s=offset_s, **kf_defaults)
     heading_deg = request.heading_deg
     if heading_deg is None and AISLE in analysis.axes:

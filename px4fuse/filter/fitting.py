@@ -282,7 +282,7 @@ class NoiseFit:
         return self.score(self.noises)
 
 
-def filter_positions(kf_input: Preintegrated) -> Positions:
+def kf_positions(kf_input: Preintegrated) -> Positions:
     """Convert KF's measurements and integrated acceleration to Positions with one segment.
 
     The unknown constants of the segment are the errors of the initial position and velocity.

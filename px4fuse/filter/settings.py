@@ -32,7 +32,7 @@ SETTING_RANGES = {
     "clock_offset_s": Range(-10.0, 10.0, "s", "time offset added to the source timestamps"),
 }
 # Numeric settings of KF, without the time offset, which is a property of the position source
-KF_NUMBERS = tuple(name for name in SETTING_RANGES if name != "clock_offset_s")
+KF_NUMERIC_SETTINGS = tuple(name for name in SETTING_RANGES if name != "clock_offset_s")
 
 
 @dataclass(frozen=True)

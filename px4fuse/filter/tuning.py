@@ -22,7 +22,7 @@ from px4fuse.filter.fitting import (
     SIGMA_Z_SEARCH_M,
     NoiseFit,
     Noises,
-    filter_positions,
+    kf_positions,
     maximise_likelihood,
     outlier_probability,
 )
@@ -215,7 +215,7 @@ def tune_axes(
     kf_inputs = [preintegrate(axis, settings) for axis in axes]
     all_time_s = axes[0].measurement_time_s[-len(kf_inputs[0].measurement_m) :]
     axes = tuple(axis.keep_rows(independent_rows(axis.measurement_time_s)) for axis in axes)
-    axis_positions = [filter_positions(preintegrate(axis, settings)) for axis in axes]
+    axis_positions = [kf_positions(preintegrate(axis, settings)) for axis in axes]
     measurement_count = len(axis_positions[0].measurement_m) - 1
     if measurement_count < MIN_MEASUREMENTS:
         return too_few_measurements(
@@ -254,7 +254,7 @@ def tune_axes(
     best_fit = kf_fit if motion_fit is None else motion_fit
     is_outlier = kf_fit.outlier_probability > 0.5
     if len(all_time_s) > measurement_count:
-        all_positions = [filter_positions(kf_input) for kf_input in kf_inputs]
+        all_positions = [kf_positions(kf_input) for kf_input in kf_inputs]
         is_outlier = outlier_probability(all_positions, kf_fit, len(all_time_s)) > 0.5
     if np.mean(is_outlier) > MAX_OUTLIER_FRACTION:
         return Unavailable(

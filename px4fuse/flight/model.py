@@ -36,7 +36,7 @@ from px4fuse.core.record import Unavailable as Unavailable  # noqa: PLC0414 - pu
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, GNSS_POS, PARAMETERS, Aid
 
 PositionKind = Literal["uwb", "vio", "mocap", "gnss", "unknown", "file"]
-DataPath = Literal[
+DataRoute = Literal[
     "given file",
     "as received",
     "aligned by EKF2",
@@ -52,7 +52,7 @@ class Origin(Record):
     # positions, "unknown" only precise positions
     kind: PositionKind
     # Route of the positions into the log (not a file path)
-    path: DataPath
+    path: DataRoute
     # Aiding source of EKF2 for these positions; None if EKF2 never fuses them
     aid: Aid | None
     # True if px4fuse may select the source without --position-source

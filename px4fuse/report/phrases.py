@@ -20,7 +20,7 @@ from px4fuse.comparison.remedy import different_settings, height_noise_advice, n
 from px4fuse.comparison.remedy import format_settings as format_parameters
 from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
-from px4fuse.filter.settings import KF_NUMBERS, SETTING_RANGES, Settings
+from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight.ekf2_parameters import EV_POS
@@ -47,7 +47,7 @@ def format_settings(settings: Settings) -> str:
     )
     setting_texts = (
         f"{SETTING_RANGES[name].label} {getattr(settings, name):g} {SETTING_RANGES[name].unit}"
-        for name in KF_NUMBERS
+        for name in KF_NUMERIC_SETTINGS
     )
     return f"{', '.join(setting_texts)}, input {settings.input}{offset_text}"
 

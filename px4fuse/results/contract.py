@@ -27,7 +27,7 @@ from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import Finding
-from px4fuse.flight.model import Alignment, ClockMap, DataPath, InputFile, LogInfo, PositionKind
+from px4fuse.flight.model import Alignment, ClockMap, DataRoute, InputFile, LogInfo, PositionKind
 from px4fuse.loop.model import Loop
 from px4fuse.request import AxisName, ComparisonRequest, InputName, LoopRequest, WhatIfRequest
 from px4fuse.results.model import SCHEMA_VERSION, Provenance, Schema, Student, Version
@@ -54,7 +54,7 @@ class Log(LogInfo, kw_only=True):
 class AvailableTrack(Record):
     name: str
     kind: PositionKind
-    path: DataPath
+    path: DataRoute
     samples: Count
     rate_hz: Positive | None = None
 
@@ -82,7 +82,7 @@ class PositionSource(Record, kw_only=True):
 
     name: str
     kind: PositionKind
-    path: DataPath
+    path: DataRoute
     ekf2_parameters: Mapping[str, float]
     description: str
     reason: str
