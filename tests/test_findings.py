@@ -462,7 +462,7 @@ def test_ekf2_reset_is_attributed_to_missing_position_source(
     flight = aisle_flight(uwb=Uwb(gap_s=gap_s), ekf2=Estimator(resets=resets))
     first, reset = found(compare(flight))[:2]
     assert (first.id, reset.id, reset.caused_by) == (cause, "ekf2_resets", cause)
-    assert "by up to 16.00 m" in reset.message
+    assert "largest reset: 16.00 m" in reset.message
 
 
 def test_positions_lost_by_logger_are_not_reported_as_source_gap(sample_flight: Flight) -> None:

@@ -16,8 +16,7 @@ from px4fuse.flight.model import Unavailable
 
 # Minimum time offset (s) for severity error: a position error of 0.1 m at 1 m/s
 MIN_OFFSET_ERROR_S = 0.10
-# A time offset is reported if its correction does not increase KF's position RMSE by more than this
-# ratio
+# Maximum position RMSE of KF with a corrected time offset / RMSE without correction, for a finding
 MAX_RMSE_RATIO = 1.005
 CORRECT_AT_SENDER = "Correct the position timestamps before sending."
 
@@ -90,7 +89,7 @@ def _find_trial(analysis: Analysis, filter_name: FilterName, kind: str) -> Trial
 
 
 def _rmse_ratio(trial: Trial | None) -> float:
-    """Return the ratio of the position RMSE with and without a change; NaN if unknown."""
+    """Return position RMSE with a change / position RMSE without it; NaN if unknown."""
     if trial is None or not trial.before.position_rmse_m or trial.after.position_rmse_m is None:
         return math.nan
     return trial.after.position_rmse_m / trial.before.position_rmse_m

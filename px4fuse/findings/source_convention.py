@@ -24,7 +24,7 @@ from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION
 from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_phrase, source_name
 
-# Groups of findings to which wrong positions do not matter
+# Groups of findings that do not depend on the positions
 UNAFFECTED_GROUPS = ("logging", "IMU")
 
 

@@ -45,8 +45,8 @@ from px4fuse.flight.model import (
 
 # Minimum extent (m) of the positions (5th to 95th percentile) if the vehicle moves
 MIN_MOTION_RANGE_M = 0.5
-# Minimum ratio of the extent of the positions to the σ of their noise if the vehicle moves: white
-# noise extends over 3.29 σ (5th to 95th percentile), and the margin is 25 %
+# Minimum extent of the positions / σ of the position noise if the vehicle moves: 3.29 for white
+# noise (5th to 95th percentile), plus 25 %
 MIN_MOTION_RANGE_SIGMAS = 1.25 * 3.29
 # Minimum log likelihood ratio (nats) of low-pass filtered to white noise; for positions that are
 # not filtered it is 0 to 2
@@ -54,8 +54,7 @@ MIN_LOW_PASS_GAIN_NATS = 6.0
 # Minimum log likelihood ratio (nats) of low-pass filtered noise to time-correlated noise without
 # lag
 MIN_LAG_NATS = 1.0
-# If the lag of the low-pass filter exceeds this multiple of the upper end of the 95 % interval of
-# the delay, the delay is reported as lag
+# Lag from correlation > MAX_LAG_RATIO · upper 95 % limit of the delay: the delay is reported as lag
 MAX_LAG_RATIO = 4.0
 # Minimum lag (s) due to a low-pass filter, for a warning: a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
@@ -63,7 +62,7 @@ MIN_LAG_S = 0.05
 MIN_LAG_ERROR_S = 0.10
 # Minimum position jump (m) for a warning: twice the noise of good UWB (0.1 m)
 MIN_JUMP_M = 0.2
-# Minimum ratio of a position jump to the σ of time-correlated noise, for a warning
+# Minimum position jump / σ of time-correlated noise, for a warning
 MIN_JUMP_SIGMAS = 5.0
 # Minimum number of jumps with a change of reset_counter to report repeated jumps
 MIN_ANNOUNCED_JUMPS = 2
@@ -71,19 +70,17 @@ MIN_ANNOUNCED_JUMPS = 2
 MIN_UNANNOUNCED_JUMPS = 3
 # Minimum size (m) of a jump without a change of reset_counter
 MIN_UNANNOUNCED_JUMP_M = 0.1
-# Minimum ratio of a jump without a change of reset_counter to the median of other position changes
+# Minimum jump without a change of reset_counter / median of the other position changes
 MIN_UNANNOUNCED_JUMP_RATIO = 8.0
-# Number of position changes in the median with which a jump is compared
+# Number of position changes whose median is compared with a jump
 MEDIAN_CHANGE_COUNT = 61
 # Minimum number of positions to detect jumps
 MIN_POSITIONS_FOR_JUMPS = 100
 # Minimum time (s) and number of positions for which a jump lasts: outliers are shorter
 MIN_LASTING_S, MIN_LASTING_SAMPLES = 0.6, 9
-# A jump lasts if the medians of the positions before and after it differ by its size, with an error
-# below this fraction of the size
+# A jump lasts if |change of the median position - jump| / size of the jump is smaller
 MAX_LASTING_RATIO = 0.5
-# Maximum ratio of the interval before a jump to the median interval: in a longer interval, the
-# vehicle moves
+# Maximum interval before a jump / median interval: in a longer interval, the vehicle moves
 MAX_JUMP_INTERVAL_RATIO = 1.5
 # The positions alternate between two points if at least this fraction of the jumps is opposite to
 # the previous jump
@@ -104,15 +101,15 @@ MIN_JUMP_ERROR_M = 0.5
 MIN_SCALE_ERROR_WARNING = 0.12
 # Minimum scale factor error (ratio minus 1) for severity error: 1 m in a distance of 7 m
 MIN_SCALE_ERROR_SEVERE = 0.15
-# Minimum ratio of a scale factor error to its σ for a warning: 0.3 % of correct sources exceed it
+# Minimum |scale factor error| / σ of its estimate, for a warning: 0.3 % of correct sources exceed 3
 MIN_SCALE_ERROR_SIGMAS = 3.0
 # Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
 MIN_OUTLIER_FRACTION = 0.005
 # Minimum fraction of outliers for severity error: one in 10 s at 5 Hz
 MIN_OUTLIER_FRACTION_ERROR = 0.02
-# Minimum number of outliers to report them
+# Minimum number of outliers for a finding
 MIN_OUTLIERS = 3
-# Rejected outliers are counted only if the log has the innovations of this fraction of positions
+# Rejected outliers are counted if the log has the innovations of a larger fraction of the positions
 MIN_INNOVATION_FRACTION = 0.75
 # Minimum factor between reported and estimated position variance for a warning
 MIN_VARIANCE_RATIO = 2.0
