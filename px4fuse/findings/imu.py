@@ -71,12 +71,12 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
 
 def detect_bias(analysis: Analysis) -> Findings:
     """Detect an accelerometer bias, estimated from the positions or by EKF2."""
-    fit, ekf2_bias = analysis.systematic_errors, _ekf2_bias(analysis)
-    if isinstance(fit, SystematicErrors) and fit.has_significant_bias():
+    systematic_errors, ekf2_bias = analysis.systematic_errors, _ekf2_bias(analysis)
+    if isinstance(systematic_errors, SystematicErrors) and systematic_errors.has_significant_bias():
         forward_bias, right_bias, bias_m_s2 = (
-            fit.forward_bias,
-            fit.right_bias,
-            fit.compute_bias().value,
+            systematic_errors.forward_bias,
+            systematic_errors.right_bias,
+            systematic_errors.compute_bias().value,
         )
         message = (
             f"The accelerometer is biased by {forward_bias.value:+.2f} m/s² forward and "
@@ -95,12 +95,14 @@ def detect_bias(analysis: Analysis) -> Findings:
             "accelerometer_bias",
             message,
             "Calibrate the accelerometers and the level horizon at the temperature of the flight.",
-            {"bias_m_s2": bias_m_s2, "sigma_m_s2": fit.compute_bias().sigma},
+            {"bias_m_s2": bias_m_s2, "sigma_m_s2": systematic_errors.compute_bias().sigma},
         )
     elif ekf2_bias is not None:
         # If positions show no horizontal bias, only the vertical bias is reported
         bias_m_s2 = float(
-            np.linalg.norm(ekf2_bias[2:] if isinstance(fit, SystematicErrors) else ekf2_bias)
+            np.linalg.norm(
+                ekf2_bias[2:] if isinstance(systematic_errors, SystematicErrors) else ekf2_bias
+            )
         )
         if bias_m_s2 >= MIN_BIAS_M_S2:
             yield warning(

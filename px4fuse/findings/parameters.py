@@ -48,8 +48,8 @@ def detect(analysis: Analysis) -> Findings:
         unit = "" if name in fusion_parameters else f" {PARAMETERS[name].printed_unit}".rstrip()
         effect_sentences, has_effect = "", name in fusion_parameters
         if part_before.verdict and part_after.verdict:
-            words = {part.verdict.partition(" ")[0] for part in (part_before, part_after)}
-            has_effect |= len(words) > 1
+            verdicts = {part.verdict.partition(" ")[0] for part in (part_before, part_after)}
+            has_effect |= len(verdicts) > 1
             has_effect |= _differ_significantly(part_before.sigma_ratio, part_after.sigma_ratio)
             effect_sentences = (
                 f" EKF2 is {part_before.verdict} before the change and {part_after.verdict} after "

@@ -40,8 +40,8 @@ def detect(analysis: Comparison) -> Findings:
         *_orientation_faults(convention.orientation, faults, source_name(analysis.source)),
         *_position_faults(convention, faults, analysis.source),
     ):
-        gain = round(convention.log_likelihood_gain, 1)
-        evidence: dict[str, float | str] = {CONVENTION: kind, "log_likelihood": gain}
+        likelihood_gain = round(convention.log_likelihood_gain, 1)
+        evidence: dict[str, float | str] = {CONVENTION: kind, "log_likelihood": likelihood_gain}
         if kind == "rotation":
             evidence["misalignment_deg"] = faults.rotation_deg
         make_finding = warning if kind in ("copied", "ambiguous") else error

@@ -93,11 +93,12 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         if not _is_drift_refuted(analysis.flight, heading):
             yield _drift_finding(analysis, heading)
         return
-    fit = analysis.systematic_errors
+    systematic_errors = analysis.systematic_errors
     is_explained_by_bias = (
-        not isinstance(fit, Unavailable)
+        not isinstance(systematic_errors, Unavailable)
         and analysis.source.orientation is None
-        and abs(fit.rotation.value) < MIN_HEADING_SIGMAS * fit.rotation.sigma
+        and abs(systematic_errors.rotation.value)
+        < MIN_HEADING_SIGMAS * systematic_errors.rotation.sigma
     )
     if is_explained_by_bias or abs(rotation_deg) < max(
         MIN_HEADING_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG

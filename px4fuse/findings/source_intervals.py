@@ -220,8 +220,12 @@ def _continuously_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[Aid
 
 
 def detect_lost_samples(analysis: Analysis) -> Findings:
-    source, clock = analysis.source, analysis.source.clock_map
-    if clock is None or clock.method == "arrival time" or clock.distinct_stamps is not None:
+    source, clock_map = analysis.source, analysis.source.clock_map
+    if (
+        clock_map is None
+        or clock_map.method == "arrival time"
+        or clock_map.distinct_stamps is not None
+    ):
         return
     intervals_s, median_interval_s = _position_intervals_s(analysis)
     lost_count = int(np.sum(np.rint(intervals_s / median_interval_s) - 1.0))

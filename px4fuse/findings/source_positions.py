@@ -179,16 +179,16 @@ def detect_low_pass(analysis: Analysis) -> Findings:
 
 def detect_jumps(analysis: Analysis) -> Findings:
     """Detect position jumps that the IMU does not measure."""
-    fit = analysis.systematic_errors
+    systematic_errors = analysis.systematic_errors
     # A change of the time offset also shifts the positions of a moving vehicle
-    if not isinstance(fit, SystematicErrors) or any(detect_arrival_times(analysis)):
+    if not isinstance(systematic_errors, SystematicErrors) or any(detect_arrival_times(analysis)):
         return
     correlated_noise = analysis.time_correlated_noise
     min_jump_m = MIN_JUMP_M
     if not isinstance(correlated_noise, Unavailable):
         # Time-correlated noise changes by up to √2 σ within seconds, which resembles a jump
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
-    large_jumps = [jump for jump in fit.jumps if jump.size_m >= min_jump_m]
+    large_jumps = [jump for jump in systematic_errors.jumps if jump.size_m >= min_jump_m]
     counter_changes_s = reset_times_s(analysis.source)
     if large_jumps:
         largest_jump = max(large_jumps, key=lambda jump: jump.size_m)
@@ -375,20 +375,20 @@ def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
 
 def detect_scale_error(analysis: Analysis) -> Findings:
     """Detect a scale factor error of the positions relative to the IMU."""
-    imu, fit = analysis.flight.imu, analysis.systematic_errors
+    imu, systematic_errors = analysis.flight.imu, analysis.systematic_errors
     if not isinstance(imu, pd.DataFrame) or is_rate_too_low(imu, MIN_IMU_RATE_HZ):
         return
     if (
         analysis.source.origin.is_gnss  # GNSS has no scale factor error
         or isinstance(analysis.flight.truth, Truth)  # source_patterns compares with ground truth
-        or not isinstance(fit, SystematicErrors)
+        or not isinstance(systematic_errors, SystematicErrors)
         # a low-pass filter reduces the motion, and time-correlated noise may resemble a scale error
         or find_low_pass(analysis) is not None
         or not isinstance(analysis.time_correlated_noise, Unavailable)
         or not _is_clock_known(analysis)
     ):
         return
-    scale_error, sigma = fit.scale.value, fit.scale.sigma
+    scale_error, sigma = systematic_errors.scale.value, systematic_errors.scale.sigma
     if abs(scale_error) >= max(MIN_SCALE_ERROR_WARNING, MIN_SCALE_ERROR_SIGMAS * sigma):
         yield finding(
             "error" if abs(scale_error) >= MIN_SCALE_ERROR_SEVERE else "warning",
@@ -409,8 +409,12 @@ def detect_outliers(analysis: Analysis) -> Findings:
     axis_tuning = analysis.tuning.get(HORIZONTAL) or next(iter(analysis.tuning.values()), None)
     if not isinstance(axis_tuning, AxisTuning):
         return
-    fit = analysis.systematic_errors
-    jump_times_s = [jump.time_s for jump in fit.jumps] if isinstance(fit, SystematicErrors) else []
+    systematic_errors = analysis.systematic_errors
+    jump_times_s = (
+        [jump.time_s for jump in systematic_errors.jumps]
+        if isinstance(systematic_errors, SystematicErrors)
+        else []
+    )
     outlier_times_s = [
         time_s
         for time_s in axis_tuning.outlier_time_s.tolist()
