@@ -224,7 +224,7 @@ def test_loop_command_on_g2o_with_extreme_weights_is_finite(
     assert json.loads(out, parse_constant=pytest.fail)["graph"]["solutions"]
 
 
-def test_loop_command_on_g2o_states_if_it_did_not_converge(tmp_path, monkeypatch, capsys):
+def test_loop_command_on_g2o_shows_if_it_did_not_converge(tmp_path, monkeypatch, capsys):
     path = tmp_path / "g.g2o"
     far = "".join(f"VERTEX_SE2 {number} {number} 3 0\n" for number in range(5))
     path.write_text(far + SQUARE.format(*[UNIT_2] * 4) + f"EDGE_SE2 0 4 0.1 0.1 6.2 {UNIT_2}\n")

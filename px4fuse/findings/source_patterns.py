@@ -126,9 +126,9 @@ def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
             "error" if abs(error_fit.scale) >= MIN_SCALE_ERROR_SEVERE else "warning",
             "source_scale_error",
             f"{source_name(analysis.source)} distances are {format_percent(abs(error_fit.scale))} "
-            f"too {'long' if error_fit.scale > 0.0 else 'short'}. The comparison with ground truth is "
-            f"accurate to ± {format_percent(1.96 * error_fit.scale_sigma, 1)} (95 %). Innovations do "
-            "not show a scale factor error.",
+            f"too {'long' if error_fit.scale > 0.0 else 'short'}. The comparison with ground truth "
+            f"is accurate to ± {format_percent(1.96 * error_fit.scale_sigma, 1)} (95 %). "
+            "Innovations do not show a scale factor error.",
             f"Check {source_words(analysis.source).scale}.",
             {"scale": 1.0 + error_fit.scale, "sigma": error_fit.scale_sigma},
         )
