@@ -446,7 +446,7 @@ def _make_replay(
 
 
 def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Span]:
-    """Return start and end (s) of each time span without a fused position, > RESTART_GAP_S."""
+    """Return the time spans (s) without a fused position that are longer than RESTART_GAP_S."""
     is_used = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
     fusion_times_s = [*updates.loc[is_used, "fused_at_s"], float(segment.time_s[-1])]
     return [

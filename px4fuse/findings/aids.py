@@ -16,7 +16,7 @@ from px4fuse.findings.model import Findings, finding, format_percent, note, warn
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.flight.model import BAD_ACCELERATION, Unavailable
 
-# Aiding sources of external vision: other modules test them by replays of EKF2
+# Aiding sources of external vision, which other modules test by replays of EKF2
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
 # Time (s) after take-off in which EKF2 may ignore the barometer because of ground effect
 TAKE_OFF_S = 10.0

@@ -186,7 +186,7 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
 
 
 def detect_missing_imu_samples(analysis: Analysis) -> Findings:
-    """Detect IMU samples that are missing one by one during the whole flight."""
+    """Detect single missing IMU samples during the whole flight."""
     imu, log = analysis.flight.imu, analysis.flight.log
     if not isinstance(imu, pd.DataFrame) or log.format.startswith("MAVLink"):
         return

@@ -30,7 +30,7 @@ class CatalogueEntry(Record):
         listed first, "noise" after other errors, "recording" before other warnings.
     verdict : str
         Relation to the statements that KF or EKF2 is consistent, over- or underconfident.
-        "meaningless": these statements are invalid. "repeated": the finding is such a statement.
+        "meaningless": the statements are invalid. "repeated": the finding repeats a statement.
     reruns : frozenset of str
         Kinds of re-runs (``Trial.kinds``) that test the finding.
     after_wrong_convention : str

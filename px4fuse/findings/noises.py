@@ -102,7 +102,7 @@ InconsistentAxis = tuple[AxisComparison, FilterSummary]
 class SettingDeviation(NamedTuple):
     """Deviation of a noise setting from its estimate, or from an upper bound of the estimate.
 
-    ``factor`` is the larger of both values / the smaller one.
+    ``factor`` = larger / smaller of setting and estimate.
     """
 
     estimate: float

@@ -247,8 +247,8 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
-    # The intervals are not those at which PX4 received the positions if px4fuse changed the
-    # timestamps, or if PX4 logs the positions only after EKF2 used them (ALIGNED)
+    # Intervals are not the receive intervals of PX4 if px4fuse changed the timestamps, or if PX4
+    # logged the positions after their use in EKF2 (ALIGNED)
     if (
         source.clock_map is not None
         or source.origin.find_preference_rank() >= ALIGNED.find_preference_rank()
