@@ -266,7 +266,7 @@ def rerun(
     progress("replaying EKF2")
     estimated_settings = corrected_settings(comparison, estimates.tuning)
     # The next two functions request these parameter sets. A replay of all sets together is faster
-    model = open_model(
+    ekf2_model = open_model(
         comparison.flight,
         lambda inputs: [
             *explanation_configurations(comparison, inputs, estimated_settings),
@@ -275,12 +275,12 @@ def rerun(
     )
     release_free_memory()
     difference_steps = explain_ekf2_difference(
-        comparison, model, estimates.clock, estimated_settings
+        comparison, ekf2_model, estimates.clock, estimated_settings
     )
-    trials = rerun_filters(comparison, estimates, model)
-    if isinstance(model, Model):  # to free memory
-        model = replace(model, runs=(), intervals={})
-    return Reruns(ekf2_model=model, difference_steps=difference_steps, trials=trials)
+    trials = rerun_filters(comparison, estimates, ekf2_model)
+    if isinstance(ekf2_model, Model):  # to free memory
+        ekf2_model = replace(ekf2_model, runs=(), intervals={})
+    return Reruns(ekf2_model=ekf2_model, difference_steps=difference_steps, trials=trials)
 
 
 def diagnose_or_check_aids(
@@ -340,11 +340,11 @@ def run_what_if(
             f"{flight.log.name}: {DIAGNOSIS_WITHHELD.reason}", "Give --set or --sweep."
         )
     progress("replaying EKF2")
-    model = require_available(open_model(flight), flight)
+    ekf2_model = require_available(open_model(flight), flight)
     difference_steps: Mapping[str, DifferenceExplanation | Unavailable] = {}
     comparison = None
     try:
-        if model.agreement.good and not flight.log.is_assessed:
+        if ekf2_model.agreement.good and not flight.log.is_assessed:
             comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
             prepared_comparison = prepare(flight, comparison_request)
             comparison = compare(prepared_comparison, run_kf(prepared_comparison))
@@ -354,13 +354,15 @@ def run_what_if(
     if comparison is not None:
         tuning, clock = estimate_noises_and_clock(comparison, progress)
         estimated_settings = corrected_settings(comparison, tuning)
-        difference_steps = explain_ekf2_difference(comparison, model, clock, estimated_settings)
+        difference_steps = explain_ekf2_difference(
+            comparison, ekf2_model, clock, estimated_settings
+        )
         if is_default_change:
-            changes = ml_ekf2_parameters(comparison, model, tuning, clock)
+            changes = ml_ekf2_parameters(comparison, ekf2_model, tuning, clock)
     parameter_sets = [changes] if changes or request.without else []
     parameter_sets += [changes | values for values in swept_settings]
     progress("replaying EKF2 with other parameters")
-    replays = require_available(what_if(model, parameter_sets, request.without), flight)
+    replays = require_available(what_if(ekf2_model, parameter_sets, request.without), flight)
     return WhatIfAnalysis(
         flight, replays, changes, is_default_change, difference_steps, request.without
     )

@@ -221,7 +221,9 @@ class _ComparedInnovations(NamedTuple):
     axes: dict[str, AxisAgreement]
 
     def compute_rejected_fractions(self) -> tuple[float, float]:
-        logged, replayed = (float(np.mean(each["rejected"] > 0.0)) for each in self[:2])
+        logged, replayed = (
+            float(np.mean(innovations["rejected"] > 0.0)) for innovations in self[:2]
+        )
         return logged, replayed
 
 

@@ -172,13 +172,13 @@ def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings
 
 def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
     """Detect a wrong EKF2_GPS_DELAY in a flight in which EKF2 also fuses vision."""
-    model = analysis.ekf2_model
-    if isinstance(model, Unavailable) or not model.agreement.good:
+    ekf2_model = analysis.ekf2_model
+    if isinstance(ekf2_model, Unavailable) or not ekf2_model.agreement.good:
         return
-    estimate = remedy.wrong_gnss_delay_ms(model)
+    estimate = remedy.wrong_gnss_delay_ms(ekf2_model)
     if estimate is None:
         return
-    delay_ms, (ml_delay_ms, sigma_ms) = model.inputs.settings[GNSS_POS.delay], estimate
+    delay_ms, (ml_delay_ms, sigma_ms) = ekf2_model.inputs.settings[GNSS_POS.delay], estimate
     yield warning(
         "ekf2_gps_delay_wrong",
         f"{GNSS_POS.delay} is {delay_ms:g} ms, but GNSS positions and velocities are "

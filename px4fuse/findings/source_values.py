@@ -199,13 +199,13 @@ def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | N
     The sentence is "" if EKF2 cannot be replayed. Return None if the change hardly reduces the
     RMSE: the position error then has another cause.
     """
-    model, truth = analysis.ekf2_model, analysis.flight.truth
-    if isinstance(model, Unavailable) or isinstance(truth, Unavailable):
+    ekf2_model, truth = analysis.ekf2_model, analysis.flight.truth
+    if isinstance(ekf2_model, Unavailable) or isinstance(truth, Unavailable):
         return ""
-    if not model.agreement.good or not is_source_fused(analysis, model.inputs):
+    if not ekf2_model.agreement.good or not is_source_fused(analysis, ekf2_model.inputs):
         return ""
     rmses_m = []
-    for replay in (model.baseline_replay, *replay_settings(model, [change])):
+    for replay in (ekf2_model.baseline_replay, *replay_settings(ekf2_model, [change])):
         replayed_track = rows_inside(replay.published, replay.find_evaluated_spans())
         axis_errors_m = [
             replayed_track[name]
