@@ -129,7 +129,7 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
         except NoMatchError as error:
             if error.remedy and missing_options:
                 raise
-            reasons.append(str(error))
+            reasons.append(error.reason)
     if missing_options:
         raise NoMatchError(
             "; ".join(dict.fromkeys(reasons)), f"Give {' and '.join(missing_options)}"

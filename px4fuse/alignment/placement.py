@@ -152,7 +152,7 @@ def align_position_file(
         if fault := _explain_mismatch(flight, problem, recording.metres_per_unit):
             raise MissingDataError(f"{recording.name}: {fault[0]}.", fault[1]) from None
         raise MissingDataError(
-            f"{recording.name}: {error}; {spans_text}", f"{error.remedy}."
+            f"{recording.name}: {error.reason}; {spans_text}", f"{error.remedy}."
         ) from None
     if frame:
         frame_reason = "the frame was given with --position-frame"

@@ -93,9 +93,8 @@ def find_correlation_peak(
     min_count = max(
         tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / GRID_STEP_S, shorter_sample_count / 2)
     )
-    no_match = NoMatchError("position file and reference have too few common samples for a match")
     if shorter_sample_count < min_count:
-        raise no_match
+        raise NoMatchError("position file and reference have too few common samples for a match")
     track_moments = moments(
         file_track.to_complex_m(), reference.to_complex_m(), file_track.is_valid, reference.is_valid
     )
@@ -103,8 +102,6 @@ def find_correlation_peak(
     covariance = track_moments.covariance
     power_sum = track_moments.power_a + track_moments.power_b
     has_overlap = common_count >= min_count
-    if not has_overlap.any():
-        raise no_match
     has_overlap &= power_sum > 1e-9 * np.max(power_sum)  # at rest, the variance is a rounding error
     real_covariance = (
         np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real

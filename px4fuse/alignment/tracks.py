@@ -10,6 +10,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from px4fuse.comparison.projection import continuous_state
 from px4fuse.core.arrays import Array, BoolArray, Complex
+from px4fuse.errors import Px4FuseError
 from px4fuse.filter.signals import Segment, ned_acceleration
 from px4fuse.flight.model import (
     POSITION_FILE,
@@ -47,12 +48,8 @@ TRANSIENT_S = 2.0
 BAND_PADDING_S = 10.0
 
 
-class NoMatchError(Exception):
-    """The position file does not match a reference; ``remedy`` is advice to the user, or ""."""
-
-    def __init__(self, reason: str, remedy: str = "") -> None:
-        super().__init__(reason)
-        self.remedy = remedy
+class NoMatchError(Px4FuseError):
+    """The position file does not match a reference."""
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,9 @@ GNSS_DELAYS_MS = (0.0, 150.0, 300.0)
 TRANSMISSION_MS = 30.0
 # EKF2_DELAY_MAX is rounded up to a multiple of this value (ms)
 DELAY_MAX_STEP_MS = 50.0
-# Minimum fraction of the time with fusion of the height if one noise parameter must fit it
+# Minimum fraction of the time in which EKF2 fuses heights, to report that their noise is different
 MIN_HEIGHT_FUSED_FRACTION = 0.5
-# Minimum ratio of height noise to horizontal noise if one noise parameter does not fit both
+# Minimum ratio of height noise to horizontal noise that one parameter does not fit
 MIN_HEIGHT_NOISE_RATIO = 2.0
 
 

@@ -215,19 +215,17 @@ def search_hypotheses(
     for heading_from, imu_motion in motions.items():
         source_motion = positions.motion(imu_motion)
         for candidate in find_candidates(source_motion, imu_motion):
-            start_hypothesis = replace(candidate, heading_from=heading_from)
-            hypotheses.append(
-                refine_hypothesis(start_hypothesis, positions, source_motion, imu_motion)
-            )
+            start_hypotheses = [replace(candidate, heading_from=heading_from)]
             if abs(candidate.remainder_rad) < 3.0 * SMALL_ROTATION_RAD:
-                parameters = start_hypothesis.parameters.copy()
+                parameters = candidate.parameters.copy()
                 parameters[1] -= candidate.remainder_rad
-                start_hypothesis = replace(
-                    start_hypothesis, parameters=parameters, has_rotation=False
+                start_hypotheses.append(
+                    replace(start_hypotheses[0], parameters=parameters, has_rotation=False)
                 )
-                hypotheses.append(
-                    refine_hypothesis(start_hypothesis, positions, source_motion, imu_motion)
-                )
+            hypotheses += [
+                refine_hypothesis(start_hypothesis, positions, source_motion, imu_motion)
+                for start_hypothesis in start_hypotheses
+            ]
     return sorted(
         (hypothesis for hypothesis in hypotheses if hypothesis.score > -np.inf),
         key=lambda hypothesis: -hypothesis.score,
@@ -343,8 +341,8 @@ def _evaluate_hypothesis(
     hypothesis: Hypothesis, rows: IntArray, source_motion: SourceMotion, imu_motion: ImuMotion
 ) -> tuple[Hypothesis, Array]:
     """Return the hypothesis with its log likelihood, and the Gauss-Newton step."""
-    offset_s, rotation_rad, heading_drift_rad_s, clock_drift = hypothesis.parameters[:4]
-    accelerometer_bias, time_s = hypothesis.parameters[4:], source_motion.time_s[rows]
+    offset_s, rotation_rad, heading_drift_rad_s, clock_drift, *_ = hypothesis.parameters
+    time_s = source_motion.time_s[rows]
     row_interval_s = GRID_INTERVAL_S * float(np.median(np.diff(rows)))
     mean_time_s = float(np.mean(time_s))
     grid_position = time_s - offset_s - clock_drift * (time_s - mean_time_s)
@@ -356,8 +354,9 @@ def _evaluate_hypothesis(
         & imu_motion.is_valid[grid_index]
     )
     independent_count = float(np.count_nonzero(is_used)) * row_interval_s / DIFFERENCE_WINDOW_S
+    rejected_hypothesis = replace(hypothesis, score=-np.inf), np.zeros(len(PARAMETER_PRECISION))
     if independent_count * DIFFERENCE_WINDOW_S < MIN_OVERLAP_S:
-        return replace(hypothesis, score=-np.inf), np.zeros(len(hypothesis.parameters))
+        return rejected_hypothesis
     grid_index, time_s = grid_index[is_used], time_s[is_used]
     elapsed_s = time_s - time_s[0]
     grid_fraction = (grid_position[is_used] - grid_index)[:, None, None]
@@ -378,7 +377,7 @@ def _evaluate_hypothesis(
             unit_size_m * vertical_sign * sent_differences[:, vertical_axis],
         ]
     )
-    imu_ned_m = imu_differences[..., 0] - imu_differences[..., 1:] @ accelerometer_bias
+    imu_ned_m = imu_differences[..., 0] - imu_differences[..., 1:] @ hypothesis.parameters[4:]
     residual = source_ned_m - imu_ned_m
     residual_squares = np.stack([np.sum(residual[:, :2] ** 2, axis=1), residual[:, 2] ** 2])
     log_likelihood_gain, sigma_m = student_score(residual_squares[0], 2, MIN_SIGMA_M)
@@ -404,7 +403,7 @@ def _evaluate_hypothesis(
     )
     # without motion the convention is unknown
     if 0.0 in (ned_square, source_imu_product, imu_square):
-        return replace(hypothesis, score=-np.inf), np.zeros(len(hypothesis.parameters))
+        return rejected_hypothesis
     jacobian = np.zeros((len(grid_index), 3, len(PARAMETER_PRECISION)))
     jacobian[..., 0] = imu_motion.rate_m_s[grid_index]
     jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal_m.imag, horizontal_m.real
@@ -415,9 +414,8 @@ def _evaluate_hypothesis(
     is_free = np.array(
         [True, hypothesis.has_rotation, uses_gyro_heading, hypothesis.has_clock_drift, *[True] * 3]
     )
-    weights = weight[[0, 0, 1]].T.ravel()
     columns = jacobian[..., is_free].reshape(-1, is_free.sum())
-    weighted_columns = columns.T * weights
+    weighted_columns = columns.T * weight[[0, 0, 1]].T.ravel()
     normal_matrix = weighted_columns @ columns + np.diag(PARAMETER_PRECISION[is_free] + 1e-9)
     gradient = (
         weighted_columns @ residual.ravel() + (PARAMETER_PRECISION * hypothesis.parameters)[is_free]

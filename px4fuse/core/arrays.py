@@ -18,7 +18,7 @@ BLOCK_ROWS = 2**14
 
 
 def row_blocks(count: int) -> Iterator[slice]:
-    """Yield slices of consecutive rows: temporary arrays of a whole flight need much memory."""
+    """Yield slices of at most BLOCK_ROWS rows, so that temporary arrays need little memory."""
     return (slice(first, first + BLOCK_ROWS) for first in range(0, count, BLOCK_ROWS))
 
 

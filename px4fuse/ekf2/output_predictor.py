@@ -1,4 +1,4 @@
-"""Output predictor of EKF2, which computes the published state from the fusion horizon.
+"""Output predictor of EKF2, which computes the published state from the delayed state.
 
 The output predictor propagates the delayed state to the present with the IMU. In each prediction
 step, it compares its buffered output with the state at the fusion horizon, and corrects velocity
@@ -23,9 +23,9 @@ from px4fuse.ekf2.replay_segments import (
 )
 from px4fuse.trajectory.rotation import rotate
 
-# Gain of the integrated error in the corrections of velocity and position (output_predictor.cpp)
+# Factor on gain² · Σ error in the corrections of velocity and position (output_predictor.cpp)
 INTEGRAL_GAIN = 0.1
-# Gain of the attitude correction, times step / delay of the fusion horizon (output_predictor.cpp)
+# Attitude correction / (error · step / delay of the fusion horizon) (output_predictor.cpp)
 ATTITUDE_GAIN = 0.5
 
 

@@ -34,10 +34,10 @@ from px4fuse.filter.steps import Timeline, make_timeline
 PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
 # Distance in ln σ from the maximum at which the search for the end of a 95 % interval starts
 START_LOG_DISTANCE = 0.05
-# In the likelihood profile of one noise (SIGMA_A), ln σ of the other noise (SIGMA_Z) changes by at
-# most this value between two points
+# Maximum change of ln SIGMA_Z between two points of the likelihood profile of SIGMA_A, or vice
+# versa
 MAX_OTHER_LOG_STEP = 1.0
-# Tolerance of ln σ in the optimisation of the other noise at each point of a likelihood profile
+# Tolerance of ln SIGMA_Z in its optimisation at each point of the profile of SIGMA_A, or vice versa
 OTHER_LOG_TOLERANCE = 2e-3
 
 

@@ -222,9 +222,9 @@ def _require_in_range(name: str, value: float, min_value: float) -> None:
 
 
 def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
-    (start_s, end_s), closure_times_s = path.time_s[[0, -1]], (closure.time_1_s, closure.time_2_s)
-    closure_text = f"{path.name}: loop closure {closure_times_s[0]:.12g},{closure_times_s[1]:.12g}"
-    if not start_s <= closure_times_s[0] < closure_times_s[1] <= end_s:
+    start_s, end_s = path.time_s[[0, -1]]
+    closure_text = f"{path.name}: loop closure {closure.time_1_s:.12g},{closure.time_2_s:.12g}"
+    if not start_s <= closure.time_1_s < closure.time_2_s <= end_s:
         raise TrajectoryError(
             f"{closure_text}: the times must be in ascending order, between {start_s:.2f} s and "
             f"{end_s:.2f} s."

@@ -39,10 +39,10 @@ def to_z_down(trajectory: Trajectory) -> Trajectory:
     if trajectory.frame not in _Z_DOWN_CONVERSIONS:
         return trajectory
     axes, z_down_frame, note = _Z_DOWN_CONVERSIONS[trajectory.frame]
-    axis_order, axis_signs = NED_COMPONENTS[axes]
+    axis_order, _ = NED_COMPONENTS[axes]
     position_variance_m2 = trajectory.position_variance_m2
     return replace(
-        _rotate(trajectory, np.diag(axis_signs) @ np.eye(3)[axis_order], z_down_frame),
+        _rotate(trajectory, _matrix_to_ned(axes), z_down_frame),
         position_variance_m2=None
         if position_variance_m2 is None
         else position_variance_m2[:, axis_order],
@@ -55,8 +55,12 @@ def from_z_down(trajectory: Trajectory, frame: Frame) -> Trajectory:
     """Convert a result of :func:`to_z_down` back to the original ``frame``."""
     if frame not in _Z_DOWN_CONVERSIONS or trajectory.frame in _Z_DOWN_CONVERSIONS:
         return trajectory
-    axis_order, axis_signs = NED_COMPONENTS[_Z_DOWN_CONVERSIONS[frame][0]]
-    return _rotate(trajectory, (np.diag(axis_signs) @ np.eye(3)[axis_order]).T, frame)
+    return _rotate(trajectory, _matrix_to_ned(_Z_DOWN_CONVERSIONS[frame][0]).T, frame)
+
+
+def _matrix_to_ned(axes: str) -> Array:
+    axis_order, axis_signs = NED_COMPONENTS[axes]
+    return np.asarray(np.diag(axis_signs) @ np.eye(3)[axis_order])
 
 
 def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:

@@ -211,10 +211,6 @@ CORRECTION_LABELS: Mapping[str, str] = {
     "by_distance": HEADINGS_CORRECTED_LABEL,
     **{f"pose_graph_{name}": label for name, label in SOLUTIONS.items()},
 }
-SINGLE_CLOSURE_REASON = (
-    "Robust optimisation rejects loop closures that contradict other loop closures, but the path "
-    "has only one loop closure. The gate also tests a single loop closure."
-)
 # Corrected path and solution of its pose graph (None without a pose graph), or the reason why the
 # corrected path is missing
 CorrectionOutcome = tuple[Trajectory, Solution | None] | Unavailable
@@ -314,7 +310,11 @@ def solve_pose_graphs(
         progress(f"optimising: {label}")
         if is_robust and len(closures) < 2:
             corrections[name] = Unavailable(
-                label, SINGLE_CLOSURE_REASON, "Give more loop closures with --closure."
+                label,
+                "Robust optimisation rejects loop closures that contradict other loop closures, "
+                "but the path has only one loop closure. The gate also tests a single loop "
+                "closure.",
+                "Give more loop closures with --closure.",
             )
         elif is_gated and is_rejected[is_closure].all():
             corrections[name] = _rejected_by_gate("pose graph", closures[0])
@@ -407,13 +407,10 @@ def score_paths(
             offset_by_reference[name] = evaluation.time_offset.offset_s
     scored_paths: dict[CorrectionName, CorrectedPath | Unavailable] = {"uncorrected": uncorrected}
     for name, corrected_path in corrected_paths.items():
-        all_closures_path = scored_paths.get("pose_graph_all")
         if isinstance(corrected_path, Unavailable):
             scored_paths[name] = corrected_path
-        elif (
-            isinstance(all_closures_path, CorrectedPath)
-            and corrected_path[1] is all_closures_path.solution
-        ):
+        elif name == "pose_graph_gated" and corrected_path is corrected_paths["pose_graph_all"]:
+            all_closures_path = scored_paths["pose_graph_all"]
             scored_paths[name] = structs.replace(all_closures_path, name=CORRECTION_LABELS[name])
         else:
             scored_paths[name] = score_path(name, *corrected_path)

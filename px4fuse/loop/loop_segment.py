@@ -79,7 +79,9 @@ def choose_loop_segment(
     SettingsError
         The segment is empty.
     """
-    segment_start_s, segment_end_s = track_span_s = trajectory.time_s[[0, -1]].tolist()
+    segment_start_s, segment_end_s = track_start_s, track_end_s = trajectory.time_s[
+        [0, -1]
+    ].tolist()
     rests_at_ends, flight_span_s = False, None
     if flight is None:
         reason = "the whole trajectory"
@@ -100,19 +102,16 @@ def choose_loop_segment(
         segment_start_s = segment_start_s if start_s is None else start_s
         segment_end_s = segment_end_s if end_s is None else end_s
         reason = "the time span was chosen with --from or --to"
-    if not segment_start_s < segment_end_s:
+    limited_span_s = max(segment_start_s, track_start_s), min(segment_end_s, track_end_s)
+    if not limited_span_s[0] < limited_span_s[1]:
         raise SettingsError(
             f"The track has no poses between {segment_start_s:.12g} s and {segment_end_s:.12g} s; "
-            f"it is from {track_span_s[0]:.2f} s to {track_span_s[1]:.2f} s.",
+            f"it is from {track_start_s:.2f} s to {track_end_s:.2f} s.",
             "Change --from or --to.",
         )
-    limited_span_s = max(segment_start_s, track_span_s[0]), min(segment_end_s, track_span_s[1])
-    if limited_span_s != (segment_start_s, segment_end_s) and limited_span_s[0] < limited_span_s[1]:
-        reason, (segment_start_s, segment_end_s) = (
-            f"{reason}, limited to the times with poses",
-            limited_span_s,
-        )
-    return Segment(segment_start_s, segment_end_s, reason, flight_span_s), rests_at_ends
+    if limited_span_s != (segment_start_s, segment_end_s):
+        reason = f"{reason}, limited to the times with poses"
+    return Segment(*limited_span_s, reason, flight_span_s), rests_at_ends
 
 
 def heading_change_deg(path: Trajectory) -> float | None:

@@ -70,15 +70,10 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
     MissingDataError
         The log does not contain the track.
     """
-    if track_name == "truth" and flight.log.is_assessed:
-        raise MissingDataError(
-            f"{flight.log.name}:truth: {DIAGNOSIS_WITHHELD.reason}", DIAGNOSIS_WITHHELD.remedy
-        )
     if track_name == "kf":
         return _make_kf_trajectory(flight)
-    track_data = {"vio": find_odometry(flight), "truth": flight.truth, "ekf2": flight.ekf2}[
-        track_name
-    ]
+    truth = DIAGNOSIS_WITHHELD if flight.log.is_assessed else flight.truth
+    track_data = {"vio": find_odometry(flight), "truth": truth, "ekf2": flight.ekf2}[track_name]
     if isinstance(track_data, PositionTrack):
         # If the log does not contain the frame, FRD is assumed: x is forward at the start
         frame: Frame = "NED" if track_data.frame == "NED" else "FRD"

@@ -55,12 +55,12 @@ MIN_ARRIVAL_FRACTION = 0.9
 # Maximum time difference (s) between a height and the horizontal position to which it is joined:
 # at a climb rate of 0.5 m/s, the height error is 2.5 cm
 MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
-# If the logged GNSS rate (Hz) is lower, the logger dropped fixes: receivers send 5 to 20 Hz
+# Maximum GNSS rate (Hz) of a log without some of the fixes: receivers send 5 to 20 Hz
 MAX_DOWNSAMPLED_HZ = 4.0
 STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
 # Length (µs) of each possible unit of timestamps
 STAMP_UNITS = {"microseconds": 1.0, "milliseconds": 1e3, "seconds": 1e6, "nanoseconds": 1e-3}
-# Maximum relative difference of a clock's rate from the boot clock to recognise its unit
+# A clock has a unit if its rate in this unit differs by less than this fraction from the boot clock
 MAX_RATE_ERROR = 0.05
 AUTOPILOT_CLOCK = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude in degrees, optionally altitude in m
@@ -114,7 +114,7 @@ def make_track(
     remedy: str = "",
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a position track from the valid samples, or its reason if there are fewer than three.
+    """Make a position track from the valid samples; with fewer than three, return the reason.
 
     Parameters
     ----------
@@ -549,8 +549,8 @@ def read_truth(
 def motion_capture_truth(positions: tuple[PositionTrack, ...]) -> Truth | None:
     """Return motion capture as ground truth, or None if EKF2 may have fused it.
 
-    EKF2 may have fused motion capture if the log contains no external vision. The
-    north of positions in FRD is unknown.
+    EKF2 may have fused it if the log contains no external vision. Motion capture in FRD is not
+    used, because its north is unknown.
     """
     tracks = (track for track in positions if track.origin.kind == "mocap")
     track = next((track for track in tracks if track.frame != "FRD"), None)

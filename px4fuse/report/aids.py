@@ -80,9 +80,8 @@ def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
     column_heads += ["axis", "n", "mean\nNIS", "95 %\nband", "mean\nν/√S"]
     page.table(column_heads, rows, right_aligned_columns=(2, 3, 4, 5, 7, 8, 10))
     if disabled_labels := [aid.label for aid in aids.values() if aid.verdict == "disabled"]:
-        page.write(
-            f"Aiding sources that are logged but never fused: {', '.join(disabled_labels)}.",
-            colour=style.MUTED_COLOUR,
+        page.write_small(
+            f"Aiding sources that are logged but never fused: {', '.join(disabled_labels)}."
         )
 
 

@@ -30,10 +30,10 @@ from px4fuse.report.phrases import (
 from px4fuse.report.style import (
     INNOVATION_DOTS,
     KF_COLOUR,
-    MUTED_COLOUR,
     TRACK_LINES,
     Axes,
     draw_curve,
+    draw_zero_line,
     line_style,
     set_plain_ticks,
 )
@@ -133,11 +133,10 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     page.heading(f"Tested causes along {axis.label}")
     column_heads = ["filter", "change", "quantity", "as flown", "with change", "explains"]
     page.table(column_heads, rows, right_aligned_columns=(3, 4))
-    page.write(
+    page.write_small(
         "Each row is a re-run with one changed setting. 'explains' is the share of ln(quantity) "
         "(of KF - EKF2: of its mean square) that the change removes; 'all' means that the "
-        "re-run is consistent. A change that explains 50 % or more is a cause.",
-        colour=MUTED_COLOUR,
+        "re-run is consistent. A change that explains 50 % or more is a cause."
     )
 
 
@@ -201,7 +200,7 @@ def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
         whiteness_half_band = _whiteness_half_band(values)
         axes.axhline(-whiteness_half_band, **_thin_line_style(name))
         axes.axhline(whiteness_half_band, **_thin_line_style(name), label=f"95 % band {name}")
-    axes.axhline(0.0, color="black", lw=0.5)
+    draw_zero_line(axes)
     low, high = axes.get_ylim()
     axes.set_ylim(max(min(low, -0.3), -1.05), min(max(high, 0.3), 1.05))
     axes.set_xlim(0.0, MAX_AUTOCORRELATION_LAG + 1)

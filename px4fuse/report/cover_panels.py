@@ -234,7 +234,7 @@ def _error_plot(
         axes.set_ylim(-half_range_m, half_range_m)
         for name, sigma in finite_sigmas.items():
             style.draw_sigma_band(axes, 0.0 * sigma, sigma, style.SIGMA_BAND_COLOURS[name])
-        axes.axhline(0.0, color="black", lw=0.5)
+        style.draw_zero_line(axes)
         draw_curve(axes, error_m, **line)
 
     return TimePlot(f"{label}: {', '.join(statistic_texts)}", draw)
@@ -272,7 +272,7 @@ def _innovation_plot(result: AxisComparison) -> TimePlot:
         height = axes.bbox.height * 72.0 / axes.figure.dpi
         axes.set_yticks(np.arange(-4.0, 4.1, 2.0 if height >= MIN_HEIGHT_WITH_TICKS_AT_2 else 4.0))
         axes.axhspan(-2.0, 2.0, color=style.CONSISTENT_BAND_COLOUR, lw=0, zorder=0.05)
-        axes.axhline(0.0, color="black", lw=0.5)
+        style.draw_zero_line(axes)
         for name in reversed(innovations):
             draw_dots(
                 axes,

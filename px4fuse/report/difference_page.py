@@ -8,7 +8,6 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.core.arrays import Array
-from px4fuse.core.text import capitalise_first
 from px4fuse.ekf2.replay import Agreement, Ekf2Replay
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.filter.signals import AISLE
@@ -48,10 +47,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
         "square difference KF - EKF2; a hatched bar is an increase. The bars add up to 100 %.",
     )
     for name, explanation in explanations.items():
-        if isinstance(explanation, Unavailable):
-            page.heading(f"{name}: no result")
-            page.write(f"{capitalise_first(explanation.reason)}. {explanation.remedy}")
-        else:
+        if isinstance(explanation, DifferenceExplanation):
             _draw_axis_explanation(page, name, explanation, analysis)
     replay = analysis.ekf2_replay
     assert isinstance(replay, Ekf2Replay)

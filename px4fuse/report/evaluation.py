@@ -1,6 +1,6 @@
 """Page on trajectory errors: map coloured by error, APE and RPE."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,17 +13,11 @@ from px4fuse.report import style
 from px4fuse.report.page import Page, two_columns
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, MUTED_COLOUR, TRUTH_COLOUR, Artist, Axes
 from px4fuse.trajectory.evaluation import AbsoluteError, Evaluation
-from px4fuse.trajectory.model import AXES_OF_FRAME, Frame, Trajectory
+from px4fuse.trajectory.model import AXES_OF_FRAME, Trajectory
 from px4fuse.trajectory.scores import RelativeError, RmseInterval, Statistics
 
-# Indices of the position axes that are drawn to the right and upwards on a map
-MAP_AXIS_INDICES: Mapping[Frame, tuple[int, int]] = {
-    "NED": (1, 0),
-    "FRD": (1, 0),
-    "ENU": (0, 1),
-    "camera": (0, 2),
-    "unknown": (0, 1),
-}
+# Indices of the position axes that are drawn to the right and upwards on a map; default (0, 1)
+MAP_AXIS_INDICES = {"NED": (1, 0), "FRD": (1, 0), "camera": (0, 2)}
 # Minimum ratio of a pose interval to the median pose interval for a gap in the drawn path
 MIN_GAP_INTERVAL_RATIO = 10.0
 MAX_PATH_POINTS = 1200  # maximum number of drawn points of a path
@@ -32,7 +26,6 @@ PANEL_HEIGHT = 76.0  # height (points) of the axes of APE and RPE
 MAP_HEIGHT = 128.0  # height (points) of the axes of a map
 LABEL_MARGIN = 34.0  # width (points) of the labels of the vertical axis of a map
 COLOUR_BAR_MARGIN = 40.0  # width (points) of the colour bar with its labels
-MAX_RPE_DELTA_LABELS = 12  # maximum number of labels on the axis of RPE distances and times
 REFERENCE_LINE = style.line_style(TRUTH_COLOUR, 0.8, (0, (4, 2)))
 STATISTIC_LINES = (
     ("max", "max", style.line_style(MUTED_COLOUR, 0.8, (0, (1, 1.5)))),
@@ -57,7 +50,7 @@ def draw_pages(evaluation: Evaluation, _: object) -> Iterator[Page]:
 def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     """Draw both paths from above before the alignment, and the aligned path coloured by error."""
     frame, is_aligned = evaluation.reference_track.frame, evaluation.alignment != "none"
-    axis_indices = list(MAP_AXIS_INDICES[frame])
+    axis_indices = list(MAP_AXIS_INDICES.get(frame, (0, 1)))
     names = [AXES_OF_FRAME[frame][index] for index in axis_indices]
     left_column, right_column = two_columns()
     unaligned_handles: dict[str, Artist] = {}
@@ -140,7 +133,6 @@ def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) ->
     axes.set(xlim=(x_start, max(x_end, x_start + 1e-6)), xlabel=label)
     axes.set_ylim(0.0, 1.08 * max(float(error_m.max()), MIN_ERROR_RANGE_M))
     axes.locator_params(axis="x", nbins=6)
-    axes.locator_params(axis="y", nbins=4)
 
 
 def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
@@ -149,8 +141,8 @@ def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
             interval = error.interval_m.low, error.interval_m.high
             axes.plot([index] * 2, interval, color=KF_COLOUR, lw=1.6, solid_capstyle="butt")
         axes.plot(index, statistics.rmse, "D", color=EKF2_COLOUR, mec="black", mew=0.5, ms=3.6)
-    ticks = range(0, len(rpe_statistics), 1 + len(rpe_statistics) // MAX_RPE_DELTA_LABELS)
-    axes.set_xticks(ticks, [rpe_statistics[index][0].delta_text for index in ticks])
+    delta_texts = [error.delta_text for error, _ in rpe_statistics]
+    axes.set_xticks(range(len(delta_texts)), delta_texts)
     axes.set_ylim(0.0, max(1.05 * axes.get_ylim()[1], MIN_ERROR_RANGE_M))
     axes.margins(x=0.1)
     axes.set_xlabel("delta: distance, time or number of frames")

@@ -7,19 +7,17 @@ import numpy as np
 
 from px4fuse.analysis import Analysis
 from px4fuse.core.text import capitalise_first, format_number, format_p_value, join_first
-from px4fuse.findings import Finding, group_by_root
+from px4fuse.findings import Finding
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop import corrections
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
-from px4fuse.loop.corrections import SINGLE_CLOSURE_REASON
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
 from px4fuse.report.evaluation import describe_method, format_interval, plot_path
 from px4fuse.report.page import Cell, Page, appendix_title
-from px4fuse.report.phrases import student_line, write_finding
+from px4fuse.report.phrases import student_line, write_findings
 from px4fuse.report.style import (
     EKF2_COLOUR,
     KF_COLOUR,
-    MUTED_COLOUR,
     SEVERITY_COLOURS,
     TRACK_LINES,
     Axes,
@@ -35,9 +33,8 @@ from px4fuse.trajectory.scores import RmseInterval, Statistics
 
 LEAD_TEXT = (
     "The closure error is the distance between the end of the odometry and the true end. Each "
-    "correction distributes it along the path: by distance (positions only as in Example 2 of "
-    "lesson UAT 366, module 2, or headings too), or by pose graph optimisation. Each closure is "
-    "tested first, because a false closure would deform the whole path."
+    "correction distributes it along the path: by distance, or by pose graph optimisation. Each "
+    "closure is tested first, because a false closure would deform the whole path."
 )
 MAX_LISTED_CLOSURES = 10
 ERROR_COLOUR = SEVERITY_COLOURS["error"]
@@ -74,21 +71,21 @@ def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
     if student := student_line(results.student, ", "):
         page.write_labelled("Student", student)
     page.write_labelled("SHA-256", loop.odometry.trajectory.sha256)
-    _write_page(page, loop, results.findings)
+    write_findings(page, results.findings)
+    _write_page(page, loop)
     yield page
 
 
-def _write_page(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
-    write_loop(page, loop, findings)
+def _write_page(page: Page, loop: Loop) -> None:
+    write_loop(page, loop)
     axes = page.panel("Map in the frame of the odometry", MAP_HEIGHT, left=36.0)
     draw_map(axes, loop)
     page.legend(axes.get_legend_handles_labels()[0])
     page.heading("Loop closures and scores")
-    page.write(
+    page.write_small(
         "d²: squared Mahalanobis distance of the closure error, from drift and closure "
         "noise. p: probability of a larger d² for a true closure. GNC weight: "
-        "1 if the closure is used, 0 if it is excluded.",
-        colour=MUTED_COLOUR,
+        "1 if the closure is used, 0 if it is excluded."
     )
     write_scores(page, loop)
 
@@ -137,12 +134,11 @@ def loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:
     page = Page()
     write_loop(page, loop)
     write_scores(page, loop)
-    for group in group_by_root(findings):
-        write_finding(page, group)
+    write_findings(page, findings)
     return page
 
 
-def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> None:
+def write_loop(page: Page, loop: Loop) -> None:
     """Write the closure error, the test of the closure, and the ATE of each corrected path."""
     odometry = loop.odometry.trajectory
     true_end = loop.true_end
@@ -156,12 +152,8 @@ def write_loop(page: Page, loop: Loop, findings: tuple[Finding, ...] = ()) -> No
     for closure in loop.closures[:1]:
         texts["Gate"] = describe_gate(closure)
     page.write_labelled_texts(texts)
-    single_loop_note = SINGLE_CLOSURE_REASON if len(loop.closures) == 1 else ""
-    notes = correction_by_distance_sentence(loop), single_loop_note, *missing_corrections(loop)
-    for note in notes:
-        page.write(note, colour=MUTED_COLOUR, above=2.0)
-    for group in group_by_root(findings):
-        write_finding(page, group)
+    for note in (correction_by_distance_sentence(loop), *missing_corrections(loop)):
+        page.write_small(note)
     names = [reference.name for reference in loop.references]
     head = [
         "path",
@@ -296,7 +288,7 @@ def missing_corrections(loop: Loop) -> list[str]:
     reasons = {
         f"{correction.what}: {correction.reason}": None
         for correction in loop.corrections.values()
-        if isinstance(correction, Unavailable) and SINGLE_CLOSURE_REASON not in correction.reason
+        if isinstance(correction, Unavailable)
     }
     return list(reasons)
 
@@ -355,13 +347,11 @@ def pose_graph_page(solved_graph: Graph) -> Page:
             )
     unconverged_solutions, rows = [], []
     for key, solution in solved_graph.solutions.items():
-        iterations_text = f"{solution.iterations}"
         if not solution.converged:
             unconverged_solutions.append(SOLUTIONS[key])
-            iterations_text += " (not converged)"
         cost_texts = [f"{cost:.6g}" for cost in (solution.cost_initial, solution.cost)]
         dropped_text = "" if key == "all" else f"{solution.dropped}"
-        rows.append([SOLUTIONS[key], *cost_texts, iterations_text, dropped_text])
+        rows.append([SOLUTIONS[key], *cost_texts, f"{solution.iterations}", dropped_text])
     if unconverged_solutions:
         page.write_labelled(
             "Solver",

@@ -207,7 +207,7 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     axis_limit_m, ekf2_innovations = _innovation_axis_limit_m(result), result.ekf2_innovations
     updates, kf_innovations = result.replay.updates, result.replay.updates["innovation_m"]
     draw_sigma_band(axes, 0.0 * kf_innovations, np.sqrt(updates["innovation_variance_m2"]))
-    axes.axhline(0.0, color="black", lw=0.5)
+    style.draw_zero_line(axes)
     innovations_and_styles = [(kf_innovations, INNOVATION_DOTS["KF"])]
     if isinstance(ekf2_innovations, pd.DataFrame):
         two_sigma = 2.0 * np.sqrt(ekf2_innovations["innovation_variance_m2"])

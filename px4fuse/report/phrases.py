@@ -25,13 +25,12 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import Alignment, ClockMap, Columns, Truth, Unavailable
-from px4fuse.report.page import styled_text
+from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.results.model import Student
 
 if TYPE_CHECKING:
     from px4fuse.analysis import Analysis
-    from px4fuse.report.page import Cell, Page
 
 # Minimum p value of the Ljung-Box test for white innovations: with eight tests per flight, less
 # than 1 % of the flights have a false alarm
@@ -264,27 +263,20 @@ def student_line(student: Student, separator: str) -> str:
 
 
 def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
-    if not findings:
-        page.write("None.")
-    for cause_and_effects in group_by_root(findings):
-        write_finding(page, cause_and_effects)
-
-
-def write_finding(page: Page, cause_and_effects: list[Finding]) -> None:
-    finding, *effects = cause_and_effects
-    title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
-    texts = [styled_text(title, 8.0, bold=True), styled_text(finding.message, 8.0)]
-    if finding.remedy:
-        texts.append(styled_text(f"Action: {finding.remedy}", 8.0, MUTED_COLOUR))
-    if effects:
-        effect_titles = " ".join(f"{finding.title} [{finding.id}]." for finding in effects)
-        texts.append(styled_text(f"Consequences: {effect_titles}", 8.0, MUTED_COLOUR))
-    page.write_labelled(
-        f"{finding.severity}\n{finding.when}".strip(),
-        *texts,
-        above=2.0,
-        colour=SEVERITY_COLOURS[finding.severity],
-    )
+    for finding, *effects in group_by_root(findings):
+        title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
+        texts = [styled_text(title, bold=True), styled_text(finding.message)]
+        if finding.remedy:
+            texts.append(styled_text(f"Action: {finding.remedy}", colour=MUTED_COLOUR))
+        if effects:
+            effect_titles = " ".join(f"{effect.title} [{effect.id}]." for effect in effects)
+            texts.append(styled_text(f"Consequences: {effect_titles}", colour=MUTED_COLOUR))
+        page.write_labelled(
+            f"{finding.severity}\n{finding.when}".strip(),
+            *texts,
+            above=2.0,
+            colour=SEVERITY_COLOURS[finding.severity],
+        )
 
 
 def format_noise_estimate(noise: Noise) -> str:

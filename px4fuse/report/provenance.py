@@ -22,6 +22,7 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) ->
     """Draw the page with all detected faults (findings), and the provenance page of a flight."""
     page = Page(ALL_FINDINGS)
     write_findings(page, results.findings)
+    page.write("" if results.findings else "None.")
     yield page
     if isinstance(analysis, Analysis):
         page, source = Page("Appendix: provenance"), analysis.source

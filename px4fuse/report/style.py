@@ -134,6 +134,10 @@ def set_plain_ticks(axes: Axes) -> None:
     axis.set_minor_locator(NullLocator())
 
 
+def draw_zero_line(axes: Axes) -> None:
+    axes.axhline(0.0, color="black", lw=0.5)
+
+
 def label_time_axis(axes: Axes, with_time_label: bool) -> None:
     if with_time_label:
         axes.set_xlabel(TIME_LABEL)
@@ -153,14 +157,8 @@ def decimate_series(times: Array, values: Array, max_points: int) -> tuple[Array
     """Reduce a series to ``max_points`` points: the minimum and maximum of each interval."""
     if len(times) <= max_points:
         return times, values
-    bucket_size, larger_bucket_count = divmod(len(times), max_points // 2)
-    split_row, index_groups = larger_bucket_count * (bucket_size + 1), []
-    for first_row, last_row, width in (
-        (0, split_row, bucket_size + 1),
-        (split_row, len(times), bucket_size),
-    ):
-        buckets = values[first_row:last_row].reshape(-1, width)
-        starts = np.arange(first_row, last_row, width)
-        index_groups += [starts + buckets.argmin(axis=1), starts + buckets.argmax(axis=1)]
-    selected_rows = np.unique(np.concatenate(index_groups))
+    intervals = np.array_split(np.arange(len(times)), max_points // 2)
+    lowest_rows = [rows[values[rows].argmin()] for rows in intervals]
+    highest_rows = [rows[values[rows].argmax()] for rows in intervals]
+    selected_rows = np.unique(lowest_rows + highest_rows)
     return times[selected_rows], values[selected_rows]

@@ -7,7 +7,6 @@ from px4fuse.card.model import Card
 from px4fuse.comparison.model import Comparison
 from px4fuse.core.text import capitalise_first
 from px4fuse.ekf2.steps import DifferenceExplanation
-from px4fuse.findings import group_by_root
 from px4fuse.report.aids import outdoor_aids, write_aids
 from px4fuse.report.difference_page import write_explanation
 from px4fuse.report.page import Page
@@ -16,10 +15,8 @@ from px4fuse.report.phrases import (
     format_settings,
     verdict_notes,
     write_error_table,
-    write_finding,
     write_findings,
 )
-from px4fuse.report.style import MUTED_COLOUR
 
 ERROR_LEGEND = (
     "KF-EKF2 is the RMS difference of position and velocity; RMSE is against ground truth. A "
@@ -45,6 +42,7 @@ def comparison_page(
         write_aids(page, analysis.aids)
         page.heading("Findings")
         write_findings(page, results.findings)
+        page.write("" if results.findings else "None.")
     else:
         _write_details(page, analysis, results)
     return page
@@ -55,14 +53,13 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
     page.write_labelled_texts(_describe_setup(analysis))
     write_error_table(page, analysis)
     for note in (ERROR_LEGEND, *verdict_notes(analysis)):
-        page.write(note, colour=MUTED_COLOUR)
+        page.write_small(note)
     explanation = analysis.difference_steps.get(analysis.main.axis.name)
     if isinstance(explanation, DifferenceExplanation):
         write_explanation(page, explanation)
     if aids := outdoor_aids(analysis):
         write_aids(page, aids)
-    for group in group_by_root(results.findings):
-        write_finding(page, group)
+    write_findings(page, results.findings)
 
 
 def card_page(block_kind: str, card: Card) -> Page:

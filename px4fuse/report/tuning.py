@@ -5,7 +5,6 @@ from px4fuse.filter.tuning import AxisTuning
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import format_noise_estimate, format_settings, tuning_advice
-from px4fuse.report.style import MUTED_COLOUR
 
 TUNING_HEAD = (
     "axis",
@@ -56,6 +55,6 @@ def tuning_page(
         page.table(TUNING_HEAD, rows, right_aligned_columns=(1, 2, 3, 4, 5))
         sentences.append(TUNING_NOTE)
     for text in sentences:
-        page.write(text, colour=MUTED_COLOUR)
+        page.write_small(text)
     page.write_labelled_texts(tuning_advice(comparison, tunings))
     return page

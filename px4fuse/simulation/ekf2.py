@@ -57,6 +57,7 @@ from px4fuse.trajectory.rotation import (
     cumulative_product,
     from_vector,
     multiply,
+    rotate,
     skew,
     to_vector,
 )
@@ -145,8 +146,10 @@ def simulate_ekf2(
         barometer_samples = barometer_samples_inside(
             segment, barometer_s, down_m, no_dead_zone, sample_weight
         )
-        heights = HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *barometer_samples)
-        segment = replace(segment, heights=heights)
+        height_samples = HeightSamples(
+            (BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *barometer_samples
+        )
+        segment = replace(segment, height_samples=height_samples)
         if not logged_values[MAG.switch]:
             segment = add_field_states(
                 segment,
@@ -318,9 +321,7 @@ def _compute_output(
     for step, reset_m in resets:
         reset_sum_m[step:, :2] += reset_m
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
-    gyro_bias_rad_s = np.einsum(
-        "nij,nj->ni", segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:]
-    )
+    gyro_bias_rad_s = rotate(segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:])
     attitude_error_steps_rad = -segment.correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
     gyro_attitude_error_rad = state[0, THETA] + cumulative_sums(attitude_error_steps_rad)
     attitude_error_rad = gyro_attitude_error_rad + follow_attitude(

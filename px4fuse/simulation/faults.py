@@ -6,11 +6,16 @@ fault has a default size that px4fuse detects easily.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from px4fuse.core.record import read_toml
 from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError, suggest_name
 from px4fuse.simulation.scenario import KINDS, ScenarioKind, bounded_number, bounds_by_field
+
+
+def _start_time() -> Any:
+    return bounded_number(None, 0.0, 1e4, "s", "AT")
 
 
 @dataclass(frozen=True)
@@ -26,22 +31,22 @@ class FaultSizes:
     nlos_percent: float = bounded_number(0.0, 0.0, 50.0, "%", "PERCENT")
     nlos_size_m: float = bounded_number(2.0, 0.0, 100.0, "m", "SIZE")
     dropout_s: float = bounded_number(0.0, 0.0, 600.0, "s", "SECONDS")
-    dropout_at_s: float | None = bounded_number(None, 0.0, 1e4, "s", "AT")
+    dropout_at_s: float | None = _start_time()
     imu_dropout_s: float = bounded_number(0.0, 0.0, 600.0, "s", "SECONDS")
-    imu_dropout_at_s: float | None = bounded_number(None, 0.0, 1e4, "s", "AT")
+    imu_dropout_at_s: float | None = _start_time()
     decimate_hz: float = bounded_number(0.0, 0.1, 100.0, "Hz", "HZ")
     r_scale: float = bounded_number(1.0, 1e-4, 1e4, "", "FACTOR")
     yaw_deg: float = bounded_number(0.0, -180.0, 180.0, "°", "DEG")
     scale_percent: float = bounded_number(0.0, -50.0, 50.0, "%", "PERCENT")
     jump_m: float = bounded_number(0.0, -100.0, 100.0, "m", "METRES")
-    jump_at_s: float | None = bounded_number(None, 0.0, 1e4, "s", "AT")
+    jump_at_s: float | None = _start_time()
     smoothed_s: float = bounded_number(0.0, 0.0, 10.0, "s", "SECONDS")
     slow_error_m: float = bounded_number(0.0, 0.0, 100.0, "m", "METRES")
     slow_error_s: float = bounded_number(30.0, 0.1, 1e4, "s", "TIME")
     heading_deg: float = bounded_number(0.0, -180.0, 180.0, "°", "DEG")
-    heading_at_s: float | None = bounded_number(None, 0.0, 1e4, "s", "AT")
+    heading_at_s: float | None = _start_time()
     mag_gauss: float = bounded_number(0.0, -1.0, 1.0, "gauss", "GAUSS")
-    mag_at_s: float | None = bounded_number(None, 0.0, 1e4, "s", "AT")
+    mag_at_s: float | None = _start_time()
     accel_bias_m_s2: float = bounded_number(0.0, -5.0, 5.0, "m/s²", "M/S2")
     vibration_m_s2: float = bounded_number(0.0, 0.0, 20.0, "m/s²", "M/S2")
     imu_rate_hz: float = bounded_number(0.0, 1.0, 1000.0, "Hz", "HZ")

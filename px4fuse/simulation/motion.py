@@ -167,12 +167,10 @@ def attitude(state: State) -> Attitude:
     """Return attitude, angular rate and specific force of a quadrotor in the true motion."""
     gravity = np.array([0.0, 0.0, constants.g])
     opposite_thrust_m_s2 = gravity - state.acceleration_m_s2
-    specific_thrust_m_s2 = np.sqrt(
-        np.einsum("ij,ij->i", opposite_thrust_m_s2, opposite_thrust_m_s2)
-    )[:, None]
+    specific_thrust_m_s2 = np.sqrt(_dot(opposite_thrust_m_s2, opposite_thrust_m_s2))[:, None]
     z = opposite_thrust_m_s2 / specific_thrust_m_s2
     z_rate = -state.jerk_m_s3 / specific_thrust_m_s2
-    z_rate -= z * np.einsum("ij,ij->i", z, z_rate)[:, None]
+    z_rate -= z * _dot(z, z_rate)[:, None]
     yaw_rad = state.yaw_rad
     nose, right = (
         np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
@@ -181,21 +179,26 @@ def attitude(state: State) -> Attitude:
     # n = z × nose is parallel to the body's y axis
     n = np.cross(z, nose)
     n_rate = np.cross(z_rate, nose) + state.yaw_rate_rad_s[:, None] * np.cross(z, right)
-    n_length = np.sqrt(np.einsum("ij,ij->i", n, n))
+    n_length = np.sqrt(_dot(n, n))
     y = n / n_length[:, None]
     x = np.cross(y, z)
     # angular rate ω in body axes, from dR/dt = R [ω]×
     rate_rad_s = np.stack(
         [
-            -np.einsum("ij,ij->i", z_rate, y),
-            np.einsum("ij,ij->i", z_rate, x),
-            -np.einsum("ij,ij->i", n_rate, x) / n_length,
+            -_dot(z_rate, y),
+            _dot(z_rate, x),
+            -_dot(n_rate, x) / n_length,
         ],
         axis=1,
     )
     force_m_s2 = np.zeros_like(z)
     force_m_s2[:, 2] = -specific_thrust_m_s2[:, 0]
     return Attitude(np.stack([x, y, z], axis=2), rate_rad_s, force_m_s2)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Compute the dot products of the vectors of two series, shape (n,)."""
+    return np.asarray(np.einsum("ij,ij->i", a, b))
 
 
 def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator) -> Motion:

@@ -3,15 +3,15 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, Aid
 
 ScenarioKind = Literal["aisle", "loop", "outdoor"]
 YawMode = Literal["fixed", "follow"]
-KINDS: tuple[ScenarioKind, ...] = ("aisle", "loop", "outdoor")
-YAW_MODES: tuple[YawMode, YawMode] = ("fixed", "follow")
+KINDS: tuple[ScenarioKind, ...] = get_args(ScenarioKind)
+YAW_MODES: tuple[YawMode, ...] = get_args(YawMode)
 
 # Averaging time (s) for which the accelerometer noise SIGMA_A is defined: DT of KF
 DT_S = 0.1

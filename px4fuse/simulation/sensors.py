@@ -11,7 +11,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from px4fuse.core.arrays import Array, ArrayPair, BoolArray
+from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.flight.ekf2_parameters import GNSS_POS, PARAMETERS
 from px4fuse.readers.px4_positions import unproject
 from px4fuse.readers.px4_topics import GPS_POSITION
@@ -116,7 +116,7 @@ def biases(scenario: Scenario, faults: FaultSizes) -> tuple[Array, Array]:
 
 def imu(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
     """Simulate sensor_combined (accelerometer and gyro) at the full rate, without gaps."""
-    time_us = _grid_us(motion.duration_s, scenario.imu_rate_hz)
+    time_us = _grid_us(motion, scenario.imu_rate_hz)
     force_m_s2, rate_rad_s = measure_imu(
         scenario, faults, motion, seconds(time_us), RandomStream.IMU
     )
@@ -136,7 +136,7 @@ def imu(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
 
 
 def magnetometer(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
-    time_us = _grid_us(motion.duration_s, MAGNETOMETER_RATE_HZ)
+    time_us = _grid_us(motion, MAGNETOMETER_RATE_HZ)
     body_to_ned = attitude(motion.at(seconds(time_us))).body_to_ned
     # The measured field is rotated, which causes EKF2's heading error outdoors
     if faults.heading_deg:
@@ -151,7 +151,7 @@ def magnetometer(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topi
 
 
 def barometer(scenario: Scenario, motion: Motion) -> Topic:
-    time_us = _grid_us(motion.duration_s, BAROMETER_RATE_HZ)
+    time_us = _grid_us(motion, BAROMETER_RATE_HZ)
     height_m = HOME_POSITION[2] - motion.at(seconds(time_us)).position_m[:, 2]
     height_m -= height_error(scenario, seconds(time_us))
     unit_noise = random_stream(scenario, RandomStream.BAROMETER).standard_normal(len(time_us))
@@ -182,7 +182,7 @@ def logged_imu(full_topic: Topic, faults: FaultSizes, motion: Motion) -> Topic:
     return limit_rate(full_topic, faults.imu_rate_hz, is_outside_gap)
 
 
-def time_us(topic: Topic, field: str = "timestamp") -> NDArray[np.int64]:
+def time_us(topic: Topic, field: str = "timestamp") -> IntArray:
     """Return the publication time (or another time) of each message, µs from the first data."""
     return np.asarray(topic.fields[field].astype(np.int64) - START_US)
 
@@ -212,7 +212,7 @@ def measure_imu(
 
 def logged_attitude(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
     """Simulate vehicle_attitude without the EKF2 model: true attitude with a slow error."""
-    time_us = _grid_us(motion.duration_s, scenario.attitude_rate_hz)
+    time_us = _grid_us(motion, scenario.attitude_rate_hz)
     true_rotation = attitude(motion.at(seconds(time_us))).body_to_ned
     error_rotation = attitude_error(scenario, faults, seconds(time_us)).as_matrix()
     logged_quaternions = quaternions(error_rotation @ true_rotation)
@@ -220,7 +220,7 @@ def logged_attitude(scenario: Scenario, faults: FaultSizes, motion: Motion) -> T
 
 
 def true_attitude(scenario: Scenario, motion: Motion) -> Topic:
-    time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
+    time_us = _grid_us(motion, scenario.truth_rate_hz)
     truth = attitude(motion.at(seconds(time_us))).body_to_ned
     return attitude_topic("vehicle_attitude_groundtruth", time_us, 0, quaternions(truth))
 
@@ -229,9 +229,7 @@ def quaternions(body_to_ned: Array) -> Array:
     return np.asarray(Rotation.from_matrix(body_to_ned).as_quat(scalar_first=True))
 
 
-def attitude_topic(
-    name: str, time_us: NDArray[np.int64], delay_us: int, quaternion: Array
-) -> Topic:
+def attitude_topic(name: str, time_us: IntArray, delay_us: int, quaternion: Array) -> Topic:
     """Make an attitude topic that is published ``delay_us`` (µs) after the measurement."""
     return topic(name, timestamps(time_us, delay_us) | {"q": quaternion})
 
@@ -266,7 +264,7 @@ def land_detector(motion: Motion) -> Topic:
 
 
 def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
-    time_us = _grid_us(motion.duration_s, scenario.truth_rate_hz)
+    time_us = _grid_us(motion, scenario.truth_rate_hz)
     state = motion.at(seconds(time_us))
     fields = timestamps(time_us) | vectors(
         {"": state.position_m, "v": state.velocity_m_s, "a": state.acceleration_m_s2}
@@ -424,7 +422,7 @@ def keep_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
 
 def _source_times_us(
     faults: FaultSizes, time_s: Array, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[IntArray, IntArray]:
     """Simulate arrival time and timestamp of each position (µs from the first data)."""
     mean_latency_s = faults.clock_jump_s or POSITION_LATENCY_S
     latency_s = np.maximum(
@@ -439,8 +437,8 @@ def _source_times_us(
 
 
 def _odometry_topic(
-    arrival_us: NDArray[np.int64],
-    timestamp_us: NDArray[np.int64],
+    arrival_us: IntArray,
+    timestamp_us: IntArray,
     position_m: Array,
     sigma_m: float,
     body_to_ned: Array | None,
@@ -454,7 +452,7 @@ def _odometry_topic(
 
 
 def _gnss_topic(
-    timestamp_us: NDArray[np.int64],
+    timestamp_us: IntArray,
     position_m: Array,
     velocity_m_s: Array,
     sigma_m: float,
@@ -497,16 +495,16 @@ def _is_outside_gap(
     return np.asarray((time_s <= start_s) | (time_s >= start_s + gap_s))
 
 
-def _grid_us(duration_s: float, rate_hz: float) -> NDArray[np.int64]:
-    time_us = np.rint(np.arange(int(duration_s * rate_hz) + 1) * (1e6 / rate_hz))
+def _grid_us(motion: Motion, rate_hz: float) -> IntArray:
+    time_us = np.rint(np.arange(int(motion.duration_s * rate_hz) + 1) * (1e6 / rate_hz))
     return np.asarray(time_us, dtype=np.int64)
 
 
-def seconds(time_us: NDArray[np.int64]) -> Array:
+def seconds(time_us: IntArray) -> Array:
     return np.asarray(time_us * 1e-6, dtype=np.float64)
 
 
-def timestamps(time_us: NDArray[np.int64], delay_us: int | NDArray[np.int64] = 0) -> dict[str, Any]:
+def timestamps(time_us: IntArray, delay_us: int | IntArray = 0) -> dict[str, Any]:
     """Return ``timestamp_sample``, and ``timestamp`` (publication, ``delay_us`` later)."""
     return {
         "timestamp": _to_boot_time(time_us + delay_us),
@@ -523,5 +521,5 @@ def vectors(values: Mapping[str, Array]) -> dict[str, Any]:
     }
 
 
-def _to_boot_time(time_us: NDArray[np.int64]) -> NDArray[np.uint64]:
+def _to_boot_time(time_us: IntArray) -> NDArray[np.uint64]:
     return (START_US + time_us).astype(np.uint64)

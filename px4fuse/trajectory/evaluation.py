@@ -103,8 +103,6 @@ def find_jumps(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
         for trajectory in (estimate, reference)
     )
     differences_m = np.abs(estimate_steps_m - reference_steps_m)
-    if not len(differences_m):
-        return ()
     min_jump_m = max(MIN_JUMP_M, MIN_JUMP_RATIO * np.median(differences_m))
     jump_indices = np.flatnonzero(estimate_steps_m - reference_steps_m > min_jump_m)
     if not len(jump_indices):
@@ -393,7 +391,7 @@ def _choose_time_offset(
     estimate: Trajectory, reference: Trajectory, given_offset_s: float | Literal["auto"] | None
 ) -> tuple[TimeOffset, list[str]]:
     """Choose the offset to add to the timestamps of the estimate; also return warnings."""
-    is_given = isinstance(given_offset_s, float | int)
+    is_given = given_offset_s not in (None, "auto")
     clock_offset_s = clock_difference(estimate, reference)
     if isinstance(given_offset_s, float | int):
         clock_offset_s = given_offset_s

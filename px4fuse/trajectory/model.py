@@ -138,16 +138,10 @@ class Trajectory:
 
     def __getitem__(self, selection: slice | BoolArray | IntArray) -> Trajectory:
         """Select poses by a slice, boolean array (n,) or integer array."""
-        array_fields = (
-            "time_s",
-            "position_m",
-            "rotation",
-            "position_variance_m2",
-            "rotation_variance_rad2",
-        )
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in array_fields}
-        selected = {
-            name: values[selection] for name, values in arrays.items() if values is not None
+        selected: dict[str, Any] = {
+            name: values[selection]
+            for name, values in vars(self).items()
+            if isinstance(values, np.ndarray | Rotation)
         }
         return replace(self, **selected)
 

@@ -125,7 +125,7 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
     fits = (_refine_offset(sparse_track, dense_track, lag, SEARCH_WINDOW_S) for lag in candidates)
     accepted_fits = sorted(
         (fit for fit in fits if fit is not None and fit.compute_misfit() <= MAX_MISFIT),
-        key=lambda fit: fit.compute_misfit(),
+        key=_OffsetFit.compute_misfit,
     )
     if not accepted_fits:
         return _not_determinable(

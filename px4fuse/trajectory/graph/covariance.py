@@ -73,10 +73,8 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
             "Add an odometry edge between these vertices.",
         )
     poses = lie.chain(model.odometry_steps(graph, connecting_edges))
-    step_adjoints = lie.adjoint(poses[1:])
-    step_covariances = (
-        step_adjoints @ _covariances(graph, connecting_edges) @ step_adjoints.transpose(0, 2, 1)
-    )  # in the axes of the first pose of the odometry chain
+    # in the axes of the first pose of the odometry chain
+    step_covariances = _transform(lie.adjoint(poses[1:]), _covariances(graph, connecting_edges))
     cumulative_covariance = np.concatenate(
         [np.zeros((1, *step_covariances.shape[1:])), np.cumsum(step_covariances, axis=0)]
     )
@@ -85,18 +83,21 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
         - cumulative_covariance[np.minimum(first_nodes, second_nodes) - first_pose_index]
     )
     end_adjoint = lie.adjoint(lie.inverse(poses[second_nodes - first_pose_index]))
-    covariance = end_adjoint @ chain_covariance @ end_adjoint.transpose(0, 2, 1)
+    covariance = _transform(end_adjoint, chain_covariance)
     relative_poses = lie.between(
         poses[first_nodes - first_pose_index], poses[second_nodes - first_pose_index]
     )
     residuals = lie.log(lie.between(graph.measurements[tested_edges], relative_poses))
-    jacobian = lie.right_jacobian_inverse(residuals)
-    covariance = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
+    covariance = _transform(lie.right_jacobian_inverse(residuals), covariance)
     edge_tests = zip(tested_edges.tolist(), residuals, covariance, strict=True)
     return [
         _test_edge(graph, edge_index, edge_residual, edge_covariance)
         for edge_index, edge_residual, edge_covariance in edge_tests
     ]
+
+
+def _transform(matrices: Array, covariances: Array) -> Array:
+    return matrices @ covariances @ matrices.transpose(0, 2, 1)
 
 
 def _test_edge(
@@ -141,7 +142,5 @@ def _covariances(graph: model.PoseGraph, odometry_edges: IntArray) -> Array:
     is_backward = graph.first_nodes[odometry_edges] > graph.second_nodes[odometry_edges]
     # An edge from a later to an earlier pose is inverted: (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r)
     measured_adjoint = lie.adjoint(graph.measurements[odometry_edges[is_backward]])
-    covariance[is_backward] = (
-        measured_adjoint @ covariance[is_backward] @ measured_adjoint.transpose(0, 2, 1)
-    )
+    covariance[is_backward] = _transform(measured_adjoint, covariance[is_backward])
     return covariance

@@ -196,12 +196,9 @@ def _solve_gnc(
     chi2_bound = np.full(len(is_doubtful), np.inf)
     drop_cost = np.zeros(len(is_doubtful))
     is_testable = is_doubtful & (degrees_of_freedom > 0)
-    chi2_bound[is_testable] = 2.0 * gammaincinv(
-        degrees_of_freedom[is_testable] / 2.0, GNC_PROBABILITY
-    )
-    drop_cost[is_testable] = 2.0 * gammaincinv(
-        degrees_of_freedom[is_testable] / 2.0, DROP_PROBABILITY
-    )
+    half_freedom = degrees_of_freedom[is_testable] / 2.0
+    chi2_bound[is_testable] = 2.0 * gammaincinv(half_freedom, GNC_PROBABILITY)
+    drop_cost[is_testable] = 2.0 * gammaincinv(half_freedom, DROP_PROBABILITY)
 
     def truncated_cost(residuals: Residuals, edge_weights: Array) -> float:
         return 0.5 * float(np.sum(np.where(edge_weights > 0.0, residuals.chi2, drop_cost)))
