@@ -371,7 +371,7 @@ def _option_text(value: Any) -> str:
         value = msgspec.structs.astuple(value)
     if isinstance(value, tuple):
         return ",".join(_option_text(part) for part in value if part is not None)
-    return f"{value:.12g}" if isinstance(value, float) else str(value)
+    return f"{value:.15g}" if isinstance(value, float) else str(value)
 
 
 def _file_name(path: str) -> str:

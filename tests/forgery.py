@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import msgspec
 from pypdf import PdfReader, PdfWriter
@@ -195,6 +196,20 @@ def read_again(results: dict[str, Any]) -> ReportedResults:
     return read_results(to_json(results).encode())
 
 
+RECOMPUTE = verification.recompute
+
+
+def verify_with(
+    pdf: bytes,
+    files: Mapping[str, Path],
+    recompute: Callable[..., Recomputed | Verification],
+) -> Verification:
+    """Verify a report with another function that repeats its analysis."""
+    report = read_attached_results(pdf)
+    with mock.patch.object(verification, "recompute", recompute):
+        return verify(report, pdf, files)
+
+
 @dataclass(frozen=True)
 class VerifiedReport:
     """Report that is verified, with its analysis, which is computed once."""
@@ -214,15 +229,14 @@ class VerifiedReport:
              msgspec.structs.replace(held.provenance, command=""))
             for held in (self.again[0], results)
         )  # fmt: skip
-        return self.again if ours == theirs else verification.recompute(results, logs)
+        return self.again if ours == theirs else RECOMPUTE(results, logs)
 
     def verified(self, pdf: bytes) -> Verification:
         """Verify a forged report with the log."""
         try:
-            report = read_attached_results(pdf)
+            return verify_with(pdf, self.files, self.recompute)
         except ResultsError as error:  # rejected before verification
             return Verification("cannot verify", (str(error),), with_log=False)
-        return verify(report, pdf, self.files, recompute=self.recompute)
 
     def with_results(self, results: dict[str, Any]) -> bytes:
         """Return the report with other results attached."""

@@ -49,8 +49,7 @@ def test_empty_answer_form_lists_every_possible_fault(tmp_path: Path) -> None:
 def test_read_answer_form_returns_filled_in_values(tmp_path: Path) -> None:
     text = EMPTY.replace('kind = ""', 'kind = "yaw"').replace('size = ""', "size = -0.367")
     text = text.replace('unit = ""', 'unit = "rad"', 1).replace('q2 = ""', "q2 = [3, 7]")
-    former = 'verdict_ours = "overstated"'  # former name
-    found = read(tmp_path, text.replace('verdict_kf = ""', former))
+    found = read(tmp_path, text.replace('verdict_kf = ""', 'verdict_kf = "underconfident"'))
     (claim,) = found.mistakes
     assert claim.size_in_first_unit() == pytest.approx(-21.03, abs=0.01)
     assert found.quantities[1] == (3.0, 7.0)

@@ -60,7 +60,7 @@ def trial(
 
 
 def analysis(*trials: Trial) -> Any:
-    source = SimpleNamespace(origin=RECEIVED)
+    source = SimpleNamespace(origin=RECEIVED, alignment=None)
     model = SimpleNamespace(inputs=SimpleNamespace(settings={"EKF2_ACC_NOISE": 0.35}))
     return SimpleNamespace(
         select_main_trials=lambda: trials,
@@ -107,6 +107,14 @@ def test_setting_without_improvement_in_rerun_is_not_recommended() -> None:
     assert [action.target for action in cause.actions] == ["sender", "KF"]
     assert cause.actions[1].commands == ("px4fuse compare a.ulg --clock-offset -0.2",)
     assert rank_causes(analysis(trial("time offset", FLOWN), fails), [OFFSET]) == []
+
+
+def test_command_for_position_file_contains_whole_clock_offset() -> None:
+    flight = analysis(trial("time offset", CORRECTED))
+    flight.source.alignment = SimpleNamespace(clock_offset_s=-1795287249.945)
+    (ranked,) = rank_causes(flight, [OFFSET])
+    (command,) = make_cause(flight, ranked, (), REQUEST).actions[1].commands
+    assert command == "px4fuse compare a.ulg --clock-offset -1795287250.145"
 
 
 def test_diagnosis_without_ground_truth_still_lists_time_offset() -> None:

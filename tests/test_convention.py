@@ -388,6 +388,13 @@ def test_ekf2_faults_are_reported_as_effects_of_wrong_axes():
     assert (effect.caused_by, effect.message) == ("source_axes_wrong", "EKF2 rejects 9 %.")
 
 
+def test_time_offset_is_not_reported_beside_clock_drift():
+    comparison = compared(sent(flown(), clock_drift=0.02))
+    roots = list(source_convention.detect(comparison))
+    rest = finding("warning", "source_time_offset", "Late.", "Run again.")
+    assert source_convention.apply_convention(comparison, [rest, *roots]) == roots
+
+
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", FLOWN)
 def test_frame_detection_on_sitl_log_finds_known_frame(name):

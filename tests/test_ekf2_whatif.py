@@ -107,7 +107,7 @@ def test_kf_ekf2_difference_without_common_time_is_unavailable(model):
 def test_kf_ekf2_difference_is_split_one_property_at_a_time():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(ReceivedPositions)
-    plain = (made(ReplaySegment, flow=None, heights=None),)
+    plain = (made(ReplaySegment, flow=None, height_samples=None),)
     flight = made(Inputs, settings=flown, mean_step_s=0.01, received=received, segments=plain)
     kf_settings = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
     found = list(step_configurations(flight, kf_settings).values())
@@ -139,7 +139,7 @@ def test_kf_ekf2_difference_is_split_one_property_at_a_time():
     assert [configuration.settings["EKF2_GPS_P_NOISE"] for configuration in found] == [0.2] * 2 + [
         0.5
     ] * 6
-    flow = (made(ReplaySegment, flow=made(SensorSamples), heights=None),)
+    flow = (made(ReplaySegment, flow=made(SensorSamples), height_samples=None),)
     more = {"segments": flow, "settings": gnss.settings | {"EKF2_MAG_NOISE": 0.05}}
     configurations = step_configurations(made(Inputs, **{**vars(gnss), **more}), kf_settings)
     assert list(configurations)[-5:] == [ATTITUDE, FIELD_STEP, VELOCITY_STEP, FLOW_STEP, GATE]

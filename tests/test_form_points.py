@@ -29,6 +29,7 @@ from px4fuse.classroom.grading.form_points import (
     panels_showing,
 )
 from px4fuse.cli.simulate import simulate
+from px4fuse.core.text import convert_nested
 from px4fuse.results.answer_form import (
     CORRECTIONS,
     FAULT_KINDS,
@@ -36,7 +37,6 @@ from px4fuse.results.answer_form import (
     Answers,
     Choice,
     NamedFault,
-    update_renamed_values,
 )
 from px4fuse.simulation import flights
 from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED
@@ -90,9 +90,13 @@ def with_false(*kinds: str) -> Answers:
     return replace(RIGHT, mistakes=(*RIGHT.mistakes, *map(NamedFault, kinds)))
 
 
+def points_by_part(answers: Answers, truth: RightFormAnswers = TRUTH) -> dict[str, float]:
+    return {part.title: part.points for part in form_points(answers, truth).parts}
+
+
 def parts(answers: Answers, truth: RightFormAnswers = TRUTH) -> list[float]:
-    found = form_points(answers, truth).points_by_part
-    return [round(found[name], 2) for name in PART_NAMES]
+    found = points_by_part(answers, truth)
+    return [round(found.get(name, 0.0), 2) for name in PART_NAMES]
 
 
 def test_answer_form_offers_correct_answers_for_each_fault() -> None:
@@ -106,7 +110,7 @@ def test_answer_form_offers_correct_answers_for_each_fault() -> None:
 
 
 def test_correct_answer_form_earns_all_and_empty_form_no_points() -> None:
-    assert form_points(RIGHT, TRUTH).points_by_part == FULL
+    assert points_by_part(RIGHT) == FULL
     assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
     assert form_points(RIGHT, TRUTH).is_named_by_kind == {"clock-offset": True, "dropout": True}
 
@@ -159,7 +163,7 @@ HALF_RIGHT: list[tuple[Answers, dict[str, float]]] = [
 def test_partly_correct_answer_form_has_partial_points(
     answers: Answers, less: dict[str, float]
 ) -> None:
-    assert form_points(answers, TRUTH).points_by_part == pytest.approx({**FULL, **less}, abs=0.01)
+    assert points_by_part(answers) == pytest.approx({**FULL, **less}, abs=0.01)
 
 
 def test_answer_that_names_a_fault_of_clean_flight_has_no_points() -> None:
@@ -231,7 +235,9 @@ def simulation_of(typed: str) -> flights.Simulation:
 
 
 def answers_of(form: dict[str, Any]) -> Answers:
-    form = update_renamed_values(form)  # the forms use the values before schema 4
+    form = convert_nested(
+        form, lambda word: NEW_WORDS.get(word, word)
+    )  # the forms use the values before schema 4
     claims = []
     for one in form["mistakes"] or []:
         when = one["when"]
@@ -263,6 +269,27 @@ def to_tuple(value: Any) -> Any:
     return tuple(map(float, value)) if isinstance(value, list) else value
 
 
+# Answers before schema 4, in the forms of the study
+NEW_WORDS = {
+    "calibrate the magnetometer": "calibrate the compass",
+    "verdict_ours": "verdict_kf",
+    "ours": "kf",
+    "overstated": "underconfident",
+    "understated": "overconfident",
+    "nothing unusual": "normal",
+    "followed the wrong positions": "followed wrong positions",
+    "rejected the bad samples": "rejected outliers",
+    "coasted, then reset": "dead-reckoned, then reset",
+    "trusted the positions too little": "weighted the positions too little",
+    "error to truth": "error against ground truth",
+    "why EKF2 differs": "differences KF - EKF2",
+    "correct the stamps at the sender": "correct the timestamps at the sender",
+    "multiply the positions at the sender": "scale the positions at the sender",
+    "turn the positions at the sender": "rotate the positions at the sender",
+    "one set of anchors": "use one set of anchors",
+    "line of sight and link": "improve line of sight and link",
+    "switch the smoothing off": "disable the low-pass filter",
+}
 VERDICT_WORDS = {
     "consistent": "consistent", "overstated": "underconfident", "understated": "overconfident",
 }  # fmt: skip
@@ -292,7 +319,7 @@ def test_answer_form_points_agree_with_manual_grading(shared_logs: Path) -> None
         kf, ekf2 = by_hand[form["flight"]]
         truth = replace(truths[form["flight"]], quantities=known, kf=kf, ekf2=ekf2)
         made = form_points(answers_of(form), truth)
-        ours.append(sum(made.points_by_part.values()))
+        ours.append(sum(part.points for part in made.parts))
         theirs.append(form["judgement"]["points"])
     assert len(ours) >= 30
     assert np.abs(np.subtract(ours, theirs)).mean() <= 2.0

@@ -90,6 +90,14 @@ def flight_of(log: Log, folder: Path) -> Flight:
     return read_log(log.write(folder / "a.ulg"))
 
 
+def test_gnss_positions_without_fix_are_invalid(tmp_path: Path) -> None:
+    log = outdoors("v1.16")
+    log["vehicle_gps_position"]["fix_type"][10:20] = 1
+    (track,) = (one for one in flight_of(log, tmp_path).positions if one.origin.is_gnss)
+    assert track.invalid.tolist() == ["no fix"] * 10
+    assert not track.invalid.index.isin(track.samples.index).any()
+
+
 def track_of(flight: Flight) -> PositionTrack:
     return next(track for track in flight.positions if track.name == "vehicle_gps_position")
 
@@ -318,7 +326,7 @@ def test_smaller_gnss_noise_is_advised_if_above_receiver_sigma(
 # By flight: first finding above a note; verdicts of aiding sources; reason without EKF2 replay
 FLIGHTS: dict[str, tuple[str | None, dict[str, str], str]] = {
     "main202603_gps_outage_flow":
-        ("source_gap", {"gnss_pos": "not_fused", "gnss_vel": "not_fused"}, ""),
+        ("source_without_position", {"gnss_pos": "not_fused", "gnss_vel": "not_fused"}, ""),
     "v1.13.3_gps_profile1":
         (None, {"gnss_pos": "consistent", "gnss_vel": "consistent"},
          "GNSS is logged at 3.0 Hz"),

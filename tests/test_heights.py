@@ -44,7 +44,7 @@ def climbing(
     force = np.tile([0.0, 0.0, -9.80665 - up_m_s2], (count, 1))
     return made(
         ReplaySegment, time_s=STEP_S * np.arange(count + 1), step_s=np.full(count, STEP_S),
-        body_to_ned=np.tile(np.eye(3), (count + 1, 1, 1)), force_m_s2=force, heights=heights,
+        body_to_ned=np.tile(np.eye(3), (count + 1, 1, 1)), force_m_s2=force, height_samples=heights,
         **more,
     )  # fmt: skip
 

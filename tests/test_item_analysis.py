@@ -57,7 +57,7 @@ def test_item_analysis_lists_answer_form_parts_and_faults() -> None:
     *_, sizes, fault = analyse_items(reports)
     assert (sizes.title, fault.title) == ("Answer form: sizes", "Fault: nlos")
     assert fault.fractions == (0.0, 0.0, 1.0, 1.0, 1.0)
-    assert fault.csv_row[1:3] == ("5", "0.6")
+    assert fault.csv_row[1:3] == (5, 0.6)
 
 
 def test_item_analysis_excludes_items_that_await_points() -> None:

@@ -42,6 +42,7 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S
+from px4fuse.readers.px4_positions import motion_capture_truth
 
 HALF_PERIOD_S = 0.005  # s; half of the prediction interval, EKF2_PREDICT_US 10,000
 HOUR_US = 3_600_000_000
@@ -517,7 +518,10 @@ def test_read_ulog_reads_ground_truth_of_simulation(read):
 
 def test_motion_capture_is_ground_truth_if_other_source_exists(read):
     log = make_log("v1.16").add(odometry("vehicle_mocap_odometry", 10.0, 16))
-    assert read(log).truth.name == "vehicle_mocap_odometry"
+    flight = read(log)
+    assert flight.truth.name == "vehicle_mocap_odometry"
+    without_north = (replace(track, frame="FRD") for track in flight.positions)
+    assert motion_capture_truth(tuple(without_north)) is None
     log.drop(*(n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"))
     flight = read(log)
     assert isinstance(flight.truth, Unavailable)

@@ -16,6 +16,7 @@ from px4fuse.comparison.trials import RunStatistics, Trial, find_trial, has_effe
 from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
+from px4fuse.filter.tuning import AxisTuning, Noise
 from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
@@ -212,3 +213,17 @@ def test_ekf2_delay_with_worse_replay_is_not_recommended(sample: Analysis) -> No
     # ground truth contradicts --clock-offset too
     found = [finding.id for finding in source_clock.detect(offset(sample, -0.15))]
     assert found == ["ekf2_ev_delay_wrong"]
+
+
+def test_height_with_other_noise_and_same_parameter_is_named(sample: Analysis) -> None:
+    """The sample fuses the horizontal position only."""
+    down = sample.tuning["down"]
+    assert isinstance(down, AxisTuning)
+    tuning = {"down": replace(down, **Noise(0.6, 0.5, 0.7).as_fields("sigma_z_m"))}
+    assert remedies.height_noise_advice(sample, tuning, 0.1) == ""
+    flags = sample.flight.ekf2.fusion_flags.assign(vertical=1.0)
+    ekf2 = replace(sample.flight.ekf2, fusion_flags=flags)
+    fused = replace(sample, flight=replace(sample.flight, ekf2=ekf2))
+    advice = remedies.height_noise_advice(fused, tuning, 0.1)
+    assert "height noise is 0.6 m. Report a variance of 0.36 m² for z" in advice
+    assert remedies.height_noise_advice(fused, tuning, 0.4) == ""

@@ -21,13 +21,6 @@ QUOTATIONS = {
 }
 # Lines that quote a phrase, by a part of the line
 EXCEPTIONS = {
-    'ours = "kf"': "value of older answer forms, which are still read",
-    'overstated = "underconfident"': "as above",
-    'understated = "overconfident"': "as above",
-    '"coasted, then reset"': "as above",
-    '"trusted the positions too little"': "as above",
-    '"error to truth"': "as above",
-    '"correct the stamps at the sender"': "as above",
     "time,timestamp,stamp": "column names of position files",
     'stamp = "usec"': "field of a table of MAVLink messages",
     "``stamp`` the": "the same field in its docstring",

@@ -36,6 +36,7 @@ from forgery import (
     set_value,
     text,
     to_dict,
+    verify_with,
     with_results,
 )
 from pypdf import PdfReader, PdfWriter
@@ -94,9 +95,7 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> VerifiedReport:
 
 def test_verify_unchanged_example_report_returns_verified(aisle: VerifiedReport) -> None:
     shipped = REPORT.read_bytes()
-    verdict = verify(
-        read_attached_results(shipped), shipped, aisle.files, recompute=aisle.recompute
-    )
+    verdict = verify_with(shipped, aisle.files, aisle.recompute)
     assert verdict.status == "verified", verdict
     assert verdict.with_log
     assert verdict.page_status == "same"
@@ -154,16 +153,12 @@ def test_verify_accepts_report_of_other_operating_system(
     drawn = move_lines(one.pdf, 0.01)
     scaled_results = read_again(scaled(json.loads(to_json(one.again[0])), -1e-9))
     elsewhere = (scaled_results, lambda: drawn)
-    verdict = verify(
-        read_attached_results(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere
-    )
+    verdict = verify_with(one.pdf, one.files, lambda *_: elsewhere)
     assert verdict.outcome == "verified", verdict
     assert f"within {RELATIVE_TOLERANCE:g}" in verdict.reasons[0]
     aside = move_lines(one.pdf, 0.6)
     elsewhere = (one.again[0], lambda: aside)
-    verdict = verify(
-        read_attached_results(one.pdf), one.pdf, one.files, recompute=lambda *_: elsewhere
-    )
+    verdict = verify_with(one.pdf, one.files, lambda *_: elsewhere)
     assert (verdict.status, verdict.outcome) == ("verified", "page differs")
     assert verdict.redrawn_pdf == aside
 
@@ -172,9 +167,7 @@ def test_verify_accepts_numbers_that_differ_by_1e_12(aisle: VerifiedReport) -> N
     """Other kernels of OpenBLAS change results of the sample flights by 3e-8 at most."""
     scaled_results = read_again(scaled(json.loads(to_json(aisle.again[0])), -1e-12))
     elsewhere = (scaled_results, lambda: forged(aisle.pdf))
-    verdict = verify(
-        read_attached_results(aisle.pdf), aisle.pdf, aisle.files, recompute=lambda *_: elsewhere
-    )
+    verdict = verify_with(aisle.pdf, aisle.files, lambda *_: elsewhere)
     assert verdict.outcome == "verified", verdict
 
 
@@ -335,7 +328,7 @@ def test_verify_report_with_changed_student_name_is_not_verified(
     set_value({"name": "Eve", "notes": "I flew it."}.get(path[-1], "9.9.9"), *path)(results)
     again = verification.recompute(read_again(results), loop.files)
     pdf = loop.with_results(results)
-    verdict = verify(read_attached_results(pdf), pdf, loop.files, recompute=lambda *_: again)
+    verdict = verify_with(pdf, loop.files, lambda *_: again)
     assert verdict.outcome != "verified", verdict
     assert verdict.differences == ()
     assert verdict.redrawn_pdf != loop.pdf

@@ -185,7 +185,7 @@ def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: 
         whole, time_s=whole.time_s[:count], step_s=whole.step_s[: count - 1],
         body_to_ned=whole.body_to_ned[:count], correction_rad=whole.correction_rad[: count - 1],
         force_m_s2=whole.force_m_s2[: count - 1], down_m=whole.down_m[:count], field=None,
-        heights=None, state=whole.state[:15], variance=whole.variance[:15],
+        height_samples=None, state=whole.state[:15], variance=whole.variance[:15],
         clipped_fraction=None, is_acceleration_bad=None,
         state_correlation=np.eye(15), attitude_variance_rad2=unknown,
         down_variance_m2=unknown[:, 0],

@@ -154,11 +154,12 @@ def align_position_file(
         raise MissingDataError(
             f"{recording.name}: {error.reason}; {spans_text}", f"{error.remedy}."
         ) from None
-    frame_reason = "the column names of the position file contain the axis directions"
-    if recording.format:
-        frame_reason = f"files of the format {recording.format} have this frame"
     if frame:
         frame_reason = "the frame was given with --position-frame"
+    elif recording.format:
+        frame_reason = f"files of the format {recording.format} have this frame"
+    else:
+        frame_reason = "the column names of the position file contain the axis directions"
     yaw_reason = "the yaw was given with --position-yaw"
     if yaw_deg is None:
         yaw_reason = "the position file is assumed to have the yaw of EKF2's frame"

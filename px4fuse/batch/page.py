@@ -122,16 +122,16 @@ def _log_cells(log: LogSummary) -> tuple[Cell, ...]:
     css_style = "command" if action.startswith(("px4fuse ", "param ")) else ""
     return (
         Cell(SEVERITY_SIGNS[severity], SEVERITIES.index(severity), style_class=f"sign {severity}"),
-        Cell(log["name"], log["name"], log.get("changed", "")),
-        Cell(log["headline"], log["headline"], action, style_class=css_style),
+        Cell(log["name"], below=log.get("changed", "")),
+        Cell(log["headline"], below=action, style_class=css_style),
         *(
             _ratio_cell(log.get(f"{name}_ratio"), name, verdict)
             for name, verdict in zip(SIGMA_RATIO_COLUMNS, log["verdict_texts"], strict=True)
         ),
         frame.number_cell(log.get("difference_rms_m"), format_metres),
-        frame.text_cell(log.get("date", "")[:10]),
-        frame.text_cell(log.get("vehicle", "")),
-        frame.text_cell(log.get("firmware", "")),
+        Cell(log.get("date", "")[:10]),
+        Cell(log.get("vehicle", "")),
+        Cell(log.get("firmware", "")),
         frame.number_cell(log.get("sigma_z_m"), format_number),
         frame.number_cell(log.get("clock_offset_s"), format_number),
         Cell()
@@ -185,9 +185,7 @@ def _log_details(log: LogSummary) -> tuple[Section, ...]:
             "Findings",
             [f"{finding_title(finding_id)} ({finding_id})" for finding_id in log["findings"]],
         ),
-        frame.table_section(
-            "Axes", column_titles if value_rows else (), value_rows, range(1, len(column_titles))
-        ),
+        frame.table_section("Axes", value_rows, column_titles, range(1, len(column_titles))),
     )
 
 

@@ -4,7 +4,7 @@ import csv
 import shlex
 from collections.abc import Iterable, Mapping
 from functools import reduce
-from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -26,7 +26,7 @@ _NOISE_ESTIMATE_BY_AXIS = {"north": "horizontal", "east": "horizontal"}
 
 def read_rows(name: str) -> list[dict[str, str]]:
     """Read a CSV file of the package px4fuse.batch as dicts by column title."""
-    with files("px4fuse.batch").joinpath(name).open(encoding="utf-8") as file:
+    with Path(__file__).with_name(name).open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 

@@ -289,12 +289,10 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
     rows_by_hash = {cached_rows.sha256: cached_rows.rows for cached_rows in load_cached_rows(state)}
 
     def rows_of_log(log: LogAddress) -> Iterable[Row]:
-        if log.address not in state.hash_by_address:
-            return (
-                [state.failed_row_by_address[log.address]]
-                if log.address in state.failed_row_by_address
-                else []
-            )
+        if log.address in state.failed_row_by_address:
+            return [state.failed_row_by_address[log.address]]
+        if log.address not in state.hash_by_address:  # the run was interrupted
+            return []
         sha256 = state.hash_by_address[log.address]
         first_log = state.first_log_by_hash[sha256]
         if first_log is log and sha256 in rows_by_hash:

@@ -78,6 +78,10 @@ HEADING_ERROR_EXPLANATION = (
     "KF and EKF2 rotate the measured acceleration by the wrong heading. Each measurement corrects "
     "the position, so innovations show little of the position error."
 )
+OUTLIER_EXPLANATION = (
+    "The mean NIS of EKF2 includes the outliers that EKF2's gate rejects. They do not affect the "
+    "position."
+)
 UNEXPLAINED_DIFFERENCE = (
     "The verdicts against source and ground truth differ, and no tested change explains it."
 )
@@ -496,20 +500,7 @@ def _explain_differing_verdicts(
     has_heading_error = "ekf2_heading_error" in finding_ids
     explanation = HEADING_ERROR_EXPLANATION if has_heading_error else UNEXPLAINED_DIFFERENCE
     rejects_outliers = "source_outliers" in finding_ids and "ekf2" in differing_filters
-    return _gate_sentence(analysis) if rejects_outliers else explanation
-
-
-def _gate_sentence(analysis: Analysis) -> str:
-    innovations = analysis.main.ekf2_innovations
-    assert not isinstance(innovations, Unavailable)  # the caller has checked this
-    is_rejected = innovations["rejected"] > 0.0
-    accepted = innovations[~is_rejected]
-    nis = float((accepted["innovation_m"] ** 2 / accepted["innovation_variance_m2"]).mean())
-    return (
-        f"EKF2's gate rejected {int(is_rejected.sum())} of {len(innovations)} positions. The mean "
-        "NIS of EKF2 includes the rejected positions. Without them, the RMS of EKF2's "
-        f"innovation ÷ √S is {format_ratio(math.sqrt(nis))}."
-    )
+    return OUTLIER_EXPLANATION if rejects_outliers else explanation
 
 
 def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> str:

@@ -228,7 +228,11 @@ def _make_actions(
         ):
             default_trial = trial_by_change.get(("kf", "defaults")) if kind == "noises" else None
             default_settings = default_trial.change if default_trial else {}
-            actions.append(make_rerun_action(request, trial.change, default_settings))
+            change, alignment = trial.change, analysis.source.alignment
+            if CLOCK_OFFSET in change and alignment:  # the option replaces that of the alignment
+                total_s = change[CLOCK_OFFSET] + alignment.clock_offset_s
+                change = {**change, CLOCK_OFFSET: round(total_s, 3)}
+            actions.append(make_rerun_action(request, change, default_settings))
         elif filter_name == "ekf2" and kind != "delay":
             changes = {name: value for name, value in trial.change.items() if name in PARAMETERS}
             actions += [make_parameter_action(analysis, changes)] if changes else []

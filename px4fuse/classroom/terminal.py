@@ -58,8 +58,8 @@ def grading_page(outcome: GradeOutcome) -> Page:
         points_text = "–" if grade.total is None else f"{grade.total:g}"
         points_text += f" / {grade.max_points:g}"
         name = one_line(grade.student or grade.student_id, 60)
-        file_name, flag_count = report.submission if report else "", f"{len(grade.flags) or ''}"
-        rows.append((name, file_name, (status, status_colour), points_text, flag_count))
+        flag_count = f"{len(grade.flags) or ''}"
+        rows.append((name, grade.file_name, (status, status_colour), points_text, flag_count))
     page.table(
         ("student", "submission", "status", "points", "flags"), rows, right_aligned_columns=(3, 4)
     )

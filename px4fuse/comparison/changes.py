@@ -108,10 +108,10 @@ def candidate_changes(
 def main_axis_changes(
     comparison: Comparison, estimates: Estimates, ekf2_inputs: Inputs | None
 ) -> list[Change]:
-    """Return the changes to test along the main axis, where more changes are tested.
+    """Return the changes to test along the main axis: :func:`candidate_changes` and more.
 
-    In addition, KF is re-run with both noises changed and with its default noises, and EKF2 with
-    shifted timestamps if its delay parameter is wrong.
+    KF is also tested with both noises changed and with its default noises, EKF2 also with shifted
+    timestamps if its delay parameter is wrong.
     """
     changes = unique_changes(
         change

@@ -26,26 +26,25 @@ NEIGHBOURS = np.array([-2, -1, 1, 2])
 # Maximum time from the first to the last neighbour of a position, in median intervals: cubic
 # interpolation across a gap is inaccurate
 MAX_NEIGHBOUR_SPAN = 8.0
-# Residuals are not used if the interpolation increases their σ to more than this multiple of the σ
-# of a position
+# Maximum ratio of the σ of a residual to the σ of a position; a larger residual σ is due to the
+# interpolation
 MAX_RESIDUAL_NOISE_GAIN = 4.0
-# Number of timestamps in the running median, which removes missing positions but not jitter
+# Number of timestamps in a running median that follows missing positions, but not jitter
 MEDIAN_TIMESTAMP_COUNT = 9
 # Half of the time (s) over which the velocity is averaged
 HALF_VELOCITY_S = 0.3
-# Number of residuals for each independent residual: successive residuals have common neighbours
+# Ratio of all residuals to independent residuals: successive residuals have common neighbours
 SHARED_RESIDUALS = 3
 # Minimum timestamp jitter (s, 1 σ): an error of 1 cm at 1 m/s
 MIN_JITTER_S = 0.008
-# Jitter is confirmed if the ratio of position residuals to timestamp residual · velocity is in this
-# range
+# Jitter is confirmed if position residual / (timestamp residual · velocity) is in this range
 JITTER_RATIOS = 0.6, 1.5
 # Minimum ratio of the errors due to jitter to all white errors (RMS) to report jitter
 MIN_JITTER_FRACTION = 0.4
 # Minimum significance (σ) of jitter, and of noise that increases with speed
 MIN_PATTERN_SIGMAS = 6.0
-# Number of flight parts in each of which the increase of noise with speed is tested, and minimum
-# median of its significance (σ)
+# The increase of noise with speed is tested in PART_COUNT flight parts. MIN_PART_SIGMAS is the
+# minimum median of its significance (σ)
 PART_COUNT, MIN_PART_SIGMAS = 5, 1.2
 # Quantiles of the speed: below the first, the vehicle is slow; above the second, it is fast
 SLOW_FRACTION, FAST_FRACTION = 0.3, 0.7
@@ -62,12 +61,14 @@ OFFSET_PART_S = 4.0
 MIN_OFFSET_SPEED_M_S = 0.3
 # Minimum range (s) of a varying time offset to report it: a position error of 8 cm at 1 m/s
 MIN_OFFSET_RANGE_S = 0.08
-# Minimum ratio of the mean square slow error to the variance of white noise: otherwise the time
-# offsets of many flight parts would only fit noise
+# Minimum ratio of the mean square error beyond white noise to the variance of white noise: with
+# less, the time offsets of many flight parts would only fit noise
 MIN_SLOW_RATIO = 0.25
-# Varying time offsets explain the slow error if at most this fraction of its mean square remains
+# Varying time offsets explain the error beyond white noise if at most this fraction of its mean
+# square remains
 MAX_REMAINING_FRACTION = 0.2
-# A sinusoidal error is reported if it explains at least this fraction of the mean square slow error
+# A sinusoidal error is reported if it explains at least this fraction of the mean square error
+# beyond white noise
 MIN_PERIODIC_FRACTION = 0.88
 # Minimum ratio of the amplitude of a sinusoidal error to the σ of white noise
 MIN_AMPLITUDE_SIGMAS = 1.0
@@ -90,7 +91,7 @@ MIN_ATTITUDE_DELAY_S = 0.04
 MAX_ROTATIONS = 20_000
 # Time (s) over which a rotation from attitude is compared with the rotation from gyroscopes
 ROTATION_STEP_S = 0.1
-# Larger differences (rad) of these rotations are due to resets of the attitude
+# Maximum difference (rad) of both rotations; larger ones are due to resets of the attitude
 MAX_ROTATION_RAD = 0.2
 # A delay of the attitude is reported if its correction reduces the mean square rotation difference
 # to less than this fraction
@@ -147,7 +148,7 @@ class ErrorFit(NamedTuple):
 
 
 class PeriodicError(NamedTuple):
-    """Sinusoidal position error; it explains ``fraction`` of the mean square slow error."""
+    """Sinusoidal position error; ``fraction``: part of the mean square error beyond white noise."""
 
     period_s: float
     amplitude_m: float
@@ -252,12 +253,16 @@ def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
     speed_m_s = errors.ekf2_speed_m_s
     if speed_m_s is None:
         return None
-    sizes_m = np.linalg.norm(errors.residual_m, axis=1)
+    residual_norms_m = np.linalg.norm(errors.residual_m, axis=1)
     # If the noise is only larger in one part of the flight, few parts show a correlation with speed
     significances = [
-        rank_correlation(sizes_m[part], speed_m_s[part]) * np.sqrt(len(part) / SHARED_RESIDUALS)
-        for part in (np.arange(len(sizes_m)), *np.array_split(np.arange(len(sizes_m)), PART_COUNT))
-        if np.ptp(sizes_m[part]) and np.ptp(speed_m_s[part])
+        rank_correlation(residual_norms_m[part], speed_m_s[part])
+        * np.sqrt(len(part) / SHARED_RESIDUALS)
+        for part in (
+            np.arange(len(residual_norms_m)),
+            *np.array_split(np.arange(len(residual_norms_m)), PART_COUNT),
+        )
+        if np.ptp(residual_norms_m[part]) and np.ptp(speed_m_s[part])
     ]
     if (
         len(significances) <= PART_COUNT
@@ -277,12 +282,12 @@ def find_speed_noise(errors: WhiteErrors) -> SpeedNoise | None:
         for part_m in (along_m, across_m)
     ):
         return None
-    noises_m = (
+    slow_and_fast_m = (
         SIGMA_PER_MEDIAN * float(np.median(np.abs(errors.residual_m[rows])))
         for rows in (is_slow, is_fast)
     )
-    speeds_m_s = (float(np.median(speed_m_s[rows])) for rows in (is_slow, is_fast))
-    noise = SpeedNoise(*noises_m, *speeds_m_s)
+    slow_and_fast_m_s = (float(np.median(speed_m_s[rows])) for rows in (is_slow, is_fast))
+    noise = SpeedNoise(*slow_and_fast_m, *slow_and_fast_m_s)
     is_relevant = noise.fast_m_s >= MIN_FAST_M_S and noise.fast_m >= MIN_FAST_NOISE_M
     return noise if is_relevant else None
 
@@ -347,7 +352,7 @@ def _least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
 
 
 def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
-    """Find a sinusoidal error that explains most of the slow error.
+    """Find a sinusoidal error that explains most of the error beyond white noise.
 
     Return None without such an error, or if the motion contains its frequency.
     """
@@ -386,7 +391,7 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
 
 
 def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
-    """Return the range of the time offset in flight if its variation explains the slow error.
+    """Return the range of the time offset in flight if it explains the error beyond white noise.
 
     The time offsets of all flight parts and the parameters of :class:`ErrorFit` are fitted
     together. A time offset causes no error at rest, so it does not explain a jump or drift.
@@ -454,8 +459,8 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
         )
         differences_rad -= np.median(differences_rad, axis=0)  # the gyroscope bias
         # Each difference is limited, because resets of the attitude cause large differences
-        sizes_rad = np.minimum(np.linalg.norm(differences_rad, axis=1), MAX_ROTATION_RAD)
-        return float(np.mean(sizes_rad**2))
+        difference_norms_rad = np.minimum(np.linalg.norm(differences_rad, axis=1), MAX_ROTATION_RAD)
+        return float(np.mean(difference_norms_rad**2))
 
     delays_s = np.arange(-MAX_ATTITUDE_DELAY_S, MAX_ATTITUDE_DELAY_S, 2.0 * DELAY_STEP_S)
     delay_s = float(min(delays_s, key=difference))

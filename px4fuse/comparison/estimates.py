@@ -87,7 +87,7 @@ def ignore_progress(_: str) -> None:
 
 
 def first_axis_tuning(tuning: Tuning, *names: str) -> AxisTuning | None:
-    """Return the noise estimate of the first of the named axes that has one."""
+    """Return the noise estimate of the first axis in ``names`` that has an estimate."""
     axis_tunings = map(tuning.get, names)
     return next(
         (axis_tuning for axis_tuning in axis_tunings if isinstance(axis_tuning, AxisTuning)), None
@@ -95,7 +95,7 @@ def first_axis_tuning(tuning: Tuning, *names: str) -> AxisTuning | None:
 
 
 def value_or_bound(noise: Noise, fallback: float) -> float:
-    """Return the estimate of a noise. Without estimate, its upper bound, or else ``fallback``."""
+    """Return the estimate of a noise, else its upper bound, else ``fallback``."""
     return noise.value or noise.high or fallback
 
 

@@ -20,7 +20,7 @@ MIN_PART_MEASUREMENTS = 25
 
 
 class NoisyPart(NamedTuple):
-    """Time span (s) with larger innovations than the rest of the flight; ratio of both σ."""
+    """Time span (s) with larger innovations than the rest of the flight, and ratio of their σ."""
 
     start_s: float
     end_s: float

@@ -85,7 +85,7 @@ def prepare(
     if convention is not None and settings.clock_offset_s:  # the user chose the time offset
         convention = structs.replace(convention, late_s=0.0)
     late_s = convention_faults(convention, flight, source_track.frame).late_s
-    # The offset is clipped to its valid range; the estimate of a larger offset is at its limit
+    # A time offset outside the valid range is set to the limit of the range
     limits_s = SETTING_RANGES["clock_offset_s"][:2]
     clock_offset_s = float(np.clip(settings.clock_offset_s - late_s, *limits_s))
     settings = replace(settings, clock_offset_s=clock_offset_s)
@@ -241,7 +241,7 @@ def _use_barometer_height(
 
     The zero of a barometer is arbitrary, so its median difference to EKF2's height is removed.
     """
-    ekf2, heights, log_name = flight.ekf2, flight.barometer, flight.log.name
+    ekf2, barometer_heights, log_name = flight.ekf2, flight.barometer, flight.log.name
     if height_sensor and not track.origin.fused_as_gnss:
         raise SettingsError(
             f"{log_name}: `height` needs GNSS as position source, not {track.name}."
@@ -252,22 +252,25 @@ def _use_barometer_height(
     uses_barometer = height_sensor == "barometer" or (
         height_sensor is None and track.origin.fused_as_gnss and is_fused_by_ekf2
     )
-    if not uses_barometer or heights is None:
+    if not uses_barometer or barometer_heights is None:
         if height_sensor == "barometer":
             raise MissingDataError(f"{log_name}: no barometer height in the log.", GNSS.to_log)
         return track
-    zero_height_down_m, zero_text = heights["down_m"].iloc[0], "the first barometer height"
+    zero_height_down_m, zero_text = (
+        barometer_heights["down_m"].iloc[0],
+        "the first barometer height",
+    )
     if isinstance(ekf2, Ekf2):
         ekf2_down_m = np.interp(
-            heights.index, ekf2.state.index, ekf2.state["down_m"], np.nan, np.nan
+            barometer_heights.index, ekf2.state.index, ekf2.state["down_m"], np.nan, np.nan
         )
         if np.isfinite(ekf2_down_m).any():
-            zero_height_down_m = float(np.nanmedian(heights["down_m"] - ekf2_down_m))
+            zero_height_down_m = float(np.nanmedian(barometer_heights["down_m"] - ekf2_down_m))
         zero_text = "that of EKF2 (median difference removed)"
     height_note = f"heights are from the barometer; height 0 is {zero_text}"
     return replace(
         track,
-        barometer=heights - zero_height_down_m,
+        barometer=barometer_heights - zero_height_down_m,
         description=f"{track.description}, barometer height",
         notes=(*track.notes, height_note),
     )

@@ -97,7 +97,7 @@ def continuous_state(
 def _states_without_resets(
     published: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
-    """Yield EKF2's position without resets, for each of its origins before and after a reset."""
+    """Yield EKF2's position without resets, once for each origin before and after a reset."""
     reset_m = np.array([reset.delta for reset in resets])[:, axes]
     is_after = np.array([published.index >= reset.time_s for reset in resets]).T
     for earlier_count in range(len(resets) + 1):

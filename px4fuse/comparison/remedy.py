@@ -13,7 +13,7 @@ from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.replay import rows_inside
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import MIN_OFFSET_S, MIN_OFFSET_SIGMAS, ClockOffset
-from px4fuse.filter.tuning import HORIZONTAL, Noise
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, PARAMETERS, Aid
 from px4fuse.flight.model import Unavailable
 
@@ -23,6 +23,10 @@ GNSS_DELAYS_MS = (0.0, 150.0, 300.0)
 TRANSMISSION_MS = 30.0
 # EKF2_DELAY_MAX is rounded up to a multiple of this value (ms)
 DELAY_MAX_STEP_MS = 50.0
+# Minimum fraction of the time in which EKF2 fuses heights, to report that their noise is different
+MIN_HEIGHT_FUSED_FRACTION = 0.5
+# Minimum ratio of height noise to horizontal noise that one parameter does not fit
+MIN_HEIGHT_NOISE_RATIO = 2.0
 
 
 def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
@@ -213,6 +217,27 @@ def noise_used_m(ekf2_inputs: Inputs) -> float:
 
 def _reported_noise_m(ekf2_inputs: Inputs) -> float:
     return float(np.sqrt(np.median(ekf2_inputs.received.variance_m2[:, :2])))
+
+
+def height_noise_advice(comparison: PreparedComparison, tuning: Tuning, noise_m: float) -> str:
+    """Return an action if EKF2 fuses heights of another noise with the parameter for ``noise_m``.
+
+    EKF2 has one noise parameter for the horizontal position and the height of external vision.
+    """
+    ekf2, down = comparison.flight.ekf2, tuning.get("down")
+    if isinstance(ekf2, Unavailable) or isinstance(ekf2.fusion_flags, Unavailable):
+        return ""
+    if not isinstance(down, AxisTuning) or not comparison.source.origin.is_vision:
+        return ""
+    height_noise_m = down.sigma_z.value or 0.0
+    is_fused = ekf2.fusion_flags["vertical"].mean() > MIN_HEIGHT_FUSED_FRACTION
+    if not is_fused or height_noise_m < MIN_HEIGHT_NOISE_RATIO * noise_m:
+        return ""
+    return (
+        " EKF2 fuses the height with the same parameter, but the height noise is "
+        f"{height_noise_m:.2g} m. Report a variance of {height_noise_m**2:.2g} m² for z, and set "
+        f"{EV_POS.noise_mode} to 0."
+    )
 
 
 def different_settings(

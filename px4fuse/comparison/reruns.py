@@ -133,16 +133,16 @@ class Reruns:
 class _Filter(NamedTuple):
     """KF or EKF2, and a function that re-runs the filter with a change.
 
-    ``model`` is the EKF2 model; None for KF.
+    ``ekf2_model`` is None for KF.
     """
 
     name: FilterName
     rerun: Callable[[AxisComparison, Change], RunStatistics]
-    model: Model | None = None
+    ekf2_model: Model | None = None
 
     @property
     def ekf2_inputs(self) -> Inputs | None:
-        return None if self.model is None else self.model.inputs
+        return None if self.ekf2_model is None else self.ekf2_model.inputs
 
 
 def rerun_filters(
@@ -252,8 +252,8 @@ def _try_changes(
             is_logged=is_logged,
             after=after,
             from_s=None
-            if tested_filter.model is None
-            else tested_filter.model.baseline_replay.find_evaluated_spans()[0][0],
+            if tested_filter.ekf2_model is None
+            else tested_filter.ekf2_model.baseline_replay.find_evaluated_spans()[0][0],
         )
 
     trials = [make_trial(change, discrepancies) for change, discrepancies in changes]
@@ -271,12 +271,12 @@ def _unchanged_statistics(
 ) -> tuple[RunStatistics, bool]:
     """Return the statistics of a filter without change, and True if they are from the log."""
     replayed_statistics, logged_state = tested_filter.rerun(axis_result, {}), axis_result.ekf2_state
-    if tested_filter.model is None:
+    if tested_filter.ekf2_model is None:
         return replayed_statistics, True
     innovations = axis_result.ekf2_innovations
     if isinstance(logged_state, Unavailable) or isinstance(innovations, Unavailable):
         return replayed_statistics, False
-    compared_s = tested_filter.model.baseline_replay.find_evaluated_spans()
+    compared_s = tested_filter.ekf2_model.baseline_replay.find_evaluated_spans()
     compared_state = rows_inside(logged_state, compared_s)
     innovations = rows_inside(innovations, compared_s)
     rejected_flags = innovations["rejected"].dropna()

@@ -24,11 +24,11 @@ Improvement = Literal["position and σ", "position", "σ only", "nothing"]
 MIN_REPORTED_NEES = 4.0
 # Maximum mean NEES of a re-run with a smaller noise, if the mean NEES is above 1 before
 MAX_NEES_AFTER_CHANGE = 2.0
-# Maximum difference of explained_fraction from 1 for which a change is a cause
+# A change is a cause if |explained_fraction - 1| is at most this value
 CAUSE_TOLERANCE = 0.5
-# Maximum difference of explained_fraction from 1 for which a sensor fault is the only cause
+# A sensor fault is the only cause if |explained_fraction - 1| is at most this value
 SENSOR_CAUSE_TOLERANCE = 0.25
-# Maximum difference of explained_fraction from 1 for which changes are combined in one re-run
+# Changes are combined in one re-run if |explained_fraction - 1| is below this value for each
 COMBINED_CAUSE_TOLERANCE = 0.9
 # Keys of Trial.change that correct a sensor fault instead of a setting
 SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))

@@ -238,12 +238,12 @@ def motion_from_imu(inertial_data: InertialData, attitude: Array) -> ImuMotion:
     acceleration = body_to_ned @ inertial_data.force_m_s2[..., None] + [[0.0], [0.0], [constants.g]]
     table = np.concatenate([acceleration, body_to_ned], axis=2)
     position_m = np.zeros((len(attitude), 3, 4))
-    velocity_m_s = np.cumsum(table, axis=0) * INTEGRATION_STEP_S
-    np.cumsum(
-        (velocity_m_s - table * (INTEGRATION_STEP_S / 2.0)) * INTEGRATION_STEP_S,
-        axis=0,
-        out=position_m[1:],
-    )
+    # displacement of each step from the mean velocity, in place to limit memory
+    displacement_m = np.cumsum(table, axis=0)
+    table /= 2.0
+    displacement_m -= table
+    displacement_m *= INTEGRATION_STEP_S**2
+    np.cumsum(displacement_m, axis=0, out=position_m[1:])
     window_steps = round(DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S)
     stride = round(GRID_INTERVAL_S / INTEGRATION_STEP_S)
     second_differences = second_difference(position_m, window_steps)[::stride]

@@ -1,5 +1,7 @@
 """Array types for annotations, and integration over time."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
@@ -10,6 +12,14 @@ Complex = NDArray[np.complex128]
 ArrayPair = tuple[Array, Array]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
+
+# Maximum number of rows of a block
+BLOCK_ROWS = 2**14
+
+
+def row_blocks(count: int) -> Iterator[slice]:
+    """Yield slices of at most BLOCK_ROWS rows, so that temporary arrays need little memory."""
+    return (slice(first, first + BLOCK_ROWS) for first in range(0, count, BLOCK_ROWS))
 
 
 def median_interval(time_s: Array) -> float:

@@ -11,8 +11,8 @@ MAX_CELL_LENGTH = 32_000
 def neutralise_formulas(text: str) -> str:
     r"""Escape text so that a spreadsheet does not execute it as a formula (OWASP, CSV injection).
 
-    >>> [neutralise_formulas(text) for text in ("=1+1", " \uff0b1", "a;=1+1", "3 - 2")]
-    ["'=1+1", "' ＋1", "a;'=1+1", '3 - 2']
+    >>> [neutralise_formulas(text) for text in ("=1+1", " \uff0b1", "a;=1+1", "3 - 2", "-17")]
+    ["'=1+1", "' ＋1", "a;'=1+1", '3 - 2', '-17']
     """
     # with some regional settings, Excel splits cells at semicolons, even inside quotes
     cells = (f"'{cell}" if _is_formula(cell) else cell for cell in text.split(";"))
@@ -20,17 +20,10 @@ def neutralise_formulas(text: str) -> str:
     return safe_text if len(safe_text) <= MAX_CELL_LENGTH else safe_text[:MAX_CELL_LENGTH] + "…"
 
 
-def neutralise_id(text: str) -> str:
-    """Escape an id only if a spreadsheet could execute it as a formula.
-
-    >>> neutralise_id("0042"), neutralise_id("-17"), neutralise_id("a.b@c.de"), neutralise_id("=1")
-    ('0042', '-17', 'a.b@c.de', "'=1")
-    """
-    return text if re.fullmatch(r"[+-]\d+|\w[\w.@+-]*", text) else neutralise_formulas(text)
-
-
 def _is_formula(text: str) -> bool:
     """Return True if the first visible character (without quotes) can begin a formula."""
+    if re.fullmatch(r"[+-][0-9]+", text):  # a student id
+        return False
     if text.startswith(("\t", "\r")):
         return True
     for character in text:

@@ -35,24 +35,23 @@ MIN_BIAS_IN_SIGMA = 0.2
 CHANGE_WINDOW_S = 10.0
 # Minimum number of innovations in a window for a mean normalised innovation
 MIN_WINDOW_SAMPLES = 5
-# Minimum number of windows before a change of the mean normalised innovation
+# Minimum number of windows (CHANGE_WINDOW_S) before a change of the mean normalised innovation
 MIN_WINDOWS_BEFORE = 2
 # Minimum change (√S) of the mean normalised innovation
 MIN_CHANGE_IN_SIGMA = 0.5
-# Minimum ratio of a change of the mean innovation to the standard deviation of the window means
-# before it
+# Minimum |change of the mean innovation| / σ of the window means before the change
 MIN_CHANGE_SCATTER_RATIO = 6.0
-# Maximum time (s) without a fused sample of an enabled aiding source. EKF2 resets its state to the
-# source after 7 s (reset_timeout_max)
+# Maximum time (s) for which EKF2 fuses no sample of an enabled aiding source. After 7 s, EKF2
+# resets its state to the source (reset_timeout_max)
 MAX_NOT_FUSED_S = 5.0
-# Maximum number of logging intervals without a fused sample of an enabled aiding source
+# Maximum time for which EKF2 fuses no sample of an enabled aiding source, in logging intervals
 MAX_NOT_FUSED_INTERVALS = 10.0
-# Maximum relative difference between √R and the noise parameter from which R is computed
+# Maximum |√R / noise parameter - 1| if EKF2 computes R from this parameter
 NOISE_TOLERANCE = 0.02
 # Aiding sources are evaluated above this height (m): near the ground, rotor downwash disturbs the
 # barometer
 MIN_HEIGHT_M = 2.0
-# Number of barometer samples in the running median of the height
+# Window length (barometer samples) of the running median of the height
 HEIGHT_MEDIAN_SAMPLES = 11
 
 
@@ -163,7 +162,7 @@ def flight_span(flight: Flight) -> Span | Unavailable:
 
 
 def evaluate_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
-    """Evaluate all logged aiding sources of EKF2 in flight; the keys are PX4's names."""
+    """Evaluate all logged aiding sources of EKF2 in flight; keys: PX4's source names."""
     if isinstance(flight.ekf2, Unavailable):
         return flight.ekf2
     if not flight.ekf2.aids:
@@ -263,8 +262,8 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
 def _largest_mean_change(time_s: Array, normalised_innovations: Array) -> Span | None:
     """Return time (s) and size (√S) of the largest change of the mean; None if not significant.
 
-    For each window of CHANGE_WINDOW_S, the mean before it is compared with the mean of the two
-    windows after it. The change starts in this window if its mean shows a third of the change.
+    Each window of CHANGE_WINDOW_S is tested: change = mean of the next two windows - mean before
+    the window. The change starts in the window if its mean contains a third of the change.
     """
     window_index = np.floor((time_s - time_s[0]) / CHANGE_WINDOW_S)
     windows = pd.Series(normalised_innovations).groupby(window_index).agg(["mean", "size"])
@@ -302,7 +301,7 @@ def _effective_gate(aid: Aid, aid_log: AidLog) -> float:
 
 
 def _noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
-    """Return the parameter from which R is computed, or another origin, like reported accuracy."""
+    """Return the parameter that determines R, or another origin, such as "reported accuracy"."""
     parameter_value = aid_log.parameters.get(aid.noise)
     if noise_sigma is None or parameter_value is None:
         return "" if noise_sigma is None else aid.noise_origin

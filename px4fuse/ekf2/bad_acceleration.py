@@ -1,4 +1,4 @@
-"""EKF2's flag for a bad vertical acceleration (``fs_bad_acc_vertical``), from innovations.
+"""Model of EKF2's flag for a bad vertical acceleration (``fs_bad_acc_vertical``).
 
 EKF2 sets the flag if barometer and GNSS both measure a larger height than the state, one of them by
 more than 3 √S, the other by more than √S. While the flag is set, the accelerometer noise is
@@ -30,7 +30,7 @@ class BadAcceleration:
     follows_log : ndarray of bool, shape (filters,)
         True for filter configurations that use the logged flag.
     flag_duration_s : float
-        Time for which the flag remains set after the last innovation that sets it.
+        The flag remains set for this time after the last large innovation.
     segment : ReplaySegment
         Segment with the logged flag.
 
@@ -62,8 +62,8 @@ class BadAcceleration:
     def flagged_fraction(self, begin_s: Array, end_s: Array) -> Array | None:
         """Return the fraction of an interval in which the flag is set, for each configuration.
 
-        Return None if the flag is not set. Successive calls have successive intervals. If the
-        flag is set several times in one interval, only the last time is counted.
+        Return None if the flag is not set. Each call is for the next interval. If the flag is set
+        several times in one interval, only the last time is counted.
         """
         if len(self.logged_since_s):
             last_row = np.searchsorted(self.logged_since_s, end_s) - 1

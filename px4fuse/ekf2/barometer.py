@@ -23,17 +23,15 @@ from px4fuse.flight.model import GROUND_EFFECT, Ekf2, FusionRecord
 BAROMETER_HZ = 10.0
 # Rate (Hz) at which EKF2 fuses the barometer before PX4 v1.15
 OLD_BAROMETER_HZ = 15.0
-# Maximum ratio of interquartile range to median of the barometer intervals that are computed from
-# the bias variance
+# Maximum interquartile range / median of the barometer intervals computed from the bias variance
 MAX_INTERVAL_SCATTER = 0.1
-# Two logged times belong to one barometer sample if they differ by less than this fraction of the
-# sample interval
+# Two logged times belong to one barometer sample if their difference / sample interval is smaller
 MATCH_TOLERANCE = 0.3
 # Maximum number of barometer samples that are reconstructed between two rows of the log
 MAX_SAMPLES_PER_ROW = 30
-# Maximum weight of a barometer sample that represents missing samples before and after it
+# Maximum weight of a barometer sample; a weight above 1 represents missing samples around it
 MAX_SAMPLE_WEIGHT = 4.0
-# Minimum sum of weights of missing barometer samples, to avoid a division by zero
+# Minimum sum of the weights of missing barometer samples; prevents a division by zero
 MIN_WEIGHT_SUM = 1e-9
 
 
@@ -71,8 +69,8 @@ def fused_samples(
 ) -> pd.DataFrame:
     """Return the barometer samples that EKF2 fused, indexed by EKF2's measurement time.
 
-    Columns: ``down_m`` (height), and ``weight``, which is above 1 if neighbouring samples are
-    missing. ``logged_down_m`` is the logged height (m, down) at measurement times.
+    Columns: ``down_m`` (height) and ``weight`` (above 1 if neighbouring samples are missing).
+    ``logged_down_m`` is the logged height (m, down) at measurement times.
     """
     interval_s = sample_interval_s(fusion_record)
     samples = _known_and_simulated_samples(ekf2, fusion_record, logged_down_m, interval_s)
@@ -127,7 +125,7 @@ def _known_and_simulated_samples(
         ) + np.interp(time_s, velocity_times_s, displacement_m)
         return np.asarray(state_m - bias_m(time_s))
 
-    # Arrays have one row for each row of the log, and a column for each sample since the row before
+    # Array rows: logged rows. Array columns: samples since the previous logged row
     span_s = np.diff(row_times_s)
     sample_count = np.maximum(np.rint(span_s / interval_s), 1.0).astype(int)
     is_regular = np.abs(span_s - sample_count * interval_s) < MATCH_TOLERANCE * interval_s
@@ -186,7 +184,7 @@ def _with_missing_innovations(
     age_samples: Array,
     filtered_m: Array,
 ) -> Array:
-    """Simulate missing innovations so that they give the logged low-pass filtered innovation.
+    """Simulate missing innovations that agree with the logged low-pass filtered innovation.
 
     Parameters
     ----------

@@ -16,11 +16,11 @@ BIAS_NOISE_DENSITY = 0.13
 MIN_BIAS_VARIANCE_M2 = 1e-8
 # Innovation gate (√S) in updates of the sensor bias
 BIAS_GATE = 3.0
-# Maximum |mean of test ratio · sign of the innovation| of a correct bias (isOffsetDetected)
+# The bias is wrong if |mean of (test ratio · sign of innovation)| is larger (isOffsetDetected)
 MAX_MEAN_SIGNED_RATIO = 0.2
-# Factor on the random walk variance of the bias if MAX_MEAN_SIGNED_RATIO is exceeded
+# Factor on the random walk variance of a wrong bias (MAX_MEAN_SIGNED_RATIO)
 RANDOM_WALK_FACTOR = 1e3
-# Time constant (s) of the low-pass filter for the test ratio with the sign of the innovation
+# Time constant (s) of the low-pass filter of (test ratio · sign of innovation)
 TEST_RATIO_FILTER_S = 10.0
 
 
@@ -47,7 +47,7 @@ class BiasEstimator:
         updates_bias: BoolArray,
         weight: Array | float = 1.0,
     ) -> tuple[Array, Array]:
-        """Update the bias with a sample; return innovation and R that the old bias corrects.
+        """Correct innovation and R of a sample with the bias, then update the bias.
 
         Parameters
         ----------

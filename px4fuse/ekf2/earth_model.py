@@ -18,7 +18,7 @@ EQUATORIAL_RADIUS_M, ECCENTRICITY = 6_378_137.0, 0.0818191908425
 
 
 def earth_rate_rad_s(fusion_record: FusionRecord) -> Array:
-    """Return EKF2's earth rotation rate (rad/s, NED, shape (3,)); 0 without a known latitude."""
+    """Return EKF2's earth rotation rate (rad/s, NED, shape (3,)); 0 if the latitude is unknown."""
     latitude_rad = np.radians(fusion_record.latitude_deg)
     return np.nan_to_num(
         EARTH_RATE_RAD_S * np.array([np.cos(latitude_rad), 0.0, -np.sin(latitude_rad)])
@@ -31,7 +31,7 @@ def ekf2_metres_per_metre(fusion_record: FusionRecord) -> tuple[float, float, fl
         return 1.0, 1.0, 1.0
     eccentricity_squared = ECCENTRICITY**2
     q = 1.0 - eccentricity_squared * np.sin(np.radians(fusion_record.latitude_deg)) ** 2
-    # PX4 uses the exponent 2.5 instead of 1.5 of an ellipsoid
+    # The exponent of an ellipsoid is 1.5; PX4 uses 2.5
     radii_m = (
         EQUATORIAL_RADIUS_M * np.array([(1.0 - eccentricity_squared) / q**2.5, q**-0.5])
         + fusion_record.altitude_m

@@ -54,7 +54,7 @@ IGNORED_VARIANCE = 1e9
 # Acceleration noise (m/s²) while EKF2 reports a bad or clipped acceleration (BADACC_BIAS_PNOISE,
 # common.h; covariance.cpp)
 BAD_ACCELERATION_NOISE = 4.9
-# Prefixes of EKF2 parameters that do not change the vertical innovations
+# EKF2 parameters with these prefixes do not change the vertical innovations
 HEIGHT_NEUTRAL_PREFIXES = (
     "EKF2_EV",
     "EKF2_MAG",
@@ -63,7 +63,7 @@ HEIGHT_NEUTRAL_PREFIXES = (
     "EKF2_GPS_P_GATE",
     "EKF2_GPS_DELAY",
 )
-# Initial σ (m/s²) of the accelerometer bias: EKF2 has estimated it on the ground
+# Initial σ (m/s²) of the accelerometer bias, which EKF2 has already estimated on the ground
 INITIAL_BIAS_SIGMA_M_S2 = 0.01
 # Factors on the GNSS velocity variance, NED: EKF2 multiplies the vertical σ by 1.5
 # (gps_control.cpp)
@@ -71,7 +71,7 @@ VELOCITY_VARIANCE_FACTORS = np.array([1.0, 1.0, 2.25])
 GRAVITY = float(GRAVITY_M_S2[2])
 # Maximum σ (m/s²) of EKF2's accelerometer bias: 0.1 g (covariance.cpp)
 MAX_BIAS_SIGMA_M_S2 = 0.1 * GRAVITY
-# Minimum accelerometer bias variance of an axis, relative to the largest of the three axes
+# Minimum accelerometer bias variance of an axis / largest variance of the three axes
 # (covariance.cpp)
 MIN_BIAS_VARIANCE_RATIO = 0.01
 # State indices of heading error and position
@@ -80,7 +80,7 @@ HEADING, NORTH, EAST, DOWN = 2, 6, 7, 8
 BIAS_NORTH, BIAS_EAST, BIAS_DOWN = 12, 13, 14
 # State indices of the measurements that are fused together, in this order
 JOINTLY_MEASURED_STATES = np.array([HEADING, DOWN, NORTH, EAST])
-# State indices of heading error and height: a slice, because an index array would copy the states
+# State indices of heading error and height (a slice, which does not copy the states)
 LOGGED_STATES = slice(HEADING, DOWN + 1, DOWN - HEADING)
 HORIZONTAL_POSITION = slice(NORTH, EAST + 1)
 # State indices of velocity and position, which a GNSS sample measures
@@ -99,9 +99,9 @@ class FilterConfiguration:
     settings : dict
         Values of all EKF2 parameters in the model, by PX4 name.
     estimates_biases : bool
-        False without an accelerometer bias.
+        True if the accelerometer bias is a state.
     estimates_attitude : bool
-        False to use the published attitude instead of attitude and gyro bias states.
+        True if attitude and gyro bias are states; False to use the published attitude.
     fuses_velocity : bool
         False to ignore the velocity of the position source.
     uses_reported_noise : bool
@@ -127,7 +127,7 @@ class FilterConfiguration:
     timestamp_offset_s: float | None = None
 
     def keeps_logged_bad_acceleration(self, inputs: Inputs) -> bool:
-        """Return True if the logged flag for a bad acceleration is valid for this configuration."""
+        """Return True if the configuration does not change EKF2's flag for a bad acceleration."""
         has_same_height_parameters = not self.without and all(
             value == inputs.settings[name] or name.startswith(HEIGHT_NEUTRAL_PREFIXES)
             for name, value in self.settings.items()
@@ -140,10 +140,10 @@ class FilterConfiguration:
             return Timing(-self.timestamp_offset_s - 0.5 * inputs.mean_step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         max_delay_ms = max(self.settings.get(aid.delay, 0.0) for aid in (GNSS_POS, EV_POS))
-        if inputs.rules.uses_delay_as_horizon:  # the largest delay is the length of the IMU buffer
+        if inputs.rules.uses_delay_as_horizon:  # IMU buffer length = largest delay parameter
             buffer_length = math.ceil(max_delay_ms * 1e-3 / inputs.configured_step_s)
             return Timing(delay_s, max(inputs.horizon_s, (buffer_length - 1) * inputs.mean_step_s))
-        # At its start, EKF2 increases EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
+        # EKF2 starts with EKF2_DELAY_MAX >= largest delay parameter (EKF2.cpp)
         longest_delay_ms = max(self.settings["EKF2_DELAY_MAX"], max_delay_ms)
         if longest_delay_ms == inputs.settings["EKF2_DELAY_MAX"]:
             return Timing(delay_s, inputs.horizon_s)
@@ -172,9 +172,9 @@ class SegmentRun:
         Covariance at the end.
     magnetometer_updates : ndarray, shape (events, 3, filters, 3)
         Innovation (gauss, body FRD), its variance, and 1 if fused.
-    heights : HeightFilter or None
+    height_filter : HeightFilter or None
         None if the logged EKF2 height is used.
-    vision : VisionFilter or None
+    vision_filter : VisionFilter or None
         Vision fusion in addition to GNSS.
     """
 
@@ -192,8 +192,8 @@ class SegmentRun:
     variance: Array32
     covariance: Array
     magnetometer_updates: Array
-    heights: HeightFilter | None = None
-    vision: VisionFilter | None = None
+    height_filter: HeightFilter | None = None
+    vision_filter: VisionFilter | None = None
 
 
 def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
@@ -279,7 +279,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     logged_variance = np.stack(
         [attitude_variance[:, :, HEADING], segment.down_variance_m2[event_steps]], axis=-1
     )
-    heights = vision = None
+    height_filter = vision_filter = None
     has_magnetometer = segment.field is not None
     event_step_arrays = [interval_arrays.events.end_step for interval_arrays in distinct_intervals]
     vector_means = []
@@ -297,7 +297,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             means = means._replace(sample_count=sample_count)
             vector_means.append((means, gate, samples.state_rows))
     follows_log = [
-        segment.heights is None
+        segment.height_samples is None
         or segment.is_acceleration_bad is None
         or configuration.keeps_logged_bad_acceleration(inputs)
         for configuration in configurations
@@ -305,9 +305,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     bad_acceleration = BadAcceleration(
         np.array(follows_log), inputs.rules.bad_acceleration_duration_s, segment
     )
-    if segment.heights is not None:
+    if segment.height_samples is not None:
         barometer = np.stack(barometer_samples(segment, event_step_arrays), axis=-1)
-        heights = HeightFilter(
+        height_filter = HeightFilter(
             segment,
             barometer[..., configuration_intervals],
             event_table["time_s"],
@@ -328,7 +328,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             )
             for interval_arrays, configuration in zip(intervals, configurations, strict=True)
         ]
-        vision = VisionFilter(
+        vision_filter = VisionFilter(
             segment,
             vision_by_configuration,
             is_enabled_by_aid,
@@ -397,10 +397,10 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     reset_states = [(HORIZONTAL_POSITION, POSITION_COLUMNS, inputs.rules.reset_variance_factor)]
     if has_velocity and inputs.rules.resets_velocity:
         reset_states.append((VELOCITY, VELOCITY_COLUMNS, 1.0))
-    for e in range(event_count):
-        batch_index = e % EVENT_BATCH_SIZE
+    for event in range(event_count):
+        batch_index = event % EVENT_BATCH_SIZE
         if not batch_index:
-            event_batch = slice(e, e + EVENT_BATCH_SIZE)
+            event_batch = slice(event, event + EVENT_BATCH_SIZE)
             batches = [one_timing.transitions(event_batch) for one_timing in distinct_intervals]
             transition, correction_input, acceleration_input, gyro_noise, accelerometer_noise = map(
                 stack_configurations, zip(*batches, strict=True)
@@ -419,16 +419,16 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += added_noise[batch_index]
         is_bias_constant = None
         flagged_fraction = bad_acceleration.flagged_fraction(
-            event_time_s[e - 1] if e else start_s, event_time_s[e]
+            event_time_s[event - 1] if event else start_s, event_time_s[event]
         )
         if flagged_fraction is not None:
             variance_increase = flagged_fraction * (
-                BAD_ACCELERATION_NOISE**2 - acceleration_variance[e, :, 0, 0]
+                BAD_ACCELERATION_NOISE**2 - acceleration_variance[event, :, 0, 0]
             )
             P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += (
                 variance_increase[:, None, None] * accelerometer_noise[batch_index]
             )
-            is_bias_constant = bad_acceleration.until_s > event_time_s[e]
+            is_bias_constant = bad_acceleration.until_s > event_time_s[event]
             bias_before = x[:, ACCELEROMETER_BIAS].copy()
             bias_covariance = P[:, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS].copy()
         bias_variance = _diagonal(P)[:, BIASES.start :]
@@ -438,104 +438,110 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         innovation[:, 2:] = 0.0
         R[:, 2:] = IGNORED_VARIANCE
         for means, gate, state_rows in vector_means:
-            if means.sample_count[e].any():
-                event_mean = EventSamples(*(quantity[e] for quantity in means))
+            if means.sample_count[event].any():
+                event_mean = EventSamples(*(quantity[event] for quantity in means))
                 x, P, vector_updates = fuse_mean(x, P, event_mean, gate, *state_rows)
                 if EARTH_FIELD in state_rows:
-                    magnetometer_updates[e] = vector_updates
-        if vision is not None:
-            x, P = vision.fuse(e, x, P, False, fusion.last_position_s)
-        if heights is not None:
-            x, P = heights.fuse_barometer(e, x, P)
-        if has_sample[e]:
-            nu = measured_values[e] - x[:, MEASURED_STATES]
-            S = _diagonal(P)[:, MEASURED_STATES] + measurement_variance[e]
+                    magnetometer_updates[event] = vector_updates
+        if vision_filter is not None:
+            x, P = vision_filter.fuse(event, x, P, False, fusion.last_position_s)
+        if height_filter is not None:
+            x, P = height_filter.fuse_barometer(event, x, P)
+        if has_sample[event]:
+            nu = measured_values[event] - x[:, MEASURED_STATES]
+            S = _diagonal(P)[:, MEASURED_STATES] + measurement_variance[event]
             is_outside_gate = nu * nu > gate_squared * S
             if is_outside_gate[:, DOWN_COLUMN].any():
                 # EKF2 clips the vertical velocity if the horizontal velocity is inside the gate
-                is_clipped = has_gate & (bad_acceleration.until_s > event_time_s[e])
+                is_clipped = has_gate & (bad_acceleration.until_s > event_time_s[event])
                 is_clipped &= ~is_outside_gate[:, :DOWN_COLUMN].any(axis=1)
                 innovation_limit = np.sqrt(gate_squared * S)[is_clipped, DOWN_COLUMN]
                 nu[is_clipped, DOWN_COLUMN] = np.clip(
                     nu[is_clipped, DOWN_COLUMN], -innovation_limit, innovation_limit
                 )
                 is_outside_gate[:, DOWN_COLUMN] &= ~is_clipped
-            innovations[e] = nu
-            variances[e] = S
-            is_velocity_fused = can_fuse_velocity[e] & ~(
+            innovations[event] = nu
+            variances[event] = S
+            is_velocity_fused = can_fuse_velocity[event] & ~(
                 is_outside_gate[:, VELOCITY_COLUMNS].any(axis=1) & has_gate
             )
             is_outside_gate = is_outside_gate[:, POSITION_COLUMNS].any(axis=1)
-            is_rejected[e], is_fused[e], is_reset[e], is_velocity_fused = fusion.decide(
-                e, is_outside_gate, is_velocity_fused
+            is_rejected[event], is_fused[event], is_reset[event], is_velocity_fused = fusion.decide(
+                event, is_outside_gate, is_velocity_fused
             )
             if inputs.aid == GNSS_POS:
                 if not has_magnetometer:
                     # Without logged magnetometer samples, the correction of the tilt is unknown.
                     # Only the tilt variance is set to its logged value
                     for tilt_row in range(HEADING):
-                        _, P = _reduce_variance_to(P, tilt_row, attitude_variance[e, :, tilt_row])
+                        _, P = _reduce_variance_to(
+                            P, tilt_row, attitude_variance[event, :, tilt_row]
+                        )
                 is_component_fused[:, VELOCITY_COLUMNS] = is_velocity_fused[:, None]
-                is_component_fused[:, POSITION_COLUMNS] = is_fused[e, :, None]
+                is_component_fused[:, POSITION_COLUMNS] = is_fused[event, :, None]
                 x, P = _sequential_update(
                     x,
                     P,
                     nu,
                     S,
-                    measurement_variance[e],
+                    measurement_variance[event],
                     measured_slice,
                     is_component_fused[:, measured_slice],
                 )
             else:
                 innovation[:, 2:] = nu[:, POSITION_COLUMNS]
-                R[is_fused[e], 2:] = measurement_variance[e, is_fused[e], POSITION_COLUMNS]
-        if heights is not None:
-            x, P = heights.fuse_gnss(
-                e, x, P, measured_values[e, :, 5], measurement_variance[e, :, 5]
+                R[is_fused[event], 2:] = measurement_variance[
+                    event, is_fused[event], POSITION_COLUMNS
+                ]
+        if height_filter is not None:
+            x, P = height_filter.fuse_gnss(
+                event, x, P, measured_values[event, :, 5], measurement_variance[event, :, 5]
             )
         # The magnetometer corrects the heading, so only the height is set to EKF2's logged value
         elif has_magnetometer:
-            K, P = _reduce_variance_to(P, DOWN, logged_variance[e, :, 1])
-            x = x + K * (logged_values[e, :, 1] - x[:, DOWN])[:, None]
-            x[:, DOWN] = logged_values[e, :, 1]
+            K, P = _reduce_variance_to(P, DOWN, logged_variance[event, :, 1])
+            x = x + K * (logged_values[event, :, 1] - x[:, DOWN])[:, None]
+            x[:, DOWN] = logged_values[event, :, 1]
         if not has_magnetometer:
-            np.subtract(logged_values[e], x[:, LOGGED_STATES], out=innovation[:, :2])
-            R[:, :2] = _noise_for_variance(_diagonal(P)[:, LOGGED_STATES], logged_variance[e])
+            np.subtract(logged_values[event], x[:, LOGGED_STATES], out=innovation[:, :2])
+            R[:, :2] = _noise_for_variance(_diagonal(P)[:, LOGGED_STATES], logged_variance[event])
             heading_error_rad = np.where(has_attitude, x[:, HEADING] + innovation[:, 0], 0.0)
-            if inputs.fuses_vision_height or heights is not None:
+            if inputs.fuses_vision_height or height_filter is not None:
                 R[:, 1] = IGNORED_VARIANCE
-                if has_sample[e] and heights is None:
+                if has_sample[event] and height_filter is None:
                     innovation[:, 1] = nu[:, 5]
                     R[:, 1] = np.where(
-                        is_active[e], measurement_variance[e, :, 5], IGNORED_VARIANCE
+                        is_active[event], measurement_variance[event, :, 5], IGNORED_VARIANCE
                     )
             x, P = _joint_update(x, P, innovation, R)
             x[:, HEADING] = heading_error_rad
-        if has_sample[e] and is_reset[e].any():
+        if has_sample[event] and is_reset[event].any():
             for rows, columns, variance_factor in reset_states:
-                reset_variance = variance_factor * measurement_variance[e, :, columns]
-                set_states(x, P, is_reset[e], rows, measured_values[e, :, columns], reset_variance)
-            position_reset_m[e, is_reset[e]] = nu[is_reset[e], POSITION_COLUMNS]
-        if vision is not None:
-            vision.bias.value_m = vision.bias.value_m + position_reset_m[e]
-            x, P = vision.fuse(e, x, P, True, fusion.last_position_s)
-            # EKF2 resets the position after a time without a fused position, from GNSS or vision
-            if inputs.rules.resets_velocity:
-                fusion.last_position_s = np.maximum(fusion.last_position_s, vision.fused_s)
-        if heights is not None and bad_acceleration.models_flag:
-            if has_sample[e] and has_velocity:
-                heights.update_log[e, -1, 0] = np.where(
-                    can_fuse_velocity[e], nu[:, DOWN_COLUMN], np.nan
+                reset_variance = variance_factor * measurement_variance[event, :, columns]
+                set_states(
+                    x, P, is_reset[event], rows, measured_values[event, :, columns], reset_variance
                 )
-                heights.update_log[e, -1, 1] = S[:, DOWN_COLUMN]
-            heights.update_bad_acceleration(e, event_time_s[e])
+            position_reset_m[event, is_reset[event]] = nu[is_reset[event], POSITION_COLUMNS]
+        if vision_filter is not None:
+            vision_filter.bias.value_m = vision_filter.bias.value_m + position_reset_m[event]
+            x, P = vision_filter.fuse(event, x, P, True, fusion.last_position_s)
+            # EKF2 resets the position after a time without fusion of GNSS and vision positions
+            if inputs.rules.resets_velocity:
+                fusion.last_position_s = np.maximum(fusion.last_position_s, vision_filter.fused_s)
+        if height_filter is not None and bad_acceleration.models_flag:
+            if has_sample[event] and has_velocity:
+                height_filter.update_log[event, -1, 0] = np.where(
+                    can_fuse_velocity[event], nu[:, DOWN_COLUMN], np.nan
+                )
+                height_filter.update_log[event, -1, 1] = S[:, DOWN_COLUMN]
+            height_filter.update_bad_acceleration(event, event_time_s[event])
         if is_bias_constant is not None:
             x[is_bias_constant, ACCELEROMETER_BIAS] = bias_before[is_bias_constant]
             P[is_bias_constant, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = bias_covariance[
                 is_bias_constant
             ]
-        states[e + 1] = x
-        state_variances[e + 1] = _diagonal(P)
+        states[event + 1] = x
+        state_variances[event + 1] = _diagonal(P)
     innovations[~is_active] = np.nan
     variances[~is_active] = np.nan
     return SegmentRun(
@@ -548,13 +554,15 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         is_rejected,
         is_fused,
         is_reset,
-        position_reset_m if vision is None else position_reset_m + vision.position_reset_m,
+        position_reset_m
+        if vision_filter is None
+        else position_reset_m + vision_filter.position_reset_m,
         states,
         state_variances,
         P,
         magnetometer_updates,
-        heights,
-        vision,
+        height_filter,
+        vision_filter,
     )
 
 
@@ -570,7 +578,7 @@ def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
 
 
 def _reduce_variance_to(P: Array, state_index: int, target_variance: Array) -> ArrayPair:
-    """Return gain and covariance of an update that reduces the variance of a state to a target."""
+    """Return gain and covariance of an update that reduces a state's variance to a target."""
     state_variance = P[:, state_index, state_index]
     R = _noise_for_variance(state_variance, target_variance)
     K = P[:, :, state_index] / (state_variance + R)[:, None]
@@ -609,9 +617,10 @@ class _Fusion:
     """Decisions on each position sample: rejected, fused, or used to reset the position.
 
     After a time without fusion, the position is reset. After several successive resets, fusion
-    stops until a sample with which EKF2 may start (``can_start``). ``logged_rejected`` and
-    ``logged_reset`` are EKF2's logged decisions. Source: updateEvPosFusion, startEvPosFusion
-    (``ev_pos_control.cpp``).
+    stops until EKF2 may start it with a sample (``can_start``). ``logged_rejected`` and
+    ``logged_reset`` are EKF2's logged decisions.
+
+    Source: updateEvPosFusion, startEvPosFusion (``ev_pos_control.cpp``).
     """
 
     rules: FusionRules
@@ -637,27 +646,27 @@ class _Fusion:
         )
 
     def decide(
-        self, e: int, is_outside_gate: BoolArray, is_velocity_fused: BoolArray
+        self, event: int, is_outside_gate: BoolArray, is_velocity_fused: BoolArray
     ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
-        """Decide for each filter configuration on the position and velocity of one event.
+        """Decide if each filter configuration rejects, fuses or resets to the sample of one event.
 
         Return four masks: position rejected, position fused, position reset, velocity fused.
         ``is_velocity_fused`` is True if the velocity is inside its gate.
         """
         rules = self.rules
-        now_s = self.time_s[e]
-        action = self.action[e]
+        now_s = self.time_s[event]
+        action = self.action[event]
         has_gate = self.has_gate
         follows_log = self.uses_logged_decisions
         may_fuse = action == FUSE
-        is_decision_logged = math.isfinite(self.logged_rejected[e])
+        is_decision_logged = math.isfinite(self.logged_rejected[event])
         self.last_velocity_s = np.where(is_velocity_fused, now_s, self.last_velocity_s)
-        if self.only_gate_decides[e] and not (is_outside_gate.any() or self.is_stopped.any()):
+        if self.only_gate_decides[event] and not (is_outside_gate.any() or self.is_stopped.any()):
             self.last_position_s = now_s
             return is_outside_gate, may_fuse, is_outside_gate, is_velocity_fused
         is_rejected = (
             np.where(
-                follows_log & is_decision_logged, self.logged_rejected[e] > 0.0, is_outside_gate
+                follows_log & is_decision_logged, self.logged_rejected[event] > 0.0, is_outside_gate
             )
             & has_gate
             & may_fuse
@@ -665,20 +674,20 @@ class _Fusion:
         since_fusion_s = now_s - self.last_position_s
         if self.has_all_resets and not is_decision_logged:
             # Without a logged reset at the next event, EKF2 fused the last sample before the limit
-            next_event = min(e + 1, len(self.time_s) - 1)
+            next_event = min(event + 1, len(self.time_s) - 1)
             is_last_before_limit = (
                 self.time_s[next_event] - self.last_position_s > rules.reset_timeout_s
             )
             is_rejected &= ~(follows_log & is_last_before_limit & ~self.logged_reset[next_event])
         is_fused = may_fuse & ~is_rejected & ~self.is_stopped
-        is_starting = has_gate & ((action == START) | (self.is_stopped & self.can_start[e]))
+        is_starting = has_gate & ((action == START) | (self.is_stopped & self.can_start[event]))
         is_failing = is_rejected & ~self.is_stopped & (since_fusion_s > rules.reset_timeout_s)
         if rules.resets_velocity:
             is_velocity_late = now_s - self.last_velocity_s > rules.reset_timeout_s
             is_failing &= is_velocity_late | (since_fusion_s > 2.0 * rules.reset_timeout_s)
         is_restarted = is_starting | (is_failing & (self.remaining_resets > 0))
-        if is_decision_logged or self.logged_reset[e] or self.has_all_resets:
-            is_restart_logged = has_gate & (self.logged_reset[e] | (action == START))
+        if is_decision_logged or self.logged_reset[event] or self.has_all_resets:
+            is_restart_logged = has_gate & (self.logged_reset[event] | (action == START))
             is_restarted = np.where(follows_log, is_restart_logged, is_restarted)
             is_fused &= ~is_restarted
             is_failing &= ~follows_log
@@ -699,16 +708,16 @@ def _variance_growth(
     has_biases: BoolArray,
     has_attitude: BoolArray,
 ) -> ArrayPair:
-    """Return the process noise of biases and magnetic fields per prediction step, and limits.
+    """Return process noise per prediction step, and variance limit, of biases and magnetic fields.
 
-    EKF2 adds no process noise to a state whose variance is above its limit.
+    EKF2 adds no process noise to a state with a variance above the limit.
     """
     initial_and_process_names = {"GYR_B": "GYR", "ACC_B": "ACC"}
     if segment.field is not None:
         initial_and_process_names |= {"MAG_E": "MAG", "MAG_B": "MAG"}
     noise_density, variance_limit = (
-        np.stack([parameters[f"EKF2_{name}_NOISE"] for name in noises], axis=-1)
-        for noises in (initial_and_process_names, initial_and_process_names.values())
+        np.stack([parameters[f"EKF2_{name}_NOISE"] for name in parameter_names], axis=-1)
+        for parameter_names in (initial_and_process_names, initial_and_process_names.values())
     )
     noise_density[:, :2] *= np.stack([has_attitude, has_biases], axis=-1)
     return np.repeat((noise_density * inputs.mean_step_s) ** 2, 3, axis=-1), np.repeat(
@@ -717,10 +726,10 @@ def _variance_growth(
 
 
 def with_state_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegment:
-    """Estimate the correlations of the initial state of a segment; only its variances are logged.
+    """Estimate the correlations of the initial state of a segment by a replay of the time before.
 
-    Without correlations, the first updates would correct tilt and accelerometer bias in a wrong
-    ratio. The correlations are computed by a replay of the flight before the segment.
+    The log contains only the variances. Without correlations, the first updates would distribute
+    corrections wrongly between tilt and accelerometer bias.
     """
     state_correlation = _settled_state_correlation(segment)
     if history := segment.history:
@@ -749,9 +758,9 @@ def _correlation_of_covariance(P: Array) -> Array:
 
 
 def _settled_state_correlation(segment: ReplaySegment) -> Array:
-    """Return the correlations of tilt and accelerometer bias after a long fusion of velocity.
+    """Return the steady-state correlations of tilt and accelerometer bias.
 
-    The effects of both errors on the acceleration cancel each other: θ × f = Rb.
+    After long fusion of velocity, the effects on the acceleration cancel each other: θ × f = Rb.
     """
     to_earth = np.eye(STATE_COUNT)
     to_earth[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.body_to_ned[0]
@@ -789,10 +798,9 @@ def _start_state(
 
 
 def _noise_for_variance(variance: Array, target_variance: Array) -> Array:
-    """Return the R of an update that reduces the variance of a state to a target.
+    """Return R for an update from ``variance`` to ``target_variance``: 1/R = 1/target - 1/variance.
 
-    1/R = 1/target - 1/variance. With this R, the fusion of EKF2's published height and heading
-    gives their logged variances.
+    With this R, updates with EKF2's published height and heading give the logged variances.
     """
     excess_variance = variance - target_variance
     noise_variance = np.full(excess_variance.shape, IGNORED_VARIANCE)
@@ -803,7 +811,7 @@ def _noise_for_variance(variance: Array, target_variance: Array) -> Array:
 
 
 def _limit_bias_variance(P: Array, absolute_minimum: float, has_biases: BoolArray) -> None:
-    """Limit the accelerometer bias variance as PX4 does up to v1.14 (fixCovarianceErrors)."""
+    """Limit the accelerometer bias variance like PX4 up to v1.14 (fixCovarianceErrors)."""
     bias_variance = _diagonal(P)[:, ACCELEROMETER_BIAS]
     min_variance = np.maximum(
         MIN_BIAS_VARIANCE_RATIO * bias_variance.max(axis=1, keepdims=True), absolute_minimum

@@ -1,7 +1,8 @@
 """Fusion of optical flow in the EKF2 replay, as horizontal velocity in the body frame.
 
-The logged velocity is low-pass filtered. The mean velocity between two logged samples is computed
-from it, propagated with the IMU to the next event (:mod:`px4fuse.ekf2.filter_recursion`) and fused.
+The logged velocity is low-pass filtered. The replay computes the unfiltered mean velocity between
+two logged samples, propagates it to the next event with the IMU
+(:mod:`px4fuse.ekf2.filter_recursion`), and fuses it.
 The range to the ground is EKF2's logged range.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/optical_flow`` (``optical_flow_control.cpp``: velocity and

@@ -1,4 +1,4 @@
-"""Conditions under which EKF2 fuses positions of external vision or GNSS, as EKF2 checks them.
+"""Checks by which EKF2 decides to fuse positions of external vision or GNSS.
 
 Source: PX4-Autopilot ``src/modules/ekf2``, v1.13.3 to main: ``RingBuffer.h``, ``ev_control.cpp``,
 ``ev_pos_control.cpp``, ``gnss_checks.cpp`` (``control.cpp``, ``gps_checks.cpp`` before v1.15).
@@ -24,7 +24,7 @@ EV_START_INTERVAL_S = 0.2
 EV_STOP_INTERVAL_S = 0.4
 # EKF2 stops GNSS fusion, and before v1.14 vision fusion, after this time (s): reset_timeout_max
 FUSION_STOP_S = 7.0
-# Maximum delay (s) of EKF2's fusion horizon, from the delay parameters
+# Maximum delay (s) of EKF2's fusion horizon, if the log does not contain EKF2_DELAY_MAX
 MAX_HORIZON_S = 1.0
 # Maximum number of position samples in EKF2's buffer
 BUFFER_COUNT = 20
@@ -32,9 +32,9 @@ BUFFER_COUNT = 20
 INTERVAL_TOLERANCE_S = 5e-7
 # EKF2 stops fusion after it has rejected all samples for this time (s): no_aid_timeout_max
 MAX_REJECTED_S = 1.0
-# If x and y vary by less than this range (m), they are not measured
+# x and y are not measured if their range (m) is smaller
 MAX_CONSTANT_RANGE_M = 1e-3
-# A failed GNSS check explains missing GNSS fusion if it fails in this fraction of the time
+# A GNSS check explains missing GNSS fusion if it fails for at least this fraction of the time
 MIN_FAILED_FRACTION = 0.1
 SET_TIMESTAMP_ACTION = (
     "Set timestamp_sample to the time of measurement in microseconds since the autopilot's boot."
@@ -43,14 +43,14 @@ SYNCHRONISE_ACTION = (
     "Synchronise the clocks: UXRCE_DDS_SYNCT 1 with the uXRCE-DDS agent, or answer TIMESYNC of "
     "MAVLink. Send microseconds."
 )
-# Wrong clocks of timestamps, and the age of positions that EKF2 computes from them
+# Age of the positions for EKF2, by the wrong clock of their timestamps
 AGE_BY_WRONG_CLOCK = {
     **dict.fromkeys(
         ("another clock", "an unknown clock", "UNIX time in seconds"), "too old or in the future"
     ),
     **{f"UNIX time in {unit}seconds": "in the future" for unit in ("nano", "micro", "milli")},
 }
-# Wrong clocks or units of timestamps, and the age of positions that EKF2 computes from them
+# Age of the positions for EKF2, by the wrong clock or unit of their timestamps
 AGE_BY_WRONG_TIMESTAMP = {
     **dict.fromkeys(("0", "milliseconds", "seconds"), "too old"),
     **AGE_BY_WRONG_CLOCK,
@@ -122,7 +122,7 @@ class FusionAttempt:
         return 1.0 / self.source.compute_rate_hz()
 
     def samples_in_span(self, samples: pd.DataFrame, before_s: float = 0.0) -> pd.DataFrame:
-        """Return the samples in ``span_s``, and up to ``before_s`` (s) before it."""
+        """Return the samples from ``before_s`` (s) before ``span_s`` to the end of ``span_s``."""
         return samples.loc[self.span_s[0] - before_s : self.span_s[1]]
 
     def fraction_set(self, state: str, bit: int = 0) -> float:
@@ -159,7 +159,7 @@ def _check_switch(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
 
 
 def constant_coordinates(source: PositionTrack) -> list[str]:
-    """Return the coordinates (x, y, z) of a source that never change, so they are not measured."""
+    """Return the coordinates (x, y, z) that a position source does not measure: constant values."""
     ranges_m = np.ptp(source.samples[Columns.POSITION].to_numpy(), axis=0)
     is_constant = ranges_m < MAX_CONSTANT_RANGE_M
     return [name for name, constant in zip("xyz", is_constant, strict=True) if constant]
@@ -334,7 +334,7 @@ def _check_gnss(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
         name, parameter, unit = GNSS_CHECKS[bit]
         check_details = [f"{100.0 * failed_fractions[bit]:.0f} % of the time"]
         if np.isfinite(limit := parameters.get(parameter, np.nan)):
-            # The samples contain only positions with a fix, so their median may be below the limit
+            # Positions without a fix are not in the samples, so the median may be below the limit
             if bit in reported_variances:
                 median_value = float(np.sqrt(reported_variances[bit].median()))
                 if median_value > limit:

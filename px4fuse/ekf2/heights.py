@@ -39,7 +39,7 @@ HEIGHT_AIDS = (*HEIGHT_SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
 DEFAULT_DEAD_ZONE_M = 4.0
 # PX4's name of the height reference, by value of EKF2_HGT_REF
 HEIGHT_REFERENCES = {0: BAROMETER.name, 1: GNSS_HGT.name}
-# Maximum time (s) from the start of the replay to the first logged height bias, logged at 2 Hz
+# Maximum time (s) from the start of the replay to the first logged height bias (logged at 2 Hz)
 MAX_BIAS_LOG_DELAY_S = 1.0
 # Minimum rate (Hz) of the logged barometer for a replay of its fusion
 MIN_BAROMETER_LOG_HZ = 4.0
@@ -54,7 +54,7 @@ GNSS_HEIGHT_NOISE_FACTOR = 1.5
 def add_heights(
     flight: Flight, ekf2: Ekf2, fusion_record: FusionRecord, segments: Sequence[ReplaySegment]
 ) -> tuple[ReplaySegment, ...] | str:
-    """Add height measurements to the replay segments; without them in the log, return a reason."""
+    """Add height measurements to the replay segments; if they are not logged, return the reason."""
     parameters = fusion_record.parameters
     replayed_s = np.concatenate([segment.time_s for segment in segments])
     if uses_aid_mask(parameters):
@@ -111,15 +111,17 @@ def add_heights(
             return f"the barometer is logged at {rate_hz:.1f} Hz, below {MIN_BAROMETER_LOG_HZ:g} Hz"
         initial_state = segment.state.copy()
         initial_state[DOWN] = np.interp(start_s, delayed_down_m.index, delayed_down_m)
-        heights = HeightSamples(tuple(fused_aids), reference, barometer_bias, *samples_inside)
-        new_segments.append(replace(segment, state=initial_state, heights=heights))
+        height_samples = HeightSamples(
+            tuple(fused_aids), reference, barometer_bias, *samples_inside
+        )
+        new_segments.append(replace(segment, state=initial_state, height_samples=height_samples))
     return tuple(new_segments)
 
 
 def barometer_samples_inside(
     segment: ReplaySegment, measured_at_s: Array, *quantities: Array
 ) -> tuple[Any, ...]:
-    """Select the samples inside a segment: return prediction step, time (s) and ``quantities``."""
+    """Return prediction step, time (s) and ``quantities`` of the samples inside a segment."""
     step, is_inside = sample_steps(segment, measured_at_s)
     return step, *(values[is_inside] for values in (measured_at_s, *quantities))
 
@@ -127,23 +129,30 @@ def barometer_samples_inside(
 def barometer_samples(segment: ReplaySegment, event_step_arrays: Sequence[IntArray]) -> list[Array]:
     """Return the barometer samples that are fused at each event.
 
-    ``event_step_arrays`` contains the prediction steps of the events, one array for each set of
-    events. Each result has the shape (6, k, events), with the rows height (m, down), age (s), time
-    (s), dead zone (m), weight, and 1 for a sample (0 for an empty slot).
+    Parameters
+    ----------
+    event_step_arrays : sequence of ndarray of int
+        Prediction steps of the events; one array for each set of events.
+
+    Returns
+    -------
+    list of ndarray, shape (6, k, events)
+        Up to k samples per event. Rows: height (m, down), age (s), time (s), dead zone (m), weight,
+        and 1 (0 for an empty slot).
     """
-    heights = segment.heights
-    assert heights is not None
+    height_samples = segment.height_samples
+    assert height_samples is not None
     return pad_samples(
         [
             samples_by_event(
                 segment,
                 event_steps,
-                heights.step,
-                heights.down_m[:, None],
+                height_samples.step,
+                height_samples.down_m[:, None],
                 slice(2, 3),
-                heights.measured_at_s,
-                heights.dead_zone_m,
-                heights.weight,
+                height_samples.measured_at_s,
+                height_samples.dead_zone_m,
+                height_samples.weight,
             )
             for event_steps in event_step_arrays
         ]
@@ -184,13 +193,15 @@ class HeightFilter:
         bad_acceleration: BadAcceleration,
     ) -> None:
         self.bad_acceleration = bad_acceleration
-        heights = segment.heights
+        height_samples = segment.height_samples
         configuration_count = len(has_gate)
-        assert heights is not None
-        self.fused_sensors = heights.fused_sensors
+        assert height_samples is not None
+        self.fused_sensors = height_samples.fused_sensors
         self.down_m, self.age_s, measured_at_s, self.dead_zone_m, weight, is_sample = barometer
         has_fix = (
-            has_fix & is_enabled_by_aid[GNSS_HGT.name] & (GNSS_HGT.name in heights.fused_sensors)
+            has_fix
+            & is_enabled_by_aid[GNSS_HGT.name]
+            & (GNSS_HGT.name in height_samples.fused_sensors)
         )
         has_barometer = (is_sample > 0.0) & is_enabled_by_aid[BAROMETER.name]
         self.has_sample = np.concatenate(
@@ -201,12 +212,12 @@ class HeightFilter:
         gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in HEIGHT_SENSORS]
         self.gate_squared = [np.where(has_gate, gate**2, np.inf) for gate in gates]
         self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
-        self.has_bias = [aid.name != heights.reference for aid in HEIGHT_SENSORS]
+        self.has_bias = [aid.name != height_samples.reference for aid in HEIGHT_SENSORS]
         self.weight = [*np.maximum(weight, 1.0), np.ones_like(fix_s)]
-        bias_m, bias_variance_m2 = np.tile(heights.initial_bias, (configuration_count, 1)).T
+        bias_m, bias_variance_m2 = np.tile(height_samples.initial_bias, (configuration_count, 1)).T
         start_s = segment.time_s[0]
         self.bias = BiasEstimator(bias_m, bias_variance_m2, segment.step_s)
-        self.updates_bias = self.has_sample & is_enabled_by_aid[heights.reference]
+        self.updates_bias = self.has_sample & is_enabled_by_aid[height_samples.reference]
         biased_slots = slice(0, -1) if self.has_bias[0] else slice(-1, None)
         self.interval_s = np.zeros(self.has_sample.shape)
         self.time_s = np.stack(np.broadcast_arrays(*measured_at_s, fix_s, self.has_sample[0])[:-1])
@@ -230,61 +241,61 @@ class HeightFilter:
         measured_at_s = self.time_s[slots, :, configuration_index].T
         return update_table(update_log, measured_at_s, end_s, ["down"])
 
-    def fuse_barometer(self, e: int, x: Array, P: Array) -> ArrayPair:
+    def fuse_barometer(self, event: int, x: Array, P: Array) -> ArrayPair:
         for slot in range(len(self.down_m)):
             x, P = self._fuse_sample(
-                e, slot, x, P, self.down_m[slot, e], self.age_s[slot, e], self.noise_m2
+                event, slot, x, P, self.down_m[slot, event], self.age_s[slot, event], self.noise_m2
             )
         return x, P
 
     def fuse_gnss(
-        self, e: int, x: Array, P: Array, gnss_down_m: Array, gnss_variance_m2: Array
+        self, event: int, x: Array, P: Array, gnss_down_m: Array, gnss_variance_m2: Array
     ) -> ArrayPair:
         """Fuse the GNSS height (m, down) of one event; ``gnss_variance_m2`` is its R (m²)."""
         return self._fuse_sample(
-            e, len(self.down_m), x, P, gnss_down_m, np.zeros(1), gnss_variance_m2
+            event, len(self.down_m), x, P, gnss_down_m, np.zeros(1), gnss_variance_m2
         )
 
-    def update_bad_acceleration(self, e: int, time_s: Array) -> None:
-        update_log = self.update_log[max(e - 1, 0) : e + 1]
+    def update_bad_acceleration(self, event: int, time_s: Array) -> None:
+        update_log = self.update_log[max(event - 1, 0) : event + 1]
         innovations = -update_log[:, :, 0] / np.sqrt(update_log[:, :, 1])
         if (innovations > MIN_LARGER_INNOVATION).any():
             innovations[:, -2] = np.fmax(innovations[:, -2], innovations[:, -1])
             self.bad_acceleration.update(time_s, innovations[0, :-1], innovations[-1, :-1])
 
     def _fuse_sample(
-        self, e: int, slot: int, x: Array, P: Array, down_m: Array, age_s: Array, R: Array
+        self, event: int, slot: int, x: Array, P: Array, down_m: Array, age_s: Array, R: Array
     ) -> ArrayPair:
         """Fuse a height (m, down), measured ``age_s`` (s) before the event."""
-        if not self.any_sample[slot][e]:
+        if not self.any_sample[slot][event]:
             return x, P
         sensor_index = int(slot == len(self.down_m))
         # PH' and HPH'
         state_covariance = P[:, :, DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
         predicted_variance = state_covariance[:, DOWN] - age_s * state_covariance[:, VELOCITY_DOWN]
         nu = down_m - x[:, DOWN] + age_s * x[:, VELOCITY_DOWN]
-        sample_weight = self.weight[slot][e]
+        sample_weight = self.weight[slot][event]
         if self.has_bias[sensor_index]:
             nu, R = self.bias.remove_bias(
                 nu,
                 predicted_variance,
                 R,
-                self.interval_s[slot, e],
-                self.updates_bias[slot, e],
+                self.interval_s[slot, event],
+                self.updates_bias[slot, event],
                 sample_weight,
             )
-        if sensor_index == 0 and self.in_ground_effect[slot, e]:
-            nu = np.where(nu > 0.0, np.maximum(nu - self.dead_zone_m[slot, e], 0.0), nu)
+        if sensor_index == 0 and self.in_ground_effect[slot, event]:
+            nu = np.where(nu > 0.0, np.maximum(nu - self.dead_zone_m[slot, event], 0.0), nu)
         S = predicted_variance + R
-        has_sample = self.has_sample[slot, e]
+        has_sample = self.has_sample[slot, event]
         is_fused = has_sample & (nu * nu <= self.gate_squared[sensor_index] * S)
         if not is_fused.all():
             is_clipped = (
-                has_sample & ~is_fused & (self.bad_acceleration.until_s > self.time_s[slot, e])
+                has_sample & ~is_fused & (self.bad_acceleration.until_s > self.time_s[slot, event])
             )
             innovation_limit = np.sqrt(self.gate_squared[sensor_index] * S)
             nu = np.where(is_clipped, np.clip(nu, -innovation_limit, innovation_limit), nu)
             is_fused |= is_clipped
-        self.update_log[e, slot] = np.where(has_sample, (nu, S, ~is_fused, is_fused), np.nan)
+        self.update_log[event, slot] = np.where(has_sample, (nu, S, ~is_fused, is_fused), np.nan)
         K = state_covariance * (is_fused / (predicted_variance + R / sample_weight))[:, None]
         return x + K * nu[:, None], P - K[:, :, None] * state_covariance[:, None]

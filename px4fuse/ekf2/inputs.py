@@ -1,4 +1,4 @@
-"""Inputs of the EKF2 replay from the log of a flight.
+"""Inputs of the EKF2 replay, read from a flight log.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/external_vision/ev_pos_control.cpp`` and, before v1.15,
 ``EKF/ev_pos_control.cpp`` (frames), ``logged_topics.cpp`` (logging rates).
@@ -59,7 +59,7 @@ ANALYSIS_NAME = "EKF2 replay"
 MODEL_NOTE = (
     "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
 )
-# Logging interval (s) of the topics with copies of the vision positions (logged_topics.cpp)
+# Logging interval (s) of the topics that repeat the vision positions (logged_topics.cpp)
 VISION_COPY_INTERVALS_S = {
     "estimator_visual_odometry_aligned": 0.2,
     "estimator_aid_src_ev_pos": 0.5,
@@ -71,7 +71,7 @@ ROTATE_VISION_BIT = 64
 SAMPLE_MATCH_TOLERANCE_S = 0.006
 # Tolerance (s) for rounding errors between sample times and prediction times
 STEP_TOLERANCE_S = 1e-4
-# Time (s) without fusion of horizontal aiding after which EKF2 reports inertial dead reckoning
+# EKF2 reports inertial dead reckoning after this time (s) without horizontal aiding
 # (no_aid_timeout_max, common.h)
 DEAD_RECKONING_TIMEOUT_S = 1.0
 # Bit of EKF2_GPS_CTRL that enables GNSS velocity; before PX4 v1.14 EKF2 always fuses it
@@ -84,9 +84,9 @@ MAX_IMU_INTERVAL_S = 0.012
 MAX_LOST_FRACTION = 0.1
 # First PX4 release with the time of the fusion horizon in estimator_states
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
-# Number of successive position resets in PX4 releases without a limit
+# Maximum number of successive position resets in PX4 releases that have no limit
 UNLIMITED_RESETS = 1_000_000
-# Maximum interval (s) between updates with height and heading in a gap of the position source
+# Maximum interval (s) between height and heading updates in a gap of the position source
 MAX_INTERVAL_S = 0.25
 
 
@@ -294,7 +294,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(FIRST_RELEASE_WITH_HORIZON_TIMES):
             return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
-        # The fusion horizon has no delay if EKF2_EV_DELAY is at most one prediction step
+        # If EKF2_EV_DELAY <= one prediction step, the fusion horizon has no delay
         horizon_s = 0.0
     aiding_times_s = received.timestamp_s
     flow_samples = fusion_record.flow if is_gnss else fusion_record.flow.iloc[:0]
@@ -326,8 +326,10 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         )
     other_aids = [EV_POS] if vision else []
     other_aids += [MAG] if any(segment.field for segment in segments) else []
-    heights = segments[0].heights
-    other_aids += [BAROMETER] if heights and BAROMETER.name in heights.fused_sensors else []
+    height_samples = segments[0].height_samples
+    other_aids += (
+        [BAROMETER] if height_samples and BAROMETER.name in height_samples.fused_sensors else []
+    )
     return Inputs(
         settings=effective_settings(fusion_record.parameters, aid, *other_aids) | lever_arm,
         segments=segments,
@@ -440,7 +442,7 @@ def read_gnss(
         is_enabled = step_values_at(enabled_log, position_samples.index) > 0.0
         position_samples = position_samples[is_enabled]
         velocity_samples = velocity_samples[is_enabled]
-    # The delay is added to measurement times, because the replay subtracts it
+    # The delay is added, because the replay subtracts it from all timestamps
     logged_settings = effective_settings(parameters, GNSS_POS)
     logged_delay_s = logged_settings[GNSS_POS.delay] * 1e-3
     timestamp_s = position_samples.index.to_numpy() + logged_delay_s
@@ -506,7 +508,7 @@ def read_vision(
         position_m = rotate(rotation, position_m)
         variance_m2 = rotate(rotation**2, variance_m2)
     vision_age_s = fusion_record.vision_age_s
-    # Without arrival times, no sample is late
+    # If arrival times are unknown, no sample is late
     arrival_s = np.full(len(timestamp_s), -np.inf)
     if len(vision_age_s) and "vehicle_visual_odometry" in track.topics:
         arrival_s = timestamp_s + np.interp(timestamp_s, vision_age_s.index, vision_age_s)
@@ -551,9 +553,9 @@ def _logged_decisions(
     arrival_s: Array,
     aid: Aid = EV_POS,
 ) -> tuple[Array, BoolArray]:
-    """Return which position samples EKF2 rejected (1, else 0), and to which samples it was reset.
+    """Return two masks of the position samples: rejected by EKF2 (1, 0 or NaN), used for a reset.
 
-    The rejection is NaN if it is not logged.
+    NaN: the rejection is not logged.
     """
     rejected_flags = np.full(len(timestamp_s), np.nan)
     is_reset = np.zeros(len(timestamp_s), dtype=bool)

@@ -34,15 +34,15 @@ from px4fuse.ekf2.replay_segments import (
 )
 from px4fuse.trajectory.rotation import rotate, skew
 
-# EKF2 does not fuse a sample that is older than the fusion horizon by more than this time (s):
-# pop_first_older_than (RingBuffer.h)
+# EKF2 fuses no sample with fusion horizon - measurement time > this time (s): pop_first_older_than
+# (RingBuffer.h)
 MAX_LATENESS_S = 0.1
-# A sample is late if it is older than the fusion horizon by more than this time (s): 3 cm at 1 m/s
+# A sample is late if fusion horizon - measurement time > this time (s): 3 cm at 1 m/s
 MIN_LATENESS_S = 0.03
 # Actions on a position sample: none, update of the state, or reset of the state to the sample
 IDLE, FUSE, START = 0, 1, 2
-# Columns of the sensitivities of the EKF2 states: 0 to 2 initial attitude error, 3 to 5 gyro bias,
-# 6 to 8 accelerometer bias, 9 known change of the nominal attitude, 10 measured acceleration
+# Derivatives of the EKF2 states with respect to: initial attitude error (columns 0 to 2), gyro bias
+# (3 to 5), accelerometer bias (6 to 8), correction of the nominal attitude (9), acceleration (10)
 SENSITIVITY_COLUMN_COUNT = 11
 CORRECTION_COLUMN, INPUT_COLUMN = 9, 10
 
@@ -92,7 +92,7 @@ class Intervals:
     step_counts, duration_s : ndarray, shape (E,)
         Number of prediction steps, and length of each interval.
     sensitivities : ndarray, shape (E, 9, SENSITIVITY_COLUMN_COUNT)
-        Sensitivity of attitude, velocity and position at the end of each interval.
+        Derivatives of attitude, velocity and position at the end of each interval.
     """
 
     events: StepEvents
@@ -101,7 +101,7 @@ class Intervals:
     sensitivities: Array
 
     def transitions(self, rows: slice) -> Transitions:
-        """Return the matrices of some intervals; those of a whole flight need much memory."""
+        """Return the matrices of some intervals: those of all intervals need much memory."""
         sensitivities, duration_s = self.sensitivities[rows], self.duration_s[rows]
         transition = np.tile(np.eye(STATE_COUNT), (len(duration_s), 1, 1))
         correction_input, acceleration_input = np.zeros((2, len(duration_s), STATE_COUNT))
@@ -221,12 +221,11 @@ def _sample_actions(
 def _state_sensitivities(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
     """Return the derivatives of attitude, velocity and position at the end of each interval.
 
-    The shape is (events, 9, SENSITIVITY_COLUMN_COUNT). The derivatives are with respect to initial
-    attitude and biases; two more columns contain the effect of the inputs.
+    Shape (events, 9, SENSITIVITY_COLUMN_COUNT).
     """
     step_counts = end - start
-    # The first prediction step of all intervals is integrated, then the second step, and so on.
-    # Intervals are sorted by length, so that the intervals with a next step are the first rows
+    # All intervals are integrated together, step by step. Intervals are sorted by length, so that
+    # those with a further step are the first rows
     longest_first = np.argsort(-step_counts, kind="stable")
     first_start_steps = start[longest_first]
     attitude, velocity, position = sensitivities = np.zeros(

@@ -1,7 +1,7 @@
 """Fusion of all three magnetometer axes in the EKF2 replay, with earth and body fields as states.
 
 The samples between two events (:mod:`px4fuse.ekf2.filter_recursion`) are averaged, and the mean is
-fused at the later event: the attitude error hardly changes in between.
+fused at the later event, because the attitude error hardly changes between events.
 
 Sources: PX4-Autopilot ``EKF/aid_sources/magnetometer`` (``mag_fusion.cpp``: fuseMag;
 ``mag_control.cpp``: R and its lower limit), ``EKF/covariance.cpp`` (process noise of the fields).
@@ -18,7 +18,7 @@ from px4fuse.trajectory.rotation import skew
 # Minimum magnetometer noise (gauss) that EKF2 uses
 MIN_SIGMA_GAUSS = 0.01
 IDENTITY_MATRIX = np.eye(3)
-# Matrix that gives the cross product matrix [v]× (flattened) of a vector v as v @ CROSS_PRODUCT
+# v @ CROSS_PRODUCT is the cross product matrix [v]× of a vector v, flattened
 CROSS_PRODUCT = skew(IDENTITY_MATRIX).reshape(3, 9)
 
 

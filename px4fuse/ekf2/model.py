@@ -81,13 +81,14 @@ from px4fuse.trajectory.rotation import rotate
 # Maximum delay (s) of the fusion horizon: PX4's maximum of EKF2_DELAY_MAX
 MAX_HORIZON_S = 1.0
 
-# Number of replays that run together: more take less time for each, but more memory
+# Number of replays that run together. A larger batch needs less time per replay, but more memory
 REPLAY_BATCH_SIZE = 10
 # Number of intervals whose states are computed at once, which limits memory
 BLOCK_EVENTS = 512
+# State indices of velocity and position
+MOTION = slice(VELOCITY.start, POSITION.stop)
 
-# Field of Agreement with the result for an aiding source, where its name is not PX4's name of the
-# source
+# Fields of Agreement with another name than PX4's name of the aiding source
 AGREEMENT_FIELDS = {FLOW.name: "carried_difference_m"}
 
 RequestConfigurations = Callable[[Inputs], Sequence[FilterConfiguration]]
@@ -95,7 +96,7 @@ RequestConfigurations = Callable[[Inputs], Sequence[FilterConfiguration]]
 
 @dataclass(frozen=True)
 class Model:
-    """Flight that is prepared for replays of EKF2 with other parameters.
+    """Flight data for replays of EKF2 with other parameters.
 
     Attributes
     ----------
@@ -317,7 +318,7 @@ def modelled_aids(inputs: Inputs) -> list[str]:
         MAG: MAG.noise in inputs.settings,
         FLOW: segment.flow is not None,
     }
-    height_aids = segment.heights.fused_sensors if segment.heights else ()
+    height_aids = segment.height_samples.fused_sensors if segment.height_samples else ()
     return [*(aid.name for aid in is_fused if is_fused[aid]), *height_aids]
 
 
@@ -361,13 +362,11 @@ def delayed_tracks(
     """
     runs = _run_model(model, configurations)
     for configuration_index in map(runs[0].configurations.index, configurations):
-        states = (delayed_states(run, configuration_index)[0] for run in runs)
-        yield _join_segments(
-            [
-                _track(run, state[:, POSITION], state[:, VELOCITY])
-                for run, state in zip(runs, states, strict=True)
-            ]
-        )
+        tracks = []
+        for run in runs:
+            motion = _states_after_steps(run, configuration_index, MOTION)
+            tracks.append(_track(run, motion[:, 3:], motion[:, :3]))
+        yield _join_segments(tracks)
 
 
 def _run_model(model: Model, configurations: Sequence[FilterConfiguration]) -> Sequence[SegmentRun]:
@@ -447,7 +446,7 @@ def _make_replay(
 
 
 def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Span]:
-    """Return start and end (s) of each time longer than RESTART_GAP_S without a fused position."""
+    """Return start and end (s) of each time span without a fused position, > RESTART_GAP_S."""
     is_used = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
     fusion_times_s = [*updates.loc[is_used, "fused_at_s"], float(segment.time_s[-1])]
     return [
@@ -461,7 +460,7 @@ def _updates_by_aid(
     inputs: Inputs, run: SegmentRun, configuration_index: int
 ) -> dict[str, pd.DataFrame]:
     """Return the updates with each aiding source; the keys are PX4's names of the sources."""
-    events, heights = run.events[configuration_index], run.heights
+    events, height_filter = run.events[configuration_index], run.height_filter
     end_s = run.segment.time_s[events.end_step]
     nu, S, R, rejected, fused, reset, variance_after = (
         array[:, configuration_index]
@@ -492,9 +491,9 @@ def _updates_by_aid(
             R[:, POSITION_COLUMNS],
         )
     }
-    if heights is not None:
-        for name in heights.fused_sensors:
-            updates_by_aid[name] = heights.updates(name, configuration_index, end_s)
+    if height_filter is not None:
+        for name in height_filter.fused_sensors:
+            updates_by_aid[name] = height_filter.updates(name, configuration_index, end_s)
     if inputs.received.velocity_m_s is not None:
         gate = run.configurations[configuration_index].settings[GNSS_VEL.gate]
         # Clipped innovations are at the gate and fused; the factor allows for rounding errors
@@ -503,8 +502,8 @@ def _updates_by_aid(
         # Without GNSS height, the replay uses EKF2's logged height
         axes = AXIS_NAMES if GNSS_HGT.name in updates_by_aid else HORIZONTAL_AXES
         updates_by_aid[GNSS_VEL.name] = updates_along(axes, slice(len(axes)), is_outside_gate)
-    if run.vision is not None:
-        updates_by_aid[EV_POS.name] = run.vision.updates(configuration_index, end_s)
+    if run.vision_filter is not None:
+        updates_by_aid[EV_POS.name] = run.vision_filter.updates(configuration_index, end_s)
     return updates_by_aid
 
 
@@ -541,39 +540,40 @@ def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Ar
     Shapes (n + 1, 15) and (n + 1, 3).
     """
     event_steps = run.events[configuration_index].end_step
-    configuration = run.configurations[configuration_index]
-    segment = run.segment
-    event_states = run.state[:, configuration_index]
-    step_count = len(segment.step_s)
-    interval_index = np.searchsorted(event_steps, np.arange(step_count), side="right")
-    state = event_states[np.append(0, interval_index)]
-    # some intervals at a time, because the arrays of a whole flight need much memory
-    block_edges = np.searchsorted(interval_index, np.arange(0, len(event_steps) + 1, BLOCK_EVENTS))
-    for steps in starmap(slice, pairwise([*block_edges, step_count])):
-        _propagate_states(segment, configuration, state[1:], interval_index, steps)
-    state[event_steps] = event_states[1:]
-    reset_m = np.zeros((step_count + 1, 3))
+    reset_m = np.zeros((len(run.segment.time_s), 3))
     position_reset_m = run.position_reset_m[:, configuration_index]
     for event_index in np.flatnonzero(position_reset_m.any(axis=1)):
         reset_m[event_steps[event_index] :, :2] += position_reset_m[event_index]
-    return state, reset_m
+    return _states_after_steps(run, configuration_index, slice(None)), reset_m
+
+
+def _states_after_steps(run: SegmentRun, configuration_index: int, rows: slice) -> Array:
+    """Return the states ``rows`` at the fusion horizon after each of n steps."""
+    event_steps = run.events[configuration_index].end_step
+    event_states = run.state[:, configuration_index]
+    step_count = len(run.segment.step_s)
+    interval_index = np.searchsorted(event_steps, np.arange(step_count), side="right")
+    states = np.empty((step_count + 1, event_states[0, rows].size))
+    states[0] = event_states[0, rows]
+    # Blocks of intervals, because the arrays of a whole flight need much memory
+    block_edges = np.searchsorted(interval_index, np.arange(0, len(event_steps) + 1, BLOCK_EVENTS))
+    for steps in starmap(slice, pairwise([*block_edges, step_count])):
+        states[1:][steps] = _propagate_states(
+            run, configuration_index, interval_index[steps], steps
+        )[:, rows]
+    states[event_steps] = event_states[1:, rows]
+    return states
 
 
 def _propagate_states(
-    segment: ReplaySegment,
-    configuration: FilterConfiguration,
-    states: Array,
-    interval_index: IntArray,
-    steps: slice,
-) -> None:
-    """Replace the states at the start of the interval by the states after some of the steps.
-
-    ``steps`` are the prediction steps of whole intervals, and ``interval_index``, shape (n,), is
-    the interval of each step.
-    """
-    state, body_to_ned = states[steps], segment.body_to_ned[1:][steps]
-    start_state, step_s = state.copy(), segment.step_s[steps, None]
-    first_step = np.searchsorted(interval_index[steps], interval_index[steps])
+    run: SegmentRun, configuration_index: int, interval_index: IntArray, steps: slice
+) -> Array:
+    """Return the states after ``steps``; ``interval_index`` is the interval of each step."""
+    segment, configuration = run.segment, run.configurations[configuration_index]
+    start_state: Array = run.state[interval_index, configuration_index]
+    state, body_to_ned = start_state.copy(), segment.body_to_ned[1:][steps]
+    step_s = segment.step_s[steps, None]
+    first_step = np.searchsorted(interval_index, interval_index)
     is_first_step = (first_step == np.arange(len(first_step)))[:, None]
 
     def sum_since_event(increments: Array) -> Array:
@@ -584,7 +584,7 @@ def _propagate_states(
         shifted = np.concatenate([state[:1, rows], state[:-1, rows]])
         return np.where(is_first_step, start_state[:, rows], shifted)
 
-    # state equations of px4fuse.ekf2.intervals, evaluated for this state only
+    # θ += -R b_g Δt; v += (θ × a - R b_a + a + g) Δt; p += mean velocity · Δt
     rotation_steps = -rotate(body_to_ned, state[:, GYRO_BIAS]) * step_s
     if configuration.estimates_attitude:
         rotation_steps -= segment.correction_rad[steps]
@@ -598,3 +598,4 @@ def _propagate_states(
     state[:, POSITION] += sum_since_event(
         0.5 * step_s * (value_before_step(VELOCITY) + state[:, VELOCITY])
     )
+    return state

@@ -1,4 +1,4 @@
-"""Output predictor of EKF2, which computes the published state from the fusion horizon.
+"""Output predictor of EKF2, which computes the published state from the delayed state.
 
 The output predictor propagates the delayed state to the present with the IMU. In each prediction
 step, it compares its buffered output with the state at the fusion horizon, and corrects velocity
@@ -13,7 +13,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.linalg import lapack
 
-from px4fuse.core.arrays import Array
+from px4fuse.core.arrays import Array, row_blocks
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
@@ -23,11 +23,9 @@ from px4fuse.ekf2.replay_segments import (
 )
 from px4fuse.trajectory.rotation import rotate
 
-# Gain of the integrated error in the corrections of velocity and position (output_predictor.cpp)
+# Factor on gain² · Σ error in the corrections of velocity and position (output_predictor.cpp)
 INTEGRAL_GAIN = 0.1
-# Number of steps that are filtered at once, which limits memory
-BLOCK_STEPS = 4096
-# Gain of the attitude correction, times step / delay of the fusion horizon (output_predictor.cpp)
+# Attitude correction / (error · step / delay of the fusion horizon) (output_predictor.cpp)
 ATTITUDE_GAIN = 0.5
 
 
@@ -124,21 +122,17 @@ def follow_attitude(error_rad: Array, lag_steps: int, step_s: float, horizon_s: 
 
 
 def _recursive_filter(numerator: Array, denominator: Array, values: Array) -> Array:
-    """Apply a recursive (IIR) filter by solving banded triangular systems (LAPACK dtbtrs).
-
-    The system of the whole flight would need much memory, so it is solved in blocks.
-    """
+    """Apply a recursive (IIR) filter by solving banded triangular systems (LAPACK dtbtrs)."""
     value_count = len(values)
     filtered = np.zeros(values.shape)
     for delay in np.flatnonzero(numerator[:value_count]).tolist():
         filtered[delay:] += numerator[delay] * values[: value_count - delay]
-    block_length = max(BLOCK_STEPS, len(denominator))
-    bands = np.tile(denominator, (block_length, 1)).T
-    for first in range(0, value_count, block_length):
-        block = filtered[first : first + block_length]
-        if first:
-            for delay in np.flatnonzero(denominator[1:]).tolist():
-                past = filtered[first - delay - 1 : first][: len(block)]
-                block[: delay + 1] -= denominator[delay + 1] * past
-        block[:] = lapack.dtbtrs(bands[:, : len(block)], block, uplo="L")[0]
+    for rows in row_blocks(value_count):
+        block = filtered[rows]
+        if rows.start:
+            for delay in (1 + np.flatnonzero(denominator[1:])).tolist():
+                past = filtered[rows.start - delay : rows.start][: len(block)]
+                block[:delay] -= denominator[delay] * past
+        bands = np.tile(denominator, (len(block), 1)).T
+        block[:] = lapack.dtbtrs(bands, block, uplo="L")[0]
     return filtered

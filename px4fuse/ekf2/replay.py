@@ -1,4 +1,4 @@
-"""Result of an EKF2 replay, and its agreement with the log."""
+"""Result of an EKF2 replay, and agreement of the replay with the log."""
 
 import math
 from collections.abc import Mapping
@@ -52,25 +52,25 @@ SAME_STEP_S = 0.002
 # Minimum correlation of replayed and logged innovations: above 0.997 with complete logs, below 0.9
 # with a downsampled source or IMU dropouts (tests/benchmarks/bench_ekf2.py)
 MIN_INNOVATION_CORRELATION = 0.95
-# Maximum |S replayed / S logged - 1| (median): below 0.003 with complete logs, above 0.05 with a
-# downsampled source
+# Maximum |median of (S replayed / S logged) - 1|: below 0.003 with complete logs, above 0.05 with a
+# downsampled position source
 MAX_S_DIFFERENCE = 0.05
 # Maximum RMS difference (m) of replayed and logged position: below 0.013 m with complete logs
 MAX_PUBLISHED_DIFFERENCE_M = 0.10
 # Maximum position difference (m) while optical flow, which is logged at a reduced rate, is the only
 # horizontal aiding source
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
-# Single innovations are compared only if a smaller fraction is rejected: with more rejections, one
-# sample near the gate changes many later innovations
+# Single innovations are compared only if a smaller fraction of the samples is rejected. Each
+# rejection changes many later innovations
 MAX_COMPARED_REJECTED_FRACTION = 0.05
-# Published positions are compared only if a smaller fraction is rejected: with more rejections,
-# EKF2 integrates most of its position from the IMU
+# Published positions are compared only if a smaller fraction of the samples is rejected. With more
+# rejections, EKF2's position is mostly integrated from the IMU
 MOSTLY_REJECTED_FRACTION = 0.5
 # Minimum correlation of replayed and logged innovations if most positions are rejected
 MIN_IMU_CORRELATION = 0.99
-# Maximum difference of the rejected fractions of replay and log
+# Maximum |rejected fraction of the replay - rejected fraction in the log|
 MAX_REJECTED_DIFFERENCE = 0.05
-# Maximum relative difference of the mean NIS of replay and log
+# Maximum |mean NIS of the replay / mean NIS in the log - 1|
 MAX_NIS_DIFFERENCE = 0.25
 # Factor on MAX_PUBLISHED_DIFFERENCE_M for a replay with logged rejections
 REJECTING_TOLERANCE_FACTOR = 3.0
@@ -200,7 +200,7 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     flow_only_spans_s: NotWritten[Spans] = NOT_WRITTEN
 
     def find_evaluated_spans(self) -> Spans:
-        """Return the evaluated spans (s), without the first seconds and times of flow only."""
+        """Return the time spans (s) after the filter has settled, without spans of flow only."""
         evaluated_spans_s = []
         for start, end in self.stretches_s:
             begin = start + SETTLING_S
@@ -214,7 +214,7 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
 
 
 class _ComparedInnovations(NamedTuple):
-    """Logged innovations, replayed innovations of these samples, and agreement along each axis."""
+    """Logged and replayed innovations of common samples, and agreement along each axis."""
 
     logged: pd.DataFrame
     replayed: pd.DataFrame
@@ -226,7 +226,7 @@ class _ComparedInnovations(NamedTuple):
 
 
 def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
-    """Compare a replay with logged parameters to EKF2's logged innovations and state."""
+    """Compare a replay that uses the logged parameters with EKF2's logged innovations and state."""
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     if rows_inside(ekf2.state, replay.find_evaluated_spans()).empty:
@@ -395,7 +395,7 @@ def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], d
 
 
 def logged_aid_innovations(name: str, aid_log: AidLog) -> pd.DataFrame:
-    """Return the logged innovations, S and rejections of an aiding source, by PX4's name."""
+    """Return logged innovations, S and rejections of the aiding source ``name`` (PX4's name)."""
     gate = aid_log.parameters.get(AIDS[name].gate, AIDS[name].default_gate)
     axes = [axis for axis in AXIS_NAMES if axis in aid_log.axes]
     return _columns_by_axis({axis: innovations_along(aid_log, axis, gate) for axis in axes})
@@ -568,15 +568,15 @@ def _agreement_verdict(
 
 
 def _format_above(value: float, limit: float) -> str:
-    """Format a value with two decimals, or more if it would otherwise equal the limit."""
+    """Format a value with enough decimals (at least 2) to differ from the limit."""
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 
 
 def with_logged_rejections(agreement: Agreement, agreement_with_rejections: Agreement) -> Agreement:
     """Return the agreement with the log of a replay that uses EKF2's logged rejections.
 
-    If EKF2 rejects many samples, one sample near the gate makes a correct replay differ from the
-    log. Rejected fraction and decisions are those of ``agreement``, the replay with a gate.
+    With many rejections, one sample near the gate can make a correct replay differ from the log.
+    Rejected fraction and decisions are from ``agreement``, the replay with a gate.
     """
     rejected_fraction = agreement.rejected_fraction_logged
     relies_on_imu = rejected_fraction > MOSTLY_REJECTED_FRACTION

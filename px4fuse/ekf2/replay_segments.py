@@ -20,6 +20,7 @@ from px4fuse.core.arrays import (
     IntArray,
     cumulative_sums,
     median_interval,
+    row_blocks,
 )
 from px4fuse.core.record import Span
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
@@ -47,8 +48,8 @@ from px4fuse.trajectory.rotation import (
     to_vector,
 )
 
-# After a longer gap (s) in the position source, the replay restarts from the logged state: EKF2
-# fuses gravity, fake positions or zero velocity in the gap, which the model does not contain
+# After a longer gap (s) in the position source, the replay restarts from the logged state. In gaps
+# EKF2 fuses gravity, fake positions or zero velocity, which the model does not contain
 RESTART_GAP_S = 2.0
 # Maximum IMU interval (s): EKF2 limits a prediction step to 2 EKF2_PREDICT_US
 IMU_GAP_S = 0.05
@@ -59,8 +60,8 @@ MIN_FUSION_S = 1.0
 MIN_AIRBORNE_S = 4.0
 # Time (s) from the start of a replay to the start of the evaluation
 SETTLING_S = 5.0
-# Time (s) from the first fusion of all magnetometer axes to the first logged field states: EKF2
-# resets them at the first fusion
+# Time (s) from EKF2's first fusion of all magnetometer axes, which resets the field states, to the
+# first logged field states that are used
 FIELD_RESET_S = 1.0
 # Flight time (s) before the replay that is used to estimate correlations of the initial state
 CORRELATION_HISTORY_S = 20.0
@@ -74,10 +75,8 @@ INNOVATION_FILTER_S = 0.5
 MIN_SEGMENT_S = 10.0
 # Maximum delay (s) from a reset to its publication
 MAX_RESET_DELAY_S = 0.5
-# An EKF2 replay is interrupted if a larger fraction of the IMU samples within 1 s is clipped
+# The EKF2 replay is interrupted if a larger fraction of the IMU samples within 1 s is clipped
 MAX_CLIPPED_FRACTION = 0.05
-# Number of prediction steps whose IMU samples are averaged at once, which limits memory
-BLOCK_STEPS = 2**14
 # If a smaller fraction of the IMU samples is missing, the EKF2 replay ignores it
 MAX_LOST_IMU_FRACTION = 0.02
 
@@ -172,7 +171,7 @@ class ReplaySegment:
     body_to_ned : ndarray, shape (n + 1, 3, 3)
         Nominal attitude.
     correction_rad : ndarray, shape (n, 3)
-        Rotation of the nominal attitude in each step minus that of the gyro.
+        Rotation of the nominal attitude in each step minus rotation measured by the gyro.
     force_m_s2 : ndarray, shape (n, 3)
         Specific force minus nominal bias, in the body frame at the end of the step.
     accelerometer_bias_m_s2 : ndarray, shape (3,)
@@ -186,7 +185,7 @@ class ReplaySegment:
     state_correlation : ndarray, shape (15, 15) or (21, 21)
         Estimated correlations of the initial state.
     field, flow : SensorSamples or None
-    heights : HeightSamples or None
+    height_samples : HeightSamples or None
     clipped_fraction : ndarray, shape (n + 1,), or None
         Fraction of the accelerometer axes that are clipped in the step.
     is_acceleration_bad : ndarray of bool, shape (n + 1,), or None
@@ -216,7 +215,7 @@ class ReplaySegment:
     state_correlation: Array
     is_fusing: bool = True
     field: SensorSamples | None = None
-    heights: HeightSamples | None = None
+    height_samples: HeightSamples | None = None
     clipped_fraction: Array | None = None
     is_acceleration_bad: BoolArray | None = None
     mean_bias_down_m_s2: float = 0.0
@@ -327,7 +326,7 @@ def update_table(
 
 
 def pad_samples(sample_arrays: Sequence[Array]) -> list[Array]:
-    """Extend the arrays of :func:`samples_by_event` by zeros to one number of slots."""
+    """Pad the arrays of :func:`samples_by_event` with zeros to an equal number of slots."""
     max_slots = max(samples.shape[1] for samples in sample_arrays)
     return [
         np.pad(samples, ((0, 0), (0, max_slots - samples.shape[1]), (0, 0)))
@@ -455,7 +454,7 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
 
 
 def _clipped_fraction(imu: pd.DataFrame, time_s: Array) -> Array:
-    """Return for each prediction step the fraction of the accelerometer axes that are clipped."""
+    """Return the fraction of the accelerometer axes that are clipped, for each prediction step."""
     fraction_by_step = np.zeros(len(time_s))
     # "clipped" has one bit per axis
     if "clipped" in imu:
@@ -487,10 +486,8 @@ def _make_segment(
     accelerometer_bias = np.asarray(initial_row[Columns.ACCELEROMETER_BIAS])
     gyro_bias = np.asarray(initial_row[Columns.GYRO_BIAS])
     rotation_vectors, velocity_increments = np.zeros((2, len(step_end_indices), 3))
-    # some steps at a time, because the arrays of a whole flight need much memory
-    for first_step in range(0, len(step_end_indices), BLOCK_STEPS):
-        steps = slice(first_step, first_step + BLOCK_STEPS)
-        first_row = step_end_indices[first_step - 1] if first_step else 0
+    for steps in row_blocks(len(step_end_indices)):
+        first_row = step_end_indices[steps.start - 1] if steps.start else 0
         rows = slice(first_row, step_end_indices[steps][-1])
         samples, intervals_s = imu.iloc[rows.start + 1 : rows.stop + 1], imu_intervals_s[rows, None]
         rotation_vectors[steps], velocity_increments[steps] = downsample_imu(
@@ -529,7 +526,7 @@ def _make_segment(
     return ReplaySegment(
         time_s=step_times_s,
         step_s=step_s,
-        # float32 as in PX4, because these are the largest arrays
+        # float32 (as in PX4) saves memory: these arrays are the largest
         body_to_ned=to_matrix(nominal_attitude).astype(np.float32),
         correction_rad=to_vector(
             multiply(published_relative_to_gyro[1:], conjugate(published_relative_to_gyro[:-1]))
@@ -659,7 +656,7 @@ def low_pass_weights(
     new_sample_weight : float or ndarray, shape (m,)
         Weight of a new sample in the low-pass filter.
     """
-    # Age of each sample, in sample intervals
+    # Age of each sample (unit: sample interval)
     sample_age = np.arange(int(sample_count.max(initial=1.0)))
     weight = np.where(
         sample_age < sample_count[:, None],
@@ -709,7 +706,7 @@ def add_field_states(
 
 
 def sample_steps(segment: ReplaySegment, measured_at_s: Array) -> tuple[IntArray, BoolArray]:
-    """Return the prediction step at which each sample is fused, for samples in the segment.
+    """Return the prediction step that fuses each sample of the segment.
 
     The second array is True for each sample in the segment.
     """
@@ -744,12 +741,9 @@ def step_ends(interval_s: Array, logged_ends: IntArray, configured_step_s: float
     logged_end_set = set(logged_ends.tolist())
     end_indices = []
     accumulated_count = accumulated_s = 0.0
-    # lists of some samples at a time, because those of a whole flight need much memory
-    blocks = np.array_split(
-        np.stack([interval_s, sample_counts], axis=1), 1 + len(interval_s) // BLOCK_STEPS
-    )
+    samples = np.stack([interval_s, sample_counts], axis=1)
     for sample, (interval, sample_count) in enumerate(
-        chain.from_iterable(block.tolist() for block in blocks), start=1
+        chain.from_iterable(samples[rows].tolist() for rows in row_blocks(len(samples))), start=1
     ):
         accumulated_count = accumulated_count + sample_count
         accumulated_s = accumulated_s + interval
@@ -765,7 +759,7 @@ def step_ends(interval_s: Array, logged_ends: IntArray, configured_step_s: float
 def downsample_imu(
     rotation_vectors: Array, velocity_increments: Array, step_end_indices: IntArray
 ) -> ArrayPair:
-    """Sum IMU samples to the rotation (rad) and velocity change (m/s) of each prediction step.
+    """Return the rotation (rad) and velocity change (m/s) of each prediction step from IMU samples.
 
     The velocity change is in the body frame at the end of the step.
     """
@@ -778,9 +772,9 @@ def downsample_imu(
     rotation_at_sample_middle_rad = 0.5 * (
         summed_rotation[:step_count] + summed_rotation[1 : step_count + 1]
     )
-    rotated_increments = velocity_increments[:step_count]
-    rotated_increments = rotated_increments - np.cross(
-        rotation_at_step_end_rad - rotation_at_sample_middle_rad, rotated_increments
+    velocity_increments = velocity_increments[:step_count]
+    rotated_increments = velocity_increments - np.cross(
+        rotation_at_step_end_rad - rotation_at_sample_middle_rad, velocity_increments
     )
     step_rotation = summed_rotation[step_end_indices] - summed_rotation[start_indices]
     return step_rotation, np.add.reduceat(rotated_increments, start_indices, axis=0)

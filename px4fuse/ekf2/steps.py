@@ -4,8 +4,8 @@ The flight is replayed with KF. In each step, one more property of KF is replace
 sample times, noises, estimated states, gate, and output predictor. A step reduces or increases the
 mean square difference from the logged EKF2.
 
-Bias states are added before EKF2's process noise, which is too small for a filter without them. The
-last replays use EKF2's logged rejections.
+Bias states are added before EKF2's process noise, which is too small for a filter without bias
+states. The last replays use EKF2's logged rejections.
 """
 
 import math
@@ -57,7 +57,7 @@ GATE = "rejections and resets"
 OUTPUT = "output predictor"
 # Aiding sources (PX4's names) that EKF2 may fuse in addition to its position source
 FURTHER_STEPS = {FLOW.name: FLOW_STEP, EV_POS.name: VISION_STEP}
-# Order in which properties of KF are replaced by those of EKF2. Additional aiding sources are
+# Order in which properties of KF are replaced by properties of EKF2. Additional aiding sources are
 # inserted before GATE
 REPLACEMENT_STEPS = (SAMPLES, TIMESTAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
 
@@ -65,7 +65,7 @@ TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class Step(Record, kw_only=True):
-    """Effect of replacing one property of KF, such as the measurement noise, by that of EKF2.
+    """Effect of the replacement of one property of KF (such as the noise) by EKF2's property.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ class RejectionRun(Record, kw_only=True):
     duration_s : float
         Time from the first rejected sample to the next fused sample.
     distance_m : float
-        Largest position difference between EKF2 and EKF2 without a gate.
+        Largest position difference between the EKF2 replays with and without a gate.
     """
 
     start_s: float
@@ -105,7 +105,7 @@ class RejectionRun(Record, kw_only=True):
 
 
 class UnreplayedDifference(Record):
-    """Largest position difference KF - EKF2 outside the replayed times, and its time."""
+    """Largest position difference KF - EKF2 outside the replayed times, and time of the maximum."""
 
     maximum_m: NotNegative
     at_s: float
@@ -114,7 +114,7 @@ class UnreplayedDifference(Record):
 class DifferenceExplanation(Record, kw_only=True):
     """Explanation of the mean square difference KF - EKF2 along one axis.
 
-    The mean square is the sum of its reductions by all ``steps`` and an unexplained remainder.
+    Mean square = sum of the reductions by all ``steps`` + unexplained remainder.
 
     Attributes
     ----------
@@ -126,11 +126,11 @@ class DifferenceExplanation(Record, kw_only=True):
         Mean square difference after all steps.
     outside : UnreplayedDifference or None
     corrected : mapping from field of Settings to value
-        Estimates that replaced wrong settings of KF before the first step.
+        KF settings that were wrong, and are replaced by estimates before the first step.
     sentences : tuple of str
         Explanations, largest contribution first.
     times_s, kf_minus_ekf2_m, unexplained_m : ndarray
-        EKF2 sample times, and position differences at these times before and after all steps.
+        EKF2 sample times, and position differences before and after all steps.
     cause : str
         Sentence about the largest contribution.
     """
@@ -161,7 +161,7 @@ class DifferenceExplanation(Record, kw_only=True):
 def explain_by_steps(
     model: Model, settings: Settings | None = None, kf_runs: Mapping[str, Replay] | None = None
 ) -> dict[str, DifferenceExplanation] | Unavailable:
-    """Replace properties of KF by those of EKF2, one after the other, and compare with the log.
+    """Replace properties of KF by EKF2's, one after the other, and compare with the log.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Fusion of external vision in addition to GNSS in the EKF2 replay.
 
 EKF2 estimates a bias of the vision frame, which adapts within seconds. Vision therefore determines
-the relative motion, and GNSS the position. Without GNSS, the bias is zero, and EKF2 resets its
+the relative motion, GNSS the position. Without GNSS, the bias is zero, and EKF2 resets its
 position to vision. Samples between two events (:mod:`px4fuse.ekf2.filter_recursion`) are fused at
 the later event. The motion in between is computed from the state and the IMU.
 
@@ -31,8 +31,8 @@ from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 HORIZONTAL_VELOCITY, HORIZONTAL_POSITION = slice(3, 5), slice(6, 8)
 # EKF2 stops vision fusion after this time (s) without a sample (2 EV_MAX_INTERVAL, ev_control.cpp)
 MAX_SAMPLE_GAP_S = 0.4
-# Time (s) with all vision samples outside the gate after which EKF2 resets the vision bias or the
-# position (no_aid_timeout_max, common.h)
+# EKF2 resets the vision bias or the position if all vision samples are outside the gate for this
+# time (s): no_aid_timeout_max (common.h)
 MAX_REJECTED_S = 1.0
 
 
@@ -140,30 +140,34 @@ class VisionFilter:
             self.update_log[..., configuration_index], measured_at_s, end_s, ["north", "east"]
         )
 
-    def fuse(self, e: int, x: Array, P: Array, at_event: bool, gnss_fused_s: Array) -> ArrayPair:
+    def fuse(
+        self, event: int, x: Array, P: Array, at_event: bool, gnss_fused_s: Array
+    ) -> ArrayPair:
         """Fuse the vision samples of one event.
 
         ``at_event`` selects the samples of the last prediction step (True), which EKF2 fuses after
         GNSS, or earlier samples (False). ``gnss_fused_s`` is the time of the last GNSS fusion.
         """
-        for slot, has_sample in enumerate(self.has_sample[at_event][:, e]):
+        for slot, has_sample in enumerate(self.has_sample[at_event][:, event]):
             if has_sample.any():
-                x, P = self._fuse_sample(e, slot, has_sample, x, P, gnss_fused_s)
+                x, P = self._fuse_sample(event, slot, has_sample, x, P, gnss_fused_s)
         return x, P
 
     def _fuse_sample(
-        self, e: int, slot: int, has_sample: BoolArray, x: Array, P: Array, gnss_fused_s: Array
+        self, event: int, slot: int, has_sample: BoolArray, x: Array, P: Array, gnss_fused_s: Array
     ) -> ArrayPair:
-        age_s = self.age_s[slot, e][:, None]
-        fusion_time_s = self.fusion_time_s[slot, e]
-        without_gnss = self.without_gnss[e]
-        noise_m2 = self.noise_m2[slot, e]
+        age_s = self.age_s[slot, event][:, None]
+        fusion_time_s = self.fusion_time_s[slot, event]
+        without_gnss = self.without_gnss[event]
+        noise_m2 = self.noise_m2[slot, event]
         HP = P[:, HORIZONTAL_POSITION] - age_s[:, None] * P[:, HORIZONTAL_VELOCITY]
         S = HP[:, :, HORIZONTAL_POSITION] - age_s[:, None] * HP[:, :, HORIZONTAL_VELOCITY]
         # diagonal is a view of S: adding R to it changes S
         diagonal = S.reshape(len(S), -1)[:, ::3]
         position_innovation_m = (
-            self.position_m[slot, e] - x[:, HORIZONTAL_POSITION] + age_s * x[:, HORIZONTAL_VELOCITY]
+            self.position_m[slot, event]
+            - x[:, HORIZONTAL_POSITION]
+            + age_s * x[:, HORIZONTAL_VELOCITY]
         )
         updates_bias = has_sample & ~without_gnss
         interval_s = np.where(updates_bias, fusion_time_s - self.last_sample_s, 0.0)
@@ -196,7 +200,7 @@ class VisionFilter:
             is_fused,
             is_position_reset,
         )
-        self.update_log[e, slot] = np.where(is_evaluated, np.stack(update_log), np.nan)
+        self.update_log[event, slot] = np.where(is_evaluated, np.stack(update_log), np.nan)
         K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
         x = x + (K @ nu[:, :, None])[:, :, 0]
         P = P - K @ HP
@@ -214,7 +218,7 @@ class VisionFilter:
                 x[:, HORIZONTAL_POSITION] + position_reset_m,
                 restart_variance,
             )
-            self.position_reset_m[e] += position_reset_m
+            self.position_reset_m[event] += position_reset_m
         if is_restarting.any():
             starts_bias = (is_restarting & ~is_position_reset)[:, None]
             clears_bias = (is_position_reset & without_gnss)[:, None]
@@ -232,7 +236,7 @@ class VisionFilter:
 def set_states(
     x: Array, P: Array, is_selected: BoolArray, rows: slice, value: Array, variance: Array
 ) -> None:
-    """Set the states ``rows`` of selected configurations to a value that is uncorrelated.
+    """Set value and variance of the states ``rows`` of selected configurations; no correlation.
 
     ``value`` and ``variance`` have the shape (filters, states).
     """

@@ -1,6 +1,6 @@
-"""Statistics of EKF2 as logged, replayed, and replayed with other parameters.
+"""Statistics of the logged EKF2, of its replay, and of replays with other parameters.
 
-All statistics are evaluated over equal times.
+All statistics are from the same time spans.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,8 +37,8 @@ from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, chec
 from px4fuse.flight.model import Columns, Ekf2, Flight, NedAxis, Unavailable
 
 ANALYSIS_NAME = "EKF2 replay with other parameters"
-# The longest time between fusions is computed from the log only if it contains at least this
-# fraction of the innovations
+# The longest time without fusion is computed only if the log contains at least this fraction of the
+# innovations
 MIN_COMPLETE_FRACTION = 0.9
 NO_TRUTH = Unavailable(
     "RMSE against ground truth",
@@ -75,18 +75,18 @@ MAX_SWEEP_VALUES = 200
 ADDED_NOISE_M = 0.002
 # Number of repeated replays with added position noise
 NOISY_REPLAY_COUNT = 4
-# A replay is repeated with added position noise if it rejects more than this fraction
+# A replay is repeated with added position noise if it rejects a larger fraction of the samples
 MIN_REJECTED_FRACTION = 0.02
-# The statistics of a replay are not predictable if it rejects more than this fraction
+# The statistics of a replay are unpredictable if it rejects a larger fraction of the samples
 MAX_REJECTED_FRACTION = 0.35
 # EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# Maximum ratio of the largest to the smallest mean NIS of repeated replays
+# Maximum (largest / smallest) mean NIS of repeated replays
 MAX_NIS_RATIO = 1.10
-# Maximum difference between the rejected fractions of repeated replays
+# Maximum (largest - smallest) rejected fraction of repeated replays
 MAX_REJECTED_SPREAD = 0.03
-# Maximum ratio of the largest to the smallest position RMSE of repeated replays
+# Maximum (largest / smallest) position RMSE of repeated replays
 MAX_RMSE_RATIO = 1.15
 
 
@@ -114,7 +114,7 @@ class HeightSummary(Record):
 
     @property
     def is_predictable(self) -> bool:
-        """False with many rejections, or with a height reset, which the model does not contain."""
+        """True with few rejections and without a height reset, which the model does not contain."""
         has_reset = self.longest_without_fusion_s > HEIGHT_TIMEOUT_S
         return not has_reset and self.rejected_fraction <= MAX_REJECTED_FRACTION
 
@@ -317,7 +317,7 @@ def _mark_unpredictable(
 ) -> tuple[Summary, ...]:
     """Set ``is_predictable`` to False if added position noise changes the statistics of a replay.
 
-    It is also False with many rejections or a height reset.
+    Many rejections or a height reset also set ``is_predictable`` to False.
     """
     repeated_summaries = [[summary] for summary in summaries]
     uncertain_summaries = [
@@ -349,7 +349,7 @@ def _mark_unpredictable(
 
 
 def _results_agree(summaries: Sequence[Summary]) -> bool:
-    """Return True if repeated replays have nearly the same statistics."""
+    """Return True if the statistics of repeated replays differ by less than the limits."""
     rmse_values = [
         rmse_m
         for summary in summaries

@@ -24,36 +24,30 @@ const Card = (() => {
       return ratio ? { against, ratio, word: wordOf(ratio, against, against === "source" ? kf.interval : null) } : null;
     });
 
-    /* Show the σ ratios of the selected axis on the card */
-    function showAxis(axis, main) {
+    /* Show the σ ratios of an axis; with changed settings, hollow symbols keep the analysed ratios */
+    function showRatios(now, axis, main, isChanged) {
       const shown = query("#card figure");
       // the figure in the card also marks explained verdicts, so it is kept for the main axis
       if (shown.hasChildNodes() && shown.dataset.axis === undefined) figures.set(main, shown);
-      shown.replaceWith(figures.get(axis));
-    }
-    /* Move the KF symbols to the ratios with the changed settings; hollow symbols keep the analysed ratios */
-    function moveMarks(now, axis, isChanged) {
-      const figure = query("#card figure");
-      now.forEach((verdict, i) => {
-        const row = verdict && figure.querySelector(`[data-filter=kf][data-against=${verdict.against}]`);
-        const [mark, was, ratio, word] = ["mark", "was", "ratio", "word"].map((name) => row?.querySelector(`.${name}`));
-        if (!mark) return;
-        row.analysed ??= { ratio: ratio.textContent, word: word.textContent, isLoud: word.classList.contains("loud"),
-          label: figure.ariaLabel };
-        const show = (node, isShown) => node.setAttribute("display", isShown ? "inline" : "none");
-        show(was, isChanged);
-        for (const line of row.querySelectorAll(".interval")) show(line, !isChanged);
-        const value = isChanged ? verdict.ratio : axis.ratios[i], place = axisFraction(value, ends);
+      const figure = figures.get(axis).cloneNode(true);
+      figure.dataset.axis = axis;
+      shown.replaceWith(figure);
+      if (!isChanged) return;
+      for (const { against, ratio, word } of now.filter(Boolean)) {
+        const row = figure.querySelector(`[data-filter=kf][data-against=${against}]`);
+        const [mark, was, ratioNode, wordNode] = ["mark", "was", "ratio", "word"].map((name) => row?.querySelector(`.${name}`));
+        if (!mark) continue;
+        was.setAttribute("display", "inline");
+        for (const line of row.querySelectorAll(".interval")) line.remove();
+        const place = axisFraction(ratio, ends);
         mark.setAttribute("x", `${100 * clamp(place, 0, 1)}%`);
-        mark.firstChild.setAttribute("d", marks[place < 0 ? "below" : place > 1 ? "above" : verdict.against]);
-        const shown = isChanged ? { ratio: formatRatio(value), word: verdict.word, isLoud: verdict.word !== "consistent" }
-          : row.analysed;
-        ratio.textContent = shown.ratio;
-        word.textContent = shown.word;
-        for (const node of [ratio, word]) node.classList.toggle("loud", shown.isLoud);
-        figure.ariaLabel = shown.label ?? [...figure.querySelectorAll("[data-filter]")].map(({ textContent }) =>
-          textContent.replace(/\s+/g, " ").trim()).join(". ");
-      });
+        mark.firstChild.setAttribute("d", marks[place < 0 ? "below" : place > 1 ? "above" : against]);
+        ratioNode.textContent = formatRatio(ratio);
+        wordNode.textContent = word;
+        for (const node of [ratioNode, wordNode]) node.classList.toggle("loud", word !== "consistent");
+      }
+      figure.ariaLabel = [...figure.querySelectorAll("[data-filter]")].map(({ textContent }) =>
+        textContent.replace(/\s+/g, " ").trim()).join(". ");
     }
     function headline(now) {
       const evaluated = now.filter(Boolean), wrong = evaluated.filter(({ word }) => word !== "consistent");
@@ -79,7 +73,7 @@ const Card = (() => {
       query("#card .do")?.toggleAttribute("hidden", isChanged);
       recorded.textContent = `Diagnosis with the original settings: ${analysed.sign} ${analysed.headline}`;
     }
-    return { showAxis, moveMarks, showTexts, verdicts };
+    return { showRatios, showTexts, verdicts };
   }
 
   return { start, formatRatio, formatMetres };

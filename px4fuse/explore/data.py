@@ -178,14 +178,8 @@ def _nis_bands(innovation_count: int, packer: Packer) -> list[dict[str, int]]:
     The number of innovations changes with the time offset.
     """
     innovation_counts = np.arange(1, 2 * innovation_count + 1)
-    probabilities = ((1.0 - CONFIDENCE_LEVEL) / 2.0, (1.0 + CONFIDENCE_LEVEL) / 2.0)
-    return [
-        packer.add(
-            np.asarray(stats.chi2.ppf(probability, innovation_counts)) / innovation_counts,
-            COARSE_SCALE,
-        )
-        for probability in probabilities
-    ]
+    bounds = stats.chi2.interval(CONFIDENCE_LEVEL, innovation_counts)
+    return [packer.add(bound / innovation_counts, COARSE_SCALE) for bound in bounds]
 
 
 def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> PageData | str:

@@ -1,6 +1,7 @@
 """Bokeh plots of the web page of ``px4fuse explore``; JavaScript adds the data."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, Literal
 
 from bokeh.document import Document
@@ -114,7 +115,7 @@ def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
     for name, plot in FIGURES.plots.items():
         if name == "error" and not has_reference(data):
             continue
-        data_sources = _PlotDataSources(name)
+        data_sources = cache(lambda source, plot=name: _empty_source(f"{plot}:{source}"))
         plot_figure = plots[name] = _figure(
             name,
             215,
@@ -126,69 +127,58 @@ def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
             min_border_left=EVENT_LEFT_MARGIN_PIXELS if name == "position" else LEFT_MARGIN_PIXELS,
         )
         if name == "position":
-            _draw_dots(plot_figure, data_sources["measured"], "t z", 3, name="measured")
+            _draw_dots(plot_figure, data_sources("measured"), "t z", 3, name="measured")
         if name == "innovation":
             _draw_innovations(plot_figure, data_sources, with_ekf2="ekf2" not in missing_tracks)
         if name == "error":
             plot_figure.varea(
-                "t", "minus", "plus", source=data_sources["error"], fill_alpha=0.25, name="kf_band"
+                "t", "minus", "plus", source=data_sources("error"), fill_alpha=0.25, name="kf_band"
             )
         line_renderers: list[Any] = []
         for source_name, column, style_name, hover_name in plot.lines:
             if style_name in missing_tracks:
                 continue
             line_renderer = plot_figure.line(
-                "t", column, source=data_sources[source_name], **LINE_STYLES[style_name]
+                "t", column, source=data_sources(source_name), **LINE_STYLES[style_name]
             )
             line_renderers.append(line_renderer)
             if hover_name:
                 _add_hover(
-                    plot_figure, line_renderer, (hover_name, f"@{column}{{0.000}} {plot.unit}")
+                    plot_figure, line_renderer, hover_name, f"@{column}{{0.000}} {plot.unit}"
                 )
         if name == "error":  # scale the axis without the 2σ band, which is very wide at the start
             plot_figure.y_range.renderers = line_renderers
-        _add_cursor(plot_figure, name="cursor")
+        _add_cursor(plot_figure)
         for low, high in data["events"]["gap"]:
             plot_figure.add_layout(BoxAnnotation(left=low, right=high, **GAP_BAND))
     return plots
 
 
-class _PlotDataSources(dict[str, ColumnDataSource]):
-    """Bokeh data sources of one plot, created on first use."""
-
-    def __init__(self, plot: str) -> None:
-        self.plot = plot
-
-    def __missing__(self, name: str) -> ColumnDataSource:
-        self[name] = _empty_source(f"{self.plot}:{name}")
-        return self[name]
-
-
 def _draw_innovations(
-    plot_figure: Any, sources: dict[str, ColumnDataSource], *, with_ekf2: bool
+    plot_figure: Any, sources: Callable[[str], ColumnDataSource], *, with_ekf2: bool
 ) -> None:
     plot_figure.y_range = Range1d(start=-INNOVATION_AXIS_LIMIT, end=INNOVATION_AXIS_LIMIT)
     plot_figure.add_layout(
         BoxAnnotation(bottom=-CONSISTENT_LIMIT, top=CONSISTENT_LIMIT, **CONSISTENT_BAND)
     )
-    kf_dots = _draw_dots(plot_figure, sources["updates"], "t x", 4, name="kf")
-    _add_hover(plot_figure, kf_dots, ("KF", "@x{0.00}"))
-    _draw_dots(plot_figure, sources["beyond"], "t y", 9, name="kf", **ARROW_MARKER)
+    kf_dots = _draw_dots(plot_figure, sources("updates"), "t x", 4, name="kf")
+    _add_hover(plot_figure, kf_dots, "KF", "@x{0.00}")
+    _draw_dots(plot_figure, sources("beyond"), "t y", 9, name="kf", **ARROW_MARKER)
     if with_ekf2:
         style: BokehStyle = {"marker": "square", "name": "ekf2"}
-        fused_dots = _draw_dots(plot_figure, sources["fused"], "t x", 4, **style)
+        fused_dots = _draw_dots(plot_figure, sources("fused"), "t x", 4, **style)
         rejected_dots = _draw_dots(
-            plot_figure, sources["rejected"], "t x", 7, **style, **HOLLOW_MARKER
+            plot_figure, sources("rejected"), "t x", 7, **style, **HOLLOW_MARKER
         )
-        _add_hover(plot_figure, fused_dots, ("EKF2", "@x{0.00}"))
-        _add_hover(plot_figure, rejected_dots, ("EKF2 rejected", "@x{0.00}"))
-        _draw_dots(plot_figure, sources["beyond_ekf2"], "t y", 9, name="ekf2", **ARROW_MARKER)
+        _add_hover(plot_figure, fused_dots, "EKF2", "@x{0.00}")
+        _add_hover(plot_figure, rejected_dots, "EKF2 rejected", "@x{0.00}")
+        _draw_dots(plot_figure, sources("beyond_ekf2"), "t y", 9, name="ekf2", **ARROW_MARKER)
 
 
-def _add_hover(plot_figure: Any, renderer: Any, *rows: tuple[str, str]) -> None:
-    tooltip_rows = [("time", "@t{0.00} s"), *rows]
+def _add_hover(plot_figure: Any, renderer: Any, label: str, value: str) -> None:
+    tooltip_rows = [("time", "@t{0.00} s"), (label, value)]
     # place tooltips on different sides, so that they do not overlap
-    side: Any = {"EKF2": "right", "ground truth": "above"}.get(rows[0][0], "left")
+    side: Any = {"EKF2": "right", "ground truth": "above"}.get(label, "left")
     plot_figure.add_tools(
         HoverTool(renderers=[renderer], tooltips=tooltip_rows, mode="vline", attachment=side)
     )
@@ -200,9 +190,11 @@ def _figure(name: str, height: int, **options: Any) -> Any:
     )
 
 
-def _add_cursor(plot_figure: Any, **options: Any) -> None:
+def _add_cursor(plot_figure: Any, name: str = "cursor", **style: Any) -> None:
     """Add a vertical line at the time or position of the selected measurement."""
-    plot_figure.add_layout(Span(dimension="height", location=0.0, visible=False, **options))
+    plot_figure.add_layout(
+        Span(dimension="height", location=0.0, visible=False, name=name, **style)
+    )
 
 
 def _axis_range(name: str | None = None) -> Range1d:
@@ -236,7 +228,7 @@ def _event_plot(data: PageData, time_range: Range1d) -> Any:
         color="#7d8894",
         name="event",
     )
-    _add_cursor(plot_figure, name="cursor")
+    _add_cursor(plot_figure)
     return plot_figure
 
 
@@ -261,7 +253,7 @@ def _phase_plot() -> Any:
     plot_figure.add_layout(
         BoxAnnotation(name="band", fill_alpha=0.25, line_color=None, visible=False)
     )
-    _add_cursor(plot_figure, name="measurement", line_dash=[2, 2])
+    _add_cursor(plot_figure, "measurement", line_dash=[2, 2])
     plot_figure.line("p", "v", source=_empty_source("before"), **KF_LINE | {"line_dash": [6, 3]})
     plot_figure.patch("p", "v", source=_empty_source("now"), fill_alpha=0.25, **KF_LINE)
     _draw_dots(plot_figure, _empty_source("mean"), "p v", 7, name="kf")

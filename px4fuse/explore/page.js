@@ -260,7 +260,7 @@ const Explore = (async () => {
   })();
   function drawCard(result) {
     const now = card.verdicts(result.numbers);
-    card.moveMarks(now, result.axis, isChanged());
+    card.showRatios(now, settings.axis, flight.main, isChanged());
     card.showTexts(now, effect(result), isChanged());
   }
   onClick("card", ({ target }) => {
@@ -413,7 +413,6 @@ const Explore = (async () => {
     replay();
     if (isNewAxis) {
       drawReferences(result.axis);
-      card.showAxis(settings.axis, flight.main);
       SETTINGS.forEach(showLikely);
     }
     if (result.run) drawKf(result);

@@ -29,14 +29,15 @@ from px4fuse.core.text import count_noun
 SigmaVerdict = Literal["consistent", "underconfident", "overconfident"]
 
 Limits = tuple[float, float]
-# Minimum number of innovations in a consistency test: the 95 % band of their mean NIS is 0.3 to 2.1
+# Minimum number of innovations in a consistency test; their mean NIS has the 95 % band 0.3 to 2.1
 MIN_INNOVATIONS = 10
 CONFIDENCE_LEVEL = 0.95
 # Number of lags of the Ljung-Box whiteness test
 LJUNG_BOX_LAGS = 10
-# Range of the ratio of actual to reported σ in which a filter is consistent. For errors against
-# ground truth it is wider, because EKF2's σ excludes the lag of its output predictor
+# Data that give the actual σ: innovations of the position source, or ground truth
 Reference = Literal["source", "truth"]
+# A filter is consistent if actual σ / reported σ is in this range. It is wider for ground truth,
+# because EKF2's σ excludes the lag of its output predictor
 CONSISTENT_RATIOS: Mapping[Reference, Limits] = {"source": (0.8, 1.25), "truth": (0.67, 1.5)}
 # Innovation gate (√S) for KF and for logs without a gate parameter: default of EKF2_EVP_GATE
 DEFAULT_GATE = 5.0
@@ -63,7 +64,7 @@ class NisVerdict(Record, kw_only=True):
 
     @property
     def sigma_error_factor(self) -> float:
-        """Ratio of reported and actual σ, the larger over the smaller: at least 1."""
+        """Factor between reported and actual σ, at least 1: the larger over the smaller."""
         return float(max(self.nis_mean, 1.0 / self.nis_mean) ** 0.5)
 
 
@@ -159,7 +160,7 @@ def _nis_verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
 def autocorrelation(values: Array, lag_count: int) -> Array:
     """Return the autocorrelation of a series at lags 1 to ``lag_count``: Σ ν(k) ν(k+l) / Σ ν(k)².
 
-    The mean is not subtracted, because another test (``bias_p``) is used for the mean.
+    The mean is not subtracted: ``bias_p`` tests it.
     """
     square_sum = float(np.dot(values, values))
     return np.array(

@@ -46,11 +46,11 @@ COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
 COARSE_NOISE_FACTORS = np.geomspace(0.7, 1.6, 12)
 # Approximate number of position measurements in the coarse search for time-correlated noise
 COARSE_MEASUREMENTS = 1000
-# Minimum gain of log-likelihood over white noise in the coarse search for which a full fit is run
+# Minimum gain of log-likelihood over white noise in the coarse search. Below it, no full fit is run
 MIN_COARSE_GAIN_NATS = 0.5
 # Positions with a smaller SIGMA_Z (m) are probably low-pass filtered
 MAX_SMOOTH_SIGMA_M = 0.01
-# Minimum gain of log-likelihood over white noise in the full fit of time-correlated noise
+# Minimum gain of log-likelihood over white noise to report time-correlated noise
 MIN_GAIN_NATS = 2.0
 # Penalty (nats) for shifted timestamps: 1 for each of two additional parameters (Akaike 1974)
 OFFSET_PENALTY_NATS = 2.0
@@ -62,11 +62,12 @@ LOG_TAU_TOLERANCE = 0.05
 MAX_TRUTH_MEASUREMENTS = 300
 # Minimum gain of log-likelihood over white noise in the noise fit to ground truth
 MIN_TRUTH_GAIN_NATS = 5.0
-# Positions with smaller errors (m) against ground truth are a copy of the ground truth
+# Minimum position error (m) against ground truth: smaller errors show that both are equal data
 MIN_TRUTH_RESIDUAL_M = 1e-5
-# Maximum time (s) from a position to the nearest ground truth sample: error of 1 cm at 2 m/s²
+# Maximum time (s) from a position to the nearest ground truth sample. Interpolation error: 1 cm at
+# 2 m/s²
 MAX_TRUTH_DISTANCE_S = 0.1
-# Number of flight parts that have separate time offsets in the noise fit to ground truth
+# Number of flight parts; the noise fit to ground truth estimates one time offset for each part
 OFFSET_PART_COUNT = 12
 # Tested time constants (s) of time-correlated noise in the noise fit to ground truth
 TRUTH_TAUS_S = np.geomspace(0.3, 80.0, 17)
@@ -240,7 +241,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
 
     def fit_low_pass(log_tau: float) -> tuple[float, Noises]:
         prepared_motion, jacobian_term = undo_low_pass(float(np.exp(log_tau)))
-        # Without low-pass filter, prepare_motion was successful at these measurement times
+        # It was available for τ = 0, which has equal measurement times
         assert not isinstance(prepared_motion, Unavailable)
         noise_fit = _fit_noises_at(prepared_motion, 0.0, white_fit.noises)
         return noise_fit.compute_score() + jacobian_term, noise_fit.noises
@@ -328,7 +329,7 @@ def fit_time_correlation_to_truth(
     ]
     residuals = residual_basis.T @ (measured_m - true_m)
     if np.abs(residuals).max() < MIN_TRUTH_RESIDUAL_M:
-        return imu_fit  # the log contains the positions a second time, as ground truth
+        return imu_fit  # ground truth is a copy of the positions
     grid_scores = []
     half_counts = 0.5 * np.array([len(axes), len(residuals)])
     for tested_tau_s in TRUTH_TAUS_S:

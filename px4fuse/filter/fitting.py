@@ -44,8 +44,8 @@ START_OUTLIER_FRACTION = 0.005
 START_OUTLIER_WIDTH = 10.0
 # Maximum fraction of outliers
 MAX_OUTLIER_FRACTION = 0.4
-# While outliers are estimated, SIGMA_Z is limited to this multiple of its estimate from the median
-# squared error
+# Maximum ratio of SIGMA_Z to its estimate from the median squared error, while outliers are
+# estimated
 MAX_SIGMA_Z_RATIO = 1.2
 # Expectation maximisation has converged if no outlier probability changes by more than this
 MAX_PROBABILITY_CHANGE = 0.01
@@ -53,11 +53,11 @@ MAX_PROBABILITY_CHANGE = 0.01
 UNCOMPUTABLE_SCORE = 1e6
 # Step of ln σ for numerical derivatives of the log-likelihood
 DERIVATIVE_LOG_STEP = 1e-4
-# Number and distance (in ln σ) of the nodes between which the final likelihood is interpolated
+# Interpolation of the final likelihood: number of nodes, and their distance in ln σ
 LIKELIHOOD_NODES = 10, 0.25
-# Number and distance (in ln σ) of the nodes while the outlier probabilities still change
+# Interpolation while the outlier probabilities still change: number and distance of the nodes
 COARSE_LIKELIHOOD_NODES = 6, 0.2
-# Number of measurements at the start of a long flight that give the initial values of its noise fit
+# A noise fit to a long flight starts with the noises of this number of first measurements
 FIRST_MEASUREMENTS = 2000
 # Precision of a known initial position (1/m²) and velocity (s²/m²): σ of 1 µm and 1 µm/s
 KNOWN_START_PRECISION = 1e12
@@ -111,7 +111,7 @@ class Likelihood:
     sigma_z_m : float
         Approximate SIGMA_Z, which all noises are divided by.
     is_coarse : bool
-        True for a grid with fewer nodes, if an approximate maximum is sufficient.
+        True for fewer nodes, if an approximate maximum is sufficient.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class Likelihood:
         self.is_interpolated = not any(
             positions.added_process_noise.any() for positions in axis_positions
         )
-        self.nodes, self.step = nodes, step = (
+        self.node_count, self.step = node_count, step = (
             COARSE_LIKELIHOOD_NODES if is_coarse else LIKELIHOOD_NODES
         )
 
@@ -141,13 +141,15 @@ class Likelihood:
 
         @cache
         def scores_at_ratio(ratio_index: int, z_index: int) -> Array:
-            scales = np.exp(step * (z_index + np.arange(nodes)))
-            totals = [axis_fit.scores(scales)[:, 0] for axis_fit in fits_at_ratio(ratio_index)]
-            return np.asarray(np.sum(totals, axis=0))
+            scales = np.exp(step * (z_index + np.arange(node_count)))
+            axis_scores = [axis_fit.scores(scales)[:, 0] for axis_fit in fits_at_ratio(ratio_index)]
+            return np.asarray(np.sum(axis_scores, axis=0))
 
         @cache
         def scores_at_nodes(ratio_index: int, z_index: int) -> Array:
-            return np.array([scores_at_ratio(ratio_index + node, z_index) for node in range(nodes)])
+            return np.array(
+                [scores_at_ratio(ratio_index + node, z_index) for node in range(node_count)]
+            )
 
         self._scores_at_nodes = scores_at_nodes
 
@@ -155,13 +157,13 @@ class Likelihood:
         """Return -ln p of the measurements, without a constant."""
         if noises.random_walk_m or noises.correlated_sigma_m or not self.is_interpolated:
             return negative_log_likelihood(self.axis_positions, noises, self.weight)
-        ln_z = log(noises.sigma_z_m) / self.step
-        ln_ratio = log(noises.sigma_a_m_s2) / self.step - ln_z
-        node_offset = (self.nodes - 1) // 2
-        first_ratio = floor(ln_ratio) - node_offset
-        first_z = floor(ln_z) - node_offset
-        ratio_weights = _interpolation_weights(ln_ratio - first_ratio, self.nodes)
-        z_weights = _interpolation_weights(ln_z - first_z, self.nodes)
+        z_node = log(noises.sigma_z_m) / self.step
+        ratio_node = log(noises.sigma_a_m_s2) / self.step - z_node
+        node_offset = (self.node_count - 1) // 2
+        first_ratio = floor(ratio_node) - node_offset
+        first_z = floor(z_node) - node_offset
+        ratio_weights = _interpolation_weights(ratio_node - first_ratio, self.node_count)
+        z_weights = _interpolation_weights(z_node - first_z, self.node_count)
         return float(ratio_weights @ self._scores_at_nodes(first_ratio, first_z) @ z_weights)
 
 
@@ -488,7 +490,7 @@ def _maximise_by_gradient(
     measurement_count = len(likelihood.weight)
 
     def score_per_measurement(logs: Array) -> float:
-        # The score per measurement gives a gradient and a first step of about 1
+        # The division makes gradient and first step about 1
         try:
             return likelihood(to_noises(logs)) / measurement_count
         # If rounding errors dominate, a large value makes L-BFGS-B shorten its step

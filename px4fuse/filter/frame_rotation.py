@@ -49,7 +49,7 @@ MAX_MEASUREMENTS = 1000
 MAX_DRIFT_P_VALUE = 0.002
 # Minimum reported change (°) of the heading error in flight
 MIN_DRIFT_DEG = 5.5
-# Headings are compared only below this yaw rate (°/s), at which a delay of 0.2 s causes 2° error
+# Maximum yaw rate (°/s) for a comparison of headings: a delay of 0.2 s then causes 2° error
 MAX_YAW_RATE_DEG_S = 10.0
 # Minimum σ (°) of a heading difference between source and EKF2
 MIN_SIGMA_DEG = 0.5
@@ -181,7 +181,9 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     )
 
 
-def _mean_per_part(time_s: Array, rotation_rad: Array, sigma_rad: Array) -> tuple[HeadingPart, ...]:
+def _mean_per_part(
+    time_s: Array, misalignment_rad: Array, sigma_rad: Array
+) -> tuple[HeadingPart, ...]:
     """Average yaw misalignment and σ (rad) over flight parts of equal duration.
 
     Parts with fewer than ``MIN_PART_SAMPLES`` samples are omitted. The errors in one part are
@@ -197,7 +199,7 @@ def _mean_per_part(time_s: Array, rotation_rad: Array, sigma_rad: Array) -> tupl
         HeadingPart(
             start_s=float(time_s[part_rows[0]]),
             end_s=float(time_s[part_rows[-1]]),
-            heading_error_deg=float(np.degrees(rotation_rad[part_rows].mean())),
+            heading_error_deg=float(np.degrees(misalignment_rad[part_rows].mean())),
             sigma_deg=float(np.degrees(np.sqrt(np.mean(sigma_rad[part_rows] ** 2)))),
         )
         for part_rows in rows_of_parts
@@ -222,17 +224,17 @@ def _compare_orientations(
     source_yaw_rad = heading_rad(orientation_samples)[is_covered]
     time_s = time_s[is_covered]
     yaw_rad = np.interp(time_s, attitude_time_s, heading_rad(attitude))
-    rotation_rad = source_yaw_rad - yaw_rad
-    rotation_rad -= 2.0 * np.pi * np.round(np.median(rotation_rad) / (2.0 * np.pi))
+    misalignment_rad = source_yaw_rad - yaw_rad
+    misalignment_rad -= 2.0 * np.pi * np.round(np.median(misalignment_rad) / (2.0 * np.pi))
     has_low_yaw_rate = np.abs(np.gradient(yaw_rad, time_s)) < np.radians(MAX_YAW_RATE_DEG_S)
     if np.count_nonzero(has_low_yaw_rate) < MIN_FLIGHT_PARTS * MIN_PART_SAMPLES:
         return None
     time_s = time_s[has_low_yaw_rate]
-    rotation_rad = rotation_rad[has_low_yaw_rate]
+    misalignment_rad = misalignment_rad[has_low_yaw_rate]
     # Robust σ from the median absolute difference of successive samples
-    noise_rad = 1.4826 * np.median(np.abs(np.diff(rotation_rad))) / np.sqrt(2.0)
+    noise_rad = 1.4826 * np.median(np.abs(np.diff(misalignment_rad))) / np.sqrt(2.0)
     sigma_rad = np.full(len(time_s), max(float(noise_rad), np.radians(MIN_SIGMA_DEG)))
-    part_headings = _mean_per_part(time_s, rotation_rad, sigma_rad)
+    part_headings = _mean_per_part(time_s, misalignment_rad, sigma_rad)
     if len(part_headings) < MIN_FLIGHT_PARTS:
         return None
     angles_deg = np.array([heading_part.heading_error_deg for heading_part in part_headings])
@@ -252,14 +254,14 @@ def _estimate_from_positions(
 ) -> HeadingError | Unavailable:
     """Estimate the heading error of each part of the flight from positions and IMU.
 
-    With ``has_constant_heading``, all parts have the same heading error.
+    With ``has_constant_heading``, all parts have equal heading errors.
     """
     time_s = position_samples.index.to_numpy()
     part_length_s = max(POSITION_PART_S, 2 * MIN_SEGMENT_MEASUREMENTS * median_interval(time_s))
     motion_cache = MotionCache()
-    rotation_rad = 0.0
+    misalignment_rad = 0.0
     for _ in range(MAX_LINEARISATIONS):
-        cosine, sine = np.cos(rotation_rad), np.sin(rotation_rad)
+        cosine, sine = np.cos(misalignment_rad), np.sin(misalignment_rad)
         motion = prepare_motion(
             flight,
             time_s,
@@ -284,7 +286,7 @@ def _estimate_from_positions(
                 "Analyse a longer segment.",
             )
         part_positions = motion.positions_at_offset(0.0)
-        # The sensitivity to the heading is the smoothed path: IMU noise in the sensitivity would
+        # The derivative with respect to the heading is the smoothed path: IMU noise in it would
         # bias the estimate towards zero (errors in variables)
         for increments in (part_positions.delta_position_m, part_positions.delta_velocity_m_s):
             north_m, east_m = increments[:, :, -1]
@@ -295,14 +297,14 @@ def _estimate_from_positions(
         fitted_positions = fit_noises([part_positions], noises, motion.weight)
         constants = fitted_positions.constants()[is_long, 0]
         constant_covariance = np.linalg.inv(fitted_positions.information())[is_long, 0]
-        # The sensitivity is from positions, so the result is divided by their estimated scale
+        # The smoothed path has the scale of the positions, so the result is divided by it
         position_scale = np.maximum(1.0 + constants[:, -1], MIN_POSITION_SCALE)
         error_rad = constants[:, HEADING_ERROR_INDEX] / position_scale
         heading_variance = (
             constant_covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX] / position_scale**2
         )
         step_rad, weight_sum = np.average(error_rad, weights=1.0 / heading_variance, returned=True)
-        rotation_rad += float(step_rad)
+        misalignment_rad += float(step_rad)
         if abs(step_rad) < MAX_CONVERGED_CHANGE_RAD:
             break
     difference_rad = error_rad - step_rad
@@ -311,16 +313,16 @@ def _estimate_from_positions(
     drift_variance = 0.0 if has_constant_heading else excess_variance
     # An estimate with a large variance is moved towards the mean (shrinkage)
     drift_fraction = drift_variance / (drift_variance + heading_variance)
-    rotation_rad = float(np.angle(np.exp(1j * rotation_rad)))
-    parts = [
+    misalignment_rad = float(np.angle(np.exp(1j * misalignment_rad)))
+    part_columns = [
         spans_s[is_long],
-        np.degrees(rotation_rad + drift_fraction * difference_rad),
+        np.degrees(misalignment_rad + drift_fraction * difference_rad),
         np.degrees(np.sqrt(1.0 / weight_sum + drift_fraction * heading_variance)),
     ]
     chi_square = float(np.sum(difference_rad**2 / heading_variance))
     has_test = len(heading_variance) > 1 and not has_constant_heading
     return combine_heading_parts(
-        tuple(HeadingPart(*row) for row in np.column_stack(parts).tolist()),
+        tuple(HeadingPart(*row) for row in np.column_stack(part_columns).tolist()),
         float(chdtrc(len(heading_variance) - 1, chi_square)) if has_test else 1.0,
         "positions",
     )

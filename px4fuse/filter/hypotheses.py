@@ -26,7 +26,6 @@ from scipy.special import chdtri
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, cumulative_integral
 from px4fuse.filter.likelihood import (
     Preintegrated,
-    compute_gains,
     innovations,
     integrate_acceleration,
     parabola_vertex,
@@ -54,16 +53,16 @@ SCALE_GRID = np.linspace(0.7, 1.3, 7)
 # Maximum number of times at which a jump of the positions is tested
 MAX_TESTED_TIMES = 800
 # Number of jump times that are tested at once, to limit the memory
-STEP_BATCH_SIZE = 40
+STEP_BATCH_SIZE = 80
 # Positions within this time (s) after a tested jump are ignored: a burst of outliers is no jump
 OUTLIER_BURST_S = 1.0
-# Outliers within this time (s) after a jump are tested again: the jump may have shifted them
+# Outliers within this time (s) after a jump are tested again: they may agree with the jump
 OUTLIERS_AFTER_STEP_S = 6.0
-# Maximum probability of a false detection of a jump, per flight
+# Maximum false alarm probability of a jump, per flight
 MAX_STEP_FALSE_ALARM_P = 1e-3
 # Probability that a good measurement near a jump is classified as an outlier
 MAX_FALSE_OUTLIER_P = 1e-3
-# Maximum number of tested times when a detected jump is located exactly
+# Maximum number of times that are tested to find the exact time of a detected jump
 MAX_CANDIDATE_TIMES = 6
 MAX_JUMPS = 3
 # Minimum accelerometer bias (m/s²) that is reported: half of EKF2_ABL_LIM
@@ -195,9 +194,9 @@ def _fit_sigma_a(
 
 
 def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
-    """Find the minimum of ``score(0)`` to ``score(count - 1)``, which has no second minimum.
+    """Return the index of the only minimum of ``score(0)`` to ``score(count - 1)``.
 
-    The search starts in the middle, because each value takes time.
+    The search starts in the middle, to compute few scores.
     """
     index = count // 2
     direction = 1 if index + 1 < count and score(index + 1) < score(index) else -1
@@ -234,8 +233,8 @@ def _find_jumps(
 ) -> tuple[tuple[Jump, ...], BoolArray]:
     """Detect lasting jumps of the positions; return them in time order, and a mask of outliers.
 
-    A jump is tested at each reset that the source reports, at the most likely time of the flight,
-    and at each first outlier, because the positions after a jump look like outliers.
+    A jump is tested at each reset that the source reports, at the first of successive outliers
+    (positions after a jump look like outliers), and at the most likely time of the flight.
     """
     jumps: list[Jump] = []
 
@@ -316,7 +315,6 @@ def _step_chi_squares(
     whitened_innovations, columns, log_variance_sum = design.whitened_design(sigma_a, is_skipped)
     fit_without_jump = design.regress(whitened_innovations, columns, log_variance_sum, is_skipped)
     columns = columns[:, ~is_skipped]
-    gains = compute_gains(design.signals, sigma_a, design.sigma_z_m, is_skipped)
     chi_squares = np.zeros(len(candidate_times_s))
     for batch in np.array_split(
         np.arange(len(candidate_times_s)), -(-len(candidate_times_s) // STEP_BATCH_SIZE)
@@ -324,7 +322,7 @@ def _step_chi_squares(
         step_signals = unit_steps(design.time_s, candidate_times_s[batch])
         zero_signal = np.broadcast_to(0.0, step_signals.shape)
         step_response = design.whitened(
-            zero_signal, zero_signal, step_signals, sigma_a, is_skipped, gains
+            zero_signal, zero_signal, step_signals, sigma_a, is_skipped
         )[0][~is_skipped]
         for axis_index in range(design.axis_count):
             axis_residual = fit_without_jump.residual[fit_without_jump.axis == axis_index]
@@ -362,7 +360,7 @@ def _locate_jump(
         outliers_by_time[jump_s] = np.where(
             is_near, residual_squares > max_residual_square, is_skipped
         )
-    # A wrong jump time makes outliers of good measurements: the time with fewest outliers is used
+    # With a wrong jump time, good measurements look like outliers: use the time with the fewest
     best_time_s = min(
         outliers_by_time, key=lambda jump_s: np.count_nonzero(outliers_by_time[jump_s])
     )
@@ -448,7 +446,7 @@ class DesignMatrix:
         Timestamps of the measurements.
     signals : Preintegrated
         Four columns for each axis: data, and effects of 1 m/s² forward bias, 1 m/s² right bias and
-        1 rad rotation. Last columns, for all axes: slow acceleration error (hat functions).
+        1 rad rotation. Last columns, for all axes: slow acceleration error (piecewise linear).
     prior_sigma : ndarray, shape (k,)
         Prior σ of the coefficients, except those of jumps.
     step_columns : ndarray, shape (m, j)
@@ -472,19 +470,13 @@ class DesignMatrix:
         return design, first_step_column + step_count * (1 + np.arange(self.axis_count)) - 1
 
     def whitened(
-        self,
-        dp: Array,
-        dv: Array,
-        measured_m: Array,
-        sigma_a: float,
-        is_skipped: BoolArray,
-        gains: Array | None = None,
+        self, dp: Array, dv: Array, measured_m: Array, sigma_a: float, is_skipped: BoolArray
     ) -> tuple[Array, float]:
         """Run KF with k inputs; return ν/√S, shape (m, k), and Σ ln S of the fused measurements."""
         signals = replace(
             self.signals, delta_position_m=dp, delta_velocity_m_s=dv, measurement_m=measured_m
         )
-        nu, s = innovations(signals, sigma_a, self.sigma_z_m, is_skipped, gains)
+        nu, s = innovations(signals, sigma_a, self.sigma_z_m, is_skipped)
         nu /= np.sqrt(s)[:, None]
         return nu, float(np.sum(np.log(s[~is_skipped])))
 
@@ -530,7 +522,7 @@ class DesignMatrix:
         )
 
     def residual_squares(self, sigma_a: float, is_skipped: BoolArray) -> Array:
-        """Return the sum over axes of each measurement's squared normalised residual."""
+        """Return the squared normalised residual of each measurement, summed over the axes."""
         whitened_innovations, columns, log_variance_sum = self.whitened_design(sigma_a, is_skipped)
         design_fit = self.regress(whitened_innovations, columns, log_variance_sum, is_skipped)
         residual = whitened_innovations - columns @ design_fit.coefficients
@@ -643,7 +635,10 @@ def _integrate_signal(integral_m_s: Array, time_s: Array, timeline: Timeline) ->
 
 
 def _common_integrals(attitude: pd.DataFrame, acceleration: Acceleration) -> list[ArrayPair]:
-    """Return time and integrated NED error of 1 m/s² forward bias, right bias, and 1 rad yaw."""
+    """Integrate the NED acceleration error due to 1 m/s² forward or right bias, or 1 rad yaw.
+
+    Return (time, integral) for each of the three errors.
+    """
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
     attitude_time_s = attitude.index.to_numpy()

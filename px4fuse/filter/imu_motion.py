@@ -59,7 +59,7 @@ MAX_OFFSET_S = 0.6
 COARSE_OFFSET_COUNT = 25
 # Approximate number of position measurements in the coarse search for a time offset
 COARSE_MEASUREMENTS = 600
-# Maximum number of array elements for time offsets that are computed at once, to limit the memory
+# Maximum number of array elements in a batch of time offsets, to limit the memory
 MAX_BATCH_ELEMENTS = 2**16
 # Minimum number of position measurements in all segments together
 MIN_MEASUREMENTS = 30
@@ -82,7 +82,7 @@ class SegmentMotion:
 
     ``table`` has the shape (times, 2, 3, 1 + constants): position and velocity, along NED. The last
     dimension contains the motion without errors, then its derivative with respect to each constant.
-    The acceleration is constant between two times.
+    The acceleration is constant between successive times.
     """
 
     time_s: Array
@@ -106,7 +106,9 @@ MotionCache = dict[Span, SegmentMotion]
 
 @dataclass(frozen=True)
 class PreparedMotion:
-    """Position measurements and IMU motion; s segments, m measurements, a axes.
+    """Position measurements, and the motion from the IMU at their times.
+
+    Symbols in shapes: s segments, m measurements, a axes.
 
     Attributes
     ----------
@@ -396,8 +398,8 @@ def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -
 def _large_gyro_bias(step_times_s: Array, angle_rad: Array, attitude: pd.DataFrame) -> Array:
     """Estimate the gyro bias (rad/s) from the logged attitude.
 
-    A bias up to ``MAX_PRIOR_GYRO_BIAS_RAD_S`` is an unknown constant, so zero is returned. Zero is
-    also returned above ``MAX_REMOVED_GYRO_BIAS_RAD_S``, because then the logged attitude is wrong.
+    Zero is returned for a bias up to ``MAX_PRIOR_GYRO_BIAS_RAD_S``, which is fitted later, and
+    above ``MAX_REMOVED_GYRO_BIAS_RAD_S``, because then the logged attitude is wrong.
     """
     samples = rows_between(attitude, step_times_s[0], step_times_s[-1])[Columns.QUATERNION]
     if len(samples) < MIN_KEPT_MEASUREMENTS:

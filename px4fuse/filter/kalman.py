@@ -13,6 +13,7 @@ results are equal to 1e-9.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -97,13 +98,17 @@ def replay(
     )
     time_arrays = timeline.time_s, timeline.time_s[timeline.measurement_index >= 0]
     step_times_s, update_index = (pd.Index(times_s, name="time_s") for times_s in time_arrays)
-    steps = pd.DataFrame(
-        states, index=step_times_s, columns=model.STATE_COLUMNS + model.COVARIANCE_COLUMNS
-    )
+    steps = _make_table(states, step_times_s, model.STATE_COLUMNS + model.COVARIANCE_COLUMNS)
     steps["acceleration_m_s2"] = np.append(timeline.acceleration_m_s2, 0.0)
     steps["input_variance_m2_s4"] = np.append(timeline.input_variance_m2_s4, 0.0)
-    update_table = pd.DataFrame(updates, update_index, UPDATE_COLUMNS)
+    update_table = _make_table(updates, update_index, UPDATE_COLUMNS)
     return Replay(axis, settings, steps, update_table, timeline.input_gap_s)
+
+
+def _make_table(rows: StepRows, index: "pd.Index[float]", columns: list[str]) -> pd.DataFrame:
+    # an array first, because pandas needs twice the time for a list of tuples
+    values = np.fromiter(chain.from_iterable(rows), np.float64, len(rows) * len(columns))
+    return pd.DataFrame(values.reshape(-1, len(columns)), index, columns)
 
 
 def _run_filterpy(

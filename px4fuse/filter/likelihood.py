@@ -34,10 +34,10 @@ from px4fuse.filter.steps import Timeline, make_timeline
 PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
 # Distance in ln σ from the maximum at which the search for the end of a 95 % interval starts
 START_LOG_DISTANCE = 0.05
-# In the likelihood profile of one noise (SIGMA_A), ln σ of the other noise (SIGMA_Z) changes by at
-# most this value between two points
+# Maximum change of ln SIGMA_Z between two points of the likelihood profile of SIGMA_A, or vice
+# versa
 MAX_OTHER_LOG_STEP = 1.0
-# Tolerance of ln σ in the optimisation of the other noise at each point of a likelihood profile
+# Tolerance of ln SIGMA_Z in its optimisation at each point of the profile of SIGMA_A, or vice versa
 OTHER_LOG_TOLERANCE = 2e-3
 
 
@@ -138,7 +138,6 @@ def innovations(
     sigma_a_m_s2: float,
     sigma_z_m: float,
     is_skipped: BoolArray | None = None,
-    variances_and_gains: Array | None = None,
 ) -> ArrayPair:
     """Run KF; return ν (m) and S (m²) of each measurement, shape (m,).
 
@@ -151,12 +150,27 @@ def innovations(
     sigma_a_m_s2, sigma_z_m : float
     is_skipped : ndarray of bool, shape (m,), optional
         True for measurements without update; their innovation is computed.
-    variances_and_gains : ndarray, shape (3, m), optional
-        Result of :func:`compute_gains` with the same arguments, if known.
     """
-    if variances_and_gains is None:
-        variances_and_gains = compute_gains(kf_input, sigma_a_m_s2, sigma_z_m, is_skipped)
-    s, k0, k1 = variances_and_gains
+    q, r = sigma_a_m_s2 * sigma_a_m_s2, sigma_z_m * sigma_z_m
+    covariance: Symmetric[float] = INITIAL_COVARIANCE
+    variances_and_gains = []
+    for dt, unit_process_noise, added_process_noise, skips_update in zip(
+        kf_input.length_s.tolist(),
+        kf_input.unit_process_noise.tolist(),
+        kf_input.added_process_noise.tolist(),
+        [False] * len(kf_input.length_s) if is_skipped is None else is_skipped.tolist(),
+        strict=True,
+    ):
+        p00, p01, p11 = propagate_covariance(covariance, dt)  # P = FPFᵀ + Q
+        covariance = (
+            p00 + q * unit_process_noise[0] + added_process_noise[0],
+            p01 + q * unit_process_noise[1] + added_process_noise[1],
+            p11 + q * unit_process_noise[2] + added_process_noise[2],
+        )
+        (_, s, k0, k1), (_, _, updated) = update_step(0.0, 0.0, covariance, 0.0, r)
+        variances_and_gains.append((s, 0.0, 0.0) if skips_update else (s, k0, k1))
+        covariance = covariance if skips_update else updated
+    s, k0, k1 = np.array(variances_and_gains).T
     # The predicted states solve linear equations with a unit lower band matrix: the predicted state
     # at the next measurement is F(x + K(z - Hx)) + [Δp, Δv]
     dt = kf_input.length_s[1:]
@@ -183,35 +197,6 @@ def innovations(
         overwrite_b=1,
     )
     return np.asarray((measured_m - state[::2].T.reshape(measured_m.shape)).T), s
-
-
-def compute_gains(
-    kf_input: Preintegrated,
-    sigma_a_m_s2: float,
-    sigma_z_m: float,
-    is_skipped: BoolArray | None = None,
-) -> Array:
-    """Return S (m²) and both gains of KF at each measurement; arguments as :func:`innovations`."""
-    q, r = sigma_a_m_s2 * sigma_a_m_s2, sigma_z_m * sigma_z_m
-    covariance: Symmetric[float] = INITIAL_COVARIANCE
-    variances_and_gains = []
-    for dt, unit_process_noise, added_process_noise, skips_update in zip(
-        kf_input.length_s.tolist(),
-        kf_input.unit_process_noise.tolist(),
-        kf_input.added_process_noise.tolist(),
-        [False] * len(kf_input.length_s) if is_skipped is None else is_skipped.tolist(),
-        strict=True,
-    ):
-        p00, p01, p11 = propagate_covariance(covariance, dt)  # P = FPFᵀ + Q
-        covariance = (
-            p00 + q * unit_process_noise[0] + added_process_noise[0],
-            p01 + q * unit_process_noise[1] + added_process_noise[1],
-            p11 + q * unit_process_noise[2] + added_process_noise[2],
-        )
-        (_, s, k0, k1), (_, _, updated) = update_step(0.0, 0.0, covariance, 0.0, r)
-        variances_and_gains.append((s, 0.0, 0.0) if skips_update else (s, k0, k1))
-        covariance = covariance if skips_update else updated
-    return np.array(variances_and_gains).T
 
 
 def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:

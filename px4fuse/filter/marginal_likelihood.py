@@ -35,14 +35,13 @@ from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 UNIT_SCALE = np.ones(1)
 # SIGMA_A (m/s²) and SIGMA_Z (m) with which positions are smoothed to a path
 SMOOTHED_PATH_NOISES = 0.5, 0.1
-# An initial position with a prior precision (1/m²) above this limit is known
+# Minimum prior precision (1/m²) of an initial position that is known
 MIN_KNOWN_START_PRECISION = 1e-3
-# A position noise (σ) is added to Q of each interval, to make a singular Q invertible. This is its
-# ratio to the measurement noise and to √Q₀₀
+# MIN_NOISE_RATIO² · (R + Q₀₀) is added to Q₀₀, to make a singular Q invertible
 MIN_NOISE_RATIO = 1e-5
 # Number of pairs of inputs whose inner products are computed at once, to limit the memory
 INPUT_BATCH_SIZE = 8
-# A determinant of Q below this fraction of the product of its diagonal is a rounding error
+# Minimum ratio |Q| / (Q₀₀ Q₁₁): a smaller determinant is a rounding error
 MIN_Q_DETERMINANT_RATIO = 1e-12
 
 
@@ -450,20 +449,20 @@ class BandedSystem:
         of whitened Δp and Δv, minus that of explained components, plus that of measurements / σ².
         ``measured_m``, shape (..., k, m), contains the measurements of the first k inputs.
         """
-        intervals, right_side = self._interval_sides(measured_m, dp, dv)
+        whitened, right_side = self._whiten_increments(measured_m, dp, dv)
         # A unit diagonal is 30 % faster, because it needs no division in each row
         diagonal = self.cholesky_factor[0]
         unit_factor = self.cholesky_factor / diagonal
         explained, _ = lapack.dtbtrs(unit_factor, right_side.T, uplo="L", diag="U", overwrite_b=1)
-        return intervals, (explained.T / diagonal).reshape(*dp.shape[:-1], -1)
+        return whitened, (explained.T / diagonal).reshape(*dp.shape[:-1], -1)
 
     def solve(self, measured_m: Array, dp: Array, dv: Array) -> Array:
         """Return the estimated states, position and velocity first, shape (..., m, states)."""
-        _, right_side = self._interval_sides(measured_m, dp, dv)
+        _, right_side = self._whiten_increments(measured_m, dp, dv)
         state, _ = lapack.dpbtrs(self.cholesky_factor, right_side.T, lower=1, overwrite_b=1)
         return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.state_count))
 
-    def _interval_sides(self, measured_m: Array, dp: Array, dv: Array) -> ArrayPair:
+    def _whiten_increments(self, measured_m: Array, dp: Array, dv: Array) -> ArrayPair:
         """Return whitened Δp and Δv, and the right-hand side of the normal equations."""
         i00, i01, _ = self.inverse_q
         # Cholesky factor U of Q⁻¹ = UᵀU

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy import constants
 from scipy.spatial.transform import Rotation, Slerp
 
-from px4fuse.core.arrays import Array, BoolArray, cumulative_integral
+from px4fuse.core.arrays import Array, BoolArray, cumulative_integral, row_blocks
 from px4fuse.core.record import Span, one_line_repr
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import (
@@ -37,8 +37,6 @@ MIN_IMU_GAP_INTERVALS = 5.0
 MAX_INDEPENDENT_HZ = 25.0
 # Minimum number of position measurements along an axis
 MIN_MEASUREMENTS = 3
-# Number of IMU samples that are rotated at once, which limits memory
-ROTATED_SAMPLES = 2**15
 
 
 @dataclass(frozen=True)
@@ -177,9 +175,7 @@ def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     body_to_ned = Slerp(attitude.index.to_numpy(), rotations)
     force_m_s2 = imu[Columns.SPECIFIC_FORCE].to_numpy()
     acceleration = np.empty(force_m_s2.shape)
-    # some samples at a time, because scipy's rotations of a long flight need much memory
-    for first_row in range(0, len(imu), ROTATED_SAMPLES):
-        rows = slice(first_row, first_row + ROTATED_SAMPLES)
+    for rows in row_blocks(len(imu)):
         rotation = body_to_ned(imu.index.to_numpy()[rows])
         acceleration[rows] = rotation.apply(force_m_s2[rows].astype(np.float64))
     acceleration[:, 2] += constants.g

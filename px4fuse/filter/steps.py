@@ -61,8 +61,8 @@ def make_timeline(
     grid_s = start_s + settings.dt_s * np.arange(grid_count)
     # Multiples of DT at which there is a measurement are omitted
     next_index = np.searchsorted(measurement_time_s, grid_s)
-    neighbours = np.clip([next_index - 1, next_index], 0, len(measurement_time_s) - 1)
-    distance_s = np.abs(measurement_time_s[neighbours] - grid_s).min(axis=0)
+    neighbour_indices = np.clip([next_index - 1, next_index], 0, len(measurement_time_s) - 1)
+    distance_s = np.abs(measurement_time_s[neighbour_indices] - grid_s).min(axis=0)
     time_s = np.union1d(grid_s[distance_s > MAX_SAME_TIME_S], measurement_time_s)
     if time_s[0] > start_s + MAX_SAME_TIME_S:
         time_s = np.append(start_s, time_s)

@@ -43,7 +43,7 @@ CURVE_OFFSET_COUNT = 121
 GNSS_HEADING_SIGMA_RAD = 0.2
 # Maximum half-width (s) of the 95 % interval of an accepted time offset
 MAX_HALF_INTERVAL_S = 0.15
-# Flight parts whose time offset has a larger σ (s) are not used to test for a change
+# Maximum σ (s) of the time offset of a flight part in the test for a change
 MAX_PART_OFFSET_SIGMA_S = 0.15
 # The time offset changes in flight if the p-value of a constant offset is below this limit
 MAX_CHANGE_P_VALUE = 0.005
@@ -235,9 +235,9 @@ def estimate_time_offset(
 def _profile(
     motion: PreparedMotion, noises: Noises, offset_s: float, half_width_s: float, drop: float
 ) -> tuple[Array, Array, float | None, float | None]:
-    """Return offsets (s), their -ln p, and the two offsets (s) at which -ln p rises by ``drop``.
+    """Return offsets (s), their -ln p, and both ends (s) of the interval around the minimum.
 
-    The range of offsets around ``offset_s`` is doubled until it contains both; else None.
+    At the ends, -ln p exceeds its minimum by ``drop``; None for an end outside the search range.
     """
     while True:
         node_offsets_s, curve_s = (

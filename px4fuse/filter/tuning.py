@@ -47,8 +47,7 @@ MAX_OUTLIER_FRACTION = 0.3
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value of the random walk (m/√s) of a source that may drift
 START_RANDOM_WALK_M = 0.02
-# If the ratio of a noise estimate to an end of its search range is smaller, the estimate is only a
-# bound
+# Maximum ratio of a noise estimate to an end of its search range at which it is only a bound
 MAX_SEARCH_END_RATIO = 1.001
 
 
@@ -175,25 +174,24 @@ def tune(
     motion_cache : dict, optional
         IMU motion that several estimates share.
     """
-    groups: dict[str, tuple[Axis, ...]] = {axis.name: (axis,) for axis in axes}
-    if {"north", "east"} <= groups.keys():
-        horizontal_axes = (*groups["north"], *groups["east"])
+    axes_by_name: dict[str, tuple[Axis, ...]] = {axis.name: (axis,) for axis in axes}
+    if {"north", "east"} <= axes_by_name.keys():
+        horizontal_axes = (*axes_by_name["north"], *axes_by_name["east"])
         if np.array_equal(
             horizontal_axes[0].measurement_time_s, horizontal_axes[1].measurement_time_s
         ):
-            groups[HORIZONTAL] = horizontal_axes
+            axes_by_name[HORIZONTAL] = horizontal_axes
     tunings = {}
     motion_cache = {} if motion_cache is None else motion_cache
-    for name, group_axes in groups.items():
+    for name, group_axes in axes_by_name.items():
         if names is None or name in names:
             progress(name)
             try:
                 tunings[name] = tune_axes(
                     name, group_axes, settings, flight, may_drift, motion_cache
                 )
-            except (
-                np.linalg.LinAlgError
-            ) as error:  # rounding errors due to positions far from the path
+            except np.linalg.LinAlgError as error:
+                # Positions far from the path cause rounding errors
                 tunings[name] = Unavailable(
                     f"estimate of the noises ({name})",
                     str(error),

@@ -3,7 +3,13 @@
 import math
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.remedy import aid_of, different_settings, format_settings, noise_used_m
+from px4fuse.comparison.remedy import (
+    aid_of,
+    different_settings,
+    format_settings,
+    height_noise_advice,
+    noise_used_m,
+)
 from px4fuse.comparison.trials import Trial, find_trial, sigma_ratio_changes
 from px4fuse.core.text import format_factor
 from px4fuse.filter.consistency import classify_sigma_ratio
@@ -77,7 +83,8 @@ def detect(analysis: Analysis) -> Findings:
         f"{title}. {name} is {flown_m:.3g} m{source_text}; the maximum-likelihood estimate is "
         f"{estimate_m:.3g} m{interval_text}. "
         f"{reason}{f' KF takes SIGMA_Z from {aid.noise}.' if has_kf_same_noise else ''}",
-        f"Set {format_settings(different_settings(trial.change, inputs.settings))}{report_text}.",
+        f"Set {format_settings(different_settings(trial.change, inputs.settings))}{report_text}."
+        f"{height_noise_advice(analysis, analysis.tuning, estimate_m)}",
         {
             "flown_m": flown_m,
             "estimate_m": estimate_m,

@@ -77,7 +77,10 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
     other_findings = [
         item
         for item in findings
-        if item not in root_findings and CATALOGUE[item.id].after_wrong_convention != "withdrawn"
+        if item not in root_findings
+        and CATALOGUE[item.id].after_wrong_convention != "withdrawn"
+        # a drifting clock has no constant time offset
+        and not (faults.clock_drift and item.id == "source_time_offset")
     ]
     if faults.is_ambiguous and not unusable_findings:
         return [

@@ -19,6 +19,7 @@ from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.model import Findings, error, note, source_words, warning
 from px4fuse.findings.source_intervals import describe_errors_after_gap
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_phrase, source_name
+from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
 # Minimum rounding step (m) to report it: the error of smaller steps is below the noise of UWB
 MIN_ROUNDING_STEP_M = 0.05
@@ -62,6 +63,11 @@ INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
         "source_without_position",
         "{positions} are more than 10 km from the other positions: another origin, or no fix",
         "",
+    ),
+    "no fix": (
+        "source_without_position",
+        "{positions} have no 3D fix",
+        NO_FIX_ACTION,
     ),
     "NaN": (
         "source_without_position",

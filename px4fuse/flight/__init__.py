@@ -1,1 +1,1 @@
-"""Records of a recorded flight: its sensors, position sources and EKF2's topics."""
+"""Data classes for the content of a flight log: IMU, position sources, EKF2 and ground truth."""

@@ -32,7 +32,7 @@ class Aid:
     noise_mode: str = ""
     # Parameters for the position of the sensor (m, FRD)
     lever_arm: tuple[str, ...] = ()
-    # Printed name
+    # Name in reports
     label: str = ""
     # Unit of the innovations
     unit: str = "m"
@@ -59,7 +59,7 @@ class Aid:
         return frozenset((self.noise, self.gate, self.delay, self.noise_mode))
 
     def logged_parameters(self, logged_values: Mapping[str, float]) -> dict[str, float]:
-        """Return the logged noise, delay, gate and activation parameters of this aiding source."""
+        """Return the logged parameters for noise, delay, gate and fusion of this aiding source."""
         names = (self.noise, self.delay, self.gate, self.noise_mode, self.switch, AID_MASK)
         return {name: float(logged_values[name]) for name in names if name in logged_values}
 
@@ -139,9 +139,9 @@ def effective_settings(
 ) -> dict[str, float]:
     """Return all parameters of the EKF2 model: the logged value or, if not logged, PX4's default.
 
-    Parameters of aiding sources that are not given are omitted.
+    Parameters of aiding sources other than ``aid`` and ``other_aids`` are omitted.
     """
-    # aiding sources of one sensor have the same switch, such as position and velocity of GNSS
+    # Aiding sources of one sensor, such as GNSS position and velocity, have one fusion switch
     used_switches = {fused_aid.switch for fused_aid in (aid, *other_aids)}
     excluded_names = {
         name

@@ -51,6 +51,7 @@ class Origin(Record):
     # Kind of device, inferred from the data: "vio" sends a changing orientation, "uwb" only noisy
     # positions, "unknown" only precise positions
     kind: PositionKind
+    # Route of the positions into the log (not a file path)
     path: DataPath
     # Aiding source of EKF2 for these positions; None if EKF2 never fuses them
     aid: Aid | None
@@ -295,8 +296,8 @@ TableOrUnavailable = pd.DataFrame | Unavailable
 StepFunctions: TypeAlias = "Mapping[str, pd.Series[float]]"
 # Intervals (start, end) in s of flight time
 Spans = tuple[Span, ...]
-# Minimum fraction of sample intervals up to three median intervals; below it, the samples arrive
-# in bursts
+# Minimum fraction of sample intervals that are at most three median intervals. Below it, the
+# samples arrive in bursts
 MIN_REGULAR_FRACTION = 0.8
 # Values of ClockMap.method for which the timestamps are not times of measurement
 ARRIVAL_METHODS = ("arrival time", "receive time", "message order")
@@ -513,7 +514,7 @@ def positions_phrase(source: PositionTrack) -> str:
 
 @dataclass(frozen=True)
 class Reset:
-    """Reset of EKF2's published state: the new state is the old one plus ``delta``.
+    """Reset of EKF2's published state: ``delta`` is added to the state.
 
     Attributes
     ----------

@@ -19,11 +19,11 @@
     return node;
   };
 
+  const isNumeric = columns.map(([, kind]) => ["number", "rank", "ratio"].includes(kind));
   const entries = rows.map(([cells, tags, details, beside], index) => ({
     index, cells, tags: new Set(tags), details, beside, open: false,
     searchText: fold(cells.map(([text, , below]) => [text, below]).join("\n")),
-    values: cells.map(([text = "", value = ""]) =>
-      (value === "" ? null : value === true ? text : value)),
+    values: cells.map(([text, value], column) => isNumeric[column] ? value : text || null),
   }));
   let order = entries, matches = entries, firstShown = 0, current = null;
 
@@ -34,7 +34,7 @@
   const prose = (text) => makeIsolated("p", text, "notes");
   const pairs = (rows) => fill(make("dl"),
     rows.flatMap(([title, value]) => [make("dt", title), makeIsolated("dd", value)]));
-  const table = (heads, rows, numeric) => {
+  const table = (rows, heads, numeric) => {
     const node = make("table"), alignment = (column) => numeric.includes(column) ? "n" : "";
     fill(node.createTHead().insertRow(), heads.map((title, column) =>
       make("th", title, { className: alignment(column), scope: "col" })));
@@ -105,14 +105,14 @@
   const nameColumn = Math.max(columns.findIndex(([, kind]) => kind === "name"), 0);
   const classes = (kind, visibleFrom, group) =>
     `${{ number: "n", line: "line", full: "full", ratio: "ratio" }[kind] ?? ""} ${visibleFrom} ${group && `g-${group}`}`;
-  const cell = ([text = "", cellValue = "", below = "", style = ""], column) => {
+  const cell = ([text, value, below, style], column) => {
     const [, kind, group, visibleFrom] = columns[column];
     const hasStyle = style === "flags" || ["ratio", "full"].includes(kind);
     const node = make(column === nameColumn ? "th" : "td", "",
       `${classes(kind, visibleFrom, group)} ${hasStyle ? style : ""}`);
     if (style === "flags") node.append(list(text ? text.split("\n") : []));
     else if (text) {
-      node.append(...kind === "ratio" ? [ratioMark(Number(cellValue), style.split(" ")[1]), make("span", text)]
+      node.append(...kind === "ratio" ? [ratioMark(value, style.split(" ")[1]), make("span", text)]
         : [style && kind !== "full" ? make("span", text, `chip ${style}`) : makeIsolated("span", text)]);
     }
     if (below) node.append(makeIsolated("span", below, "file"));
@@ -184,12 +184,11 @@
     const isAscending = heads[column].ariaSort !== "ascending", sign = isAscending ? 1 : -1;
     for (const head of heads) head.ariaSort = "none";
     heads[column].ariaSort = isAscending ? "ascending" : "descending";
-    const isNumeric = ["number", "rank", "ratio"].includes(columns[column][1]);
     order = order.slice().sort((one, other) => {
       const a = one.values[column], b = other.values[column];
       // rows without a value are last in both sort directions
       if (a === null || b === null) return (a === null) - (b === null);
-      return sign * (isNumeric ? a - b : collator.compare(a, b));
+      return sign * (isNumeric[column] ? a - b : collator.compare(a, b));
     });
     filter();
   };
@@ -239,7 +238,7 @@
   };
 
   const KEYS = {
-    j: () => step(1), n: () => step(1), k: () => step(-1), p: () => step(-1),
+    n: () => step(1), p: () => step(-1),
     "/": () => $("text").focus(),
     Escape: () => {
       if (current) unfold(current, false);
@@ -275,7 +274,6 @@
     box.addEventListener("change", groups);
   }
   addEventListener("resize", fit);
-  document.documentElement.classList.add("live");
   for (const node of queryAll(".controls, .keys")) node.hidden = false;
   frame.prepend(listTable);
   filter();

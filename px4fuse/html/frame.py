@@ -3,16 +3,14 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from px4fuse.html.safe import clean_values, csp_hash, inert_json, load_template, read_asset
 
 MAX_PAGE_ROWS = 100  # maximum number of rows on one page of the table
-MAX_PLAIN_ROWS = 300  # maximum number of rows of the plain table, for browsers without scripts
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """Column of the table.
 
     Attributes
@@ -32,18 +30,13 @@ class Column:
     visible_from: Literal["always", "tablet", "desk"] = "always"
 
 
-@dataclass(frozen=True)
-class Cell:
-    """Cell of the table: text, second line ``below``, and sort key ``value``."""
+class Cell(NamedTuple):
+    """Cell of the table: text, second line ``below``, sort key ``value`` of a numeric column."""
 
     text: str = ""
-    value: float | str | None = None
+    value: float | None = None
     below: str = ""
     style_class: str = ""
-
-
-def text_cell(text: str, text_below: str = "") -> Cell:
-    return Cell(text, text or None, text_below)
 
 
 def number_cell(
@@ -92,11 +85,11 @@ def name_value_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
 
 def table_section(
     title: str,
-    column_titles: Sequence[str],
     rows: Sequence[Sequence[str]],
+    column_titles: Sequence[str],
     numeric_columns: Sequence[int] = (),
 ) -> Section:
-    return ["table", title, column_titles, rows, list(numeric_columns)]
+    return ["table", title, rows, column_titles, list(numeric_columns)]
 
 
 def links_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
@@ -158,10 +151,10 @@ def page(
     style = "".join(map(read_asset, ("colours.css", "base.css", "frame.css")))
     script = "".join(map(read_asset, ("dom.js", "frame.js")))
     page_data = {
-        "columns": [(c.title, c.kind, c.group, c.visible_from) for c in columns],
+        "columns": columns,
         "rows": [
             (
-                [_compact_cell(cell) for cell in row.cells],
+                row.cells,
                 row.tags,
                 *(
                     [section for section in column_sections if section[2]]
@@ -186,18 +179,6 @@ def page(
         filters=filters,
         groups=groups,
         row_nouns=row_nouns,
-        columns=columns,
-        rows=rows,
-        plain_rows=MAX_PLAIN_ROWS,
         full_table_note=full_table_note,
         content=inert_json(clean_values(page_data)),
     )
-
-
-def _compact_cell(cell: Cell) -> list[Any]:
-    # to keep the page small, True replaces a sort key that equals the text
-    value = True if cell.value == cell.text else "" if cell.value is None else cell.value
-    cell_fields = [cell.text, value, cell.below, cell.style_class]
-    while cell_fields and cell_fields[-1] == "":
-        cell_fields.pop()
-    return cell_fields

@@ -259,15 +259,13 @@ def _make_logged_data(
     if isinstance(data, pd.DataFrame):
         data_fields["samples"] = len(data)
         times_s = data.index.tolist()
+        if len(data) > 1:
+            data_fields["rate_hz"] = sample_rate(data)
+            data_fields["gaps"] = _measure_gaps(data, is_imu=part == DATA_LABELS["imu"])
     else:
         times_s = [time_s for span in data for time_s in span]
     if times_s:
         data_fields |= {"start_s": times_s[0], "end_s": times_s[-1]}
-    if isinstance(data, pd.DataFrame) and len(data) > 1:
-        data_fields |= {
-            "rate_hz": sample_rate(data),
-            "gaps": _measure_gaps(data, is_imu=part == DATA_LABELS["imu"]),
-        }
     return LoggedData(part, **data_fields)
 
 

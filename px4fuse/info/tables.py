@@ -4,8 +4,8 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from io import StringIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -114,7 +114,7 @@ def description(flight: Flight) -> dict[str, Any]:
 @cache
 def _read_column_descriptions() -> pd.DataFrame:
     """Read the descriptions of all columns (columns.csv), indexed by table name."""
-    csv_lines = files("px4fuse.info").joinpath("columns.csv").read_text("utf-8").splitlines()
+    csv_lines = Path(__file__).with_name("columns.csv").read_text("utf-8").splitlines()
     for placeholder, names in PLACEHOLDER_NAMES.items():
         csv_lines = [
             line.replace(placeholder, name)

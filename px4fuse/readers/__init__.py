@@ -10,7 +10,7 @@ from px4fuse.readers.text_table import refuse_foreign_format
 # Number of bytes at the start of a file that are read to detect its format
 _FORMAT_BYTES = 100
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
-# Text files that users give instead of a flight log: suffixes, kind of file and advice
+# Text files that users give by mistake instead of a flight log: suffixes, format and advice
 _TEXT_FILES = {
     (".csv", ".tsv", ".jsonl"): (
         "table",
@@ -29,8 +29,8 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     Parameters
     ----------
     path : str or Path
-        A PX4 ULog (``.ulg``) or a MAVLink recording (``.tlog`` or a raw stream); gzip or zstd may
-        have compressed it.
+        A PX4 ULog (``.ulg``) or a MAVLink recording (``.tlog`` or a raw stream), possibly
+        compressed with gzip or zstd.
     system : int, optional
         MAVLink system id of the vehicle; by default the autopilot with the most messages.
 

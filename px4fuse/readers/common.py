@@ -12,25 +12,23 @@ MAX_VALID_VALUE = 1e9
 # Maximum absolute value (m/s², rad/s) of valid IMU data: above the range of accelerometers (400 g)
 # and gyros (4000 °/s)
 MAX_IMU_VALUE = 1e4
-# A position 0, 0, 0 is rejected if it is farther than this distance (m) from the previous and the
-# next position: 3 σ of accurate UWB (0.1 m)
+# Minimum distance (m) of a rejected position 0, 0, 0 from the previous and the next position: 3 σ
+# of accurate UWB (0.1 m)
 MIN_ZERO_DISTANCE_M = 0.3
-# A position is rejected as damaged if it is farther than this distance (m) from the median position
+# Minimum distance (m) of a damaged position from the median position
 MIN_FAR_DISTANCE_M = 1e4
-# The distance of a damaged position from the median position also exceeds this multiple of the
-# median distance
+# Minimum ratio of the distance of a damaged position to the median distance of all positions
 MIN_FAR_DISTANCE_RATIO = 100.0
-# Equal positions are rejected as frozen if they last at least this time (s): some sources send each
-# position several times within a shorter time
+# Minimum duration (s) of equal positions that are rejected as frozen: some sources repeat each
+# position for a shorter time
 MIN_FROZEN_S = 1.0
 # Minimum number of successive equal positions that are rejected as frozen
 MIN_FROZEN_COUNT = 5
-# If a larger fraction of the positions is frozen, none is rejected: the vehicle may be at rest
+# Maximum fraction of frozen positions. With more, none is rejected: the vehicle may be at rest
 MAX_FROZEN_FRACTION = 0.5
-# Maximum probability that a source which repeats positions at random has a run of equal positions
-# that is rejected as frozen
+# Maximum probability that positions which a source repeats at random are rejected as frozen
 MAX_RANDOM_RUN_PROBABILITY = 0.01
-# Maximum distance of a coordinate difference from a whole number of rounding steps, in steps
+# Maximum distance of coordinate difference / rounding step from a whole number
 MAX_STEP_ERROR = 0.01
 # Minimum norm of a valid quaternion: senders without attitude send zeros
 MIN_QUATERNION_NORM = 0.5
@@ -89,8 +87,10 @@ def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[s
     measured_rows, zero_rows = np.flatnonzero(is_number & ~is_zero), np.flatnonzero(is_zero)
     if len(measured_rows):
         next_index = np.searchsorted(measured_rows, zero_rows)
-        neighbours = measured_rows[np.clip([next_index - 1, next_index], 0, len(measured_rows) - 1)]
-        distance_m = np.linalg.norm(values[neighbours], axis=2).min(axis=0)
+        neighbour_rows = measured_rows[
+            np.clip([next_index - 1, next_index], 0, len(measured_rows) - 1)
+        ]
+        distance_m = np.linalg.norm(values[neighbour_rows], axis=2).min(axis=0)
         reasons.iloc[zero_rows[distance_m > MIN_ZERO_DISTANCE_M]] = "zero"
     valid_rows = np.flatnonzero(reasons == "")
     if len(valid_rows):

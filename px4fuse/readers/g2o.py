@@ -30,8 +30,8 @@ _FORMAT_REMEDY = (
 _VERTEX_ID = re.compile("[+-]?[0-9]{1,19}")
 # Maximum vertex id: GTSAM writes 64-bit symbols, such as 6989586621679009792 for a0
 _MAX_VERTEX_ID = 2**63 - 1
-# A negative eigenvalue of an information matrix is accepted as a rounding error if its ratio to the
-# largest eigenvalue is below this limit
+# A negative eigenvalue λ of an information matrix is a rounding error if |λ| is below this fraction
+# of the largest eigenvalue
 _EIGENVALUE_TOLERANCE = 1e-9
 # Minimum and maximum valid element (1/m², 1/rad²) of an information matrix: the product of two
 # elements neither overflows nor becomes zero
@@ -164,7 +164,7 @@ def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
 
 
 def _parse_rows(rows: Rows, tag: str) -> tuple[IntArray, Array]:
-    """Return the numbers of all lines with one tag, and the vertex ids, shape (n, 1 or 2)."""
+    """Return vertex ids, shape (n, 1 or 2), and the numbers after them, of all lines of a tag."""
     vertex_count, value_count = _COUNTS_BY_TAG[tag]
     cells, numbers = rows.parse(1 + vertex_count, value_count)
     is_invalid_id = [

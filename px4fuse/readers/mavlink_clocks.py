@@ -34,7 +34,7 @@ MAX_RELATIVE_RATE_DIFFERENCE = 0.01
 # Maximum valid ratio of the rates of two clocks: a wrong unit of time gives up to 1e9 (s for ns)
 MAX_RATE_RATIO = 1e12
 MIN_TIMESYNC_PAIRS = 3
-# Minimum fraction of distinct timestamps; with fewer distinct timestamps, a clock does not run
+# Minimum fraction of distinct timestamps of a running clock
 MIN_DISTINCT_FRACTION = 0.1
 # Maximum regular interval (s) between positions: a longer interval is a gap
 MAX_REGULAR_INTERVAL_S = 1.0
@@ -66,7 +66,7 @@ class ClockLine:
 
 
 def fit_least_delay(x: Array, y: Array) -> ClockLine:
-    """Fit a line to clock readings (s), of which y is read after x with an unknown delay.
+    """Fit a line to clock readings x and y (s); y is read after x, with an unknown delay.
 
     The pairs x, y with the least delay determine the line. Its slope is 1 if the time span is too
     short to estimate a drift.
@@ -128,7 +128,7 @@ def robust_std(values: Array) -> float:
 class ClockMapping:
     """Conversion of a sender's timestamps to the autopilot's boot clock, with its description.
 
-    ``sender_to_boot`` is None if receive times replace the timestamps, most of which are equal.
+    ``sender_to_boot`` is None if most timestamps are equal: receive times then replace them.
     """
 
     sender_to_boot: ClockLine | None

@@ -56,7 +56,7 @@ _CRC_EXTRA = np.full(
     max(1 << 16, *(number + 1 for number in dialect.mavlink_map)), -1, dtype=np.int16
 )
 _CRC_EXTRA[[*dialect.mavlink_map]] = [message.crc_extra for message in dialect.mavlink_map.values()]
-# CRC of each possible byte, with which the byte CRC_EXTRA is appended to the CRC of a frame
+# CRC of each byte value, to append the byte CRC_EXTRA to the CRC of a frame
 _BYTE_CHECKSUMS = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], dtype=np.uint16)
 
 

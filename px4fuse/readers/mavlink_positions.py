@@ -20,8 +20,8 @@ from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recordi
 from px4fuse.readers.mavlink_senders import senders_of
 from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unproject
 
-# GNSS timestamps are not boot time if their median difference from the receive time since boot
-# exceeds this time (s)
+# Maximum median difference (s) between GNSS timestamps in boot time and their receive times. If the
+# difference is larger, the timestamps are not boot time
 MAX_BOOT_CLOCK_DISTANCE_S = 5.0
 # Maximum time difference (s) of the global and local position from which the origin of the local
 # frame is computed; at 1 m/s, the error of the origin is 5 cm

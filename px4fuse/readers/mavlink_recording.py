@@ -36,14 +36,14 @@ MIN_RESTART_STEP_S = 5.0
 # Number of messages before and after a backward step of the boot clock that have to confirm a
 # restart
 RESTART_CHECK_MESSAGES = 20
-# Timestamps between two gaps are damaged if their number is below this fraction of the largest
-# number of timestamps between two gaps
+# A group of timestamps between two gaps is damaged if its size is below this fraction of the size
+# of the largest group
 MIN_GROUP_FRACTION = 0.01
 # Maximum distance (s) of a valid timestamp from the analysed time span, or from the next timestamp
 MAX_OUTSIDE_S = 60.0
 # A file is damaged if a larger fraction of its bytes is outside of MAVLink frames
 MAX_STRAY_BYTE_FRACTION = 0.002
-# Minimum number of timestamps to conclude from mostly equal timestamps that the clock does not run
+# Minimum number of mostly equal timestamps which show that the clock does not run
 MIN_CONSTANT_TIMESTAMPS = 10
 
 

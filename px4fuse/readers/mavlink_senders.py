@@ -23,7 +23,7 @@ from px4fuse.readers.mavlink_recording import MIN_RESTART_STEP_S, Recording, map
 MAX_SENDERS = 32
 # Maximum fraction of lost messages: above it, the sender does not number its messages in sequence
 MAX_LOST_FRACTION = 0.9
-# Maximum number of later messages of a sender that may arrive before a message, on a faster link
+# Maximum number of later messages of a sender that overtake a message, on a faster link
 MAX_LATE_MESSAGES = 16
 # Maximum difference (s) of TIMESYNC timestamps from a sender's position timestamps: a larger
 # difference shows another clock
@@ -181,7 +181,7 @@ def _map_sender_clock(
 
 
 def _requests_of_other_senders(recording: Recording, sender: Address) -> Int64Array:
-    """Return the request times (ns) in TIMESYNC of all senders except ``sender``: field ``ts1``."""
+    """Return the TIMESYNC request times ``ts1`` (ns) of all senders except ``sender``."""
     frames = recording.frames
     rows = frames.rows("TIMESYNC")
     timesync = frames.table("TIMESYNC", rows[~frames.sent_by(sender, rows)])

@@ -44,7 +44,7 @@ from px4fuse.readers.ulog_topics import longest_increasing_run
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
 SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 
-# A column of UWB tag numbers has at most this number of different values; a counter has more
+# Maximum number of UWB tags in a column; a column with more different values is a counter
 MAX_TAGS = 100
 MIN_USABLE_ROWS = 3
 # Minimum fraction of rows with increasing times in a time column, or with whole seconds if another
@@ -58,7 +58,7 @@ MAX_INTERVAL_S = 1.1 / 0.2
 POSITION_TIME_LIMITS = tuple(TIME_UNITS), (MIN_INTERVAL_S, MAX_INTERVAL_S)
 # Plausible units of the timestamps of trajectories, and plausible median intervals (s)
 TRAJECTORY_TIME_LIMITS = ("s", "ns"), (1e-3, 1e3)
-# Timestamps with a longer median interval (s) are not UNIX times in seconds, but boot times in µs
+# Maximum median interval (s) of UNIX times in seconds. With a longer one, they are boot times in µs
 MAX_UNIX_TIME_INTERVAL_S = 60.0
 # Maximum extent (m) of an indoor flight. Positions with a larger extent are probably in mm
 MAX_INDOOR_EXTENT_M = 200.0
@@ -389,7 +389,7 @@ def _choose_columns(
     given_columns: list[int],
     numbers: pd.DataFrame,
 ) -> tuple[int, _Columns, _Columns, str | None, str]:
-    """Choose the columns of time, position and sigma; return also the frame and a text on the time.
+    """Choose the columns of time, position and sigma; return also frame and text of the time.
 
     A column with the time of measurement is preferred to the time of recording.
     """

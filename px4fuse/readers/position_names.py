@@ -29,8 +29,8 @@ TIME_KINDS = ["time of measurement", "time", "time of recording"]
 _JOINED_NAMES = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
 # Quaternion components, such as "qx", "q_RS_w []" and "pose.orientation.x"
 _QUATERNION_NAME = re.compile(r"(?:\bq|orientation|rotation|quat)(?:\w*_|[ .])?([wxyz])\b")
-# Coordinate frame and names of its axes. The first frame is used of which the file has columns for
-# both horizontal axes
+# Coordinate frames with the names of their axes. The first frame is used of which the file has both
+# horizontal axes
 _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
     ("ned", ("north", "east", "down")),
     ("enu", ("east", "north", "up")),

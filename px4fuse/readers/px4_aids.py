@@ -54,7 +54,7 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
 
 
 def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
-    """Read for each aiding source the times at which EKF2 enables its fusion: 1, otherwise 0.
+    """Return a time series for each aiding source: 1 while EKF2 enables its fusion, otherwise 0.
 
     The flags are in ``estimator_status_flags``; in older logs, in the control bits of
     ``estimator_status``.

@@ -216,7 +216,7 @@ def _prediction_interval_s(topics: Topics) -> float:
 
 
 def rows_of_timestamps(times_s: Array, wanted_times_s: ArrayLike) -> IntArray:
-    """Return the indices of the increasing ``times_s`` in ``wanted_times_s``, compared in µs."""
+    """Return the indices of ``times_s`` (increasing) that ``wanted_times_s`` contains, to 1 µs."""
     times_us, wanted_us = (
         np.rint(np.asarray(times, float) * 1e6) for times in (times_s, wanted_times_s)
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -54,12 +55,12 @@ MIN_ARRIVAL_FRACTION = 0.9
 # Maximum time difference (s) between a height and the horizontal position to which it is joined:
 # at a climb rate of 0.5 m/s, the height error is 2.5 cm
 MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
-# If the logged GNSS rate (Hz) is lower, the logger dropped fixes: receivers send 5 to 20 Hz
+# Maximum GNSS rate (Hz) of a log without some of the fixes: receivers send 5 to 20 Hz
 MAX_DOWNSAMPLED_HZ = 4.0
 STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
 # Length (µs) of each possible unit of timestamps
 STAMP_UNITS = {"microseconds": 1.0, "milliseconds": 1e3, "seconds": 1e6, "nanoseconds": 1e-3}
-# Maximum relative difference of a clock's rate from the boot clock to recognise its unit
+# A clock has a unit if its rate in this unit differs by less than this fraction from the boot clock
 MAX_RATE_ERROR = 0.05
 AUTOPILOT_CLOCK = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude in degrees, optionally altitude in m
@@ -113,7 +114,7 @@ def make_track(
     remedy: str = "",
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
-    """Make a position track from the valid samples, or its reason if there are fewer than three.
+    """Make a position track from the valid samples; with fewer than three, return the reason.
 
     Parameters
     ----------
@@ -414,9 +415,10 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     if layout is None:
         return unavailable_source(px4.GPS_POSITION)
     fixes = topics.read_instance(layout)
-    message_count = len(fixes)
+    message_count, no_fix = len(fixes), fixes.iloc[:0]
     if "fix_type" in fixes:
-        fixes = fixes[fixes["fix_type"] >= FIX_TYPE_3D]
+        has_fix = fixes["fix_type"] >= FIX_TYPE_3D
+        fixes, no_fix = fixes[has_fix], fixes[~has_fix]
     if fixes.empty:
         return unavailable_source(
             px4.GPS_POSITION,
@@ -461,7 +463,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     # Since v1.17, the lever arm of each receiver is logged
     if {*px4.ANTENNA_COLUMNS} <= {*fixes}:
         track_fields["lever_arm_m"] = tuple(fixes[px4.ANTENNA_COLUMNS].iloc[-1].tolist())
-    return _make_ulog_track(
+    track = _make_ulog_track(
         topics,
         px4.GPS_POSITION,
         samples,
@@ -473,6 +475,10 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         is_automatic=has_fused_aid(ekf2),
         **track_fields,
     )
+    if isinstance(track, Unavailable):
+        return track
+    no_fix_s = (no_fix["published_us"].to_numpy() - topics.zero_us) * 1e-6 - delay_ms * 1e-3
+    return replace(track, invalid=pd.Series("no fix", time_index(no_fix_s), dtype=object))
 
 
 def _gnss_samples(fixes: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
@@ -543,8 +549,8 @@ def read_truth(
 def motion_capture_truth(positions: tuple[PositionTrack, ...]) -> Truth | None:
     """Return motion capture as ground truth, or None if EKF2 may have fused it.
 
-    EKF2 may have fused motion capture if the log contains no external vision. The
-    north of positions in FRD is unknown.
+    EKF2 may have fused it if the log contains no external vision. Motion capture in FRD is not
+    used, because its north is unknown.
     """
     tracks = (track for track in positions if track.origin.kind == "mocap")
     track = next((track for track in tracks if track.frame != "FRD"), None)

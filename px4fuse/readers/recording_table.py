@@ -1,4 +1,4 @@
-"""Detection of the table in a position file, whose format is converted to named columns.
+"""Detection of the table in a position file, and its conversion to named columns.
 
 A table with a header is found by its column names. Other formats are recognised by their
 structure: headers of Motive and Vicon Nexus, JSON lines, KITTI matrices, tables without a header,

@@ -21,7 +21,7 @@ STREAM_FORMATS = _FORMATS["streams"]
 
 
 def refuse_foreign_format(path: Path, first_bytes: bytes, error_type: type[Px4FuseError]) -> None:
-    """Raise an error with the name of the file format if px4fuse does not support it."""
+    """Raise an error that names the file format, if px4fuse does not support it."""
     name = display_name(path)
     for foreign_format in _FORMATS["foreign"]:
         if any(
@@ -33,8 +33,8 @@ def refuse_foreign_format(path: Path, first_bytes: bytes, error_type: type[Px4Fu
 
 # Minimum and maximum valid UNIX time (s): the years 2000 and 2100
 UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0
-# A file with a control character among this number of characters at its beginning is binary; a file
-# with a NUL character is always binary
+# Number of first characters that are searched for a control character, which shows a binary file.
+# NUL is searched in the whole file
 _CHECKED_CHARS = 100_000
 # Byte order marks of UTF-16, the encoding of texts from Windows shells
 _UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")

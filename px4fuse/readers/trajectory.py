@@ -25,17 +25,16 @@ MAX_NORM_ERROR = 0.1
 MAX_COORDINATE_M = 1e9
 # Quaternions are normalised if their norm deviates by more than this from 1 (rounding of float64)
 UNIT_NORM_TOLERANCE = 1e-15
-# A file in which a larger fraction of the rows is invalid is rejected: its timestamps are probably
-# rounded, or it contains several recordings
+# Maximum fraction of invalid rows of a file. With more, its timestamps are probably rounded, or it
+# contains several recordings: it is rejected
 MAX_DROPPED_FRACTION = 0.01
 # Maximum coordinate (m) and rotation angle (rad) of a first pose that is the identity: SLAM begins
 # at the identity
 MAX_IDENTITY_DISTANCE = 1e-6
-# Maximum ratio of the smallest to the second RMS extent along the principal axes, for a motion in a
-# plane
+# Maximum ratio smallest / second RMS extent along the principal axes, for a motion in a plane
 MAX_THICKNESS_RATIO = 1 / 3
-# Minimum ratio of the second to the largest RMS extent along the principal axes, for a motion in a
-# plane: a straight motion has no unique plane
+# Minimum ratio second / largest RMS extent along the principal axes, for a motion in a plane: a
+# straight motion has no unique plane
 MIN_WIDTH_RATIO = 0.1
 # Maximum angle (rad) between the normal of the plane of motion and the y axis of a camera frame
 MAX_TILT_RAD = math.radians(20.0)

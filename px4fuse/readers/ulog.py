@@ -23,7 +23,7 @@ from px4fuse.readers.px4_positions import FIX_TYPE_3D, barometer, read_positions
 from px4fuse.readers.ulog_topics import Topics, dropped_notes, longest_increasing_run, read_topics
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
-# IMU samples are missing if the interval (s) between two samples is longer; normal are 4 ms
+# Maximum interval (s) between two IMU samples if none is missing; 4 ms is normal
 MIN_MISSING_IMU_S = 0.2
 # Minimum and maximum valid UTC (UNIX time, s) of a GNSS receiver: GPS_EPOCH_SECS of PX4
 # (gps_helper.h), and the year 2100

@@ -16,7 +16,7 @@ from px4fuse.comparison.model import (
     PreparedComparison,
     UntestedFilter,
 )
-from px4fuse.comparison.remedy import different_settings, noise_change
+from px4fuse.comparison.remedy import different_settings, height_noise_advice, noise_change
 from px4fuse.comparison.remedy import format_settings as format_parameters
 from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
@@ -231,6 +231,7 @@ def tuning_advice(
             )
         elif is_logged_within_interval:
             advice_by_label["PX4"] = f"{name} {logged_m:g} m is within the 95 % interval."
+        advice_by_label["PX4"] += height_noise_advice(comparison, tuning_by_axis, sigma_z.value)
     if sigma_a.value is None:
         advice_by_label["SIGMA_A"] = (
             "SIGMA_A cannot be estimated: the flight has too little motion, or is too short."

@@ -16,7 +16,7 @@ from msgspec import Meta
 
 from px4fuse.core.reading import read_text
 from px4fuse.core.record import Record, Sha256, read_toml
-from px4fuse.core.text import convert_nested, one_line
+from px4fuse.core.text import one_line
 from px4fuse.errors import SettingsError
 
 # Maximum size (bytes) of an answer form
@@ -51,15 +51,14 @@ class FaultKind(Record, rename={"size_quantity": "in"}):
         return _UNITS_BY_QUANTITY[self.size_quantity]
 
 
-class AllowedAnswers(Record, rename={"new_by_old_name": "renamed"}):
-    """Allowed answers (``form.toml``), and new names of answers that were renamed."""
+class AllowedAnswers(Record):
+    """Allowed answers (``form.toml``)."""
 
     behaviours: tuple[str, ...]
     panels: tuple[str, ...]
     units: dict[str, dict[str, float]]
     mistakes: dict[str, FaultKind]
     corrections: dict[str, str]
-    new_by_old_name: dict[str, str]
 
 
 _ALLOWED = read_toml(__file__, AllowedAnswers, "form.toml")
@@ -300,7 +299,7 @@ def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
 
 
 def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
-    filled_form = _without_blanks(update_renamed_values(form))
+    filled_form = _without_blanks(form)
     mistakes = filled_form.pop("mistake", ())
     quantities, choices = (
         msgspec.convert(filled_form.pop(name, {}), dict[str, Any])
@@ -323,11 +322,6 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
         "quantities": tuple(map(quantities.get, quantity_names)),
         "choices": tuple(choices.get(name, "") for name in answered_names),
     }
-
-
-def update_renamed_values(value: Any) -> Any:
-    """Rename fields and values in answer forms and answer keys of older px4fuse versions."""
-    return convert_nested(value, lambda element: _ALLOWED.new_by_old_name.get(element, element))
 
 
 def _without_blanks(value: Any) -> Any:

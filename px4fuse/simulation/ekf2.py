@@ -146,8 +146,10 @@ def simulate_ekf2(
         barometer_samples = barometer_samples_inside(
             segment, barometer_s, down_m, no_dead_zone, sample_weight
         )
-        heights = HeightSamples((BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *barometer_samples)
-        segment = replace(segment, heights=heights)
+        height_samples = HeightSamples(
+            (BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *barometer_samples
+        )
+        segment = replace(segment, height_samples=height_samples)
         if not logged_values[MAG.switch]:
             segment = add_field_states(
                 segment,

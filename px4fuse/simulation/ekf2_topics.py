@@ -209,16 +209,16 @@ def _barometer_topics(
     model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output
 ) -> list[Topic]:
     """Return estimator_aid_src_baro_hgt, or nothing without barometer."""
-    heights, end_step = model_run.segment.heights, model_run.events[0].end_step
-    if heights is None or model_run.heights is None:
+    height_samples, end_step = model_run.segment.height_samples, model_run.events[0].end_step
+    if height_samples is None or model_run.height_filter is None:
         return []
-    updates = model_run.heights.updates(BAROMETER.name, 0, end_step.astype(float))
+    updates = model_run.height_filter.updates(BAROMETER.name, 0, end_step.astype(float))
     updates = updates[updates["fused_at_s"] < len(output.time_us) - output.lag_steps].iloc[1:]
     updates = updates[sensors.keep_at_rate(updates.index.to_numpy(), OTHER_AIDS_HZ)]
     innovation, innovation_variance, is_rejected, is_fused, update_steps = updates.to_numpy().T
     measured_s, steps = updates.index.to_numpy(), update_steps.astype(np.intp)
     measured_m = (
-        heights.down_m[np.searchsorted(heights.measured_at_s, measured_s)]
+        height_samples.down_m[np.searchsorted(height_samples.measured_at_s, measured_s)]
         - sensors.HOME_POSITION[2]
     )
     noise_variance = np.full(len(steps), model_inputs.settings[BAROMETER.noise] ** 2)

@@ -17,7 +17,6 @@ The attached results are compared in :mod:`px4fuse.verification.verification`.
 
 import math
 import re
-import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice, zip_longest
@@ -249,7 +248,7 @@ class _PdfComparison:
 
     def _compare_dictionaries(
         self,
-        submitted_dictionary: DictionaryObject,
+        submitted_dictionary: Any,
         redrawn_dictionary: DictionaryObject,
         key: str,
         page_number: int,
@@ -269,9 +268,7 @@ class _PdfComparison:
             (self.page_parents if page_number and name == "/Parent" else remaining_values).append(
                 values
             )
-        if isinstance(submitted_dictionary, StreamObject) and isinstance(
-            redrawn_dictionary, StreamObject
-        ):
+        if isinstance(redrawn_dictionary, StreamObject):
             yield from self._compare_streams(
                 submitted_dictionary, redrawn_dictionary, key, page_number
             )
@@ -357,14 +354,14 @@ class _PdfComparison:
         """Decode a PDF text (operator Tj or TJ) with the ToUnicode map of its font."""
         to_unicode = self.fonts[font].get_object()["/ToUnicode"].get_data().decode("latin-1")
         text_by_glyph = {
-            int(glyph, 16): bytes.fromhex(utf16_text)
+            bytes.fromhex(glyph): bytes.fromhex(utf16_text)
             for glyph, utf16_text in _TO_UNICODE_ENTRY_PATTERN.findall(to_unicode)
         }
         glyph_bytes = b"".join(operand for operand in operands if isinstance(operand, bytes))
-        glyph_numbers = struct.unpack(
-            f">{len(glyph_bytes) // 2}H", glyph_bytes[: len(glyph_bytes) // 2 * 2]
+        utf16_text = b"".join(
+            text_by_glyph.get(glyph_bytes[start : start + 2], b"\0?")
+            for start in range(0, len(glyph_bytes), 2)
         )
-        utf16_text = b"".join(text_by_glyph.get(number, b"\0?") for number in glyph_numbers)
         return utf16_text.decode("utf-16-be", "replace")
 
 
@@ -451,19 +448,22 @@ def _has_near_operands(
     operator: str, submitted_operands: Sequence[Operand], redrawn_operands: Sequence[Operand]
 ) -> bool:
     """Return True if the operands of a drawing operator are equal within the tolerances."""
-    if len(submitted_operands) != len(redrawn_operands):
-        return False
     first_coordinate_index = _FIRST_COORDINATE_INDEX.get(operator, len(redrawn_operands))
-    for index, (submitted_operand, redrawn_operand) in enumerate(
-        zip(submitted_operands, redrawn_operands, strict=True)
-    ):
-        tolerance = COORDINATE_TOLERANCE_PT if index >= first_coordinate_index else NUMBER_TOLERANCE
-        if submitted_operand != redrawn_operand and not (
+    return len(submitted_operands) == len(redrawn_operands) and all(
+        submitted_operand == redrawn_operand
+        or (
             isinstance(submitted_operand, float)
             and isinstance(redrawn_operand, float)
             and math.isclose(
-                submitted_operand, redrawn_operand, rel_tol=NUMBER_TOLERANCE, abs_tol=tolerance
+                submitted_operand,
+                redrawn_operand,
+                rel_tol=NUMBER_TOLERANCE,
+                abs_tol=(
+                    COORDINATE_TOLERANCE_PT if index >= first_coordinate_index else NUMBER_TOLERANCE
+                ),
             )
-        ):
-            return False
-    return True
+        )
+        for index, (submitted_operand, redrawn_operand) in enumerate(
+            zip(submitted_operands, redrawn_operands, strict=True)
+        )
+    )

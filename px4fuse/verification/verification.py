@@ -219,15 +219,7 @@ def _draw_report(
 # ------------------------------------------------------------------ the verdict
 
 
-def verify(
-    results: ReportedResults,
-    pdf: bytes,
-    logs: Mapping[str, Path],
-    *,
-    recompute: Callable[
-        [ReportedResults, Mapping[str, Path]], Recomputed | Verification
-    ] = recompute,
-) -> Verification:
+def verify(results: ReportedResults, pdf: bytes, logs: Mapping[str, Path]) -> Verification:
     """Verify a report: repeat its analysis, draw it again, and compare numbers and pages.
 
     Parameters
@@ -238,8 +230,6 @@ def verify(
         Content of the report file.
     logs : mapping of str to Path
         Logs and other input files by SHA-256.
-    recompute : callable
-        Function that repeats the analysis.
     """
     report_version, installed_version = results.provenance.px4fuse, metadata.version("px4fuse")
     if report_version != installed_version:

@@ -10,7 +10,6 @@ from px4fuse.classroom.assignment.roster import MAX_STUDENTS, ClassList, Person,
 from px4fuse.classroom.assignment.truth import RightFormAnswers
 from px4fuse.core.reading import read_text
 from px4fuse.errors import SettingsError
-from px4fuse.results.answer_form import update_renamed_values
 
 # Maximum size (bytes) of an answer key: the key of 1000 students has 2 million bytes
 MAX_KEY_BYTES = 20_000_000
@@ -103,7 +102,7 @@ def read_answer_key(path: Path) -> AnswerKey:
     """
     text = read_text(path, SettingsError, MAX_KEY_BYTES, name=str(path))
     try:
-        key = msgspec.convert(update_renamed_values(msgspec.json.decode(text)), AnswerKey)
+        key = msgspec.json.decode(text, type=AnswerKey)
         if len({normalise_text(answer.student_id) for answer in key.answers}) < len(key.answers):
             raise ValueError("two students have the same id")
     except (msgspec.MsgspecError, RecursionError, ValueError) as error:

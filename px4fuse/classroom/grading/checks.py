@@ -287,9 +287,8 @@ class AnswersItem(RubricItem, frozen=True, tag="answers"):
         if isinstance(points_or_reason, str):
             return 0.0, f"{capitalise_first(points_or_reason)}."
         points_text = ", ".join(
-            f"{name} {points_or_reason.points_by_part[name]:.3g} of {max_points:g}"
-            for name, max_points in points_or_reason.max_points_by_part.items()
-            if max_points
+            f"{part.title} {part.points:.3g} of {part.max_points:g}"
+            for part in points_or_reason.parts
         )
         feedback = capitalise_first("; ".join(points_or_reason.feedback))
         return points_or_reason.fraction, f"Points of 100: {points_text}. {feedback}."

@@ -13,9 +13,10 @@ from px4fuse.classroom.grading.model import (
     TOTAL_TITLE,
     Grade,
     Override,
+    counted_reports,
     list_titles,
 )
-from px4fuse.core.text import format_number
+from px4fuse.core.text import count_noun, format_number
 from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, Section
 from px4fuse.html.safe import load_template, local_link
@@ -44,8 +45,7 @@ def class_page_html(grades: Sequence[Grade], title: str, made_with: str) -> str:
     options = [(tag, f"{tag} ({count_by_tag[tag]})") for tag in tags if count_by_tag[tag]]
     return frame.page(
         title=title,
-        subtitle=f"{len(grades)} {'student' if len(grades) == 1 else 'students'}, graded with "
-        f"{made_with}",
+        subtitle=f"{count_noun(len(grades), 'student')}, graded with {made_with}",
         html_above=_statistics_html(grades, count_by_tag),
         row_nouns=("student", "students"),
         columns=(
@@ -70,7 +70,7 @@ def _statistics_html(grades: Sequence[Grade], count_by_tag: Mapping[str, int]) -
     """Format the statistics of the class: number of reports by status, and histograms of points."""
     totals = [grade.total for grade in grades if grade.total is not None]
     max_points = max((grade.max_points for grade in grades if grade.max_points > 0.0), default=1.0)
-    reports = [report for grade in grades if (report := grade.counted_report)]
+    reports = counted_reports(grades)
     return load_template("classroom/grading/above.html").render(
         students=len(grades),
         counts=count_by_tag,
@@ -112,23 +112,22 @@ def _class_row(grade: Grade, item_titles: Sequence[str], number_titles: Sequence
     status = report.status if report else NO_SUBMISSION_STATUS
     css_style, symbol = STATUS_STYLES[status]
     flag_count = len(grade.flags)
-    flag_count_text = f"{flag_count} flag{'s' if flag_count > 1 else ''}" if flag_count else ""
-    file_name = report.submission if report else ""
+    flag_count_text = count_noun(flag_count, "flag") if flag_count else ""
     late_text = f"{math.ceil(grade.late_s / 60.0)} min late" if grade.late_s else ""
     points_by_title = {item.title: item.points for item in report.items} if report else {}
     number_values = report.numbers if report else {}
     cells = (
-        Cell(grade.display_name, grade.student or None, file_name),
-        frame.text_cell(grade.student_id),
+        Cell(grade.display_name, below=grade.file_name),
+        Cell(grade.student_id),
         Cell(f"{symbol} {status}", float(STATUSES.index(status)), flag_count_text, css_style),
         _points_cell(grade),
-        frame.text_cell(grade.submission_time, late_text),
+        Cell(grade.submission_time, below=late_text),
         Cell("\n".join(grade.flags), float(flag_count), "", "flags"),
         *(frame.number_cell(points_by_title.get(title)) for title in item_titles),
         *(frame.number_cell(number_values.get(title)) for title in number_titles),
     )
     # the points of an anonymous student cannot be entered: overrides.csv needs the id or the file
-    point_boxes = (_point_boxes(grade),) if grade.student_id or file_name else ()
+    point_boxes = (_point_boxes(grade),) if grade.student_id or grade.file_name else ()
     links = (
         [("Report redrawn from the log (PDF)", local_link(report.redrawn_path))] if report else []
     )
@@ -172,11 +171,11 @@ def _grade_details(grade: Grade) -> Iterator[Section]:
     actions = [report.instructor_action] if report.instructor_action else []
     yield frame.list_section("Required decision of the instructor", actions, is_warning=True)
     yield frame.list_section("Verification", verification.reasons)
-    titles = ("Value", "Report", "New run") if differences else ()
-    yield frame.table_section("Numbers that differ in the new run", titles, differences)
+    yield frame.table_section(
+        "Numbers that differ in the new run", differences, ("Value", "Report", "New run")
+    )
     title = "Points (proposed)" if report.instructor_action else "Points"
-    item_titles = ("Item", "Points", "Of", "Comment") if items else ()
-    yield frame.table_section(title, item_titles, items, (1, 2))
+    yield frame.table_section(title, items, ("Item", "Points", "Of", "Comment"), (1, 2))
     yield comment
     yield frame.list_section("Injected faults of this flight", fault_texts)
     yield frame.name_value_section("Answer form", [*form_rows(report.form)] if report.form else [])
@@ -221,7 +220,7 @@ def _point_boxes(grade: Grade) -> Section:
         for title, override in grade.overrides.items()
         if title not in max_by_title
     ]
-    identity = grade.student_id or (report.submission if report else "")
+    identity = grade.student_id or grade.file_name
     return frame.input_boxes_section(
         "Points and comments of the instructor", identity, rows, other_rows
     )

@@ -26,6 +26,7 @@ from px4fuse.classroom.grading.model import (
     ItemScore,
     Override,
     Submission,
+    counted_reports,
 )
 from px4fuse.classroom.grading.rubric import Rubric
 from px4fuse.core.text import clean_text, one_line
@@ -183,9 +184,7 @@ def build_grades(
         for *_, grade in attempts_by_index[None]
     ]
     overrides_by_grade, notes = match_overrides(overrides, grades)
-    flags_by_submission = flag_equal_contents(
-        [grade.counted_report for grade in grades if grade.counted_report]
-    )
+    flags_by_submission = flag_equal_contents(counted_reports(grades))
     grades_with_report = [grade for grade in grades if grade.counted_report]
     unknown_count = sum(grade.late_s is None for grade in grades_with_report)
     if course.late_rule and unknown_count:
@@ -450,11 +449,7 @@ def match_overrides(
     matched_overrides: list[dict[str, Override]] = [{} for _ in grades]
     max_points_of_reports = (report.max_points for grade in grades for report in grade.reports)
     max_total_points = max(max_points_of_reports, default=math.inf)
-    people = ClassList(
-        Person(grade.student_id, login=report.submission if report else "")
-        for grade in grades
-        for report in [grade.counted_report]
-    )
+    people = ClassList(Person(grade.student_id, login=grade.file_name) for grade in grades)
     notes = []
     for student, override_by_item in overrides.items():
         # the instructor may type an id, with or without leading zeros, or a file name

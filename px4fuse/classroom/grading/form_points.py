@@ -14,6 +14,7 @@ from typing import NamedTuple
 import msgspec
 
 from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers
+from px4fuse.classroom.grading.model import ItemScore
 from px4fuse.core.record import read_toml
 from px4fuse.results.answer_form import (
     CHOICE_NAMES,
@@ -81,20 +82,19 @@ PART_NAMES = tuple(POINTS_TABLE["weights"])
 
 @dataclass(frozen=True)
 class FormPoints:
-    """Points for a student's answers, by part ("mistakes", "sizes", ...), and feedback.
+    """Points for the parts of a student's answers ("mistakes", "sizes", ...), and feedback.
 
     ``is_named_by_kind`` is True for each injected fault that the student named.
     """
 
-    points_by_part: Mapping[str, float]
-    max_points_by_part: Mapping[str, float]
+    parts: tuple[ItemScore, ...] = ()
     feedback: tuple[str, ...] = ()
     is_named_by_kind: Mapping[str, bool] = field(default_factory=dict)
 
     @property
     def fraction(self) -> float:
-        points = sum(self.points_by_part.values())
-        return max(points, 0.0) / sum(self.max_points_by_part.values())
+        points = sum(part.points for part in self.parts)
+        return max(points, 0.0) / sum(part.max_points for part in self.parts)
 
 
 def form_points(answers: Answers, right_answers: RightFormAnswers) -> FormPoints:
@@ -130,7 +130,12 @@ def form_points(answers: Answers, right_answers: RightFormAnswers) -> FormPoints
         *_fault_feedback(matches, false_faults, is_no_fault_right),
         *_answer_feedback(answers, right_answers),
     )
-    return FormPoints(points_by_part, weights, feedback, is_named_by_kind)
+    parts = tuple(
+        ItemScore(name, points_by_part[name], max_points, "")
+        for name, max_points in weights.items()
+        if max_points
+    )
+    return FormPoints(parts, feedback, is_named_by_kind)
 
 
 # Injected fault, fault that the student named for it (or None), and fraction of the points

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from px4fuse.classroom.assignment.sheet import format_cell_number
 from px4fuse.classroom.grading.model import GradedReport
 
 # Minimum number of reports for a correlation of points
@@ -33,15 +32,15 @@ class ItemStatistics:
     discrimination: float | None
 
     @property
-    def csv_row(self) -> tuple[str, ...]:
+    def csv_row(self) -> tuple[str | float | None, ...]:
         """Cells of the row of ``items.csv``, in the order of ITEM_STATISTICS_TITLES."""
-        numbers = (
+        return (
+            self.title,
             len(self.fractions),
             round(float(np.mean(self.fractions)), 3),
             self.discrimination,
             self.fractions.count(0.0),
         )
-        return (self.title, *map(format_cell_number, numbers))
 
 
 def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:

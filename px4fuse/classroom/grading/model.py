@@ -205,13 +205,22 @@ class Grade:
         return (*([self.counted_report] if self.counted_report else []), *self.other_reports)
 
     @property
+    def file_name(self) -> str:
+        """Name of the report that counts; "" without a submission."""
+        return self.counted_report.submission if self.counted_report else ""
+
+    @property
     def display_name(self) -> str:
         return self.student or self.student_id or "no name"
 
 
+def counted_reports(grades: Sequence[Grade]) -> list[GradedReport]:
+    return [report for grade in grades if (report := grade.counted_report)]
+
+
 def list_titles(grades: Sequence[Grade]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the column titles for the points of rubric items, and for numbers of reports."""
-    reports = [report for grade in grades if (report := grade.counted_report)]
+    reports = counted_reports(grades)
     item_titles = dict.fromkeys(item.title for report in reports for item in report.items)
     number_titles = dict.fromkeys(title for report in reports for title in report.numbers)
     return tuple(item_titles), tuple(number_titles)

@@ -20,7 +20,7 @@ import itertools
 import random
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from importlib import metadata
 from operator import itemgetter
@@ -38,11 +38,17 @@ from px4fuse.classroom.grading.checks import shorten_text
 from px4fuse.classroom.grading.class_page import class_page_html
 from px4fuse.classroom.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
 from px4fuse.classroom.grading.item_analysis import ITEM_STATISTICS_TITLES, analyse_items
-from px4fuse.classroom.grading.model import TOTAL_TITLE, Grade, GradedReport, list_titles
+from px4fuse.classroom.grading.model import (
+    TOTAL_TITLE,
+    Grade,
+    GradedReport,
+    counted_reports,
+    list_titles,
+)
 from px4fuse.classroom.grading.oral_check import questions_text
 from px4fuse.classroom.grading.records import DIAGNOSIS_SUFFIX, RECORDS_FOLDER, REDRAWN_SUFFIX
 from px4fuse.core.input_files import inputs_not_registered
-from px4fuse.core.spreadsheet import neutralise_formulas, neutralise_id
+from px4fuse.core.spreadsheet import neutralise_formulas
 from px4fuse.core.text import join_first, one_line
 from px4fuse.core.writing import write_all
 from px4fuse.errors import SettingsError
@@ -119,18 +125,12 @@ def write_class(
     page_grades = [
         _copy_redrawn(grade, stem, output) for grade, stem in zip(grades, file_stems, strict=True)
     ]
-    has_redrawn = any(
-        grade.counted_report and grade.counted_report.redrawn_path for grade in page_grades
-    )
+    has_redrawn = any(report.redrawn_path for report in counted_reports(page_grades))
     feedback_texts = [feedback_text(grade, class_title) for grade in grades]
-    reports = [report for grade in grades if (report := grade.counted_report)]
-    item_rows = tuple(
-        (neutralise_formulas(title), *numbers)
-        for title, *numbers in (statistics.csv_row for statistics in analyse_items(reports))
-    )
+    item_rows = (statistics.csv_row for statistics in analyse_items(counted_reports(grades)))
     contents = {
         "class.csv": class_table_csv(grades).encode(),
-        "items.csv": ("\ufeff" + Sheet(Path(), ITEM_STATISTICS_TITLES, item_rows).text).encode(),
+        "items.csv": _spreadsheet_csv(ITEM_STATISTICS_TITLES, item_rows).encode(),
     }
     if course.anonymous:
         page_grades, names_table = _anonymise_grades(page_grades, output / PSEUDONYMS_FILE)
@@ -161,9 +161,8 @@ def write_class(
 
 def _student_identity(grade: Grade, use_file_stem: bool = False) -> str:
     """Return the id of a student; without an id, the name or the name of the submitted file."""
-    file_name = grade.counted_report.submission if grade.counted_report else ""
     return grade.student_id or (
-        Path(file_name).stem if use_file_stem else grade.student or file_name
+        Path(grade.file_name).stem if use_file_stem else grade.student or grade.file_name
     )
 
 
@@ -209,13 +208,13 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
     for identity in new_identities:
         names_by_identity[identity] = next(free_pseudonyms), students[identity]
     rows = (
-        (pseudonym, neutralise_id(identity), neutralise_formulas(student))
+        (pseudonym, identity, student)
         for identity, (pseudonym, student) in sorted(names_by_identity.items(), key=itemgetter(1))
     )
     anonymous_grades = [
         anonymise_grade(grade, names_by_identity[_student_identity(grade)][0]) for grade in grades
     ]
-    names_table = "\ufeff" + Sheet(path, PSEUDONYM_TITLES, tuple(rows)).text
+    names_table = _spreadsheet_csv(PSEUDONYM_TITLES, rows)
     return sorted(anonymous_grades, key=lambda grade: grade.student), names_table
 
 
@@ -261,9 +260,9 @@ def class_table_csv(grades: Sequence[Grade]) -> str:
         report = grade.counted_report
         points_by_title = {item.title: item.points for item in report.items} if report else {}
         row: list[str | float | None] = [
-            report.submission if report else "",
+            grade.file_name,
             grade.student,
-            None,
+            grade.student_id,
             report.status if report else "missing",
             report.counted_points if report else None,
             report.points if report and report.counted_points is None else None,
@@ -281,14 +280,20 @@ def class_table_csv(grades: Sequence[Grade]) -> str:
             LIST_SEPARATOR.join(report.verification.reasons) if report else "",
             report.log_sha256 if report else "",
         ]
-        cells = [
+        rows.append(row)
+    return _spreadsheet_csv(titles, rows)
+
+
+def _spreadsheet_csv(titles: Sequence[str], rows: Iterable[Sequence[str | float | None]]) -> str:
+    cell_rows = (
+        tuple(
             neutralise_formulas(value) if isinstance(value, str) else format_cell_number(value)
             for value in row
-        ]
-        cells[FIRST_COLUMNS.index("id")] = neutralise_id(grade.student_id)
-        rows.append(tuple(cells))
+        )
+        for row in (titles, *rows)
+    )
     # Excel detects UTF-8 by the byte order mark
-    return "\ufeff" + Sheet(Path(), tuple(map(neutralise_formulas, titles)), tuple(rows)).text
+    return "\ufeff" + Sheet(Path(), next(cell_rows), tuple(cell_rows)).text
 
 
 # ------------------------------------------------------------------ feedback

@@ -91,7 +91,12 @@ def load_or_verify(
         results, files[DIAGNOSIS_SUFFIX] = repeat_with_diagnosis(results, path_by_sha256)
     stored_verification = replace(verification, redrawn_pdf=b"")
     record = VerificationRecord(dependencies, to_json(results), stored_verification)
-    _write_record(records, sha256, record, files)
+    for old_file in records.glob(f"{sha256}.*"):
+        # keep the JSON file: another process may read it for an identical PDF
+        if old_file.suffix != ".json":
+            old_file.unlink(missing_ok=True)
+    files[".json"] = msgspec.json.encode(record)
+    write_all({records / f"{sha256}{suffix}": content for suffix, content in files.items()})
     return results, stored_verification, False
 
 
@@ -131,17 +136,6 @@ def _dependencies(
 def _versions() -> dict[str, str]:
     versions = provenance("")
     return {**versions.libraries, "px4fuse": versions.px4fuse}
-
-
-def _write_record(
-    records: Path, sha256: str, record: VerificationRecord, files: Mapping[str, bytes]
-) -> None:
-    for old_file in records.glob(f"{sha256}.*"):
-        # keep the JSON file: another process may read it for an identical PDF
-        if old_file.suffix != ".json":
-            old_file.unlink(missing_ok=True)
-    contents = {**files, ".json": msgspec.json.encode(record)}
-    write_all({records / f"{sha256}{suffix}": content for suffix, content in contents.items()})
 
 
 def _load_record(

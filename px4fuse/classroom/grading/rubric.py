@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import tomllib
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Union
 
@@ -89,9 +88,7 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 def rubric_text() -> str:
-    return (
-        files("px4fuse.classroom.grading").joinpath(DEFAULT_RUBRIC_NAME).read_text(encoding="utf-8")
-    )
+    return Path(__file__).with_name(DEFAULT_RUBRIC_NAME).read_text("utf-8")
 
 
 def read_rubric(path: Path | None) -> Rubric:
@@ -157,7 +154,7 @@ def score_report(
         )
     form_result, values = check_input.form_points, check_input.values
     if isinstance(form_result, str) or not check_input.is_own_log:
-        form_result = FormPoints({}, {})
+        form_result = FormPoints()
     return GradedReport(
         "",
         student.name,
@@ -172,11 +169,7 @@ def score_report(
         ),
         instructor_action=reason_or_action if points_rule == "pending" else "",
         is_found_by_fault=form_result.is_named_by_kind,
-        form_parts=tuple(
-            ItemScore(name, form_result.points_by_part[name], max_points, "")
-            for name, max_points in form_result.max_points_by_part.items()
-            if max_points
-        ),
+        form_parts=form_result.parts,
         form=check_input.form if isinstance(check_input.form, Answers) else None,
         numbers={title: float(values[path]) for title, path in TABLE_NUMBERS if path in values},
         log_sha256=log_sha256(results),
