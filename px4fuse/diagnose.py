@@ -4,7 +4,7 @@
 2. prepare: position source, time span and axes
 3. filter: run KF along each axis
 4. compare: KF, EKF2 and ground truth
-5. estimate: noises, time offset, frame misalignment, biases. The estimated time offset replaces a
+5. estimate: noise σ, time offset, frame misalignment, biases. The estimated time offset replaces a
    delay that step 2 detected, in the report only
 6. rerun: replay EKF2, explain KF - EKF2, re-run both filters with one change at a time
 7. analyse the rest of the flight: loop closure, EKF2's other aiding sources, events
@@ -102,7 +102,7 @@ def _diagnose_flight(
 
 
 def _refine_file_clock(flight: Flight, analysis: Analysis) -> Flight | None:
-    """Correct an estimated clock offset of a position file by that of the IMU, if they differ.
+    """Replace the clock offset of a position file by the estimate from the IMU, if both differ.
 
     The first estimate is from EKF2's positions, which may be late.
     """
@@ -112,8 +112,8 @@ def _refine_file_clock(flight: Flight, analysis: Analysis) -> Flight | None:
         or alignment.clock_offset_sigma_s is None
         or alignment.reference != "EKF2 position"
         or not isinstance(clock, ClockOffset)
-        or all(found.id != "source_time_offset" for found in analysis.findings)
-        or any(CONVENTION in found.evidence for found in analysis.findings)
+        or all(finding.id != "source_time_offset" for finding in analysis.findings)
+        or any(CONVENTION in finding.evidence for finding in analysis.findings)
     ):
         return None
     difference = f"{abs(clock.offset_s):.3f} s {'late' if clock.offset_s < 0 else 'early'}"
@@ -262,11 +262,10 @@ def prepare_comparison(
 def rerun(
     comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
 ) -> Reruns:
-    """Replay EKF2, explain the difference KF - EKF2, and re-run both with one error corrected."""
+    """Replay EKF2, explain KF - EKF2, and re-run KF and EKF2 with one error corrected at a time."""
     progress("replaying EKF2")
     estimated_settings = corrected_settings(comparison, estimates.tuning)
-    # EKF2 replays all parameter sets together, which is faster. The sets must be those that the two
-    # following functions request; other sets are replayed again
+    # The next two functions request these parameter sets. A replay of all sets together is faster
     model = open_model(
         comparison.flight,
         lambda inputs: [

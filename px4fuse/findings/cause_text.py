@@ -1,4 +1,4 @@
-"""Texts on a re-run of KF or EKF2 with a change: kind of cause, change, effect, action."""
+"""Texts on a re-run of KF or EKF2 with one change: kind of cause, change, effect, action."""
 
 from collections.abc import Mapping
 
