@@ -163,7 +163,7 @@ def examples() -> dict[str, Example]:
         command = f"px4fuse loop {options['source']} {drift_option}".strip()
         add_examples(find_loop(px4fuse.close_loop(**loop_options)), f"the result of `{command}`")
     add_examples(convention_examples(), "a simulated loop flight with changed positions")
-    add_examples(value_examples(), "a simulated flight of the tests")
+    add_examples(value_examples(), "a simulated test flight")
     _, odometry = laps(3, 5, OdometryNoise())
     wrong_closure = GivenClosure(20.0, 21.5 + LAP_S, 0.05)
     findings = find_loop(px4fuse.close_loop(odometry, closures=(*TRUE, wrong_closure)))
@@ -197,7 +197,7 @@ def examples() -> dict[str, Example]:
         comparison = compare(fault.fly(), Settings(**fault.settings))
         analysis = (with_noises if fault.id in TUNED_IDS else unexplained)(comparison)
         findings = [finding for finding in find(analysis) if finding.id == fault.id]
-        add_examples(findings, "a simulated flight of the tests", analysis)
+        add_examples(findings, "a simulated test flight", analysis)
     return example_by_id
 
 
@@ -270,7 +270,7 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
         yield "This finding is about the recording. It is listed before findings about noises.\n"
     if example is not None:
         finding = example.finding
-        yield f"## Example\n\nFinding of severity *{finding.severity}* on {example.flight}:\n"
+        yield f"## Example\n\nSeverity: *{finding.severity}*. Example from {example.flight}:\n"
         yield f"> {finding.message}\n"
         if example.analysis is not None:
             file = save_picture(name, example, folder)

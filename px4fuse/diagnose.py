@@ -4,7 +4,7 @@
 2. prepare: position source, time span and axes
 3. filter: run KF along each axis
 4. compare: KF, EKF2 and ground truth
-5. estimate: noises, time offset, frame misalignment, biases. The estimated time offset replaces a
+5. estimate: noise σ, time offset, frame misalignment, biases. The estimated time offset replaces a
    delay that step 2 detected, in the report only
 6. rerun: replay EKF2, explain KF - EKF2, re-run both filters with one change at a time
 7. analyse the rest of the flight: loop closure, EKF2's other aiding sources, events
@@ -102,7 +102,7 @@ def _diagnose_flight(
 
 
 def _refine_file_clock(flight: Flight, analysis: Analysis) -> Flight | None:
-    """Correct an estimated clock offset of a position file by that of the IMU, if they differ.
+    """Replace the clock offset of a position file by the estimate from the IMU, if both differ.
 
     The first estimate is from EKF2's positions, which may be late.
     """
@@ -112,8 +112,8 @@ def _refine_file_clock(flight: Flight, analysis: Analysis) -> Flight | None:
         or alignment.clock_offset_sigma_s is None
         or alignment.reference != "EKF2 position"
         or not isinstance(clock, ClockOffset)
-        or all(found.id != "source_time_offset" for found in analysis.findings)
-        or any(CONVENTION in found.evidence for found in analysis.findings)
+        or all(finding.id != "source_time_offset" for finding in analysis.findings)
+        or any(CONVENTION in finding.evidence for finding in analysis.findings)
     ):
         return None
     difference = f"{abs(clock.offset_s):.3f} s {'late' if clock.offset_s < 0 else 'early'}"
@@ -262,12 +262,11 @@ def prepare_comparison(
 def rerun(
     comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
 ) -> Reruns:
-    """Replay EKF2, explain the difference KF - EKF2, and re-run both with one error corrected."""
+    """Replay EKF2, explain KF - EKF2, and re-run KF and EKF2 with one error corrected at a time."""
     progress("replaying EKF2")
     estimated_settings = corrected_settings(comparison, estimates.tuning)
-    # EKF2 replays all parameter sets together, which is faster. The sets must be those that the two
-    # following functions request; other sets are replayed again
-    model = open_model(
+    # The next two functions request these parameter sets. A replay of all sets together is faster
+    ekf2_model = open_model(
         comparison.flight,
         lambda inputs: [
             *explanation_configurations(comparison, inputs, estimated_settings),
@@ -276,12 +275,12 @@ def rerun(
     )
     release_free_memory()
     difference_steps = explain_ekf2_difference(
-        comparison, model, estimates.clock, estimated_settings
+        comparison, ekf2_model, estimates.clock, estimated_settings
     )
-    trials = rerun_filters(comparison, estimates, model)
-    if isinstance(model, Model):  # to free memory
-        model = replace(model, runs=(), intervals={})
-    return Reruns(ekf2_model=model, difference_steps=difference_steps, trials=trials)
+    trials = rerun_filters(comparison, estimates, ekf2_model)
+    if isinstance(ekf2_model, Model):  # to free memory
+        ekf2_model = replace(ekf2_model, runs=(), intervals={})
+    return Reruns(ekf2_model=ekf2_model, difference_steps=difference_steps, trials=trials)
 
 
 def diagnose_or_check_aids(
@@ -341,11 +340,11 @@ def run_what_if(
             f"{flight.log.name}: {DIAGNOSIS_WITHHELD.reason}", "Give --set or --sweep."
         )
     progress("replaying EKF2")
-    model = require_available(open_model(flight), flight)
+    ekf2_model = require_available(open_model(flight), flight)
     difference_steps: Mapping[str, DifferenceExplanation | Unavailable] = {}
     comparison = None
     try:
-        if model.agreement.good and not flight.log.is_assessed:
+        if ekf2_model.agreement.good and not flight.log.is_assessed:
             comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
             prepared_comparison = prepare(flight, comparison_request)
             comparison = compare(prepared_comparison, run_kf(prepared_comparison))
@@ -355,13 +354,15 @@ def run_what_if(
     if comparison is not None:
         tuning, clock = estimate_noises_and_clock(comparison, progress)
         estimated_settings = corrected_settings(comparison, tuning)
-        difference_steps = explain_ekf2_difference(comparison, model, clock, estimated_settings)
+        difference_steps = explain_ekf2_difference(
+            comparison, ekf2_model, clock, estimated_settings
+        )
         if is_default_change:
-            changes = ml_ekf2_parameters(comparison, model, tuning, clock)
+            changes = ml_ekf2_parameters(comparison, ekf2_model, tuning, clock)
     parameter_sets = [changes] if changes or request.without else []
     parameter_sets += [changes | values for values in swept_settings]
     progress("replaying EKF2 with other parameters")
-    replays = require_available(what_if(model, parameter_sets, request.without), flight)
+    replays = require_available(what_if(ekf2_model, parameter_sets, request.without), flight)
     return WhatIfAnalysis(
         flight, replays, changes, is_default_change, difference_steps, request.without
     )

@@ -169,7 +169,7 @@ def test_gap_limit_of_aiding_source_increases_at_low_log_rate() -> None:
         assert evaluate(replace(decimated, samples=samples)).verdict == verdict
 
 
-def test_aiding_source_fault_report_states_sensor_and_times() -> None:
+def test_aiding_source_fault_report_contains_sensor_and_times() -> None:
     log = aid_log()
     with_gap = replace(log, samples=outage_free(log, 20.0, 41.0), enabled=steps((0.0, 1.0)))
     found = evaluate_aids(with_aids(

@@ -310,7 +310,7 @@ def test_align_position_file_with_rotated_frame_gives_warning(flight, yaw_deg, o
     (0.01, "in centimetres, not in metres", "Run again with --position-unit cm."),
     (0.3048, "in feet, not in metres", "Multiply x, y and z by 0.3048 in the file."),
 ])  # fmt: skip
-def test_align_position_file_in_wrong_unit_states_the_unit(
+def test_align_position_file_in_wrong_unit_reports_the_unit(
     sample_flight: Flight, unit_m: float, message: str, remedy: str
 ) -> None:
     file = uwb_file(sample_flight)

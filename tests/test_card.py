@@ -95,7 +95,7 @@ def test_diagnosis_lists_sensor_fault_before_wrong_parameter() -> None:
         (outcome(0.3, 1.0, 0.29), "nothing"),  # the σ ratio against the source becomes worse
     ],
 )
-def test_filter_rerun_result_states_if_rmse_or_sigma_improved(after, improves) -> None:
+def test_filter_rerun_result_shows_if_rmse_or_sigma_improved(after, improves) -> None:
     assert improvement(trial("noises", after)) == improves
 
 
@@ -152,7 +152,7 @@ def test_diagnosis_merges_equal_actions_for_kf_and_ekf2() -> None:
     ]  # fmt: skip
 
 
-def test_diagnosis_without_ground_truth_states_it_is_untested() -> None:
+def test_diagnosis_without_ground_truth_is_reported_as_untested() -> None:
     ratios = verdicts(*[(1.0, "consistent")] * 4)
     untested = tuple(each for each in ratios if each.against == "source")
     (ranked,) = rank_causes(analysis(), [OFFSET])

@@ -350,7 +350,7 @@ def test_time_offset_95_percent_interval_contains_true_value() -> None:
     assert 0.6 < np.std(normalised) < 1.4
 
 
-def test_time_offset_from_insufficient_data_states_reason() -> None:
+def test_time_offset_from_insufficient_data_gives_reason() -> None:
     hovering = estimate(made_flight(3, moving=0.0)[0])
     assert not hovering.is_determinable
     assert "too little acceleration" in hovering.reason

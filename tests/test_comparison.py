@@ -199,7 +199,7 @@ class TestSimulatedFlight:
 
 
 class TestMissingParts:
-    def test_compare_without_ekf2_evaluates_kf_and_states_reason(self) -> None:
+    def test_compare_without_ekf2_evaluates_kf_and_gives_reason(self) -> None:
         comparison = compare(aisle_flight(ekf2=None))
         assert comparison.horizontal.get("kf").verdict == "consistent"
         assert comparison.horizontal.get("ekf2") is None
@@ -216,7 +216,7 @@ class TestMissingParts:
                 assert part == comparison.flight.ekf2
 
     @pytest.mark.parametrize("left_out", ["imu", "attitude_hz"])
-    def test_compare_without_imu_states_constant_velocity_model(self, left_out) -> None:
+    def test_compare_without_imu_uses_constant_velocity_model(self, left_out) -> None:
         flight = aisle_flight(**{left_out: None})
         comparison = compare(flight, Settings(sigma_z_m=0.2))
         assert comparison.settings == Settings(sigma_z_m=0.2, input="zero")
@@ -270,9 +270,7 @@ class TestRobustness:
     def test_compare_removes_ekf2_frame_reset_and_adds_note(self, made: Comparison) -> None:
         reset = Reset(60.0, "position", (5.0, -3.0, 0.0))
         comparison = compare(aisle_flight(ekf2=Estimator(resets=(reset,))))
-        assert any(
-            "EKF2 resets removed: 1 of horizontal position" in note for note in comparison.notes
-        )
+        assert any("EKF2's frame: 1 of horizontal position" in note for note in comparison.notes)
         for result, same in zip(comparison.axes.values(), made.axes.values(), strict=True):
             assert asdict(result.difference) == pytest.approx(asdict(same.difference))
 

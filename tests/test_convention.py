@@ -298,7 +298,7 @@ def test_positions_in_correct_ned_frame_give_no_frame_fault():
     assert not list(source_convention.detect(compared(sent(flown()))))
 
 
-def test_enu_orientation_report_states_conversion_to_ned():
+def test_enu_orientation_report_contains_conversion_to_ned():
     time, attitude = oriented(flown())
     quaternion = multiply(multiply(np.array(NED_TO["ENU"]), attitude), np.array(NED_TO["NWU"]))
     (found,) = source_convention.detect(compared(with_orientation(sent(flown()), quaternion, time)))
@@ -335,7 +335,7 @@ def test_positions_in_frd_frame_have_no_yaw_fault():
 
 
 @pytest.mark.parametrize(("estimate_s", "reported_s"), [(-0.55, 0.55), (-0.48, 0.52)])
-def test_late_timestamps_report_states_refined_time_offset(estimate_s, reported_s):
+def test_late_timestamps_report_contains_refined_time_offset(estimate_s, reported_s):
     late = Convention(verdict="determined", late_s=0.52)
     comparison = replace(compared(sent(flown())), convention=late)
     clock = ClockOffset(
@@ -349,7 +349,7 @@ def test_late_timestamps_report_states_refined_time_offset(estimate_s, reported_
     assert refine_delay(comparison, unclear) is comparison
 
 
-def test_clock_offset_auto_note_states_already_applied_delay():
+def test_clock_offset_auto_note_contains_already_applied_delay():
     late = replace(flown(), positions=(sent(flown(), late_s=0.7),))
     request = ComparisonRequest(log="made", clock_offset_s="auto", axes=("north", "east"))
     prepared = prepare_comparison(late, request)

@@ -123,7 +123,7 @@ def test_sigma_ratio_beyond_plot_scale_is_drawn_as_triangle() -> None:
     assert block["rows"][2]["interval"] == [1.0, 1.0]
 
 
-def test_report_cover_states_reason_of_missing_verdict() -> None:
+def test_report_cover_contains_reason_of_missing_verdict() -> None:
     missing = replace(
         SMALL_SIGMA_A.verdicts[3], ratio=None, word="not evaluated", reason="no ground truth"
     )
@@ -191,7 +191,7 @@ def test_report_cover_omits_plots_of_missing_data(changes, titles) -> None:
     assert len(set_by_typst(page)) == 1
 
 
-def test_report_cover_map_title_states_distance_outside_map() -> None:
+def test_report_cover_map_title_contains_distance_outside_map() -> None:
     flight = aisle_flight(duration_s=60.0)
     flight.ekf2.state.loc[30.0:31.0, "east_m"] += 40.0
     analysis = unexplained(compare(flight))

@@ -78,7 +78,7 @@ def damage(content: bytes, kind: str, place: int) -> tuple[bytes, int, int]:
 
 @pytest.mark.parametrize("place", range(PLACES))
 @pytest.mark.parametrize("kind", KINDS)
-def test_read_damaged_ulog_states_the_missing_data(
+def test_read_damaged_ulog_reports_the_missing_data(
     content, whole, capsys, kind: str, place: int
 ) -> None:
     data, at, size = damage(content, kind, place)
@@ -146,7 +146,7 @@ def test_read_ulog_with_huge_format_definition_is_rejected(definitions: list[byt
 
 
 @pytest.mark.parametrize("share", [0.1, 0.25, 0.5, 0.9])
-def test_read_truncated_log_states_that_it_ends_in_flight(
+def test_read_truncated_log_reports_that_it_ends_in_flight(
     tmp_path, sample_log, share: float
 ) -> None:
     path = tmp_path / "cut.ulg"

@@ -36,13 +36,13 @@ def test_ekf2_replay_benchmark_matches_documented_numbers(shared_logs, model_of,
 
 
 @pytest.mark.parametrize("name", NOT_CARRIED)
-def test_ekf2_model_of_insufficient_log_states_reason(shared_logs, name):
+def test_ekf2_model_of_insufficient_log_gives_reason(shared_logs, name):
     found = open_model(read_log(shared_logs / "simulated" / f"{name}.ulg"))
     assert isinstance(found, Unavailable)
     assert NOT_CARRIED[name] in found.reason
 
 
-def test_ekf2_model_states_fraction_of_missing_imu_samples(shared_logs):
+def test_ekf2_model_reports_fraction_of_missing_imu_samples(shared_logs):
     name = "mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3.ulg"
     found = open_model(read_log(shared_logs / "real" / name))
     assert isinstance(found, Unavailable)

@@ -176,7 +176,7 @@ def unavailable(flight: Flight) -> str:
     return found.reason
 
 
-def test_ekf2_model_without_required_topic_states_reason(sample_flight: Flight) -> None:
+def test_ekf2_model_without_required_topic_gives_reason(sample_flight: Flight) -> None:
     ekf2 = sample_flight.ekf2
     missing = Unavailable("IMU", "no topic sensor_combined", "Record it.")
     assert "sensor_combined" in unavailable(replace(sample_flight, imu=missing))

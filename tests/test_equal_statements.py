@@ -15,7 +15,7 @@ LOGS = (
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", LOGS)
-def test_report_terminal_and_json_state_equal_numbers(shared_logs: Path, name: str) -> None:
+def test_report_terminal_and_json_show_equal_numbers(shared_logs: Path, name: str) -> None:
     outputs = flight_outputs(ComparisonRequest(log=str(shared_logs / name)))
     assert contradictions(outputs) == []
 

@@ -240,7 +240,7 @@ def test_nearest_pose_association_equals_exhaustive_search(denser: bool) -> None
 
 
 @pytest.mark.parametrize("method", ["interpolate", "nearest"])
-def test_evaluate_without_overlap_states_both_time_spans(method: AssociationMethod) -> None:
+def test_evaluate_without_overlap_reports_both_time_spans(method: AssociationMethod) -> None:
     reference = flight()
     estimate = replace(reference, name="boot.tum", time_s=reference.time_s + 500.0)
     said = r"0 poses match.*500.000 to 559.950 s.*0.000 to 59.950 s.*`time_offset_s` auto"
@@ -318,7 +318,7 @@ def test_rpe_pairs_are_chosen_by_reference_distance() -> None:
     assert other.translation_m.count == same.translation_m.count
 
 
-def test_evaluate_without_orientation_or_pairs_states_reason() -> None:
+def test_evaluate_without_orientation_or_pairs_gives_reason() -> None:
     reference = flight()
     got = evaluate(replace(reference, rotation=None, kind="vio"), reference)
     assert isinstance(got.ate.rotation_deg, Unavailable)
@@ -359,7 +359,7 @@ def test_default_alignment_depends_on_source_kind_and_frame(
     assert why in reason
 
 
-def test_evaluate_straight_track_with_vertical_z_aligns_by_yaw() -> None:
+def test_evaluate_straight_track_with_known_vertical_fits_yaw() -> None:
     x, y = line(0.02)
     aisle = Trajectory("aisle", "truth", np.arange(len(x)) * 0.1, y, None, "NED")
     got = evaluate(replace(aisle, kind="unknown", position_m=x), aisle)

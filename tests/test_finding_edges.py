@@ -504,7 +504,7 @@ def heading_error(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> He
     return together(tuple(parts), p, "positions")
 
 
-def test_misaligned_frame_report_states_rotation_to_apply() -> None:
+def test_misaligned_frame_report_contains_rotation_to_apply() -> None:
     finding = only(source_frame.detect, analysis(heading=heading_error(20.0, sigma_deg=2.0)))
     assert finding.id == "source_frame_misaligned"
     assert finding.title == "UWB positions are rotated by +20° relative to the IMU"
@@ -515,7 +515,7 @@ def test_misaligned_frame_report_states_rotation_to_apply() -> None:
     assert only(source_frame.detect, one).id == "ekf2_heading_error"
 
 
-def test_heading_drift_report_states_heading_at_start_and_end() -> None:
+def test_heading_drift_report_contains_heading_at_start_and_end() -> None:
     drifting = heading_error(2.0, 30.0, p=0.0)
     for has_ulog, orientation in ((True, object()), (False, object()), (True, None)):
         sent = source(orientation=orientation)
@@ -829,7 +829,7 @@ SOURCE_EDGES = [
 ]  # fmt: skip
 
 
-def test_accelerometer_bias_report_states_95_percent_interval() -> None:
+def test_accelerometer_bias_report_contains_95_percent_interval() -> None:
     one = analysis(systematic_errors=with_bias(0.3, 0.05, -0.4), ekf2=bias_of_ekf2(0.1, -0.2, 0.0))
     finding = only(imu.detect_bias, one)
     assert "tilt error of 2.9° has the same effect" in finding.message  # 0.5 of 9.80665 m/s²
@@ -901,14 +901,14 @@ def test_lost_samples_in_a_position_gap_are_not_counted() -> None:
         assert [each.evidence["lost"] for each in source_intervals.detect_lost_samples(one)] == lost
 
 
-def test_position_jump_report_states_count_and_largest_jump() -> None:
+def test_position_jump_report_contains_count_and_largest_jump() -> None:
     sizes = (jump(0.3, 0.0, at_s=30.0), jump(0.6, 0.8, at_s=60.0), jump(0.1, 0.0, at_s=90.0))
     finding = only(source_positions.detect_jumps, jumping(*sizes))
     assert finding.evidence == {"count": 2, "size_m": 1.0, "at_s": 60.0, "sigma_m": 0.02}
     assert finding.spans_s == ((30.0, 30.0), (60.0, 60.0))
 
 
-def test_scale_error_report_states_if_distances_are_too_long() -> None:
+def test_scale_error_report_shows_if_distances_are_too_long() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
         assert finding.title == f"UWB distances are 20 % too {word}"
@@ -965,7 +965,7 @@ def test_position_outlier_size_is_distance_to_ground_truth() -> None:
         assert f"distance to {reference} is {north_m:.2f} m" in finding.message
 
 
-def test_position_outlier_report_states_number_ekf2_rejected() -> None:
+def test_position_outlier_report_contains_number_ekf2_rejected() -> None:
     innovations = pd.DataFrame({"rejected": np.zeros(120)}, index=np.arange(0.05, 120.0))
     innovations.iloc[[20, 40, 50], 0] = 1.0
     outliers = tuned(outlier_time_s=np.array([20.0, 30.0, 40.0]), count=120)

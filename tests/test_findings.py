@@ -462,7 +462,7 @@ def test_ekf2_reset_is_attributed_to_missing_position_source(
     flight = aisle_flight(uwb=Uwb(gap_s=gap_s), ekf2=Estimator(resets=resets))
     first, reset = found(compare(flight))[:2]
     assert (first.id, reset.id, reset.caused_by) == (cause, "ekf2_resets", cause)
-    assert "by up to 16.00 m" in reset.message
+    assert "largest reset: 16.00 m" in reset.message
 
 
 def test_positions_lost_by_logger_are_not_reported_as_source_gap(sample_flight: Flight) -> None:
@@ -564,7 +564,7 @@ def test_each_reportable_fault_belongs_to_a_known_group() -> None:
         assert entry.meaning.endswith(".")
 
 
-def test_explain_command_examples_state_measured_detection_rates() -> None:
+def test_explain_command_examples_show_measured_detection_rates() -> None:
     examples = load_examples()
     assert list(examples) == list(CATALOGUE)
     rows = pd.read_csv(Path(__file__).parent / "studies" / "rates.csv")
@@ -598,7 +598,7 @@ def test_explain_command_prints_meaning_and_example_of_fault(typed, monkeypatch,
         assert text in out
 
 
-def test_explain_command_states_if_detection_is_not_measured(monkeypatch, capsys) -> None:
+def test_explain_command_shows_if_detection_is_not_measured(monkeypatch, capsys) -> None:
     _, out, _ = run_main(monkeypatch, capsys, "explain", "not_px4")
     assert "detection are not measured" in out
 

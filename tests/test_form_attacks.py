@@ -235,10 +235,3 @@ HONEST_FORMS: dict[str, tuple[RightFormAnswers, Answers, float]] = {
 def test_honest_answers_earn_at_least_expected_points(name: str) -> None:
     truth, form, expected = HONEST_FORMS[name]
     assert 100.0 * form_points(form, truth).fraction >= expected - 0.01
-
-
-def test_answer_with_old_name_of_compass_calibration_is_read(tmp_path: Path) -> None:
-    file = tmp_path / "answers.toml"
-    text = changed('"--start"\nvalue = 54', '"calibrate the magnetometer"')
-    file.write_text(text, encoding="utf-8")
-    assert read_answers(file).mistakes[1].parameter == "calibrate the compass"

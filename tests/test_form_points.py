@@ -118,7 +118,7 @@ def test_correct_answer_form_earns_all_and_empty_form_no_points() -> None:
 FULL = dict(zip(PART_NAMES, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))
 
 
-def test_feedback_states_each_right_answer_that_was_not_given() -> None:
+def test_feedback_reports_each_right_answer_that_was_not_given() -> None:
     assert not [each for each in form_points(RIGHT, TRUTH).feedback if "you gave" in each]
     choice = Choice("Figure 1: injected fault", ("yaw", "gap", "delay", "gate", "jump"))
     truth = replace(TRUTH, choices=((choice, "c"), (choice, "e")))

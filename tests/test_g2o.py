@@ -100,7 +100,7 @@ INVALID_TEXTS = {
     "huge": (PLANE.replace("SE2 0 1", "SE2 0 " + "9" * 30), f"line 3: {NO_VERTEX}"),
     "missing": (
         PLANE + EDGE.replace("0 1", "1 5", 1),
-        "line 4: the edge connects a vertex that is not in",
+        "line 4: the edge refers to a vertex that is not in",
     ),
     "twice": (PLANE + "\nVERTEX_SE2 1 0 0 0", "line 5: another line has the same vertex id"),
     "self": (PLANE + EDGE.replace("0 1", "1 1", 1), "line 4: the edge connects a vertex to itself"),
@@ -224,7 +224,7 @@ def test_loop_command_on_g2o_with_extreme_weights_is_finite(
     assert json.loads(out, parse_constant=pytest.fail)["graph"]["solutions"]
 
 
-def test_loop_command_on_g2o_states_if_it_did_not_converge(tmp_path, monkeypatch, capsys):
+def test_loop_command_on_g2o_reports_missing_convergence(tmp_path, monkeypatch, capsys):
     path = tmp_path / "g.g2o"
     far = "".join(f"VERTEX_SE2 {number} {number} 3 0\n" for number in range(5))
     path.write_text(far + SQUARE.format(*[UNIT_2] * 4) + f"EDGE_SE2 0 4 0.1 0.1 6.2 {UNIT_2}\n")

@@ -261,7 +261,7 @@ def test_down_axis_uses_unfused_barometer_only_on_request(tmp_path):
     requested = prepare(flight, axes=("down",), height="barometer")
     assert requested.source.barometer is not None
     bare = flight_of(outdoors(), tmp_path)
-    with pytest.raises(MissingDataError, match="no barometer height in the log"):
+    with pytest.raises(MissingDataError, match="the log contains no barometer height"):
         prepare(bare, height="barometer")
     vision = simulate_flight(make_scenario("aisle", seed=1))
     with pytest.raises(SettingsError, match="`height` needs GNSS as position source"):

@@ -95,7 +95,7 @@ def test_drifting_heading_misalignment_is_estimated_over_time(by):
     assert first.heading_error_deg > last.heading_error_deg
 
 
-def test_heading_misalignment_without_data_states_reason():
+def test_heading_misalignment_without_data_gives_reason():
     flight = simulated()
     few = tuple(replace(t, samples=t.samples.iloc[:40]) for t in flight.positions)
     for changed, reason in (

@@ -270,7 +270,7 @@ def test_what_if_excludes_height_sensor_that_disagrees_with_log() -> None:
         what_if(model, [{}], {"baro_hgt": 40.0})
 
 
-def test_ekf2_replay_of_heights_without_data_states_reason() -> None:
+def test_ekf2_replay_of_heights_without_data_gives_reason() -> None:
     flight = outdoors()
     model = opened_once()
     ekf2, segments = model.flight.ekf2, model.inputs.segments

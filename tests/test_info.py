@@ -173,7 +173,7 @@ def test_info_on_slow_imu_reports_no_acceleration_analysis(tmp_path, imu_hz, sai
     assert "attitude was logged at 5.0 Hz, but 10 Hz are needed" in slow.reason
 
 
-def test_info_on_damaged_log_states_the_damage_first(tmp_path, sample_log):
+def test_info_on_damaged_log_reports_the_damage_first(tmp_path, sample_log):
     path = tmp_path / "damaged.tlog"
     content = Aisle(seconds=10.0).record().tlog()
     path.write_bytes(content[: len(content) // 2] + bytes(5000) + content[len(content) // 2 :])
@@ -188,7 +188,7 @@ def test_info_on_damaged_log_states_the_damage_first(tmp_path, sample_log):
     assert "Copy the log" in remedies(take_inventory(read_log(path.with_suffix(".ulg"))))[0]
 
 
-def test_info_on_log_without_take_off_states_never_airborne(tmp_path):
+def test_info_on_log_without_take_off_reports_never_airborne(tmp_path):
     log = make_log()
     for name in ("x", "y", "z"):
         log["vehicle_local_position"][name][:] = 0
@@ -212,7 +212,7 @@ def test_info_does_not_use_position_source_as_ground_truth(tmp_path):
 # ---- gaps -------------------------------------------------------------------------------------
 
 
-def test_info_states_count_and_duration_of_gaps(tmp_path):
+def test_info_reports_count_and_duration_of_gaps(tmp_path):
     log = make_log(seconds=40.0)
     for name, rate_hz, first_s in (("sensor_combined", 100, 0.0),
                                    ("vehicle_visual_odometry", 5, 0.1)):  # fmt: skip

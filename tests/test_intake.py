@@ -134,7 +134,7 @@ def test_read_resaved_report_pdf_returns_same_results():
     (small_report(edit=lambda w: w.add_attachment("results.json", b"{}")), "several attachments"),
     (raw_pdf(CATALOG, b"<< /Type /Pages /Kids [] /Count 0 >>"), "the PDF has no pages"),
 ], ids=range(12))  # fmt: skip
-def test_read_report_from_unsuitable_pdf_states_reason(pdf, said):
+def test_read_report_from_unsuitable_pdf_gives_reason(pdf, said):
     assert said in reason(pdf)
 
 

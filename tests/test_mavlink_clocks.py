@@ -377,7 +377,7 @@ def test_mavlink_system_option_selects_one_of_several_vehicles(read):
             read(recorder, system=system)
 
 
-def test_mavlink_sender_report_states_fraction_of_lost_messages(tmp_path):
+def test_mavlink_sender_report_has_fraction_of_lost_messages(tmp_path):
     """Every tenth message of the companion is missing, every twentieth is repeated."""
     aisle = Aisle(seconds=60.0)
     recorder = aisle.record()

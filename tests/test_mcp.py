@@ -234,7 +234,7 @@ def test_mcp_call_with_invalid_file_or_argument_is_an_error(tmp_path: Path, serv
     connect(serve(root), talk)
 
 
-def test_mcp_command_without_mcp_package_states_how_to_install(
+def test_mcp_command_without_mcp_package_reports_how_to_install(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("px4fuse.cli.mcp.find_spec", lambda _: None)

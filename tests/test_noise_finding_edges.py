@@ -136,7 +136,7 @@ def test_noise_error_remains_if_kf_was_consistent_before_rerun(
     assert (finding.severity, finding.remedy) == expected
 
 
-def test_wrong_noise_report_states_factor_and_estimated_noise() -> None:
+def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
     fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=fitted))
     assert worse.evidence["factor"] == pytest.approx(10.0)
@@ -212,7 +212,7 @@ def test_near_zero_q_report_requires_correlated_innovations(one: Any, expected: 
     assert severity(noises.detect_process_noise_near_zero, analysis(axes=(one,))) == expected
 
 
-def test_near_zero_process_noise_report_states_response_time() -> None:
+def test_near_zero_process_noise_report_contains_response_time() -> None:
     slower = following(0.01)
     slower.axis.name = "east"
     finding = only(noises.detect_process_noise_near_zero, analysis(axes=(following(0.05), slower)))
@@ -496,7 +496,7 @@ def closing(gap_m: float | None, length_m: float = 50.0, end: Any = NONE, **part
     return loop(closure_error_m=gap_m, path_length_m=length_m, true_end=end, **usual | parts)
 
 
-def test_possible_drift_report_states_loop_closure_error() -> None:
+def test_possible_drift_report_contains_loop_closure_error() -> None:
     finding = only(hidden_errors.detect, analysis(source=ODOMETRY))
     assert finding.evidence == {"source": "uwb"}
     assert finding.message.endswith("innovations do not show the drift.")
@@ -528,7 +528,7 @@ END = TrueEnd(displacement_m={"forward": 0.0, "right": 0.0, "down": 0.0}, sigma_
         (NONE, None),
     ],
 )  # fmt: skip
-def test_drift_report_states_closure_error_at_known_landing(loop: Any, size: str | None) -> None:
+def test_drift_report_contains_closure_error_at_known_landing(loop: Any, size: str | None) -> None:
     one = analysis(axes=(hiding(nees=25.0),), source=ODOMETRY, loop=loop)
     finding = only(hidden_errors.detect, one)
     assert (finding.id, finding.severity) == ("source_drift", "error")
@@ -553,7 +553,7 @@ def test_drift_report_states_closure_error_at_known_landing(loop: Any, size: str
          "EKF2_EV_DELAY 90 ms instead of 7 ms"),
     ],
 )  # fmt: skip
-def test_changed_setting_text_states_old_and_new_value(
+def test_changed_setting_text_contains_old_and_new_value(
     owner: Any, change: dict[str, float], expected: str
 ) -> None:
     model = SimpleNamespace(inputs=SimpleNamespace(settings=dict.fromkeys(PARAMETERS, 7.0)))

@@ -763,7 +763,7 @@ def test_pdf_comparison_of_damaged_file_raises_no_exception(pdf: bytes) -> None:
         assert isinstance(compare(bytes(content), pdf), tuple)
 
 
-def test_read_report_pdf_encrypted_with_aes_states_encryption() -> None:
+def test_read_report_pdf_encrypted_with_aes_reports_encryption() -> None:
     """pypdf decrypts AES with a library that px4fuse does not need."""
     writer = PdfWriter(clone_from=REPORT)
     writer.encrypt("", algorithm="RC4-128")

@@ -218,7 +218,7 @@ def test_pose_graph_cost_does_not_depend_on_edge_order() -> None:
 # --- refusals ------------------------------------------------------------------------------------
 
 
-def test_solve_invalid_pose_graph_states_reason() -> None:
+def test_solve_invalid_pose_graph_gives_reason() -> None:
     graph = noisy_graph(2, 0)
     poses = graph.poses.copy()
     poses[4, 1] = np.nan

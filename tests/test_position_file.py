@@ -280,7 +280,7 @@ def test_read_position_file_detects_frame_from_column_names(read, case, separato
     ("mm unsaid", ("mm", "m is too large for an indoor flight", "--position-unit")),
     ("two tracks", ("'raw_x', 'raw_y', 'raw_z' as x, y, z",)),
 ])  # fmt: skip
-def test_read_position_file_states_the_used_position_columns(read, case, words):
+def test_read_position_file_reports_used_position_columns(read, case, words):
     assert_stated(read(table({"time": UNIX_S, **POSITIONS[case][0]})), "position: ", *words)
 
 

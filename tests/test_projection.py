@@ -107,7 +107,7 @@ GONE = Unavailable("innovations", "none logged", "Log them.")
     (flight(uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE)), "north", WHOLE,
      "never fuses vehicle_mocap_odometry"),
 ], ids=["segment", "north", "east", "mocap"])  # fmt: skip
-def test_axis_without_ekf2_innovations_states_the_reason(made, axis, segment, says) -> None:
+def test_axis_without_ekf2_innovations_gives_reason(made, axis, segment, says) -> None:
     (track,) = made.positions
     got = project_innovations(made, made.ekf2, track, axes_of(made)[axis], segment)
     assert isinstance(got, Unavailable)

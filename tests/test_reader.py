@@ -538,7 +538,7 @@ STREAMS = {
 
 
 @pytest.mark.parametrize("generation", STREAMS)
-def test_data_streams_state_their_topics_clock_and_file(read, generation):
+def test_data_streams_list_their_topics_clock_and_file(read, generation):
     streams = read(make_log(generation)).streams
     of_ekf2 = ("ekf2_innovations", "ekf2_fusing", "ekf2_variance")
     assert [streams[part].topics[0] for part in of_ekf2] == STREAMS[generation]

@@ -129,7 +129,7 @@ def test_file_of_exactly_the_size_limit_is_read_completely(tmp_path) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/kallsyms").exists(), reason="the file is Linux's")
-def test_file_that_states_size_0_is_read_only_up_to_limit() -> None:
+def test_file_with_reported_size_0_is_read_only_up_to_limit() -> None:
     path = Path("/proc/kallsyms")
     assert path.stat().st_size == 0
     with pytest.raises(LogError, match="more than the limit"):

@@ -165,7 +165,7 @@ def test_ekf2_rerun_equals_what_if_with_the_same_parameters() -> None:
 rms_difference = attrgetter("main.difference.position_rms_m")
 
 
-def test_filter_rerun_states_kf_ekf2_difference_before_and_after() -> None:
+def test_filter_rerun_gives_kf_ekf2_difference_before_and_after() -> None:
     kf_case = flown(sigma_a=0.02)
     right = compare(kf_case.flight, replace(kf_case.settings, **cause(kf_case, "kf").change))
     row = cause(kf_case, "kf")

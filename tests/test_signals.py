@@ -356,7 +356,7 @@ def test_ekf2_reset_along_an_unmeasured_axis_is_kept():
     state, statement = continuous_state(ekf2, blind, WHOLE)
     pd.testing.assert_frame_equal(state, ekf2.state)
     assert (
-        statement == "EKF2 resets not removed: 1 of height (these resets correct an error of EKF2)"
+        statement == "EKF2 resets not removed, because they correct an error of EKF2: 1 of height"
     )
 
 

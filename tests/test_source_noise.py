@@ -209,7 +209,7 @@ def test_small_clock_jump_is_not_reported_as_correlated_noise() -> None:
     )
 
 
-def test_low_pass_report_states_lag_below_time_constant() -> None:
+def test_low_pass_report_contains_lag_below_time_constant() -> None:
     """Expected lag for steady motion: Δt ρ / (1 - ρ)."""
     found = root_findings(analysed(SMOOTH, 5.0))["source_low_pass_filtered"]
     assert found.evidence["lag_s"] == pytest.approx(0.2 / (np.exp(0.2 / 0.5) - 1.0), abs=0.06)

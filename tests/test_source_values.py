@@ -162,7 +162,7 @@ def with_track(flight: Flight, **changes: object) -> Flight:
     return replace(flight, positions=(replace(flight.positions[0], **changes),))
 
 
-def test_invalid_position_report_states_times_and_effect():
+def test_invalid_position_report_contains_times_and_effect():
     flight = aisle_flight(uwb=Uwb(gap_s=(40.0, 46.0)))
     at = pd.Index([*np.arange(40.2, 46.0, 0.2), 80.1, 80.2])
     reasons = pd.Series(["held"] * (len(at) - 2) + ["zero"] * 2, at)
@@ -256,13 +256,13 @@ def test_invalid_position_values_are_the_only_reported_fault(name):
 
 
 @pytest.mark.parametrize("lost", [0, 1])
-def test_two_position_senders_report_states_their_distance(lost):
+def test_two_position_senders_report_contains_their_distance(lost):
     (one,) = detected(alternating(aisle_flight(uwb=Uwb(rate_hz=10.0)), lost))
     assert one.evidence["distance_m"] == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize("is_fused", [0.0, 1.0])
-def test_report_on_positions_copied_from_ekf2_states_delay(is_fused):
+def test_report_on_positions_copied_from_ekf2_reports_delay(is_fused):
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, is_fused),)))
     first, *_ = detected(copied(flight))
     assert first.evidence["delay_s"] == pytest.approx(0.03, abs=0.01)
@@ -273,7 +273,7 @@ def test_valid_positions_of_clean_flight_are_not_reported():
     assert detected(aisle_flight()) == ()
 
 
-def test_wrong_timestamp_unit_report_states_ekf2_never_fused():
+def test_wrong_timestamp_unit_report_shows_ekf2_never_fused():
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 0.0),)))
     flight = replace(flight, log=replace(flight.log, parameters={"EKF2_EV_CTRL": 15}))
     first, second = detected(with_clock(flight, "milliseconds"))
@@ -282,7 +282,7 @@ def test_wrong_timestamp_unit_report_states_ekf2_never_fused():
     assert "the timestamps are in milliseconds" in second.title
 
 
-def test_equal_timestamps_report_states_clock_resolution():
+def test_equal_timestamps_report_contains_clock_resolution():
     (one,) = detected(
         with_clock(aisle_flight(uwb=Uwb(rate_hz=1.0)), "local", REPEATED_TIMESTAMPS, 120)
     )
@@ -291,7 +291,7 @@ def test_equal_timestamps_report_states_clock_resolution():
 
 
 @pytest.mark.parametrize(("quality", "words"), [(20.0, "light"), (0.0, "ODOMETRY")])
-def test_unfused_vision_report_states_quality_below_ekf2_ev_qmin(quality, words):
+def test_unfused_vision_report_shows_quality_below_ekf2_ev_qmin(quality, words):
     flight = aisle_flight(ekf2=Estimator(fusing=((0.0, 0.0),)))
     parameters = {"EKF2_EV_CTRL": 15, "EKF2_EV_QMIN": 50}
     flight = replace(flight, log=replace(flight.log, parameters=parameters))

@@ -328,7 +328,7 @@ def test_find_submissions_skips_zip_beyond_size_limits(tmp_path, monkeypatch, li
     assert any(note.startswith("x.zip was ignored: ") and said in note for note in notes)
 
 
-def test_read_submission_from_unsupported_zip_states_reason(tmp_path):
+def test_read_submission_from_unsupported_zip_gives_reason(tmp_path):
     link = zipfile.ZipInfo("link.pdf")
     link.external_attr = 0o120777 << 16
     out = io.BytesIO()

@@ -202,7 +202,7 @@ def test_evaluate_command_writes_only_the_named_files(
     assert alone == ("ATE (m)" not in result.output)
 
 
-def test_loop_with_reference_states_ate_of_each_correction(desk) -> None:
+def test_loop_with_reference_reports_ate_of_each_correction(desk) -> None:
     """References: the source itself, a flight with other timestamps, and one without overlap."""
 
     def scores(reference: str, way: str = "uncorrected") -> dict[str, Any]:

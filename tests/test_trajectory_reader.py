@@ -136,7 +136,7 @@ def test_read_trajectory_detects_camera_frame_by_level_motion(
     assert (got.kind, got.frame) == ("slam", frame)
 
 
-def test_read_trajectory_states_gaps_and_repeated_timestamps(tmp_path: Path) -> None:
+def test_read_trajectory_reports_gaps_and_repeated_timestamps(tmp_path: Path) -> None:
     time = np.arange(1000) * 0.05
     keep = ((time < 10) | (time > 14)) & ((time < 30) | (time > 31))
     made = Trajectory("t", "unknown", time, np.tile(POSITION_M, (20, 1)), Rotation.identity(1000))

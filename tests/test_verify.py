@@ -479,7 +479,7 @@ DOCUMENT: dict[str, tuple[Forge, str, str]] = {
 
 
 @pytest.mark.parametrize("name", DOCUMENT)
-def test_verify_report_with_changed_pdf_document_states_reason(
+def test_verify_report_with_changed_pdf_document_gives_reason(
     aisle: VerifiedReport, name: str
 ) -> None:
     forge, expected, said = DOCUMENT[name]

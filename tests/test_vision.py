@@ -203,8 +203,8 @@ def ran(inputs: Inputs, *configurations: FilterConfiguration) -> SegmentRun:
 
 
 def update_log(done: SegmentRun, at: int = 0) -> pd.DataFrame:
-    assert done.vision is not None
-    return done.vision.updates(at, done.segment.time_s[done.events[at].end_step])
+    assert done.vision_filter is not None
+    return done.vision_filter.updates(at, done.segment.time_s[done.events[at].end_step])
 
 
 @pytest.mark.parametrize(("rate_hz", "late_s", "settings"), [
@@ -242,8 +242,10 @@ def test_vision_noise_during_gnss_fusion_is_at_least_gnss_noise() -> None:
     noises = ({**inputs.settings, "EKF2_EVP_NOISE": noise_m} for noise_m in (0.01, 0.5, 0.7))
     alone = FilterConfiguration(inputs.settings, without={"gnss_pos": 0.0})
     done = ran(inputs, *map(FilterConfiguration, noises), alone)
-    assert done.vision is not None
-    noise = np.sqrt(np.unique(done.vision.noise_m2[done.vision.has_sample[0]].round(9), axis=0))
+    assert done.vision_filter is not None
+    noise = np.sqrt(
+        np.unique(done.vision_filter.noise_m2[done.vision_filter.has_sample[0]].round(9), axis=0)
+    )
     assert sorted({*noise[:, 0].round(6)}) == [0.1, 0.5, 0.7]
     pd.testing.assert_frame_equal(update_log(done, 0), update_log(done, 1))
     assert np.abs(update_log(done, 2) - update_log(done, 1)).max(axis=None) > 0.01
@@ -266,8 +268,8 @@ def test_vision_lever_arm_is_subtracted_in_replay() -> None:
 
 def test_vision_position_bias_estimates_frame_offset() -> None:
     done = ran(flying(sent(sigma_m=0.05)))
-    assert done.vision is not None
-    np.testing.assert_allclose(-done.vision.bias.value_m[0], FRAME_M[:2], atol=0.5)
+    assert done.vision_filter is not None
+    np.testing.assert_allclose(-done.vision_filter.bias.value_m[0], FRAME_M[:2], atol=0.5)
     truth = on_gnss().flight.truth
     end_s = float(done.segment.time_s[done.events[0].end_step[-1]])
     for axis in (0, 1):
@@ -325,8 +327,8 @@ def test_loss_of_gnss_resets_position_to_vision() -> None:
     assert reset_s == pytest.approx(lost_s, abs=0.3)
     moved = done.position_reset_m[:, 1]
     np.testing.assert_allclose(moved.sum(axis=0), FRAME_M[:2], atol=0.6)
-    assert done.vision is not None
-    np.testing.assert_array_equal(done.vision.bias.value_m[1], 0.0)
+    assert done.vision_filter is not None
+    np.testing.assert_array_equal(done.vision_filter.bias.value_m[1], 0.0)
     difference = done.state[-1, 1, 6:8] - done.state[-1, 0, 6:8]
     np.testing.assert_allclose(difference, FRAME_M[:2], atol=0.6)
     after = found.loc[reset_s + 1.0 :]
@@ -364,8 +366,8 @@ def test_rejection_of_gnss_and_vision_resets_position_to_vision() -> None:
     assert reset_s == pytest.approx(float(done.segment.time_s[0]) + 16.0, abs=0.2)
     np.testing.assert_allclose(done.position_reset_m.sum(axis=(0, 1)), [20.0, 0.0], atol=0.7)
     assert found.loc[reset_s + 0.1 :, "fused"].all()
-    assert done.vision is not None
-    np.testing.assert_allclose(-done.vision.bias.value_m[0], FRAME_M[:2], atol=0.7)
+    assert done.vision_filter is not None
+    np.testing.assert_allclose(-done.vision_filter.bias.value_m[0], FRAME_M[:2], atol=0.7)
 
 
 def test_larger_vision_delay_extends_the_fusion_horizon() -> None:

@@ -70,7 +70,7 @@ def test_kf_ekf2_difference_uses_only_evaluated_segment(sample: Analysis) -> Non
     assert of(sample).outside.at_s < of(sample).spans_s[0][0]
 
 
-def test_kf_ekf2_difference_without_replay_states_reason(sample: Analysis) -> None:
+def test_kf_ekf2_difference_without_replay_gives_reason(sample: Analysis) -> None:
     down = compare(sample.flight, axes=("down",))
     found = explain_ekf2_difference(down, sample.ekf2_model, sample.clock, {})["down"]
     assert "horizontal" in found.reason

@@ -25,9 +25,9 @@ from px4fuse.core.reading import (
 )
 from px4fuse.errors import SettingsError
 
-# Names of tool arguments that differ from the parameter of the command
+# Tool arguments with another name than the parameter of the command
 ARGUMENT_NAMES = {"finding": "finding_id", "parameter_texts": "parameters", "source": "log"}
-# Parameters of commands that are not offered in tools: outputs, exit codes and student
+# Command parameters that the tools do not have: outputs, exit codes, and data of the student
 HIDDEN_PARAMETERS = {
     *("output", "json_path", "tum", "g2o", "fail_on", "checks"),
     *("student", "student_id", "notes", "answers"),
@@ -125,9 +125,9 @@ def run_command(
 
 
 def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
-    """Return the tools of the server, each with the function that parses its arguments.
+    """Return each tool of the server with the function that parses the arguments of the tool.
 
-    The options of a command define the input schema, and the type of its results the output schema.
+    Input schema: from the options of the command. Output schema: from the type of the results.
     """
     from mcp.types import Tool
 
@@ -213,24 +213,24 @@ def _parse_arguments(
     LogError
         A file is outside the folders.
     """
-    words, operands, files = [command_name], ["--"], list[Path]()
+    command_words, operands, files = [command_name], ["--"], list[Path]()
     for name, parameter in parameters.items():
         if name not in arguments:
             continue
         value, option = arguments[name], parameter.opts[-1]
         if isinstance(value, dict):
             value = [f"{key}={number}" for key, number in value.items()]
-        texts = [str(text) for text in (value if isinstance(value, list) else [value])]
+        argument_texts = [str(text) for text in (value if isinstance(value, list) else [value])]
         if isinstance(parameter.type, options.InputPath):
-            texts = [_find_file(texts[0], folders)]
-            files.append(split_path_and_part(texts[0])[0])
+            argument_texts = [_find_file(argument_texts[0], folders)]
+            files.append(split_path_and_part(argument_texts[0])[0])
         if isinstance(parameter, click.Argument):
-            operands += texts
+            operands += argument_texts
         elif isinstance(value, bool):
-            words += [option] * value
+            command_words += [option] * value
         else:
-            words += [f"{option}={text}" for text in texts]
-    return words + operands, files
+            command_words += [f"{option}={text}" for text in argument_texts]
+    return command_words + operands, files
 
 
 def _find_file(file_text: str, folders: Sequence[Path]) -> str:

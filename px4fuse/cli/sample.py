@@ -1,27 +1,15 @@
 """Command ``px4fuse sample``: writes the sample logs."""
 
-from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Any
 
 import click
 
 from px4fuse.cli.options import output_option
 from px4fuse.cli.outputs import write_and_print
-from px4fuse.errors import MissingDataError, OutputError
 
 SAMPLES_FOLDER = Path("sample_logs")
 SAMPLE_LOG = "aisle_uwb.ulg"
-
-
-def _installed_samples() -> Any:
-    try:
-        return files("px4fuse_samples")
-    except ModuleNotFoundError:
-        raise MissingDataError(
-            "The sample logs are not installed.",
-            'Give the path of a log, or run pip install "px4fuse[samples]".',
-        ) from None
+INSTALL_COMMAND = 'pip install "px4fuse[samples]"'
 
 
 def sample_log() -> Path:
@@ -32,10 +20,20 @@ def sample_log() -> Path:
     MissingDataError
         The sample logs are not installed.
     """
+    from importlib.resources import as_file, files
+
+    from px4fuse.errors import MissingDataError
+
     path = SAMPLES_FOLDER / SAMPLE_LOG
     if not path.is_file():
-        with as_file(_installed_samples() / SAMPLE_LOG) as path:
-            pass
+        try:
+            with as_file(files("px4fuse_samples") / SAMPLE_LOG) as path:
+                pass
+        except ModuleNotFoundError:
+            raise MissingDataError(
+                "No log was given, and the sample logs are not installed.",
+                f"Give the path of a log, or run {INSTALL_COMMAND}.",
+            ) from None
     click.echo(f"No log was given: the sample log {SAMPLE_LOG} is used.", err=True)
     return path
 
@@ -44,10 +42,18 @@ def sample_log() -> Path:
 @output_option("DIR", "Folder to write the sample logs to.", default=SAMPLES_FOLDER)
 def sample(output: Path) -> None:
     """Write the sample logs (aisle with UWB, loop with VIO) to a folder."""
+    from importlib.resources import files
+
+    from px4fuse.errors import MissingDataError, OutputError
     from px4fuse.report.page import Page
     from px4fuse.request import ComparisonRequest, command_line
 
-    logs = [file for file in _installed_samples().iterdir() if file.is_file()]
+    try:
+        logs = [file for file in files("px4fuse_samples").iterdir() if file.is_file()]
+    except ModuleNotFoundError:
+        raise MissingDataError(
+            "The sample logs are not installed", f"Run {INSTALL_COMMAND}."
+        ) from None
     contents = {output / file.name: file.read_bytes() for file in sorted(logs, key=str)}
     for path, content in contents.items():
         if path.is_file() and path.read_bytes() != content:

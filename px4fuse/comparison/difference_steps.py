@@ -250,9 +250,9 @@ def _step_reasons(
         f"assumes {age_ms:.0f} ms"
     )
     if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
-        ends_s = (clock_offset.offset_s, *clock_offset.interval_s[::-1])
+        estimate_and_limits_s = (clock_offset.offset_s, *clock_offset.interval_s[::-1])
         estimated_delay_ms, low_ms, high_ms = (
-            1e3 * (source.assumed_delay_s - offset_s) for offset_s in ends_s
+            1e3 * (source.assumed_delay_s - offset_s) for offset_s in estimate_and_limits_s
         )
         delay_text += (
             f". The maximum-likelihood estimate of this delay is {estimated_delay_ms:.0f} ms (95 % "

@@ -192,10 +192,10 @@ def white_errors(comparison: Comparison) -> WhiteErrors | None:
         array[is_complete] for array in (rows, neighbour_rows, elapsed_s)
     )
     weights = np.ones_like(elapsed_s)  # of Lagrange's interpolation at the time of the position
-    for row in range(len(NEIGHBOURS)):
-        for other_row in set(range(len(NEIGHBOURS))) - {row}:
-            other_s = elapsed_s[:, other_row]
-            weights[:, row] *= other_s / (other_s - elapsed_s[:, row])
+    for neighbour in range(len(NEIGHBOURS)):
+        for other_neighbour in set(range(len(NEIGHBOURS))) - {neighbour}:
+            other_s = elapsed_s[:, other_neighbour]
+            weights[:, neighbour] *= other_s / (other_s - elapsed_s[:, neighbour])
     noise_gain = np.sqrt(1.0 + np.sum(weights**2, axis=1))
     phase_s = time_s - interval_s * np.arange(len(time_s))
     late_s = phase_s - median_filter(phase_s, MEDIAN_TIMESTAMP_COUNT, mode="nearest")
@@ -303,8 +303,8 @@ def fit_errors(comparison: Comparison, white: WhiteErrors) -> ErrorFit | None:
     time_s, position_m = time_s[is_inside], position_m[is_inside]
     if len(time_s) < MIN_POSITIONS:
         return None
-    curve = CubicSpline(true_m.index, true_m)
-    path_m, velocity_m_s = curve(time_s), curve(time_s, 1)
+    true_spline = CubicSpline(true_m.index, true_m)
+    path_m, velocity_m_s = true_spline(time_s), true_spline(time_s, 1)
     path_m = path_m - path_m.mean(axis=0)
     path_square_m2 = float(np.mean(np.sum(path_m**2, axis=1)))
     if path_square_m2 < MIN_PATH_RMS_M**2:
@@ -318,17 +318,17 @@ def fit_errors(comparison: Comparison, white: WhiteErrors) -> ErrorFit | None:
         ],
         axis=-1,
     )
-    error_m = position_m - curve(time_s)
+    error_m = position_m - true_spline(time_s)
     parameters, remaining_m = _least_squares(columns, error_m)
     # Successive errors are correlated, so fewer errors are independent
     interval_s = float(np.median(np.diff(time_s)))
     independent_count = len(time_s) / max(*map(autocorrelation_time, remaining_m.T), 1.0)
     sigma = np.sqrt(np.mean(remaining_m**2) / (path_square_m2 * independent_count))
     if comparison.source.origin.may_drift:
-        width = max(1, round(DRIFT_WINDOW_S / interval_s))
+        window_rows = max(1, round(DRIFT_WINDOW_S / interval_s))
 
         def high_pass(values: Array) -> Array:
-            return values - uniform_filter1d(values, width, axis=0)
+            return values - uniform_filter1d(values, window_rows, axis=0)
 
         _, remaining_m = _least_squares(high_pass(columns)[..., 2:], high_pass(error_m))
     white_m = SIGMA_PER_MEDIAN * float(np.median(np.abs(white.residual_m)))
@@ -364,8 +364,10 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
         return None
     # errors in bins of equal length have the spectrum of all frequencies in one FFT
     bin_count = 2 ** int(np.ceil(np.log2(MIN_BINS_PER_PERIOD * highest_hz / step_hz)))
-    bins = np.rint((fit.time_s - fit.time_s[0]) * step_hz * bin_count).astype(int)
-    spectrum = np.fft.rfft([np.bincount(bins, error, bin_count) for error in fit.remaining_m.T])
+    bin_indices = np.rint((fit.time_s - fit.time_s[0]) * step_hz * bin_count).astype(int)
+    spectrum = np.fft.rfft(
+        [np.bincount(bin_indices, error, bin_count) for error in fit.remaining_m.T]
+    )
     powers = np.sum(np.abs(spectrum[:, rows]) ** 2, axis=0)
     frequency_hz = float(step_hz * (rows.start + np.argmax(powers)))
 
@@ -396,9 +398,9 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     The time offsets of all flight parts and the parameters of :class:`ErrorFit` are fitted
     together. A time offset causes no error at rest, so it does not explain a jump or drift.
     """
-    parts = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_S).astype(int)
-    square_sums = np.bincount(parts, np.sum(fit.velocity_m_s**2, axis=1))
-    square_speeds = square_sums / np.maximum(np.bincount(parts), 1)
+    part_indices = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_S).astype(int)
+    square_sums = np.bincount(part_indices, np.sum(fit.velocity_m_s**2, axis=1))
+    square_speeds = square_sums / np.maximum(np.bincount(part_indices), 1)
     moving_parts = np.flatnonzero(square_speeds > MIN_OFFSET_SPEED_M_S**2)
     if len(moving_parts) < 2:
         return None
@@ -409,13 +411,13 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
 
     def fit_offsets(values: Array) -> Array:
         sums = np.zeros((len(inverse_squares), values.shape[-1]))
-        np.add.at(sums, parts, np.einsum("na,nak->nk", effect, values))
+        np.add.at(sums, part_indices, np.einsum("na,nak->nk", effect, values))
         return sums * inverse_squares[:, None]
 
     # the constants without the constant time offset, and the error
     columns = np.concatenate([fit.columns[..., :-1], fit.remaining_m[..., None]], axis=-1)
     offsets_by_column_s = fit_offsets(columns)
-    columns -= effect[:, :, None] * offsets_by_column_s[parts, None]
+    columns -= effect[:, :, None] * offsets_by_column_s[part_indices, None]
     parameters, remaining_m = _least_squares(columns[..., :-1], columns[..., -1])
     offsets_s = (offsets_by_column_s @ np.append(-parameters, 1.0))[moving_parts]
     remaining_square_m2 = float(np.mean(remaining_m**2, axis=0).sum()) - 2.0 * fit.white_m**2
@@ -426,10 +428,8 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     ):
         return None
     times_s = fit.time_s[0] + OFFSET_PART_S * (moving_parts + 0.5)
-    least, most = np.argmin(offsets_s), np.argmax(offsets_s)
-    return OffsetVariation(
-        float(offsets_s[least]), float(offsets_s[most]), float(times_s[least]), float(times_s[most])
-    )
+    extreme_indices = [int(np.argmin(offsets_s)), int(np.argmax(offsets_s))]
+    return OffsetVariation(*offsets_s[extreme_indices].tolist(), *times_s[extreme_indices].tolist())
 
 
 def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | None:

@@ -120,7 +120,9 @@ def prepare(
                 f"{flight.log.name}: `input` imu needs acceleration: {acceleration}"
             )
         settings = replace(settings, input="zero")
-        notes += (f"no acceleration ({acceleration.reason}): KF assumes constant velocity",)
+        notes += (
+            f"KF assumes constant velocity, because acceleration is missing: {acceleration.reason}",
+        )
         missing += () if acceleration in missing else (acceleration,)
     return PreparedComparison(
         flight,
@@ -254,12 +256,12 @@ def _use_barometer_height(
     )
     if not uses_barometer or barometer_heights is None:
         if height_sensor == "barometer":
-            raise MissingDataError(f"{log_name}: no barometer height in the log.", GNSS.to_log)
+            raise MissingDataError(
+                f"{log_name}: the log contains no barometer height.", GNSS.to_log
+            )
         return track
-    zero_height_down_m, zero_text = (
-        barometer_heights["down_m"].iloc[0],
-        "the first barometer height",
-    )
+    zero_height_down_m = barometer_heights["down_m"].iloc[0]
+    zero_text = "the first barometer height"
     if isinstance(ekf2, Ekf2):
         ekf2_down_m = np.interp(
             barometer_heights.index, ekf2.state.index, ekf2.state["down_m"], np.nan, np.nan
@@ -297,13 +299,15 @@ def explain_missing_source(flight: Flight) -> Unavailable:
             f"or {remedy}"
         )
     reason = f"{damage_text}no external position in this log (no {topics})"
-    height_only = next((item for item in flight.missing if item.reason == HEIGHT_ONLY_REASON), None)
-    if height_only is not None:
-        reason = f"{damage_text}{height_only.source}: {HEIGHT_ONLY_REASON}"
-    gnss = next((item for item in flight.missing if item.remedy == NO_FIX_ACTION), None)
-    if gnss is not None:
-        reason += f"; {gnss.source}: {gnss.reason}"
-        remedy = f"{gnss.remedy} Or {remedy}"
+    height_only_source = next(
+        (item for item in flight.missing if item.reason == HEIGHT_ONLY_REASON), None
+    )
+    if height_only_source is not None:
+        reason = f"{damage_text}{height_only_source.source}: {HEIGHT_ONLY_REASON}"
+    gnss_without_fix = next((item for item in flight.missing if item.remedy == NO_FIX_ACTION), None)
+    if gnss_without_fix is not None:
+        reason += f"; {gnss_without_fix.source}: {gnss_without_fix.reason}"
+        remedy = f"{gnss_without_fix.remedy} Or {remedy}"
     if flight.log.autopilot != "PX4":
         reason += f"; the autopilot is {flight.log.autopilot}, so there is no EKF2"
     return Unavailable("position source", reason, capitalise_first(remedy))
@@ -392,7 +396,7 @@ def choose_segment(
     if not chosen_start_s < chosen_end_s:
         raise SettingsError(
             f"{flight.log.name}: no positions between {chosen_start_s:.6g} s and "
-            f"{chosen_end_s:.6g} s; the position source runs from "
+            f"{chosen_end_s:.6g} s; the positions are from "
             f"{source_span_s[0]:.2f} s to {source_span_s[1]:.2f} s. Change --start or --end."
         )
     segment_start_s = max(chosen_start_s, available_start_s)

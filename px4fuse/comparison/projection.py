@@ -84,10 +84,10 @@ def continuous_state(
                 state[columns], group = best_state, removed_resets
         group.append(f"{len(resets)} of {label}")
     reset_statements = (
-        f"EKF2 resets {treatment}: {', '.join(reset_texts)} ({reason})"
-        for treatment, reset_texts, reason in (
-            ("removed", removed_resets, "these resets move the origin"),
-            ("not removed", kept_resets, "these resets correct an error of EKF2"),
+        f"EKF2 resets {treatment}: {', '.join(reset_texts)}"
+        for treatment, reset_texts in (
+            ("removed, because they move the origin of EKF2's frame", removed_resets),
+            ("not removed, because they correct an error of EKF2", kept_resets),
         )
         if reset_texts
     )

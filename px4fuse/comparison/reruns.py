@@ -161,10 +161,10 @@ def rerun_filters(
         replays: dict[frozenset[tuple[str, float]], Ekf2Replay] = {}
 
         def rerun_ekf2(axis_result: AxisComparison, change: Change) -> RunStatistics:
-            key = frozenset(change.items())
-            if key not in replays:
-                replays[key] = _replay_ekf2(comparison, estimates.tuning, model, change)
-            return _replay_statistics(comparison, model, replays[key], axis_result, change)
+            change_key = frozenset(change.items())
+            if change_key not in replays:
+                replays[change_key] = _replay_ekf2(comparison, estimates.tuning, model, change)
+            return _replay_statistics(comparison, model, replays[change_key], axis_result, change)
 
         filters.append(_Filter("ekf2", rerun_ekf2, model))
     return tuple(

@@ -181,14 +181,14 @@ def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]
 
     The list is empty if one re-run brings the statistic inside its limits.
     """
-    helpful = [
+    candidates = [
         trial
         for trial in trials
         if statistic in trial.discrepancies
         and _explanation_error(trial, statistic) < COMBINED_CAUSE_TOLERANCE
     ]
-    helpful.sort(key=lambda trial: _explanation_error(trial, statistic))
-    return [] if any(is_sufficient(trial, statistic) for trial in helpful) else helpful
+    candidates.sort(key=lambda trial: _explanation_error(trial, statistic))
+    return [] if any(is_sufficient(trial, statistic) for trial in candidates) else candidates
 
 
 def log_ratio_sum(statistics: RunStatistics) -> float:
@@ -217,7 +217,11 @@ def sigma_ratios(statistics: RunStatistics) -> dict[Reference, float]:
         "source": statistics.nis_mean,
         "truth": statistics.nees_mean,
     }
-    return {reference: math.sqrt(mean) for reference, mean in squared_ratios.items() if mean}
+    return {
+        reference: math.sqrt(squared_ratio)
+        for reference, squared_ratio in squared_ratios.items()
+        if squared_ratio
+    }
 
 
 def log_ratio_reduction(trial: Trial) -> float:

@@ -75,7 +75,7 @@ def fused_samples(
     interval_s = sample_interval_s(fusion_record)
     samples = _known_and_simulated_samples(ekf2, fusion_record, logged_down_m, interval_s)
     distance_s = np.diff(np.pad(samples.index.to_numpy(), 1, mode="edge"))
-    # Each sample represents half of the missing samples before it and half of those after it
+    # Half of the missing samples between two samples count for each of them
     weight = 0.5 * np.rint((distance_s[1:] + distance_s[:-1]) / interval_s)
     return pd.DataFrame({"down_m": samples, "weight": np.clip(weight, 1.0, MAX_SAMPLE_WEIGHT)})
 

@@ -1,6 +1,6 @@
 """Earth rotation rate and radii of curvature of the earth in EKF2.
 
-Since PX4 v1.16, EKF2's state contains latitude and longitude. EKF2 converts them to metres on an
+Since PX4 v1.16, EKF2's state contains latitude and longitude. EKF2 converts both to metres on an
 ellipsoid, but publishes positions in metres on a sphere.
 
 Sources: PX4-Autopilot ``lib/lat_lon_alt/lat_lon_alt.cpp`` (computeRadiiOfCurvature),
@@ -26,7 +26,7 @@ def earth_rate_rad_s(fusion_record: FusionRecord) -> Array:
 
 
 def ekf2_metres_per_metre(fusion_record: FusionRecord) -> tuple[float, float, float]:
-    """Return the ratio of EKF2's internal to its published position along north, east, down."""
+    """Return EKF2's internal position / published position along north, east and down."""
     if np.isnan(fusion_record.latitude_deg) or not fusion_record.stores_latitude():
         return 1.0, 1.0, 1.0
     eccentricity_squared = ECCENTRICITY**2

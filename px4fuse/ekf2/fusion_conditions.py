@@ -112,7 +112,7 @@ class FusionAttempt:
 
     @property
     def horizon_s(self) -> float:
-        """Maximum age (s) of buffered samples; EKF2_DELAY_MAX or MAX_HORIZON_S if not logged."""
+        """Maximum age (s) of buffered samples: EKF2_DELAY_MAX, or MAX_HORIZON_S if not logged."""
         horizon_s = self.ekf2.horizon_s
         limit_s = 1e-3 * self.parameters.get("EKF2_DELAY_MAX", 1e3 * MAX_HORIZON_S)
         return horizon_s if isinstance(horizon_s, float) else limit_s
@@ -166,7 +166,7 @@ def constant_coordinates(source: PositionTrack) -> list[str]:
 
 
 def is_height_only(source: PositionTrack) -> bool:
-    """Return True if x and y of a position source are constant: it measures only the height."""
+    """Return True if a position source measures only the height: x and y are constant."""
     return {"x", "y"} <= {*constant_coordinates(source)}
 
 

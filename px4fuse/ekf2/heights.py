@@ -60,9 +60,9 @@ def add_heights(
     if uses_aid_mask(parameters):
         return "EKF2 before PX4 v1.14 fuses only one height sensor"
     enabled_fractions = {
-        name: np.mean(step_values_at(log.enabled, replayed_s) > 0.0)
-        for name, log in ekf2.aids.items()
-        if log.enabled is not None
+        name: np.mean(step_values_at(aid_log.enabled, replayed_s) > 0.0)
+        for name, aid_log in ekf2.aids.items()
+        if aid_log.enabled is not None
     }
     fused_aids = [aid.name for aid in HEIGHT_SENSORS if enabled_fractions.get(aid.name) == 1.0]
     for aid in HEIGHT_AIDS:

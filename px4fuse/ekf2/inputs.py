@@ -84,7 +84,7 @@ MAX_IMU_INTERVAL_S = 0.012
 MAX_LOST_FRACTION = 0.1
 # First PX4 release with the time of the fusion horizon in estimator_states
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
-# Maximum number of successive position resets in PX4 releases that have no limit
+# Maximum number of successive position resets in PX4 releases without a limit: never reached
 UNLIMITED_RESETS = 1_000_000
 # Maximum interval (s) between height and heading updates in a gap of the position source
 MAX_INTERVAL_S = 0.25
@@ -109,7 +109,7 @@ class ReceivedPositions:
     uses_sender_times : bool
         True if EKF2 uses measurement times of the sender and ignores its delay parameter.
     reset_s : ndarray
-        Timestamps of the samples with a new ``reset_counter``: EKF2 resets its position to them.
+        Timestamps of the samples with a new ``reset_counter``, to which EKF2 resets its position.
     has_all_resets : bool
         True if the log contains all resets of EKF2's position to a sample.
     """

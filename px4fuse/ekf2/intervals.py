@@ -159,8 +159,8 @@ def _make_events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Step
     is_usable[:-1] &= end_steps[1:] > end_steps[:-1]
     action, can_start = _sample_actions(inputs, segment, measured_s, end_steps, is_usable)
     action[np.isin(timestamp_s, received.reset_s) & (action == FUSE)] = START
-    # Gaps of the position source contain additional events. Their number does not depend on the
-    # delay
+    # Gaps of the position source contain additional events. The number of events does not depend on
+    # the delay
     gap_s = np.diff(np.r_[time_s[0], timestamp_s, time_s[-1]])
     extra_event_counts = np.maximum(np.ceil(gap_s / inputs.max_interval_s).astype(int) - 1, 0)
     sample_event_rows = np.cumsum(extra_event_counts[:-1] + 1) - 1

@@ -446,7 +446,7 @@ def _make_replay(
 
 
 def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Span]:
-    """Return start and end (s) of each time span without a fused position, > RESTART_GAP_S."""
+    """Return the time spans (s) without a fused position that are longer than RESTART_GAP_S."""
     is_used = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
     fusion_times_s = [*updates.loc[is_used, "fused_at_s"], float(segment.time_s[-1])]
     return [
@@ -577,12 +577,12 @@ def _propagate_states(
     is_first_step = (first_step == np.arange(len(first_step)))[:, None]
 
     def sum_since_event(increments: Array) -> Array:
-        total = np.cumsum(increments, axis=0)
-        return np.asarray(total - (total - increments)[first_step])
+        cumulative_sum = np.cumsum(increments, axis=0)
+        return np.asarray(cumulative_sum - (cumulative_sum - increments)[first_step])
 
     def value_before_step(rows: slice) -> Array:
-        shifted = np.concatenate([state[:1, rows], state[:-1, rows]])
-        return np.where(is_first_step, start_state[:, rows], shifted)
+        previous_state = np.concatenate([state[:1, rows], state[:-1, rows]])
+        return np.where(is_first_step, start_state[:, rows], previous_state)
 
     # θ += -R b_g Δt; v += (θ × a - R b_a + a + g) Δt; p += mean velocity · Δt
     rotation_steps = -rotate(body_to_ned, state[:, GYRO_BIAS]) * step_s

@@ -23,9 +23,11 @@ from px4fuse.ekf2.replay_segments import (
 )
 from px4fuse.trajectory.rotation import rotate
 
-# Factor on gain² · Σ error in the corrections of velocity and position (output_predictor.cpp)
+# Velocity and position: correction = gain · error + INTEGRAL_GAIN · gain² · Σ error
+# (output_predictor.cpp)
 INTEGRAL_GAIN = 0.1
-# Attitude correction / (error · step / delay of the fusion horizon) (output_predictor.cpp)
+# Attitude: correction = ATTITUDE_GAIN · error · step / delay of the fusion horizon
+# (output_predictor.cpp)
 ATTITUDE_GAIN = 0.5
 
 

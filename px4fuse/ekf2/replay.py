@@ -175,7 +175,7 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     settings : mapping
         All parameters of the model, by PX4 name.
     late, lost : int
-        Number of samples that were fused late, and that were too late to be fused.
+        Number of samples that were fused late, and number of samples too late to be fused.
     updates : DataFrame, one row per position sample, at EKF2's measurement time
         See :func:`~px4fuse.ekf2.replay_segments.update_table`.
     other_aid_updates : mapping from PX4's name to DataFrame
@@ -200,7 +200,7 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     flow_only_spans_s: NotWritten[Spans] = NOT_WRITTEN
 
     def find_evaluated_spans(self) -> Spans:
-        """Return the time spans (s) after the filter has settled, without spans of flow only."""
+        """Return the evaluated time spans (s): settled filter, not with optical flow alone."""
         evaluated_spans_s = []
         for start, end in self.stretches_s:
             begin = start + SETTLING_S
@@ -221,7 +221,9 @@ class _ComparedInnovations(NamedTuple):
     axes: dict[str, AxisAgreement]
 
     def compute_rejected_fractions(self) -> tuple[float, float]:
-        logged, replayed = (float(np.mean(each["rejected"] > 0.0)) for each in self[:2])
+        logged, replayed = (
+            float(np.mean(innovations["rejected"] > 0.0)) for innovations in self[:2]
+        )
         return logged, replayed
 
 
@@ -329,7 +331,7 @@ def _compare_innovations(
 def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     """Return the largest position difference (m) while optical flow was the only horizontal aid.
 
-    Return None if the flight contains no such time.
+    Return None if other horizontal aiding sources were always available.
     """
     logged_state = rows_inside(ekf2.state, replay.flow_only_spans_s)
     if logged_state.empty:

@@ -60,8 +60,8 @@ MIN_FUSION_S = 1.0
 MIN_AIRBORNE_S = 4.0
 # Time (s) from the start of a replay to the start of the evaluation
 SETTLING_S = 5.0
-# Time (s) from EKF2's first fusion of all magnetometer axes, which resets the field states, to the
-# first logged field states that are used
+# EKF2's first fusion of all magnetometer axes resets the field states. Logged field states are used
+# from this time (s) after the first fusion on
 FIELD_RESET_S = 1.0
 # Flight time (s) before the replay that is used to estimate correlations of the initial state
 CORRELATION_HISTORY_S = 20.0
@@ -557,7 +557,7 @@ def _make_segment(
 def _field_span(fusion_record: FusionRecord) -> Span | None:
     """Return start and end (s) of EKF2's fusion of all three magnetometer axes.
 
-    Return None without such a fusion, or if it is interrupted.
+    Return None if EKF2 did not fuse all three axes, or interrupted this fusion.
     """
     is_fused_3d = (
         fusion_record.field_gauss["fused_3d"]

@@ -1,7 +1,7 @@
 """Explanation of the difference between KF (position and velocity states) and EKF2, step by step.
 
-The flight is replayed with KF. In each step, one more property of KF is replaced by that of EKF2:
-sample times, noises, estimated states, gate, and output predictor. A step reduces or increases the
+The flight is replayed with KF. In each step, one more property of KF is replaced by EKF2's: sample
+times, noise settings, estimated states, gate, and output predictor. A step reduces or increases the
 mean square difference from the logged EKF2.
 
 Bias states are added before EKF2's process noise, which is too small for a filter without bias

@@ -135,7 +135,7 @@ class Summary(Record, kw_only=True, omit_defaults=False):
     heights, others : mapping from PX4's name to HeightSummary
         Replayed height sensors, and vision that is fused in addition to GNSS.
     late, lost : int
-        Number of samples that were fused late, and that were too late to be fused.
+        Number of samples that were fused late, and number of samples too late to be fused.
     is_predictable : bool
         False if the statistics depend on the rejection of single samples.
     """
@@ -531,7 +531,7 @@ def _summarise_aid(evaluated_updates: pd.DataFrame, evaluated_s: Spans) -> Heigh
 def _heading_error(
     flight: Flight, replay: Ekf2Replay, headings_rad: pd.Series, evaluated_s: Spans
 ) -> float | Unavailable:
-    """Return the mean difference (°) of ``headings_rad`` (rad) minus true heading."""
+    """Return the mean (°) of ``headings_rad`` minus true heading."""
     if GNSS_POS.noise not in replay.settings:
         return HEADING_NOT_REPLAYED
     true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude

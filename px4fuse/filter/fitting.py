@@ -141,8 +141,10 @@ class Likelihood:
 
         @cache
         def scores_at_ratio(ratio_index: int, z_index: int) -> Array:
-            scales = np.exp(step * (z_index + np.arange(node_count)))
-            axis_scores = [axis_fit.scores(scales)[:, 0] for axis_fit in fits_at_ratio(ratio_index)]
+            sigma_factors = np.exp(step * (z_index + np.arange(node_count)))
+            axis_scores = [
+                axis_fit.scores(sigma_factors)[:, 0] for axis_fit in fits_at_ratio(ratio_index)
+            ]
             return np.asarray(np.sum(axis_scores, axis=0))
 
         @cache
@@ -160,11 +162,13 @@ class Likelihood:
         z_node = log(noises.sigma_z_m) / self.step
         ratio_node = log(noises.sigma_a_m_s2) / self.step - z_node
         node_offset = (self.node_count - 1) // 2
-        first_ratio = floor(ratio_node) - node_offset
-        first_z = floor(z_node) - node_offset
-        ratio_weights = _interpolation_weights(ratio_node - first_ratio, self.node_count)
-        z_weights = _interpolation_weights(z_node - first_z, self.node_count)
-        return float(ratio_weights @ self._scores_at_nodes(first_ratio, first_z) @ z_weights)
+        first_ratio_node = floor(ratio_node) - node_offset
+        first_z_node = floor(z_node) - node_offset
+        ratio_weights = _interpolation_weights(ratio_node - first_ratio_node, self.node_count)
+        z_weights = _interpolation_weights(z_node - first_z_node, self.node_count)
+        return float(
+            ratio_weights @ self._scores_at_nodes(first_ratio_node, first_z_node) @ z_weights
+        )
 
 
 @cache
@@ -354,14 +358,14 @@ def maximise_likelihood(
         )
         # Outliers increase the estimated SIGMA_Z and would hide themselves. They hardly change the
         # median of the squared errors
-        median_square = float(
+        median_square_m2 = float(
             np.median(expected_squared_errors_m2 / axis_counts)
             / (chdtri(axis_counts[0], 0.5) / axis_counts[0])
         )
         # If the median error is above the search range of SIGMA_Z, large errors are no outliers
-        if median_square > SIGMA_Z_SEARCH_M[1] ** 2:
+        if median_square_m2 > SIGMA_Z_SEARCH_M[1] ** 2:
             break
-        sigma_z_variance_m2 = min(noises.sigma_z_m**2, MAX_SIGMA_Z_RATIO**2 * median_square)
+        sigma_z_variance_m2 = min(noises.sigma_z_m**2, MAX_SIGMA_Z_RATIO**2 * median_square_m2)
         normalised_squares = expected_squared_errors_m2 / sigma_z_variance_m2
         previous_probability = outlier_probability
         for _ in range(MAX_OUTLIER_ITERATIONS if is_long else 1):
@@ -489,16 +493,16 @@ def _maximise_by_gradient(
     log_bounds = np.log([SEARCH_RANGES[name] for name in nonzero_noises])
     measurement_count = len(likelihood.weight)
 
-    def score_per_measurement(logs: Array) -> float:
+    def score_per_measurement(log_noises: Array) -> float:
         # The division makes gradient and first step about 1
         try:
-            return likelihood(to_noises(logs)) / measurement_count
+            return likelihood(to_noises(log_noises)) / measurement_count
         # If rounding errors dominate, a large value makes L-BFGS-B shorten its step
         except np.linalg.LinAlgError:
             return UNCOMPUTABLE_SCORE
 
-    def to_noises(logs: Array) -> Noises:
-        return Noises(**dict(zip(nonzero_noises, np.exp(logs).tolist(), strict=True)))
+    def to_noises(log_noises: Array) -> Noises:
+        return Noises(**dict(zip(nonzero_noises, np.exp(log_noises).tolist(), strict=True)))
 
     minimum = minimize(
         score_per_measurement,

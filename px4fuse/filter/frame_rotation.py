@@ -194,7 +194,7 @@ def _mean_per_part(
         int(min((time_s[-1] - time_s[0]) / PART_LENGTH_S, len(time_s) / (2 * MIN_PART_SAMPLES))), 1
     )
     part_edges_s = np.linspace(time_s[0], time_s[-1], part_count + 1)[1:-1]
-    rows_of_parts = np.split(np.arange(len(time_s)), np.searchsorted(time_s, part_edges_s))
+    rows_by_part = np.split(np.arange(len(time_s)), np.searchsorted(time_s, part_edges_s))
     return tuple(
         HeadingPart(
             start_s=float(time_s[part_rows[0]]),
@@ -202,7 +202,7 @@ def _mean_per_part(
             heading_error_deg=float(np.degrees(misalignment_rad[part_rows].mean())),
             sigma_deg=float(np.degrees(np.sqrt(np.mean(sigma_rad[part_rows] ** 2)))),
         )
-        for part_rows in rows_of_parts
+        for part_rows in rows_by_part
         if len(part_rows) >= MIN_PART_SAMPLES
     )
 
@@ -223,10 +223,10 @@ def _compare_orientations(
         return None
     source_yaw_rad = heading_rad(orientation_samples)[is_covered]
     time_s = time_s[is_covered]
-    yaw_rad = np.interp(time_s, attitude_time_s, heading_rad(attitude))
-    misalignment_rad = source_yaw_rad - yaw_rad
+    ekf2_yaw_rad = np.interp(time_s, attitude_time_s, heading_rad(attitude))
+    misalignment_rad = source_yaw_rad - ekf2_yaw_rad
     misalignment_rad -= 2.0 * np.pi * np.round(np.median(misalignment_rad) / (2.0 * np.pi))
-    has_low_yaw_rate = np.abs(np.gradient(yaw_rad, time_s)) < np.radians(MAX_YAW_RATE_DEG_S)
+    has_low_yaw_rate = np.abs(np.gradient(ekf2_yaw_rad, time_s)) < np.radians(MAX_YAW_RATE_DEG_S)
     if np.count_nonzero(has_low_yaw_rate) < MIN_FLIGHT_PARTS * MIN_PART_SAMPLES:
         return None
     time_s = time_s[has_low_yaw_rate]
@@ -303,23 +303,25 @@ def _estimate_from_positions(
         heading_variance = (
             constant_covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX] / position_scale**2
         )
-        step_rad, weight_sum = np.average(error_rad, weights=1.0 / heading_variance, returned=True)
-        misalignment_rad += float(step_rad)
-        if abs(step_rad) < MAX_CONVERGED_CHANGE_RAD:
+        correction_rad, weight_sum = np.average(
+            error_rad, weights=1.0 / heading_variance, returned=True
+        )
+        misalignment_rad += float(correction_rad)
+        if abs(correction_rad) < MAX_CONVERGED_CHANGE_RAD:
             break
-    difference_rad = error_rad - step_rad
+    deviation_rad = error_rad - correction_rad
     # Variance of the estimates = variance of the true heading errors + estimation variance
-    excess_variance = max(float(np.mean(difference_rad**2 - heading_variance)), 0.0)
+    excess_variance = max(float(np.mean(deviation_rad**2 - heading_variance)), 0.0)
     drift_variance = 0.0 if has_constant_heading else excess_variance
     # An estimate with a large variance is moved towards the mean (shrinkage)
     drift_fraction = drift_variance / (drift_variance + heading_variance)
     misalignment_rad = float(np.angle(np.exp(1j * misalignment_rad)))
     part_columns = [
         spans_s[is_long],
-        np.degrees(misalignment_rad + drift_fraction * difference_rad),
+        np.degrees(misalignment_rad + drift_fraction * deviation_rad),
         np.degrees(np.sqrt(1.0 / weight_sum + drift_fraction * heading_variance)),
     ]
-    chi_square = float(np.sum(difference_rad**2 / heading_variance))
+    chi_square = float(np.sum(deviation_rad**2 / heading_variance))
     has_test = len(heading_variance) > 1 and not has_constant_heading
     return combine_heading_parts(
         tuple(HeadingPart(*row) for row in np.column_stack(part_columns).tolist()),

@@ -543,10 +543,10 @@ class DesignMatrix:
         data_columns = (1 + CONSTANT_COUNT) * np.arange(axis_count)
         column_factors = np.ones(signals.measurement_m.shape[1])
         column_factors[np.append(data_columns, data_columns + 1 + ROTATION)] = scale
-        no_motion = 0.0 * self.step_columns
+        zero_increments = 0.0 * self.step_columns
         normalised, log_variance_sum = self.whitened(
-            np.hstack([column_factors * signals.delta_position_m, no_motion]),
-            np.hstack([column_factors * signals.delta_velocity_m_s, no_motion]),
+            np.hstack([column_factors * signals.delta_position_m, zero_increments]),
+            np.hstack([column_factors * signals.delta_velocity_m_s, zero_increments]),
             np.hstack([signals.measurement_m, self.step_columns]),
             scale * sigma_a,
             is_skipped,
@@ -642,12 +642,12 @@ def _common_integrals(attitude: pd.DataFrame, acceleration: Acceleration) -> lis
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
     attitude_time_s = attitude.index.to_numpy()
-    biases = [
+    bias_integrals = [
         (attitude_time_s, cumulative_integral(body_to_ned.apply(np.eye(3)[axis]), attitude_time_s))
         for axis in (FORWARD, RIGHT)
     ]
     north, east, _ = acceleration.ned_integral_m_s
-    return [*biases, (acceleration.time_s, np.stack([-east, north, 0.0 * north]).T)]
+    return [*bias_integrals, (acceleration.time_s, np.stack([-east, north, 0.0 * north]).T)]
 
 
 def _hat_functions(start_s: float, end_s: float) -> ArrayPair:

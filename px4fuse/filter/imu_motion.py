@@ -378,15 +378,15 @@ def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -
     # error θ = -∫ R b dt
     gyro_bias_rotation = -INTEGRATION_STEP_S * (np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0)
     for axis in range(3):
-        next_axis = (axis + 1) % 3
-        last_axis = (axis + 2) % 3
-        acceleration[:, next_axis, 1 + axis] = -specific_force_ned_m_s2[:, last_axis]
-        acceleration[:, last_axis, 1 + axis] = specific_force_ned_m_s2[:, next_axis]
+        second_axis = (axis + 1) % 3
+        third_axis = (axis + 2) % 3
+        acceleration[:, second_axis, 1 + axis] = -specific_force_ned_m_s2[:, third_axis]
+        acceleration[:, third_axis, 1 + axis] = specific_force_ned_m_s2[:, second_axis]
         acceleration[:, axis, 4:7] = (
-            gyro_bias_rotation[:, next_axis] * specific_force_ned_m_s2[:, [last_axis]]
+            gyro_bias_rotation[:, second_axis] * specific_force_ned_m_s2[:, [third_axis]]
         )
         acceleration[:, axis, 4:7] -= (
-            gyro_bias_rotation[:, last_axis] * specific_force_ned_m_s2[:, [next_axis]]
+            gyro_bias_rotation[:, third_axis] * specific_force_ned_m_s2[:, [second_axis]]
         )
     acceleration[:, :, 7:10] = -body_to_ned
     np.cumsum(acceleration[:-1] * INTEGRATION_STEP_S, axis=0, out=velocity[1:])

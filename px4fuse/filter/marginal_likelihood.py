@@ -209,12 +209,12 @@ class FittedPositions:
         """Return the maximum-likelihood values of the unknown constants, shape (s, T, c)."""
         return np.asarray(-np.linalg.solve(self.information(), self.gram[..., 1:, :1])[..., 0])
 
-    def scores_by_segment(self, scales: Array = UNIT_SCALE) -> Array:
+    def scores_by_segment(self, sigma_factors: Array = UNIT_SCALE) -> Array:
         """Return -ln p of each segment, shape (k, s, T), without the log-determinant.
 
-        The σ of all noises is multiplied by each of k ``scales``.
+        The σ of all noises is multiplied by each of k ``sigma_factors``.
         """
-        scaled_gram = self.gram / scales[:, None, None, None, None] ** 2
+        scaled_gram = self.gram / sigma_factors[:, None, None, None, None] ** 2
         prior_sigma = self.constants_prior_sigma
         information = scaled_gram[..., 1:, 1:] * np.outer(prior_sigma, prior_sigma) + np.eye(
             len(prior_sigma)
@@ -226,13 +226,17 @@ class FittedPositions:
         square_sum = scaled_gram[..., 0, 0] - np.sum(cross_products * estimated_constants, axis=-1)
         return np.asarray(0.5 * square_sum + log_diagonal)
 
-    def scores(self, scales: Array = UNIT_SCALE) -> Array:
+    def scores(self, sigma_factors: Array = UNIT_SCALE) -> Array:
         """Return -ln p, shape (k, T), without a constant.
 
-        The σ of all noises is multiplied by each of k ``scales``.
+        The σ of all noises is multiplied by each of k ``sigma_factors``.
         """
-        determinant_terms = 0.5 * self.log_determinant + self.degrees_of_freedom * np.log(scales)
-        return np.asarray(self.scores_by_segment(scales).sum(axis=1) + determinant_terms[:, None])
+        determinant_terms = 0.5 * self.log_determinant + self.degrees_of_freedom * np.log(
+            sigma_factors
+        )
+        return np.asarray(
+            self.scores_by_segment(sigma_factors).sum(axis=1) + determinant_terms[:, None]
+        )
 
 
 def fit_positions(
@@ -388,10 +392,10 @@ def products_by_segment(
         constant_coefficients = np.linalg.solve(
             information, gram[:, constant_rows[:, None], second_rows]
         )
-        by_constants = np.einsum(
+        explained_by_constants = np.einsum(
             "skc,sck->sk", gram[:, first_rows[:, None], constant_rows], constant_coefficients
         )
-        batch_products.append(gram[:, first_rows, second_rows] - by_constants)
+        batch_products.append(gram[:, first_rows, second_rows] - explained_by_constants)
     return np.concatenate(batch_products, axis=1)
 
 
@@ -496,9 +500,11 @@ class BandedSystem:
         """
         # The order of the rows and columns of A is reversed
         reversed_bands = np.zeros_like(self.bands)
-        size = self.bands.shape[1]
-        for below in range(4):
-            reversed_bands[below, : size - below] = self.bands[below, : size - below][::-1]
+        unknown_count = self.bands.shape[1]
+        for band in range(4):
+            reversed_bands[band, : unknown_count - band] = self.bands[band, : unknown_count - band][
+                ::-1
+            ]
         reversed_lower, _ = lapack.dpbtrf(reversed_bands, lower=1, overwrite_ab=1)
         (a, c) = (self.cholesky_factor[0, first_row::2] for first_row in (0, 1))
         b = self.cholesky_factor[1, 0::2]

@@ -167,9 +167,9 @@ def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     The attitude is interpolated (slerp, Shoemake 1985), because PX4 by default logs it at a tenth
     of the IMU rate.
     """
-    if isinstance(recorded := imu_and_attitude(flight), Unavailable):
-        return recorded
-    imu, attitude = recorded
+    if isinstance(imu_with_attitude := imu_and_attitude(flight), Unavailable):
+        return imu_with_attitude
+    imu, attitude = imu_with_attitude
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     rotations = Rotation.from_quat(quaternions, scalar_first=True)
     body_to_ned = Slerp(attitude.index.to_numpy(), rotations)

@@ -75,7 +75,7 @@ def make_timeline(
         raise SettingsError(
             "With the setting `input` imu, KF needs IMU data.", f"{axis.acceleration}"
         )
-    mean_m_s2, gap_fraction = mean_step_acceleration(axis.acceleration, time_s)
+    mean_acceleration_m_s2, gap_fraction = mean_step_acceleration(axis.acceleration, time_s)
     gap_s = gap_fraction * np.diff(time_s)
     # The unknown acceleration in an IMU gap of T seconds is assumed to be constant. The velocity
     # error is rms·T instead of rms·√(DT·T) for white noise, so the variance is multiplied by T/DT
@@ -85,4 +85,6 @@ def make_timeline(
     gap_in_interval_s = np.bincount(interval_index, weights=gap_s)[interval_index]
     variance_scale = np.maximum(gap_in_interval_s / settings.dt_s, 1.0)
     gap_variance = gap_fraction * variance_scale * axis.acceleration.rms_m_s2**2
-    return Timeline(time_s, measurement_index, mean_m_s2, gap_variance, float(np.sum(gap_s)))
+    return Timeline(
+        time_s, measurement_index, mean_acceleration_m_s2, gap_variance, float(np.sum(gap_s))
+    )

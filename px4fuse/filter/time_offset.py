@@ -233,11 +233,11 @@ def estimate_time_offset(
 
 
 def _profile(
-    motion: PreparedMotion, noises: Noises, offset_s: float, half_width_s: float, drop: float
+    motion: PreparedMotion, noises: Noises, offset_s: float, half_width_s: float, score_rise: float
 ) -> tuple[Array, Array, float | None, float | None]:
     """Return offsets (s), their -ln p, and both ends (s) of the interval around the minimum.
 
-    At the ends, -ln p exceeds its minimum by ``drop``; None for an end outside the search range.
+    At the ends, -ln p is its minimum plus ``score_rise``; None for an end outside the search range.
     """
     while True:
         node_offsets_s, curve_s = (
@@ -247,7 +247,7 @@ def _profile(
         position_batches = motion.position_batches(node_offsets_s)
         node_scores = fit_noises(position_batches, noises, motion.weight).scores()[0]
         curve_scores = CubicSpline(node_offsets_s, node_scores)(curve_s)
-        low_s, high_s = profile_interval(curve_s, curve_scores, drop)
+        low_s, high_s = profile_interval(curve_s, curve_scores, score_rise)
         if None not in (low_s, high_s) or half_width_s >= 2.0 * MAX_OFFSET_S:
             return curve_s, curve_scores, low_s, high_s
         half_width_s *= 2.0
@@ -276,8 +276,8 @@ def _simulate_offset_variance_factor(
     first_segments = np.arange(0, len(prepared_motion.segment_motions), SIMULATED_SEGMENTS)
     series_count = -(-SIMULATION_COUNT // len(first_segments))
 
-    def draw_normal(size: int) -> Array:
-        return rng.standard_normal((size, axis_count, series_count)).transpose(1, 2, 0)
+    def draw_normal(count: int) -> Array:
+        return rng.standard_normal((count, axis_count, series_count)).transpose(1, 2, 0)
 
     q00, q01, q11 = noises.sigma_a_m_s2**2 * offset_positions.unit_process_noise[:, is_joined]
     dp, dv = np.zeros((2, axis_count, series_count, measurement_count - 1))
@@ -325,13 +325,13 @@ def _offset_per_part(
 
     The second value is the p-value of the test; None with fewer than two offsets.
     """
-    coarse_s = offset_s + np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSET_COUNT)
-    coarse_s = coarse_s[np.abs(coarse_s) <= MAX_OFFSET_S]
+    coarse_offsets_s = offset_s + np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSET_COUNT)
+    coarse_offsets_s = coarse_offsets_s[np.abs(coarse_offsets_s) <= MAX_OFFSET_S]
     coarse_profiles = fit_noises(
-        prepared_motion.position_batches(coarse_s), noises, prepared_motion.weight
+        prepared_motion.position_batches(coarse_offsets_s), noises, prepared_motion.weight
     ).scores_by_segment()[0]
-    grid_s = np.linspace(coarse_s[0], coarse_s[-1], CURVE_OFFSET_COUNT)
-    part_profiles = CubicSpline(coarse_s, coarse_profiles, axis=1)(grid_s)
+    grid_offsets_s = np.linspace(coarse_offsets_s[0], coarse_offsets_s[-1], CURVE_OFFSET_COUNT)
+    part_profiles = CubicSpline(coarse_offsets_s, coarse_profiles, axis=1)(grid_offsets_s)
     part_offsets = []
     score_drops = []
     for begin, end, profile in zip(
@@ -340,7 +340,7 @@ def _offset_per_part(
         part_profiles,
         strict=False,
     ):
-        part_offset_s, sigma_s = _minimum_and_sigma(grid_s, profile)
+        part_offset_s, sigma_s = _minimum_and_sigma(grid_offsets_s, profile)
         sigma_s *= float(np.sqrt(offset_variance_factor))
         if sigma_s < MAX_PART_OFFSET_SIGMA_S:
             start_s, end_s = prepared_motion.time_s[[begin, end - 1]].tolist()

@@ -80,7 +80,7 @@ DETECTORS = (
 
 def find(analysis: Analysis) -> tuple[Finding, ...]:
     """Return the findings of a comparison of KF with EKF2, most severe first."""
-    findings = [found for module in DETECTORS for found in module.detect(analysis)]
+    findings = [finding for module in DETECTORS for finding in module.detect(analysis)]
     return group_by_cause(source_convention.apply_convention(analysis, findings))
 
 

@@ -16,17 +16,17 @@ from px4fuse.findings.model import Findings, finding, format_percent, note, warn
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.flight.model import BAD_ACCELERATION, Unavailable
 
-# Aiding sources of external vision: other modules test them by replays of EKF2
+# Aiding sources of external vision, which other modules test by replays of EKF2
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
 # Time (s) after take-off in which EKF2 may ignore the barometer because of ground effect
 TAKE_OFF_S = 10.0
-# EKF2's largest height error in a barometer gap is reported if it exceeds the height RMSE outside
-# the gap by this factor
+# EKF2's height error in a barometer gap is reported if largest error / height RMSE outside the gap
+# is larger
 MIN_HEIGHT_ERROR_RATIO = 3.0
 # Aiding sources whose vertical innovations can set EKF2's flag for a bad vertical acceleration
 VERTICAL_AIDS = ("gnss_vel", "gnss_hgt", "baro_hgt")
-# If EKF2 reports a bad vertical acceleration for a larger fraction of the time, the severity is
-# warning instead of note
+# Maximum fraction of the time with EKF2's flag for a bad vertical acceleration, for severity note;
+# above: severity warning
 MAX_BAD_FRACTION_NOTE = 0.3
 # Action if EKF2 does not fuse a sensor, by the PX4 parameter that enables its fusion
 CHECKS = {

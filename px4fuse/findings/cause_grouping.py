@@ -8,8 +8,7 @@ from px4fuse.core.record import read_toml
 from px4fuse.finding import SEVERITIES, Finding
 from px4fuse.findings.model import CATALOGUE, group_by_root
 
-# Key in Finding.evidence for the kind of cause. The next constants are its values; ELSEWHERE is any
-# other cause
+# Key in Finding.evidence: kind of cause. Values: the constants below; ELSEWHERE for other causes
 CAUSE = "cause"
 NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "measurement noise",
@@ -21,7 +20,7 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "accelerometer",
     "elsewhere",
 )
-# Key in Finding.evidence: white noise of the source ÷ noise that a filter assumes, if this is large
+# Key in Finding.evidence: white position noise / measurement noise that a filter assumes, if large
 WHITE_RATIO = "white_over_assumed"
 # Kind of cause: the aiding source of EKF2 is the sensor whose positions KF uses
 SENSOR = "the source's sensor"
@@ -83,9 +82,9 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def _with_action_of(cause: Finding, finding: Finding) -> Finding:
-    """Replace the action of an effect by that of its cause.
+    """Replace the action of an effect by the action of its cause.
 
-    The action of an effect may be wrong, such as a larger noise setting that hides outliers.
+    The action of an effect may be wrong. Example: a larger noise setting, which hides outliers.
     """
     if (
         finding.caused_by is None
@@ -107,6 +106,6 @@ def _report_rank(group: list[Finding]) -> int:
     is_listed_first = CONVENTION in cause.evidence or role in ("unusable", "misleading", "first")
     if is_listed_first and cause.severity != "note":
         return -1
-    # Warnings on the recording (rank 1) are before wrong noises (2), as bad data bias the estimates
+    # Warnings on the recording (1) precede noise errors (2), because bad data bias noise estimates
     rank_by_severity = {"error": 2 * (role == "noise"), "warning": 3 - 2 * (role == "recording")}
     return rank_by_severity.get(cause.severity, 4)

@@ -1,4 +1,4 @@
-"""Texts on a re-run of KF or EKF2 with a change: kind of cause, change, effect, action."""
+"""Texts on a re-run of KF or EKF2 with one change: kind of cause, change, effect, action."""
 
 from collections.abc import Mapping
 
@@ -64,8 +64,8 @@ def format_change(analysis: Analysis, cause: Trial) -> str:
 
 
 def _flown_settings(analysis: Analysis) -> Mapping[str, float]:
-    model = analysis.ekf2_model
-    return {} if isinstance(model, Unavailable) else model.inputs.settings
+    ekf2_model = analysis.ekf2_model
+    return {} if isinstance(ekf2_model, Unavailable) else ekf2_model.inputs.settings
 
 
 def format_explained_fraction(cause: Trial, statistic: Statistic) -> str:

@@ -19,10 +19,10 @@ from px4fuse.findings.cause_grouping import CAUSE, REPORTED
 from px4fuse.findings.model import Findings, finding, format_percent
 from px4fuse.flight.model import Unavailable, source_name
 
-# Minimum factor between EKF2's noise parameter and the estimate for severity error: a smaller
-# factor hardly changes EKF2's position error
+# Minimum factor between EKF2's noise parameter and the estimated noise, for severity error. A
+# smaller factor hardly changes EKF2's position error
 MIN_FACTOR_ERROR = 2.0
-# Minimum fraction of rejected positions that the first sentence of the message states
+# The first sentence of the message contains the rejected fraction of the positions if it is larger
 MIN_NAMED_REJECTION = 0.05
 
 
@@ -34,7 +34,7 @@ def detect(analysis: Analysis) -> Findings:
     assert not isinstance(analysis.ekf2_model, Unavailable)
     inputs = analysis.ekf2_model.inputs
     flown_m, estimate_m = noise_used_m(inputs), trial.change[aid.noise]
-    # EKF2 uses the σ that the source reports if this is the larger one
+    # EKF2 uses the reported σ or the noise parameter, the larger one
     is_reported = flown_m > inputs.settings[aid.noise]
     ratio, is_small = estimate_m / flown_m, estimate_m > flown_m
     factor, direction = max(ratio, 1.0 / ratio), "small" if is_small else "large"
@@ -95,7 +95,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def confirmed_noise_trial(analysis: Analysis) -> Trial | None:
-    """Return the re-run with another EKF2 measurement noise, if it makes EKF2 consistent."""
+    """Return a re-run in which another EKF2 measurement noise makes EKF2 consistent, or None."""
     trial = find_trial(analysis.select_main_trials(), "ekf2", "noise", aid_of(analysis).noise)
     is_confirmed = trial is not None and any(
         classify_sigma_ratio(ratio_before, reference) != "consistent"

@@ -35,11 +35,11 @@ from px4fuse.flight.model import (
 MIN_FUSED_FRACTION_ERROR = 0.5
 # The severity is warning if EKF2 fuses the positions for a smaller fraction of the time
 MIN_FUSED_FRACTION_WARNING = 0.98
-# Minimum interval (s) between positions at which jitter may exceed EV_START_INTERVAL_S
+# Minimum interval (s) between positions that jitter can increase above EV_START_INTERVAL_S
 MIN_LIMITING_INTERVAL_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
-# An invalid position of EKF2 is reported if its distance from ground truth or position source
-# exceeds this limit (m)
+# Minimum distance (m) of EKF2's invalid position from ground truth or position source, for a
+# finding
 MIN_INVALID_DISTANCE_M = 1.0
 
 
@@ -114,7 +114,7 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
 
 
 def _received_source(analysis: PreparedComparison) -> PositionTrack | None:
-    """Return the positions that PX4 received, which are not those of a position file."""
+    """Return the track of the positions that PX4 received, without those of a position file."""
     if analysis.source.origin != POSITION_FILE:
         return analysis.source
     tracks = (track for track in analysis.flight.positions if track.origin != POSITION_FILE)

@@ -17,13 +17,13 @@ from px4fuse.findings.model import (
 )
 from px4fuse.flight.model import Ekf2, Unavailable
 
-# Minimum fraction of rejected positions for a warning: a consistent filter with a gate of 5 √S
+# Minimum fraction of rejected positions for a warning. With a gate of 5 √S, a consistent filter
 # rejects 6e-7
 REJECTED_FRACTION_WARNING = 0.01
 # Minimum fraction of rejected positions for severity error
 REJECTED_FRACTION_ERROR = 0.20
-# A change in a re-run prevents rejections if it reduces the rejected fraction to less than this
-# multiple
+# A change prevents rejections if rejected fraction of the re-run / rejected fraction of EKF2 is
+# smaller
 MAX_REJECTED_RATIO = 0.5
 
 

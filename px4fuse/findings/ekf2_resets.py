@@ -13,9 +13,9 @@ from px4fuse.flight.model import Ekf2, Reset
 
 # Time (s) after take-off in which a height reset of EKF2 is normal
 TAKE_OFF_S = 10.0
-# Maximum time (s) from the end of a gap in the position source to a reset that the gap causes
+# Maximum time (s) from the end of a gap in the position source to the EKF2 reset caused by the gap
 MAX_RESET_DELAY_S = 5.0
-# Maximum time (s) from the logged start of fusion to the reset to the first position: flags are
+# Maximum time (s) from EKF2's logged start of fusion to its normal first reset: fusion flags are
 # logged at 1 Hz
 MAX_START_S = 1.0
 
@@ -24,7 +24,7 @@ def detect(analysis: Analysis) -> Findings:
     ekf2, segment = analysis.flight.ekf2, analysis.segment.flight
     if not isinstance(ekf2, Ekf2):
         return
-    # the first fused position resets EKF2's position
+    # EKF2 starts fusion by a reset to the first position
     start_s = -np.inf
     if isinstance(ekf2.fusion_flags, pd.DataFrame):
         is_fused = ekf2.fusion_flags["horizontal"] > 0.0
@@ -57,8 +57,8 @@ def detect(analysis: Analysis) -> Findings:
             "warning" if horizontal_resets else "note",
             "ekf2_resets",
             f"EKF2 reset its {'horizontal position' if horizontal_resets else 'height'} "
-            f"{format_count(len(sizes_m))}, by up to {max(sizes_m):.2f} m. The largest reset is at "
-            f"{largest_reset_s:.1f} s.{reset_treatment}",
+            f"{format_count(len(sizes_m))} (largest reset: {max(sizes_m):.2f} m at "
+            f"{largest_reset_s:.1f} s).{reset_treatment}",
             f"Run px4fuse explore LOG and compare position and innovation at {largest_reset_s:.1f} "
             "s.",
             {

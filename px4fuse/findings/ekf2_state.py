@@ -28,12 +28,12 @@ from px4fuse.flight.model import (
     rows_between,
 )
 
-# For each bias state of EKF2: parameter with its limit, unit, sensor, and columns of the bias
+# Bias states of EKF2: limit parameter, unit, sensor, and columns of the bias
 BIAS_STATES = (
     ("EKF2_ABL_LIM", "m/s²", "accelerometer", Columns.ACCELEROMETER_BIAS),
     ("EKF2_GYR_B_LIM", "rad/s", "gyroscope", Columns.GYRO_BIAS),
 )
-# A bias state is at its limit if its ratio to the limit parameter is above this value
+# A bias state is at its limit if |bias| / limit parameter is larger
 MIN_LIMIT_FRACTION = 0.98
 # A bias is reported if it is at its limit for at least this fraction of the flight
 MIN_LIMITED_FRACTION = 0.5
@@ -45,14 +45,13 @@ RUN_UP_S = 0.5
 MAX_REST_STDS = (0.04, 1.5)
 # Maximum change (rad/s) of the mean angular rate between windows at rest
 MAX_REST_CHANGE_RAD_S = 0.01
-# Minimum gyroscope bias (rad/s) to report it: the heading turns by 90° in 30 s
+# Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
 MIN_GYRO_BIAS_RAD_S = 0.05
-# Minimum difference (m/s²) between gravity and the specific force at rest that a message states
+# Minimum |gravity - specific force at rest| (m/s²) that a message contains
 MIN_GRAVITY_ERROR_M_S2 = 0.3
 # Missing tilt or yaw alignment is reported if it lasts for a larger fraction of the flight
 MAX_UNALIGNED_FRACTION = 0.02
-# Maximum time (s) from the alignment of the tilt to that of the heading that is not reported: the
-# heading is aligned after the tilt
+# Maximum time (s) from tilt alignment to heading alignment; a later heading alignment is a finding
 MAX_HEADING_ALIGNMENT_S = 5.0
 
 

@@ -33,10 +33,9 @@ from px4fuse.trajectory.alignment import fit_alignment
 
 # Minimum mean NEES for severity error: the RMS position error is 4 reported σ
 MIN_NEES_ERROR = 16.0
-# Only EKF2 has a fault if the ratio of KF's to EKF2's position RMSE is below this value
+# Only EKF2 has a fault if position RMSE of KF / position RMSE of EKF2 is smaller
 MAX_KF_ERROR_RATIO = 0.7
-# The position frame is misaligned if an alignment reduces the position RMSE to less than this
-# multiple
+# The position frame is misaligned if position RMSE after an alignment / RMSE before it is smaller
 MAX_ALIGNED_RMSE_RATIO = 0.5
 DRIFT_REMEDY = (
     "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "
@@ -259,8 +258,8 @@ def make_possible_drift_finding(analysis: Analysis) -> Finding:
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     evidence: dict[str, float | str] = {"source": analysis.source.name}
     message = (
-        f"{sensor_name} may drift: odometry sends a heading as these messages do. Filters follow a "
-        "drifting source, so innovations do not show the drift."
+        f"{sensor_name} may drift: its messages contain a heading, like those of odometry. Filters "
+        "follow a drifting source, so innovations do not show the drift."
     )
     if isinstance(horizontal_tuning, AxisTuning) and (
         noise_m := horizontal_tuning.sigma_z.value or horizontal_tuning.sigma_z.high

@@ -16,13 +16,13 @@ from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
 MAX_SPECIFIC_FORCE_M_S2 = 343.0
-# Minimum number of impossible samples to report them
+# Minimum number of impossible samples for a finding
 MIN_IMPOSSIBLE_SAMPLES = 3
 # Minimum accelerometer bias (m/s²) for severity error: a position error of 0.15 m after 1 s
 MIN_BIAS_ERROR_M_S2 = 0.3
 # Tilt error (°) that has the same effect as an accelerometer bias of 1 m/s²
 TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
-# Minimum time (s) without IMU samples to report it: two prediction steps of KF
+# Minimum time (s) without IMU samples for a finding: two prediction steps of KF
 MIN_REPORTED_IMU_GAP_S = 0.2
 # Minimum IMU rate (Hz): 5 samples in each DT of 0.1 s, so that vibration is not aliased
 MIN_IMU_RATE_HZ = 50.0
@@ -71,12 +71,12 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
 
 def detect_bias(analysis: Analysis) -> Findings:
     """Detect an accelerometer bias, estimated from the positions or by EKF2."""
-    fit, ekf2_bias = analysis.systematic_errors, _ekf2_bias(analysis)
-    if isinstance(fit, SystematicErrors) and fit.has_significant_bias():
+    systematic_errors, ekf2_bias = analysis.systematic_errors, _ekf2_bias(analysis)
+    if isinstance(systematic_errors, SystematicErrors) and systematic_errors.has_significant_bias():
         forward_bias, right_bias, bias_m_s2 = (
-            fit.forward_bias,
-            fit.right_bias,
-            fit.compute_bias().value,
+            systematic_errors.forward_bias,
+            systematic_errors.right_bias,
+            systematic_errors.compute_bias().value,
         )
         message = (
             f"The accelerometer is biased by {forward_bias.value:+.2f} m/s² forward and "
@@ -95,12 +95,14 @@ def detect_bias(analysis: Analysis) -> Findings:
             "accelerometer_bias",
             message,
             "Calibrate the accelerometers and the level horizon at the temperature of the flight.",
-            {"bias_m_s2": bias_m_s2, "sigma_m_s2": fit.compute_bias().sigma},
+            {"bias_m_s2": bias_m_s2, "sigma_m_s2": systematic_errors.compute_bias().sigma},
         )
     elif ekf2_bias is not None:
         # If positions show no horizontal bias, only the vertical bias is reported
         bias_m_s2 = float(
-            np.linalg.norm(ekf2_bias[2:] if isinstance(fit, SystematicErrors) else ekf2_bias)
+            np.linalg.norm(
+                ekf2_bias[2:] if isinstance(systematic_errors, SystematicErrors) else ekf2_bias
+            )
         )
         if bias_m_s2 >= MIN_BIAS_M_S2:
             yield warning(
@@ -166,7 +168,7 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
     if gap_s > max(MIN_REPORTED_IMU_GAP_S, 2.0 * interval_s):
         log = analysis.flight.log
         spans = _gap_spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else ()
-        # KF needs IMU and attitude, so without an IMU gap the attitude has a gap
+        # KF needs IMU and attitude: if the IMU has no gap, the attitude has one
         missing_data = "IMU" if spans else "Attitude"
         action = ""
         if log.format.startswith("MAVLink"):
@@ -184,7 +186,7 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
 
 
 def detect_missing_imu_samples(analysis: Analysis) -> Findings:
-    """Detect IMU samples that are missing one by one during the whole flight."""
+    """Detect single missing IMU samples during the whole flight."""
     imu, log = analysis.flight.imu, analysis.flight.log
     if not isinstance(imu, pd.DataFrame) or log.format.startswith("MAVLink"):
         return
@@ -210,7 +212,7 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
 
 
 def _gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
-    """Return start and end (s) of each IMU gap in a segment, including its start and end."""
+    """Return start and end (s) of each IMU gap in a segment, also at both ends of the segment."""
     time_s = imu.index.to_numpy()
     gaps = intervals_where(time_s, imu_gaps(time_s))
     end_spans = ((segment.start_s, float(time_s[0])), (float(time_s[-1]), segment.end_s))

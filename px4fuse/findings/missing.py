@@ -43,7 +43,7 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
 
 
 def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
-    """Detect a log that does not contain the positions which PX4 received."""
+    """Detect that the log lacks the positions which PX4 received."""
     source, received_preference = analysis.source, RECEIVED.find_preference_rank()
     has_received_positions = any(
         track.origin.find_preference_rank() == received_preference

@@ -25,12 +25,12 @@ class CatalogueEntry(Record):
     group : str
         One of :data:`GROUPS`.
     role : str
-        Effect on estimates and order. "unusable": all positions are wrong; "misleading": some are.
-        These and "first" are listed first, "noise" after other errors, "recording" before other
-        warnings.
+        Effect on the estimates, and place in the list of findings. "unusable": all positions are
+        wrong. "misleading": some positions are wrong. "unusable", "misleading" and "first" are
+        listed first, "noise" after other errors, "recording" before other warnings.
     verdict : str
         Relation to the statements that KF or EKF2 is consistent, over- or underconfident.
-        "meaningless": these statements are invalid. "repeated": the finding is such a statement.
+        "meaningless": the statements are invalid. "repeated": the finding repeats a statement.
     reruns : frozenset of str
         Kinds of re-runs (``Trial.kinds``) that test the finding.
     after_wrong_convention : str
@@ -62,7 +62,7 @@ class FindingExample(Record):
     clean_flights : int
         Number of simulated flights without an injected fault.
     false_alarms : int
-        Number of these flights with the finding.
+        Number of clean flights with the finding.
     detection : dict
         Fraction of the flights with an injected fault that have the finding, by name of the fault.
     """
@@ -81,7 +81,7 @@ def load_examples() -> Mapping[str, FindingExample]:
 
 
 class SourceWords(Record):
-    """Causes and actions in findings on the position source, for one kind, such as UWB."""
+    """Texts about one kind of position source (such as UWB): causes of faults, and actions."""
 
     smoothing_action: str
     jump: str
@@ -101,7 +101,7 @@ SOURCE_WORDS: Mapping[PositionKind, SourceWords] = {
 
 
 def source_words(source: PositionTrack) -> SourceWords:
-    """Return the causes and actions in messages for the kind of a position source."""
+    """Return the texts about causes and actions for a position source, such as UWB."""
     return SOURCE_WORDS[source.origin.kind]
 
 
@@ -134,7 +134,7 @@ error, warning, note = (partial(finding, severity) for severity in SEVERITIES)
 
 
 def group_by_root(findings: Iterable[Finding]) -> list[list[Finding]]:
-    """Group findings: each group begins with a cause, which is followed by its effects."""
+    """Group findings: each group is a cause, followed by its effects."""
     groups: list[list[Finding]] = []
     for entry in findings:
         if entry.caused_by is None:
@@ -161,7 +161,7 @@ def format_percent(fraction: float, digits: int = 0) -> str:
 
 
 def spans_with_value(value: float, step_function: pd.Series, segment: Segment) -> tuple[Span, ...]:
-    """Return start and end (s) of each time in a segment at which a step function has a value."""
+    """Return the time spans (s) in a segment in which a step function equals ``value``."""
     step_times_s = np.clip(
         np.append(step_function.index.to_numpy(), np.inf), segment.start_s, segment.end_s
     )
@@ -174,7 +174,7 @@ def spans_with_value(value: float, step_function: pd.Series, segment: Segment) -
 
 
 def fraction_of_ones(step_function: pd.Series, segment: Segment) -> float:
-    """Return the fraction of the time in a segment at which a flag (0 or 1) is 1."""
+    """Return the fraction of a segment's duration in which a flag (0 or 1) is 1."""
     duration_of_ones_s = sum(
         end - start for start, end in spans_with_value(1.0, step_function, segment)
     )

@@ -44,12 +44,12 @@ from px4fuse.flight.model import Columns, Unavailable, sample_rate
 from px4fuse.readers.px4_innovations import has_fused_aid
 from px4fuse.request import COMPARISON_OPTIONS
 
-# Minimum factor between a noise setting and its estimate for a warning: a smaller factor hardly
+# Minimum factor between a noise setting and its estimate, for a warning. A smaller factor hardly
 # changes the track
 MIN_NOISE_FACTOR = 1.5
 # Minimum factor between a noise setting and its estimate for severity error
 MIN_NOISE_FACTOR_ERROR = 4.0
-# KF ignores new positions if its time constant (s) is larger: vehicles turn faster
+# Minimum time constant (s) of a KF that ignores new positions: vehicles turn in less time
 MIN_TIME_CONSTANT_S = 2.5
 # The 95 % interval of ln(noise estimate) is widened by this factor: 0.3 % of correct settings are
 # outside the widened interval
@@ -60,11 +60,9 @@ MIN_LAG1_AUTOCORRELATION = 0.3
 
 # Minimum factor between actual and reported σ for severity error
 MIN_SIGMA_FACTOR_ERROR = 2.0
-# Two noises are equal if their ratio is below this value: two standard errors of a median of 100
-# values
+# Maximum ratio of two noise σ that are equal: two standard errors of a median of 100 values
 NOISE_RATIO_TOLERANCE = 1.25
-# EKF2 uses the variance in the position messages if the ratio of √R to EKF2_EVP_NOISE exceeds this
-# value
+# EKF2 uses the variance in the position messages if √R / EKF2_EVP_NOISE is larger
 MIN_REPORTED_NOISE_RATIO = 1.25
 # Action if no change in a re-run corrects the wrong σ
 UNEXPLAINED_SIGMA = (
@@ -104,7 +102,7 @@ InconsistentAxis = tuple[AxisComparison, FilterSummary]
 class SettingDeviation(NamedTuple):
     """Deviation of a noise setting from its estimate, or from an upper bound of the estimate.
 
-    ``factor`` is the ratio of setting and estimate, the larger over the smaller.
+    ``factor`` = larger / smaller of setting and estimate.
     """
 
     estimate: float
@@ -132,8 +130,8 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
         for name, noise in ml_noises.items()
         if (deviation := setting_deviation(name, settings[name], noise))
     }
-    # Innovations do not show drift or time-correlated errors, so they do not show if a noise is too
-    # large
+    # Innovations do not contain drift and time-correlated errors. A noise setting that includes
+    # these errors is not too large
     may_drift = analysis.source.origin.may_drift
     if (
         may_drift
@@ -218,7 +216,7 @@ def setting_deviation(name: str, setting: float, ml_noise: Noise) -> SettingDevi
     if low <= setting <= high or factor < MIN_NOISE_FACTOR:
         return None
     severity: Severity = "error" if factor >= MIN_NOISE_FACTOR_ERROR else "warning"
-    if setting == getattr(Settings(), name):  # the user did not choose the default
+    if setting == getattr(Settings(), name):  # the default is px4fuse's, not the user's choice
         severity = lower_severity(severity)
     return SettingDeviation(estimate, factor, severity)
 
@@ -373,7 +371,7 @@ def _format_noise_minimum(analysis: Analysis) -> str:
 def _has_default_noises(
     analysis: Analysis, filter_name: FilterName, result: AxisComparison
 ) -> bool:
-    """Return True if a filter has default noises: those of px4fuse (KF) or of PX4 (EKF2)."""
+    """Return True if a filter uses default noise settings: px4fuse's (KF) or PX4's (EKF2)."""
     if filter_name == "kf":
         settings, defaults = analysis.settings, Settings()
         return all(

@@ -14,8 +14,7 @@ from px4fuse.findings.model import Findings, note, warning
 from px4fuse.flight.ekf2_parameters import AID_MASK, PARAMETERS
 from px4fuse.flight.model import Ekf2, Unavailable
 
-# A change of a parameter has an effect if σ ratio or position RMSE differ by at least this factor
-# before and after it
+# A parameter change has an effect if σ ratio or position RMSE change by at least this factor
 MIN_CHANGE_RATIO = 1.5
 
 
@@ -31,7 +30,7 @@ class PartConsistency(NamedTuple):
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect changes in flight of the EKF2 parameters that px4fuse uses."""
+    """Detect EKF2 parameters that are changed in flight and that px4fuse uses."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment
     fusion_parameters = (aid_of(analysis).switch, AID_MASK)
     changes = [
@@ -49,8 +48,8 @@ def detect(analysis: Analysis) -> Findings:
         unit = "" if name in fusion_parameters else f" {PARAMETERS[name].printed_unit}".rstrip()
         effect_sentences, has_effect = "", name in fusion_parameters
         if part_before.verdict and part_after.verdict:
-            words = {part.verdict.partition(" ")[0] for part in (part_before, part_after)}
-            has_effect |= len(words) > 1
+            verdicts = {part.verdict.partition(" ")[0] for part in (part_before, part_after)}
+            has_effect |= len(verdicts) > 1
             has_effect |= _differ_significantly(part_before.sigma_ratio, part_after.sigma_ratio)
             effect_sentences = (
                 f" EKF2 is {part_before.verdict} before the change and {part_after.verdict} after "

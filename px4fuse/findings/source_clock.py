@@ -16,53 +16,56 @@ from px4fuse.flight.model import Unavailable
 
 # Minimum time offset (s) for severity error: a position error of 0.1 m at 1 m/s
 MIN_OFFSET_ERROR_S = 0.10
-# A time offset is reported if its correction does not increase KF's position RMSE by more than this
-# ratio
+# Maximum position RMSE of KF with a corrected time offset / RMSE without correction, for a finding
 MAX_RMSE_RATIO = 1.005
 CORRECT_AT_SENDER = "Correct the position timestamps before sending."
 
 
 def detect(analysis: Analysis) -> Findings:
-    clock, is_reconstructed = analysis.clock, analysis.source.origin.reconstructed
-    if isinstance(clock, ClockOffset) and clock.is_determinable and not is_reconstructed:
-        yield from detect_offset(analysis, clock)
-        yield from detect_wrong_delay(analysis, clock)
+    time_offset, is_reconstructed = analysis.clock, analysis.source.origin.reconstructed
+    if (
+        isinstance(time_offset, ClockOffset)
+        and time_offset.is_determinable
+        and not is_reconstructed
+    ):
+        yield from detect_offset(analysis, time_offset)
+        yield from detect_wrong_delay(analysis, time_offset)
     yield from detect_wrong_gnss_delay(analysis)
 
 
-def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
+def detect_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings:
     if find_low_pass(analysis) is not None:  # a low-pass filter delays positions, not timestamps
         return
-    interval_low_s, interval_high_s = clock.interval_s
+    interval_low_s, interval_high_s = time_offset.interval_s
     evidence = {
-        "offset_s": clock.offset_s,
+        "offset_s": time_offset.offset_s,
         "interval_low_s": interval_low_s,
         "interval_high_s": interval_high_s,
     }
-    if clock.has_changed() and clock.change_p_value is not None:
-        start_offset_s, end_offset_s = clock.parts[0].offset_s, clock.parts[-1].offset_s
+    if time_offset.has_changed() and time_offset.change_p_value is not None:
+        start_offset_s, end_offset_s = time_offset.parts[0].offset_s, time_offset.parts[-1].offset_s
         yield error(
             "source_time_offset_changes",
             f"The time offset of the positions changes in flight from {start_offset_s:+.2f} s to "
-            f"{end_offset_s:+.2f} s (significance test: p {clock.change_p_value:.1g}). No single "
-            "--clock-offset corrects both. Possible cause: PX4 uses arrival times until 500 "
+            f"{end_offset_s:+.2f} s (significance test: p {time_offset.change_p_value:.1g}). No "
+            "single --clock-offset corrects both. Possible cause: PX4 uses arrival times until 500 "
             "TIMESYNC answers have synchronised the clocks.",
             "Let the clocks synchronise for one minute before take-off. Analyse only the time "
             "before or after the change (--start, --end).",
-            {**evidence, "change_p_value": clock.change_p_value},
+            {**evidence, "change_p_value": time_offset.change_p_value},
         )
         return
-    offset_size_s = abs(clock.remaining_s)
+    offset_size_s = abs(time_offset.remaining_s)
     # If timestamps are arrival times in a part of the flight, one offset cannot correct them
     if (
-        not clock.is_significant(clock.remaining_s)
+        not time_offset.is_significant(time_offset.remaining_s)
         or find_synchronisation(analysis) is not None
         or _rmse_ratio(_find_trial(analysis, "kf", "time offset")) > MAX_RMSE_RATIO
     ):
         return
     interval_s, is_late = (
-        (interval_low_s - clock.applied_s, interval_high_s - clock.applied_s),
-        clock.remaining_s < 0,
+        (interval_low_s - time_offset.applied_s, interval_high_s - time_offset.applied_s),
+        time_offset.remaining_s < 0,
     )
     lower_s, upper_s = (-interval_s[1], -interval_s[0]) if is_late else interval_s
     yield finding(
@@ -72,8 +75,8 @@ def detect_offset(analysis: Analysis, clock: ClockOffset) -> Findings:
         f"estimate from IMU and positions is {offset_size_s:.3f} s (95 % {lower_s:.3f} to "
         f"{upper_s:.3f} s). At 1 m/s this is a position error of {offset_size_s:.2f} m in KF and "
         "EKF2. Innovations hardly show this "
-        f"error.{_assumed_delay_sentence(analysis, clock)}",
-        _offset_remedy(analysis, clock),
+        f"error.{_assumed_delay_sentence(analysis, time_offset)}",
+        _offset_remedy(analysis, time_offset),
         evidence,
     )
 
@@ -90,7 +93,7 @@ def _find_trial(analysis: Analysis, filter_name: FilterName, kind: str) -> Trial
 
 
 def _rmse_ratio(trial: Trial | None) -> float:
-    """Return the ratio of the position RMSE with and without a change; NaN if unknown."""
+    """Return position RMSE with a change / position RMSE without it; NaN if unknown."""
     if trial is None or not trial.before.position_rmse_m or trial.after.position_rmse_m is None:
         return math.nan
     return trial.after.position_rmse_m / trial.before.position_rmse_m
@@ -102,44 +105,44 @@ def _receiver_delay_parameter(analysis: Analysis) -> str | None:
     return next(names, None) if analysis.source.origin.fused_as_gnss else None
 
 
-def _assumed_delay_sentence(analysis: Analysis, clock: ClockOffset) -> str:
+def _assumed_delay_sentence(analysis: Analysis, time_offset: ClockOffset) -> str:
     delay_parameter = _receiver_delay_parameter(analysis)
     if delay_parameter is None:
         return ""
     assumed_ms = analysis.flight.log.parameters[delay_parameter]
-    estimate_ms = max(assumed_ms - 1e3 * clock.remaining_s, 0.0)
+    estimate_ms = max(assumed_ms - 1e3 * time_offset.remaining_s, 0.0)
     return f" {delay_parameter} is {assumed_ms:g} ms; the estimate is {estimate_ms:.0f} ms."
 
 
-def _offset_remedy(analysis: Analysis, clock: ClockOffset) -> str:
+def _offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
     if delay_parameter := _receiver_delay_parameter(analysis):
         return f"Check the delay of the GNSS receiver ({delay_parameter})."
     if analysis.source.alignment is not None:
-        option_s = clock_offset_option_s(analysis, clock)
+        option_s = clock_offset_option_s(analysis, time_offset)
         return f"Run again with --clock-offset {option_s:.3f}."
-    age_ms = (remedy.delay_ms(analysis) or 0.0) - 1e3 * clock.remaining_s
+    age_ms = (remedy.delay_ms(analysis) or 0.0) - 1e3 * time_offset.remaining_s
     horizon_parameters = remedy.horizon_change(analysis.flight.log.parameters, age_ms)
     delay_action = (
         f", and set {remedy.format_settings(horizon_parameters)}" if horizon_parameters else ""
     )
-    shift_text = format_shift(clock.remaining_s)
+    shift_text = format_shift(time_offset.remaining_s)
     return f"{shift_text} the timestamp of each position{delay_action}."
 
 
-def clock_offset_option_s(comparison: PreparedComparison, clock: ClockOffset) -> float:
+def clock_offset_option_s(comparison: PreparedComparison, time_offset: ClockOffset) -> float:
     """Return the value (s) of ``--clock-offset`` that corrects a time offset."""
     # --clock-offset replaces the time offset that the alignment of a position file applied
     alignment = comparison.source.alignment
-    return clock.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
+    return time_offset.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
 
 
-def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
+def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings:
     # For GNSS, the time offset already includes an error of EKF2_GPS_DELAY
     delay_ms = remedy.delay_ms(analysis) if analysis.source.origin.is_vision else None
-    ml_delay_ms = -1e3 * clock.offset_s
-    if delay_ms is None or remedy.wrong_delay_ms(analysis, clock, delay_ms) is None:
+    ml_delay_ms = -1e3 * time_offset.offset_s
+    if delay_ms is None or remedy.wrong_delay_ms(analysis, time_offset, delay_ms) is None:
         return
-    low_ms, high_ms = (-1e3 * end_s for end_s in reversed(clock.interval_s))
+    low_ms, high_ms = (-1e3 * end_s for end_s in reversed(time_offset.interval_s))
     interval_low_ms, interval_high_ms, delay_size_ms = (
         round(low_ms),
         round(high_ms),
@@ -169,13 +172,13 @@ def detect_wrong_delay(analysis: Analysis, clock: ClockOffset) -> Findings:
 
 def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
     """Detect a wrong EKF2_GPS_DELAY in a flight in which EKF2 also fuses vision."""
-    model = analysis.ekf2_model
-    if isinstance(model, Unavailable) or not model.agreement.good:
+    ekf2_model = analysis.ekf2_model
+    if isinstance(ekf2_model, Unavailable) or not ekf2_model.agreement.good:
         return
-    estimate = remedy.wrong_gnss_delay_ms(model)
+    estimate = remedy.wrong_gnss_delay_ms(ekf2_model)
     if estimate is None:
         return
-    delay_ms, (ml_delay_ms, sigma_ms) = model.inputs.settings[GNSS_POS.delay], estimate
+    delay_ms, (ml_delay_ms, sigma_ms) = ekf2_model.inputs.settings[GNSS_POS.delay], estimate
     yield warning(
         "ekf2_gps_delay_wrong",
         f"{GNSS_POS.delay} is {delay_ms:g} ms, but GNSS positions and velocities are "

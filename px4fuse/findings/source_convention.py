@@ -24,7 +24,7 @@ from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION
 from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_phrase, source_name
 
-# Groups of findings to which wrong positions do not matter
+# Groups of findings that do not depend on the positions
 UNAFFECTED_GROUPS = ("logging", "IMU")
 
 
@@ -40,8 +40,8 @@ def detect(analysis: Comparison) -> Findings:
         *_orientation_faults(convention.orientation, faults, source_name(analysis.source)),
         *_position_faults(convention, faults, analysis.source),
     ):
-        gain = round(convention.log_likelihood_gain, 1)
-        evidence: dict[str, float | str] = {CONVENTION: kind, "log_likelihood": gain}
+        likelihood_gain = round(convention.log_likelihood_gain, 1)
+        evidence: dict[str, float | str] = {CONVENTION: kind, "log_likelihood": likelihood_gain}
         if kind == "rotation":
             evidence["misalignment_deg"] = faults.rotation_deg
         make_finding = warning if kind in ("copied", "ambiguous") else error

@@ -32,14 +32,14 @@ from px4fuse.flight.model import (
 from px4fuse.trajectory.rotation import heading as heading_of
 from px4fuse.trajectory.rotation import interpolate
 
-# Minimum ratio of yaw misalignment to its σ to report it: flights without a fault reach 3.2
+# Minimum |yaw misalignment| / σ of its estimate, for a finding: flights without a fault reach 3.2
 MIN_HEADING_SIGMAS = 4.0
-# Minimum yaw misalignment (°) to report it: magnetic headings of real flights are wrong by 3 to 4°
+# Minimum yaw misalignment (°) for a finding: magnetic headings of real flights are wrong by 3 to 4°
 MIN_HEADING_ERROR_DEG = 5.0
 # Minimum yaw misalignment (°) for severity error: 26 % of the motion appears on the other axis
 MIN_SEVERE_HEADING_ERROR_DEG = 15.0
-# EKF2's heading drifts if the ratio of its drift against ground truth to that against the positions
-# exceeds this value; otherwise the positions drift
+# EKF2's heading drifts if drift against ground truth / drift against the positions is larger.
+# Otherwise the positions drift
 MIN_TRUE_DRIFT_RATIO = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
@@ -93,11 +93,12 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         if not _is_drift_refuted(analysis.flight, heading):
             yield _drift_finding(analysis, heading)
         return
-    fit = analysis.systematic_errors
+    systematic_errors = analysis.systematic_errors
     is_explained_by_bias = (
-        not isinstance(fit, Unavailable)
+        not isinstance(systematic_errors, Unavailable)
         and analysis.source.orientation is None
-        and abs(fit.rotation.value) < MIN_HEADING_SIGMAS * fit.rotation.sigma
+        and abs(systematic_errors.rotation.value)
+        < MIN_HEADING_SIGMAS * systematic_errors.rotation.sigma
     )
     if is_explained_by_bias or abs(rotation_deg) < max(
         MIN_HEADING_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG

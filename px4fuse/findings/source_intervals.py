@@ -19,26 +19,26 @@ from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
 from px4fuse.flight.model import ALIGNED, Ekf2, Unavailable, positions_phrase, step_values_at
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
-# Minimum fraction of lost positions to report it: PX4 v1.14 and later loses 0.3 %
+# Minimum fraction of lost positions for a finding: PX4 v1.14 and later loses 0.3 %
 MIN_LOST_FRACTION = 0.02
 # Minimum number of intervals between positions to detect downsampling
 MIN_INTERVALS = 50
 # Minimum fraction of missing positions to report downsampling: a radio link loses fewer
 MIN_DOWNSAMPLED_FRACTION = 0.25
-# The intervals of downsampled positions alternate between n and n + 1 periods of the source, for
-# example 1 and 2 from 30 Hz to 20 Hz. Minimum fraction of intervals with one of both lengths
+# Intervals of downsampled positions are n or n + 1 periods of the source (30 Hz to 20 Hz: 1 or 2).
+# Minimum fraction of the intervals with one of these two lengths
 MIN_MULTIPLE_PAIR_FRACTION = 0.85
-# Minimum fraction of intervals with the rarer of both lengths
+# Minimum fraction of the intervals with the rarer length (n or n + 1 periods of the source)
 MIN_RARER_MULTIPLE_FRACTION = 0.1
-# Maximum RMS distance (periods) of intervals from whole periods: jitter causes 0.03, random
-# intervals cause 0.29
+# Maximum RMS of (interval / period - nearest integer): jitter causes 0.03, random intervals cause
+# 0.29
 MAX_MULTIPLE_RMS_ERROR = 0.06
 # Maximum number of periods of the source in the median interval between positions
 MAX_PERIOD_COUNT = 4
-# Minimum length (s) of a gap at the start or end of the flight to report it: the land detector is
+# Minimum length (s) of a gap at the start or end of the flight for a finding: the land detector is
 # seconds late
 MIN_END_GAP_S = 3.0
-# KF's state before an update is its state this time (s) before the position
+# KF's state before an update is read this time (s) before the position
 BEFORE_UPDATE_S = 1e-6
 
 
@@ -166,7 +166,7 @@ def describe_errors_after_gap(analysis: Analysis, gap_s: Span) -> str:
     before_end_s = np.array([start_s, end_s - BEFORE_UPDATE_S])
     axis, ekf2_state = result.axis, result.ekf2_state
     reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
-    quantity = "Distance to the first position after the gap"
+    quantity = "Distance from estimate to first position after the gap"
     if isinstance(result.truth, pd.DataFrame):
         true_m = result.truth["position_m"]
         reference_m, quantity = (
@@ -220,8 +220,12 @@ def _continuously_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[Aid
 
 
 def detect_lost_samples(analysis: Analysis) -> Findings:
-    source, clock = analysis.source, analysis.source.clock_map
-    if clock is None or clock.method == "arrival time" or clock.distinct_stamps is not None:
+    source, clock_map = analysis.source, analysis.source.clock_map
+    if (
+        clock_map is None
+        or clock_map.method == "arrival time"
+        or clock_map.distinct_stamps is not None
+    ):
         return
     intervals_s, median_interval_s = _position_intervals_s(analysis)
     lost_count = int(np.sum(np.rint(intervals_s / median_interval_s) - 1.0))
@@ -243,8 +247,8 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
-    # The intervals are not those at which PX4 received the positions if px4fuse changed the
-    # timestamps, or if PX4 logs the positions only after EKF2 used them (ALIGNED)
+    # Intervals are not the receive intervals of PX4 if px4fuse changed the timestamps, or if PX4
+    # logged the positions after their use in EKF2 (ALIGNED)
     if (
         source.clock_map is not None
         or source.origin.find_preference_rank() >= ALIGNED.find_preference_rank()

@@ -19,10 +19,10 @@ from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_NATS, has_little_motion
 from px4fuse.flight.model import Columns, positions_phrase, source_name
 
-# White noise is a separate fault if its ratio to the time-correlated noise exceeds this value
+# White noise is a separate fault if white noise σ / time-correlated noise σ is larger
 MIN_WHITE_NOISE_RATIO = 0.3
-# Minimum log likelihood ratio (nats) of time-correlated to white noise: 1 of 400 flights without
-# a fault exceeds it
+# Minimum log likelihood ratio (nats) of time-correlated to white noise: larger in 1 of 400 flights
+# without a fault
 MIN_CORRELATION_GAIN_NATS = 5.0
 # Minimum time-correlated error (m, 1 σ): timestamps in ms cause 2 mm at 4 m/s, and the motion from
 # IMU or ground truth also has errors of some mm
@@ -31,9 +31,9 @@ MIN_CORRELATED_SIGMA_M = 0.005
 MIN_REPEAT_FRACTION = 0.05
 # Minimum fraction of repeated positions for severity error
 MIN_REPEAT_FRACTION_ERROR = 0.3
-# Minimum number of repeated positions to report them
+# Minimum number of repeated positions for a finding
 MIN_REPEATS = 10
-# Minimum ratio of the position noises (σ) along north and east to report them as unequal
+# Minimum (larger / smaller) position noise σ of the axes north and east, for a finding
 MIN_AXIS_NOISE_RATIO = 1.5
 # Minimum ratio of the noise in one part of the flight to the noise in the rest, for a warning
 MIN_PART_NOISE_RATIO = 2.0
@@ -133,17 +133,19 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
 
 
 def detect_unequal_noise(analysis: Analysis) -> Findings:
-    """Detect different position noise along north and east."""
+    """Detect that the position noise differs between north and east."""
     if analysis.source.origin.is_gnss:
         return  # the estimate of SIGMA_Z contains only the white noise of GNSS
-    noises_m = sorted(
+    axis_noise_estimates = sorted(
         (noise.value, noise.low, noise.high, axis_tuning.name)
         for axis_tuning in analysis.tuning_by_axis
         if (noise := axis_tuning.sigma_z).value and noise.low and noise.high
     )
-    if len(noises_m) < 2:
+    if len(axis_noise_estimates) < 2:
         return
-    (quiet_m, _, quiet_high_m, quiet_axis), (noisy_m, noisy_low_m, _, noisy_axis) = noises_m
+    (quiet_m, _, quiet_high_m, quiet_axis), (noisy_m, noisy_low_m, _, noisy_axis) = (
+        axis_noise_estimates
+    )
     if noisy_m < MIN_AXIS_NOISE_RATIO * quiet_m or noisy_low_m <= quiet_high_m:
         return
     yield warning(

@@ -36,7 +36,7 @@ from px4fuse.findings.source_positions import (
 from px4fuse.findings.source_stamps import detect_bursts
 from px4fuse.flight.model import positions_phrase, source_name
 
-# Minimum scale factor error (ratio minus 1) against ground truth to report it: 0.8 m in 10 m
+# Minimum scale factor error (ratio minus 1) against ground truth for a finding: 0.8 m in 10 m
 MIN_TRUE_SCALE_ERROR = 0.08
 # Minimum jitter (s) for severity error: a position error of 3 cm at 1 m/s
 MIN_JITTER_ERROR_S = 0.03
@@ -52,16 +52,16 @@ def detect(analysis: Analysis) -> Findings:
     if white is None:
         return
     yield from detect_white_patterns(analysis, white)
-    fit = fit_errors(analysis, white)
-    if fit is not None:
-        yield from detect_slow_patterns(analysis, fit)
+    error_fit = fit_errors(analysis, white)
+    if error_fit is not None:
+        yield from detect_slow_patterns(analysis, error_fit)
         if not analysis.source.origin.is_gnss:  # GNSS has no scale factor error
-            yield from detect_scale_error(analysis, fit)
+            yield from detect_scale_error(analysis, error_fit)
 
 
 def detect_white_patterns(analysis: Analysis, white: WhiteErrors) -> Findings:
-    jitter_s, clock = find_timestamp_jitter(white), analysis.source.clock_map
-    if jitter_s is not None and (clock is None or clock.distinct_stamps is None):
+    jitter_s, clock_map = find_timestamp_jitter(white), analysis.source.clock_map
+    if jitter_s is not None and (clock_map is None or clock_map.distinct_stamps is None):
         yield (error if jitter_s >= MIN_JITTER_ERROR_S else warning)(
             "source_timestamp_jitter",
             f"The timestamps of the {positions_phrase(analysis.source)} jitter by "
@@ -87,8 +87,8 @@ def detect_white_patterns(analysis: Analysis, white: WhiteErrors) -> Findings:
         )
 
 
-def detect_slow_patterns(analysis: Analysis, fit: ErrorFit) -> Findings:
-    periodic, positions = find_periodic_error(fit), positions_phrase(analysis.source)
+def detect_slow_patterns(analysis: Analysis, error_fit: ErrorFit) -> Findings:
+    periodic, positions = find_periodic_error(error_fit), positions_phrase(analysis.source)
     if periodic is not None:
         yield (error if periodic.amplitude_m >= MIN_PERIODIC_ERROR_M else warning)(
             "source_error_periodic",
@@ -101,7 +101,7 @@ def detect_slow_patterns(analysis: Analysis, fit: ErrorFit) -> Findings:
             periodic._asdict(),
         )
         return
-    clock, variation = analysis.clock, find_offset_variation(fit)
+    clock, variation = analysis.clock, find_offset_variation(error_fit)
     if isinstance(clock, ClockOffset) and clock.has_changed():
         return  # source_clock reports the change
     if variation is not None:
@@ -118,17 +118,19 @@ def detect_slow_patterns(analysis: Analysis, fit: ErrorFit) -> Findings:
         )
 
 
-def detect_scale_error(analysis: Analysis, fit: ErrorFit) -> Findings:
-    if abs(fit.scale) >= max(MIN_TRUE_SCALE_ERROR, MIN_SCALE_ERROR_SIGMAS * fit.scale_sigma):
+def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
+    if abs(error_fit.scale) >= max(
+        MIN_TRUE_SCALE_ERROR, MIN_SCALE_ERROR_SIGMAS * error_fit.scale_sigma
+    ):
         yield finding(
-            "error" if abs(fit.scale) >= MIN_SCALE_ERROR_SEVERE else "warning",
+            "error" if abs(error_fit.scale) >= MIN_SCALE_ERROR_SEVERE else "warning",
             "source_scale_error",
-            f"{source_name(analysis.source)} distances are {format_percent(abs(fit.scale))} too "
-            f"{'long' if fit.scale > 0.0 else 'short'}. The comparison with ground truth is "
-            f"accurate to ± {format_percent(1.96 * fit.scale_sigma, 1)} (95 %). Innovations do not "
-            "show a scale factor error.",
+            f"{source_name(analysis.source)} distances are {format_percent(abs(error_fit.scale))} "
+            f"too {'long' if error_fit.scale > 0.0 else 'short'}. The comparison with ground truth "
+            f"is accurate to ± {format_percent(1.96 * error_fit.scale_sigma, 1)} (95 %). "
+            "Innovations do not show a scale factor error.",
             f"Check {source_words(analysis.source).scale}.",
-            {"scale": 1.0 + fit.scale, "sigma": fit.scale_sigma},
+            {"scale": 1.0 + error_fit.scale, "sigma": error_fit.scale_sigma},
         )
 
 

@@ -45,8 +45,8 @@ from px4fuse.flight.model import (
 
 # Minimum extent (m) of the positions (5th to 95th percentile) if the vehicle moves
 MIN_MOTION_RANGE_M = 0.5
-# Minimum ratio of the extent of the positions to the σ of their noise if the vehicle moves: white
-# noise extends over 3.29 σ (5th to 95th percentile), and the margin is 25 %
+# Minimum extent of the positions / σ of the position noise if the vehicle moves: 3.29 for white
+# noise (5th to 95th percentile), plus 25 %
 MIN_MOTION_RANGE_SIGMAS = 1.25 * 3.29
 # Minimum log likelihood ratio (nats) of low-pass filtered to white noise; for positions that are
 # not filtered it is 0 to 2
@@ -54,8 +54,7 @@ MIN_LOW_PASS_GAIN_NATS = 6.0
 # Minimum log likelihood ratio (nats) of low-pass filtered noise to time-correlated noise without
 # lag
 MIN_LAG_NATS = 1.0
-# If the lag of the low-pass filter exceeds this multiple of the upper end of the 95 % interval of
-# the delay, the delay is reported as lag
+# Lag from correlation > MAX_LAG_RATIO · upper 95 % limit of the delay: the delay is reported as lag
 MAX_LAG_RATIO = 4.0
 # Minimum lag (s) due to a low-pass filter, for a warning: a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
@@ -63,7 +62,7 @@ MIN_LAG_S = 0.05
 MIN_LAG_ERROR_S = 0.10
 # Minimum position jump (m) for a warning: twice the noise of good UWB (0.1 m)
 MIN_JUMP_M = 0.2
-# Minimum ratio of a position jump to the σ of time-correlated noise, for a warning
+# Minimum position jump / σ of time-correlated noise, for a warning
 MIN_JUMP_SIGMAS = 5.0
 # Minimum number of jumps with a change of reset_counter to report repeated jumps
 MIN_ANNOUNCED_JUMPS = 2
@@ -71,19 +70,17 @@ MIN_ANNOUNCED_JUMPS = 2
 MIN_UNANNOUNCED_JUMPS = 3
 # Minimum size (m) of a jump without a change of reset_counter
 MIN_UNANNOUNCED_JUMP_M = 0.1
-# Minimum ratio of a jump without a change of reset_counter to the median of other position changes
+# Minimum jump without a change of reset_counter / median of the other position changes
 MIN_UNANNOUNCED_JUMP_RATIO = 8.0
-# Number of position changes in the median with which a jump is compared
+# Number of position changes whose median is compared with a jump
 MEDIAN_CHANGE_COUNT = 61
 # Minimum number of positions to detect jumps
 MIN_POSITIONS_FOR_JUMPS = 100
 # Minimum time (s) and number of positions for which a jump lasts: outliers are shorter
 MIN_LASTING_S, MIN_LASTING_SAMPLES = 0.6, 9
-# A jump lasts if the medians of the positions before and after it differ by its size, with an error
-# below this fraction of the size
+# A jump lasts if |change of the median position - jump| / size of the jump is smaller
 MAX_LASTING_RATIO = 0.5
-# Maximum ratio of the interval before a jump to the median interval: in a longer interval, the
-# vehicle moves
+# Maximum interval before a jump / median interval: in a longer interval, the vehicle moves
 MAX_JUMP_INTERVAL_RATIO = 1.5
 # The positions alternate between two points if at least this fraction of the jumps is opposite to
 # the previous jump
@@ -104,15 +101,15 @@ MIN_JUMP_ERROR_M = 0.5
 MIN_SCALE_ERROR_WARNING = 0.12
 # Minimum scale factor error (ratio minus 1) for severity error: 1 m in a distance of 7 m
 MIN_SCALE_ERROR_SEVERE = 0.15
-# Minimum ratio of a scale factor error to its σ for a warning: 0.3 % of correct sources exceed it
+# Minimum |scale factor error| / σ of its estimate, for a warning: 0.3 % of correct sources exceed 3
 MIN_SCALE_ERROR_SIGMAS = 3.0
 # Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
 MIN_OUTLIER_FRACTION = 0.005
 # Minimum fraction of outliers for severity error: one in 10 s at 5 Hz
 MIN_OUTLIER_FRACTION_ERROR = 0.02
-# Minimum number of outliers to report them
+# Minimum number of outliers for a finding
 MIN_OUTLIERS = 3
-# Rejected outliers are counted only if the log has the innovations of this fraction of positions
+# Rejected outliers are counted if the log has the innovations of a larger fraction of the positions
 MIN_INNOVATION_FRACTION = 0.75
 # Minimum factor between reported and estimated position variance for a warning
 MIN_VARIANCE_RATIO = 2.0
@@ -182,16 +179,16 @@ def detect_low_pass(analysis: Analysis) -> Findings:
 
 def detect_jumps(analysis: Analysis) -> Findings:
     """Detect position jumps that the IMU does not measure."""
-    fit = analysis.systematic_errors
+    systematic_errors = analysis.systematic_errors
     # A change of the time offset also shifts the positions of a moving vehicle
-    if not isinstance(fit, SystematicErrors) or any(detect_arrival_times(analysis)):
+    if not isinstance(systematic_errors, SystematicErrors) or any(detect_arrival_times(analysis)):
         return
     correlated_noise = analysis.time_correlated_noise
     min_jump_m = MIN_JUMP_M
     if not isinstance(correlated_noise, Unavailable):
         # Time-correlated noise changes by up to √2 σ within seconds, which resembles a jump
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
-    large_jumps = [jump for jump in fit.jumps if jump.size_m >= min_jump_m]
+    large_jumps = [jump for jump in systematic_errors.jumps if jump.size_m >= min_jump_m]
     counter_changes_s = reset_times_s(analysis.source)
     if large_jumps:
         largest_jump = max(large_jumps, key=lambda jump: jump.size_m)
@@ -378,20 +375,20 @@ def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
 
 def detect_scale_error(analysis: Analysis) -> Findings:
     """Detect a scale factor error of the positions relative to the IMU."""
-    imu, fit = analysis.flight.imu, analysis.systematic_errors
+    imu, systematic_errors = analysis.flight.imu, analysis.systematic_errors
     if not isinstance(imu, pd.DataFrame) or is_rate_too_low(imu, MIN_IMU_RATE_HZ):
         return
     if (
         analysis.source.origin.is_gnss  # GNSS has no scale factor error
         or isinstance(analysis.flight.truth, Truth)  # source_patterns compares with ground truth
-        or not isinstance(fit, SystematicErrors)
+        or not isinstance(systematic_errors, SystematicErrors)
         # a low-pass filter reduces the motion, and time-correlated noise may resemble a scale error
         or find_low_pass(analysis) is not None
         or not isinstance(analysis.time_correlated_noise, Unavailable)
         or not _is_clock_known(analysis)
     ):
         return
-    scale_error, sigma = fit.scale.value, fit.scale.sigma
+    scale_error, sigma = systematic_errors.scale.value, systematic_errors.scale.sigma
     if abs(scale_error) >= max(MIN_SCALE_ERROR_WARNING, MIN_SCALE_ERROR_SIGMAS * sigma):
         yield finding(
             "error" if abs(scale_error) >= MIN_SCALE_ERROR_SEVERE else "warning",
@@ -412,8 +409,12 @@ def detect_outliers(analysis: Analysis) -> Findings:
     axis_tuning = analysis.tuning.get(HORIZONTAL) or next(iter(analysis.tuning.values()), None)
     if not isinstance(axis_tuning, AxisTuning):
         return
-    fit = analysis.systematic_errors
-    jump_times_s = [jump.time_s for jump in fit.jumps] if isinstance(fit, SystematicErrors) else []
+    systematic_errors = analysis.systematic_errors
+    jump_times_s = (
+        [jump.time_s for jump in systematic_errors.jumps]
+        if isinstance(systematic_errors, SystematicErrors)
+        else []
+    )
     outlier_times_s = [
         time_s
         for time_s in axis_tuning.outlier_time_s.tolist()

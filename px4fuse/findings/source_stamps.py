@@ -26,7 +26,7 @@ from px4fuse.flight.model import (
 
 # Jitter of receive times is reported above this value (s): a position error of 1 cm at 1 m/s
 MAX_RECEIPT_JITTER_S = 0.010
-# A timestamp is the arrival time if PX4 publishes the position within this time (s) after it
+# A timestamp is an arrival time if PX4 publishes the position within this time (s) after it
 MAX_ARRIVAL_AGE_S = 0.001
 # Minimum latency (s) for a warning: a position error of 2 cm at 1 m/s
 MIN_LATENCY_S = 0.02
@@ -36,16 +36,16 @@ MIN_LATENCY_ERROR_S = 0.10
 MIN_LATENCY_TREND = 0.8
 # Minimum fraction of positions that EKF2 drops because of their latency, for a finding
 MIN_DROPPED_FRACTION = 0.02
-# Minimum number of positions before the convergence of TIMESYNC, and minimum number after it
+# Minimum number of positions before the convergence of TIMESYNC, and also after it
 MIN_SAMPLES = 10
-# Minimum fraction of arrival times among the timestamps before the convergence of TIMESYNC, and of
-# measurement times after it
+# Minimum fraction of timestamps that are arrival times before TIMESYNC converges, and measurement
+# times afterwards
 MIN_CONSISTENT_FRACTION = 0.95
-# Minimum mean number of positions in a burst of positions that arrive together
+# Minimum mean number of positions that arrive together (burst)
 MIN_BURST_SIZE = 2.5
-# Minimum number of bursts: fewer pauses are gaps in the position source
+# Minimum number of bursts. With fewer bursts, the pauses are gaps in the position source
 MIN_BURST_COUNT = 20
-# Maximum ratio of the duration of a burst to the pause between bursts
+# Maximum duration of a burst / pause between bursts
 MAX_BURST_DURATION_RATIO = 0.3
 ANSWER_TIMESYNC = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
@@ -83,7 +83,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_bursts(analysis: Analysis) -> Findings:
-    """Detect timestamps in bursts: arrival times of positions that wait for each other."""
+    """Detect timestamps in bursts: arrival times of positions that wait and arrive together."""
     intervals_s = np.diff(analysis.source.samples.index.to_numpy())
     is_pause = intervals_s > intervals_s.mean()
     if np.count_nonzero(is_pause) < MIN_BURST_COUNT:
@@ -247,7 +247,7 @@ def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
     if position_age_s is None:
         return None
     is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
-    # Number of timestamps that contradict a convergence directly after each position
+    # For each position: number of timestamps that contradict a convergence of TIMESYNC after it
     contradicting_count: Array = (
         np.cumsum(~is_arrival_time) + np.sum(is_arrival_time) - np.cumsum(is_arrival_time)
     )

@@ -21,18 +21,16 @@ from px4fuse.findings.source_intervals import describe_errors_after_gap
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_phrase, source_name
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
-# Minimum rounding step (m) to report it: the error of smaller steps is below the noise of UWB
+# Minimum rounding step (m) for a finding: the error of smaller steps is below the noise of UWB
 MIN_ROUNDING_STEP_M = 0.05
-# A lever arm is reported if it reduces the position RMSE of an EKF2 replay to less than this
-# multiple
+# Maximum position RMSE of an EKF2 replay with the new lever arm / with the old one, for a finding
 MAX_LEVER_ARM_RMSE_RATIO = 0.7
 # Minimum distance (m) between the positions of two senders that alternate: the noise of good UWB
 MIN_SENDER_DISTANCE_M = 0.1
-# Minimum ratio of the distance between the positions of two senders to the noise σ: the noise of
-# one sender reaches 2 σ
+# Minimum distance between the positions of two senders / noise σ: one sender reaches 2
 MIN_SENDER_DISTANCE_SIGMAS = 4.0
-# Number of samples in a window to detect two senders: few, because a lost sample exchanges the
-# senders of odd and even samples
+# Window length (samples) for the detection of two senders: short, because a lost sample exchanges
+# the senders of odd and even samples
 WINDOW_SAMPLES = 16
 # Minimum number of windows to detect two senders: in fewer windows, outliers of one sender resemble
 # a second sender
@@ -86,7 +84,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _consecutive_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
-    # A span ends at the next valid sample: the number of valid samples before its rows is constant
+    # Invalid samples between two valid samples are one span
     valid_count_before = np.searchsorted(valid_s, time_s)
     starts = np.flatnonzero(np.diff(valid_count_before, prepend=-1))
     ends = np.append(starts[1:], len(time_s)) - 1
@@ -198,16 +196,16 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
 def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | None:
     """Return a sentence on EKF2's position RMSE in replays without and with a change.
 
-    The sentence is "" without a replay. Return None if the change hardly reduces the RMSE, because
-    the position error then has another cause.
+    The sentence is "" if EKF2 cannot be replayed. Return None if the change hardly reduces the
+    RMSE: the position error then has another cause.
     """
-    model, truth = analysis.ekf2_model, analysis.flight.truth
-    if isinstance(model, Unavailable) or isinstance(truth, Unavailable):
+    ekf2_model, truth = analysis.ekf2_model, analysis.flight.truth
+    if isinstance(ekf2_model, Unavailable) or isinstance(truth, Unavailable):
         return ""
-    if not model.agreement.good or not is_source_fused(analysis, model.inputs):
+    if not ekf2_model.agreement.good or not is_source_fused(analysis, ekf2_model.inputs):
         return ""
     rmses_m = []
-    for replay in (model.baseline_replay, *replay_settings(model, [change])):
+    for replay in (ekf2_model.baseline_replay, *replay_settings(ekf2_model, [change])):
         replayed_track = rows_inside(replay.published, replay.find_evaluated_spans())
         axis_errors_m = [
             replayed_track[name]

@@ -80,9 +80,9 @@ def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[s
     the position is damaged. "held": the source sent its last position again.
     """
     values, time_s = samples[columns].to_numpy(), samples.index.to_numpy()
-    reasons = pd.Series("", index=samples.index)
+    reason_by_row = pd.Series("", index=samples.index)
     is_number: BoolArray = (np.abs(values) < MAX_VALID_VALUE).all(axis=1)
-    reasons[~is_number] = "NaN"
+    reason_by_row[~is_number] = "NaN"
     is_zero: BoolArray = (values == 0.0).all(axis=1)
     measured_rows, zero_rows = np.flatnonzero(is_number & ~is_zero), np.flatnonzero(is_zero)
     if len(measured_rows):
@@ -91,15 +91,15 @@ def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[s
             np.clip([next_index - 1, next_index], 0, len(measured_rows) - 1)
         ]
         distance_m = np.linalg.norm(values[neighbour_rows], axis=2).min(axis=0)
-        reasons.iloc[zero_rows[distance_m > MIN_ZERO_DISTANCE_M]] = "zero"
-    valid_rows = np.flatnonzero(reasons == "")
+        reason_by_row.iloc[zero_rows[distance_m > MIN_ZERO_DISTANCE_M]] = "zero"
+    valid_rows = np.flatnonzero(reason_by_row == "")
     if len(valid_rows):
         median_offset_m = values[valid_rows] - np.median(values[valid_rows], axis=0)
         distance_m = np.linalg.norm(median_offset_m, axis=1)
         is_far = distance_m > max(
             MIN_FAR_DISTANCE_M, MIN_FAR_DISTANCE_RATIO * float(np.median(distance_m))
         )
-        reasons.iloc[valid_rows[is_far]] = "far"
+        reason_by_row.iloc[valid_rows[is_far]] = "far"
         valid_rows = valid_rows[~is_far]
     is_repeated = np.all(np.diff(values[valid_rows], axis=0) == 0.0, axis=1)
     run_starts = np.flatnonzero(np.append(True, ~is_repeated))
@@ -117,19 +117,19 @@ def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[s
     if frozen_rows and len(rows := np.concatenate(frozen_rows)) < MAX_FROZEN_FRACTION * len(
         valid_rows
     ):
-        reasons.iloc[rows] = "held"
-    return reasons
+        reason_by_row.iloc[rows] = "held"
+    return reason_by_row
 
 
 def rounding_step(values: Array) -> float:
     """Return the quantisation step of rounded values; 0 if the values are not rounded."""
-    steps = np.diff(np.unique(values[np.isfinite(values)]))
-    if not len(steps):
+    differences = np.diff(np.unique(values[np.isfinite(values)]))
+    if not len(differences):
         return 0.0
     with np.errstate(over="ignore", invalid="ignore"):  # a tiny step makes the ratio infinite
-        multiples = steps / steps.min()
-        is_multiple = np.abs(multiples - np.rint(multiples)) < MAX_STEP_ERROR
-    return float(steps.min()) if is_multiple.all() else 0.0
+        step_counts = differences / differences.min()
+        is_multiple = np.abs(step_counts - np.rint(step_counts)) < MAX_STEP_ERROR
+    return float(differences.min()) if is_multiple.all() else 0.0
 
 
 def interpolate_inside(time_s: pd.Index | Array, values: "pd.Series[float]") -> Array:

@@ -83,12 +83,12 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         is_repeated = np.zeros(len(ids), bool)
         is_repeated[id_order[1:]] = ids[1:] == ids[:-1]
         vertices.raise_where(
-            is_repeated, "another line has the same vertex id", "Remove one of both lines."
+            is_repeated, "another line has the same vertex id", "Remove one of the two lines."
         )
     vertex_index = np.minimum(np.searchsorted(ids, edge_vertex_ids), len(ids) - 1)
     edges.raise_where(
         ids[vertex_index] != edge_vertex_ids,
-        "the edge connects a vertex that is not in the file",
+        "the edge refers to a vertex that is not in the file",
         "Add the VERTEX line of this vertex, or remove all VERTEX lines.",
     )
     edges.raise_where(

@@ -203,11 +203,11 @@ def map_clock(
         )
     clock_kind = "UNIX time" if float(np.median(timestamp_s)) > MIN_UNIX_TIME_S else "clock"
     clock_name = f"{clock_kind} of {name}"
-    candidate_maps = [] if timesync_line is None else [("TIMESYNC", timesync_line, "")]
+    candidate_lines = [] if timesync_line is None else [("TIMESYNC", timesync_line, "")]
     if clock_kind == "UNIX time" and boot_to_unix is not None:
         unix_note = "sender and autopilot are assumed to have the same UNIX time"
-        candidate_maps.append(("SYSTEM_TIME", boot_to_unix.inverse(), unix_note))
-    for method, sender_to_boot, note in candidate_maps:
+        candidate_lines.append(("SYSTEM_TIME", boot_to_unix.inverse(), unix_note))
+    for method, sender_to_boot, note in candidate_lines:
         # If TIMESYNC or SYSTEM_TIME are from another clock, boot times differ from receive times
         if distance_s(sender_to_boot.at(timestamp_s)) <= MAX_BOOT_CLOCK_DISTANCE_S:
             return _clock_mapping(clock_name, method, sender_to_boot, timestamp_s, note)
@@ -226,18 +226,18 @@ def _fit_timesync(
     sender_replies: tuple[Array, Array], autopilot_replies: tuple[Array, Array]
 ) -> ClockLine | None:
     """Fit the relation of sender clock to boot clock by TIMESYNC, averaged over both directions."""
-    lines = []
+    clock_lines = []
     if len(sender_replies[0]) >= MIN_TIMESYNC_PAIRS:
         # The autopilot reads its clock first, so the fitted line converts boot to sender times
-        lines.append(fit_least_delay(*sender_replies).inverse())
+        clock_lines.append(fit_least_delay(*sender_replies).inverse())
     if len(autopilot_replies[0]) >= MIN_TIMESYNC_PAIRS:
-        lines.append(fit_least_delay(*autopilot_replies))
-    if not lines:
+        clock_lines.append(fit_least_delay(*autopilot_replies))
+    if not clock_lines:
         return None
-    x0 = lines[0].x0
-    line_values = [(float(line.at(x0)), line.slope, line.jitter) for line in lines]
+    x0 = clock_lines[0].x0
+    line_values = [(float(line.at(x0)), line.slope, line.jitter) for line in clock_lines]
     y0, slope, jitter = np.mean(line_values, axis=0).tolist()
-    return ClockLine(x0, y0, slope, jitter, sum(line.pair_count for line in lines))
+    return ClockLine(x0, y0, slope, jitter, sum(line.pair_count for line in clock_lines))
 
 
 def _clock_mapping(

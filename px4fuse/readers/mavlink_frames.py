@@ -307,9 +307,9 @@ def _count_other_bytes(
         gap_starts < gap_ends
     ].tolist():
         offset = gap_start
-        for size in _unknown_frames(content, gap_start, gap_end, receive_time_bytes):
+        for frame_bytes in _unknown_frames(content, gap_start, gap_end, receive_time_bytes):
             unknown_frame_count += 1
-            offset += size
+            offset += frame_bytes
         bad_byte_count += gap_end - offset
         last_bytes = content[offset:gap_end] if gap_end == len(content) else b""
     begins_frame = {*last_bytes[receive_time_bytes : receive_time_bytes + 1]} <= {
@@ -332,18 +332,20 @@ def _unknown_frames(
             offset + receive_time_bytes : offset + receive_time_bytes + HEADER_BYTES_V2
         ]
         message_id = header[5]
-        size = receive_time_bytes + header[1] + HEADER_BYTES_V1 + CHECKSUM_BYTES
+        frame_bytes = receive_time_bytes + header[1] + HEADER_BYTES_V1 + CHECKSUM_BYTES
         if header[0] == MAGIC_BYTE_V2:
             message_id = int.from_bytes(header[7:10], "little")
-            size += HEADER_BYTES_V2 - HEADER_BYTES_V1 + SIGNATURE_BYTES * (header[2] & SIGNED_FLAG)
-        offset += size
+            frame_bytes += (
+                HEADER_BYTES_V2 - HEADER_BYTES_V1 + SIGNATURE_BYTES * (header[2] & SIGNED_FLAG)
+            )
+        offset += frame_bytes
         if (
             header[0] not in (MAGIC_BYTE_V1, MAGIC_BYTE_V2)
             or message_id in dialect.mavlink_map
             or offset > gap_end
         ):
             return
-        yield size
+        yield frame_bytes
 
 
 def _read_receive_times(

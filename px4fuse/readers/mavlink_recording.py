@@ -180,10 +180,12 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     ned_samples = samples.copy()
     ned_samples[Columns.STATE + Columns.POSITION_VARIANCE] = np.nan
     ned_samples[Columns.VELOCITY_VARIANCE + orientation] = np.nan
-    for number, frame in FRAMES_OF_REFERENCE.items():
+    for frame_number, frame in FRAMES_OF_REFERENCE.items():
         is_body = frame.body
-        in_frame = (samples["frame_id"] == number) & (not is_body)
-        in_child_frame = (samples["child_frame_id"] == number) & (has_quaternion | (not is_body))
+        in_frame = (samples["frame_id"] == frame_number) & (not is_body)
+        in_child_frame = (samples["child_frame_id"] == frame_number) & (
+            has_quaternion | (not is_body)
+        )
         if min(frame.signs) > 0.0:
             ned_samples.loc[in_frame, orientation] = samples.loc[in_frame, orientation]
         for rows, vector_columns, variance_columns in (
@@ -225,9 +227,9 @@ def _read_boot_times(frames: MavlinkFrames, address: Address) -> tuple[IntArray,
     is_usable = is_boot_time if np.any(is_boot_time) else (times_s >= MIN_UNIX_TIME_S)
     if is_usable.sum() >= MIN_CONSTANT_TIMESTAMPS and not is_running_clock(times_s[is_usable]):
         is_usable &= False
-    order = np.flatnonzero(is_usable)
-    order = order[np.argsort(rows[order])]
-    return rows[order], times_s[order]
+    usable_order = np.flatnonzero(is_usable)
+    usable_order = usable_order[np.argsort(rows[usable_order])]
+    return rows[usable_order], times_s[usable_order]
 
 
 def read_recording(frames: MavlinkFrames, address: Address) -> Recording:
@@ -318,10 +320,12 @@ def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
     Groups are separated by gaps of more than MAX_OUTSIDE_S. A group is small if it has less than
     MIN_GROUP_FRACTION of the timestamps of the largest group.
     """
-    groups = np.split(rows, np.flatnonzero(np.diff(times_s[rows]) > MAX_OUTSIDE_S) + 1)
-    min_count = MIN_GROUP_FRACTION * max(len(group) for group in groups)
-    large_groups = [index for index, group in enumerate(groups) if len(group) >= min_count]
-    return np.concatenate(groups[large_groups[0] : large_groups[-1] + 1])
+    timestamp_groups = np.split(rows, np.flatnonzero(np.diff(times_s[rows]) > MAX_OUTSIDE_S) + 1)
+    min_group_size = MIN_GROUP_FRACTION * max(len(group) for group in timestamp_groups)
+    large_groups = [
+        index for index, group in enumerate(timestamp_groups) if len(group) >= min_group_size
+    ]
+    return np.concatenate(timestamp_groups[large_groups[0] : large_groups[-1] + 1])
 
 
 def map_boot_to_unix(recording: Recording) -> ClockLine | None:

@@ -205,13 +205,13 @@ def configured_step_s(topics: Topics) -> float:
 def _prediction_interval_s(topics: Topics) -> float:
     """Return EKF2's prediction interval (s), a multiple of the IMU interval (ImuDownSampler)."""
     configured_s = configured_step_s(topics)
-    imu_s = topics.read(Layout(px4.IMU.topic, {"time": "timestamp"})).index.to_numpy()
-    if len(imu_s) < 2 or (interval_s := median_interval(imu_s)) >= configured_s:
+    imu_time_s = topics.read(Layout(px4.IMU.topic, {"time": "timestamp"})).index.to_numpy()
+    if len(imu_time_s) < 2 or (interval_s := median_interval(imu_time_s)) >= configured_s:
         return configured_s
     layout = Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
-    prediction_end_rows = rows_of_timestamps(imu_s, topics.primary_samples(layout).index)
+    prediction_end_rows = rows_of_timestamps(imu_time_s, topics.primary_samples(layout).index)
     # time differences are used instead of row numbers, because IMU samples may be missing
-    prediction_ends = np.rint((imu_s[prediction_end_rows] - imu_s[0]) / interval_s)
+    prediction_ends = np.rint((imu_time_s[prediction_end_rows] - imu_time_s[0]) / interval_s)
     return samples_per_step(configured_s, interval_s, prediction_ends) * interval_s
 
 

@@ -148,13 +148,13 @@ def reconstruct_fixes(
     )
 
 
-def _receiver_interval_s(times: Array) -> float | None:
+def _receiver_interval_s(fix_times_s: Array) -> float | None:
     """Estimate the interval (s) of a GNSS receiver of which the log contains only some fixes.
 
     It is the longest interval of which all logged intervals are multiples. Return None if all
     logged intervals are equal, because the multiple is then unknown.
     """
-    logged_intervals_s = np.diff(times)[:, None]
+    logged_intervals_s = np.diff(fix_times_s)[:, None]
     multiples = logged_intervals_s / FIX_INTERVALS_S
     multiple_error_s = np.abs(multiples - np.round(multiples)) * FIX_INTERVALS_S
     worst_error_s = np.percentile(multiple_error_s, 98, axis=0)

@@ -518,8 +518,8 @@ def _read_tables(ulog: ULog) -> Tables:
                 for name, values in other_table.items()
                 if name in table
             }
-            order = np.argsort(table["timestamp"], kind="stable")
-            table = {name: values[order] for name, values in table.items()}
+            time_order = np.argsort(table["timestamp"], kind="stable")
+            table = {name: values[time_order] for name, values in table.items()}
         tables[key] = table
     return tables
 
@@ -540,7 +540,10 @@ def _data_span_us(tables: Tables, name: str) -> tuple[int, int]:
 
 
 def _printable_text(info: dict[str, Any], key: str, default: str) -> str:
-    return "".join(c for c in str(info.get(key, default)) if c.isprintable()) or default
+    return (
+        "".join(character for character in str(info.get(key, default)) if character.isprintable())
+        or default
+    )
 
 
 def _firmware_text(info: dict[str, Any]) -> str:

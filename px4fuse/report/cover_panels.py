@@ -96,10 +96,6 @@ class FlightMap(NamedTuple):
     right_labels: Sequence[str]
     up_label: str
 
-    def has_elongated_track(self) -> bool:
-        map_length_m, width_m = (float(np.ptp(values)) for values in self.tracks["positions"])
-        return map_length_m >= MIN_LONG_TRACK_RATIO * max(width_m, 1e-6)
-
 
 def write_panels(block: Block, analysis: Analysis, card: Card, free_height: float) -> None:
     """Draw legend, map and plots over time on the first page; ``free_height`` is in points."""
@@ -118,7 +114,9 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free_height: floa
     innovation_height = float(
         np.clip(INNOVATION_HEIGHT_FRACTION * plots_height, *INNOVATION_HEIGHT_RANGE)
     )
-    if flight_map.has_elongated_track() and plots_height >= min_long_map_height:
+    length_m, width_m = np.ptp(flight_map.tracks["positions"], axis=1)
+    is_elongated = length_m >= MIN_LONG_TRACK_RATIO * max(width_m, 1e-6)
+    if is_elongated and plots_height >= min_long_map_height:
         map_height = float(np.clip(MAP_HEIGHT_FRACTION * plots_height, *MAP_HEIGHT_RANGE))
         _draw_map(page, analysis, flight_map, map_height)
         error_heights = _equal_heights(page, errors, plots_height - map_height - innovation_height)

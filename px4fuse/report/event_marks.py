@@ -80,8 +80,14 @@ def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> No
         else:
             min_interval_s = MIN_MARK_INTERVAL_FRACTION * (segment.end_s - segment.start_s)
             times_s = visible_times(spans_or_times, min_interval_s)
-            mark_style = {**style, "transform": x_transform, "zorder": 2.6, "clip_on": height > 0.0}
-            markers = Line2D(times_s, np.full(len(times_s), height), **mark_style)
+            markers = Line2D(
+                times_s,
+                np.full(len(times_s), height),
+                **style,
+                transform=x_transform,
+                zorder=2.6,
+                clip_on=height > 0.0,
+            )
             axes.add_artist(markers)  # unlike add_line, add_artist does not change the axis limits
 
 

@@ -1,7 +1,6 @@
 """Report page on a loop flight: closure error, corrected paths and errors against references."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -102,8 +101,8 @@ def draw_map(axes: Axes, loop: Loop) -> None:
             plot_path(axes, horizontal_m, track.time_s, label=name, **PATH_STYLES[name])
     start, end = odometry_path.position_m[[0, -1]][:, (1, 0)]
     axes.plot(*start, "o", color="black", ms=5, label="start", zorder=5)
-    end_mark: dict[str, Any] = {"color": EKF2_COLOUR, "mec": "black", "mew": 0.6, "ms": 5}
-    axes.plot(*end, "s", **end_mark, label="end of odometry", zorder=5)
+    end_label = "end of odometry"
+    axes.plot(*end, "s", color=EKF2_COLOUR, mec="black", mew=0.6, ms=5, label=end_label, zorder=5)
     if loop.closure_error_axes_m is not None:
         true_end = end - np.array(list(loop.closure_error_axes_m.values()))[[1, 0]]
         arrow_style = {
@@ -125,8 +124,8 @@ def _draw_reference(axes: Axes, loop: Loop) -> None:
         evaluation = loop.choose_best_path().scores.get(reference.name)
         if isinstance(evaluation, Evaluation):
             reference_m = evaluation.transform.apply_inverse(evaluation.reference_m)[:, (1, 0)]
-            line = {"label": reference.name, "zorder": 4, **TRACK_LINES["ground truth"]}
-            plot_path(axes, reference_m, evaluation.time_s, **line)
+            line = TRACK_LINES["ground truth"]
+            plot_path(axes, reference_m, evaluation.time_s, label=reference.name, zorder=4, **line)
 
 
 def loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.flight.model import Flight, PositionTrack, Unavailable
@@ -112,14 +111,15 @@ def _write_versions(page: Page, results: FlightResults | LoopResults) -> None:
 
 def _write_section(page: Page, title: str, texts: Iterable[str | tuple[str, str]]) -> None:
     """Write texts, or pairs of label and text, below a title if there are any."""
-    label_style: dict[str, Any] = {"above": -1.0, "colour": MUTED_COLOUR, "bold": False}
     for index, text in enumerate(texts):
         if index == 0:
             page.heading(title)
         if isinstance(text, str):
             page.write(text)
         else:
-            page.write_labelled(*text, width=LABEL_WIDTH, **label_style)
+            page.write_labelled(
+                *text, width=LABEL_WIDTH, above=-1.0, colour=MUTED_COLOUR, bold=False
+            )
 
 
 def _write_methods(page: Page, name: str) -> None:

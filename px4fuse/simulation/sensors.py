@@ -459,20 +459,16 @@ def _gnss_topic(
     scenario: Scenario,
 ) -> Topic:
     latitude, longitude = unproject(position_m[:, 0], position_m[:, 1], HOME_POSITION[:2])
-    accuracy_fields = {
+    fields = timestamps(timestamp_us) | {
         "eph": sigma_m,
         "epv": sigma_m * GNSS_SIGMA_FACTORS[2],
         "s_variance_m_s": scenario.sigma_gnss_m_s,
-    }
-    position_fields = {
         "latitude_deg": latitude,
         "longitude_deg": longitude,
         "altitude_msl_m": HOME_POSITION[2] - position_m[:, 2],
     }
-    velocity_fields = {f"vel_{axis}_m_s": velocity_m_s[:, i] for i, axis in enumerate("ned")}
-    return topic(
-        GPS_POSITION, timestamps(timestamp_us) | position_fields | accuracy_fields | velocity_fields
-    )
+    fields |= {f"vel_{axis}_m_s": velocity_m_s[:, i] for i, axis in enumerate("ned")}
+    return topic(GPS_POSITION, fields)
 
 
 def _low_pass(position_m: Array, interval_s: float, time_constant_s: float) -> Array:

@@ -250,7 +250,9 @@ def offset_to_add(found: re.Match[str], surface: str, _: str) -> Iterator[Statem
 
 def signed_offset(found: re.Match[str], surface: str, _: str) -> Iterator[Statement]:
     is_negative = {"late", "subtract"} & {word.lower() for word in found.groups()}
-    number = next(word for word in found.groups() if word[0].isdigit())
+    number = next(
+        word for word in found.groups() if word.lstrip("+-−").startswith(tuple("0123456789"))
+    )
     yield printed("offset", surface, number, -1.0 if is_negative else 1.0)
 
 
