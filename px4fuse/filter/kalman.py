@@ -139,7 +139,8 @@ def _run_filterpy(
     for u, B, F, Q, measured_m in zip(*matrices, inputs[3], strict=True):
         kalman.predict(u=u, B=B, F=F, Q=Q)
         if measured_m is not None:
-            kalman.update(measured_m)
+            # with H, filterpy does not convert and copy the scalar measurement at each update
+            kalman.update(measured_m, H=kalman.H)
             x, P, K = kalman.x_prior, kalman.P_prior, kalman.K
             updates.append(
                 (
