@@ -61,8 +61,6 @@ MAX_DATA_GAP_S = 600.0
 MAX_FIELDS = 200_000
 # Length (bytes) of a ULog message header
 HEADER_BYTES = 3
-# Start of a ULog data message: length (bytes) after the header, type, topic, timestamp (µs)
-_DATA_START = struct.Struct("<HBHQ")
 
 # Samples of one topic instance: an array for each PX4 field
 TopicArrays = dict[str, NDArray[Any]]
@@ -118,39 +116,7 @@ def _skip_if_short(parse: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class _MessageData(ULog._MessageData):  # type: ignore[misc]  # pyulog has no types
-    timestamp: int  # µs
-    _initialize_one = _skip_if_short(ULog._MessageData.initialize)
-
-    def initialize(self, data: bytes, header: Any, subscriptions: Any, ulog: ULog) -> bool:
-        """Store a data message and the valid data messages after it.
-
-        The loop of pyulog needs twice the CPU time for each message.
-        """
-        if self._initialize_one(data, header, subscriptions, ulog):
-            return True
-        content: _CountingContent = ulog._file_handle
-        file_bytes, start = content.getvalue(), content.position
-        file_end = len(file_bytes)
-        # pyulog must check each position if the file contains appended data
-        last_start = -1 if ulog._appended_offsets else file_end - _DATA_START.size
-        filtered, unpack, last_time_us = ulog._filtered_message_ids, _DATA_START.unpack_from, 0
-        while start <= last_start:
-            size, kind, topic_id, time_us = unpack(file_bytes, start)
-            end = start + HEADER_BYTES + size
-            if kind != ULog.MSG_TYPE_DATA or end > file_end:
-                break
-            topic = subscriptions.get(topic_id)
-            if topic:
-                if topic.timestamp_offset or size != topic.dtype.itemsize + 2 or size < 10:
-                    break
-                topic.buffer += file_bytes[start + HEADER_BYTES + 2 : end]
-                last_time_us = max(last_time_us, time_us)
-            elif topic_id not in filtered or size < 2:
-                break
-            content.header_start, start = start, end
-        self.timestamp = max(self.timestamp, last_time_us)
-        content.read_end = content.seek(start)
-        return False
+    initialize = _skip_if_short(ULog._MessageData.initialize)
 
 
 class _Reader(ULog):  # type: ignore[misc]
