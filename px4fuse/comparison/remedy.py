@@ -23,7 +23,8 @@ GNSS_DELAYS_MS = (0.0, 150.0, 300.0)
 TRANSMISSION_MS = 30.0
 # EKF2_DELAY_MAX is rounded up to a multiple of this value (ms)
 DELAY_MAX_STEP_MS = 50.0
-# Minimum fraction of the time in which EKF2 fuses heights, to report that their noise is different
+# A height noise that differs from the horizontal noise is reported only if EKF2 fuses heights of
+# the source for at least this fraction of the time
 MIN_HEIGHT_FUSED_FRACTION = 0.5
 # Minimum ratio of height noise to horizontal noise that one parameter does not fit
 MIN_HEIGHT_NOISE_RATIO = 2.0

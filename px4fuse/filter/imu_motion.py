@@ -45,8 +45,8 @@ HEADING_SIGMA_RAD = 0.05
 # Prior σ of the unknown constants, wide for consumer sensors: initial tilt and heading (rad), gyro
 # bias (rad/s), accelerometer bias (m/s²), scale of the positions (1)
 CONSTANTS_PRIOR_SIGMA = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
-# Maximum gyro bias (rad/s) within the prior of the constants (5 σ). A larger bias is estimated from
-# EKF2's attitude and removed
+# Maximum gyro bias (rad/s) that the prior of the estimated bias allows (5 σ). A larger bias is
+# estimated from EKF2's attitude and removed
 MAX_PRIOR_GYRO_BIAS_RAD_S = 0.02
 # Maximum gyro bias (rad/s) that EKF2 can remove from its attitude: the maximum of EKF2_GYR_B_LIM
 MAX_REMOVED_GYRO_BIAS_RAD_S = 0.4

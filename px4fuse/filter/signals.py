@@ -32,8 +32,8 @@ AISLE = "aisle"
 MIN_IMU_GAP_S = 0.1
 # Minimum length of a gap in the IMU, as multiple of the median sample interval
 MIN_IMU_GAP_INTERVALS = 5.0
-# Positions are downsampled to at least this rate (Hz) before the noises are estimated: errors of
-# faster positions are time-correlated, so that more positions add no information
+# Faster positions are downsampled to about this rate (Hz) before the noises are estimated: their
+# errors are time-correlated, so that more positions add no information
 MAX_INDEPENDENT_HZ = 25.0
 # Minimum number of position measurements along an axis
 MIN_MEASUREMENTS = 3

@@ -47,7 +47,7 @@ MAX_OUTLIER_FRACTION = 0.3
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value of the random walk (m/√s) of a source that may drift
 START_RANDOM_WALK_M = 0.02
-# Maximum ratio of a noise estimate to an end of its search range at which it is only a bound
+# A noise estimate is only a bound if it equals an end of its search range, within this factor
 MAX_SEARCH_END_RATIO = 1.001
 
 

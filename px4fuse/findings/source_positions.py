@@ -405,7 +405,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
 
 
 def detect_outliers(analysis: Analysis) -> Findings:
-    """Detect more outliers than normal noise has."""
+    """Detect more outliers than Gaussian noise has."""
     axis_tuning = analysis.tuning.get(HORIZONTAL) or next(iter(analysis.tuning.values()), None)
     if not isinstance(axis_tuning, AxisTuning):
         return

@@ -164,7 +164,7 @@ def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
 
 
 def _parse_rows(rows: Rows, tag: str) -> tuple[IntArray, Array]:
-    """Return vertex ids, shape (n, 1 or 2), and the numbers after them, of all lines of a tag."""
+    """Return the vertex ids, shape (n, 1 or 2), and the other numbers of all lines with a tag."""
     vertex_count, value_count = _COUNTS_BY_TAG[tag]
     cells, numbers = rows.parse(1 + vertex_count, value_count)
     is_invalid_id = [

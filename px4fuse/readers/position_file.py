@@ -58,7 +58,8 @@ MAX_INTERVAL_S = 1.1 / 0.2
 POSITION_TIME_LIMITS = tuple(TIME_UNITS), (MIN_INTERVAL_S, MAX_INTERVAL_S)
 # Plausible units of the timestamps of trajectories, and plausible median intervals (s)
 TRAJECTORY_TIME_LIMITS = ("s", "ns"), (1e-3, 1e3)
-# Maximum median interval (s) of UNIX times in seconds. With a longer one, they are boot times in µs
+# Maximum median interval (s) of UNIX times in seconds. Numbers with a longer interval are boot
+# times in µs
 MAX_UNIX_TIME_INTERVAL_S = 60.0
 # Maximum extent (m) of an indoor flight. Positions with a larger extent are probably in mm
 MAX_INDOOR_EXTENT_M = 200.0

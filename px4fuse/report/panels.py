@@ -81,7 +81,7 @@ class Panel(NamedTuple):
             title,
             height,
             caption=caption,
-            # innovations that EKF2 rejected are already drawn as hollow dots
+            # rejected innovations are drawn as hollow dots, so they need no marks: axis ""
             axis="" if self is INNOVATIONS else result.axis.name,
             with_time_label=with_time_label,
         )

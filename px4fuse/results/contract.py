@@ -45,7 +45,7 @@ SIGNIFICANT_DIGITS = 10
 
 
 class Log(LogInfo, kw_only=True):
-    """Log of a flight, further input files, and clocks that were converted to the boot clock."""
+    """Description of a log, of other input files, and of clocks converted to the boot clock."""
 
     joined: tuple[InputFile, ...]
     clocks: tuple[ClockMap, ...]

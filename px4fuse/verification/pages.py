@@ -447,7 +447,7 @@ def _unescape(match: re.Match[str]) -> str:
 def _has_near_operands(
     operator: str, submitted_operands: Sequence[Operand], redrawn_operands: Sequence[Operand]
 ) -> bool:
-    """Return True if the operands of a drawing operator are equal within the tolerances."""
+    """Return True if the operands of a PDF drawing operator are equal within the tolerances."""
     first_coordinate_index = _FIRST_COORDINATE_INDEX.get(operator, len(redrawn_operands))
     return len(submitted_operands) == len(redrawn_operands) and all(
         submitted_operand == redrawn_operand
