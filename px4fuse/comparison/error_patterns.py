@@ -82,7 +82,7 @@ FREQUENCY_STEP_PERIODS = 0.2
 MIN_BINS_PER_PERIOD = 30
 # Maximum fraction of the mean square motion at the frequency of a sinusoidal error
 MAX_MOTION_FRACTION = 0.1
-# Interval and maximum (s) of the tested delays of the logged attitude
+# Tested delays of the logged attitude: distance of successive delays, and largest delay (s)
 DELAY_STEP_S, MAX_ATTITUDE_DELAY_S = 0.01, 0.5
 # Minimum delay (s) of the logged attitude that is reported
 MIN_ATTITUDE_DELAY_S = 0.04

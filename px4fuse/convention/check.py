@@ -96,12 +96,12 @@ def check_convention(
         name: motion_from_imu(inertial_data, attitude)
         for name, attitude in inertial_data.compute_attitudes().items()
     }
-    hypotheses = _rank_hypotheses(positions, motions)
+    hypotheses = _rank_convention_hypotheses(positions, motions)
     if not hypotheses:
         return None
     if clock_drift := _clock_drift(positions, motions[hypotheses[0].heading_from], hypotheses[0]):
         positions_without_drift = positions.remove_clock_drift(clock_drift)
-        hypotheses_without_drift = _rank_hypotheses(positions_without_drift, motions)
+        hypotheses_without_drift = _rank_convention_hypotheses(positions_without_drift, motions)
         if (
             hypotheses_without_drift
             and hypotheses_without_drift[0].score > hypotheses[0].score + MIN_DRIFT_SCORE_GAIN
@@ -137,7 +137,7 @@ def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -
     )
 
 
-def _rank_hypotheses(
+def _rank_convention_hypotheses(
     positions: SentPositions, motions: dict[HeadingSource, ImuMotion]
 ) -> list[Hypothesis]:
     """Return the likely hypotheses, best first; a hypothesis with EKF2's heading is preferred."""

@@ -1,4 +1,4 @@
-"""Lever arm (sensor of the position source relative to the IMU) from ground truth or from turns."""
+"""Estimate of the lever arm from the IMU to the position sensor, from ground truth or turns."""
 
 from typing import NamedTuple
 

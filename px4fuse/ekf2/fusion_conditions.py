@@ -182,7 +182,7 @@ def _check_frame(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
         )
 
 
-def _check_gap(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
+def _check_position_gap(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
     has_short_timeout = attempt.is_vision and attempt.has_switch
     stop_timeout_s = EV_STOP_INTERVAL_S if has_short_timeout else FUSION_STOP_S
     times_s = attempt.source.samples.index.to_numpy()
@@ -371,13 +371,13 @@ def _check_gate(attempt: FusionAttempt) -> Iterator[UnmetCondition]:
 VISION_CONDITIONS = (
     _check_switch,
     _check_frame,
-    _check_gap,
+    _check_position_gap,
     _check_timestamps,
     _check_quality,
     _check_interval,
     _check_alignment,
     _check_gate,
 )
-# Checks for GNSS. _check_gnss is before _check_gap, because positions without a fix are not logged
-# and look like a gap
-GNSS_CONDITIONS = (_check_switch, _check_gnss, _check_gap, _check_alignment, _check_gate)
+# Checks for GNSS. _check_gnss is before _check_position_gap, because positions without a fix are
+# not logged and look like a gap
+GNSS_CONDITIONS = (_check_switch, _check_gnss, _check_position_gap, _check_alignment, _check_gate)

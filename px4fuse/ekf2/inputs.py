@@ -141,7 +141,7 @@ class FusionRules:
     reset_timeout_s : float
         The position is reset after all samples are rejected for this time.
     max_resets : int
-        Fusion stops after this number of successive resets.
+        EKF2 stops fusing the position source after this number of successive resets.
     min_bias_variance : float or None
         Minimum accelerometer bias variance (m²/s⁴).
     uses_delay_as_horizon : bool
@@ -294,7 +294,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(FIRST_RELEASE_WITH_HORIZON_TIMES):
             return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
-        # If EKF2_EV_DELAY <= one prediction step, the fusion horizon has no delay
+        # EKF2 fuses at the current time if EKF2_EV_DELAY is at most one prediction step
         horizon_s = 0.0
     aiding_times_s = received.timestamp_s
     flow_samples = fusion_record.flow if is_gnss else fusion_record.flow.iloc[:0]

@@ -149,10 +149,12 @@ def _axis_signals(
         "z": packer.add(position_m[is_near_segment]),
     }
     if isinstance(axis.acceleration, Acceleration):
-        integral_m_s = axis.acceleration.integral_m_s[_segment_slice(comparison, axis.acceleration)]
+        integral_m_s = axis.acceleration.compute_integral_m_s()[
+            _segment_slice(comparison, axis.acceleration)
+        ]
         signals |= {
             "integral": packer.add(integral_m_s - integral_m_s[0]),
-            "rms": axis.acceleration.rms_m_s2,
+            "rms": axis.acceleration.compute_rms_m_s2(),
         }
     return signals
 

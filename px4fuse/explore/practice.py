@@ -70,7 +70,7 @@ class QuizFault(Record):
     choice : str
         Right answer of the quiz.
     name : str
-        Name of the fault in ``px4fuse simulate --mistake``, or :data:`NOISY_UWB`.
+        Fault, as in ``px4fuse simulate --mistake NAME``; :data:`NOISY_UWB` is a noise setting.
     sizes : tuple of str
         Size at each level of difficulty, as in ``px4fuse simulate --mistake``.
     view : str

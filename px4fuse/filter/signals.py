@@ -32,8 +32,8 @@ AISLE = "aisle"
 MIN_IMU_GAP_S = 0.1
 # Minimum length of a gap in the IMU, as multiple of the median sample interval
 MIN_IMU_GAP_INTERVALS = 5.0
-# Faster positions are downsampled to about this rate (Hz) before the noises are estimated: their
-# errors are time-correlated, so that more positions add no information
+# Faster positions are downsampled to 1 to 2 times this rate (Hz) before the noises are estimated:
+# their errors are time-correlated, so that more positions add no information
 MAX_INDEPENDENT_HZ = 25.0
 # Minimum number of position measurements along an axis
 MIN_MEASUREMENTS = 3
@@ -91,14 +91,12 @@ class Acceleration:
 
     __repr__ = one_line_repr
 
-    @property
-    def integral_m_s(self) -> Array:
-        """Integral of the acceleration along the axis (m/s), shape (n,)."""
+    def compute_integral_m_s(self) -> Array:
+        """Return the integral of the acceleration along the axis (m/s), shape (n,)."""
         return np.asarray(self.direction @ self.ned_integral_m_s)
 
-    @property
-    def rms_m_s2(self) -> float:
-        """RMS of the acceleration in the segment: standard deviation assumed in an IMU gap."""
+    def compute_rms_m_s2(self) -> float:
+        """Return the RMS of the acceleration in the segment: its assumed σ in an IMU gap."""
         return float(np.sqrt(self.direction @ self.mean_products_m2_s4 @ self.direction))
 
 

@@ -84,7 +84,7 @@ def make_timeline(
     )
     gap_in_interval_s = np.bincount(interval_index, weights=gap_s)[interval_index]
     variance_scale = np.maximum(gap_in_interval_s / settings.dt_s, 1.0)
-    gap_variance = gap_fraction * variance_scale * axis.acceleration.rms_m_s2**2
+    gap_variance = gap_fraction * variance_scale * axis.acceleration.compute_rms_m_s2() ** 2
     return Timeline(
         time_s, measurement_index, mean_acceleration_m_s2, gap_variance, float(np.sum(gap_s))
     )

@@ -20,7 +20,8 @@ NOISE, PROCESS, OUTLIERS, CLOCK, FRAME, GATE, ACCELEROMETER, ELSEWHERE = (
     "accelerometer",
     "elsewhere",
 )
-# Key in Finding.evidence: white position noise / measurement noise that a filter assumes, if large
+# Key in Finding.evidence: white position noise ÷ assumed measurement noise. It is only set if the
+# ratio is large
 WHITE_RATIO = "white_over_assumed"
 # Kind of cause: the aiding source of EKF2 is the sensor whose positions KF uses
 SENSOR = "the source's sensor"

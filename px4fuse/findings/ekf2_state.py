@@ -39,7 +39,7 @@ MIN_LIMIT_FRACTION = 0.98
 MIN_LIMITED_FRACTION = 0.5
 # Length (s) of the windows in which px4fuse tests if the vehicle is at rest
 REST_WINDOW_S = 1.0
-# Time (s) before take-off in which the motors run, so that the IMU is not at rest
+# During this time (s) before take-off the motors run, so the IMU is not regarded as at rest
 RUN_UP_S = 0.5
 # Maximum standard deviation of angular rate (rad/s) and specific force (m/s²) at rest
 MAX_REST_STDS = (0.04, 1.5)

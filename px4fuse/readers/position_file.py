@@ -390,7 +390,7 @@ def _choose_columns(
     given_columns: list[int],
     numbers: pd.DataFrame,
 ) -> tuple[int, _Columns, _Columns, str | None, str]:
-    """Choose the columns of time, position and sigma; return also frame and text of the time.
+    """Choose the columns of time, position and σ; return also the frame and the time format.
 
     A column with the time of measurement is preferred to the time of recording.
     """

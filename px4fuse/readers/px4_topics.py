@@ -56,8 +56,8 @@ DEFAULT_PROFILE_REMEDY = "Record with SDLOG_PROFILE bit 0 (default)."
 STATE_VECTOR_TOPICS = ("estimator_states", "estimator_status")  # since v1.12, v1.8 to v1.11
 # Layouts of the measured magnetic field: magnetometer, and EKF2's observation (since v1.14)
 MAGNETIC_FIELD_LAYOUTS = LAYOUTS["magnetometer"], LAYOUTS["observed_field"]
-# Number of attitude variances of EKF2, by the number of logged states and of logged variances: 4
-# for quaternion states, 3 for an error-state filter (generated/state.h, v1.15.4 and v1.16)
+# Number of attitude variances, by the number of logged states and of logged variances of EKF2. An
+# EKF2 with quaternion states has 4, with attitude errors 3 (generated/state.h, v1.15.4 and v1.16)
 ATTITUDE_VARIANCE_COUNTS: Mapping[tuple[int, int], int] = {
     (24, 24): 4,
     (24, 23): 3,

@@ -22,7 +22,7 @@ LEAD_TEXT = (
     "Time-correlated errors, wrong delays and wrong headings hardly change the NIS."
 )
 AID_PANEL_HEIGHT = 21.0  # height (points) of the plot of one aiding source
-MAX_DRAWN_SIGMAS = 4.0  # maximum drawn ν/√S; larger values are triangles at the edge
+MAX_DRAWN_SIGMAS = 4.0  # larger |ν/√S| are drawn as triangles at the edge of the plot
 # Aiding sources of outdoor flights: a report has a page on all aiding sources if EKF2 fused one
 OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 

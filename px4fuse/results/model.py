@@ -40,7 +40,7 @@ NO_STUDENT = Student()
 
 
 class Provenance(Record):
-    """Software versions and command that produced the results.
+    """Command that produced the results, and versions of px4fuse and its libraries.
 
     Attributes
     ----------
