@@ -12,6 +12,7 @@ from typing import Any
 
 from px4fuse.core.text import with_log_name
 from px4fuse.report.style import FONT, MUTED_COLOUR, Artist, Axes
+from px4fuse.report.ticks import replace_ticks
 
 PAGE_WIDTH = 178.0 * 72.0 / 25.4  # width (points) of the text on a page
 COLUMN_GAP = 5.0 * 72.0 / 25.4  # gap (points) between two columns
@@ -262,6 +263,7 @@ def to_typst_data(block: Any, log: str) -> Any:
 def _figure_svg(block: Mapping[str, Any]) -> str:
     if "axes" in block:
         _place_axes(block)
+        replace_ticks(block["axes"], text_width)
     buffer = io.StringIO()
     block["figure"].savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return buffer.getvalue()

@@ -1,0 +1,81 @@
+"""Ticks, grid and labels of plots as few artists.
+
+A matplotlib axis makes seven artists per tick, which takes a tenth of the time of a report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import compress
+from typing import Any
+
+import numpy as np
+
+from px4fuse.report.style import Axes
+
+ZORDER = 0.5  # below the curves, as with axes.axisbelow
+LINE_HEIGHT = 8.0  # height (points) of a tick label of 8 points
+
+
+def replace_ticks(axes: Axes, text_width: Callable[[str], float]) -> None:
+    """Draw ticks, grid and labels as few artists, and hide the axis artists of matplotlib.
+
+    Data and limits of the axes are final; ``text_width`` returns the width (points) of a text.
+    """
+    axes.apply_aspect()  # sets the limits of maps
+    for is_x, axis in ((True, axes.xaxis), (False, axes.yaxis)):
+        if axes.axison and axis.get_visible():
+            _replace_axis(axes, text_width, is_x=is_x)
+
+
+def _replace_axis(axes: Axes, text_width: Callable[[str], float], *, is_x: bool) -> None:
+    from matplotlib import rcParams  # noqa: PLC0415 - slow import
+    from matplotlib.lines import Line2D  # noqa: PLC0415
+    from matplotlib.markers import TICKDOWN, TICKLEFT  # noqa: PLC0415
+
+    axis = axes.xaxis if is_x else axes.yaxis
+    transform: Any = axes.get_xaxis_transform if is_x else axes.get_yaxis_transform
+    options, (low, high) = axis.get_tick_params(), sorted(axis.get_view_interval())
+    size, pad = rcParams["xtick.major.size"], rcParams["xtick.major.pad"]
+
+    def points(along: Any, across: Any) -> tuple[Any, Any]:
+        """Return x and y of points along the axis, at a distance from the axis."""
+        return (along, across) if is_x else (across, along)
+
+    all_locations, formatter = np.asarray(axis.get_majorticklocs()), axis.get_major_formatter()
+    is_visible = np.abs(all_locations - (low + high) / 2.0) <= (0.5 + 1e-9) * (high - low)
+    locations = all_locations[is_visible]
+    labels = [*compress(formatter.format_ticks(all_locations.tolist()), is_visible)]
+    if options["gridOn"]:
+        ends = np.tile([0.0, 1.0, np.nan], len(locations))  # nan separates the grid lines
+        grid = Line2D(*points(np.repeat(locations, 3), ends), transform=transform("grid"))
+        grid.set(color=rcParams["grid.color"], lw=rcParams["grid.linewidth"], zorder=ZORDER)
+        axes.add_artist(grid)
+    ticks = Line2D(*points(locations, 0.0 * locations), transform=transform("tick1"), ls="none")
+    ticks.set(marker=TICKDOWN if is_x else TICKLEFT, ms=size, color="black")
+    ticks.set(mew=rcParams["xtick.major.width"], clip_on=False, zorder=ZORDER)
+    axes.add_artist(ticks)
+    distance = size + pad  # extent (points) of ticks and tick labels beside the axis
+    if options["labelbottom" if is_x else "labelleft"] and labels:
+        text1_transform = axes.get_xaxis_text1_transform if is_x else axes.get_yaxis_text1_transform
+        label_transform, vertical, horizontal = text1_transform(distance)
+        for location, label in zip(locations, labels, strict=True):
+            text = axes.text(*points(location, 0.0), label, transform=label_transform)
+            text.set(va=vertical, ha=horizontal, zorder=ZORDER)
+        distance += LINE_HEIGHT if is_x else max(map(text_width, labels))
+    # the formatter moves a common summand or factor of the tick labels to the end of the axis
+    for label, position in ((axis.get_label_text(), 0.5), (formatter.get_offset(), 1.0)):
+        is_axis_label = position == 0.5
+        text = axes.annotate(
+            label,
+            points(position, 0.0),
+            points(0.0, -distance - rcParams["axes.labelpad"]),
+            xycoords="axes fraction",
+            textcoords="offset points",
+        )
+        text.set(
+            ha="center" if is_x and is_axis_label else "right",
+            va="top" if is_x else "center" if is_axis_label else "bottom",
+            rotation=90.0 if is_axis_label and not is_x else 0.0,
+        )
+    axis.set_visible(False)
