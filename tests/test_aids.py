@@ -344,7 +344,7 @@ def test_gnss_without_fix_is_reported() -> None:
     assert "none with a 3D fix" in finding.message
 
 
-def test_yaw_fusion_without_orientation_is_named_in_the_action() -> None:
+def test_action_disables_yaw_fusion_if_orientation_is_missing() -> None:
     flight = aids_only(states={"yaw_align": pd.Series([0.0], [0.0])})
     flight.log = log(parameters={"EKF2_EV_CTRL": 9, "EKF2_MAG_TYPE": 5})
     (finding,) = ekf2_state.detect_missing_alignment(flight, SEGMENT, source())

@@ -367,7 +367,7 @@ QUIET = Imu(sigma_a_m_s2=0.1)
 
 
 @pytest.mark.parametrize("noise", [0.1, 0.5])
-def test_align_position_file_without_ekf2_uses_imu(noise: float) -> None:
+def test_position_file_is_aligned_by_imu_if_ekf2_is_missing(noise: float) -> None:
     flight = flight_along(imu=Imu(sigma_a_m_s2=noise), ekf2=None)
     file = uwb_file(flight, yaw_deg=25.0, origin_m=(4.0, 5.0, 0.0))
     alignment, _ = align(flight, file, frame="enu", yaw_deg="auto")

@@ -159,6 +159,6 @@ def test_student_answers_about_another_log_are_rejected(tmp_path: Path, sample_l
         assert "f.toml was made for another log than" in said
 
 
-def test_read_answer_form_accepts_verdict_not_available(tmp_path: Path) -> None:
+def test_answer_form_accepts_not_available_as_verdict(tmp_path: Path) -> None:
     text = EMPTY.replace('verdict_ekf2 = ""', 'verdict_ekf2 = "not available"')
     assert read(tmp_path, text).verdict_ekf2 == "not available"

@@ -293,7 +293,7 @@ class TestAssign:
         assert len(read_answer_key(key_file).answers) == 2
         assert assign(CLASS, folder, key_file, None, "aisle", 2) == (read_answer_key(key_file), 1)
 
-    def test_assign_flights_after_failed_key_write_can_be_repeated(self, tmp_path):
+    def test_assign_flights_can_be_repeated_if_key_was_not_written(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         key_file.mkdir()
         with pytest.raises(SettingsError):

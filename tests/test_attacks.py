@@ -303,7 +303,7 @@ def test_grade_report_with_forged_results_is_not_verified(
     assert graded.points <= honest.points + 1e-9
 
 
-def test_grade_of_pdf_with_overpainted_page_uses_log_results(
+def test_grade_of_pdf_with_overpainted_numbers_analyses_log(
     flight: Flight, honest: GradedReport, rubric: Rubric
 ) -> None:
     """The numbers are verified and the page is not; the redrawn report is scored."""

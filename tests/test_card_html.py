@@ -30,7 +30,7 @@ def text_of(html: str) -> str:
     return " ".join(unescape(re.sub(r"<[^>]+>", " ", html)).split())
 
 
-def test_diagnosis_html_contains_all_fields() -> None:
+def test_diagnosis_html_shows_every_field_of_the_card() -> None:
     text = text_of(card_html(SMALL_SIGMA_A))
     cause = SMALL_SIGMA_A.causes[0]
     for part in (

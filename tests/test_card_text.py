@@ -29,7 +29,7 @@ def test_sigma_ratio_text_plot_has_marker_at_column_of_ratio(ratio, column, mark
     assert (len(drawn), drawn.index(mark)) == (37, column)
 
 
-def test_sigma_ratio_text_plot_without_ratio_shows_only_band() -> None:
+def test_sigma_ratio_plot_without_ratio_shows_consistent_range() -> None:
     assert re.fullmatch("─{16}░{5}─{16}", draw_sigma_ratio(None, "source"))
     assert re.fullmatch("─{15}░{7}─{15}", draw_sigma_ratio(None, "truth"))
 
@@ -58,7 +58,7 @@ def test_diagnosis_text_joins_alternative_actions_by_either_or() -> None:
     assert closing.endswith(f"px4fuse explain {card.id}")
 
 
-def test_diagnosis_text_numbers_causes_and_counts_notes() -> None:
+def test_diagnosis_text_has_numbered_causes_and_count_of_notes() -> None:
     notes = tuple(Note(f"note_{number}", f"Text {number}.") for number in range(5))
     card = replace(SMALL_SIGMA_A, causes=2 * SMALL_SIGMA_A.causes, notes=notes)
     lines = text_of(card)

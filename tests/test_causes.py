@@ -99,6 +99,6 @@ def test_consistency_notes_of_white_innovations_are_empty(sample: Analysis) -> N
     assert verdict_notes(replace(sample, axes={"east": white})) == []
 
 
-def test_consistency_note_shows_that_odometry_may_drift(sample: Analysis) -> None:
+def test_note_on_consistent_odometry_states_that_it_may_drift(sample: Analysis) -> None:
     turning = replace(sample.source, origin=replace(sample.source.origin, kind="vio"))
     assert "source may drift" in verdict_notes(replace(sample, source=turning))[0]

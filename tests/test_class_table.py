@@ -74,7 +74,7 @@ def test_grades_csv_has_no_formula_cell_for_any_delimiter(text: str) -> None:
 
 
 @given(st.lists(st.tuples(texts, st.dictionaries(texts, finite, max_size=3)), max_size=4))
-def test_grades_csv_contains_only_neutralised_formulas(
+def test_grades_csv_escapes_cells_that_start_like_formulas(
     rows: list[tuple[str, dict[str, float]]],
 ) -> None:
     head, *rest = cells(class_table_csv([graded(text, numbers) for text, numbers in rows]))

@@ -48,7 +48,7 @@ def report(tmp_path_factory, sample_log) -> tuple[Path, str]:
     return folder, result.output
 
 
-def test_compare_report_pdf_attaches_results_without_paths(report):
+def test_results_attached_to_report_pdf_contain_no_file_paths(report):
     folder, said = report
     assert sorted(p.name for p in folder.iterdir()) == ["notes.md", "report.json", "report.pdf"]
     assert "warning[kf_underconfident]: KF is underconfident along the main axis" in said

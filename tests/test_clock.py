@@ -127,7 +127,7 @@ def test_imu_integration_at_constant_yaw_rate_gives_a_circle() -> None:
     np.testing.assert_allclose(signals.table[:, 1, :2, 0], speed, atol=1e-4)
 
 
-def test_integrated_imu_motion_equals_constant_acceleration() -> None:
+def test_integrated_constant_acceleration_equals_closed_form() -> None:
     """Sideways acceleration s over dt gives s dt²/2 and s dt at every offset in each stretch."""
     time, stamps = np.arange(0.0, 80.0, 0.01), np.arange(0.0, 80.0, 0.25)
     still = np.zeros((len(time), 3))
@@ -381,7 +381,7 @@ def test_clock_jump_and_drift_within_a_flight_are_detected() -> None:
 
 
 @pytest.mark.parametrize("hole_s", [0.0, 1.0])
-def test_constant_time_offset_shows_no_significant_change(hole_s: float) -> None:
+def test_constant_time_offset_is_not_reported_as_drift(hole_s: float) -> None:
     found = estimate(made_flight(5, duration_s=100.0, offset_s=-0.2, hole_s=hole_s)[0])
     assert len(found.parts) == 4
     assert found.change_p_value > 0.01

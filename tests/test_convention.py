@@ -335,7 +335,7 @@ def test_positions_in_frd_frame_have_no_yaw_fault():
 
 
 @pytest.mark.parametrize(("estimate_s", "reported_s"), [(-0.55, 0.55), (-0.48, 0.52)])
-def test_late_timestamps_report_contains_refined_time_offset(estimate_s, reported_s):
+def test_late_timestamps_finding_has_maximum_likelihood_offset(estimate_s, reported_s):
     late = Convention(verdict="determined", late_s=0.52)
     comparison = replace(compared(sent(flown())), convention=late)
     clock = ClockOffset(

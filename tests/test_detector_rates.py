@@ -41,7 +41,7 @@ def test_simulated_fault_is_top_finding_on_95_percent_of_logs(finding) -> None:
     assert rows["rate" if finding in CONSEQUENCES else "first"].max() >= 0.95
 
 
-def test_too_small_faults_are_detected_on_under_10_percent() -> None:
+def test_undetectable_faults_are_found_in_below_10_percent() -> None:
     for finding, condition in NOT_DETECTABLE:
         (row,) = TABLE[
             (TABLE["finding"] == finding) & (TABLE["condition"] == condition)
@@ -55,7 +55,7 @@ def test_clock_jump_is_detected_despite_rounded_likelihood() -> None:
     assert found(FAULTY_SEED + 2, jump)[0] == "source_time_offset_changes"
 
 
-def test_faults_with_documented_rate_of_100_percent_are_detected() -> None:
+def test_faults_with_detection_rate_of_100_percent_are_detected() -> None:
     certain = {(row.finding, row.condition) for row in TABLE.itertuples() if row.rate == 1.0}
     assert found(5) == ()
     for condition in (
@@ -68,7 +68,7 @@ def test_faults_with_documented_rate_of_100_percent_are_detected() -> None:
         assert condition.finding in found(20_000, condition)
 
 
-def test_detection_rate_table_counts_top_and_lower_findings() -> None:
+def test_rate_table_counts_first_and_lower_ranked_findings() -> None:
     usual, yaw = clean(DEFAULT), Condition("source_frame_misaligned", "--mistake yaw=30")
     flown = [Job(0, (usual,)), Job(1, (usual,)), Job(FAULTY_SEED, (yaw,))]
     made = pd.DataFrame(

@@ -74,7 +74,7 @@ def by_path(found: ChangeResults) -> dict[str, tuple[float | None, float | None]
     return {one.path: (one.a, one.b) for one in found.numbers}
 
 
-def test_diff_of_two_clean_flights_reports_no_worse_verdict(clean):
+def test_diff_of_two_clean_flights_lists_no_worsened_verdict(clean):
     found = list_changes(clean, flown(503))
     assert found.worse == ()
     assert {one.name for one in found.settings} <= {

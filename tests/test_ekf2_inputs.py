@@ -304,7 +304,7 @@ def test_logged_fusion_is_derived_from_time_of_last_fusion():
     ([2.75] * 7, [0, 6], [3, 6]),
     ([3.2] * 9, [0, 2, 6], [2, 4, 6, 8]),  # 2.5 samples, rounded as the log shows
 ])  # fmt: skip
-def test_ekf2_prediction_step_ends_at_imu_sample_count_or_time(interval_ms, known, ends):
+def test_ekf2_step_ends_after_n_imu_samples_or_minimum_time(interval_ms, known, ends):
     found = step_ends(np.array(interval_ms) * 1e-3, np.array(known, int), 0.008)
     assert found.tolist() == ends
 

@@ -63,7 +63,7 @@ def test_ekf2_model_transition_equals_product_of_step_matrices(model: Model) -> 
 
 
 @pytest.mark.parametrize("attitude", [True, False])
-def test_ekf2_model_states_between_updates_equal_predictions(model: Model, attitude: bool) -> None:
+def test_ekf2_model_state_between_updates_is_imu_prediction(model: Model, attitude: bool) -> None:
     """Without attitude as a state, the nominal attitude is not corrected."""
     configuration = FilterConfiguration(model.inputs.settings, estimates_attitude=attitude)
     (part,) = run_configurations(model.inputs, [configuration], model.intervals)

@@ -137,7 +137,7 @@ def test_ekf2_prediction_step_is_multiple_of_imu_interval(read):
     assert read(log).ekf2.step_s == STEP_S
 
 
-def test_ekf2_fusion_horizon_is_state_age_at_publication(read):
+def test_fusion_horizon_delay_equals_age_of_published_state(read):
     log = make_log("v1.16")
     assert read(log).ekf2.horizon_s == pytest.approx(0.060)
     states = log["estimator_states"]

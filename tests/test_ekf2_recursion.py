@@ -189,7 +189,7 @@ def test_ekf2_without_fusion_resets_to_gnss_after_7_or_14_s(
     assert (taken, reset) == (False, resets)
 
 
-def test_ekf2_sequential_update_uses_innovations_before_update():
+def test_second_axis_update_uses_innovation_before_first_update():
     """The second gain uses the new covariance and the old S, as in EKF2; it is not optimal."""
     rng = np.random.default_rng(6)
     root = rng.normal(size=(2, 15, 15))
@@ -459,7 +459,7 @@ def acting(stamps: list[float], *, fusing: bool = True, rules: FusionRules = RUL
     return action.tolist()
 
 
-def test_vision_fusion_starts_and_stops_by_sample_interval():
+def test_vision_fusion_starts_below_0_2_s_and_stops_above_0_4_s():
     assert acting([10.1, 10.3, 10.45], fusing=False) == [IDLE, IDLE, START]
     assert acting([10.1, 10.29, 10.45], fusing=False) == [IDLE, START, FUSE]
     assert acting([10.1, 10.29, 10.45]) == [FUSE, FUSE, FUSE]

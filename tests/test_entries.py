@@ -186,7 +186,7 @@ def test_grade_keeps_first_report_if_later_one_needs_review() -> None:
     assert ada.counted_report.submission == "a.pdf"
 
 
-def test_submission_name_that_imitates_platform_is_flagged() -> None:
+def test_submission_named_like_a_platform_export_is_flagged() -> None:
     name = blackboard("ada", "20-10-00-00", "ada_attempt_2026-11-18-10-00-00_r.pdf")
     (ada, _), _ = make_grades({name: graded_report("", 4.0)})
     assert ada.submission_time == "2026-11-20 10:00"

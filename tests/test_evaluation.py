@@ -407,7 +407,7 @@ def test_evaluate_constant_reference_orientation_is_not_scored() -> None:
     assert got.rpe[-1].translation_m.rmse < 1e-6
 
 
-def test_evaluate_frozen_estimate_scores_only_time_before() -> None:
+def test_evaluation_of_frozen_estimate_ends_at_the_freeze() -> None:
     reference = flight()
     middle, position_m = len(reference) // 2, reference.position_m.copy()
     position_m[middle:] = position_m[middle]
@@ -484,7 +484,7 @@ def test_trajectory_time_offset_interval_contains_true_offset() -> None:
     assert held >= 22
 
 
-def test_trajectory_time_offset_starts_at_unix_clock_difference() -> None:
+def test_time_offset_search_starts_at_difference_of_unix_times() -> None:
     reference = replace(flight(), unix_offset_s=1.5e9)
     estimate = replace(flight(), unix_offset_s=0.0, time_s=flight().time_s + 1.5e9 - 0.2)
     assert clock_difference(estimate, reference) == -1.5e9

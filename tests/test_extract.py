@@ -240,7 +240,7 @@ def test_extract_to_parquet_writes_the_same_tables(tmp_path, sample_log, sample_
 # ---- the lesson by hand -----------------------------------------------------------------------
 
 
-def test_documented_kf_on_extracted_tables_equals_compare_kf(
+def test_kf_example_of_docs_on_extracted_tables_equals_compare(
     tmp_path, monkeypatch, capsys, sample_log, sample_flight
 ):
     """The example is KF, except that it rounds the time of each measurement to the DT grid."""

@@ -310,7 +310,7 @@ CHECK_FIRST = (
 # ---------------------------------------------------------------- errors and truth
 
 
-def test_report_on_error_beyond_sigma_names_axis_and_action() -> None:
+def test_finding_of_error_above_sigma_names_axis_and_action() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
     finding = only(hidden_errors.detect, analysis(axes=(axis(), hiding(name="down"), ekf2)))
     assert finding.title == (

@@ -598,7 +598,7 @@ def test_explain_command_prints_meaning_and_example_of_fault(typed, monkeypatch,
         assert text in out
 
 
-def test_explain_command_shows_if_detection_is_not_measured(monkeypatch, capsys) -> None:
+def test_explain_command_states_if_detection_rate_is_unknown(monkeypatch, capsys) -> None:
     _, out, _ = run_main(monkeypatch, capsys, "explain", "not_px4")
     assert "detection are not measured" in out
 

@@ -121,7 +121,7 @@ def test_constant_positions_not_fused_by_ekf2_are_not_reported() -> None:
     assert named(ekf2_not_fusing.detect, still) == {}
 
 
-def test_position_file_unknown_to_ekf2_is_not_reported_unfused() -> None:
+def test_position_file_that_ekf2_never_got_is_no_fusion_fault() -> None:
     beside = unfused(source={"origin": POSITION_FILE}, ekf2={"parameters": {"EKF2_EV_CTRL": 0.0}})
     assert named(ekf2_not_fusing.detect, beside) == {}
     # EKF2 received the same or another source
@@ -172,7 +172,7 @@ def test_unmet_ekf2_fusion_condition_is_found_in_real_log(
         assert text in f"{found[0].message} {found[0].remedy}"
 
 
-def test_gnss_fusion_without_flags_follows_from_global_position() -> None:
+def test_gnss_fusion_without_flags_is_read_from_xy_global() -> None:
     ekf2 = made(Ekf2, aids={}, states={"xy_global": on(1.0)})
     assert has_fused_aid(ekf2)
     assert not has_fused_aid(ekf2, "baro_hgt")

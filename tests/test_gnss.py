@@ -123,7 +123,7 @@ def test_read_gnss_fixes_have_position_and_time_as_in_ekf2(generation, tmp_path)
     ({"EKF2_GPS_MODE": 0}, 0.03, 0.11 - 0.03),  # main of 2026: measurement time of the driver
     ({"EKF2_GPS_MODE": 0}, 0.0, 0.0),  # without one: the delay
 ])  # fmt: skip
-def test_gnss_measurement_time_uses_delay_parameter_or_driver(
+def test_gnss_measurement_time_is_driver_time_or_minus_delay(
     parameters, own_s, expected_s, tmp_path
 ):
     track = track_of(flight_of(outdoors(own_s=own_s, **parameters), tmp_path))
@@ -131,7 +131,7 @@ def test_gnss_measurement_time_uses_delay_parameter_or_driver(
     assert track.samples.index[0] - first == pytest.approx(expected_s, abs=1e-6)
 
 
-def test_read_gnss_from_vehicle_gnss_topic_gives_same_track(tmp_path):
+def test_vehicle_gnss_track_equals_vehicle_gps_position_track(tmp_path):
     """vehicle_gnss contains the receiver's message; its timestamp_sample includes the delay."""
     log = with_velocity(outdoors(own_s=0.03, EKF2_GPS_MODE=0))
     before = track_of(flight_of(log, tmp_path))
@@ -304,7 +304,7 @@ def test_ground_truth_of_gnss_flight_is_relative_to_ekf2_origin(fused, tmp_path)
 @pytest.mark.parametrize(("least_m", "eph_m", "expected"), [
     (2.0, 0.3, True), (0.5, 0.45, False), (0.5, 0.9, False), (None, 0.3, False),
 ])  # fmt: skip
-def test_smaller_gnss_noise_is_advised_if_above_receiver_sigma(
+def test_gnss_noise_above_receiver_sigma_is_advised_smaller(
     least_m, eph_m, expected, tmp_path, monkeypatch
 ):
     log = outdoors(eph_m=eph_m)

@@ -168,7 +168,7 @@ def test_grade_second_run_processes_only_changed_files(submitted, tmp_path) -> N
 
 
 @pytest.mark.usefixtures("jobs_in_process", "cached_pages")
-def test_grade_with_other_logs_verifies_reports_again(tmp_path) -> None:
+def test_grade_with_changed_logs_does_not_reuse_verification(tmp_path) -> None:
     (tmp_path / "in").mkdir()
     shutil.copy(REPORT, tmp_path / "in" / "a.pdf")
     said = []

@@ -73,7 +73,7 @@ def test_gyro_bias_that_ekf2_removes_is_no_misalignment():
 
 
 @pytest.mark.parametrize("by", ["positions", "orientation"])
-def test_drifting_heading_misalignment_is_estimated_over_time(by):
+def test_drifting_heading_error_is_estimated_per_flight_part(by):
     """A source with an orientation gives the misalignment more accurately than positions."""
     plain = simulated(passes=6 if by == "positions" else 4)
     flight, turn = with_heading_drift(plain)
@@ -139,7 +139,7 @@ def test_heading_misalignment_of_real_logs_is_in_known_range(shared_logs, log, d
 # ---- parts and drift ----------------------------------------------------------------------------
 
 
-def test_heading_of_long_flight_is_estimated_in_over_100_parts() -> None:
+def test_long_flight_has_over_100_heading_error_estimates() -> None:
     """1,000 measurements in 25 minutes: fewer than three per part of ``PART_LENGTH_S``."""
     time = np.linspace(0.0, 1500.0, 1000)
     parts = frame_rotation._mean_per_part(

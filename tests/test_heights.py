@@ -202,7 +202,7 @@ def opened_once() -> Model:
     return opened(outdoors())
 
 
-def test_what_if_barometer_noise_equals_flight_with_this_noise() -> None:
+def test_what_if_with_barometer_noise_equals_flight_with_noise() -> None:
     model = opened_once()
     assert model.agreement.baro_hgt["down"].innovation_correlation > 0.999
     assert model.agreement.baro_hgt["down"].position_rms_difference_m < 0.02
@@ -231,7 +231,7 @@ def test_what_if_without_height_sensor_reports_drift() -> None:
     assert ". The heights of the two replays differ by at most " in found.notes[-1]
 
 
-def test_what_if_with_long_height_rejection_is_unpredictable() -> None:
+def test_what_if_gives_no_result_after_long_height_rejection() -> None:
     """EKF2 resets the height after 5 s, which the model does not contain."""
     flight = outdoors()
     jump = flight.barometer.copy()

@@ -95,7 +95,7 @@ def test_bias_regression_columns_equal_kf_step_responses() -> None:
     np.testing.assert_allclose([nu[:, 0], s], expected, atol=1e-9)
 
 
-def test_bias_regression_with_imu_gap_equals_kf_innovations() -> None:
+def test_innovations_of_bias_regression_equal_kf_over_imu_gap() -> None:
     analysis = flown()
     axes = tuple(analysis.axes[name].axis for name in ("north", "east"))
     model = make_design_matrix(analysis.flight, axes, RIGHT, 0.10, 0.0)

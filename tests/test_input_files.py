@@ -91,7 +91,7 @@ def test_grade_refuses_output_folder_linked_to_its_inputs(class_desk) -> None:
     assert file_hashes(class_desk) == before
 
 
-def test_second_grade_run_keeps_the_file_of_pseudonyms(class_desk) -> None:
+def test_repeated_run_of_grade_keeps_the_file_of_pseudonyms(class_desk) -> None:
     command = ["grade", "h/reports", "--roster", "gg/class.csv", "--anonymous", "-o", "out"]
     run_checked(*command)
     (class_desk / "out" / "overrides.csv").write_text("id,item,points,comment\n1001,,,Good\n")
@@ -110,7 +110,7 @@ def test_compare_refuses_to_write_over_its_answer_form(tmp_path, monkeypatch) ->
     assert file_hashes(tmp_path) == before
 
 
-def test_verify_refuses_to_write_over_a_log_of_its_folder(tmp_path, monkeypatch) -> None:
+def test_verify_refuses_output_path_that_is_one_of_the_logs(tmp_path, monkeypatch) -> None:
     in_this_process(monkeypatch)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "d").mkdir()
@@ -149,7 +149,7 @@ def test_write_to_protected_input_file_is_refused(tmp_path) -> None:
     assert path.read_bytes() == b"x"
 
 
-def test_input_file_without_inode_is_protected_by_its_path(tmp_path, monkeypatch) -> None:
+def test_input_file_without_inode_number_is_not_overwritten(tmp_path, monkeypatch) -> None:
     """Simulate a file system that ignores case and gives every file the inode 0."""
     from px4fuse.core.input_files import (
         add_input,

@@ -236,7 +236,7 @@ def test_read_report_pdf_with_action_is_rejected(edit, said):
     annotation(Subtype=NameObject("/Link"), A=action("URI", URI=TEXT)),
     annotation(Subtype=NameObject("/FreeText")),
 ], ids=range(5))  # fmt: skip
-def test_read_report_pdf_with_harmless_additions_is_accepted(edit):
+def test_report_pdf_resaved_by_another_program_is_accepted(edit):
     """Other programs add these entries when they save a report."""
     report = read_report(small_report(edit=edit), "r.pdf")
     assert to_json(report).encode() == JSON

@@ -45,7 +45,7 @@ def test_dir_of_package_lists_only_public_names() -> None:
         px4fuse.comapre  # noqa: B018
 
 
-def test_type_checking_imports_equal_lazy_imports() -> None:
+def test_names_imported_for_type_checking_are_imported_lazily() -> None:
     tree = ast.parse(Path(px4fuse.__file__).read_text(encoding="utf-8"))
     imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
     read = {one.asname: node.module for node in imports for one in node.names}
@@ -125,7 +125,7 @@ def test_settings_errors_name_python_argument_or_command_option(sample_log):
 # -- table and text --------------------------------------------------------------------------------
 
 
-def test_python_table_contains_the_numbers_of_the_results(analysis) -> None:
+def test_table_of_python_api_equals_numbers_of_json_results(analysis) -> None:
     table = px4fuse.table(analysis)
     assert list(table.columns) == list(SUMMARY_COLUMNS)
     assert list(table.index) == [(axis, name) for axis in analysis.axes for name in ("kf", "ekf2")]

@@ -57,7 +57,7 @@ class TestTangents:
             quotient = (up - down) / (2.0 * step)
             np.testing.assert_allclose(jacobian[:, :, k], quotient, atol=1e-7, rtol=0)
 
-    def test_lie_group_adjoint_moves_tangent_vector_to_other_side(
+    def test_lie_adjoint_converts_right_to_left_perturbation(
         self, dimension: int, angle: float
     ) -> None:
         x, xi = lie.exp(tangents(dimension, angle)), tangents(dimension, 0.7)

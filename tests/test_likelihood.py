@@ -47,7 +47,9 @@ def test_fast_kf_on_noise_grid_equals_kf_replay(sample_flight: Flight) -> None:
 
 @settings(max_examples=60)
 @given(axis=any_axis(), chosen=any_settings)
-def test_fast_kf_innovations_of_any_axis_equal_kf_replay(axis: Axis, chosen: Settings) -> None:
+def test_vectorised_kf_innovations_equal_kf_replay_on_any_axis(
+    axis: Axis, chosen: Settings
+) -> None:
     found = innovations(preintegrate(axis, chosen), chosen.sigma_a_m_s2, chosen.sigma_z_m)
     np.testing.assert_allclose(found, replayed(axis, chosen), rtol=1e-9, atol=1e-9)
 
@@ -62,7 +64,7 @@ def test_fast_kf_innovations_with_imu_gap_equal_kf_replay() -> None:
     np.testing.assert_allclose(found, replayed(axis, Settings()), rtol=1e-9, atol=1e-9)
 
 
-def test_fast_kf_does_not_fuse_skipped_measurement() -> None:
+def test_vectorised_kf_does_not_fuse_excluded_measurement() -> None:
     """Later innovations are as without the skipped measurement."""
     axis = walk(count=60)
     skip = np.zeros(59, dtype=bool)

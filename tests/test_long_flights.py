@@ -42,13 +42,13 @@ def peak_bytes(work: Callable[[], object]) -> int:
     return peak
 
 
-def test_offset_variation_memory_is_proportional_to_length():
+def test_memory_for_varying_offset_is_proportional_to_length():
     short, long = (fit_of(count, varying_offset) for count in (1000, 8000))
     peaks = [peak_bytes(lambda fit=fit: find_offset_variation(fit)) for fit in (short, long)]
     assert peaks[1] < 10.0 * peaks[0]
 
 
-def test_offset_variation_equals_dense_least_squares():
+def test_varying_time_offset_fit_equals_dense_least_squares():
     fit = fit_of(600, varying_offset)
     found = find_offset_variation(fit)
     parts = np.floor(fit.time_s / 4.0).astype(int)
@@ -62,7 +62,7 @@ def test_offset_variation_equals_dense_least_squares():
 
 
 @pytest.mark.parametrize("count", [900, 18_000])
-def test_periodic_error_of_any_length_has_injected_period(count):
+def test_injected_error_period_is_found_at_any_flight_length(count):
     def error_m(time_s: np.ndarray, _: np.ndarray) -> np.ndarray:
         phase = 2.0 * np.pi * time_s / 13.0
         return 0.3 * np.stack([np.sin(phase), np.cos(phase)], axis=1)
@@ -74,7 +74,7 @@ def test_periodic_error_of_any_length_has_injected_period(count):
 
 
 @pytest.mark.parametrize("lag_steps", [1, 20])
-def test_output_predictor_blocks_equal_recursion(monkeypatch, lag_steps):
+def test_output_predictor_in_blocks_equals_stepwise_recursion(monkeypatch, lag_steps):
     error_rad = np.random.default_rng(lag_steps).standard_normal((500, 3))
     whole = output_predictor.follow_attitude(error_rad, lag_steps, 0.01, 0.2)
     monkeypatch.setattr(arrays, "BLOCK_ROWS", 64)
@@ -82,7 +82,7 @@ def test_output_predictor_blocks_equal_recursion(monkeypatch, lag_steps):
     np.testing.assert_allclose(in_blocks, whole, atol=1e-12)
 
 
-def test_rows_between_equals_slice_by_label():
+def test_rows_between_returns_same_rows_as_loc_slice():
     time_s = np.sort(np.random.default_rng(1).uniform(0.0, 9.0, 50))
     samples = pd.DataFrame({"value": np.arange(50.0)}, time_index(time_s))
     for start_s, end_s in ((time_s[3], time_s[8]), (-1.0, 4.0), (5.0, 20.0), (20.0, 30.0)):

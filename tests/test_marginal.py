@@ -276,7 +276,7 @@ def test_fitted_imu_biases_equal_dense_least_squares() -> None:
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
 
 
-def test_likelihood_is_unchanged_if_imu_path_is_subtracted() -> None:
+def test_likelihood_is_unchanged_if_imu_motion_is_subtracted() -> None:
     part = with_constants()
     given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, centre_on_path(part))]
     plain, found_values = (fit_positions(*each).scores()[0] for each in given)

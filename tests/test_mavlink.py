@@ -125,7 +125,7 @@ def test_read_mavlink_version_1_equals_version_2(read):
     assert_frame_equal(as_2.positions[0].samples, as_1.positions[0].samples)
 
 
-def test_read_mavlink_removes_messages_recorded_on_two_links(read):
+def test_read_mavlink_removes_duplicates_of_two_links(read):
     """MAVProxy with two radios records every message twice, with a delay."""
     aisle = Aisle(asks=True)
     once = aisle.record()

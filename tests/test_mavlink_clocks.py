@@ -77,7 +77,7 @@ def test_mavlink_clock_fit_of_messages_without_delay_is_exact(span, slope):
 
 @pytest.mark.parametrize("speed", [0.04, 0.5, 10.0])
 @pytest.mark.parametrize("span", [10.0, 100.0])
-def test_mavlink_clock_fit_recovers_speed_of_replayed_recording(speed, span):
+def test_clock_fit_finds_playback_speed_of_recording(speed, span):
     x = np.linspace(0.0, span, 600)
     delay = np.random.default_rng(1).exponential(0.01, len(x))
     line = fit_least_delay(x, 5.0 + speed * x + delay)

@@ -123,7 +123,7 @@ def test_wrong_noise_report_recommends_noise_of_better_rerun(trials: Any, expect
         (0.5, None, ("note", noises.NO_IMPROVEMENT)),
     ],
 )
-def test_noise_error_remains_if_kf_was_consistent_before_rerun(
+def test_noise_finding_keeps_severity_error_if_kf_is_consistent(
     nis_mean: float, rmse_m: float | None, expected: tuple[str, str]
 ) -> None:
     """A re-run shows no improvement if σ is consistent before and the position error unknown."""
@@ -208,7 +208,7 @@ def following(gain: float, *, growth: float = 0.05, **parts: Any) -> Any:
         (axis(kf=NONE, replay=SimpleNamespace(updates=None)), None),
     ],
 )  # fmt: skip
-def test_near_zero_q_report_requires_correlated_innovations(one: Any, expected: str | None) -> None:
+def test_near_zero_q_with_white_innovations_is_not_reported(one: Any, expected: str | None) -> None:
     assert severity(noises.detect_process_noise_near_zero, analysis(axes=(one,))) == expected
 
 
@@ -235,7 +235,7 @@ def kf(nis: float, name: str = "north", **parts: Any) -> Any:
     return axis(name, kf=statement(nis, **{"verdict": verdict, **parts}))
 
 
-def test_inconsistent_filter_is_an_error_from_mean_nis_of_4() -> None:
+def test_inconsistency_is_severity_error_at_mean_nis_4_or_more() -> None:
     for nis, expected in (
         (3.99, "warning"), (4.0, "error"), (0.25, "error"), (0.251, "warning"),
     ):  # fmt: skip
@@ -389,7 +389,7 @@ def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
         (fused(0.1), Noise(None, None, 0.2), {}, "Set EKF2_EVP_NOISE to 0.2 m (EKF2 uses 0.1 m)."),
     ],
 )  # fmt: skip
-def test_noise_of_overconfident_ekf2_is_advised_without_replay(
+def test_overconfident_ekf2_without_replay_gets_noise_advice(
     one, estimate, parameters, text
 ) -> None:
     flown = analysis(axes=(one,), log=log(parameters=parameters), tuning=tuned(estimate))

@@ -24,7 +24,9 @@ def random_equations(poses: int, size: int, sides: int, closures: int) -> tuple:
 @pytest.mark.parametrize("closures", [0, 5, 300])
 @pytest.mark.parametrize(("size", "sides"), [(2, 2), (3, 1), (6, 1)])
 @pytest.mark.parametrize("poses", [2, 3, 30, 200])
-def test_solution_equals_dense_matrices(poses: int, size: int, sides: int, closures: int) -> None:
+def test_sparse_solution_equals_solution_with_dense_matrices(
+    poses: int, size: int, sides: int, closures: int
+) -> None:
     edges, first, second, weights, values = random_equations(poses, size, sides, closures)
     dense = np.zeros((len(values), size, poses, size))
     rows = np.arange(len(values))

@@ -182,7 +182,7 @@ def test_simulated_outdoor_fault_is_cause_of_ekf2_error(
     assert is_sufficient(found, of)
 
 
-def test_larger_ekf2_acc_noise_partly_corrects_vibration_nees() -> None:
+def test_larger_ekf2_acc_noise_reduces_nees_under_vibration() -> None:
     """EKF2_ACC_NOISE corrects the filter, but the output predictor still integrates vibration."""
     analysis = flown("vibration=1")
     (tried,) = find_trials(analysis.trials, "ekf2", "aisle", "nees")
@@ -201,7 +201,7 @@ def test_larger_ekf2_acc_noise_partly_corrects_vibration_nees() -> None:
     assert np.nanmean(error_m**2) / variances < 1.5**2 < tried.after.nees_mean
 
 
-def test_what_if_with_correct_gnss_delay_equals_correct_flight() -> None:
+def test_what_if_with_true_gnss_delay_equals_faultless_flight() -> None:
     wrong, right = (flown(*texts).ekf2_model for texts in (("ekf2-delay=0",), ()))
     result, other = what_if(wrong, [{"EKF2_GPS_DELAY": 110.0}]), what_if(right, [])
     (predicted,), true = result.whatif, other.logged
@@ -212,7 +212,7 @@ def test_what_if_with_correct_gnss_delay_equals_correct_flight() -> None:
     assert result.logged.position_rmse_to_truth_m > 1.4 * true.position_rmse_to_truth_m
 
 
-def test_what_if_without_magnetometer_replay_uses_logged_heading(tmp_path: Path) -> None:
+def test_what_if_uses_logged_heading_if_mag_is_not_replayed(tmp_path: Path) -> None:
     log = tmp_path / "a.ulg"  # a log file has the true attitude, a flight in memory has not
     # with a heading fault EKF2 fuses the magnetic heading only
     log.write_bytes(to_ulog(simulate(OUTDOOR, parse_faults(["ekf2-delay=0", "heading=3"]))))

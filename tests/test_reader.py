@@ -323,7 +323,7 @@ def test_ekf2_reset_counter_overflow_counts_as_one_reset(read, before):
 # ---- innovations ------------------------------------------------------------------------------
 
 
-def test_ekf2_innovations_without_variance_in_time_are_dropped(read):
+def test_ekf2_innovation_without_variance_near_it_is_dropped(read):
     log = make_log("v1.12")
     late = log["estimator_innovation_variances"]
     kept = seconds_of(late["timestamp_sample"]) < 5.0
@@ -538,7 +538,7 @@ STREAMS = {
 
 
 @pytest.mark.parametrize("generation", STREAMS)
-def test_data_streams_list_their_topics_clock_and_file(read, generation):
+def test_read_log_lists_topics_clock_and_file_of_each_stream(read, generation):
     streams = read(make_log(generation)).streams
     of_ekf2 = ("ekf2_innovations", "ekf2_fusing", "ekf2_variance")
     assert [streams[part].topics[0] for part in of_ekf2] == STREAMS[generation]

@@ -352,7 +352,7 @@ def test_read_log_opens_compressed_ulog(compress, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["TUM", "EuRoC", "KITTI", "ROS 1", "ROS 2"])
-def test_read_trajectory_equals_reader_of_evo(name: str, tmp_path: Path) -> None:
+def test_read_trajectory_returns_same_poses_as_evo(name: str, tmp_path: Path) -> None:
     """ATE and RPE of equal poses are equal to those of evo, see test_evaluation."""
     file_interface = pytest.importorskip("evo.tools.file_interface")
     path = tmp_path / "poses.txt"

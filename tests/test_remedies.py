@@ -84,7 +84,7 @@ def test_recommended_actions_do_not_increase_rmse_when_applied(settings, mistake
 
 
 @pytest.mark.parametrize(("seed", "mistakes"), [(1, ()), (2, ("ekf2-noise=50cm",))])
-def test_vio_drift_is_reported_first(seed, mistakes) -> None:
+def test_vio_drift_is_reported_before_its_consequences(seed, mistakes) -> None:
     """With PX4's default noise, and with an EKF2 noise of 50 times the short-term noise."""
     analysis = flown(replace(LOOP, seed=seed), Settings(), *mistakes)
     findings = find(analysis)

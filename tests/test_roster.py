@@ -167,7 +167,7 @@ def at(platform: str, number: str = "", name: str = "", **more: str) -> ExportOr
         (at("moodle", "99", "Jane"), None),
     ],
 )
-def test_student_id_of_learning_platform_precedes_name(origin, place) -> None:
+def test_student_is_identified_by_platform_id_before_name(origin, place) -> None:
     assert CLASS.student_index(origin.person) == place
 
 

@@ -17,14 +17,14 @@ from px4fuse.trajectory.rotation import (
 )
 
 
-def test_rotation_vector_of_tiny_quaternion_has_its_angle() -> None:
+def test_rotation_vector_of_tiny_rotation_keeps_the_angle() -> None:
     tiny = np.array([1.0, 2e-14, -4e-14, 6e-14])
     for sign in (1.0, -1.0):
         np.testing.assert_allclose(to_vector(sign * tiny), [4e-14, -8e-14, 12e-14])
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 9, 10, 50])
-def test_quaternion_running_product_equals_single_products(count: int) -> None:
+def test_cumulative_quaternion_product_equals_stepwise_product(count: int) -> None:
     turns = from_vector(np.random.default_rng(count).normal(0.0, 1.0, (count, 3)))
     product, one = cumulative_product(turns), np.array([1.0, 0.0, 0.0, 0.0])
     for row, turn in zip(product, turns, strict=True):

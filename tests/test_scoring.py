@@ -410,7 +410,7 @@ class TestClassFlags:
         assert "The id in this report is also in the report of" in made["5.pdf"][0]
         assert "identical to the PDF of" in made["8.pdf"][0]
 
-    def test_two_reports_of_one_student_are_flagged_for_their_id(self):
+    def test_two_reports_with_one_student_id_are_flagged(self):
         two = [
             report(1, log_sha256="x"),
             report(1, log_sha256="x", sha256="z", submission="b.pdf"),

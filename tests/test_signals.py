@@ -178,7 +178,7 @@ def line_track(heading_deg, count=200, noise=0.0):
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 30.0, 90.0, 135.0, 179.0, 210.0])
-def test_aisle_heading_of_straight_track_equals_its_heading(heading_deg):
+def test_main_axis_of_straight_track_equals_track_direction(heading_deg):
     heading, elongation = aisle_heading(line_track(heading_deg)[0], ALL)
     assert (heading - heading_deg + 90.0) % 180.0 - 90.0 == pytest.approx(0.0, abs=1e-6)
     assert 0.0 <= heading < 180.0

@@ -278,7 +278,7 @@ class TestMistakes:
             np.std(position_errors_m(noisy)[:25]) < 0.07
         )  # on the ground; 0.10 m without the filter
 
-    def test_simulated_fault_no_vvo_removes_visual_odometry_topic(self):
+    def test_fault_no_vvo_removes_topic_vehicle_visual_odometry(self):
         remaining = to_flight(simulate(AISLE, parse_faults(["no-vvo"]))).positions
         assert [round(track.compute_rate_hz()) for track in remaining] == [2, 2]
         flight = to_flight(simulate(replace(AISLE, ekf2=False), parse_faults(["no-vvo"])))
@@ -339,7 +339,7 @@ def test_simulation_scenario_with_invalid_value_raises_error(changes):
     (Scenario(passes=100, length_m=100.0), [], "limited to 3600 s"),
     (AISLE, ["dropout=600s,0s"], "vehicle_visual_odometry contains no messages"),
 ])  # fmt: skip
-def test_simulate_with_unsuitable_fault_raises_error(scenario, texts, expected):
+def test_simulate_fault_of_other_flight_kind_raises_error(scenario, texts, expected):
     with pytest.raises(SettingsError, match=expected):
         simulate(scenario, parse_faults(texts))
 

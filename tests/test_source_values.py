@@ -100,7 +100,7 @@ def test_rounding_step_of_float32_positions_is_found(origin, step):
     assert rounding_step(values) < 0.01
 
 
-def test_rounding_step_with_denormal_difference_is_zero():
+def test_position_resolution_of_subnormal_difference_is_zero():
     assert rounding_step(np.array([0.0, 5e-324, 1e10])) == 0.0
 
 
@@ -269,7 +269,7 @@ def test_report_on_positions_copied_from_ekf2_reports_delay(is_fused):
     assert "source_is_ekf2_estimate" not in {one.id for one in detected(copied(flight, 0.02))}
 
 
-def test_valid_positions_of_clean_flight_are_not_reported():
+def test_clean_flight_has_no_finding_on_invalid_positions():
     assert detected(aisle_flight()) == ()
 
 
@@ -301,7 +301,7 @@ def test_unfused_vision_report_shows_quality_below_ekf2_ev_qmin(quality, words):
     assert words in one.remedy
 
 
-def test_two_position_senders_hide_reports_of_their_effects():
+def test_two_position_senders_suppress_findings_they_cause():
     analysis = unexplained(compare(aisle_flight()))
     findings = [
         finding("error", name, "m.", "r.")

@@ -299,7 +299,7 @@ def test_html_file_of_user_is_not_overwritten_by_default(desk, command, mine) ->
     run_checked(*command.split())  # an own page is replaced
 
 
-def test_default_file_name_of_settings_has_valid_characters() -> None:
+def test_output_name_made_from_settings_has_valid_characters() -> None:
     request = ComparisonRequest(
         log="a.ulg", axes=("north", "east"), clock_offset_s=-0.12, heading_deg=30.0,
         position=PositionFile(path="/home/x/u wb.csv", columns=("t", "x/y", "*")),

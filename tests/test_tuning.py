@@ -123,7 +123,7 @@ def test_wrong_noises_show_likelihood_gain_on_held_out_data() -> None:
         assert one == pytest.approx(two, rel=1e-4)
 
 
-def test_tuned_noise_interval_of_two_axes_is_root_2_narrower() -> None:
+def test_noise_interval_of_two_axes_is_root_2_below_one_axis() -> None:
     for seed in range(2):
         north, east = modelled(seed), modelled(seed + 100)
         both = tuned(north, east)
@@ -171,7 +171,7 @@ def test_tuned_noise_intervals_equal_profile_likelihood() -> None:
 
 
 @pytest.mark.parametrize("sigma_a", [0.05, 0.5])
-def test_tune_on_noise_free_positions_bounds_sigma_z_from_above(sigma_a: float) -> None:
+def test_tune_on_noise_free_positions_gives_sigma_z_upper_limit(sigma_a: float) -> None:
     found = tuned(modelled(3, 500, sigma_a=sigma_a, sigma_z=0.0))
     assert found.sigma_z.value is found.sigma_z.low is None
     assert SIGMA_Z_SEARCH_M[0] <= found.sigma_z.high < 0.003

@@ -31,7 +31,7 @@ def longest_run_length(stamps: list[int]) -> int:
 
 
 @given(any_timestamps)
-def test_kept_ulog_timestamps_are_positive_and_increasing(stamps):
+def test_ulog_rows_with_decreasing_timestamps_are_dropped(stamps):
     indices = kept_indices(stamps)
     chosen = [stamps[at] for at in indices]
     assert indices == sorted(set(indices))
@@ -68,7 +68,7 @@ PUBLISHED = [10_000_000, 11_000_000, 12_000_000, 13_000_000]
         id="one unusable falls back alone",
     ),
 ])  # fmt: skip
-def test_measurement_time_is_sample_or_publication_timestamp(sampled, expected):
+def test_measurement_time_is_timestamp_sample_or_else_timestamp(sampled, expected):
     assert measurement_time_us(table(PUBLISHED, sampled)).tolist() == (expected or sampled)
 
 

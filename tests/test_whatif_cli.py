@@ -154,7 +154,7 @@ class TestFlownFlights:
         assert error(cured) < 1.2 * error(clean) < 0.5 * error(found.whatif.logged)
         assert not any("would reach EKF2 after" in note for note in found.whatif.notes)
 
-    def test_what_if_estimate_reverts_a_wrong_ekf2_delay(self, shared_logs: Path) -> None:
+    def test_what_if_recovers_true_delay_from_wrong_ekf2_delay(self, shared_logs: Path) -> None:
         found = self.of(shared_logs, "v1.13.3_aisle_evdelay175")
         assert found.changes["EKF2_EV_DELAY"] == 0.0
         (cured,) = found.whatif.whatif

@@ -74,7 +74,7 @@ def test_output_to_named_pipe_keeps_the_pipe(desk) -> None:
 
 
 @posix
-def test_output_to_device_keeps_the_device(desk) -> None:
+def test_output_to_device_does_not_replace_it_by_a_file(desk) -> None:
     """Use a link, so that a failure replaces the link and not the device."""
     link = desk / "null"
     link.symlink_to(os.devnull)
@@ -95,7 +95,7 @@ def test_output_to_socket_is_refused_and_keeps_the_socket(desk) -> None:
 
 
 @posix
-def test_output_to_symbolic_link_replaces_its_target(tmp_path) -> None:
+def test_output_to_symbolic_link_keeps_link_and_writes_target(tmp_path) -> None:
     (tmp_path / "old").write_bytes(b"old")
     for link, target in (("a", "old"), ("b", "new"), ("c", "a")):
         (tmp_path / link).symlink_to(target)
