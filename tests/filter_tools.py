@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.comparison.preparation import choose_segment, choose_source
 from px4fuse.core.arrays import Array
-from px4fuse.filter.likelihood import Preintegrated
+from px4fuse.filter.likelihood import PreintegratedMotion
 from px4fuse.filter.model import INITIAL_COVARIANCE, propagate_covariance, update_step
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, make_axes
@@ -152,7 +152,7 @@ def attitude_table(time: Array, turn: Rotation) -> pd.DataFrame:
 
 
 def score_grid(
-    intervals: list[Preintegrated], sigma_a_m_s2: Array, sigma_z_m: Array, weight: Array
+    intervals: list[PreintegratedMotion], sigma_a_m_s2: Array, sigma_z_m: Array, weight: Array
 ) -> Array:
     """Return KF's -ln p of all axes (without a constant) on a grid of settings.
 
@@ -161,15 +161,15 @@ def score_grid(
     q, r = np.broadcast_arrays(np.square(sigma_a_m_s2), np.square(sigma_z_m))
     total = np.zeros(q.shape)
     for axis in intervals:
-        p, v = axis.initial.position_m, axis.initial.velocity_m_s + 0.0 * q
+        p, v = axis.initial_state.position_m, axis.initial_state.velocity_m_s + 0.0 * q
         covariance = INITIAL_COVARIANCE
         for k, z in enumerate(axis.measurement_m):
-            p = p + axis.length_s[k] * v + axis.delta_position_m[k]
+            p = p + axis.interval_s[k] * v + axis.delta_position_m[k]
             v = v + axis.delta_velocity_m_s[k]
             covariance = tuple(
                 p_ij + q * unit + fixed
                 for p_ij, unit, fixed in zip(
-                    propagate_covariance(covariance, axis.length_s[k]),
+                    propagate_covariance(covariance, axis.interval_s[k]),
                     axis.unit_process_noise[k], axis.added_process_noise[k], strict=True,
                 )
             )  # fmt: skip

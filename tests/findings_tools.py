@@ -18,7 +18,7 @@ from px4fuse.filter.hypotheses import Estimate, Jump, SystematicErrors
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.time_offset import ClockOffset, PartOffset
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.findings import Finding
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import NO_INVALID_ROWS, RECEIVED, Columns, Ekf2, FusionRecord, Unavailable
@@ -240,9 +240,9 @@ def at_rate(rate_hz: float, start_s: float = 10.0, end_s: float = 110.0) -> pd.D
 
 
 def tuned(
-    sigma_z: Noise | None = None, sigma_a: Noise | None = None, **parts: Any
+    sigma_z: NoiseEstimate | None = None, sigma_a: NoiseEstimate | None = None, **parts: Any
 ) -> dict[str, Any]:
-    right = Noise(1.0, 0.9, 1.1)
+    right = NoiseEstimate(1.0, 0.9, 1.1)
     usual = {"name": "horizontal", "before": NONE, "held_out": NONE, "outlier_time_s": np.array([])}
     noises = (sigma_z or right).as_fields("sigma_z_m") | (sigma_a or right).as_fields(
         "sigma_a_two_state_m_s2"
@@ -267,5 +267,7 @@ def late(
 
 def with_bias(forward: float, sigma: float = 0.01, right: float = 0.0) -> SystematicErrors:
     return made(
-        SystematicErrors, forward_bias=Estimate(forward, sigma), right_bias=Estimate(right, 0.0)
+        SystematicErrors,
+        accelerometer_bias_forward=Estimate(forward, sigma),
+        accelerometer_bias_right=Estimate(right, 0.0),
     )

@@ -35,16 +35,16 @@ from px4fuse.comparison.estimates import (
 )
 from px4fuse.core.arrays import Array
 from px4fuse.filter import time_offset
-from px4fuse.filter.fitting import Noises
+from px4fuse.filter.fitting import NoiseParameters
 from px4fuse.filter.imu_motion import (
     CONSTANTS_PRIOR_SIGMA,
     INTEGRATION_STEP_S,
-    SEGMENT_START_PRECISION,
+    SEGMENT_START_PRIOR_PRECISION,
     SegmentMotion,
+    compute_imu_motion,
     make_segment_motion,
-    prepare_motion,
 )
-from px4fuse.filter.likelihood import profile_interval
+from px4fuse.filter.likelihood import compute_profile_interval
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.time_offset import MAX_CHANGE_P_VALUE, ClockOffset, PartOffset
 from px4fuse.flight.model import (
@@ -65,7 +65,7 @@ DT = SETTINGS.dt_s
 
 def estimate(flight: Flight, **options: object) -> ClockOffset | Unavailable:
     segment = Segment(-np.inf, np.inf, "all of it")
-    noises = Noises(SIGMA_A, SIGMA_Z)
+    noises = NoiseParameters(SIGMA_A, SIGMA_Z)
     track = flight.positions[0]
     return time_offset.estimate_time_offset(flight, track, segment, SETTINGS, noises, **options)
 
@@ -138,18 +138,18 @@ def test_integrated_constant_acceleration_equals_closed_form() -> None:
     )
     measured = np.column_stack([stamps, np.full(len(stamps), np.nan)])
     measured[:5, 0] = np.nan
-    moved = prepare_motion(flight, stamps, measured, directions=np.eye(3)[:2], dt_s=DT)
+    moved = compute_imu_motion(flight, stamps, measured, directions=np.eye(3)[:2], dt_s=DT)
     assert len(moved.segment_motions) == 3
     assert moved.time_s[[0, -1]] == pytest.approx([0.75, 79.25])
-    positions = moved.positions(np.array([-0.3, 0.0, 0.21]))
+    positions = moved.make_positions(np.array([-0.3, 0.0, 0.21]))
     way, speed = positions.delta_position_m, positions.delta_velocity_m_s
     assert way.shape == (2, 3, 1 + len(CONSTANTS_PRIOR_SIGMA), len(moved.time_s) - 1)
-    inside = np.flatnonzero(positions.is_joined)
+    inside = np.flatnonzero(positions.is_within_segment)
     np.testing.assert_allclose(way[0, :, 0], 0.0, atol=1e-9)
     np.testing.assert_allclose(way[1, :, 0, inside], 1.5 * 0.25**2 / 2.0, atol=1e-9)
     np.testing.assert_allclose(speed[1, :, 0, inside], 1.5 * 0.25, atol=1e-9)
     np.testing.assert_array_equal(
-        np.flatnonzero(~positions.is_joined) + 1, moved.segment_edges[1:-1]
+        np.flatnonzero(~positions.is_within_segment) + 1, moved.segment_edges[1:-1]
     )
     # positions are relative to the first measured one of each stretch
     for begin, end in positions.segments:
@@ -205,8 +205,8 @@ class JointNormal:
         since = self.since
         short, long = np.minimum.outer(since, since), np.maximum.outer(since, since)
         one_axis = (
-            1.0 / SEGMENT_START_PRECISION[0]
-            + np.multiply.outer(since, since) / SEGMENT_START_PRECISION[1]
+            1.0 / SEGMENT_START_PRIOR_PRECISION[0]
+            + np.multiply.outer(since, since) / SEGMENT_START_PRIOR_PRECISION[1]
             + sigma_a**2 * DT * short**2 * (3.0 * long - short) / 6.0
             + sigma_z**2 * np.eye(len(since))
         )
@@ -287,14 +287,17 @@ def test_time_offset_likelihood_equals_joint_normal_density(exact_imu) -> None:
 def test_time_offset_sigma_equals_width_of_likelihood_parabola() -> None:
     grid = np.linspace(-0.1, 0.3, 41)
     drop = (grid - 0.123) ** 2 / (2.0 * 0.03**2)
-    assert time_offset._minimum_and_sigma(grid, drop) == pytest.approx((0.123, 0.03))
+    assert time_offset._fit_minimum_and_sigma(grid, drop) == pytest.approx((0.123, 0.03))
     ends = 0.123 - 1.96 * 0.03, 0.123 + 1.96 * 0.03
-    assert profile_interval(grid, drop) == pytest.approx(ends, abs=1e-3)
+    assert compute_profile_interval(grid, drop) == pytest.approx(ends, abs=1e-3)
     # an end outside the grid is None
-    assert profile_interval(grid[18:], drop[18:]) == (None, pytest.approx(ends[1], abs=1e-3))
-    assert profile_interval(grid[:25], drop[:25])[1] is None
+    assert compute_profile_interval(grid[18:], drop[18:]) == (
+        None,
+        pytest.approx(ends[1], abs=1e-3),
+    )
+    assert compute_profile_interval(grid[:25], drop[:25])[1] is None
     # without a minimum, σ is the width of the grid
-    found, sigma = time_offset._minimum_and_sigma(grid, -((grid - 0.1) ** 2))
+    found, sigma = time_offset._fit_minimum_and_sigma(grid, -((grid - 0.1) ** 2))
     assert found in (grid[0], grid[-1])
     assert sigma == pytest.approx(0.4)
 
@@ -304,18 +307,18 @@ def test_time_offset_maximises_joint_likelihood_of_flight_parts(monkeypatch, off
     """Use parabolas as profiles of the parts."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 
-    def fit_noises(grid: Array, *_: object) -> SimpleNamespace:
+    def fit_with_noises(grid: Array, *_: object) -> SimpleNamespace:
         square = (grid - offset_s - shift[:, None]) ** 2 / sigma[:, None] ** 2
-        return SimpleNamespace(scores_by_segment=lambda: 0.5 * square[None])
+        return SimpleNamespace(compute_segment_scores=lambda: 0.5 * square[None])
 
-    monkeypatch.setattr(time_offset, "fit_noises", fit_noises)
+    monkeypatch.setattr(time_offset, "fit_with_noises", fit_with_noises)
     moved = SimpleNamespace(
         segment_edges=np.arange(5) * 2,
         time_s=np.arange(8.0),
-        position_batches=lambda grid: grid,
-        weight=None,
+        make_position_batches=lambda grid: grid,
+        measurement_weights=None,
     )
-    parts, p = time_offset._offset_per_part(moved, offset_s, Noises(0.1, 0.1), 1.0)
+    parts, p = time_offset._estimate_part_offsets(moved, offset_s, NoiseParameters(0.1, 0.1), 1.0)
     # the last part has a σ above the limit
     assert [(part.start_s, part.end_s) for part in parts] == [(0.0, 1.0), (2.0, 3.0), (4.0, 5.0)]
     assert [part.offset_s for part in parts] == pytest.approx(offset_s + shift[:3])

@@ -8,7 +8,12 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from px4fuse.core.text import count_noun
-from px4fuse.filter.consistency import Consistency, assess, assess_horizontal, nis_band
+from px4fuse.filter.consistency import (
+    Consistency,
+    assess_horizontal_nis,
+    assess_innovations,
+    compute_nis_band,
+)
 from px4fuse.flight.model import Unavailable
 
 # n, and 95 % band of the mean NIS with two degrees of freedom, as published for real flights
@@ -20,15 +25,15 @@ def white(seed: int, count: int = 200) -> NDArray[np.float64]:
 
 
 def assessed(nu: NDArray[np.float64], s: float | NDArray[np.float64] = 1.0) -> Consistency:
-    return assess(nu, np.broadcast_to(s, nu.shape).astype(float))
+    return assess_innovations(nu, np.broadcast_to(s, nu.shape).astype(float))
 
 
 def test_nis_band_contains_95_percent_of_chi_square_values() -> None:
     for count, low, high in BANDS_OF_TWO:
-        band = nis_band(count, 2)
+        band = compute_nis_band(count, 2)
         assert (round(2 * band[0], 2), round(2 * band[1], 2)) == (low, high)
     for count in (10, 100, 1000):
-        low, high = nis_band(count)
+        low, high = compute_nis_band(count)
         tails = stats.chi2.cdf(low * count, count), stats.chi2.sf(high * count, count)
         assert tails == pytest.approx((0.025, 0.025))
 
@@ -39,7 +44,7 @@ def test_white_innovations_have_verdict_consistent() -> None:
     one = np.ones(200)
     pairs = [((white(seed), one), (white(seed + 5000), one)) for seed in range(1000)]
     assert all(each.verdict == "consistent" for each in found)
-    assert all(assess_horizontal(*pair).verdict == "consistent" for pair in pairs)
+    assert all(assess_horizontal_nis(*pair).verdict == "consistent" for pair in pairs)
     inside = [each.nis_band[0] <= each.nis_mean <= each.nis_band[1] for each in found]
     for fine in (
         inside,
@@ -69,7 +74,7 @@ def test_innovation_statistics_equal_their_formulas() -> None:
     assert result.innovation_std_m == pytest.approx(np.std(nu, ddof=1))
     assert result.sqrt_s_median_m == pytest.approx(np.median([math.sqrt(v) for v in s]))
     assert result.nis_mean == pytest.approx(sum(e * e for e in normalised) / 60)
-    assert result.nis_band == nis_band(60)
+    assert result.nis_band == compute_nis_band(60)
     assert result.fraction_outside_two_sigma == sum(abs(e) > 2 for e in normalised) / 60
     power = sum(e * e for e in normalised)
     r = [np.dot(normalised[:-lag], normalised[lag:]) / power for lag in range(1, 11)]
@@ -83,7 +88,7 @@ def test_innovation_statistics_equal_their_formulas() -> None:
 
 def test_larger_gate_reduces_fraction_of_innovations_outside() -> None:
     nu = np.repeat([0.5, 2.5, 4.0, 6.0], 5)
-    result = assess(nu, np.ones(20), gate=3.0)
+    result = assess_innovations(nu, np.ones(20), gate=3.0)
     assert (result.fraction_outside_two_sigma, result.fraction_outside_gate) == (0.75, 0.5)
     assert assessed(nu).fraction_outside_gate == 0.25
 
@@ -92,29 +97,29 @@ def test_nis_statistics_ignore_nan_and_zero_variance() -> None:
     nu, s = white(1, 50), np.ones(50)
     nu[3], s[7], s[9] = np.nan, 0.0, np.nan
     kept = np.delete(np.arange(50), [3, 7, 9])
-    assert assess(nu, s) == assessed(nu[kept])
+    assert assess_innovations(nu, s) == assessed(nu[kept])
 
 
 def test_nis_verdict_of_few_or_equal_innovations_is_unavailable() -> None:
     for count in (0, 1, 9):
-        result = assess(white(1, count), np.ones(count))
+        result = assess_innovations(white(1, count), np.ones(count))
         assert isinstance(result, Unavailable)
         assert f"only {count_noun(count, 'innovation')} (at least 10" in result.reason
     assert assessed(white(1, 14)).ljung_box_lags == 2
     for value in (0.0, -0.5):
-        result = assess(np.full(50, value), np.ones(50))
+        result = assess_innovations(np.full(50, value), np.ones(50))
         assert isinstance(result, Unavailable)
         assert "same value" in result.reason
 
 
 def test_horizontal_nis_is_mean_of_north_and_east_nis() -> None:
     north, east = white(1), 0.5 * white(2)
-    result = assess_horizontal((north, np.ones(200)), (east, np.ones(200)))
+    result = assess_horizontal_nis((north, np.ones(200)), (east, np.ones(200)))
     both = (assessed(north).nis_mean + assessed(east).nis_mean) / 2
     assert result.count == 200
     assert result.nis_mean == pytest.approx(both)
     assert result.sigma_ratio == pytest.approx(both**0.5)
-    assert result.nis_band == nis_band(200, 2)
+    assert result.nis_band == compute_nis_band(200, 2)
     assert result.verdict == "underconfident"
 
 
@@ -122,8 +127,8 @@ def test_horizontal_nis_of_few_samples_is_not_evaluated() -> None:
     def axis(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return white(1, count), np.ones(count)
 
-    assert assess_horizontal(axis(9), axis(9)) is None
-    assert assess_horizontal((np.zeros(20), np.ones(20)), (np.zeros(20), np.ones(20))) is None
+    assert assess_horizontal_nis(axis(9), axis(9)) is None
+    assert assess_horizontal_nis((np.zeros(20), np.ones(20)), (np.zeros(20), np.ones(20))) is None
 
 
 def test_horizontal_nis_ignores_nan_and_zero_variance() -> None:
@@ -132,4 +137,4 @@ def test_horizontal_nis_ignores_nan_and_zero_variance() -> None:
         north, east = (white(1), np.ones(200)), (white(2), np.ones(200))
         north[column][5] = value
         left = [(nu[kept], variance[kept]) for nu, variance in (north, east)]
-        assert assess_horizontal(north, east) == assess_horizontal(*left)
+        assert assess_horizontal_nis(north, east) == assess_horizontal_nis(*left)

@@ -44,7 +44,7 @@ from px4fuse.filter.frame_rotation import combine_heading_parts as together
 from px4fuse.filter.hypotheses import Estimate, SystematicErrors
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
-from px4fuse.filter.tuning import Noise
+from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.findings import (
     Finding,
     ekf2_not_fusing,
@@ -652,7 +652,13 @@ def low_pass(gain: float, lag_s: float, **parts: Any) -> Any:
 
 def slow(gain: float, lag: float, slow_m: float = 0.1) -> TimeCorrelatedNoise:
     return TimeCorrelatedNoise(
-        1.0, 1.0, np.inf, slow_m=slow_m, white_m=0.1, gain_nats=gain, low_pass_gain_nats=lag
+        1.0,
+        1.0,
+        np.inf,
+        slow_m=slow_m,
+        white_m=0.1,
+        likelihood_gain_nats=gain,
+        low_pass_likelihood_gain_nats=lag,
     )
 
 
@@ -681,7 +687,7 @@ def stating(reported: float, noise: float, interval: Any = None, **parts: Any) -
     low, high = interval or (0.99 * noise, 1.01 * noise)
     states = source(samples=positions(np.arange(0.0, 120.0), variance_m2=reported**2))
     usual = {"source_low_pass": SourceLowPass(0.0, 0.0, 0.0, noise), "source": states,
-             "tuning": tuned(Noise(noise, low, high), count=100)}  # fmt: skip
+             "tuning": tuned(NoiseEstimate(noise, low, high), count=100)}  # fmt: skip
     return analysis(**{**usual, **parts})
 
 
@@ -807,7 +813,7 @@ SOURCE_EDGES = [
     # inside the interval, no interval, unknown low pass, no reported variance, odometry
     *((STATED, stating(3.0, 1.0, interval), None) for interval in (
         (0.1, 9.0), (None, 9.0), (0.1, None))),
-    (STATED, stating(3.0, 1.0, tuning=tuned(Noise(None, None, 9.0))), None),
+    (STATED, stating(3.0, 1.0, tuning=tuned(NoiseEstimate(None, None, 9.0))), None),
     (STATED, stating(3.0, 1.0, tuning={}), None),
     (STATED, stating(3.0, 1.0, source_low_pass=NONE), None),
     (STATED, stating(np.nan, 1.0), None),

@@ -90,7 +90,7 @@ def test_drifting_heading_error_is_estimated_per_flight_part(by):
         expected = -np.interp(middle, flight.attitude.index, turn)
         within = 0.5 if by == "orientation" else 3.5 * part.sigma_deg
         assert part.heading_error_deg == pytest.approx(expected, abs=within)
-    first, last = found.find_ends()
+    first, last = found.find_extreme_parts()
     assert first.start_s < last.start_s
     assert first.heading_error_deg > last.heading_error_deg
 
@@ -102,7 +102,7 @@ def test_heading_misalignment_without_data_gives_reason():
         ({"attitude": Unavailable("attitude", "not logged", "")}, "not logged"),
         ({"imu": Unavailable("IMU", "not logged", "")}, "not logged"),
         ({"imu": flight.imu.iloc[::10]}, "the IMU rate is too low"),
-        ({"attitude": flight.attitude.iloc[::25]}, "the attitude rate is too low"),
+        ({"attitude": flight.attitude.iloc[::25]}, "the attitude is logged at only"),
         ({"positions": few}, "only 10 measurements"),
     ):
         found = estimate(replace(flight, **changed))
@@ -140,9 +140,9 @@ def test_heading_misalignment_of_real_logs_is_in_known_range(shared_logs, log, d
 
 
 def test_long_flight_has_over_100_heading_error_estimates() -> None:
-    """1,000 measurements in 25 minutes: fewer than three per part of ``PART_LENGTH_S``."""
+    """1,000 measurements in 25 minutes: fewer than three per part of ``FLIGHT_PART_DURATION_S``."""
     time = np.linspace(0.0, 1500.0, 1000)
-    parts = frame_rotation._mean_per_part(
+    parts = frame_rotation._average_flight_parts(
         time, np.radians(np.full(1000, 4.0)), np.radians(np.full(1000, 1.0))
     )
     assert len(parts) > 100
@@ -153,7 +153,7 @@ def test_long_flight_has_over_100_heading_error_estimates() -> None:
 
 def test_heading_drift_requires_minimum_angle_and_p_value() -> None:
     for spread, drift_p, drifts in ((1.0, 0.0, True), (0.999, 0.0, False), (9.0, 1.0, False)):
-        turns = (0.0, spread * frame_rotation.MIN_DRIFT_DEG)
+        turns = (0.0, spread * frame_rotation.MIN_HEADING_DRIFT_DEG)
         parts = tuple(HeadingPart(float(n), n + 1.0, turn, 0.1) for n, turn in enumerate(turns))
         found = frame_rotation.combine_heading_parts(parts, drift_p, "positions")
         assert (found.drifts, found.misalignment_deg) == (drifts, pytest.approx(np.mean(turns)))

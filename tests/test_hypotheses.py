@@ -74,13 +74,13 @@ def test_bias_regression_columns_equal_kf_step_responses() -> None:
     step = np.where(north.measurement_time_s >= 12.0, 0.7, 0.0)
     intervals = preintegrate(north, RIGHT)
     none = np.zeros(len(intervals.measurement_m), dtype=bool)
-    measured = intervals.measurement_m - intervals.initial.position_m
+    measured = intervals.measurement_m - intervals.initial_state.position_m
     both = replace(
         intervals,
         delta_position_m=np.outer(intervals.delta_position_m, [1.0, 1.0]),
         delta_velocity_m_s=np.outer(intervals.delta_velocity_m_s, [1.0, 1.0]),
         measurement_m=np.stack([measured, measured + step[1:]], 1),
-        initial=replace(intervals.initial, position_m=0.0),
+        initial_state=replace(intervals.initial_state, position_m=0.0),
     )
     nu, s = innovations(both, RIGHT.sigma_a_m_s2, RIGHT.sigma_z_m, none)
     for column, added in zip(nu.T, (0.0, step), strict=True):
@@ -99,16 +99,18 @@ def test_innovations_of_bias_regression_equal_kf_over_imu_gap() -> None:
     analysis = flown()
     axes = tuple(analysis.axes[name].axis for name in ("north", "east"))
     model = make_design_matrix(analysis.flight, axes, RIGHT, 0.10, 0.0)
-    gap = np.zeros_like(model.signals.added_process_noise)
+    gap = np.zeros_like(model.preintegrated_columns.added_process_noise)
     gap[200] = 0.5, 0.5, 1.0
-    with_gap = replace(model, signals=replace(model.signals, added_process_noise=gap))
+    with_gap = replace(
+        model, preintegrated_columns=replace(model.preintegrated_columns, added_process_noise=gap)
+    )
     skip = np.zeros(len(model.time_s), dtype=bool)
     for each in (model, with_gap):
-        fits, (data, columns, _) = each.fit(0.27, skip), each.whitened_design(0.27, skip)
+        fits, (data, columns, _) = each.fit(0.27, skip), each.whiten_design(0.27, skip)
         arrays = "measurement_m", "delta_position_m", "delta_velocity_m_s"
         for at, column in enumerate((0, 4)):
-            own = {name: getattr(each.signals, name)[:, column] for name in arrays}
-            nu, s = innovations(replace(each.signals, **own), 0.27, 0.10)
+            own = {name: getattr(each.preintegrated_columns, name)[:, column] for name in arrays}
+            nu, s = innovations(replace(each.preintegrated_columns, **own), 0.27, 0.10)
             np.testing.assert_allclose(data[at], nu / np.sqrt(s), atol=1e-9)
             residual = data[at] - columns[at] @ fits.coefficients
             np.testing.assert_allclose(fits.residual[fits.axis == at], residual, atol=1e-9)
@@ -228,9 +230,9 @@ def test_outlier_burst_is_not_reported_as_position_jump() -> None:
 
 def test_time_offset_is_not_reported_as_low_pass_filter() -> None:
     late = flown("clock-offset=250ms", passes=6)
-    assert late.source_low_pass.gain_nats == 0.0
+    assert late.source_low_pass.likelihood_gain_nats == 0.0
     _, low_pass, _ = _fit_source_errors(late, late.tuning, unavailable("clock offset"))
-    assert low_pass.gain_nats > 3.0
+    assert low_pass.likelihood_gain_nats > 3.0
 
 
 # ------------------------------------------------------------------ arrival times

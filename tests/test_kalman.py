@@ -98,7 +98,7 @@ def test_kf_settings_out_of_range_are_rejected(name: str) -> None:
 
 
 def test_kf_replay_with_imu_input_but_no_imu_is_rejected() -> None:
-    with pytest.raises(SettingsError, match="`input` imu, KF needs IMU data"):
+    with pytest.raises(SettingsError, match="`input` is imu, but KF has no acceleration"):
         replay(line([0.0, 0.2, 0.4], [0.0, 0.0, 0.0]), Settings(input="imu"))
 
 
@@ -214,7 +214,7 @@ def test_kf_prediction_formulas_equal_matrix_products(dt: float) -> None:
     np.testing.assert_allclose(model.propagate_state(1.5, -2.0, 3.0, dt), moved[:, 0], rtol=1e-14)
     # Q = B Bᵀ / dt: the acceleration is constant over the step
     np.testing.assert_allclose(
-        model.symmetric_matrix(model.process_noise_unit(dt)), b @ b.T / dt, rtol=1e-14
+        model.symmetric_matrix(model.compute_unit_process_noise(dt)), b @ b.T / dt, rtol=1e-14
     )
 
 
@@ -225,7 +225,7 @@ def test_kf_process_noise_sum_of_short_steps_equals_closed_form() -> None:
     for _ in range(count):
         propagate_covariance, added = (
             model.propagate_covariance(covariance, dt),
-            model.process_noise_unit(dt),
+            model.compute_unit_process_noise(dt),
         )
         covariance = tuple(a + b for a, b in zip(propagate_covariance, added, strict=True))
-    np.testing.assert_allclose(covariance, model.continuous_noise_unit(total), rtol=1e-7)
+    np.testing.assert_allclose(covariance, model.compute_unit_continuous_noise(total), rtol=1e-7)

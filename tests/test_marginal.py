@@ -18,31 +18,31 @@ from scipy.stats import norm
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.filter.fitting import (
     START_OUTLIER_FRACTION,
-    START_OUTLIER_WIDTH,
+    START_OUTLIER_SIGMA_RATIO,
     Likelihood,
     NoiseFit,
-    Noises,
-    _outlier_probability,
-    fit_noises,
-    kf_positions,
+    NoiseParameters,
+    _compute_outlier_probability,
+    compute_variance_inflation,
+    convert_to_positions,
+    fit_with_noises,
     maximise_likelihood,
     negative_log_likelihood,
-    outlier_variance_factor,
 )
 from px4fuse.filter.likelihood import (
-    PROFILE_DROP,
+    MAX_LOG_LIKELIHOOD_DROP,
+    find_profile_interval,
     innovations,
     preintegrate,
-    profile_ends,
 )
 from px4fuse.filter.marginal_likelihood import (
-    Positions,
-    centre_on_path,
-    expected_squared_errors,
+    PositionsAndIncrements,
+    estimate_squared_errors,
     factorise,
     fit_positions,
+    subtract_smooth_path,
 )
-from px4fuse.filter.model import continuous_noise_unit
+from px4fuse.filter.model import compute_unit_continuous_noise
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 
@@ -65,7 +65,7 @@ def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     second = int(rng.integers(3, count - 2))
     joined = np.arange(1, count) != second
     length = rng.uniform(0.05, 0.6, count - 1)
-    noise = rng.uniform(0.001, 0.4) * np.stack(continuous_noise_unit(length))
+    noise = rng.uniform(0.001, 0.4) * np.stack(compute_unit_continuous_noise(length))
     noise[[0, 2]] += rng.choice([0.0, 0.003], count - 1)
     precision = np.stack([rng.uniform(1.0, 100.0, count), np.zeros(count)], 1)
     precision[[0, second], 1] = 0.5, 2.0
@@ -125,12 +125,13 @@ START, COUNT = np.array([0, 11]), 24
 WEAK = np.array([1e-6, 1e-4])  # prior precision of position and velocity
 WEIGHT = np.random.default_rng(2).uniform(0.1, 1.0, COUNT)
 SOME_NOISES = [
-    Noises(0.5, 0.1), Noises(0.05, 0.1), Noises(2.0, 0.1), Noises(0.5, 0.02), Noises(0.5, 1.0),
-    Noises(0.5, 0.1, 0.3), Noises(0.5, 0.1, 0.0, 0.3, 0.7), Noises(0.5, 0.1, 0.3, 0.05, 3.0),
+    NoiseParameters(0.5, 0.1), NoiseParameters(0.05, 0.1), NoiseParameters(2.0, 0.1),
+    NoiseParameters(0.5, 0.02), NoiseParameters(0.5, 1.0), NoiseParameters(0.5, 0.1, 0.3),
+    NoiseParameters(0.5, 0.1, 0.0, 0.3, 0.7), NoiseParameters(0.5, 0.1, 0.3, 0.05, 3.0),
 ]  # fmt: skip
 
 
-def with_constants(offsets: int = 3) -> Positions:
+def with_constants(offsets: int = 3) -> PositionsAndIncrements:
     """Two stretches of three axes with three constants.
 
     The first two axes lack some measurements, the second its first one; the third has one only in
@@ -144,9 +145,9 @@ def with_constants(offsets: int = 3) -> Positions:
     measured[15, 2] = -500.0
     initial = np.zeros((COUNT, 2))
     initial[START] = WEAK
-    return Positions(
-        measurement_m=measured, segment_starts=START, length_s=length,
-        unit_process_noise=0.1 * np.stack(continuous_noise_unit(length)),
+    return PositionsAndIncrements(
+        measurement_m=measured, segment_starts=START, interval_s=length,
+        unit_process_noise=0.1 * np.stack(compute_unit_continuous_noise(length)),
         added_process_noise=np.outer([0.3, 0.0, 0.2], rng.choice([0.0, 0.01], COUNT - 1)),
         prior_precision=initial, constants_prior_sigma=np.array([0.3, 1.0, 0.1]),
         delta_position_m=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
@@ -154,18 +155,25 @@ def with_constants(offsets: int = 3) -> Positions:
     )  # fmt: skip
 
 
-def arguments(positions: Positions, noises: Noises, weight: Array) -> tuple[Any, float, Array]:
+def arguments(
+    positions: PositionsAndIncrements, noises: NoiseParameters, weight: Array
+) -> tuple[Any, float, Array]:
     """Return the arguments of :func:`fit_positions`."""
     if noises.correlated_sigma_m:
         positions = replace(positions, correlated_noise=(noises.correlated_sigma_m, noises.tau_s))
-    scaled, variance = positions.in_sigma_z_units(
+    scaled, variance = positions.normalise_by_sigma_z(
         1.0, noises.random_walk_m, weight / noises.sigma_z_m**2
     )
     return scaled, noises.sigma_a_m_s2, variance
 
 
 def stretch_normal(
-    part: Positions, noises: Noises, variance: Array, stretch: int, axis: int, at: int = 0
+    part: PositionsAndIncrements,
+    noises: NoiseParameters,
+    variance: Array,
+    stretch: int,
+    axis: int,
+    at: int = 0,
 ) -> tuple[IntArray, Array, Array]:
     """Return measured rows, their signals (data minus mean, constants) and their covariance."""
     q = matrices(noises.sigma_a_m_s2**2 * part.unit_process_noise + part.added_process_noise)
@@ -174,7 +182,7 @@ def stretch_normal(
     means = [np.zeros((2, 4))]
     cross = {(0, 0): np.diag(1.0 / WEAK)}  # covariance of each state with all earlier ones
     for k, row in enumerate(rows[1:], start=1):
-        length = part.length_s[row - 1]
+        length = part.interval_s[row - 1]
         f = np.array([[1.0, length], [0.0, 1.0]])
         legs = part.delta_position_m, part.delta_velocity_m_s
         means.append(f @ means[-1] + [each[axis, at, :, row - 1] for each in legs])
@@ -190,7 +198,7 @@ def stretch_normal(
     signals[:, 0] += part.measurement_m[kept, axis]
     covariance = np.array([cross[k, j][0, 0] for k in used for j in used])
     if noises.correlated_sigma_m:
-        time = np.concatenate([[0.0], np.cumsum(part.length_s)])[kept]
+        time = np.concatenate([[0.0], np.cumsum(part.interval_s)])[kept]
         correlated_noise = noises.correlated_sigma_m**2 * np.exp(
             -np.abs(time[:, None] - time) / noises.tau_s
         )
@@ -199,7 +207,11 @@ def stretch_normal(
 
 
 def joint_normal(
-    part: Positions, noises: Noises, variance: Array, stretch: int, at: int = 0
+    part: PositionsAndIncrements,
+    noises: NoiseParameters,
+    variance: Array,
+    stretch: int,
+    at: int = 0,
 ) -> tuple[Array, Array, list[tuple[IntArray, Array, Array]]]:
     """Return data and covariance (with constants) of all axes, and each axis separately."""
     made = [stretch_normal(part, noises, variance, stretch, axis, at) for axis in range(3)]
@@ -212,7 +224,7 @@ def test_likelihood_with_imu_biases_equals_dense_joint_normal() -> None:
     """Equal at all offsets and noises, except for a constant."""
     part = with_constants()
 
-    def dense(noises: Noises, at: int) -> float:
+    def dense(noises: NoiseParameters, at: int) -> float:
         total, variance = 0.0, noises.sigma_z_m**2 / WEIGHT
         for stretch in range(2):
             data, covariance, _ = joint_normal(part, noises, variance, stretch, at)
@@ -223,13 +235,18 @@ def test_likelihood_with_imu_biases_equals_dense_joint_normal() -> None:
     expected = np.array([[dense(noises, at) for at in range(3)] for noises in SOME_NOISES])
     assert np.ptp(expected) > 1000.0
     found_values = np.array(
-        [fit_positions(*arguments(part, noises, WEIGHT)).scores()[0] for noises in SOME_NOISES]
+        [
+            fit_positions(*arguments(part, noises, WEIGHT)).compute_scores()[0]
+            for noises in SOME_NOISES
+        ]
     )
     np.testing.assert_allclose(
         found_values - found_values[0, 0], expected - expected[0, 0], rtol=1e-5, atol=1e-3
     )
     # in units of SIGMA_Z, which changes only negligible priors
-    scaled = np.array([fit_noises([part], noises, WEIGHT).scores()[0] for noises in SOME_NOISES])
+    scaled = np.array(
+        [fit_with_noises([part], noises, WEIGHT).compute_scores()[0] for noises in SOME_NOISES]
+    )
     np.testing.assert_allclose(
         scaled - scaled[0, 0], found_values - found_values[0, 0], rtol=1e-5, atol=1e-3
     )
@@ -245,8 +262,10 @@ def test_segment_with_one_position_does_not_change_likelihood(start_known: bool)
     for noises in SOME_NOISES:
         both = part, replace(part, measurement_m=without)
         one, none = (fit_positions(*arguments(each, noises, np.ones(COUNT))) for each in both)
-        np.testing.assert_allclose(one.scores(), none.scores(), rtol=1e-12)
-        np.testing.assert_allclose(one.constants(), none.constants(), rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(one.compute_scores(), none.compute_scores(), rtol=1e-12)
+        np.testing.assert_allclose(
+            one.estimate_constants(), none.estimate_constants(), rtol=1e-9, atol=1e-12
+        )
 
 
 def test_fitted_imu_biases_equal_dense_least_squares() -> None:
@@ -256,7 +275,7 @@ def test_fitted_imu_biases_equal_dense_least_squares() -> None:
     for noises in SOME_NOISES[:5]:
         variance, square = np.full(COUNT, noises.sigma_z_m**2), np.zeros(COUNT)
         arranged = arguments(part, noises, np.ones(COUNT))
-        constants = fit_positions(*arranged).constants()[:, 0]
+        constants = fit_positions(*arranged).estimate_constants()[:, 0]
         for stretch in range(2):
             _, _, made = joint_normal(part, noises, variance, stretch)
             information, right = np.diag(part.constants_prior_sigma**-2.0), np.zeros(3)
@@ -271,25 +290,25 @@ def test_fitted_imu_biases_equal_dense_least_squares() -> None:
                 r = np.diag(variance[rows])
                 error = r @ np.linalg.solve(covariance, signals @ [1.0, *found])
                 square[rows] += error**2 + np.diag(r - r @ np.linalg.solve(covariance, r))
-        found_values, count = expected_squared_errors(*arranged, constants)
+        found_values, count = estimate_squared_errors(*arranged, constants)
         np.testing.assert_allclose(found_values, square, rtol=1e-4, atol=1e-9)
         np.testing.assert_array_equal(count, np.isfinite(part.measurement_m).sum(axis=1))
 
 
 def test_likelihood_is_unchanged_if_imu_motion_is_subtracted() -> None:
     part = with_constants()
-    given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, centre_on_path(part))]
-    plain, found_values = (fit_positions(*each).scores()[0] for each in given)
+    given = [arguments(each, SOME_NOISES[0], WEIGHT) for each in (part, subtract_smooth_path(part))]
+    plain, found_values = (fit_positions(*each).compute_scores()[0] for each in given)
     assert np.ptp(plain) > 1.0
     np.testing.assert_allclose(found_values, plain, rtol=1e-7)
     # the signal of the scale is the path of each offset
     scaled = fit_positions(
-        *arguments(centre_on_path(part, has_scale=True), SOME_NOISES[0], WEIGHT)
+        *arguments(subtract_smooth_path(part, estimates_scale=True), SOME_NOISES[0], WEIGHT)
     ).gram
     way, speed = part.delta_position_m[:, 1:2], part.delta_velocity_m_s[:, 1:2]
     alone = replace(part, delta_position_m=way, delta_velocity_m_s=speed)
     one = fit_positions(
-        *arguments(centre_on_path(alone, has_scale=True), SOME_NOISES[0], WEIGHT)
+        *arguments(subtract_smooth_path(alone, estimates_scale=True), SOME_NOISES[0], WEIGHT)
     ).gram
     assert np.ptp(scaled[..., -1, -1]) > 1.0
     np.testing.assert_allclose(scaled[:, [1]], one, rtol=1e-7, atol=1e-7)
@@ -298,18 +317,18 @@ def test_likelihood_is_unchanged_if_imu_motion_is_subtracted() -> None:
 @pytest.mark.parametrize("which", ["filter", "constants"])
 def test_interpolated_likelihood_equals_computed_likelihood(which: str) -> None:
     """Equal over four decades of the ratio and of SIGMA_Z, except for a constant."""
-    parts = [kf_positions(preintegrate(modelled(seed, COUNT), TRUE)) for seed in (1, 2)]
+    parts = [convert_to_positions(preintegrate(modelled(seed, COUNT), TRUE)) for seed in (1, 2)]
     if which == "constants":
         part = with_constants(offsets=1)
         parts = [replace(part, added_process_noise=0.0 * part.added_process_noise)]
     some = np.exp(np.random.default_rng(4).uniform(-4.6, 1.0, (30, 2))).tolist()
-    direct = [negative_log_likelihood(parts, Noises(*pair), WEIGHT) for pair in some]
+    direct = [negative_log_likelihood(parts, NoiseParameters(*pair), WEIGHT) for pair in some]
     assert np.ptp(direct) > 100.0
     # far from the maximum the weak prior of the initial state has an effect
     for rough, error in ((False, 1e-6 if which == "filter" else 1e-4), (True, 2e-3)):
         score = Likelihood(parts, WEIGHT, 0.1, rough)
         assert score.is_interpolated
-        found_values = np.array([score(Noises(*pair)) for pair in some])
+        found_values = np.array([score(NoiseParameters(*pair)) for pair in some])
         expected = np.array(direct) - direct[0]
         np.testing.assert_allclose(found_values - found_values[0], expected, rtol=error, atol=1e-3)
 
@@ -341,9 +360,9 @@ def test_banded_likelihood_equals_that_of_kf_innovations(interval: float | None)
     weight = np.ones(len(legs.measurement_m))
     assert np.ptp(expected) > 50.0
     np.testing.assert_allclose(score_grid([legs], a, z, weight), expected, rtol=1e-9)
-    part = [kf_positions(legs)]
+    part = [convert_to_positions(legs)]
     found_values = np.array(
-        [negative_log_likelihood(part, Noises(*pair), weight) for pair in pairs]
+        [negative_log_likelihood(part, NoiseParameters(*pair), weight) for pair in pairs]
     )
     np.testing.assert_allclose(
         found_values - found_values[0], expected - expected[0], rtol=1e-6, atol=2e-3
@@ -352,7 +371,7 @@ def test_banded_likelihood_equals_that_of_kf_innovations(interval: float | None)
     weight = np.random.default_rng(1).uniform(0.01, 1.0, len(weight))
     grid = score_grid([legs], a, z, weight)
     found_values = np.array(
-        [negative_log_likelihood(part, Noises(*pair), weight) for pair in pairs]
+        [negative_log_likelihood(part, NoiseParameters(*pair), weight) for pair in pairs]
     )
     np.testing.assert_allclose(found_values - found_values[0], grid - grid[0], rtol=2e-3, atol=0.02)
 
@@ -366,12 +385,12 @@ def test_profile_likelihood_interval_of_parabola_is_1_96_sigma(slope: float) -> 
         along, across = (at - 1.0) / sigma, (other - 2.0 - slope * (at - 1.0)) / other_sigma
         return 0.5 * along**2 + 0.5 * across**2
 
-    reach = sigma * np.sqrt(2.0 * PROFILE_DROP)
-    ends = np.log(profile_ends(score, (1.0, 2.0), (np.exp(-4.0), np.exp(6.0))))
+    reach = sigma * np.sqrt(2.0 * MAX_LOG_LIKELIHOOD_DROP)
+    ends = np.log(find_profile_interval(score, (1.0, 2.0), (np.exp(-4.0), np.exp(6.0))))
     assert ends == pytest.approx((1.0 - reach, 1.0 + reach), abs=0.01 * reach)
     bounds = np.exp(1.0 - 0.5 * reach), np.exp(1.0 + 0.5 * reach)
-    assert profile_ends(score, (1.0, 2.0), bounds) == (None, None)
-    wide = np.log(profile_ends(score, (1.0, 2.0), (np.exp(-4.0), np.exp(6.0)), 4.0))
+    assert find_profile_interval(score, (1.0, 2.0), bounds) == (None, None)
+    wide = np.log(find_profile_interval(score, (1.0, 2.0), (np.exp(-4.0), np.exp(6.0)), 4.0))
     assert wide == pytest.approx((1.0 - 2.0 * reach, 1.0 + 2.0 * reach), abs=0.02 * reach)
 
 
@@ -401,8 +420,10 @@ def bursts(seed: int, share: float, length: int) -> Array:
 
 
 def noises_of(*axes: Axis) -> NoiseFit:
-    parts = [kf_positions(preintegrate(axis, TRUE)) for axis in axes]
-    return maximise_likelihood(parts, Noises(TRUE.sigma_a_m_s2, TRUE.sigma_z_m), np.ones(MANY))
+    parts = [convert_to_positions(preintegrate(axis, TRUE)) for axis in axes]
+    return maximise_likelihood(
+        parts, NoiseParameters(TRUE.sigma_a_m_s2, TRUE.sigma_z_m), np.ones(MANY)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -425,14 +446,14 @@ def test_maximum_likelihood_fit_finds_simulated_outliers(clean, share, size_m, l
             spoiled(east, outlier_probability, size_m, seed + 50),
         )
         found = noises_of(*axes)
-        ratio.append(found.noises.sigma_z_m / clean[seed].noises.sigma_z_m)
+        ratio.append(found.noise_parameters.sigma_z_m / clean[seed].noise_parameters.sigma_z_m)
         called = found.outlier_probability > 0.5
         hits += np.count_nonzero(called & outlier_probability[1:])
         wrong += np.count_nonzero(called & ~outlier_probability[1:])
         missed += np.count_nonzero(~called & outlier_probability[1:])
         # outliers have a low weight, all others weight 1
-        assert np.all(found.weight[called & outlier_probability[1:]] < 0.6)
-        assert np.median(found.weight) > 0.98
+        assert np.all(found.measurement_weights[called & outlier_probability[1:]] < 0.6)
+        assert np.median(found.measurement_weights) > 0.98
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.025)
     assert hits / (hits + missed) > least_found
     assert hits / (hits + wrong) > 0.9
@@ -464,21 +485,25 @@ def test_sigma_of_noise_estimate_equals_likelihood_curvature(axes, share, width)
     curved = np.linalg.inv(hessian(score, best, initial_step=0.05).ddf)[0, 0]
     sigma, wide = np.exp(best[0]), np.exp(best[1])
     over = square / sigma**2
-    found = _outlier_probability(over, np.full(4000, axes), float(expit(best[2])), float(wide))
-    widening = outlier_variance_factor(over, np.full(4000, axes), found, float(wide))
+    found = _compute_outlier_probability(
+        over, np.full(4000, axes), float(expit(best[2])), float(wide)
+    )
+    widening = compute_variance_inflation(over, np.full(4000, axes), found, float(wide))
     assert widening > 1.1
     assert widening == pytest.approx(curved * 2.0 * axes * 4000, rel=0.01)
 
 
 def test_maximum_likelihood_without_outlier_model_keeps_weights() -> None:
     weight = np.random.default_rng(1).uniform(0.2, 1.0, MANY)
-    parts = [kf_positions(preintegrate(pair(1)[0], TRUE))]
-    found = maximise_likelihood(parts, Noises(0.5, 0.1), weight, fits_outliers=False)
-    np.testing.assert_array_equal(found.weight, weight)
+    parts = [convert_to_positions(preintegrate(pair(1)[0], TRUE))]
+    found = maximise_likelihood(parts, NoiseParameters(0.5, 0.1), weight, fits_outliers=False)
+    np.testing.assert_array_equal(found.measurement_weights, weight)
     assert not found.outlier_probability.any()
-    best = negative_log_likelihood(parts, found.noises, weight)
+    best = negative_log_likelihood(parts, found.noise_parameters, weight)
     for a, z in ((1.1, 1.0), (0.9, 1.0), (1.0, 1.05), (1.0, 0.95)):
-        other = Noises(a * found.noises.sigma_a_m_s2, z * found.noises.sigma_z_m)
+        other = NoiseParameters(
+            a * found.noise_parameters.sigma_a_m_s2, z * found.noise_parameters.sigma_z_m
+        )
         assert negative_log_likelihood(parts, other, weight) > best
 
 
@@ -487,15 +512,15 @@ def test_outlier_probability_follows_bayes_rule() -> None:
     error = np.linspace(0.0, 6.0, 25)
     for axes in (1, 2):
         narrow = (1.0 - START_OUTLIER_FRACTION) * norm.pdf(error) ** axes
-        wide = START_OUTLIER_FRACTION * norm.pdf(error, scale=START_OUTLIER_WIDTH) ** axes
-        got = _outlier_probability(
-            axes * error**2, np.full(25, axes), START_OUTLIER_FRACTION, START_OUTLIER_WIDTH
+        wide = START_OUTLIER_FRACTION * norm.pdf(error, scale=START_OUTLIER_SIGMA_RATIO) ** axes
+        got = _compute_outlier_probability(
+            axes * error**2, np.full(25, axes), START_OUTLIER_FRACTION, START_OUTLIER_SIGMA_RATIO
         )
         np.testing.assert_allclose(got, wide / (wide + narrow), rtol=1e-9)
     # where the density underflows
     assert (
-        _outlier_probability(
-            np.array([1e200]), np.ones(1), START_OUTLIER_FRACTION, START_OUTLIER_WIDTH
+        _compute_outlier_probability(
+            np.array([1e200]), np.ones(1), START_OUTLIER_FRACTION, START_OUTLIER_SIGMA_RATIO
         )
         == 1.0
     )

@@ -32,7 +32,7 @@ from findings_tools import (
 
 from px4fuse.comparison.trials import RunStatistics, Trial
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.tuning import Noise
+from px4fuse.filter.tuning import NoiseEstimate
 from px4fuse.findings import cause_text, ekf2_noise, hidden_errors, loops, noises
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.noises import _has_default_noises
@@ -43,7 +43,7 @@ from px4fuse.loop.model import Closure, Loop, TrueEnd
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
 HOVERING = source(samples=positions(np.arange(0.0, 120.0)))
 ODOMETRY = source(samples=MOVING.samples, origin=DRIFTING)
-RIGHT = Noise(1.0, 0.9, 1.1)
+RIGHT = NoiseEstimate(1.0, 0.9, 1.1)
 
 
 def trial(
@@ -62,23 +62,27 @@ def trial(
 @pytest.mark.parametrize(
     ("chosen", "estimate", "expected"),
     [
-        (1.5, Noise(1.0, 0.99, 1.01), ("warning", 1.5)), (1.49, Noise(1.0, 0.99, 1.01), None),
+        (1.5, NoiseEstimate(1.0, 0.99, 1.01), ("warning", 1.5)),
+        (1.49, NoiseEstimate(1.0, 0.99, 1.01), None),
         (3.99, RIGHT, ("warning", 3.99)), (4.0, RIGHT, ("error", 4.0)),
         (0.25, RIGHT, ("error", 4.0)), (0.251, RIGHT, ("warning", 1.0 / 0.251)),
         # beyond the 95 % interval, widened 1.5 times on a log scale
-        (8.0, Noise(1.0, 0.25, 4.0), None), (8.1, Noise(1.0, 0.25, 4.0), ("error", 8.1)),
-        (0.125, Noise(1.0, 0.25, 4.0), None), (0.124, Noise(1.0, 0.25, 4.0), ("error", 8.1)),
+        (8.0, NoiseEstimate(1.0, 0.25, 4.0), None),
+        (8.1, NoiseEstimate(1.0, 0.25, 4.0), ("error", 8.1)),
+        (0.125, NoiseEstimate(1.0, 0.25, 4.0), None),
+        (0.124, NoiseEstimate(1.0, 0.25, 4.0), ("error", 8.1)),
         # bounded from above, or not at all
-        (0.75, Noise(None, None, 0.5), ("warning", 1.5)), (0.4, Noise(None, None, 0.5), None),
-        (0.1, Noise(None, None, 0.5), None), (9.0, Noise(None, None, None), None),
-        (0.1, Noise(1.0, None, 2.0), None), (9.0, Noise(1.0, 0.5, None), None),
+        (0.75, NoiseEstimate(None, None, 0.5), ("warning", 1.5)),
+        (0.4, NoiseEstimate(None, None, 0.5), None),
+        (0.1, NoiseEstimate(None, None, 0.5), None), (9.0, NoiseEstimate(None, None, None), None),
+        (0.1, NoiseEstimate(1.0, None, 2.0), None), (9.0, NoiseEstimate(1.0, 0.5, None), None),
         # a default setting is one level less severe
-        (0.1, Noise(0.033, 0.032, 0.034), ("note", 3.03)),
-        (0.101, Noise(0.033, 0.032, 0.034), ("warning", 3.06)),
+        (0.1, NoiseEstimate(0.033, 0.032, 0.034), ("note", 3.03)),
+        (0.101, NoiseEstimate(0.033, 0.032, 0.034), ("warning", 3.06)),
     ],
 )  # fmt: skip
 def test_wrong_noise_severity_depends_on_ratio_to_estimate(
-    chosen: float, estimate: Noise, expected: Any
+    chosen: float, estimate: NoiseEstimate, expected: Any
 ) -> None:
     off = noises.setting_deviation("sigma_z_m", chosen, estimate)
     if off is None or expected is None:
@@ -107,7 +111,7 @@ SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m":
     ],
 )  # fmt: skip
 def test_wrong_noise_report_recommends_noise_of_better_rerun(trials: Any, expected: Any) -> None:
-    fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11))
+    fitted = tuned(NoiseEstimate(0.5, 0.45, 0.55), NoiseEstimate(0.1, 0.09, 0.11))
     cause, other = noises.detect_wrong_settings(
         analysis(source=MOVING, tuning=fitted, trials=trials)
     )
@@ -129,7 +133,7 @@ def test_noise_finding_keeps_severity_error_if_kf_is_consistent(
     """A re-run shows no improvement if σ is consistent before and the position error unknown."""
     as_flown = RunStatistics(innovations=100, nis_mean=nis_mean, position_rmse_m=rmse_m)
     rerun = replace(trial(SIGMA_A_TO_0_1), before=as_flown, after=as_flown)
-    fitted = tuned(None, Noise(0.1, 0.09, 0.11))
+    fitted = tuned(None, NoiseEstimate(0.1, 0.09, 0.11))
     finding = only(
         noises.detect_wrong_settings, analysis(source=MOVING, tuning=fitted, trials=(rerun,))
     )
@@ -137,7 +141,7 @@ def test_noise_finding_keeps_severity_error_if_kf_is_consistent(
 
 
 def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
-    fitted = tuned(Noise(0.5, 0.45, 0.55), Noise(0.1, 0.09, 0.11))
+    fitted = tuned(NoiseEstimate(0.5, 0.45, 0.55), NoiseEstimate(0.1, 0.09, 0.11))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=fitted))
     assert worse.evidence["factor"] == pytest.approx(10.0)
     assert worse.message == (
@@ -145,7 +149,7 @@ def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
         "its maximum-likelihood estimate is 0.1 m/s² (95 % 0.09 to 0.11 m/s²). P grows too much "
         "between updates, so the gain is too large."
     )
-    small = tuned(Noise(2.0, 1.9, 2.1), Noise(9.0, 8.9, None))
+    small = tuned(NoiseEstimate(2.0, 1.9, 2.1), NoiseEstimate(9.0, 8.9, None))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=small))
     assert (
         "too small: KF lags behind the motion. SIGMA_A is 1 m/s²; its maximum-likelihood estimate "
@@ -155,7 +159,7 @@ def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
 
 
 def test_recommended_sigma_z_is_at_least_5_mm() -> None:
-    bounded = tuned(Noise(None, None, 0.0021))
+    bounded = tuned(NoiseEstimate(None, None, 0.0021))
     finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
     assert finding.remedy == "Compare this run with one that has --sigma-z 0.005."
     assert finding.title.startswith("SIGMA_Z is at least 480 times too large")
@@ -180,7 +184,9 @@ def test_too_large_noise_for_odometry_is_not_reported(
     parts: dict[str, Any], expected: list[str]
 ) -> None:
     estimate = 3.0 * (parts.get("settings") or CHOSEN).sigma_z_m
-    fitted = tuned(Noise(estimate, 0.9 * estimate, 1.1 * estimate), Noise(0.1, 0.09, 0.11))
+    fitted = tuned(
+        NoiseEstimate(estimate, 0.9 * estimate, 1.1 * estimate), NoiseEstimate(0.1, 0.09, 0.11)
+    )
     assert list(named(noises.detect_wrong_settings, analysis(tuning=fitted, **parts))) == expected
 
 
@@ -220,7 +226,7 @@ def test_near_zero_process_noise_report_contains_response_time() -> None:
     assert finding.title.startswith("Process noise SIGMA_A is almost zero (1 m/s²): KF ignores")
     assert "decreases to 0.05, so KF needs 5 s" in finding.message
     assert finding.evidence["response_s"] == pytest.approx(5.0)
-    one = analysis(axes=(following(0.05),), tuning=tuned(None, Noise(2.3456, 2.0, 3.0)),
+    one = analysis(axes=(following(0.05),), tuning=tuned(None, NoiseEstimate(2.3456, 2.0, 3.0)),
                    trials=(trial({"sigma_a_m_s2": 2.35}),))  # fmt: skip
     finding = only(noises.detect_process_noise_near_zero, one)
     assert finding.title == "SIGMA_A is 2.3 times too small: KF ignores new positions"
@@ -374,19 +380,22 @@ def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
 @pytest.mark.parametrize(
     ("one", "estimate", "parameters", "text"),
     [
-        (fused(0.1), Noise(0.3, 0.2, 0.4), {}, "Set EKF2_EVP_NOISE to 0.3 m (EKF2 uses 0.1 m)."),
-        (fused(0.1), Noise(0.124, 0.12, 0.13), {},
+        (fused(0.1), NoiseEstimate(0.3, 0.2, 0.4), {},
+         "Set EKF2_EVP_NOISE to 0.3 m (EKF2 uses 0.1 m)."),
+        (fused(0.1), NoiseEstimate(0.124, 0.12, 0.13), {},
          "EKF2's measurement noise (0.1 m) equals the estimated position"),
-        (fused(0.1, 0.2), Noise(0.081, 0.08, 0.09), {},
+        (fused(0.1, 0.2), NoiseEstimate(0.081, 0.08, 0.09), {},
          "EKF2's measurement noise (0.1 m) equals"),
         # a smaller noise than the sender reports: its variances must not be used
-        (fused(0.3, 0.2), Noise(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.1},
+        (fused(0.3, 0.2), NoiseEstimate(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.1},
          "Set EKF2_EV_NOISE_MD to 1 (EKF2"),
-        (fused(0.3, 0.2), Noise(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.25},
+        (fused(0.3, 0.2), NoiseEstimate(0.1, 0.09, 0.11), {"EKF2_EVP_NOISE": 0.25},
          "Set EKF2_EVP_NOISE to 0.1 m (EKF2"),
         # PX4's minimum, and a bound
-        (fused(0.3, 0.2), Noise(0.002, 0.001, 0.003), {}, "Set EKF2_EVP_NOISE to 0.01 m (EKF2"),
-        (fused(0.1), Noise(None, None, 0.2), {}, "Set EKF2_EVP_NOISE to 0.2 m (EKF2 uses 0.1 m)."),
+        (fused(0.3, 0.2), NoiseEstimate(0.002, 0.001, 0.003), {},
+         "Set EKF2_EVP_NOISE to 0.01 m (EKF2"),
+        (fused(0.1), NoiseEstimate(None, None, 0.2), {},
+         "Set EKF2_EVP_NOISE to 0.2 m (EKF2 uses 0.1 m)."),
     ],
 )  # fmt: skip
 def test_overconfident_ekf2_without_replay_gets_noise_advice(
@@ -501,7 +510,8 @@ def test_possible_drift_report_contains_loop_closure_error() -> None:
     assert finding.evidence == {"source": "uwb"}
     assert finding.message.endswith("innovations do not show the drift.")
     for noise, bound, value in (
-        (Noise(0.02, 0.01, 0.03), "", 0.02), (Noise(None, None, 0.04), "at most ", 0.04)
+        (NoiseEstimate(0.02, 0.01, 0.03), "", 0.02),
+        (NoiseEstimate(None, None, 0.04), "at most ", 0.04)
     ):  # fmt: skip
         one = analysis(source=ODOMETRY, tuning=tuned(noise), loop=closing(1.25))
         finding = only(hidden_errors.detect, one)

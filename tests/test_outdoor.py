@@ -32,7 +32,7 @@ from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.model import replay_settings
 from px4fuse.ekf2.whatif import HEADING_LOGGED_NOTE, what_if
 from px4fuse.errors import SettingsError
-from px4fuse.filter.consistency import nis_band
+from px4fuse.filter.consistency import compute_nis_band
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, source_clock
 from px4fuse.flight.model import Columns
@@ -129,7 +129,7 @@ def test_simulated_outdoor_flight_without_fault_is_consistent() -> None:
         assert (aid.verdict, len(aid.axes)) == ("consistent", axes)
         for axis in aid.axes.values():
             # simplifications of the model increase the NIS of GNSS velocity slightly
-            low, high = nis_band(axis.samples)
+            low, high = compute_nis_band(axis.samples)
             assert low < axis.nis_mean < 1.05 * high
     height = analysis.aids["baro_hgt"]
     assert (height.verdict, height.rejected_fraction) == ("consistent", 0.0)

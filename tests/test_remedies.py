@@ -16,7 +16,7 @@ from px4fuse.comparison.trials import RunStatistics, Trial, find_trial, has_effe
 from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.tuning import AxisTuning, Noise
+from px4fuse.filter.tuning import AxisTuning, NoiseEstimate
 from px4fuse.findings import Finding, ekf2_rejecting, find, source_clock
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
@@ -219,7 +219,7 @@ def test_height_with_other_noise_and_same_parameter_is_named(sample: Analysis) -
     """The sample fuses the horizontal position only."""
     down = sample.tuning["down"]
     assert isinstance(down, AxisTuning)
-    tuning = {"down": replace(down, **Noise(0.6, 0.5, 0.7).as_fields("sigma_z_m"))}
+    tuning = {"down": replace(down, **NoiseEstimate(0.6, 0.5, 0.7).as_fields("sigma_z_m"))}
     assert remedies.height_noise_advice(sample, tuning, 0.1) == ""
     flags = sample.flight.ekf2.fusion_flags.assign(vertical=1.0)
     ekf2 = replace(sample.flight.ekf2, fusion_flags=flags)

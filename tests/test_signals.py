@@ -19,8 +19,8 @@ from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import (
     Segment,
     aisle_heading,
+    compute_mean_step_acceleration,
     make_axes,
-    mean_step_acceleration,
     ned_acceleration,
     project_acceleration,
 )
@@ -130,7 +130,7 @@ def test_acceleration_mean_per_step_of_linear_signal_is_exact(gaps_ms, data):
     values = np.array(data.draw(st.lists(st.floats(-20, 20), min_size=count, max_size=count)))
     ends = data.draw(st.sets(st.integers(0, len(time) - 1), min_size=2))
     at = sorted(ends)
-    mean, _ = mean_step_acceleration(acceleration_of(time, values), time[at])
+    mean, _ = compute_mean_step_acceleration(acceleration_of(time, values), time[at])
     for step, (first, last) in enumerate(pairwise(at)):
         area = trapezoid(values[first : last + 1], time[first : last + 1])
         assert mean[step] == pytest.approx(area / (time[last] - time[first]), abs=1e-9)
@@ -149,7 +149,7 @@ def test_acceleration_mean_per_step_of_linear_signal_is_exact(gaps_ms, data):
 )  # fmt: skip
 def test_imu_gap_per_step_is_fraction_without_imu(time, edges, gaps):
     """In a gap between equal values the mean is that value; outside the data it is zero."""
-    mean, gap = mean_step_acceleration(acceleration_of(time, np.ones(len(time))), edges)
+    mean, gap = compute_mean_step_acceleration(acceleration_of(time, np.ones(len(time))), edges)
     np.testing.assert_allclose(gap, gaps, atol=1e-9)
     inside = np.clip(np.diff(np.clip(edges, time[0], time[-1])) / np.diff(edges), 0.0, 1.0)
     np.testing.assert_allclose(mean, inside, atol=1e-9)

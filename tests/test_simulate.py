@@ -15,10 +15,15 @@ from scipy.spatial.transform import Rotation
 
 import px4fuse
 from px4fuse.errors import SettingsError
-from px4fuse.filter.consistency import nis_band
+from px4fuse.filter.consistency import compute_nis_band
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Segment, make_axes, mean_step_acceleration, project_acceleration
+from px4fuse.filter.signals import (
+    Segment,
+    compute_mean_step_acceleration,
+    make_axes,
+    project_acceleration,
+)
 from px4fuse.findings import find
 from px4fuse.flight.model import Columns
 from px4fuse.simulation import sensors
@@ -158,7 +163,7 @@ def test_simulated_imu_noise_averaged_over_dt_equals_sigma_a(texts):
     frame = pd.DataFrame(error, index=imu.index)
     for axis in np.eye(3):
         signal = project_acceleration(frame, axis, Segment(0.0, time[-1], ""))
-        mean, _ = mean_step_acceleration(signal, np.arange(0.0, time[-1], DT_S))
+        mean, _ = compute_mean_step_acceleration(signal, np.arange(0.0, time[-1], DT_S))
         expected = np.hypot(0.2, 0.5 if texts else 0.0)
         assert np.std(mean) == pytest.approx(expected, rel=0.07)
 
@@ -372,7 +377,7 @@ def nis(scenario, names=("north", "east", "down")):
     for axis in make_axes(flight, flight.positions[0], Segment(start, end, ""), names=names):
         nu, s = innovations(preintegrate(axis, settings), settings.sigma_a_m_s2, settings.sigma_z_m)
         found.append(float(np.mean(nu**2 / s)))
-    return found, nis_band(len(nu))
+    return found, compute_nis_band(len(nu))
 
 
 @pytest.mark.parametrize(("errors", "off", "share"), [

@@ -12,7 +12,7 @@ from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.inputs import MODEL_NOTE
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.replay import Agreement
-from px4fuse.filter.consistency import nis_band
+from px4fuse.filter.consistency import compute_nis_band
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.flight.model import Flight, Unavailable
@@ -95,7 +95,7 @@ def test_simulated_ekf2_of_clean_flights_is_consistent():
         for axis in ("north", "east"):
             frame = fused(flight, axis)
             nis = frame["innovation_m"] ** 2 / frame["innovation_variance_m2"]
-            low, high = nis_band(len(frame))
+            low, high = compute_nis_band(len(frame))
             values.append(float(nis.mean()))
             inside.append(low < values[-1] < high)
             errors.append(rmse(flight, 10.0, 50.0, f"{axis}_m"))

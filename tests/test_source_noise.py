@@ -16,7 +16,7 @@ from px4fuse.comparison.trials import makes_overconfident
 from px4fuse.diagnose import find_faults
 from px4fuse.filter import correlated_noise
 from px4fuse.filter.correlated_noise import fit_time_correlation
-from px4fuse.filter.fitting import Noises
+from px4fuse.filter.fitting import NoiseParameters
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding, find
 from px4fuse.findings.source_noise import detect, detect_noise_variation
@@ -128,8 +128,8 @@ def test_correlated_noise_is_distinguished_from_low_pass_filter() -> None:
     assert "source_low_pass_filtered" in root_findings(smooth)
     for analysis, lags in ((slow, False), (smooth, True)):
         found = analysis.time_correlated_noise
-        assert found.gain_nats > 30.0
-        assert (found.low_pass_gain_nats > 1.0) == lags
+        assert found.likelihood_gain_nats > 30.0
+        assert (found.low_pass_likelihood_gain_nats > 1.0) == lags
         assert found.slow_m >= found.white_m
 
 
@@ -248,11 +248,13 @@ def test_time_correlation_fit_without_imu_is_unavailable() -> None:
     axis, given = analysis.axes["north"].axis, {"outlier_time_s": NONE, "clock_offset_s": 0.0}
     few = replace(axis, measurement_time_s=axis.measurement_time_s[:99],
                   measurement_m=axis.measurement_m[:99])  # fmt: skip
-    found = fit_time_correlation(analysis.flight, (few,), RIGHT, Noises(0.3, 0.1), **given)
+    found = fit_time_correlation(analysis.flight, (few,), RIGHT, NoiseParameters(0.3, 0.1), **given)
     assert isinstance(found, Unavailable)
     assert "99" in found.reason
     blind = replace(analysis.flight, imu=Unavailable("IMU", "no IMU", ""))
-    assert fit_time_correlation(blind, (axis,), RIGHT, Noises(0.3, 0.1), **given) == blind.imu
+    assert (
+        fit_time_correlation(blind, (axis,), RIGHT, NoiseParameters(0.3, 0.1), **given) == blind.imu
+    )
 
 
 def test_time_correlation_fit_tries_zero_and_estimated_offset(
@@ -264,10 +266,10 @@ def test_time_correlation_fit_tries_zero_and_estimated_offset(
         tried.append(offsets)
         return 0.0, noises[0]
 
-    monkeypatch.setattr(correlated_noise, "_best_of_grid", none_better)
+    monkeypatch.setattr(correlated_noise, "_search_coarse_grid", none_better)
     for offset_s in (0.0, 0.3, -0.2):
         fit_time_correlation(
-            analysis.flight, (analysis.axes["north"].axis,), RIGHT, Noises(0.3, 0.1),
+            analysis.flight, (analysis.axes["north"].axis,), RIGHT, NoiseParameters(0.3, 0.1),
             outlier_time_s=NONE, clock_offset_s=offset_s,
         )  # fmt: skip
     assert tried[::2] == tried[1::2] == [[0.0], [0.0, 0.3], [-0.2, 0.0]]

@@ -12,15 +12,15 @@ from scipy.interpolate import CubicSpline
 from scipy.stats import binom, norm
 
 from px4fuse.filter import fitting
-from px4fuse.filter.likelihood import PROFILE_DROP, innovations, preintegrate
+from px4fuse.filter.likelihood import MAX_LOG_LIKELIHOOD_DROP, innovations, preintegrate
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis
 from px4fuse.filter.tuning import (
     HORIZONTAL,
     MIN_MEASUREMENTS,
-    SIGMA_Z_SEARCH_M,
+    SIGMA_Z_SEARCH_RANGE_M,
     AxisTuning,
-    Noise,
+    NoiseEstimate,
     tune,
     tune_axes,
 )
@@ -72,7 +72,7 @@ def test_long_flight_fit_equals_fit_of_all_measurements(
     measured_m[outliers] += 1.5
     axis = replace(axis, measurement_m=measured_m)
     expected = tuned(axis)
-    monkeypatch.setattr(fitting, "FIRST_MEASUREMENTS", 400)
+    monkeypatch.setattr(fitting, "FIRST_MEASUREMENT_COUNT", 400)
     found = tuned(axis)
     for name in ("sigma_a_two_state", "sigma_z"):
         noise, expected_noise = getattr(found, name), getattr(expected, name)
@@ -163,7 +163,7 @@ def test_tuned_noise_intervals_equal_profile_likelihood() -> None:
     for grid, axis_of_other, noise in ends:
         profile = CubicSpline(np.log(grid), drops.min(axis=axis_of_other))
         for end in (noise.low, noise.high):
-            assert profile(np.log(end)) == pytest.approx(PROFILE_DROP, abs=0.1)
+            assert profile(np.log(end)) == pytest.approx(MAX_LOG_LIKELIHOOD_DROP, abs=0.1)
         assert noise.low < noise.value < noise.high
 
 
@@ -174,7 +174,7 @@ def test_tuned_noise_intervals_equal_profile_likelihood() -> None:
 def test_tune_on_noise_free_positions_gives_sigma_z_upper_limit(sigma_a: float) -> None:
     found = tuned(modelled(3, 500, sigma_a=sigma_a, sigma_z=0.0))
     assert found.sigma_z.value is found.sigma_z.low is None
-    assert SIGMA_Z_SEARCH_M[0] <= found.sigma_z.high < 0.003
+    assert SIGMA_Z_SEARCH_RANGE_M[0] <= found.sigma_z.high < 0.003
     assert found.sigma_a.low <= sigma_a <= found.sigma_a.high or sigma_a < 0.1
 
 
@@ -262,12 +262,12 @@ def test_tune_estimates_random_walk_of_drifting_source() -> None:
 @pytest.mark.parametrize(
     ("noise", "expected"),
     [
-        (Noise(None, None, None), "not identifiable"),
-        (Noise(None, None, 0.25), "at most 0.25"),
-        (Noise(None, 8.0, None), "at least 8"),
-        (Noise(0.1, None, 0.2), "0.1 (0-0.2)"),
-        (Noise(0.1, 0.05, None), "0.1 (0.05-?)"),
+        (NoiseEstimate(None, None, None), "not identifiable"),
+        (NoiseEstimate(None, None, 0.25), "at most 0.25"),
+        (NoiseEstimate(None, 8.0, None), "at least 8"),
+        (NoiseEstimate(0.1, None, 0.2), "0.1 (0-0.2)"),
+        (NoiseEstimate(0.1, 0.05, None), "0.1 (0.05-?)"),
     ],
 )
-def test_tuned_noise_text_has_interval_or_bound(noise: Noise, expected: str) -> None:
+def test_tuned_noise_text_has_interval_or_bound(noise: NoiseEstimate, expected: str) -> None:
     assert format_noise_estimate(noise) == expected

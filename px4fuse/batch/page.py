@@ -11,7 +11,7 @@ import pandas as pd
 from px4fuse.batch.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, RESULT_PATHS
 from px4fuse.card.model import RATIO_AXIS_ENDS
 from px4fuse.core.text import count_noun, format_metres, format_number, format_ratio, join_first
-from px4fuse.filter.consistency import CONSISTENT_RATIOS
+from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.findings import finding_title
 from px4fuse.html import frame
 from px4fuse.html.frame import Cell, Column, Row, Section
@@ -112,7 +112,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
         groups=[(EXTRA_COLUMN_GROUP, "more columns")],
         placeholder="search by name, vehicle, firmware or finding",
         full_table_note="The table fleet.csv contains all rows.",
-        ratio_axis={"bands": CONSISTENT_RATIOS, "ends": RATIO_AXIS_ENDS, "marks": MARK_PATHS},
+        ratio_axis={"bands": CONSISTENT_SIGMA_RATIOS, "ends": RATIO_AXIS_ENDS, "marks": MARK_PATHS},
     )
 
 

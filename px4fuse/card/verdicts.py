@@ -10,7 +10,7 @@ from px4fuse.card.model import Verdict
 from px4fuse.comparison.comparison import normalised_position_errors
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
 from px4fuse.core.arrays import Array
-from px4fuse.filter.consistency import Reference, classify_sigma_ratio, sigma_ratio_interval
+from px4fuse.filter.consistency import Reference, classify_sigma_ratio, compute_sigma_ratio_interval
 from px4fuse.flight.model import Unavailable
 
 # Length (s) of the bootstrap blocks: longer than the usual correlation time of position errors
@@ -37,7 +37,7 @@ def _verdict_against_source(result: AxisComparison, filter_name: FilterName) -> 
         filter=filter_name,
         against="source",
         ratio=summary.sigma_ratio,
-        interval=sigma_ratio_interval(summary.nis_mean, summary.nis_band),
+        interval=compute_sigma_ratio_interval(summary.nis_mean, summary.nis_band),
         word=summary.verdict,
         samples=summary.count,
     )

@@ -214,8 +214,8 @@ def _bias_changes(estimates: Estimates) -> list[Change]:
     if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_significant_bias():
         return []
     biases = {
-        FORWARD_BIAS: systematic_errors.forward_bias,
-        RIGHT_BIAS: systematic_errors.right_bias,
+        FORWARD_BIAS: systematic_errors.accelerometer_bias_forward,
+        RIGHT_BIAS: systematic_errors.accelerometer_bias_right,
     }
     return [{name: round(bias.value, 3) for name, bias in biases.items()}]
 

@@ -21,7 +21,12 @@ from px4fuse.comparison.model import (
     Updates,
 )
 from px4fuse.core.arrays import Array
-from px4fuse.filter.consistency import DEFAULT_GATE, HorizontalNis, assess, assess_horizontal
+from px4fuse.filter.consistency import (
+    DEFAULT_GATE,
+    HorizontalNis,
+    assess_horizontal_nis,
+    assess_innovations,
+)
 from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
 from px4fuse.filter.model import STATE_COLUMNS
 from px4fuse.filter.signals import Axis, Segment
@@ -110,7 +115,7 @@ def _compare_axis(
         ekf2_innovations=innovations,
         **tracks,
         flight_tracks=tracks
-        if segment.flight_s in (None, (segment.start_s, segment.end_s))
+        if segment.flight_span_s in (None, (segment.start_s, segment.end_s))
         else project_tracks(ekf2, flight.truth, axis, segment.flight),
     )
 
@@ -150,7 +155,7 @@ def _summarise_filter(
             innovations["innovation_m"],
             innovations["innovation_variance_m2"],
         )
-        consistency = assess(innovation_m.to_numpy(), variance_m2.to_numpy(), gate)
+        consistency = assess_innovations(innovation_m.to_numpy(), variance_m2.to_numpy(), gate)
         if not isinstance(consistency, Unavailable):
             return FilterSummary(**structs.asdict(consistency), **sigmas, truth=truth)
         innovations = consistency
@@ -330,6 +335,6 @@ def _horizontal_nis(axis_innovations: Mapping[str, TableOrUnavailable]) -> Horiz
         return None
     # Only updates with innovations along both axes (equal timestamps) are used
     north_and_east = pd.concat(tables, axis=1, join="inner").to_numpy().T
-    return assess_horizontal(
+    return assess_horizontal_nis(
         (north_and_east[0], north_and_east[1]), (north_and_east[2], north_and_east[3])
     )

@@ -20,18 +20,22 @@ from px4fuse.filter.correlated_noise import (
     fit_time_correlation,
     fit_time_correlation_to_truth,
 )
-from px4fuse.filter.fitting import Noises
+from px4fuse.filter.fitting import NoiseParameters
 from px4fuse.filter.frame_rotation import HeadingError, estimate_heading_error
-from px4fuse.filter.hypotheses import OUTLIERS_AFTER_STEP_S, SystematicErrors, fit_systematic_errors
+from px4fuse.filter.hypotheses import (
+    OUTLIER_RETEST_DURATION_S,
+    SystematicErrors,
+    fit_systematic_errors,
+)
 from px4fuse.filter.imu_motion import MAX_IMU_INTERVAL_S, MotionCache
 from px4fuse.filter.signals import AISLE, Axis
 from px4fuse.filter.time_offset import (
-    MAX_HALF_INTERVAL_S,
-    MIN_CHANGE_S,
+    MAX_OFFSET_HALF_INTERVAL_S,
+    MIN_TIME_OFFSET_CHANGE_S,
     ClockOffset,
     estimate_time_offset,
 )
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise, tune
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate, tune
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable, reset_times_s
 
 # Minimum IMU rate (Hz) for an estimate of the time offset
@@ -94,7 +98,7 @@ def first_axis_tuning(tuning: Tuning, *names: str) -> AxisTuning | None:
     )
 
 
-def value_or_bound(noise: Noise, fallback: float) -> float:
+def value_or_bound(noise: NoiseEstimate, fallback: float) -> float:
     """Return the estimate of a noise, else its upper bound, else ``fallback``."""
     return noise.value or noise.high or fallback
 
@@ -175,7 +179,9 @@ def estimate_noises_and_clock(
         comparison.source,
         comparison.segment,
         settings,
-        axis_tuning.noises if axis_tuning else Noises(settings.sigma_a_m_s2, settings.sigma_z_m),
+        axis_tuning.noises
+        if axis_tuning
+        else NoiseParameters(settings.sigma_a_m_s2, settings.sigma_z_m),
         axis_tuning.outlier_time_s if axis_tuning else None,
         progress,
         motion_cache,
@@ -241,7 +247,7 @@ def _fit_source_errors(
     # The exact time of a jump is unknown, so the measurements directly after it are excluded
     time_s, excluded_s = axes[0].measurement_time_s, axis_tuning.outlier_time_s
     for jump in jumps:
-        is_after_jump = (time_s >= jump.time_s) & (time_s < jump.time_s + OUTLIERS_AFTER_STEP_S)
+        is_after_jump = (time_s >= jump.time_s) & (time_s < jump.time_s + OUTLIER_RETEST_DURATION_S)
         excluded_s = np.union1d(excluded_s, time_s[is_after_jump])
     correlated_fit = fit_time_correlation(
         flight,
@@ -327,7 +333,7 @@ def widen_for_drift(clock_offset: ClockOffset) -> ClockOffset:
         for limit_s in clock_offset.interval_s
     )
     drift_reason = clock_offset.reason
-    if not drift_reason and (high_s - low_s) / 2.0 > MAX_HALF_INTERVAL_S:
+    if not drift_reason and (high_s - low_s) / 2.0 > MAX_OFFSET_HALF_INTERVAL_S:
         drift_reason = (
             "the time offset differs between parts of the flight, probably because the source "
             f"drifts (95 % {low_s:+.2f} s to {high_s:+.2f} s)"
@@ -352,7 +358,7 @@ def _largest_step_p_value(offsets_s: Array, weights: Array) -> float | None:
     """Return the p-value of the largest change of the time offset; None for a short flight.
 
     Method: Student's t-test of the mean offsets before and after each time, with Bonferroni
-    correction. Changes below ``MIN_CHANGE_S`` are ignored.
+    correction. Changes below ``MIN_TIME_OFFSET_CHANGE_S`` are ignored.
     """
     part_count = len(offsets_s)
     split_rows = range(MIN_PARTS_PER_SIDE, part_count - MIN_PARTS_PER_SIDE + 1)
@@ -370,7 +376,7 @@ def _largest_step_p_value(offsets_s: Array, weights: Array) -> float | None:
                 ]
             )[0]
         )
-        if abs(step_s) < MIN_CHANGE_S:
+        if abs(step_s) < MIN_TIME_OFFSET_CHANGE_S:
             continue
         variance_factor = max(
             1.0,

@@ -12,8 +12,8 @@ from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_settings
 from px4fuse.ekf2.replay import rows_inside
 from px4fuse.filter.signals import AISLE
-from px4fuse.filter.time_offset import MIN_OFFSET_S, MIN_OFFSET_SIGMAS, ClockOffset
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
+from px4fuse.filter.time_offset import MIN_OFFSET_SIGMAS, MIN_TIME_OFFSET_S, ClockOffset
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, PARAMETERS, Aid
 from px4fuse.flight.model import Unavailable
 
@@ -60,7 +60,7 @@ def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
         -0.5 * linear_coefficient / quadratic_coefficient,
         quadratic_coefficient**-0.5,
     )
-    limit_ms = max(1e3 * MIN_OFFSET_S, MIN_OFFSET_SIGMAS * sigma_ms)
+    limit_ms = max(1e3 * MIN_TIME_OFFSET_S, MIN_OFFSET_SIGMAS * sigma_ms)
     error_ms = abs(estimate_ms - model.inputs.settings[GNSS_POS.delay])
     return (estimate_ms, sigma_ms) if error_ms > limit_ms and estimate_ms >= 0.0 else None
 
@@ -159,7 +159,9 @@ def delay_ms(comparison: PreparedComparison) -> float | None:
     )
 
 
-def ml_noise_change(ekf2_inputs: Inputs, ml_noise: Noise, noise_m: float) -> dict[str, float]:
+def ml_noise_change(
+    ekf2_inputs: Inputs, ml_noise: NoiseEstimate, noise_m: float
+) -> dict[str, float]:
     """Return the EKF2 parameters for the position noise ``noise_m``.
 
     The mapping is empty if EKF2's noise is inside the 95 % interval of the estimate ``ml_noise``.

@@ -8,7 +8,7 @@ import numpy as np
 
 from px4fuse.comparison.model import FilterName
 from px4fuse.core.record import Count, NotNegative, Positive, Record, Share
-from px4fuse.filter.consistency import Reference, classify_sigma_ratio, nis_band
+from px4fuse.filter.consistency import Reference, classify_sigma_ratio, compute_nis_band
 from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
@@ -119,7 +119,9 @@ def _explanation_error(trial: Trial, statistic: Statistic) -> float:
 def is_sufficient(trial: Trial, statistic: Statistic) -> bool:
     """Return True if the change brings the mean NIS or mean NEES inside its limits."""
     low, high = (
-        nis_band(trial.after.innovations) if statistic == "nis" else (0.0, MIN_REPORTED_NEES)
+        compute_nis_band(trial.after.innovations)
+        if statistic == "nis"
+        else (0.0, MIN_REPORTED_NEES)
     )
     return low <= (trial.after.value(statistic) or np.nan) <= high
 

@@ -17,7 +17,7 @@ from scipy import constants
 from px4fuse.convention.model import HeadingSource
 from px4fuse.core.arrays import Array, BoolArray, cumulative_integral
 from px4fuse.ekf2.replay import inside_spans
-from px4fuse.filter.signals import imu_gaps
+from px4fuse.filter.signals import find_imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.trajectory.association import gap_limit, is_bracketed
 from px4fuse.trajectory.rotation import (
@@ -151,7 +151,7 @@ def read_inertial(flight: Flight) -> InertialData | None:
     airborne = flight.airborne
     if isinstance(airborne, Unavailable):
         airborne = ((float(time_s[0]), float(time_s[-1])),)
-    gap_rows = np.flatnonzero(imu_gaps(imu_s))
+    gap_rows = np.flatnonzero(find_imu_gaps(imu_s))
     recorded_spans_s = zip([-np.inf, *imu_s[gap_rows + 1]], [*imu_s[gap_rows], np.inf], strict=True)
     valid_spans_s = (
         (max(flight_start_s, recorded_from_s), min(flight_end_s, recorded_until_s))

@@ -14,7 +14,7 @@ import pandas as pd
 from px4fuse.core.arrays import Array, BoolArray, median_interval
 from px4fuse.core.record import Correlation, Count, NotNegative, Positive, Record, Share, Span
 from px4fuse.ekf2.heights import GNSS_HEIGHT_NOISE_FACTOR
-from px4fuse.filter.consistency import assess, classify_mean_nis, nis_band
+from px4fuse.filter.consistency import assess_innovations, classify_mean_nis, compute_nis_band
 from px4fuse.flight.ekf2_parameters import AIDS, Aid
 from px4fuse.flight.model import AidLog, Flight, Unavailable, longest_flight, step_values_at
 
@@ -215,7 +215,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
     longest_gap_s = _longest_gap(sample_s, is_fused & is_enabled, aid_log, start_s, end_s)
     axes = {}
     for axis_index, axis in enumerate(aid_log.axes):
-        consistency = assess(
+        consistency = assess_innovations(
             innovation[is_evaluated, axis_index],
             innovation_variance[is_evaluated, axis_index],
             gate,
@@ -347,7 +347,9 @@ def _aid_verdict(axes: dict[str, AidAxis], longest_gap_s: Span, fused_s: Array) 
         min_bias = max(MIN_BIAS_IN_SIGMA, MIN_BIAS_RATIO * math.sqrt(axis.nis_mean))
         if abs(axis.mean_normalised_innovation) > min_bias:
             return "biased"
-    return classify_mean_nis(_mean_nis(axes), nis_band(sum(axis.samples for axis in axes.values())))
+    return classify_mean_nis(
+        _mean_nis(axes), compute_nis_band(sum(axis.samples for axis in axes.values()))
+    )
 
 
 def _mean_nis(axes: Mapping[str, AidAxis]) -> float:

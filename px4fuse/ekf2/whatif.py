@@ -31,7 +31,7 @@ from px4fuse.ekf2.replay import (
     rows_inside,
 )
 from px4fuse.errors import SettingsError
-from px4fuse.filter.consistency import nis_band
+from px4fuse.filter.consistency import compute_nis_band
 from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, GNSS_VEL, MAG, check_parameters
 from px4fuse.flight.model import Columns, Ekf2, Flight, NedAxis, Unavailable
@@ -513,7 +513,7 @@ def _innovation_statistics(
 ) -> tuple[float, tuple[float, float], float]:
     nu = np.concatenate([updates[f"innovation_{axis}_m"] for axis in axes])
     S = np.concatenate([updates[f"innovation_variance_{axis}_m2"] for axis in axes])
-    return float(np.mean(nu**2 / S)), nis_band(len(nu)), float(np.std(nu))
+    return float(np.mean(nu**2 / S)), compute_nis_band(len(nu)), float(np.std(nu))
 
 
 def _summarise_aid(evaluated_updates: pd.DataFrame, evaluated_s: Spans) -> HeightSummary:

@@ -16,10 +16,10 @@ from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTr
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.explore.packing import COARSE_SCALE, Packer
-from px4fuse.filter.consistency import CONFIDENCE_LEVEL, CONSISTENT_RATIOS
+from px4fuse.filter.consistency import CONFIDENCE_LEVEL, CONSISTENT_SIGMA_RATIOS
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
-from px4fuse.filter.signals import AISLE, Acceleration, Axis, imu_gaps, weighted_sum
+from px4fuse.filter.signals import AISLE, Acceleration, Axis, find_imu_gaps, weighted_sum
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.ekf2_parameters import PARAMETERS
@@ -77,7 +77,7 @@ def ranges() -> PageData:
     return {
         "settings": {name: (low, high) for name, (low, high, *_) in SETTING_RANGES.items()},
         "lesson": asdict(Settings()),
-        "bands": CONSISTENT_RATIOS,
+        "bands": CONSISTENT_SIGMA_RATIOS,
         "ends": RATIO_AXIS_ENDS,
         "marks": MARK_PATHS,
     }
@@ -109,7 +109,7 @@ def _imu_data(comparison: Comparison, packer: Packer) -> PageData | str:
     if isinstance(acceleration, Unavailable):
         return acceleration.reason
     time_s = acceleration.time_s
-    gap_start_indices = np.flatnonzero(imu_gaps(time_s))
+    gap_start_indices = np.flatnonzero(find_imu_gaps(time_s))
     gap_edges_s = np.stack([time_s[gap_start_indices], time_s[gap_start_indices + 1]], 1)
     gap_sum_s = np.cumsum(np.diff(gap_edges_s, prepend=gap_edges_s[:, :1]))
     return {

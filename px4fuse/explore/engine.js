@@ -23,7 +23,7 @@ const Engine = (() => {
     return out;
   }
 
-  /* Mean acceleration of each step, and the fraction of the step within a gap (signals.mean_step_acceleration) */
+  /* Mean acceleration of each step, and the fraction of the step within a gap (signals.compute_mean_step_acceleration) */
   function stepMeans(imu, axis, edges) {
     const velocity = interp(edges, imu.time, axis.integral);
     const gap = interp(edges, imu.gapEdges, imu.gapSum);
@@ -150,7 +150,7 @@ const Engine = (() => {
     return { p: position, v: velocity, p00: variance };
   }
 
-  /* Statistics of innovations (consistency.assess); null for fewer than MIN_INNOVATIONS */
+  /* Statistics of innovations (consistency.assess_innovations); null for fewer than MIN_INNOVATIONS */
   function assess(nu, s) {
     let square = 0, outside = 0, product = 0, previous = 0;
     const n = nu.length;

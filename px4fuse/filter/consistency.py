@@ -38,7 +38,7 @@ LJUNG_BOX_LAGS = 10
 Reference = Literal["source", "truth"]
 # A filter is consistent if actual σ / reported σ is in this range. It is wider for ground truth,
 # because EKF2's σ excludes the lag of its output predictor
-CONSISTENT_RATIOS: Mapping[Reference, Limits] = {"source": (0.8, 1.25), "truth": (0.67, 1.5)}
+CONSISTENT_SIGMA_RATIOS: Mapping[Reference, Limits] = {"source": (0.8, 1.25), "truth": (0.67, 1.5)}
 # Innovation gate (√S) for KF and for logs without a gate parameter: default of EKF2_EVP_GATE
 DEFAULT_GATE = 5.0
 
@@ -104,12 +104,12 @@ class HorizontalNis(NisVerdict, kw_only=True):
     """
 
 
-def nis_band(count: int, dimensions: int = 1) -> Limits:
+def compute_nis_band(count: int, dimensions: int = 1) -> Limits:
     """Return the two-sided 95 % chi-square band of the mean of ``count`` NIS values.
 
     Each NIS is divided by its number of ``dimensions``, so that the expected mean is 1.
 
-    >>> low, high = nis_band(128, 2)
+    >>> low, high = compute_nis_band(128, 2)
     >>> round(2 * low, 2), round(2 * high, 2)
     (1.67, 2.36)
     """
@@ -127,27 +127,29 @@ def classify_sigma_ratio(
 ) -> SigmaVerdict:
     """Classify a filter by the ratio of its actual to its reported σ.
 
-    The filter is consistent if the ratio is inside :data:`CONSISTENT_RATIOS`, or if the 95 %
+    The filter is consistent if the ratio is inside :data:`CONSISTENT_SIGMA_RATIOS`, or if the 95 %
     ``interval`` of the ratio contains 1.
     """
-    low, high = CONSISTENT_RATIOS[reference]
+    low, high = CONSISTENT_SIGMA_RATIOS[reference]
     if low <= ratio <= high or (interval is not None and interval[0] <= 1.0 <= interval[1]):
         return "consistent"
     return "overconfident" if ratio > 1.0 else "underconfident"
 
 
-def sigma_ratio_interval(nis_mean: float, band: Limits) -> Limits:
+def compute_sigma_ratio_interval(nis_mean: float, nis_band: Limits) -> Limits:
     """Return the 95 % interval of √(mean NIS)."""
-    return (nis_mean / band[1]) ** 0.5, (nis_mean / band[0]) ** 0.5
+    return (nis_mean / nis_band[1]) ** 0.5, (nis_mean / nis_band[0]) ** 0.5
 
 
-def classify_mean_nis(nis_mean: float, band: Limits) -> SigmaVerdict:
-    return classify_sigma_ratio(nis_mean**0.5, "source", sigma_ratio_interval(nis_mean, band))
+def classify_mean_nis(nis_mean: float, nis_band: Limits) -> SigmaVerdict:
+    return classify_sigma_ratio(
+        nis_mean**0.5, "source", compute_sigma_ratio_interval(nis_mean, nis_band)
+    )
 
 
 def _nis_verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
     nis_mean = float(np.mean(nis)) / dimensions
-    mean_nis_band = nis_band(len(nis), dimensions)
+    mean_nis_band = compute_nis_band(len(nis), dimensions)
     return {
         "count": len(nis),
         "nis_mean": nis_mean,
@@ -157,10 +159,10 @@ def _nis_verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
     }
 
 
-def autocorrelation(values: Array, lag_count: int) -> Array:
+def compute_autocorrelation(values: Array, lag_count: int) -> Array:
     """Return the autocorrelation of a series at lags 1 to ``lag_count``: Σ ν(k) ν(k+l) / Σ ν(k)².
 
-    The mean is not subtracted: ``bias_p`` tests it.
+    The mean is not subtracted, because ``Consistency.bias_p`` tests it separately.
     """
     square_sum = float(np.dot(values, values))
     return np.array(
@@ -168,7 +170,7 @@ def autocorrelation(values: Array, lag_count: int) -> Array:
     )
 
 
-def assess(
+def assess_innovations(
     innovation_m: Array, innovation_variance_m2: Array, gate: float = DEFAULT_GATE
 ) -> Consistency | Unavailable:
     """Test innovations (in time order) against the innovation variances S that the filter reports.
@@ -192,21 +194,21 @@ def assess(
             "all innovations have the same value",
             "Check the position source; then analyse a longer segment.",
         )
-    normalised = nu_m / np.sqrt(variance_m2)
+    normalised_innovation = nu_m / np.sqrt(variance_m2)
     std_m = float(np.std(nu_m, ddof=1))
-    bias_t = float(np.sqrt(innovation_count) * np.mean(nu_m) / std_m)
+    mean_t_statistic = float(np.sqrt(innovation_count) * np.mean(nu_m) / std_m)
     lag_count = min(LJUNG_BOX_LAGS, innovation_count // 5)
-    autocorrelations = autocorrelation(normalised, lag_count)
+    autocorrelations = compute_autocorrelation(normalised_innovation, lag_count)
     ljung_box_terms = autocorrelations**2 / (innovation_count - np.arange(1, lag_count + 1))
     return Consistency(
-        **_nis_verdict_fields(normalised**2),
+        **_nis_verdict_fields(normalised_innovation**2),
         innovation_mean_m=float(np.mean(nu_m)),
         innovation_std_m=std_m,
         sqrt_s_median_m=float(np.median(np.sqrt(variance_m2))),
-        fraction_outside_two_sigma=float(np.mean(np.abs(normalised) > 2.0)),
-        fraction_outside_gate=float(np.mean(np.abs(normalised) > gate)),
-        bias_t=bias_t,
-        bias_p=float(2.0 * stdtr(innovation_count - 1, -abs(bias_t))),
+        fraction_outside_two_sigma=float(np.mean(np.abs(normalised_innovation) > 2.0)),
+        fraction_outside_gate=float(np.mean(np.abs(normalised_innovation) > gate)),
+        bias_t=mean_t_statistic,
+        bias_p=float(2.0 * stdtr(innovation_count - 1, -abs(mean_t_statistic))),
         lag1_autocorrelation=float(autocorrelations[0]),
         ljung_box_p=float(
             chdtrc(lag_count, innovation_count * (innovation_count + 2) * ljung_box_terms.sum())
@@ -215,7 +217,7 @@ def assess(
     )
 
 
-def assess_horizontal(north: ArrayPair, east: ArrayPair) -> HorizontalNis | None:
+def assess_horizontal_nis(north: ArrayPair, east: ArrayPair) -> HorizontalNis | None:
     """Test the innovations along north and east together; None if there are fewer than ten.
 
     ``north`` and ``east`` contain innovations (m) and innovation variances (m²) at equal times.

@@ -4,7 +4,7 @@ Both models are compared with white noise by the likelihood of the positions giv
 (:mod:`px4fuse.filter.imu_motion`).
 
 - Low pass: z_k = (1 - ρ) u_k + ρ z_(k-1), ρ = exp(-Δt/τ). The unfiltered positions u have white
-  noise and no lag. The likelihood of z is that of u times the Jacobian Π 1/(1 - ρ).
+  noise and no lag. The likelihood of z is that of u times |du/dz| = Π 1/(1 - ρ).
 - Time-correlated noise: z = p + c + v with c_k = ρ c_(k-1) + √(1 - ρ²) σ_c w. It causes no lag.
   Its fit may shift the timestamps, because a time offset also looks like a lag.
 
@@ -22,10 +22,10 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
 from px4fuse.core.arrays import Array
-from px4fuse.filter.fitting import NoiseFit, Noises, fit_noises, maximise_likelihood
-from px4fuse.filter.hypotheses import Jump, unit_steps
-from px4fuse.filter.imu_motion import MotionCache, PreparedMotion, prepare_motion
-from px4fuse.filter.likelihood import PROFILE_DROP
+from px4fuse.filter.fitting import NoiseFit, NoiseParameters, fit_with_noises, maximise_likelihood
+from px4fuse.filter.hypotheses import Jump, make_unit_steps
+from px4fuse.filter.imu_motion import MotionCache, PositionsAndImuMotion, compute_imu_motion
+from px4fuse.filter.likelihood import MAX_LOG_LIKELIHOOD_DROP
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Axis, too_few_measurements
 from px4fuse.flight.model import Flight, Unavailable
@@ -38,21 +38,24 @@ MAX_MEASUREMENTS = 2000
 MAX_INTERVAL_RATIO = 3.0
 # Time constants (s) in the coarse search for time-correlated noise
 COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
-# Time-correlated fractions of the variance SIGMA_Z² in the coarse search
-COARSE_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
+# Tested fractions σ_c² / SIGMA_Z² in the coarse search, where the white and the time-correlated
+# variance (σ_c²) together are SIGMA_Z²
+COARSE_CORRELATED_FRACTIONS = (0.12, 0.35, 0.8)
 # Tested multiples of SIGMA_A in the coarse search for time-correlated noise
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
 # In the coarse search for time-correlated noise, all noises are multiplied by these factors
 COARSE_NOISE_FACTORS = np.geomspace(0.7, 1.6, 12)
 # Approximate number of position measurements in the coarse search for time-correlated noise
-COARSE_MEASUREMENTS = 1000
-# Minimum gain of log-likelihood over white noise in the coarse search. Below it, no full fit is run
-MIN_COARSE_GAIN_NATS = 0.5
+COARSE_MEASUREMENT_COUNT = 1000
+# Minimum log-likelihood gain of time-correlated over white noise in the coarse search. Below it, no
+# full fit is run
+MIN_COARSE_LIKELIHOOD_GAIN_NATS = 0.5
 # Positions with a smaller SIGMA_Z (m) are probably low-pass filtered
-MAX_SMOOTH_SIGMA_M = 0.01
-# Minimum gain of log-likelihood over white noise to report time-correlated noise
-MIN_GAIN_NATS = 2.0
-# Penalty (nats) for shifted timestamps: 1 for each of two additional parameters (Akaike 1974)
+MAX_LOW_PASS_SIGMA_Z_M = 0.01
+# Minimum log-likelihood gain of time-correlated over white noise to report time-correlated noise
+MIN_LIKELIHOOD_GAIN_NATS = 2.0
+# Penalty (nats) for time-correlated noise with shifted timestamps, which has two more parameters
+# than a low-pass filter: 1 per parameter (Akaike 1974)
 OFFSET_PENALTY_NATS = 2.0
 # Search range (s) of the time constant of a low pass
 LOW_PASS_TAU_S = (0.02, 3.0)
@@ -60,17 +63,19 @@ LOW_PASS_TAU_S = (0.02, 3.0)
 LOG_TAU_TOLERANCE = 0.05
 # Maximum number of position errors against ground truth in the noise fit, to limit computing time
 MAX_TRUTH_MEASUREMENTS = 300
-# Minimum gain of log-likelihood over white noise in the noise fit to ground truth
-MIN_TRUTH_GAIN_NATS = 5.0
-# Minimum position error (m) against ground truth: smaller errors show that both are equal data
+# Minimum log-likelihood gain of time-correlated over white noise in the fit to the position errors
+# against ground truth
+MIN_TRUTH_LIKELIHOOD_GAIN_NATS = 5.0
+# If all position errors (m) against ground truth are smaller, ground truth is a copy of the
+# positions
 MIN_TRUTH_RESIDUAL_M = 1e-5
-# Maximum time (s) from a position to the nearest ground truth sample. Interpolation error: 1 cm at
-# 2 m/s²
-MAX_TRUTH_DISTANCE_S = 0.1
-# Number of flight parts; the noise fit to ground truth estimates one time offset for each part
-OFFSET_PART_COUNT = 12
+# Maximum time difference (s) between a position and the nearest ground truth sample. Interpolation
+# error: 1 cm at 2 m/s²
+MAX_TRUTH_TIME_DIFFERENCE_S = 0.1
+# The noise fit to ground truth estimates one time offset for each of this number of flight parts
+FLIGHT_PART_COUNT = 12
 # Tested time constants (s) of time-correlated noise in the noise fit to ground truth
-TRUTH_TAUS_S = np.geomspace(0.3, 80.0, 17)
+TESTED_TAUS_S = np.geomspace(0.3, 80.0, 17)
 # Tested time-correlated fractions of the error variance in the noise fit to ground truth
 CORRELATED_FRACTIONS = np.linspace(0.05, 0.999, 20)
 
@@ -85,7 +90,7 @@ class SourceLowPass:
         Correlation of the noise of successive positions; 0 without a low-pass filter.
     lag_s : float
         Lag of the positions at constant velocity.
-    gain_nats : float
+    likelihood_gain_nats : float
         Gain of log-likelihood over the model with white noise.
     sigma_z_m : float
         Standard deviation of the white position noise before the low-pass filter.
@@ -93,7 +98,7 @@ class SourceLowPass:
 
     correlation: float
     lag_s: float
-    gain_nats: float
+    likelihood_gain_nats: float
     sigma_z_m: float
 
 
@@ -107,9 +112,9 @@ class TimeCorrelatedNoise:
         Correlation time with its 95 % interval; ``high_s`` is infinite without ground truth.
     slow_m, white_m : float
         Standard deviations of time-correlated and white noise, per axis.
-    gain_nats : float
+    likelihood_gain_nats : float
         Gain of log-likelihood over white noise alone.
-    low_pass_gain_nats : float
+    low_pass_likelihood_gain_nats : float
         Log-likelihood of the model with a low-pass filter minus that with time-correlated noise.
     """
 
@@ -118,15 +123,15 @@ class TimeCorrelatedNoise:
     high_s: float
     slow_m: float
     white_m: float
-    gain_nats: float
-    low_pass_gain_nats: float
+    likelihood_gain_nats: float
+    low_pass_likelihood_gain_nats: float
 
 
 def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     flight: Flight,
     axes: tuple[Axis, ...],
     settings: Settings,
-    noises: Noises,
+    noise_parameters: NoiseParameters,
     *,
     outlier_time_s: Array,
     clock_offset_s: float,
@@ -140,7 +145,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     axes : tuple of Axis
         Axes with the same measurement times.
     settings : Settings
-    noises : Noises
+    noise_parameters : NoiseParameters
         Initial values: estimates with white noise.
     outlier_time_s : ndarray
         Timestamps of measurements to exclude.
@@ -170,81 +175,92 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     directions = np.array([axis.direction for axis in axes])
     motion_cache = MotionCache()
 
-    def undo_low_pass(tau_s: float) -> tuple[PreparedMotion | Unavailable, float]:
-        """Return the positions before the low-pass filter, and -ln of the Jacobian Π 1/(1 - ρ)."""
+    def undo_low_pass(tau_s: float) -> tuple[PositionsAndImuMotion | Unavailable, float]:
+        """Invert a low-pass filter with time constant ``tau_s``.
+
+        Return the unfiltered positions with their IMU motion, and -ln(Π 1/(1 - ρ)), the score term
+        of this change of variables.
+        """
         rho = np.zeros(len(time_s))
         if tau_s:
             rho[is_short_interval] = np.exp(-interval_s[is_short_interval] / tau_s)
-        previous_m = np.concatenate([measured_m[:1], measured_m[:-1]])
-        unfiltered_m = (measured_m - rho[:, None] * previous_m) / (1.0 - rho)[:, None]
+        previous_position_m = np.concatenate([measured_m[:1], measured_m[:-1]])
+        unfiltered_position_m = (measured_m - rho[:, None] * previous_position_m) / (1.0 - rho)[
+            :, None
+        ]
         # The inverse filter spreads an outlier to the next position, so both are excluded
         is_used_position = ~(is_outlier | (is_short_interval & np.append(False, is_outlier[:-1])))
-        prepared_motion = prepare_motion(
+        unfiltered_motion = compute_imu_motion(
             flight,
             time_s[is_used_position],
-            unfiltered_m[is_used_position],
+            unfiltered_position_m[is_used_position],
             directions=directions,
             dt_s=settings.dt_s,
             motion_cache=motion_cache,
         )
-        if isinstance(prepared_motion, Unavailable):
-            return prepared_motion, 0.0
+        if isinstance(unfiltered_motion, Unavailable):
+            return unfiltered_motion, 0.0
         # The likelihood omits the first position of each IMU segment: it is the initial state
         is_used = np.isin(
-            time_s, np.delete(prepared_motion.time_s, prepared_motion.segment_edges[:-1])
+            time_s, np.delete(unfiltered_motion.time_s, unfiltered_motion.segment_edges[:-1])
         )
-        return prepared_motion, len(axes) * float(np.sum(np.log1p(-rho[is_used])))
+        return unfiltered_motion, len(axes) * float(np.sum(np.log1p(-rho[is_used])))
 
-    prepared_motion, _ = undo_low_pass(0.0)
-    if isinstance(prepared_motion, Unavailable):
-        return prepared_motion
+    imu_motion, _ = undo_low_pass(0.0)
+    if isinstance(imu_motion, Unavailable):
+        return imu_motion
     tested_offsets_s = sorted({0.0, clock_offset_s})
-    sigma_z_m = noises.sigma_z_m
-    coarse_motion = prepared_motion.downsample(COARSE_MEASUREMENTS)
-    source_low_pass = SourceLowPass(0.0, 0.0, 0.0, sigma_z_m)  # no low pass
-    correlated_noises = [
+    sigma_z_m = noise_parameters.sigma_z_m
+    coarse_motion = imu_motion.downsample(COARSE_MEASUREMENT_COUNT)
+    # Result without a low-pass filter, if none is found below
+    source_low_pass = SourceLowPass(0.0, 0.0, 0.0, sigma_z_m)
+    correlated_candidates = [
         replace(
-            noises,
+            noise_parameters,
             sigma_z_m=sigma_z_m * (1.0 - fraction) ** 0.5,
             correlated_sigma_m=sigma_z_m * fraction**0.5,
             tau_s=tau,
         )
-        for fraction, tau in product(COARSE_VARIANCE_FRACTIONS, COARSE_TAUS_S)
+        for fraction, tau in product(COARSE_CORRELATED_FRACTIONS, COARSE_TAUS_S)
     ]
-    (white_score, _), (correlated_score, correlated_start) = (
-        _best_of_grid(coarse_motion, tested_offsets_s, candidate_noises)
-        for candidate_noises in ([noises], correlated_noises)
+    # Scores are -ln p
+    (coarse_white_score, _), (coarse_correlated_score, correlated_start_parameters) = (
+        _search_coarse_grid(coarse_motion, tested_offsets_s, candidate_parameters)
+        for candidate_parameters in ([noise_parameters], correlated_candidates)
     )
     no_correlation = Unavailable(
         "time-correlated noise of the positions", "the position errors are not time-correlated", ""
     )
-    is_smooth = sigma_z_m < MAX_SMOOTH_SIGMA_M
-    if white_score - correlated_score < MIN_COARSE_GAIN_NATS and not is_smooth:
+    is_smooth = sigma_z_m < MAX_LOW_PASS_SIGMA_Z_M
+    if (
+        coarse_white_score - coarse_correlated_score < MIN_COARSE_LIKELIHOOD_GAIN_NATS
+        and not is_smooth
+    ):
         return source_low_pass, no_correlation
     (white_fit, _), (correlated_fit, offset_s) = (
         min(
             (
-                (_fit_noises_at(prepared_motion, offset, start_noises), offset)
+                (_fit_noises_at(imu_motion, offset, start_parameters), offset)
                 for offset in tested_offsets_s
             ),
             key=lambda fit_and_offset: fit_and_offset[0].compute_score(),
         )
-        for start_noises in (noises, correlated_start)
+        for start_parameters in (noise_parameters, correlated_start_parameters)
     )
-    white_full_score = white_fit.compute_score()
-    correlated_score = correlated_fit.compute_score()
+    white_noise_score = white_fit.compute_score()
+    correlated_noise_score = correlated_fit.compute_score()
     # A low-pass filter also looks like time-correlated noise. It is only fitted if time-correlated
     # noise is significant, or if the positions are too smooth for white noise
-    is_correlated = white_full_score - correlated_score >= MIN_GAIN_NATS
+    is_correlated = white_noise_score - correlated_noise_score >= MIN_LIKELIHOOD_GAIN_NATS
     if not (is_correlated or is_smooth):
         return source_low_pass, no_correlation
 
-    def fit_low_pass(log_tau: float) -> tuple[float, Noises]:
-        prepared_motion, jacobian_term = undo_low_pass(float(np.exp(log_tau)))
-        # It was available for τ = 0, which has equal measurement times
-        assert not isinstance(prepared_motion, Unavailable)
-        noise_fit = _fit_noises_at(prepared_motion, 0.0, white_fit.noises)
-        return noise_fit.compute_score() + jacobian_term, noise_fit.noises
+    def fit_low_pass(log_tau: float) -> tuple[float, NoiseParameters]:
+        unfiltered_motion, jacobian_term = undo_low_pass(float(np.exp(log_tau)))
+        # unfiltered_motion was available for τ = 0, and the measurement times are the same
+        assert not isinstance(unfiltered_motion, Unavailable)
+        noise_fit = _fit_noises_at(unfiltered_motion, 0.0, white_fit.noise_parameters)
+        return noise_fit.compute_score() + jacobian_term, noise_fit.noise_parameters
 
     low_log_tau, high_log_tau = np.log(LOW_PASS_TAU_S)
     log_tau = minimize_scalar(
@@ -252,25 +268,28 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         bounds=(low_log_tau, high_log_tau),
         options={"xatol": LOG_TAU_TOLERANCE},
     ).x
-    low_pass_score, filtered_noises = fit_low_pass(log_tau)
-    if low_pass_score < white_full_score:
+    low_pass_score, unfiltered_parameters = fit_low_pass(log_tau)
+    if low_pass_score < white_noise_score:
         median_s = float(np.median(np.diff(time_s)))
         lag1_correlation = float(np.exp(-median_s / np.exp(log_tau)))
         lag_s = median_s * lag1_correlation / (1.0 - lag1_correlation)
         source_low_pass = SourceLowPass(
-            lag1_correlation, lag_s, white_full_score - low_pass_score, filtered_noises.sigma_z_m
+            lag1_correlation,
+            lag_s,
+            white_noise_score - low_pass_score,
+            unfiltered_parameters.sigma_z_m,
         )
     if not is_correlated:
         return source_low_pass, no_correlation
-    fitted_noises = correlated_fit.noises
+    fitted_parameters = correlated_fit.noise_parameters
     return source_low_pass, TimeCorrelatedNoise(
-        fitted_noises.tau_s,
-        fitted_noises.tau_s,
+        fitted_parameters.tau_s,
+        fitted_parameters.tau_s,
         np.inf,
-        fitted_noises.correlated_sigma_m,
-        fitted_noises.sigma_z_m,
-        white_full_score - correlated_score,
-        correlated_score - low_pass_score + (OFFSET_PENALTY_NATS if offset_s else 0.0),
+        fitted_parameters.correlated_sigma_m,
+        fitted_parameters.sigma_z_m,
+        white_noise_score - correlated_noise_score,
+        correlated_noise_score - low_pass_score + (OFFSET_PENALTY_NATS if offset_s else 0.0),
     )
 
 
@@ -286,19 +305,19 @@ def fit_time_correlation_to_truth(
     """Fit time-correlated noise to the position errors against ground truth.
 
     Frame errors and time offsets are removed from the errors. ``imu_fit`` and ``low_pass`` are the
-    results of :func:`fit_time_correlation`. ``imu_fit`` is returned if its gain of log-likelihood
-    is larger.
+    results of :func:`fit_time_correlation`. ``imu_fit`` is returned if the log-likelihood gain
+    of time-correlated over white noise is larger in it than in this fit.
     """
-    min_gain_nats = MIN_TRUTH_GAIN_NATS
-    low_pass_gain_nats = low_pass.gain_nats
+    min_likelihood_gain_nats = MIN_TRUTH_LIKELIHOOD_GAIN_NATS
+    low_pass_likelihood_gain_nats = low_pass.likelihood_gain_nats
     if isinstance(imu_fit, TimeCorrelatedNoise):
-        min_gain_nats = max(MIN_TRUTH_GAIN_NATS, imu_fit.gain_nats)
-        low_pass_gain_nats = imu_fit.low_pass_gain_nats
+        min_likelihood_gain_nats = max(MIN_TRUTH_LIKELIHOOD_GAIN_NATS, imu_fit.likelihood_gain_nats)
+        low_pass_likelihood_gain_nats = imu_fit.low_pass_likelihood_gain_nats
     true_track = pd.concat([truth["position_m"] for truth in truths], axis=1).dropna()
     measurement_time_s = np.setdiff1d(axes[0].measurement_time_s, outlier_time_s)
     measurement_time_s = measurement_time_s[
         true_track.index.get_indexer(
-            pd.Index(measurement_time_s), "nearest", tolerance=MAX_TRUTH_DISTANCE_S
+            pd.Index(measurement_time_s), "nearest", tolerance=MAX_TRUTH_TIME_DIFFERENCE_S
         )
         >= 0
     ]
@@ -314,25 +333,25 @@ def fit_time_correlation_to_truth(
     true_m, true_velocity_m_s = (
         true_spline(measurement_time_s + clock_offset_s, order) for order in (0, 1)
     )
-    part_indicators = np.eye(OFFSET_PART_COUNT)[
-        OFFSET_PART_COUNT * np.arange(len(measurement_time_s)) // len(measurement_time_s)
+    flight_part_indicators = np.eye(FLIGHT_PART_COUNT)[
+        FLIGHT_PART_COUNT * np.arange(len(measurement_time_s)) // len(measurement_time_s)
     ]
-    offset_columns = np.einsum("tp,ta->tpa", part_indicators, true_velocity_m_s).reshape(
-        len(measurement_time_s), -1
-    )
-    jump_columns = unit_steps(measurement_time_s, [jump.time_s for jump in jumps])
+    time_offset_columns = np.einsum(
+        "tp,ta->tpa", flight_part_indicators, true_velocity_m_s
+    ).reshape(len(measurement_time_s), -1)
+    jump_columns = make_unit_steps(measurement_time_s, [jump.time_s for jump in jumps])
     nuisance_columns = np.column_stack(
-        [np.ones_like(measurement_time_s), true_m, offset_columns, jump_columns]
+        [np.ones_like(measurement_time_s), true_m, time_offset_columns, jump_columns]
     )
     residual_basis = np.linalg.qr(nuisance_columns, mode="complete")[0][
         :, nuisance_columns.shape[1] :
     ]
     residuals = residual_basis.T @ (measured_m - true_m)
     if np.abs(residuals).max() < MIN_TRUTH_RESIDUAL_M:
-        return imu_fit  # ground truth is a copy of the positions
+        return imu_fit
     grid_scores = []
-    half_counts = 0.5 * np.array([len(axes), len(residuals)])
-    for tested_tau_s in TRUTH_TAUS_S:
+    half_axis_and_residual_count = 0.5 * np.array([len(axes), len(residuals)])
+    for tested_tau_s in TESTED_TAUS_S:
         correlation_matrix = (
             residual_basis.T
             @ np.exp(-np.abs(measurement_time_s[:, None] - measurement_time_s) / tested_tau_s)
@@ -343,7 +362,7 @@ def fit_time_correlation_to_truth(
         mean_squares = (
             ((eigenvectors.T @ residuals) ** 2).T @ (1.0 / relative_variance) / len(residuals)
         )
-        scores = half_counts @ [
+        scores = half_axis_and_residual_count @ [
             np.log(relative_variance).sum(axis=0),
             np.log(mean_squares).sum(axis=0),
         ]
@@ -351,14 +370,16 @@ def fit_time_correlation_to_truth(
     # Both arrays have the shape (time constants, correlated fractions)
     scores, mean_squares = np.transpose(grid_scores, (1, 0, 2))
     tau_index, fraction_index = divmod(int(np.argmin(scores)), len(CORRELATED_FRACTIONS))
-    gains_nats = half_counts[1] * np.log(np.mean(residuals**2, axis=0)).sum() - scores.min(axis=1)
-    if gains_nats.max() < min_gain_nats:
+    likelihood_gains_nats = half_axis_and_residual_count[1] * np.log(
+        np.mean(residuals**2, axis=0)
+    ).sum() - scores.min(axis=1)
+    if likelihood_gains_nats.max() < min_likelihood_gain_nats:
         return imu_fit
-    first_tau_index, last_tau_index = np.flatnonzero(gains_nats > gains_nats.max() - PROFILE_DROP)[
-        [0, -1]
-    ]
-    # The 95 % interval of τ ends between two tested values, of which the outer one is returned
-    tau_s = np.append(TRUTH_TAUS_S, np.inf)[
+    first_tau_index, last_tau_index = np.flatnonzero(
+        likelihood_gains_nats > likelihood_gains_nats.max() - MAX_LOG_LIKELIHOOD_DROP
+    )[[0, -1]]
+    # Each end of the 95 % interval of τ is between two tested values: return the outer of them
+    tau_s = np.append(TESTED_TAUS_S, np.inf)[
         [tau_index, max(first_tau_index - 1, 0), last_tau_index + 1]
     ]
     sigmas_m = np.sqrt(
@@ -368,39 +389,45 @@ def fit_time_correlation_to_truth(
         )
     )
     return TimeCorrelatedNoise(
-        *np.r_[tau_s, sigmas_m, gains_nats.max(), low_pass_gain_nats].tolist()
+        *np.r_[tau_s, sigmas_m, likelihood_gains_nats.max(), low_pass_likelihood_gain_nats].tolist()
     )
 
 
 def _fit_noises_at(
-    prepared_motion: PreparedMotion, offset_s: float, start_noises: Noises
+    imu_motion: PositionsAndImuMotion, offset_s: float, start_parameters: NoiseParameters
 ) -> NoiseFit:
     return maximise_likelihood(
-        [prepared_motion.positions_at_offset(offset_s)],
-        start_noises,
-        prepared_motion.weight,
+        [imu_motion.make_positions_at_offset(offset_s)],
+        start_parameters,
+        imu_motion.measurement_weights,
         fits_outliers=False,
     )
 
 
-def _best_of_grid(
-    prepared_motion: PreparedMotion, offsets_s: Sequence[float], candidate_noises: Sequence[Noises]
-) -> tuple[float, Noises]:
-    """Search a coarse grid of time offsets and noises; return the lowest -ln p and its noises."""
-    scored_noises = []
-    for positions in map(prepared_motion.positions_at_offset, offsets_s):
-        for candidate, sigma_a_factor in product(candidate_noises, COARSE_SIGMA_A_FACTORS):
-            noises = replace(candidate, sigma_a_m_s2=sigma_a_factor * candidate.sigma_a_m_s2)
-            total_scores = fit_noises([positions], noises, prepared_motion.weight).scores(
-                COARSE_NOISE_FACTORS
-            )[:, 0]
-            scored_noises.append(
+def _search_coarse_grid(
+    imu_motion: PositionsAndImuMotion,
+    offsets_s: Sequence[float],
+    candidate_parameters: Sequence[NoiseParameters],
+) -> tuple[float, NoiseParameters]:
+    """Return the lowest -ln p on a coarse grid of time offsets and noises, with its noises."""
+    scored_parameters = []
+    for positions in map(imu_motion.make_positions_at_offset, offsets_s):
+        for candidate, sigma_a_factor in product(candidate_parameters, COARSE_SIGMA_A_FACTORS):
+            noise_parameters = replace(
+                candidate, sigma_a_m_s2=sigma_a_factor * candidate.sigma_a_m_s2
+            )
+            total_scores = fit_with_noises(
+                [positions], noise_parameters, imu_motion.measurement_weights
+            ).compute_scores(COARSE_NOISE_FACTORS)[:, 0]
+            scored_parameters.append(
                 (
                     float(total_scores.min()),
                     float(COARSE_NOISE_FACTORS[np.argmin(total_scores)]),
-                    noises,
+                    noise_parameters,
                 )
             )
-    lowest_score, factor, noises = min(scored_noises, key=lambda scored: scored[0])
-    best_noises = {name: value * factor for name, value in vars(noises).items() if name != "tau_s"}
-    return lowest_score, replace(noises, **best_noises)
+    lowest_score, factor, noise_parameters = min(scored_parameters, key=lambda scored: scored[0])
+    best_parameters = {
+        name: value * factor for name, value in vars(noise_parameters).items() if name != "tau_s"
+    }
+    return lowest_score, replace(noise_parameters, **best_parameters)

@@ -25,10 +25,10 @@ class _LazyDistribution:
 
 def _import_kalman_filter() -> Any:
     if "scipy.stats" not in sys.modules:
-        stand_in = ModuleType("scipy.stats")
+        stub_module = ModuleType("scipy.stats")
         for name in ("norm", "multivariate_normal"):
-            setattr(stand_in, name, _LazyDistribution(name))
-        sys.modules["scipy.stats"] = stand_in
+            setattr(stub_module, name, _LazyDistribution(name))
+        sys.modules["scipy.stats"] = stub_module
         try:
             import filterpy.kalman  # noqa: PLC0415, F401 - loaded before scipy.stats is restored
         finally:

@@ -19,36 +19,37 @@ from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array, median_interval
 from px4fuse.core.record import NotNegative, Record, Share
-from px4fuse.filter.fitting import Noises, fit_noises, maximise_likelihood
+from px4fuse.filter.fitting import NoiseParameters, fit_with_noises, maximise_likelihood
 from px4fuse.filter.imu_motion import (
     MAX_IMU_INTERVAL_S,
     MIN_SEGMENT_MEASUREMENTS,
     MotionCache,
-    prepare_motion,
+    compute_imu_motion,
 )
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment, too_few_measurements
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.trajectory.rotation import heading
 
-# Length (s) of each flight part whose heading error is estimated from orientations
-PART_LENGTH_S = 2.0
-# Length (s) of each flight part whose heading error is estimated from positions
-POSITION_PART_S = 15.0
-# Minimum length (s) of a flight part whose heading error is estimated from positions
-MIN_POSITION_PART_S = 5.0
+# A flight is divided into parts, each with its own heading error. Duration (s) of a part if the
+# heading error is estimated from orientations
+FLIGHT_PART_DURATION_S = 2.0
+# Duration (s) of a flight part if the heading error is fitted to positions
+HEADING_FIT_DURATION_S = 15.0
+# Minimum duration (s) of a flight part if the heading error is fitted to positions
+MIN_HEADING_FIT_DURATION_S = 5.0
 # Minimum number of flight parts for a heading error from orientations
-MIN_FLIGHT_PARTS = 3
+MIN_FLIGHT_PART_COUNT = 3
 # Minimum number of positions for an estimate of the heading error
 MIN_MEASUREMENTS = 50
 # Minimum number of orientation samples in a flight part
-MIN_PART_SAMPLES = 3
+MIN_FLIGHT_PART_SAMPLES = 3
 # Maximum number of positions in the estimate of the heading error; more are downsampled
 MAX_MEASUREMENTS = 1000
 # The heading error changes in flight if the p-value of a constant error is below this limit
 MAX_DRIFT_P_VALUE = 0.002
 # Minimum reported change (°) of the heading error in flight
-MIN_DRIFT_DEG = 5.5
+MIN_HEADING_DRIFT_DEG = 5.5
 # Maximum yaw rate (°/s) for a comparison of headings: a delay of 0.2 s then causes 2° error
 MAX_YAW_RATE_DEG_S = 10.0
 # Minimum σ (°) of a heading difference between source and EKF2
@@ -58,7 +59,7 @@ MAX_ATTITUDE_INTERVAL_S = 0.11
 # Maximum number of iterations in the fit of the heading error
 MAX_LINEARISATIONS = 5
 # The fit has converged if an iteration changes the heading error by less than this angle (rad)
-MAX_CONVERGED_CHANGE_RAD = 0.01
+CONVERGED_HEADING_CHANGE_RAD = 0.01
 # Prior σ (rad) of the heading error
 HEADING_SIGMA_RAD = 1.0
 # Minimum estimated scale factor of the positions, to avoid a division by zero
@@ -84,7 +85,8 @@ class HeadingError(Record):
     misalignment_deg, sigma_deg : float
         Mean over the flight, and its σ.
     drifts : bool
-        True if the angle changes significantly and by at least ``MIN_DRIFT_DEG``.
+        True if the heading error drifts: the angle changes significantly and by at least
+        ``MIN_HEADING_DRIFT_DEG``.
     parts : tuple of HeadingPart
         Angles in consecutive parts of the flight, clockwise from above.
     drift_p : float
@@ -100,7 +102,7 @@ class HeadingError(Record):
     drift_p: Share
     by: Literal["orientation", "positions"]
 
-    def find_ends(self) -> tuple[HeadingPart, HeadingPart]:
+    def find_extreme_parts(self) -> tuple[HeadingPart, HeadingPart]:
         """Return flight parts with the smallest and the largest misalignment, in time order."""
         angles_deg = [heading_part.heading_error_deg for heading_part in self.parts]
         first_index, last_index = sorted((int(np.argmin(angles_deg)), int(np.argmax(angles_deg))))
@@ -114,7 +116,8 @@ def combine_heading_parts(
     return HeadingError(
         misalignment_deg=float(np.mean(angles_deg)),
         sigma_deg=float(np.mean([heading_part.sigma_deg for heading_part in parts])),
-        drifts=drift_p < MAX_DRIFT_P_VALUE and max(angles_deg) - min(angles_deg) >= MIN_DRIFT_DEG,
+        drifts=drift_p < MAX_DRIFT_P_VALUE
+        and max(angles_deg) - min(angles_deg) >= MIN_HEADING_DRIFT_DEG,
         parts=parts,
         drift_p=drift_p,
         by=method,
@@ -145,17 +148,19 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     """
     if isinstance(flight.attitude, Unavailable):
         return flight.attitude
-    if np.median(np.diff(flight.attitude.index)) > MAX_ATTITUDE_INTERVAL_S:
+    if (interval_s := np.median(np.diff(flight.attitude.index))) > MAX_ATTITUDE_INTERVAL_S:
         return Unavailable(
-            "heading error", "the attitude rate is too low", "Log the attitude at 10 Hz or more."
+            "heading error",
+            f"the attitude is logged at only {1.0 / interval_s:.1f} Hz",
+            "Log the attitude at 10 Hz or more.",
         )
-    orientation_result = None
+    orientation_heading_error = None
     if track.orientation is not None:
-        orientation_result = _compare_orientations(
+        orientation_heading_error = _compare_orientations(
             flight.attitude, track.orientation, segment, offset_s
         )
-        if orientation_result is not None and orientation_result.drifts:
-            return orientation_result
+        if orientation_heading_error is not None and orientation_heading_error.drifts:
+            return orientation_heading_error
     if isinstance(flight.imu, Unavailable):
         return flight.imu
     if np.median(np.diff(flight.imu.index)) > MAX_IMU_INTERVAL_S:
@@ -169,29 +174,35 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
         :: int(np.ceil(len(position_samples) / MAX_MEASUREMENTS))
     ]
     position_samples = position_samples.set_axis(position_samples.index.to_numpy() + offset_s)
-    noises = Noises(settings.sigma_a_m_s2, sigma_z_m)
+    noise_parameters = NoiseParameters(settings.sigma_a_m_s2, sigma_z_m)
     # The mounting angle of the source is unknown, so orientations do not give the misalignment.
     # They show only that it is constant
     return _estimate_from_positions(
         flight,
         position_samples,
-        noises,
+        noise_parameters,
         settings.dt_s,
-        has_constant_heading=orientation_result is not None,
+        has_constant_heading=orientation_heading_error is not None,
     )
 
 
-def _mean_per_part(
+def _average_flight_parts(
     time_s: Array, misalignment_rad: Array, sigma_rad: Array
 ) -> tuple[HeadingPart, ...]:
     """Average yaw misalignment and σ (rad) over flight parts of equal duration.
 
-    Parts with fewer than ``MIN_PART_SAMPLES`` samples are omitted. The errors in one part are
-    correlated, so σ of the mean is the RMS of the samples' σ.
+    Parts with fewer than ``MIN_FLIGHT_PART_SAMPLES`` samples are omitted. The errors in one part
+    are correlated, so σ of the mean is the RMS of the samples' σ.
     """
-    # If samples are rare, parts are longer than PART_LENGTH_S, to contain enough samples
+    # At a low sample rate, parts are longer than FLIGHT_PART_DURATION_S, to contain enough samples
     part_count = max(
-        int(min((time_s[-1] - time_s[0]) / PART_LENGTH_S, len(time_s) / (2 * MIN_PART_SAMPLES))), 1
+        int(
+            min(
+                (time_s[-1] - time_s[0]) / FLIGHT_PART_DURATION_S,
+                len(time_s) / (2 * MIN_FLIGHT_PART_SAMPLES),
+            )
+        ),
+        1,
     )
     part_edges_s = np.linspace(time_s[0], time_s[-1], part_count + 1)[1:-1]
     rows_by_part = np.split(np.arange(len(time_s)), np.searchsorted(time_s, part_edges_s))
@@ -203,7 +214,7 @@ def _mean_per_part(
             sigma_deg=float(np.degrees(np.sqrt(np.mean(sigma_rad[part_rows] ** 2)))),
         )
         for part_rows in rows_by_part
-        if len(part_rows) >= MIN_PART_SAMPLES
+        if len(part_rows) >= MIN_FLIGHT_PART_SAMPLES
     )
 
 
@@ -219,7 +230,7 @@ def _compare_orientations(
     time_s = orientation_samples.index.to_numpy() + offset_s
     attitude_time_s = attitude.index.to_numpy()
     is_covered = (time_s >= attitude_time_s[0]) & (time_s <= attitude_time_s[-1])
-    if np.count_nonzero(is_covered) < MIN_FLIGHT_PARTS * MIN_PART_SAMPLES:
+    if np.count_nonzero(is_covered) < MIN_FLIGHT_PART_COUNT * MIN_FLIGHT_PART_SAMPLES:
         return None
     source_yaw_rad = heading_rad(orientation_samples)[is_covered]
     time_s = time_s[is_covered]
@@ -227,27 +238,27 @@ def _compare_orientations(
     misalignment_rad = source_yaw_rad - ekf2_yaw_rad
     misalignment_rad -= 2.0 * np.pi * np.round(np.median(misalignment_rad) / (2.0 * np.pi))
     has_low_yaw_rate = np.abs(np.gradient(ekf2_yaw_rad, time_s)) < np.radians(MAX_YAW_RATE_DEG_S)
-    if np.count_nonzero(has_low_yaw_rate) < MIN_FLIGHT_PARTS * MIN_PART_SAMPLES:
+    if np.count_nonzero(has_low_yaw_rate) < MIN_FLIGHT_PART_COUNT * MIN_FLIGHT_PART_SAMPLES:
         return None
     time_s = time_s[has_low_yaw_rate]
     misalignment_rad = misalignment_rad[has_low_yaw_rate]
     # Robust σ from the median absolute difference of successive samples
     noise_rad = 1.4826 * np.median(np.abs(np.diff(misalignment_rad))) / np.sqrt(2.0)
     sigma_rad = np.full(len(time_s), max(float(noise_rad), np.radians(MIN_SIGMA_DEG)))
-    part_headings = _mean_per_part(time_s, misalignment_rad, sigma_rad)
-    if len(part_headings) < MIN_FLIGHT_PARTS:
+    heading_parts = _average_flight_parts(time_s, misalignment_rad, sigma_rad)
+    if len(heading_parts) < MIN_FLIGHT_PART_COUNT:
         return None
-    angles_deg = np.array([heading_part.heading_error_deg for heading_part in part_headings])
+    angles_deg = np.array([heading_part.heading_error_deg for heading_part in heading_parts])
     chi_square = np.sum((angles_deg - angles_deg.mean()) ** 2) / np.degrees(sigma_rad[0]) ** 2
     return combine_heading_parts(
-        part_headings, float(chdtrc(len(part_headings) - 1, chi_square)), "orientation"
+        heading_parts, float(chdtrc(len(heading_parts) - 1, chi_square)), "orientation"
     )
 
 
 def _estimate_from_positions(
     flight: Flight,
     position_samples: pd.DataFrame,
-    noises: Noises,
+    noise_parameters: NoiseParameters,
     dt_s: float,
     *,
     has_constant_heading: bool,
@@ -257,12 +268,14 @@ def _estimate_from_positions(
     With ``has_constant_heading``, all parts have equal heading errors.
     """
     time_s = position_samples.index.to_numpy()
-    part_length_s = max(POSITION_PART_S, 2 * MIN_SEGMENT_MEASUREMENTS * median_interval(time_s))
+    fit_duration_s = max(
+        HEADING_FIT_DURATION_S, 2 * MIN_SEGMENT_MEASUREMENTS * median_interval(time_s)
+    )
     motion_cache = MotionCache()
     misalignment_rad = 0.0
     for _ in range(MAX_LINEARISATIONS):
         cosine, sine = np.cos(misalignment_rad), np.sin(misalignment_rad)
-        motion = prepare_motion(
+        motion = compute_imu_motion(
             flight,
             time_s,
             position_samples.to_numpy() @ np.array([[cosine, -sine], [sine, cosine]]),
@@ -270,61 +283,64 @@ def _estimate_from_positions(
             dt_s=dt_s,
             motion_cache=motion_cache,
             heading_sigma_rad=HEADING_SIGMA_RAD,
-            max_segment_s=part_length_s,
+            max_segment_s=fit_duration_s,
         )
         if isinstance(motion, Unavailable):
             return structs.replace(motion, what="heading error")
         spans_s = motion.time_s[
             np.column_stack([motion.segment_edges[:-1], motion.segment_edges[1:] - 1])
         ]
-        is_long = np.ptp(spans_s, axis=1) >= MIN_POSITION_PART_S
+        is_long = np.ptp(spans_s, axis=1) >= MIN_HEADING_FIT_DURATION_S
         if not is_long.any():
             return Unavailable(
                 "heading error",
                 "the longest part of the flight without an IMU gap is shorter than "
-                f"{MIN_POSITION_PART_S:g} s",
+                f"{MIN_HEADING_FIT_DURATION_S:g} s",
                 "Analyse a longer segment.",
             )
-        part_positions = motion.positions_at_offset(0.0)
+        positions = motion.make_positions_at_offset(0.0)
         # The derivative with respect to the heading is the smoothed path: IMU noise in it would
         # bias the estimate towards zero (errors in variables)
-        for increments in (part_positions.delta_position_m, part_positions.delta_velocity_m_s):
+        for increments in (positions.delta_position_m, positions.delta_velocity_m_s):
             north_m, east_m = increments[:, :, -1]
             increments[:, :, HEADING_ERROR_INDEX] = -east_m, north_m
-        noises = maximise_likelihood(
-            [part_positions], noises, motion.weight, fits_outliers=False
-        ).noises
-        fitted_positions = fit_noises([part_positions], noises, motion.weight)
-        constants = fitted_positions.constants()[is_long, 0]
-        constant_covariance = np.linalg.inv(fitted_positions.information())[is_long, 0]
-        # The smoothed path has the scale of the positions, so the result is divided by it
-        position_scale = np.maximum(1.0 + constants[:, -1], MIN_POSITION_SCALE)
-        error_rad = constants[:, HEADING_ERROR_INDEX] / position_scale
+        noise_parameters = maximise_likelihood(
+            [positions], noise_parameters, motion.measurement_weights, fits_outliers=False
+        ).noise_parameters
+        fitted_positions = fit_with_noises(
+            [positions], noise_parameters, motion.measurement_weights
+        )
+        fitted_constants = fitted_positions.estimate_constants()[is_long, 0]
+        constants_covariance = np.linalg.inv(fitted_positions.compute_information())[is_long, 0]
+        # The smoothed path of the derivative has the scale factor of the positions. The fitted
+        # heading error is therefore divided by this factor
+        position_scale = np.maximum(1.0 + fitted_constants[:, -1], MIN_POSITION_SCALE)
+        error_rad = fitted_constants[:, HEADING_ERROR_INDEX] / position_scale
         heading_variance = (
-            constant_covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX] / position_scale**2
+            constants_covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX] / position_scale**2
         )
         correction_rad, weight_sum = np.average(
             error_rad, weights=1.0 / heading_variance, returned=True
         )
         misalignment_rad += float(correction_rad)
-        if abs(correction_rad) < MAX_CONVERGED_CHANGE_RAD:
+        if abs(correction_rad) < CONVERGED_HEADING_CHANGE_RAD:
             break
     deviation_rad = error_rad - correction_rad
     # Variance of the estimates = variance of the true heading errors + estimation variance
     excess_variance = max(float(np.mean(deviation_rad**2 - heading_variance)), 0.0)
     drift_variance = 0.0 if has_constant_heading else excess_variance
-    # An estimate with a large variance is moved towards the mean (shrinkage)
+    # Shrinkage: the deviation of an uncertain flight part from the mean heading error is reduced
     drift_fraction = drift_variance / (drift_variance + heading_variance)
     misalignment_rad = float(np.angle(np.exp(1j * misalignment_rad)))
-    part_columns = [
+    heading_part_columns = [
         spans_s[is_long],
         np.degrees(misalignment_rad + drift_fraction * deviation_rad),
         np.degrees(np.sqrt(1.0 / weight_sum + drift_fraction * heading_variance)),
     ]
     chi_square = float(np.sum(deviation_rad**2 / heading_variance))
-    has_test = len(heading_variance) > 1 and not has_constant_heading
+    is_drift_tested = len(heading_variance) > 1 and not has_constant_heading
     return combine_heading_parts(
-        tuple(HeadingPart(*row) for row in np.column_stack(part_columns).tolist()),
-        float(chdtrc(len(heading_variance) - 1, chi_square)) if has_test else 1.0,
+        tuple(HeadingPart(*row) for row in np.column_stack(heading_part_columns).tolist()),
+        float(chdtrc(len(heading_variance) - 1, chi_square)) if is_drift_tested else 1.0,
         "positions",
     )

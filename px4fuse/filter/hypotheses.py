@@ -1,9 +1,10 @@
 """Estimate of biases, scale factor error and jumps from KF's innovations.
 
 KF is linear: an error of the positions or of the acceleration adds its response to the innovations.
-The response to an error of size 1 is a column of a design matrix. Least squares, weighted by S,
-estimates all errors together (generalised likelihood ratio, Willsky and Jones 1976): accelerometer
-biases, a rotation of the frame, a slow tilt error and jumps of the positions.
+The response to an error of size 1 (1 m/s², 1 rad or 1 m) is a column of a design matrix. Least
+squares, weighted by S, estimates all errors together (generalised likelihood ratio, Willsky and
+Jones 1976): accelerometer biases, a rotation of the frame, a slow tilt error and jumps of the
+positions.
 
 A scale factor also multiplies the acceleration noise, which would bias the regression (errors in
 variables). The scale factor is therefore found by fits with several scale factors (Deming 1943).
@@ -25,7 +26,7 @@ from scipy.special import chdtri
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, cumulative_integral
 from px4fuse.filter.likelihood import (
-    Preintegrated,
+    PreintegratedMotion,
     innovations,
     integrate_acceleration,
     parabola_vertex,
@@ -43,34 +44,37 @@ TILT_SIGMA_RAD = 0.002
 # Interval (s) between the knots of the slow acceleration error, which is piecewise linear
 KNOT_SPACING_S = 15.0
 MAX_KNOTS = 40
-# Columns of the design matrix: accelerometer bias forward, accelerometer bias right, frame rotation
-FORWARD, RIGHT, ROTATION = range(3)
-CONSTANT_COUNT = 3
-# Tested multiples of KF's SIGMA_A. If biases and tilt are estimated, less noise remains
+# Columns of the design matrix: accelerometer bias forward (body axis x) and right (y), and rotation
+# of the position source's frame about the vertical
+FORWARD_COLUMN, RIGHT_COLUMN, ROTATION_COLUMN = range(3)
+CONSTANT_ERROR_COUNT = 3
+# Tested multiples of KF's SIGMA_A. Most are below 1, because KF's SIGMA_A also covers biases and
+# tilt, which are estimated here
 TESTED_SIGMA_A_FACTORS = np.geomspace(0.2, 2.0, 7)
 # Tested scale factors of the position source
-SCALE_GRID = np.linspace(0.7, 1.3, 7)
+TESTED_SCALE_FACTORS = np.linspace(0.7, 1.3, 7)
 # Maximum number of times at which a jump of the positions is tested
-MAX_TESTED_TIMES = 800
+MAX_TESTED_JUMP_TIMES = 800
 # Number of jump times that are tested at once, to limit the memory
-STEP_BATCH_SIZE = 80
+JUMP_BATCH_SIZE = 80
 # Positions within this time (s) after a tested jump are ignored: a burst of outliers is no jump
 OUTLIER_BURST_S = 1.0
-# Outliers within this time (s) after a jump are tested again: they may agree with the jump
-OUTLIERS_AFTER_STEP_S = 6.0
+# Outliers within this time (s) after a jump are tested again: positions after a jump look like
+# outliers
+OUTLIER_RETEST_DURATION_S = 6.0
 # Maximum false alarm probability of a jump, per flight
-MAX_STEP_FALSE_ALARM_P = 1e-3
+MAX_JUMP_FALSE_ALARM_P = 1e-3
 # Probability that a good measurement near a jump is classified as an outlier
 MAX_FALSE_OUTLIER_P = 1e-3
 # Maximum number of times that are tested to find the exact time of a detected jump
-MAX_CANDIDATE_TIMES = 6
+MAX_CANDIDATE_JUMP_TIMES = 6
 MAX_JUMPS = 3
 # Minimum accelerometer bias (m/s²) that is reported: half of EKF2_ABL_LIM
 MIN_BIAS_M_S2 = 0.2
 # Minimum ratio of an accelerometer bias to its σ to report it: false alarm rate 6e-5
-MIN_BIAS_SIGMAS = 4.0
-# Minimum number of measurements before and after a jump
-MIN_SIDE_MEASUREMENTS = 8
+MIN_BIAS_TO_SIGMA_RATIO = 4.0
+# Minimum number of measurements on each side of a jump: before it and after it
+MIN_MEASUREMENTS_PER_SIDE = 8
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Jump:
-    """Lasting jump of the positions: time, length along each axis (m), and test statistic χ²."""
+    """Lasting jump of the positions: time, change along each axis (m), and test statistic χ²."""
 
     time_s: float
     step_m: tuple[Estimate, ...]
@@ -100,7 +104,7 @@ class SystematicErrors:
 
     Attributes
     ----------
-    forward_bias, right_bias : Estimate
+    accelerometer_bias_forward, accelerometer_bias_right : Estimate
         Accelerometer bias (m/s²). At constant heading, a tilt error has an equal effect.
     rotation : Estimate
         Yaw of the position source's frame relative to the attitude (rad, clockwise from above).
@@ -110,8 +114,8 @@ class SystematicErrors:
         White noise of the acceleration that remains after the fit.
     """
 
-    forward_bias: Estimate
-    right_bias: Estimate
+    accelerometer_bias_forward: Estimate
+    accelerometer_bias_right: Estimate
     rotation: Estimate
     scale: Estimate
     jumps: tuple[Jump, ...]
@@ -119,14 +123,15 @@ class SystematicErrors:
 
     def compute_bias(self) -> Estimate:
         """Return the magnitude of the horizontal accelerometer bias (m/s²)."""
-        forward, right = self.forward_bias, self.right_bias
+        forward_bias, right_bias = self.accelerometer_bias_forward, self.accelerometer_bias_right
         return Estimate(
-            math.hypot(forward.value, right.value), math.hypot(forward.sigma, right.sigma)
+            math.hypot(forward_bias.value, right_bias.value),
+            math.hypot(forward_bias.sigma, right_bias.sigma),
         )
 
     def has_significant_bias(self) -> bool:
         bias = self.compute_bias()
-        return bias.value >= max(MIN_BIAS_M_S2, MIN_BIAS_SIGMAS * bias.sigma)
+        return bias.value >= max(MIN_BIAS_M_S2, MIN_BIAS_TO_SIGMA_RATIO * bias.sigma)
 
 
 def fit_systematic_errors(
@@ -170,13 +175,15 @@ def fit_systematic_errors(
     )
     if jumps:
         design = replace(
-            design, step_columns=unit_steps(design.time_s, [jump.time_s for jump in jumps])
+            design, jump_columns=make_unit_steps(design.time_s, [jump.time_s for jump in jumps])
         )
         sigma_a, design_fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
-    forward_bias, right_bias, frame_rotation = map(design_fit.estimate, (FORWARD, RIGHT, ROTATION))
+    accelerometer_bias_forward, accelerometer_bias_right, frame_rotation = map(
+        design_fit.estimate, (FORWARD_COLUMN, RIGHT_COLUMN, ROTATION_COLUMN)
+    )
     return SystematicErrors(
-        forward_bias,
-        right_bias,
+        accelerometer_bias_forward,
+        accelerometer_bias_right,
         frame_rotation,
         _fit_scale(design, sigma_a, is_skipped),
         jumps,
@@ -208,23 +215,26 @@ def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
 def _fit_scale(design: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> Estimate:
     """Estimate the scale factor error of the positions from fits with several scale factors."""
     fit_at = cache(
-        lambda grid_index: design.fit(sigma_a, is_skipped, float(SCALE_GRID[grid_index]))
+        lambda grid_index: design.fit(sigma_a, is_skipped, float(TESTED_SCALE_FACTORS[grid_index]))
     )
-    # ln S is omitted from the score: it grows with the scale and would bias the estimate to zero
+    # ln S is omitted from the score: the innovation variance S grows with the scale factor, so ln S
+    # would bias the estimated scale factor to zero
     lowest_index = _index_of_minimum(
-        lambda grid_index: fit_at(grid_index).square_sum, len(SCALE_GRID)
+        lambda grid_index: fit_at(grid_index).square_sum, len(TESTED_SCALE_FACTORS)
     )
-    grid_index = int(np.clip(lowest_index, 1, len(SCALE_GRID) - 2))
+    grid_index = int(np.clip(lowest_index, 1, len(TESTED_SCALE_FACTORS) - 2))
     scores_at_minimum = [
         fit_at(grid_index + grid_shift).square_sum / 2.0 for grid_shift in (-1, 0, 1)
     ]
     vertex_shift, curvature = parabola_vertex(np.array(scores_at_minimum), 1)
-    grid_step = float(SCALE_GRID[1] - SCALE_GRID[0])
+    grid_step = float(TESTED_SCALE_FACTORS[1] - TESTED_SCALE_FACTORS[0])
     if curvature <= 0.0:
         return Estimate(0.0, float("inf"))
-    best_scale = SCALE_GRID[grid_index] + float(np.clip(vertex_shift, -1.5, 1.5)) * grid_step
+    best_scale = (
+        TESTED_SCALE_FACTORS[grid_index] + float(np.clip(vertex_shift, -1.5, 1.5)) * grid_step
+    )
     scale_sigma = grid_step / np.sqrt(curvature) * max(fit_at(grid_index).residual_rms, 1.0)
-    rotation_factor = np.hypot(1.0, fit_at(grid_index).coefficients[ROTATION])
+    rotation_factor = np.hypot(1.0, fit_at(grid_index).coefficients[ROTATION_COLUMN])
     return Estimate(float(best_scale * rotation_factor - 1.0), float(scale_sigma))
 
 
@@ -238,31 +248,29 @@ def _find_jumps(
     """
     jumps: list[Jump] = []
 
-    def skip_burst_after(jump_s: float) -> BoolArray:
+    def make_skip_mask(jump_s: float) -> BoolArray:
         # The positions after a reset of the source are used: they are no burst of outliers
         if jump_s in source_resets_s:
-            return is_skipped & ~_is_in_window(design.time_s, jump_s, OUTLIERS_AFTER_STEP_S)
+            return is_skipped & ~_is_in_window(design.time_s, jump_s, OUTLIER_RETEST_DURATION_S)
         return is_skipped | _is_in_window(design.time_s, jump_s, OUTLIER_BURST_S)
 
     for _ in range(MAX_JUMPS):
         design = replace(
-            design, step_columns=unit_steps(design.time_s, [jump.time_s for jump in jumps])
+            design, jump_columns=make_unit_steps(design.time_s, [jump.time_s for jump in jumps])
         )
         outlier_run_starts = design.time_s[
             np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
         jump_times = [
             *source_resets_s,
-            *_significant_step_times(design, sigma_a, is_skipped, outlier_run_starts),
-            *_significant_step_times(design, sigma_a, is_skipped)[:1],
+            *_find_significant_jump_times(design, sigma_a, is_skipped, outlier_run_starts),
+            *_find_significant_jump_times(design, sigma_a, is_skipped)[:1],
         ]
-        false_alarm_p = MAX_STEP_FALSE_ALARM_P / max(len(outlier_run_starts), 1)
+        false_alarm_p = MAX_JUMP_FALSE_ALARM_P / max(len(outlier_run_starts), 1)
         significant_jumps = [
             jump
             for time_s in jump_times
-            if (
-                jump := _test_step(design, sigma_a, skip_burst_after(time_s), time_s, false_alarm_p)
-            )
+            if (jump := _test_jump(design, sigma_a, make_skip_mask(time_s), time_s, false_alarm_p))
         ]
         if not significant_jumps:
             break
@@ -277,11 +285,11 @@ def _find_jumps(
     return tuple(sorted(jumps, key=lambda jump: jump.time_s)), is_skipped
 
 
-def _is_in_window(time_s: Array, start_s: float, length_s: float) -> BoolArray:
-    return np.asarray((time_s >= start_s) & (time_s < start_s + length_s))
+def _is_in_window(time_s: Array, start_s: float, duration_s: float) -> BoolArray:
+    return np.asarray((time_s >= start_s) & (time_s < start_s + duration_s))
 
 
-def _significant_step_times(
+def _find_significant_jump_times(
     design: DesignMatrix,
     sigma_a: float,
     is_skipped: BoolArray,
@@ -292,14 +300,14 @@ def _significant_step_times(
     By default, all measurement times are tested.
     """
     if candidate_times_s is None:
-        candidate_times_s = design.time_s[MIN_SIDE_MEASUREMENTS:-MIN_SIDE_MEASUREMENTS]
+        candidate_times_s = design.time_s[MIN_MEASUREMENTS_PER_SIDE:-MIN_MEASUREMENTS_PER_SIDE]
         candidate_times_s = candidate_times_s[
-            :: max(1, -(-len(candidate_times_s) // MAX_TESTED_TIMES))
+            :: max(1, -(-len(candidate_times_s) // MAX_TESTED_JUMP_TIMES))
         ]
     if not len(candidate_times_s):
         return []
-    chi_square = _step_chi_squares(design, sigma_a, is_skipped, candidate_times_s)
-    min_chi_square = chdtri(design.axis_count, MAX_STEP_FALSE_ALARM_P / len(design.time_s))
+    chi_square = _compute_jump_chi_squares(design, sigma_a, is_skipped, candidate_times_s)
+    min_chi_square = chdtri(design.axis_count, MAX_JUMP_FALSE_ALARM_P / len(design.time_s))
     descending_order = np.argsort(-chi_square)
     return [
         float(candidate_times_s[index])
@@ -308,90 +316,96 @@ def _significant_step_times(
     ]
 
 
-def _step_chi_squares(
+def _compute_jump_chi_squares(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, candidate_times_s: Array
 ) -> Array:
     """Return χ² of a jump at each time: the decrease of the sum of squared residuals."""
-    whitened_innovations, columns, log_variance_sum = design.whitened_design(sigma_a, is_skipped)
+    whitened_innovations, columns, log_variance_sum = design.whiten_design(sigma_a, is_skipped)
     fit_without_jump = design.regress(whitened_innovations, columns, log_variance_sum, is_skipped)
     columns = columns[:, ~is_skipped]
     chi_squares = np.zeros(len(candidate_times_s))
     for batch in np.array_split(
-        np.arange(len(candidate_times_s)), -(-len(candidate_times_s) // STEP_BATCH_SIZE)
+        np.arange(len(candidate_times_s)), -(-len(candidate_times_s) // JUMP_BATCH_SIZE)
     ):
-        step_signals = unit_steps(design.time_s, candidate_times_s[batch])
-        zero_signal = np.broadcast_to(0.0, step_signals.shape)
-        step_response = design.whitened(
-            zero_signal, zero_signal, step_signals, sigma_a, is_skipped
+        jump_steps = make_unit_steps(design.time_s, candidate_times_s[batch])
+        zero_increments = np.broadcast_to(0.0, jump_steps.shape)
+        jump_response = design.whiten_inputs(
+            zero_increments, zero_increments, jump_steps, sigma_a, is_skipped
         )[0][~is_skipped]
         for axis_index in range(design.axis_count):
             axis_residual = fit_without_jump.residual[fit_without_jump.axis == axis_index]
-            cross_product = columns[axis_index].T @ step_response
-            step_information = np.sum(step_response**2, axis=0) - np.sum(
+            cross_product = columns[axis_index].T @ jump_response
+            jump_information = np.sum(jump_response**2, axis=0) - np.sum(
                 cross_product * (fit_without_jump.covariance @ cross_product), axis=0
             )
             chi_squares[batch] += (
-                axis_residual @ step_response / fit_without_jump.compute_axis_rms()[axis_index]
-            ) ** 2 / np.maximum(step_information, 1e-9)
+                axis_residual @ jump_response / fit_without_jump.compute_axis_rms()[axis_index]
+            ) ** 2 / np.maximum(jump_information, 1e-9)
     return chi_squares
 
 
 def _locate_jump(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, jump: Jump
 ) -> tuple[Jump, BoolArray]:
-    """Return a detected jump with its exact time and length, and a mask of outliers."""
+    """Return a detected jump with its exact time and change (m), and a mask of outliers to skip."""
     is_near = np.abs(design.time_s - jump.time_s) <= OUTLIER_BURST_S
-    # Measurements near the jump are excluded. Later outliers are used if they agree with the jump
-    residual_squares = design.with_step(jump.time_s)[0].residual_squares(
+    # Fit with the jump, without the measurements within OUTLIER_BURST_S of its time. Later outliers
+    # are used again if their residual is now small
+    residual_squares = design.add_jump(jump.time_s)[0].compute_residual_squares(
         sigma_a, is_skipped | is_near
     )
-    is_after = is_near | _is_in_window(design.time_s, jump.time_s, OUTLIERS_AFTER_STEP_S)
+    is_near_or_after_jump = is_near | _is_in_window(
+        design.time_s, jump.time_s, OUTLIER_RETEST_DURATION_S
+    )
     max_residual_square = chdtri(design.axis_count, MAX_FALSE_OUTLIER_P)
-    is_skipped = np.where(is_after & ~is_near, residual_squares > max_residual_square, is_skipped)
+    is_skipped = np.where(
+        is_near_or_after_jump & ~is_near, residual_squares > max_residual_square, is_skipped
+    )
     candidate_times_s = design.time_s[is_near]
     best_indices = np.argsort(
-        -_step_chi_squares(design, sigma_a, is_skipped & ~is_near, candidate_times_s)
-    )[:MAX_CANDIDATE_TIMES]
-    outliers_by_time = {}
+        -_compute_jump_chi_squares(design, sigma_a, is_skipped & ~is_near, candidate_times_s)
+    )[:MAX_CANDIDATE_JUMP_TIMES]
+    outlier_mask_by_jump_time = {}
     for jump_s in candidate_times_s[best_indices].tolist():
-        residual_squares = design.with_step(jump_s)[0].residual_squares(
+        residual_squares = design.add_jump(jump_s)[0].compute_residual_squares(
             sigma_a, is_skipped | is_near
         )
-        outliers_by_time[jump_s] = np.where(
+        outlier_mask_by_jump_time[jump_s] = np.where(
             is_near, residual_squares > max_residual_square, is_skipped
         )
     # With a wrong jump time, good measurements look like outliers: use the time with the fewest
     best_time_s = min(
-        outliers_by_time, key=lambda jump_s: np.count_nonzero(outliers_by_time[jump_s])
+        outlier_mask_by_jump_time,
+        key=lambda jump_s: np.count_nonzero(outlier_mask_by_jump_time[jump_s]),
     )
-    is_skipped = outliers_by_time[best_time_s]
-    stepped_design, step_column_indices = design.with_step(best_time_s)
-    design_fit = stepped_design.fit(sigma_a, is_skipped)
-    step_m = tuple(design_fit.estimate(int(column)) for column in step_column_indices)
+    is_skipped = outlier_mask_by_jump_time[best_time_s]
+    jump_design, jump_column_indices = design.add_jump(best_time_s)
+    design_fit = jump_design.fit(sigma_a, is_skipped)
+    step_m = tuple(design_fit.estimate(int(column)) for column in jump_column_indices)
     return replace(jump, time_s=best_time_s, step_m=step_m), is_skipped
 
 
-def _test_step(
+def _test_jump(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, time_s: float, false_alarm_p: float
 ) -> Jump | None:
     """Test for a jump at ``time_s``, and return it if it is significant."""
-    design, step_column_indices = design.with_step(time_s)
+    design, jump_column_indices = design.add_jump(time_s)
     count_before = np.count_nonzero(~is_skipped & (design.time_s < time_s))
     if (
         min(count_before, np.count_nonzero(~is_skipped & (design.time_s >= time_s)))
-        < MIN_SIDE_MEASUREMENTS
+        < MIN_MEASUREMENTS_PER_SIDE
     ):
         return None
     design_fit = design.fit(sigma_a, is_skipped)
-    jump_m = design_fit.coefficients[step_column_indices]
-    step_covariance = design_fit.covariance[np.ix_(step_column_indices, step_column_indices)]
-    jump_m = jump_m / design_fit.compute_axis_rms()
-    chi_square = float(jump_m @ np.linalg.solve(step_covariance, jump_m))
-    if chi_square < chdtri(len(step_column_indices), false_alarm_p):
+    normalised_jump = design_fit.coefficients[jump_column_indices]
+    jump_covariance = design_fit.covariance[np.ix_(jump_column_indices, jump_column_indices)]
+    normalised_jump = normalised_jump / design_fit.compute_axis_rms()
+    chi_square = float(normalised_jump @ np.linalg.solve(jump_covariance, normalised_jump))
+    if chi_square < chdtri(len(jump_column_indices), false_alarm_p):
         return None
     return Jump(
         time_s,
-        tuple(design_fit.estimate(int(column)) for column in step_column_indices),
+        tuple(design_fit.estimate(int(column)) for column in jump_column_indices),
         chi_square,
     )
 
@@ -424,12 +438,12 @@ class DesignFit:
     residual_rms: float
 
     def compute_axis_rms(self) -> Array:
-        """Return the RMS residual along each axis in √S, but at least 1."""
+        """Return the RMS residual (in √S) along each axis; 1 if it is smaller."""
         mean_square = np.bincount(self.axis, self.residual**2) / np.bincount(self.axis)
         return np.sqrt(np.maximum(mean_square, 1.0))
 
     def estimate(self, column: int) -> Estimate:
-        """Return a coefficient with its σ, multiplied by ``residual_rms`` if this is above 1."""
+        """Return a coefficient and its σ, which is multiplied by ``residual_rms`` if above 1."""
         coefficient_sigma = float(np.sqrt(self.covariance[column, column])) * max(
             self.residual_rms, 1.0
         )
@@ -438,54 +452,66 @@ class DesignFit:
 
 @dataclass(frozen=True)
 class DesignMatrix:
-    """Inputs of KF along several axes: the data, and the effect of each tested error of size 1.
+    """Inputs of KF along several axes, for the data and for each error of size 1.
+
+    KF's responses to the data are innovations; its responses to the errors are the columns of the
+    design matrix.
 
     Attributes
     ----------
     time_s : ndarray, shape (m,)
         Timestamps of the measurements.
-    signals : Preintegrated
-        Four columns for each axis: data, and effects of 1 m/s² forward bias, 1 m/s² right bias and
-        1 rad rotation. Last columns, for all axes: slow acceleration error (piecewise linear).
+    preintegrated_columns : PreintegratedMotion
+        Four columns for each axis: data, 1 m/s² forward bias, 1 m/s² right bias and 1 rad rotation.
+        Last columns, shared by the axes: slow acceleration error of 1 m/s² at each knot.
     prior_sigma : ndarray, shape (k,)
         Prior σ of the coefficients, except those of jumps.
-    step_columns : ndarray, shape (m, j)
+    jump_columns : ndarray, shape (m, j)
         Unit steps at the times of j jumps.
     """
 
     time_s: Array
     axis_count: int
-    signals: Preintegrated
+    preintegrated_columns: PreintegratedMotion
     prior_sigma: Array
     sigma_z_m: float
-    step_columns: Array
+    jump_columns: Array
 
-    def with_step(self, time_s: float) -> tuple[DesignMatrix, IntArray]:
+    def add_jump(self, time_s: float) -> tuple[DesignMatrix, IntArray]:
         """Add a jump; return the design matrix, and the column of the jump for each axis."""
         design = replace(
-            self, step_columns=np.hstack([self.step_columns, unit_steps(self.time_s, [time_s])])
+            self,
+            jump_columns=np.hstack([self.jump_columns, make_unit_steps(self.time_s, [time_s])]),
         )
-        first_step_column = len(self.prior_sigma)
-        step_count = design.step_columns.shape[1]
-        return design, first_step_column + step_count * (1 + np.arange(self.axis_count)) - 1
+        first_jump_column = len(self.prior_sigma)
+        jump_count = design.jump_columns.shape[1]
+        return design, first_jump_column + jump_count * (1 + np.arange(self.axis_count)) - 1
 
-    def whitened(
+    def whiten_inputs(
         self, dp: Array, dv: Array, measured_m: Array, sigma_a: float, is_skipped: BoolArray
     ) -> tuple[Array, float]:
-        """Run KF with k inputs; return ν/√S, shape (m, k), and Σ ln S of the fused measurements."""
-        signals = replace(
-            self.signals, delta_position_m=dp, delta_velocity_m_s=dv, measurement_m=measured_m
+        """Run KF on k inputs at once.
+
+        Return normalised innovations ν/√S of m measurements, shape (m, k), and Σ ln S of the fused
+        measurements.
+        """
+        preintegrated_columns = replace(
+            self.preintegrated_columns,
+            delta_position_m=dp,
+            delta_velocity_m_s=dv,
+            measurement_m=measured_m,
         )
-        nu, s = innovations(signals, sigma_a, self.sigma_z_m, is_skipped)
+        nu, s = innovations(preintegrated_columns, sigma_a, self.sigma_z_m, is_skipped)
         nu /= np.sqrt(s)[:, None]
         return nu, float(np.sum(np.log(s[~is_skipped])))
 
     def fit(self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0) -> DesignFit:
-        """Fit all errors by least squares; ``scale`` multiplies the acceleration and its noise.
+        """Fit biases, rotation, slow error and jumps together by least squares.
 
-        ``is_skipped``, shape (m,), is True for measurements that are not used.
+        ``scale`` is a trial scale factor of the positions: it multiplies the acceleration and its
+        noise. ``is_skipped``, shape (m,), is True for measurements that are not used.
         """
-        return self.regress(*self.whitened_design(sigma_a, is_skipped, scale), is_skipped)
+        return self.regress(*self.whiten_design(sigma_a, is_skipped, scale), is_skipped)
 
     def regress(
         self,
@@ -494,7 +520,10 @@ class DesignMatrix:
         log_variance_sum: float,
         is_skipped: BoolArray,
     ) -> DesignFit:
-        """Fit normalised innovations by least squares; inputs from :meth:`whitened_design`."""
+        """Fit the columns of the design matrix to the normalised innovations by least squares.
+
+        The arguments are results of :meth:`whiten_design`.
+        """
         axis_indices = np.repeat(np.arange(len(innovations_by_axis)), np.count_nonzero(~is_skipped))
         innovations_by_axis = innovations_by_axis[:, ~is_skipped].ravel()
         columns = columns[:, ~is_skipped].reshape(len(axis_indices), -1)
@@ -505,65 +534,79 @@ class DesignMatrix:
         information = np.diag(prior_sigma**-2.0) + columns.T @ columns
         # A small diagonal prevents a singular matrix if a column is zero (frame rotation in hover)
         information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(column_count)
-        moment = columns.T @ innovations_by_axis
+        right_hand_side = columns.T @ innovations_by_axis
         information_factor = cho_factor(information)
         covariance = cho_solve(information_factor, np.eye(column_count))
-        coefficients = covariance @ moment
-        square_sum = float(innovations_by_axis @ innovations_by_axis - coefficients @ moment)
+        coefficients = covariance @ right_hand_side
+        square_sum = float(
+            innovations_by_axis @ innovations_by_axis - coefficients @ right_hand_side
+        )
         score = 0.5 * (square_sum + log_variance_sum) + float(
             np.sum(np.log(np.diag(information_factor[0])))
         )
         residual_rms = float(
-            np.sqrt(max(square_sum, 0.0) / max(len(innovations_by_axis) - CONSTANT_COUNT, 1))
+            np.sqrt(max(square_sum, 0.0) / max(len(innovations_by_axis) - CONSTANT_ERROR_COUNT, 1))
         )
         residual = innovations_by_axis - columns @ coefficients
         return DesignFit(
             axis_indices, residual, coefficients, covariance, square_sum, score, residual_rms
         )
 
-    def residual_squares(self, sigma_a: float, is_skipped: BoolArray) -> Array:
-        """Return the squared normalised residual of each measurement, summed over the axes."""
-        whitened_innovations, columns, log_variance_sum = self.whitened_design(sigma_a, is_skipped)
+    def compute_residual_squares(self, sigma_a: float, is_skipped: BoolArray) -> Array:
+        """Return the squared residual of each measurement (in S) after the fit, summed over axes.
+
+        Measurements in ``is_skipped`` have residuals, but are not used in the fit.
+        """
+        whitened_innovations, columns, log_variance_sum = self.whiten_design(sigma_a, is_skipped)
         design_fit = self.regress(whitened_innovations, columns, log_variance_sum, is_skipped)
         residual = whitened_innovations - columns @ design_fit.coefficients
         return np.asarray(np.sum(residual**2, axis=0)) / max(design_fit.residual_rms, 1.0) ** 2
 
-    def whitened_design(
+    def whiten_design(
         self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
-        """Return the normalised innovations, the columns of the design matrix, and Σ ln S.
+        """Return KF's responses to the data and to each error, normalised by √S, and Σ ln S.
 
-        Shapes: (axes, measurements) and (axes, measurements, columns).
+        The responses to the data are innovations, shape (axes, measurements). Those to errors form
+        the design matrix, shape (axes, measurements, columns).
         """
-        signals, axis_count, step_count = self.signals, self.axis_count, self.step_columns.shape[1]
+        preintegrated_columns, axis_count, jump_count = (
+            self.preintegrated_columns,
+            self.axis_count,
+            self.jump_columns.shape[1],
+        )
         column_count = len(self.prior_sigma)
         whitened_innovations = np.empty((axis_count, len(is_skipped)))
-        columns = np.zeros((axis_count, len(is_skipped), column_count + axis_count * step_count))
-        # The scale factor multiplies the data and the effect of the rotation, not the biases
-        data_columns = (1 + CONSTANT_COUNT) * np.arange(axis_count)
-        column_factors = np.ones(signals.measurement_m.shape[1])
-        column_factors[np.append(data_columns, data_columns + 1 + ROTATION)] = scale
-        zero_increments = 0.0 * self.step_columns
-        normalised, log_variance_sum = self.whitened(
-            np.hstack([column_factors * signals.delta_position_m, zero_increments]),
-            np.hstack([column_factors * signals.delta_velocity_m_s, zero_increments]),
-            np.hstack([signals.measurement_m, self.step_columns]),
+        columns = np.zeros((axis_count, len(is_skipped), column_count + axis_count * jump_count))
+        # The scale factor multiplies measured accelerations: the columns of the data and of the
+        # rotation. Biases are in unscaled m/s²
+        data_column_indices = (1 + CONSTANT_ERROR_COUNT) * np.arange(axis_count)
+        column_factors = np.ones(preintegrated_columns.measurement_m.shape[1])
+        column_factors[
+            np.append(data_column_indices, data_column_indices + 1 + ROTATION_COLUMN)
+        ] = scale
+        zero_increments = 0.0 * self.jump_columns
+        whitened_columns, log_variance_sum = self.whiten_inputs(
+            np.hstack([column_factors * preintegrated_columns.delta_position_m, zero_increments]),
+            np.hstack([column_factors * preintegrated_columns.delta_velocity_m_s, zero_increments]),
+            np.hstack([preintegrated_columns.measurement_m, self.jump_columns]),
             scale * sigma_a,
             is_skipped,
         )
-        *axis_signals, common_signals = np.split(
-            normalised, (1 + CONSTANT_COUNT) * np.arange(1, 1 + axis_count), 1
+        *columns_by_axis, shared_columns = np.split(
+            whitened_columns, (1 + CONSTANT_ERROR_COUNT) * np.arange(1, 1 + axis_count), 1
         )
-        hat_count = common_signals.shape[1] - step_count
-        for axis, axis_signal in enumerate(axis_signals):
-            whitened_innovations[axis] = axis_signal[:, 0]
-            first_hat = CONSTANT_COUNT + hat_count * axis
-            first_step = column_count + step_count * axis
-            columns[axis][:, :CONSTANT_COUNT] = axis_signal[:, 1:]
-            common_columns = np.r_[
-                first_hat : first_hat + hat_count, first_step : first_step + step_count
+        knot_count = shared_columns.shape[1] - jump_count
+        for axis, axis_columns in enumerate(columns_by_axis):
+            whitened_innovations[axis] = axis_columns[:, 0]
+            first_knot_column = CONSTANT_ERROR_COUNT + knot_count * axis
+            first_jump_column = column_count + jump_count * axis
+            columns[axis][:, :CONSTANT_ERROR_COUNT] = axis_columns[:, 1:]
+            shared_column_indices = np.r_[
+                first_knot_column : first_knot_column + knot_count,
+                first_jump_column : first_jump_column + jump_count,
             ]
-            columns[axis][:, common_columns] = common_signals
+            columns[axis][:, shared_column_indices] = shared_columns
         return whitened_innovations, columns, axis_count * log_variance_sum
 
 
@@ -571,10 +614,13 @@ def make_design_matrix(
     flight: Flight,
     axes: tuple[Axis, ...],
     settings: Settings,
-    sigma_z: float,
+    sigma_z_m: float,
     clock_offset_s: float,
 ) -> DesignMatrix | Unavailable:
-    """Make the design matrix without jumps; ``clock_offset_s`` is added to the timestamps."""
+    """Make the design matrix without columns for jumps.
+
+    ``clock_offset_s`` is added to the timestamps of the positions.
+    """
     acceleration, attitude = axes[0].acceleration, flight.attitude
     if isinstance(acceleration, Unavailable):
         return acceleration
@@ -588,78 +634,93 @@ def make_design_matrix(
     shifted_axes = [replace(axis, measurement_time_s=time_s) for axis in axes]
     settings = replace(settings, input="imu")
     timeline = make_timeline(shifted_axes[0], settings)
-    common_integrals = _common_integrals(attitude, acceleration)
-    kf_inputs = [preintegrate(axis, settings) for axis in shifted_axes]
+    error_integrals = _integrate_shared_errors(attitude, acceleration)
+    kf_motions = [preintegrate(axis, settings) for axis in shifted_axes]
     column_pairs: list[ArrayPair] = []
-    for axis, kf_input in zip(axes, kf_inputs, strict=True):
-        column_pairs.append((kf_input.delta_position_m, kf_input.delta_velocity_m_s))
+    for axis, kf_motion in zip(axes, kf_motions, strict=True):
+        column_pairs.append((kf_motion.delta_position_m, kf_motion.delta_velocity_m_s))
         column_pairs += [
-            _integrate_signal(integral @ axis.direction, input_time_s, timeline)
-            for input_time_s, integral in common_integrals
+            _integrate_between_measurements(integral @ axis.direction, input_time_s, timeline)
+            for input_time_s, integral in error_integrals
         ]
-    time_s = axes[0].measurement_time_s[-len(kf_inputs[0].measurement_m) :]
-    hat_time_s, hat_functions = _hat_functions(
+    time_s = axes[0].measurement_time_s[-len(kf_motions[0].measurement_m) :]
+    weight_time_s, knot_weights = _make_knot_weights(
         time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s
     )
     column_pairs += [
-        _integrate_signal(cumulative_integral(hat, hat_time_s), hat_time_s, timeline)
-        for hat in hat_functions
+        _integrate_between_measurements(
+            cumulative_integral(weights, weight_time_s), weight_time_s, timeline
+        )
+        for weights in knot_weights
     ]
     dp, dv = (np.stack(arrays, axis=1) for arrays in zip(*column_pairs, strict=True))
     measured_m = np.zeros_like(dp)
-    for index, kf_input in enumerate(kf_inputs):
+    for index, kf_motion in enumerate(kf_motions):
         # Positions are relative to the first measurement, which is KF's initial position
-        measured_m[:, index * (1 + CONSTANT_COUNT)] = (
-            kf_input.measurement_m - kf_input.initial.position_m
+        measured_m[:, index * (1 + CONSTANT_ERROR_COUNT)] = (
+            kf_motion.measurement_m - kf_motion.initial_state.position_m
         )
-    signals = replace(
-        kf_inputs[0],
+    preintegrated_columns = replace(
+        kf_motions[0],
         delta_position_m=dp,
         delta_velocity_m_s=dv,
         measurement_m=measured_m,
         # All axes share one process noise, including the additional noise in IMU gaps
         added_process_noise=np.mean(
-            [kf_input.added_process_noise for kf_input in kf_inputs], axis=0
+            [kf_motion.added_process_noise for kf_motion in kf_motions],
+            axis=0,
         ),
-        initial=replace(kf_inputs[0].initial, position_m=0.0),
+        initial_state=replace(kf_motions[0].initial_state, position_m=0.0),
     )
-    tilt_sigma = np.full(len(axes) * len(hat_functions), TILT_SIGMA_RAD * constants.g)
-    prior_sigma = np.append(np.full(CONSTANT_COUNT, np.inf), tilt_sigma)
-    return DesignMatrix(time_s, len(axes), signals, prior_sigma, sigma_z, unit_steps(time_s, []))
+    tilt_sigma_m_s2 = np.full(len(axes) * len(knot_weights), TILT_SIGMA_RAD * constants.g)
+    prior_sigma = np.append(np.full(CONSTANT_ERROR_COUNT, np.inf), tilt_sigma_m_s2)
+    return DesignMatrix(
+        time_s,
+        len(axes),
+        preintegrated_columns,
+        prior_sigma,
+        sigma_z_m,
+        make_unit_steps(time_s, []),
+    )
 
 
-def _integrate_signal(integral_m_s: Array, time_s: Array, timeline: Timeline) -> ArrayPair:
+def _integrate_between_measurements(
+    integral_m_s: Array, time_s: Array, timeline: Timeline
+) -> ArrayPair:
     """Return Δp (m) and Δv (m/s) between the measurements, from an integrated acceleration."""
     velocity_m_s = np.interp(timeline.time_s, time_s, integral_m_s)
     return integrate_acceleration(timeline, np.diff(velocity_m_s) / np.diff(timeline.time_s))
 
 
-def _common_integrals(attitude: pd.DataFrame, acceleration: Acceleration) -> list[ArrayPair]:
-    """Integrate the NED acceleration error due to 1 m/s² forward or right bias, or 1 rad yaw.
+def _integrate_shared_errors(attitude: pd.DataFrame, acceleration: Acceleration) -> list[ArrayPair]:
+    """Return the NED velocity errors due to a bias of 1 m/s² forward or right, or 1 rad yaw error.
 
-    Return (time, integral) for each of the three errors.
+    These errors are shared by all axes. Each item is (times in s, velocity error since the start).
     """
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
     attitude_time_s = attitude.index.to_numpy()
     bias_integrals = [
         (attitude_time_s, cumulative_integral(body_to_ned.apply(np.eye(3)[axis]), attitude_time_s))
-        for axis in (FORWARD, RIGHT)
+        for axis in (FORWARD_COLUMN, RIGHT_COLUMN)
     ]
-    north, east, _ = acceleration.ned_integral_m_s
+    north, east, _ = acceleration.acceleration_integral_m_s
     return [*bias_integrals, (acceleration.time_s, np.stack([-east, north, 0.0 * north]).T)]
 
 
-def _hat_functions(start_s: float, end_s: float) -> ArrayPair:
-    """Return times (s), and the weight of each knot at these times in linear interpolation."""
+def _make_knot_weights(start_s: float, end_s: float) -> ArrayPair:
+    """Return times (s) from start to end, and the interpolation weight of each knot at these times.
+
+    Linear interpolation between knots of the slow acceleration error, :data:`KNOT_SPACING_S` apart.
+    """
     knot_count = int(np.clip(np.ceil((end_s - start_s) / KNOT_SPACING_S), 1, MAX_KNOTS)) + 1
-    hat_time_s = np.linspace(start_s, end_s, 20 * (knot_count - 1) + 1)
+    weight_time_s = np.linspace(start_s, end_s, 20 * (knot_count - 1) + 1)
     knot_times_s = np.linspace(start_s, end_s, knot_count)
-    return hat_time_s, np.array(
-        [np.interp(hat_time_s, knot_times_s, weights) for weights in np.eye(knot_count)]
+    return weight_time_s, np.array(
+        [np.interp(weight_time_s, knot_times_s, weights) for weights in np.eye(knot_count)]
     )
 
 
-def unit_steps(time_s: Array, starts_s: Iterable[float]) -> Array:
+def make_unit_steps(time_s: Array, starts_s: Iterable[float]) -> Array:
     """Return step functions from 0 to 1 at the times ``starts_s``, shape (m, j)."""
     return np.asarray(time_s[:, None] >= np.fromiter(starts_s, float)[None, :], dtype=np.float64)

@@ -5,12 +5,12 @@ is integrated from the gyroscopes, starting at EKF2's attitude. EKF2's later att
 because EKF2 corrected it with the positions to be tested.
 
 Unknown constants of each segment are errors of the initial attitude (rad, NED), gyro biases (rad/s,
-body), accelerometer biases (m/s², body) and the scale of the positions. The motion is linear in
-small constants. Its derivatives are integrated once and interpolated for any time offset.
+body), accelerometer biases (m/s², body) and the scale factor error of the positions. The motion is
+linear in small constants. Its derivatives are integrated once and interpolated for any time offset.
 
 The derivative with respect to the scale is the smooth path of
-:func:`px4fuse.filter.marginal_likelihood.centre_on_path`. With the IMU motion instead, the IMU
-noise would bias the estimated scale (errors in variables, Fuller 1987).
+:func:`px4fuse.filter.marginal_likelihood.subtract_smooth_path`. With the IMU motion instead, the
+IMU noise would bias the estimated scale (errors in variables, Fuller 1987).
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.core.arrays import Array, IntArray, cumulative_integral
 from px4fuse.core.record import Span
-from px4fuse.filter.fitting import Noises, fit_ratios
-from px4fuse.filter.marginal_likelihood import Positions, centre_on_path
-from px4fuse.filter.model import continuous_noise_unit
-from px4fuse.filter.signals import imu_gaps
+from px4fuse.filter.fitting import NoiseParameters, fit_with_sigma_ratios
+from px4fuse.filter.marginal_likelihood import PositionsAndIncrements, subtract_smooth_path
+from px4fuse.filter.model import compute_unit_continuous_noise
+from px4fuse.filter.signals import find_imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable, rows_between
 from px4fuse.trajectory.rotation import (
     conjugate,
@@ -58,7 +58,7 @@ MAX_OFFSET_S = 0.6
 # Number of tested time offsets in the coarse search
 COARSE_OFFSET_COUNT = 25
 # Approximate number of position measurements in the coarse search for a time offset
-COARSE_MEASUREMENTS = 600
+COARSE_MEASUREMENT_COUNT = 600
 # Maximum number of array elements in a batch of time offsets, to limit the memory
 MAX_BATCH_ELEMENTS = 2**16
 # Minimum number of position measurements in all segments together
@@ -69,27 +69,28 @@ MIN_SEGMENT_MEASUREMENTS = 15
 MIN_KEPT_MEASUREMENTS = 5
 # Interval (s) over which the IMU is averaged before integration
 INTEGRATION_STEP_S = 0.02
-# Prior precision of position (1/m²) and velocity (s²/m²) at the start of a segment: so small that
-# it only prevents a singular matrix
-SEGMENT_START_PRECISION = 1e-6, 1e-4
+# Prior precision of position (1/m²) and of velocity (s²/m²) at the start of a segment: so small
+# that it only prevents a singular matrix
+SEGMENT_START_PRIOR_PRECISION = 1e-6, 1e-4
 # Maximum median interval (s) between IMU samples for an estimate of the motion
 MAX_IMU_INTERVAL_S = 0.025
 
 
 @dataclass(frozen=True)
 class SegmentMotion:
-    """Motion of one segment from the IMU, and its derivative with respect to constant errors.
+    """Motion of one segment from the IMU, and its derivatives with respect to the IMU's errors.
 
-    ``table`` has the shape (times, 2, 3, 1 + constants): position and velocity, along NED. The last
-    dimension contains the motion without errors, then its derivative with respect to each constant.
-    The acceleration is constant between successive times.
+    ``table`` has the shape (times, 2, 3, 1 + c): position and velocity, along NED. The last
+    dimension contains the motion without errors, then its derivative with respect to each of c = 9
+    constants: initial attitude error, gyro bias and accelerometer bias. The acceleration is
+    constant between successive times.
     """
 
     time_s: Array
     table: Array
 
     def interpolate(self, time_s: Array) -> tuple[Array, Array]:
-        """Interpolate position and velocity at other times, shape (..., 3, 1 + constants)."""
+        """Interpolate position and velocity, and their derivatives, shape (..., 3, 1 + c)."""
         last_index = len(self.time_s) - 2
         row = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
         elapsed_s = (time_s - self.time_s[row])[..., None, None]
@@ -105,7 +106,7 @@ MotionCache = dict[Span, SegmentMotion]
 
 
 @dataclass(frozen=True)
-class PreparedMotion:
+class PositionsAndImuMotion:
     """Position measurements, and the motion from the IMU at their times.
 
     Symbols in shapes: s segments, m measurements, a axes.
@@ -115,7 +116,8 @@ class PreparedMotion:
     time_s : ndarray, shape (m,)
     measurement_m : ndarray, shape (m, a)
         Positions relative to the segment's first position; NaN if missing.
-    weight : ndarray, shape (m,)
+    measurement_weights : ndarray, shape (m,)
+        The variance of a measurement is SIGMA_Z² / weight.
     segment_edges : ndarray of int, shape (s + 1,)
         Index of the first measurement of each segment; the last element is m.
     segment_motions : tuple of SegmentMotion
@@ -129,7 +131,7 @@ class PreparedMotion:
 
     time_s: Array
     measurement_m: Array
-    weight: Array
+    measurement_weights: Array
     segment_edges: IntArray
     segment_motions: tuple[SegmentMotion, ...]
     directions: Array
@@ -137,7 +139,7 @@ class PreparedMotion:
     imu_interval_s: float
     heading_sigma_rad: float = HEADING_SIGMA_RAD
 
-    def downsample(self, max_count: int) -> PreparedMotion:
+    def downsample(self, max_count: int) -> PositionsAndImuMotion:
         """Keep about ``max_count`` measurements, and the segments that still have enough.
 
         If no segment had enough, all measurements are kept.
@@ -149,7 +151,8 @@ class PreparedMotion:
             return self
         is_kept &= np.repeat(has_enough_kept, np.diff(self.segment_edges))
         arrays = {
-            name: getattr(self, name)[is_kept] for name in ("time_s", "measurement_m", "weight")
+            name: getattr(self, name)[is_kept]
+            for name in ("time_s", "measurement_m", "measurement_weights")
         }
         segment_motions = tuple(
             self.segment_motions[index] for index in np.flatnonzero(has_enough_kept)
@@ -161,21 +164,24 @@ class PreparedMotion:
             segment_motions=segment_motions,
         )
 
-    def positions(self, time_offsets_s: Array) -> Positions:
-        """Return positions and integrated IMU data for each time offset, with a scale of 1."""
-        length_s = np.diff(self.time_s)
-        unit_process_noise = self.dt_s * np.stack(continuous_noise_unit(length_s))
+    def make_positions(self, time_offsets_s: Array) -> PositionsAndIncrements:
+        """Return the positions and the IMU increments between them for each time offset.
+
+        The scale factor of the positions is 1.
+        """
+        interval_s = np.diff(self.time_s)
+        unit_process_noise = self.dt_s * np.stack(compute_unit_continuous_noise(interval_s))
         prior_precision = np.zeros((len(self.time_s), 2))
-        prior_precision[self.segment_edges[:-1]] = SEGMENT_START_PRECISION
+        prior_precision[self.segment_edges[:-1]] = SEGMENT_START_PRIOR_PRECISION
         column_count = 1 + len(CONSTANTS_PRIOR_SIGMA)
         dp, dv = np.zeros(
-            (2, len(self.directions), len(time_offsets_s), column_count, len(length_s))
+            (2, len(self.directions), len(time_offsets_s), column_count, len(interval_s))
         )
         for begin, end, segment_motion in zip(
             self.segment_edges, self.segment_edges[1:], self.segment_motions, strict=False
         ):
             measurement_time_s = self.time_s[begin:end]
-            # Both arrays have the shape (axes, time offsets, constants, times)
+            # Shape (axes, time offsets, 1 + constants, times): motion, then its derivatives
             position, velocity = (
                 np.moveaxis(self.directions @ signal, (2, 0, 3, 1), range(4))
                 for signal in segment_motion.interpolate(
@@ -185,10 +191,10 @@ class PreparedMotion:
             interval_rows = np.s_[:, :, :-1, begin : end - 1]
             dv[interval_rows] = np.diff(velocity)
             dp[interval_rows] = np.diff(position) - velocity[..., :-1] * np.diff(measurement_time_s)
-        return Positions(
+        return PositionsAndIncrements(
             measurement_m=self.measurement_m,
             segment_starts=self.segment_edges[:-1],
-            length_s=length_s,
+            interval_s=interval_s,
             unit_process_noise=unit_process_noise,
             added_process_noise=np.zeros_like(unit_process_noise),
             prior_precision=prior_precision,
@@ -199,67 +205,82 @@ class PreparedMotion:
             delta_velocity_m_s=dv,
         )
 
-    def positions_at_offset(self, offset_s: float) -> Positions:
-        """Return positions and integrated IMU data for one time offset, with unknown scale."""
-        return next(self.position_batches(np.array([offset_s])))
+    def make_positions_at_offset(self, offset_s: float) -> PositionsAndIncrements:
+        """Return positions and IMU increments for one time offset, with an unknown scale factor."""
+        return next(self.make_position_batches(np.array([offset_s])))
 
-    def position_batches(
-        self, time_offsets_s: Array, *, has_scale: bool = True
-    ) -> Iterator[Positions]:
-        """Yield positions and integrated IMU data for batches of time offsets.
+    def make_position_batches(
+        self, time_offsets_s: Array, *, estimates_scale: bool = True
+    ) -> Iterator[PositionsAndIncrements]:
+        """Yield positions and IMU increments for batches of time offsets.
 
-        ``has_scale`` is True for an unknown scale, False for a scale of 1.
+        With ``estimates_scale``, the scale factor of the positions is an unknown constant; else 1.
         """
-        signal_count = len(self.time_s) * len(self.directions) * (1 + len(CONSTANTS_PRIOR_SIGMA))
-        batch_size = max(1, MAX_BATCH_ELEMENTS // signal_count)
+        values_per_offset = (
+            len(self.time_s) * len(self.directions) * (1 + len(CONSTANTS_PRIOR_SIGMA))
+        )
+        batch_size = max(1, MAX_BATCH_ELEMENTS // values_per_offset)
         for batch in np.split(time_offsets_s, range(batch_size, len(time_offsets_s), batch_size)):
-            positions = self.positions(batch)
-            yield centre_on_path(positions, has_scale=True) if has_scale else positions
+            positions = self.make_positions(batch)
+            yield (
+                subtract_smooth_path(positions, estimates_scale=True)
+                if estimates_scale
+                else positions
+            )
 
     def search_offset(
-        self, noises: Noises, sigma_a_factors: Sequence[float] = (1.0,), *, has_scale: bool = True
-    ) -> tuple[float, Noises]:
+        self,
+        noise_parameters: NoiseParameters,
+        sigma_a_factors: Sequence[float] = (1.0,),
+        *,
+        estimates_scale: bool = True,
+    ) -> tuple[float, NoiseParameters]:
         """Return the time offset and SIGMA_A with the maximum likelihood on a coarse grid.
 
-        ``sigma_a_factors`` are the tested multiples of SIGMA_A. ``has_scale`` is True if the scale
-        of the positions is estimated.
+        ``sigma_a_factors`` are the tested multiples of SIGMA_A. With ``estimates_scale``, the
+        scale factor of the positions is estimated.
         """
         tested_offsets_s = np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSET_COUNT)
-        sigma_z_m = noises.sigma_z_m
+        sigma_z_m = noise_parameters.sigma_z_m
         sigma_ratios = [
-            sigma_a_factor * noises.sigma_a_m_s2 / sigma_z_m for sigma_a_factor in sigma_a_factors
+            sigma_a_factor * noise_parameters.sigma_a_m_s2 / sigma_z_m
+            for sigma_a_factor in sigma_a_factors
         ]
-        coarse_motion = self.downsample(COARSE_MEASUREMENTS)
-        position_batches = coarse_motion.position_batches(tested_offsets_s, has_scale=has_scale)
-        ratio_fits = fit_ratios(
+        coarse_motion = self.downsample(COARSE_MEASUREMENT_COUNT)
+        position_batches = coarse_motion.make_position_batches(
+            tested_offsets_s, estimates_scale=estimates_scale
+        )
+        ratio_fits = fit_with_sigma_ratios(
             position_batches,
             sigma_ratios,
-            noises.random_walk_m / sigma_z_m,
-            coarse_motion.weight,
+            noise_parameters.random_walk_m / sigma_z_m,
+            coarse_motion.measurement_weights,
             sigma_z_m,
         )
         minus_log_likelihood = np.stack(
-            [ratio_fit.scaled(sigma_z_m).scores()[0] for ratio_fit in ratio_fits]
+            [ratio_fit.scale_sigmas(sigma_z_m).compute_scores()[0] for ratio_fit in ratio_fits]
         )
         factor_index, offset_index = np.unravel_index(
             np.argmin(minus_log_likelihood), minus_log_likelihood.shape
         )
-        sigma_a = noises.sigma_a_m_s2 * sigma_a_factors[int(factor_index)]
-        return float(tested_offsets_s[offset_index]), replace(noises, sigma_a_m_s2=sigma_a)
+        sigma_a = noise_parameters.sigma_a_m_s2 * sigma_a_factors[int(factor_index)]
+        return float(tested_offsets_s[offset_index]), replace(
+            noise_parameters, sigma_a_m_s2=sigma_a
+        )
 
 
-def prepare_motion(
+def compute_imu_motion(
     flight: Flight,
     time_s: Array,
     measurement_m: Array,
     *,
     directions: Array,
     dt_s: float,
-    weight: Array | None = None,
+    measurement_weights: Array | None = None,
     motion_cache: MotionCache | None = None,
     heading_sigma_rad: float = HEADING_SIGMA_RAD,
     max_segment_s: float = MAX_SEGMENT_S,
-) -> PreparedMotion | Unavailable:
+) -> PositionsAndImuMotion | Unavailable:
     """Divide measurements into segments without IMU gap, and compute their motion from the IMU.
 
     Parameters
@@ -267,8 +288,8 @@ def prepare_motion(
     flight : Flight
     time_s : ndarray, shape (m,)
     measurement_m : ndarray, shape (m, a)
-    directions, dt_s, weight, heading_sigma_rad
-        See :class:`PreparedMotion`; weights are 1 by default.
+    directions, dt_s, measurement_weights, heading_sigma_rad
+        See :class:`PositionsAndImuMotion`; weights are 1 by default.
     motion_cache : dict, optional
         IMU motion of this flight that is already computed; new motion is added.
     max_segment_s : float
@@ -285,7 +306,7 @@ def prepare_motion(
     imu_time_s = imu.index.to_numpy()
     attitude_time_s = attitude.index.to_numpy()
     rows_by_segment: list[IntArray] = []
-    for begin_s, end_s in _covered_spans(imu_time_s, attitude_time_s):
+    for begin_s, end_s in _find_covered_spans(imu_time_s, attitude_time_s):
         covered_rows = np.flatnonzero(
             (time_s >= begin_s + MAX_OFFSET_S) & (time_s <= end_s - MAX_OFFSET_S)
         )
@@ -319,11 +340,11 @@ def prepare_motion(
     # smaller numbers have smaller rounding errors
     measured_m = pd.DataFrame(measurement_m[used_rows])
     segment_index = np.repeat(np.arange(len(rows_by_segment)), np.diff(segment_edges))
-    first_m = measured_m.groupby(segment_index).transform("first")
-    return PreparedMotion(
+    first_position_m = measured_m.groupby(segment_index).transform("first")
+    return PositionsAndImuMotion(
         time_s[used_rows],
-        (measured_m - first_m).to_numpy(),
-        np.ones(len(used_rows)) if weight is None else weight[used_rows],
+        (measured_m - first_position_m).to_numpy(),
+        np.ones(len(used_rows)) if measurement_weights is None else measurement_weights[used_rows],
         segment_edges,
         tuple(segment_motions),
         directions,
@@ -333,18 +354,18 @@ def prepare_motion(
     )
 
 
-def _covered_spans(imu_time_s: Array, attitude_time_s: Array) -> list[Span]:
+def _find_covered_spans(imu_time_s: Array, attitude_time_s: Array) -> list[Span]:
     """Find the time spans (s) without a gap in IMU or attitude; none if the IMU rate is too low."""
     if len(imu_time_s) < 2 or np.median(np.diff(imu_time_s)) > MAX_IMU_INTERVAL_S:
         return []
-    gap_indices = np.flatnonzero(imu_gaps(imu_time_s))
+    gap_indices = np.flatnonzero(find_imu_gaps(imu_time_s))
     starts_s = np.maximum(imu_time_s[np.r_[0, gap_indices + 1]], attitude_time_s[0])
     ends_s = np.minimum(imu_time_s[np.r_[gap_indices, len(imu_time_s) - 1]], attitude_time_s[-1])
     return list(zip(starts_s.tolist(), ends_s.tolist(), strict=True))
 
 
 def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> SegmentMotion:
-    """Compute the motion in NED from the IMU, and its derivative for each constant error."""
+    """Compute the motion in NED from the IMU, and its derivatives (see :class:`SegmentMotion`)."""
     imu_time_s = imu.index.to_numpy()
     first_row, end_row = np.searchsorted(
         imu_time_s,
@@ -361,7 +382,9 @@ def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -
     )
     specific_force_integral_m_s = integrals_at_steps[:, :3]
     angle_rad = integrals_at_steps[:, 3:]
-    angle_rad -= np.outer(step_times_s, _large_gyro_bias(step_times_s, angle_rad, attitude))
+    angle_rad -= np.outer(
+        step_times_s, _estimate_large_gyro_bias(step_times_s, angle_rad, attitude)
+    )
     attitude_quaternion = _integrate_gyros(step_times_s, angle_rad, attitude)
     # The mean specific force of each step is rotated by the attitude in the middle of the step
     mean_specific_force_m_s2 = np.diff(specific_force_integral_m_s, axis=0) / INTEGRATION_STEP_S
@@ -376,44 +399,49 @@ def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -
     acceleration[:, 2, 0] += constants.g
     # A small attitude error θ adds θ × f to the acceleration. A gyro bias b causes the attitude
     # error θ = -∫ R b dt
-    gyro_bias_rotation = -INTEGRATION_STEP_S * (np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0)
+    attitude_error_per_gyro_bias = -INTEGRATION_STEP_S * (
+        np.cumsum(body_to_ned, axis=0) - body_to_ned / 2.0
+    )
     for axis in range(3):
         second_axis = (axis + 1) % 3
         third_axis = (axis + 2) % 3
         acceleration[:, second_axis, 1 + axis] = -specific_force_ned_m_s2[:, third_axis]
         acceleration[:, third_axis, 1 + axis] = specific_force_ned_m_s2[:, second_axis]
         acceleration[:, axis, 4:7] = (
-            gyro_bias_rotation[:, second_axis] * specific_force_ned_m_s2[:, [third_axis]]
+            attitude_error_per_gyro_bias[:, second_axis] * specific_force_ned_m_s2[:, [third_axis]]
         )
         acceleration[:, axis, 4:7] -= (
-            gyro_bias_rotation[:, third_axis] * specific_force_ned_m_s2[:, [second_axis]]
+            attitude_error_per_gyro_bias[:, third_axis] * specific_force_ned_m_s2[:, [second_axis]]
         )
     acceleration[:, :, 7:10] = -body_to_ned
     np.cumsum(acceleration[:-1] * INTEGRATION_STEP_S, axis=0, out=velocity[1:])
-    mean_velocity = velocity[:-1] + acceleration[:-1] * (INTEGRATION_STEP_S / 2.0)
-    np.cumsum(mean_velocity * INTEGRATION_STEP_S, axis=0, out=position[1:])
+    mean_step_velocity = velocity[:-1] + acceleration[:-1] * (INTEGRATION_STEP_S / 2.0)
+    np.cumsum(mean_step_velocity * INTEGRATION_STEP_S, axis=0, out=position[1:])
     return SegmentMotion(step_times_s[:-1], table)
 
 
-def _large_gyro_bias(step_times_s: Array, angle_rad: Array, attitude: pd.DataFrame) -> Array:
-    """Estimate the gyro bias (rad/s) from the logged attitude.
+def _estimate_large_gyro_bias(
+    step_times_s: Array, angle_rad: Array, attitude: pd.DataFrame
+) -> Array:
+    """Estimate a large gyro bias (rad/s) from the logged attitude.
 
-    Zero is returned for a bias up to ``MAX_PRIOR_GYRO_BIAS_RAD_S``, which is fitted later, and
-    above ``MAX_REMOVED_GYRO_BIAS_RAD_S``, because then the logged attitude is wrong.
+    A bias up to ``MAX_PRIOR_GYRO_BIAS_RAD_S`` is returned as zero, because it is fitted later. A
+    bias above ``MAX_REMOVED_GYRO_BIAS_RAD_S`` is also returned as zero: the logged attitude is then
+    wrong.
     """
     samples = rows_between(attitude, step_times_s[0], step_times_s[-1])[Columns.QUATERNION]
     if len(samples) < MIN_KEPT_MEASUREMENTS:
         return np.zeros(3)
     attitude_time_s, quaternions = samples.index.to_numpy(), samples.to_numpy()
-    angle_at_attitude = np.column_stack(
+    gyro_angle_rad = np.column_stack(
         [np.interp(attitude_time_s, step_times_s, column) for column in angle_rad.T]
     )
-    drift_rad = np.diff(angle_at_attitude, axis=0) - to_vector(
+    drift_rad = np.diff(gyro_angle_rad, axis=0) - to_vector(
         multiply(conjugate(quaternions[:-1]), quaternions[1:])
     )
-    bias = np.asarray(np.median(drift_rad / np.diff(attitude_time_s)[:, None], axis=0))
-    is_removed = MAX_PRIOR_GYRO_BIAS_RAD_S < np.abs(bias).max() <= MAX_REMOVED_GYRO_BIAS_RAD_S
-    return bias if is_removed else np.zeros(3)
+    bias_rad_s = np.asarray(np.median(drift_rad / np.diff(attitude_time_s)[:, None], axis=0))
+    is_removed = MAX_PRIOR_GYRO_BIAS_RAD_S < np.abs(bias_rad_s).max() <= MAX_REMOVED_GYRO_BIAS_RAD_S
+    return bias_rad_s if is_removed else np.zeros(3)
 
 
 def _integrate_gyros(step_times_s: Array, angle_rad: Array, attitude: pd.DataFrame) -> Array:
@@ -423,17 +451,17 @@ def _integrate_gyros(step_times_s: Array, angle_rad: Array, attitude: pd.DataFra
     first.
     """
     attitude_time_s = attitude.index.to_numpy()
-    near_rows = slice(
+    nearby_rows = slice(
         *np.clip(
             np.searchsorted(attitude_time_s, step_times_s[0]) + np.array([-2, 3]),
             0,
             len(attitude_time_s),
         )
     )
-    logged_quaternions = attitude.iloc[near_rows][Columns.QUATERNION].to_numpy(copy=True)
-    near_time_s = attitude_time_s[near_rows]
-    start_s = np.clip(step_times_s[0], near_time_s[0], near_time_s[-1])
-    slerp = Slerp(near_time_s, Rotation.from_quat(logged_quaternions, scalar_first=True))
+    logged_quaternions = attitude.iloc[nearby_rows][Columns.QUATERNION].to_numpy(copy=True)
+    nearby_attitude_time_s = attitude_time_s[nearby_rows]
+    start_s = np.clip(step_times_s[0], nearby_attitude_time_s[0], nearby_attitude_time_s[-1])
+    slerp = Slerp(nearby_attitude_time_s, Rotation.from_quat(logged_quaternions, scalar_first=True))
     start_quaternion = slerp(start_s).as_quat(scalar_first=True)
     rotation_since_start = cumulative_product(from_vector(np.diff(angle_rad, axis=0)))
     return np.vstack([start_quaternion, multiply(start_quaternion, rotation_since_start)])

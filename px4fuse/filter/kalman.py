@@ -84,7 +84,7 @@ def replay(
     """
     timeline = make_timeline(axis, settings, initial)
     initial_state = initial or InitialState(timeline.time_s[0], axis.measurement_m[0])
-    run_filter = _run_floats if fast else _run_filterpy
+    run_filter = _run_with_floats if fast else _run_with_filterpy
     states, updates = run_filter(
         initial_state,
         settings.sigma_z_m**2,
@@ -111,8 +111,8 @@ def _make_table(rows: StepRows, index: "pd.Index[float]", columns: list[str]) ->
     return pd.DataFrame(values.reshape(-1, len(columns)), index, columns)
 
 
-def _run_filterpy(
-    initial: InitialState, measurement_variance: float, *inputs: Sequence[Any]
+def _run_with_filterpy(
+    initial_state: InitialState, measurement_variance: float, *inputs: Sequence[Any]
 ) -> tuple[StepRows, StepRows]:
     """Run KF with filterpy; return the rows of :attr:`Replay.steps` and :attr:`Replay.updates`.
 
@@ -122,24 +122,26 @@ def _run_filterpy(
     from px4fuse.filter.filterpy_import import KalmanFilter  # noqa: PLC0415 - takes 0.1 s
 
     kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
-    kalman.x = np.array([[initial.position_m], [initial.velocity_m_s]])
+    kalman.x = np.array([[initial_state.position_m], [initial_state.velocity_m_s]])
     kalman.P = model.symmetric_matrix(model.INITIAL_COVARIANCE)
     kalman.H = np.array([[1.0, 0.0]])
     kalman.R = np.array([[measurement_variance]])
     kalman.inv = np.reciprocal  # S is 1 by 1
-    states: StepRows = [(initial.position_m, initial.velocity_m_s, *model.INITIAL_COVARIANCE)]
+    states: StepRows = [
+        (initial_state.position_m, initial_state.velocity_m_s, *model.INITIAL_COVARIANCE)
+    ]
     updates: StepRows = []
     dt_s, acceleration, noise_density = (np.array(values)[:, None, None] for values in inputs[:3])
     matrices = (
         acceleration,
         np.concatenate([dt_s**2 / 2.0, dt_s], axis=1),
         model.transition(dt_s[:, 0, 0]),
-        noise_density * model.symmetric_matrix(model.process_noise_unit(dt_s[:, 0, 0])),
+        noise_density * model.symmetric_matrix(model.compute_unit_process_noise(dt_s[:, 0, 0])),
     )
     for u, B, F, Q, measured_m in zip(*matrices, inputs[3], strict=True):
         kalman.predict(u=u, B=B, F=F, Q=Q)
         if measured_m is not None:
-            # with H, filterpy does not convert and copy the scalar measurement at each update
+            # Without the argument H, filterpy would convert and copy the scalar measurement (slow)
             kalman.update(measured_m, H=kalman.H)
             x, P, K = kalman.x_prior, kalman.P_prior, kalman.K
             updates.append(
@@ -159,13 +161,13 @@ def _run_filterpy(
     return states, updates
 
 
-def _run_floats(
-    initial: InitialState, measurement_variance: float, *inputs: Sequence[Any]
+def _run_with_floats(
+    initial_state: InitialState, measurement_variance: float, *inputs: Sequence[Any]
 ) -> tuple[StepRows, StepRows]:
-    """Run KF with Python floats; arguments and results are those of :func:`_run_filterpy`."""
+    """Run KF with Python floats; arguments and results are those of :func:`_run_with_filterpy`."""
     position, velocity, covariance = (
-        initial.position_m,
-        initial.velocity_m_s,
+        initial_state.position_m,
+        initial_state.velocity_m_s,
         model.INITIAL_COVARIANCE,
     )
     states: StepRows = [(position, velocity, *covariance)]
@@ -186,10 +188,10 @@ def _run_floats(
     return states, updates
 
 
-def _step_before(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
-    """Return for each time the index of the last step before it, and the time (s) since this step.
+def _find_previous_steps(run: Replay, times_s: Array) -> tuple[IntArray, Array, BoolArray]:
+    """Find for each time the last step of KF before it.
 
-    The third array is True for times outside the run of KF.
+    Return its index, the time (s) since this step, and True for times outside the run of KF.
     """
     step_times_s = run.steps.index.to_numpy()
     step_index = np.clip(
@@ -207,7 +209,7 @@ def state_at(run: Replay, times_s: Array) -> Array:
 
     Interpolation would use a measurement before its time. Times outside the run of KF give NaN.
     """
-    step_index, elapsed_s, is_outside = _step_before(run, times_s)
+    step_index, elapsed_s, is_outside = _find_previous_steps(run, times_s)
     position, velocity, acceleration = (
         run.steps[column].to_numpy()[step_index]
         for column in (*model.STATE_COLUMNS, "acceleration_m_s2")
@@ -218,11 +220,11 @@ def state_at(run: Replay, times_s: Array) -> Array:
 
 def variance_at(run: Replay, times_s: Array) -> Array:
     """Return the variances (m², m²/s²) of the results of :func:`state_at`: FPFᵀ + Q."""
-    step_index, elapsed_s, is_outside = _step_before(run, times_s)
+    step_index, elapsed_s, is_outside = _find_previous_steps(run, times_s)
     p00, p01, p11 = run.steps[model.COVARIANCE_COLUMNS].to_numpy()[step_index].T
-    gap_variance = run.steps["input_variance_m2_s4"].to_numpy()[step_index]
-    noise_density = (run.settings.sigma_a_m_s2**2 + gap_variance) * run.settings.dt_s
+    input_variance_m2_s4 = run.steps["input_variance_m2_s4"].to_numpy()[step_index]
+    noise_density = (run.settings.sigma_a_m_s2**2 + input_variance_m2_s4) * run.settings.dt_s
     p00, _, p11 = model.propagate_covariance((p00, p01, p11), elapsed_s)
-    q00, _, q11 = model.process_noise_unit(elapsed_s)
+    q00, _, q11 = model.compute_unit_process_noise(elapsed_s)
     variances = p00 + noise_density * q00, p11 + noise_density * q11
     return np.where(is_outside, np.nan, variances)

@@ -20,7 +20,7 @@ from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.filter.model import (
     INITIAL_COVARIANCE,
     Symmetric,
-    process_noise_unit,
+    compute_unit_process_noise,
     propagate_covariance,
     propagate_state,
     update_step,
@@ -31,43 +31,43 @@ from px4fuse.filter.steps import Timeline, make_timeline
 
 # Decrease of the log-likelihood (nats) from its maximum to the ends of a 95 % interval: half of the
 # 95 % point of χ²(1)
-PROFILE_DROP = float(chdtri(1, 0.05)) / 2.0
-# Distance in ln σ from the maximum at which the search for the end of a 95 % interval starts
-START_LOG_DISTANCE = 0.05
-# Maximum change of ln SIGMA_Z between two points of the likelihood profile of SIGMA_A, or vice
-# versa
-MAX_OTHER_LOG_STEP = 1.0
-# Tolerance of ln SIGMA_Z in its optimisation at each point of the profile of SIGMA_A, or vice versa
-OTHER_LOG_TOLERANCE = 2e-3
+MAX_LOG_LIKELIHOOD_DROP = float(chdtri(1, 0.05)) / 2.0
+# Initial distance (in ln σ) from the maximum in the search for an end of a 95 % interval
+START_LOG_SIGMA_DISTANCE = 0.05
+# The profile likelihood of one σ (SIGMA_A or SIGMA_Z) is maximised over the other σ. Maximum change
+# of ln(other σ) between two points of the profile
+MAX_OTHER_LOG_SIGMA_STEP = 1.0
+# Tolerance of ln(other σ) in this maximisation
+OTHER_LOG_SIGMA_TOLERANCE = 2e-3
 
 
 @dataclass(frozen=True)
-class Preintegrated:
+class PreintegratedMotion:
     """Measurements of KF, and its acceleration integrated over the intervals between them.
 
     Arrays have the shape (m,), if not stated otherwise.
 
     Attributes
     ----------
-    length_s : ndarray
+    interval_s : ndarray
     delta_position_m, delta_velocity_m_s : ndarray
         Δp and Δv in each interval due to the acceleration.
     unit_process_noise, added_process_noise : ndarray, shape (m, 3)
         Elements 00, 01, 11 of Q for SIGMA_A = 1 m/s², and of the additional Q in gaps of the IMU.
     measurement_m : ndarray
-    initial : InitialState
+    initial_state : InitialState
     """
 
-    length_s: Array
+    interval_s: Array
     delta_position_m: Array
     delta_velocity_m_s: Array
     unit_process_noise: Array
     added_process_noise: Array
     measurement_m: Array
-    initial: InitialState
+    initial_state: InitialState
 
 
-def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
+def preintegrate(axis: Axis, settings: Settings) -> PreintegratedMotion:
     """Integrate the acceleration and process noise of KF between measurements.
 
     Raises
@@ -76,18 +76,21 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
         ``settings.input`` is "imu" and the axis has no acceleration.
     """
     timeline = make_timeline(axis, settings)
-    last_steps, interval_index, remaining_s = _interval_index(timeline)
+    last_steps, interval_index, time_to_interval_end_s = _assign_steps_to_intervals(timeline)
     step_times_s = timeline.time_s
     unit_process_noise = settings.dt_s * np.stack(
-        propagate_covariance(process_noise_unit(np.diff(step_times_s)), remaining_s), 1
+        propagate_covariance(
+            compute_unit_process_noise(np.diff(step_times_s)), time_to_interval_end_s
+        ),
+        1,
     )
     dp, dv = integrate_acceleration(timeline, timeline.acceleration_m_s2)
 
     def sum_by_interval(values: Array) -> Array:
         return np.stack([np.bincount(interval_index, column) for column in values.T], 1)
 
-    return Preintegrated(
-        length_s=np.diff(step_times_s[np.append(0, last_steps)]),
+    return PreintegratedMotion(
+        interval_s=np.diff(step_times_s[np.append(0, last_steps)]),
         delta_position_m=dp,
         delta_velocity_m_s=dv,
         unit_process_noise=sum_by_interval(unit_process_noise),
@@ -95,7 +98,7 @@ def preintegrate(axis: Axis, settings: Settings) -> Preintegrated:
             unit_process_noise * timeline.input_variance_m2_s4[:, None]
         ),
         measurement_m=axis.measurement_m[timeline.measurement_index[last_steps]],
-        initial=InitialState(float(step_times_s[0]), float(axis.measurement_m[0])),
+        initial_state=InitialState(float(step_times_s[0]), float(axis.measurement_m[0])),
     )
 
 
@@ -104,18 +107,18 @@ def integrate_acceleration(timeline: Timeline, acceleration_m_s2: Array) -> Arra
 
     ``acceleration_m_s2``, shape (n - 1,), contains the acceleration in each prediction step.
     """
-    _, interval_index, remaining_s = _interval_index(timeline)
-    zeros = np.zeros(len(remaining_s))
+    _, interval_index, time_to_interval_end_s = _assign_steps_to_intervals(timeline)
+    zeros = np.zeros(len(time_to_interval_end_s))
     dp, dv = propagate_state(
         *propagate_state(zeros, zeros, acceleration_m_s2, np.diff(timeline.time_s)),
         zeros,
-        remaining_s,
+        time_to_interval_end_s,
     )
     dp, dv = (np.bincount(interval_index, increment).astype(float) for increment in (dp, dv))
     return dp, dv
 
 
-def _interval_index(timeline: Timeline) -> tuple[IntArray, IntArray, Array]:
+def _assign_steps_to_intervals(timeline: Timeline) -> tuple[IntArray, IntArray, Array]:
     """Assign each prediction step to an interval between measurements.
 
     Returns
@@ -124,17 +127,17 @@ def _interval_index(timeline: Timeline) -> tuple[IntArray, IntArray, Array]:
         Index of the last step of each interval.
     interval_index : ndarray
         Index of the interval that contains each step.
-    remaining_s : ndarray
+    time_to_interval_end_s : ndarray
         Time from the end of each step to the end of its interval.
     """
     last_steps = np.flatnonzero(timeline.measurement_index >= 0)
     interval_index = np.searchsorted(last_steps, np.arange(1, len(timeline.time_s)))
-    remaining_s = timeline.time_s[last_steps[interval_index]] - timeline.time_s[1:]
-    return last_steps, interval_index, remaining_s
+    time_to_interval_end_s = timeline.time_s[last_steps[interval_index]] - timeline.time_s[1:]
+    return last_steps, interval_index, time_to_interval_end_s
 
 
 def innovations(
-    kf_input: Preintegrated,
+    kf_motion: PreintegratedMotion,
     sigma_a_m_s2: float,
     sigma_z_m: float,
     is_skipped: BoolArray | None = None,
@@ -146,7 +149,7 @@ def innovations(
 
     Parameters
     ----------
-    kf_input : Preintegrated
+    kf_motion : PreintegratedMotion
     sigma_a_m_s2, sigma_z_m : float
     is_skipped : ndarray of bool, shape (m,), optional
         True for measurements without update; their innovation is computed.
@@ -155,10 +158,10 @@ def innovations(
     covariance: Symmetric[float] = INITIAL_COVARIANCE
     variances_and_gains = []
     for dt, unit_process_noise, added_process_noise, skips_update in zip(
-        kf_input.length_s.tolist(),
-        kf_input.unit_process_noise.tolist(),
-        kf_input.added_process_noise.tolist(),
-        [False] * len(kf_input.length_s) if is_skipped is None else is_skipped.tolist(),
+        kf_motion.interval_s.tolist(),
+        kf_motion.unit_process_noise.tolist(),
+        kf_motion.added_process_noise.tolist(),
+        [False] * len(kf_motion.interval_s) if is_skipped is None else is_skipped.tolist(),
         strict=True,
     ):
         p00, p01, p11 = propagate_covariance(covariance, dt)  # P = FPFᵀ + Q
@@ -167,23 +170,26 @@ def innovations(
             p01 + q * unit_process_noise[1] + added_process_noise[1],
             p11 + q * unit_process_noise[2] + added_process_noise[2],
         )
-        (_, s, k0, k1), (_, _, updated) = update_step(0.0, 0.0, covariance, 0.0, r)
+        (_, s, k0, k1), (_, _, updated_covariance) = update_step(0.0, 0.0, covariance, 0.0, r)
         variances_and_gains.append((s, 0.0, 0.0) if skips_update else (s, k0, k1))
-        covariance = covariance if skips_update else updated
+        covariance = covariance if skips_update else updated_covariance
     s, k0, k1 = np.array(variances_and_gains).T
-    # The predicted states solve linear equations with a unit lower band matrix: the predicted state
-    # at the next measurement is F(x + K(z - Hx)) + [Δp, Δv]
-    dt = kf_input.length_s[1:]
+    # The predicted state x at the next measurement is F(x + K(z - Hx)) + [Δp, Δv], with KF's
+    # transition matrix F and gain K. This is linear in x, so the states of all times are the
+    # solution of one lower triangular band system with unit diagonal
+    dt = kf_motion.interval_s[1:]
     position_gain = k0[:-1] + dt * k1[:-1]
-    measured_m = np.ascontiguousarray(kf_input.measurement_m.T)
-    right_side = np.empty((*measured_m.shape, 2))
-    right_side[..., 0] = kf_input.delta_position_m.T
-    right_side[..., 1] = kf_input.delta_velocity_m_s.T
-    right_side[..., 1:, 0] += position_gain * measured_m[..., :-1]
-    right_side[..., 1:, 1] += k1[:-1] * measured_m[..., :-1]
-    initial = kf_input.initial
-    right_side[..., 0, 0] += initial.position_m + kf_input.length_s[0] * initial.velocity_m_s
-    right_side[..., 0, 1] += initial.velocity_m_s
+    measured_m = np.ascontiguousarray(kf_motion.measurement_m.T)
+    right_hand_side = np.empty((*measured_m.shape, 2))
+    right_hand_side[..., 0] = kf_motion.delta_position_m.T
+    right_hand_side[..., 1] = kf_motion.delta_velocity_m_s.T
+    right_hand_side[..., 1:, 0] += position_gain * measured_m[..., :-1]
+    right_hand_side[..., 1:, 1] += k1[:-1] * measured_m[..., :-1]
+    initial_state = kf_motion.initial_state
+    right_hand_side[..., 0, 0] += (
+        initial_state.position_m + kf_motion.interval_s[0] * initial_state.velocity_m_s
+    )
+    right_hand_side[..., 0, 1] += initial_state.velocity_m_s
     bands = np.zeros((len(s), 2, 4))
     bands[:-1, 1, 1] = -dt
     bands[:-1, 0, 2] = position_gain - 1.0
@@ -191,7 +197,7 @@ def innovations(
     bands[:-1, 0, 3] = k1[:-1]
     state, _ = lapack.dtbtrs(
         bands.reshape(-1, 4).T,
-        right_side.reshape(-1, 2 * len(s)).T,
+        right_hand_side.reshape(-1, 2 * len(s)).T,
         uplo="L",
         diag="U",
         overwrite_b=1,
@@ -210,10 +216,10 @@ def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
     return (0.5 * (left_value - right_value) / curvature if curvature > 0.0 else 0.0), curvature
 
 
-def profile_interval(
-    grid: Array, profile: Array, max_drop: float = PROFILE_DROP
+def compute_profile_interval(
+    grid: Array, profile: Array, max_drop: float = MAX_LOG_LIKELIHOOD_DROP
 ) -> tuple[float | None, float | None]:
-    """Return the 95 % interval of a parameter from its negative log-likelihood on a grid.
+    """Return the 95 % interval of a parameter from its profile -ln p on a grid.
 
     None replaces an end outside the grid. ``max_drop`` is the decrease of the log-likelihood from
     its maximum to the ends.
@@ -236,9 +242,9 @@ def profile_interval(
     )
 
 
-def profile_ends(
+def find_profile_interval(
     score: Callable[[float, float], float],
-    best_logs: tuple[float, float],
+    best_log_values: tuple[float, float],
     parameter_bounds: tuple[float, float],
     variance_factor: float = 1.0,
 ) -> tuple[float | None, float | None]:
@@ -249,42 +255,50 @@ def profile_ends(
     score : callable
         -ln p as a function of the logarithms of the parameter and of a second parameter, over
         which -ln p is minimised.
-    best_logs : (float, float)
-        Logarithms of both parameters at the minimum.
+    best_log_values : (float, float)
+        Natural logarithms of both parameters at the minimum.
     parameter_bounds : (float, float)
         Bounds of the first parameter, not of its logarithm.
     variance_factor : float
         Factor on the parameter's variance, for uncertainty that ``score`` does not include.
     """
-    best_score = score(*best_logs)
-    max_root_drop = float(np.sqrt(PROFILE_DROP * variance_factor))
+    best_score = score(*best_log_values)
+    max_sqrt_drop = float(np.sqrt(MAX_LOG_LIKELIHOOD_DROP * variance_factor))
 
     def find_interval_end(direction: float, bound: float) -> float | None:
-        other_log = best_logs[1]
+        other_log_sigma = best_log_values[1]
 
-        # The square root of the decrease is nearly linear in the distance, so brentq is fast
+        # √(decrease of the log-likelihood from its maximum) is nearly linear in the distance of ln
+        # σ from its estimate, so brentq is fast
         @cache
-        def root_drop_minus_limit(log_distance: float) -> float:
-            nonlocal other_log
-            if log_distance == 0.0:
-                return -max_root_drop
-            other_minimum = minimize_scalar(
-                lambda log_value: score(best_logs[0] + direction * log_distance, log_value),
-                bounds=(other_log - MAX_OTHER_LOG_STEP, other_log + MAX_OTHER_LOG_STEP),
-                options={"xatol": OTHER_LOG_TOLERANCE},
+        def compute_sqrt_drop_excess(log_sigma_distance: float) -> float:
+            nonlocal other_log_sigma
+            if log_sigma_distance == 0.0:
+                return -max_sqrt_drop
+            minimum_over_other_sigma = minimize_scalar(
+                lambda log_value: score(
+                    best_log_values[0] + direction * log_sigma_distance, log_value
+                ),
+                bounds=(
+                    other_log_sigma - MAX_OTHER_LOG_SIGMA_STEP,
+                    other_log_sigma + MAX_OTHER_LOG_SIGMA_STEP,
+                ),
+                options={"xatol": OTHER_LOG_SIGMA_TOLERANCE},
             )
-            other_log = float(other_minimum.x)
-            return float(np.sqrt(max(other_minimum.fun - best_score, 0.0)) - max_root_drop)
+            other_log_sigma = float(minimum_over_other_sigma.x)
+            return float(
+                np.sqrt(max(minimum_over_other_sigma.fun - best_score, 0.0)) - max_sqrt_drop
+            )
 
-        max_distance = direction * (float(np.log(bound)) - best_logs[0])
-        distance_limit = min(START_LOG_DISTANCE, max_distance)
-        while root_drop_minus_limit(distance_limit) < 0.0:
+        max_distance = direction * (float(np.log(bound)) - best_log_values[0])
+        distance_limit = min(START_LOG_SIGMA_DISTANCE, max_distance)
+        while compute_sqrt_drop_excess(distance_limit) < 0.0:
             if distance_limit == max_distance:
                 return None
             distance_limit = min(2.0 * distance_limit, max_distance)
-        log_distance = brentq(
-            root_drop_minus_limit, 0.0, distance_limit, xtol=1e-3 * distance_limit
+        log_sigma_distance = brentq(
+            compute_sqrt_drop_excess, 0.0, distance_limit, xtol=1e-3 * distance_limit
         )
-        return float(np.exp(best_logs[0] + direction * log_distance))
+        return float(np.exp(best_log_values[0] + direction * log_sigma_distance))
 
     return find_interval_end(-1.0, parameter_bounds[0]), find_interval_end(1.0, parameter_bounds[1])

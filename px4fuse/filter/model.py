@@ -41,21 +41,22 @@ def transition(dt_s: float | Array) -> Array:
     return from_elements((1.0, dt_s), (0.0, 1.0))
 
 
-def process_noise_unit(dt_s: T) -> Symmetric[T]:
-    """Return the process noise Q / (SIGMA_A² · DT) of one prediction step: elements 00, 01, 11."""
+def compute_unit_process_noise(dt_s: T) -> Symmetric[T]:
+    """Return Q / (SIGMA_A² · DT) of a prediction step of ``dt_s``: elements 00, 01, 11."""
     return dt_s**3 / 4.0, dt_s**2 / 2.0, dt_s
 
 
-def continuous_noise_unit(dt_s: T) -> Symmetric[T]:
-    """Return Q / (SIGMA_A² · DT) over ``dt_s`` for continuous acceleration noise.
+def compute_unit_continuous_noise(dt_s: T) -> Symmetric[T]:
+    """Return Q / (SIGMA_A² · DT) over ``dt_s`` for continuous white acceleration noise.
 
-    Element 00 is dt³/3. In one prediction step with constant acceleration error, it is dt³/4.
+    Element 00 is dt³/3, the limit for many short steps; in one prediction step, whose acceleration
+    error is constant, it is dt³/4. DT is the interval for which SIGMA_A is defined.
     """
     return dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s
 
 
 def propagate_state(position: T, velocity: T, acceleration: T, dt_s: T) -> tuple[T, T]:
-    """Return position (m) and velocity (m/s) after ``dt_s``: x = Fx + Ba."""
+    """Return position (m) and velocity (m/s) after ``dt_s`` of constant acceleration: Fx + Ba."""
     new_position = position + velocity * dt_s + acceleration * dt_s**2 / 2.0
     return new_position, velocity + acceleration * dt_s
 
@@ -74,10 +75,14 @@ def predict_step(
     ``noise_density`` (m²/s³) is the increase of the velocity variance per second, SIGMA_A² · DT.
     """
     p00, p01, p11 = propagate_covariance(covariance, dt_s)
-    q00, q01, q11 = process_noise_unit(dt_s)
-    predicted = p00 + noise_density * q00, p01 + noise_density * q01, p11 + noise_density * q11
+    q00, q01, q11 = compute_unit_process_noise(dt_s)
+    predicted_covariance = (
+        p00 + noise_density * q00,
+        p01 + noise_density * q01,
+        p11 + noise_density * q11,
+    )
     position, velocity = propagate_state(position, velocity, acceleration, dt_s)
-    return position, velocity, predicted
+    return position, velocity, predicted_covariance
 
 
 def update_step(
@@ -93,5 +98,5 @@ def update_step(
     s = p00 + variance
     k0 = p00 / s
     k1 = p01 / s
-    updated = variance * k0, variance * k1, p11 - k1 * p01
-    return (nu, s, k0, k1), (position + k0 * nu, velocity + k1 * nu, updated)
+    updated_covariance = variance * k0, variance * k1, p11 - k1 * p01
+    return (nu, s, k0, k1), (position + k0 * nu, velocity + k1 * nu, updated_covariance)

@@ -80,7 +80,8 @@ class Settings:
 def requested_settings(request: ComparisonRequest) -> Settings:
     """Return the KF settings that the user requested, and defaults for all others."""
     values = {name: getattr(request, name) for name in Settings.__dataclass_fields__}
-    # A time offset "auto" is estimated later. The reader of a position file adds its time offset
+    # No time offset is set here: "auto" is estimated later, and the reader of a position file adds
+    # its time offset to the timestamps
     if request.clock_offset_s == AUTO or request.position is not None:
         del values["clock_offset_s"]
     return Settings(**{name: value for name, value in values.items() if value is not None})

@@ -32,9 +32,9 @@ AISLE = "aisle"
 MIN_IMU_GAP_S = 0.1
 # Minimum length of a gap in the IMU, as multiple of the median sample interval
 MIN_IMU_GAP_INTERVALS = 5.0
-# Faster positions are downsampled to 1 to 2 times this rate (Hz) before the noises are estimated:
-# their errors are time-correlated, so that more positions add no information
-MAX_INDEPENDENT_HZ = 25.0
+# Positions at a higher rate are downsampled to 1 to 2 times this rate (Hz) before the noises are
+# estimated: at short intervals, position errors are time-correlated and add no information
+MAX_INDEPENDENT_RATE_HZ = 25.0
 # Minimum number of position measurements along an axis
 MIN_MEASUREMENTS = 3
 
@@ -43,18 +43,18 @@ MIN_MEASUREMENTS = 3
 class Segment:
     """Analysed time span (s) of a flight, and the reason why it was chosen.
 
-    ``flight_s`` is the time span of the whole flight; None if it is analysed completely.
+    ``flight_span_s`` is the time span of the whole flight; None if all of it is analysed.
     """
 
     start_s: float
     end_s: float
     reason: str
-    flight_s: Span | None = None
+    flight_span_s: Span | None = None
 
     @property
     def flight(self) -> Segment:
         """Time span of the whole flight."""
-        return Segment(*(self.flight_s or (self.start_s, self.end_s)), self.reason)
+        return Segment(*(self.flight_span_s or (self.start_s, self.end_s)), self.reason)
 
     def cut(self, spans_s: Iterable[Span]) -> tuple[Span, ...]:
         """Cut time spans (s) to the analysed segment, and drop those outside."""
@@ -69,35 +69,35 @@ class Acceleration:
     Attributes
     ----------
     time_s : ndarray, shape (n,)
-    ned_integral_m_s : ndarray, shape (3, n)
+    acceleration_integral_m_s : ndarray, shape (3, n)
         Integral of the acceleration in NED without gravity, from the first sample of the flight;
         all axes share it.
-    mean_products_m2_s4 : ndarray, shape (3, 3)
-        Mean products of the components of the acceleration in the segment.
+    acceleration_products_m2_s4 : ndarray, shape (3, 3)
+        Means, in the segment, of the products of two components (NED) of the acceleration.
     direction : ndarray, shape (3,)
         Unit vector of the axis in NED.
-    gap_time_s : ndarray, shape (k,)
+    gap_edge_time_s : ndarray, shape (k,)
         Start and end of each IMU gap.
-    gap_integral_s : ndarray, shape (k,)
-        Total length of the IMU gaps before each time in ``gap_time_s``.
+    cumulative_gap_s : ndarray, shape (k,)
+        Total length of the IMU gaps before each time in ``gap_edge_time_s``.
     """
 
     time_s: Array
-    ned_integral_m_s: Array
-    mean_products_m2_s4: Array
+    acceleration_integral_m_s: Array
+    acceleration_products_m2_s4: Array
     direction: Array
-    gap_time_s: Array
-    gap_integral_s: Array
+    gap_edge_time_s: Array
+    cumulative_gap_s: Array
 
     __repr__ = one_line_repr
 
     def compute_integral_m_s(self) -> Array:
-        """Return the integral of the acceleration along the axis (m/s), shape (n,)."""
-        return np.asarray(self.direction @ self.ned_integral_m_s)
+        """Return the velocity change (m/s) along the axis since the first sample, shape (n,)."""
+        return np.asarray(self.direction @ self.acceleration_integral_m_s)
 
     def compute_rms_m_s2(self) -> float:
-        """Return the RMS of the acceleration in the segment: its assumed σ in an IMU gap."""
-        return float(np.sqrt(self.direction @ self.mean_products_m2_s4 @ self.direction))
+        """Return the RMS acceleration in the segment: σ of the unknown acceleration in IMU gaps."""
+        return float(np.sqrt(self.direction @ self.acceleration_products_m2_s4 @ self.direction))
 
 
 @dataclass(frozen=True)
@@ -138,12 +138,12 @@ class Axis:
 
     @property
     def label(self) -> str:
-        """Name of the axis in messages: "the main axis" for "aisle"."""
+        """Name of the axis in messages: north, east, down, or "the main axis" for "aisle"."""
         return "the main axis" if self.name == AISLE else self.name
 
 
 def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unavailable:
-    """Return the attitude, and the IMU samples between its first and last sample."""
+    """Return the IMU samples in the time span of the attitude, and the attitude."""
     imu, attitude = flight.imu, flight.attitude
     if isinstance(imu, Unavailable):
         return imu
@@ -154,7 +154,7 @@ def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unav
         return Unavailable(
             "acceleration in NED",
             "IMU and attitude data do not overlap in time",
-            "Log from boot (SDLOG_MODE 1).",
+            "Set SDLOG_MODE to 1 to log from boot.",
         )
     return imu, attitude
 
@@ -234,7 +234,7 @@ def make_axes(
         raise SettingsError(f"`heading_deg` {heading_deg:g} is not between 0 and 360 degrees.")
     if unknown_names := [name for name in axis_names if name not in valid_names]:
         raise SettingsError(
-            f"px4fuse has no axis {unknown_names[0]}.",
+            f"The axis {unknown_names[0]} is unknown.",
             f"Choose from the axes {', '.join(valid_names)}.",
         )
     source_label = f"{flight.log.name}: {track.name}"
@@ -271,10 +271,13 @@ def make_axes(
     return tuple(axes)
 
 
-def independent_rows(time_s: Array) -> slice:
-    """Return a slice that downsamples fast positions to 1 to 2 times ``MAX_INDEPENDENT_HZ``."""
+def make_downsampling_slice(time_s: Array) -> slice:
+    """Return a slice that downsamples positions at a high rate to every k-th position.
+
+    The rate is then 1 to 2 times ``MAX_INDEPENDENT_RATE_HZ``.
+    """
     interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else np.inf
-    return slice(None, None, max(1, int(1.0 / (interval_s * MAX_INDEPENDENT_HZ))))
+    return slice(None, None, max(1, int(1.0 / (interval_s * MAX_INDEPENDENT_RATE_HZ))))
 
 
 def too_few_measurements(name: str, count: int, min_count: int) -> Unavailable:
@@ -318,36 +321,40 @@ def project_acceleration(
     if isinstance(acceleration, Unavailable):
         return acceleration
     time_s = acceleration.index.to_numpy()
-    inside_m_s2 = rows_between(acceleration, segment.start_s, segment.end_s).to_numpy()
-    if len(inside_m_s2) < 2:
+    segment_acceleration_m_s2 = rows_between(
+        acceleration, segment.start_s, segment.end_s
+    ).to_numpy()
+    if len(segment_acceleration_m_s2) < 2:
         return Unavailable(
             "IMU",
             "the analysed segment contains no IMU samples",
             "Use --start and --end to choose a segment with IMU samples.",
         )
-    is_gap = imu_gaps(time_s)
+    is_gap = find_imu_gaps(time_s)
     gap_rows = np.flatnonzero(is_gap)
     gap_sum_s = np.cumsum(np.where(is_gap, np.diff(time_s), 0.0))
     gap_ends = np.unique([0, *gap_rows, *(gap_rows + 1), len(time_s) - 1])
     return Acceleration(
         time_s=time_s,
-        ned_integral_m_s=np.array(
+        acceleration_integral_m_s=np.array(
             [cumulative_integral(values.to_numpy(), time_s) for _, values in acceleration.items()]
         ),
-        mean_products_m2_s4=inside_m_s2.T @ inside_m_s2 / len(inside_m_s2),
+        acceleration_products_m2_s4=segment_acceleration_m_s2.T
+        @ segment_acceleration_m_s2
+        / len(segment_acceleration_m_s2),
         direction=direction,
-        gap_time_s=time_s[gap_ends],
-        gap_integral_s=np.append(0.0, gap_sum_s)[gap_ends],
+        gap_edge_time_s=time_s[gap_ends],
+        cumulative_gap_s=np.append(0.0, gap_sum_s)[gap_ends],
     )
 
 
-def imu_gaps(time_s: Array) -> BoolArray:
+def find_imu_gaps(time_s: Array) -> BoolArray:
     """Return True for each interval between IMU samples that is a gap, shape (n - 1,)."""
     interval_s = np.diff(time_s)
     return interval_s > max(MIN_IMU_GAP_S, MIN_IMU_GAP_INTERVALS * float(np.median(interval_s)))
 
 
-def mean_step_acceleration(
+def compute_mean_step_acceleration(
     acceleration: Acceleration, step_edges_s: ArrayLike
 ) -> tuple[Array, Array]:
     """Return for each prediction step the mean acceleration, and its fraction in an IMU gap.
@@ -355,18 +362,18 @@ def mean_step_acceleration(
     ``step_edges_s`` contains the start of the first step, and the end (s) of each step.
     """
     step_edges_s = np.asarray(step_edges_s, dtype=np.float64)
-    length_s = np.diff(step_edges_s)
+    step_s = np.diff(step_edges_s)
     velocity_m_s = np.zeros(len(step_edges_s))
     for component, integral_m_s in zip(
-        acceleration.direction, acceleration.ned_integral_m_s, strict=True
+        acceleration.direction, acceleration.acceleration_integral_m_s, strict=True
     ):
         if component != 0.0:
             velocity_m_s += component * np.interp(step_edges_s, acceleration.time_s, integral_m_s)
-    gap_s = np.interp(step_edges_s, acceleration.gap_time_s, acceleration.gap_integral_s)
-    covered_s = np.clip(step_edges_s, acceleration.time_s[0], acceleration.time_s[-1])
-    outside_fraction = 1.0 - np.diff(covered_s) / length_s
-    return np.diff(velocity_m_s) / length_s, np.clip(
-        np.diff(gap_s) / length_s + outside_fraction, 0.0, 1.0
+    gap_s = np.interp(step_edges_s, acceleration.gap_edge_time_s, acceleration.cumulative_gap_s)
+    clipped_edges_s = np.clip(step_edges_s, acceleration.time_s[0], acceleration.time_s[-1])
+    fraction_outside_imu_data = 1.0 - np.diff(clipped_edges_s) / step_s
+    return np.diff(velocity_m_s) / step_s, np.clip(
+        np.diff(gap_s) / step_s + fraction_outside_imu_data, 0.0, 1.0
     )
 
 

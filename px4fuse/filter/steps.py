@@ -7,11 +7,11 @@ import numpy as np
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import InitialState, Settings
-from px4fuse.filter.signals import Axis, mean_step_acceleration
+from px4fuse.filter.signals import Axis, compute_mean_step_acceleration
 from px4fuse.flight.model import Unavailable
 
-# Timestamps are equal up to this difference (s): half of their resolution of 1 µs
-MAX_SAME_TIME_S = 5e-7
+# Two timestamps up to this difference (s) are equal: half of their resolution of 1 µs
+MAX_EQUAL_TIME_DIFFERENCE_S = 5e-7
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def make_timeline(
         than the initial state.
     """
     start_s = axis.measurement_time_s[0] if initial_state is None else initial_state.time_s
-    is_usable = axis.measurement_time_s > start_s + MAX_SAME_TIME_S
+    is_usable = axis.measurement_time_s > start_s + MAX_EQUAL_TIME_DIFFERENCE_S
     measurement_time_s = axis.measurement_time_s[is_usable]
     if not len(measurement_time_s):
         raise SettingsError(
@@ -59,12 +59,12 @@ def make_timeline(
         )
     grid_count = int(np.floor((measurement_time_s[-1] - start_s) / settings.dt_s + 1e-9)) + 1
     grid_s = start_s + settings.dt_s * np.arange(grid_count)
-    # Multiples of DT at which there is a measurement are omitted
+    # Multiples of DT that equal a measurement time are omitted, so that no step has zero length
     next_index = np.searchsorted(measurement_time_s, grid_s)
     neighbour_indices = np.clip([next_index - 1, next_index], 0, len(measurement_time_s) - 1)
     distance_s = np.abs(measurement_time_s[neighbour_indices] - grid_s).min(axis=0)
-    time_s = np.union1d(grid_s[distance_s > MAX_SAME_TIME_S], measurement_time_s)
-    if time_s[0] > start_s + MAX_SAME_TIME_S:
+    time_s = np.union1d(grid_s[distance_s > MAX_EQUAL_TIME_DIFFERENCE_S], measurement_time_s)
+    if time_s[0] > start_s + MAX_EQUAL_TIME_DIFFERENCE_S:
         time_s = np.append(start_s, time_s)
     measurement_index = np.full(len(time_s), -1, dtype=np.intp)
     measurement_index[np.searchsorted(time_s, measurement_time_s)] = np.flatnonzero(is_usable)
@@ -73,9 +73,10 @@ def make_timeline(
         return Timeline(time_s, measurement_index, np.zeros(step_count), np.zeros(step_count), 0.0)
     if isinstance(axis.acceleration, Unavailable):
         raise SettingsError(
-            "With the setting `input` imu, KF needs IMU data.", f"{axis.acceleration}"
+            f"The setting `input` is imu, but KF has no acceleration along {axis.name}.",
+            f"{axis.acceleration}",
         )
-    mean_acceleration_m_s2, gap_fraction = mean_step_acceleration(axis.acceleration, time_s)
+    mean_acceleration_m_s2, gap_fraction = compute_mean_step_acceleration(axis.acceleration, time_s)
     gap_s = gap_fraction * np.diff(time_s)
     # The unknown acceleration in an IMU gap of T seconds is assumed to be constant. The velocity
     # error is rms·T instead of rms·√(DT·T) for white noise, so the variance is multiplied by T/DT

@@ -18,44 +18,48 @@ from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Record, Share, Span
-from px4fuse.filter.fitting import Noises, fit_noises, maximise_likelihood
+from px4fuse.filter.fitting import NoiseParameters, fit_with_noises, maximise_likelihood
 from px4fuse.filter.imu_motion import (
-    COARSE_MEASUREMENTS,
+    COARSE_MEASUREMENT_COUNT,
     COARSE_OFFSET_COUNT,
     HEADING_SIGMA_RAD,
     MAX_OFFSET_S,
     MotionCache,
-    PreparedMotion,
-    prepare_motion,
+    PositionsAndImuMotion,
+    compute_imu_motion,
 )
-from px4fuse.filter.likelihood import PROFILE_DROP, parabola_vertex, profile_interval
-from px4fuse.filter.marginal_likelihood import products_by_segment
+from px4fuse.filter.likelihood import (
+    MAX_LOG_LIKELIHOOD_DROP,
+    compute_profile_interval,
+    parabola_vertex,
+)
+from px4fuse.filter.marginal_likelihood import compute_segment_products
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Segment, cut_to_segment, independent_rows
+from px4fuse.filter.signals import Segment, cut_to_segment, make_downsampling_slice
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 
 # Number of time offsets near the maximum at which the likelihood is computed
 FINE_OFFSET_COUNT = 11
-# Number of time offsets to which the likelihood is interpolated
-CURVE_OFFSET_COUNT = 121
+# Number of time offsets to which the likelihood is interpolated (the curve in the report)
+LIKELIHOOD_CURVE_POINT_COUNT = 121
 # Prior σ (rad) of EKF2's heading with GNSS: large, because a wrong GNSS delay (0.2 s) rotates
 # EKF2's heading (5°)
 GNSS_HEADING_SIGMA_RAD = 0.2
 # Maximum half-width (s) of the 95 % interval of an accepted time offset
-MAX_HALF_INTERVAL_S = 0.15
-# Maximum σ (s) of the time offset of a flight part in the test for a change
-MAX_PART_OFFSET_SIGMA_S = 0.15
+MAX_OFFSET_HALF_INTERVAL_S = 0.15
+# A segment whose time offset has a larger σ (s) is excluded from the test for a changed time offset
+MAX_SEGMENT_OFFSET_SIGMA_S = 0.15
 # The time offset changes in flight if the p-value of a constant offset is below this limit
 MAX_CHANGE_P_VALUE = 0.005
 # Minimum change (s) of the time offset in flight: a smaller change may be drift of the source
-MIN_CHANGE_S = 0.10
+MIN_TIME_OFFSET_CHANGE_S = 0.10
 # A time offset is significant if it exceeds this multiple of its σ: false alarm probability 0.3 %
 MIN_OFFSET_SIGMAS = 3.0
 # A time offset is significant if it exceeds this time (s): position error of 3 cm at 1 m/s
-MIN_OFFSET_S = 0.03
-# The variance of the time offset is simulated with 96 series of IMU noise. A flight of more than 12
-# segments needs fewer, because each group of 12 segments is independent
-SIMULATION_COUNT, SIMULATED_SEGMENTS = 96, 12
+MIN_TIME_OFFSET_S = 0.03
+# The variance of the time offset is simulated with about 96 samples. Each group of 12 segments
+# gives one sample per series of IMU noise, so a longer flight needs fewer series
+SIMULATION_COUNT, SIMULATED_SEGMENT_COUNT = 96, 12
 
 
 class PartOffset(Record):
@@ -116,13 +120,13 @@ class ClockOffset(Record, kw_only=True):
         return MIN_OFFSET_SIGMAS * self.sigma_s
 
     def has_changed(self) -> bool:
-        """Return True if the offset changes in flight significantly, by at least MIN_CHANGE_S."""
+        """Return True for a significant change in flight of at least MIN_TIME_OFFSET_CHANGE_S."""
         if self.change_p_value is None or self.change_p_value >= MAX_CHANGE_P_VALUE:
             return False
-        return abs(self.parts[-1].offset_s - self.parts[0].offset_s) >= MIN_CHANGE_S
+        return abs(self.parts[-1].offset_s - self.parts[0].offset_s) >= MIN_TIME_OFFSET_CHANGE_S
 
     def is_significant(self, offset_s: float) -> bool:
-        return abs(offset_s) > max(MIN_OFFSET_S, self.three_sigma_s)
+        return abs(offset_s) > max(MIN_TIME_OFFSET_S, self.three_sigma_s)
 
 
 def estimate_time_offset(
@@ -130,7 +134,7 @@ def estimate_time_offset(
     track: PositionTrack,
     segment: Segment,
     settings: Settings,
-    noises: Noises,
+    noise_parameters: NoiseParameters,
     outlier_time_s: Array | None = None,
     progress: Callable[[str], None] = lambda _: None,
     motion_cache: MotionCache | None = None,
@@ -144,7 +148,7 @@ def estimate_time_offset(
     segment : Segment
     settings : Settings
         ``clock_offset_s`` is a time offset that was already added.
-    noises : Noises
+    noise_parameters : NoiseParameters
         Initial values. The random walk is above zero if the source may drift (odometry).
     outlier_time_s : ndarray, optional
         Timestamps of measurements to exclude.
@@ -153,14 +157,15 @@ def estimate_time_offset(
     motion_cache : dict, optional
         IMU motion that several estimates share.
     """
-    # The height of GNSS is not used: it is noisier, but all axes have one SIGMA_Z
+    # GNSS height is noisier than the horizontal position. It is omitted, because all axes have the
+    # same SIGMA_Z
     axis_count = 2 if track.origin.is_gnss else 3
     position_samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:axis_count]]
     position_samples = position_samples.dropna(subset=Columns.POSITION[:2])
     if outlier_time_s is not None:
         position_samples = position_samples[~np.isin(position_samples.index, outlier_time_s)]
-    position_samples = position_samples[independent_rows(position_samples.index.to_numpy())]
-    prepared_motion = prepare_motion(
+    position_samples = position_samples[make_downsampling_slice(position_samples.index.to_numpy())]
+    imu_motion = compute_imu_motion(
         flight,
         position_samples.index.to_numpy(),
         position_samples.to_numpy(),
@@ -169,37 +174,54 @@ def estimate_time_offset(
         motion_cache=motion_cache,
         heading_sigma_rad=GNSS_HEADING_SIGMA_RAD if track.origin.is_gnss else HEADING_SIGMA_RAD,
     )
-    if isinstance(prepared_motion, Unavailable):
-        return prepared_motion
+    if isinstance(imu_motion, Unavailable):
+        return imu_motion
     progress("time offset")
-    coarse_motion = prepared_motion.downsample(COARSE_MEASUREMENTS)
-    offset_s, _ = prepared_motion.search_offset(noises)
+    coarse_motion = imu_motion.downsample(COARSE_MEASUREMENT_COUNT)
+    offset_s, _ = imu_motion.search_offset(noise_parameters)
     sigma_s = 0.0
     half_width_s = 0.1
-    for motion in (coarse_motion, prepared_motion):
-        noises = maximise_likelihood(
-            [motion.positions_at_offset(offset_s)], noises, motion.weight, fits_outliers=False
-        ).noises
-        curve_s = _offset_grid(offset_s, half_width_s, FINE_OFFSET_COUNT)
-        fitted_positions = fit_noises(motion.position_batches(curve_s), noises, motion.weight)
-        offset_s, sigma_s = _minimum_and_sigma(curve_s, fitted_positions.scores()[0])
+    for motion in (coarse_motion, imu_motion):
+        noise_parameters = maximise_likelihood(
+            [motion.make_positions_at_offset(offset_s)],
+            noise_parameters,
+            motion.measurement_weights,
+            fits_outliers=False,
+        ).noise_parameters
+        tested_offsets_s = _make_offset_grid(offset_s, half_width_s, FINE_OFFSET_COUNT)
+        fitted_positions = fit_with_noises(
+            motion.make_position_batches(tested_offsets_s),
+            noise_parameters,
+            motion.measurement_weights,
+        )
+        offset_s, sigma_s = _fit_minimum_and_sigma(
+            tested_offsets_s, fitted_positions.compute_scores()[0]
+        )
         half_width_s = float(np.clip(3.5 * sigma_s, 0.01, MAX_OFFSET_S))
     offset_variance_factor = _simulate_offset_variance_factor(
-        prepared_motion, offset_s, noises, sigma_s**-2.0
+        imu_motion, offset_s, noise_parameters, sigma_s**-2.0
     )
-    curve_s, curve_scores, low_s, high_s = _profile(
-        prepared_motion, noises, offset_s, half_width_s, PROFILE_DROP * offset_variance_factor
+    curve_offsets_s, profile_scores, low_s, high_s = _compute_offset_profile(
+        imu_motion,
+        noise_parameters,
+        offset_s,
+        half_width_s,
+        MAX_LOG_LIKELIHOOD_DROP * offset_variance_factor,
     )
-    is_closed = low_s is not None and high_s is not None
-    offset_s = _minimum_and_sigma(curve_s, curve_scores)[0]
-    # An IMU sample is the mean over one interval, and its timestamp may be any time in it
-    resolution_s = 0.5 * prepared_motion.imu_interval_s
-    ends_s = curve_s[0] if low_s is None else low_s, curve_s[-1] if high_s is None else high_s
+    has_both_ends = low_s is not None and high_s is not None
+    offset_s = _fit_minimum_and_sigma(curve_offsets_s, profile_scores)[0]
+    # An IMU sample is the mean over one interval, and its timestamp may be any time in it. The
+    # error is half an interval (1 σ), and is added to both half-widths of the 95 % interval
+    resolution_s = 0.5 * imu_motion.imu_interval_s
+    ends_s = (
+        curve_offsets_s[0] if low_s is None else low_s,
+        curve_offsets_s[-1] if high_s is None else high_s,
+    )
     half_intervals_s = np.hypot(np.array(ends_s) - offset_s, 1.96 * resolution_s)
     low_s = float(offset_s - half_intervals_s[0])
     high_s = float(offset_s + half_intervals_s[1])
     rejection_reason = ""
-    if not is_closed or (high_s - low_s) / 2.0 > MAX_HALF_INTERVAL_S:
+    if not has_both_ends or (high_s - low_s) / 2.0 > MAX_OFFSET_HALF_INTERVAL_S:
         rejection_reason = (
             f"time offsets from {low_s:+.2f} s to {high_s:+.2f} s have nearly the same likelihood: "
             "the flight has too little acceleration, or the positions have too much noise"
@@ -208,8 +230,8 @@ def estimate_time_offset(
     change_p_value = None
     if not rejection_reason:
         progress("changes of the time offset in flight")
-        parts, change_p_value = _offset_per_part(
-            prepared_motion, offset_s, noises, offset_variance_factor
+        parts, change_p_value = _estimate_part_offsets(
+            imu_motion, offset_s, noise_parameters, offset_variance_factor
         )
     drift_ppm, drift_sigma_ppm = _fit_clock_drift(parts)
     applied_s = settings.clock_offset_s
@@ -220,94 +242,113 @@ def estimate_time_offset(
         sigma_s=float(np.hypot(sigma_s * np.sqrt(offset_variance_factor), resolution_s)),
         is_determinable=not rejection_reason,
         reason=rejection_reason,
-        curve_s=applied_s + curve_s,
-        curve_log_likelihood_drop=curve_scores - curve_scores.min(),
+        curve_s=applied_s + curve_offsets_s,
+        curve_log_likelihood_drop=profile_scores - profile_scores.min(),
         parts=tuple(structs.replace(part, offset_s=applied_s + part.offset_s) for part in parts),
         drift_ppm=drift_ppm,
         drift_sigma_ppm=drift_sigma_ppm,
         change_p_value=change_p_value,
-        sigma_a_m_s2=noises.sigma_a_m_s2,
-        sigma_z_m=noises.sigma_z_m,
-        count=len(prepared_motion.time_s),
+        sigma_a_m_s2=noise_parameters.sigma_a_m_s2,
+        sigma_z_m=noise_parameters.sigma_z_m,
+        count=len(imu_motion.time_s),
     )
 
 
-def _profile(
-    motion: PreparedMotion, noises: Noises, offset_s: float, half_width_s: float, score_rise: float
+def _compute_offset_profile(
+    motion: PositionsAndImuMotion,
+    noise_parameters: NoiseParameters,
+    offset_s: float,
+    half_width_s: float,
+    score_rise: float,
 ) -> tuple[Array, Array, float | None, float | None]:
-    """Return offsets (s), their -ln p, and both ends (s) of the interval around the minimum.
+    """Compute the profile of -ln p of the positions over the time offset.
 
-    At the ends, -ln p is its minimum plus ``score_rise``; None for an end outside the search range.
+    Return time offsets (s), -ln p, and both ends (s) of the interval around the minimum. At the
+    ends, -ln p is its minimum plus ``score_rise``; None for an end outside the search range.
     """
     while True:
-        node_offsets_s, curve_s = (
-            _offset_grid(offset_s, half_width_s, offset_count)
-            for offset_count in (FINE_OFFSET_COUNT, CURVE_OFFSET_COUNT)
+        node_offsets_s, curve_offsets_s = (
+            _make_offset_grid(offset_s, half_width_s, offset_count)
+            for offset_count in (FINE_OFFSET_COUNT, LIKELIHOOD_CURVE_POINT_COUNT)
         )
-        position_batches = motion.position_batches(node_offsets_s)
-        node_scores = fit_noises(position_batches, noises, motion.weight).scores()[0]
-        curve_scores = CubicSpline(node_offsets_s, node_scores)(curve_s)
-        low_s, high_s = profile_interval(curve_s, curve_scores, score_rise)
+        position_batches = motion.make_position_batches(node_offsets_s)
+        node_scores = fit_with_noises(
+            position_batches, noise_parameters, motion.measurement_weights
+        ).compute_scores()[0]
+        profile_scores = CubicSpline(node_offsets_s, node_scores)(curve_offsets_s)
+        low_s, high_s = compute_profile_interval(curve_offsets_s, profile_scores, score_rise)
         if None not in (low_s, high_s) or half_width_s >= 2.0 * MAX_OFFSET_S:
-            return curve_s, curve_scores, low_s, high_s
+            return curve_offsets_s, profile_scores, low_s, high_s
         half_width_s *= 2.0
 
 
-def _offset_grid(centre_s: float, half_width_s: float, offset_count: int) -> Array:
+def _make_offset_grid(centre_s: float, half_width_s: float, offset_count: int) -> Array:
     low_s = max(centre_s - half_width_s, -MAX_OFFSET_S)
     return np.linspace(low_s, min(centre_s + half_width_s, MAX_OFFSET_S), offset_count)
 
 
 def _simulate_offset_variance_factor(
-    prepared_motion: PreparedMotion, offset_s: float, noises: Noises, fisher_information: float
+    imu_motion: PositionsAndImuMotion,
+    offset_s: float,
+    noise_parameters: NoiseParameters,
+    fisher_information: float,
 ) -> float:
-    """Simulate the ratio of the time offset's variance to the variance from the curvature of -ln p.
+    """Simulate the factor on the variance of the estimated time offset due to IMU noise.
 
-    The derivative of -ln p with respect to the time offset is eᵀM(v + n), with residuals e, inverse
-    covariance M, velocity v and velocity noise n of the IMU. The term eᵀMn increases the variance:
-    e also contains n.
+    The factor is the variance times ``fisher_information``, the curvature of -ln p. The derivative
+    of -ln p with respect to the time offset is eᵀM(v + n), with residuals e, inverse covariance M,
+    velocity v and velocity noise n of the IMU. The term eᵀMn increases the variance: e also
+    contains n.
     """
-    offset_positions = prepared_motion.positions_at_offset(offset_s)
-    is_joined = offset_positions.is_joined
-    measurement_count = len(prepared_motion.time_s)
-    axis_count = len(prepared_motion.directions)
-    interval_count = int(np.count_nonzero(is_joined))
+    offset_positions = imu_motion.make_positions_at_offset(offset_s)
+    is_within_segment = offset_positions.is_within_segment
+    measurement_count = len(imu_motion.time_s)
+    axis_count = len(imu_motion.directions)
+    interval_count = int(np.count_nonzero(is_within_segment))
     rng = np.random.default_rng(measurement_count)
-    first_segments = np.arange(0, len(prepared_motion.segment_motions), SIMULATED_SEGMENTS)
+    first_segments = np.arange(0, len(imu_motion.segment_motions), SIMULATED_SEGMENT_COUNT)
     series_count = -(-SIMULATION_COUNT // len(first_segments))
 
     def draw_normal(count: int) -> Array:
         return rng.standard_normal((count, axis_count, series_count)).transpose(1, 2, 0)
 
-    q00, q01, q11 = noises.sigma_a_m_s2**2 * offset_positions.unit_process_noise[:, is_joined]
+    q00, q01, q11 = (
+        noise_parameters.sigma_a_m_s2**2 * offset_positions.unit_process_noise[:, is_within_segment]
+    )
     dp, dv = np.zeros((2, axis_count, series_count, measurement_count - 1))
-    dp[..., is_joined] = np.sqrt(q00) * draw_normal(interval_count)
-    dv[..., is_joined] = np.sqrt(q11 - q01**2 / q00) * draw_normal(interval_count)
-    dv[..., is_joined] += q01 / q00 * dp[..., is_joined]
-    error_m = noises.sigma_z_m * draw_normal(measurement_count)
-    # The velocity noise is the sum of Δv since the start of the segment
+    dp[..., is_within_segment] = np.sqrt(q00) * draw_normal(interval_count)
+    dv[..., is_within_segment] = np.sqrt(q11 - q01**2 / q00) * draw_normal(interval_count)
+    dv[..., is_within_segment] += q01 / q00 * dp[..., is_within_segment]
+    error_m = noise_parameters.sigma_z_m * draw_normal(measurement_count)
+    # The velocity noise of the IMU is the sum of the noise of Δv since the start of the segment
     velocity_noise = np.zeros_like(error_m)
     for begin, end in offset_positions.segments:
         np.cumsum(dv[..., begin : end - 1], axis=-1, out=velocity_noise[..., begin + 1 : end])
-    # The random walk of the source is added to Δp only, not to the velocity noise of the IMU
-    if noises.random_walk_m:
-        dp[..., is_joined] += (
-            noises.random_walk_m
-            * np.sqrt(offset_positions.length_s[is_joined])
+    # The random walk of the source changes Δp only: the velocity of the IMU does not contain it
+    if noise_parameters.random_walk_m:
+        dp[..., is_within_segment] += (
+            noise_parameters.random_walk_m
+            * np.sqrt(offset_positions.interval_s[is_within_segment])
             * draw_normal(interval_count)
         )
-    offset_positions, scaled_variance = offset_positions.in_sigma_z_units(
-        1.0, noises.random_walk_m, prepared_motion.weight / noises.sigma_z_m**2
+    offset_positions, scaled_variance = offset_positions.normalise_by_sigma_z(
+        1.0,
+        noise_parameters.random_walk_m,
+        imu_motion.measurement_weights / noise_parameters.sigma_z_m**2,
     )
-    noise_products = products_by_segment(
-        offset_positions, noises.sigma_a_m_s2, scaled_variance, (error_m, dp, dv), velocity_noise
+    noise_products = compute_segment_products(
+        offset_positions,
+        noise_parameters.sigma_a_m_s2,
+        scaled_variance,
+        (error_m, dp, dv),
+        velocity_noise,
     )
     variances = np.add.reduceat(noise_products, first_segments).var(axis=1)
     return 1.0 + float(variances.sum()) / fisher_information
 
 
-def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
-    """Fit a parabola to -ln p on a grid; return the minimum, and σ from the curvature."""
+def _fit_minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
+    """Fit a parabola to -ln p on a grid; return its minimiser, and σ from its curvature."""
     minimum_index = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
     grid_step = grid[1] - grid[0]
     vertex_shift, curvature = parabola_vertex(profile, minimum_index)
@@ -318,8 +359,11 @@ def _minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
     )
 
 
-def _offset_per_part(
-    prepared_motion: PreparedMotion, offset_s: float, noises: Noises, offset_variance_factor: float
+def _estimate_part_offsets(
+    imu_motion: PositionsAndImuMotion,
+    offset_s: float,
+    noise_parameters: NoiseParameters,
+    offset_variance_factor: float,
 ) -> tuple[tuple[PartOffset, ...], float | None]:
     """Estimate the time offset in each segment of the flight, and test for a constant offset.
 
@@ -327,23 +371,27 @@ def _offset_per_part(
     """
     coarse_offsets_s = offset_s + np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSET_COUNT)
     coarse_offsets_s = coarse_offsets_s[np.abs(coarse_offsets_s) <= MAX_OFFSET_S]
-    coarse_profiles = fit_noises(
-        prepared_motion.position_batches(coarse_offsets_s), noises, prepared_motion.weight
-    ).scores_by_segment()[0]
-    grid_offsets_s = np.linspace(coarse_offsets_s[0], coarse_offsets_s[-1], CURVE_OFFSET_COUNT)
-    part_profiles = CubicSpline(coarse_offsets_s, coarse_profiles, axis=1)(grid_offsets_s)
+    coarse_profiles = fit_with_noises(
+        imu_motion.make_position_batches(coarse_offsets_s),
+        noise_parameters,
+        imu_motion.measurement_weights,
+    ).compute_segment_scores()[0]
+    grid_offsets_s = np.linspace(
+        coarse_offsets_s[0], coarse_offsets_s[-1], LIKELIHOOD_CURVE_POINT_COUNT
+    )
+    segment_profiles = CubicSpline(coarse_offsets_s, coarse_profiles, axis=1)(grid_offsets_s)
     part_offsets = []
     score_drops = []
     for begin, end, profile in zip(
-        prepared_motion.segment_edges,
-        prepared_motion.segment_edges[1:],
-        part_profiles,
+        imu_motion.segment_edges,
+        imu_motion.segment_edges[1:],
+        segment_profiles,
         strict=False,
     ):
-        part_offset_s, sigma_s = _minimum_and_sigma(grid_offsets_s, profile)
+        part_offset_s, sigma_s = _fit_minimum_and_sigma(grid_offsets_s, profile)
         sigma_s *= float(np.sqrt(offset_variance_factor))
-        if sigma_s < MAX_PART_OFFSET_SIGMA_S:
-            start_s, end_s = prepared_motion.time_s[[begin, end - 1]].tolist()
+        if sigma_s < MAX_SEGMENT_OFFSET_SIGMA_S:
+            start_s, end_s = imu_motion.time_s[[begin, end - 1]].tolist()
             part_offsets.append(PartOffset(start_s, end_s, part_offset_s, sigma_s))
             score_drops.append(profile - profile.min())
     if len(part_offsets) < 2:
@@ -359,11 +407,11 @@ def _fit_clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None
     """
     if len(part_offsets) < 3:
         return None, None
-    weighted_offsets = [
+    offsets_with_sigma = [
         ((part_offset.start_s + part_offset.end_s) / 2.0, part_offset.offset_s, part_offset.sigma_s)
         for part_offset in part_offsets
     ]
-    time_s, offset_s, sigma_s = np.transpose(weighted_offsets)
+    time_s, offset_s, sigma_s = np.transpose(offsets_with_sigma)
     coefficients, covariance = np.polyfit(
         time_s - time_s.mean(), offset_s, 1, w=1.0 / sigma_s, cov="unscaled"
     )

@@ -16,25 +16,25 @@ from scipy.optimize import minimize_scalar
 
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, OrUnavailable, Record
-from px4fuse.filter.consistency import Consistency, assess
+from px4fuse.filter.consistency import Consistency, assess_innovations
 from px4fuse.filter.fitting import (
-    SIGMA_A_SEARCH_M_S2,
-    SIGMA_Z_SEARCH_M,
+    SIGMA_A_SEARCH_RANGE_M_S2,
+    SIGMA_Z_SEARCH_RANGE_M,
     NoiseFit,
-    Noises,
-    kf_positions,
+    NoiseParameters,
+    convert_to_positions,
+    estimate_outlier_probability,
     maximise_likelihood,
-    outlier_probability,
 )
-from px4fuse.filter.imu_motion import MotionCache, prepare_motion
+from px4fuse.filter.imu_motion import MotionCache, compute_imu_motion
 from px4fuse.filter.likelihood import (
-    Preintegrated,
+    PreintegratedMotion,
+    find_profile_interval,
     innovations,
     preintegrate,
-    profile_ends,
 )
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, independent_rows, too_few_measurements
+from px4fuse.filter.signals import Axis, make_downsampling_slice, too_few_measurements
 from px4fuse.flight.model import Flight, Unavailable
 
 HORIZONTAL = "horizontal"
@@ -47,11 +47,11 @@ MAX_OUTLIER_FRACTION = 0.3
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
 # Initial value of the random walk (m/√s) of a source that may drift
 START_RANDOM_WALK_M = 0.02
-# A noise estimate is only a bound if it equals an end of its search range, within this factor
-MAX_SEARCH_END_RATIO = 1.001
+# A noise estimate is only a bound if its ratio to an end of its search range is within this factor
+MAX_SEARCH_LIMIT_RATIO = 1.001
 
 
-class Noise(Record):
+class NoiseEstimate(Record):
     """Maximum-likelihood estimate of one noise parameter, with its 95 % interval.
 
     ``value`` is None if the maximum is outside the search range. ``low`` is None if the noise may
@@ -63,13 +63,13 @@ class Noise(Record):
     high: float | None
 
     @classmethod
-    def from_fields(cls, value: float | None, interval: NoiseInterval | None) -> Noise:
-        """Make a noise from its value and interval in :class:`AxisTuning`."""
+    def from_fields(cls, value: float | None, interval: NoiseInterval | None) -> NoiseEstimate:
+        """Make the estimate from its value and interval in :class:`AxisTuning`."""
         low, high = interval or (0.0, None)
         return cls(value, low or None, high)
 
     def as_fields(self, name: str) -> dict[str, Any]:
-        """Return value and interval as keyword arguments for :class:`AxisTuning`."""
+        """Return the fields ``name`` and ``name_interval`` of :class:`AxisTuning`."""
         is_bounded = self.low is not None or self.high is not None
         interval = (self.low or 0.0, self.high) if is_bounded else None
         return {name: self.value, f"{name}_interval": interval}
@@ -101,7 +101,7 @@ class AxisTuning(Record, kw_only=True):
     Attributes
     ----------
     sigma_a_two_state_m_s2 : float or None
-        SIGMA_A that KF needs, because it has no states for biases.
+        SIGMA_A for KF, whose two states do not include biases: also covers biases and tilt.
     log_likelihood_gain_per_measurement : float
         Gain of the estimated over the current settings of KF.
     before, after : Consistency or Unavailable
@@ -111,7 +111,7 @@ class AxisTuning(Record, kw_only=True):
     biases_fitted : bool
         False if the IMU rate is too low to estimate biases. KF's SIGMA_A is then only an upper
         bound of the acceleration noise.
-    noises : Noises
+    noises : NoiseParameters
         Maximum-likelihood noises, including the random walk of a drifting source.
     """
 
@@ -130,21 +130,23 @@ class AxisTuning(Record, kw_only=True):
     biases_fitted: bool
     name: NotWritten[str] = NOT_WRITTEN
     outlier_time_s: NotWritten[Array] = NOT_WRITTEN
-    noises: NotWritten[Noises] = NOT_WRITTEN
+    noises: NotWritten[NoiseParameters] = NOT_WRITTEN
 
     @property
-    def sigma_a(self) -> Noise:
-        """SIGMA_A of the acceleration noise alone (m/s²)."""
-        return Noise.from_fields(self.sigma_a_m_s2, self.sigma_a_m_s2_interval)
+    def sigma_a(self) -> NoiseEstimate:
+        """SIGMA_A (m/s²) of the acceleration noise, without the effect of biases and tilt."""
+        return NoiseEstimate.from_fields(self.sigma_a_m_s2, self.sigma_a_m_s2_interval)
 
     @property
-    def sigma_a_two_state(self) -> Noise:
-        """SIGMA_A (m/s²) that KF needs, because it has no states for biases."""
-        return Noise.from_fields(self.sigma_a_two_state_m_s2, self.sigma_a_two_state_m_s2_interval)
+    def sigma_a_two_state(self) -> NoiseEstimate:
+        """SIGMA_A (m/s²) for KF: acceleration noise and the effect of biases and tilt."""
+        return NoiseEstimate.from_fields(
+            self.sigma_a_two_state_m_s2, self.sigma_a_two_state_m_s2_interval
+        )
 
     @property
-    def sigma_z(self) -> Noise:
-        return Noise.from_fields(self.sigma_z_m, self.sigma_z_m_interval)
+    def sigma_z(self) -> NoiseEstimate:
+        return NoiseEstimate.from_fields(self.sigma_z_m, self.sigma_z_m_interval)
 
 
 def tune(
@@ -191,7 +193,8 @@ def tune(
                     name, group_axes, settings, flight, may_drift, motion_cache
                 )
             except np.linalg.LinAlgError as error:
-                # Positions far from the path cause rounding errors
+                # Positions far from the path cause rounding errors, which make the normal equations
+                # singular
                 tunings[name] = Unavailable(
                     f"estimate of the noises ({name})",
                     str(error),
@@ -212,50 +215,55 @@ def tune_axes(
 
     See :func:`tune` for the parameters.
     """
-    kf_inputs = [preintegrate(axis, settings) for axis in axes]
-    all_time_s = axes[0].measurement_time_s[-len(kf_inputs[0].measurement_m) :]
-    axes = tuple(axis.keep_rows(independent_rows(axis.measurement_time_s)) for axis in axes)
-    axis_positions = [kf_positions(preintegrate(axis, settings)) for axis in axes]
+    kf_motions = [preintegrate(axis, settings) for axis in axes]
+    all_measurement_time_s = axes[0].measurement_time_s[-len(kf_motions[0].measurement_m) :]
+    axes = tuple(axis.keep_rows(make_downsampling_slice(axis.measurement_time_s)) for axis in axes)
+    axis_positions = [convert_to_positions(preintegrate(axis, settings)) for axis in axes]
     measurement_count = len(axis_positions[0].measurement_m) - 1
     if measurement_count < MIN_MEASUREMENTS:
         return too_few_measurements(
             f"estimate of the noises ({name})", measurement_count, MIN_MEASUREMENTS
         )
-    current_noises = Noises(settings.sigma_a_m_s2, settings.sigma_z_m)
-    kf_fit = maximise_likelihood(axis_positions, current_noises, np.ones(measurement_count))
+    current_parameters = NoiseParameters(settings.sigma_a_m_s2, settings.sigma_z_m)
+    kf_fit = maximise_likelihood(axis_positions, current_parameters, np.ones(measurement_count))
     # The estimate with biases, tilt and time offset needs IMU data
     motion_fit = None
     if flight is not None and settings.input == "imu":
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
-        # KF's fit contains no weight of the first measurement: it is the initial state
-        axis_weights = np.concatenate([np.ones(len(measured_m) - measurement_count), kf_fit.weight])
-        prepared_motion = prepare_motion(
+        # KF's fit has no weights of measurements that are its initial state: their weight is 1
+        measurement_weights = np.concatenate(
+            [np.ones(len(measured_m) - measurement_count), kf_fit.measurement_weights]
+        )
+        imu_motion = compute_imu_motion(
             flight,
             axes[0].measurement_time_s,
             measured_m,
             directions=np.array([axis.direction for axis in axes]),
             dt_s=settings.dt_s,
-            weight=axis_weights,
+            measurement_weights=measurement_weights,
             motion_cache=motion_cache,
         )
-        if not isinstance(prepared_motion, Unavailable):
-            start_noises = replace(
-                kf_fit.noises, random_walk_m=START_RANDOM_WALK_M if may_drift else 0.0
+        if not isinstance(imu_motion, Unavailable):
+            start_parameters = replace(
+                kf_fit.noise_parameters, random_walk_m=START_RANDOM_WALK_M if may_drift else 0.0
             )
             # An approximate time offset is sufficient: it hardly changes the noises
-            offset_s, start_noises = prepared_motion.search_offset(
-                start_noises, START_SIGMA_A_FACTORS, has_scale=False
+            offset_s, start_parameters = imu_motion.search_offset(
+                start_parameters, START_SIGMA_A_FACTORS, estimates_scale=False
             )
             motion_fit = maximise_likelihood(
-                [prepared_motion.positions_at_offset(offset_s)],
-                start_noises,
-                prepared_motion.weight,
+                [imu_motion.make_positions_at_offset(offset_s)],
+                start_parameters,
+                imu_motion.measurement_weights,
             )
     best_fit = kf_fit if motion_fit is None else motion_fit
     is_outlier = kf_fit.outlier_probability > 0.5
-    if len(all_time_s) > measurement_count:
-        all_positions = [kf_positions(kf_input) for kf_input in kf_inputs]
-        is_outlier = outlier_probability(all_positions, kf_fit, len(all_time_s)) > 0.5
+    if len(all_measurement_time_s) > measurement_count:
+        all_axis_positions = [convert_to_positions(kf_motion) for kf_motion in kf_motions]
+        is_outlier = (
+            estimate_outlier_probability(all_axis_positions, kf_fit, len(all_measurement_time_s))
+            > 0.5
+        )
     if np.mean(is_outlier) > MAX_OUTLIER_FRACTION:
         return Unavailable(
             f"estimate of the noises ({name})",
@@ -264,107 +272,118 @@ def tune_axes(
             "Reduce the outliers of the positioning system.",
         )
     sigma_a, sigma_z = (_estimate_noise(best_fit, noise_index) for noise_index in (0, 1))
-    final_sigma_z_m = sigma_z.value or sigma_z.high or best_fit.noises.sigma_z_m
+    final_sigma_z_m = sigma_z.value or sigma_z.high or best_fit.noise_parameters.sigma_z_m
     kf_sigma_a = sigma_a if motion_fit is None else _estimate_kf_sigma_a(kf_fit, final_sigma_z_m)
     if motion_fit is None and flight is not None and settings.input == "imu":
         # Without estimates of biases and tilt, KF's SIGMA_A is only an upper bound of the noise
-        sigma_a = Noise(None, None, kf_sigma_a.high)
-    final_noises = Noises(
-        kf_sigma_a.value or kf_sigma_a.high or kf_fit.noises.sigma_a_m_s2, final_sigma_z_m
+        sigma_a = NoiseEstimate(None, None, kf_sigma_a.high)
+    final_parameters = NoiseParameters(
+        kf_sigma_a.value or kf_sigma_a.high or kf_fit.noise_parameters.sigma_a_m_s2, final_sigma_z_m
     )
-    gain_nats = kf_fit.score(current_noises) - kf_fit.score(final_noises)
+    likelihood_gain_nats = kf_fit.score(current_parameters) - kf_fit.score(final_parameters)
     return AxisTuning(
         name=name,
         **sigma_a.as_fields("sigma_a_m_s2"),
         **sigma_z.as_fields("sigma_z_m"),
         **kf_sigma_a.as_fields("sigma_a_two_state_m_s2"),
-        log_likelihood_gain_per_measurement=gain_nats / measurement_count,
-        before=_assess_innovations(kf_inputs[0], current_noises, is_outlier),
-        after=_assess_innovations(kf_inputs[0], final_noises, is_outlier),
-        outlier_time_s=all_time_s[is_outlier],
-        count=len(all_time_s),
+        log_likelihood_gain_per_measurement=likelihood_gain_nats / measurement_count,
+        before=_assess_kf(kf_motions[0], current_parameters, is_outlier),
+        after=_assess_kf(kf_motions[0], final_parameters, is_outlier),
+        outlier_time_s=all_measurement_time_s[is_outlier],
+        count=len(all_measurement_time_s),
         outliers=int(np.count_nonzero(is_outlier)),
-        held_out=_check_held_out(name, current_noises, kf_fit),
-        noises=best_fit.noises,
+        held_out=_check_held_out(name, current_parameters, kf_fit),
+        noises=best_fit.noise_parameters,
         biases_fitted=motion_fit is not None,
     )
 
 
-def _estimate_noise(fit: NoiseFit, noise_index: int) -> Noise:
+def _estimate_noise(fit: NoiseFit, noise_index: int) -> NoiseEstimate:
     """Return SIGMA_A (``noise_index`` 0) or SIGMA_Z (1) of a fit with its 95 % interval."""
-    best_noises = fit.noises.sigma_a_m_s2, fit.noises.sigma_z_m
+    best_parameters = fit.noise_parameters.sigma_a_m_s2, fit.noise_parameters.sigma_z_m
 
-    def score(log_value: float, log_other: float) -> float:
-        log_noises = (log_value, log_other) if noise_index == 0 else (log_other, log_value)
-        sigma_a, sigma_z = np.exp(log_noises).tolist()
-        return fit.score(Noises(sigma_a, sigma_z, fit.noises.random_walk_m))
+    def score(log_value: float, log_other_sigma: float) -> float:
+        log_parameters = (
+            (log_value, log_other_sigma) if noise_index == 0 else (log_other_sigma, log_value)
+        )
+        sigma_a, sigma_z = np.exp(log_parameters).tolist()
+        return fit.score(NoiseParameters(sigma_a, sigma_z, fit.noise_parameters.random_walk_m))
 
-    search_range = (SIGMA_A_SEARCH_M_S2, SIGMA_Z_SEARCH_M)[noise_index]
-    variance_factor = (1.0, fit.sigma_z_variance_factor)[noise_index]
-    return _noise_with_interval(
+    search_range = (SIGMA_A_SEARCH_RANGE_M_S2, SIGMA_Z_SEARCH_RANGE_M)[noise_index]
+    variance_factor = (1.0, fit.sigma_z_variance_inflation)[noise_index]
+    return _make_noise_estimate(
         score,
-        (np.log(best_noises[noise_index]), np.log(best_noises[1 - noise_index])),
+        (np.log(best_parameters[noise_index]), np.log(best_parameters[1 - noise_index])),
         search_range,
         variance_factor,
     )
 
 
-def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z: float) -> Noise:
-    def score(log_a: float, _: float = 0.0) -> float:
-        return fit.score(Noises(float(np.exp(log_a)), sigma_z))
+def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z: float) -> NoiseEstimate:
+    def score(log_sigma_a: float, _: float = 0.0) -> float:
+        return fit.score(NoiseParameters(float(np.exp(log_sigma_a)), sigma_z))
 
-    low_log_sigma, high_log_sigma = np.log(SIGMA_A_SEARCH_M_S2)
-    best_log_a = float(
+    low_log_sigma, high_log_sigma = np.log(SIGMA_A_SEARCH_RANGE_M_S2)
+    best_log_sigma_a = float(
         minimize_scalar(score, bounds=(low_log_sigma, high_log_sigma), options={"xatol": 1e-3}).x
     )
-    return _noise_with_interval(score, (best_log_a, 0.0), SIGMA_A_SEARCH_M_S2)
+    return _make_noise_estimate(score, (best_log_sigma_a, 0.0), SIGMA_A_SEARCH_RANGE_M_S2)
 
 
-def _noise_with_interval(
+def _make_noise_estimate(
     score: Callable[[float, float], float],
-    best_logs: tuple[float, float],
+    best_log_values: tuple[float, float],
     search_range: tuple[float, float],
     variance_factor: float = 1.0,
-) -> Noise:
-    estimate = float(np.exp(best_logs[0]))
-    low, high = profile_ends(score, best_logs, search_range, variance_factor)
+) -> NoiseEstimate:
+    estimate = float(np.exp(best_log_values[0]))
+    low, high = find_profile_interval(score, best_log_values, search_range, variance_factor)
     is_inside = (
-        search_range[0] * MAX_SEARCH_END_RATIO < estimate < search_range[1] / MAX_SEARCH_END_RATIO
+        search_range[0] * MAX_SEARCH_LIMIT_RATIO
+        < estimate
+        < search_range[1] / MAX_SEARCH_LIMIT_RATIO
     )
-    is_closed = low is not None and high is not None
-    return Noise(estimate if is_inside and is_closed else None, low, high)
+    has_both_ends = low is not None and high is not None
+    return NoiseEstimate(estimate if is_inside and has_both_ends else None, low, high)
 
 
-def _assess_innovations(
-    kf_input: Preintegrated, noises: Noises, is_outlier: BoolArray
+def _assess_kf(
+    kf_motion: PreintegratedMotion,
+    noise_parameters: NoiseParameters,
+    is_outlier: BoolArray,
 ) -> Consistency | Unavailable:
-    nu, s = innovations(kf_input, noises.sigma_a_m_s2, noises.sigma_z_m, is_outlier)
-    return assess(nu[~is_outlier], s[~is_outlier])
+    nu, s = innovations(
+        kf_motion, noise_parameters.sigma_a_m_s2, noise_parameters.sigma_z_m, is_outlier
+    )
+    return assess_innovations(nu[~is_outlier], s[~is_outlier])
 
 
-def _check_held_out(name: str, current_noises: Noises, fit: NoiseFit) -> HeldOutCheck | Unavailable:
-    half_count = len(fit.weight) // 2
+def _check_held_out(
+    name: str, current_parameters: NoiseParameters, fit: NoiseFit
+) -> HeldOutCheck | Unavailable:
+    half_count = len(fit.measurement_weights) // 2
     if half_count < MIN_MEASUREMENTS:
         return Unavailable(
             f"held-out test of SIGMA_A and SIGMA_Z ({name})",
-            f"half of the segment contains only {half_count} measurements (at least "
+            f"the first half of the segment contains only {half_count} measurements (at least "
             f"{MIN_MEASUREMENTS} are needed)",
             "Analyse a longer segment.",
         )
     # The first measurement is KF's initial state
     first_half = [positions.first(1 + half_count) for positions in fit.score.axis_positions]
     first_fit = maximise_likelihood(
-        first_half, fit.noises, fit.weight[:half_count], fits_outliers=False
+        first_half, fit.noise_parameters, fit.measurement_weights[:half_count], fits_outliers=False
     )
-    tuned_noises = first_fit.noises
+    tuned_parameters = first_fit.noise_parameters
     # -ln p of the second half: whole flight minus first half
     current_score, tuned_score = (
-        fit.score(noises) - first_fit.score(noises) for noises in (current_noises, tuned_noises)
+        fit.score(noise_parameters) - first_fit.score(noise_parameters)
+        for noise_parameters in (current_parameters, tuned_parameters)
     )
-    count = len(fit.weight) - half_count
+    count = len(fit.measurement_weights) - half_count
     return HeldOutCheck(
-        tuned_noises.sigma_a_m_s2,
-        tuned_noises.sigma_z_m,
+        tuned_parameters.sigma_a_m_s2,
+        tuned_parameters.sigma_z_m,
         count,
         (current_score - tuned_score) / count,
     )

@@ -8,7 +8,7 @@ from px4fuse.core.arrays import intervals_where
 from px4fuse.core.record import Span
 from px4fuse.ekf2.inputs import MAX_LOST_FRACTION, lost_imu_fraction
 from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, SystematicErrors
-from px4fuse.filter.signals import Segment, cut_to_segment, imu_gaps
+from px4fuse.filter.signals import Segment, cut_to_segment, find_imu_gaps
 from px4fuse.finding import MIN_SPAN_S
 from px4fuse.findings.missing import DEFAULT_PROFILE, VISION_PROFILE_BIT
 from px4fuse.findings.model import Findings, error, finding, format_percent, warning
@@ -74,8 +74,8 @@ def detect_bias(analysis: Analysis) -> Findings:
     systematic_errors, ekf2_bias = analysis.systematic_errors, _ekf2_bias(analysis)
     if isinstance(systematic_errors, SystematicErrors) and systematic_errors.has_significant_bias():
         forward_bias, right_bias, bias_m_s2 = (
-            systematic_errors.forward_bias,
-            systematic_errors.right_bias,
+            systematic_errors.accelerometer_bias_forward,
+            systematic_errors.accelerometer_bias_right,
             systematic_errors.compute_bias().value,
         )
         message = (
@@ -214,7 +214,7 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
 def _gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
     """Return start and end (s) of each IMU gap in a segment, also at both ends of the segment."""
     time_s = imu.index.to_numpy()
-    gaps = intervals_where(time_s, imu_gaps(time_s))
+    gaps = intervals_where(time_s, find_imu_gaps(time_s))
     end_spans = ((segment.start_s, float(time_s[0])), (float(time_s[-1]), segment.end_s))
     gaps += [(start, end) for start, end in end_spans if end - start > MIN_SPAN_S]
     gaps_inside = (span for span in gaps if span[1] > segment.start_s and span[0] < segment.end_s)

@@ -27,7 +27,7 @@ from px4fuse.comparison.trials import (
 from px4fuse.core.text import format_factor, format_number, format_ratio
 from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.filter.signals import cut_to_segment
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.finding import SEVERITIES, Finding, Severity
 from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, NOISE
 from px4fuse.findings.cause_text import (
@@ -181,7 +181,7 @@ def _setting_finding(
     )
 
 
-def format_estimate(name: str, setting: float, noise: Noise) -> str:
+def format_estimate(name: str, setting: float, noise: NoiseEstimate) -> str:
     unit, label = SETTING_RANGES[name][2:]
     value = f"at most {noise.high:.3g}" if noise.value is None else f"{noise.value:.3g}"
     value += f" {unit}"
@@ -202,7 +202,9 @@ def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
     return f"Compare this run with one that has {COMPARISON_OPTIONS[name]} {value:.3g}."
 
 
-def setting_deviation(name: str, setting: float, ml_noise: Noise) -> SettingDeviation | None:
+def setting_deviation(
+    name: str, setting: float, ml_noise: NoiseEstimate
+) -> SettingDeviation | None:
     """Return the deviation of a noise setting from its estimate; None if it is not significant."""
     if not (estimate := ml_noise.value or ml_noise.high):
         return None

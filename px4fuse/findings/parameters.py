@@ -9,7 +9,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import position_errors
 from px4fuse.comparison.remedy import aid_of
 from px4fuse.core.text import format_metres, format_ratio
-from px4fuse.filter.consistency import assess
+from px4fuse.filter.consistency import assess_innovations
 from px4fuse.findings.model import Findings, note, warning
 from px4fuse.flight.ekf2_parameters import AID_MASK, PARAMETERS
 from px4fuse.flight.model import Ekf2, Unavailable
@@ -93,7 +93,7 @@ def _assess_part(analysis: Analysis, start_s: float, end_s: float) -> PartConsis
     if isinstance(innovations, Unavailable):
         return PartConsistency("", unknown, rmse_m)
     samples = innovations[(innovations.index >= start_s) & (innovations.index < end_s)]
-    consistency = assess(
+    consistency = assess_innovations(
         samples["innovation_m"].to_numpy(), samples["innovation_variance_m2"].to_numpy(), math.inf
     )
     if isinstance(consistency, Unavailable):

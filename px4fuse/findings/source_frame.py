@@ -159,7 +159,7 @@ def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
         or isinstance(attitude, Unavailable)
     ):
         return False
-    errors_deg, (first_part, last_part) = [], heading.find_ends()
+    errors_deg, (first_part, last_part) = [], heading.find_extreme_parts()
     for part in (first_part, last_part):
         samples = rows_between(attitude, part.start_s, part.end_s)[Columns.QUATERNION]
         true_attitude = interpolate(
@@ -173,7 +173,7 @@ def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
 
 
 def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
-    first_part, last_part = heading.find_ends()
+    first_part, last_part = heading.find_extreme_parts()
     errors_deg = [math.remainder(part.heading_error_deg, 360.0) for part in (first_part, last_part)]
     change_deg = last_part.heading_error_deg - first_part.heading_error_deg
     estimation_basis = "positions and IMU"

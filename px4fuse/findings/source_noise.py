@@ -10,7 +10,7 @@ import numpy as np
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.text import format_number
-from px4fuse.filter.consistency import CONSISTENT_RATIOS
+from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.cause_grouping import WHITE_RATIO
@@ -59,9 +59,9 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     noise = analysis.time_correlated_noise
     if (
         not isinstance(noise, TimeCorrelatedNoise)
-        or noise.gain_nats < MIN_CORRELATION_GAIN_NATS
+        or noise.likelihood_gain_nats < MIN_CORRELATION_GAIN_NATS
         or noise.slow_m < MIN_CORRELATED_SIGMA_M
-        or noise.low_pass_gain_nats
+        or noise.low_pass_likelihood_gain_nats
         >= MIN_LAG_NATS  # a low-pass filtered source has its own finding
     ):
         return
@@ -100,7 +100,7 @@ def _has_error_above_reported_sigma(analysis: Analysis) -> bool:
         isinstance(truth, ErrorsAgainstTruth)
         and not truth.is_lag_only
         and truth.nees_position_mean is not None
-        and truth.nees_position_mean > CONSISTENT_RATIOS["truth"][1] ** 2
+        and truth.nees_position_mean > CONSISTENT_SIGMA_RATIOS["truth"][1] ** 2
         for truth in truths
     )
 

@@ -12,7 +12,7 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_factor, format_metres
 from px4fuse.ekf2.fusion_conditions import constant_coordinates, is_height_only
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
-from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIERS_AFTER_STEP_S, SystematicErrors
+from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIER_RETEST_DURATION_S, SystematicErrors
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -139,7 +139,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
         or source.origin.reconstructed
         or not _is_clock_known(analysis)
         or not isinstance(low_pass, SourceLowPass)
-        or low_pass.gain_nats < MIN_LOW_PASS_GAIN_NATS
+        or low_pass.likelihood_gain_nats < MIN_LOW_PASS_GAIN_NATS
         or low_pass.lag_s < MIN_LAG_S
     ):
         return None
@@ -151,7 +151,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     # A low-pass filter delays positions: correlated errors without lag have another cause
     if (
         isinstance(correlated_noise, TimeCorrelatedNoise)
-        and correlated_noise.low_pass_gain_nats < MIN_LAG_NATS
+        and correlated_noise.low_pass_likelihood_gain_nats < MIN_LAG_NATS
     ):
         return None
     return low_pass
@@ -419,7 +419,7 @@ def detect_outliers(analysis: Analysis) -> Findings:
         time_s
         for time_s in axis_tuning.outlier_time_s.tolist()
         if not any(
-            jump_s - OUTLIER_BURST_S <= time_s < jump_s + OUTLIERS_AFTER_STEP_S
+            jump_s - OUTLIER_BURST_S <= time_s < jump_s + OUTLIER_RETEST_DURATION_S
             for jump_s in jump_times_s
         )
     ]

@@ -24,7 +24,7 @@ from px4fuse.card.model import (
 )
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_metres, format_ratio
-from px4fuse.filter.consistency import CONSISTENT_RATIOS, Reference
+from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS, Reference
 from px4fuse.request import quote_command
 
 CARD_WIDTH = 100  # maximum number of characters per line
@@ -176,7 +176,7 @@ def format_consistent_ratios() -> str:
     """
     return ", ".join(
         f"{REFERENCE_MARKS[name]} {low:g} to {high:g}"
-        for name, (low, high) in CONSISTENT_RATIOS.items()
+        for name, (low, high) in CONSISTENT_SIGMA_RATIOS.items()
     )
 
 
@@ -188,7 +188,7 @@ def draw_sigma_ratio(ratio: float | None, reference: Reference) -> str:
     >>> draw_sigma_ratio(128.0, "truth")
     '───────────────░░░░░░░──────────────▶'
     """
-    low, high = (_axis_column(end) for end in CONSISTENT_RATIOS[reference])
+    low, high = (_axis_column(end) for end in CONSISTENT_SIGMA_RATIOS[reference])
     characters = ["░" if low <= column <= high else "─" for column in range(AXIS_WIDTH)]
     if ratio is not None:
         column, last_column = _axis_column(ratio), AXIS_WIDTH - 1
@@ -209,7 +209,7 @@ def sigma_ratio_marks(
     return {
         "fraction": fraction,
         "mark": "below" if fraction < 0.0 else "above" if fraction > 1.0 else reference,
-        "band": [axis_fraction(end) for end in CONSISTENT_RATIOS[reference]],
+        "band": [axis_fraction(end) for end in CONSISTENT_SIGMA_RATIOS[reference]],
         "interval": [
             axis_fraction(float(np.clip(end, *RATIO_AXIS_ENDS))) for end in interval or ()
         ],

@@ -13,7 +13,12 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison
 from px4fuse.comparison.trials import DISCREPANCIES, Statistic, Trial, find_cause, find_trials
 from px4fuse.core.text import format_number, format_p_value
-from px4fuse.filter.consistency import MIN_INNOVATIONS, Consistency, autocorrelation, nis_band
+from px4fuse.filter.consistency import (
+    MIN_INNOVATIONS,
+    Consistency,
+    compute_autocorrelation,
+    compute_nis_band,
+)
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings.cause_text import format_change, format_explained_fraction
 from px4fuse.flight.model import Unavailable
@@ -160,7 +165,7 @@ def _draw_running_nis(axes: Axes, innovations: InnovationsByFilter) -> None:
         running_nis = (values**2).cumsum() / innovation_counts
         draw_curve(axes, running_nis.iloc[2:], **TRACK_LINES[name], label=name)
         drawn_counts = np.unique(np.geomspace(3, len(innovation_counts), 60).astype(int))
-        band_low, band_high = np.array([nis_band(int(count)) for count in drawn_counts]).T
+        band_low, band_high = np.array([compute_nis_band(int(count)) for count in drawn_counts]).T
         drawn_times_s = values.index[drawn_counts - 1]
         axes.plot(drawn_times_s, band_low, **_thin_line_style(name))
         axes.plot(drawn_times_s, band_high, **_thin_line_style(name), label=f"95 % band {name}")
@@ -191,7 +196,7 @@ def _draw_histogram(axes: Axes, innovations: InnovationsByFilter) -> None:
 def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
     for shift, (name, values) in zip((-0.18, 0.18), innovations.items(), strict=False):
         lag_count = min(MAX_AUTOCORRELATION_LAG, len(values) // 3)
-        correlations = autocorrelation(np.asarray(values, np.float64), lag_count)
+        correlations = compute_autocorrelation(np.asarray(values, np.float64), lag_count)
         lag_positions = np.arange(1, lag_count + 1) + shift
         axes.vlines(lag_positions, 0.0, correlations, color=TRACK_LINES[name]["color"], lw=1.2)
         fill_colour = KF_COLOUR if name == "KF" else "white"

@@ -21,7 +21,7 @@ from px4fuse.comparison.remedy import format_settings as format_parameters
 from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.findings import Finding, finding_title, group_by_root
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import Alignment, ClockMap, Columns, Truth, Unavailable
@@ -279,7 +279,7 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
         )
 
 
-def format_noise_estimate(noise: Noise) -> str:
+def format_noise_estimate(noise: NoiseEstimate) -> str:
     """Format a maximum-likelihood noise with its 95 % interval."""
     if noise.value is None:
         bounds = (("at most", noise.high), ("at least", noise.low))

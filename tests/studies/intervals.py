@@ -19,8 +19,8 @@ from comparisons import compare
 from detector_rates import DEFAULT, SCENARIOS, clean
 
 from px4fuse.comparison.estimates import estimate_noises_and_clock
-from px4fuse.filter.time_offset import MAX_CHANGE_P_VALUE, MIN_OFFSET_S, ClockOffset
-from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, Noise
+from px4fuse.filter.time_offset import MAX_CHANGE_P_VALUE, MIN_TIME_OFFSET_S, ClockOffset
+from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
 
@@ -29,7 +29,7 @@ OUTLIERS = ("nlos=2%", "nlos=7%", "nlos=12%", "nlos=6%,0.5m")
 Job = tuple[int, str, str]
 
 
-def covers(noise: Noise, true: float) -> bool:
+def covers(noise: NoiseEstimate, true: float) -> bool:
     """Return True if an interval, which may have open ends, contains a value."""
     return (noise.low or 0.0) <= true <= (noise.high or np.inf)
 
@@ -45,7 +45,7 @@ def measured(job: Job) -> tuple[float, ...] | None:
     if not isinstance(tuned, AxisTuning) or not isinstance(clock, ClockOffset):
         return None
     low, high = clock.interval_s
-    false = abs(clock.offset_s) > max(clock.three_sigma_s, MIN_OFFSET_S)
+    false = abs(clock.offset_s) > max(clock.three_sigma_s, MIN_TIME_OFFSET_S)
     return (
         (tuned.sigma_z.value or np.nan) / flown.source_sigma_m - 1.0,
         covers(tuned.sigma_z, flown.source_sigma_m), covers(tuned.sigma_a, flown.sigma_a_m_s2),

@@ -14,7 +14,7 @@ from px4fuse.core.record import Record, read_toml
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.model import (
     COVARIANCE_COLUMNS,
-    process_noise_unit,
+    compute_unit_process_noise,
     symmetric_matrix,
     transition,
 )
@@ -243,7 +243,7 @@ def right_numeric_answer(
             return tuple(rejected_update_numbers.astype(float).tolist())
         case "prediction":
             p, f = symmetric_matrix(tuple(covariance)), transition(settings.dt_s)
-            q = symmetric_matrix(process_noise_unit(settings.dt_s))
+            q = symmetric_matrix(compute_unit_process_noise(settings.dt_s))
             q *= settings.sigma_a_m_s2**2 * settings.dt_s
             for _ in range(round(question.duration_or_gate / settings.dt_s)):
                 p = f @ p @ f.T + q
