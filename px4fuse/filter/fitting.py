@@ -162,7 +162,7 @@ class Likelihood:
         self._compute_scores_at_nodes = compute_scores_at_nodes
 
     def __call__(self, noise_parameters: NoiseParameters) -> float:
-        """Return -ln p of the measurements without the constant term (n/2) ln 2π."""
+        """Return -ln p of the measurements without its constant term, a multiple of ln 2π."""
         if (
             noise_parameters.random_walk_m
             or noise_parameters.correlated_sigma_m
@@ -271,7 +271,7 @@ def negative_log_likelihood(
     noise_parameters: NoiseParameters,
     measurement_weights: Array,
 ) -> float:
-    """Return -ln p of the measurements of all axes without the constant term (n/2) ln 2π."""
+    """Return -ln p of the measurements of all axes without its multiple of ln 2π."""
     return float(
         sum(
             fit_with_noises([positions], noise_parameters, measurement_weights).compute_scores()[

@@ -12,11 +12,11 @@ The matrix A of this quadratic form has three bands below the diagonal, so LAPAC
 flight in a millisecond. log|A| and the squared residuals at the minimum give the likelihood, which
 equals that of KF's innovations (Schweppe 1965).
 
-The minimum is linear in the data and in the constants. The system is therefore solved for the data
-and for their derivative with respect to each constant ("inputs": z, Δp and Δv of all measurements).
-The inner products of all inputs, weighted by the inverse covariance, are a Gram matrix; its Schur
-complement eliminates the constants. Time-correlated noise is a third state, c_{k+1} = ρ c_k +
-noise, in the measurement: z - p - c.
+The states at the minimum are linear in the data and in the constants. The system is therefore
+solved for the data and for their derivative with respect to each constant ("inputs": z, Δp and Δv
+of all measurements). The inner products of all inputs, weighted by the inverse covariance, are a
+Gram matrix; its Schur complement eliminates the constants. Time-correlated noise is a third state,
+c_{k+1} = ρ c_k + noise, in the measurement: z - p - c.
 
 Symbols in shapes: m measurements, a axes, s segments, T time offsets, c constants.
 """
@@ -245,7 +245,7 @@ class FittedPositions:
         return np.asarray(0.5 * square_sum + half_log_determinant)
 
     def compute_scores(self, sigma_factors: Array = UNIT_SCALE) -> Array:
-        """Return -ln p of the positions, shape (k, T), without the constant term (n/2) ln 2π.
+        """Return -ln p of the positions, shape (k, T), without its multiple of ln 2π.
 
         The σ of all noises is multiplied by each of k ``sigma_factors``.
         """
@@ -495,7 +495,7 @@ class BandedSystem:
     def solve(self, measured_m: Array, dp: Array, dv: Array) -> Array:
         """Estimate the states from measured positions, Δp and Δv; shape (..., m, states).
 
-        The first states are position (m) and velocity (m/s).
+        The states are position (m), velocity (m/s) and time-correlated noise (m), if any.
         """
         _, right_hand_side = self._whiten_increments(measured_m, dp, dv)
         state, _ = lapack.dpbtrs(self.cholesky_factor, right_hand_side.T, lower=1, overwrite_b=1)
