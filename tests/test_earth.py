@@ -8,7 +8,7 @@ from exchange import replace
 from findings_tools import made
 
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
-from px4fuse.ekf2.inputs import MODEL_NOTE
+from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.flight.model import FusionRecord
 from px4fuse.readers.px4_positions import EARTH_RADIUS_M
 from px4fuse.simulation.faults import parse_faults
@@ -57,7 +57,7 @@ def test_earth_rotation_rate_matches_sidereal_day() -> None:
 def test_ekf2_model_of_gnss_flight_includes_earth_rotation() -> None:
     """The model uses EKF2's metres, the output those of the track; simulations are flat."""
     flight = simulate_flight(make_scenario("outdoor", seed=3), parse_faults(()))
-    assert MODEL_NOTE in flight.log.notes
+    assert SIMULATED_EKF2_NOTE in flight.log.notes
     flat, round_ = opened(flight), opened(replace(flight, log=replace(flight.log, notes=())))
     known = flight.ekf2.record
     metres = ekf2_metres_per_metre(known)
