@@ -19,7 +19,7 @@ from px4fuse.ekf2.replay import (
     Ekf2Replay,
     _compare_axis,
     _compare_other_aids,
-    _heading_error_deg,
+    _compute_heading_difference_deg,
     _judge_agreement,
     compare_with_log,
     inside_spans,
@@ -184,7 +184,7 @@ def test_ekf2_replay_heading_error_without_logged_state_is_none():
     replay = SimpleNamespace(
         settings={"EKF2_MAG_NOISE": 0.05}, find_evaluated_spans=lambda: ((5.0, 9.0),)
     )
-    assert _heading_error_deg(ekf2, replay) is None
+    assert _compute_heading_difference_deg(ekf2, replay) is None
 
 
 def compared(

@@ -22,8 +22,8 @@ from px4fuse.ekf2.inputs import (
     FusionRules,
     Inputs,
     ReceivedPositions,
-    _logged_decisions,
-    _vision_track,
+    _find_vision_track,
+    _read_logged_decisions,
     prepare_inputs,
     read_vision,
 )
@@ -190,7 +190,7 @@ def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> P
     ([track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2, 0.26)], None),
 ])  # fmt: skip
 def test_ekf2_replay_selects_the_most_complete_vision_topic(tracks, expected):
-    found = _vision_track(made(Flight, positions=tuple(tracks)))
+    found = _find_vision_track(made(Flight, positions=tuple(tracks)))
     assert getattr(found, "name", None) == expected
 
 
@@ -249,7 +249,7 @@ def test_logged_rejections_are_matched_by_measurement_time():
     }  # fmt: skip
 
     def decisions(**other: Any) -> Any:
-        return _logged_decisions(made(Ekf2, **parts | other), record, stamp, stamp - 1.0)
+        return _read_logged_decisions(made(Ekf2, **parts | other), record, stamp, stamp - 1.0)
 
     rejected, reset = decisions()
     assert_array_equal(rejected, [1.0, 1.0, 0.0, np.nan, np.nan, 0.0])
@@ -279,7 +279,7 @@ def test_logged_fusion_is_derived_from_time_of_last_fusion():
     )  # fmt: skip
     for states, resets_at in (({DEAD_RECKONING: steps}, 13), ({}, 14)):
         record = made(FusionRecord, parameters={}, states=states)
-        rejected, reset = _logged_decisions(ekf2, record, taken, taken - 1.0)
+        rejected, reset = _read_logged_decisions(ekf2, record, taken, taken - 1.0)
         assert rejected[2] == 0.0
         known = 13 if states else 11
         assert_array_equal(rejected[3:known], 1.0)

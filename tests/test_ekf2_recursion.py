@@ -17,22 +17,22 @@ from scipy.spatial.transform import Rotation
 from px4fuse.ekf2.filter_recursion import (
     FilterConfiguration,
     SegmentRun,
-    _Fusion,
+    _compute_settled_correlation,
+    _FusionDecisions,
     _limit_bias_variance,
     _sequential_update,
-    _settled_state_correlation,
     run_segment,
 )
-from px4fuse.ekf2.filter_recursion import _measurements_by_event as measurements
+from px4fuse.ekf2.filter_recursion import _collect_measurements as measurements
 from px4fuse.ekf2.inputs import FusionRules, Inputs, ReceivedPositions
 from px4fuse.ekf2.intervals import (
     FUSE,
     NO_ACTION,
     START_FUSION,
     FusionDelays,
-    _imu_noise_by_interval,
+    _compute_imu_process_noise,
+    _find_sample_actions,
     _make_events,
-    _sample_actions,
     make_intervals,
 )
 from px4fuse.ekf2.model import Model, replay_with_settings
@@ -93,16 +93,16 @@ def deciding(
     velocity_gap_s: float = 0.0,
 ) -> tuple[bool, bool, bool, float, bool, int]:
     """Return rejected, fused and reset at 10 s; then last fusion, stopped, remaining resets."""
-    fusion = _Fusion(
+    fusion = _FusionDecisions(
         rules, 10.0 - gap_s, action=np.array([[action]]), can_start=np.array([[can_start]]),
         time_s=np.array([[10.0]]), has_gate=np.array([has_gate]),
         uses_logged_decisions=np.array([follows_log]),
-        logged_rejected=np.array([logged]), logged_reset=np.array([logged_reset]),
+        logged_rejections=np.array([logged]), logged_resets=np.array([logged_reset]),
         has_all_resets=False,
     )  # fmt: skip
     fusion.last_velocity_s = np.array([10.0 - velocity_gap_s])
     fusion.is_stopped, fusion.remaining_resets = np.array([stopped]), np.array([left])
-    rejected, taken, reset, _ = fusion.decide(0, np.array([outside]), np.array([False]))
+    rejected, taken, reset, _ = fusion.decide_fusion(0, np.array([outside]), np.array([False]))
     last, stop, rest = fusion.last_position_s[0], fusion.is_stopped[0], fusion.remaining_resets[0]
     return bool(rejected[0]), bool(taken[0]), bool(reset[0]), float(last), bool(stop), int(rest)
 
@@ -258,7 +258,7 @@ def test_ekf2_replay_initial_state_correlation_equals_reference():
     deviation = np.sqrt(np.diag(P))
     known = (P / deviation[:, None] / deviation)[:2, 12:14]
     segment.variance[:] = np.diag(P)
-    found = _settled_state_correlation(segment)
+    found = _compute_settled_correlation(segment)
     np.testing.assert_allclose(found[:2, 12:14], known, atol=0.03)
     assert np.abs(known).max() > 0.9
     np.testing.assert_allclose(np.diag(found), 1.0)
@@ -429,7 +429,7 @@ def test_closed_form_process_noise_equals_sum_over_steps(n):
         for at, rows in enumerate((slice(0, 3), slice(3, 6))):
             sums[at] = F @ sums[at] @ F.T
             sums[at][rows, rows] += dt**2 * np.eye(3)
-    closed_forms = _imu_noise_by_interval(
+    closed_forms = _compute_imu_process_noise(
         np.array([float(n)]), np.array([n * dt]), (n * tilt)[None]
     )
     # for the gyro, only leading terms of position with velocity and itself
@@ -455,7 +455,7 @@ def acting(stamps: list[float], *, fusing: bool = True, rules: FusionRules = RUL
     taken = np.array(stamps)
     end = np.searchsorted(segment.time_s, taken - 1e-9)
     inputs = made(Inputs, rules=rules)
-    action, _ = _sample_actions(inputs, segment, taken, end, np.ones(len(taken), bool))
+    action, _ = _find_sample_actions(inputs, segment, taken, end, np.ones(len(taken), bool))
     return action.tolist()
 
 

@@ -15,7 +15,7 @@ from findings_tools import made
 
 from px4fuse.analysis import WhatIfAnalysis
 from px4fuse.ekf2.bad_acceleration import BadAccelerationFlag
-from px4fuse.ekf2.barometer import fused_samples, sample_interval_s
+from px4fuse.ekf2.barometer import estimate_barometer_interval_s, find_fused_barometer_samples
 from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun
 from px4fuse.ekf2.heights import HeightFilter, add_heights, group_barometer_by_event
 from px4fuse.ekf2.model import Model, run_configurations
@@ -345,7 +345,7 @@ def test_bad_acceleration_flag_is_set_by_two_large_innovations() -> None:
 
     def event(time_s: float, barometer: list[float], gnss: float) -> list[float]:
         """Return the fraction of the 0.1 s before an event with the flag, then fuse samples."""
-        share = flag.flagged_fraction(np.array([time_s - 0.1]), np.array([time_s]))
+        share = flag.compute_flagged_fraction(np.array([time_s - 0.1]), np.array([time_s]))
         ratios.append(np.array([[one, one] for one in (*barometer, gnss)]))
         flag.update(np.array([time_s]), *ratios[-2:])
         return [0.0, 0.0] if share is None else share.tolist()
@@ -370,7 +370,7 @@ def test_ekf2_flag_for_bad_acceleration_is_read_from_log() -> None:
     segment = climbing(of_baro([10], [0.0]), is_acceleration_bad=is_bad)
     flag = BadAccelerationFlag(np.array([True]), 3.0, segment)
     shares = [
-        flag.flagged_fraction(np.array([end_s - 0.2]), np.array([end_s]))
+        flag.compute_flagged_fraction(np.array([end_s - 0.2]), np.array([end_s]))
         for end_s in (0.9, 1.1, 1.3, 1.6, 1.8, 4.0)
     ]
     expected = [None, 0.5, 1.0, 0.5, None, 1.0]
@@ -403,9 +403,9 @@ def test_barometer_samples_missing_in_log_are_reconstructed(every: int, has_filt
     state = pd.DataFrame({"down_m_s": 0.0}, time_s)
     log = made(AidLog, samples=rows if has_filter else rows.drop(columns="filtered_down"))
     ekf2 = made(Ekf2, state=state, aids={"baro_hgt": log})
-    assert sample_interval_s(record) == pytest.approx(0.05, rel=1e-6)
+    assert estimate_barometer_interval_s(record) == pytest.approx(0.05, rel=1e-6)
     raw = pd.Series(innovation_m - 1.7, time_s)
-    found = fused_samples(ekf2, record, raw.iloc[::every])["down_m"]
+    found = find_fused_barometer_samples(ekf2, record, raw.iloc[::every])["down_m"]
     is_known = np.isin(
         np.arange(401) % (10 * every), [*range(0, 10 * every, every), *range(0, 99, 10)]
     )

@@ -219,7 +219,7 @@ class HeightFilter:
         self.in_ground_effect = self.dead_zone_m.any(axis=2)
         gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in HEIGHT_SENSORS]
         self.gate_squared = [np.where(has_gate, gate**2, np.inf) for gate in gates]
-        self.noise_m2 = (
+        self.R_m2 = (
             np.maximum(parameters.get(BAROMETER.noise, MIN_NOISE_SIGMA), MIN_NOISE_SIGMA) ** 2
         )
         self.has_bias = [aid.name != height_samples.reference for aid in HEIGHT_SENSORS]
@@ -263,7 +263,7 @@ class HeightFilter:
     def fuse_barometer(self, event: int, x: Array, P: Array) -> ArrayPair:
         for slot in range(len(self.down_m)):
             x, P = self._fuse_sample(
-                event, slot, x, P, self.down_m[slot, event], self.age_s[slot, event], self.noise_m2
+                event, slot, x, P, self.down_m[slot, event], self.age_s[slot, event], self.R_m2
             )
         return x, P
 

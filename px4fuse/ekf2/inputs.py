@@ -255,9 +255,9 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
     flow_labels = [FLOW.label] if len(fusion_record.flow) else []
-    list_modelled_aids = [GNSS_POS.label, GNSS_VEL.label, *flow_labels] if is_gnss else []
+    modelled_labels = [GNSS_POS.label, GNSS_VEL.label, *flow_labels] if is_gnss else []
     if unmodelled_aids := [
-        label for label in fusion_record.other_horizontal_aids if label not in list_modelled_aids
+        label for label in fusion_record.other_horizontal_aids if label not in modelled_labels
     ]:
         switch_settings = ["EKF2_OF_CTRL 0", *([] if is_gnss else [f"{GNSS_POS.switch} 0"])]
         return Unavailable(

@@ -132,7 +132,7 @@ class FusionDelays:
 def make_intervals(inputs: Inputs, segment: ReplaySegment, delays: FusionDelays) -> Intervals:
     """Compute state transition and process noise of all intervals in a segment.
 
-    The number of intervals does not depend on ``compute_delays``.
+    The number of intervals does not depend on ``delays``.
     """
     events = _make_events(inputs, segment, delays)
     end_steps = events.end_step

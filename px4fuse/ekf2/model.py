@@ -36,7 +36,7 @@ from px4fuse.ekf2.intervals import FusionDelays, Intervals, make_intervals
 from px4fuse.ekf2.output_predictor import compute_published_state, sum_attitude_corrections
 from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
-    MAX_COMPARED_REJECTED_FRACTION,
+    MAX_REJECTED_FOR_COMPARISON,
     Agreement,
     Ekf2Replay,
     compare_with_log,
@@ -148,7 +148,7 @@ def _open_without_aids(
     segments = tuple(with_state_correlation(inputs, segment) for segment in inputs.segments)
     inputs = replace(inputs, segments=segments)
     configurations = [baseline_configuration]
-    if np.mean(inputs.received.rejected > 0.0) > MAX_COMPARED_REJECTED_FRACTION:
+    if np.mean(inputs.received.rejected > 0.0) > MAX_REJECTED_FOR_COMPARISON:
         configurations.append(FilterConfiguration(inputs.settings, uses_logged_decisions=True))
     for configuration in request_configurations(inputs):
         configurations += [] if configuration in configurations else [configuration]
@@ -163,7 +163,7 @@ def _open_without_aids(
         agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed
     )
     if (
-        rejected_fraction > MAX_COMPARED_REJECTED_FRACTION
+        rejected_fraction > MAX_REJECTED_FOR_COMPARISON
         and np.isfinite(inputs.received.rejected).any()
     ):
         agreement_with_rejections = compare_with_log(flight, replay_with_logged_rejections(model))

@@ -67,7 +67,7 @@ MAX_PUBLISHED_DIFFERENCE_M = 0.10
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
 # Single innovations are compared only if a smaller fraction of the samples is rejected. Each
 # rejection changes many later innovations
-MAX_COMPARED_REJECTED_FRACTION = 0.05
+MAX_REJECTED_FOR_COMPARISON = 0.05
 # Published positions are compared only if a smaller fraction of the samples is rejected. With more
 # rejections, EKF2's position is mostly integrated from the IMU
 MOSTLY_REJECTED_FRACTION = 0.5
@@ -559,7 +559,7 @@ def _judge_agreement(
                 "lacks an input of EKF2's output predictor"
             )
         return True, correlation_text
-    if max(rejected_fraction_logged, rejected_fraction_replayed) < MAX_COMPARED_REJECTED_FRACTION:
+    if max(rejected_fraction_logged, rejected_fraction_replayed) < MAX_REJECTED_FOR_COMPARISON:
         return False, f"{correlation_text}, below the minimum of {MIN_INNOVATION_CORRELATION:g}"
     rejected_fraction_difference = abs(rejected_fraction_replayed - rejected_fraction_logged)
     relative_nis_difference = max(
@@ -591,7 +591,7 @@ def _format_exceeding(value: float, limit: float) -> str:
 
 
 def with_logged_rejections(agreement: Agreement, agreement_with_rejections: Agreement) -> Agreement:
-    """Return ``agreement_with_rejections``, judged with its own limits.
+    """Return ``agreement_with_rejections``, judged with the limits for logged rejections.
 
     It compares the log with a replay that uses EKF2's logged rejections: with many rejections, one
     sample near the gate can make a correct replay differ from the log. Rejected fraction and

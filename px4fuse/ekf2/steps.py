@@ -128,7 +128,8 @@ class UnreplayedDifference(Record):
 class DifferenceExplanation(Record, kw_only=True):
     """Explanation of the mean square difference KF - EKF2 along one axis.
 
-    Mean square = sum of the reductions by all ``steps`` + unexplained remainder.
+    Each of the ``steps`` replaces one property of KF by EKF2's. Mean square = sum of the reductions
+    by all steps + unexplained remainder.
 
     Attributes
     ----------

@@ -337,7 +337,7 @@ def _mark_unpredictable(
         replays = replay_with_settings(noisy_model, repeated_changes, without=without)
         for replay_summaries, replay in zip(repeated_summaries, replays, strict=True):
             replay_summaries.append(_summarise_replay(model.flight, replay, spans_s))
-    marked_summaries = []
+    final_summaries = []
     for summary, *noisy_summaries in all_summaries:
         rejected_fractions = [
             axis_summary.rejected_fraction for axis_summary in summary.others.values()
@@ -349,8 +349,8 @@ def _mark_unpredictable(
             and max(rejected_fractions, default=0.0) <= MAX_REJECTED_FRACTION
             and _results_agree([summary, *noisy_summaries])
         )
-        marked_summaries.append(replace(summary, is_predictable=is_predictable, without=without))
-    return tuple(marked_summaries)
+        final_summaries.append(replace(summary, is_predictable=is_predictable, without=without))
+    return tuple(final_summaries)
 
 
 def _results_agree(summaries: Sequence[Summary]) -> bool:
@@ -378,7 +378,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Sum
     if evaluated_updates.empty:
         raise SettingsError(
             f"{_format_changes(replay)}: {replay.source} would never be fused in the evaluated "
-            f"time; {replay.lost} samples arrive after the fusion horizon",
+            f"time: {replay.lost} samples arrive after the fusion horizon has passed them",
             "Choose another parameter value.",
         )
     # Position variance 1 µs before each update, and after it
