@@ -44,7 +44,7 @@ from px4fuse.core.reading import display_name
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.model import Model, open_model
 from px4fuse.ekf2.steps import DifferenceExplanation
-from px4fuse.ekf2.whatif import sweep_values, what_if
+from px4fuse.ekf2.whatif import make_sweep_values, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
@@ -325,7 +325,7 @@ def run_what_if(
     changes, sweep = check_parameters(request.changes), request.sweep
     swept_settings: list[dict[str, float]] = []
     if sweep is not None:
-        values = sweep_values(sweep.parameter, sweep.low, sweep.high, sweep.count)
+        values = make_sweep_values(sweep.parameter, sweep.low, sweep.high, sweep.count)
         swept_settings = [{sweep.parameter: value} for value in values]
         if sweep.parameter in changes:
             raise SettingsError(

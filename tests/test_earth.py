@@ -7,8 +7,8 @@ from ekf2_tools import opened
 from exchange import replace
 from findings_tools import made
 
-from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
-from px4fuse.ekf2.inputs import MODEL_NOTE
+from px4fuse.ekf2.earth_model import compute_earth_rate_rad_s, compute_position_scale
+from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.flight.model import FusionRecord
 from px4fuse.readers.px4_positions import EARTH_RADIUS_M
 from px4fuse.simulation.faults import parse_faults
@@ -32,42 +32,42 @@ def test_metres_per_degree_use_curvature_radii_of_ekf2(latitude_deg: float) -> N
     latitude = np.radians(latitude_deg)
     of_degree = np.radians(1.0) * EARTH_RADIUS_M
     too_long = 1.0 / (1.0 - ECCENTRICITY2 * np.sin(latitude) ** 2)
-    north, east, down = ekf2_metres_per_metre(record(latitude_deg))
+    north, east, down = compute_position_scale(record(latitude_deg))
     assert north * of_degree == pytest.approx(north_m * too_long, rel=2e-5)
     assert east * of_degree * np.cos(latitude) == pytest.approx(east_m, rel=2e-5)
     assert down == 1.0
-    higher = ekf2_metres_per_metre(record(latitude_deg, 637.1))
+    higher = compute_position_scale(record(latitude_deg, 637.1))
     assert np.subtract(higher, (north, east, down)) == pytest.approx([1e-4, 1e-4, 0.0], abs=1e-12)
 
 
 def test_ekf2_projection_scale_without_gnss_origin_is_1() -> None:
-    assert ekf2_metres_per_metre(record(45.0, north_m=3.0)) == (1.0, 1.0, 1.0)
-    assert ekf2_metres_per_metre(record(np.nan)) == (1.0, 1.0, 1.0)
+    assert compute_position_scale(record(45.0, north_m=3.0)) == (1.0, 1.0, 1.0)
+    assert compute_position_scale(record(np.nan)) == (1.0, 1.0, 1.0)
 
 
 def test_earth_rotation_rate_matches_sidereal_day() -> None:
     rate = 2.0 * np.pi / 86_164.1
     for latitude_deg, expected in ((0.0, (rate, 0.0, 0.0)), (90.0, (0.0, 0.0, -rate)),
                                    (-30.0, (rate * 0.75**0.5, 0.0, 0.5 * rate))):  # fmt: skip
-        found = earth_rate_rad_s(record(latitude_deg))
+        found = compute_earth_rate_rad_s(record(latitude_deg))
         np.testing.assert_allclose(found, expected, atol=1e-10)
-    np.testing.assert_array_equal(earth_rate_rad_s(record(np.nan)), np.zeros(3))
+    np.testing.assert_array_equal(compute_earth_rate_rad_s(record(np.nan)), np.zeros(3))
 
 
 def test_ekf2_model_of_gnss_flight_includes_earth_rotation() -> None:
     """The model uses EKF2's metres, the output those of the track; simulations are flat."""
     flight = simulate_flight(make_scenario("outdoor", seed=3), parse_faults(()))
-    assert MODEL_NOTE in flight.log.notes
+    assert SIMULATED_EKF2_NOTE in flight.log.notes
     flat, round_ = opened(flight), opened(replace(flight, log=replace(flight.log, notes=())))
     known = flight.ekf2.record
-    metres = ekf2_metres_per_metre(known)
+    metres = compute_position_scale(known)
     assert metres == pytest.approx((1.00357, 1.00302, 1.0), abs=1e-5)
     flat_m, round_m = (found.inputs.received.position_m for found in (flat, round_))
     np.testing.assert_allclose(round_m, flat_m * metres)
     (flat_stretch,), (segment,) = flat.inputs.segments, round_.inputs.segments
     np.testing.assert_allclose(segment.state[6:9], flat_stretch.state[6:9] * metres)
     turned = segment.correction_rad - flat_stretch.correction_rad
-    expected = earth_rate_rad_s(known) * segment.step_s[:, None]
+    expected = compute_earth_rate_rad_s(known) * segment.step_s[:, None]
     np.testing.assert_allclose(turned, expected, atol=1e-12)
     for name in ("delayed", "published"):
         difference = getattr(round_.baseline_replay, name) - getattr(flat.baseline_replay, name)

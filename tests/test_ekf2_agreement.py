@@ -13,15 +13,15 @@ from exchange import replace
 from findings_tools import NONE, made
 
 from px4fuse.ekf2.replay import (
-    CONSTANT_INNOVATIONS,
+    CONSTANT_INNOVATIONS_REASON,
     Agreement,
     AxisAgreement,
     Ekf2Replay,
-    _agreement_verdict,
-    _axis_agreement,
-    _heading_error_deg,
-    _other_agreements,
-    agreement_with_log,
+    _compare_axis,
+    _compare_other_aids,
+    _compute_heading_difference_deg,
+    _judge_agreement,
+    compare_with_log,
     inside_spans,
     logged_innovations,
     match_updates,
@@ -107,7 +107,7 @@ def test_ekf2_replay_agrees_if_differences_are_below_limits(
     axis, logged, replayed_share, good, expected
 ):
     for axes in ({"north": axis, "east": agreeing()}, {"north": agreeing(), "east": axis}):
-        found, reason = _agreement_verdict(axes, logged, replayed_share)
+        found, reason = _judge_agreement(axes, logged, replayed_share)
         assert found is good
         assert expected in reason
 
@@ -149,7 +149,7 @@ def test_ekf2_replay_agreement_statistics_equal_their_formulas():
     still = pd.DataFrame(0.0, index=index, columns=Columns.STATE)
     off = still.assign(**{Columns.STATE[1]: [3.0, 4.0, 50.0], Columns.STATE[4]: 0.25})
     replay = SimpleNamespace(published=off, find_evaluated_spans=lambda: ((15.0, 20.0),))
-    found = _axis_agreement("east", pd.DataFrame(frame), model, made(Ekf2, state=still), replay)  # type: ignore[arg-type]
+    found = _compare_axis("east", pd.DataFrame(frame), model, made(Ekf2, state=still), replay)  # type: ignore[arg-type]
     assert found.innovation_correlation == pytest.approx(1.0)
     assert found.innovation_rms_difference == pytest.approx(0.5)
     ratios = found.s_ratio_p5, found.s_ratio_median, found.s_ratio_p95
@@ -175,7 +175,7 @@ def test_correlation_of_constant_innovations_is_unavailable():
     replay = SimpleNamespace(
         find_evaluated_spans=lambda: ((0.0, 99.0),), other_aid_updates={"gnss_vel": updates}
     )
-    assert _other_agreements(ekf2, replay) == ({}, {"gnss_vel": CONSTANT_INNOVATIONS})
+    assert _compare_other_aids(ekf2, replay) == ({}, {"gnss_vel": CONSTANT_INNOVATIONS_REASON})
 
 
 def test_ekf2_replay_heading_error_without_logged_state_is_none():
@@ -184,7 +184,7 @@ def test_ekf2_replay_heading_error_without_logged_state_is_none():
     replay = SimpleNamespace(
         settings={"EKF2_MAG_NOISE": 0.05}, find_evaluated_spans=lambda: ((5.0, 9.0),)
     )
-    assert _heading_error_deg(ekf2, replay) is None
+    assert _compute_heading_difference_deg(ekf2, replay) is None
 
 
 def compared(
@@ -224,7 +224,7 @@ def compared(
         other_aid_updates={},
         flow_only_spans_s=(),
     )
-    return agreement_with_log(SimpleNamespace(ekf2=ekf2), replay)  # type: ignore[arg-type]
+    return compare_with_log(SimpleNamespace(ekf2=ekf2), replay)  # type: ignore[arg-type]
 
 
 def test_ekf2_replay_agreement_requires_20_varying_innovations():

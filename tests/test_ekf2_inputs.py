@@ -22,8 +22,8 @@ from px4fuse.ekf2.inputs import (
     FusionRules,
     Inputs,
     ReceivedPositions,
-    _logged_decisions,
-    _vision_track,
+    _find_vision_track,
+    _read_logged_decisions,
     prepare_inputs,
     read_vision,
 )
@@ -32,10 +32,10 @@ from px4fuse.ekf2.replay_segments import (
     _make_segment,
     downsample_imu,
     find_replay_segments,
-    predict_s,
-    step_ends,
+    find_step_ends,
+    read_prediction_step_s,
 )
-from px4fuse.ekf2.whatif import sweep_values
+from px4fuse.ekf2.whatif import make_sweep_values
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import (
     GNSS_POS,
@@ -99,13 +99,13 @@ def test_ekf2_parameter_check_accepts_limits_of_range(name, fits, not_fits):
 
 
 def test_parameter_sweep_accepts_2_to_200_values():
-    assert sweep_values("EKF2_EV_DELAY", 0.0, 100.0, 2) == [0.0, 100.0]
-    assert len(sweep_values("EKF2_EV_DELAY", 0.0, 100.0, 200)) == 200
-    assert len(sweep_values("EKF2_EV_DELAY", 0.0, 100.0)) == 9
-    assert sweep_values("EKF2_EVP_NOISE", 0.01, 1.0, 3) == pytest.approx([0.01, 0.1, 1.0])
+    assert make_sweep_values("EKF2_EV_DELAY", 0.0, 100.0, 2) == [0.0, 100.0]
+    assert len(make_sweep_values("EKF2_EV_DELAY", 0.0, 100.0, 200)) == 200
+    assert len(make_sweep_values("EKF2_EV_DELAY", 0.0, 100.0)) == 9
+    assert make_sweep_values("EKF2_EVP_NOISE", 0.01, 1.0, 3) == pytest.approx([0.01, 0.1, 1.0])
     for low, high, count in ((0.0, 100.0, 1), (0.0, 100.0, 201), (50.0, 50.0, 5)):
         with pytest.raises(SettingsError):
-            sweep_values("EKF2_EV_DELAY", low, high, count)
+            make_sweep_values("EKF2_EV_DELAY", low, high, count)
 
 
 # ---------------------------------------------------------------- inputs and vision
@@ -190,7 +190,7 @@ def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> P
     ([track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2, 0.26)], None),
 ])  # fmt: skip
 def test_ekf2_replay_selects_the_most_complete_vision_topic(tracks, expected):
-    found = _vision_track(made(Flight, positions=tuple(tracks)))
+    found = _find_vision_track(made(Flight, positions=tuple(tracks)))
     assert getattr(found, "name", None) == expected
 
 
@@ -249,7 +249,7 @@ def test_logged_rejections_are_matched_by_measurement_time():
     }  # fmt: skip
 
     def decisions(**other: Any) -> Any:
-        return _logged_decisions(made(Ekf2, **parts | other), record, stamp, stamp - 1.0)
+        return _read_logged_decisions(made(Ekf2, **parts | other), record, stamp, stamp - 1.0)
 
     rejected, reset = decisions()
     assert_array_equal(rejected, [1.0, 1.0, 0.0, np.nan, np.nan, 0.0])
@@ -279,7 +279,7 @@ def test_logged_fusion_is_derived_from_time_of_last_fusion():
     )  # fmt: skip
     for states, resets_at in (({DEAD_RECKONING: steps}, 13), ({}, 14)):
         record = made(FusionRecord, parameters={}, states=states)
-        rejected, reset = _logged_decisions(ekf2, record, taken, taken - 1.0)
+        rejected, reset = _read_logged_decisions(ekf2, record, taken, taken - 1.0)
         assert rejected[2] == 0.0
         known = 13 if states else 11
         assert_array_equal(rejected[3:known], 1.0)
@@ -305,7 +305,7 @@ def test_logged_fusion_is_derived_from_time_of_last_fusion():
     ([3.2] * 9, [0, 2, 6], [2, 4, 6, 8]),  # 2.5 samples, rounded as the log shows
 ])  # fmt: skip
 def test_ekf2_step_ends_after_n_imu_samples_or_minimum_time(interval_ms, known, ends):
-    found = step_ends(np.array(interval_ms) * 1e-3, np.array(known, int), 0.008)
+    found = find_step_ends(np.array(interval_ms) * 1e-3, np.array(known, int), 0.008)
     assert found.tolist() == ends
 
 
@@ -426,4 +426,4 @@ def test_ekf2_replay_segments_end_at_vision_and_imu_gaps(monkeypatch):
     assert segments(monkeypatch, fused=np.arange(49.3, 60.0, 0.1)) == []
     assert segments(monkeypatch, fused=np.array([])) == []
     assert segments(monkeypatch, vision=np.arange(5.0, 40.0, 0.1)) == [(6.0, 40.9)]
-    assert predict_s(made(FusionRecord, parameters={})) == 0.01
+    assert read_prediction_step_s(made(FusionRecord, parameters={})) == 0.01

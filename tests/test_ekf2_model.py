@@ -13,9 +13,9 @@ from exchange import replace
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.model import (
     Model,
-    delayed_states,
+    compute_delayed_states,
     open_model,
-    replay_settings,
+    replay_with_settings,
     run_configurations,
 )
 from px4fuse.ekf2.replay import HORIZONTAL_AXES
@@ -40,7 +40,7 @@ def vision_of(flight: Flight) -> pd.DataFrame:
 
 def test_ekf2_model_transition_equals_product_of_step_matrices(model: Model) -> None:
     segment, intervals = model.inputs.segments[0], next(iter(model.intervals.values()))[0]
-    made, end = intervals.transitions(slice(None)), intervals.events.end_step
+    made, end = intervals.compute_transitions(slice(None)), intervals.events.end_step
     starts = np.concatenate([[0], end[:-1]])
     gyro, force = (model.inputs.settings[f"EKF2_{name}_NOISE"] for name in ("GYR", "ACC"))
     noise = np.zeros_like(made.transition)
@@ -68,7 +68,7 @@ def test_ekf2_model_state_between_updates_is_imu_prediction(model: Model, attitu
     configuration = FilterConfiguration(model.inputs.settings, estimates_attitude=attitude)
     (part,) = run_configurations(model.inputs, [configuration], model.intervals)
     kept = np.random.default_rng(4).normal(0.0, 0.05, part.state.shape)
-    state, _ = delayed_states(replace(part, state=kept), 0)
+    state, _ = compute_delayed_states(replace(part, state=kept), 0)
     segment, ends = part.segment, part.events[0].end_step
     if not attitude:
         segment = replace(segment, correction_rad=np.zeros_like(segment.correction_rad))
@@ -114,7 +114,7 @@ def test_ekf2_replay_memory_does_not_grow_with_setting_count(
 
     def peak(count: int) -> int:
         tracemalloc.start()
-        for _ in replay_settings(model, [{"EKF2_EV_DELAY": 20.0 + at} for at in range(count)]):
+        for _ in replay_with_settings(model, [{"EKF2_EV_DELAY": 20.0 + at} for at in range(count)]):
             pass
         found = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
@@ -128,9 +128,9 @@ def test_ekf2_replay_of_several_settings_equals_separate_runs(model: Model) -> N
         {"EKF2_EVP_NOISE": 0.02}, {"EKF2_EV_DELAY": 80.0},
         {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_DELAY": 40.0, "EKF2_EVP_GATE": 2.0}, {},
     ]  # fmt: skip
-    together = list(replay_settings(model, settings))
+    together = list(replay_with_settings(model, settings))
     for change, found in zip(settings, together, strict=True):
-        (alone,) = replay_settings(model, [change])
+        (alone,) = replay_with_settings(model, [change])
         for part in ("updates", "delayed", "published"):
             joint, separate = getattr(found, part), getattr(alone, part)
             pd.testing.assert_frame_equal(joint, separate, rtol=0.0, atol=1e-9)
@@ -148,7 +148,7 @@ def test_ekf2_replay_counts_late_and_lost_vision_samples(model: Model) -> None:
     def arriving(after_s: float, **settings: float) -> Any:
         slow = replace(vision, arrival_s=vision.timestamp_s + after_s)
         made = replace(model, inputs=replace(model.inputs, received=slow))
-        return next(replay_settings(made, [{"EKF2_EV_DELAY": 1.0, **settings}]))
+        return next(replay_with_settings(made, [{"EKF2_EV_DELAY": 1.0, **settings}]))
 
     in_time, late, lost = (arriving(after_s) for after_s in (0.20, 0.28, 0.36))
     assert (in_time.late, in_time.lost) == (0, 0)

@@ -5,7 +5,7 @@ import pytest
 from findings_tools import made as made_of
 from scipy.spatial.transform import Rotation
 
-from px4fuse.ekf2.output_predictor import follow_attitude, publish
+from px4fuse.ekf2.output_predictor import compute_published_state, sum_attitude_corrections
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
@@ -64,7 +64,7 @@ def test_ekf2_output_predictor_equals_step_by_step_simulation(lag: int) -> None:
     state = np.zeros((n + 1, 15))
     state[:, VELOCITY], state[:, POSITION], state[:, ACCELEROMETER_BIAS] = velocity, position, bias
     settings = {"EKF2_TAU_VEL": 0.25, "EKF2_TAU_POS": 0.4}
-    made = publish(segment, state, reset, turned, lag, settings)
+    made = compute_published_state(segment, state, reset, turned, lag, settings)
     expected = buffered(gain, velocity, position, reset, lag, 0.25, 0.4)
     for found, known in zip(made, expected, strict=True):
         assert found == pytest.approx(known, abs=1e-9)
@@ -74,7 +74,7 @@ def test_output_predictor_attitude_equals_stepwise_recursion() -> None:
     lag, horizon_s = 19, 0.2
     error = np.zeros((600, 3))
     error[100:] = 0.01, 0.0, -0.02
-    made = follow_attitude(error, lag, STEP_S, horizon_s)
+    made = sum_attitude_corrections(error, lag, STEP_S, horizon_s)
     share, expected = 0.5 * STEP_S / horizon_s, np.zeros((600, 3))
     for k in range(599):
         late = k - lag

@@ -17,25 +17,25 @@ from scipy.spatial.transform import Rotation
 from px4fuse.ekf2.filter_recursion import (
     FilterConfiguration,
     SegmentRun,
-    _Fusion,
+    _compute_settled_correlation,
+    _FusionDecisions,
     _limit_bias_variance,
     _sequential_update,
-    _settled_state_correlation,
     run_segment,
 )
-from px4fuse.ekf2.filter_recursion import _measurements_by_event as measurements
+from px4fuse.ekf2.filter_recursion import _collect_measurements as measurements
 from px4fuse.ekf2.inputs import FusionRules, Inputs, ReceivedPositions
 from px4fuse.ekf2.intervals import (
     FUSE,
-    IDLE,
-    START,
-    Timing,
-    _imu_noise_by_interval,
+    NO_ACTION,
+    START_FUSION,
+    FusionDelays,
+    _compute_imu_process_noise,
+    _find_sample_actions,
     _make_events,
-    _sample_actions,
     make_intervals,
 )
-from px4fuse.ekf2.model import Model, replay_settings
+from px4fuse.ekf2.model import Model, replay_with_settings
 from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment, add_field_states
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, effective_settings
@@ -93,16 +93,16 @@ def deciding(
     velocity_gap_s: float = 0.0,
 ) -> tuple[bool, bool, bool, float, bool, int]:
     """Return rejected, fused and reset at 10 s; then last fusion, stopped, remaining resets."""
-    fusion = _Fusion(
+    fusion = _FusionDecisions(
         rules, 10.0 - gap_s, action=np.array([[action]]), can_start=np.array([[can_start]]),
         time_s=np.array([[10.0]]), has_gate=np.array([has_gate]),
         uses_logged_decisions=np.array([follows_log]),
-        logged_rejected=np.array([logged]), logged_reset=np.array([logged_reset]),
+        logged_rejections=np.array([logged]), logged_resets=np.array([logged_reset]),
         has_all_resets=False,
     )  # fmt: skip
     fusion.last_velocity_s = np.array([10.0 - velocity_gap_s])
     fusion.is_stopped, fusion.remaining_resets = np.array([stopped]), np.array([left])
-    rejected, taken, reset, _ = fusion.decide(0, np.array([outside]), np.array([False]))
+    rejected, taken, reset, _ = fusion.decide_fusion(0, np.array([outside]), np.array([False]))
     last, stop, rest = fusion.last_position_s[0], fusion.is_stopped[0], fusion.remaining_resets[0]
     return bool(rejected[0]), bool(taken[0]), bool(reset[0]), float(last), bool(stop), int(rest)
 
@@ -115,10 +115,10 @@ def deciding(
     ({"gap_s": 1.5, "left": 1}, (True, False, True, 10.0, False, 0)),
     ({"gap_s": 1.5, "left": 0}, (True, False, False, 8.5, True, 0)),
     ({"has_gate": False}, (False, True, False, 10.0, False, 5)),
-    ({"action": START, "left": 2}, (False, False, True, 10.0, False, 5)),
+    ({"action": START_FUSION, "left": 2}, (False, False, True, 10.0, False, 5)),
     ({"stopped": True, "outside": False}, (False, False, False, 9.5, True, 5)),
     ({"stopped": True, "can_start": True, "left": 0}, (True, False, True, 10.0, False, 5)),
-    ({"action": IDLE}, (False, False, False, 9.5, False, 5)),
+    ({"action": NO_ACTION}, (False, False, False, 9.5, False, 5)),
     # logged decisions
     ({"follows_log": True, "logged": 0.0}, (False, True, False, 10.0, False, 5)),
     ({"follows_log": True, "logged": 1.0, "outside": False}, (True, False, False, 9.5, False, 5)),
@@ -134,12 +134,12 @@ def test_replayed_fusion_decision_follows_ekf2_rules(case, expected):
 
 
 @pytest.mark.parametrize(("settings", "by_delay", "timing"), [
-    ({"EKF2_EV_DELAY": 50.0}, False, Timing(0.05, 0.12)),
-    ({"EKF2_DELAY_MAX": 300.0}, False, Timing(0.0, 0.29)),
-    ({"EKF2_DELAY_MAX": 301.0}, False, Timing(0.0, 0.3)),
-    ({"EKF2_DELAY_MAX": 0.0}, False, Timing(0.0, 0.01)),
-    ({"EKF2_EV_DELAY": 50.0}, True, Timing(0.05, 0.12)),
-    ({"EKF2_EV_DELAY": 200.0}, True, Timing(0.2, 0.19)),
+    ({"EKF2_EV_DELAY": 50.0}, False, FusionDelays(0.05, 0.12)),
+    ({"EKF2_DELAY_MAX": 300.0}, False, FusionDelays(0.0, 0.29)),
+    ({"EKF2_DELAY_MAX": 301.0}, False, FusionDelays(0.0, 0.3)),
+    ({"EKF2_DELAY_MAX": 0.0}, False, FusionDelays(0.0, 0.01)),
+    ({"EKF2_EV_DELAY": 50.0}, True, FusionDelays(0.05, 0.12)),
+    ({"EKF2_EV_DELAY": 200.0}, True, FusionDelays(0.2, 0.19)),
 ])  # fmt: skip
 def test_fusion_horizon_equals_length_of_ekf2_buffer(settings, by_delay, timing):
     usual = {"EKF2_EV_DELAY": 0.0, "EKF2_DELAY_MAX": 200.0}
@@ -152,9 +152,9 @@ def test_fusion_horizon_equals_length_of_ekf2_buffer(settings, by_delay, timing)
         mean_step_s=0.01,
         configured_step_s=0.01,
     )
-    found = FilterConfiguration({**usual, **settings}).timing(inputs)
+    found = FilterConfiguration({**usual, **settings}).compute_delays(inputs)
     assert (found.delay_s, found.horizon_s) == pytest.approx((timing.delay_s, timing.horizon_s))
-    shifted = FilterConfiguration(usual, timestamp_offset_s=0.03).timing(inputs)
+    shifted = FilterConfiguration(usual, timestamp_offset_s=0.03).compute_delays(inputs)
     assert (shifted.delay_s, shifted.horizon_s) == pytest.approx((-0.035, math.inf))
 
 
@@ -167,8 +167,8 @@ def test_what_if_with_ekf2_delay_max_on_px4_v1_14_raises_error():
     with pytest.raises(
         SettingsError, match=r"in PX4 v1\.14 the largest delay parameter is the delay"
     ):
-        replay_settings(model, [{"EKF2_DELAY_MAX": 100.0}])
-    assert not list(replay_settings(model, []))
+        replay_with_settings(model, [{"EKF2_DELAY_MAX": 100.0}])
+    assert not list(replay_with_settings(model, []))
 
 
 GNSS_RULES = replace(
@@ -258,7 +258,7 @@ def test_ekf2_replay_initial_state_correlation_equals_reference():
     deviation = np.sqrt(np.diag(P))
     known = (P / deviation[:, None] / deviation)[:2, 12:14]
     segment.variance[:] = np.diag(P)
-    found = _settled_state_correlation(segment)
+    found = _compute_settled_correlation(segment)
     np.testing.assert_allclose(found[:2, 12:14], known, atol=0.03)
     assert np.abs(known).max() > 0.9
     np.testing.assert_allclose(np.diag(found), 1.0)
@@ -366,7 +366,7 @@ def at_rest(
         rules, 0.01, 0.1, 0.01,
         fuses_vision_height=False, imu_offset_m=np.zeros(3), aid=aid,
     )  # fmt: skip
-    intervals = make_intervals(inputs, segment, Timing(0.0, 0.1))
+    intervals = make_intervals(inputs, segment, FusionDelays(0.0, 0.1))
     configuration = FilterConfiguration(
         inputs.settings, uses_logged_decisions=True, without=without or {}
     )
@@ -429,7 +429,7 @@ def test_closed_form_process_noise_equals_sum_over_steps(n):
         for at, rows in enumerate((slice(0, 3), slice(3, 6))):
             sums[at] = F @ sums[at] @ F.T
             sums[at][rows, rows] += dt**2 * np.eye(3)
-    closed_forms = _imu_noise_by_interval(
+    closed_forms = _compute_imu_process_noise(
         np.array([float(n)]), np.array([n * dt]), (n * tilt)[None]
     )
     # for the gyro, only leading terms of position with velocity and itself
@@ -455,19 +455,19 @@ def acting(stamps: list[float], *, fusing: bool = True, rules: FusionRules = RUL
     taken = np.array(stamps)
     end = np.searchsorted(segment.time_s, taken - 1e-9)
     inputs = made(Inputs, rules=rules)
-    action, _ = _sample_actions(inputs, segment, taken, end, np.ones(len(taken), bool))
+    action, _ = _find_sample_actions(inputs, segment, taken, end, np.ones(len(taken), bool))
     return action.tolist()
 
 
 def test_vision_fusion_starts_below_0_2_s_and_stops_above_0_4_s():
-    assert acting([10.1, 10.3, 10.45], fusing=False) == [IDLE, IDLE, START]
-    assert acting([10.1, 10.29, 10.45], fusing=False) == [IDLE, START, FUSE]
+    assert acting([10.1, 10.3, 10.45], fusing=False) == [NO_ACTION, NO_ACTION, START_FUSION]
+    assert acting([10.1, 10.29, 10.45], fusing=False) == [NO_ACTION, START_FUSION, FUSE]
     assert acting([10.1, 10.29, 10.45]) == [FUSE, FUSE, FUSE]
     # 0.4 s to the previous step
     assert acting([10.1, 10.5, 10.6]) == [FUSE, FUSE, FUSE]
-    assert acting([10.1, 10.53, 10.6]) == [FUSE, IDLE, START]
+    assert acting([10.1, 10.53, 10.6]) == [FUSE, NO_ACTION, START_FUSION]
     old = replace(RULES, start_interval_s=math.inf, stop_timeout_s=7.0)
-    assert acting([10.1, 12.0, 14.9], fusing=False, rules=old) == [IDLE, START, FUSE]
+    assert acting([10.1, 12.0, 14.9], fusing=False, rules=old) == [NO_ACTION, START_FUSION, FUSE]
 
 
 def events(
@@ -480,7 +480,7 @@ def events(
         rules=RULES,
         max_interval_s=0.25,
     )
-    return _make_events(inputs, stretch_of(100), Timing(delay_s, horizon_s))
+    return _make_events(inputs, stretch_of(100), FusionDelays(delay_s, horizon_s))
 
 
 def test_ekf2_replay_interval_ends_at_step_that_fuses_a_sample():
@@ -493,7 +493,7 @@ def test_ekf2_replay_interval_ends_at_step_that_fuses_a_sample():
     assert found.time_s == pytest.approx([10.195, 10.3, 10.5, 10.7, 10.895])
     assert found.usable[has_sample].all()
     assert not found.usable[~has_sample].any()
-    assert found.action.tolist() == [FUSE, FUSE, IDLE, IDLE, IDLE]
+    assert found.action.tolist() == [FUSE, FUSE, NO_ACTION, NO_ACTION, NO_ACTION]
     assert events([10.2, 10.305], delay_s=0.05).end_step[:2].tolist() == [15, 25]
     assert events([10.505]).sample[:3].tolist() == [-1, -1, 0]
     # in the first step, and before it

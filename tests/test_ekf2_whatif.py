@@ -16,22 +16,28 @@ from msgspec import structs
 from px4fuse.ekf2 import whatif
 from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
 from px4fuse.ekf2.model import Model
-from px4fuse.ekf2.replay import Ekf2Replay, component_along, rms_to_truth
+from px4fuse.ekf2.replay import Ekf2Replay, compute_rmse_to_truth, interpolate_component
 from px4fuse.ekf2.replay_segments import ReplaySegment, SensorSamples
 from px4fuse.ekf2.steps import (
-    ATTITUDE,
-    FIELD_STEP,
+    ATTITUDE_STEP,
     FLOW_STEP,
-    GATE,
-    OUTPUT,
+    GATE_STEP,
+    MAGNETOMETER_STEP,
+    OUTPUT_PREDICTOR_STEP,
     REPLACEMENT_STEPS,
     VELOCITY_STEP,
     DifferenceExplanation,
-    _longest_rejection,
+    _find_longest_rejection,
     explain_by_steps,
-    step_configurations,
+    make_step_configurations,
 )
-from px4fuse.ekf2.whatif import AxisSummary, Summary, _longest_between_fusions, _notes, what_if
+from px4fuse.ekf2.whatif import (
+    AxisSummary,
+    Summary,
+    _describe_replay_limits,
+    _find_longest_gap_s,
+    what_if,
+)
 from px4fuse.errors import SettingsError
 from px4fuse.filter.kalman import Replay
 from px4fuse.filter.settings import Settings
@@ -89,7 +95,7 @@ def test_contributions_to_kf_ekf2_difference_add_up_to_total(model):
         assert by_name["measurement noise"].position_moved_m < 1e-6
         assert by_name["rejections and resets"].position_moved_m < 1e-6
         largest = sorted(axis.steps, key=lambda step: -step.position_mean_square_m2)[:2]
-        assert {step.name for step in largest} == {"process noise", OUTPUT}
+        assert {step.name for step in largest} == {"process noise", OUTPUT_PREDICTOR_STEP}
         last = axis.steps[-1].position_rmse_to_truth_m
         assert last == pytest.approx(axis.position_rmse_to_truth_m["ekf2"], abs=0.003)
 
@@ -110,7 +116,7 @@ def test_kf_ekf2_difference_is_explained_one_property_at_a_time():
     plain = (made(ReplaySegment, flow=None, height_samples=None),)
     flight = made(Inputs, settings=flown, mean_step_s=0.01, received=received, segments=plain)
     kf_settings = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
-    found = list(step_configurations(flight, kf_settings).values())
+    found = list(make_step_configurations(flight, kf_settings).values())
     settings = [configuration.settings for configuration in found]
     assert [s["EKF2_ACC_NOISE"] for s in settings] == pytest.approx([2.0] * 4 + [0.35] * 3)
     assert [s["EKF2_EVP_NOISE"] for s in settings] == [0.2] * 2 + [0.3] * 5
@@ -131,7 +137,7 @@ def test_kf_ekf2_difference_is_explained_one_property_at_a_time():
         settings={"EKF2_ACC_NOISE": 0.35, "EKF2_GPS_P_NOISE": 0.5, "EKF2_GPS_DELAY": 110.0},
         segments=plain,
     )
-    found = list(step_configurations(gnss, kf_settings).values())
+    found = list(make_step_configurations(gnss, kf_settings).values())
     assert [configuration.fuses_velocity for configuration in found] == [False] * 6 + [True] * 2
     assert [configuration.has_gate for configuration in found] == [False] * 7 + [True]
     # the GNSS positions of KF already include the delay
@@ -141,8 +147,14 @@ def test_kf_ekf2_difference_is_explained_one_property_at_a_time():
     ] * 6
     flow = (made(ReplaySegment, flow=made(SensorSamples), height_samples=None),)
     more = {"segments": flow, "settings": gnss.settings | {"EKF2_MAG_NOISE": 0.05}}
-    configurations = step_configurations(made(Inputs, **{**vars(gnss), **more}), kf_settings)
-    assert list(configurations)[-5:] == [ATTITUDE, FIELD_STEP, VELOCITY_STEP, FLOW_STEP, GATE]
+    configurations = make_step_configurations(made(Inputs, **{**vars(gnss), **more}), kf_settings)
+    assert list(configurations)[-5:] == [
+        ATTITUDE_STEP,
+        MAGNETOMETER_STEP,
+        VELOCITY_STEP,
+        FLOW_STEP,
+        GATE_STEP,
+    ]
     assert ["mag" in each.without for each in configurations.values()] == [True] * 6 + [False] * 4
     assert ["optical_flow" in each.without for each in configurations.values()] == [True] * 8 + [
         False
@@ -161,33 +173,33 @@ def test_longest_run_of_ekf2_rejections_has_start_and_duration():
     away.iloc[:, 0] = np.where(time == 26.5, 3.0, 0.0)
     away.iloc[:, 1] = np.where(time == 26.5, -4.0, np.where(time < 24.0, 99.0, 0.0))
     one = made(Ekf2Replay, updates=updates, delayed=away)
-    found = _longest_rejection(one, still, (0.0, 99.0), ((0.0, 99.0),))
+    found = _find_longest_rejection(one, still, (0.0, 99.0), ((0.0, 99.0),))
     assert (found.start_s, found.samples, found.duration_s) == (24.5, 3, 3.0)
     assert found.distance_m == pytest.approx(5.0)
     # outside the evaluated time, and without rejections
-    early = _longest_rejection(one, still, (0.0, 22.0), ((0.0, 99.0),))
+    early = _find_longest_rejection(one, still, (0.0, 22.0), ((0.0, 99.0),))
     assert (early.start_s, early.samples, early.duration_s) == (21.5, 1, 0.0)
-    assert _longest_rejection(one, still, (22.4, 24.4), ((0.0, 99.0),)) is None
+    assert _find_longest_rejection(one, still, (22.4, 24.4), ((0.0, 99.0),)) is None
 
 
 def test_rmse_against_ground_truth_uses_only_common_times():
     times, direction = np.array([9.0, 10.0, 15.0, 20.0, 21.0]), np.array([0.6, 0.8, 0.0])
     frame = pd.DataFrame(0.0, index=[10.0, 20.0], columns=Columns.STATE)
     truth = made(Truth, samples=frame.assign(north_m=[0.0, 2.0], east_m=2.0))
-    there = component_along(truth.samples, ["north_m", "east_m"], direction, times)
+    there = interpolate_component(truth.samples, ["north_m", "east_m"], direction, times)
     assert there == pytest.approx([1.6, 1.6, 2.2, 2.8, 2.8])
     off, flight = np.array([9.0, 3.0, 4.0, 5.0, 9.0]), made(Flight, truth=truth)
-    error = rms_to_truth(flight, there + off, direction, times)
+    error = compute_rmse_to_truth(flight, there + off, direction, times)
     assert error == pytest.approx(math.sqrt(50.0 / 3.0))
-    assert rms_to_truth(flight, there[:1], direction, times[:1]) is None
-    assert rms_to_truth(made(Flight, truth=NONE), there, direction, times) is None
+    assert compute_rmse_to_truth(flight, there[:1], direction, times[:1]) is None
+    assert compute_rmse_to_truth(made(Flight, truth=NONE), there, direction, times) is None
 
 
 def test_longest_time_without_fusion_includes_start_and_end():
     evaluated_spans = ((15.0, 30.0), (40.0, 60.0))
-    assert _longest_between_fusions(np.array([16.0, 29.0, 41.0, 59.0]), evaluated_spans) == 18.0
-    assert _longest_between_fusions(np.array([40.0]), evaluated_spans) == 25.0
-    assert _longest_between_fusions(np.array([16.0]), evaluated_spans) == 44.0
+    assert _find_longest_gap_s(np.array([16.0, 29.0, 41.0, 59.0]), evaluated_spans) == 18.0
+    assert _find_longest_gap_s(np.array([40.0]), evaluated_spans) == 25.0
+    assert _find_longest_gap_s(np.array([16.0]), evaluated_spans) == 44.0
 
 
 def test_what_if_summary_has_horizontal_nis_and_rmse() -> None:
@@ -208,13 +220,13 @@ def test_what_if_with_late_samples_adds_a_note():
         one: Any = SimpleNamespace(
             late=3, lost=2, updates=range(8), changed={"EKF2_EV_DELAY": 90}, settings={}
         )
-        (note,) = _notes(model, one)
+        (note,) = _describe_replay_limits(model, one)
         assert note.startswith("EKF2_EV_DELAY=90: 5 of 10 samples")
         assert note.endswith(f"(2 would never be fused){remedy}")
         few = SimpleNamespace(**(vars(one) | {"updates": range(1)}))
-        assert "5 of 5 samples" in next(_notes(model, few))
+        assert "5 of 5 samples" in next(_describe_replay_limits(model, few))
         one.late = one.lost = 0
-        assert list(_notes(model, one)) == []
+        assert list(_describe_replay_limits(model, one)) == []
 
 
 # ---------------------------------------------------------- predictability of results
@@ -253,7 +265,7 @@ def test_what_if_delay_that_prevents_fusion_raises_error(model, monkeypatch):
     never = replace(
         model.baseline_replay, updates=model.baseline_replay.updates[:0], lost=9, changed=changed
     )
-    monkeypatch.setattr(whatif, "replay_settings", lambda *_, **_more: [never])
+    monkeypatch.setattr(whatif, "replay_with_settings", lambda *_, **_more: [never])
     with pytest.raises(SettingsError, match=r"EKF2_EV_DELAY=300: .* never be fused .* 9 samples"):
         what_if(model, [changed])
 
@@ -284,7 +296,7 @@ def test_what_if_sensitive_to_noise_is_marked_unpredictable(model, monkeypatch):
 
     def is_predictable(changed: Summary) -> bool:
         monkeypatch.setattr(whatif, "with_position_noise", with_position_noise)
-        monkeypatch.setattr(whatif, "replay_settings", lambda _, changes, **_more: changes)
+        monkeypatch.setattr(whatif, "replay_with_settings", lambda _, changes, **_more: changes)
         monkeypatch.setattr(whatif, "_summarise_replay", lambda *_: changed)
         (found,) = whatif._mark_unpredictable(model, [base], ((0.0, 1.0),), {})
         return found.is_predictable

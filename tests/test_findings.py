@@ -18,7 +18,7 @@ from golden_tools import assert_matches_golden, rounded, value
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.diagnose import prepare_comparison, read_flight
-from px4fuse.ekf2.inputs import MODEL_NOTE
+from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import TITLES, Finding, find, group_by_root
@@ -234,7 +234,7 @@ FAULTS = [
           ekf2(resets=(STEP_UP,))),
     Fault("ekf2_instance_switch", "warning", {"count": 2, "at_s": 30.0},
           ekf2(instances=((-math.inf, 0), (30.0, 1), (80.0, 0)))),
-    Fault("ekf2_simulated", "note", change=with_log(notes=(MODEL_NOTE,))),
+    Fault("ekf2_simulated", "note", change=with_log(notes=(SIMULATED_EKF2_NOTE,))),
     Fault("ekf2_not_logged", "warning", flight={"ekf2": None}),
     # the position source
     Fault("source_not_logged", "warning", {"rate_hz": about(4.0), "sdlog_profile": 1},

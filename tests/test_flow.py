@@ -11,8 +11,8 @@ from ulog_tools import gnss_log, seconds_of, stamps, topic
 
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.inputs import read_gnss
-from px4fuse.ekf2.magnetometer import EventSamples, fuse_mean, mean_by_event
-from px4fuse.ekf2.model import Model, replay_settings
+from px4fuse.ekf2.magnetometer import EventSamples, average_by_event, fuse_mean
+from px4fuse.ekf2.model import Model, replay_with_settings
 from px4fuse.ekf2.replay_segments import VELOCITY
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.flight.model import Columns, Flight, Reset
@@ -112,7 +112,7 @@ def test_mean_flow_velocity_equals_velocity_at_update_time(every):
     (segment,) = model().inputs.segments
     with_flow = add_flow_samples(segment, flow_of(every=every), 3.0)
     end = next(iter(model().intervals.values()))[0].events.end_step
-    found = mean_by_event(segment, with_flow.flow, end)
+    found = average_by_event(segment, with_flow.flow, end)
     has_sample = found.sample_count > 0.0
     assert found.sample_count.sum() == pytest.approx(len(flow_of(every=every)) * every, abs=12.0)
     speed = true_velocity(segment.time_s[end[has_sample]])
@@ -146,7 +146,7 @@ def test_ekf2_replay_without_gnss_drifts_less_with_optical_flow():
     lost = dict.fromkeys(("gnss_pos", "gnss_vel"), 40.0)
     off = []
     for carried in (flying(), model()):
-        (replay,) = replay_settings(carried, [{}], without=lost)
+        (replay,) = replay_with_settings(carried, [{}], without=lost)
         difference = (
             replay.delayed[["north_m", "east_m"]]
             - model().baseline_replay.delayed[["north_m", "east_m"]]
@@ -154,8 +154,8 @@ def test_ekf2_replay_without_gnss_drifts_less_with_optical_flow():
         off.append(float(np.hypot(*difference.loc[100.0:101.0].to_numpy().T).max()))
     assert off[0] < 1.5
     assert off[1] > 10.0
-    (alone,) = replay_settings(flying(), [{}], without={"optical_flow": 0.0})
-    (flown,) = replay_settings(model(), [{}])
+    (alone,) = replay_with_settings(flying(), [{}], without={"optical_flow": 0.0})
+    (flown,) = replay_with_settings(model(), [{}])
     pd.testing.assert_frame_equal(alone.delayed, flown.delayed)
 
 
@@ -205,9 +205,9 @@ def test_read_gnss_omits_fixes_while_fusion_is_disabled():
 def test_ekf2_replay_start_covariance_uses_data_before_start():
     """Six seconds at rest and the climb correlate tilt and accelerometer bias."""
     (segment,) = model().inputs.segments
-    assert segment.history is not None
-    assert segment.history.time_s[-1] == pytest.approx(segment.time_s[0], abs=1e-6)
-    assert segment.history.time_s[0] < 1.0
+    assert segment.preceding_segment is not None
+    assert segment.preceding_segment.time_s[-1] == pytest.approx(segment.time_s[0], abs=1e-6)
+    assert segment.preceding_segment.time_s[0] < 1.0
     of_tilt = segment.state_correlation[:2, 12:15] @ segment.body_to_ned[0].T
     # θ × f = Rb with f = -g: the north bias couples with the east tilt, and vice versa
     np.testing.assert_allclose(of_tilt[:, :2], [[0.0, 0.98], [-0.98, 0.0]], atol=0.02)

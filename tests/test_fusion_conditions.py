@@ -9,7 +9,7 @@ import pytest
 from comparisons import compare
 from findings_tools import NONE, analysis, made, moving, named, only, positions, source
 
-from px4fuse.ekf2.fusion_conditions import FusionAttempt, find_unmet
+from px4fuse.ekf2.fusion_conditions import UnfusedPositions, find_unmet_condition
 from px4fuse.findings import ekf2_not_fusing
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.flight.model import GNSS, POSITION_FILE, AidLog, ClockMap, Ekf2
@@ -27,11 +27,11 @@ def on(value: float) -> "pd.Series[float]":
 
 def attempt(
     rate_hz: float = 10.0, ekf2: Any = None, aid: Any = EV_POS, **parts: Any
-) -> FusionAttempt:
+) -> UnfusedPositions:
     parameters = parts.pop("parameters", V114)
     usual = {"states": {}, "aids": {}, "record": NONE, "horizon_s": 0.2}
     track = source(rate_hz=rate_hz, **parts)
-    return FusionAttempt(made(Ekf2, **{**usual, **(ekf2 or {})}), track, aid, parameters, SPAN_S)
+    return UnfusedPositions(made(Ekf2, **{**usual, **(ekf2 or {})}), track, aid, parameters, SPAN_S)
 
 
 def with_quality(*values: float) -> dict[str, Any]:
@@ -41,7 +41,7 @@ def with_quality(*values: float) -> dict[str, Any]:
             "parameters": {**V114, "EKF2_EV_QMIN": 50.0}}  # fmt: skip
 
 
-def gnss(failed: int = 0, accuracy_m: float = 0.4, **parts: Any) -> FusionAttempt:
+def gnss(failed: int = 0, accuracy_m: float = 0.4, **parts: Any) -> UnfusedPositions:
     samples = moving(10.0).assign(north_m2=accuracy_m**2, down_m2=1.0)
     states = {"failed_checks": on(failed), **parts.pop("states", {})}
     return attempt(aid=GNSS_POS, origin=GNSS, samples=samples, ekf2={"states": states}, **parts)
@@ -100,9 +100,9 @@ def clock(name: str) -> ClockMap:
     ],
 )  # fmt: skip
 def test_unmet_ekf2_fusion_condition_is_reported_with_value(
-    tried: FusionAttempt, name: str | None, texts: tuple[str, ...]
+    tried: UnfusedPositions, name: str | None, texts: tuple[str, ...]
 ) -> None:
-    found = find_unmet(tried)
+    found = find_unmet_condition(tried)
     assert found.condition == (name or "")
     for text in texts:
         assert text in f"{found.fault} {found.reason} {found.action}"

@@ -21,7 +21,7 @@ import px4fuse
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.diagnose import prepare_comparison
 from px4fuse.ekf2.aids import AidResult
-from px4fuse.ekf2.inputs import _fusion_rules, read_gnss
+from px4fuse.ekf2.inputs import _make_fusion_rules, read_gnss
 from px4fuse.ekf2.inputs import prepare_inputs as prepare_replay
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.replay import inside_spans, rms
@@ -637,7 +637,7 @@ def test_gnss_reset_rule_depends_on_px4_release(north_m, parameters, scale, with
     record = made(
         FusionRecord, parameters=parameters, stores_bias_increments=False, delayed=delayed
     )
-    rules = _fusion_rules(record, 0.01, is_gnss=True)
+    rules = _make_fusion_rules(record, 0.01, is_gnss=True)
     assert (rules.reset_variance_factor, rules.resets_velocity) == (scale, with_velocity)
     assert (rules.reset_timeout_s, rules.stop_timeout_s) == (7.0, np.inf)
 

@@ -14,10 +14,10 @@ from exchange import replace
 from findings_tools import made
 
 from px4fuse.analysis import WhatIfAnalysis
-from px4fuse.ekf2.bad_acceleration import BadAcceleration
-from px4fuse.ekf2.barometer import fused_samples, sample_interval_s
+from px4fuse.ekf2.bad_acceleration import BadAccelerationFlag
+from px4fuse.ekf2.barometer import estimate_barometer_interval_s, find_fused_barometer_samples
 from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun
-from px4fuse.ekf2.heights import HeightFilter, add_heights, barometer_samples
+from px4fuse.ekf2.heights import HeightFilter, add_heights, group_barometer_by_event
 from px4fuse.ekf2.model import Model, run_configurations
 from px4fuse.ekf2.replay_segments import HeightSamples, ReplaySegment
 from px4fuse.ekf2.whatif import HEIGHT_LOGGED_NOTE, HEIGHT_REPLAYED_NOTE, what_if
@@ -72,13 +72,13 @@ def fusing(
     reference_until: float = np.inf,
     has_gate: bool = True,
 ) -> HeightFilter:
-    (samples,) = barometer_samples(segment, [end])
+    (samples,) = group_barometer_by_event(segment, [end])
     there, time_s = np.zeros((len(end), 1), bool), segment.time_s[end][:, None]
     on = {"baro_hgt": np.ones_like(there), "gnss_hgt": time_s < reference_until}
     parameters = {"EKF2_BARO_NOISE": np.array([0.5]), "EKF2_BARO_GATE": np.array([5.0])}
     return HeightFilter(
         segment, samples[..., None], time_s, there, on, parameters, np.array([has_gate]),
-        BadAcceleration(np.array([True]), 3.0, segment),
+        BadAccelerationFlag(np.array([True]), 3.0, segment),
     )  # fmt: skip
 
 
@@ -88,7 +88,7 @@ def standing(of: HeightSamples, count: int = 400, **how: Any) -> tuple[HeightFil
     heights = fusing(climbing(of, count), end, **how)
     for e in range(len(end)):
         heights.fuse_barometer(e, np.zeros((1, 9)), np.zeros((1, 9, 9)))
-    return heights, heights.updates("baro_hgt", 0, end * STEP_S)
+    return heights, heights.make_update_table("baro_hgt", 0, end * STEP_S)
 
 
 def test_barometer_bias_matches_scalar_kalman_filter() -> None:
@@ -149,7 +149,7 @@ def test_height_innovation_refers_to_sample_time() -> None:
         x = np.zeros((1, 9))
         x[0, 5], x[0, 8] = -2.0 - 3.0 * time[at], down[at]
         heights.fuse_barometer(e, x, np.zeros((1, 9, 9)))
-    found = heights.updates("baro_hgt", 0, end * STEP_S)
+    found = heights.make_update_table("baro_hgt", 0, end * STEP_S)
     np.testing.assert_allclose(found["innovation_down_m"], -0.1, atol=1e-9)
     np.testing.assert_allclose(found.index, time[steps])
     np.testing.assert_allclose(found["fused_at_s"], [0.2, 0.2, 0.3, 0.5])
@@ -165,7 +165,7 @@ def test_height_sample_with_weight_2_equals_two_samples() -> None:
         heights = fusing(segment, np.array([10]))
         x, after = heights.fuse_barometer(0, np.zeros((1, 9)), P)
         variances.append((after[0, 8, 8], x[0, 8]))
-        assert heights.update_log[0, 0, 1, 0] == pytest.approx(0.75)
+        assert heights.update_records[0, 0, 1, 0] == pytest.approx(0.75)
     assert variances[0] == pytest.approx(variances[1])
 
 
@@ -286,8 +286,8 @@ def test_ekf2_replay_of_heights_without_data_gives_reason() -> None:
         }
         log = replace(record, parameters=record.parameters | parameters)
         other = replace(flight, barometer=flight.barometer.iloc[::rows])
-        update_log = add_heights(other, replace(ekf2, aids=found), log, segments)
-        return update_log if isinstance(update_log, str) else ""
+        update_records = add_heights(other, replace(ekf2, aids=found), log, segments)
+        return update_records if isinstance(update_records, str) else ""
 
     assert why({"baro_hgt": 1.0}) == ""
     assert "range finder in part" in why({"baro_hgt": 1.0, "rng_hgt": 0.0})
@@ -328,22 +328,24 @@ def test_bad_acceleration_fraction_equals_clipped_imu_fraction() -> None:
     clipped = pd.Series(0, flight.imu.index)
     at = plain.time_s[[100, 200]] - 1e-4
     clipped.iloc[np.searchsorted(flight.imu.index, at)] = [0b101, 0b111]
-    (update_log,) = opened(replace(flight, imu=flight.imu.assign(clipped=clipped))).inputs.segments
+    (update_records,) = opened(
+        replace(flight, imu=flight.imu.assign(clipped=clipped))
+    ).inputs.segments
     assert not plain.clipped_fraction.any()
-    assert update_log.clipped_fraction[[100, 200]].tolist() == [pytest.approx(2.0 / 3.0), 1.0]
-    assert np.flatnonzero(update_log.clipped_fraction).tolist() == [100, 200]
+    assert update_records.clipped_fraction[[100, 200]].tolist() == [pytest.approx(2.0 / 3.0), 1.0]
+    assert np.flatnonzero(update_records.clipped_fraction).tolist() == [100, 200]
 
 
 def test_bad_acceleration_flag_is_set_by_two_large_innovations() -> None:
     """Two innovations of different sensors, above 3 √S and above √S; the flag lasts 3 s."""
     nan = np.nan
     segment = climbing(of_baro([10], [0.0]))
-    flag = BadAcceleration(np.array([False, True]), 3.0, segment)
+    flag = BadAccelerationFlag(np.array([False, True]), 3.0, segment)
     ratios = [np.full((2, 2), nan)]
 
     def event(time_s: float, barometer: list[float], gnss: float) -> list[float]:
         """Return the fraction of the 0.1 s before an event with the flag, then fuse samples."""
-        share = flag.flagged_fraction(np.array([time_s - 0.1]), np.array([time_s]))
+        share = flag.compute_flagged_fraction(np.array([time_s - 0.1]), np.array([time_s]))
         ratios.append(np.array([[one, one] for one in (*barometer, gnss)]))
         flag.update(np.array([time_s]), *ratios[-2:])
         return [0.0, 0.0] if share is None else share.tolist()
@@ -366,9 +368,9 @@ def test_ekf2_flag_for_bad_acceleration_is_read_from_log() -> None:
     is_bad = np.zeros(401, bool)
     is_bad[[*range(100, 150), *range(300, 401)]] = True
     segment = climbing(of_baro([10], [0.0]), is_acceleration_bad=is_bad)
-    flag = BadAcceleration(np.array([True]), 3.0, segment)
+    flag = BadAccelerationFlag(np.array([True]), 3.0, segment)
     shares = [
-        flag.flagged_fraction(np.array([end_s - 0.2]), np.array([end_s]))
+        flag.compute_flagged_fraction(np.array([end_s - 0.2]), np.array([end_s]))
         for end_s in (0.9, 1.1, 1.3, 1.6, 1.8, 4.0)
     ]
     expected = [None, 0.5, 1.0, 0.5, None, 1.0]
@@ -401,9 +403,9 @@ def test_barometer_samples_missing_in_log_are_reconstructed(every: int, has_filt
     state = pd.DataFrame({"down_m_s": 0.0}, time_s)
     log = made(AidLog, samples=rows if has_filter else rows.drop(columns="filtered_down"))
     ekf2 = made(Ekf2, state=state, aids={"baro_hgt": log})
-    assert sample_interval_s(record) == pytest.approx(0.05, rel=1e-6)
+    assert estimate_barometer_interval_s(record) == pytest.approx(0.05, rel=1e-6)
     raw = pd.Series(innovation_m - 1.7, time_s)
-    found = fused_samples(ekf2, record, raw.iloc[::every])["down_m"]
+    found = find_fused_barometer_samples(ekf2, record, raw.iloc[::every])["down_m"]
     is_known = np.isin(
         np.arange(401) % (10 * every), [*range(0, 10 * every, every), *range(0, 99, 10)]
     )

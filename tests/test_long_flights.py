@@ -76,9 +76,9 @@ def test_injected_error_period_is_found_at_any_flight_length(count):
 @pytest.mark.parametrize("lag_steps", [1, 20])
 def test_output_predictor_in_blocks_equals_stepwise_recursion(monkeypatch, lag_steps):
     error_rad = np.random.default_rng(lag_steps).standard_normal((500, 3))
-    whole = output_predictor.follow_attitude(error_rad, lag_steps, 0.01, 0.2)
+    whole = output_predictor.sum_attitude_corrections(error_rad, lag_steps, 0.01, 0.2)
     monkeypatch.setattr(arrays, "BLOCK_ROWS", 64)
-    in_blocks = output_predictor.follow_attitude(error_rad, lag_steps, 0.01, 0.2)
+    in_blocks = output_predictor.sum_attitude_corrections(error_rad, lag_steps, 0.01, 0.2)
     np.testing.assert_allclose(in_blocks, whole, atol=1e-12)
 
 

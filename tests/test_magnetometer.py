@@ -9,14 +9,14 @@ from findings_tools import made
 from scipy.spatial.transform import Rotation
 from ulog_tools import Log, gnss_log, seconds_of, stamps, topic
 
-from px4fuse.ekf2.magnetometer import EventSamples, fuse_mean, mean_by_event
+from px4fuse.ekf2.magnetometer import EventSamples, average_by_event, fuse_mean
 from px4fuse.ekf2.replay_segments import (
     BODY_FIELD,
     EARTH_FIELD,
     ReplaySegment,
     SensorSamples,
-    _field_span,
-    _mean_field,
+    _compute_mean_field,
+    _find_field_fusion_span,
 )
 from px4fuse.flight.model import Columns, FusionRecord
 from px4fuse.readers import read_log
@@ -114,7 +114,7 @@ def test_magnetometer_samples_are_averaged_until_next_update() -> None:
     step = np.array([2, 3, 6, 9])
     turn = rotation[step].transpose(0, 2, 1)
     sensed = SensorSamples(step, gauss, turn, np.full(4, 2.0), np.array([0.1, 0.3, 0.2, 0.4]))
-    found = mean_by_event(made(ReplaySegment), sensed, np.array([1, 3, 6, 6, 8]))
+    found = average_by_event(made(ReplaySegment), sensed, np.array([1, 3, 6, 6, 8]))
     np.testing.assert_allclose(found.noise, [0.0, 0.2, 0.2, 0.0, 0.0])
     assert found.sample_count.tolist() == [0.0, 4.0, 2.0, 0.0, 0.0]
     np.testing.assert_allclose(found.value[1], gauss[:2].mean(axis=0))
@@ -208,7 +208,7 @@ def test_mean_magnetometer_sample_inverts_logged_low_pass() -> None:
     delayed = pd.DataFrame(dict(zip(fields, [*EARTH, *body], strict=True)), [99.0, 200.0])
     matrices = rotation.as_matrix()
     segment = made(ReplaySegment, time_s=time_s, body_to_ned=matrices, attitude_error_rad=error)
-    found = _mean_field(segment, delayed, measured_at_s[remaining], filtered[remaining])
+    found = _compute_mean_field(segment, delayed, measured_at_s[remaining], filtered[remaining])
     near = np.flatnonzero(np.diff(remaining) < 20) + 1
     assert found.sample_count.tolist() == np.diff(remaining)[near - 1].tolist()
     assert sorted(set(found.sample_count)) == [7.0, 14.0]
@@ -232,7 +232,7 @@ def settled(frame_hz: float, on: slice, count: int = 60) -> tuple[float, float] 
     fused = np.zeros(count)
     fused[on] = 1.0
     frame = pd.DataFrame({"fused_3d": fused}, index=np.arange(count) / frame_hz)
-    return _field_span(made(FusionRecord, field_gauss=frame))
+    return _find_field_fusion_span(made(FusionRecord, field_gauss=frame))
 
 
 def test_magnetometer_replay_requires_continuous_3d_fusion() -> None:

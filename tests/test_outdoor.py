@@ -29,7 +29,7 @@ from px4fuse.comparison.trials import (
     is_sufficient,
 )
 from px4fuse.diagnose import find_faults
-from px4fuse.ekf2.model import replay_settings
+from px4fuse.ekf2.model import replay_with_settings
 from px4fuse.ekf2.whatif import HEADING_LOGGED_NOTE, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import compute_nis_band
@@ -193,7 +193,7 @@ def test_larger_ekf2_acc_noise_reduces_nees_under_vibration() -> None:
     before, after = tried.before.position_rmse_m, tried.after.position_rmse_m
     assert after == pytest.approx(0.8 * before, rel=0.05)
     # at the fusion horizon σ covers the error with this noise
-    (replayed,) = replay_settings(analysis.ekf2_model, [dict(tried.change)])
+    (replayed,) = replay_with_settings(analysis.ekf2_model, [dict(tried.change)])
     delayed = project_state(replayed.delayed, analysis.main.axis, analysis.segment)["position_m"]
     truth = analysis.main.truth["position_m"]
     error_m = delayed - np.interp(delayed.index, truth.index, truth, np.nan, np.nan)

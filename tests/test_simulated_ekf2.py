@@ -9,7 +9,7 @@ from flights import unexplained
 from scipy.spatial.transform import Rotation
 
 from px4fuse.diagnose import find_faults
-from px4fuse.ekf2.inputs import MODEL_NOTE
+from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.ekf2.model import open_model
 from px4fuse.ekf2.replay import Agreement
 from px4fuse.filter.consistency import compute_nis_band
@@ -223,7 +223,7 @@ def test_simulated_ekf2_holds_position_if_fusion_is_disabled(clean):
 def test_simulated_log_has_note_that_ekf2_is_simulated(clean, tmp_path):
     path = tmp_path / "flight.ulg"
     path.write_bytes(to_ulog(simulate(AISLE)))
-    assert read_log(path).log.notes == clean.log.notes == (MODEL_NOTE,)
+    assert read_log(path).log.notes == clean.log.notes == (SIMULATED_EKF2_NOTE,)
     assert "ekf2_simulated" in named(clean)
     path.write_bytes(to_ulog(simulate(replace(AISLE, ekf2=False))))
     flight = read_log(path)

@@ -22,7 +22,13 @@ from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun, run_segment
 from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
 from px4fuse.ekf2.intervals import StepEvents, make_intervals
-from px4fuse.ekf2.model import Model, modelled_aids, open_model, replay_settings, run_configurations
+from px4fuse.ekf2.model import (
+    Model,
+    list_modelled_aids,
+    open_model,
+    replay_with_settings,
+    run_configurations,
+)
 from px4fuse.ekf2.replay_segments import ReplaySegment
 from px4fuse.ekf2.vision import MAX_SAMPLE_GAP_S
 from px4fuse.ekf2.whatif import what_if
@@ -122,7 +128,7 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
     steps = np.searchsorted(segment.time_s, measured_at_s - 1e-9).tolist()
     has_sample = {step: row for row, step in enumerate(steps) if step > 0}
     at = {int(event.end_step): event for event in events}
-    gps2, fixes, update_log = settings["EKF2_GPS_P_NOISE"] ** 2, [], []
+    gps2, fixes, update_records = settings["EKF2_GPS_P_NOISE"] ** 2, [], []
     biases: list[PlainBias] = []
 
     def fuse(i: int, nu: float, S: float, R: float) -> None:
@@ -166,13 +172,13 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
         nu = position - [bias.bias for bias in biases] - x[6:8]
         R = np.array([R0 + bias.variance for bias in biases])
         S = np.diag(P)[6:8] + R
-        update_log.append(np.concatenate([[measured_at_s[has_sample[k]]], nu, S]))
+        update_records.append(np.concatenate([[measured_at_s[has_sample[k]]], nu, S]))
         for j, bias in enumerate(biases):
             bias.fuse(float(off[j]), R0 + P[6 + j, 6 + j], inputs.mean_step_s)
         if np.all(nu**2 <= settings["EKF2_EVP_GATE"] ** 2 * S):
             for j in range(2):
                 fuse(6 + j, nu[j], S[j], R[j])
-    return np.array(fixes), np.array(update_log)
+    return np.array(fixes), np.array(update_records)
 
 
 def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: float) -> Inputs:
@@ -198,13 +204,13 @@ def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: 
 def ran(inputs: Inputs, *configurations: FilterConfiguration) -> SegmentRun:
     (segment,) = inputs.segments
     configurations = configurations or (FilterConfiguration(inputs.settings),)
-    made = [make_intervals(inputs, segment, one.timing(inputs)) for one in configurations]
+    made = [make_intervals(inputs, segment, one.compute_delays(inputs)) for one in configurations]
     return run_segment(inputs, segment, configurations, made)
 
 
-def update_log(done: SegmentRun, at: int = 0) -> pd.DataFrame:
+def update_records(done: SegmentRun, at: int = 0) -> pd.DataFrame:
     assert done.vision_filter is not None
-    return done.vision_filter.updates(at, done.segment.time_s[done.events[at].end_step])
+    return done.vision_filter.make_update_table(at, done.segment.time_s[done.events[at].end_step])
 
 
 @pytest.mark.parametrize(("rate_hz", "late_s", "settings"), [
@@ -225,7 +231,7 @@ def test_ekf2_replay_of_vision_and_gnss_equals_reference(
     assert difference.max() < 0.006
     assert np.all(without[3:] > 8.0 * difference[3:])
     np.testing.assert_allclose(S[10:], fixes[10:, 5:], rtol=2e-3)
-    found = update_log(done)
+    found = update_records(done)
     found = found.loc[rows[0, 0] + 3.0 :]
     rows = rows[np.searchsorted(rows[:, 0], found.index - 1e-6)]
     assert len(found) > 20.0 * rate_hz
@@ -244,11 +250,14 @@ def test_vision_noise_during_gnss_fusion_is_at_least_gnss_noise() -> None:
     done = ran(inputs, *map(FilterConfiguration, noises), alone)
     assert done.vision_filter is not None
     noise = np.sqrt(
-        np.unique(done.vision_filter.noise_m2[done.vision_filter.has_sample[0]].round(9), axis=0)
+        np.unique(
+            done.vision_filter.R_m2[done.vision_filter.has_sample[0]].round(9),
+            axis=0,
+        )
     )
     assert sorted({*noise[:, 0].round(6)}) == [0.1, 0.5, 0.7]
-    pd.testing.assert_frame_equal(update_log(done, 0), update_log(done, 1))
-    assert np.abs(update_log(done, 2) - update_log(done, 1)).max(axis=None) > 0.01
+    pd.testing.assert_frame_equal(update_records(done, 0), update_records(done, 1))
+    assert np.abs(update_records(done, 2) - update_records(done, 1)).max(axis=None) > 0.01
 
 
 def test_vision_lever_arm_is_subtracted_in_replay() -> None:
@@ -262,7 +271,7 @@ def test_vision_lever_arm_is_subtracted_in_replay() -> None:
         f"EKF2_EV_POS_{axis}": value for axis, value in zip("XYZ", lever_arm_m, strict=True)
     }
     pd.testing.assert_frame_equal(
-        update_log(ran(flying(beside, **settings))), update_log(ran(inputs))
+        update_records(ran(flying(beside, **settings))), update_records(ran(inputs))
     )
 
 
@@ -285,7 +294,7 @@ def test_ekf2_rejects_vision_jump_until_position_bias_is_reset() -> None:
         vision, position_m=vision.position_m + 20.0 * (vision.timestamp_s > at_s)[:, None]
     )
     smooth, done = ran(flying(vision)), ran(flying(jumped))
-    found = update_log(done)
+    found = update_records(done)
     rejected = found.index[found["rejected"] > 0.0]
     assert rejected[0] == pytest.approx(at_s, abs=0.05)
     assert rejected[-1] - rejected[0] == pytest.approx(1.0, abs=0.1)
@@ -295,7 +304,7 @@ def test_ekf2_rejects_vision_jump_until_position_bias_is_reset() -> None:
     difference = done.state[-1, 0, 6:8] - smooth.state[-1, 0, 6:8]
     assert np.abs(difference).max() < 0.05
     without_gate = ran(flying(jumped), FilterConfiguration(flying(jumped).settings, has_gate=False))
-    assert not update_log(without_gate)["rejected"].any()
+    assert not update_records(without_gate)["rejected"].any()
 
 
 def test_vision_position_bias_restarts_after_a_gap() -> None:
@@ -306,7 +315,7 @@ def test_vision_position_bias_restarts_after_a_gap() -> None:
         moved = vision.position_m + 20.0 * (vision.timestamp_s > at_s)[:, None]
         fields = ("timestamp_s", "arrival_s", "variance_m2", "rejected", "reset")
         parts = {name: getattr(vision, name)[remaining] for name in fields}
-        found = update_log(ran(flying(replace(vision, position_m=moved[remaining], **parts))))
+        found = update_records(ran(flying(replace(vision, position_m=moved[remaining], **parts))))
         after = found.loc[at_s + gap_s :]
         assert bool(after["rejected"].any()) is not anew
 
@@ -321,7 +330,7 @@ def test_loss_of_gnss_resets_position_to_vision() -> None:
         FilterConfiguration(inputs.settings),
         FilterConfiguration(inputs.settings, without=lost),
     )
-    found, flown = update_log(done, 1), update_log(done, 0)
+    found, flown = update_records(done, 1), update_records(done, 0)
     assert not flown["reset"].any()
     (reset_s,) = found.index[found["reset"] > 0.0]
     assert reset_s == pytest.approx(lost_s, abs=0.3)
@@ -348,7 +357,7 @@ def test_vision_position_bias_changes_with_gnss_position_reset() -> None:
         assert done.position_reset_m.sum() == pytest.approx(
             0.0 if resets_velocity else 30.0, abs=3.0
         )
-        assert update_log(done)["fused"].mean() > 0.999
+        assert update_records(done)["fused"].mean() > 0.999
 
 
 def off_by(received: ReceivedPositions, north_m: float) -> ReceivedPositions:
@@ -361,7 +370,7 @@ def off_by(received: ReceivedPositions, north_m: float) -> ReceivedPositions:
 def test_rejection_of_gnss_and_vision_resets_position_to_vision() -> None:
     inputs = flying(off_by(sent(sigma_m=0.05), 20.0), seconds=20.0)
     done = ran(replace(inputs, received=off_by(inputs.received, 40.0)))
-    found = update_log(done)
+    found = update_records(done)
     (reset_s,) = found.index[found["reset"] > 0.0]
     assert reset_s == pytest.approx(float(done.segment.time_s[0]) + 16.0, abs=0.2)
     np.testing.assert_allclose(done.position_reset_m.sum(axis=(0, 1)), [20.0, 0.0], atol=0.7)
@@ -373,8 +382,8 @@ def test_rejection_of_gnss_and_vision_resets_position_to_vision() -> None:
 def test_larger_vision_delay_extends_the_fusion_horizon() -> None:
     inputs = flying(sent())
     settings = inputs.settings
-    flown = FilterConfiguration(settings).timing(inputs)
-    later = FilterConfiguration({**settings, "EKF2_EV_DELAY": 290.0}).timing(inputs)
+    flown = FilterConfiguration(settings).compute_delays(inputs)
+    later = FilterConfiguration({**settings, "EKF2_EV_DELAY": 290.0}).compute_delays(inputs)
     assert later.delay_s == flown.delay_s == pytest.approx(1e-3 * settings["EKF2_GPS_DELAY"])
     assert later.horizon_s == pytest.approx(28 * inputs.mean_step_s)
     assert flown.horizon_s == inputs.horizon_s < later.horizon_s
@@ -388,13 +397,13 @@ def test_second_vision_sample_in_one_step_is_dropped() -> None:
     }
     stamps = np.repeat(vision.timestamp_s, 2)
     stamps[::2] -= 0.0005
-    once, twice = (update_log(ran(flying(one))) for one in (
+    once, twice = (update_records(ran(flying(one))) for one in (
         vision, replace(vision, timestamp_s=stamps, **doubled)))  # fmt: skip
     assert len(once) <= len(twice) <= 1.1 * len(once)
     horizon_s = flying(vision).horizon_s
     for age_s, remaining in ((horizon_s + 0.05, True), (horizon_s + 0.15, False)):
         late = replace(vision, arrival_s=vision.timestamp_s + age_s)
-        assert bool(len(update_log(ran(flying(late))))) is remaining
+        assert bool(len(update_records(ran(flying(late))))) is remaining
 
 
 # ------------------------------------------------------------- a flight with both
@@ -429,7 +438,7 @@ def flown(
         patch.setattr(simulated, "parameters", lambda *of: usual(*of) | OF_VISION | changed)
         patch.setattr(simulated, "run_configurations", both)
         flight = simulate_flight(OUTDOOR, parse_faults(()))
-    updates = update_log(runs[0])
+    updates = update_records(runs[0])
     enabled = pd.Series([1.0, 0.0], index=[0.0, off_from_s])
     samples = pd.DataFrame({
         "innovation_north": updates["innovation_north_m"],
@@ -465,7 +474,7 @@ def test_ekf2_model_of_gnss_and_vision_agrees_with_log() -> None:
         for axis in axes.values():
             assert axis.innovation_correlation > 0.998
             assert 0.99 < axis.s_ratio_p5 < axis.s_ratio_p95 < 1.01
-    assert modelled_aids(model().inputs)[:3] == ["gnss_pos", "gnss_vel", "ev_pos"]
+    assert list_modelled_aids(model().inputs)[:3] == ["gnss_pos", "gnss_vel", "ev_pos"]
     assert model().inputs.settings["EKF2_EVP_NOISE"] == pytest.approx(0.1)
 
 
@@ -479,18 +488,22 @@ def test_what_if_vision_noise_equals_flight_with_this_noise() -> None:
         assert predicted.nis_mean == pytest.approx(replayed.nis_mean, rel=0.01)
     assert found.logged.others["ev_pos"].nis_mean < 0.5 * predicted.others["ev_pos"].nis_mean
     # R is then the noise of GNSS
-    update_log = what_if(model(), [{"EKF2_EVP_NOISE": 0.2}])
+    update_records = what_if(model(), [{"EKF2_EVP_NOISE": 0.2}])
     assert (
-        "the noise of vision positions is at least EKF2_GPS_P_NOISE (0.4 m)" in update_log.notes[-1]
+        "the noise of vision positions is at least EKF2_GPS_P_NOISE (0.4 m)"
+        in update_records.notes[-1]
     )
-    assert update_log.whatif[0].others == update_log.replayed.others
+    assert update_records.whatif[0].others == update_records.replayed.others
 
 
 def test_what_if_with_smaller_vision_gate_rejects_more() -> None:
     request = WhatIfRequest(log="flight.ulg", changes={"EKF2_EVP_GATE": 1.0})
     made_of = run_what_if(request, flight=flown())
-    found, update_log = made_of.whatif, {label: cells for label, *cells in statistic_rows(made_of)}
-    assert "external vision, position: mean NIS" in update_log
+    found, update_records = (
+        made_of.whatif,
+        {label: cells for label, *cells in statistic_rows(made_of)},
+    )
+    assert "external vision, position: mean NIS" in update_records
     results = json.loads(to_json(whatif_results(request, made_of)))
     jsonschema.validate(results, schema())
     assert results["replayed"]["others"]["ev_pos"]["rejected_fraction"] == 0.0
@@ -524,16 +537,16 @@ def test_ekf2_model_excludes_vision_that_disagrees_with_log(wrong: dict[str, Any
     # a replay with GNSS only differs from EKF2
     assert not found.agreement.good
     assert found.inputs.vision is None
-    assert "ev_pos" not in modelled_aids(found.inputs)
+    assert "ev_pos" not in list_modelled_aids(found.inputs)
     with pytest.raises(SettingsError, match="EKF2_EVP_NOISE has no effect in a replay of this log"):
-        replay_settings(found, [{"EKF2_EVP_NOISE": 0.3}])
+        replay_with_settings(found, [{"EKF2_EVP_NOISE": 0.3}])
 
 
 def test_ekf2_model_does_not_fuse_vision_while_disabled() -> None:
     found = opened(flown(off_from_s=60.0))
     assert found.inputs.vision is not None
-    update_log = np.isfinite(found.inputs.vision.position_m[:, 0])
-    assert found.inputs.vision.timestamp_s[update_log][-1] == pytest.approx(60.0, abs=0.1)
+    update_records = np.isfinite(found.inputs.vision.position_m[:, 0])
+    assert found.inputs.vision.timestamp_s[update_records][-1] == pytest.approx(60.0, abs=0.1)
     assert found.agreement.good
     assert found.agreement.doubtful == {}
 
@@ -559,7 +572,7 @@ def test_kf_ekf2_difference_on_gnss_flight_includes_vision() -> None:
         assert (
             names.index(steps.VELOCITY_STEP)
             < names.index(steps.VISION_STEP)
-            < names.index(steps.GATE)
+            < names.index(steps.GATE_STEP)
         )
         assert why.unexplained_fraction < 0.05
         moved_m = {step.name: step.position_moved_m for step in why.steps}

@@ -14,7 +14,13 @@ from px4fuse.comparison.difference_steps import (
     corrected_settings,
     explain_ekf2_difference,
 )
-from px4fuse.ekf2.steps import NOISE, REPLACEMENT_STEPS, SAMPLES, TIMESTAMPS, DifferenceExplanation
+from px4fuse.ekf2.steps import (
+    NOISE_STEP,
+    REPLACEMENT_STEPS,
+    SAMPLES_STEP,
+    TIMESTAMPS_STEP,
+    DifferenceExplanation,
+)
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Unavailable
@@ -50,14 +56,14 @@ def test_position_difference_on_report_page_is_kf_minus_ekf2(sample: Analysis) -
 def test_kf_setting_changes_only_its_part_of_ekf2_difference(sample: Analysis) -> None:
     plain = of(sample)
     zero = explain_again(sample, Settings(input="zero"))
-    assert zero.steps[0].name == SAMPLES
+    assert zero.steps[0].name == SAMPLES_STEP
     assert zero.steps[0].position_mean_square_m2 > 10 * plain.steps[0].position_mean_square_m2
     assert "KF uses no acceleration (--input zero)" in " ".join(zero.sentences)
     small = explain_again(sample, Settings(sigma_z_m=0.02))
-    assert next(step for step in small.steps if step.name == NOISE).position_moved_m > 0.05
-    assert NOISE not in {step.name for step in plain.steps}  # equal settings
+    assert next(step for step in small.steps if step.name == NOISE_STEP).position_moved_m > 0.05
+    assert NOISE_STEP not in {step.name for step in plain.steps}  # equal settings
     late = explain_again(sample, Settings(clock_offset_s=-0.3))
-    assert TIMESTAMPS in late.sentences[0]
+    assert TIMESTAMPS_STEP in late.sentences[0]
     assert "300 ms" in late.sentences[0]
     left = pytest.approx(plain.unexplained_mean_square_m2, rel=0.02)
     assert [o.unexplained_mean_square_m2 for o in (zero, small, late)] == [left] * 3

@@ -50,7 +50,7 @@ from px4fuse.core.text import (
     with_log_name,
 )
 from px4fuse.ekf2.fusion_conditions import is_height_only
-from px4fuse.ekf2.inputs import horizontal_resets_s
+from px4fuse.ekf2.inputs import find_horizontal_reset_times_s
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
@@ -240,7 +240,7 @@ def _make_effect(analysis: Analysis) -> Effect:
     comparison, segment, reset_count = analysis.main, analysis.segment.flight, None
     difference = comparison.difference
     if isinstance(analysis.flight.ekf2, Ekf2):
-        resets_s = horizontal_resets_s(analysis.flight.ekf2)
+        resets_s = find_horizontal_reset_times_s(analysis.flight.ekf2)
         reset_count = int(((segment.start_s < resets_s) & (resets_s <= segment.end_s)).sum())
     return Effect(
         axis=describe_axis(analysis, comparison),

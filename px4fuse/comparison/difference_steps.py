@@ -119,7 +119,7 @@ def explanation_configurations(
 ) -> list[FilterConfiguration]:
     """Return the EKF2 configurations that :func:`explain_ekf2_difference` replays."""
     return list(
-        steps.step_configurations(
+        steps.make_step_configurations(
             ekf2_inputs, _comparable_settings(comparison, ekf2_inputs, estimated_noises)
         ).values()
     )
@@ -166,7 +166,7 @@ def add_sentences(
     """
     step_reasons = {
         **step_reasons,
-        steps.GATE: f"{step_reasons[steps.GATE]}{_rejection_text(explanation)}",
+        steps.GATE_STEP: f"{step_reasons[steps.GATE_STEP]}{_rejection_text(explanation)}",
     }
     largest_step, second_step, *_ = sorted(
         explanation.steps, key=lambda step: -step.position_mean_square_m2
@@ -263,32 +263,32 @@ def _step_reasons(
     )
     trusted_input = "IMU" if equivalent_sigma_a < kf_settings.sigma_a_m_s2 else "positions"
     return {
-        steps.SAMPLES: samples_text,
-        steps.TIMESTAMPS: delay_text,
-        steps.NOISE: (
+        steps.SAMPLES_STEP: samples_text,
+        steps.TIMESTAMPS_STEP: delay_text,
+        steps.NOISE_STEP: (
             f"EKF2 uses a measurement noise of {noise_used_m(model.inputs):.2g} m ({aid.noise}), "
             f"KF {kf_settings.sigma_z_m:.2g} m"
         ),
-        steps.BIASES: "EKF2 estimates the accelerometer bias; KF does not",
-        steps.PROCESS: (
+        steps.BIASES_STEP: "EKF2 estimates the accelerometer bias; KF does not",
+        steps.PROCESS_NOISE_STEP: (
             f"EKF2_ACC_NOISE {ekf2_parameters['EKF2_ACC_NOISE']:g} corresponds to SIGMA_A "
             f"{equivalent_sigma_a:.2g} m/s²; KF uses {kf_settings.sigma_a_m_s2:.2g} m/s². "
             f"EKF2 gives the {trusted_input} more weight than KF"
         ),
-        steps.ATTITUDE: (
+        steps.ATTITUDE_STEP: (
             "EKF2 corrects its attitude with the positions; KF uses EKF2's logged attitude"
         ),
-        steps.FIELD_STEP: (
+        steps.MAGNETOMETER_STEP: (
             "EKF2 estimates its heading with the magnetometer; KF uses EKF2's published heading"
         ),
         steps.VELOCITY_STEP: "EKF2 also fuses GNSS velocity; KF uses GNSS position only",
         steps.FLOW_STEP: "EKF2 also fuses optical flow; KF uses positions only",
         steps.VISION_STEP: "EKF2 fuses external vision and GNSS; KF uses one position source",
-        steps.GATE: (
+        steps.GATE_STEP: (
             f"EKF2 rejects {100 * model.agreement.rejected_fraction_logged:.1f} % of the "
             "positions; KF has no innovation gate"
         ),
-        steps.OUTPUT: (
+        steps.OUTPUT_PREDICTOR_STEP: (
             f"EKF2 fuses positions {1e3 * ekf2_inputs.horizon_s:.0f} ms late, and its output "
             f"predictor (EKF2_TAU_POS {ekf2_parameters['EKF2_TAU_POS']:g} s) predicts the present "
             "state; KF has no delay"

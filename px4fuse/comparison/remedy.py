@@ -9,7 +9,7 @@ import numpy as np
 from px4fuse.comparison.estimates import Tuning, first_axis_tuning
 from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.model import Model, replay_settings
+from px4fuse.ekf2.model import Model, replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import MIN_OFFSET_SIGMAS, MIN_TIME_OFFSET_S, ClockOffset
@@ -40,7 +40,9 @@ def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
     if model.inputs.vision is None or received.velocity_m_s is None or received.uses_sender_times:
         return None
     nis_sums = []
-    for replay in replay_settings(model, [{GNSS_POS.delay: delay} for delay in GNSS_DELAYS_MS]):
+    for replay in replay_with_settings(
+        model, [{GNSS_POS.delay: delay} for delay in GNSS_DELAYS_MS]
+    ):
         update_tables = [
             rows_inside(updates, model.baseline_replay.find_evaluated_spans())
             for updates in (replay.updates, replay.other_aid_updates[GNSS_VEL.name])

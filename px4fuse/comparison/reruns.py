@@ -55,7 +55,7 @@ from px4fuse.comparison.trials import (
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.model import Model, replay_settings, with_misaligned_positions
+from px4fuse.ekf2.model import Model, replay_with_settings, with_misaligned_positions
 from px4fuse.ekf2.replay import HORIZONTAL_AXES, Ekf2Replay, rows_inside
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.filter.kalman import replay
@@ -400,7 +400,7 @@ def _replay_ekf2(
         if comparison.source.origin.fused_as_gnss:
             excluded_times_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
         excluded_times_s += change.get(CLOCK_OFFSET, 0.0)
-    (replay,) = replay_settings(changed_model, [changed_parameters], excluded_times_s)
+    (replay,) = replay_with_settings(changed_model, [changed_parameters], excluded_times_s)
     return replay
 
 

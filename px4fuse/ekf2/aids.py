@@ -27,19 +27,19 @@ AidVerdict = Literal[
     "disabled",
     "too few samples",
 ]
-# Minimum ratio of |mean innovation| to RMS innovation of a biased aiding source
-MIN_BIAS_RATIO = 0.5
-# Minimum |mean normalised innovation| (√S) of a biased aiding source
+# An aiding source is biased if |mean innovation| / RMS innovation exceeds this value, and
+MIN_BIAS_TO_RMS_RATIO = 0.5
+# |mean innovation| / median √S exceeds this value
 MIN_BIAS_IN_SIGMA = 0.2
 # Length (s) of the windows in which normalised innovations ν/√S are averaged to detect a change
 CHANGE_WINDOW_S = 10.0
 # Minimum number of innovations in a window for a mean normalised innovation
 MIN_WINDOW_SAMPLES = 5
-# Minimum number of windows (CHANGE_WINDOW_S) before a change of the mean normalised innovation
-MIN_WINDOWS_BEFORE = 2
-# Minimum change (√S) of the mean normalised innovation
-MIN_CHANGE_IN_SIGMA = 0.5
-# Minimum |change of the mean innovation| / σ of the window means before the change
+# A change of the mean normalised innovation is searched only after this number of windows,
+MIN_WINDOWS_BEFORE_CHANGE = 2
+# and reported only if it is larger than this value (√S)
+MIN_MEAN_CHANGE_IN_SIGMA = 0.5
+# and than this multiple of the standard deviation of the window means before it
 MIN_CHANGE_SCATTER_RATIO = 6.0
 # Maximum time (s) for which EKF2 fuses no sample of an enabled aiding source. After 7 s, EKF2
 # resets its state to the source (reset_timeout_max)
@@ -47,12 +47,12 @@ MAX_NOT_FUSED_S = 5.0
 # Maximum time for which EKF2 fuses no sample of an enabled aiding source, in logging intervals
 MAX_NOT_FUSED_INTERVALS = 10.0
 # Maximum |√R / noise parameter - 1| if EKF2 computes R from this parameter
-NOISE_TOLERANCE = 0.02
+NOISE_RELATIVE_TOLERANCE = 0.02
 # Aiding sources are evaluated above this height (m): near the ground, rotor downwash disturbs the
 # barometer
 MIN_HEIGHT_M = 2.0
 # Window length (barometer samples) of the running median of the height
-HEIGHT_MEDIAN_SAMPLES = 11
+HEIGHT_MEDIAN_FILTER_LENGTH = 11
 
 
 class AidAxis(Record, kw_only=True):
@@ -141,7 +141,7 @@ class AidResult(Record, kw_only=True):
     @property
     def nis_mean(self) -> float:
         """Mean NIS over all axes; NaN with too few samples."""
-        return _mean_nis(self.axes)
+        return _compute_mean_nis(self.axes)
 
 
 def flight_span(flight: Flight) -> Span | Unavailable:
@@ -153,7 +153,9 @@ def flight_span(flight: Flight) -> Span | Unavailable:
     start, end = longest_flight(flight.airborne)
     # The barometer is used, because EKF2's height may be wrong
     if flight.barometer is not None:
-        down_m = flight.barometer["down_m"].loc[start:end].rolling(HEIGHT_MEDIAN_SAMPLES).median()
+        down_m = (
+            flight.barometer["down_m"].loc[start:end].rolling(HEIGHT_MEDIAN_FILTER_LENGTH).median()
+        )
         height_m = (down_m.dropna().iloc[0] if down_m.notna().any() else 0.0) - down_m
         flight_times_s = height_m.index[height_m > min(MIN_HEIGHT_M, height_m.max() / 2.0)]
         if len(flight_times_s):
@@ -186,7 +188,7 @@ def evaluate_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
 def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> AidResult:
     samples = aid_log.samples.loc[start_s:end_s]
     sample_s = samples.index.to_numpy()
-    gate = _effective_gate(aid, aid_log)
+    gate = _find_effective_gate(aid, aid_log)
 
     def values_by_axis(name: str) -> Array:
         return samples[[f"{name}_{axis}" for axis in aid_log.axes]].to_numpy()
@@ -198,21 +200,21 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         is_enabled = np.asarray(step_values_at(aid_log.enabled, samples.index) > 0.0)
         flight_grid_s = pd.Index(np.arange(start_s, end_s, 0.1))
         enabled_fraction = float(np.mean(step_values_at(aid_log.enabled, flight_grid_s) > 0.0))
-    fused_logged = "fused" in samples
+    is_fusion_logged = "fused" in samples
     is_reset = np.zeros(len(samples), bool)
-    noise_median = None
-    if fused_logged:
+    noise_sigma_median = None
+    if is_fusion_logged:
         is_fused, is_rejected = samples[["fused", "rejected"]].to_numpy().T > 0.0
         noise_sigma = values_by_axis("noise")
         # If EKF2 resets its state to a sample, it logs innovation 0 and S = R for this sample
         is_reset = ((innovation == 0.0) & np.isclose(innovation_variance, noise_sigma)).all(axis=1)
         if is_fused.any():
-            noise_median = float(np.median(np.sqrt(noise_sigma[is_fused, 0])))
+            noise_sigma_median = float(np.median(np.sqrt(noise_sigma[is_fused, 0])))
     else:
         is_rejected = np.max(innovation**2 / innovation_variance, axis=1, initial=0.0) > gate**2
         is_fused = ~is_rejected
     is_evaluated = (is_fused | is_rejected) & is_enabled & ~is_reset
-    longest_gap_s = _longest_gap(sample_s, is_fused & is_enabled, aid_log, start_s, end_s)
+    longest_gap_s = _find_longest_gap(sample_s, is_fused & is_enabled, aid_log, start_s, end_s)
     axes = {}
     for axis_index, axis in enumerate(aid_log.axes):
         consistency = assess_innovations(
@@ -233,7 +235,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
                 bias_p=consistency.bias_p,
                 lag1_autocorrelation=consistency.lag1_autocorrelation,
                 ljung_box_p=consistency.ljung_box_p,
-                change=_largest_mean_change(
+                change=_find_largest_mean_change(
                     sample_s[is_evaluated],
                     innovation[is_evaluated, axis_index]
                     / np.sqrt(innovation_variance[is_evaluated, axis_index]),
@@ -244,52 +246,53 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         unit=aid.unit,
         topic=aid_log.topics[0],
         enabled_fraction=enabled_fraction,
-        fused_fraction=_fraction_within(is_fused, is_enabled),
-        fused_logged=fused_logged,
-        rejected_fraction=_fraction_within(is_rejected, is_enabled),
+        fused_fraction=_compute_fraction(is_fused, is_enabled),
+        fused_logged=is_fusion_logged,
+        rejected_fraction=_compute_fraction(is_rejected, is_enabled),
         longest_gap_s=longest_gap_s,
         resets=int(is_reset.sum()),
         gate=gate,
-        noise=noise_median,
-        noise_from=_noise_origin(aid, aid_log, noise_median),
+        noise=noise_sigma_median,
+        noise_from=_find_noise_origin(aid, aid_log, noise_sigma_median),
         axes=axes,
-        verdict=_aid_verdict(axes, longest_gap_s, sample_s[is_fused & (not fused_logged)])
+        verdict=_classify_aid(axes, longest_gap_s, sample_s[is_fused & (not is_fusion_logged)])
         if is_evaluated.any()
         else "disabled",
     )
 
 
-def _largest_mean_change(time_s: Array, normalised_innovations: Array) -> Span | None:
+def _find_largest_mean_change(time_s: Array, normalised_innovations: Array) -> Span | None:
     """Return time (s) and size (√S) of the largest change of the mean; None if not significant.
 
     Each window of CHANGE_WINDOW_S is tested: change = mean of the next two windows - mean before
-    the window. The change starts in the window if its mean contains a third of the change.
+    the window. The change starts in the window if mean of the window - mean before > change / 3,
+    else after the window.
     """
     window_index = np.floor((time_s - time_s[0]) / CHANGE_WINDOW_S)
     windows = pd.Series(normalised_innovations).groupby(window_index).agg(["mean", "size"])
     windows = windows[windows["size"] >= MIN_WINDOW_SAMPLES]
     window_means = windows["mean"].to_numpy()
     largest_change = None
-    min_size = MIN_CHANGE_IN_SIGMA
-    for index in range(MIN_WINDOWS_BEFORE, len(window_means) - 2):
+    min_mean_change = MIN_MEAN_CHANGE_IN_SIGMA
+    for index in range(MIN_WINDOWS_BEFORE_CHANGE, len(window_means) - 2):
         mean_before = np.mean(window_means[:index])
         mean_change = float(np.mean(window_means[index + 1 : index + 3]) - mean_before)
-        innovation_std = np.std(normalised_innovations[window_index < windows.index[index]])
-        standard_error = innovation_std / math.sqrt(2.0 * windows["size"].iloc[:index].median())
+        normalised_std = np.std(normalised_innovations[window_index < windows.index[index]])
+        standard_error = normalised_std / math.sqrt(2.0 * windows["size"].iloc[:index].median())
         mean_scatter = max(np.std(window_means[:index], ddof=1), standard_error)
-        if abs(mean_change) > max(min_size, MIN_CHANGE_SCATTER_RATIO * mean_scatter):
-            starts_in_window = abs(window_means[index] - mean_before) > abs(mean_change) / 3.0
-            first_changed_window = windows.index[index if starts_in_window else index + 1]
+        if abs(mean_change) > max(min_mean_change, MIN_CHANGE_SCATTER_RATIO * mean_scatter):
+            is_change_in_window = abs(window_means[index] - mean_before) > abs(mean_change) / 3.0
+            first_changed_window = windows.index[index if is_change_in_window else index + 1]
             largest_change = float(time_s[0] + CHANGE_WINDOW_S * first_changed_window), mean_change
-            min_size = abs(mean_change)
+            min_mean_change = abs(mean_change)
     return largest_change
 
 
-def _fraction_within(is_selected: BoolArray, is_counted: BoolArray) -> float:
+def _compute_fraction(is_selected: BoolArray, is_counted: BoolArray) -> float:
     return float((is_selected & is_counted).sum() / max(is_counted.sum(), 1))
 
 
-def _effective_gate(aid: Aid, aid_log: AidLog) -> float:
+def _find_effective_gate(aid: Aid, aid_log: AidLog) -> float:
     """Return EKF2's gate (√S) from logged test ratios ν²/(gate² S), or from its parameter."""
     axis = aid_log.axes[0]
     if f"ratio_{axis}" in aid_log.samples:
@@ -300,7 +303,7 @@ def _effective_gate(aid: Aid, aid_log: AidLog) -> float:
     return max(aid_log.parameters.get(aid.gate, aid.default_gate), 0.01)
 
 
-def _noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
+def _find_noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
     """Return the parameter that determines R, or another origin, such as "reported accuracy"."""
     parameter_value = aid_log.parameters.get(aid.noise)
     if noise_sigma is None or parameter_value is None:
@@ -310,12 +313,12 @@ def _noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
         GNSS_HEIGHT_NOISE_FACTOR * parameter_value,
         np.sqrt(parameter_value),
     ):
-        if abs(noise_sigma - expected_noise) <= NOISE_TOLERANCE * expected_noise:
+        if abs(noise_sigma - expected_noise) <= NOISE_RELATIVE_TOLERANCE * expected_noise:
             return aid.noise
     return aid.noise_origin or aid.noise
 
 
-def _longest_gap(
+def _find_longest_gap(
     sample_s: Array, is_fused: BoolArray, aid_log: AidLog, start_s: float, end_s: float
 ) -> Span:
     is_inside = (aid_log.unknown_fusion_times_s > start_s) & (
@@ -335,8 +338,10 @@ def _longest_gap(
     return float(gap_ends_s[longest_index]), float(gap_ends_s[longest_index + 1])
 
 
-def _aid_verdict(axes: dict[str, AidAxis], longest_gap_s: Span, fused_s: Array) -> AidVerdict:
-    interval_s = median_interval(fused_s) if len(fused_s) > 1 else 0.0
+def _classify_aid(
+    axes: dict[str, AidAxis], longest_gap_s: Span, fusion_times_s: Array
+) -> AidVerdict:
+    interval_s = median_interval(fusion_times_s) if len(fusion_times_s) > 1 else 0.0
     if longest_gap_s[1] - longest_gap_s[0] > max(
         MAX_NOT_FUSED_S, MAX_NOT_FUSED_INTERVALS * interval_s
     ):
@@ -344,13 +349,13 @@ def _aid_verdict(axes: dict[str, AidAxis], longest_gap_s: Span, fused_s: Array) 
     if not axes:
         return "too few samples"
     for axis in axes.values():
-        min_bias = max(MIN_BIAS_IN_SIGMA, MIN_BIAS_RATIO * math.sqrt(axis.nis_mean))
+        min_bias = max(MIN_BIAS_IN_SIGMA, MIN_BIAS_TO_RMS_RATIO * math.sqrt(axis.nis_mean))
         if abs(axis.mean_normalised_innovation) > min_bias:
             return "biased"
     return classify_mean_nis(
-        _mean_nis(axes), compute_nis_band(sum(axis.samples for axis in axes.values()))
+        _compute_mean_nis(axes), compute_nis_band(sum(axis.samples for axis in axes.values()))
     )
 
 
-def _mean_nis(axes: Mapping[str, AidAxis]) -> float:
+def _compute_mean_nis(axes: Mapping[str, AidAxis]) -> float:
     return float(np.mean([axis.nis_mean for axis in axes.values()] or [np.nan]))

@@ -16,18 +16,18 @@ from px4fuse.ekf2.replay_segments import ReplaySegment
 
 # EKF2 sets the flag if the larger height innovation (√S) of barometer and GNSS exceeds this value
 # (vert_innov_test_lim, common.h)
-MIN_LARGER_INNOVATION = 3.0
+MIN_LARGER_HEIGHT_INNOVATION = 3.0
 # EKF2 sets the flag if the smaller height innovation (√S) of barometer and GNSS exceeds this value
 # (vert_innov_test_min, common.h)
-MIN_SMALLER_INNOVATION = 1.0
+MIN_SMALLER_HEIGHT_INNOVATION = 1.0
 
 
-class BadAcceleration:
+class BadAccelerationFlag:
     """EKF2's flag for a bad vertical acceleration, for each of several filter configurations.
 
     Parameters
     ----------
-    follows_log : ndarray of bool, shape (filters,)
+    uses_logged_flag : ndarray of bool, shape (filters,)
         True for filter configurations that use the logged flag.
     flag_duration_s : float
         The flag remains set for this time after the last large innovation.
@@ -43,40 +43,41 @@ class BadAcceleration:
     """
 
     def __init__(
-        self, follows_log: BoolArray, flag_duration_s: float, segment: ReplaySegment
+        self, uses_logged_flag: BoolArray, flag_duration_s: float, segment: ReplaySegment
     ) -> None:
         time_s = segment.time_s
         logged_flag = segment.is_acceleration_bad
         if logged_flag is None:
             logged_flag = np.zeros(len(time_s), bool)
-        self.models_flag = not follows_log.all()
-        self.follows_log = follows_log
+        self.models_flag = not uses_logged_flag.all()
+        self.uses_logged_flag = uses_logged_flag
         self.flag_duration_s = flag_duration_s
         edges = np.flatnonzero(np.diff(logged_flag, prepend=False, append=False))
         self.logged_since_s, self.logged_until_s = np.append(time_s, np.inf)[edges].reshape(-1, 2).T
-        self.since_s = np.full(len(follows_log), time_s[0])
+        self.since_s = np.full(len(uses_logged_flag), time_s[0])
         self.until_s = np.full(
-            len(follows_log), time_s[0] + flag_duration_s * float(logged_flag[0])
+            len(uses_logged_flag), time_s[0] + flag_duration_s * float(logged_flag[0])
         )
 
-    def flagged_fraction(self, begin_s: Array, end_s: Array) -> Array | None:
+    def compute_flagged_fraction(self, begin_s: Array, end_s: Array) -> Array | None:
         """Return the fraction of an interval in which the flag is set, for each configuration.
 
-        Return None if the flag is not set. Each call is for the next interval. If the flag is set
-        several times in one interval, only the last time is counted.
+        Return None if the flag is not set for any configuration. Call the method for the
+        intervals in time order: it remembers the latest time span with the flag. If the flag is set
+        several times in one interval, only the last span counts.
         """
         if len(self.logged_since_s):
             last_row = np.searchsorted(self.logged_since_s, end_s) - 1
-            has_begun = self.follows_log & (last_row >= 0)
-            self.since_s = np.where(has_begun, self.logged_since_s[last_row], self.since_s)
-            self.until_s = np.where(has_begun, self.logged_until_s[last_row], self.until_s)
+            uses_logged_span = self.uses_logged_flag & (last_row >= 0)
+            self.since_s = np.where(uses_logged_span, self.logged_since_s[last_row], self.since_s)
+            self.until_s = np.where(uses_logged_span, self.logged_until_s[last_row], self.until_s)
         if not (self.until_s > begin_s).any():
             return None
         overlap_s = np.minimum(self.until_s, end_s) - np.maximum(self.since_s, begin_s)
         return np.asarray(np.maximum(overlap_s, 0.0) / np.maximum(end_s - begin_s, 1e-9))
 
     def update(self, time_s: Array, previous_innovations: Array, innovations: Array) -> None:
-        """Update the modelled flag after all fusions of one event.
+        """Update the modelled bad-acceleration flag after all fusions of one event.
 
         Parameters
         ----------
@@ -86,7 +87,7 @@ class BadAcceleration:
             Normalised height innovations (√S, positive upwards) of the previous and of the current
             event: k rows for barometer samples, one row for GNSS. NaN without a sample.
         """
-        # An innovation is valid until the next innovation of its sensor
+        # EKF2 tests the latest innovation of each sensor, so it is kept until the next sample
         gnss_innovation = previous_innovations[-1]
         barometer_innovation = np.full(len(gnss_innovation), np.nan)
         for sample_innovation in previous_innovations[:-1]:
@@ -100,7 +101,7 @@ class BadAcceleration:
             )
             is_bad |= _is_falling(barometer_innovation, gnss_innovation)
         is_bad |= _is_falling(barometer_innovation, innovations[-1])
-        is_bad &= ~self.follows_log
+        is_bad &= ~self.uses_logged_flag
         self.since_s = np.where(is_bad & (self.until_s < time_s), time_s, self.since_s)
         self.until_s = np.where(is_bad, time_s + self.flag_duration_s, self.until_s)
 
@@ -109,5 +110,6 @@ def _is_falling(barometer_innovation: Array, gnss_innovation: Array) -> BoolArra
     larger_innovation = np.maximum(barometer_innovation, gnss_innovation)
     smaller_innovation = np.minimum(barometer_innovation, gnss_innovation)
     return np.asarray(
-        (larger_innovation > MIN_LARGER_INNOVATION) & (smaller_innovation > MIN_SMALLER_INNOVATION)
+        (larger_innovation > MIN_LARGER_HEIGHT_INNOVATION)
+        & (smaller_innovation > MIN_SMALLER_HEIGHT_INNOVATION)
     )

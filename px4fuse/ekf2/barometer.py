@@ -14,28 +14,29 @@ import pandas as pd
 from scipy.integrate import cumulative_trapezoid
 
 from px4fuse.core.arrays import Array, BoolArray
-from px4fuse.ekf2.bias import BIAS_NOISE_DENSITY
-from px4fuse.ekf2.replay_segments import INNOVATION_FILTER_S
+from px4fuse.ekf2.bias import SENSOR_BIAS_NOISE_DENSITY
+from px4fuse.ekf2.replay_segments import INNOVATION_TIME_CONSTANT_S
 from px4fuse.flight.ekf2_parameters import BAROMETER
 from px4fuse.flight.model import GROUND_EFFECT, Ekf2, FusionRecord
 
 # Default rate (Hz) at which EKF2 fuses the barometer, PX4 v1.15 and later
 BAROMETER_HZ = 10.0
 # Rate (Hz) at which EKF2 fuses the barometer before PX4 v1.15
-OLD_BAROMETER_HZ = 15.0
+BAROMETER_HZ_BEFORE_V1_15 = 15.0
 # Maximum interquartile range / median of the barometer intervals computed from the bias variance
-MAX_INTERVAL_SCATTER = 0.1
+MAX_RELATIVE_INTERVAL_IQR = 0.1
 # Two logged times belong to one barometer sample if their difference / sample interval is smaller
 MATCH_TOLERANCE = 0.3
 # Maximum number of barometer samples that are reconstructed between two rows of the log
 MAX_SAMPLES_PER_ROW = 30
-# Maximum weight of a barometer sample; a weight above 1 represents missing samples around it
+# Maximum weight of a barometer sample: number of fused samples that it stands for (1 plus half of
+# the missing samples before and after it)
 MAX_SAMPLE_WEIGHT = 4.0
 # Minimum sum of the weights of missing barometer samples; prevents a division by zero
 MIN_WEIGHT_SUM = 1e-9
 
 
-def sample_interval_s(fusion_record: FusionRecord) -> float:
+def estimate_barometer_interval_s(fusion_record: FusionRecord) -> float:
     """Return the interval (s) of the barometer samples that EKF2 fuses.
 
     The interval is computed from the variance p of EKF2's barometer bias. In the steady state, an
@@ -43,28 +44,30 @@ def sample_interval_s(fusion_record: FusionRecord) -> float:
     """
     bias_updates = fusion_record.height_bias.get(BAROMETER.name)
     if bias_updates is not None and len(bias_updates) > 1:
-        variance_m2 = bias_updates["variance_m2"] * _bias_gain(bias_updates)
+        variance_m2 = bias_updates["variance_m2"] * _compute_bias_gain(bias_updates)
         intervals_s = (variance_m2 - bias_updates["bias_m2"])[
             len(bias_updates) // 5 :
-        ] / BIAS_NOISE_DENSITY**2
+        ] / SENSOR_BIAS_NOISE_DENSITY**2
         lower_quartile_s, median_s, upper_quartile_s = np.percentile(
             intervals_s, [25.0, 50.0, 75.0]
         )
-        if upper_quartile_s - lower_quartile_s < MAX_INTERVAL_SCATTER * median_s:
+        if upper_quartile_s - lower_quartile_s < MAX_RELATIVE_INTERVAL_IQR * median_s:
             return float(median_s)
-    return 1.0 / (OLD_BAROMETER_HZ if fusion_record.stores_bias_increments else BAROMETER_HZ)
+    return 1.0 / (
+        BAROMETER_HZ_BEFORE_V1_15 if fusion_record.stores_bias_increments else BAROMETER_HZ
+    )
 
 
-def _bias_gain(bias: pd.DataFrame) -> Array:
+def _compute_bias_gain(bias: pd.DataFrame) -> Array:
     """Return the Kalman gain K = p/S of the logged updates of the barometer bias.
 
-    The log contains the variance after the update, p' = p - p²/S.
+    p is the bias variance before the update. The log contains the variance after it, p - p²/S.
     """
     ratio = (bias["bias_m2"] / bias["variance_m2"]).to_numpy()
     return np.asarray(0.5 - 0.5 * np.sqrt(np.maximum(1.0 - 4.0 * ratio, 0.0)))
 
 
-def fused_samples(
+def find_fused_barometer_samples(
     ekf2: Ekf2, fusion_record: FusionRecord, logged_down_m: "pd.Series[float]"
 ) -> pd.DataFrame:
     """Return the barometer samples that EKF2 fused, indexed by EKF2's measurement time.
@@ -72,15 +75,14 @@ def fused_samples(
     Columns: ``down_m`` (height) and ``weight`` (above 1 if neighbouring samples are missing).
     ``logged_down_m`` is the logged height (m, down) at measurement times.
     """
-    interval_s = sample_interval_s(fusion_record)
-    samples = _known_and_simulated_samples(ekf2, fusion_record, logged_down_m, interval_s)
+    interval_s = estimate_barometer_interval_s(fusion_record)
+    samples = _combine_barometer_samples(ekf2, fusion_record, logged_down_m, interval_s)
     distance_s = np.diff(np.pad(samples.index.to_numpy(), 1, mode="edge"))
-    # Half of the missing samples between two samples count for each of them
     weight = 0.5 * np.rint((distance_s[1:] + distance_s[:-1]) / interval_s)
     return pd.DataFrame({"down_m": samples, "weight": np.clip(weight, 1.0, MAX_SAMPLE_WEIGHT)})
 
 
-def _known_and_simulated_samples(
+def _combine_barometer_samples(
     ekf2: Ekf2, fusion_record: FusionRecord, logged_down_m: "pd.Series[float]", interval_s: float
 ) -> "pd.Series[float]":
     logged_rows = ekf2.aids[BAROMETER.name].samples
@@ -95,81 +97,83 @@ def _known_and_simulated_samples(
     bias_updates = fusion_record.height_bias.get(
         BAROMETER.name, pd.DataFrame(no_bias, index=row_times_s[:1])
     )
-    # EKF2 logs the bias after the update, but fuses the sample with the bias before the update
+    # EKF2 logs the barometer bias after its update, but innovations use the bias before it. Half an
+    # interval after an update, the bias is therefore the updated one
     bias_times_s = np.column_stack(
         [bias_updates.index, bias_updates.index + 0.5 * interval_s]
     ).ravel()
     previous_bias_m = bias_updates["bias_m"] - (
-        _bias_gain(bias_updates) * bias_updates["innovation_m"]
+        _compute_bias_gain(bias_updates) * bias_updates["innovation_m"]
     ).fillna(0.0)
     fused_bias_m = np.column_stack([previous_bias_m, bias_updates["bias_m"]]).ravel()
     # Innovations in ground effect are not used: EKF2 subtracts a dead zone from them
     rows_outside_ground_effect = logged_rows[
         ~fusion_record.was_in_state(GROUND_EFFECT, row_times_s)
     ]
-    height_without_motion_m = (
+    prediction_offset_m = (
         rows_outside_ground_effect["observation_down"]
         - rows_outside_ground_effect["innovation_down"]
     )
-    height_without_motion_m -= np.interp(
+    prediction_offset_m -= np.interp(
         rows_outside_ground_effect.index, velocity_times_s, displacement_m
     )
 
-    def bias_m(time_s: Array) -> Array:
+    def interpolate_bias_m(time_s: Array) -> Array:
         return np.asarray(np.interp(time_s, bias_times_s, fused_bias_m))
 
-    def prediction_m(time_s: Array) -> Array:
-        """Return the height (m, down) that EKF2 predicts for the barometer."""
-        state_m = np.interp(
-            time_s, rows_outside_ground_effect.index, height_without_motion_m
+    def predict_height_m(time_s: Array) -> Array:
+        """Return EKF2's predicted barometer measurement (m, down): state minus bias."""
+        state_down_m = np.interp(
+            time_s, rows_outside_ground_effect.index, prediction_offset_m
         ) + np.interp(time_s, velocity_times_s, displacement_m)
-        return np.asarray(state_m - bias_m(time_s))
+        return np.asarray(state_down_m - interpolate_bias_m(time_s))
 
-    # Array rows: logged rows. Array columns: samples since the previous logged row
+    # The log omits samples. Each array row belongs to a logged row, and its columns to the samples
+    # since the previous logged row
     span_s = np.diff(row_times_s)
     sample_count = np.maximum(np.rint(span_s / interval_s), 1.0).astype(int)
     is_regular = np.abs(span_s - sample_count * interval_s) < MATCH_TOLERANCE * interval_s
     is_regular &= sample_count <= MAX_SAMPLES_PER_ROW
     sample_interval_by_row_s = span_s / sample_count
-    sample_column = np.arange(sample_count[is_regular].max(initial=1))
-    innovation_m = np.full((len(sample_count), len(sample_column)), np.nan)
+    sample_indices = np.arange(sample_count[is_regular].max(initial=1))
+    innovation_m = np.full((len(sample_count), len(sample_indices)), np.nan)
     # If several topics contain a sample, the last of them is used
     time_s = np.concatenate([bias_updates.index, logged_down_m.index, row_times_s])
     down_m = np.concatenate(
         [
-            prediction_m(bias_updates.index.to_numpy()) - bias_updates["innovation_m"],
+            predict_height_m(bias_updates.index.to_numpy()) - bias_updates["innovation_m"],
             logged_down_m,
-            logged_rows["observation_down"] - bias_m(row_times_s),
+            logged_rows["observation_down"] - interpolate_bias_m(row_times_s),
         ]
     )
     row_index = np.searchsorted(row_times_s[1:], time_s - MATCH_TOLERANCE * interval_s)
     row_index = np.minimum(row_index, len(sample_count) - 1)
-    position_in_interval = (time_s - row_times_s[row_index]) / sample_interval_by_row_s[row_index]
+    intervals_since_row = (time_s - row_times_s[row_index]) / sample_interval_by_row_s[row_index]
     is_matched = is_regular[row_index] & (
-        np.abs(position_in_interval - np.rint(position_in_interval)) < MATCH_TOLERANCE
+        np.abs(intervals_since_row - np.rint(intervals_since_row)) < MATCH_TOLERANCE
     )
-    is_matched &= (position_in_interval > MATCH_TOLERANCE) & (
-        position_in_interval < sample_count[row_index] + MATCH_TOLERANCE
+    is_matched &= (intervals_since_row > MATCH_TOLERANCE) & (
+        intervals_since_row < sample_count[row_index] + MATCH_TOLERANCE
     )
     innovation_m[
-        row_index[is_matched], np.rint(position_in_interval[is_matched]).astype(int) - 1
-    ] = (down_m - prediction_m(time_s))[is_matched]
+        row_index[is_matched], np.rint(intervals_since_row[is_matched]).astype(int) - 1
+    ] = (down_m - predict_height_m(time_s))[is_matched]
     if "filtered_down" in logged_rows:
         # The sign is changed, because PX4 logs state minus measurement
-        filtered_m = -logged_rows["filtered_down"].to_numpy()
-        age_samples = sample_count[:, None] - 1.0 - sample_column
+        filtered_nu_m = -logged_rows["filtered_down"].to_numpy()
+        age_samples = sample_count[:, None] - 1.0 - sample_indices
         is_missing = np.isnan(innovation_m) & (age_samples >= 0.0) & is_regular[:, None]
-        innovation_m = _with_missing_innovations(
-            innovation_m, is_missing, sample_interval_by_row_s[:, None], age_samples, filtered_m
+        innovation_m = _simulate_missing_innovations(
+            innovation_m, is_missing, sample_interval_by_row_s[:, None], age_samples, filtered_nu_m
         )
     sample_times_s = row_times_s[:-1, None] + sample_interval_by_row_s[:, None] * (
-        sample_column + 1
+        sample_indices + 1
     )
     has_sample = np.isfinite(innovation_m)
     sample_times_s = sample_times_s[has_sample]
     time_s = np.concatenate([sample_times_s, time_s[~is_matched]])
     down_m = np.concatenate(
-        [prediction_m(sample_times_s) + innovation_m[has_sample], down_m[~is_matched]]
+        [predict_height_m(sample_times_s) + innovation_m[has_sample], down_m[~is_matched]]
     )
     height_samples = pd.Series(down_m, pd.Index(time_s, name="time_s")).dropna().sort_index()
     return height_samples[
@@ -177,12 +181,12 @@ def _known_and_simulated_samples(
     ]
 
 
-def _with_missing_innovations(
+def _simulate_missing_innovations(
     innovation_m: Array,
     is_missing: BoolArray,
     interval_s: Array,
     age_samples: Array,
-    filtered_m: Array,
+    filtered_nu_m: Array,
 ) -> Array:
     """Simulate missing innovations that agree with the logged low-pass filtered innovation.
 
@@ -194,19 +198,19 @@ def _with_missing_innovations(
         Time between two samples.
     age_samples : ndarray, shape (n, k)
         Number of samples from each sample to the next logged row.
-    filtered_m : ndarray, shape (n + 1,)
+    filtered_nu_m : ndarray, shape (n + 1,)
         Low-pass filtered innovation at the start and at each logged row.
     """
-    new_sample_weight = interval_s / (interval_s + INNOVATION_FILTER_S)
+    new_sample_weight = interval_s / (interval_s + INNOVATION_TIME_CONSTANT_S)
     filter_weight = new_sample_weight * (1.0 - new_sample_weight) ** np.maximum(age_samples, 0.0)
     missing_weight = filter_weight * is_missing
-    simulated_m = np.random.default_rng(0).normal(
+    simulated_nu_m = np.random.default_rng(0).normal(
         scale=np.nanstd(innovation_m), size=innovation_m.shape
     )
     previous_value_weight = (1.0 - new_sample_weight[:, 0]) ** (age_samples[:, 0] + 1.0)
     known_sum_m = np.nansum(filter_weight * innovation_m, axis=1) + (
-        missing_weight * simulated_m
+        missing_weight * simulated_nu_m
     ).sum(axis=1)
-    offset_m = filtered_m[1:] - previous_value_weight * filtered_m[:-1] - known_sum_m
+    offset_m = filtered_nu_m[1:] - previous_value_weight * filtered_nu_m[:-1] - known_sum_m
     offset_m /= np.maximum(missing_weight.sum(axis=1), MIN_WEIGHT_SUM)
-    return np.where(is_missing, simulated_m + offset_m[:, None], innovation_m)
+    return np.where(is_missing, simulated_nu_m + offset_m[:, None], innovation_m)

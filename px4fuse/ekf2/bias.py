@@ -10,16 +10,17 @@ import numpy as np
 
 from px4fuse.core.arrays import Array, BoolArray
 
-# Noise density (m/s/√Hz) of the random walk of the bias (bias_nsd, common.h)
-BIAS_NOISE_DENSITY = 0.13
+# Noise density (m/s/√Hz) of the random walk of the sensor bias (bias_nsd, common.h)
+SENSOR_BIAS_NOISE_DENSITY = 0.13
 # Minimum variance (m²) of the sensor bias
 MIN_BIAS_VARIANCE_M2 = 1e-8
 # Innovation gate (√S) in updates of the sensor bias
 BIAS_GATE = 3.0
-# The bias is wrong if |mean of (test ratio · sign of innovation)| is larger (isOffsetDetected)
-MAX_MEAN_SIGNED_RATIO = 0.2
-# Factor on the random walk variance of a wrong bias (MAX_MEAN_SIGNED_RATIO)
-RANDOM_WALK_FACTOR = 1e3
+# EKF2 takes its sensor bias as wrong if |mean of (test ratio · sign of innovation)| exceeds this
+# value (isOffsetDetected, bias_estimator.cpp)
+MAX_MEAN_SIGNED_TEST_RATIO = 0.2
+# and then multiplies the variance of the random walk by this factor
+WRONG_BIAS_VARIANCE_FACTOR = 1e3
 # Time constant (s) of the low-pass filter of (test ratio · sign of innovation)
 TEST_RATIO_FILTER_S = 10.0
 
@@ -35,14 +36,14 @@ class BiasEstimator:
         step_s = np.median(steps_s)
         self.value_m = value_m
         self.variance_m2 = variance_m2
-        self.mean_signed_ratio = np.zeros_like(value_m)
+        self.mean_signed_test_ratio = np.zeros_like(value_m)
         self.filter_weight = step_s / (TEST_RATIO_FILTER_S + step_s)
 
     def remove_bias(
         self,
         nu: Array,
         predicted_variance: Array,
-        noise_m2: Array,
+        R_m2: Array,
         interval_s: Array,
         updates_bias: BoolArray,
         weight: Array | float = 1.0,
@@ -51,7 +52,7 @@ class BiasEstimator:
 
         Parameters
         ----------
-        nu, predicted_variance, noise_m2 : ndarray
+        nu, predicted_variance, R_m2 : ndarray
             Uncorrected innovation (m), HPH' and R (m²).
         interval_s : ndarray
             Time (s) since the previous sample; 0 if the bias is not updated.
@@ -59,20 +60,24 @@ class BiasEstimator:
         weight : float or ndarray, shape (filters,)
             Number of samples fused by EKF2 that this sample represents.
         """
-        has_offset = np.abs(self.mean_signed_ratio) > MAX_MEAN_SIGNED_RATIO
+        has_offset = np.abs(self.mean_signed_test_ratio) > MAX_MEAN_SIGNED_TEST_RATIO
         variance_rate = np.where(
-            has_offset, RANDOM_WALK_FACTOR * BIAS_NOISE_DENSITY**2, BIAS_NOISE_DENSITY**2
+            has_offset,
+            WRONG_BIAS_VARIANCE_FACTOR * SENSOR_BIAS_NOISE_DENSITY**2,
+            SENSOR_BIAS_NOISE_DENSITY**2,
         )
-        bias_variance = np.minimum(self.variance_m2 + variance_rate * interval_s, noise_m2)
+        bias_variance = np.minimum(self.variance_m2 + variance_rate * interval_s, R_m2)
         nu = nu + self.value_m
-        R = noise_m2 + bias_variance
-        S = bias_variance + (noise_m2 + predicted_variance) / weight
+        R = R_m2 + bias_variance
+        S = bias_variance + (R_m2 + predicted_variance) / weight
         test_ratio = nu * nu / (BIAS_GATE**2 * S)
         K = bias_variance / S * (updates_bias & (test_ratio < 1.0))
         self.value_m = self.value_m - K * nu
         self.variance_m2 = np.maximum(bias_variance - K * bias_variance, MIN_BIAS_VARIANCE_M2)
-        signed_ratio_sum = np.copysign(np.minimum(test_ratio, 1.0), nu) + self.mean_signed_ratio
-        self.mean_signed_ratio = self.mean_signed_ratio - (
+        signed_ratio_sum = (
+            np.copysign(np.minimum(test_ratio, 1.0), nu) + self.mean_signed_test_ratio
+        )
+        self.mean_signed_test_ratio = self.mean_signed_test_ratio - (
             self.filter_weight * weight * updates_bias * signed_ratio_sum
         )
         return nu, R

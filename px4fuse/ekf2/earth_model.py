@@ -17,7 +17,7 @@ EARTH_RATE_RAD_S = 7.292115e-5
 EQUATORIAL_RADIUS_M, ECCENTRICITY = 6_378_137.0, 0.0818191908425
 
 
-def earth_rate_rad_s(fusion_record: FusionRecord) -> Array:
+def compute_earth_rate_rad_s(fusion_record: FusionRecord) -> Array:
     """Return EKF2's earth rotation rate (rad/s, NED, shape (3,)); 0 if the latitude is unknown."""
     latitude_rad = np.radians(fusion_record.latitude_deg)
     return np.nan_to_num(
@@ -25,13 +25,13 @@ def earth_rate_rad_s(fusion_record: FusionRecord) -> Array:
     )
 
 
-def ekf2_metres_per_metre(fusion_record: FusionRecord) -> tuple[float, float, float]:
-    """Return EKF2's internal position / published position along north, east and down."""
+def compute_position_scale(fusion_record: FusionRecord) -> tuple[float, float, float]:
+    """Return the ratio of EKF2's internal to its published position along north, east and down."""
     if np.isnan(fusion_record.latitude_deg) or not fusion_record.stores_latitude():
         return 1.0, 1.0, 1.0
     eccentricity_squared = ECCENTRICITY**2
     q = 1.0 - eccentricity_squared * np.sin(np.radians(fusion_record.latitude_deg)) ** 2
-    # The exponent of an ellipsoid is 1.5; PX4 uses 2.5
+    # The meridian radius of an ellipsoid has the exponent 1.5; PX4 uses 2.5
     radii_m = (
         EQUATORIAL_RADIUS_M * np.array([(1.0 - eccentricity_squared) / q**2.5, q**-0.5])
         + fusion_record.altitude_m

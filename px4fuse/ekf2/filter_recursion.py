@@ -18,18 +18,26 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from px4fuse.core.arrays import Array, Array32, ArrayPair, BoolArray, IntArray
-from px4fuse.ekf2.bad_acceleration import BadAcceleration
+from px4fuse.ekf2.bad_acceleration import BadAccelerationFlag
 from px4fuse.ekf2.heights import (
     GNSS_HEIGHT_NOISE_FACTOR,
     HEIGHT_SENSORS,
     MIN_GATE,
-    MIN_SIGMA,
+    MIN_NOISE_SIGMA,
     HeightFilter,
-    barometer_samples,
+    group_barometer_by_event,
 )
 from px4fuse.ekf2.inputs import FusionRules, Inputs
-from px4fuse.ekf2.intervals import FUSE, IDLE, START, Intervals, StepEvents, Timing, make_intervals
-from px4fuse.ekf2.magnetometer import MIN_SIGMA_GAUSS, EventSamples, fuse_mean, mean_by_event
+from px4fuse.ekf2.intervals import (
+    FUSE,
+    NO_ACTION,
+    START_FUSION,
+    FusionDelays,
+    Intervals,
+    StepEvents,
+    make_intervals,
+)
+from px4fuse.ekf2.magnetometer import MIN_SIGMA_GAUSS, EventSamples, average_by_event, fuse_mean
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     BIASES,
@@ -42,7 +50,7 @@ from px4fuse.ekf2.replay_segments import (
     VELOCITY,
     ReplaySegment,
 )
-from px4fuse.ekf2.vision import VisionFilter, set_states, vision_samples
+from px4fuse.ekf2.vision import VisionFilter, group_vision_by_event, set_states
 from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
 
 # Minimum state variance, to avoid a division by zero
@@ -53,7 +61,7 @@ EVENT_BATCH_SIZE = 64
 IGNORED_VARIANCE = 1e9
 # Acceleration noise (m/s²) while EKF2 reports a bad or clipped acceleration (BADACC_BIAS_PNOISE,
 # common.h; covariance.cpp)
-BAD_ACCELERATION_NOISE = 4.9
+BAD_ACCELERATION_NOISE_M_S2 = 4.9
 # EKF2 parameters with these prefixes do not change the vertical innovations
 HEIGHT_NEUTRAL_PREFIXES = (
     "EKF2_EV",
@@ -68,9 +76,9 @@ INITIAL_BIAS_SIGMA_M_S2 = 0.01
 # Factors on the GNSS velocity variance, NED: EKF2 multiplies the vertical σ by 1.5
 # (gps_control.cpp)
 VELOCITY_VARIANCE_FACTORS = np.array([1.0, 1.0, 2.25])
-GRAVITY = float(GRAVITY_M_S2[2])
+GRAVITY_MAGNITUDE_M_S2 = float(GRAVITY_M_S2[2])
 # Maximum σ (m/s²) of EKF2's accelerometer bias: 0.1 g (covariance.cpp)
-MAX_BIAS_SIGMA_M_S2 = 0.1 * GRAVITY
+MAX_BIAS_SIGMA_M_S2 = 0.1 * GRAVITY_MAGNITUDE_M_S2
 # Minimum accelerometer bias variance of an axis / largest variance of the three axes
 # (covariance.cpp)
 MIN_BIAS_VARIANCE_RATIO = 0.01
@@ -81,7 +89,7 @@ BIAS_NORTH, BIAS_EAST, BIAS_DOWN = 12, 13, 14
 # State indices of the measurements that are fused together, in this order
 JOINTLY_MEASURED_STATES = np.array([HEADING, DOWN, NORTH, EAST])
 # State indices of heading error and height (a slice, which does not copy the states)
-LOGGED_STATES = slice(HEADING, DOWN + 1, DOWN - HEADING)
+HEADING_AND_DOWN = slice(HEADING, DOWN + 1, DOWN - HEADING)
 HORIZONTAL_POSITION = slice(NORTH, EAST + 1)
 # State indices of velocity and position, which a GNSS sample measures
 MEASURED_STATES = slice(3, 9)
@@ -134,22 +142,24 @@ class FilterConfiguration:
         )
         return self.uses_logged_decisions or has_same_height_parameters
 
-    def timing(self, inputs: Inputs) -> Timing:
+    def compute_delays(self, inputs: Inputs) -> FusionDelays:
         """Return the delay of the position source, and the delay of the fusion horizon."""
         if self.timestamp_offset_s is not None:
-            return Timing(-self.timestamp_offset_s - 0.5 * inputs.mean_step_s, np.inf)
+            return FusionDelays(-self.timestamp_offset_s - 0.5 * inputs.mean_step_s, np.inf)
         delay_s = self.settings[inputs.aid.delay] * 1e-3
         max_delay_ms = max(self.settings.get(aid.delay, 0.0) for aid in (GNSS_POS, EV_POS))
         if inputs.rules.uses_delay_as_horizon:  # IMU buffer length = largest delay parameter
             buffer_length = math.ceil(max_delay_ms * 1e-3 / inputs.configured_step_s)
-            return Timing(delay_s, max(inputs.horizon_s, (buffer_length - 1) * inputs.mean_step_s))
-        # EKF2 starts with EKF2_DELAY_MAX >= largest delay parameter (EKF2.cpp)
+            return FusionDelays(
+                delay_s, max(inputs.horizon_s, (buffer_length - 1) * inputs.mean_step_s)
+            )
+        # At its start, EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
         longest_delay_ms = max(self.settings["EKF2_DELAY_MAX"], max_delay_ms)
         if longest_delay_ms == inputs.settings["EKF2_DELAY_MAX"]:
-            return Timing(delay_s, inputs.horizon_s)
+            return FusionDelays(delay_s, inputs.horizon_s)
         # Number of samples in the IMU buffer (initialise_interface, estimator_interface.cpp)
         buffer_length = max(math.ceil(longest_delay_ms * 1e-3 / inputs.configured_step_s), 2)
-        return Timing(delay_s, (buffer_length - 1) * inputs.mean_step_s)
+        return FusionDelays(delay_s, (buffer_length - 1) * inputs.mean_step_s)
 
 
 @dataclass(frozen=True)
@@ -159,7 +169,7 @@ class SegmentRun:
     Attributes
     ----------
     events : tuple of recarray
-        Events of each configuration, see :data:`~px4fuse.ekf2.intervals.EVENT`.
+        Events of each configuration, see :data:`~px4fuse.ekf2.intervals.EVENT_DTYPE`.
     innovation, innovation_variance, noise : ndarray, shape (events, filters, 6)
         ν (measurement minus state), S and R of velocity (m/s) and position (m), NED.
     rejected, fused, reset : ndarray of bool, shape (events, filters)
@@ -212,7 +222,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         name: np.array([configuration.settings[name] for configuration in configurations])
         for name in configurations[0].settings
     }
-    for name, value in segment.changed.items():  # parameters that were changed in flight
+    for name, value in segment.changed_parameters.items():  # parameters that were changed in flight
         is_unchanged = parameters[name] == inputs.settings[name]
         parameters[name] = np.where(is_unchanged, value, parameters[name])
     (
@@ -236,21 +246,21 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         ]
     ).T
     distinct_intervals = list(dict.fromkeys(intervals))
-    configuration_intervals = (
+    interval_index_by_filter = (
         list(map(distinct_intervals.index, intervals))
         if len(distinct_intervals) > 1
         else slice(None)
     )
 
     def stack_configurations(interval_quantities: Sequence[Any]) -> Any:
-        return np.stack(interval_quantities, axis=1)[:, configuration_intervals]
+        return np.stack(interval_quantities, axis=1)[:, interval_index_by_filter]
 
     event_table = stack_configurations(
         [interval_arrays.events for interval_arrays in distinct_intervals]
     )
     action = np.where(has_gate, event_table["action"], FUSE * event_table["usable"])
     event_steps = event_table["end_step"]
-    is_active = action > IDLE
+    is_active = action > NO_ACTION
     event_time_s = segment.time_s[event_steps]
     has_sample = np.any(is_active, axis=1).tolist()
     is_enabled_by_aid = {
@@ -261,9 +271,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         for aid in (inputs.aid, GNSS_VEL, MAG, FLOW, EV_POS, *HEIGHT_SENSORS)
     }
     can_fuse_velocity = (action == FUSE) & is_enabled_by_aid[GNSS_VEL.name] & fuses_velocity
-    sample_index = np.maximum(intervals[0].events.sample, 0)
-    measured_values, measurement_variance = _measurements_by_event(
-        inputs, segment, sample_index, event_steps, parameters, uses_reported_noise
+    sample_indices = np.maximum(intervals[0].events.sample, 0)
+    measured_values, measurement_variance = _collect_measurements(
+        inputs, segment, sample_indices, event_steps, parameters, uses_reported_noise
     )
     has_velocity = inputs.received.velocity_m_s is not None
     gates = [
@@ -271,7 +281,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         parameters[inputs.aid.gate],
     ]
     gate_squared = np.maximum(np.repeat(np.stack(gates, axis=1), 3, axis=1), MIN_GATE) ** 2
-    # EKF2's logged height, and without magnetometer its logged heading, are used as measurements
+    # EKF2's logged height, and without magnetometer its logged heading, replace the sensors that
+    # the model does not contain
     logged_values = np.stack(
         [segment.attitude_error_rad[event_steps, HEADING], segment.down_m[event_steps]], axis=-1
     )
@@ -282,34 +293,36 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     height_filter = vision_filter = None
     has_magnetometer = segment.field is not None
     event_step_arrays = [interval_arrays.events.end_step for interval_arrays in distinct_intervals]
-    vector_means = []
+    sensor_means = []
     for aid, samples in ((MAG, segment.field), (FLOW, segment.flow)):
         if samples is not None:
             means_by_interval = [
-                mean_by_event(segment, samples, end_steps) for end_steps in event_step_arrays
+                average_by_event(segment, samples, end_steps) for end_steps in event_step_arrays
             ]
-            means = EventSamples(*map(stack_configurations, zip(*means_by_interval, strict=True)))
+            event_means = EventSamples(
+                *map(stack_configurations, zip(*means_by_interval, strict=True))
+            )
             if aid == MAG:
                 R = np.maximum(parameters[MAG.noise], MIN_SIGMA_GAUSS) ** 2
-                means = means._replace(noise=means.noise + R)
-            sample_count = means.sample_count * is_enabled_by_aid[aid.name]
+                event_means = event_means._replace(noise=event_means.noise + R)
+            sample_count = event_means.sample_count * is_enabled_by_aid[aid.name]
             gate = parameters.get(aid.gate, np.full(configuration_count, samples.gate))
-            means = means._replace(sample_count=sample_count)
-            vector_means.append((means, gate, samples.state_rows))
-    follows_log = [
+            event_means = event_means._replace(sample_count=sample_count)
+            sensor_means.append((event_means, gate, samples.state_rows))
+    uses_logged_flag = [
         segment.height_samples is None
         or segment.is_acceleration_bad is None
         or configuration.keeps_logged_bad_acceleration(inputs)
         for configuration in configurations
     ]
-    bad_acceleration = BadAcceleration(
-        np.array(follows_log), inputs.rules.bad_acceleration_duration_s, segment
+    bad_acceleration = BadAccelerationFlag(
+        np.array(uses_logged_flag), inputs.rules.bad_acceleration_duration_s, segment
     )
     if segment.height_samples is not None:
-        barometer = np.stack(barometer_samples(segment, event_step_arrays), axis=-1)
+        barometer_by_event = np.stack(group_barometer_by_event(segment, event_step_arrays), axis=-1)
         height_filter = HeightFilter(
             segment,
-            barometer[..., configuration_intervals],
+            barometer_by_event[..., interval_index_by_filter],
             event_table["time_s"],
             is_active,
             is_enabled_by_aid,
@@ -319,12 +332,12 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         )
     if inputs.vision is not None:
         vision_by_configuration = [
-            vision_samples(
+            group_vision_by_event(
                 inputs,
                 segment,
                 interval_arrays.events.end_step,
                 configuration.settings,
-                configuration.timing(inputs).horizon_s,
+                configuration.compute_delays(inputs).horizon_s,
             )
             for interval_arrays, configuration in zip(intervals, configurations, strict=True)
         ]
@@ -337,7 +350,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             uses_reported_noise,
         )
     gyro_variance = np.where(has_attitude, parameters["EKF2_GYR_NOISE"] ** 2, 0.0)[:, None, None]
-    variance_increment, variance_limit = _variance_growth(
+    variance_increment, variance_limit = _compute_variance_growth(
         inputs, segment, parameters, has_biases, has_attitude
     )
     step_counts = np.diff(event_steps, axis=0, prepend=0)[:, :, None]
@@ -345,38 +358,38 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         parameters["EKF2_ACC_NOISE"][:, None, None] ** 2, (event_count, 1, 1, 1)
     )
     if (clipped_fraction := segment.clipped_fraction) is not None:
-        # Mean fraction of clipped axes in each interval; their noise is BAD_ACCELERATION_NOISE
+        # EKF2 uses BAD_ACCELERATION_NOISE_M_S2 for clipped axes: mean over the interval
         clipped_fraction_sums = np.diff(
             np.cumsum(clipped_fraction)[event_steps], axis=0, prepend=clipped_fraction[0]
         )
         acceleration_variance += (
             clipped_fraction_sums[:, :, None, None]
             / np.maximum(step_counts, 1)[..., None]
-            * (BAD_ACCELERATION_NOISE**2 - acceleration_variance)
+            * (BAD_ACCELERATION_NOISE_M_S2**2 - acceleration_variance)
         )
-    x, P = _start_state(segment, has_biases, has_attitude)
+    x, P = _make_start_state(segment, has_biases, has_attitude)
     if bad_acceleration.until_s[0] > segment.time_s[0]:
-        # While EKF2 reports a bad acceleration, its accelerometer bias is not logged. The initial
-        # bias is the mean bias, which is computed from the published velocity
+        # The log contains no accelerometer bias while the flag is set. The replay starts with the
+        # mean bias of the segment, computed from the change of the published velocity
         set_states(
             x,
             P,
-            ~bad_acceleration.follows_log & has_biases,
+            ~bad_acceleration.uses_logged_flag & has_biases,
             slice(BIAS_DOWN, BIAS_DOWN + 1),
             np.full((configuration_count, 1), segment.mean_bias_down_m_s2),
             np.full((configuration_count, 1), INITIAL_BIAS_SIGMA_M_S2**2),
         )
     is_aid_enabled = is_enabled_by_aid[inputs.aid.name]
-    fusion = _Fusion(
+    decisions = _FusionDecisions(
         inputs.rules,
         segment.time_s[0],
-        np.where(is_aid_enabled, action, IDLE),
+        np.where(is_aid_enabled, action, NO_ACTION),
         event_table["can_start"] & is_aid_enabled,
         event_time_s,
         has_gate,
         uses_logged_decisions,
-        inputs.received.rejected[sample_index],
-        inputs.received.reset[sample_index],
+        inputs.received.rejected[sample_indices],
+        inputs.received.reset[sample_indices],
         inputs.received.has_all_resets,
     )
     innovations = np.full((event_count, configuration_count, 6), np.nan)
@@ -401,12 +414,15 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         batch_index = event % EVENT_BATCH_SIZE
         if not batch_index:
             event_batch = slice(event, event + EVENT_BATCH_SIZE)
-            batches = [one_timing.transitions(event_batch) for one_timing in distinct_intervals]
-            transition, correction_input, acceleration_input, gyro_noise, accelerometer_noise = map(
-                stack_configurations, zip(*batches, strict=True)
+            batches = [
+                interval_arrays.compute_transitions(event_batch)
+                for interval_arrays in distinct_intervals
+            ]
+            (transition, correction_input, acceleration_input, gyro_noise, accelerometer_noise) = (
+                map(stack_configurations, zip(*batches, strict=True))
             )
             state_input = acceleration_input + has_attitude[:, None] * correction_input
-            added_noise = (
+            process_noise = (
                 gyro_variance * gyro_noise
                 + acceleration_variance[event_batch] * accelerometer_noise
             )
@@ -416,14 +432,14 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         x[:, :STATE_COUNT] = (phi @ x[:, :STATE_COUNT, None])[:, :, 0] + state_input[batch_index]
         P[:, :STATE_COUNT] = phi @ P[:, :STATE_COUNT]
         P[:, :, :STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
-        P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += added_noise[batch_index]
+        P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += process_noise[batch_index]
         is_bias_constant = None
-        flagged_fraction = bad_acceleration.flagged_fraction(
+        flagged_fraction = bad_acceleration.compute_flagged_fraction(
             event_time_s[event - 1] if event else start_s, event_time_s[event]
         )
         if flagged_fraction is not None:
             variance_increase = flagged_fraction * (
-                BAD_ACCELERATION_NOISE**2 - acceleration_variance[event, :, 0, 0]
+                BAD_ACCELERATION_NOISE_M_S2**2 - acceleration_variance[event, :, 0, 0]
             )
             P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += (
                 variance_increase[:, None, None] * accelerometer_noise[batch_index]
@@ -437,14 +453,14 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             _limit_bias_variance(P, inputs.rules.min_bias_variance, has_biases)
         innovation[:, 2:] = 0.0
         R[:, 2:] = IGNORED_VARIANCE
-        for means, gate, state_rows in vector_means:
-            if means.sample_count[event].any():
-                event_mean = EventSamples(*(quantity[event] for quantity in means))
-                x, P, vector_updates = fuse_mean(x, P, event_mean, gate, *state_rows)
+        for event_means, gate, state_rows in sensor_means:
+            if event_means.sample_count[event].any():
+                event_mean = EventSamples(*(quantity[event] for quantity in event_means))
+                x, P, innovation_record = fuse_mean(x, P, event_mean, gate, *state_rows)
                 if EARTH_FIELD in state_rows:
-                    magnetometer_updates[event] = vector_updates
+                    magnetometer_updates[event] = innovation_record
         if vision_filter is not None:
-            x, P = vision_filter.fuse(event, x, P, False, fusion.last_position_s)
+            x, P = vision_filter.fuse(event, x, P, False, decisions.last_position_s)
         if height_filter is not None:
             x, P = height_filter.fuse_barometer(event, x, P)
         if has_sample[event]:
@@ -466,8 +482,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 is_outside_gate[:, VELOCITY_COLUMNS].any(axis=1) & has_gate
             )
             is_outside_gate = is_outside_gate[:, POSITION_COLUMNS].any(axis=1)
-            is_rejected[event], is_fused[event], is_reset[event], is_velocity_fused = fusion.decide(
-                event, is_outside_gate, is_velocity_fused
+            is_rejected[event], is_fused[event], is_reset[event], is_velocity_fused = (
+                decisions.decide_fusion(event, is_outside_gate, is_velocity_fused)
             )
             if inputs.aid == GNSS_POS:
                 if not has_magnetometer:
@@ -503,8 +519,10 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             x = x + K * (logged_values[event, :, 1] - x[:, DOWN])[:, None]
             x[:, DOWN] = logged_values[event, :, 1]
         if not has_magnetometer:
-            np.subtract(logged_values[event], x[:, LOGGED_STATES], out=innovation[:, :2])
-            R[:, :2] = _noise_for_variance(_diagonal(P)[:, LOGGED_STATES], logged_variance[event])
+            np.subtract(logged_values[event], x[:, HEADING_AND_DOWN], out=innovation[:, :2])
+            R[:, :2] = _compute_noise_for_variance(
+                _diagonal(P)[:, HEADING_AND_DOWN], logged_variance[event]
+            )
             heading_error_rad = np.where(has_attitude, x[:, HEADING] + innovation[:, 0], 0.0)
             if inputs.fuses_vision_height or height_filter is not None:
                 R[:, 1] = IGNORED_VARIANCE
@@ -524,16 +542,18 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             position_reset_m[event, is_reset[event]] = nu[is_reset[event], POSITION_COLUMNS]
         if vision_filter is not None:
             vision_filter.bias.value_m = vision_filter.bias.value_m + position_reset_m[event]
-            x, P = vision_filter.fuse(event, x, P, True, fusion.last_position_s)
-            # EKF2 resets the position after a time without fusion of GNSS and vision positions
+            x, P = vision_filter.fuse(event, x, P, True, decisions.last_position_s)
+            # A fusion of vision also postpones the position reset after a time without GNSS fusion
             if inputs.rules.resets_velocity:
-                fusion.last_position_s = np.maximum(fusion.last_position_s, vision_filter.fused_s)
+                decisions.last_position_s = np.maximum(
+                    decisions.last_position_s, vision_filter.last_fusion_s
+                )
         if height_filter is not None and bad_acceleration.models_flag:
             if has_sample[event] and has_velocity:
-                height_filter.update_log[event, -1, 0] = np.where(
+                height_filter.update_records[event, -1, 0] = np.where(
                     can_fuse_velocity[event], nu[:, DOWN_COLUMN], np.nan
                 )
-                height_filter.update_log[event, -1, 1] = S[:, DOWN_COLUMN]
+                height_filter.update_records[event, -1, 1] = S[:, DOWN_COLUMN]
             height_filter.update_bad_acceleration(event, event_time_s[event])
         if is_bias_constant is not None:
             x[is_bias_constant, ACCELEROMETER_BIAS] = bias_before[is_bias_constant]
@@ -569,9 +589,9 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
 def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
     """Fuse all measurements together: K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP."""
     HP = np.take(P, JOINTLY_MEASURED_STATES, axis=1)
-    HPH = np.take(HP, JOINTLY_MEASURED_STATES, axis=2)
-    HPH.reshape(len(x), -1)[:, :: len(JOINTLY_MEASURED_STATES) + 1] += R
-    K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(HPH)
+    S = np.take(HP, JOINTLY_MEASURED_STATES, axis=2)
+    S.reshape(len(x), -1)[:, :: len(JOINTLY_MEASURED_STATES) + 1] += R
+    K = np.swapaxes(HP, 1, 2) @ np.linalg.inv(S)
     x = x + (K @ innovation[:, :, None])[:, :, 0]
     P = P - K @ HP
     return x, 0.5 * (P + np.swapaxes(P, 1, 2))
@@ -580,7 +600,7 @@ def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
 def _reduce_variance_to(P: Array, state_index: int, target_variance: Array) -> ArrayPair:
     """Return gain and covariance of an update that reduces a state's variance to a target."""
     state_variance = P[:, state_index, state_index]
-    R = _noise_for_variance(state_variance, target_variance)
+    R = _compute_noise_for_variance(state_variance, target_variance)
     K = P[:, :, state_index] / (state_variance + R)[:, None]
     return K, P - K[:, :, None] * P[:, None, state_index]
 
@@ -608,17 +628,17 @@ def _sequential_update(
             factor = b[:, j, None] * cross_covariance[:, j + 1 :]
             columns[:, j + 1 :] -= factor[:, :, None] * column
     x = x + ((fused_weight * nu)[:, None] @ columns)[:, 0]
-    reduction_root = np.sqrt(b)[:, :, None] * columns
-    return x, P - np.swapaxes(reduction_root, 1, 2) @ reduction_root
+    reduction_sqrt = np.sqrt(b)[:, :, None] * columns
+    return x, P - np.swapaxes(reduction_sqrt, 1, 2) @ reduction_sqrt
 
 
 @dataclass
-class _Fusion:
+class _FusionDecisions:
     """Decisions on each position sample: rejected, fused, or used to reset the position.
 
     After a time without fusion, the position is reset. After several successive resets, fusion
-    stops until EKF2 may start it with a sample (``can_start``). ``logged_rejected`` and
-    ``logged_reset`` are EKF2's logged decisions.
+    stops until EKF2 may start it with a sample (``can_start``). ``logged_rejections`` and
+    ``logged_resets`` are EKF2's logged decisions.
 
     Source: updateEvPosFusion, startEvPosFusion (``ev_pos_control.cpp``).
     """
@@ -630,8 +650,8 @@ class _Fusion:
     time_s: Array
     has_gate: BoolArray
     uses_logged_decisions: BoolArray
-    logged_rejected: Array
-    logged_reset: BoolArray
+    logged_rejections: Array
+    logged_resets: BoolArray
     has_all_resets: bool
 
     def __post_init__(self) -> None:
@@ -642,10 +662,12 @@ class _Fusion:
         self.remaining_resets = np.full(configuration_count, self.rules.max_resets)
         # True for events without any reset, start or rejection in the log
         self.only_gate_decides = (
-            (self.action == FUSE).all(axis=1) & ~self.logged_reset & ~(self.logged_rejected > 0.0)
+            (self.action == FUSE).all(axis=1)
+            & ~self.logged_resets
+            & ~(self.logged_rejections > 0.0)
         )
 
-    def decide(
+    def decide_fusion(
         self, event: int, is_outside_gate: BoolArray, is_velocity_fused: BoolArray
     ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
         """Decide if each filter configuration rejects, fuses or resets to the sample of one event.
@@ -659,35 +681,40 @@ class _Fusion:
         has_gate = self.has_gate
         follows_log = self.uses_logged_decisions
         may_fuse = action == FUSE
-        is_decision_logged = math.isfinite(self.logged_rejected[event])
+        is_decision_logged = math.isfinite(self.logged_rejections[event])
         self.last_velocity_s = np.where(is_velocity_fused, now_s, self.last_velocity_s)
         if self.only_gate_decides[event] and not (is_outside_gate.any() or self.is_stopped.any()):
             self.last_position_s = now_s
             return is_outside_gate, may_fuse, is_outside_gate, is_velocity_fused
         is_rejected = (
             np.where(
-                follows_log & is_decision_logged, self.logged_rejected[event] > 0.0, is_outside_gate
+                follows_log & is_decision_logged,
+                self.logged_rejections[event] > 0.0,
+                is_outside_gate,
             )
             & has_gate
             & may_fuse
         )
         since_fusion_s = now_s - self.last_position_s
         if self.has_all_resets and not is_decision_logged:
-            # Without a logged reset at the next event, EKF2 fused the last sample before the limit
+            # If no reset is logged at the next event, EKF2 has fused the last sample before the
+            # timeout
             next_event = min(event + 1, len(self.time_s) - 1)
-            is_last_before_limit = (
+            is_last_before_timeout = (
                 self.time_s[next_event] - self.last_position_s > rules.reset_timeout_s
             )
-            is_rejected &= ~(follows_log & is_last_before_limit & ~self.logged_reset[next_event])
+            is_rejected &= ~(follows_log & is_last_before_timeout & ~self.logged_resets[next_event])
         is_fused = may_fuse & ~is_rejected & ~self.is_stopped
-        is_starting = has_gate & ((action == START) | (self.is_stopped & self.can_start[event]))
+        is_starting = has_gate & (
+            (action == START_FUSION) | (self.is_stopped & self.can_start[event])
+        )
         is_failing = is_rejected & ~self.is_stopped & (since_fusion_s > rules.reset_timeout_s)
         if rules.resets_velocity:
-            is_velocity_late = now_s - self.last_velocity_s > rules.reset_timeout_s
-            is_failing &= is_velocity_late | (since_fusion_s > 2.0 * rules.reset_timeout_s)
+            is_velocity_timed_out = now_s - self.last_velocity_s > rules.reset_timeout_s
+            is_failing &= is_velocity_timed_out | (since_fusion_s > 2.0 * rules.reset_timeout_s)
         is_restarted = is_starting | (is_failing & (self.remaining_resets > 0))
-        if is_decision_logged or self.logged_reset[event] or self.has_all_resets:
-            is_restart_logged = has_gate & (self.logged_reset[event] | (action == START))
+        if is_decision_logged or self.logged_resets[event] or self.has_all_resets:
+            is_restart_logged = has_gate & (self.logged_resets[event] | (action == START_FUSION))
             is_restarted = np.where(follows_log, is_restart_logged, is_restarted)
             is_fused &= ~is_restarted
             is_failing &= ~follows_log
@@ -701,23 +728,23 @@ class _Fusion:
         return is_rejected, is_fused, is_restarted, is_velocity_fused & ~is_restarted
 
 
-def _variance_growth(
+def _compute_variance_growth(
     inputs: Inputs,
     segment: ReplaySegment,
     parameters: dict[str, Array],
     has_biases: BoolArray,
     has_attitude: BoolArray,
 ) -> ArrayPair:
-    """Return process noise per prediction step, and variance limit, of biases and magnetic fields.
+    """Return process noise per prediction step, and maximum variance, of biases and fields.
 
-    EKF2 adds no process noise to a state with a variance above the limit.
+    EKF2 adds no process noise to a state with a larger variance.
     """
-    initial_and_process_names = {"GYR_B": "GYR", "ACC_B": "ACC"}
+    limit_name_by_noise_name = {"GYR_B": "GYR", "ACC_B": "ACC"}
     if segment.field is not None:
-        initial_and_process_names |= {"MAG_E": "MAG", "MAG_B": "MAG"}
+        limit_name_by_noise_name |= {"MAG_E": "MAG", "MAG_B": "MAG"}
     noise_density, variance_limit = (
         np.stack([parameters[f"EKF2_{name}_NOISE"] for name in parameter_names], axis=-1)
-        for parameter_names in (initial_and_process_names, initial_and_process_names.values())
+        for parameter_names in (limit_name_by_noise_name, limit_name_by_noise_name.values())
     )
     noise_density[:, :2] *= np.stack([has_attitude, has_biases], axis=-1)
     return np.repeat((noise_density * inputs.mean_step_s) ** 2, 3, axis=-1), np.repeat(
@@ -731,14 +758,16 @@ def with_state_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegm
     The log contains only the variances. Without correlations, the first updates would distribute
     corrections wrongly between tilt and accelerometer bias.
     """
-    state_correlation = _settled_state_correlation(segment)
-    if history := segment.history:
+    state_correlation = _compute_settled_correlation(segment)
+    if preceding_segment := segment.preceding_segment:
         inputs = replace(inputs, vision=None)
         configuration = FilterConfiguration(inputs.settings)
-        history = replace(history, state_correlation=_settled_state_correlation(history))
-        intervals = make_intervals(inputs, history, configuration.timing(inputs))
-        state_correlation = _correlation_of_covariance(
-            run_segment(inputs, history, [configuration], [intervals]).covariance[0]
+        preceding_segment = replace(
+            preceding_segment, state_correlation=_compute_settled_correlation(preceding_segment)
+        )
+        intervals = make_intervals(inputs, preceding_segment, configuration.compute_delays(inputs))
+        state_correlation = _compute_correlation(
+            run_segment(inputs, preceding_segment, [configuration], [intervals]).covariance[0]
         )
     if segment.field is not None:
         # EKF2 has just reset heading and magnetic fields, so they are uncorrelated with all states
@@ -751,29 +780,34 @@ def with_state_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegm
     return replace(segment, state_correlation=state_correlation)
 
 
-def _correlation_of_covariance(P: Array) -> Array:
+def _compute_correlation(P: Array) -> Array:
     # The lower limit prevents a division by zero: a bias that is not estimated has variance 0
     sigma = np.sqrt(np.maximum(np.diagonal(P), MIN_STATE_VARIANCE))
     return np.asarray(P / sigma[:, None] / sigma)
 
 
-def _settled_state_correlation(segment: ReplaySegment) -> Array:
-    """Return the steady-state correlations of tilt and accelerometer bias.
+def _compute_settled_correlation(segment: ReplaySegment) -> Array:
+    """Return the steady-state correlations of tilt error θ and accelerometer bias b.
 
-    After long fusion of velocity, the effects on the acceleration cancel each other: θ × f = Rb.
+    After long fusion of velocity, their acceleration errors cancel each other: θ × f = R b, with
+    specific force f and rotation R from body to NED.
     """
-    to_earth = np.eye(STATE_COUNT)
-    to_earth[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.body_to_ned[0]
-    P = np.diag(np.diagonal(to_earth @ np.diag(segment.variance[:STATE_COUNT]) @ to_earth.T))
+    body_to_ned_states = np.eye(STATE_COUNT)
+    body_to_ned_states[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.body_to_ned[0]
+    P = np.diag(
+        np.diagonal(
+            body_to_ned_states @ np.diag(segment.variance[:STATE_COUNT]) @ body_to_ned_states.T
+        )
+    )
     for tilt_state, bias_state, acceleration_per_rad in (
-        (1, BIAS_NORTH, -GRAVITY),
-        (0, BIAS_EAST, GRAVITY),
+        (1, BIAS_NORTH, -GRAVITY_MAGNITUDE_M_S2),
+        (0, BIAS_EAST, GRAVITY_MAGNITUDE_M_S2),
     ):
         P[tilt_state, bias_state] = P[bias_state, tilt_state] = (
             min(P[tilt_state, tilt_state] * acceleration_per_rad**2, P[bias_state, bias_state])
             / acceleration_per_rad
         )
-    return _correlation_of_covariance(to_earth.T @ P @ to_earth)
+    return _compute_correlation(body_to_ned_states.T @ P @ body_to_ned_states)
 
 
 def _diagonal(P: Array) -> Array:
@@ -781,7 +815,7 @@ def _diagonal(P: Array) -> Array:
     return P.reshape(len(P), -1)[:, :: P.shape[1] + 1]
 
 
-def _start_state(
+def _make_start_state(
     segment: ReplaySegment, has_biases: BoolArray, has_attitude: BoolArray
 ) -> ArrayPair:
     x = np.tile(segment.state, (len(has_biases), 1))
@@ -797,7 +831,7 @@ def _start_state(
     return x, P
 
 
-def _noise_for_variance(variance: Array, target_variance: Array) -> Array:
+def _compute_noise_for_variance(variance: Array, target_variance: Array) -> Array:
     """Return R for an update from ``variance`` to ``target_variance``: 1/R = 1/target - 1/variance.
 
     With this R, updates with EKF2's published height and heading give the logged variances.
@@ -821,10 +855,10 @@ def _limit_bias_variance(P: Array, absolute_minimum: float, has_biases: BoolArra
     ]
 
 
-def _measurements_by_event(
+def _collect_measurements(
     inputs: Inputs,
     segment: ReplaySegment,
-    sample_index: IntArray,
+    sample_indices: IntArray,
     event_steps: IntArray,
     parameters: dict[str, Array],
     uses_reported_noise: BoolArray,
@@ -839,14 +873,14 @@ def _measurements_by_event(
         (2, len(event_steps), len(sensor_offset_m), 6), np.nan
     )
     lever_arm_ned_m = (segment.body_to_ned[event_steps] @ sensor_offset_m)[..., 0]
-    measured_values[..., 3:] = received.position_m[sample_index][:, None] - lever_arm_ned_m
+    measured_values[..., 3:] = received.position_m[sample_indices][:, None] - lever_arm_ned_m
     if aid.noise_mode:
         uses_reported_noise = uses_reported_noise & (parameters[aid.noise_mode] != 1.0)
     reported_variance = np.where(
-        uses_reported_noise[:, None], received.variance_m2[sample_index][:, None], 0.0
+        uses_reported_noise[:, None], received.variance_m2[sample_indices][:, None], 0.0
     )
     measurement_variance[..., 3:] = np.maximum(
-        reported_variance, np.maximum(parameters[aid.noise], MIN_SIGMA)[:, None] ** 2
+        reported_variance, np.maximum(parameters[aid.noise], MIN_NOISE_SIGMA)[:, None] ** 2
     )
     if received.velocity_m_s is not None and received.velocity_variance_m2_s2 is not None:
         # Velocity of the antenna relative to the IMU while the vehicle rotates
@@ -856,10 +890,10 @@ def _measurements_by_event(
         )
         lever_arm_velocity_m_s = (rotation_rate @ sensor_offset_m)[..., 0]
         measured_values[..., :3] = (
-            received.velocity_m_s[sample_index][:, None] - lever_arm_velocity_m_s
+            received.velocity_m_s[sample_indices][:, None] - lever_arm_velocity_m_s
         )
-        reported_variance = received.velocity_variance_m2_s2[sample_index][:, None]
-        min_variance = np.maximum(parameters[GNSS_VEL.noise], MIN_SIGMA)[:, None] ** 2
+        reported_variance = received.velocity_variance_m2_s2[sample_indices][:, None]
+        min_variance = np.maximum(parameters[GNSS_VEL.noise], MIN_NOISE_SIGMA)[:, None] ** 2
         measurement_variance[..., :3] = (
             np.maximum(reported_variance, min_variance) * VELOCITY_VARIANCE_FACTORS
         )

@@ -14,25 +14,30 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from px4fuse.ekf2.replay_segments import VELOCITY, ReplaySegment, SensorSamples, low_pass_weights
+from px4fuse.ekf2.replay_segments import (
+    VELOCITY,
+    ReplaySegment,
+    SensorSamples,
+    compute_low_pass_weights,
+)
 from px4fuse.flight.model import FLOW_FILTER_WEIGHT
 
 
 def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) -> ReplaySegment:
-    """Add the logged optical flow to a segment of the replay; ``gate`` is the innovation gate (√S).
+    """Add the logged optical flow (:attr:`FusionRecord.flow`) to a segment of the replay.
 
-    ``flow`` is :attr:`FusionRecord.flow`.
+    ``gate`` is the innovation gate as a multiple of √S.
     """
     begin_s = flow.index - (flow["samples"] - 1.0) * flow["interval_s"]
     flow = flow[(begin_s > segment.time_s[0]) & (flow.index <= segment.time_s[-1])]
     sample_count = flow["samples"].to_numpy()
     interval_s = flow["interval_s"].to_numpy()
-    step_index, weight = low_pass_weights(
+    step_index, weight = compute_low_pass_weights(
         segment, flow.index.to_numpy(), sample_count, interval_s, FLOW_FILTER_WEIGHT
     )
     rotation_to_body = segment.body_to_ned[step_index].swapaxes(2, 3)[:, :, :2]
     imu_velocity = np.einsum(
-        "ki,kiab,kib->ka", weight, rotation_to_body, segment.imu_velocity_m_s[step_index]
+        "ki,kiab,kib->ka", weight, rotation_to_body, segment.imu_velocity_change_m_s[step_index]
     )
     sensor_samples = SensorSamples(
         step_index[:, 0],

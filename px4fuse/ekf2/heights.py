@@ -17,16 +17,16 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
-from px4fuse.ekf2.bad_acceleration import MIN_LARGER_INNOVATION, BadAcceleration
-from px4fuse.ekf2.barometer import fused_samples
+from px4fuse.ekf2.bad_acceleration import MIN_LARGER_HEIGHT_INNOVATION, BadAccelerationFlag
+from px4fuse.ekf2.barometer import find_fused_barometer_samples
 from px4fuse.ekf2.bias import BiasEstimator
 from px4fuse.ekf2.replay_segments import (
     HeightSamples,
     ReplaySegment,
+    find_sample_steps,
+    group_samples_by_event,
+    make_update_table,
     pad_samples,
-    sample_steps,
-    samples_by_event,
-    update_table,
 )
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, uses_aid_mask
 from px4fuse.flight.model import GROUND_EFFECT, Ekf2, Flight, FusionRecord, step_values_at
@@ -46,7 +46,7 @@ MIN_BAROMETER_LOG_HZ = 4.0
 # Minimum innovation gate (√S) that EKF2 uses
 MIN_GATE = 1.0
 # Minimum σ of the measurement noise that EKF2 uses: position (m) or velocity (m/s)
-MIN_SIGMA = 0.01
+MIN_NOISE_SIGMA = 0.01
 # Factor on EKF2_GPS_P_NOISE for GNSS heights (gnss_height_control.cpp)
 GNSS_HEIGHT_NOISE_FACTOR = 1.5
 
@@ -78,7 +78,7 @@ def add_heights(
     if BAROMETER.name in fused_aids and flight.barometer is not None:
         barometer_down_m = flight.barometer["down_m"]
         barometer_down_m = barometer_down_m.set_axis(barometer_down_m.index - 0.5 * ekf2.step_s)
-        fused_barometer = fused_samples(ekf2, fusion_record, barometer_down_m)
+        fused_barometer = find_fused_barometer_samples(ekf2, fusion_record, barometer_down_m)
         measured_at_s = fused_barometer.index.to_numpy()
         down_m = fused_barometer["down_m"].to_numpy() + fusion_record.altitude_m
         sample_weight = fused_barometer["weight"].to_numpy()
@@ -90,7 +90,7 @@ def add_heights(
     delayed_down_m = fusion_record.delayed["down_m"]
     for segment in segments:
         start_s = float(segment.time_s[0])
-        barometer_bias = (0.0, 0.0)
+        bias_and_variance = (0.0, 0.0)
         for aid_name in {*fused_aids} - {reference}:
             logged_bias = fusion_record.height_bias.get(aid_name)
             if (
@@ -98,36 +98,41 @@ def add_heights(
                 or not logged_bias.index[0] - MAX_BIAS_LOG_DELAY_S < start_s < logged_bias.index[-1]
             ):
                 return f"EKF2's bias of the {AIDS[aid_name].label} is not logged"
-            bias_m, bias_m2 = (
+            bias_m, bias_variance_m2 = (
                 float(np.interp(start_s, logged_bias.index, logged_bias[name]))
                 for name in ("bias_m", "bias_m2")
             )
-            barometer_bias = bias_m, bias_m2
-        samples_inside = barometer_samples_inside(
+            bias_and_variance = bias_m, bias_variance_m2
+        segment_samples = select_samples_in_segment(
             segment, measured_at_s, down_m, dead_zone_m, sample_weight
         )
-        rate_hz = len(samples_inside[0]) / float(segment.time_s[-1] - start_s)
+        rate_hz = len(segment_samples[0]) / float(segment.time_s[-1] - start_s)
         if BAROMETER.name in fused_aids and rate_hz < MIN_BAROMETER_LOG_HZ:
-            return f"the barometer is logged at {rate_hz:.1f} Hz, below {MIN_BAROMETER_LOG_HZ:g} Hz"
+            return (
+                f"the barometer is logged at {rate_hz:.1f} Hz; a replay of its fusion needs "
+                f"{MIN_BAROMETER_LOG_HZ:g} Hz"
+            )
         initial_state = segment.state.copy()
         initial_state[DOWN] = np.interp(start_s, delayed_down_m.index, delayed_down_m)
         height_samples = HeightSamples(
-            tuple(fused_aids), reference, barometer_bias, *samples_inside
+            tuple(fused_aids), reference, bias_and_variance, *segment_samples
         )
         new_segments.append(replace(segment, state=initial_state, height_samples=height_samples))
     return tuple(new_segments)
 
 
-def barometer_samples_inside(
+def select_samples_in_segment(
     segment: ReplaySegment, measured_at_s: Array, *quantities: Array
 ) -> tuple[Any, ...]:
-    """Return prediction step, time (s) and ``quantities`` of the samples inside a segment."""
-    step, is_inside = sample_steps(segment, measured_at_s)
+    """Return the fusing prediction step, time (s) and ``quantities`` of samples in a segment."""
+    step, is_inside = find_sample_steps(segment, measured_at_s)
     return step, *(values[is_inside] for values in (measured_at_s, *quantities))
 
 
-def barometer_samples(segment: ReplaySegment, event_step_arrays: Sequence[IntArray]) -> list[Array]:
-    """Return the barometer samples that are fused at each event.
+def group_barometer_by_event(
+    segment: ReplaySegment, event_step_arrays: Sequence[IntArray]
+) -> list[Array]:
+    """Group the barometer samples by the event (end of an interval) that fuses them.
 
     Parameters
     ----------
@@ -138,13 +143,13 @@ def barometer_samples(segment: ReplaySegment, event_step_arrays: Sequence[IntArr
     -------
     list of ndarray, shape (6, k, events)
         Up to k samples per event. Rows: height (m, down), age (s), time (s), dead zone (m), weight,
-        and 1 (0 for an empty slot).
+        and 1 for a sample, 0 for an empty slot.
     """
     height_samples = segment.height_samples
     assert height_samples is not None
     return pad_samples(
         [
-            samples_by_event(
+            group_samples_by_event(
                 segment,
                 event_steps,
                 height_samples.step,
@@ -160,44 +165,47 @@ def barometer_samples(segment: ReplaySegment, event_step_arrays: Sequence[IntArr
 
 
 class HeightFilter:
-    """Height fusion in several filter configurations, event by event through one segment.
+    """EKF2's height fusion in several filter configurations, at the events of one segment.
 
     Parameters
     ----------
     segment : ReplaySegment
-    barometer : ndarray, shape (6, k, events, filters) or (6, k, events, 1)
-        Result of :func:`barometer_samples`.
-    fix_s, has_fix : ndarray, shape (events, filters) or (events, 1)
+    barometer_by_event : ndarray, shape (6, k, events, filters) or (6, k, events, 1)
+        Result of :func:`group_barometer_by_event`.
+    gnss_fix_times_s, has_fix : ndarray, shape (events, filters) or (events, 1)
         Time of the GNSS fix of each event, and mask of the events with a fix.
     is_enabled_by_aid : mapping from PX4's name of a source to ndarray of bool, (events, filters)
     parameters : mapping from parameter name to ndarray, shape (filters,)
     has_gate : ndarray of bool, shape (filters,)
+        False to fuse every sample.
     bad_acceleration : BadAcceleration
 
     Attributes
     ----------
-    update_log : ndarray, shape (events, k + 2, 4, filters)
-        Rows of :func:`~px4fuse.ekf2.replay_segments.update_table` for k barometer samples, GNSS
-        height and GNSS velocity.
+    update_records : ndarray, shape (events, k + 2, 4, filters)
+        Rows of :func:`~px4fuse.ekf2.replay_segments.make_update_table` for k barometer samples,
+        GNSS height and GNSS velocity.
     """
 
     def __init__(
         self,
         segment: ReplaySegment,
-        barometer: Array,
-        fix_s: Array,
+        barometer_by_event: Array,
+        gnss_fix_times_s: Array,
         has_fix: BoolArray,
         is_enabled_by_aid: Mapping[str, BoolArray],
         parameters: Mapping[str, Array],
         has_gate: BoolArray,
-        bad_acceleration: BadAcceleration,
+        bad_acceleration: BadAccelerationFlag,
     ) -> None:
         self.bad_acceleration = bad_acceleration
         height_samples = segment.height_samples
         configuration_count = len(has_gate)
         assert height_samples is not None
         self.fused_sensors = height_samples.fused_sensors
-        self.down_m, self.age_s, measured_at_s, self.dead_zone_m, weight, is_sample = barometer
+        self.down_m, self.age_s, measured_at_s, self.dead_zone_m, weight, is_sample = (
+            barometer_by_event
+        )
         has_fix = (
             has_fix
             & is_enabled_by_aid[GNSS_HGT.name]
@@ -211,40 +219,51 @@ class HeightFilter:
         self.in_ground_effect = self.dead_zone_m.any(axis=2)
         gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in HEIGHT_SENSORS]
         self.gate_squared = [np.where(has_gate, gate**2, np.inf) for gate in gates]
-        self.noise_m2 = np.maximum(parameters.get(BAROMETER.noise, MIN_SIGMA), MIN_SIGMA) ** 2
+        self.R_m2 = (
+            np.maximum(parameters.get(BAROMETER.noise, MIN_NOISE_SIGMA), MIN_NOISE_SIGMA) ** 2
+        )
         self.has_bias = [aid.name != height_samples.reference for aid in HEIGHT_SENSORS]
-        self.weight = [*np.maximum(weight, 1.0), np.ones_like(fix_s)]
-        bias_m, bias_variance_m2 = np.tile(height_samples.initial_bias, (configuration_count, 1)).T
+        self.weight = [*np.maximum(weight, 1.0), np.ones_like(gnss_fix_times_s)]
+        bias_m, bias_variance_m2 = np.tile(
+            height_samples.initial_bias_and_variance, (configuration_count, 1)
+        ).T
         start_s = segment.time_s[0]
         self.bias = BiasEstimator(bias_m, bias_variance_m2, segment.step_s)
         self.updates_bias = self.has_sample & is_enabled_by_aid[height_samples.reference]
-        biased_slots = slice(0, -1) if self.has_bias[0] else slice(-1, None)
+        slots_with_bias = slice(0, -1) if self.has_bias[0] else slice(-1, None)
         self.interval_s = np.zeros(self.has_sample.shape)
-        self.time_s = np.stack(np.broadcast_arrays(*measured_at_s, fix_s, self.has_sample[0])[:-1])
+        self.time_s = np.stack(
+            np.broadcast_arrays(*measured_at_s, gnss_fix_times_s, self.has_sample[0])[:-1]
+        )
         slot_count, event_count, _ = self.time_s.shape
-        self.update_log = np.full((event_count, slot_count + 1, 4, configuration_count), np.nan)
-        # Times of the samples in the order of fusion
-        sample_s = np.where(self.has_sample, self.time_s, start_s)[biased_slots].swapaxes(0, 1)
+        self.update_records = np.full((event_count, slot_count + 1, 4, configuration_count), np.nan)
+        # Interval between samples of the sensor with a bias, in the order of fusion. A slot without
+        # a sample gets start_s, which is not later than any sample
+        sample_s = np.where(self.has_sample, self.time_s, start_s)[slots_with_bias].swapaxes(0, 1)
         latest_sample_s = np.maximum.accumulate(sample_s.reshape(-1, configuration_count), axis=0)
         interval_s = np.diff(latest_sample_s, axis=0, prepend=start_s).reshape(sample_s.shape)
-        self.interval_s[biased_slots] = interval_s.swapaxes(0, 1)
+        self.interval_s[slots_with_bias] = interval_s.swapaxes(0, 1)
         self.interval_s *= self.updates_bias
 
-    def updates(self, sensor: str, configuration_index: int, end_s: Array) -> pd.DataFrame:
+    def make_update_table(
+        self, sensor: str, configuration_index: int, end_s: Array
+    ) -> pd.DataFrame:
         """Return the updates of one filter configuration with one height sensor.
 
         ``end_s`` contains the time (s) of each event.
         """
         gnss_slot = len(self.down_m)
-        slots = slice(gnss_slot, gnss_slot + 1) if sensor == GNSS_HGT.name else slice(gnss_slot)
-        update_log = self.update_log[:, slots, :, configuration_index]
-        measured_at_s = self.time_s[slots, :, configuration_index].T
-        return update_table(update_log, measured_at_s, end_s, ["down"])
+        sample_slots = (
+            slice(gnss_slot, gnss_slot + 1) if sensor == GNSS_HGT.name else slice(gnss_slot)
+        )
+        update_records = self.update_records[:, sample_slots, :, configuration_index]
+        measured_at_s = self.time_s[sample_slots, :, configuration_index].T
+        return make_update_table(update_records, measured_at_s, end_s, ["down"])
 
     def fuse_barometer(self, event: int, x: Array, P: Array) -> ArrayPair:
         for slot in range(len(self.down_m)):
             x, P = self._fuse_sample(
-                event, slot, x, P, self.down_m[slot, event], self.age_s[slot, event], self.noise_m2
+                event, slot, x, P, self.down_m[slot, event], self.age_s[slot, event], self.R_m2
             )
         return x, P
 
@@ -257,9 +276,9 @@ class HeightFilter:
         )
 
     def update_bad_acceleration(self, event: int, time_s: Array) -> None:
-        update_log = self.update_log[max(event - 1, 0) : event + 1]
-        innovations = -update_log[:, :, 0] / np.sqrt(update_log[:, :, 1])
-        if (innovations > MIN_LARGER_INNOVATION).any():
+        update_records = self.update_records[max(event - 1, 0) : event + 1]
+        innovations = -update_records[:, :, 0] / np.sqrt(update_records[:, :, 1])
+        if (innovations > MIN_LARGER_HEIGHT_INNOVATION).any():
             innovations[:, -2] = np.fmax(innovations[:, -2], innovations[:, -1])
             self.bad_acceleration.update(time_s, innovations[0, :-1], innovations[-1, :-1])
 
@@ -270,7 +289,7 @@ class HeightFilter:
         if not self.any_sample[slot][event]:
             return x, P
         sensor_index = int(slot == len(self.down_m))
-        # PH' and HPH'
+        # PH' and HPH', with H = 1 for the height and -age_s for the vertical velocity
         state_covariance = P[:, :, DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
         predicted_variance = state_covariance[:, DOWN] - age_s * state_covariance[:, VELOCITY_DOWN]
         nu = down_m - x[:, DOWN] + age_s * x[:, VELOCITY_DOWN]
@@ -296,6 +315,8 @@ class HeightFilter:
             innovation_limit = np.sqrt(self.gate_squared[sensor_index] * S)
             nu = np.where(is_clipped, np.clip(nu, -innovation_limit, innovation_limit), nu)
             is_fused |= is_clipped
-        self.update_log[event, slot] = np.where(has_sample, (nu, S, ~is_fused, is_fused), np.nan)
+        self.update_records[event, slot] = np.where(
+            has_sample, (nu, S, ~is_fused, is_fused), np.nan
+        )
         K = state_covariance * (is_fused / (predicted_variance + R / sample_weight))[:, None]
         return x + K * nu[:, None], P - K[:, :, None] * state_covariance[:, None]

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray, median_interval
-from px4fuse.ekf2.earth_model import ekf2_metres_per_metre
+from px4fuse.ekf2.earth_model import compute_position_scale
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
 from px4fuse.ekf2.replay_segments import (
@@ -20,7 +20,7 @@ from px4fuse.ekf2.replay_segments import (
     MIN_SEGMENT_S,
     ReplaySegment,
     find_replay_segments,
-    predict_s,
+    read_prediction_step_s,
 )
 from px4fuse.flight.ekf2_parameters import (
     AID_MASK,
@@ -56,11 +56,11 @@ from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, rotate
 
 ANALYSIS_NAME = "EKF2 replay"
 # Note in the log of a simulated flight
-MODEL_NOTE = (
+SIMULATED_EKF2_NOTE = (
     "EKF2 in this log is px4fuse's model of EKF2, run on the simulated sensors, not PX4's EKF2"
 )
-# Logging interval (s) of the topics that repeat the vision positions (logged_topics.cpp)
-VISION_COPY_INTERVALS_S = {
+# Logging interval (s) of the EKF2 topics that repeat the vision positions (logged_topics.cpp)
+VISION_REPETITION_INTERVALS_S = {
     "estimator_visual_odometry_aligned": 0.2,
     "estimator_aid_src_ev_pos": 0.5,
 }
@@ -77,7 +77,7 @@ DEAD_RECKONING_TIMEOUT_S = 1.0
 # Bit of EKF2_GPS_CTRL that enables GNSS velocity; before PX4 v1.14 EKF2 always fuses it
 GNSS_VELOCITY_BIT = 4
 # Maximum time (s) from a reset to its publication: vehicle_local_position is logged every 0.1 s
-MAX_RESET_PUBLICATION_S = 0.2
+MAX_RESET_PUBLICATION_DELAY_S = 0.2
 # Maximum median IMU interval (s) for an EKF2 replay: EKF2 predicts every 8 to 13 ms
 MAX_IMU_INTERVAL_S = 0.012
 # Maximum fraction of missing IMU samples outside gaps for an EKF2 replay
@@ -86,7 +86,8 @@ MAX_LOST_FRACTION = 0.1
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
 # Maximum number of successive position resets in PX4 releases without a limit: never reached
 UNLIMITED_RESETS = 1_000_000
-# Maximum interval (s) between height and heading updates in a gap of the position source
+# In a gap of the position source, the replay fuses height and heading at least once in this time
+# (s)
 MAX_INTERVAL_S = 0.25
 
 
@@ -201,7 +202,7 @@ class Inputs:
     imu_offset_m : ndarray, shape (3,)
         Position of the IMU (EKF2_IMU_POS, body FRD).
     max_interval_s : float
-        Maximum interval between events in a gap of the position source.
+        Maximum interval (s) between fusions of height and heading in a gap of the position source.
     logged_height_reason : str
         Reason why EKF2's logged height is used in a flight with GNSS.
     vision : ReceivedPositions or None
@@ -239,7 +240,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         return attitude
     if isinstance(ekf2, Unavailable):
         return ekf2
-    aid = replayed_aid(ekf2)
+    aid = find_replayed_aid(ekf2)
     is_gnss = aid == GNSS_POS
     logged_ekf2 = ekf2
     if is_gnss:
@@ -248,21 +249,22 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     horizon_s = ekf2.horizon_s
     if isinstance(fusion_record, Unavailable):
         return fusion_record
-    # The earth in px4fuse's simulation is a sphere without rotation
-    if MODEL_NOTE in flight.log.notes:
+    # Simulated flights have no earth rotation. Without a latitude, the model has none
+    if SIMULATED_EKF2_NOTE in flight.log.notes:
         fusion_record = replace(fusion_record, latitude_deg=np.nan)
     if isinstance(innovations := ekf2.innovations["north"], Unavailable):
         return innovations
     flow_labels = [FLOW.label] if len(fusion_record.flow) else []
-    modelled_aids = [GNSS_POS.label, GNSS_VEL.label, *flow_labels] if is_gnss else []
+    modelled_labels = [GNSS_POS.label, GNSS_VEL.label, *flow_labels] if is_gnss else []
     if unmodelled_aids := [
-        label for label in fusion_record.other_horizontal_aids if label not in modelled_aids
+        label for label in fusion_record.other_horizontal_aids if label not in modelled_labels
     ]:
-        switches = ["EKF2_OF_CTRL 0", *([] if is_gnss else [f"{GNSS_POS.switch} 0"])]
+        switch_settings = ["EKF2_OF_CTRL 0", *([] if is_gnss else [f"{GNSS_POS.switch} 0"])]
         return Unavailable(
             ANALYSIS_NAME,
             f"EKF2 also fused {', '.join(unmodelled_aids)}, which the model does not contain",
-            f"Fly with {', '.join(switches)} and without bit 2 of {EV_POS.switch}.",
+            f"Fly with {', '.join(switch_settings)} and without bit 2 (velocity) of "
+            f"{EV_POS.switch}.",
         )
     if missing_imu := _explain_missing_imu(imu.index.to_numpy()):
         return missing_imu
@@ -287,14 +289,14 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if isinstance(vision, Unavailable):
         return vision
     # Since PX4 v1.17, each GNSS receiver has a separate lever arm, which its messages contain
-    gnss_track = _gnss_track(flight) if is_gnss else None
+    gnss_track = _find_gnss_track(flight) if is_gnss else None
     lever_arm = (
         {} if gnss_track is None else dict(zip(aid.lever_arm, gnss_track.lever_arm_m, strict=True))
     )
     if isinstance(horizon_s, Unavailable):
         if not flight.log.firmware.startswith(FIRST_RELEASE_WITH_HORIZON_TIMES):
             return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
-        # EKF2 fuses at the current time if EKF2_EV_DELAY is at most one prediction step
+        # EKF2's fusion horizon is the current time if EKF2_EV_DELAY is at most one prediction step
         horizon_s = 0.0
     aiding_times_s = received.timestamp_s
     flow_samples = fusion_record.flow if is_gnss else fusion_record.flow.iloc[:0]
@@ -306,8 +308,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if not segments:
         return Unavailable(
             ANALYSIS_NAME,
-            f"EKF2 never fused {aid.label.removesuffix(', position')} for {MIN_SEGMENT_S:g} s in "
-            "flight without a gap in the position source or the IMU",
+            f"the flight contains no {MIN_SEGMENT_S:g} s in which EKF2 fused "
+            f"{aid.label.removesuffix(', position')} without a gap in the source or the IMU",
             "Record without dropouts (faster SD card, fewer topics) and with a steady position "
             "source.",
         )
@@ -320,9 +322,11 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         if name not in (FLOW.name, EV_POS.name)
     )
     if is_gnss and not logged_height_reason:
-        new_segments = add_heights(flight, ekf2, fusion_record, segments)
+        segments_or_reason = add_heights(flight, ekf2, fusion_record, segments)
         segments, logged_height_reason = (
-            (segments, new_segments) if isinstance(new_segments, str) else (new_segments, "")
+            (segments, segments_or_reason)
+            if isinstance(segments_or_reason, str)
+            else (segments_or_reason, "")
         )
     other_aids = [EV_POS] if vision else []
     other_aids += [MAG] if any(segment.field for segment in segments) else []
@@ -334,11 +338,12 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         settings=effective_settings(fusion_record.parameters, aid, *other_aids) | lever_arm,
         segments=segments,
         received=received,
-        rules=_fusion_rules(fusion_record, ekf2.step_s, is_gnss=is_gnss),
+        rules=_make_fusion_rules(fusion_record, ekf2.step_s, is_gnss=is_gnss),
         mean_step_s=ekf2.step_s,
         horizon_s=horizon_s,
-        configured_step_s=predict_s(fusion_record),
-        # While EKF2 reports a bad acceleration, it clips vision heights, which the model does not
+        configured_step_s=read_prediction_step_s(fusion_record),
+        # While EKF2 reports a bad acceleration, it clips vision heights. The model does not, so it
+        # uses EKF2's logged height
         fuses_vision_height=not is_gnss
         and isinstance(ekf2.fusion_flags, pd.DataFrame)
         and bool(ekf2.fusion_flags["vertical"].mean() > 0.5)
@@ -352,8 +357,8 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     )
 
 
-def lost_imu_fraction(time_s: Array) -> float:
-    """Return the fraction of IMU samples that are missing from the log, not counting gaps."""
+def compute_lost_imu_fraction(time_s: Array) -> float:
+    """Return the fraction of IMU samples missing from the log, without gaps above IMU_GAP_S."""
     intervals_s = np.diff(time_s)
     lost_counts = np.rint(intervals_s[intervals_s <= IMU_GAP_S] / np.median(intervals_s)) - 1.0
     lost_count = lost_counts.clip(0.0).sum()
@@ -368,7 +373,7 @@ def _explain_missing_imu(time_s: Array) -> Unavailable | None:
             f"the IMU is logged at {1.0 / median_interval_s:.0f} Hz, below EKF2's prediction rate",
             "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
         )
-    if (lost_fraction := lost_imu_fraction(time_s)) > MAX_LOST_FRACTION:
+    if (lost_fraction := compute_lost_imu_fraction(time_s)) > MAX_LOST_FRACTION:
         return Unavailable(
             ANALYSIS_NAME,
             f"{100.0 * lost_fraction:.0f} % of the IMU samples are missing from the log",
@@ -377,10 +382,10 @@ def _explain_missing_imu(time_s: Array) -> Unavailable | None:
     return None
 
 
-def _fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
+def _make_fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
     rules, parameters = VISION_RULES, fusion_record.parameters
     if is_gnss:
-        # Since 2026, position and velocity have separate timeouts and separate resets in PX4 main
+        # PX4 with EKF2_GPS_MODE (main since 2026) resets position and velocity separately
         rules = replace(GNSS_RULES, resets_velocity=GNSS_MODE_PARAMETER not in parameters)
         if not fusion_record.stores_latitude():
             # The flag for a bad acceleration stays set for 10 s (BADACC_PROBATION, common.h)
@@ -394,15 +399,15 @@ def _fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) 
     )
 
 
-def replayed_aid(ekf2: Ekf2) -> Aid:
+def find_replayed_aid(ekf2: Ekf2) -> Aid:
     """Return the position source of the replay: GNSS if EKF2 fused GNSS, else external vision."""
     vision = ekf2.aids.get(EV_POS.name)
     is_vision_used = bool(vision and (vision.enabled is None or vision.enabled.any()))
-    has_gnss = _enabled_log(ekf2, GNSS_POS) is not None
+    has_gnss = _find_enabled_changes(ekf2, GNSS_POS) is not None
     return GNSS_POS if has_fused_aid(ekf2) and (has_gnss or not is_vision_used) else EV_POS
 
 
-def _enabled_log(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
+def _find_enabled_changes(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
     """Return the times at which EKF2 enables (1) or disables (0) an aiding source.
 
     Return None if the source is never enabled.
@@ -415,7 +420,7 @@ def _enabled_log(ekf2: Ekf2, aid: Aid) -> "pd.Series[float] | None":
     )
 
 
-def _gnss_track(flight: Flight) -> PositionTrack | None:
+def _find_gnss_track(flight: Flight) -> PositionTrack | None:
     return next((track for track in flight.positions if track.origin.is_gnss), None)
 
 
@@ -423,7 +428,7 @@ def read_gnss(
     flight: Flight, ekf2: Ekf2, fusion_record: FusionRecord
 ) -> ReceivedPositions | Unavailable:
     """Return the GNSS fixes that EKF2 received (NED), or the reason why they are incomplete."""
-    track = _gnss_track(flight)
+    track = _find_gnss_track(flight)
     if track is None or track.velocity is None:
         return Unavailable(
             ANALYSIS_NAME, "the log has no topic vehicle_gps_position", DEFAULT_PROFILE_REMEDY
@@ -438,8 +443,8 @@ def read_gnss(
     control_bits = int(parameters.get(GNSS_POS.switch, 7.0))
     position_samples, velocity_samples = track.samples, track.velocity
     # EKF2 ignores GNSS fixes while GNSS is disabled
-    if (enabled_log := ekf2.aids[GNSS_POS.name].enabled) is not None:
-        is_enabled = step_values_at(enabled_log, position_samples.index) > 0.0
+    if (enabled_changes := ekf2.aids[GNSS_POS.name].enabled) is not None:
+        is_enabled = step_values_at(enabled_changes, position_samples.index) > 0.0
         position_samples = position_samples[is_enabled]
         velocity_samples = velocity_samples[is_enabled]
     # The delay is added, because the replay subtracts it from all timestamps
@@ -459,9 +464,9 @@ def read_gnss(
     return ReceivedPositions(
         timestamp_s,
         timestamp_s,
-        position_samples[Columns.POSITION].to_numpy() * ekf2_metres_per_metre(fusion_record),
+        position_samples[Columns.POSITION].to_numpy() * compute_position_scale(fusion_record),
         reported_variance.to_numpy(),
-        *_logged_decisions(ekf2, fusion_record, timestamp_s, timestamp_s, GNSS_POS),
+        *_read_logged_decisions(ekf2, fusion_record, timestamp_s, timestamp_s, GNSS_POS),
         track.name,
         velocity,
         velocity_variance,
@@ -476,7 +481,7 @@ def read_vision(
 
     Positions in an FRD frame are rotated to NED with EKF2's published ``attitude``.
     """
-    track = _vision_track(flight)
+    track = _find_vision_track(flight)
     if isinstance(track, Unavailable):
         return track
     position_samples = track.samples.dropna(subset=Columns.POSITION[:2])
@@ -494,7 +499,7 @@ def read_vision(
                 ANALYSIS_NAME,
                 f"the positions of {track.name} are in an FRD frame, without an orientation to "
                 "rotate them to NED",
-                "Send the position in NED, or with an orientation.",
+                "Send the positions in NED, or also send the orientation.",
             )
         ekf2_attitude, source_attitude = (
             interpolate(
@@ -512,7 +517,7 @@ def read_vision(
     arrival_s = np.full(len(timestamp_s), -np.inf)
     if len(vision_age_s) and "vehicle_visual_odometry" in track.topics:
         arrival_s = timestamp_s + np.interp(timestamp_s, vision_age_s.index, vision_age_s)
-    rejected_and_reset = _logged_decisions(ekf2, fusion_record, timestamp_s, arrival_s)
+    rejected_and_reset = _read_logged_decisions(ekf2, fusion_record, timestamp_s, arrival_s)
     return ReceivedPositions(
         timestamp_s,
         arrival_s,
@@ -529,7 +534,7 @@ def _read_vision_besides_gnss(
     flight: Flight, ekf2: Ekf2, fusion_record: FusionRecord, attitude: pd.DataFrame
 ) -> ReceivedPositions | Unavailable | None:
     """Return the vision positions of a flight with GNSS; None if EKF2 did not fuse vision."""
-    if (enabled_log := _enabled_log(ekf2, EV_POS)) is None:
+    if (enabled_changes := _find_enabled_changes(ekf2, EV_POS)) is None:
         return None
     if uses_aid_mask(fusion_record.parameters):
         return Unavailable(
@@ -541,17 +546,13 @@ def _read_vision_besides_gnss(
     received = read_vision(flight, ekf2, fusion_record, attitude)
     if isinstance(received, Unavailable):
         return received
-    is_disabled = step_values_at(enabled_log, received.timestamp_s) == 0.0
-    position_m = received.position_m * ekf2_metres_per_metre(fusion_record)
+    is_disabled = step_values_at(enabled_changes, received.timestamp_s) == 0.0
+    position_m = received.position_m * compute_position_scale(fusion_record)
     return replace(received, position_m=np.where(is_disabled[:, None], np.nan, position_m))
 
 
-def _logged_decisions(
-    ekf2: Ekf2,
-    fusion_record: FusionRecord,
-    timestamp_s: Array,
-    arrival_s: Array,
-    aid: Aid = EV_POS,
+def _read_logged_decisions(
+    ekf2: Ekf2, fusion_record: FusionRecord, timestamp_s: Array, arrival_s: Array, aid: Aid = EV_POS
 ) -> tuple[Array, BoolArray]:
     """Return two masks of the position samples: rejected by EKF2 (1, 0 or NaN), used for a reset.
 
@@ -570,36 +571,40 @@ def _logged_decisions(
     delay_s = effective_settings(fusion_record.parameters, aid)[aid.delay] * 1e-3
     measured_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
     # EKF2 fuses a sample at the first step after its measurement time, or after a late arrival
-    due_s = np.maximum.accumulate(np.maximum(measured_s, arrival_s - horizon_s))
+    fusion_due_s = np.maximum.accumulate(np.maximum(measured_s, arrival_s - horizon_s))
     aid_rows = ekf2.aids[aid.name].samples
-    # EKF2 rejected all samples between its last fusion or reset and each logged row, and all
-    # samples in dead reckoning
-    fusions = aid_rows.reindex(columns=["last_fused_s"]).dropna()
-    fusion_to_row_s = np.column_stack([fusions, fusions.index])
+    # EKF2 rejected all samples between its last fusion or reset (last_fused_s) and the row that
+    # logs this time, and all samples in dead reckoning
+    last_fusion_times_s = aid_rows.reindex(columns=["last_fused_s"]).dropna()
+    fusion_to_row_spans_s = np.column_stack([last_fusion_times_s, last_fusion_times_s.index])
     dead_reckoning_s = (
-        _dead_reckoning_spans(ekf2, fusion_record) if aid == EV_POS else fusion_to_row_s[:0]
+        _find_dead_reckoning_spans(ekf2, fusion_record)
+        if aid == EV_POS
+        else fusion_to_row_spans_s[:0]
     )
     rejection_rows = np.searchsorted(
-        due_s, np.concatenate([fusion_to_row_s, dead_reckoning_s]) + STEP_TOLERANCE_S
+        fusion_due_s, np.concatenate([fusion_to_row_spans_s, dead_reckoning_s]) + STEP_TOLERANCE_S
     )
     for begin, end in rejection_rows.tolist():
         rejected_flags[begin : max(end - 1, 0)] = 1.0
     is_reset_possible = np.isnan(rejected_flags)
-    sample_row = matching_sample_rows(innovations.index.to_numpy(), measured_s)
+    sample_row = find_matching_samples(innovations.index.to_numpy(), measured_s)
     sample_innovations = innovations.iloc[sample_row[sample_row >= 0]]
     rejected_flags[sample_row >= 0] = sample_innovations["rejected"]
     # If EKF2 resets its position to a sample, it logs innovation 0, and not a rejection
     is_reset_possible[sample_row >= 0] &= (sample_innovations["rejected"] > 0.0) | (
         sample_innovations["innovation_m"] == 0.0
     )
-    last_fused_rows = rejection_rows[: len(fusion_to_row_s), 0] - 1
-    dead_reckoning_ends = rejection_rows[len(fusion_to_row_s) :, 1] - 1
+    last_fused_rows = rejection_rows[: len(fusion_to_row_spans_s), 0] - 1
+    last_dead_reckoning_rows = rejection_rows[len(fusion_to_row_spans_s) :, 1] - 1
     # A reset is visible in the next published state, one fusion horizon after the measurement
-    published_s = due_s + horizon_s
-    for reset_s in horizontal_resets_s(ekf2):
-        is_recent = (published_s <= reset_s) & (published_s > reset_s - MAX_RESET_PUBLICATION_S)
+    published_s = fusion_due_s + horizon_s
+    for reset_s in find_horizontal_reset_times_s(ekf2):
+        is_recent = (published_s <= reset_s) & (
+            published_s > reset_s - MAX_RESET_PUBLICATION_DELAY_S
+        )
         reset_rows = np.flatnonzero(is_recent & is_reset_possible)
-        dead_reckoning_end_rows = np.intersect1d(reset_rows, dead_reckoning_ends)
+        dead_reckoning_end_rows = np.intersect1d(reset_rows, last_dead_reckoning_rows)
         is_reset[
             dead_reckoning_end_rows[:1] if len(dead_reckoning_end_rows) else reset_rows[-1:]
         ] = True
@@ -609,7 +614,7 @@ def _logged_decisions(
     return rejected_flags, is_reset
 
 
-def _dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array:
+def _find_dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array:
     """Return start and end (s) of each time span without fusion of vision.
 
     EKF2 reports inertial dead reckoning after DEAD_RECKONING_TIMEOUT_S without fusion, and
@@ -631,30 +636,32 @@ def innovation_topic(aid: Aid) -> str:
     return f"estimator_aid_src_{aid.name}"
 
 
-def matching_sample_rows(sample_s: Array, measurement_s: Array) -> IntArray:
+def find_matching_samples(sample_s: Array, measurement_times_s: Array) -> IntArray:
     """Return the index of the sample at each measurement time; -1 without a sample."""
-    sample_row = np.searchsorted(sample_s, measurement_s - SAMPLE_MATCH_TOLERANCE_S)
-    sample_row = np.minimum(sample_row, len(sample_s) - 1)
+    sample_index = np.searchsorted(sample_s, measurement_times_s - SAMPLE_MATCH_TOLERANCE_S)
+    sample_index = np.minimum(sample_index, len(sample_s) - 1)
     return np.where(
-        np.abs(sample_s[sample_row] - measurement_s) <= SAMPLE_MATCH_TOLERANCE_S, sample_row, -1
+        np.abs(sample_s[sample_index] - measurement_times_s) <= SAMPLE_MATCH_TOLERANCE_S,
+        sample_index,
+        -1,
     )
 
 
-def horizontal_resets_s(ekf2: Ekf2) -> Array:
+def find_horizontal_reset_times_s(ekf2: Ekf2) -> Array:
     """Return the times (s) of horizontal position resets in the published state."""
     return np.array([reset.time_s for reset in ekf2.find_horizontal_resets()])
 
 
-def _vision_track(flight: Flight) -> PositionTrack | Unavailable:
+def _find_vision_track(flight: Flight) -> PositionTrack | Unavailable:
     """Return the position track that contains all vision positions EKF2 received."""
     missing_reasons = ["the log has no topic vehicle_visual_odometry"]
     for track in sorted(flight.positions, key=lambda track: track.origin == POSITION_FILE):
         if track.origin.is_vision and track.origin.has_all_samples:
             return track
-        if track.name in VISION_COPY_INTERVALS_S:
+        if track.name in VISION_REPETITION_INTERVALS_S:
             median_interval_s = median_interval(track.samples.index.to_numpy())
             if (
-                median_interval_s < 0.9 * VISION_COPY_INTERVALS_S[track.name]
+                median_interval_s < 0.9 * VISION_REPETITION_INTERVALS_S[track.name]
                 and median_interval_s <= 0.25
             ):
                 return track

@@ -37,18 +37,19 @@ from px4fuse.trajectory.rotation import rotate, skew
 # EKF2 fuses no sample with fusion horizon - measurement time > this time (s): pop_first_older_than
 # (RingBuffer.h)
 MAX_LATENESS_S = 0.1
-# A sample is late if fusion horizon - measurement time > this time (s): 3 cm at 1 m/s
+# A sample is late if fusion horizon - measurement time > this time (s), which is an error of 3 cm
+# at 1 m/s
 MIN_LATENESS_S = 0.03
 # Actions on a position sample: none, update of the state, or reset of the state to the sample
-IDLE, FUSE, START = 0, 1, 2
-# Derivatives of the EKF2 states with respect to: initial attitude error (columns 0 to 2), gyro bias
+NO_ACTION, FUSE, START_FUSION = 0, 1, 2
+# Columns of the state derivatives: with respect to the initial attitude error (0 to 2), gyro bias
 # (3 to 5), accelerometer bias (6 to 8), correction of the nominal attitude (9), acceleration (10)
 SENSITIVITY_COLUMN_COUNT = 11
-CORRECTION_COLUMN, INPUT_COLUMN = 9, 10
+CORRECTION_COLUMN, ACCELERATION_COLUMN = 9, 10
 
 # One row per event (end of an interval), in time order
 StepEvents = np.recarray[Any, Any]
-EVENT = np.dtype(
+EVENT_DTYPE = np.dtype(
     [
         ("end_step", np.intp),  # index of the prediction step after which the event occurs
         ("sample", np.intp),  # index of the position sample, -1 without a sample
@@ -63,7 +64,7 @@ EVENT = np.dtype(
 
 
 class Transitions(NamedTuple):
-    """State transition and process noise of E intervals.
+    """State transition and process noise of E intervals between events.
 
     Attributes
     ----------
@@ -71,7 +72,7 @@ class Transitions(NamedTuple):
     correction_input, acceleration_input : ndarray, shape (E, 15)
         State changes due to the correction of the nominal attitude, and to the acceleration.
     gyro_noise, accelerometer_noise : ndarray, shape (E, 9, 9)
-        Process noise for a sensor noise of 1 rad/s or 1 m/s².
+        Process noise of attitude, velocity and position for a sensor noise of 1 rad/s or 1 m/s².
     """
 
     transition: Array
@@ -87,12 +88,13 @@ class Intervals:
 
     Attributes
     ----------
-    events : recarray, shape (events,)
-        Event at the end of each interval, see :data:`EVENT`.
+    events : recarray, shape (E,)
+        Event at the end of each interval, see :data:`EVENT_DTYPE`.
     step_counts, duration_s : ndarray, shape (E,)
         Number of prediction steps, and length of each interval.
     sensitivities : ndarray, shape (E, 9, SENSITIVITY_COLUMN_COUNT)
-        Derivatives of attitude, velocity and position at the end of each interval.
+        Derivatives of attitude, velocity and position at the end of each interval with respect to
+        errors at its start and to its inputs, see SENSITIVITY_COLUMN_COUNT.
     """
 
     events: StepEvents
@@ -100,72 +102,75 @@ class Intervals:
     duration_s: Array
     sensitivities: Array
 
-    def transitions(self, rows: slice) -> Transitions:
-        """Return the matrices of some intervals: those of all intervals need much memory."""
+    def compute_transitions(self, rows: slice) -> Transitions:
+        """Return the matrices of the intervals ``rows``; all intervals would need much memory."""
         sensitivities, duration_s = self.sensitivities[rows], self.duration_s[rows]
         transition = np.tile(np.eye(STATE_COUNT), (len(duration_s), 1, 1))
         correction_input, acceleration_input = np.zeros((2, len(duration_s), STATE_COUNT))
         transition[:, :IMU_STATE_COUNT, THETA] = sensitivities[..., :3]
         transition[:, :IMU_STATE_COUNT, BIASES] = sensitivities[..., 3:9]
         correction_input[:, :IMU_STATE_COUNT] = sensitivities[..., CORRECTION_COLUMN]
-        acceleration_input[:, :IMU_STATE_COUNT] = sensitivities[..., INPUT_COLUMN]
+        acceleration_input[:, :IMU_STATE_COUNT] = sensitivities[..., ACCELERATION_COLUMN]
         transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
-        noises = _imu_noise_by_interval(
+        noises = _compute_imu_process_noise(
             self.step_counts[rows], duration_s, transition[:, VELOCITY, THETA]
         )
         return Transitions(transition, correction_input, acceleration_input, *noises)
 
 
 @dataclass(frozen=True)
-class Timing:
-    """Delay (s) of the position source, and delay (s) of EKF2's fusion horizon."""
+class FusionDelays:
+    """Delay (s) of position measurements, and delay (s) of EKF2's fusion horizon.
+
+    The timestamps minus ``delay_s`` are the measurement times.
+    """
 
     delay_s: float
     horizon_s: float
 
 
-def make_intervals(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Intervals:
+def make_intervals(inputs: Inputs, segment: ReplaySegment, delays: FusionDelays) -> Intervals:
     """Compute state transition and process noise of all intervals in a segment.
 
-    The number of intervals does not depend on ``timing``.
+    The number of intervals does not depend on ``delays``.
     """
-    events = _make_events(inputs, segment, timing)
+    events = _make_events(inputs, segment, delays)
     end_steps = events.end_step
     start_steps = np.append(0, end_steps[:-1])
     return Intervals(
         events,
         (end_steps - start_steps).astype(float),
         segment.time_s[end_steps] - segment.time_s[start_steps],
-        _state_sensitivities(segment, start_steps, end_steps),
+        _integrate_sensitivities(segment, start_steps, end_steps),
     )
 
 
-def _make_events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> StepEvents:
+def _make_events(inputs: Inputs, segment: ReplaySegment, delays: FusionDelays) -> StepEvents:
     received = inputs.received
     time_s = segment.time_s
     first_row, last_row = np.searchsorted(received.timestamp_s, time_s[[0, -1]])
     timestamp_s = received.timestamp_s[first_row:last_row]
     last_step = len(time_s) - 1
-    measured_s = timestamp_s - timing.delay_s - 0.5 * inputs.mean_step_s
+    measured_s = timestamp_s - delays.delay_s - 0.5 * inputs.mean_step_s
     # If a sample arrives after the fusion horizon has passed its measurement time, EKF2 fuses it
     # late or never
-    due_s = np.maximum(measured_s, received.arrival_s[first_row:last_row] - timing.horizon_s)
-    end_steps = np.searchsorted(time_s, due_s - 1e-9)
+    fusion_due_s = np.maximum(measured_s, received.arrival_s[first_row:last_row] - delays.horizon_s)
+    end_steps = np.searchsorted(time_s, fusion_due_s - 1e-9)
     is_inside = (end_steps > 0) & (end_steps <= last_step)
     end_steps = np.maximum.accumulate(np.minimum(end_steps, last_step))
     is_in_time = time_s[end_steps] < measured_s + MAX_LATENESS_S
     is_usable = is_inside & is_in_time
     # EKF2 fuses only the newer of two samples in one prediction step
     is_usable[:-1] &= end_steps[1:] > end_steps[:-1]
-    action, can_start = _sample_actions(inputs, segment, measured_s, end_steps, is_usable)
-    action[np.isin(timestamp_s, received.reset_s) & (action == FUSE)] = START
-    # Gaps of the position source contain additional events. The number of events does not depend on
-    # the delay
+    action, can_start = _find_sample_actions(inputs, segment, measured_s, end_steps, is_usable)
+    action[np.isin(timestamp_s, received.reset_s) & (action == FUSE)] = START_FUSION
+    # Events without a sample divide gaps of the position source: height and heading are fused at
+    # each event. Their number is the same for all delays
     gap_s = np.diff(np.r_[time_s[0], timestamp_s, time_s[-1]])
     extra_event_counts = np.maximum(np.ceil(gap_s / inputs.max_interval_s).astype(int) - 1, 0)
     sample_event_rows = np.cumsum(extra_event_counts[:-1] + 1) - 1
     event_count = len(timestamp_s) + int(extra_event_counts.sum())
-    events = np.zeros(event_count, EVENT)
+    events = np.zeros(event_count, EVENT_DTYPE)
     events["end_step"] = np.rint(
         np.interp(
             np.arange(event_count),
@@ -174,17 +179,17 @@ def _make_events(inputs: Inputs, segment: ReplaySegment, timing: Timing) -> Step
         )
     )
     events["sample"], events["time_s"] = -1, time_s[events["end_step"]]
-    is_late = is_inside & is_in_time & (due_s - measured_s > MIN_LATENESS_S)
+    is_late = is_inside & is_in_time & (fusion_due_s - measured_s > MIN_LATENESS_S)
     sample_indices = np.arange(first_row, last_row)
     is_lost = is_inside & ~is_in_time
     events[sample_event_rows] = np.rec.fromarrays(
         [end_steps, sample_indices, action, is_usable, can_start, is_late, is_lost, measured_s],
-        dtype=EVENT,
+        dtype=EVENT_DTYPE,
     )
     return events.view(np.recarray)
 
 
-def _sample_actions(
+def _find_sample_actions(
     inputs: Inputs,
     segment: ReplaySegment,
     measured_at_s: Array,
@@ -196,7 +201,7 @@ def _sample_actions(
     The actions are IDLE, FUSE and START. Source: PX4-Autopilot ``ev_control.cpp``.
     """
     rules = inputs.rules
-    action = np.full(len(measured_at_s), IDLE)
+    action = np.full(len(measured_at_s), NO_ACTION)
     can_start = np.zeros(len(measured_at_s), dtype=bool)
     usable_rows = np.flatnonzero(is_usable)
     intervals_s = np.diff(measured_at_s[usable_rows], prepend=-np.inf)
@@ -213,26 +218,23 @@ def _sample_actions(
         if is_fusing:
             action[usable_rows[row]] = FUSE
         elif interval_s < rules.start_interval_s:
-            action[usable_rows[row]] = START
+            action[usable_rows[row]] = START_FUSION
             is_fusing = True
     return action, can_start
 
 
-def _state_sensitivities(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
-    """Return the derivatives of attitude, velocity and position at the end of each interval.
-
-    Shape (events, 9, SENSITIVITY_COLUMN_COUNT).
-    """
+def _integrate_sensitivities(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
+    """Integrate :attr:`Intervals.sensitivities` over the intervals from step start to end."""
     step_counts = end - start
-    # All intervals are integrated together, step by step. Intervals are sorted by length, so that
-    # those with a further step are the first rows
+    # All intervals are integrated together, step by step. They are sorted by length, so that the
+    # intervals that continue are the first rows of the arrays
     longest_first = np.argsort(-step_counts, kind="stable")
     first_start_steps = start[longest_first]
-    attitude, velocity, position = sensitivities = np.zeros(
+    d_attitude, d_velocity, d_position = sensitivities = np.zeros(
         (3, len(end), 3, SENSITIVITY_COLUMN_COUNT)
     )
-    attitude[:, :, 0:3] = np.eye(3)
-    force_m_s2 = rotate(segment.body_to_ned[1:], segment.force_m_s2)
+    d_attitude[:, :, 0:3] = np.eye(3)
+    specific_force_ned_m_s2 = rotate(segment.body_to_ned[1:], segment.force_m_s2)
     step_numbers = np.arange(int(step_counts.max(initial=0)))
     for step_number, count in zip(
         step_numbers, np.searchsorted(-step_counts[longest_first], -step_numbers), strict=True
@@ -240,21 +242,21 @@ def _state_sensitivities(segment: ReplaySegment, start: IntArray, end: IntArray)
         step = first_start_steps[:count] + step_number
         rows = slice(count)
         dt = segment.step_s[step][:, None, None]
-        force = force_m_s2[step]
+        force_m_s2 = specific_force_ned_m_s2[step]
         # Derivative of attitude by gyro bias, and of velocity by accelerometer bias, in one step
         bias_sensitivity_step = -segment.body_to_ned[1:][step] * dt
-        position[rows] += 0.5 * dt * velocity[rows]
-        velocity[rows] += (-skew(force) * dt) @ attitude[rows]
-        velocity[rows, :, 6:9] += bias_sensitivity_step
-        velocity[rows, :, INPUT_COLUMN] += (force + GRAVITY_M_S2) * dt[:, :, 0]
-        position[rows] += 0.5 * dt * velocity[rows]
-        attitude[rows, :, 3:6] += bias_sensitivity_step
-        attitude[rows, :, CORRECTION_COLUMN] -= segment.correction_rad[step]
+        d_position[rows] += 0.5 * dt * d_velocity[rows]
+        d_velocity[rows] += (-skew(force_m_s2) * dt) @ d_attitude[rows]
+        d_velocity[rows, :, 6:9] += bias_sensitivity_step
+        d_velocity[rows, :, ACCELERATION_COLUMN] += (force_m_s2 + GRAVITY_M_S2) * dt[:, :, 0]
+        d_position[rows] += 0.5 * dt * d_velocity[rows]
+        d_attitude[rows, :, 3:6] += bias_sensitivity_step
+        d_attitude[rows, :, CORRECTION_COLUMN] -= segment.correction_rad[step]
     sensitivities[:, longest_first] = sensitivities.copy()
     return np.concatenate(sensitivities, axis=1)
 
 
-def _imu_noise_by_interval(
+def _compute_imu_process_noise(
     step_counts: Array, duration_s: Array, velocity_per_attitude_error: Array
 ) -> tuple[Array, Array]:
     """Return the process noise of each interval for 1 rad/s gyro and 1 m/s² accelerometer noise.
@@ -265,7 +267,7 @@ def _imu_noise_by_interval(
     """
     n = np.maximum(step_counts, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n
-    # Velocity change per attitude error in one of n equal prediction steps
+    # Derivative of the velocity by the attitude error for one of n equal prediction steps
     m = velocity_per_attitude_error / n
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)

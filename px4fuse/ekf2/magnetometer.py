@@ -19,7 +19,7 @@ from px4fuse.trajectory.rotation import skew
 MIN_SIGMA_GAUSS = 0.01
 IDENTITY_MATRIX = np.eye(3)
 # v @ CROSS_PRODUCT is the cross product matrix [v]× of a vector v, flattened
-CROSS_PRODUCT = skew(IDENTITY_MATRIX).reshape(3, 9)
+CROSS_PRODUCT_TENSOR = skew(IDENTITY_MATRIX).reshape(3, 9)
 
 
 class EventSamples(NamedTuple):
@@ -44,10 +44,10 @@ class EventSamples(NamedTuple):
     noise: Array
 
 
-def mean_by_event(
+def average_by_event(
     segment: ReplaySegment, sensor_samples: SensorSamples, event_steps: IntArray
 ) -> EventSamples:
-    """Average the magnetometer or optical flow samples that are fused at each event."""
+    """Average the magnetometer or optical flow samples between two events (fused at the later)."""
     event_index = np.searchsorted(event_steps, sensor_samples.step)
     is_inside = event_index < len(event_steps)
     event_count = len(event_steps)
@@ -62,8 +62,8 @@ def mean_by_event(
     value, rotation_to_body, noise = map(
         mean, (sensor_samples.value, sensor_samples.rotation_to_body, sensor_samples.noise)
     )
-    if VELOCITY in sensor_samples.state_rows:  # propagate velocities to the event with the IMU
-        velocity_m_s = segment.imu_velocity_m_s[event_steps]
+    if VELOCITY in sensor_samples.state_rows:  # add the IMU's velocity change up to the event
+        velocity_m_s = segment.imu_velocity_change_m_s[event_steps]
         value = value + np.einsum("eab,eb->ea", rotation_to_body, velocity_m_s)
     sample_count = np.bincount(event_index, sensor_samples.sample_count[is_inside], event_count)
     return EventSamples(value, rotation_to_body, np.asarray(sample_count, float), noise)
@@ -95,12 +95,13 @@ def fuse_mean(
     """
     measured_state = x[:, state_rows]
     sample_count, R = sample_mean.sample_count, sample_mean.noise
-    cross_state, cross_theta = (
-        (vectors @ CROSS_PRODUCT).reshape(-1, 3, 3) for vectors in (measured_state, x[:, THETA])
+    state_cross_matrix, theta_cross_matrix = (
+        (vectors @ CROSS_PRODUCT_TENSOR).reshape(-1, 3, 3)
+        for vectors in (measured_state, x[:, THETA])
     )
     H = np.zeros((len(x), sample_mean.value.shape[-1], x.shape[1]))
-    H[:, :, THETA] = sample_mean.rotation_to_body @ cross_state
-    H[:, :, state_rows] = sample_mean.rotation_to_body @ (IDENTITY_MATRIX - cross_theta)
+    H[:, :, THETA] = sample_mean.rotation_to_body @ state_cross_matrix
+    H[:, :, state_rows] = sample_mean.rotation_to_body @ (IDENTITY_MATRIX - theta_cross_matrix)
     predicted_value = (H[:, :, state_rows] @ measured_state[:, :, None])[:, :, 0]
     if bias_state_rows is not None:
         H[:, :, bias_state_rows] = IDENTITY_MATRIX

@@ -31,15 +31,15 @@ from px4fuse.ekf2.filter_recursion import (
     with_state_correlation,
 )
 from px4fuse.ekf2.heights import MIN_GATE
-from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, matching_sample_rows, prepare_inputs
-from px4fuse.ekf2.intervals import Intervals, Timing, make_intervals
-from px4fuse.ekf2.output_predictor import follow_attitude, publish
+from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, find_matching_samples, prepare_inputs
+from px4fuse.ekf2.intervals import FusionDelays, Intervals, make_intervals
+from px4fuse.ekf2.output_predictor import compute_published_state, sum_attitude_corrections
 from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
-    MAX_COMPARED_REJECTED_FRACTION,
+    MAX_REJECTED_FOR_COMPARISON,
     Agreement,
     Ekf2Replay,
-    agreement_with_log,
+    compare_with_log,
     with_logged_rejections,
 )
 from px4fuse.ekf2.replay_segments import (
@@ -51,7 +51,7 @@ from px4fuse.ekf2.replay_segments import (
     THETA,
     VELOCITY,
     ReplaySegment,
-    update_table,
+    make_update_table,
 )
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import (
@@ -66,15 +66,7 @@ from px4fuse.flight.ekf2_parameters import (
     PARAMETERS,
     check_parameters,
 )
-from px4fuse.flight.model import (
-    AXIS_NAMES,
-    Columns,
-    Ekf2,
-    Flight,
-    NedAxis,
-    Unavailable,
-    time_index,
-)
+from px4fuse.flight.model import AXIS_NAMES, Columns, Ekf2, Flight, NedAxis, Unavailable, time_index
 from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.trajectory.rotation import rotate
 
@@ -84,14 +76,14 @@ MAX_HORIZON_S = 1.0
 # Number of replays that run together. A larger batch needs less time per replay, but more memory
 REPLAY_BATCH_SIZE = 10
 # Number of intervals whose states are computed at once, which limits memory
-BLOCK_EVENTS = 512
+EVENTS_PER_BLOCK = 512
 # State indices of velocity and position
-MOTION = slice(VELOCITY.start, POSITION.stop)
+VELOCITY_AND_POSITION = slice(VELOCITY.start, POSITION.stop)
 
-# Fields of Agreement with another name than PX4's name of the aiding source
-AGREEMENT_FIELDS = {FLOW.name: "carried_difference_m"}
+# Field of Agreement by PX4's name of the aiding source, if it does not have this name
+AGREEMENT_FIELD_BY_AID = {FLOW.name: "carried_difference_m"}
 
-RequestConfigurations = Callable[[Inputs], Sequence[FilterConfiguration]]
+ConfigurationRequest = Callable[[Inputs], Sequence[FilterConfiguration]]
 
 
 @dataclass(frozen=True)
@@ -110,14 +102,14 @@ class Model:
 
     flight: Flight
     inputs: Inputs
-    intervals: Mapping[Timing, tuple[Intervals, ...]]
+    intervals: Mapping[FusionDelays, tuple[Intervals, ...]]
     baseline_replay: Ekf2Replay
     agreement: Agreement
     runs: tuple[SegmentRun, ...] = ()
 
 
 def open_model(
-    flight: Flight, request_configurations: RequestConfigurations = lambda _: ()
+    flight: Flight, request_configurations: ConfigurationRequest = lambda _: ()
 ) -> Model | Unavailable:
     """Prepare a flight for EKF2 replays, and replay it with the logged parameters.
 
@@ -136,13 +128,13 @@ def open_model(
 
 def _open_without_aids(
     flight: Flight,
-    request_configurations: RequestConfigurations,
+    request_configurations: ConfigurationRequest,
     failed_agreements: Mapping[str, Agreement],
 ) -> Model | Unavailable:
     """Prepare a replay that omits some aiding sources.
 
-    ``failed_agreements`` contains the name of each omitted source, and the agreement with the log
-    of the replay that fused this source.
+    ``failed_agreements`` contains each omitted source (PX4's name), and the failed agreement of an
+    earlier replay that fused it.
     """
     omitted_aids = {name: agreement.doubtful[name] for name, agreement in failed_agreements.items()}
     inputs = prepare_inputs(flight, omitted_aids)
@@ -151,35 +143,37 @@ def _open_without_aids(
     if inputs.aid == GNSS_POS and isinstance(flight.ekf2, Ekf2):
         flight = replace(flight, ekf2=with_gnss_innovations(flight.ekf2))
     baseline_configuration = FilterConfiguration(inputs.settings)
-    timing = baseline_configuration.timing(inputs)
-    intervals = tuple(make_intervals(inputs, segment, timing) for segment in inputs.segments)
+    delays = baseline_configuration.compute_delays(inputs)
+    intervals = tuple(make_intervals(inputs, segment, delays) for segment in inputs.segments)
     segments = tuple(with_state_correlation(inputs, segment) for segment in inputs.segments)
     inputs = replace(inputs, segments=segments)
     configurations = [baseline_configuration]
-    if np.mean(inputs.received.rejected > 0.0) > MAX_COMPARED_REJECTED_FRACTION:
+    if np.mean(inputs.received.rejected > 0.0) > MAX_REJECTED_FOR_COMPARISON:
         configurations.append(FilterConfiguration(inputs.settings, uses_logged_decisions=True))
     for configuration in request_configurations(inputs):
         configurations += [] if configuration in configurations else [configuration]
-    intervals_by_timing = {timing: intervals}
-    runs = run_configurations(inputs, configurations, intervals_by_timing)
+    intervals_by_delays = {delays: intervals}
+    runs = run_configurations(inputs, configurations, intervals_by_delays)
     baseline_replay = _make_replay(inputs, runs, baseline_configuration, {})
-    agreement = agreement_with_log(flight, baseline_replay)
+    agreement = compare_with_log(flight, baseline_replay)
     if isinstance(agreement, Unavailable):
         return agreement
-    model = Model(flight, inputs, intervals_by_timing, baseline_replay, agreement, tuple(runs))
+    model = Model(flight, inputs, intervals_by_delays, baseline_replay, agreement, tuple(runs))
     rejected_fraction = max(
         agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed
     )
     if (
-        rejected_fraction > MAX_COMPARED_REJECTED_FRACTION
+        rejected_fraction > MAX_REJECTED_FOR_COMPARISON
         and np.isfinite(inputs.received.rejected).any()
     ):
-        agreement_with_rejections = agreement_with_log(flight, replay_with_logged_rejections(model))
+        agreement_with_rejections = compare_with_log(flight, replay_with_logged_rejections(model))
         if isinstance(agreement_with_rejections, Agreement):
             agreement = with_logged_rejections(agreement, agreement_with_rejections)
-    # The agreement of an omitted aiding source is from the replay that fused this source
+    # The agreement of an omitted source is that of the earlier replay, which fused the source
     failed_results = {
-        (field_name := AGREEMENT_FIELDS.get(name, name)): getattr(failed_agreement, field_name)
+        (field_name := AGREEMENT_FIELD_BY_AID.get(name, name)): getattr(
+            failed_agreement, field_name
+        )
         for name, failed_agreement in failed_agreements.items()
     }
     agreement = structs.replace(
@@ -198,10 +192,10 @@ def replay_with_logged_rejections(model: Model) -> Ekf2Replay:
     return _make_replay(model.inputs, _run_model(model, [configuration]), configuration, {})
 
 
-def replay_settings(
+def replay_with_settings(
     model: Model,
     settings: Sequence[Mapping[str, float]],
-    excluded_s: Array | None = None,
+    excluded_times_s: Array | None = None,
     without: Mapping[str, float] | None = None,
 ) -> Iterator[Ekf2Replay]:
     """Replay EKF2 with several sets of changed parameters.
@@ -213,7 +207,7 @@ def replay_settings(
     model : Model
     settings : sequence of mapping
         Changed parameters of each replay, by PX4 name and in PX4's units.
-    excluded_s : ndarray, optional
+    excluded_times_s : ndarray, optional
         Timestamps of position samples that are not used.
     without : mapping from PX4's name of an aiding source to float, optional
         Time (s) from which the aiding source is not fused.
@@ -246,14 +240,14 @@ def replay_settings(
     if inputs.rules.uses_delay_as_horizon:
         firmware = model.flight.log.firmware
         reasons["EKF2_DELAY_MAX"] = (
-            f"in {firmware} the largest delay parameter is the delay of the fusion horizon"
+            f"in {firmware} the largest delay parameter is the delay of the fusion horizon instead"
         )
     if inputs.received.uses_sender_times:
         reasons[GNSS_POS.delay] = "EKF2 uses the measurement times of the receiver driver"
     for name in [name for change in changes for name in change if name in reasons]:
         raise SettingsError(f"{name} has no effect in a replay of this log: {reasons[name]}.")
     without = without or {}
-    fused_aids = modelled_aids(inputs) if without else []
+    fused_aids = list_modelled_aids(inputs) if without else []
     if unknown_aids := without.keys() - set(fused_aids):
         fused_text = ", ".join(fused_aids)
         if inputs.logged_height_reason:
@@ -262,34 +256,34 @@ def replay_settings(
             f"{min(unknown_aids)} cannot be omitted: the replay of this log fuses only "
             f"{fused_text}."
         )
-    if excluded_s is not None:
-        excluded_rows = matching_sample_rows(inputs.received.timestamp_s, excluded_s)
+    if excluded_times_s is not None:
+        excluded_rows = find_matching_samples(inputs.received.timestamp_s, excluded_times_s)
         rejected_flags = np.full(len(inputs.received.timestamp_s), np.nan)
         rejected_flags[excluded_rows[excluded_rows >= 0]] = 1.0
-        no_reset = np.zeros(len(rejected_flags), dtype=bool)
+        is_reset = np.zeros(len(rejected_flags), dtype=bool)
         inputs = replace(
             inputs,
             received=replace(
-                inputs.received, rejected=rejected_flags, reset=no_reset, has_all_resets=False
+                inputs.received, rejected=rejected_flags, reset=is_reset, has_all_resets=False
             ),
         )
         model = replace(model, inputs=inputs, runs=())
     configurations = [
         FilterConfiguration(
             {**inputs.settings, **change},
-            uses_logged_decisions=excluded_s is not None,
+            uses_logged_decisions=excluded_times_s is not None,
             without=without,
         )
         for change in changes
     ]
-    return _replays(model, configurations, changes, excluded_s)
+    return _run_replays(model, configurations, changes, excluded_times_s)
 
 
-def _replays(
+def _run_replays(
     model: Model,
     configurations: Sequence[FilterConfiguration],
     changes: Sequence[Mapping[str, float]],
-    excluded_s: Array | None,
+    excluded_times_s: Array | None,
 ) -> Iterator[Ekf2Replay]:
     inputs = model.inputs
     runs: Sequence[SegmentRun] = ()
@@ -299,16 +293,18 @@ def _replays(
             runs = _run_model(model, configurations[index : index + REPLAY_BATCH_SIZE])
         replay = _make_replay(inputs, runs, configuration, change)
         updates = replay.updates
-        if excluded_s is not None:
+        if excluded_times_s is not None:
             age_s = configuration.settings[inputs.aid.delay] * 1e-3 + 0.5 * inputs.mean_step_s
-            excluded_rows = matching_sample_rows(updates.index.to_numpy(), excluded_s - age_s)
+            excluded_rows = find_matching_samples(
+                updates.index.to_numpy(), excluded_times_s - age_s
+            )
             updates = updates.iloc[
                 np.delete(np.arange(len(updates)), excluded_rows[excluded_rows >= 0])
             ]
         yield structs.replace(replay, updates=updates, agreement=model.agreement)
 
 
-def modelled_aids(inputs: Inputs) -> list[str]:
+def list_modelled_aids(inputs: Inputs) -> list[str]:
     """Return PX4's names of the aiding sources that the EKF2 model fuses."""
     segment = inputs.segments[0]
     is_fused = {
@@ -331,7 +327,7 @@ def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
         if samples is not None:
             position_noise_m = rng.normal(scale=sigma_m, size=samples.position_m.shape)
             new_inputs[name] = replace(samples, position_m=samples.position_m + position_noise_m)
-    # The noise does not change the times of the positions, so the intervals remain valid
+    # The noise does not change the times of the positions, so the computed intervals are reused
     return replace(model, inputs=replace(inputs, **new_inputs), runs=())
 
 
@@ -353,7 +349,7 @@ def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float)
     return replace(model, inputs=inputs, intervals=intervals, runs=())
 
 
-def delayed_tracks(
+def compute_delayed_tracks(
     model: Model, configurations: Sequence[FilterConfiguration]
 ) -> Iterator[pd.DataFrame]:
     """Yield position and velocity at the fusion horizon for each filter configuration.
@@ -364,8 +360,8 @@ def delayed_tracks(
     for configuration_index in map(runs[0].configurations.index, configurations):
         tracks = []
         for run in runs:
-            motion = _states_after_steps(run, configuration_index, MOTION)
-            tracks.append(_track(run, motion[:, 3:], motion[:, :3]))
+            motion = _compute_states_after_steps(run, configuration_index, VELOCITY_AND_POSITION)
+            tracks.append(_make_track(run, motion[:, 3:], motion[:, :3]))
         yield _join_segments(tracks)
 
 
@@ -380,29 +376,31 @@ def _run_model(model: Model, configurations: Sequence[FilterConfiguration]) -> S
 def run_configurations(
     inputs: Inputs,
     configurations: Sequence[FilterConfiguration],
-    computed_intervals: Mapping[Timing, Sequence[Intervals]],
+    computed_intervals: Mapping[FusionDelays, Sequence[Intervals]],
 ) -> list[SegmentRun]:
-    """Run filter configurations through all segments.
+    """Run filter configurations through all segments, and return states and updates by segment.
 
-    ``computed_intervals`` contains intervals that need not be computed again.
+    ``computed_intervals``: transition and process noise of each segment, if already computed.
     """
-    timings = [configuration.timing(inputs) for configuration in configurations]
+    all_delays = [configuration.compute_delays(inputs) for configuration in configurations]
     segment_runs = []
     for segment_index, segment in enumerate(inputs.segments):
         intervals = {
-            timing: by_segment[segment_index] for timing, by_segment in computed_intervals.items()
+            delays: by_segment[segment_index] for delays, by_segment in computed_intervals.items()
         }
-        for timing in set(timings) - computed_intervals.keys():
-            intervals[timing] = make_intervals(inputs, segment, timing)
+        for delays in set(all_delays) - computed_intervals.keys():
+            intervals[delays] = make_intervals(inputs, segment, delays)
         segment_runs.append(
-            run_segment(inputs, segment, configurations, [intervals[timing] for timing in timings])
+            run_segment(
+                inputs, segment, configurations, [intervals[delays] for delays in all_delays]
+            )
         )
     return segment_runs
 
 
-def _track(run: SegmentRun, position_m: Array, velocity_m_s: Array) -> pd.DataFrame:
-    """Return position and velocity at each prediction step, scaled as EKF2 publishes them."""
-    states = np.hstack([position_m / run.segment.ekf2_metres_per_metre, velocity_m_s])
+def _make_track(run: SegmentRun, position_m: Array, velocity_m_s: Array) -> pd.DataFrame:
+    """Return velocity and position (in published metres) at each prediction step."""
+    states = np.hstack([position_m / run.segment.position_scale, velocity_m_s])
     return pd.DataFrame(states, time_index(run.segment.time_s), Columns.STATE, copy=False)
 
 
@@ -418,10 +416,11 @@ def _make_replay(
     changed_parameters: Mapping[str, float],
 ) -> Ekf2Replay:
     configuration_index = runs[0].configurations.index(configuration)
-    delayed, published = zip(
-        *(_delayed_and_published(inputs, run, configuration_index) for run in runs), strict=True
+    delayed_tables, published_tables = zip(
+        *(_make_delayed_and_published(inputs, run, configuration_index) for run in runs),
+        strict=True,
     )
-    updates_by_run = [_updates_by_aid(inputs, run, configuration_index) for run in runs]
+    updates_by_run = [_collect_updates_by_aid(inputs, run, configuration_index) for run in runs]
     updates_by_aid = {
         name: pd.concat([updates[name] for updates in updates_by_run]) for name in updates_by_run[0]
     }
@@ -433,10 +432,10 @@ def _make_replay(
             span
             for run, updates in zip(runs, updates_by_run, strict=True)
             if run.segment.flow is not None
-            for span in _flow_only_spans_s(updates[inputs.aid.name], run.segment)
+            for span in _find_flow_only_spans(updates[inputs.aid.name], run.segment)
         ),
-        delayed=_join_segments(delayed),
-        published=_join_segments(published),
+        delayed=_join_segments(delayed_tables),
+        published=_join_segments(published_tables),
         other_aid_updates=updates_by_aid,
         stretches_s=tuple(tuple(run.segment.time_s[[0, -1]].tolist()) for run in runs),
         source=inputs.received.source,
@@ -445,8 +444,8 @@ def _make_replay(
     )
 
 
-def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Span]:
-    """Return the time spans (s) without a fused position that are longer than RESTART_GAP_S."""
+def _find_flow_only_spans(updates: pd.DataFrame, segment: ReplaySegment) -> list[Span]:
+    """Return the time spans (s) above RESTART_GAP_S in which flow, but no position, was fused."""
     is_used = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
     fusion_times_s = [*updates.loc[is_used, "fused_at_s"], float(segment.time_s[-1])]
     return [
@@ -456,7 +455,7 @@ def _flow_only_spans_s(updates: pd.DataFrame, segment: ReplaySegment) -> list[Sp
     ]
 
 
-def _updates_by_aid(
+def _collect_updates_by_aid(
     inputs: Inputs, run: SegmentRun, configuration_index: int
 ) -> dict[str, pd.DataFrame]:
     """Return the updates with each aiding source; the keys are PX4's names of the sources."""
@@ -475,13 +474,15 @@ def _updates_by_aid(
         )
     )
 
-    def updates_along(axes: Sequence[NedAxis], columns: slice, *other_values: Any) -> pd.DataFrame:
-        update_log = np.column_stack([nu[:, columns], S[:, columns], *other_values])
-        return update_table(update_log[:, None], events.time_s[:, None], end_s, axes)
+    def make_axis_table(
+        axes: Sequence[NedAxis], columns: slice, *other_values: Any
+    ) -> pd.DataFrame:
+        update_records = np.column_stack([nu[:, columns], S[:, columns], *other_values])
+        return make_update_table(update_records[:, None], events.time_s[:, None], end_s, axes)
 
     position_variance = variance_after[:, HORIZONTAL_POSITION]
     updates_by_aid = {
-        inputs.aid.name: updates_along(
+        inputs.aid.name: make_axis_table(
             HORIZONTAL_AXES,
             POSITION_COLUMNS,
             rejected,
@@ -493,62 +494,64 @@ def _updates_by_aid(
     }
     if height_filter is not None:
         for name in height_filter.fused_sensors:
-            updates_by_aid[name] = height_filter.updates(name, configuration_index, end_s)
+            updates_by_aid[name] = height_filter.make_update_table(name, configuration_index, end_s)
     if inputs.received.velocity_m_s is not None:
         gate = run.configurations[configuration_index].settings[GNSS_VEL.gate]
-        # Clipped innovations are at the gate and fused; the factor allows for rounding errors
-        velocity_limit = (1.0 + 1e-9) * max(gate, MIN_GATE) ** 2
-        is_outside_gate = (nu[:, :3] ** 2 > velocity_limit * S[:, :3]).any(axis=1)
+        # EKF2 clips some innovations to the gate and fuses them; the factor allows for rounding
+        squared_gate = (1.0 + 1e-9) * max(gate, MIN_GATE) ** 2
+        is_outside_gate = (nu[:, :3] ** 2 > squared_gate * S[:, :3]).any(axis=1)
         # Without GNSS height, the replay uses EKF2's logged height
         axes = AXIS_NAMES if GNSS_HGT.name in updates_by_aid else HORIZONTAL_AXES
-        updates_by_aid[GNSS_VEL.name] = updates_along(axes, slice(len(axes)), is_outside_gate)
+        updates_by_aid[GNSS_VEL.name] = make_axis_table(axes, slice(len(axes)), is_outside_gate)
     if run.vision_filter is not None:
-        updates_by_aid[EV_POS.name] = run.vision_filter.updates(configuration_index, end_s)
+        updates_by_aid[EV_POS.name] = run.vision_filter.make_update_table(
+            configuration_index, end_s
+        )
     return updates_by_aid
 
 
-def _delayed_and_published(
+def _make_delayed_and_published(
     inputs: Inputs, run: SegmentRun, configuration_index: int
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return the state at the fusion horizon, and the published state, after each step."""
     segment = run.segment
     configuration = run.configurations[configuration_index]
-    state, reset = delayed_states(run, configuration_index)
-    horizon_s = min(configuration.timing(inputs).horizon_s, MAX_HORIZON_S)
+    state, reset = compute_delayed_states(run, configuration_index)
+    horizon_s = min(configuration.compute_delays(inputs).horizon_s, MAX_HORIZON_S)
     lag_steps = max(round(horizon_s / inputs.mean_step_s), 1)
-    # without attitude states, the nominal (published) attitude already is EKF2's logged attitude
-    published_rotation = np.zeros((len(state), 3))
+    # without attitude states, the published attitude is used unchanged, so its correction is 0
+    attitude_correction_rad = np.zeros((len(state), 3))
     if configuration.estimates_attitude:
-        published_rotation = follow_attitude(
+        attitude_correction_rad = sum_attitude_corrections(
             state[:, THETA] - segment.attitude_error_rad, lag_steps, inputs.mean_step_s, horizon_s
         )
-    published_velocity, published_position = publish(
-        segment, state, reset, published_rotation, lag_steps, configuration.settings
+    published_velocity, published_position = compute_published_state(
+        segment, state, reset, attitude_correction_rad, lag_steps, configuration.settings
     )
     heading_rad = (
         np.arctan2(segment.body_to_ned[:, 1, 0], segment.body_to_ned[:, 0, 0]) + state[:, HEADING]
     )
-    delayed_track = _track(run, state[:, POSITION], state[:, VELOCITY])
-    return delayed_track.assign(heading_rad=heading_rad), _track(
+    delayed_track = _make_track(run, state[:, POSITION], state[:, VELOCITY])
+    return delayed_track.assign(heading_rad=heading_rad), _make_track(
         run, published_position, published_velocity
     )
 
 
-def delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Array]:
+def compute_delayed_states(run: SegmentRun, configuration_index: int) -> tuple[Array, Array]:
     """Return state and sum of position resets (m) at the fusion horizon after each of n steps.
 
     Shapes (n + 1, 15) and (n + 1, 3).
     """
     event_steps = run.events[configuration_index].end_step
-    reset_m = np.zeros((len(run.segment.time_s), 3))
+    cumulative_reset_m = np.zeros((len(run.segment.time_s), 3))
     position_reset_m = run.position_reset_m[:, configuration_index]
     for event_index in np.flatnonzero(position_reset_m.any(axis=1)):
-        reset_m[event_steps[event_index] :, :2] += position_reset_m[event_index]
-    return _states_after_steps(run, configuration_index, slice(None)), reset_m
+        cumulative_reset_m[event_steps[event_index] :, :2] += position_reset_m[event_index]
+    return _compute_states_after_steps(run, configuration_index, slice(None)), cumulative_reset_m
 
 
-def _states_after_steps(run: SegmentRun, configuration_index: int, rows: slice) -> Array:
-    """Return the states ``rows`` at the fusion horizon after each of n steps."""
+def _compute_states_after_steps(run: SegmentRun, configuration_index: int, rows: slice) -> Array:
+    """Return the state components ``rows`` at the fusion horizon after each of n steps."""
     event_steps = run.events[configuration_index].end_step
     event_states = run.state[:, configuration_index]
     step_count = len(run.segment.step_s)
@@ -556,7 +559,9 @@ def _states_after_steps(run: SegmentRun, configuration_index: int, rows: slice) 
     states = np.empty((step_count + 1, event_states[0, rows].size))
     states[0] = event_states[0, rows]
     # Blocks of intervals, because the arrays of a whole flight need much memory
-    block_edges = np.searchsorted(interval_index, np.arange(0, len(event_steps) + 1, BLOCK_EVENTS))
+    block_edges = np.searchsorted(
+        interval_index, np.arange(0, len(event_steps) + 1, EVENTS_PER_BLOCK)
+    )
     for steps in starmap(slice, pairwise([*block_edges, step_count])):
         states[1:][steps] = _propagate_states(
             run, configuration_index, interval_index[steps], steps
@@ -568,7 +573,7 @@ def _states_after_steps(run: SegmentRun, configuration_index: int, rows: slice) 
 def _propagate_states(
     run: SegmentRun, configuration_index: int, interval_index: IntArray, steps: slice
 ) -> Array:
-    """Return the states after ``steps``; ``interval_index`` is the interval of each step."""
+    """Propagate the state from the start of the interval of each step to the end of the step."""
     segment, configuration = run.segment, run.configurations[configuration_index]
     start_state: Array = run.state[interval_index, configuration_index]
     state, body_to_ned = start_state.copy(), segment.body_to_ned[1:][steps]
@@ -584,14 +589,16 @@ def _propagate_states(
         previous_state = np.concatenate([state[:1, rows], state[:-1, rows]])
         return np.where(is_first_step, start_state[:, rows], previous_state)
 
-    # θ += -R b_g Δt; v += (θ × a - R b_a + a + g) Δt; p += mean velocity · Δt
+    # As in intervals.py: θ += -R b_g Δt; v += (θ × a - R b_a + a + g) Δt; p += mean velocity · Δt
     rotation_steps = -rotate(body_to_ned, state[:, GYRO_BIAS]) * step_s
     if configuration.estimates_attitude:
         rotation_steps -= segment.correction_rad[steps]
     state[:, THETA] += sum_since_event(rotation_steps)
-    force_ned_m_s2 = rotate(body_to_ned, segment.force_m_s2[steps])
+    specific_force_ned_m_s2 = rotate(body_to_ned, segment.force_m_s2[steps])
     acceleration = (
-        np.cross(value_before_step(THETA), force_ned_m_s2) + force_ned_m_s2 + GRAVITY_M_S2
+        np.cross(value_before_step(THETA), specific_force_ned_m_s2)
+        + specific_force_ned_m_s2
+        + GRAVITY_M_S2
     )
     acceleration -= rotate(body_to_ned, state[:, ACCELEROMETER_BIAS])
     state[:, VELOCITY] += sum_since_event(acceleration * step_s)

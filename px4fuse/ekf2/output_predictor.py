@@ -28,10 +28,10 @@ from px4fuse.trajectory.rotation import rotate
 INTEGRAL_GAIN = 0.1
 # Attitude: correction = ATTITUDE_GAIN · error · step / delay of the fusion horizon
 # (output_predictor.cpp)
-ATTITUDE_GAIN = 0.5
+ATTITUDE_CORRECTION_GAIN = 0.5
 
 
-def publish(
+def compute_published_state(
     segment: ReplaySegment,
     state: Array,
     reset_m: Array,
@@ -56,37 +56,38 @@ def publish(
         EKF2 parameters by PX4 name.
     """
     step_s = segment.step_s[:, None]
-    mean_step = float(np.mean(segment.step_s))
+    mean_step_s = float(np.mean(segment.step_s))
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
     increments = segment.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag_steps)[1:]
     increments = rotate(segment.body_to_ned[1:], increments)
     increments += np.cross(attitude_difference_rad[1:], increments)
     increments += GRAVITY_M_S2
     increments *= step_s
-    velocity_m_s = _follow_state(
-        state[:, VELOCITY], increments, lag_steps, mean_step, settings["EKF2_TAU_VEL"]
+    velocity_m_s = _predict_output(
+        state[:, VELOCITY], increments, lag_steps, mean_step_s, settings["EKF2_TAU_VEL"]
     )
-    # the IMU changes the velocity within a step; corrections apply at the end of the step
+    # mean velocity of a step = velocity before + half of the IMU increment, because corrections are
+    # added at the end of the step
     increments *= 0.5
     increments += velocity_m_s[:-1]
     increments *= step_s
-    # a reset is removed, because EKF2 shifts the whole buffer with a reset
+    # without resets: a reset shifts all buffered outputs, so the predictor has no error to correct
     position_without_resets = state[:, POSITION] - reset_m
-    position_m = _follow_state(
-        position_without_resets, increments, lag_steps, mean_step, settings["EKF2_TAU_POS"]
+    position_m = _predict_output(
+        position_without_resets, increments, lag_steps, mean_step_s, settings["EKF2_TAU_POS"]
     )
     position_m += delay_by(reset_m, lag_steps)
     return velocity_m_s, position_m
 
 
-def _follow_state(
+def _predict_output(
     state: Array, increments: Array, lag_steps: int, step_s: float, tau_s: float
 ) -> Array:
     """Return the output of the predictor: sum of IMU ``increments`` and of corrections.
 
-    In step k, the error at the fusion horizon is e_k = o_(k-lag) - c_k. Here o is the state minus
-    the sum of increments, and c is the sum of corrections: a correction shifts the whole buffer.
-    With gain g, c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
+    o: state minus sum of increments; c: sum of corrections, each of which shifts the whole buffer;
+    g: gain. In step k, the error at the fusion horizon is e_k = o_(k-lag) - c_k, and
+    c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
     """
     dead_reckoned = np.concatenate([state[:1], increments])
     np.cumsum(dead_reckoned, axis=0, out=dead_reckoned)
@@ -94,7 +95,7 @@ def _follow_state(
     offset -= (start_offset := offset[0].copy())
     gain = step_s / np.clip(tau_s, step_s, 10.0)
     integral_gain = INTEGRAL_GAIN * gain**2
-    correction_sum = _recursive_filter(
+    correction_sum = _apply_recursive_filter(
         np.array([gain + integral_gain, -gain]),
         np.array([1.0, gain + integral_gain - 2.0, 1.0 - gain]),
         delay_by(offset, lag_steps),
@@ -109,21 +110,23 @@ def delay_by(values: Array, lag_steps: int) -> Array:
     return np.concatenate([np.repeat(values[:1], lag_steps, axis=0), values])[: len(values)]
 
 
-def follow_attitude(error_rad: Array, lag_steps: int, step_s: float, horizon_s: float) -> Array:
-    """Return the sum of the attitude corrections of the output predictor.
+def sum_attitude_corrections(
+    error_rad: Array, lag_steps: int, step_s: float, horizon_s: float
+) -> Array:
+    """Return the sum of the output predictor's attitude corrections after each step.
 
     Each step corrects the attitude by 0.5 · step / horizon of ``error_rad``, the attitude error at
-    the fusion horizon (rotation vectors, shape (n + 1, 3)).
+    the fusion horizon (rotation vectors, shape (n + 1, 3)), ``lag_steps`` behind the output.
     """
-    gain = ATTITUDE_GAIN * step_s / max(horizon_s, step_s)
+    gain = ATTITUDE_CORRECTION_GAIN * step_s / max(horizon_s, step_s)
     numerator, denominator = np.zeros((2, lag_steps + 2))
     numerator[-1] = gain
     denominator[:2] = (1.0, -1.0)
     denominator[-1] += gain
-    return _recursive_filter(numerator, denominator, error_rad)
+    return _apply_recursive_filter(numerator, denominator, error_rad)
 
 
-def _recursive_filter(numerator: Array, denominator: Array, values: Array) -> Array:
+def _apply_recursive_filter(numerator: Array, denominator: Array, values: Array) -> Array:
     """Apply a recursive (IIR) filter by solving banded triangular systems (LAPACK dtbtrs)."""
     value_count = len(values)
     filtered = np.zeros(values.shape)
@@ -133,8 +136,8 @@ def _recursive_filter(numerator: Array, denominator: Array, values: Array) -> Ar
         block = filtered[rows]
         if rows.start:
             for delay in (1 + np.flatnonzero(denominator[1:])).tolist():
-                past = filtered[rows.start - delay : rows.start][: len(block)]
-                block[:delay] -= denominator[delay] * past
+                past_output = filtered[rows.start - delay : rows.start][: len(block)]
+                block[:delay] -= denominator[delay] * past_output
         bands = np.tile(denominator, (len(block), 1)).T
         block[:] = lapack.dtbtrs(bands, block, uplo="L")[0]
     return filtered

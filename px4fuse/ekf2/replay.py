@@ -22,8 +22,13 @@ from px4fuse.core.record import (
     Span,
 )
 from px4fuse.core.text import count_noun
-from px4fuse.ekf2.inputs import ANALYSIS_NAME, innovation_topic, matching_sample_rows, replayed_aid
-from px4fuse.ekf2.replay_segments import SETTLING_S
+from px4fuse.ekf2.inputs import (
+    ANALYSIS_NAME,
+    find_matching_samples,
+    find_replayed_aid,
+    innovation_topic,
+)
+from px4fuse.ekf2.replay_segments import REPLAY_SETTLING_S
 from px4fuse.filter import signals
 from px4fuse.filter.frame_rotation import heading_rad
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, FLOW, GNSS_VEL, MAG
@@ -44,36 +49,37 @@ T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
 HORIZONTAL_AXES: tuple[NedAxis, NedAxis] = ("north", "east")
 # Minimum number of logged innovations for a comparison with the EKF2 replay
 MIN_COMPARED_INNOVATIONS = 20
-CONSTANT_INNOVATIONS = "the logged or replayed innovations are constant"
+CONSTANT_INNOVATIONS_REASON = "the logged or replayed innovations are constant"
 # Maximum time (s) from an update to its logged innovation (estimator_innovations)
 MAX_INNOVATION_AGE_S = 0.5
 # Two times are in one prediction step if they differ by less than this time (s)
-SAME_STEP_S = 0.002
+MAX_SAME_STEP_DIFFERENCE_S = 0.002
 # Minimum correlation of replayed and logged innovations: above 0.997 with complete logs, below 0.9
 # with a downsampled source or IMU dropouts (tests/benchmarks/bench_ekf2.py)
 MIN_INNOVATION_CORRELATION = 0.95
 # Maximum |median of (S replayed / S logged) - 1|: below 0.003 with complete logs, above 0.05 with a
 # downsampled position source
-MAX_S_DIFFERENCE = 0.05
+MAX_RELATIVE_S_DIFFERENCE = 0.05
 # Maximum RMS difference (m) of replayed and logged position: below 0.013 m with complete logs
 MAX_PUBLISHED_DIFFERENCE_M = 0.10
-# Maximum position difference (m) while optical flow, which is logged at a reduced rate, is the only
-# horizontal aiding source
+# Maximum difference (m) of replayed and logged position while optical flow, which is logged at a
+# reduced rate, is the only horizontal aiding source
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
 # Single innovations are compared only if a smaller fraction of the samples is rejected. Each
 # rejection changes many later innovations
-MAX_COMPARED_REJECTED_FRACTION = 0.05
+MAX_REJECTED_FOR_COMPARISON = 0.05
 # Published positions are compared only if a smaller fraction of the samples is rejected. With more
 # rejections, EKF2's position is mostly integrated from the IMU
 MOSTLY_REJECTED_FRACTION = 0.5
-# Minimum correlation of replayed and logged innovations if most positions are rejected
-MIN_IMU_CORRELATION = 0.99
+# Minimum correlation of replayed and logged innovations if a larger fraction is rejected
+MIN_MOSTLY_IMU_CORRELATION = 0.99
 # Maximum |rejected fraction of the replay - rejected fraction in the log|
 MAX_REJECTED_DIFFERENCE = 0.05
 # Maximum |mean NIS of the replay / mean NIS in the log - 1|
-MAX_NIS_DIFFERENCE = 0.25
-# Factor on MAX_PUBLISHED_DIFFERENCE_M for a replay with logged rejections
-REJECTING_TOLERANCE_FACTOR = 3.0
+MAX_RELATIVE_NIS_DIFFERENCE = 0.25
+# Factor on MAX_PUBLISHED_DIFFERENCE_M for a replay with EKF2's logged rejections, which is used on
+# flights with many rejections
+REJECTION_TOLERANCE_FACTOR = 3.0
 
 
 class AxisAgreement(Record, kw_only=True):
@@ -200,16 +206,16 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     flow_only_spans_s: NotWritten[Spans] = NOT_WRITTEN
 
     def find_evaluated_spans(self) -> Spans:
-        """Return the evaluated time spans (s): settled filter, not with optical flow alone."""
+        """Return the replayed time spans (s), without REPLAY_SETTLING_S and optical flow alone."""
         evaluated_spans_s = []
         for start, end in self.stretches_s:
-            begin = start + SETTLING_S
+            begin_s = start + REPLAY_SETTLING_S
             for flow_start, flow_end in self.flow_only_spans_s:
-                if begin < flow_start < end:
-                    evaluated_spans_s.append((begin, flow_start))
-                    begin = flow_end + SETTLING_S
-            if begin < end:
-                evaluated_spans_s.append((begin, end))
+                if begin_s < flow_start < end:
+                    evaluated_spans_s.append((begin_s, flow_start))
+                    begin_s = flow_end + REPLAY_SETTLING_S
+            if begin_s < end:
+                evaluated_spans_s.append((begin_s, end))
         return tuple(evaluated_spans_s)
 
 
@@ -221,13 +227,13 @@ class _ComparedInnovations(NamedTuple):
     axes: dict[str, AxisAgreement]
 
     def compute_rejected_fractions(self) -> tuple[float, float]:
-        logged, replayed = (
+        logged_fraction, replayed_fraction = (
             float(np.mean(innovations["rejected"] > 0.0)) for innovations in self[:2]
         )
-        return logged, replayed
+        return logged_fraction, replayed_fraction
 
 
-def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
+def compare_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
     """Compare a replay that uses the logged parameters with EKF2's logged innovations and state."""
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
@@ -237,7 +243,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
             "EKF2's position is not logged in the replayed time",
             "Record vehicle_local_position during the whole flight.",
         )
-    aid = replayed_aid(ekf2)
+    aid = find_replayed_aid(ekf2)
     position_agreement = _compare_innovations(
         ekf2,
         replay,
@@ -254,15 +260,15 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     rejected_fraction_logged, rejected_fraction_replayed = (
         position_agreement.compute_rejected_fractions()
     )
-    is_good, reason = _agreement_verdict(
+    is_good, reason = _judge_agreement(
         position_agreement.axes, rejected_fraction_logged, rejected_fraction_replayed
     )
-    agreements, omitted_aids = _other_agreements(ekf2, replay)
-    flow_only_m = _flow_only_error_m(ekf2, replay)
-    if flow_only_m is not None and flow_only_m > MAX_FLOW_ONLY_DIFFERENCE_M:
+    agreement_by_aid, omitted_aids = _compare_other_aids(ekf2, replay)
+    flow_error_m = _compute_flow_only_difference_m(ekf2, replay)
+    if flow_error_m is not None and flow_error_m > MAX_FLOW_ONLY_DIFFERENCE_M:
         omitted_aids[FLOW.name] = (
             f"while {FLOW.label} was the only horizontal aiding source, replayed and logged "
-            f"positions differ by {_format_above(flow_only_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
+            f"positions differ by {_format_exceeding(flow_error_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
             f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
         )
     is_same_decision = (position_agreement.logged["rejected"] > 0.0).to_numpy() == (
@@ -272,7 +278,7 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
     return Agreement(
         north=position_agreement.axes["north"],
         east=position_agreement.axes["east"],
-        **(agreements | {aid.name: position_agreement.axes}),
+        **(agreement_by_aid | {aid.name: position_agreement.axes}),
         doubtful=omitted_aids,
         samples=len(position_agreement.logged),
         rejected_fraction_logged=rejected_fraction_logged,
@@ -281,8 +287,8 @@ def agreement_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavai
         published_rms_difference_m=math.hypot(*distances_m),
         good=is_good,
         reason=reason,
-        heading_rms_difference_deg=_heading_error_deg(ekf2, replay),
-        carried_difference_m=flow_only_m,
+        heading_rms_difference_deg=_compute_heading_difference_deg(ekf2, replay),
+        carried_difference_m=flow_error_m,
     )
 
 
@@ -311,24 +317,24 @@ def _compare_innovations(
             f"the log contains only {count_noun(len(logged_innovations), 'innovation')} in the "
             f"replayed time (at least {MIN_COMPARED_INNOVATIONS} are needed)"
         )
-    axes = axes_of(replayed_innovations)
+    axes = list_innovation_axes(replayed_innovations)
     columns = [f"innovation_{axis}_m" for axis in axes]
     if not all(
         np.ptp(innovations[columns], axis=0).all()
         for innovations in (logged_innovations, replayed_innovations)
     ):
-        return CONSTANT_INNOVATIONS
+        return CONSTANT_INNOVATIONS_REASON
     return _ComparedInnovations(
         logged_innovations,
         replayed_innovations,
         {
-            axis: _axis_agreement(axis, logged_innovations, replayed_innovations, ekf2, replay)
+            axis: _compare_axis(axis, logged_innovations, replayed_innovations, ekf2, replay)
             for axis in axes
         },
     )
 
 
-def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
+def _compute_flow_only_difference_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     """Return the largest position difference (m) while optical flow was the only horizontal aid.
 
     Return None if other horizontal aiding sources were always available.
@@ -336,83 +342,87 @@ def _flow_only_error_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     logged_state = rows_inside(ekf2.state, replay.flow_only_spans_s)
     if logged_state.empty:
         return None
-    north_m, east_m = (
-        _replayed_minus_logged(replay, logged_state, name) for name in Columns.POSITION[:2]
+    north_difference_m, east_difference_m = (
+        _subtract_logged(replay, logged_state, name) for name in Columns.POSITION[:2]
     )
-    return float(np.hypot(north_m, east_m).max())
+    return float(np.hypot(north_difference_m, east_difference_m).max())
 
 
-def _replayed_minus_logged(replay: Ekf2Replay, logged_state: pd.DataFrame, name: str) -> Array:
+def _subtract_logged(replay: Ekf2Replay, logged_state: pd.DataFrame, name: str) -> Array:
     """Return replayed minus logged values of one column of the published state."""
     replayed = np.interp(logged_state.index, replay.published.index, replay.published[name])
     return np.asarray(replayed - logged_state[name])
 
 
-def _heading_error_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
+def _compute_heading_difference_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
     if MAG.noise not in replay.settings or isinstance(ekf2.record, Unavailable):
         return None
     logged_state = rows_inside(ekf2.record.delayed, replay.find_evaluated_spans())
     if logged_state.empty:
         return None
     replayed_heading_rad = replay.delayed["heading_rad"]
-    replayed_at_log_times_rad = np.interp(
+    heading_at_log_times_rad = np.interp(
         logged_state.index, replayed_heading_rad.index, np.unwrap(replayed_heading_rad)
     )
-    difference_rad = np.angle(np.exp(1j * (replayed_at_log_times_rad - heading_rad(logged_state))))
+    difference_rad = np.angle(np.exp(1j * (heading_at_log_times_rad - heading_rad(logged_state))))
     return float(np.degrees(rms(difference_rad)))
 
 
-def _other_agreements(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the agreement of all aiding sources except the position source.
+def _compare_other_aids(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any], dict[str, str]]:
+    """Compare replayed and logged innovations of all aiding sources except the position source.
 
-    The second mapping contains the sources that do not agree with the log, and the reasons.
+    Return the agreement of each source, and the reasons for sources that do not agree with the log.
     """
-    agreements: dict[str, Any] = {}
+    agreement_by_aid: dict[str, Any] = {}
     omitted_aids = {}
     for name, updates in replay.other_aid_updates.items():
         if (aid_log := ekf2.aids.get(name)) is None:
             continue
-        # The replay fuses a barometer sample at the next event, EKF2 at the time of the sample
+        # Barometer updates are matched by measurement time: the replay fuses a sample only at the
+        # end of the interval, later than EKF2
         matched_updates = (
             updates.assign(fused_at_s=updates.index) if name == BAROMETER.name else updates
         )
-        compared = _compare_innovations(
+        comparison = _compare_innovations(
             ekf2,
             replay,
             matched_updates,
             logged_aid_innovations(name, aid_log),
             innovation_topic(AIDS[name]) in aid_log.topics,
         )
-        if isinstance(compared, str):
-            is_good, reason = name == GNSS_VEL.name and compared != CONSTANT_INNOVATIONS, compared
+        if isinstance(comparison, str):
+            is_good, reason = (
+                name == GNSS_VEL.name and comparison != CONSTANT_INNOVATIONS_REASON,
+                comparison,
+            )
         else:
-            agreements[name] = compared.axes
-            is_good, reason = _agreement_verdict(
-                compared.axes, *compared.compute_rejected_fractions()
+            agreement_by_aid[name] = comparison.axes
+            is_good, reason = _judge_agreement(
+                comparison.axes, *comparison.compute_rejected_fractions()
             )
             is_good |= name == GNSS_VEL.name
         if not is_good:
             omitted_aids[name] = reason
-    return agreements, omitted_aids
+    return agreement_by_aid, omitted_aids
 
 
 def logged_aid_innovations(name: str, aid_log: AidLog) -> pd.DataFrame:
     """Return logged innovations, S and rejections of the aiding source ``name`` (PX4's name)."""
     gate = aid_log.parameters.get(AIDS[name].gate, AIDS[name].default_gate)
     axes = [axis for axis in AXIS_NAMES if axis in aid_log.axes]
-    return _columns_by_axis({axis: innovations_along(aid_log, axis, gate) for axis in axes})
+    return _join_axes({axis: innovations_along(aid_log, axis, gate) for axis in axes})
 
 
-def axes_of(updates: pd.DataFrame) -> list[NedAxis]:
+def list_innovation_axes(updates: pd.DataFrame) -> list[NedAxis]:
     return [axis for axis in AXIS_NAMES if f"innovation_{axis}_m" in updates]
 
 
 def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
     """Return the logged position innovations north and east, with S and rejections."""
-    return _columns_by_axis({axis: ekf2.innovations[axis] for axis in HORIZONTAL_AXES})
+    return _join_axes({axis: ekf2.innovations[axis] for axis in HORIZONTAL_AXES})
 
 
-def _columns_by_axis(innovations: Mapping[NedAxis, pd.DataFrame | Unavailable]) -> pd.DataFrame:
+def _join_axes(innovations: Mapping[NedAxis, pd.DataFrame | Unavailable]) -> pd.DataFrame:
     columns = {}
     for axis, axis_innovations in innovations.items():
         if isinstance(axis_innovations, Unavailable):
@@ -445,13 +455,14 @@ def match_updates(
     ``has_measurement_times`` is True if the innovations are from estimator_aid_src topics.
     """
     if has_measurement_times:
-        return matching_sample_rows(updates.index.to_numpy(), logged_s)
+        return find_matching_samples(updates.index.to_numpy(), logged_s)
     fused_at_s = updates["fused_at_s"].to_numpy()
     update_row = np.searchsorted(fused_at_s, logged_s + 1e-4, side="right") - 1
     age_s = logged_s - fused_at_s[np.maximum(update_row, 0)]
     is_matched = (update_row >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
-    # A row that is logged in the prediction step of a fusion may contain the previous innovation
-    is_unambiguous = is_matched & (age_s >= SAME_STEP_S)
+    # A row that is logged in the same prediction step as a fusion may still contain the previous
+    # innovation, so later rows are preferred
+    is_unambiguous = is_matched & (age_s >= MAX_SAME_STEP_DIFFERENCE_S)
     return np.where(
         is_unambiguous if is_unambiguous.sum() > 0.5 * is_matched.sum() else is_matched,
         update_row,
@@ -459,7 +470,7 @@ def match_updates(
     )
 
 
-def _axis_agreement(
+def _compare_axis(
     axis: NedAxis,
     logged_innovations: pd.DataFrame,
     replayed_innovations: pd.DataFrame,
@@ -474,7 +485,7 @@ def _axis_agreement(
     s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_logged, [5, 50, 95]).tolist()
     logged_state = rows_inside(ekf2.state, ekf2_replay.find_evaluated_spans())
     position_m, velocity_m_s = (
-        _replayed_minus_logged(ekf2_replay, logged_state, f"{axis}_{unit}") for unit in ("m", "m_s")
+        _subtract_logged(ekf2_replay, logged_state, f"{axis}_{unit}") for unit in ("m", "m_s")
     )
     return AxisAgreement(
         innovation_correlation=float(np.corrcoef(nu, nu_logged)[0, 1]),
@@ -489,7 +500,7 @@ def _axis_agreement(
     )
 
 
-def component_along(
+def interpolate_component(
     vectors: pd.DataFrame, columns: list[str], direction: Array, times_s: Array
 ) -> Array:
     """Interpolate the component of a vector (NED columns) along a direction."""
@@ -497,7 +508,7 @@ def component_along(
     return np.asarray(np.interp(times_s, vectors.index, component))
 
 
-def rms_to_truth(
+def compute_rmse_to_truth(
     flight: Flight, position_m: Array, direction: Array, times_s: Array
 ) -> float | None:
     """Return the position RMSE (m) against ground truth along a direction; None without truth."""
@@ -519,19 +530,20 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _agreement_verdict(
+def _judge_agreement(
     axes: Mapping[str, AxisAgreement],
     rejected_fraction_logged: float,
     rejected_fraction_replayed: float,
-    published_factor: float = 1.0,
+    tolerance_factor: float = 1.0,
 ) -> tuple[bool, str]:
     """Return True if the replay agrees with the log, and the statistics as a reason."""
     s_ratios = (axis.s_ratio_median for axis in axes.values())
     worst_s_ratio = max(s_ratios, key=lambda s_ratio: abs(s_ratio - 1.0))
-    if abs(worst_s_ratio - 1.0) > MAX_S_DIFFERENCE:
+    if abs(worst_s_ratio - 1.0) > MAX_RELATIVE_S_DIFFERENCE:
         return False, (
             f"the innovation variance of the replay is {worst_s_ratio:.2f} times the logged one "
-            f"(tolerance {MAX_S_DIFFERENCE:.0%}): EKF2 fused samples that are not in the log"
+            f"(tolerance {MAX_RELATIVE_S_DIFFERENCE:.0%}): EKF2 fused samples that are not in the "
+            "log"
         )
     min_correlation = min(axis.innovation_correlation for axis in axes.values())
     correlation_text = (
@@ -539,28 +551,32 @@ def _agreement_verdict(
     )
     if min_correlation >= MIN_INNOVATION_CORRELATION:
         difference_m = max(axis.position_rms_difference_m for axis in axes.values())
-        limit_m = published_factor * MAX_PUBLISHED_DIFFERENCE_M
+        limit_m = tolerance_factor * MAX_PUBLISHED_DIFFERENCE_M
         if difference_m > limit_m:
             return False, (
                 "the innovations agree, but replayed and published positions differ by "
-                f"{_format_above(difference_m, limit_m)} m RMS (limit {limit_m:g} m): the log "
+                f"{_format_exceeding(difference_m, limit_m)} m RMS (limit {limit_m:g} m): the log "
                 "lacks an input of EKF2's output predictor"
             )
         return True, correlation_text
-    if max(rejected_fraction_logged, rejected_fraction_replayed) < MAX_COMPARED_REJECTED_FRACTION:
+    if max(rejected_fraction_logged, rejected_fraction_replayed) < MAX_REJECTED_FOR_COMPARISON:
         return False, f"{correlation_text}, below the minimum of {MIN_INNOVATION_CORRELATION:g}"
-    rejected_difference = abs(rejected_fraction_replayed - rejected_fraction_logged)
-    nis_difference = max(
+    rejected_fraction_difference = abs(rejected_fraction_replayed - rejected_fraction_logged)
+    relative_nis_difference = max(
         abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) for axis in axes.values()
     )
     tolerance_text = (
         f"the replay rejected {rejected_fraction_replayed:.1%} of the samples, EKF2 "
         f"{rejected_fraction_logged:.1%}; "
-        f"the mean NIS differs by {nis_difference:.0%}"
+        f"the mean NIS differs by {relative_nis_difference:.0%}"
     )
-    if rejected_difference > MAX_REJECTED_DIFFERENCE or nis_difference > MAX_NIS_DIFFERENCE:
+    if (
+        rejected_fraction_difference > MAX_REJECTED_DIFFERENCE
+        or relative_nis_difference > MAX_RELATIVE_NIS_DIFFERENCE
+    ):
         return False, (
-            f"{tolerance_text} (limits {MAX_REJECTED_DIFFERENCE:.0%} and {MAX_NIS_DIFFERENCE:.0%})"
+            f"{tolerance_text} (limits {MAX_REJECTED_DIFFERENCE:.0%} and "
+            f"{MAX_RELATIVE_NIS_DIFFERENCE:.0%})"
         )
     return (
         True,
@@ -569,29 +585,30 @@ def _agreement_verdict(
     )
 
 
-def _format_above(value: float, limit: float) -> str:
+def _format_exceeding(value: float, limit: float) -> str:
     """Format a value with enough decimals (at least 2) to differ from the limit."""
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 
 
 def with_logged_rejections(agreement: Agreement, agreement_with_rejections: Agreement) -> Agreement:
-    """Return the agreement with the log of a replay that uses EKF2's logged rejections.
+    """Return ``agreement_with_rejections``, judged with the limits for logged rejections.
 
-    With many rejections, one sample near the gate can make a correct replay differ from the log.
-    Rejected fraction and decisions are from ``agreement``, the replay with a gate.
+    It compares the log with a replay that uses EKF2's logged rejections: with many rejections, one
+    sample near the gate can make a correct replay differ from the log. Rejected fraction and
+    decisions are from ``agreement``, which compares the log with a replay that has a gate.
     """
     rejected_fraction = agreement.rejected_fraction_logged
     relies_on_imu = rejected_fraction > MOSTLY_REJECTED_FRACTION
-    published_factor = np.inf if relies_on_imu else REJECTING_TOLERANCE_FACTOR
-    is_good, reason = _agreement_verdict(agreement_with_rejections.axes, 0.0, 0.0, published_factor)
+    tolerance_factor = np.inf if relies_on_imu else REJECTION_TOLERANCE_FACTOR
+    is_good, reason = _judge_agreement(agreement_with_rejections.axes, 0.0, 0.0, tolerance_factor)
     min_correlation = min(
         axis.innovation_correlation for axis in agreement_with_rejections.axes.values()
     )
-    if is_good and relies_on_imu and min_correlation < MIN_IMU_CORRELATION:
+    if is_good and relies_on_imu and min_correlation < MIN_MOSTLY_IMU_CORRELATION:
         is_good = False
         reason = (
             f"the correlation {min_correlation:.4f} of replayed and logged innovations is below "
-            f"the minimum of {MIN_IMU_CORRELATION:g}"
+            f"the minimum of {MIN_MOSTLY_IMU_CORRELATION:g}"
         )
     reason = f"in a replay with EKF2's logged rejections, {reason}"
     if relies_on_imu and not is_good:

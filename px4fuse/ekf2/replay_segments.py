@@ -23,7 +23,7 @@ from px4fuse.core.arrays import (
     row_blocks,
 )
 from px4fuse.core.record import Span
-from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
+from px4fuse.ekf2.earth_model import compute_earth_rate_rad_s, compute_position_scale
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import (
     BAD_ACCELERATION,
@@ -59,10 +59,10 @@ MIN_FUSION_S = 1.0
 # velocity and gravity
 MIN_AIRBORNE_S = 4.0
 # Time (s) from the start of a replay to the start of the evaluation
-SETTLING_S = 5.0
+REPLAY_SETTLING_S = 5.0
 # EKF2's first fusion of all magnetometer axes resets the field states. Logged field states are used
 # from this time (s) after the first fusion on
-FIELD_RESET_S = 1.0
+MAGNETIC_FIELD_RESET_S = 1.0
 # Flight time (s) before the replay that is used to estimate correlations of the initial state
 CORRELATION_HISTORY_S = 20.0
 # Rate (Hz) at which EKF2 fuses the magnetometer (SENS_MAG_RATE 15)
@@ -70,7 +70,7 @@ MAG_FUSION_HZ = 14.0
 # Minimum rate (Hz) of the logged magnetometer for a replay of its fusion
 MIN_MAG_LOG_HZ = 1.5
 # Time constant (s) of EKF2's low-pass filter of innovations (updateAidSourceStatus, ekf_helper.cpp)
-INNOVATION_FILTER_S = 0.5
+INNOVATION_TIME_CONSTANT_S = 0.5
 # Minimum length (s) of a replayed segment
 MIN_SEGMENT_S = 10.0
 # Maximum delay (s) from a reset to its publication
@@ -96,25 +96,25 @@ EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)
 
 @dataclass(frozen=True)
 class SensorSamples:
-    """Magnetometer or optical flow data of one segment, as means of successive samples.
+    """Magnetometer or optical flow data of one segment, as m means of successive samples.
 
     Attributes
     ----------
     step : ndarray of int, shape (m,)
         Prediction step that fuses the last sample of each mean.
     value : ndarray, shape (m, k)
-        Magnetic field (gauss, FRD), or velocity forward and right (m/s) from optical flow, minus
-        the velocity change from the IMU since the start of the segment.
+        Magnetic field (gauss, FRD), or optical flow velocity forward and right minus the velocity
+        change from the IMU since the start of the segment (m/s).
     rotation_to_body : ndarray, shape (m, k, 3)
         Mean rotation from NED to the body axes.
     sample_count : ndarray, shape (m,)
     noise : ndarray, shape (m,)
-        R of one sample; 0 if R is a parameter.
+        R of one sample; 0 if an EKF2 parameter determines R.
     gate : float
-        Innovation gate in √S; infinite if the gate is a parameter.
+        Innovation gate in √S; infinite if an EKF2 parameter determines the gate.
     state_rows : tuple of slice
-        State indices of the vector (NED) that the sensor measures in the body frame; optionally
-        state indices of a vector (body frame) that is added to the measurement.
+        State indices of the measured vector (NED; for example the earth field) and, optionally, of
+        the sensor's bias vector (body frame).
     """
 
     step: IntArray
@@ -136,7 +136,7 @@ class HeightSamples:
         PX4's names of the fused height sensors.
     reference : str
         PX4's name of the height reference, which has no bias.
-    initial_bias : (float, float)
+    initial_bias_and_variance : (float, float)
         Initial bias of the sensor that is not the reference (m, positive: too high), and its
         variance (m²).
     step, measured_at_s, down_m : ndarray, shape (m,)
@@ -149,7 +149,7 @@ class HeightSamples:
 
     fused_sensors: tuple[str, ...]
     reference: str
-    initial_bias: tuple[float, float]
+    initial_bias_and_variance: tuple[float, float]
     step: IntArray
     measured_at_s: Array
     down_m: Array
@@ -192,11 +192,11 @@ class ReplaySegment:
         Logged flag for a bad vertical acceleration.
     mean_bias_down_m_s2 : float
         Mean vertical accelerometer bias, computed from the published velocity.
-    ekf2_metres_per_metre : (float, float, float)
+    position_scale : (float, float, float)
         Ratio of EKF2's internal to its published position along each axis.
-    history : ReplaySegment or None
+    preceding_segment : ReplaySegment or None
         Flight before the start, from which the correlations are estimated.
-    changed : mapping from PX4's name to float
+    changed_parameters : mapping from PX4's name to float
         Parameters that were changed in flight.
     """
 
@@ -220,12 +220,12 @@ class ReplaySegment:
     is_acceleration_bad: BoolArray | None = None
     mean_bias_down_m_s2: float = 0.0
     flow: SensorSamples | None = None
-    ekf2_metres_per_metre: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    history: "ReplaySegment | None" = None
-    changed: Mapping[str, float] = record_field(default_factory=dict)
+    position_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    preceding_segment: "ReplaySegment | None" = None
+    changed_parameters: Mapping[str, float] = record_field(default_factory=dict)
 
     @cached_property
-    def imu_velocity_m_s(self) -> Array:
+    def imu_velocity_change_m_s(self) -> Array:
         """Velocity change (m/s, NED) since the start, integrated from the IMU, shape (n + 1, 3)."""
         force = rotate(self.body_to_ned[1:], self.force_m_s2) + GRAVITY_M_S2
         return cumulative_sums(force * self.step_s[:, None])
@@ -233,11 +233,11 @@ class ReplaySegment:
     @cached_property
     def imu_displacement_m(self) -> Array:
         """Displacement (m, NED) since the start, integrated from the IMU, shape (n + 1, 3)."""
-        velocity = self.imu_velocity_m_s
+        velocity = self.imu_velocity_change_m_s
         return cumulative_sums(0.5 * (velocity[1:] + velocity[:-1]) * self.step_s[:, None])
 
 
-def samples_by_event(
+def group_samples_by_event(
     segment: ReplaySegment,
     event_steps: IntArray,
     measurement_step: IntArray,
@@ -245,7 +245,7 @@ def samples_by_event(
     axes: slice,
     *quantities: Array,
 ) -> Array:
-    """Assign position samples to the events at which they are fused: up to k samples per event.
+    """Group position samples by the event (end of an interval) that fuses them.
 
     Parameters
     ----------
@@ -263,23 +263,23 @@ def samples_by_event(
     Returns
     -------
     ndarray, shape (a + 2 + len(quantities), k, events)
-        Position, propagated to the event with the IMU; age (s); further quantities; and 1 for a
-        sample, 0 for an empty slot.
+        Up to k samples per event. Rows: position, propagated to the event with the IMU; age (s);
+        further quantities; and 1 for a sample, 0 for an empty slot.
     """
-    event_index = np.searchsorted(event_steps, measurement_step)
-    event_index = event_index[event_index < len(event_steps)]
-    sample_count = len(event_index)
+    event_indices = np.searchsorted(event_steps, measurement_step)
+    event_indices = event_indices[event_indices < len(event_steps)]
+    sample_count = len(event_indices)
     measurement_step = measurement_step[:sample_count]
-    event_step = event_steps[event_index]
+    event_step = event_steps[event_indices]
     age_s = segment.time_s[event_step] - segment.time_s[measurement_step]
     displacement_m = segment.imu_displacement_m[:, axes]
-    velocity_m_s = segment.imu_velocity_m_s[:, axes]
+    velocity_m_s = segment.imu_velocity_change_m_s[:, axes]
     displacement_m = (
         displacement_m[event_step]
         - displacement_m[measurement_step]
         - velocity_m_s[event_step] * age_s[:, None]
     )
-    slot_index = np.arange(sample_count) - np.searchsorted(event_index, event_index)
+    index_in_event = np.arange(sample_count) - np.searchsorted(event_indices, event_indices)
     position_m = position_m[:sample_count] + displacement_m
     columns = (
         *position_m.T,
@@ -287,27 +287,27 @@ def samples_by_event(
         *(column[:sample_count] for column in quantities),
         np.ones(sample_count),
     )
-    samples = np.zeros((len(columns), slot_index.max(initial=-1) + 1, len(event_steps)))
-    samples[:, slot_index, event_index] = columns
+    samples = np.zeros((len(columns), index_in_event.max(initial=-1) + 1, len(event_steps)))
+    samples[:, index_in_event, event_indices] = columns
     return samples
 
 
-def update_table(
-    update_log: Array, measured_at_s: Array, end_s: Array, axes: Sequence[NedAxis]
+def make_update_table(
+    update_records: Array, measured_at_s: Array, end_s: Array, axes: Sequence[NedAxis]
 ) -> pd.DataFrame:
     """Return the updates with one aiding source as a table, indexed by measurement time (s).
 
     Parameters
     ----------
-    update_log : ndarray, shape (events, k, ...)
-        Columns of the table for k samples of each event, NaN without a sample. The last columns of
-        the table may be missing.
+    update_records : ndarray, shape (events, k, ...)
+        For up to k samples of each event: innovations, their variances, and optionally further
+        columns of the table in their order; NaN without a sample.
     measured_at_s : ndarray, shape (events, k)
     end_s : ndarray, shape (events,)
         Time of each event.
     axes : sequence of str
     """
-    has_innovation = np.isfinite(update_log[..., 0])
+    has_innovation = np.isfinite(update_records[..., 0])
     columns = [
         *(f"innovation_{axis}_m" for axis in axes),
         *(f"innovation_variance_{axis}_m2" for axis in axes),
@@ -318,18 +318,18 @@ def update_table(
         *(f"observation_variance_{axis}_m2" for axis in axes),
     ]
     updates = pd.DataFrame(
-        update_log[has_innovation],
+        update_records[has_innovation],
         time_index(measured_at_s[has_innovation]),
-        columns[: update_log.shape[-1]],
+        columns[: update_records.shape[-1]],
     )
     return updates.assign(fused_at_s=end_s[np.nonzero(has_innovation)[0]])
 
 
 def pad_samples(sample_arrays: Sequence[Array]) -> list[Array]:
-    """Pad the arrays of :func:`samples_by_event` with zeros to an equal number of slots."""
-    max_slots = max(samples.shape[1] for samples in sample_arrays)
+    """Pad the arrays of :func:`group_samples_by_event` with zeros to equal samples per event k."""
+    max_samples_per_event = max(samples.shape[1] for samples in sample_arrays)
     return [
-        np.pad(samples, ((0, 0), (0, max_slots - samples.shape[1]), (0, 0)))
+        np.pad(samples, ((0, 0), (0, max_samples_per_event - samples.shape[1]), (0, 0)))
         for samples in sample_arrays
     ]
 
@@ -340,29 +340,29 @@ def find_replay_segments(
     attitude: pd.DataFrame,
     ekf2: Ekf2,
     fusion_record: FusionRecord,
-    source_s: Array,
+    position_times_s: Array,
     *,
     is_gnss: bool = False,
 ) -> tuple[ReplaySegment, ...]:
     """Find the parts of a flight without gaps in IMU and positions, after EKF2's first fusion.
 
-    ``source_s`` contains the timestamps of the positions.
+    ``position_times_s`` contains the timestamps of the positions.
     """
     innovations = ekf2.innovations["north"]
     assert isinstance(innovations, pd.DataFrame)
-    fused_s = innovations.index.to_numpy()
+    fusion_times_s = innovations.index.to_numpy()
     state_times_s = fusion_record.delayed.index.to_numpy()
-    imu_s = imu.index.to_numpy()
-    cut_times_s = [imu_s[0], imu_s[-1]]
-    for sample_times_s, limit in ((imu_s, IMU_GAP_S), (source_s, RESTART_GAP_S)):
+    imu_times_s = imu.index.to_numpy()
+    cut_times_s = [imu_times_s[0], imu_times_s[-1]]
+    for sample_times_s, limit in ((imu_times_s, IMU_GAP_S), (position_times_s, RESTART_GAP_S)):
         gap_rows = np.flatnonzero(np.diff(sample_times_s) > limit)
         cut_times_s += [*sample_times_s[gap_rows], *sample_times_s[gap_rows + 1]]
-    cut_times_s += _break_times_s(imu, ekf2) if is_gnss else ()
-    first_s = max(attitude.index[0], source_s[0])
-    end_s = min(attitude.index[-1], source_s[-1] + 1.0)
+    cut_times_s += _find_break_times_s(imu, ekf2) if is_gnss else ()
+    first_s = max(attitude.index[0], position_times_s[0])
+    end_s = min(attitude.index[-1], position_times_s[-1] + 1.0)
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
-    field_span = _field_span(fusion_record) if is_gnss else None
-    cut_times_s += field_span[1:] if field_span else ()
+    field_fusion_span_s = _find_field_fusion_span(fusion_record) if is_gnss else None
+    cut_times_s += field_fusion_span_s[1:] if field_fusion_span_s else ()
     # The replay restarts when another EKF2 instance becomes primary, because its state differs
     cut_times_s += [time_s for time_s, _ in ekf2.instances[1:]]
     parameter_changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
@@ -370,30 +370,32 @@ def find_replay_segments(
 
     def make_segment(start_row: int, end_s: float) -> ReplaySegment:
         segment = _make_segment(imu, attitude, ekf2, fusion_record, start_row, end_s)
-        return _with_gnss_model(segment, imu, ekf2, fusion_record) if is_gnss else segment
+        return _add_gnss_terms(segment, imu, ekf2, fusion_record) if is_gnss else segment
 
     segments = []
     for part_start_s, part_end_s in pairwise(np.unique(np.clip(cut_times_s, first_s, end_s))):
-        fused_inside = fused_s[(fused_s >= part_start_s) & (fused_s <= part_end_s)]
-        if not len(fused_inside):
+        fusion_times_in_part_s = fusion_times_s[
+            (fusion_times_s >= part_start_s) & (fusion_times_s <= part_end_s)
+        ]
+        if not len(fusion_times_in_part_s):
             continue
         # The replay starts MIN_AIRBORNE_S after the first take-off, if this is before part_end_s
         earliest_starts_s = [
             start_s + MIN_AIRBORNE_S for start_s, _ in airborne[:1] if start_s < part_end_s
         ]
-        if field_span and part_start_s <= field_span[0] < part_end_s:
-            earliest_starts_s.append(field_span[0])
+        if field_fusion_span_s and part_start_s <= field_fusion_span_s[0] < part_end_s:
+            earliest_starts_s.append(field_fusion_span_s[0])
         start_row = int(
             np.searchsorted(
-                state_times_s, max([fused_inside[0] + MIN_FUSION_S, *earliest_starts_s])
+                state_times_s, max([fusion_times_in_part_s[0] + MIN_FUSION_S, *earliest_starts_s])
             )
         )
         if start_row == len(state_times_s) or part_end_s - state_times_s[start_row] < MIN_SEGMENT_S:
             continue
-        is_covered = (imu_s[1:] > state_times_s[start_row]) & (imu_s[:-1] < part_end_s)
-        if not np.all(np.diff(imu_s)[is_covered] <= IMU_GAP_S):
+        is_covered = (imu_times_s[1:] > state_times_s[start_row]) & (imu_times_s[:-1] < part_end_s)
+        if not np.all(np.diff(imu_times_s)[is_covered] <= IMU_GAP_S):
             continue
-        changed = {
+        changed_parameters = {
             change.name: change.after
             for change in parameter_changes
             if change.time_s <= part_start_s
@@ -405,36 +407,43 @@ def find_replay_segments(
             )
         )
         if history_row < start_row:
-            history = make_segment(history_row, state_times_s[start_row])
-            segment = replace(segment, history=history)
-        if field_span and field_span[0] <= state_times_s[start_row] and part_end_s <= field_span[1]:
-            segment = _add_field(segment, fusion_record, start_row, ekf2.step_s)
-        segments.append(replace(segment, changed=changed))
+            preceding_segment = make_segment(history_row, state_times_s[start_row])
+            segment = replace(segment, preceding_segment=preceding_segment)
+        if (
+            field_fusion_span_s
+            and field_fusion_span_s[0] <= state_times_s[start_row]
+            and part_end_s <= field_fusion_span_s[1]
+        ):
+            segment = _add_magnetic_field(segment, fusion_record, start_row, ekf2.step_s)
+        segments.append(replace(segment, changed_parameters=changed_parameters))
     return tuple(segments)
 
 
-def _with_gnss_model(
+def _add_gnss_terms(
     segment: ReplaySegment, imu: pd.DataFrame, ekf2: Ekf2, fusion_record: FusionRecord
 ) -> ReplaySegment:
-    """Add earth rotation, position scale, clipping, and mean vertical bias to a segment."""
-    metres_per_metre = ekf2_metres_per_metre(fusion_record)
+    """Add quantities that only the GNSS model uses.
+
+    These are earth rotation, position scale, clipping and mean vertical bias of the accelerometer.
+    """
+    position_scale = compute_position_scale(fusion_record)
     initial_state = segment.state.copy()
-    initial_state[POSITION] *= metres_per_metre
-    earth_rotation_rad = earth_rate_rad_s(fusion_record) * segment.step_s[:, None]
+    initial_state[POSITION] *= position_scale
+    earth_rotation_rad = compute_earth_rate_rad_s(fusion_record) * segment.step_s[:, None]
     start_s, end_s = span_s = segment.time_s[[0, -1]]
     velocity_change_m_s = np.diff(np.interp(span_s, ekf2.state.index, ekf2.state["down_m_s"]))[0]
-    velocity_error = segment.imu_velocity_m_s[-1, 2] - velocity_change_m_s
+    velocity_error = segment.imu_velocity_change_m_s[-1, 2] - velocity_change_m_s
     return replace(
         segment,
         state=initial_state,
-        ekf2_metres_per_metre=metres_per_metre,
+        position_scale=position_scale,
         correction_rad=segment.correction_rad + earth_rotation_rad,
-        clipped_fraction=_clipped_fraction(imu, segment.time_s),
+        clipped_fraction=_compute_clipped_fraction(imu, segment.time_s),
         mean_bias_down_m_s2=float(velocity_error / (end_s - start_s)),
     )
 
 
-def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
+def _find_break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
     """Return the times (s) at which the replay must be interrupted: clipping and height resets."""
     break_times_s = [
         time
@@ -443,17 +452,19 @@ def _break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
         for time in (reset.time_s - MAX_RESET_DELAY_S, reset.time_s)
     ]
     if "clipped" in imu:
-        imu_s = imu.index.to_numpy()
-        clipped_s = imu_s[imu["clipped"].to_numpy() > 0.0]
-        begin_rows, end_rows = (np.searchsorted(clipped_s, clipped_s + s) for s in (-0.5, 0.5))
-        clipped_moments = clipped_s[
-            end_rows - begin_rows > MAX_CLIPPED_FRACTION / median_interval(imu_s)
+        imu_times_s = imu.index.to_numpy()
+        clipped_times_s = imu_times_s[imu["clipped"].to_numpy() > 0.0]
+        begin_rows, end_rows = (
+            np.searchsorted(clipped_times_s, clipped_times_s + s) for s in (-0.5, 0.5)
+        )
+        heavy_clipping_times_s = clipped_times_s[
+            end_rows - begin_rows > MAX_CLIPPED_FRACTION / median_interval(imu_times_s)
         ]
-        break_times_s += [*(clipped_moments - 0.5), *(clipped_moments + 0.5)]
+        break_times_s += [*(heavy_clipping_times_s - 0.5), *(heavy_clipping_times_s + 0.5)]
     return break_times_s
 
 
-def _clipped_fraction(imu: pd.DataFrame, time_s: Array) -> Array:
+def _compute_clipped_fraction(imu: pd.DataFrame, time_s: Array) -> Array:
     """Return the fraction of the accelerometer axes that are clipped, for each prediction step."""
     fraction_by_step = np.zeros(len(time_s))
     # "clipped" has one bit per axis
@@ -475,14 +486,16 @@ def _make_segment(
     end_s: float,
 ) -> ReplaySegment:
     initial_row = fusion_record.delayed.iloc[start_row].astype(np.float64)
-    imu_s = imu.index.to_numpy()
-    first_row = int(np.argmin(np.abs(imu_s - fusion_record.delayed.index[start_row])))
-    segment_rows = slice(first_row, int(np.searchsorted(imu_s, end_s, side="right")))
-    imu_s = imu_s[segment_rows]
+    imu_times_s = imu.index.to_numpy()
+    first_row = int(np.argmin(np.abs(imu_times_s - fusion_record.delayed.index[start_row])))
+    segment_rows = slice(first_row, int(np.searchsorted(imu_times_s, end_s, side="right")))
+    imu_times_s = imu_times_s[segment_rows]
     imu = imu.iloc[segment_rows]
-    imu_intervals_s = np.diff(imu_s)
-    end_stamps = rows_of_timestamps(imu_s, fusion_record.delayed.index)
-    step_end_indices = step_ends(imu_intervals_s, end_stamps, predict_s(fusion_record))
+    imu_intervals_s = np.diff(imu_times_s)
+    logged_end_indices = rows_of_timestamps(imu_times_s, fusion_record.delayed.index)
+    step_end_indices = find_step_ends(
+        imu_intervals_s, logged_end_indices, read_prediction_step_s(fusion_record)
+    )
     accelerometer_bias = np.asarray(initial_row[Columns.ACCELEROMETER_BIAS])
     gyro_bias = np.asarray(initial_row[Columns.GYRO_BIAS])
     rotation_vectors, velocity_increments = np.zeros((2, len(step_end_indices), 3))
@@ -495,33 +508,36 @@ def _make_segment(
             (samples[Columns.SPECIFIC_FORCE].to_numpy() - accelerometer_bias) * intervals_s,
             step_end_indices[steps] - first_row,
         )
-    step_times_s = imu_s[np.append(0, step_end_indices)]
+    step_times_s = imu_times_s[np.append(0, step_end_indices)]
     step_s = np.diff(step_times_s)
     gyro_attitude = cumulative_product(
         np.concatenate([[[1.0, 0.0, 0.0, 0.0]], from_vector(rotation_vectors)])
     )
 
-    def relative_attitude(
-        attitude_samples: pd.DataFrame, early_s: float, end_attitude: Array
+    def compute_relative_attitude(
+        attitude_samples: pd.DataFrame, lead_time_s: float, end_attitude: Array
     ) -> ArrayPair:
         attitude_samples = rows_between(
-            attitude_samples, step_times_s[0] - early_s, step_times_s[-1]
+            attitude_samples, step_times_s[0] - lead_time_s, step_times_s[-1]
         )
         at_s = attitude_samples.index.to_numpy()
-        end_rotation = conjugate(interpolate(at_s, step_times_s, end_attitude))
-        return at_s, multiply(attitude_samples[Columns.QUATERNION].to_numpy(), end_rotation)
+        inverse_attitude = conjugate(interpolate(at_s, step_times_s, end_attitude))
+        return at_s, multiply(attitude_samples[Columns.QUATERNION].to_numpy(), inverse_attitude)
 
     # Published attitude relative to the attitude integrated from the gyro, in NED
     published_relative_to_gyro = interpolate(
-        step_times_s, *relative_attitude(attitude, 0.0, gyro_attitude)
+        step_times_s, *compute_relative_attitude(attitude, 0.0, gyro_attitude)
     )
     nominal_attitude = multiply(published_relative_to_gyro, gyro_attitude)
-    state_times_s, state_rotation = relative_attitude(fusion_record.delayed, 1e-4, nominal_attitude)
-    attitude_error_rad = to_vector(state_rotation)
+    state_times_s, error_quaternions = compute_relative_attitude(
+        fusion_record.delayed, 1e-4, nominal_attitude
+    )
+    attitude_error_rad = to_vector(error_quaternions)
     published_m = _interpolate(ekf2.state[Columns.POSITION], step_times_s[:1])[0]
     position_m = initial_row[Columns.POSITION].to_numpy()
     position_m = np.where(np.isfinite(position_m), position_m, published_m)
-    # Since PX4 v1.16, the height of the state and the published height have different origins
+    # Since PX4 v1.16, heights in the logged state and published heights have different origins. The
+    # model uses published heights
     position_m[2] = published_m[2]
     return ReplaySegment(
         time_s=step_times_s,
@@ -554,7 +570,7 @@ def _make_segment(
     )
 
 
-def _field_span(fusion_record: FusionRecord) -> Span | None:
+def _find_field_fusion_span(fusion_record: FusionRecord) -> Span | None:
     """Return start and end (s) of EKF2's fusion of all three magnetometer axes.
 
     Return None if EKF2 did not fuse all three axes, or interrupted this fusion.
@@ -564,17 +580,17 @@ def _field_span(fusion_record: FusionRecord) -> Span | None:
         if len(fusion_record.field_gauss)
         else pd.Series(dtype=float)
     )
-    fused_3d_s = is_fused_3d.index.to_numpy()
+    flag_times_s = is_fused_3d.index.to_numpy()
     is_fused = is_fused_3d.to_numpy() > 0.0
-    if not is_fused.any() or 1.0 / median_interval(fused_3d_s) < MIN_MAG_LOG_HZ:
+    if not is_fused.any() or 1.0 / median_interval(flag_times_s) < MIN_MAG_LOG_HZ:
         return None
     first_row, last_row = np.flatnonzero(is_fused)[[0, -1]]
     if not is_fused[first_row:last_row].all():
         return None
-    return float(fused_3d_s[first_row]) + FIELD_RESET_S, float(fused_3d_s[last_row])
+    return float(flag_times_s[first_row]) + MAGNETIC_FIELD_RESET_S, float(flag_times_s[last_row])
 
 
-def _add_field(
+def _add_magnetic_field(
     segment: ReplaySegment, fusion_record: FusionRecord, start_row: int, step_s: float
 ) -> ReplaySegment:
     initial_row = fusion_record.delayed.iloc[start_row]
@@ -593,61 +609,73 @@ def _add_field(
     )
     if Columns.FIELD_INNOVATION[0] not in field_gauss:
         return extended_segment
-    filtered_gauss = field_gauss[Columns.FIELD_INNOVATION].to_numpy()
+    filtered_nu_gauss = field_gauss[Columns.FIELD_INNOVATION].to_numpy()
     return replace(
         extended_segment,
-        field=_mean_field(segment, fusion_record.delayed, measured_at_s, filtered_gauss),
+        field=_compute_mean_field(segment, fusion_record.delayed, measured_at_s, filtered_nu_gauss),
     )
 
 
-def _mean_field(
-    segment: ReplaySegment, delayed_state: pd.DataFrame, measured_at_s: Array, filtered_gauss: Array
+def _compute_mean_field(
+    segment: ReplaySegment,
+    delayed_state: pd.DataFrame,
+    measured_at_s: Array,
+    filtered_nu_gauss: Array,
 ) -> SensorSamples:
     """Compute the mean measured magnetic field between two logged rows (FRD, gauss).
 
     It is the field predicted from the logged states, minus the innovation. The innovation is
     computed from EKF2's logged low-pass filtered innovation.
     """
-    between_s = np.diff(measured_at_s)
+    row_interval_s = np.diff(measured_at_s)
     is_inside = (measured_at_s[:-1] > segment.time_s[0]) & (measured_at_s[1:] <= segment.time_s[-1])
-    gap_free_rows = np.flatnonzero(is_inside & (between_s > 0.0) & (between_s < RESTART_GAP_S)) + 1
+    gap_free_rows = (
+        np.flatnonzero(is_inside & (row_interval_s > 0.0) & (row_interval_s < RESTART_GAP_S)) + 1
+    )
     measured_at_s = measured_at_s[gap_free_rows]
-    between_s = between_s[gap_free_rows - 1]
-    fused_counts = np.maximum(np.rint(MAG_FUSION_HZ * between_s), 1.0)
-    new_sample_weight = between_s / (between_s + fused_counts * INNOVATION_FILTER_S)
+    row_interval_s = row_interval_s[gap_free_rows - 1]
+    fused_counts = np.maximum(np.rint(MAG_FUSION_HZ * row_interval_s), 1.0)
+    new_sample_weight = row_interval_s / (
+        row_interval_s + fused_counts * INNOVATION_TIME_CONSTANT_S
+    )
     previous_innovation_weight = ((1.0 - new_sample_weight) ** fused_counts)[:, None]
-    innovation = (
-        filtered_gauss[gap_free_rows]
-        - previous_innovation_weight * filtered_gauss[gap_free_rows - 1]
+    nu_gauss = (
+        filtered_nu_gauss[gap_free_rows]
+        - previous_innovation_weight * filtered_nu_gauss[gap_free_rows - 1]
     ) / (1.0 - previous_innovation_weight)
-    step, weight = low_pass_weights(
-        segment, measured_at_s, fused_counts, between_s / fused_counts, new_sample_weight
+    step, weight = compute_low_pass_weights(
+        segment, measured_at_s, fused_counts, row_interval_s / fused_counts, new_sample_weight
     )
     rotation_to_body = segment.body_to_ned[step].swapaxes(2, 3)
-    earth_gauss, body_gauss = (
+    earth_field_gauss, body_field_gauss = (
         _interpolate(delayed_state[names], measured_at_s)
         for names in (Columns.EARTH_FIELD, Columns.BODY_FIELD)
     )
-    rotated_earth_field = earth_gauss[:, None] - np.cross(
-        segment.attitude_error_rad[step], earth_gauss[:, None]
+    rotated_earth_field = earth_field_gauss[:, None] - np.cross(
+        segment.attitude_error_rad[step], earth_field_gauss[:, None]
     )
-    expected_field = (
-        np.einsum("ki,kiab,kib->ka", weight, rotation_to_body, rotated_earth_field) + body_gauss
+    expected_field_gauss = (
+        np.einsum("ki,kiab,kib->ka", weight, rotation_to_body, rotated_earth_field)
+        + body_field_gauss
     )
     mean = np.einsum("ki,kiab->kab", weight, rotation_to_body)
     return SensorSamples(
-        step[:, 0], expected_field - innovation, mean, fused_counts, np.zeros(len(gap_free_rows))
+        step[:, 0],
+        expected_field_gauss - nu_gauss,
+        mean,
+        fused_counts,
+        np.zeros(len(gap_free_rows)),
     )
 
 
-def low_pass_weights(
+def compute_low_pass_weights(
     segment: ReplaySegment,
     newest_sample_s: Array,
     sample_count: Array,
     interval_s: Array,
     new_sample_weight: Array | float,
 ) -> tuple[IntArray, Array]:
-    """Return prediction step and weight of each of k samples in m low-pass filtered means.
+    """Return prediction step and weight of the samples in m low-pass filtered means, shape (m, k).
 
     Parameters
     ----------
@@ -657,47 +685,47 @@ def low_pass_weights(
         Weight of a new sample in the low-pass filter.
     """
     # Age of each sample (unit: sample interval)
-    sample_age = np.arange(int(sample_count.max(initial=1.0)))
+    age_samples = np.arange(int(sample_count.max(initial=1.0)))
     weight = np.where(
-        sample_age < sample_count[:, None],
-        (1.0 - np.reshape(new_sample_weight, (-1, 1))) ** sample_age,
+        age_samples < sample_count[:, None],
+        (1.0 - np.reshape(new_sample_weight, (-1, 1))) ** age_samples,
         0.0,
     )
     weight /= weight.sum(axis=1, keepdims=True)
-    measured_at_s = newest_sample_s[:, None] - sample_age * interval_s[:, None]
+    measured_at_s = newest_sample_s[:, None] - age_samples * interval_s[:, None]
     return np.searchsorted(segment.time_s, measured_at_s - 1e-9), weight
 
 
 def add_field_states(
     segment: ReplaySegment,
     measured_at_s: Array,
-    gauss: Array,
+    field_gauss: Array,
     sample_weight: float,
-    fields_gauss: Array,
+    initial_fields_gauss: Array,
     field_variance_gauss2: Array,
 ) -> ReplaySegment:
     """Add the magnetic fields of earth and body to the states of a segment.
 
     Parameters
     ----------
-    measured_at_s, gauss : ndarray, shape (m,) and (m, 3)
+    measured_at_s, field_gauss : ndarray, shape (m,) and (m, 3)
         Magnetometer samples (body FRD) at EKF2's measurement time.
     sample_weight : float
         Number of samples fused by EKF2 that each logged sample represents.
-    fields_gauss, field_variance_gauss2 : ndarray, shape (6,)
+    initial_fields_gauss, field_variance_gauss2 : ndarray, shape (6,)
         Initial fields of earth (NED) and body (FRD), and their variances.
     """
-    step_index, is_inside = sample_steps(segment, measured_at_s)
+    step_index, is_inside = find_sample_steps(segment, measured_at_s)
     rotation_to_body = segment.body_to_ned[step_index].transpose(0, 2, 1)
     sample_count = len(step_index)
     return replace(
         segment,
-        state=np.concatenate([segment.state, fields_gauss]),
+        state=np.concatenate([segment.state, initial_fields_gauss]),
         variance=np.concatenate([segment.variance, field_variance_gauss2]),
-        state_correlation=block_diag(segment.state_correlation, np.eye(len(fields_gauss))),
+        state_correlation=block_diag(segment.state_correlation, np.eye(len(initial_fields_gauss))),
         field=SensorSamples(
             step_index,
-            gauss[is_inside],
+            field_gauss[is_inside],
             rotation_to_body,
             np.full(sample_count, sample_weight),
             np.zeros(sample_count),
@@ -705,17 +733,17 @@ def add_field_states(
     )
 
 
-def sample_steps(segment: ReplaySegment, measured_at_s: Array) -> tuple[IntArray, BoolArray]:
-    """Return the prediction step that fuses each sample of the segment.
+def find_sample_steps(segment: ReplaySegment, measured_at_s: Array) -> tuple[IntArray, BoolArray]:
+    """Return the index of the prediction step in which each sample of the segment is fused.
 
-    The second array is True for each sample in the segment.
+    The second array is True for each given sample that is in the segment.
     """
     step_index = np.searchsorted(segment.time_s, measured_at_s - 1e-9)
     is_inside = (step_index > 0) & (step_index < len(segment.time_s))
     return step_index[is_inside], is_inside
 
 
-def predict_s(fusion_record: FusionRecord) -> float:
+def read_prediction_step_s(fusion_record: FusionRecord) -> float:
     """Return EKF2_PREDICT_US in seconds."""
     return fusion_record.parameters.get("EKF2_PREDICT_US", 10_000.0) * 1e-6
 
@@ -725,19 +753,20 @@ def _interpolate(table: pd.DataFrame, times_s: Array) -> Array:
     return np.column_stack([np.interp(times_s, table.index, table[name]) for name in table])
 
 
-def step_ends(interval_s: Array, logged_ends: IntArray, configured_step_s: float) -> IntArray:
+def find_step_ends(interval_s: Array, logged_ends: IntArray, configured_step_s: float) -> IntArray:
     """Return the index of the IMU sample at the end of each prediction step of EKF2.
 
     A step ends after :func:`samples_per_step` IMU samples, after ``configured_step_s``, or at a
-    logged end of a step.
+    logged end of a step, whichever is first.
     """
-    median_s = float(np.median(interval_s))
-    # Number of IMU samples in each interval. A single gap may be a gap of the IMU itself
-    sample_counts = np.maximum(np.rint(interval_s / median_s), 1.0)
+    median_interval_s = float(np.median(interval_s))
+    # Number of IMU samples in each interval. If few samples are missing, the IMU itself may have
+    # gaps, so they are not counted
+    sample_counts = np.maximum(np.rint(interval_s / median_interval_s), 1.0)
     if sample_counts.mean() <= 1.0 + MAX_LOST_IMU_FRACTION:
         sample_counts[:] = 1.0
-    end_counts = np.append(0.0, np.cumsum(sample_counts))[logged_ends]
-    samples_needed = samples_per_step(configured_step_s, median_s, end_counts)
+    sample_counts_at_ends = np.append(0.0, np.cumsum(sample_counts))[logged_ends]
+    samples_needed = samples_per_step(configured_step_s, median_interval_s, sample_counts_at_ends)
     logged_end_set = set(logged_ends.tolist())
     end_indices = []
     accumulated_count = accumulated_s = 0.0

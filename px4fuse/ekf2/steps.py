@@ -20,14 +20,19 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Record, Span
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.model import Model, delayed_tracks, modelled_aids, replay_with_logged_rejections
+from px4fuse.ekf2.model import (
+    Model,
+    compute_delayed_tracks,
+    list_modelled_aids,
+    replay_with_logged_rejections,
+)
 from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
     Ekf2Replay,
     Spans,
-    component_along,
+    compute_rmse_to_truth,
     inside_spans,
-    rms_to_truth,
+    interpolate_component,
     rows_inside,
 )
 from px4fuse.filter.kalman import Replay, state_at
@@ -43,23 +48,32 @@ NO_TRUTH_OVERLAP = Unavailable(
     "Record ground truth during the whole flight.",
 )
 # Names of the properties that differ between KF and EKF2
-SAMPLES = "sample times and time steps"
-TIMESTAMPS = "timestamps and delay"
-NOISE = "measurement noise"
-BIASES = "accelerometer bias as a state"
-PROCESS = "process noise"
-ATTITUDE = "attitude and gyro bias as states"
-FIELD_STEP = "magnetometer"
+SAMPLES_STEP = "sample times and time steps"
+TIMESTAMPS_STEP = "timestamps and delay"
+NOISE_STEP = "measurement noise"
+BIASES_STEP = "accelerometer bias as a state"
+PROCESS_NOISE_STEP = "process noise"
+ATTITUDE_STEP = "attitude and gyro bias as states"
+MAGNETOMETER_STEP = "magnetometer"
 VELOCITY_STEP = "GNSS velocity"
 FLOW_STEP = "optical flow"
 VISION_STEP = "external vision"
-GATE = "rejections and resets"
-OUTPUT = "output predictor"
-# Aiding sources (PX4's names) that EKF2 may fuse in addition to its position source
-FURTHER_STEPS = {FLOW.name: FLOW_STEP, EV_POS.name: VISION_STEP}
+GATE_STEP = "rejections and resets"
+OUTPUT_PREDICTOR_STEP = "output predictor"
+# Step of each aiding source (PX4's name) that EKF2 may fuse in addition to its position source
+STEP_BY_ADDITIONAL_AID = {FLOW.name: FLOW_STEP, EV_POS.name: VISION_STEP}
 # Order in which properties of KF are replaced by properties of EKF2. Additional aiding sources are
 # inserted before GATE
-REPLACEMENT_STEPS = (SAMPLES, TIMESTAMPS, NOISE, BIASES, PROCESS, ATTITUDE, GATE, OUTPUT)
+REPLACEMENT_STEPS = (
+    SAMPLES_STEP,
+    TIMESTAMPS_STEP,
+    NOISE_STEP,
+    BIASES_STEP,
+    PROCESS_NOISE_STEP,
+    ATTITUDE_STEP,
+    GATE_STEP,
+    OUTPUT_PREDICTOR_STEP,
+)
 
 TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
@@ -114,7 +128,8 @@ class UnreplayedDifference(Record):
 class DifferenceExplanation(Record, kw_only=True):
     """Explanation of the mean square difference KF - EKF2 along one axis.
 
-    Mean square = sum of the reductions by all ``steps`` + unexplained remainder.
+    Each of the ``steps`` replaces one property of KF by EKF2's. Mean square = sum of the reductions
+    by all steps + unexplained remainder.
 
     Attributes
     ----------
@@ -125,6 +140,7 @@ class DifferenceExplanation(Record, kw_only=True):
     unexplained_mean_square_m2, unexplained_velocity_mean_square_m2_s2 : float
         Mean square difference after all steps.
     outside : UnreplayedDifference or None
+        Difference outside the replayed times, which the steps do not explain.
     corrected : mapping from field of Settings to value
         KF settings that were wrong, and are replaced by estimates before the first step.
     sentences : tuple of str
@@ -161,7 +177,7 @@ class DifferenceExplanation(Record, kw_only=True):
 def explain_by_steps(
     model: Model, settings: Settings | None = None, kf_runs: Mapping[str, Replay] | None = None
 ) -> dict[str, DifferenceExplanation] | Unavailable:
-    """Replace properties of KF by EKF2's, one after the other, and compare with the log.
+    """Return, by axis, the part of the difference KF - EKF2 that each replaced property explains.
 
     Parameters
     ----------
@@ -176,17 +192,14 @@ def explain_by_steps(
     kf_runs = kf_runs or {}
     ekf2 = model.flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    configurations = step_configurations(model.inputs, settings or Settings())
-    delayed_positions = delayed_tracks(model, list(configurations.values()))
+    configurations = make_step_configurations(model.inputs, settings or Settings())
+    delayed_positions = compute_delayed_tracks(model, list(configurations.values()))
     baseline_replay = replay_with_logged_rejections(model)
     evaluated_spans = model.baseline_replay.find_evaluated_spans()
     state_times_s = ekf2.state.index.to_numpy()
     is_inside = inside_spans(state_times_s, evaluated_spans)
     # Only times at which the EKF2 replay and all runs of KF have a state are compared
-    for index in (
-        baseline_replay.delayed.index,
-        *(run.steps.index for run in kf_runs.values()),
-    ):
+    for index in (baseline_replay.delayed.index, *(run.steps.index for run in kf_runs.values())):
         is_inside &= (state_times_s >= index[0]) & (state_times_s <= index[-1])
     state_times_s = state_times_s[is_inside]
     if not len(state_times_s):
@@ -201,21 +214,23 @@ def explain_by_steps(
     tracks_by_step = []
     # Tracks are computed one at a time, to limit the memory
     tracks = chain(delayed_positions, (baseline_replay.published, ekf2.state))
-    for step_name, track in zip((*configurations, OUTPUT, "EKF2 as logged"), tracks, strict=True):
+    for step_name, track in zip(
+        (*configurations, OUTPUT_PREDICTOR_STEP, "EKF2 as logged"), tracks, strict=True
+    ):
         tracks_by_step.append(
             [
                 [
-                    component_along(track, columns, direction, state_times_s)
+                    interpolate_component(track, columns, direction, state_times_s)
                     for columns in TRACK_COLUMNS
                 ]
                 for direction in directions.values()
             ]
         )
-        # This track has all properties of EKF2 except gate and output predictor
+        # After the last step but GATE_STEP, only EKF2's gate and output predictor are missing
         if step_name == [*configurations][-2]:
             track_without_gate = track
     spans = Segment(*state_span_s, "").cut(evaluated_spans)
-    longest_rejection = _longest_rejection(
+    longest_rejection = _find_longest_rejection(
         baseline_replay, track_without_gate, state_span_s, evaluated_spans
     )
     explanations = {}
@@ -225,7 +240,7 @@ def explain_by_steps(
         explanations[axis] = _explain_axis(
             model.flight,
             direction,
-            (*configurations, OUTPUT),
+            (*configurations, OUTPUT_PREDICTOR_STEP),
             state_times_s,
             np.array([kf_state, *axis_tracks]),
             spans,
@@ -243,14 +258,15 @@ def _explain_axis(
     spans_s: Spans,
     longest_rejection: RejectionRun | None,
 ) -> DifferenceExplanation:
-    """Explain the difference KF - EKF2 along one axis at the times of EKF2's states.
+    """Split the difference KF - EKF2 along one axis into the parts of k replaced properties.
 
-    ``positions_by_step``, shape (k + 2, 2, n), contains position and velocity of KF, of the k
-    replays of EKF2, and of the logged EKF2.
+    ``positions_by_step``, shape (k + 2, 2, n), contains position and velocity of KF, of k replays
+    (each with one more property of EKF2), and of the logged EKF2, at the times of EKF2's states.
     """
     difference_by_step_m = positions_by_step - positions_by_step[-1]
     rmse_by_step = [
-        rms_to_truth(flight, track, direction, times_s) for track in positions_by_step[:, 0]
+        compute_rmse_to_truth(flight, track, direction, times_s)
+        for track in positions_by_step[:, 0]
     ]
     mean_squares = np.mean(difference_by_step_m[:-1] ** 2, axis=2)
     position_change = np.abs(np.diff(positions_by_step[:-1, 0], axis=0))
@@ -272,7 +288,7 @@ def _explain_axis(
         )
     )
     total_mean_squares, *_, unexplained_mean_squares = mean_squares.tolist()
-    no_truth = NO_TRUTH_OVERLAP if isinstance(flight.truth, Truth) else flight.truth
+    missing_truth = NO_TRUTH_OVERLAP if isinstance(flight.truth, Truth) else flight.truth
     rmse_by_filter = {"kf": rmse_by_step[0], "ekf2": rmse_by_step[-1]}
     return DifferenceExplanation(
         count=len(times_s),
@@ -282,71 +298,81 @@ def _explain_axis(
         unexplained_mean_square_m2=unexplained_mean_squares[0],
         unexplained_velocity_mean_square_m2_s2=unexplained_mean_squares[1],
         position_rmse_to_truth_m={
-            name: no_truth if rmse_m is None else rmse_m for name, rmse_m in rmse_by_filter.items()
+            name: missing_truth if rmse_m is None else rmse_m
+            for name, rmse_m in rmse_by_filter.items()
         },
         spans_s=spans_s,
         longest_rejection=longest_rejection,
         times_s=times_s,
-        # Copied, because a view would keep the tracks of all replays in memory
+        # Copied, because a view would keep the whole array in memory
         kf_minus_ekf2_m=difference_by_step_m[0, 0].copy(),
         unexplained_m=difference_by_step_m[-2, 0].copy(),
     )
 
 
-def step_configurations(inputs: Inputs, kf_settings: Settings) -> dict[str, FilterConfiguration]:
-    """Return the EKF2 configuration after each step, from KF to EKF2 without output predictor."""
+def make_step_configurations(
+    inputs: Inputs, kf_settings: Settings
+) -> dict[str, FilterConfiguration]:
+    """Return the model configurations that change KF into EKF2, one property (key) after the other.
+
+    The last configuration is EKF2 without output predictor.
+    """
     logged_settings = inputs.settings
     aid = inputs.aid
     acceleration_noise = kf_settings.sigma_a_m_s2 * math.sqrt(kf_settings.dt_s / inputs.mean_step_s)
-    kf_process_noise = {**logged_settings, "EKF2_ACC_NOISE": acceleration_noise}
-    kf_parameters = {**kf_process_noise, aid.noise: kf_settings.sigma_z_m}
+    kf_process_settings = {**logged_settings, "EKF2_ACC_NOISE": acceleration_noise}
+    kf_noise_settings = {**kf_process_settings, aid.noise: kf_settings.sigma_z_m}
     # The delay is already subtracted from the timestamps of GNSS positions
     applied_delay_s = logged_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     time_offset_s = kf_settings.clock_offset_s - applied_delay_s
-    without_lever_arm = {**kf_parameters, **dict.fromkeys(aid.lever_arm, 0.0)}
-    replayed_aids = modelled_aids(inputs)[1:]
-    further_steps = {aid: step for aid, step in FURTHER_STEPS.items() if aid in replayed_aids}
-    further_aids = [*further_steps]
+    settings_without_lever_arm = {**kf_noise_settings, **dict.fromkeys(aid.lever_arm, 0.0)}
+    replayed_aids = list_modelled_aids(inputs)[1:]
+    step_by_aid = {
+        aid: step for aid, step in STEP_BY_ADDITIONAL_AID.items() if aid in replayed_aids
+    }
+    additional_aids = [*step_by_aid]
     kf_configuration = FilterConfiguration(
-        kf_parameters,
+        kf_noise_settings,
         estimates_biases=False,
         estimates_attitude=False,
         uses_reported_noise=False,
         has_gate=False,
         fuses_velocity=False,
-        without=dict.fromkeys((MAG.name, *further_aids), 0.0),
+        without=dict.fromkeys((MAG.name, *additional_aids), 0.0),
     )
-    noise_configuration = replace(
-        kf_configuration, settings=kf_process_noise, uses_reported_noise=True
+    noise_step_configuration = replace(
+        kf_configuration, settings=kf_process_settings, uses_reported_noise=True
     )
-    process_configuration = replace(
-        noise_configuration, settings=logged_settings, estimates_biases=True
+    process_step_configuration = replace(
+        noise_step_configuration, settings=logged_settings, estimates_biases=True
     )
-    configuration = replace(process_configuration, estimates_attitude=True)
+    configuration = replace(process_step_configuration, estimates_attitude=True)
     configurations = {
-        SAMPLES: replace(
-            kf_configuration, settings=without_lever_arm, timestamp_offset_s=time_offset_s
+        SAMPLES_STEP: replace(
+            kf_configuration, settings=settings_without_lever_arm, timestamp_offset_s=time_offset_s
         ),
-        TIMESTAMPS: kf_configuration,
-        NOISE: noise_configuration,
-        BIASES: replace(noise_configuration, estimates_biases=True),
-        PROCESS: process_configuration,
-        ATTITUDE: configuration,
+        TIMESTAMPS_STEP: kf_configuration,
+        NOISE_STEP: noise_step_configuration,
+        BIASES_STEP: replace(noise_step_configuration, estimates_biases=True),
+        PROCESS_NOISE_STEP: process_step_configuration,
+        ATTITUDE_STEP: configuration,
     }
     if MAG.name in replayed_aids:
-        configurations[FIELD_STEP] = configuration = replace(
-            configuration, without=dict.fromkeys(further_aids, 0.0)
+        configurations[MAGNETOMETER_STEP] = configuration = replace(
+            configuration, without=dict.fromkeys(additional_aids, 0.0)
         )
     if GNSS_VEL.name in replayed_aids:
         configurations[VELOCITY_STEP] = configuration = replace(configuration, fuses_velocity=True)
-    for next_index, step in enumerate(further_steps.values(), start=1):
+    for next_index, step in enumerate(step_by_aid.values(), start=1):
         configurations[step] = configuration = replace(
-            configuration, without=dict.fromkeys(further_aids[next_index:], 0.0)
+            configuration, without=dict.fromkeys(additional_aids[next_index:], 0.0)
         )
-    return configurations | {GATE: FilterConfiguration(logged_settings, uses_logged_decisions=True)}
+    return configurations | {
+        GATE_STEP: FilterConfiguration(logged_settings, uses_logged_decisions=True)
+    }
 
 
-def _longest_rejection(
+def _find_longest_rejection(
     baseline_replay: Ekf2Replay, track_without_gate: pd.DataFrame, span: Span, spans_s: Spans
 ) -> RejectionRun | None:
     updates = rows_inside(baseline_replay.updates, spans_s)

@@ -16,14 +16,14 @@ import pandas as pd
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.bias import BiasEstimator
-from px4fuse.ekf2.heights import MIN_GATE, MIN_SIGMA
+from px4fuse.ekf2.heights import MIN_GATE, MIN_NOISE_SIGMA
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.intervals import MAX_LATENESS_S
 from px4fuse.ekf2.replay_segments import (
     ReplaySegment,
+    group_samples_by_event,
+    make_update_table,
     pad_samples,
-    samples_by_event,
-    update_table,
 )
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 
@@ -33,17 +33,17 @@ HORIZONTAL_VELOCITY, HORIZONTAL_POSITION = slice(3, 5), slice(6, 8)
 MAX_SAMPLE_GAP_S = 0.4
 # EKF2 resets the vision bias or the position if all vision samples are outside the gate for this
 # time (s): no_aid_timeout_max (common.h)
-MAX_REJECTED_S = 1.0
+MAX_REJECTION_DURATION_S = 1.0
 
 
-def vision_samples(
+def group_vision_by_event(
     inputs: Inputs,
     segment: ReplaySegment,
     event_steps: IntArray,
     settings: Mapping[str, float],
     horizon_s: float,
 ) -> Array:
-    """Return the vision samples that are fused at each event, shape (8, k, events).
+    """Group the vision samples by the event that fuses them, shape (8, k, events).
 
     Rows: position north and east (m), age, measurement time, fusion time (s), reported variances
     north and east (m²), and 1 for a sample, 0 for an empty slot.
@@ -52,10 +52,12 @@ def vision_samples(
     time_s = segment.time_s
     assert vision is not None
     measured_at_s = vision.timestamp_s - settings[EV_POS.delay] * 1e-3 - 0.5 * inputs.mean_step_s
-    due_s = np.maximum(measured_at_s, vision.arrival_s - horizon_s)
-    step_index = np.maximum.accumulate(np.searchsorted(time_s, due_s - 1e-9))
+    fusion_due_s = np.maximum(measured_at_s, vision.arrival_s - horizon_s)
+    step_index = np.maximum.accumulate(np.searchsorted(time_s, fusion_due_s - 1e-9))
     is_usable = (
-        (step_index > 0) & (step_index < len(time_s)) & (due_s < measured_at_s + MAX_LATENESS_S)
+        (step_index > 0)
+        & (step_index < len(time_s))
+        & (fusion_due_s < measured_at_s + MAX_LATENESS_S)
     )
     is_usable &= np.isfinite(vision.position_m[:, 0])
     # EKF2 fuses only the newer of two samples in one prediction step
@@ -65,35 +67,36 @@ def vision_samples(
     position_m = (vision.position_m[is_usable] - segment.body_to_ned[step_index] @ lever_arm_m)[
         :, :2
     ]
-    more_columns = (
+    sample_quantities = (
         measured_at_s[is_usable],
         time_s[step_index],
         *vision.variance_m2[is_usable, :2].T,
     )
-    return samples_by_event(
-        segment, event_steps, step_index, position_m, slice(0, 2), *more_columns
+    return group_samples_by_event(
+        segment, event_steps, step_index, position_m, slice(0, 2), *sample_quantities
     )
 
 
 class VisionFilter:
-    """Vision fusion in several filter configurations, event by event through one segment.
+    """EKF2's vision fusion in several filter configurations, at the events of one segment.
 
     Parameters
     ----------
     segment : ReplaySegment
     sample_arrays : sequence of ndarray, shape (8, k, events)
-        Result of :func:`vision_samples` for each filter configuration.
+        Result of :func:`group_vision_by_event` for each filter configuration.
     is_enabled_by_aid : mapping from PX4's name of a source to ndarray of bool, (events, filters)
     parameters : mapping from parameter name to ndarray, shape (filters,)
     has_gate, uses_reported_noise : ndarray of bool, shape (filters,)
+        False to fuse every sample; False to ignore the reported variances.
 
     Attributes
     ----------
-    update_log : ndarray, shape (events, k, 7, filters)
-        Rows of :func:`~px4fuse.ekf2.replay_segments.update_table` for each sample.
+    update_records : ndarray, shape (events, k, 7, filters)
+        Rows of :func:`~px4fuse.ekf2.replay_segments.make_update_table` for each sample.
     position_reset_m : ndarray, shape (events, filters, 2)
         Change of the position by a reset at each event, north and east.
-    fused_s : ndarray, shape (filters,)
+    last_fusion_s : ndarray, shape (filters,)
         Time of the last position fusion or reset.
     """
 
@@ -110,56 +113,62 @@ class VisionFilter:
         self.position_m = np.moveaxis(samples[:2], 0, -1)
         self.age_s, self.measured_at_s, self.fusion_time_s = samples[2:5]
         _, sample_count, event_count, configuration_count = samples.shape
-        self.update_log = np.full((event_count, sample_count, 7, configuration_count), np.nan)
+        self.update_records = np.full((event_count, sample_count, 7, configuration_count), np.nan)
         self.position_reset_m = np.zeros((event_count, configuration_count, 2))
         has_sample = (samples[7] > 0.0) & is_enabled_by_aid[EV_POS.name]
-        # In one prediction step, EKF2 fuses GNSS before vision. Samples of the last step before an
-        # event are therefore fused after GNSS, earlier samples before GNSS
+        # GNSS is fused at the event. In one prediction step, EKF2 fuses GNSS before vision, so
+        # samples of age 0 are fused after GNSS, older samples before GNSS
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
         self.has_gate = has_gate
-        self.without_gnss = ~is_enabled_by_aid[GNSS_POS.name]
+        self.is_gnss_off = ~is_enabled_by_aid[GNSS_POS.name]
         self.gate_squared = np.maximum(parameters[EV_POS.gate], MIN_GATE)[:, None] ** 2
         reported_variance = samples[5:7] * (
             uses_reported_noise & (parameters[EV_POS.noise_mode] != 1.0)
         )
-        min_variance = np.maximum(parameters[EV_POS.noise], MIN_SIGMA) ** 2
-        gnss_variance = np.where(self.without_gnss, 0.0, parameters[GNSS_POS.noise] ** 2)
-        self.noise_m2 = np.moveaxis(
+        min_variance = np.maximum(parameters[EV_POS.noise], MIN_NOISE_SIGMA) ** 2
+        gnss_variance = np.where(self.is_gnss_off, 0.0, parameters[GNSS_POS.noise] ** 2)
+        self.R_m2 = np.moveaxis(
             np.maximum(reported_variance, np.maximum(min_variance, gnss_variance)), 0, -1
         )
         bias = np.zeros((configuration_count, 2))
         self.bias = BiasEstimator(bias, bias + np.inf, segment.step_s)
         self.last_sample_s, self.last_attempt_s = np.full((2, configuration_count), -np.inf)
-        self.fused_s = np.full(configuration_count, segment.time_s[0])
-        self.was_without_gnss = self.without_gnss[0]
+        self.last_fusion_s = np.full(configuration_count, segment.time_s[0])
+        self.was_gnss_off = self.is_gnss_off[0]
 
-    def updates(self, configuration_index: int, end_s: Array) -> pd.DataFrame:
-        """Return the updates of one configuration; ``end_s`` contains the time of each event."""
+    def make_update_table(self, configuration_index: int, end_s: Array) -> pd.DataFrame:
+        """Return the vision updates of one configuration; ``end_s``: time (s) of each event."""
         measured_at_s = self.measured_at_s[..., configuration_index].T
-        return update_table(
-            self.update_log[..., configuration_index], measured_at_s, end_s, ["north", "east"]
+        return make_update_table(
+            self.update_records[..., configuration_index], measured_at_s, end_s, ["north", "east"]
         )
 
     def fuse(
-        self, event: int, x: Array, P: Array, at_event: bool, gnss_fused_s: Array
+        self, event: int, x: Array, P: Array, is_last_step: bool, last_gnss_fusion_s: Array
     ) -> ArrayPair:
         """Fuse the vision samples of one event.
 
-        ``at_event`` selects the samples of the last prediction step (True), which EKF2 fuses after
-        GNSS, or earlier samples (False). ``gnss_fused_s`` is the time of the last GNSS fusion.
+        ``is_last_step``: True for the samples of the last prediction step before the event, which
+        EKF2 fuses after GNSS; False for older samples.
         """
-        for slot, has_sample in enumerate(self.has_sample[at_event][:, event]):
+        for slot, has_sample in enumerate(self.has_sample[is_last_step][:, event]):
             if has_sample.any():
-                x, P = self._fuse_sample(event, slot, has_sample, x, P, gnss_fused_s)
+                x, P = self._fuse_sample(event, slot, has_sample, x, P, last_gnss_fusion_s)
         return x, P
 
     def _fuse_sample(
-        self, event: int, slot: int, has_sample: BoolArray, x: Array, P: Array, gnss_fused_s: Array
+        self,
+        event: int,
+        slot: int,
+        has_sample: BoolArray,
+        x: Array,
+        P: Array,
+        last_gnss_fusion_s: Array,
     ) -> ArrayPair:
         age_s = self.age_s[slot, event][:, None]
         fusion_time_s = self.fusion_time_s[slot, event]
-        without_gnss = self.without_gnss[event]
-        noise_m2 = self.noise_m2[slot, event]
+        is_gnss_off = self.is_gnss_off[event]
+        R_m2 = self.R_m2[slot, event]
         HP = P[:, HORIZONTAL_POSITION] - age_s[:, None] * P[:, HORIZONTAL_VELOCITY]
         S = HP[:, :, HORIZONTAL_POSITION] - age_s[:, None] * HP[:, :, HORIZONTAL_VELOCITY]
         # diagonal is a view of S: adding R to it changes S
@@ -169,47 +178,46 @@ class VisionFilter:
             - x[:, HORIZONTAL_POSITION]
             + age_s * x[:, HORIZONTAL_VELOCITY]
         )
-        updates_bias = has_sample & ~without_gnss
+        updates_bias = has_sample & ~is_gnss_off
         interval_s = np.where(updates_bias, fusion_time_s - self.last_sample_s, 0.0)
         nu, R = self.bias.remove_bias(
-            position_innovation_m,
-            diagonal.copy(),
-            noise_m2,
-            interval_s[:, None],
-            updates_bias[:, None],
+            position_innovation_m, diagonal.copy(), R_m2, interval_s[:, None], updates_bias[:, None]
         )
         diagonal += R
         has_restarted = (fusion_time_s - self.last_sample_s > MAX_SAMPLE_GAP_S) | (
-            without_gnss != self.was_without_gnss
+            is_gnss_off != self.was_gnss_off
         )
         is_outside_gate = (
             (nu * nu > self.gate_squared * diagonal).any(axis=1) & self.has_gate & ~has_restarted
         )
-        is_failing = is_outside_gate & (fusion_time_s - self.last_attempt_s > MAX_REJECTED_S)
+        is_failing = is_outside_gate & (
+            fusion_time_s - self.last_attempt_s > MAX_REJECTION_DURATION_S
+        )
         is_restarting = has_sample & (has_restarted | is_failing)
         is_fused = has_sample & ~is_outside_gate & ~has_restarted
         is_position_reset = is_restarting & (
-            without_gnss | (is_failing & (fusion_time_s - gnss_fused_s > MAX_REJECTED_S))
+            is_gnss_off
+            | (is_failing & (fusion_time_s - last_gnss_fusion_s > MAX_REJECTION_DURATION_S))
         )
         is_evaluated = has_sample & ~has_restarted | is_position_reset
         # If EKF2 resets its position to a sample, it logs innovation 0 for this sample
-        update_log = (
+        update_records = (
             *np.where(is_position_reset, 0.0, nu.T),
             *diagonal.T,
             is_outside_gate & ~is_position_reset,
             is_fused,
             is_position_reset,
         )
-        self.update_log[event, slot] = np.where(is_evaluated, np.stack(update_log), np.nan)
+        self.update_records[event, slot] = np.where(is_evaluated, np.stack(update_records), np.nan)
         K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
         x = x + (K @ nu[:, :, None])[:, :, 0]
         P = P - K @ HP
         if is_position_reset.any():
             position_reset_m = (
-                np.where(without_gnss[:, None], position_innovation_m, nu)
+                np.where(is_gnss_off[:, None], position_innovation_m, nu)
                 * is_position_reset[:, None]
             )
-            restart_variance = np.where(without_gnss[:, None], noise_m2, R)
+            restart_variance = np.where(is_gnss_off[:, None], R_m2, R)
             set_states(
                 x,
                 P,
@@ -220,25 +228,29 @@ class VisionFilter:
             )
             self.position_reset_m[event] += position_reset_m
         if is_restarting.any():
-            starts_bias = (is_restarting & ~is_position_reset)[:, None]
-            clears_bias = (is_position_reset & without_gnss)[:, None]
+            initialises_bias = (is_restarting & ~is_position_reset)[:, None]
+            clears_bias = (is_position_reset & is_gnss_off)[:, None]
             self.bias.value_m = np.where(
-                starts_bias, -position_innovation_m, np.where(clears_bias, 0.0, self.bias.value_m)
+                initialises_bias,
+                -position_innovation_m,
+                np.where(clears_bias, 0.0, self.bias.value_m),
             )
             self.bias.variance_m2 = np.where(clears_bias, 0.0, self.bias.variance_m2)
         self.last_sample_s = np.where(has_sample, fusion_time_s, self.last_sample_s)
         self.last_attempt_s = np.where(is_fused | is_restarting, fusion_time_s, self.last_attempt_s)
-        self.fused_s = np.where(is_fused | is_position_reset, fusion_time_s, self.fused_s)
-        self.was_without_gnss = np.where(has_sample, without_gnss, self.was_without_gnss)
+        self.last_fusion_s = np.where(
+            is_fused | is_position_reset, fusion_time_s, self.last_fusion_s
+        )
+        self.was_gnss_off = np.where(has_sample, is_gnss_off, self.was_gnss_off)
         return x, P
 
 
 def set_states(
     x: Array, P: Array, is_selected: BoolArray, rows: slice, value: Array, variance: Array
 ) -> None:
-    """Set value and variance of the states ``rows`` of selected configurations; no correlation.
+    """Set value and variance of the states ``rows`` in the selected filter configurations.
 
-    ``value`` and ``variance`` have the shape (filters, states).
+    Their correlations are set to zero. ``value`` and ``variance`` have the shape (filters, states).
     """
     x[is_selected, rows] = value[is_selected]
     P[is_selected, :, rows] = 0.0

@@ -15,19 +15,19 @@ from numpy.typing import ArrayLike
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Count, NotNegative, Record, Share, one_line_repr
 from px4fuse.ekf2.heights import HEIGHT_SENSORS
-from px4fuse.ekf2.inputs import horizontal_resets_s
-from px4fuse.ekf2.model import Model, modelled_aids, replay_settings, with_position_noise
+from px4fuse.ekf2.inputs import find_horizontal_reset_times_s
+from px4fuse.ekf2.model import Model, list_modelled_aids, replay_with_settings, with_position_noise
 from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
     Agreement,
     Ekf2Replay,
     Spans,
-    axes_of,
-    component_along,
+    compute_rmse_to_truth,
     inside_spans,
+    interpolate_component,
+    list_innovation_axes,
     logged_aid_innovations,
     logged_innovations,
-    rms_to_truth,
     rows_inside,
 )
 from px4fuse.errors import SettingsError
@@ -39,22 +39,22 @@ from px4fuse.flight.model import Columns, Ekf2, Flight, NedAxis, Unavailable
 ANALYSIS_NAME = "EKF2 replay with other parameters"
 # The longest time without fusion is computed only if the log contains at least this fraction of the
 # innovations
-MIN_COMPLETE_FRACTION = 0.9
+MIN_LOGGED_INNOVATION_FRACTION = 0.9
 NO_TRUTH = Unavailable(
     "RMSE against ground truth",
     "the log has no ground truth",
     "Record motion capture (ATT_POS_MOCAP) besides the position source, or fly in simulation.",
 )
 HEADING_LOGGED_NOTE = (
-    "The logged EKF2 heading is used in all columns: the log does not contain all fused "
+    "All replays use the logged EKF2 heading, because the log does not contain all fused "
     "magnetometer samples"
 )
 HEIGHT_REPLAYED_NOTE = "Height is replayed with the logged height sensors"
 HEIGHT_START_NOTE = (
-    "When the replay starts, EKF2 has declared its vertical acceleration bad, so the replayed "
-    "height may be wrong at first"
+    "When the replay starts, EKF2's flag fs_bad_acc_vertical is set, so the replayed height may be "
+    "wrong at first"
 )
-HEIGHT_LOGGED_NOTE = "The logged EKF2 height is used in all columns"
+HEIGHT_LOGGED_NOTE = "All replays use the logged EKF2 height"
 HEADING_NOT_REPLAYED = Unavailable(
     "heading error",
     "with external vision the replay uses the logged EKF2 heading",
@@ -65,28 +65,29 @@ HEIGHT_NOT_REPLAYED = Unavailable(
     "the replay uses the logged EKF2 height",
     "Use the logged height (vehicle_local_position) instead of a replayed height.",
 )
-HEIGHT_NAMES = {aid.name for aid in HEIGHT_SENSORS}
+HEIGHT_AID_NAMES = {aid.name for aid in HEIGHT_SENSORS}
 # Minimum evaluated flight time (s) after an aiding source is disabled
 MIN_EVALUATED_S = 5.0
 # Default and maximum number of parameter values in a sweep
 SWEEP_VALUE_COUNT = 9
 MAX_SWEEP_VALUES = 200
-# Position noise (m, 1 σ) that is added in repeated replays
+# A rejection near the gate can change the whole replay. The replay is therefore repeated with this
+# position noise (m, 1 σ), to test if its statistics are predictable
 ADDED_NOISE_M = 0.002
-# Number of repeated replays with added position noise
+# Number of repetitions with added position noise
 NOISY_REPLAY_COUNT = 4
-# A replay is repeated with added position noise if it rejects a larger fraction of the samples
+# A replay is repeated if it rejects more than this fraction of the samples
 MIN_REJECTED_FRACTION = 0.02
-# The statistics of a replay are unpredictable if it rejects a larger fraction of the samples
+# The statistics of a replay are unpredictable if it rejects more than this fraction of the samples,
 MAX_REJECTED_FRACTION = 0.35
 # EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# Maximum (largest / smallest) mean NIS of repeated replays
+# or if the mean NIS of its repetitions differs by more than this factor,
 MAX_NIS_RATIO = 1.10
-# Maximum (largest - smallest) rejected fraction of repeated replays
-MAX_REJECTED_SPREAD = 0.03
-# Maximum (largest / smallest) position RMSE of repeated replays
+# their rejected fraction by more than this value,
+MAX_REJECTED_FRACTION_SPREAD = 0.03
+# or their position RMSE by more than this factor
 MAX_RMSE_RATIO = 1.15
 
 
@@ -104,7 +105,7 @@ class AxisSummary(Record):
 
 
 class HeightSummary(Record):
-    """Statistics of one height sensor, or of vision that EKF2 fuses in addition to GNSS."""
+    """Innovation statistics of a height sensor, or of vision that is fused in addition to GNSS."""
 
     nis_mean: NotNegative
     nis_band: tuple[NotNegative, NotNegative]
@@ -114,7 +115,7 @@ class HeightSummary(Record):
 
     @property
     def is_predictable(self) -> bool:
-        """True with few rejections and without a height reset, which the model does not contain."""
+        """True if the model can predict EKF2: few rejections, and no height reset."""
         has_reset = self.longest_without_fusion_s > HEIGHT_TIMEOUT_S
         return not has_reset and self.rejected_fraction <= MAX_REJECTED_FRACTION
 
@@ -177,7 +178,7 @@ class Summary(Record, kw_only=True, omit_defaults=False):
 
 @dataclass(frozen=True)
 class WhatIf:
-    """Statistics of EKF2 as logged, replayed, and replayed with other parameters.
+    """Innovation and error statistics of EKF2: logged, replayed, and with other parameters.
 
     Attributes
     ----------
@@ -186,6 +187,7 @@ class WhatIf:
     whatif : tuple of Summary
         Statistics with each set of changed parameters.
     evaluated_s : tuple of (float, float)
+        Time spans (start, end) of the statistics.
     notes : tuple of str
         Limitations of the replay.
     """
@@ -223,55 +225,56 @@ def what_if(
     if not model.agreement.good:
         return model.agreement.as_unavailable(ANALYSIS_NAME)
     without = without or {}
-    replays = replay_settings(model, settings, without=without)
+    replays = replay_with_settings(model, settings, without=without)
     flight = model.flight
-    evaluated_s = model.baseline_replay.find_evaluated_spans()
+    spans_s = model.baseline_replay.find_evaluated_spans()
     if without:
-        disabled_s = min(without.values())
-        # Later segments start from logged states, to which the disabled source contributed
-        replay_end_s = evaluated_s[-1][1]
+        first_disable_time_s = min(without.values())
+        # Only the first remaining segment is evaluated: later segments start from logged states, to
+        # which the disabled source contributed
+        replay_end_s = spans_s[-1][1]
         remaining_spans = [
-            (max(start, disabled_s), end)
-            for start, end in evaluated_s
-            if end - disabled_s > MIN_EVALUATED_S
+            (max(start, first_disable_time_s), end)
+            for start, end in spans_s
+            if end - first_disable_time_s > MIN_EVALUATED_S
         ]
-        evaluated_s = tuple(remaining_spans[:1])
-        if not evaluated_s:
+        spans_s = tuple(remaining_spans[:1])
+        if not spans_s:
             raise SettingsError(
-                f"--from {disabled_s:g} s leaves less than {MIN_EVALUATED_S:g} s of the replayed "
-                f"flight, which ends at {replay_end_s:.0f} s. "
+                f"--from {first_disable_time_s:g} s leaves less than {MIN_EVALUATED_S:g} s of the "
+                f"replayed flight, which ends at {replay_end_s:.0f} s. "
                 "Choose an earlier time."
             )
     summaries: list[Summary] = []
     notes: list[str] = []
     deviation_notes: list[str] = []
     for replay in replays:
-        summaries.append(_summarise_replay(flight, replay, evaluated_s))
-        notes += _notes(model, replay)
+        summaries.append(_summarise_replay(flight, replay, spans_s))
+        notes += _describe_replay_limits(model, replay)
         if without:
-            deviation_notes.append(_deviation_note(model, replay, without, evaluated_s))
+            deviation_notes.append(_describe_deviation(model, replay, without, spans_s))
     is_gnss = model.inputs.aid == GNSS_POS
     return WhatIf(
         agreement=model.agreement,
-        logged=_summarise_log(flight, model.baseline_replay, evaluated_s),
-        replayed=_summarise_replay(flight, model.baseline_replay, evaluated_s),
-        whatif=_mark_unpredictable(model, summaries, evaluated_s, without),
-        evaluated_s=evaluated_s,
+        logged=_summarise_log(flight, model.baseline_replay, spans_s),
+        replayed=_summarise_replay(flight, model.baseline_replay, spans_s),
+        whatif=_mark_unpredictable(model, summaries, spans_s, without),
+        evaluated_s=spans_s,
         notes=(
-            *(_heading_and_height_notes(model) if summaries and is_gnss else ()),
+            *(_describe_heading_and_height(model) if summaries and is_gnss else ()),
             *notes,
             *deviation_notes,
         ),
     )
 
 
-def _heading_and_height_notes(model: Model) -> tuple[str, str]:
-    difference_deg = model.agreement.heading_rms_difference_deg
+def _describe_heading_and_height(model: Model) -> tuple[str, str]:
+    heading_difference_deg = model.agreement.heading_rms_difference_deg
     heading_note = HEADING_LOGGED_NOTE
-    if difference_deg is not None:
+    if heading_difference_deg is not None:
         heading_note = (
             "Heading is replayed with the magnetometer (with the logged parameters it differs from "
-            f"the log by {difference_deg:.1f}° RMS)"
+            f"the log by {heading_difference_deg:.1f}° RMS)"
         )
     height_note = HEIGHT_LOGGED_NOTE if model.inputs.logged_height_reason else HEIGHT_REPLAYED_NOTE
     bad_acceleration_flags = model.inputs.segments[0].is_acceleration_bad
@@ -284,7 +287,9 @@ def _heading_and_height_notes(model: Model) -> tuple[str, str]:
     return heading_note, height_note
 
 
-def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUE_COUNT) -> list[float]:
+def make_sweep_values(
+    name: str, low: float, high: float, count: int = SWEEP_VALUE_COUNT
+) -> list[float]:
     """Return values of a parameter from ``low`` to ``high``, both included.
 
     The values have equal ratios if ``low`` is above zero, else equal differences.
@@ -296,7 +301,7 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUE_CO
 
     Examples
     --------
-    >>> sweep_values("EKF2_EV_DELAY", 0, 200, 3)
+    >>> make_sweep_values("EKF2_EV_DELAY", 0, 200, 3)
     [0.0, 100.0, 200.0]
     """
     for limit in (low, high):
@@ -313,27 +318,27 @@ def sweep_values(name: str, low: float, high: float, count: int = SWEEP_VALUE_CO
 
 
 def _mark_unpredictable(
-    model: Model, summaries: Sequence[Summary], evaluated_s: Spans, without: Mapping[str, float]
+    model: Model, summaries: Sequence[Summary], spans_s: Spans, without: Mapping[str, float]
 ) -> tuple[Summary, ...]:
     """Set ``is_predictable`` to False if added position noise changes the statistics of a replay.
 
     Many rejections or a height reset also set ``is_predictable`` to False.
     """
-    repeated_summaries = [[summary] for summary in summaries]
-    uncertain_summaries = [
+    all_summaries = [[summary] for summary in summaries]
+    repeated_summaries = [
         replay_summaries
-        for replay_summaries in repeated_summaries
+        for replay_summaries in all_summaries
         if replay_summaries[0].changed
         and MIN_REJECTED_FRACTION < replay_summaries[0].rejected_fraction <= MAX_REJECTED_FRACTION
     ]
-    uncertain_changes = [replay_summaries[0].changed for replay_summaries in uncertain_summaries]
-    for seed in range(NOISY_REPLAY_COUNT if uncertain_changes else 0):
+    repeated_changes = [replay_summaries[0].changed for replay_summaries in repeated_summaries]
+    for seed in range(NOISY_REPLAY_COUNT if repeated_changes else 0):
         noisy_model = with_position_noise(model, ADDED_NOISE_M, seed)
-        replays = replay_settings(noisy_model, uncertain_changes, without=without)
-        for replay_summaries, replay in zip(uncertain_summaries, replays, strict=True):
-            replay_summaries.append(_summarise_replay(model.flight, replay, evaluated_s))
-    marked_summaries = []
-    for summary, *noisy_summaries in repeated_summaries:
+        replays = replay_with_settings(noisy_model, repeated_changes, without=without)
+        for replay_summaries, replay in zip(repeated_summaries, replays, strict=True):
+            replay_summaries.append(_summarise_replay(model.flight, replay, spans_s))
+    final_summaries = []
+    for summary, *noisy_summaries in all_summaries:
         rejected_fractions = [
             axis_summary.rejected_fraction for axis_summary in summary.others.values()
         ]
@@ -344,12 +349,12 @@ def _mark_unpredictable(
             and max(rejected_fractions, default=0.0) <= MAX_REJECTED_FRACTION
             and _results_agree([summary, *noisy_summaries])
         )
-        marked_summaries.append(replace(summary, is_predictable=is_predictable, without=without))
-    return tuple(marked_summaries)
+        final_summaries.append(replace(summary, is_predictable=is_predictable, without=without))
+    return tuple(final_summaries)
 
 
 def _results_agree(summaries: Sequence[Summary]) -> bool:
-    """Return True if the statistics of repeated replays differ by less than the limits."""
+    """Return True if mean NIS, rejected fraction and RMSE of repeated replays hardly differ."""
     rmse_values = [
         rmse_m
         for summary in summaries
@@ -361,22 +366,22 @@ def _results_agree(summaries: Sequence[Summary]) -> bool:
     ]
     return (
         all(max(axis_nis) <= MAX_NIS_RATIO * min(axis_nis) for axis_nis in nis_by_axis)
-        and max(rejected_fractions) - min(rejected_fractions) <= MAX_REJECTED_SPREAD
+        and max(rejected_fractions) - min(rejected_fractions) <= MAX_REJECTED_FRACTION_SPREAD
         and (not rmse_values or max(rmse_values) <= MAX_RMSE_RATIO * min(rmse_values))
     )
 
 
-def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Summary:
+def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Summary:
     updates = replay.updates
-    evaluated_updates = rows_inside(updates, evaluated_s)
+    evaluated_updates = rows_inside(updates, spans_s)
     fused_at_s = updates["fused_at_s"].to_numpy()
     if evaluated_updates.empty:
         raise SettingsError(
-            f"{_change_text(replay)}: {replay.source} would never be fused in the evaluated time; "
-            f"{replay.lost} samples arrive after the fusion horizon",
+            f"{_format_changes(replay)}: {replay.source} would never be fused in the evaluated "
+            f"time: {replay.lost} samples arrive after the fusion horizon has passed them",
             "Choose another parameter value.",
         )
-    # Position variance before and after each update
+    # Position variance 1 µs before each update, and after it
     variance = pd.DataFrame(index=np.column_stack([fused_at_s - 1e-6, fused_at_s]).ravel())
     for axis in HORIZONTAL_AXES:
         innovation_variance, noise_variance = (
@@ -386,44 +391,46 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) ->
         variance[f"{axis}_m2"] = np.column_stack(
             [innovation_variance - noise_variance, variance_after]
         ).ravel()
-    fused_s = evaluated_updates["fused_at_s"][evaluated_updates[["fused", "reset"]].any(axis=1)]
+    fusion_times_s = evaluated_updates["fused_at_s"][
+        evaluated_updates[["fused", "reset"]].any(axis=1)
+    ]
     reset_count = evaluated_updates["reset"].sum()
     if (vision := replay.other_aid_updates.get(EV_POS.name)) is not None:
-        reset_count += vision["reset"][inside_spans(vision["fused_at_s"], evaluated_s)].sum()
+        reset_count += vision["reset"][inside_spans(vision["fused_at_s"], spans_s)].sum()
     return _make_summary(
         flight,
         replay,
-        evaluated_s,
+        spans_s,
         evaluated_updates,
         replay.published,
         variance,
         replay.other_aid_updates,
         replay.delayed["heading_rad"],
         changed=replay.changed,
-        longest_without_fusion_s=_longest_between_fusions(fused_s, evaluated_s),
+        longest_without_fusion_s=_find_longest_gap_s(fusion_times_s, spans_s),
         resets=int(reset_count),
         late=replay.late,
         lost=replay.lost,
     )
 
 
-def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Summary:
+def _summarise_log(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Summary:
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
-    evaluated_updates = rows_inside(logged_innovations(ekf2), evaluated_s)
+    evaluated_updates = rows_inside(logged_innovations(ekf2), spans_s)
     horizon_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
-    reset_times_s = horizontal_resets_s(ekf2) - horizon_s
-    reset_times_s = reset_times_s[inside_spans(reset_times_s, evaluated_s)]
-    replayed_count = len(rows_inside(replay.updates, evaluated_s))
+    reset_times_s = find_horizontal_reset_times_s(ekf2) - horizon_s
+    reset_times_s = reset_times_s[inside_spans(reset_times_s, spans_s)]
+    replayed_count = len(rows_inside(replay.updates, spans_s))
     longest_gap_s: float | Unavailable = Unavailable(
         "longest time without fusion",
         f"the log contains only {len(evaluated_updates)} of about {replayed_count} innovations",
         f"Log {ekf2.innovation_topics[0]} at full rate.",
     )
-    if len(evaluated_updates) > MIN_COMPLETE_FRACTION * replayed_count:
-        fused_s = evaluated_updates.index[evaluated_updates["rejected"] == 0]
-        longest_gap_s = _longest_between_fusions(
-            np.concatenate([fused_s, reset_times_s]), evaluated_s
+    if len(evaluated_updates) > MIN_LOGGED_INNOVATION_FRACTION * replayed_count:
+        fusion_times_s = evaluated_updates.index[evaluated_updates["rejected"] == 0]
+        longest_gap_s = _find_longest_gap_s(
+            np.concatenate([fusion_times_s, reset_times_s]), spans_s
         )
     # a flight with a replay has an attitude
     assert isinstance(flight.attitude, pd.DataFrame)
@@ -436,7 +443,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
     return _make_summary(
         flight,
         replay,
-        evaluated_s,
+        spans_s,
         evaluated_updates,
         ekf2.state,
         None,
@@ -451,7 +458,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, evaluated_s: Spans) -> Su
 def _make_summary(
     flight: Flight,
     replay: Ekf2Replay,
-    evaluated_s: Spans,
+    spans_s: Spans,
     evaluated_updates: pd.DataFrame,
     published_track: pd.DataFrame,
     variance: pd.DataFrame | None,
@@ -466,13 +473,13 @@ def _make_summary(
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     logged_variance = ekf2.variance
-    evaluated_state_s = rows_inside(ekf2.state, evaluated_s).index.to_numpy()
+    evaluated_state_s = rows_inside(ekf2.state, spans_s).index.to_numpy()
 
     def error_m(direction: Array) -> float | Unavailable:
-        position_m = component_along(
+        position_m = interpolate_component(
             published_track, Columns.POSITION, direction, evaluated_state_s
         )
-        rmse_to_truth = rms_to_truth(flight, position_m, direction, evaluated_state_s)
+        rmse_to_truth = compute_rmse_to_truth(flight, position_m, direction, evaluated_state_s)
         return NO_TRUTH if rmse_to_truth is None else rmse_to_truth
 
     for axis, direction in zip(HORIZONTAL_AXES, np.eye(3), strict=False):
@@ -480,35 +487,37 @@ def _make_summary(
         if isinstance(logged_variance, Unavailable):
             median_sigma = logged_variance
         else:
-            variance_s = rows_inside(logged_variance, evaluated_s).index
+            variance_times_s = rows_inside(logged_variance, spans_s).index
             axis_variance = (logged_variance if variance is None else variance)[f"{axis}_m2"]
             median_sigma = float(
-                np.sqrt(np.median(np.interp(variance_s, axis_variance.index, axis_variance)))
+                np.sqrt(np.median(np.interp(variance_times_s, axis_variance.index, axis_variance)))
             )
         other_fields[axis] = AxisSummary(
-            *_innovation_statistics(evaluated_updates, axis), median_sigma, error_m(direction)
+            *_compute_innovation_statistics(evaluated_updates, axis),
+            median_sigma,
+            error_m(direction),
         )
     aids = {
-        name: _summarise_aid(evaluated, evaluated_s)
+        name: _summarise_aid(evaluated, spans_s)
         for name, updates in other_aid_updates.items()
-        if len(evaluated := rows_inside(updates, evaluated_s))
+        if len(evaluated := rows_inside(updates, spans_s))
     }
     if velocity := aids.pop(GNSS_VEL.name, None):
         other_fields["velocity_rejected_fraction"] = velocity.rejected_fraction
     if vision := aids.pop(EV_POS.name, None):
         other_fields["others"] = {EV_POS.name: vision}
-    if other_aid_updates.keys() & HEIGHT_NAMES:
+    if other_aid_updates.keys() & HEIGHT_AID_NAMES:
         other_fields["heights"] = aids
         other_fields["height_rmse_to_truth_m"] = error_m(np.eye(3)[2])
     return Summary(
         samples=len(evaluated_updates),
         rejected_fraction=float(evaluated_updates["rejected"].mean()),
-        heading_error_mean_deg=_heading_error(flight, replay, headings_rad, evaluated_s),
+        heading_error_mean_deg=_compute_heading_error_deg(flight, replay, headings_rad, spans_s),
         **other_fields,
     )
 
 
-def _innovation_statistics(
+def _compute_innovation_statistics(
     updates: pd.DataFrame, *axes: NedAxis
 ) -> tuple[float, tuple[float, float], float]:
     nu = np.concatenate([updates[f"innovation_{axis}_m"] for axis in axes])
@@ -516,20 +525,22 @@ def _innovation_statistics(
     return float(np.mean(nu**2 / S)), compute_nis_band(len(nu)), float(np.std(nu))
 
 
-def _summarise_aid(evaluated_updates: pd.DataFrame, evaluated_s: Spans) -> HeightSummary:
-    fused = evaluated_updates[evaluated_updates["rejected"] == 0.0]
-    longest_s = max(
-        _longest_between_fusions(rows_inside(fused, (span,)).index, (span,)) for span in evaluated_s
+def _summarise_aid(evaluated_updates: pd.DataFrame, spans_s: Spans) -> HeightSummary:
+    fused_updates = evaluated_updates[evaluated_updates["rejected"] == 0.0]
+    longest_gap_s = max(
+        _find_longest_gap_s(rows_inside(fused_updates, (span,)).index, (span,)) for span in spans_s
     )
     return HeightSummary(
-        *_innovation_statistics(evaluated_updates, *axes_of(evaluated_updates)),
+        *_compute_innovation_statistics(
+            evaluated_updates, *list_innovation_axes(evaluated_updates)
+        ),
         float(evaluated_updates["rejected"].mean()),
-        longest_s,
+        longest_gap_s,
     )
 
 
-def _heading_error(
-    flight: Flight, replay: Ekf2Replay, headings_rad: pd.Series, evaluated_s: Spans
+def _compute_heading_error_deg(
+    flight: Flight, replay: Ekf2Replay, headings_rad: pd.Series, spans_s: Spans
 ) -> float | Unavailable:
     """Return the mean (°) of ``headings_rad`` minus true heading."""
     if GNSS_POS.noise not in replay.settings:
@@ -537,7 +548,7 @@ def _heading_error(
     true_attitude = None if isinstance(flight.truth, Unavailable) else flight.truth.attitude
     if true_attitude is None:
         return replace(NO_TRUTH, what="heading error", reason="the log has no true attitude")
-    headings_rad = rows_inside(headings_rad, evaluated_s)
+    headings_rad = rows_inside(headings_rad, spans_s)
     true_headings_rad = np.interp(
         headings_rad.index, true_attitude.index, heading_rad(true_attitude), np.nan, np.nan
     )
@@ -545,24 +556,27 @@ def _heading_error(
     return float(np.degrees(np.nanmean(error_rad)))
 
 
-def _longest_between_fusions(fused_s: ArrayLike, evaluated_s: Spans) -> float:
-    fusion_times_s = [evaluated_s[0][0], evaluated_s[-1][1]]
-    return float(np.diff(np.sort(np.append(fusion_times_s, fused_s))).max())
+def _find_longest_gap_s(fusion_times_s: ArrayLike, spans_s: Spans) -> float:
+    span_limits_s = [spans_s[0][0], spans_s[-1][1]]
+    return float(np.diff(np.sort(np.append(span_limits_s, fusion_times_s))).max())
 
 
-def _deviation_note(
-    model: Model, replay: Ekf2Replay, disabled_aids: Mapping[str, float], evaluated_s: Spans
+def _describe_deviation(
+    model: Model, replay: Ekf2Replay, disabled_aids: Mapping[str, float], spans_s: Spans
 ) -> str:
     """Describe the position difference between replays with and without an aiding source."""
     position_difference_m = rows_inside(
         replay.published[Columns.POSITION] - model.baseline_replay.published[Columns.POSITION],
-        evaluated_s,
+        spans_s,
     )
     *horizontal_m, down_difference_m = np.abs(position_difference_m.to_numpy()).T
-    horizontal_distance_m, max_down_m = np.hypot(*horizontal_m), down_difference_m.max()
+    horizontal_distance_m, max_height_difference_m = (
+        np.hypot(*horizontal_m),
+        down_difference_m.max(),
+    )
     aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in disabled_aids.items())
-    height_aids = HEIGHT_NAMES & model.baseline_replay.other_aid_updates.keys()
-    horizontal_aids = {*modelled_aids(model.inputs)} - {MAG.name} - height_aids
+    height_aids = HEIGHT_AID_NAMES & model.baseline_replay.other_aid_updates.keys()
+    horizontal_aids = {*list_modelled_aids(model.inputs)} - {MAG.name} - height_aids
     at_s = position_difference_m.index[horizontal_distance_m.argmax()]
     note = (
         f"Without {aids_text} the published position differs from the replay with all aiding "
@@ -570,7 +584,10 @@ def _deviation_note(
         f"{horizontal_distance_m[-1]:.3g} m at the end"
     )
     if height_aids & {*disabled_aids}:
-        note = f"{note}. The heights of the two replays differ by at most {max_down_m:.3g} m"
+        note = (
+            f"{note}. The heights of the two replays differ by at most "
+            f"{max_height_difference_m:.3g} m"
+        )
     if horizontal_aids <= disabled_aids.keys():
         note = (
             f"{note}. The replay continues with the IMU alone; EKF2 stops publishing a position "
@@ -579,7 +596,7 @@ def _deviation_note(
     return note
 
 
-def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
+def _describe_replay_limits(model: Model, replay: Ekf2Replay) -> Iterator[str]:
     min_noise_m = replay.settings.get(GNSS_POS.noise, 0.0)
     if min_noise_m >= replay.changed.get(EV_POS.noise, np.inf):
         yield (
@@ -591,14 +608,14 @@ def _notes(model: Model, replay: Ekf2Replay) -> Iterator[str]:
         # fewer updates than samples
         received_count = max(len(replay.updates), replay.late) + replay.lost
         note = (
-            f"{_change_text(replay)}: {replay.late + replay.lost} of {received_count} samples "
+            f"{_format_changes(replay)}: {replay.late + replay.lost} of {received_count} samples "
             f"would arrive after the fusion horizon ({replay.lost} would never be fused)"
         )
         has_delay_limit = not model.inputs.rules.uses_delay_as_horizon
         yield f"{note}. Increase EKF2_DELAY_MAX" if has_delay_limit else note
 
 
-def _change_text(replay: Ekf2Replay) -> str:
+def _format_changes(replay: Ekf2Replay) -> str:
     return (
         ", ".join(f"{name}={value:g}" for name, value in replay.changed.items())
         or "Logged parameters"

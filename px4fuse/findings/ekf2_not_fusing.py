@@ -9,8 +9,8 @@ from px4fuse.core.text import format_metres
 from px4fuse.ekf2.fusion_conditions import (
     EV_START_INTERVAL_S,
     EV_STOP_INTERVAL_S,
-    FusionAttempt,
-    find_unmet,
+    UnfusedPositions,
+    find_unmet_condition,
     is_height_only,
 )
 from px4fuse.findings.model import (
@@ -81,7 +81,9 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
     spans = spans_with_value(0.0, fusion_flag, analysis.segment)
     longest_s = max(spans, key=lambda span: span[1] - span[0])
     parameters = {**analysis.flight.log.parameters, **ekf2.parameters}
-    unmet_condition = find_unmet(FusionAttempt(ekf2, source, aid, parameters, longest_s))
+    unmet_condition = find_unmet_condition(
+        UnfusedPositions(ekf2, source, aid, parameters, longest_s)
+    )
     evidence["condition"] = unmet_condition.condition
     action = unmet_condition.action
     if not unmet_condition.condition and not source.origin.has_all_samples:

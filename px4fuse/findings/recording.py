@@ -5,7 +5,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.text import capitalise_first, format_number
-from px4fuse.ekf2.inputs import MODEL_NOTE
+from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.findings.model import Findings, finding, format_count, note, warning
 from px4fuse.flight.model import Ekf2, Flight
 
@@ -106,7 +106,7 @@ def detect_clocks_set_back(flight: Flight) -> Findings:
 def detect_other_estimators(analysis: Analysis) -> Findings:
     """Detect an estimator that is not PX4's EKF2, and missing innovations."""
     log, ekf2 = analysis.flight.log, analysis.flight.ekf2
-    if MODEL_NOTE in log.notes:
+    if SIMULATED_EKF2_NOTE in log.notes:
         yield note(
             "ekf2_simulated",
             "This log is simulated: px4fuse's own model of EKF2 computed the EKF2 estimates, not "

@@ -7,7 +7,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.core.arrays import Array, rank_correlation
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.fusion_conditions import (
-    AGE_BY_WRONG_TIMESTAMP,
+    AGE_TEXT_BY_WRONG_TIMESTAMP,
     SET_TIMESTAMP_ACTION,
     SYNCHRONISE_ACTION,
 )
@@ -60,7 +60,7 @@ def detect(analysis: Analysis) -> Findings:
         yield from detect_varying_latency(analysis)
     elif clock.note == REPEATED_TIMESTAMPS and clock.distinct_stamps:
         yield from detect_shared_timestamps(analysis, clock.pairs, clock.distinct_stamps)
-    elif clock.clock in AGE_BY_WRONG_TIMESTAMP:
+    elif clock.clock in AGE_TEXT_BY_WRONG_TIMESTAMP:
         yield from detect_timestamp_unit(analysis, clock.clock)
     elif clock.distinct_stamps is not None:
         yield from detect_constant_timestamps(positions, clock, clock.distinct_stamps)
@@ -132,7 +132,7 @@ def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
     ):
         fusion_sentence = (
             f"EKF2 never fused the positions, because it treats them as "
-            f"{AGE_BY_WRONG_TIMESTAMP[clock]}. "
+            f"{AGE_TEXT_BY_WRONG_TIMESTAMP[clock]}. "
         )
     is_unix = clock.startswith("UNIX") or clock == "another clock"
     yield error(

@@ -13,7 +13,7 @@ from px4fuse.convention.lever_arm import estimate_lever_arm
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
-from px4fuse.ekf2.model import replay_settings
+from px4fuse.ekf2.model import replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.findings.model import Findings, error, note, source_words, warning
@@ -205,7 +205,7 @@ def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | N
     if not ekf2_model.agreement.good or not is_source_fused(analysis, ekf2_model.inputs):
         return ""
     rmses_m = []
-    for replay in (ekf2_model.baseline_replay, *replay_settings(ekf2_model, [change])):
+    for replay in (ekf2_model.baseline_replay, *replay_with_settings(ekf2_model, [change])):
         replayed_track = rows_inside(replay.published, replay.find_evaluated_spans())
         axis_errors_m = [
             replayed_track[name]

@@ -21,10 +21,14 @@ from px4fuse.ekf2.filter_recursion import (
     FilterConfiguration,
     SegmentRun,
 )
-from px4fuse.ekf2.heights import barometer_samples_inside
+from px4fuse.ekf2.heights import select_samples_in_segment
 from px4fuse.ekf2.inputs import GNSS_RULES, VISION_RULES, Inputs, ReceivedPositions
-from px4fuse.ekf2.model import delayed_states, run_configurations
-from px4fuse.ekf2.output_predictor import delay_by, follow_attitude, publish
+from px4fuse.ekf2.model import compute_delayed_states, run_configurations
+from px4fuse.ekf2.output_predictor import (
+    compute_published_state,
+    delay_by,
+    sum_attitude_corrections,
+)
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     GRAVITY_M_S2,
@@ -36,7 +40,7 @@ from px4fuse.ekf2.replay_segments import (
     ReplaySegment,
     add_field_states,
     downsample_imu,
-    step_ends,
+    find_step_ends,
 )
 from px4fuse.flight.ekf2_parameters import (
     BAROMETER,
@@ -143,7 +147,7 @@ def simulate_ekf2(
         # the barometer is EKF2's only height source outdoors
         down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
         no_dead_zone, sample_weight = np.zeros(len(down_m)), np.ones(len(down_m))
-        barometer_samples = barometer_samples_inside(
+        barometer_samples = select_samples_in_segment(
             segment, barometer_s, down_m, no_dead_zone, sample_weight
         )
         height_samples = HeightSamples(
@@ -192,7 +196,9 @@ def _make_segment(
     """Prepare the input of the EKF2 model, and the times (µs) and true attitudes of its steps."""
     time_us = sensors.time_us(imu)
     interval_s = np.diff(time_us) * 1e-6
-    step_end_indices = step_ends(interval_s, np.array([], dtype=np.intp), PREDICTION_STEP_US * 1e-6)
+    step_end_indices = find_step_ends(
+        interval_s, np.array([], dtype=np.intp), PREDICTION_STEP_US * 1e-6
+    )
     delta_angle_rad, delta_velocity_m_s = (
         imu.fields[name][1:].astype(np.float64) * interval_s[:, None]
         for name in ("gyro_rad", "accelerometer_m_s2")
@@ -315,7 +321,7 @@ def _compute_output(
 ) -> Ekf2Output:
     segment = model_run.segment
     lag_steps = round(inputs.horizon_s / inputs.mean_step_s)
-    state, _ = delayed_states(model_run, 0)
+    state, _ = compute_delayed_states(model_run, 0)
     resets, is_step_aided = _hold_without_aiding(model_run, state)
     reset_sum_m = np.zeros((len(state), 3))
     for step, reset_m in resets:
@@ -324,10 +330,10 @@ def _compute_output(
     gyro_bias_rad_s = rotate(segment.body_to_ned[1:], delay_by(state[:, GYRO_BIAS], lag_steps)[1:])
     attitude_error_steps_rad = -segment.correction_rad - gyro_bias_rad_s * segment.step_s[:, None]
     gyro_attitude_error_rad = state[0, THETA] + cumulative_sums(attitude_error_steps_rad)
-    attitude_error_rad = gyro_attitude_error_rad + follow_attitude(
+    attitude_error_rad = gyro_attitude_error_rad + sum_attitude_corrections(
         state[:, THETA] - gyro_attitude_error_rad, lag_steps, inputs.mean_step_s, inputs.horizon_s
     )
-    velocity_m_s, position_m = publish(
+    velocity_m_s, position_m = compute_published_state(
         segment, state, reset_sum_m, attitude_error_rad, lag_steps, inputs.settings
     )
     return Ekf2Output(

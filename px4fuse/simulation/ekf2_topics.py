@@ -212,7 +212,7 @@ def _barometer_topics(
     height_samples, end_step = model_run.segment.height_samples, model_run.events[0].end_step
     if height_samples is None or model_run.height_filter is None:
         return []
-    updates = model_run.height_filter.updates(BAROMETER.name, 0, end_step.astype(float))
+    updates = model_run.height_filter.make_update_table(BAROMETER.name, 0, end_step.astype(float))
     updates = updates[updates["fused_at_s"] < len(output.time_us) - output.lag_steps].iloc[1:]
     updates = updates[sensors.keep_at_rate(updates.index.to_numpy(), OTHER_AIDS_HZ)]
     innovation, innovation_variance, is_rejected, is_fused, update_steps = updates.to_numpy().T

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from px4fuse.core.text import to_json_types
-from px4fuse.ekf2.inputs import MODEL_NOTE
+from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
 from px4fuse.flight.model import Flight
@@ -117,7 +117,7 @@ def to_ulog(simulation: Simulation, *, is_assessed: bool = False) -> bytes:
         "sys_name": "PX4",
         "ver_hw": SIMULATION_HARDWARE,
         "ver_sw_release": PX4_RELEASE,
-        **({NOTE_KEY: MODEL_NOTE} if simulation.scenario.ekf2 else {}),
+        **({NOTE_KEY: SIMULATED_EKF2_NOTE} if simulation.scenario.ekf2 else {}),
         **({ASSESSED_KEY: 1} if is_assessed else {}),
     }
     return encode(simulation.topics, simulation.parameters, info, sensors.START_US)

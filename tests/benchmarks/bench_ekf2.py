@@ -19,11 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-from px4fuse.ekf2.model import Model, open_model, replay_settings
+from px4fuse.ekf2.model import Model, open_model, replay_with_settings
 from px4fuse.ekf2.replay import Agreement
 from px4fuse.ekf2.steps import (
-    FIELD_STEP,
     FLOW_STEP,
+    MAGNETOMETER_STEP,
     REPLACEMENT_STEPS,
     VELOCITY_STEP,
     explain_by_steps,
@@ -96,7 +96,13 @@ def waterfalls(models: dict[str, Model]) -> dict[str, float]:
     Returns the unexplained share of each flight.
     """
     unexplained = {}
-    steps = (*REPLACEMENT_STEPS[:-2], FIELD_STEP, VELOCITY_STEP, FLOW_STEP, *REPLACEMENT_STEPS[-2:])
+    steps = (
+        *REPLACEMENT_STEPS[:-2],
+        MAGNETOMETER_STEP,
+        VELOCITY_STEP,
+        FLOW_STEP,
+        *REPLACEMENT_STEPS[-2:],
+    )
     print("\nwhy EKF2 differs | total rms m | " + " | ".join(steps) + " | left")
     for name, model in models.items():
         found = explain_by_steps(model)
@@ -211,7 +217,9 @@ def speed(flight: Flight, model: Model) -> None:
         ("EKF2_EV_DELAY", np.linspace(5.0, 150.0, count)),
     ):
         settings = [{name: float(value)} for value in values]
-        each = cpu_s(lambda settings=settings: list(replay_settings(model, settings)), 3) / count
+        each = (
+            cpu_s(lambda settings=settings: list(replay_with_settings(model, settings)), 3) / count
+        )
         print(f"{count} values of {name}: {each:.4f} s of CPU each (aim 0.03 s)")
     for share in (0.25, 0.5, 1.0):
         assert not isinstance(flight.imu, Unavailable)

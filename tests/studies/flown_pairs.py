@@ -19,7 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from px4fuse.ekf2.model import Model, open_model, replay_with_logged_rejections
-from px4fuse.ekf2.replay import agreement_with_log, component_along, inside_spans, rms_to_truth
+from px4fuse.ekf2.replay import (
+    compare_with_log,
+    compute_rmse_to_truth,
+    inside_spans,
+    interpolate_component,
+)
 from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import PARAMETERS
@@ -51,7 +56,7 @@ def describe_agreement(flown: FlownFlight) -> str:
     if isinstance(flown.model, Unavailable):
         return flown.model.reason
     replay = replay_with_logged_rejections(flown.model)
-    agreement = agreement_with_log(flown.model.flight, replay)
+    agreement = compare_with_log(flown.model.flight, replay)
     if isinstance(agreement, Unavailable):
         return agreement.reason
     correlations = {
@@ -90,8 +95,11 @@ def flown_errors_m(before: FlownFlight, after: FlownFlight, found: WhatIf) -> tu
     spans = [(begin + shift_s, end + shift_s) for begin, end in found.find_evaluated_spans()]
     times = ekf2.state.index[inside_spans(ekf2.state.index, tuple(spans))].to_numpy()
     north, east, down = (
-        rms_to_truth(
-            after.flight, component_along(ekf2.state, Columns.POSITION, axis, times), axis, times
+        compute_rmse_to_truth(
+            after.flight,
+            interpolate_component(ekf2.state, Columns.POSITION, axis, times),
+            axis,
+            times,
         )
         for axis in np.eye(3)
     )
