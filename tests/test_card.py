@@ -14,7 +14,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, build_refusal_card
 from px4fuse.card.causes import make_cause, rank_causes
 from px4fuse.card.model import Action
-from px4fuse.comparison.trials import RunStatistics, Trial, improvement
+from px4fuse.comparison.trials import RunStatistics, Trial, classify_improvement
 from px4fuse.diagnose import find_faults
 from px4fuse.errors import LogError
 from px4fuse.filter.settings import Settings
@@ -78,7 +78,7 @@ NOISE = Finding("sigma_z_too_small", "error", "SIGMA_Z is too small.", "", {})
 def test_diagnosis_lists_sensor_fault_before_wrong_parameter() -> None:
     flight = analysis(trial("noises", outcome(1.0, 1.0, 0.1)), trial("time offset", CORRECTED))
     ranked = rank_causes(flight, [NOISE, OFFSET])
-    assert [(each.finding.id, each.tier) for each in ranked] == [
+    assert [(each.finding.id, each.rank) for each in ranked] == [
         ("source_time_offset", 1), ("sigma_z_too_small", 1),
     ]  # fmt: skip
     # the setting reduces the error more, but a source fault comes first
@@ -96,7 +96,7 @@ def test_diagnosis_lists_sensor_fault_before_wrong_parameter() -> None:
     ],
 )
 def test_filter_rerun_result_shows_if_rmse_or_sigma_improved(after, improves) -> None:
-    assert improvement(trial("noises", after)) == improves
+    assert classify_improvement(trial("noises", after)) == improves
 
 
 def test_setting_without_improvement_in_rerun_is_not_recommended() -> None:
