@@ -82,7 +82,7 @@ def test_diagnosis_lists_sensor_fault_before_wrong_parameter() -> None:
         ("source_time_offset", 1), ("sigma_z_too_small", 1),
     ]  # fmt: skip
     # the setting reduces the error more, but a source fault comes first
-    assert ranked[1].reduction > ranked[0].reduction
+    assert ranked[1].log_ratio_reduction > ranked[0].log_ratio_reduction
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_diagnosis_merges_equal_actions_for_kf_and_ekf2() -> None:
     (ranked,) = rank_causes(flight, [gap])
     cause = make_cause(flight, ranked, verdicts(*ratios), REQUEST)
     assert [(action.target, action.sentence) for action in cause.actions] == [
-        ("sender", "Check the link."), ("KF, EKF2", "no setting removes this fault"),
+        ("sender", "Check the link."), ("KF, EKF2", "no filter setting corrects this fault"),
     ]  # fmt: skip
 
 
@@ -200,6 +200,7 @@ def test_diagnosis_explains_differing_nis_and_nees_verdicts() -> None:
         "position and σ",
     )
     assert card.reconcile == (
-        "The verdicts on EKF2 against source and ground truth differ, because innovations show "
-        "little of this fault. The first action of this card removes most of the position error."
+        "The σ ratio of EKF2 against the position source differs from that against ground truth, "
+        "because innovations show little of the first fault of this card. The re-run without this "
+        "fault reduces the position error."
     )

@@ -20,7 +20,7 @@ from msgspec import structs
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.projection import project as project_state
 from px4fuse.comparison.remedy import find_aid
-from px4fuse.comparison.reruns import POSITION_VARIANCES
+from px4fuse.comparison.reruns import POSITION_VARIANCE_COLUMNS
 from px4fuse.comparison.trials import (
     ROTATION,
     brings_inside_limits,
@@ -197,7 +197,7 @@ def test_larger_ekf2_acc_noise_partly_corrects_vibration_nees() -> None:
     delayed = project_state(replayed.delayed, analysis.main.axis, analysis.segment)["position_m"]
     truth = analysis.main.truth["position_m"]
     error_m = delayed - np.interp(delayed.index, truth.index, truth, np.nan, np.nan)
-    variances = replayed.updates[POSITION_VARIANCES].mean(axis=1).mean()
+    variances = replayed.updates[POSITION_VARIANCE_COLUMNS].mean(axis=1).mean()
     assert np.nanmean(error_m**2) / variances < 1.5**2 < tried.after.nees_mean
 
 

@@ -44,7 +44,7 @@ REBOOT_PARAMETER_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
 # Minimum fraction of rejected positions that the table of re-runs shows
 MIN_SHOWN_REJECTED_FRACTION = 0.005
 # Devices or filters to be changed, by group of the finding
-ACTION_TARGET_BY_FINDING_GROUP: Mapping[str, ActionTarget] = {
+ACTION_TARGET_BY_GROUP: Mapping[str, ActionTarget] = {
     "position source": "sender",
     "time": "sender",
     "IMU": "flight",
@@ -53,8 +53,8 @@ ACTION_TARGET_BY_FINDING_GROUP: Mapping[str, ActionTarget] = {
     "loops": "source",
     "logging": "logging",
 }
-# Exceptions from ACTION_TARGET_BY_FINDING_GROUP
-ACTION_TARGET_BY_FINDING_ID: Mapping[str, ActionTarget] = {
+# Exceptions from ACTION_TARGET_BY_GROUP
+ACTION_TARGET_BY_ID: Mapping[str, ActionTarget] = {
     "source_drift": "source",
     "source_lever_arm": "EKF2",
     "source_coordinate_constant": "EKF2",
@@ -89,14 +89,9 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
             has_effect(trial) or not can_show_effect(trial) for trial in trials
         ):
             continue
-        ranked_causes.append(
-            RankedCause(
-                finding,
-                _find_cause_rank(finding, trials),
-                sum(map(compute_log_ratio_reduction, trials)),
-                trials,
-            )
-        )
+        reduction = sum(map(compute_log_ratio_reduction, trials))
+        rank = _find_cause_rank(finding, trials)
+        ranked_causes.append(RankedCause(finding, rank, reduction, trials))
     fault_causes = [
         cause for cause in ranked_causes if CATALOGUE[cause.finding.id].verdict != "repeated"
     ]
@@ -283,10 +278,8 @@ def _explain_no_change(
 
 
 def _find_action_target(finding: Finding, source: PositionTrack | None = None) -> ActionTarget:
-    target = (
-        ACTION_TARGET_BY_FINDING_ID.get(finding.id)
-        or ACTION_TARGET_BY_FINDING_GROUP[CATALOGUE[finding.id].group]
-    )
+    group = CATALOGUE[finding.id].group
+    target = ACTION_TARGET_BY_ID.get(finding.id) or ACTION_TARGET_BY_GROUP[group]
     is_gnss_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_gnss_receiver else target
 
@@ -369,8 +362,8 @@ def _format_closing_sentence(
 ) -> str:
     if alternative_groups:
         return (
-            "The delay parameter and the corrected timestamps correct the same time offset: use "
-            "only one of them, and take all other actions. For late timestamps, a delay parameter "
+            "The actions on timestamps and on the delay parameter correct the same time offset: "
+            "take only one of them, and all other actions. For late timestamps, a delay parameter "
             "(ms) is positive, and --clock-offset (s) is negative."
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):

@@ -96,9 +96,7 @@ def find_candidate_changes(
         else make_ml_delay_change(comparison, ekf2_inputs, estimates.clock)
     )
     changes += (
-        [delay_parameters]
-        if delay_parameters
-        else _find_time_offset_changes(estimates, ekf2_inputs)
+        [delay_parameters] if delay_parameters else _find_offset_changes(estimates, ekf2_inputs)
     )
     if axis_result.axis.name == "down":
         return changes
@@ -130,9 +128,7 @@ def find_main_axis_changes(
     )
     if ekf2_inputs is not None:
         has_delay_change = any(ekf2_inputs.aid.delay in change for change in changes)
-        offset_changes = (
-            _find_time_offset_changes(estimates, ekf2_inputs) if has_delay_change else []
-        )
+        offset_changes = _find_offset_changes(estimates, ekf2_inputs) if has_delay_change else []
         return remove_repeated_changes([*changes, *offset_changes])
     noise_changes = [change for change in changes if change.keys() <= CHANGED_KF_SETTINGS]
     if len(noise_changes) > 1:
@@ -142,7 +138,6 @@ def find_main_axis_changes(
 
 
 def remove_repeated_changes(changes: Iterable[Change]) -> list[Change]:
-    """Remove repeated changes; the order of the others is kept."""
     return list({frozenset(change.items()): change for change in changes}.values())
 
 
@@ -181,7 +176,7 @@ def find_axis_tuning(tuning: Tuning, axis: str) -> AxisTuning | None:
     return find_first_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
-def _find_time_offset_changes(estimates: Estimates, ekf2_inputs: Inputs | None) -> list[Change]:
+def _find_offset_changes(estimates: Estimates, ekf2_inputs: Inputs | None) -> list[Change]:
     """Return the estimated time offset, if a significant part of it is not corrected yet.
 
     For EKF2, EKF2_DELAY_MAX is increased if the shifted positions are too old to be fused.
@@ -270,19 +265,12 @@ def _find_vibration_noise_changes(
     SIGMA_A² · DT².
     """
     ekf2_steps_per_dt = settings.dt_s / ekf2_inputs.mean_step_s
-    logged_acc_noise_m_s2, px4_maximum = (
-        ekf2_inputs.settings[ACC_NOISE],
-        PARAMETERS[ACC_NOISE].maximum,
-    )
+    logged_acc_noise, px4_maximum = ekf2_inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
     if (
         axis_tuning.sigma_a_two_state.low or 0.0
-    ) * ekf2_steps_per_dt**0.5 <= MIN_VIBRATION_RATIO * logged_acc_noise_m_s2:
+    ) * ekf2_steps_per_dt**0.5 <= MIN_VIBRATION_RATIO * logged_acc_noise:
         return []
-    ml_acc_noise_m_s2 = min(
+    ml_acc_noise = min(
         (axis_tuning.sigma_a_two_state.value or 0.0) * ekf2_steps_per_dt**0.5, px4_maximum
     )
-    return (
-        [{ACC_NOISE: float(f"{ml_acc_noise_m_s2:.2g}")}]
-        if ml_acc_noise_m_s2 > logged_acc_noise_m_s2
-        else []
-    )
+    return [{ACC_NOISE: float(f"{ml_acc_noise:.2g}")}] if ml_acc_noise > logged_acc_noise else []

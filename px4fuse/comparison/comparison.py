@@ -212,12 +212,10 @@ def _compute_kf_track(
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return state and variances of KF at EKF2's sample times; without EKF2, at KF's steps."""
     output_times_s = (kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index
-    return compute_kf_state_and_variance(kf_run, output_times_s.to_numpy())
+    return sample_kf_run(kf_run, output_times_s.to_numpy())
 
 
-def compute_kf_state_and_variance(
-    kf_run: Replay, times_s: Array
-) -> tuple[pd.DataFrame, pd.DataFrame]:
+def sample_kf_run(kf_run: Replay, times_s: Array) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return state and variances of KF at ``times_s`` (s)."""
     state, variance = (
         pd.DataFrame(
@@ -248,9 +246,7 @@ def compute_error_statistics(
             "Choose a time span with ground truth.",
         )
     nees_position, nees_velocity = (
-        _compute_mean_nees(
-            error / interpolate_reported_sigma(state.index.to_numpy(), variance, column)
-        )
+        _compute_mean_nees(error / interpolate_sigma(state.index.to_numpy(), variance, column))
         for error, column in zip((position_m, velocity_m_s), VARIANCE_COLUMNS, strict=True)
     )
     return ErrorsAgainstTruth(
@@ -276,7 +272,7 @@ def _compute_errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Ar
     return np.asarray(state[column].to_numpy() - true_values)
 
 
-def interpolate_reported_sigma(time_s: Array, variance: TableOrUnavailable, column: str) -> Array:
+def interpolate_sigma(time_s: Array, variance: TableOrUnavailable, column: str) -> Array:
     """Interpolate the reported σ to the times ``time_s``; NaN if it is unknown."""
     known_variance = _select_known_values(variance, column)
     if known_variance.empty:
@@ -313,7 +309,7 @@ def compute_position_errors(
         state, variance = axis_result.ekf2_state, axis_result.ekf2_variance
     time_s = state.index.to_numpy()
     errors_m = _compute_errors(state, axis_result.truth, STATE_COLUMNS[0])
-    sigma_m = interpolate_reported_sigma(time_s, variance, VARIANCE_COLUMNS[0])
+    sigma_m = interpolate_sigma(time_s, variance, VARIANCE_COLUMNS[0])
     return pd.DataFrame({"error_m": errors_m, "sigma_m": sigma_m}, index=time_s)
 
 

@@ -37,7 +37,7 @@ EQUAL_RMSE_TOLERANCE = 0.05
 MIN_CONTRIBUTION_FRACTION = 0.05
 # A noise setting of KF that differs from its estimate by at least this factor dominates the
 # difference KF - EKF2. The explanation then uses KF with the estimate
-MIN_SETTING_ERROR_FACTOR = 4.0
+MIN_SETTING_ERROR_RATIO = 4.0
 # A step replaces one property of KF by that of EKF2. The report omits steps that change KF's
 # position by less than this distance (m)
 MIN_STEP_EFFECT_M = 1e-6
@@ -111,10 +111,7 @@ def estimate_wrong_settings(comparison: Comparison, tuning: Tuning) -> dict[str,
         current_value = getattr(comparison.settings, name)
         if noise.value is None or current_value == getattr(Settings(), name):
             continue
-        if (
-            max(current_value / noise.value, noise.value / current_value)
-            >= MIN_SETTING_ERROR_FACTOR
-        ):
+        if max(current_value / noise.value, noise.value / current_value) >= MIN_SETTING_ERROR_RATIO:
             estimate_by_setting[name] = float(f"{noise.value:.3g}")
     return estimate_by_setting
 
@@ -245,14 +242,14 @@ def _explain_steps(
 ) -> dict[str, str]:
     kf_settings, ekf2_inputs, source = comparison.settings, model.inputs, comparison.source
     ekf2_parameters, aid = ekf2_inputs.settings, ekf2_inputs.aid
-    prediction_times_text = (
+    prediction_text = (
         f"KF predicts every {kf_settings.dt_s:g} s, starting at its first position; EKF2 predicts "
         f"every {1e3 * ekf2_inputs.mean_step_s:.0f} ms"
     )
     if kf_settings.input == "zero":
-        prediction_times_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
+        prediction_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
     elif source.name != ekf2_inputs.received.source:
-        prediction_times_text = (
+        prediction_text = (
             f"KF uses positions of {source.name}; EKF2 uses {ekf2_inputs.received.source}"
         )
     position_age_ms = 1e3 * (source.assumed_delay_s - kf_settings.clock_offset_s)
@@ -274,7 +271,7 @@ def _explain_steps(
     )
     trusted_input = "IMU" if equivalent_sigma_a < kf_settings.sigma_a_m_s2 else "positions"
     return {
-        steps.SAMPLES: prediction_times_text,
+        steps.SAMPLES: prediction_text,
         steps.TIMESTAMPS: delay_text,
         steps.NOISE: (
             f"EKF2 uses a measurement noise of {find_used_noise_m(model.inputs):.2g} m "

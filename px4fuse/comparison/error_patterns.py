@@ -28,13 +28,13 @@ NEIGHBOUR_ROW_OFFSETS = np.array([-2, -1, 1, 2])
 MAX_NEIGHBOUR_SPAN_INTERVALS = 8.0
 # Maximum ratio of the σ of a residual to the σ of a position: above it, the interpolation is
 # inaccurate, and the residual is not used
-MAX_RESIDUAL_TO_POSITION_SIGMA = 4.0
+MAX_RESIDUAL_SIGMA_RATIO = 4.0
 # Number of timestamps in a running median: it follows steps by missing positions, but not jitter
 TIMESTAMP_MEDIAN_LENGTH = 9
 # Half of the time (s) over which a velocity is averaged
 VELOCITY_HALF_WINDOW_S = 0.3
 # Number of residuals per independent residual: successive residuals have common neighbours
-RESIDUALS_PER_INDEPENDENT = 3
+DEPENDENT_RESIDUALS = 3
 # Minimum timestamp jitter (s, 1 σ): an error of 1 cm at 1 m/s
 MIN_JITTER_S = 0.008
 # Jitter is confirmed if position residual / (timestamp residual · velocity) is in this range
@@ -43,9 +43,9 @@ JITTER_RATIO_LIMITS = 0.6, 1.5
 MIN_JITTER_FRACTION = 0.4
 # Minimum significance (σ) of jitter, and of noise that increases with speed
 MIN_SIGNIFICANCE_SIGMAS = 6.0
-# Number of flight parts in which an increase of noise with speed is tested, and minimum of the
-# median significance (σ) of these tests
-FLIGHT_PART_COUNT, MIN_PART_SIGNIFICANCE_SIGMAS = 5, 1.2
+# Number of flight parts with a test of noise against speed, and minimum median of its significance
+# (σ) in these parts
+FLIGHT_PART_COUNT, MIN_PART_SIGMAS = 5, 1.2
 # Quantiles of the speed: below the first, the vehicle is slow; above the second, it is fast
 SLOW_SPEED_QUANTILE, FAST_SPEED_QUANTILE = 0.3, 0.7
 # Minimum ratio of the noise at high speed to the noise at low speed, both along and across the
@@ -56,7 +56,7 @@ MIN_PATH_RMS_M = 0.5
 # Length (s) of the running mean that is removed from the errors of odometry, which drifts
 DRIFT_WINDOW_S = 12.0
 # Length (s) of the flight parts with separate time offsets
-OFFSET_PART_DURATION_S = 4.0
+OFFSET_PART_LENGTH_S = 4.0
 # Minimum RMS speed (m/s) of a flight part whose time offset is estimated
 MIN_SPEED_FOR_OFFSET_M_S = 0.3
 # Minimum range (s) of a varying time offset to report it: a position error of 8 cm at 1 m/s
@@ -76,7 +76,7 @@ MIN_PERIODS = 5.0
 # Maximum tested frequency (Hz) of a sinusoidal error
 MAX_FREQUENCY_HZ = 2.0
 # Spacing of the tested frequencies, in periods per flight duration
-FREQUENCY_STEP_TIMES_DURATION = 0.2
+FREQUENCY_STEP_PERIODS = 0.2
 # Minimum number of time bins per period: an amplitude is then too small by at most 0.2 %
 MIN_BINS_PER_PERIOD = 30
 # A sinusoidal error is reported if at most this fraction of the mean square motion of the vehicle
@@ -84,7 +84,7 @@ MIN_BINS_PER_PERIOD = 30
 MAX_PERIODIC_MOTION_FRACTION = 0.1
 # Interval (s) of the compared rotations, half the step of the tested delays of the logged attitude;
 # largest tested delay (s)
-ROTATION_SAMPLE_INTERVAL_S, MAX_ATTITUDE_DELAY_S = 0.01, 0.5
+ROTATION_INTERVAL_S, MAX_ATTITUDE_DELAY_S = 0.01, 0.5
 # Smaller delays (s) of the logged attitude are not reported
 MIN_ATTITUDE_DELAY_S = 0.04
 # Maximum number of rotations from attitude and gyroscopes that are compared, to limit the computing
@@ -144,7 +144,7 @@ class ErrorFit(NamedTuple):
     scale_sigma: float
 
     def compute_slow_mean_square_m2(self) -> float:
-        """Return the mean square (m²) of the slow errors: the residual without white noise."""
+        """Return the mean square (m²) of the slow errors, the residual without white noise."""
         return float(np.mean(self.residual_m**2, axis=0).sum()) - 2.0 * self.white_sigma_m**2
 
 
@@ -194,10 +194,10 @@ def compute_local_residuals(comparison: Comparison) -> LocalFitResiduals | None:
         for other_neighbour in set(range(len(NEIGHBOUR_ROW_OFFSETS))) - {neighbour}:
             other_elapsed_s = elapsed_s[:, other_neighbour]
             weights[:, neighbour] *= other_elapsed_s / (other_elapsed_s - elapsed_s[:, neighbour])
-    residual_to_position_sigma = np.sqrt(1.0 + np.sum(weights**2, axis=1))
-    timestamp_deviation_s = time_s - interval_s * np.arange(len(time_s))
-    timestamp_delay_s = timestamp_deviation_s - median_filter(
-        timestamp_deviation_s, TIMESTAMP_MEDIAN_LENGTH, mode="nearest"
+    residual_sigma_ratio = np.sqrt(1.0 + np.sum(weights**2, axis=1))
+    deviation_s = time_s - interval_s * np.arange(len(time_s))
+    timestamp_delay_s = deviation_s - median_filter(
+        deviation_s, TIMESTAMP_MEDIAN_LENGTH, mode="nearest"
     )
     half_window_rows = max(2, round(VELOCITY_HALF_WINDOW_S / interval_s))
     first_row, last_row = (
@@ -206,11 +206,11 @@ def compute_local_residuals(comparison: Comparison) -> LocalFitResiduals | None:
     )
     displacement_m = position_m[last_row] - position_m[first_row]
     velocity_m_s = displacement_m / (time_s[last_row] - time_s[first_row])[:, None]
-    is_accurate = residual_to_position_sigma < MAX_RESIDUAL_TO_POSITION_SIGMA
+    is_accurate = residual_sigma_ratio < MAX_RESIDUAL_SIGMA_RATIO
 
     def compute_residual(values: Array) -> Array:
         interpolated_values = np.einsum("nk,nk...->n...", weights, values[neighbour_rows])
-        scaled_residuals = ((values[rows] - interpolated_values).T / residual_to_position_sigma).T
+        scaled_residuals = ((values[rows] - interpolated_values).T / residual_sigma_ratio).T
         return np.asarray(scaled_residuals[is_accurate])
 
     ekf2 = comparison.flight.ekf2
@@ -240,7 +240,7 @@ def find_timestamp_jitter(errors: LocalFitResiduals) -> float | None:
         return None
     ratio = float(np.sum(errors.residual_m * expected_m)) / expected_square_m2
     unexplained_m = errors.residual_m - ratio * expected_m
-    sigma = np.sqrt(RESIDUALS_PER_INDEPENDENT * np.mean(unexplained_m**2) / expected_square_m2)
+    sigma = np.sqrt(DEPENDENT_RESIDUALS * np.mean(unexplained_m**2) / expected_square_m2)
     jitter_fraction = np.sqrt(expected_square_m2 / np.sum(errors.residual_m**2))
     is_jitter = (
         JITTER_RATIO_LIMITS[0] < ratio < JITTER_RATIO_LIMITS[1]
@@ -260,7 +260,7 @@ def find_speed_noise(errors: LocalFitResiduals) -> SpeedNoise | None:
     # Parts are tested, because noise that is larger in one part only may correlate with speed, too
     correlation_z_scores = [
         rank_correlation(residual_norms_m[part], speed_m_s[part])
-        * np.sqrt(len(part) / RESIDUALS_PER_INDEPENDENT)
+        * np.sqrt(len(part) / DEPENDENT_RESIDUALS)
         for part in (
             np.arange(len(residual_norms_m)),
             *np.array_split(np.arange(len(residual_norms_m)), FLIGHT_PART_COUNT),
@@ -270,7 +270,7 @@ def find_speed_noise(errors: LocalFitResiduals) -> SpeedNoise | None:
     if (
         len(correlation_z_scores) <= FLIGHT_PART_COUNT
         or correlation_z_scores[0] < MIN_SIGNIFICANCE_SIGMAS
-        or np.median(correlation_z_scores[1:]) < MIN_PART_SIGNIFICANCE_SIGMAS
+        or np.median(correlation_z_scores[1:]) < MIN_PART_SIGMAS
     ):
         return None
     speed_limits_m_s = np.quantile(speed_m_s, [SLOW_SPEED_QUANTILE, FAST_SPEED_QUANTILE])
@@ -281,9 +281,8 @@ def find_speed_noise(errors: LocalFitResiduals) -> SpeedNoise | None:
     across_residual_m = np.abs(np.sum(errors.residual_m * _rotate_90(direction), axis=1))
     # Noise along the motion only is not reported: timestamp jitter causes it, too
     if any(
-        np.median(component_m[is_fast])
-        < MIN_FAST_TO_SLOW_NOISE_RATIO * np.median(component_m[is_slow])
-        for component_m in (along_residual_m, across_residual_m)
+        np.median(noise_m[is_fast]) < MIN_FAST_TO_SLOW_NOISE_RATIO * np.median(noise_m[is_slow])
+        for noise_m in (along_residual_m, across_residual_m)
     ):
         return None
     slow_and_fast_noise_m = (
@@ -364,10 +363,8 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     """
     duration_s = fit.time_s[-1] - fit.time_s[0]
     highest_hz = min(MAX_FREQUENCY_HZ, 0.25 / float(np.median(np.diff(fit.time_s))))
-    step_hz = FREQUENCY_STEP_TIMES_DURATION / duration_s
-    rows = slice(
-        round(MIN_PERIODS / FREQUENCY_STEP_TIMES_DURATION), int(np.ceil(highest_hz / step_hz))
-    )
+    step_hz = FREQUENCY_STEP_PERIODS / duration_s
+    rows = slice(round(MIN_PERIODS / FREQUENCY_STEP_PERIODS), int(np.ceil(highest_hz / step_hz)))
     if rows.stop <= rows.start or fit.compute_slow_mean_square_m2() <= 0.0:
         return None
     # With the errors summed in time bins of equal length, one FFT contains all tested frequencies
@@ -404,10 +401,10 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     The time offsets of all flight parts and the parameters of :class:`ErrorFit` are fitted
     together. A time offset causes no error at rest, so it does not explain a jump or drift.
     """
-    part_indices = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_DURATION_S).astype(int)
+    part_indices = np.floor((fit.time_s - fit.time_s[0]) / OFFSET_PART_LENGTH_S).astype(int)
     square_speed_sums = np.bincount(part_indices, np.sum(fit.velocity_m_s**2, axis=1))
-    mean_square_speeds_m2_s2 = square_speed_sums / np.maximum(np.bincount(part_indices), 1)
-    moving_part_indices = np.flatnonzero(mean_square_speeds_m2_s2 > MIN_SPEED_FOR_OFFSET_M_S**2)
+    mean_square_speeds = square_speed_sums / np.maximum(np.bincount(part_indices), 1)
+    moving_part_indices = np.flatnonzero(mean_square_speeds > MIN_SPEED_FOR_OFFSET_M_S**2)
     if len(moving_part_indices) < 2:
         return None
     # The time offset of a part affects only this part, so it is eliminated part by part. Then the
@@ -427,17 +424,15 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     columns -= effect[:, :, None] * offsets_by_column_s[part_indices, None]
     parameters, residual_m = _least_squares(columns[..., :-1], columns[..., -1])
     offsets_s = (offsets_by_column_s @ np.append(-parameters, 1.0))[moving_part_indices]
-    remaining_mean_square_m2 = (
-        float(np.mean(residual_m**2, axis=0).sum()) - 2.0 * fit.white_sigma_m**2
-    )
+    slow_square_m2 = fit.compute_slow_mean_square_m2()
+    remaining_square_m2 = float(np.mean(residual_m**2, axis=0).sum()) - 2.0 * fit.white_sigma_m**2
     if (
         np.ptp(offsets_s) < MIN_OFFSET_RANGE_S
-        or fit.compute_slow_mean_square_m2() < MIN_SLOW_TO_WHITE_RATIO * 2.0 * fit.white_sigma_m**2
-        or remaining_mean_square_m2
-        > MAX_REMAINING_SLOW_FRACTION * fit.compute_slow_mean_square_m2()
+        or slow_square_m2 < MIN_SLOW_TO_WHITE_RATIO * 2.0 * fit.white_sigma_m**2
+        or remaining_square_m2 > MAX_REMAINING_SLOW_FRACTION * slow_square_m2
     ):
         return None
-    times_s = fit.time_s[0] + OFFSET_PART_DURATION_S * (moving_part_indices + 0.5)
+    times_s = fit.time_s[0] + OFFSET_PART_LENGTH_S * (moving_part_indices + 0.5)
     extreme_indices = [int(np.argmin(offsets_s)), int(np.argmax(offsets_s))]
     return OffsetVariation(*offsets_s[extreme_indices].tolist(), *times_s[extreme_indices].tolist())
 
@@ -450,10 +445,10 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
         min(imu_time_s[-1], attitude_time_s[-1]),
     )
     time_s = np.arange(
-        start_s + MAX_ATTITUDE_DELAY_S, end_s - MAX_ATTITUDE_DELAY_S, ROTATION_SAMPLE_INTERVAL_S
+        start_s + MAX_ATTITUDE_DELAY_S, end_s - MAX_ATTITUDE_DELAY_S, ROTATION_INTERVAL_S
     )
     time_s = time_s[:MAX_ROTATION_COUNT]
-    rows_per_rotation = round(ROTATION_STEP_S / ROTATION_SAMPLE_INTERVAL_S)
+    rows_per_rotation = round(ROTATION_STEP_S / ROTATION_INTERVAL_S)
     if len(time_s) < MIN_POSITIONS:
         return None
     imu = rows_between(
@@ -467,26 +462,19 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     angle_rad = cumulative_integral(imu[Columns.ANGULAR_RATE].to_numpy(), imu_time_s)
 
     def compute_mean_square_rad2(delay_s: float) -> float:
-        delayed_angles_rad = [
-            np.interp(time_s - delay_s, imu_time_s, column) for column in angle_rad.T
-        ]
+        delayed_rad = np.array(
+            [np.interp(time_s - delay_s, imu_time_s, column) for column in angle_rad.T]
+        )
         differences_rad = (
             rotation_rad
-            - (
-                np.array(delayed_angles_rad)[:, rows_per_rotation:]
-                - np.array(delayed_angles_rad)[:, :-rows_per_rotation]
-            ).T
+            - (delayed_rad[:, rows_per_rotation:] - delayed_rad[:, :-rows_per_rotation]).T
         )
         differences_rad -= np.median(differences_rad, axis=0)  # removes the gyroscope bias
         # Each difference is limited, because resets of the attitude cause large differences
-        difference_norms_rad = np.minimum(
-            np.linalg.norm(differences_rad, axis=1), MAX_ROTATION_DIFFERENCE_RAD
-        )
-        return float(np.mean(difference_norms_rad**2))
+        norms_rad = np.minimum(np.linalg.norm(differences_rad, axis=1), MAX_ROTATION_DIFFERENCE_RAD)
+        return float(np.mean(norms_rad**2))
 
-    delays_s = np.arange(
-        -MAX_ATTITUDE_DELAY_S, MAX_ATTITUDE_DELAY_S, 2.0 * ROTATION_SAMPLE_INTERVAL_S
-    )
+    delays_s = np.arange(-MAX_ATTITUDE_DELAY_S, MAX_ATTITUDE_DELAY_S, 2.0 * ROTATION_INTERVAL_S)
     delay_s = float(min(delays_s, key=compute_mean_square_rad2))
     is_late = abs(delay_s) >= MIN_ATTITUDE_DELAY_S and compute_mean_square_rad2(
         delay_s

@@ -134,7 +134,7 @@ def estimate_noises(
     ----------
     comparison : Comparison
     axis_names : tuple of str, optional
-        Axis axis_names, or "horizontal" for north and east together; default: all.
+        Axis names, or "horizontal" for north and east together; default: all.
     progress : callable
         Called with the name of each estimate before it is computed.
     motion_cache : dict, optional

@@ -215,5 +215,4 @@ class Comparison(PreparedComparison):
 
 
 def select_north_and_east(comparison: Comparison) -> list[AxisComparison]:
-    """Return the results along north and east, if available."""
     return [comparison.axes[name] for name in ("north", "east") if name in comparison.axes]

@@ -32,10 +32,8 @@ def tune_by_axis(comparison: Comparison) -> tuple[AxisTuning, ...]:
     """Estimate separate noises along north and along east, if their mean NIS differs."""
     axes = select_north_and_east(comparison)
     summaries = [axis.filters["kf"] for axis in axes]
-    mean_nis_values = [
-        summary.nis_mean for summary in summaries if not isinstance(summary, Unavailable)
-    ]
-    if len(mean_nis_values) < 2 or max(mean_nis_values) < MIN_AXIS_NIS_RATIO * min(mean_nis_values):
+    nis_means = [summary.nis_mean for summary in summaries if not isinstance(summary, Unavailable)]
+    if len(nis_means) < 2 or max(nis_means) < MIN_AXIS_NIS_RATIO * min(nis_means):
         return ()
     return tuple(
         axis_tuning
@@ -77,10 +75,8 @@ def find_noisy_part(
         axis_innovations = [
             innovations(kf_input, sigma_a, sigma_z, is_excluded) for kf_input in kf_inputs
         ]
-        normalised_magnitudes = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
-        return np.asarray(
-            normalised_magnitudes / np.median(normalised_magnitudes, axis=1, keepdims=True)
-        )
+        magnitudes = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
+        return np.asarray(magnitudes / np.median(magnitudes, axis=1, keepdims=True))
 
     relative_magnitudes = compute_relative_magnitudes(None)
     magnitude_by_part = np.array(
@@ -90,14 +86,12 @@ def find_noisy_part(
         ]
     )
     is_noisy = magnitude_by_part > np.sqrt(magnitude_by_part.min() * magnitude_by_part.max())
-    first_part_index = int(np.argmax(is_noisy))
-    end_part_index = first_part_index + int(
-        np.argmin(np.append(is_noisy[first_part_index:], False))
-    )
-    if is_noisy.sum() != end_part_index - first_part_index or is_noisy.all() or not is_noisy.any():
+    first_noisy = int(np.argmax(is_noisy))
+    end_noisy = first_noisy + int(np.argmin(np.append(is_noisy[first_noisy:], False)))
+    if is_noisy.sum() != end_noisy - first_noisy or is_noisy.all() or not is_noisy.any():
         return None  # not exactly one noisy time span
     is_quiet = np.ones(len(time_s), bool)
-    is_quiet[part_edges[first_part_index] : part_edges[end_part_index]] = False
+    is_quiet[part_edges[first_noisy] : part_edges[end_noisy]] = False
     sigma_ratios = (
         float(np.median(magnitudes[:, ~is_quiet]) / np.median(magnitudes[:, is_quiet]))
         for magnitudes in (
@@ -105,5 +99,5 @@ def find_noisy_part(
             compute_relative_magnitudes(np.isin(time_s, outlier_time_s)),
         )
     )
-    start_s, end_s = time_s[[part_edges[first_part_index], part_edges[end_part_index] - 1]].tolist()
+    start_s, end_s = time_s[[part_edges[first_noisy], part_edges[end_noisy] - 1]].tolist()
     return NoisyPart(start_s, end_s, *sigma_ratios)

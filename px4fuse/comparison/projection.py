@@ -237,19 +237,14 @@ def _combine_north_and_east(
     north_innovations: pd.DataFrame, east_innovations: pd.DataFrame, direction: Array
 ) -> pd.DataFrame:
     common_times = north_innovations.index.intersection(east_innovations.index)
-    north_innovations, east_innovations = (
-        north_innovations.loc[common_times],
-        east_innovations.loc[common_times],
-    )
+    north, east = north_innovations.loc[common_times], east_innovations.loc[common_times]
     cosine, sine = float(direction[0]), float(direction[1])
     # Weights of variances; all other columns are replaced below
-    projected = cosine * cosine * north_innovations + sine * sine * east_innovations
-    projected["innovation_m"] = (
-        cosine * north_innovations["innovation_m"] + sine * east_innovations["innovation_m"]
-    )
+    projected = cosine * cosine * north + sine * sine * east
+    projected["innovation_m"] = cosine * north["innovation_m"] + sine * east["innovation_m"]
     for column in ("test_ratio", "fused", "rejected"):
         # EKF2 fuses or rejects both axes together, so the larger value is used
-        projected[column] = np.fmax(north_innovations[column], east_innovations[column])
+        projected[column] = np.fmax(north[column], east[column])
     return projected
 
 
@@ -286,7 +281,6 @@ def find_observation_variance(
 def project_truth(
     truth: Truth | Unavailable, axis: Axis, segment: Segment
 ) -> pd.DataFrame | Unavailable:
-    """Project the ground truth onto an axis."""
     if isinstance(truth, Unavailable):
         return truth
     projected = project(truth.samples, axis, segment)

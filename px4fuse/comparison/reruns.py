@@ -82,7 +82,7 @@ DIFFERENCE_UNAVAILABLE = Unavailable(
 )
 # Re-runs of EKF2 are compared with the log if position RMSE and σ ratios of the replay agree with
 # the log within this factor. Otherwise they are compared with the replay
-MAX_REPLAY_DEVIATION_FACTOR = 1.10
+MAX_REPLAY_TO_LOG_FACTOR = 1.10
 
 
 class ErrorAboveSigma(NamedTuple):
@@ -165,9 +165,7 @@ def rerun_filters(
             change_key = frozenset(change.items())
             if change_key not in replays:
                 replays[change_key] = _replay_ekf2(comparison, estimates.tuning, model, change)
-            return _compute_replay_statistics(
-                comparison, model, replays[change_key], axis_result, change
-            )
+            return _summarise_replay(comparison, model, replays[change_key], axis_result, change)
 
         filters.append(_Filter("ekf2", rerun_ekf2, model))
     return tuple(
@@ -210,7 +208,7 @@ def _find_changes_to_test(
         ekf2_inputs is not None and axis_result.axis.name == "down"
     ):
         return []  # EKF2's replay contains no vertical position to test a change
-    has_discrepancy_by_statistic = {
+    is_discrepant = {
         "nees": find_error_above_sigma(summary) is not None,
         "nis": is_inconsistent(summary),
     }
@@ -219,7 +217,7 @@ def _find_changes_to_test(
             comparison, estimates, ekf2_inputs, axis_result, statistic
         )
         for statistic in DISCREPANCY_STATISTICS
-        if has_discrepancy_by_statistic[statistic]
+        if is_discrepant[statistic]
     }
     changes = remove_repeated_changes(chain.from_iterable(candidates.values()))
     if axis_result is comparison.main:
@@ -285,35 +283,35 @@ def _find_unchanged_statistics(
     compared_state = rows_inside(logged_state, evaluated_spans_s)
     innovations = rows_inside(innovations, evaluated_spans_s)
     rejected_flags = innovations["rejected"].dropna()
-    logged_statistics = _compute_run_statistics(
+    logged_statistics = _summarise_run(
         innovations["innovation_m"].to_numpy(),
         innovations["innovation_variance_m2"].to_numpy(),
         compute_error_statistics(compared_state, axis_result.ekf2_variance, axis_result.truth),
         compute_difference_statistics(axis_result.replay, compared_state),
         float((rejected_flags > 0.0).mean()) if len(rejected_flags) else None,
     )
-    value_pairs_and_factors = (
+    pairs_and_factors = (
         (
             logged_statistics.position_rmse_m,
             replayed_statistics.position_rmse_m,
-            MAX_REPLAY_DEVIATION_FACTOR,
+            MAX_REPLAY_TO_LOG_FACTOR,
         ),
-        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAY_DEVIATION_FACTOR**2),
+        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAY_TO_LOG_FACTOR**2),
         (
             logged_statistics.nees_mean,
             replayed_statistics.nees_mean,
-            MAX_REPLAY_DEVIATION_FACTOR**2,
+            MAX_REPLAY_TO_LOG_FACTOR**2,
         ),
     )
     is_replay_similar = all(
         logged_value and replayed_value and 1.0 / factor <= logged_value / replayed_value <= factor
-        for logged_value, replayed_value, factor in value_pairs_and_factors
+        for logged_value, replayed_value, factor in pairs_and_factors
         if logged_value is not None
     )
     return (logged_statistics, True) if is_replay_similar else (replayed_statistics, False)
 
 
-def _compute_run_statistics(
+def _summarise_run(
     innovation_m: Array,
     variance_m2: Array,
     errors: ErrorsAgainstTruth | Unavailable,
@@ -372,7 +370,7 @@ def _rerun_kf(
         measurement_m=axis.measurement_m[is_used],
     )
     kf_run, ekf2_state = replay(axis, changed_settings, fast=True), axis_result.ekf2_state
-    return _compute_run_statistics(
+    return _summarise_run(
         kf_run.updates["innovation_m"].to_numpy(),
         kf_run.updates["innovation_variance_m2"].to_numpy(),
         compute_kf_error_statistics(kf_run, truth, ekf2_state),
@@ -401,7 +399,7 @@ def _replay_ekf2(
     if not change:
         return model.baseline_replay
     changed_parameters = {name: value for name, value in change.items() if name in PARAMETERS}
-    model_with_changed_positions = with_misaligned_positions(
+    misaligned_model = with_misaligned_positions(
         model, change.get(ROTATION, 0.0), change.get(CLOCK_OFFSET, 0.0)
     )
     excluded_times_s, axis_tuning = None, find_axis_tuning(tuning, HORIZONTAL)
@@ -410,13 +408,11 @@ def _replay_ekf2(
         if comparison.source.origin.fused_as_gnss:
             excluded_times_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
         excluded_times_s += change.get(CLOCK_OFFSET, 0.0)
-    (replay,) = replay_settings(
-        model_with_changed_positions, [changed_parameters], excluded_times_s
-    )
+    (replay,) = replay_settings(misaligned_model, [changed_parameters], excluded_times_s)
     return replay
 
 
-def _compute_replay_statistics(
+def _summarise_replay(
     comparison: Comparison,
     model: Model,
     ekf2_replay: Ekf2Replay,
@@ -432,17 +428,13 @@ def _compute_replay_statistics(
     if ROTATION in change and comparison.source.origin.is_gnss:
         # Rotated GNSS positions rotate EKF2's frame, so the axis is rotated by the same angle
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))
-    direction_cosines, ekf2_updates = axis.direction[:2], ekf2_replay.updates
+    cosines, ekf2_updates = axis.direction[:2], ekf2_replay.updates
     ekf2_updates = rows_inside(ekf2_updates, evaluated_spans_s)
-    innovation_variance_m2 = weighted_sum(
-        ekf2_updates, INNOVATION_VARIANCE_COLUMNS, direction_cosines**2
-    )
+    innovation_variance_m2 = weighted_sum(ekf2_updates, INNOVATION_VARIANCE_COLUMNS, cosines**2)
     prior_variance_m2 = innovation_variance_m2 - weighted_sum(
-        ekf2_updates, OBSERVATION_VARIANCE_COLUMNS, direction_cosines**2
+        ekf2_updates, OBSERVATION_VARIANCE_COLUMNS, cosines**2
     )
-    posterior_variance_m2 = weighted_sum(
-        ekf2_updates, POSITION_VARIANCE_COLUMNS, direction_cosines**2
-    )
+    posterior_variance_m2 = weighted_sum(ekf2_updates, POSITION_VARIANCE_COLUMNS, cosines**2)
     variance_by_time = pd.DataFrame(
         {
             "position_variance_m2": 0.5 * (prior_variance_m2 + posterior_variance_m2),
@@ -456,8 +448,8 @@ def _compute_replay_statistics(
     # Without a change, KF is compared with the logged state of EKF2, as in the report
     if not change and not isinstance(logged_state, Unavailable):
         compared_track = rows_inside(logged_state, evaluated_spans_s)
-    return _compute_run_statistics(
-        weighted_sum(ekf2_updates, INNOVATION_COLUMNS, direction_cosines),
+    return _summarise_run(
+        weighted_sum(ekf2_updates, INNOVATION_COLUMNS, cosines),
         innovation_variance_m2,
         compute_error_statistics(published, variance_by_time, axis_result.truth),
         compute_difference_statistics(axis_result.replay, compared_track),

@@ -234,7 +234,7 @@ def compute_log_ratio_reduction(trial: Trial) -> float:
     return compute_log_ratio_sum(trial.before) - compute_log_ratio_sum(trial.after)
 
 
-def compute_sigma_ratio_changes(trial: Trial) -> list[tuple[Reference, float, float]]:
+def compare_sigma_ratios(trial: Trial) -> list[tuple[Reference, float, float]]:
     """Return (reference, ratio before, ratio after) of actual to reported σ for each reference.
 
     The reference is "source" (ratio from innovations) or "truth" (from errors).
@@ -254,7 +254,7 @@ def becomes_consistent(trial: Trial) -> bool:
     return any(
         classify_sigma_ratio(before, reference) != "consistent"
         and classify_sigma_ratio(after, reference) == "consistent"
-        for reference, before, after in compute_sigma_ratio_changes(trial)
+        for reference, before, after in compare_sigma_ratios(trial)
     )
 
 
@@ -263,7 +263,7 @@ def halves_discrepancy(trial: Trial) -> bool:
     return any(
         classify_sigma_ratio(before, reference) != "consistent"
         and abs(math.log(after)) <= 0.5 * abs(math.log(before))
-        for reference, before, after in compute_sigma_ratio_changes(trial)
+        for reference, before, after in compare_sigma_ratios(trial)
     )
 
 
@@ -275,7 +275,7 @@ def remains_overconfident(trial: Trial) -> bool:
         == classify_sigma_ratio(after, reference)
         == "overconfident"
         and math.log(after) > MAX_REMAINING_ERROR_FRACTION * math.log(before)
-        for reference, before, after in compute_sigma_ratio_changes(trial)
+        for reference, before, after in compare_sigma_ratios(trial)
     )
 
 
@@ -304,7 +304,7 @@ def has_effect(trial: Trial) -> bool:
     """Return True if a re-run changes a σ ratio by 10 % or the position RMSE by 5 %."""
     if any(
         not 1.0 / MIN_SIGMA_RATIO_FACTOR <= after / before <= MIN_SIGMA_RATIO_FACTOR
-        for _, before, after in compute_sigma_ratio_changes(trial)
+        for _, before, after in compare_sigma_ratios(trial)
     ):
         return True
     rmse_before_m, rmse_after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
@@ -322,7 +322,7 @@ def can_show_improvement(trial: Trial) -> bool:
     """
     return trial.before.position_rmse_m is not None or any(
         classify_sigma_ratio(before, reference) != "consistent"
-        for reference, before, _ in compute_sigma_ratio_changes(trial)
+        for reference, before, _ in compare_sigma_ratios(trial)
     )
 
 
@@ -341,7 +341,7 @@ def classify_improvement(trial: Trial) -> Improvement:
     is_sigma_better = (becomes_consistent(trial) or halves_discrepancy(trial)) and all(
         abs(math.log(after)) <= abs(math.log(before))
         or classify_sigma_ratio(after, reference) == "consistent"
-        for reference, before, after in compute_sigma_ratio_changes(trial)
+        for reference, before, after in compare_sigma_ratios(trial)
     )
     if is_position_better:
         return "position and σ" if is_sigma_better else "position"

@@ -10,7 +10,7 @@ from px4fuse.comparison.remedy import (
     make_height_noise_advice,
     select_changed_settings,
 )
-from px4fuse.comparison.trials import Trial, compute_sigma_ratio_changes, find_trial
+from px4fuse.comparison.trials import Trial, compare_sigma_ratios, find_trial
 from px4fuse.core.text import format_factor
 from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -101,7 +101,7 @@ def confirmed_noise_trial(analysis: Analysis) -> Trial | None:
     is_confirmed = trial is not None and any(
         classify_sigma_ratio(ratio_before, reference) != "consistent"
         and classify_sigma_ratio(ratio_after, reference) == "consistent"
-        for reference, ratio_before, ratio_after in compute_sigma_ratio_changes(trial)
+        for reference, ratio_before, ratio_after in compare_sigma_ratios(trial)
         if reference == "source"
     )
     return trial if is_confirmed else None

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Card
 from px4fuse.comparison.comparison import (
-    compute_kf_state_and_variance,
     compute_position_errors,
-    interpolate_reported_sigma,
+    interpolate_sigma,
+    sample_kf_run,
 )
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, select_north_and_east
 from px4fuse.core.arrays import Array
@@ -196,12 +196,12 @@ def _position_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
     if not isinstance(result.ekf2_state, pd.DataFrame):
         return []
     time_s = result.ekf2_state.index.to_numpy()
-    state, variance = compute_kf_state_and_variance(result.replay, time_s)
+    state, variance = sample_kf_run(result.replay, time_s)
     difference_m = state["position_m"] - result.ekf2_state["position_m"]
     if not difference_m.notna().any():
         return []
     sigmas_m = {
-        name: pd.Series(interpolate_reported_sigma(time_s, frame, "position_variance_m2"), time_s)
+        name: pd.Series(interpolate_sigma(time_s, frame, "position_variance_m2"), time_s)
         for name, frame in (("KF", variance), ("EKF2", result.ekf2_variance))
     }
     limits_m = [2.2 * sigma.median() for sigma in sigmas_m.values() if sigma.notna().any()]
