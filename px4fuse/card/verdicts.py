@@ -32,7 +32,7 @@ def make_sigma_verdicts(result: AxisComparison) -> tuple[Verdict, ...]:
 def _assess_against_source(result: AxisComparison, filter_name: FilterName) -> Verdict:
     summary = result.filters[filter_name]
     if not isinstance(summary, FilterSummary):
-        return _make_unevaluated_verdict(filter_name, "source", summary)
+        return _make_unevaluated(filter_name, "source", summary)
     return Verdict(
         filter=filter_name,
         against="source",
@@ -46,10 +46,10 @@ def _assess_against_source(result: AxisComparison, filter_name: FilterName) -> V
 def _assess_against_truth(result: AxisComparison, filter_name: FilterName) -> Verdict:
     errors_against_truth = result.filters[filter_name].truth
     if isinstance(errors_against_truth, Unavailable):
-        return _make_unevaluated_verdict(filter_name, "truth", errors_against_truth)
+        return _make_unevaluated(filter_name, "truth", errors_against_truth)
     errors = compute_normalised_errors(result, filter_name)
     if isinstance(errors, Unavailable):
-        return _make_unevaluated_verdict(filter_name, "truth", errors)
+        return _make_unevaluated(filter_name, "truth", errors)
     time_s, normalised_errors = errors
     ratio = float(np.sqrt(np.mean(np.square(normalised_errors))))
     interval = block_bootstrap_rms(time_s, normalised_errors)
@@ -63,7 +63,7 @@ def _assess_against_truth(result: AxisComparison, filter_name: FilterName) -> Ve
     )
 
 
-def _make_unevaluated_verdict(
+def _make_unevaluated(
     filter_name: FilterName, reference: Reference, unavailable: Unavailable
 ) -> Verdict:
     return Verdict(

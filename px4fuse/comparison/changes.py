@@ -105,9 +105,9 @@ def find_candidate_changes(
         changes += [{ROTATION: -round(heading.misalignment_deg, 1)}] if is_significant else []
     if ekf2_inputs is None:
         return changes + _find_bias_changes(estimates)
-    changes += _find_px4_default_changes(comparison.flight.log, ekf2_inputs)
+    changes += _find_default_changes(comparison.flight.log, ekf2_inputs)
     if axis_tuning is not None and not is_underconfident:
-        changes += _find_vibration_noise_changes(comparison.settings, ekf2_inputs, axis_tuning)
+        changes += _find_vibration_changes(comparison.settings, ekf2_inputs, axis_tuning)
     return changes
 
 
@@ -240,7 +240,7 @@ def _find_ekf2_noise_changes(
     return [change] if change else []
 
 
-def _find_px4_default_changes(log: LogInfo, ekf2_inputs: Inputs) -> list[Change]:
+def _find_default_changes(log: LogInfo, ekf2_inputs: Inputs) -> list[Change]:
     """Return changes to PX4's default, for each EKF2 noise with another value in the log.
 
     The gate is included if the logged gate is below PX4's default.
@@ -256,7 +256,7 @@ def _find_px4_default_changes(log: LogInfo, ekf2_inputs: Inputs) -> list[Change]
     ]
 
 
-def _find_vibration_noise_changes(
+def _find_vibration_changes(
     settings: Settings, ekf2_inputs: Inputs, axis_tuning: AxisTuning
 ) -> list[Change]:
     """Return the EKF2_ACC_NOISE for the estimated SIGMA_A, if it is much larger than logged.

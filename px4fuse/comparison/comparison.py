@@ -58,9 +58,7 @@ def compare(prepared: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comp
         "ekf2": {name: axis.ekf2_innovations for name, axis in axes.items()},
     }
     horizontal = {
-        name: nis
-        for name, tables in innovations.items()
-        if (nis := _compute_horizontal_nis(tables))
+        name: nis for name, tables in innovations.items() if (nis := _assess_horizontal(tables))
     }
     prepared = replace(prepared, notes=tuple(notes))
     return Comparison(**vars(prepared), axes=axes, horizontal=horizontal)
@@ -89,7 +87,7 @@ def _compare_axis(
         posterior_variance_m2=kf_run.steps["position_variance_m2"].reindex(kf_run.updates.index),
     )
     north_component, east_component, down_component = axis.direction.tolist()
-    rejected_flags = _select_known_values(innovations, "rejected")
+    rejected_flags = _find_known_values(innovations, "rejected")
     return AxisComparison(
         heading_deg=axis.heading_deg,
         direction=(north_component, east_component, down_component),
@@ -146,10 +144,10 @@ def _summarise_filter(
     sigmas: dict[str, Any] = {
         name: float(np.sqrt(values.median())) if len(values) else None
         for name, values in (
-            ("sigma_p_median_m", _select_known_values(variance, "position_variance_m2")),
-            ("sigma_v_median_m_s", _select_known_values(variance, "velocity_variance_m2_s2")),
-            ("sigma_p_before_update_m", _select_known_values(innovations, "prior_variance_m2")),
-            ("sigma_p_after_update_m", _select_known_values(innovations, "posterior_variance_m2")),
+            ("sigma_p_median_m", _find_known_values(variance, "position_variance_m2")),
+            ("sigma_v_median_m_s", _find_known_values(variance, "velocity_variance_m2_s2")),
+            ("sigma_p_before_update_m", _find_known_values(innovations, "prior_variance_m2")),
+            ("sigma_p_after_update_m", _find_known_values(innovations, "posterior_variance_m2")),
         )
     }
     if not isinstance(innovations, Unavailable):
@@ -164,7 +162,7 @@ def _summarise_filter(
     return UntestedFilter(**structs.asdict(innovations), **sigmas, truth=truth)
 
 
-def _select_known_values(table: TableOrUnavailable, column: str) -> pd.Series:
+def _find_known_values(table: TableOrUnavailable, column: str) -> pd.Series:
     return pd.Series(dtype=float) if isinstance(table, Unavailable) else table[column].dropna()
 
 
@@ -274,7 +272,7 @@ def _compute_errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Ar
 
 def interpolate_sigma(time_s: Array, variance: TableOrUnavailable, column: str) -> Array:
     """Interpolate the reported σ to the times ``time_s``; NaN if it is unknown."""
-    known_variance = _select_known_values(variance, column)
+    known_variance = _find_known_values(variance, column)
     if known_variance.empty:
         return np.full(len(time_s), np.nan)
     variance_at_times = np.interp(time_s, known_variance.index, known_variance, np.nan, np.nan)
@@ -332,9 +330,7 @@ def compute_normalised_errors(
     return normalised_errors.index.to_numpy(), normalised_errors.to_numpy()
 
 
-def _compute_horizontal_nis(
-    axis_innovations: Mapping[str, TableOrUnavailable],
-) -> HorizontalNis | None:
+def _assess_horizontal(axis_innovations: Mapping[str, TableOrUnavailable]) -> HorizontalNis | None:
     columns = ["innovation_m", "innovation_variance_m2"]
     tables = [
         table[columns]

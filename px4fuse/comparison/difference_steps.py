@@ -169,7 +169,7 @@ def add_cause_sentences(
     """
     step_reasons = {
         **step_reasons,
-        steps.GATE: f"{step_reasons[steps.GATE]}{_describe_longest_rejection(explanation)}",
+        steps.GATE: f"{step_reasons[steps.GATE]}{_describe_rejections(explanation)}",
     }
     largest_step, second_largest_step, *_ = sorted(
         explanation.steps, key=lambda step: -step.position_mean_square_m2
@@ -226,7 +226,7 @@ def _describe_step_effect(step: Step, explanation: DifferenceExplanation) -> str
     )
 
 
-def _describe_longest_rejection(explanation: DifferenceExplanation) -> str:
+def _describe_rejections(explanation: DifferenceExplanation) -> str:
     rejection_run = explanation.longest_rejection
     if rejection_run is None:
         return ""

@@ -113,7 +113,7 @@ class SpeedNoise(NamedTuple):
     fast_m_s: float
 
 
-class LocalFitResiduals(NamedTuple):
+class LocalResiduals(NamedTuple):
     """Deviations of positions and timestamps from a cubic polynomial through their four neighbours.
 
     ``residual_m``, shape (n, 2), is that of the horizontal position. ``timestamp_residual_s`` is
@@ -176,7 +176,7 @@ def _select_distinct_positions(comparison: Comparison) -> tuple[Array, Array]:
     return samples.index.to_numpy(), samples.to_numpy()
 
 
-def compute_local_residuals(comparison: Comparison) -> LocalFitResiduals | None:
+def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
     """Return the residuals of cubic fits to neighbouring positions; None with too few positions."""
     time_s, position_m = _select_distinct_positions(comparison)
     if len(time_s) < MIN_POSITIONS:
@@ -220,7 +220,7 @@ def compute_local_residuals(comparison: Comparison) -> LocalFitResiduals | None:
         ekf2_speed_m_s = np.interp(
             time_s[rows[is_accurate]], ekf2.state.index.to_numpy(), logged_speed_m_s
         )
-    return LocalFitResiduals(
+    return LocalResiduals(
         compute_residual(position_m),
         velocity_m_s[is_accurate],
         compute_residual(timestamp_delay_s),
@@ -228,7 +228,7 @@ def compute_local_residuals(comparison: Comparison) -> LocalFitResiduals | None:
     )
 
 
-def find_timestamp_jitter(errors: LocalFitResiduals) -> float | None:
+def find_timestamp_jitter(errors: LocalResiduals) -> float | None:
     """Return the jitter (s, 1 σ) of the timestamps if the position errors confirm it.
 
     If a position has a late timestamp, it is behind the interpolated position by delay · velocity.
@@ -250,7 +250,7 @@ def find_timestamp_jitter(errors: LocalFitResiduals) -> float | None:
     return jitter_s if is_jitter else None
 
 
-def find_speed_noise(errors: LocalFitResiduals) -> SpeedNoise | None:
+def find_speed_noise(errors: LocalResiduals) -> SpeedNoise | None:
     """Return the noise at low and high speed if it increases with speed in all directions."""
     # The speed is from EKF2, because a speed from the positions would contain their noise
     speed_m_s = errors.ekf2_speed_m_s
@@ -297,7 +297,7 @@ def find_speed_noise(errors: LocalFitResiduals) -> SpeedNoise | None:
     return speed_noise if is_relevant else None
 
 
-def fit_errors(comparison: Comparison, local_residuals: LocalFitResiduals) -> ErrorFit | None:
+def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> ErrorFit | None:
     """Fit a constant, scale factor, rotation and time offset to the errors against ground truth."""
     truth = comparison.flight.truth
     if isinstance(truth, Unavailable):

@@ -133,7 +133,7 @@ def project(table: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
     return pd.DataFrame(projected, index=rows.index)
 
 
-def _make_no_samples_reason(quantity_name: str) -> Unavailable:
+def _report_no_samples(quantity_name: str) -> Unavailable:
     reason = f"the log contains no {quantity_name} in the analysed time span"
     return Unavailable(quantity_name, reason, "Analyse a longer time span.")
 
@@ -144,7 +144,7 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
         return ekf2.variance
     projected = project(ekf2.variance, axis, segment)
     if projected.empty:
-        return _make_no_samples_reason("EKF2 variances")
+        return _report_no_samples("EKF2 variances")
     return projected
 
 
@@ -216,7 +216,7 @@ def project_innovations(
     if axis.name == AISLE:
         rows = _combine_north_and_east(rows, axis_innovations[1], axis.direction)
     if rows.empty:
-        return _make_no_samples_reason("EKF2 innovations")
+        return _report_no_samples("EKF2 innovations")
     noise_variance = rows["observation_variance_m2"].fillna(
         find_observation_variance(flight, track, axis, segment)
     )
@@ -285,5 +285,5 @@ def project_truth(
         return truth
     projected = project(truth.samples, axis, segment)
     if len(projected) < MIN_COMMON_SAMPLES:
-        return _make_no_samples_reason("ground truth")
+        return _report_no_samples("ground truth")
     return projected

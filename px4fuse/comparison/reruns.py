@@ -94,9 +94,7 @@ class ErrorAboveSigma(NamedTuple):
     nis_mean: float | None
 
 
-def find_error_above_sigma(
-    summary: FilterSummary | UntestedFilter,
-) -> ErrorAboveSigma | None:
+def find_error_above_sigma(summary: FilterSummary | UntestedFilter) -> ErrorAboveSigma | None:
     """Return the position error of a filter if it exceeds the reported σ although NIS is small.
 
     Without innovations along the axis, NIS is assumed to be small.
@@ -237,7 +235,7 @@ def _try_changes(
     changes = _find_changes_to_test(comparison, estimates, tested_filter.ekf2_inputs, axis_result)
     if not changes:
         return []
-    before, is_logged = _find_unchanged_statistics(tested_filter, axis_result)
+    before, is_logged = _find_original_statistics(tested_filter, axis_result)
 
     def make_trial(change: Change, discrepancies: Iterable[Statistic]) -> Trial:
         after = tested_filter.rerun(axis_result, change)
@@ -269,7 +267,7 @@ def _try_changes(
     return trials
 
 
-def _find_unchanged_statistics(
+def _find_original_statistics(
     tested_filter: _Filter, axis_result: AxisComparison
 ) -> tuple[RunStatistics, bool]:
     """Return the statistics with unchanged settings, and True if they are from the log."""
@@ -290,7 +288,7 @@ def _find_unchanged_statistics(
         compute_difference_statistics(axis_result.replay, compared_state),
         float((rejected_flags > 0.0).mean()) if len(rejected_flags) else None,
     )
-    pairs_and_factors = (
+    compared_values = (
         (
             logged_statistics.position_rmse_m,
             replayed_statistics.position_rmse_m,
@@ -305,7 +303,7 @@ def _find_unchanged_statistics(
     )
     is_replay_similar = all(
         logged_value and replayed_value and 1.0 / factor <= logged_value / replayed_value <= factor
-        for logged_value, replayed_value, factor in pairs_and_factors
+        for logged_value, replayed_value, factor in compared_values
         if logged_value is not None
     )
     return (logged_statistics, True) if is_replay_similar else (replayed_statistics, False)

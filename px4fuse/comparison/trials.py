@@ -230,7 +230,6 @@ def compute_sigma_ratios(statistics: RunStatistics) -> dict[Reference, float]:
 
 
 def compute_log_ratio_reduction(trial: Trial) -> float:
-    """Return the decrease of :func:`compute_log_ratio_sum` by a re-run."""
     return compute_log_ratio_sum(trial.before) - compute_log_ratio_sum(trial.after)
 
 

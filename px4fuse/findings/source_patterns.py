@@ -10,7 +10,7 @@ from scipy import constants
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.error_patterns import (
     ErrorFit,
-    LocalFitResiduals,
+    LocalResiduals,
     compute_local_residuals,
     find_attitude_delay,
     find_offset_variation,
@@ -63,7 +63,7 @@ def detect(analysis: Analysis) -> Findings:
             yield from detect_scale_error(analysis, error_fit)
 
 
-def detect_white_patterns(analysis: Analysis, white: LocalFitResiduals) -> Findings:
+def detect_white_patterns(analysis: Analysis, white: LocalResiduals) -> Findings:
     jitter_s, clock_map = find_timestamp_jitter(white), analysis.source.clock_map
     if jitter_s is not None and (clock_map is None or clock_map.distinct_stamps is None):
         yield (error if jitter_s >= MIN_JITTER_ERROR_S else warning)(
