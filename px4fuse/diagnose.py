@@ -22,9 +22,9 @@ from msgspec import structs
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis, WhatIfAnalysis
 from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.difference_steps import (
-    corrected_settings,
+    estimate_wrong_settings,
     explain_ekf2_difference,
-    explanation_configurations,
+    list_step_configurations,
 )
 from px4fuse.comparison.estimates import (
     Estimates,
@@ -36,8 +36,8 @@ from px4fuse.comparison.estimates import (
 from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.comparison.preparation import explain_missing_source, prepare, shift_clock
-from px4fuse.comparison.remedy import ml_ekf2_parameters
-from px4fuse.comparison.reruns import Reruns, planned_configurations, rerun_filters
+from px4fuse.comparison.remedy import estimate_ekf2_parameters
+from px4fuse.comparison.reruns import Reruns, list_rerun_configurations, rerun_filters
 from px4fuse.convention.correction import convention_faults
 from px4fuse.core.memory import release_free_memory
 from px4fuse.core.reading import display_name
@@ -264,13 +264,13 @@ def rerun(
 ) -> Reruns:
     """Replay EKF2, explain KF - EKF2, and re-run KF and EKF2 with one error corrected at a time."""
     progress("replaying EKF2")
-    estimated_settings = corrected_settings(comparison, estimates.tuning)
+    estimated_settings = estimate_wrong_settings(comparison, estimates.tuning)
     # The next two functions request these parameter sets. A replay of all sets together is faster
     ekf2_model = open_model(
         comparison.flight,
         lambda inputs: [
-            *explanation_configurations(comparison, inputs, estimated_settings),
-            *planned_configurations(comparison, estimates, inputs),
+            *list_step_configurations(comparison, inputs, estimated_settings),
+            *list_rerun_configurations(comparison, estimates, inputs),
         ],
     )
     release_free_memory()
@@ -353,12 +353,12 @@ def run_what_if(
             raise
     if comparison is not None:
         tuning, clock = estimate_noises_and_clock(comparison, progress)
-        estimated_settings = corrected_settings(comparison, tuning)
+        estimated_settings = estimate_wrong_settings(comparison, tuning)
         difference_steps = explain_ekf2_difference(
             comparison, ekf2_model, clock, estimated_settings
         )
         if is_default_change:
-            changes = ml_ekf2_parameters(comparison, ekf2_model, tuning, clock)
+            changes = estimate_ekf2_parameters(comparison, ekf2_model, tuning, clock)
     parameter_sets = [changes] if changes or request.without else []
     parameter_sets += [changes | values for values in swept_settings]
     progress("replaying EKF2 with other parameters")

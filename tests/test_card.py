@@ -14,7 +14,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, build_refusal_card
 from px4fuse.card.causes import make_cause, rank_causes
 from px4fuse.card.model import Action
-from px4fuse.comparison.trials import RunStatistics, Trial, improvement
+from px4fuse.comparison.trials import RunStatistics, Trial, classify_improvement
 from px4fuse.diagnose import find_faults
 from px4fuse.errors import LogError
 from px4fuse.filter.settings import Settings
@@ -78,11 +78,11 @@ NOISE = Finding("sigma_z_too_small", "error", "SIGMA_Z is too small.", "", {})
 def test_diagnosis_lists_sensor_fault_before_wrong_parameter() -> None:
     flight = analysis(trial("noises", outcome(1.0, 1.0, 0.1)), trial("time offset", CORRECTED))
     ranked = rank_causes(flight, [NOISE, OFFSET])
-    assert [(each.finding.id, each.tier) for each in ranked] == [
+    assert [(each.finding.id, each.rank) for each in ranked] == [
         ("source_time_offset", 1), ("sigma_z_too_small", 1),
     ]  # fmt: skip
     # the setting reduces the error more, but a source fault comes first
-    assert ranked[1].reduction > ranked[0].reduction
+    assert ranked[1].log_ratio_reduction > ranked[0].log_ratio_reduction
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_diagnosis_lists_sensor_fault_before_wrong_parameter() -> None:
     ],
 )
 def test_filter_rerun_result_shows_if_rmse_or_sigma_improved(after, improves) -> None:
-    assert improvement(trial("noises", after)) == improves
+    assert classify_improvement(trial("noises", after)) == improves
 
 
 def test_setting_without_improvement_in_rerun_is_not_recommended() -> None:
@@ -148,7 +148,7 @@ def test_diagnosis_merges_equal_actions_for_kf_and_ekf2() -> None:
     (ranked,) = rank_causes(flight, [gap])
     cause = make_cause(flight, ranked, verdicts(*ratios), REQUEST)
     assert [(action.target, action.sentence) for action in cause.actions] == [
-        ("sender", "Check the link."), ("KF, EKF2", "no setting removes this fault"),
+        ("sender", "Check the link."), ("KF, EKF2", "no filter setting corrects this fault"),
     ]  # fmt: skip
 
 
@@ -200,6 +200,7 @@ def test_diagnosis_explains_differing_nis_and_nees_verdicts() -> None:
         "position and σ",
     )
     assert card.reconcile == (
-        "The verdicts on EKF2 against source and ground truth differ, because innovations show "
-        "little of this fault. The first action of this card removes most of the position error."
+        "The σ ratio of EKF2 against the position source differs from that against ground truth, "
+        "because innovations show little of the first fault of this card. The re-run without this "
+        "fault reduces the position error."
     )

@@ -13,7 +13,7 @@ from explore_tools import axe, serious
 from msgspec import structs
 
 import px4fuse
-from px4fuse.card.model import Action, Card, Identity, Note, axis_fraction
+from px4fuse.card.model import Action, Card, Identity, Note, map_ratio_to_axis
 from px4fuse.core.text import format_ratio
 from px4fuse.report.card_html import (
     MARK_PATHS,
@@ -52,7 +52,7 @@ def test_sigma_ratio_html_plot_shows_ratio_and_interval() -> None:
     four[3] = structs.replace(four[3], reason="the log has no <ground> truth")
     html = sigma_ratio_html(four, "along the aisle")
     marks = re.findall(r'class="mark" y="10" x="([\d.]+)%"><path d="([^"]+)"', html)
-    middle = f"{100.0 * axis_fraction(0.9):.2f}"
+    middle = f"{100.0 * map_ratio_to_axis(0.9):.2f}"
     assert marks == [
         ("100.00", MARK_PATHS["above"]),
         (middle, MARK_PATHS["truth"]),

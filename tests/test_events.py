@@ -8,15 +8,15 @@ from comparisons import compare
 from exchange import replace
 from flights import Estimator, Uwb, aisle_flight
 
-from px4fuse.comparison.flight_events import collect_events, source_gaps
+from px4fuse.comparison.flight_events import collect_events, find_source_gaps
 from px4fuse.flight.model import Dropout, Reset, Unavailable
 
 
 def test_detected_position_gaps_exceed_1_s_and_five_intervals() -> None:
     time_s = np.array([0.0, 0.2, 0.4, 1.4, 1.6, 3.0, 3.2])
-    assert source_gaps(time_s, 5.0) == ((1.6, 3.0),)
-    assert source_gaps(time_s, 1.0) == ()
-    assert source_gaps(time_s[:1], 5.0) == ()
+    assert find_source_gaps(time_s, 5.0) == ((1.6, 3.0),)
+    assert find_source_gaps(time_s, 1.0) == ()
+    assert find_source_gaps(time_s[:1], 5.0) == ()
 
 
 def test_flight_events_outside_evaluated_segment_are_excluded() -> None:
@@ -31,7 +31,7 @@ def test_flight_events_outside_evaluated_segment_are_excluded() -> None:
     ((start, end),) = found.gaps
     assert (start, end) == pytest.approx((60.0, 65.0), abs=0.21)
     assert found.dropouts == ((10.0, 11.0), (50.0, 50.5))
-    assert found.ground == ((10.0, 20.0), (70.0, 80.0))
+    assert found.ground_spans_s == ((10.0, 20.0), (70.0, 80.0))
     assert (found.take_off_s, found.landing_s) == ((20.0, 80.0), (70.0,))
     assert found.resets_s == (30.0,)
 
@@ -71,7 +71,7 @@ def test_flight_events_without_data_are_empty() -> None:
     flight = aisle_flight(ekf2=None)
     absent = Unavailable("land detector", "no topic", "Record it.")
     found = collect_events(compare(replace(flight, airborne=absent)))
-    assert (found.gaps, found.dropouts, found.ground) == ((), (), ())
+    assert (found.gaps, found.dropouts, found.ground_spans_s) == ((), (), ())
     assert (found.take_off_s, found.resets_s, dict(found.rejected_s)) == ((), (), {})
     never = compare(replace(flight, airborne=()))
-    assert collect_events(never).ground == ((never.segment.start_s, never.segment.end_s),)
+    assert collect_events(never).ground_spans_s == ((never.segment.start_s, never.segment.end_s),)

@@ -14,7 +14,7 @@ from comparisons import compare_prepared
 from explore_tools import ask, axe, open_view, serious, settle, show
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import axis_fraction
+from px4fuse.card.model import map_ratio_to_axis
 from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.diagnose import diagnose, prepare_comparison
@@ -126,7 +126,7 @@ def test_explore_page_shows_report_diagnosis_before_any_change(
     for verdict in card.verdicts:
         ratio, word, place = rows[f"{verdict.filter} {verdict.against}"]
         assert (ratio, word) == (format_ratio(verdict.ratio), verdict.word)
-        at = 100.0 * axis_fraction(verdict.ratio)
+        at = 100.0 * map_ratio_to_axis(verdict.ratio)
         assert float(place.rstrip("%")) == pytest.approx(at, abs=0.01)
     assert card.headline in page.ask("document.querySelector('#card h2').textContent")
     put(page, sigma_a_m_s2=0.3)

@@ -36,7 +36,7 @@ from findings_tools import (
 )
 from flights import given_placement
 
-from px4fuse.comparison.flight_events import source_gaps
+from px4fuse.comparison.flight_events import find_source_gaps
 from px4fuse.comparison.trials import RunStatistics, Trial
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
 from px4fuse.filter.frame_rotation import HeadingError, HeadingPart
@@ -133,7 +133,7 @@ NO_GAP = SimpleNamespace(gaps=())
 def test_ekf2_resets_outside_evaluated_segment_are_ignored(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(ekf2_resets, "continuous_state", lambda *_: (None, "resets undone"))
+    monkeypatch.setattr(ekf2_resets, "remove_origin_resets", lambda *_: (None, "resets undone"))
     switches = tuple((time, 1) for time in (-np.inf, 10.0, 10.5, 110.0, 110.1))
     resets = (
         Reset(10.0, "position", (9.0, 0.0, 0.0)), Reset(10.5, "position", (3.0, 0.0, -4.0)),
@@ -163,7 +163,7 @@ def test_ekf2_resets_outside_evaluated_segment_are_ignored(
 def test_ekf2_height_reset_at_take_off_is_not_reported(
     reset: Reset, gaps: Any, expected: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ekf2_resets, "continuous_state", lambda *_: (None, "resets kept"))
+    monkeypatch.setattr(ekf2_resets, "remove_origin_resets", lambda *_: (None, "resets kept"))
     one = analysis(ekf2={"instances": (), "resets": (reset,)}, flight={"airborne": ((20.0, 90.0),)},
                    events=SimpleNamespace(gaps=gaps))  # fmt: skip
     found = [(each.severity, each.evidence["cause"]) for each in ekf2_resets.detect(one)]
@@ -452,7 +452,7 @@ def test_position_gap_above_1_s_and_five_intervals_is_reported(
     for gap_s, there in ((least_s, False), (least_s + 0.25, True)):
         monkeypatch.setattr(source_intervals, "describe_errors_after_gap", lambda *_: "Errors.")
         time = np.concatenate([np.arange(10.0, 20.5, 0.5), [20.0 + gap_s, 20.5 + gap_s]])
-        gaps = source_gaps(time, rate_hz)
+        gaps = find_source_gaps(time, rate_hz)
         one = analysis(
             axes=(axis(),), source=source(rate_hz=rate_hz), events=SimpleNamespace(gaps=gaps)
         )

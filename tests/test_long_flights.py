@@ -26,8 +26,8 @@ def fit_of(count: int, error_m: Callable[[np.ndarray, np.ndarray], np.ndarray]) 
     constants = np.broadcast_to(np.eye(2)[:, None], (2, count, 2))
     columns = np.stack([*constants, path_m, rotated_m, -velocity_m_s], axis=-1)
     noise_m = 0.005 * np.random.default_rng(count).standard_normal((count, 2))
-    remaining_m = error_m(time_s, velocity_m_s) + noise_m
-    return ErrorFit(time_s, velocity_m_s, path_m, columns, remaining_m, 0.005, 0.0, 0.1)
+    residual_m = error_m(time_s, velocity_m_s) + noise_m
+    return ErrorFit(time_s, velocity_m_s, path_m, columns, residual_m, 0.005, 0.0, 0.1)
 
 
 def varying_offset(time_s: np.ndarray, velocity_m_s: np.ndarray) -> np.ndarray:
@@ -56,7 +56,7 @@ def test_varying_time_offset_fit_equals_dense_least_squares():
     moving = np.flatnonzero(square_speeds > 0.3**2)
     dense = -fit.velocity_m_s[:, :, None] * (parts[:, None] == moving)[:, None, :]
     columns = np.concatenate([fit.columns[..., :-1], dense], axis=-1).reshape(1200, -1)
-    offsets_s = np.linalg.lstsq(columns, fit.remaining_m.ravel(), rcond=None)[0][4:]
+    offsets_s = np.linalg.lstsq(columns, fit.residual_m.ravel(), rcond=None)[0][4:]
     assert found is not None
     assert (found.least_s, found.most_s) == pytest.approx((offsets_s.min(), offsets_s.max()))
 

@@ -19,14 +19,14 @@ from msgspec import structs
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.projection import project as project_state
-from px4fuse.comparison.remedy import aid_of
-from px4fuse.comparison.reruns import POSITION_VARIANCES
+from px4fuse.comparison.remedy import find_aid
+from px4fuse.comparison.reruns import POSITION_VARIANCE_COLUMNS
 from px4fuse.comparison.trials import (
     ROTATION,
-    explained_fraction,
-    find_cause,
+    brings_inside_limits,
+    compute_explained_fraction,
+    find_cause_trial,
     find_trials,
-    is_sufficient,
 )
 from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.model import replay_with_settings
@@ -137,7 +137,7 @@ def test_simulated_outdoor_flight_without_fault_is_consistent() -> None:
     field = analysis.aids["mag"].axes
     assert [axis.nis_mean for axis in field.values()] == pytest.approx([0.16] * 3, abs=0.05)
     model = analysis.ekf2_model
-    assert aid_of(analysis).name == model.inputs.aid.name == "gnss_pos"
+    assert find_aid(analysis).name == model.inputs.aid.name == "gnss_pos"
     assert model.agreement.good
     assert model.agreement.heading_rms_difference_deg < 0.5
     assert max(axis.position_rms_difference_m for axis in model.agreement.axes.values()) < 0.03
@@ -177,9 +177,9 @@ def test_simulated_outdoor_fault_is_cause_of_ekf2_error(
     mistake: str, of: Any, name: str, value: float, within: float
 ) -> None:
     analysis = flown(mistake)
-    found = find_cause(analysis.trials, "ekf2", "aisle", of)
+    found = find_cause_trial(analysis.trials, "ekf2", "aisle", of)
     assert found.change[name] == pytest.approx(value, abs=within)
-    assert is_sufficient(found, of)
+    assert brings_inside_limits(found, of)
 
 
 def test_larger_ekf2_acc_noise_reduces_nees_under_vibration() -> None:
@@ -187,9 +187,9 @@ def test_larger_ekf2_acc_noise_reduces_nees_under_vibration() -> None:
     analysis = flown("vibration=1")
     (tried,) = find_trials(analysis.trials, "ekf2", "aisle", "nees")
     assert tried.change == {"EKF2_ACC_NOISE": 1.0}
-    assert is_sufficient(tried, "nees")
-    assert explained_fraction(tried, "nees") == pytest.approx(0.34, abs=0.05)
-    assert find_cause(analysis.trials, "ekf2", "aisle", "nees") is None
+    assert brings_inside_limits(tried, "nees")
+    assert compute_explained_fraction(tried, "nees") == pytest.approx(0.34, abs=0.05)
+    assert find_cause_trial(analysis.trials, "ekf2", "aisle", "nees") is None
     before, after = tried.before.position_rmse_m, tried.after.position_rmse_m
     assert after == pytest.approx(0.8 * before, rel=0.05)
     # at the fusion horizon σ covers the error with this noise
@@ -197,7 +197,7 @@ def test_larger_ekf2_acc_noise_reduces_nees_under_vibration() -> None:
     delayed = project_state(replayed.delayed, analysis.main.axis, analysis.segment)["position_m"]
     truth = analysis.main.truth["position_m"]
     error_m = delayed - np.interp(delayed.index, truth.index, truth, np.nan, np.nan)
-    variances = replayed.updates[POSITION_VARIANCES].mean(axis=1).mean()
+    variances = replayed.updates[POSITION_VARIANCE_COLUMNS].mean(axis=1).mean()
     assert np.nanmean(error_m**2) / variances < 1.5**2 < tried.after.nees_mean
 
 

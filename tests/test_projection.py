@@ -8,7 +8,7 @@ import pytest
 from exchange import replace
 from flights import Estimator, Uwb, aisle_flight, given_placement, table
 
-from px4fuse.comparison.projection import observation_variance, project_innovations
+from px4fuse.comparison.projection import find_observation_variance, project_innovations
 from px4fuse.filter.signals import Axis, Segment, make_axes
 from px4fuse.flight.model import MOTION_CAPTURE, Columns, Flight, Unavailable
 
@@ -144,7 +144,7 @@ def test_ekf2_position_variance_follows_its_noise_parameters(
         samples.iloc[10, samples.columns.get_indexer(Columns.POSITION_VARIANCE)] = 100.0
         track = replace(track, samples=samples)
     aisle = axes_of(made)["aisle"]
-    assert observation_variance(made, track, aisle, WHOLE) == pytest.approx(expected_m2)
+    assert find_observation_variance(made, track, aisle, WHOLE) == pytest.approx(expected_m2)
     own_file = replace(track, alignment=given_placement())
     least = max(parameters["EKF2_EVP_NOISE"], 0.01) ** 2
-    assert observation_variance(made, own_file, aisle, WHOLE) == pytest.approx(least)
+    assert find_observation_variance(made, own_file, aisle, WHOLE) == pytest.approx(least)

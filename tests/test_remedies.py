@@ -10,9 +10,15 @@ from exchange import replace
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import remedy as remedies
 from px4fuse.comparison.model import Comparison
-from px4fuse.comparison.remedy import ml_ekf2_parameters, noise_used_m
+from px4fuse.comparison.remedy import estimate_ekf2_parameters, find_used_noise_m
 from px4fuse.comparison.reruns import rerun_filters
-from px4fuse.comparison.trials import RunStatistics, Trial, find_trial, has_effect, improvement
+from px4fuse.comparison.trials import (
+    RunStatistics,
+    Trial,
+    classify_improvement,
+    find_trial,
+    has_effect,
+)
 from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.settings import Settings
@@ -94,7 +100,9 @@ def test_vio_drift_is_reported_before_its_consequences(seed, mistakes) -> None:
     for finding in findings:
         assert "set EKF2_EVP_NOISE" not in finding.remedy
         assert "--sigma-z" not in finding.remedy
-    estimated = ml_ekf2_parameters(analysis, analysis.ekf2_model, analysis.tuning, analysis.clock)
+    estimated = estimate_ekf2_parameters(
+        analysis, analysis.ekf2_model, analysis.tuning, analysis.clock
+    )
     flown_with = analysis.ekf2_model.inputs.settings["EKF2_EVP_NOISE"]
     assert estimated.get("EKF2_EVP_NOISE", flown_with) >= flown_with
 
@@ -123,7 +131,7 @@ def test_filter_rerun_with_smaller_nis_or_rmse_is_improvement(
     nis, nees, rmse_m, expected, has
 ) -> None:
     one = trial(RunStatistics(nis_mean=nis, nees_mean=nees, position_rmse_m=rmse_m))
-    assert improvement(one) == expected
+    assert classify_improvement(one) == expected
     assert has_effect(one) is has
 
 
@@ -160,7 +168,7 @@ def test_recommended_ekf2_noise_and_delay_equal_estimates(sample: Analysis) -> N
     model, comparison = sample.ekf2_model, sample
 
     def estimated(analysis: Analysis) -> dict[str, float]:
-        return ml_ekf2_parameters(comparison, model, analysis.tuning, analysis.clock)
+        return estimate_ekf2_parameters(comparison, model, analysis.tuning, analysis.clock)
 
     assert estimated(sample) == {}  # 0.1 m is within the interval
     settings = {**model.inputs.settings, "EKF2_EVP_NOISE": 0.3}
@@ -181,23 +189,26 @@ def test_recommended_ekf2_noise_and_delay_equal_estimates(sample: Analysis) -> N
         offset(sample, 0.2)
     )  # early: EKF2_EV_DELAY is already 0
     other = replace(comparison, source=replace(comparison.source, name="another"))
-    assert ml_ekf2_parameters(other, model, sample.tuning, sample.clock) == {}
+    assert estimate_ekf2_parameters(other, model, sample.tuning, sample.clock) == {}
 
 
 def test_ekf2_noise_advice_with_logged_variance_sets_noise_mode(sample: Analysis) -> None:
     model = sample.ekf2_model
-    assert noise_used_m(model.inputs) == pytest.approx(0.1)
-    flown = model.inputs.aid, model.inputs.settings, noise_used_m(model.inputs)
-    assert remedies.noise_change(*flown, 0.0012345) == {"EKF2_EVP_NOISE": 0.01}
+    assert find_used_noise_m(model.inputs) == pytest.approx(0.1)
+    flown = model.inputs.aid, model.inputs.settings, find_used_noise_m(model.inputs)
+    assert remedies.make_noise_change(*flown, 0.0012345) == {"EKF2_EVP_NOISE": 0.01}
     settings = {**model.inputs.settings, "EKF2_EVP_NOISE": 0.02, "EKF2_EV_NOISE_MD": 0.0}
     reported = replace(model, inputs=replace(model.inputs, settings=settings))
-    used = reported.inputs.aid, settings, noise_used_m(reported.inputs)
-    assert remedies.noise_change(*used, 0.05) == {"EKF2_EVP_NOISE": 0.05, "EKF2_EV_NOISE_MD": 1.0}
-    assert remedies.noise_change(*used, 0.2) == {"EKF2_EVP_NOISE": 0.2}
+    used = reported.inputs.aid, settings, find_used_noise_m(reported.inputs)
+    assert remedies.make_noise_change(*used, 0.05) == {
+        "EKF2_EVP_NOISE": 0.05,
+        "EKF2_EV_NOISE_MD": 1.0,
+    }
+    assert remedies.make_noise_change(*used, 0.2) == {"EKF2_EVP_NOISE": 0.2}
     changes = {"EKF2_EVP_NOISE": 0.02, "EKF2_EV_NOISE_MD": 1.0}
-    assert remedies.different_settings(changes, settings) == {"EKF2_EV_NOISE_MD": 1.0}
-    assert remedies.delay_change(model.inputs, -40.0) == {}
-    assert remedies.delay_change(model.inputs, 400.0) == {}
+    assert remedies.select_changed_settings(changes, settings) == {"EKF2_EV_NOISE_MD": 1.0}
+    assert remedies.make_delay_change(model.inputs, -40.0) == {}
+    assert remedies.make_delay_change(model.inputs, 400.0) == {}
 
 
 def only(name: str, analysis: Analysis) -> Finding:
@@ -220,10 +231,10 @@ def test_height_with_other_noise_and_same_parameter_is_named(sample: Analysis) -
     down = sample.tuning["down"]
     assert isinstance(down, AxisTuning)
     tuning = {"down": replace(down, **NoiseEstimate(0.6, 0.5, 0.7).as_fields("sigma_z_m"))}
-    assert remedies.height_noise_advice(sample, tuning, 0.1) == ""
+    assert remedies.make_height_noise_advice(sample, tuning, 0.1) == ""
     flags = sample.flight.ekf2.fusion_flags.assign(vertical=1.0)
     ekf2 = replace(sample.flight.ekf2, fusion_flags=flags)
     fused = replace(sample, flight=replace(sample.flight, ekf2=ekf2))
-    advice = remedies.height_noise_advice(fused, tuning, 0.1)
-    assert "height noise is 0.6 m. Report a variance of 0.36 m² for z" in advice
-    assert remedies.height_noise_advice(fused, tuning, 0.4) == ""
+    advice = remedies.make_height_noise_advice(fused, tuning, 0.1)
+    assert "height noise of the source is 0.6 m. Report a variance of 0.36 m² for z" in advice
+    assert remedies.make_height_noise_advice(fused, tuning, 0.4) == ""

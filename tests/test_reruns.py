@@ -11,7 +11,7 @@ from exchange import replace
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.reruns import (
-    planned_configurations,
+    list_rerun_configurations,
     rerun_filters,
 )
 from px4fuse.comparison.trials import (
@@ -21,10 +21,10 @@ from px4fuse.comparison.trials import (
     ROTATION,
     RunStatistics,
     Trial,
-    explained_fraction,
-    find_cause,
+    brings_inside_limits,
+    compute_explained_fraction,
+    find_cause_trial,
     find_trials,
-    is_sufficient,
 )
 from px4fuse.comparison.trials import RIGHT_BIAS as TO_RIGHT
 from px4fuse.diagnose import find_faults
@@ -49,7 +49,7 @@ def flown(*mistakes: str, sigma_a=0.27, sigma_z=0.10, passes=4) -> Analysis:
 
 
 def cause(analysis: Analysis, owner: Any, of: Any = "nis") -> Trial:
-    return find_cause(analysis.trials, owner, "aisle", of)
+    return find_cause_trial(analysis.trials, owner, "aisle", of)
 
 
 def test_filter_reruns_of_consistent_flight_report_no_cause() -> None:
@@ -87,8 +87,8 @@ def test_filter_reruns_find_the_simulated_fault_as_cause(
     assert found.change.keys() == change.keys()
     for name, (value, within) in change.items():
         assert found.change[name] == pytest.approx(value, abs=within)
-    distance = abs(explained_fraction(found, of) - 1.0)
-    assert is_sufficient(found, of) or (found.corrects_sensor and distance <= 0.25)
+    distance = abs(compute_explained_fraction(found, of) - 1.0)
+    assert brings_inside_limits(found, of) or (found.corrects_sensor and distance <= 0.25)
 
 
 def test_kf_rerun_without_bias_equals_run_on_unbiased_imu() -> None:
@@ -108,7 +108,7 @@ def test_filter_rerun_for_vibration_increases_ekf2_acc_noise() -> None:
     analysis = flown("vibration=1.5")
     found = cause(analysis, "ekf2", "nis")
     assert found.change == {"EKF2_ACC_NOISE": 1.0}  # PX4's maximum
-    assert explained_fraction(found, "nis") > 0.5
+    assert compute_explained_fraction(found, "nis") > 0.5
     assert not any("EKF2_ACC_NOISE" in row.change for row in flown("nlos=7%").trials)
 
 
@@ -127,7 +127,7 @@ def test_time_offset_applied_to_kf_is_also_tested_for_ekf2() -> None:
 )
 def test_kf_rerun_equals_compare_with_the_changed_setting(analysis, of) -> None:
     analysis = analysis()
-    found = find_cause(analysis.trials, "kf", "north", of)
+    found = find_cause_trial(analysis.trials, "kf", "north", of)
     again = compare(analysis.flight, replace(analysis.settings, **found.change))
 
     def statistic(of_comparison: Any) -> float:
@@ -138,12 +138,14 @@ def test_kf_rerun_equals_compare_with_the_changed_setting(analysis, of) -> None:
     assert before == pytest.approx(statistic(analysis), rel=1e-9)
     # the re-run's NEES is at KF's steps, that of the comparison at EKF2's sample times
     assert after == pytest.approx(statistic(again), rel=1e-6 if of == "nis" else 0.1)
-    assert explained_fraction(found, of) == pytest.approx(1.0 - np.log(after) / np.log(before))
+    assert compute_explained_fraction(found, of) == pytest.approx(
+        1.0 - np.log(after) / np.log(before)
+    )
 
 
 def test_ekf2_rerun_equals_what_if_with_the_same_parameters() -> None:
     analysis = flown("ekf2-noise=0.03")
-    found = [find_cause(analysis.trials, "ekf2", axis) for axis in ("north", "east")]
+    found = [find_cause_trial(analysis.trials, "ekf2", axis) for axis in ("north", "east")]
     model, change = analysis.ekf2_model, found[0].change  # type: ignore[union-attr]
     replays = what_if(replace(model, runs=()), [change])  # a copy without cached replays
     for one, axis in zip(found, ("north", "east"), strict=True):
@@ -153,7 +155,7 @@ def test_ekf2_rerun_equals_what_if_with_the_same_parameters() -> None:
         nis_after = replays.whatif[0].axes[axis].nis_mean
         assert one.after.nis_mean == pytest.approx(nis_after, rel=1e-9)
     # the configuration was planned with EKF2 as flown; other positions give another replay
-    assert FilterConfiguration({**model.inputs.settings, **change}) in planned_configurations(
+    assert FilterConfiguration({**model.inputs.settings, **change}) in list_rerun_configurations(
         analysis, analysis, model.inputs
     )
     once, other = (
@@ -173,7 +175,7 @@ def test_rerun_gives_kf_ekf2_difference_with_and_without_change() -> None:
     assert (row.before.difference_rms_m, row.after.difference_rms_m) == pytest.approx(
         (rms_difference(kf_case), rms_difference(right))
     )
-    assert explained_fraction(row, "difference") > 0.8
+    assert compute_explained_fraction(row, "difference") > 0.8
     # corrected EKF2 differs from KF as much as EKF2 in the same flight without the fault
     ekf2_case = flown("ekf2-gate=1", passes=6)
     right = compare(simulate_flight(Scenario(seed=5)), RIGHT)
@@ -188,7 +190,7 @@ def test_filter_rerun_with_time_offset_excludes_shifted_outliers() -> None:
     count = cause(analysis, "ekf2").change[OUTLIERS]
     rows = [one for one in analysis.trials if one.filter == "ekf2" and one.axis == "aisle"]
     alone = next(one for one in rows if one.change == {OUTLIERS: count})
-    assert is_sufficient(alone, "nis")
+    assert brings_inside_limits(alone, "nis")
     model, out = analysis.ekf2_model, analysis.tuning["horizontal"]
     (bare,) = replay_with_settings(model, [{}], out.outlier_time_s)
     (late,) = replay_with_settings(
@@ -220,24 +222,30 @@ def test_cause_must_explain_50_to_150_percent_of_nis_deviation() -> None:
         )  # fmt: skip
 
     for explains in (0.49, 1.51, -1.0):
-        assert find_cause([one({"sigma_z_m": 1.0}, explains)], "kf", "aisle") is None
+        assert find_cause_trial([one({"sigma_z_m": 1.0}, explains)], "kf", "aisle") is None
     part, whole = one({"sigma_a_m_s2": 0.1}, 0.99), one({"sigma_z_m": 1.0}, 0.9, into=True)
     assert (
-        find_cause([part, whole], "kf", "aisle") is whole
+        find_cause_trial([part, whole], "kf", "aisle") is whole
     )  # a change into the band precedes a larger share
     both = one({CLOCK_OFFSET: 0.1, "sigma_z_m": 1.0}, 1.0, into=True)
-    assert find_cause([both, whole], "kf", "aisle") is whole  # fewer changes precede
+    assert find_cause_trial([both, whole], "kf", "aisle") is whole  # fewer changes precede
     fault = one({CLOCK_OFFSET: 0.1}, 0.9, into=True)
-    assert find_cause([whole, fault], "kf", "aisle") is fault  # sensor faults precede settings
+    assert (
+        find_cause_trial([whole, fault], "kf", "aisle") is fault
+    )  # sensor faults precede settings
     nearly, far = (
         one({FORWARD_BIAS: 0.3, TO_RIGHT: 0.1}, 0.8),
         one({FORWARD_BIAS: 0.3, TO_RIGHT: 0.1}, 0.7),
     )
     assert (
-        find_cause([whole, nearly], "kf", "aisle") is nearly
+        find_cause_trial([whole, nearly], "kf", "aisle") is nearly
     )  # both bias components are one change
-    assert find_cause([whole, far], "kf", "aisle") is whole
-    assert find_cause([whole], "ekf2", "aisle") is find_cause([whole], "kf", "north") is None
+    assert find_cause_trial([whole, far], "kf", "aisle") is whole
+    assert (
+        find_cause_trial([whole], "ekf2", "aisle")
+        is find_cause_trial([whole], "kf", "north")
+        is None
+    )
 
 
 def test_filter_rerun_without_required_data_is_skipped() -> None:

@@ -14,7 +14,7 @@ from scipy.integrate import trapezoid
 from scipy.spatial.transform import Rotation
 
 from px4fuse.comparison.preparation import choose_segment, shift_clock
-from px4fuse.comparison.projection import continuous_state
+from px4fuse.comparison.projection import remove_origin_resets
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import (
     Segment,
@@ -313,7 +313,7 @@ def test_ekf2_reset_that_shifts_the_origin_is_removed(at, good):
     later = STATE_TIME[:, None] >= np.array(at)
     offset = later @ deltas - deltas[:good].sum(axis=0)
     resets = [Reset(t, "position", tuple(d)) for t, d in zip(at, deltas, strict=True)]
-    state, statement = continuous_state(ekf2_of(offset, resets), noisy_track(), WHOLE)
+    state, statement = remove_origin_resets(ekf2_of(offset, resets), noisy_track(), WHOLE)
     np.testing.assert_allclose(state[Columns.POSITION], truth_at(STATE_TIME), atol=1e-12)
     assert f"{len(at)} of horizontal position" in statement
     assert "removed" in statement
@@ -326,7 +326,7 @@ def test_ekf2_reset_that_corrects_an_error_is_kept(reset_s):
     drift = np.where(reset_s > STATE_TIME, 2.0 * STATE_TIME / reset_s, 0.0)
     resets = [Reset(reset_s, kind, (-2.0, 0.0, 0.0)) for kind in ("position", "velocity")]
     ekf2 = ekf2_of(np.outer(drift, NORTH), resets)
-    state, statement = continuous_state(ekf2, noisy_track(), WHOLE)
+    state, statement = remove_origin_resets(ekf2, noisy_track(), WHOLE)
     pd.testing.assert_frame_equal(state, ekf2.state)
     assert "not removed" in statement
     assert "1 of velocity" in statement
@@ -339,7 +339,7 @@ def test_ekf2_height_reset_is_kept_if_position_reset_is_removed():
     offset = np.stack([frame_change, 0.0 * drift, drift], axis=1)
     resets = [Reset(8.0, "position", (3.0, 0.0, 0.0)), Reset(12.0, "position", (0.0, 0.0, -1.2))]
     ekf2 = ekf2_of(offset, resets)
-    state, statement = continuous_state(ekf2, noisy_track(), WHOLE)
+    state, statement = remove_origin_resets(ekf2, noisy_track(), WHOLE)
     np.testing.assert_allclose(state["north_m"], truth_at(STATE_TIME)[:, 0], atol=1e-12)
     np.testing.assert_array_equal(state["down_m"], ekf2.state["down_m"])
     assert "horizontal" in statement.split("not removed")[0]
@@ -352,8 +352,8 @@ def test_ekf2_reset_along_an_unmeasured_axis_is_kept():
     blind = replace(track, samples=track.samples.assign(down_m=np.nan))
     offset = np.where(STATE_TIME[:, None] >= 8.0, [0.0, 0.0, 3.0], 0.0)
     ekf2 = ekf2_of(offset, [Reset(8.0, "position", (0.0, 0.0, 3.0))])
-    assert "removed" in continuous_state(ekf2, track, WHOLE)[1]
-    state, statement = continuous_state(ekf2, blind, WHOLE)
+    assert "removed" in remove_origin_resets(ekf2, track, WHOLE)[1]
+    state, statement = remove_origin_resets(ekf2, blind, WHOLE)
     pd.testing.assert_frame_equal(state, ekf2.state)
     assert (
         statement == "EKF2 resets not removed, because they correct an error of EKF2: 1 of height"
@@ -367,7 +367,7 @@ def test_ekf2_reset_along_an_unmeasured_axis_is_kept():
 def test_ekf2_resets_outside_evaluated_segment_are_not_removed(reset_s, said):
     """A reset at the start defines the frame; one at the end affects the last sample only."""
     ekf2 = ekf2_of(np.zeros(3), [Reset(reset_s, "position", (5.0, 5.0, 0.0))])
-    state, statement = continuous_state(ekf2, noisy_track(), Segment(1.0, 18.0, ""))
+    state, statement = remove_origin_resets(ekf2, noisy_track(), Segment(1.0, 18.0, ""))
     pd.testing.assert_frame_equal(state, ekf2.state)
     assert said in statement
     assert bool(said) == bool(statement)

@@ -10,8 +10,8 @@ from flights import unexplained
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.difference_steps import (
-    add_sentences,
-    corrected_settings,
+    add_cause_sentences,
+    estimate_wrong_settings,
     explain_ekf2_difference,
 )
 from px4fuse.ekf2.steps import (
@@ -115,7 +115,7 @@ def test_report_without_ekf2_replay_omits_difference_page(sample: Analysis) -> N
 
 @pytest.mark.parametrize(
     ("share", "text"),
-    [(0.47, "decreases by 47 %."), (1.4, "decreases by 140 %. Other properties")],
+    [(0.47, "decreases by 47 %."), (1.4, "decreases by 140 %. With other properties")],
 )
 def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text) -> None:
     explanation = of(sample)
@@ -124,7 +124,7 @@ def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text)
     steps = tuple(replace(one, position_mean_square_m2=of * whole)
                   for one, of in zip(explanation.steps, shares, strict=True))  # fmt: skip
     reasons = {name: f"Reason of {name}" for name in REPLACEMENT_STEPS}
-    explained = add_sentences(replace(explanation, steps=steps), "the aisle", reasons)
+    explained = add_cause_sentences(replace(explanation, steps=steps), "the aisle", reasons)
     assert f"along the aisle: {first.name}." in explained.cause
     assert text in explained.sentences[0]
     assert explained.cause.endswith(f"Reason of {first.name}.")
@@ -134,7 +134,7 @@ def test_kf_ekf2_difference_text_names_largest_contribution(sample, share, text)
 
 def test_kf_ekf2_difference_names_a_wrong_kf_setting_first(sample: Analysis) -> None:
     comparison = compare(sample.flight, Settings(sigma_a_m_s2=0.001), axes=("aisle",))
-    corrected = corrected_settings(comparison, sample.tuning)
+    corrected = estimate_wrong_settings(comparison, sample.tuning)
     assert corrected == {"sigma_a_m_s2": pytest.approx(0.363, abs=0.01)}
     explained = explain_ekf2_difference(comparison, sample.ekf2_model, sample.clock, corrected)[
         "aisle"
@@ -142,4 +142,4 @@ def test_kf_ekf2_difference_names_a_wrong_kf_setting_first(sample: Analysis) -> 
     assert explained.corrected == corrected
     assert explained.position_mean_square_m2 < 0.01
     assert "--sigma-a 0.363" in explained.sentences[0]
-    assert corrected_settings(sample, sample.tuning) == {}
+    assert estimate_wrong_settings(sample, sample.tuning) == {}

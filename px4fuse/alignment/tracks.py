@@ -8,7 +8,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.ndimage import binary_erosion, gaussian_filter1d, median_filter
 from scipy.signal import butter, sosfiltfilt
 
-from px4fuse.comparison.projection import continuous_state
+from px4fuse.comparison.projection import remove_origin_resets
 from px4fuse.core.arrays import Array, BoolArray, Complex
 from px4fuse.errors import Px4FuseError
 from px4fuse.filter.signals import Segment, ned_acceleration
@@ -205,4 +205,4 @@ def ekf2_track_without_resets(ekf2: Ekf2, aligned_samples: pd.DataFrame) -> Samp
     """Return EKF2's track without position resets that only move the origin of EKF2's frame."""
     track = PositionTrack("", POSITION_FILE, "", aligned_samples, "NED", "", ())
     segment = Segment(float(aligned_samples.index[0]), float(aligned_samples.index[-1]), "")
-    return _smooth_ekf2_track(continuous_state(ekf2, track, segment)[0])
+    return _smooth_ekf2_track(remove_origin_resets(ekf2, track, segment)[0])

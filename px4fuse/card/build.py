@@ -37,10 +37,10 @@ from px4fuse.comparison.model import (
     AxisComparison,
     ErrorsAgainstTruth,
     FilterName,
-    north_and_east,
+    select_north_and_east,
 )
-from px4fuse.comparison.remedy import aid_of
-from px4fuse.comparison.trials import improvement
+from px4fuse.comparison.remedy import find_aid
+from px4fuse.comparison.trials import classify_improvement
 from px4fuse.core.reading import display_name, file_size, read_head
 from px4fuse.core.text import (
     capitalise_first,
@@ -67,10 +67,10 @@ MAX_ACTIONS = 3
 # Minimum fraction of positions rejected by EKF2 for a sentence about rejections
 MIN_NAMED_REJECTED_FRACTION = 0.01
 # Aiding sources whose √S is usually too large with PX4's default noises, which is not a fault
-USUALLY_UNDERCONFIDENT = frozenset({"baro_hgt", "mag", "gravity"})
+USUALLY_UNDERCONFIDENT_AIDS = frozenset({"baro_hgt", "mag", "gravity"})
 DRIFT_EXPLANATION = (
-    "A σ that is too large against the source is not a fault here: the source may drift, and "
-    "innovations do not show drift. Do not reduce noise settings because of it."
+    "The innovations are smaller than expected. This is not a fault here: the source may drift, "
+    "and innovations do not show drift. Do not reduce noise settings."
 )
 PRINTED_BYTE_COUNT = 4  # number of bytes printed from the start of an unreadable log
 ULOG_FIRST_BYTES = "55 4C 6F 67"  # first bytes of each ULog file (hexadecimal)
@@ -83,10 +83,11 @@ OUTLIER_EXPLANATION = (
     "position."
 )
 UNEXPLAINED_DIFFERENCE = (
-    "The verdicts against source and ground truth differ, and no tested change explains it."
+    "The σ ratio of KF or EKF2 against the position source differs from that against ground "
+    "truth. No re-run explains the difference."
 )
 # Reasons why innovations are consistent but errors against ground truth are not, by finding ids
-SENTENCES_BY_SOURCE_FAULTS = (
+SOURCE_FAULTS_AND_SENTENCES = (
     (
         {"source_axes_wrong", "source_orientation_wrong", "source_unit_wrong"},
         "KF uses the corrected positions of the source. EKF2 used the uncorrected positions.",
@@ -117,19 +118,19 @@ def build_card(
         Name and id.
     """
     source, segment = analysis.source, analysis.segment
-    identity = _make_identity(
+    analysis_identity = _make_identity(
         analysis.flight.log,
         request,
         student,
         source=f"{source_name(source)} {source.compute_rate_hz():.1f} Hz",
-        settings=_settings_text(analysis, request),
-        changed=_changed_setting_texts(request),
-        parameters=_changed_parameter_texts(analysis),
+        settings=_format_settings(analysis, request),
+        changed=_format_changed_settings(request),
+        parameters=_format_changed_parameters(analysis),
         segment=f"{segment.start_s:.1f} to {segment.end_s:.1f} s, {segment.reason}",
     )
     if analysis.flight.log.is_assessed:
         headline = "Assignment: the student makes the diagnosis, so px4fuse prints none"
-        return Card(severity="note", headline=headline, identity=identity)
+        return Card(severity="note", headline=headline, identity=analysis_identity)
     root_findings = [group[0] for group in group_by_root(analysis.findings)]
     sigma_verdicts = make_sigma_verdicts(analysis.main)
     ranked_causes = rank_causes(analysis, root_findings)
@@ -146,15 +147,15 @@ def build_card(
         id=causes[0].id if causes else "",
         headline=_make_headline(causes, sigma_verdicts),
         effect=effect,
-        effect_text=_effect_text(analysis, effect, sigma_verdicts),
-        do_this=_action_sentences(causes),
+        effect_text=_describe_effect(analysis, effect, sigma_verdicts),
+        do_this=_format_actions(causes),
         verdicts=sigma_verdicts,
         reconcile=explanation,
-        difference=_difference_text(effect, ranked_causes),
+        difference=_describe_difference(effect, ranked_causes),
         causes=causes,
         more_causes=max(len(ranked_causes) - MAX_CAUSES, 0),
         notes=_make_notes(root_findings, request.log),
-        identity=identity,
+        identity=analysis_identity,
     )
 
 
@@ -170,7 +171,7 @@ def build_aids_card(
         severity=causes[0].severity if causes else "clean",
         id=causes[0].id if causes else "",
         headline=causes[0].title if causes else "No fault found in EKF2's aiding sources",
-        do_this=_action_sentences(causes),
+        do_this=_format_actions(causes),
         causes=causes,
         more_causes=max(len(faults) - MAX_CAUSES, 0),
         notes=_make_notes(root_findings, request.log),
@@ -179,7 +180,7 @@ def build_aids_card(
                 label=aid.label,
                 component=name,
                 ratio=math.sqrt(axis.nis_mean) if axis.nis_mean else None,
-                is_usual=key in USUALLY_UNDERCONFIDENT,
+                is_usual=key in USUALLY_UNDERCONFIDENT_AIDS,
             )
             for key, aid in analysis.aids.items()
             for name, axis in aid.axes.items()
@@ -223,8 +224,8 @@ def _make_headline(causes: Sequence[Cause], sigma_verdicts: Sequence[Verdict]) -
         return (
             f"{FILTER_NAMES[worst_verdict.filter]} {worst_verdict.word}: σ "
             f"{format_ratio(max(ratio, 1.0 / ratio))} times too "
-            f"{'small' if ratio > 1.0 else 'large'} against "
-            f"{'the source' if worst_verdict.against == 'source' else 'ground truth'}"
+            f"{'small' if ratio > 1.0 else 'large'} compared with "
+            f"{'the innovations' if worst_verdict.against == 'source' else 'ground truth'}"
         )
     if all(verdict.word == "not evaluated" for verdict in sigma_verdicts):
         return "No fault found; KF and EKF2 could not be evaluated"
@@ -244,8 +245,8 @@ def _make_effect(analysis: Analysis) -> Effect:
         reset_count = int(((segment.start_s < resets_s) & (resets_s <= segment.end_s)).sum())
     return Effect(
         axis=describe_axis(analysis, comparison),
-        position_rmse_m=_position_rmse_m(comparison),
-        horizontal_rmse_m=_horizontal_rmse_m(analysis),
+        position_rmse_m=_find_rmse_by_filter_m(comparison),
+        horizontal_rmse_m=_compute_horizontal_rmse_m(analysis),
         difference_rms_m=None if isinstance(difference, Unavailable) else difference.position_rms_m,
         rejected_fraction=comparison.rejected_fraction,
         horizontal_resets=reset_count,
@@ -261,7 +262,7 @@ def describe_axis(analysis: Analysis, result: AxisComparison) -> str:
     return f"{direction}, {heading % 180.0:.0f}° from {reference}"
 
 
-def _position_rmse_m(result: AxisComparison) -> dict[FilterName, float]:
+def _find_rmse_by_filter_m(result: AxisComparison) -> dict[FilterName, float]:
     return {
         filter_name: truth.position_rmse_m
         for filter_name, summary in result.filters.items()
@@ -269,8 +270,8 @@ def _position_rmse_m(result: AxisComparison) -> dict[FilterName, float]:
     }
 
 
-def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
-    rmse_by_axis_m = [_position_rmse_m(result) for result in north_and_east(analysis)]
+def _compute_horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
+    rmse_by_axis_m = [_find_rmse_by_filter_m(result) for result in select_north_and_east(analysis)]
     return {
         name: math.hypot(*(rmse_m[name] for rmse_m in rmse_by_axis_m))
         for name in FILTER_NAMES
@@ -278,7 +279,7 @@ def _horizontal_rmse_m(analysis: Analysis) -> dict[FilterName, float]:
     }
 
 
-def _effect_text(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Verdict]) -> str:
+def _describe_effect(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Verdict]) -> str:
     sentences, segment, flight = [], analysis.segment, analysis.segment.flight
     if analysis.flight.airborne == () and has_little_motion(analysis):
         return "The vehicle stayed on the ground, so the errors of KF and EKF2 are not evaluated."
@@ -289,7 +290,7 @@ def _effect_text(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Ve
         if max(segment.start_s - flight.start_s, flight.end_s - segment.end_s) > MIN_GAP_S:
             span_text = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s"
         if effect.horizontal_rmse_m:
-            horizontal_text = f" (horizontal: {_lengths_by_filter(effect.horizontal_rmse_m)})"
+            horizontal_text = f" (horizontal: {_format_lengths(effect.horizontal_rmse_m)})"
         is_track_direction = (
             analysis.main.axis.name == AISLE
             and analysis.request is not None
@@ -299,7 +300,7 @@ def _effect_text(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Ve
         sentences.append(
             f"Position RMSE against ground truth along {analysis.main.axis.label}{axis_text}"
             f"{span_text}: "
-            f"{_lengths_by_filter(effect.position_rmse_m)}{horizontal_text}."
+            f"{_format_lengths(effect.position_rmse_m)}{horizontal_text}."
         )
         sentences += [
             f"The position error of {FILTER_NAMES[verdict.filter]} is "
@@ -307,7 +308,7 @@ def _effect_text(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Ve
             for verdict in sigma_verdicts
             if verdict.against == "truth" and verdict.ratio and verdict.word != "consistent"
         ]
-        sentences += _worst_axis_sentences(analysis)
+        sentences += _describe_worst_axis(analysis)
     if effect.difference_rms_m is not None and (
         not effect.position_rmse_m
         or all(verdict.word == "consistent" for verdict in sigma_verdicts)
@@ -326,7 +327,7 @@ def _effect_text(analysis: Analysis, effect: Effect, sigma_verdicts: Sequence[Ve
     return " ".join(sentences)
 
 
-def _worst_axis_sentences(analysis: Analysis) -> list[str]:
+def _describe_worst_axis(analysis: Analysis) -> list[str]:
     results = (analysis.main, *analysis.select_secondary_axes())
     nees_with_results = [
         (truth.nees_position_mean, result, truth.position_rmse_m)
@@ -352,24 +353,22 @@ def _format_difference(rms_m: float) -> str:
     return f"Position difference KF − EKF2 along the main axis: {format_metres(rms_m)} m RMS"
 
 
-def _lengths_by_filter(lengths_m: Mapping[FilterName, float]) -> str:
+def _format_lengths(length_by_filter_m: Mapping[FilterName, float]) -> str:
     return ", ".join(
         f"{FILTER_NAMES[filter_name]} {format_metres(length_m)} m"
-        for filter_name, length_m in lengths_m.items()
+        for filter_name, length_m in length_by_filter_m.items()
     )
 
 
-def _action_sentences(causes: Sequence[Cause]) -> tuple[str, ...]:
+def _format_actions(causes: Sequence[Cause]) -> tuple[str, ...]:
     if not causes:
         return ("Change nothing.",)
     numbered_sentences: list[str] = []
     for number, cause in enumerate(causes, 1):
-        alternatives = [
-            _action_sentence(action) for group in cause.alternatives for action in group
-        ]
+        alternatives = [_format_action(action) for group in cause.alternatives for action in group]
         sentences = [", or ".join(alternatives)] if alternatives else []
         sentences += [
-            _action_sentence(action)
+            _format_action(action)
             for action in cause.actions
             if action.commands or not action.sentence.startswith("no ")
         ]
@@ -378,11 +377,11 @@ def _action_sentences(causes: Sequence[Cause]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(numbered_sentences))[:MAX_ACTIONS]
 
 
-def _action_sentence(action: Action) -> str:
+def _format_action(action: Action) -> str:
     if action.where == "console":
         # do not repeat the parameter name, which is in the command
-        value_change = action.sentence.partition(" ")[2]
-        change_text = value_change if len(action.commands) == 1 else action.sentence
+        value_change_text = action.sentence.partition(" ")[2]
+        change_text = value_change_text if len(action.commands) == 1 else action.sentence
         return f"EKF2: {', '.join(action.commands)} ({change_text})"
     if action.where == "shell":
         options_text = action.commands[0].partition(" --")[2]
@@ -391,11 +390,11 @@ def _action_sentence(action: Action) -> str:
     return f"{capitalise_first(action.target)}: {text}"
 
 
-def _mark_explained(
+def _mark_explained_verdicts(
     sigma_verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Mark inconsistent filters whose settings need no change (``is_explained``)."""
-    filters_without_change = {
+    """Set ``is_explained`` if the inconsistency is no reason to change settings of the filter."""
+    filters_to_keep_unchanged = {
         name
         for cause in causes
         for action in cause.actions
@@ -411,7 +410,7 @@ def _mark_explained(
         replace(verdict, is_explained=True)
         if verdict.is_fault
         and (
-            FILTER_NAMES[verdict.filter] in filters_without_change
+            FILTER_NAMES[verdict.filter] in filters_to_keep_unchanged
             or verdict.filter in filters_consistent_with_truth
             # a small NIS does not prove a too large σ: innovations do not show drift
             or (may_drift and (verdict.against, verdict.word) == ("source", "underconfident"))
@@ -426,19 +425,21 @@ def _explain_verdict_differences(
 ) -> tuple[tuple[Verdict, ...], str]:
     """Explain why the innovations of a filter are consistent and its errors not, or vice versa."""
     may_drift, ekf2_errors = analysis.source.origin.may_drift, analysis.main.filters["ekf2"].truth
-    sigma_verdicts = _mark_explained(sigma_verdicts, causes, may_drift=may_drift)
+    sigma_verdicts = _mark_explained_verdicts(sigma_verdicts, causes, may_drift=may_drift)
     *other_verdicts, ekf2_verdict = sigma_verdicts
-    horizon_nees = (
+    horizon_sigma_ratio = math.inf
+    if (
         not causes
         and ekf2_verdict.word == "overconfident"
         and isinstance(ekf2_errors, ErrorsAgainstTruth)
         and ekf2_errors.nees_position_horizon_mean
-    )
-    ratio = math.sqrt(horizon_nees or math.inf)
-    if classify_sigma_ratio(ratio, "truth") == "consistent":
+    ):
+        horizon_sigma_ratio = math.sqrt(ekf2_errors.nees_position_horizon_mean)
+    if classify_sigma_ratio(horizon_sigma_ratio, "truth") == "consistent":
         return (*other_verdicts, replace(ekf2_verdict, is_explained=True)), (
-            "EKF2's published position lags behind the estimate from which EKF2 computes σ. The "
-            f"error of this estimate is {format_ratio(ratio)} times σ: consistent."
+            "EKF2's σ belongs to its delayed position at the fusion horizon. The error of this "
+            f"position is {format_ratio(horizon_sigma_ratio)} times σ, so EKF2 is consistent. The "
+            "error of the published position also contains the lag of the output predictor."
         )
     explanation = _explain_differing_verdicts(analysis, sigma_verdicts, causes)
     if explanation == UNEXPLAINED_DIFFERENCE:
@@ -473,15 +474,15 @@ def _explain_differing_verdicts(
     if not differing_filters:
         return ""
     finding_ids = {finding.id for finding in analysis.findings}
-    for fault_ids, sentence in SENTENCES_BY_SOURCE_FAULTS:
+    for fault_ids, sentence in SOURCE_FAULTS_AND_SENTENCES:
         if not finding_ids.isdisjoint(fault_ids):
             return sentence
     if corrected_filters.issuperset(differing_filters):
         filter_labels = " and ".join(FILTER_NAMES[filter_name] for filter_name in differing_filters)
         return (
-            f"The verdicts on {filter_labels} against source and ground truth differ, because "
-            "innovations show little of this fault. The first action of this card removes most of "
-            "the position error."
+            f"The σ ratio of {filter_labels} against the position source differs from that against "
+            "ground truth, because innovations show little of the first fault of this card. The "
+            "re-run without this fault reduces the position error."
         )
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
@@ -503,7 +504,7 @@ def _explain_differing_verdicts(
     return OUTLIER_EXPLANATION if rejects_outliers else explanation
 
 
-def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> str:
+def _describe_difference(effect: Effect, ranked_causes: Sequence[RankedCause]) -> str:
     if effect.difference_rms_m is None or not ranked_causes:
         return ""
     difference_text = _format_difference(effect.difference_rms_m)
@@ -511,25 +512,22 @@ def _difference_text(effect: Effect, ranked_causes: Sequence[RankedCause]) -> st
     corrected_filters = {
         trial.filter
         for trial in trials
-        if "position" in improvement(trial) or not can_show_effect(trial)
+        if "position" in classify_improvement(trial) or not can_show_effect(trial)
     }
     if len(corrected_filters) == 2:
         return (
             f"{difference_text}. The fault affects both KF and EKF2, so the position difference "
             "hardly shows the fault."
         )
-    difference_after_by_filter = {
+    rerun_rms_by_filter_m = {
         trial.filter: trial.after.difference_rms_m for trial in reversed(trials)
     }
-    is_ekf2 = {"ekf2"} in (corrected_filters, difference_after_by_filter.keys())
-    difference_after_m = difference_after_by_filter.get("ekf2" if is_ekf2 else "kf")
-    if difference_after_m is None:
+    is_only_ekf2_corrected = {"ekf2"} in (corrected_filters, rerun_rms_by_filter_m.keys())
+    rerun_rms_m = rerun_rms_by_filter_m.get("ekf2" if is_only_ekf2_corrected else "kf")
+    if rerun_rms_m is None:
         return f"{difference_text}."
-    corrected_filter = "EKF2 (predicted by replay)" if is_ekf2 else "KF"
-    return (
-        f"{difference_text}; {format_metres(difference_after_m)} m after correcting "
-        f"{corrected_filter}."
-    )
+    corrected_filter = "EKF2 (predicted by replay)" if is_only_ekf2_corrected else "KF"
+    return f"{difference_text}; {format_metres(rerun_rms_m)} m after correcting {corrected_filter}."
 
 
 def _make_notes(root_findings: Sequence[Finding], log_name: str) -> tuple[Note, ...]:
@@ -556,21 +554,21 @@ def _make_identity(
     )
 
 
-def _settings_text(analysis: Analysis, request: ComparisonRequest) -> str:
+def _format_settings(analysis: Analysis, request: ComparisonRequest) -> str:
     settings = analysis.settings
     setting_texts = []
     for name in KF_NUMERIC_SETTINGS:
         value, value_origin = getattr(settings, name), "set by the user"
         unit, label = SETTING_RANGES[name][2:]
         if name == "sigma_z_m" and request.sigma_z_m is None and analysis.source.origin.is_gnss:
-            value_origin = f"from {aid_of(analysis).noise}"
+            value_origin = f"from {find_aid(analysis).noise}"
         elif value == getattr(Settings(), name):
             value_origin = "default"
         setting_texts.append(f"{label} {value:g} {unit} ({value_origin})")
     return ", ".join(setting_texts)
 
 
-def _changed_setting_texts(request: ComparisonRequest) -> tuple[str, ...]:
+def _format_changed_settings(request: ComparisonRequest) -> tuple[str, ...]:
     defaults = Settings()
     return tuple(
         f"{COMPARISON_OPTIONS[name]} {value:g} (default {getattr(defaults, name):g})"
@@ -579,7 +577,7 @@ def _changed_setting_texts(request: ComparisonRequest) -> tuple[str, ...]:
     )
 
 
-def _changed_parameter_texts(analysis: Analysis) -> tuple[str, ...]:
+def _format_changed_parameters(analysis: Analysis) -> tuple[str, ...]:
     aid = analysis.source.origin.aid
     if aid is None:
         return ()

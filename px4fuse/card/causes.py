@@ -7,22 +7,22 @@ from typing import Any, NamedTuple
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.model import Action, Cause, Rerun, Target, Verdict
+from px4fuse.card.model import Action, ActionTarget, Cause, Rerun, Verdict
 from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
 from px4fuse.comparison.model import FILTER_NAMES, FilterName
-from px4fuse.comparison.remedy import different_settings
+from px4fuse.comparison.remedy import select_changed_settings
 from px4fuse.comparison.trials import (
     CLOCK_OFFSET,
     OUTLIERS,
     Trial,
     becomes_consistent,
+    classify_improvement,
+    compute_log_ratio_reduction,
+    compute_preference_key,
+    compute_sigma_ratios,
     halves_discrepancy,
     has_effect,
-    improvement,
-    log_ratio_reduction,
-    preference_key,
     remains_overconfident,
-    sigma_ratios,
 )
 from px4fuse.core.text import lower_first, with_log_name
 from px4fuse.filter.consistency import classify_sigma_ratio
@@ -43,7 +43,8 @@ TRUTH_ONLY_CHANGE_KINDS = frozenset({"time offset", "delay", "rotation"})
 REBOOT_PARAMETER_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
 # Minimum fraction of rejected positions that the table of re-runs shows
 MIN_SHOWN_REJECTED_FRACTION = 0.005
-TARGET_BY_GROUP: Mapping[str, Target] = {
+# Devices or filters to be changed, by group of the finding
+ACTION_TARGET_BY_GROUP: Mapping[str, ActionTarget] = {
     "position source": "sender",
     "time": "sender",
     "IMU": "flight",
@@ -52,8 +53,8 @@ TARGET_BY_GROUP: Mapping[str, Target] = {
     "loops": "source",
     "logging": "logging",
 }
-# Devices to be changed, by finding id; exceptions from TARGET_BY_GROUP
-TARGET_BY_ID: Mapping[str, Target] = {
+# Exceptions from ACTION_TARGET_BY_GROUP
+ACTION_TARGET_BY_ID: Mapping[str, ActionTarget] = {
     "source_drift": "source",
     "source_lever_arm": "EKF2",
     "source_coordinate_constant": "EKF2",
@@ -63,15 +64,15 @@ TARGET_BY_ID: Mapping[str, Target] = {
 
 
 class RankedCause(NamedTuple):
-    """Possible cause of a fault, with the re-runs that test it and its rank.
+    """Possible cause of a fault, its rank (0 first), and the re-runs of KF and EKF2 that test it.
 
-    ``tier`` is the priority (0 first). Within a tier, the cause with the largest ``reduction`` of
-    |ln σ ratio| by its re-runs is first.
+    Of causes with equal rank, the one whose re-runs most reduce |ln(actual / reported σ)|
+    (``log_ratio_reduction``) is first.
     """
 
     finding: Finding
-    tier: int
-    reduction: float
+    rank: int
+    log_ratio_reduction: float
     trials: tuple[Trial, ...]
 
 
@@ -81,28 +82,26 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
     for finding in root_findings:
         if finding.severity == "note":
             continue
-        trials = confirming_trials(analysis.select_main_trials(), finding)
+        trials = find_trials_of_finding(analysis.select_main_trials(), finding)
         if CATALOGUE[finding.id].verdict == "repeated":
-            trials = tuple(filter(is_useful, trials))
+            trials = tuple(filter(may_improve_filter, trials))
         elif trials and not any(
             has_effect(trial) or not can_show_effect(trial) for trial in trials
         ):
             continue
-        ranked_causes.append(
-            RankedCause(
-                finding, _cause_tier(finding, trials), sum(map(log_ratio_reduction, trials)), trials
-            )
-        )
+        reduction = sum(map(compute_log_ratio_reduction, trials))
+        rank = _find_cause_rank(finding, trials)
+        ranked_causes.append(RankedCause(finding, rank, reduction, trials))
     fault_causes = [
         cause for cause in ranked_causes if CATALOGUE[cause.finding.id].verdict != "repeated"
     ]
     return sorted(
         fault_causes or ranked_causes,
         key=lambda cause: (
-            cause.tier,
-            # faults of the source before settings: a changed setting may only hide a fault
-            cause.tier in (1, 2, 3) and _is_setting_fault(cause.finding),
-            -cause.reduction,
+            cause.rank,
+            # False is first: source faults precede settings, whose change may only hide a fault
+            cause.rank in (1, 2, 3) and _is_setting_fault(cause.finding),
+            -cause.log_ratio_reduction,
         ),
     )
 
@@ -112,7 +111,7 @@ def _is_setting_fault(finding: Finding) -> bool:
     return bool(rerun_kinds) and rerun_kinds <= SETTING_CHANGE_KINDS
 
 
-def _cause_tier(finding: Finding, trials: Iterable[Trial]) -> int:
+def _find_cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
     if CATALOGUE[finding.id].verdict == "meaningless" or CONVENTION in finding.evidence:
         return 0
     if _is_setting_fault(finding) and any(map(remains_overconfident, trials)):
@@ -124,15 +123,15 @@ def _cause_tier(finding: Finding, trials: Iterable[Trial]) -> int:
     return 3 if finding.severity == "error" else 4
 
 
-def confirming_trials(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
-    """Return the re-runs of KF and EKF2 that test a finding, the best for each type of change."""
-    change_kinds = CATALOGUE[finding.id].reruns
-    change_kinds |= {"defaults"} if "noises" in change_kinds else set()
+def find_trials_of_finding(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
+    """Return the best re-run of KF and of EKF2 for each kind of change that tests a finding."""
+    tested_kinds = CATALOGUE[finding.id].reruns
+    tested_kinds |= {"defaults"} if "noises" in tested_kinds else set()
     best_trials: dict[tuple[FilterName, str], Trial] = {}
     for trial in trials:
-        if len(trial.kinds) == 1 and trial.kinds[0] in change_kinds:
+        if len(trial.kinds) == 1 and trial.kinds[0] in tested_kinds:
             key = trial.filter, trial.kinds[0]
-            best_trials[key] = min(trial, best_trials.get(key, trial), key=preference_key)
+            best_trials[key] = min(trial, best_trials.get(key, trial), key=compute_preference_key)
     return tuple(best_trials.values())
 
 
@@ -142,8 +141,8 @@ def can_show_effect(trial: Trial) -> bool:
     return has_truth or TRUTH_ONLY_CHANGE_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
 
 
-def is_useful(trial: Trial) -> bool:
-    return improvement(trial) != "nothing" or not can_show_effect(trial)
+def may_improve_filter(trial: Trial) -> bool:
+    return classify_improvement(trial) != "nothing" or not can_show_effect(trial)
 
 
 def make_cause(
@@ -154,7 +153,7 @@ def make_cause(
 ) -> Cause:
     """Describe a fault, with actions for position source, KF and EKF2."""
     finding, trials = ranked_cause.finding, ranked_cause.trials
-    useful_trials = [trial for trial in trials if is_useful(trial)]
+    useful_trials = [trial for trial in trials if may_improve_filter(trial)]
     alternatives, actions = _make_actions(
         analysis, ranked_cause, useful_trials, sigma_verdicts, request
     )
@@ -163,19 +162,19 @@ def make_cause(
         alternatives=alternatives,
         actions=actions,
         reruns=tuple(_make_rerun(trial, trials) for trial in trials if can_show_effect(trial)),
-        after=_closing_sentence(analysis, useful_trials, alternatives),
+        after=_format_closing_sentence(analysis, useful_trials, alternatives),
     )
 
 
 def make_plain_cause(finding: Finding) -> Cause:
-    """Describe a fault without re-runs."""
+    """Make a cause from the texts of a finding, without results of re-runs."""
     return Cause(
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",
         title=finding.title,
         why=finding.message.removeprefix(finding.title).lstrip(". "),
         spans_s=finding.spans_s,
-        actions=(Action(_target_of(finding), finding.remedy),) if finding.remedy else (),
+        actions=(Action(_find_action_target(finding), finding.remedy),) if finding.remedy else (),
     )
 
 
@@ -186,20 +185,20 @@ def _make_actions(
     sigma_verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
-    """Return (alternatives, actions): groups of which one is sufficient, and necessary actions."""
+    """Return (alternatives, actions): the user needs one group of alternatives and all actions."""
     finding = ranked_cause.finding
     trial_by_change = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
     sender_actions: list[Action] = []
     if finding.remedy:
         remedy = with_log_name(finding.remedy, request.log)
-        sender_actions.append(Action(_target_of(finding, analysis.source), remedy))
+        sender_actions.append(Action(_find_action_target(finding, analysis.source), remedy))
     delay_trial = trial_by_change.get(("ekf2", "delay"))
     offset_trial = trial_by_change.get(("ekf2", "time offset")) or trial_by_change.get(
         ("kf", "time offset")
     )
     delay_actions = []
     if delay_trial:
-        # parameters that both corrections need become a separate action
+        # A new delay and shifted timestamps may both need EKF2_DELAY_MAX: it is a separate action
         common_names = offset_trial.change.keys() if offset_trial else ()
         delay_change = {
             name: value for name, value in delay_trial.change.items() if name not in common_names
@@ -210,8 +209,8 @@ def _make_actions(
         shift_s = offset_trial.change[CLOCK_OFFSET]
         if offset_trial.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
-        add_or_subtract = lower_first(format_shift(shift_s))
-        sender_actions = [Action("sender", f"{add_or_subtract} the timestamp of each position")]
+        shift_instruction = lower_first(format_shift(shift_s))
+        sender_actions = [Action("sender", f"{shift_instruction} the timestamp of each position")]
     alternatives: tuple[tuple[Action, ...], ...] = ()
     actions = delay_actions or sender_actions
     if offset_trial and delay_trial:
@@ -229,7 +228,8 @@ def _make_actions(
             default_trial = trial_by_change.get(("kf", "defaults")) if kind == "noises" else None
             default_settings = default_trial.change if default_trial else {}
             change, alignment = trial.change, analysis.source.alignment
-            if CLOCK_OFFSET in change and alignment:  # the option replaces that of the alignment
+            # --clock-offset replaces the alignment's time offset, so it must include that offset
+            if CLOCK_OFFSET in change and alignment:
                 total_s = change[CLOCK_OFFSET] + alignment.clock_offset_s
                 change = {**change, CLOCK_OFFSET: round(total_s, 3)}
             actions.append(make_rerun_action(request, change, default_settings))
@@ -239,11 +239,11 @@ def _make_actions(
     # actions on KF are last: first correct the vehicle
     actions.sort(key=lambda action: action.target == "KF")
     targets = {action.target for group in (actions, *alternatives) for action in group}
-    reason_by_filter: dict[Target, str] = {
+    reason_by_filter: dict[ActionTarget, str] = {
         name: reason
         for filter_name, name in FILTER_NAMES.items()
         if name not in targets
-        and (reason := _no_change_reason(finding, filter_name, sigma_verdicts))
+        and (reason := _explain_no_change(finding, filter_name, sigma_verdicts))
     }
     if len(reason_by_filter) == 2 and len(set(reason_by_filter.values())) == 1:
         reason_by_filter = {"KF, EKF2": reason_by_filter["KF"]}
@@ -251,7 +251,7 @@ def _make_actions(
     return alternatives, tuple(actions)
 
 
-def _no_change_reason(
+def _explain_no_change(
     finding: Finding, filter_name: FilterName, sigma_verdicts: Sequence[Verdict]
 ) -> str:
     verdict_by_reference = {
@@ -273,14 +273,15 @@ def _no_change_reason(
             )
         if verdict_by_reference.get("truth", "consistent") == "consistent":
             return "no change: EKF2's gate rejects outliers, and the reported σ is consistent"
-    fault_text = "drift of the source" if finding.id == "source_drift" else "this fault"
-    return f"no setting removes {fault_text}"
+    fault_text = "drift of the position source" if finding.id == "source_drift" else "this fault"
+    return f"no filter setting corrects {fault_text}"
 
 
-def _target_of(finding: Finding, source: PositionTrack | None = None) -> Target:
-    target = TARGET_BY_ID.get(finding.id) or TARGET_BY_GROUP[CATALOGUE[finding.id].group]
-    is_receiver = target == "sender" and source is not None and source.origin.is_gnss
-    return "receiver" if is_receiver else target
+def _find_action_target(finding: Finding, source: PositionTrack | None = None) -> ActionTarget:
+    group = CATALOGUE[finding.id].group
+    target = ACTION_TARGET_BY_ID.get(finding.id) or ACTION_TARGET_BY_GROUP[group]
+    is_gnss_receiver = target == "sender" and source is not None and source.origin.is_gnss
+    return "receiver" if is_gnss_receiver else target
 
 
 def make_rerun_action(
@@ -288,7 +289,7 @@ def make_rerun_action(
 ) -> Action:
     """Return the command that runs KF with changed settings.
 
-    ``default_settings`` are default noises with which KF is also consistent, or empty.
+    If KF also improves with its default noises (``default_settings``), the action offers both.
     """
     command = command_line(structs.replace(request, **change))
     default_options_text = " and ".join(
@@ -307,7 +308,7 @@ def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Ac
     model = analysis.ekf2_model
     flown_settings = {} if isinstance(model, Unavailable) else model.inputs.settings
     change_texts, commands = [], []
-    change = different_settings(change, flown_settings)
+    change = select_changed_settings(change, flown_settings)
     for name, value in change.items():
         change_text = f"{name} {flown_settings.get(name, math.nan):g} → {value:g}"
         change_texts.append(f"{change_text} {PARAMETERS[name].printed_unit}".rstrip())
@@ -317,25 +318,29 @@ def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Ac
 
 
 def _make_rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
-    outcomes = trial.before, trial.after
-    rejected_fractions = [outcome.rejected_fraction for outcome in outcomes]
+    statistics_pair = trial.before, trial.after
+    rejected_fractions = [statistics.rejected_fraction for statistics in statistics_pair]
     before_and_after: dict[str, Any] = {
-        "position_rmse_m": [outcome.position_rmse_m for outcome in outcomes],
-        "source_ratio": [sigma_ratios(outcome).get("source") for outcome in outcomes],
-        "truth_ratio": [sigma_ratios(outcome).get("truth") for outcome in outcomes],
+        "position_rmse_m": [statistics.position_rmse_m for statistics in statistics_pair],
+        "source_ratio": [
+            compute_sigma_ratios(statistics).get("source") for statistics in statistics_pair
+        ],
+        "truth_ratio": [
+            compute_sigma_ratios(statistics).get("truth") for statistics in statistics_pair
+        ],
     }
     if max(fraction or 0.0 for fraction in rejected_fractions) >= MIN_SHOWN_REJECTED_FRACTION:
         before_and_after["rejected_fraction"] = rejected_fractions
     return Rerun(
-        label=_trial_label(trial, trials),
+        label=_format_trial_label(trial, trials),
         is_prediction=trial.filter == "ekf2",
         from_s=trial.from_s,
-        improves=improvement(trial),
+        improves=classify_improvement(trial),
         **{name: tuple(pair) for name, pair in before_and_after.items() if None not in pair},
     )
 
 
-def _trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
+def _format_trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
     kind, label = trial.kinds[0], "KF" if trial.filter == "kf" else "EKF2 (replay)"
     if OUTLIERS in trial.change:
         return f"{label} without {trial.change[OUTLIERS]:.0f} outliers"
@@ -352,24 +357,24 @@ def _trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
     return f"{label}, {'sender' if kind == 'time offset' else 'parameters'}"
 
 
-def _closing_sentence(
-    analysis: Analysis, useful_trials: Sequence[Trial], alternatives: Sequence[object]
+def _format_closing_sentence(
+    analysis: Analysis, useful_trials: Sequence[Trial], alternative_groups: Sequence[object]
 ) -> str:
-    if alternatives:
+    if alternative_groups:
         return (
-            "Take only one of the two alternatives, because both correct the same time offset. "
-            "The other actions are necessary with both. A delay parameter (ms) is positive for "
-            "late timestamps, and --clock-offset (s) is negative."
+            "The actions on timestamps and on the delay parameter correct the same time offset: "
+            "take only one of them, and all other actions. For late timestamps, a delay parameter "
+            "(ms) is positive, and --clock-offset (s) is negative."
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):
         return "KF is consistent with the default noises as well as with the estimated noises."
     tuning = analysis.tuning.get(HORIZONTAL)
     for trial in useful_trials:
         if trial.kinds == ("noise",) and isinstance(tuning, AxisTuning):
-            default_m = analysis.flight.log.default_of(next(iter(trial.change)))
-            if (tuning.sigma_z.low or 0.0) <= default_m <= (tuning.sigma_z.high or 0.0):
+            default_noise_m = analysis.flight.log.default_of(next(iter(trial.change)))
+            if (tuning.sigma_z.low or 0.0) <= default_noise_m <= (tuning.sigma_z.high or 0.0):
                 return (
-                    f"PX4's default of {default_m:g} m is inside the 95 % interval of the "
+                    f"PX4's default of {default_noise_m:g} m is inside the 95 % interval of the "
                     "estimate, so the default is as good as the estimate."
                 )
     ratios_after = [

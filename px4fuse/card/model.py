@@ -13,9 +13,11 @@ from px4fuse.filter.consistency import Reference
 
 CardSeverity = Literal["clean", "note", "warning", "error", "refused"]
 VerdictWord = Literal["consistent", "overconfident", "underconfident", "not evaluated"]
-Target = Literal["sender", "receiver", "source", "logging", "flight", "KF", "EKF2", "KF, EKF2"]
+ActionTarget = Literal[
+    "sender", "receiver", "source", "logging", "flight", "KF", "EKF2", "KF, EKF2"
+]
 
-# Limits of the logarithmic axis in plots of σ ratios
+# Limits of the logarithmic axis in plots of the σ ratio (actual / reported σ)
 RATIO_AXIS_ENDS = (0.1, 10.0)
 RATIO_AXIS_TICKS = {0.1: "1/10", 0.2: "1/5", 0.5: "1/2", 1.0: "1", 2.0: "2", 5.0: "5", 10.0: "10"}
 # Maximum number of causes on a diagnosis card
@@ -25,10 +27,10 @@ MAX_NOTES = 3
 MAX_HEADLINE_LENGTH = 84
 
 
-def axis_fraction(ratio: float) -> float:
+def map_ratio_to_axis(ratio: float) -> float:
     """Map a σ ratio from 0.1 to 10 to a position from 0 to 1 on a logarithmic axis.
 
-    >>> axis_fraction(0.1), axis_fraction(1.0), axis_fraction(10.0)
+    >>> map_ratio_to_axis(0.1), map_ratio_to_axis(1.0), map_ratio_to_axis(10.0)
     (0.0, 0.5, 1.0)
     """
     log_low, log_high = (math.log10(end) for end in RATIO_AXIS_ENDS)
@@ -46,8 +48,9 @@ class Verdict(Record, kw_only=True):
         √(mean NIS) or √(mean NEES); above 1 the reported σ is too small.
     interval : (float, float) or None
         95 % interval of the ratio.
-    reason : str
-        Reason if ``word`` is "not evaluated".
+    word : str
+        "consistent", "overconfident" (reported σ too small), "underconfident" (too large), or
+        "not evaluated" with a ``reason``.
     is_explained : bool
         True if the filter is inconsistent, but its settings need no change.
     """
@@ -106,7 +109,7 @@ class Action(Record):
         Program for the commands: shell of the computer, or MAVLink console of the vehicle.
     """
 
-    target: Target
+    target: ActionTarget
     sentence: str = ""
     commands: tuple[str, ...] = ()
     where: Literal["shell", "console", ""] = ""
@@ -120,12 +123,12 @@ class Rerun(Record, kw_only=True):
     label : str
         Filter and change, for example "KF without 26 outliers".
     is_prediction : bool
-        True for a replay of EKF2, False for a run of KF.
+        True for EKF2, because a replay only predicts the results of PX4; False for KF.
     from_s : float or None
         Start of the replay (s).
     position_rmse_m, source_ratio, truth_ratio, rejected_fraction : (float, float) or None
-        Before and after the change: position RMSE, σ ratio from innovations, σ ratio from errors,
-        and fraction of rejected positions.
+        Before and after the change: position RMSE, σ ratio (actual / reported σ) from innovations,
+        σ ratio from errors against ground truth, and fraction of rejected positions.
     """
 
     label: str
@@ -148,13 +151,13 @@ class Cause(Record, kw_only=True):
     spans_s : tuple of (float, float)
         Times of the fault (s); empty for the whole flight.
     alternatives : tuple of tuple of Action
-        Groups of actions; the user chooses one group.
+        Groups of actions, of which one group is necessary.
     actions : tuple of Action
-        Necessary actions.
+        Actions that are necessary in addition.
     reruns : tuple of Rerun
         Runs of KF and replays of EKF2 without the fault.
     after : str
-        Sentence about the re-runs.
+        Closing sentence, for example on an error that remains after the actions.
     """
 
     id: Annotated[str, Meta(pattern="^[a-z0-9_]+$")]
@@ -209,10 +212,10 @@ class Identity(Record, kw_only=True):
 
 
 class AidRow(Record, kw_only=True):
-    """Consistency of one component of an EKF2 aiding source: RMS of innovation ÷ √S.
+    """Consistency of one ``component`` (for example "north") of an EKF2 aiding source.
 
-    ``is_usual`` is True if a small ratio is not a fault, because PX4's default noise is larger than
-    the noise of usual sensors.
+    ``ratio`` is the RMS of innovation ÷ √S. ``is_usual`` is True if a small ratio is not a fault,
+    because PX4's default noise is larger than the noise of usual sensors.
     """
 
     label: str
@@ -238,7 +241,8 @@ class Card(Record, kw_only=True):
     more_causes : int
         Number of causes that are not in ``causes``, which contains at most :data:`MAX_CAUSES`.
     facts : mapping from label to str
-        Further texts, for example the label "fix" for a log that cannot be read.
+        Further rows of the card: "KF" (why KF was not run); for a log that cannot be analysed,
+        "read" (size and first bytes) and "fix" (action).
     """
 
     severity: CardSeverity

@@ -7,7 +7,7 @@ against ground truth.
 import numpy as np
 
 from px4fuse.card.model import Verdict
-from px4fuse.comparison.comparison import normalised_position_errors
+from px4fuse.comparison.comparison import compute_normalised_errors
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
 from px4fuse.core.arrays import Array
 from px4fuse.filter.consistency import Reference, classify_sigma_ratio, compute_sigma_ratio_interval
@@ -23,16 +23,16 @@ MIN_BOOTSTRAP_BLOCKS = 4
 def make_sigma_verdicts(result: AxisComparison) -> tuple[Verdict, ...]:
     """Evaluate the consistency of KF and EKF2 along one axis, from innovations and from errors."""
     return tuple(
-        judge(result, filter_name)
+        assess(result, filter_name)
         for filter_name in FILTER_NAMES
-        for judge in (_verdict_against_source, _verdict_against_truth)
+        for assess in (_assess_against_source, _assess_against_truth)
     )
 
 
-def _verdict_against_source(result: AxisComparison, filter_name: FilterName) -> Verdict:
+def _assess_against_source(result: AxisComparison, filter_name: FilterName) -> Verdict:
     summary = result.filters[filter_name]
     if not isinstance(summary, FilterSummary):
-        return _not_evaluated(filter_name, "source", summary)
+        return _make_unevaluated(filter_name, "source", summary)
     return Verdict(
         filter=filter_name,
         against="source",
@@ -43,13 +43,13 @@ def _verdict_against_source(result: AxisComparison, filter_name: FilterName) -> 
     )
 
 
-def _verdict_against_truth(result: AxisComparison, filter_name: FilterName) -> Verdict:
-    truth_errors = result.filters[filter_name].truth
-    if isinstance(truth_errors, Unavailable):
-        return _not_evaluated(filter_name, "truth", truth_errors)
-    errors = normalised_position_errors(result, filter_name)
+def _assess_against_truth(result: AxisComparison, filter_name: FilterName) -> Verdict:
+    errors_against_truth = result.filters[filter_name].truth
+    if isinstance(errors_against_truth, Unavailable):
+        return _make_unevaluated(filter_name, "truth", errors_against_truth)
+    errors = compute_normalised_errors(result, filter_name)
     if isinstance(errors, Unavailable):
-        return _not_evaluated(filter_name, "truth", errors)
+        return _make_unevaluated(filter_name, "truth", errors)
     time_s, normalised_errors = errors
     ratio = float(np.sqrt(np.mean(np.square(normalised_errors))))
     interval = block_bootstrap_rms(time_s, normalised_errors)
@@ -63,7 +63,7 @@ def _verdict_against_truth(result: AxisComparison, filter_name: FilterName) -> V
     )
 
 
-def _not_evaluated(
+def _make_unevaluated(
     filter_name: FilterName, reference: Reference, unavailable: Unavailable
 ) -> Verdict:
     return Verdict(
@@ -82,11 +82,11 @@ def block_bootstrap_rms(time_s: Array, values: Array) -> tuple[float, float] | N
     start_indices = np.arange(np.searchsorted(time_s, time_s[-1] - BOOTSTRAP_BLOCK_S, side="right"))
     end_indices = np.searchsorted(time_s, time_s[start_indices] + BOOTSTRAP_BLOCK_S)
     cumulative_squares = np.concatenate(([0.0], np.cumsum(np.square(values))))
-    block_squares = cumulative_squares[end_indices] - cumulative_squares[start_indices]
+    block_square_sums = cumulative_squares[end_indices] - cumulative_squares[start_indices]
     drawn_blocks = np.random.default_rng(0).integers(
         len(start_indices), size=(BOOTSTRAP_RESAMPLES, block_count)
     )
     sample_counts = (end_indices - start_indices)[drawn_blocks].sum(axis=1)
-    mean_squares = block_squares[drawn_blocks].sum(axis=1) / sample_counts
+    mean_squares = block_square_sums[drawn_blocks].sum(axis=1) / sample_counts
     rms_low, rms_high = np.percentile(np.sqrt(mean_squares), (2.5, 97.5))
     return float(rms_low), float(rms_high)

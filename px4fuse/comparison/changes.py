@@ -8,17 +8,21 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from px4fuse.comparison.estimates import Estimates, Tuning, first_axis_tuning
+from px4fuse.comparison.estimates import Estimates, Tuning, find_first_tuning
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterSummary
-from px4fuse.comparison.remedy import horizon_change, ml_delay_change, ml_noise_change
+from px4fuse.comparison.remedy import (
+    make_delay_max_change,
+    make_ml_delay_change,
+    make_ml_noise_change,
+)
 from px4fuse.comparison.trials import (
-    ACCOMPANYING_CHANGES,
     CLOCK_OFFSET,
-    DISCREPANCIES,
+    DISCREPANCY_STATISTICS,
     FORWARD_BIAS,
     OUTLIERS,
     RIGHT_BIAS,
     ROTATION,
+    SECONDARY_CHANGE_KEYS,
     Change,
     Statistic,
 )
@@ -33,7 +37,7 @@ from px4fuse.flight.model import LogInfo, Unavailable
 MIN_RERUN_SIGMA_Z_M = 0.005
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
 # Kind of change in :attr:`Trial.kinds`, for each KF setting and each correction of the data
-KF_KINDS = {
+KIND_BY_KF_CHANGE = {
     SIGMA_A: "noises",
     SIGMA_Z: "noises",
     OUTLIERS: "outliers",
@@ -42,14 +46,14 @@ KF_KINDS = {
     FORWARD_BIAS: "bias",
     RIGHT_BIAS: "bias",
 }
-# Changes of KF's settings; all other changes correct the data
-SETTING_CHANGES = frozenset((SIGMA_A, SIGMA_Z))
+# KF settings that re-runs change; all other changes in re-runs of KF correct the data
+CHANGED_KF_SETTINGS = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
 # EKF2 is re-run with a larger EKF2_ACC_NOISE if the estimated SIGMA_A exceeds it by this factor. A
 # smaller factor may be due to tilt errors and biases, which SIGMA_A includes
 MIN_VIBRATION_RATIO = 3.0
 # EKF2 parameters that a re-run sets to PX4's default
-RESTORED_PARAMETERS = (
+PARAMETERS_SET_TO_DEFAULT = (
     ACC_NOISE,
     "EKF2_GYR_NOISE",
     "EKF2_ACC_B_NOISE",
@@ -61,7 +65,7 @@ RESTORED_PARAMETERS = (
 MIN_MISALIGNMENT_SIGMAS = 3.0
 
 
-def candidate_changes(
+def find_candidate_changes(
     comparison: Comparison,
     estimates: Estimates,
     ekf2_inputs: Inputs | None,
@@ -72,25 +76,27 @@ def candidate_changes(
     summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
     assert isinstance(summary, FilterSummary)  # an UntestedFilter has no mean NIS or NEES
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
-    axis_tuning = tuning_of_axis(estimates.tuning, axis_result.axis.name)
+    axis_tuning = find_axis_tuning(estimates.tuning, axis_result.axis.name)
     changes = list[Change]()
     # Innovations do not show the slow errors of GNSS and odometry, so small innovations do not
     # justify a smaller noise
     origin = comparison.source.origin
-    hides_slow_errors = origin.may_drift or origin.is_gnss
-    if axis_tuning is not None and not (is_underconfident and hides_slow_errors):
+    may_have_slow_errors = origin.may_drift or origin.is_gnss
+    if axis_tuning is not None and not (is_underconfident and may_have_slow_errors):
         changes += (
-            _kf_noise_changes(comparison.settings, axis_tuning, is_underconfident)
+            _find_kf_noise_changes(comparison.settings, axis_tuning, is_underconfident)
             if ekf2_inputs is None
-            else _ekf2_noise_changes(ekf2_inputs, summary, axis_tuning)
+            else _find_ekf2_noise_changes(ekf2_inputs, summary, axis_tuning)
         )
     if axis_tuning is not None and not is_underconfident and len(axis_tuning.outlier_time_s):
         changes.append({OUTLIERS: float(len(axis_tuning.outlier_time_s))})
     delay_parameters = (
-        {} if ekf2_inputs is None else ml_delay_change(comparison, ekf2_inputs, estimates.clock)
+        {}
+        if ekf2_inputs is None
+        else make_ml_delay_change(comparison, ekf2_inputs, estimates.clock)
     )
     changes += (
-        [delay_parameters] if delay_parameters else _time_offset_changes(estimates, ekf2_inputs)
+        [delay_parameters] if delay_parameters else _find_offset_changes(estimates, ekf2_inputs)
     )
     if axis_result.axis.name == "down":
         return changes
@@ -98,63 +104,63 @@ def candidate_changes(
         is_significant = abs(heading.misalignment_deg) > MIN_MISALIGNMENT_SIGMAS * heading.sigma_deg
         changes += [{ROTATION: -round(heading.misalignment_deg, 1)}] if is_significant else []
     if ekf2_inputs is None:
-        return changes + _bias_changes(estimates)
-    changes += _px4_default_changes(comparison.flight.log, ekf2_inputs)
+        return changes + _find_bias_changes(estimates)
+    changes += _find_default_changes(comparison.flight.log, ekf2_inputs)
     if axis_tuning is not None and not is_underconfident:
-        changes += _vibration_noise_changes(comparison.settings, ekf2_inputs, axis_tuning)
+        changes += _find_vibration_changes(comparison.settings, ekf2_inputs, axis_tuning)
     return changes
 
 
-def main_axis_changes(
+def find_main_axis_changes(
     comparison: Comparison, estimates: Estimates, ekf2_inputs: Inputs | None
 ) -> list[Change]:
-    """Return the changes to test along the main axis: :func:`candidate_changes` and more.
+    """Return the changes that re-runs along the main axis test.
 
-    KF is also tested with both noises changed and with its default noises, EKF2 also with shifted
-    timestamps if its delay parameter is wrong.
+    In addition to :func:`find_candidate_changes`, KF is tested with both noises changed and with
+    its default noises, EKF2 with shifted timestamps if its delay parameter is wrong.
     """
-    changes = unique_changes(
+    changes = remove_repeated_changes(
         change
-        for statistic in DISCREPANCIES[::-1]
-        for change in candidate_changes(
+        for statistic in DISCREPANCY_STATISTICS[::-1]
+        for change in find_candidate_changes(
             comparison, estimates, ekf2_inputs, comparison.main, statistic
         )
     )
     if ekf2_inputs is not None:
-        has_delay = any(ekf2_inputs.aid.delay in change for change in changes)
-        offset_changes = _time_offset_changes(estimates, ekf2_inputs) if has_delay else []
-        return unique_changes([*changes, *offset_changes])
-    noise_changes = [change for change in changes if change.keys() <= SETTING_CHANGES]
+        has_delay_change = any(ekf2_inputs.aid.delay in change for change in changes)
+        offset_changes = _find_offset_changes(estimates, ekf2_inputs) if has_delay_change else []
+        return remove_repeated_changes([*changes, *offset_changes])
+    noise_changes = [change for change in changes if change.keys() <= CHANGED_KF_SETTINGS]
     if len(noise_changes) > 1:
         changes.append({name: value for change in noise_changes for name, value in change.items()})
-    defaults = default_settings(comparison)
+    defaults = find_default_settings(comparison)
     return [*changes, *([defaults] if defaults and noise_changes else [])]
 
 
-def unique_changes(changes: Iterable[Change]) -> list[Change]:
-    """Remove repeated changes; the order of the others is kept."""
+def remove_repeated_changes(changes: Iterable[Change]) -> list[Change]:
     return list({frozenset(change.items()): change for change in changes}.values())
 
 
-def change_kinds(
+def classify_change(
     comparison: Comparison, ekf2_inputs: Inputs | None, change: Change
 ) -> tuple[str, ...]:
     """Return the kinds of a change, for example ("noise",) or ("delay", "outliers")."""
-    if ekf2_inputs is None and change == default_settings(comparison):
+    if ekf2_inputs is None and change == find_default_settings(comparison):
         return ("defaults",)
-    kinds: dict[str, str] = {}
+    kind_by_parameter: dict[str, str] = {}
     if ekf2_inputs is not None:
         aid = ekf2_inputs.aid
-        kinds = {aid.noise: "noise", aid.gate: "gate", aid.delay: "delay"}
-    changed_names = [name for name in change if name not in ACCOMPANYING_CHANGES]
+        kind_by_parameter = {aid.noise: "noise", aid.gate: "gate", aid.delay: "delay"}
+    changed_names = [name for name in change if name not in SECONDARY_CHANGE_KEYS]
     return tuple(
         dict.fromkeys(
-            KF_KINDS.get(name) or kinds.get(name, "process noise") for name in changed_names
+            KIND_BY_KF_CHANGE.get(name) or kind_by_parameter.get(name, "process noise")
+            for name in changed_names
         )
     )
 
 
-def default_settings(comparison: Comparison) -> Change:
+def find_default_settings(comparison: Comparison) -> Change:
     """Return the default of each KF noise for which the user chose another value."""
     user_settings, px4fuse_default = comparison.settings, Settings()
     setting_names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
@@ -165,12 +171,12 @@ def default_settings(comparison: Comparison) -> Change:
     }
 
 
-def tuning_of_axis(tuning: Tuning, axis: str) -> AxisTuning | None:
+def find_axis_tuning(tuning: Tuning, axis: str) -> AxisTuning | None:
     """Return the noise estimate of an axis. North and east have a common estimate."""
-    return first_axis_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
+    return find_first_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
-def _time_offset_changes(estimates: Estimates, ekf2_inputs: Inputs | None) -> list[Change]:
+def _find_offset_changes(estimates: Estimates, ekf2_inputs: Inputs | None) -> list[Change]:
     """Return the estimated time offset, if a significant part of it is not corrected yet.
 
     For EKF2, EKF2_DELAY_MAX is increased if the shifted positions are too old to be fused.
@@ -184,15 +190,18 @@ def _time_offset_changes(estimates: Estimates, ekf2_inputs: Inputs | None) -> li
         return []
     change = {CLOCK_OFFSET: round(clock_offset.offset_s, 3)}
     if ekf2_inputs is not None:
-        age_ms = ekf2_inputs.settings[ekf2_inputs.aid.delay] - 1e3 * clock_offset.offset_s
-        change |= horizon_change(ekf2_inputs.settings, age_ms)
+        position_age_ms = ekf2_inputs.settings[ekf2_inputs.aid.delay] - 1e3 * clock_offset.offset_s
+        change |= make_delay_max_change(ekf2_inputs.settings, position_age_ms)
     return [change]
 
 
-def _kf_noise_changes(
+def _find_kf_noise_changes(
     settings: Settings, axis_tuning: AxisTuning, is_underconfident: bool
 ) -> list[Change]:
-    """Return the estimates of SIGMA_A and SIGMA_Z that differ significantly from KF's settings."""
+    """Return changes of SIGMA_A and SIGMA_Z to their estimates, if significantly different.
+
+    The noises of an underconfident KF are only reduced, otherwise they are only increased.
+    """
     changes = list[Change]()
     for name, noise in ((SIGMA_A, axis_tuning.sigma_a_two_state), (SIGMA_Z, axis_tuning.sigma_z)):
         current_sigma = getattr(settings, name)
@@ -209,7 +218,7 @@ def _kf_noise_changes(
     return changes
 
 
-def _bias_changes(estimates: Estimates) -> list[Change]:
+def _find_bias_changes(estimates: Estimates) -> list[Change]:
     systematic_errors = estimates.systematic_errors
     if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_significant_bias():
         return []
@@ -220,24 +229,24 @@ def _bias_changes(estimates: Estimates) -> list[Change]:
     return [{name: round(bias.value, 3) for name, bias in biases.items()}]
 
 
-def _ekf2_noise_changes(
+def _find_ekf2_noise_changes(
     ekf2_inputs: Inputs, summary: FilterSummary, axis_tuning: AxisTuning
 ) -> list[Change]:
     """Return the EKF2 parameters for the estimated position noise, if significantly different."""
     noise_m = axis_tuning.sigma_z.value
     if noise_m is None:  # the RMS innovation is an upper bound of the noise
         noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
-    change = ml_noise_change(ekf2_inputs, axis_tuning.sigma_z, noise_m)
+    change = make_ml_noise_change(ekf2_inputs, axis_tuning.sigma_z, noise_m)
     return [change] if change else []
 
 
-def _px4_default_changes(log: LogInfo, ekf2_inputs: Inputs) -> list[Change]:
-    """Return PX4's default of each EKF2 noise that has another value in the log.
+def _find_default_changes(log: LogInfo, ekf2_inputs: Inputs) -> list[Change]:
+    """Return changes to PX4's default, for each EKF2 noise with another value in the log.
 
-    PX4's default of the gate is included if the logged gate is smaller.
+    The gate is included if the logged gate is below PX4's default.
     """
     gate, logged_parameters = ekf2_inputs.aid.gate, ekf2_inputs.settings
-    defaults = {name: log.default_of(name) for name in (gate, *RESTORED_PARAMETERS)}
+    defaults = {name: log.default_of(name) for name in (gate, *PARAMETERS_SET_TO_DEFAULT)}
     return [
         {name: value}
         for name, value in defaults.items()
@@ -247,7 +256,7 @@ def _px4_default_changes(log: LogInfo, ekf2_inputs: Inputs) -> list[Change]:
     ]
 
 
-def _vibration_noise_changes(
+def _find_vibration_changes(
     settings: Settings, ekf2_inputs: Inputs, axis_tuning: AxisTuning
 ) -> list[Change]:
     """Return the EKF2_ACC_NOISE for the estimated SIGMA_A, if it is much larger than logged.
@@ -255,11 +264,13 @@ def _vibration_noise_changes(
     In each prediction, EKF2 adds (EKF2_ACC_NOISE · step)² to the velocity variance, and KF adds
     SIGMA_A² · DT².
     """
-    steps_per_dt = settings.dt_s / ekf2_inputs.mean_step_s
-    logged_noise, px4_maximum = ekf2_inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
+    ekf2_steps_per_dt = settings.dt_s / ekf2_inputs.mean_step_s
+    logged_acc_noise, px4_maximum = ekf2_inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
     if (
         axis_tuning.sigma_a_two_state.low or 0.0
-    ) * steps_per_dt**0.5 <= MIN_VIBRATION_RATIO * logged_noise:
+    ) * ekf2_steps_per_dt**0.5 <= MIN_VIBRATION_RATIO * logged_acc_noise:
         return []
-    ml_noise = min((axis_tuning.sigma_a_two_state.value or 0.0) * steps_per_dt**0.5, px4_maximum)
-    return [{ACC_NOISE: float(f"{ml_noise:.2g}")}] if ml_noise > logged_noise else []
+    ml_acc_noise = min(
+        (axis_tuning.sigma_a_two_state.value or 0.0) * ekf2_steps_per_dt**0.5, px4_maximum
+    )
+    return [{ACC_NOISE: float(f"{ml_acc_noise:.2g}")}] if ml_acc_noise > logged_acc_noise else []

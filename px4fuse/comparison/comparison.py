@@ -51,11 +51,11 @@ def compare(prepared: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comp
     """Compare the runs of KF with EKF2, and both with ground truth, along each axis."""
     notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
     if isinstance(ekf2, Ekf2):
-        state, note = projection.continuous_state(ekf2, prepared.source, prepared.segment)
+        state, note = projection.remove_origin_resets(ekf2, prepared.source, prepared.segment)
         notes += [note] if note else []
         notes += ekf2.notes
         if not state.equals(ekf2.state):
-            # The states at the fusion horizon are omitted: their origin still moves with the resets
+            # The states at the fusion horizon still contain the removed resets, so they are omitted
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
     axes = {name: _compare_axis(prepared, ekf2, kf_run) for name, kf_run in kf_runs.items()}
     innovations: dict[FilterName, dict[str, TableOrUnavailable]] = {
@@ -63,7 +63,7 @@ def compare(prepared: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comp
         "ekf2": {name: axis.ekf2_innovations for name, axis in axes.items()},
     }
     horizontal = {
-        name: nis for name, tables in innovations.items() if (nis := _horizontal_nis(tables))
+        name: nis for name, tables in innovations.items() if (nis := _assess_horizontal(tables))
     }
     prepared = replace(prepared, notes=tuple(notes))
     return Comparison(**vars(prepared), axes=axes, horizontal=horizontal)
@@ -81,16 +81,18 @@ def _compare_axis(
     else:
         innovations = projection.project_innovations(flight, ekf2, prepared.source, axis, segment)
         gate = ekf2.gate
-    ekf2_errors = error_statistics(ekf2_state, ekf2_variance, truth)
+    ekf2_errors = compute_error_statistics(ekf2_state, ekf2_variance, truth)
     if isinstance(ekf2_errors, ErrorsAgainstTruth) and isinstance(ekf2, Ekf2):
-        horizon_nees = _horizon_nees(projection.project_horizon(ekf2, axis, segment), truth)
+        horizon_nees = _compute_horizon_nees(
+            projection.project_horizon_position(ekf2, axis, segment), truth
+        )
         ekf2_errors = structs.replace(ekf2_errors, nees_position_horizon_mean=horizon_nees)
     updates = kf_run.updates.assign(
         prior_variance_m2=kf_run.updates["prior_position_variance_m2"],
         posterior_variance_m2=kf_run.steps["position_variance_m2"].reindex(kf_run.updates.index),
     )
     north_component, east_component, down_component = axis.direction.tolist()
-    rejected_flags = _known_values(innovations, "rejected")
+    rejected_flags = _find_known_values(innovations, "rejected")
     return AxisComparison(
         heading_deg=axis.heading_deg,
         direction=(north_component, east_component, down_component),
@@ -104,11 +106,14 @@ def _compare_axis(
         ),
         filters={
             "kf": _summarise_filter(
-                updates, kf_run.steps, kf_error_statistics(kf_run, truth, ekf2_state), DEFAULT_GATE
+                updates,
+                kf_run.steps,
+                compute_kf_error_statistics(kf_run, truth, ekf2_state),
+                DEFAULT_GATE,
             ),
             "ekf2": _summarise_filter(innovations, ekf2_variance, ekf2_errors, gate),
         },
-        difference=difference_statistics(kf_run, ekf2_state),
+        difference=compute_difference_statistics(kf_run, ekf2_state),
         rejected_fraction=float(rejected_flags.mean()) if len(rejected_flags) else None,
         axis=axis,
         replay=kf_run,
@@ -144,10 +149,10 @@ def _summarise_filter(
     sigmas: dict[str, Any] = {
         name: float(np.sqrt(values.median())) if len(values) else None
         for name, values in (
-            ("sigma_p_median_m", _known_values(variance, "position_variance_m2")),
-            ("sigma_v_median_m_s", _known_values(variance, "velocity_variance_m2_s2")),
-            ("sigma_p_before_update_m", _known_values(innovations, "prior_variance_m2")),
-            ("sigma_p_after_update_m", _known_values(innovations, "posterior_variance_m2")),
+            ("sigma_p_median_m", _find_known_values(variance, "position_variance_m2")),
+            ("sigma_v_median_m_s", _find_known_values(variance, "velocity_variance_m2_s2")),
+            ("sigma_p_before_update_m", _find_known_values(innovations, "prior_variance_m2")),
+            ("sigma_p_after_update_m", _find_known_values(innovations, "posterior_variance_m2")),
         )
     }
     if not isinstance(innovations, Unavailable):
@@ -162,11 +167,11 @@ def _summarise_filter(
     return UntestedFilter(**structs.asdict(innovations), **sigmas, truth=truth)
 
 
-def _known_values(table: TableOrUnavailable, column: str) -> pd.Series:
+def _find_known_values(table: TableOrUnavailable, column: str) -> pd.Series:
     return pd.Series(dtype=float) if isinstance(table, Unavailable) else table[column].dropna()
 
 
-def difference_statistics(
+def compute_difference_statistics(
     kf_run: Replay, ekf2_state: TableOrUnavailable
 ) -> Difference | Unavailable:
     """Compute the difference KF - EKF2 along one axis at EKF2's sample times."""
@@ -185,33 +190,35 @@ def difference_statistics(
         )
     return Difference(
         count=len(position_m),
-        position_rms_m=_rmse(position_m),
+        position_rms_m=_compute_rmse(position_m),
         position_mean_m=float(np.mean(position_m)),
         position_maximum_m=float(np.max(np.abs(position_m))),
-        velocity_rms_m_s=_rmse(velocity_m_s),
+        velocity_rms_m_s=_compute_rmse(velocity_m_s),
         velocity_mean_m_s=float(np.mean(velocity_m_s)),
         velocity_maximum_m_s=float(np.max(np.abs(velocity_m_s))),
     )
 
 
-def _rmse(error: Array) -> float:
+def _compute_rmse(error: Array) -> float:
     return float(np.sqrt(np.nanmean(error**2)))
 
 
-def kf_error_statistics(
+def compute_kf_error_statistics(
     kf_run: Replay, truth: TableOrUnavailable, ekf2_state: TableOrUnavailable
 ) -> ErrorsAgainstTruth | Unavailable:
     """Compute the errors of KF against ground truth, if possible at EKF2's sample times."""
-    return error_statistics(*_kf_track(kf_run, ekf2_state), truth)
+    return compute_error_statistics(*_compute_kf_track(kf_run, ekf2_state), truth)
 
 
-def _kf_track(kf_run: Replay, ekf2_state: TableOrUnavailable) -> tuple[pd.DataFrame, pd.DataFrame]:
+def _compute_kf_track(
+    kf_run: Replay, ekf2_state: TableOrUnavailable
+) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return state and variances of KF at EKF2's sample times; without EKF2, at KF's steps."""
-    timed_rows = kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state
-    return kf_state_and_variance(kf_run, timed_rows.index.to_numpy())
+    output_times_s = (kf_run.steps if isinstance(ekf2_state, Unavailable) else ekf2_state).index
+    return sample_kf_run(kf_run, output_times_s.to_numpy())
 
 
-def kf_state_and_variance(kf_run: Replay, times_s: Array) -> tuple[pd.DataFrame, pd.DataFrame]:
+def sample_kf_run(kf_run: Replay, times_s: Array) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return state and variances of KF at ``times_s`` (s)."""
     state, variance = (
         pd.DataFrame(
@@ -222,7 +229,7 @@ def kf_state_and_variance(kf_run: Replay, times_s: Array) -> tuple[pd.DataFrame,
     return state, variance
 
 
-def error_statistics(
+def compute_error_statistics(
     state: TableOrUnavailable, variance: TableOrUnavailable, truth: TableOrUnavailable
 ) -> ErrorsAgainstTruth | Unavailable:
     """Compute the errors of a filter against ground truth along one axis.
@@ -234,7 +241,7 @@ def error_statistics(
         return state
     if isinstance(truth, Unavailable):
         return truth
-    position_m, velocity_m_s = (_errors(state, truth, column) for column in STATE_COLUMNS)
+    position_m, velocity_m_s = (_compute_errors(state, truth, column) for column in STATE_COLUMNS)
     if np.isfinite(position_m).sum() < projection.MIN_COMMON_SAMPLES:
         return Unavailable(
             "error against ground truth",
@@ -242,40 +249,42 @@ def error_statistics(
             "Choose a time span with ground truth.",
         )
     nees_position, nees_velocity = (
-        _mean_nees(error / reported_sigma(state.index.to_numpy(), variance, column))
+        _compute_mean_nees(error / interpolate_sigma(state.index.to_numpy(), variance, column))
         for error, column in zip((position_m, velocity_m_s), VARIANCE_COLUMNS, strict=True)
     )
     return ErrorsAgainstTruth(
         count=int(np.isfinite(position_m).sum()),
-        position_rmse_m=_rmse(position_m),
-        velocity_rmse_m_s=_rmse(velocity_m_s) if np.isfinite(velocity_m_s).any() else None,
+        position_rmse_m=_compute_rmse(position_m),
+        velocity_rmse_m_s=_compute_rmse(velocity_m_s) if np.isfinite(velocity_m_s).any() else None,
         nees_position_mean=nees_position,
         nees_velocity_mean=nees_velocity,
     )
 
 
-def _horizon_nees(horizon_state: pd.DataFrame | None, truth: TableOrUnavailable) -> float | None:
+def _compute_horizon_nees(
+    horizon_state: pd.DataFrame | None, truth: TableOrUnavailable
+) -> float | None:
     if horizon_state is None or isinstance(truth, Unavailable):
         return None
-    errors_m = _errors(horizon_state, truth, "position_m")
-    return _mean_nees(errors_m / np.sqrt(horizon_state["position_variance_m2"].to_numpy()))
+    errors_m = _compute_errors(horizon_state, truth, "position_m")
+    return _compute_mean_nees(errors_m / np.sqrt(horizon_state["position_variance_m2"].to_numpy()))
 
 
-def _errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
+def _compute_errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Array:
     true_values = np.interp(state.index, truth.index, truth[column], np.nan, np.nan)
     return np.asarray(state[column].to_numpy() - true_values)
 
 
-def reported_sigma(time_s: Array, variance: TableOrUnavailable, column: str) -> Array:
+def interpolate_sigma(time_s: Array, variance: TableOrUnavailable, column: str) -> Array:
     """Interpolate the reported σ to the times ``time_s``; NaN if it is unknown."""
-    known_variance = _known_values(variance, column)
+    known_variance = _find_known_values(variance, column)
     if known_variance.empty:
         return np.full(len(time_s), np.nan)
     variance_at_times = np.interp(time_s, known_variance.index, known_variance, np.nan, np.nan)
     return np.asarray(np.sqrt(np.where(variance_at_times > 0.0, variance_at_times, np.nan)))
 
 
-def _mean_nees(normalised_errors: Array) -> float | None:
+def _compute_mean_nees(normalised_errors: Array) -> float | None:
     return (
         float(np.nanmean(np.square(normalised_errors)))
         if np.isfinite(normalised_errors).any()
@@ -283,7 +292,9 @@ def _mean_nees(normalised_errors: Array) -> float | None:
     )
 
 
-def position_errors(axis_result: AxisComparison, filter_name: FilterName) -> TableOrUnavailable:
+def compute_position_errors(
+    axis_result: AxisComparison, filter_name: FilterName
+) -> TableOrUnavailable:
     """Return position errors against ground truth and reported σ (m) of one filter along an axis.
 
     The columns are ``error_m`` and ``sigma_m``, NaN if unknown. The index is the time (s) of EKF2's
@@ -294,22 +305,22 @@ def position_errors(axis_result: AxisComparison, filter_name: FilterName) -> Tab
     state: pd.DataFrame
     variance: TableOrUnavailable
     if filter_name == "kf":
-        state, variance = _kf_track(axis_result.replay, axis_result.ekf2_state)
+        state, variance = _compute_kf_track(axis_result.replay, axis_result.ekf2_state)
     elif isinstance(axis_result.ekf2_state, Unavailable):
         return axis_result.ekf2_state
     else:
         state, variance = axis_result.ekf2_state, axis_result.ekf2_variance
     time_s = state.index.to_numpy()
-    errors_m = _errors(state, axis_result.truth, STATE_COLUMNS[0])
-    sigma_m = reported_sigma(time_s, variance, VARIANCE_COLUMNS[0])
+    errors_m = _compute_errors(state, axis_result.truth, STATE_COLUMNS[0])
+    sigma_m = interpolate_sigma(time_s, variance, VARIANCE_COLUMNS[0])
     return pd.DataFrame({"error_m": errors_m, "sigma_m": sigma_m}, index=time_s)
 
 
-def normalised_position_errors(
+def compute_normalised_errors(
     axis_result: AxisComparison, filter_name: FilterName
 ) -> tuple[Array, Array] | Unavailable:
     """Return times (s), and ratios of position error against ground truth to reported σ."""
-    errors = position_errors(axis_result, filter_name)
+    errors = compute_position_errors(axis_result, filter_name)
     if isinstance(errors, Unavailable):
         return errors
     if filter_name == "ekf2" and isinstance(axis_result.ekf2_variance, Unavailable):
@@ -324,7 +335,7 @@ def normalised_position_errors(
     return normalised_errors.index.to_numpy(), normalised_errors.to_numpy()
 
 
-def _horizontal_nis(axis_innovations: Mapping[str, TableOrUnavailable]) -> HorizontalNis | None:
+def _assess_horizontal(axis_innovations: Mapping[str, TableOrUnavailable]) -> HorizontalNis | None:
     columns = ["innovation_m", "innovation_variance_m2"]
     tables = [
         table[columns]

@@ -13,9 +13,9 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.comparison.estimates import Tuning, first_axis_tuning
+from px4fuse.comparison.estimates import Tuning, find_first_tuning
 from px4fuse.comparison.model import AxisComparison, Comparison
-from px4fuse.comparison.remedy import noise_used_m
+from px4fuse.comparison.remedy import find_used_noise_m
 from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.inputs import Inputs
@@ -34,17 +34,18 @@ from px4fuse.request import COMPARISON_OPTIONS
 EQUAL_RMSE_TOLERANCE = 0.05
 # The second largest contribution is reported if it explains at least this fraction of the mean
 # square difference KF - EKF2
-MIN_NOTABLE_FRACTION = 0.05
-# If a noise setting of KF differs from its estimate by at least this factor, the difference KF -
-# EKF2 is explained for KF with the estimate
-MIN_SETTING_RATIO = 4.0
-# The report omits properties of EKF2 that change KF's position by less than this distance (m)
+MIN_CONTRIBUTION_FRACTION = 0.05
+# A noise setting of KF that differs from its estimate by at least this factor dominates the
+# difference KF - EKF2. The explanation then uses KF with the estimate
+MIN_SETTING_ERROR_RATIO = 4.0
+# A step replaces one property of KF by that of EKF2. The report omits steps that change KF's
+# position by less than this distance (m)
 MIN_STEP_EFFECT_M = 1e-6
 # Position differences KF - EKF2 outside the replayed times are reported above this value (m)
 MIN_DIFFERENCE_OUTSIDE_REPLAY_M = 0.5
 # Position differences KF - EKF2 outside the replayed times are reported if they exceed the
 # differences inside by this factor
-MIN_DIFFERENCE_RATIO_OUTSIDE_REPLAY = 3.0
+MIN_OUTSIDE_TO_INSIDE_RATIO = 3.0
 
 
 def explain_ekf2_difference(
@@ -55,8 +56,8 @@ def explain_ekf2_difference(
 ) -> dict[str, DifferenceExplanation | Unavailable]:
     """Explain the difference KF - EKF2 along each horizontal axis of a comparison.
 
-    ``estimated_noises`` contains the noise estimates from :func:`corrected_settings`. If only the
-    down axis is analysed, return the reason why its difference is not explained.
+    ``estimated_noises`` contains the noise estimates from :func:`estimate_wrong_settings`. If only
+    the down axis is analysed, return the reason why its difference is not explained.
     """
     axis_results = {
         name: axis_result for name, axis_result in comparison.axes.items() if name != "down"
@@ -76,7 +77,7 @@ def explain_ekf2_difference(
     explanations = steps.explain_by_steps(model, kf_settings, kf_runs)
     if isinstance(explanations, Unavailable):
         return dict.fromkeys(axis_results, explanations)
-    reasons = _step_reasons(replace(comparison, settings=changed_settings), model, clock_offset)
+    reasons = _explain_steps(replace(comparison, settings=changed_settings), model, clock_offset)
     explanation_by_axis: dict[str, DifferenceExplanation | Unavailable] = {}
     for name, by_steps in explanations.items():
         explanation = structs.replace(
@@ -85,23 +86,24 @@ def explain_ekf2_difference(
             steps=tuple(
                 step for step in by_steps.steps if step.position_moved_m > MIN_STEP_EFFECT_M
             ),
-            outside=_unreplayed_part(axis_results[name], kf_runs[name], by_steps.spans_s),
+            outside=_compare_unreplayed_times(axis_results[name], kf_runs[name], by_steps.spans_s),
         )
-        explanation_by_axis[name] = add_sentences(
+        explanation_by_axis[name] = add_cause_sentences(
             explanation, axis_results[name].axis.label, reasons
         )
     return explanation_by_axis
 
 
-def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, float]:
+def estimate_wrong_settings(comparison: Comparison, tuning: Tuning) -> dict[str, float]:
     """Return noise estimates for those KF settings that are wrong by a large factor.
 
-    With a very wrong setting, each property of EKF2 alone would remove most of the difference.
+    With a very wrong setting, each property of EKF2 alone would remove most of the difference
+    KF - EKF2, so the contributions of the properties could not be separated.
     """
-    axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
+    axis_tuning = find_first_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     if axis_tuning is None or comparison.source.origin.is_gnss:
         return {}
-    corrected = {}
+    estimate_by_setting = {}
     for name, noise in (
         ("sigma_a_m_s2", axis_tuning.sigma_a_two_state),
         ("sigma_z_m", axis_tuning.sigma_z),
@@ -109,12 +111,12 @@ def corrected_settings(comparison: Comparison, tuning: Tuning) -> dict[str, floa
         current_value = getattr(comparison.settings, name)
         if noise.value is None or current_value == getattr(Settings(), name):
             continue
-        if max(current_value / noise.value, noise.value / current_value) >= MIN_SETTING_RATIO:
-            corrected[name] = float(f"{noise.value:.3g}")
-    return corrected
+        if max(current_value / noise.value, noise.value / current_value) >= MIN_SETTING_ERROR_RATIO:
+            estimate_by_setting[name] = float(f"{noise.value:.3g}")
+    return estimate_by_setting
 
 
-def explanation_configurations(
+def list_step_configurations(
     comparison: Comparison, ekf2_inputs: Inputs, estimated_noises: Mapping[str, Any]
 ) -> list[FilterConfiguration]:
     """Return the EKF2 configurations that :func:`explain_ekf2_difference` replays."""
@@ -133,25 +135,25 @@ def _comparable_settings(
     return settings if is_same_source else replace(settings, clock_offset_s=0.0)
 
 
-def _unreplayed_part(
+def _compare_unreplayed_times(
     axis_result: AxisComparison, kf_run: Replay, spans_s: Spans
 ) -> UnreplayedDifference | None:
     if not isinstance(axis_result.ekf2_state, pd.DataFrame):
         return None
     unreplayed_state = axis_result.ekf2_state[~inside_spans(axis_result.ekf2_state.index, spans_s)]
-    unreplayed_s = unreplayed_state.index.to_numpy()
-    distance_m = np.abs(
-        state_at(kf_run, unreplayed_s)[0] - unreplayed_state["position_m"].to_numpy()
+    unreplayed_times_s = unreplayed_state.index.to_numpy()
+    difference_m = np.abs(
+        state_at(kf_run, unreplayed_times_s)[0] - unreplayed_state["position_m"].to_numpy()
     )
-    if not np.isfinite(distance_m).any():
+    if not np.isfinite(difference_m).any():
         return None
-    largest_index = int(np.nanargmax(distance_m))
+    largest_index = int(np.nanargmax(difference_m))
     return UnreplayedDifference(
-        float(distance_m[largest_index]), float(unreplayed_s[largest_index])
+        float(difference_m[largest_index]), float(unreplayed_times_s[largest_index])
     )
 
 
-def add_sentences(
+def add_cause_sentences(
     explanation: DifferenceExplanation, axis_label: str, step_reasons: dict[str, str]
 ) -> DifferenceExplanation:
     """Add sentences on the causes of the difference KF - EKF2, largest first.
@@ -161,14 +163,15 @@ def add_sentences(
     explanation : DifferenceExplanation
     axis_label : str
         Name of the axis, for example "the main axis".
-    step_reasons : dict
-        Text on the difference between KF and EKF2 in each property, such as the measurement noise.
+    step_reasons : mapping from step name to str
+        Difference between KF and EKF2 in the property that the step replaces, such as the
+        measurement noise.
     """
     step_reasons = {
         **step_reasons,
-        steps.GATE_STEP: f"{step_reasons[steps.GATE_STEP]}{_rejection_text(explanation)}",
+        steps.GATE_STEP: f"{step_reasons[steps.GATE_STEP]}{_describe_rejections(explanation)}",
     }
-    largest_step, second_step, *_ = sorted(
+    largest_step, second_largest_step, *_ = sorted(
         explanation.steps, key=lambda step: -step.position_mean_square_m2
     )
     cause_text = (
@@ -184,19 +187,20 @@ def add_sentences(
             f"KF is first run again with the estimated noise ({settings_text}). The following "
             "sentences explain the remaining difference KF - EKF2."
         )
-    sentences.append(f"{cause_text} {_effect_text(largest_step, explanation)}")
+    sentences.append(f"{cause_text} {_describe_step_effect(largest_step, explanation)}")
     if (
-        second_step.position_mean_square_m2
-        >= MIN_NOTABLE_FRACTION * explanation.position_mean_square_m2
+        second_largest_step.position_mean_square_m2
+        >= MIN_CONTRIBUTION_FRACTION * explanation.position_mean_square_m2
     ):
         sentences.append(
-            f"Second largest contribution: {second_step.name}. {step_reasons[second_step.name]}. "
-            f"{_effect_text(second_step, explanation)}"
+            f"Second largest contribution: {second_largest_step.name}. "
+            f"{step_reasons[second_largest_step.name]}. "
+            f"{_describe_step_effect(second_largest_step, explanation)}"
         )
-    sentences += [_unexplained_sentence(explanation), *_truth_sentences(explanation)]
+    sentences += [_describe_unexplained(explanation), *_describe_rmse(explanation)]
     min_reported_m = max(
         MIN_DIFFERENCE_OUTSIDE_REPLAY_M,
-        MIN_DIFFERENCE_RATIO_OUTSIDE_REPLAY * float(np.max(np.abs(explanation.kf_minus_ekf2_m))),
+        MIN_OUTSIDE_TO_INSIDE_RATIO * float(np.max(np.abs(explanation.kf_minus_ekf2_m))),
     )
     if explanation.outside is not None and explanation.outside.maximum_m > min_reported_m:
         sentences.append(
@@ -207,11 +211,13 @@ def add_sentences(
     return structs.replace(explanation, sentences=tuple(sentences), cause=cause_text)
 
 
-def _effect_text(step: Step, explanation: DifferenceExplanation) -> str:
+def _describe_step_effect(step: Step, explanation: DifferenceExplanation) -> str:
     explained_fraction = step.position_mean_square_m2 / explanation.position_mean_square_m2
     # The fractions of all properties add up to 1. If one is above 1, others are negative
     increase_text = (
-        " Other properties of EKF2 increase the difference." if explained_fraction > 1.0 else ""
+        " With other properties of EKF2, the difference KF - EKF2 increases."
+        if explained_fraction > 1.0
+        else ""
     )
     return (
         f"With EKF2's {step.name}, KF's position changes by up to {step.position_moved_m:.2f} m "
@@ -220,7 +226,7 @@ def _effect_text(step: Step, explanation: DifferenceExplanation) -> str:
     )
 
 
-def _rejection_text(explanation: DifferenceExplanation) -> str:
+def _describe_rejections(explanation: DifferenceExplanation) -> str:
     rejection_run = explanation.longest_rejection
     if rejection_run is None:
         return ""
@@ -231,43 +237,45 @@ def _rejection_text(explanation: DifferenceExplanation) -> str:
     )
 
 
-def _step_reasons(
+def _explain_steps(
     comparison: Comparison, model: Model, clock_offset: ClockOffset | Unavailable
 ) -> dict[str, str]:
     kf_settings, ekf2_inputs, source = comparison.settings, model.inputs, comparison.source
     ekf2_parameters, aid = ekf2_inputs.settings, ekf2_inputs.aid
-    samples_text = (
+    prediction_text = (
         f"KF predicts every {kf_settings.dt_s:g} s, starting at its first position; EKF2 predicts "
         f"every {1e3 * ekf2_inputs.mean_step_s:.0f} ms"
     )
     if kf_settings.input == "zero":
-        samples_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
+        prediction_text = "KF uses no acceleration (--input zero); EKF2 uses the IMU"
     elif source.name != ekf2_inputs.received.source:
-        samples_text = f"KF uses {source.name}; EKF2 uses {ekf2_inputs.received.source}"
-    age_ms = 1e3 * (source.assumed_delay_s - kf_settings.clock_offset_s)
+        prediction_text = (
+            f"KF uses positions of {source.name}; EKF2 uses {ekf2_inputs.received.source}"
+        )
+    position_age_ms = 1e3 * (source.assumed_delay_s - kf_settings.clock_offset_s)
     delay_text = (
         f"EKF2 assumes that positions are {ekf2_parameters[aid.delay]:g} ms old ({aid.delay}), KF "
-        f"assumes {age_ms:.0f} ms"
+        f"assumes {position_age_ms:.0f} ms"
     )
     if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
         estimate_and_limits_s = (clock_offset.offset_s, *clock_offset.interval_s[::-1])
         estimated_delay_ms, low_ms, high_ms = (
             1e3 * (source.assumed_delay_s - offset_s) for offset_s in estimate_and_limits_s
         )
-        delay_text += (
-            f". The maximum-likelihood estimate of this delay is {estimated_delay_ms:.0f} ms (95 % "
-            f"{low_ms:.0f} to {high_ms:.0f} ms)"
+        delay_text = (
+            f"{delay_text}. The maximum-likelihood estimate of the age is {estimated_delay_ms:.0f} "
+            f"ms (95 % {low_ms:.0f} to {high_ms:.0f} ms)"
         )
     equivalent_sigma_a = ekf2_parameters["EKF2_ACC_NOISE"] * np.sqrt(
         ekf2_inputs.mean_step_s / kf_settings.dt_s
     )
     trusted_input = "IMU" if equivalent_sigma_a < kf_settings.sigma_a_m_s2 else "positions"
     return {
-        steps.SAMPLES_STEP: samples_text,
+        steps.SAMPLES_STEP: prediction_text,
         steps.TIMESTAMPS_STEP: delay_text,
         steps.NOISE_STEP: (
-            f"EKF2 uses a measurement noise of {noise_used_m(model.inputs):.2g} m ({aid.noise}), "
-            f"KF {kf_settings.sigma_z_m:.2g} m"
+            f"EKF2 uses a measurement noise of {find_used_noise_m(model.inputs):.2g} m "
+            f" ({aid.noise}),KF {kf_settings.sigma_z_m:.2g} m"
         ),
         steps.BIASES_STEP: "EKF2 estimates the accelerometer bias; KF does not",
         steps.PROCESS_NOISE_STEP: (
@@ -296,27 +304,27 @@ def _step_reasons(
     }
 
 
-def _unexplained_sentence(explanation: DifferenceExplanation) -> str:
-    position_m2, velocity_m2_s2 = (
+def _describe_unexplained(explanation: DifferenceExplanation) -> str:
+    position_mean_square_m2, velocity_mean_square_m2_s2 = (
         explanation.position_mean_square_m2,
         explanation.velocity_mean_square_m2_s2,
     )
-    position_percent, velocity_percent = (
+    unexplained_position_text, unexplained_velocity_text = (
         f"{100 * min(fraction, 1.0):.1f} %"
         for fraction in (
             explanation.unexplained_fraction,
-            explanation.unexplained_velocity_mean_square_m2_s2 / velocity_m2_s2,
+            explanation.unexplained_velocity_mean_square_m2_s2 / velocity_mean_square_m2_s2,
         )
     )
     return (
-        f"RMS difference KF - EKF2 over the replayed times: {np.sqrt(position_m2):.3f} m and "
-        f"{np.sqrt(velocity_m2_s2):.3f} m/s. The replay does not explain {position_percent} of the "
-        f"mean square position difference and {velocity_percent} of the "
-        "mean square velocity difference."
+        f"RMS difference KF - EKF2 over the replayed times: {np.sqrt(position_mean_square_m2):.3f} "
+        f"m and {np.sqrt(velocity_mean_square_m2_s2):.3f} m/s. The replay does not explain "
+        f"{unexplained_position_text} of the mean square position difference and "
+        f"{unexplained_velocity_text} of the mean square velocity difference."
     )
 
 
-def _truth_sentences(explanation: DifferenceExplanation) -> list[str]:
+def _describe_rmse(explanation: DifferenceExplanation) -> list[str]:
     kf_rmse_m, ekf2_rmse_m = (explanation.position_rmse_to_truth_m[name] for name in ("kf", "ekf2"))
     if isinstance(kf_rmse_m, Unavailable) or isinstance(ekf2_rmse_m, Unavailable):
         return []
@@ -338,8 +346,8 @@ def _truth_sentences(explanation: DifferenceExplanation) -> list[str]:
         if ekf2_rmse_m < kf_rmse_m
         else np.argmax(mean_square_changes)
     )
-    before_m, after_m = rmse_by_step[step_index : step_index + 2]
+    rmse_before_m, rmse_after_m = rmse_by_step[step_index : step_index + 2]
     return [
         f"Position RMSE: EKF2 {ekf2_rmse_m:.3f} m, KF {kf_rmse_m:.3f} m. KF's RMSE changes most "
-        f"with EKF2's {step_names[step_index]} ({before_m:.3f} → {after_m:.3f} m)."
+        f"with EKF2's {step_names[step_index]} ({rmse_before_m:.3f} → {rmse_after_m:.3f} m)."
     ]

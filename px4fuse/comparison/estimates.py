@@ -39,17 +39,17 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate, tune
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable, reset_times_s
 
 # Minimum IMU rate (Hz) for an estimate of the time offset
-MIN_CLOCK_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
+MIN_TIME_OFFSET_IMU_HZ = 1.0 / MAX_IMU_INTERVAL_S
 # Minimum IMU rate (Hz) of telemetry: PX4 publishes vehicle_imu at 200 Hz (IMU_INTEG_RATE), and
 # slower telemetry skips samples
 MIN_TELEMETRY_IMU_HZ = 200.0
 # Minimum ratio of the measured IMU rate to the required rate: measured rates are up to 2 % lower
 MIN_IMU_RATE_RATIO = 0.98
-TELEMETRY_IMU = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
+TELEMETRY_IMU_MESSAGES = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
 # A change of the time offset in flight is tested with at least this number of estimates before and
 # after it
-MIN_PARTS_PER_SIDE = 2
+MIN_ESTIMATES_BEFORE_AFTER = 2
 
 # Axes with a noise estimate in the report; north and east have a common estimate
 REPORTED_AXES = (HORIZONTAL, "down")
@@ -90,9 +90,9 @@ def ignore_progress(_: str) -> None:
     """Ignore the progress text."""
 
 
-def first_axis_tuning(tuning: Tuning, *names: str) -> AxisTuning | None:
-    """Return the noise estimate of the first axis in ``names`` that has an estimate."""
-    axis_tunings = map(tuning.get, names)
+def find_first_tuning(tuning: Tuning, *axis_names: str) -> AxisTuning | None:
+    """Return the noise estimate of the first axis in ``axis_names`` that has an estimate."""
+    axis_tunings = map(tuning.get, axis_names)
     return next(
         (axis_tuning for axis_tuning in axis_tunings if isinstance(axis_tuning, AxisTuning)), None
     )
@@ -128,7 +128,7 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
 
 def estimate_noises(
     comparison: PreparedComparison,
-    names: tuple[str, ...] | None = None,
+    axis_names: tuple[str, ...] | None = None,
     progress: Progress = ignore_progress,
     motion_cache: MotionCache | None = None,
 ) -> dict[str, AxisTuning | Unavailable]:
@@ -137,22 +137,22 @@ def estimate_noises(
     Parameters
     ----------
     comparison : Comparison
-    names : tuple of str, optional
+    axis_names : tuple of str, optional
         Axis names, or "horizontal" for north and east together; default: all.
     progress : callable
         Called with the name of each estimate before it is computed.
     motion_cache : dict, optional
         IMU motion that several estimates share.
     """
-    flight, slow_imu = comparison.flight, missing_imu_rate(comparison.flight)
+    flight, low_imu_rate = comparison.flight, explain_low_imu_rate(comparison.flight)
     if flight.log.is_assessed:
         return {HORIZONTAL: DIAGNOSIS_WITHHELD}
     return tune(
         comparison.input_axes,
         comparison.settings,
-        names,
+        axis_names,
         lambda name: progress(f"tuning {name}"),
-        flight if slow_imu is None else replace(flight, imu=slow_imu),
+        flight if low_imu_rate is None else replace(flight, imu=low_imu_rate),
         comparison.source.origin.may_drift,
         motion_cache,
     )
@@ -161,19 +161,19 @@ def estimate_noises(
 def estimate_noises_and_clock(
     comparison: PreparedComparison,
     progress: Progress = ignore_progress,
-    names: tuple[str, ...] | None = (HORIZONTAL,),
+    axis_names: tuple[str, ...] | None = (HORIZONTAL,),
 ) -> tuple[Tuning, ClockOffset | Unavailable]:
     """Estimate measurement noise, process noise, and the time offset between positions and IMU.
 
     Parameters are those of :func:`estimate_noises`.
     """
     motion_cache: MotionCache = {}
-    tuning = estimate_noises(comparison, names, progress, motion_cache)
+    tuning = estimate_noises(comparison, axis_names, progress, motion_cache)
     if comparison.flight.log.is_assessed:
         return tuning, DIAGNOSIS_WITHHELD
-    if slow_imu := missing_imu_rate(comparison.flight):
-        return tuning, slow_imu
-    settings, axis_tuning = comparison.settings, first_axis_tuning(tuning, HORIZONTAL, *tuning)
+    if low_imu_rate := explain_low_imu_rate(comparison.flight):
+        return tuning, low_imu_rate
+    settings, axis_tuning = comparison.settings, find_first_tuning(tuning, HORIZONTAL, *tuning)
     clock_offset = estimate_time_offset(
         comparison.flight,
         comparison.source,
@@ -198,7 +198,7 @@ def estimate_frame_rotation(
     clock_offset: ClockOffset | Unavailable,
 ) -> HeadingError | Unavailable:
     """Estimate the yaw misalignment of the position frame."""
-    axis_tuning, sigma_z_m = first_axis_tuning(tuning, HORIZONTAL), comparison.settings.sigma_z_m
+    axis_tuning, sigma_z_m = find_first_tuning(tuning, HORIZONTAL), comparison.settings.sigma_z_m
     if axis_tuning is not None:
         sigma_z_m = value_or_bound(axis_tuning.sigma_z, sigma_z_m)
     offset_s = 0.0
@@ -222,10 +222,10 @@ def _fit_source_errors(
     TimeCorrelatedNoise | Unavailable,
 ]:
     """Fit biases, scale factor and jumps, then the time correlation of the remaining errors."""
-    horizontal = _horizontal_axes(comparison, tuning)
-    if isinstance(horizontal, Unavailable):
-        return horizontal, horizontal, horizontal
-    flight, settings, (axes, axis_tuning) = comparison.flight, comparison.settings, horizontal
+    axes_and_tuning = _select_horizontal_axes(comparison, tuning)
+    if isinstance(axes_and_tuning, Unavailable):
+        return axes_and_tuning, axes_and_tuning, axes_and_tuning
+    flight, settings, (axes, axis_tuning) = comparison.flight, comparison.settings, axes_and_tuning
     offset_s = 0.0
     if (
         isinstance(clock_offset, ClockOffset)
@@ -245,16 +245,16 @@ def _fit_source_errors(
     )
     jumps = systematic_errors.jumps if isinstance(systematic_errors, SystematicErrors) else ()
     # The exact time of a jump is unknown, so the measurements directly after it are excluded
-    time_s, excluded_s = axes[0].measurement_time_s, axis_tuning.outlier_time_s
+    time_s, excluded_times_s = axes[0].measurement_time_s, axis_tuning.outlier_time_s
     for jump in jumps:
         is_after_jump = (time_s >= jump.time_s) & (time_s < jump.time_s + OUTLIER_RETEST_DURATION_S)
-        excluded_s = np.union1d(excluded_s, time_s[is_after_jump])
+        excluded_times_s = np.union1d(excluded_times_s, time_s[is_after_jump])
     correlated_fit = fit_time_correlation(
         flight,
         axes,
         settings,
         axis_tuning.noises,
-        outlier_time_s=excluded_s,
+        outlier_time_s=excluded_times_s,
         clock_offset_s=offset_s,
         jumps=jumps,
     )
@@ -265,12 +265,12 @@ def _fit_source_errors(
     known_truths = [truth for truth in truths if not isinstance(truth, Unavailable)]
     if len(known_truths) == len(axes):
         correlated_noise = fit_time_correlation_to_truth(
-            axes, known_truths, excluded_s, offset_s, jumps, correlated_noise, low_pass
+            axes, known_truths, excluded_times_s, offset_s, jumps, correlated_noise, low_pass
         )
     return systematic_errors, low_pass, correlated_noise
 
 
-def _horizontal_axes(
+def _select_horizontal_axes(
     comparison: Comparison, tuning: Tuning
 ) -> tuple[tuple[Axis, ...], AxisTuning] | Unavailable:
     """Return the horizontal axes that have a noise estimate, with the estimate."""
@@ -285,7 +285,7 @@ def _horizontal_axes(
     )
 
 
-def missing_imu_rate(flight: Flight) -> Unavailable | None:
+def explain_low_imu_rate(flight: Flight) -> Unavailable | None:
     """Return a reason if the IMU rate is too low to estimate a time offset, otherwise None.
 
     Telemetry needs a higher rate than a ULog: it sends only the newest of several samples, and
@@ -294,8 +294,8 @@ def missing_imu_rate(flight: Flight) -> Unavailable | None:
     if isinstance(flight.imu, Unavailable) or len(flight.imu) < 2:
         return None
     stream = flight.streams.get("imu")
-    is_telemetry = stream is not None and stream.topics[0] in TELEMETRY_IMU
-    required_hz = MIN_TELEMETRY_IMU_HZ if is_telemetry else MIN_CLOCK_IMU_HZ
+    is_telemetry = stream is not None and stream.topics[0] in TELEMETRY_IMU_MESSAGES
+    required_hz = MIN_TELEMETRY_IMU_HZ if is_telemetry else MIN_TIME_OFFSET_IMU_HZ
     rate_hz = 1.0 / float(np.median(np.diff(flight.imu.index.to_numpy())))
     if rate_hz >= MIN_IMU_RATE_RATIO * required_hz:
         return None
@@ -321,7 +321,7 @@ def widen_for_drift(clock_offset: ClockOffset) -> ClockOffset:
     """
     offsets_s = np.array([part.offset_s for part in clock_offset.parts])
     weights = np.array([part.sigma_s**-2.0 for part in clock_offset.parts])
-    if len(offsets_s) <= MIN_PARTS_PER_SIDE:
+    if len(offsets_s) <= MIN_ESTIMATES_BEFORE_AFTER:
         return structs.replace(
             clock_offset, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None
         )
@@ -336,7 +336,7 @@ def widen_for_drift(clock_offset: ClockOffset) -> ClockOffset:
     if not drift_reason and (high_s - low_s) / 2.0 > MAX_OFFSET_HALF_INTERVAL_S:
         drift_reason = (
             "the time offset differs between parts of the flight, probably because the source "
-            f"drifts (95 % {low_s:+.2f} s to {high_s:+.2f} s)"
+            f"drifts (95 % interval of the offset: {low_s:+.2f} s to {high_s:+.2f} s)"
         )
     return structs.replace(
         clock_offset,
@@ -361,7 +361,7 @@ def _largest_step_p_value(offsets_s: Array, weights: Array) -> float | None:
     correction. Changes below ``MIN_TIME_OFFSET_CHANGE_S`` are ignored.
     """
     part_count = len(offsets_s)
-    split_rows = range(MIN_PARTS_PER_SIDE, part_count - MIN_PARTS_PER_SIDE + 1)
+    split_rows = range(MIN_ESTIMATES_BEFORE_AFTER, part_count - MIN_ESTIMATES_BEFORE_AFTER + 1)
     smallest_p = 1.0
     for split_row in split_rows:
         before_and_after = [

@@ -14,7 +14,7 @@ from px4fuse.flight.model import Ekf2, Flight, Unavailable
 # Minimum length (s) of a gap in the position source: jitter causes longer intervals, too
 MIN_GAP_S = 1.0
 # Minimum length of a gap in the position source, in sample intervals
-MIN_GAP_INTERVALS = 5.0
+MIN_GAP_IN_INTERVALS = 5.0
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Events:
         Spans without positions.
     dropouts : tuple of (float, float)
         Spans in which the logger wrote no data.
-    ground : tuple of (float, float)
+    ground_spans_s : tuple of (float, float)
         Spans on the ground, from the land detector.
     resets_s : tuple of float
         Resets of EKF2's position or velocity.
@@ -37,49 +37,49 @@ class Events:
 
     gaps: tuple[Span, ...]
     dropouts: tuple[Span, ...]
-    ground: tuple[Span, ...]
+    ground_spans_s: tuple[Span, ...]
     take_off_s: tuple[float, ...]
     landing_s: tuple[float, ...]
     resets_s: tuple[float, ...]
     rejected_s: Mapping[str, Array]
 
 
-def max_interval_s(interval_s: float) -> float:
+def compute_max_interval_s(interval_s: float) -> float:
     """Return the longest interval (s) between two positions that is not a gap."""
-    return max(MIN_GAP_S, MIN_GAP_INTERVALS * interval_s)
+    return max(MIN_GAP_S, MIN_GAP_IN_INTERVALS * interval_s)
 
 
-def source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
+def find_source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
     """Return start and end (s) of each gap in the positions; ``rate_hz`` is their normal rate."""
-    is_gap = np.diff(time_s) > max_interval_s(1.0 / rate_hz)
+    is_gap = np.diff(time_s) > compute_max_interval_s(1.0 / rate_hz)
     return tuple(intervals_where(time_s, is_gap))
 
 
-def airborne_spans(flight: Flight) -> tuple[Span, ...]:
+def find_airborne_spans(flight: Flight) -> tuple[Span, ...]:
     """Return take-off and landing (s) of each flight; empty without a land detector."""
     return () if isinstance(flight.airborne, Unavailable) else flight.airborne
 
 
 def collect_events(comparison: Comparison) -> Events:
-    """Collect the events of a flight."""
+    """Collect gaps, rejections, resets, take-offs and landings in the flight of the segment."""
     flight, segment = comparison.flight, comparison.segment.flight
     start_s, end_s = segment.start_s, segment.end_s
     time_s = np.concatenate([[start_s], comparison.input_axes[0].measurement_time_s, [end_s]])
 
-    airborne = airborne_spans(flight)
-    flight_edges_s = [start_s, *(edge_s for span in airborne for edge_s in span), end_s]
+    airborne_spans_s = find_airborne_spans(flight)
+    flight_edges_s = [start_s, *(edge_s for span in airborne_spans_s for edge_s in span), end_s]
     resets = flight.ekf2.resets if isinstance(flight.ekf2, Ekf2) else ()
     return Events(
-        gaps=source_gaps(time_s, comparison.source.compute_rate_hz()),
+        gaps=find_source_gaps(time_s, comparison.source.compute_rate_hz()),
         dropouts=segment.cut(
             (dropout.start_s, dropout.start_s + dropout.duration_s)
             for dropout in flight.log.dropouts
         ),
-        ground=()
+        ground_spans_s=()
         if isinstance(flight.airborne, Unavailable)
         else segment.cut(zip(flight_edges_s[::2], flight_edges_s[1::2], strict=True)),
-        take_off_s=tuple(start for start, _ in airborne if start_s <= start <= end_s),
-        landing_s=tuple(end for _, end in airborne if start_s <= end <= end_s),
+        take_off_s=tuple(start for start, _ in airborne_spans_s if start_s <= start <= end_s),
+        landing_s=tuple(end for _, end in airborne_spans_s if start_s <= end <= end_s),
         resets_s=tuple(
             sorted({reset.time_s for reset in resets if start_s <= reset.time_s <= end_s})
         ),

@@ -214,6 +214,5 @@ class Comparison(PreparedComparison):
         return self.axes.get(AISLE) or next(iter(self.axes.values()))
 
 
-def north_and_east(comparison: Comparison) -> list[AxisComparison]:
-    """Return the results along north and east, if available."""
+def select_north_and_east(comparison: Comparison) -> list[AxisComparison]:
     return [comparison.axes[name] for name in ("north", "east") if name in comparison.axes]

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from px4fuse.comparison.model import Comparison, north_and_east
+from px4fuse.comparison.model import Comparison, select_north_and_east
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.filter.likelihood import innovations, preintegrate
 from px4fuse.filter.tuning import AxisTuning, tune
@@ -14,7 +14,7 @@ from px4fuse.flight.model import Unavailable
 # Noises are estimated separately along north and east if their mean NIS differ by this factor
 MIN_AXIS_NIS_RATIO = 1.7
 # Maximum number of flight parts of equal length whose innovations are compared
-MAX_PART_COUNT = 12
+MAX_FLIGHT_PART_COUNT = 12
 # Minimum number of measurements in each compared flight part
 MIN_PART_MEASUREMENTS = 25
 
@@ -30,10 +30,10 @@ class NoisyPart(NamedTuple):
 
 def tune_by_axis(comparison: Comparison) -> tuple[AxisTuning, ...]:
     """Estimate separate noises along north and along east, if their mean NIS differs."""
-    axes = north_and_east(comparison)
+    axes = select_north_and_east(comparison)
     summaries = [axis.filters["kf"] for axis in axes]
-    mean_nis = [summary.nis_mean for summary in summaries if not isinstance(summary, Unavailable)]
-    if len(mean_nis) < 2 or max(mean_nis) < MIN_AXIS_NIS_RATIO * min(mean_nis):
+    nis_means = [summary.nis_mean for summary in summaries if not isinstance(summary, Unavailable)]
+    if len(nis_means) < 2 or max(nis_means) < MIN_AXIS_NIS_RATIO * min(nis_means):
         return ()
     return tuple(
         axis_tuning
@@ -53,48 +53,51 @@ def find_noisy_part(
     settings = comparison.settings
     if axis_tuning is None:
         return None
-    # Many noisy measurements prevent an estimate of the noises. KF's settings are then used
+    # KF's settings replace missing estimates: many noisy measurements may prevent the estimation
     sigma_a: float | None = settings.sigma_a_m_s2
     sigma_z: float | None = settings.sigma_z_m
     outlier_time_s = np.zeros(0)
     if isinstance(axis_tuning, AxisTuning):
         sigma_a, sigma_z = axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value
         outlier_time_s = axis_tuning.outlier_time_s
-    axes = [axis_result.axis for axis_result in north_and_east(comparison)]
+    axes = [axis_result.axis for axis_result in select_north_and_east(comparison)]
     if sigma_a is None or sigma_z is None or len(axes) < 2:
         return None
     kf_inputs = [preintegrate(axis, settings) for axis in axes]
     time_s = axes[0].measurement_time_s[-len(kf_inputs[0].measurement_m) :]
-    if len(time_s) < MAX_PART_COUNT * MIN_PART_MEASUREMENTS // 2:
+    if len(time_s) < MAX_FLIGHT_PART_COUNT * MIN_PART_MEASUREMENTS // 2:
         return None
-    part_count = min(MAX_PART_COUNT, len(time_s) // MIN_PART_MEASUREMENTS)
+    part_count = min(MAX_FLIGHT_PART_COUNT, len(time_s) // MIN_PART_MEASUREMENTS)
     part_edges = np.linspace(0, len(time_s), part_count + 1).astype(int)
 
-    def relative_innovations(is_excluded: BoolArray | None) -> Array:
+    def compute_relative_magnitudes(is_excluded: BoolArray | None) -> Array:
         # Innovations are divided by their median, because wrong noise settings scale all of them
         axis_innovations = [
             innovations(kf_input, sigma_a, sigma_z, is_excluded) for kf_input in kf_inputs
         ]
-        normalised_sizes = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
-        return np.asarray(normalised_sizes / np.median(normalised_sizes, axis=1, keepdims=True))
+        magnitudes = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
+        return np.asarray(magnitudes / np.median(magnitudes, axis=1, keepdims=True))
 
-    relative_sizes = relative_innovations(None)
-    part_sigma = np.array(
+    relative_magnitudes = compute_relative_magnitudes(None)
+    magnitude_by_part = np.array(
         [
-            np.median(relative_sizes[:, first_row:end_row])
+            np.median(relative_magnitudes[:, first_row:end_row])
             for first_row, end_row in pairwise(part_edges)
         ]
     )
-    is_noisy = part_sigma > np.sqrt(part_sigma.min() * part_sigma.max())
-    first_part = int(np.argmax(is_noisy))
-    end_part = first_part + int(np.argmin(np.append(is_noisy[first_part:], False)))
-    if is_noisy.sum() != end_part - first_part or is_noisy.all() or not is_noisy.any():
+    is_noisy = magnitude_by_part > np.sqrt(magnitude_by_part.min() * magnitude_by_part.max())
+    first_noisy = int(np.argmax(is_noisy))
+    end_noisy = first_noisy + int(np.argmin(np.append(is_noisy[first_noisy:], False)))
+    if is_noisy.sum() != end_noisy - first_noisy or is_noisy.all() or not is_noisy.any():
         return None  # not exactly one noisy time span
     is_quiet = np.ones(len(time_s), bool)
-    is_quiet[part_edges[first_part] : part_edges[end_part]] = False
+    is_quiet[part_edges[first_noisy] : part_edges[end_noisy]] = False
     sigma_ratios = (
-        float(np.median(relative[:, ~is_quiet]) / np.median(relative[:, is_quiet]))
-        for relative in (relative_sizes, relative_innovations(np.isin(time_s, outlier_time_s)))
+        float(np.median(magnitudes[:, ~is_quiet]) / np.median(magnitudes[:, is_quiet]))
+        for magnitudes in (
+            relative_magnitudes,
+            compute_relative_magnitudes(np.isin(time_s, outlier_time_s)),
+        )
     )
-    start_s, end_s = time_s[[part_edges[first_part], part_edges[end_part] - 1]].tolist()
+    start_s, end_s = time_s[[part_edges[first_noisy], part_edges[end_noisy] - 1]].tolist()
     return NoisyPart(start_s, end_s, *sigma_ratios)

@@ -7,7 +7,7 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.comparison.model import PreparedComparison
-from px4fuse.comparison.projection import observation_variance
+from px4fuse.comparison.projection import find_observation_variance
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import convention_faults, correct_convention
 from px4fuse.core.text import capitalise_first
@@ -40,7 +40,7 @@ from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME, SOURCE_TRACKS
 from px4fuse.request import ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
-# Origin of each position source, by PX4 topic or MAVLink message
+# Kind and route into the log of each position source, by PX4 topic or MAVLink message
 LOGGED_ORIGINS = ORIGIN_BY_TRACK_NAME | {
     source.track_name: source.origin for source in POSITION_INPUTS
 }
@@ -80,9 +80,10 @@ def prepare(
         )
     source_track = shift_clock(source_track, settings.clock_offset_s)
     is_in_ned = source_track.origin.is_gnss or source_track.origin.path == ALIGNED.path
-    has_no_check = as_sent or is_in_ned or flight.log.is_assessed
-    convention = None if has_no_check else check_convention(flight, source_track)
-    if convention is not None and settings.clock_offset_s:  # the user chose the time offset
+    skips_convention_check = as_sent or is_in_ned or flight.log.is_assessed
+    convention = None if skips_convention_check else check_convention(flight, source_track)
+    # A time offset from the user replaces the detected one
+    if convention is not None and settings.clock_offset_s:
         convention = structs.replace(convention, late_s=0.0)
     late_s = convention_faults(convention, flight, source_track.frame).late_s
     # A time offset outside the valid range is set to the limit of the range
@@ -90,11 +91,11 @@ def prepare(
     clock_offset_s = float(np.clip(settings.clock_offset_s - late_s, *limits_s))
     settings = replace(settings, clock_offset_s=clock_offset_s)
     flight, source_track = correct_convention(flight, source_track, convention)
-    source_track = _move_to_vehicle(source_track, flight)
-    source_track = _use_origin_of_gnss(source_track, flight)
+    source_track = _subtract_lever_arm(source_track, flight)
+    source_track = _shift_vision_to_ekf2_origin(source_track, flight)
     source_track = _use_barometer_height(source_track, flight, request.height)
     flight = select_innovations(flight, source_track)
-    missing = flight.missing
+    missing_data = flight.missing
     segment = choose_segment(flight, source_track, request.start_s, request.end_s)
     has_height = not source_track.origin.fused_as_gnss and "z" not in constant_coordinates(
         source_track
@@ -109,7 +110,8 @@ def prepare(
     if source_track.origin.fused_as_gnss and request.sigma_z_m is None:
         default_m = PARAMETERS[GNSS_POS.noise].default
         sigma_z_m = (
-            observation_variance(flight, source_track, compared_axes[0], segment, default_m) ** 0.5
+            find_observation_variance(flight, source_track, compared_axes[0], segment, default_m)
+            ** 0.5
         )
         if sigma_z_m >= SETTING_RANGES["sigma_z_m"].low:
             settings = replace(settings, sigma_z_m=float(f"{sigma_z_m:.3g}"))
@@ -117,13 +119,14 @@ def prepare(
     if settings.input == "imu" and isinstance(acceleration, Unavailable):
         if request.input == "imu":
             raise SettingsError(
-                f"{flight.log.name}: `input` imu needs acceleration: {acceleration}"
+                f"{flight.log.name}: `input` imu needs acceleration, which is missing: "
+                f"{acceleration}"
             )
         settings = replace(settings, input="zero")
         notes += (
             f"KF assumes constant velocity, because acceleration is missing: {acceleration.reason}",
         )
-        missing += () if acceleration in missing else (acceleration,)
+        missing_data += () if acceleration in missing_data else (acceleration,)
     return PreparedComparison(
         flight,
         source_track,
@@ -132,27 +135,29 @@ def prepare(
         settings,
         compared_axes,
         notes,
-        missing,
+        missing_data,
         convention,
     )
 
 
 def select_innovations(flight: Flight, track: PositionTrack) -> Flight:
-    """Use EKF2's GNSS innovations if the position source is GNSS, otherwise those of vision."""
+    """Return the flight with EKF2's GNSS innovations for a GNSS source, else those of vision."""
     if isinstance(flight.ekf2, Unavailable) or not track.origin.fused_as_gnss:
         return flight
     # KF and EKF2 use GNSS in this flight, so missing external vision is not reported
-    missing_vision, streams = _missing_innovations(flight.ekf2), dict(flight.streams)
+    missing_vision_innovations, streams = _missing_innovations(flight.ekf2), dict(flight.streams)
     ekf2 = with_gnss_innovations(
         flight.ekf2, GNSS if track.barometer is None else GNSS_AND_BAROMETER
     )
-    missing_innovations = tuple(
-        item for item in flight.missing if not item.source and item not in missing_vision
+    other_missing_data = tuple(
+        item
+        for item in flight.missing
+        if not item.source and item not in missing_vision_innovations
     )
     if "ekf2_state" in streams and ekf2.aids:
         streams["ekf2_innovations"] = replace(streams["ekf2_state"], topics=ekf2.innovation_topics)
     return replace(
-        flight, ekf2=ekf2, streams=streams, missing=missing_innovations + _missing_innovations(ekf2)
+        flight, ekf2=ekf2, streams=streams, missing=other_missing_data + _missing_innovations(ekf2)
     )
 
 
@@ -175,8 +180,8 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
         for track in flight.positions:
             if track.origin.is_automatic:
                 return track, _reason_for_choice(flight, track)
-        no_track = explain_missing_source(flight)
-        raise MissingDataError(f"{flight.log.name}: {no_track.reason}", no_track.remedy)
+        missing_source = explain_missing_source(flight)
+        raise MissingDataError(f"{flight.log.name}: {missing_source.reason}", missing_source.remedy)
     for track in flight.positions:
         if track.name == name:
             return track, "chosen with --position-source"
@@ -189,26 +194,26 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     )
 
 
-def _move_to_vehicle(track: PositionTrack, flight: Flight) -> PositionTrack:
+def _subtract_lever_arm(track: PositionTrack, flight: Flight) -> PositionTrack:
     """Subtract EKF2's lever arm of the sensor, so that positions are those of the vehicle."""
     attitude = flight.attitude
     if not any(track.lever_arm_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
         return track
     attitude_samples = attitude.index.to_numpy(), attitude[Columns.QUATERNION].to_numpy()
-    lever_arm_ned = to_matrix(
+    lever_arm_ned_m = to_matrix(
         interpolate(track.samples.index.to_numpy(), *attitude_samples)
     ) @ np.asarray(track.lever_arm_m)
     samples = track.samples.copy()
-    samples[Columns.POSITION] -= lever_arm_ned
-    forward, right, down = track.lever_arm_m
+    samples[Columns.POSITION] -= lever_arm_ned_m
+    forward_m, right_m, down_m = track.lever_arm_m
     lever_arm_note = (
         "positions converted from the sensor to the vehicle's origin by the lever arm "
-        f"{forward:g} m forward, {right:g} m right, {down:g} m down (from EKF2 parameters)"
+        f"{forward_m:g} m forward, {right_m:g} m right, {down_m:g} m down (from EKF2 parameters)"
     )
     return replace(track, samples=samples, notes=(*track.notes, lever_arm_note))
 
 
-def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
+def _shift_vision_to_ekf2_origin(track: PositionTrack, flight: Flight) -> PositionTrack:
     """Shift vision positions to EKF2's origin if EKF2 also fused GNSS.
 
     EKF2 then estimates the constant offset of vision, so it is not an error for KF either.
@@ -228,10 +233,10 @@ def _use_origin_of_gnss(track: PositionTrack, flight: Flight) -> PositionTrack:
     if track.frame != "NED" or not np.isfinite(offset_m).all():
         return track
     samples[Columns.POSITION] -= offset_m
-    north, east, down = offset_m
+    north_m, east_m, down_m = offset_m
     origin_note = (
-        f"the median offset of {track.name} from EKF2 ({north:.1f} m north, {east:.1f} m east, "
-        f"{down:.1f} m down) is removed: EKF2 estimates this offset while it fuses GNSS"
+        f"the median offset of {track.name} from EKF2 ({north_m:.1f} m north, {east_m:.1f} m east, "
+        f"{down_m:.1f} m down) is removed: EKF2 estimates this offset while it fuses GNSS"
     )
     return replace(track, samples=samples, notes=(*track.notes, origin_note))
 
@@ -261,15 +266,15 @@ def _use_barometer_height(
             )
         return track
     zero_height_down_m = barometer_heights["down_m"].iloc[0]
-    zero_text = "the first barometer height"
+    height_origin_text = "the first barometer height"
     if isinstance(ekf2, Ekf2):
         ekf2_down_m = np.interp(
             barometer_heights.index, ekf2.state.index, ekf2.state["down_m"], np.nan, np.nan
         )
         if np.isfinite(ekf2_down_m).any():
             zero_height_down_m = float(np.nanmedian(barometer_heights["down_m"] - ekf2_down_m))
-        zero_text = "that of EKF2 (median difference removed)"
-    height_note = f"heights are from the barometer; height 0 is {zero_text}"
+        height_origin_text = "EKF2's height 0 (median difference removed)"
+    height_note = f"heights are from the barometer; height 0 is {height_origin_text}"
     return replace(
         track,
         barometer=barometer_heights - zero_height_down_m,
@@ -280,7 +285,6 @@ def _use_barometer_height(
 
 def explain_missing_source(flight: Flight) -> Unavailable:
     """Return the reason why the log has no position source, and the action for the user."""
-    damage_text = "the file is damaged, and " if flight.log.damage else ""
     topics = f"{', '.join(SOURCE_TRACKS)} or EKF2 innovations of external vision"
     remedy = (
         "set SDLOG_PROFILE to 129 and send the UWB position to PX4 as VISION_POSITION_ESTIMATE, or "
@@ -288,9 +292,9 @@ def explain_missing_source(flight: Flight) -> Unavailable:
     )
     if flight.log.format.startswith("MAVLink"):
         topics = " or ".join(dict.fromkeys(source.message for source in POSITION_INPUTS))
-        ulog_text = ", or read the ULog of this flight" if flight.log.has_ulog else ""
+        remedy = "give the position file of the positioning system as argument `position`"
         remedy = (
-            f"give the position file of the positioning system as argument `position`{ulog_text}."
+            f"{remedy}, or read the ULog of this flight." if flight.log.has_ulog else f"{remedy}."
         )
     if flight.positions:
         track_name = flight.positions[0].name
@@ -298,12 +302,14 @@ def explain_missing_source(flight: Flight) -> Unavailable:
             f"use {track_name}, which EKF2 did not fuse (--position-source {track_name}), "
             f"or {remedy}"
         )
-    reason = f"{damage_text}no external position in this log (no {topics})"
-    height_only_source = next(
+    reason = f"no external position in this log (no {topics})"
+    height_only_reason = next(
         (item for item in flight.missing if item.reason == HEIGHT_ONLY_REASON), None
     )
-    if height_only_source is not None:
-        reason = f"{damage_text}{height_only_source.source}: {HEIGHT_ONLY_REASON}"
+    if height_only_reason is not None:
+        reason = f"{height_only_reason.source}: {HEIGHT_ONLY_REASON}"
+    if flight.log.damage:
+        reason = f"the file is damaged, and {reason}"
     gnss_without_fix = next((item for item in flight.missing if item.remedy == NO_FIX_ACTION), None)
     if gnss_without_fix is not None:
         reason += f"; {gnss_without_fix.source}: {gnss_without_fix.reason}"
@@ -319,16 +325,17 @@ def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
     if track.origin.fused_as_gnss:
         return "the only position source in the log, fused by EKF2"
     origin_text = f" (from {track.log})" if track.log and track.log != flight.log.name else ""
-    better_sources = [
+    unusable_sources = [
         missing.source
         for missing in flight.missing
         if missing.source in LOGGED_ORIGINS
         and LOGGED_ORIGINS[missing.source].find_preference_rank()
         < track.origin.find_preference_rank()
     ]
-    if not better_sources:
+    if not unusable_sources:
         return f"chosen automatically: positions as received by PX4{origin_text}"
-    return f"chosen automatically{origin_text}; not usable: {', '.join(better_sources)}"
+    unusable_text = ", ".join(unusable_sources)
+    return f"chosen automatically{origin_text}; preferred sources are not usable: {unusable_text}"
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
@@ -371,13 +378,14 @@ def choose_segment(
         )
         reason = "positions available and vehicle airborne"
         if len(flight_spans_s) > 1:
-            others_text = ", ".join(
+            other_flights_text = ", ".join(
                 f"{start_s:.1f} to {end_s:.1f} s (--start {start_s:.1f} --end {end_s:.1f})"
                 for start_s, end_s in flight_spans_s
                 if start_s != chosen_start_s
             )
             reason += (
-                f"; this is the longest of {len(flight_spans_s)} flights; the others: {others_text}"
+                f"; this is the longest of {len(flight_spans_s)} flights; the others: "
+                f"{other_flights_text}"
             )
         if not max(chosen_start_s, available_start_s) < min(chosen_end_s, available_end_s):
             chosen_start_s = min(chosen_start_s, available_start_s)

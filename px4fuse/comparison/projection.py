@@ -35,10 +35,10 @@ PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
 }
 # Resets are removed if this reduces EKF2's median squared distance from the positions to less than
 # this fraction
-MAX_DISTANCE_RATIO = 0.95
+MAX_SQUARED_DISTANCE_RATIO = 0.95
 
 
-def continuous_state(
+def remove_origin_resets(
     ekf2: Ekf2, track: PositionTrack, segment: Segment
 ) -> tuple[pd.DataFrame, str]:
     """Remove the resets of EKF2's position that only move the origin of its frame.
@@ -75,19 +75,19 @@ def continuous_state(
         group = kept_resets
         if quantity == "position":  # a velocity does not depend on the origin
             samples = cut_to_segment(track.samples, segment)[columns].dropna()
-            distance_to_samples = partial(_median_square_distance, samples)
+            compute_distance_m2 = partial(_compute_median_distance_m2, samples)
             candidates = _states_without_resets(ekf2.state[columns], resets, axes)
-            best_state = min(candidates, key=distance_to_samples)
-            if distance_to_samples(best_state) < MAX_DISTANCE_RATIO * distance_to_samples(
+            best_state = min(candidates, key=compute_distance_m2)
+            if compute_distance_m2(best_state) < MAX_SQUARED_DISTANCE_RATIO * compute_distance_m2(
                 ekf2.state
             ):
                 state[columns], group = best_state, removed_resets
         group.append(f"{len(resets)} of {label}")
     reset_statements = (
-        f"EKF2 resets {treatment}: {', '.join(reset_texts)}"
+        f"{treatment}: {', '.join(reset_texts)}"
         for treatment, reset_texts in (
-            ("removed, because they move the origin of EKF2's frame", removed_resets),
-            ("not removed, because they correct an error of EKF2", kept_resets),
+            ("EKF2 resets removed, because they move the origin of EKF2's frame", removed_resets),
+            ("EKF2 resets not removed, because they correct an error of EKF2", kept_resets),
         )
         if reset_texts
     )
@@ -97,7 +97,7 @@ def continuous_state(
 def _states_without_resets(
     published: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
-    """Yield EKF2's position without resets, once for each origin before and after a reset."""
+    """Yield EKF2's position without resets, with the origin of each interval between resets."""
     reset_m = np.array([reset.delta for reset in resets])[:, axes]
     is_after = np.array([published.index >= reset.time_s for reset in resets]).T
     for earlier_count in range(len(resets) + 1):
@@ -109,11 +109,13 @@ def _states_without_resets(
         yield published + shift_m
 
 
-def _median_square_distance(samples: pd.DataFrame, state: pd.DataFrame) -> float:
-    distance_m2 = np.zeros(len(samples))
+def _compute_median_distance_m2(samples: pd.DataFrame, state: pd.DataFrame) -> float:
+    squared_distance_m2 = np.zeros(len(samples))
     for column in samples:
-        distance_m2 += (np.interp(samples.index, state.index, state[column]) - samples[column]) ** 2
-    return float(np.median(distance_m2)) if len(distance_m2) else float("inf")
+        squared_distance_m2 += (
+            np.interp(samples.index, state.index, state[column]) - samples[column]
+        ) ** 2
+    return float(np.median(squared_distance_m2)) if len(squared_distance_m2) else float("inf")
 
 
 def project(table: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
@@ -131,7 +133,7 @@ def project(table: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
     return pd.DataFrame(projected, index=rows.index)
 
 
-def _no_samples(quantity_name: str) -> Unavailable:
+def _report_no_samples(quantity_name: str) -> Unavailable:
     reason = f"the log contains no {quantity_name} in the analysed time span"
     return Unavailable(quantity_name, reason, "Analyse a longer time span.")
 
@@ -142,11 +144,11 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
         return ekf2.variance
     projected = project(ekf2.variance, axis, segment)
     if projected.empty:
-        return _no_samples("EKF2 variances")
+        return _report_no_samples("EKF2 variances")
     return projected
 
 
-def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | None:
+def project_horizon_position(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | None:
     """Return EKF2's position (m) and its variance (m²) at the fusion horizon, if logged.
 
     EKF2's variance belongs to this position. The published position is extrapolated to the present
@@ -169,25 +171,25 @@ def project_horizon(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | 
             )
         )
         if axis.name == "down":
-            position = position + _altitude_offset_m(ekf2, position)
-        horizon = pd.DataFrame({"position_m": position, "position_variance_m2": variance})
-        return horizon[horizon["position_variance_m2"] > 0.0]
+            position = position + _find_altitude_offset_m(ekf2, position)
+        horizon_positions = pd.DataFrame({"position_m": position, "position_variance_m2": variance})
+        return horizon_positions[horizon_positions["position_variance_m2"] > 0.0]
     if isinstance(ekf2.record, Unavailable):
         return None
     # Before PX4 v1.16, the log contains the state at the fusion horizon
     projected = project(ekf2.record.delayed, axis, segment)
-    horizon = projected[["position_m", "position_variance_m2"]].dropna()
-    return horizon if len(horizon) else None
+    horizon_positions = projected[["position_m", "position_variance_m2"]].dropna()
+    return horizon_positions if len(horizon_positions) else None
 
 
-def _altitude_offset_m(ekf2: Ekf2, down_m: pd.Series) -> float:
+def _find_altitude_offset_m(ekf2: Ekf2, down_m: pd.Series) -> float:
     """Return the altitude (m) of EKF2's origin if logged heights are altitudes, else 0.
 
     Since PX4 v1.16, EKF2 fuses altitudes above sea level as soon as it has an origin.
     """
-    published_m = np.interp(down_m.index, ekf2.state.index, ekf2.state["down_m"])
+    published_down_m = np.interp(down_m.index, ekf2.state.index, ekf2.state["down_m"])
     altitude_m = 0.0 if isinstance(ekf2.record, Unavailable) else ekf2.record.altitude_m
-    distance_m = float((down_m - published_m).median())
+    distance_m = float((down_m - published_down_m).median())
     return altitude_m if abs(distance_m + altitude_m) < abs(distance_m) else 0.0
 
 
@@ -212,11 +214,11 @@ def project_innovations(
         axis_innovations.append(innovations)
     rows = cut_to_segment(axis_innovations[0], segment).copy()
     if axis.name == AISLE:
-        rows = _innovations_along(rows, axis_innovations[1], axis.direction)
+        rows = _combine_north_and_east(rows, axis_innovations[1], axis.direction)
     if rows.empty:
-        return _no_samples("EKF2 innovations")
+        return _report_no_samples("EKF2 innovations")
     noise_variance = rows["observation_variance_m2"].fillna(
-        observation_variance(flight, track, axis, segment)
+        find_observation_variance(flight, track, axis, segment)
     )
     innovation_variance = rows["innovation_variance_m2"]
     prior_variance = (innovation_variance - noise_variance).where(
@@ -231,11 +233,14 @@ def project_innovations(
     return rows
 
 
-def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array) -> pd.DataFrame:
-    common_times = north.index.intersection(east.index)
-    north, east = north.loc[common_times], east.loc[common_times]
+def _combine_north_and_east(
+    north_innovations: pd.DataFrame, east_innovations: pd.DataFrame, direction: Array
+) -> pd.DataFrame:
+    common_times = north_innovations.index.intersection(east_innovations.index)
+    north, east = north_innovations.loc[common_times], east_innovations.loc[common_times]
     cosine, sine = float(direction[0]), float(direction[1])
-    projected = cosine * cosine * north + sine * sine * east  # correct only for variances
+    # Weights of variances; all other columns are replaced below
+    projected = cosine * cosine * north + sine * sine * east
     projected["innovation_m"] = cosine * north["innovation_m"] + sine * east["innovation_m"]
     for column in ("test_ratio", "fused", "rejected"):
         # EKF2 fuses or rejects both axes together, so the larger value is used
@@ -243,7 +248,7 @@ def _innovations_along(north: pd.DataFrame, east: pd.DataFrame, direction: Array
     return projected
 
 
-def observation_variance(
+def find_observation_variance(
     flight: Flight,
     track: PositionTrack,
     axis: Axis,
@@ -263,23 +268,22 @@ def observation_variance(
     if aid is None or math.isnan(noise_m):
         return math.nan
     noise_factor = GNSS_HEIGHT_NOISE_FACTOR if aid == GNSS_POS and axis.name == "down" else 1.0
-    configured_m2 = max(noise_factor * noise_m, EKF2_MIN_NOISE_M) ** 2
-    # EKF2 did not receive the variances of a position file
-    ignores_reported = track.alignment is not None or aid == BAROMETER
-    if ignores_reported or parameters.get(aid.noise_mode) == 1.0:
-        return configured_m2
-    median_m2 = cut_to_segment(track.samples, segment)[Columns.POSITION_VARIANCE].median()
-    reported_m2 = float(np.nansum(median_m2.to_numpy() * axis.direction**2))
-    return max(configured_m2, reported_m2)
+    configured_variance_m2 = max(noise_factor * noise_m, EKF2_MIN_NOISE_M) ** 2
+    # For a position file or barometer, EKF2 receives no variance: only the parameter sets R
+    ignores_reported_variance = track.alignment is not None or aid == BAROMETER
+    if ignores_reported_variance or parameters.get(aid.noise_mode) == 1.0:
+        return configured_variance_m2
+    median_variance_m2 = cut_to_segment(track.samples, segment)[Columns.POSITION_VARIANCE].median()
+    reported_variance_m2 = float(np.nansum(median_variance_m2.to_numpy() * axis.direction**2))
+    return max(configured_variance_m2, reported_variance_m2)
 
 
 def project_truth(
     truth: Truth | Unavailable, axis: Axis, segment: Segment
 ) -> pd.DataFrame | Unavailable:
-    """Project the ground truth onto an axis."""
     if isinstance(truth, Unavailable):
         return truth
     projected = project(truth.samples, axis, segment)
     if len(projected) < MIN_COMMON_SAMPLES:
-        return _no_samples("ground truth")
+        return _report_no_samples("ground truth")
     return projected

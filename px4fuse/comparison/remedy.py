@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from px4fuse.comparison.estimates import Tuning, first_axis_tuning
+from px4fuse.comparison.estimates import Tuning, find_first_tuning
 from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_with_settings
@@ -20,17 +20,17 @@ from px4fuse.flight.model import Unavailable
 # Values of EKF2_GPS_DELAY (ms) in the re-runs that estimate the delay of GNSS
 GNSS_DELAYS_MS = (0.0, 150.0, 300.0)
 # Transmission time (ms) of a position message: EKF2_DELAY_MAX includes it
-TRANSMISSION_MS = 30.0
+TRANSMISSION_DELAY_MS = 30.0
 # EKF2_DELAY_MAX is rounded up to a multiple of this value (ms)
 DELAY_MAX_STEP_MS = 50.0
 # A height noise that differs from the horizontal noise is reported only if EKF2 fuses heights of
 # the source for at least this fraction of the time
 MIN_HEIGHT_FUSED_FRACTION = 0.5
-# Minimum ratio of height noise to horizontal noise that one parameter does not fit
-MIN_HEIGHT_NOISE_RATIO = 2.0
+# Minimum height noise / horizontal noise for which one noise parameter does not fit both
+MIN_HEIGHT_TO_HORIZONTAL_NOISE = 2.0
 
 
-def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
+def estimate_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
     """Estimate the delay of GNSS and its σ (ms) in a flight with vision and GNSS velocity.
 
     The delay minimises the NIS of GNSS in re-runs of EKF2 with several values of EKF2_GPS_DELAY.
@@ -67,7 +67,7 @@ def wrong_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
     return (estimate_ms, sigma_ms) if error_ms > limit_ms and estimate_ms >= 0.0 else None
 
 
-def ml_ekf2_parameters(
+def estimate_ekf2_parameters(
     comparison: Comparison,
     model: Model,
     tuning: Tuning,
@@ -81,26 +81,26 @@ def ml_ekf2_parameters(
     changes: dict[str, float] = {}
     ekf2_inputs, min_vision_noise_m = model.inputs, 0.0
     if ekf2_inputs.vision is not None and comparison.source.name == ekf2_inputs.vision.source:
-        if (gnss_delay := wrong_gnss_delay_ms(model)) is not None:
-            changes |= delay_change(ekf2_inputs, gnss_delay[0])
+        if (gnss_delay := estimate_gnss_delay_ms(model)) is not None:
+            changes |= make_delay_change(ekf2_inputs, gnss_delay[0])
         # While EKF2 fuses GNSS, it increases the noise of vision at least to that of GNSS
         min_vision_noise_m = ekf2_inputs.settings[GNSS_POS.noise]
         ekf2_inputs = replace(ekf2_inputs, aid=EV_POS, received=ekf2_inputs.vision)
     if not is_source_fused(comparison, ekf2_inputs):
         return {}
-    axis_tuning = first_axis_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
-    has_slow_errors = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
+    axis_tuning = find_first_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
+    may_have_slow_errors = comparison.source.origin.may_drift or comparison.source.origin.is_gnss
     noise_m = None if axis_tuning is None else axis_tuning.sigma_z.value
-    used_noise_m = noise_used_m(ekf2_inputs)
-    min_noise_m = used_noise_m if has_slow_errors else 0.0
+    used_noise_m = find_used_noise_m(ekf2_inputs)
+    min_noise_m = used_noise_m if may_have_slow_errors else 0.0
     if (
         axis_tuning
         and noise_m
         and noise_m > min_noise_m
         and (max(noise_m, used_noise_m) > min_vision_noise_m)
     ):
-        changes |= ml_noise_change(ekf2_inputs, axis_tuning.sigma_z, noise_m)
-    return changes | ml_delay_change(comparison, ekf2_inputs, clock_offset)
+        changes |= make_ml_noise_change(ekf2_inputs, axis_tuning.sigma_z, noise_m)
+    return changes | make_ml_delay_change(comparison, ekf2_inputs, clock_offset)
 
 
 def is_source_fused(comparison: Comparison, ekf2_inputs: Inputs) -> bool:
@@ -109,18 +109,18 @@ def is_source_fused(comparison: Comparison, ekf2_inputs: Inputs) -> bool:
     return source.name == ekf2_inputs.received.source and source.alignment is None
 
 
-def ml_delay_change(
+def make_ml_delay_change(
     comparison: Comparison, ekf2_inputs: Inputs, clock_offset: ClockOffset | Unavailable
 ) -> dict[str, float]:
     if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
         return {}
-    ml_delay_ms = wrong_delay_ms(
+    ml_delay_ms = estimate_delay_if_wrong_ms(
         comparison, clock_offset, ekf2_inputs.settings[ekf2_inputs.aid.delay]
     )
-    return {} if ml_delay_ms is None else delay_change(ekf2_inputs, ml_delay_ms)
+    return {} if ml_delay_ms is None else make_delay_change(ekf2_inputs, ml_delay_ms)
 
 
-def wrong_delay_ms(
+def estimate_delay_if_wrong_ms(
     comparison: PreparedComparison, clock_offset: ClockOffset, logged_delay_ms: float
 ) -> float | None:
     """Return the estimated delay (ms) of the positions if it differs from the logged delay.
@@ -133,19 +133,19 @@ def wrong_delay_ms(
     )
 
 
-def delay_limit(parameter_name: str, ml_delay_ms: float, logged_delay_ms: float) -> str:
-    """Return a text if PX4 does not permit a delay: "exceed 300 ms", "be negative", or ""."""
+def describe_delay_limit(parameter_name: str, ml_delay_ms: float, logged_delay_ms: float) -> str:
+    """Return "exceed 300 ms" or "be negative" for a delay that PX4 does not permit, else ""."""
     if ml_delay_ms > (maximum_ms := PARAMETERS[parameter_name].maximum):
         return f"exceed {maximum_ms:g} ms"
     return "be negative" if round(ml_delay_ms) <= 0.0 == logged_delay_ms else ""
 
 
-def aid_of(comparison: PreparedComparison, axis: str = "") -> Aid:
+def find_aid(comparison: PreparedComparison, axis: str = "") -> Aid:
     """Return the EKF2 aiding source that fuses the positions along an axis."""
     return comparison.source.aid(axis) or EV_POS
 
 
-def delay_ms(comparison: PreparedComparison) -> float | None:
+def find_logged_delay_ms(comparison: PreparedComparison) -> float | None:
     """Return the logged delay (ms) that EKF2 subtracts from the timestamps of the positions.
 
     Return None if the parameter is not logged, or if EKF2 does not use it.
@@ -161,34 +161,34 @@ def delay_ms(comparison: PreparedComparison) -> float | None:
     )
 
 
-def ml_noise_change(
+def make_ml_noise_change(
     ekf2_inputs: Inputs, ml_noise: NoiseEstimate, noise_m: float
 ) -> dict[str, float]:
     """Return the EKF2 parameters for the position noise ``noise_m``.
 
     The mapping is empty if EKF2's noise is inside the 95 % interval of the estimate ``ml_noise``.
     """
-    if (ml_noise.low or 0.0) <= noise_used_m(ekf2_inputs) <= (ml_noise.high or math.inf):
+    if (ml_noise.low or 0.0) <= find_used_noise_m(ekf2_inputs) <= (ml_noise.high or math.inf):
         return {}
-    return noise_change(
-        ekf2_inputs.aid, ekf2_inputs.settings, _reported_noise_m(ekf2_inputs), noise_m
+    return make_noise_change(
+        ekf2_inputs.aid, ekf2_inputs.settings, _compute_reported_noise_m(ekf2_inputs), noise_m
     )
 
 
-def noise_change(
-    aid: Aid, settings: Mapping[str, float], reported_m: float, noise_m: float
+def make_noise_change(
+    aid: Aid, settings: Mapping[str, float], reported_noise_m: float, noise_m: float
 ) -> dict[str, float]:
     """Return the EKF2 parameters that set the position noise to ``noise_m``.
 
-    If the sender reports a larger noise (``reported_m``), a parameter makes EKF2 ignore it.
+    If the sender reports a larger noise (``reported_noise_m``), a parameter makes EKF2 ignore it.
     """
     changes = {aid.noise: max(float(f"{noise_m:.2g}"), PARAMETERS[aid.noise].minimum)}
-    if aid.noise_mode and settings.get(aid.noise_mode, 0.0) == 0.0 and noise_m < reported_m:
+    if aid.noise_mode and settings.get(aid.noise_mode, 0.0) == 0.0 and noise_m < reported_noise_m:
         changes[aid.noise_mode] = 1.0
     return changes
 
 
-def delay_change(ekf2_inputs: Inputs, delay_ms: float) -> dict[str, float]:
+def make_delay_change(ekf2_inputs: Inputs, delay_ms: float) -> dict[str, float]:
     """Return the EKF2 parameters for a delay of the positions. A negative delay is set to 0.
 
     The mapping is empty if PX4 does not permit the delay, or if EKF2 ignores the parameter.
@@ -198,57 +198,62 @@ def delay_change(ekf2_inputs: Inputs, delay_ms: float) -> dict[str, float]:
     if delay_ms > parameter.maximum or ekf2_inputs.received.uses_sender_times:
         return {}
     changes = {delay_name: max(float(round(delay_ms)), parameter.minimum)}
-    changes |= horizon_change(ekf2_inputs.settings, changes[delay_name])
+    changes |= make_delay_max_change(ekf2_inputs.settings, changes[delay_name])
     return {name: value for name, value in changes.items() if value != ekf2_inputs.settings[name]}
 
 
-def horizon_change(settings: Mapping[str, float], age_ms: float) -> dict[str, float]:
+def make_delay_max_change(
+    settings: Mapping[str, float], position_age_ms: float
+) -> dict[str, float]:
     """Return a larger EKF2_DELAY_MAX if positions of this age (ms) are otherwise too old.
 
     PX4 has this parameter since v1.14.
     """
-    required_ms = age_ms + TRANSMISSION_MS
+    required_ms = position_age_ms + TRANSMISSION_DELAY_MS
     if required_ms <= settings.get("EKF2_DELAY_MAX", math.inf):
         return {}
     return {"EKF2_DELAY_MAX": DELAY_MAX_STEP_MS * math.ceil(required_ms / DELAY_MAX_STEP_MS)}
 
 
-def noise_used_m(ekf2_inputs: Inputs) -> float:
+def find_used_noise_m(ekf2_inputs: Inputs) -> float:
     """Return the median √R (m) that EKF2 used for the positions."""
     aid, logged_parameters = ekf2_inputs.aid, ekf2_inputs.settings
-    is_fixed = aid.noise_mode and logged_parameters[aid.noise_mode] == 1.0
-    return max(logged_parameters[aid.noise], 0.0 if is_fixed else _reported_noise_m(ekf2_inputs))
+    ignores_reported_noise = aid.noise_mode and logged_parameters[aid.noise_mode] == 1.0
+    return max(
+        logged_parameters[aid.noise],
+        0.0 if ignores_reported_noise else _compute_reported_noise_m(ekf2_inputs),
+    )
 
 
-def _reported_noise_m(ekf2_inputs: Inputs) -> float:
+def _compute_reported_noise_m(ekf2_inputs: Inputs) -> float:
     return float(np.sqrt(np.median(ekf2_inputs.received.variance_m2[:, :2])))
 
 
-def height_noise_advice(comparison: PreparedComparison, tuning: Tuning, noise_m: float) -> str:
-    """Return an action if EKF2 fuses heights of another noise with the parameter for ``noise_m``.
+def make_height_noise_advice(comparison: PreparedComparison, tuning: Tuning, noise_m: float) -> str:
+    """Return an action if the height noise is much larger than the horizontal noise ``noise_m``.
 
     EKF2 has one noise parameter for the horizontal position and the height of external vision.
     """
-    ekf2, down = comparison.flight.ekf2, tuning.get("down")
+    ekf2, down_tuning = comparison.flight.ekf2, tuning.get("down")
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.fusion_flags, Unavailable):
         return ""
-    if not isinstance(down, AxisTuning) or not comparison.source.origin.is_vision:
+    if not isinstance(down_tuning, AxisTuning) or not comparison.source.origin.is_vision:
         return ""
-    height_noise_m = down.sigma_z.value or 0.0
+    height_noise_m = down_tuning.sigma_z.value or 0.0
     is_fused = ekf2.fusion_flags["vertical"].mean() > MIN_HEIGHT_FUSED_FRACTION
-    if not is_fused or height_noise_m < MIN_HEIGHT_NOISE_RATIO * noise_m:
+    if not is_fused or height_noise_m < MIN_HEIGHT_TO_HORIZONTAL_NOISE * noise_m:
         return ""
     return (
-        " EKF2 fuses the height with the same parameter, but the height noise is "
+        f" {EV_POS.noise} also sets EKF2's height noise, but the height noise of the source is "
         f"{height_noise_m:.2g} m. Report a variance of {height_noise_m**2:.2g} m² for z, and set "
         f"{EV_POS.noise_mode} to 0."
     )
 
 
-def different_settings(
+def select_changed_settings(
     changes: Mapping[str, float], flight_settings: Mapping[str, float]
 ) -> dict[str, float]:
-    """Return the changes of parameters that had another value in flight."""
+    """Return the entries of ``changes`` with a value that differs from that in flight."""
     return {
         name: value
         for name, value in changes.items()

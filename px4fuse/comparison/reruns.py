@@ -15,16 +15,16 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 
 from px4fuse.comparison.changes import (
-    candidate_changes,
-    change_kinds,
-    main_axis_changes,
-    tuning_of_axis,
-    unique_changes,
+    classify_change,
+    find_axis_tuning,
+    find_candidate_changes,
+    find_main_axis_changes,
+    remove_repeated_changes,
 )
 from px4fuse.comparison.comparison import (
-    difference_statistics,
-    error_statistics,
-    kf_error_statistics,
+    compute_difference_statistics,
+    compute_error_statistics,
+    compute_kf_error_statistics,
 )
 from px4fuse.comparison.estimates import Estimates, Tuning
 from px4fuse.comparison.model import (
@@ -40,7 +40,7 @@ from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_source_fused
 from px4fuse.comparison.trials import (
     CLOCK_OFFSET,
-    DISCREPANCIES,
+    DISCREPANCY_STATISTICS,
     FORWARD_BIAS,
     MIN_REPORTED_NEES,
     OUTLIERS,
@@ -50,7 +50,7 @@ from px4fuse.comparison.trials import (
     RunStatistics,
     Statistic,
     Trial,
-    helpful_trials,
+    find_helpful_trials,
 )
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
@@ -71,18 +71,18 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable
 
-# Innovations are normal if the mean NIS is below this limit
+# A filter with a mean NIS below this limit has no conspicuous innovations
 MAX_NORMAL_NIS = 1.5
-INNOVATIONS = [f"innovation_{axis}_m" for axis in HORIZONTAL_AXES]
-INNOVATION_VARIANCES = [f"innovation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
-POSITION_VARIANCES = [f"position_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
-OBSERVATION_VARIANCES = [f"observation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
-NO_DIFFERENCE = Unavailable(
-    "difference KF - EKF2", "with this change KF and EKF2 use different frames", ""
+INNOVATION_COLUMNS = [f"innovation_{axis}_m" for axis in HORIZONTAL_AXES]
+INNOVATION_VARIANCE_COLUMNS = [f"innovation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
+POSITION_VARIANCE_COLUMNS = [f"position_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
+OBSERVATION_VARIANCE_COLUMNS = [f"observation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
+DIFFERENCE_UNAVAILABLE = Unavailable(
+    "difference KF - EKF2", "this re-run rotates the frame of KF, but not that of EKF2", ""
 )
 # Re-runs of EKF2 are compared with the log if position RMSE and σ ratios of the replay agree with
 # the log within this factor. Otherwise they are compared with the replay
-MAX_REPLAY_TO_LOGGED_RATIO = 1.10
+MAX_REPLAY_TO_LOG_FACTOR = 1.10
 
 
 class ErrorAboveSigma(NamedTuple):
@@ -94,19 +94,18 @@ class ErrorAboveSigma(NamedTuple):
     nis_mean: float | None
 
 
-def error_above_reported_sigma(
-    summary: FilterSummary | UntestedFilter,
-) -> ErrorAboveSigma | None:
-    """Return the position error of a filter if it exceeds the reported σ although NIS is normal.
+def find_error_above_sigma(summary: FilterSummary | UntestedFilter) -> ErrorAboveSigma | None:
+    """Return the position error of a filter if it exceeds the reported σ although NIS is small.
 
-    Without innovations along the axis, NIS is assumed to be normal.
+    Without innovations along the axis, NIS is assumed to be small.
     """
     truth = summary.truth
     if isinstance(truth, Unavailable):
         return None
     nis_mean = None if isinstance(summary, Unavailable) else summary.nis_mean
     nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
-    horizon_nees = truth.nees_position_horizon_mean or nees  # without the output predictor's lag
+    # NEES at the fusion horizon does not contain the lag of the output predictor
+    horizon_nees = truth.nees_position_horizon_mean or nees
     if min(nees, horizon_nees) < MIN_REPORTED_NEES or (nis_mean or 0.0) >= MAX_NORMAL_NIS:
         return None
     reported_sigma_m = summary.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
@@ -164,7 +163,7 @@ def rerun_filters(
             change_key = frozenset(change.items())
             if change_key not in replays:
                 replays[change_key] = _replay_ekf2(comparison, estimates.tuning, model, change)
-            return _replay_statistics(comparison, model, replays[change_key], axis_result, change)
+            return _summarise_replay(comparison, model, replays[change_key], axis_result, change)
 
         filters.append(_Filter("ekf2", rerun_ekf2, model))
     return tuple(
@@ -175,7 +174,7 @@ def rerun_filters(
     )
 
 
-def planned_configurations(
+def list_rerun_configurations(
     comparison: Comparison, estimates: Estimates, ekf2_inputs: Inputs
 ) -> list[FilterConfiguration]:
     """Return the EKF2 configurations that :func:`rerun_filters` will replay."""
@@ -185,7 +184,7 @@ def planned_configurations(
     return [
         FilterConfiguration({**logged_parameters, **change})
         for axis_result in comparison.axes.values()
-        for change, _ in _changes_along(comparison, estimates, ekf2_inputs, axis_result)
+        for change, _ in _find_changes_to_test(comparison, estimates, ekf2_inputs, axis_result)
         if change.keys() <= logged_parameters.keys()
     ]
 
@@ -195,7 +194,7 @@ def is_inconsistent(summary: FilterSummary | UntestedFilter) -> TypeGuard[Filter
     return not isinstance(summary, Unavailable) and summary.verdict != "consistent"
 
 
-def _changes_along(
+def _find_changes_to_test(
     comparison: Comparison,
     estimates: Estimates,
     ekf2_inputs: Inputs | None,
@@ -206,19 +205,21 @@ def _changes_along(
     if not isinstance(summary, FilterSummary) or (
         ekf2_inputs is not None and axis_result.axis.name == "down"
     ):
-        return []  # an EKF2 replay has no vertical position
-    has_discrepancy = {
-        "nees": error_above_reported_sigma(summary) is not None,
+        return []  # EKF2's replay contains no vertical position to test a change
+    is_discrepant = {
+        "nees": find_error_above_sigma(summary) is not None,
         "nis": is_inconsistent(summary),
     }
     candidates = {
-        statistic: candidate_changes(comparison, estimates, ekf2_inputs, axis_result, statistic)
-        for statistic in DISCREPANCIES
-        if has_discrepancy[statistic]
+        statistic: find_candidate_changes(
+            comparison, estimates, ekf2_inputs, axis_result, statistic
+        )
+        for statistic in DISCREPANCY_STATISTICS
+        if is_discrepant[statistic]
     }
-    changes = unique_changes(chain.from_iterable(candidates.values()))
+    changes = remove_repeated_changes(chain.from_iterable(candidates.values()))
     if axis_result is comparison.main:
-        changes = main_axis_changes(comparison, estimates, ekf2_inputs)
+        changes = find_main_axis_changes(comparison, estimates, ekf2_inputs)
     return [
         (change, tuple(statistic for statistic in candidates if change in candidates[statistic]))
         for change in changes
@@ -231,17 +232,17 @@ def _try_changes(
     tested_filter: _Filter,
     axis_result: AxisComparison,
 ) -> list[Trial]:
-    changes = _changes_along(comparison, estimates, tested_filter.ekf2_inputs, axis_result)
+    changes = _find_changes_to_test(comparison, estimates, tested_filter.ekf2_inputs, axis_result)
     if not changes:
         return []
-    before, is_logged = _unchanged_statistics(tested_filter, axis_result)
+    before, is_logged = _find_original_statistics(tested_filter, axis_result)
 
     def make_trial(change: Change, discrepancies: Iterable[Statistic]) -> Trial:
         after = tested_filter.rerun(axis_result, change)
         return Trial(
             filter=tested_filter.name,
             axis=axis_result.axis.name,
-            kinds=change_kinds(comparison, tested_filter.ekf2_inputs, change),
+            kinds=classify_change(comparison, tested_filter.ekf2_inputs, change),
             change=change,
             discrepancies=tuple(
                 statistic
@@ -257,54 +258,58 @@ def _try_changes(
         )
 
     trials = [make_trial(change, discrepancies) for change, discrepancies in changes]
-    for statistic in DISCREPANCIES:
-        helpful = helpful_trials(trials, statistic)
+    for statistic in DISCREPANCY_STATISTICS:
+        helpful_trials = find_helpful_trials(trials, statistic)
         trials += [
-            make_trial({**helpful[0].change, **other_trial.change}, (statistic,))
-            for other_trial in helpful[1:]
+            make_trial({**helpful_trials[0].change, **other_trial.change}, (statistic,))
+            for other_trial in helpful_trials[1:]
         ]
     return trials
 
 
-def _unchanged_statistics(
+def _find_original_statistics(
     tested_filter: _Filter, axis_result: AxisComparison
 ) -> tuple[RunStatistics, bool]:
-    """Return the statistics of a filter without change, and True if they are from the log."""
+    """Return the statistics with unchanged settings, and True if they are from the log."""
     replayed_statistics, logged_state = tested_filter.rerun(axis_result, {}), axis_result.ekf2_state
     if tested_filter.ekf2_model is None:
         return replayed_statistics, True
     innovations = axis_result.ekf2_innovations
     if isinstance(logged_state, Unavailable) or isinstance(innovations, Unavailable):
         return replayed_statistics, False
-    compared_s = tested_filter.ekf2_model.baseline_replay.find_evaluated_spans()
-    compared_state = rows_inside(logged_state, compared_s)
-    innovations = rows_inside(innovations, compared_s)
+    evaluated_spans_s = tested_filter.ekf2_model.baseline_replay.find_evaluated_spans()
+    compared_state = rows_inside(logged_state, evaluated_spans_s)
+    innovations = rows_inside(innovations, evaluated_spans_s)
     rejected_flags = innovations["rejected"].dropna()
-    logged_statistics = _run_statistics(
+    logged_statistics = _summarise_run(
         innovations["innovation_m"].to_numpy(),
         innovations["innovation_variance_m2"].to_numpy(),
-        error_statistics(compared_state, axis_result.ekf2_variance, axis_result.truth),
-        difference_statistics(axis_result.replay, compared_state),
+        compute_error_statistics(compared_state, axis_result.ekf2_variance, axis_result.truth),
+        compute_difference_statistics(axis_result.replay, compared_state),
         float((rejected_flags > 0.0).mean()) if len(rejected_flags) else None,
     )
-    logged_and_replayed = (
+    compared_values = (
         (
             logged_statistics.position_rmse_m,
             replayed_statistics.position_rmse_m,
-            MAX_REPLAY_TO_LOGGED_RATIO,
+            MAX_REPLAY_TO_LOG_FACTOR,
         ),
-        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAY_TO_LOGGED_RATIO**2),
-        (logged_statistics.nees_mean, replayed_statistics.nees_mean, MAX_REPLAY_TO_LOGGED_RATIO**2),
+        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAY_TO_LOG_FACTOR**2),
+        (
+            logged_statistics.nees_mean,
+            replayed_statistics.nees_mean,
+            MAX_REPLAY_TO_LOG_FACTOR**2,
+        ),
     )
     is_replay_similar = all(
         logged_value and replayed_value and 1.0 / factor <= logged_value / replayed_value <= factor
-        for logged_value, replayed_value, factor in logged_and_replayed
+        for logged_value, replayed_value, factor in compared_values
         if logged_value is not None
     )
     return (logged_statistics, True) if is_replay_similar else (replayed_statistics, False)
 
 
-def _run_statistics(
+def _summarise_run(
     innovation_m: Array,
     variance_m2: Array,
     errors: ErrorsAgainstTruth | Unavailable,
@@ -337,21 +342,22 @@ def _rerun_kf(
         name: change[name] for name in change if name in vars(Settings())
     }
     changed_settings = replace(comparison.settings, **kf_settings)
-    truth, is_gnss_rotation = axis_result.truth, ROTATION in change and source.origin.is_gnss
+    truth, rotates_gnss_positions = axis_result.truth, ROTATION in change and source.origin.is_gnss
     if ROTATION in change:
         rotated_direction = _rotate_direction(axis.direction, change[ROTATION])
         measured_m = weighted_sum(
             cut_to_segment(source.samples, segment), Columns.POSITION, rotated_direction
         )
         axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
-        if is_gnss_rotation:
-            # The rotation of GNSS positions and ground truth has the effect of a corrected heading
+        if rotates_gnss_positions:
+            # GNSS positions and ground truth are rotated instead of the acceleration, whose heading
+            # is wrong
             rotated_axis = replace(axis, direction=rotated_direction)
             truth = project_truth(comparison.flight.truth, rotated_axis, segment)
     if FORWARD_BIAS in change:
         acceleration = _acceleration_without_bias(comparison, change, axis.direction)
         axis = replace(axis, acceleration=acceleration)
-    time_s, axis_tuning = axis.measurement_time_s, tuning_of_axis(tuning, axis.name)
+    time_s, axis_tuning = axis.measurement_time_s, find_axis_tuning(tuning, axis.name)
     is_used = np.ones(len(time_s), dtype=bool)
     if OUTLIERS in change and axis_tuning is not None:
         is_used = ~np.isin(time_s, axis_tuning.outlier_time_s)
@@ -362,13 +368,13 @@ def _rerun_kf(
         measurement_m=axis.measurement_m[is_used],
     )
     kf_run, ekf2_state = replay(axis, changed_settings, fast=True), axis_result.ekf2_state
-    return _run_statistics(
+    return _summarise_run(
         kf_run.updates["innovation_m"].to_numpy(),
         kf_run.updates["innovation_variance_m2"].to_numpy(),
-        kf_error_statistics(kf_run, truth, ekf2_state),
-        NO_DIFFERENCE
-        if is_gnss_rotation or isinstance(ekf2_state, Unavailable)
-        else difference_statistics(kf_run, ekf2_state),
+        compute_kf_error_statistics(kf_run, truth, ekf2_state),
+        DIFFERENCE_UNAVAILABLE
+        if rotates_gnss_positions or isinstance(ekf2_state, Unavailable)
+        else compute_difference_statistics(kf_run, ekf2_state),
     )
 
 
@@ -391,20 +397,20 @@ def _replay_ekf2(
     if not change:
         return model.baseline_replay
     changed_parameters = {name: value for name, value in change.items() if name in PARAMETERS}
-    changed_model = with_misaligned_positions(
+    misaligned_model = with_misaligned_positions(
         model, change.get(ROTATION, 0.0), change.get(CLOCK_OFFSET, 0.0)
     )
-    excluded_times_s, axis_tuning = None, tuning_of_axis(tuning, HORIZONTAL)
+    excluded_times_s, axis_tuning = None, find_axis_tuning(tuning, HORIZONTAL)
     if OUTLIERS in change and axis_tuning is not None:
         excluded_times_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
         if comparison.source.origin.fused_as_gnss:
             excluded_times_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
         excluded_times_s += change.get(CLOCK_OFFSET, 0.0)
-    (replay,) = replay_with_settings(changed_model, [changed_parameters], excluded_times_s)
+    (replay,) = replay_with_settings(misaligned_model, [changed_parameters], excluded_times_s)
     return replay
 
 
-def _replay_statistics(
+def _summarise_replay(
     comparison: Comparison,
     model: Model,
     ekf2_replay: Ekf2Replay,
@@ -416,34 +422,34 @@ def _replay_statistics(
     The errors are those of the published state. Its reported variance is the mean of the variances
     before and after each update, because the replay contains no variance between updates.
     """
-    compared_s, axis = model.baseline_replay.find_evaluated_spans(), axis_result.axis
+    evaluated_spans_s, axis = model.baseline_replay.find_evaluated_spans(), axis_result.axis
     if ROTATION in change and comparison.source.origin.is_gnss:
-        # The rotation of GNSS positions also rotates EKF2's heading, so the axis is rotated back
+        # Rotated GNSS positions rotate EKF2's frame, so the axis is rotated by the same angle
         axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))
-    direction_cosines, ekf2_updates = axis.direction[:2], ekf2_replay.updates
-    ekf2_updates = rows_inside(ekf2_updates, compared_s)
-    innovation_variance_m2 = weighted_sum(ekf2_updates, INNOVATION_VARIANCES, direction_cosines**2)
-    prior_m2 = innovation_variance_m2 - weighted_sum(
-        ekf2_updates, OBSERVATION_VARIANCES, direction_cosines**2
+    cosines, ekf2_updates = axis.direction[:2], ekf2_replay.updates
+    ekf2_updates = rows_inside(ekf2_updates, evaluated_spans_s)
+    innovation_variance_m2 = weighted_sum(ekf2_updates, INNOVATION_VARIANCE_COLUMNS, cosines**2)
+    prior_variance_m2 = innovation_variance_m2 - weighted_sum(
+        ekf2_updates, OBSERVATION_VARIANCE_COLUMNS, cosines**2
     )
-    posterior_m2 = weighted_sum(ekf2_updates, POSITION_VARIANCES, direction_cosines**2)
+    posterior_variance_m2 = weighted_sum(ekf2_updates, POSITION_VARIANCE_COLUMNS, cosines**2)
     variance_by_time = pd.DataFrame(
         {
-            "position_variance_m2": 0.5 * (prior_m2 + posterior_m2),
+            "position_variance_m2": 0.5 * (prior_variance_m2 + posterior_variance_m2),
             "velocity_variance_m2_s2": np.nan,
         },
         index=pd.Index(ekf2_updates["fused_at_s"].to_numpy()),
     )
     published = project(ekf2_replay.published, axis, comparison.segment)
-    published = rows_inside(published, compared_s)
+    published = rows_inside(published, evaluated_spans_s)
     logged_state, compared_track = axis_result.ekf2_state, published
-    # Without a change, the difference KF - EKF2 is that of the report: from the logged state
+    # Without a change, KF is compared with the logged state of EKF2, as in the report
     if not change and not isinstance(logged_state, Unavailable):
-        compared_track = rows_inside(logged_state, compared_s)
-    return _run_statistics(
-        weighted_sum(ekf2_updates, INNOVATIONS, direction_cosines),
+        compared_track = rows_inside(logged_state, evaluated_spans_s)
+    return _summarise_run(
+        weighted_sum(ekf2_updates, INNOVATION_COLUMNS, cosines),
         innovation_variance_m2,
-        error_statistics(published, variance_by_time, axis_result.truth),
-        difference_statistics(axis_result.replay, compared_track),
+        compute_error_statistics(published, variance_by_time, axis_result.truth),
+        compute_difference_statistics(axis_result.replay, compared_track),
         float((ekf2_updates["rejected"] > 0.0).mean()) if len(ekf2_updates) else None,
     )

@@ -1,4 +1,4 @@
-"""Re-runs of KF or EKF2 with a change along one axis, and their effect on the statistics."""
+"""Re-runs of KF or EKF2 with changed settings or data, and their effect along one axis."""
 
 import math
 from collections.abc import Iterable, Mapping
@@ -12,8 +12,9 @@ from px4fuse.filter.consistency import Reference, classify_sigma_ratio, compute_
 from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
-# Statistics of an inconsistent filter that a change may correct
-DISCREPANCIES: tuple[Statistic, Statistic] = ("nees", "nis")
+# Statistics that a change may bring inside the limits of a consistent filter
+DISCREPANCY_STATISTICS: tuple[Statistic, Statistic] = ("nees", "nis")
+# Values of KF settings, EKF2 parameters and corrections of the data, by name
 Change = Mapping[str, float]
 # Keys of Trial.change for corrections of the data, not of parameters
 CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
@@ -22,25 +23,26 @@ Improvement = Literal["position and σ", "position", "σ only", "nothing"]
 # Position errors are reported if the mean NEES exceeds this limit (2 reported σ): flights without a
 # fault have a mean NEES below 3
 MIN_REPORTED_NEES = 4.0
-# Maximum mean NEES of a re-run with a smaller noise, if the mean NEES is above 1 before
+# Maximum mean NEES after a noise is reduced, if the mean NEES exceeds 1 with the original noise
 MAX_NEES_AFTER_CHANGE = 2.0
-# A change is a cause if |explained_fraction - 1| is at most this value
-CAUSE_TOLERANCE = 0.5
-# A sensor fault is the only cause if |explained_fraction - 1| is at most this value
-SENSOR_CAUSE_TOLERANCE = 0.25
-# Changes are combined in one re-run if |explained_fraction - 1| is below this value for each
-COMBINED_CAUSE_TOLERANCE = 0.9
-# Keys of Trial.change that correct a sensor fault instead of a setting
-SENSOR_CHANGES = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
+# A change is a cause if compute_explained_fraction returns 1 ± this tolerance
+CAUSE_FRACTION_TOLERANCE = 0.5
+# A corrected sensor fault is the only cause if the explained fraction is 1 ± this tolerance
+SENSOR_FRACTION_TOLERANCE = 0.25
+# Changes are combined in one re-run if each alone explains a fraction of 1 ± this tolerance
+COMBINED_FRACTION_TOLERANCE = 0.9
+# Keys of Trial.change that correct faulty sensor data; other keys change settings of a filter
+SENSOR_CHANGE_KEYS = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
 # Keys of Trial.change that have an effect only together with another change
-ACCOMPANYING_CHANGES = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
+SECONDARY_CHANGE_KEYS = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
 # A re-run has an effect if it changes a ratio of actual to reported σ by at least this factor
-MIN_RATIO_CHANGE = 1.10
+MIN_SIGMA_RATIO_FACTOR = 1.10
 # A re-run has an effect if it changes the position RMSE by more than this fraction
-MIN_RMSE_CHANGE = 0.05
+MIN_RMSE_CHANGE_FRACTION = 0.05
 # A re-run improves the position if it reduces the position RMSE by at least this fraction
-POSITION_IMPROVEMENT = 0.20
-# A filter remains overconfident if a re-run leaves more than this fraction of ln(σ ratio)
+MIN_RMSE_REDUCTION = 0.20
+# A filter remains overconfident if more than this fraction of ln(actual / reported σ) remains after
+# a re-run
 MAX_REMAINING_ERROR_FRACTION = 0.75
 
 
@@ -94,11 +96,11 @@ class Trial(Record, kw_only=True):
 
     @property
     def corrects_sensor(self) -> bool:
-        """True if the change corrects a sensor fault instead of a setting."""
-        return not SENSOR_CHANGES.isdisjoint(self.change)
+        """True if the change corrects faulty sensor data, False if it only changes settings."""
+        return not SENSOR_CHANGE_KEYS.isdisjoint(self.change)
 
 
-def explained_fraction(trial: Trial, statistic: Statistic) -> float:
+def compute_explained_fraction(trial: Trial, statistic: Statistic) -> float:
     """Return the fraction of ln(mean NIS) or ln(mean NEES) that a change removes.
 
     For the statistic "difference", it is the fraction of the mean square difference KF - EKF2.
@@ -112,11 +114,11 @@ def explained_fraction(trial: Trial, statistic: Statistic) -> float:
     return 1.0 - float(np.log(after) / np.log(before))
 
 
-def _explanation_error(trial: Trial, statistic: Statistic) -> float:
-    return abs(explained_fraction(trial, statistic) - 1.0)
+def _compute_explanation_error(trial: Trial, statistic: Statistic) -> float:
+    return abs(compute_explained_fraction(trial, statistic) - 1.0)
 
 
-def is_sufficient(trial: Trial, statistic: Statistic) -> bool:
+def brings_inside_limits(trial: Trial, statistic: Statistic) -> bool:
     """Return True if the change brings the mean NIS or mean NEES inside its limits."""
     low, high = (
         compute_nis_band(trial.after.innovations)
@@ -143,7 +145,7 @@ def makes_overconfident(trial: Trial, statistic: Statistic) -> bool:
 def find_trials(
     trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> list[Trial]:
-    """Return the re-runs of a filter along an axis that may correct a statistic."""
+    """Return the re-runs of a filter and axis with changes that may correct ``statistic``."""
     return [
         trial
         for trial in trials
@@ -151,7 +153,7 @@ def find_trials(
     ]
 
 
-def find_cause(
+def find_cause_trial(
     trials: Iterable[Trial], filter_name: FilterName, axis: str, statistic: Statistic = "nis"
 ) -> Trial | None:
     """Return the re-run that best corrects a mean NIS or mean NEES outside its limits.
@@ -160,11 +162,11 @@ def find_cause(
     """
 
     def rank(trial: Trial) -> tuple[bool, int, bool, float]:
-        explanation_error = _explanation_error(trial, statistic)
-        is_complete = trial.corrects_sensor and explanation_error <= SENSOR_CAUSE_TOLERANCE
+        explanation_error = _compute_explanation_error(trial, statistic)
+        is_complete = trial.corrects_sensor and explanation_error <= SENSOR_FRACTION_TOLERANCE
         return (
-            not (is_complete or is_sufficient(trial, statistic)),
-            len(trial.change.keys() - ACCOMPANYING_CHANGES),
+            not (is_complete or brings_inside_limits(trial, statistic)),
+            len(trial.change.keys() - SECONDARY_CHANGE_KEYS),
             not trial.corrects_sensor,
             explanation_error,
         )
@@ -172,13 +174,13 @@ def find_cause(
     causes = (
         trial
         for trial in find_trials(trials, filter_name, axis, statistic)
-        if _explanation_error(trial, statistic) <= CAUSE_TOLERANCE
+        if _compute_explanation_error(trial, statistic) <= CAUSE_FRACTION_TOLERANCE
         and not makes_overconfident(trial, statistic)
     )
     return min(causes, key=rank, default=None)
 
 
-def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]:
+def find_helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]:
     """Return the re-runs that correct a statistic only partly, best first.
 
     The list is empty if one re-run brings the statistic inside its limits.
@@ -187,14 +189,14 @@ def helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[Trial]
         trial
         for trial in trials
         if statistic in trial.discrepancies
-        and _explanation_error(trial, statistic) < COMBINED_CAUSE_TOLERANCE
+        and _compute_explanation_error(trial, statistic) < COMBINED_FRACTION_TOLERANCE
     ]
-    candidates.sort(key=lambda trial: _explanation_error(trial, statistic))
-    return [] if any(is_sufficient(trial, statistic) for trial in candidates) else candidates
+    candidates.sort(key=lambda trial: _compute_explanation_error(trial, statistic))
+    return [] if any(brings_inside_limits(trial, statistic) for trial in candidates) else candidates
 
 
-def log_ratio_sum(statistics: RunStatistics) -> float:
-    """Return the sum of |ln σ ratio| against position source and ground truth."""
+def compute_log_ratio_sum(statistics: RunStatistics) -> float:
+    """Return the sum of |ln(actual / reported σ)| from innovations and from ground truth."""
     squared_ratios = [
         squared_ratio
         for squared_ratio in (statistics.nis_mean, statistics.nees_mean)
@@ -203,17 +205,20 @@ def log_ratio_sum(statistics: RunStatistics) -> float:
     return sum(0.5 * abs(math.log(squared_ratio)) for squared_ratio in squared_ratios)
 
 
-def preference_key(trial: Trial) -> tuple[bool, int, float]:
-    """Return a key to sort re-runs with one kind of change: the best re-run is the first."""
+def compute_preference_key(trial: Trial) -> tuple[bool, int, float]:
+    """Return a key to sort re-runs with one kind of change, the best first.
+
+    Re-runs that make a filter consistent precede others, then few changed values precede many.
+    """
     is_solved = becomes_consistent(trial)
     return (
         not is_solved,
         len(trial.change) if is_solved else 0,
-        log_ratio_sum(trial.after),
+        compute_log_ratio_sum(trial.after),
     )
 
 
-def sigma_ratios(statistics: RunStatistics) -> dict[Reference, float]:
+def compute_sigma_ratios(statistics: RunStatistics) -> dict[Reference, float]:
     """Return the ratios of actual to reported σ against position source and ground truth."""
     squared_ratios: dict[Reference, float | None] = {
         "source": statistics.nis_mean,
@@ -226,17 +231,19 @@ def sigma_ratios(statistics: RunStatistics) -> dict[Reference, float]:
     }
 
 
-def log_ratio_reduction(trial: Trial) -> float:
-    """Return the decrease of the sum of |ln σ ratio| by a re-run (:func:`log_ratio_sum`)."""
-    return log_ratio_sum(trial.before) - log_ratio_sum(trial.after)
+def compute_log_ratio_reduction(trial: Trial) -> float:
+    return compute_log_ratio_sum(trial.before) - compute_log_ratio_sum(trial.after)
 
 
-def sigma_ratio_changes(trial: Trial) -> list[tuple[Reference, float, float]]:
-    """Return the σ ratios before and after the change, against "source" and against "truth".
+def compare_sigma_ratios(trial: Trial) -> list[tuple[Reference, float, float]]:
+    """Return (reference, ratio before, ratio after) of actual to reported σ for each reference.
 
-    An element is (reference, σ ratio before, σ ratio after).
+    The reference is "source" (ratio from innovations) or "truth" (from errors).
     """
-    ratios_before, ratios_after = sigma_ratios(trial.before), sigma_ratios(trial.after)
+    ratios_before, ratios_after = (
+        compute_sigma_ratios(trial.before),
+        compute_sigma_ratios(trial.after),
+    )
     return [
         (reference, ratios_before[reference], ratios_after[reference])
         for reference in ratios_before.keys() & ratios_after.keys()
@@ -248,16 +255,16 @@ def becomes_consistent(trial: Trial) -> bool:
     return any(
         classify_sigma_ratio(before, reference) != "consistent"
         and classify_sigma_ratio(after, reference) == "consistent"
-        for reference, before, after in sigma_ratio_changes(trial)
+        for reference, before, after in compare_sigma_ratios(trial)
     )
 
 
 def halves_discrepancy(trial: Trial) -> bool:
-    """Return True if a re-run halves |ln σ ratio| of an inconsistent filter."""
+    """Return True if a re-run halves |ln(actual / reported σ)| of an inconsistent filter."""
     return any(
         classify_sigma_ratio(before, reference) != "consistent"
         and abs(math.log(after)) <= 0.5 * abs(math.log(before))
-        for reference, before, after in sigma_ratio_changes(trial)
+        for reference, before, after in compare_sigma_ratios(trial)
     )
 
 
@@ -269,7 +276,7 @@ def remains_overconfident(trial: Trial) -> bool:
         == classify_sigma_ratio(after, reference)
         == "overconfident"
         and math.log(after) > MAX_REMAINING_ERROR_FRACTION * math.log(before)
-        for reference, before, after in sigma_ratio_changes(trial)
+        for reference, before, after in compare_sigma_ratios(trial)
     )
 
 
@@ -287,9 +294,9 @@ def find_trial(
             if trial.filter == filter_name
             and trial.kinds == (kind,)
             and (not name or name in trial.change)
-            and improvement(trial) != "nothing"
+            and classify_improvement(trial) != "nothing"
         ),
-        key=preference_key,
+        key=compute_preference_key,
         default=None,
     )
 
@@ -297,41 +304,45 @@ def find_trial(
 def has_effect(trial: Trial) -> bool:
     """Return True if a re-run changes a σ ratio by 10 % or the position RMSE by 5 %."""
     if any(
-        not 1.0 / MIN_RATIO_CHANGE <= after / before <= MIN_RATIO_CHANGE
-        for _, before, after in sigma_ratio_changes(trial)
+        not 1.0 / MIN_SIGMA_RATIO_FACTOR <= after / before <= MIN_SIGMA_RATIO_FACTOR
+        for _, before, after in compare_sigma_ratios(trial)
     ):
         return True
     rmse_before_m, rmse_after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
     return bool(
-        rmse_before_m and rmse_after_m and abs(rmse_after_m / rmse_before_m - 1.0) > MIN_RMSE_CHANGE
+        rmse_before_m
+        and rmse_after_m
+        and abs(rmse_after_m / rmse_before_m - 1.0) > MIN_RMSE_CHANGE_FRACTION
     )
 
 
 def can_show_improvement(trial: Trial) -> bool:
     """Return True if a re-run could show an improvement.
 
-    This requires ground truth or a σ ratio that is inconsistent before the change.
+    This requires ground truth, or a filter that is inconsistent before the change.
     """
     return trial.before.position_rmse_m is not None or any(
         classify_sigma_ratio(before, reference) != "consistent"
-        for reference, before, _ in sigma_ratio_changes(trial)
+        for reference, before, _ in compare_sigma_ratios(trial)
     )
 
 
-def improvement(trial: Trial) -> Improvement:
+def classify_improvement(trial: Trial) -> Improvement:
     """Return the quantities that a re-run improves: position, σ, both or nothing.
 
     Position: the RMSE decreases by at least 20 %. σ: a σ ratio becomes consistent or its |ln| is
     halved, and no σ ratio becomes worse.
     """
-    before_m, after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
+    rmse_before_m, rmse_after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
     is_position_better = bool(
-        before_m and after_m is not None and after_m <= (1.0 - POSITION_IMPROVEMENT) * before_m
+        rmse_before_m
+        and rmse_after_m is not None
+        and rmse_after_m <= (1.0 - MIN_RMSE_REDUCTION) * rmse_before_m
     )
     is_sigma_better = (becomes_consistent(trial) or halves_discrepancy(trial)) and all(
         abs(math.log(after)) <= abs(math.log(before))
         or classify_sigma_ratio(after, reference) == "consistent"
-        for reference, before, after in sigma_ratio_changes(trial)
+        for reference, before, after in compare_sigma_ratios(trial)
     )
     if is_position_better:
         return "position and σ" if is_sigma_better else "position"

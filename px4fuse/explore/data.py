@@ -14,7 +14,7 @@ from px4fuse.card.model import RATIO_AXIS_ENDS
 from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
 from px4fuse.comparison.preparation import shift_clock
-from px4fuse.comparison.remedy import aid_of
+from px4fuse.comparison.remedy import find_aid
 from px4fuse.explore.packing import COARSE_SCALE, Packer
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL, CONSISTENT_SIGMA_RATIOS
 from px4fuse.filter.model import INITIAL_COVARIANCE
@@ -52,7 +52,7 @@ def flight_data(analysis: Analysis, packer: Packer) -> PageData:
         "events": {
             "gap": events.gaps,
             "dropout": events.dropouts,
-            "ground": events.ground,
+            "ground": events.ground_spans_s,
             "reset": list(events.resets_s),
         },
         "command": _command_data(request, analysis),
@@ -256,7 +256,7 @@ def _ml_noises_by_axis(analysis: Analysis) -> PageData:
 
 def _ekf2_settings(analysis: Analysis) -> dict[str, str]:
     """Return the EKF2 parameters for noise, delay and gate of the position source, with units."""
-    aid, logged_parameters = aid_of(analysis), analysis.flight.log.parameters
+    aid, logged_parameters = find_aid(analysis), analysis.flight.log.parameters
     return {
         name: f"{logged_parameters[name]:.4g} {PARAMETERS[name].unit}".rstrip()
         for name in (aid.noise, aid.delay, aid.gate)

@@ -7,7 +7,7 @@ the files to change for a new finding.
 from collections.abc import Mapping
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.flight_events import airborne_spans
+from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import Finding, Severity
@@ -99,7 +99,7 @@ def find_aids(
             message = f"The GNSS receiver had no position: {item.reason}."
             findings.append(warning("source_without_position", message, item.remedy))
     if flight is not None and isinstance(flight.ekf2, Ekf2):
-        spans_s = airborne_spans(flight) or ((0.0, flight.log.duration_s),)
+        spans_s = find_airborne_spans(flight) or ((0.0, flight.log.duration_s),)
         segment = Segment(spans_s[0][0], spans_s[-1][1], "")
         findings += ekf2_resets.detect_instance_switches(
             flight.ekf2, (segment.start_s, segment.end_s)

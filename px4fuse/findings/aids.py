@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import position_errors
-from px4fuse.comparison.flight_events import airborne_spans
+from px4fuse.comparison.comparison import compute_position_errors
+from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_number, format_ratio
 from px4fuse.ekf2.aids import CHANGE_WINDOW_S, AidResult
@@ -45,7 +45,7 @@ def detect(analysis: Analysis) -> Findings:
     if isinstance(analysis.aids, Unavailable):
         return
     aid = analysis.source.origin.aid
-    take_off_s = [start_s for start_s, _ in airborne_spans(analysis.flight)]
+    take_off_s = [start_s for start_s, _ in find_airborne_spans(analysis.flight)]
     barometer = analysis.aids.get(BAROMETER.name)
     height_error_m = _large_height_error_m(analysis, barometer.longest_gap_s) if barometer else None
     yield from detect_in_aids(analysis.aids, aid.name if aid else "", take_off_s, height_error_m)
@@ -208,7 +208,7 @@ def _biased_finding(name: str, aid: AidResult) -> Finding:
 
 def _large_height_error_m(analysis: Analysis, span_s: Span) -> float | None:
     down_comparison = analysis.axes.get("down")
-    errors = None if down_comparison is None else position_errors(down_comparison, "ekf2")
+    errors = None if down_comparison is None else compute_position_errors(down_comparison, "ekf2")
     if errors is None or isinstance(errors, Unavailable):
         return None
     error_m = errors["error_m"].abs()

@@ -5,14 +5,14 @@ from collections.abc import Mapping
 from px4fuse.analysis import Analysis
 from px4fuse.comparison import changes, trials
 from px4fuse.comparison.model import FilterName
-from px4fuse.comparison.remedy import aid_of, different_settings, format_settings
+from px4fuse.comparison.remedy import find_aid, format_settings, select_changed_settings
 from px4fuse.comparison.trials import (
     Statistic,
     Trial,
+    brings_inside_limits,
     can_show_improvement,
-    explained_fraction,
-    improvement,
-    is_sufficient,
+    classify_improvement,
+    compute_explained_fraction,
     makes_overconfident,
 )
 from px4fuse.filter.frame_rotation import HeadingError
@@ -28,7 +28,7 @@ def kind_of_cause(analysis: Analysis, cause: Trial | None) -> str:
     """Return the kind of fault that a re-run corrects, such as "measurement noise"."""
     if cause is None:
         return kinds.ELSEWHERE
-    aid = aid_of(analysis)
+    aid = find_aid(analysis)
     kind_by_change = {
         trials.OUTLIERS: kinds.OUTLIERS,
         trials.CLOCK_OFFSET: kinds.CLOCK,
@@ -49,15 +49,15 @@ def is_refuted(analysis: Analysis, filter_name: FilterName, cause: Trial) -> boo
     return any(
         (trial.filter, trial.change) == (filter_name, cause.change)
         and can_show_improvement(trial)
-        and improvement(trial) == "nothing"
+        and classify_improvement(trial) == "nothing"
         for trial in analysis.select_main_trials()
     )
 
 
 def format_change(analysis: Analysis, cause: Trial) -> str:
     """Format the changes of a re-run: "SIGMA_Z 0.1 m instead of 0.05 m"."""
-    change = different_settings(cause.change, _flown_settings(analysis))
-    names = change.keys() - trials.ACCOMPANYING_CHANGES or change
+    change = select_changed_settings(cause.change, _flown_settings(analysis))
+    names = change.keys() - trials.SECONDARY_CHANGE_KEYS or change
     return " and ".join(
         _format_one_change(analysis, cause, name) for name in cause.change if name in names
     )
@@ -72,9 +72,9 @@ def format_explained_fraction(cause: Trial, statistic: Statistic) -> str:
     """Format the fraction of ln(mean NIS) or ln(mean NEES) that a change removes."""
     if makes_overconfident(cause, statistic):
         return "contradicts ground truth"
-    if statistic != "difference" and is_sufficient(cause, statistic):
+    if statistic != "difference" and brings_inside_limits(cause, statistic):
         return "all"
-    fraction = explained_fraction(cause, statistic)
+    fraction = compute_explained_fraction(cause, statistic)
     if fraction > 1.0:
         return "too much"
     return format_percent(fraction) if fraction > 0.0 else "nothing"
@@ -97,9 +97,9 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
         )
     if (offset_s := change.pop(trials.CLOCK_OFFSET, None)) is not None:
         actions.append(f"{format_shift(offset_s)} the position timestamps before sending.")
-    settings = {name: change.pop(name) for name in changes.SETTING_CHANGES & change.keys()}
+    settings = {name: change.pop(name) for name in changes.CHANGED_KF_SETTINGS & change.keys()}
     if change:
-        change = different_settings(change, _flown_settings(analysis))
+        change = select_changed_settings(change, _flown_settings(analysis))
         actions.append(f"Set {format_settings(change)}.")
     if settings:
         actions.append(format_kf_settings(settings))

@@ -4,13 +4,13 @@ import math
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.remedy import (
-    aid_of,
-    different_settings,
+    find_aid,
+    find_used_noise_m,
     format_settings,
-    height_noise_advice,
-    noise_used_m,
+    make_height_noise_advice,
+    select_changed_settings,
 )
-from px4fuse.comparison.trials import Trial, find_trial, sigma_ratio_changes
+from px4fuse.comparison.trials import Trial, compare_sigma_ratios, find_trial
 from px4fuse.core.text import format_factor
 from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -28,12 +28,12 @@ MIN_NAMED_REJECTION = 0.05
 
 def detect(analysis: Analysis) -> Findings:
     """Detect a wrong noise parameter of EKF2, if EKF2 is consistent with the estimated noise."""
-    trial, aid = confirmed_noise_trial(analysis), aid_of(analysis)
+    trial, aid = confirmed_noise_trial(analysis), find_aid(analysis)
     if trial is None:
         return
     assert not isinstance(analysis.ekf2_model, Unavailable)
     inputs = analysis.ekf2_model.inputs
-    flown_m, estimate_m = noise_used_m(inputs), trial.change[aid.noise]
+    flown_m, estimate_m = find_used_noise_m(inputs), trial.change[aid.noise]
     # EKF2 uses the reported σ or the noise parameter, the larger one
     is_reported = flown_m > inputs.settings[aid.noise]
     ratio, is_small = estimate_m / flown_m, estimate_m > flown_m
@@ -83,8 +83,9 @@ def detect(analysis: Analysis) -> Findings:
         f"{title}. {name} is {flown_m:.3g} m{source_text}; the maximum-likelihood estimate is "
         f"{estimate_m:.3g} m{interval_text}. "
         f"{reason}{f' KF takes SIGMA_Z from {aid.noise}.' if has_kf_same_noise else ''}",
-        f"Set {format_settings(different_settings(trial.change, inputs.settings))}{report_text}."
-        f"{height_noise_advice(analysis, analysis.tuning, estimate_m)}",
+        f"Set {format_settings(select_changed_settings(trial.change, inputs.settings))}"
+        f"{report_text}."
+        f"{make_height_noise_advice(analysis, analysis.tuning, estimate_m)}",
         {
             "flown_m": flown_m,
             "estimate_m": estimate_m,
@@ -96,11 +97,11 @@ def detect(analysis: Analysis) -> Findings:
 
 def confirmed_noise_trial(analysis: Analysis) -> Trial | None:
     """Return a re-run in which another EKF2 measurement noise makes EKF2 consistent, or None."""
-    trial = find_trial(analysis.select_main_trials(), "ekf2", "noise", aid_of(analysis).noise)
+    trial = find_trial(analysis.select_main_trials(), "ekf2", "noise", find_aid(analysis).noise)
     is_confirmed = trial is not None and any(
         classify_sigma_ratio(ratio_before, reference) != "consistent"
         and classify_sigma_ratio(ratio_after, reference) == "consistent"
-        for reference, ratio_before, ratio_after in sigma_ratio_changes(trial)
+        for reference, ratio_before, ratio_after in compare_sigma_ratios(trial)
         if reference == "source"
     )
     return trial if is_confirmed else None

@@ -4,8 +4,8 @@ import math
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import AxisComparison
-from px4fuse.comparison.remedy import aid_of
-from px4fuse.comparison.trials import Trial, improvement, preference_key
+from px4fuse.comparison.remedy import find_aid
+from px4fuse.comparison.trials import Trial, classify_improvement, compute_preference_key
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_text import format_action
 from px4fuse.findings.model import (
@@ -40,7 +40,7 @@ def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> F
         # Probability that both innovations, north and east, are inside the gate: erf(gate/√2)²
         expected_fraction = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
         if expected_fraction >= REJECTED_FRACTION_WARNING:
-            aid = aid_of(analysis)
+            aid = find_aid(analysis)
             rejected_fraction = float(rejections[0].evidence["rejected_fraction"])
             yield finding(
                 rejections[0].severity,
@@ -85,12 +85,12 @@ def _detect_rejections(analysis: Analysis) -> Findings:
 
 
 def _rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
-    aid = aid_of(analysis, result.axis.name)
+    aid = find_aid(analysis, result.axis.name)
     helpful_trials = [
         trial for trial in analysis.select_main_trials() if _prevents_rejections(trial)
     ]
     if helpful_trials and result is analysis.main:
-        return format_action(analysis, min(helpful_trials, key=preference_key).change)
+        return format_action(analysis, min(helpful_trials, key=compute_preference_key).change)
     return (
         f"Check {source_words(analysis.source).reception}. Then check {aid.delay} and {aid.noise}. "
         f"Increase {aid.gate} last."
@@ -99,6 +99,10 @@ def _rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
 
 def _prevents_rejections(trial: Trial) -> bool:
     rejected_before, rejected_after = trial.before.rejected_fraction, trial.after.rejected_fraction
-    if rejected_before is None or rejected_after is None or improvement(trial) == "nothing":
+    if (
+        rejected_before is None
+        or rejected_after is None
+        or classify_improvement(trial) == "nothing"
+    ):
         return False
     return len(trial.kinds) == 1 and rejected_after < MAX_REJECTED_RATIO * rejected_before

@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.flight_events import airborne_spans
-from px4fuse.comparison.projection import continuous_state
+from px4fuse.comparison.flight_events import find_airborne_spans
+from px4fuse.comparison.projection import remove_origin_resets
 from px4fuse.core.record import Span
 from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, GAP
 from px4fuse.findings.model import Findings, finding, format_count, warning, zero_length_spans
@@ -50,7 +50,7 @@ def detect(analysis: Analysis) -> Findings:
             for reset in reported_resets
         )
         largest_reset_s = reported_resets[int(np.argmax(sizes_m))].time_s
-        _, reset_treatment = continuous_state(ekf2, analysis.source, analysis.segment)
+        _, reset_treatment = remove_origin_resets(ekf2, analysis.source, analysis.segment)
         if reset_treatment:
             reset_treatment = f" In the comparison: {reset_treatment}."
         yield finding(
@@ -89,5 +89,5 @@ def detect_instance_switches(ekf2: Ekf2, span_s: Span) -> Findings:
 def _is_take_off_height_reset(analysis: Analysis, reset: Reset) -> bool:
     return not any(reset.delta[:2]) and any(
         start_s <= reset.time_s <= start_s + TAKE_OFF_S
-        for start_s, _ in airborne_spans(analysis.flight)
+        for start_s, _ in find_airborne_spans(analysis.flight)
     )

@@ -10,16 +10,16 @@ from typing import NamedTuple
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import position_errors
+from px4fuse.comparison.comparison import compute_position_errors
 from px4fuse.comparison.model import (
     FILTER_NAMES,
     Comparison,
     ErrorsAgainstTruth,
     FilterName,
-    north_and_east,
+    select_north_and_east,
 )
-from px4fuse.comparison.reruns import ErrorAboveSigma, error_above_reported_sigma
-from px4fuse.comparison.trials import Trial, find_cause
+from px4fuse.comparison.reruns import ErrorAboveSigma, find_error_above_sigma
+from px4fuse.comparison.trials import Trial, find_cause_trial
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -82,7 +82,7 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
         (filter_name, name, error)
         for name, result in comparison.axes.items()
         for filter_name, summary in result.filters.items()
-        if (error := error_above_reported_sigma(summary))
+        if (error := find_error_above_sigma(summary))
         and (
             filter_name == "ekf2"
             or (error.rmse_m > frame_error_m and not (is_frame_fitted and name == "down"))
@@ -118,7 +118,7 @@ def make_hidden_error_finding(
                 f"{filter_name}_position_rmse_m": hidden_error.rmse_m,
                 f"{filter_name}_sigma_p_m": hidden_error.reported_sigma_m,
             }
-            cause = find_cause(analysis.trials, filter_name, axis, "nees")
+            cause = find_cause_trial(analysis.trials, filter_name, axis, "nees")
             if cause is not None and not is_refuted(analysis, filter_name, cause):
                 cause_by_filter[filter_name] = cause
             ratio_by_filter[label] = hidden_error.nees**0.5
@@ -229,8 +229,8 @@ def _rmse_after_alignment(comparison: Comparison, filter_name: FilterName) -> Al
     The alignment is a shift and a rotation about the vertical axis.
     """
     axis_errors_m, true_positions_m = [], []
-    for result in north_and_east(comparison):
-        errors, truth = position_errors(result, filter_name), result.truth
+    for result in select_north_and_east(comparison):
+        errors, truth = compute_position_errors(result, filter_name), result.truth
         if isinstance(errors, Unavailable) or isinstance(truth, Unavailable):
             return None
         axis_errors_m.append(errors["error_m"])

@@ -10,16 +10,16 @@ import numpy as np
 from msgspec import structs
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.changes import MIN_RERUN_SIGMA_Z_M, SIGMA_A, SIGMA_Z, tuning_of_axis
-from px4fuse.comparison.estimates import first_axis_tuning
+from px4fuse.comparison.changes import MIN_RERUN_SIGMA_Z_M, SIGMA_A, SIGMA_Z, find_axis_tuning
+from px4fuse.comparison.estimates import find_first_tuning
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, FilterName, FilterSummary
 from px4fuse.comparison.projection import EKF2_MIN_NOISE_M
-from px4fuse.comparison.remedy import aid_of, format_settings, noise_change
+from px4fuse.comparison.remedy import find_aid, format_settings, make_noise_change
 from px4fuse.comparison.reruns import is_inconsistent
 from px4fuse.comparison.trials import (
     Trial,
     can_show_improvement,
-    find_cause,
+    find_cause_trial,
     find_trial,
     find_trials,
     makes_overconfident,
@@ -118,7 +118,7 @@ def detect(analysis: Analysis) -> Findings:
 
 def detect_wrong_settings(analysis: Analysis) -> Findings:
     """Detect a SIGMA_A or SIGMA_Z that differs significantly from its estimate."""
-    axis_tuning = first_axis_tuning(analysis.tuning, HORIZONTAL, "aisle", "down")
+    axis_tuning = find_first_tuning(analysis.tuning, HORIZONTAL, "aisle", "down")
     if axis_tuning is None:
         return
     settings = {SIGMA_Z: analysis.settings.sigma_z_m, SIGMA_A: analysis.settings.sigma_a_m_s2}
@@ -239,7 +239,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
         if time_constant_s < MIN_TIME_CONSTANT_S:
             continue
         sigma_a = analysis.settings.sigma_a_m_s2
-        axis_tuning = tuning_of_axis(analysis.tuning, result.axis.name)
+        axis_tuning = find_axis_tuning(analysis.tuning, result.axis.name)
         title, estimate_text = f"Process noise SIGMA_A is almost zero ({sigma_a:g} m/s²)", ""
         action = "Increase SIGMA_A (--sigma-a)."
         if axis_tuning is not None and (ml_sigma_a := axis_tuning.sigma_a_two_state.value):
@@ -290,7 +290,7 @@ def _variance_finding(
     severity: Severity = "error" if sigma_factor >= MIN_SIGMA_FACTOR_ERROR else "warning"
     if _has_default_noises(analysis, filter_name, result):
         severity = lower_severity(severity)
-    axis_tuning = tuning_of_axis(analysis.tuning, result.axis.name)
+    axis_tuning = find_axis_tuning(analysis.tuning, result.axis.name)
     confidence = "underconfident" if is_underconfident else "overconfident"
     if is_underconfident and analysis.source.origin.may_drift:
         severity, remedy_text, cause = "note", KEEP_NOISES_DRIFT, ELSEWHERE
@@ -315,7 +315,7 @@ def _variance_finding(
     ):
         remedy_text, cause = KEEP_NOISES_TRUTH, ELSEWHERE
     else:
-        rerun = find_cause(analysis.trials, filter_name, result.axis.name)
+        rerun = find_cause_trial(analysis.trials, filter_name, result.axis.name)
         cause = kind_of_cause(analysis, rerun)
         remedy_text = _variance_remedy(analysis, filter_name, result, axis_tuning, rerun)
         severity = "note" if remedy_text == KEEP_NOISES_TRUTH else severity
@@ -339,13 +339,13 @@ def _variance_finding(
 
 
 def _format_excessive_noise(analysis: Analysis) -> str:
-    name = aid_of(analysis).noise
+    name = find_aid(analysis).noise
     parameter_m = analysis.flight.log.parameters.get(name, float("nan"))
     reported_variance = cut_to_segment(analysis.source.samples, analysis.segment)[
         Columns.POSITION_VARIANCE[0]
     ]
     reported_m = float(np.sqrt(reported_variance.median()))
-    horizontal_tuning = first_axis_tuning(analysis.tuning, HORIZONTAL)
+    horizontal_tuning = find_first_tuning(analysis.tuning, HORIZONTAL)
     noise_m = max(
         reported_m, (horizontal_tuning.sigma_z.value if horizontal_tuning else None) or 0.0
     )
@@ -379,7 +379,7 @@ def _has_default_noises(
         return all(
             getattr(settings, name) == getattr(defaults, name) for name in (SIGMA_Z, SIGMA_A)
         )
-    noise_parameter = aid_of(analysis, result.axis.name).noise
+    noise_parameter = find_aid(analysis, result.axis.name).noise
     log = analysis.flight.log
     default = log.default_of(noise_parameter)
     is_parameter_default = log.parameters.get(noise_parameter, default) == default
@@ -411,7 +411,7 @@ def _variance_remedy(
 def _variance_remedy_without_replay(
     analysis: Analysis, result: AxisComparison, axis_tuning: AxisTuning
 ) -> str:
-    aid, noise = aid_of(analysis, result.axis.name), axis_tuning.sigma_z
+    aid, noise = find_aid(analysis, result.axis.name), axis_tuning.sigma_z
     summary = result.filters["ekf2"]
     assert not isinstance(summary, Unavailable)
     if not (ml_noise_m := noise.value or noise.high):
@@ -425,7 +425,7 @@ def _variance_remedy_without_replay(
         )
         changes = {
             name: value
-            for name, value in noise_change(
+            for name, value in make_noise_change(
                 aid, parameters, ekf2_sigma_m * uses_reported_noise, noise_m
             ).items()
             if value != parameters.get(name)

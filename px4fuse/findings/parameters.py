@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import position_errors
-from px4fuse.comparison.remedy import aid_of
+from px4fuse.comparison.comparison import compute_position_errors
+from px4fuse.comparison.remedy import find_aid
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.consistency import assess_innovations
 from px4fuse.findings.model import Findings, note, warning
@@ -32,7 +32,7 @@ class PartConsistency(NamedTuple):
 def detect(analysis: Analysis) -> Findings:
     """Detect EKF2 parameters that are changed in flight and that px4fuse uses."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment
-    fusion_parameters = (aid_of(analysis).switch, AID_MASK)
+    fusion_parameters = (find_aid(analysis).switch, AID_MASK)
     changes = [
         change
         for change in (ekf2.parameter_changes if isinstance(ekf2, Ekf2) else ())
@@ -86,7 +86,7 @@ def _differ_significantly(before: float, after: float) -> bool:
 
 def _assess_part(analysis: Analysis, start_s: float, end_s: float) -> PartConsistency:
     unknown, rmse_m = float("nan"), float("nan")
-    errors = position_errors(analysis.main, "ekf2")
+    errors = compute_position_errors(analysis.main, "ekf2")
     if not isinstance(errors, Unavailable):
         rmse_m = float(np.sqrt((errors["error_m"].loc[start_s:end_s] ** 2).mean()))
     innovations = analysis.main.ekf2_innovations

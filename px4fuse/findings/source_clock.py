@@ -120,8 +120,8 @@ def _offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
     if analysis.source.alignment is not None:
         option_s = clock_offset_option_s(analysis, time_offset)
         return f"Run again with --clock-offset {option_s:.3f}."
-    age_ms = (remedy.delay_ms(analysis) or 0.0) - 1e3 * time_offset.remaining_s
-    horizon_parameters = remedy.horizon_change(analysis.flight.log.parameters, age_ms)
+    age_ms = (remedy.find_logged_delay_ms(analysis) or 0.0) - 1e3 * time_offset.remaining_s
+    horizon_parameters = remedy.make_delay_max_change(analysis.flight.log.parameters, age_ms)
     delay_action = (
         f", and set {remedy.format_settings(horizon_parameters)}" if horizon_parameters else ""
     )
@@ -138,9 +138,12 @@ def clock_offset_option_s(comparison: PreparedComparison, time_offset: ClockOffs
 
 def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings:
     # For GNSS, the time offset already includes an error of EKF2_GPS_DELAY
-    delay_ms = remedy.delay_ms(analysis) if analysis.source.origin.is_vision else None
+    delay_ms = remedy.find_logged_delay_ms(analysis) if analysis.source.origin.is_vision else None
     ml_delay_ms = -1e3 * time_offset.offset_s
-    if delay_ms is None or remedy.wrong_delay_ms(analysis, time_offset, delay_ms) is None:
+    if (
+        delay_ms is None
+        or remedy.estimate_delay_if_wrong_ms(analysis, time_offset, delay_ms) is None
+    ):
         return
     low_ms, high_ms = (-1e3 * end_s for end_s in reversed(time_offset.interval_s))
     interval_low_ms, interval_high_ms, delay_size_ms = (
@@ -158,7 +161,7 @@ def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings
         )
     else:
         delay_text = f"the positions are {delay_size_ms} ms late"
-    limit_text = remedy.delay_limit("EKF2_EV_DELAY", ml_delay_ms, delay_ms)
+    limit_text = remedy.describe_delay_limit("EKF2_EV_DELAY", ml_delay_ms, delay_ms)
     yield warning(
         "ekf2_ev_delay_wrong",
         f"EKF2_EV_DELAY is {delay_ms:g} ms, but {delay_text}. The 95 % interval is "
@@ -175,7 +178,7 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
     ekf2_model = analysis.ekf2_model
     if isinstance(ekf2_model, Unavailable) or not ekf2_model.agreement.good:
         return
-    estimate = remedy.wrong_gnss_delay_ms(ekf2_model)
+    estimate = remedy.estimate_gnss_delay_ms(ekf2_model)
     if estimate is None:
         return
     delay_ms, (ml_delay_ms, sigma_ms) = ekf2_model.inputs.settings[GNSS_POS.delay], estimate

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.remedy import aid_of, format_settings
+from px4fuse.comparison.remedy import find_aid, format_settings
 from px4fuse.core.text import lower_first
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
@@ -142,7 +142,7 @@ def _gnss_heading_fault(analysis: Analysis) -> tuple[str, str]:
     """Return the possible cause of a wrong heading in a flight with GNSS, and the action."""
     if (trial := confirmed_noise_trial(analysis)) is not None:
         cause = (
-            f"the wrong {aid_of(analysis).noise}: it determines the influence of GNSS on EKF2's "
+            f"the wrong {find_aid(analysis).noise}: it determines the influence of GNSS on EKF2's "
             "heading"
         )
         return cause, f"Set {format_settings(trial.change)}. Then check the heading again."

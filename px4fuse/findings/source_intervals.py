@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.comparison import reported_sigma
-from px4fuse.comparison.flight_events import max_interval_s
+from px4fuse.comparison.comparison import interpolate_sigma
+from px4fuse.comparison.flight_events import compute_max_interval_s
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
@@ -150,7 +150,7 @@ def _ekf2_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
         if isinstance(tracks.truth, pd.DataFrame):
             true_positions = tracks.truth["position_m"]
             true_m = np.interp(time_s, true_positions.index, true_positions, np.nan, np.nan)
-        sigma_m = reported_sigma(time_s, tracks.ekf2_variance, "position_variance_m2")
+        sigma_m = interpolate_sigma(time_s, tracks.ekf2_variance, "position_variance_m2")
         squares_m2.append([(position_m - true_m) ** 2, sigma_m**2])
     sums_m2 = zip(("error_m", "sigma_m"), np.sum(squares_m2, axis=0), strict=True)
     return {
@@ -300,7 +300,7 @@ def _position_intervals_s(analysis: Analysis) -> tuple[Array, float]:
         cut_to_segment(analysis.source.samples, analysis.segment).index.to_numpy()
     )
     median_interval_s = float(np.median(intervals_s)) if len(intervals_s) else np.nan
-    return intervals_s[intervals_s <= max_interval_s(median_interval_s)], median_interval_s
+    return intervals_s[intervals_s <= compute_max_interval_s(median_interval_s)], median_interval_s
 
 
 def _find_period(intervals_s: Array) -> tuple[float, Array] | None:

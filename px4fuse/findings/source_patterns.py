@@ -10,14 +10,14 @@ from scipy import constants
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.error_patterns import (
     ErrorFit,
-    WhiteErrors,
+    LocalResiduals,
+    compute_local_residuals,
     find_attitude_delay,
     find_offset_variation,
     find_periodic_error,
     find_speed_noise,
     find_timestamp_jitter,
     fit_errors,
-    white_errors,
 )
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.time_offset import ClockOffset
@@ -48,7 +48,11 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_attitude_delay(analysis)
     bursts = [*detect_bursts(analysis)]
     yield from bursts
-    white = None if bursts or analysis.source.origin.reconstructed else white_errors(analysis)
+    white = (
+        None
+        if bursts or analysis.source.origin.reconstructed
+        else compute_local_residuals(analysis)
+    )
     if white is None:
         return
     yield from detect_white_patterns(analysis, white)
@@ -59,7 +63,7 @@ def detect(analysis: Analysis) -> Findings:
             yield from detect_scale_error(analysis, error_fit)
 
 
-def detect_white_patterns(analysis: Analysis, white: WhiteErrors) -> Findings:
+def detect_white_patterns(analysis: Analysis, white: LocalResiduals) -> Findings:
     jitter_s, clock_map = find_timestamp_jitter(white), analysis.source.clock_map
     if jitter_s is not None and (clock_map is None or clock_map.distinct_stamps is None):
         yield (error if jitter_s >= MIN_JITTER_ERROR_S else warning)(

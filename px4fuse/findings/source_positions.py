@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.model import Comparison, north_and_east
+from px4fuse.comparison.model import Comparison, select_north_and_east
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_factor, format_metres
 from px4fuse.ekf2.fusion_conditions import constant_coordinates, is_height_only
@@ -453,7 +453,7 @@ def outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, s
 
     The reference is ground truth or, without it, the neighbouring positions.
     """
-    axes = north_and_east(analysis) or [analysis.main]
+    axes = select_north_and_east(analysis) or [analysis.main]
     has_truth = all(isinstance(result.truth, pd.DataFrame) for result in axes)
     squares_m2 = np.zeros(len(outlier_time_s))
     for result in axes:
@@ -530,7 +530,7 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
 
 def _rmse_per_axis_m(analysis: Analysis) -> float | None:
     mean_squares_m2 = []
-    for result in north_and_east(analysis):
+    for result in select_north_and_east(analysis):
         if isinstance(result.truth, Unavailable):
             return None
         true_positions, axis = result.truth["position_m"].dropna(), result.axis

@@ -7,8 +7,8 @@ import pandas as pd
 from scipy.interpolate import CubicHermiteSpline
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.flight_events import max_interval_s
-from px4fuse.comparison.remedy import aid_of, format_settings, is_source_fused
+from px4fuse.comparison.flight_events import compute_max_interval_s
+from px4fuse.comparison.remedy import find_aid, format_settings, is_source_fused
 from px4fuse.convention.lever_arm import estimate_lever_arm
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Span
@@ -109,7 +109,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         if len(spans) <= 3:
             times = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
         error_text, make_finding = "", note if reason == "NaN" else warning
-        if duration_s > max_interval_s(1.0 / source.compute_rate_hz()):
+        if duration_s > compute_max_interval_s(1.0 / source.compute_rate_hz()):
             make_finding = warning
             valid_times_s = _valid_times_around(analysis, longest_span_s)
             error_text = f" {describe_errors_after_gap(analysis, valid_times_s)}"
@@ -173,7 +173,7 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     lever_arm_m = (
         np.add(source.lever_arm_m[:2], lever_arm[:2]).round(2) + 0.0
     )  # + 0.0 removes a sign of zero
-    change = dict(zip(aid_of(analysis).lever_arm, lever_arm_m.tolist(), strict=False))
+    change = dict(zip(find_aid(analysis).lever_arm, lever_arm_m.tolist(), strict=False))
     effect_sentence = _replayed_effect(analysis, change)
     if effect_sentence is None:
         return

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison.comparison import project_tracks
-from px4fuse.comparison.flight_events import max_interval_s
+from px4fuse.comparison.flight_events import compute_max_interval_s
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.preparation import prepare, select_innovations
 from px4fuse.comparison.projection import project_innovations
@@ -275,7 +275,7 @@ def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
     limit_s = (
         max(MIN_IMU_GAP_S, MIN_IMU_GAP_INTERVALS * float(np.median(intervals_s)))
         if is_imu
-        else float(max_interval_s(1.0 / sample_rate(samples)))
+        else float(compute_max_interval_s(1.0 / sample_rate(samples)))
     )
     long_intervals_s = intervals_s[intervals_s > limit_s]
     return Gaps(

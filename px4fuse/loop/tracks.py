@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.preparation import prepare
-from px4fuse.comparison.projection import continuous_state
+from px4fuse.comparison.projection import remove_origin_resets
 from px4fuse.core.arrays import Array
 from px4fuse.core.reading import display_name, read_head, split_path_and_part
 from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
@@ -94,7 +94,7 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
     source = next((t for t in flight.positions if t.origin.is_vision), None)
     if source is not None:
         segment = Segment(0.0, flight.log.duration_s, "")
-        state, resets = continuous_state(track_data, source, segment)
+        state, resets = remove_origin_resets(track_data, source, segment)
         notes += [resets] if resets else []
     return _make_trajectory(flight, track_name, state, flight.attitude, tuple(notes))
 

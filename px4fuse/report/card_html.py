@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.build import build_card, describe_axis
-from px4fuse.card.model import RATIO_AXIS_TICKS, Card, Verdict, axis_fraction
+from px4fuse.card.model import RATIO_AXIS_TICKS, Card, Verdict, map_ratio_to_axis
 from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_ratio
@@ -85,7 +85,7 @@ def sigma_ratio_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> 
         percent=_axis_percent,
         alternative=alternative_text(verdicts),
         ticks=[
-            (_axis_percent(axis_fraction(tick)), label, tick not in LABELLED_TICKS)
+            (_axis_percent(map_ratio_to_axis(tick)), label, tick not in LABELLED_TICKS)
             for tick, label in RATIO_AXIS_TICKS.items()
         ],
         limits=format_consistent_ratios(),

@@ -20,7 +20,7 @@ from px4fuse.card.model import (
     Cause,
     Rerun,
     Verdict,
-    axis_fraction,
+    map_ratio_to_axis,
 )
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_metres, format_ratio
@@ -205,19 +205,19 @@ def sigma_ratio_marks(
     Positions are fractions of the axis length. ``mark`` is "below" or "above" if the ratio is
     outside the axis.
     """
-    fraction = axis_fraction(ratio)
+    fraction = map_ratio_to_axis(ratio)
     return {
         "fraction": fraction,
         "mark": "below" if fraction < 0.0 else "above" if fraction > 1.0 else reference,
-        "band": [axis_fraction(end) for end in CONSISTENT_SIGMA_RATIOS[reference]],
+        "band": [map_ratio_to_axis(end) for end in CONSISTENT_SIGMA_RATIOS[reference]],
         "interval": [
-            axis_fraction(float(np.clip(end, *RATIO_AXIS_ENDS))) for end in interval or ()
+            map_ratio_to_axis(float(np.clip(end, *RATIO_AXIS_ENDS))) for end in interval or ()
         ],
     }
 
 
 def _axis_column(ratio: float) -> int:
-    return round(axis_fraction(ratio) * (AXIS_WIDTH - 1))
+    return round(map_ratio_to_axis(ratio) * (AXIS_WIDTH - 1))
 
 
 def _identity_lines(card: Card) -> Iterator[Line]:

@@ -4,7 +4,12 @@ from collections.abc import Iterable, Iterator
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
-from px4fuse.comparison.remedy import aid_of, delay_limit, delay_ms, wrong_delay_ms
+from px4fuse.comparison.remedy import (
+    describe_delay_limit,
+    estimate_delay_if_wrong_ms,
+    find_aid,
+    find_logged_delay_ms,
+)
 from px4fuse.convention.correction import convention_faults
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings import Finding
@@ -66,7 +71,7 @@ def clock_advice(
         )
         new_option_s = clock_offset_option_s(comparison, clock)
         advice_by_label["Re-run"] = f"px4fuse compare LOG --clock-offset {new_option_s:.3f}"
-    if (logged_ms := delay_ms(comparison)) is not None:
+    if (logged_ms := find_logged_delay_ms(comparison)) is not None:
         advice_by_label["PX4"] = _delay_advice(comparison, clock, logged_ms)
     if clock.has_changed():
         offset_texts = ", ".join(
@@ -91,10 +96,13 @@ def clock_advice(
 
 
 def _delay_advice(comparison: PreparedComparison, clock: ClockOffset, logged_ms: float) -> str:
-    name, fitted_delay_ms = aid_of(comparison).delay, wrong_delay_ms(comparison, clock, logged_ms)
+    name, fitted_delay_ms = (
+        find_aid(comparison).delay,
+        estimate_delay_if_wrong_ms(comparison, clock, logged_ms),
+    )
     if fitted_delay_ms is None:
         return f"{name} {logged_ms:g} ms agrees with the estimate."
-    if limit_text := delay_limit(name, fitted_delay_ms, logged_ms):
+    if limit_text := describe_delay_limit(name, fitted_delay_ms, logged_ms):
         return (
             f"The maximum-likelihood {name} is {fitted_delay_ms:.0f} ms, but {name} cannot "
             f"{limit_text}. Correct the sender's clock."

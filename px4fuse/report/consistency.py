@@ -11,7 +11,13 @@ import pandas as pd
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison
-from px4fuse.comparison.trials import DISCREPANCIES, Statistic, Trial, find_cause, find_trials
+from px4fuse.comparison.trials import (
+    DISCREPANCY_STATISTICS,
+    Statistic,
+    Trial,
+    find_cause_trial,
+    find_trials,
+)
 from px4fuse.core.text import format_number, format_p_value
 from px4fuse.filter.consistency import (
     MIN_INNOVATIONS,
@@ -120,10 +126,10 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 def _write_causes(page: Page, analysis: Analysis) -> None:
     axis = analysis.main.axis
     reruns_and_statistics: list[tuple[Trial, Statistic]] = []
-    for filter_name, statistic in product(FILTER_NAMES, DISCREPANCIES):
+    for filter_name, statistic in product(FILTER_NAMES, DISCREPANCY_STATISTICS):
         trials = find_trials(analysis.trials, filter_name, axis.name, statistic)
         reruns_and_statistics += [(trial, statistic) for trial in trials]
-        cause = find_cause(trials, filter_name, axis.name, statistic)
+        cause = find_cause_trial(trials, filter_name, axis.name, statistic)
         if cause and cause.before.difference_rms_m and cause.after.difference_rms_m:
             reruns_and_statistics.append((cause, "difference"))
     rows = []

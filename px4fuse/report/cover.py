@@ -12,7 +12,7 @@ from px4fuse.card.model import (
     Card,
     Cause,
     Verdict,
-    axis_fraction,
+    map_ratio_to_axis,
 )
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.core.text import format_ratio
@@ -123,7 +123,7 @@ def _axis_data(card: Card) -> dict[str, Any]:
             f"◀ ▶ outside {ends_text}"
         ),
         "ticks": [
-            {"fraction": axis_fraction(tick), "label": label}
+            {"fraction": map_ratio_to_axis(tick), "label": label}
             for tick, label in RATIO_AXIS_TICKS.items()
         ],
         "rows": [*map(_verdict_row_data, card.verdicts), *map(_aid_row_data, card.aids)],

@@ -14,8 +14,12 @@ from numpy.typing import ArrayLike
 
 from px4fuse.analysis import Analysis
 from px4fuse.card.model import Card
-from px4fuse.comparison.comparison import kf_state_and_variance, position_errors, reported_sigma
-from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, north_and_east
+from px4fuse.comparison.comparison import (
+    compute_position_errors,
+    interpolate_sigma,
+    sample_kf_run,
+)
+from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, select_north_and_east
 from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.signals import AISLE, cut_to_segment
@@ -173,7 +177,7 @@ def _position_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
     errors_by_filter = {
         filter_name: errors
         for filter_name in FILTER_NAMES
-        if isinstance(errors := position_errors(result, filter_name), pd.DataFrame)
+        if isinstance(errors := compute_position_errors(result, filter_name), pd.DataFrame)
         and errors["error_m"].notna().any()
     }
     if errors_by_filter:
@@ -192,12 +196,12 @@ def _position_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
     if not isinstance(result.ekf2_state, pd.DataFrame):
         return []
     time_s = result.ekf2_state.index.to_numpy()
-    state, variance = kf_state_and_variance(result.replay, time_s)
+    state, variance = sample_kf_run(result.replay, time_s)
     difference_m = state["position_m"] - result.ekf2_state["position_m"]
     if not difference_m.notna().any():
         return []
     sigmas_m = {
-        name: pd.Series(reported_sigma(time_s, frame, "position_variance_m2"), time_s)
+        name: pd.Series(interpolate_sigma(time_s, frame, "position_variance_m2"), time_s)
         for name, frame in (("KF", variance), ("EKF2", result.ekf2_variance))
     }
     limits_m = [2.2 * sigma.median() for sigma in sigmas_m.values() if sigma.notna().any()]
@@ -291,7 +295,7 @@ def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
         return segment_track["north_m"].to_numpy(), segment_track["east_m"].to_numpy()
 
     tracks = {"positions": cut_to_flight(analysis.source.samples)}
-    results = north_and_east(analysis)
+    results = select_north_and_east(analysis)
     if len(results) == 2:
         north, east = (result.replay.steps["position_m"].to_numpy() for result in results)
         tracks["KF"] = north, east

@@ -44,7 +44,7 @@ class EventMarks(NamedTuple):
 def _event_marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[EventMarks, ...]:
     events = analysis.events
     return (
-        EventMarks("on the ground", events.ground, GROUND_BAND),
+        EventMarks("on the ground", events.ground_spans_s, GROUND_BAND),
         EventMarks("gap in position source", events.gaps, GAP_BAND),
         EventMarks("log dropout", events.dropouts, DROPOUT_BAND),
         EventMarks("EKF2 rejected", rejected_s, REJECTED_DOTS, 0.025),

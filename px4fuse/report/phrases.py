@@ -16,8 +16,12 @@ from px4fuse.comparison.model import (
     PreparedComparison,
     UntestedFilter,
 )
-from px4fuse.comparison.remedy import different_settings, height_noise_advice, noise_change
 from px4fuse.comparison.remedy import format_settings as format_parameters
+from px4fuse.comparison.remedy import (
+    make_height_noise_advice,
+    make_noise_change,
+    select_changed_settings,
+)
 from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
@@ -218,20 +222,22 @@ def tuning_advice(
         logged_m, name = log.parameters.get(EV_POS.noise), EV_POS.noise
         variance_m2 = comparison.source.samples[Columns.POSITION_VARIANCE[:2]].median().mean()
         reported_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
-        changes = noise_change(EV_POS, log.parameters, reported_m, sigma_z.value)
+        changes = make_noise_change(EV_POS, log.parameters, reported_m, sigma_z.value)
         logged_text = "" if logged_m is None else f" (now {logged_m:g} m)"
         advice_by_label["PX4"] = f"Set {name} to {changes[name]:g} m{logged_text}."
         is_logged_within_interval = logged_m is not None and (sigma_z.low or 0.0) <= logged_m <= (
             sigma_z.high or 0.0
         )
         if EV_POS.noise_mode in changes and reported_m > (sigma_z.high or np.inf):
-            changes = different_settings(changes, log.parameters)
+            changes = select_changed_settings(changes, log.parameters)
             advice_by_label["PX4"] = (
                 f"Set {format_parameters(changes)}: EKF2 uses the reported σ, {reported_m:.2g} m."
             )
         elif is_logged_within_interval:
             advice_by_label["PX4"] = f"{name} {logged_m:g} m is within the 95 % interval."
-        advice_by_label["PX4"] += height_noise_advice(comparison, tuning_by_axis, sigma_z.value)
+        advice_by_label["PX4"] += make_height_noise_advice(
+            comparison, tuning_by_axis, sigma_z.value
+        )
     if sigma_a.value is None:
         advice_by_label["SIGMA_A"] = (
             "SIGMA_A cannot be estimated: the flight has too little motion, or is too short."

@@ -10,7 +10,7 @@ import pandas as pd
 
 from px4fuse.classroom.assignment.random_assignment import random_scenario_numbers
 from px4fuse.classroom.assignment.truth import compare_simulation
-from px4fuse.comparison.comparison import position_errors
+from px4fuse.comparison.comparison import compute_position_errors
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, Comparison, FilterName
 from px4fuse.core.record import Record, read_toml
 from px4fuse.flight.model import Ekf2, Truth
@@ -121,7 +121,7 @@ def _figures_png(comparisons: Mapping[str, Comparison]) -> bytes:
 def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterName) -> None:
     """Plot the position error of a filter with ±2σ; grey background during motion."""
     name, truth = FILTER_NAMES[filter_name], result.truth
-    errors = position_errors(result, filter_name)
+    errors = compute_position_errors(result, filter_name)
     axes.set_title(f"{name}: error along the aisle and ±2σ (m)")
     assert isinstance(errors, pd.DataFrame)
     assert isinstance(truth, pd.DataFrame)
