@@ -44,7 +44,7 @@ class Clock:
         return time.monotonic() + self.ahead_s
 
 
-def analyse(work: job.Job) -> job.Outcome:
+def analyse(work: job.Job) -> job.LogOutcome:
     """Analyse a log like the worker; a log named "hang" never ends, one named "crash" crashes."""
     name = Path(work.address).stem
     if name in ("hang", "crash"):
@@ -56,7 +56,7 @@ def analyse(work: job.Job) -> job.Outcome:
 MEMORY = "PX4FUSE_TESTS_MEMORY"
 
 
-def analyse_cached(work: job.Job) -> job.Outcome:
+def analyse_cached(work: job.Job) -> job.LogOutcome:
     """Analyse a log like the worker, or return the cached result of the same log."""
     with mock.patch.object(job, "_compare_log", _compare_cached):  # other tests use the same worker
         return job.analyse(work)
@@ -65,7 +65,7 @@ def analyse_cached(work: job.Job) -> job.Outcome:
 _compare_log = job._compare_log
 
 
-def _compare_cached(work: job.Job, path: Path, sha256: str) -> job.Outcome:
+def _compare_cached(work: job.Job, path: Path, sha256: str) -> job.LogOutcome:
     known = repr((path.name, sha256, work.request, work.with_report))
     kept = Path(os.environ[MEMORY]) / hashlib.sha256(known.encode()).hexdigest()
     if not kept.is_file():

@@ -11,7 +11,7 @@ from comparisons import compare
 from flights import aisle_flight
 from pypdf import PdfReader
 
-from px4fuse.classroom.assignment.truth import right_numeric_answer
+from px4fuse.classroom.assignment.truth import compute_numeric_answer
 from px4fuse.errors import SettingsError
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
@@ -109,7 +109,7 @@ def test_answer_form_questions_differ_for_each_log() -> None:
             "gain": p / s, "variance": p * (1.0 - p / s), "nis": row["innovation_m"] ** 2 / s,
             "innovation": row["measurement_m"] - row["prior_position_m"],
         }  # fmt: skip
-        found = right_numeric_answer(main, quantity)
+        found = compute_numeric_answer(main, quantity)
         assert found == pytest.approx(by_hand.get(quantity.kind, found), rel=1e-9)
 
 
@@ -130,7 +130,7 @@ def test_expected_answer_for_predicted_sigma_equals_closed_form() -> None:
     lags = dt * (np.arange(n) + 0.5)
     grown = settings.sigma_a_m_s2**2 * dt**2 * float((lags**2).sum())
     expected = np.sqrt(p0 + 2.0 * t * p1 + t**2 * p2 + grown)
-    assert right_numeric_answer(main, quantity) == pytest.approx(expected, rel=1e-9)
+    assert compute_numeric_answer(main, quantity) == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.usefixtures("cached_analyses", "cached_pages")

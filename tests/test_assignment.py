@@ -18,18 +18,18 @@ import px4fuse
 from px4fuse.classroom.assignment import assignment
 from px4fuse.classroom.assignment.assignment import (
     answer_key_path,
-    assign,
     simulate_assigned_flight,
+    write_assignment,
 )
 from px4fuse.classroom.assignment.key import AnswerKey, format_answer_key, read_answer_key
 from px4fuse.classroom.assignment.random_assignment import (
     EASIEST_DIFFICULTY,
     FAULT_COUNT_FRACTIONS,
     HARDEST_DIFFICULTY,
-    LOOP_FRACTION,
-    RULES_BY_KIND,
-    UNDETECTABLE_DIFFICULTY,
-    UNDETECTABLE_FRACTION,
+    LOOP_FLIGHT_FRACTION,
+    MAX_FAULT_DIFFICULTY,
+    SAMPLING_RULES_BY_KIND,
+    UNDETECTABLE_FLIGHT_FRACTION,
     assign_random_flight,
     derive_hmac_key,
 )
@@ -55,7 +55,9 @@ FINDINGS = {
     "ekf2-gate": "ekf2_rejects_positions", "ekf2-delay": "ekf2_ev_delay_wrong",
     "ekf2-off": "ekf2_not_fusing", "open-end": "false_loop_closure",
 }  # fmt: skip
-CHOICE = {choice.name: choice for rules in RULES_BY_KIND.values() for choice in rules.faults}
+CHOICE = {
+    choice.name: choice for rules in SAMPLING_RULES_BY_KIND.values() for choice in rules.faults
+}
 
 
 def choices_of(drawn):
@@ -127,12 +129,12 @@ class TestDraw:
             found = sum(len(one.mistake_options) == count for one in flights) / 1000
             assert found == pytest.approx(share, abs=0.05)
         names = {choice.name for one in flights for choice in choices_of(one)}
-        assert names == {choice.name for choice in RULES_BY_KIND[kind].faults}
+        assert names == {choice.name for choice in SAMPLING_RULES_BY_KIND[kind].faults}
 
     def test_mixed_assignment_contains_straight_and_loop_flights(self):
         mixed = [assign_random_flight(SECRET, f"s{n}", "mixed") for n in range(1000)]
         kinds = Counter(one.scenario.kind for one in mixed)
-        assert kinds["loop"] / 1000 == pytest.approx(LOOP_FRACTION, abs=0.05)
+        assert kinds["loop"] / 1000 == pytest.approx(LOOP_FLIGHT_FRACTION, abs=0.05)
         assert all(
             one == assign_random_flight(SECRET, f"s{n}", one.scenario.kind)
             for n, one in enumerate(mixed)
@@ -159,15 +161,21 @@ class TestDraw:
                     at = float(text.rpartition(",")[2].removesuffix("s"))
                     assert choice.start_range_s[0] <= at <= choice.start_range_s[1]
             assert drawn.difficulty == pytest.approx(max(ratios), abs=0.011)
-            assert EASIEST_DIFFICULTY <= drawn.difficulty <= UNDETECTABLE_DIFFICULTY
-        both = {choice.name for choice in RULES_BY_KIND["aisle"].faults if choice.has_either_sign}
+            assert EASIEST_DIFFICULTY <= drawn.difficulty <= MAX_FAULT_DIFFICULTY
+        both = {
+            choice.name
+            for choice in SAMPLING_RULES_BY_KIND["aisle"].faults
+            if choice.has_either_sign
+        }
         assert {name for name, positive in signs if not positive} == both
 
     def test_minimum_fault_size_equals_smallest_detected_size(self):
         """From the limit on, 95 % of the flights of tests/studies/rates.csv have the finding."""
         table = rates()
         table = table[~table.condition.str.contains("outdoor")]
-        for choice in (choice for rules in RULES_BY_KIND.values() for choice in rules.faults):
+        for choice in (
+            choice for rules in SAMPLING_RULES_BY_KIND.values() for choice in rules.faults
+        ):
             plain = re.compile(rf"--mistake {choice.name}(=([\d.]+)\D*)?$")
             rows = table[(table.finding == FINDINGS[choice.name]) & (table.flights >= 10)]
             matches = ((plain.search(row.condition), row) for row in rows.itertuples())
@@ -187,7 +195,9 @@ class TestDraw:
         counts, _ = np.histogram(each, bins=4, range=(EASIEST_DIFFICULTY, HARDEST_DIFFICULTY))
         assert counts.min() > 65
         undetectable_count = sum(one > HARDEST_DIFFICULTY for one in each)
-        assert undetectable_count / len(each) == pytest.approx(UNDETECTABLE_FRACTION, abs=0.06)
+        assert undetectable_count / len(each) == pytest.approx(
+            UNDETECTABLE_FLIGHT_FRACTION, abs=0.06
+        )
 
     def test_assignment_flight_seeds_have_128_bits(self):
         seeds = [assign_random_flight(SECRET, f"s{n}", "aisle").scenario.seed for n in range(50)]
@@ -229,7 +239,7 @@ class TestAssign:
 
     def test_assign_flights_writes_logs_answer_forms_and_answer_key(self, tmp_path):
         folder, key_file = tmp_path / "a" / "flights", tmp_path / "key.json"
-        made, written = assign(CLASS, folder, key_file, SECRET, "aisle", 2)
+        made, written = write_assignment(CLASS, folder, key_file, SECRET, "aisle", 2)
         key = read_answer_key(key_file)
         assert (key, written) == (made, 3)
         assert not key.secret
@@ -251,30 +261,30 @@ class TestAssign:
 
     def test_assign_flights_second_run_adds_only_new_students(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
-        assert assign(CLASS[:2], folder, key_file, None, "aisle", 2)[0].secret
+        assert write_assignment(CLASS[:2], folder, key_file, None, "aisle", 2)[0].secret
         before = files(folder) | {"key": key_file.read_bytes()}
-        assert assign(CLASS[:2], folder, key_file, None, "aisle", 2)[1] == 0
+        assert write_assignment(CLASS[:2], folder, key_file, None, "aisle", 2)[1] == 0
         assert files(folder) | {"key": key_file.read_bytes()} == before
-        key, written = assign(CLASS, folder, key_file, None, "aisle", 2)
+        key, written = write_assignment(CLASS, folder, key_file, None, "aisle", 2)
         assert written == 1
         assert files(folder).items() >= {k: v for k, v in before.items() if k != "key"}.items()
         # the generated secret can be given later
-        assign(CLASS, folder, key_file, derive_hmac_key(key.secret), "aisle", 2)
+        write_assignment(CLASS, folder, key_file, derive_hmac_key(key.secret), "aisle", 2)
         assert read_answer_key(key_file).secret == key.secret
 
     def test_assign_flights_does_not_overwrite_other_files(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
-        assign(CLASS[:2], folder, key_file, SECRET, "aisle", 2)
+        write_assignment(CLASS[:2], folder, key_file, SECRET, "aisle", 2)
         before = files(folder) | {"key": key_file.read_bytes()}
         for students, secret in ((CLASS, b"another secret"), (CLASS[2:], SECRET)):
             with pytest.raises(OutputError, match="was not overwritten"):
-                assign(students, folder, key_file, secret, "aisle", 2)
+                write_assignment(students, folder, key_file, secret, "aisle", 2)
         with pytest.raises(OutputError, match="other flights"):
-            assign(CLASS[:2], tmp_path / "new", key_file, b"another secret", "aisle", 2)
+            write_assignment(CLASS[:2], tmp_path / "new", key_file, b"another secret", "aisle", 2)
         assert not (tmp_path / "new").exists()
         key_file.write_text("{}", encoding="utf-8")
         with pytest.raises(SettingsError, match="not an answer key"):
-            assign(CLASS[:2], folder, key_file, SECRET, "aisle", 2)
+            write_assignment(CLASS[:2], folder, key_file, SECRET, "aisle", 2)
         assert files(folder) == {k: v for k, v in before.items() if k != "key"}
 
     def test_assign_flights_rerun_after_interrupt_completes_files(self, tmp_path, monkeypatch):
@@ -288,16 +298,19 @@ class TestAssign:
 
         monkeypatch.setattr(assignment, "simulate_assigned_flight", stop_at_last)
         with pytest.raises(KeyboardInterrupt):
-            assign(CLASS, folder, key_file, None, "aisle", 2)
+            write_assignment(CLASS, folder, key_file, None, "aisle", 2)
         monkeypatch.undo()
         assert len(read_answer_key(key_file).answers) == 2
-        assert assign(CLASS, folder, key_file, None, "aisle", 2) == (read_answer_key(key_file), 1)
+        assert write_assignment(CLASS, folder, key_file, None, "aisle", 2) == (
+            read_answer_key(key_file),
+            1,
+        )
 
     def test_assign_flights_can_be_repeated_if_key_was_not_written(self, tmp_path):
         folder, key_file = tmp_path / "flights", tmp_path / "key.json"
         key_file.mkdir()
         with pytest.raises(SettingsError):
-            assign(CLASS[:1], folder, key_file, SECRET, "aisle", 2)
+            write_assignment(CLASS[:1], folder, key_file, SECRET, "aisle", 2)
         blocked = tmp_path / "file"
         blocked.write_bytes(b"")
         kept = tmp_path / "k.json"
@@ -306,10 +319,13 @@ class TestAssign:
             (blocked, kept, None),
         ):
             with pytest.raises(OutputError, match="cannot be written"):
-                assign(CLASS[:1], where, key, secret, "aisle", 2)
+                write_assignment(CLASS[:1], where, key, secret, "aisle", 2)
         assert not any(path.is_file() for path in folder.rglob("*"))
         assert stat.S_IMODE(kept.stat().st_mode) == 0o600 or os.name == "nt"
-        assert assign(CLASS[:1], folder, kept, None, "aisle", 2) == (read_answer_key(kept), 1)
+        assert write_assignment(CLASS[:1], folder, kept, None, "aisle", 2) == (
+            read_answer_key(kept),
+            1,
+        )
 
     def test_answer_key_path_inside_students_folder_is_rejected(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)

@@ -29,7 +29,7 @@ from forgery import (
 from results_tools import LOOP, changed_results, decode_results
 
 from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
-from px4fuse.classroom.assignment.truth import right_form_answers
+from px4fuse.classroom.assignment.truth import compute_form_answers
 from px4fuse.classroom.grading.model import GradedReport
 from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable, read_rubric, score_report
 from px4fuse.errors import ResultsError
@@ -124,7 +124,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
         run_checked("compare", log, "-o", pdf, *own)
     honest = make_verified_report(pdf.read_bytes(), log)
     (sha256,) = honest.files
-    truth = right_form_answers(simulation, sha256)
+    truth = compute_form_answers(simulation, sha256)
     answers = (
         RightAnswers(
             "s01", "Ada", "s01.ulg", sha256, {}, FAULT_TYPES, {"duration_s": 70.0}, None, truth
@@ -168,7 +168,7 @@ def test_grade_gives_no_points_for_keywords_in_student_notes(
     graded = flight.with_notes(text, rubric)
     points = [(item.title, item.points) for item in graded.items]
     assert points == [(item.title, item.points) for item in honest.items]
-    assert graded.awaits_points
+    assert graded.is_awaiting_points
 
 
 # ------------------------------------------------------------------ files

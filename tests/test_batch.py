@@ -35,7 +35,13 @@ from px4fuse.batch import engine, job, run
 from px4fuse.batch.engine import connect_cluster, run_jobs
 from px4fuse.batch.job import Job
 from px4fuse.batch.logs import find_logs
-from px4fuse.batch.rows import COLUMN_TYPES, axis_rows, csv_bytes, log_columns, make_table
+from px4fuse.batch.rows import (
+    COLUMN_TYPES,
+    collect_log_values,
+    format_csv,
+    make_axis_rows,
+    make_table,
+)
 from px4fuse.batch.run import BatchResult, load_cached_rows
 from px4fuse.batch.terminal import format_summary
 from px4fuse.cli.outputs import terminal
@@ -151,10 +157,10 @@ def test_batch_table_has_numbers_or_failure_reason_per_log(tmp_path):
     assert (output / first.loc[0, "report"]).read_bytes().startswith(b"%PDF")
     # a log whose clock is out of range has no date
     beyond = structs.replace(results.log, start_unix_s=1e18)
-    assert log_columns(results.log)["date"] == first.loc[0, "date"]
-    assert log_columns(beyond)["date"] == ""
+    assert collect_log_values(results.log)["date"] == first.loc[0, "date"]
+    assert collect_log_values(beyond)["date"] == ""
     # the clock offset is present only if it is determinable
-    rows = axis_rows(
+    rows = make_axis_rows(
         structs.replace(results, clock=structs.replace(results.clock, is_determinable=False))
     )
     assert first["clock_offset_s"].tolist() == pytest.approx([results.clock.offset_s] * 4)
@@ -191,7 +197,7 @@ def test_batch_csv_leaves_missing_numbers_empty(tmp_path):
     table = make_table([{"name": "=1+1.ulg", "updates": 3, "kf_nis_mean": None}, {"reason": None}])
     assert table["kf_nis_mean"].isna().all()
     assert table["updates"].isna().tolist() == [False, True]
-    head, row, _ = csv_bytes(table).decode("utf-8-sig").splitlines()
+    head, row, _ = format_csv(table).decode("utf-8-sig").splitlines()
     values = dict(zip(head.split(","), row.split(","), strict=True))
     assert values["name"] == "'=1+1.ulg"
     assert (values["updates"], values["kf_nis_mean"]) == ("3", "")
@@ -199,7 +205,7 @@ def test_batch_csv_leaves_missing_numbers_empty(tmp_path):
     table = make_table([{"log": os.fsdecode(b"flight-\xff.ulg"), "status": "failed"}])
     table.to_parquet(tmp_path / "fleet.parquet")
     assert pd.read_parquet(tmp_path / "fleet.parquet")["log"].item() == "flight-?.ulg"
-    assert "flight-?.ulg" in csv_bytes(table).decode()
+    assert "flight-?.ulg" in format_csv(table).decode()
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -299,7 +305,7 @@ def test_batch_hanging_log_does_not_affect_other_logs(tmp_path, monkeypatch):
     assert crash["reason"] == "the worker process ended during a job (exit code 3)"
 
 
-def analysed(log: Path | str, max_bytes: int = 10**9) -> job.Outcome:
+def analysed(log: Path | str, max_bytes: int = 10**9) -> job.LogOutcome:
     """Analyse a log in a separate context, so that its size limit has no effect elsewhere."""
     work = Job(str(log), ComparisonRequest(log="LOG"), False, max_bytes)
     return contextvars.copy_context().run(job.analyse, work)
@@ -310,7 +316,7 @@ def test_batch_log_changed_during_reading_is_reported_failed(flights, tmp_path, 
     shutil.copy(flights / "f1.ulg", log)
     compared = job._compare_log
 
-    def grows(work: Job, path: Path, sha256: str) -> job.Outcome:
+    def grows(work: Job, path: Path, sha256: str) -> job.LogOutcome:
         outcome = compared(work, path, sha256)
         with path.open("ab") as file:
             file.write(b"more")
@@ -497,7 +503,7 @@ def assert_cluster_gives_the_same_table(address, flights, undisturbed, tmp_path)
     (other / "METADATA").write_text("Metadata-Version: 2.1\nName: px4fuse\nVersion: 9.9\n")
     path = f"{tmp_path}{os.pathsep}{batch_tools.REPOSITORY}"
     with started_worker(address, tmp_path / "third", path):
-        assert "px4fuse version: 9.9 on Dask worker" in error_line("batch", *arguments)
+        assert "is 9.9, that of this computer" in error_line("batch", *arguments)
 
 
 def assert_failed_job_does_not_affect_others(address):

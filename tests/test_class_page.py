@@ -16,7 +16,7 @@ from golden_tools import assert_matches_golden, of_values
 from hypothesis import given
 from hypothesis import strategies as st
 
-from px4fuse.classroom.grading.class_page import class_page_html, count_by_bin
+from px4fuse.classroom.grading.class_page import count_by_bin, format_class_page
 from px4fuse.classroom.grading.model import Grade, GradedReport, ItemScore, Override
 from px4fuse.classroom.grading.outputs import anonymise_grade
 from px4fuse.html.safe import MAX_TEXT_LENGTH
@@ -99,7 +99,7 @@ CLASS = (
         comment=BREAKOUT,
         items=(
             ItemScore(
-                BREAKOUT, 5.0, 20.0, MARKUP, is_scored_by_instructor=True, awaits_points=True
+                BREAKOUT, 5.0, 20.0, MARKUP, is_scored_by_instructor=True, is_awaiting_points=True
             ),
         ),
         submitted_at=MARKUP,
@@ -119,7 +119,7 @@ def shape(text: str) -> list[tuple[str, list[str]]]:
 
 
 def test_grades_page_html_equals_reference_file() -> None:
-    text = class_page_html(CLASS, "Class", "px4fuse 1")
+    text = format_class_page(CLASS, "Class", "px4fuse 1")
     above = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL).splitlines()
     lines = [line for line in above if line.strip() and "sha256" not in line]
     lines += of_values(content(text))
@@ -136,7 +136,7 @@ def test_grades_page_escapes_html_in_student_text(text: str) -> None:
             is_found_by_fault={word: False},
             instructor_action=word, form=FORM, comment=word,
         )  # fmt: skip
-        return class_page_html([one], word, word)
+        return format_class_page([one], word, word)
 
     made = page(text)
     made.encode()
@@ -149,7 +149,7 @@ def test_grades_page_mean_excludes_pending_points() -> None:
     grades = [row("Ada", 10.0, late_s=61), row("Bo", 20.0),
                row("Cy", 12.0, instructor_action="Run 0.1.1."),
                row("Di", 13.0, overrides=said, total=13.0)]  # fmt: skip
-    text = class_page_html(grades, "Class", "px4fuse 1")
+    text = format_class_page(grades, "Class", "px4fuse 1")
     assert "2 min late" in text  # 61 s are rounded up
     assert "14.3 <small>of 20" in text  # mean of 10, 20 and 13
     assert "1 <small>12 points, not counted" in text
@@ -162,12 +162,12 @@ def test_grades_page_mean_excludes_pending_points() -> None:
 
 def test_grades_page_shortens_long_text_and_omits_nan() -> None:
     odd = row("x" * 10**6, 3.0, notes="y" * 10**6, numbers={"NIS": float("nan")})
-    text = class_page_html([odd], "Class", "px4fuse 1")
+    text = format_class_page([odd], "Class", "px4fuse 1")
     assert "nan" not in text.lower().split("<script>")[0]
     assert len(text) < 16 * MAX_TEXT_LENGTH
     apart = (Mismatch("axes.49", "1.0", "2.0"),)
     one = GradedReport("a.pdf", "Ada", "1", Verification("numbers differ", ("60.",), True, apart))
-    text = class_page_html([Grade("Ada", "1", one)], "Class", "px4fuse 1")
+    text = format_class_page([Grade("Ada", "1", one)], "Class", "px4fuse 1")
     assert '["axes.49","1.0","2.0"]' in text
 
 
@@ -202,7 +202,7 @@ def anonymous_class() -> list[Grade]:
 
 
 def test_grades_page_in_anonymous_mode_contains_no_names() -> None:
-    text = class_page_html(anonymous_class(), "Class", "px4fuse 1")
+    text = format_class_page(anonymous_class(), "Class", "px4fuse 1")
     written = unicodedata.normalize("NFC", text + json.dumps(content(text), ensure_ascii=False))
     for name, student_id, file in PEOPLE:
         for word in (*name.split(), student_id, *re.split(r"[/. _]", file)):
@@ -230,7 +230,7 @@ def test_grades_page_in_anonymous_mode_contains_no_names() -> None:
 @pytest.fixture
 def page(browser: Browser, tmp_path: Path) -> Browser:
     file = tmp_path / "class.html"
-    file.write_bytes(class_page_html(CLASS, "Navigation lab & more", "px4fuse 1").encode())
+    file.write_bytes(format_class_page(CLASS, "Navigation lab & more", "px4fuse 1").encode())
     browser.open(file)
     return browser
 
@@ -293,7 +293,7 @@ def test_grades_page_keyboard_selects_next_and_previous_report(page: Browser) ->
 
 def test_grades_page_links_report_redrawn_from_the_log() -> None:
     one = row("Zoë", 18.5, redrawn_path="reports/1.pdf", pages=(PageDifference(1, "a word"),))
-    made = content(class_page_html([one, row("Bo", 1.0)], "Class", "px4fuse 1"))
+    made = content(format_class_page([one, row("Bo", 1.0)], "Class", "px4fuse 1"))
     (leads,) = (part for part in made["rows"][0][3] if part[0] == "links")
     assert [to for _, to in leads[2]] == ["reports/1.pdf"]
     assert made["rows"][1][3] == []

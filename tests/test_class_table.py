@@ -13,7 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from px4fuse.classroom.grading.model import Grade, GradedReport, ItemScore
-from px4fuse.classroom.grading.outputs import FIRST_COLUMNS, LAST_COLUMNS, class_table_csv
+from px4fuse.classroom.grading.outputs import (
+    FIRST_COLUMN_TITLES,
+    LAST_COLUMN_TITLES,
+    format_class_table,
+)
 from px4fuse.core.spreadsheet import MAX_CELL_LENGTH, neutralise_formulas
 from px4fuse.verification.model import Verification
 
@@ -64,7 +68,7 @@ def may_be_formula(cell: str) -> bool:
 
 @given(texts)
 def test_grades_csv_has_no_formula_cell_for_any_delimiter(text: str) -> None:
-    made = class_table_csv([graded(text, {text: -3.25})])
+    made = format_class_table([graded(text, {text: -3.25})])
     made.encode()
     for delimiter in (",", ";", "\t"):
         for row in cells(made, delimiter):
@@ -77,9 +81,9 @@ def test_grades_csv_has_no_formula_cell_for_any_delimiter(text: str) -> None:
 def test_grades_csv_escapes_cells_that_start_like_formulas(
     rows: list[tuple[str, dict[str, float]]],
 ) -> None:
-    head, *rest = cells(class_table_csv([graded(text, numbers) for text, numbers in rows]))
-    assert tuple(head[: len(FIRST_COLUMNS)]) == FIRST_COLUMNS
-    assert tuple(head[-len(LAST_COLUMNS) :]) == LAST_COLUMNS
+    head, *rest = cells(format_class_table([graded(text, numbers) for text, numbers in rows]))
+    assert tuple(head[: len(FIRST_COLUMN_TITLES)]) == FIRST_COLUMN_TITLES
+    assert tuple(head[-len(LAST_COLUMN_TITLES) :]) == LAST_COLUMN_TITLES
     assert len(rest) == len(rows)
     for (text, numbers), row in zip(rows, rest, strict=True):
         assert len(row) == len(head)
@@ -92,7 +96,7 @@ def test_grades_csv_escapes_cells_that_start_like_formulas(
             "",
             "1",
         ]
-        assert row[: len(FIRST_COLUMNS)] == said
+        assert row[: len(FIRST_COLUMN_TITLES)] == said
         both = neutralise_formulas(f"{text} | {text}")
         said = [
             neutralise_formulas(text),
@@ -104,8 +108,10 @@ def test_grades_csv_escapes_cells_that_start_like_formulas(
             both,
             "ab" * 32,
         ]
-        assert row[-len(LAST_COLUMNS) :] == said
-        found = sorted(float(cell) for cell in row[len(FIRST_COLUMNS) : -len(LAST_COLUMNS)] if cell)
+        assert row[-len(LAST_COLUMN_TITLES) :] == said
+        found = sorted(
+            float(cell) for cell in row[len(FIRST_COLUMN_TITLES) : -len(LAST_COLUMN_TITLES)] if cell
+        )
         assert found == pytest.approx(sorted([*numbers.values(), 1.0]), rel=1e-9, abs=1e-300)
 
 
@@ -127,18 +133,20 @@ def test_neutralise_csv_formulas_changes_only_formulas() -> None:
 
 
 def test_grades_csv_begins_with_bom_and_has_crlf_line_ends() -> None:
-    made = class_table_csv([graded("Zoë 李雷", {"NIS": float("nan")}, points=0.1 + 0.2)])
+    made = format_class_table([graded("Zoë 李雷", {"NIS": float("nan")}, points=0.1 + 0.2)])
     assert made.encode().startswith(b"\xef\xbb\xbffile,student,")
     assert made.count("\r\n") == made.count("\n") == 2
     (_, row) = cells(made)
-    assert row[len(FIRST_COLUMNS) : -len(LAST_COLUMNS)] == ["0.3", ""]
+    assert row[len(FIRST_COLUMN_TITLES) : -len(LAST_COLUMN_TITLES)] == ["0.3", ""]
 
 
 def test_grades_csv_lists_late_and_missing_students() -> None:
     one = GradedReport("a.pdf", "A", "1", VERIFIED, (ItemScore("notes", 1.5, 2.0, ""),))
     late = entry(one, late_s=5400.0, deduction=0.4, total=1.1, comment="see me")
     pending = entry(replace(one, instructor_action="Run 0.1.1."), total=None)
-    head, *rest = cells(class_table_csv([late, pending, Grade("C", "-17", None, max_points=4.0)]))
+    head, *rest = cells(
+        format_class_table([late, pending, Grade("C", "-17", None, max_points=4.0)])
+    )
     asked = ("id", "status", "points", "pending points", "deducted", "total", "hours late",
              "pending", "comment")  # fmt: skip
     assert [[dict(zip(head, row, strict=True))[name] for name in asked] for row in rest] == [
@@ -146,7 +154,7 @@ def test_grades_csv_lists_late_and_missing_students() -> None:
         ["1", "verified", "", "1.5", "", "", "", "Run 0.1.1.", ""],
         ["-17", "missing", "", "", "", "", "", "", ""],
     ]
-    assert len(cells(class_table_csv([]))) == 1
+    assert len(cells(format_class_table([]))) == 1
     assert (
         len(neutralise_formulas("=" * 10**6)) <= MAX_CELL_LENGTH + 1
     )  # maximum length of a cell in Excel

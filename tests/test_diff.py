@@ -10,7 +10,7 @@ from msgspec import structs
 
 from px4fuse.batch.changes import compare_numbers, list_changes
 from px4fuse.batch.inputs import InputResults
-from px4fuse.batch.measures import MEASURES, ComparedNumber, collect_numbers
+from px4fuse.batch.measures import NUMBER_DEFINITIONS, ComparedNumber, collect_numbers
 from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.aids import AidAxis, AidResult
 from px4fuse.request import ComparisonRequest
@@ -162,7 +162,7 @@ def test_diff_with_additional_fault_is_reported_as_worse(clean):
 
 
 def test_diff_compares_each_json_number_only_once(clean):
-    paths = [one["path"] for one in MEASURES]
+    paths = [one["path"] for one in NUMBER_DEFINITIONS]
     assert len(set(paths)) == len(paths)
     found = collect_numbers(clean.results)
     assert {path for path, one in found.items() if one.interval} >= {
@@ -197,7 +197,10 @@ def test_diff_of_aiding_sources_excludes_the_position_source(clean):
     north = of_aids["aids.gnss_vel.axes.north.nis_mean"]
     assert (north.label, north.value) == ("mean NIS of EKF2, GNSS velocity, north", 1.2)
     share = of_aids["aids.gnss_vel.rejected_fraction"]
-    assert (share.label, share.unit) == ("measurements rejected by EKF2, GNSS velocity", "share")
+    assert (share.label, share.unit) == (
+        "fraction of measurements rejected by EKF2, GNSS velocity",
+        "share",
+    )
     source = structs.replace(clean.results.source, kind="gnss")
     found = collect_numbers(structs.replace(clean.results, source=source, aids=judged))
     assert "ev_pos" in {path.split(".")[1] for path in found}

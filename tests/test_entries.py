@@ -11,7 +11,7 @@ from class_tools import graded_report
 from exchange import replace
 
 from px4fuse.classroom.assignment.roster import Person
-from px4fuse.classroom.grading.class_page import _point_boxes
+from px4fuse.classroom.grading.class_page import _make_points_inputs
 from px4fuse.classroom.grading.entries import (
     Course,
     add_time_zone,
@@ -24,7 +24,7 @@ from px4fuse.classroom.grading.entries import (
 from px4fuse.classroom.grading.model import Override, Submission
 from px4fuse.classroom.grading.outputs import feedback_text
 from px4fuse.classroom.grading.rubric import read_rubric
-from px4fuse.classroom.grading.submissions import parse_origin
+from px4fuse.classroom.grading.submissions import parse_submission_path
 from px4fuse.errors import SettingsError
 from px4fuse.results.answer_form import Answers, NamedFault
 from px4fuse.verification.model import Verification
@@ -39,7 +39,10 @@ def make_grades(files, term=LATEST, overrides=None, people=PEOPLE, packed=None):
     """Make the grades of reports, given by file name."""
     reports = [replace(one, submission=name, sha256=name) for name, one in files.items()]
     zipped, times = Path("x.zip"), packed or {}
-    found = [Submission(zipped, name, name, times.get(name), parse_origin(name)) for name in files]
+    found = [
+        Submission(zipped, name, name, times.get(name), parse_submission_path(name))
+        for name in files
+    ]
     return build_grades(reports, found, replace(term, roster=people), overrides or {})
 
 
@@ -179,7 +182,7 @@ def test_grade_keeps_first_report_if_later_one_needs_review() -> None:
         assert [one.submission for one in ada.other_reports] == ["z.pdf"]
         assert ada.flags == ("The file z.pdf does not count (status: pending).",)
     waiting = replace(
-        files["a.pdf"].items[0], awaits_points=True
+        files["a.pdf"].items[0], is_awaiting_points=True
     )  # waits for the points of the notes
     files["a.pdf"] = replace(files["a.pdf"], items=(waiting,))
     (ada, _), _ = make_grades(files)
@@ -191,8 +194,8 @@ def test_submission_named_like_a_platform_export_is_flagged() -> None:
     (ada, _), _ = make_grades({name: graded_report("", 4.0)})
     assert ada.submission_time == "2026-11-20 10:00"
     assert ada.flags == (
-        "The student imitated the file name of a learning platform "
-        "(platform of the export: Blackboard).",
+        "The student's part of the file name imitates a learning platform (platform of the "
+        "export: Blackboard). Check who handed in the file.",
     )
 
 
@@ -282,8 +285,8 @@ def test_instructor_overrides_replace_points_and_add_comments(tmp_path) -> None:
     ("rows", "points", "told"),
     [
         (("1,A,95,A slip.", "1,total,200,"), (10.0, 10.0), (
-            "student 1 cannot have more than 10 points of 'A'",
-            "student 1 cannot have more than 20 points of 'total'",
+            "points of student 1 are above the maximum, 10 points of 'A'",
+            "points of student 1 are above the maximum, 20 points of 'total'",
         )),
         (("1,A,9,", "1,a,2,", "01,total,12,", "1,Total,3,"), (15.0, 3.0), (
             "student 1 has two rows for 'A'", "student 01 has two rows for 'total'",
@@ -305,7 +308,7 @@ def test_grades_download_includes_students_without_report(tmp_path) -> None:
     )
     grades, notes = make_grades({"1.pdf": TWO["1.pdf"]}, overrides=rows)
     again: dict[str, dict[str, Override]] = {}
-    for _, _, owner, boxes, kept in map(_point_boxes, grades):
+    for _, _, owner, boxes, kept in map(_make_points_inputs, grades):
         for item, points, comment in (*((a, c, d) for a, _, c, d in boxes), *kept):
             if points is not None or comment:
                 again.setdefault(owner, {})[item] = Override(points, comment)
@@ -338,11 +341,11 @@ def test_instructor_overrides_csv_accepts_decimal_commas(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("row", "says"),
     [
-        ("1,A,abc,", "row 2: points 'abc' must be a number of 0 or more"),
-        ("1,A,-1,", "must be a number of 0 or more"),
-        ("1,A,nan,", "must be a number of 0 or more"),
-        ("1,A,1_5,", "must be a number of 0 or more"),
-        ("1,,5,", "in a row that names an item or total"),
+        ("1,A,abc,", "row 2: points 'abc' are not a number of 0 or more"),
+        ("1,A,-1,", "are not a number of 0 or more"),
+        ("1,A,nan,", "are not a number of 0 or more"),
+        ("1,A,1_5,", "are not a number of 0 or more"),
+        ("1,,5,", "points 5 need the title of an item, or total"),
         ("1,A,5,\n1,A,6,", "student 1 has two rows for the item A"),
     ],
 )
@@ -398,10 +401,10 @@ def test_invalid_due_time_or_late_rule_raises_one_line_error(read, said, texts) 
 
 def test_late_rule_deducts_points_per_started_day_up_to_limit() -> None:
     for late_s, off in ((0.0, 0), (1.0, 12), (86_400.0, 12), (86_400.5, 24), (1e9, 120)):
-        assert parse_late_rule("10%/day").deduction(late_s, 120.0) == off
+        assert parse_late_rule("10%/day").compute_deduction(late_s, 120.0) == off
     # a rule may state a limit, and hours
-    assert parse_late_rule("1 % / hour up to 5%").deduction(3600.0 * 3.5, 100.0) == 4.0
-    assert parse_late_rule("1%/hour up to 5%").deduction(1e6, 100.0) == 5.0
+    assert parse_late_rule("1 % / hour up to 5%").compute_deduction(3600.0 * 3.5, 100.0) == 4.0
+    assert parse_late_rule("1%/hour up to 5%").compute_deduction(1e6, 100.0) == 5.0
 
 
 def test_submission_time_without_zone_uses_zone_of_due_time() -> None:

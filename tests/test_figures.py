@@ -13,13 +13,13 @@ from px4fuse.classroom.assignment.figures import (
     draw_figures,
     select_choices,
 )
-from px4fuse.classroom.assignment.random_assignment import random_uniform
+from px4fuse.classroom.assignment.random_assignment import draw_uniform
 from px4fuse.results.answer_form import CHOICE_NAMES, MAX_CHOICES, MAX_FORM_BYTES, form_text
 
 
 def test_right_answers_of_each_figure_belong_to_one_fault() -> None:
     for number in range(20):
-        choices = select_choices(partial(random_uniform, b"secret", f"s{number}", "aisle"))
+        choices = select_choices(partial(draw_uniform, b"secret", f"s{number}", "aisle"))
         assert len(choices) == len(QUESTIONS) * figures.FIGURE_COUNT <= MAX_CHOICES
         for first in range(0, len(choices), len(QUESTIONS)):
             rows = zip(choices[first:], QUESTIONS, strict=False)
@@ -31,7 +31,7 @@ def test_right_answers_of_each_figure_belong_to_one_fault() -> None:
 
 
 def test_right_multiple_choice_letters_are_equally_frequent() -> None:
-    draws = [partial(random_uniform, b"secret", f"s{number}", "aisle") for number in range(200)]
+    draws = [partial(draw_uniform, b"secret", f"s{number}", "aisle") for number in range(200)]
     letters = [letter for random_number in draws for _, letter in select_choices(random_number)]
     for name in CHOICE_NAMES:
         assert letters.count(name) / len(letters) == pytest.approx(0.2, abs=0.03)
@@ -46,8 +46,8 @@ def test_answers_to_plot_questions_differ_between_faults() -> None:
 
 def test_plot_questions_of_same_secret_and_student_are_equal(monkeypatch) -> None:
     monkeypatch.setattr(figures, "FIGURE_COUNT", 1)
-    random_number = partial(random_uniform, b"secret", "s1", "aisle")
+    random_number = partial(draw_uniform, b"secret", "s1", "aisle")
     content = draw_figures(random_number)
     assert content.startswith(b"\x89PNG")
     assert content == draw_figures(random_number)
-    assert content != draw_figures(partial(random_uniform, b"secret", "s2", "aisle"))
+    assert content != draw_figures(partial(draw_uniform, b"secret", "s2", "aisle"))

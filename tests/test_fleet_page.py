@@ -16,7 +16,7 @@ from explore_tools import axe, serious
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from px4fuse.batch.page import html_text, logs_from_table, sort_logs
+from px4fuse.batch.page import format_html, logs_from_table, sort_logs
 from px4fuse.html.frame import MAX_PAGE_ROWS
 from px4fuse.report.card_html import MARK_PATHS
 
@@ -40,7 +40,7 @@ def parts(row: list[Any]) -> dict[str, Any]:
 def test_batch_page_lists_missing_results_of_each_log() -> None:
     table = artificial_logs(30)
     table.loc[table["axis"] == "down", ["reason", "remedy"]] = ("EKF2, down: no heights", "Set it.")
-    text = html_text(table, "Bench", "px4fuse 1")
+    text = format_html(table, "Bench", "px4fuse 1")
     inside = parts(content(text)["rows"][0])
     assert inside["Missing results"][2] == ["EKF2, down: no heights"]
     assert inside["Actions"][2] == ["Set it."]
@@ -68,7 +68,7 @@ def test_batch_page_sorts_logs_by_severity_and_rmse() -> None:
 
 def test_batch_page_row_shows_diagnosis_action_and_sigma_ratios() -> None:
     table = artificial_logs(30)
-    rows = [row[0] for row in content(html_text(table, "Bench", "px4fuse 1"))["rows"]]
+    rows = [row[0] for row in content(format_html(table, "Bench", "px4fuse 1"))["rows"]]
     first = rows[0]
     assert first[0][0] == "■ ERROR"
     assert first[2][:3] == [STORY, None, "param set EKF2_EVP_NOISE 0.3"]
@@ -84,7 +84,7 @@ def test_batch_page_omits_column_without_numbers() -> None:
     for name in ("clock_offset_s", "sigma_z_m", "kf_truth_ratio", "difference_rms_m"):
         table[name] = np.nan
     table["updates"] = table["updates"].astype("Int64")
-    text = html_text(table, "Bench", "px4fuse 1")
+    text = format_html(table, "Bench", "px4fuse 1")
     made = content(text)
     cells = made["rows"][0][0]
     assert [cells[place] for place in (4, 7, 11, 12)] == [["", None, "", ""]] * 4
@@ -93,11 +93,11 @@ def test_batch_page_omits_column_without_numbers() -> None:
 
 
 def test_batch_page_without_compared_logs_lists_failed_logs() -> None:
-    assert "0 logs" in html_text(artificial_logs(0), "Bench", "px4fuse 1")
+    assert "0 logs" in format_html(artificial_logs(0), "Bench", "px4fuse 1")
     table = artificial_logs(30)
     failed = table[table["status"] == "failed"].reset_index(drop=True)
-    text = html_text(failed, "B", "px4fuse 1")
-    assert text == html_text(failed, "B", "px4fuse 1")  # the same table gives the same page
+    text = format_html(failed, "B", "px4fuse 1")
+    assert text == format_html(failed, "B", "px4fuse 1")  # the same table gives the same page
     assert parts(content(text)["rows"][0])["Actions"][2] == [DAMAGED[1]]
 
 
@@ -111,7 +111,7 @@ def hostile_table(word: str, count: int = 2) -> pd.DataFrame:
 @given(text=st.text(max_size=40) | st.sampled_from(HOSTILE))
 def test_batch_page_escapes_text_from_logs(text: str) -> None:
     def shape(word: str) -> list[tuple[str, list[str]]]:
-        made = html_text(hostile_table(f"a{word}z"), word, word)
+        made = format_html(hostile_table(f"a{word}z"), word, word)
         made.encode()
         assert not re.search("[\x1b\u202e]", made)
         return [(tag, sorted(attributes)) for tag, attributes in Elements(made).found]
@@ -123,7 +123,7 @@ def test_batch_page_escapes_text_from_logs(text: str) -> None:
 def test_batch_page_links_lead_only_to_relative_paths() -> None:
     bad = ("//example.org/a", "/etc/passwd", "javascript:alert(1)", "https://example.org/")
     table = artificial_logs(4).assign(report=np.repeat(bad, 3), results="")
-    rows = content(html_text(table, "a", "b"))["rows"]
+    rows = content(format_html(table, "a", "b"))["rows"]
     assert len(rows) == 4
     for row in rows:
         files = parts(row).get("Files", ["", "", []])[2]
@@ -135,7 +135,7 @@ def test_batch_page_links_lead_only_to_relative_paths() -> None:
 
 def shown(browser: Browser, folder: Path, table: pd.DataFrame, *titles: str, **how: bool) -> None:
     file = folder / "fleet.html"
-    file.write_bytes(html_text(table, *(titles or ("Bench & more", "px4fuse 1"))).encode())
+    file.write_bytes(format_html(table, *(titles or ("Bench & more", "px4fuse 1"))).encode())
     browser.open(file, **how)
 
 

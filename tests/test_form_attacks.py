@@ -17,7 +17,7 @@ from test_form_points import CLEAN, GAP, RIGHT, TRUTH
 
 from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers, RightVerdict
 from px4fuse.classroom.grading.flags import flag_equal_contents
-from px4fuse.classroom.grading.form_points import form_points
+from px4fuse.classroom.grading.form_points import compute_form_points
 from px4fuse.errors import SettingsError
 from px4fuse.results.answer_form import (
     FAULT_KINDS,
@@ -154,7 +154,7 @@ def test_manipulated_answer_form_is_refused_or_loses_points(name: str, tmp_path:
         assert "\n" not in message
         assert "$" not in message
         return
-    points = 100.0 * form_points(read_answers(file), TRUTH).fraction
+    points = 100.0 * compute_form_points(read_answers(file), TRUTH).fraction
     assert points <= expected + 0.01
     assert points == pytest.approx(expected, abs=6.0)
 
@@ -163,9 +163,9 @@ def test_manipulated_answer_form_is_refused_or_loses_points(name: str, tmp_path:
 def test_fault_named_on_clean_flight_earns_no_points_for_faults(kinds, tmp_path: Path) -> None:
     file = tmp_path / "answers.toml"
     file.write_text(of_kinds(*kinds), encoding="utf-8")
-    named = form_points(read_answers(file), CLEAN)
+    named = compute_form_points(read_answers(file), CLEAN)
     assert [part.points for part in named.parts if part.title == "mistakes"] == [0.0]
-    assert named.fraction < 0.5 * form_points(right(CLEAN), CLEAN).fraction
+    assert named.fraction < 0.5 * compute_form_points(right(CLEAN), CLEAN).fraction
 
 
 def test_two_students_with_equal_plot_answers_are_flagged() -> None:
@@ -234,4 +234,4 @@ HONEST_FORMS: dict[str, tuple[RightFormAnswers, Answers, float]] = {
 @pytest.mark.parametrize("name", HONEST_FORMS)
 def test_honest_answers_earn_at_least_expected_points(name: str) -> None:
     truth, form, expected = HONEST_FORMS[name]
-    assert 100.0 * form_points(form, truth).fraction >= expected - 0.01
+    assert 100.0 * compute_form_points(form, truth).fraction >= expected - 0.01

@@ -19,14 +19,14 @@ from px4fuse.classroom.assignment.truth import (
     InjectedFault,
     RightFormAnswers,
     RightVerdict,
-    right_form_answers,
+    compute_form_answers,
 )
 from px4fuse.classroom.grading.form_points import (
-    PART_NAMES,
+    FORM_PART_NAMES,
     POINTS_TABLE,
-    accepted_corrections,
-    form_points,
-    panels_showing,
+    compute_form_points,
+    find_accepted_corrections,
+    find_panels,
 )
 from px4fuse.cli.simulate import simulate
 from px4fuse.core.text import convert_nested
@@ -91,39 +91,42 @@ def with_false(*kinds: str) -> Answers:
 
 
 def points_by_part(answers: Answers, truth: RightFormAnswers = TRUTH) -> dict[str, float]:
-    return {part.title: part.points for part in form_points(answers, truth).parts}
+    return {part.title: part.points for part in compute_form_points(answers, truth).parts}
 
 
 def parts(answers: Answers, truth: RightFormAnswers = TRUTH) -> list[float]:
     found = points_by_part(answers, truth)
-    return [round(found.get(name, 0.0), 2) for name in PART_NAMES]
+    return [round(found.get(name, 0.0), 2) for name in FORM_PART_NAMES]
 
 
 def test_answer_form_offers_correct_answers_for_each_fault() -> None:
     assert set(SIMULATED) == set(FAULT_KINDS) - {"none", "vio-drift"}
     assert set(POINTS_TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
-        offered = accepted_corrections(InjectedFault(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
+        offered = find_accepted_corrections(InjectedFault(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
         assert {cure for cure, _, _ in offered} <= set(CORRECTIONS)
         assert max(share for _, _, share in offered) == 1.0
-        assert set(panels_showing(name)) > {"cover"}
+        assert set(find_panels(name)) > {"cover"}
 
 
 def test_correct_answer_form_earns_all_and_empty_form_no_points() -> None:
     assert points_by_part(RIGHT) == FULL
     assert parts(Answers(log_sha256=SHA256)) == [0.0] * 6
-    assert form_points(RIGHT, TRUTH).is_named_by_kind == {"clock-offset": True, "dropout": True}
+    assert compute_form_points(RIGHT, TRUTH).is_named_by_kind == {
+        "clock-offset": True,
+        "dropout": True,
+    }
 
 
-FULL = dict(zip(PART_NAMES, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))
+FULL = dict(zip(FORM_PART_NAMES, (30.0, 15.0, 10.0, 15.0, 15.0, 15.0), strict=True))
 
 
 def test_feedback_reports_each_right_answer_that_was_not_given() -> None:
-    assert not [each for each in form_points(RIGHT, TRUTH).feedback if "you gave" in each]
+    assert not [each for each in compute_form_points(RIGHT, TRUTH).feedback if "you gave" in each]
     choice = Choice("Figure 1: injected fault", ("yaw", "gap", "delay", "gate", "jump"))
     truth = replace(TRUTH, choices=((choice, "c"), (choice, "e")))
     form = replace(RIGHT, verdict_kf="", ekf2_did=(), quantities=(0.5, (3.0, 8.0)), choices=("a",))
-    feedback = "; ".join(form_points(form, truth).feedback)
+    feedback = "; ".join(compute_form_points(form, truth).feedback)
     assert "consistency of KF: 'overconfident' is right, you gave 'none'" in feedback
     assert "'dead-reckoned, then reset' is right, you gave none" in feedback
     assert "3, 7 is right, you gave 3, 8" in feedback
@@ -169,12 +172,12 @@ def test_partly_correct_answer_form_has_partial_points(
 def test_answer_that_names_a_fault_of_clean_flight_has_no_points() -> None:
     none = Answers(log_sha256=SHA256, mistakes=(NamedFault("none"),))
     assert parts(none, CLEAN) == [40.0, 0.0, 0.0, 0.0, 0.0, 0.0]
-    assert form_points(none, CLEAN).fraction == 0.4
+    assert compute_form_points(none, CLEAN).fraction == 0.4
     whole = replace(
         none, verdict_kf="consistent", verdict_ekf2="consistent", quantities=(0.5, 0.1, 0.2),
         ekf2_did=("followed the positions",),
     )  # fmt: skip
-    assert form_points(whole, CLEAN).fraction == 1.0
+    assert compute_form_points(whole, CLEAN).fraction == 1.0
     assert parts(RIGHT, CLEAN)[:4] == [0.0] * 4
 
 
@@ -207,13 +210,13 @@ def test_guessed_answers_for_all_loop_flights_earn_few_points() -> None:
     for kind in ("open-end", "none"):
         for each in constants(truths, kind):
             form = replace(each, quantities=(None, None, ()))
-            assert np.mean([form_points(form, one).fraction for one in truths]) <= 0.36
+            assert np.mean([compute_form_points(form, one).fraction for one in truths]) <= 0.36
 
 
 def test_expected_loop_closure_error_includes_odometry_drift() -> None:
     """A student cannot separate the drift from the measured closure error."""
     scenario = Scenario(kind="loop", passes=1, vio_drift=0.02, seed=4, truth=False)
-    (wrong,) = right_form_answers(
+    (wrong,) = compute_form_answers(
         flights.simulate(scenario, parse_faults(("open-end=5m",))), SHA256
     ).mistakes
     assert wrong.size is not None
@@ -309,7 +312,7 @@ def verdicts_by_hand(flight: dict[str, Any]) -> tuple[RightVerdict, RightVerdict
 def test_answer_form_points_agree_with_manual_grading(shared_logs: Path) -> None:
     bank = json.loads((shared_logs.parent / "grading" / "bank.json").read_text(encoding="utf-8"))
     truths = {
-        flight["flight"]: right_form_answers(simulation_of(flight["simulate"]), SHA256)
+        flight["flight"]: compute_form_answers(simulation_of(flight["simulate"]), SHA256)
         for flight in bank["flights"]
     }
     by_hand = {flight["flight"]: verdicts_by_hand(flight) for flight in bank["flights"]}
@@ -318,7 +321,7 @@ def test_answer_form_points_agree_with_manual_grading(shared_logs: Path) -> None
         known = tuple(to_tuple(one["truth"]) for one in form["quantities"])
         kf, ekf2 = by_hand[form["flight"]]
         truth = replace(truths[form["flight"]], quantities=known, kf=kf, ekf2=ekf2)
-        made = form_points(answers_of(form), truth)
+        made = compute_form_points(answers_of(form), truth)
         ours.append(sum(part.points for part in made.parts))
         theirs.append(form["judgement"]["points"])
     assert len(ours) >= 30
@@ -339,6 +342,7 @@ def test_random_answer_forms_earn_at_most_20_percent() -> None:
     rng = np.random.default_rng(5)
     truths = (TRUTH, replace(TRUTH, mistakes=(LATE,)), CLEAN)
     earned = [
-        form_points(at_random(rng, truths[n % 3]), truths[n % 3]).fraction for n in range(500)
+        compute_form_points(at_random(rng, truths[n % 3]), truths[n % 3]).fraction
+        for n in range(500)
     ]
     assert np.mean(earned) <= 0.2

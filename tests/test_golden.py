@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 from ulog_tools import gnss_log
 
 import px4fuse
-from px4fuse.batch.page import html_text
+from px4fuse.batch.page import format_html
 from px4fuse.cli import COMMANDS as CLI_COMMANDS
 from px4fuse.cli.mcp import make_tools, run_command
 from px4fuse.core.text import to_json_types
@@ -41,7 +41,7 @@ from px4fuse.explore.packing import Packer
 from px4fuse.report import pdf
 from px4fuse.simulation.faults import FAULT_TYPES, parse_faults
 from px4fuse.simulation.flights import make_answer_key, simulate
-from px4fuse.simulation.scenario import KINDS, make_scenario
+from px4fuse.simulation.scenario import SCENARIO_KINDS, make_scenario
 
 NOTES = """# What I saw
 
@@ -204,7 +204,7 @@ def spread(kind: str, *mistakes: str) -> list[str]:
     ] + list(of_values(make_answer_key(made)))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", SCENARIO_KINDS)
 def test_simulated_flight_values_match_reference_file(kind: str) -> None:
     """Flight without faults, then the lines that differ with each fault."""
     clean = spread(kind)
@@ -240,7 +240,7 @@ def test_report_on_aiding_sources_matches_reference_file(
 
 
 def test_batch_page_matches_reference_file() -> None:
-    text = html_text(artificial_logs(12), "Bench", "px4fuse 1")
+    text = format_html(artificial_logs(12), "Bench", "px4fuse 1")
     above = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL)
     drawn = [rounded(line) for line in above.splitlines() if line.strip()]
     assert_matches_golden("fleet_page", [*drawn, *of_values(content(text))])

@@ -18,7 +18,7 @@ from forgery import forged, with_results
 from pypdf import PdfReader, PdfWriter
 
 from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
-from px4fuse.classroom.assignment.roster import file_names
+from px4fuse.classroom.assignment.roster import make_file_names
 from px4fuse.classroom.grading.entries import Course, parse_late_rule
 from px4fuse.classroom.grading.grade import GradeOutcome, grade
 from px4fuse.classroom.grading.model import Grade, GradedReport
@@ -223,7 +223,7 @@ def test_interrupted_grade_command_prints_how_to_continue(tmp_path, monkeypatch)
 
 
 def test_grade_output_file_names_are_safe_and_unique() -> None:
-    assert file_names(["12345", "12345", "../../etc/passwd", "CON", "", "日本"]) == [
+    assert make_file_names(["12345", "12345", "../../etc/passwd", "CON", "", "日本"]) == [
         "12345", "12345-2", "_.._etc_passwd", "_CON", "report", "日本"
     ]  # fmt: skip
 

@@ -190,10 +190,10 @@ def test_height_sample_outside_gate_is_rejected(has_gate: bool, fused: float) ->
 @cache
 def outdoors(baro_noise_m: float = 0.4) -> Flight:
     """Simulate a flight with this EKF2_BARO_NOISE."""
-    usual = simulated.parameters
+    usual = simulated.make_parameters
     noise = {"EKF2_BARO_NOISE": baro_noise_m}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulated, "parameters", lambda *of: usual(*of) | noise)
+        patch.setattr(simulated, "make_parameters", lambda *of: usual(*of) | noise)
         return simulate_flight(make_scenario("outdoor", seed=3, passes=3), parse_faults(()))
 
 

@@ -12,7 +12,7 @@ from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
 from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers, RightVerdict
 from px4fuse.classroom.grading.item_analysis import analyse_items
 from px4fuse.classroom.grading.model import ItemScore
-from px4fuse.classroom.grading.oral_check import ask_about_form, questions_text
+from px4fuse.classroom.grading.oral_check import ask_about_form, format_questions
 from px4fuse.results.answer_form import Answers, Choice, NamedFault
 
 POINTS = np.array([[9, 2, 1], [8, 4, 9], [5, 6, 3], [2, 8, 8], [1, 9, 2]], dtype=float)
@@ -40,7 +40,7 @@ def test_item_discrimination_equals_correlation_with_other_items() -> None:
         others = POINTS.sum(axis=1) - POINTS[:, index]
         expected = np.corrcoef(POINTS[:, index], others)[0, 1]
         assert item.discrimination == pytest.approx(expected, abs=0.005)
-        assert item.fractions == pytest.approx(tuple(POINTS[:, index] / 10.0))
+        assert item.point_fractions == pytest.approx(tuple(POINTS[:, index] / 10.0))
 
 
 def test_item_analysis_of_four_reports_omits_discrimination() -> None:
@@ -50,13 +50,15 @@ def test_item_analysis_of_four_reports_omits_discrimination() -> None:
 def test_item_analysis_lists_answer_form_parts_and_faults() -> None:
     reports = [
         replace(
-            each, form_parts=(ItemScore("sizes", n, 15.0, ""),), is_found_by_fault={"nlos": n > 1}
+            each,
+            form_part_scores=(ItemScore("sizes", n, 15.0, ""),),
+            is_found_by_fault={"nlos": n > 1},
         )
         for n, each in enumerate(REPORTS)
     ]
     *_, sizes, fault = analyse_items(reports)
     assert (sizes.title, fault.title) == ("Answer form: sizes", "Fault: nlos")
-    assert fault.fractions == (0.0, 0.0, 1.0, 1.0, 1.0)
+    assert fault.point_fractions == (0.0, 0.0, 1.0, 1.0, 1.0)
     assert fault.csv_row[1:3] == (5, 0.6)
 
 
@@ -78,7 +80,7 @@ def test_oral_exam_asks_first_about_wrong_and_missed_faults() -> None:
     assert "You named nlos" in questions[1][0]
     assert "accepted size 8.5 to 11.5 %" in questions[1][1]
     assert "Your flight also has this fault" in questions[2][0]
-    assert "you answered: yaw" in questions[3][0]
+    assert "Your answer: yaw" in questions[3][0]
     assert "Right: delay" in questions[3][1]
     assert len(questions) == 4
 
@@ -87,7 +89,7 @@ def test_oral_exam_page_lists_n_questions_per_student() -> None:
     key = AnswerKey("aisle", (RightAnswers("s1", "Ada", "s1.ulg", "a" * 64, form=TRUTH),))
     report = graded_report("r.pdf", 5.0, form=FORM, log_sha256="a" * 64)
     rows = (replace(grade("s1", "Ada", 5.0), counted_report=report), grade("s2", "Max", None))
-    text = questions_text(rows, key, 2)
+    text = format_questions(rows, key, 2)
     assert text.count("Expected:") == 2
     assert "Ada s1" in text
     assert "Max" not in text

@@ -257,20 +257,24 @@ def test_simulate_ekf2_noise_below_reported_one_raises_error() -> None:
 
 def test_simulated_correlated_error_has_requested_sigma_and_tau() -> None:
     mistakes = FaultSizes(slow_error_m=0.5, slow_error_s=4.0)
-    drawn = sensors.slow_error(OUTDOOR, mistakes, 100_000, 0.2)
+    drawn = sensors.simulate_correlated_noise(OUTDOOR, mistakes, 100_000, 0.2)
     assert drawn.std(axis=0) == pytest.approx(0.5, rel=0.05)
     lag = int(4.0 / 0.2)
     after = np.mean(drawn[:-lag] * drawn[lag:], axis=0) / np.var(drawn, axis=0)
     assert after == pytest.approx(np.exp(-1.0), abs=0.05)
     # the first sample has the same σ
-    first = [sensors.slow_error(Scenario(seed=s), mistakes, 2, 0.2)[0] for s in range(400)]
+    first = [
+        sensors.simulate_correlated_noise(Scenario(seed=s), mistakes, 2, 0.2)[0] for s in range(400)
+    ]
     assert np.std(first) == pytest.approx(0.5, rel=0.1)
 
 
 def test_simulated_heading_error_builds_up_with_a_lag() -> None:
     time_s = np.array([0.0, 39.9, 43.0, 100.0])
-    clean = sensors.attitude_error(OUTDOOR, FaultSizes(), time_s).as_rotvec()
-    wrong = sensors.attitude_error(OUTDOOR, parse_faults(["heading=25,40"]), time_s).as_rotvec()
+    clean = sensors.simulate_attitude_error(OUTDOOR, FaultSizes(), time_s).as_rotvec()
+    wrong = sensors.simulate_attitude_error(
+        OUTDOOR, parse_faults(["heading=25,40"]), time_s
+    ).as_rotvec()
     turned = np.degrees(wrong - clean)[:, 2]
     assert turned == pytest.approx([0.0, 0.0, 25.0 * (1.0 - np.exp(-1.0)), 25.0], abs=0.01)
 

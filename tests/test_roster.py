@@ -101,7 +101,7 @@ ROSTERS = {
 def test_read_class_list_accepts_any_table_format(tmp_path, content) -> None:
     students = read_roster(written(tmp_path, content))
     assert [one.student_id for one in students] == ["1001", "1002"]
-    assert [one.file for one in students] == ["1001.ulg", "1002.ulg"]
+    assert [one.log_file_name for one in students] == ["1001.ulg", "1002.ulg"]
     if "whole" not in str(content):
         assert [one.name for one in students] == ["Ann Lee", "Bob Ray"]
 
@@ -168,15 +168,15 @@ def at(platform: str, number: str = "", name: str = "", **more: str) -> ExportOr
     ],
 )
 def test_student_is_identified_by_platform_id_before_name(origin, place) -> None:
-    assert CLASS.student_index(origin.person) == place
+    assert CLASS.find_student_index(origin.person) == place
 
 
 def test_student_is_matched_by_id_before_name() -> None:
     said = (("42", "Max Roe"), ("", "Roe, Max"), ("99", "Jane Doe"), ("", ""))
-    assert [CLASS.student_index(Person(*each)) for each in said] == [0, 1, 0, None]
+    assert [CLASS.find_student_index(Person(*each)) for each in said] == [0, 1, 0, None]
     # an exact id has priority over one with leading zeros
     class_list = ClassList([Person("042"), Person("42")])
-    assert [class_list.student_index(Person(each)) for each in ("42", "0042")] == [1, None]
+    assert [class_list.find_student_index(Person(each)) for each in ("42", "0042")] == [1, None]
 
 
 def test_class_list_is_completed_from_grading_worksheet() -> None:

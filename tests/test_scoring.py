@@ -213,11 +213,15 @@ class TestForm:
         assert [item.points for item in items if "faults" in item.title] == [points]
 
     def test_points_for_student_notes_are_pending_until_graded(self):
-        for notes, awaits_points in (("", False), ("I saw a gap.", True)):
+        for notes, is_awaiting_points in (("", False), ("I saw a gap.", True)):
             made = assess_results(with_notes(notes, student__id="s01"), key=key())
-            assert (made.awaits_points, made.counted_points is None, made.items[-1].points) == (
-                awaits_points,
-                awaits_points,
+            assert (
+                made.is_awaiting_points,
+                made.counted_points is None,
+                made.items[-1].points,
+            ) == (
+                is_awaiting_points,
+                is_awaiting_points,
                 0.0,
             )
 
@@ -260,7 +264,7 @@ class TestScore:
 
     def test_report_on_log_missing_in_answer_key_is_pending_review(self):
         made = assess_results(with_notes("", student__id="s01"), key=key(sha256="c" * 64))
-        assert "not about a log of the answer key" in made.instructor_action
+        assert "log of the report is not in the answer key" in made.instructor_action
 
     @pytest.mark.parametrize("results", [EXAMPLE, LOOP], ids=["compare", "loop"])
     def test_any_results_that_follow_the_schema_can_be_scored(self, results):
@@ -431,7 +435,7 @@ class TestClassFlags:
         theirs = Answers(log_sha256=SHA, mistakes=other, quantities=(0.124, 0.7, None))
         made = flag_equal_contents([report(1, form=mine), report(2, form=theirs)])
         assert set(made) == {"1.pdf", "2.pdf"}
-        assert "The answer form has the same numbers as the form of" in made["1.pdf"][0]
+        assert "The answer form contains the same numbers as the form of" in made["1.pdf"][0]
         # two equal numbers are not enough
         theirs = replace(theirs, quantities=(0.2, 0.7, 0.45))
         apart = replace(mine, quantities=(0.123, None, 0.3))

@@ -41,8 +41,8 @@ from px4fuse.simulation.flights import (
     to_flight,
     to_ulog,
 )
-from px4fuse.simulation.motion import attitude, direction, plan_flight
-from px4fuse.simulation.scenario import DT_S, Scenario, bounds_by_field
+from px4fuse.simulation.motion import compute_attitude, compute_direction, plan_flight
+from px4fuse.simulation.scenario import DT_S, Scenario, collect_field_bounds
 
 NO_FAULTS = FaultSizes()
 AISLE = Scenario(passes=2, seed=4)
@@ -58,7 +58,7 @@ IDEAL = {
 
 def test_each_simulated_fault_size_has_limits() -> None:
     numbers = {item.name for item in fields(FaultSizes) if "float" in str(item.type)}
-    assert set(bounds_by_field(FaultSizes)) == numbers
+    assert set(collect_field_bounds(FaultSizes)) == numbers
 
 
 def motion_of(scenario, mistakes=NO_FAULTS):
@@ -69,12 +69,12 @@ def motion_of(scenario, mistakes=NO_FAULTS):
 
 def position_errors_m(simulation):
     positions = simulation.positions
-    return positions.position_m - simulation.motion.at(positions.measured_s).position_m
+    return positions.position_m - simulation.motion.at(positions.measurement_times_s).position_m
 
 
 def stamps_s(simulation):
     source = simulation.positions.topic.fields
-    return (source["timestamp_sample"].astype(np.int64) - sensors.START_US) * 1e-6
+    return (source["timestamp_sample"].astype(np.int64) - sensors.FIRST_TIMESTAMP_US) * 1e-6
 
 
 # --- motion
@@ -110,7 +110,7 @@ class TestMotion:
         # the jerk has small steps at the ends of the fade
         time = np.linspace(0.0, motion.duration_s, 20_001)
         step = 1e-4
-        before, here, after = (attitude(motion.at(time + s)) for s in (-step, 0.0, step))
+        before, here, after = (compute_attitude(motion.at(time + s)) for s in (-step, 0.0, step))
         force = np.einsum("nij,nj->ni", here.body_to_ned, here.specific_force_m_s2)
         force[:, 2] += 9.80665
         assert np.allclose(force, motion.at(time).acceleration_m_s2, atol=1e-9)
@@ -127,7 +127,7 @@ def test_simulated_open_loop_has_requested_closure_error(left_out, texts):
     flown = simulate(scenario, parse_faults(texts))
     first, last = flown.motion.at(np.array([0.0, flown.motion.duration_s])).position_m
     # the last side points back along heading + 270 degrees
-    assert np.allclose(last - first, -left_out * direction(30.0 + 270.0), atol=1e-9)
+    assert np.allclose(last - first, -left_out * compute_direction(30.0 + 270.0), atol=1e-9)
     error_m = make_answer_key(flown)["truth"]["closure_error_m"]
     assert error_m == pytest.approx(left_out, abs=1e-9)
 
@@ -136,8 +136,8 @@ def test_simulated_open_loop_has_requested_closure_error(left_out, texts):
 def test_simulated_aisle_flight_has_requested_length_and_yaw(yaw):
     motion = motion_of(replace(AISLE, wander_m=0.0, yaw=yaw))
     state = motion.at(np.linspace(0.0, motion.duration_s, 5001))
-    assert (state.position_m @ direction(30.0)).max() == pytest.approx(12.0, abs=1e-9)
-    assert np.abs(state.position_m @ direction(120.0)).max() < 1e-9
+    assert (state.position_m @ compute_direction(30.0)).max() == pytest.approx(12.0, abs=1e-9)
+    assert np.abs(state.position_m @ compute_direction(120.0)).max() < 1e-9
     assert state.position_m[:, 2].min() == pytest.approx(-1.5, abs=1e-9)
     assert np.allclose(state.position_m[-1], 0.0, atol=1e-9)
     moving = np.hypot(*state.velocity_m_s[:, :2].T) > 0.8
@@ -156,7 +156,7 @@ def test_simulated_imu_noise_averaged_over_dt_equals_sigma_a(texts):
     simulation = simulate(scenario, parse_faults(texts))
     imu = to_flight(simulation).imu
     time = imu.index.to_numpy()
-    truth = attitude(simulation.motion.at(time))
+    truth = compute_attitude(simulation.motion.at(time))
     error = np.einsum("nij,nj->ni", truth.body_to_ned, imu.to_numpy()[:, :3])
     error[:, 2] += 9.80665
     error -= simulation.motion.at(time).acceleration_m_s2
@@ -171,13 +171,13 @@ def test_simulated_imu_noise_averaged_over_dt_equals_sigma_a(texts):
 def test_simulated_imu_biases_are_constant_with_requested_sigma():
     simulation = simulate(Scenario(seed=9))
     imu = to_flight(simulation).imu
-    truth = attitude(simulation.motion.at(imu.index.to_numpy()))
+    truth = compute_attitude(simulation.motion.at(imu.index.to_numpy()))
     truth_values = make_answer_key(simulation)["truth"]
     bias = imu.to_numpy()[:, :3].astype(float) - truth.specific_force_m_s2
     assert bias.mean(axis=0) == pytest.approx(truth_values["accelerometer_bias_m_s2"], abs=0.025)
     bias = imu[Columns.ANGULAR_RATE].to_numpy(float) - truth.angular_rate_rad_s
     assert bias.mean(axis=0) == pytest.approx(truth_values["gyro_bias_rad_s"], abs=3e-4)
-    drawn = [sensors.biases(Scenario(seed=seed), NO_FAULTS) for seed in range(400)]
+    drawn = [sensors.draw_biases(Scenario(seed=seed), NO_FAULTS) for seed in range(400)]
     assert np.std([b[0] for b in drawn]) == pytest.approx(0.03, rel=0.1)
     assert np.std([b[1] for b in drawn]) == pytest.approx(0.002, rel=0.1)
 
@@ -187,8 +187,8 @@ def test_simulated_vio_drift_has_requested_rate():
     for seed in range(40):
         scenario = Scenario(kind="loop", passes=1, length_m=8.0, seed=seed, sigma_vio_m=0.0)
         motion = motion_of(scenario)
-        source = sensors.positions(scenario, NO_FAULTS, motion)
-        errors_m = source.position_m - motion.at(source.measured_s).position_m
+        source = sensors.simulate_positions(scenario, NO_FAULTS, motion)
+        errors_m = source.position_m - motion.at(source.measurement_times_s).position_m
         assert np.allclose(errors_m[-1], source.drift_m, atol=1e-9)
         ends.append(source.drift_m)
     # 1.5 % of 32 m plus the deviation, with a random walk of 0.01 m/√m
@@ -209,7 +209,7 @@ class TestMistakes:
     ])  # fmt: skip
     def test_simulated_clock_error_shifts_only_timestamps(self, text, offset_s, share):
         late = simulate(UNFILTERED, parse_faults([text]))
-        time = late.positions.measured_s
+        time = late.positions.measurement_times_s
         assert np.allclose(stamps_s(late) - time, offset_s + share * time, atol=1e-6)
         arrivals = (s.positions.topic.fields["timestamp"] for s in (late, self.CLEAN))
         assert np.array_equal(*arrivals)
@@ -217,7 +217,7 @@ class TestMistakes:
 
     def test_simulated_clock_jump_ends_at_timesync_convergence(self):
         jumping = simulate(Scenario(seed=4), parse_faults(["clock-jump=0.25"]))
-        fields, time = jumping.positions.topic.fields, jumping.positions.measured_s
+        fields, time = jumping.positions.topic.fields, jumping.positions.measurement_times_s
         before = time < 50.0
         assert 0.0 < before.mean() < 1.0
         assert np.array_equal(fields["timestamp"] == fields["timestamp_sample"], before)
@@ -228,7 +228,7 @@ class TestMistakes:
     def test_simulated_nlos_outliers_have_exact_fraction(self):
         simulation = simulate(Scenario(seed=6, sigma_uwb_m=0.0), parse_faults(["nlos=5%,3m"]))
         outlier, motion = simulation.positions.is_outlier, simulation.motion
-        time = simulation.positions.measured_s
+        time = simulation.positions.measurement_times_s
         flying = (time > motion.take_off_s) & (time < motion.touch_down_s)
         assert np.count_nonzero(outlier) == round(0.05 * np.count_nonzero(flying))
         assert not np.any(outlier & ~flying)
@@ -249,9 +249,9 @@ class TestMistakes:
         with_gap = simulate(UNFILTERED, parse_faults([text]))
         middle = with_gap.motion.duration_s / 2.0
         start, end = start or middle - 3.0, end or middle + 3.0
-        clean = self.CLEAN.positions.measured_s
+        clean = self.CLEAN.positions.measurement_times_s
         remaining = clean[(clean <= start) | (clean >= end)]
-        assert np.array_equal(with_gap.positions.measured_s, remaining)
+        assert np.array_equal(with_gap.positions.measurement_times_s, remaining)
 
     @pytest.mark.parametrize("rate", [2.0, 4.0])
     def test_simulated_decimation_reduces_position_and_imu_rate(self, rate):
@@ -271,9 +271,9 @@ class TestMistakes:
     def test_simulated_low_pass_positions_lag_by_time_constant(self):
         scenario = Scenario(seed=4, sigma_uwb_m=0.0, uwb_rate_hz=50.0, wander_m=0.0)
         simulation = simulate(scenario, parse_faults(["smoothed=0.5s"]))
-        truth = simulation.motion.at(simulation.positions.measured_s)
-        along = truth.velocity_m_s @ direction(30.0)
-        lag = -(position_errors_m(simulation) @ direction(30.0))
+        truth = simulation.motion.at(simulation.positions.measurement_times_s)
+        along = truth.velocity_m_s @ compute_direction(30.0)
+        lag = -(position_errors_m(simulation) @ compute_direction(30.0))
         fast = np.abs(np.abs(along) - 1.0) < 1e-9
         settled = fast & np.roll(fast, 150)  # 3 s are six time constants
         assert np.any(settled)

@@ -114,7 +114,7 @@ def test_simulated_ekf2_is_consistent_at_its_fusion_horizon(clean):
     later = record.delayed[record.delayed.index > 15.0]
     error = later["north_m_s"] - np.interp(later.index, truth.index, truth["north_m_s"])
     assert 0.5 < np.mean(error**2 / later["north_m2_s2"]) < 2.5
-    bias, gyro_bias = sensors.biases(AISLE, parse_faults([]))
+    bias, gyro_bias = sensors.draw_biases(AISLE, parse_faults([]))
     last = later.iloc[-1]
     names = [f"gyro_bias_{axis}_rad_s" for axis in ("forward", "right")]
     assert last[names].to_numpy(float) == pytest.approx(gyro_bias[:2], abs=0.002)
@@ -125,7 +125,7 @@ def test_simulated_ekf2_at_rest_estimates_level_attitude():
     tilt = Rotation.from_euler("x", 0.1).as_matrix()
     gravity = np.array([0.0, 0.0, 9.80665])
     bias, rate = np.array([0.03, -0.02, 0.05]), np.array([0.002, -0.001, 0.003])
-    x, P = ekf2._initial_state_at_rest(tilt, tilt.T @ -gravity + bias, rate, 0.01)
+    x, P = ekf2._compute_state_at_rest(tilt, tilt.T @ -gravity + bias, rate, 0.01)
     assert x[9:12] == pytest.approx(rate, rel=1e-3)
     # the remaining horizontal bias is compensated by a tilt
     force = tilt @ (tilt.T @ -gravity + bias - x[12:15])
@@ -191,7 +191,7 @@ def test_simulated_ekf2_ignores_samples_with_older_timestamps():
     taken = topics["estimator_aid_src_ev_pos"]["timestamp_sample"].astype(np.int64)
     assert np.any(np.diff(sent) < 0)
     assert np.all(np.diff(taken) > 0)
-    rows = ekf2._received_positions(simulation.positions)
+    rows = ekf2._select_positions(simulation.positions)
     assert len(rows.timestamp_s) < len(sent)
     assert np.all(np.diff(rows.timestamp_s) > 0)
 

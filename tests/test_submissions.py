@@ -19,9 +19,9 @@ from px4fuse.classroom.assignment.roster import Person
 from px4fuse.classroom.grading import submissions
 from px4fuse.classroom.grading.model import Submission
 from px4fuse.classroom.grading.submissions import (
-    add_origins,
+    add_submitters,
     find_submissions,
-    parse_origin,
+    parse_submission_path,
     read_submission,
 )
 from px4fuse.core.reading import files_by_sha256
@@ -53,7 +53,7 @@ def reason(submission: Submission) -> str:
 
 
 def name_and_number(name: str) -> tuple[str, str]:
-    origin = parse_origin(name)
+    origin = parse_submission_path(name)
     return origin.person.name, "".join(origin.person.numbers.values())
 
 
@@ -99,10 +99,12 @@ def test_student_name_is_read_from_learning_platform_file_name(name, is_):
 
 
 def test_submission_file_name_gives_login_time_and_lateness():
-    blackboard = parse_origin("Lab 3_roe1_attempt_2026-11-20-12-34-56_Lab_doe1_attempt_x.pdf")
+    blackboard = parse_submission_path(
+        "Lab 3_roe1_attempt_2026-11-20-12-34-56_Lab_doe1_attempt_x.pdf"
+    )
     assert (blackboard.person.login, blackboard.platform) == ("roe1", "blackboard")
-    assert parse_origin("Lab_roe1_attempt_2026-99-20-12-34-56_r.pdf").time is None
-    ilias = parse_origin("Lab 3/Roe_Max_roe1_77/Late Submission - r.pdf")
+    assert parse_submission_path("Lab_roe1_attempt_2026-99-20-12-34-56_r.pdf").time is None
+    ilias = parse_submission_path("Lab 3/Roe_Max_roe1_77/Late Submission - r.pdf")
     assert (ilias.platform, ilias.person.login, ilias.is_late) == ("ilias", "roe1", True)
 
 
@@ -133,7 +135,7 @@ def test_forged_file_name_does_not_change_learning_platform():
         "Lab_mal_attempt_2026-11-23-10-00-00_Doe Jane_4711_assignsubmission_file_r.pdf",
     ]
     files = [Submission(Path("export.zip"), name, name) for name in (*usual, *forged)]
-    origins = [one.origin for one in add_origins(files, {})]
+    origins = [one.origin for one in add_submitters(files, {})]
     assert {one.platform for one in origins} == {"blackboard"}
     assert [one.person.login for one in origins[3:]] == ["eve", "mal"]
     assert {one.time.day for one in origins[3:]} == {23}

@@ -419,7 +419,7 @@ def flown(
     opposite sign in EKF2; ``off_from_s``: EKF2 does not fuse vision from then on.
     """
     vision, runs = sent(), []
-    usual, usual_run = simulated.parameters, run_configurations
+    usual, usual_run = simulated.make_parameters, run_configurations
     noise = np.random.default_rng(9).normal(0.0, 1.0, vision.position_m.shape)
     heard = replace(vision, position_m=(-1.0 if flipped else 1.0) * vision.position_m
                     + wrong_m * noise)  # fmt: skip
@@ -435,7 +435,7 @@ def flown(
         return runs
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulated, "parameters", lambda *of: usual(*of) | OF_VISION | changed)
+        patch.setattr(simulated, "make_parameters", lambda *of: usual(*of) | OF_VISION | changed)
         patch.setattr(simulated, "run_configurations", both)
         flight = simulate_flight(OUTDOOR, parse_faults(()))
     updates = update_records(runs[0])

@@ -13,7 +13,7 @@ from form_guesses import right
 
 from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
-from px4fuse.classroom.grading.form_points import FLIGHT_SHARE, form_points
+from px4fuse.classroom.grading.form_points import FLIGHT_POINTS_FRACTION, compute_form_points
 from px4fuse.classroom.grading.records import load_or_verify
 from px4fuse.classroom.grading.rubric import read_rubric, score_report
 from px4fuse.core.reading import files_by_sha256
@@ -116,12 +116,14 @@ def test_form_without_answers_on_plots_earns_part_of_points() -> None:
     _, answer = simulate_assigned_flight(SECRET, Person("s01"), "aisle", 2)
     assert answer.form is not None
     complete = right(answer.form)
-    assert form_points(complete, answer.form).fraction == pytest.approx(1.0)
+    assert compute_form_points(complete, answer.form).fraction == pytest.approx(1.0)
     copied = replace(complete, choices=())
-    assert form_points(copied, answer.form).fraction == pytest.approx(FLIGHT_SHARE)
+    assert compute_form_points(copied, answer.form).fraction == pytest.approx(
+        FLIGHT_POINTS_FRACTION
+    )
     for letter in CHOICE_NAMES:
         guessed = replace(complete, choices=(letter,) * len(answer.form.choices))
-        assert form_points(guessed, answer.form).fraction < 0.6
+        assert compute_form_points(guessed, answer.form).fraction < 0.6
 
 
 def test_grade_flags_answer_form_of_other_log(assigned: Assigned) -> None:
@@ -130,5 +132,5 @@ def test_grade_flags_answer_form_of_other_log(assigned: Assigned) -> None:
     results = replace(assigned.results, student=other)
     report = score_report(results, Verification("verified", (), True), read_rubric(None), None)
     assert report.counted_points is None
-    assert "made for another log" in report.pending_reason
-    assert report.pending_reason in report.flags
+    assert "made for another log" in report.pending_actions
+    assert report.pending_actions in report.flags

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from pyulog import ULog
 
 from px4fuse.core.arrays import Array
-from px4fuse.simulation.ulog_writer import Topic, encode
+from px4fuse.simulation.ulog_writer import Topic, encode_ulog
 
 START_US = 5_000_000
 PUBLICATION_LAG_US = 60_000
@@ -69,7 +69,7 @@ class Log:
     def encode(self) -> bytes:
         """Return the file content; a repeated topic gets two subscriptions."""
         dropouts = (struct.pack("<HcH", 2, b"O", length) for length in self.dropouts_ms)
-        return encode(self.topics, self.parameters, self.info, START_US) + b"".join(dropouts)
+        return encode_ulog(self.topics, self.parameters, self.info, START_US) + b"".join(dropouts)
 
 
 def load(path: Path) -> Log:

@@ -5,14 +5,14 @@ import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-from px4fuse.batch.inputs import InputResults, Progress, Results, read_inputs
+from px4fuse.batch.inputs import InputResults, ProgressCallback, Results, read_inputs
 from px4fuse.batch.measures import (
     ABSOLUTE_TOLERANCE,
     RELATIVE_TOLERANCE,
     ComparedNumber,
     collect_numbers,
 )
-from px4fuse.batch.rows import value_at
+from px4fuse.batch.rows import find_value
 from px4fuse.comparison.model import FILTER_NAMES, FilterSummary
 from px4fuse.comparison.reruns import is_inconsistent
 from px4fuse.core.text import format_factor, format_number
@@ -20,9 +20,9 @@ from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.results import contract
 from px4fuse.results.model import provenance, schema_of
 
-# Maximum √(mean NEES) of a consistent filter (minimum: 1/2). The limits are wide, because the
-# errors in a flight are correlated and the output predictor of EKF2 delays its position
-MAX_NEES_SIGMA_RATIO = 2.0
+# Maximum √(mean NEES) of a consistent filter (minimum: its inverse). The limits are wide, because
+# the errors in a flight are correlated and the output predictor of EKF2 delays its position
+MAX_SQRT_MEAN_NEES = 2.0
 # Settings and flight properties that px4fuse diff compares
 SETTING_PATHS_BY_LABEL = {
     **{
@@ -42,7 +42,7 @@ SETTING_PATHS_BY_LABEL = {
 
 
 def diff(
-    a: str | Path, b: str | Path, *, progress: Progress = lambda _: None
+    a: str | Path, b: str | Path, *, progress: ProgressCallback = lambda _: None
 ) -> contract.ChangeResults:
     """List the settings, numbers and findings that differ between A and B.
 
@@ -64,12 +64,12 @@ def diff(
 
 def list_changes(a: InputResults, b: InputResults) -> contract.ChangeResults:
     """List the settings, numbers and findings that differ between the results of A and B."""
-    findings = tuple(_finding_changes(a.results, b.results))
+    findings = tuple(_list_finding_changes(a.results, b.results))
     return contract.ChangeResults(
         schema=schema_of(contract.CHANGES_SCHEMA),
         a=_describe_input(a),
         b=_describe_input(b),
-        settings=tuple(_setting_changes(a.results, b.results)),
+        settings=tuple(_list_setting_changes(a.results, b.results)),
         numbers=tuple(compare_numbers(collect_numbers(a.results), collect_numbers(b.results))),
         findings=findings,
         worse=tuple(_describe_worse_verdicts(a.results, b.results, findings)),
@@ -88,10 +88,12 @@ def _describe_input(diff_input: InputResults) -> contract.DiffInput:
     )
 
 
-def _setting_changes(results_a: Results, results_b: Results) -> Iterator[contract.SettingChange]:
+def _list_setting_changes(
+    results_a: Results, results_b: Results
+) -> Iterator[contract.SettingChange]:
     values_a, values_b = (
-        {label: value_at(results, path) for label, path in SETTING_PATHS_BY_LABEL.items()}
-        | _parameters(results)
+        {label: find_value(results, path) for label, path in SETTING_PATHS_BY_LABEL.items()}
+        | _collect_parameters(results)
         for results in (results_a, results_b)
     )
     for name in {**values_a, **values_b}:
@@ -99,9 +101,9 @@ def _setting_changes(results_a: Results, results_b: Results) -> Iterator[contrac
             yield contract.SettingChange(name, value_a, value_b)
 
 
-def _parameters(results: Results) -> dict[str, float]:
+def _collect_parameters(results: Results) -> dict[str, float]:
     """Return the PX4 parameters in the results, rounded to the 6 digits of a float32."""
-    parameters = (value_at(results, "ekf2_replay.settings") or {}) | dict(results.log.parameters)
+    parameters = (find_value(results, "ekf2_replay.settings") or {}) | dict(results.log.parameters)
     return {name: float(f"{parameters[name]:.6g}") for name in sorted(parameters)}
 
 
@@ -141,7 +143,9 @@ def compare_numbers(
         )
 
 
-def _finding_changes(results_a: Results, results_b: Results) -> Iterator[contract.UnsharedFinding]:
+def _list_finding_changes(
+    results_a: Results, results_b: Results
+) -> Iterator[contract.UnsharedFinding]:
     """Yield the findings whose id and severity are only in A or only in B."""
     comparisons: tuple[tuple[Results, Results, contract.DiffSide], ...] = (
         (results_b, results_a, "B"),
@@ -161,16 +165,16 @@ def _describe_worse_verdicts(
 ) -> Iterator[str]:
     """Yield sentences on filters that are consistent only in results A, and errors only in B."""
     statistics_a, statistics_b = map(_mean_statistics_by_label, (results_a, results_b))
-    for label, (value_a, was_consistent) in statistics_a.items():
-        value_b, is_consistent = statistics_b.get(label, (value_a, True))
+    for label, (mean_a, was_consistent) in statistics_a.items():
+        mean_b, is_consistent = statistics_b.get(label, (mean_a, True))
         if was_consistent and not is_consistent:
-            ratio = value_b**0.5
-            factor = format_factor(max(ratio, 1.0 / ratio))
-            verdict_text = f"overconfident, σ {factor} times too small"
+            ratio = mean_b**0.5
+            factor_text = format_factor(max(ratio, 1.0 / ratio))
+            verdict_text = f"overconfident, σ {factor_text} times too small"
             if ratio < 1.0:
-                verdict_text = f"underconfident, σ {factor} times too large"
+                verdict_text = f"underconfident, σ {factor_text} times too large"
             yield (
-                f"{label}: {format_number(value_a)} (consistent) → {format_number(value_b)} "
+                f"{label}: {format_number(mean_a)} (consistent) → {format_number(mean_b)} "
                 f"({verdict_text})."
             )
     error_ids = [
@@ -183,13 +187,13 @@ def _describe_worse_verdicts(
 def _mean_statistics_by_label(results: Results) -> dict[str, tuple[float, bool]]:
     """Return each mean NIS and mean NEES by label, with True for a consistent filter."""
     statistics: dict[str, tuple[float, bool]] = {}
-    for axis, result in (value_at(results, "axes") or {}).items():
+    for axis, result in (find_value(results, "axes") or {}).items():
         for name, label in FILTER_NAMES.items():
             summary = result.filters[name]
             if isinstance(summary, FilterSummary):
                 is_consistent = not is_inconsistent(summary)
                 statistics[f"Mean NIS of {label}, {axis}"] = summary.nis_mean, is_consistent
-            if (nees := value_at(summary, "truth.nees_position_mean")) is not None:
-                is_consistent = MAX_NEES_SIGMA_RATIO**-2 <= nees <= MAX_NEES_SIGMA_RATIO**2
+            if (nees := find_value(summary, "truth.nees_position_mean")) is not None:
+                is_consistent = MAX_SQRT_MEAN_NEES**-2 <= nees <= MAX_SQRT_MEAN_NEES**2
                 statistics[f"Mean NEES of {label}, {axis}"] = nees, is_consistent
     return statistics

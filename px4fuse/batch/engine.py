@@ -77,8 +77,8 @@ def _check_workers(client: Client) -> None:
         if worker_version != own_version:
             version_text = worker_version if isinstance(worker_version, str) else "missing"
             raise SettingsError(
-                f"px4fuse version: {version_text} on Dask worker {name}, "
-                f"{own_version} on this computer.",
+                f"px4fuse of Dask worker {name} is {version_text}, that of this computer is "
+                f"{own_version}.",
                 "Install the same version of px4fuse on the worker and on this computer.",
             )
 

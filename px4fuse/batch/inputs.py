@@ -18,11 +18,11 @@ from px4fuse.results.reading import MAX_RESULTS_BYTES, read_results
 from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_attached_results
 
 InputKind = Literal["log", "report", "results"]
-Progress = Callable[[str], None]
+ProgressCallback = Callable[[str], None]
 Results = ComparisonResults | AidsResults
-# Settings that are copied from the results of A to the analysis of a log B, or vice versa
+# Settings with which a log is analysed if the other input has the results of another log
 _FILTER_SETTINGS = {*Settings.__dataclass_fields__, "axes"}
-# Options that describe input files; they are never copied
+# Options that name input files: the analysis of a log never takes them from the other input
 _INPUT_FILE_SETTINGS = {"log", "system", "position"}
 
 
@@ -36,7 +36,7 @@ class InputResults:
 
 
 def read_inputs(
-    a: Path, b: Path, progress: Progress = lambda _: None
+    a: Path, b: Path, progress: ProgressCallback = lambda _: None
 ) -> tuple[InputResults, InputResults]:
     """Read two logs, reports or results; analyse a log with the settings of the other input.
 
@@ -74,7 +74,9 @@ def _read_given_results(path: Path) -> InputResults | None:
     return InputResults(name, "report" if is_report else "results", results)
 
 
-def _analyse_log(path: Path, other_input: InputResults | None, progress: Progress) -> InputResults:
+def _analyse_log(
+    path: Path, other_input: InputResults | None, progress: ProgressCallback
+) -> InputResults:
     request = ComparisonRequest(log=str(path))
     if other_input is not None:
         is_same_log = other_input.results.log.sha256 in files_by_sha256([path])

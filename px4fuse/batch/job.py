@@ -7,7 +7,14 @@ from pathlib import Path
 import msgspec
 
 from px4fuse.batch.logs import local_file
-from px4fuse.batch.rows import FAILED, NOT_COMPARED, Row, axis_rows, finding_columns, log_columns
+from px4fuse.batch.rows import (
+    FAILED,
+    NOT_COMPARED,
+    Row,
+    collect_finding_values,
+    collect_log_values,
+    make_axis_rows,
+)
 from px4fuse.core.reading import files_by_sha256, max_log_bytes
 from px4fuse.errors import LogError, MissingDataError, Px4FuseError
 from px4fuse.request import ComparisonRequest, with_options
@@ -35,8 +42,8 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """Table rows, results and report of one log.
+class LogOutcome:
+    """Result of one log: table rows, results (JSON), and report (PDF) if requested.
 
     ``rows`` has one row per axis, or one row with the reason if the log could not be compared.
     """
@@ -47,31 +54,31 @@ class Outcome:
     report_pdf: bytes = b""
 
 
-def analyse(job: Job) -> Outcome:
+def analyse(job: Job) -> LogOutcome:
     """Compare KF and EKF2 on one log, as ``px4fuse compare`` does."""
     sha256 = ""
     max_log_bytes.set(job.max_bytes)
     try:
         with local_file(job.address) as path:
-            sha256 = _sha256(path)
+            sha256 = _compute_sha256(path)
             if sha256 in job.finished_hashes:
-                return Outcome(sha256)
+                return LogOutcome(sha256)
             outcome = _compare_log(job, path, sha256)
-            if _sha256(path) != sha256:
+            if _compute_sha256(path) != sha256:
                 remedy = "Run the same command again when the file is complete."
                 raise LogError("the file changed while it was read", remedy)
             return outcome
     except Px4FuseError as error:
-        return Outcome(sha256, (failure_row(error, FAILED) | {"log_sha256": sha256},))
+        return LogOutcome(sha256, (make_failure_row(error, FAILED) | {"log_sha256": sha256},))
 
 
-def failure_row(error: Px4FuseError, status: str, name: str = "") -> Row:
+def make_failure_row(error: Px4FuseError, status: str, name: str = "") -> Row:
     """Return the columns with status, reason and action for a log without results."""
     reason = with_options(error.reason).removeprefix(f"{name}: ")
     return {"status": status, "reason": reason, "remedy": with_options(error.remedy)}
 
 
-def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
+def _compare_log(job: Job, path: Path, sha256: str) -> LogOutcome:
     # slow imports, which only the worker processes need
     from px4fuse.analysis import AidsOnlyAnalysis  # noqa: PLC0415
     from px4fuse.diagnose import diagnose_or_check_aids, read_flight  # noqa: PLC0415
@@ -82,35 +89,39 @@ def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
     row: Row = {"name": path.name, "log_sha256": sha256}
     try:
         flight = read_flight(request)
-        row |= log_columns(log_record(flight))
+        row |= collect_log_values(log_record(flight))
         analysis = diagnose_or_check_aids(request, flight=flight)
         if isinstance(analysis, AidsOnlyAnalysis):
-            row |= finding_columns(analysis.findings, analysis.aids)
+            row |= collect_finding_values(analysis.findings, analysis.aids)
             missing_data = MissingDataError(
                 analysis.missing_data.reason, analysis.missing_data.remedy
             )
-            return Outcome(sha256, (row | failure_row(missing_data, NOT_COMPARED, path.name),))
-        contract_results = results(request, analysis)
-        results_json, report_pdf = to_json(contract_results), b""
+            return LogOutcome(
+                sha256, (row | make_failure_row(missing_data, NOT_COMPARED, path.name),)
+            )
+        comparison_results = results(request, analysis)
+        results_json, report_pdf = to_json(comparison_results), b""
         if job.with_report:
             from px4fuse.report.pdf import render_pdf  # noqa: PLC0415
 
-            report_pdf = render_pdf(analysis, contract_results, results_json)
+            report_pdf = render_pdf(analysis, comparison_results, results_json)
     except Px4FuseError as error:
         status = NOT_COMPARED if isinstance(error, MissingDataError) else FAILED
-        return Outcome(sha256, (row | failure_row(error, status, path.name),))
-    return Outcome(sha256, tuple(axis_rows(contract_results)), results_json.encode(), report_pdf)
+        return LogOutcome(sha256, (row | make_failure_row(error, status, path.name),))
+    return LogOutcome(
+        sha256, tuple(make_axis_rows(comparison_results)), results_json.encode(), report_pdf
+    )
 
 
-def _sha256(path: Path) -> str:
+def _compute_sha256(path: Path) -> str:
     (sha256,) = files_by_sha256([path])
     return sha256
 
 
-def file_stem(name: str, sha256: str) -> str:
+def make_file_stem(name: str, sha256: str) -> str:
     """Return an output file name: name of the log and first digits of its SHA-256.
 
-    >>> file_stem("Flug 3.ulg", "ab" * 32)
+    >>> make_file_stem("Flug 3.ulg", "ab" * 32)
     'Flug_3-abababababab'
     """
     return f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', Path(name).stem)[:60]}-{sha256[:12]}"

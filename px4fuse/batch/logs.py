@@ -51,13 +51,15 @@ def find_logs(patterns: Iterable[str]) -> list[LogAddress]:
     SettingsError
         A pattern matches no log, or a URL requires a package that is not installed.
     """
-    logs_by_address = {log.address: log for pattern in patterns for log in _logs_in(pattern)}
+    logs_by_address = {
+        log.address: log for pattern in patterns for log in _find_pattern_logs(pattern)
+    }
     if not logs_by_address:
         raise SettingsError("no logs were given. Give files, folders, globs or URLs.")
     return sorted(logs_by_address.values())
 
 
-def _logs_in(pattern: str) -> list[LogAddress]:
+def _find_pattern_logs(pattern: str) -> list[LogAddress]:
     if not pattern:
         raise SettingsError("the name of a log is empty", "Give files, folders, globs or URLs.")
     file_system, root_path = _file_system(pattern)
@@ -136,7 +138,10 @@ def _file_system(address: str) -> tuple[AbstractFileSystem, str]:
             f"{address}: this type of URL requires {package}.", f'Run pip install "{package}".'
         ) from error
     except ValueError as error:  # the protocol of the URL is unknown
-        raise SettingsError(f"{address}: {error}", "Give a path or another URL.") from error
+        raise SettingsError(
+            f"{address}: {error}",
+            "Give the path of a log, or a URL with a protocol that fsspec supports.",
+        ) from error
     return file_system, path
 
 

@@ -8,7 +8,7 @@ is a fraction from 0 to 1.
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from px4fuse.batch.rows import read_rows, value_at
+from px4fuse.batch.rows import find_value, read_rows
 from px4fuse.comparison.model import FILTER_NAMES
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.signals import AISLE
@@ -17,7 +17,7 @@ from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.results.contract import AidsResults, ComparisonResults, Interval
 
 # Rows of measures.csv; "interval" is the field in the results that contains the 95 % interval
-MEASURES = [
+NUMBER_DEFINITIONS = [
     row
     | {"path": row["path"].replace("FILTER", name), "label": row["label"].replace("FILTER", label)}
     for row in read_rows("measures.csv")
@@ -42,43 +42,43 @@ class ComparedNumber:
 def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, ComparedNumber]:
     """Return the numbers that ``px4fuse diff`` compares, by path (``clock.offset_s``)."""
     axes = {} if isinstance(results, AidsResults) else results.axes
-    # EKF2 rejects north and east together: the rejected fraction of one axis is sufficient
+    # EKF2 accepts or rejects north and east together: compare the fraction on one of these axes
     horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
     # the results of each axis already contain the numbers of the position source
     position_source_aids: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
-    if value_at(results, "source.kind") == "gnss":
+    if find_value(results, "source.kind") == "gnss":
         position_source_aids = ("gnss_pos",)
     numbers_by_path: dict[str, ComparedNumber] = {}
-    for measure in MEASURES:
-        pattern, interval_field = measure["path"], measure["interval"]
-        for path, names in _matching_paths(results, pattern):
+    for definition in NUMBER_DEFINITIONS:
+        pattern, interval_field = definition["path"], definition["interval"]
+        for path, keys in _find_matching_paths(results, pattern):
             record_path, _, field_name = path.rpartition(".")
-            record, first_name = value_at(results, record_path), names[0] if names else ""
+            record, first_key = find_value(results, record_path), keys[0] if keys else ""
             value = getattr(record, field_name, None)
             is_undetermined = isinstance(record, ClockOffset) and not record.is_determinable
             is_undetermined |= isinstance(record, HeadingError) and record.drifts
-            is_duplicate = pattern.startswith("aids.") and first_name in position_source_aids
+            is_duplicate = pattern.startswith("aids.") and first_key in position_source_aids
             if pattern == "axes.*.rejected_fraction":
-                is_duplicate = first_name not in (horizontal_axis, "down")
+                is_duplicate = first_key not in (horizontal_axis, "down")
             if is_undetermined or is_duplicate or not isinstance(value, int | float):
                 continue
-            labels = (AIDS[name].label if name in AIDS else name for name in names)
+            labels = (AIDS[name].label if name in AIDS else name for name in keys)
             numbers_by_path[path] = ComparedNumber(
-                ", ".join((measure["label"], *labels)),
-                measure["unit"],
+                ", ".join((definition["label"], *labels)),
+                definition["unit"],
                 float(value),
                 getattr(record, interval_field) if interval_field else None,
             )
     return numbers_by_path
 
 
-def _matching_paths(
+def _find_matching_paths(
     results: ComparisonResults | AidsResults, pattern: str
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Yield the paths that match a pattern, each with the keys that replace ``*``."""
-    parent, has_wildcard, pattern_end = pattern.partition(".*")
-    if not has_wildcard:
+    """Yield the paths in the results that match a pattern, with the keys that replace ``*``."""
+    parent, wildcard, pattern_end = pattern.partition(".*")
+    if not wildcard:
         yield pattern, ()
-    for name in (value_at(results, parent) or ()) if has_wildcard else ():
-        for path, names in _matching_paths(results, f"{parent}.{name}{pattern_end}"):
-            yield path, (name, *names)
+    for key in (find_value(results, parent) or ()) if wildcard else ():
+        for path, keys in _find_matching_paths(results, f"{parent}.{key}{pattern_end}"):
+            yield path, (key, *keys)

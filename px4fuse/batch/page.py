@@ -64,7 +64,7 @@ MAIN_AXES_BY_PREFERENCE = (("aisle",), ("north", "east"), ("down",))
 LogSummary = Mapping[str, Any]
 
 
-def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
+def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
     """Format the table of logs as an HTML page.
 
     Parameters
@@ -73,17 +73,22 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
         One row per log and axis, with the columns of :data:`px4fuse.batch.rows.COLUMN_TYPES`. A log
         that could not be read has one row.
     title : str
-    made_with : str
+    version_text : str
         Name and version of px4fuse.
     """
     logs = sort_logs(logs_from_table(table))
     rows = [
-        Row(_log_cells(log), tuple(log["tags"]), _log_details(log), _side_sections(log))
+        Row(
+            _make_log_cells(log),
+            tuple(log["tags"]),
+            _make_log_details(log),
+            _make_side_sections(log),
+        )
         for log in logs
     ]
     return frame.page(
         title=title,
-        subtitle=f"{count_noun(len(logs), 'log')}. Compared by {made_with}.",
+        subtitle=f"{count_noun(len(logs), 'log')}. Compared by {version_text}.",
         html_above=load_template("batch/axis.html").render(limits=format_consistent_ratios()),
         row_nouns=("log", "logs"),
         columns=(
@@ -108,7 +113,7 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
             Column("Findings", "rank", EXTRA_COLUMN_GROUP),
         ),
         rows=rows,
-        filters=_drop_down_lists(logs),
+        filters=_make_drop_down_lists(logs),
         groups=[(EXTRA_COLUMN_GROUP, "more columns")],
         placeholder="search by name, vehicle, firmware or finding",
         full_table_note="The table fleet.csv contains all rows.",
@@ -116,16 +121,16 @@ def html_text(table: pd.DataFrame, title: str, made_with: str) -> str:
     )
 
 
-def _log_cells(log: LogSummary) -> tuple[Cell, ...]:
+def _make_log_cells(log: LogSummary) -> tuple[Cell, ...]:
     finding_titles = [finding_title(finding) for finding in log["findings"]]
     severity, action = log["severity"], log.get("action", "")
-    css_style = "command" if action.startswith(("px4fuse ", "param ")) else ""
+    css_class = "command" if action.startswith(("px4fuse ", "param ")) else ""
     return (
         Cell(SEVERITY_SIGNS[severity], SEVERITIES.index(severity), style_class=f"sign {severity}"),
         Cell(log["name"], below=log.get("changed", "")),
-        Cell(log["headline"], below=action, style_class=css_style),
+        Cell(log["headline"], below=action, style_class=css_class),
         *(
-            _ratio_cell(log.get(f"{name}_ratio"), name, verdict)
+            _make_ratio_cell(log.get(f"{name}_ratio"), name, verdict)
             for name, verdict in zip(SIGMA_RATIO_COLUMNS, log["verdict_texts"], strict=True)
         ),
         frame.number_cell(log.get("difference_rms_m"), format_metres),
@@ -142,7 +147,7 @@ def _log_cells(log: LogSummary) -> tuple[Cell, ...]:
     )
 
 
-def _ratio_cell(ratio: float | None, name: str, verdict: str) -> Cell:
+def _make_ratio_cell(ratio: float | None, name: str, verdict: str) -> Cell:
     if ratio is None:
         return Cell()
     filter_name, _, reference_name = name.partition("_")
@@ -153,7 +158,7 @@ def _ratio_cell(ratio: float | None, name: str, verdict: str) -> Cell:
 def sort_logs(logs: Iterable[LogSummary]) -> list[LogSummary]:
     """Sort logs by severity, then |ln(σ ratio)|, then position RMSE, largest first."""
 
-    def sort_key(log: LogSummary) -> tuple[float, ...]:
+    def compute_sort_key(log: LogSummary) -> tuple[float, ...]:
         ratios = [log[key] for name in SIGMA_RATIO_COLUMNS if log.get(key := f"{name}_ratio")]
         largest_log_ratio = max((abs(math.log(ratio)) for ratio in ratios), default=0.0)
         return (
@@ -162,10 +167,10 @@ def sort_logs(logs: Iterable[LogSummary]) -> list[LogSummary]:
             -log.get("position_rmse_m", 0.0),
         )
 
-    return sorted(logs, key=sort_key)
+    return sorted(logs, key=compute_sort_key)
 
 
-def _log_details(log: LogSummary) -> tuple[Section, ...]:
+def _make_log_details(log: LogSummary) -> tuple[Section, ...]:
     value_rows = [
         [name, *(_format_value(axis.get(name, "")) for axis in log["axes"])]
         for name in AXIS_COLUMNS
@@ -189,7 +194,7 @@ def _log_details(log: LogSummary) -> tuple[Section, ...]:
     )
 
 
-def _side_sections(log: LogSummary) -> tuple[Section, ...]:
+def _make_side_sections(log: LogSummary) -> tuple[Section, ...]:
     return (
         frame.links_section(
             "Files", [(label, local_link(log.get(name, ""))) for label, name in FILE_LINKS]
@@ -204,7 +209,7 @@ def _format_value(value: str | float) -> str:
     return value if isinstance(value, str) else format_number(float(value))
 
 
-def _drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, str]]]]:
+def _make_drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, str]]]]:
     """Return label and options of the drop-down lists that filter logs, by frequency."""
     count_by_tag = Counter(tag for log in logs for tag in log["tags"])
     label_by_tag: Mapping[str, str] = {
@@ -236,9 +241,9 @@ def logs_from_table(table: pd.DataFrame) -> list[LogSummary]:
 
 
 def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
-    """Combine the table rows (one per axis) of a log, with the values of its main axis."""
+    """Combine the rows of a log, one per axis; numbers are those of the main axis."""
     axis_rows = [row for row in rows if "axis" in row]
-    main_rows = next(
+    main_axis_rows = next(
         (
             preferred_rows
             for names in MAIN_AXES_BY_PREFERENCE
@@ -247,7 +252,7 @@ def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
         rows,
     )
     log: dict[str, Any] = {}
-    for row in reversed((*main_rows, *rows)):
+    for row in reversed((*main_axis_rows, *rows)):
         log |= row
     reasons_and_remedies = ((row.get("reason", ""), row.get("remedy", "")) for row in rows)
     log |= {
@@ -264,10 +269,10 @@ def _summarise_log(rows: Sequence[Mapping[str, Any]]) -> LogSummary:
         "action": log.get("action") or log.get("remedy", "") * ("headline" not in log),
         "verdict_texts": (log.get("verdicts", "").split(FINDING_SEPARATOR) + [""] * 4)[:4],
     }
-    return log | {"tags": _log_tags(log)}
+    return log | {"tags": _make_log_tags(log)}
 
 
-def _log_tags(log: LogSummary) -> dict[str, str]:
+def _make_log_tags(log: LogSummary) -> dict[str, str]:
     label_by_tag = {
         f"severity:{log['severity']}": log["severity"],
         f"status:{log['status']}": log["status"],

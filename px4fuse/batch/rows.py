@@ -20,8 +20,8 @@ from px4fuse.results.contract import ComparisonResults, Log
 
 DONE, NOT_COMPARED, FAILED = "done", "not compared", "failed"
 FINDING_SEPARATOR = ";"
-# Key of the noise estimate of an axis: north and east have a common estimate
-_NOISE_ESTIMATE_BY_AXIS = {"north": "horizontal", "east": "horizontal"}
+# Key of the noise estimate in the results; north and east have a common estimate
+_TUNING_KEY_BY_AXIS = {"north": "horizontal", "east": "horizontal"}
 
 
 def read_rows(name: str) -> list[dict[str, str]]:
@@ -39,7 +39,7 @@ COLUMN_TYPES = {row["column"]: row["type"] for row in _COLUMNS}
 Row = dict[str, Any]
 
 
-def value_at(results: object, path: str) -> Any:
+def find_value(results: object, path: str) -> Any:
     """Return the value at a path such as "axes.north.updates", or None if it is missing."""
 
     def get_child(parent: Any, name: str) -> Any:
@@ -50,31 +50,37 @@ def value_at(results: object, path: str) -> Any:
     return reduce(get_child, path.split("."), results)
 
 
-def axis_rows(results: ComparisonResults) -> list[Row]:
+def make_axis_rows(results: ComparisonResults) -> list[Row]:
     """Return the table rows of one log, one per axis, as dicts without missing values."""
-    common_columns = log_columns(results.log) | finding_columns(results.findings, results.aids)
-    common_columns |= card_columns(results.card)
-    has_time_offset = bool(value_at(results, "clock.is_determinable"))
+    common_values = collect_log_values(results.log) | collect_finding_values(
+        results.findings, results.aids
+    )
+    common_values |= collect_card_values(results.card)
+    is_offset_determinable = bool(find_value(results, "clock.is_determinable"))
     rows = []
     for name, axis in results.axes.items():
         missing_filter = next(
             (summary for summary in axis.filters.values() if isinstance(summary, Unavailable)), None
         )
-        row = common_columns | {
+        row = common_values | {
             "axis": name,
             "status": NOT_COMPARED if isinstance(axis.filters["kf"], Unavailable) else DONE,
             "reason": f"{missing_filter.what}: {missing_filter.reason}" if missing_filter else "",
             "remedy": missing_filter.remedy if missing_filter else "",
         }
         for column, path in RESULT_PATHS.items():
-            if column not in row and path and (has_time_offset or not path.startswith("clock.")):
-                tuned_axis = _NOISE_ESTIMATE_BY_AXIS.get(name, name)
-                row[column] = value_at(results, path.format(axis=name, tuned=tuned_axis))
+            if (
+                column not in row
+                and path
+                and (is_offset_determinable or not path.startswith("clock."))
+            ):
+                tuning_key = _TUNING_KEY_BY_AXIS.get(name, name)
+                row[column] = find_value(results, path.format(axis=name, tuned=tuning_key))
         rows.append(row)
     return rows
 
 
-def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
+def collect_finding_values(findings: Iterable[Finding], aids: Mapping[str, AidResult]) -> Row:
     """Return the values of the table columns about findings and about EKF2's aiding sources.
 
     Findings that are an effect of another finding are omitted.
@@ -90,25 +96,25 @@ def finding_columns(findings: Iterable[Finding], aids: Mapping[str, AidResult]) 
     }
 
 
-def card_columns(card: Card) -> Row:
+def collect_card_values(card: Card) -> Row:
     """Return the values of the table columns about the diagnosis of a flight."""
-    rmse_m = card.effect.position_rmse_m.values() if card.effect else ()
+    rmse_values_m = card.effect.position_rmse_m.values() if card.effect else ()
     return {
         "severity": card.severity,
         "headline": card.headline,
-        "action": first_action(card),
+        "action": find_first_action(card),
         "changed": "; ".join((*card.identity.changed, *card.identity.parameters)),
         "verdicts": FINDING_SEPARATOR.join(
             f"{verdict.word}, explained" if verdict.is_explained else verdict.word
             for verdict in card.verdicts
         ),
         **{f"{verdict.filter}_{verdict.against}_ratio": verdict.ratio for verdict in card.verdicts},
-        "position_rmse_m": max(rmse_m, default=None),
+        "position_rmse_m": max(rmse_values_m, default=None),
         "difference_rms_m": card.effect.difference_rms_m if card.effect else None,
     }
 
 
-def first_action(card: Card) -> str:
+def find_first_action(card: Card) -> str:
     """Return the commands of the first recommended action, or its text if it has no command."""
     if not card.causes:
         return ""
@@ -138,10 +144,10 @@ def with_log_path(row: Row, path: str) -> Row:
     return row | {"action": quote_command(command_words)}
 
 
-def log_columns(log: Log) -> Row:
+def collect_log_values(log: Log) -> Row:
     start_utc, record = utc_time(log.start_unix_s), {"log": log}
     path_by_column = {name: path for name, path in RESULT_PATHS.items() if path.startswith("log.")}
-    return {name: value_at(record, path) for name, path in path_by_column.items()} | {
+    return {name: find_value(record, path) for name, path in path_by_column.items()} | {
         "airframe": f"{airframe:g}" if (airframe := log.parameters.get("SYS_AUTOSTART")) else "",
         "date": f"{start_utc[:19]}Z" if start_utc else "",
     }
@@ -162,7 +168,7 @@ def clean_row(row: Row) -> Row:
     }
 
 
-def csv_bytes(table: pd.DataFrame) -> bytes:
+def format_csv(table: pd.DataFrame) -> bytes:
     """Format the table as CSV; texts that a spreadsheet would run as formulas are escaped."""
     text_columns = {
         name: table[name].map(neutralise_formulas)

@@ -14,17 +14,17 @@ from typing import Annotated, Any
 import msgspec
 import pandas as pd
 
-from px4fuse.batch import TIMEOUT_S
+from px4fuse.batch import LOG_TIMEOUT_S
 from px4fuse.batch.engine import connect_cluster, run_jobs
-from px4fuse.batch.job import Job, Outcome, analyse, failure_row, file_stem
+from px4fuse.batch.job import Job, LogOutcome, analyse, make_failure_row, make_file_stem
 from px4fuse.batch.logs import LogAddress, find_logs
-from px4fuse.batch.page import html_text
+from px4fuse.batch.page import format_html
 from px4fuse.batch.rows import (
     FAILED,
     NOT_COMPARED,
     Row,
     clean_row,
-    csv_bytes,
+    format_csv,
     make_table,
     with_log_path,
 )
@@ -78,9 +78,9 @@ class CachedRows(msgspec.Struct, frozen=True):
         return f"rows/{self.sha256}.json"
 
 
-@dataclass(eq=False)  # filled during the run
+@dataclass(eq=False)
 class _RunState:
-    """Settings of ``px4fuse batch``, and logs that are finished."""
+    """Settings of ``px4fuse batch``, and logs that are finished; changes during the run."""
 
     output: Path
     version: str
@@ -144,8 +144,8 @@ def run_batch(
             map(str, sources), folder, reports=reports and output is not None, **settings
         )
     # without an output folder, the files were temporary
-    missing_files = {} if output else dict.fromkeys(OUTPUT_FILE_COLUMNS, "")
-    return batch_result.table.assign(**missing_files)
+    empty_columns = {} if output else dict.fromkeys(OUTPUT_FILE_COLUMNS, "")
+    return batch_result.table.assign(**empty_columns)
 
 
 def run(
@@ -153,7 +153,7 @@ def run(
     output: Path,
     *,
     reports: bool = False,
-    timeout_s: float = TIMEOUT_S,
+    timeout_s: float = LOG_TIMEOUT_S,
     scheduler: str | None = None,
     workers: int | None = None,
     memory_gb: float = MAX_MEMORY_BYTES / 1e9,
@@ -183,12 +183,14 @@ def run(
     try:
         request = ComparisonRequest(log="LOG", **settings)
     except TypeError as error:
-        raise SettingsError(f"a setting is unknown ({error}).") from error
+        raise SettingsError(
+            f"a setting is not an argument of px4fuse.compare ({error})."
+        ) from error
     if request.position is not None:
         raise SettingsError("A position file belongs to one flight. Omit `position` for many logs.")
     requested_settings(request)  # raises SettingsError if a setting is out of range
     state = _RunState(output, metadata.version("px4fuse"), command_line(request))
-    hashes_by_size = _cached_hashes(state, reports)
+    hashes_by_size = _find_cached_hashes(state, reports)
     log_by_address = {log.address: log for log in logs}
     jobs = [
         Job(
@@ -226,7 +228,7 @@ def run(
     return batch_result
 
 
-def _cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]]:
+def _find_cached_hashes(state: _RunState, reports: bool) -> dict[int | None, set[str]]:
     """Return the SHA-256 of the logs that earlier runs finished, by size of the log in bytes."""
     hashes_by_size: dict[int | None, set[str]] = defaultdict(set)
     for cached_rows in load_cached_rows(state):
@@ -250,11 +252,13 @@ def load_cached_rows(state: _RunState) -> Iterator[CachedRows]:
             yield cached_rows
 
 
-def _cache_outcome(state: _RunState, log: LogAddress, outcome: Outcome | JobFailure) -> None:
+def _cache_outcome(state: _RunState, log: LogAddress, outcome: LogOutcome | JobFailure) -> None:
     """Register a finished log in ``state``, and write its results."""
     if isinstance(outcome, JobFailure):
         remedy = "Increase --timeout or --memory, or run px4fuse compare on this log."
-        outcome = Outcome("", (failure_row(LogError(outcome.reason.rstrip("."), remedy), FAILED),))
+        outcome = LogOutcome(
+            "", (make_failure_row(LogError(outcome.reason.rstrip("."), remedy), FAILED),)
+        )
     if outcome.rows and outcome.rows[0]["status"] == FAILED:
         state.failed_row_by_address[log.address] = outcome.rows[0]
         return
@@ -267,8 +271,8 @@ def _cache_outcome(state: _RunState, log: LogAddress, outcome: Outcome | JobFail
     state.first_log_by_hash[outcome.sha256] = first_log
 
 
-def _write_log(state: _RunState, log: LogAddress, outcome: Outcome) -> None:
-    path_stem = f"results/{file_stem(log.name, outcome.sha256)}"
+def _write_log(state: _RunState, log: LogAddress, outcome: LogOutcome) -> None:
+    path_stem = f"results/{make_file_stem(log.name, outcome.sha256)}"
     content_by_name = {
         f"{path_stem}.json": outcome.results_json,
         f"{path_stem}.pdf": outcome.report_pdf,
@@ -288,10 +292,10 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
     severities: set[str] = set()
     rows_by_hash = {cached_rows.sha256: cached_rows.rows for cached_rows in load_cached_rows(state)}
 
-    def rows_of_log(log: LogAddress) -> Iterable[Row]:
+    def find_rows(log: LogAddress) -> Iterable[Row]:
         if log.address in state.failed_row_by_address:
             return [state.failed_row_by_address[log.address]]
-        if log.address not in state.hash_by_address:  # the run was interrupted
+        if log.address not in state.hash_by_address:  # the run ended before this log
             return []
         sha256 = state.hash_by_address[log.address]
         first_log = state.first_log_by_hash[sha256]
@@ -303,19 +307,19 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
             reason = "another run of px4fuse batch changed the results of this log"
         return [{"status": status, "log_sha256": sha256, "reason": reason}]
 
-    def rows() -> Iterator[Row]:
+    def complete_rows() -> Iterator[Row]:
         for log in logs:
-            common_columns = {"log": log.table_path, "name": log.name}
-            common_columns |= {"px4fuse": state.version, "settings": state.settings}
-            for row in rows_of_log(log):
+            common_values = {"log": log.table_path, "name": log.name}
+            common_values |= {"px4fuse": state.version, "settings": state.settings}
+            for row in find_rows(log):
                 severities.update(row.get("severities", ()))
-                yield with_log_path(row, log.table_path) | common_columns
+                yield with_log_path(row, log.table_path) | common_values
 
-    table = make_table(rows())
-    page = html_text(table, state.output.resolve().name, f"px4fuse {state.version}")
+    table = make_table(complete_rows())
+    page = format_html(table, state.output.resolve().name, f"px4fuse {state.version}")
     contents = {
         state.output / "fleet.parquet": table.to_parquet(index=False),
-        state.output / "fleet.csv": csv_bytes(table),
+        state.output / "fleet.csv": format_csv(table),
         state.output / "fleet.html": page.encode(),
     }
     write_all(contents)

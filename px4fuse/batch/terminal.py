@@ -24,7 +24,7 @@ NUMBER_TABLE_TITLES = ("number", "A", "95 %", "B", "95 %", "unit")
 
 
 def format_summary(batch_result: BatchResult) -> Page:
-    """Format a summary of all logs: diagnoses, σ ratios, and reasons for missing results."""
+    """Format diagnoses and σ ratios (actual ÷ reported σ), and reasons for missing results."""
     page, logs = Page(), batch_result.table.drop_duplicates("log")
     uncompared_logs = logs[logs["axis"] == ""].groupby(["status", "reason", "remedy"], sort=False)[
         "log"
@@ -41,7 +41,7 @@ def format_summary(batch_result: BatchResult) -> Page:
         page.write(f"fleet.html lists {unlisted_count} more reasons for logs without a result.")
     sorted_logs = sort_logs(logs_from_table(batch_result.table))
     if sorted_logs:
-        rows = [_log_row(log) for log in sorted_logs[:MAX_LISTED_LOGS]]
+        rows = [_make_log_row(log) for log in sorted_logs[:MAX_LISTED_LOGS]]
         page.table(
             ("", "log", "diagnosis", "KF ●", "◆", "EKF2 ●", "◆"),
             rows,
@@ -60,7 +60,7 @@ def format_summary(batch_result: BatchResult) -> Page:
     return page
 
 
-def _log_row(log: LogSummary) -> tuple[Cell, ...]:
+def _make_log_row(log: LogSummary) -> tuple[Cell, ...]:
     colour = SEVERITY_COLOURS.get(log["severity"], MUTED_COLOUR)
     ratios = (log.get(f"{name}_ratio") for name in SIGMA_RATIO_COLUMNS)
     return (

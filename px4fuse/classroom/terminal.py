@@ -6,7 +6,7 @@ from pathlib import Path
 from px4fuse.classroom.assignment.key import AnswerKey
 from px4fuse.classroom.assignment.random_assignment import (
     EASIEST_DIFFICULTY,
-    UNDETECTABLE_DIFFICULTY,
+    MAX_FAULT_DIFFICULTY,
 )
 from px4fuse.classroom.grading.grade import GradeOutcome
 from px4fuse.core.text import count_noun, one_line
@@ -31,7 +31,7 @@ def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count:
             f"{name} {number}" for name, number in sorted(flight_count_by_fault.items())
         ),
         "Level": f"difficulty {min(difficulties):.2f} to {max(difficulties):.2f}, from the range "
-        f"{EASIEST_DIFFICULTY:g} to {UNDETECTABLE_DIFFICULTY:g}. The difficulty is the smallest "
+        f"{EASIEST_DIFFICULTY:g} to {MAX_FAULT_DIFFICULTY:g}. The difficulty is the smallest "
         "size that px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
         "Flights": f"{folder_text} ({written_count} logs written, {flight_count - written_count} "
         "existed already)",
@@ -39,8 +39,8 @@ def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count:
     }
     if key.secret:
         text_by_label["Secret"] = (
-            "The answer key contains a new secret. Use --secret-file to write the same "
-            "flights again, or to add students."
+            "The answer key contains a new secret, the seed of the flights. To write the same "
+            "flights again or to add students, give this secret with --secret-file."
         )
     page = Page()
     page.write_labelled_texts(text_by_label)
@@ -75,7 +75,7 @@ def grading_page(outcome: GradeOutcome) -> Page:
         report = grade.counted_report
         if report is not None and grade.total is None:
             name = one_line(grade.display_name, 60)
-            page.write(f"{name}: {report.pending_reason}", colour=MUTED_COLOUR)
+            page.write(f"{name}: {report.pending_actions}", colour=MUTED_COLOUR)
     for note in outcome.notes:
         page.write(note, colour=MUTED_COLOUR)
     return page

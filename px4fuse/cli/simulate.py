@@ -22,11 +22,11 @@ from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.simulation.faults import FAULT_TYPES, parse_faults
 from px4fuse.simulation.scenario import (
-    DEFAULTS_OF_KIND,
+    DEFAULTS_BY_KIND,
     Scenario,
     ScenarioKind,
     YawMode,
-    bounds_by_field,
+    collect_field_bounds,
     make_scenario,
 )
 
@@ -49,11 +49,11 @@ MAX_SECRET_BYTES = 10_000
 
 def _scenario_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add a command-line option for each numeric field of Scenario."""
-    for field, quantity in reversed(bounds_by_field(Scenario).items()):
+    for field, quantity in reversed(collect_field_bounds(Scenario).items()):
         if not quantity.meaning:
             continue
         default = getattr(_DEFAULT_SCENARIO, field)
-        outdoor_default = DEFAULTS_OF_KIND[OUTDOOR_KIND].get(field)
+        outdoor_default = DEFAULTS_BY_KIND[OUTDOOR_KIND].get(field)
         default_text = f"{default:g}" + (
             f"; outdoors {outdoor_default:g}" if outdoor_default else ""
         )
@@ -220,7 +220,7 @@ def _check_options(assignment: Path | None) -> None:
 
 
 def _read_secret(file: Path | None) -> bytes | None:
-    from px4fuse.classroom.assignment.random_assignment import encode_secret
+    from px4fuse.classroom.assignment.random_assignment import parse_secret
 
     if file is None:
         return None
@@ -232,7 +232,7 @@ def _read_secret(file: Path | None) -> bytes | None:
         name=name,
         size_remedy="Give a file with one line of text.",
     )
-    return encode_secret(secret_text, name)
+    return parse_secret(secret_text, name)
 
 
 def _write_assignment(
@@ -253,7 +253,7 @@ def _write_assignment(
     check_targets([answer_key_path])
     check_output_folder(folder)
     with progress() as show_progress:
-        key, written_count = assignment.assign(
+        key, written_count = assignment.write_assignment(
             students,
             folder,
             answer_key_path,

@@ -51,9 +51,9 @@ from px4fuse.flight.ekf2_parameters import (
     effective_settings,
 )
 from px4fuse.simulation import sensors
-from px4fuse.simulation.ekf2_topics import VEHICLE_AID_SOURCE_HZ, Ekf2Output, ekf2_topics
+from px4fuse.simulation.ekf2_topics import VEHICLE_AID_SOURCE_HZ, Ekf2Output, make_ekf2_topics
 from px4fuse.simulation.faults import FaultSizes
-from px4fuse.simulation.motion import Motion, attitude
+from px4fuse.simulation.motion import Motion, compute_attitude
 from px4fuse.simulation.scenario import Scenario
 from px4fuse.simulation.ulog_writer import Topic
 from px4fuse.trajectory.rotation import (
@@ -75,42 +75,42 @@ FIELD_SIGMA_GAUSS = 0.03
 NO_AID_TIMEOUT_S = 5.0
 # Initial σ of tilt, velocity, position, gyro bias and accelerometer bias: EKF2_ANGERR_INIT,
 # EKF2_GPS_V_NOISE, EKF2_GPS_P_NOISE, EKF2_GBIAS_INIT and EKF2_ABIAS_INIT (covariance.cpp)
-INITIAL_SIGMA = np.repeat([0.1, 0.3, 0.5, 0.1, 0.2], 3)
+INITIAL_STATE_SIGMA = np.repeat([0.1, 0.3, 0.5, 0.1, 0.2], 3)
 # Simulated time (s) at rest before the log starts
 REST_BEFORE_LOG_S = 10.0
 # σ of specific force (m/s²), angular rate (rad/s) and velocity (m/s) at rest. With these values the
 # model has the σ that EKF2 v1.16 reports on the ground: gyro bias 0.0005 rad/s, velocity 0.06 m/s,
 # horizontal accelerometer bias 0.17 m/s²
-REST_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
+REST_MEASUREMENT_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
 # σ of EKF2's heading (rad) as PX4 v1.16 logs it in flight
 HEADING_SIGMA_RAD = 0.03
 # σ of EKF2's height (m) as PX4 v1.16 logs it in flight
 HEIGHT_SIGMA_M = 0.15
-# Maximum interval (s) between the variances that the EKF2 model computes for estimator_states
+# Maximum time (s) between two computations of the variances, which estimator_states contains
 MAX_EVENT_INTERVAL_S = 0.1
 
 
-def _fused_aids(scenario: Scenario) -> tuple[Aid, ...]:
+def _select_fused_aids(scenario: Scenario) -> tuple[Aid, ...]:
     return (scenario.aid, MAG, BAROMETER) if scenario.aid == GNSS_POS else (scenario.aid,)
 
 
-def parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | float]:
+def make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | float]:
     """Return the values of all EKF2 parameters that the model uses, by PX4 name."""
     aid = scenario.aid
     is_gnss = aid == GNSS_POS
-    defaults = effective_settings({}, *_fused_aids(scenario))
+    defaults = effective_settings({}, *_select_fused_aids(scenario))
     delay_ms = defaults[aid.delay] if faults.ekf2_delay_s is None else 1e3 * faults.ekf2_delay_s
-    aid_values: dict[str, float] = {aid.noise_mode: 1}
+    aid_parameters: dict[str, float] = {aid.noise_mode: 1}
     if is_gnss:
         # with EKF2_MAG_TYPE 1 EKF2 fuses the magnetic heading only, with 0 all axes
         mag_type = int(bool(faults.heading_deg))
-        aid_values = {GNSS_VEL.noise: scenario.sigma_gnss_m_s, MAG.switch: mag_type}
-        aid_values |= {BAROMETER.noise: sensors.SIGMA_BAROMETER_M}
+        aid_parameters = {GNSS_VEL.noise: scenario.sigma_gnss_m_s, MAG.switch: mag_type}
+        aid_parameters |= {BAROMETER.noise: sensors.SIGMA_BAROMETER_M}
     return (
         defaults
-        | aid_values
+        | aid_parameters
         | {
-            aid.noise: faults.ekf2_noise_m or sensors.reported_sigma_m(scenario, faults),
+            aid.noise: faults.ekf2_noise_m or sensors.compute_reported_sigma_m(scenario, faults),
             aid.gate: faults.ekf2_gate,
             aid.delay: delay_ms,
             # EKF2 does not fuse samples that are older than EKF2_DELAY_MAX
@@ -135,20 +135,20 @@ def simulate_ekf2(
     samples that EKF2 receives; the log may contain fewer. ``log_parameters`` are all parameters in
     the log, by PX4 name.
     """
-    aid, fused_aids = scenario.aid, _fused_aids(scenario)
+    aid, fused_aids = scenario.aid, _select_fused_aids(scenario)
     segment, time_us, true_quaternions = _make_segment(scenario, faults, motion, imu)
     logged_values = {name: float(np.float32(value)) for name, value in log_parameters.items()}
     step_s = float(np.median(segment.step_s))
     if other_sensors:
         magnetometer, barometer = other_sensors
-        magnetometer_s, barometer_s = (
-            sensors.seconds(sensors.time_us(topic)) - 0.5 * step_s for topic in other_sensors
+        magnetometer_times_s, barometer_times_s = (
+            sensors.to_seconds(sensors.get_time_us(topic)) - 0.5 * step_s for topic in other_sensors
         )
         # the barometer is EKF2's only height source outdoors
         down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
-        no_dead_zone, sample_weight = np.zeros(len(down_m)), np.ones(len(down_m))
+        dead_zone_m, sample_weight = np.zeros(len(down_m)), np.ones(len(down_m))
         barometer_samples = select_samples_in_segment(
-            segment, barometer_s, down_m, no_dead_zone, sample_weight
+            segment, barometer_times_s, down_m, dead_zone_m, sample_weight
         )
         height_samples = HeightSamples(
             (BAROMETER.name,), BAROMETER.name, (0.0, 0.0), *barometer_samples
@@ -157,7 +157,7 @@ def simulate_ekf2(
         if not logged_values[MAG.switch]:
             segment = add_field_states(
                 segment,
-                magnetometer_s,
+                magnetometer_times_s,
                 magnetometer.fields["magnetometer_ga"].astype(np.float64),
                 1.0,
                 # EKF2 initialises earth field and magnetometer bias on the ground
@@ -170,9 +170,9 @@ def simulate_ekf2(
     inputs = Inputs(
         settings=settings,
         segments=(segment,),
-        received=_received_positions(source),
-        # without bit 0 of EKF2_EV_CTRL, EKF2 tests the samples but does not fuse them
-        # (ev_pos_control.cpp)
+        received=_select_positions(source),
+        # without bit 0 of EKF2_EV_CTRL, EKF2 only tests the samples (ev_pos_control.cpp): fusion
+        # never starts
         rules=rules
         if int(log_parameters[aid.switch]) & 1
         else replace(rules, start_interval_s=0.0),
@@ -187,14 +187,14 @@ def simulate_ekf2(
     model_run = run_configurations(inputs, [FilterConfiguration(settings)], {})[0]
     output = _compute_output(inputs, model_run, time_us, true_quaternions)
     aid_source_hz = VEHICLE_AID_SOURCE_HZ if faults.no_vvo else 0.0
-    return ekf2_topics(inputs, model_run, output, scenario.attitude_rate_hz, aid_source_hz)
+    return make_ekf2_topics(inputs, model_run, output, scenario.attitude_rate_hz, aid_source_hz)
 
 
 def _make_segment(
     scenario: Scenario, faults: FaultSizes, motion: Motion, imu: Topic
 ) -> tuple[ReplaySegment, IntArray, Array]:
     """Prepare the input of the EKF2 model, and the times (µs) and true attitudes of its steps."""
-    time_us = sensors.time_us(imu)
+    time_us = sensors.get_time_us(imu)
     interval_s = np.diff(time_us) * 1e-6
     step_end_indices = find_step_ends(
         interval_s, np.array([], dtype=np.intp), PREDICTION_STEP_US * 1e-6
@@ -206,18 +206,18 @@ def _make_segment(
     rotation_rad, velocity_increment_m_s = downsample_imu(
         delta_angle_rad, delta_velocity_m_s, step_end_indices
     )
-    step_us = time_us[np.concatenate([[0], step_end_indices])]
-    time_s = step_us * 1e-6
-    body_to_ned = attitude(motion.at(time_s)).body_to_ned
-    true_quaternions = sensors.quaternions(body_to_ned)
+    step_times_us = time_us[np.concatenate([[0], step_end_indices])]
+    time_s = step_times_us * 1e-6
+    body_to_ned = compute_attitude(motion.at(time_s)).body_to_ned
+    true_quaternions = sensors.to_quaternions(body_to_ned)
     integrated_attitude = cumulative_product(
         np.concatenate([true_quaternions[:1], from_vector(rotation_rad)])
     )
     attitude_difference = multiply(true_quaternions, conjugate(integrated_attitude))
     attitude_error_rad = np.zeros((len(time_s), 3))
-    attitude_error_rad[:, HEADING] = sensors.attitude_error(scenario, faults, time_s).as_rotvec()[
-        :, HEADING
-    ]
+    attitude_error_rad[:, HEADING] = sensors.simulate_attitude_error(
+        scenario, faults, time_s
+    ).as_rotvec()[:, HEADING]
     force_m_s2, rate_rad_s = sensors.measure_imu(
         scenario,
         faults,
@@ -226,7 +226,7 @@ def _make_segment(
         sensors.RandomStream.REST,
         REST_BEFORE_LOG_S * scenario.imu_rate_hz,
     )
-    state, covariance = _initial_state_at_rest(
+    state, covariance = _compute_state_at_rest(
         body_to_ned[0], force_m_s2[0], rate_rad_s[0], float(attitude_error_rad[0, HEADING])
     )
     variance = np.diagonal(covariance).copy()
@@ -243,7 +243,8 @@ def _make_segment(
             accelerometer_bias_m_s2=np.zeros(3),
             state=state,
             variance=variance,
-            down_m=motion.at(time_s).position_m[:, 2] + sensors.height_error(scenario, time_s),
+            down_m=motion.at(time_s).position_m[:, 2]
+            + sensors.simulate_height_error(scenario, time_s),
             # The variance of tilt measurements is infinite, so only positions correct the tilt
             attitude_variance_rad2=np.tile(
                 [np.inf, np.inf, HEADING_SIGMA_RAD**2], (len(time_s), 1)
@@ -253,18 +254,18 @@ def _make_segment(
             state_correlation=covariance / sigma[:, None] / sigma,
             is_fusing=False,
         ),
-        step_us,
+        step_times_us,
         true_quaternions,
     )
 
 
-def _initial_state_at_rest(
+def _compute_state_at_rest(
     rotation: Array, force_m_s2: Array, rate_rad_s: Array, heading_error_rad: float
 ) -> tuple[Array, Array]:
-    """Compute EKF2's error state and covariance at the start of the log, after REST_BEFORE_LOG_S.
+    """Compute EKF2's error state and covariance after REST_BEFORE_LOG_S at rest.
 
-    One Kalman update of PX4's initial covariance uses the known values at rest: specific force -g,
-    angular rate and velocity 0.
+    PX4's initial covariance is corrected by one Kalman update with the known values at rest:
+    specific force -g, angular rate 0 and velocity 0.
     """
     H = np.zeros((9, STATE_COUNT))
     H[0:3, THETA] = -skew(rotation @ force_m_s2)
@@ -272,24 +273,24 @@ def _initial_state_at_rest(
     H[3:6, GYRO_BIAS] = np.eye(3)
     H[6:9, VELOCITY] = np.eye(3)
     z = np.concatenate([-GRAVITY_M_S2 - rotation @ force_m_s2, rate_rad_s, np.zeros(3)])
-    P = np.diag(INITIAL_SIGMA**2)
+    P = np.diag(INITIAL_STATE_SIGMA**2)
     x = np.zeros(STATE_COUNT)
     P[HEADING, HEADING], x[HEADING] = HEADING_SIGMA_RAD**2, heading_error_rad
-    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(REST_SIGMA**2))
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.diag(REST_MEASUREMENT_SIGMA**2))
     x += K @ (z - H @ x)
     x[HEADING] = heading_error_rad
     P -= K @ H @ P
     return x, 0.5 * (P + P.T)
 
 
-def _received_positions(source: sensors.SimulatedPositions) -> ReceivedPositions:
+def _select_positions(source: sensors.SimulatedPositions) -> ReceivedPositions:
     """List the positions that EKF2 accepts, in order of arrival.
 
     EKF2 ignores a position that is older than the previous one (estimator_interface.cpp).
     """
     topic_fields = source.topic.fields
     timestamp_s, arrival_s = (
-        sensors.seconds(sensors.time_us(source.topic, name))
+        sensors.to_seconds(sensors.get_time_us(source.topic, name))
         for name in ("timestamp_sample", "timestamp")
     )
     latest_timestamp_s = np.maximum.accumulate(np.concatenate([[-np.inf], timestamp_s[:-1]]))

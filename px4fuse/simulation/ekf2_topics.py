@@ -14,18 +14,18 @@ from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, A
 from px4fuse.readers.px4_ekf2 import MAG_3D_BIT
 from px4fuse.readers.px4_positions import unproject
 from px4fuse.simulation import sensors
-from px4fuse.simulation.ulog_writer import Topic, topic
+from px4fuse.simulation.ulog_writer import Topic, make_topic
 
 # Logging rate (Hz) of estimator_aid_src_ev_pos on a vehicle (PX4 v1.16, logged_topics.cpp); PX4's
 # simulation (SITL) logs all messages
 VEHICLE_AID_SOURCE_HZ = 2.0
 # Logging rates (Hz) of EKF2 topics and vehicle_magnetometer on a vehicle (PX4 v1.16,
 # logged_topics.cpp)
-STATES_HZ = 2.0
-LOCAL_POSITION_HZ = 10.0
-FLAGS_HZ = 1.0
-MAGNETOMETER_HZ = 2.0
-OTHER_AIDS_HZ = 2.0
+STATES_LOG_RATE_HZ = 2.0
+LOCAL_POSITION_LOG_RATE_HZ = 10.0
+FLAGS_LOG_RATE_HZ = 1.0
+MAGNETOMETER_LOG_RATE_HZ = 2.0
+OTHER_AIDS_LOG_RATE_HZ = 2.0
 # Time (µs) from the newest IMU sample to the publication of vehicle_local_position
 PUBLICATION_DELAY_US = 100
 
@@ -60,27 +60,31 @@ class Ekf2Output:
     resets: tuple[tuple[int, Array], ...]
     is_step_aided: BoolArray
 
-    def timestamps(self, steps: IntArray, measured_s: Array | None = None) -> dict[str, Any]:
+    def make_timestamps(
+        self, steps: IntArray, measurement_times_s: Array | None = None
+    ) -> dict[str, Any]:
         """Return the timestamps of messages that EKF2 publishes after the prediction ``steps``.
 
-        ``measured_s`` are the measurement times (s), by default the times of the steps.
+        ``measurement_times_s`` are the measurement times (s), by default the times of the steps.
         """
-        sample_us = self.time_us[steps]
-        if measured_s is not None:
-            sample_us = np.rint(measured_s * 1e6).astype(np.int64)
-        return sensors.timestamps(sample_us, self.time_us[steps + self.lag_steps] - sample_us)
+        sample_times_us = self.time_us[steps]
+        if measurement_times_s is not None:
+            sample_times_us = np.rint(measurement_times_s * 1e6).astype(np.int64)
+        return sensors.make_timestamps(
+            sample_times_us, self.time_us[steps + self.lag_steps] - sample_times_us
+        )
 
-    def logged_message_indices(
+    def find_logged_messages(
         self, is_message_event: BoolArray, end_step: IntArray, rate_hz: float
     ) -> IntArray:
         """Return the indices of the messages that a logger writes with a rate limit (Hz)."""
         is_published = end_step < len(self.time_us) - self.lag_steps
         events = np.flatnonzero(is_message_event & is_published)
-        times_s = sensors.seconds(self.time_us[end_step[events]])
+        times_s = sensors.to_seconds(self.time_us[end_step[events]])
         return events[sensors.keep_at_rate(times_s, rate_hz)]
 
 
-def ekf2_topics(
+def make_ekf2_topics(
     model_inputs: Inputs,
     model_run: SegmentRun,
     output: Ekf2Output,
@@ -93,25 +97,25 @@ def ekf2_topics(
     estimator_aid_src_ev_pos is logged (0: all messages).
     """
     topics = (
-        _local_position_topic(model_inputs, output),
-        _states_topic(model_inputs, model_run, output),
-        *_position_aid_topics(model_inputs, model_run, output, aid_source_hz),
-        *_barometer_topics(model_inputs, model_run, output),
-        *_magnetometer_topics(model_inputs, model_run, output, attitude_hz),
-        _flags_topic(model_inputs, model_run, output),
+        _make_local_position_topic(model_inputs, output),
+        _make_states_topic(model_inputs, model_run, output),
+        *_make_position_aid_topics(model_inputs, model_run, output, aid_source_hz),
+        *_make_barometer_topics(model_inputs, model_run, output),
+        *_make_magnetometer_topics(model_inputs, model_run, output, attitude_hz),
+        _make_flags_topic(model_inputs, model_run, output),
     )
     return tuple(topic for topic in topics if len(topic.fields["timestamp"]))
 
 
-def _local_position_topic(model_inputs: Inputs, output: Ekf2Output) -> Topic:
+def _make_local_position_topic(model_inputs: Inputs, output: Ekf2Output) -> Topic:
     logged_steps = np.flatnonzero(
-        sensors.keep_at_rate(sensors.seconds(output.time_us), LOCAL_POSITION_HZ)
+        sensors.keep_at_rate(sensors.to_seconds(output.time_us), LOCAL_POSITION_LOG_RATE_HZ)
     )
     reset_steps = np.array([step for step, _ in output.resets], dtype=np.intp)
     resets_m = np.array([[0.0, 0.0], *(reset_m for _, reset_m in output.resets)])
     reset_count = np.searchsorted(reset_steps, logged_steps, side="right")
-    fields = sensors.timestamps(output.time_us[logged_steps], PUBLICATION_DELAY_US)
-    fields |= sensors.vectors(
+    fields = sensors.make_timestamps(output.time_us[logged_steps], PUBLICATION_DELAY_US)
+    fields |= sensors.split_vectors(
         {"": output.position_m[logged_steps], "v": output.velocity_m_s[logged_steps]}
     )
     is_step_aided = output.is_step_aided[np.maximum(logged_steps - output.lag_steps, 0)]
@@ -119,46 +123,47 @@ def _local_position_topic(model_inputs: Inputs, output: Ekf2Output) -> Topic:
     fields |= dict.fromkeys(("xy_valid", "v_xy_valid"), is_step_aided)
     if model_inputs.aid == GNSS_POS:
         fields |= dict(zip(("ref_lat", "ref_lon", "ref_alt"), sensors.HOME_POSITION, strict=True))
-    return topic("vehicle_local_position", fields)
+    return make_topic("vehicle_local_position", fields)
 
 
-def _states_topic(model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output) -> Topic:
+def _make_states_topic(model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output) -> Topic:
     """Make estimator_states as PX4 v1.16 logs it: horizontal positions are 0."""
     end_step = model_run.events[0].end_step
-    logged_indices = output.logged_message_indices(
-        np.diff(end_step, prepend=0) > 0, end_step, STATES_HZ
+    logged_indices = output.find_logged_messages(
+        np.diff(end_step, prepend=0) > 0, end_step, STATES_LOG_RATE_HZ
     )
     logged_steps = end_step[logged_indices]
     states = np.zeros((len(logged_steps), 25), np.float32)
     states[:, 0:4] = output.delayed_attitude[logged_steps]
     states[:, 4 : 4 + output.delayed_states.shape[1]] = output.delayed_states[logged_steps]
-    states[:, 7:9] = 0.0  # v1.16 logs latitude and longitude instead of horizontal positions
+    # v1.16 stores the horizontal position outside this vector, as latitude and longitude
+    states[:, 7:9] = 0.0
     if model_inputs.aid == GNSS_POS:
         # with a global origin, v1.16 logs the altitude instead of the down position
         states[:, 9] -= sensors.HOME_POSITION[2]
     covariances = np.zeros((len(logged_steps), 24), np.float32)
     covariances[:, : model_run.variance.shape[2]] = model_run.variance[logged_indices + 1, 0]
-    fields = output.timestamps(logged_steps) | {"states": states, "covariances": covariances}
-    return topic("estimator_states", fields)
+    fields = output.make_timestamps(logged_steps) | {"states": states, "covariances": covariances}
+    return make_topic("estimator_states", fields)
 
 
-def _position_aid_topics(
+def _make_position_aid_topics(
     model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output, rate_hz: float
 ) -> tuple[Topic, ...]:
     """Make estimator_aid_src_* of the position source, with one message per usable position."""
-    events, received = model_run.events[0], model_inputs.received
-    velocity_m_s = received.velocity_m_s
-    logged_indices = output.logged_message_indices(events.usable, events.end_step, rate_hz)
+    events, received_positions = model_run.events[0], model_inputs.received
+    velocity_m_s = received_positions.velocity_m_s
+    logged_indices = output.find_logged_messages(events.usable, events.end_step, rate_hz)
     steps, sample_indices = events.end_step[logged_indices], events.sample[logged_indices]
-    timestamps = output.timestamps(steps, events.time_s[logged_indices])
-    measured_m = received.position_m[sample_indices, :2]
+    timestamps = output.make_timestamps(steps, events.time_s[logged_indices])
+    measured_m = received_positions.position_m[sample_indices, :2]
     north, east = measured_m.T
     innovation_arrays = (model_run.innovation, model_run.innovation_variance, model_run.noise)
     innovation, innovation_variance, noise_variance = (
         values[logged_indices, 0, POSITION_COLUMNS] for values in innovation_arrays
     )
-    # The model computes no innovation (NaN) for positions that EKF2 does not test, but EKF2 logs
-    # measured minus estimated position
+    # The model gives no innovation (NaN) for positions that EKF2 does not test. EKF2 logs measured
+    # minus estimated position also for these
     innovation, innovation_variance = np.where(
         np.isnan(innovation[:, :1]),
         (
@@ -167,17 +172,19 @@ def _position_aid_topics(
         ),
         (innovation, innovation_variance),
     )
-    fused_us = np.where(
+    fusion_times_us = np.where(
         model_run.fused[logged_indices, 0] | model_run.reset[logged_indices, 0],
         output.time_us[steps],
         -1,
     )
-    newest_fused_us = np.maximum.accumulate(fused_us)
-    last_fused_us = np.where(newest_fused_us >= 0, sensors.START_US + newest_fused_us, 0)
+    newest_fusion_us = np.maximum.accumulate(fusion_times_us)
+    last_fused_us = np.where(
+        newest_fusion_us >= 0, sensors.FIRST_TIMESTAMP_US + newest_fusion_us, 0
+    )
     observation = north, east
     if velocity_m_s is not None:
         observation = unproject(north, east, sensors.HOME_POSITION[:2])
-    position_topic = _aid_source_topic(
+    position_topic = _make_aid_source_topic(
         model_inputs.aid,
         model_inputs.settings,
         timestamps | {"time_last_fuse": last_fused_us},
@@ -195,7 +202,7 @@ def _position_aid_topics(
         > model_inputs.settings[GNSS_VEL.gate] ** 2 * velocity_innovation_variance,
         axis=1,
     )
-    return position_topic, _aid_source_topic(
+    return position_topic, _make_aid_source_topic(
         GNSS_VEL,
         model_inputs.settings,
         timestamps,
@@ -205,7 +212,7 @@ def _position_aid_topics(
     )
 
 
-def _barometer_topics(
+def _make_barometer_topics(
     model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output
 ) -> list[Topic]:
     """Return estimator_aid_src_baro_hgt, or nothing without barometer."""
@@ -214,19 +221,19 @@ def _barometer_topics(
         return []
     updates = model_run.height_filter.make_update_table(BAROMETER.name, 0, end_step.astype(float))
     updates = updates[updates["fused_at_s"] < len(output.time_us) - output.lag_steps].iloc[1:]
-    updates = updates[sensors.keep_at_rate(updates.index.to_numpy(), OTHER_AIDS_HZ)]
+    updates = updates[sensors.keep_at_rate(updates.index.to_numpy(), OTHER_AIDS_LOG_RATE_HZ)]
     innovation, innovation_variance, is_rejected, is_fused, update_steps = updates.to_numpy().T
-    measured_s, steps = updates.index.to_numpy(), update_steps.astype(np.intp)
+    measurement_times_s, steps = updates.index.to_numpy(), update_steps.astype(np.intp)
     measured_m = (
-        height_samples.down_m[np.searchsorted(height_samples.measured_at_s, measured_s)]
+        height_samples.down_m[np.searchsorted(height_samples.measured_at_s, measurement_times_s)]
         - sensors.HOME_POSITION[2]
     )
     noise_variance = np.full(len(steps), model_inputs.settings[BAROMETER.noise] ** 2)
     return [
-        _aid_source_topic(
+        _make_aid_source_topic(
             BAROMETER,
             model_inputs.settings,
-            output.timestamps(steps, measured_s),
+            output.make_timestamps(steps, measurement_times_s),
             measured_m,
             (innovation, innovation_variance, noise_variance),
             (is_rejected > 0, is_fused > 0),
@@ -234,7 +241,7 @@ def _barometer_topics(
     ]
 
 
-def _magnetometer_topics(
+def _make_magnetometer_topics(
     model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output, attitude_hz: float
 ) -> list[Topic]:
     """Return the topics that need a magnetometer, or nothing without magnetometer."""
@@ -243,7 +250,7 @@ def _magnetometer_topics(
     if field is None:
         return []
     has_sample = np.isfinite(model_run.magnetometer_updates[:, 2, 0, 0])
-    logged_indices = output.logged_message_indices(has_sample, end_step, OTHER_AIDS_HZ)
+    logged_indices = output.find_logged_messages(has_sample, end_step, OTHER_AIDS_LOG_RATE_HZ)
     logged_steps = end_step[logged_indices]
     innovation, innovation_variance, fused_fraction = np.moveaxis(
         model_run.magnetometer_updates[logged_indices, :, 0], 1, 0
@@ -252,35 +259,35 @@ def _magnetometer_topics(
     noise_variance = np.full(innovation.shape, settings[MAG.noise] ** 2)
     is_fused = fused_fraction[:, 0] > 0.0
     attitude_steps, status_steps = (
-        np.flatnonzero(sensors.keep_at_rate(sensors.seconds(time_us), rate_hz))
+        np.flatnonzero(sensors.keep_at_rate(sensors.to_seconds(time_us), rate_hz))
         for time_us, rate_hz in (
             (output.time_us, attitude_hz),
-            (output.time_us[: -output.lag_steps], FLAGS_HZ),
+            (output.time_us[: -output.lag_steps], FLAGS_LOG_RATE_HZ),
         )
     )
     return [
-        sensors.attitude_topic(
+        sensors.make_attitude_topic(
             "vehicle_attitude",
             output.time_us[attitude_steps],
             PUBLICATION_DELAY_US,
             output.attitude[attitude_steps],
         ),
-        _aid_source_topic(
+        _make_aid_source_topic(
             MAG,
             settings,
-            output.timestamps(logged_steps),
+            output.make_timestamps(logged_steps),
             observed_gauss,
             (innovation, innovation_variance, noise_variance),
             (~is_fused, is_fused),
         ),
-        topic(
+        make_topic(
             "estimator_status",
-            output.timestamps(status_steps) | {"control_mode_flags": 1 << MAG_3D_BIT},
+            output.make_timestamps(status_steps) | {"control_mode_flags": 1 << MAG_3D_BIT},
         ),
     ]
 
 
-def _aid_source_topic(
+def _make_aid_source_topic(
     aid: Aid,
     settings: Mapping[str, float],
     timestamps: Mapping[str, Any],
@@ -305,33 +312,33 @@ def _aid_source_topic(
         "innovation_rejected": rejected_and_fused[0],
         "fused": rejected_and_fused[1],
     }
-    return topic(f"estimator_aid_src_{aid.name}", fields)
+    return make_topic(f"estimator_aid_src_{aid.name}", fields)
 
 
-def _flags_topic(model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output) -> Topic:
+def _make_flags_topic(model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output) -> Topic:
     """Make estimator_status_flags: once a second, and when fusion starts or stops."""
     events, time_s = model_run.events[0], model_run.segment.time_s
-    fusion_attempts = np.flatnonzero(
+    attempt_indices = np.flatnonzero(
         model_run.fused[:, 0] | model_run.rejected[:, 0] | model_run.reset[:, 0]
     )
     is_fusing = np.zeros(len(time_s), np.bool_)
-    next_attempts_s = np.append(time_s[events.end_step[fusion_attempts]], np.inf)[1:]
+    next_attempts_s = np.append(time_s[events.end_step[attempt_indices]], np.inf)[1:]
     for step, next_attempt_s in zip(
-        events.end_step[fusion_attempts].tolist(), next_attempts_s.tolist(), strict=True
+        events.end_step[attempt_indices].tolist(), next_attempts_s.tolist(), strict=True
     ):
         stop_s = time_s[step] + model_inputs.rules.stop_timeout_s
         is_fusing[step : int(np.searchsorted(time_s, min(next_attempt_s, stop_s)))] = True
     has_changed = np.diff(is_fusing.astype(int), prepend=0) != 0
-    is_logged = has_changed | sensors.keep_at_rate(time_s, FLAGS_HZ)
+    is_logged = has_changed | sensors.keep_at_rate(time_s, FLAGS_LOG_RATE_HZ)
     logged_steps = np.flatnonzero(is_logged[: len(time_s) - output.lag_steps])
     is_gnss = model_inputs.aid == GNSS_POS
-    fields = output.timestamps(logged_steps) | {
+    fields = output.make_timestamps(logged_steps) | {
         "control_status_changes": np.cumsum(has_changed)[logged_steps],
         "cs_gnss_pos": is_fusing[logged_steps] & is_gnss,
         "cs_ev_pos": is_fusing[logged_steps] & (not is_gnss),
         "cs_mag_hdg" if model_run.segment.field is None else "cs_mag_3d": True,
     }
-    return topic(
+    return make_topic(
         "estimator_status_flags",
         fields | ({"cs_gnss_vel": is_fusing[logged_steps]} if is_gnss else {}),
     )

@@ -11,55 +11,61 @@ from typing import Any
 from px4fuse.core.record import read_toml
 from px4fuse.core.units import UNIT_NAMES, convert_to_unit
 from px4fuse.errors import SettingsError, suggest_name
-from px4fuse.simulation.scenario import KINDS, ScenarioKind, bounded_number, bounds_by_field
+from px4fuse.simulation.scenario import (
+    SCENARIO_KINDS,
+    ScenarioKind,
+    collect_field_bounds,
+    make_bounded_field,
+)
 
 
-def _start_time() -> Any:
-    return bounded_number(None, 0.0, 1e4, "s", "AT")
+def _make_start_time_field() -> Any:
+    return make_bounded_field(None, 0.0, 1e4, "s", "AT")
 
 
 @dataclass(frozen=True)
 class FaultSizes:
     """Sizes of the faults to inject into a simulated flight; ``faults.toml`` explains each fault.
 
-    By default, no fault is injected. An EKF2 noise of 0 and a delay of None are the correct values.
+    By default, no fault is injected. ``ekf2_noise_m`` 0 and ``ekf2_delay_s`` None stand for the
+    correct noise and delay of EKF2.
     """
 
-    clock_offset_s: float = bounded_number(0.0, -5.0, 5.0, "s", "SECONDS")
-    clock_drift_ppm: float = bounded_number(0.0, -20_000.0, 20_000.0, "ppm", "PPM")
-    clock_jump_s: float = bounded_number(0.0, 0.0, 5.0, "s", "SECONDS")
-    nlos_percent: float = bounded_number(0.0, 0.0, 50.0, "%", "PERCENT")
-    nlos_size_m: float = bounded_number(2.0, 0.0, 100.0, "m", "SIZE")
-    dropout_s: float = bounded_number(0.0, 0.0, 600.0, "s", "SECONDS")
-    dropout_at_s: float | None = _start_time()
-    imu_dropout_s: float = bounded_number(0.0, 0.0, 600.0, "s", "SECONDS")
-    imu_dropout_at_s: float | None = _start_time()
-    decimate_hz: float = bounded_number(0.0, 0.1, 100.0, "Hz", "HZ")
-    r_scale: float = bounded_number(1.0, 1e-4, 1e4, "", "FACTOR")
-    yaw_deg: float = bounded_number(0.0, -180.0, 180.0, "°", "DEG")
-    scale_percent: float = bounded_number(0.0, -50.0, 50.0, "%", "PERCENT")
-    jump_m: float = bounded_number(0.0, -100.0, 100.0, "m", "METRES")
-    jump_at_s: float | None = _start_time()
-    smoothed_s: float = bounded_number(0.0, 0.0, 10.0, "s", "SECONDS")
-    slow_error_m: float = bounded_number(0.0, 0.0, 100.0, "m", "METRES")
-    slow_error_s: float = bounded_number(30.0, 0.1, 1e4, "s", "TIME")
-    heading_deg: float = bounded_number(0.0, -180.0, 180.0, "°", "DEG")
-    heading_at_s: float | None = _start_time()
-    mag_gauss: float = bounded_number(0.0, -1.0, 1.0, "gauss", "GAUSS")
-    mag_at_s: float | None = _start_time()
-    accel_bias_m_s2: float = bounded_number(0.0, -5.0, 5.0, "m/s²", "M/S2")
-    vibration_m_s2: float = bounded_number(0.0, 0.0, 20.0, "m/s²", "M/S2")
-    imu_rate_hz: float = bounded_number(0.0, 1.0, 1000.0, "Hz", "HZ")
+    clock_offset_s: float = make_bounded_field(0.0, -5.0, 5.0, "s", "SECONDS")
+    clock_drift_ppm: float = make_bounded_field(0.0, -20_000.0, 20_000.0, "ppm", "PPM")
+    clock_jump_s: float = make_bounded_field(0.0, 0.0, 5.0, "s", "SECONDS")
+    nlos_percent: float = make_bounded_field(0.0, 0.0, 50.0, "%", "PERCENT")
+    nlos_size_m: float = make_bounded_field(2.0, 0.0, 100.0, "m", "SIZE")
+    dropout_s: float = make_bounded_field(0.0, 0.0, 600.0, "s", "SECONDS")
+    dropout_at_s: float | None = _make_start_time_field()
+    imu_dropout_s: float = make_bounded_field(0.0, 0.0, 600.0, "s", "SECONDS")
+    imu_dropout_at_s: float | None = _make_start_time_field()
+    decimate_hz: float = make_bounded_field(0.0, 0.1, 100.0, "Hz", "HZ")
+    r_scale: float = make_bounded_field(1.0, 1e-4, 1e4, "", "FACTOR")
+    yaw_deg: float = make_bounded_field(0.0, -180.0, 180.0, "°", "DEG")
+    scale_percent: float = make_bounded_field(0.0, -50.0, 50.0, "%", "PERCENT")
+    jump_m: float = make_bounded_field(0.0, -100.0, 100.0, "m", "METRES")
+    jump_at_s: float | None = _make_start_time_field()
+    smoothed_s: float = make_bounded_field(0.0, 0.0, 10.0, "s", "SECONDS")
+    slow_error_m: float = make_bounded_field(0.0, 0.0, 100.0, "m", "METRES")
+    slow_error_s: float = make_bounded_field(30.0, 0.1, 1e4, "s", "TIME")
+    heading_deg: float = make_bounded_field(0.0, -180.0, 180.0, "°", "DEG")
+    heading_at_s: float | None = _make_start_time_field()
+    mag_gauss: float = make_bounded_field(0.0, -1.0, 1.0, "gauss", "GAUSS")
+    mag_at_s: float | None = _make_start_time_field()
+    accel_bias_m_s2: float = make_bounded_field(0.0, -5.0, 5.0, "m/s²", "M/S2")
+    vibration_m_s2: float = make_bounded_field(0.0, 0.0, 20.0, "m/s²", "M/S2")
+    imu_rate_hz: float = make_bounded_field(0.0, 1.0, 1000.0, "Hz", "HZ")
     no_motion: bool = False
-    open_end_m: float = bounded_number(0.0, 0.0, 100.0, "m", "METRES")
+    open_end_m: float = make_bounded_field(0.0, 0.0, 100.0, "m", "METRES")
     no_vvo: bool = False
-    ekf2_noise_m: float = bounded_number(0.0, 0.01, 100.0, "m", "METRES")
-    ekf2_delay_s: float | None = bounded_number(None, 0.0, 0.3, "s", "SECONDS")
-    ekf2_gate: float = bounded_number(5.0, 1.0, 1000.0, "", "SD")
+    ekf2_noise_m: float = make_bounded_field(0.0, 0.01, 100.0, "m", "METRES")
+    ekf2_delay_s: float | None = make_bounded_field(None, 0.0, 0.3, "s", "SECONDS")
+    ekf2_gate: float = make_bounded_field(5.0, 1.0, 1000.0, "", "SD")
     ekf2_off: bool = False
 
 
-BOUNDS_BY_FIELD = bounds_by_field(FaultSizes)
+BOUNDS_BY_FIELD = collect_field_bounds(FaultSizes)
 # ASCII spelling of units, for sizes of injected faults on the command line
 _ASCII_UNITS = {"°": "deg", "m/s²": "m/s2"}
 
@@ -83,13 +89,13 @@ class FaultType:
     default: float | bool
     help: str
     finding: str
-    kinds: tuple[ScenarioKind, ...] = KINDS
+    kinds: tuple[ScenarioKind, ...] = SCENARIO_KINDS
     changes_ekf2: bool = False
     fields: tuple[str, ...] = ()
 
     @property
     def size_fields(self) -> tuple[str, ...]:
-        """Names of the fields with sizes and times; empty for a fault without a size."""
+        """Fields of size, start and duration; empty for a fault without a size."""
         return () if self.default is True else self.fields
 
     @property
@@ -138,23 +144,23 @@ def parse_faults(texts: Iterable[str]) -> FaultSizes:
                 f"{suggest_name(name, FAULT_TYPES)}Choose from {', '.join(FAULT_TYPES)}.",
             )
         fault_type = FAULT_TYPES[name]
-        typed_values = values_text.split(",") if separator else []
-        if len(typed_values) > len(fault_type.size_fields):
+        value_texts = values_text.split(",") if separator else []
+        if len(value_texts) > len(fault_type.size_fields):
             raise SettingsError(
                 f"--mistake {option_text}: the fault has too many values. "
                 f"Use {name}{fault_type.usage}."
             )
         value_by_field[fault_type.fields[0]] = fault_type.default
-        for field_name, value in zip(fault_type.size_fields, typed_values, strict=False):
+        for field_name, value_text in zip(fault_type.size_fields, value_texts, strict=False):
             bounds = BOUNDS_BY_FIELD[field_name]
-            typed_size = convert_to_unit(value, bounds.unit)
-            if typed_size is None:
+            size = convert_to_unit(value_text, bounds.unit)
+            if size is None:
                 raise SettingsError(
-                    f"--mistake {option_text}: {value!r} is not a valid value: give "
+                    f"--mistake {option_text}: {value_text!r} is not a valid value: give "
                     f"{UNIT_NAMES[bounds.unit]}, as in {name}{fault_type.usage}."
                 )
-            bounds.check(typed_size, f"--mistake {option_text}: {bounds.cli_name}")
-            value_by_field[field_name] = typed_size
+            bounds.check(size, f"--mistake {option_text}: {bounds.cli_name}")
+            value_by_field[field_name] = size
     return FaultSizes(**value_by_field)  # type: ignore[arg-type]
 
 

@@ -14,15 +14,15 @@ from px4fuse.flight.model import Flight
 from px4fuse.readers.ulog import read_ulog
 from px4fuse.readers.ulog_topics import ASSESSED_KEY, NOTE_KEY
 from px4fuse.simulation import ekf2, sensors
-from px4fuse.simulation.ekf2_topics import MAGNETOMETER_HZ
+from px4fuse.simulation.ekf2_topics import MAGNETOMETER_LOG_RATE_HZ
 from px4fuse.simulation.faults import FAULT_TYPES, FaultSizes, format_fault, injected_fault_names
 from px4fuse.simulation.motion import Motion, plan_flight
 from px4fuse.simulation.scenario import Scenario
-from px4fuse.simulation.ulog_writer import Topic, encode
+from px4fuse.simulation.ulog_writer import Topic, encode_ulog
 
 NO_FAULTS = FaultSizes()
 # PX4 parameter values with which EKF2 fuses positions (GNSS: positions and velocities)
-FUSION_ON_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}
+FUSION_SWITCH_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}
 # SDLOG_PROFILE that logs the topics of external vision
 PROFILE_WITH_VISION = 129
 # SDLOG_PROFILE that does not log the topics of external vision
@@ -61,7 +61,7 @@ def simulate(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Simulation:
                 f"--mistake {name} changes EKF2, which --no-ekf2 does not simulate. Omit --no-ekf2."
             )
     if scenario.aid == GNSS_POS and 0.0 < faults.ekf2_noise_m < (
-        reported_m := sensors.reported_sigma_m(scenario, faults)
+        reported_m := sensors.compute_reported_sigma_m(scenario, faults)
     ):
         raise SettingsError(
             f"--mistake ekf2-noise={faults.ekf2_noise_m:g} has no effect outdoors: "
@@ -71,23 +71,23 @@ def simulate(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Simulation:
     motion = plan_flight(
         scenario, faults, sensors.random_stream(scenario, sensors.RandomStream.WANDER)
     )
-    positions = sensors.positions(scenario, faults, motion)
-    imu = sensors.imu(scenario, faults, motion)
-    parameters = _parameters(scenario, faults)
+    positions = sensors.simulate_positions(scenario, faults, motion)
+    imu = sensors.simulate_imu(scenario, faults, motion)
+    parameters = _make_parameters(scenario, faults)
     topics = [
-        sensors.logged_imu(imu, faults, motion),
-        sensors.logged_attitude(scenario, faults, motion),
-        sensors.land_detector(motion),
+        sensors.select_logged_imu(imu, faults, motion),
+        sensors.simulate_logged_attitude(scenario, faults, motion),
+        sensors.simulate_land_detector(motion),
     ]
     if not faults.no_vvo:
         topics.append(positions.topic)
     other_sensors: tuple[Topic, ...] = ()
     if scenario.aid == GNSS_POS:
-        barometer = sensors.barometer(scenario, motion)
-        other_sensors = (sensors.magnetometer(scenario, faults, motion), barometer)
-        topics += [sensors.limit_rate(other_sensors[0], MAGNETOMETER_HZ), barometer]
+        barometer = sensors.simulate_barometer(scenario, motion)
+        other_sensors = (sensors.simulate_magnetometer(scenario, faults, motion), barometer)
+        topics += [sensors.limit_rate(other_sensors[0], MAGNETOMETER_LOG_RATE_HZ), barometer]
     if scenario.truth:
-        topics.append(sensors.ground_truth(scenario, motion))
+        topics.append(sensors.simulate_ground_truth(scenario, motion))
     for topic in topics:
         if len(topic.fields["timestamp"]) < 2:
             raise SettingsError(
@@ -100,7 +100,7 @@ def simulate(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Simulation:
         ekf2_topic_names = {topic.name for topic in ekf2_topics}
         topics = [*(topic for topic in topics if topic.name not in ekf2_topic_names), *ekf2_topics]
     if scenario.truth:
-        topics.append(sensors.true_attitude(scenario, motion))
+        topics.append(sensors.simulate_true_attitude(scenario, motion))
     return Simulation(scenario, faults, motion, positions, tuple(topics), parameters)
 
 
@@ -120,7 +120,7 @@ def to_ulog(simulation: Simulation, *, is_assessed: bool = False) -> bytes:
         **({NOTE_KEY: SIMULATED_EKF2_NOTE} if simulation.scenario.ekf2 else {}),
         **({ASSESSED_KEY: 1} if is_assessed else {}),
     }
-    return encode(simulation.topics, simulation.parameters, info, sensors.START_US)
+    return encode_ulog(simulation.topics, simulation.parameters, info, sensors.FIRST_TIMESTAMP_US)
 
 
 def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
@@ -128,13 +128,13 @@ def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
     return read_ulog(name, to_ulog(simulation))
 
 
-def _parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | float]:
-    switch_value = 0 if faults.ekf2_off else FUSION_ON_VALUES[scenario.aid.switch]
+def _make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | float]:
+    fusion_switch = 0 if faults.ekf2_off else FUSION_SWITCH_VALUES[scenario.aid.switch]
     return {
-        **ekf2.parameters(scenario, faults),
+        **ekf2.make_parameters(scenario, faults),
         "EKF2_EN": int(scenario.ekf2),
-        **dict.fromkeys(FUSION_ON_VALUES, 0),
-        scenario.aid.switch: switch_value,
+        **dict.fromkeys(FUSION_SWITCH_VALUES, 0),
+        scenario.aid.switch: fusion_switch,
         "EKF2_HGT_REF": 0,
         "SDLOG_PROFILE": PROFILE_WITHOUT_VISION
         if faults.no_vvo or scenario.aid == GNSS_POS
@@ -146,9 +146,9 @@ def make_answer_key(simulation: Simulation) -> dict[str, Any]:
     """Return injected faults and true values of a flight for the instructor, as JSON types."""
     scenario, faults = simulation.scenario, simulation.faults
     motion, source = simulation.motion, simulation.positions
-    accelerometer_bias_m_s2, gyro_bias_rad_s = sensors.biases(scenario, faults)
+    accelerometer_bias_m_s2, gyro_bias_rad_s = sensors.draw_biases(scenario, faults)
     first_position_m, last_position_m = motion.at(np.array([0.0, motion.duration_s])).position_m
-    timestamps_us = sensors.time_us(source.topic, "timestamp_sample")
+    timestamps_us = sensors.get_time_us(source.topic, "timestamp_sample")
     outlier_indices = np.flatnonzero(source.is_outlier)
     answer_key: dict[str, Any] = to_json_types(
         {
@@ -168,7 +168,7 @@ def make_answer_key(simulation: Simulation) -> dict[str, Any]:
                 "airborne_s": [motion.take_off_s, motion.touch_down_s],
                 "sigma_z_m": scenario.source_sigma_m,
                 "sigma_a_m_s2": float(np.hypot(scenario.sigma_a_m_s2, faults.vibration_m_s2)),
-                "reported_sigma_m": sensors.reported_sigma_m(scenario, faults),
+                "reported_sigma_m": sensors.compute_reported_sigma_m(scenario, faults),
                 "accelerometer_bias_m_s2": accelerometer_bias_m_s2.tolist(),
                 "gyro_bias_rad_s": gyro_bias_rad_s.tolist(),
                 "clock_offset_to_add_s": 0.0 - faults.clock_offset_s,

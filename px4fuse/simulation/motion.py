@@ -18,7 +18,7 @@ from scipy.interpolate import BPoly, PPoly
 from px4fuse.core.arrays import Array
 from px4fuse.errors import SettingsError
 from px4fuse.simulation.faults import FaultSizes
-from px4fuse.simulation.scenario import CORNER_DURATION_S, START_STOP_S, Scenario
+from px4fuse.simulation.scenario import CORNER_DURATION_S, SPEED_RAMP_S, Scenario
 
 # Time (s) on the ground before take-off and after landing
 TIME_ON_GROUND_S = 6.0
@@ -30,38 +30,38 @@ CLIMB_RAMP_S = 1.5
 MAX_FLIGHT_S = 3600.0
 # Time (s) in which the slow deviation from the path increases to its full size after take-off, and
 # decreases to zero before landing
-DEVIATION_FADE_S = 3.0
+DEVIATION_RAMP_S = 3.0
 # Time (s) of a 180° turn at the end of the aisle with --yaw follow
 TURN_ROUND_S = 4.0
 # Minimum distance (s) of the breakpoints of piecewise polynomials; nearer breakpoints are merged
 MIN_BREAKPOINT_DISTANCE_S = 1e-9
 # Range of the periods (s) of the sines whose sum is the slow deviation from the path
-DEVIATION_PERIODS_S = (3.0, 20.0)
+DEVIATION_PERIOD_RANGE_S = (3.0, 20.0)
 # Number of sines in a slow deviation or sensor error
 SINE_COUNT = 4
 
 
-def _sum_of_ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
+def _sum_ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
     """Return a function of time that changes in quintic ramps, and is constant between them.
 
     ``ramps`` are tuples of start (s), duration (s) and change. Before the first ramp, the function
     is zero.
     """
     start_s, duration_s, change = (np.array(values) for values in zip(*ramps, strict=True))
-    value_after = np.concatenate([0.0 * change[:1], np.cumsum(change, axis=0)])
+    value_after_ramp = np.concatenate([0.0 * change[:1], np.cumsum(change, axis=0)])
     end_s = start_s + duration_s
     times_s = np.r_[start_s[0] - 1.0, np.column_stack([start_s, end_s]).ravel(), end_s[-1] + 1.0]
-    # If a ramp starts at the end of the previous ramp, both have one breakpoint
+    # If a ramp starts at the end of the previous ramp, keep only one of the two equal breakpoints
     is_used = np.diff(times_s, prepend=-np.inf) > MIN_BREAKPOINT_DISTANCE_S
-    values = np.repeat(value_after, 2, axis=0)[is_used]
+    values = np.repeat(value_after_ramp, 2, axis=0)[is_used]
     derivatives = np.stack([values, 0.0 * values, 0.0 * values], axis=1)
     return PPoly.from_bernstein_basis(BPoly.from_derivatives(times_s[is_used], derivatives))
 
 
-def _derivatives(ramp_function: PPoly, time_s: Array, orders: Sequence[int]) -> list[Array]:
-    """Return derivatives of a :func:`_sum_of_ramps`, shape (t, k); order -1 is the integral."""
-    inside_s = np.clip(time_s, *ramp_function.x[[0, -1]])
-    return [np.asarray(ramp_function.derivative(order)(inside_s)) for order in orders]
+def _differentiate(ramp_function: PPoly, time_s: Array, orders: Sequence[int]) -> list[Array]:
+    """Return derivatives of a :func:`_sum_ramps`, shape (t, k); order -1 is the integral."""
+    clipped_times_s = np.clip(time_s, *ramp_function.x[[0, -1]])
+    return [np.asarray(ramp_function.derivative(order)(clipped_times_s)) for order in orders]
 
 
 @dataclass(frozen=True)
@@ -73,25 +73,27 @@ class Sines:
     cosine: Array
 
     @classmethod
-    def draw(cls, rng: np.random.Generator, rms: Array, periods_s: tuple[float, float]) -> Sines:
+    def draw(
+        cls, rng: np.random.Generator, rms: Array, period_range_s: tuple[float, float]
+    ) -> Sines:
         """Draw SINE_COUNT sines with log-uniform periods, random phases, and an RMS per axis."""
-        low, high = np.log(periods_s)
+        low, high = np.log(period_range_s)
         angular_frequency = 2.0 * np.pi / np.exp(rng.uniform(low, high, SINE_COUNT))
         phase = rng.uniform(0.0, 2.0 * np.pi, (SINE_COUNT, len(rms)))
         amplitude = rms * np.sqrt(2.0 / SINE_COUNT)
         return cls(angular_frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))
 
-    def at(self, time_s: Array, order_count: int = 1) -> list[Array]:
-        """Return the sum and its time derivatives: ``order_count`` arrays of shape (t, k)."""
+    def at(self, time_s: Array, output_count: int = 1) -> list[Array]:
+        """Return ``output_count`` arrays (t, k): sum of the sines, then its time derivatives."""
         angle = np.outer(time_s, self.angular_frequency_rad_s)
         basis = np.concatenate([np.sin(angle), np.cos(angle)], axis=1)
         amplitudes = [np.concatenate([self.sine, self.cosine])]
         omega = self.angular_frequency_rad_s[:, None]
-        for _ in range(order_count - 1):
+        for _ in range(output_count - 1):
             # d/dt (s sin ωt + c cos ωt) = -ωc sin ωt + ωs cos ωt
             sine, cosine = np.split(amplitudes[-1], 2)
             amplitudes.append(np.concatenate([-omega * cosine, omega * sine]))
-        return np.split(basis @ np.hstack(amplitudes), order_count, axis=1)
+        return np.split(basis @ np.hstack(amplitudes), output_count, axis=1)
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ class State:
 class Motion:
     """True motion of a flight: velocity (NED) and yaw (rad) as functions of time.
 
-    ``deviation`` is a slow deviation from the path.
+    ``deviation`` is a slow deviation (m) of the position from the planned path.
     """
 
     velocity: PPoly
@@ -122,30 +124,32 @@ class Motion:
 
     def at(self, time_s: Array) -> State:
         """Return the true state at the times ``time_s``, which are seconds from the first data."""
-        position, velocity, acceleration, jerk = _derivatives(self.velocity, time_s, (-1, 0, 1, 2))
-        yaw, yaw_rate = _derivatives(self.yaw, time_s, (0, 1))
-        # the deviation is multiplied by a factor that is 1 in the air and 0 on the ground
-        fade = _sum_of_ramps(
+        position, velocity, acceleration, jerk = _differentiate(
+            self.velocity, time_s, (-1, 0, 1, 2)
+        )
+        yaw_rad, yaw_rate_rad_s = _differentiate(self.yaw, time_s, (0, 1))
+        # the deviation from the path is multiplied by 1 in the air and by 0 on the ground
+        deviation_factor = _sum_ramps(
             [
-                (self.take_off_s, DEVIATION_FADE_S, np.array([1.0])),
-                (self.touch_down_s - DEVIATION_FADE_S, DEVIATION_FADE_S, np.array([-1.0])),
+                (self.take_off_s, DEVIATION_RAMP_S, np.array([1.0])),
+                (self.touch_down_s - DEVIATION_RAMP_S, DEVIATION_RAMP_S, np.array([-1.0])),
             ]
         )
-        # derivatives of the product fade · deviation (Leibniz rule)
-        f0, f1, f2, f3 = _derivatives(fade, time_s, range(4))
+        # derivatives of the product factor · deviation (Leibniz rule)
+        f0, f1, f2, f3 = _differentiate(deviation_factor, time_s, range(4))
         d0, d1, d2, d3 = self.deviation.at(time_s, 4)
         return State(
             position_m=position + f0 * d0,
             velocity_m_s=velocity + f0 * d1 + f1 * d0,
             acceleration_m_s2=acceleration + f0 * d2 + 2.0 * f1 * d1 + f2 * d0,
             jerk_m_s3=jerk + f0 * d3 + 3.0 * (f1 * d2 + f2 * d1) + f3 * d0,
-            yaw_rad=yaw[:, 0],
-            yaw_rate_rad_s=yaw_rate[:, 0],
+            yaw_rad=yaw_rad[:, 0],
+            yaw_rate_rad_s=yaw_rate_rad_s[:, 0],
         )
 
 
 @dataclass(frozen=True)
-class Attitude:
+class AttitudeAndImu:
     """Attitude at n times, with angular rate and specific force that an ideal IMU measures.
 
     Attributes
@@ -163,37 +167,39 @@ class Attitude:
     specific_force_m_s2: Array
 
 
-def attitude(state: State) -> Attitude:
+def compute_attitude(state: State) -> AttitudeAndImu:
     """Return attitude, angular rate and specific force of a quadrotor in the true motion."""
     gravity = np.array([0.0, 0.0, constants.g])
     opposite_thrust_m_s2 = gravity - state.acceleration_m_s2
     specific_thrust_m_s2 = np.sqrt(_dot(opposite_thrust_m_s2, opposite_thrust_m_s2))[:, None]
     z = opposite_thrust_m_s2 / specific_thrust_m_s2
-    z_rate = -state.jerk_m_s3 / specific_thrust_m_s2
-    z_rate -= z * _dot(z, z_rate)[:, None]
+    z_rate_1_s = -state.jerk_m_s3 / specific_thrust_m_s2
+    z_rate_1_s -= z * _dot(z, z_rate_1_s)[:, None]
     yaw_rad = state.yaw_rad
-    nose, right = (
+    forward, rightward = (
         np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
         for angle in (yaw_rad, yaw_rad + np.pi / 2.0)
     )
     # n = z × nose is parallel to the body's y axis
-    n = np.cross(z, nose)
-    n_rate = np.cross(z_rate, nose) + state.yaw_rate_rad_s[:, None] * np.cross(z, right)
+    n = np.cross(z, forward)
+    n_rate_1_s = np.cross(z_rate_1_s, forward) + state.yaw_rate_rad_s[:, None] * np.cross(
+        z, rightward
+    )
     n_length = np.sqrt(_dot(n, n))
     y = n / n_length[:, None]
     x = np.cross(y, z)
     # angular rate ω in body axes, from dR/dt = R [ω]×
     rate_rad_s = np.stack(
         [
-            -_dot(z_rate, y),
-            _dot(z_rate, x),
-            -_dot(n_rate, x) / n_length,
+            -_dot(z_rate_1_s, y),
+            _dot(z_rate_1_s, x),
+            -_dot(n_rate_1_s, x) / n_length,
         ],
         axis=1,
     )
     force_m_s2 = np.zeros_like(z)
     force_m_s2[:, 2] = -specific_thrust_m_s2[:, 0]
-    return Attitude(np.stack([x, y, z], axis=2), rate_rad_s, force_m_s2)
+    return AttitudeAndImu(np.stack([x, y, z], axis=2), rate_rad_s, force_m_s2)
 
 
 def _dot(a: Array, b: Array) -> Array:
@@ -207,7 +213,8 @@ def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator
     Raises
     ------
     SettingsError
-        The open end of the loop is longer than its last side, or the flight takes too long.
+        The distance from start to end of the loop is longer than the last side, or the flight
+        takes too long.
     """
     flight_plan = _FlightPlan(TIME_ON_GROUND_S, scenario.heading_deg)
     climb_rate_m_s = min(MAX_CLIMB_RATE_M_S, scenario.altitude_m / 2.0)
@@ -230,9 +237,9 @@ def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator
         )
     flight_plan.add_velocity_change(climb_velocity_m_s, CLIMB_RAMP_S, 0.0)
     return Motion(
-        velocity=_sum_of_ramps(flight_plan.velocity_ramps),
-        yaw=_sum_of_ramps(flight_plan.yaw_ramps),
-        deviation=Sines.draw(rng, np.full(3, scenario.wander_m), DEVIATION_PERIODS_S),
+        velocity=_sum_ramps(flight_plan.velocity_ramps),
+        yaw=_sum_ramps(flight_plan.yaw_ramps),
+        deviation=Sines.draw(rng, np.full(3, scenario.wander_m), DEVIATION_PERIOD_RANGE_S),
         take_off_s=TIME_ON_GROUND_S,
         touch_down_s=touch_down_s,
         duration_s=float(np.ceil(touch_down_s + TIME_ON_GROUND_S)),
@@ -240,21 +247,22 @@ def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator
 
 
 class _FlightPlan:
-    """Velocity and yaw ramps of a flight; ``ramp_centre_s`` is the next velocity ramp's centre.
+    """Builder of a flight, which appends velocity and yaw ramps.
 
-    The distance flown between two ramps is the speed times the time between their centres.
+    ``ramp_centre_s`` is the time of the centre of the next velocity ramp. The distance flown
+    between two ramps is the speed times the time between their centres.
     """
 
     def __init__(self, climb_start_s: float, heading_deg: float) -> None:
         self.ramp_centre_s = climb_start_s + CLIMB_RAMP_S / 2.0
         self.velocity_ramps: list[tuple[float, float, Array]] = []
-        # the first yaw ramp ends before the first data, so the nose then points along the heading
+        # initial yaw: a ramp from 0 to the heading that ends before the first data
         self.yaw_ramps = [(-1.0, 1.0, np.radians([heading_deg]))]
 
     def add_velocity_change(
         self, velocity_change_m_s: Array, duration_s: float, time_to_next_s: float
     ) -> None:
-        """Add a velocity ramp; the next ramp's centre is ``time_to_next_s`` later."""
+        """Append a velocity change; ``time_to_next_s`` is from its centre to that of the next."""
         self.velocity_ramps.append(
             (self.ramp_centre_s - duration_s / 2.0, duration_s, velocity_change_m_s)
         )
@@ -264,24 +272,24 @@ class _FlightPlan:
         self.yaw_ramps.append((start_s, duration_s, np.array([angle_rad])))
 
 
-def direction(heading_deg: float) -> Array:
+def compute_direction(heading_deg: float) -> Array:
     """Return the horizontal unit vector (NED) of a heading in degrees."""
     heading_rad = np.radians(heading_deg)
     return np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0])
 
 
 def _fly_aisle(flight_plan: _FlightPlan, scenario: Scenario, speed_m_s: float) -> None:
-    velocity_m_s = speed_m_s * direction(scenario.heading_deg)
+    velocity_m_s = speed_m_s * compute_direction(scenario.heading_deg)
     nose_follows_path = scenario.nose_follows_path and speed_m_s > 0.0
     pause_s = max(scenario.pause_s, TURN_ROUND_S) if nose_follows_path else scenario.pause_s
-    flight_plan.ramp_centre_s += START_STOP_S / 2.0
+    flight_plan.ramp_centre_s += SPEED_RAMP_S / 2.0
     for pass_index in range(scenario.passes):
         pass_velocity_m_s = velocity_m_s if pass_index % 2 == 0 else -velocity_m_s
         flight_plan.add_velocity_change(
-            pass_velocity_m_s, START_STOP_S, scenario.length_m / scenario.speed_m_s
+            pass_velocity_m_s, SPEED_RAMP_S, scenario.length_m / scenario.speed_m_s
         )
-        stop_s = flight_plan.ramp_centre_s + START_STOP_S / 2.0
-        flight_plan.add_velocity_change(-pass_velocity_m_s, START_STOP_S, START_STOP_S + pause_s)
+        stop_s = flight_plan.ramp_centre_s + SPEED_RAMP_S / 2.0
+        flight_plan.add_velocity_change(-pass_velocity_m_s, SPEED_RAMP_S, SPEED_RAMP_S + pause_s)
         if nose_follows_path and pass_index < scenario.passes - 1:
             flight_plan.add_turn(np.pi, stop_s, TURN_ROUND_S)
 
@@ -296,10 +304,10 @@ def _fly_loop(flight_plan: _FlightPlan, scenario: Scenario, faults: FaultSizes) 
         )
     side_count = 4 * scenario.passes
     previous_velocity_m_s = np.zeros(3)
-    flight_plan.ramp_centre_s += START_STOP_S / 2.0
+    flight_plan.ramp_centre_s += SPEED_RAMP_S / 2.0
     for side_index in range(side_count):
-        velocity_m_s = speed_m_s * direction(scenario.heading_deg + 90.0 * side_index)
-        ramp_duration_s = CORNER_DURATION_S if side_index else START_STOP_S
+        velocity_m_s = speed_m_s * compute_direction(scenario.heading_deg + 90.0 * side_index)
+        ramp_duration_s = CORNER_DURATION_S if side_index else SPEED_RAMP_S
         if side_index and scenario.nose_follows_path and speed_m_s > 0.0:
             flight_plan.add_turn(
                 np.pi / 2.0, flight_plan.ramp_centre_s - CORNER_DURATION_S / 2.0, CORNER_DURATION_S
@@ -310,5 +318,5 @@ def _fly_loop(flight_plan: _FlightPlan, scenario: Scenario, faults: FaultSizes) 
         )
         previous_velocity_m_s = velocity_m_s
     flight_plan.add_velocity_change(
-        -previous_velocity_m_s, START_STOP_S, START_STOP_S + scenario.pause_s
+        -previous_velocity_m_s, SPEED_RAMP_S, SPEED_RAMP_S + scenario.pause_s
     )

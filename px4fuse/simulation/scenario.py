@@ -10,17 +10,16 @@ from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, Aid
 
 ScenarioKind = Literal["aisle", "loop", "outdoor"]
 YawMode = Literal["fixed", "follow"]
-KINDS: tuple[ScenarioKind, ...] = get_args(ScenarioKind)
+SCENARIO_KINDS: tuple[ScenarioKind, ...] = get_args(ScenarioKind)
 YAW_MODES: tuple[YawMode, ...] = get_args(YawMode)
 
 # Averaging time (s) for which the accelerometer noise SIGMA_A is defined: DT of KF
 DT_S = 0.1
 # Duration (s) of acceleration and braking along the aisle
-START_STOP_S = 1.5
-# Duration (s) of a corner of the loop
+SPEED_RAMP_S = 1.5
 CORNER_DURATION_S = 2.0
 # Defaults of the scenario that depend on the kind of flight
-DEFAULTS_OF_KIND: Mapping[ScenarioKind, Mapping[str, float]] = {
+DEFAULTS_BY_KIND: Mapping[ScenarioKind, Mapping[str, float]] = {
     "aisle": {},
     "loop": {"passes": 1},
     "outdoor": {"passes": 3, "length_m": 30.0, "speed_m_s": 4.0, "altitude_m": 8.0},
@@ -48,13 +47,13 @@ class Bounds:
             raise SettingsError(f"{name} {value:g} is out of range: give {range_text}.")
 
 
-def bounded_number(default: Any, *bounds: Any) -> Any:
+def make_bounded_field(default: Any, *bounds: Any) -> Any:
     """Make a dataclass field with a default, and with :class:`Bounds` from ``bounds``."""
     return field(default=default, metadata={"quantity": Bounds(*bounds)})
 
 
-def bounds_by_field(dataclass_type: type) -> dict[str, Bounds]:
-    """Return the bounds of the fields of a dataclass that :func:`bounded_number` made."""
+def collect_field_bounds(dataclass_type: type) -> dict[str, Bounds]:
+    """Return the bounds of each field of a dataclass that has :class:`Bounds`, by field name."""
     return {
         dataclass_field.name: dataclass_field.metadata["quantity"]
         for dataclass_field in fields(dataclass_type)
@@ -90,14 +89,14 @@ class Scenario:
     """
 
     kind: ScenarioKind = "aisle"
-    passes: int = bounded_number(6, 1, 100, "", "--passes")
-    length_m: float = bounded_number(
+    passes: int = make_bounded_field(6, 1, 100, "", "--passes")
+    length_m: float = make_bounded_field(
         12.0, 2.0, 1000.0, "m", "--length", "Length of the aisle, or of one side of the square."
     )
-    speed_m_s: float = bounded_number(
+    speed_m_s: float = make_bounded_field(
         1.0, 0.1, 10.0, "m/s", "--speed", "Speed on the straight segments of the path."
     )
-    heading_deg: float = bounded_number(
+    heading_deg: float = make_bounded_field(
         30.0,
         -360.0,
         360.0,
@@ -109,8 +108,8 @@ class Scenario:
     yaw: YawMode | None = None
     pause_s: float = 3.0
     wander_m: float = 0.03
-    uwb_rate_hz: float = bounded_number(5.0, 0.5, 100.0, "Hz", "--uwb-rate", "UWB rate.")
-    sigma_uwb_m: float = bounded_number(
+    uwb_rate_hz: float = make_bounded_field(5.0, 0.5, 100.0, "Hz", "--uwb-rate", "UWB rate.")
+    sigma_uwb_m: float = make_bounded_field(
         0.10,
         0.0,
         10.0,
@@ -120,16 +119,16 @@ class Scenario:
     )
     vio_rate_hz: float = 30.0
     sigma_vio_m: float = 0.01
-    vio_drift: float = bounded_number(
+    vio_drift: float = make_bounded_field(
         0.015, 0.0, 0.5, "", "--vio-drift", "VIO drift, as a fraction of the distance flown."
     )
     vio_walk_m: float = 0.01
     gnss_rate_hz: float = 5.0
-    sigma_gnss_m: float = bounded_number(
+    sigma_gnss_m: float = make_bounded_field(
         0.4, 0.0, 10.0, "m", "--sigma-gnss", "White GNSS position noise, north and east (1 σ)."
     )
     sigma_gnss_m_s: float = 0.3
-    sigma_a_m_s2: float = bounded_number(
+    sigma_a_m_s2: float = make_bounded_field(
         0.2,
         0.0,
         20.0,
@@ -137,7 +136,7 @@ class Scenario:
         "--sigma-a",
         "White accelerometer noise (1 σ of 0.1 s averages): the true process noise SIGMA_A.",
     )
-    accel_bias_sigma_m_s2: float = bounded_number(
+    accel_bias_sigma_m_s2: float = make_bounded_field(
         0.03,
         0.0,
         2.0,
@@ -154,17 +153,17 @@ class Scenario:
     truth_rate_hz: float = 50.0
     truth: bool = True
     ekf2: bool = True
-    seed: int = bounded_number(1, 0, 2**128 - 1, "", "--seed")
+    seed: int = make_bounded_field(1, 0, 2**128 - 1, "", "--seed")
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise SettingsError(f"--kind {self.kind}: give {' or '.join(KINDS)}.")
+        if self.kind not in SCENARIO_KINDS:
+            raise SettingsError(f"--kind {self.kind}: give {' or '.join(SCENARIO_KINDS)}.")
         if self.yaw is not None and self.yaw not in YAW_MODES:
             raise SettingsError(f"--yaw {self.yaw}: give {' or '.join(YAW_MODES)}.")
-        for name, bounds in bounds_by_field(Scenario).items():
+        for name, bounds in collect_field_bounds(Scenario).items():
             bounds.check(getattr(self, name), bounds.cli_name)
         min_length_m = self.speed_m_s * (
-            START_STOP_S if self.kind == "aisle" else CORNER_DURATION_S
+            SPEED_RAMP_S if self.kind == "aisle" else CORNER_DURATION_S
         )
         if self.length_m < min_length_m:
             raise SettingsError(
@@ -179,11 +178,15 @@ class Scenario:
 
     @property
     def source_rate_hz(self) -> float:
-        return (self.uwb_rate_hz, self.vio_rate_hz, self.gnss_rate_hz)[KINDS.index(self.kind)]
+        return (self.uwb_rate_hz, self.vio_rate_hz, self.gnss_rate_hz)[
+            SCENARIO_KINDS.index(self.kind)
+        ]
 
     @property
     def source_sigma_m(self) -> float:
-        return (self.sigma_uwb_m, self.sigma_vio_m, self.sigma_gnss_m)[KINDS.index(self.kind)]
+        return (self.sigma_uwb_m, self.sigma_vio_m, self.sigma_gnss_m)[
+            SCENARIO_KINDS.index(self.kind)
+        ]
 
     @property
     def aid(self) -> Aid:
@@ -198,4 +201,4 @@ class Scenario:
 
 def make_scenario(kind: ScenarioKind, **field_values: Any) -> Scenario:
     """Make a scenario with the defaults of its kind, except for ``field_values``."""
-    return Scenario(kind=kind, **{**DEFAULTS_OF_KIND[kind], **field_values})
+    return Scenario(kind=kind, **{**DEFAULTS_BY_KIND[kind], **field_values})

@@ -16,52 +16,47 @@ from px4fuse.flight.ekf2_parameters import GNSS_POS, PARAMETERS
 from px4fuse.readers.px4_positions import unproject
 from px4fuse.readers.px4_topics import GPS_POSITION
 from px4fuse.simulation.faults import FaultSizes
-from px4fuse.simulation.motion import Motion, Sines, attitude, direction
+from px4fuse.simulation.motion import Motion, Sines, compute_attitude, compute_direction
 from px4fuse.simulation.scenario import DT_S, Scenario
-from px4fuse.simulation.ulog_writer import Topic, topic
+from px4fuse.simulation.ulog_writer import Topic, make_topic
 
 # Time since boot (µs) of the first data
-START_US = 12_000_000
+FIRST_TIMESTAMP_US = 12_000_000
 # Mean latency (s) of positions from measurement to arrival in PX4
 POSITION_LATENCY_S = 0.030
 # Standard deviation (s) of the latency of positions
 POSITION_LATENCY_SIGMA_S = 0.003
-# Minimum latency (s) of positions
-MIN_LATENCY_S = 0.005
+# Minimum simulated latency (s) of positions: smaller random values are set to it
+MIN_POSITION_LATENCY_S = 0.005
 # Standard deviation of the times of position measurements, as fraction of their interval
-POSITION_INTERVAL_JITTER = 0.02
+INTERVAL_JITTER_FRACTION = 0.02
 # Time (s) from the first data to the first position
-FIRST_POSITION_S = 0.1
+FIRST_POSITION_TIME_S = 0.1
 # Time (s) until PX4 uses the sender's timestamps instead of arrival times: 500 TIMESYNC replies at
 # 10 Hz (Timesync.cpp)
-TIMESYNC_CONVERGED_S = 50.0
+TIMESYNC_CONVERGENCE_TIME_S = 50.0
 # Mean number of positions in a burst of outliers
 MEAN_OUTLIER_BURST_LENGTH = 3
 # Origin of the local frame outdoors: latitude, longitude (degrees) and altitude (m)
 HOME_POSITION = (47.397742, 8.545594, 488.0)
 # Time (s) from the measurement of a GNSS position to its timestamp
-FIX_AGE_S = 1e-3 * PARAMETERS[GNSS_POS.delay].default
-# Factors on the GNSS noise north, east and down
+GNSS_DELAY_S = 1e-3 * PARAMETERS[GNSS_POS.delay].default
+# GNSS noise north, east and down, as multiples of the σ of the scenario
 GNSS_SIGMA_FACTORS = np.array([1.0, 1.0, 1.5])
 # Magnetic field (gauss, NED) at HOME_POSITION
 EARTH_FIELD_GAUSS = np.array([0.217, 0.013, 0.430])
-# White noise (1 σ, gauss) of the magnetometer
 SIGMA_MAGNETOMETER_GAUSS = 0.02
-# Measurement rate (Hz) of the magnetometer
 MAGNETOMETER_RATE_HZ = 14.0
-# White noise (1 σ, m) of the barometer
 SIGMA_BAROMETER_M = 0.4
-# Measurement rate (Hz) of the barometer
 BAROMETER_RATE_HZ = 10.0
 # RMS (m) of the slow height error that weather and wind cause
-HEIGHT_ERROR_M = 0.03
+HEIGHT_ERROR_RMS_M = 0.03
 # Time constant (s) with which EKF2's heading follows a compass error that starts in flight
 HEADING_TIME_CONSTANT_S = 3.0
 # Range of the periods (s) of the sines whose sum is the slow attitude or height error
-SLOW_ERROR_PERIODS_S = (20.0, 60.0)
+SLOW_ERROR_PERIOD_RANGE_S = (20.0, 60.0)
 # Time (µs) from the measurement to the publication of vehicle_attitude
 ATTITUDE_LATENCY_US = 200
-# Publication interval (µs) of vehicle_land_detected
 LAND_DETECTOR_INTERVAL_US = 1_000_000
 
 
@@ -89,7 +84,7 @@ class SimulatedPositions:
         Measured position, NED.
     velocity_m_s : ndarray, shape (n, 3), or None
         Velocity measured by GNSS, NED; None for UWB and VIO.
-    measured_s : ndarray, shape (n,)
+    measurement_times_s : ndarray, shape (n,)
         True times of measurement (s from the first data).
     distance_m : float
         Horizontal distance flown.
@@ -101,12 +96,12 @@ class SimulatedPositions:
     is_outlier: BoolArray
     position_m: Array
     velocity_m_s: Array | None
-    measured_s: Array
+    measurement_times_s: Array
     distance_m: float
     drift_m: Array
 
 
-def biases(scenario: Scenario, faults: FaultSizes) -> tuple[Array, Array]:
+def draw_biases(scenario: Scenario, faults: FaultSizes) -> tuple[Array, Array]:
     """Return accelerometer (m/s²) and gyro (rad/s) biases, body FRD, each of shape (3,)."""
     rng = random_stream(scenario, RandomStream.BIAS)
     accelerometer_bias_m_s2 = rng.normal(0.0, scenario.accel_bias_sigma_m_s2, 3)
@@ -114,11 +109,11 @@ def biases(scenario: Scenario, faults: FaultSizes) -> tuple[Array, Array]:
     return accelerometer_bias_m_s2, rng.normal(0.0, scenario.gyro_bias_sigma_rad_s, 3)
 
 
-def imu(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
+def simulate_imu(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
     """Simulate sensor_combined (accelerometer and gyro) at the full rate, without gaps."""
-    time_us = _grid_us(motion, scenario.imu_rate_hz)
+    time_us = _make_sample_times_us(motion, scenario.imu_rate_hz)
     force_m_s2, rate_rad_s = measure_imu(
-        scenario, faults, motion, seconds(time_us), RandomStream.IMU
+        scenario, faults, motion, to_seconds(time_us), RandomStream.IMU
     )
     if faults.vibration_m_s2:
         vibration_sigma_m_s2 = faults.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
@@ -132,59 +127,64 @@ def imu(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
         "gyro_rad": rate_rad_s,
         "accelerometer_m_s2": force_m_s2,
     }
-    return topic("sensor_combined", sample_fields | integral_fields)
+    return make_topic("sensor_combined", sample_fields | integral_fields)
 
 
-def magnetometer(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
-    time_us = _grid_us(motion, MAGNETOMETER_RATE_HZ)
-    body_to_ned = attitude(motion.at(seconds(time_us))).body_to_ned
+def simulate_magnetometer(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
+    time_us = _make_sample_times_us(motion, MAGNETOMETER_RATE_HZ)
+    body_to_ned = compute_attitude(motion.at(to_seconds(time_us))).body_to_ned
     # The measured field is rotated, which causes EKF2's heading error outdoors
     if faults.heading_deg:
-        body_to_ned = attitude_error(scenario, faults, seconds(time_us)).as_matrix() @ body_to_ned
+        body_to_ned = (
+            simulate_attitude_error(scenario, faults, to_seconds(time_us)).as_matrix() @ body_to_ned
+        )
     field_gauss = np.einsum("nji,j->ni", body_to_ned, EARTH_FIELD_GAUSS)
     field_gauss += SIGMA_MAGNETOMETER_GAUSS * random_stream(
         scenario, RandomStream.FIELD
     ).standard_normal(field_gauss.shape)
     disturbance_start_s = motion.duration_s / 2.0 if faults.mag_at_s is None else faults.mag_at_s
-    field_gauss[seconds(time_us) >= disturbance_start_s, 1] += faults.mag_gauss
-    return topic("vehicle_magnetometer", timestamps(time_us) | {"magnetometer_ga": field_gauss})
+    field_gauss[to_seconds(time_us) >= disturbance_start_s, 1] += faults.mag_gauss
+    return make_topic(
+        "vehicle_magnetometer", make_timestamps(time_us) | {"magnetometer_ga": field_gauss}
+    )
 
 
-def barometer(scenario: Scenario, motion: Motion) -> Topic:
-    time_us = _grid_us(motion, BAROMETER_RATE_HZ)
-    height_m = HOME_POSITION[2] - motion.at(seconds(time_us)).position_m[:, 2]
-    height_m -= height_error(scenario, seconds(time_us))
+def simulate_barometer(scenario: Scenario, motion: Motion) -> Topic:
+    time_us = _make_sample_times_us(motion, BAROMETER_RATE_HZ)
+    height_m = HOME_POSITION[2] - motion.at(to_seconds(time_us)).position_m[:, 2]
+    height_m -= simulate_height_error(scenario, to_seconds(time_us))
     unit_noise = random_stream(scenario, RandomStream.BAROMETER).standard_normal(len(time_us))
     height_m += SIGMA_BAROMETER_M * unit_noise
-    return topic("vehicle_air_data", timestamps(time_us) | {"baro_alt_meter": height_m})
+    return make_topic("vehicle_air_data", make_timestamps(time_us) | {"baro_alt_meter": height_m})
 
 
-def height_error(scenario: Scenario, time_s: Array) -> Array:
-    """Simulate the slow height error (m, positive downward)."""
-    rng, rms = random_stream(scenario, RandomStream.HEIGHT), np.array([HEIGHT_ERROR_M])
-    return Sines.draw(rng, rms, SLOW_ERROR_PERIODS_S).at(time_s)[0][:, 0]
+def simulate_height_error(scenario: Scenario, time_s: Array) -> Array:
+    """Simulate the slow error (m, positive downward) of the barometer and of EKF2's height."""
+    rng, rms = random_stream(scenario, RandomStream.HEIGHT), np.array([HEIGHT_ERROR_RMS_M])
+    return Sines.draw(rng, rms, SLOW_ERROR_PERIOD_RANGE_S).at(time_s)[0][:, 0]
 
 
 def limit_rate(full_topic: Topic, rate_hz: float, is_kept: BoolArray | bool = True) -> Topic:
     """Return the messages that a logger with a rate limit (Hz) writes; 0 is no limit."""
-    is_logged = keep_at_rate(seconds(time_us(full_topic)), rate_hz) & is_kept
+    is_logged = keep_at_rate(to_seconds(get_time_us(full_topic)), rate_hz) & is_kept
     logged_fields = {name: values[is_logged] for name, values in full_topic.fields.items()}
     return Topic(full_topic.name, logged_fields)
 
 
-def logged_imu(full_topic: Topic, faults: FaultSizes, motion: Motion) -> Topic:
+def select_logged_imu(full_topic: Topic, faults: FaultSizes, motion: Motion) -> Topic:
     """Return sensor_combined as logged, with the gap and the reduced rate of ``faults``."""
-    times_s, gap_values = (
-        seconds(time_us(full_topic)),
-        (faults.imu_dropout_s, faults.imu_dropout_at_s),
+    is_outside_gap = _is_outside_gap(
+        to_seconds(get_time_us(full_topic)),
+        faults.imu_dropout_s,
+        faults.imu_dropout_at_s,
+        motion.duration_s,
     )
-    is_outside_gap = _is_outside_gap(times_s, *gap_values, motion.duration_s)
     return limit_rate(full_topic, faults.imu_rate_hz, is_outside_gap)
 
 
-def time_us(topic: Topic, field: str = "timestamp") -> IntArray:
+def get_time_us(topic: Topic, field: str = "timestamp") -> IntArray:
     """Return the publication time (or another time) of each message, µs from the first data."""
-    return np.asarray(topic.fields[field].astype(np.int64) - START_US)
+    return np.asarray(topic.fields[field].astype(np.int64) - FIRST_TIMESTAMP_US)
 
 
 def measure_imu(
@@ -193,53 +193,53 @@ def measure_imu(
     motion: Motion,
     time_s: Array,
     stream: RandomStream,
-    mean_count: float = 1.0,
+    averaged_sample_count: float = 1.0,
 ) -> ArrayPair:
-    """Simulate specific force (m/s²) and angular rate (rad/s), mean of ``mean_count`` samples."""
-    truth = attitude(motion.at(time_s))
+    """Simulate specific force (m/s²) and angular rate (rad/s), each a mean of samples."""
+    truth = compute_attitude(motion.at(time_s))
     rng, measurements = random_stream(scenario, stream), []
     for true_value, bias, sigma in zip(
         (truth.specific_force_m_s2, truth.angular_rate_rad_s),
-        biases(scenario, faults),
+        draw_biases(scenario, faults),
         (scenario.accelerometer_noise_m_s2, scenario.gyro_noise_rad_s),
         strict=True,
     ):
-        noise = 1.0 / np.sqrt(mean_count) * sigma * rng.standard_normal(true_value.shape)
+        noise = 1.0 / np.sqrt(averaged_sample_count) * sigma * rng.standard_normal(true_value.shape)
         measurements.append(true_value + bias + noise)
     force_m_s2, rate_rad_s = measurements
     return force_m_s2, rate_rad_s
 
 
-def logged_attitude(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
+def simulate_logged_attitude(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
     """Simulate vehicle_attitude without the EKF2 model: true attitude with a slow error."""
-    time_us = _grid_us(motion, scenario.attitude_rate_hz)
-    true_rotation = attitude(motion.at(seconds(time_us))).body_to_ned
-    error_rotation = attitude_error(scenario, faults, seconds(time_us)).as_matrix()
-    logged_quaternions = quaternions(error_rotation @ true_rotation)
-    return attitude_topic("vehicle_attitude", time_us, ATTITUDE_LATENCY_US, logged_quaternions)
+    time_us = _make_sample_times_us(motion, scenario.attitude_rate_hz)
+    true_rotation = compute_attitude(motion.at(to_seconds(time_us))).body_to_ned
+    error_rotation = simulate_attitude_error(scenario, faults, to_seconds(time_us)).as_matrix()
+    logged_quaternions = to_quaternions(error_rotation @ true_rotation)
+    return make_attitude_topic("vehicle_attitude", time_us, ATTITUDE_LATENCY_US, logged_quaternions)
 
 
-def true_attitude(scenario: Scenario, motion: Motion) -> Topic:
-    time_us = _grid_us(motion, scenario.truth_rate_hz)
-    truth = attitude(motion.at(seconds(time_us))).body_to_ned
-    return attitude_topic("vehicle_attitude_groundtruth", time_us, 0, quaternions(truth))
+def simulate_true_attitude(scenario: Scenario, motion: Motion) -> Topic:
+    time_us = _make_sample_times_us(motion, scenario.truth_rate_hz)
+    truth = compute_attitude(motion.at(to_seconds(time_us))).body_to_ned
+    return make_attitude_topic("vehicle_attitude_groundtruth", time_us, 0, to_quaternions(truth))
 
 
-def quaternions(body_to_ned: Array) -> Array:
+def to_quaternions(body_to_ned: Array) -> Array:
     return np.asarray(Rotation.from_matrix(body_to_ned).as_quat(scalar_first=True))
 
 
-def attitude_topic(name: str, time_us: IntArray, delay_us: int, quaternion: Array) -> Topic:
+def make_attitude_topic(name: str, time_us: IntArray, delay_us: int, quaternion: Array) -> Topic:
     """Make an attitude topic that is published ``delay_us`` (µs) after the measurement."""
-    return topic(name, timestamps(time_us, delay_us) | {"q": quaternion})
+    return make_topic(name, make_timestamps(time_us, delay_us) | {"q": quaternion})
 
 
-def attitude_error(scenario: Scenario, faults: FaultSizes, time_s: Array) -> Rotation:
+def simulate_attitude_error(scenario: Scenario, faults: FaultSizes, time_s: Array) -> Rotation:
     """Simulate the error of the logged attitude, a rotation in NED."""
     tilt_rms_deg = scenario.tilt_error_deg
     rms_rad = np.radians([tilt_rms_deg, tilt_rms_deg, scenario.yaw_error_deg])
     rng = random_stream(scenario, RandomStream.ATTITUDE)
-    error_rad = Sines.draw(rng, rms_rad, SLOW_ERROR_PERIODS_S).at(time_s)[0]
+    error_rad = Sines.draw(rng, rms_rad, SLOW_ERROR_PERIOD_RANGE_S).at(time_s)[0]
     if faults.heading_deg:
         heading_error_rad = np.radians(faults.heading_deg)
         if faults.heading_at_s is not None:
@@ -250,7 +250,7 @@ def attitude_error(scenario: Scenario, faults: FaultSizes, time_s: Array) -> Rot
     return Rotation.from_rotvec(error_rad)
 
 
-def land_detector(motion: Motion) -> Topic:
+def simulate_land_detector(motion: Motion) -> Topic:
     """Simulate vehicle_land_detected, logged once a second and at take-off and landing."""
     landed_changes_us = np.rint(np.array([motion.take_off_s, motion.touch_down_s]) * 1e6).astype(
         np.int64
@@ -260,35 +260,41 @@ def land_detector(motion: Motion) -> Topic:
     )
     is_landed = (time_us < landed_changes_us[0]) | (time_us >= landed_changes_us[1])
     landed_flags = dict.fromkeys(("ground_contact", "maybe_landed", "landed"), is_landed)
-    return topic("vehicle_land_detected", {"timestamp": _to_boot_time(time_us), **landed_flags})
+    return make_topic(
+        "vehicle_land_detected", {"timestamp": _to_boot_time(time_us), **landed_flags}
+    )
 
 
-def ground_truth(scenario: Scenario, motion: Motion) -> Topic:
-    time_us = _grid_us(motion, scenario.truth_rate_hz)
-    state = motion.at(seconds(time_us))
-    fields = timestamps(time_us) | vectors(
+def simulate_ground_truth(scenario: Scenario, motion: Motion) -> Topic:
+    time_us = _make_sample_times_us(motion, scenario.truth_rate_hz)
+    state = motion.at(to_seconds(time_us))
+    fields = make_timestamps(time_us) | split_vectors(
         {"": state.position_m, "v": state.velocity_m_s, "a": state.acceleration_m_s2}
     )
     fields["heading"] = np.angle(np.exp(1j * state.yaw_rad))
-    return topic("vehicle_local_position_groundtruth", fields)
+    return make_topic("vehicle_local_position_groundtruth", fields)
 
 
-def positions(scenario: Scenario, faults: FaultSizes, motion: Motion) -> SimulatedPositions:
+def simulate_positions(
+    scenario: Scenario, faults: FaultSizes, motion: Motion
+) -> SimulatedPositions:
     """Simulate UWB (aisle), VIO (loop) or GNSS (outdoor) positions with injected faults."""
     timing_rng = random_stream(scenario, RandomStream.TIMING)
     interval_s = 1.0 / scenario.source_rate_hz
-    position_count = int((motion.duration_s - FIRST_POSITION_S) / interval_s)
-    nominal_s = FIRST_POSITION_S + interval_s * np.arange(position_count)
+    position_count = int((motion.duration_s - FIRST_POSITION_TIME_S) / interval_s)
+    nominal_times_s = FIRST_POSITION_TIME_S + interval_s * np.arange(position_count)
     # jitter below half an interval keeps the positions in order
-    jitter = np.clip(timing_rng.normal(0.0, POSITION_INTERVAL_JITTER, position_count), -0.4, 0.4)
-    time_s = np.maximum(nominal_s + jitter * interval_s, 0.0)
+    jitter_fraction = np.clip(
+        timing_rng.normal(0.0, INTERVAL_JITTER_FRACTION, position_count), -0.4, 0.4
+    )
+    time_s = np.maximum(nominal_times_s + jitter_fraction * interval_s, 0.0)
     state = motion.at(time_s)
     position_m = state.position_m.copy()
     speed_m_s = np.hypot(state.velocity_m_s[:, 0], state.velocity_m_s[:, 1])
     distance_m = cumulative_trapezoid(speed_m_s, time_s, initial=0)
     drift_m = np.zeros_like(position_m)
     if scenario.kind == "loop":
-        drift_m = vio_drift(scenario, distance_m)
+        drift_m = simulate_vio_drift(scenario, distance_m)
     position_m += drift_m
     is_outdoor = scenario.kind == "outdoor"
     sigma_m = scenario.source_sigma_m * (GNSS_SIGMA_FACTORS if is_outdoor else 1.0)
@@ -296,10 +302,10 @@ def positions(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Simulat
         position_m.shape
     )
     is_airborne = (time_s > motion.take_off_s) & (time_s < motion.touch_down_s)
-    outlier_offset_m, is_outlier = outliers(scenario, faults, is_airborne)
+    outlier_offset_m, is_outlier = simulate_outliers(scenario, faults, is_airborne)
     position_m += outlier_offset_m
     if faults.slow_error_m:
-        position_m += slow_error(scenario, faults, len(time_s), interval_s)
+        position_m += simulate_correlated_noise(scenario, faults, len(time_s), interval_s)
     if faults.smoothed_s:
         position_m = _low_pass(position_m, interval_s, faults.smoothed_s)
     position_m *= 1.0 + faults.scale_percent / 100.0
@@ -307,12 +313,14 @@ def positions(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Simulat
         position_m = Rotation.from_euler("z", faults.yaw_deg, degrees=True).apply(position_m)
     if faults.jump_m:
         jump_start_s = motion.duration_s / 1.5 if faults.jump_at_s is None else faults.jump_at_s
-        position_m[time_s >= jump_start_s] += faults.jump_m * direction(scenario.heading_deg)
+        position_m[time_s >= jump_start_s] += faults.jump_m * compute_direction(
+            scenario.heading_deg
+        )
     is_logged = _is_outside_gap(
         time_s, faults.dropout_s, faults.dropout_at_s, motion.duration_s
     ) & keep_at_rate(time_s, faults.decimate_hz)
-    arrival_us, timestamp_us = _source_times_us(faults, time_s, timing_rng)
-    reported_sigma = reported_sigma_m(scenario, faults)
+    arrival_us, timestamp_us = _simulate_position_times_us(faults, time_s, timing_rng)
+    reported_sigma_m = compute_reported_sigma_m(scenario, faults)
     velocity_m_s = None
     if is_outdoor:
         velocity_noise = random_stream(scenario, RandomStream.FIX_VELOCITY).standard_normal(
@@ -321,21 +329,23 @@ def positions(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Simulat
         velocity_m_s = (
             state.velocity_m_s + scenario.sigma_gnss_m_s * GNSS_SIGMA_FACTORS * velocity_noise
         )[is_logged]
-        gnss_timestamp_us = timestamp_us + round(1e6 * FIX_AGE_S)
-        topic = _gnss_topic(
+        gnss_timestamp_us = timestamp_us + round(1e6 * GNSS_DELAY_S)
+        topic = _make_gnss_topic(
             gnss_timestamp_us[is_logged],
             position_m[is_logged],
             velocity_m_s,
-            reported_sigma,
+            reported_sigma_m,
             scenario,
         )
     else:
-        body_to_ned = attitude(state).body_to_ned[is_logged] if scenario.kind == "loop" else None
-        topic = _odometry_topic(
+        body_to_ned = (
+            compute_attitude(state).body_to_ned[is_logged] if scenario.kind == "loop" else None
+        )
+        topic = _make_odometry_topic(
             arrival_us[is_logged],
             timestamp_us[is_logged],
             position_m[is_logged],
-            reported_sigma,
+            reported_sigma_m,
             body_to_ned,
         )
     return SimulatedPositions(
@@ -343,19 +353,19 @@ def positions(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Simulat
         is_outlier=is_outlier[is_logged],
         position_m=position_m[is_logged],
         velocity_m_s=velocity_m_s,
-        measured_s=time_s[is_logged],
+        measurement_times_s=time_s[is_logged],
         distance_m=float(distance_m[-1]),
         drift_m=drift_m[-1],
     )
 
 
-def reported_sigma_m(scenario: Scenario, faults: FaultSizes) -> float:
+def compute_reported_sigma_m(scenario: Scenario, faults: FaultSizes) -> float:
     """Return the σ (m) that the source reports."""
-    # EKF2.cpp uses at least 0.01 m
+    # EKF2.cpp limits the reported σ to at least 0.01 m
     return max(scenario.source_sigma_m, 0.01) * float(np.sqrt(faults.r_scale))
 
 
-def slow_error(
+def simulate_correlated_noise(
     scenario: Scenario, faults: FaultSizes, sample_count: int, interval_s: float
 ) -> Array:
     """Simulate time-correlated noise (m), shape (n, 3): a first-order Gauss-Markov process."""
@@ -368,16 +378,16 @@ def slow_error(
     return np.asarray(lfilter([1.0], [1.0, -decay_factor], noise_m, axis=0))
 
 
-def vio_drift(scenario: Scenario, distance_m: Array) -> Array:
+def simulate_vio_drift(scenario: Scenario, distance_m: Array) -> Array:
     """Simulate the VIO drift (m, NED), shape (n, 3): proportional to distance, and random walk."""
     rng = random_stream(scenario, RandomStream.DRIFT)
-    drift_per_metre = scenario.vio_drift * direction(rng.uniform(0.0, 360.0))
-    step_sigmas = np.sqrt(np.diff(distance_m, prepend=0.0))[:, None]
-    random_walk = np.cumsum(step_sigmas * rng.standard_normal((len(distance_m), 3)), axis=0)
+    drift_per_metre = scenario.vio_drift * compute_direction(rng.uniform(0.0, 360.0))
+    sqrt_step_lengths = np.sqrt(np.diff(distance_m, prepend=0.0))[:, None]
+    random_walk = np.cumsum(sqrt_step_lengths * rng.standard_normal((len(distance_m), 3)), axis=0)
     return np.asarray(distance_m[:, None] * drift_per_metre + scenario.vio_walk_m * random_walk)
 
 
-def outliers(
+def simulate_outliers(
     scenario: Scenario, faults: FaultSizes, is_airborne: BoolArray
 ) -> tuple[Array, BoolArray]:
     """Simulate outliers; return the errors (m, NED), shape (n, 3), and a mask of the outliers.
@@ -400,7 +410,8 @@ def outliers(
         len(airborne_indices) - outlier_count, np.full(burst_count + 1, 1.0 / (burst_count + 1))
     )
     burst_index = np.repeat(np.arange(burst_count), burst_lengths)
-    # index of an outlier: number of outliers plus number of other positions before it
+    # number of positions before an outlier: earlier outliers, and positions in the gaps between
+    # bursts
     outlier_indices = airborne_indices[
         np.arange(outlier_count) + np.cumsum(gap_lengths)[burst_index]
     ]
@@ -420,23 +431,23 @@ def keep_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
     return np.asarray(np.diff(np.floor(time_s * rate_hz + 1e-6), prepend=-1.0) > 0.0)
 
 
-def _source_times_us(
+def _simulate_position_times_us(
     faults: FaultSizes, time_s: Array, rng: np.random.Generator
 ) -> tuple[IntArray, IntArray]:
     """Simulate arrival time and timestamp of each position (µs from the first data)."""
     mean_latency_s = faults.clock_jump_s or POSITION_LATENCY_S
     latency_s = np.maximum(
-        rng.normal(mean_latency_s, POSITION_LATENCY_SIGMA_S, len(time_s)), MIN_LATENCY_S
+        rng.normal(mean_latency_s, POSITION_LATENCY_SIGMA_S, len(time_s)), MIN_POSITION_LATENCY_S
     )
     arrival_us = np.maximum.accumulate(np.rint((time_s + latency_s) * 1e6).astype(np.int64))
     offset_s = faults.clock_offset_s + faults.clock_drift_ppm * 1e-6 * time_s
     timestamp_us = np.rint((time_s + offset_s) * 1e6).astype(np.int64)
     if faults.clock_jump_s:
-        timestamp_us = np.where(time_s < TIMESYNC_CONVERGED_S, arrival_us, timestamp_us)
+        timestamp_us = np.where(time_s < TIMESYNC_CONVERGENCE_TIME_S, arrival_us, timestamp_us)
     return arrival_us, timestamp_us
 
 
-def _odometry_topic(
+def _make_odometry_topic(
     arrival_us: IntArray,
     timestamp_us: IntArray,
     position_m: Array,
@@ -444,31 +455,31 @@ def _odometry_topic(
     body_to_ned: Array | None,
 ) -> Topic:
     variance_m2 = np.full(position_m.shape, sigma_m**2)
-    fields = timestamps(timestamp_us, arrival_us - timestamp_us)
+    fields = make_timestamps(timestamp_us, arrival_us - timestamp_us)
     fields |= {"position": position_m, "position_variance": variance_m2}
     if body_to_ned is not None:
-        fields["q"] = quaternions(body_to_ned)
-    return topic("vehicle_visual_odometry", fields)
+        fields["q"] = to_quaternions(body_to_ned)
+    return make_topic("vehicle_visual_odometry", fields)
 
 
-def _gnss_topic(
+def _make_gnss_topic(
     timestamp_us: IntArray,
     position_m: Array,
     velocity_m_s: Array,
     sigma_m: float,
     scenario: Scenario,
 ) -> Topic:
-    latitude, longitude = unproject(position_m[:, 0], position_m[:, 1], HOME_POSITION[:2])
-    fields = timestamps(timestamp_us) | {
+    latitude_deg, longitude_deg = unproject(position_m[:, 0], position_m[:, 1], HOME_POSITION[:2])
+    fields = make_timestamps(timestamp_us) | {
         "eph": sigma_m,
         "epv": sigma_m * GNSS_SIGMA_FACTORS[2],
         "s_variance_m_s": scenario.sigma_gnss_m_s,
-        "latitude_deg": latitude,
-        "longitude_deg": longitude,
+        "latitude_deg": latitude_deg,
+        "longitude_deg": longitude_deg,
         "altitude_msl_m": HOME_POSITION[2] - position_m[:, 2],
     }
     fields |= {f"vel_{axis}_m_s": velocity_m_s[:, i] for i, axis in enumerate("ned")}
-    return topic(GPS_POSITION, fields)
+    return make_topic(GPS_POSITION, fields)
 
 
 def _low_pass(position_m: Array, interval_s: float, time_constant_s: float) -> Array:
@@ -484,23 +495,23 @@ def _low_pass(position_m: Array, interval_s: float, time_constant_s: float) -> A
 
 
 def _is_outside_gap(
-    time_s: Array, gap_s: float, at_s: float | None, duration_s: float
+    time_s: Array, gap_s: float, gap_start_s: float | None, duration_s: float
 ) -> BoolArray:
     """Return a mask of times outside a gap; by default the gap is in the middle of the flight."""
-    start_s = (duration_s - gap_s) / 2.0 if at_s is None else at_s
+    start_s = (duration_s - gap_s) / 2.0 if gap_start_s is None else gap_start_s
     return np.asarray((time_s <= start_s) | (time_s >= start_s + gap_s))
 
 
-def _grid_us(motion: Motion, rate_hz: float) -> IntArray:
+def _make_sample_times_us(motion: Motion, rate_hz: float) -> IntArray:
     time_us = np.rint(np.arange(int(motion.duration_s * rate_hz) + 1) * (1e6 / rate_hz))
     return np.asarray(time_us, dtype=np.int64)
 
 
-def seconds(time_us: IntArray) -> Array:
+def to_seconds(time_us: IntArray) -> Array:
     return np.asarray(time_us * 1e-6, dtype=np.float64)
 
 
-def timestamps(time_us: IntArray, delay_us: int | IntArray = 0) -> dict[str, Any]:
+def make_timestamps(time_us: IntArray, delay_us: int | IntArray = 0) -> dict[str, Any]:
     """Return ``timestamp_sample``, and ``timestamp`` (publication, ``delay_us`` later)."""
     return {
         "timestamp": _to_boot_time(time_us + delay_us),
@@ -508,7 +519,7 @@ def timestamps(time_us: IntArray, delay_us: int | IntArray = 0) -> dict[str, Any
     }
 
 
-def vectors(values: Mapping[str, Array]) -> dict[str, Any]:
+def split_vectors(values: Mapping[str, Array]) -> dict[str, Any]:
     """Split vectors, shape (n, 3), into PX4 fields, for example "v" into vx, vy and vz."""
     return {
         f"{name}{axis}": vector[:, i]
@@ -518,4 +529,4 @@ def vectors(values: Mapping[str, Array]) -> dict[str, Any]:
 
 
 def _to_boot_time(time_us: IntArray) -> NDArray[np.uint64]:
-    return (START_US + time_us).astype(np.uint64)
+    return (FIRST_TIMESTAMP_US + time_us).astype(np.uint64)

@@ -16,8 +16,8 @@ def summary(simulation: Simulation, answer: Path | None) -> Page:
     scenario, page = simulation.scenario, Page()
     path = f"{count_noun(scenario.passes, 'lap')} of a square of {scenario.length_m:g} m"
     if scenario.kind == "aisle":
-        plural = "es" * (scenario.passes > 1)
-        path = f"{scenario.passes} pass{plural} of {scenario.length_m:g} m"
+        plural_suffix = "es" * (scenario.passes > 1)
+        path = f"{scenario.passes} pass{plural_suffix} of {scenario.length_m:g} m"
     texts = {
         "Flight": f"{scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
         f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",

@@ -34,7 +34,7 @@ class Topic:
     instance: int = 0
 
 
-def topic(name: str, field_values: Mapping[str, ArrayLike]) -> Topic:
+def make_topic(name: str, field_values: Mapping[str, ArrayLike]) -> Topic:
     """Make a topic with PX4's fields and types, and defaults for missing fields.
 
     A scalar value is used for all messages.
@@ -62,7 +62,7 @@ def topic(name: str, field_values: Mapping[str, ArrayLike]) -> Topic:
     return Topic(name, fields)
 
 
-def encode(
+def encode_ulog(
     topics: Sequence[Topic],
     parameters: Mapping[str, int | float],
     info: Mapping[str, int | str],
@@ -75,29 +75,33 @@ def encode(
     content = [
         ULOG_MAGIC + _ULOG_VERSION,
         struct.pack("<Q", start_us),
-        _message("B", _FLAG_BITS_MESSAGE),
+        _pack_message("B", _FLAG_BITS_MESSAGE),
     ]
-    format_texts = dict.fromkeys(_format_text(topic) for topic in topics)
-    content += [_message("F", format_text.encode()) for format_text in format_texts]
+    format_texts = dict.fromkeys(_make_format_definition(topic) for topic in topics)
+    content += [_pack_message("F", format_text.encode()) for format_text in format_texts]
     for name, info_value in info.items():
         if isinstance(info_value, str):
             info_bytes = info_value.encode()
-            content.append(_keyed_message("I", f"char[{len(info_bytes)}] {name}", info_bytes))
+            content.append(_pack_keyed_message("I", f"char[{len(info_bytes)}] {name}", info_bytes))
         else:
-            content.append(_keyed_message("I", f"uint32_t {name}", struct.pack("<I", info_value)))
+            content.append(
+                _pack_keyed_message("I", f"uint32_t {name}", struct.pack("<I", info_value))
+            )
     for name, parameter_value in parameters.items():
         ulog_type, struct_code = (
             ("int32_t", "<i") if isinstance(parameter_value, int) else ("float", "<f")
         )
         content.append(
-            _keyed_message("P", f"{ulog_type} {name}", struct.pack(struct_code, parameter_value))
+            _pack_keyed_message(
+                "P", f"{ulog_type} {name}", struct.pack(struct_code, parameter_value)
+            )
         )
     data_messages: list[bytes] = []
     for topic_id, topic in enumerate(topics):
         content.append(
-            _message("A", struct.pack("<BH", topic.instance, topic_id) + topic.name.encode())
+            _pack_message("A", struct.pack("<BH", topic.instance, topic_id) + topic.name.encode())
         )
-        data_messages += _data_messages(topic, topic_id)
+        data_messages += _encode_data_messages(topic, topic_id)
     timestamps_us = [np.maximum.accumulate(topic.fields["timestamp"]) for topic in topics]
     content += [
         data_messages[index]
@@ -106,15 +110,15 @@ def encode(
     return b"".join(content)
 
 
-def _message(message_type: str, content: bytes) -> bytes:
+def _pack_message(message_type: str, content: bytes) -> bytes:
     return struct.pack("<HB", len(content), ord(message_type)) + content
 
 
-def _keyed_message(message_type: str, key: str, value: bytes) -> bytes:
-    return _message(message_type, bytes([len(key)]) + key.encode() + value)
+def _pack_keyed_message(message_type: str, key: str, value: bytes) -> bytes:
+    return _pack_message(message_type, bytes([len(key)]) + key.encode() + value)
 
 
-def _format_text(topic: Topic) -> str:
+def _make_format_definition(topic: Topic) -> str:
     field_types = []
     for name, values in topic.fields.items():
         array_size = f"[{values.shape[1]}]" if values.ndim == 2 else ""
@@ -123,7 +127,7 @@ def _format_text(topic: Topic) -> str:
     return f"{topic.name}:{''.join(field_types)}"
 
 
-def _data_messages(topic: Topic, topic_id: int) -> list[bytes]:
+def _encode_data_messages(topic: Topic, topic_id: int) -> list[bytes]:
     header_fields = [("size", "<u2"), ("kind", "u1"), ("number", "<u2")]
     topic_fields = [
         (name, values.dtype.newbyteorder("<"), values.shape[1:])

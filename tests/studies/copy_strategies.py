@@ -36,10 +36,10 @@ from px4fuse.classroom.assignment.truth import (
     InjectedFault,
     RightFormAnswers,
     RightVerdict,
-    _ekf2_behaviour,
-    right_numeric_answer,
+    _find_ekf2_behaviours,
+    compute_numeric_answer,
 )
-from px4fuse.classroom.grading.form_points import form_points
+from px4fuse.classroom.grading.form_points import compute_form_points
 from px4fuse.diagnose import analyse_loop_closure, diagnose
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.time_offset import ClockOffset
@@ -48,7 +48,7 @@ from px4fuse.loop.model import Loop
 from px4fuse.readers.ulog_topics import ignores_assessed
 from px4fuse.request import ComparisonRequest, Landing, LoopRequest
 from px4fuse.results.answer_form import Answers, select_questions
-from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
+from px4fuse.simulation.sensors import TIMESYNC_CONVERGENCE_TIME_S
 
 SECRET = b"copy strategies"
 # Faults that assignments contain, by the id of their finding
@@ -89,7 +89,7 @@ def sizes(analysis: Analysis) -> dict[str, InjectedFault]:
     for kind, size in values.items():
         reach = 0.0 if size is None else 0.15 * abs(size)
         low, high = (None, None) if size is None else (size - reach, size + reach)
-        until_s = TIMESYNC_CONVERGED_S if kind == "clock-jump" else None
+        until_s = TIMESYNC_CONVERGENCE_TIME_S if kind == "clock-jump" else None
         from_s = analysis.segment.end_s if kind == "open-end" else None
         found[kind] = InjectedFault(kind, size, low, high, from_s, until_s)
     if analysis.events.gaps:
@@ -110,9 +110,9 @@ def copied(analysis: Analysis, kinds: list[str], log_sha256: str) -> RightFormAn
     ekf2 = RightVerdict(getattr(filters["ekf2"], "verdict", ""))
     tuning = analysis.tuning.get(HORIZONTAL)
     sigma_z_m = (tuning.sigma_z.value if isinstance(tuning, AxisTuning) else None) or 0.1
-    behaviour = _ekf2_behaviour(analysis, mistakes, sigma_z_m)
+    behaviour = _find_ekf2_behaviours(analysis, mistakes, sigma_z_m)
     numbers = tuple(
-        right_numeric_answer(analysis.main, question) for question in select_questions(log_sha256)
+        compute_numeric_answer(analysis.main, question) for question in select_questions(log_sha256)
     )
     return RightFormAnswers(mistakes, sigma_z_m, kf, ekf2, *behaviour, numbers)
 
@@ -172,7 +172,9 @@ def main() -> None:
     truths = [truth for truth, _ in made]
 
     def mean_points(form: Callable[[int], Answers]) -> float:
-        return 100.0 * fmean(form_points(form(n), one).fraction for n, one in enumerate(truths))
+        return 100.0 * fmean(
+            compute_form_points(form(n), one).fraction for n, one in enumerate(truths)
+        )
 
     print(f"{len(truths)} flights, mean points of 100")
     print(f"{'ideal':14} {mean_points(lambda n: right(truths[n])):5.1f}")

@@ -21,7 +21,11 @@ from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.figures import FIGURE_FAULTS, QUESTIONS
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.classroom.assignment.truth import InjectedFault, RightFormAnswers
-from px4fuse.classroom.grading.form_points import accepted_corrections, form_points, panels_showing
+from px4fuse.classroom.grading.form_points import (
+    compute_form_points,
+    find_accepted_corrections,
+    find_panels,
+)
 from px4fuse.results.answer_form import (
     CHOICE_NAMES,
     CORRECTIONS,
@@ -105,11 +109,11 @@ def constants(truths: Sequence[RightFormAnswers], kind: str) -> Iterator[Answers
     sizes = [wrong.size for wrong in of_kind if wrong.size is not None] or [0.0]
     begins = [wrong.from_s for wrong in of_kind if wrong.from_s is not None] or [0.0]
     for size in np.quantile(sizes, np.arange(0.05, 1.0, 0.1)):
-        cure = accepted_corrections(InjectedFault(kind, size, size, size), truths[0])[0][0]
+        cure = find_accepted_corrections(InjectedFault(kind, size, size, size), truths[0])[0][0]
         for from_s in (None, float(np.median(begins))):
             claim = NamedFault(
                 kind, float(size), when="whole flight" if from_s is None else "", from_s=from_s,
-                parameter=cure, panel=panels_showing(kind)[0],
+                parameter=cure, panel=find_panels(kind)[0],
             )  # fmt: skip
             yield replace(blank, mistakes=(claim,))
 
@@ -118,7 +122,7 @@ def right(one: RightFormAnswers) -> Answers:
     """Return the correct form."""
     claims = []
     for wrong in one.mistakes:
-        parameter, (low, high), _ = accepted_corrections(wrong, one)[0]
+        parameter, (low, high), _ = find_accepted_corrections(wrong, one)[0]
         value = 1.1 * low if np.isinf(high) else 0.5 * (low + high)
         value = None if np.isinf(low) else value
         whole = wrong.from_s is None and wrong.until_s is None
@@ -126,7 +130,7 @@ def right(one: RightFormAnswers) -> Answers:
             NamedFault(
                 wrong.kind, wrong.size, when="whole flight" if whole else "", parameter=parameter,
                 from_s=wrong.from_s, until_s=wrong.until_s, value=value,
-                panel=panels_showing(wrong.kind)[0],
+                panel=find_panels(wrong.kind)[0],
             )
         )  # fmt: skip
     return Answers(
@@ -153,7 +157,7 @@ def main() -> None:
     print(f"{len(aisles)} aisles, {len(loops)} loops")
     for name, group in (("all", truths), ("aisles", aisles), ("loops", loops)):
         kinds = {wrong.kind for one in group for wrong in one.mistakes} | {"none"}
-        best = {kind: max(fmean(form_points(form, one).fraction for one in group)
+        best = {kind: max(fmean(compute_form_points(form, one).fraction for one in group)
                           for form in constants(group, kind))
                 for kind in kinds}  # fmt: skip
         kind = max(best, key=lambda each: best[each])
@@ -161,7 +165,9 @@ def main() -> None:
             ("right", right, 1), ("random", lambda one: at_random(rng, one), GUESSES),
             ("none", lambda _: none, 1),
         ):  # fmt: skip
-            shares = [form_points(form(one), one).fraction for one in group for _ in range(times)]
+            shares = [
+                compute_form_points(form(one), one).fraction for one in group for _ in range(times)
+            ]
             print(f"{name:7} {what:7} {fmean(shares):.3f}")
         print(f"{name:7} best constant {best[kind]:.3f} ({kind})")
 

@@ -20,10 +20,10 @@ from px4fuse.classroom.assignment.random_assignment import (
     FlightKind,
     assign_random_flight,
     derive_hmac_key,
-    random_uniform,
+    draw_uniform,
 )
 from px4fuse.classroom.assignment.roster import Person, normalise_text
-from px4fuse.classroom.assignment.truth import right_form_answers
+from px4fuse.classroom.assignment.truth import compute_form_answers
 from px4fuse.core.input_files import inputs_not_registered
 from px4fuse.core.text import to_json_types
 from px4fuse.core.writing import write_all
@@ -61,18 +61,18 @@ def simulate_assigned_flight(
     log = flights.to_ulog(simulation, is_assessed=True)
     sha256 = hashlib.sha256(log).hexdigest()
     true_values = flights.make_answer_key(simulation)["truth"]
-    choices = select_choices(partial(random_uniform, secret, student.student_id, kind))
-    right_form = replace(right_form_answers(simulation, sha256), choices=choices)
+    choices = select_choices(partial(draw_uniform, secret, student.student_id, kind))
+    form_answers = replace(compute_form_answers(simulation, sha256), choices=choices)
     return log, RightAnswers(
         student_id=student.student_id,
         name=student.name,
-        file=student.file,
+        file=student.log_file_name,
         sha256=sha256,
         scenario=to_json_types(asdict(assigned_flight.scenario)),
         mistakes=assigned_flight.mistake_options,
         true_values={name: float(true_values[name]) for name in TRUE_VALUE_NAMES},
         difficulty=assigned_flight.difficulty,
-        form=right_form,
+        form=form_answers,
     )
 
 
@@ -94,7 +94,7 @@ def answer_key_path(folder: Path, key_option: Path | None) -> Path:
     return path
 
 
-def assign(
+def write_assignment(
     students: Sequence[Person],
     folder: Path,
     key_file: Path,
@@ -154,26 +154,28 @@ def assign(
         stored_answer = answers.setdefault(normalise_text(student.student_id), answer)
         _require_same_flights(key_file, stored_answer.sha256 == answer.sha256)
         choices = stored_answer.form.choices if stored_answer.form else ()
-        empty_form = form_text(student.file, answer.sha256, [choice for choice, _ in choices])
+        empty_form = form_text(
+            student.log_file_name, answer.sha256, [choice for choice, _ in choices]
+        )
         content_by_path = {
-            folder / student.file: log,
-            folder / form_name(student.file): empty_form.encode(),
+            folder / student.log_file_name: log,
+            folder / form_name(student.log_file_name): empty_form.encode(),
         }
         missing_content_by_path = {
             path: content
             for path, content in content_by_path.items()
             if not _is_written(path, content)
         }
-        figures_file = folder / Path(student.file).with_suffix(".png")
+        figures_file = folder / Path(student.log_file_name).with_suffix(".png")
         if not figures_file.exists():
-            random_number = partial(random_uniform, secret, student.student_id, kind)
-            missing_content_by_path[figures_file] = draw_figures(random_number)
+            draw_number = partial(draw_uniform, secret, student.student_id, kind)
+            missing_content_by_path[figures_file] = draw_figures(draw_number)
         key = AnswerKey(kind, tuple(answers.values()), stored_secret)
         # the secret must be stored before the log: a restart after an interruption needs it
         write_all({key_file: format_answer_key(key).encode()})
         key_file.chmod(0o600)  # only the instructor can read the answer key
         write_all(missing_content_by_path)
-        written_count += folder / student.file in missing_content_by_path
+        written_count += folder / student.log_file_name in missing_content_by_path
         progress(finished_count, len(students))
     return key, written_count
 

@@ -8,7 +8,7 @@ from io import BytesIO
 
 import pandas as pd
 
-from px4fuse.classroom.assignment.random_assignment import random_scenario_numbers
+from px4fuse.classroom.assignment.random_assignment import draw_scenario_numbers
 from px4fuse.classroom.assignment.truth import compare_simulation
 from px4fuse.comparison.comparison import compute_position_errors
 from px4fuse.comparison.model import FILTER_NAMES, AxisComparison, Comparison, FilterName
@@ -21,24 +21,25 @@ from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import make_scenario
 
 FIGURE_COUNT = 3
-# Number of passes along the aisle in each simulated flight
-PASS_COUNT = 4
-# Minimum speed (m/s) along the aisle for a grey background in the plots
-MIN_GREY_SPEED_M_S = 0.2
+AISLE_PASS_COUNT = 4
+# Minimum speed (m/s) along the aisle, in the direction of the axis, for a grey background
+MIN_SHADED_SPEED_M_S = 0.2
 # Questions about each figure, by the field of FigureFault that contains the right answer
 QUESTIONS = {
     "fault": "injected fault",
-    "evidence": "plots that show the fault, and plots that do not",
-    "change": "smallest change that makes both filters consistent",
+    "evidence": "evidence in the plots, and plots without evidence",
+    "change": "smallest change that makes KF and EKF2 consistent",
     "prediction": "effect if SIGMA_Z and EKF2_EVP_NOISE were three times as large",
-    "useless": "change that does not help, and the reason",
+    "useless": "change that does not correct the fault, and the reason",
 }
 
 
 class FigureFault(Record):
     """Injected fault of a simulated flight, and right answers to the questions about its figure.
 
-    ``option`` is the value of ``px4fuse simulate --mistake``, or "" without a fault.
+    ``prediction`` is the effect of three times larger position noises, and ``useless`` a change
+    that does not correct the fault. ``option`` is the value of ``px4fuse simulate --mistake``, or
+    "" without a fault.
     """
 
     fault: str
@@ -52,52 +53,55 @@ class FigureFault(Record):
 FIGURE_FAULTS = read_toml(__file__, dict[str, FigureFault])
 
 
-def _shuffle(names: Iterable[str], prefix: str, random_number: Callable[[str], float]) -> list[str]:
-    return sorted(names, key=lambda name: random_number(f"{prefix} {name}"))
+def _shuffle(names: Iterable[str], prefix: str, draw_number: Callable[[str], float]) -> list[str]:
+    return sorted(names, key=lambda name: draw_number(f"{prefix} {name}"))
 
 
-def _select_kinds(random_number: Callable[[str], float]) -> dict[str, str]:
+def _select_kinds(draw_number: Callable[[str], float]) -> dict[str, str]:
     """Select the injected fault of each figure at random; return the fault by figure title."""
-    kinds = _shuffle(FIGURE_FAULTS, "figures", random_number)[:FIGURE_COUNT]
+    kinds = _shuffle(FIGURE_FAULTS, "figures", draw_number)[:FIGURE_COUNT]
     return {f"Figure {number}": kind for number, kind in enumerate(kinds, start=1)}
 
 
 def select_choices(
-    random_number: Callable[[str], float],
+    draw_number: Callable[[str], float],
 ) -> tuple[tuple[Choice, ChoiceName], ...]:
     """Make multiple-choice questions about the figures; return each with its right letter.
 
-    ``random_number`` returns a random number in [0, 1) that depends only on its argument.
+    ``draw_number`` returns a random number in [0, 1) that depends only on its argument.
     """
     choices = []
-    for title, kind in _select_kinds(random_number).items():
-        other_kinds = _shuffle(FIGURE_FAULTS.keys() - {kind}, f"{title} other", random_number)
+    for title, kind in _select_kinds(draw_number).items():
+        other_kinds = _shuffle(FIGURE_FAULTS.keys() - {kind}, f"{title} other", draw_number)
         kinds = [kind, *other_kinds[: len(CHOICE_NAMES) - 1]]
         for field, question in QUESTIONS.items():
-            shuffled_kinds = _shuffle(kinds, f"{title} {field}", random_number)
+            shuffled_kinds = _shuffle(kinds, f"{title} {field}", draw_number)
             options = tuple(getattr(FIGURE_FAULTS[each], field) for each in shuffled_kinds)
             right_letter = CHOICE_NAMES[shuffled_kinds.index(kind)]
             choices.append((Choice(f"{title}: {question}", options), right_letter))
     return tuple(choices)
 
 
-def draw_figures(random_number: Callable[[str], float]) -> bytes:
-    """Simulate, analyse and plot the flights of the figures; return a PNG file."""
+def draw_figures(draw_number: Callable[[str], float]) -> bytes:
+    """Simulate and plot the flights of a student's figures; return one PNG file.
+
+    ``draw_number`` is that of :func:`select_choices`.
+    """
     comparisons = {}
-    for title, kind in _select_kinds(random_number).items():
+    for title, kind in _select_kinds(draw_number).items():
 
-        def figure_random_number(quantity: str, title: str = title) -> float:
-            return random_number(f"{title} {quantity}")
+        def draw_figure_number(quantity: str, title: str = title) -> float:
+            return draw_number(f"{title} {quantity}")
 
-        numbers = random_scenario_numbers("aisle", figure_random_number)
-        seed = int(2**53 * figure_random_number("seed"))
-        scenario = make_scenario("aisle", passes=PASS_COUNT, seed=seed, **numbers)
+        numbers = draw_scenario_numbers("aisle", draw_figure_number)
+        seed = int(2**53 * draw_figure_number("seed"))
+        scenario = make_scenario("aisle", passes=AISLE_PASS_COUNT, seed=seed, **numbers)
         faults = parse_faults(tuple(filter(None, [FIGURE_FAULTS[kind].option])))
         comparisons[title] = compare_simulation(flights.simulate(scenario, faults))
-    return _figures_png(comparisons)
+    return _plot_figures(comparisons)
 
 
-def _figures_png(comparisons: Mapping[str, Comparison]) -> bytes:
+def _plot_figures(comparisons: Mapping[str, Comparison]) -> bytes:
     """Plot each flight in one row: innovations, position errors of KF and EKF2, and map."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - slow import
 
@@ -119,7 +123,7 @@ def _figures_png(comparisons: Mapping[str, Comparison]) -> bytes:
 
 
 def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterName) -> None:
-    """Plot the position error of a filter with ±2σ; grey background during motion."""
+    """Plot the position error of a filter with ±2σ; the background is grey on forward passes."""
     name, truth = FILTER_NAMES[filter_name], result.truth
     errors = compute_position_errors(result, filter_name)
     axes.set_title(f"{name}: error along the aisle and ±2σ (m)")
@@ -132,7 +136,7 @@ def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterNa
         truth.index,
         0.0,
         1.0,
-        where=truth["velocity_m_s"] > MIN_GREY_SPEED_M_S,
+        where=truth["velocity_m_s"] > MIN_SHADED_SPEED_M_S,
         transform=axes.get_xaxis_transform(),
         color="0.9",
         zorder=0,

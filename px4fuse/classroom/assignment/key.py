@@ -13,7 +13,7 @@ from px4fuse.errors import SettingsError
 
 # Maximum size (bytes) of an answer key: the key of 1000 students has 2 million bytes
 MAX_KEY_BYTES = 20_000_000
-KEY_NOTE = (
+ANSWER_KEY_NOTE = (
     "For the instructor only: this file lists the injected faults of every student's flight. Do "
     "not hand it out, and do not put it into the students' folder."
 )
@@ -72,19 +72,18 @@ class AnswerKey(msgspec.Struct, frozen=True):
     )
     secret: _Text = ""
     schema: _Schema = _Schema()
-    note: str = KEY_NOTE
+    note: str = ANSWER_KEY_NOTE
 
     def __repr__(self) -> str:  # an error message must not show the secret
         return f"AnswerKey({self.kind!r}, {len(self.answers)} students)"
 
-    def of_student(self, student_id: str) -> RightAnswers | None:
-        """Return the right answers for a student; the id may lack leading zeros."""
+    def find_student_answers(self, student_id: str) -> RightAnswers | None:
+        """Return the right answers for a student, or None; the id may lack leading zeros."""
         class_list = ClassList(Person(answer.student_id) for answer in self.answers)
-        student_index = class_list.student_index(Person(student_id))
+        student_index = class_list.find_student_index(Person(student_id))
         return None if student_index is None else self.answers[student_index]
 
-    def of_log(self, sha256: str) -> RightAnswers | None:
-        """Return the right answers for the log with this SHA-256, or None."""
+    def find_log_answers(self, sha256: str) -> RightAnswers | None:
         return next((answer for answer in self.answers if answer.sha256 == sha256), None)
 
 

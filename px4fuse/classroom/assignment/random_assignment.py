@@ -35,13 +35,13 @@ FAULT_COUNT_FRACTIONS: dict[ScenarioKind, tuple[float, ...]] = {
     "loop": (0.4, 0.6),
 }
 # Fraction of loops if the kind of flight is "mixed"; the other flights are along an aisle
-LOOP_FRACTION = 1 / 3
+LOOP_FLIGHT_FRACTION = 1 / 3
 # Range of the difficulty of an injected fault. Difficulty: smallest size that px4fuse detects,
 # divided by the size in the flight
 EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
 # Fraction of the flights whose faults are too small to be detected by px4fuse, and the maximum
 # difficulty of these faults: students must analyse them without the findings of px4fuse
-UNDETECTABLE_FRACTION, UNDETECTABLE_DIFFICULTY = 0.25, 1.5
+UNDETECTABLE_FLIGHT_FRACTION, MAX_FAULT_DIFFICULTY = 0.25, 1.5
 
 
 class AssignableFault(Record):
@@ -110,7 +110,7 @@ class SamplingRules(Record):
     numbers: dict[str, tuple[float, float, int]]
 
 
-RULES_BY_KIND = read_toml(__file__, dict[ScenarioKind, SamplingRules], "drawn.toml")
+SAMPLING_RULES_BY_KIND = read_toml(__file__, dict[ScenarioKind, SamplingRules], "drawn.toml")
 
 
 @dataclass(frozen=True)
@@ -131,16 +131,19 @@ class AssignedFlight:
     difficulty: float
 
 
-def random_bits(secret: bytes, student_id: str, kind: FlightKind, quantity: str) -> int:
-    """Return a random integer (128 bits) for a quantity of a student's flight."""
+def draw_bits(secret: bytes, student_id: str, kind: FlightKind, quantity: str) -> int:
+    """Return a random integer (128 bits) for a quantity of a student's flight, such as "seed".
+
+    Equal arguments always give the same number.
+    """
     message = "\0".join((HMAC_LABEL, kind, normalise_text(student_id), quantity))
     digest = hmac.new(secret, message.encode(errors="replace"), hashlib.sha256).digest()
     return int.from_bytes(digest[:16], "big")
 
 
-def random_uniform(secret: bytes, student_id: str, kind: FlightKind, quantity: str) -> float:
+def draw_uniform(secret: bytes, student_id: str, kind: FlightKind, quantity: str) -> float:
     """Return a uniform random number in [0, 1) for a quantity of a student's flight."""
-    return (random_bits(secret, student_id, kind, quantity) >> 75) / 2**53
+    return (draw_bits(secret, student_id, kind, quantity) >> 75) / 2**53
 
 
 def assign_random_flight(
@@ -178,51 +181,53 @@ def assign_random_flight(
         )
     if kind == "mixed":
         kind = (
-            "loop" if random_uniform(secret, student_id, kind, "kind") < LOOP_FRACTION else "aisle"
+            "loop"
+            if draw_uniform(secret, student_id, kind, "kind") < LOOP_FLIGHT_FRACTION
+            else "aisle"
         )
-    random_number = partial(random_uniform, secret, student_id, kind)
+    draw_number = partial(draw_uniform, secret, student_id, kind)
     if fault_count is None:
         fault_count = bisect(
-            list(accumulate(FAULT_COUNT_FRACTIONS[kind][:-1])), random_number("count")
+            list(accumulate(FAULT_COUNT_FRACTIONS[kind][:-1])), draw_number("count")
         )
     faults: list[AssignableFault] = []
-    rules = RULES_BY_KIND[kind]
-    for fault in sorted(rules.faults, key=lambda each: random_number(f"order {each.name}")):
+    rules = SAMPLING_RULES_BY_KIND[kind]
+    for fault in sorted(rules.faults, key=lambda each: draw_number(f"order {each.name}")):
         if len(faults) < fault_count and all(map(fault.is_detectable_with, faults)):
             faults.append(fault)
     difficulty_range = EASIEST_DIFFICULTY, HARDEST_DIFFICULTY
-    if random_number("undetectable") < UNDETECTABLE_FRACTION:
-        difficulty_range = HARDEST_DIFFICULTY, UNDETECTABLE_DIFFICULTY
+    if draw_number("undetectable") < UNDETECTABLE_FLIGHT_FRACTION:
+        difficulty_range = HARDEST_DIFFICULTY, MAX_FAULT_DIFFICULTY
     difficulties, mistake_options = [], []
     for fault in faults:
         name, difficulty = fault.name, EASIEST_DIFFICULTY
         if fault.detectable_size is not None:
-            easiest, hardest = difficulty_range
-            difficulty = easiest + (hardest - easiest) * random_number(f"size {name}")
-        sign = -1.0 if fault.has_either_sign and random_number(f"sign {name}") < 0.5 else 1.0
+            low, high = difficulty_range
+            difficulty = low + (high - low) * draw_number(f"size {name}")
+        sign = -1.0 if fault.has_either_sign and draw_number(f"sign {name}") < 0.5 else 1.0
         difficulties.append(difficulty)
-        mistake_options.append(fault.format_option(difficulty, sign, random_number(f"at {name}")))
+        mistake_options.append(fault.format_option(difficulty, sign, draw_number(f"at {name}")))
     scenario = make_scenario(
         kind,
         truth=with_ground_truth and kind == "aisle",
-        seed=random_bits(secret, student_id, kind, "seed"),
-        **random_scenario_numbers(kind, random_number),
+        seed=draw_bits(secret, student_id, kind, "seed"),
+        **draw_scenario_numbers(kind, draw_number),
     )
     max_difficulty = max(difficulties, default=HARDEST_DIFFICULTY)
     return AssignedFlight(scenario, tuple(mistake_options), round(max_difficulty, 2))
 
 
-def random_scenario_numbers(
-    kind: ScenarioKind, random_number: Callable[[str], float]
+def draw_scenario_numbers(
+    kind: ScenarioKind, draw_number: Callable[[str], float]
 ) -> dict[str, Any]:
     """Return random values for the numeric fields of :class:`Scenario`."""
     return {
-        name: round(low + (high - low) * random_number(name), decimals)
-        for name, (low, high, decimals) in RULES_BY_KIND[kind].numbers.items()
+        name: round(low + (high - low) * draw_number(name), decimals)
+        for name, (low, high, decimals) in SAMPLING_RULES_BY_KIND[kind].numbers.items()
     }
 
 
-def encode_secret(text: str, source_name: str) -> bytes:
+def parse_secret(text: str, source_name: str) -> bytes:
     """Derive the seed of the random numbers from the instructor's secret.
 
     Raises

@@ -25,7 +25,7 @@ WINDOWS_RESERVED_NAMES = {"con", "prn", "aux", "nul"} | {
 }
 TITLES_BY_FIELD = read_toml(__file__, dict[str, tuple[str, ...]], "columns.toml")
 # Fields of a student that are copied from other tables if they are missing in the class list
-FIELDS_OF_OTHER_LISTS = ("name", "email", "login", "submission_time", "extended_due")
+FIELDS_FROM_OTHER_TABLES = ("name", "email", "login", "submission_time", "extended_due")
 # Names in Canvas gradebooks that are not students ("Points Possible", "Student, Test")
 NOT_STUDENT_NAMES = ("pointspossible", "studenttest")
 
@@ -43,7 +43,7 @@ class Person:
     submission_time : str
         Submission time in Moodle's worksheet.
     extended_due : str
-        Due time of this student, if the instructor extended it.
+        Due time of this student, as text, if the instructor extended it.
     """
 
     student_id: str
@@ -55,9 +55,9 @@ class Person:
     extended_due: str = ""
 
     @property
-    def file(self) -> str:
+    def log_file_name(self) -> str:
         """File name of the student's assigned log."""
-        return f"{file_stem(self.student_id)}.ulg"
+        return f"{make_file_stem(self.student_id)}.ulg"
 
 
 def read_people(sheet: Sheet) -> tuple[Person, ...]:
@@ -71,7 +71,7 @@ def read_people(sheet: Sheet) -> tuple[Person, ...]:
     SettingsError
         No column identifies the students, or two rows have the same id.
     """
-    if all(sheet.column_index(titles) is None for titles in TITLES_BY_FIELD.values()):
+    if all(sheet.find_column_index(titles) is None for titles in TITLES_BY_FIELD.values()):
         raise SettingsError(
             f"{sheet.path}: no column identifies the student.",
             "Give one column the title id, email or name.",
@@ -110,7 +110,7 @@ def read_roster(path: Path) -> tuple[Person, ...]:
         )
     person_by_stem: dict[str, Person] = {}
     for person in people:
-        stem = file_stem(person.student_id)
+        stem = make_file_stem(person.student_id)
         if stem is None or person_by_stem.setdefault(stem.casefold(), person) is not person:
             student_text = one_line(person.student_id or person.name, 40)
             raise SettingsError(
@@ -123,20 +123,20 @@ def read_roster(path: Path) -> tuple[Person, ...]:
 def read_student(sheet: Sheet, row: Sequence[str]) -> Person | None:
     """Return the student in a table row; None for a row without a student."""
     cells = {
-        field_name: one_line(sheet.cell(row, titles), MAX_NAME_LENGTH)
+        field_name: one_line(sheet.find_cell(row, titles), MAX_NAME_LENGTH)
         for field_name, titles in TITLES_BY_FIELD.items()
     }
     name = cells["name"] or f"{cells['first']} {cells['last']}".strip()
     if re.sub(r"\W", "", name.casefold()) in NOT_STUDENT_NAMES:
         return None
     numbers = {}
-    if participant := re.search(r"\d+$", sheet.cell(row, ("identifier",))):
+    if participant := re.search(r"\d+$", sheet.find_cell(row, ("identifier",))):
         numbers["moodle"] = participant[0]
-    if sheet.column_index(("sisuserid", "sisloginid")) is not None:
-        numbers |= {"canvas": number} if (number := sheet.cell(row, ("id",))) else {}
-        cells["student_id"] = one_line(sheet.cell(row, ("sisuserid",)), MAX_NAME_LENGTH)
+    if sheet.find_column_index(("sisuserid", "sisloginid")) is not None:
+        numbers |= {"canvas": number} if (number := sheet.find_cell(row, ("id",))) else {}
+        cells["student_id"] = one_line(sheet.find_cell(row, ("sisuserid",)), MAX_NAME_LENGTH)
     student_id = cells["student_id"] or cells["login"] or cells["email"]
-    submission_time = sheet.cell(row, ("lastmodifiedsubmission",))
+    submission_time = sheet.find_cell(row, ("lastmodifiedsubmission",))
     person = Person(
         student_id,
         name,
@@ -155,17 +155,17 @@ class ClassList:
     def __init__(self, people: Iterable[Person] = (), *other_lists: Iterable[Person]) -> None:
         self.people = list(people)
         for other_person in chain.from_iterable(other_lists):
-            student_index = self.student_index(other_person)
+            student_index = self.find_student_index(other_person)
             if student_index is not None:
                 student = self.people[student_index]
                 fields = {
                     name: getattr(student, name) or getattr(other_person, name)
-                    for name in FIELDS_OF_OTHER_LISTS
+                    for name in FIELDS_FROM_OTHER_TABLES
                 }
                 numbers = other_person.numbers | student.numbers
                 self.people[student_index] = replace(student, numbers=numbers, **fields)
 
-    def student_index(self, other: Person) -> int | None:
+    def find_student_index(self, other: Person) -> int | None:
         """Return the index of a person in ``people``; None for an unknown person.
 
         The fields are compared in this order until exactly one student matches: number on the
@@ -232,13 +232,13 @@ def is_same_name(name: str, other_name: str) -> bool:
     return bool(short_name) and (sorted(words) == sorted(other_words) or is_joined)
 
 
-def file_stem(student_id: str) -> str | None:
+def make_file_stem(student_id: str) -> str | None:
     """Convert a student id to a portable file name; None if it has no letter or digit.
 
-    >>> file_stem("s01/2026"), file_stem("../../x"), file_stem("nul"), file_stem("=;")
-    ('s01_2026', '_.._x', '_nul', None)
-    >>> file_stem("com1.txt"), file_stem("-rf"), file_stem("a."), len(file_stem("x" * 300))
-    ('_com1.txt', 'rf', 'a', 48)
+    >>> [make_file_stem(student_id) for student_id in ("s01/2026", "../../x", "nul", "=;")]
+    ['s01_2026', '_.._x', '_nul', None]
+    >>> [make_file_stem(student_id) for student_id in ("com1.txt", "-rf", "a.", "x" * 50)]
+    ['_com1.txt', 'rf', 'a', 'xxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxx']
     """
     text = unicodedata.normalize("NFC", student_id.strip())
     safe_characters = "".join(c if c.isalnum() or c in "-_.@+" else "_" for c in text)
@@ -265,6 +265,6 @@ def make_unique(names: Iterable[str], pattern: str = "{} ({})") -> list[str]:
     return list(unique_names.values())
 
 
-def file_names(stems: Iterable[str]) -> list[str]:
+def make_file_names(stems: Iterable[str]) -> list[str]:
     """Convert texts to unique, portable file names."""
-    return make_unique((file_stem(stem) or "report" for stem in stems), "{}-{}")
+    return make_unique((make_file_stem(stem) or "report" for stem in stems), "{}-{}")

@@ -30,14 +30,14 @@ class Sheet:
     encoding: str = "utf-8"
     separator: str = ","
 
-    def column_index(self, titles: Sequence[str]) -> int | None:
-        """Return the index of the column with one of ``titles``, or None; earlier titles first."""
+    def find_column_index(self, titles: Sequence[str]) -> int | None:
+        """Return the index of the column with the first matching title of ``titles``, or None."""
         plain_titles = [normalise_title(title) for title in self.column_titles]
         return next((plain_titles.index(title) for title in titles if title in plain_titles), None)
 
-    def cell(self, row: Sequence[str], titles: Sequence[str]) -> str:
-        """Return the cell in the column with one of ``titles``, or ""; earlier titles first."""
-        column_index = self.column_index(titles)
+    def find_cell(self, row: Sequence[str], titles: Sequence[str]) -> str:
+        """Return the cell in the column with the first matching title of ``titles``, or ""."""
+        column_index = self.find_column_index(titles)
         return "" if column_index is None else row[column_index].strip()
 
     @property
@@ -76,7 +76,7 @@ def read_sheet(path: Path) -> Sheet:
         SettingsError,
         MAX_TABLE_BYTES,
         name=str(path),
-        size_remedy="Give a CSV table of one class.",
+        size_remedy="Give a CSV table with the students of one class only.",
     )
     if content.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
         raise SettingsError(f"{path} is a spreadsheet, not a CSV file.", "Save the table as CSV.")

@@ -33,10 +33,10 @@ from px4fuse.results.answer_form import (
 )
 from px4fuse.simulation import flights
 from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED_MISTAKES
-from px4fuse.simulation.sensors import TIMESYNC_CONVERGED_S
+from px4fuse.simulation.sensors import TIMESYNC_CONVERGENCE_TIME_S
 
 # Maximum relative error of the size of a fault in a student's answer
-SIZE_TOLERANCE = 0.15
+RELATIVE_SIZE_TOLERANCE = 0.15
 # Maximum deviation (m) of a student's loop closure error from the right value
 CLOSURE_TOLERANCE_M = 0.3
 # Minimum fraction of positions rejected by EKF2 for which the student must report rejections
@@ -45,8 +45,9 @@ MIN_REJECTED_FRACTION = 0.005
 MIN_RESET_M = 0.2
 # Duration (s) at the start of the flight in which position resets are ignored: EKF2 resets to the
 # first position
-IGNORED_RESETS_S = 5.0
-# Faults for which the student must ("required") or may ("allowed") report a behaviour of EKF2
+RESET_IGNORE_DURATION_S = 5.0
+# Faults by behaviour of EKF2, such as "never fused", that the student must ("required") or may
+# ("allowed") report for these faults
 BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, set[str]]], "did.toml")
 
 
@@ -109,23 +110,23 @@ class RightFormAnswers(Record):
     choices: tuple[tuple[Choice, ChoiceName], ...] = ()
 
 
-def right_form_answers(simulation: flights.Simulation, log_sha256: str) -> RightFormAnswers:
+def compute_form_answers(simulation: flights.Simulation, log_sha256: str) -> RightFormAnswers:
     """Compute the right answers from the simulated flight and its analysis by px4fuse."""
-    answer = flights.make_answer_key(simulation)
+    answer_key = flights.make_answer_key(simulation)
     comparison = compare_simulation(simulation)
-    mistakes = tuple(
-        _injected_fault(name, values, answer["truth"], comparison)
-        for name, values in answer["mistakes"].items()
+    faults = tuple(
+        _make_injected_fault(name, values, answer_key["truth"], comparison)
+        for name, values in answer_key["mistakes"].items()
     )
-    sigma_z_m = answer["truth"]["sigma_z_m"]
+    sigma_z_m = answer_key["truth"]["sigma_z_m"]
     return RightFormAnswers(
-        mistakes,
+        faults,
         sigma_z_m,
-        _verdict(comparison, "kf"),
-        _verdict(comparison, "ekf2"),
-        *_ekf2_behaviour(comparison, mistakes, sigma_z_m),
+        _make_right_verdict(comparison, "kf"),
+        _make_right_verdict(comparison, "ekf2"),
+        *_find_ekf2_behaviours(comparison, faults, sigma_z_m),
         tuple(
-            right_numeric_answer(comparison.main, question)
+            compute_numeric_answer(comparison.main, question)
             for question in select_questions(log_sha256)
         ),
     )
@@ -134,46 +135,47 @@ def right_form_answers(simulation: flights.Simulation, log_sha256: str) -> Right
 def compare_simulation(simulation: flights.Simulation) -> Comparison:
     """Analyse a simulated flight with the default settings of KF."""
     flight = flights.to_flight(simulation)
-    prepared = prepare(
+    preparation = prepare(
         flight,
         ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M),
         as_sent=True,  # do not correct frame and clock: the student has to find these faults
     )
-    return compare(prepared, run_kf(prepared))
+    return compare(preparation, run_kf(preparation))
 
 
-def _injected_fault(
+def _make_injected_fault(
     name: str, values: Mapping[str, Any], truth: Mapping[str, Any], comparison: Comparison
 ) -> InjectedFault:
-    sizes = SIMULATED_MISTAKES[name].size_fields
-    if not sizes:
+    size_fields = SIMULATED_MISTAKES[name].size_fields
+    if not size_fields:
         return InjectedFault(name)
-    size = values[sizes[0]]
-    tolerance = SIZE_TOLERANCE * abs(size)
+    size = values[size_fields[0]]
+    tolerance = RELATIVE_SIZE_TOLERANCE * abs(size)
     if name == "open-end":  # the student measures the closure error, which contains odometry drift
         odometry = trajectory_of(comparison.flight, "vio")
-        measured_m = analyse(LoopSource(odometry, comparison.flight)).closure_error_m
-        size, tolerance = measured_m if isinstance(measured_m, float) else size, CLOSURE_TOLERANCE_M
+        closure_error_m = analyse(LoopSource(odometry, comparison.flight)).closure_error_m
+        size = closure_error_m if isinstance(closure_error_m, float) else size
+        tolerance = CLOSURE_TOLERANCE_M
     low, high = size - tolerance, size + tolerance
-    if name == "clock-offset":  # each value in the 95 % interval of the estimate is accepted
+    if name == "clock-offset":  # accept also each value in the 95 % interval of the estimate
         _, time_offset = estimate_noises_and_clock(comparison)
         if isinstance(time_offset, ClockOffset) and time_offset.is_determinable:
             low, high = min(low, -time_offset.interval_s[1]), max(high, -time_offset.interval_s[0])
     from_s = until_s = None
     match name:
         case "clock-jump":
-            until_s = TIMESYNC_CONVERGED_S
+            until_s = TIMESYNC_CONVERGENCE_TIME_S
         case "open-end":
             _, from_s = truth["airborne_s"]
         case "nlos" if truth["outlier_time_s"]:
             from_s, *_, until_s = truth["outlier_time_s"] * 2
         case "dropout" | "imu-dropout" | "jump" | "heading" | "mag":
-            from_s = values[sizes[1]]
+            from_s = values[size_fields[1]]
             until_s = from_s + abs(size) if name.endswith("dropout") else None
     return InjectedFault(name, size, low, high, from_s, until_s)
 
 
-def _verdict(comparison: Comparison, filter_name: FilterName) -> RightVerdict:
+def _make_right_verdict(comparison: Comparison, filter_name: FilterName) -> RightVerdict:
     filter_summary = comparison.main.filters[filter_name]
     if not isinstance(filter_summary, FilterSummary):
         return RightVerdict("")
@@ -182,11 +184,11 @@ def _verdict(comparison: Comparison, filter_name: FilterName) -> RightVerdict:
     return RightVerdict(filter_summary.verdict, factor)
 
 
-def _ekf2_behaviour(
-    comparison: Comparison, mistakes: tuple[InjectedFault, ...], sigma_z_m: float
+def _find_ekf2_behaviours(
+    comparison: Comparison, faults: tuple[InjectedFault, ...], sigma_z_m: float
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the behaviours of EKF2 that the student must report, and those that are accepted."""
-    size_by_kind = {mistake.kind: mistake.size or 0.0 for mistake in mistakes}
+    size_by_kind = {fault.kind: fault.size or 0.0 for fault in faults}
     required_behaviours, allowed_behaviours = (
         [
             behaviour
@@ -205,10 +207,10 @@ def _ekf2_behaviour(
                 "rejected outliers" if has_bad_samples else "rejected good samples"
             )
     ekf2 = comparison.flight.ekf2
-    first_counted_reset_s = comparison.segment.start_s + IGNORED_RESETS_S
+    counted_resets_start_s = comparison.segment.start_s + RESET_IGNORE_DURATION_S
     for reset in ekf2.resets if isinstance(ekf2, Ekf2) else ():
         is_large = reset.quantity == "position" and math.hypot(*reset.delta[:2]) > MIN_RESET_M
-        if is_large and reset.time_s > first_counted_reset_s:
+        if is_large and reset.time_s > counted_resets_start_s:
             required_behaviours.append("dead-reckoned, then reset")
     if "never fused" in required_behaviours:  # EKF2 cannot follow positions that it does not fuse
         allowed_behaviours = [*required_behaviours, *allowed_behaviours]
@@ -222,7 +224,7 @@ def _ekf2_behaviour(
     )
 
 
-def right_numeric_answer(
+def compute_numeric_answer(
     axis_comparison: AxisComparison, question: FormQuestion
 ) -> float | tuple[float, ...] | None:
     """Run KF to compute the right answer to a question; None with too few measurements.

@@ -16,7 +16,7 @@ import msgspec
 from msgspec import Meta
 
 from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
-from px4fuse.classroom.grading.form_points import FormPoints, form_points
+from px4fuse.classroom.grading.form_points import FormPoints, compute_form_points
 from px4fuse.comparison.model import ErrorsAgainstTruth
 from px4fuse.core.record import Share
 from px4fuse.core.text import capitalise_first, format_factor, format_length, one_line
@@ -35,7 +35,7 @@ from px4fuse.verification.model import Verification
 from px4fuse.verification.verification import flatten, is_number, log_sha256
 
 MAX_QUOTE_LENGTH = 160
-OTHER_FORM_REASON = "your answer form and your report are about different logs"
+FORM_MISMATCH_REASON = "your answer form and your report are about different logs"
 BOTH_AXES_ADVICE = "Make the report without --axis: the axes north and east are required"
 # Regular expression of one character, without control characters
 _PLAIN_CHARACTER = r"[^\x00-\x1f\x7f]"
@@ -45,9 +45,9 @@ Title = Annotated[
     Meta(max_length=200, pattern=rf"^{_PLAIN_CHARACTER}*[^\s\x00-\x1f\x7f]{_PLAIN_CHARACTER}*$"),
 ]
 Bound = Annotated[float, Meta(ge=-1e12, le=1e12)]
-Factor = Annotated[float, Meta(ge=1.0, le=1000.0)]
+ZeroPointsFactor = Annotated[float, Meta(ge=1.0, le=1000.0)]
 # Fraction of the maximum points (0 to 1), and reason for the student
-FractionAndReason = tuple[float, str]
+ScoreAndReason = tuple[float, str]
 
 
 class RubricItem(
@@ -60,39 +60,39 @@ class RubricItem(
     points : float
         Maximum points.
     report : {"any", "compare", "loop"}
-        Only reports of this px4fuse command are scored (choice of the instructor).
+        Only reports of this px4fuse command are scored, as the instructor decided.
     command : {"any", "compare", "loop"}
-        Only reports of this px4fuse command contain the data for the check.
+        Only reports of this px4fuse command contain the data that the check needs.
     needs_key : bool
         True if the check requires an answer key.
-    by_hand : bool
+    is_scored_by_instructor : bool
         True if the instructor enters the points.
     """
 
     command: ClassVar[str] = "any"
     needs_key: ClassVar[bool] = False
-    by_hand: ClassVar[bool] = False
+    is_scored_by_instructor: ClassVar[bool] = False
 
     title: Title
     points: Annotated[float, Meta(ge=0.0, le=1000.0)]
     report: Literal["any", "compare", "loop"] = "any"
 
-    def score(self, check_input: CheckInput) -> FractionAndReason:
+    def score(self, check_input: CheckInput) -> ScoreAndReason:
         """Return the fraction of the maximum points (0 to 1), and the reason as sentences."""
         raise NotImplementedError
 
-    def applies(self, command_name: str, key: AnswerKey | None) -> bool:
-        """Return True if the check is used for reports of ``px4fuse compare`` or ``loop``."""
+    def is_applicable(self, command_name: str, key: AnswerKey | None) -> bool:
+        """Return True if the item scores reports of the command, with or without answer key."""
         has_key = key is not None or not self.needs_key
         return has_key and {self.report, self.command} <= {"any", command_name}
 
 
-def fraction_for_deviation(deviation_factor: float, zero_points_factor: float) -> float:
+def score_deviation(deviation_factor: float, zero_points_factor: float) -> float:
     """Return the fraction of the points for a value that is wrong by ``deviation_factor``.
 
     The fraction is 1 - ln(deviation_factor) / ln(zero_points_factor), between 0 and 1.
 
-    >>> [round(fraction_for_deviation(deviation, 4.0), 2) for deviation in (1.0, 2.0, 4.0, 9.0)]
+    >>> [round(score_deviation(deviation, 4.0), 2) for deviation in (1.0, 2.0, 4.0, 9.0)]
     [1.0, 0.5, 0.0, 0.0]
     """
     if deviation_factor <= 1.0:
@@ -127,7 +127,7 @@ class CheckInput:
     @cached_property
     def right_answers(self) -> RightAnswers | None:
         """Right answers for the log of the report; None if the log is not in the answer key."""
-        return None if self.key is None else self.key.of_log(log_sha256(self.results))
+        return None if self.key is None else self.key.find_log_answers(log_sha256(self.results))
 
     @cached_property
     def assigned_answer(self) -> RightAnswers | None:
@@ -135,7 +135,9 @@ class CheckInput:
         if self.key is None:
             return None
         stated_id = shorten_text(self.results.student.id)
-        return self.key.of_student(self.submitter_id) or self.key.of_student(stated_id)
+        return self.key.find_student_answers(self.submitter_id) or self.key.find_student_answers(
+            stated_id
+        )
 
     @cached_property
     def is_own_log(self) -> bool:
@@ -153,11 +155,11 @@ class CheckInput:
             check_answers(answers)
         except ValueError as error:
             return f"your answer form cannot be read ({shorten_text(str(error))})"
-        return OTHER_FORM_REASON if self.has_form_of_other_log else answers
+        return FORM_MISMATCH_REASON if self.has_form_of_other_log else answers
 
     @property
     def has_form_of_other_log(self) -> bool:
-        """True if the answers in the report are about another log than the report."""
+        """True if the answer form in the report was made for another log."""
         answers = self.results.student.answers
         return isinstance(answers, Answers) and answers.log_sha256 != log_sha256(self.results)
 
@@ -175,12 +177,12 @@ class CheckInput:
             return self.form
         if self.right_answers.form is None:
             return "the answer key contains no right answers for this log"
-        return form_points(self.form, self.right_answers.form)
+        return compute_form_points(self.form, self.right_answers.form)
 
     def has_finding(self, *ids: str) -> bool:
         return any(finding.id in ids for finding in self.results.findings)
 
-    def missing_reason(self, path: str) -> str:
+    def find_missing_reason(self, path: str) -> str:
         """Return the reason (in brackets) why the results do not contain a value, or ""."""
         parent_path = path
         while parent_path:
@@ -218,7 +220,7 @@ def format_reason(reason: str) -> str:
 class VerifiedItem(RubricItem, frozen=True, tag="verified"):
     """Check that a re-run of the analysis on the log reproduces the numbers of the report."""
 
-    def score(self, check_input: CheckInput) -> FractionAndReason:
+    def score(self, check_input: CheckInput) -> ScoreAndReason:
         verification = check_input.verification
         reason_text = format_reason("".join(verification.reasons[:1]))
         is_verified = verification.status == "verified"
@@ -242,31 +244,31 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
 
     def __post_init__(self) -> None:
         is_bounded = math.isfinite(self.at_least) or math.isfinite(self.at_most)
-        is_zero_outside = self.zero_at is None or self._excess(self.zero_at) >= 0.0
-        if not is_bounded or self.at_least > self.at_most or not is_zero_outside:
+        is_zero_at_outside = self.zero_at is None or self._compute_excess(self.zero_at) >= 0.0
+        if not is_bounded or self.at_least > self.at_most or not is_zero_at_outside:
             raise ValueError(
                 "give at_least, at_most or both (at_least <= at_most); zero_at must be outside"
             )
 
-    def _excess(self, number: float) -> float:
+    def _compute_excess(self, number: float) -> float:
         """Return the distance from the nearer bound to the number; negative within the bounds."""
         return max(self.at_least - number, number - self.at_most)
 
-    def _fraction(self, number: float) -> float:
-        excess = self._excess(number)
+    def _score_number(self, number: float) -> float:
+        excess = self._compute_excess(number)
         if excess <= 0.0:
             return 1.0
-        zero_excess = 0.0 if self.zero_at is None else self._excess(self.zero_at)
-        return max(1.0 - excess / zero_excess, 0.0) if zero_excess > 0.0 else 0.0
+        zero_points_excess = 0.0 if self.zero_at is None else self._compute_excess(self.zero_at)
+        return max(1.0 - excess / zero_points_excess, 0.0) if zero_points_excess > 0.0 else 0.0
 
-    def score(self, check_input: CheckInput) -> FractionAndReason:
+    def score(self, check_input: CheckInput) -> ScoreAndReason:
         values = find_values(check_input.values, self.path)
         numbers = [
-            (self._fraction(value), value, path) for path, value in values if is_number(value)
+            (self._score_number(value), value, path) for path, value in values if is_number(value)
         ]
         if not numbers:
             label = self.name or f"the number {self.path}"
-            reason_text = check_input.missing_reason(self.path)
+            reason_text = check_input.find_missing_reason(self.path)
             return 0.0, f"Your report does not contain {label}{reason_text}."
         fraction, number, path = min(numbers, key=lambda each: each[0])
         label = self.name or f"the number {shorten_text(path)}"
@@ -282,7 +284,7 @@ class AnswersItem(RubricItem, frozen=True, tag="answers"):
 
     needs_key: ClassVar[bool] = True
 
-    def score(self, check_input: CheckInput) -> FractionAndReason:
+    def score(self, check_input: CheckInput) -> ScoreAndReason:
         points_or_reason = check_input.form_points
         if isinstance(points_or_reason, str):
             return 0.0, f"{capitalise_first(points_or_reason)}."
@@ -298,9 +300,9 @@ class TextItem(RubricItem, frozen=True, tag="text"):
     """Let the instructor score the student's text about the flight (option ``--notes``)."""
 
     needs_key: ClassVar[bool] = True
-    by_hand: ClassVar[bool] = True
+    is_scored_by_instructor: ClassVar[bool] = True
 
-    def score(self, check_input: CheckInput) -> FractionAndReason:
+    def score(self, check_input: CheckInput) -> ScoreAndReason:
         if not check_input.results.student.notes.strip():
             return 0.0, "Your report has no text. Write a text and add it with --notes."
         return 0.0, "Your instructor reads your text and gives points for it."
@@ -311,9 +313,9 @@ class TextItem(RubricItem, frozen=True, tag="text"):
 
 # Finding ids that report a change of the time offset during the flight
 CHANGING_CLOCK_FINDINGS = ("source_time_offset_changes", "source_timestamps_are_arrival_times")
-Sigma = Literal["sigma_z_m", "sigma_a_m_s2"]
+NoiseSettingName = Literal["sigma_z_m", "sigma_a_m_s2"]
 # Name, unit and command-line option of the measurement noise and the process noise of KF
-NOISE_SETTINGS: dict[Sigma, tuple[str, str, str]] = {
+NOISE_SETTINGS: dict[NoiseSettingName, tuple[str, str, str]] = {
     "sigma_z_m": ("SIGMA_Z", "m", "--sigma-z"),
     "sigma_a_m_s2": ("SIGMA_A", "m/s²", "--sigma-a"),
 }
@@ -327,10 +329,10 @@ class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"zero_points_fac
 
     command: ClassVar[str] = "compare"
 
-    setting: Sigma
-    zero_points_factor: Factor = 2.0
+    setting: NoiseSettingName
+    zero_points_factor: ZeroPointsFactor = 2.0
 
-    def score(self, check_input: CheckInput) -> FractionAndReason:
+    def score(self, check_input: CheckInput) -> ScoreAndReason:
         comparison = check_input.comparison
         label, unit, option = NOISE_SETTINGS[self.setting]
         chosen_value: float = getattr(comparison.settings, self.setting)
@@ -339,12 +341,12 @@ class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"zero_points_fac
             horizontal_tuning, f"{ESTIMATE_FIELD_BY_SETTING[self.setting]}_interval", None
         )
         if interval is None or interval[1] is None:
-            reason_text = check_input.missing_reason(f"tuning.{HORIZONTAL}")
+            reason_text = check_input.find_missing_reason(f"tuning.{HORIZONTAL}")
             return 0.0, f"Your report has no 95 % interval for {label}{reason_text}."
         low, high = interval
         if label == "SIGMA_Z" and check_input.has_finding("source_may_drift", "source_drift"):
             # innovations, and so the estimate of SIGMA_Z, do not contain the drift of the source
-            high = max(high, _largest_source_error_m(comparison))
+            high = max(high, _find_largest_error_m(comparison))
         deviation_factor = max(
             chosen_value / high if high > 0.0 else math.inf, low / chosen_value, 1.0
         )
@@ -353,16 +355,18 @@ class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"zero_points_fac
             side = "above" if chosen_value > high else "below"
             relation = f"a factor of {format_factor(deviation_factor)} {side}"
             advice = f" Set {option} within this interval."
-        return fraction_for_deviation(deviation_factor, self.zero_points_factor), (
+        return score_deviation(deviation_factor, self.zero_points_factor), (
             f"Your {label} {chosen_value:.3g} {unit} is {relation} the 95 % interval of the "
             f"maximum-likelihood estimate ({low:.3g} to {high:.3g} {unit}).{advice}"
         )
 
 
-def _largest_source_error_m(comparison: ComparisonResults) -> float:
+def _find_largest_error_m(comparison: ComparisonResults) -> float:
     """Return the position RMSE of KF or the loop closure error (m), whichever is larger."""
-    truths = [axis.filters["kf"].truth for axis in comparison.axes.values()]
-    errors_m = [truth.position_rmse_m for truth in truths if isinstance(truth, ErrorsAgainstTruth)]
+    truth_errors = [axis.filters["kf"].truth for axis in comparison.axes.values()]
+    errors_m = [
+        errors.position_rmse_m for errors in truth_errors if isinstance(errors, ErrorsAgainstTruth)
+    ]
     if isinstance(comparison.loop, Loop):
         errors_m.append(comparison.loop.closure_error_m or 0.0)
     return max(errors_m, default=0.0)
@@ -379,18 +383,18 @@ class ConsistencyItem(
 
     command: ClassVar[str] = "compare"
 
-    zero_points_factor: Factor = 2.0
+    zero_points_factor: ZeroPointsFactor = 2.0
 
-    def score(self, check_input: CheckInput) -> FractionAndReason:
+    def score(self, check_input: CheckInput) -> ScoreAndReason:
         nis_result = check_input.comparison.horizontal.get("kf")
         if not isinstance(nis_result, HorizontalNis):
-            reason_text = check_input.missing_reason(f"{HORIZONTAL}.kf")
+            reason_text = check_input.find_missing_reason(f"{HORIZONTAL}.kf")
             return 0.0, f"Your report has no result on the consistency of KF{reason_text}."
         if nis_result.verdict == "consistent":
             return 1.0, "KF is consistent."
         direction = "small" if nis_result.nis_mean > 1.0 else "large"
-        factor = nis_result.sigma_error_factor
-        fraction = fraction_for_deviation(factor, self.zero_points_factor)
+        sigma_factor = nis_result.sigma_error_factor
+        fraction = score_deviation(sigma_factor, self.zero_points_factor)
         advice = (
             "Compare SIGMA_A and SIGMA_Z with the maximum-likelihood estimates, and look for "
             "errors that are not white noise."
@@ -399,11 +403,11 @@ class ConsistencyItem(
         if all(item.score(check_input)[0] == 1.0 for item in tuning_items):
             fraction = 1.0
             advice = (
-                "SIGMA_A and SIGMA_Z are within their 95 % intervals, so other settings do not "
-                "make KF consistent."
+                "SIGMA_A and SIGMA_Z are within the 95 % intervals of their estimates, so other "
+                "settings do not make KF consistent."
             )
         return fraction, (
-            f"The reported σ of KF is {format_factor(factor)} times too {direction}. {advice}"
+            f"The reported σ of KF is {format_factor(sigma_factor)} times too {direction}. {advice}"
         )
 
 
@@ -423,13 +427,13 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
     margin_s: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.03
     undeterminable: Share = 0.5
 
-    def score(self, check_input: CheckInput) -> FractionAndReason:
+    def score(self, check_input: CheckInput) -> ScoreAndReason:
         clock = check_input.comparison.clock
         if not isinstance(clock, ClockOffset) or not clock.is_determinable:
             fraction = self.undeterminable if isinstance(clock, ClockOffset) else 0.0
             reason_text = format_reason(clock.reason or "")
             statement = f"The time offset cannot be estimated from your flight{reason_text}."
-            # all points for a simulated log, because the student could not choose the flight
+            # all points for an assigned log: the student could not fly more motion
             return 1.0 if check_input.right_answers is not None else fraction, statement
         (low, high), applied_s = clock.interval_s, clock.applied_s
         statement = (
@@ -464,7 +468,7 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
     a corrected path. If the vehicle did not return, all points if no loop closure was accepted.
     """
 
-    def score(self, check_input: CheckInput) -> FractionAndReason:
+    def score(self, check_input: CheckInput) -> ScoreAndReason:
         loop = check_input.results.loop
         closures = loop.closures if isinstance(loop, Loop) else ()
         is_accepted = any(closure.accepted for closure in closures)
@@ -479,7 +483,7 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
         if not isinstance(loop, Loop) or loop.closure_error_m is None:
             unavailable = loop.true_end if isinstance(loop, Loop) else loop
             reason_text = format_reason(getattr(unavailable, "reason", ""))
-            return 0.0, f"Your report contains no loop closure error{reason_text}."
+            return 0.0, f"Your report does not state a loop closure error{reason_text}."
         if loop.is_absolute_track:
             return 0.0, (
                 "The track in your report does not drift. Analyse odometry, for example LOG:vio."

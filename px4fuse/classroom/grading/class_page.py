@@ -34,19 +34,22 @@ STATUS_STYLES: dict[str, tuple[str, str]] = {
     NO_SUBMISSION_STATUS: ("open", "–"),
 }
 STATUSES = tuple(STATUS_STYLES)
-FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "changed by instructor")
+TABLE_FILTER_TAGS = (*STATUSES, "pending", "to read", "flagged", "late", "changed by instructor")
 
 
-def class_page_html(grades: Sequence[Grade], title: str, made_with: str) -> str:
-    """Format the web page of the class; ``made_with`` is name and version of px4fuse."""
+def format_class_page(grades: Sequence[Grade], title: str, version_text: str) -> str:
+    """Format the web page of the class; ``version_text`` is name and version of px4fuse."""
     item_titles, number_titles = list_titles(grades)
-    count_by_tag = Counter(tag for grade in grades for tag in _grade_tags(grade))
-    tags = (*FILTER_TAGS, *sorted(tag for tag in count_by_tag if tag not in FILTER_TAGS))
+    count_by_tag = Counter(tag for grade in grades for tag in _make_grade_tags(grade))
+    tags = (
+        *TABLE_FILTER_TAGS,
+        *sorted(tag for tag in count_by_tag if tag not in TABLE_FILTER_TAGS),
+    )
     options = [(tag, f"{tag} ({count_by_tag[tag]})") for tag in tags if count_by_tag[tag]]
     return frame.page(
         title=title,
-        subtitle=f"{count_noun(len(grades), 'student')}, graded with {made_with}",
-        html_above=_statistics_html(grades, count_by_tag),
+        subtitle=f"{count_noun(len(grades), 'student')}, graded with {version_text}",
+        html_above=_format_statistics(grades, count_by_tag),
         row_nouns=("student", "students"),
         columns=(
             Column("Student"),
@@ -58,7 +61,7 @@ def class_page_html(grades: Sequence[Grade], title: str, made_with: str) -> str:
             *(Column(title, "number", "items") for title in item_titles),
             *(Column(title, "number", "numbers") for title in number_titles),
         ),
-        rows=[_class_row(grade, item_titles, number_titles) for grade in grades],
+        rows=[_make_class_row(grade, item_titles, number_titles) for grade in grades],
         filters=[("Status", [("", f"Everyone ({len(grades)})"), *options])],
         groups=(("items", "Points of each rubric item"), ("numbers", "Numbers")),
         placeholder="search for name, id, file or flag",
@@ -66,7 +69,7 @@ def class_page_html(grades: Sequence[Grade], title: str, made_with: str) -> str:
     )
 
 
-def _statistics_html(grades: Sequence[Grade], count_by_tag: Mapping[str, int]) -> str:
+def _format_statistics(grades: Sequence[Grade], count_by_tag: Mapping[str, int]) -> str:
     """Format the statistics of the class: number of reports by status, and histograms of points."""
     totals = [grade.total for grade in grades if grade.total is not None]
     max_points = max((grade.max_points for grade in grades if grade.max_points > 0.0), default=1.0)
@@ -80,7 +83,7 @@ def _statistics_html(grades: Sequence[Grade], count_by_tag: Mapping[str, int]) -
         max_points_edge=format_number(max_points),
         pending_points=[report.points for report in reports if report.instructor_action],
         number=format_cell_number,
-        items=[(each, count_by_bin(each.fractions, 1.0)) for each in analyse_items(reports)],
+        items=[(each, count_by_bin(each.point_fractions, 1.0)) for each in analyse_items(reports)],
     )
 
 
@@ -95,22 +98,23 @@ def count_by_bin(values: Sequence[float], maximum: float) -> list[tuple[int, str
     return list(zip(counts.tolist(), lower_edges, strict=False))
 
 
-def _grade_tags(grade: Grade) -> list[str]:
+def _make_grade_tags(grade: Grade) -> list[str]:
     report = grade.counted_report
     tags = [report.status if report else NO_SUBMISSION_STATUS]
     tags += ["flagged"] * bool(grade.flags) + ["late"] * bool(grade.late_s)
     if report:
-        tags += ["pending"] * bool(report.instructor_action) + ["to read"] * report.awaits_points
+        tags += ["pending"] * bool(report.instructor_action)
+        tags += ["to read"] * report.is_awaiting_points
         tags += [
             f"missed: {kind}" for kind, is_named in report.is_found_by_fault.items() if not is_named
         ]
     return tags + ["changed by instructor"] * bool(grade.overrides or grade.comment)
 
 
-def _class_row(grade: Grade, item_titles: Sequence[str], number_titles: Sequence[str]) -> Row:
+def _make_class_row(grade: Grade, item_titles: Sequence[str], number_titles: Sequence[str]) -> Row:
     report = grade.counted_report
     status = report.status if report else NO_SUBMISSION_STATUS
-    css_style, symbol = STATUS_STYLES[status]
+    css_class, symbol = STATUS_STYLES[status]
     flag_count = len(grade.flags)
     flag_count_text = count_noun(flag_count, "flag") if flag_count else ""
     late_text = f"{math.ceil(grade.late_s / 60.0)} min late" if grade.late_s else ""
@@ -119,27 +123,27 @@ def _class_row(grade: Grade, item_titles: Sequence[str], number_titles: Sequence
     cells = (
         Cell(grade.display_name, below=grade.file_name),
         Cell(grade.student_id),
-        Cell(f"{symbol} {status}", float(STATUSES.index(status)), flag_count_text, css_style),
-        _points_cell(grade),
+        Cell(f"{symbol} {status}", float(STATUSES.index(status)), flag_count_text, css_class),
+        _make_points_cell(grade),
         Cell(grade.submission_time, below=late_text),
         Cell("\n".join(grade.flags), float(flag_count), "", "flags"),
         *(frame.number_cell(points_by_title.get(title)) for title in item_titles),
         *(frame.number_cell(number_values.get(title)) for title in number_titles),
     )
     # the points of an anonymous student cannot be entered: overrides.csv needs the id or the file
-    point_boxes = (_point_boxes(grade),) if grade.student_id or grade.file_name else ()
+    points_inputs = (_make_points_inputs(grade),) if grade.student_id or grade.file_name else ()
     links = (
         [("Report redrawn from the log (PDF)", local_link(report.redrawn_path))] if report else []
     )
     return Row(
         cells,
-        tuple(_grade_tags(grade)),
-        (*_grade_details(grade), *point_boxes),
+        tuple(_make_grade_tags(grade)),
+        (*_make_grade_details(grade), *points_inputs),
         (frame.links_section("Report", links),),
     )
 
 
-def _grade_details(grade: Grade) -> Iterator[Section]:
+def _make_grade_details(grade: Grade) -> Iterator[Section]:
     """Yield the details of a student, which the web page shows after a click on the row."""
     report, comment = grade.counted_report, frame.prose_section("Your comment", grade.comment)
     if report is None:
@@ -164,7 +168,7 @@ def _grade_details(grade: Grade) -> Iterator[Section]:
         f"{kind}: {'named' if is_named else 'not named'} in the answer form"
         for kind, is_named in report.is_found_by_fault.items()
     ]
-    attempts = [
+    other_report_texts = [
         f"{other_report.submission}: {other_report.status}" for other_report in grade.other_reports
     ]
     yield frame.list_section("Flags", grade.flags, is_warning=True)
@@ -180,18 +184,18 @@ def _grade_details(grade: Grade) -> Iterator[Section]:
     yield frame.list_section("Injected faults of this flight", fault_texts)
     yield frame.name_value_section("Answer form", [*form_rows(report.form)] if report.form else [])
     yield frame.prose_section("Text of the student", report.notes)
-    yield frame.list_section("Other attempts", attempts)
+    yield frame.list_section("Other attempts", other_report_texts)
 
 
-def _points_cell(grade: Grade) -> Cell:
+def _make_points_cell(grade: Grade) -> Cell:
     report = grade.counted_report
     if grade.total is None:
-        proposed_text = (
+        proposed_points_text = (
             f"{format_cell_number(report.points)} proposed"
             if report and report.counted_points is None
             else ""
         )
-        return Cell("pending" if proposed_text else "–", None, proposed_text)
+        return Cell("pending" if proposed_points_text else "–", None, proposed_points_text)
     notes = [f"{format_cell_number(grade.deduction)} deducted (late)"] * bool(grade.deduction)
     notes += ["changed by instructor"] * any(
         override.points is not None for override in grade.overrides.values()
@@ -200,8 +204,8 @@ def _points_cell(grade: Grade) -> Cell:
     return Cell(text, grade.total, ", ".join(notes))
 
 
-def _point_boxes(grade: Grade) -> Section:
-    """Return input boxes for the points that the instructor can enter."""
+def _make_points_inputs(grade: Grade) -> Section:
+    """Make the input boxes for the points that the instructor can enter."""
     report = grade.counted_report
     max_by_title = {
         item.title: item.max_points

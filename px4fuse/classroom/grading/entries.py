@@ -1,4 +1,4 @@
-"""Grade of each student: report that counts, deduction for lateness, and instructor's points.
+"""Grade of each student: choice of one report, deduction for lateness, and instructor's points.
 
 Points that the instructor writes into ``overrides.csv`` replace the computed points.
 """
@@ -42,12 +42,12 @@ MAX_COMMENT_LENGTH = 10_000
 # Points and comment of the instructor, by student id and rubric item ("" for the whole report)
 Overrides = Mapping[str, Mapping[str, Override]]
 # Syntax of the option --late, for example "10 % / day up to 50 %"
-_LATE_RULE = re.compile(
+_LATE_RULE_PATTERN = re.compile(
     r"(?P<rate>\d+(?:\.\d+)?)\s*%\s*/\s*(?P<unit>day|hour)"
     r"(?:\s+up to\s+(?P<most>\d+(?:\.\d+)?)\s*%)?"
 )
 # Formats of submission times in English tables of Moodle, with a 12-hour and a 24-hour clock
-_MOODLE_FORMATS = ("%A, %d %B %Y, %I:%M %p", "%A, %d %B %Y, %H:%M")
+_MOODLE_TIME_FORMATS = ("%A, %d %B %Y, %I:%M %p", "%A, %d %B %Y, %H:%M")
 # First letters of the German names of months, January first
 GERMAN_MONTHS = ("jan", "feb", "mär", "apr", "mai", "jun", "jul", "aug", "sep", "okt", "nov", "dez")
 
@@ -56,24 +56,26 @@ GERMAN_MONTHS = ("jan", "feb", "mär", "apr", "mai", "jun", "jul", "aug", "sep",
 class LateRule:
     """Deduction of points for late submissions.
 
-    For each started day or hour (``unit_s``), ``fraction_per_unit`` of the maximum points is
-    deducted, but at most ``max_fraction``.
+    For each started day or hour (``unit_s``), the fraction ``deduction_per_unit`` of the maximum
+    points is deducted, but at most ``max_deduction_fraction``.
     """
 
-    fraction_per_unit: float
+    deduction_per_unit: float
     unit_s: float
-    max_fraction: float
+    max_deduction_fraction: float
 
-    def deduction(self, late_s: float, max_points: float) -> float:
+    def compute_deduction(self, late_s: float, max_points: float) -> float:
         """Compute the points to deduct from a submission that is late by ``late_s`` seconds.
 
-        >>> parse_late_rule("10%/day").deduction(86_401.0, 50.0)
+        >>> parse_late_rule("10%/day").compute_deduction(86_401.0, 50.0)
         10.0
-        >>> parse_late_rule("10%/day up to 30%").deduction(1e9, 50.0)
+        >>> parse_late_rule("10%/day up to 30%").compute_deduction(1e9, 50.0)
         15.0
         """
         late_units = math.ceil(max(late_s, 0.0) / self.unit_s)
-        return round(max_points * min(late_units * self.fraction_per_unit, self.max_fraction), 2)
+        return round(
+            max_points * min(late_units * self.deduction_per_unit, self.max_deduction_fraction), 2
+        )
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ class Course:
 
 
 # Sort key (UNIX times of submission and zip entry), report, and grade if only this report counts
-Attempt = tuple[tuple[float, float], GradedReport, Grade]
+RankedAttempt = tuple[tuple[float, float], GradedReport, Grade]
 
 
 def build_grades(
@@ -161,11 +163,11 @@ def build_grades(
     """
     has_class_list = bool(course.class_list.people)
     class_list = course.class_list if has_class_list else _collect_students(reports, submissions)
-    attempts_by_index: dict[int | None, list[Attempt]] = defaultdict(list)
+    attempts_by_index: dict[int | None, list[RankedAttempt]] = defaultdict(list)
     for report, submission in zip(reports, submissions, strict=True):
-        student_index = class_list.student_index(submission.origin.person)
+        student_index = class_list.find_student_index(submission.origin.person)
         if student_index is None:
-            student_index = class_list.student_index(Person(report.student_id, report.student))
+            student_index = class_list.find_student_index(Person(report.student_id, report.student))
         attempts_by_index[student_index].append(
             _make_attempt(report, submission, course, student_index, class_list)
         )
@@ -206,13 +208,13 @@ def _collect_students(
     class_list = ClassList()
     for report, submission in zip(reports, submissions, strict=True):
         person = submission.origin.person
-        reported_student_index = class_list.student_index(Person(report.student_id))
+        reported_student_index = class_list.find_student_index(Person(report.student_id))
         if person.numbers or person.login:
-            if class_list.student_index(person) is not None:
+            if class_list.find_student_index(person) is not None:
                 continue
             # ignore the id in the report if another student already has this id
-            free_id = report.student_id if reported_student_index is None else ""
-            student_id = person.student_id or free_id
+            unclaimed_id = report.student_id if reported_student_index is None else ""
+            student_id = person.student_id or unclaimed_id
             name = one_line(report.student if student_id else person.name, 200) or person.name
             student_id = next(filter(None, (student_id, person.login, *person.numbers.values())))
             class_list.people.append(replace(person, student_id=student_id, name=name))
@@ -227,7 +229,7 @@ def _make_attempt(
     course: Course,
     student_index: int | None,
     class_list: ClassList,
-) -> Attempt:
+) -> RankedAttempt:
     """Compute the grade of a student if only this report counts."""
     origin, platform = submission.origin, submission.origin.platform.capitalize()
     person = (
@@ -259,11 +261,11 @@ def _make_attempt(
         )
     if origin.is_imitated:
         flags.append(
-            "The student imitated the file name of a learning platform "
-            f"(platform of the export: {platform or 'none'})."
+            "The student's part of the file name imitates a learning platform (platform of the "
+            f"export: {platform or 'none'}). Check who handed in the file."
         )
     reported_student_index = (
-        class_list.student_index(Person(report.student_id)) if platform else None
+        class_list.find_student_index(Person(report.student_id)) if platform else None
     )
     if reported_student_index is not None and student_index not in (None, reported_student_index):
         reported_person = class_list.people[reported_student_index]
@@ -278,7 +280,9 @@ def _make_attempt(
         report,
         submission_time="" if submission_time is None else submission_time.strftime(TIME_FORMAT),
         late_s=late_s,
-        deduction=late_rule.deduction(late_s, report.max_points) if late_rule and late_s else 0.0,
+        deduction=late_rule.compute_deduction(late_s, report.max_points)
+        if late_rule and late_s
+        else 0.0,
         max_points=report.max_points,
         flags=tuple(flags),
     )
@@ -289,17 +293,17 @@ def _make_attempt(
     return sort_key, report, grade
 
 
-def _points_after_deduction(attempt: Attempt) -> float:
+def _deduct_points(attempt: RankedAttempt) -> float:
     _, report, grade = attempt
     return max(report.points - grade.deduction, 0.0)
 
 
-def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Grade:
+def _choose_attempt(attempts: Sequence[RankedAttempt], course: Course) -> Grade:
     """Choose the report of a student that counts; add flags if the choice is ambiguous."""
     # sort by time; reports with equal times by points
     sorted_attempts = sorted(
         attempts,
-        key=lambda attempt: (attempt[0], _points_after_deduction(attempt), attempt[1].submission),
+        key=lambda attempt: (attempt[0], _deduct_points(attempt), attempt[1].submission),
     )
     # prefer reports that need no decision of the instructor, then readable reports
     attempts_with_report = [attempt for attempt in sorted_attempts if attempt[1].version]
@@ -313,7 +317,7 @@ def _choose_attempt(attempts: Sequence[Attempt], course: Course) -> Grade:
         "first": [
             attempt for attempt in eligible_attempts if attempt[0] == eligible_attempts[0][0]
         ][-1],
-        "best": max(reversed(eligible_attempts), key=_points_after_deduction),
+        "best": max(reversed(eligible_attempts), key=_deduct_points),
     }[course.attempt]
     flags = list(grade.flags)
     other_reports = tuple(report for _, report, _ in sorted_attempts if report is not chosen_report)
@@ -381,7 +385,7 @@ def _override_item(item: ItemScore, override: Override | None) -> ItemScore:
         return replace(item, comment=comment)
     if override.points != item.points:
         comment = f"{comment} (Your instructor gave {format_cell_number(override.points)} points.)"
-    return replace(item, points=override.points, comment=comment, awaits_points=False)
+    return replace(item, points=override.points, comment=comment, is_awaiting_points=False)
 
 
 # ------------------------------------------------------------------ overrides
@@ -401,7 +405,9 @@ def read_overrides(path: Path) -> Overrides:
     if not path.exists():
         return {}
     sheet = read_sheet(path)
-    missing_titles = [title for title in OVERRIDE_TITLES if sheet.column_index((title,)) is None]
+    missing_titles = [
+        title for title in OVERRIDE_TITLES if sheet.find_column_index((title,)) is None
+    ]
     if missing_titles:
         remedy = f"Required columns: {', '.join(OVERRIDE_TITLES)}."
         raise SettingsError(f"{path}: no column {', '.join(missing_titles)}.", remedy)
@@ -413,19 +419,17 @@ def read_overrides(path: Path) -> Overrides:
                 "Put a comment that contains a comma in double quotes.",
             )
         student, item_title, points, comment = (
-            sheet.cell(row, (title,)).removeprefix("'") for title in OVERRIDE_TITLES
+            sheet.find_cell(row, (title,)).removeprefix("'") for title in OVERRIDE_TITLES
         )
         parsed_points = parse_decimal(points)
         problem = ""
         if item_title in overrides[student]:
             item_text = one_line(item_title, 40) or "(whole report)"
             problem = f"student {one_line(student, 40)} has two rows for the item {item_text}"
-        elif points and (parsed_points is None or parsed_points < 0.0 or not item_title):
-            points_text = one_line(points, 20)
-            problem = (
-                f"points {points_text!r} must be a number of 0 or more, in a row that names an "
-                "item or total"
-            )
+        elif points and (parsed_points is None or parsed_points < 0.0):
+            problem = f"points {one_line(points, 20)!r} are not a number of 0 or more"
+        elif points and not item_title:
+            problem = f"points {one_line(points, 20)} need the title of an item, or total"
         if problem:
             raise SettingsError(f"{path}: row {row_number}: {problem}.")
         overrides[student][item_title] = Override(
@@ -453,7 +457,7 @@ def match_overrides(
     notes = []
     for student, override_by_item in overrides.items():
         # the instructor may type an id, with or without leading zeros, or a file name
-        student_index = people.student_index(Person(student, login=student))
+        student_index = people.find_student_index(Person(student, login=student))
         student_text = one_line(student, 40) or "(empty)"
         if student_index is None:
             notes.append(f"{OVERRIDES_NAME}: no student has the id {student_text}.")
@@ -471,7 +475,7 @@ def match_overrides(
                 problem = f"student {student_text} has two rows for {title or 'the whole report'!r}"
             elif (override.points or 0.0) > max_by_title[title]:
                 limit_text = f"{max_by_title[title]:g} points of {one_line(title, 60)!r}"
-                problem = f"student {student_text} cannot have more than {limit_text}"
+                problem = f"points of student {student_text} are above the maximum, {limit_text}"
             else:
                 matched_overrides[student_index][title] = override
             notes += [f"{OVERRIDES_NAME}: {problem}."] if problem else []
@@ -489,14 +493,14 @@ def parse_late_rule(text: str) -> LateRule:
     SettingsError
         The text is not a late rule.
     """
-    match = _LATE_RULE.fullmatch(text.strip())
+    match = _LATE_RULE_PATTERN.fullmatch(text.strip())
     if match is None or not 0.0 <= float(match["rate"]) <= 100.0:
         raise SettingsError(
             f"--late {text!r} is not a deduction, such as 10%/day or 10%/day up to 50%."
         )
     unit_s = {"day": 86_400.0, "hour": 3_600.0}[match["unit"]]
-    max_fraction = min(float(match["most"] or 100.0) / 100.0, 1.0)
-    return LateRule(float(match["rate"]) / 100.0, unit_s, max_fraction)
+    max_deduction_fraction = min(float(match["most"] or 100.0) / 100.0, 1.0)
+    return LateRule(float(match["rate"]) / 100.0, unit_s, max_deduction_fraction)
 
 
 def parse_due_time(text: str, name: str = "--due", default_zone: tzinfo | None = None) -> datetime:
@@ -553,7 +557,7 @@ def parse_moodle_time(text: str) -> datetime | None:
             text = f"{year}-{GERMAN_MONTHS.index(month_start) + 1:02}-{day:>02} {time_of_day:>05}"
     with suppress(ValueError):
         return datetime.fromisoformat(text.strip())
-    for time_format in _MOODLE_FORMATS:
+    for time_format in _MOODLE_TIME_FORMATS:
         with suppress(ValueError):
             return datetime.strptime(text.strip(), time_format)
     return None

@@ -25,9 +25,10 @@ MIN_SAME_NUMBERS = 3
 MIN_ANSWERED_CHOICES = 6
 # Maximum relative difference of numbers that count as equal: a copy may have small changes
 SAME_NUMBER_TOLERANCE = 0.02
-# Minimum fraction of the log between --start and --end that is not suspicious
-MIN_SEGMENT_FRACTION = 0.5
-# Maximum factor between --drift or --heading-drift and its default that is not suspicious
+# Minimum fraction of the log that a report must analyse (--start, --end): else it is flagged
+MIN_ANALYSED_FRACTION = 0.5
+# Maximum factor by which --drift or --heading-drift may be above or below its default: else the
+# report is flagged
 MAX_DRIFT_FACTOR = 4.0
 MAX_LISTED_REPORTS = 4
 # Pairs of reports with equal contents
@@ -39,7 +40,7 @@ def flag_page_differences(verification: Verification) -> Iterator[str]:
     if verification.pages:
         first_difference, *further_differences = verification.pages
         count = len(further_differences)
-        more_text = f" The PDF has {count} more differences." if count else ""
+        more_text = f" Further differences: {count}." if count else ""
         yield (
             "The PDF differs from the report that px4fuse draws from the log. "
             f"{capitalise_first(first_difference.sentence)}.{more_text} Read the redrawn report."
@@ -59,7 +60,7 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
         (settings.end_s - settings.start_s) / log_duration_s if log_duration_s else 1.0
     )
     has_time_options = (results.request.start_s, results.request.end_s) != (None, None)
-    if has_time_options and analysed_fraction < MIN_SEGMENT_FRACTION:
+    if has_time_options and analysed_fraction < MIN_ANALYSED_FRACTION:
         yield (
             f"The student analysed only {analysed_fraction:.0%} of the log ({settings.start_s:.1f} "
             f"to {settings.end_s:.1f} s of {log_duration_s:.1f} s). Ask the student for the reason."
@@ -68,11 +69,11 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
     if settings.input == "zero" and not has_no_imu:
         yield "KF did not use the IMU (--input zero)."
     source = results.source
-    tracks_as_received = [track.name for track in source.available if track.path == "as received"]
-    if tracks_as_received and source.path != "as received":
+    received_tracks = [track.name for track in source.available if track.path == "as received"]
+    if received_tracks and source.path != "as received":
         yield (
             f"The position source is {source.name} ({source.path}), not "
-            f"{tracks_as_received[0]}, the positions as received by PX4."
+            f"{received_tracks[0]}, the positions as received by PX4."
         )
     if results.log.hardware == flights.SIMULATION_HARDWARE and not has_key:
         yield "The log is simulated (px4fuse simulate), not a real flight."
@@ -92,7 +93,7 @@ def _flag_drift(request: LoopRequest) -> Iterator[str]:
             )
 
 
-def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
+def _collect_form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
     """Return the numbers in a student's answers, by fault kind (or "") and field name."""
     if report.form is None:
         return {}
@@ -102,7 +103,7 @@ def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
         for name in ("size", "value")
     }
     answers |= {("", f"q{index}"): number for index, number in enumerate(report.form.quantities)}
-    # join the digits of a list of numbers, so that lists are compared like numbers
+    # numbers of a list are compared as one number: (3, 14) as 314
     answers |= {
         (f"q{index}", "value"): float("".join(f"{number:.0f}" for number in numbers))
         for index, numbers in enumerate(report.form.quantities)
@@ -112,9 +113,10 @@ def _form_numbers(report: GradedReport) -> dict[tuple[str, str], float]:
 
 
 def _count_same_numbers(numbers: Mapping[Any, float], other_numbers: Mapping[Any, float]) -> int:
-    """Count the equal numbers of two students; numbers with one digit do not count.
+    """Count the equal numbers of two students, except numbers with one digit (equal by chance).
 
-    Values with the key "value" must be exactly equal, others within SAME_NUMBER_TOLERANCE.
+    Numbers with the field name "value" (lists, values of corrections) must be exactly equal, others
+    within SAME_NUMBER_TOLERANCE.
     """
     return sum(
         _count_digits(number) > 1
@@ -125,12 +127,12 @@ def _count_same_numbers(numbers: Mapping[Any, float], other_numbers: Mapping[Any
     )
 
 
-def _student_identity(report: GradedReport) -> str:
+def _identify_student(report: GradedReport) -> str:
     return normalise_text(report.student_id) or normalise_text(report.student) or report.submission
 
 
-# Checks for equal contents of two reports: sentence for the instructor, function for the compared
-# content, and function for the owner. Reports of one owner are not compared with each other
+# Checks for equal contents of two reports: sentence for the instructor, function that returns the
+# compared content, and function that returns an owner. Reports of one owner are not compared
 EQUAL_CONTENT_CHECKS: tuple[
     tuple[str, Callable[[GradedReport], object], Callable[[GradedReport], str]], ...
 ] = (
@@ -143,10 +145,11 @@ EQUAL_CONTENT_CHECKS: tuple[
     (
         "This report is about the same log as the report of {}.",
         attrgetter("log_sha256"),
-        _student_identity,
+        _identify_student,
     ),
     (
-        "The numbers are those of {}, but the SHA-256 of the log differs: this is a copy.",
+        "The numbers are those in the report of {}, but the SHA-256 of the log differs: this is a "
+        "copy.",
         lambda report: (
             report.verification.status == "verified"
             and len(report.numbers) >= MIN_SAME_NUMBERS
@@ -155,13 +158,13 @@ EQUAL_CONTENT_CHECKS: tuple[
         attrgetter("log_sha256"),
     ),
     (
-        "The answers about the figures are those of {}, although the figures differ.",
+        "The answers about the figures are those in the report of {}, although the figures differ.",
         lambda report: (
             report.form
             and sum(map(bool, report.form.choices)) >= MIN_ANSWERED_CHOICES
             and report.form.choices
         ),
-        _student_identity,
+        _identify_student,
     ),
 )
 
@@ -171,16 +174,19 @@ def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequenc
     flags_by_submission: dict[str, list[str]] = defaultdict(list)
     for flag_text, pairs in (
         *(
-            (flag_text, _equal_content_pairs(reports, content_of, owner_of))
-            for flag_text, content_of, owner_of in EQUAL_CONTENT_CHECKS
+            (flag_text, _find_equal_reports(reports, get_content, get_owner))
+            for flag_text, get_content, get_owner in EQUAL_CONTENT_CHECKS
         ),
-        ("The answer form has the same numbers as the form of {}.", _copied_forms(reports)),
+        (
+            "The answer form contains the same numbers as the form of {}. It may be a copy.",
+            _find_copied_forms(reports),
+        ),
     ):
         students_by_submission: dict[str, list[str]] = defaultdict(list)
         for report, other_report in chain.from_iterable(map(permutations, pairs)):
             file_name = one_line(other_report.submission, 80)
             students_by_submission[report.submission].append(
-                f"{_student_text(other_report)} ({file_name})"
+                f"{_format_student(other_report)} ({file_name})"
             )
         for submission_name, student_texts in students_by_submission.items():
             flags_by_submission[submission_name].append(
@@ -189,30 +195,30 @@ def flag_equal_contents(reports: Sequence[GradedReport]) -> Mapping[str, Sequenc
     return flags_by_submission
 
 
-def _equal_content_pairs(
+def _find_equal_reports(
     reports: Sequence[GradedReport],
-    content_of: Callable[[GradedReport], object],
-    owner_of: Callable[[GradedReport], str],
+    get_content: Callable[[GradedReport], object],
+    get_owner: Callable[[GradedReport], str],
 ) -> ReportPairs:
     reports_by_content: dict[object, list[GradedReport]] = defaultdict(list)
     for report in reports:
-        reports_by_content[content_of(report)].append(report)
+        reports_by_content[get_content(report)].append(report)
     for content, equal_reports in reports_by_content.items():
         for report, other_report in combinations(equal_reports if content else (), 2):
-            if owner_of(report) != owner_of(other_report):
+            if get_owner(report) != get_owner(other_report):
                 yield report, other_report
 
 
-def _copied_forms(reports: Sequence[GradedReport]) -> ReportPairs:
+def _find_copied_forms(reports: Sequence[GradedReport]) -> ReportPairs:
     """Yield pairs of reports of different students whose answers have equal numbers."""
-    numbers_by_report = [(report, _form_numbers(report)) for report in reports]
+    numbers_by_report = [(report, _collect_form_numbers(report)) for report in reports]
     for (report, numbers), (other_report, other_numbers) in combinations(numbers_by_report, 2):
         is_copied = _count_same_numbers(numbers, other_numbers) >= MIN_SAME_NUMBERS
-        if is_copied and _student_identity(report) != _student_identity(other_report):
+        if is_copied and _identify_student(report) != _identify_student(other_report):
             yield report, other_report
 
 
-def _student_text(report: GradedReport) -> str:
+def _format_student(report: GradedReport) -> str:
     names = filter(None, (report.student.strip(), report.student_id.strip()))
     return one_line(", ".join(names) or report.submission, 80)
 

@@ -1,8 +1,9 @@
 """Points (0 to 100) for a student's answers about a flight, by comparison with the answer key.
 
-The constants reproduce points that an instructor gave by hand. Guesses do not pay: each false fault
-(named by the student, but not in the flight) costs points, and a fault that can be guessed without
-a measurement has points only with the correct size.
+The constants in this file reproduce points that an instructor gave by hand. A score is a fraction
+of the points. To discourage guesses, each false fault (named by the student, but not in the
+flight) costs points, and a fault that can be guessed without a measurement gives points only with
+the correct size.
 """
 
 import math
@@ -29,33 +30,33 @@ from px4fuse.results.answer_form import (
 
 # Fraction of the points for questions about the flight; the rest is for questions about figures.
 # Small, because px4fuse itself can answer the questions about the flight
-FLIGHT_SHARE = 0.2
+FLIGHT_POINTS_FRACTION = 0.2
 # Points deducted for each false fault
-FALSE_FAULT_POINTS = 10.0
-# Minimum number of false faults for zero points: the student guessed
-MIN_FALSE_FAULTS_WITHOUT_POINTS = 3
-# Fraction of the points for naming a fault that is similar to the injected fault
-SIMILAR_FAULT_FRACTION = 0.4
-# Fraction of the points for naming ekf2-noise instead of r-scale: both make R wrong
-NOISE_FOR_R_SCALE_FRACTION = 2.0 / 3.0
-# Fraction of the points for naming a consequence of the injected fault instead of the fault
-EFFECT_FRACTION = 0.15
+FALSE_FAULT_DEDUCTION = 10.0
+# Minimum number of false faults with which the faults give no points: the student guessed
+FALSE_FAULTS_FOR_ZERO_POINTS = 3
+# Score for naming a fault that is similar to the injected fault
+SIMILAR_FAULT_SCORE = 0.4
+# Score for naming ekf2-noise instead of r-scale: both make R of EKF2 wrong
+NOISE_FOR_R_SCALE_SCORE = 2.0 / 3.0
+# Score for naming a consequence of the injected fault instead of the fault
+CONSEQUENCE_SCORE = 0.15
 # Kinds of injected faults that can be guessed without a measurement
-GUESSABLE_KINDS = frozenset(("open-end",))
-# Relative error, in excess of the tolerance, at which the size of a guessable fault gives no
-# points. Small, because the sizes in the students' flights differ little
-GUESSABLE_SIZE_RANGE = 0.08
+GUESSABLE_FAULT_KINDS = frozenset(("open-end",))
+# Points for the size of a guessable fault decrease to zero if the relative error is this much above
+# the tolerance. Small, because the sizes in the students' flights differ little
+ZERO_POINTS_SIZE_EXCESS = 0.08
 NO_BOUNDS = (-math.inf, math.inf)
 # Minimum tolerance (s) of the start and the end of an injected fault
 TIME_TOLERANCE_S = 2.0
 # Tolerance of the start and the end of an injected fault, relative to the time since the first data
 TIME_TOLERANCE_FRACTION = 0.05
 # Maximum relative error of a number that the student computed, for full points
-FULL_POINTS_TOLERANCE = 0.02
+FULL_POINTS_NUMBER_ERROR = 0.02
 # Maximum relative error of a number that the student computed, for half of the points
-HALF_POINTS_TOLERANCE = 0.10
+HALF_POINTS_NUMBER_ERROR = 0.10
 # Maximum relative error of the size of an injected fault for half of the points
-HALF_POINTS_FAULT_SIZE_TOLERANCE = 0.4
+HALF_POINTS_SIZE_ERROR = 0.4
 
 
 class _CorrectionRule(NamedTuple):
@@ -63,21 +64,24 @@ class _CorrectionRule(NamedTuple):
 
     Attributes
     ----------
-    fraction_by_kind : mapping
-        Fraction of the points for naming the parameter, by kind of fault.
+    score_by_kind : mapping
+        Score for naming the parameter, by kind of fault.
     right_values : (float, float) or str
-        Smallest and largest right value, or the name of a rule in :func:`accepted_corrections`.
+        Smallest and largest right value, or the name of a rule in
+        :func:`find_accepted_corrections`.
     """
 
     parameter: str
-    fraction_by_kind: Mapping[str, float]
+    score_by_kind: Mapping[str, float]
     right_values: tuple[float, float] | str = NO_BOUNDS
 
 
 POINTS_TABLE = read_toml(__file__, dict)
 CORRECTIONS = msgspec.convert(POINTS_TABLE["corrections"], tuple[_CorrectionRule, ...])
-SIMILAR_FAULTS = msgspec.convert([*POINTS_TABLE["neighbours"].values()], tuple[frozenset[str], ...])
-PART_NAMES = tuple(POINTS_TABLE["weights"])
+SIMILAR_FAULT_GROUPS = msgspec.convert(
+    [*POINTS_TABLE["neighbours"].values()], tuple[frozenset[str], ...]
+)
+FORM_PART_NAMES = tuple(POINTS_TABLE["weights"])
 
 
 @dataclass(frozen=True)
@@ -97,37 +101,39 @@ class FormPoints:
         return max(points, 0.0) / sum(part.max_points for part in self.parts)
 
 
-def form_points(answers: Answers, right_answers: RightFormAnswers) -> FormPoints:
+def compute_form_points(answers: Answers, right_answers: RightFormAnswers) -> FormPoints:
     """Compare a student's answers with the right answers, and compute the points."""
-    is_no_fault_right = not right_answers.mistakes and answers.states_no_fault
-    weights = POINTS_TABLE["weights_clean" if is_no_fault_right else "weights"]
-    fractions = dict.fromkeys(PART_NAMES, 0.0)
+    is_no_fault_recognised = not right_answers.mistakes and answers.states_no_fault
+    weights = POINTS_TABLE["weights_clean" if is_no_fault_recognised else "weights"]
+    scores = dict.fromkeys(FORM_PART_NAMES, 0.0)
     matches, false_faults = _match_faults(answers, right_answers)
-    if right_answers.mistakes and len(false_faults) < MIN_FALSE_FAULTS_WITHOUT_POINTS:
-        fractions |= _fault_fractions(matches, right_answers)
-    fractions["numbers"] = quantities_fraction = _quantities_fraction(answers, right_answers)
-    # consistency can be guessed: without a right number, the answers give half of the points
-    is_guess_possible = not quantities_fraction and not is_no_fault_right
-    fractions["verdicts"] = _verdicts_fraction(answers, right_answers) * (
+    if right_answers.mistakes and len(false_faults) < FALSE_FAULTS_FOR_ZERO_POINTS:
+        scores |= _score_faults(matches, right_answers)
+    scores["numbers"] = numbers_score = _score_numbers(answers, right_answers)
+    # the verdicts can be guessed: without a right number, they give only half of their points
+    is_guess_possible = not numbers_score and not is_no_fault_recognised
+    scores["verdicts"] = _score_verdicts(answers, right_answers) * (
         0.5 if is_guess_possible else 1.0
     )
-    points_by_part = {name: weights[name] * fraction for name, fraction in fractions.items()}
-    if is_no_fault_right:
+    points_by_part = {name: weights[name] * score for name, score in scores.items()}
+    if is_no_fault_recognised:
         points_by_part["mistakes"] = weights["mistakes"]
     elif right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
         # the faults have no size: add the points for sizes to the points for naming the faults
-        points_by_part["mistakes"] += weights["sizes"] * fractions["mistakes"]
-    points_by_part["mistakes"] -= FALSE_FAULT_POINTS * len(false_faults)
+        points_by_part["mistakes"] += weights["sizes"] * scores["mistakes"]
+    points_by_part["mistakes"] -= FALSE_FAULT_DEDUCTION * len(false_faults)
     points_by_part["mistakes"] = max(points_by_part["mistakes"], 0.0)
     if right_answers.choices:
-        weights = {name: FLIGHT_SHARE * points for name, points in weights.items()}
-        weights["figures"] = 100.0 * (1.0 - FLIGHT_SHARE)
-        points_by_part = {name: FLIGHT_SHARE * points for name, points in points_by_part.items()}
-        points_by_part["figures"] = weights["figures"] * _choices_fraction(answers, right_answers)
+        weights = {name: FLIGHT_POINTS_FRACTION * points for name, points in weights.items()}
+        weights["figures"] = 100.0 * (1.0 - FLIGHT_POINTS_FRACTION)
+        points_by_part = {
+            name: FLIGHT_POINTS_FRACTION * points for name, points in points_by_part.items()
+        }
+        points_by_part["figures"] = weights["figures"] * _score_choices(answers, right_answers)
     named_kinds = [named_fault.kind for named_fault in answers.mistakes]
     is_named_by_kind = {fault.kind: fault.kind in named_kinds for fault in right_answers.mistakes}
     feedback = (
-        *_fault_feedback(matches, false_faults, is_no_fault_right),
+        *_fault_feedback(matches, false_faults, is_no_fault_recognised),
         *_answer_feedback(answers, right_answers),
     )
     parts = tuple(
@@ -138,16 +144,16 @@ def form_points(answers: Answers, right_answers: RightFormAnswers) -> FormPoints
     return FormPoints(parts, feedback, is_named_by_kind)
 
 
-# Injected fault, fault that the student named for it (or None), and fraction of the points
-Match = tuple[InjectedFault, NamedFault | None, float]
+# Injected fault, fault that the student named for it (or None), and score
+FaultMatch = tuple[InjectedFault, NamedFault | None, float]
 
 
 def _fault_feedback(
-    matches: list[Match], false_faults: list[NamedFault], is_no_fault_right: bool
+    matches: list[FaultMatch], false_faults: list[NamedFault], is_no_fault_recognised: bool
 ) -> Iterator[str]:
     """Yield feedback on each injected fault, and on faults that the flight does not have."""
     if not matches:
-        yield f"your flight has no injected fault{', as your form states' * is_no_fault_right}"
+        yield f"your flight has no injected fault{', as your form states' * is_no_fault_recognised}"
     for fault, named_fault, _ in matches:
         fault_text = f"{fault.kind} ({FAULT_KINDS[fault.kind].description})"
         right_answer = describe_right_answer(fault)
@@ -171,7 +177,7 @@ def describe_right_answer(fault: InjectedFault) -> str:
     start_text = "" if fault.from_s is None else f"from {fault.from_s:.0f} s "
     end_text = "" if fault.until_s is None else f"until {fault.until_s:.0f} s"
     texts.append(f"{start_text}{end_text}".strip() or "whole flight")
-    return ", ".join([*texts, f"shown in {' or '.join(panels_showing(fault.kind))}"])
+    return ", ".join([*texts, f"shown in {' or '.join(find_panels(fault.kind))}"])
 
 
 def _answer_feedback(answers: Answers, right_answers: RightFormAnswers) -> Iterator[str]:
@@ -188,14 +194,14 @@ def _answer_feedback(answers: Answers, right_answers: RightFormAnswers) -> Itera
             right_answers.ekf2.verdict or NOT_AVAILABLE,
         ),
     ]
-    if _ekf2_behaviour_fraction(answers, right_answers) < 1.0:
+    if _score_ekf2_behaviour(answers, right_answers) < 1.0:
         rows.append(("behaviour of EKF2", answers.ekf2_did, right_answers.ekf2_did))
     for question, given, right in zip_longest(
         select_questions(answers.log_sha256), answers.quantities, right_answers.quantities
     ):
-        if right not in (None, ()) and _quantity_fraction(given, right) < 1.0:
+        if right not in (None, ()) and _score_number(given, right) < 1.0:
             rows.append(
-                (f"{question.text}, within {100.0 * FULL_POINTS_TOLERANCE:g} %", given, right)
+                (f"{question.text}, within {100.0 * FULL_POINTS_NUMBER_ERROR:g} %", given, right)
             )
     for letter, (choice, right_letter) in zip_longest(
         answers.choices[: len(right_answers.choices)], right_answers.choices
@@ -215,128 +221,130 @@ def _format_answer(answer: object) -> str:
 
 def _match_faults(
     answers: Answers, right_answers: RightFormAnswers
-) -> tuple[list[Match], list[NamedFault]]:
+) -> tuple[list[FaultMatch], list[NamedFault]]:
     """Match each injected fault with the named fault that gives the most points.
 
     Return the matches, and the named faults that match no injected fault.
     """
-    unmatched = [
+    unmatched_faults = [
         named_fault for named_fault in answers.mistakes if named_fault.kind != NO_FAULT_KIND
     ]
     match_by_kind: dict[str, tuple[NamedFault, float]] = {}
     candidates = [
-        (fraction_for_named_kind(fault.kind, named_fault.kind), fault.kind, named_fault)
+        (score_named_kind(fault.kind, named_fault.kind), fault.kind, named_fault)
         for fault in right_answers.mistakes
-        for named_fault in unmatched
+        for named_fault in unmatched_faults
     ]
-    for fraction, kind, named_fault in sorted(candidates, key=lambda each: -each[0]):
-        if fraction and kind not in match_by_kind and named_fault in unmatched:
-            match_by_kind[kind] = named_fault, fraction
-            unmatched.remove(named_fault)
+    for score, kind, named_fault in sorted(candidates, key=lambda each: -each[0]):
+        if score and kind not in match_by_kind and named_fault in unmatched_faults:
+            match_by_kind[kind] = named_fault, score
+            unmatched_faults.remove(named_fault)
     no_match = (None, 0.0)
     matches = [
         (fault, *match_by_kind.get(fault.kind, no_match)) for fault in right_answers.mistakes
     ]
-    return matches, unmatched
+    return matches, unmatched_faults
 
 
-def fraction_for_named_kind(kind: str, named_kind: str) -> float:
-    """Return the fraction of the points for naming ``named_kind`` if the fault is ``kind``."""
+def score_named_kind(kind: str, named_kind: str) -> float:
+    """Return the score for naming ``named_kind`` if the fault is ``kind``."""
     if kind == named_kind:
         return 1.0
     if (kind, named_kind) == ("r-scale", "ekf2-noise"):
-        return NOISE_FOR_R_SCALE_FRACTION
-    if any({kind, named_kind} <= group for group in SIMILAR_FAULTS):
-        return SIMILAR_FAULT_FRACTION
-    return EFFECT_FRACTION if named_kind in POINTS_TABLE["effects"].get(kind, ()) else 0.0
+        return NOISE_FOR_R_SCALE_SCORE
+    if any({kind, named_kind} <= group for group in SIMILAR_FAULT_GROUPS):
+        return SIMILAR_FAULT_SCORE
+    return CONSEQUENCE_SCORE if named_kind in POINTS_TABLE["effects"].get(kind, ()) else 0.0
 
 
-def _fault_fractions(matches: list[Match], right_answers: RightFormAnswers) -> dict[str, float]:
-    """Return the mean score (0 to 1) over all injected faults, by part of the answers."""
+def _score_faults(matches: list[FaultMatch], right_answers: RightFormAnswers) -> dict[str, float]:
+    """Return the mean score of all injected faults, by part of the answer form."""
     sized_fault_count = sum(fault.size is not None for fault, _, _ in matches)
-    fractions = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
-    for fault, named_fault, fraction in matches:
+    scores = dict.fromkeys(("mistakes", "sizes", "time and panel", "correction"), 0.0)
+    for fault, named_fault, score in matches:
         if named_fault is None:
             continue
-        size_score = size_fraction(fault, named_fault)
-        weight = (size_score if fault.kind in GUESSABLE_KINDS else 1.0) / len(matches)
+        size_score = score_fault_size(fault, named_fault)
+        weight = (size_score if fault.kind in GUESSABLE_FAULT_KINDS else 1.0) / len(matches)
         time_weight = weight if named_fault.kind == fault.kind else 0.5 * weight
-        fractions["mistakes"] += fraction / len(matches)
-        fractions["time and panel"] += evidence_fraction(fault, named_fault) * time_weight
-        fractions["correction"] += correction_fraction(fault, named_fault, right_answers) * weight
-        fractions["sizes"] += size_score / max(sized_fault_count, 1)
-    return fractions
+        scores["mistakes"] += score / len(matches)
+        scores["time and panel"] += score_evidence(fault, named_fault) * time_weight
+        scores["correction"] += score_correction(fault, named_fault, right_answers) * weight
+        scores["sizes"] += size_score / max(sized_fault_count, 1)
+    return scores
 
 
-def size_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
-    """Return the fraction of the points for the size that the student states for a fault.
+def score_fault_size(fault: InjectedFault, named_fault: NamedFault) -> float:
+    """Return the score for the size that the student states for a fault.
 
-    1: within the tolerance. 1/2: near the tolerance. 1/3: wrong sign, or correct size of a wrong
-    fault.
+    1: within the tolerance. 1/2: relative error up to HALF_POINTS_SIZE_ERROR. 1/3: wrong sign,
+    or correct size of a wrong fault. A guessable fault has a score from 0 to 1 instead of 1/2.
     """
-    named_size = named_fault.size_in_first_unit()
-    if fault.size is None or fault.low is None or fault.high is None or named_size is None:
+    stated_size = named_fault.size_in_first_unit()
+    if fault.size is None or fault.low is None or fault.high is None or stated_size is None:
         return 0.0
     if named_fault.kind != fault.kind:
         units = [[*FAULT_KINDS[kind].units][:1] for kind in (named_fault.kind, fault.kind)]
-        is_right = fault.low <= named_size <= fault.high and units[0] == units[1]
+        is_right = fault.low <= stated_size <= fault.high and units[0] == units[1]
         return is_right / 3.0
-    deviation = abs(named_size - fault.size) / abs(fault.size)
-    close_fraction = 0.5 * (deviation <= HALF_POINTS_FAULT_SIZE_TOLERANCE)
-    if fault.kind in GUESSABLE_KINDS:
+    deviation = abs(stated_size - fault.size) / abs(fault.size)
+    near_score = 0.5 * (deviation <= HALF_POINTS_SIZE_ERROR)
+    if fault.kind in GUESSABLE_FAULT_KINDS:
         tolerance = (fault.high - fault.low) / (2.0 * abs(fault.size))
-        close_fraction = max(1.0 - (deviation - tolerance) / GUESSABLE_SIZE_RANGE, 0.0)
-    return _value_fraction(named_size, fault.low, fault.high, close_fraction)
+        near_score = max(1.0 - (deviation - tolerance) / ZERO_POINTS_SIZE_EXCESS, 0.0)
+    return _score_value(stated_size, fault.low, fault.high, near_score)
 
 
-def evidence_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
+def score_evidence(fault: InjectedFault, named_fault: NamedFault) -> float:
     """Return 1/2 for the right time of a fault, plus 1/2 for naming a plot that shows the fault."""
     if fault.from_s is None and fault.until_s is None:
         is_time_right = named_fault.when == "whole flight"
     else:
-        true_and_named_s = (fault.from_s, named_fault.from_s), (fault.until_s, named_fault.until_s)
+        true_and_named_times_s = (
+            (fault.from_s, named_fault.from_s),
+            (fault.until_s, named_fault.until_s),
+        )
         is_time_right = not named_fault.when and all(
             named_s is not None
             and abs(named_s - true_s) <= max(TIME_TOLERANCE_S, TIME_TOLERANCE_FRACTION * true_s)
-            for true_s, named_s in true_and_named_s
+            for true_s, named_s in true_and_named_times_s
             if true_s is not None
         )
-    return 0.5 * is_time_right + 0.5 * (named_fault.panel in panels_showing(fault.kind))
+    return 0.5 * is_time_right + 0.5 * (named_fault.panel in find_panels(fault.kind))
 
 
-def panels_showing(fault_kind: str) -> list[str]:
+def find_panels(fault_kind: str) -> list[str]:
     kinds_by_panel = POINTS_TABLE["shows"].items()
     return [*(panel for panel, kinds in kinds_by_panel if fault_kind in kinds), "cover"]
 
 
-def correction_fraction(
+def score_correction(
     fault: InjectedFault, named_fault: NamedFault, right_answers: RightFormAnswers
 ) -> float:
-    """Return the fraction of the points for the parameter that corrects a fault, with its value."""
-    named_value = named_fault.value_in_first_unit()
-    fractions = [
-        fraction
+    """Return the score for the parameter that corrects a fault, and for the value of it."""
+    stated_value = named_fault.value_in_first_unit()
+    scores = [
+        score
         if (low, high) == NO_BOUNDS
-        else fraction
-        * (0.5 if named_value is None else _value_fraction(named_value, low, high, 0.5))
-        for parameter, (low, high), fraction in accepted_corrections(fault, right_answers)
+        else score * (0.5 if stated_value is None else _score_value(stated_value, low, high, 0.5))
+        for parameter, (low, high), score in find_accepted_corrections(fault, right_answers)
         if parameter == named_fault.parameter
     ]
-    return max(fractions, default=0.0)
+    return max(scores, default=0.0)
 
 
-def _value_fraction(value: float, low: float, high: float, fraction_outside: float) -> float:
-    """Return 1 within the bounds, 1/3 for a wrong sign, and ``fraction_outside`` otherwise."""
+def _score_value(value: float, low: float, high: float, score_outside: float) -> float:
+    """Return 1 within the bounds, 1/3 if only the sign is wrong, and else ``score_outside``."""
     if low <= value <= high:
         return 1.0
-    return 1.0 / 3.0 if low <= -value <= high else fraction_outside
+    return 1.0 / 3.0 if low <= -value <= high else score_outside
 
 
-# Parameter that corrects an injected fault, range of right values, and fraction of the points
+# Parameter that corrects an injected fault, range of right values, and score
 AcceptedCorrection = tuple[str, tuple[float, float], float]
 
 
-def accepted_corrections(
+def find_accepted_corrections(
     fault: InjectedFault, right_answers: RightFormAnswers
 ) -> tuple[AcceptedCorrection, ...]:
     size, low, high = (value or 0.0 for value in (fault.size, fault.low, fault.high))
@@ -356,39 +364,41 @@ def accepted_corrections(
         (
             rule.parameter,
             bounds_by_name[values] if isinstance(values := rule.right_values, str) else values,
-            rule.fraction_by_kind[fault.kind],
+            rule.score_by_kind[fault.kind],
         )
         for rule in CORRECTIONS
-        if fault.kind in rule.fraction_by_kind
+        if fault.kind in rule.score_by_kind
         # EKF2_EV_DELAY cannot be negative
         and (size > 0.0 or rule.right_values != "late milliseconds")
     )
 
 
-def _verdicts_fraction(answers: Answers, right_answers: RightFormAnswers) -> float:
+def _score_verdicts(answers: Answers, right_answers: RightFormAnswers) -> float:
     """Return the mean score for the consistency of KF and of EKF2, and the behaviour of EKF2."""
-    given_and_right = (
+    given_and_right_verdicts = (
         (answers.verdict_kf, right_answers.kf.verdict),
         (answers.verdict_ekf2, right_answers.ekf2.verdict),
     )
-    right_count = sum(answer == (right or NOT_AVAILABLE) for answer, right in given_and_right)
-    return (right_count + _ekf2_behaviour_fraction(answers, right_answers)) / 3.0
+    right_count = sum(
+        answer == (right or NOT_AVAILABLE) for answer, right in given_and_right_verdicts
+    )
+    return (right_count + _score_ekf2_behaviour(answers, right_answers)) / 3.0
 
 
-def _ekf2_behaviour_fraction(answers: Answers, right_answers: RightFormAnswers) -> float:
+def _score_ekf2_behaviour(answers: Answers, right_answers: RightFormAnswers) -> float:
     """Return 1 if the reported behaviour of EKF2 is right, 1/2 with one error, otherwise 0."""
     stated_behaviours, required_behaviours = set(answers.ekf2_did), set(right_answers.ekf2_did)
-    also_allowed = set(right_answers.ekf2_did_also)
-    false_count = len(stated_behaviours - required_behaviours - also_allowed)
+    allowed_behaviours = set(right_answers.ekf2_did_also)
+    false_count = len(stated_behaviours - required_behaviours - allowed_behaviours)
     if len(stated_behaviours) == false_count or false_count > 1:
         return 0.0
     is_complete = required_behaviours <= stated_behaviours or (
-        len(required_behaviours) == 1 and stated_behaviours & also_allowed
+        len(required_behaviours) == 1 and stated_behaviours & allowed_behaviours
     )
     return 1.0 if is_complete and not false_count else 0.5
 
 
-def _choices_fraction(answers: Answers, right_answers: RightFormAnswers) -> float:
+def _score_choices(answers: Answers, right_answers: RightFormAnswers) -> float:
     """Return the mean score of the multiple-choice questions; random answers give 0 on average."""
     wrong_points = -1.0 / (len(CHOICE_NAMES) - 1)
     right_letters = (right_letter for _, right_letter in right_answers.choices)
@@ -400,22 +410,23 @@ def _choices_fraction(answers: Answers, right_answers: RightFormAnswers) -> floa
     return sum(points) / len(right_answers.choices)
 
 
-def _quantities_fraction(answers: Answers, right_answers: RightFormAnswers) -> float:
+def _score_numbers(answers: Answers, right_answers: RightFormAnswers) -> float:
     """Return the mean score for the numbers that the student computed with KF."""
     # an empty list as right answer is not scored, because it could be guessed
     scored_count = sum(value not in (None, ()) for value in right_answers.quantities)
-    given_and_right = zip(answers.quantities, right_answers.quantities, strict=False)
-    return sum(_quantity_fraction(*pair) for pair in given_and_right) / max(scored_count, 1)
+    given_and_right_numbers = zip(answers.quantities, right_answers.quantities, strict=False)
+    return sum(_score_number(*pair) for pair in given_and_right_numbers) / max(scored_count, 1)
 
 
-def _quantity_fraction(answer: QuantityAnswer, right_answer: QuantityAnswer) -> float:
+def _score_number(answer: QuantityAnswer, right_answer: QuantityAnswer) -> float:
     if isinstance(right_answer, tuple) and answer is not None:
         answer = answer if isinstance(answer, tuple) else (answer,)
         difference_count = len(set(answer) ^ set(right_answer))
         has_right_number = not set(answer).isdisjoint(right_answer)
         return max(1.0 - 0.5 * difference_count, 0.0) * has_right_number
     if isinstance(answer, float | int) and isinstance(right_answer, float | int):
-        for tolerance, fraction in ((FULL_POINTS_TOLERANCE, 1.0), (HALF_POINTS_TOLERANCE, 0.5)):
-            if abs(answer - right_answer) <= tolerance * abs(right_answer):
-                return fraction
+        error = abs(answer - right_answer)
+        for tolerance, score in ((FULL_POINTS_NUMBER_ERROR, 1.0), (HALF_POINTS_NUMBER_ERROR, 0.5)):
+            if error <= tolerance * abs(right_answer):
+                return score
     return 0.0

@@ -11,7 +11,7 @@ from px4fuse.classroom.assignment.key import AnswerKey
 from px4fuse.classroom.grading import submissions
 from px4fuse.classroom.grading.entries import OVERRIDES_NAME, Course, build_grades, read_overrides
 from px4fuse.classroom.grading.model import Grade, GradedReport, Submission
-from px4fuse.classroom.grading.outputs import find_grade_column, write_class
+from px4fuse.classroom.grading.outputs import find_grade_column, write_grading_files
 from px4fuse.classroom.grading.records import RECORDS_FOLDER, load_or_verify
 from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable, score_report
 from px4fuse.core.reading import files_by_sha256, max_log_bytes
@@ -19,7 +19,9 @@ from px4fuse.core.text import one_line
 from px4fuse.core.workers import JobFailure, run_with_limits
 from px4fuse.errors import ResultsError
 
-FAILED_REMEDY = "Do not open the file. Ask the student for the PDF that px4fuse wrote."
+FAILURE_REMEDY = (
+    "Do not open the file: it may be harmful. Ask the student for the PDF that px4fuse wrote."
+)
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ def grade(
     found_submissions, notes = submissions.find_submissions(paths)
     jobs = []
     for submission in found_submissions:
-        student_index = course.class_list.student_index(submission.origin.person)
+        student_index = course.class_list.find_student_index(submission.origin.person)
         submitter_id = (
             "" if student_index is None else course.class_list.people[student_index].student_id
         )
@@ -103,7 +105,8 @@ def grade(
         for index, result in results:
             if isinstance(result, JobFailure):
                 reason = f"the grading of this file failed: {result.reason}"
-                report, is_loaded = grade_unreadable(*rubric_and_key, reason, FAILED_REMEDY), False
+                report = grade_unreadable(*rubric_and_key, reason, FAILURE_REMEDY)
+                is_loaded = False
             else:
                 report, is_loaded = result
             submission, student = found_submissions[index], report.student
@@ -114,7 +117,7 @@ def grade(
             progress(len(graded_by_index), len(found_submissions))
     graded_reports = [graded_by_index[index] for index in range(len(found_submissions))]
     grades, override_notes = build_grades(graded_reports, found_submissions, course, overrides)
-    written_paths, class_notes = write_class(grades, course, output)
+    written_paths, class_notes = write_grading_files(grades, course, output)
     all_notes = *notes, *unread_notes, *override_notes, *class_notes
     return GradeOutcome(grades, all_notes, reused_count, written_paths)
 
@@ -123,7 +126,7 @@ def grade_submission(
     rubric: Rubric,
     key: AnswerKey | None,
     path_by_sha256: Mapping[str, Path],
-    records: Path,
+    records_folder: Path,
     max_bytes: int,
     job: tuple[Submission, str],
 ) -> tuple[GradedReport, bool]:
@@ -131,7 +134,7 @@ def grade_submission(
 
     Parameters
     ----------
-    records : Path
+    records_folder : Path
         Folder of earlier verifications.
     max_bytes : int
         Maximum size of a log.
@@ -152,7 +155,7 @@ def grade_submission(
         content = submissions.read_submission(submission)
         sha256 = hashlib.sha256(content).hexdigest()
         results, verification, is_loaded = load_or_verify(
-            records, content, path_by_sha256, assigned_hashes
+            records_folder, content, path_by_sha256, assigned_hashes
         )
     except ResultsError as error:
         graded_report = grade_unreadable(rubric, key, f"{error.reason}.", error.remedy)

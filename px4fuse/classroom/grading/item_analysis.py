@@ -8,18 +8,18 @@ import numpy as np
 
 from px4fuse.classroom.grading.model import GradedReport
 
-# Minimum number of reports for a correlation of points
-MIN_REPORTS = 5
+# Minimum number of reports for the correlation of an item with the other items
+MIN_CORRELATED_REPORTS = 5
 ITEM_STATISTICS_TITLES = ("item", "reports", "mean_fraction", "discrimination", "without_points")
 
 
 @dataclass(frozen=True)
 class ItemStatistics:
-    """Points of all reports for a rubric item, part of the answers, or injected fault.
+    """Points of all reports for one rubric item, one part of the answer form, or one fault.
 
     Attributes
     ----------
-    fractions : tuple of float
+    point_fractions : tuple of float
         Points of each report divided by the maximum; for a fault, 1 if the student found the fault.
     discrimination : float or None
         Correlation between the points for this item and the points for all other items. The item
@@ -27,7 +27,7 @@ class ItemStatistics:
     """
 
     title: str
-    fractions: tuple[float, ...]
+    point_fractions: tuple[float, ...]
     max_points: float
     discrimination: float | None
 
@@ -36,10 +36,10 @@ class ItemStatistics:
         """Cells of the row of ``items.csv``, in the order of ITEM_STATISTICS_TITLES."""
         return (
             self.title,
-            len(self.fractions),
-            round(float(np.mean(self.fractions)), 3),
+            len(self.point_fractions),
+            round(float(np.mean(self.point_fractions)), 3),
             self.discrimination,
-            self.fractions.count(0.0),
+            self.point_fractions.count(0.0),
         )
 
 
@@ -54,11 +54,11 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
             continue
         for group_index, prefix, items in (
             (0, "", report.items),
-            (1, "Answer form: ", report.form_parts),
+            (1, "Answer form: ", report.form_part_scores),
         ):
             total_points = sum(item.points for item in items)
             for item in items:
-                if item.awaits_points:
+                if item.is_awaiting_points:
                     continue
                 score = item.points, item.max_points, total_points - item.points
                 scores_by_item[group_index, f"{prefix}{item.title}"].append(score)
@@ -68,10 +68,12 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
     for (_, title), scores in sorted(scores_by_item.items(), key=lambda item: item[0][0]):
         item_points, max_points, other_points = np.transpose(scores)
         discrimination = None
-        if len(scores) >= MIN_REPORTS and np.ptp(item_points) and np.ptp(other_points):
+        if len(scores) >= MIN_CORRELATED_REPORTS and np.ptp(item_points) and np.ptp(other_points):
             discrimination = round(float(np.corrcoef(item_points, other_points)[0, 1]), 2)
-        fractions = item_points / np.where(max_points > 0.0, max_points, 1.0)
+        point_fractions = item_points / np.where(max_points > 0.0, max_points, 1.0)
         statistics.append(
-            ItemStatistics(title, tuple(fractions.tolist()), float(max(max_points)), discrimination)
+            ItemStatistics(
+                title, tuple(point_fractions.tolist()), float(max(max_points)), discrimination
+            )
         )
     return statistics

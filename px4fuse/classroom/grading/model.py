@@ -31,7 +31,7 @@ class ExportOrigin:
     is_late : bool
         True if the platform marks the file as late.
     is_imitated : bool
-        True if the student imitated a file name of another platform.
+        True if the student's part of the file name imitates a platform.
     """
 
     platform: str = ""
@@ -71,7 +71,7 @@ class Submission:
 class ItemScore:
     """Points of a report for one rubric item, with a comment for the student.
 
-    ``awaits_points`` is True if the instructor has not yet entered the points.
+    ``is_awaiting_points`` is True if the instructor has not yet entered the points.
     """
 
     title: str
@@ -79,7 +79,7 @@ class ItemScore:
     max_points: float
     comment: str
     is_scored_by_instructor: bool = False
-    awaits_points: bool = False
+    is_awaiting_points: bool = False
 
 
 @dataclass(frozen=True)
@@ -94,6 +94,8 @@ class GradedReport:
         Name and id in the report.
     instructor_action : str
         Decision that the instructor must make before the points count; "" if none is needed.
+    flags : tuple of str
+        Sentences for the instructor about suspicious contents.
     form : Answers or None
         Answers of the student to the questions about the flight.
     numbers : mapping
@@ -102,7 +104,7 @@ class GradedReport:
         Version of px4fuse that wrote the report.
     is_found_by_fault : mapping
         For each injected fault of the student's flight: True if the student found the fault.
-    form_parts : tuple of ItemScore
+    form_part_scores : tuple of ItemScore
         Points for each part of ``form``, 100 points in total.
     redrawn_path : str
         Relative path of the PDF that px4fuse draws from the log for comparison.
@@ -122,7 +124,7 @@ class GradedReport:
     version: str = ""
     notes: str = field(default="", repr=False)
     is_found_by_fault: Mapping[str, bool] = field(default_factory=dict)
-    form_parts: tuple[ItemScore, ...] = ()
+    form_part_scores: tuple[ItemScore, ...] = ()
     redrawn_path: str = ""
 
     @property
@@ -138,19 +140,19 @@ class GradedReport:
     @property
     def counted_points(self) -> float | None:
         """Sum of the points; None while a decision or points of the instructor are missing."""
-        return None if self.instructor_action or self.awaits_points else self.points
+        return None if self.instructor_action or self.is_awaiting_points else self.points
 
     @property
-    def awaits_points(self) -> bool:
-        return any(item.awaits_points for item in self.items)
+    def is_awaiting_points(self) -> bool:
+        return any(item.is_awaiting_points for item in self.items)
 
     @property
-    def pending_reason(self) -> str:
+    def pending_actions(self) -> str:
         """Actions required of the instructor before the points count; "" for none."""
         actions = [
             f"Enter the points of the item {item.title}."
             for item in self.items
-            if item.awaits_points
+            if item.is_awaiting_points
         ]
         return " ".join([self.instructor_action, *actions]).strip()
 
@@ -219,7 +221,7 @@ def counted_reports(grades: Sequence[Grade]) -> list[GradedReport]:
 
 
 def list_titles(grades: Sequence[Grade]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the column titles for the points of rubric items, and for numbers of reports."""
+    """Return the column titles of the rubric items, and of the numbers from the reports."""
     reports = counted_reports(grades)
     item_titles = dict.fromkeys(item.title for report in reports for item in report.items)
     number_titles = dict.fromkeys(title for report in reports for title in report.numbers)

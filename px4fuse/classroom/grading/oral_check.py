@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 
 from px4fuse.classroom.assignment.key import AnswerKey
 from px4fuse.classroom.assignment.truth import RightFormAnswers
-from px4fuse.classroom.grading.form_points import describe_right_answer, panels_showing
+from px4fuse.classroom.grading.form_points import describe_right_answer, find_panels
 from px4fuse.classroom.grading.model import Grade
 from px4fuse.core.text import one_line
 from px4fuse.results.answer_form import FAULT_KINDS, NO_FAULT_KIND, PANELS, Answers
@@ -14,12 +14,12 @@ from px4fuse.results.answer_form import FAULT_KINDS, NO_FAULT_KIND, PANELS, Answ
 Question = tuple[str, str]
 
 
-def questions_text(grades: Sequence[Grade], key: AnswerKey, count: int) -> str:
+def format_questions(grades: Sequence[Grade], key: AnswerKey, count: int) -> str:
     """Format ``count`` questions with expected answers for each student with answers."""
     lines = [f"Questions for an oral check: {count} per student, with the expected answers."]
     for grade in grades:
         report = grade.counted_report
-        answer = key.of_log(report.log_sha256) if report else None
+        answer = key.find_log_answers(report.log_sha256) if report else None
         if report is None or report.form is None or answer is None or answer.form is None:
             continue
         lines += ["", one_line(f"{grade.display_name} {grade.student_id}", 100)]
@@ -30,9 +30,9 @@ def questions_text(grades: Sequence[Grade], key: AnswerKey, count: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def ask_about_form(form: Answers, right_answers: RightFormAnswers) -> Iterator[Question]:
+def ask_about_form(answers: Answers, right_answers: RightFormAnswers) -> Iterator[Question]:
     """Yield questions about the faults and figures in a student's answers, wrong answers first."""
-    named_kinds = [fault.kind for fault in form.mistakes]
+    named_kinds = [fault.kind for fault in answers.mistakes]
     true_kinds = [fault.kind for fault in right_answers.mistakes]
     flight_text = ", ".join(true_kinds) or "no fault"
     for kind in named_kinds:
@@ -41,8 +41,8 @@ def ask_about_form(form: Answers, right_answers: RightFormAnswers) -> Iterator[Q
         yield (
             f"You named {kind} ({FAULT_KINDS[kind].description}). Which plot would show this "
             "fault, and does this plot in your report show the fault?",
-            f"{' or '.join(panels_showing(kind))}. The plot does not show the fault. The flight "
-            f"has {flight_text}.",
+            f"Plot: {' or '.join(find_panels(kind))}. The plot does not show the fault, because "
+            f"the flight has {flight_text}.",
         )
     for fault in right_answers.mistakes:
         description = FAULT_KINDS[fault.kind].description
@@ -53,20 +53,20 @@ def ask_about_form(form: Answers, right_answers: RightFormAnswers) -> Iterator[Q
                 f"{describe_right_answer(fault)}.",
             )
             continue
-        other_panels = [panel for panel in PANELS if panel not in panels_showing(fault.kind)]
+        other_panels = [panel for panel in PANELS if panel not in find_panels(fault.kind)]
         yield (
             f"You named {fault.kind} ({description}). Show this fault in a plot of your report. "
             "Name a plot that cannot show this fault, with the reason.",
             f"{describe_right_answer(fault)}. Plots that cannot show the fault, for example: "
             f"{' or '.join(other_panels[:2])}.",
         )
-    given_letters = dict(enumerate(form.choices))
+    given_letters = dict(enumerate(answers.choices))
     questions = [
         (*each, given_letters.get(index)) for index, each in enumerate(right_answers.choices)
     ]
     for choice, right_letter, letter in sorted(questions, key=lambda each: each[1] == each[2]):
         answer_text = choice.answer_text(letter) if letter else "none"
         yield (
-            f"{choice.question}: you answered: {answer_text}. Explain this answer with the figure.",
+            f"{choice.question}. Your answer: {answer_text}. Explain this answer with the figure.",
             f"Right: {choice.answer_text(right_letter)}.",
         )

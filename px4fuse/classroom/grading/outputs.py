@@ -28,14 +28,14 @@ from pathlib import Path
 
 from px4fuse.classroom.assignment.roster import (
     ClassList,
-    file_names,
+    make_file_names,
     make_unique,
     normalise_text,
     read_student,
 )
 from px4fuse.classroom.assignment.sheet import Sheet, format_cell_number, parse_decimal, read_sheet
 from px4fuse.classroom.grading.checks import shorten_text
-from px4fuse.classroom.grading.class_page import class_page_html
+from px4fuse.classroom.grading.class_page import format_class_page
 from px4fuse.classroom.grading.entries import OVERRIDES_NAME, OVERRIDES_TEMPLATE, Course
 from px4fuse.classroom.grading.item_analysis import ITEM_STATISTICS_TITLES, analyse_items
 from px4fuse.classroom.grading.model import (
@@ -45,7 +45,7 @@ from px4fuse.classroom.grading.model import (
     counted_reports,
     list_titles,
 )
-from px4fuse.classroom.grading.oral_check import questions_text
+from px4fuse.classroom.grading.oral_check import format_questions
 from px4fuse.classroom.grading.records import DIAGNOSIS_SUFFIX, RECORDS_FOLDER, REDRAWN_SUFFIX
 from px4fuse.core.input_files import inputs_not_registered
 from px4fuse.core.spreadsheet import neutralise_formulas
@@ -62,7 +62,7 @@ PSEUDONYMS_FILE = "names.csv"
 QUESTIONS_FILE = "questions.txt"
 PSEUDONYM_TITLES = ("pseudonym", "id", "name")
 # Columns of class.csv before and after the columns of rubric items and numbers
-FIRST_COLUMNS = (
+FIRST_COLUMN_TITLES = (
     "file",
     "student",
     "id",
@@ -73,7 +73,7 @@ FIRST_COLUMNS = (
     "deducted",
     "total",
 )
-LAST_COLUMNS = (
+LAST_COLUMN_TITLES = (
     "handed in",
     "hours late",
     "pending",
@@ -85,7 +85,7 @@ LAST_COLUMNS = (
 )
 LIST_SEPARATOR = " | "
 # Maximum number of reasons for a failed verification in the feedback
-MAX_REASONS = 4
+MAX_LISTED_REASONS = 4
 # Titles of grade columns in tables of learning platforms, as lower-case letters and digits
 GRADE_TITLES = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
 MAX_GRADE_TITLES = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
@@ -94,11 +94,11 @@ HTML_COMMENT_TITLES = ("feedbackcomments", "feedbackalskommentar")
 # Titles of all feedback columns
 COMMENT_TITLES = (*HTML_COMMENT_TITLES, "feedbacktolearner", "feedback", "comment")
 _ASSIGNMENT_NUMBER = re.compile(r" \(\d+\)$")
-# Mark of columns that Canvas computes: px4fuse must not change them
-READ_ONLY_MARK = "(read only)"
+# Text in columns that Canvas computes: px4fuse must not change them
+READ_ONLY_TEXT = "(read only)"
 
 
-def write_class(
+def write_grading_files(
     grades: Sequence[Grade], course: Course, output: Path
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Write all output files of grading. An existing ``overrides.csv`` is not overwritten.
@@ -121,24 +121,25 @@ def write_class(
         The folder cannot be written.
     """
     class_title = course.title or course.rubric.title or "Class"
-    file_stems = file_names([_student_identity(grade, use_file_stem=True) for grade in grades])
+    file_stems = make_file_names([_identify_student(grade, use_file_stem=True) for grade in grades])
     page_grades = [
-        _copy_redrawn(grade, stem, output) for grade, stem in zip(grades, file_stems, strict=True)
+        _copy_redrawn_report(grade, stem, output)
+        for grade, stem in zip(grades, file_stems, strict=True)
     ]
-    has_redrawn = any(report.redrawn_path for report in counted_reports(page_grades))
+    has_redrawn_reports = any(report.redrawn_path for report in counted_reports(page_grades))
     feedback_texts = [feedback_text(grade, class_title) for grade in grades]
     item_rows = (statistics.csv_row for statistics in analyse_items(counted_reports(grades)))
     contents = {
-        "class.csv": class_table_csv(grades).encode(),
-        "items.csv": _spreadsheet_csv(ITEM_STATISTICS_TITLES, item_rows).encode(),
+        "class.csv": format_class_table(grades).encode(),
+        "items.csv": _format_csv(ITEM_STATISTICS_TITLES, item_rows).encode(),
     }
     if course.anonymous:
         page_grades, names_table = _anonymise_grades(page_grades, output / PSEUDONYMS_FILE)
         contents[PSEUDONYMS_FILE] = names_table.encode()
-    made_with = f"px4fuse {metadata.version('px4fuse')}"
-    contents["class.html"] = class_page_html(page_grades, class_title, made_with).encode()
+    version_text = f"px4fuse {metadata.version('px4fuse')}"
+    contents["class.html"] = format_class_page(page_grades, class_title, version_text).encode()
     if course.question_count and course.key is not None:
-        text = questions_text(grades, course.key, course.question_count)
+        text = format_questions(grades, course.key, course.question_count)
         contents[QUESTIONS_FILE] = text.encode()
     if not (output / OVERRIDES_NAME).exists():
         contents[OVERRIDES_NAME] = OVERRIDES_TEMPLATE.encode()
@@ -154,20 +155,20 @@ def write_class(
         notes += sheet_notes
     write_all({output / name: content for name, content in contents.items()})
     output_names = dict.fromkeys([*(name.partition("/")[0] for name in contents), OVERRIDES_NAME])
-    if has_redrawn:
+    if has_redrawn_reports:
         output_names[REPORTS_FOLDER] = None
     return tuple(output / name for name in output_names), tuple(notes)
 
 
-def _student_identity(grade: Grade, use_file_stem: bool = False) -> str:
+def _identify_student(grade: Grade, use_file_stem: bool = False) -> str:
     """Return the id of a student; without an id, the name or the name of the submitted file."""
     return grade.student_id or (
         Path(grade.file_name).stem if use_file_stem else grade.student or grade.file_name
     )
 
 
-def _copy_redrawn(grade: Grade, stem: str, output: Path) -> Grade:
-    """Copy the PDF files that px4fuse drew from the log to the output folder."""
+def _copy_redrawn_report(grade: Grade, stem: str, output: Path) -> Grade:
+    """Copy the PDFs that px4fuse drew from the log to STEM.pdf; return the grade with the path."""
     report = grade.counted_report
     if report is None or not report.sha256:
         return grade
@@ -188,33 +189,36 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
     Return the anonymous grades and a CSV table of the pseudonyms. Pseudonyms in an existing table
     at ``path`` are kept.
     """
-    names_by_identity: dict[str, tuple[str, str]] = {}
+    name_pair_by_identity: dict[str, tuple[str, str]] = {}
     if path.exists():
         with inputs_not_registered():
             sheet = read_sheet(path)
         for row in sheet.rows:
             pseudonym, identity, student = (
-                sheet.cell(row, (title,)).removeprefix("'") for title in PSEUDONYM_TITLES
+                sheet.find_cell(row, (title,)).removeprefix("'") for title in PSEUDONYM_TITLES
             )
-            names_by_identity[identity] = pseudonym, student
-    used_pseudonyms = {pseudonym for pseudonym, _ in names_by_identity.values()}
+            name_pair_by_identity[identity] = pseudonym, student
+    used_pseudonyms = {pseudonym for pseudonym, _ in name_pair_by_identity.values()}
     numbered_pseudonyms = (f"Student {number:03}" for number in itertools.count(1))
     free_pseudonyms = (
         pseudonym for pseudonym in numbered_pseudonyms if pseudonym not in used_pseudonyms
     )
-    students = {_student_identity(grade): grade.student for grade in grades}
-    new_identities = [identity for identity in students if identity not in names_by_identity]
+    students = {_identify_student(grade): grade.student for grade in grades}
+    new_identities = [identity for identity in students if identity not in name_pair_by_identity]
     random.SystemRandom().shuffle(new_identities)
     for identity in new_identities:
-        names_by_identity[identity] = next(free_pseudonyms), students[identity]
+        name_pair_by_identity[identity] = next(free_pseudonyms), students[identity]
     rows = (
         (pseudonym, identity, student)
-        for identity, (pseudonym, student) in sorted(names_by_identity.items(), key=itemgetter(1))
+        for identity, (pseudonym, student) in sorted(
+            name_pair_by_identity.items(), key=itemgetter(1)
+        )
     )
     anonymous_grades = [
-        anonymise_grade(grade, names_by_identity[_student_identity(grade)][0]) for grade in grades
+        anonymise_grade(grade, name_pair_by_identity[_identify_student(grade)][0])
+        for grade in grades
     ]
-    names_table = _spreadsheet_csv(PSEUDONYM_TITLES, rows)
+    names_table = _format_csv(PSEUDONYM_TITLES, rows)
     return sorted(anonymous_grades, key=lambda grade: grade.student), names_table
 
 
@@ -233,7 +237,7 @@ def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
             form=report.form,
             numbers=report.numbers,
             is_found_by_fault=report.is_found_by_fault,
-            form_parts=report.form_parts,
+            form_part_scores=report.form_part_scores,
         )
     return Grade(
         pseudonym,
@@ -244,17 +248,17 @@ def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
         deduction=grade.deduction,
         total=grade.total,
         max_points=grade.max_points,
-        flags=("This report is flagged.",) * bool(grade.flags),
+        flags=("This report is flagged. The reasons are in class.csv.",) * bool(grade.flags),
     )
 
 
 # ------------------------------------------------------------------ the class table
 
 
-def class_table_csv(grades: Sequence[Grade]) -> str:
+def format_class_table(grades: Sequence[Grade]) -> str:
     """Format a table with one row per student as CSV for Excel and LibreOffice."""
     item_titles, number_titles = list_titles(grades)
-    titles = (*FIRST_COLUMNS, *item_titles, *number_titles, *LAST_COLUMNS)
+    titles = (*FIRST_COLUMN_TITLES, *item_titles, *number_titles, *LAST_COLUMN_TITLES)
     rows = []
     for grade in grades:
         report = grade.counted_report
@@ -273,7 +277,7 @@ def class_table_csv(grades: Sequence[Grade]) -> str:
             *(report.numbers.get(title) if report else None for title in number_titles),
             grade.submission_time,
             None if grade.late_s is None else grade.late_s / 3600.0,
-            report.pending_reason if report else "",
+            report.pending_actions if report else "",
             grade.comment,
             LIST_SEPARATOR.join(grade.flags),
             LIST_SEPARATOR.join(other_report.submission for other_report in grade.other_reports),
@@ -281,10 +285,10 @@ def class_table_csv(grades: Sequence[Grade]) -> str:
             report.log_sha256 if report else "",
         ]
         rows.append(row)
-    return _spreadsheet_csv(titles, rows)
+    return _format_csv(titles, rows)
 
 
-def _spreadsheet_csv(titles: Sequence[str], rows: Iterable[Sequence[str | float | None]]) -> str:
+def _format_csv(titles: Sequence[str], rows: Iterable[Sequence[str | float | None]]) -> str:
     cell_rows = (
         tuple(
             neutralise_formulas(value) if isinstance(value, str) else format_cell_number(value)
@@ -302,7 +306,7 @@ def _spreadsheet_csv(titles: Sequence[str], rows: Iterable[Sequence[str | float 
 def feedback_text(grade: Grade, class_name: str = "") -> str:
     """Format points, comments and reasons for one student as text."""
     report = grade.counted_report
-    reasons = report.verification.reasons[:MAX_REASONS] if report else ()
+    reasons = report.verification.reasons[:MAX_LISTED_REASONS] if report else ()
     text = load_template("classroom/grading/feedback.j2").render(
         grade=grade,
         report=report,
@@ -344,9 +348,9 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
     title_by_index = {
         index: title
         for index, title in enumerate(sheet.column_titles)
-        if not any(READ_ONLY_MARK in row[index] for row in sheet.rows[:3])
+        if not any(READ_ONLY_TEXT in row[index] for row in sheet.rows[:3])
     }
-    grade_index = sheet.column_index(GRADE_TITLES)
+    grade_index = sheet.find_column_index(GRADE_TITLES)
     short_title_by_index = {
         index: _ASSIGNMENT_NUMBER.sub("", title) for index, title in title_by_index.items()
     }
@@ -359,8 +363,9 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         if normalise_text(column_title) in map(normalise_text, (title, short_title_by_index[index]))
     ]
     candidate_indices = assignment_indices if grade_index is None else [grade_index]
-    # a Moodle table has one grade column, so a --column without a match is for another table
-    if column_title and (matching_indices or sheet.column_index(("identifier",)) is None):
+    # a Moodle table has one grade column: if --column does not match it, the option is for another
+    # table
+    if column_title and (matching_indices or sheet.find_column_index(("identifier",)) is None):
         candidate_indices = matching_indices
     if len(candidate_indices) == 1:
         return candidate_indices[0]
@@ -378,17 +383,17 @@ def fill_grades(
     sheet: Sheet,
     grades: Sequence[Grade],
     class_list: ClassList,
-    column: str,
-    feedback: Sequence[str],
+    grade_column_title: str,
+    feedback_texts: Sequence[str],
     platform_max_points: float | None = None,
 ) -> tuple[Sheet, tuple[str, ...]]:
     """Enter grades and feedback into a copy of a table of a learning platform.
 
     Parameters
     ----------
-    grades, feedback : sequences
+    grades, feedback_texts : sequences
         Grade and feedback of each student in ``class_list``, then of unknown students.
-    column : str
+    grade_column_title : str
         Title of the grade column; "" if the table has only one.
     platform_max_points : float, optional
         Maximum points on the platform; by default those of the rubric.
@@ -405,11 +410,11 @@ def fill_grades(
         No grade column was found, or several.
     """
     grade_index, feedback_index = (
-        find_grade_column(sheet, column),
-        sheet.column_index(COMMENT_TITLES),
+        find_grade_column(sheet, grade_column_title),
+        sheet.find_column_index(COMMENT_TITLES),
     )
     format_feedback = (
-        neutralise_formulas if sheet.column_index(HTML_COMMENT_TITLES) is None else escape_html
+        neutralise_formulas if sheet.find_column_index(HTML_COMMENT_TITLES) is None else escape_html
     )
     cells_by_row = [list(row) for row in sheet.rows]
     names = [one_line(grade.student or grade.student_id, 40) for grade in grades]
@@ -419,7 +424,7 @@ def fill_grades(
     notes, found_indices = [], set()
     for row in cells_by_row:
         person = read_student(sheet, row)
-        student_index = class_list.student_index(person) if person else None
+        student_index = class_list.find_student_index(person) if person else None
         if student_index is None:
             continue
         found_indices.add(student_index)
@@ -428,7 +433,7 @@ def fill_grades(
             continue
         if platform_max_points is not None and grade.max_points:
             total_points = round(total_points * platform_max_points / grade.max_points, 2)
-        max_points = _max_points_in_table(sheet, row, grade_index)
+        max_points = _find_max_points(sheet, row, grade_index)
         if max_points is not None and total_points > max_points:
             notes.append(
                 f"{sheet.path.name}: {names[student_index]} has {total_points:.10g} points, above "
@@ -439,7 +444,7 @@ def fill_grades(
             ".", "," if has_decimal_comma else "."
         )
         if feedback_index is not None and feedback_index != grade_index:
-            row[feedback_index] = format_feedback(feedback[student_index])
+            row[feedback_index] = format_feedback(feedback_texts[student_index])
     missing_names = [
         names[index]
         for index in range(len(class_list.people))
@@ -453,11 +458,11 @@ def fill_grades(
     return replace(sheet, rows=tuple(map(tuple, cells_by_row))), tuple(notes)
 
 
-def _max_points_in_table(sheet: Sheet, row: Sequence[str], grade_index: int) -> float | None:
+def _find_max_points(sheet: Sheet, row: Sequence[str], grade_index: int) -> float | None:
     maximum_texts = (
         cells[grade_index] for cells in sheet.rows[:3] if "points possible" in cells[0].casefold()
     )
-    return parse_decimal(next(maximum_texts, sheet.cell(row, MAX_GRADE_TITLES)))
+    return parse_decimal(next(maximum_texts, sheet.find_cell(row, MAX_GRADE_TITLES)))
 
 
 def escape_html(text: str) -> str:

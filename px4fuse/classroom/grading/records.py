@@ -49,13 +49,16 @@ class VerificationRecord:
 
 
 def load_or_verify(
-    records: Path, pdf: bytes, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
+    records_folder: Path,
+    pdf: bytes,
+    path_by_sha256: Mapping[str, Path],
+    assigned_hashes: frozenset[str],
 ) -> tuple[ReportedResults, Verification, bool]:
     """Read and verify a report, or load the result of an earlier verification.
 
     Parameters
     ----------
-    records : Path
+    records_folder : Path
         Folder of earlier results.
     pdf : bytes
         Content of the submitted file.
@@ -79,10 +82,10 @@ def load_or_verify(
         The file is not a report.
     """
     sha256 = hashlib.sha256(pdf).hexdigest()
-    if loaded := _load_record(records, sha256, path_by_sha256, assigned_hashes):
+    if loaded := _load_record(records_folder, sha256, path_by_sha256, assigned_hashes):
         return *loaded, True
     results = read_report(pdf, "The file")
-    dependencies = _dependencies(to_json(results), path_by_sha256, assigned_hashes)
+    dependencies = _collect_dependencies(to_json(results), path_by_sha256, assigned_hashes)
     # the log is in the answer key but not available: the status must be "cannot verify"
     is_log_missing = dependencies.get(log_sha256(results)) == "assigned"
     verification = verify(results, pdf, {} if is_log_missing else path_by_sha256)
@@ -91,12 +94,13 @@ def load_or_verify(
         results, files[DIAGNOSIS_SUFFIX] = repeat_with_diagnosis(results, path_by_sha256)
     stored_verification = replace(verification, redrawn_pdf=b"")
     record = VerificationRecord(dependencies, to_json(results), stored_verification)
-    for old_file in records.glob(f"{sha256}.*"):
-        # keep the JSON file: another process may read it for an identical PDF
+    for old_file in records_folder.glob(f"{sha256}.*"):
+        # keep the JSON file until write_all replaces it: another process may read it now, if two
+        # students handed in the same PDF
         if old_file.suffix != ".json":
             old_file.unlink(missing_ok=True)
     files[".json"] = msgspec.json.encode(record)
-    write_all({records / f"{sha256}{suffix}": content for suffix, content in files.items()})
+    write_all({records_folder / f"{sha256}{suffix}": content for suffix, content in files.items()})
     return results, stored_verification, False
 
 
@@ -118,11 +122,11 @@ def repeat_with_diagnosis(
     return structs.replace(diagnosed_results, provenance=results.provenance), draw()
 
 
-def _dependencies(
+def _collect_dependencies(
     results: str, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
 ) -> dict[str, str]:
-    """Return the version of each library, and the availability of each input file."""
-    return _versions() | {
+    """Return the dependencies of a result: library versions, and availability of input files."""
+    return _read_versions() | {
         sha256: "available"
         if sha256 in path_by_sha256
         else "assigned"
@@ -133,19 +137,24 @@ def _dependencies(
 
 
 @cache
-def _versions() -> dict[str, str]:
+def _read_versions() -> dict[str, str]:
     versions = provenance("")
     return {**versions.libraries, "px4fuse": versions.px4fuse}
 
 
 def _load_record(
-    records: Path, sha256: str, path_by_sha256: Mapping[str, Path], assigned_hashes: frozenset[str]
+    records_folder: Path,
+    sha256: str,
+    path_by_sha256: Mapping[str, Path],
+    assigned_hashes: frozenset[str],
 ) -> tuple[ReportedResults, Verification] | None:
     """Load an earlier result; None if there is none or its dependencies have changed."""
     try:
-        content = (records / f"{sha256}.json").read_bytes()
+        content = (records_folder / f"{sha256}.json").read_bytes()
         record = msgspec.json.decode(content, type=VerificationRecord)
-        if record.dependencies != _dependencies(record.results, path_by_sha256, assigned_hashes):
+        if record.dependencies != _collect_dependencies(
+            record.results, path_by_sha256, assigned_hashes
+        ):
             return None
         results = read_results(record.results.encode())
     # an unreadable result is ignored, and the report is verified again

@@ -13,7 +13,7 @@ from msgspec import Meta
 from px4fuse.classroom.assignment.key import AnswerKey
 from px4fuse.classroom.assignment.roster import make_unique
 from px4fuse.classroom.grading.checks import (
-    OTHER_FORM_REASON,
+    FORM_MISMATCH_REASON,
     CheckInput,
     RubricItem,
     Text,
@@ -35,8 +35,8 @@ DEFAULT_RUBRIC_NAME = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000
 RUBRIC_HELP = "Write a commented example with px4fuse grade --write-rubric FILE.toml."
 
-# Numbers of a report in the table of the class: column title, and path in the results
-TABLE_NUMBERS = (
+# Columns of the class table with numbers from the reports: title, and path in the results
+CLASS_TABLE_NUMBERS = (
     ("SIGMA_A (m/s²)", "settings.sigma_a_m_s2"),
     ("SIGMA_Z (m)", "settings.sigma_z_m"),
     ("mean NIS of KF, north", "axes.north.filters.kf.nis_mean"),
@@ -53,7 +53,8 @@ if TYPE_CHECKING:
 else:
     # union of all subclasses; the field "check" in the TOML file selects the subclass
     AnyRubricItem = Union[tuple(RubricItem.__subclasses__())]  # noqa: UP007
-# Rule for the points of a report. "pending": the instructor decides
+# Rule for the points of a report. "pending": they do not count until the instructor decides;
+# "zero": no points; "count": they count
 PointsRule = Literal["pending", "zero", "count"]
 
 
@@ -63,11 +64,11 @@ class Rubric(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     Attributes
     ----------
     unverified : {"pending", "zero"}
-        Points of a report that could not be verified.
+        Rule for a report that could not be verified.
     others_log : {"pending", "zero", "count"}
-        Points of a report on the log of another student.
+        Rule for a report on the log of another student.
     pages : {"count", "pending", "zero"}
-        Points of a report whose numbers are verified, but whose pages were changed.
+        Rule for a report whose numbers are verified, but whose pages were changed.
     """
 
     title: Text = ""
@@ -109,18 +110,18 @@ def parse_rubric(text: str, source_name: str) -> Rubric:
         return msgspec.convert(tomllib.loads(text.replace("\r\n", "\n")), Rubric)
     # tomllib raises ValueError for a syntax error, and for an integer with very many digits
     except (msgspec.ValidationError, ValueError, RecursionError) as error:
-        message = re.sub(r"`\$\.item\[(\d+)\]\.?([^`]*)`", _describe_place, str(error))
+        message = re.sub(r"`\$\.item\[(\d+)\]\.?([^`]*)`", _format_item_and_field, str(error))
         raise SettingsError(f"{source_name}: {one_line(message, 300)}", RUBRIC_HELP) from error
 
 
-def _describe_place(path: re.Match[str]) -> str:
+def _format_item_and_field(path: re.Match[str]) -> str:
     """Convert the path in an error of msgspec to item number and field."""
     return f"item {int(path[1]) + 1}{f', {path[2]}' * bool(path[2])}"
 
 
 # ------------------------------------------------------------------ points
 
-OTHER_FORM_ADVICE = (
+FORM_MISMATCH_ADVICE = (
     "The answer form was made for another log. Ask for a report with the right form."
 )
 
@@ -138,19 +139,28 @@ def score_report(
     the report.
     """
     check_input = CheckInput(results, verification, key, submitter_id)
-    points_rule, reason_or_action = _points_rule(check_input, rubric)
+    points_rule, reason_or_action = _decide_points_rule(check_input, rubric)
     student, command = results.student, "loop" if isinstance(results, LoopResults) else "compare"
     graded_items = []
     for item in rubric.items:
-        if not item.applies(command, key):
+        if not item.is_applicable(command, key):
             continue
         fraction, comment = 0.0, f"No points: {reason_or_action}."
         if points_rule != "zero":
             fraction, comment = item.score(check_input)
-        awaits_points = item.by_hand and bool(student.notes.strip()) and points_rule != "zero"
+        is_awaiting_points = (
+            item.is_scored_by_instructor and bool(student.notes.strip()) and points_rule != "zero"
+        )
         points = round(item.points * min(max(fraction, 0.0), 1.0), 2)
         graded_items.append(
-            ItemScore(item.title, points, item.points, comment, item.by_hand, awaits_points)
+            ItemScore(
+                item.title,
+                points,
+                item.points,
+                comment,
+                item.is_scored_by_instructor,
+                is_awaiting_points,
+            )
         )
     form_result, values = check_input.form_points, check_input.values
     if isinstance(form_result, str) or not check_input.is_own_log:
@@ -164,21 +174,23 @@ def score_report(
         flags=(
             *flag_page_differences(verification),
             *flag_settings(results, key is not None),
-            *([] if check_input.is_own_log else [_foreign_log_advice(check_input)]),
-            *([OTHER_FORM_ADVICE] if check_input.has_form_of_other_log else []),
+            *([] if check_input.is_own_log else [_make_foreign_log_advice(check_input)]),
+            *([FORM_MISMATCH_ADVICE] if check_input.has_form_of_other_log else []),
         ),
         instructor_action=reason_or_action if points_rule == "pending" else "",
         is_found_by_fault=form_result.is_named_by_kind,
-        form_parts=form_result.parts,
+        form_part_scores=form_result.parts,
         form=check_input.form if isinstance(check_input.form, Answers) else None,
-        numbers={title: float(values[path]) for title, path in TABLE_NUMBERS if path in values},
+        numbers={
+            title: float(values[path]) for title, path in CLASS_TABLE_NUMBERS if path in values
+        },
         log_sha256=log_sha256(results),
         version=results.provenance.px4fuse,
         notes=student.notes,
     )
 
 
-def _points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, str]:
+def _decide_points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, str]:
     """Decide if the points of a report count.
 
     Return the decision, and the reason for zero points or the required action of the instructor.
@@ -198,16 +210,22 @@ def _points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, s
         )
     elif verification.page_status == "differ":
         reason_text = "pages of your PDF differ from those that px4fuse draws from the log"
-        problems.append((rubric.pages, reason_text, "Compare the pages with the redrawn report."))
+        problems.append(
+            (
+                rubric.pages,
+                reason_text,
+                "Compare the pages with the report that px4fuse drew from the log.",
+            )
+        )
     if not check_input.is_own_log:
         reason_text = "your report is not about the log that you were given"
-        problems.append((rubric.others_log, reason_text, _foreign_log_advice(check_input)))
+        problems.append((rubric.others_log, reason_text, _make_foreign_log_advice(check_input)))
     if check_input.has_form_of_other_log:
-        problems.append(("pending", OTHER_FORM_REASON, OTHER_FORM_ADVICE))
+        problems.append(("pending", FORM_MISMATCH_REASON, FORM_MISMATCH_ADVICE))
     if check_input.key is not None and getattr(check_input.results.request, "position", None):
         action = (
-            "Ask for the origin of the position file (--position): the assignment contains no "
-            "position files."
+            "Ask where the position file (--position) is from: the assignment contains no position "
+            "files."
         )
         problems.append(("pending", "", action))
     for rule, reason_text, _ in problems:
@@ -217,16 +235,18 @@ def _points_rule(check_input: CheckInput, rubric: Rubric) -> tuple[PointsRule, s
     return ("pending", action) if action else ("count", "")
 
 
-def _foreign_log_advice(check_input: CheckInput) -> str:
+def _make_foreign_log_advice(check_input: CheckInput) -> str:
     """Return the action of the instructor for a report on the log of another student."""
     student_id = shorten_text(check_input.results.student.id)
     id_text = f"the id in the report is {student_id}" if student_id else "the report has no id"
     if check_input.submitter_id:
         id_text += f", and {shorten_text(check_input.submitter_id)} submitted the report"
     if check_input.right_answers is None:
-        return "The report is not about a log of the answer key. Ask for a report on that log."
-    given_to = shorten_text(check_input.right_answers.student_id)
-    return f"Ask who wrote the report: its log was assigned to student {given_to}, but {id_text}."
+        return "The log of the report is not in the answer key. Ask for a report on the given log."
+    assigned_id = shorten_text(check_input.right_answers.student_id)
+    return (
+        f"Ask who wrote the report: its log was assigned to student {assigned_id}, but {id_text}."
+    )
 
 
 def grade_unreadable(
@@ -238,6 +258,6 @@ def grade_unreadable(
     graded_items = tuple(
         ItemScore(item.title, 0.0, item.points, comment)
         for item in items
-        if item.applies("compare", key)
+        if item.is_applicable("compare", key)
     )
     return GradedReport("", "", "", verification, graded_items, instructor_action=remedy)

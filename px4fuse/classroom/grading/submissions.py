@@ -42,7 +42,6 @@ from px4fuse.errors import ResultsError, SettingsError
 from px4fuse.verification.model import BAD_VALUE_ERRORS
 from px4fuse.verification.pdf_input import MAX_PDF_BYTES
 
-# Maximum number of entries of a submitted zip file
 MAX_ZIP_ENTRIES = 10_000
 # Maximum size (bytes) of the central directory of a zip file; zipfile reads it into memory
 MAX_DIRECTORY_BYTES = 4_000_000
@@ -69,13 +68,13 @@ PLATFORMS = {
     name: re.compile(pattern)
     for name, pattern in read_toml(__file__, dict[str, str], "platforms.toml").items()
 }
-# Texts that a platform writes once into a path: a second one was written by the student
-_PLATFORM_NAMES = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
+# Parts of a path that a learning platform writes once: the student wrote a second one
+_PLATFORM_NAME_PATTERN = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
 BLACKBOARD_TIME_FORMAT = "%Y-%m-%d-%H-%M-%S"
-_SUBMISSION_BLOCK = re.compile(
+_SUBMISSION_PATTERN = re.compile(
     r"^(?:submission_)?(\d+)(?:\.pdf)?:\s*\n((?:[ -].*\n?)*)", re.MULTILINE
 )
-_SUBMITTERS_BLOCK = re.compile(r"^  :submitters:\s*\n((?:  - .*\n?|    .*\n?)*)", re.MULTILINE)
+_SUBMITTERS_PATTERN = re.compile(r"^  :submitters:\s*\n((?:  - .*\n?|    .*\n?)*)", re.MULTILINE)
 
 
 class _EntryError(Exception):
@@ -83,11 +82,11 @@ class _EntryError(Exception):
 
 
 _BROKEN_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError)
-# BAD_VALUE_ERRORS includes NotImplementedError (a RuntimeError), which zipfile raises
-_UNREADABLE_ERRORS = (_EntryError, *_BROKEN_ZIP_ERRORS, *BAD_VALUE_ERRORS)
+# BAD_VALUE_ERRORS contains RuntimeError, and so the NotImplementedError of zipfile
+_UNREADABLE_FILE_ERRORS = (_EntryError, *_BROKEN_ZIP_ERRORS, *BAD_VALUE_ERRORS)
 
 
-def _unread_reason(error: Exception) -> str:
+def _format_unread_reason(error: Exception) -> str:
     if isinstance(error, _EntryError):
         return str(error)
     reason = error.strerror if isinstance(error, OSError) and error.strerror else "damaged"
@@ -120,15 +119,17 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
     origin_by_submission_number: dict[str, ExportOrigin] = {}
     ignored_names, zip_count = list[str](), 0
     for path in paths:
-        is_export = path.is_file() and path.name.lower().endswith(".zip")
-        for submission in (_zip_submissions if is_export else _folder_submissions)(path, notes):
+        is_zip = path.is_file() and path.name.lower().endswith(".zip")
+        for submission in (_list_zip_submissions if is_zip else _list_folder_submissions)(
+            path, notes
+        ):
             add_input(submission.file)
             suffix = submission.name.lower()[-4:]
             if suffix in (".pdf", ".zip"):
                 submission_by_path.setdefault((submission.file, submission.zip_entry), submission)
                 zip_count += suffix == ".zip"
             elif not _is_gradescope_metadata(submission.name):
-                ignored_names.append(_short_name(submission.name))
+                ignored_names.append(_shorten_name(submission.name))
             else:
                 try:
                     text = read_submission(submission).decode("utf-8", errors="replace")
@@ -153,32 +154,34 @@ def find_submissions(paths: Sequence[Path]) -> tuple[tuple[Submission, ...], tup
             submission.zip_entry,
         ),
     )
-    names = make_unique(_short_name(submission.name) for submission in submissions)
+    names = make_unique(_shorten_name(submission.name) for submission in submissions)
     named_submissions = [
         replace(submission, name=name) for submission, name in zip(submissions, names, strict=True)
     ]
-    return tuple(add_origins(named_submissions, origin_by_submission_number)), tuple(notes)
+    return tuple(add_submitters(named_submissions, origin_by_submission_number)), tuple(notes)
 
 
-def add_origins(
+def add_submitters(
     submissions: Sequence[Submission], origin_by_submission_number: Mapping[str, ExportOrigin]
 ) -> Iterator[Submission]:
-    """Add student and learning platform to submissions.
+    """Add student and learning platform, found in the file names, to submissions.
 
-    The platform is the same for all files of a zip file or folder: the one that matches most file
-    names. So a student cannot imitate the file names of another platform.
-    ``origin_by_submission_number`` contains students and times of Gradescope.
+    All files of a zip file or folder have one platform, whose pattern matches most file names. So a
+    student cannot imitate the file names of another platform. ``origin_by_submission_number``
+    contains students and times from the metadata of Gradescope, which replace those in file names.
     """
-    exports = [
+    export_names = [
         submission.file if submission.zip_entry else submission.name.partition("/")[0]
         for submission in submissions
     ]
     platform_counts: dict[object, Counter[str]] = defaultdict(Counter)
-    for export, submission in zip(exports, submissions, strict=True):
-        platform_counts[export].update(filter(None, [parse_origin(submission.name).platform]))
-    for export, submission in zip(exports, submissions, strict=True):
-        platforms = [platform for platform, _ in platform_counts[export].most_common(1)]
-        origin = parse_origin(submission.name, platforms)
+    for export_name, submission in zip(export_names, submissions, strict=True):
+        platform_counts[export_name].update(
+            filter(None, [parse_submission_path(submission.name).platform])
+        )
+    for export_name, submission in zip(export_names, submissions, strict=True):
+        platforms = [platform for platform, _ in platform_counts[export_name].most_common(1)]
+        origin = parse_submission_path(submission.name, platforms)
         if origin.platform in ("gradescope", ""):
             # Gradescope exports PDFs as SUBMISSION_NUMBER.pdf
             stem = submission.name.rpartition("/")[2].casefold().removesuffix(".pdf")
@@ -205,9 +208,9 @@ def read_submission(submission: Submission) -> bytes:
                 content = file.read(MAX_PDF_BYTES + 1)
         if len(content) > MAX_PDF_BYTES:
             raise _EntryError(_TOO_LARGE_REASON)
-    except _UNREADABLE_ERRORS as error:
+    except _UNREADABLE_FILE_ERRORS as error:
         name = one_line(submission.name, MAX_NAME_LENGTH)
-        raise ResultsError(f"{name}: {_unread_reason(error)}") from error
+        raise ResultsError(f"{name}: {_format_unread_reason(error)}") from error
     return content
 
 
@@ -240,7 +243,7 @@ def _open_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
         yield archive
 
 
-def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
+def _list_zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
     """Return the files in a zip file; for an unreadable zip file, add a note and return []."""
     try:
         with path.open("rb") as file, _open_zip(file) as archive:
@@ -250,19 +253,19 @@ def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
             raise _EntryError(
                 f"the zip file unpacks to more than {MAX_UNPACKED_BYTES // 10**9} GB."
             )
-    except _UNREADABLE_ERRORS as error:
-        notes.append(f"{_short_name(path.name)} was ignored: {_unread_reason(error)}")
+    except _UNREADABLE_FILE_ERRORS as error:
+        notes.append(f"{_shorten_name(path.name)} was ignored: {_format_unread_reason(error)}")
         return []
     last_entry_by_name = {entry.filename: entry for entry in entries}
     if len(entries) > len(last_entry_by_name):
         (name, _), *_ = Counter(entry.filename for entry in entries).most_common(1)
         raise SettingsError(
-            f"{_short_name(path.name)} contains two files with the name {_short_name(name)}: a "
+            f"{_shorten_name(path.name)} contains two files with the name {_shorten_name(name)}: a "
             "student may have added one of them.",
             "Export the submissions again.",
         )
     submissions = (
-        Submission(path.resolve(), name, _entry_label(entry), _entry_time(entry))
+        Submission(path.resolve(), name, _make_entry_label(entry), _read_entry_time(entry))
         for name, entry in last_entry_by_name.items()
     )
     return [
@@ -272,7 +275,7 @@ def _zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
     ]
 
 
-def _folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
+def _list_folder_submissions(path: Path, notes: list[str]) -> Iterator[Submission]:
     """Yield the regular files of a folder and its subfolders, except hidden files."""
     if path.is_file():
         yield Submission(path.resolve(), "", path.name)
@@ -305,7 +308,7 @@ def _is_hidden(name: str) -> bool:
     return name.startswith(".") or name == "__MACOSX"
 
 
-def _entry_time(entry: zipfile.ZipInfo) -> datetime | None:
+def _read_entry_time(entry: zipfile.ZipInfo) -> datetime | None:
     """Return the time of a zip entry (unknown time zone), or None."""
     try:
         time = datetime(*entry.date_time)
@@ -314,7 +317,7 @@ def _entry_time(entry: zipfile.ZipInfo) -> datetime | None:
     return time if time.year > ZIP_EPOCH_YEAR else None
 
 
-def _entry_label(entry: zipfile.ZipInfo) -> str:
+def _make_entry_label(entry: zipfile.ZipInfo) -> str:
     """Return the path of a zip entry without ``.``, ``..`` and drive letters, for messages."""
     name = entry.filename
     if not entry.flag_bits & _UTF8_FLAG:
@@ -351,7 +354,7 @@ def _read_entry(archive: zipfile.ZipFile, name: str) -> bytes:
     return archive.read(entry)
 
 
-def _short_name(name: str) -> str:
+def _shorten_name(name: str) -> str:
     short_name = " ".join(clean_text(name[-10 * MAX_NAME_LENGTH :]).split())
     if len(short_name) > MAX_NAME_LENGTH:
         half_length = MAX_NAME_LENGTH // 2
@@ -362,16 +365,16 @@ def _short_name(name: str) -> str:
 # ------------------------------------------------------------------ student and time in exports
 
 
-def parse_origin(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportOrigin:
+def parse_submission_path(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportOrigin:
     """Return student and submission time from a file path that a learning platform wrote.
 
-    >>> parse_origin("Doe Jane_4711_assignsubmission_file_/report.pdf").person.name
+    >>> parse_submission_path("Doe Jane_4711_assignsubmission_file_/report.pdf").person.name
     'Doe Jane'
-    >>> parse_origin("doejane_LATE_12345_67890_report-1.pdf").person.numbers
+    >>> parse_submission_path("doejane_LATE_12345_67890_report-1.pdf").person.numbers
     {'canvas': '12345'}
-    >>> parse_origin("Lab 3_jdoe_attempt_2026-11-20-12-34-56_report.pdf").time
+    >>> parse_submission_path("Lab 3_jdoe_attempt_2026-11-20-12-34-56_report.pdf").time
     datetime.datetime(2026, 11, 20, 12, 34, 56)
-    >>> parse_origin("report.pdf") == ExportOrigin()
+    >>> parse_submission_path("report.pdf") == ExportOrigin()
     True
     """
     remaining_path = name
@@ -384,14 +387,14 @@ def parse_origin(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> Expo
             time_text = name_parts.get("time", "")
             try:
                 time = datetime.strptime(time_text, BLACKBOARD_TIME_FORMAT) if time_text else None
-            except ValueError:  # a platform writes only valid times
+            except ValueError:  # not written by a platform, which writes valid times only
                 continue
             person_names = (name_parts.get(key) for key in ("name", "first", "last"))
             numbers = {platform: name_parts["number"]} if "number" in name_parts else {}
             full_name, login = " ".join(filter(None, person_names)), name_parts.get("login", "")
             person = Person("", full_name, "", login, numbers)
-            expected_count = platform in ("moodle", "blackboard")
-            is_imitated = len(_PLATFORM_NAMES.findall(name)) > expected_count
+            expected_name_count = platform in ("moodle", "blackboard")
+            is_imitated = len(_PLATFORM_NAME_PATTERN.findall(name)) > expected_name_count
             return ExportOrigin(platform, person, time, bool(name_parts.get("late")), is_imitated)
         remaining_path = remaining_path.partition("/")[2]
     return UNKNOWN_SUBMITTER
@@ -408,19 +411,19 @@ def read_gradescope_metadata(text: str) -> dict[str, ExportOrigin]:
     '12'
     """
     origins = {}
-    for number, block in _SUBMISSION_BLOCK.findall(text.replace("\r\n", "\n")):
-        submitters = _SUBMITTERS_BLOCK.search(block)
+    for number, block in _SUBMISSION_PATTERN.findall(text.replace("\r\n", "\n")):
+        submitters_match = _SUBMITTERS_PATTERN.search(block)
         name, student_id, email = (
-            _yaml_value(submitters[1] if submitters else "", rf"  (?:- |  ):{key}")
+            _read_yaml_value(submitters_match[1] if submitters_match else "", rf"  (?:- |  ):{key}")
             for key in ("name", "sid", "email")
         )
         person = Person(student_id, name, email, "", {"gradescope": number})
-        time = _parse_time(_yaml_value(block, "  :created_at"))
+        time = _parse_time(_read_yaml_value(block, "  :created_at"))
         origins[number] = ExportOrigin("gradescope", person, time)
     return origins
 
 
-def _yaml_value(block: str, key: str) -> str:
+def _read_yaml_value(block: str, key: str) -> str:
     match = re.search(rf"^{key}: *(['\"]?)(.*)\1 *$", block, re.MULTILINE)
     return match[2] if match else ""
 
