@@ -80,7 +80,7 @@ def trial(
 def test_wrong_noise_severity_depends_on_ratio_to_estimate(
     chosen: float, estimate: Noise, expected: Any
 ) -> None:
-    off = noises.setting_deviation("sigma_z_m", chosen, estimate)
+    off = noises.find_setting_deviation("sigma_z_m", chosen, estimate)
     if off is None or expected is None:
         assert off is expected
         return
@@ -103,7 +103,7 @@ SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m":
         # a re-run that improves nothing: the other setting is the cause
         ((trial(SIGMA_A_TO_0_1, 9.0),),
          [("sigma_z_too_large", "warning", "Compare this run with one that has --sigma-z 0.5."),
-          ("sigma_a_too_large", "note", noises.NO_IMPROVEMENT)]),
+          ("sigma_a_too_large", "note", noises.NO_IMPROVEMENT_ACTION)]),
     ],
 )  # fmt: skip
 def test_wrong_noise_report_recommends_noise_of_better_rerun(trials: Any, expected: Any) -> None:
@@ -119,8 +119,8 @@ def test_wrong_noise_report_recommends_noise_of_better_rerun(trials: Any, expect
     ("nis_mean", "rmse_m", "expected"),
     [
         (0.78, None, ("error", "Compare this run with one that has --sigma-a 0.1.")),
-        (0.78, 0.3, ("note", noises.NO_IMPROVEMENT)),
-        (0.5, None, ("note", noises.NO_IMPROVEMENT)),
+        (0.78, 0.3, ("note", noises.NO_IMPROVEMENT_ACTION)),
+        (0.5, None, ("note", noises.NO_IMPROVEMENT_ACTION)),
     ],
 )
 def test_noise_error_remains_if_kf_was_consistent_before_rerun(
@@ -269,14 +269,14 @@ def test_smaller_noise_on_odometry_is_not_recommended() -> None:
         finding = only(
             noises.detect_inconsistent_variances, analysis(axes=(kf(nis),), source=ODOMETRY)
         )
-        assert (finding.remedy == noises.KEEP_NOISES_DRIFT) is is_kept
+        assert (finding.remedy == noises.KEEP_NOISE_ACTION_DRIFT) is is_kept
         assert finding.severity == level
     for owner, there in (("kf", True), ("ekf2", False)):
         worse = {owner: statement(), f"{owner}_truth": against_truth(9.0)}
         finding = only(
             noises.detect_inconsistent_variances, analysis(axes=(kf(0.2), axis("east", **worse)))
         )
-        assert (finding.remedy == noises.KEEP_NOISES_TRUTH) is there
+        assert (finding.remedy == noises.KEEP_NOISE_ACTION_TRUTH) is there
         assert finding.evidence["cause"] == "elsewhere"
 
 
@@ -345,7 +345,7 @@ def test_filter_rerun_without_improvement_is_not_recommended() -> None:
     change = {"sigma_z_m": 2.0}
     for after, action in (
         (1.0, "Set SIGMA_Z to 2 m (--sigma-z 2)."),
-        (9.0, noises.UNEXPLAINED_SIGMA),
+        (9.0, noises.UNEXPLAINED_SIGMA_ACTION),
     ):
         one = analysis(axes=(kf(9.0),), tuning=tuned(), trials=(
             tried("kf", change), trial(change, after), trial(change, 9.0, "ekf2")))  # fmt: skip
@@ -357,9 +357,12 @@ def test_inconsistent_filter_without_cause_recommends_a_check() -> None:
               tried("kf", {"sigma_z_m": 2.0}, "east"))  # fmt: skip
     one = analysis(axes=(kf(9.0),), trials=causes, tuning=tuned())
     finding = only(noises.detect_inconsistent_variances, one)
-    assert (finding.evidence["cause"], finding.remedy) == ("elsewhere", noises.UNEXPLAINED_SIGMA)
+    assert (finding.evidence["cause"], finding.remedy) == (
+        "elsewhere",
+        noises.UNEXPLAINED_SIGMA_ACTION,
+    )
     unknown = only(noises.detect_inconsistent_variances, analysis(axes=(kf(9.0),)))
-    assert unknown.remedy == noises.UNKNOWN_NOISE
+    assert unknown.remedy == noises.UNKNOWN_NOISE_ACTION
 
 
 def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
@@ -367,7 +370,7 @@ def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
     contradicted = replace(contradicted, after=replace(contradicted.after, nees_mean=4.0))
     one = analysis(axes=(kf(0.2),), trials=(contradicted,))
     finding = only(noises.detect_inconsistent_variances, one)
-    assert (finding.remedy, finding.severity) == (noises.KEEP_NOISES_TRUTH, "note")
+    assert (finding.remedy, finding.severity) == (noises.KEEP_NOISE_ACTION_TRUTH, "note")
     assert finding.evidence["cause"] == "elsewhere"
 
 

@@ -240,7 +240,7 @@ def detected(flight: Flight) -> tuple[Finding, ...]:
     analysis = unexplained(compare(flight))
     detectors = (source_values, source_stamps, source_intervals, ekf2_not_fusing)
     findings = [one for detector in detectors for one in detector.detect(analysis)]
-    return group_by_cause(source_convention.apply_convention(analysis, findings))
+    return group_by_cause(source_convention.remove_convention_effects(analysis, findings))
 
 
 def examples() -> Iterator[Finding]:
@@ -307,7 +307,7 @@ def test_two_position_senders_hide_reports_of_their_effects():
         finding("error", name, "m.", "r.")
         for name in ("ekf2_not_fusing", "source_outliers", "source_two_senders", "imu_gap")
     ]
-    left = source_convention.apply_convention(analysis, findings)
+    left = source_convention.remove_convention_effects(analysis, findings)
     assert [one.id for one in left] == ["source_two_senders", "ekf2_not_fusing", "imu_gap"]
     assert left[1].caused_by == "source_two_senders"
 

@@ -32,15 +32,15 @@ from px4fuse.flight.model import (
 )
 
 # The severity is error if EKF2 fuses the positions for a smaller fraction of the time
-MIN_FUSED_FRACTION_ERROR = 0.5
+FUSED_FRACTION_FOR_ERROR = 0.5
 # The severity is warning if EKF2 fuses the positions for a smaller fraction of the time
-MIN_FUSED_FRACTION_WARNING = 0.98
+FUSED_FRACTION_FOR_WARNING = 0.98
 # Minimum interval (s) between positions that jitter can increase above EV_START_INTERVAL_S
-MIN_LIMITING_INTERVAL_S = 0.18
+MIN_LATE_START_INTERVAL_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
 # Minimum distance (m) of EKF2's invalid position from ground truth or position source, for a
 # finding
-MIN_INVALID_DISTANCE_M = 1.0
+MIN_INVALID_POSITION_ERROR_M = 1.0
 
 
 def detect(analysis: Comparison) -> Findings:
@@ -52,14 +52,14 @@ def detect(analysis: Comparison) -> Findings:
 
 
 def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
-    ekf2, source = analysis.flight.ekf2, _received_source(analysis)
+    ekf2, source = analysis.flight.ekf2, _find_received_source(analysis)
     if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusion_flags, Unavailable):
         return
     fusion_flag = ekf2.fusion_flags["horizontal"]
     fused_fraction = fraction_of_ones(fusion_flag, analysis.segment)
-    if fused_fraction >= MIN_FUSED_FRACTION_ERROR:
+    if fused_fraction >= FUSED_FRACTION_FOR_ERROR:
         yield from _detect_slow_restart(analysis, ekf2, fusion_flag)
-    if source is None or fused_fraction >= MIN_FUSED_FRACTION_WARNING:
+    if source is None or fused_fraction >= FUSED_FRACTION_FOR_WARNING:
         return
     positions, aid = positions_phrase(source), source.origin.aid
     evidence: dict[str, float | str] = {
@@ -92,7 +92,7 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
     message = (
         f"{title}{unmet_condition.fault and ': '}{unmet_condition.fault}. {unmet_condition.reason}"
     )
-    if fused_fraction < MIN_FUSED_FRACTION_ERROR:
+    if fused_fraction < FUSED_FRACTION_FOR_ERROR:
         is_disabled_gnss = source.origin.fused_as_gnss and unmet_condition.condition == "switch"
         yield finding(
             "note" if is_disabled_gnss else "error",
@@ -113,7 +113,7 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
         )
 
 
-def _received_source(analysis: PreparedComparison) -> PositionTrack | None:
+def _find_received_source(analysis: PreparedComparison) -> PositionTrack | None:
     """Return the track of the positions that PX4 received, without those of a position file."""
     if analysis.source.origin != POSITION_FILE:
         return analysis.source
@@ -126,11 +126,11 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     if is_valid is None or is_valid.empty:
         return
     invalid_fraction = 1.0 - fraction_of_ones(is_valid, analysis.segment)
-    if invalid_fraction <= 1.0 - MIN_FUSED_FRACTION_WARNING:
+    if invalid_fraction <= 1.0 - FUSED_FRACTION_FOR_WARNING:
         return
     spans = spans_with_value(0.0, is_valid, analysis.segment)
-    distance_m = _largest_distance_m(analysis, ekf2, spans)
-    if distance_m < MIN_INVALID_DISTANCE_M:
+    distance_m = _find_largest_distance_m(analysis, ekf2, spans)
+    if distance_m < MIN_INVALID_POSITION_ERROR_M:
         return
     reference = "ground truth" if isinstance(analysis.flight.truth, Truth) else "source"
     distance_sentence = (
@@ -139,7 +139,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     if not np.isfinite(distance_m):
         distance_sentence = ""
     yield finding(
-        "error" if invalid_fraction > MIN_FUSED_FRACTION_ERROR else "warning",
+        "error" if invalid_fraction > FUSED_FRACTION_FOR_ERROR else "warning",
         "ekf2_position_invalid",
         f"EKF2's horizontal position is invalid {format_percent(invalid_fraction)} of the time "
         f"(xy_valid 0), and PX4 does not use it.{distance_sentence}",
@@ -150,7 +150,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     )
 
 
-def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...]) -> float:
+def _find_largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...]) -> float:
     """Return EKF2's largest horizontal distance (m) from ground truth or source in time spans."""
     truth, columns = analysis.flight.truth, ["north_m", "east_m"]
     reference = truth.samples if isinstance(truth, Truth) else analysis.source.samples
@@ -173,7 +173,7 @@ def _detect_slow_restart(
         or not source.origin.is_vision
         or not source.origin.has_all_samples
         or source.alignment
-        or 1.0 / rate_hz < MIN_LIMITING_INTERVAL_S
+        or 1.0 / rate_hz < MIN_LATE_START_INTERVAL_S
     ):
         return
     time_s = source.samples.index.to_numpy()

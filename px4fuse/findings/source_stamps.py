@@ -27,13 +27,13 @@ from px4fuse.flight.model import (
 # Jitter of receive times is reported above this value (s): a position error of 1 cm at 1 m/s
 MAX_RECEIPT_JITTER_S = 0.010
 # A timestamp is an arrival time if PX4 publishes the position within this time (s) after it
-MAX_ARRIVAL_AGE_S = 0.001
+MAX_ARRIVAL_TIME_AGE_S = 0.001
 # Minimum latency (s) for a warning: a position error of 2 cm at 1 m/s
 MIN_LATENCY_S = 0.02
 # Minimum latency (s) for severity error: a position error of 10 cm at 1 m/s
-MIN_LATENCY_ERROR_S = 0.10
+MIN_LATENCY_FOR_ERROR_S = 0.10
 # The latency grows in flight if its rank correlation with time exceeds this value
-MIN_LATENCY_TREND = 0.8
+MIN_LATENCY_CORRELATION = 0.8
 # Minimum fraction of positions that EKF2 drops because of their latency, for a finding
 MIN_DROPPED_FRACTION = 0.02
 # Minimum number of positions before the convergence of TIMESYNC, and also after it
@@ -42,12 +42,12 @@ MIN_SAMPLES = 10
 # times afterwards
 MIN_CONSISTENT_FRACTION = 0.95
 # Minimum mean number of positions that arrive together (burst)
-MIN_BURST_SIZE = 2.5
+MIN_POSITIONS_PER_BURST = 2.5
 # Minimum number of bursts. With fewer bursts, the pauses are gaps in the position source
 MIN_BURST_COUNT = 20
 # Maximum duration of a burst / pause between bursts
 MAX_BURST_DURATION_RATIO = 0.3
-ANSWER_TIMESYNC = (
+ANSWER_TIMESYNC_ACTION = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
     "every request). Send positions only after 500 answers, which take 50 s at 10 Hz."
 )
@@ -56,7 +56,7 @@ ANSWER_TIMESYNC = (
 def detect(analysis: Analysis) -> Findings:
     clock, positions = analysis.source.clock_map, positions_phrase(analysis.source)
     if clock is None:
-        yield from detect_arrival_times(analysis)
+        yield from detect_arrival_timestamps(analysis)
         yield from detect_varying_latency(analysis)
     elif clock.note == REPEATED_TIMESTAMPS and clock.distinct_stamps:
         yield from detect_shared_timestamps(analysis, clock.pairs, clock.distinct_stamps)
@@ -77,7 +77,7 @@ def detect(analysis: Analysis) -> Findings:
             "companion_not_synchronised",
             f"The source of the {positions} never synchronised its clock (TIMESYNC). EKF2 used "
             f"arrival times as times of measurement. {kf_times_sentence}",
-            ANSWER_TIMESYNC,
+            ANSWER_TIMESYNC_ACTION,
             {"jitter_s": clock.jitter_s},
         )
 
@@ -89,8 +89,11 @@ def detect_bursts(analysis: Analysis) -> Findings:
     if np.count_nonzero(is_pause) < MIN_BURST_COUNT:
         return
     burst_size, pause_s = 1.0 / float(is_pause.mean()), float(np.median(intervals_s[is_pause]))
-    burst_s = burst_size * float(np.median(intervals_s[~is_pause]))
-    if burst_size < MIN_BURST_SIZE or burst_s > MAX_BURST_DURATION_RATIO * pause_s:
+    burst_duration_s = burst_size * float(np.median(intervals_s[~is_pause]))
+    if (
+        burst_size < MIN_POSITIONS_PER_BURST
+        or burst_duration_s > MAX_BURST_DURATION_RATIO * pause_s
+    ):
         return
     yield error(
         "source_timestamp_jitter",
@@ -134,14 +137,14 @@ def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
             f"EKF2 never fused the positions, because it treats them as "
             f"{AGE_BY_WRONG_TIMESTAMP[clock]}. "
         )
-    is_unix = clock.startswith("UNIX") or clock == "another clock"
+    is_other_clock = clock.startswith("UNIX") or clock == "another clock"
     yield error(
         "source_timestamp_unit",
         f"The timestamps of the {positions_phrase(analysis.source)} are "
         f"{'0 in every message' if clock == '0' else f'in {clock}'}. PX4 expects timestamp_sample "
         f"in microseconds since the autopilot's boot. {fusion_sentence}px4fuse uses the arrival "
         "times, which are late by the latency.",
-        SYNCHRONISE_ACTION if is_unix else SET_TIMESTAMP_ACTION,
+        SYNCHRONISE_ACTION if is_other_clock else SET_TIMESTAMP_ACTION,
         {"clock": clock},
     )
 
@@ -168,19 +171,19 @@ def detect_constant_timestamps(positions: str, clock: ClockMap, distinct_count: 
         )
 
 
-def detect_arrival_times(analysis: Analysis) -> Findings:
+def detect_arrival_timestamps(analysis: Analysis) -> Findings:
     """Detect timestamps that are arrival times instead of times of measurement.
 
     Without TIMESYNC, PX4 uses the arrival time as timestamp (Timesync.cpp). The age of a position
     when PX4 publishes it is then zero instead of the latency.
     """
-    position_age_s = _position_age_s(analysis)
+    position_age_s = _find_position_age_s(analysis)
     if position_age_s is None:
         return
     synchronisation = find_synchronisation(analysis)
     if synchronisation is not None:
         until_s, latency_s = synchronisation
-        make_finding = error if latency_s >= MIN_LATENCY_ERROR_S else warning
+        make_finding = error if latency_s >= MIN_LATENCY_FOR_ERROR_S else warning
         airborne = analysis.flight.airborne
         if not isinstance(airborne, Unavailable) and all(start >= until_s for start, _ in airborne):
             make_finding = note
@@ -195,19 +198,19 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
             {"until_s": until_s, "latency_s": latency_s},
             ((float(position_age_s.index[0]), until_s),),
         )
-    elif np.mean(position_age_s.abs() < MAX_ARRIVAL_AGE_S) >= MIN_CONSISTENT_FRACTION:
+    elif np.mean(position_age_s.abs() < MAX_ARRIVAL_TIME_AGE_S) >= MIN_CONSISTENT_FRACTION:
         yield warning(
             "source_timestamps_are_arrival_times",
             "Position timestamps are arrival times in the whole flight. The source was never "
             "synchronised with the autopilot (TIMESYNC), so every position is late by its latency.",
-            ANSWER_TIMESYNC,
+            ANSWER_TIMESYNC_ACTION,
             {"until_s": float(position_age_s.index[-1])},
         )
 
 
 def detect_varying_latency(analysis: Analysis) -> Findings:
     """Detect positions that arrive later and later, or too late for EKF2's buffer."""
-    position_age_s = _position_age_s(analysis)
+    position_age_s = _find_position_age_s(analysis)
     if position_age_s is None or find_synchronisation(analysis) is not None:
         return
     sample_count = max(MIN_SAMPLES, len(position_age_s) // 10)
@@ -216,7 +219,9 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
         for age_s in (position_age_s.iloc[:sample_count], position_age_s.iloc[-sample_count:])
     )
     change_text = "grows in flight"
-    trend = rank_correlation(position_age_s.index.to_numpy(), position_age_s.to_numpy())
+    latency_correlation = rank_correlation(
+        position_age_s.index.to_numpy(), position_age_s.to_numpy()
+    )
     ekf2, buffer_sentence, dropped_fraction = analysis.flight.ekf2, "", 0.0
     if isinstance(ekf2, Ekf2) and isinstance(ekf2.horizon_s, float):
         delay_s = 1e-3 * analysis.flight.log.parameters.get(EV_POS.delay, 0.0)
@@ -226,7 +231,7 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
             f" EKF2 drops positions that arrive later than {limit_s:.2f} s (here "
             f"{format_percent(dropped_fraction)})."
         )
-    if end_s - start_s < MIN_LATENCY_ERROR_S or trend < MIN_LATENCY_TREND:
+    if end_s - start_s < MIN_LATENCY_FOR_ERROR_S or latency_correlation < MIN_LATENCY_CORRELATION:
         if not MIN_DROPPED_FRACTION < dropped_fraction < 1.0 - MIN_DROPPED_FRACTION:
             return
         change_text = "varies"
@@ -243,15 +248,15 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
 
 def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
     """Find the time (s) at which TIMESYNC converged in flight, and the position latency (s)."""
-    position_age_s = _position_age_s(analysis)
+    position_age_s = _find_position_age_s(analysis)
     if position_age_s is None:
         return None
-    is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
+    is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_TIME_AGE_S).to_numpy()
     # For each position: number of timestamps that contradict a convergence of TIMESYNC after it
-    contradicting_count: Array = (
+    inconsistent_count: Array = (
         np.cumsum(~is_arrival_time) + np.sum(is_arrival_time) - np.cumsum(is_arrival_time)
     )
-    converged_index = int(np.argmin(contradicting_count)) + 1
+    converged_index = int(np.argmin(inconsistent_count)) + 1
     if (
         np.mean(is_arrival_time) >= MIN_CONSISTENT_FRACTION
         or min(converged_index, len(position_age_s) - converged_index) < MIN_SAMPLES
@@ -266,7 +271,7 @@ def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
     return float(position_age_s.index[converged_index]), latency_s
 
 
-def _position_age_s(analysis: Analysis) -> pd.Series | None:
+def _find_position_age_s(analysis: Analysis) -> pd.Series | None:
     """Return the age (s) of each position at its publication, from timestamp_sample.
 
     Return None if the log does not contain it.
