@@ -43,7 +43,14 @@ from px4fuse.diagnose import find_faults  # noqa: E402
 from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
-from px4fuse.findings import TITLES, Finding, find, find_aid_findings, find_loop_findings, source_frame  # noqa: E402
+from px4fuse.findings import (  # noqa: E402
+    TITLES,
+    Finding,
+    find,
+    find_aid_findings,
+    find_loop_findings,
+    source_frame,
+)
 from px4fuse.findings.cause_grouping import CONSEQUENCES, effect_ids  # noqa: E402
 from px4fuse.findings.model import CATALOGUE, FINDING_GROUPS, load_examples  # noqa: E402
 from px4fuse.flight.model import Columns  # noqa: E402
@@ -161,7 +168,9 @@ def examples() -> dict[str, Example]:
     ):
         loop_options = {**options, "source": f"{ROOT}/{options['source']}"}
         command = f"px4fuse loop {options['source']} {drift_option}".strip()
-        add_examples(find_loop_findings(px4fuse.close_loop(**loop_options)), f"the result of `{command}`")
+        add_examples(
+            find_loop_findings(px4fuse.close_loop(**loop_options)), f"the result of `{command}`"
+        )
     add_examples(convention_examples(), "a simulated loop flight with changed positions")
     add_examples(value_examples(), "a simulated test flight")
     _, odometry = laps(3, 5, OdometryNoise())
@@ -170,7 +179,8 @@ def examples() -> dict[str, Example]:
     add_examples(findings, "simulated odometry of three laps")
     _, odometry = laps(3, 5, OdometryNoise(5.0, 20.0))
     add_examples(
-        find_loop_findings(px4fuse.close_loop(odometry, closures=TRUE)), "simulated odometry of three laps"
+        find_loop_findings(px4fuse.close_loop(odometry, closures=TRUE)),
+        "simulated odometry of three laps",
     )
     parts = [
         HeadingPart(2.0 * n, 2.0 * n + 2.0, angle_deg, 1.0)

@@ -219,9 +219,9 @@ def test_height_error_in_gap_below_3_times_rmse_is_not_reported(
         truth=pd.DataFrame({"position_m": 0.0}, index=time_s),
     )
     one = SimpleNamespace(axes={"down": down})
-    found = aids_detector._large_height_error_m(one, (20.0, 30.0))  # type: ignore[arg-type]
+    found = aids_detector._find_large_height_error_m(one, (20.0, 30.0))  # type: ignore[arg-type]
     assert found == (None if expected_m is None else pytest.approx(expected_m))
-    assert aids_detector._large_height_error_m(SimpleNamespace(axes={}), (0.0, 1.0)) is None  # type: ignore[arg-type]
+    assert aids_detector._find_large_height_error_m(SimpleNamespace(axes={}), (0.0, 1.0)) is None  # type: ignore[arg-type]
 
 
 def test_shift_of_mean_innovation_is_reported_with_its_time() -> None:

@@ -314,7 +314,8 @@ def test_report_on_error_beyond_sigma_names_axis_and_action() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
     finding = only(hidden_errors.detect, analysis(axes=(axis(), hiding(name="down"), ekf2)))
     assert finding.title == (
-        "Position errors that innovations do not show: KF 2.0 times σ, EKF2 5.0 times σ"
+        "Position errors that innovations do not show: KF 2.0 times the reported σ, "
+        "EKF2 5.0 times the reported σ"
     )
     assert finding.evidence["filter"] == "ekf2"
     # the main axis is preferred
@@ -402,7 +403,7 @@ def test_imu_gaps_are_found_only_inside_evaluated_segment(
 ) -> None:
     """Gaps at an end count if longer than 0.05 s; gaps outside the segment do not."""
     time = np.concatenate([np.arange(ends[0], 40.0, 0.01), np.arange(42.0, ends[1], 0.01)])
-    found = imu._gap_spans(pd.DataFrame(index=time), Segment(*segment, ""))
+    found = imu._find_gap_spans(pd.DataFrame(index=time), Segment(*segment, ""))
     assert len(found) == len(spans)
     assert not spans or np.allclose(found, spans, atol=0.02)
 

@@ -95,14 +95,14 @@ SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m":
     [
         ((trial(SIGMA_A_TO_0_1),),
          [("sigma_a_too_large", "error", "Set SIGMA_A to 0.1 m/s² (--sigma-a 0.1)."),
-          ("sigma_z_too_large", "warning", "Compare this run with one that has --sigma-z 0.5.")]),
+          ("sigma_z_too_large", "warning", "To test the estimate, run again with --sigma-z 0.5.")]),
         ((trial(BOTH), trial(SIGMA_A_TO_0_1, 9.0)),
          [(name, level, "Set SIGMA_A to 0.1 m/s² (--sigma-a 0.1) and SIGMA_Z to 0.5 m (--sigma-z "
            "0.5).")
           for name, level in (("sigma_a_too_large", "error"), ("sigma_z_too_large", "warning"))]),
         # a re-run that improves nothing: the other setting is the cause
         ((trial(SIGMA_A_TO_0_1, 9.0),),
-         [("sigma_z_too_large", "warning", "Compare this run with one that has --sigma-z 0.5."),
+         [("sigma_z_too_large", "warning", "To test the estimate, run again with --sigma-z 0.5."),
           ("sigma_a_too_large", "note", noises.NO_IMPROVEMENT_ACTION)]),
     ],
 )  # fmt: skip
@@ -118,7 +118,7 @@ def test_wrong_noise_report_recommends_noise_of_better_rerun(trials: Any, expect
 @pytest.mark.parametrize(
     ("nis_mean", "rmse_m", "expected"),
     [
-        (0.78, None, ("error", "Compare this run with one that has --sigma-a 0.1.")),
+        (0.78, None, ("error", "To test the estimate, run again with --sigma-a 0.1.")),
         (0.78, 0.3, ("note", noises.NO_IMPROVEMENT_ACTION)),
         (0.5, None, ("note", noises.NO_IMPROVEMENT_ACTION)),
     ],
@@ -143,7 +143,7 @@ def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
     assert worse.message == (
         "SIGMA_A is 10 times too large: KF follows the measurement noise. SIGMA_A is 1 m/s²; "
         "its maximum-likelihood estimate is 0.1 m/s² (95 % 0.09 to 0.11 m/s²). P grows too much "
-        "between updates, so the gain is too large."
+        "between updates, so KF's gain is too large."
     )
     small = tuned(Noise(2.0, 1.9, 2.1), Noise(9.0, 8.9, None))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=small))
@@ -157,7 +157,7 @@ def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
 def test_recommended_sigma_z_is_at_least_5_mm() -> None:
     bounded = tuned(Noise(None, None, 0.0021))
     finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
-    assert finding.remedy == "Compare this run with one that has --sigma-z 0.005."
+    assert finding.remedy == "To test the estimate, run again with --sigma-z 0.005."
     assert finding.title.startswith("SIGMA_Z is at least 480 times too large")
     assert "estimate is at most 0.0021 m. The" in finding.message
 

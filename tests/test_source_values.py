@@ -334,7 +334,7 @@ def mounted(arm_m: tuple[float, float]) -> Analysis:
 
 def test_lever_arm_that_does_not_reduce_error_is_not_reported(monkeypatch):
     analysis = mounted((0.4, -0.3))
-    monkeypatch.setattr(source_values, "_replayed_effect", lambda *_: None)
+    monkeypatch.setattr(source_values, "_describe_replayed_effect", lambda *_: None)
     assert not [*source_values.detect_lever_arm(analysis)]
 
 

@@ -18,17 +18,17 @@ from px4fuse.flight.model import BAD_ACCELERATION, Unavailable
 
 # Aiding sources of external vision, which other modules test by replays of EKF2
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
-# Time (s) after take-off in which EKF2 may ignore the barometer because of ground effect
+# A barometer gap that begins within this time (s) after take-off is normal: ground effect
 GROUND_EFFECT_DURATION_S = 10.0
-# EKF2's height error in a barometer gap is reported if largest error / height RMSE outside the gap
-# is larger
+# Minimum ratio of EKF2's largest height error in a barometer gap to the height RMSE outside the
+# gap; only above this ratio, a finding states the error
 MIN_GAP_HEIGHT_ERROR_RATIO = 3.0
 # Aiding sources whose vertical innovations can set EKF2's flag for a bad vertical acceleration
 VERTICAL_AIDS = ("gnss_vel", "gnss_hgt", "baro_hgt")
-# Maximum fraction of the time with EKF2's flag for a bad vertical acceleration, for severity note;
-# above: severity warning
+# Severity warning if EKF2 flags its vertical acceleration as bad for more than this fraction of the
+# time, otherwise note
 MAX_FLAGGED_FRACTION_FOR_NOTE = 0.3
-# Action if EKF2 does not fuse a sensor, by the PX4 parameter that enables its fusion
+# Action if EKF2 does not fuse a sensor, by the PX4 parameter that enables the fusion of the sensor
 ACTION_BY_SWITCH = {
     "EKF2_BARO_CTRL": "Shield the barometer from propeller wash and light.",
     "EKF2_GPS_CTRL": "Give the antenna a free view of the sky.",
@@ -73,17 +73,18 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
         for name in VERTICAL_AIDS
         if name in aids and aids[name].verdict == "overconfident"
     }
-    cause = "Normal measurement noise can cause this for some seconds."
-    remedy = "If it lasts longer, check the IMU for vibration and clipping."
+    cause = "Normal measurement noise can set this flag for some seconds."
+    remedy = "If the flag is set for longer, check the IMU for vibration and clipping."
     if small_noise_parameters:
-        cause = "EKF2's noise parameters of these sensors are too small."
-        remedy = f"Increase {' and '.join(sorted(small_noise_parameters))} to the true noise."
+        names = " and ".join(sorted(small_noise_parameters))
+        cause = f"The noise of EKF2 is set too small: {names}."
+        remedy = f"Increase {names} to the true noise of the sensor."
     flagged_fraction, start_s = float(is_flagged.mean()), float(state_times_s[is_flagged.argmax()])
     yield finding(
         "warning" if flagged_fraction > MAX_FLAGGED_FRACTION_FOR_NOTE else "note",
         "ekf2_acceleration_bad",
-        f"EKF2 flags its vertical acceleration as bad for {format_percent(flagged_fraction)} of the "
-        f"time, first at {start_s:.0f} s. Barometer and GNSS both measure a larger height than "
+        f"EKF2 flags its vertical acceleration as bad for {format_percent(flagged_fraction)} of "
+        f"the time, first at {start_s:.0f} s. Barometer and GNSS both measure a larger height than "
         f"EKF2 estimates. {cause}",
         remedy,
         {"fraction": flagged_fraction, "start_s": start_s},
@@ -98,8 +99,8 @@ def detect_aid_faults(
 ) -> Findings:
     """Detect faults of EKF2's aiding sources.
 
-    ``source_aid`` is the aiding source whose positions KF uses, ``take_off_s`` are the times (s) of
-    take-off, ``height_error_m`` is EKF2's height error in a barometer gap, if large.
+    ``source_aid`` is the aiding source whose positions KF uses, ``height_error_m`` is EKF2's height
+    error in a barometer gap, if large.
     """
     tested_aids = {name: aid for name, aid in aids.items() if name not in AIDS_OF_OTHER_DETECTORS}
     unfused_aids_by_switch: dict[str, list[AidResult]] = {}
@@ -154,15 +155,15 @@ def _make_not_fused_finding(
 
 
 def _make_innovation_shift_finding(name: str, aid: AidResult) -> Finding:
-    label = _format_aid_label(aid)
     shifts_by_axis = {axis: result.change for axis, result in aid.axes.items() if result.change}
     axis, (time_s, mean_change) = max(shifts_by_axis.items(), key=lambda item: abs(item[1][1]))
     s_sqrt = aid.axes[axis].s_sqrt_median
     return warning(
         "aid_innovation_shift",
-        f"{label}: the {axis} innovation shifts by {format_number(abs(mean_change) * s_sqrt, 2)} "
-        f"{aid.unit} at {time_s:.0f} s. The mean innovation before and after differs by "
-        f"{abs(mean_change):.1f} √S (√S {format_number(s_sqrt, 2)} {aid.unit}).",
+        f"{_format_aid_label(aid)}: the mean {axis} innovation shifts by "
+        f"{format_number(abs(mean_change) * s_sqrt, 2)} {aid.unit} at {time_s:.0f} s. This is "
+        f"{abs(mean_change):.1f} times its expected standard deviation √S "
+        f"({format_number(s_sqrt, 2)} {aid.unit}).",
         f"Check what was switched, moved or passed near the sensor at {time_s:.0f} s.",
         {"aid": name, "axis": axis, "time_s": time_s, "moved": mean_change},
         ((time_s, time_s + CHANGE_WINDOW_S),),
@@ -180,8 +181,9 @@ def _make_overconfident_finding(name: str, aid: AidResult, sensor_cause: str) ->
         noise_text = f" ({format_number(aid.noise)} {aid.unit}, from {aid.noise_from})"
     return warning(
         "aid_overconfident",
-        f"EKF2 is overconfident about {_format_aid_label(aid)}: σ is {format_ratio(aid.nis_mean**0.5)} "
-        f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1). "
+        f"EKF2 is overconfident about {_format_aid_label(aid)}: σ is "
+        f"{format_ratio(aid.nis_mean**0.5)} times too small. The mean NIS is "
+        f"{format_number(aid.nis_mean)} (expected 1). "
         f"EKF2 rejects {format_percent(aid.rejected_fraction)} of the samples. Possible "
         f"causes: errors of this sensor larger than its √R{noise_text}, or errors of "
         "another sensor.",

@@ -8,50 +8,39 @@ from px4fuse.core.record import read_toml
 from px4fuse.finding import SEVERITIES, Finding
 from px4fuse.findings.model import CATALOGUE, split_cause_groups
 
-# Key in Finding.evidence: kind of cause. Values: the constants below; ELSEWHERE for other causes
+# Key in Finding.evidence for the cause. Its values are the constants ..._CAUSE: settings or sensor
+# faults that a re-run corrects, and causes that the detectors of findings distinguish
 CAUSE_KEY = "cause"
-(
-    NOISE_CAUSE,
-    PROCESS_NOISE_CAUSE,
-    OUTLIER_CAUSE,
-    CLOCK_CAUSE,
-    FRAME_CAUSE,
-    GATE_CAUSE,
-    ACCELEROMETER_CAUSE,
-    OTHER_CAUSE,
-) = (
-    "measurement noise",
-    "process noise",
-    "outliers",
-    "clock",
-    "frame",
-    "gate",
-    "accelerometer",
-    "elsewhere",
-)
-# Key in Finding.evidence: white position noise ÷ assumed measurement noise. It is only set if the
-# ratio is large
+NOISE_CAUSE = "measurement noise"
+PROCESS_NOISE_CAUSE = "process noise"
+OUTLIER_CAUSE = "outliers"
+CLOCK_CAUSE = "clock"
+FRAME_CAUSE = "frame"
+GATE_CAUSE = "gate"
+ACCELEROMETER_CAUSE = "accelerometer"
+OTHER_CAUSE = "elsewhere"
+# Key in Finding.evidence: white position noise ÷ assumed measurement noise, only if this is large
 WHITE_NOISE_RATIO_KEY = "white_over_assumed"
-# Kind of cause: the aiding source of EKF2 is the sensor whose positions KF uses
+# Cause of a fault of an aiding source: it belongs to the sensor whose positions KF uses
 SOURCE_SENSOR_CAUSE = "the source's sensor"
-# Kind of cause: EKF2 uses the variance that the source reports
+# Cause: the variance that the source reports is wrong, and EKF2 uses it as measurement noise
 REPORTED_VARIANCE_CAUSE = "EKF2's noise"
-# Kind of cause: the mean innovation of the aiding source changes in flight
+# Cause: the mean innovation of the aiding source changes in flight
 INNOVATION_SHIFT_CAUSE = "change"
-# Kind of cause: each position reset of EKF2 follows a gap in the position source
+# Cause of resets: each position reset of EKF2 follows a gap in the position source
 GAP_CAUSE = "gap"
-# Kind of cause: the vehicle stayed on the ground
+# Cause of missing motion: the vehicle stayed on the ground
 NO_TAKE_OFF_CAUSE = "never took off"
-# Key in Finding.evidence: wrong axes, unit, clock or orientation of the source
+# Key in Finding.evidence: property that the source sends wrongly (axes, unit, clock, orientation)
 CONVENTION_KEY = "convention"
 # Key in Finding.evidence: time (s) of a position jump that the source announces by reset_counter
 RESET_TIME_KEY = "reset_at_s"
 # Findings that are causes of other findings only if their severity is warning or error
 CAUSES_ONLY_ABOVE_NOTE = ("ekf2_not_aligned", "parameter_changed")
-# Effects that keep their own action, because it also corrects their cause
+# Findings that keep their action if they are effects of another finding: the action corrects both
 EFFECTS_KEEPING_ACTION = ("ekf2_ev_delay_wrong",)
 
-_KF_VARIANCE_FINDINGS = ("kf_underconfident", "kf_overconfident")
+_KF_FINDINGS = ("kf_underconfident", "kf_overconfident")
 # Effects of each finding: ids of other findings, one per line
 CONSEQUENCES: Mapping[str, str] = read_toml(__file__, dict[str, str], "consequences.toml")
 
@@ -80,9 +69,7 @@ def group_by_cause(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         for effect, *further_effects in effect_groups:
             cause_group += [replace(effect, caused_by=cause), *further_effects]
         severities = (
-            effect.severity
-            for effect, *_ in effect_groups
-            if effect.id not in _KF_VARIANCE_FINDINGS
+            effect.severity for effect, *_ in effect_groups if effect.id not in _KF_FINDINGS
         )
         severity = min((cause_group[0].severity, *severities), key=SEVERITIES.index)
         cause_group[0] = replace(cause_group[0], severity=severity)
@@ -115,12 +102,8 @@ def effect_ids(cause: str) -> tuple[str, ...]:
 def _find_report_rank(group: list[Finding]) -> int:
     cause = group[0]
     role = CATALOGUE[cause.id].role
-    is_listed_first = CONVENTION_KEY in cause.evidence or role in (
-        "unusable",
-        "misleading",
-        "first",
-    )
-    if is_listed_first and cause.severity != "note":
+    is_first = CONVENTION_KEY in cause.evidence or role in ("unusable", "misleading", "first")
+    if is_first and cause.severity != "note":
         return -1
     # Warnings on the recording (1) precede noise errors (2), because bad data bias noise estimates
     rank_by_severity = {"error": 2 * (role == "noise"), "warning": 3 - 2 * (role == "recording")}

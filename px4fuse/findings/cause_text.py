@@ -46,7 +46,7 @@ def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
 
 
 def is_refuted(analysis: Analysis, filter_name: FilterName, cause: Trial) -> bool:
-    """Return True if the change of a re-run improves nothing along the main axis."""
+    """Return True if the change corrects neither σ nor RMSE in a re-run along the main axis."""
     return any(
         (trial.filter, trial.change) == (filter_name, cause.change)
         and can_show_improvement(trial)

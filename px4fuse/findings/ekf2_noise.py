@@ -19,15 +19,15 @@ from px4fuse.findings.cause_grouping import CAUSE_KEY, REPORTED_VARIANCE_CAUSE
 from px4fuse.findings.model import Findings, finding, format_percent
 from px4fuse.flight.model import Unavailable, source_name
 
-# Minimum factor between EKF2's noise parameter and the estimated noise, for severity error. A
-# smaller factor hardly changes EKF2's position error
+# Minimum factor between EKF2's noise parameter and the estimated noise, for severity error: smaller
+# factors hardly change EKF2's position error
 MIN_NOISE_FACTOR_FOR_ERROR = 2.0
-# The first sentence of the message contains the rejected fraction of the positions if it is larger
+# Minimum fraction of rejected positions that is stated in the first sentence of the message
 MIN_STATED_REJECTED_FRACTION = 0.05
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect a wrong noise parameter of EKF2, if EKF2 is consistent with the estimated noise."""
+    """Detect a wrong noise parameter: a replay with the estimated noise makes EKF2 consistent."""
     trial, aid = find_confirmed_noise_trial(analysis), aid_of(analysis)
     if trial is None:
         return
@@ -47,16 +47,13 @@ def detect(analysis: Analysis) -> Findings:
         effect_text = f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"
         reason = f"EKF2 rejects normal {sensor_name} noise as outliers and relies on the IMU."
     else:
-        effect_text, gain_direction = "", "large" if is_set_too_small else "small"
-        reason = (
-            f"EKF2's gain is therefore too {gain_direction}, and its reported σ too {direction}."
-        )
+        effect_text, gain_size = "", "large" if is_set_too_small else "small"
+        reason = f"EKF2's gain is therefore too {gain_size}, and its reported σ too {direction}."
     name = "EKF2's position noise" if is_reported else aid.noise
     title = f"{name} is {format_factor(factor)} times too {direction}{effect_text}"
     is_default = used_noise_m == analysis.flight.log.default_of(aid.noise)
-    if (
-        is_set_too_small and is_default
-    ):  # PX4's default fits usual sensors, so the sensor is at fault
+    # PX4's default fits usual sensors, so the sensor is at fault
+    if is_set_too_small and is_default:
         filters = "KF and EKF2" if is_kf_noise_equal else "EKF2"
         title = (
             f"{sensor_name} noise is {format_factor(factor)} times the noise setting of "
@@ -87,8 +84,8 @@ def detect(analysis: Analysis) -> Findings:
         f"{title}. {name} is {used_noise_m:.3g} m{source_text}; the maximum-likelihood estimate is "
         f"{estimate_m:.3g} m{interval_text}. "
         f"{reason}{f' KF takes SIGMA_Z from {aid.noise}.' if is_kf_noise_equal else ''}",
-        f"Set {format_settings(different_settings(trial.change, inputs.settings))}{variance_action}."
-        f"{height_noise_advice(analysis, analysis.tuning, estimate_m)}",
+        f"Set {format_settings(different_settings(trial.change, inputs.settings))}"
+        f"{variance_action}.{height_noise_advice(analysis, analysis.tuning, estimate_m)}",
         {
             "flown_m": used_noise_m,
             "estimate_m": estimate_m,

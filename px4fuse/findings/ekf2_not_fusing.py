@@ -1,4 +1,7 @@
-"""Position source that EKF2 does not fuse horizontally, or only for part of the flight."""
+"""Faults of fusion: EKF2 does not fuse the positions, fuses them too late, or flags its position.
+
+A source that measures only the height is not tested.
+"""
 
 import numpy as np
 import pandas as pd
@@ -31,15 +34,14 @@ from px4fuse.flight.model import (
     positions_phrase,
 )
 
-# The severity is error if EKF2 fuses the positions for a smaller fraction of the time
+# Severity error if EKF2 fuses the positions for less than this fraction of the time
 FUSED_FRACTION_FOR_ERROR = 0.5
-# The severity is warning if EKF2 fuses the positions for a smaller fraction of the time
+# Severity warning if EKF2 fuses the positions for less than this fraction of the time
 FUSED_FRACTION_FOR_WARNING = 0.98
-# Minimum interval (s) between positions that jitter can increase above EV_START_INTERVAL_S
+# Minimum interval (s) between positions for late starts of fusion, due to jitter of the interval
 MIN_LATE_START_INTERVAL_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
-# Minimum distance (m) of EKF2's invalid position from ground truth or position source, for a
-# finding
+# Minimum distance (m) of an EKF2 position that is flagged as invalid from ground truth or source
 MIN_INVALID_POSITION_ERROR_M = 1.0
 
 
@@ -61,7 +63,7 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
         yield from _detect_slow_restart(analysis, ekf2, fusion_flag)
     if source is None or fused_fraction >= FUSED_FRACTION_FOR_WARNING:
         return
-    positions, aid = positions_phrase(source), source.origin.aid
+    positions_text, aid = positions_phrase(source), source.origin.aid
     evidence: dict[str, float | str] = {
         "fused_fraction": fused_fraction,
         "source_interval_s": 1.0 / source.compute_rate_hz(),
@@ -70,25 +72,25 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
         if source.name == MOTION_CAPTURE_TOPIC and not fused_fraction:
             yield warning(
                 "ekf2_not_fusing",
-                f"EKF2 never fused the {positions}: EKF2 does not read {source.name}. PX4 writes "
-                "ATT_POS_MOCAP, and ODOMETRY of estimator type MOCAP, to this topic as ground "
-                "truth.",
+                f"EKF2 never fused the {positions_text}: EKF2 does not read {source.name}. PX4 "
+                "writes ATT_POS_MOCAP, and ODOMETRY of estimator type MOCAP, to this topic as "
+                "ground truth.",
                 "To fuse these positions, send VISION_POSITION_ESTIMATE, or ODOMETRY of "
                 "estimator type VISION.",
                 evidence,
             )
         return
     spans = spans_with_value(0.0, fusion_flag, analysis.segment)
-    longest_s = max(spans, key=lambda span: span[1] - span[0])
+    longest_span_s = max(spans, key=lambda span: span[1] - span[0])
     parameters = {**analysis.flight.log.parameters, **ekf2.parameters}
-    unmet_condition = find_unmet(FusionAttempt(ekf2, source, aid, parameters, longest_s))
+    unmet_condition = find_unmet(FusionAttempt(ekf2, source, aid, parameters, longest_span_s))
     evidence["condition"] = unmet_condition.condition
     action = unmet_condition.action
     if not unmet_condition.condition and not source.origin.has_all_samples:
         action = f"Record with SDLOG_PROFILE 129 (default and vision). {action}"
-    title = f"EKF2 fused the {positions} only {format_percent(fused_fraction)} of the time"
+    title = f"EKF2 fused the {positions_text} only {format_percent(fused_fraction)} of the time"
     if not fused_fraction:
-        title = f"EKF2 never fused the {positions}"
+        title = f"EKF2 never fused the {positions_text}"
     message = (
         f"{title}{unmet_condition.fault and ': '}{unmet_condition.fault}. {unmet_condition.reason}"
     )
@@ -105,8 +107,8 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
     else:
         yield warning(
             "ekf2_fusion_interrupted",
-            f"{message} For up to {longest_s[1] - longest_s[0]:.1f} s EKF2 relied on the IMU and "
-            "its other aiding sources.",
+            f"{message} For up to {longest_span_s[1] - longest_span_s[0]:.1f} s EKF2 relied on the "
+            "IMU and its other aiding sources.",
             action,
             evidence,
             spans,
@@ -134,7 +136,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
         return
     reference = "ground truth" if isinstance(analysis.flight.truth, Truth) else "source"
     distance_sentence = (
-        f" In this time EKF2's distance to the {reference} is up to {format_metres(distance_m)} m."
+        f" During that time EKF2 is up to {format_metres(distance_m)} m from the {reference}."
     )
     if not np.isfinite(distance_m):
         distance_sentence = ""
@@ -143,8 +145,8 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
         "ekf2_position_invalid",
         f"EKF2's horizontal position is invalid {format_percent(invalid_fraction)} of the time "
         f"(xy_valid 0), and PX4 does not use it.{distance_sentence}",
-        "Restore the fusion of positions first. EKF2's errors in this time do not depend on "
-        "noise settings.",
+        "Restore the fusion of positions first. While EKF2's position is invalid, its errors do "
+        "not depend on noise settings.",
         {"invalid_fraction": invalid_fraction, "distance_m": distance_m},
         spans,
     )
@@ -166,7 +168,7 @@ def _find_largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span
 def _detect_slow_restart(
     analysis: PreparedComparison, ekf2: Ekf2, fusion_flag: pd.Series
 ) -> Findings:
-    """Detect a position rate so low that EKF2 restarts fusion late after a gap."""
+    """Detect that EKF2 resumes fusion late after a gap, because the position rate is too low."""
     source, rate_hz = analysis.source, analysis.source.compute_rate_hz()
     if (
         "EKF2_EV_CTRL" not in analysis.flight.log.parameters  # earlier than v1.14
@@ -192,13 +194,13 @@ def _detect_slow_restart(
         ):
             restart_delay_spans.append((float(unfused_times_s[0]), end_s))
     if restart_delay_spans:
-        longest_s = max(end - start for start, end in restart_delay_spans)
+        longest_delay_s = max(end - start for start, end in restart_delay_spans)
         yield note(
             "source_rate_at_limit",
-            f"After a gap EKF2 resumed fusion {longest_s:.1f} s late: {positions_phrase(source)} "
-            f"come at only {rate_hz:.1f} Hz. EKF2 (v1.14 and later) starts fusion when two "
-            f"positions arrive within {EV_START_INTERVAL_S:g} s.",
+            f"After a gap EKF2 resumed fusion {longest_delay_s:.1f} s late: "
+            f"{positions_phrase(source)} come at only {rate_hz:.1f} Hz. EKF2 (v1.14 and later) "
+            f"starts fusion when two positions arrive within {EV_START_INTERVAL_S:g} s.",
             "Send the position at 10 Hz.",
-            {"rate_hz": rate_hz, "longest_s": longest_s, "count": len(restart_delay_spans)},
+            {"rate_hz": rate_hz, "longest_s": longest_delay_s, "count": len(restart_delay_spans)},
             tuple(restart_delay_spans),
         )

@@ -1,4 +1,4 @@
-"""Positions that EKF2's innovation gate rejects, and a gate that is too small."""
+"""Rejections: EKF2's innovation gate rejects positions, for example because it is too small."""
 
 import math
 
@@ -22,8 +22,7 @@ from px4fuse.flight.model import Ekf2, Unavailable
 REJECTED_FRACTION_FOR_WARNING = 0.01
 # Minimum fraction of rejected positions for severity error
 REJECTED_FRACTION_FOR_ERROR = 0.20
-# A change prevents rejections if rejected fraction of the re-run / rejected fraction of EKF2 is
-# smaller
+# A change prevents rejections if it reduces the rejected fraction at least to this fraction of it
 MAX_REJECTED_FRACTION_RATIO = 0.5
 
 
@@ -47,8 +46,8 @@ def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> F
                 "ekf2_gate_too_small",
                 f"{aid.gate} {ekf2.gate:g} is too small: EKF2 rejects "
                 f"{format_percent(rejected_fraction)} of the positions. Without any fault, this "
-                f"gate rejects {format_percent(expected_rejected_fraction)} of the positions. Rejected "
-                "positions do not correct EKF2.",
+                f"gate rejects {format_percent(expected_rejected_fraction)} of the positions. "
+                "Rejected positions do not correct EKF2.",
                 f"Set {aid.gate} to {aid.default_gate:g} √S (PX4's default).",
                 {"gate": ekf2.gate, "rejected_by_gate": expected_rejected_fraction},
             )
@@ -56,7 +55,8 @@ def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> F
 
 def _detect_rejections(analysis: Analysis) -> Findings:
     ekf2, down_comparison = analysis.flight.ekf2, analysis.axes.get("down")
-    # EKF2 rejects both horizontal axes of a position together, so one axis is sufficient
+    # EKF2 rejects north and east of a position together, so the main axis contains all rejections
+    # of horizontal positions
     for result in (
         analysis.main,
         *([down_comparison] if down_comparison and down_comparison is not analysis.main else []),
@@ -92,23 +92,13 @@ def _find_rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
     if helpful_trials and result is analysis.main:
         return format_action(analysis, min(helpful_trials, key=preference_key).change)
     return (
-        f"Check {find_source_texts(analysis.source).reception}. Then check {aid.delay} and {aid.noise}. "
-        f"Increase {aid.gate} last."
+        f"Check {find_source_texts(analysis.source).reception}. Then check {aid.delay} and "
+        f"{aid.noise}. Increase {aid.gate} last."
     )
 
 
 def _prevents_rejections(trial: Trial) -> bool:
-    rejected_fraction_before, rejected_fraction_after = (
-        trial.before.rejected_fraction,
-        trial.after.rejected_fraction,
-    )
-    if (
-        rejected_fraction_before is None
-        or rejected_fraction_after is None
-        or improvement(trial) == "nothing"
-    ):
+    fraction_before, fraction_after = trial.before.rejected_fraction, trial.after.rejected_fraction
+    if fraction_before is None or fraction_after is None or improvement(trial) == "nothing":
         return False
-    return (
-        len(trial.kinds) == 1
-        and rejected_fraction_after < MAX_REJECTED_FRACTION_RATIO * rejected_fraction_before
-    )
+    return len(trial.kinds) == 1 and fraction_after < MAX_REJECTED_FRACTION_RATIO * fraction_before

@@ -33,9 +33,9 @@ from px4fuse.trajectory.alignment import fit_alignment
 
 # Minimum mean NEES for severity error: the RMS position error is 4 reported σ
 MIN_NEES_FOR_ERROR = 16.0
-# Only EKF2 has a fault if position RMSE of KF / position RMSE of EKF2 is smaller
+# Maximum ratio of KF's position RMSE to EKF2's, at which the fault is in EKF2 alone
 MAX_KF_TO_EKF2_RMSE_RATIO = 0.7
-# The position frame is misaligned if position RMSE after an alignment / RMSE before it is smaller
+# Maximum ratio of position RMSE after alignment to RMSE before it, for a misaligned position frame
 MAX_ALIGNED_RMSE_RATIO = 0.5
 DRIFT_REMEDY = (
     "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "
@@ -60,8 +60,8 @@ class AlignedError(NamedTuple):
 
     def __str__(self) -> str:
         return (
-            f"{format_metres(self.rmse_before_m)} m before and {format_metres(self.rmse_after_m)} m after "
-            "the best shift and rotation"
+            f"{format_metres(self.rmse_before_m)} m before and "
+            f"{format_metres(self.rmse_after_m)} m after the best shift and rotation"
         )
 
     @property
@@ -75,10 +75,11 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
     Return (filter, axis, error) for each error, largest mean NEES first.
     """
     alignment, frame_residual_rms_m = comparison.source.alignment, 0.0
-    # A position frame aligned with EKF2's track may contain EKF2's error, also in height
+    # A frame fitted to EKF2's track contains EKF2's errors. KF's errors up to the residual of the
+    # fit, and in height, may thus be errors of the frame
     if is_frame_fitted := alignment is not None and alignment.yaw_sigma_deg is not None:
         frame_residual_rms_m = alignment.residual_rms_m or 0.0
-    errors = [
+    hidden_errors = [
         (filter_name, name, error)
         for name, result in comparison.axes.items()
         for filter_name, summary in result.filters.items()
@@ -88,7 +89,7 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
             or (error.rmse_m > frame_residual_rms_m and not (is_frame_fitted and name == "down"))
         )
     ]
-    return sorted(errors, key=lambda entry: -entry[2].nees)
+    return sorted(hidden_errors, key=lambda entry: -entry[2].nees)
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -161,7 +162,8 @@ def make_hidden_error_finding(
     elif is_ekf2_alone:
         remedy = HEIGHT_REMEDY if main_axis == "down" else EKF2_REMEDY
     ratio_texts = (
-        f"{label} {format_ratio(ratio)} times σ" for label, ratio in ratio_by_filter.items()
+        f"{label} {format_ratio(ratio)} times the reported σ"
+        for label, ratio in ratio_by_filter.items()
     )
     title = f"Position errors that innovations do not show: {', '.join(ratio_texts)}"
     return finding(
@@ -189,16 +191,13 @@ def _make_drift_finding(
     rmse_sentence = ""
     if aligned_error is not None:
         drift_text = (
-            f"horizontal position RMSE {format_metres(aligned_error.rmse_after_m)} m after the best "
-            "alignment"
+            f"horizontal position RMSE {format_metres(aligned_error.rmse_after_m)} m after the "
+            "best alignment"
         )
         rmse_sentence = (
             f"Before the alignment the RMSE is {format_metres(aligned_error.rmse_before_m)} m. "
         )
-    if (
-        isinstance(loop, Loop)
-        and (closure_error_m := _find_known_closure_error_m(loop)) is not None
-    ):
+    if isinstance(loop, Loop) and (closure_error_m := _find_closure_error_m(loop)) is not None:
         length_m = loop.path_length_m
         evidence = {**evidence, "closure_error_m": closure_error_m, "path_length_m": length_m}
         rmse_sentence = (
@@ -220,7 +219,7 @@ def _make_drift_finding(
     )
 
 
-def _find_known_closure_error_m(loop: Loop) -> float | None:
+def _find_closure_error_m(loop: Loop) -> float | None:
     if isinstance(loop.true_end, Unavailable) or loop.is_end_assumed or loop.is_absolute_track:
         return None
     return loop.closure_error_m

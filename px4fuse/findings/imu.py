@@ -16,7 +16,7 @@ from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
 MAX_SPECIFIC_FORCE_M_S2 = 343.0
-# Minimum number of impossible samples for a finding
+# Minimum number of samples above MAX_SPECIFIC_FORCE_M_S2 for a finding
 MIN_OUT_OF_RANGE_SAMPLES = 3
 # Minimum accelerometer bias (m/s²) for severity error: a position error of 0.15 m after 1 s
 MIN_BIAS_FOR_ERROR_M_S2 = 0.3
@@ -63,7 +63,7 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
         f"The accelerometer values are impossible: up to {np.nanmax(force_m_s2):,.0f} m/s², "
         f"first at {time_s[0]:.1f} s. Sensors of autopilots measure at most 32 g (314 m/s²). The "
         "simulator has diverged, or the log is damaged. px4fuse estimates nothing from this time.",
-        f"Analyse only the time before (--end {max(time_s[0] - 1.0, 0.0):.1f}).",
+        f"Analyse only the time before these values (--end {max(time_s[0] - 1.0, 0.0):.1f}).",
         {"max_m_s2": float(np.nanmax(force_m_s2)), "count": len(time_s), "at_s": float(time_s[0])},
         ((float(time_s[0]), float(time_s[-1])),),
     )
@@ -98,7 +98,7 @@ def detect_bias(analysis: Analysis) -> Findings:
             {"bias_m_s2": bias_m_s2, "sigma_m_s2": systematic_errors.compute_bias().sigma},
         )
     elif ekf2_bias is not None:
-        # If positions show no horizontal bias, only the vertical bias is reported
+        # The positions show no significant horizontal bias, so only EKF2's vertical bias counts
         bias_m_s2 = float(
             np.linalg.norm(
                 ekf2_bias[2:] if isinstance(systematic_errors, SystematicErrors) else ekf2_bias

@@ -1,4 +1,4 @@
-"""False loop closures, a stated odometry drift that is too small, and wrong assumptions."""
+"""Faults of loop closures: contradictions to odometry, and wrong assumptions about the loop."""
 
 from px4fuse.analysis import Analysis
 from px4fuse.finding import Finding
@@ -62,7 +62,7 @@ def detect_wrong_assumptions(loop: Loop) -> Findings:
             "loop_on_absolute_positions",
             "This track consists of absolute positions, which do not drift. The loop closure error "
             "is only position noise, so a correction makes the path worse.",
-            "Measure the loop on odometry: send visual-inertial odometry to PX4 as ODOMETRY.",
+            "Use odometry for loop closures: send visual-inertial odometry to PX4 as ODOMETRY.",
             evidence,
         )
     if evidence and loop.is_end_assumed:
@@ -78,12 +78,12 @@ def detect_wrong_assumptions(loop: Loop) -> Findings:
 
 def _make_false_closure_finding(closure: Closure, is_end_assumed: bool) -> Finding:
     is_landing = closure.source == LANDING_CLOSURE_SOURCE
-    fault = f"False loop closure of {closure.distance_m:.2f} m: {closure}"
-    if is_landing and is_end_assumed:
-        fault = (
-            f"False loop closure of {closure.distance_m:.2f} m: the landing place is not the "
-            "take-off place"
-        )
+    fault = f"False loop closure (closure error {closure.distance_m:.2f} m): "
+    fault += (
+        "the landing place is not the take-off place"
+        if is_landing and is_end_assumed
+        else f"{closure}"
+    )
     action = "Remove this loop closure. In this run, px4fuse already ignores it."
     if is_landing:
         action = (

@@ -1,4 +1,4 @@
-"""Missing data: EKF2 state, acceleration, innovations, or positions that PX4 received."""
+"""Detection of missing data: EKF2 state, acceleration, innovations, positions received by PX4."""
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
@@ -62,6 +62,7 @@ def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
         f"The log lacks the {positions_phrase(source)} as PX4 received them. Reason: "
         f"{next(reasons, f'{VISION_TOPIC} is not in this log')}. px4fuse uses {source.name} "
         f"({source.description}) at {rate_hz:.1f} Hz instead.",
-        f"Set SDLOG_PROFILE to {sdlog_profile | VISION_PROFILE_BIT} (bit 7) and fly again.",
+        f"Set SDLOG_PROFILE to {sdlog_profile | VISION_PROFILE_BIT} (bit 7: vision topics) and fly "
+        "again.",
         {"rate_hz": rate_hz, "sdlog_profile": sdlog_profile},
     )

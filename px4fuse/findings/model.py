@@ -23,18 +23,19 @@ class CatalogueEntry(Record):
     Attributes
     ----------
     group : str
-        One of :data:`GROUPS`.
+        One of :data:`FINDING_GROUPS`.
     role : str
-        Effect on the estimates, and place in the list of findings. "unusable": all positions are
-        wrong. "misleading": some positions are wrong. "unusable", "misleading" and "first" are
-        listed first, "noise" after other errors, "recording" before other warnings.
+        Effect on the estimates, and place in the list of findings. "unusable" (all positions are
+        wrong), "misleading" (some positions are wrong) and "first" are listed first, "noise" after
+        other errors, "recording" before other warnings.
     verdict : str
         Relation to the statements that KF or EKF2 is consistent, over- or underconfident.
         "meaningless": the statements are invalid. "repeated": the finding repeats a statement.
     reruns : frozenset of str
         Kinds of re-runs (``Trial.kinds``) that test the finding.
     after_wrong_convention : str
-        If axes, unit or clock of the positions are wrong: "effect" or "withdrawn".
+        Treatment of the finding if axes, unit or clock of the positions are wrong. "effect": it is
+        listed as an effect of this fault. "withdrawn": it is removed. Empty: it remains.
     """
 
     title: str
@@ -81,7 +82,7 @@ def load_examples() -> Mapping[str, FindingExample]:
 
 
 class SourceTexts(Record):
-    """Texts about one kind of position source (such as UWB): causes of faults, and actions."""
+    """Texts on causes and actions for one kind of source; source_words.toml explains the keys."""
 
     smoothing_action: str
     jump: str

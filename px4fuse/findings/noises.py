@@ -44,15 +44,15 @@ from px4fuse.flight.model import Columns, Unavailable, sample_rate
 from px4fuse.readers.px4_innovations import has_fused_aid
 from px4fuse.request import COMPARISON_OPTIONS
 
-# Minimum factor between a noise setting and its estimate, for a warning. A smaller factor hardly
-# changes the track
+# Minimum factor between a noise setting and its estimate, for a warning: smaller factors hardly
+# change the track
 MIN_NOISE_FACTOR = 1.5
 # Minimum factor between a noise setting and its estimate for severity error
 MIN_NOISE_FACTOR_FOR_ERROR = 4.0
 # Minimum time constant (s) of a KF that ignores new positions: vehicles turn in less time
 MIN_TIME_CONSTANT_S = 2.5
-# The 95 % interval of ln(noise estimate) is widened by this factor: 0.3 % of correct settings are
-# outside the widened interval
+# Factor on the 95 % interval of ln(noise estimate): 0.3 % of correct settings are outside the
+# widened interval
 INTERVAL_WIDENING_FACTOR = 1.5
 # KF lags if the lag-1 autocorrelation of its innovations exceeds this value; white innovations
 # reach 0.2
@@ -60,9 +60,9 @@ MIN_LAG1_AUTOCORRELATION = 0.3
 
 # Minimum factor between actual and reported σ for severity error
 MIN_SIGMA_FACTOR_FOR_ERROR = 2.0
-# Maximum ratio of two noise σ that are equal: two standard errors of a median of 100 values
+# Two noise σ count as equal up to this ratio: two standard errors of a median of 100 values
 NOISE_RATIO_TOLERANCE = 1.25
-# EKF2 uses the variance in the position messages if √R / EKF2_EVP_NOISE is larger
+# If EKF2's √R is larger than EKF2_EVP_NOISE times this factor, R is the variance in the messages
 MIN_REPORTED_NOISE_RATIO = 1.25
 # Action if no change in a re-run corrects the wrong σ
 UNEXPLAINED_SIGMA_ACTION = (
@@ -88,15 +88,15 @@ KEEP_NOISE_ACTION_TRUTH = (
 )
 # Effect of a noise setting that is too small or too large on KF, and the reason
 SETTING_EFFECTS = {
-    (SIGMA_Z, "small"): ("KF follows the measurement noise", "The gain is too large."),
-    (SIGMA_Z, "large"): ("KF corrects slowly", "The gain is too small."),
+    (SIGMA_Z, "small"): ("KF follows the measurement noise", "KF's gain is too large."),
+    (SIGMA_Z, "large"): ("KF follows the positions slowly", "KF's gain is too small."),
     (SIGMA_A, "small"): (
         "KF lags behind the motion",
-        "P grows too little between updates, so the gain is too small.",
+        "P grows too little between updates, so KF's gain is too small.",
     ),
     (SIGMA_A, "large"): (
         "KF follows the measurement noise",
-        "P grows too much between updates, so the gain is too large.",
+        "P grows too much between updates, so KF's gain is too large.",
     ),
 }
 
@@ -205,7 +205,7 @@ def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
     ):
         return NO_IMPROVEMENT_ACTION
     value = max(value, MIN_RERUN_SIGMA_Z_M) if name == SIGMA_Z else value
-    return f"Compare this run with one that has {COMPARISON_OPTIONS[name]} {value:.3g}."
+    return f"To test the estimate, run again with {COMPARISON_OPTIONS[name]} {value:.3g}."
 
 
 def find_setting_deviation(
@@ -224,7 +224,7 @@ def find_setting_deviation(
     if low <= setting <= high or factor < MIN_NOISE_FACTOR:
         return None
     severity: Severity = "error" if factor >= MIN_NOISE_FACTOR_FOR_ERROR else "warning"
-    if setting == getattr(Settings(), name):  # the default is px4fuse's, not the user's choice
+    if setting == getattr(Settings(), name):  # less severe, because the user did not choose it
         severity = lower_severity(severity)
     return SettingDeviation(estimate, factor, severity)
 
@@ -233,7 +233,8 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     """Detect a SIGMA_A so small that KF ignores new positions."""
     for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
         updates, summary = result.replay.updates, result.filters["kf"]
-        # Without motion, a small SIGMA_A is correct, and innovations are small and white
+        # Innovations that are consistent or white show no fault: without motion, a small SIGMA_A
+        # is correct
         if (
             isinstance(summary, Unavailable)
             or summary.verdict != "overconfident"
@@ -255,7 +256,8 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
         yield error(
             "process_noise_near_zero",
             f"{title}: KF ignores new positions. {estimate_text}KF's position gain decreases to "
-            f"{steady_position_gain:.2g}, so KF needs {time_constant_s:.0f} s to follow a position change.",
+            f"{steady_position_gain:.2g}, so KF needs {time_constant_s:.0f} s to follow a position "
+            "change.",
             action,
             {"gain": steady_position_gain, "response_s": time_constant_s, "axis": result.axis.name},
         )
@@ -360,12 +362,12 @@ def _format_excessive_noise(analysis: Analysis) -> str:
     )
     if not parameter_noise_m > NOISE_RATIO_TOLERANCE * noise_m:  # the comparison is False for NaN
         return ""
-    noise_origin = (
-        "the receiver reports" if noise_m == reported_noise_m else "the estimated noise is"
+    noise_label = (
+        "noise that the receiver reports" if noise_m == reported_noise_m else "estimated noise"
     )
     return (
-        f"{name} is {parameter_noise_m:g} m, but {noise_origin} {noise_m:.2g} m. Test this noise by a "
-        "replay: px4fuse whatif LOG."
+        f"{name} is {parameter_noise_m:g} m, but the {noise_label} is {noise_m:.2g} m. Test this "
+        "smaller noise by a replay: px4fuse whatif LOG."
     )
 
 
@@ -394,7 +396,7 @@ def _has_default_noises(
     log = analysis.flight.log
     default = log.default_of(noise_parameter)
     is_parameter_default = log.parameters.get(noise_parameter, default) == default
-    # If EKF2 uses a variance that the sender reports, the user has chosen it
+    # An R far from the parameter is a variance that the sender reports: not PX4's default
     return is_parameter_default and not abs(np.log(find_ekf2_noise_m(result) / default)) > np.log(
         NOISE_RATIO_TOLERANCE
     )
@@ -449,8 +451,8 @@ def _find_remedy_without_replay(
         )
     return (
         f"EKF2's measurement noise ({used_noise_m:.2g} m) equals the estimated position noise, so "
-        "another fault makes σ wrong. Check the time offset (px4fuse sync LOG) and the IMU (gaps, "
-        "vibration)."
+        "EKF2's wrong σ has another cause. Check the time offset (px4fuse sync LOG) and the IMU "
+        "(gaps, vibration)."
     )
 
 

@@ -71,20 +71,20 @@ def detect_lost_data(flight: Flight) -> Findings:
         other_count = len(log.dropped) - 1
         topics = "topic" if other_count == 1 else "topics"
         other_topics_sentence = (
-            f" {other_count} other {topics} also have such errors." if other_count else ""
+            f" {other_count} other {topics} also contain wrong timestamps." if other_count else ""
         )
         yield note(
             "samples_out_of_order",
             f"{count} samples of {topic} have wrong timestamps: zero, or earlier than the sample "
-            f"before. px4fuse ignores these samples.{other_topics_sentence} Possible cause: a clock was set "
-            "back, or messages arrived in another order.",
+            f"before. px4fuse ignores these samples.{other_topics_sentence} Possible cause: a "
+            "clock was set back, or messages arrived in another order.",
             "Synchronise the clock of the sending computer before take-off (TIMESYNC).",
             {"notes": other_count + 1},
         )
 
 
 def detect_decreasing_clocks(flight: Flight) -> Findings:
-    """Detect restarts of the autopilot, and decreasing receive times."""
+    """Detect a decreasing boot clock (restart of the autopilot) and decreasing receive times."""
     log = flight.log
     if log.restarts:
         yield warning(

@@ -51,7 +51,7 @@ def detect_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings:
             "single --clock-offset corrects both. Possible cause: PX4 uses arrival times until 500 "
             "TIMESYNC answers have synchronised the clocks.",
             "Let the clocks synchronise for one minute before take-off. Analyse only the time "
-            "before or after the change (--start, --end).",
+            "before or after the change of the offset (--start, --end).",
             {**evidence, "change_p_value": time_offset.change_p_value},
         )
         return
@@ -63,16 +63,16 @@ def detect_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings:
         or _compute_rmse_ratio(_find_trial(analysis, "kf", "time offset")) > MAX_RMSE_RATIO
     ):
         return
-    interval_s, is_late = (
+    interval_s, has_late_timestamps = (
         (interval_low_s - time_offset.applied_s, interval_high_s - time_offset.applied_s),
         time_offset.remaining_s < 0,
     )
-    lower_s, upper_s = (-interval_s[1], -interval_s[0]) if is_late else interval_s
+    lower_s, upper_s = (-interval_s[1], -interval_s[0]) if has_late_timestamps else interval_s
     yield finding(
         "error" if abs_offset_s > MIN_OFFSET_FOR_ERROR_S else "warning",
         "source_time_offset",
-        f"Position timestamps are {abs_offset_s:.2f} s {'late' if is_late else 'early'}. The "
-        f"estimate from IMU and positions is {abs_offset_s:.3f} s (95 % {lower_s:.3f} to "
+        f"Position timestamps are {abs_offset_s:.2f} s {'late' if has_late_timestamps else 'early'}"
+        f". The estimate from IMU and positions is {abs_offset_s:.3f} s (95 % {lower_s:.3f} to "
         f"{upper_s:.3f} s). At 1 m/s this is a position error of {abs_offset_s:.2f} m in KF and "
         "EKF2. Innovations hardly show this "
         f"error.{_format_assumed_delay(analysis, time_offset)}",
@@ -111,7 +111,10 @@ def _format_assumed_delay(analysis: Analysis, time_offset: ClockOffset) -> str:
         return ""
     assumed_delay_ms = analysis.flight.log.parameters[delay_parameter]
     estimated_delay_ms = max(assumed_delay_ms - 1e3 * time_offset.remaining_s, 0.0)
-    return f" {delay_parameter} is {assumed_delay_ms:g} ms; the estimate is {estimated_delay_ms:.0f} ms."
+    return (
+        f" {delay_parameter} is {assumed_delay_ms:g} ms; the estimate is "
+        f"{estimated_delay_ms:.0f} ms."
+    )
 
 
 def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
@@ -131,7 +134,8 @@ def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
 
 def clock_offset_option_s(comparison: PreparedComparison, time_offset: ClockOffset) -> float:
     """Return the value (s) of ``--clock-offset`` that corrects a time offset."""
-    # --clock-offset replaces the time offset that the alignment of a position file applied
+    # --clock-offset is the total offset of a position file, including that which its alignment
+    # already applied
     alignment = comparison.source.alignment
     return time_offset.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
 
@@ -182,8 +186,8 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
     yield warning(
         "ekf2_gps_delay_wrong",
         f"{GNSS_POS.delay} is {delay_ms:g} ms, but GNSS positions and velocities are "
-        f"{estimated_delay_ms:.0f} ms late (± {1.96 * sigma_ms:.0f} ms, 95 %, compared with vision). EKF2 "
-        "fuses each GNSS sample at the wrong time, so its track leads or lags.",
+        f"{estimated_delay_ms:.0f} ms late (± {1.96 * sigma_ms:.0f} ms, 95 %, compared with "
+        "vision). EKF2 fuses each GNSS sample at the wrong time, so its track leads or lags.",
         f"Set {remedy.format_settings({GNSS_POS.delay: round(estimated_delay_ms)})}.",
         {"ekf2_gps_delay_ms": delay_ms, "estimate_ms": estimated_delay_ms, "sigma_ms": sigma_ms},
     )

@@ -24,11 +24,12 @@ from px4fuse.findings.cause_grouping import CONVENTION_KEY, RESET_TIME_KEY
 from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_phrase, source_name
 
-# Groups of findings that do not depend on the positions
+# Groups of findings that are valid even if all positions are wrong
 POSITION_INDEPENDENT_GROUPS = ("logging", "IMU")
 
 
-# Id of the finding, kind of fault, message, and action
+# Fault of the convention (axes, unit, clock or orientation): id of the finding, kind (the value of
+# CONVENTION_KEY in its evidence), message, and action
 ConventionFaultTexts = tuple[str, str, str, str]
 
 
@@ -40,11 +41,8 @@ def detect(analysis: Comparison) -> Findings:
         *_find_orientation_faults(convention.orientation, faults, source_name(analysis.source)),
         *_find_position_faults(convention, faults, analysis.source),
     ):
-        log_likelihood_gain = round(convention.log_likelihood_gain, 1)
-        evidence: dict[str, float | str] = {
-            CONVENTION_KEY: kind,
-            "log_likelihood": log_likelihood_gain,
-        }
+        gain_nats = round(convention.log_likelihood_gain, 1)
+        evidence: dict[str, float | str] = {CONVENTION_KEY: kind, "log_likelihood": gain_nats}
         if kind == "rotation":
             evidence["misalignment_deg"] = faults.rotation_deg
         make_finding = warning if kind in ("copied", "ambiguous") else error
@@ -54,7 +52,7 @@ def detect(analysis: Comparison) -> Findings:
 def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding]) -> list[Finding]:
     """Remove findings that are only effects of wrong axes, unit, clock or orientation.
 
-    Findings on EKF2 remain as effects, because EKF2 used the positions without correction.
+    Findings on EKF2 are kept and marked as effects, because EKF2 used the wrong positions.
     """
     faults = _find_convention_faults(analysis)
     cause_findings = [item for item in findings if CONVENTION_KEY in item.evidence]
@@ -121,7 +119,7 @@ def _find_convention_faults(analysis: Comparison) -> Faults:
 def _find_position_faults(
     convention: Convention, faults: Faults, source: PositionTrack
 ) -> Iterator[ConventionFaultTexts]:
-    positions, alignment = positions_phrase(source), source.alignment
+    positions_text, alignment = positions_phrase(source), source.alignment
     is_file = alignment is not None
     log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
     basis_text = (
@@ -153,13 +151,11 @@ def _find_position_faults(
             "gyroscopes": "the heading at take-off",
             "GNSS": "the GNSS positions",
         }[convention.heading_from]
-        alternative_cause = (
-            "." if convention.heading_from == "GNSS" else f", or {heading_text} is wrong."
-        )
+        other_cause = "." if convention.heading_from == "GNSS" else f", or {heading_text} is wrong."
         message = (
-            f"{positions} are rotated by {turn_deg:+.0f}° (clockwise from above) "
-            f"relative to {heading_text}. The x axis of the source does not point north{alternative_cause} "
-            f"{basis_text} The analysis uses the positions rotated to NED."
+            f"{positions_text} are rotated by {turn_deg:+.0f}° (clockwise from above) "
+            f"relative to {heading_text}. The x axis of the source does not point north"
+            f"{other_cause} {basis_text} The analysis uses the positions rotated to NED."
         )
         action = (
             "Align the frame of the positioning system with north, or rotate positions and "
@@ -169,7 +165,7 @@ def _find_position_faults(
             action = "Run again with --position-yaw auto."
         yield "source_frame_misaligned", "rotation", message, action
     if faults.has_wrong_unit:
-        fault, action = describe_unit(convention.unit, positions, is_file=is_file)
+        fault, action = describe_unit(convention.unit, positions_text, is_file=is_file)
         distance_ratio = convention.scale / UNIT_SIZES_M[convention.unit]
         message = (
             f"{fault}. Distances are {distance_ratio:.3g} times those that the IMU measures. "
@@ -204,9 +200,9 @@ def _find_position_faults(
     if faults.is_ambiguous:
         axes_text = format_axes(convention.axes, convention.unit)
         message = (
-            f"The axes of the {positions} are not NED, and the motion does not show which they "
-            f"are: {'; or '.join((axes_text, *convention.alternatives[:3]))}. px4fuse estimates "
-            "nothing from the positions."
+            f"The axes of the {positions_text} are not NED, and the motion does not show which "
+            f"they are: {'; or '.join((axes_text, *convention.alternatives[:3]))}. px4fuse "
+            "estimates nothing from the positions."
         )
         action = "Fly a square with climb and descent, or state the frame (--position-frame)."
         yield "source_convention_ambiguous", "ambiguous", message, action
@@ -241,8 +237,8 @@ def _find_orientation_faults(
             "geometry_msgs have the order x, y, z, w.",
         ),
         "frames": (
-            f"The orientation of {source} rotates {orientation.frames}, but PX4 expects FRD to "
-            f"NED. After a conversion of the frames, {agreement_text}",
+            f"The orientation of {source} is the rotation {orientation.frames}, but PX4 expects "
+            f"FRD to NED. With converted frames, {agreement_text}",
             describe_conversion(orientation.frames),
         ),
         "heading": (

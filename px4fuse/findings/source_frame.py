@@ -38,8 +38,8 @@ MIN_MISALIGNMENT_SIGMAS = 4.0
 MIN_HEADING_ERROR_DEG = 5.0
 # Minimum yaw misalignment (°) for severity error: 26 % of the motion appears on the other axis
 MIN_SEVERE_HEADING_ERROR_DEG = 15.0
-# EKF2's heading drifts if drift against ground truth / drift against the positions is larger.
-# Otherwise the positions drift
+# Minimum ratio of the drift of EKF2's heading against ground truth to that against the positions.
+# Below this ratio, the frame of the positions drifts, not EKF2's heading
 MIN_TRUE_TO_ESTIMATED_DRIFT = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
@@ -73,7 +73,7 @@ def make_frame_finding(analysis: Analysis) -> Finding:
         fusion_flags is not None
         and fraction_of_ones(fusion_flags["yaw"], analysis.segment) > FUSED_FRACTION_FOR_ERROR
     ):
-        fusion_sentence = f"EKF2 fused the yaw of {sensor_name}, so EKF2 uses the same frame."
+        fusion_sentence = f"EKF2 fused the yaw of {sensor_name}, so EKF2 has the same axes."
     has_yaw = analysis.source.orientation is not None
     if fusion_sentence:
         return note("source_frame_frd", f"{fault} {fusion_sentence}", action)
@@ -104,15 +104,15 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
         MIN_MISALIGNMENT_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG
     ):
         return
-    positions = positions_phrase(analysis.source)
+    positions_text = positions_phrase(analysis.source)
     finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     if analysis.source.origin.is_gnss:
-        reason = "GNSS positions refer to true north, so the heading is wrong."
+        reason = "GNSS positions refer to true north, so EKF2's heading is wrong."
         _, action = _explain_gnss_heading_error(analysis)
     elif analysis.source.name == ALIGNED_TOPIC:
         reason = (
-            "EKF2 fused the positions in this frame, but the IMU measures another direction of "
-            "motion."
+            "EKF2 fused the positions in the frame of its state, but the IMU measures motion in "
+            "another direction."
         )
         action = "Align the positioning frame with north."
     else:
@@ -130,7 +130,7 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     yield finding(
         "error" if abs(rotation_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         finding_id,
-        f"{positions} are rotated by {rotation_deg:+.0f}° relative to {reference}. The 95 % "
+        f"{positions_text} are rotated by {rotation_deg:+.0f}° relative to {reference}. The 95 % "
         f"interval is ± {1.96 * sigma_deg:.0f}°; the rotation is clockwise from above and constant "
         f"over the flight. {reason}",
         action,
@@ -142,12 +142,12 @@ def _explain_gnss_heading_error(analysis: Analysis) -> tuple[str, str]:
     """Return the possible cause of a wrong heading in a flight with GNSS, and the action."""
     if (trial := find_confirmed_noise_trial(analysis)) is not None:
         cause = (
-            f"the wrong {aid_of(analysis).noise}: it determines the influence of GNSS on EKF2's "
+            f"a wrong {aid_of(analysis).noise}, which determines the influence of GNSS on EKF2's "
             "heading"
         )
         return cause, f"Set {format_settings(trial.change)}. Then check the heading again."
     advice = magnetometer_advice(analysis.flight)
-    cause = "a magnetometer near currents or steel" if advice else "the heading source of EKF2"
+    cause = "a magnetometer near currents or steel" if advice else "a wrong heading source of EKF2"
     return cause, f"{advice} {CHECK_GNSS_DELAY_ACTION}".lstrip()
 
 

@@ -33,19 +33,19 @@ MIN_INTERVALS = 50
 # Minimum fraction of missing positions to report downsampling: a radio link loses fewer
 MIN_DOWNSAMPLED_FRACTION = 0.25
 # Intervals of downsampled positions are n or n + 1 periods of the source (30 Hz to 20 Hz: 1 or 2).
-# Minimum fraction of the intervals with one of these two lengths
+# Minimum fraction of intervals of n or n + 1 periods, for a finding
 MIN_INTERVAL_PAIR_FRACTION = 0.85
-# Minimum fraction of the intervals with the rarer length (n or n + 1 periods of the source)
+# Minimum fraction of intervals with the less frequent of both lengths, for a finding
 MIN_RARER_INTERVAL_FRACTION = 0.1
-# Maximum RMS of (interval / period - nearest integer): jitter causes 0.03, random intervals cause
-# 0.29
+# Intervals are multiples of a period if the RMS of (interval / period - nearest integer) is at most
+# this value: jitter causes 0.03, random intervals cause 0.29
 MAX_ROUNDING_RMS_ERROR = 0.06
-# Maximum number of periods of the source in the median interval between positions
+# Tested periods of the source are the median interval divided by 1 to this number
 MAX_PERIODS_PER_INTERVAL = 4
-# Minimum length (s) of a gap at the start or end of the flight for a finding: the land detector is
-# seconds late
+# Minimum length (s) of a gap at the start or end of the flight for a finding: shorter gaps may be
+# errors of take-off and landing times, because the land detector is seconds late
 MIN_END_GAP_S = 3.0
-# KF's state before an update is read this time (s) before the position
+# KF's predicted state is read this time (s) before the position that updates it
 TIME_BEFORE_UPDATE_S = 1e-6
 
 
@@ -62,7 +62,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
     invalid_times_s = analysis.source.invalid.index
     for gap in analysis.events.gaps:
         if np.any((invalid_times_s > gap[0]) & (invalid_times_s < gap[1])):
-            continue  # source_values reports this gap
+            continue  # source_values reports the invalid positions in this gap
         aids = _find_fused_aids(ekf2, gap)
         if source.origin.aid in aids and source.alignment is None:
             fused_gap_spans.append(gap)
@@ -71,13 +71,13 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
                 yield _make_partial_source_finding(analysis, gap, aids)
         else:
             gap_spans.append(gap)
-    positions = positions_phrase(source)
+    positions_text = positions_phrase(source)
     if fused_gap_spans:
         start_s, end_s, gap_count_text = _find_longest_gap(fused_gap_spans)
         yield warning(
             "source_gap_in_log",
-            f"{positions} are missing in the log for {end_s - start_s:.1f} s{gap_count_text}, but EKF2 "
-            "fused them. The source did not stop; KF has no measurement in this time.",
+            f"{positions_text} are missing in the log for {end_s - start_s:.1f} s{gap_count_text}, "
+            "but EKF2 fused them. The source did not stop; KF has no measurement in this time.",
             _find_unlogged_remedy(analysis, start_s, end_s),
             {"count": len(fused_gap_spans), "longest_s": end_s - start_s, "at_s": start_s},
             tuple(fused_gap_spans),
@@ -118,16 +118,16 @@ def _make_partial_source_finding(
     )
     action = "" if is_source_stop or source.alignment else " Take off only when positions arrive."
     ekf2_errors_at_end, duration_s = _find_ekf2_errors_at_end(analysis, span_s), end_s - start_s
-    error_time_text = (
-        f"after {duration_s:.1f} s" if is_source_stop else "just before the first position"
-    )
+    time_text = f"after {duration_s:.1f} s" if is_source_stop else "just before the first position"
     effect_text = (
         f", {duration_s:.1f} s {'before the end' if is_source_stop else 'after the start'}"
     )
     if "error_m" in ekf2_errors_at_end:
-        effect_text = f": EKF2's position error is {format_metres(ekf2_errors_at_end['error_m'])} m {error_time_text}"
+        error_text = format_metres(ekf2_errors_at_end["error_m"])
+        effect_text = f": EKF2's position error is {error_text} m {time_text}"
     elif "sigma_m" in ekf2_errors_at_end:
-        effect_text = f": EKF2's reported σ is {format_metres(ekf2_errors_at_end['sigma_m'])} m {error_time_text}"
+        sigma_text = format_metres(ekf2_errors_at_end["sigma_m"])
+        effect_text = f": EKF2's reported σ is {sigma_text} m {time_text}"
     has_aids, aiding_sentence = _has_aids(analysis.flight.ekf2), ""
     if has_aids:
         labels = [aid.label for aid in fused_aids] or ["the IMU alone (dead reckoning)"]
@@ -155,12 +155,14 @@ def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, floa
         if isinstance(tracks.ekf2_state, Unavailable):
             return {}
         position_m = tracks.ekf2_state["position_m"].loc[slice(*span_s)]
-        time_s, true_m = position_m.index.to_numpy(), np.full(len(position_m), np.nan)
+        time_s, true_position_m = position_m.index.to_numpy(), np.full(len(position_m), np.nan)
         if isinstance(tracks.truth, pd.DataFrame):
             true_positions = tracks.truth["position_m"]
-            true_m = np.interp(time_s, true_positions.index, true_positions, np.nan, np.nan)
+            true_position_m = np.interp(
+                time_s, true_positions.index, true_positions, np.nan, np.nan
+            )
         sigma_m = reported_sigma(time_s, tracks.ekf2_variance, "position_variance_m2")
-        squares_m2.append([(position_m - true_m) ** 2, sigma_m**2])
+        squares_m2.append([(position_m - true_position_m) ** 2, sigma_m**2])
     squared_sums_by_name = zip(("error_m", "sigma_m"), np.sum(squares_m2, axis=0), strict=True)
     return {
         name: float(np.sqrt(values[np.isfinite(values)][-1]))
@@ -177,21 +179,21 @@ def describe_errors_after_gap(analysis: Analysis, gap_s: Span) -> str:
     reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
     quantity = "Distance from estimate to first position after the gap"
     if isinstance(result.truth, pd.DataFrame):
-        true_m = result.truth["position_m"]
+        true_positions_m = result.truth["position_m"]
         reference_m, quantity = (
-            float(np.interp(end_s, true_m.index, true_m)),
+            float(np.interp(end_s, true_positions_m.index, true_positions_m)),
             "Position error at the end of the gap",
         )
     error_texts = []
-    aiding_sentence = "KF relies on the IMU alone."
+    aiding_sentence = "In the gap KF relies on the IMU alone."
     if isinstance(ekf2_state, pd.DataFrame) and len(
         positions_before := ekf2_state["position_m"].loc[:end_s]
     ):
         if _has_aids(analysis.flight.ekf2):
-            aiding_sentence = "KF and EKF2 rely on the IMU alone."
+            aiding_sentence = "In the gap KF and EKF2 rely on the IMU alone."
         if other_aids := _find_fused_aids(analysis.flight.ekf2, gap_s):
             aid_labels = " and ".join(aid.label for aid in other_aids)
-            aiding_sentence = f"KF relies on the IMU alone, EKF2 also on {aid_labels}."
+            aiding_sentence = f"In the gap KF relies on the IMU alone, EKF2 also on {aid_labels}."
         variance, state_time_s = result.ekf2_variance, float(positions_before.index[-1])
         sigma_text = ""
         if isinstance(variance, pd.DataFrame) and len(variance):
@@ -256,8 +258,8 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
-    # Intervals are not the receive intervals of PX4 if px4fuse changed the timestamps, or if PX4
-    # logged the positions after their use in EKF2 (ALIGNED)
+    # These timestamps do not show when PX4 received the positions: px4fuse changed them, or PX4
+    # logged the positions only after EKF2 had used them (ALIGNED)
     if (
         source.clock_map is not None
         or source.origin.find_preference_rank() >= ALIGNED.find_preference_rank()
@@ -315,7 +317,8 @@ def _compute_intervals_s(analysis: Analysis) -> tuple[Array, float]:
 
 def _find_period(intervals_s: Array) -> tuple[float, Array] | None:
     """Return the period (s) of the source, and the number of periods in each interval."""
-    # The upper median is one of the intervals, not the mean of two intervals
+    # The upper median is one of the intervals. The mean of two intervals may be no multiple of the
+    # period
     median_interval_s = float(np.sort(intervals_s)[len(intervals_s) // 2])
     for median_count in range(1, MAX_PERIODS_PER_INTERVAL + 1):
         period_counts = np.rint(intervals_s * median_count / median_interval_s)

@@ -19,7 +19,7 @@ from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, find_ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_LIKELIHOOD_NATS, has_little_motion
 from px4fuse.flight.model import Columns, positions_phrase, source_name
 
-# White noise is a separate fault if white noise σ / time-correlated noise σ is larger
+# Minimum ratio of white to time-correlated noise σ, at which white noise is a separate fault
 MIN_WHITE_TO_CORRELATED_RATIO = 0.3
 # Minimum log likelihood ratio (nats) of time-correlated to white noise: larger in 1 of 400 flights
 # without a fault
@@ -33,7 +33,7 @@ MIN_REPEATED_FRACTION = 0.05
 MIN_REPEATED_FRACTION_FOR_ERROR = 0.3
 # Minimum number of repeated positions for a finding
 MIN_REPEATED_COUNT = 10
-# Minimum (larger / smaller) position noise σ of the axes north and east, for a finding
+# Minimum ratio of the larger to the smaller position noise σ of north and east, for a finding
 MIN_AXIS_NOISE_RATIO = 1.5
 # Minimum ratio of the noise in one part of the flight to the noise in the rest, for a warning
 MIN_PART_NOISE_RATIO = 2.0
@@ -61,8 +61,8 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         not isinstance(noise, TimeCorrelatedNoise)
         or noise.gain_nats < MIN_CORRELATED_LIKELIHOOD_NATS
         or noise.slow_m < MIN_CORRELATED_SIGMA_M
-        or noise.low_pass_gain_nats
-        >= MIN_LAG_LIKELIHOOD_NATS  # a low-pass filtered source has its own finding
+        # a low-pass filtered source has its own finding
+        or noise.low_pass_gain_nats >= MIN_LAG_LIKELIHOOD_NATS
     ):
         return
     low_text, high_text = (format_number(end, 1) for end in (noise.low_s, noise.high_s))
@@ -138,7 +138,7 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
 def detect_unequal_noise(analysis: Analysis) -> Findings:
     """Detect that the position noise differs between north and east."""
     if analysis.source.origin.is_gnss:
-        return  # the estimate of SIGMA_Z contains only the white noise of GNSS
+        return  # the estimate of SIGMA_Z lacks the time-correlated noise, which dominates in GNSS
     axis_noise_estimates = sorted(
         (noise.value, noise.low, noise.high, axis_tuning.name)
         for axis_tuning in analysis.tuning_by_axis
@@ -158,8 +158,8 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
     yield warning(
         "source_noise_unequal_axes",
         f"{source_name(analysis.source)} noise is {larger_noise_m:.2g} m along "
-        f"{larger_noise_axis} and {smaller_noise_m:.2g} m along {smaller_noise_axis}. One SIGMA_Z, or one EKF2 "
-        "measurement noise, does not fit both axes.",
+        f"{larger_noise_axis} and {smaller_noise_m:.2g} m along {smaller_noise_axis}. One SIGMA_Z, "
+        "or one EKF2 measurement noise, does not fit both axes.",
         f"Check {find_source_texts(analysis.source).errors}. Analyse each axis separately "
         f"(--axis {larger_noise_axis} --sigma-z {larger_noise_m:.2g}).",
         {
@@ -174,7 +174,8 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     if (
         noisy_part is None
         or noisy_part.sigma_ratio < MIN_PART_NOISE_RATIO
-        # An outlier that is fused also increases the next innovations
+        # Without outliers, too, the noise must be larger: a fused outlier also increases the next
+        # innovations
         or noisy_part.sigma_ratio_without_outliers < MIN_PART_NOISE_RATIO_WITHOUT_OUTLIERS
     ):
         return

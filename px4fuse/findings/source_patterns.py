@@ -1,6 +1,6 @@
-"""Position errors with a pattern: timestamp jitter, and noise that increases with speed.
+"""Position errors with a pattern: timestamp jitter, noise that grows with speed, late attitude.
 
-Ground truth also shows periodic errors, a time offset that varies in flight, and a scale factor
+Only with ground truth: periodic errors, a time offset that varies in flight, and a scale factor
 error.
 """
 
@@ -90,30 +90,34 @@ def detect_jitter_and_speed_noise(analysis: Analysis, white: WhiteErrors) -> Fin
 
 
 def detect_slow_errors(analysis: Analysis, error_fit: ErrorFit) -> Findings:
-    periodic_error, positions = find_periodic_error(error_fit), positions_phrase(analysis.source)
+    periodic_error = find_periodic_error(error_fit)
+    positions_text = positions_phrase(analysis.source)
     if periodic_error is not None:
         yield (error if periodic_error.amplitude_m >= MIN_AMPLITUDE_FOR_ERROR_M else warning)(
             "source_error_periodic",
-            f"The error of the {positions} is periodic: amplitude "
-            f"{format_metres(periodic_error.amplitude_m)} m, period {periodic_error.period_s:.1f} s. This "
-            f"sinusoid explains {format_percent(min(periodic_error.fraction, 1.0))} of the slow errors "
-            "against ground truth. KF and EKF2 follow this error, so innovations hardly show it.",
-            f"Check {find_source_texts(analysis.source).errors}. Look for a process with this period, "
-            "such as a rotating part or a control loop. No noise setting corrects this error.",
+            f"The error of the {positions_text} is periodic: amplitude "
+            f"{format_metres(periodic_error.amplitude_m)} m, period {periodic_error.period_s:.1f} "
+            f"s. This sinusoid explains {format_percent(min(periodic_error.fraction, 1.0))} of the "
+            "slow errors against ground truth. KF and EKF2 follow this error, so innovations "
+            "hardly show it.",
+            f"Check {find_source_texts(analysis.source).errors}. Look for a process with this "
+            "period, such as a rotating part or a control loop. No noise setting corrects this "
+            "error.",
             periodic_error._asdict(),
         )
         return
     clock, offset_variation = analysis.clock, find_offset_variation(error_fit)
     if isinstance(clock, ClockOffset) and clock.has_changed():
-        return  # source_clock reports the change
+        return  # source_clock reports the change of the time offset
     if offset_variation is not None:
         yield error(
             "source_time_offset_changes",
-            f"The time offset of the {positions} varies in flight by "
-            f"{offset_variation.most_s - offset_variation.least_s:.2f} s. Its deviation from the mean is "
-            f"{offset_variation.least_s:+.2f} s at {offset_variation.least_at_s:.0f} s and "
-            f"{offset_variation.most_s:+.2f} s at {offset_variation.most_at_s:.0f} s, estimated from the errors "
-            "along the motion against ground truth. No single --clock-offset corrects this.",
+            f"The time offset of the {positions_text} varies in flight by "
+            f"{offset_variation.most_s - offset_variation.least_s:.2f} s. Its deviation from the "
+            f"mean is {offset_variation.least_s:+.2f} s at {offset_variation.least_at_s:.0f} s and "
+            f"{offset_variation.most_s:+.2f} s at {offset_variation.most_at_s:.0f} s, estimated "
+            "from the errors along the motion against ground truth. No single --clock-offset "
+            "corrects this.",
             "Synchronise the clocks during the whole flight. Send the time of measurement, not the "
             "time at which a position was sent or received.",
             offset_variation._asdict(),

@@ -1,4 +1,7 @@
-"""Faults of the positions: little motion, low pass, jumps, scale factor, outliers, variance."""
+"""Faults of the positions: constant, low-pass filtered, jumps, scale factor, outliers, variance.
+
+Flights with too little motion are also reported.
+"""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -48,18 +51,19 @@ from px4fuse.flight.model import (
     white_noise_m,
 )
 
-# Minimum extent (m) of the positions (5th to 95th percentile) if the vehicle moves
+# The vehicle moves if the extent (m) of the positions is at least this (5th to 95th percentile)
 MIN_MOTION_RANGE_M = 0.5
-# Minimum extent of the positions / σ of the position noise if the vehicle moves: 3.29 for white
-# noise (5th to 95th percentile), plus 25 %
+# The vehicle moves if the ratio of this extent to the position noise σ is at least this: white
+# noise at rest has 3.29 (5th to 95th percentile), plus 25 %
 MIN_MOTION_RANGE_SIGMAS = 1.25 * 3.29
 # Minimum log likelihood ratio (nats) of low-pass filtered to white noise; for positions that are
 # not filtered it is 0 to 2
 MIN_LOW_PASS_LIKELIHOOD_NATS = 6.0
-# Minimum log likelihood ratio (nats) of low-pass filtered noise to time-correlated noise without
-# lag
+# Minimum log likelihood ratio (nats) of low-pass filtered to time-correlated noise, to report a
+# low-pass filter. Only the filter delays the positions
 MIN_LAG_LIKELIHOOD_NATS = 1.0
-# Lag from correlation > MAX_LAG_RATIO · upper 95 % limit of the delay: the delay is reported as lag
+# Maximum ratio of the lag estimated from the noise correlation to the upper 95 % limit of the time
+# offset. Above this ratio, the time offset is reported as the lag
 MAX_LAG_TO_DELAY_RATIO = 4.0
 # Minimum lag (s) due to a low-pass filter, for a warning: a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
@@ -67,7 +71,7 @@ MIN_LAG_S = 0.05
 MIN_LAG_FOR_ERROR_S = 0.10
 # Minimum position jump (m) for a warning: twice the noise of good UWB (0.1 m)
 MIN_JUMP_M = 0.2
-# Minimum position jump / σ of time-correlated noise, for a warning
+# Minimum ratio of a position jump to the σ of time-correlated noise, for a warning
 MIN_JUMP_SIGMAS = 5.0
 # Minimum number of jumps with a change of reset_counter to report repeated jumps
 MIN_ANNOUNCED_JUMPS = 2
@@ -75,17 +79,19 @@ MIN_ANNOUNCED_JUMPS = 2
 MIN_UNANNOUNCED_JUMPS = 3
 # Minimum size (m) of a jump without a change of reset_counter
 MIN_UNANNOUNCED_JUMP_M = 0.1
-# Minimum jump without a change of reset_counter / median of the other position changes
+# Minimum ratio of a jump without a change of reset_counter to the median of position changes
 MIN_UNANNOUNCED_JUMP_RATIO = 8.0
-# Number of position changes whose median is compared with a jump
+# Number of successive position changes around a jump, whose median is compared with the jump
 CHANGE_WINDOW_SAMPLES = 61
 # Minimum number of positions to detect jumps
 MIN_POSITIONS_FOR_JUMPS = 100
-# Minimum time (s) and number of positions for which a jump lasts: outliers are shorter
+# Minimum time (s) and number of positions after a jump without return: outliers return earlier
 MIN_JUMP_DURATION_S, MIN_JUMP_DURATION_SAMPLES = 0.6, 9
-# A jump lasts if |change of the median position - jump| / size of the jump is smaller
+# The shift between the median positions before and after a jump differs from the jump by less than
+# this fraction of the jump; otherwise the positions have returned
 MAX_SHIFT_DEVIATION_RATIO = 0.5
-# Maximum interval before a jump / median interval: in a longer interval, the vehicle moves
+# Maximum ratio of the interval before a jump to the median interval: a position change in a longer
+# interval may be motion
 MAX_JUMP_INTERVAL_RATIO = 1.5
 # The positions alternate between two points if at least this fraction of the jumps is opposite to
 # the previous jump
@@ -110,12 +116,12 @@ MIN_SCALE_ERROR_FOR_ERROR = 0.15
 MIN_SCALE_ERROR_SIGMAS = 3.0
 # Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
 MIN_OUTLIER_FRACTION = 0.005
-# Minimum fraction of outliers for severity error: one in 10 s at 5 Hz
+# Minimum fraction of outliers for severity error: one outlier in 10 s at 5 Hz
 MIN_OUTLIER_FRACTION_FOR_ERROR = 0.02
 # Minimum number of outliers for a finding
 MIN_OUTLIERS = 3
-# Rejected outliers are counted if the log has the innovations of a larger fraction of the positions
-MIN_LOGGED_INNOVATION_FRACTION = 0.75
+# Minimum fraction of positions with logged innovations, to state the number of rejected outliers
+MIN_LOGGED_FRACTION = 0.75
 # Minimum factor between reported and estimated position variance for a warning
 MIN_VARIANCE_RATIO = 2.0
 # Minimum factor between reported and estimated position variance for severity error
@@ -149,7 +155,8 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     ):
         return None
     clock, correlated_noise = analysis.clock, analysis.time_correlated_noise
-    # At a high rate, the time offset (negative for a lag) is more accurate than the correlation
+    # At a high rate, the time offset (negative for a lag) shows the lag more accurately than the
+    # noise correlation
     lag_limit_s = (
         -MAX_LAG_TO_DELAY_RATIO * clock.interval_s[0] if isinstance(clock, ClockOffset) else 0.0
     )
@@ -187,7 +194,8 @@ def detect_low_pass(analysis: Analysis) -> Findings:
 def detect_jumps(analysis: Analysis) -> Findings:
     """Detect position jumps that the IMU does not measure."""
     systematic_errors = analysis.systematic_errors
-    # A change of the time offset also shifts the positions of a moving vehicle
+    # A change from arrival to measurement times shifts the positions of a moving vehicle, like a
+    # jump
     if not isinstance(systematic_errors, SystematicErrors) or any(
         detect_arrival_timestamps(analysis)
     ):
@@ -195,24 +203,29 @@ def detect_jumps(analysis: Analysis) -> Findings:
     correlated_noise = analysis.time_correlated_noise
     min_jump_m = MIN_JUMP_M
     if not isinstance(correlated_noise, Unavailable):
-        # Time-correlated noise changes by up to √2 σ within seconds, which resembles a jump
+        # Time-correlated noise also changes within seconds (1 σ of the change: up to √2 σ)
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
     large_jumps = [jump for jump in systematic_errors.jumps if jump.size_m >= min_jump_m]
     counter_change_times_s = reset_times_s(analysis.source)
     if large_jumps:
         largest_jump = max(large_jumps, key=lambda jump: jump.size_m)
-        size_m, jump_s, sigma_m = (
+        size_m, jump_time_s, sigma_m = (
             largest_jump.size_m,
             largest_jump.time_s,
             max(step.sigma for step in largest_jump.step_m),
         )
-        positions = positions_phrase(analysis.source)
+        positions_text = positions_phrase(analysis.source)
         texts = find_source_texts(analysis.source)
         cause = f"Possible causes: {texts.jump}."
-        evidence = {"count": len(large_jumps), "size_m": size_m, "at_s": jump_s, "sigma_m": sigma_m}
-        if np.any(np.abs(counter_change_times_s - jump_s) < MAX_JUMP_TO_COUNTER_TIME_S):
+        evidence = {
+            "count": len(large_jumps),
+            "size_m": size_m,
+            "at_s": jump_time_s,
+            "sigma_m": sigma_m,
+        }
+        if np.any(np.abs(counter_change_times_s - jump_time_s) < MAX_JUMP_TO_COUNTER_TIME_S):
             evidence[RESET_TIME_KEY] = float(
-                counter_change_times_s[np.argmin(np.abs(counter_change_times_s - jump_s))]
+                counter_change_times_s[np.argmin(np.abs(counter_change_times_s - jump_time_s))]
             )
             cause = (
                 "The source announced the jump (reset_counter): it relocalised or set a new origin."
@@ -227,9 +240,9 @@ def detect_jumps(analysis: Analysis) -> Findings:
         yield finding(
             "error" if size_m >= MIN_JUMP_FOR_ERROR_M else "warning",
             "source_position_jump",
-            f"{positions} {jump_text} at {jump_s:.1f} s and {end_text}. The IMU measures no such "
-            f"motion (± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow the jump, and "
-            "their innovations stay consistent.",
+            f"{positions_text} {jump_text} at {jump_time_s:.1f} s and {end_text}. The IMU measures "
+            f"no such motion (± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow the "
+            "jump, and their innovations stay consistent.",
             f"{texts.jump_action} Analyse only the time before or after the jump (--start, --end).",
             evidence,
             zero_length_spans(jump.time_s for jump in large_jumps),
@@ -244,7 +257,7 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
     if not (is_single_coordinate or is_height_only(source)) or (
         is_single_coordinate and source.step_m > 0.0
     ):
-        return  # rounded positions may stay within one step
+        return  # coarsely rounded positions may be constant while the vehicle moves
     values_m = dict(zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True))
     name, bit, make_finding = "source_coordinate_constant", HORIZONTAL_CONTROL_BIT, error
     consequence = "px4fuse estimates nothing from these positions."
@@ -264,13 +277,13 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
         elif names == ["z"]:
             make_finding = note
         action += f", so that EKF2 does not fuse {listed_names}. "
-    constant_text = f"coordinate {listed_names} of {source.name} is"
+    coordinate_text = f"coordinate {listed_names} of {source.name} is"
     if not is_single_coordinate:
-        constant_text = f"coordinates {listed_names} of {source.name} are"
+        coordinate_text = f"coordinates {listed_names} of {source.name} are"
     values_text = ", ".join(f"{values_m[each]:g}" for each in names)
     yield make_finding(
         name,
-        f"The {constant_text} constant ({values_text} m): the source does not measure "
+        f"The {coordinate_text} constant ({values_text} m): the source does not measure "
         f"{'it' if is_single_coordinate else 'them'}. {consequence}",
         f"{action}Send NaN for a coordinate that is not measured.",
         {f"{each}_m": value for each, value in values_m.items()},
@@ -295,12 +308,12 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
     ]
     reset_delays_s = [
         min(delays_after_jump_s)
-        for jump_s in times_s
+        for jump_time_s in times_s
         if (
             delays_after_jump_s := [
-                at_s - jump_s
+                at_s - jump_time_s
                 for at_s in ekf2_reset_times_s
-                if 0.0 < at_s - jump_s < MAX_JUMP_TO_RESET_TIME_S
+                if 0.0 < at_s - jump_time_s < MAX_JUMP_TO_RESET_TIME_S
             ]
         )
     ]
@@ -317,7 +330,7 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
     if not is_announced:
         counter_text = "without a change of its reset_counter"
         cause_sentence = f"Possible causes: {find_source_texts(analysis.source).jump}."
-    action = "Improve the tracking of the source, or correct the drift in smaller steps."
+    action = "Improve the tracking of the source, or let it correct its drift in smaller steps."
     if is_reversal.mean() >= MIN_REVERSED_JUMP_FRACTION:
         cause_sentence = (
             "The source alternately sends the positions of two points, "
@@ -338,7 +351,7 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
 def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
     """Return time (s) and step (m) of each jump, and True if ``reset_counter`` changes with them.
 
-    If it does not change, a jump must last for :data:`MIN_LASTING_S`, and must be
+    If it does not change, a jump must last for :data:`MIN_JUMP_DURATION_S`, and must be
     :data:`MIN_UNANNOUNCED_JUMP_RATIO` times larger than other position changes.
     """
     position_m = cut_to_segment(analysis.source.samples, analysis.segment)[
@@ -395,9 +408,9 @@ def detect_scale_error(analysis: Analysis) -> Findings:
         return
     if (
         analysis.source.origin.is_gnss  # GNSS has no scale factor error
-        or isinstance(analysis.flight.truth, Truth)  # source_patterns compares with ground truth
+        or isinstance(analysis.flight.truth, Truth)  # source_patterns finds the error more exactly
         or not isinstance(systematic_errors, SystematicErrors)
-        # a low-pass filter reduces the motion, and time-correlated noise may resemble a scale error
+        # the effect of a low-pass filter or of time-correlated noise may resemble a scale error
         or find_low_pass(analysis) is not None
         or not isinstance(analysis.time_correlated_noise, Unavailable)
         or not _is_clock_known(analysis)
@@ -420,7 +433,7 @@ def detect_scale_error(analysis: Analysis) -> Findings:
 
 
 def detect_outliers(analysis: Analysis) -> Findings:
-    """Detect more outliers than Gaussian noise has."""
+    """Detect more outliers of the innovations than Gaussian noise causes."""
     axis_tuning = analysis.tuning.get(HORIZONTAL) or next(iter(analysis.tuning.values()), None)
     if not isinstance(axis_tuning, AxisTuning):
         return
@@ -434,8 +447,8 @@ def detect_outliers(analysis: Analysis) -> Findings:
         time_s
         for time_s in axis_tuning.outlier_time_s.tolist()
         if not any(
-            jump_s - OUTLIER_BURST_S <= time_s < jump_s + OUTLIERS_AFTER_STEP_S
-            for jump_s in jump_times_s
+            jump_time_s - OUTLIER_BURST_S <= time_s < jump_time_s + OUTLIERS_AFTER_STEP_S
+            for jump_time_s in jump_times_s
         )
     ]
     outlier_count, outlier_fraction = len(outlier_times_s), len(outlier_times_s) / axis_tuning.count
@@ -487,9 +500,7 @@ def _format_rejected_outliers(analysis: Analysis, outlier_times_s: Sequence[floa
     innovations = analysis.main.ekf2_innovations
     if not isinstance(innovations, pd.DataFrame) or innovations["rejected"].isna().any():
         return ""
-    if len(innovations) < MIN_LOGGED_INNOVATION_FRACTION * len(
-        analysis.main.axis.measurement_time_s
-    ):
+    if len(innovations) < MIN_LOGGED_FRACTION * len(analysis.main.axis.measurement_time_s):
         return ""
     rejection_times_s = innovations.index[innovations["rejected"] > 0.0].to_numpy()
     tolerance_s = 0.5 / analysis.source.compute_rate_hz()
@@ -526,15 +537,15 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
         if direction == "large" and rmse_m is None:
             correlation_note = " The reported σ may include time-correlated errors."
         severity: Severity = "error" if ratio >= MIN_VARIANCE_RATIO_FOR_ERROR else "warning"
-        effect = "EKF2 uses this variance or EKF2_EVP_NOISE², the larger one (EKF2_EV_NOISE_MD 0)."
+        effect = "EKF2 uses the larger of it and EKF2_EVP_NOISE² (EKF2_EV_NOISE_MD 0)."
         if analysis.flight.log.parameters.get("EKF2_EV_NOISE_MD") == 1:
-            severity, effect = "note", "EKF2 does not use this variance (EKF2_EV_NOISE_MD 1)."
+            severity, effect = "note", "EKF2 ignores reported variances (EKF2_EV_NOISE_MD 1)."
         yield finding(
             severity,
             "source_reported_variance_wrong",
             f"The variance that {source_name(source)} reports is {format_factor(ratio)} times too "
-            f"{direction}. The reported σ is {reported_sigma_m:.3g} m, the position noise {noise_m:.3g} "
-            f"m (95 % {low:.3g} to {high:.3g} m). {effect}{correlation_note}",
+            f"{direction}. The reported σ is {reported_sigma_m:.3g} m, the position noise "
+            f"{noise_m:.3g} m (95 % {low:.3g} to {high:.3g} m). {effect}{correlation_note}",
             f"Report a variance of {noise_m**2:.2g} m² with each position.",
             {
                 "reported_sigma_m": reported_sigma_m,
@@ -559,7 +570,7 @@ def _compute_rmse_per_axis_m(analysis: Analysis) -> float | None:
 
 
 def compute_motion_range_m(comparison: Comparison) -> float:
-    """Return the extent (m) of the positions along north or east, 5th to 95th percentile."""
+    """Return the larger extent (m) of the positions, north or east, 5th to 95th percentile."""
     samples = cut_to_segment(comparison.source.samples, comparison.segment)
     low, high = samples[Columns.POSITION[:2]].quantile([0.05, 0.95]).to_numpy()
     return float(np.max(high - low))

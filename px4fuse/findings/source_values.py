@@ -23,11 +23,13 @@ from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
 # Minimum rounding step (m) for a finding: the error of smaller steps is below the noise of UWB
 MIN_ROUNDING_STEP_M = 0.05
-# Maximum position RMSE of an EKF2 replay with the new lever arm / with the old one, for a finding
+# Maximum ratio of EKF2's position RMSE in a replay with the estimated lever arm to that with the
+# lever arm used in flight, for a finding
 MAX_LEVER_ARM_RMSE_RATIO = 0.7
-# Minimum distance (m) between the positions of two senders that alternate: the noise of good UWB
+# Minimum distance (m) between the positions of two alternating senders, for a finding: smaller
+# distances may be the noise of good UWB
 MIN_SENDER_DISTANCE_M = 0.1
-# Minimum distance between the positions of two senders / noise σ: one sender reaches 2
+# Minimum ratio of this distance to its scatter (1 σ), for a finding: noise of one sender reaches 2
 MIN_SENDER_DISTANCE_SIGMAS = 4.0
 # Window length (samples) for the detection of two senders: short, because a lost sample exchanges
 # the senders of odd and even samples
@@ -37,13 +39,13 @@ WINDOW_SAMPLES = 16
 MIN_WINDOWS = 10
 # Positions are a copy of EKF2's position if their median distance is below this limit (m)
 MAX_COPY_DISTANCE_M = 0.01
-# Maximum median distance (m) between EKF2 and a copy that EKF2 fuses. It is small, because EKF2
-# follows any source that it fuses
+# This limit (m) is smaller if EKF2 fuses the positions, because EKF2 follows any source that it
+# fuses
 MAX_FUSED_COPY_DISTANCE_M = 0.001
 # Positions are compared with EKF2's position above this speed (m/s): at rest, any source may agree
 MIN_COPY_SPEED_M_S = 0.2
-# Tested delays (s) of a copy of EKF2's position
-TESTED_COPY_DELAYS_S = np.arange(0.0, 0.305, 0.005)
+# Tested delays (s) between EKF2's position and a source that sends it back
+COPY_DELAYS_S = np.arange(0.0, 0.305, 0.005)
 NO_ESTIMATES_SENTENCE = "px4fuse estimates nothing from these positions."
 # For each reason of an invalid position: id of the finding, fault, and action
 INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
@@ -84,7 +86,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _find_invalid_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
-    # Invalid samples between two valid samples are one span
+    # Successive invalid samples have the same number of valid samples before them
     valid_count_before = np.searchsorted(valid_s, time_s)
     starts = np.flatnonzero(np.diff(valid_count_before, prepend=-1))
     ends = np.append(starts[1:], len(time_s)) - 1
@@ -104,7 +106,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
             longest_span_s[1] - longest_span_s[0],
             sum(end - start for start, end in spans),
         )
-        fault = fault_template.format(positions=f"{count} {positions_phrase(source)}")
+        fault_sentence = fault_template.format(positions=f"{count} {positions_phrase(source)}")
         times = f"{len(spans)} parts from {spans[0][0]:.1f} s to {spans[-1][1]:.1f} s"
         if len(spans) <= 3:
             times = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
@@ -115,8 +117,8 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
             error_text = f" {describe_errors_after_gap(analysis, valid_times_s)}"
         yield make_finding(
             name,
-            f"{fault}. Times of these positions: {times} ({total_s:.1f} s in total). KF does not "
-            f"use them.{error_text}",
+            f"{fault_sentence}. Times of these positions: {times} ({total_s:.1f} s in total). KF "
+            f"does not use them.{error_text}",
             action or f"Check {find_source_texts(source).reception} at {longest_span_s[0]:.1f} s.",
             {
                 "count": count,
@@ -143,8 +145,8 @@ def detect_rounding(analysis: Analysis) -> Findings:
     cause, action = "The source rounds the positions.", "Send the positions with more digits."
     if np.log2(step_m) % 1.0 == 0.0:
         cause = (
-            "Possible causes: the source rounds them, or they were 32-bit floats at large "
-            "coordinates, such as UTM."
+            "Possible causes: the source rounds the positions, or stores large coordinates (such "
+            "as UTM) as 32-bit floats."
         )
         action += (
             " Subtract a local origin in double precision (64 bit) before the position becomes a "
@@ -170,22 +172,21 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     if lever_arm is None:
         return
     forward_m, right_m, sigma_m = lever_arm
-    lever_arm_m = (
-        np.add(source.lever_arm_m[:2], lever_arm[:2]).round(2) + 0.0
-    )  # + 0.0 removes a sign of zero
+    # + 0.0 replaces -0.0 by 0.0
+    lever_arm_m = np.add(source.lever_arm_m[:2], lever_arm[:2]).round(2) + 0.0
     change = dict(zip(aid_of(analysis).lever_arm, lever_arm_m.tolist(), strict=False))
     effect_sentence = _describe_replayed_effect(analysis, change)
     if effect_sentence is None:
         return
     forward_m, right_m = (round(part, 2) + 0.0 for part in (forward_m, right_m))
-    sensor, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
-    if source.alignment is not None:  # EKF2 did not fuse the file
-        sensor = "sensor"
-        action = "Subtract this lever arm, rotated by the attitude, from the positions of the file."
+    sensor_text, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
+    if source.alignment is not None:  # EKF2 did not fuse a file, so no parameter corrects it
+        sensor_text = "sensor"
+        action = "Subtract this lever arm, rotated to NED by the attitude, from the positions."
     yield warning(
         "source_lever_arm",
-        f"The {sensor} is mounted {np.hypot(forward_m, right_m):.2f} m from the mounting point "
-        f"that EKF2 assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± "
+        f"The {sensor_text} is mounted {np.hypot(forward_m, right_m):.2f} m from the mounting "
+        f"point that EKF2 assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± "
         f"{1.96 * sigma_m:.2f} m, 95 %). When the vehicle turns, the error of the positions "
         f"changes by up to twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
         f"{action} Measure the position of the sensor relative to the IMU.",
@@ -267,8 +268,7 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
         return
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
     distances_m = [
-        _compute_median_distance_m(position_m, time_s - delay_s, state)
-        for delay_s in TESTED_COPY_DELAYS_S
+        _compute_median_distance_m(position_m, time_s - delay_s, state) for delay_s in COPY_DELAYS_S
     ]
     best_index = int(np.nanargmin(distances_m)) if np.isfinite(distances_m).any() else 0
     fusion_flags = ekf2.fusion_flags
@@ -286,15 +286,12 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
     yield error(
         "source_is_ekf2_estimate",
         f"{source_name(source)} sends EKF2's own {copied_quantity} back. The positions equal those "
-        f"that EKF2 estimated {1e3 * TESTED_COPY_DELAYS_S[best_index]:.0f} ms before (median difference "
-        f"{1e3 * distances_m[best_index]:.1f} mm). They contain no measurement, so fusion reduces "
-        "EKF2's σ, but not its error.",
+        f"that EKF2 estimated {1e3 * COPY_DELAYS_S[best_index]:.0f} ms before (median "
+        f"difference {1e3 * distances_m[best_index]:.1f} mm). They contain no measurement, so "
+        "fusion reduces EKF2's σ, but not its error.",
         "Send the position of the positioning system. Do not connect the autopilot's local "
         "position (MAVROS local_position) to its vision input.",
-        {
-            "delay_s": float(TESTED_COPY_DELAYS_S[best_index]),
-            "difference_m": distances_m[best_index],
-        },
+        {"delay_s": float(COPY_DELAYS_S[best_index]), "difference_m": distances_m[best_index]},
     )
 
 
