@@ -1,7 +1,4 @@
-"""Faults of fusion: EKF2 does not fuse the positions, fuses them too late, or flags its position.
-
-A source that measures only the height is not tested.
-"""
+"""Faults of fusion: missing, interrupted or late fusion of positions, and an invalid position."""
 
 import numpy as np
 import pandas as pd

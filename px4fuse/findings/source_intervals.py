@@ -258,7 +258,7 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
-    # These timestamps do not show when PX4 received the positions: px4fuse changed them, or PX4
+    # Timestamps do not show when PX4 received the positions if px4fuse changed them, or if PX4
     # logged the positions only after EKF2 had used them (ALIGNED)
     if (
         source.clock_map is not None
@@ -274,12 +274,12 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     count_fractions = np.bincount(period_counts.astype(np.intp)) / len(period_counts)
     count_pair_fractions = count_fractions[:-1] + count_fractions[1:]
     first_multiple = int(np.argmax(count_pair_fractions))
-    is_downsampled = (
+    has_two_lengths = (
         count_pair_fractions[first_multiple] >= MIN_INTERVAL_PAIR_FRACTION
         and count_fractions[first_multiple : first_multiple + 2].min()
         >= MIN_RARER_INTERVAL_FRACTION
     )
-    if lost_fraction < MIN_DOWNSAMPLED_FRACTION or not is_downsampled:
+    if lost_fraction < MIN_DOWNSAMPLED_FRACTION or not has_two_lengths:
         return
     mean_interval_s = float(np.mean(intervals_s))
     is_too_slow = mean_interval_s > EV_START_INTERVAL_S

@@ -39,8 +39,7 @@ WINDOW_SAMPLES = 16
 MIN_WINDOWS = 10
 # Positions are a copy of EKF2's position if their median distance is below this limit (m)
 MAX_COPY_DISTANCE_M = 0.01
-# This limit (m) is smaller if EKF2 fuses the positions, because EKF2 follows any source that it
-# fuses
+# The same limit (m) if EKF2 fuses the positions: smaller, because EKF2 follows each fused source
 MAX_FUSED_COPY_DISTANCE_M = 0.001
 # Positions are compared with EKF2's position above this speed (m/s): at rest, any source may agree
 MIN_COPY_SPEED_M_S = 0.2
