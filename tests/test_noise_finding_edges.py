@@ -159,7 +159,7 @@ def test_recommended_sigma_z_is_at_least_5_mm() -> None:
     finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
     assert finding.remedy == "To test the estimate, run again with --sigma-z 0.005."
     assert finding.title.startswith("SIGMA_Z is at least 480 times too large")
-    assert "estimate is at most 0.0021 m. The" in finding.message
+    assert "estimate is at most 0.0021 m. KF's" in finding.message
 
 
 @pytest.mark.parametrize(
