@@ -43,9 +43,16 @@ from px4fuse.diagnose import find_faults  # noqa: E402
 from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
-from px4fuse.findings import TITLES, Finding, find, find_aids, find_loop, source_frame  # noqa: E402
+from px4fuse.findings import (  # noqa: E402
+    TITLES,
+    Finding,
+    find,
+    find_aid_findings,
+    find_loop_findings,
+    source_frame,
+)
 from px4fuse.findings.cause_grouping import CONSEQUENCES, effect_ids  # noqa: E402
-from px4fuse.findings.model import CATALOGUE, GROUPS, load_examples  # noqa: E402
+from px4fuse.findings.model import CATALOGUE, FINDING_GROUPS, load_examples  # noqa: E402
 from px4fuse.flight.model import Columns  # noqa: E402
 from px4fuse.report.panels import INNOVATIONS, POSITION, SIGMA_P  # noqa: E402
 from px4fuse.simulation.faults import parse_faults  # noqa: E402
@@ -161,16 +168,19 @@ def examples() -> dict[str, Example]:
     ):
         loop_options = {**options, "source": f"{ROOT}/{options['source']}"}
         command = f"px4fuse loop {options['source']} {drift_option}".strip()
-        add_examples(find_loop(px4fuse.close_loop(**loop_options)), f"the result of `{command}`")
+        add_examples(
+            find_loop_findings(px4fuse.close_loop(**loop_options)), f"the result of `{command}`"
+        )
     add_examples(convention_examples(), "a simulated loop flight with changed positions")
     add_examples(value_examples(), "a simulated test flight")
     _, odometry = laps(3, 5, OdometryNoise())
     wrong_closure = GivenClosure(20.0, 21.5 + LAP_S, 0.05)
-    findings = find_loop(px4fuse.close_loop(odometry, closures=(*TRUE, wrong_closure)))
+    findings = find_loop_findings(px4fuse.close_loop(odometry, closures=(*TRUE, wrong_closure)))
     add_examples(findings, "simulated odometry of three laps")
     _, odometry = laps(3, 5, OdometryNoise(5.0, 20.0))
     add_examples(
-        find_loop(px4fuse.close_loop(odometry, closures=TRUE)), "simulated odometry of three laps"
+        find_loop_findings(px4fuse.close_loop(odometry, closures=TRUE)),
+        "simulated odometry of three laps",
     )
     parts = [
         HeadingPart(2.0 * n, 2.0 * n + 2.0, angle_deg, 1.0)
@@ -189,7 +199,7 @@ def examples() -> dict[str, Example]:
     aids = {"gnss_pos": log_with_outage, "baro_hgt": aid_log(sigma=1.5), "mag": aid_log(mean=-0.4),
             "mag_heading": changed_log}  # fmt: skip
     aid_analysis = evaluate_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
-    add_examples(find_aids(aid_analysis), "simulated innovations of the aiding sources")
+    add_examples(find_aid_findings(aid_analysis), "simulated innovations of the aiding sources")
     add_examples(find_in_changed_timestamps(), "a simulated flight with changed timestamps")
     for fault in FAULTS:
         if fault.id in example_by_id:
@@ -344,7 +354,7 @@ def save_picture(name: str, example: Example, folder: Path) -> str:
 def index() -> Iterator[str]:
     """Yield the Markdown paragraphs of the index, with a table for each group of findings."""
     yield "# Findings\n\n`px4fuse explain ID` prints the page on a finding in the terminal.\n"
-    for group in GROUPS:
+    for group in FINDING_GROUPS:
         names = [name for name, entry in CATALOGUE.items() if entry.group == group]
         caption = group[0].upper() + group[1:]
         yield f"## {caption}\n\n| finding | id |\n|---|---|"

@@ -49,8 +49,8 @@ from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL
-from px4fuse.findings import find, find_aids
-from px4fuse.findings.cause_grouping import CONVENTION
+from px4fuse.findings import find, find_aid_findings
+from px4fuse.findings.cause_grouping import CONVENTION_KEY
 from px4fuse.flight.ekf2_parameters import check_parameters
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
 from px4fuse.loop.model import Loop
@@ -113,7 +113,7 @@ def _refine_file_clock(flight: Flight, analysis: Analysis) -> Flight | None:
         or alignment.reference != "EKF2 position"
         or not isinstance(clock, ClockOffset)
         or all(finding.id != "source_time_offset" for finding in analysis.findings)
-        or any(CONVENTION in finding.evidence for finding in analysis.findings)
+        or any(CONVENTION_KEY in finding.evidence for finding in analysis.findings)
     ):
         return None
     difference = f"{abs(clock.offset_s):.3f} s {'late' if clock.offset_s < 0 else 'early'}"
@@ -308,7 +308,7 @@ def diagnose_or_check_aids(
             f"checked: {aids.reason}",
             missing_source.remedy,
         )
-    return AidsOnlyAnalysis(flight, aids, missing_source, find_aids(aids, flight))
+    return AidsOnlyAnalysis(flight, aids, missing_source, find_aid_findings(aids, flight))
 
 
 def run_what_if(

@@ -18,9 +18,9 @@ from px4fuse.analysis import AidsOnlyAnalysis, failed_checks
 from px4fuse.ekf2.aids import AidResult, evaluate_aids
 from px4fuse.errors import MissingDataError
 from px4fuse.findings import aids as aids_detector
-from px4fuse.findings import ekf2_state, find_aids
-from px4fuse.findings.aids import detect_in_aids
-from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
+from px4fuse.findings import ekf2_state, find_aid_findings
+from px4fuse.findings.aids import detect_aid_faults
+from px4fuse.findings.cause_grouping import CAUSE_KEY, INNOVATION_SHIFT_CAUSE, SOURCE_SENSOR_CAUSE
 from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.flight.model import AidLog, Ekf2, Flight, Unavailable
 from px4fuse.readers import read_log
@@ -176,7 +176,7 @@ def test_aiding_source_fault_report_contains_sensor_and_times() -> None:
         gnss_pos=with_gap, gnss_vel=with_gap, baro_hgt=aid_log(sigma=1.5), mag=aid_log(mean=-0.4),
         ev_pos=aid_log(sigma=9.0), rng_hgt=log,
     ))  # fmt: skip
-    by_id = {one.id: one for one in find_aids(found)}
+    by_id = {one.id: one for one in find_aid_findings(found)}
     assert set(by_id) == {"aid_not_fused", "aid_overconfident", "aid_innovation_bias"}
     assert "GNSS position, GNSS velocity" in by_id["aid_not_fused"].title
     assert by_id["aid_not_fused"].spans_s == ((20.0, 41.0),)
@@ -202,7 +202,7 @@ def test_unfused_barometer_is_reported_only_with_height_error(
     log = aid_log()
     with_gap = replace(log, samples=outage_free(log, 20.0, 41.0), enabled=steps((0.0, 1.0)))
     barometer = {"baro_hgt": evaluate(with_gap, "baro_hgt")}
-    found = detect_in_aids(barometer, take_off_s=take_off_s, height_error_m=height_error_m)
+    found = detect_aid_faults(barometer, take_off_times_s=take_off_s, height_error_m=height_error_m)
     assert [(each.severity, each.title) for each in found] == ([expected] if expected else [])
 
 
@@ -219,9 +219,9 @@ def test_height_error_in_gap_below_3_times_rmse_is_not_reported(
         truth=pd.DataFrame({"position_m": 0.0}, index=time_s),
     )
     one = SimpleNamespace(axes={"down": down})
-    found = aids_detector._large_height_error_m(one, (20.0, 30.0))  # type: ignore[arg-type]
+    found = aids_detector._find_large_height_error_m(one, (20.0, 30.0))  # type: ignore[arg-type]
     assert found == (None if expected_m is None else pytest.approx(expected_m))
-    assert aids_detector._large_height_error_m(SimpleNamespace(axes={}), (0.0, 1.0)) is None  # type: ignore[arg-type]
+    assert aids_detector._find_large_height_error_m(SimpleNamespace(axes={}), (0.0, 1.0)) is None  # type: ignore[arg-type]
 
 
 def test_shift_of_mean_innovation_is_reported_with_its_time() -> None:
@@ -235,19 +235,22 @@ def test_shift_of_mean_innovation_is_reported_with_its_time() -> None:
         when_s, moved = found.axes["east"].change  # type: ignore[misc]
         assert when_s == pytest.approx(expected_s, abs=0.5)
         assert moved == pytest.approx(-1.4, abs=0.4)
-    (finding,) = find_aids({"mag": found})
+    (finding,) = find_aid_findings({"mag": found})
     assert (finding.id, finding.severity, finding.evidence["axis"]) == (
         "aid_innovation_shift",
         "warning",
         "east",
     )
     # a change of KF's own source is another finding
-    assert not [*detect_in_aids({"gnss_vel": found}, "gnss_pos")]
+    assert not [*detect_aid_faults({"gnss_vel": found}, "gnss_pos")]
     # an aiding source that EKF2 rejects after the change has the same finding
     rejected = replace(found, verdict="not_fused")
-    (starved,) = detect_in_aids({"gnss_vel": rejected}, "gnss_pos")
-    assert starved.evidence[CAUSE] == SENSOR
-    assert next(detect_in_aids({"mag": rejected}, "gnss_pos")).evidence[CAUSE] == CHANGE
+    (starved,) = detect_aid_faults({"gnss_vel": rejected}, "gnss_pos")
+    assert starved.evidence[CAUSE_KEY] == SOURCE_SENSOR_CAUSE
+    assert (
+        next(detect_aid_faults({"mag": rejected}, "gnss_pos")).evidence[CAUSE_KEY]
+        == INNOVATION_SHIFT_CAUSE
+    )
     little = log.samples.copy()
     little.loc[35.0:, "innovation_east"] -= 0.2
     assert evaluate(replace(log, samples=little)).axes["east"].change is None
@@ -322,14 +325,14 @@ def aids_only(**ekf2: Any) -> Any:
 
 
 def test_aiding_source_report_lists_ekf2_instance_changes() -> None:
-    (finding,) = find_aids({}, aids_only(instances=((0.5, 0), (12.0, 1), (13.5, 0))))
+    (finding,) = find_aid_findings({}, aids_only(instances=((0.5, 0), (12.0, 1), (13.5, 0))))
     assert (finding.id, finding.evidence["count"]) == ("ekf2_instance_switch", 2)
-    assert not find_aids({}, aids_only())
+    assert not find_aid_findings({}, aids_only())
 
 
 def test_missing_heading_alignment_without_positions_is_reported() -> None:
     states = {"tilt_align": pd.Series([1.0], [0.0]), "yaw_align": pd.Series([0.0], [0.0])}
-    (finding,) = find_aids({}, aids_only(states=states))
+    (finding,) = find_aid_findings({}, aids_only(states=states))
     assert finding.id == "ekf2_not_aligned"
     assert "heading" in finding.title
     assert finding.remedy.startswith("Calibrate the magnetometer")
@@ -339,7 +342,7 @@ def test_gnss_without_fix_is_reported() -> None:
     flight = aids_only()
     reason = "the log has 9 vehicle_gps_position, none with a 3D fix"
     flight.missing = (Unavailable("", reason, NO_FIX_ACTION, "vehicle_gps_position"),)
-    (finding,) = find_aids({}, flight)
+    (finding,) = find_aid_findings({}, flight)
     assert finding.id == "source_without_position"
     assert "none with a 3D fix" in finding.message
 

@@ -36,7 +36,7 @@ from px4fuse.classroom.assignment.random_assignment import (
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.diagnose import find_faults
 from px4fuse.errors import OutputError, SettingsError
-from px4fuse.findings import find_loop
+from px4fuse.findings import find_loop_findings
 from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.readers import ulog_topics
@@ -217,7 +217,7 @@ def test_each_fault_in_assignment_log_is_detected_by_analysis(
     flight = px4fuse.read_log(path)
     assert flight.log.sha256 == answer.sha256
     if kind == "loop":
-        found = find_loop(analyse(LoopSource(trajectory_of(flight, "vio"), flight)))
+        found = find_loop_findings(analyse(LoopSource(trajectory_of(flight, "vio"), flight)))
     else:
         found = find_faults(compare(flight, axes=("north", "east"))).findings
     drawn = assign_random_flight(SECRET, CLASS[number].student_id, kind, count)

@@ -9,8 +9,8 @@ from px4fuse.analysis import Analysis
 from px4fuse.findings import TITLES, Finding
 from px4fuse.findings.cause_grouping import (
     CONSEQUENCES,
-    ELSEWHERE,
-    GAP,
+    GAP_CAUSE,
+    OTHER_CAUSE,
     effect_ids,
     group_by_cause,
 )
@@ -54,17 +54,17 @@ UNDERSTATED, REJECTING = "ekf2_overconfident", "ekf2_rejects_positions"
           (REJECTING, "warning", UNDERSTATED)]),
         # jump and scale are consequences of changed noise; a jump's consequence follows the jump
         ([*map(one, ("source_noise_varies", "source_position_jump", "source_scale_error")),
-          one("ekf2_resets", cause=ELSEWHERE)],
+          one("ekf2_resets", cause=OTHER_CAUSE)],
          [("source_noise_varies", "warning", None),
           ("source_position_jump", "warning", "source_noise_varies"),
           ("ekf2_resets", "warning", "source_position_jump"),
           ("source_scale_error", "warning", "source_noise_varies")]),
         # resets follow the gap if all of them are at its end, else the rejections
         ([one("source_outliers", "error"), one(REJECTING), one("source_gap"),
-          one("ekf2_resets", cause=GAP)],
+          one("ekf2_resets", cause=GAP_CAUSE)],
          [("source_outliers", "error", None), (REJECTING, "warning", "source_outliers"),
           ("source_gap", "warning", None), ("ekf2_resets", "warning", "source_gap")]),
-        ([one("source_outliers", "error"), one(REJECTING), one("ekf2_resets", cause=ELSEWHERE)],
+        ([one("source_outliers", "error"), one(REJECTING), one("ekf2_resets", cause=OTHER_CAUSE)],
          [("source_outliers", "error", None), (REJECTING, "warning", "source_outliers"),
           ("ekf2_resets", "warning", REJECTING)]),
         # the severity of a KF variance does not raise that of advice

@@ -23,7 +23,7 @@ from px4fuse.diagnose import prepare_comparison, refine_delay
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.finding import Finding
 from px4fuse.findings import source_convention
-from px4fuse.findings.cause_grouping import CONVENTION
+from px4fuse.findings.cause_grouping import CONVENTION_KEY
 from px4fuse.findings.model import finding
 from px4fuse.flight.model import GNSS, RECEIVED, Columns, Flight, PositionTrack, Unavailable
 from px4fuse.readers import read_log
@@ -271,7 +271,7 @@ AMBIGUOUS = Convention(
 @pytest.mark.parametrize(("name", "kind"), CONVENTION_FAULTS)
 def test_wrong_axes_unit_or_clock_is_the_only_reported_fault(name, kind):
     found = list(source_convention.detect(compared(CONVENTION_FAULTS[name, kind](flown()))))
-    assert [(one.id, one.evidence[CONVENTION]) for one in found] == [(name, kind)]
+    assert [(one.id, one.evidence[CONVENTION_KEY]) for one in found] == [(name, kind)]
 
 
 @pytest.mark.parametrize(
@@ -302,7 +302,7 @@ def test_enu_orientation_report_contains_conversion_to_ned():
     time, attitude = oriented(flown())
     quaternion = multiply(multiply(np.array(NED_TO["ENU"]), attitude), np.array(NED_TO["NWU"]))
     (found,) = source_convention.detect(compared(with_orientation(sent(flown()), quaternion, time)))
-    assert found.evidence[CONVENTION] == "frames"
+    assert found.evidence[CONVENTION_KEY] == "frames"
     assert "q_NED = (0, √½, √½, 0) ⊗ q ⊗ (0, 1, 0, 0)" in found.remedy
 
 
@@ -383,7 +383,7 @@ def test_ekf2_faults_are_reported_as_effects_of_wrong_axes():
     roots = list(source_convention.detect(comparison))
     other = finding("error", "ekf2_rejects_positions", "EKF2 rejects 9 %. Why.", "Set a gate.")
     false = finding("error", "ekf2_noise_too_small", "Too small.", "Set EKF2_EVP_NOISE to 1.")
-    root, effect = source_convention.apply_convention(comparison, [false, other, *roots])
+    root, effect = source_convention.remove_convention_effects(comparison, [false, other, *roots])
     assert root.id == "source_axes_wrong"
     assert (effect.caused_by, effect.message) == ("source_axes_wrong", "EKF2 rejects 9 %.")
 
@@ -392,7 +392,7 @@ def test_time_offset_is_not_reported_beside_clock_drift():
     comparison = compared(sent(flown(), clock_drift=0.02))
     roots = list(source_convention.detect(comparison))
     rest = finding("warning", "source_time_offset", "Late.", "Run again.")
-    assert source_convention.apply_convention(comparison, [rest, *roots]) == roots
+    assert source_convention.remove_convention_effects(comparison, [rest, *roots]) == roots
 
 
 @pytest.mark.reallogs

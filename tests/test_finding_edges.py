@@ -50,7 +50,6 @@ from px4fuse.findings import (
     ekf2_not_fusing,
     ekf2_rejecting,
     ekf2_resets,
-    group_by_root,
     hidden_errors,
     imu,
     missing,
@@ -61,10 +60,11 @@ from px4fuse.findings import (
     source_noise,
     source_positions,
     source_stamps,
+    split_cause_groups,
 )
-from px4fuse.findings.cause_grouping import ELSEWHERE, GAP
+from px4fuse.findings.cause_grouping import GAP_CAUSE, OTHER_CAUSE
 from px4fuse.findings.model import (
-    SOURCE_WORDS,
+    SOURCE_TEXTS,
     fraction_of_ones,
     spans_with_value,
     zero_length_spans,
@@ -121,7 +121,7 @@ def test_status_flag_before_first_sample_has_first_value() -> None:
 def test_fault_report_lists_consequences_below_root_cause() -> None:
     first, other = make_finding("kf_underconfident"), make_finding("no_motion", "note")
     follows = make_finding("kf_underconfident", caused_by="kf_underconfident")
-    assert group_by_root([first, follows, other]) == [[first, follows], [other]]
+    assert split_cause_groups([first, follows, other]) == [[first, follows], [other]]
 
 
 # ---------------------------------------------------------------- EKF2
@@ -144,7 +144,7 @@ def test_ekf2_resets_outside_evaluated_segment_are_ignored(
     reset, switch = ekf2_resets.detect(one)
     assert switch.evidence == {"count": 2, "at_s": 10.5}
     # the reset of the height alone is not counted
-    assert reset.evidence == {"count": 1, "largest_m": 5.0, "at_s": 10.5, "cause": ELSEWHERE}
+    assert reset.evidence == {"count": 1, "largest_m": 5.0, "at_s": 10.5, "cause": OTHER_CAUSE}
 
 
 @pytest.mark.parametrize(
@@ -152,12 +152,12 @@ def test_ekf2_resets_outside_evaluated_segment_are_ignored(
     [
         # a height reset within 10 s of take-off is usual
         (Reset(30.0, "position", (0.0, 0.0, 1.0)), (), None),
-        (Reset(30.1, "position", (0.0, 0.0, 1.0)), (), ("note", ELSEWHERE)),
-        (Reset(19.9, "position", (0.0, 0.0, 1.0)), (), ("note", ELSEWHERE)),
-        (Reset(30.0, "position", (1.0, 0.0, 1.0)), (), ("warning", ELSEWHERE)),
+        (Reset(30.1, "position", (0.0, 0.0, 1.0)), (), ("note", OTHER_CAUSE)),
+        (Reset(19.9, "position", (0.0, 0.0, 1.0)), (), ("note", OTHER_CAUSE)),
+        (Reset(30.0, "position", (1.0, 0.0, 1.0)), (), ("warning", OTHER_CAUSE)),
         # up to 5 s after a gap in the source
-        (Reset(65.0, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", GAP)),
-        (Reset(65.1, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", ELSEWHERE)),
+        (Reset(65.0, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", GAP_CAUSE)),
+        (Reset(65.1, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", OTHER_CAUSE)),
     ],
 )
 def test_ekf2_height_reset_at_take_off_is_not_reported(
@@ -314,7 +314,8 @@ def test_finding_of_error_above_sigma_names_axis_and_action() -> None:
     ekf2 = axis("east", ekf2=statement(0.49), ekf2_truth=against_truth(25.0, 1.0))
     finding = only(hidden_errors.detect, analysis(axes=(axis(), hiding(name="down"), ekf2)))
     assert finding.title == (
-        "Position errors that innovations do not show: KF 2.0 times σ, EKF2 5.0 times σ"
+        "Position errors that innovations do not show: KF 2.0 times the reported σ, "
+        "EKF2 5.0 times the reported σ"
     )
     assert finding.evidence["filter"] == "ekf2"
     # the main axis is preferred
@@ -323,7 +324,7 @@ def test_finding_of_error_above_sigma_names_axis_and_action() -> None:
     assert finding.evidence["ekf2_sigma_p_m"] == pytest.approx(0.2)
     assert finding.remedy == (
         "Check the time offset of the positions (px4fuse sync LOG). "
-        f"Then check {SOURCE_WORDS['uwb'].errors}."
+        f"Then check {SOURCE_TEXTS['uwb'].errors}."
     )
     # the error is EKF2's own only if the RMSE of KF is below 0.7 of it
     for kf_rmse_m, remedy in (
@@ -332,14 +333,14 @@ def test_finding_of_error_above_sigma_names_axis_and_action() -> None:
             0.28,
             (
                 "Check the time offset of the positions (px4fuse sync LOG). "
-                f"Then check {SOURCE_WORDS['uwb'].errors}."
+                f"Then check {SOURCE_TEXTS['uwb'].errors}."
             ),
         ),
         (
             0.4,
             (
                 "Check the time offset of the positions (px4fuse sync LOG). "
-                f"Then check {SOURCE_WORDS['uwb'].errors}."
+                f"Then check {SOURCE_TEXTS['uwb'].errors}."
             ),
         ),
     ):
@@ -402,7 +403,7 @@ def test_imu_gaps_are_found_only_inside_evaluated_segment(
 ) -> None:
     """Gaps at an end count if longer than 0.05 s; gaps outside the segment do not."""
     time = np.concatenate([np.arange(ends[0], 40.0, 0.01), np.arange(42.0, ends[1], 0.01)])
-    found = imu._gap_spans(pd.DataFrame(index=time), Segment(*segment, ""))
+    found = imu._find_gap_spans(pd.DataFrame(index=time), Segment(*segment, ""))
     assert len(found) == len(spans)
     assert not spans or np.allclose(found, spans, atol=0.02)
 
@@ -467,7 +468,7 @@ def test_motion_range_ignores_5_percent_of_positions_at_each_end() -> None:
     moving["east_m"] = np.repeat([-9.0, -1.0, -0.5, 0.0, 0.5, 1.0, 9.0], [3, 4, 3, 80, 3, 4, 3])
     outside = positions([5.0, 111.0], 99.0)
     comparison = analysis(source=source(samples=pd.concat([moving, outside])))
-    assert source_positions.motion_range_m(comparison) == 2.0
+    assert source_positions.compute_motion_range_m(comparison) == 2.0
 
 
 # ---------------------------------------------------------------- frames
@@ -702,7 +703,7 @@ BIAS, JUMPS, SCALE = (
     source_positions.detect_scale_error,
 )
 ARRIVALS, DOWNSAMPLED, CLOCK = (
-    source_stamps.detect_arrival_times,
+    source_stamps.detect_arrival_timestamps,
     source_intervals.detect_downsampling,
     source_clock.detect,
 )
@@ -858,7 +859,7 @@ def test_faulty_timestamps_of_recording_are_reported(clock: Any, expected: list[
 
 def test_arrival_times_used_until_clock_sync_are_reported() -> None:
     one = analysis(ekf2=ages(12, 20, 0.05))
-    finding = only(source_stamps.detect_arrival_times, one)
+    finding = only(source_stamps.detect_arrival_timestamps, one)
     assert finding.evidence == {"until_s": 32.0, "latency_s": 0.05}
     assert finding.spans_s == ((20.0, 32.0),)
     assert source_stamps.find_synchronisation(one) == (32.0, 0.05)

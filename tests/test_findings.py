@@ -21,8 +21,8 @@ from px4fuse.diagnose import prepare_comparison, read_flight
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import TITLES, Finding, find, group_by_root
-from px4fuse.findings.model import CATALOGUE, GROUPS, load_examples
+from px4fuse.findings import TITLES, Finding, find, split_cause_groups
+from px4fuse.findings.model import CATALOGUE, FINDING_GROUPS, load_examples
 from px4fuse.flight.model import (
     ALIGNED,
     AXIS_NAMES,
@@ -524,7 +524,7 @@ def test_narrow_gate_is_reported_before_its_rejections(gate, expected) -> None:
     assert (first.id, first.severity) == ("ekf2_gate_too_small", "error")
     assert first.evidence == {"gate": gate, "rejected_by_gate": pytest.approx(expected, abs=1e-4)}
     assert re.search(r"EKF2 rejects [23]\d %", first.message)
-    group = group_by_root((first, *others))[0]
+    group = split_cause_groups((first, *others))[0]
     assert {"ekf2_rejects_positions", "ekf2_overconfident"} <= {one.id for one in group}
     # a gate without rejections is not reported
     assert not found(compare(with_ekf2(gate=gate)(aisle_flight())))
@@ -559,7 +559,7 @@ def test_fault_detection_on_very_short_flight_does_not_raise(
 
 def test_each_reportable_fault_belongs_to_a_known_group() -> None:
     for entry in CATALOGUE.values():
-        assert entry.group in GROUPS
+        assert entry.group in FINDING_GROUPS
         assert not entry.title.endswith(".")
         assert entry.meaning.endswith(".")
 
@@ -608,7 +608,7 @@ def test_explain_command_without_argument_lists_all_faults(monkeypatch, capsys) 
     code, out, _ = run_main(monkeypatch, capsys, "explain")
     assert code == 0
     lines = out.splitlines()
-    places = [lines.index(group[0].upper() + group[1:]) for group in GROUPS]
+    places = [lines.index(group[0].upper() + group[1:]) for group in FINDING_GROUPS]
     assert places == sorted(places)
     for name, title in TITLES.items():
         assert re.search(rf"^{name} +{re.escape(title)} *$", out, re.MULTILINE)

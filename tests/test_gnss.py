@@ -318,7 +318,9 @@ def test_gnss_noise_above_receiver_sigma_is_advised_smaller(
     )
     assert bool(words) is expected
     if expected:
-        assert words.startswith("EKF2_GPS_P_NOISE is 2 m, but the receiver reports 0.3 m. Test")
+        assert words.startswith(
+            "EKF2_GPS_P_NOISE is 2 m, but the noise that the receiver reports is 0.3 m."
+        )
 
 
 # -------------------------------------------------------------------- flights of PX4's EKF2

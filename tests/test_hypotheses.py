@@ -33,7 +33,7 @@ RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
 OF_CAUSES = (
     imu.detect_bias,
     sent.detect,
-    stamps.detect_arrival_times,
+    stamps.detect_arrival_timestamps,
     intervals.detect_downsampling,
 )
 DETECTORS = (
@@ -247,7 +247,7 @@ def with_ekf2(*mistakes: str) -> Analysis:
 
 @pytest.mark.parametrize(("jump", "severity"), [("50ms", "warning"), ("300ms", "error")])
 def test_clock_jump_severity_depends_on_its_size(jump, severity):
-    (finding,) = stamps.detect_arrival_times(with_ekf2(f"clock-jump={jump}"))
+    (finding,) = stamps.detect_arrival_timestamps(with_ekf2(f"clock-jump={jump}"))
     assert finding.severity == severity
     assert finding.evidence["until_s"] == pytest.approx(50.0, abs=0.5)
     assert finding.evidence["latency_s"] == pytest.approx(float(jump[:-2]) / 1e3, abs=0.005)

@@ -151,7 +151,10 @@ def test_info_on_unlogged_source_advises_sdlog_profile(tmp_path, profile, wanted
     log = make_log().drop("vehicle_visual_odometry")
     log.parameters["SDLOG_PROFILE"] = profile
     inventory = inventory_of(log, tmp_path)
-    assert remedies(inventory)[0] == f"Set SDLOG_PROFILE to {wanted} (bit 7) and fly again."
+    assert (
+        remedies(inventory)[0]
+        == f"Set SDLOG_PROFILE to {wanted} (bit 7: vision topics) and fly again."
+    )
     assert source(inventory, "position").name == "estimator_aid_src_ev_pos"
 
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from trajectory_tools import noisy_odometry, square
 
 from px4fuse.errors import SettingsError, TrajectoryError
-from px4fuse.findings import find_loop
+from px4fuse.findings import find_loop_findings
 from px4fuse.flight.model import Unavailable
 from px4fuse.lesson import ODOMETRY_M, loop_lines
 from px4fuse.loop.analysis import analyse, analyse_flight_loop
@@ -189,7 +189,7 @@ def test_loop_command_on_absolute_positions_gives_warning() -> None:
     assert source.trajectory.kind == "ekf2"
     found = analyse(source)
     assert found.is_absolute_track
-    assert "loop_on_absolute_positions" in {finding.id for finding in find_loop(found)}
+    assert "loop_on_absolute_positions" in {finding.id for finding in find_loop_findings(found)}
     assert isinstance(analyse_flight_loop(source.flight), Unavailable)
 
 
@@ -241,7 +241,7 @@ def test_false_loop_closure_is_rejected_among_true_ones() -> None:
         assert rmse(fooled, name) == pytest.approx(without, rel=0.05), name
     assert false.weight_gnc < 0.05
     assert min(judged.weight_gnc for judged in true) > 0.5
-    named = [finding.id for finding in find_loop(fooled)]
+    named = [finding.id for finding in find_loop_findings(fooled)]
     assert named[0] == "false_loop_closure"
     assert "loop_closure_inconsistent" not in named
 
@@ -268,14 +268,14 @@ def test_loop_that_does_not_return_to_start_is_not_corrected() -> None:
         assert isinstance(part, Unavailable)
         assert "the gate rejects the loop closure" in part.reason
         assert "the gate rejects the loop closure" in part.reason
-    finding = find_loop(found)[0]
+    finding = find_loop_findings(found)[0]
     assert (finding.id, finding.severity) == ("false_loop_closure", "error")
     assert finding.evidence["p"] < 0.001
     opened = close_loop(half, closed_loop=False)
     assert opened.closure_error_m is None
     assert opened.closure_error_axes_m is None
     assert opened.closures == ()
-    assert find_loop(opened) == ()
+    assert find_loop_findings(opened) == ()
 
 
 def test_loop_closure_without_equal_heading_uses_position_only() -> None:
@@ -297,7 +297,7 @@ def test_contradicting_loop_closure_is_reported_as_inconsistent() -> None:
     wrong = GivenClosure(20.0, 21.5 + LAP_S, 0.05)  # 1.5 m further along the side
     found = close_loop(odometry, closures=(*TRUE, wrong))
     assert found.closures[-1].accepted
-    doubtful = [f for f in find_loop(found) if f.id == "loop_closure_inconsistent"]
+    doubtful = [f for f in find_loop_findings(found) if f.id == "loop_closure_inconsistent"]
     assert len(doubtful) == 1
     assert doubtful[0].evidence["time_1_s"] == 20.0
 
@@ -310,19 +310,19 @@ def test_loop_drift_option_below_true_drift_is_reported() -> None:
     position = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
     biased = replace(odometry, position_m=position, rotation=turn * odometry.rotation)
     found = close_loop(biased, closures=TRUE, heading_drift_deg=1.0)
-    assert "loop_drift_too_small" in {finding.id for finding in find_loop(found)}
+    assert "loop_drift_too_small" in {finding.id for finding in find_loop_findings(found)}
 
 
 def test_loop_without_known_landing_point_gives_a_note(
     sample: LoopSource, sample_loop: Loop
 ) -> None:
-    assert find_loop(sample_loop) == ()  # the log contains ground truth
+    assert find_loop_findings(sample_loop) == ()  # the log contains ground truth
     blind = Unavailable("ground truth", "left out", "")
     found = analyse(LoopSource(sample.trajectory, replace(sample.flight, truth=blind)))
-    (finding,) = find_loop(found)
+    (finding,) = find_loop_findings(found)
     assert (finding.id, finding.severity) == ("loop_landing_assumed", "note")
     assert "--landed-at" in finding.remedy
-    assert find_loop(analyse_loop(sample, landed_at=Landing(0.0, 0.0))) == ()
+    assert find_loop_findings(analyse_loop(sample, landed_at=Landing(0.0, 0.0))) == ()
 
 
 def test_odometry_that_stops_in_flight_gets_no_loop_closure(sample: LoopSource) -> None:

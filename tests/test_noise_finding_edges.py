@@ -84,7 +84,7 @@ def trial(
 def test_wrong_noise_severity_depends_on_ratio_to_estimate(
     chosen: float, estimate: NoiseEstimate, expected: Any
 ) -> None:
-    off = noises.setting_deviation("sigma_z_m", chosen, estimate)
+    off = noises.find_setting_deviation("sigma_z_m", chosen, estimate)
     if off is None or expected is None:
         assert off is expected
         return
@@ -99,15 +99,15 @@ SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m":
     [
         ((trial(SIGMA_A_TO_0_1),),
          [("sigma_a_too_large", "error", "Set SIGMA_A to 0.1 m/s² (--sigma-a 0.1)."),
-          ("sigma_z_too_large", "warning", "Compare this run with one that has --sigma-z 0.5.")]),
+          ("sigma_z_too_large", "warning", "To test the estimate, run again with --sigma-z 0.5.")]),
         ((trial(BOTH), trial(SIGMA_A_TO_0_1, 9.0)),
          [(name, level, "Set SIGMA_A to 0.1 m/s² (--sigma-a 0.1) and SIGMA_Z to 0.5 m (--sigma-z "
            "0.5).")
           for name, level in (("sigma_a_too_large", "error"), ("sigma_z_too_large", "warning"))]),
         # a re-run that improves nothing: the other setting is the cause
         ((trial(SIGMA_A_TO_0_1, 9.0),),
-         [("sigma_z_too_large", "warning", "Compare this run with one that has --sigma-z 0.5."),
-          ("sigma_a_too_large", "note", noises.NO_IMPROVEMENT)]),
+         [("sigma_z_too_large", "warning", "To test the estimate, run again with --sigma-z 0.5."),
+          ("sigma_a_too_large", "note", noises.NO_IMPROVEMENT_ACTION)]),
     ],
 )  # fmt: skip
 def test_wrong_noise_report_recommends_noise_of_better_rerun(trials: Any, expected: Any) -> None:
@@ -122,9 +122,9 @@ def test_wrong_noise_report_recommends_noise_of_better_rerun(trials: Any, expect
 @pytest.mark.parametrize(
     ("nis_mean", "rmse_m", "expected"),
     [
-        (0.78, None, ("error", "Compare this run with one that has --sigma-a 0.1.")),
-        (0.78, 0.3, ("note", noises.NO_IMPROVEMENT)),
-        (0.5, None, ("note", noises.NO_IMPROVEMENT)),
+        (0.78, None, ("error", "To test the estimate, run again with --sigma-a 0.1.")),
+        (0.78, 0.3, ("note", noises.NO_IMPROVEMENT_ACTION)),
+        (0.5, None, ("note", noises.NO_IMPROVEMENT_ACTION)),
     ],
 )
 def test_noise_finding_keeps_severity_error_if_kf_is_consistent(
@@ -147,7 +147,7 @@ def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
     assert worse.message == (
         "SIGMA_A is 10 times too large: KF follows the measurement noise. SIGMA_A is 1 m/s²; "
         "its maximum-likelihood estimate is 0.1 m/s² (95 % 0.09 to 0.11 m/s²). P grows too much "
-        "between updates, so the gain is too large."
+        "between updates, so KF's gain is too large."
     )
     small = tuned(NoiseEstimate(2.0, 1.9, 2.1), NoiseEstimate(9.0, 8.9, None))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=small))
@@ -161,9 +161,9 @@ def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
 def test_recommended_sigma_z_is_at_least_5_mm() -> None:
     bounded = tuned(NoiseEstimate(None, None, 0.0021))
     finding = only(noises.detect_wrong_settings, analysis(source=MOVING, tuning=bounded))
-    assert finding.remedy == "Compare this run with one that has --sigma-z 0.005."
+    assert finding.remedy == "To test the estimate, run again with --sigma-z 0.005."
     assert finding.title.startswith("SIGMA_Z is at least 480 times too large")
-    assert "estimate is at most 0.0021 m. The" in finding.message
+    assert "estimate is at most 0.0021 m. KF's" in finding.message
 
 
 @pytest.mark.parametrize(
@@ -275,14 +275,14 @@ def test_smaller_noise_on_odometry_is_not_recommended() -> None:
         finding = only(
             noises.detect_inconsistent_variances, analysis(axes=(kf(nis),), source=ODOMETRY)
         )
-        assert (finding.remedy == noises.KEEP_NOISES_DRIFT) is is_kept
+        assert (finding.remedy == noises.KEEP_NOISE_ACTION_DRIFT) is is_kept
         assert finding.severity == level
     for owner, there in (("kf", True), ("ekf2", False)):
         worse = {owner: statement(), f"{owner}_truth": against_truth(9.0)}
         finding = only(
             noises.detect_inconsistent_variances, analysis(axes=(kf(0.2), axis("east", **worse)))
         )
-        assert (finding.remedy == noises.KEEP_NOISES_TRUTH) is there
+        assert (finding.remedy == noises.KEEP_NOISE_ACTION_TRUTH) is there
         assert finding.evidence["cause"] == "elsewhere"
 
 
@@ -351,7 +351,7 @@ def test_filter_rerun_without_improvement_is_not_recommended() -> None:
     change = {"sigma_z_m": 2.0}
     for after, action in (
         (1.0, "Set SIGMA_Z to 2 m (--sigma-z 2)."),
-        (9.0, noises.UNEXPLAINED_SIGMA),
+        (9.0, noises.UNEXPLAINED_SIGMA_ACTION),
     ):
         one = analysis(axes=(kf(9.0),), tuning=tuned(), trials=(
             tried("kf", change), trial(change, after), trial(change, 9.0, "ekf2")))  # fmt: skip
@@ -363,9 +363,12 @@ def test_inconsistent_filter_without_cause_recommends_a_check() -> None:
               tried("kf", {"sigma_z_m": 2.0}, "east"))  # fmt: skip
     one = analysis(axes=(kf(9.0),), trials=causes, tuning=tuned())
     finding = only(noises.detect_inconsistent_variances, one)
-    assert (finding.evidence["cause"], finding.remedy) == ("elsewhere", noises.UNEXPLAINED_SIGMA)
+    assert (finding.evidence["cause"], finding.remedy) == (
+        "elsewhere",
+        noises.UNEXPLAINED_SIGMA_ACTION,
+    )
     unknown = only(noises.detect_inconsistent_variances, analysis(axes=(kf(9.0),)))
-    assert unknown.remedy == noises.UNKNOWN_NOISE
+    assert unknown.remedy == noises.UNKNOWN_NOISE_ACTION
 
 
 def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
@@ -373,7 +376,7 @@ def test_smaller_noise_that_contradicts_ground_truth_is_rejected() -> None:
     contradicted = replace(contradicted, after=replace(contradicted.after, nees_mean=4.0))
     one = analysis(axes=(kf(0.2),), trials=(contradicted,))
     finding = only(noises.detect_inconsistent_variances, one)
-    assert (finding.remedy, finding.severity) == (noises.KEEP_NOISES_TRUTH, "note")
+    assert (finding.remedy, finding.severity) == (noises.KEEP_NOISE_ACTION_TRUTH, "note")
     assert finding.evidence["cause"] == "elsewhere"
 
 

@@ -240,7 +240,7 @@ def detected(flight: Flight) -> tuple[Finding, ...]:
     analysis = unexplained(compare(flight))
     detectors = (source_values, source_stamps, source_intervals, ekf2_not_fusing)
     findings = [one for detector in detectors for one in detector.detect(analysis)]
-    return group_by_cause(source_convention.apply_convention(analysis, findings))
+    return group_by_cause(source_convention.remove_convention_effects(analysis, findings))
 
 
 def examples() -> Iterator[Finding]:
@@ -307,7 +307,7 @@ def test_two_position_senders_suppress_findings_they_cause():
         finding("error", name, "m.", "r.")
         for name in ("ekf2_not_fusing", "source_outliers", "source_two_senders", "imu_gap")
     ]
-    left = source_convention.apply_convention(analysis, findings)
+    left = source_convention.remove_convention_effects(analysis, findings)
     assert [one.id for one in left] == ["source_two_senders", "ekf2_not_fusing", "imu_gap"]
     assert left[1].caused_by == "source_two_senders"
 
@@ -334,7 +334,7 @@ def mounted(arm_m: tuple[float, float]) -> Analysis:
 
 def test_lever_arm_that_does_not_reduce_error_is_not_reported(monkeypatch):
     analysis = mounted((0.4, -0.3))
-    monkeypatch.setattr(source_values, "_replayed_effect", lambda *_: None)
+    monkeypatch.setattr(source_values, "_describe_replayed_effect", lambda *_: None)
     assert not [*source_values.detect_lever_arm(analysis)]
 
 

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from flights import Uwb, aisle_flight
 
-from px4fuse.findings.model import SOURCE_WORDS, source_words
+from px4fuse.findings.model import SOURCE_TEXTS, find_source_texts
 from px4fuse.flight.model import Columns, PositionKind, PositionTrack, kind_without_orientation
 
 # Words that belong to some kinds of source only
@@ -25,7 +25,7 @@ FINDINGS = Path(__file__).parents[1] / "px4fuse" / "findings"
 
 @pytest.mark.parametrize(("words", "kinds"), WORDS_OF_KINDS.items())
 def test_report_text_names_only_sensors_of_the_source_kind(words, kinds) -> None:
-    for kind, texts in SOURCE_WORDS.items():
+    for kind, texts in SOURCE_TEXTS.items():
         if kind not in (*kinds, "file"):
             for text in (getattr(texts, name) for name in texts.__struct_fields__):
                 assert not re.search(words, text, re.IGNORECASE), (kind, text)
@@ -34,7 +34,7 @@ def test_report_text_names_only_sensors_of_the_source_kind(words, kinds) -> None
 def test_report_text_exists_for_each_position_source_kind() -> None:
     for kind in PositionKind.__args__:
         source = SimpleNamespace(origin=SimpleNamespace(kind=kind))
-        assert source_words(source) is SOURCE_WORDS[kind]  # type: ignore[arg-type]
+        assert find_source_texts(source) is SOURCE_TEXTS[kind]  # type: ignore[arg-type]
 
 
 def test_fault_detectors_contain_no_sensor_specific_words() -> None:

@@ -57,7 +57,7 @@ from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Setting
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
-from px4fuse.findings.model import format_count, format_percent, group_by_root
+from px4fuse.findings.model import format_count, format_percent, split_cause_groups
 from px4fuse.findings.source_positions import has_little_motion
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Ekf2, LogInfo, Unavailable, source_name
@@ -131,7 +131,7 @@ def build_card(
     if analysis.flight.log.is_assessed:
         headline = "Assignment: the student makes the diagnosis, so px4fuse prints none"
         return Card(severity="note", headline=headline, identity=analysis_identity)
-    root_findings = [group[0] for group in group_by_root(analysis.findings)]
+    root_findings = [group[0] for group in split_cause_groups(analysis.findings)]
     sigma_verdicts = make_sigma_verdicts(analysis.main)
     ranked_causes = rank_causes(analysis, root_findings)
     causes = tuple(
@@ -163,7 +163,7 @@ def build_aids_card(
     analysis: AidsOnlyAnalysis, request: ComparisonRequest, student: tuple[str, str]
 ) -> Card:
     """Build the diagnosis card of a flight without positions, about the aiding sources of EKF2."""
-    root_findings = [group[0] for group in group_by_root(analysis.findings)]
+    root_findings = [group[0] for group in split_cause_groups(analysis.findings)]
     faults = [finding for finding in root_findings if finding.severity != "note"]
     causes = tuple(make_plain_cause(finding) for finding in faults[:MAX_CAUSES])
     missing_data = analysis.missing_data

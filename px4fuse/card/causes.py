@@ -28,7 +28,7 @@ from px4fuse.core.text import lower_first, with_log_name
 from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import CONVENTION
+from px4fuse.findings.cause_grouping import CONVENTION_KEY
 from px4fuse.findings.cause_text import format_shift
 from px4fuse.findings.model import CATALOGUE
 from px4fuse.flight.ekf2_parameters import PARAMETERS
@@ -112,7 +112,7 @@ def _is_setting_fault(finding: Finding) -> bool:
 
 
 def _find_cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
-    if CATALOGUE[finding.id].verdict == "meaningless" or CONVENTION in finding.evidence:
+    if CATALOGUE[finding.id].verdict == "meaningless" or CONVENTION_KEY in finding.evidence:
         return 0
     if _is_setting_fault(finding) and any(map(remains_overconfident, trials)):
         return 3

@@ -36,7 +36,7 @@ from px4fuse.findings import (
     source_values,
 )
 from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import TITLES, group_by_root, warning
+from px4fuse.findings.model import TITLES, split_cause_groups, warning
 from px4fuse.flight.model import Ekf2, Flight
 from px4fuse.loop.model import Loop
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
@@ -46,10 +46,10 @@ __all__ = [
     "Finding",
     "Severity",
     "find",
-    "find_aids",
-    "find_loop",
+    "find_aid_findings",
+    "find_loop_findings",
     "finding_title",
-    "group_by_root",
+    "split_cause_groups",
 ]
 
 DETECTORS = (
@@ -81,19 +81,19 @@ DETECTORS = (
 def find(analysis: Analysis) -> tuple[Finding, ...]:
     """Return the findings of a comparison of KF with EKF2, most severe first."""
     findings = [finding for module in DETECTORS for finding in module.detect(analysis)]
-    return group_by_cause(source_convention.apply_convention(analysis, findings))
+    return group_by_cause(source_convention.remove_convention_effects(analysis, findings))
 
 
-def find_loop(loop: Loop) -> tuple[Finding, ...]:
+def find_loop_findings(loop: Loop) -> tuple[Finding, ...]:
     """Return the findings on the loop closures of a path, most severe first."""
     return () if loop.is_assessed else group_by_cause(loops.detect_in_loop(loop))
 
 
-def find_aids(
+def find_aid_findings(
     aid_results: Mapping[str, AidResult], flight: Flight | None = None
 ) -> tuple[Finding, ...]:
     """Return the findings on EKF2 and its aiding sources, for a flight without position source."""
-    findings = list(aids.detect_in_aids(aid_results))
+    findings = list(aids.detect_aid_faults(aid_results))
     for item in flight.missing if flight is not None else ():
         if item.remedy == NO_FIX_ACTION:
             message = f"The GNSS receiver had no position: {item.reason}."

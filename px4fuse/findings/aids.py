@@ -11,25 +11,25 @@ from px4fuse.core.record import Span
 from px4fuse.core.text import format_number, format_ratio
 from px4fuse.ekf2.aids import CHANGE_WINDOW_S, AidResult
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
+from px4fuse.findings.cause_grouping import CAUSE_KEY, INNOVATION_SHIFT_CAUSE, SOURCE_SENSOR_CAUSE
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
 from px4fuse.flight.model import BAD_ACCELERATION, Unavailable
 
 # Aiding sources of external vision, which other modules test by replays of EKF2
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
-# Time (s) after take-off in which EKF2 may ignore the barometer because of ground effect
-TAKE_OFF_S = 10.0
-# EKF2's height error in a barometer gap is reported if largest error / height RMSE outside the gap
-# is larger
-MIN_HEIGHT_ERROR_RATIO = 3.0
+# A barometer gap that begins within this time (s) after take-off is normal: ground effect
+GROUND_EFFECT_DURATION_S = 10.0
+# Minimum ratio of EKF2's largest height error in a barometer gap to the height RMSE outside the
+# gap; only above this ratio, a finding states the error
+MIN_GAP_HEIGHT_ERROR_RATIO = 3.0
 # Aiding sources whose vertical innovations can set EKF2's flag for a bad vertical acceleration
 VERTICAL_AIDS = ("gnss_vel", "gnss_hgt", "baro_hgt")
-# Maximum fraction of the time with EKF2's flag for a bad vertical acceleration, for severity note;
-# above: severity warning
-MAX_BAD_FRACTION_NOTE = 0.3
-# Action if EKF2 does not fuse a sensor, by the PX4 parameter that enables its fusion
-CHECKS = {
+# Severity warning if EKF2 flags its vertical acceleration as bad for more than this fraction of the
+# time, otherwise note
+MAX_FLAGGED_FRACTION_FOR_NOTE = 0.3
+# Action if EKF2 does not fuse a sensor, by the PX4 parameter that enables the fusion of the sensor
+ACTION_BY_SWITCH = {
     "EKF2_BARO_CTRL": "Shield the barometer from propeller wash and light.",
     "EKF2_GPS_CTRL": "Give the antenna a free view of the sky.",
     "EKF2_RNG_CTRL": "Fly within the range of the distance sensor.",
@@ -37,7 +37,7 @@ CHECKS = {
     "EKF2_MAG_TYPE": "Mount the magnetometer away from motors and power cables.",
     "EKF2_EV_CTRL": "Check the position source and its data link.",
 }
-DEFAULT_CHECK = "Check mounting and power supply of the sensor."
+DEFAULT_ACTION = "Check mounting and power supply of the sensor."
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -45,10 +45,14 @@ def detect(analysis: Analysis) -> Findings:
     if isinstance(analysis.aids, Unavailable):
         return
     aid = analysis.source.origin.aid
-    take_off_s = [start_s for start_s, _ in find_airborne_spans(analysis.flight)]
+    take_off_times_s = [start_s for start_s, _ in find_airborne_spans(analysis.flight)]
     barometer = analysis.aids.get(BAROMETER.name)
-    height_error_m = _large_height_error_m(analysis, barometer.longest_gap_s) if barometer else None
-    yield from detect_in_aids(analysis.aids, aid.name if aid else "", take_off_s, height_error_m)
+    height_error_m = (
+        _find_large_height_error_m(analysis, barometer.longest_gap_s) if barometer else None
+    )
+    yield from detect_aid_faults(
+        analysis.aids, aid.name if aid else "", take_off_times_s, height_error_m
+    )
     yield from detect_bad_acceleration(analysis, analysis.aids)
 
 
@@ -61,106 +65,112 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
     state_times_s = state_times_s[
         (state_times_s >= analysis.segment.start_s) & (state_times_s <= analysis.segment.end_s)
     ]
-    is_bad = ekf2.record.was_in_state(BAD_ACCELERATION, state_times_s)
-    if not is_bad.any():
+    is_flagged = ekf2.record.was_in_state(BAD_ACCELERATION, state_times_s)
+    if not is_flagged.any():
         return
     small_noise_parameters = {
         AIDS[name].noise
         for name in VERTICAL_AIDS
         if name in aids and aids[name].verdict == "overconfident"
     }
-    cause = "Normal measurement noise can cause this for some seconds."
-    remedy = "If it lasts longer, check the IMU for vibration and clipping."
+    cause = "Normal measurement noise can set this flag for some seconds."
+    remedy = "If the flag is set for longer, check the IMU for vibration and clipping."
     if small_noise_parameters:
-        cause = "EKF2's noise parameters of these sensors are too small."
-        remedy = f"Increase {' and '.join(sorted(small_noise_parameters))} to the true noise."
-    bad_fraction, start_s = float(is_bad.mean()), float(state_times_s[is_bad.argmax()])
+        names = " and ".join(sorted(small_noise_parameters))
+        cause = f"The noise of EKF2 is set too small: {names}."
+        remedy = f"Increase {names} to the true noise of the sensor."
+    flagged_fraction, start_s = float(is_flagged.mean()), float(state_times_s[is_flagged.argmax()])
     yield finding(
-        "warning" if bad_fraction > MAX_BAD_FRACTION_NOTE else "note",
+        "warning" if flagged_fraction > MAX_FLAGGED_FRACTION_FOR_NOTE else "note",
         "ekf2_acceleration_bad",
-        f"EKF2 flags its vertical acceleration as bad for {format_percent(bad_fraction)} of the "
-        f"time, first at {start_s:.0f} s. Barometer and GNSS both measure a larger height than "
+        f"EKF2 flags its vertical acceleration as bad for {format_percent(flagged_fraction)} of "
+        f"the time, first at {start_s:.0f} s. Barometer and GNSS both measure a larger height than "
         f"EKF2 estimates. {cause}",
         remedy,
-        {"fraction": bad_fraction, "start_s": start_s},
+        {"fraction": flagged_fraction, "start_s": start_s},
     )
 
 
-def detect_in_aids(
+def detect_aid_faults(
     aids: Mapping[str, AidResult],
     source_aid: str = "",
-    take_off_s: Sequence[float] = (),
+    take_off_times_s: Sequence[float] = (),
     height_error_m: float | None = None,
 ) -> Findings:
     """Detect faults of EKF2's aiding sources.
 
-    ``source_aid`` is the aiding source whose positions KF uses, ``take_off_s`` are the times (s) of
-    take-off, ``height_error_m`` is EKF2's height error in a barometer gap, if large.
+    ``source_aid`` is the aiding source whose positions KF uses, ``height_error_m`` is EKF2's height
+    error in a barometer gap, if large.
     """
     tested_aids = {name: aid for name, aid in aids.items() if name not in AIDS_OF_OTHER_DETECTORS}
     unfused_aids_by_switch: dict[str, list[AidResult]] = {}
     for name, aid in tested_aids.items():
         is_take_off_gap = name == BAROMETER.name and any(
-            start <= aid.longest_gap_s[0] <= start + TAKE_OFF_S for start in take_off_s
+            start <= aid.longest_gap_s[0] <= start + GROUND_EFFECT_DURATION_S
+            for start in take_off_times_s
         )
         if aid.verdict == "not_fused" and not is_take_off_gap:
             unfused_aids_by_switch.setdefault(AIDS[name].switch or name, []).append(aid)
-    for switch, aids_of_sensor in unfused_aids_by_switch.items():
-        yield _not_fused_finding(switch, aids_of_sensor, source_aid, height_error_m)
+    for fusion_parameter, aids_of_sensor in unfused_aids_by_switch.items():
+        yield _make_not_fused_finding(fusion_parameter, aids_of_sensor, source_aid, height_error_m)
     for name, aid in tested_aids.items():
-        sensor_cause = _sensor_cause(AIDS[name].switch, source_aid)
+        sensor_cause = _find_sensor_cause(AIDS[name].switch, source_aid)
         if not sensor_cause and any(result.change for result in aid.axes.values()):
-            yield _innovation_shift_finding(name, aid)
+            yield _make_innovation_shift_finding(name, aid)
         elif aid.verdict == "overconfident" and name != source_aid:
-            yield _overconfident_finding(name, aid, sensor_cause)
+            yield _make_overconfident_finding(name, aid, sensor_cause)
         elif aid.verdict == "biased":
-            yield _biased_finding(name, aid)
+            yield _make_innovation_bias_finding(name, aid)
 
 
-def _not_fused_finding(
-    switch: str, aids_of_sensor: list[AidResult], source_aid: str, height_error_m: float | None
+def _make_not_fused_finding(
+    fusion_parameter: str,
+    aids_of_sensor: list[AidResult],
+    source_aid: str,
+    height_error_m: float | None,
 ) -> Finding:
-    longest_unfused = max(aids_of_sensor, key=lambda aid: aid.longest_gap_duration_s)
-    aid_labels = ", ".join(_aid_label(aid) for aid in aids_of_sensor)
+    longest_gap_aid = max(aids_of_sensor, key=lambda aid: aid.longest_gap_duration_s)
+    aid_labels = ", ".join(_format_aid_label(aid) for aid in aids_of_sensor)
     has_innovation_shift = any(axis.change for aid in aids_of_sensor for axis in aid.axes.values())
-    is_barometer, height_error_text = switch == BAROMETER.switch, ""
+    is_barometer, height_error_text = fusion_parameter == BAROMETER.switch, ""
     if is_barometer and height_error_m is not None:
         height_error_text = f": EKF2's height error is {height_error_m:.2f} m"
     return finding(
         "note" if is_barometer and not height_error_text else "warning",
         "aid_not_fused",
         f"EKF2 fused no sample of {aid_labels} for "
-        f"{longest_unfused.longest_gap_duration_s:.0f} s{height_error_text}. EKF2 rejected "
-        f"{format_percent(longest_unfused.rejected_fraction)} of the samples, and relied on "
+        f"{longest_gap_aid.longest_gap_duration_s:.0f} s{height_error_text}. EKF2 rejected "
+        f"{format_percent(longest_gap_aid.rejected_fraction)} of the samples, and relied on "
         "the IMU and other aiding sources.",
-        CHECKS.get(switch, DEFAULT_CHECK),
+        ACTION_BY_SWITCH.get(fusion_parameter, DEFAULT_ACTION),
         {
             "aid": aid_labels,
-            "longest_gap_s": longest_unfused.longest_gap_duration_s,
-            "rejected_fraction": longest_unfused.rejected_fraction,
-            CAUSE: _sensor_cause(switch, source_aid) or (CHANGE if has_innovation_shift else ""),
+            "longest_gap_s": longest_gap_aid.longest_gap_duration_s,
+            "rejected_fraction": longest_gap_aid.rejected_fraction,
+            CAUSE_KEY: _find_sensor_cause(fusion_parameter, source_aid)
+            or (INNOVATION_SHIFT_CAUSE if has_innovation_shift else ""),
         },
-        (longest_unfused.longest_gap_s,),
+        (longest_gap_aid.longest_gap_s,),
     )
 
 
-def _innovation_shift_finding(name: str, aid: AidResult) -> Finding:
-    label = _aid_label(aid)
+def _make_innovation_shift_finding(name: str, aid: AidResult) -> Finding:
     shifts_by_axis = {axis: result.change for axis, result in aid.axes.items() if result.change}
     axis, (time_s, mean_change) = max(shifts_by_axis.items(), key=lambda item: abs(item[1][1]))
     s_sqrt = aid.axes[axis].s_sqrt_median
     return warning(
         "aid_innovation_shift",
-        f"{label}: the {axis} innovation shifts by {format_number(abs(mean_change) * s_sqrt, 2)} "
-        f"{aid.unit} at {time_s:.0f} s. The mean innovation before and after differs by "
-        f"{abs(mean_change):.1f} √S (√S {format_number(s_sqrt, 2)} {aid.unit}).",
+        f"{_format_aid_label(aid)}: the mean {axis} innovation shifts by "
+        f"{format_number(abs(mean_change) * s_sqrt, 2)} {aid.unit} at {time_s:.0f} s. This is "
+        f"{abs(mean_change):.1f} times its expected standard deviation √S "
+        f"({format_number(s_sqrt, 2)} {aid.unit}).",
         f"Check what was switched, moved or passed near the sensor at {time_s:.0f} s.",
         {"aid": name, "axis": axis, "time_s": time_s, "moved": mean_change},
         ((time_s, time_s + CHANGE_WINDOW_S),),
     )
 
 
-def _overconfident_finding(name: str, aid: AidResult, sensor_cause: str) -> Finding:
+def _make_overconfident_finding(name: str, aid: AidResult, sensor_cause: str) -> Finding:
     # No noise value is proposed, because innovations alone do not distinguish noise from a
     # wrong delay
     action = "correct the accuracy that the sensor reports"
@@ -171,8 +181,9 @@ def _overconfident_finding(name: str, aid: AidResult, sensor_cause: str) -> Find
         noise_text = f" ({format_number(aid.noise)} {aid.unit}, from {aid.noise_from})"
     return warning(
         "aid_overconfident",
-        f"EKF2 is overconfident about {_aid_label(aid)}: σ is {format_ratio(aid.nis_mean**0.5)} "
-        f"times too small. The mean NIS is {format_number(aid.nis_mean)} (expected 1). "
+        f"EKF2 is overconfident about {_format_aid_label(aid)}: σ is "
+        f"{format_ratio(aid.nis_mean**0.5)} times too small. The mean NIS is "
+        f"{format_number(aid.nis_mean)} (expected 1). "
         f"EKF2 rejects {format_percent(aid.rejected_fraction)} of the samples. Possible "
         f"causes: errors of this sensor larger than its √R{noise_text}, or errors of "
         "another sensor.",
@@ -181,18 +192,18 @@ def _overconfident_finding(name: str, aid: AidResult, sensor_cause: str) -> Find
             "aid": name,
             "nis_mean": aid.nis_mean,
             "rejected_fraction": aid.rejected_fraction,
-            CAUSE: sensor_cause,
+            CAUSE_KEY: sensor_cause,
         },
     )
 
 
-def _biased_finding(name: str, aid: AidResult) -> Finding:
+def _make_innovation_bias_finding(name: str, aid: AidResult) -> Finding:
     axis, worst_axis = max(
         aid.axes.items(), key=lambda item: abs(item[1].mean_normalised_innovation)
     )
     return note(
         "aid_innovation_bias",
-        f"{_aid_label(aid)}: the {axis} innovation has a mean of "
+        f"{_format_aid_label(aid)}: the {axis} innovation has a mean of "
         f"{format_number(worst_axis.innovation_mean)} {aid.unit} (√S "
         f"{format_number(worst_axis.s_sqrt_median)} {aid.unit}). This aiding source "
         "contradicts another one.",
@@ -206,7 +217,7 @@ def _biased_finding(name: str, aid: AidResult) -> Finding:
     )
 
 
-def _large_height_error_m(analysis: Analysis, span_s: Span) -> float | None:
+def _find_large_height_error_m(analysis: Analysis, span_s: Span) -> float | None:
     down_comparison = analysis.axes.get("down")
     errors = None if down_comparison is None else compute_position_errors(down_comparison, "ekf2")
     if errors is None or isinstance(errors, Unavailable):
@@ -215,12 +226,14 @@ def _large_height_error_m(analysis: Analysis, span_s: Span) -> float | None:
     is_in_span = (error_m.index >= span_s[0]) & (error_m.index <= span_s[1])
     rmse_outside_m = float(np.sqrt(np.mean(error_m[~is_in_span] ** 2)))
     largest_error_m = float(error_m[is_in_span].max())
-    return largest_error_m if largest_error_m > MIN_HEIGHT_ERROR_RATIO * rmse_outside_m else None
+    return (
+        largest_error_m if largest_error_m > MIN_GAP_HEIGHT_ERROR_RATIO * rmse_outside_m else None
+    )
 
 
-def _aid_label(aid: AidResult) -> str:
+def _format_aid_label(aid: AidResult) -> str:
     return f"the {aid.label}" if aid.label in (BAROMETER.label, MAG.label) else aid.label
 
 
-def _sensor_cause(switch: str, source_aid: str) -> str:
-    return SENSOR if source_aid and AIDS[source_aid].switch == switch else ""
+def _find_sensor_cause(fusion_parameter: str, source_aid: str) -> str:
+    return SOURCE_SENSOR_CAUSE if source_aid and AIDS[source_aid].switch == fusion_parameter else ""

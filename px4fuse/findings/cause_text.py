@@ -18,34 +18,35 @@ from px4fuse.comparison.trials import (
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import SETTING_RANGES
 from px4fuse.findings import cause_grouping as kinds
-from px4fuse.findings.model import format_percent, magnetometer_advice, source_words
+from px4fuse.findings.model import find_source_texts, format_percent, magnetometer_advice
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
 
-def kind_of_cause(analysis: Analysis, cause: Trial | None) -> str:
+def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
     """Return the kind of fault that a re-run corrects, such as "measurement noise"."""
     if cause is None:
-        return kinds.ELSEWHERE
+        return kinds.OTHER_CAUSE
     aid = find_aid(analysis)
     kind_by_change = {
-        trials.OUTLIERS: kinds.OUTLIERS,
-        trials.CLOCK_OFFSET: kinds.CLOCK,
-        aid.delay: kinds.CLOCK,
-        trials.ROTATION: kinds.FRAME,
-        trials.FORWARD_BIAS: kinds.ACCELEROMETER,
-        changes.SIGMA_Z: kinds.NOISE,
-        aid.noise: kinds.NOISE,
-        aid.gate: kinds.GATE,
+        trials.OUTLIERS: kinds.OUTLIER_CAUSE,
+        trials.CLOCK_OFFSET: kinds.CLOCK_CAUSE,
+        aid.delay: kinds.CLOCK_CAUSE,
+        trials.ROTATION: kinds.FRAME_CAUSE,
+        trials.FORWARD_BIAS: kinds.ACCELEROMETER_CAUSE,
+        changes.SIGMA_Z: kinds.NOISE_CAUSE,
+        aid.noise: kinds.NOISE_CAUSE,
+        aid.gate: kinds.GATE_CAUSE,
     }
     return next(
-        (kind for name, kind in kind_by_change.items() if name in cause.change), kinds.PROCESS
+        (kind for name, kind in kind_by_change.items() if name in cause.change),
+        kinds.PROCESS_NOISE_CAUSE,
     )
 
 
 def is_refuted(analysis: Analysis, filter_name: FilterName, cause: Trial) -> bool:
-    """Return True if the change of a re-run improves nothing along the main axis."""
+    """Return True if the change corrects neither σ nor RMSE in a re-run along the main axis."""
     return any(
         (trial.filter, trial.change) == (filter_name, cause.change)
         and can_show_improvement(trial)
@@ -56,14 +57,14 @@ def is_refuted(analysis: Analysis, filter_name: FilterName, cause: Trial) -> boo
 
 def format_change(analysis: Analysis, cause: Trial) -> str:
     """Format the changes of a re-run: "SIGMA_Z 0.1 m instead of 0.05 m"."""
-    change = select_changed_settings(cause.change, _flown_settings(analysis))
+    change = select_changed_settings(cause.change, _find_used_settings(analysis))
     names = change.keys() - trials.SECONDARY_CHANGE_KEYS or change
     return " and ".join(
         _format_one_change(analysis, cause, name) for name in cause.change if name in names
     )
 
 
-def _flown_settings(analysis: Analysis) -> Mapping[str, float]:
+def _find_used_settings(analysis: Analysis) -> Mapping[str, float]:
     ekf2_model = analysis.ekf2_model
     return {} if isinstance(ekf2_model, Unavailable) else ekf2_model.inputs.settings
 
@@ -84,7 +85,7 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
     actions, change = [], dict(change)
     is_gnss = analysis.source.origin.is_gnss
     if change.pop(trials.OUTLIERS, None):
-        actions.append(source_words(analysis.source).outliers_action)
+        actions.append(find_source_texts(analysis.source).outliers_action)
     if change.pop(trials.FORWARD_BIAS, None) is not None:
         actions.append("Calibrate the accelerometer and the level horizon.")
         change.pop(trials.RIGHT_BIAS)
@@ -99,7 +100,7 @@ def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
         actions.append(f"{format_shift(offset_s)} the position timestamps before sending.")
     settings = {name: change.pop(name) for name in changes.CHANGED_KF_SETTINGS & change.keys()}
     if change:
-        change = select_changed_settings(change, _flown_settings(analysis))
+        change = select_changed_settings(change, _find_used_settings(analysis))
         actions.append(f"Set {format_settings(change)}.")
     if settings:
         actions.append(format_kf_settings(settings))
@@ -147,6 +148,6 @@ def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
             unit, label = SETTING_RANGES[name][2:]
             return f"{label} {value:.2g} {unit} instead of {getattr(settings, name):g} {unit}"
     assert not isinstance(analysis.ekf2_model, Unavailable)
-    flown_value, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].printed_unit
-    text = f"{name} {value:.3g} {unit} instead of {flown_value:.4g} {unit}"
+    used_value, unit = analysis.ekf2_model.inputs.settings[name], PARAMETERS[name].printed_unit
+    text = f"{name} {value:.3g} {unit} instead of {used_value:.4g} {unit}"
     return text.replace("  ", " ").rstrip()

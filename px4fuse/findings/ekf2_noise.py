@@ -15,53 +15,54 @@ from px4fuse.core.text import format_factor
 from px4fuse.filter.consistency import classify_sigma_ratio
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Severity
-from px4fuse.findings.cause_grouping import CAUSE, REPORTED
+from px4fuse.findings.cause_grouping import CAUSE_KEY, REPORTED_VARIANCE_CAUSE
 from px4fuse.findings.model import Findings, finding, format_percent
 from px4fuse.flight.model import Unavailable, source_name
 
-# Minimum factor between EKF2's noise parameter and the estimated noise, for severity error. A
-# smaller factor hardly changes EKF2's position error
-MIN_FACTOR_ERROR = 2.0
-# The first sentence of the message contains the rejected fraction of the positions if it is larger
-MIN_NAMED_REJECTION = 0.05
+# Minimum factor between EKF2's noise parameter and the estimated noise, for severity error: smaller
+# factors hardly change EKF2's position error
+MIN_NOISE_FACTOR_FOR_ERROR = 2.0
+# Minimum fraction of rejected positions that is stated in the first sentence of the message
+MIN_STATED_REJECTED_FRACTION = 0.05
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect a wrong noise parameter of EKF2, if EKF2 is consistent with the estimated noise."""
-    trial, aid = confirmed_noise_trial(analysis), find_aid(analysis)
+    """Detect a wrong noise parameter: a replay with the estimated noise makes EKF2 consistent."""
+    trial, aid = find_confirmed_noise_trial(analysis), find_aid(analysis)
     if trial is None:
         return
     assert not isinstance(analysis.ekf2_model, Unavailable)
     inputs = analysis.ekf2_model.inputs
-    flown_m, estimate_m = find_used_noise_m(inputs), trial.change[aid.noise]
+    used_noise_m, estimate_m = find_used_noise_m(inputs), trial.change[aid.noise]
     # EKF2 uses the reported σ or the noise parameter, the larger one
-    is_reported = flown_m > inputs.settings[aid.noise]
-    ratio, is_small = estimate_m / flown_m, estimate_m > flown_m
-    factor, direction = max(ratio, 1.0 / ratio), "small" if is_small else "large"
+    is_reported = used_noise_m > inputs.settings[aid.noise]
+    ratio, is_set_too_small = estimate_m / used_noise_m, estimate_m > used_noise_m
+    factor, direction = max(ratio, 1.0 / ratio), "small" if is_set_too_small else "large"
     sensor_name = source_name(analysis.source)
-    has_kf_same_noise = analysis.source.origin.is_gnss and math.isclose(
-        analysis.settings.sigma_z_m, flown_m, rel_tol=1e-2
+    is_kf_noise_equal = analysis.source.origin.is_gnss and math.isclose(
+        analysis.settings.sigma_z_m, used_noise_m, rel_tol=1e-2
     )
     rejected_fraction = analysis.main.rejected_fraction or 0.0
-    if rejected_fraction >= MIN_NAMED_REJECTION:
+    if rejected_fraction >= MIN_STATED_REJECTED_FRACTION:
         effect_text = f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"
         reason = f"EKF2 rejects normal {sensor_name} noise as outliers and relies on the IMU."
     else:
-        effect_text, opposite = "", "large" if is_small else "small"
-        reason = f"EKF2's gain is therefore too {opposite}, and its reported σ too {direction}."
+        effect_text, gain_size = "", "large" if is_set_too_small else "small"
+        reason = f"EKF2's gain is therefore too {gain_size}, and its reported σ too {direction}."
     name = "EKF2's position noise" if is_reported else aid.noise
     title = f"{name} is {format_factor(factor)} times too {direction}{effect_text}"
-    is_default = flown_m == analysis.flight.log.default_of(aid.noise)
-    if is_small and is_default:  # PX4's default fits usual sensors, so the sensor is at fault
-        filters = "KF and EKF2" if has_kf_same_noise else "EKF2"
+    is_default = used_noise_m == analysis.flight.log.default_of(aid.noise)
+    # PX4's default fits usual sensors, so the sensor is at fault
+    if is_set_too_small and is_default:
+        filters = "KF and EKF2" if is_kf_noise_equal else "EKF2"
         title = (
             f"{sensor_name} noise is {format_factor(factor)} times the noise setting of "
             f"{filters}{effect_text}"
         )
     source_text = ""
-    report_text = ""
+    variance_action = ""
     if is_reported:
-        report_text = f", or report a variance of {estimate_m**2:.2g} m² with each position"
+        variance_action = f", or report a variance of {estimate_m**2:.2g} m² with each position"
         mode_text = f" ({aid.noise_mode} 0)" if aid.noise_mode else ""
         source_text = (
             f", the σ that {sensor_name} reports{mode_text}, because {aid.noise} is only "
@@ -76,26 +77,26 @@ def detect(analysis: Analysis) -> Findings:
         interval_text = (
             f" (95 % {horizontal_tuning.sigma_z.low:.3g} to {horizontal_tuning.sigma_z.high:.3g} m)"
         )
-    severity: Severity = "error" if factor >= MIN_FACTOR_ERROR else "warning"
+    severity: Severity = "error" if factor >= MIN_NOISE_FACTOR_FOR_ERROR else "warning"
     yield finding(
         severity,
         f"ekf2_noise_too_{direction}",
-        f"{title}. {name} is {flown_m:.3g} m{source_text}; the maximum-likelihood estimate is "
+        f"{title}. {name} is {used_noise_m:.3g} m{source_text}; the maximum-likelihood estimate is "
         f"{estimate_m:.3g} m{interval_text}. "
-        f"{reason}{f' KF takes SIGMA_Z from {aid.noise}.' if has_kf_same_noise else ''}",
+        f"{reason}{f' KF takes SIGMA_Z from {aid.noise}.' if is_kf_noise_equal else ''}",
         f"Set {format_settings(select_changed_settings(trial.change, inputs.settings))}"
-        f"{report_text}."
-        f"{make_height_noise_advice(analysis, analysis.tuning, estimate_m)}",
+        f""
+        f"{variance_action}.{make_height_noise_advice(analysis, analysis.tuning, estimate_m)}",
         {
-            "flown_m": flown_m,
+            "flown_m": used_noise_m,
             "estimate_m": estimate_m,
             "factor": ratio,
-            CAUSE: REPORTED if is_reported else "",
+            CAUSE_KEY: REPORTED_VARIANCE_CAUSE if is_reported else "",
         },
     )
 
 
-def confirmed_noise_trial(analysis: Analysis) -> Trial | None:
+def find_confirmed_noise_trial(analysis: Analysis) -> Trial | None:
     """Return a re-run in which another EKF2 measurement noise makes EKF2 consistent, or None."""
     trial = find_trial(analysis.select_main_trials(), "ekf2", "noise", find_aid(analysis).noise)
     is_confirmed = trial is not None and any(

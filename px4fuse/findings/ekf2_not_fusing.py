@@ -1,4 +1,4 @@
-"""Position source that EKF2 does not fuse horizontally, or only for part of the flight."""
+"""Faults of fusion: missing, interrupted or late fusion of positions, and an invalid position."""
 
 import numpy as np
 import pandas as pd
@@ -31,16 +31,15 @@ from px4fuse.flight.model import (
     positions_phrase,
 )
 
-# The severity is error if EKF2 fuses the positions for a smaller fraction of the time
-MIN_FUSED_FRACTION_ERROR = 0.5
-# The severity is warning if EKF2 fuses the positions for a smaller fraction of the time
-MIN_FUSED_FRACTION_WARNING = 0.98
-# Minimum interval (s) between positions that jitter can increase above EV_START_INTERVAL_S
-MIN_LIMITING_INTERVAL_S = 0.18
+# Severity error if EKF2 fuses the positions for less than this fraction of the time
+FUSED_FRACTION_FOR_ERROR = 0.5
+# Severity warning if EKF2 fuses the positions for less than this fraction of the time
+FUSED_FRACTION_FOR_WARNING = 0.98
+# Minimum interval (s) between positions for late starts of fusion, due to jitter of the interval
+MIN_LATE_START_INTERVAL_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
-# Minimum distance (m) of EKF2's invalid position from ground truth or position source, for a
-# finding
-MIN_INVALID_DISTANCE_M = 1.0
+# Minimum distance (m) of an EKF2 position that is flagged as invalid from ground truth or source
+MIN_INVALID_POSITION_ERROR_M = 1.0
 
 
 def detect(analysis: Comparison) -> Findings:
@@ -52,16 +51,16 @@ def detect(analysis: Comparison) -> Findings:
 
 
 def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
-    ekf2, source = analysis.flight.ekf2, _received_source(analysis)
+    ekf2, source = analysis.flight.ekf2, _find_received_source(analysis)
     if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusion_flags, Unavailable):
         return
     fusion_flag = ekf2.fusion_flags["horizontal"]
     fused_fraction = fraction_of_ones(fusion_flag, analysis.segment)
-    if fused_fraction >= MIN_FUSED_FRACTION_ERROR:
+    if fused_fraction >= FUSED_FRACTION_FOR_ERROR:
         yield from _detect_slow_restart(analysis, ekf2, fusion_flag)
-    if source is None or fused_fraction >= MIN_FUSED_FRACTION_WARNING:
+    if source is None or fused_fraction >= FUSED_FRACTION_FOR_WARNING:
         return
-    positions, aid = positions_phrase(source), source.origin.aid
+    positions_text, aid = positions_phrase(source), source.origin.aid
     evidence: dict[str, float | str] = {
         "fused_fraction": fused_fraction,
         "source_interval_s": 1.0 / source.compute_rate_hz(),
@@ -70,31 +69,31 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
         if source.name == MOTION_CAPTURE_TOPIC and not fused_fraction:
             yield warning(
                 "ekf2_not_fusing",
-                f"EKF2 never fused the {positions}: EKF2 does not read {source.name}. PX4 writes "
-                "ATT_POS_MOCAP, and ODOMETRY of estimator type MOCAP, to this topic as ground "
-                "truth.",
+                f"EKF2 never fused the {positions_text}: EKF2 does not read {source.name}. PX4 "
+                "writes ATT_POS_MOCAP, and ODOMETRY of estimator type MOCAP, to this topic as "
+                "ground truth.",
                 "To fuse these positions, send VISION_POSITION_ESTIMATE, or ODOMETRY of "
                 "estimator type VISION.",
                 evidence,
             )
         return
     spans = spans_with_value(0.0, fusion_flag, analysis.segment)
-    longest_s = max(spans, key=lambda span: span[1] - span[0])
+    longest_span_s = max(spans, key=lambda span: span[1] - span[0])
     parameters = {**analysis.flight.log.parameters, **ekf2.parameters}
     unmet_condition = find_unmet_condition(
-        UnfusedPositions(ekf2, source, aid, parameters, longest_s)
+        UnfusedPositions(ekf2, source, aid, parameters, longest_span_s)
     )
     evidence["condition"] = unmet_condition.condition
     action = unmet_condition.action
     if not unmet_condition.condition and not source.origin.has_all_samples:
         action = f"Record with SDLOG_PROFILE 129 (default and vision). {action}"
-    title = f"EKF2 fused the {positions} only {format_percent(fused_fraction)} of the time"
+    title = f"EKF2 fused the {positions_text} only {format_percent(fused_fraction)} of the time"
     if not fused_fraction:
-        title = f"EKF2 never fused the {positions}"
+        title = f"EKF2 never fused the {positions_text}"
     message = (
         f"{title}{unmet_condition.fault and ': '}{unmet_condition.fault}. {unmet_condition.reason}"
     )
-    if fused_fraction < MIN_FUSED_FRACTION_ERROR:
+    if fused_fraction < FUSED_FRACTION_FOR_ERROR:
         is_disabled_gnss = source.origin.fused_as_gnss and unmet_condition.condition == "switch"
         yield finding(
             "note" if is_disabled_gnss else "error",
@@ -107,15 +106,15 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
     else:
         yield warning(
             "ekf2_fusion_interrupted",
-            f"{message} For up to {longest_s[1] - longest_s[0]:.1f} s EKF2 relied on the IMU and "
-            "its other aiding sources.",
+            f"{message} For up to {longest_span_s[1] - longest_span_s[0]:.1f} s EKF2 relied on the "
+            "IMU and its other aiding sources.",
             action,
             evidence,
             spans,
         )
 
 
-def _received_source(analysis: PreparedComparison) -> PositionTrack | None:
+def _find_received_source(analysis: PreparedComparison) -> PositionTrack | None:
     """Return the track of the positions that PX4 received, without those of a position file."""
     if analysis.source.origin != POSITION_FILE:
         return analysis.source
@@ -128,31 +127,31 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     if is_valid is None or is_valid.empty:
         return
     invalid_fraction = 1.0 - fraction_of_ones(is_valid, analysis.segment)
-    if invalid_fraction <= 1.0 - MIN_FUSED_FRACTION_WARNING:
+    if invalid_fraction <= 1.0 - FUSED_FRACTION_FOR_WARNING:
         return
     spans = spans_with_value(0.0, is_valid, analysis.segment)
-    distance_m = _largest_distance_m(analysis, ekf2, spans)
-    if distance_m < MIN_INVALID_DISTANCE_M:
+    distance_m = _find_largest_distance_m(analysis, ekf2, spans)
+    if distance_m < MIN_INVALID_POSITION_ERROR_M:
         return
     reference = "ground truth" if isinstance(analysis.flight.truth, Truth) else "source"
     distance_sentence = (
-        f" In this time EKF2's distance to the {reference} is up to {format_metres(distance_m)} m."
+        f" During that time EKF2 is up to {format_metres(distance_m)} m from the {reference}."
     )
     if not np.isfinite(distance_m):
         distance_sentence = ""
     yield finding(
-        "error" if invalid_fraction > MIN_FUSED_FRACTION_ERROR else "warning",
+        "error" if invalid_fraction > FUSED_FRACTION_FOR_ERROR else "warning",
         "ekf2_position_invalid",
         f"EKF2's horizontal position is invalid {format_percent(invalid_fraction)} of the time "
         f"(xy_valid 0), and PX4 does not use it.{distance_sentence}",
-        "Restore the fusion of positions first. EKF2's errors in this time do not depend on "
-        "noise settings.",
+        "Restore the fusion of positions first. While EKF2's position is invalid, its errors do "
+        "not depend on noise settings.",
         {"invalid_fraction": invalid_fraction, "distance_m": distance_m},
         spans,
     )
 
 
-def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...]) -> float:
+def _find_largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...]) -> float:
     """Return EKF2's largest horizontal distance (m) from ground truth or source in time spans."""
     truth, columns = analysis.flight.truth, ["north_m", "east_m"]
     reference = truth.samples if isinstance(truth, Truth) else analysis.source.samples
@@ -168,14 +167,14 @@ def _largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span, ...
 def _detect_slow_restart(
     analysis: PreparedComparison, ekf2: Ekf2, fusion_flag: pd.Series
 ) -> Findings:
-    """Detect a position rate so low that EKF2 restarts fusion late after a gap."""
+    """Detect that EKF2 resumes fusion late after a gap, because the position rate is too low."""
     source, rate_hz = analysis.source, analysis.source.compute_rate_hz()
     if (
         "EKF2_EV_CTRL" not in analysis.flight.log.parameters  # earlier than v1.14
         or not source.origin.is_vision
         or not source.origin.has_all_samples
         or source.alignment
-        or 1.0 / rate_hz < MIN_LIMITING_INTERVAL_S
+        or 1.0 / rate_hz < MIN_LATE_START_INTERVAL_S
     ):
         return
     time_s = source.samples.index.to_numpy()
@@ -194,13 +193,13 @@ def _detect_slow_restart(
         ):
             restart_delay_spans.append((float(unfused_times_s[0]), end_s))
     if restart_delay_spans:
-        longest_s = max(end - start for start, end in restart_delay_spans)
+        longest_delay_s = max(end - start for start, end in restart_delay_spans)
         yield note(
             "source_rate_at_limit",
-            f"After a gap EKF2 resumed fusion {longest_s:.1f} s late: {positions_phrase(source)} "
-            f"come at only {rate_hz:.1f} Hz. EKF2 (v1.14 and later) starts fusion when two "
-            f"positions arrive within {EV_START_INTERVAL_S:g} s.",
+            f"After a gap EKF2 resumed fusion {longest_delay_s:.1f} s late: "
+            f"{positions_phrase(source)} come at only {rate_hz:.1f} Hz. EKF2 (v1.14 and later) "
+            f"starts fusion when two positions arrive within {EV_START_INTERVAL_S:g} s.",
             "Send the position at 10 Hz.",
-            {"rate_hz": rate_hz, "longest_s": longest_s, "count": len(restart_delay_spans)},
+            {"rate_hz": rate_hz, "longest_s": longest_delay_s, "count": len(restart_delay_spans)},
             tuple(restart_delay_spans),
         )

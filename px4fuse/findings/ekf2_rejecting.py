@@ -1,4 +1,4 @@
-"""Positions that EKF2's innovation gate rejects, and a gate that is too small."""
+"""Rejections: EKF2's innovation gate rejects positions, for example because it is too small."""
 
 import math
 
@@ -10,21 +10,20 @@ from px4fuse.finding import Finding
 from px4fuse.findings.cause_text import format_action
 from px4fuse.findings.model import (
     Findings,
+    find_source_texts,
     finding,
     format_percent,
-    source_words,
     zero_length_spans,
 )
 from px4fuse.flight.model import Ekf2, Unavailable
 
 # Minimum fraction of rejected positions for a warning. With a gate of 5 √S, a consistent filter
 # rejects 6e-7
-REJECTED_FRACTION_WARNING = 0.01
+REJECTED_FRACTION_FOR_WARNING = 0.01
 # Minimum fraction of rejected positions for severity error
-REJECTED_FRACTION_ERROR = 0.20
-# A change prevents rejections if rejected fraction of the re-run / rejected fraction of EKF2 is
-# smaller
-MAX_REJECTED_RATIO = 0.5
+REJECTED_FRACTION_FOR_ERROR = 0.20
+# A change prevents rejections if it reduces the rejected fraction at least to this fraction of it
+MAX_REJECTED_FRACTION_RATIO = 0.5
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -38,8 +37,8 @@ def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> F
     ekf2 = analysis.flight.ekf2
     if isinstance(ekf2, Ekf2) and rejections:
         # Probability that both innovations, north and east, are inside the gate: erf(gate/√2)²
-        expected_fraction = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
-        if expected_fraction >= REJECTED_FRACTION_WARNING:
+        expected_rejected_fraction = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
+        if expected_rejected_fraction >= REJECTED_FRACTION_FOR_WARNING:
             aid = find_aid(analysis)
             rejected_fraction = float(rejections[0].evidence["rejected_fraction"])
             yield finding(
@@ -47,16 +46,17 @@ def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> F
                 "ekf2_gate_too_small",
                 f"{aid.gate} {ekf2.gate:g} is too small: EKF2 rejects "
                 f"{format_percent(rejected_fraction)} of the positions. Without any fault, this "
-                f"gate rejects {format_percent(expected_fraction)} of the positions. Rejected "
-                "positions do not correct EKF2.",
+                f"gate rejects {format_percent(expected_rejected_fraction)} of the positions. "
+                "Rejected positions do not correct EKF2.",
                 f"Set {aid.gate} to {aid.default_gate:g} √S (PX4's default).",
-                {"gate": ekf2.gate, "rejected_by_gate": expected_fraction},
+                {"gate": ekf2.gate, "rejected_by_gate": expected_rejected_fraction},
             )
 
 
 def _detect_rejections(analysis: Analysis) -> Findings:
     ekf2, down_comparison = analysis.flight.ekf2, analysis.axes.get("down")
-    # EKF2 rejects both horizontal axes of a position together, so one axis is sufficient
+    # EKF2 rejects north and east of a position together, so the main axis contains all rejections
+    # of horizontal positions
     for result in (
         analysis.main,
         *([down_comparison] if down_comparison and down_comparison is not analysis.main else []),
@@ -66,15 +66,15 @@ def _detect_rejections(analysis: Analysis) -> Findings:
             continue
         rejected_flags = innovations["rejected"].dropna()
         rejected_fraction = float(rejected_flags.mean())  # NaN if the log has no rejections
-        if rejected_fraction >= REJECTED_FRACTION_WARNING:
+        if rejected_fraction >= REJECTED_FRACTION_FOR_WARNING:
             quantity = "heights" if result is down_comparison else "positions"
             yield finding(
-                "error" if rejected_fraction >= REJECTED_FRACTION_ERROR else "warning",
+                "error" if rejected_fraction >= REJECTED_FRACTION_FOR_ERROR else "warning",
                 "ekf2_rejects_positions",
                 f"EKF2 rejects {format_percent(rejected_fraction)} of the {quantity}. Their "
                 f"innovations are outside its gate of {ekf2.gate:g} √S. Possible causes: outliers, "
                 "measurement noise set too small, or late timestamps.",
-                _rejection_remedy(analysis, result),
+                _find_rejection_remedy(analysis, result),
                 {
                     "rejected_fraction": rejected_fraction,
                     "count": len(innovations),
@@ -84,7 +84,7 @@ def _detect_rejections(analysis: Analysis) -> Findings:
             )
 
 
-def _rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
+def _find_rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
     aid = find_aid(analysis, result.axis.name)
     helpful_trials = [
         trial for trial in analysis.select_main_trials() if _prevents_rejections(trial)
@@ -92,17 +92,16 @@ def _rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
     if helpful_trials and result is analysis.main:
         return format_action(analysis, min(helpful_trials, key=compute_preference_key).change)
     return (
-        f"Check {source_words(analysis.source).reception}. Then check {aid.delay} and {aid.noise}. "
-        f"Increase {aid.gate} last."
+        f"Check {find_source_texts(analysis.source).reception}. Then check {aid.delay} and "
+        f"{aid.noise}. Increase {aid.gate} last."
     )
 
 
 def _prevents_rejections(trial: Trial) -> bool:
-    rejected_before, rejected_after = trial.before.rejected_fraction, trial.after.rejected_fraction
-    if (
-        rejected_before is None
-        or rejected_after is None
+    fraction_before, fraction_after = trial.before.rejected_fraction, trial.after.rejected_fraction
+    if ( fraction_before is None
+        or fraction_after is None
         or classify_improvement(trial) == "nothing"
     ):
         return False
-    return len(trial.kinds) == 1 and rejected_after < MAX_REJECTED_RATIO * rejected_before
+    return len(trial.kinds) == 1 and fraction_after < MAX_REJECTED_FRACTION_RATIO * fraction_before

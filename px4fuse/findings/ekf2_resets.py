@@ -7,28 +7,28 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.comparison.projection import remove_origin_resets
 from px4fuse.core.record import Span
-from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, GAP
+from px4fuse.findings.cause_grouping import CAUSE_KEY, GAP_CAUSE, OTHER_CAUSE
 from px4fuse.findings.model import Findings, finding, format_count, warning, zero_length_spans
 from px4fuse.flight.model import Ekf2, Reset
 
 # Time (s) after take-off in which a height reset of EKF2 is normal
-TAKE_OFF_S = 10.0
+TAKE_OFF_DURATION_S = 10.0
 # Maximum time (s) from the end of a gap in the position source to the EKF2 reset caused by the gap
 MAX_RESET_DELAY_S = 5.0
-# Maximum time (s) from EKF2's logged start of fusion to its normal first reset: fusion flags are
-# logged at 1 Hz
-MAX_START_S = 1.0
+# Maximum time (s) from EKF2's logged start of fusion to the normal first reset, because fusion
+# flags are logged at 1 Hz
+MAX_START_RESET_DELAY_S = 1.0
 
 
 def detect(analysis: Analysis) -> Findings:
     ekf2, segment = analysis.flight.ekf2, analysis.segment.flight
     if not isinstance(ekf2, Ekf2):
         return
-    # EKF2 starts fusion by a reset to the first position
-    start_s = -np.inf
+    # EKF2 starts fusion by a reset to the first position: resets up to this time (s) are normal
+    fusion_start_s = -np.inf
     if isinstance(ekf2.fusion_flags, pd.DataFrame):
         is_fused = ekf2.fusion_flags["horizontal"] > 0.0
-        start_s = is_fused.index[is_fused].min() + MAX_START_S
+        fusion_start_s = is_fused.index[is_fused].min() + MAX_START_RESET_DELAY_S
     position_resets = [
         reset
         for reset in ekf2.resets
@@ -36,7 +36,7 @@ def detect(analysis: Analysis) -> Findings:
         and reset.quantity == "position"
         and any(reset.delta)
         and not _is_take_off_height_reset(analysis, reset)
-        and not reset.time_s <= start_s  # NaN without fusion
+        and not reset.time_s <= fusion_start_s  # False for NaN, if EKF2 fuses no position
     ]
     if position_resets:
         horizontal_resets = [reset for reset in position_resets if any(reset.delta[:2])]
@@ -49,23 +49,23 @@ def detect(analysis: Analysis) -> Findings:
             )
             for reset in reported_resets
         )
-        largest_reset_s = reported_resets[int(np.argmax(sizes_m))].time_s
-        _, reset_treatment = remove_origin_resets(ekf2, analysis.source, analysis.segment)
-        if reset_treatment:
-            reset_treatment = f" In the comparison: {reset_treatment}."
+        largest_reset_time_s = reported_resets[int(np.argmax(sizes_m))].time_s
+        _, reset_statement = remove_origin_resets(ekf2, analysis.source, analysis.segment)
+        if reset_statement:
+            reset_statement = f" In the comparison of KF with EKF2: {reset_statement}."
         yield finding(
             "warning" if horizontal_resets else "note",
             "ekf2_resets",
             f"EKF2 reset its {'horizontal position' if horizontal_resets else 'height'} "
             f"{format_count(len(sizes_m))} (largest reset: {max(sizes_m):.2f} m at "
-            f"{largest_reset_s:.1f} s).{reset_treatment}",
-            f"Run px4fuse explore LOG and compare position and innovation at {largest_reset_s:.1f} "
-            "s.",
+            f"{largest_reset_time_s:.1f} s).{reset_statement}",
+            "Run px4fuse explore LOG and compare position and innovation at "
+            f"{largest_reset_time_s:.1f} s.",
             {
                 "count": len(sizes_m),
                 "largest_m": max(sizes_m),
-                "at_s": largest_reset_s,
-                CAUSE: GAP if follows_gap else ELSEWHERE,
+                "at_s": largest_reset_time_s,
+                CAUSE_KEY: GAP_CAUSE if follows_gap else OTHER_CAUSE,
             },
             zero_length_spans(reset.time_s for reset in reported_resets),
         )
@@ -80,7 +80,8 @@ def detect_instance_switches(ekf2: Ekf2, span_s: Span) -> Findings:
             "ekf2_instance_switch",
             f"The primary EKF2 instance changed {format_count(len(switch_times_s))}, first at "
             f"{switch_times_s[0]:.1f} s. The comparison uses the primary instance at each time.",
-            "Compare the IMUs (vehicle_imu_status). Set EKF2_MULTI_IMU to 1 for a lab flight.",
+            "Compare vibration and clipping of the IMUs (vehicle_imu_status). For a lab flight set "
+            "EKF2_MULTI_IMU to 1, so that EKF2 uses only one IMU.",
             {"count": len(switch_times_s), "at_s": switch_times_s[0]},
             zero_length_spans(switch_times_s),
         )
@@ -88,6 +89,6 @@ def detect_instance_switches(ekf2: Ekf2, span_s: Span) -> Findings:
 
 def _is_take_off_height_reset(analysis: Analysis, reset: Reset) -> bool:
     return not any(reset.delta[:2]) and any(
-        start_s <= reset.time_s <= start_s + TAKE_OFF_S
+        start_s <= reset.time_s <= start_s + TAKE_OFF_DURATION_S
         for start_s, _ in find_airborne_spans(analysis.flight)
     )

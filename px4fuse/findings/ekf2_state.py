@@ -28,31 +28,31 @@ from px4fuse.flight.model import (
     rows_between,
 )
 
-# Bias states of EKF2: limit parameter, unit, sensor, and columns of the bias
-BIAS_STATES = (
+# Limits of EKF2's bias estimates: parameter, its unit, sensor, and columns of the bias
+BIAS_LIMITS = (
     ("EKF2_ABL_LIM", "m/s²", "accelerometer", Columns.ACCELEROMETER_BIAS),
     ("EKF2_GYR_B_LIM", "rad/s", "gyroscope", Columns.GYRO_BIAS),
 )
-# A bias state is at its limit if |bias| / limit parameter is larger
-MIN_LIMIT_FRACTION = 0.98
-# A bias is reported if it is at its limit for at least this fraction of the flight
-MIN_LIMITED_FRACTION = 0.5
+# EKF2's estimate of a bias is at its limit if |bias| / limit parameter is at least this value
+MIN_BIAS_LIMIT_RATIO = 0.98
+# Minimum fraction of the flight with EKF2's estimate of a bias at its limit, for a finding
+MIN_TIME_AT_LIMIT_FRACTION = 0.5
 # Length (s) of the windows in which px4fuse tests if the vehicle is at rest
 REST_WINDOW_S = 1.0
-# During this time (s) before take-off the motors run, so the IMU is not regarded as at rest
-RUN_UP_S = 0.5
+# Time (s) before take-off in which the motors run, so that the IMU is not at rest
+MOTORS_ON_S = 0.5
 # Maximum standard deviation of angular rate (rad/s) and specific force (m/s²) at rest
-MAX_REST_STDS = (0.04, 1.5)
+MAX_STDS_AT_REST = (0.04, 1.5)
 # Maximum change (rad/s) of the mean angular rate between windows at rest
-MAX_REST_CHANGE_RAD_S = 0.01
+MAX_RATE_CHANGE_AT_REST_RAD_S = 0.01
 # Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
 MIN_GYRO_BIAS_RAD_S = 0.05
-# Minimum |gravity - specific force at rest| (m/s²) that a message contains
+# Minimum |gravity - specific force at rest| (m/s²) that the message on a limited bias states
 MIN_GRAVITY_ERROR_M_S2 = 0.3
 # Missing tilt or yaw alignment is reported if it lasts for a larger fraction of the flight
 MAX_UNALIGNED_FRACTION = 0.02
 # Maximum time (s) from tilt alignment to heading alignment; a later heading alignment is a finding
-MAX_HEADING_ALIGNMENT_S = 5.0
+MAX_HEADING_ALIGNMENT_DELAY_S = 5.0
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -74,18 +74,18 @@ def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
         return None
     if isinstance(flight.airborne, Unavailable):
         return None
-    imu = rows_between(flight.imu, -np.inf, flight.airborne[0][0] - RUN_UP_S).astype(np.float64)
+    imu = rows_between(flight.imu, -np.inf, flight.airborne[0][0] - MOTORS_ON_S).astype(np.float64)
     windows = imu.groupby(np.floor(imu.index / REST_WINDOW_S))
     window_means, window_stds = windows.mean(), windows.std()
     is_at_rest = np.ones(len(window_means), bool)
     for columns, limit in zip(
-        (Columns.ANGULAR_RATE, Columns.SPECIFIC_FORCE), MAX_REST_STDS, strict=True
+        (Columns.ANGULAR_RATE, Columns.SPECIFIC_FORCE), MAX_STDS_AT_REST, strict=True
     ):
         is_at_rest &= np.linalg.norm(window_stds[columns], axis=1) < limit
     window_means = window_means[is_at_rest]
     if (
         window_means.empty
-        or np.ptp(window_means[Columns.ANGULAR_RATE], axis=0).max() > MAX_REST_CHANGE_RAD_S
+        or np.ptp(window_means[Columns.ANGULAR_RATE], axis=0).max() > MAX_RATE_CHANGE_AT_REST_RAD_S
     ):
         return None
     return window_means.median()
@@ -94,17 +94,17 @@ def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
 def _detect_limited_bias(
     analysis: Analysis, ekf2: Ekf2, bias_states: pd.DataFrame, imu_at_rest: pd.Series | None
 ) -> Findings:
-    for parameter, unit, sensor, columns in BIAS_STATES:
+    for parameter, unit, sensor, columns in BIAS_LIMITS:
         limit = ekf2.parameters.get(parameter, 0.0)
-        fractions = (bias_states[columns].abs() >= MIN_LIMIT_FRACTION * limit).mean().to_numpy()
+        fractions = (bias_states[columns].abs() >= MIN_BIAS_LIMIT_RATIO * limit).mean().to_numpy()
         axis_index = int(np.argmax(fractions))
-        limited_fraction = float(fractions[axis_index])
-        if limit <= 0.0 or limited_fraction < MIN_LIMITED_FRACTION:
+        at_limit_fraction = float(fractions[axis_index])
+        if limit <= 0.0 or at_limit_fraction < MIN_TIME_AT_LIMIT_FRACTION:
             continue
         bias = float(bias_states[columns[axis_index]].median())
         message = (
             f"EKF2's {sensor} bias is at its limit {parameter} {limit:.3g} {unit} for "
-            f"{format_percent(limited_fraction)} of the flight. The estimate is {bias:+.3g} "
+            f"{format_percent(at_limit_fraction)} of the flight. The estimate is {bias:+.3g} "
             f"{unit} {BODY_AXES[axis_index]}; EKF2 cannot estimate a larger bias."
         )
         if sensor == "accelerometer" and imu_at_rest is not None:
@@ -119,7 +119,7 @@ def _detect_limited_bias(
             "ekf2_bias_at_limit",
             message + (_describe_height_error(analysis, ekf2) if axis_index == 2 else ""),
             f"Calibrate the {sensor}s at the temperature of the flight.",
-            {"bias": bias, "limit": limit, "limited_fraction": limited_fraction},
+            {"bias": bias, "limit": limit, "limited_fraction": at_limit_fraction},
         )
 
 
@@ -141,22 +141,23 @@ def _describe_height_error(analysis: Analysis, ekf2: Ekf2) -> str:
 def _detect_gyro_bias(bias_states: pd.DataFrame, imu_at_rest: pd.Series | None) -> Findings:
     if imu_at_rest is None:
         return
-    measured_rad_s: Array = imu_at_rest[Columns.ANGULAR_RATE].to_numpy()
-    estimated_rad_s: Array = bias_states[Columns.GYRO_BIAS].median().to_numpy()
-    axis_index = int(np.argmax(np.abs(measured_rad_s - estimated_rad_s)))
-    if abs(measured_rad_s[axis_index] - estimated_rad_s[axis_index]) < MIN_GYRO_BIAS_RAD_S:
+    measured_biases_rad_s: Array = imu_at_rest[Columns.ANGULAR_RATE].to_numpy()
+    estimated_biases_rad_s: Array = bias_states[Columns.GYRO_BIAS].median().to_numpy()
+    differences_rad_s = np.abs(measured_biases_rad_s - estimated_biases_rad_s)
+    axis_index = int(np.argmax(differences_rad_s))
+    if differences_rad_s[axis_index] < MIN_GYRO_BIAS_RAD_S:
         return
     direction = ("forward", "right", "down (vertical)")[axis_index]
     yield error(
         "gyroscope_bias",
-        f"The gyroscope measures {measured_rad_s[axis_index]:+.2f} rad/s about {direction} at "
-        f"rest. EKF2 estimates only {estimated_rad_s[axis_index]:+.3f} rad/s of this bias in "
-        "flight (median), so its attitude turns by "
-        f"{np.degrees(abs(measured_rad_s[axis_index] - estimated_rad_s[axis_index])):.0f}°/s.",
+        f"The gyroscope measures {measured_biases_rad_s[axis_index]:+.2f} rad/s about {direction} "
+        f"at rest. EKF2 estimates only {estimated_biases_rad_s[axis_index]:+.3f} rad/s of this "
+        "bias in flight (median), so its attitude turns by "
+        f"{np.degrees(differences_rad_s[axis_index]):.0f}°/s.",
         "Calibrate the gyroscopes, and keep the vehicle at rest during the calibration.",
         {
-            "measured_rad_s": float(measured_rad_s[axis_index]),
-            "estimated_rad_s": float(estimated_rad_s[axis_index]),
+            "measured_rad_s": float(measured_biases_rad_s[axis_index]),
+            "estimated_rad_s": float(estimated_biases_rad_s[axis_index]),
         },
     )
 
@@ -179,7 +180,7 @@ def detect_missing_alignment(
     alignment_end_s = segment.start_s
     for flag, quantity, action in (
         ("tilt_align", "tilt", "Keep the vehicle at rest after boot until EKF2 is ready."),
-        ("yaw_align", "heading", _align_heading_action(flight, source)),
+        ("yaw_align", "heading", _find_heading_action(flight, source)),
     ):
         alignment_flag = ekf2.states.get(flag)
         if alignment_flag is None or (flag == "yaw_align" and fuses_source_yaw):
@@ -188,7 +189,7 @@ def detect_missing_alignment(
         unaligned_fraction = 1.0 - fraction_of_ones(alignment_flag, segment)
         if (
             unaligned_fraction > MAX_UNALIGNED_FRACTION
-            and spans[-1][1] > alignment_end_s + MAX_HEADING_ALIGNMENT_S
+            and spans[-1][1] > alignment_end_s + MAX_HEADING_ALIGNMENT_DELAY_S
         ):
             alignment_end_s = spans[-1][1]
             until_text = (
@@ -205,17 +206,17 @@ def detect_missing_alignment(
             )
 
 
-def _align_heading_action(flight: Flight, source: PositionTrack | None) -> str:
-    """Return the action for a heading that EKF2 did not align, by the sensors of the vehicle."""
+def _find_heading_action(flight: Flight, source: PositionTrack | None) -> str:
+    """Return the action for a missing heading alignment; it depends on the heading sensors."""
     action = magnetometer_advice(flight) or f"Enable the magnetometer ({MAG.switch} 0)."
     if source is not None and source.origin.is_vision:
-        alternative = "let EKF2 fuse the yaw of the source"
+        alternative_action = "let EKF2 fuse the yaw of the source"
         if source.orientation is None:
-            alternative = f"send the orientation of the source, and {alternative}"
+            alternative_action = f"send the orientation of the source, and {alternative_action}"
             if int(flight.log.parameters.get(EV_POS.switch, 0)) & YAW_CONTROL_BIT:
-                alternative = (
+                alternative_action = (
                     f"send the orientation of the source: {EV_POS.switch} bit 3 is set, but the "
                     "orientation is missing or constant"
                 )
-        action += f" Alternatively, {alternative}."
+        action += f" Alternatively, {alternative_action}."
     return action

@@ -24,18 +24,18 @@ from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import CAUSE
-from px4fuse.findings.cause_text import format_action, is_refuted, kind_of_cause
-from px4fuse.findings.model import Findings, error, finding, format_percent, note, source_words
+from px4fuse.findings.cause_grouping import CAUSE_KEY
+from px4fuse.findings.cause_text import classify_cause, format_action, is_refuted
+from px4fuse.findings.model import Findings, error, find_source_texts, finding, format_percent, note
 from px4fuse.flight.model import Unavailable, source_name
 from px4fuse.loop.model import Loop
 from px4fuse.trajectory.alignment import fit_alignment
 
 # Minimum mean NEES for severity error: the RMS position error is 4 reported σ
-MIN_NEES_ERROR = 16.0
-# Only EKF2 has a fault if position RMSE of KF / position RMSE of EKF2 is smaller
-MAX_KF_ERROR_RATIO = 0.7
-# The position frame is misaligned if position RMSE after an alignment / RMSE before it is smaller
+MIN_NEES_FOR_ERROR = 16.0
+# Maximum ratio of KF's position RMSE to EKF2's, at which the fault is in EKF2 alone
+MAX_KF_TO_EKF2_RMSE_RATIO = 0.7
+# Maximum ratio of position RMSE after alignment to RMSE before it, for a misaligned position frame
 MAX_ALIGNED_RMSE_RATIO = 0.5
 DRIFT_REMEDY = (
     "Send an absolute position (GNSS, UWB) as well in the next flight. A loop closure (px4fuse "
@@ -55,18 +55,18 @@ HEIGHT_REMEDY = (
 class AlignedError(NamedTuple):
     """Horizontal position RMSE (m) against ground truth, before and after the best alignment."""
 
-    before_m: float
-    after_m: float
+    rmse_before_m: float
+    rmse_after_m: float
 
     def __str__(self) -> str:
         return (
-            f"{format_metres(self.before_m)} m before and {format_metres(self.after_m)} m after "
-            "the best shift and rotation"
+            f"{format_metres(self.rmse_before_m)} m before and "
+            f"{format_metres(self.rmse_after_m)} m after the best shift and rotation"
         )
 
     @property
     def is_misaligned(self) -> bool:
-        return self.after_m < MAX_ALIGNED_RMSE_RATIO * self.before_m
+        return self.rmse_after_m < MAX_ALIGNED_RMSE_RATIO * self.rmse_before_m
 
 
 def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, ErrorAboveSigma]]:
@@ -74,21 +74,22 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
 
     Return (filter, axis, error) for each error, largest mean NEES first.
     """
-    alignment, frame_error_m = comparison.source.alignment, 0.0
-    # A position frame aligned with EKF2's track may contain EKF2's error, also in height
+    alignment, frame_residual_rms_m = comparison.source.alignment, 0.0
+    # A frame fitted to EKF2's track contains EKF2's errors. KF's errors up to the residual of the
+    # fit, and in height, may thus be errors of the frame
     if is_frame_fitted := alignment is not None and alignment.yaw_sigma_deg is not None:
-        frame_error_m = alignment.residual_rms_m or 0.0
-    errors = [
+        frame_residual_rms_m = alignment.residual_rms_m or 0.0
+    hidden_errors = [
         (filter_name, name, error)
         for name, result in comparison.axes.items()
         for filter_name, summary in result.filters.items()
         if (error := find_error_above_sigma(summary))
         and (
             filter_name == "ekf2"
-            or (error.rmse_m > frame_error_m and not (is_frame_fitted and name == "down"))
+            or (error.rmse_m > frame_residual_rms_m and not (is_frame_fitted and name == "down"))
         )
     ]
-    return sorted(errors, key=lambda entry: -entry[2].nees)
+    return sorted(hidden_errors, key=lambda entry: -entry[2].nees)
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -128,31 +129,31 @@ def make_hidden_error_finding(
                 f"{format_metres(hidden_error.reported_sigma_m)} m."
             )
     cause = cause_by_filter.get(worst_filter) or next(iter(cause_by_filter.values()), None)
-    evidence |= {CAUSE: kind_of_cause(analysis, cause)}
-    aligned_error = None if cause_by_filter else _rmse_after_alignment(analysis, worst_filter)
+    evidence |= {CAUSE_KEY: classify_cause(analysis, cause)}
+    aligned_error = None if cause_by_filter else _compute_aligned_error(analysis, worst_filter)
     if aligned_error is not None:
         evidence |= {
-            "position_rmse_horizontal_m": aligned_error.before_m,
-            "position_rmse_aligned_m": aligned_error.after_m,
+            "position_rmse_horizontal_m": aligned_error.rmse_before_m,
+            "position_rmse_aligned_m": aligned_error.rmse_after_m,
         }
     is_misaligned = aligned_error is not None and aligned_error.is_misaligned
     if analysis.source.origin.may_drift and not cause_by_filter and not is_misaligned:
-        return _drift_finding(
+        return _make_drift_finding(
             analysis, aligned_error, worst_error, evidence, tuple(ratio_by_filter)
         )
     if is_misaligned and aligned_error is not None:
         sentences.append(
             f"The position frame is misaligned: horizontal position RMSE {aligned_error}."
         )
-    kf_truth = analysis.axes[main_axis].filters["kf"].truth
+    kf_errors = analysis.axes[main_axis].filters["kf"].truth
     is_kf_better = (
-        isinstance(kf_truth, ErrorsAgainstTruth)
-        and kf_truth.position_rmse_m < MAX_KF_ERROR_RATIO * worst_error.rmse_m
+        isinstance(kf_errors, ErrorsAgainstTruth)
+        and kf_errors.position_rmse_m < MAX_KF_TO_EKF2_RMSE_RATIO * worst_error.rmse_m
     )
     is_ekf2_alone = is_kf_better and all(filter_name == "ekf2" for filter_name, *_ in hidden_errors)
     remedy = (
         "Check the time offset of the positions (px4fuse sync LOG). "
-        f"Then check {source_words(analysis.source).errors}."
+        f"Then check {find_source_texts(analysis.source).errors}."
     )
     if cause is not None:
         remedy = format_action(analysis, cause.change)
@@ -161,11 +162,12 @@ def make_hidden_error_finding(
     elif is_ekf2_alone:
         remedy = HEIGHT_REMEDY if main_axis == "down" else EKF2_REMEDY
     ratio_texts = (
-        f"{label} {format_ratio(ratio)} times σ" for label, ratio in ratio_by_filter.items()
+        f"{label} {format_ratio(ratio)} times the reported σ"
+        for label, ratio in ratio_by_filter.items()
     )
     title = f"Position errors that innovations do not show: {', '.join(ratio_texts)}"
     return finding(
-        "error" if worst_error.nees >= MIN_NEES_ERROR else "warning",
+        "error" if worst_error.nees >= MIN_NEES_FOR_ERROR else "warning",
         "error_exceeds_reported_sigma",
         f"{title}. {' '.join(sentences)}",
         remedy,
@@ -173,7 +175,7 @@ def make_hidden_error_finding(
     )
 
 
-def _drift_finding(
+def _make_drift_finding(
     analysis: Analysis,
     aligned_error: AlignedError | None,
     worst_error: ErrorAboveSigma,
@@ -189,13 +191,13 @@ def _drift_finding(
     rmse_sentence = ""
     if aligned_error is not None:
         drift_text = (
-            f"horizontal position RMSE {format_metres(aligned_error.after_m)} m after the best "
-            "alignment"
+            f"horizontal position RMSE {format_metres(aligned_error.rmse_after_m)} m after the "
+            "best alignment"
         )
         rmse_sentence = (
-            f"Before the alignment the RMSE is {format_metres(aligned_error.before_m)} m. "
+            f"Before the alignment the RMSE is {format_metres(aligned_error.rmse_before_m)} m. "
         )
-    if isinstance(loop, Loop) and (closure_error_m := _known_closure_error_m(loop)) is not None:
+    if isinstance(loop, Loop) and (closure_error_m := _find_closure_error_m(loop)) is not None:
         length_m = loop.path_length_m
         evidence = {**evidence, "closure_error_m": closure_error_m, "path_length_m": length_m}
         rmse_sentence = (
@@ -217,13 +219,13 @@ def _drift_finding(
     )
 
 
-def _known_closure_error_m(loop: Loop) -> float | None:
+def _find_closure_error_m(loop: Loop) -> float | None:
     if isinstance(loop.true_end, Unavailable) or loop.is_end_assumed or loop.is_absolute_track:
         return None
     return loop.closure_error_m
 
 
-def _rmse_after_alignment(comparison: Comparison, filter_name: FilterName) -> AlignedError | None:
+def _compute_aligned_error(comparison: Comparison, filter_name: FilterName) -> AlignedError | None:
     """Return the horizontal position RMSE before and after alignment with ground truth.
 
     The alignment is a shift and a rotation about the vertical axis.

@@ -10,16 +10,16 @@ from px4fuse.ekf2.inputs import MAX_LOST_FRACTION, compute_lost_imu_fraction
 from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, SystematicErrors
 from px4fuse.filter.signals import Segment, cut_to_segment, find_imu_gaps
 from px4fuse.finding import MIN_SPAN_S
-from px4fuse.findings.missing import DEFAULT_PROFILE, VISION_PROFILE_BIT
+from px4fuse.findings.missing import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_BIT
 from px4fuse.findings.model import Findings, error, finding, format_percent, warning
 from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
 # Maximum specific force (m/s²) of real sensors: 35 g, because the largest range is 32 g
 MAX_SPECIFIC_FORCE_M_S2 = 343.0
-# Minimum number of impossible samples for a finding
-MIN_IMPOSSIBLE_SAMPLES = 3
+# Minimum number of samples above MAX_SPECIFIC_FORCE_M_S2 for a finding
+MIN_OUT_OF_RANGE_SAMPLES = 3
 # Minimum accelerometer bias (m/s²) for severity error: a position error of 0.15 m after 1 s
-MIN_BIAS_ERROR_M_S2 = 0.3
+MIN_BIAS_FOR_ERROR_M_S2 = 0.3
 # Tilt error (°) that has the same effect as an accelerometer bias of 1 m/s²
 TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
 # Minimum time (s) without IMU samples for a finding: two prediction steps of KF
@@ -35,7 +35,7 @@ MIN_CLIPPING_PAUSE_S = 2.0
 # Bit 4 of SDLOG_PROFILE: full IMU rate (logged_topics.cpp)
 HIGH_RATE_BIT = 16
 # Minimum ratio of measured to required sample rate: sensors are up to 2 % slower than nominal
-MIN_RATE_RATIO = 0.98
+MIN_REQUIRED_RATE_FRACTION = 0.98
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -56,14 +56,14 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
     samples = cut_to_segment(imu, analysis.segment)[Columns.SPECIFIC_FORCE]
     force_m_s2 = np.linalg.norm(samples.to_numpy(), axis=1)
     time_s = samples.index[force_m_s2 > MAX_SPECIFIC_FORCE_M_S2].to_numpy()
-    if len(time_s) < MIN_IMPOSSIBLE_SAMPLES:
+    if len(time_s) < MIN_OUT_OF_RANGE_SAMPLES:
         return
     yield error(
         "imu_values_impossible",
         f"The accelerometer values are impossible: up to {np.nanmax(force_m_s2):,.0f} m/s², "
         f"first at {time_s[0]:.1f} s. Sensors of autopilots measure at most 32 g (314 m/s²). The "
         "simulator has diverged, or the log is damaged. px4fuse estimates nothing from this time.",
-        f"Analyse only the time before (--end {max(time_s[0] - 1.0, 0.0):.1f}).",
+        f"Analyse only the time before these values (--end {max(time_s[0] - 1.0, 0.0):.1f}).",
         {"max_m_s2": float(np.nanmax(force_m_s2)), "count": len(time_s), "at_s": float(time_s[0])},
         ((float(time_s[0]), float(time_s[-1])),),
     )
@@ -71,7 +71,7 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
 
 def detect_bias(analysis: Analysis) -> Findings:
     """Detect an accelerometer bias, estimated from the positions or by EKF2."""
-    systematic_errors, ekf2_bias = analysis.systematic_errors, _ekf2_bias(analysis)
+    systematic_errors, ekf2_bias = analysis.systematic_errors, _compute_ekf2_bias(analysis)
     if isinstance(systematic_errors, SystematicErrors) and systematic_errors.has_significant_bias():
         forward_bias, right_bias, bias_m_s2 = (
             systematic_errors.accelerometer_bias_forward,
@@ -91,14 +91,14 @@ def detect_bias(analysis: Analysis) -> Findings:
                 "right."
             )
         yield finding(
-            "error" if bias_m_s2 >= MIN_BIAS_ERROR_M_S2 else "warning",
+            "error" if bias_m_s2 >= MIN_BIAS_FOR_ERROR_M_S2 else "warning",
             "accelerometer_bias",
             message,
             "Calibrate the accelerometers and the level horizon at the temperature of the flight.",
             {"bias_m_s2": bias_m_s2, "sigma_m_s2": systematic_errors.compute_bias().sigma},
         )
     elif ekf2_bias is not None:
-        # If positions show no horizontal bias, only the vertical bias is reported
+        # The positions show no significant horizontal bias, so only EKF2's vertical bias counts
         bias_m_s2 = float(
             np.linalg.norm(
                 ekf2_bias[2:] if isinstance(systematic_errors, SystematicErrors) else ekf2_bias
@@ -115,7 +115,7 @@ def detect_bias(analysis: Analysis) -> Findings:
             )
 
 
-def _ekf2_bias(analysis: Analysis) -> list[float] | None:
+def _compute_ekf2_bias(analysis: Analysis) -> list[float] | None:
     """Return EKF2's median accelerometer bias forward, right and down (m/s²), if logged."""
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2) or not isinstance(ekf2.accelerometer_bias, pd.DataFrame):
@@ -167,7 +167,7 @@ def detect_imu_gaps(analysis: Analysis) -> Findings:
     interval_s = 1.0 / sample_rate(imu) if isinstance(imu, pd.DataFrame) else 0.0
     if gap_s > max(MIN_REPORTED_IMU_GAP_S, 2.0 * interval_s):
         log = analysis.flight.log
-        spans = _gap_spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else ()
+        spans = _find_gap_spans(imu, analysis.segment) if isinstance(imu, pd.DataFrame) else ()
         # KF needs IMU and attitude: if the IMU has no gap, the attitude has one
         missing_data = "IMU" if spans else "Attitude"
         action = ""
@@ -194,9 +194,9 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
     lost_fraction = compute_lost_imu_fraction(samples.index.to_numpy()) if len(samples) > 1 else 0.0
     if lost_fraction <= MAX_LOST_FRACTION:
         return
-    sdlog_profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE))
+    sdlog_profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE))
     action = "Use a faster SD card."
-    if other_topics := sdlog_profile & ~(DEFAULT_PROFILE | VISION_PROFILE_BIT):
+    if other_topics := sdlog_profile & ~(DEFAULT_SDLOG_PROFILE | VISION_PROFILE_BIT):
         action = (
             "Use a faster SD card, or log fewer topics: set SDLOG_PROFILE to "
             f"{sdlog_profile ^ other_topics}."
@@ -211,7 +211,7 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
     )
 
 
-def _gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
+def _find_gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
     """Return start and end (s) of each IMU gap in a segment, also at both ends of the segment."""
     time_s = imu.index.to_numpy()
     gaps = intervals_where(time_s, find_imu_gaps(time_s))
@@ -222,7 +222,7 @@ def _gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
 
 
 def is_rate_too_low(samples: pd.DataFrame, required_hz: float) -> bool:
-    return sample_rate(samples) < MIN_RATE_RATIO * required_hz
+    return sample_rate(samples) < MIN_REQUIRED_RATE_FRACTION * required_hz
 
 
 def detect_low_rates(flight: Flight) -> Findings:
@@ -236,7 +236,7 @@ def detect_low_rates(flight: Flight) -> Findings:
         if isinstance(samples, pd.DataFrame) and is_rate_too_low(samples, required_hz):
             rate_hz, requested_hz = sample_rate(samples), 2.0 * required_hz
             sdlog_profile = (
-                int(log.parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE)) | HIGH_RATE_BIT
+                int(log.parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE)) | HIGH_RATE_BIT
             )
             action = f"Set SDLOG_PROFILE to {sdlog_profile} (bit 4 logs {topic} at full rate)."
             if log.format.startswith("MAVLink"):

@@ -1,4 +1,4 @@
-"""False loop closures, a stated odometry drift that is too small, and wrong assumptions."""
+"""Faults of loop closures: contradictions to odometry, and wrong assumptions about the loop."""
 
 from px4fuse.analysis import Analysis
 from px4fuse.finding import Finding
@@ -43,14 +43,14 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
         )
     for closure, gnc_weight in zip(loop.closures, gnc_weights, strict=True):
         if not closure.accepted:
-            yield _false_closure(closure, loop.is_end_assumed)
+            yield _make_false_closure_finding(closure, loop.is_end_assumed)
         elif gnc_weight < MIN_GNC_WEIGHT and not rejects_most:
             yield warning(
                 "loop_closure_inconsistent",
                 f"{closure!s} contradicts the other loop closures. Robust "
                 "optimisation rejects it, although drift could explain its closure error.",
                 "Remove this loop closure, or use the path of the robust optimisation (GNC).",
-                _closure_evidence(closure) | {"gnc_weight": gnc_weight},
+                _make_closure_evidence(closure) | {"gnc_weight": gnc_weight},
             )
 
 
@@ -62,7 +62,7 @@ def detect_wrong_assumptions(loop: Loop) -> Findings:
             "loop_on_absolute_positions",
             "This track consists of absolute positions, which do not drift. The loop closure error "
             "is only position noise, so a correction makes the path worse.",
-            "Measure the loop on odometry: send visual-inertial odometry to PX4 as ODOMETRY.",
+            "Use odometry for loop closures: send visual-inertial odometry to PX4 as ODOMETRY.",
             evidence,
         )
     if evidence and loop.is_end_assumed:
@@ -76,14 +76,14 @@ def detect_wrong_assumptions(loop: Loop) -> Findings:
         )
 
 
-def _false_closure(closure: Closure, is_end_assumed: bool) -> Finding:
+def _make_false_closure_finding(closure: Closure, is_end_assumed: bool) -> Finding:
     is_landing = closure.source == LANDING_CLOSURE_SOURCE
-    fault = f"False loop closure of {closure.distance_m:.2f} m: {closure}"
-    if is_landing and is_end_assumed:
-        fault = (
-            f"False loop closure of {closure.distance_m:.2f} m: the landing place is not the "
-            "take-off place"
-        )
+    fault = f"False loop closure (closure error {closure.distance_m:.2f} m): "
+    fault += (
+        "the landing place is not the take-off place"
+        if is_landing and is_end_assumed
+        else f"{closure}"
+    )
     action = "Remove this loop closure. In this run, px4fuse already ignores it."
     if is_landing:
         action = (
@@ -97,9 +97,9 @@ def _false_closure(closure: Closure, is_end_assumed: bool) -> Finding:
         f"p {closure.p:.1g}). A path that contains this closure would be deformed.",
         f"{action} If the odometry has more drift than stated, increase --drift and "
         "--heading-drift.",
-        _closure_evidence(closure),
+        _make_closure_evidence(closure),
     )
 
 
-def _closure_evidence(closure: Closure) -> dict[str, float]:
+def _make_closure_evidence(closure: Closure) -> dict[str, float]:
     return {**{name: getattr(closure, name) for name in CLOSURE_FIELDS}, "alpha": GATE_ALPHA}

@@ -1,4 +1,4 @@
-"""Missing data: EKF2 state, acceleration, innovations, or positions that PX4 received."""
+"""Detection of missing data: EKF2 state, acceleration, innovations, positions received by PX4."""
 
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
@@ -6,9 +6,9 @@ from px4fuse.core.text import capitalise_first
 from px4fuse.findings.model import Findings, warning
 from px4fuse.flight.model import RECEIVED, Unavailable, positions_phrase
 
-RECEIVED_TOPIC = "vehicle_visual_odometry"
+VISION_TOPIC = "vehicle_visual_odometry"
 # Bits 0 and 7 of SDLOG_PROFILE: default topics, and external vision (logged_topics.cpp)
-DEFAULT_PROFILE, VISION_PROFILE_BIT = 1, 128
+DEFAULT_SDLOG_PROFILE, VISION_PROFILE_BIT = 1, 128
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -44,25 +44,25 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
 
 def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
     """Detect that the log lacks the positions which PX4 received."""
-    source, received_preference = analysis.source, RECEIVED.find_preference_rank()
+    source, received_rank = analysis.source, RECEIVED.find_preference_rank()
     has_received_positions = any(
-        track.origin.find_preference_rank() == received_preference
-        for track in analysis.flight.positions
+        track.origin.find_preference_rank() == received_rank for track in analysis.flight.positions
     )
     if source.origin.has_all_samples or has_received_positions:
         return
     rate_hz, parameters = source.compute_rate_hz(), analysis.flight.log.parameters
-    sdlog_profile = int(parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE))
+    sdlog_profile = int(parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE))
     reasons = (
         missing_data.reason
         for missing_data in analysis.missing
-        if missing_data.source == RECEIVED_TOPIC
+        if missing_data.source == VISION_TOPIC
     )
     yield warning(
         "source_not_logged",
         f"The log lacks the {positions_phrase(source)} as PX4 received them. Reason: "
-        f"{next(reasons, f'{RECEIVED_TOPIC} is not in this log')}. px4fuse uses {source.name} "
+        f"{next(reasons, f'{VISION_TOPIC} is not in this log')}. px4fuse uses {source.name} "
         f"({source.description}) at {rate_hz:.1f} Hz instead.",
-        f"Set SDLOG_PROFILE to {sdlog_profile | VISION_PROFILE_BIT} (bit 7) and fly again.",
+        f"Set SDLOG_PROFILE to {sdlog_profile | VISION_PROFILE_BIT} (bit 7: vision topics) and fly "
+        "again.",
         {"rate_hz": rate_hz, "sdlog_profile": sdlog_profile},
     )

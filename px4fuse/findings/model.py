@@ -23,18 +23,19 @@ class CatalogueEntry(Record):
     Attributes
     ----------
     group : str
-        One of :data:`GROUPS`.
+        One of :data:`FINDING_GROUPS`.
     role : str
-        Effect on the estimates, and place in the list of findings. "unusable": all positions are
-        wrong. "misleading": some positions are wrong. "unusable", "misleading" and "first" are
-        listed first, "noise" after other errors, "recording" before other warnings.
+        Effect on the estimates, and place in the list of findings. "unusable" (all positions are
+        wrong), "misleading" (some positions are wrong) and "first" are listed first, "noise" after
+        other errors, "recording" before other warnings.
     verdict : str
         Relation to the statements that KF or EKF2 is consistent, over- or underconfident.
         "meaningless": the statements are invalid. "repeated": the finding repeats a statement.
     reruns : frozenset of str
         Kinds of re-runs (``Trial.kinds``) that test the finding.
     after_wrong_convention : str
-        If axes, unit or clock of the positions are wrong: "effect" or "withdrawn".
+        Treatment of the finding if axes, unit or clock of the positions are wrong. "effect": it is
+        listed as an effect of this fault. "withdrawn": it is removed. Empty: it remains.
     """
 
     title: str
@@ -50,7 +51,7 @@ class CatalogueEntry(Record):
 CATALOGUE: Mapping[str, CatalogueEntry] = read_toml(
     __file__, dict[str, CatalogueEntry], "catalogue.toml"
 )
-GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging")
+FINDING_GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging")
 TITLES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.items()}
 
 
@@ -80,8 +81,8 @@ def load_examples() -> Mapping[str, FindingExample]:
     )
 
 
-class SourceWords(Record):
-    """Texts about one kind of position source (such as UWB): causes of faults, and actions."""
+class SourceTexts(Record):
+    """Texts on causes and actions for one kind of source; source_words.toml explains the keys."""
 
     smoothing_action: str
     jump: str
@@ -93,16 +94,16 @@ class SourceWords(Record):
     errors: str
 
 
-_WORDS_BY_KIND = read_toml(__file__, dict[PositionKind, dict[str, str]], "source_words.toml")
-SOURCE_WORDS: Mapping[PositionKind, SourceWords] = {
-    kind: SourceWords(**(_WORDS_BY_KIND["unknown"] | words))
-    for kind, words in _WORDS_BY_KIND.items()
+_TEXTS_BY_KIND = read_toml(__file__, dict[PositionKind, dict[str, str]], "source_words.toml")
+SOURCE_TEXTS: Mapping[PositionKind, SourceTexts] = {
+    kind: SourceTexts(**(_TEXTS_BY_KIND["unknown"] | words))
+    for kind, words in _TEXTS_BY_KIND.items()
 }
 
 
-def source_words(source: PositionTrack) -> SourceWords:
+def find_source_texts(source: PositionTrack) -> SourceTexts:
     """Return the texts about causes and actions for a position source, such as UWB."""
-    return SOURCE_WORDS[source.origin.kind]
+    return SOURCE_TEXTS[source.origin.kind]
 
 
 def magnetometer_advice(flight: Flight) -> str:
@@ -133,7 +134,7 @@ def finding(
 error, warning, note = (partial(finding, severity) for severity in SEVERITIES)
 
 
-def group_by_root(findings: Iterable[Finding]) -> list[list[Finding]]:
+def split_cause_groups(findings: Iterable[Finding]) -> list[list[Finding]]:
     """Group findings: each group is a cause, followed by its effects."""
     groups: list[list[Finding]] = []
     for entry in findings:
@@ -169,8 +170,8 @@ def spans_with_value(value: float, step_function: pd.Series, segment: Segment) -
     is_inside = np.diff(step_times_s) > 0.0
     has_value = np.concatenate([[False], step_function.to_numpy()[is_inside] == value, [False]])
     step_times_s = np.append(step_times_s[:-1][is_inside], segment.end_s)
-    changes_s = step_times_s[np.flatnonzero(np.diff(has_value.astype(np.int8)))].tolist()
-    return tuple(zip(changes_s[::2], changes_s[1::2], strict=True))
+    change_times_s = step_times_s[np.flatnonzero(np.diff(has_value.astype(np.int8)))].tolist()
+    return tuple(zip(change_times_s[::2], change_times_s[1::2], strict=True))
 
 
 def fraction_of_ones(step_function: pd.Series, segment: Segment) -> float:

@@ -29,12 +29,12 @@ from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.finding import SEVERITIES, Finding, Severity
-from px4fuse.findings.cause_grouping import CAUSE, ELSEWHERE, NOISE
+from px4fuse.findings.cause_grouping import CAUSE_KEY, NOISE_CAUSE, OTHER_CAUSE
 from px4fuse.findings.cause_text import (
+    classify_cause,
     format_action,
     format_kf_settings,
     is_refuted,
-    kind_of_cause,
 )
 from px4fuse.findings.hidden_errors import find_hidden_errors
 from px4fuse.findings.model import Findings, error, finding, lower_severity
@@ -44,59 +44,63 @@ from px4fuse.flight.model import Columns, Unavailable, sample_rate
 from px4fuse.readers.px4_innovations import has_fused_aid
 from px4fuse.request import COMPARISON_OPTIONS
 
-# Minimum factor between a noise setting and its estimate, for a warning. A smaller factor hardly
-# changes the track
+# Minimum factor between a noise setting and its estimate, for a warning: smaller factors hardly
+# change the track
 MIN_NOISE_FACTOR = 1.5
 # Minimum factor between a noise setting and its estimate for severity error
-MIN_NOISE_FACTOR_ERROR = 4.0
+MIN_NOISE_FACTOR_FOR_ERROR = 4.0
 # Minimum time constant (s) of a KF that ignores new positions: vehicles turn in less time
 MIN_TIME_CONSTANT_S = 2.5
-# The 95 % interval of ln(noise estimate) is widened by this factor: 0.3 % of correct settings are
-# outside the widened interval
-INTERVAL_WIDENING = 1.5
+# Factor on the 95 % interval of ln(noise estimate): 0.3 % of correct settings are outside the
+# widened interval
+INTERVAL_WIDENING_FACTOR = 1.5
 # KF lags if the lag-1 autocorrelation of its innovations exceeds this value; white innovations
 # reach 0.2
 MIN_LAG1_AUTOCORRELATION = 0.3
 
 # Minimum factor between actual and reported σ for severity error
-MIN_SIGMA_FACTOR_ERROR = 2.0
-# Maximum ratio of two noise σ that are equal: two standard errors of a median of 100 values
+MIN_SIGMA_FACTOR_FOR_ERROR = 2.0
+# Two noise σ count as equal up to this ratio: two standard errors of a median of 100 values
 NOISE_RATIO_TOLERANCE = 1.25
-# EKF2 uses the variance in the position messages if √R / EKF2_EVP_NOISE is larger
+# If EKF2's √R is larger than EKF2_EVP_NOISE times this factor, R is the variance in the messages
 MIN_REPORTED_NOISE_RATIO = 1.25
 # Action if no change in a re-run corrects the wrong σ
-UNEXPLAINED_SIGMA = (
+UNEXPLAINED_SIGMA_ACTION = (
     "No tested change of noise, time offset, frame or outliers explains the wrong σ. Check the "
     "IMU (rate, gaps, vibration)."
 )
-UNKNOWN_NOISE = "The noise could not be estimated; px4fuse tune LOG states the reason."
-NO_IMPROVEMENT = "No change: a re-run with the estimated noise improves neither position nor σ."
+UNKNOWN_NOISE_ACTION = "The noise could not be estimated; px4fuse tune LOG states the reason."
+NO_IMPROVEMENT_ACTION = (
+    "No change: a re-run with the estimated noise improves neither position nor σ."
+)
 
 
 AXIS_GROUPS = {"horizontal": ("north", "east", "aisle"), "vertical": ("down",)}
-KEEP_NOISES_DRIFT = "Do not reduce noise settings: innovations do not show the drift of the source."
-KEEP_NOISES_CORRELATED = (
+KEEP_NOISE_ACTION_DRIFT = (
+    "Do not reduce noise settings: innovations do not show the drift of the source."
+)
+KEEP_NOISE_ACTION_CORRELATED = (
     "Do not reduce noise settings: R has to include the time-correlated error of {sensor}, which "
     "innovations do not show."
 )
-KEEP_NOISES_TRUTH = (
+KEEP_NOISE_ACTION_TRUTH = (
     "Do not reduce noise settings: ground truth shows that a smaller σ would be too small."
 )
 # Effect of a noise setting that is too small or too large on KF, and the reason
 SETTING_EFFECTS = {
-    (SIGMA_Z, "small"): ("KF follows the measurement noise", "The gain is too large."),
-    (SIGMA_Z, "large"): ("KF corrects slowly", "The gain is too small."),
+    (SIGMA_Z, "small"): ("KF follows the measurement noise", "KF's gain is too large."),
+    (SIGMA_Z, "large"): ("KF follows the positions slowly", "KF's gain is too small."),
     (SIGMA_A, "small"): (
         "KF lags behind the motion",
-        "P grows too little between updates, so the gain is too small.",
+        "P grows too little between updates, so KF's gain is too small.",
     ),
     (SIGMA_A, "large"): (
         "KF follows the measurement noise",
-        "P grows too much between updates, so the gain is too large.",
+        "P grows too much between updates, so KF's gain is too large.",
     ),
 }
 
-InconsistentAxis = tuple[AxisComparison, FilterSummary]
+AxisWithSummary = tuple[AxisComparison, FilterSummary]
 
 
 class SettingDeviation(NamedTuple):
@@ -122,13 +126,13 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
     if axis_tuning is None:
         return
     settings = {SIGMA_Z: analysis.settings.sigma_z_m, SIGMA_A: analysis.settings.sigma_a_m_s2}
-    ml_noises = {SIGMA_Z: axis_tuning.sigma_z, SIGMA_A: axis_tuning.sigma_a_two_state}
+    noise_estimates = {SIGMA_Z: axis_tuning.sigma_z, SIGMA_A: axis_tuning.sigma_a_two_state}
     if has_little_motion(analysis):  # without motion SIGMA_A cannot be estimated
-        del ml_noises[SIGMA_A]
-    wrong_settings = {
+        del noise_estimates[SIGMA_A]
+    deviation_by_setting = {
         name: deviation
-        for name, noise in ml_noises.items()
-        if (deviation := setting_deviation(name, settings[name], noise))
+        for name, noise in noise_estimates.items()
+        if (deviation := find_setting_deviation(name, settings[name], noise))
     }
     # Innovations do not contain drift and time-correlated errors. A noise setting that includes
     # these errors is not too large
@@ -138,23 +142,25 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
         or analysis.source.origin.is_gnss
         or any(filter_name == "kf" for filter_name, *_ in find_hidden_errors(analysis))
     ):
-        wrong_settings = {
+        deviation_by_setting = {
             name: deviation
-            for name, deviation in wrong_settings.items()
+            for name, deviation in deviation_by_setting.items()
             if settings[name] < deviation.estimate
             and not (may_drift and deviation.severity == "note")
         }
     cause = None
     findings = [
-        _setting_finding(analysis, axis_tuning, name, deviation)
-        for name, deviation in sorted(wrong_settings.items(), key=lambda item: -item[1].factor)
+        _make_setting_finding(analysis, axis_tuning, name, deviation)
+        for name, deviation in sorted(
+            deviation_by_setting.items(), key=lambda item: -item[1].factor
+        )
     ]
     for setting_finding in sorted(findings, key=lambda item: SEVERITIES.index(item.severity)):
         yield structs.replace(setting_finding, caused_by=cause)
         cause = cause or setting_finding.id
 
 
-def _setting_finding(
+def _make_setting_finding(
     analysis: Analysis, axis_tuning: AxisTuning, name: str, deviation: SettingDeviation
 ) -> Finding:
     estimated_noise, factor, severity = deviation
@@ -165,7 +171,7 @@ def _setting_finding(
     effect, reason = SETTING_EFFECTS[name, direction]
     action = format_setting_action(analysis, name, estimated_noise)
     return finding(
-        "note" if action == NO_IMPROVEMENT else severity,
+        "note" if action == NO_IMPROVEMENT_ACTION else severity,
         f"{name[:7]}_too_{direction}",
         f"{name[:7].upper()} is {'at least ' if is_upper_bound else ''}{format_factor(factor)} "
         f"times too {direction}: {effect}. {format_estimate(name, setting, noise)}. {reason}",
@@ -197,28 +203,28 @@ def format_setting_action(analysis: Analysis, name: str, value: float) -> str:
         trial.filter == "kf" and trial.change.keys() == {name} and can_show_improvement(trial)
         for trial in analysis.select_main_trials()
     ):
-        return NO_IMPROVEMENT
+        return NO_IMPROVEMENT_ACTION
     value = max(value, MIN_RERUN_SIGMA_Z_M) if name == SIGMA_Z else value
-    return f"Compare this run with one that has {COMPARISON_OPTIONS[name]} {value:.3g}."
+    return f"To test the estimate, run again with {COMPARISON_OPTIONS[name]} {value:.3g}."
 
 
-def setting_deviation(
-    name: str, setting: float, ml_noise: NoiseEstimate
+def find_setting_deviation(
+    name: str, setting: float, noise_estimate: NoiseEstimate
 ) -> SettingDeviation | None:
     """Return the deviation of a noise setting from its estimate; None if it is not significant."""
-    if not (estimate := ml_noise.value or ml_noise.high):
+    if not (estimate := noise_estimate.value or noise_estimate.high):
         return None
     low, high = (
         (0.0, estimate)
-        if ml_noise.value is None
-        else (ml_noise.low or 0.0, ml_noise.high or np.inf)
+        if noise_estimate.value is None
+        else (noise_estimate.low or 0.0, noise_estimate.high or np.inf)
     )
-    low, high = (estimate * (end / estimate) ** INTERVAL_WIDENING for end in (low, high))
+    low, high = (estimate * (end / estimate) ** INTERVAL_WIDENING_FACTOR for end in (low, high))
     factor = max(setting / estimate, estimate / setting)
     if low <= setting <= high or factor < MIN_NOISE_FACTOR:
         return None
-    severity: Severity = "error" if factor >= MIN_NOISE_FACTOR_ERROR else "warning"
-    if setting == getattr(Settings(), name):  # the default is px4fuse's, not the user's choice
+    severity: Severity = "error" if factor >= MIN_NOISE_FACTOR_FOR_ERROR else "warning"
+    if setting == getattr(Settings(), name):  # less severe, because the user did not choose it
         severity = lower_severity(severity)
     return SettingDeviation(estimate, factor, severity)
 
@@ -227,31 +233,33 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     """Detect a SIGMA_A so small that KF ignores new positions."""
     for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
         updates, summary = result.replay.updates, result.filters["kf"]
-        # Without motion, a small SIGMA_A is correct, and innovations are small and white
+        # Innovations that are consistent or white show no fault: without motion, a small SIGMA_A
+        # is correct
         if (
             isinstance(summary, Unavailable)
             or summary.verdict != "overconfident"
             or summary.lag1_autocorrelation < MIN_LAG1_AUTOCORRELATION
         ):
             continue
-        final_gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
-        time_constant_s = 1.0 / (sample_rate(updates) * final_gain)
+        steady_position_gain = float(updates["gain_position"].iloc[len(updates) // 2 :].median())
+        time_constant_s = 1.0 / (sample_rate(updates) * steady_position_gain)
         if time_constant_s < MIN_TIME_CONSTANT_S:
             continue
         sigma_a = analysis.settings.sigma_a_m_s2
         axis_tuning = find_axis_tuning(analysis.tuning, result.axis.name)
         title, estimate_text = f"Process noise SIGMA_A is almost zero ({sigma_a:g} m/s²)", ""
         action = "Increase SIGMA_A (--sigma-a)."
-        if axis_tuning is not None and (ml_sigma_a := axis_tuning.sigma_a_two_state.value):
-            title = f"SIGMA_A is {format_factor(ml_sigma_a / sigma_a)} times too small"
+        if axis_tuning is not None and (estimated_sigma_a := axis_tuning.sigma_a_two_state.value):
+            title = f"SIGMA_A is {format_factor(estimated_sigma_a / sigma_a)} times too small"
             estimate_text = f"{format_estimate(SIGMA_A, sigma_a, axis_tuning.sigma_a_two_state)}. "
-            action = format_setting_action(analysis, SIGMA_A, ml_sigma_a)
+            action = format_setting_action(analysis, SIGMA_A, estimated_sigma_a)
         yield error(
             "process_noise_near_zero",
             f"{title}: KF ignores new positions. {estimate_text}KF's position gain decreases to "
-            f"{final_gain:.2g}, so KF needs {time_constant_s:.0f} s to follow a position change.",
+            f"{steady_position_gain:.2g}, so KF needs {time_constant_s:.0f} s to follow a position "
+            "change.",
             action,
-            {"gain": final_gain, "response_s": time_constant_s, "axis": result.axis.name},
+            {"gain": steady_position_gain, "response_s": time_constant_s, "axis": result.axis.name},
         )
         return
 
@@ -259,7 +267,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
 def detect_inconsistent_variances(analysis: Analysis) -> Findings:
     for filter_name in FILTER_NAMES:
         for is_underconfident in (True, False):
-            first_id = None
+            first_finding_id = None
             for axis_group, axes in AXIS_GROUPS.items():
                 results = [analysis.axes[name] for name in axes if name in analysis.axes]
                 inconsistent_axes = [
@@ -269,61 +277,64 @@ def detect_inconsistent_variances(analysis: Analysis) -> Findings:
                     and (summary.sigma_ratio < 1.0) == is_underconfident
                 ]
                 if inconsistent_axes:
-                    variance_finding = _variance_finding(
+                    variance_finding = _make_variance_finding(
                         analysis, filter_name, axis_group, inconsistent_axes
                     )
-                    yield structs.replace(variance_finding, caused_by=first_id)
-                    first_id = variance_finding.id
+                    yield structs.replace(variance_finding, caused_by=first_finding_id)
+                    first_finding_id = variance_finding.id
 
 
-def _variance_finding(
+def _make_variance_finding(
     analysis: Analysis,
     filter_name: FilterName,
     axis_group: str,
-    inconsistent_axes: list[InconsistentAxis],
+    inconsistent_axes: list[AxisWithSummary],
 ) -> Finding:
     result, summary = max(
         inconsistent_axes,
         key=lambda axis: (axis[0] is analysis.main, abs(np.log(axis[1].nis_mean))),
     )
     is_underconfident, sigma_factor = summary.sigma_ratio < 1.0, summary.sigma_error_factor
-    severity: Severity = "error" if sigma_factor >= MIN_SIGMA_FACTOR_ERROR else "warning"
+    severity: Severity = "error" if sigma_factor >= MIN_SIGMA_FACTOR_FOR_ERROR else "warning"
     if _has_default_noises(analysis, filter_name, result):
         severity = lower_severity(severity)
     axis_tuning = find_axis_tuning(analysis.tuning, result.axis.name)
-    confidence = "underconfident" if is_underconfident else "overconfident"
+    verdict = "underconfident" if is_underconfident else "overconfident"
     if is_underconfident and analysis.source.origin.may_drift:
-        severity, remedy_text, cause = "note", KEEP_NOISES_DRIFT, ELSEWHERE
+        severity, remedy_text, cause = "note", KEEP_NOISE_ACTION_DRIFT, OTHER_CAUSE
     elif is_underconfident and analysis.source.origin.is_gnss:
         is_barometer = analysis.source.aid(result.axis.name) == BAROMETER
         remedy_text = (
             _format_excessive_noise(analysis) if filter_name == "ekf2" and not is_barometer else ""
         )
-        cause = NOISE if remedy_text else ELSEWHERE
-        keep_noises_text = KEEP_NOISES_CORRELATED.format(
+        cause = NOISE_CAUSE if remedy_text else OTHER_CAUSE
+        keep_noise_action = KEEP_NOISE_ACTION_CORRELATED.format(
             sensor="a barometer" if is_barometer else "GNSS"
         )
-        severity, remedy_text = severity if remedy_text else "note", remedy_text or keep_noises_text
+        severity, remedy_text = (
+            severity if remedy_text else "note",
+            remedy_text or keep_noise_action,
+        )
     elif (
         is_underconfident
         and filter_name == "ekf2"
         and (minimum_text := _format_noise_minimum(analysis))
     ):
-        severity, remedy_text, cause = "note", minimum_text, ELSEWHERE
+        severity, remedy_text, cause = "note", minimum_text, OTHER_CAUSE
     elif is_underconfident and any(
         filter_with_error == filter_name for filter_with_error, *_ in find_hidden_errors(analysis)
     ):
-        remedy_text, cause = KEEP_NOISES_TRUTH, ELSEWHERE
+        remedy_text, cause = KEEP_NOISE_ACTION_TRUTH, OTHER_CAUSE
     else:
         rerun = find_cause_trial(analysis.trials, filter_name, result.axis.name)
-        cause = kind_of_cause(analysis, rerun)
-        remedy_text = _variance_remedy(analysis, filter_name, result, axis_tuning, rerun)
-        severity = "note" if remedy_text == KEEP_NOISES_TRUTH else severity
+        cause = classify_cause(analysis, rerun)
+        remedy_text = _find_variance_remedy(analysis, filter_name, result, axis_tuning, rerun)
+        severity = "note" if remedy_text == KEEP_NOISE_ACTION_TRUTH else severity
     low, high = summary.nis_band
     return finding(
         severity,
-        f"{filter_name}_{confidence}",
-        f"{FILTER_NAMES[filter_name]} is {confidence} along {result.axis.label}: σ is "
+        f"{filter_name}_{verdict}",
+        f"{FILTER_NAMES[filter_name]} is {verdict} along {result.axis.label}: σ is "
         f"{format_ratio(sigma_factor)} times too {'large' if is_underconfident else 'small'}. The "
         f"mean NIS of this {axis_group} axis is {format_number(summary.nis_mean)}, expected "
         f"{low:.2f} to {high:.2f}.",
@@ -333,40 +344,42 @@ def _variance_finding(
             "sigma_ratio": summary.sigma_ratio,
             "nis_mean": summary.nis_mean,
             "fraction_outside_gate": summary.fraction_outside_gate,
-            CAUSE: cause,
+            CAUSE_KEY: cause,
         },
     )
 
 
 def _format_excessive_noise(analysis: Analysis) -> str:
     name = find_aid(analysis).noise
-    parameter_m = analysis.flight.log.parameters.get(name, float("nan"))
+    parameter_noise_m = analysis.flight.log.parameters.get(name, float("nan"))
     reported_variance = cut_to_segment(analysis.source.samples, analysis.segment)[
         Columns.POSITION_VARIANCE[0]
     ]
-    reported_m = float(np.sqrt(reported_variance.median()))
+    reported_noise_m = float(np.sqrt(reported_variance.median()))
     horizontal_tuning = find_first_tuning(analysis.tuning, HORIZONTAL)
     noise_m = max(
-        reported_m, (horizontal_tuning.sigma_z.value if horizontal_tuning else None) or 0.0
+        reported_noise_m, (horizontal_tuning.sigma_z.value if horizontal_tuning else None) or 0.0
     )
-    if not parameter_m > NOISE_RATIO_TOLERANCE * noise_m:  # the comparison is False for NaN
+    if not parameter_noise_m > NOISE_RATIO_TOLERANCE * noise_m:  # the comparison is False for NaN
         return ""
-    noise_origin = "the receiver reports" if noise_m == reported_m else "the estimated noise is"
+    noise_label = (
+        "noise that the receiver reports" if noise_m == reported_noise_m else "estimated noise"
+    )
     return (
-        f"{name} is {parameter_m:g} m, but {noise_origin} {noise_m:.2g} m. Test this noise by a "
-        "replay: px4fuse whatif LOG."
+        f"{name} is {parameter_noise_m:g} m, but the {noise_label} is {noise_m:.2g} m. Test this "
+        "smaller noise by a replay: px4fuse whatif LOG."
     )
 
 
 def _format_noise_minimum(analysis: Analysis) -> str:
     parameters = analysis.flight.log.parameters
-    gnss_m = parameters.get(GNSS_POS.noise, PARAMETERS[GNSS_POS.noise].default)
+    gnss_noise_m = parameters.get(GNSS_POS.noise, PARAMETERS[GNSS_POS.noise].default)
     is_fused_with_gnss = analysis.source.origin.is_vision and has_fused_aid(analysis.flight.ekf2)
-    if not is_fused_with_gnss or parameters.get(EV_POS.noise, 0.0) > gnss_m:
+    if not is_fused_with_gnss or parameters.get(EV_POS.noise, 0.0) > gnss_noise_m:
         return ""
     return (
         "No change: while EKF2 fuses GNSS as well, PX4 limits the noise of vision positions to at "
-        f"least {GNSS_POS.noise} ({gnss_m:g} m)."
+        f"least {GNSS_POS.noise} ({gnss_noise_m:g} m)."
     )
 
 
@@ -383,13 +396,13 @@ def _has_default_noises(
     log = analysis.flight.log
     default = log.default_of(noise_parameter)
     is_parameter_default = log.parameters.get(noise_parameter, default) == default
-    # If EKF2 uses a variance that the sender reports, the user has chosen it
-    return is_parameter_default and not abs(np.log(ekf2_noise_m(result) / default)) > np.log(
+    # An R far from the parameter is a variance that the sender reports: not PX4's default
+    return is_parameter_default and not abs(np.log(find_ekf2_noise_m(result) / default)) > np.log(
         NOISE_RATIO_TOLERANCE
     )
 
 
-def _variance_remedy(
+def _find_variance_remedy(
     analysis: Analysis,
     filter_name: FilterName,
     result: AxisComparison,
@@ -400,50 +413,50 @@ def _variance_remedy(
         return format_action(analysis, cause.change)
     reruns = find_trials(analysis.trials, filter_name, result.axis.name)
     if any(makes_overconfident(rerun, "nis") for rerun in reruns):
-        return KEEP_NOISES_TRUTH
+        return KEEP_NOISE_ACTION_TRUTH
     if axis_tuning is None:
-        return UNKNOWN_NOISE
+        return UNKNOWN_NOISE_ACTION
     if filter_name == "ekf2" and not reruns:
-        return _variance_remedy_without_replay(analysis, result, axis_tuning)
-    return UNEXPLAINED_SIGMA
+        return _find_remedy_without_replay(analysis, result, axis_tuning)
+    return UNEXPLAINED_SIGMA_ACTION
 
 
-def _variance_remedy_without_replay(
+def _find_remedy_without_replay(
     analysis: Analysis, result: AxisComparison, axis_tuning: AxisTuning
 ) -> str:
     aid, noise = find_aid(analysis, result.axis.name), axis_tuning.sigma_z
     summary = result.filters["ekf2"]
     assert not isinstance(summary, Unavailable)
-    if not (ml_noise_m := noise.value or noise.high):
-        return UNEXPLAINED_SIGMA
-    noise_m, ekf2_sigma_m = max(ml_noise_m, EKF2_MIN_NOISE_M), ekf2_noise_m(result)
-    ratio = ekf2_sigma_m / noise_m if summary.sigma_ratio < 1.0 else noise_m / ekf2_sigma_m
+    if not (estimated_noise_m := noise.value or noise.high):
+        return UNEXPLAINED_SIGMA_ACTION
+    noise_m, used_noise_m = max(estimated_noise_m, EKF2_MIN_NOISE_M), find_ekf2_noise_m(result)
+    ratio = used_noise_m / noise_m if summary.sigma_ratio < 1.0 else noise_m / used_noise_m
     if ratio > NOISE_RATIO_TOLERANCE:
         parameters = analysis.flight.log.parameters
-        uses_reported_noise = ekf2_sigma_m > MIN_REPORTED_NOISE_RATIO * parameters.get(
+        uses_reported_noise = used_noise_m > MIN_REPORTED_NOISE_RATIO * parameters.get(
             aid.noise, np.inf
         )
         changes = {
             name: value
             for name, value in make_noise_change(
-                aid, parameters, ekf2_sigma_m * uses_reported_noise, noise_m
+                aid, parameters, used_noise_m * uses_reported_noise, noise_m
             ).items()
             if value != parameters.get(name)
         }
         if not changes:
-            return UNEXPLAINED_SIGMA
+            return UNEXPLAINED_SIGMA_ACTION
         return (
-            f"Set {format_settings(changes)} (EKF2 uses {ekf2_sigma_m:.2g} m). No replay confirms "
+            f"Set {format_settings(changes)} (EKF2 uses {used_noise_m:.2g} m). No replay confirms "
             "this change: fly again and compare."
         )
     return (
-        f"EKF2's measurement noise ({ekf2_sigma_m:.2g} m) equals the estimated position noise, so "
-        "another fault makes σ wrong. Check the time offset (px4fuse sync LOG) and the IMU (gaps, "
-        "vibration)."
+        f"EKF2's measurement noise ({used_noise_m:.2g} m) equals the estimated position noise, so "
+        "EKF2's wrong σ has another cause. Check the time offset (px4fuse sync LOG) and the IMU "
+        "(gaps, vibration)."
     )
 
 
-def ekf2_noise_m(result: AxisComparison) -> float:
+def find_ekf2_noise_m(result: AxisComparison) -> float:
     """Return EKF2's median measurement noise √R (m) along an axis; NaN if unknown."""
     innovations = result.ekf2_innovations
     if isinstance(innovations, Unavailable):

@@ -15,11 +15,11 @@ from px4fuse.flight.ekf2_parameters import AID_MASK, PARAMETERS
 from px4fuse.flight.model import Ekf2, Unavailable
 
 # A parameter change has an effect if σ ratio or position RMSE change by at least this factor
-MIN_CHANGE_RATIO = 1.5
+MIN_EFFECT_FACTOR = 1.5
 
 
-class PartConsistency(NamedTuple):
-    """Consistency and position RMSE of EKF2 in one part of the flight.
+class SpanConsistency(NamedTuple):
+    """Consistency and position RMSE of EKF2 between two parameter changes.
 
     Unknown values are NaN or "".
     """
@@ -39,27 +39,28 @@ def detect(analysis: Analysis) -> Findings:
         if change.name in (*PARAMETERS, *fusion_parameters)
         and segment.start_s < change.time_s < segment.end_s
     ]
-    part_edges_s = [segment.start_s, *(change.time_s for change in changes), segment.end_s]
+    span_edges_s = [segment.start_s, *(change.time_s for change in changes), segment.end_s]
     for change_index, (time_s, name, before, after) in enumerate(changes):
-        part_before, part_after = (
-            _assess_part(analysis, *part_edges_s[part_index : part_index + 2])
-            for part_index in (change_index, change_index + 1)
+        span_before, span_after = (
+            _assess_span(analysis, *span_edges_s[span_index : span_index + 2])
+            for span_index in (change_index, change_index + 1)
         )
         unit = "" if name in fusion_parameters else f" {PARAMETERS[name].printed_unit}".rstrip()
         effect_sentences, has_effect = "", name in fusion_parameters
-        if part_before.verdict and part_after.verdict:
-            verdicts = {part.verdict.partition(" ")[0] for part in (part_before, part_after)}
+        if span_before.verdict and span_after.verdict:
+            verdicts = {span.verdict.partition(" ")[0] for span in (span_before, span_after)}
             has_effect |= len(verdicts) > 1
-            has_effect |= _differ_significantly(part_before.sigma_ratio, part_after.sigma_ratio)
+            has_effect |= _differ_significantly(span_before.sigma_ratio, span_after.sigma_ratio)
             effect_sentences = (
-                f" EKF2 is {part_before.verdict} before the change and {part_after.verdict} after "
-                "it (innovations along the main axis)."
+                f" EKF2 is {span_before.verdict} before the change and "
+                f"{span_after.verdict} after it (innovations along the main axis)."
             )
-        if _differ_significantly(part_before.rmse_m, part_after.rmse_m):
+        if _differ_significantly(span_before.rmse_m, span_after.rmse_m):
             has_effect = True
             effect_sentences += (
-                f" EKF2's position RMSE along the main axis is {format_metres(part_before.rmse_m)} "
-                f"m before the change and {format_metres(part_after.rmse_m)} m after it."
+                " EKF2's position RMSE along the main axis is "
+                f"{format_metres(span_before.rmse_m)} m before the change and "
+                f"{format_metres(span_after.rmse_m)} m after it."
             )
         action = (
             "Analyse the flight before and after the change separately "
@@ -78,29 +79,29 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _differ_significantly(before: float, after: float) -> bool:
-    """Return True if both values are known and differ by more than the factor MIN_CHANGE_RATIO."""
+    """Return True if both values are known and differ by more than the factor MIN_EFFECT_FACTOR."""
     return (
-        before > 0.0 and after > 0.0 and abs(math.log(after / before)) > math.log(MIN_CHANGE_RATIO)
+        before > 0.0 and after > 0.0 and abs(math.log(after / before)) > math.log(MIN_EFFECT_FACTOR)
     )
 
 
-def _assess_part(analysis: Analysis, start_s: float, end_s: float) -> PartConsistency:
+def _assess_span(analysis: Analysis, start_s: float, end_s: float) -> SpanConsistency:
     unknown, rmse_m = float("nan"), float("nan")
     errors = compute_position_errors(analysis.main, "ekf2")
     if not isinstance(errors, Unavailable):
         rmse_m = float(np.sqrt((errors["error_m"].loc[start_s:end_s] ** 2).mean()))
     innovations = analysis.main.ekf2_innovations
     if isinstance(innovations, Unavailable):
-        return PartConsistency("", unknown, rmse_m)
+        return SpanConsistency("", unknown, rmse_m)
     samples = innovations[(innovations.index >= start_s) & (innovations.index < end_s)]
     consistency = assess_innovations(
         samples["innovation_m"].to_numpy(), samples["innovation_variance_m2"].to_numpy(), math.inf
     )
     if isinstance(consistency, Unavailable):
-        return PartConsistency("", unknown, rmse_m)
+        return SpanConsistency("", unknown, rmse_m)
     direction = "small" if consistency.sigma_ratio > 1.0 else "large"
     factor = format_ratio(consistency.sigma_error_factor)
     verdict = f"{consistency.verdict} (σ {factor} times too {direction})"
     if consistency.verdict == "consistent":
         verdict = consistency.verdict
-    return PartConsistency(verdict, consistency.sigma_ratio, rmse_m)
+    return SpanConsistency(verdict, consistency.sigma_ratio, rmse_m)

@@ -13,7 +13,7 @@ from px4fuse.flight.model import Ekf2, Flight
 def detect(analysis: Analysis) -> Findings:
     yield from detect_dropouts(analysis)
     yield from detect_lost_data(analysis.flight)
-    yield from detect_clocks_set_back(analysis.flight)
+    yield from detect_decreasing_clocks(analysis.flight)
     yield from detect_other_estimators(analysis)
 
 
@@ -48,8 +48,10 @@ def detect_lost_data(flight: Flight) -> Findings:
             lost_fraction = 1.0 - log.bytes_read / log.bytes if log.bytes else 0.0
             damage_text = "the log is damaged"
             if lost_fraction:
-                lost_percent = format_number(100.0 * lost_fraction, 2)
-                damage_text = f"the log is damaged: {lost_percent} % of its bytes cannot be read"
+                lost_percent_text = format_number(100.0 * lost_fraction, 2)
+                damage_text = (
+                    f"the log is damaged: {lost_percent_text} % of its bytes cannot be read"
+                )
             fault = " ".join(f"{_capitalise_note(note)}." for note in (damage_text, *log.damage))
         action = "Copy the log again. If this does not help, replace the SD card."
         if not log.damage:
@@ -68,21 +70,21 @@ def detect_lost_data(flight: Flight) -> Findings:
     for topic, count in list(log.dropped.items())[:1]:
         other_count = len(log.dropped) - 1
         topics = "topic" if other_count == 1 else "topics"
-        other_topics = (
-            f" {other_count} other {topics} also have such errors." if other_count else ""
+        other_topics_sentence = (
+            f" {other_count} other {topics} also contain wrong timestamps." if other_count else ""
         )
         yield note(
             "samples_out_of_order",
             f"{count} samples of {topic} have wrong timestamps: zero, or earlier than the sample "
-            f"before. px4fuse ignores these samples.{other_topics} Possible cause: a clock was set "
-            "back, or messages arrived in another order.",
+            f"before. px4fuse ignores these samples.{other_topics_sentence} Possible cause: a "
+            "clock was set back, or messages arrived in another order.",
             "Synchronise the clock of the sending computer before take-off (TIMESYNC).",
             {"notes": other_count + 1},
         )
 
 
-def detect_clocks_set_back(flight: Flight) -> Findings:
-    """Detect restarts of the autopilot, and decreasing receive times."""
+def detect_decreasing_clocks(flight: Flight) -> Findings:
+    """Detect a decreasing boot clock (restart of the autopilot) and decreasing receive times."""
     log = flight.log
     if log.restarts:
         yield warning(

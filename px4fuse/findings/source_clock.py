@@ -15,10 +15,10 @@ from px4fuse.flight.ekf2_parameters import GNSS_POS, RECEIVER_DELAY_PARAMETERS
 from px4fuse.flight.model import Unavailable
 
 # Minimum time offset (s) for severity error: a position error of 0.1 m at 1 m/s
-MIN_OFFSET_ERROR_S = 0.10
+MIN_OFFSET_FOR_ERROR_S = 0.10
 # Maximum position RMSE of KF with a corrected time offset / RMSE without correction, for a finding
 MAX_RMSE_RATIO = 1.005
-CORRECT_AT_SENDER = "Correct the position timestamps before sending."
+CORRECT_AT_SENDER_ACTION = "Correct the position timestamps before sending."
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -51,32 +51,32 @@ def detect_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings:
             "single --clock-offset corrects both. Possible cause: PX4 uses arrival times until 500 "
             "TIMESYNC answers have synchronised the clocks.",
             "Let the clocks synchronise for one minute before take-off. Analyse only the time "
-            "before or after the change (--start, --end).",
+            "before or after the change of the offset (--start, --end).",
             {**evidence, "change_p_value": time_offset.change_p_value},
         )
         return
-    offset_size_s = abs(time_offset.remaining_s)
+    abs_offset_s = abs(time_offset.remaining_s)
     # If timestamps are arrival times in a part of the flight, one offset cannot correct them
     if (
         not time_offset.is_significant(time_offset.remaining_s)
         or find_synchronisation(analysis) is not None
-        or _rmse_ratio(_find_trial(analysis, "kf", "time offset")) > MAX_RMSE_RATIO
+        or _compute_rmse_ratio(_find_trial(analysis, "kf", "time offset")) > MAX_RMSE_RATIO
     ):
         return
-    interval_s, is_late = (
+    interval_s, has_late_timestamps = (
         (interval_low_s - time_offset.applied_s, interval_high_s - time_offset.applied_s),
         time_offset.remaining_s < 0,
     )
-    lower_s, upper_s = (-interval_s[1], -interval_s[0]) if is_late else interval_s
+    lower_s, upper_s = (-interval_s[1], -interval_s[0]) if has_late_timestamps else interval_s
     yield finding(
-        "error" if offset_size_s > MIN_OFFSET_ERROR_S else "warning",
+        "error" if abs_offset_s > MIN_OFFSET_FOR_ERROR_S else "warning",
         "source_time_offset",
-        f"Position timestamps are {offset_size_s:.2f} s {'late' if is_late else 'early'}. The "
-        f"estimate from IMU and positions is {offset_size_s:.3f} s (95 % {lower_s:.3f} to "
-        f"{upper_s:.3f} s). At 1 m/s this is a position error of {offset_size_s:.2f} m in KF and "
+        f"Position timestamps are {abs_offset_s:.2f} s {'late' if has_late_timestamps else 'early'}"
+        f". The estimate from IMU and positions is {abs_offset_s:.3f} s (95 % {lower_s:.3f} to "
+        f"{upper_s:.3f} s). At 1 m/s this is a position error of {abs_offset_s:.2f} m in KF and "
         "EKF2. Innovations hardly show this "
-        f"error.{_assumed_delay_sentence(analysis, time_offset)}",
-        _offset_remedy(analysis, time_offset),
+        f"error.{_format_assumed_delay(analysis, time_offset)}",
+        _find_offset_remedy(analysis, time_offset),
         evidence,
     )
 
@@ -92,34 +92,37 @@ def _find_trial(analysis: Analysis, filter_name: FilterName, kind: str) -> Trial
     )
 
 
-def _rmse_ratio(trial: Trial | None) -> float:
+def _compute_rmse_ratio(trial: Trial | None) -> float:
     """Return position RMSE with a change / position RMSE without it; NaN if unknown."""
     if trial is None or not trial.before.position_rmse_m or trial.after.position_rmse_m is None:
         return math.nan
     return trial.after.position_rmse_m / trial.before.position_rmse_m
 
 
-def _receiver_delay_parameter(analysis: Analysis) -> str | None:
+def _find_receiver_delay_parameter(analysis: Analysis) -> str | None:
     parameters = analysis.flight.log.parameters
     names = (name for name in (*RECEIVER_DELAY_PARAMETERS, GNSS_POS.delay) if name in parameters)
     return next(names, None) if analysis.source.origin.fused_as_gnss else None
 
 
-def _assumed_delay_sentence(analysis: Analysis, time_offset: ClockOffset) -> str:
-    delay_parameter = _receiver_delay_parameter(analysis)
+def _format_assumed_delay(analysis: Analysis, time_offset: ClockOffset) -> str:
+    delay_parameter = _find_receiver_delay_parameter(analysis)
     if delay_parameter is None:
         return ""
-    assumed_ms = analysis.flight.log.parameters[delay_parameter]
-    estimate_ms = max(assumed_ms - 1e3 * time_offset.remaining_s, 0.0)
-    return f" {delay_parameter} is {assumed_ms:g} ms; the estimate is {estimate_ms:.0f} ms."
+    assumed_delay_ms = analysis.flight.log.parameters[delay_parameter]
+    estimated_delay_ms = max(assumed_delay_ms - 1e3 * time_offset.remaining_s, 0.0)
+    return (
+        f" {delay_parameter} is {assumed_delay_ms:g} ms; the estimate is "
+        f"{estimated_delay_ms:.0f} ms."
+    )
 
 
-def _offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
-    if delay_parameter := _receiver_delay_parameter(analysis):
+def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
+    if delay_parameter := _find_receiver_delay_parameter(analysis):
         return f"Check the delay of the GNSS receiver ({delay_parameter})."
     if analysis.source.alignment is not None:
-        option_s = clock_offset_option_s(analysis, time_offset)
-        return f"Run again with --clock-offset {option_s:.3f}."
+        total_offset_s = clock_offset_option_s(analysis, time_offset)
+        return f"Run again with --clock-offset {total_offset_s:.3f}."
     age_ms = (remedy.find_logged_delay_ms(analysis) or 0.0) - 1e3 * time_offset.remaining_s
     horizon_parameters = remedy.make_delay_max_change(analysis.flight.log.parameters, age_ms)
     delay_action = (
@@ -131,7 +134,8 @@ def _offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
 
 def clock_offset_option_s(comparison: PreparedComparison, time_offset: ClockOffset) -> float:
     """Return the value (s) of ``--clock-offset`` that corrects a time offset."""
-    # --clock-offset replaces the time offset that the alignment of a position file applied
+    # --clock-offset is the total offset of a position file, including that which its alignment
+    # already applied
     alignment = comparison.source.alignment
     return time_offset.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
 
@@ -139,37 +143,37 @@ def clock_offset_option_s(comparison: PreparedComparison, time_offset: ClockOffs
 def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings:
     # For GNSS, the time offset already includes an error of EKF2_GPS_DELAY
     delay_ms = remedy.find_logged_delay_ms(analysis) if analysis.source.origin.is_vision else None
-    ml_delay_ms = -1e3 * time_offset.offset_s
+    estimated_delay_ms = -1e3 * time_offset.offset_s
     if (
         delay_ms is None
         or remedy.estimate_delay_if_wrong_ms(analysis, time_offset, delay_ms) is None
     ):
         return
     low_ms, high_ms = (-1e3 * end_s for end_s in reversed(time_offset.interval_s))
-    interval_low_ms, interval_high_ms, delay_size_ms = (
+    interval_low_ms, interval_high_ms, abs_delay_ms = (
         round(low_ms),
         round(high_ms),
-        round(abs(ml_delay_ms)),
+        round(abs(estimated_delay_ms)),
     )
     if low_ms <= 0.0 <= high_ms:
         delay_text = "the positions have no significant delay"
-    elif ml_delay_ms < 0.0:
+    elif estimated_delay_ms < 0.0:
         delay_text, interval_low_ms, interval_high_ms = (
-            f"the timestamps are {delay_size_ms} ms early",
+            f"the timestamps are {abs_delay_ms} ms early",
             -interval_high_ms,
             -interval_low_ms,
         )
     else:
-        delay_text = f"the positions are {delay_size_ms} ms late"
-    limit_text = remedy.describe_delay_limit("EKF2_EV_DELAY", ml_delay_ms, delay_ms)
+        delay_text = f"the positions are {abs_delay_ms} ms late"
+    limit_text = remedy.describe_delay_limit("EKF2_EV_DELAY", estimated_delay_ms, delay_ms)
     yield warning(
         "ekf2_ev_delay_wrong",
         f"EKF2_EV_DELAY is {delay_ms:g} ms, but {delay_text}. The 95 % interval is "
         f"{interval_low_ms} to {interval_high_ms} ms. EKF2 fuses each position at the wrong time, "
         "so its track leads or "
         f"lags.{f' The parameter EKF2_EV_DELAY cannot {limit_text}.' if limit_text else ''}",
-        CORRECT_AT_SENDER if limit_text else _delay_remedy(analysis),
-        {"ekf2_ev_delay_ms": delay_ms, "asked_ms": ml_delay_ms},
+        CORRECT_AT_SENDER_ACTION if limit_text else _find_delay_remedy(analysis),
+        {"ekf2_ev_delay_ms": delay_ms, "asked_ms": estimated_delay_ms},
     )
 
 
@@ -181,24 +185,26 @@ def detect_wrong_gnss_delay(analysis: Analysis) -> Findings:
     estimate = remedy.estimate_gnss_delay_ms(ekf2_model)
     if estimate is None:
         return
-    delay_ms, (ml_delay_ms, sigma_ms) = ekf2_model.inputs.settings[GNSS_POS.delay], estimate
+    delay_ms, (estimated_delay_ms, sigma_ms) = ekf2_model.inputs.settings[GNSS_POS.delay], estimate
     yield warning(
         "ekf2_gps_delay_wrong",
         f"{GNSS_POS.delay} is {delay_ms:g} ms, but GNSS positions and velocities are "
-        f"{ml_delay_ms:.0f} ms late (± {1.96 * sigma_ms:.0f} ms, 95 %, compared with vision). EKF2 "
-        "fuses each GNSS sample at the wrong time, so its track leads or lags.",
-        f"Set {remedy.format_settings({GNSS_POS.delay: round(ml_delay_ms)})}.",
-        {"ekf2_gps_delay_ms": delay_ms, "estimate_ms": ml_delay_ms, "sigma_ms": sigma_ms},
+        f"{estimated_delay_ms:.0f} ms late (± {1.96 * sigma_ms:.0f} ms, 95 %, compared with "
+        "vision). EKF2 fuses each GNSS sample at the wrong time, so its track leads or lags.",
+        f"Set {remedy.format_settings({GNSS_POS.delay: round(estimated_delay_ms)})}.",
+        {"ekf2_gps_delay_ms": delay_ms, "estimate_ms": estimated_delay_ms, "sigma_ms": sigma_ms},
     )
 
 
-def _delay_remedy(analysis: Analysis) -> str:
+def _find_delay_remedy(analysis: Analysis) -> str:
     trial = _find_trial(analysis, "ekf2", "delay")
     if trial is None:
         return "Check EKF2_EV_DELAY."
-    error_ratio = _rmse_ratio(trial)
-    if math.isnan(error_ratio) and trial.before.nis_mean and trial.after.nis_mean:
-        error_ratio = trial.after.nis_mean / trial.before.nis_mean
+    rmse_or_nis_ratio = _compute_rmse_ratio(trial)
+    if math.isnan(rmse_or_nis_ratio) and trial.before.nis_mean and trial.after.nis_mean:
+        rmse_or_nis_ratio = trial.after.nis_mean / trial.before.nis_mean
     return (
-        f"Set {remedy.format_settings(trial.change)}." if error_ratio < 1.0 else CORRECT_AT_SENDER
+        f"Set {remedy.format_settings(trial.change)}."
+        if rmse_or_nis_ratio < 1.0
+        else CORRECT_AT_SENDER_ACTION
     )

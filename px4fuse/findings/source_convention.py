@@ -20,98 +20,106 @@ from px4fuse.convention.texts import (
     format_axes,
 )
 from px4fuse.finding import Finding
-from px4fuse.findings.cause_grouping import ANNOUNCED, CONVENTION
+from px4fuse.findings.cause_grouping import CONVENTION_KEY, RESET_TIME_KEY
 from px4fuse.findings.model import CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_phrase, source_name
 
-# Groups of findings that do not depend on the positions
-UNAFFECTED_GROUPS = ("logging", "IMU")
+# Groups of findings that are valid even if all positions are wrong
+POSITION_INDEPENDENT_GROUPS = ("logging", "IMU")
 
 
-# Id of the finding, kind of fault, message, and action
-ConventionFault = tuple[str, str, str, str]
+# Fault of the convention (axes, unit, clock or orientation): id of the finding, kind (the value of
+# CONVENTION_KEY in its evidence), message, and action
+ConventionFaultTexts = tuple[str, str, str, str]
 
 
 def detect(analysis: Comparison) -> Findings:
-    convention, faults = analysis.convention, _convention_faults(analysis)
+    convention, faults = analysis.convention, _find_convention_faults(analysis)
     if convention is None:
         return
     for name, kind, message, action in (
-        *_orientation_faults(convention.orientation, faults, source_name(analysis.source)),
-        *_position_faults(convention, faults, analysis.source),
+        *_find_orientation_faults(convention.orientation, faults, source_name(analysis.source)),
+        *_find_position_faults(convention, faults, analysis.source),
     ):
-        likelihood_gain = round(convention.log_likelihood_gain, 1)
-        evidence: dict[str, float | str] = {CONVENTION: kind, "log_likelihood": likelihood_gain}
+        gain_nats = round(convention.log_likelihood_gain, 1)
+        evidence: dict[str, float | str] = {CONVENTION_KEY: kind, "log_likelihood": gain_nats}
         if kind == "rotation":
             evidence["misalignment_deg"] = faults.rotation_deg
         make_finding = warning if kind in ("copied", "ambiguous") else error
         yield make_finding(name, message, action, evidence)
 
 
-def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[Finding]:
+def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding]) -> list[Finding]:
     """Remove findings that are only effects of wrong axes, unit, clock or orientation.
 
-    Findings on EKF2 remain as effects, because EKF2 used the positions without correction.
+    Findings on EKF2 are kept and marked as effects, because EKF2 used the wrong positions.
     """
-    faults = _convention_faults(analysis)
-    root_findings = [item for item in findings if CONVENTION in item.evidence]
+    faults = _find_convention_faults(analysis)
+    cause_findings = [item for item in findings if CONVENTION_KEY in item.evidence]
     unusable_findings = [item for item in findings if CATALOGUE[item.id].role == "unusable"]
     if unusable_findings:
-        root_findings = unusable_findings
+        cause_findings = unusable_findings
         findings = [
             item
             for item in findings
             if item in unusable_findings
-            or _is_effect(item)
-            or (CATALOGUE[item.id].group in UNAFFECTED_GROUPS and item.id != "accelerometer_bias")
+            or _is_convention_effect(item)
+            or (
+                CATALOGUE[item.id].group in POSITION_INDEPENDENT_GROUPS
+                and item.id != "accelerometer_bias"
+            )
         ]
     elif faults.orientation == "copied" and not faults.has_position_fault:
-        root_findings = []
-    root_findings += [
+        cause_findings = []
+    cause_findings += [
         item
         for item in findings
-        if CATALOGUE[item.id].role == "misleading" or ANNOUNCED in item.evidence
+        if CATALOGUE[item.id].role == "misleading" or RESET_TIME_KEY in item.evidence
     ]
-    if not root_findings:
+    if not cause_findings:
         return [*findings]
     other_findings = [
         item
         for item in findings
-        if item not in root_findings
+        if item not in cause_findings
         and CATALOGUE[item.id].after_wrong_convention != "withdrawn"
         # a drifting clock has no constant time offset
         and not (faults.clock_drift and item.id == "source_time_offset")
     ]
     if faults.is_ambiguous and not unusable_findings:
         return [
-            *root_findings,
-            *(item for item in other_findings if _is_effect(item) or item.severity == "note"),
+            *cause_findings,
+            *(
+                item
+                for item in other_findings
+                if _is_convention_effect(item) or item.severity == "note"
+            ),
         ]
     effects = [
-        replace(item, message=f"{item.title}.", caused_by=root_findings[0].id)
+        replace(item, message=f"{item.title}.", caused_by=cause_findings[0].id)
         for item in other_findings
-        if _is_effect(item) and item.caused_by is None
+        if _is_convention_effect(item) and item.caused_by is None
     ]
     return [
-        root_findings[0],
+        cause_findings[0],
         *effects,
-        *root_findings[1:],
-        *(item for item in other_findings if not _is_effect(item)),
+        *cause_findings[1:],
+        *(item for item in other_findings if not _is_convention_effect(item)),
     ]
 
 
-def _is_effect(item: Finding) -> bool:
+def _is_convention_effect(item: Finding) -> bool:
     return CATALOGUE[item.id].after_wrong_convention == "effect"
 
 
-def _convention_faults(analysis: Comparison) -> Faults:
+def _find_convention_faults(analysis: Comparison) -> Faults:
     return convention_faults(analysis.convention, analysis.flight, analysis.source.frame)
 
 
-def _position_faults(
+def _find_position_faults(
     convention: Convention, faults: Faults, source: PositionTrack
-) -> Iterator[ConventionFault]:
-    positions, alignment = positions_phrase(source), source.alignment
+) -> Iterator[ConventionFaultTexts]:
+    positions_text, alignment = positions_phrase(source), source.alignment
     is_file = alignment is not None
     log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
     basis_text = (
@@ -120,13 +128,13 @@ def _position_faults(
     )
     stated_frame = alignment.frame.upper() if alignment else "NED"
     axes, turn_deg = axes_as_sent(convention.axes, stated_frame), faults.rotation_deg
-    is_other_frame = is_file and abs(convention.rotation_deg) <= MIN_REMAINDER_DEG
-    if faults.has_wrong_axes or (turn_deg and is_other_frame and axes in FRAME_AXES.values()):
+    is_frame_choice = is_file and abs(convention.rotation_deg) <= MIN_REMAINDER_DEG
+    if faults.has_wrong_axes or (turn_deg and is_frame_choice and axes in FRAME_AXES.values()):
         orientation = convention.orientation
-        usage_text = "The analysis uses the positions converted to NED."
+        frame_sentence = "The analysis uses the positions converted to NED."
         if faults.is_north_unknown and orientation and axes not in FRAME_AXES.values():
             axes = FRAME_AXES.get(orientation.frames[-3:], axes)
-            usage_text = (
+            frame_sentence = (
                 "EKF2 took its heading from this source, so nothing shows the direction of north."
             )
         fault, action = describe_axes(
@@ -136,18 +144,18 @@ def _position_faults(
             fault += f", rotated by {turn_deg:+.0f}° (clockwise from above)"
         if orientation and orientation.frames.startswith("FLU"):
             action += f" {describe_conversion(orientation.frames)}"
-        yield "source_axes_wrong", "axes", f"{fault}. {basis_text} {usage_text}", action
+        yield "source_axes_wrong", "axes", f"{fault}. {basis_text} {frame_sentence}", action
     elif turn_deg:
         heading_text = {
             "EKF2": "EKF2's heading",
             "gyroscopes": "the heading at take-off",
             "GNSS": "the GNSS positions",
         }[convention.heading_from]
-        doubt = "." if convention.heading_from == "GNSS" else f", or {heading_text} is wrong."
+        other_cause = "." if convention.heading_from == "GNSS" else f", or {heading_text} is wrong."
         message = (
-            f"{positions} are rotated by {turn_deg:+.0f}° (clockwise from above) "
-            f"relative to {heading_text}. The x axis of the source does not point north{doubt} "
-            f"{basis_text} The analysis uses the positions rotated to NED."
+            f"{positions_text} are rotated by {turn_deg:+.0f}° (clockwise from above) "
+            f"relative to {heading_text}. The x axis of the source does not point north"
+            f"{other_cause} {basis_text} The analysis uses the positions rotated to NED."
         )
         action = (
             "Align the frame of the positioning system with north, or rotate positions and "
@@ -157,7 +165,7 @@ def _position_faults(
             action = "Run again with --position-yaw auto."
         yield "source_frame_misaligned", "rotation", message, action
     if faults.has_wrong_unit:
-        fault, action = describe_unit(convention.unit, positions, is_file=is_file)
+        fault, action = describe_unit(convention.unit, positions_text, is_file=is_file)
         distance_ratio = convention.scale / UNIT_SIZES_M[convention.unit]
         message = (
             f"{fault}. Distances are {distance_ratio:.3g} times those that the IMU measures. "
@@ -192,17 +200,17 @@ def _position_faults(
     if faults.is_ambiguous:
         axes_text = format_axes(convention.axes, convention.unit)
         message = (
-            f"The axes of the {positions} are not NED, and the motion does not show which they "
-            f"are: {'; or '.join((axes_text, *convention.alternatives[:3]))}. px4fuse estimates "
-            "nothing from the positions."
+            f"The axes of the {positions_text} are not NED, and the motion does not show which "
+            f"they are: {'; or '.join((axes_text, *convention.alternatives[:3]))}. px4fuse "
+            "estimates nothing from the positions."
         )
         action = "Fly a square with climb and descent, or state the frame (--position-frame)."
         yield "source_convention_ambiguous", "ambiguous", message, action
 
 
-def _orientation_faults(
+def _find_orientation_faults(
     orientation: OrientationConvention | None, faults: Faults, source: str
-) -> Iterator[ConventionFault]:
+) -> Iterator[ConventionFaultTexts]:
     if orientation is None or not faults.orientation:
         return
     if faults.orientation == "copied":
@@ -229,8 +237,8 @@ def _orientation_faults(
             "geometry_msgs have the order x, y, z, w.",
         ),
         "frames": (
-            f"The orientation of {source} rotates {orientation.frames}, but PX4 expects FRD to "
-            f"NED. After a conversion of the frames, {agreement_text}",
+            f"The orientation of {source} is the rotation {orientation.frames}, but PX4 expects "
+            f"FRD to NED. With converted frames, {agreement_text}",
             describe_conversion(orientation.frames),
         ),
         "heading": (

@@ -9,8 +9,8 @@ from px4fuse.comparison.remedy import find_aid, format_settings
 from px4fuse.core.text import lower_first
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.finding import Finding, Severity
-from px4fuse.findings.ekf2_noise import confirmed_noise_trial
-from px4fuse.findings.ekf2_not_fusing import MIN_FUSED_FRACTION_ERROR
+from px4fuse.findings.ekf2_noise import find_confirmed_noise_trial
+from px4fuse.findings.ekf2_not_fusing import FUSED_FRACTION_FOR_ERROR
 from px4fuse.findings.model import (
     Findings,
     finding,
@@ -33,17 +33,17 @@ from px4fuse.trajectory.rotation import heading as heading_of
 from px4fuse.trajectory.rotation import interpolate
 
 # Minimum |yaw misalignment| / σ of its estimate, for a finding: flights without a fault reach 3.2
-MIN_HEADING_SIGMAS = 4.0
+MIN_MISALIGNMENT_SIGMAS = 4.0
 # Minimum yaw misalignment (°) for a finding: magnetic headings of real flights are wrong by 3 to 4°
 MIN_HEADING_ERROR_DEG = 5.0
 # Minimum yaw misalignment (°) for severity error: 26 % of the motion appears on the other axis
 MIN_SEVERE_HEADING_ERROR_DEG = 15.0
-# EKF2's heading drifts if drift against ground truth / drift against the positions is larger.
-# Otherwise the positions drift
-MIN_TRUE_DRIFT_RATIO = 0.5
+# Minimum ratio of the drift of EKF2's heading against ground truth to that against the positions.
+# Below this ratio, the frame of the positions drifts, not EKF2's heading
+MIN_TRUE_TO_ESTIMATED_DRIFT = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
 ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
-CHECK_GNSS_DELAY = "Check EKF2_GPS_DELAY: a wrong delay also causes a heading error."
+CHECK_GNSS_DELAY_ACTION = "Check EKF2_GPS_DELAY: a wrong delay also causes a heading error."
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -71,9 +71,9 @@ def make_frame_finding(analysis: Analysis) -> Finding:
             action += " Give the ULog of this flight as well: it shows the frame that EKF2 uses."
     elif (
         fusion_flags is not None
-        and fraction_of_ones(fusion_flags["yaw"], analysis.segment) > MIN_FUSED_FRACTION_ERROR
+        and fraction_of_ones(fusion_flags["yaw"], analysis.segment) > FUSED_FRACTION_FOR_ERROR
     ):
-        fusion_sentence = f"EKF2 fused the yaw of {sensor_name}, so EKF2 uses the same frame."
+        fusion_sentence = f"EKF2 fused the yaw of {sensor_name}, so EKF2 has the same axes."
     has_yaw = analysis.source.orientation is not None
     if fusion_sentence:
         return note("source_frame_frd", f"{fault} {fusion_sentence}", action)
@@ -91,28 +91,28 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     rotation_deg, sigma_deg = math.remainder(heading.misalignment_deg, 360.0), heading.sigma_deg
     if heading.drifts:
         if not _is_drift_refuted(analysis.flight, heading):
-            yield _drift_finding(analysis, heading)
+            yield _make_heading_drift_finding(analysis, heading)
         return
     systematic_errors = analysis.systematic_errors
     is_explained_by_bias = (
         not isinstance(systematic_errors, Unavailable)
         and analysis.source.orientation is None
         and abs(systematic_errors.rotation.value)
-        < MIN_HEADING_SIGMAS * systematic_errors.rotation.sigma
+        < MIN_MISALIGNMENT_SIGMAS * systematic_errors.rotation.sigma
     )
     if is_explained_by_bias or abs(rotation_deg) < max(
-        MIN_HEADING_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG
+        MIN_MISALIGNMENT_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG
     ):
         return
-    positions = positions_phrase(analysis.source)
+    positions_text = positions_phrase(analysis.source)
     finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     if analysis.source.origin.is_gnss:
-        reason = "GNSS positions refer to true north, so the heading is wrong."
-        _, action = _gnss_heading_fault(analysis)
+        reason = "GNSS positions refer to true north, so EKF2's heading is wrong."
+        _, action = _explain_gnss_heading_error(analysis)
     elif analysis.source.name == ALIGNED_TOPIC:
         reason = (
-            "EKF2 fused the positions in this frame, but the IMU measures another direction of "
-            "motion."
+            "EKF2 fused the positions in the frame of its state, but the IMU measures motion in "
+            "another direction."
         )
         action = "Align the positioning frame with north."
     else:
@@ -130,7 +130,7 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     yield finding(
         "error" if abs(rotation_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         finding_id,
-        f"{positions} are rotated by {rotation_deg:+.0f}° relative to {reference}. The 95 % "
+        f"{positions_text} are rotated by {rotation_deg:+.0f}° relative to {reference}. The 95 % "
         f"interval is ± {1.96 * sigma_deg:.0f}°; the rotation is clockwise from above and constant "
         f"over the flight. {reason}",
         action,
@@ -138,17 +138,17 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     )
 
 
-def _gnss_heading_fault(analysis: Analysis) -> tuple[str, str]:
+def _explain_gnss_heading_error(analysis: Analysis) -> tuple[str, str]:
     """Return the possible cause of a wrong heading in a flight with GNSS, and the action."""
-    if (trial := confirmed_noise_trial(analysis)) is not None:
+    if (trial := find_confirmed_noise_trial(analysis)) is not None:
         cause = (
-            f"the wrong {find_aid(analysis).noise}: it determines the influence of GNSS on EKF2's "
+            f"a wrong {find_aid(analysis).noise}, which determines the influence of GNSS on EKF2's "
             "heading"
         )
         return cause, f"Set {format_settings(trial.change)}. Then check the heading again."
     advice = magnetometer_advice(analysis.flight)
-    cause = "a magnetometer near currents or steel" if advice else "the heading source of EKF2"
-    return cause, f"{advice} {CHECK_GNSS_DELAY}".lstrip()
+    cause = "a magnetometer near currents or steel" if advice else "a wrong heading source of EKF2"
+    return cause, f"{advice} {CHECK_GNSS_DELAY_ACTION}".lstrip()
 
 
 def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
@@ -168,14 +168,14 @@ def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
         error_rad = heading_of(samples.to_numpy()) - heading_of(true_attitude)
         wrapped_rad = np.arctan2(np.sin(error_rad), np.cos(error_rad))
         errors_deg.append(float(np.degrees(np.median(wrapped_rad))))
-    change_deg = abs(last_part.heading_error_deg - first_part.heading_error_deg)
-    return abs(errors_deg[1] - errors_deg[0]) < MIN_TRUE_DRIFT_RATIO * change_deg
+    heading_change_deg = abs(last_part.heading_error_deg - first_part.heading_error_deg)
+    return abs(errors_deg[1] - errors_deg[0]) < MIN_TRUE_TO_ESTIMATED_DRIFT * heading_change_deg
 
 
-def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
+def _make_heading_drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     first_part, last_part = heading.find_extreme_parts()
     errors_deg = [math.remainder(part.heading_error_deg, 360.0) for part in (first_part, last_part)]
-    change_deg = last_part.heading_error_deg - first_part.heading_error_deg
+    heading_change_deg = last_part.heading_error_deg - first_part.heading_error_deg
     estimation_basis = "positions and IMU"
     if heading.by == "orientation":
         estimation_basis = f"the orientation of {source_name(analysis.source)}"
@@ -189,18 +189,18 @@ def _drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
     ]
     possible_cause, action = ", or ".join(possible_causes), ""
     is_yaw_fused = int(analysis.flight.log.parameters.get(EV_POS.switch, 0.0)) & YAW_CONTROL_BIT
-    let_text = "Alternatively, let" if calibration_advice else "Let"
+    sentence_start = "Alternatively, let" if calibration_advice else "Let"
     if has_yaw and not is_yaw_fused:
-        action = f"{let_text} EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
+        action = f"{sentence_start} EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."
     if analysis.source.origin.is_gnss:
         calibration_advice = ""
-        possible_cause, action = _gnss_heading_fault(analysis)
+        possible_cause, action = _explain_gnss_heading_error(analysis)
     elif action and not analysis.flight.log.has_ulog:
-        action = f"{let_text} the autopilot fuse the yaw of the source."
+        action = f"{sentence_start} the autopilot fuse the yaw of the source."
     return finding(
-        "error" if abs(change_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
+        "error" if abs(heading_change_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
-        f"EKF2's heading drifts by {change_deg:+.0f}° relative to the "
+        f"EKF2's heading drifts by {heading_change_deg:+.0f}° relative to the "
         f"{positions_phrase(analysis.source)}. Its error is {errors_deg[0]:+.0f}° from "
         f"{first_part.start_s:.0f} to {first_part.end_s:.0f} s and {errors_deg[1]:+.0f}° from "
         f"{last_part.start_s:.0f} to {last_part.end_s:.0f} s (clockwise from above, estimated from "

@@ -14,7 +14,14 @@ from px4fuse.ekf2.fusion_conditions import EV_START_INTERVAL_S
 from px4fuse.filter.kalman import state_at, variance_at
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.finding import Finding
-from px4fuse.findings.model import Findings, finding, format_percent, note, source_words, warning
+from px4fuse.findings.model import (
+    Findings,
+    find_source_texts,
+    finding,
+    format_percent,
+    note,
+    warning,
+)
 from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
 from px4fuse.flight.model import ALIGNED, Ekf2, Unavailable, positions_phrase, step_values_at
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
@@ -26,20 +33,20 @@ MIN_INTERVALS = 50
 # Minimum fraction of missing positions to report downsampling: a radio link loses fewer
 MIN_DOWNSAMPLED_FRACTION = 0.25
 # Intervals of downsampled positions are n or n + 1 periods of the source (30 Hz to 20 Hz: 1 or 2).
-# Minimum fraction of the intervals with one of these two lengths
-MIN_MULTIPLE_PAIR_FRACTION = 0.85
-# Minimum fraction of the intervals with the rarer length (n or n + 1 periods of the source)
-MIN_RARER_MULTIPLE_FRACTION = 0.1
-# Maximum RMS of (interval / period - nearest integer): jitter causes 0.03, random intervals cause
-# 0.29
-MAX_MULTIPLE_RMS_ERROR = 0.06
-# Maximum number of periods of the source in the median interval between positions
-MAX_PERIOD_COUNT = 4
-# Minimum length (s) of a gap at the start or end of the flight for a finding: the land detector is
-# seconds late
+# Minimum fraction of intervals of n or n + 1 periods, for a finding
+MIN_INTERVAL_PAIR_FRACTION = 0.85
+# Minimum fraction of intervals with the less frequent of both lengths, for a finding
+MIN_RARER_INTERVAL_FRACTION = 0.1
+# Intervals are multiples of a period if the RMS of (interval / period - nearest integer) is at most
+# this value: jitter causes 0.03, random intervals cause 0.29
+MAX_ROUNDING_RMS_ERROR = 0.06
+# Tested periods of the source are the median interval divided by 1 to this number
+MAX_PERIODS_PER_INTERVAL = 4
+# Minimum length (s) of a gap at the start or end of the flight for a finding: shorter gaps may be
+# errors of take-off and landing times, because the land detector is seconds late
 MIN_END_GAP_S = 3.0
-# KF's state before an update is read this time (s) before the position
-BEFORE_UPDATE_S = 1e-6
+# KF's predicted state is read this time (s) before the position that updates it
+TIME_BEFORE_UPDATE_S = 1e-6
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -52,47 +59,47 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
     """Detect gaps in the position source."""
     flight, source, ekf2 = analysis.segment.flight, analysis.source, analysis.flight.ekf2
     gap_spans, fused_gap_spans = list[Span](), list[Span]()
-    invalid_s = analysis.source.invalid.index
+    invalid_times_s = analysis.source.invalid.index
     for gap in analysis.events.gaps:
-        if np.any((invalid_s > gap[0]) & (invalid_s < gap[1])):
-            continue  # source_values reports this gap
-        aids = _continuously_fused_aids(ekf2, gap)
+        if np.any((invalid_times_s > gap[0]) & (invalid_times_s < gap[1])):
+            continue  # source_values reports the invalid positions in this gap
+        aids = _find_fused_aids(ekf2, gap)
         if source.origin.aid in aids and source.alignment is None:
             fused_gap_spans.append(gap)
         elif gap[0] == flight.start_s or gap[1] == flight.end_s:
             if gap[1] - gap[0] > MIN_END_GAP_S:
-                yield _partial_source_finding(analysis, gap, aids)
+                yield _make_partial_source_finding(analysis, gap, aids)
         else:
             gap_spans.append(gap)
-    positions = positions_phrase(source)
+    positions_text = positions_phrase(source)
     if fused_gap_spans:
-        start_s, end_s, rank_text = _longest_gap(fused_gap_spans)
+        start_s, end_s, gap_count_text = _find_longest_gap(fused_gap_spans)
         yield warning(
             "source_gap_in_log",
-            f"{positions} are missing in the log for {end_s - start_s:.1f} s{rank_text}, but EKF2 "
-            "fused them. The source did not stop; KF has no measurement in this time.",
-            _remedy_for_unlogged_positions(analysis, start_s, end_s),
+            f"{positions_text} are missing in the log for {end_s - start_s:.1f} s{gap_count_text}, "
+            "but EKF2 fused them. The source did not stop; KF has no measurement in this time.",
+            _find_unlogged_remedy(analysis, start_s, end_s),
             {"count": len(fused_gap_spans), "longest_s": end_s - start_s, "at_s": start_s},
             tuple(fused_gap_spans),
         )
     if gap_spans:
-        start_s, end_s, rank_text = _longest_gap(gap_spans)
+        start_s, end_s, gap_count_text = _find_longest_gap(gap_spans)
         yield warning(
             "source_gap",
-            f"No position for {end_s - start_s:.1f} s{rank_text}. "
+            f"No position for {end_s - start_s:.1f} s{gap_count_text}. "
             f"{describe_errors_after_gap(analysis, (start_s, end_s))}",
-            f"Check {source_words(source).reception} at {start_s:.1f} s.",
+            f"Check {find_source_texts(source).reception} at {start_s:.1f} s.",
             {"count": len(gap_spans), "longest_s": end_s - start_s, "at_s": start_s},
             tuple(gap_spans),
         )
 
 
-def _longest_gap(gaps: list[Span]) -> tuple[float, float, str]:
+def _find_longest_gap(gaps: list[Span]) -> tuple[float, float, str]:
     start_s, end_s = max(gaps, key=lambda gap: gap[1] - gap[0])
     return start_s, end_s, "" if len(gaps) == 1 else f", the longest of {len(gaps)} gaps"
 
 
-def _remedy_for_unlogged_positions(analysis: Analysis, start_s: float, end_s: float) -> str:
+def _find_unlogged_remedy(analysis: Analysis, start_s: float, end_s: float) -> str:
     for track in analysis.flight.positions:
         if track.origin.aid == analysis.source.origin.aid and len(track.samples[start_s:end_s]) > 2:
             return f"Run again with --position-source {track.name}, which contains these positions."
@@ -101,40 +108,42 @@ def _remedy_for_unlogged_positions(analysis: Analysis, start_s: float, end_s: fl
     return "Log fewer topics (SDLOG_PROFILE)."
 
 
-def _partial_source_finding(analysis: Analysis, span_s: Span, fused_aids: list[Aid]) -> Finding:
+def _make_partial_source_finding(
+    analysis: Analysis, span_s: Span, fused_aids: list[Aid]
+) -> Finding:
     (start_s, end_s), source = span_s, analysis.source
-    is_stop = end_s == analysis.segment.flight.end_s
+    is_source_stop = end_s == analysis.segment.flight.end_s
     event_verb, event_s, before_or_after = (
-        ("stop", start_s, "after") if is_stop else ("begin", end_s, "before")
+        ("stop", start_s, "after") if is_source_stop else ("begin", end_s, "before")
     )
-    action = "" if is_stop or source.alignment else " Take off only when positions arrive."
-    ekf2_at_end, duration_s = _ekf2_at_end(analysis, span_s), end_s - start_s
-    delay_text = f"after {duration_s:.1f} s" if is_stop else "just before the first position"
-    effect_text = f", {duration_s:.1f} s {'before the end' if is_stop else 'after the start'}"
-    if "error_m" in ekf2_at_end:
-        effect_text = (
-            f": EKF2's position error is {format_metres(ekf2_at_end['error_m'])} m {delay_text}"
-        )
-    elif "sigma_m" in ekf2_at_end:
-        effect_text = (
-            f": EKF2's reported σ is {format_metres(ekf2_at_end['sigma_m'])} m {delay_text}"
-        )
+    action = "" if is_source_stop or source.alignment else " Take off only when positions arrive."
+    ekf2_errors_at_end, duration_s = _find_ekf2_errors_at_end(analysis, span_s), end_s - start_s
+    time_text = f"after {duration_s:.1f} s" if is_source_stop else "just before the first position"
+    effect_text = (
+        f", {duration_s:.1f} s {'before the end' if is_source_stop else 'after the start'}"
+    )
+    if "error_m" in ekf2_errors_at_end:
+        error_text = format_metres(ekf2_errors_at_end["error_m"])
+        effect_text = f": EKF2's position error is {error_text} m {time_text}"
+    elif "sigma_m" in ekf2_errors_at_end:
+        sigma_text = format_metres(ekf2_errors_at_end["sigma_m"])
+        effect_text = f": EKF2's reported σ is {sigma_text} m {time_text}"
     has_aids, aiding_sentence = _has_aids(analysis.flight.ekf2), ""
     if has_aids:
         labels = [aid.label for aid in fused_aids] or ["the IMU alone (dead reckoning)"]
         aiding_sentence = f"For {duration_s:.1f} s EKF2 relied on {' and '.join(labels)}. "
     return finding(
         "error" if has_aids and not fused_aids and duration_s > MAX_NOT_FUSED_S else "warning",
-        "source_stops" if is_stop else "source_begins",
+        "source_stops" if is_source_stop else "source_begins",
         f"{positions_phrase(source)} {event_verb} in flight at {event_s:.1f} s{effect_text}. "
         f"{aiding_sentence}px4fuse evaluates KF and EKF2 only while positions arrive.",
-        f"Check {source_words(source).reception} {before_or_after} {event_s:.1f} s.{action}",
-        {"at_s": event_s, "duration_s": duration_s, **ekf2_at_end},
+        f"Check {find_source_texts(source).reception} {before_or_after} {event_s:.1f} s.{action}",
+        {"at_s": event_s, "duration_s": duration_s, **ekf2_errors_at_end},
         (span_s,),
     )
 
 
-def _ekf2_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
+def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
     """Return EKF2's horizontal position error and reported σ (m) at the end of a time span.
 
     The mapping does not contain unknown values.
@@ -146,16 +155,16 @@ def _ekf2_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
         if isinstance(tracks.ekf2_state, Unavailable):
             return {}
         position_m = tracks.ekf2_state["position_m"].loc[slice(*span_s)]
-        time_s, true_m = position_m.index.to_numpy(), np.full(len(position_m), np.nan)
+        time_s, true_position_m = position_m.index.to_numpy(), np.full(len(position_m), np.nan)
         if isinstance(tracks.truth, pd.DataFrame):
             true_positions = tracks.truth["position_m"]
-            true_m = np.interp(time_s, true_positions.index, true_positions, np.nan, np.nan)
+            true_position_m = np.interp(time_s, true_positions.index, true_positions, np.nan, np.nan)
         sigma_m = interpolate_sigma(time_s, tracks.ekf2_variance, "position_variance_m2")
-        squares_m2.append([(position_m - true_m) ** 2, sigma_m**2])
-    sums_m2 = zip(("error_m", "sigma_m"), np.sum(squares_m2, axis=0), strict=True)
+        squares_m2.append([(position_m - true_position_m) ** 2, sigma_m**2])
+    squared_sums_by_name = zip(("error_m", "sigma_m"), np.sum(squares_m2, axis=0), strict=True)
     return {
         name: float(np.sqrt(values[np.isfinite(values)][-1]))
-        for name, values in sums_m2
+        for name, values in squared_sums_by_name
         if np.isfinite(values).any()
     }
 
@@ -163,35 +172,35 @@ def _ekf2_at_end(analysis: Analysis, span_s: Span) -> dict[str, float]:
 def describe_errors_after_gap(analysis: Analysis, gap_s: Span) -> str:
     """Describe the position errors of KF and EKF2 at the end of a gap."""
     result, (start_s, end_s) = analysis.main, gap_s
-    before_end_s = np.array([start_s, end_s - BEFORE_UPDATE_S])
+    start_and_end_times_s = np.array([start_s, end_s - TIME_BEFORE_UPDATE_S])
     axis, ekf2_state = result.axis, result.ekf2_state
     reference_m = float(axis.measurement_m[np.searchsorted(axis.measurement_time_s, end_s)])
     quantity = "Distance from estimate to first position after the gap"
     if isinstance(result.truth, pd.DataFrame):
-        true_m = result.truth["position_m"]
+        true_positions_m = result.truth["position_m"]
         reference_m, quantity = (
-            float(np.interp(end_s, true_m.index, true_m)),
+            float(np.interp(end_s, true_positions_m.index, true_positions_m)),
             "Position error at the end of the gap",
         )
     error_texts = []
-    aiding_sentence = "KF relies on the IMU alone."
+    aiding_sentence = "In the gap KF relies on the IMU alone."
     if isinstance(ekf2_state, pd.DataFrame) and len(
         positions_before := ekf2_state["position_m"].loc[:end_s]
     ):
         if _has_aids(analysis.flight.ekf2):
-            aiding_sentence = "KF and EKF2 rely on the IMU alone."
-        if other_aids := _continuously_fused_aids(analysis.flight.ekf2, gap_s):
+            aiding_sentence = "In the gap KF and EKF2 rely on the IMU alone."
+        if other_aids := _find_fused_aids(analysis.flight.ekf2, gap_s):
             aid_labels = " and ".join(aid.label for aid in other_aids)
-            aiding_sentence = f"KF relies on the IMU alone, EKF2 also on {aid_labels}."
-        variance, state_s = result.ekf2_variance, float(positions_before.index[-1])
+            aiding_sentence = f"In the gap KF relies on the IMU alone, EKF2 also on {aid_labels}."
+        variance, state_time_s = result.ekf2_variance, float(positions_before.index[-1])
         sigma_text = ""
         if isinstance(variance, pd.DataFrame) and len(variance):
-            variance_m2 = np.interp(state_s, variance.index, variance["position_variance_m2"])
+            variance_m2 = np.interp(state_time_s, variance.index, variance["position_variance_m2"])
             sigma_text = f" (σ {format_metres(float(np.sqrt(variance_m2)))} m)"
         error_m = abs(float(positions_before.iloc[-1]) - reference_m)
         error_texts.append(f"EKF2 {format_metres(error_m)} m{sigma_text}")
-    kf_error_m = abs(float(state_at(result.replay, before_end_s)[0][1]) - reference_m)
-    kf_sigma_m = float(np.sqrt(variance_at(result.replay, before_end_s)[0][1]))
+    kf_error_m = abs(float(state_at(result.replay, start_and_end_times_s)[0][1]) - reference_m)
+    kf_sigma_m = float(np.sqrt(variance_at(result.replay, start_and_end_times_s)[0][1]))
     error_texts.append(f"KF {format_metres(kf_error_m)} m (σ {format_metres(kf_sigma_m)} m)")
     return f"{aiding_sentence} {quantity} along {axis.label}: {', '.join(error_texts)}."
 
@@ -200,7 +209,7 @@ def _has_aids(ekf2: Ekf2 | Unavailable) -> bool:
     return isinstance(ekf2, Ekf2) and bool(ekf2.aids)
 
 
-def _continuously_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[Aid]:
+def _find_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[Aid]:
     """Return the horizontal aiding sources that EKF2 fused during a whole time span."""
     aids, (start_s, end_s) = list[Aid](), span_s
     for name in (EV_POS.name, *OTHER_HORIZONTAL_AIDS):
@@ -227,7 +236,7 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
         or clock_map.distinct_stamps is not None
     ):
         return
-    intervals_s, median_interval_s = _position_intervals_s(analysis)
+    intervals_s, median_interval_s = _compute_intervals_s(analysis)
     lost_count = int(np.sum(np.rint(intervals_s / median_interval_s) - 1.0))
     sent_count = lost_count + len(intervals_s)
     if len(intervals_s) > 1 and lost_count / sent_count > MIN_LOST_FRACTION:
@@ -247,27 +256,28 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
-    # Intervals are not the receive intervals of PX4 if px4fuse changed the timestamps, or if PX4
-    # logged the positions after their use in EKF2 (ALIGNED)
+    # Timestamps do not show when PX4 received the positions if px4fuse changed them, or if PX4
+    # logged the positions only after EKF2 had used them (ALIGNED)
     if (
         source.clock_map is not None
         or source.origin.find_preference_rank() >= ALIGNED.find_preference_rank()
     ):
         return
-    intervals_s, _ = _position_intervals_s(analysis)
+    intervals_s, _ = _compute_intervals_s(analysis)
     period_and_counts = _find_period(intervals_s) if len(intervals_s) >= MIN_INTERVALS else None
     if period_and_counts is None:
         return
     period_s, period_counts = period_and_counts
     lost_fraction = 1.0 - 1.0 / float(np.mean(period_counts))
-    fractions = np.bincount(period_counts.astype(np.intp)) / len(period_counts)
-    pair_fractions = fractions[:-1] + fractions[1:]
-    first_multiple = int(np.argmax(pair_fractions))
-    is_alternating = (
-        pair_fractions[first_multiple] >= MIN_MULTIPLE_PAIR_FRACTION
-        and fractions[first_multiple : first_multiple + 2].min() >= MIN_RARER_MULTIPLE_FRACTION
+    count_fractions = np.bincount(period_counts.astype(np.intp)) / len(period_counts)
+    count_pair_fractions = count_fractions[:-1] + count_fractions[1:]
+    first_multiple = int(np.argmax(count_pair_fractions))
+    has_two_lengths = (
+        count_pair_fractions[first_multiple] >= MIN_INTERVAL_PAIR_FRACTION
+        and count_fractions[first_multiple : first_multiple + 2].min()
+        >= MIN_RARER_INTERVAL_FRACTION
     )
-    if lost_fraction < MIN_DOWNSAMPLED_FRACTION or not is_alternating:
+    if lost_fraction < MIN_DOWNSAMPLED_FRACTION or not has_two_lengths:
         return
     mean_interval_s = float(np.mean(intervals_s))
     is_too_slow = mean_interval_s > EV_START_INTERVAL_S
@@ -295,7 +305,7 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     )
 
 
-def _position_intervals_s(analysis: Analysis) -> tuple[Array, float]:
+def _compute_intervals_s(analysis: Analysis) -> tuple[Array, float]:
     intervals_s = np.diff(
         cut_to_segment(analysis.source.samples, analysis.segment).index.to_numpy()
     )
@@ -305,16 +315,17 @@ def _position_intervals_s(analysis: Analysis) -> tuple[Array, float]:
 
 def _find_period(intervals_s: Array) -> tuple[float, Array] | None:
     """Return the period (s) of the source, and the number of periods in each interval."""
-    # The upper median is one of the intervals, not the mean of two intervals
+    # The upper median is one of the intervals. The mean of two intervals may be no multiple of the
+    # period
     median_interval_s = float(np.sort(intervals_s)[len(intervals_s) // 2])
-    for median_count in range(1, MAX_PERIOD_COUNT + 1):
+    for median_count in range(1, MAX_PERIODS_PER_INTERVAL + 1):
         period_counts = np.rint(intervals_s * median_count / median_interval_s)
         if np.any(period_counts < 1.0):
             continue
         period_s = float(np.sum(intervals_s) / np.sum(period_counts))
         if (
             float(np.sqrt(np.mean((intervals_s / period_s - period_counts) ** 2)))
-            <= MAX_MULTIPLE_RMS_ERROR
+            <= MAX_ROUNDING_RMS_ERROR
         ):
             return period_s, period_counts
     return None

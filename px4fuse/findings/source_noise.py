@@ -13,27 +13,27 @@ from px4fuse.core.text import format_number
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.filter.correlated_noise import TimeCorrelatedNoise
 from px4fuse.filter.signals import cut_to_segment
-from px4fuse.findings.cause_grouping import WHITE_RATIO
-from px4fuse.findings.model import Findings, error, format_percent, note, source_words, warning
-from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, ekf2_noise_m
-from px4fuse.findings.source_positions import MIN_LAG_NATS, has_little_motion
+from px4fuse.findings.cause_grouping import WHITE_NOISE_RATIO_KEY
+from px4fuse.findings.model import Findings, error, find_source_texts, format_percent, note, warning
+from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, find_ekf2_noise_m
+from px4fuse.findings.source_positions import MIN_LAG_LIKELIHOOD_NATS, has_little_motion
 from px4fuse.flight.model import Columns, positions_phrase, source_name
 
-# White noise is a separate fault if white noise σ / time-correlated noise σ is larger
-MIN_WHITE_NOISE_RATIO = 0.3
+# Minimum ratio of white to time-correlated noise σ, at which white noise is a separate fault
+MIN_WHITE_TO_CORRELATED_RATIO = 0.3
 # Minimum log likelihood ratio (nats) of time-correlated to white noise: larger in 1 of 400 flights
 # without a fault
-MIN_CORRELATION_GAIN_NATS = 5.0
+MIN_CORRELATED_LIKELIHOOD_NATS = 5.0
 # Minimum time-correlated error (m, 1 σ): timestamps in ms cause 2 mm at 4 m/s, and the motion from
 # IMU or ground truth also has errors of some mm
 MIN_CORRELATED_SIGMA_M = 0.005
 # Minimum fraction of repeated positions for a warning
-MIN_REPEAT_FRACTION = 0.05
+MIN_REPEATED_FRACTION = 0.05
 # Minimum fraction of repeated positions for severity error
-MIN_REPEAT_FRACTION_ERROR = 0.3
+MIN_REPEATED_FRACTION_FOR_ERROR = 0.3
 # Minimum number of repeated positions for a finding
-MIN_REPEATS = 10
-# Minimum (larger / smaller) position noise σ of the axes north and east, for a finding
+MIN_REPEATED_COUNT = 10
+# Minimum ratio of the larger to the smaller position noise σ of north and east, for a finding
 MIN_AXIS_NOISE_RATIO = 1.5
 # Minimum ratio of the noise in one part of the flight to the noise in the rest, for a warning
 MIN_PART_NOISE_RATIO = 2.0
@@ -41,7 +41,7 @@ MIN_PART_NOISE_RATIO = 2.0
 # for a warning
 MIN_PART_NOISE_RATIO_WITHOUT_OUTLIERS = 1.5
 # Minimum ratio of the noise in one part of the flight to the noise in the rest, for severity error
-MIN_PART_NOISE_RATIO_ERROR = 4.0
+MIN_PART_NOISE_RATIO_FOR_ERROR = 4.0
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -59,10 +59,10 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
     noise = analysis.time_correlated_noise
     if (
         not isinstance(noise, TimeCorrelatedNoise)
-        or noise.likelihood_gain_nats < MIN_CORRELATION_GAIN_NATS
+        or noise.likelihood_gain_nats < MIN_CORRELATED_LIKELIHOOD_NATS
         or noise.slow_m < MIN_CORRELATED_SIGMA_M
-        or noise.low_pass_likelihood_gain_nats
-        >= MIN_LAG_NATS  # a low-pass filtered source has its own finding
+        # a low-pass filtered source has its own finding
+        or noise.low_pass_likelihood_gain_nats >= MIN_LAG_LIKELIHOOD_NATS
     ):
         return
     low_text, high_text = (format_number(end, 1) for end in (noise.low_s, noise.high_s))
@@ -74,13 +74,16 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         correlation_time_text, interval_text = f"at least {low_text} s", "95 %"
     is_gnss, name = analysis.source.origin.is_gnss, source_name(analysis.source)
     evidence = {name: value for name, value in asdict(noise).items() if np.isfinite(value)}
-    assumed_m = [analysis.settings.sigma_z_m, *map(ekf2_noise_m, analysis.axes.values())]
-    white_noise_ratio = noise.white_m / float(np.nanmin(assumed_m))
+    assumed_noises_m = [
+        analysis.settings.sigma_z_m,
+        *map(find_ekf2_noise_m, analysis.axes.values()),
+    ]
+    white_noise_ratio = noise.white_m / float(np.nanmin(assumed_noises_m))
     if (
         white_noise_ratio > NOISE_RATIO_TOLERANCE
-        and noise.white_m > MIN_WHITE_NOISE_RATIO * noise.slow_m
+        and noise.white_m > MIN_WHITE_TO_CORRELATED_RATIO * noise.slow_m
     ):
-        evidence[WHITE_RATIO] = white_noise_ratio
+        evidence[WHITE_NOISE_RATIO_KEY] = white_noise_ratio
     # Time-correlated errors are normal for GNSS: if they are within the reported σ, they are a note
     make_finding = note if is_gnss and not _has_error_above_reported_sigma(analysis) else warning
     yield make_finding(
@@ -89,7 +92,7 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         f"{correlation_time_text} ({interval_text}). The rest of the error is white noise of "
         f"{noise.white_m:.2g} m (1 σ). KF and EKF2 assume independent errors. Both follow the "
         "correlated error and report a σ that is too small. Innovations do not show this error.",
-        f"Check {source_words(analysis.source).errors}.",
+        f"Check {find_source_texts(analysis.source).errors}.",
         evidence,
     )
 
@@ -119,9 +122,9 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
         int(is_repeated.sum()),
         float(is_repeated.mean()) if len(is_repeated) else 0.0,
     )
-    if repeated_count < MIN_REPEATS or repeated_fraction < MIN_REPEAT_FRACTION:
+    if repeated_count < MIN_REPEATED_COUNT or repeated_fraction < MIN_REPEATED_FRACTION:
         return
-    make_finding = error if repeated_fraction >= MIN_REPEAT_FRACTION_ERROR else warning
+    make_finding = error if repeated_fraction >= MIN_REPEATED_FRACTION_FOR_ERROR else warning
     yield make_finding(
         "source_samples_repeated",
         f"{repeated_count} of {len(is_repeated)} {positions_phrase(analysis.source)} repeat the "
@@ -135,7 +138,7 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
 def detect_unequal_noise(analysis: Analysis) -> Findings:
     """Detect that the position noise differs between north and east."""
     if analysis.source.origin.is_gnss:
-        return  # the estimate of SIGMA_Z contains only the white noise of GNSS
+        return  # the estimate of SIGMA_Z lacks the time-correlated noise, which dominates in GNSS
     axis_noise_estimates = sorted(
         (noise.value, noise.low, noise.high, axis_tuning.name)
         for axis_tuning in analysis.tuning_by_axis
@@ -143,19 +146,26 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
     )
     if len(axis_noise_estimates) < 2:
         return
-    (quiet_m, _, quiet_high_m, quiet_axis), (noisy_m, noisy_low_m, _, noisy_axis) = (
-        axis_noise_estimates
-    )
-    if noisy_m < MIN_AXIS_NOISE_RATIO * quiet_m or noisy_low_m <= quiet_high_m:
+    (
+        (smaller_noise_m, _, smaller_noise_high_m, smaller_noise_axis),
+        (larger_noise_m, larger_noise_low_m, _, larger_noise_axis),
+    ) = axis_noise_estimates
+    if (
+        larger_noise_m < MIN_AXIS_NOISE_RATIO * smaller_noise_m
+        or larger_noise_low_m <= smaller_noise_high_m
+    ):
         return
     yield warning(
         "source_noise_unequal_axes",
-        f"{source_name(analysis.source)} noise is {noisy_m:.2g} m along "
-        f"{noisy_axis} and {quiet_m:.2g} m along {quiet_axis}. One SIGMA_Z, or one EKF2 "
-        "measurement noise, does not fit both axes.",
-        f"Check {source_words(analysis.source).errors}. Analyse each axis separately "
-        f"(--axis {noisy_axis} --sigma-z {noisy_m:.2g}).",
-        {f"{quiet_axis}_sigma_z_m": quiet_m, f"{noisy_axis}_sigma_z_m": noisy_m},
+        f"{source_name(analysis.source)} noise is {larger_noise_m:.2g} m along "
+        f"{larger_noise_axis} and {smaller_noise_m:.2g} m along {smaller_noise_axis}. One SIGMA_Z, "
+        "or one EKF2 measurement noise, does not fit both axes.",
+        f"Check {find_source_texts(analysis.source).errors}. Analyse each axis separately "
+        f"(--axis {larger_noise_axis} --sigma-z {larger_noise_m:.2g}).",
+        {
+            f"{smaller_noise_axis}_sigma_z_m": smaller_noise_m,
+            f"{larger_noise_axis}_sigma_z_m": larger_noise_m,
+        },
     )
 
 
@@ -164,17 +174,18 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     if (
         noisy_part is None
         or noisy_part.sigma_ratio < MIN_PART_NOISE_RATIO
-        # An outlier that is fused also increases the next innovations
+        # Without outliers, too, the noise must be larger: a fused outlier also increases the next
+        # innovations
         or noisy_part.sigma_ratio_without_outliers < MIN_PART_NOISE_RATIO_WITHOUT_OUTLIERS
     ):
         return
     noise_ratio, start_s, end_s = noisy_part.sigma_ratio, noisy_part.start_s, noisy_part.end_s
-    yield (error if noise_ratio >= MIN_PART_NOISE_RATIO_ERROR else warning)(
+    yield (error if noise_ratio >= MIN_PART_NOISE_RATIO_FOR_ERROR else warning)(
         "source_noise_varies",
         f"{source_name(analysis.source)} noise is {noise_ratio:.1f} times larger from "
         f"{start_s:.0f} to {end_s:.0f} s. Most samples of that time are affected, not single "
         "outliers. No single SIGMA_Z fits the whole flight.",
-        f"Check {source_words(analysis.source).reception} in that time. Let the source send a "
+        f"Check {find_source_texts(analysis.source).reception} in that time. Let the source send a "
         "variance with each position, or analyse this time separately (--start, --end).",
         {"ratio": noise_ratio, "first_s": start_s, "until_s": end_s},
         ((start_s, end_s),),

@@ -1,6 +1,6 @@
-"""Position errors with a pattern: timestamp jitter, and noise that increases with speed.
+"""Position errors with a pattern: timestamp jitter, noise that grows with speed, late attitude.
 
-Ground truth also shows periodic errors, a time offset that varies in flight, and a scale factor
+Only with ground truth: periodic errors, a time offset that varies in flight, and a scale factor
 error.
 """
 
@@ -24,49 +24,49 @@ from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings.model import (
     Findings,
     error,
+    find_source_texts,
     finding,
     format_percent,
-    source_words,
     warning,
 )
 from px4fuse.findings.source_positions import (
-    MIN_SCALE_ERROR_SEVERE,
+    MIN_SCALE_ERROR_FOR_ERROR,
     MIN_SCALE_ERROR_SIGMAS,
 )
 from px4fuse.findings.source_stamps import detect_bursts
 from px4fuse.flight.model import positions_phrase, source_name
 
 # Minimum scale factor error (ratio minus 1) against ground truth for a finding: 0.8 m in 10 m
-MIN_TRUE_SCALE_ERROR = 0.08
+MIN_SCALE_ERROR_AGAINST_TRUTH = 0.08
 # Minimum jitter (s) for severity error: a position error of 3 cm at 1 m/s
-MIN_JITTER_ERROR_S = 0.03
+MIN_JITTER_FOR_ERROR_S = 0.03
 # Minimum amplitude (m) of a periodic error for severity error: twice the noise of good UWB
-MIN_PERIODIC_ERROR_M = 0.2
+MIN_AMPLITUDE_FOR_ERROR_M = 0.2
 
 
 def detect(analysis: Analysis) -> Findings:
     yield from detect_attitude_delay(analysis)
-    bursts = [*detect_bursts(analysis)]
-    yield from bursts
+    burst_findings = [*detect_bursts(analysis)]
+    yield from burst_findings
     white = (
         None
-        if bursts or analysis.source.origin.reconstructed
+        if burst_findings or analysis.source.origin.reconstructed
         else compute_local_residuals(analysis)
     )
     if white is None:
         return
-    yield from detect_white_patterns(analysis, white)
+    yield from detect_jitter_and_speed_noise(analysis, white)
     error_fit = fit_errors(analysis, white)
     if error_fit is not None:
-        yield from detect_slow_patterns(analysis, error_fit)
+        yield from detect_slow_errors(analysis, error_fit)
         if not analysis.source.origin.is_gnss:  # GNSS has no scale factor error
             yield from detect_scale_error(analysis, error_fit)
 
 
-def detect_white_patterns(analysis: Analysis, white: LocalResiduals) -> Findings:
+def detect_jitter_and_speed_noise(analysis: Analysis, white: LocalResiduals) -> Findings:
     jitter_s, clock_map = find_timestamp_jitter(white), analysis.source.clock_map
     if jitter_s is not None and (clock_map is None or clock_map.distinct_stamps is None):
-        yield (error if jitter_s >= MIN_JITTER_ERROR_S else warning)(
+        yield (error if jitter_s >= MIN_JITTER_FOR_ERROR_S else warning)(
             "source_timestamp_jitter",
             f"The timestamps of the {positions_phrase(analysis.source)} jitter by "
             f"{1e3 * jitter_s:.0f} ms (1 σ). The positions are measured at a constant interval, "
@@ -91,49 +91,53 @@ def detect_white_patterns(analysis: Analysis, white: LocalResiduals) -> Findings
         )
 
 
-def detect_slow_patterns(analysis: Analysis, error_fit: ErrorFit) -> Findings:
-    periodic, positions = find_periodic_error(error_fit), positions_phrase(analysis.source)
-    if periodic is not None:
-        yield (error if periodic.amplitude_m >= MIN_PERIODIC_ERROR_M else warning)(
+def detect_slow_errors(analysis: Analysis, error_fit: ErrorFit) -> Findings:
+    periodic_error = find_periodic_error(error_fit)
+    positions_text = positions_phrase(analysis.source)
+    if periodic_error is not None:
+        yield (error if periodic_error.amplitude_m >= MIN_AMPLITUDE_FOR_ERROR_M else warning)(
             "source_error_periodic",
-            f"The error of the {positions} is periodic: amplitude "
-            f"{format_metres(periodic.amplitude_m)} m, period {periodic.period_s:.1f} s. This "
-            f"sinusoid explains {format_percent(min(periodic.fraction, 1.0))} of the slow errors "
-            "against ground truth. KF and EKF2 follow this error, so innovations hardly show it.",
-            f"Check {source_words(analysis.source).errors}. Look for a process with this period, "
-            "such as a rotating part or a control loop. No noise setting corrects this error.",
-            periodic._asdict(),
+            f"The error of the {positions_text} is periodic: amplitude "
+            f"{format_metres(periodic_error.amplitude_m)} m, period {periodic_error.period_s:.1f} "
+            f"s. This sinusoid explains {format_percent(min(periodic_error.fraction, 1.0))} of the "
+            "slow errors against ground truth. KF and EKF2 follow this error, so innovations "
+            "hardly show it.",
+            f"Check {find_source_texts(analysis.source).errors}. Look for a process with this "
+            "period, such as a rotating part or a control loop. No noise setting corrects this "
+            "error.",
+            periodic_error._asdict(),
         )
         return
-    clock, variation = analysis.clock, find_offset_variation(error_fit)
+    clock, offset_variation = analysis.clock, find_offset_variation(error_fit)
     if isinstance(clock, ClockOffset) and clock.has_changed():
-        return  # source_clock reports the change
-    if variation is not None:
+        return  # source_clock reports the change of the time offset
+    if offset_variation is not None:
         yield error(
             "source_time_offset_changes",
-            f"The time offset of the {positions} varies in flight by "
-            f"{variation.most_s - variation.least_s:.2f} s. Its deviation from the mean is "
-            f"{variation.least_s:+.2f} s at {variation.least_at_s:.0f} s and "
-            f"{variation.most_s:+.2f} s at {variation.most_at_s:.0f} s, estimated from the errors "
-            "along the motion against ground truth. No single --clock-offset corrects this.",
+            f"The time offset of the {positions_text} varies in flight by "
+            f"{offset_variation.most_s - offset_variation.least_s:.2f} s. Its deviation from the "
+            f"mean is {offset_variation.least_s:+.2f} s at {offset_variation.least_at_s:.0f} s and "
+            f"{offset_variation.most_s:+.2f} s at {offset_variation.most_at_s:.0f} s, estimated "
+            "from the errors along the motion against ground truth. No single --clock-offset "
+            "corrects this.",
             "Synchronise the clocks during the whole flight. Send the time of measurement, not the "
             "time at which a position was sent or received.",
-            variation._asdict(),
+            offset_variation._asdict(),
         )
 
 
 def detect_scale_error(analysis: Analysis, error_fit: ErrorFit) -> Findings:
     if abs(error_fit.scale) >= max(
-        MIN_TRUE_SCALE_ERROR, MIN_SCALE_ERROR_SIGMAS * error_fit.scale_sigma
+        MIN_SCALE_ERROR_AGAINST_TRUTH, MIN_SCALE_ERROR_SIGMAS * error_fit.scale_sigma
     ):
         yield finding(
-            "error" if abs(error_fit.scale) >= MIN_SCALE_ERROR_SEVERE else "warning",
+            "error" if abs(error_fit.scale) >= MIN_SCALE_ERROR_FOR_ERROR else "warning",
             "source_scale_error",
             f"{source_name(analysis.source)} distances are {format_percent(abs(error_fit.scale))} "
             f"too {'long' if error_fit.scale > 0.0 else 'short'}. The comparison with ground truth "
             f"is accurate to ± {format_percent(1.96 * error_fit.scale_sigma, 1)} (95 %). "
             "Innovations do not show a scale factor error.",
-            f"Check {source_words(analysis.source).scale}.",
+            f"Check {find_source_texts(analysis.source).scale}.",
             {"scale": 1.0 + error_fit.scale, "sigma": error_fit.scale_sigma},
         )
 

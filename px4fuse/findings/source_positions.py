@@ -1,4 +1,7 @@
-"""Faults of the positions: little motion, low pass, jumps, scale factor, outliers, variance."""
+"""Faults of the positions: constant, low-pass filtered, jumps, scale factor, outliers, variance.
+
+Flights with too little motion are also reported.
+"""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -17,20 +20,25 @@ from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Severity
-from px4fuse.findings.cause_grouping import ANNOUNCED, CAUSE, GROUND, REPORTED
+from px4fuse.findings.cause_grouping import (
+    CAUSE_KEY,
+    NO_TAKE_OFF_CAUSE,
+    REPORTED_VARIANCE_CAUSE,
+    RESET_TIME_KEY,
+)
 from px4fuse.findings.imu import MIN_IMU_RATE_HZ, is_rate_too_low
 from px4fuse.findings.model import (
     Findings,
     error,
+    find_source_texts,
     finding,
     format_count,
     format_percent,
     note,
-    source_words,
     warning,
     zero_length_spans,
 )
-from px4fuse.findings.source_stamps import detect_arrival_times
+from px4fuse.findings.source_stamps import detect_arrival_timestamps
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
     Columns,
@@ -43,26 +51,27 @@ from px4fuse.flight.model import (
     white_noise_m,
 )
 
-# Minimum extent (m) of the positions (5th to 95th percentile) if the vehicle moves
+# The vehicle moves if the extent (m) of the positions is at least this (5th to 95th percentile)
 MIN_MOTION_RANGE_M = 0.5
-# Minimum extent of the positions / σ of the position noise if the vehicle moves: 3.29 for white
-# noise (5th to 95th percentile), plus 25 %
+# The vehicle moves if the ratio of this extent to the position noise σ is at least this: white
+# noise at rest has 3.29 (5th to 95th percentile), plus 25 %
 MIN_MOTION_RANGE_SIGMAS = 1.25 * 3.29
 # Minimum log likelihood ratio (nats) of low-pass filtered to white noise; for positions that are
 # not filtered it is 0 to 2
-MIN_LOW_PASS_GAIN_NATS = 6.0
-# Minimum log likelihood ratio (nats) of low-pass filtered noise to time-correlated noise without
-# lag
-MIN_LAG_NATS = 1.0
-# Lag from correlation > MAX_LAG_RATIO · upper 95 % limit of the delay: the delay is reported as lag
-MAX_LAG_RATIO = 4.0
+MIN_LOW_PASS_LIKELIHOOD_NATS = 6.0
+# Minimum log likelihood ratio (nats) of low-pass filtered to time-correlated noise, to report a
+# low-pass filter. Only the filter delays the positions
+MIN_LAG_LIKELIHOOD_NATS = 1.0
+# Maximum ratio of the lag estimated from the noise correlation to the upper 95 % limit of the time
+# offset. Above this ratio, the time offset is reported as the lag
+MAX_LAG_TO_DELAY_RATIO = 4.0
 # Minimum lag (s) due to a low-pass filter, for a warning: a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
 # Minimum lag (s) due to a low-pass filter, for severity error: a position error of 10 cm at 1 m/s
-MIN_LAG_ERROR_S = 0.10
+MIN_LAG_FOR_ERROR_S = 0.10
 # Minimum position jump (m) for a warning: twice the noise of good UWB (0.1 m)
 MIN_JUMP_M = 0.2
-# Minimum position jump / σ of time-correlated noise, for a warning
+# Minimum ratio of a position jump to the σ of time-correlated noise, for a warning
 MIN_JUMP_SIGMAS = 5.0
 # Minimum number of jumps with a change of reset_counter to report repeated jumps
 MIN_ANNOUNCED_JUMPS = 2
@@ -70,51 +79,53 @@ MIN_ANNOUNCED_JUMPS = 2
 MIN_UNANNOUNCED_JUMPS = 3
 # Minimum size (m) of a jump without a change of reset_counter
 MIN_UNANNOUNCED_JUMP_M = 0.1
-# Minimum jump without a change of reset_counter / median of the other position changes
+# Minimum ratio of a jump without a change of reset_counter to the median of position changes
 MIN_UNANNOUNCED_JUMP_RATIO = 8.0
-# Number of position changes whose median is compared with a jump
-MEDIAN_CHANGE_COUNT = 61
+# Number of successive position changes around a jump, whose median is compared with the jump
+CHANGE_WINDOW_SAMPLES = 61
 # Minimum number of positions to detect jumps
 MIN_POSITIONS_FOR_JUMPS = 100
-# Minimum time (s) and number of positions for which a jump lasts: outliers are shorter
-MIN_LASTING_S, MIN_LASTING_SAMPLES = 0.6, 9
-# A jump lasts if |change of the median position - jump| / size of the jump is smaller
-MAX_LASTING_RATIO = 0.5
-# Maximum interval before a jump / median interval: in a longer interval, the vehicle moves
+# Minimum time (s) and number of positions after a jump without return: outliers return earlier
+MIN_JUMP_DURATION_S, MIN_JUMP_DURATION_SAMPLES = 0.6, 9
+# The shift between the median positions before and after a jump differs from the jump by less than
+# this fraction of the jump; otherwise the positions have returned
+MAX_SHIFT_DEVIATION_RATIO = 0.5
+# Maximum ratio of the interval before a jump to the median interval: a position change in a longer
+# interval may be motion
 MAX_JUMP_INTERVAL_RATIO = 1.5
 # The positions alternate between two points if at least this fraction of the jumps is opposite to
 # the previous jump
-MIN_RETURN_FRACTION = 0.7
+MIN_REVERSED_JUMP_FRACTION = 0.7
 # Maximum time (s) from a position jump to the reset of EKF2 that the jump causes
-MAX_JUMP_TO_RESET_S = 5.0
+MAX_JUMP_TO_RESET_TIME_S = 5.0
 # Maximum number of jumps whose times are printed
 MAX_LISTED_JUMPS = 8
 # Maximum rounding difference (s) between the time of a position and that of its reset_counter
 RESET_TOLERANCE_S = 1e-4
 # Bits of EKF2_EV_CTRL: horizontal position, and height
-HORIZONTAL_CONTROL, HEIGHT_CONTROL = 1, 2
+HORIZONTAL_CONTROL_BIT, HEIGHT_CONTROL_BIT = 1, 2
 # Maximum time (s) between a jump and the increment of reset_counter: two intervals at 2 Hz
-MAX_JUMP_TO_COUNTER_S = 1.0
+MAX_JUMP_TO_COUNTER_TIME_S = 1.0
 # Minimum position jump (m) for severity error: five times the noise of good UWB (0.1 m)
-MIN_JUMP_ERROR_M = 0.5
+MIN_JUMP_FOR_ERROR_M = 0.5
 # Minimum scale factor error (ratio minus 1) for a warning: flights without a fault reach 0.11
-MIN_SCALE_ERROR_WARNING = 0.12
+MIN_SCALE_ERROR_FOR_WARNING = 0.12
 # Minimum scale factor error (ratio minus 1) for severity error: 1 m in a distance of 7 m
-MIN_SCALE_ERROR_SEVERE = 0.15
+MIN_SCALE_ERROR_FOR_ERROR = 0.15
 # Minimum |scale factor error| / σ of its estimate, for a warning: 0.3 % of correct sources exceed 3
 MIN_SCALE_ERROR_SIGMAS = 3.0
 # Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
 MIN_OUTLIER_FRACTION = 0.005
-# Minimum fraction of outliers for severity error: one in 10 s at 5 Hz
-MIN_OUTLIER_FRACTION_ERROR = 0.02
+# Minimum fraction of outliers for severity error: one outlier in 10 s at 5 Hz
+MIN_OUTLIER_FRACTION_FOR_ERROR = 0.02
 # Minimum number of outliers for a finding
 MIN_OUTLIERS = 3
-# Rejected outliers are counted if the log has the innovations of a larger fraction of the positions
-MIN_INNOVATION_FRACTION = 0.75
+# Minimum fraction of positions with logged innovations, to state the number of rejected outliers
+MIN_LOGGED_FRACTION = 0.75
 # Minimum factor between reported and estimated position variance for a warning
 MIN_VARIANCE_RATIO = 2.0
 # Minimum factor between reported and estimated position variance for severity error
-MIN_VARIANCE_RATIO_ERROR = 3.0
+MIN_VARIANCE_RATIO_FOR_ERROR = 3.0
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -139,39 +150,42 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
         or source.origin.reconstructed
         or not _is_clock_known(analysis)
         or not isinstance(low_pass, SourceLowPass)
-        or low_pass.likelihood_gain_nats < MIN_LOW_PASS_GAIN_NATS
+        or low_pass.likelihood_gain_nats < MIN_LOW_PASS_LIKELIHOOD_NATS
         or low_pass.lag_s < MIN_LAG_S
     ):
         return None
     clock, correlated_noise = analysis.clock, analysis.time_correlated_noise
-    # At a high rate, the time offset (negative for a lag) is more accurate than the correlation
-    lag_limit_s = -MAX_LAG_RATIO * clock.interval_s[0] if isinstance(clock, ClockOffset) else 0.0
+    # At a high rate, the time offset (negative for a lag) shows the lag more accurately than the
+    # noise correlation
+    lag_limit_s = (
+        -MAX_LAG_TO_DELAY_RATIO * clock.interval_s[0] if isinstance(clock, ClockOffset) else 0.0
+    )
     if isinstance(clock, ClockOffset) and low_pass.lag_s > lag_limit_s >= MIN_LAG_S:
         low_pass = replace(low_pass, lag_s=-clock.offset_s)
     # A low-pass filter delays positions: correlated errors without lag have another cause
     if (
         isinstance(correlated_noise, TimeCorrelatedNoise)
-        and correlated_noise.low_pass_likelihood_gain_nats < MIN_LAG_NATS
+        and correlated_noise.low_pass_likelihood_gain_nats < MIN_LAG_LIKELIHOOD_NATS
     ):
         return None
     return low_pass
 
 
 def _is_clock_known(analysis: Analysis) -> bool:
-    return isinstance(analysis.clock, ClockOffset) and not any(detect_arrival_times(analysis))
+    return isinstance(analysis.clock, ClockOffset) and not any(detect_arrival_timestamps(analysis))
 
 
 def detect_low_pass(analysis: Analysis) -> Findings:
     low_pass = find_low_pass(analysis)
     if low_pass is not None:
-        make_finding = error if low_pass.lag_s >= MIN_LAG_ERROR_S else warning
+        make_finding = error if low_pass.lag_s >= MIN_LAG_FOR_ERROR_S else warning
         yield make_finding(
             "source_low_pass_filtered",
             f"{positions_phrase(analysis.source)} are low-pass filtered and lag by "
             f"{low_pass.lag_s:.2f} s. The correlation of successive errors is "
             f"{low_pass.correlation:.1f}; the noise before filtering is {low_pass.sigma_z_m:.2g} "
             "m. KF and EKF2 assume independent errors, so both are overconfident and lag.",
-            f"{source_words(analysis.source).smoothing_action} Do not change the timestamps, "
+            f"{find_source_texts(analysis.source).smoothing_action} Do not change the timestamps, "
             "because the positions are late, not the timestamps.",
             asdict(low_pass),
         )
@@ -180,30 +194,38 @@ def detect_low_pass(analysis: Analysis) -> Findings:
 def detect_jumps(analysis: Analysis) -> Findings:
     """Detect position jumps that the IMU does not measure."""
     systematic_errors = analysis.systematic_errors
-    # A change of the time offset also shifts the positions of a moving vehicle
-    if not isinstance(systematic_errors, SystematicErrors) or any(detect_arrival_times(analysis)):
+    # A change from arrival to measurement times shifts the positions of a moving vehicle, like a
+    # jump
+    if not isinstance(systematic_errors, SystematicErrors) or any(
+        detect_arrival_timestamps(analysis)
+    ):
         return
     correlated_noise = analysis.time_correlated_noise
     min_jump_m = MIN_JUMP_M
     if not isinstance(correlated_noise, Unavailable):
-        # Time-correlated noise changes by up to √2 σ within seconds, which resembles a jump
+        # Time-correlated noise also changes within seconds (1 σ of the change: up to √2 σ)
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
     large_jumps = [jump for jump in systematic_errors.jumps if jump.size_m >= min_jump_m]
-    counter_changes_s = reset_times_s(analysis.source)
+    counter_change_times_s = reset_times_s(analysis.source)
     if large_jumps:
         largest_jump = max(large_jumps, key=lambda jump: jump.size_m)
-        size_m, jump_s, sigma_m = (
+        size_m, jump_time_s, sigma_m = (
             largest_jump.size_m,
             largest_jump.time_s,
             max(step.sigma for step in largest_jump.step_m),
         )
-        positions = positions_phrase(analysis.source)
-        texts = source_words(analysis.source)
+        positions_text = positions_phrase(analysis.source)
+        texts = find_source_texts(analysis.source)
         cause = f"Possible causes: {texts.jump}."
-        evidence = {"count": len(large_jumps), "size_m": size_m, "at_s": jump_s, "sigma_m": sigma_m}
-        if np.any(np.abs(counter_changes_s - jump_s) < MAX_JUMP_TO_COUNTER_S):
-            evidence[ANNOUNCED] = float(
-                counter_changes_s[np.argmin(np.abs(counter_changes_s - jump_s))]
+        evidence = {
+            "count": len(large_jumps),
+            "size_m": size_m,
+            "at_s": jump_time_s,
+            "sigma_m": sigma_m,
+        }
+        if np.any(np.abs(counter_change_times_s - jump_time_s) < MAX_JUMP_TO_COUNTER_TIME_S):
+            evidence[RESET_TIME_KEY] = float(
+                counter_change_times_s[np.argmin(np.abs(counter_change_times_s - jump_time_s))]
             )
             cause = (
                 "The source announced the jump (reset_counter): it relocalised or set a new origin."
@@ -216,11 +238,11 @@ def detect_jumps(analysis: Analysis) -> Findings:
         if len(large_jumps) > 1:
             jump_text = f"jump {format_count(len(large_jumps))}, by up to {size_m:.2f} m"
         yield finding(
-            "error" if size_m >= MIN_JUMP_ERROR_M else "warning",
+            "error" if size_m >= MIN_JUMP_FOR_ERROR_M else "warning",
             "source_position_jump",
-            f"{positions} {jump_text} at {jump_s:.1f} s and {end_text}. The IMU measures no such "
-            f"motion (± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow the jump, and "
-            "their innovations stay consistent.",
+            f"{positions_text} {jump_text} at {jump_time_s:.1f} s and {end_text}. The IMU measures "
+            f"no such motion (± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow the "
+            "jump, and their innovations stay consistent.",
             f"{texts.jump_action} Analyse only the time before or after the jump (--start, --end).",
             evidence,
             zero_length_spans(jump.time_s for jump in large_jumps),
@@ -235,33 +257,33 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
     if not (is_single_coordinate or is_height_only(source)) or (
         is_single_coordinate and source.step_m > 0.0
     ):
-        return  # rounded positions may stay within one step
+        return  # coarsely rounded positions may be constant while the vehicle moves
     values_m = dict(zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True))
-    name, bit, make_finding = "source_coordinate_constant", HORIZONTAL_CONTROL, error
+    name, bit, make_finding = "source_coordinate_constant", HORIZONTAL_CONTROL_BIT, error
     consequence = "px4fuse estimates nothing from these positions."
     if names == ["z"]:
-        name, bit, make_finding = "source_height_constant", HEIGHT_CONTROL, warning
+        name, bit, make_finding = "source_height_constant", HEIGHT_CONTROL_BIT, warning
         consequence = "The height is not evaluated."
     elif names == ["x", "y"]:
         make_finding = warning
         consequence = "Only the height is a measurement. The horizontal position is not evaluated."
     action, listed_names = "", " and ".join(names)
     if parameter in analysis.flight.log.parameters:
-        control = int(analysis.flight.log.parameters[parameter])
-        action = f"Leave {parameter} at {control}"
-        if control & bit:
-            fused_bit = HORIZONTAL_CONTROL + HEIGHT_CONTROL - bit
-            action = f"Set {parameter} to {control & ~bit | fused_bit}"
+        control_mask = int(analysis.flight.log.parameters[parameter])
+        action = f"Leave {parameter} at {control_mask}"
+        if control_mask & bit:
+            other_bit = HORIZONTAL_CONTROL_BIT + HEIGHT_CONTROL_BIT - bit
+            action = f"Set {parameter} to {control_mask & ~bit | other_bit}"
         elif names == ["z"]:
             make_finding = note
         action += f", so that EKF2 does not fuse {listed_names}. "
-    subject = f"coordinate {listed_names} of {source.name} is"
+    coordinate_text = f"coordinate {listed_names} of {source.name} is"
     if not is_single_coordinate:
-        subject = f"coordinates {listed_names} of {source.name} are"
+        coordinate_text = f"coordinates {listed_names} of {source.name} are"
     values_text = ", ".join(f"{values_m[each]:g}" for each in names)
     yield make_finding(
         name,
-        f"The {subject} constant ({values_text} m): the source does not measure "
+        f"The {coordinate_text} constant ({values_text} m): the source does not measure "
         f"{'it' if is_single_coordinate else 'them'}. {consequence}",
         f"{action}Send NaN for a coordinate that is not measured.",
         {f"{each}_m": value for each, value in values_m.items()},
@@ -279,25 +301,27 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
         np.array([step_m for _, step_m in jumps]),
     )
     sizes_m = np.linalg.norm(steps_m, axis=1)
-    resets_s = [
+    ekf2_reset_times_s = [
         reset.time_s
         for reset in (ekf2.resets if isinstance(ekf2, Ekf2) else ())
         if reset.quantity == "position" and any(reset.delta[:2])
     ]
-    jump_to_reset_s = [
-        min(waits_after_jump_s)
-        for jump_s in times_s
+    reset_delays_s = [
+        min(delays_after_jump_s)
+        for jump_time_s in times_s
         if (
-            waits_after_jump_s := [
-                at_s - jump_s for at_s in resets_s if 0.0 < at_s - jump_s < MAX_JUMP_TO_RESET_S
+            delays_after_jump_s := [
+                at_s - jump_time_s
+                for at_s in ekf2_reset_times_s
+                if 0.0 < at_s - jump_time_s < MAX_JUMP_TO_RESET_TIME_S
             ]
         )
     ]
     reset_sentence = ""
-    if jump_to_reset_s:
+    if reset_delays_s:
         reset_sentence = (
             " EKF2 rejects the positions after a jump and resets its position "
-            f"{np.median(jump_to_reset_s):.1f} s later."
+            f"{np.median(reset_delays_s):.1f} s later."
         )
     listed_times = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
     is_reversal = np.sum(steps_m[1:] * steps_m[:-1], axis=1) < 0.0
@@ -305,9 +329,9 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
     cause_sentence = "The source (VIO or SLAM) drifts and corrects its drift."
     if not is_announced:
         counter_text = "without a change of its reset_counter"
-        cause_sentence = f"Possible causes: {source_words(analysis.source).jump}."
-    action = "Improve the tracking of the source, or correct the drift in smaller steps."
-    if is_reversal.mean() >= MIN_RETURN_FRACTION:
+        cause_sentence = f"Possible causes: {find_source_texts(analysis.source).jump}."
+    action = "Improve the tracking of the source, or let it correct its drift in smaller steps."
+    if is_reversal.mean() >= MIN_REVERSED_JUMP_FRACTION:
         cause_sentence = (
             "The source alternately sends the positions of two points, "
             f"{np.median(sizes_m):.2f} m apart."
@@ -327,7 +351,7 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
 def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
     """Return time (s) and step (m) of each jump, and True if ``reset_counter`` changes with them.
 
-    If it does not change, a jump must last for :data:`MIN_LASTING_S`, and must be
+    If it does not change, a jump must last for :data:`MIN_JUMP_DURATION_S`, and must be
     :data:`MIN_UNANNOUNCED_JUMP_RATIO` times larger than other position changes.
     """
     position_m = cut_to_segment(analysis.source.samples, analysis.segment)[
@@ -338,38 +362,42 @@ def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
     time_s, steps_m = position_m.index.to_numpy(), np.diff(position_m.to_numpy(), axis=0)
     if len(steps_m) < MIN_POSITIONS_FOR_JUMPS:
         return [], False
-    excess_steps_m = steps_m[1:-1] - 0.5 * (steps_m[:-2] + steps_m[2:])
-    excess_sizes_m, intervals_s = np.linalg.norm(excess_steps_m, axis=1), np.diff(time_s)[1:-1]
+    jump_steps_m = steps_m[1:-1] - 0.5 * (steps_m[:-2] + steps_m[2:])
+    jump_sizes_m, intervals_s = np.linalg.norm(jump_steps_m, axis=1), np.diff(time_s)[1:-1]
     reset_rows = np.searchsorted(time_s, reset_times_s(analysis.source) - RESET_TOLERANCE_S) - 2
-    reset_rows = reset_rows[(reset_rows >= 0) & (reset_rows < len(excess_sizes_m))]
-    reset_rows = reset_rows[excess_sizes_m[reset_rows] >= MIN_JUMP_M]
+    reset_rows = reset_rows[(reset_rows >= 0) & (reset_rows < len(jump_sizes_m))]
+    reset_rows = reset_rows[jump_sizes_m[reset_rows] >= MIN_JUMP_M]
     if len(reset_rows) >= MIN_ANNOUNCED_JUMPS:
-        return [(float(time_s[row + 2]), excess_steps_m[row]) for row in reset_rows], True
+        return [(float(time_s[row + 2]), jump_steps_m[row]) for row in reset_rows], True
     median_change_m = (
-        pd.Series(excess_sizes_m).rolling(MEDIAN_CHANGE_COUNT, center=True, min_periods=1).median()
+        pd.Series(jump_sizes_m).rolling(CHANGE_WINDOW_SAMPLES, center=True, min_periods=1).median()
     )
     limit_m = np.maximum(
         MIN_UNANNOUNCED_JUMP_M, MIN_UNANNOUNCED_JUMP_RATIO * median_change_m.to_numpy()
     )
-    is_jump = (excess_sizes_m > limit_m) & (
+    is_jump = (jump_sizes_m > limit_m) & (
         intervals_s < MAX_JUMP_INTERVAL_RATIO * np.median(intervals_s)
     )
-    lasting_count = max(MIN_LASTING_SAMPLES, round(MIN_LASTING_S / float(np.median(intervals_s))))
+    window_count = max(
+        MIN_JUMP_DURATION_SAMPLES, round(MIN_JUMP_DURATION_S / float(np.median(intervals_s)))
+    )
     jumps = []
     for row in np.flatnonzero(is_jump) + 2:  # the first position after the jump
-        before_m, after_m = (
-            position_m.iloc[max(row - lasting_count, 0) : row],
-            position_m.iloc[row:][:lasting_count],
+        positions_before_m, positions_after_m = (
+            position_m.iloc[max(row - window_count, 0) : row],
+            position_m.iloc[row:][:window_count],
         )
-        steps_around_m = steps_m[max(row - lasting_count, 0) : row + lasting_count]
+        nearby_steps_m = steps_m[max(row - window_count, 0) : row + window_count]
         lasting_shift_m = (
-            after_m.median() - before_m.median() - lasting_count * np.median(steps_around_m, axis=0)
+            positions_after_m.median()
+            - positions_before_m.median()
+            - window_count * np.median(nearby_steps_m, axis=0)
         )
         if (
-            np.linalg.norm(lasting_shift_m - excess_steps_m[row - 2])
-            < MAX_LASTING_RATIO * excess_sizes_m[row - 2]
+            np.linalg.norm(lasting_shift_m - jump_steps_m[row - 2])
+            < MAX_SHIFT_DEVIATION_RATIO * jump_sizes_m[row - 2]
         ):
-            jumps.append((float(time_s[row]), excess_steps_m[row - 2]))
+            jumps.append((float(time_s[row]), jump_steps_m[row - 2]))
     return jumps, False
 
 
@@ -380,32 +408,32 @@ def detect_scale_error(analysis: Analysis) -> Findings:
         return
     if (
         analysis.source.origin.is_gnss  # GNSS has no scale factor error
-        or isinstance(analysis.flight.truth, Truth)  # source_patterns compares with ground truth
+        or isinstance(analysis.flight.truth, Truth)  # source_patterns finds the error more exactly
         or not isinstance(systematic_errors, SystematicErrors)
-        # a low-pass filter reduces the motion, and time-correlated noise may resemble a scale error
+        # the effect of a low-pass filter or of time-correlated noise may resemble a scale error
         or find_low_pass(analysis) is not None
         or not isinstance(analysis.time_correlated_noise, Unavailable)
         or not _is_clock_known(analysis)
     ):
         return
     scale_error, sigma = systematic_errors.scale.value, systematic_errors.scale.sigma
-    if abs(scale_error) >= max(MIN_SCALE_ERROR_WARNING, MIN_SCALE_ERROR_SIGMAS * sigma):
+    if abs(scale_error) >= max(MIN_SCALE_ERROR_FOR_WARNING, MIN_SCALE_ERROR_SIGMAS * sigma):
         yield finding(
-            "error" if abs(scale_error) >= MIN_SCALE_ERROR_SEVERE else "warning",
+            "error" if abs(scale_error) >= MIN_SCALE_ERROR_FOR_ERROR else "warning",
             "source_scale_error",
             f"{source_name(analysis.source)} distances are "
             f"{format_percent(abs(scale_error))} too {'long' if scale_error > 0 else 'short'}. The "
             f"comparison with the IMU is accurate to ± {format_percent(1.96 * sigma)} (95 %). "
             "Innovations do not show a scale factor error.",
             "Measure a known distance with the source. Then check "
-            f"{source_words(analysis.source).scale}. If the distance is right, calibrate the "
+            f"{find_source_texts(analysis.source).scale}. If the distance is right, calibrate the "
             "accelerometers.",
             {"scale": 1.0 + scale_error, "sigma": sigma},
         )
 
 
 def detect_outliers(analysis: Analysis) -> Findings:
-    """Detect more outliers than Gaussian noise has."""
+    """Detect more outliers of the innovations than Gaussian noise causes."""
     axis_tuning = analysis.tuning.get(HORIZONTAL) or next(iter(analysis.tuning.values()), None)
     if not isinstance(axis_tuning, AxisTuning):
         return
@@ -419,24 +447,24 @@ def detect_outliers(analysis: Analysis) -> Findings:
         time_s
         for time_s in axis_tuning.outlier_time_s.tolist()
         if not any(
-            jump_s - OUTLIER_BURST_S <= time_s < jump_s + OUTLIER_RETEST_DURATION_S
-            for jump_s in jump_times_s
+            jump_time_s - OUTLIER_BURST_S <= time_s < jump_time_s + OUTLIER_RETEST_DURATION_S
+            for jump_time_s in jump_times_s
         )
     ]
     outlier_count, outlier_fraction = len(outlier_times_s), len(outlier_times_s) / axis_tuning.count
     if outlier_fraction < MIN_OUTLIER_FRACTION or outlier_count < MIN_OUTLIERS:
         return
-    texts = source_words(analysis.source)
-    sizes_m, reference = outlier_sizes_m(analysis, np.array(outlier_times_s))
+    texts = find_source_texts(analysis.source)
+    sizes_m, reference = compute_outlier_sizes_m(analysis, np.array(outlier_times_s))
     yield finding(
-        "error" if outlier_fraction >= MIN_OUTLIER_FRACTION_ERROR else "warning",
+        "error" if outlier_fraction >= MIN_OUTLIER_FRACTION_FOR_ERROR else "warning",
         "source_outliers",
         f"{outlier_count} of {axis_tuning.count} {positions_phrase(analysis.source)} "
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
         f"{format_metres(float(sizes_m.max()))} m. Their median distance to {reference} is "
         f"{format_metres(float(np.median(sizes_m)))} m. Possible cause: {texts.outliers}. KF "
         "rejects no outliers and follows each "
-        f"outlier.{_rejected_outliers_sentence(analysis, outlier_times_s)}",
+        f"outlier.{_format_rejected_outliers(analysis, outlier_times_s)}",
         texts.outliers_action,
         {
             "count": outlier_count,
@@ -448,7 +476,7 @@ def detect_outliers(analysis: Analysis) -> Findings:
     )
 
 
-def outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, str]:
+def compute_outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, str]:
     """Return the horizontal distances (m) of outliers from a reference, and its name.
 
     The reference is ground truth or, without it, the neighbouring positions.
@@ -468,16 +496,16 @@ def outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[Array, s
     return np.sqrt(squares_m2), "ground truth" if has_truth else "the neighbouring positions"
 
 
-def _rejected_outliers_sentence(analysis: Analysis, outlier_times_s: Sequence[float]) -> str:
+def _format_rejected_outliers(analysis: Analysis, outlier_times_s: Sequence[float]) -> str:
     innovations = analysis.main.ekf2_innovations
     if not isinstance(innovations, pd.DataFrame) or innovations["rejected"].isna().any():
         return ""
-    if len(innovations) < MIN_INNOVATION_FRACTION * len(analysis.main.axis.measurement_time_s):
+    if len(innovations) < MIN_LOGGED_FRACTION * len(analysis.main.axis.measurement_time_s):
         return ""
-    rejected_s = innovations.index[innovations["rejected"] > 0.0].to_numpy()
+    rejection_times_s = innovations.index[innovations["rejected"] > 0.0].to_numpy()
     tolerance_s = 0.5 / analysis.source.compute_rate_hz()
     rejected_count = sum(
-        bool(np.any(np.abs(rejected_s - time_s) < tolerance_s)) for time_s in outlier_times_s
+        bool(np.any(np.abs(rejection_times_s - time_s) < tolerance_s)) for time_s in outlier_times_s
     )
     return f" EKF2's gate rejected {rejected_count} of the {len(outlier_times_s)} outliers."
 
@@ -497,38 +525,38 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
     noise_m, low, high = noise.value, noise.low, noise.high
     if reported_variance_m2.empty or noise_m is None or low is None or high is None:
         return
-    reported_m = float(np.sqrt(reported_variance_m2.to_numpy().mean(axis=1)).mean())
-    variance_ratio = (reported_m / noise_m) ** 2
+    reported_sigma_m = float(np.sqrt(reported_variance_m2.to_numpy().mean(axis=1)).mean())
+    variance_ratio = (reported_sigma_m / noise_m) ** 2
     ratio = max(variance_ratio, 1.0 / variance_ratio)
     # R has to include time-correlated errors, too, which innovations do not show
-    rmse_m = _rmse_per_axis_m(analysis) if variance_ratio > 1.0 else None
-    if rmse_m is not None and reported_m**2 < MIN_VARIANCE_RATIO * rmse_m**2:
+    rmse_m = _compute_rmse_per_axis_m(analysis) if variance_ratio > 1.0 else None
+    if rmse_m is not None and reported_sigma_m**2 < MIN_VARIANCE_RATIO * rmse_m**2:
         return
-    if ratio >= MIN_VARIANCE_RATIO and not low <= reported_m <= high:
+    if ratio >= MIN_VARIANCE_RATIO and not low <= reported_sigma_m <= high:
         direction, correlation_note = "small" if variance_ratio < 1.0 else "large", ""
         if direction == "large" and rmse_m is None:
             correlation_note = " The reported σ may include time-correlated errors."
-        severity: Severity = "error" if ratio >= MIN_VARIANCE_RATIO_ERROR else "warning"
-        effect = "EKF2 uses this variance or EKF2_EVP_NOISE², the larger one (EKF2_EV_NOISE_MD 0)."
+        severity: Severity = "error" if ratio >= MIN_VARIANCE_RATIO_FOR_ERROR else "warning"
+        effect = "EKF2 uses the larger of it and EKF2_EVP_NOISE² (EKF2_EV_NOISE_MD 0)."
         if analysis.flight.log.parameters.get("EKF2_EV_NOISE_MD") == 1:
-            severity, effect = "note", "EKF2 does not use this variance (EKF2_EV_NOISE_MD 1)."
+            severity, effect = "note", "EKF2 ignores reported variances (EKF2_EV_NOISE_MD 1)."
         yield finding(
             severity,
             "source_reported_variance_wrong",
             f"The variance that {source_name(source)} reports is {format_factor(ratio)} times too "
-            f"{direction}. The reported σ is {reported_m:.3g} m, the position noise {noise_m:.3g} "
-            f"m (95 % {low:.3g} to {high:.3g} m). {effect}{correlation_note}",
+            f"{direction}. The reported σ is {reported_sigma_m:.3g} m, the position noise "
+            f"{noise_m:.3g} m (95 % {low:.3g} to {high:.3g} m). {effect}{correlation_note}",
             f"Report a variance of {noise_m**2:.2g} m² with each position.",
             {
-                "reported_sigma_m": reported_m,
+                "reported_sigma_m": reported_sigma_m,
                 "sigma_z_m": noise_m,
                 "variance_factor": variance_ratio,
-                CAUSE: REPORTED if severity != "note" else "",
+                CAUSE_KEY: REPORTED_VARIANCE_CAUSE if severity != "note" else "",
             },
         )
 
 
-def _rmse_per_axis_m(analysis: Analysis) -> float | None:
+def _compute_rmse_per_axis_m(analysis: Analysis) -> float | None:
     mean_squares_m2 = []
     for result in select_north_and_east(analysis):
         if isinstance(result.truth, Unavailable):
@@ -541,8 +569,8 @@ def _rmse_per_axis_m(analysis: Analysis) -> float | None:
     return float(np.sqrt(np.mean(mean_squares_m2))) if mean_squares_m2 else None
 
 
-def motion_range_m(comparison: Comparison) -> float:
-    """Return the extent (m) of the positions along north or east, 5th to 95th percentile."""
+def compute_motion_range_m(comparison: Comparison) -> float:
+    """Return the larger extent (m) of the positions, north or east, 5th to 95th percentile."""
     samples = cut_to_segment(comparison.source.samples, comparison.segment)
     low, high = samples[Columns.POSITION[:2]].quantile([0.05, 0.95]).to_numpy()
     return float(np.max(high - low))
@@ -554,12 +582,14 @@ def has_little_motion(comparison: Comparison) -> bool:
         Columns.POSITION[:2]
     ].dropna()
     noise_m = white_noise_m(positions.to_numpy())
-    return motion_range_m(comparison) < max(MIN_MOTION_RANGE_M, MIN_MOTION_RANGE_SIGMAS * noise_m)
+    return compute_motion_range_m(comparison) < max(
+        MIN_MOTION_RANGE_M, MIN_MOTION_RANGE_SIGMAS * noise_m
+    )
 
 
 def detect_little_motion(analysis: Analysis) -> Findings:
     """Detect too little motion to estimate velocity, heading and time offset."""
-    extent_m = motion_range_m(analysis)
+    extent_m = compute_motion_range_m(analysis)
     if has_little_motion(analysis):
         yield warning(
             "no_motion",
@@ -567,5 +597,6 @@ def detect_little_motion(analysis: Analysis) -> Findings:
             "positions (5th to 95th percentile). Velocity, heading and time offset cannot be "
             "estimated from this flight.",
             "Fly several passes of 5 m or more, with clear starts and stops.",
-            {"range_m": extent_m} | ({CAUSE: GROUND} if analysis.flight.airborne == () else {}),
+            {"range_m": extent_m}
+            | ({CAUSE_KEY: NO_TAKE_OFF_CAUSE} if analysis.flight.airborne == () else {}),
         )

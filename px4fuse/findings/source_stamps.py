@@ -27,58 +27,58 @@ from px4fuse.flight.model import (
 # Jitter of receive times is reported above this value (s): a position error of 1 cm at 1 m/s
 MAX_RECEIPT_JITTER_S = 0.010
 # A timestamp is an arrival time if PX4 publishes the position within this time (s) after it
-MAX_ARRIVAL_AGE_S = 0.001
+MAX_ARRIVAL_TIME_AGE_S = 0.001
 # Minimum latency (s) for a warning: a position error of 2 cm at 1 m/s
 MIN_LATENCY_S = 0.02
 # Minimum latency (s) for severity error: a position error of 10 cm at 1 m/s
-MIN_LATENCY_ERROR_S = 0.10
-# The latency grows in flight if its rank correlation with time exceeds this value
-MIN_LATENCY_TREND = 0.8
+MIN_LATENCY_FOR_ERROR_S = 0.10
+# The latency of the positions grows in flight if its rank correlation with time is at least this
+MIN_LATENCY_CORRELATION = 0.8
 # Minimum fraction of positions that EKF2 drops because of their latency, for a finding
 MIN_DROPPED_FRACTION = 0.02
-# Minimum number of positions before the convergence of TIMESYNC, and also after it
+# Minimum number of positions before the convergence of TIMESYNC, and after it, to detect it
 MIN_SAMPLES = 10
-# Minimum fraction of timestamps that are arrival times before TIMESYNC converges, and measurement
-# times afterwards
+# TIMESYNC converged in flight if at least this fraction of timestamps are arrival times before
+# that, and if at least this fraction are measurement times afterwards
 MIN_CONSISTENT_FRACTION = 0.95
 # Minimum mean number of positions that arrive together (burst)
-MIN_BURST_SIZE = 2.5
+MIN_BURST_POSITIONS = 2.5
 # Minimum number of bursts. With fewer bursts, the pauses are gaps in the position source
 MIN_BURST_COUNT = 20
-# Maximum duration of a burst / pause between bursts
+# Maximum ratio of the duration of a burst to the pause between bursts
 MAX_BURST_DURATION_RATIO = 0.3
-ANSWER_TIMESYNC = (
+ANSWER_TIMESYNC_ACTION = (
     "Let the companion computer answer TIMESYNC (MAVROS does by default; with pymavlink answer "
     "every request). Send positions only after 500 answers, which take 50 s at 10 Hz."
 )
 
 
 def detect(analysis: Analysis) -> Findings:
-    clock, positions = analysis.source.clock_map, positions_phrase(analysis.source)
-    if clock is None:
-        yield from detect_arrival_times(analysis)
+    clock_map, positions_text = analysis.source.clock_map, positions_phrase(analysis.source)
+    if clock_map is None:
+        yield from detect_arrival_timestamps(analysis)
         yield from detect_varying_latency(analysis)
-    elif clock.note == REPEATED_TIMESTAMPS and clock.distinct_stamps:
-        yield from detect_shared_timestamps(analysis, clock.pairs, clock.distinct_stamps)
-    elif clock.clock in AGE_TEXT_BY_WRONG_TIMESTAMP:
-        yield from detect_timestamp_unit(analysis, clock.clock)
-    elif clock.distinct_stamps is not None:
-        yield from detect_constant_timestamps(positions, clock, clock.distinct_stamps)
-    elif clock.method in ARRIVAL_METHODS:
+    elif clock_map.note == REPEATED_TIMESTAMPS and clock_map.distinct_stamps:
+        yield from detect_shared_timestamps(analysis, clock_map.pairs, clock_map.distinct_stamps)
+    elif clock_map.clock in AGE_TEXT_BY_WRONG_TIMESTAMP:
+        yield from detect_timestamp_unit(analysis, clock_map.clock)
+    elif clock_map.distinct_stamps is not None:
+        yield from detect_constant_timestamps(positions_text, clock_map, clock_map.distinct_stamps)
+    elif clock_map.method in ARRIVAL_METHODS:
         kf_times_sentence = (
             "KF uses the timestamps of the messages, converted to the autopilot's boot clock by "
-            f"the {clock.method}."
+            f"the {clock_map.method}."
         )
-        if clock.method == "arrival time":
+        if clock_map.method == "arrival time":
             kf_times_sentence = (
                 "KF also uses arrival times, so its track is late by the position latency."
             )
         yield warning(
             "companion_not_synchronised",
-            f"The source of the {positions} never synchronised its clock (TIMESYNC). EKF2 used "
-            f"arrival times as times of measurement. {kf_times_sentence}",
-            ANSWER_TIMESYNC,
-            {"jitter_s": clock.jitter_s},
+            f"The source of the {positions_text} never synchronised its clock (TIMESYNC). EKF2 "
+            f"used arrival times as times of measurement. {kf_times_sentence}",
+            ANSWER_TIMESYNC_ACTION,
+            {"jitter_s": clock_map.jitter_s},
         )
 
 
@@ -89,8 +89,8 @@ def detect_bursts(analysis: Analysis) -> Findings:
     if np.count_nonzero(is_pause) < MIN_BURST_COUNT:
         return
     burst_size, pause_s = 1.0 / float(is_pause.mean()), float(np.median(intervals_s[is_pause]))
-    burst_s = burst_size * float(np.median(intervals_s[~is_pause]))
-    if burst_size < MIN_BURST_SIZE or burst_s > MAX_BURST_DURATION_RATIO * pause_s:
+    burst_duration_s = burst_size * float(np.median(intervals_s[~is_pause]))
+    if burst_size < MIN_BURST_POSITIONS or burst_duration_s > MAX_BURST_DURATION_RATIO * pause_s:
         return
     yield error(
         "source_timestamp_jitter",
@@ -122,7 +122,7 @@ def detect_shared_timestamps(
     )
 
 
-def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
+def detect_timestamp_unit(analysis: Analysis, clock_name: str) -> Findings:
     """Report timestamps in a wrong unit or from another clock."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
@@ -132,55 +132,57 @@ def detect_timestamp_unit(analysis: Analysis, clock: str) -> Findings:
     ):
         fusion_sentence = (
             f"EKF2 never fused the positions, because it treats them as "
-            f"{AGE_TEXT_BY_WRONG_TIMESTAMP[clock]}. "
+            f"{AGE_TEXT_BY_WRONG_TIMESTAMP[clock_name]}. "
         )
-    is_unix = clock.startswith("UNIX") or clock == "another clock"
+    is_other_clock = clock_name.startswith("UNIX") or clock_name == "another clock"
     yield error(
         "source_timestamp_unit",
         f"The timestamps of the {positions_phrase(analysis.source)} are "
-        f"{'0 in every message' if clock == '0' else f'in {clock}'}. PX4 expects timestamp_sample "
-        f"in microseconds since the autopilot's boot. {fusion_sentence}px4fuse uses the arrival "
-        "times, which are late by the latency.",
-        SYNCHRONISE_ACTION if is_unix else SET_TIMESTAMP_ACTION,
-        {"clock": clock},
+        f"{'0 in every message' if clock_name == '0' else f'in {clock_name}'}. PX4 expects "
+        f"timestamp_sample in microseconds since the autopilot's boot. {fusion_sentence}px4fuse "
+        "uses the arrival times, which are late by the latency.",
+        SYNCHRONISE_ACTION if is_other_clock else SET_TIMESTAMP_ACTION,
+        {"clock": clock_name},
     )
 
 
-def detect_constant_timestamps(positions: str, clock: ClockMap, distinct_count: int) -> Findings:
+def detect_constant_timestamps(
+    positions_text: str, clock_map: ClockMap, distinct_count: int
+) -> Findings:
     yield error(
         "source_timestamps_constant",
-        f"The timestamps of {clock.pairs} {positions} have only {distinct_count} distinct "
+        f"The timestamps of {clock_map.pairs} {positions_text} have only {distinct_count} distinct "
         f"value{'s' if distinct_count > 1 else ''}. The time of measurement is unknown; px4fuse "
         "uses the receive time instead.",
         "Send the time of measurement in the message (usec, time_usec), in microseconds and as a "
         "64-bit integer.",
-        {"stamps": clock.pairs, "distinct": distinct_count},
+        {"stamps": clock_map.pairs, "distinct": distinct_count},
     )
-    if (jitter_s := clock.jitter_s) > MAX_RECEIPT_JITTER_S:
+    if (jitter_s := clock_map.jitter_s) > MAX_RECEIPT_JITTER_S:
         yield warning(
             "source_timestamp_jitter",
-            f"The receive times of the {positions} jitter by {jitter_s * 1e3:.0f} ms (1 σ). "
+            f"The receive times of the {positions_text} jitter by {jitter_s * 1e3:.0f} ms (1 σ). "
             "px4fuse uses them as timestamps. At 1 m/s this is a position error of "
             f"{format_metres(jitter_s)} m.",
-            "Send the time of measurement in the message, and record on the computer that "
-            "sends it.",
+            "Send the time of measurement in the message, and record the log on the computer that "
+            "sends the positions.",
             {"jitter_s": jitter_s},
         )
 
 
-def detect_arrival_times(analysis: Analysis) -> Findings:
+def detect_arrival_timestamps(analysis: Analysis) -> Findings:
     """Detect timestamps that are arrival times instead of times of measurement.
 
     Without TIMESYNC, PX4 uses the arrival time as timestamp (Timesync.cpp). The age of a position
     when PX4 publishes it is then zero instead of the latency.
     """
-    position_age_s = _position_age_s(analysis)
+    position_age_s = _find_position_age_s(analysis)
     if position_age_s is None:
         return
     synchronisation = find_synchronisation(analysis)
     if synchronisation is not None:
         until_s, latency_s = synchronisation
-        make_finding = error if latency_s >= MIN_LATENCY_ERROR_S else warning
+        make_finding = error if latency_s >= MIN_LATENCY_FOR_ERROR_S else warning
         airborne = analysis.flight.airborne
         if not isinstance(airborne, Unavailable) and all(start >= until_s for start, _ in airborne):
             make_finding = note
@@ -195,19 +197,19 @@ def detect_arrival_times(analysis: Analysis) -> Findings:
             {"until_s": until_s, "latency_s": latency_s},
             ((float(position_age_s.index[0]), until_s),),
         )
-    elif np.mean(position_age_s.abs() < MAX_ARRIVAL_AGE_S) >= MIN_CONSISTENT_FRACTION:
+    elif np.mean(position_age_s.abs() < MAX_ARRIVAL_TIME_AGE_S) >= MIN_CONSISTENT_FRACTION:
         yield warning(
             "source_timestamps_are_arrival_times",
             "Position timestamps are arrival times in the whole flight. The source was never "
             "synchronised with the autopilot (TIMESYNC), so every position is late by its latency.",
-            ANSWER_TIMESYNC,
+            ANSWER_TIMESYNC_ACTION,
             {"until_s": float(position_age_s.index[-1])},
         )
 
 
 def detect_varying_latency(analysis: Analysis) -> Findings:
     """Detect positions that arrive later and later, or too late for EKF2's buffer."""
-    position_age_s = _position_age_s(analysis)
+    position_age_s = _find_position_age_s(analysis)
     if position_age_s is None or find_synchronisation(analysis) is not None:
         return
     sample_count = max(MIN_SAMPLES, len(position_age_s) // 10)
@@ -216,7 +218,7 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
         for age_s in (position_age_s.iloc[:sample_count], position_age_s.iloc[-sample_count:])
     )
     change_text = "grows in flight"
-    trend = rank_correlation(position_age_s.index.to_numpy(), position_age_s.to_numpy())
+    age_correlation = rank_correlation(position_age_s.index.to_numpy(), position_age_s.to_numpy())
     ekf2, buffer_sentence, dropped_fraction = analysis.flight.ekf2, "", 0.0
     if isinstance(ekf2, Ekf2) and isinstance(ekf2.horizon_s, float):
         delay_s = 1e-3 * analysis.flight.log.parameters.get(EV_POS.delay, 0.0)
@@ -226,7 +228,7 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
             f" EKF2 drops positions that arrive later than {limit_s:.2f} s (here "
             f"{format_percent(dropped_fraction)})."
         )
-    if end_s - start_s < MIN_LATENCY_ERROR_S or trend < MIN_LATENCY_TREND:
+    if end_s - start_s < MIN_LATENCY_FOR_ERROR_S or age_correlation < MIN_LATENCY_CORRELATION:
         if not MIN_DROPPED_FRACTION < dropped_fraction < 1.0 - MIN_DROPPED_FRACTION:
             return
         change_text = "varies"
@@ -243,15 +245,16 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
 
 def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
     """Find the time (s) at which TIMESYNC converged in flight, and the position latency (s)."""
-    position_age_s = _position_age_s(analysis)
+    position_age_s = _find_position_age_s(analysis)
     if position_age_s is None:
         return None
-    is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_AGE_S).to_numpy()
-    # For each position: number of timestamps that contradict a convergence of TIMESYNC after it
-    contradicting_count: Array = (
+    is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_TIME_AGE_S).to_numpy()
+    # For each position: number of wrong timestamps if TIMESYNC converged directly after it. These
+    # are measurement times before the convergence, and arrival times after it
+    inconsistent_count: Array = (
         np.cumsum(~is_arrival_time) + np.sum(is_arrival_time) - np.cumsum(is_arrival_time)
     )
-    converged_index = int(np.argmin(contradicting_count)) + 1
+    converged_index = int(np.argmin(inconsistent_count)) + 1
     if (
         np.mean(is_arrival_time) >= MIN_CONSISTENT_FRACTION
         or min(converged_index, len(position_age_s) - converged_index) < MIN_SAMPLES
@@ -266,7 +269,7 @@ def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
     return float(position_age_s.index[converged_index]), latency_s
 
 
-def _position_age_s(analysis: Analysis) -> pd.Series | None:
+def _find_position_age_s(analysis: Analysis) -> pd.Series | None:
     """Return the age (s) of each position at its publication, from timestamp_sample.
 
     Return None if the log does not contain it.

@@ -16,18 +16,20 @@ from px4fuse.core.text import format_metres
 from px4fuse.ekf2.model import replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
 from px4fuse.filter.signals import cut_to_segment
-from px4fuse.findings.model import Findings, error, note, source_words, warning
+from px4fuse.findings.model import Findings, error, find_source_texts, note, warning
 from px4fuse.findings.source_intervals import describe_errors_after_gap
 from px4fuse.flight.model import Columns, Ekf2, Truth, Unavailable, positions_phrase, source_name
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
 # Minimum rounding step (m) for a finding: the error of smaller steps is below the noise of UWB
 MIN_ROUNDING_STEP_M = 0.05
-# Maximum position RMSE of an EKF2 replay with the new lever arm / with the old one, for a finding
+# Maximum ratio of EKF2's position RMSE in a replay with the estimated lever arm to that with the
+# lever arm used in flight, for a finding
 MAX_LEVER_ARM_RMSE_RATIO = 0.7
-# Minimum distance (m) between the positions of two senders that alternate: the noise of good UWB
+# Minimum distance (m) between the positions of two alternating senders, for a finding: smaller
+# distances may be the noise of good UWB
 MIN_SENDER_DISTANCE_M = 0.1
-# Minimum distance between the positions of two senders / noise σ: one sender reaches 2
+# Minimum ratio of this distance to its scatter (1 σ), for a finding: noise of one sender reaches 2
 MIN_SENDER_DISTANCE_SIGMAS = 4.0
 # Window length (samples) for the detection of two senders: short, because a lost sample exchanges
 # the senders of odd and even samples
@@ -37,14 +39,13 @@ WINDOW_SAMPLES = 16
 MIN_WINDOWS = 10
 # Positions are a copy of EKF2's position if their median distance is below this limit (m)
 MAX_COPY_DISTANCE_M = 0.01
-# Maximum median distance (m) between EKF2 and a copy that EKF2 fuses. It is small, because EKF2
-# follows any source that it fuses
+# The same limit (m) if EKF2 fuses the positions: smaller, because EKF2 follows each fused source
 MAX_FUSED_COPY_DISTANCE_M = 0.001
 # Positions are compared with EKF2's position above this speed (m/s): at rest, any source may agree
 MIN_COPY_SPEED_M_S = 0.2
-# Tested delays (s) of a copy of EKF2's position
+# Tested delays (s) between EKF2's position and a source that sends it back
 COPY_DELAYS_S = np.arange(0.0, 0.305, 0.005)
-NO_ESTIMATES = "px4fuse estimates nothing from these positions."
+NO_ESTIMATES_SENTENCE = "px4fuse estimates nothing from these positions."
 # For each reason of an invalid position: id of the finding, fault, and action
 INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
     "zero": (
@@ -83,8 +84,8 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_copied_estimate(analysis)
 
 
-def _consecutive_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
-    # Invalid samples between two valid samples are one span
+def _find_invalid_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
+    # Successive invalid samples have the same number of valid samples before them
     valid_count_before = np.searchsorted(valid_s, time_s)
     starts = np.flatnonzero(np.diff(valid_count_before, prepend=-1))
     ends = np.append(starts[1:], len(time_s)) - 1
@@ -98,26 +99,26 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         time_s = invalid[invalid == reason].index.to_numpy()
         if not (count := len(time_s)):
             continue
-        spans = _consecutive_spans(time_s, source.samples.index.to_numpy())
+        spans = _find_invalid_spans(time_s, source.samples.index.to_numpy())
         longest_span_s = max(spans, key=lambda span: span[1] - span[0])
         duration_s, total_s = (
             longest_span_s[1] - longest_span_s[0],
             sum(end - start for start, end in spans),
         )
-        fault = fault_template.format(positions=f"{count} {positions_phrase(source)}")
+        fault_sentence = fault_template.format(positions=f"{count} {positions_phrase(source)}")
         times = f"{len(spans)} parts from {spans[0][0]:.1f} s to {spans[-1][1]:.1f} s"
         if len(spans) <= 3:
             times = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
         error_text, make_finding = "", note if reason == "NaN" else warning
         if duration_s > compute_max_interval_s(1.0 / source.compute_rate_hz()):
             make_finding = warning
-            valid_times_s = _valid_times_around(analysis, longest_span_s)
+            valid_times_s = _find_valid_times_around(analysis, longest_span_s)
             error_text = f" {describe_errors_after_gap(analysis, valid_times_s)}"
         yield make_finding(
             name,
-            f"{fault}. Times of these positions: {times} ({total_s:.1f} s in total). KF does not "
-            f"use them.{error_text}",
-            action or f"Check {source_words(source).reception} at {longest_span_s[0]:.1f} s.",
+            f"{fault_sentence}. Times of these positions: {times} ({total_s:.1f} s in total). KF "
+            f"does not use them.{error_text}",
+            action or f"Check {find_source_texts(source).reception} at {longest_span_s[0]:.1f} s.",
             {
                 "count": count,
                 "longest_s": duration_s,
@@ -128,7 +129,7 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
         )
 
 
-def _valid_times_around(analysis: Analysis, span_s: Span) -> Span:
+def _find_valid_times_around(analysis: Analysis, span_s: Span) -> Span:
     """Return the times (s) of the last position before a time span and of the first after it."""
     time_s = analysis.input_axes[0].measurement_time_s
     indices = np.clip(np.searchsorted(time_s, span_s), 1, len(time_s) - 1)
@@ -143,8 +144,8 @@ def detect_rounding(analysis: Analysis) -> Findings:
     cause, action = "The source rounds the positions.", "Send the positions with more digits."
     if np.log2(step_m) % 1.0 == 0.0:
         cause = (
-            "Possible causes: the source rounds them, or they were 32-bit floats at large "
-            "coordinates, such as UTM."
+            "Possible causes: the source rounds the positions, or stores large coordinates (such "
+            "as UTM) as 32-bit floats."
         )
         action += (
             " Subtract a local origin in double precision (64 bit) before the position becomes a "
@@ -153,7 +154,7 @@ def detect_rounding(analysis: Analysis) -> Findings:
     yield warning(
         "source_positions_rounded",
         f"{positions_phrase(source)} move in steps of {step_m:.3g} m. {cause} The rounding error "
-        f"is {step_m / 12.0**0.5:.2g} m (1 σ) and correlated in time. {NO_ESTIMATES}",
+        f"is {step_m / 12.0**0.5:.2g} m (1 σ) and correlated in time. {NO_ESTIMATES_SENTENCE}",
         action,
         {"step_m": step_m},
     )
@@ -170,30 +171,29 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     if lever_arm is None:
         return
     forward_m, right_m, sigma_m = lever_arm
-    lever_arm_m = (
+    # + 0.0 replaces -0.0 by 0.0    lever_arm_m =
         np.add(source.lever_arm_m[:2], lever_arm[:2]).round(2) + 0.0
-    )  # + 0.0 removes a sign of zero
     change = dict(zip(find_aid(analysis).lever_arm, lever_arm_m.tolist(), strict=False))
-    effect_sentence = _replayed_effect(analysis, change)
+    effect_sentence = _describe_replayed_effect(analysis, change)
     if effect_sentence is None:
         return
     forward_m, right_m = (round(part, 2) + 0.0 for part in (forward_m, right_m))
-    sensor, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
-    if source.alignment is not None:  # EKF2 did not fuse the file
-        sensor = "sensor"
-        action = "Subtract this lever arm, rotated by the attitude, from the positions of the file."
+    sensor_text, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
+    if source.alignment is not None:  # EKF2 did not fuse a file, so no parameter corrects it
+        sensor_text = "sensor"
+        action = "Subtract this lever arm, rotated to NED by the attitude, from the positions."
     yield warning(
         "source_lever_arm",
-        f"The {sensor} is mounted {np.hypot(forward_m, right_m):.2f} m from the mounting point "
-        f"that EKF2 assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± "
+        f"The {sensor_text} is mounted {np.hypot(forward_m, right_m):.2f} m from the mounting "
+        f"point that EKF2 assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± "
         f"{1.96 * sigma_m:.2f} m, 95 %). When the vehicle turns, the error of the positions "
-        f"changes by up to twice this distance. {effect_sentence}{NO_ESTIMATES}",
+        f"changes by up to twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
         f"{action} Measure the position of the sensor relative to the IMU.",
         {"forward_m": forward_m, "right_m": right_m, "sigma_m": sigma_m},
     )
 
 
-def _replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | None:
+def _describe_replayed_effect(analysis: Analysis, change: Mapping[str, float]) -> str | None:
     """Return a sentence on EKF2's position RMSE in replays without and with a change.
 
     The sentence is "" if EKF2 cannot be replayed. Return None if the change hardly reduces the
@@ -228,10 +228,11 @@ def detect_two_senders(analysis: Analysis) -> Findings:
         return
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
     weight = ((time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2]))[:, None]
-    offsets_m = position_m[1:-1] - (1.0 - weight) * position_m[:-2] - weight * position_m[2:]
-    offsets_m[::2] *= -1.0
+    deviations_m = position_m[1:-1] - (1.0 - weight) * position_m[:-2] - weight * position_m[2:]
+    deviations_m[::2] *= -1.0
     window_offsets_m = np.median(
-        offsets_m[: window_count * WINDOW_SAMPLES].reshape(window_count, WINDOW_SAMPLES, -1), axis=1
+        deviations_m[: window_count * WINDOW_SAMPLES].reshape(window_count, WINDOW_SAMPLES, -1),
+        axis=1,
     )
     largest_offset_m = window_offsets_m[np.argmax(np.linalg.norm(window_offsets_m, axis=1))]
     window_offsets_m[window_offsets_m @ largest_offset_m < 0.0] *= -1.0
@@ -248,7 +249,7 @@ def detect_two_senders(analysis: Analysis) -> Findings:
         "source_two_senders",
         f"Two systems alternately send positions that differ by {distance_m:.2f} m. Successive "
         f"{positions_phrase(analysis.source)} ({rate_hz:.3g} Hz in total) differ by "
-        f"{distance_texts}, in addition to the motion. {NO_ESTIMATES}",
+        f"{distance_texts}, in addition to the motion. {NO_ESTIMATES_SENTENCE}",
         "Send the positions of one system only, for example stop the second node, bridge or "
         "MAVROS plugin.",
         {"distance_m": distance_m, "rate_hz": rate_hz},
@@ -266,7 +267,7 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
         return
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
     distances_m = [
-        _median_distance_m(position_m, time_s - delay_s, state) for delay_s in COPY_DELAYS_S
+        _compute_median_distance_m(position_m, time_s - delay_s, state) for delay_s in COPY_DELAYS_S
     ]
     best_index = int(np.nanargmin(distances_m)) if np.isfinite(distances_m).any() else 0
     fusion_flags = ekf2.fusion_flags
@@ -284,16 +285,16 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
     yield error(
         "source_is_ekf2_estimate",
         f"{source_name(source)} sends EKF2's own {copied_quantity} back. The positions equal those "
-        f"that EKF2 estimated {1e3 * COPY_DELAYS_S[best_index]:.0f} ms before (median difference "
-        f"{1e3 * distances_m[best_index]:.1f} mm). They contain no measurement, so fusion reduces "
-        "EKF2's σ, but not its error.",
+        f"that EKF2 estimated {1e3 * COPY_DELAYS_S[best_index]:.0f} ms before (median "
+        f"difference {1e3 * distances_m[best_index]:.1f} mm). They contain no measurement, so "
+        "fusion reduces EKF2's σ, but not its error.",
         "Send the position of the positioning system. Do not connect the autopilot's local "
         "position (MAVROS local_position) to its vision input.",
         {"delay_s": float(COPY_DELAYS_S[best_index]), "difference_m": distances_m[best_index]},
     )
 
 
-def _median_distance_m(position_m: Array, time_s: Array, ekf2_state: pd.DataFrame) -> float:
+def _compute_median_distance_m(position_m: Array, time_s: Array, ekf2_state: pd.DataFrame) -> float:
     """Return the median distance (m) of positions from EKF2's position at ``time_s``."""
     state_times_s = ekf2_state.index.to_numpy()
     state_curve = CubicHermiteSpline(

@@ -367,7 +367,7 @@ def _logging_advice(
     """
     if flight.log.is_assessed:
         return (LoggingAdvice("None", (DIAGNOSIS_WITHHELD.reason,)),)
-    findings = [*recording.detect_lost_data(flight), *recording.detect_clocks_set_back(flight)]
+    findings = [*recording.detect_lost_data(flight), *recording.detect_decreasing_clocks(flight)]
     actions_and_purposes = [(position_remedy, "position")] if position_remedy else []
     if comparison is not None:
         findings += [

@@ -3,14 +3,14 @@
 from px4fuse.core.text import capitalise_first
 from px4fuse.errors import SettingsError, suggest_name
 from px4fuse.findings.cause_grouping import CONSEQUENCES, effect_ids
-from px4fuse.findings.model import CATALOGUE, GROUPS, load_examples
+from px4fuse.findings.model import CATALOGUE, FINDING_GROUPS, load_examples
 from px4fuse.report.page import Page
 
 
 def list_page() -> Page:
     """List the ids and titles of all findings (detectable faults), by group."""
     page = Page()
-    for group in GROUPS:
+    for group in FINDING_GROUPS:
         page.heading(capitalise_first(group))
         rows = [
             (name, finding.title) for name, finding in CATALOGUE.items() if finding.group == group

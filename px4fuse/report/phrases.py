@@ -26,7 +26,7 @@ from px4fuse.core.text import capitalise_first, format_factor, format_number
 from px4fuse.filter.consistency import Consistency
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
-from px4fuse.findings import Finding, finding_title, group_by_root
+from px4fuse.findings import Finding, finding_title, split_cause_groups
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import Alignment, ClockMap, Columns, Truth, Unavailable
 from px4fuse.report.page import Cell, Page, styled_text
@@ -269,7 +269,7 @@ def student_line(student: Student, separator: str) -> str:
 
 
 def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
-    for finding, *effects in group_by_root(findings):
+    for finding, *effects in split_cause_groups(findings):
         title = f"{capitalise_first(finding_title(finding.id))} [{finding.id}]"
         texts = [styled_text(title, bold=True), styled_text(finding.message)]
         if finding.remedy:

@@ -11,7 +11,7 @@ from px4fuse.card.build import build_aids_card, build_card
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import AxisTuning
-from px4fuse.findings import find_loop
+from px4fuse.findings import find_loop_findings
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.request import (
@@ -116,7 +116,7 @@ def loop_results(request: LoopRequest, loop: Loop, student: Student) -> contract
             track=loop.odometry.trajectory.track(),
             references=tuple(reference.track() for reference in loop.references),
             loop=loop,
-            findings=find_loop(loop),
+            findings=find_loop_findings(loop),
             student=student,
             provenance=provenance(command_line(request)),
         )

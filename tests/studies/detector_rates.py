@@ -30,7 +30,7 @@ from px4fuse.comparison.reruns import rerun_filters
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.model import open_model
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import find, find_loop
+from px4fuse.findings import find, find_loop_findings
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop.analysis import analyse, analyse_flight_loop
 from px4fuse.loop.tracks import LoopSource, trajectory_of
@@ -195,7 +195,7 @@ def _fly(job: Job) -> list[tuple[str, ...]]:
         # the loop without ground truth, which would show the landing
         flight = simulate_flight(replace(scenario, truth=False), mistakes)
         loop = analyse(LoopSource(trajectory_of(flight, "vio"), flight))
-        of_loop = tuple(found.id for found in find_loop(loop))
+        of_loop = tuple(found.id for found in find_loop_findings(loop))
         if first.finding:
             return [_named(first, of_loop)]
     flight = simulate_flight(scenario, mistakes)
