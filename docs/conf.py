@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
 ROOT = Path(__file__).resolve().parents[1]
-GENERATED = Path(__file__).parent / "made"
+GENERATED_FOLDER = Path(__file__).parent / "made"
 sys.path.insert(0, str(Path(__file__).parent))
 
 import findings_pages  # noqa: E402
@@ -80,7 +80,7 @@ def format_options() -> str:
     return "\n".join(sections)
 
 
-GENERATED.mkdir(exist_ok=True)
-draw_layers().savefig(GENERATED / "layers.svg")
-(GENERATED / "options.md").write_text(format_options(), encoding="utf-8")
-findings_pages.write(GENERATED / "findings")
+GENERATED_FOLDER.mkdir(exist_ok=True)
+draw_layers().savefig(GENERATED_FOLDER / "layers.svg")
+(GENERATED_FOLDER / "options.md").write_text(format_options(), encoding="utf-8")
+findings_pages.write_finding_pages(GENERATED_FOLDER / "findings")

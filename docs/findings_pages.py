@@ -14,6 +14,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -59,15 +60,15 @@ from px4fuse.simulation.faults import parse_faults  # noqa: E402
 from px4fuse.simulation.flights import simulate_flight  # noqa: E402
 from px4fuse.simulation.scenario import Scenario  # noqa: E402
 
-slow_errors, larger_errors = (
+add_time_correlated_errors, add_two_noise_levels = (
     partial(coloured, tau_s=0.5, share=1.0),
     partial(two_levels, factor=3.0),
 )
-UNEQUAL_M = (0.05, 0.2, 0.1)
-FINDINGS = ROOT / "px4fuse" / "findings"
-EXAMPLES = FINDINGS / "examples.json"
+AXIS_NOISES_M = (0.05, 0.2, 0.1)
+FINDINGS_FOLDER = ROOT / "px4fuse" / "findings"
+EXAMPLES_PATH = FINDINGS_FOLDER / "examples.json"
 # Findings that no simulated flight shows; their examples in examples.json are of recorded flights
-IDS_FROM_LOGS = {
+IDS_WITH_RECORDED_EXAMPLE = {
     "ekf2_acceleration_bad",
     "ekf2_bias_at_limit",
     "ekf2_gps_delay_wrong",
@@ -81,7 +82,7 @@ IDS_FROM_LOGS = {
 }
 LABEL_LENGTH = 26  # characters per line of an axis label
 # Simulated faults (option --mistake) and KF settings with which a finding appears, by finding id
-SIMULATED: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
+FAULTS_AND_SETTINGS_BY_ID: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
     "accelerometer_bias": (("accel-bias",), {}),
     "ekf2_ev_delay_wrong": (("ekf2-delay=250ms",), {}),
     "ekf2_gate_too_small": (("ekf2-gate",), {}),
@@ -113,8 +114,8 @@ class Example:
     analysis: Analysis | None = None
 
 
-def find_in_changed_timestamps() -> list[Finding]:
-    """Find a late attitude, and a latency of the positions that grows in flight."""
+def simulate_late_timestamps() -> list[Finding]:
+    """Simulate a late attitude and a growing latency of the positions; return their findings."""
     flight = simulate_flight(Scenario(passes=4, seed=2))
     age_s = pd.Series(np.linspace(0.03, 0.2, 100), index=np.linspace(5.0, 60.0, 100))
     record = replace(flight.ekf2.record, vision_age_s=age_s)
@@ -135,7 +136,7 @@ def examples() -> dict[str, Example]:
         for finding in findings:
             example_by_id.setdefault(finding.id, Example(finding, flight, analysis))
 
-    for name, (faults, settings) in SIMULATED.items():
+    for name, (faults, settings) in FAULTS_AND_SETTINGS_BY_ID.items():
         flight = simulate_flight(Scenario(passes=4, seed=2), parse_faults(faults))
         analysis = find_faults(compare(flight, Settings(**settings)))
         command = " ".join(["px4fuse simulate", *(f"--mistake {fault}" for fault in faults)])
@@ -144,10 +145,10 @@ def examples() -> dict[str, Example]:
         findings = [finding for finding in find(analysis) if finding.id == name]
         add_examples(findings, f"a flight of `{command}`{settings_text}", analysis)
     for model in (
-        slow_errors,
+        add_time_correlated_errors,
         partial(held, share=0.2),
-        partial(white, sigma=UNEQUAL_M),
-        larger_errors,
+        partial(white, sigma=AXIS_NOISES_M),
+        add_two_noise_levels,
     ):
         flight = simulate_flight(Scenario(passes=4, seed=2, ekf2=False))
         truth = flight.truth.samples[Columns.POSITION].dropna()
@@ -182,13 +183,13 @@ def examples() -> dict[str, Example]:
         find_loop_findings(px4fuse.close_loop(odometry, closures=TRUE)),
         "simulated odometry of three laps",
     )
-    parts = [
+    heading_parts = [
         HeadingPart(2.0 * n, 2.0 * n + 2.0, angle_deg, 1.0)
         for n, angle_deg in enumerate((-36.0, -20.0, -9.0))
     ]
     aisle_analysis = unexplained(compare(aisle_flight(duration_s=20.0), axes=("north",)))
     drift_analysis = replace(
-        aisle_analysis, heading=combine_heading_parts(tuple(parts), 1e-9, "positions")
+        aisle_analysis, heading=combine_heading_parts(tuple(heading_parts), 1e-9, "positions")
     )
     add_examples(source_frame.detect(drift_analysis), "a heading estimate with simulated drift")
     flight = aisle_flight(duration_s=60.0)
@@ -200,7 +201,7 @@ def examples() -> dict[str, Example]:
             "mag_heading": changed_log}  # fmt: skip
     aid_analysis = evaluate_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
     add_examples(find_aid_findings(aid_analysis), "simulated innovations of the aiding sources")
-    add_examples(find_in_changed_timestamps(), "a simulated flight with changed timestamps")
+    add_examples(simulate_late_timestamps(), "a simulated flight with changed timestamps")
     for fault in FAULTS:
         if fault.id in example_by_id:
             continue
@@ -211,10 +212,10 @@ def examples() -> dict[str, Example]:
     return example_by_id
 
 
-def detectors() -> dict[str, str]:
+def find_detector_modules() -> dict[str, str]:
     """Return the module name of the detector of each finding, by finding id."""
     module_by_id: dict[str, str] = {}
-    for path in sorted(FINDINGS.glob("*.py")):
+    for path in sorted(FINDINGS_FOLDER.glob("*.py")):
         if path.stem in ("cause_grouping", "cause_text", "model", "__init__"):
             continue
         tree = ast.parse(path.read_text(encoding="utf-8"))
@@ -222,7 +223,7 @@ def detectors() -> dict[str, str]:
             if isinstance(node, ast.Constant) and node.value in TITLES:
                 module_by_id.setdefault(str(node.value), path.stem)
     # These modules form finding ids from a filter or parameter name and a suffix
-    module_by_composed_id = {
+    module_by_generated_id = {
         name: stem
         for name in TITLES
         for stem, prefixes in {
@@ -231,33 +232,36 @@ def detectors() -> dict[str, str]:
         }.items()
         if name.startswith(prefixes)
     }
-    return module_by_id | module_by_composed_id
+    return module_by_id | module_by_generated_id
 
 
-def thresholds(module_name: str) -> Iterator[str]:
+def format_threshold_rows(module_name: str) -> Iterator[str]:
     """Yield a Markdown table row with value and comment of each constant of a detector module."""
-    source = (FINDINGS / f"{module_name}.py").read_text(encoding="utf-8")
+    source = (FINDINGS_FOLDER / f"{module_name}.py").read_text(encoding="utf-8")
     lines = source.splitlines()
     for node in ast.parse(source).body:
-        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Constant | ast.UnaryOp):
+        if isinstance(node, ast.Assign) and isinstance(
+            node.value, ast.Constant | ast.UnaryOp | ast.Tuple
+        ):
             name, line = ast.unparse(node.targets[0]), lines[node.lineno - 1]
-            line_above = lines[node.lineno - 2]
-            comment = line.partition("  # ")[2] or line_above.removeprefix("# ") * (
-                line_above.startswith("# ")
+            lines_above = takewhile(
+                lambda text: text.startswith("# "), lines[node.lineno - 2 :: -1]
             )
+            comment_above = " ".join(reversed([text.removeprefix("# ") for text in lines_above]))
+            comment = line.partition("  # ")[2] or comment_above
             if name.isupper() and not isinstance(ast.literal_eval(node.value), str):
                 comment = comment.replace("|", r"\|")
                 yield f"| `{name}` | {ast.unparse(node.value)} | {comment} |"
 
 
-def measured_rates() -> pd.DataFrame:
+def read_detection_rates() -> pd.DataFrame:
     """Read false alarm and detection rates of the findings, measured on simulated flights."""
     return pd.read_csv(ROOT / "tests" / "studies" / "rates.csv")
 
 
-def rate_rows(name: str) -> Iterator[str]:
+def format_rate_rows(name: str) -> Iterator[str]:
     """Yield Markdown table rows with the false alarm and detection rates of a finding."""
-    table = measured_rates()
+    table = read_detection_rates()
     for row in table[table["finding"] == name].itertuples():
         yield (
             f"| {row.condition} | {row.scenario} | {row.flights} | {100.0 * row.rate:.0f} % | "
@@ -286,7 +290,7 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
             file = save_picture(name, example, folder)
             yield f"![Position, innovations and σ of the example flight]({file})\n"
         yield f"## What to do\n\n> {finding.remedy}\n"
-    rates = list(rate_rows(name))
+    rates = list(format_rate_rows(name))
     if rates:
         yield "## False alarms and detection\n"
         yield "The rates were measured on simulated flights. In flights with the fault `none`,"
@@ -294,8 +298,8 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
         yield "| fault | kind of flight | number of flights | rate of the finding | 95 % interval |"
         yield "|---|---|---|---|---|"
         yield "\n".join(rates) + "\n"
-    module_name = detectors()[name]
-    rows = list(thresholds(module_name))
+    module_name = find_detector_modules()[name]
+    rows = list(format_threshold_rows(module_name))
     if rows:
         yield "## Thresholds\n"
         yield f"The file `px4fuse/findings/{module_name}.py` contains these thresholds."
@@ -309,9 +313,9 @@ def links(names: Iterable[str]) -> str:
     return ", ".join(f"[{TITLES[name]}]({name}.md)" for name in dict.fromkeys(names))
 
 
-def packaged_examples(simulated: Mapping[str, Example]) -> dict[str, Any]:
+def collect_examples_and_rates(simulated: Mapping[str, Example]) -> dict[str, Any]:
     """Return message, action and error rates of each finding, which ``px4fuse explain`` prints."""
-    table, recorded, contents = measured_rates(), load_examples(), {}
+    table, recorded, contents = read_detection_rates(), load_examples(), {}
     for name in TITLES:
         rows = table[table["finding"] == name]
         fault_free_rows = rows[rows["condition"] == "none"]
@@ -332,8 +336,8 @@ def packaged_examples(simulated: Mapping[str, Example]) -> dict[str, Any]:
 
 def write_examples() -> None:
     """Write the examples for ``px4fuse explain`` to ``examples.json``."""
-    text = json.dumps(packaged_examples(examples()), ensure_ascii=False, indent=1)
-    EXAMPLES.write_text(f"{text}\n", encoding="utf-8")
+    text = json.dumps(collect_examples_and_rates(examples()), ensure_ascii=False, indent=1)
+    EXAMPLES_PATH.write_text(f"{text}\n", encoding="utf-8")
 
 
 def save_picture(name: str, example: Example, folder: Path) -> str:
@@ -363,12 +367,12 @@ def index() -> Iterator[str]:
         yield "\n".join(names) + "\n```\n"
 
 
-def write(folder: Path) -> None:
+def write_finding_pages(folder: Path) -> None:
     """Write the index and the pages of all findings."""
     mpl.use("Agg")
     folder.mkdir(parents=True, exist_ok=True)
     example_by_id = examples()
-    missing_ids = set(TITLES) - set(example_by_id) - IDS_FROM_LOGS
+    missing_ids = set(TITLES) - set(example_by_id) - IDS_WITH_RECORDED_EXAMPLE
     assert not missing_ids, f"these findings have no example: {sorted(missing_ids)}"
     for name in TITLES:
         text = "\n".join(page(name, example_by_id.get(name), folder))
@@ -381,4 +385,4 @@ if __name__ == "__main__":
     if sys.argv[1] == "--examples":
         write_examples()
     else:
-        write(Path(sys.argv[1]))
+        write_finding_pages(Path(sys.argv[1]))
