@@ -99,7 +99,8 @@ def _find_rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
 
 def _prevents_rejections(trial: Trial) -> bool:
     fraction_before, fraction_after = trial.before.rejected_fraction, trial.after.rejected_fraction
-    if ( fraction_before is None
+    if (
+        fraction_before is None
         or fraction_after is None
         or classify_improvement(trial) == "nothing"
     ):

@@ -158,7 +158,9 @@ def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, floa
         time_s, true_position_m = position_m.index.to_numpy(), np.full(len(position_m), np.nan)
         if isinstance(tracks.truth, pd.DataFrame):
             true_positions = tracks.truth["position_m"]
-            true_position_m = np.interp(time_s, true_positions.index, true_positions, np.nan, np.nan)
+            true_position_m = np.interp(
+                time_s, true_positions.index, true_positions, np.nan, np.nan
+            )
         sigma_m = interpolate_sigma(time_s, tracks.ekf2_variance, "position_variance_m2")
         squares_m2.append([(position_m - true_position_m) ** 2, sigma_m**2])
     squared_sums_by_name = zip(("error_m", "sigma_m"), np.sum(squares_m2, axis=0), strict=True)

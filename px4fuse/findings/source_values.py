@@ -171,8 +171,8 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     if lever_arm is None:
         return
     forward_m, right_m, sigma_m = lever_arm
-    # + 0.0 replaces -0.0 by 0.0    lever_arm_m =
-        np.add(source.lever_arm_m[:2], lever_arm[:2]).round(2) + 0.0
+    # + 0.0 replaces -0.0 by 0.0
+    lever_arm_m = np.add(source.lever_arm_m[:2], lever_arm[:2]).round(2) + 0.0
     change = dict(zip(find_aid(analysis).lever_arm, lever_arm_m.tolist(), strict=False))
     effect_sentence = _describe_replayed_effect(analysis, change)
     if effect_sentence is None:
