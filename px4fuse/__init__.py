@@ -10,7 +10,7 @@ import importlib as _importlib
 import typing as _typing
 
 # Module of each public name. A module is imported at the first use of a name, which saves time
-_MODULES = {
+_MODULE_BY_NAME = {
     "Analysis": "analysis",
     "Px4FuseError": "errors",
     "Settings": "filter.settings",
@@ -29,7 +29,7 @@ _MODULES = {
     "write_page": "api",
     "write_report": "api",
 }
-__all__ = list(_MODULES)
+__all__ = list(_MODULE_BY_NAME)
 
 if _typing.TYPE_CHECKING:
     from px4fuse.analysis import Analysis as Analysis
@@ -56,8 +56,8 @@ else:
 
     def __getattr__(name):
         """Import a public name at its first use."""
-        if name not in _MODULES:
+        if name not in _MODULE_BY_NAME:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        value = getattr(_importlib.import_module(f"px4fuse.{_MODULES[name]}"), name)
+        value = getattr(_importlib.import_module(f"px4fuse.{_MODULE_BY_NAME[name]}"), name)
         globals()[name] = value
         return value

@@ -51,7 +51,7 @@ def compare(
     sigma_a_m_s2: float = request.SIGMA_A_M_S2,
     sigma_z_m: float | None = None,
     dt_s: float = request.DT_S,
-    input: request.InputName | None = None,  # noqa: A002 - name of the setting
+    input: request.KfInputName | None = None,  # noqa: A002 - name of the setting
     clock_offset_s: float | Literal["auto"] | None = None,
     axes: request.AxisName | Sequence[request.AxisName] = (),
     heading_deg: float | None = None,
@@ -310,7 +310,8 @@ def _require_suffix(path: Pathlike, suffix: str) -> Path:
 def _require_request(analysis: Analysis) -> request.ComparisonRequest:
     if analysis.request is None:
         raise SettingsError(
-            "This analysis was not made by px4fuse.compare. The report needs its command line.",
+            "The analysis contains no command line for the report, because px4fuse.compare did not "
+            "make the analysis.",
             "Make the analysis with px4fuse.compare.",
         )
     return analysis.request

@@ -65,9 +65,9 @@ def diagnose(
     progress: Progress = ignore_progress,
     flight: Flight | None = None,
     *,
-    as_sent: bool = False,
+    keep_as_sent: bool = False,
 ) -> Analysis:
-    """Read a flight, compare KF with EKF2, and find faults (steps 1 to 8).
+    """Read a flight, compare KF with EKF2, and find faults (steps 1 to 8 of this module).
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def diagnose(
         Called with the name of each step of the computation.
     flight : Flight, optional
         Flight that was already read from the files of the request.
-    as_sent : bool
+    keep_as_sent : bool
         True to skip the check and correction of axes, unit and timestamps of the positions.
 
     Raises
@@ -85,26 +85,26 @@ def diagnose(
         A file cannot be read, the flight lacks required data, or a setting is out of range.
     """
     flight = flight or read_flight(request, progress)
-    analysis = _diagnose_flight(request, progress, flight, as_sent=as_sent)
-    if refined_flight := _refine_file_clock(flight, analysis):
-        analysis = _diagnose_flight(request, progress, refined_flight, as_sent=as_sent)
+    analysis = _diagnose_flight(request, progress, flight, keep_as_sent=keep_as_sent)
+    if refined_flight := _refine_clock_offset(flight, analysis):
+        analysis = _diagnose_flight(request, progress, refined_flight, keep_as_sent=keep_as_sent)
     return analysis
 
 
 def _diagnose_flight(
-    request: ComparisonRequest, progress: Progress, flight: Flight, *, as_sent: bool
+    request: ComparisonRequest, progress: Progress, flight: Flight, *, keep_as_sent: bool
 ) -> Analysis:
-    prepared_comparison = prepare_comparison(flight, request, progress, as_sent=as_sent)
+    prepared_comparison = prepare_comparison(flight, request, progress, keep_as_sent=keep_as_sent)
     progress("running KF")
     kf_runs = run_kf(prepared_comparison)
     comparison = compare(prepared_comparison, kf_runs)
     return replace(find_faults(comparison, progress), request=request)
 
 
-def _refine_file_clock(flight: Flight, analysis: Analysis) -> Flight | None:
-    """Replace the clock offset of a position file by the estimate from the IMU, if both differ.
+def _refine_clock_offset(flight: Flight, analysis: Analysis) -> Flight | None:
+    """Replace the clock offset of a position file by the estimate from the IMU, if it differs.
 
-    The first estimate is from EKF2's positions, which may be late.
+    The offset from reading the file is relative to EKF2's positions, which may be late.
     """
     alignment, clock = analysis.source.alignment, analysis.clock
     if (
@@ -116,13 +116,13 @@ def _refine_file_clock(flight: Flight, analysis: Analysis) -> Flight | None:
         or any(CONVENTION_KEY in finding.evidence for finding in analysis.findings)
     ):
         return None
-    difference = f"{abs(clock.offset_s):.3f} s {'late' if clock.offset_s < 0 else 'early'}"
+    delay_text = f"{abs(clock.offset_s):.3f} s {'late' if clock.offset_s < 0 else 'early'}"
     alignment = structs.replace(
         alignment,
         clock_offset_s=alignment.clock_offset_s + clock.offset_s,
         clock_offset_sigma_s=clock.sigma_s,
         clock_reason=f"the offset was estimated with the IMU, because EKF2's position is "
-        f"{difference} relative to the IMU",
+        f"{delay_text} relative to the IMU",
     )
     file_track, *other_tracks = flight.positions
     shifted_track = replace(shift_clock(file_track, clock.offset_s), alignment=alignment)
@@ -130,7 +130,7 @@ def _refine_file_clock(flight: Flight, analysis: Analysis) -> Flight | None:
 
 
 def find_faults(comparison: Comparison, progress: Progress = ignore_progress) -> Analysis:
-    """Estimate errors, re-run KF and EKF2, and find faults and their causes (steps 5 to 8).
+    """Estimate errors, re-run KF and EKF2, and find faults and their causes (steps 5 to 8 of 8).
 
     If students must find the faults of the flight, only the comparison is returned.
     """
@@ -159,7 +159,7 @@ def find_faults(comparison: Comparison, progress: Progress = ignore_progress) ->
     from px4fuse.loop.analysis import analyse_flight_loop  # noqa: PLC0415 - not for tune and sync
 
     flight = comparison.flight
-    analysis = Analysis(  # which has the fields of Comparison, Estimates and Reruns
+    analysis = Analysis(  # inherits the fields of Comparison, Estimates and Reruns
         **vars(comparison),
         **vars(estimates),
         **vars(reruns),
@@ -180,8 +180,8 @@ def refine_delay(comparison: Comparison, clock: ClockOffset | Unavailable) -> Co
         return comparison
     # a time offset is negative for late timestamps
     refined_convention = structs.replace(comparison.convention, late_s=-clock.offset_s)
-    # keep the first delay if the refined delay is too small to be a fault: the report must contain
-    # the delay that was corrected
+    # Positions were corrected by the detected delay, so the report must contain it: keep it if the
+    # refined delay is too small to be a fault
     is_fault = all(
         convention_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
         for convention in (comparison.convention, refined_convention)
@@ -229,13 +229,13 @@ def prepare_comparison(
     request: ComparisonRequest,
     progress: Progress = ignore_progress,
     *,
-    as_sent: bool = False,
+    keep_as_sent: bool = False,
 ) -> PreparedComparison:
     """Choose position source, time span, axes and time offset, before KF runs.
 
     For arguments and errors see :func:`diagnose`.
     """
-    prepared_comparison = prepare(flight, request, as_sent=as_sent)
+    prepared_comparison = prepare(flight, request, keep_as_sent=keep_as_sent)
     # read_flight has already corrected the time offset of a position file
     if request.clock_offset_s != AUTO or request.position is not None:
         return prepared_comparison
@@ -253,19 +253,19 @@ def prepare_comparison(
             f"{high:+.3f} s) is not significant and was not applied"
         )
         if clock.applied_s:
-            note += f", in addition to {clock.applied_s:+.3f} s from the check of the timestamps"
+            note += f". The check of the timestamps has already applied {clock.applied_s:+.3f} s"
         return replace(prepared_comparison, notes=(*prepared_comparison.notes, note))
     request = structs.replace(request, clock_offset_s=clock.offset_s)
-    return prepare(flight, request, as_sent=as_sent)
+    return prepare(flight, request, keep_as_sent=keep_as_sent)
 
 
 def rerun(
     comparison: Comparison, estimates: Estimates, progress: Progress = ignore_progress
 ) -> Reruns:
-    """Replay EKF2, explain KF - EKF2, and re-run KF and EKF2 with one error corrected at a time."""
+    """Replay EKF2, explain the difference KF - EKF2, and re-run both with one error corrected."""
     progress("replaying EKF2")
     estimated_settings = estimate_wrong_settings(comparison, estimates.tuning)
-    # The next two functions request these parameter sets. A replay of all sets together is faster
+    # Replay all parameter sets that the next two functions need at once, which is faster
     ekf2_model = open_model(
         comparison.flight,
         lambda inputs: [
@@ -348,7 +348,7 @@ def run_what_if(
             comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
             prepared_comparison = prepare(flight, comparison_request)
             comparison = compare(prepared_comparison, run_kf(prepared_comparison))
-    except MissingDataError:  # an error only if the parameters are estimated from the comparison
+    except MissingDataError:  # only needed to estimate the parameters, if the user gave none
         if is_default_change:
             raise
     if comparison is not None:
@@ -362,9 +362,9 @@ def run_what_if(
     parameter_sets = [changes] if changes or request.without else []
     parameter_sets += [changes | values for values in swept_settings]
     progress("replaying EKF2 with other parameters")
-    replays = require_available(what_if(ekf2_model, parameter_sets, request.without), flight)
+    what_if_result = require_available(what_if(ekf2_model, parameter_sets, request.without), flight)
     return WhatIfAnalysis(
-        flight, replays, changes, is_default_change, difference_steps, request.without
+        flight, what_if_result, changes, is_default_change, difference_steps, request.without
     )
 
 

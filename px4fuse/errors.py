@@ -25,8 +25,8 @@ def suggest_name(name: str, known_names: Iterable[str]) -> str:
     """
     import difflib  # noqa: PLC0415 - needed for errors only
 
-    similar = difflib.get_close_matches(name, list(known_names), n=1, cutoff=0.7)
-    return f"Did you mean {similar[0]}? " if similar else ""
+    similar_names = difflib.get_close_matches(name, list(known_names), n=1, cutoff=0.7)
+    return f"Did you mean {similar_names[0]}? " if similar_names else ""
 
 
 def to_one_line(text: str) -> str:

@@ -46,7 +46,7 @@ class Finding(Record, omit_defaults=False):
     spans_s: tuple[Span, ...] = ()
 
     @property
-    def when(self) -> str:
+    def spans_text(self) -> str:
         """Times of the fault as text; "" for the whole flight."""
         if len(self.spans_s) > MAX_LISTED_SPANS:
             return f"from {self.spans_s[0][0]:.1f} s to {self.spans_s[-1][1]:.1f} s"

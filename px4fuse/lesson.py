@@ -23,8 +23,8 @@ UWB_NOISE_M = (0.08, -0.12, 0.05, 0.10, -0.06, -0.09)
 ODOMETRY_M = ((0.0, 0.0), (20.3, 0.2), (20.6, 20.4), (0.8, 20.9), (1.2, 0.8))
 
 
-def example_1() -> Replay:
-    """Run Example 1: UWB every 0.5 s along an aisle at 1 m/s, initial velocity unknown."""
+def run_example_1() -> Replay:
+    """Run KF on Example 1: UWB every 0.5 s along an aisle at 1 m/s, initial velocity unknown."""
     settings = Settings(sigma_a_m_s2=0.5, sigma_z_m=0.10, dt_s=0.1, input="zero")
     time_s = settings.dt_s * np.arange(
         PREDICTIONS_PER_UPDATE, PREDICTION_COUNT + 1, PREDICTIONS_PER_UPDATE, dtype=np.float64
@@ -37,15 +37,17 @@ def example_1() -> Replay:
         measurement_time_s=time_s,
         measurement_m=TRUE_VELOCITY_M_S * time_s + np.array(UWB_NOISE_M),
         acceleration=Unavailable(
-            "acceleration", "Example 1 has no acceleration", "No action is needed for Example 1."
+            "acceleration",
+            "Example 1 of the course UAT 366 has no acceleration",
+            "No action is needed: KF assumes constant velocity.",
         ),
     )
     return replay(axis, settings, InitialState(time_s=0.0, position_m=0.0))
 
 
-def kalman_lines() -> Iterator[str]:
+def format_kalman_lines() -> Iterator[str]:
     """Yield the lines of Example 1, as in the course: the state after each UWB update."""
-    kf_run = example_1()
+    kf_run = run_example_1()
     for index, state in kf_run.steps.loc[kf_run.updates.index].iterrows():
         time_s = float(str(index))
         yield (
@@ -56,7 +58,7 @@ def kalman_lines() -> Iterator[str]:
         )
 
 
-def loop_lines() -> Iterator[str]:
+def format_loop_lines() -> Iterator[str]:
     """Yield the lines of Example 2: the loop closure error, and the five corrected corners."""
     odometry = np.array(ODOMETRY_M)
     length_m = cumulative_distance(odometry)[-1]

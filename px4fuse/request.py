@@ -19,7 +19,7 @@ AUTO: Literal["auto"] = "auto"
 # Default settings of KF: process noise, measurement noise and prediction interval
 SIGMA_A_M_S2, SIGMA_Z_M, DT_S = 0.5, 0.10, 0.1
 AxisName = Literal["north", "east", "down", "aisle"]
-InputName = Literal["imu", "zero"]
+KfInputName = Literal["imu", "zero"]
 # Kinds of position source that the user can state if the messages in the log are ambiguous
 SourceKind = Literal["uwb", "vio", "mocap", "gnss"]
 # Directions of x, y and z in a position file, such as east, up and south
@@ -31,22 +31,23 @@ FrameName = Literal["NED", "FRD", "ENU", "camera"]
 SystemId = Annotated[int, msgspec.Meta(ge=0, le=255)]
 
 
-# Fields of the request classes that contain a path
 _PATH_FIELDS = ("log", "path", "source", "estimate", "reference")
 
 
 class _BaseRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base class of the settings of all commands."""
 
-    def without_paths(self) -> Self:
+    def with_file_names(self) -> Self:
         """Replace paths by file names."""
         paths = {name: getattr(self, name, None) for name in _PATH_FIELDS}
         changes: dict[str, Any] = {
-            field_name: _file_name(path) for field_name, path in paths.items() if path is not None
+            field_name: _extract_file_name(path)
+            for field_name, path in paths.items()
+            if path is not None
         }
         position = getattr(self, "position", None)
         if position is not None:
-            changes["position"] = position.without_paths()
+            changes["position"] = position.with_file_names()
         return msgspec.structs.replace(self, **changes)
 
 
@@ -96,7 +97,7 @@ class ComparisonRequest(
     sigma_a_m_s2: float = SIGMA_A_M_S2
     sigma_z_m: float | None = None
     dt_s: float = DT_S
-    input: InputName | None = None
+    input: KfInputName | None = None
     axes: tuple[AxisName, ...] = ()
     heading_deg: float | None = None
     start_s: float | None = None
@@ -247,8 +248,8 @@ _POSITION_OPTIONS = {
 }
 
 
-def _option_names(
-    request_type: type[msgspec.Struct], excluded: Sequence[str] = (), **renamed_options: str
+def _make_option_names(
+    request_type: type[msgspec.Struct], excluded_fields: Sequence[str] = (), **renamed_options: str
 ) -> dict[str, str]:
     """Return the command-line option of each optional field, for example ``--max-gap``.
 
@@ -257,17 +258,17 @@ def _option_names(
     option_names = {
         field.name: "--" + re.sub(f"({'|'.join(SUFFIX_UNITS)})$", "", field.name).replace("_", "-")
         for field in msgspec.structs.fields(request_type)
-        if not field.required and field.name not in excluded
+        if not field.required and field.name not in excluded_fields
     }
     return option_names | renamed_options
 
 
 # Command-line options of the optional fields of each request class
 OPTION_NAMES: Mapping[type[msgspec.Struct], Mapping[str, str]] = {
-    ComparisonRequest: _option_names(ComparisonRequest, ["position"], axes="--axis")
+    ComparisonRequest: _make_option_names(ComparisonRequest, ["position"], axes="--axis")
     | _POSITION_OPTIONS,
     PositionFile: _POSITION_OPTIONS,
-    LoopRequest: _option_names(
+    LoopRequest: _make_option_names(
         LoopRequest,
         start_s="--from",
         end_s="--to",
@@ -275,8 +276,8 @@ OPTION_NAMES: Mapping[type[msgspec.Struct], Mapping[str, str]] = {
         closures="--closure",
         position_drift_m="--drift",
     ),
-    WhatIfRequest: _option_names(WhatIfRequest, ["changes", "sweep", "without"]),
-    EvaluationRequest: _option_names(EvaluationRequest),
+    WhatIfRequest: _make_option_names(WhatIfRequest, ["changes", "sweep", "without"]),
+    EvaluationRequest: _make_option_names(EvaluationRequest),
 }
 COMPARISON_OPTIONS = OPTION_NAMES[ComparisonRequest]
 # Options that occur in the error messages of several commands, by Python argument
@@ -307,7 +308,7 @@ def command_line(
         True: paths, quoted for the shell of this system. False: file names, quoted for a POSIX
         shell.
     """
-    shown_request = request if for_shell else request.without_paths()
+    shown_request = request if for_shell else request.with_file_names()
     # required fields are input files, and all other fields are options
     files = [
         getattr(shown_request, field.name)
@@ -317,19 +318,21 @@ def command_line(
     # without "./", a path that begins with "-" is read as an option
     files = [f"./{path}" if path.startswith("-") else path for path in files]
     arguments = [command or str(type(shown_request).__struct_config__.tag or "evaluate"), *files]
-    arguments += [word for pair in _all_options(shown_request) for word in pair if word is not None]
+    arguments += [
+        word for pair in _list_changed_options(shown_request) for word in pair if word is not None
+    ]
     if isinstance(shown_request, WhatIfRequest):
         for name, value in shown_request.changes.items():
-            arguments += ["--set", f"{name}={_option_text(value)}"]
+            arguments += ["--set", f"{name}={_format_value(value)}"]
         if (sweep := shown_request.sweep) is not None:
-            values = f"{_option_text(sweep.low)}:{_option_text(sweep.high)}:{sweep.count}"
-            arguments += ["--sweep", f"{sweep.parameter}={values}"]
+            range_text = f"{_format_value(sweep.low)}:{_format_value(sweep.high)}:{sweep.count}"
+            arguments += ["--sweep", f"{sweep.parameter}={range_text}"]
         for name in shown_request.without:
             arguments += ["--without", name]
         for start_s in {*shown_request.without.values()} - {0.0}:
-            arguments += ["--from", _option_text(start_s)]
-    words = ["px4fuse", *arguments]
-    return quote_command(words) if for_shell else shlex.join(words)
+            arguments += ["--from", _format_value(start_s)]
+    command_words = ["px4fuse", *arguments]
+    return quote_command(command_words) if for_shell else shlex.join(command_words)
 
 
 def quote_command(words: Sequence[str]) -> str:
@@ -337,21 +340,21 @@ def quote_command(words: Sequence[str]) -> str:
     return subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
 
 
-def settings_name(request: ComparisonRequest | EvaluationRequest | LoopRequest) -> str:
+def format_settings_suffix(request: ComparisonRequest | EvaluationRequest | LoopRequest) -> str:
     """Format the settings that differ from their defaults, as the end of a file name.
 
     >>> file = PositionFile(path="b/c.csv")
-    >>> settings_name(ComparisonRequest(log="a.ulg", sigma_z_m=0.05, position=file))
+    >>> format_settings_suffix(ComparisonRequest(log="a.ulg", sigma_z_m=0.05, position=file))
     '_sigma-z-0.05_position-c'
     """
     name_suffix = ""
-    for option, value in _all_options(request.without_paths()):
+    for option, value in _list_changed_options(request.with_file_names()):
         text = PurePath(value).stem if option == "--position" and value is not None else value
         name_suffix += f"_{option[2:]}" + ("" if text is None else f"-{text}")
     return re.sub(r"[^\w.,+-]+", "-", name_suffix)
 
 
-def _all_options(request: msgspec.Struct) -> Iterator[tuple[str, str | None]]:
+def _list_changed_options(request: msgspec.Struct) -> Iterator[tuple[str, str | None]]:
     """Yield each option that differs from its default, with its value (None for a flag)."""
     option_names = OPTION_NAMES[type(request)]
     for field in msgspec.structs.fields(request):
@@ -360,21 +363,21 @@ def _all_options(request: msgspec.Struct) -> Iterator[tuple[str, str | None]]:
             continue
         values = value if field.name in ("axes", "closures", "rpe") else (value,)
         for single_value in values:
-            text = None if isinstance(single_value, bool) else _option_text(single_value)
+            text = None if isinstance(single_value, bool) else _format_value(single_value)
             yield option_names[field.name], text
     if (position := getattr(request, "position", None)) is not None:
-        yield from _all_options(position)
+        yield from _list_changed_options(position)
 
 
-def _option_text(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, msgspec.Struct):
         value = msgspec.structs.astuple(value)
     if isinstance(value, tuple):
-        return ",".join(_option_text(part) for part in value if part is not None)
+        return ",".join(_format_value(part) for part in value if part is not None)
     return f"{value:.15g}" if isinstance(value, float) else str(value)
 
 
-def _file_name(path: str) -> str:
+def _extract_file_name(path: str) -> str:
     """Return the file name in a path, including the topic of a ROS bag (``BAG:/TOPIC``)."""
     file, topic, _ = re.split(r"((?<=..):/.*|$)", path, maxsplit=1, flags=re.DOTALL)
     return replace_unencodable(PurePath(file).name) + topic

@@ -274,10 +274,10 @@ def _diagnose_cached(
     progress: Progress = ignore_progress,
     flight: Flight | None = None,
     *,
-    as_sent: bool = False,
+    keep_as_sent: bool = False,
 ) -> Analysis:
-    if as_sent or (flight is not None and flight is not _cache.get(_flight_key(request))):
-        return _diagnose(request, progress, flight, as_sent=as_sent)
+    if keep_as_sent or (flight is not None and flight is not _cache.get(_flight_key(request))):
+        return _diagnose(request, progress, flight, keep_as_sent=keep_as_sent)
     return _cached(_cache_key(request, "analysis"), lambda: _diagnose(request, progress, flight))
 
 

@@ -227,7 +227,8 @@ def test_align_position_file_takes_frame_from_column_names(flight: Flight, frame
     alignment, track = align(flight, file)
     assert alignment.frame == frame
     assert alignment.frame_reason.startswith(
-        f"this frame has the smallest residual against the EKF2 position ({frame} 0.1"
+        f"of all tried frames, {frame} has the smallest residual against the EKF2 position "
+        f"({frame} 0.1"
     )
     assert_same_track(track, flight.positions[0], 1e-9)
     alignment, _ = align(flight, replace(file, frames=(frame,) if frame else ()))

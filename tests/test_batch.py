@@ -44,7 +44,7 @@ from px4fuse.batch.rows import (
 )
 from px4fuse.batch.run import BatchResult, load_cached_rows
 from px4fuse.batch.terminal import format_summary
-from px4fuse.cli.outputs import terminal
+from px4fuse.cli.outputs import make_console
 from px4fuse.core import workers
 from px4fuse.core.workers import JobFailure, run_with_limits
 from px4fuse.errors import OutputError, SettingsError
@@ -184,7 +184,7 @@ def test_batch_table_has_numbers_or_failure_reason_per_log(tmp_path):
 
 def test_batch_summary_counts_logs_by_failure_reason(capsys):
     table = artificial_logs(60).fillna({"axis": "", "change": ""})
-    print_blocks(terminal(), format_summary(BatchResult(table, 3, frozenset(), ())).blocks)
+    print_blocks(make_console(), format_summary(BatchResult(table, 3, frozenset(), ())).blocks)
     said = " ".join(capsys.readouterr().out.split())
     failed = table[table["status"] == "failed"]
     first_log = failed["log"].iloc[0]
@@ -510,7 +510,7 @@ def assert_failed_job_does_not_affect_others(address):
     """Assert that other jobs succeed, also after a worker was killed."""
     # jobs that end at once or never: reporting an exception takes seconds of imports
     jobs = [("square", 3), ("unreadable", 0), ("exit", 3), ("hang", 0), ("square", 4)]
-    work = partial(run_with_limits, failing_jobs.run_job, timeout_s=5.0, memory_bytes=2 * 10**9)
+    work = partial(run_with_limits, failing_jobs.run_job, timeout_s=5.0, max_memory_bytes=2 * 10**9)
     expected = [9, "cannot be read (ValueError)", "exit code 3", "limit of 5 s", 16]
     with connect_cluster(address) as client:
         found = []

@@ -61,7 +61,7 @@ def test_loop_correction_removes_linear_heading_drift() -> None:
 def test_key_frame_path_length_excludes_position_noise() -> None:
     position, _ = square(600, 20.0)  # 80 m, 3.3 cm a step
     noisy = position + np.random.default_rng(1).normal(0.0, 0.02, position.shape)
-    frames = closure.choose_key_frames(noisy, closure.default_key_frame_spacing_m(noisy))
+    frames = closure.choose_key_frames(noisy, closure.compute_default_spacing_m(noisy))
     assert cumulative_distance(noisy)[-1] > 95.0
     assert abs(cumulative_distance(noisy[frames])[-1] - 80.0) < 0.8
     assert frames[0] == 0
@@ -72,7 +72,7 @@ def test_key_frame_path_length_excludes_position_noise() -> None:
 def test_heading_change_equals_rotation_about_vertical(yaw: float, x: float, y: float) -> None:
     tilt = Rotation.from_rotvec([x, y, 0.0])
     turn = Rotation.from_rotvec([0.0, 0.0, yaw])
-    assert abs(closure.heading_change_rad(turn * tilt) - yaw) < 1e-9
+    assert abs(closure.compute_heading_change_rad(turn * tilt) - yaw) < 1e-9
 
 
 def test_camera_frame_positions_are_converted_to_frd() -> None:

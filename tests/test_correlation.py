@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import f
 
-from px4fuse.trajectory.correlation import autocovariance, moments
+from px4fuse.trajectory.correlation import autocovariance, compute_moments
 from px4fuse.trajectory.time_offset import MIN_SECOND_PEAK_RATIO
 
 
@@ -16,7 +16,7 @@ def test_cross_correlation_equals_direct_sum_at_each_lag(is_complex: bool) -> No
         a, b = a + 1j * rng.normal(size=7), b + 1j * rng.normal(size=11)
     a_known, b_known = rng.random(7) < 0.7, rng.random(11) < 0.7
     a[~a_known] = np.nan
-    found = moments(a, b, a_known, b_known)
+    found = compute_moments(a, b, a_known, b_known)
     assert len(found.count) == 7 + 11 - 1
     for k, count in enumerate(found.count):
         lag = k - 6  # a's sample 0 meets b's sample lag
@@ -25,8 +25,8 @@ def test_cross_correlation_equals_direct_sum_at_each_lag(is_complex: bool) -> No
         x, y = a[both], b[[i + lag for i in both]]
         x, y = (v - v.mean() if len(v) else v for v in (x, y))
         np.testing.assert_allclose(found.covariance[k], np.sum(x.conj() * y), atol=1e-10)
-        np.testing.assert_allclose(found.power_a[k], np.sum(np.abs(x) ** 2), atol=1e-10)
-        np.testing.assert_allclose(found.power_b[k], np.sum(np.abs(y) ** 2), atol=1e-10)
+        np.testing.assert_allclose(found.energy_a[k], np.sum(np.abs(x) ** 2), atol=1e-10)
+        np.testing.assert_allclose(found.energy_b[k], np.sum(np.abs(y) ** 2), atol=1e-10)
 
 
 def test_autocovariance_equals_sum_of_products() -> None:

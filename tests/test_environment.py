@@ -69,7 +69,7 @@ def test_command_in_deleted_folder_reports_missing_folder(tmp_path, command) -> 
     gone.mkdir()
     code, out, err = started(command.format(log=LOG), before='rmdir "$PWD";', folder=gone)
     said = "px4fuse: the current folder no longer exists; nothing was written. "
-    assert (code, out, err) == (2, "", f"{said}Change to another folder.\n")
+    assert (code, out, err) == (2, "", f"{said}Change to an existing folder.\n")
 
 
 @linux

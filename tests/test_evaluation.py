@@ -27,12 +27,12 @@ from px4fuse.trajectory.scores import (
     Delta,
     RmseInterval,
     autocorrelation_time,
+    compute_relative_error,
+    compute_statistics,
+    estimate_rmse_interval,
     find_pairs,
-    relative_error,
-    rmse_interval,
-    statistics,
 )
-from px4fuse.trajectory.time_offset import clock_difference, estimate_time_offset
+from px4fuse.trajectory.time_offset import compute_clock_offset_s, estimate_time_offset
 
 # -- evo -------------------------------------------------------------------------------------------
 
@@ -114,7 +114,9 @@ def test_trajectory_rpe_equals_that_of_the_evo_package(
                 continue
             turns = np.degrees(Rotation.from_matrix(np.array(metric.E)[:, :3, :3]).magnitude())
             for found, errors in ((ours.translation_m, metric.error), (ours.rotation_deg, turns)):
-                assert asdict(found) == pytest.approx(asdict(statistics(errors)), rel=0, abs=1e-9)
+                assert asdict(found) == pytest.approx(
+                    asdict(compute_statistics(errors)), rel=0, abs=1e-9
+                )
 
 
 # -- alignment -------------------------------------------------------------------------------------
@@ -285,7 +287,7 @@ def test_rpe_of_scaled_track_is_proportional_to_distance() -> None:
     for one in got.rpe:
         start, end = find_pairs(got.reference_m, got.time_s, Delta(one.delta, one.unit))
         chord = np.linalg.norm(got.reference_m[end] - got.reference_m[start], axis=1)
-        assert asdict(one.translation_m) == pytest.approx(asdict(statistics(0.02 * chord)))
+        assert asdict(one.translation_m) == pytest.approx(asdict(compute_statistics(0.02 * chord)))
 
 
 @settings(max_examples=60)
@@ -313,7 +315,9 @@ def test_rpe_pairs_are_chosen_by_reference_distance() -> None:
     """Also if the path of the estimate is twice as long."""
     reference = flight(30.0)
     double = transformed(reference, TURN, SHIFT, 2.0, kind="vio")
-    same, other = (relative_error(one, reference, Delta(1.0, "m")) for one in (reference, double))
+    same, other = (
+        compute_relative_error(one, reference, Delta(1.0, "m")) for one in (reference, double)
+    )
     assert other.pairs_from == "reference"
     assert other.translation_m.count == same.translation_m.count
 
@@ -344,9 +348,9 @@ def test_evaluate_without_orientation_or_pairs_gives_reason() -> None:
     (("vio", "NED"), ("slam", "camera"), "a", 1.0, "se3", "first key frame"),
     (("slam", "camera"), ("vio", "NED"), "a", 1.05, "se3", "first key frame"),
     (("slam", "camera"), ("truth", "NED"), "a", 2.0, "sim3", "the scale factor 0.5"),
-    (("slam", "unknown"), ("truth", "NED"), "kf_mono", 1.0, "sim3", "is monocular"),
+    (("slam", "unknown"), ("truth", "NED"), "kf_mono", 1.0, "sim3", "monocular"),
     (("slam", "unknown"), ("truth", "NED"), "harmony", 1.0, "se3", "first key frame"),
-    (("unknown", "unknown"), ("truth", "unknown"), "a", 1.0, "se3", "kind is unknown"),
+    (("unknown", "unknown"), ("truth", "unknown"), "a", 1.0, "se3", "source of this"),
     (("truth", "NED"), ("truth", "NED"), "a", 1.0, "none", "ground truth"),
 ])  # fmt: skip
 def test_default_alignment_depends_on_source_kind_and_frame(
@@ -487,7 +491,7 @@ def test_trajectory_time_offset_interval_contains_true_offset() -> None:
 def test_time_offset_search_starts_at_difference_of_unix_times() -> None:
     reference = replace(flight(), unix_offset_s=1.5e9)
     estimate = replace(flight(), unix_offset_s=0.0, time_s=flight().time_s + 1.5e9 - 0.2)
-    assert clock_difference(estimate, reference) == -1.5e9
+    assert compute_clock_offset_s(estimate, reference) == -1.5e9
     got = evaluate(estimate, reference, time_offset_s="auto")
     assert got.time_offset.offset_s == pytest.approx(0.2 - 1.5e9, abs=1e-3)
     again = evaluate(estimate, reference, time_offset_s=got.time_offset.offset_s)
@@ -551,7 +555,7 @@ def test_rmse_confidence_interval_contains_true_rmse(phi: float) -> None:
     flights, n = 200, 2000
     white = random.normal(size=(n + 500, flights, 3)) * np.sqrt(1.0 - phi**2)
     errors = np.linalg.norm(lfilter([1.0], [1.0, -phi], white, axis=0)[500:], axis=2)
-    got = [rmse_interval(errors[:, i], "ATE") for i in range(flights)]
+    got = [estimate_rmse_interval(errors[:, i], "ATE") for i in range(flights)]
     known = [one for one in got if isinstance(one, RmseInterval)]
     assert len(known) == flights
     assert np.median([one.blocks for one in known]) > 20.0
@@ -569,10 +573,12 @@ def test_autocorrelation_time_of_ar1_series_equals_closed_form() -> None:
 
 def test_rmse_interval_from_too_few_blocks_is_unavailable() -> None:
     drift = np.linspace(0.0, 1.0, 500)
-    got = rmse_interval(drift, "ATE")
+    got = estimate_rmse_interval(drift, "ATE")
     assert isinstance(got, Unavailable)
     assert f"fewer than {MIN_BOOTSTRAP_BLOCKS:.0f} independent blocks" in str(got)
-    assert isinstance(rmse_interval(np.ones(100), "ATE", min_block_length=30), Unavailable)
-    same = rmse_interval(np.full(100, 0.5), "ATE")
+    assert isinstance(estimate_rmse_interval(np.ones(100), "ATE", min_block_length=30), Unavailable)
+    same = estimate_rmse_interval(np.full(100, 0.5), "ATE")
     assert (same.low, same.high) == (pytest.approx(0.5), pytest.approx(0.5))
-    assert rmse_interval(np.sin(drift * 99), "ATE") == rmse_interval(np.sin(drift * 99), "ATE")
+    assert estimate_rmse_interval(np.sin(drift * 99), "ATE") == estimate_rmse_interval(
+        np.sin(drift * 99), "ATE"
+    )

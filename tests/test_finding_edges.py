@@ -106,7 +106,7 @@ def make_finding(name: str, level: Any = "error", caused_by: str | None = None) 
     ],
 )  # fmt: skip
 def test_fault_report_lists_times_of_occurrence(spans: Any, expected: str) -> None:
-    assert replace(make_finding("x"), spans_s=spans).when == expected
+    assert replace(make_finding("x"), spans_s=spans).spans_text == expected
 
 
 def test_status_flag_before_first_sample_has_first_value() -> None:

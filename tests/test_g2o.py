@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers.g2o import g2o_text, parse_g2o, read_g2o
 from px4fuse.trajectory.graph import lie, solver
-from px4fuse.trajectory.graph.model import FROM_FILE, PoseGraph
+from px4fuse.trajectory.graph.model import POSES_FROM_FILE, PoseGraph
 
 UNIT_2 = "1 0 0 1 0 1"
 UNIT_3 = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
@@ -37,7 +37,7 @@ def test_parse_g2o_reads_information_as_upper_triangle_by_rows(whole: str, unit:
     expected = np.zeros((size, size))
     expected[upper] = np.arange(len(upper[0])) + 100.0 * (upper[0] == upper[1])
     graph = parse_g2o(whole.replace(unit, " ".join(map(str, expected[upper]))), "a.g2o")
-    assert (graph.dimension, graph.initialised) == (size // 3 + 1, FROM_FILE)
+    assert (graph.dimension, graph.initialised) == (size // 3 + 1, POSES_FROM_FILE)
     np.testing.assert_array_equal(np.triu(graph.information[0]), expected)
     np.testing.assert_array_equal(graph.information[0], graph.information[0].T)
 
@@ -230,7 +230,7 @@ def test_loop_command_on_g2o_reports_missing_convergence(tmp_path, monkeypatch, 
     path.write_text(far + SQUARE.format(*[UNIT_2] * 4) + f"EDGE_SE2 0 4 0.1 0.1 6.2 {UNIT_2}\n")
     assert "Solver" not in run_main(monkeypatch, capsys, "loop", path)[1]
     monkeypatch.setattr(solver, "_MAX_DAMPING", 0.0)
-    monkeypatch.setattr(solver, "_MIN_FIDELITY", 1e9)
+    monkeypatch.setattr(solver, "_MIN_GAIN_RATIO", 1e9)
     code, out, _ = run_main(monkeypatch, capsys, "loop", path, "--json", tmp_path / "g.json")
     assert code == 0
     assert "not converged: pose graph, all closures" in out

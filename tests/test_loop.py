@@ -14,12 +14,12 @@ from trajectory_tools import noisy_odometry, square
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.findings import find_loop_findings
 from px4fuse.flight.model import Unavailable
-from px4fuse.lesson import ODOMETRY_M, loop_lines
+from px4fuse.lesson import ODOMETRY_M, format_loop_lines
 from px4fuse.loop.analysis import analyse, analyse_flight_loop
 from px4fuse.loop.corrections import (
     HEADINGS_CORRECTED_LABEL,
     POSITIONS_CORRECTED_LABEL,
-    odometry_variances,
+    compute_odometry_variances,
 )
 from px4fuse.loop.model import Loop, OdometryNoise
 from px4fuse.loop.tracks import LoopSource, read_source, split_path_and_part
@@ -122,7 +122,7 @@ def test_loop_command_on_lesson_example_2_equals_lesson_output() -> None:
     found = close_loop(Trajectory("corners", "vio", np.arange(5.0), corners, None, "FRD"))
     error, total = closure_error_vector_m(found), found.path_length_m
     corrected = path(found, "by_distance_plain").trajectory.position_m
-    assert list(loop_lines()) == [
+    assert list(format_loop_lines()) == [
         f"loop closure error ({error[0]:.1f}, {error[1]:.1f}) m over {total:.1f} m = "
         f"{found.closure_error_m / total:.1%}",
         *(
@@ -341,13 +341,13 @@ def test_odometry_variance_uses_growth_of_reported_variance() -> None:
     _, odometry = laps(1, 6, OdometryNoise())
     nodes = np.arange(0, len(odometry), 10)
     constant = replace(odometry, position_variance_m2=np.full((len(odometry), 3), 0.0025))
-    default, _, _ = odometry_variances(odometry, nodes, OdometryNoise())
-    same, _, words = odometry_variances(constant, nodes, OdometryNoise())
+    default, _, _ = compute_odometry_variances(odometry, nodes, OdometryNoise())
+    same, _, words = compute_odometry_variances(constant, nodes, OdometryNoise())
     np.testing.assert_array_equal(same, default)
     assert "do not grow" in words
     growing = np.linspace(0.001, 0.4, len(odometry))[:, None].repeat(3, axis=1)
     with_growing = replace(odometry, position_variance_m2=growing)
-    grown, _, words = odometry_variances(with_growing, nodes, OdometryNoise())
+    grown, _, words = compute_odometry_variances(with_growing, nodes, OdometryNoise())
     np.testing.assert_allclose(grown.sum(), 0.4 - 0.001, rtol=0.05)
     assert "increase of the logged position variances" in words
 

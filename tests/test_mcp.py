@@ -29,7 +29,13 @@ from px4fuse.classroom.assignment.roster import Person
 from px4fuse.cli.mcp import make_tools, run_command
 from px4fuse.findings.model import CATALOGUE
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD
-from px4fuse.mcp.server import INSTRUCTIONS, MAX_CACHED_ANSWERS, NOTICE, PROMPTS, Server
+from px4fuse.mcp.server import (
+    INSTRUCTIONS,
+    MAX_CACHED_ANSWERS,
+    PROMPTS,
+    UNTRUSTED_TEXT_NOTICE,
+    Server,
+)
 from px4fuse.results.contract import schema, to_json
 
 # Command of px4fuse for each tool that analyses a file
@@ -109,7 +115,7 @@ def text_of(result: Any) -> str:
         (content,) = result.content
     else:
         notice, content = result.content
-        assert notice.text == NOTICE
+        assert notice.text == UNTRUSTED_TEXT_NOTICE
     return content.text
 
 

@@ -18,8 +18,8 @@ from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.covariance import gate_edges
 from px4fuse.trajectory.graph.initialisation import _initialise_chordal, initialise
 from px4fuse.trajectory.graph.model import (
-    FROM_CHORDAL,
-    FROM_ODOMETRY,
+    POSES_FROM_CHORDAL,
+    POSES_FROM_ODOMETRY,
     PoseGraph,
     compose_odometry,
     cost,
@@ -111,7 +111,7 @@ def test_chordal_initialisation_equals_dense_least_squares(dimension: int, seed:
     weights = [(-root, root) for root in roots]
     position = least_squares(weights, values, graph.poses[0, :d]).reshape(n - 1, d)
     made = _initialise_chordal(graph)
-    assert made.initialised == FROM_CHORDAL
+    assert made.initialised == POSES_FROM_CHORDAL
     np.testing.assert_array_equal(made.poses[0], graph.poses[0])
     np.testing.assert_allclose(lie.rotation_matrix(made.poses), rotation, atol=1e-7)
     np.testing.assert_allclose(made.poses[1:, :d], position, rtol=1e-6, atol=1e-6)
@@ -148,7 +148,7 @@ def test_pose_graph_minimum_cost_equals_gtsam(name: str) -> None:
 @pytest.mark.parametrize("name", ["SE-Sync_manhattan", "SE-Sync_CSAIL", "SE-Sync_kitti_00"])
 def test_g2o_without_vertices_starts_from_chordal_solution(name: str) -> None:
     graph = read_g2o(shared("pose_graphs") / f"{name}.g2o")
-    assert graph.initialised == FROM_CHORDAL
+    assert graph.initialised == POSES_FROM_CHORDAL
     assert cost(graph) < 1e-3 * cost(compose_odometry(graph))
     assert solve(graph).cost < 0.9 * cost(graph) or name == "SE-Sync_CSAIL"
 
@@ -179,7 +179,8 @@ def test_square_loop_closure_error_is_spread_by_distance(dimension: int) -> None
     ends = np.arange(4 * side)
     graph = PoseGraph(
         dimension, np.arange(4 * side + 1), odometry, np.append(ends, 0),
-        np.append(ends + 1, 4 * side), np.vstack([measured, back]), information, FROM_ODOMETRY,
+        np.append(ends + 1, 4 * side), np.vstack([measured, back]), information,
+        POSES_FROM_ODOMETRY,
     )  # fmt: skip
     solution = solve(graph)
     share = np.concatenate([[0.0], np.cumsum(length)]) / np.sum(length)
@@ -283,7 +284,7 @@ def laps(seed: int, false: int = 1) -> tuple[PoseGraph, np.ndarray, np.ndarray]:
     chain = np.arange(n - 1)
     graph = PoseGraph(
         3, np.arange(n), odometry, np.concatenate([chain, i]), np.concatenate([chain + 1, j]),
-        np.vstack([steps, closures]), information, FROM_ODOMETRY,
+        np.vstack([steps, closures]), information, POSES_FROM_ODOMETRY,
     )  # fmt: skip
     true = np.ones(len(graph.first_nodes), dtype=bool)
     true[n - 1 + count :] = False

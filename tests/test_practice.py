@@ -84,7 +84,7 @@ def flown(mistake: QuizFault | None, level: int, seed: int) -> Flight:
 
 def compared(flight: Flight, **settings: float) -> Comparison:
     chosen = Settings(**({"sigma_a_m_s2": practice.SIGMA_A_M_S2} | settings))
-    return compare(flight, chosen, as_sent=True)
+    return compare(flight, chosen, keep_as_sent=True)
 
 
 def kf_statistics(flight: Flight, **settings: float) -> Any:

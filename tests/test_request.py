@@ -91,8 +91,8 @@ def test_compare_options_written_as_json_are_read_back_equal(request: Request) -
 def test_command_in_report_names_input_files_without_folders() -> None:
     request = ComparisonRequest(log="/home/eve/a.ulg", position=PositionFile(path="../d.csv"))
     assert command_line(request) == "px4fuse compare a.ulg --position d.csv"
-    assert "eve" not in msgspec.json.encode(request.without_paths()).decode()
-    assert LoopRequest(source="x/l.ulg:vio", reference="y/s.tum").without_paths() == LoopRequest(
+    assert "eve" not in msgspec.json.encode(request.with_file_names()).decode()
+    assert LoopRequest(source="x/l.ulg:vio", reference="y/s.tum").with_file_names() == LoopRequest(
         source="l.ulg:vio", reference="s.tum"
     )
 

@@ -18,7 +18,7 @@ from exchange import replace
 from rich.console import Console
 
 from px4fuse.analysis import Analysis
-from px4fuse.cli.outputs import default_report_path, progress, terminal
+from px4fuse.cli.outputs import default_report_path, make_console, progress
 from px4fuse.diagnose import diagnose as analyse
 from px4fuse.errors import OutputError
 from px4fuse.report import card_text, screen
@@ -26,7 +26,7 @@ from px4fuse.report.card_text import card_lines, with_typed_path
 from px4fuse.report.page import Page
 from px4fuse.report.screen import expand_commands, print_paragraph
 from px4fuse.report.terminal import comparison_page
-from px4fuse.request import ComparisonRequest, PositionFile, command_line, settings_name
+from px4fuse.request import ComparisonRequest, PositionFile, command_line, format_settings_suffix
 from px4fuse.results.build import results
 from px4fuse.results.contract import ComparisonResults, to_json
 from px4fuse.results.model import Student
@@ -78,7 +78,7 @@ def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> N
         monkeypatch.delenv("COLUMNS", raising=False)
         if width is not None:
             monkeypatch.setenv("COLUMNS", str(width))
-        console = terminal()
+        console = make_console()
         with console.capture() as captured:
             page = comparison_page(*document, verbose=True)
             screen.print_blocks(console, page.blocks, document[0].request)
@@ -213,8 +213,8 @@ def reported(made: ComparisonResults, **changes: object) -> str:
     """Write a report without pages to its default path and return the file name."""
     student = Student(name=str(changes.pop("student", "")))
     request = replace(made.request, **changes)
-    changed = replace(made, request=request.without_paths(), student=student)
-    path = default_report_path(Path(request.log).stem + settings_name(request), changed)
+    changed = replace(made, request=request.with_file_names(), student=student)
+    path = default_report_path(Path(request.log).stem + format_settings_suffix(request), changed)
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(blank_page(None, to_json(changed)))
     path.with_suffix(".json").write_text(to_json(changed), encoding="utf-8")
@@ -292,7 +292,7 @@ def test_html_file_of_user_is_not_overwritten_by_default(desk, command, mine) ->
     page.parent.mkdir()
     page.write_bytes(mine)
     message = error_line(*command.split())
-    assert f"{page} exists and was not overwritten, because the file is not a page of" in message
+    assert f"{page} exists and was not overwritten, because this px4fuse version did not" in message
     assert page.read_bytes() == mine
     run_checked(*command.split(), "-o", page)
     assert page.read_bytes() != mine
@@ -304,10 +304,10 @@ def test_output_name_made_from_settings_has_valid_characters() -> None:
         log="a.ulg", axes=("north", "east"), clock_offset_s=-0.12, heading_deg=30.0,
         position=PositionFile(path="/home/x/u wb.csv", columns=("t", "x/y", "*")),
     )  # fmt: skip
-    assert settings_name(request) == (
+    assert format_settings_suffix(request) == (
         "_axis-north_axis-east_heading-30_clock-offset--0.12_position-u-wb_position-columns-t,x-y,-"
     )
-    assert settings_name(ComparisonRequest(log="a.ulg")) == ""
+    assert format_settings_suffix(ComparisonRequest(log="a.ulg")) == ""
 
 
 # --- progress bar ---

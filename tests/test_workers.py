@@ -18,10 +18,14 @@ from px4fuse.core.workers import JobFailure, run_with_limits
 MEMORY = 1_500_000_000
 
 
-def run(jobs, processes=2, timeout_s=60.0, memory_bytes=None):
+def run(jobs, processes=2, timeout_s=60.0, max_memory_bytes=None):
     outcomes = list(
         run_with_limits(
-            run_job, jobs, processes=processes, timeout_s=timeout_s, memory_bytes=memory_bytes
+            run_job,
+            jobs,
+            processes=processes,
+            timeout_s=timeout_s,
+            max_memory_bytes=max_memory_bytes,
         )
     )
     assert not multiprocessing.active_children()
@@ -75,11 +79,11 @@ def test_worker_job_that_hangs_ends_at_time_limit():
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not enforce the limit")
 def test_worker_job_above_memory_limit_is_ended():
     jobs = [("square", 2), ("hog", 10 * MEMORY), ("square", 3)]
-    results, _ = run(jobs, processes=1, memory_bytes=MEMORY)
+    results, _ = run(jobs, processes=1, max_memory_bytes=MEMORY)
     assert results == [4, JobFailure("the job exceeded the memory limit for one file."), 9]
     # after a memory error the process is replaced
     jobs = [("process", 0), ("hog", 10 * MEMORY), ("process", 0)]
-    (before, _, after), _ = run(jobs, processes=1, memory_bytes=MEMORY)
+    (before, _, after), _ = run(jobs, processes=1, max_memory_bytes=MEMORY)
     assert before != after
 
 
@@ -102,7 +106,7 @@ def test_worker_that_cannot_import_the_function_fails_each_job(monkeypatch):
 def test_closing_the_worker_pool_ends_all_processes():
     jobs = [("square", 1), ("hang", 0)]
     with closing(
-        run_with_limits(run_job, jobs, processes=2, timeout_s=60, memory_bytes=None)
+        run_with_limits(run_job, jobs, processes=2, timeout_s=60, max_memory_bytes=None)
     ) as work:
         assert next(work) == (0, 1)
     assert not multiprocessing.active_children()
@@ -116,7 +120,7 @@ from failing_jobs import run_job
 
 if __name__ == "__main__":
     for _, result in run_with_limits(run_job, [("process", 0), ("hang", 0)], processes=1,
-                                     timeout_s=500, memory_bytes=None):
+                                     timeout_s=500, max_memory_bytes=None):
         print(result, flush=True)
 """
 

@@ -8,10 +8,10 @@ import pandas as pd
 
 from px4fuse.alignment import time_and_pose_fit, tracks
 from px4fuse.alignment.time_and_pose_fit import (
-    GRID_RESIDUAL_M,
+    INTERPOLATION_RESIDUAL_M,
     MIN_CONCORDANCE,
     CorrelationPeak,
-    Fit,
+    TrackFit,
 )
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTrack
 from px4fuse.flight.model import Flight, Unavailable
@@ -23,19 +23,19 @@ ESTIMATED_YAW_FRAMES = ("ned", "enu")
 # flight along one axis cannot distinguish them from frames with z up
 GIVEN_YAW_FRAMES = ("ned", "enu", "nwu")
 # Maximum time span (s) of a position file, which limits the computing time to five seconds
-MAX_SPAN_S = 86400.0
-# Minimum concordance correlation coefficient (Lin 1989) of a good match with each reference
-MIN_GOOD_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
+MAX_FILE_DURATION_S = 86400.0
+# Minimum concordance correlation coefficient (Lin 1989) of a reliable match, by reference
+MIN_RELIABLE_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
 # Maximum standard deviation (s) of an accepted time offset
 MAX_CLOCK_SIGMA_S = 0.5
 # Minimum ratio of the residuals in the second best and the best frame; with a smaller ratio, the
 # frame is ambiguous
 MIN_FRAME_RESIDUAL_RATIO = 1.3
-# Minimum ratio of the residual with the user's yaw to the residual with estimated yaw and origin,
-# to report a misaligned frame
-MIN_ROTATED_RESIDUAL_RATIO = 2.0
-# Minimum residual (m, RMS) with the user's yaw, to report a misaligned frame
-MIN_ROTATED_RESIDUAL_M = 0.3
+# Minimum ratio of the position residual with the given yaw (default 0) to the residual with
+# estimated yaw, to report a misaligned frame
+MIN_MISALIGNED_RATIO = 2.0
+# Minimum position residual (m, RMS) with the given yaw, to report a misaligned frame
+MIN_MISALIGNED_RESIDUAL_M = 0.3
 
 
 @dataclass(frozen=True)
@@ -69,45 +69,45 @@ class Match:
     reference : SampledTrack
     frame : str
         Directions of x, y and z in the file, such as "enu".
-    residuals_m : dict from frame to float
-        RMS residual in each tried frame, best first.
-    fit : Fit
+    rms_m_by_frame : dict from frame to float
+        RMS position residual in each tried frame, best first.
+    fit : TrackFit
         Fit with the yaw from the user; equal to ``free_yaw_fit`` if the user gave no yaw.
-    free_yaw_fit : Fit
+    free_yaw_fit : TrackFit
         Fit with estimated yaw.
     is_rotated : bool
-        True if the user's yaw is wrong: ``free_yaw_fit`` is much better than ``fit``.
+        True if the yaw from the user is wrong: ``free_yaw_fit`` is much better than ``fit``.
     """
 
     reference: SampledTrack
     frame: str
-    residuals_m: dict[str, float]
-    fit: Fit
-    free_yaw_fit: Fit
+    rms_m_by_frame: dict[str, float]
+    fit: TrackFit
+    free_yaw_fit: TrackFit
     is_rotated: bool
 
     @property
-    def time_offset_fit(self) -> Fit:
-        """Fit from which the time offset is taken: a wrong yaw would bias the time offset."""
+    def time_offset_fit(self) -> TrackFit:
+        """Fit for the time offset: with estimated yaw if a wrong given yaw would bias it."""
         return self.free_yaw_fit if self.is_rotated else self.fit
 
     @property
     def residuals_text(self) -> str:
         """Residuals for messages, best frame first: "ned 0.12 m, enu 3.40 m"."""
         return ", ".join(
-            f"{name} {residual_m:.2f} m" for name, residual_m in self.residuals_m.items()
+            f"{name} {residual_m:.2f} m" for name, residual_m in self.rms_m_by_frame.items()
         )
 
 
 def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     """Match the position file with EKF2's position or, if this fails, with the IMU.
 
-    Return None if both fail, but the user gave all parameters.
+    Return None if both fail, but the user gave all options.
 
     Raises
     ------
     NoMatchError
-        Both fail, so a parameter that the user did not give cannot be estimated.
+        Both fail, so an option that the user did not give cannot be estimated.
     """
     value_by_option = {
         "clock_offset_s": problem.lag_s,
@@ -117,13 +117,13 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     missing_options = [f"`{name}`" for name, value in value_by_option.items() if value is None]
     reasons = []
     make_reference_functions = [tracks.make_ekf2_references]
-    # Parameters that the user gave are only checked against EKF2, because the band-pass filtered
-    # motion of the IMU is not accurate enough for a check
+    # The IMU is used only to estimate missing options: its band-pass filtered motion is not
+    # accurate enough for checking given options
     if missing_options:
         make_reference_functions.append(tracks.make_imu_references)
     for make_references in make_reference_functions:
         try:
-            match = _best_match(make_references(flight), problem)
+            match = _find_best_match(make_references(flight), problem)
             _require_unique_match(match)
             return _refit_with_corrected_resets(flight, match, problem)
         except NoMatchError as error:
@@ -137,45 +137,48 @@ def find_match(flight: Flight, problem: AlignmentProblem) -> Match | None:
     return None
 
 
-def _best_match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
+def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) -> Match:
     samples = problem.samples
     yaw_rad = problem.yaw_rad
-    if samples.index[-1] - samples.index[0] > MAX_SPAN_S:
+    if samples.index[-1] - samples.index[0] > MAX_FILE_DURATION_S:
         raise NoMatchError(
             "the position file covers more than one day; shorten the file to the flight"
         )
     frames = problem.frames or (ESTIMATED_YAW_FRAMES if yaw_rad is None else GIVEN_YAW_FRAMES)
-    if tracks.horizontal_range_m(tracks.convert_to_ned(samples, frames[0])) < tracks.MIN_MOTION_M:
+    if (
+        tracks.compute_horizontal_range_m(tracks.convert_to_ned(samples, frames[0]))
+        < tracks.MIN_MOTION_M
+    ):
         raise NoMatchError(
             f"the positions in the file change by less than {tracks.MIN_MOTION_M:g} m"
         )
     matches = []
     for reference in references:
         reference_name = reference.name
-        fit_frame = partial(_best_fit, problem, reference)
-        fit_by_frame = [(frame, fit_frame(frame, yaw_rad)) for frame in frames]
-        fit_by_frame.sort(key=lambda frame_and_fit: frame_and_fit[1].rms_m)
-        best_frame, fit = fit_by_frame[0]
+        fit_frame = partial(_fit_in_frame, problem, reference)
+        frames_and_fits = [(frame, fit_frame(frame, yaw_rad)) for frame in frames]
+        frames_and_fits.sort(key=lambda frame_and_fit: frame_and_fit[1].rms_m)
+        best_frame, fit = frames_and_fits[0]
         free_yaw_fit = fit if yaw_rad is None else fit_frame(best_frame, None)
-        is_rotated = is_good_fit(free_yaw_fit, reference_name) and (
+        is_rotated = is_reliable_fit(free_yaw_fit, reference_name) and (
             fit.concordance < MIN_CONCORDANCE[reference_name]
             or needs_rotation(fit.horizontal_rms_m, free_yaw_fit, reference_name)
         )
-        residuals_m = {frame: fit.rms_m for frame, fit in fit_by_frame}
-        matches.append(Match(reference, best_frame, residuals_m, fit, free_yaw_fit, is_rotated))
+        rms_m_by_frame = {frame: fit.rms_m for frame, fit in frames_and_fits}
+        matches.append(Match(reference, best_frame, rms_m_by_frame, fit, free_yaw_fit, is_rotated))
     return min(matches, key=lambda match: match.time_offset_fit.rms_m)
 
 
-def needs_rotation(horizontal_rms_m: float, free_yaw_fit: Fit, reference: str) -> bool:
-    """Return True if the residual with estimated yaw is much smaller than ``horizontal_rms_m``."""
-    return horizontal_rms_m > MIN_ROTATED_RESIDUAL_RATIO * free_yaw_fit.horizontal_rms_m and (
-        horizontal_rms_m > MIN_ROTATED_RESIDUAL_M or reference == IMU
+def needs_rotation(horizontal_rms_m: float, free_yaw_fit: TrackFit, reference: str) -> bool:
+    """Return True if estimating the yaw makes the residual much less than ``horizontal_rms_m``."""
+    return horizontal_rms_m > MIN_MISALIGNED_RATIO * free_yaw_fit.horizontal_rms_m and (
+        horizontal_rms_m > MIN_MISALIGNED_RESIDUAL_M or reference == IMU
     )
 
 
-def is_good_fit(fit: Fit, reference: str) -> bool:
+def is_reliable_fit(fit: TrackFit, reference: str) -> bool:
     return (
-        fit.concordance >= MIN_GOOD_CONCORDANCE[reference]
+        fit.concordance >= MIN_RELIABLE_CONCORDANCE[reference]
         and fit.second_peak_ratio >= MIN_SECOND_PEAK_RATIO
     )
 
@@ -204,9 +207,9 @@ def _require_unique_match(match: Match) -> None:
             f"{ambiguity_text}",
             "Give `clock_offset_s`",
         )
-    if len(match.residuals_m) > 1:
+    if len(match.rms_m_by_frame) > 1:
         best_residual_m, second_residual_m = (
-            np.hypot(m, GRID_RESIDUAL_M) for m in [*match.residuals_m.values()][:2]
+            np.hypot(m, INTERPOLATION_RESIDUAL_M) for m in [*match.rms_m_by_frame.values()][:2]
         )
         if second_residual_m < MIN_FRAME_RESIDUAL_RATIO * best_residual_m:
             raise NoMatchError(
@@ -224,7 +227,7 @@ def _refit_with_corrected_resets(flight: Flight, match: Match, problem: Alignmen
     aligned_samples = tracks.align_samples(
         problem.samples, match.frame, fit.yaw_rad, fit.origin_m, fit.lag_s
     )
-    ekf2_track = tracks.ekf2_track_without_resets(ekf2, aligned_samples)
+    ekf2_track = tracks.make_continuous_ekf2_track(ekf2, aligned_samples)
     refit = partial(
         time_and_pose_fit.fit_by_least_squares,
         tracks.convert_to_ned(problem.samples, match.frame),
@@ -236,9 +239,9 @@ def _refit_with_corrected_resets(flight: Flight, match: Match, problem: Alignmen
     return replace(match, reference=ekf2_track, fit=fit, free_yaw_fit=free_yaw_fit)
 
 
-def _best_fit(
+def _fit_in_frame(
     problem: AlignmentProblem, reference: SampledTrack, frame: str, yaw_rad: float | None
-) -> Fit:
+) -> TrackFit:
     file_track = tracks.convert_to_ned(problem.samples, frame)
     lag_s = problem.lag_s
     grid_track = tracks.resample_to_grid(tracks.remove_spikes(file_track))
@@ -248,7 +251,7 @@ def _best_fit(
                 f"the position file is shorter than {tracks.MIN_OVERLAP_S:g} s, too short for a "
                 "match with the IMU"
             )
-        position_m = tracks.band_pass(tracks.band_pass(grid_track.position_m))
+        position_m = tracks.apply_band_pass(tracks.apply_band_pass(grid_track.position_m))
         file_track = grid_track = tracks.mark_transients(replace(grid_track, position_m=position_m))
     if lag_s is None:
         peak = time_and_pose_fit.find_correlation_peak(grid_track, reference, yaw_rad)

@@ -18,7 +18,7 @@ from msgspec import structs
 
 from px4fuse.alignment import matching, tracks
 from px4fuse.alignment.matching import AlignmentProblem, Match
-from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, truncated_rms
+from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, compute_clipped_rms_m
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
 from px4fuse.convention.axes import UNIT_SIZES_M
 from px4fuse.convention.check import check_convention
@@ -82,8 +82,8 @@ def _explain_mismatch(
     return "; ".join(fault_texts), " ".join(actions)
 
 
-# Maximum ratio of the residuals at the second best and the best time offset for a warning about an
-# ambiguous time offset, by reference. Correct matches with the noisy IMU have ratios of 1.4 to 1.7
+# A time offset is ambiguous if the residual at the second best time offset is less than this many
+# times the residual at the best one, by reference. Correct matches with the noisy IMU: 1.4 to 1.7
 MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight
@@ -118,9 +118,9 @@ def align_position_file(
     Raises
     ------
     SettingsError
-        A parameter is invalid.
+        An option is invalid.
     MissingDataError
-        A parameter cannot be estimated, or file and log do not overlap in time.
+        An option cannot be estimated, or file and log do not overlap in time.
     """
     _check_options(frame, yaw_deg, clock_offset_s)
     samples = finite_rows(recording.samples, ["x_m", "y_m"])
@@ -131,12 +131,13 @@ def align_position_file(
             "Check that the position file contains the whole flight.",
         )
     start_s, end_s = samples.index[[0, -1]].tolist()
-    boot_s, duration_s = flight.log.boot_time_s, flight.log.duration_s
+    boot_time_s, duration_s = flight.log.boot_time_s, flight.log.duration_s
     spans_text = (
-        f"the log is from {boot_s:.2f} s to {boot_s + duration_s:.2f} s on the boot clock, the "
-        f"position file from {start_s:.2f} s to {end_s:.2f} s on a {recording.clock} clock"
+        f"the log is from {boot_time_s:.2f} s to {boot_time_s + duration_s:.2f} s on the boot "
+        f"clock, the position file from {start_s:.2f} s to {end_s:.2f} s on a {recording.clock} "
+        "clock"
     )
-    lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_s
+    lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_time_s
     if lag_s is not None and not start_s - end_s <= lag_s <= duration_s:
         raise MissingDataError(
             f"{recording.name}: with --clock-offset {clock_offset_s:.3f} the file does not "
@@ -157,7 +158,7 @@ def align_position_file(
     if frame:
         frame_reason = "the frame was given with --position-frame"
     elif recording.format:
-        frame_reason = f"files of the format {recording.format} have this frame"
+        frame_reason = f"the format {recording.format} defines the frame"
     else:
         frame_reason = "the column names of the position file contain the axis directions"
     yaw_reason = "the yaw was given with --position-yaw"
@@ -166,7 +167,7 @@ def align_position_file(
     alignment, aligned_samples = _apply_alignment(
         flight, recording, problem, match, frame_reason, yaw_reason, clock_offset_s
     )
-    clock_source = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
+    offset_origin = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
     invalid, sample_count = recording.invalid, len(recording.samples)
     clock_map = clock_of_repeated_timestamps(
@@ -180,7 +181,7 @@ def align_position_file(
         samples=aligned_samples,
         frame="NED",
         clock=f"{recording.clock} clock of the position file; boot clock minus this clock: "
-        f"{alignment.clock_offset_s:+.3f} s ({clock_source})",
+        f"{alignment.clock_offset_s:+.3f} s ({offset_origin})",
         topics=(recording.name,),
         log=recording.name,
         alignment=alignment,
@@ -189,11 +190,15 @@ def align_position_file(
         step_m=recording.step_m,
     )
     notes = [f"{recording.name}: {text}" for text in (*recording.detected, *recording.notes)]
-    dropped = {recording.name: recording.dropped} if recording.dropped and not clock_map else {}
+    dropped_counts = (
+        {recording.name: recording.dropped} if recording.dropped and not clock_map else {}
+    )
     log = flight.log
     return replace(
         flight,
-        log=structs.replace(log, notes=(*log.notes, *notes), dropped={**log.dropped, **dropped}),
+        log=structs.replace(
+            log, notes=(*log.notes, *notes), dropped={**log.dropped, **dropped_counts}
+        ),
         positions=(track, *flight.positions),
         inputs=(InputFile(recording.name, recording.sha256, recording.size_bytes, "position"),),
     )
@@ -235,8 +240,8 @@ def _apply_alignment(
         reference_name = match.reference.name
         if len(problem.frames) != 1:
             frame_reason = (
-                f"this frame has the smallest residual against the {reference_name} "
-                f"({match.residuals_text})"
+                f"of all tried frames, {frame} has the smallest residual against the "
+                f"{reference_name} ({match.residuals_text})"
             )
             if is_yaw_free and frame == "enu":
                 frame_reason += " (nwu was not tried, because nwu is enu rotated by 90°)"
@@ -304,25 +309,25 @@ def _apply_alignment(
 def _compare_with_ekf2(
     flight: Flight, aligned_samples: pd.DataFrame
 ) -> tuple[Array, float | None] | None:
-    """Return the horizontal distances (m) and the correlation of file and EKF2, if available."""
+    """Return the horizontal distances (m) and the correlation of file and EKF2 positions."""
     if isinstance(flight.ekf2, Unavailable):
         return None
     try:
-        ekf2_track = tracks.ekf2_track_without_resets(flight.ekf2, aligned_samples)
+        ekf2_track = tracks.make_continuous_ekf2_track(flight.ekf2, aligned_samples)
     except NoMatchError:
         return None
-    ekf2_m, is_known = ekf2_track.at(aligned_samples.index.to_numpy())
+    ekf2_position_m, is_known = ekf2_track.at(aligned_samples.index.to_numpy())
     if np.count_nonzero(is_known) < tracks.MIN_SAMPLES:
         return None
-    file_m = aligned_samples[Columns.POSITION[:2]].to_numpy()[is_known]
-    ekf2_m = ekf2_m[is_known, :2]
-    distance_m = np.linalg.norm(file_m - ekf2_m, axis=1)
-    file_m -= file_m.mean(axis=0)
-    ekf2_m -= ekf2_m.mean(axis=0)
-    norm_product = np.linalg.norm(file_m) * np.linalg.norm(ekf2_m)
-    if norm_product == 0.0 or np.ptp(ekf2_m, axis=0).max() < tracks.MIN_MOTION_M:
+    file_position_m = aligned_samples[Columns.POSITION[:2]].to_numpy()[is_known]
+    ekf2_position_m = ekf2_position_m[is_known, :2]
+    distance_m = np.linalg.norm(file_position_m - ekf2_position_m, axis=1)
+    file_position_m -= file_position_m.mean(axis=0)
+    ekf2_position_m -= ekf2_position_m.mean(axis=0)
+    norm_product = np.linalg.norm(file_position_m) * np.linalg.norm(ekf2_position_m)
+    if norm_product == 0.0 or np.ptp(ekf2_position_m, axis=0).max() < tracks.MIN_MOTION_M:
         return distance_m, None
-    return distance_m, float(np.sum(file_m * ekf2_m) / norm_product)
+    return distance_m, float(np.sum(file_position_m * ekf2_position_m) / norm_product)
 
 
 def _describe_frame_conflict(match: Match, distance_m: Array | None, yaw_rad: float) -> str:
@@ -331,8 +336,8 @@ def _describe_frame_conflict(match: Match, distance_m: Array | None, yaw_rad: fl
     is_rotated = match.is_rotated
     shift_text, shift_m = "", 0.0
     if distance_m is not None:
-        residual_m = truncated_rms(distance_m) / np.sqrt(2.0)
-        is_rotated = matching.is_good_fit(fit, reference_name) and matching.needs_rotation(
+        residual_m = compute_clipped_rms_m(distance_m) / np.sqrt(2.0)
+        is_rotated = matching.is_reliable_fit(fit, reference_name) and matching.needs_rotation(
             residual_m, fit, reference_name
         )
         shift_m = float(np.hypot(*fit.origin_m[:2]))
@@ -340,7 +345,7 @@ def _describe_frame_conflict(match: Match, distance_m: Array | None, yaw_rad: fl
     if not is_rotated:
         return ""
     yaw_deg = np.degrees(np.angle(np.exp(1j * (fit.yaw_rad - yaw_rad))))
-    # A smaller shift is not reported, because GNSS determines EKF2's origin to about 1 m
+    # A smaller distance of the origins is not reported: GNSS determines EKF2's origin to about 1 m
     if shift_text and abs(yaw_deg) < MIN_REPORTED_YAW_DEG and shift_m < MIN_REPORTED_SHIFT_M:
         return ""
     return (
@@ -352,7 +357,7 @@ def _describe_frame_conflict(match: Match, distance_m: Array | None, yaw_rad: fl
 def _find_warnings(match: Match, is_yaw_free: bool) -> Iterator[str]:
     reference_name = match.reference.name
     fit = match.time_offset_fit
-    if fit.concordance < matching.MIN_GOOD_CONCORDANCE[reference_name]:
+    if fit.concordance < matching.MIN_RELIABLE_CONCORDANCE[reference_name]:
         yield (
             f"The match of the position file with the {reference_name} is poor: Lin's concordance "
             f"correlation coefficient is {fit.concordance:.2f}."

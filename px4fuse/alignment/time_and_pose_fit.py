@@ -7,23 +7,23 @@ from scipy.optimize import least_squares
 
 from px4fuse.alignment import tracks
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTrack
-from px4fuse.core.arrays import Array, Complex
-from px4fuse.trajectory.correlation import autocovariance, moments
+from px4fuse.core.arrays import Array, ComplexArray
+from px4fuse.trajectory.correlation import autocovariance, compute_moments
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 
 # Maximum distance (s) of the least-squares lag from the correlation peak
-MAX_LAG_SHIFT_S = 1.0
+MAX_LAG_FROM_PEAK_S = 1.0
 # Minimum value of Lin's concordance correlation coefficient (1989) for an accepted match, by
 # reference
 MIN_CONCORDANCE = {EKF2_POSITION: 0.7, IMU: 0.5}
-# Lower limit of 1 - concordance in the log-likelihood ratio: of two nearly perfect matches, the
-# longer one then has the larger likelihood
+# Lower limit of 1 - concordance in the log-likelihood ratio: otherwise a short match with a
+# concordance near 1 would have a larger likelihood than a longer match
 MIN_ONE_MINUS_CONCORDANCE = 1e-4
 # Minimum distance (s) between the lags of two separate correlation peaks
 MIN_PEAK_DISTANCE_S = 3.0
 # Residual (m) of identical tracks, which is caused by interpolation on the time grid
-GRID_RESIDUAL_M = 0.05
-# Maximum residual (m): larger residuals are truncated, because they may be outliers
+INTERPOLATION_RESIDUAL_M = 0.05
+# Limit (m) to which position residuals are clipped in an RMS, because they may be outliers
 MAX_RESIDUAL_M = 1.0
 
 
@@ -50,13 +50,13 @@ class CorrelationPeak:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit(CorrelationPeak):
+class TrackFit(CorrelationPeak):
     """Least-squares fit of e^{i·yaw}·file(t) + origin to reference(t + lag).
 
     Attributes
     ----------
     lag_sigma_s, yaw_sigma_rad : float or None
-        Standard deviations; None if the user gave the parameter.
+        Standard deviations; None if the user gave the value.
     origin_m : ndarray, shape (3,)
         Position of the file's origin: north, east, down.
     coherence : complex
@@ -79,8 +79,8 @@ def find_correlation_peak(
 ) -> CorrelationPeak:
     """Find the lag at which a position file matches a reference best.
 
-    The maximised quantity is the log-likelihood ratio to two independent tracks, which is
-    -N·ln(1 - concordance) for N common samples.
+    The maximised quantity is the log-likelihood ratio to two independent tracks: for N common
+    samples and Lin's concordance (see :class:`CorrelationPeak`), -N·ln(1 - concordance).
 
     Raises
     ------
@@ -95,29 +95,30 @@ def find_correlation_peak(
     )
     if shorter_sample_count < min_count:
         raise NoMatchError("position file and reference have too few common samples for a match")
-    track_moments = moments(
+    track_moments = compute_moments(
         file_track.to_complex_m(), reference.to_complex_m(), file_track.is_valid, reference.is_valid
     )
     common_count = track_moments.count
     covariance = track_moments.covariance
-    power_sum = track_moments.power_a + track_moments.power_b
+    energy_sum = track_moments.energy_a + track_moments.energy_b
     has_overlap = common_count >= min_count
-    has_overlap &= power_sum > 1e-9 * np.max(power_sum)  # at rest, the variance is a rounding error
+    # Exclude lags at which both tracks are at rest: their variance is a rounding error
+    has_overlap &= energy_sum > 1e-9 * np.max(energy_sum)
     real_covariance = (
         np.abs(covariance) if yaw_rad is None else (np.exp(-1j * yaw_rad) * covariance).real
     )
-    concordance = np.zeros_like(power_sum)
-    concordance[has_overlap] = 2.0 * real_covariance[has_overlap] / power_sum[has_overlap]
+    concordance = np.zeros_like(energy_sum)
+    concordance[has_overlap] = 2.0 * real_covariance[has_overlap] / energy_sum[has_overlap]
     likelihood_gain = -common_count * np.log(
         np.maximum(1.0 - concordance, MIN_ONE_MINUS_CONCORDANCE)
     )
     best_index = int(np.argmax(np.where(has_overlap, likelihood_gain, -np.inf)))
 
-    def lag_at(index: int) -> float:
+    def compute_lag_s(index: int) -> float:
         return float(reference.time_s[0]) + (index - len(file_track.is_valid) + 1) * GRID_STEP_S
 
-    # Lags around the best lag with more than half of its concordance, and lags nearer than
-    # MIN_PEAK_DISTANCE_S, are the same peak
+    # The peak of the best lag includes all lags around it with at least half of its concordance,
+    # and all lags nearer to it than MIN_PEAK_DISTANCE_S
     low_concordance_indices = np.flatnonzero(concordance < 0.5 * concordance[best_index])
     peak_start_index = np.max(
         low_concordance_indices[low_concordance_indices < best_index], initial=-1
@@ -128,24 +129,24 @@ def find_correlation_peak(
     is_other_peak = (
         has_overlap
         & (common_count >= 0.5 * common_count[best_index])
-        & (power_sum >= 0.25 * power_sum[best_index])
+        & (energy_sum >= 0.25 * energy_sum[best_index])
         & (concordance >= MIN_CONCORDANCE[reference.name])
     )
     min_peak_distance = round(MIN_PEAK_DISTANCE_S / GRID_STEP_S)
     same_peak_start = max(peak_start_index + 1, best_index - min_peak_distance)
     is_other_peak[same_peak_start : min(peak_end_index, best_index + min_peak_distance + 1)] = False
-    peak = CorrelationPeak(lag_at(best_index), float(concordance[best_index]))
+    peak = CorrelationPeak(compute_lag_s(best_index), float(concordance[best_index]))
     if not is_other_peak.any():
         return peak
-    # Residual (m) per axis, at least the interpolation error of the time grid
-    mean_square_m2 = np.maximum(power_sum - 2.0 * real_covariance, 0.0) / (
+    # RMS residual (m) per axis at each lag, plus the interpolation error of the time grid
+    mean_square_m2 = np.maximum(energy_sum - 2.0 * real_covariance, 0.0) / (
         2.0 * np.maximum(common_count, 1.0)
     )
-    residual_m = np.sqrt(mean_square_m2 + GRID_RESIDUAL_M**2)
+    residual_m = np.sqrt(mean_square_m2 + INTERPOLATION_RESIDUAL_M**2)
     second_index = int(np.argmin(np.where(is_other_peak, residual_m, np.inf)))
     return replace(
         peak,
-        second_peak_s=lag_at(second_index) - lag_at(best_index),
+        second_peak_s=compute_lag_s(second_index) - compute_lag_s(best_index),
         second_peak_ratio=float(residual_m[second_index] / residual_m[best_index]),
     )
 
@@ -157,7 +158,7 @@ def fit_by_least_squares(
     yaw_rad: float | None,
     *,
     is_lag_free: bool,
-) -> Fit:
+) -> TrackFit:
     """Fit the file to the reference by robust least squares (soft L1).
 
     The lag is fitted if ``is_lag_free``, and the yaw if ``yaw_rad`` is None. The origin is always
@@ -191,34 +192,34 @@ def fit_by_least_squares(
     mean_variance_m2 = float(np.var(file_position_m) + np.var(reference_position_m)) / 2.0
     reference_horizontal_m = reference.to_complex_m()
 
-    # Parameters: origin north, origin east, lag relative to the peak, yaw
+    # Parameters: origin north, origin east, lag minus lag of the correlation peak, yaw
     reference_mean_m = reference_position_m.mean()
     parameters = np.array([reference_mean_m.real, reference_mean_m.imag, 0.0, np.angle(coherence)])
-    bounds = np.array([np.inf, np.inf, MAX_LAG_SHIFT_S, np.inf])
+    bounds = np.array([np.inf, np.inf, MAX_LAG_FROM_PEAK_S, np.inf])
     is_fitted = np.array([True, True, is_lag_free, yaw_rad is None])
     if yaw_rad is not None:
         parameters[3] = yaw_rad
 
-    def residuals_at(fitted_parameters: Array) -> Array:
+    def compute_residuals_m(fitted_parameters: Array) -> Array:
         all_parameters = parameters.copy()
         all_parameters[is_fitted] = fitted_parameters
-        north, east, lag_shift_s, yaw = all_parameters
+        north, east, lag_from_peak_s, yaw = all_parameters
         target_m = np.interp(
-            reference_time_s + lag_shift_s, reference.time_s, reference_horizontal_m
+            reference_time_s + lag_from_peak_s, reference.time_s, reference_horizontal_m
         )
         residuals = np.exp(1j * yaw) * file_position_m + complex(north, east) - target_m
         return np.concatenate([residuals.real, residuals.imag])
 
     solution = least_squares(
-        residuals_at,
+        compute_residuals_m,
         parameters[is_fitted],
         bounds=(-bounds[is_fitted], bounds[is_fitted]),
         loss="soft_l1",
-        f_scale=_robust_scale(residuals_at(parameters[is_fitted])),
+        f_scale=_compute_robust_sigma(compute_residuals_m(parameters[is_fitted])),
     )
-    residuals = residuals_at(solution.x)
+    residuals = compute_residuals_m(solution.x)
     parameters[is_fitted] = solution.x
-    north, east, lag_shift_s, yaw = parameters.tolist()
+    north, east, lag_from_peak_s, yaw = parameters.tolist()
     complex_residuals = residuals[: len(file_position_m)] + 1j * residuals[len(file_position_m) :]
     jacobian = np.asarray(solution.jac)
     information = jacobian.T @ jacobian
@@ -226,18 +227,18 @@ def fit_by_least_squares(
     information += 1e-9 * np.diag(np.diag(information) + 1e-12)
     parameter_variance = (
         np.diag(np.linalg.inv(information))
-        * _robust_scale(residuals) ** 2
-        * _autocorrelation_factor(complex_residuals)
+        * _compute_robust_sigma(residuals) ** 2
+        * _compute_autocorrelation_factor(complex_residuals)
     )
     parameter_sigma = np.sqrt(np.maximum(parameter_variance, 0.0))
-    is_at_limit = is_lag_free and abs(lag_shift_s) > 0.99 * MAX_LAG_SHIFT_S
-    reference_ned_m, _ = reference.at(reference_time_s + lag_shift_s)
+    is_at_limit = is_lag_free and abs(lag_from_peak_s) > 0.99 * MAX_LAG_FROM_PEAK_S
+    reference_ned_m, _ = reference.at(reference_time_s + lag_from_peak_s)
     down_difference_m = reference_ned_m[:, 2] - file_track.position_m[is_used, 2]
     down_difference_m = down_difference_m[np.isfinite(down_difference_m)]
     origin_down_m = float(np.median(down_difference_m)) if len(down_difference_m) else 0.0
-    horizontal_rms_m = truncated_rms(np.abs(complex_residuals)) / np.sqrt(2.0)
+    horizontal_rms_m = compute_clipped_rms_m(np.abs(complex_residuals)) / np.sqrt(2.0)
     vertical_rms_m = (
-        truncated_rms(down_difference_m - origin_down_m) if len(down_difference_m) else 0.0
+        compute_clipped_rms_m(down_difference_m - origin_down_m) if len(down_difference_m) else 0.0
     )
     concordance = peak.concordance
     if np.isnan(concordance):
@@ -246,8 +247,8 @@ def fit_by_least_squares(
             real_covariance * sigma_product_m2 / mean_variance_m2 if sigma_product_m2 > 0 else 0.0
         )
     horizontal_origin_m = complex(north, east) - np.exp(1j * yaw) * centre_m
-    return Fit(
-        lag_s=peak.lag_s + lag_shift_s,
+    return TrackFit(
+        lag_s=peak.lag_s + lag_from_peak_s,
         lag_sigma_s=(np.inf if is_at_limit else float(parameter_sigma[2])) if is_lag_free else None,
         concordance=concordance,
         second_peak_s=peak.second_peak_s,
@@ -261,14 +262,14 @@ def fit_by_least_squares(
     )
 
 
-def _robust_scale(residual: Array) -> float:
+def _compute_robust_sigma(residual: Array) -> float:
     """Return the standard deviation from the median absolute residual, at least 1 mm."""
     return max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
 
 
-def _autocorrelation_factor(residual: Complex) -> float:
+def _compute_autocorrelation_factor(residual: ComplexArray) -> float:
     """Return 1 + 2Σρ, the factor by which autocorrelation increases the variance of a mean."""
-    clip_limit = 3.0 * _robust_scale(np.abs(residual))
+    clip_limit = 3.0 * _compute_robust_sigma(np.abs(residual))
     clipped_residual = residual * np.minimum(1.0, clip_limit / np.maximum(np.abs(residual), 1e-12))
     covariance_by_lag = autocovariance(clipped_residual)
     if covariance_by_lag[0] <= 0.0:
@@ -278,6 +279,6 @@ def _autocorrelation_factor(residual: Complex) -> float:
     return float(1.0 + 2.0 * np.sum(covariance_by_lag[1:first_zero]) / covariance_by_lag[0])
 
 
-def truncated_rms(values_m: Array) -> float:
-    """Return the RMS (m) of residuals that are truncated to MAX_RESIDUAL_M."""
+def compute_clipped_rms_m(values_m: Array) -> float:
+    """Return the RMS (m) of residuals that are clipped to MAX_RESIDUAL_M."""
     return float(np.sqrt(np.mean(np.minimum(np.abs(values_m), MAX_RESIDUAL_M) ** 2)))

@@ -9,7 +9,7 @@ from scipy.ndimage import binary_erosion, gaussian_filter1d, median_filter
 from scipy.signal import butter, sosfiltfilt
 
 from px4fuse.comparison.projection import remove_origin_resets
-from px4fuse.core.arrays import Array, BoolArray, Complex
+from px4fuse.core.arrays import Array, BoolArray, ComplexArray
 from px4fuse.errors import Px4FuseError
 from px4fuse.filter.signals import Segment, ned_acceleration
 from px4fuse.flight.model import (
@@ -31,21 +31,19 @@ EKF2_POSITION, IMU = "EKF2 position", "IMU"
 # An interval between two samples is a gap if it is longer than this time (s), and longer than three
 # median intervals
 MIN_GAP_LIMIT_S = 0.5
-# Minimum horizontal motion (m) of a track for a match
+# Minimum horizontal motion (m) of a track, to match the track with another track
 MIN_MOTION_M = 0.5
-# Minimum number of positions for a match
+# Minimum number of positions of a track, to match the track with another track
 MIN_SAMPLES = 10
-# Minimum overlap (s) of two tracks for a match, or half of the shorter track if that is less
+# Minimum overlap (s) of two matched tracks, or half of the shorter track if that is less
 MIN_OVERLAP_S = 10.0
 # σ (s) of the Gaussian filter that smooths the steps of EKF2's position at updates
 SMOOTHING_SIGMA_S = 0.2
 # Frequency band in which acceleration integrated twice equals position; at lower frequencies the
 # integral drifts
 BAND_PASS_HZ = (0.1, 1.0)
-# Length (s) of the transients of the band-pass filter
-TRANSIENT_S = 2.0
-# Length (s) of the padding at both ends of a track that is band-pass filtered
-BAND_PADDING_S = 10.0
+BAND_PASS_TRANSIENT_S = 2.0
+BAND_PASS_PADDING_S = 10.0
 
 
 class NoMatchError(Px4FuseError):
@@ -73,7 +71,7 @@ class SampledTrack:
     is_valid: BoolArray
     name: str = ""
 
-    def to_complex_m(self) -> Complex:
+    def to_complex_m(self) -> ComplexArray:
         """Return the horizontal positions as complex numbers north + i·east, shape (n,)."""
         return self.position_m[:, 0] + 1j * self.position_m[:, 1]
 
@@ -88,10 +86,10 @@ def convert_to_ned(samples: pd.DataFrame, frame: str) -> SampledTrack:
     """Convert the positions of a file to north, east, down, with times from the first sample."""
     axis_order, axis_signs = NED_COMPONENTS[frame]
     position_m = samples[["x_m", "y_m", "z_m"]].to_numpy()[:, axis_order] * axis_signs
-    return _track_without_gaps(samples.index.to_numpy() - samples.index[0], position_m)
+    return _make_gapless_track(samples.index.to_numpy() - samples.index[0], position_m)
 
 
-def _track_without_gaps(time_s: Array, position_m: Array) -> SampledTrack:
+def _make_gapless_track(time_s: Array, position_m: Array) -> SampledTrack:
     return SampledTrack(time_s, position_m, np.ones(len(time_s), bool))
 
 
@@ -107,26 +105,27 @@ def remove_spikes(track: SampledTrack, window_size: int = 3) -> SampledTrack:
     return replace(track, position_m=median_filter(track.position_m, size=(window_size, 1)))
 
 
-def band_pass(position_m: Array) -> Array:
-    """Band-pass filter positions on the time grid, without delay."""
+def apply_band_pass(position_m: Array) -> Array:
+    """Filter positions on the time grid to the band BAND_PASS_HZ, without delay."""
     filter_sections = butter(2, BAND_PASS_HZ, "bandpass", fs=1.0 / GRID_STEP_S, output="sos")
     return sosfiltfilt(
         filter_sections,
         position_m,
         axis=0,
-        padlen=min(round(BAND_PADDING_S / GRID_STEP_S), len(position_m) - 1),
+        padlen=min(round(BAND_PASS_PADDING_S / GRID_STEP_S), len(position_m) - 1),
     )
 
 
 def mark_transients(track: SampledTrack) -> SampledTrack:
     """Mark the transients of the band-pass filter at ends and gaps as invalid."""
-    transient_samples = round(TRANSIENT_S / GRID_STEP_S)
+    transient_sample_count = round(BAND_PASS_TRANSIENT_S / GRID_STEP_S)
     return replace(
-        track, is_valid=binary_erosion(track.is_valid, np.ones(2 * transient_samples + 1, bool))
+        track,
+        is_valid=binary_erosion(track.is_valid, np.ones(2 * transient_sample_count + 1, bool)),
     )
 
 
-def horizontal_range_m(track: SampledTrack) -> float:
+def compute_horizontal_range_m(track: SampledTrack) -> float:
     """Return the larger of the position ranges (m) along north and east, without outliers."""
     return float(np.max(np.ptp(remove_spikes(track, 5).position_m[:, :2], axis=0)))
 
@@ -136,11 +135,11 @@ def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
     if len(finite_state) < MIN_SAMPLES:
         raise NoMatchError(f"the log has fewer than {MIN_SAMPLES} horizontal EKF2 positions")
     position_m = finite_state[Columns.POSITION].to_numpy()
-    grid = resample_to_grid(_track_without_gaps(finite_state.index.to_numpy(), position_m))
-    smooth_m = gaussian_filter1d(
-        grid.position_m, SMOOTHING_SIGMA_S / GRID_STEP_S, axis=0, mode="nearest"
+    grid_track = resample_to_grid(_make_gapless_track(finite_state.index.to_numpy(), position_m))
+    smoothed_position_m = gaussian_filter1d(
+        grid_track.position_m, SMOOTHING_SIGMA_S / GRID_STEP_S, axis=0, mode="nearest"
     )
-    return replace(grid, position_m=smooth_m, name=EKF2_POSITION)
+    return replace(grid_track, position_m=smoothed_position_m, name=EKF2_POSITION)
 
 
 def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
@@ -158,7 +157,7 @@ def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
         reset_sum_m = is_after_reset @ np.array([(*reset.delta[:2], 0.0) for reset in resets])
         states.append(state.assign(**(state[Columns.POSITION] - reset_sum_m)))
     references = [_smooth_ekf2_track(state) for state in states]
-    if max(map(horizontal_range_m, references)) < MIN_MOTION_M:
+    if max(map(compute_horizontal_range_m, references)) < MIN_MOTION_M:
         raise NoMatchError(f"the EKF2 position changes by less than {MIN_MOTION_M:g} m")
     return references
 
@@ -170,11 +169,13 @@ def make_imu_references(flight: Flight) -> list[SampledTrack]:
         raise NoMatchError(f"the log has no acceleration in NED ({acceleration.reason})")
     time_s = acceleration.index.to_numpy()
     velocity_m_s = cumulative_trapezoid(acceleration.to_numpy(), time_s, axis=0, initial=0)
-    grid = resample_to_grid(_track_without_gaps(time_s, velocity_m_s))
-    if len(grid.time_s) * GRID_STEP_S < MIN_OVERLAP_S:
+    grid_track = resample_to_grid(_make_gapless_track(time_s, velocity_m_s))
+    if len(grid_track.time_s) * GRID_STEP_S < MIN_OVERLAP_S:
         raise NoMatchError(f"the IMU data are shorter than {MIN_OVERLAP_S:g} s")
-    position_m = cumulative_trapezoid(band_pass(grid.position_m), dx=GRID_STEP_S, axis=0, initial=0)
-    return [mark_transients(replace(grid, position_m=band_pass(position_m), name=IMU))]
+    position_m = cumulative_trapezoid(
+        apply_band_pass(grid_track.position_m), dx=GRID_STEP_S, axis=0, initial=0
+    )
+    return [mark_transients(replace(grid_track, position_m=apply_band_pass(position_m), name=IMU))]
 
 
 def align_samples(
@@ -189,7 +190,7 @@ def align_samples(
     position_m = track.position_m
     axis_order, _ = NED_COMPONENTS[frame]
     variance_m2 = samples[["sigma_x_m", "sigma_y_m", "sigma_z_m"]].to_numpy()[:, axis_order] ** 2
-    if yaw_rad:  # a rotation mixes both axes, so both sigmas are then needed
+    if yaw_rad:  # mixes north and east: both variances are NaN if σ of one axis is missing
         c, s = np.cos(yaw_rad), np.sin(yaw_rad)
         yaw_rotation = np.array([[c, -s], [s, c]])
         position_m[:, :2] = position_m[:, :2] @ yaw_rotation.T
@@ -201,7 +202,7 @@ def align_samples(
     )
 
 
-def ekf2_track_without_resets(ekf2: Ekf2, aligned_samples: pd.DataFrame) -> SampledTrack:
+def make_continuous_ekf2_track(ekf2: Ekf2, aligned_samples: pd.DataFrame) -> SampledTrack:
     """Return EKF2's track without position resets that only move the origin of EKF2's frame."""
     track = PositionTrack("", POSITION_FILE, "", aligned_samples, "NED", "", ())
     segment = Segment(float(aligned_samples.index[0]), float(aligned_samples.index[-1]), "")

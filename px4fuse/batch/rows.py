@@ -12,7 +12,7 @@ import pandas as pd
 from px4fuse.card.model import Card
 from px4fuse.core.record import Unavailable
 from px4fuse.core.spreadsheet import neutralise_formulas
-from px4fuse.core.text import replace_unencodable, utc_time
+from px4fuse.core.text import format_utc_time, replace_unencodable
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.findings import Finding
 from px4fuse.request import quote_command
@@ -145,7 +145,7 @@ def with_log_path(row: Row, path: str) -> Row:
 
 
 def collect_log_values(log: Log) -> Row:
-    start_utc, record = utc_time(log.start_unix_s), {"log": log}
+    start_utc, record = format_utc_time(log.start_unix_s), {"log": log}
     path_by_column = {name: path for name, path in RESULT_PATHS.items() if path.startswith("log.")}
     return {name: find_value(record, path) for name, path in path_by_column.items()} | {
         "airframe": f"{airframe:g}" if (airframe := log.parameters.get("SYS_AUTOSTART")) else "",

@@ -203,7 +203,7 @@ def run(
         for log in logs
     ]
     run_in_processes = partial(
-        run_with_limits, analyse, timeout_s=timeout_s, memory_bytes=int(memory_gb * 1e9)
+        run_with_limits, analyse, timeout_s=timeout_s, max_memory_bytes=int(memory_gb * 1e9)
     )
     with (
         connect_cluster(scheduler) as client,

@@ -546,7 +546,7 @@ def _make_identity(
         firmware=log.firmware,
         hardware=log.hardware,
         duration_s=log.duration_s,
-        command=command_line(request.without_paths()),
+        command=command_line(request.with_file_names()),
         student=student[0],
         student_id=student[1],
         version=f"px4fuse {metadata.version('px4fuse')}",

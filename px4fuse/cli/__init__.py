@@ -54,7 +54,7 @@ TERMINATION_SIGNALS = (
 HELP_OPTIONS = ["-h", "--help"]
 # Environment variables that px4fuse removes: an invalid value stops the import of matplotlib or
 # pymavlink. No output depends on them
-IGNORED_VARIABLES = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
+IGNORED_ENVIRONMENT_VARIABLES = ("MPLBACKEND", "SOURCE_DATE_EPOCH")
 # Minimum address space (bytes) for a run: the report of the sample log needs 0.7 GB
 MIN_ADDRESS_SPACE_BYTES = 800_000_000
 
@@ -130,13 +130,14 @@ def _make_system_error(error: MemoryError | OSError, files_sentence: str) -> Px4
     if isinstance(error, MemoryError) or error.errno == errno.ENOMEM:
         return Px4FuseError(
             f"not enough memory; {files_sentence}",
-            "Close other programs, or raise the limit (ulimit -v).",
+            "Close other programs, or raise the memory limit (ulimit -v).",
         )
     try:
         Path.cwd()
     except OSError:
         return SettingsError(
-            f"the current folder no longer exists; {files_sentence}", "Change to another folder."
+            f"the current folder no longer exists; {files_sentence}",
+            "Change to an existing folder.",
         )
     if error.filename is not None:
         return OutputError(
@@ -146,7 +147,7 @@ def _make_system_error(error: MemoryError | OSError, files_sentence: str) -> Px4
 
 
 def _check_memory() -> None:
-    # with less memory, libraries end the process without a message
+    # below MIN_ADDRESS_SPACE_BYTES, libraries end the process without an error message
     try:
         import resource
     except ImportError:  # Windows has no memory limit for a process
@@ -201,12 +202,12 @@ def main() -> None:
 def _prepare_libraries() -> None:
     for name, value in ONE_THREAD_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
-    for name in IGNORED_VARIABLES:
+    for name in IGNORED_ENVIRONMENT_VARIABLES:
         os.environ.pop(name, None)
     # matplotlib warns if the home folder is read-only, which has no effect on px4fuse
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     if not set(PARQUET_COMMANDS) & set(sys.argv[1:2]):
-        # so that pandas does not import pyarrow
+        # pandas then does not import pyarrow, which needs 70 MB
         sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]
 
 
@@ -258,7 +259,7 @@ def _raise_signal_again(unraisable: "sys.UnraisableHookArgs") -> None:
     error = unraisable.exc_value
     if isinstance(error, KeyboardInterrupt):
         signal_number = error.args[0] if error.args else signal.SIGINT
-        # after 0.1 s the finaliser has ended
+        # after 0.1 s the finaliser that received the signal has ended
         threading.Timer(
             0.1, signal.pthread_kill, [threading.main_thread().ident, signal_number]
         ).start()
@@ -267,5 +268,5 @@ def _raise_signal_again(unraisable: "sys.UnraisableHookArgs") -> None:
 
 
 def _discard_output() -> None:
-    # without buffered output, Python prints no error at exit
+    # otherwise Python flushes the closed stream at exit and prints an error
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

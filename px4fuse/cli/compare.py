@@ -10,7 +10,7 @@ from px4fuse.cli import options, outputs
 from px4fuse.core.writing import STANDARD_OUTPUT
 from px4fuse.errors import LogError, MissingDataError
 from px4fuse.finding import SEVERITIES, Severity
-from px4fuse.request import settings_name
+from px4fuse.request import format_settings_suffix
 
 
 @click.command()
@@ -69,10 +69,10 @@ def compare(
                 output,
                 outcome,
                 show_progress,
-                log.stem + settings_name(request),
+                log.stem + format_settings_suffix(request),
             )
     except (LogError, MissingDataError) as error:
-        if not sys.stderr.isatty():  # print one line if a program reads standard error
+        if not sys.stderr.isatty():  # a program reads the error: print one line, not a card
             raise
         outputs.show_page(card_page("card", build_refusal_card(error, log)), is_error=True)
         sys.exit(2)

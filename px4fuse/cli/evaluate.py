@@ -11,7 +11,7 @@ import click
 
 from px4fuse.cli import options, outputs
 from px4fuse.errors import SettingsError
-from px4fuse.request import EvaluationRequest, settings_name
+from px4fuse.request import EvaluationRequest, format_settings_suffix
 
 if TYPE_CHECKING:
     from px4fuse.trajectory.scores import Delta
@@ -55,7 +55,8 @@ _evaluation_option = partial(options.request_option, EvaluationRequest)
 )
 @_evaluation_option(
     "association",
-    "Reference pose for an estimated pose: interpolated, or nearest in time (as in evo).",
+    "Reference pose that an estimated pose is compared with: interpolated at the same time, or the "
+    "nearest in time (as in evo).",
 )
 @_evaluation_option(
     "max_gap_s",
@@ -89,7 +90,7 @@ def evaluate(
     LOG:ekf2, LOG:kf or LOG:truth. Prints errors with 95 % intervals. Writes a PDF report and the
     results as JSON.
     """
-    from px4fuse.loop.tracks import file_name, read_source
+    from px4fuse.loop.tracks import make_file_stem, read_source
     from px4fuse.report.evaluation import write_evaluation
     from px4fuse.report.page import Page
     from px4fuse.results.build import evaluation_results
@@ -121,7 +122,8 @@ def evaluate(
             time_offset_s=request.time_offset_s,
         )
         results = evaluation_results(request, evaluation)
-        name = f"{file_name(estimate)}_against_{file_name(reference)}{settings_name(request)}"
+        name = f"{make_file_stem(estimate)}_against_{make_file_stem(reference)}"
+        name += format_settings_suffix(request)
         contents = outputs.result_files(results, json_path, output, evaluation, show_progress, name)
     page = Page()
     write_evaluation(page, evaluation)

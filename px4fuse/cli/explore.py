@@ -7,7 +7,7 @@ import click
 
 from px4fuse.cli import options, outputs
 from px4fuse.cli.sample import sample_log
-from px4fuse.request import settings_name
+from px4fuse.request import format_settings_suffix
 
 
 @click.command()
@@ -28,7 +28,7 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
     log = log or sample_log()
     request = options.comparison_request(log, option_values)
     target = outputs.web_page_path(
-        output, Path("reports", f"{log.stem}{settings_name(request)}.html")
+        output, Path("reports", f"{log.stem}{format_settings_suffix(request)}.html")
     )
     with outputs.progress(target) as show_progress:
         analysis = diagnose(request, show_progress)

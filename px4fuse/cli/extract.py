@@ -19,7 +19,7 @@ from px4fuse.core.input_files import check_output_folder, inputs_not_registered
 from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, to_one_line
 
-# Maximum size (bytes) of an existing flight.json
+# Maximum size (bytes) of the flight.json of an earlier export, which names the exported log
 MAX_DESCRIPTION_BYTES = 50_000_000
 
 

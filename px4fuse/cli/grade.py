@@ -69,7 +69,7 @@ from px4fuse.errors import OutputError, SettingsError
     type=click.FloatRange(0.0, 10_080.0),
     metavar="MINUTES",
     default=0.0,
-    help="Maximum delay without a deduction.",
+    help="Delay after --due for which no points are deducted.",
 )
 @click.option(
     "--scale",
@@ -187,11 +187,11 @@ def grade(
 
 def _require_output_outside(output: Path, input_paths: tuple[Path, ...]) -> None:
     resolved_path = output.resolve()
-    output_folders = [
+    output_and_parents = [
         folder for folder in (resolved_path, *resolved_path.parents) if folder.is_dir()
     ]
     for path in input_paths:
-        if path.is_dir() and any(map(path.samefile, output_folders)):
+        if path.is_dir() and any(map(path.samefile, output_and_parents)):
             raise OutputError(
                 f"-o {output} is inside the input {path}, so the next run would read this output. "
                 "Choose another output folder."

@@ -10,17 +10,17 @@ def lesson() -> None:
 
 @lesson.command()
 def kalman() -> None:
-    """Print Example 1 of the lesson: fusion of IMU and UWB in an aisle at 1 m/s."""
-    from px4fuse.lesson import kalman_lines
+    """Print Example 1 of the lesson: KF with UWB positions in an aisle at 1 m/s."""
+    from px4fuse.lesson import format_kalman_lines
 
-    for line in kalman_lines():
+    for line in format_kalman_lines():
         click.echo(line)
 
 
 @lesson.command()
 def loop() -> None:
     """Print Example 2 of the lesson: loop closure error, distributed by distance."""
-    from px4fuse.lesson import loop_lines
+    from px4fuse.lesson import format_loop_lines
 
-    for line in loop_lines():
+    for line in format_loop_lines():
         click.echo(line)

@@ -13,7 +13,7 @@ from px4fuse.cli import options, outputs
 from px4fuse.core.reading import display_name, split_path_and_part
 from px4fuse.core.writing import STANDARD_OUTPUT
 from px4fuse.errors import MissingDataError, SettingsError
-from px4fuse.request import GivenClosure, Landing, LoopRequest, command_line, settings_name
+from px4fuse.request import GivenClosure, Landing, LoopRequest, command_line, format_settings_suffix
 
 if TYPE_CHECKING:
     from px4fuse.loop.model import Loop
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # Maximum distance (m) from take-off to landing place (--landed-at); more is a typing error
 MAX_LANDING_DISTANCE_M = 10_000.0
 # Parameters of the command that are allowed if SOURCE is a pose graph
-GRAPH_PARAMETERS = ("source", "json_path", "g2o", "robust")
+POSE_GRAPH_PARAMETERS = ("source", "json_path", "g2o", "robust")
 
 
 def _parse_numbers(text: str, syntax: str, max_absolute: float) -> list[float]:
@@ -149,16 +149,17 @@ def loop(
     is VIO, or else EKF2. Writes a PDF report and the results as JSON, except for a pose graph.
     """
     from px4fuse.diagnose import analyse_loop_closure
-    from px4fuse.loop.tracks import file_name, is_g2o
+    from px4fuse.loop.tracks import is_g2o, make_file_stem
     from px4fuse.report.loop import loop_page
     from px4fuse.results.build import loop_results
 
-    log = split_path_and_part(str(source))[0]  # LOG of LOG:TRACK
+    log = split_path_and_part(str(source))[0]  # SOURCE may be LOG:TRACK
     student = options.read_student(option_values, log)
     for name, path in (("--tum", tum), ("--g2o", g2o)):
         if path == STANDARD_OUTPUT:
             raise SettingsError(
-                f"{name} cannot write to standard output, only --json can", "Give a file name."
+                f"{name} cannot write to standard output, only --json can",
+                f"Give a file name after {name}.",
             )
     if is_g2o(log):
         _solve_graph(source, json_path, g2o, option_values["robust"] or None)
@@ -168,7 +169,7 @@ def loop(
     with outputs.progress(json_path) as show_progress:
         loop_result = analyse_loop_closure(request, show_progress)
         results = loop_results(request, loop_result, student)
-        name = f"{file_name(source)}_loop{settings_name(request)}"
+        name = f"{make_file_stem(source)}_loop{format_settings_suffix(request)}"
         contents = _output_files(loop_result, tum, g2o) | outputs.result_files(
             results, json_path, output, loop_result, show_progress, name
         )
@@ -217,11 +218,11 @@ def _solve_graph(
         raise SettingsError(
             f"{display_name(source)}: a pose graph has no track {track!r}", f"Omit :{track}."
         )
-    for parameter in options.typed_parameters():
-        if parameter.name not in GRAPH_PARAMETERS:
+    for parameter in options.list_given_parameters():
+        if parameter.name not in POSE_GRAPH_PARAMETERS:
             raise SettingsError(
                 f"{display_name(source)}: {parameter.opts[-1]} is not available for a pose graph.",
-                "Use only --g2o FILE, --json FILE and --robust.",
+                "For a pose graph, use only --g2o FILE, --json FILE and --robust.",
             )
     with outputs.progress(json_path, g2o) as show_progress:
         show_progress(f"reading {display_name(source)}")

@@ -27,8 +27,8 @@ from px4fuse.errors import SettingsError
 
 # Tool arguments with another name than the parameter of the command
 ARGUMENT_NAMES = {"finding": "finding_id", "parameter_texts": "parameters", "source": "log"}
-# Command parameters that the tools do not have: outputs, exit codes, and data of the student
-HIDDEN_PARAMETERS = {
+# Command parameters that the tools of the server do not offer: outputs, exit codes, student data
+OMITTED_PARAMETERS = {
     *("output", "json_path", "tum", "g2o", "fail_on", "checks"),
     *("student", "student_id", "notes", "answers"),
 }
@@ -65,7 +65,7 @@ def mcp(roots: tuple[Path, ...], out: Path | None, timeout_s: float, memory_gb: 
         )
     from px4fuse.mcp.server import Server
 
-    gc.enable()  # the server runs for a long time
+    gc.enable()  # main() disables it for short commands, but the server runs for a long time
     for signal_number in TERMINATION_SIGNALS:
         # an exception would not end the thread that reads standard input
         signal.signal(signal_number, lambda number, _: os._exit(128 + number))
@@ -84,9 +84,9 @@ def mcp(roots: tuple[Path, ...], out: Path | None, timeout_s: float, memory_gb: 
 def run_command(
     folders: tuple[Path, ...],
     max_bytes: int,
-    out: Path | None,
+    report_folder: Path | None,
     sender: Connection | None,
-    words: Sequence[str],
+    command_words: Sequence[str],
 ) -> tuple[str, Any]:
     """Run a command in this process; return its terminal text, and its results or None.
 
@@ -96,23 +96,26 @@ def run_command(
         Folders from which files may be read.
     max_bytes : int
         Maximum size of a log (bytes).
-    out : Path or None
-        Folder for reports.
+    report_folder : Path or None
+        Folder for reports; None: no report is written.
     sender : Connection or None
         Pipe to the process that shows the progress.
-    words : sequence of str
+    command_words : sequence of str
         Command line without ``px4fuse``.
     """
     readable_folders.set(folders)
     max_log_bytes.set(max_bytes)
-    if out and sender:  # in a worker process; commands in the server process write no files
-        os.chdir(out)
+    # only in a worker process: commands in the server process write no files
+    if report_folder and sender:
+        os.chdir(report_folder)
     output, results_json = io.StringIO(), list[str]()
     try:
         with redirect_stdout(output), redirect_stderr(io.StringIO()):
-            # "-" (standard output): the command writes no report
-            default_options = {words[0]: {"json_path": None if out else "-"}}
-            with cli.make_context("px4fuse", [*words], default_map=default_options) as context:
+            # without a folder, the results go to standard output ("-"), and no report is written
+            default_options = {command_words[0]: {"json_path": None if report_folder else "-"}}
+            with cli.make_context(
+                "px4fuse", [*command_words], default_map=default_options
+            ) as context:
                 context.meta[outputs.SEND_PROGRESS_KEY] = sender and sender.send
                 context.meta[outputs.RESULTS_KEY] = results_json
                 cli.invoke(context)
@@ -121,7 +124,7 @@ def run_command(
     if not results_json:
         return output.getvalue(), None
     results = json.loads(results_json[0])
-    return output.getvalue(), results["card"] if words[0] == "compare" else results
+    return output.getvalue(), results["card"] if command_words[0] == "compare" else results
 
 
 def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
@@ -147,7 +150,7 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
     }
     tools = []
     for name, (command_name, result_type) in command_and_type_by_tool.items():
-        parameters = {} if name == "list_findings" else _parameters_of(command_name)
+        parameters = {} if name == "list_findings" else _list_parameters(command_name)
         output_schema = None
         if result_type is not None:
             schemas, definitions = contract.schema_of_types(get_args(result_type) or (result_type,))
@@ -155,40 +158,40 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
         tool = Tool(
             name=name,
             description=help_text(command_name) if parameters else "List the ids of all findings.",
-            input_schema=_input_schema(parameters),
+            input_schema=_make_input_schema(parameters),
             output_schema=output_schema,
         )
         tools.append((tool, partial(_parse_arguments, command_name, parameters, folders)))
     return tools
 
 
-def _parameters_of(command_name: str) -> dict[str, click.Parameter]:
+def _list_parameters(command_name: str) -> dict[str, click.Parameter]:
     """Return the parameters of a command, by the name of the tool argument."""
     return {
         ARGUMENT_NAMES.get(name, name): parameter
         for parameter in find_command(command_name).params
-        if parameter.expose_value and (name := str(parameter.name)) not in HIDDEN_PARAMETERS
+        if parameter.expose_value and (name := str(parameter.name)) not in OMITTED_PARAMETERS
     }
 
 
-def _input_schema(parameters: Mapping[str, click.Parameter]) -> dict[str, Any]:
+def _make_input_schema(parameters: Mapping[str, click.Parameter]) -> dict[str, Any]:
     argument_names = [
         name for name, parameter in parameters.items() if isinstance(parameter, click.Argument)
     ]
     return {
         "type": "object",
-        "properties": {name: _schema_of(parameter) for name, parameter in parameters.items()},
+        "properties": {name: _make_schema(parameter) for name, parameter in parameters.items()},
         "required": argument_names,
         "additionalProperties": False,
     }
 
 
-def _schema_of(parameter: click.Parameter) -> dict[str, Any]:
+def _make_schema(parameter: click.Parameter) -> dict[str, Any]:
     value_type, schema = parameter.type, dict[str, Any](type="string", pattern=r"^[^\x00]+$")
     if isinstance(value_type, click.Choice):
         schema = {"enum": [*value_type.choices]}
     elif isinstance(value_type, options.TypedQuantity):
-        schema = {"anyOf": [{"type": "number"}, {"const": "auto"}][: 1 + value_type.auto]}
+        schema = {"anyOf": [{"type": "number"}, {"const": "auto"}][: 1 + value_type.accepts_auto]}
     elif isinstance(value_type, click.IntRange):
         schema = {"type": "integer"}
     elif getattr(parameter, "is_flag", False):

@@ -32,11 +32,11 @@ if TYPE_CHECKING:
     from px4fuse.results.model import Student
 
 
-Option = Callable[[Callable[..., None]], Callable[..., None]]
+OptionDecorator = Callable[[Callable[..., None]], Callable[..., None]]
 Choice = partial(click.Choice, case_sensitive=False)
 
 
-def _combine_options(*options: Option) -> Option:
+def _combine_options(*options: OptionDecorator) -> OptionDecorator:
     """Combine options into one decorator; --help lists them in this order."""
 
     def add_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -72,22 +72,22 @@ class InputPath(NonEmptyPath):
 class TypedQuantity(click.ParamType["float | str"]):
     """Number in a fixed unit, as type of a command-line option.
 
-    ``example`` is a valid value for the error message. If ``auto`` is True, the text "auto" is also
+    ``example`` is a valid value for the error message. If ``accepts_auto``, the text "auto" is also
     accepted.
     """
 
     name = "number"
 
-    def __init__(self, unit: str, example: float = 0.1, *, auto: bool = False) -> None:
-        self.unit, self.example, self.auto = unit, example, auto
+    def __init__(self, unit: str, example: float = 0.1, *, accepts_auto: bool = False) -> None:
+        self.unit, self.example, self.accepts_auto = unit, example, accepts_auto
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
         """Return the unit in capital letters, for --help."""
         unit = "DEG" if self.unit == "°" else self.unit.upper() or "NUMBER"
-        return f"{unit}|auto" if self.auto else unit
+        return f"{unit}|auto" if self.accepts_auto else unit
 
     def convert(self, value: Any, param: Any, ctx: Any) -> float | str:
-        if self.auto and value == AUTO:
+        if self.accepts_auto and value == AUTO:
             return str(value)
         unit = f" in {UNIT_NAMES[self.unit]}" if self.unit else ""
         try:
@@ -97,7 +97,7 @@ class TypedQuantity(click.ParamType["float | str"]):
             example = self.example if converted is None else converted
             self.fail(
                 f"{value!r} is not a number{unit}. Give for example {example:.12g}"
-                f"{', or auto' if self.auto else ''}.",
+                f"{', or auto' if self.accepts_auto else ''}.",
                 param,
                 ctx,
             )
@@ -143,7 +143,7 @@ max_size_option = click.option(
 )
 
 
-def _json_option(more_text: str = "") -> Option:
+def _json_option(more_text: str = "") -> OptionDecorator:
     return click.option(
         "--json",
         "json_path",
@@ -160,28 +160,28 @@ json_option = _json_option()
 flag_option = partial(click.option, is_flag=True)
 
 
-def count_option(name: str, low: int, high: int, **details: Any) -> Option:
+def count_option(name: str, low: int, high: int, **details: Any) -> OptionDecorator:
     return click.option(name, type=click.IntRange(low, high), metavar="N", **details)
 
 
-def input_option(name: str, metavar: str, help_text: str, **details: Any) -> Option:
+def input_option(name: str, metavar: str, help_text: str, **details: Any) -> OptionDecorator:
     return click.option(name, type=InputPath(), metavar=metavar, help=help_text, **details)
 
 
-def output_option(metavar: str, help_text: str, **details: Any) -> Option:
+def output_option(metavar: str, help_text: str, **details: Any) -> OptionDecorator:
     """Make the option -o for an output file or folder."""
     return click.option(
         "-o", "--output", type=NonEmptyPath(), metavar=metavar, help=help_text, **details
     )
 
 
-def report_options(help_text: str) -> Option:
+def report_options(help_text: str) -> OptionDecorator:
     """Make the option -o for the PDF report, and the option --json for the results."""
     json_text = " With --json and without -o, no report is written.  [default: beside the report]"
     return _combine_options(output_option("FILE.pdf", help_text), _json_option(json_text))
 
 
-def fail_option(levels: tuple[str, ...], help_text: str) -> Option:
+def fail_option(levels: tuple[str, ...], help_text: str) -> OptionDecorator:
     return click.option("--fail-on", type=Choice(levels), help=help_text)
 
 
@@ -193,7 +193,7 @@ def exit_for_severity(
         sys.exit(1)
 
 
-def _open_flag(*names: str) -> Option:
+def _open_flag(*names: str) -> OptionDecorator:
     return flag_option(
         *names,
         expose_value=False,
@@ -204,7 +204,7 @@ def _open_flag(*names: str) -> Option:
 
 #: Option --open of commands that write a report or a page
 open_option = _open_flag("--open", "--show", "opened")
-#: Option --show of px4fuse loop, where --open has another meaning
+#: Option --show of px4fuse loop, where --open means that the path is open (not a loop)
 show_option = _open_flag("--show", "shown")
 #: Options for the student's name and id, notes and answer form
 student_options = _combine_options(
@@ -216,7 +216,7 @@ student_options = _combine_options(
     input_option(
         "--answers",
         "FILE.toml",
-        "Completed answer form of px4fuse answers, which the report contains.",
+        "Answer form from px4fuse answers, completed by the student, to add to the report.",
     ),
 )
 system_option = click.option(
@@ -229,7 +229,7 @@ system_option = click.option(
 
 def request_option(
     request_type: type[Struct], name: str, help_text: str, example: float = 0.1, **details: Any
-) -> Option:
+) -> OptionDecorator:
     """Make the option for a field of ``request_type``, with its type, unit and default.
 
     RANGE in ``help_text`` is replaced by the range of the KF setting. ``example`` is a valid value
@@ -240,7 +240,9 @@ def request_option(
     literal_types = [each for each in types if get_origin(each) is Literal]
     if float in types:
         unit = next(unit for suffix, unit in SUFFIX_UNITS.items() if name.endswith(suffix))
-        details["type"] = TypedQuantity(unit, field.default or example, auto=bool(literal_types))
+        details["type"] = TypedQuantity(
+            unit, field.default or example, accepts_auto=bool(literal_types)
+        )
     elif literal_types:
         details["type"] = Choice(get_args(literal_types[0]))
     if field.default:
@@ -298,14 +300,14 @@ position_options = _combine_options(
 filter_options = _combine_options(
     _comparison_option(
         "sigma_a_m_s2",
-        "KF process noise SIGMA_A: σ of the acceleration error over one step DT, RANGE.",
+        "KF process noise SIGMA_A (RANGE): σ of the acceleration error over one step DT.",
     ),
     _comparison_option(
         "sigma_z_m",
-        "KF measurement noise SIGMA_Z: σ of a measured position, RANGE.  [default: 0.1; for GNSS "
+        "KF measurement noise SIGMA_Z (RANGE): σ of a measured position.  [default: 0.1; for GNSS "
         "√R of EKF2]",
     ),
-    _comparison_option("dt_s", "KF prediction interval DT, RANGE."),
+    _comparison_option("dt_s", "KF prediction interval DT (RANGE)."),
     _comparison_option(
         "input",
         "KF input: acceleration measured by the IMU, or zero (constant velocity).  [default: imu "
@@ -352,7 +354,7 @@ filter_options = _combine_options(
 flight_options = _combine_options(system_option, position_options, _clock_option, max_size_option)
 #: Options of commands that run KF on one flight
 analysis_options = _combine_options(filter_options, flight_options)
-#: Options of commands that run KF on many logs: all except the files of one flight
+#: Options of commands that run KF on many logs: ``analysis_options`` without a position file
 settings_options = _combine_options(filter_options, system_option, _clock_option, max_size_option)
 
 
@@ -380,7 +382,7 @@ def _position_file(option_values: dict[str, Any]) -> PositionFile | None:
     return None
 
 
-def typed_parameters() -> Iterator[click.Parameter]:
+def list_given_parameters() -> Iterator[click.Parameter]:
     context = click.get_current_context()
     for parameter in context.command.params:
         if context.get_parameter_source(parameter.name or "") == ParameterSource.COMMANDLINE:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 # Maximum length (bytes) of a default report name (file systems allow 255), and length to which a
 # longer name is cut
-MAX_NAME_BYTES, KEPT_STEM_BYTES = 200, 180
+MAX_NAME_BYTES, CUT_STEM_BYTES = 200, 180
 # Empty name and id, for a report without a student
 NO_STUDENT_NAME = ("", "")
 # Line width (characters) in a pipe: longer than any paragraph
@@ -118,14 +118,14 @@ def default_report_path(name: str, results: Results) -> Path:
     from px4fuse.verification.pdf_input import read_attached_results
 
     if len(os.fsencode(name)) > MAX_NAME_BYTES:
-        short_stem = os.fsencode(name)[:KEPT_STEM_BYTES].decode(errors="ignore")
+        short_stem = os.fsencode(name)[:CUT_STEM_BYTES].decode(errors="ignore")
         name = f"{short_stem}_{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
     path = Path("reports", f"{name}.pdf")
     mismatch_reason = (
-        "the file is not a report of this px4fuse version for the same input files and student"
+        "this px4fuse version did not write the file for the same input files and student"
     )
     for target, read in (path, read_attached_results), (path.with_suffix(".json"), read_results):
-        _check_default(target, mismatch_reason, partial(_is_same_report, results, read))
+        _require_replaceable(target, mismatch_reason, partial(_is_same_report, results, read))
     return path
 
 
@@ -137,15 +137,15 @@ def check_default_page(path: Path, page: str) -> None:
     OutputError
         A file with this path exists, and is not a web page of this command and log.
     """
-    generator = GENERATOR_PATTERN.findall(page)
-    _check_default(
+    generators = GENERATOR_PATTERN.findall(page)
+    _require_replaceable(
         path,
-        "the file is not a page of this px4fuse version for the same command and log",
-        lambda content: GENERATOR_PATTERN.findall(content.decode()) == generator,
+        "this px4fuse version did not write the file for the same command and log",
+        lambda content: GENERATOR_PATTERN.findall(content.decode()) == generators,
     )
 
 
-def _check_default(
+def _require_replaceable(
     path: Path, mismatch_reason: str, is_replaceable: Callable[[bytes], bool]
 ) -> None:
     try:
@@ -162,7 +162,7 @@ def _check_default(
 def _is_same_report(
     new_results: Results, read: Callable[[bytes, str], Results], existing_content: bytes
 ) -> bool:
-    """Return True if both reports have the same input files, and not two different students."""
+    """Return True for equal input files and student; the existing report may have no student."""
     from px4fuse.results.contract import file_hashes_in, to_json
 
     existing_results = read(existing_content, "report")
@@ -326,7 +326,7 @@ def write_and_print(
     write_outputs(contents)
     files = [*contents, *written_files]
     if STANDARD_OUTPUT not in contents:
-        console = terminal()
+        console = make_console()
         if page is not None:
             print_blocks(console, page.blocks, request)
         for path in files:
@@ -341,10 +341,10 @@ def write_and_print(
 def show_page(page: Page, *, is_error: bool = False) -> None:
     from px4fuse.report.screen import print_blocks
 
-    print_blocks(terminal(is_error=is_error), page.blocks)
+    print_blocks(make_console(is_error=is_error), page.blocks)
 
 
-def terminal(*, is_error: bool = False) -> Console:
+def make_console(*, is_error: bool = False) -> Console:
     """Return a console that raises BrokenPipeError if the reader of a pipe has ended.
 
     In a pipe, lines are not wrapped unless the environment variable COLUMNS contains a width.

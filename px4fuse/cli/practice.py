@@ -35,7 +35,7 @@ from px4fuse.cli.outputs import (
 @output_option("FILE.html", "Web page to write.  [default: reports/practice_SEED.html]")
 @click.option(
     "--open/--no-open",
-    "opens_page",
+    "opens_browser",
     default=None,
     help="Open the page in the browser.  [default: --open on a terminal]",
 )
@@ -46,7 +46,7 @@ def practice(
     level: int,
     flights: int,
     output: Path | None,
-    opens_page: bool | None,
+    opens_browser: bool | None,
 ) -> None:
     """Write a quiz page with simulated flights and injected faults.
 
@@ -55,7 +55,7 @@ def practice(
     """
     seed = secrets.randbelow(10**6) if seed is None else seed
     target = web_page_path(output, Path("reports", f"practice_{seed}.html"))
-    ctx.meta[OPENS_OUTPUT_KEY] = sys.stdout.isatty() if opens_page is None else opens_page
+    ctx.meta[OPENS_OUTPUT_KEY] = sys.stdout.isatty() if opens_browser is None else opens_browser
     with progress(target) as show_progress:
         from px4fuse.explore.practice import practice_text
 

@@ -13,8 +13,8 @@ from px4fuse.cli.options import (
     TypedQuantity,
     flag_option,
     input_option,
+    list_given_parameters,
     output_option,
-    typed_parameters,
 )
 from px4fuse.cli.outputs import check_targets, progress, write_and_print
 from px4fuse.core.input_files import check_output_folder
@@ -33,7 +33,6 @@ from px4fuse.simulation.scenario import (
 _DEFAULT_SCENARIO = Scenario()
 MIXED_KIND = "mixed"
 OUTDOOR_KIND: ScenarioKind = "outdoor"
-# Options that require --assignment
 ASSIGNMENT_ONLY_OPTIONS = ("secret_file", "mistakes")
 # Options that can be combined with --assignment
 ASSIGNMENT_OPTIONS = (
@@ -47,7 +46,7 @@ ASSIGNMENT_OPTIONS = (
 MAX_SECRET_BYTES = 10_000
 
 
-def _scenario_options(command: Callable[..., None]) -> Callable[..., None]:
+def _add_scenario_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add a command-line option for each numeric field of Scenario."""
     for field, quantity in reversed(collect_field_bounds(Scenario).items()):
         if not quantity.meaning:
@@ -146,7 +145,7 @@ class CommandWithFaultTable(click.Command):
     help="Heading of the vehicle: fixed, or follow (along the flight direction).  [default: fixed; "
     "follow on a square]",
 )
-@_scenario_options
+@_add_scenario_options
 def simulate(
     output: Path,
     *,
@@ -208,7 +207,7 @@ def _check_options(assignment: Path | None) -> None:
             f"--kind {OUTDOOR_KIND} is not available with --assignment.",
             f"Use --kind aisle, loop or {MIXED_KIND}.",
         )
-    for parameter in typed_parameters():
+    for parameter in list_given_parameters():
         if assignment is not None and parameter.name not in ASSIGNMENT_OPTIONS:
             raise SettingsError(
                 f"{parameter.opts[0]} is not available with --assignment, which draws flights "
@@ -230,7 +229,7 @@ def _read_secret(file: Path | None) -> bytes | None:
         SettingsError,
         MAX_SECRET_BYTES,
         name=name,
-        size_remedy="Give a file with one line of text.",
+        size_remedy="Give a file with the secret as one line of text.",
     )
     return parse_secret(secret_text, name)
 

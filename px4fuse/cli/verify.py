@@ -12,14 +12,14 @@ from px4fuse.core.reading import display_name, files_by_sha256, read_bytes_limit
 from px4fuse.errors import LogError
 
 # Maximum time (s) to repeat an analysis; a flight of 10 minutes takes about 60 s
-TIMEOUT_S = 1800.0
+ANALYSIS_TIMEOUT_S = 1800.0
 
 
 @click.command()
 @click.argument("report", type=InputPath(), metavar="REPORT.pdf")
 @click.argument("logs", type=InputPath(), nargs=-1, metavar="[LOG ...]")
 @max_size_option
-@output_option("FILE.pdf", "Report to write again from the log (PDF).  [default: no report]")
+@output_option("FILE.pdf", "PDF to write: the report, made again from the log.  [default: none]")
 @json_option
 @open_option
 def verify(
@@ -51,7 +51,9 @@ def verify(
             raise LogError("The folders LOG contain no files. Give the flight log or its folder.")
         show_progress("repeating the analysis")
         verification = run_one_with_limits(
-            partial(verify_report, pdf=content, logs=file_by_sha256), recorded_results, TIMEOUT_S
+            partial(verify_report, pdf=content, logs=file_by_sha256),
+            recorded_results,
+            ANALYSIS_TIMEOUT_S,
         )
     if isinstance(verification, JobFailure):
         raise LogError(f"{display_name(report)}: cannot be verified: {verification.reason}")

@@ -98,14 +98,16 @@ def _parse_parameters(parameter_texts: tuple[str, ...]) -> dict[str, float]:
 
 def _parse_sweep(text: str) -> Sweep:
     name, _, range_text = text.partition("=")
-    limits = range_text.split(":")
-    if len(limits) not in (2, 3) or (len(limits) == 3 and not limits[2].isdecimal()):
+    range_fields = range_text.split(":")
+    if len(range_fields) not in (2, 3) or (
+        len(range_fields) == 3 and not range_fields[2].isdecimal()
+    ):
         raise SettingsError(
             f"--sweep {text} is not valid. Use NAME=LOW:HIGH or NAME=LOW:HIGH:COUNT, for "
             "example EKF2_EVP_NOISE=0.02:0.5."
         )
-    low, high = (_parse_number(f"--sweep {text}", name, limit) for limit in limits[:2])
-    return Sweep(name, low, high, *map(int, limits[2:]))
+    low, high = (_parse_number(f"--sweep {text}", name, field) for field in range_fields[:2])
+    return Sweep(name, low, high, *map(int, range_fields[2:]))
 
 
 def _parse_number(option_text: str, name: str, value: str) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.core.arrays import Array, intervals_where
+from px4fuse.core.arrays import Array, select_intervals
 from px4fuse.core.record import Span
 from px4fuse.flight.model import Ekf2, Flight, Unavailable
 
@@ -52,7 +52,7 @@ def compute_max_interval_s(interval_s: float) -> float:
 def find_source_gaps(time_s: Array, rate_hz: float) -> tuple[Span, ...]:
     """Return start and end (s) of each gap in the positions; ``rate_hz`` is their normal rate."""
     is_gap = np.diff(time_s) > compute_max_interval_s(1.0 / rate_hz)
-    return tuple(intervals_where(time_s, is_gap))
+    return tuple(select_intervals(time_s, is_gap))
 
 
 def find_airborne_spans(flight: Flight) -> tuple[Span, ...]:

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
-Complex = NDArray[np.complex128]
+ComplexArray = NDArray[np.complex128]
 ArrayPair = tuple[Array, Array]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
-# Maximum number of rows of a block
+# Maximum number of rows in a slice from row_blocks
 BLOCK_ROWS = 2**14
 
 
@@ -40,7 +40,7 @@ def cumulative_sums(rows: Array) -> Array:
     return np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(rows, axis=0)])
 
 
-def intervals_where(time_s: Array, is_selected: BoolArray) -> list[tuple[float, float]]:
+def select_intervals(time_s: Array, is_selected: BoolArray) -> list[tuple[float, float]]:
     """Return start and end (s) of the selected intervals between successive times."""
     starts_s, ends_s = time_s[:-1][is_selected], time_s[1:][is_selected]
     return list(zip(starts_s.tolist(), ends_s.tolist(), strict=True))

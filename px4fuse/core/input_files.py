@@ -17,7 +17,7 @@ from px4fuse.errors import OutputError
 _FileIdentity = tuple[int, int] | str
 
 
-@dataclass(eq=False)  # filled during the run
+@dataclass(eq=False)  # not frozen, because files are added during the run
 class _InputRegister:
     """Input files and folders of the running command."""
 
@@ -41,7 +41,7 @@ def inputs_protected() -> Iterator[None]:
 
 @contextmanager
 def inputs_not_registered() -> Iterator[None]:
-    """Do not register files that are read inside this context; outputs may overwrite them."""
+    """Do not protect the files that are read inside this context: outputs may overwrite them."""
     previous_register = _register.set(None)
     try:
         yield
@@ -52,12 +52,12 @@ def inputs_not_registered() -> Iterator[None]:
 def add_input(path: Path) -> None:
     """Register an input file or folder, so that no output overwrites it."""
     register = _register.get()
-    if register is None or (identity := _file_identity(path)) is None:
+    if register is None or (identity := _read_file_identity(path)) is None:
         return
     register.inputs.add(identity)
     for folder in {path.absolute().parent, path.resolve().parent} - register.registered_folders:
         register.registered_folders.add(folder)
-        for parent in map(_file_identity, (folder, *folder.parents)):
+        for parent in map(_read_file_identity, (folder, *folder.parents)):
             if parent is not None:
                 register.input_by_folder.setdefault(parent, path)
 
@@ -66,7 +66,7 @@ def check_outputs(targets: Iterable[Path]) -> None:
     """Raise an OutputError if an output is a registered input file or folder."""
     register = _register.get() or _InputRegister()
     for target in targets:
-        if _file_identity(target) in register.inputs:
+        if _read_file_identity(target) in register.inputs:
             raise OutputError(
                 f"{target} is an input of this command and was not overwritten. Choose "
                 "another output name."
@@ -78,13 +78,13 @@ def check_output_folder(folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"the output folder {folder} is a file. Choose another name.")
     register = _register.get() or _InputRegister()
-    folder_entries = _folder_entries(folder)
+    folder_entries = _list_folder(folder)
     for path in (
         folder,
         *folder_entries,
-        *(child for entry in folder_entries for child in _folder_entries(entry)),
+        *(child for entry in folder_entries for child in _list_folder(entry)),
     ):
-        if (identity := _file_identity(path)) is None:
+        if (identity := _read_file_identity(path)) is None:
             continue
         input_path = path if identity in register.inputs else register.input_by_folder.get(identity)
         if input_path is not None:
@@ -94,11 +94,11 @@ def check_output_folder(folder: Path) -> None:
             )
 
 
-def _folder_entries(folder: Path) -> list[Path]:
+def _list_folder(folder: Path) -> list[Path]:
     return list(folder.iterdir()) if folder.is_dir() else []
 
 
-def _file_identity(path: Path) -> _FileIdentity | None:
+def _read_file_identity(path: Path) -> _FileIdentity | None:
     with suppress(OSError, ValueError):  # ValueError: a path that contains NUL
         status = path.stat()
         if status.st_ino:

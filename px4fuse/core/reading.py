@@ -29,7 +29,9 @@ else:
 max_log_bytes: ContextVar[int] = ContextVar("max_log_bytes", default=2_000_000_000)
 #: Folders from which ``px4fuse mcp`` may read files (option ``--root``); all folders if empty
 readable_folders: ContextVar[tuple[Path, ...]] = ContextVar("readable_folders", default=())
-LOG_SIZE_REMEDY = "Shorten the log to the flight, or increase the size limit with --max-size MB."
+LOG_SIZE_REMEDY = (
+    "Cut the log to the time span of the flight, or increase the size limit with --max-size MB."
+)
 
 
 def display_name(path: Path) -> str:
@@ -82,7 +84,7 @@ def file_size(path: Path, error_type: type[Px4FuseError], name: str = "") -> int
         with suppress(OSError):  # no suggestion if the folder cannot be listed
             if isinstance(error, FileNotFoundError):
                 suggestion = suggest_name(path.name, os.listdir(path.parent)).strip()  # noqa: PTH208
-        raise _read_error(name, error, error_type, suggestion) from error
+        raise _make_read_error(name, error, error_type, suggestion) from error
     if stat.S_ISDIR(file_status.st_mode):
         raise error_type(f"{name} is a folder", "Give a file.")
     if not stat.S_ISREG(file_status.st_mode):
@@ -103,7 +105,7 @@ def read_bytes_limited(
     limit_bytes: int,
     *,
     name: str = "",
-    size_remedy: str = "Shorten the file to the flight.",
+    size_remedy: str = "Cut the file to the time span of the flight.",
     empty_remedy: str | None = None,
 ) -> bytes:
     """Read all bytes of a regular file up to a size limit.
@@ -121,7 +123,7 @@ def read_bytes_limited(
     content = (
         b"" if size_bytes > limit_bytes else _read_bytes(path, size_bytes + 1, error_type, name)
     )
-    if len(content) > size_bytes:  # a growing file, or a file in /proc (size 0)
+    if len(content) > size_bytes:  # the file grew, or it is in /proc (size 0)
         content = _read_bytes(path, limit_bytes + 1, error_type, name)
     if (actual_size_bytes := max(size_bytes, len(content))) > limit_bytes:
         raise error_type(format_size_limit(name, actual_size_bytes, limit_bytes), size_remedy)
@@ -202,7 +204,7 @@ def files_by_sha256(paths: Iterable[Path]) -> dict[str, Path]:
                 with file.open("rb") as stream:
                     sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
             except OSError as error:
-                raise _read_error(display_name(file), error, LogError) from error
+                raise _make_read_error(display_name(file), error, LogError) from error
             file_by_hash.setdefault(sha256, file)
     return file_by_hash
 
@@ -232,7 +234,7 @@ def _read_bytes(path: Path, byte_count: int, error_type: type[Px4FuseError], nam
             content: bytes = file.read(byte_count)
             return content
     except (OSError, EOFError, zlib.error, zstd.ZstdError) as error:
-        raise _read_error(name, error, error_type) from error
+        raise _make_read_error(name, error, error_type) from error
 
 
 def _open_decompressed(path: Path) -> Any:
@@ -242,7 +244,7 @@ def _open_decompressed(path: Path) -> Any:
     return compression_module.open(path) if compression_module else path.open("rb")
 
 
-def _read_error(
+def _make_read_error(
     name: str, error: Exception, error_type: type[Px4FuseError], remedy: str = ""
 ) -> Px4FuseError:
     reason = getattr(error, "strerror", None) or error
@@ -251,8 +253,8 @@ def _read_error(
 
 def format_size_limit(name: str, size_bytes: int, limit_bytes: int) -> str:
     """Format the error message for a file that is too large."""
-    size_mb, limit_mb = (
+    size_mb_text, limit_mb_text = (
         f"{byte_count / 1e6:,.{0 if byte_count >= 10_000_000 else 2}f}"
         for byte_count in (size_bytes, limit_bytes)
     )
-    return f"{name}: the file has {size_mb} MB, more than the limit of {limit_mb} MB"
+    return f"{name}: the file has {size_mb_text} MB, more than the limit of {limit_mb_text} MB"

@@ -111,7 +111,7 @@ if TYPE_CHECKING:
 else:
 
     class NotWritten:
-        """``NotWritten[T]``: a field of type T that is not written to the JSON results."""
+        """``NotWritten[T]``: type of a field (T, such as Array) that the JSON results omit."""
 
         def __class_getitem__(cls, kind: object) -> type:
             return msgspec.UnsetType
@@ -124,12 +124,12 @@ else:
         """
 
         def __class_getitem__(cls, kinds: tuple[type, type]) -> type:
-            either_type = ABCMeta(
+            union_class = ABCMeta(
                 "Or".join(kind.__name__ for kind in kinds), (), {"union_members": kinds}
             )
             for kind in kinds:
-                either_type.register(kind)
-            return either_type
+                union_class.register(kind)
+            return union_class
 
     class OrUnavailable:
         """``OrUnavailable[T]``: a record T, or :class:`Unavailable`."""

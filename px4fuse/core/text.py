@@ -49,12 +49,12 @@ def convert_nested(value: Any, convert: Callable[[Any], Any]) -> Any:
     return convert(value)
 
 
-def utc_time(unix_s: float | None) -> str | None:
+def format_utc_time(unix_s: float | None) -> str | None:
     """Format a UNIX time (s) as ISO 8601 with milliseconds.
 
     Return None if the time is unknown or out of range.
 
-    >>> utc_time(1.5), utc_time(1e18)
+    >>> format_utc_time(1.5), format_utc_time(1e18)
     ('1970-01-01T00:00:01.500+00:00', None)
     """
     if unix_s is None:

@@ -30,7 +30,7 @@ Result = TypeVar("Result")
 # Maximum number of jobs of a worker process: caches of libraries grow, but a new process takes 2 s
 MAX_JOBS_PER_WORKER = 80
 # Default limits of time (s) and memory (bytes) of a job; a report on 10 minutes takes 60 s
-TIMEOUT_S, MAX_MEMORY_BYTES = 120.0, 4_000_000_000
+JOB_TIMEOUT_S, MAX_MEMORY_BYTES = 120.0, 4_000_000_000
 # Maximum time (s) for the start of a process on a slow and busy computer
 START_TIMEOUT_S = 180.0
 # Environment variables of worker processes. With PYTHONSAFEPATH, Python does not import files from
@@ -49,13 +49,13 @@ class _Worker:
     """Worker process with its current job, and the pipe for jobs and results."""
 
     def __init__(
-        self, function: Callable[[Any], Any], memory_bytes: int | None, job_index: int
+        self, function: Callable[[Any], Any], max_memory_bytes: int | None, job_index: int
     ) -> None:
         # spawn works on all systems and does not copy the memory of this process
         context = multiprocessing.get_context("spawn")
         self.pipe, child_pipe = context.Pipe()
         self.process = context.Process(
-            target=_run_worker, args=(child_pipe, function, memory_bytes)
+            target=_run_worker, args=(child_pipe, function, max_memory_bytes)
         )
         previous_environment = dict(os.environ)
         os.environ.update(_WORKER_ENVIRONMENT)
@@ -84,7 +84,7 @@ def _interrupts_blocked() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
-    resource_tracker.ensure_running()  # its start would unblock Ctrl-C
+    resource_tracker.ensure_running()  # now, because its start unblocks Ctrl-C
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -97,8 +97,8 @@ def run_with_limits(
     jobs: Sequence[Job],
     *,
     processes: int | None = None,
-    timeout_s: float = TIMEOUT_S,
-    memory_bytes: int | None = MAX_MEMORY_BYTES,
+    timeout_s: float = JOB_TIMEOUT_S,
+    max_memory_bytes: int | None = MAX_MEMORY_BYTES,
 ) -> Generator[tuple[int, Result | JobFailure]]:
     """Call a function on every job in worker processes, with limits of time and memory.
 
@@ -113,7 +113,7 @@ def run_with_limits(
         Number of parallel processes; by default the number of cores.
     timeout_s : float
         Maximum time for one job, without the start of its process.
-    memory_bytes : int or None
+    max_memory_bytes : int or None
         Maximum address space of one process on Linux (RLIMIT_AS), of which libraries use about
         0.6 GB; None for no limit.
 
@@ -122,7 +122,9 @@ def run_with_limits(
     (int, object)
         Index of a finished job, and its result or :class:`JobFailure`.
     """
-    with closing(poll_with_limits(function, jobs, processes, timeout_s, memory_bytes)) as outcomes:
+    with closing(
+        poll_with_limits(function, jobs, processes, timeout_s, max_memory_bytes)
+    ) as outcomes:
         yield from (outcome for outcome in outcomes if outcome is not None)
 
 
@@ -131,17 +133,17 @@ def poll_with_limits(
     jobs: Sequence[Job],
     processes: int | None,
     timeout_s: float,
-    memory_bytes: int | None,
+    max_memory_bytes: int | None,
     max_wait_s: float = math.inf,
 ) -> Generator[tuple[int, Result | JobFailure] | None]:
-    """Run jobs like :func:`run_with_limits`; yield None if none finishes within ``max_wait_s``."""
+    """Yield results like :func:`run_with_limits`; None after ``max_wait_s`` without a result."""
     waiting_indices = list(range(len(jobs)))[::-1]
     workers: dict[Connection, _Worker] = {}
     try:
         while waiting_indices or workers:
             while waiting_indices and len(workers) < (processes or os.cpu_count() or 1):
                 # take the job first: if the process does not start, only this job fails
-                new_worker = _Worker(function, memory_bytes, waiting_indices.pop())
+                new_worker = _Worker(function, max_memory_bytes, waiting_indices.pop())
                 workers[new_worker.pipe] = new_worker
             # wait for the first deadline, or until a pipe has data
             first_deadline = min(worker.deadline for worker in workers.values())
@@ -185,11 +187,11 @@ def run_one_with_limits(
     function: Callable[[Job], Result],
     job: Job,
     timeout_s: float,
-    memory_bytes: int = MAX_MEMORY_BYTES,
+    max_memory_bytes: int = MAX_MEMORY_BYTES,
 ) -> Result | JobFailure:
     """Call a function on one job in a worker process, with limits of time and memory."""
     [(_, outcome)] = run_with_limits(
-        function, [job], timeout_s=timeout_s, memory_bytes=memory_bytes
+        function, [job], timeout_s=timeout_s, max_memory_bytes=max_memory_bytes
     )
     return outcome
 
@@ -210,19 +212,21 @@ def _receive_result(worker: _Worker) -> tuple[bool, Any]:
     return message
 
 
-def _run_worker(pipe: Connection, function: Callable[[Any], Any], memory_bytes: int | None) -> None:
+def _run_worker(
+    pipe: Connection, function: Callable[[Any], Any], max_memory_bytes: int | None
+) -> None:
     """Receive and run jobs in a worker process, until its pipe is closed."""
     # the parent process handles Ctrl-C and ends its worker processes
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    _limit_memory(memory_bytes)
+    _limit_memory(max_memory_bytes)
     with suppress(EOFError, OSError):  # the parent process closed the pipe, or was killed
         pipe.send((True, None))
         while True:
-            pipe.send_bytes(_pickled_result(function, pipe.recv()))
+            pipe.send_bytes(_run_and_pickle(function, pipe.recv()))
 
 
-def _pickled_result(function: Callable[[Any], Any], job: Any) -> bytes:
+def _run_and_pickle(function: Callable[[Any], Any], job: Any) -> bytes:
     """Run a job; return (True if the process can run further jobs, result) as pickled bytes."""
     try:
         return pickle.dumps((True, function(job)), pickle.HIGHEST_PROTOCOL)
@@ -243,13 +247,13 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _limit_memory(memory_bytes: int | None) -> None:
+def _limit_memory(max_memory_bytes: int | None) -> None:
     try:
         import resource  # noqa: PLC0415 - not on Windows
     except ImportError:
         return
     # no core dump, which would contain data of a student
-    for resource_kind, limit in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, memory_bytes)):
+    for resource_kind, limit in ((resource.RLIMIT_CORE, 0), (resource.RLIMIT_AS, max_memory_bytes)):
         if limit is not None:
             with suppress(ValueError, OSError):  # macOS rejects some limits
                 resource.setrlimit(resource_kind, (limit, limit))

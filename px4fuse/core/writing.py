@@ -74,7 +74,7 @@ def _write_output(path: Path, content: bytes) -> None:
         sys.stdout.flush()
         sys.stdout.buffer.write(content)
         sys.stdout.flush()
-    elif stat.S_ISREG(file_mode := _file_mode(path)):
+    elif stat.S_ISREG(file_mode := _read_file_mode(path)):
         _replace_file(path.resolve(), content)
     else:
         with _open_pipe(path) if stat.S_ISFIFO(file_mode) else path.open("wb") as file:
@@ -89,7 +89,7 @@ def _is_standard_output(path: Path) -> bool:
         return False
 
 
-def _file_mode(path: Path) -> int:
+def _read_file_mode(path: Path) -> int:
     try:
         return path.stat().st_mode
     except FileNotFoundError:

@@ -189,8 +189,8 @@ def _flight_data(practice_flight: QuizFlight, flight_index: int) -> tuple[dict[s
     simulation = flights.simulate(practice_flight.scenario, parse_faults(options))
     flight = flights.to_flight(simulation, f"flight {flight_index + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
-    # as_sent: the automatic correction of axes and timestamps would hide the injected fault
-    analysis, packer = diagnose(request, flight=flight, as_sent=True), Packer()
+    # keep_as_sent: the automatic correction of axes and timestamps would hide the injected fault
+    analysis, packer = diagnose(request, flight=flight, keep_as_sent=True), Packer()
     data, card = flight_data(analysis, packer), build_card(analysis, request)
     descriptions = [_describe_fault(*pair, analysis.findings) for pair in faults_and_sizes]
     answer_key = {

@@ -10,10 +10,10 @@ from px4fuse.request import (
     SIGMA_A_M_S2,
     SIGMA_Z_M,
     ComparisonRequest,
-    InputName,
+    KfInputName,
 )
 
-INPUT_NAMES: tuple[InputName, ...] = get_args(InputName)
+INPUT_NAMES: tuple[KfInputName, ...] = get_args(KfInputName)
 
 
 class Range(NamedTuple):
@@ -61,7 +61,7 @@ class Settings:
     sigma_a_m_s2: float = SIGMA_A_M_S2
     sigma_z_m: float = SIGMA_Z_M
     dt_s: float = DT_S
-    input: InputName = "imu"
+    input: KfInputName = "imu"
     clock_offset_s: float = 0.0
 
     def __post_init__(self) -> None:

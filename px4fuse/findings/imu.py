@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.analysis import Analysis
-from px4fuse.core.arrays import intervals_where
+from px4fuse.core.arrays import select_intervals
 from px4fuse.core.record import Span
 from px4fuse.ekf2.inputs import MAX_LOST_FRACTION, compute_lost_imu_fraction
 from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, SystematicErrors
@@ -214,7 +214,7 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
 def _find_gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
     """Return start and end (s) of each IMU gap in a segment, also at both ends of the segment."""
     time_s = imu.index.to_numpy()
-    gaps = intervals_where(time_s, find_imu_gaps(time_s))
+    gaps = select_intervals(time_s, find_imu_gaps(time_s))
     end_spans = ((segment.start_s, float(time_s[0])), (float(time_s[-1]), segment.end_s))
     gaps += [(start, end) for start, end in end_spans if end - start > MIN_SPAN_S]
     gaps_inside = (span for span in gaps if span[1] > segment.start_s and span[0] < segment.end_s)

@@ -12,7 +12,7 @@ from px4fuse.comparison.flight_events import compute_max_interval_s
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.preparation import prepare, select_innovations
 from px4fuse.comparison.projection import project_innovations
-from px4fuse.core.text import capitalise_first, to_json_types, utc_time
+from px4fuse.core.text import capitalise_first, format_utc_time, to_json_types
 from px4fuse.ekf2.aids import evaluate_aids
 from px4fuse.ekf2.inputs import prepare_inputs
 from px4fuse.errors import MissingDataError, Px4FuseError
@@ -65,7 +65,7 @@ TimeSpans = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class AnalysisOption:
-    """Analysis of a log: data that it uses (``reason``), or reason why it is not possible."""
+    """Analysis of a log; ``reason``: the data that it uses, or why it is not possible."""
 
     name: str
     possible: bool
@@ -81,7 +81,7 @@ class LoggingAdvice:
 
 
 @dataclass(frozen=True)
-class Gaps:
+class GapStatistics:
     """Sample intervals longer than ``limit_s``: number, sum (s) and maximum (s)."""
 
     count: int
@@ -119,7 +119,7 @@ class LoggedData:
     log: str = ""
     samples: int | None = None
     rate_hz: float | None = None
-    gaps: Gaps | None = None
+    gaps: GapStatistics | None = None
     start_s: float | None = None
     end_s: float | None = None
     chosen: bool = False
@@ -163,7 +163,7 @@ def take_inventory(flight: Flight) -> Inventory:
     """List the data in a log, the possible analyses, and changes for the next flight."""
     comparison, reason, position_remedy = None, "", ""
     try:
-        comparison = prepare(flight, ComparisonRequest(log=flight.log.name), as_sent=True)
+        comparison = prepare(flight, ComparisonRequest(log=flight.log.name), keep_as_sent=True)
         reason = comparison.source_reason
     except Px4FuseError as error:
         reason = with_options(error.reason).removeprefix(f"{flight.log.name}: ")
@@ -178,12 +178,12 @@ def take_inventory(flight: Flight) -> Inventory:
     is_incomplete = log.ends_in_flight and not log.damage
     return Inventory(
         flight=flight,
-        start_utc=utc_time(log.start_unix_s),
+        start_utc=format_utc_time(log.start_unix_s),
         sources=tuple(_list_logged_data(flight, comparison, reason)),
         source_reason=reason,
         segment=None if comparison is None else comparison.segment,
         abilities=tuple(_list_analyses(flight, comparison, reason)),
-        advice=_logging_advice(flight, comparison, position_remedy),
+        advice=_collect_logging_advice(flight, comparison, position_remedy),
         notes=(
             *log.damage,
             *["the log ends in flight and does not contain the landing"] * is_incomplete,
@@ -207,14 +207,14 @@ def to_json_dict(inventory: Inventory) -> dict[str, Any]:
     }
 
 
-def _data_by_stream(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavailable]:
+def _collect_data_by_stream(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unavailable]:
     """Return all data of a flight except positions, by the keys of :data:`DATA_LABELS`."""
     ekf2, truth = flight.ekf2, flight.truth
     data_by_stream = {"imu": flight.imu, "attitude": flight.attitude}
     if isinstance(ekf2, Unavailable):
         data_by_stream["ekf2_state"] = ekf2
     else:
-        # the axis with most innovations
+        # from the axis with most innovations, because other axes may be missing
         innovations = max(
             ekf2.innovations.values(),
             key=lambda samples: len(samples) if isinstance(samples, pd.DataFrame) else -1,
@@ -228,7 +228,7 @@ def _data_by_stream(flight: Flight) -> dict[str, pd.DataFrame | TimeSpans | Unav
 def _list_logged_data(
     flight: Flight, comparison: PreparedComparison | None, reason: str
 ) -> Iterator[LoggedData]:
-    data_by_stream = _data_by_stream(flight)
+    data_by_stream = _collect_data_by_stream(flight)
     for key, name in DATA_LABELS.items():
         if key in data_by_stream:
             yield _make_logged_data(name, data_by_stream[key], flight.streams.get(key))
@@ -269,7 +269,7 @@ def _make_logged_data(
     return LoggedData(part, **data_fields)
 
 
-def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
+def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> GapStatistics:
     """Find sample intervals that are longer than a limit, which differs for IMU and other data."""
     intervals_s = np.diff(samples.index.to_numpy())
     limit_s = (
@@ -278,7 +278,7 @@ def _measure_gaps(samples: pd.DataFrame, *, is_imu: bool) -> Gaps:
         else float(compute_max_interval_s(1.0 / sample_rate(samples)))
     )
     long_intervals_s = intervals_s[intervals_s > limit_s]
-    return Gaps(
+    return GapStatistics(
         len(long_intervals_s),
         float(long_intervals_s.sum()),
         float(long_intervals_s.max(initial=0.0)),
@@ -300,12 +300,12 @@ def _list_analyses(
         )
         yield AnalysisOption("compare", True, description)
     low_rate_findings = () if flight.log.is_assessed else imu.detect_low_rates(flight)
-    imu_reason = " ".join(finding.message for finding in low_rate_findings)
+    imu_fault_text = " ".join(finding.message for finding in low_rate_findings)
     if isinstance(missing_data := imu_and_attitude(flight), Unavailable):
-        imu_reason = f"{missing_data.reason}; KF assumes constant velocity"
+        imu_fault_text = f"{missing_data.reason}; KF assumes constant velocity"
     acceleration_text = "IMU acceleration rotated into NED by the attitude, without gravity"
-    yield AnalysisOption("acceleration", not imu_reason, imu_reason or acceleration_text)
-    yield from _analyses_against_ekf2_and_truth(flight, comparison)
+    yield AnalysisOption("acceleration", not imu_fault_text, imu_fault_text or acceleration_text)
+    yield from _list_ekf2_and_truth_analyses(flight, comparison)
     results_by_aid, ekf2, description = evaluate_aids(flight), flight.ekf2, ""
     if isinstance(results_by_aid, dict) and isinstance(ekf2, Ekf2):
         rate_texts = (
@@ -318,8 +318,10 @@ def _list_analyses(
     yield _make_analysis_option("aids", results_by_aid, description)
     replay_inputs, description = prepare_inputs(flight), ""
     if not isinstance(replay_inputs, Unavailable):
-        replayed_s = sum(float(np.ptp(segment.time_s)) for segment in replay_inputs.segments)
-        description = f"EKF2 replay of {replayed_s:.0f} s with {replay_inputs.aid.label}"
+        replayed_duration_s = sum(
+            float(np.ptp(segment.time_s)) for segment in replay_inputs.segments
+        )
+        description = f"EKF2 replay of {replayed_duration_s:.0f} s with {replay_inputs.aid.label}"
     yield _make_analysis_option("what-if", replay_inputs, description)
 
 
@@ -329,7 +331,7 @@ def _make_analysis_option(name: str, data: object, description: str) -> Analysis
     return AnalysisOption(name, True, description)
 
 
-def _analyses_against_ekf2_and_truth(
+def _list_ekf2_and_truth_analyses(
     flight: Flight, comparison: PreparedComparison | None
 ) -> Iterator[AnalysisOption]:
     """Yield the analyses that need EKF2 data or ground truth."""
@@ -358,7 +360,7 @@ def _analyses_against_ekf2_and_truth(
         )
 
 
-def _logging_advice(
+def _collect_logging_advice(
     flight: Flight, comparison: PreparedComparison | None, position_remedy: str
 ) -> tuple[LoggingAdvice, ...]:
     """Collect the changes that avoid missing data and recording faults in the next flight.
@@ -380,12 +382,12 @@ def _logging_advice(
         (finding.remedy, finding_title(finding.id)) for finding in findings if finding.remedy
     ]
     # data that a MAVLink recording can contain, in addition to positions
-    mavlink_data = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
+    possible_mavlink_data = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
     actions_and_purposes += [
         (missing_data.remedy, missing_data.what)
         for missing_data in list_missing_data(flight)
         if missing_data is not NO_POSITION
-        and (flight.log.has_ulog or any(missing_data is data for data in mavlink_data))
+        and (flight.log.has_ulog or any(missing_data is data for data in possible_mavlink_data))
     ]
     purposes_by_action: dict[str, dict[str, None]] = {}
     for action, purpose in actions_and_purposes:

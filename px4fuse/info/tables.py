@@ -60,12 +60,12 @@ def tables(flight: Flight) -> Mapping[str, pd.DataFrame]:
 
     Data that are missing in the log have no table; see :func:`list_missing_data`.
     """
-    return {table.name: table.data for table in _described_tables(flight)}
+    return {table.name: table.data for table in _make_described_tables(flight)}
 
 
 def data_dictionary(flight: Flight) -> pd.DataFrame:
     """Describe each column of all tables: unit, frame, meaning, topic and clock."""
-    descriptions = [table.column_descriptions for table in _described_tables(flight)]
+    descriptions = [table.column_descriptions for table in _make_described_tables(flight)]
     if not descriptions:
         return pd.DataFrame(columns=DICTIONARY_COLUMNS)
     return pd.concat(descriptions, ignore_index=True)[DICTIONARY_COLUMNS]
@@ -99,7 +99,7 @@ def description(flight: Flight) -> dict[str, Any]:
         "log": flight.log,
         "streams": flight.streams,
         "positions": [
-            {"table": table, **track.description_fields()} for table, track in _named_tracks(flight)
+            {"table": table, **track.description_fields()} for table, track in _name_tracks(flight)
         ],
         "ekf2": {"gate": ekf2.gate, "notes": ekf2.notes} if isinstance(ekf2, Ekf2) else None,
         "clocks": flight.clocks,
@@ -131,10 +131,12 @@ def _describe_table(
     name_in_csv: str = "",
     **placeholder_values: str,
 ) -> DescribedTable:
-    """Select the columns of a table that columns.csv describes, and add their descriptions.
+    """Keep the columns that have a row in columns.csv, and add their descriptions.
 
     Parameters
     ----------
+    topics_and_clock : tuple
+        Source topics and clock of the table.
     name_in_csv : str
         Name of the table in columns.csv; by default ``name``.
     placeholder_values : str
@@ -154,34 +156,34 @@ def _describe_table(
     return DescribedTable(name, described_data, column_descriptions)
 
 
-def _stream_table(
+def _make_stream_table(
     flight: Flight, name: str, data: pd.DataFrame | Unavailable
 ) -> Iterator[DescribedTable]:
     if isinstance(data, pd.DataFrame):
-        yield _describe_table(name, _with_time_column(data), _topics_and_clock(flight, name))
+        yield _describe_table(name, _with_time_column(data), _find_topics_and_clock(flight, name))
 
 
 def _with_time_column(data: pd.DataFrame) -> pd.DataFrame:
     return data.rename_axis("time_s").reset_index()
 
 
-def _described_tables(flight: Flight) -> Iterator[DescribedTable]:
+def _make_described_tables(flight: Flight) -> Iterator[DescribedTable]:
     imu = flight.imu
-    yield from _stream_table(
+    yield from _make_stream_table(
         flight, "imu", imu if isinstance(imu, Unavailable) else imu.astype(np.float64)
     )
-    yield from _stream_table(flight, "attitude", flight.attitude)
+    yield from _make_stream_table(flight, "attitude", flight.attitude)
     acceleration = ned_acceleration(flight)
     if isinstance(acceleration, pd.DataFrame):
         acceleration = acceleration.set_axis(["north_m_s2", "east_m_s2", "down_m_s2"], axis=1)
-        imu_topics, clock = _topics_and_clock(flight, "imu")
-        attitude_topics, _ = _topics_and_clock(flight, "attitude")
+        imu_topics, clock = _find_topics_and_clock(flight, "imu")
+        attitude_topics, _ = _find_topics_and_clock(flight, "attitude")
         yield _describe_table(
             "acceleration_ned",
             _with_time_column(acceleration),
             ((*imu_topics, *attitude_topics), clock),
         )
-    for name, track in _named_tracks(flight):
+    for name, track in _name_tracks(flight):
         placeholder_values = {"frame": track.frame, "description": track.description}
         topics_and_clock = (track.topics, track.clock)
         position_table = _with_time_column(track.samples)
@@ -197,17 +199,19 @@ def _described_tables(flight: Flight) -> Iterator[DescribedTable]:
                 **placeholder_values,
             )
     if isinstance(flight.ekf2, Ekf2):
-        yield from _ekf2_tables(flight, flight.ekf2)
+        yield from _make_ekf2_tables(flight, flight.ekf2)
     if isinstance(flight.truth, Truth):
-        yield from _stream_table(flight, "truth", flight.truth.samples)
+        yield from _make_stream_table(flight, "truth", flight.truth.samples)
     log = flight.log
     if not isinstance(flight.airborne, Unavailable):
-        flight_times = _numeric_table(["time_s", "end_s"], flight.airborne)
-        yield _describe_table("airborne", flight_times, _topics_and_clock(flight, "airborne"))
+        airborne_table = _make_numeric_table(["time_s", "end_s"], flight.airborne)
+        yield _describe_table(
+            "airborne", airborne_table, _find_topics_and_clock(flight, "airborne")
+        )
     if log.dropouts:
         rows = [(dropout.start_s, dropout.duration_s) for dropout in log.dropouts]
-        yield _describe_table("dropouts", _numeric_table(["time_s", "duration_s"], rows))
-    if parameters := _logged_parameters(flight):
+        yield _describe_table("dropouts", _make_numeric_table(["time_s", "duration_s"], rows))
+    if parameters := _collect_logged_parameters(flight):
         yield _describe_table(
             "parameters", pd.DataFrame(parameters.items(), columns=["name", "value"])
         )
@@ -217,8 +221,7 @@ def _described_tables(flight: Flight) -> Iterator[DescribedTable]:
         yield _describe_table("clocks", clock_table.astype({"distinct_stamps": np.float64}))
 
 
-def _logged_parameters(flight: Flight) -> dict[str, float]:
-    """Return the values of the PX4 parameters in the log."""
+def _collect_logged_parameters(flight: Flight) -> dict[str, float]:
     logged_values = dict(flight.log.parameters)
     if isinstance(flight.ekf2, Ekf2):
         for record_or_aid in (flight.ekf2.record, *flight.ekf2.aids.values()):
@@ -228,13 +231,13 @@ def _logged_parameters(flight: Flight) -> dict[str, float]:
     return logged_values
 
 
-def _numeric_table(columns: list[str], rows: Iterable[tuple[float, ...]]) -> pd.DataFrame:
+def _make_numeric_table(columns: list[str], rows: Iterable[tuple[float, ...]]) -> pd.DataFrame:
     return pd.DataFrame(list(rows), columns=columns, dtype=np.float64)
 
 
-def _ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
-    yield from _stream_table(flight, "ekf2_state", ekf2.state)
-    yield from _stream_table(flight, "ekf2_variance", ekf2.variance)
+def _make_ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
+    yield from _make_stream_table(flight, "ekf2_state", ekf2.state)
+    yield from _make_stream_table(flight, "ekf2_variance", ekf2.variance)
     axis_tables = [
         axis_innovations.assign(axis=axis)
         for axis, axis_innovations in ekf2.innovations.items()
@@ -242,24 +245,24 @@ def _ekf2_tables(flight: Flight, ekf2: Ekf2) -> Iterator[DescribedTable]:
     ]
     if axis_tables:
         innovation_table = pd.concat(axis_tables).sort_index(kind="stable")
-        yield from _stream_table(flight, "ekf2_innovations", innovation_table)
-    yield from _stream_table(flight, "ekf2_fusing", ekf2.fusion_flags)
-    topics_and_clock = _topics_and_clock(flight, "ekf2_state")
+        yield from _make_stream_table(flight, "ekf2_innovations", innovation_table)
+    yield from _make_stream_table(flight, "ekf2_fusing", ekf2.fusion_flags)
+    topics_and_clock = _find_topics_and_clock(flight, "ekf2_state")
     delta_rows = [reset.delta for reset in ekf2.resets]
-    reset_table = _numeric_table(["delta_north", "delta_east", "delta_down"], delta_rows)
+    reset_table = _make_numeric_table(["delta_north", "delta_east", "delta_down"], delta_rows)
     reset_table["time_s"] = np.array([reset.time_s for reset in ekf2.resets], np.float64)
     reset_table["quantity"] = np.array([reset.quantity for reset in ekf2.resets], object)
     yield _describe_table("resets", reset_table, topics_and_clock)
-    # the first EKF2 instance of a Flight has the start time minus infinity
+    # the table needs a finite time, but the first EKF2 instance starts at minus infinity
     first_time_s = min(float(ekf2.state.index[0]), 0.0)
     instance_rows = [(max(time_s, first_time_s), instance) for time_s, instance in ekf2.instances]
-    instance_table = _numeric_table(["time_s", "instance"], instance_rows).astype(
+    instance_table = _make_numeric_table(["time_s", "instance"], instance_rows).astype(
         {"instance": np.int64}
     )
     yield _describe_table("instances", instance_table, topics_and_clock)
 
 
-def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
+def _name_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
     """Yield each position track with a table name, which is also unique in lower case."""
     used_names: set[str] = set()
     for track in flight.positions:
@@ -275,6 +278,6 @@ def _named_tracks(flight: Flight) -> Iterator[tuple[str, PositionTrack]]:
         yield name, track
 
 
-def _topics_and_clock(flight: Flight, stream_name: str) -> tuple[tuple[str, ...], str]:
+def _find_topics_and_clock(flight: Flight, stream_name: str) -> tuple[tuple[str, ...], str]:
     stream = flight.streams.get(stream_name)
     return ((), "") if stream is None else (stream.topics, stream.clock)

@@ -9,7 +9,7 @@ from px4fuse.errors import MissingDataError, SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD, Flight, Unavailable
 from px4fuse.loop import loop_segment
-from px4fuse.loop.closure import choose_key_frames, default_key_frame_spacing_m, to_z_down
+from px4fuse.loop.closure import choose_key_frames, compute_default_spacing_m, to_z_down
 from px4fuse.loop.corrections import (
     ClosureAndLanding,
     build_pose_graph,
@@ -27,14 +27,14 @@ from px4fuse.trajectory.model import Trajectory, components_by_axis, cumulative_
 # A time (s) in an option is UNIX time above this limit, else time from the first pose
 MIN_UNIX_TIME_S = 1e6
 # Minimum path length (m) of a loop
-MIN_PATH_M = 2.0
+MIN_PATH_LENGTH_M = 2.0
 # Minimum path length (m) for a loop analysis in ``px4fuse compare``
 MIN_FLIGHT_LOOP_PATH_M = 10.0
 # Maximum distance between both ends of the path for a loop analysis in ``px4fuse compare``, as
 # fraction of the path length
 MAX_END_DISTANCE_FRACTION = 0.10
 # Maximum value (m or °) of the options for drift, key frame spacing and σ
-MAX_OPTION_VALUE = 100.0
+MAX_LOOP_OPTION_VALUE = 100.0
 
 
 def analyse(
@@ -76,10 +76,10 @@ def analyse(
     truth = None if flight is None or trajectory.kind == "truth" else truth_trajectory(flight)
     z_down_trajectory = to_z_down(trajectory)
     path = loop_segment.cut_trajectory(z_down_trajectory, segment, rests_at_ends)
-    truth_end = None
+    end_from_truth = None
     if truth and request.closed_loop and request.landed_at is None:
-        truth_end = loop_segment.read_end_from_truth(path, truth, segment, rests_at_ends)
-    true_end = _find_true_end(path, request, truth_end, segment, is_assessed=is_assessed)
+        end_from_truth = loop_segment.read_end_from_truth(path, truth, segment, rests_at_ends)
+    true_end = _find_true_end(path, request, end_from_truth, segment, is_assessed=is_assessed)
     given_closures = [
         GivenClosure(
             to_track_time(closure.time_1_s), to_track_time(closure.time_2_s), closure.sigma_m
@@ -94,20 +94,20 @@ def analyse(
             0, (GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m), true_end)
         )
     spacing_m = request.key_frames_m
-    spacing_m = default_key_frame_spacing_m(path.position_m) if spacing_m is None else spacing_m
+    spacing_m = compute_default_spacing_m(path.position_m) if spacing_m is None else spacing_m
     key_frame_indices, distance_m = _choose_key_frames(path, spacing_m)
     graph, node_indices, variance_note = build_pose_graph(
         path, key_frame_indices, closures_and_landings, noise
     )
     notes = [*z_down_trajectory.notes, variance_note]
-    if isinstance(truth_end, str):
-        notes.append(f"the ground truth does not contain the landing place: {truth_end}")
+    if isinstance(end_from_truth, str):
+        notes.append(f"the ground truth does not contain the landing place: {end_from_truth}")
     gated_closures = gate_closures(graph, closures_and_landings)
     graph_corrections, gated_closures = solve_pose_graphs(
         path, node_indices, graph, gated_closures, progress
     )
     end_from_start_m = path.position_m[-1] - path.position_m[0]
-    odometry_heading_change_deg = loop_segment.heading_change_deg(path)
+    odometry_heading_change_deg = loop_segment.compute_heading_change_deg(path)
     misclosure_m = (
         true_end if isinstance(true_end, Unavailable) else end_from_start_m - true_end.displacement
     )
@@ -156,7 +156,7 @@ def analyse(
 def _find_true_end(
     path: Trajectory,
     request: LoopRequest,
-    truth_end: TrueEnd | str | None,
+    end_from_truth: TrueEnd | str | None,
     segment: Segment,
     *,
     is_assessed: bool,
@@ -172,11 +172,11 @@ def _find_true_end(
     if not request.closed_loop:
         return Unavailable(
             "loop closure error",
-            "the path does not return to its start, as stated with --open",
+            "the path does not return to its start (stated with --open)",
             "Omit --open.",
         )
-    if isinstance(truth_end, TrueEnd):
-        return truth_end
+    if isinstance(end_from_truth, TrueEnd):
+        return end_from_truth
     if is_assessed:
         return DIAGNOSIS_WITHHELD
     flight = segment.flight
@@ -194,18 +194,18 @@ def _find_true_end(
 
 
 def _is_drift_free(trajectory: Trajectory, flight: Flight) -> bool:
-    """Return True if the positions do not drift: KF or EKF2 with a positioning system."""
+    """Return True for KF or EKF2 with a positioning system, whose positions do not drift."""
     has_vision = any(track.origin.is_vision for track in flight.positions)
     has_no_odometry = isinstance(find_odometry(flight), Unavailable)
     return trajectory.kind in ("ekf2", "kf") and has_vision and has_no_odometry
 
 
 def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
-    """Return the indices of the key frames, and the path length (m) along them at each pose."""
+    """Return the indices of the key frames, and the distance (m) along them up to each pose."""
     _require_in_range("key_frames_m", spacing_m, 1e-3)
     key_frame_indices = choose_key_frames(path.position_m, spacing_m)
     distance_m = cumulative_distance(path.position_m[key_frame_indices])
-    if not distance_m[-1] >= max(MIN_PATH_M * min(1.0, spacing_m / 0.5), 1e-6):
+    if not distance_m[-1] >= max(MIN_PATH_LENGTH_M * min(1.0, spacing_m / 0.5), 1e-6):
         raise TrajectoryError(
             f"{path.name}: the path of {distance_m[-1]:.2f} m is too short for key frames every "
             f"{spacing_m:g} m",
@@ -215,9 +215,9 @@ def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Ar
 
 
 def _require_in_range(name: str, value: float, min_value: float) -> None:
-    if not min_value <= value <= MAX_OPTION_VALUE:
+    if not min_value <= value <= MAX_LOOP_OPTION_VALUE:
         raise SettingsError(
-            f"`{name}` {value:g} is out of range ({min_value:g} to {MAX_OPTION_VALUE:g})."
+            f"`{name}` {value:g} is out of range ({min_value:g} to {MAX_LOOP_OPTION_VALUE:g})."
         )
 
 
@@ -229,7 +229,7 @@ def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
             f"{closure_text}: the times must be in ascending order, between {start_s:.2f} s and "
             f"{end_s:.2f} s."
         )
-    if not 1e-4 <= closure.sigma_m <= MAX_OPTION_VALUE:
+    if not 1e-4 <= closure.sigma_m <= MAX_LOOP_OPTION_VALUE:
         raise TrajectoryError(
             f"{closure_text}: SIGMA {closure.sigma_m:g} is out of range (0.0001 to 100 m)."
         )
@@ -238,7 +238,7 @@ def _require_valid_closure(closure: GivenClosure, path: Trajectory) -> None:
 def _compute_heading_error(
     true_end: TrueEnd | Unavailable, heading_change_deg: float | None
 ) -> float | Unavailable:
-    quantity = "heading error of the loop"
+    quantity = "heading error at the end of the loop"
     if isinstance(true_end, Unavailable):
         return true_end
     if heading_change_deg is None:
@@ -249,8 +249,8 @@ def _compute_heading_error(
         return Unavailable(
             quantity,
             f"the final heading differs by {heading_change_deg:+.0f}° from the initial heading, "
-            "and the true difference is unknown",
-            "Give the true difference as DEG in --landed-at FORWARD,RIGHT,DEG.",
+            "and the true heading change is unknown",
+            "Give the true heading change as DEG in --landed-at FORWARD,RIGHT,DEG.",
         )
     return float(np.degrees(lie.wrap(np.radians(heading_change_deg - true_end.heading_change_deg))))
 

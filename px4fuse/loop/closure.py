@@ -1,4 +1,4 @@
-"""Distribution of the loop closure error along the path in proportion to distance; key frames.
+"""Distribution of the loop closure error along the path, and choice of key frames.
 
 Frames have z down: NED, or FRD (forward, right, down at the start); see :func:`to_z_down`.
 """
@@ -74,8 +74,8 @@ def _rotate(trajectory: Trajectory, matrix: Array, frame: Frame) -> Trajectory:
     return replace(rotated, rotation=rotated.rotation * axes_rotation.inv())
 
 
-def default_key_frame_spacing_m(position_m: Array) -> float:
-    """Return the default key frame spacing (m) of a path, shape (n, d)."""
+def compute_default_spacing_m(position_m: Array) -> float:
+    """Return the default key frame spacing (m): 2 % of the extent of the path, within limits."""
     extent_m = float(np.linalg.norm(np.ptp(position_m, axis=0)))
     return float(
         np.clip(
@@ -120,7 +120,7 @@ def distribute_by_distance(
     return np.asarray(position_m - (distance_m / distance_m[-1])[:, None] * misclosure_m)
 
 
-def heading_change_rad(rotation: Rotation) -> float:
+def compute_heading_change_rad(rotation: Rotation) -> float:
     """Return the angle (rad) about the vertical of a rotation in a frame with z down.
 
     It is the twist of the swing-twist decomposition about z; positive is clockwise from above.

@@ -12,9 +12,9 @@ from px4fuse.errors import Px4FuseError
 from px4fuse.flight.model import Unavailable
 from px4fuse.loop.closure import (
     DOWN_DIRECTION,
+    compute_heading_change_rad,
     correct_by_distance,
     distribute_by_distance,
-    heading_change_rad,
 )
 from px4fuse.loop.model import (
     LANDING_CLOSURE_SOURCE,
@@ -29,21 +29,21 @@ from px4fuse.trajectory.evaluation import Evaluation, evaluate
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.covariance import gate_edges
 from px4fuse.trajectory.graph.model import PoseGraph
-from px4fuse.trajectory.graph.solver import ROBUST, SOLUTIONS, Solution, solve
+from px4fuse.trajectory.graph.solver import ROBUST_KEY, SOLUTIONS, Solution, solve
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
-# Minimum ratio of final to initial reported position variance for using the reported variances
-# instead of the default drift
+# The variances that the odometry reports are used instead of the default drift if they grow by more
+# than this factor along the path
 MIN_VARIANCE_GROWTH = 2.0
 # Minimum variance of an odometry edge, as fraction of the default variance: avoids a division by 0
 MIN_VARIANCE_FRACTION = 1e-2
-# Fraction of the poses at each end of the path for the median of the reported variance
+# Fraction of the poses at each end of the path whose median reported variance is used there
 END_POSES_FRACTION = 0.1
 # Loop closure, and the true final pose if the closure connects take-off and landing (else None)
 ClosureAndLanding = tuple[GivenClosure, TrueEnd | None]
 
 
-def odometry_variances(
+def compute_odometry_variances(
     path: Trajectory, node_indices: IntArray, noise: OdometryNoise
 ) -> tuple[Array, Array, str]:
     """Compute the variances of the odometry between successive nodes of the pose graph.
@@ -57,32 +57,36 @@ def odometry_variances(
 
     Returns
     -------
-    translation_m2 : ndarray, shape (k - 1,)
+    translation_variance_m2 : ndarray, shape (k - 1,)
         Variance per axis.
-    rotation_rad2 : ndarray, shape (k - 1, 3)
+    rotation_variance_rad2 : ndarray, shape (k - 1, 3)
         Variances about the body axes.
     variance_note : str
         Data from which the variances are computed, for the user.
     """
     step_length_m = np.diff(cumulative_distance(path.position_m[node_indices]))
     step_duration_s = np.diff(path.time_s[node_indices])
-    translation_m2 = (
+    translation_variance_m2 = (
         noise.position_m**2 / 100.0 * step_length_m
         + noise.position_m_per_root_s**2 * step_duration_s
     )
-    heading_rad2 = np.radians(noise.heading_deg) ** 2 / 100.0 * step_length_m
-    heading_rad2 = heading_rad2 + np.radians(noise.heading_deg_per_root_s) ** 2 * step_duration_s
-    tilt_rad2 = noise.tilt_share**2 * heading_rad2
-    rotation_rad2 = np.column_stack([tilt_rad2, tilt_rad2, heading_rad2])
+    heading_variance_rad2 = np.radians(noise.heading_deg) ** 2 / 100.0 * step_length_m
+    heading_variance_rad2 = (
+        heading_variance_rad2 + np.radians(noise.heading_deg_per_root_s) ** 2 * step_duration_s
+    )
+    tilt_variance_rad2 = noise.tilt_share**2 * heading_variance_rad2
+    rotation_variance_rad2 = np.column_stack(
+        [tilt_variance_rad2, tilt_variance_rad2, heading_variance_rad2]
+    )
     drift_origin = "default" if noise == OdometryNoise() else "from options"
     variance_sources = [
         f"the odometry drift after 100 m is {noise.position_m:g} m in position and "
         f"{noise.heading_deg:g}° in heading (1 σ, {drift_origin})"
     ]
-    position_growth = _variance_growth(path.position_variance_m2, node_indices)
-    if position_growth is not None:
-        translation_m2 = np.maximum(
-            position_growth.mean(axis=1), MIN_VARIANCE_FRACTION * translation_m2
+    position_variance_growth = _compute_variance_growth(path.position_variance_m2, node_indices)
+    if position_variance_growth is not None:
+        translation_variance_m2 = np.maximum(
+            position_variance_growth.mean(axis=1), MIN_VARIANCE_FRACTION * translation_variance_m2
         )
         variance_sources.append(
             "the translation variances of the odometry are computed from the increase of the "
@@ -90,17 +94,19 @@ def odometry_variances(
         )
     elif path.position_variance_m2 is not None:
         variance_sources.append("the logged position variances do not grow, so they are not used")
-    rotation_growth = _variance_growth(path.rotation_variance_rad2, node_indices)
-    if rotation_growth is not None:
-        rotation_rad2 = np.maximum(rotation_growth, MIN_VARIANCE_FRACTION * rotation_rad2)
+    rotation_variance_growth = _compute_variance_growth(path.rotation_variance_rad2, node_indices)
+    if rotation_variance_growth is not None:
+        rotation_variance_rad2 = np.maximum(
+            rotation_variance_growth, MIN_VARIANCE_FRACTION * rotation_variance_rad2
+        )
         variance_sources.append(
             "the rotation variances of the odometry are computed from the increase of the logged "
             "orientation variances"
         )
-    return translation_m2, rotation_rad2, "; ".join(variance_sources)
+    return translation_variance_m2, rotation_variance_rad2, "; ".join(variance_sources)
 
 
-def _variance_growth(variance: Array | None, node_indices: IntArray) -> Array | None:
+def _compute_variance_growth(variance: Array | None, node_indices: IntArray) -> Array | None:
     """Compute the growth of reported variances between graph nodes, shape (k - 1, 3).
 
     Return None if the variances do not grow by MIN_VARIANCE_GROWTH along the path.
@@ -149,33 +155,37 @@ def build_pose_graph(
     closure_nodes = np.searchsorted(node_indices, pose_indices)
     node_position_m = path.position_m[node_indices]
     node_rotation = path.rotation[node_indices]
-    translation_m2, rotation_rad2, variance_note = odometry_variances(path, node_indices, noise)
+    translation_variance_m2, rotation_variance_rad2, variance_note = compute_odometry_variances(
+        path, node_indices, noise
+    )
     step_indices = np.arange(len(node_indices) - 1)
     first_nodes = np.append(step_indices, closure_nodes[:, 0])
     second_nodes = np.append(step_indices + 1, closure_nodes[:, 1])
     information = np.zeros((len(first_nodes), 6, 6))
     information_diagonal = np.column_stack(
-        [np.repeat(1.0 / translation_m2[:, None], 3, axis=1), 1.0 / rotation_rad2]
+        [np.repeat(1.0 / translation_variance_m2[:, None], 3, axis=1), 1.0 / rotation_variance_rad2]
     )
     information[step_indices[:, None], range(6), range(6)] = information_diagonal
-    first_inverse = node_rotation[first_nodes].inv()
+    first_rotation_inverse = node_rotation[first_nodes].inv()
     second_rotation = node_rotation[second_nodes]
-    translation_measured = first_inverse.apply(
+    translation_measured = first_rotation_inverse.apply(
         node_position_m[second_nodes] - node_position_m[first_nodes]
     )
     for edge_index, (closure, true_end) in enumerate(
         closures_and_landings, start=len(step_indices)
     ):
         translation_measured[edge_index] = (
-            0.0 if true_end is None else first_inverse[edge_index].apply(true_end.displacement)
+            0.0
+            if true_end is None
+            else first_rotation_inverse[edge_index].apply(true_end.displacement)
         )
         information[edge_index, range(3), range(3)] = closure.sigma_m**-2
         if true_end is not None and true_end.heading_change_deg is not None:
-            odometry_change_rad = heading_change_rad(
+            odometry_heading_change_rad = compute_heading_change_rad(
                 second_rotation[edge_index] * node_rotation[first_nodes[edge_index]].inv()
             )
             heading_correction_rad = float(
-                lie.wrap(np.radians(true_end.heading_change_deg) - odometry_change_rad)
+                lie.wrap(np.radians(true_end.heading_change_deg) - odometry_heading_change_rad)
             )
             second_rotation[edge_index] = (
                 Rotation.from_rotvec(heading_correction_rad * DOWN_DIRECTION)
@@ -193,7 +203,7 @@ def build_pose_graph(
         first_nodes=first_nodes,
         second_nodes=second_nodes,
         measurements=np.column_stack(
-            [translation_measured, (first_inverse * second_rotation).as_quat()]
+            [translation_measured, (first_rotation_inverse * second_rotation).as_quat()]
         ),
         information=information,
         initialised="odometry",
@@ -223,9 +233,11 @@ def correct_paths_by_distance(
     heading_error_deg: float | Unavailable,
     landing_closure: Closure | None,
 ) -> dict[CorrectionName, CorrectionOutcome]:
-    """Distribute the loop closure error over positions only, and over positions and headings."""
+    """Return two corrected paths: closure error distributed over positions, and also headings."""
     if landing_closure is not None and not landing_closure.accepted:
-        misclosure_m = _rejected_by_gate("distribution of the closure error", landing_closure)
+        misclosure_m = _make_gate_rejection(
+            "distribution of the closure error along the path", landing_closure
+        )
     if isinstance(misclosure_m, Unavailable):
         return {"by_distance_plain": misclosure_m, "by_distance": misclosure_m}
     corrected_position_m = distribute_by_distance(path.position_m, misclosure_m, distance_m)
@@ -239,7 +251,7 @@ def correct_paths_by_distance(
     }
 
 
-def _rejected_by_gate(correction_name: str, closure: Closure) -> Unavailable:
+def _make_gate_rejection(correction_name: str, closure: Closure) -> Unavailable:
     return Unavailable(
         correction_name,
         f"the gate rejects {closure} (squared Mahalanobis distance {closure.d2:.1f}, "
@@ -252,7 +264,7 @@ def _rejected_by_gate(correction_name: str, closure: Closure) -> Unavailable:
 def gate_closures(
     graph: PoseGraph | Unavailable, closures_and_landings: Sequence[ClosureAndLanding]
 ) -> tuple[Closure, ...]:
-    """Test the loop closures, which are the last edges of the graph, against odometry."""
+    """Return the loop closures (the last edges of the graph), tested against odometry."""
     if isinstance(graph, Unavailable):
         return ()
     closure_edges = np.arange(
@@ -305,7 +317,7 @@ def solve_pose_graphs(
     is_rejected[is_closure] = [not closure.accepted for closure in closures]
     for solution_name, label in SOLUTIONS.items():
         name = f"pose_graph_{solution_name}"
-        is_robust = solution_name == ROBUST
+        is_robust = solution_name == ROBUST_KEY
         is_gated = solution_name == "gated"
         progress(f"optimising: {label}")
         if is_robust and len(closures) < 2:
@@ -317,7 +329,7 @@ def solve_pose_graphs(
                 "Give more loop closures with --closure.",
             )
         elif is_gated and is_rejected[is_closure].all():
-            corrections[name] = _rejected_by_gate("pose graph", closures[0])
+            corrections[name] = _make_gate_rejection("pose graph", closures[0])
         elif is_gated and not is_rejected.any():
             corrections[name] = corrections["pose_graph_all"]
         else:
@@ -401,11 +413,13 @@ def score_paths(
             **solution_fields,
         )
 
-    uncorrected = score_path("uncorrected", odometry, None)
-    for name, evaluation in uncorrected.scores.items():
+    uncorrected_path = score_path("uncorrected", odometry, None)
+    for name, evaluation in uncorrected_path.scores.items():
         if isinstance(evaluation, Evaluation) and evaluation.time_offset.offset_s is not None:
             offset_by_reference[name] = evaluation.time_offset.offset_s
-    scored_paths: dict[CorrectionName, CorrectedPath | Unavailable] = {"uncorrected": uncorrected}
+    scored_paths: dict[CorrectionName, CorrectedPath | Unavailable] = {
+        "uncorrected": uncorrected_path
+    }
     for name, corrected_path in corrected_paths.items():
         if isinstance(corrected_path, Unavailable):
             scored_paths[name] = corrected_path

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from px4fuse.errors import SettingsError, TrajectoryError
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.model import Flight, Unavailable
-from px4fuse.loop.closure import DOWN_DIRECTION, heading_change_rad
+from px4fuse.loop.closure import DOWN_DIRECTION, compute_heading_change_rad
 from px4fuse.loop.model import TrueEnd
 from px4fuse.request import Landing
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, components_by_axis, format_vector
@@ -19,7 +19,7 @@ REST_TIME_S = 1.0
 # Maximum extent (m) of the positions of a vehicle at rest
 MAX_POSITION_EXTENT_AT_REST_M = 0.15
 # Maximum heading change (°) of the odometry for which the true heading change is assumed to be zero
-MAX_SAME_HEADING_DEG = 15.0
+MAX_NEGLIGIBLE_CHANGE_DEG = 15.0
 
 
 def cut_trajectory(
@@ -110,15 +110,15 @@ def choose_loop_segment(
             "Change --from or --to.",
         )
     if limited_span_s != (segment_start_s, segment_end_s):
-        reason = f"{reason}, limited to the times with poses"
+        reason = f"{reason}, without the times that have no poses"
     return Segment(*limited_span_s, reason, flight_span_s), rests_at_ends
 
 
-def heading_change_deg(path: Trajectory) -> float | None:
+def compute_heading_change_deg(path: Trajectory) -> float | None:
     """Return final minus initial heading (°), clockwise; None without orientations."""
     if path.rotation is None:
         return None
-    return float(np.degrees(heading_change_rad(path.rotation[-1] * path.rotation[0].inv())))
+    return float(np.degrees(compute_heading_change_rad(path.rotation[-1] * path.rotation[0].inv())))
 
 
 def assume_end_at_takeoff(path: Trajectory) -> TrueEnd:
@@ -127,9 +127,10 @@ def assume_end_at_takeoff(path: Trajectory) -> TrueEnd:
     If the odometry's heading change is small, the final heading is assumed equal to the initial
     heading, else it is unknown.
     """
-    odometry_change_deg = heading_change_deg(path)
+    odometry_heading_change_deg = compute_heading_change_deg(path)
     is_same_heading = (
-        odometry_change_deg is not None and abs(odometry_change_deg) <= MAX_SAME_HEADING_DEG
+        odometry_heading_change_deg is not None
+        and abs(odometry_heading_change_deg) <= MAX_NEGLIGIBLE_CHANGE_DEG
     )
     source = "assumed: landing at the take-off place, final heading unknown"
     if is_same_heading:
@@ -174,22 +175,24 @@ def read_end_from_truth(
     except TrajectoryError as error:
         return str(error)
     displacement_m = true_path.position_m[-1] - true_path.position_m[0]
-    true_change_deg = None
-    landing_distance_m = np.linalg.norm(displacement_m)
+    true_heading_change_deg = None
+    start_to_landing_m = np.linalg.norm(displacement_m)
     if path.rotation is not None and true_path.rotation is not None:
-        heading_difference_rad = heading_change_rad(path.rotation[0] * true_path.rotation[0].inv())
+        heading_difference_rad = compute_heading_change_rad(
+            path.rotation[0] * true_path.rotation[0].inv()
+        )
         displacement_m = Rotation.from_rotvec(heading_difference_rad * DOWN_DIRECTION).apply(
             displacement_m
         )
-        true_change_deg = heading_change_deg(true_path)
+        true_heading_change_deg = compute_heading_change_deg(true_path)
     elif path.frame != true_path.frame:
         return "the ground truth cannot be rotated to the odometry frame without orientation"
     return TrueEnd(
         displacement_m=components_by_axis(path.frame, displacement_m),
-        heading_change_deg=true_change_deg,
+        heading_change_deg=true_heading_change_deg,
         sigma_m=0.02,
-        sigma_heading_deg=None if true_change_deg is None else 0.5,
-        source=f"ground truth in the log ({truth.name}): landing {landing_distance_m:.2f} m from "
+        sigma_heading_deg=None if true_heading_change_deg is None else 0.5,
+        source=f"ground truth in the log ({truth.name}): landing {start_to_landing_m:.2f} m from "
         "the take-off place",
         assumed=False,
     )

@@ -62,7 +62,7 @@ class TrueEnd(Record, kw_only=True):
 
     @property
     def displacement(self) -> Array:
-        """Displacement in the frame of the trajectory (m), shape (3,)."""
+        """Final minus initial position (m), in the frame of the trajectory, shape (3,)."""
         return np.array(list(self.displacement_m.values()))
 
 
@@ -87,7 +87,7 @@ class OdometryNoise(Record, omit_defaults=False):
 class Closure(Record, kw_only=True):
     """Loop closure (two times at one place), with the results of gate and robust optimisation."""
 
-    # Two times at the same place, on the clock of the trajectory
+    # Two times at which the vehicle was at the same place, on the clock of the trajectory
     time_1_s: float
     time_2_s: float
     # σ of the displacement between the two times, per axis
@@ -178,18 +178,18 @@ class Loop(Record, kw_only=True):
         return self.find_paths()["uncorrected"]
 
     def find_paths(self) -> dict[CorrectionName, CorrectedPath]:
-        """Return the available paths by name, with the odometry first."""
+        """Return the odometry and the corrected paths that could be computed, by name."""
         return {
             name: path for name, path in self.corrections.items() if isinstance(path, CorrectedPath)
         }
 
     def select_reported_paths(self) -> tuple[CorrectedPath, ...]:
-        """Return the available paths; of two paths that are equal by definition, only one."""
+        """Return the available paths, without those that equal another path by definition."""
         duplicates: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
-            duplicates.add("pose_graph_all")
+            duplicates.add("pose_graph_all")  # equals "pose_graph_gated"
         if isinstance(self.heading_error_deg, Unavailable):
-            duplicates.add("by_distance")
+            duplicates.add("by_distance")  # equals "by_distance_plain"
         return tuple(path for name, path in self.find_paths().items() if name not in duplicates)
 
     def choose_best_path(self) -> CorrectedPath:
@@ -214,6 +214,6 @@ class Loop(Record, kw_only=True):
         if isinstance(self.graph, Unavailable):
             raise MissingDataError(f"{self.graph.what}: {self.graph.reason}.")
         paths = self.find_paths()
-        graph_path = paths.get("pose_graph_gated") or paths.get("pose_graph_all")
-        solution = None if graph_path is None else graph_path.solution
+        pose_graph_path = paths.get("pose_graph_gated") or paths.get("pose_graph_all")
+        solution = None if pose_graph_path is None else pose_graph_path.solution
         return self.graph if solution is None else replace(self.graph, poses=solution.poses)

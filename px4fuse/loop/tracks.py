@@ -47,10 +47,10 @@ def find_odometry(flight: Flight) -> PositionTrack | Unavailable:
     for track in flight.positions:
         if track.origin.is_vision and track.orientation is not None:
             return track
-    track_names = ", ".join(track.name for track in flight.positions) or "none"
+    source_names = ", ".join(track.name for track in flight.positions) or "none"
     return Unavailable(
         "visual-inertial odometry",
-        f"the log has no external vision with orientation (position sources: {track_names})",
+        f"the log has no external vision with orientation (position sources: {source_names})",
         "Send odometry to PX4 as MAVLink message ODOMETRY, and set SDLOG_PROFILE to 129 to log the "
         "odometry.",
     )
@@ -101,8 +101,8 @@ def trajectory_of(flight: Flight, track_name: TrackName) -> Trajectory:
 
 def _make_kf_trajectory(flight: Flight) -> Trajectory:
     request = ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M, axes=AXIS_NAMES)
-    prepared = prepare(flight, request)
-    kf_comparison = compare(prepared, run_kf(prepared))
+    prepared_comparison = prepare(flight, request)
+    kf_comparison = compare(prepared_comparison, run_kf(prepared_comparison))
     columns = zip(Columns.POSITION, kf_comparison.axes.values(), strict=True)
     position_samples = pd.DataFrame(
         {name: axis.replay.steps["position_m"] for name, axis in columns}
@@ -139,7 +139,7 @@ def _make_trajectory(
                 orientation[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
             )
             rotation = Slerp(orientation_s, rotations)(position_samples.index.to_numpy())
-            reported_variance = _complete_variances(orientation, Columns.ROTATION_VARIANCE)
+            reported_variance = _read_reported_variances(orientation, Columns.ROTATION_VARIANCE)
             if reported_variance is not None:
                 variance_columns = [
                     np.interp(position_samples.index, orientation_s, column)
@@ -159,7 +159,7 @@ def _make_trajectory(
         rotation=rotation,
         frame=frame,
         unix_offset_s=flight.log.start_unix_s,
-        position_variance_m2=_complete_variances(position_samples, Columns.POSITION_VARIANCE),
+        position_variance_m2=_read_reported_variances(position_samples, Columns.POSITION_VARIANCE),
         rotation_variance_rad2=rotation_variance,
         sha256=flight.log.sha256,
         size_bytes=flight.log.bytes,
@@ -167,7 +167,7 @@ def _make_trajectory(
     )
 
 
-def _complete_variances(samples: pd.DataFrame, columns: list[str]) -> Array | None:
+def _read_reported_variances(samples: pd.DataFrame, columns: list[str]) -> Array | None:
     """Return the reported variances, shape (n, 3); None if any value is missing."""
     if not set(columns) <= set(samples.columns) or samples[columns].isna().to_numpy().any():
         return None
@@ -182,7 +182,7 @@ class LoopSource:
     flight: Flight | None
 
 
-def file_name(source: Path) -> str:
+def make_file_stem(source: Path) -> str:
     """Return the stem of output file names, such as ``flight_vio`` for ``flight.ulg:vio``."""
     path, track_name = split_path_and_part(str(source))
     return "_".join([path.stem, *(track_name or "").split("/")]).rstrip("_")

@@ -26,7 +26,7 @@ from px4fuse.report.style import (
 from px4fuse.results.contract import LoopResults
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.covariance import GATE_ALPHA
-from px4fuse.trajectory.graph.solver import MAX_ROBUST_CLOSURES, SOLUTIONS, Graph
+from px4fuse.trajectory.graph.solver import MAX_GNC_CLOSURES, SOLUTIONS, Graph
 from px4fuse.trajectory.model import AXES_OF_FRAME, format_vector
 from px4fuse.trajectory.scores import RmseInterval, Statistics
 
@@ -339,7 +339,7 @@ def pose_graph_page(solved_graph: Graph) -> Page:
         count_text = f"{len(gate_texts)} of {len(gates)} loop closures rejected"
         listed_closures = join_first(gate_texts, MAX_LISTED_CLOSURES, "\n").split("\n")
         page.write_labelled("Gate", count_text, *listed_closures)
-        if len(gates) > MAX_ROBUST_CLOSURES and len(solved_graph.solutions) == 1:
+        if len(gates) > MAX_GNC_CLOSURES and len(solved_graph.solutions) == 1:
             page.write_labelled(
                 "Robust",
                 "not solved, because the graph has many loop closures. Add --robust to solve it.",

@@ -278,7 +278,7 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
             effect_titles = " ".join(f"{effect.title} [{effect.id}]." for effect in effects)
             texts.append(styled_text(f"Consequences: {effect_titles}", colour=MUTED_COLOUR))
         page.write_labelled(
-            f"{finding.severity}\n{finding.when}".strip(),
+            f"{finding.severity}\n{finding.spans_text}".strip(),
             *texts,
             above=2.0,
             colour=SEVERITY_COLOURS[finding.severity],

@@ -37,7 +37,7 @@ def results(
 
     If a student must find the faults of the flight, the student's answers replace the diagnosis.
     """
-    card = build_card(analysis, request.without_paths(), (student.name, student.id))
+    card = build_card(analysis, request.with_file_names(), (student.name, student.id))
     if analysis.flight.log.is_assessed and isinstance(student.answers, Answers):
         answer_texts = (
             f"{question}: {answer_text}"
@@ -67,7 +67,7 @@ def outcome_results(
         contract.AidsResults(
             **_common_fields(contract.AIDS_SCHEMA, request, outcome.flight),
             aids=dict(outcome.aids),
-            card=build_aids_card(outcome, request.without_paths(), (student.name, student.id)),
+            card=build_aids_card(outcome, request.with_file_names(), (student.name, student.id)),
             findings=outcome.findings,
             missing=(outcome.missing_data, *outcome.flight.missing),
             student=student,
@@ -112,7 +112,7 @@ def loop_results(request: LoopRequest, loop: Loop, student: Student) -> contract
     return within_bounds(
         contract.LoopResults(
             schema=schema_of(contract.LOOP_SCHEMA),
-            request=request.without_paths(),
+            request=request.with_file_names(),
             track=loop.odometry.trajectory.track(),
             references=tuple(reference.track() for reference in loop.references),
             loop=loop,
@@ -155,7 +155,7 @@ def _common_fields(
 ) -> dict[str, Any]:
     return {
         "schema": schema_of(name),
-        "request": request.without_paths(),
+        "request": request.with_file_names(),
         "log": log_record(flight),
         "provenance": provenance(command_line(request, command)),
     }

@@ -29,7 +29,7 @@ from px4fuse.filter.tuning import AxisTuning
 from px4fuse.findings import Finding
 from px4fuse.flight.model import Alignment, ClockMap, DataRoute, InputFile, LogInfo, PositionKind
 from px4fuse.loop.model import Loop
-from px4fuse.request import AxisName, ComparisonRequest, InputName, LoopRequest, WhatIfRequest
+from px4fuse.request import AxisName, ComparisonRequest, KfInputName, LoopRequest, WhatIfRequest
 from px4fuse.results.model import SCHEMA_VERSION, Provenance, Schema, Student, Version
 from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.solver import Graph
@@ -103,7 +103,7 @@ class ChosenSettings(Record, kw_only=True):
     sigma_a_m_s2: Positive
     sigma_z_m: Positive
     dt_s: Positive
-    input: InputName
+    input: KfInputName
     start_s: float
     end_s: float
     segment_reason: str

@@ -18,14 +18,14 @@ from px4fuse.trajectory.model import MIN_POSES
 AlignmentKind = Literal["none", "yaw", "se3", "sim3"]
 
 # Minimum extent of a path for an estimate of the rotation, as fraction of its largest extent
-MIN_EXTENT_FRACTION = 1e-6
+MIN_RELATIVE_EXTENT = 1e-6
 # Minimum extent (m, RMS) of a path for an estimate of the rotation
 MIN_EXTENT_M = 1e-6
-# Maximum ratio of residual to horizontal motion for an estimate of yaw: two independent noise
-# tracks of equal variance have the ratio √2
+# The yaw is estimated if the residual (RMS) is at most this many times the horizontal motion (RMS):
+# unrelated noise tracks of equal variance have the ratio √2
 MAX_YAW_RESIDUAL_RATIO = 1.0
-# Maximum ratio of residual to motion along the second principal axis for an estimate of the full
-# rotation: two independent noise tracks of equal variance have the ratio √6
+# The full rotation is estimated if the residual (RMS) is at most this many times the motion (RMS)
+# along the second principal axis: unrelated noise tracks of equal variance have the ratio √6
 MAX_ROTATION_RESIDUAL_RATIO = 2.0
 
 
@@ -60,8 +60,8 @@ class Transform(Record):
 
     def apply_inverse(self, position_m: Array) -> Array:
         """Transform positions to the frame of the estimate, shape (n, 3) or (3,)."""
-        shifted: Array = self.to_rotation().inv().apply(position_m - np.array(self.translation_m))
-        return shifted / self.scale
+        rotated: Array = self.to_rotation().inv().apply(position_m - np.array(self.translation_m))
+        return rotated / self.scale
 
 
 def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) -> Transform:
@@ -90,14 +90,16 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
         )
     if kind == "none":
         return Transform((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0, 0)
-    # The motion is tested with a fitted scale, because a scale factor error does not make the
+    # Motion is tested after a fit with scale, because a scale factor error does not make the
     # rotation uncertain
     transform = umeyama(estimate_m, reference_m, with_scale=True)
     if kind == "yaw":
         estimate_xy_m, reference_xy_m = (m[:, 0] + 1j * m[:, 1] for m in (estimate_m, reference_m))
         centred_estimate_m = estimate_xy_m - estimate_xy_m.mean()
         yaw_rad = np.angle(np.vdot(centred_estimate_m, reference_xy_m - reference_xy_m.mean()))
-        transform = _align_means(Rotation.from_euler("z", yaw_rad), estimate_m, reference_m, 1.0, 4)
+        transform = _make_transform(
+            Rotation.from_euler("z", yaw_rad), estimate_m, reference_m, 1.0, 4
+        )
     _require_sufficient_motion(transform, estimate_m, reference_m, kind)
     return umeyama(estimate_m, reference_m, with_scale=False) if kind == "se3" else transform
 
@@ -122,25 +124,25 @@ def umeyama(estimate_m: Array, reference_m: Array, *, with_scale: bool) -> Trans
     if with_scale and estimate_variance_m2 > MIN_EXTENT_M**2:  # else the scale would be infinite
         scale = float(d @ s / estimate_variance_m2)  # Umeyama eq. 42
     rotation = Rotation.from_matrix((u * s) @ vt)  # Umeyama eq. 40
-    return _align_means(rotation, estimate_m, reference_m, scale, 7 if with_scale else 6)
+    return _make_transform(rotation, estimate_m, reference_m, scale, 7 if with_scale else 6)
 
 
-def _align_means(
+def _make_transform(
     rotation: Rotation, estimate_m: Array, reference_m: Array, scale: float, degrees_of_freedom: int
 ) -> Transform:
-    """Return the transform that also aligns the means of both trajectories (Umeyama eq. 41)."""
+    """Return the transform with the translation that equates both means (Umeyama eq. 41)."""
     translation_m = reference_m.mean(axis=0) - scale * rotation.apply(estimate_m.mean(axis=0))
     quaternion = tuple(rotation.as_quat(scalar_first=True).tolist())
     return Transform(quaternion, tuple(translation_m.tolist()), scale, degrees_of_freedom)
 
 
-def _principal_extents(position_m: Array) -> Array:
+def _compute_principal_extents_m(position_m: Array) -> Array:
     """Compute the RMS extents (m) along the principal directions, largest first."""
     centred_m = position_m - position_m.mean(axis=0)
     return np.asarray(np.linalg.svd(centred_m, compute_uv=False) / np.sqrt(len(centred_m)))
 
 
-def rms_m(difference_m: Array) -> float:
+def compute_rms_length_m(difference_m: Array) -> float:
     """Return the RMS length (m) of vectors, shape (n, d)."""
     return float(np.sqrt((difference_m * difference_m).sum(axis=1).mean()))
 
@@ -149,11 +151,14 @@ def _require_sufficient_motion(
     transform: Transform, estimate_m: Array, reference_m: Array, kind: str
 ) -> None:
     """Raise TrajectoryError if the motion is too small to estimate the rotation."""
-    estimate_extents, reference_extents = map(_principal_extents, (estimate_m, reference_m))
+    estimate_extents, reference_extents = map(
+        _compute_principal_extents_m, (estimate_m, reference_m)
+    )
     residuals_m = reference_m - transform.apply(estimate_m)
     if kind == "yaw":
         extent_m = min(
-            float(np.hypot(*_principal_extents(m[:, :2]))) for m in (estimate_m, reference_m)
+            float(np.hypot(*_compute_principal_extents_m(m[:, :2])))
+            for m in (estimate_m, reference_m)
         )
         residuals_m = residuals_m[:, :2]
         max_extent_m = float(np.linalg.norm(reference_extents))
@@ -168,9 +173,9 @@ def _require_sufficient_motion(
         max_residual_ratio = MAX_ROTATION_RESIDUAL_RATIO
         motion_text = "motion perpendicular to the main direction of flight"
         remedy = "Use `alignment` yaw or none."
-    residual_m = rms_m(residuals_m)
+    residual_m = compute_rms_length_m(residuals_m)
     if (
-        extent_m < max(MIN_EXTENT_M, MIN_EXTENT_FRACTION * max_extent_m)
+        extent_m < max(MIN_EXTENT_M, MIN_RELATIVE_EXTENT * max_extent_m)
         or residual_m > max_residual_ratio * extent_m
     ):
         raise TrajectoryError(

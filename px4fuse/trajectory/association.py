@@ -17,7 +17,7 @@ AssociationMethod = Literal["interpolate", "nearest"]
 MAX_GAP_INTERVALS = 3.0
 # Minimum pose interval (s) of a sparse reference, which is not interpolated: its poses are paired
 # with the nearest poses of the estimate
-MIN_SPARSE_INTERVAL_S = 2.0
+MIN_SPARSE_POSE_INTERVAL_S = 2.0
 # Lower limit (s) of the default maximum gap over which poses are interpolated
 MIN_GAP_LIMIT_S = 0.1
 # Default maximum time difference (s) of a pair of poses, as in the evo package
@@ -78,7 +78,7 @@ def associate(
     estimate_interval_s = median_interval(estimate.time_s)
     if method == "interpolate" and max_gap_s is None:
         reference_interval_s = median_interval(reference.time_s)
-        if reference_interval_s > max(MIN_SPARSE_INTERVAL_S, 2.0 * estimate_interval_s):
+        if reference_interval_s > max(MIN_SPARSE_POSE_INTERVAL_S, 2.0 * estimate_interval_s):
             method, max_gap_s = "nearest", estimate_interval_s
     time_s = estimate.time_s + time_offset_s
     reference_start_s, reference_end_s = reference.time_s[[0, -1]]
@@ -95,7 +95,8 @@ def associate(
         matched_reference = _interpolate_poses(reference, time_s[pose_indices])
     if len(pose_indices) < MIN_POSES:
         raise TrajectoryError(
-            f"{estimate.name}: {len(pose_indices)} poses match in time. With the time offset "
+            f"{estimate.name}: {len(pose_indices)} poses match in time; at least {MIN_POSES} are "
+            "needed. With the time offset "
             f"{time_offset_s:.12g} s, the estimate is from {time_s[0]:.3f} to {time_s[-1]:.3f} s; "
             f"the reference {reference.name} is from {reference_start_s:.3f} to "
             f"{reference_end_s:.3f} s.",
@@ -164,17 +165,21 @@ def _pair_nearest(
     """
     # The offset is added to the longer series as in the evo package, for equal rounding errors
     is_estimate_longer = len(estimate_s) > len(reference_s)
-    shorter_s = reference_s if is_estimate_longer else estimate_s
-    longer_s = estimate_s + offset_s if is_estimate_longer else reference_s - offset_s
-    next_indices = np.minimum(np.searchsorted(longer_s, shorter_s, side="right"), len(longer_s) - 1)
+    shorter_time_s = reference_s if is_estimate_longer else estimate_s
+    longer_time_s = estimate_s + offset_s if is_estimate_longer else reference_s - offset_s
+    next_indices = np.minimum(
+        np.searchsorted(longer_time_s, shorter_time_s, side="right"),
+        len(longer_time_s) - 1,
+    )
     previous_indices = np.maximum(next_indices - 1, 0)
     nearest_indices = np.where(
-        np.abs(longer_s[next_indices] - shorter_s) < np.abs(shorter_s - longer_s[previous_indices]),
+        np.abs(longer_time_s[next_indices] - shorter_time_s)
+        < np.abs(shorter_time_s - longer_time_s[previous_indices]),
         next_indices,
         previous_indices,
     )
     paired_indices = np.flatnonzero(
-        np.abs(longer_s[nearest_indices] - shorter_s) <= max_difference_s
+        np.abs(longer_time_s[nearest_indices] - shorter_time_s) <= max_difference_s
     )
     nearest_indices = nearest_indices[paired_indices]
     return (

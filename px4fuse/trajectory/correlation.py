@@ -1,4 +1,4 @@
-"""Correlation of two series with gaps at all lags, and autocovariance of a series."""
+"""Cross-correlation of two series, also with gaps, and autocovariance of a series."""
 
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -6,9 +6,9 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy import fft
 
-from px4fuse.core.arrays import Array, BoolArray, Complex
+from px4fuse.core.arrays import Array, BoolArray, ComplexArray
 
-Series = TypeVar("Series", Array, Complex)
+RealOrComplex = TypeVar("RealOrComplex", Array, ComplexArray)
 
 
 @dataclass(frozen=True)
@@ -24,18 +24,20 @@ class Moments:
         Number of common samples.
     covariance : ndarray, complex for complex series
         Σ conj(a - ā)(b - b̄).
-    power_a, power_b : ndarray
+    energy_a, energy_b : ndarray
         Σ |a - ā|² and Σ |b - b̄|².
     """
 
     count: Array
-    covariance: Complex
-    power_a: Array
-    power_b: Array
+    covariance: ComplexArray
+    energy_a: Array
+    energy_b: Array
 
 
-def moments(a: Series, b: Series, is_known_a: BoolArray, is_known_b: BoolArray) -> Moments:
-    """Compute the moments of two series on one time grid at all lags (Padfield 2012, eqs. 3 to 9).
+def compute_moments(
+    a: RealOrComplex, b: RealOrComplex, is_known_a: BoolArray, is_known_b: BoolArray
+) -> Moments:
+    """Compute :class:`Moments` of two series on one time grid (Padfield 2012, eqs. 3 to 9).
 
     Parameters
     ----------
@@ -56,12 +58,12 @@ def moments(a: Series, b: Series, is_known_a: BoolArray, is_known_b: BoolArray) 
     inverse_count = 1.0 / np.maximum(common_count, 1.0)
     sum_a, sum_b = _correlate(mask_b, a), _correlate(b, mask_a)  # conjugate of Σ a
     covariance = _correlate(b, a) - sum_a * sum_b * inverse_count
-    power_a = _correlate(mask_b, np.abs(a) ** 2).real - np.abs(sum_a) ** 2 * inverse_count
-    power_b = _correlate(np.abs(b) ** 2, mask_a).real - np.abs(sum_b) ** 2 * inverse_count
-    return Moments(common_count, covariance, power_a, power_b)
+    energy_a = _correlate(mask_b, np.abs(a) ** 2).real - np.abs(sum_a) ** 2 * inverse_count
+    energy_b = _correlate(np.abs(b) ** 2, mask_a).real - np.abs(sum_b) ** 2 * inverse_count
+    return Moments(common_count, covariance, energy_a, energy_b)
 
 
-def autocovariance(values: Array | Complex) -> Array:
+def autocovariance(values: Array | ComplexArray) -> Array:
     """Return the real part of Σ conj(v_k) v_(k+l) at lags 0 to n - 1, without subtracting the mean.
 
     ``values``: shape (n,), real or complex.
@@ -69,7 +71,7 @@ def autocovariance(values: Array | Complex) -> Array:
     return _correlate(values, values)[len(values) - 1 :].real
 
 
-def _correlate(a: Array | Complex, b: Array | Complex) -> Complex:
+def _correlate(a: Array | ComplexArray, b: Array | ComplexArray) -> ComplexArray:
     """Compute Σ a conj(b) over the common samples, at each lag.
 
     The result equals that of ``scipy.signal.correlate``, whose import takes 0.3 s.

@@ -24,7 +24,7 @@ from px4fuse.trajectory.alignment import AlignmentKind, Transform, fit_alignment
 from px4fuse.trajectory.association import Association, AssociationMethod, associate
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, cumulative_distance
 from px4fuse.trajectory.scores import Delta, RelativeError, RmseInterval, Statistics
-from px4fuse.trajectory.time_offset import TimeOffset, clock_difference, estimate_time_offset
+from px4fuse.trajectory.time_offset import TimeOffset, compute_clock_offset_s, estimate_time_offset
 
 # Maximum rotation (rad) from the first orientation of a trajectory with constant orientation: files
 # contain rounded numbers
@@ -35,11 +35,11 @@ MIN_CONSTANT_POSES, MIN_CONSTANT_MOTION_M = 10, 1.0
 # Minimum duration (s) of a repeated position for a warning, and minimum motion (m) of the reference
 # during the repetition
 MIN_FROZEN_DURATION_S, MIN_FROZEN_MOTION_M = 2.0, 0.5
-# Minimum difference (m) between the steps of estimate and reference at a jump, and minimum ratio to
-# the median difference
-MIN_JUMP_M, MIN_JUMP_RATIO = 0.5, 20.0
-# Maximum distance (m) from the first position or the origin after a jump that is a map restart
-MAX_RESTART_DISTANCE_M = 0.5
+# At a jump, the step of the estimate from one pose to the next exceeds that of the reference: by at
+# least this distance (m), and by this multiple of the median difference of the steps
+MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO = 0.5, 20.0
+# A jump is a map restart if it ends within this distance (m) of the first position or the origin
+MAX_MAP_RESTART_DISTANCE_M = 0.5
 # Maximum number of jump times in the warning about jumps
 MAX_STATED_JUMPS = 5
 # Minimum mean rotation (rad) between the orientations of estimate and reference for the conclusion
@@ -103,7 +103,7 @@ def find_jumps(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
         for trajectory in (estimate, reference)
     )
     differences_m = np.abs(estimate_steps_m - reference_steps_m)
-    min_jump_m = max(MIN_JUMP_M, MIN_JUMP_RATIO * np.median(differences_m))
+    min_jump_m = max(MIN_JUMP_M, MIN_JUMP_TO_MEDIAN_RATIO * np.median(differences_m))
     jump_indices = np.flatnonzero(estimate_steps_m - reference_steps_m > min_jump_m)
     if not len(jump_indices):
         return ()
@@ -114,7 +114,7 @@ def find_jumps(estimate: Trajectory, reference: Trajectory) -> tuple[str, ...]:
         for origin_m in (estimate.position_m[0], 0.0)
     ]
     cause_text = "The SLAM system probably lost track or relocalised."
-    if np.min(distances_m) < MAX_RESTART_DISTANCE_M:
+    if np.min(distances_m) < MAX_MAP_RESTART_DISTANCE_M:
         cause_text = "Probable cause: restart of the map, because the jump ends near the origin."
     return (
         f"{estimate.name} jumps by up to {differences_m[jump_indices].max():.1f} m, {times_text} s "
@@ -128,34 +128,32 @@ def has_other_body_axes(aligned_estimate: Trajectory, reference: Trajectory) -> 
     if aligned_estimate.rotation is None or reference.rotation is None:
         return False
     rotation_difference = aligned_estimate.rotation.inv() * reference.rotation
-    mean_difference = rotation_difference.mean()
-    deviation_rad = (mean_difference.inv() * rotation_difference).magnitude()
+    mean_rotation = rotation_difference.mean()
+    deviation_rad = (mean_rotation.inv() * rotation_difference).magnitude()
     return bool(
-        mean_difference.magnitude() > MIN_BODY_ROTATION_RAD
+        mean_rotation.magnitude() > MIN_BODY_ROTATION_RAD
         and np.sqrt(np.mean(deviation_rad**2)) < MAX_BODY_DEVIATION_RAD
     )
 
 
 # Maximum scale factor error (ratio minus 1) of the estimate without a warning
 MAX_SCALE_ERROR = 0.1
-# Minimum fraction of used poses of the estimate, and of covered time of the reference, without a
-# warning
-MIN_COVERAGE = 0.5
+# A warning appears if a smaller fraction of the poses of the estimate is used, or if these poses
+# cover a smaller fraction of the time of the reference
+MIN_COVERED_FRACTION = 0.5
 # Minimum estimated time offset (s) for a warning that the clocks differ: a smaller time offset may
 # be the delay of a filter
-MIN_DOUBTFUL_OFFSET_S = 0.1
+MIN_REPORTED_OFFSET_S = 0.1
 # Maximum ratio of the pose interval of the reference to that of the estimate; above it, the user
 # probably interchanged reference and estimate
 MAX_POSE_INTERVAL_RATIO = 5.0
 
-# Frames with the z axis down
 _Z_DOWN_FRAMES = ("NED", "FRD")
-# Frames with the z axis up
 _Z_UP_FRAMES = ("ENU",)
 # Kinds of trajectories in a frame with unknown vertical direction
 _KINDS_WITHOUT_VERTICAL = ("slam", "unknown")
 # File names of monocular SLAM, of which the scale is unknown
-_MONOCULAR_NAME = re.compile(r"(?<![a-z])mono(?![a-z])|monocular", re.IGNORECASE)
+_MONOCULAR_PATTERN = re.compile(r"(?<![a-z])mono(?![a-z])|monocular", re.IGNORECASE)
 
 
 class AbsoluteError(Record):
@@ -189,7 +187,7 @@ class Evaluation(Record, kw_only=True):
         Times of the compared poses, on the clock of the estimate.
     distance_m : ndarray, shape (n,)
         Distance along the reference, from the first compared pose.
-    unaligned_m, estimate_m, reference_m : ndarray, shape (n, 3)
+    unaligned_estimate_m, estimate_m, reference_m : ndarray, shape (n, 3)
         Positions of the estimate before and after alignment, and of the reference.
     position_error_m : ndarray, shape (n,)
     """
@@ -207,7 +205,7 @@ class Evaluation(Record, kw_only=True):
     reference_track: NotWritten[Trajectory] = NOT_WRITTEN
     time_s: NotWritten[Array] = NOT_WRITTEN
     distance_m: NotWritten[Array] = NOT_WRITTEN
-    unaligned_m: NotWritten[Array] = NOT_WRITTEN
+    unaligned_estimate_m: NotWritten[Array] = NOT_WRITTEN
     estimate_m: NotWritten[Array] = NOT_WRITTEN
     reference_m: NotWritten[Array] = NOT_WRITTEN
     position_error_m: NotWritten[Array] = NOT_WRITTEN
@@ -247,7 +245,7 @@ def evaluate(
     SettingsError
         A delta is not positive, or not an integer for frames.
     """
-    (estimate, reference), constant_notes = zip(
+    (estimate, reference), constant_orientation_notes = zip(
         *map(drop_constant_orientation, (estimate, reference)), strict=True
     )
     time_offset, offset_warnings = _choose_time_offset(estimate, reference, time_offset_s)
@@ -268,7 +266,7 @@ def evaluate(
     )
     jump_warnings = find_jumps(matched_estimate, matched_reference)
     aligned_estimate, notes = _with_reference_body_axes(
-        _apply(transform, matched_estimate), matched_reference
+        _apply_transform(transform, matched_estimate), matched_reference
     )
     if not notes and has_other_body_axes(aligned_estimate, matched_reference):
         matched_estimate, notes = _move_to_reference_body(
@@ -277,14 +275,14 @@ def evaluate(
         transform = fit_alignment(
             matched_estimate.position_m, matched_reference.position_m, alignment
         )
-        aligned_estimate = _apply(transform, matched_estimate)
+        aligned_estimate = _apply_transform(transform, matched_estimate)
     distance_m = cumulative_distance(matched_reference.position_m)
     position_error_m = np.linalg.norm(
         aligned_estimate.position_m - matched_reference.position_m, axis=1
     )
-    rotations = scores.get_rotations(aligned_estimate, matched_reference, "ATE of the rotation")
+    rotations = scores.get_rotations(aligned_estimate, matched_reference, "ATE of the orientation")
     if rpe_deltas is None:
-        rpe_deltas = scores.default_deltas(distance_m, matched_estimate.time_s)
+        rpe_deltas = scores.choose_default_deltas(distance_m, matched_estimate.time_s)
     return Evaluation(
         estimate_track=estimate,
         reference_track=reference,
@@ -294,30 +292,32 @@ def evaluate(
         association=association_result,
         time_offset=time_offset,
         ate=AbsoluteError(
-            scores.statistics(position_error_m),
-            scores.rmse_interval(position_error_m, "ATE"),
+            scores.compute_statistics(position_error_m),
+            scores.estimate_rmse_interval(position_error_m, "ATE"),
             rotations
             if isinstance(rotations, Unavailable)
-            else scores.rotation_statistics(*rotations),
+            else scores.compute_rotation_statistics(*rotations),
         ),
         rpe=tuple(
-            scores.relative_error(aligned_estimate, matched_reference, delta, all_pairs=all_pairs)
+            scores.compute_relative_error(
+                aligned_estimate, matched_reference, delta, all_pairs=all_pairs
+            )
             for delta in rpe_deltas
         ),
         time_s=matched_estimate.time_s,
         distance_m=distance_m,
-        unaligned_m=matched_estimate.position_m,
+        unaligned_estimate_m=matched_estimate.position_m,
         estimate_m=aligned_estimate.position_m,
         reference_m=matched_reference.position_m,
         position_error_m=position_error_m,
-        notes=(*constant_notes[0], *constant_notes[1], *notes),
+        notes=(*constant_orientation_notes[0], *constant_orientation_notes[1], *notes),
         warnings=(
             *frozen_warnings,
             *jump_warnings,
             *line_motion_warnings,
-            *_swap_warnings(estimate, reference),
+            *_find_swap_warnings(estimate, reference),
             *offset_warnings,
-            *_comparison_warnings(
+            *_find_comparison_warnings(
                 matched_estimate,
                 matched_reference,
                 association_result,
@@ -328,7 +328,7 @@ def evaluate(
     )
 
 
-def _apply(transform: Transform, estimate: Trajectory) -> Trajectory:
+def _apply_transform(transform: Transform, estimate: Trajectory) -> Trajectory:
     return estimate.with_positions(transform.apply(estimate.position_m), transform.to_rotation())
 
 
@@ -341,22 +341,22 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
     """
     has_same_frame = estimate.frame == reference.frame != "unknown"
     if estimate.kind == "truth" and (has_same_frame or reference.kind == "truth"):
-        return "none", "The estimate is not aligned, because the estimate is ground truth."
+        return "none", "The estimate is not aligned, because it is itself ground truth."
     frames_text = f"{estimate.frame} and {reference.frame}"
-    is_upright = any(
+    has_common_vertical = any(
         {estimate.frame, reference.frame} <= set(vertical_frames)
         for vertical_frames in (_Z_DOWN_FRAMES, _Z_UP_FRAMES)
     )
-    if is_upright and estimate.kind not in _KINDS_WITHOUT_VERTICAL:
+    if has_common_vertical and estimate.kind not in _KINDS_WITHOUT_VERTICAL:
         return "yaw", (
             "Yaw and position are aligned (4 degrees of freedom): z is vertical in both frames "
-            f"({frames_text}), so a tilt is an error."
+            f"({frames_text}), so a tilt counts as an error."
         )
     scale, scale_reason = 1.0, ""
     try:
         scale = fit_alignment(estimate.position_m, reference.position_m, "sim3").scale
     except TrajectoryError:
-        if is_upright:
+        if has_common_vertical:
             return "yaw", (
                 "Yaw and position are aligned (4 degrees of freedom): the motion is along a line, "
                 f"and z is vertical in both frames ({frames_text})."
@@ -366,11 +366,11 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
             f"the scale factor {scale:.3g} differs from 1 by more than {MAX_SCALE_ERROR:.0%}"
         )
     for track in (reference, estimate):
-        if _MONOCULAR_NAME.search(track.name):
-            scale_reason = f"{track.name} is monocular according to the file name"
+        if _MONOCULAR_PATTERN.search(track.name):
+            scale_reason = f"the file name {track.name} indicates monocular SLAM"
     for track in (estimate, reference):
         if track.kind in _KINDS_WITHOUT_VERTICAL:
-            frame_cause = "the trajectory kind is unknown"
+            frame_cause = "the source of this trajectory is unknown"
             if track.kind == "slam":
                 frame_cause = "SLAM uses the frame of the first key frame"
             frame_reason = (
@@ -392,7 +392,7 @@ def _choose_time_offset(
 ) -> tuple[TimeOffset, list[str]]:
     """Choose the offset to add to the timestamps of the estimate; also return warnings."""
     is_given = given_offset_s not in (None, "auto")
-    clock_offset_s = clock_difference(estimate, reference)
+    clock_offset_s = compute_clock_offset_s(estimate, reference)
     if isinstance(given_offset_s, float | int):
         clock_offset_s = given_offset_s
     clock_text = "the UNIX time of both files" if clock_offset_s else "unchanged timestamps"
@@ -407,7 +407,7 @@ def _choose_time_offset(
     start_s, end_s = estimate.time_s[[0, -1]] + added_offset_s
     is_disjoint = start_s > reference.time_s[-1] or end_s < reference.time_s[0]
     # The boot clock of a flight log and the clock of a trajectory file are unrelated
-    are_clocks_unrelated = clock_offset_s is None and estimate.is_of_log != reference.is_of_log
+    are_clocks_unrelated = clock_offset_s is None and estimate.is_from_log != reference.is_from_log
     is_estimated = given_offset_s == "auto" or is_disjoint
     if is_given or not (is_estimated or are_clocks_unrelated):
         return default_offset, []
@@ -422,7 +422,7 @@ def _choose_time_offset(
             f"{estimated_offset.reason} Instead, poses are matched by {clock_text}."
         ]
     low_s, high_s = estimated_offset.interval_s or (0.0, 0.0)
-    if low_s <= 0.0 <= high_s or abs(estimated_offset.offset_s or 0.0) < MIN_DOUBTFUL_OFFSET_S:
+    if low_s <= 0.0 <= high_s or abs(estimated_offset.offset_s or 0.0) < MIN_REPORTED_OFFSET_S:
         return default_offset, []
     return default_offset, [
         "The timestamps are unchanged, but the motions match best with "
@@ -431,7 +431,7 @@ def _choose_time_offset(
     ]
 
 
-def _swap_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]:
+def _find_swap_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]:
     if reference.kind == "truth" != estimate.kind:
         return
     estimate_interval_s = median_interval(estimate.time_s)
@@ -446,7 +446,7 @@ def _swap_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]
         )
 
 
-def _comparison_warnings(
+def _find_comparison_warnings(
     estimate: Trajectory,
     reference: Trajectory,
     association: Association,
@@ -454,17 +454,17 @@ def _comparison_warnings(
     *,
     has_jumps: bool,
 ) -> Iterator[str]:
-    if association.coverage_estimate < MIN_COVERAGE:
+    if association.coverage_estimate < MIN_COVERED_FRACTION:
         yield (
             f"Only {association.coverage_estimate:.0%} of the poses of the estimate are evaluated; "
             "the reference has no poses at the other times."
         )
-    if association.coverage_reference < MIN_COVERAGE:
+    if association.coverage_reference < MIN_COVERED_FRACTION:
         yield (
             f"The estimate covers only {association.coverage_reference:.0%} of the time of the "
             "reference."
         )
-    if has_jumps:  # a jump changes the scale of the best fit
+    if has_jumps:  # a jump changes the fitted scale, so the scale is not checked
         return
     # Unlike fit_alignment, umeyama also returns the scale for motion along a line
     scale = umeyama(estimate.position_m, reference.position_m, with_scale=True).scale
@@ -514,7 +514,7 @@ def _move_to_reference_body(
     corrected_estimate = estimate
     for _ in range(LEVER_ARM_ITERATIONS):
         transform = fit_alignment(corrected_estimate.position_m, reference.position_m, alignment)
-        # chordal mean (Hartley 2013, section 5.3)
+        # chordal mean of the rotation differences (Hartley 2013, section 5.3)
         body_rotation = (
             (transform.to_rotation() * estimate.rotation).inv() * reference.rotation
         ).mean()
@@ -538,7 +538,7 @@ def _move_to_reference_body(
 def _with_reference_body_axes(
     aligned_estimate: Trajectory, reference: Trajectory
 ) -> tuple[Trajectory, tuple[str, ...]]:
-    """Remove the constant rotation between camera and vehicle axes from the estimate."""
+    """Remove the constant rotation between camera and vehicle axes; also return a note."""
     vehicle_frames = (*_Z_DOWN_FRAMES, *_Z_UP_FRAMES)
     axes_differ = (aligned_estimate.frame == "camera") != (reference.frame == "camera") or any(
         track.kind == "slam"
@@ -546,12 +546,12 @@ def _with_reference_body_axes(
         and track.frame not in vehicle_frames
         for track, other_track in ((aligned_estimate, reference), (reference, aligned_estimate))
     )
-    estimate_rotation = aligned_estimate.rotation
-    if estimate_rotation is None or reference.rotation is None or not axes_differ:
+    rotation_of_estimate = aligned_estimate.rotation
+    if rotation_of_estimate is None or reference.rotation is None or not axes_differ:
         return aligned_estimate, ()
-    # chordal mean (Hartley 2013, section 5.3)
-    rotation = (estimate_rotation.inv() * reference.rotation).mean()
-    return replace(aligned_estimate, rotation=estimate_rotation * rotation), (
+    # chordal mean of the rotation differences (Hartley 2013, section 5.3)
+    rotation = (rotation_of_estimate.inv() * reference.rotation).mean()
+    return replace(aligned_estimate, rotation=rotation_of_estimate * rotation), (
         "Rotation errors exclude the estimated constant rotation between vehicle and camera axes, "
         f"{np.degrees(rotation.magnitude()):.1f}°. Position errors include the "
         "lever arm between vehicle and camera.",

@@ -129,7 +129,7 @@ class Trajectory:
     __repr__ = one_line_repr
 
     @property
-    def is_of_log(self) -> bool:
+    def is_from_log(self) -> bool:
         """True for a track of a flight log, on the boot clock of the autopilot."""
         return self.name.endswith(f":{self.kind}")
 

@@ -22,27 +22,24 @@ DeltaUnit = Literal["frames", "m", "s"]
 
 # Maximum relative error of the distance of an RPE pair, if all pairs are used: default of the evo
 # package
-DELTA_TOLERANCE = 0.1
-# Default distances (m) of RPE pairs
-DEFAULT_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
-# Default times (s) between the two poses of an RPE pair
-DEFAULT_TIMES_S = (1.0, 10.0, 60.0)
+RELATIVE_DELTA_TOLERANCE = 0.1
+DEFAULT_RPE_DISTANCES_M = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0, 100.0, 500.0, 1000.0)
+DEFAULT_RPE_TIMES_S = (1.0, 10.0, 60.0)
 # Maximum number of default distances and of default times of RPE pairs
 MAX_DISTANCE_DELTAS = 3
 MAX_TIME_DELTAS = 2
-# Minimum and maximum of a default distance or time, as fraction of path length or duration
+# Limits of a default distance as fraction of the path length; the maximum is also that of a default
+# time, as fraction of the duration
 MIN_DELTA_FRACTION = 1 / 200
 MAX_DELTA_FRACTION = 1 / 5
-# Number of bootstrap resamples
 BOOTSTRAP_RESAMPLES = 2000
-# Seed of the random bootstrap resamples
 BOOTSTRAP_SEED = 20120101
 # Probability of the bootstrap interval
 CONFIDENCE_LEVEL = 0.95
 # Length of a bootstrap block, in integrated autocorrelation times of the squared errors
-BLOCK_CORRELATION_TIMES = 3.0
+BLOCK_PER_CORRELATION_TIME = 3.0
 # Number of lags in the sum of autocorrelations, in integrated autocorrelation times (Sokal 1997)
-WINDOW_CORRELATION_TIMES = 5.0
+WINDOW_PER_CORRELATION_TIME = 5.0
 # Minimum number of bootstrap blocks for a 95 % interval
 MIN_BOOTSTRAP_BLOCKS = 5.0
 
@@ -122,8 +119,8 @@ class RelativeError(Record):
         return str(Delta(self.delta, self.unit))
 
 
-def statistics(errors: Array) -> Statistics:
-    """Compute the statistics of errors, shape (n,), n ≥ 1."""
+def compute_statistics(errors: Array) -> Statistics:
+    """Compute RMSE, mean, median, standard deviation and range of n ≥ 1 errors, shape (n,)."""
     return Statistics(
         count=len(errors),
         rmse=float(np.sqrt(np.mean(errors**2))),
@@ -135,12 +132,12 @@ def statistics(errors: Array) -> Statistics:
     )
 
 
-def rotation_statistics(a: Rotation, b: Rotation) -> Statistics:
+def compute_rotation_statistics(a: Rotation, b: Rotation) -> Statistics:
     """Compute the statistics of the angles (°) between two series of rotations."""
-    return statistics(np.degrees((a.inv() * b).magnitude()))
+    return compute_statistics(np.degrees((a.inv() * b).magnitude()))
 
 
-def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
+def choose_default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
     """Choose distances and times for the RPE that fit path length and duration of the flight."""
 
     def choose_values(
@@ -151,8 +148,8 @@ def default_deltas(distance_m: Array, time_s: Array) -> tuple[Delta, ...]:
         minimum = max(min_fraction * total, 2.0 * median_interval(distance_or_time))
         return [value for value in values if minimum <= value <= MAX_DELTA_FRACTION * total]
 
-    distances_m = choose_values(distance_m, DEFAULT_DISTANCES_M, MIN_DELTA_FRACTION)
-    times_s = choose_values(time_s, DEFAULT_TIMES_S, 0.0)
+    distances_m = choose_values(distance_m, DEFAULT_RPE_DISTANCES_M, MIN_DELTA_FRACTION)
+    times_s = choose_values(time_s, DEFAULT_RPE_TIMES_S, 0.0)
     return (
         *(Delta(value, "m") for value in distances_m[-MAX_DISTANCE_DELTAS:]),
         *(Delta(value, "s") for value in times_s[-MAX_TIME_DELTAS:]),
@@ -196,7 +193,7 @@ def find_pairs(
         return start_indices, start_indices + frame_step
     distance_or_time = cumulative_distance(position_m) if delta.unit == "m" else time_s - time_s[0]
     if not all_pairs:
-        return _consecutive_pairs(np.diff(distance_or_time), delta.value)
+        return _find_consecutive_pairs(np.diff(distance_or_time), delta.value)
     start_indices = np.arange(pose_count - 1)
     # Neighbours of the nearest pose are tested, too, because of rounding errors
     nearest_indices = np.searchsorted(distance_or_time, distance_or_time + delta.value)[:-1]
@@ -211,11 +208,11 @@ def find_pairs(
     first_equal_indices = np.searchsorted(
         distance_or_time, distance_or_time[candidate_indices[start_indices, best_columns]]
     )
-    is_near = distance_error[start_indices, best_columns] <= DELTA_TOLERANCE * delta.value
+    is_near = distance_error[start_indices, best_columns] <= RELATIVE_DELTA_TOLERANCE * delta.value
     return start_indices[is_near], np.maximum(first_equal_indices, start_indices + 1)[is_near]
 
 
-def _consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
+def _find_consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
     # Distances are summed from the start of each pair as in the evo package, for equal rounding
     pair_ends = [0]
     distance_or_time = 0.0
@@ -228,7 +225,7 @@ def _consecutive_pairs(steps: Array, delta: float) -> tuple[IntArray, IntArray]:
     return end_indices[:-1], end_indices[1:]
 
 
-def relative_error(
+def compute_relative_error(
     aligned_estimate: Trajectory, reference: Trajectory, delta: Delta, *, all_pairs: bool = True
 ) -> RelativeError:
     """Compute the RPE over one delta: E = (Q_i⁻¹ Q_j)⁻¹ (P_i⁻¹ P_j), Sturm (2012), eq. 1.
@@ -267,15 +264,15 @@ def relative_error(
         # with orientations, each motion is compared in the axes of its first pose
         inverses = [rotation[start_indices].inv() for rotation in rotations]
         motions = [inverse.apply(motion) for inverse, motion in zip(inverses, motions, strict=True)]
-        estimated_turn, reference_turn = (
+        estimated_rotation, reference_rotation = (
             inverse * rotation[end_indices]
             for inverse, rotation in zip(inverses, rotations, strict=True)
         )
-        rotation_deg = rotation_statistics(reference_turn, estimated_turn)
-    # The rotation Q_j⁻¹ Q_i in E does not change the length of the translation
+        rotation_deg = compute_rotation_statistics(reference_rotation, estimated_rotation)
+    # The translation of E is also rotated by Q_j⁻¹ Q_i, which does not change its length
     translation_m = np.linalg.norm(motions[0] - motions[1], axis=1)
     overlapping_pair_count = int(np.median(end_indices - start_indices)) if all_pairs else 1
-    interval_m = rmse_interval(
+    interval_m = estimate_rmse_interval(
         translation_m, analysis_name, min_block_length=overlapping_pair_count
     )
     return RelativeError(
@@ -283,7 +280,7 @@ def relative_error(
         delta.unit,
         all_pairs,
         "reference",
-        statistics(translation_m),
+        compute_statistics(translation_m),
         interval_m,
         rotation_deg,
     )
@@ -292,7 +289,7 @@ def relative_error(
 def get_rotations(
     aligned_estimate: Trajectory, reference: Trajectory, analysis_name: str
 ) -> tuple[Rotation, Rotation] | Unavailable:
-    """Return both orientations, or the reason why ``analysis_name`` cannot be computed."""
+    """Return the orientations of both, or the reason why ``analysis_name`` is not possible."""
     if aligned_estimate.rotation is not None and reference.rotation is not None:
         return aligned_estimate.rotation, reference.rotation
     role = "reference" if aligned_estimate.rotation else "estimate"
@@ -303,19 +300,19 @@ def get_rotations(
     )
 
 
-def rmse_interval(
+def estimate_rmse_interval(
     errors: Array, analysis_name: str, *, min_block_length: int = 1
 ) -> RmseInterval | Unavailable:
     """Compute the 95 % interval of the RMSE of correlated errors by circular block bootstrap.
 
     The method is that of Politis & Romano (1992), with blocks of three integrated autocorrelation
     times. Percentiles are widened for a small number of blocks (Hesterberg 2015, section 5.3).
-    ``min_block_length`` is the number of pairs that overlap, because overlap correlates errors.
+    ``min_block_length`` is the number of RPE pairs that overlap: their errors are correlated.
     """
     squared_errors = errors**2
     error_count = len(squared_errors)
     block_length = max(
-        int(np.ceil(BLOCK_CORRELATION_TIMES * autocorrelation_time(squared_errors))),
+        int(np.ceil(BLOCK_PER_CORRELATION_TIME * autocorrelation_time(squared_errors))),
         min_block_length,
         1,
     )
@@ -356,12 +353,14 @@ def autocorrelation_time(values: Array) -> float:
     sample_count = len(centred_values)
     covariance_by_lag = autocovariance(centred_values)
     correlation_times = 2.0 * np.cumsum(covariance_by_lag / covariance_by_lag[0]) - 1.0
-    sufficient_windows = np.flatnonzero(
-        np.arange(sample_count) >= WINDOW_CORRELATION_TIMES * correlation_times
+    sufficient_window_lengths = np.flatnonzero(
+        np.arange(sample_count) >= WINDOW_PER_CORRELATION_TIME * correlation_times
     )
     return max(
         1.0,
         float(
-            correlation_times[sufficient_windows[0]] if len(sufficient_windows) else sample_count
+            correlation_times[sufficient_window_lengths[0]]
+            if len(sufficient_window_lengths)
+            else sample_count
         ),
     )

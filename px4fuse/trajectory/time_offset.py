@@ -15,9 +15,9 @@ from scipy.special import stdtrit
 
 from px4fuse.core.arrays import Array, BoolArray, median_interval
 from px4fuse.core.record import Record, Span
-from px4fuse.trajectory.alignment import Transform, rms_m, umeyama
+from px4fuse.trajectory.alignment import Transform, compute_rms_length_m, umeyama
 from px4fuse.trajectory.association import gap_limit, is_bracketed, positions_at
-from px4fuse.trajectory.correlation import autocovariance, moments
+from px4fuse.trajectory.correlation import autocovariance, compute_moments
 from px4fuse.trajectory.model import MIN_POSES, Trajectory
 
 # Minimum step (s) of the time grid on which speeds are correlated
@@ -26,37 +26,37 @@ GRID_STEP_S = 0.05
 MAX_GRID_SAMPLES = 200_000
 # Standard deviation (s) of the Gaussian filter of positions, because differentiated positions are
 # noisy
-SMOOTHING_S = 0.25
+SMOOTHING_SIGMA_S = 0.25
 # Minimum overlap of the two trajectories in time, as fraction of the shorter trajectory
 MIN_OVERLAP_FRACTION = 0.5
 # Minimum number of overlapping poses, as fraction of their number at complete overlap
-MIN_POSES_FRACTION = 0.3
+MIN_USED_POSES_FRACTION = 0.3
 # Maximum number of candidate time offsets (correlation peaks) for which the ATE is computed
 MAX_CANDIDATES = 12
 # Half-width (s) of the least-squares search around a correlation peak
-SEARCH_WINDOW_S = 0.5
-# Half-width (s) of the least-squares search around the first result
-FINE_SEARCH_WINDOW_S = 0.1
+SEARCH_HALF_WIDTH_S = 0.5
+# Half-width (s) of the second least-squares search, around the result of the first search
+FINE_SEARCH_HALF_WIDTH_S = 0.1
 # Minimum distance (s) between two peaks of the speed correlation
 MIN_PEAK_DISTANCE_S = 1.0
-# Minimum correlation of the speeds at a peak
+# Minimum correlation of the speeds of both trajectories at a candidate time offset
 MIN_CORRELATION = 0.3
 # Minimum ratio of the residuals (RMS) at the second best and the best time offset, for an
 # unambiguous result: 95 % limit of an F-test with 80 independent residuals (30 s of flight)
 MIN_SECOND_PEAK_RATIO = 1.2
 # Maximum number of poses in the least-squares fit of the time offset
 MAX_FITTED_POSES = 2000
-# Maximum ratio of residual to extent of the motion for accepting a fit of the time offset
+# Maximum misfit (residual over extent of the motion) for accepting a fit of the time offset
 MAX_MISFIT = 0.5
-# Ratio of residual to extent of the motion that no fit improves: two fits below it are equally good
+# Lower limit of the misfit: two fits with a smaller misfit are equally good
 MIN_MISFIT = 1e-3
-# Minimum RMS of the velocity that no shift, rotation or scale of the path explains, as fraction of
-# the speed: only this part of the velocity makes a time offset observable
-MIN_UNEXPLAINED_SPEED_FRACTION = 0.05
-# Minimum correlation of these unexplained velocities of two trajectories: noise is not correlated
-MIN_UNEXPLAINED_CORRELATION = 0.5
-# Number of lags in the variance of a sum of correlated residuals, in correlation lengths
-WINDOW_CORRELATION_LENGTHS = 4
+# Minimum RMS of the residual velocity, as fraction of the speed: only the velocity that no shift,
+# rotation or scale of the path explains makes a time offset observable
+MIN_RESIDUAL_SPEED_FRACTION = 0.05
+# Minimum correlation of the residual velocities of both trajectories: noise is not correlated
+MIN_RESIDUAL_CORRELATION = 0.5
+# Maximum lag of the autocovariances in the variance of a sum of residuals, in correlation lengths
+MAX_LAG_CORRELATION_LENGTHS = 4
 # Maximum half-width (s) of the 95 % interval of an accepted time offset
 MAX_HALF_INTERVAL_S = 0.5
 CONFIDENCE_LEVEL = 0.95
@@ -82,7 +82,7 @@ class TimeOffset(Record, kw_only=True):
     reason: str
 
 
-def clock_difference(estimate: Trajectory, reference: Trajectory) -> float | None:
+def compute_clock_offset_s(estimate: Trajectory, reference: Trajectory) -> float | None:
     """Return the time offset (s) between two trajectories from their UNIX times, if available."""
     if estimate.unix_offset_s is None or reference.unix_offset_s is None:
         return None
@@ -102,35 +102,37 @@ def estimate_time_offset(estimate: Trajectory, reference: Trajectory) -> TimeOff
     # The trajectory with the shorter pose intervals is interpolated
     if median_interval(estimate.time_s) >= median_interval(reference.time_s):
         return _search_offset(estimate, reference)
-    reversed_offset = _search_offset(reference, estimate)
-    if reversed_offset.offset_s is None or reversed_offset.interval_s is None:
-        return reversed_offset
-    low_s, high_s = reversed_offset.interval_s
+    swapped_offset = _search_offset(reference, estimate)
+    if swapped_offset.offset_s is None or swapped_offset.interval_s is None:
+        return swapped_offset
+    low_s, high_s = swapped_offset.interval_s
     return structs.replace(
-        reversed_offset, offset_s=-reversed_offset.offset_s, interval_s=(-high_s, -low_s)
+        swapped_offset, offset_s=-swapped_offset.offset_s, interval_s=(-high_s, -low_s)
     )
 
 
 def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOffset:
     """Estimate the offset to add to the timestamps of the trajectory with fewer poses (sparse)."""
-    clock_offset_s = clock_difference(sparse_track, dense_track)
+    clock_offset_s = compute_clock_offset_s(sparse_track, dense_track)
     candidates = _find_candidates(sparse_track, dense_track)
     if clock_offset_s is not None:
         candidates.insert(0, clock_offset_s)
     if not candidates:
-        return _not_determinable(
+        return _make_unknown_offset(
             "the speeds of both trajectories are not correlated at any time offset (no motion, "
             "constant speed, or different flights)"
         )
-    fits = (_refine_offset(sparse_track, dense_track, lag, SEARCH_WINDOW_S) for lag in candidates)
+    offset_fits = (
+        _refine_offset(sparse_track, dense_track, lag, SEARCH_HALF_WIDTH_S) for lag in candidates
+    )
     accepted_fits = sorted(
-        (fit for fit in fits if fit is not None and fit.compute_misfit() <= MAX_MISFIT),
+        (fit for fit in offset_fits if fit is not None and fit.compute_misfit() <= MAX_MISFIT),
         key=_OffsetFit.compute_misfit,
     )
     if not accepted_fits:
-        return _not_determinable(
-            "at the time offsets with correlated speeds, the positions do not match, or too few "
-            "poses overlap"
+        return _make_unknown_offset(
+            "at the time offsets with correlated speeds of both trajectories, the positions do not "
+            "match, or too few poses overlap"
         )
     best_fit = accepted_fits[0]
     similar_fits = [
@@ -144,20 +146,20 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
     for fit in similar_fits if clock_offset_s is None else []:
         difference_s = abs(fit.offset_s - best_fit.offset_s)
         if difference_s > MIN_PEAK_DISTANCE_S:
-            return _not_determinable(
+            return _make_unknown_offset(
                 f"the motion is periodic: with a time offset that differs by {difference_s:.1f} s "
                 f"the ATE is {fit.compute_rms_m():.3g} m instead of "
                 f"{best_fit.compute_rms_m():.3g} m"
             )
     # The fit is repeated with a narrower window of offsets, within which more poses overlap in time
     best_fit = (
-        _refine_offset(sparse_track, dense_track, best_fit.offset_s, FINE_SEARCH_WINDOW_S)
+        _refine_offset(sparse_track, dense_track, best_fit.offset_s, FINE_SEARCH_HALF_WIDTH_S)
         or best_fit
     )
-    half_interval_s = _half_interval(sparse_track, dense_track, best_fit)
+    half_interval_s = _compute_half_interval_s(sparse_track, dense_track, best_fit)
     if not half_interval_s <= MAX_HALF_INTERVAL_S:
         interval_text = f" (95 %: ±{half_interval_s:.2g} s)" if np.isfinite(half_interval_s) else ""
-        return _not_determinable(
+        return _make_unknown_offset(
             "the speed is nearly constant, so a time offset cannot be distinguished from a "
             f"position offset{interval_text}"
         )
@@ -170,13 +172,13 @@ def _search_offset(sparse_track: Trajectory, dense_track: Trajectory) -> TimeOff
     )
 
 
-def _not_determinable(reason: str) -> TimeOffset:
+def _make_unknown_offset(reason: str) -> TimeOffset:
     return TimeOffset(
         is_determinable=False, reason=f"The time offset cannot be estimated: {reason}."
     )
 
 
-def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]:
+def _compute_grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]:
     """Compute smoothed velocities (m/s) on a regular time grid."""
     time_s = trajectory.time_s
     grid_s = time_s[0] + step_s * np.arange(int(np.ptp(time_s) / step_s) + 1)
@@ -187,24 +189,24 @@ def _grid_velocity(trajectory: Trajectory, step_s: float) -> tuple[Array, Array]
 
 def _smooth(grid_values: Array, time_s: Array, step_s: float, derivative_order: int = 0) -> Array:
     """Smooth values on a time grid, or return their smoothed derivative per grid step (order 1)."""
-    sigma_samples = max(SMOOTHING_S, median_interval(time_s)) / step_s
+    sigma_samples = max(SMOOTHING_SIGMA_S, median_interval(time_s)) / step_s
     return np.asarray(gaussian_filter1d(grid_values, sigma_samples, axis=0, order=derivative_order))
 
 
-def _velocity(trajectory: Trajectory, time_s: Array) -> Array:
+def _compute_velocity(trajectory: Trajectory, time_s: Array) -> Array:
     """Return the smoothed velocity (m/s) at times within the trajectory, shape (n, 3)."""
     step_s = max(GRID_STEP_S, float(np.ptp(trajectory.time_s)) / MAX_GRID_SAMPLES)
-    grid_s, velocity_m_s = _grid_velocity(trajectory, step_s)
+    grid_s, velocity_m_s = _compute_grid_velocity(trajectory, step_s)
     return np.stack([np.interp(time_s, grid_s, column) for column in velocity_m_s.T], axis=1)
 
 
-def _speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArray]:
+def _compute_speeds(trajectory: Trajectory, step_s: float) -> tuple[list[Array], BoolArray]:
     """Compute speed and, from orientations, angular speed on a time grid.
 
     Also return a mask of the times outside of gaps.
     """
     time_s = trajectory.time_s
-    grid_s, velocity_m_s = _grid_velocity(trajectory, step_s)
+    grid_s, velocity_m_s = _compute_grid_velocity(trajectory, step_s)
     # Speeds are interpolated between key frames, but not across gaps with lost tracking
     is_known = is_bracketed(grid_s, time_s, max(10.0 * median_interval(time_s), 0.5))
     speeds = [np.linalg.norm(velocity_m_s, axis=1)]
@@ -223,23 +225,25 @@ def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[
     shorter_duration_s = min(durations_s)
     if shorter_duration_s < 10 * step_s:
         return []
-    (sparse_speeds, is_known_sparse), (dense_speeds, is_known_dense) = (
-        _speeds(track, step_s) for track in (sparse_track, dense_track)
+    (sparse_speeds, is_sparse_known), (dense_speeds, is_dense_known) = (
+        _compute_speeds(track, step_s) for track in (sparse_track, dense_track)
     )
     min_count = MIN_OVERLAP_FRACTION * shorter_duration_s / step_s
     correlations = []
     # angular speeds are only compared if both trajectories have orientations
     for sparse_values, dense_values in zip(sparse_speeds, dense_speeds, strict=False):
-        speed_moments = moments(sparse_values, dense_values, is_known_sparse, is_known_dense)
-        # Exclude lags at which a trajectory is at rest: its variance is a rounding error
+        speed_moments = compute_moments(
+            sparse_values, dense_values, is_sparse_known, is_dense_known
+        )
+        # Exclude lags at which a trajectory is at rest: its speed variance is a rounding error
         is_usable = speed_moments.count >= min_count
-        for values, is_known, power in (
-            (sparse_values, is_known_sparse, speed_moments.power_a),
-            (dense_values, is_known_dense, speed_moments.power_b),
+        for values, is_known, energy in (
+            (sparse_values, is_sparse_known, speed_moments.energy_a),
+            (dense_values, is_dense_known, speed_moments.energy_b),
         ):
-            total_power = float(np.var(values[is_known])) * np.count_nonzero(is_known)
-            is_usable &= power > 1e-3 * total_power / len(values) * speed_moments.count
-        scale = np.sqrt(np.where(is_usable, speed_moments.power_a * speed_moments.power_b, 1.0))
+            total_energy = float(np.var(values[is_known])) * np.count_nonzero(is_known)
+            is_usable &= energy > 1e-3 * total_energy / len(values) * speed_moments.count
+        scale = np.sqrt(np.where(is_usable, speed_moments.energy_a * speed_moments.energy_b, 1.0))
         correlations.append(np.where(is_usable, speed_moments.covariance.real / scale, 0.0))
     mean_correlation = np.mean(correlations, axis=0)
     local_maximum = maximum_filter1d(mean_correlation, round(2 * MIN_PEAK_DISTANCE_S / step_s) + 1)
@@ -248,8 +252,8 @@ def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[
     )
     peak_indices = peak_indices[np.argsort(-mean_correlation[peak_indices])][:MAX_CANDIDATES]
     # At index k of the correlation, the first sparse sample coincides with dense sample k - (n - 1)
-    first_dense_indices = peak_indices - (len(is_known_sparse) - 1)
-    lags_s = first_dense_indices * step_s + dense_track.time_s[0] - sparse_track.time_s[0]
+    dense_start_indices = peak_indices - (len(is_sparse_known) - 1)
+    lags_s = dense_start_indices * step_s + dense_track.time_s[0] - sparse_track.time_s[0]
     return list(lags_s.tolist())
 
 
@@ -257,8 +261,8 @@ def _find_candidates(sparse_track: Trajectory, dense_track: Trajectory) -> list[
 class _OffsetFit:
     """Fit of the trajectory with fewer poses (sparse) to that with more poses (dense).
 
-    ``time_s`` and ``aligned_m`` are times and positions of the sparse trajectory after alignment,
-    ``target_m`` the positions of the dense trajectory at these times.
+    ``time_s`` and ``aligned_m`` are times and aligned positions (m) of the sparse trajectory,
+    ``target_m`` the positions (m) of the dense trajectory at these times.
     """
 
     offset_s: float
@@ -268,17 +272,19 @@ class _OffsetFit:
     target_m: Array
 
     def compute_rms_m(self) -> float:
-        """Return the RMS (m) of the residuals."""
-        return rms_m(self.target_m - self.aligned_m)
+        """Return the RMS (m) of the position residuals."""
+        return compute_rms_length_m(self.target_m - self.aligned_m)
 
     def compute_misfit(self) -> float:
         """Return the ratio of RMS residual to RMS extent of the motion; the least is best."""
-        # Extent of the dense trajectory, because a bad fit shrinks the sparse one to a point
+        # Extent of the dense trajectory: a bad fit can shrink the sparse trajectory to a point
         extent_m = float(np.sqrt(self.target_m.var(axis=0).sum()))
         return max(self.compute_rms_m() / extent_m, MIN_MISFIT) if extent_m > 0.0 else float("inf")
 
 
-def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _OffsetFit) -> float:
+def _compute_half_interval_s(
+    sparse_track: Trajectory, dense_track: Trajectory, fit: _OffsetFit
+) -> float:
     """Compute the half-width (s) of the 95 % interval of the time offset.
 
     The half-width is infinite if a shift, a rotation or another scale of the trajectory has the
@@ -286,9 +292,9 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
     """
     pose_count = len(fit.time_s)
     centred_m = fit.aligned_m - fit.aligned_m.mean(axis=0)
-    dense_velocity = _velocity(dense_track, fit.time_s + fit.offset_s)
+    dense_velocity = _compute_velocity(dense_track, fit.time_s + fit.offset_s)
     sparse_velocity = fit.transform.to_rotation().apply(
-        fit.transform.scale * _velocity(sparse_track, fit.time_s)
+        fit.transform.scale * _compute_velocity(sparse_track, fit.time_s)
     )
     # Remove the velocity that a translation, a small rotation or a scale factor can explain
     columns = [np.tile(axis, (pose_count, 1)) for axis in np.eye(3)]
@@ -299,19 +305,22 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
         velocities
         - similarity_columns @ np.linalg.lstsq(similarity_columns, velocities, rcond=None)[0]
     )
-    (information, cross_information), (_, other_information) = (velocities.T @ velocities).tolist()
+    (dense_information, cross_information), (_, sparse_information) = (
+        velocities.T @ velocities
+    ).tolist()
     if (
-        information <= MIN_UNEXPLAINED_SPEED_FRACTION**2 * float((dense_velocity**2).sum())
+        dense_information <= MIN_RESIDUAL_SPEED_FRACTION**2 * float((dense_velocity**2).sum())
         or cross_information
-        <= MIN_UNEXPLAINED_CORRELATION * (information * other_information) ** 0.5
+        <= MIN_RESIDUAL_CORRELATION * (dense_information * sparse_information) ** 0.5
     ):
         return float("inf")
     likelihood_score = (
         velocities[:, 0].reshape(pose_count, 3) * (fit.target_m - fit.aligned_m)
     ).sum(axis=1)
-    # The window of the weights must be longer than the correlation
+    # The weights must cover more lags than the correlation length of the scores
     lag_count = min(
-        max(1, WINDOW_CORRELATION_LENGTHS * _correlation_length(likelihood_score)), pose_count // 4
+        max(1, MAX_LAG_CORRELATION_LENGTHS * _compute_correlation_length(likelihood_score)),
+        pose_count // 4,
     )
     lag_weights = 1.0 - np.arange(1, lag_count + 1) / (lag_count + 1.0)
     lagged_products = [
@@ -322,10 +331,10 @@ def _half_interval(sparse_track: Trajectory, dense_track: Trajectory, fit: _Offs
         uncorrelated_variance + 2.0 * float(lag_weights @ lagged_products), uncorrelated_variance
     )
     quantile = float(stdtrit(max(pose_count / lag_count - 1.0, 1.0), 0.5 + CONFIDENCE_LEVEL / 2.0))
-    return float(quantile * np.sqrt(score_variance) / information)
+    return float(quantile * np.sqrt(score_variance) / dense_information)
 
 
-def _correlation_length(values: Array) -> int:
+def _compute_correlation_length(values: Array) -> int:
     """Return the first lag with autocorrelation below 1/e, at most n / 4."""
     covariance_by_lag = autocovariance(values - values.mean())
     lags_below_limit = np.flatnonzero(covariance_by_lag < covariance_by_lag[0] / np.e)
@@ -333,9 +342,9 @@ def _correlation_length(values: Array) -> int:
 
 
 def _refine_offset(
-    sparse_track: Trajectory, dense_track: Trajectory, lag_s: float, window_s: float
+    sparse_track: Trajectory, dense_track: Trajectory, lag_s: float, half_width_s: float
 ) -> _OffsetFit | None:
-    """Minimise the ATE over time offsets within ``window_s`` of ``lag_s``.
+    """Minimise the ATE over time offsets within ``half_width_s`` of ``lag_s``.
 
     Return None if too few poses overlap.
     """
@@ -344,33 +353,39 @@ def _refine_offset(
     # The same poses are used at every offset, so that the objective is continuous
     is_known = [
         is_bracketed(sparse_time_s + (lag_s + shift), dense_track.time_s, gap_limit_s)
-        for shift in (-window_s, 0.0, window_s)
+        for shift in (-half_width_s, 0.0, half_width_s)
     ]
     pose_indices = np.flatnonzero(np.all(is_known, axis=0))
     time_fraction = min(1.0, float(np.ptp(dense_track.time_s) / np.ptp(sparse_time_s)))
-    min_pose_count = max(2 * MIN_POSES, MIN_POSES_FRACTION * time_fraction * len(sparse_time_s))
+    min_pose_count = max(
+        2 * MIN_POSES, MIN_USED_POSES_FRACTION * time_fraction * len(sparse_time_s)
+    )
     if len(pose_indices) < min_pose_count:
         return None
     pose_indices = pose_indices[:: -(-len(pose_indices) // MAX_FITTED_POSES)]
     sparse_time_s = sparse_time_s[pose_indices]
     sparse_position_m = sparse_track.position_m[pose_indices]
 
-    def fit_at(shift_s: float) -> _OffsetFit:
+    def make_fit(shift_s: float) -> _OffsetFit:
         target_m = positions_at(dense_track, sparse_time_s + (lag_s + shift_s))
         # The transform is applied to the sparse trajectory, because a transform of the target could
         # shrink the target to a point
         transform = umeyama(sparse_position_m, target_m, with_scale=True)
         return _OffsetFit(
-            lag_s + shift_s, transform, sparse_time_s, transform.apply(sparse_position_m), target_m
+            lag_s + shift_s,
+            transform,
+            sparse_time_s,
+            transform.apply(sparse_position_m),
+            target_m,
         )
 
-    def cost(shift_s: float) -> float:
-        fit = fit_at(shift_s)
+    def compute_cost(shift_s: float) -> float:
+        fit = make_fit(shift_s)
         return float(((fit.target_m - fit.aligned_m) ** 2).sum())
 
-    # The shift is optimised instead of the offset: with UNIX time against boot time, the relative
-    # tolerance of the optimiser would be seconds
-    shifts_s = window_s * np.linspace(-1.0, 1.0, 21)
-    best_index = int(np.argmin([cost(shift) for shift in shifts_s]))
+    # The shift from lag_s is optimised: the offset may be 1e9 s (UNIX time minus boot time), so the
+    # relative tolerance of the optimiser would be seconds
+    shifts_s = half_width_s * np.linspace(-1.0, 1.0, 21)
+    best_index = int(np.argmin([compute_cost(shift) for shift in shifts_s]))
     bounds_s = (shifts_s[max(best_index - 1, 0)], shifts_s[min(best_index + 1, len(shifts_s) - 1)])
-    return fit_at(float(minimize_scalar(cost, bounds=bounds_s, method="bounded").x))
+    return make_fit(float(minimize_scalar(compute_cost, bounds=bounds_s, method="bounded").x))

@@ -27,7 +27,7 @@ def main() -> None:
     from px4fuse.readers.trajectory import read_trajectory, tum_text
     from px4fuse.trajectory.association import associate
     from px4fuse.trajectory.evaluation import evaluate
-    from px4fuse.trajectory.scores import rmse_interval
+    from px4fuse.trajectory.scores import estimate_rmse_interval
     from px4fuse.trajectory.time_offset import estimate_time_offset
 
     reference = flight(600.0, 200.0)
@@ -45,7 +45,7 @@ def main() -> None:
     for words, work in (
         ("write 120,000 poses", lambda: tum_text(reference)),
         ("associate 18,000 with 120,000", lambda: associate(estimate, reference)),
-        ("interval of 18,000 errors", lambda: rmse_interval(error, "ATE")),
+        ("interval of 18,000 errors", lambda: estimate_rmse_interval(error, "ATE")),
         ("all scores", lambda: evaluate(estimate, reference)),
         ("the time offset", lambda: estimate_time_offset(estimate, reference)),
     ):

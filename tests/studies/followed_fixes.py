@@ -182,7 +182,7 @@ def follow(analysis: Analysis, request: ComparisonRequest) -> list[Fix]:
         try:
             sent = compare_with_kf(
                 prepare_comparison(
-                    read_flight(request) if request.position else flight, request, as_sent=True
+                    read_flight(request) if request.position else flight, request, keep_as_sent=True
                 )
             )
             fixes.append(

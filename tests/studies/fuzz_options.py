@@ -196,7 +196,7 @@ def drawn_words(name: str, command: click.Command, rng: random.Random, out: Path
         if isinstance(one, click.Option) and one.expose_value and one.name not in NEVER
     }
     if name == "practice":
-        del options["opens_page"]  # it opens a browser
+        del options["opens_browser"]  # it opens a browser
     arguments = rng.choice(ARGUMENTS.get(name, ("",)))
     chosen = set(rng.sample(sorted(options), min(rng.randrange(6), len(options))))
     chosen |= {NEEDS[one] for one in chosen if one in NEEDS}

@@ -12,7 +12,7 @@ from px4fuse.trajectory.graph import lie, model
 
 # Probability that the gate rejects a true closure
 GATE_ALPHA = 0.001
-# Eigenvalues of a covariance matrix with unit diagonal are rounding errors below this limit
+# Eigenvalues of a covariance matrix (scaled to unit diagonal) below this limit are rounding errors
 _MIN_EIGENVALUE = 1e-13
 
 
@@ -57,7 +57,7 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     tested_edges = np.asarray(edge_indices, dtype=np.intp)
     if not len(tested_edges):
         return []
-    odometry_edges = model.odometry_chain(graph, tested_edges)
+    odometry_edges = model.find_odometry_edges(graph, tested_edges)
     first_nodes = graph.first_nodes[tested_edges]
     second_nodes = graph.second_nodes[tested_edges]
     first_pose_index = int(min(first_nodes.min(), second_nodes.min()))
@@ -72,9 +72,11 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
             f"{graph.ids[pose_index]} and {graph.ids[pose_index + 1]}",
             "Add an odometry edge between these vertices.",
         )
-    poses = lie.chain(model.odometry_steps(graph, connecting_edges))
-    # in the axes of the first pose of the odometry chain
-    step_covariances = _transform(lie.adjoint(poses[1:]), _covariances(graph, connecting_edges))
+    poses = lie.chain(model.get_odometry_steps(graph, connecting_edges))
+    # all in the axes of the first pose of the odometry chain, so that they can be summed
+    step_covariances = _propagate_covariances(
+        lie.adjoint(poses[1:]), _compute_covariances(graph, connecting_edges)
+    )
     cumulative_covariance = np.concatenate(
         [np.zeros((1, *step_covariances.shape[1:])), np.cumsum(step_covariances, axis=0)]
     )
@@ -83,12 +85,12 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
         - cumulative_covariance[np.minimum(first_nodes, second_nodes) - first_pose_index]
     )
     end_adjoint = lie.adjoint(lie.inverse(poses[second_nodes - first_pose_index]))
-    covariance = _transform(end_adjoint, chain_covariance)
+    covariance = _propagate_covariances(end_adjoint, chain_covariance)
     relative_poses = lie.between(
         poses[first_nodes - first_pose_index], poses[second_nodes - first_pose_index]
     )
     residuals = lie.log(lie.between(graph.measurements[tested_edges], relative_poses))
-    covariance = _transform(lie.right_jacobian_inverse(residuals), covariance)
+    covariance = _propagate_covariances(lie.right_jacobian_inverse(residuals), covariance)
     edge_tests = zip(tested_edges.tolist(), residuals, covariance, strict=True)
     return [
         _test_edge(graph, edge_index, edge_residual, edge_covariance)
@@ -96,7 +98,7 @@ def gate_edges(graph: model.PoseGraph, edge_indices: Sequence[int] | IntArray) -
     ]
 
 
-def _transform(matrices: Array, covariances: Array) -> Array:
+def _propagate_covariances(matrices: Array, covariances: Array) -> Array:
     return matrices @ covariances @ matrices.transpose(0, 2, 1)
 
 
@@ -127,7 +129,7 @@ def _test_edge(
     return GateResult(*vertices, d2, degrees_of_freedom, p_value, p_value >= GATE_ALPHA)
 
 
-def _covariances(graph: model.PoseGraph, odometry_edges: IntArray) -> Array:
+def _compute_covariances(graph: model.PoseGraph, odometry_edges: IntArray) -> Array:
     """Compute the covariances of odometry edges, in the axes of the later pose."""
     scale, scaled_information = model.scale_to_unit_diagonal(graph.information[odometry_edges])
     is_full_rank = np.linalg.eigvalsh(scaled_information)[:, 0] > 1e-12
@@ -142,5 +144,5 @@ def _covariances(graph: model.PoseGraph, odometry_edges: IntArray) -> Array:
     is_backward = graph.first_nodes[odometry_edges] > graph.second_nodes[odometry_edges]
     # An edge from a later to an earlier pose is inverted: (Z exp(r))^-1 = Z^-1 exp(-Ad(Z) r)
     measured_adjoint = lie.adjoint(graph.measurements[odometry_edges[is_backward]])
-    covariance[is_backward] = _transform(measured_adjoint, covariance[is_backward])
+    covariance[is_backward] = _propagate_covariances(measured_adjoint, covariance[is_backward])
     return covariance

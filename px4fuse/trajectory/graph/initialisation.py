@@ -23,12 +23,12 @@ def initialise(graph: PoseGraph) -> PoseGraph:
     TrajectoryError
         The graph is not connected, or its edges do not determine its poses.
     """
-    if np.any(model.odometry_chain(graph) < 0):
+    if np.any(model.find_odometry_edges(graph) < 0):
         return _initialise_chordal(graph)
     composed_graph = model.compose_odometry(graph)
     try:
         return min(composed_graph, _initialise_chordal(graph), key=model.cost)
-    except TrajectoryError:  # some edges have no rotation
+    except TrajectoryError:  # some edges have no rotation, so only the composed poses are possible
         return composed_graph
 
 
@@ -39,7 +39,8 @@ def _initialise_chordal(graph: PoseGraph) -> PoseGraph:
     model.require_connected(graph, rotation_information > 0.0, "edges that measure rotation")
     measured_rotation = lie.rotation_matrix(graph.measurements)
     eye = np.broadcast_to(np.eye(dimension), measured_rotation.shape)
-    # Minimise the sum of weight |Z' Y_i - Y_j|^2 over the transposed rotations Y
+    # Minimise the sum of weight |Z' R_i' - R_j'|^2 over matrices R, not only rotations; Z is the
+    # measured rotation of the edge from pose i to pose j
     relaxed_rotation = _solve_positions(
         graph,
         measured_rotation.transpose(0, 2, 1),
@@ -48,12 +49,15 @@ def _initialise_chordal(graph: PoseGraph) -> PoseGraph:
         0.0 * measured_rotation,
         lie.rotation_matrix(graph.poses[0]).T,
     )
-    rotation = _nearest_rotations(relaxed_rotation.transpose(0, 2, 1))
-    # Residual of an edge in the axes of the measured pose: (R_i Z)' (t_j - t_i - R_i z)
+    rotation = _find_nearest_rotations(relaxed_rotation.transpose(0, 2, 1))
+    # Residual of an edge in the axes of its measured pose (rotation Z, translation z):
+    # (R_i Z)' (t_j - t_i - R_i z), for poses with rotation R and position t
     first_rotation = rotation[graph.first_nodes]
-    edge_axes = first_rotation @ measured_rotation
+    measured_pose_rotation = first_rotation @ measured_rotation
     information = (
-        edge_axes @ graph.information[:, :dimension, :dimension] @ edge_axes.transpose(0, 2, 1)
+        measured_pose_rotation
+        @ graph.information[:, :dimension, :dimension]
+        @ measured_pose_rotation.transpose(0, 2, 1)
     )
     translation = first_rotation @ graph.measurements[:, :dimension, None]
     position = _solve_positions(
@@ -64,7 +68,7 @@ def _initialise_chordal(graph: PoseGraph) -> PoseGraph:
     else:
         poses = np.column_stack([position, Rotation.from_matrix(rotation).as_quat()])
     poses[0] = graph.poses[0]
-    return replace(graph, poses=poses, initialised=model.FROM_CHORDAL)
+    return replace(graph, poses=poses, initialised=model.POSES_FROM_CHORDAL)
 
 
 def _solve_positions(
@@ -72,26 +76,28 @@ def _solve_positions(
     first_coefficient: Array,
     second_coefficient: Array,
     information: Array,
-    edge_value: Array,
+    edge_constant: Array,
     first_pose: Array,
 ) -> Array:
     """Solve the :class:`NormalEquations` for a known first pose; the result has shape (n, d, k)."""
     edges = np.stack([graph.first_nodes, graph.second_nodes])
     equations = NormalEquations(edges, *first_pose.shape)
-    known = np.zeros((len(graph), *first_pose.shape))
-    known[0] = first_pose
+    known_poses = np.zeros((len(graph), *first_pose.shape))
+    known_poses[0] = first_pose
     for coefficient, nodes in zip((first_coefficient, second_coefficient), edges, strict=True):
-        edge_value = edge_value - coefficient @ known[nodes]
-    values, _ = equations.assemble(first_coefficient, second_coefficient, information, edge_value)
-    solution = equations.solve(values)
+        edge_constant = edge_constant - coefficient @ known_poses[nodes]
+    equation_values, _ = equations.assemble(
+        first_coefficient, second_coefficient, information, edge_constant
+    )
+    solution = equations.solve(equation_values)
     if solution is None:
         raise TrajectoryError(
             "The edges do not determine the initial poses", "Give VERTEX lines with initial poses."
         )
-    return known + solution
+    return known_poses + solution
 
 
-def _nearest_rotations(matrices: Array) -> Array:
+def _find_nearest_rotations(matrices: Array) -> Array:
     """Return the nearest rotations to matrices, shape (n, d, d), in the Frobenius norm."""
     left_vectors, _, right_vectors = np.linalg.svd(matrices)
     left_vectors[:, :, -1] *= np.sign(np.linalg.det(left_vectors @ right_vectors))[:, None]

@@ -18,8 +18,9 @@ from px4fuse.trajectory.rotation import from_elements, skew
 # Maximum angle (rad) for power series instead of quotients, which lose precision at small angles:
 # five terms of the series are accurate to 1e-14
 SMALL_ANGLE_RAD = 0.3
-_COT_SERIES = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
-_COT_SLOPE_SERIES = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
+# Coefficients of the power series in theta^2 of _compute_cot_term and _compute_cot_term_slope
+_COT_TERM_SERIES = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600, 1 / 47900160)
+_COT_TERM_SLOPE_SERIES = (1 / 360, 1 / 7560, 1 / 201600, 1 / 5987520, 691 / 130767436800)
 
 
 def wrap(angle: Array) -> Array:
@@ -56,10 +57,10 @@ def compose(a: Array, b: Array) -> Array:
     a, b : ndarray, shape (..., 3) or (..., 7)
         Poses. Quaternions of the result are normalised; its headings are not wrapped.
     """
-    d = _dimension(a)
+    d = _get_dimension(a)
     rotation = a[..., 2:] + b[..., 2:] if d == 2 else (_rotation_of(a) * _rotation_of(b)).as_quat()
     return np.concatenate(
-        [a[..., :d] + _multiply_rotations(rotation_matrix(a), b[..., :d]), rotation], axis=-1
+        [a[..., :d] + _multiply_vectors(rotation_matrix(a), b[..., :d]), rotation], axis=-1
     )
 
 
@@ -70,25 +71,25 @@ def inverse(pose: Array) -> Array:
 
 def between(a: Array, b: Array) -> Array:
     """Return the poses b relative to a: the inverse of a, times b."""
-    d = _dimension(a)
+    d = _get_dimension(a)
     inverse_rotation = np.swapaxes(rotation_matrix(a), -1, -2)
     rotation = (
         b[..., 2:] - a[..., 2:] if d == 2 else (_rotation_of(a).inv() * _rotation_of(b)).as_quat()
     )
     return np.concatenate(
-        [_multiply_rotations(inverse_rotation, b[..., :d] - a[..., :d]), rotation], axis=-1
+        [_multiply_vectors(inverse_rotation, b[..., :d] - a[..., :d]), rotation], axis=-1
     )
 
 
 def exp(tangent: Array) -> Array:
-    """Return the exponentials of tangents (Barfoot 2017, 7.35; Sola 2018, 156).
+    """Return the poses of tangents: exponential map (Barfoot 2017, 7.35; Sola 2018, 156).
 
     Parameters
     ----------
     tangent : ndarray, shape (..., 3) or (..., 6)
-        Rotation below 2 pi.
+        Tangents with a rotation below 2 pi.
     """
-    d = _dimension(tangent)
+    d = _get_dimension(tangent)
     rho = tangent[..., :d]
     phi = tangent[..., d:]
     position = np.linalg.solve(_left_jacobian_inverse(phi), rho[..., None])[..., 0]
@@ -104,10 +105,10 @@ def log(pose: Array) -> Array:
     pose : ndarray, shape (..., 3) or (..., 7)
         Poses with normalised quaternions; q and -q give the same result.
     """
-    d = _dimension(pose)
+    d = _get_dimension(pose)
     phi = wrap(pose[..., 2:]) if d == 2 else _rotation_of(pose).as_rotvec()
     return np.concatenate(
-        [_multiply_rotations(_left_jacobian_inverse(phi), pose[..., :d]), phi], axis=-1
+        [_multiply_vectors(_left_jacobian_inverse(phi), pose[..., :d]), phi], axis=-1
     )
 
 
@@ -132,34 +133,34 @@ def adjoint(pose: Array) -> Array:
 
 
 def right_jacobian_inverse(tangent: Array) -> Array:
-    """Return the inverse right Jacobians, the derivatives of log(X exp(xi)) by xi at xi = 0.
+    """Return the inverse right Jacobians, the derivatives of log(X exp(xi)) by xi at 0.
 
     Parameters
     ----------
     tangent : ndarray, shape (..., 3) or (..., 6)
-        Rotation below 2 pi.
+        Tangents with a rotation below 2 pi.
 
     Returns
     -------
     ndarray, shape (..., 3, 3) or (..., 6, 6)
     """
-    commutator = _commutator(tangent)
+    commutator = _compute_commutator(tangent)
     commutator_squared = commutator @ commutator
-    theta = np.linalg.norm(tangent[..., _dimension(tangent) :], axis=-1)[..., None, None]
-    cot_term = _cot_term(theta)
-    half_cot_slope = 0.5 * _cot_term_slope(theta)
+    theta = np.linalg.norm(tangent[..., _get_dimension(tangent) :], axis=-1)[..., None, None]
+    cot_term = _compute_cot_term(theta)
+    half_cot_term_slope = 0.5 * _compute_cot_term_slope(theta)
     # Power series of x / (1 - exp(-x)) for the matrix x = ad; powers above 4 are replaced with
     # ad^5 = -2 theta^2 ad^3 - theta^4 ad
     jacobian: Array = (
         np.eye(commutator.shape[-1])
         + 0.5 * commutator
-        + (cot_term - theta * theta * half_cot_slope) * commutator_squared
+        + (cot_term - theta * theta * half_cot_term_slope) * commutator_squared
     )
-    return jacobian - half_cot_slope * (commutator_squared @ commutator_squared)
+    return jacobian - half_cot_term_slope * (commutator_squared @ commutator_squared)
 
 
-def _commutator(tangent: Array) -> Array:
-    """Return ``ad``, the derivative of ``adjoint(exp(t xi))`` at t = 0 (Barfoot 2017, 7.33)."""
+def _compute_commutator(tangent: Array) -> Array:
+    """Return the Lie bracket matrices ad(xi) of tangents xi (Barfoot 2017, 7.33)."""
     if tangent.shape[-1] == 3:
         x, y, theta = np.moveaxis(tangent, -1, 0)
         return from_elements((0.0, -theta, y), (theta, 0.0, -x), (0.0, 0.0, 0.0))
@@ -188,7 +189,7 @@ def chain(steps: Array) -> Array:
     return poses
 
 
-def _dimension(values: Array) -> int:
+def _get_dimension(values: Array) -> int:
     return 2 if values.shape[-1] == 3 else 3
 
 
@@ -196,7 +197,7 @@ def _rotation_of(pose: Array) -> Rotation:
     return Rotation.from_quat(pose[..., 3:])
 
 
-def _multiply_rotations(matrix: Array, vector: Array) -> Array:
+def _multiply_vectors(matrix: Array, vector: Array) -> Array:
     return (matrix @ vector[..., None])[..., 0]
 
 
@@ -209,20 +210,23 @@ def _left_jacobian_inverse(phi: Array) -> Array:
     return (
         np.eye(skew_matrix.shape[-1])
         - 0.5 * skew_matrix
-        + _cot_term(np.linalg.norm(phi, axis=-1)[..., None, None]) * (skew_matrix @ skew_matrix)
+        + _compute_cot_term(np.linalg.norm(phi, axis=-1)[..., None, None])
+        * (skew_matrix @ skew_matrix)
     )
 
 
-def _cot_term(theta: Array) -> Array:
+def _compute_cot_term(theta: Array) -> Array:
     """Return (1 - theta/2 cot(theta/2)) / theta^2."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
     exact_value = (1.0 - 0.5 * t / np.tan(0.5 * t)) / t**2
-    return np.where(theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_SERIES), exact_value)
+    return np.where(theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_TERM_SERIES), exact_value)
 
 
-def _cot_term_slope(theta: Array) -> Array:
-    """Return the derivative of :func:`_cot_term` by theta, divided by theta."""
+def _compute_cot_term_slope(theta: Array) -> Array:
+    """Return the derivative of :func:`_compute_cot_term` by theta, divided by theta."""
     t = np.where(theta < SMALL_ANGLE_RAD, 1.0, theta)
-    g_slope = 0.5 / np.tan(0.5 * t) - 0.25 * t / np.sin(0.5 * t) ** 2
-    exact_value = -(g_slope + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3
-    return np.where(theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_SLOPE_SERIES), exact_value)
+    half_cot_derivative = 0.5 / np.tan(0.5 * t) - 0.25 * t / np.sin(0.5 * t) ** 2
+    exact_value = -(half_cot_derivative + 2.0 * (1.0 - 0.5 * t / np.tan(0.5 * t)) / t) / t**3
+    return np.where(
+        theta < SMALL_ANGLE_RAD, polyval(theta * theta, _COT_TERM_SLOPE_SERIES), exact_value
+    )

@@ -15,13 +15,13 @@ from px4fuse.errors import TrajectoryError
 from px4fuse.trajectory.graph import lie
 from px4fuse.trajectory.graph.normal_equations import NormalEquations
 
-# A direction is not measured if the eigenvalue of the information matrix (scaled to unit diagonal)
-# is below this limit
+# A measurement does not observe a direction if the eigenvalue of its information matrix (scaled to
+# unit diagonal) is below this limit
 MIN_OBSERVED_EIGENVALUE = 1e-9
 # Sources of the initial poses of a pose graph
-FROM_FILE = "the file's vertices"
-FROM_ODOMETRY = "composed odometry edges"
-FROM_CHORDAL = "chordal initialisation"
+POSES_FROM_FILE = "the file's vertices"
+POSES_FROM_ODOMETRY = "composed odometry edges"
+POSES_FROM_CHORDAL = "chordal initialisation"
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class PoseGraph:
     # measured pose; zero in directions that are not measured
     information: Array
     # Source of the initial poses
-    initialised: str = FROM_FILE
+    initialised: str = POSES_FROM_FILE
 
     __repr__ = one_line_repr
 
@@ -77,7 +77,7 @@ class Residuals:
     Attributes
     ----------
     poses : ndarray, shape (n, 3) or (n, 7)
-    relative : ndarray, shape (m, 3) or (m, 7)
+    relative_poses : ndarray, shape (m, 3) or (m, 7)
         Second pose of each edge relative to the first.
     residual : ndarray, shape (m, d)
         ``r = log(Z^-1 X_i^-1 X_j)``, as in GTSAM's BetweenFactor.
@@ -86,17 +86,17 @@ class Residuals:
     """
 
     poses: Array
-    relative: Array
+    relative_poses: Array
     residual: Array
     chi2: Array
 
 
 def residuals(graph: PoseGraph, poses: Array) -> Residuals:
     """Compute the residuals of all edges at the poses, shape (n, 3) or (n, 7)."""
-    relative = lie.between(poses[graph.first_nodes], poses[graph.second_nodes])
-    residual = lie.log(lie.between(graph.measurements, relative))
+    relative_poses = lie.between(poses[graph.first_nodes], poses[graph.second_nodes])
+    residual = lie.log(lie.between(graph.measurements, relative_poses))
     weighted_residual = (graph.information @ residual[..., None])[..., 0]
-    return Residuals(poses, relative, residual, np.sum(residual * weighted_residual, axis=-1))
+    return Residuals(poses, relative_poses, residual, np.sum(residual * weighted_residual, axis=-1))
 
 
 def cost(graph: PoseGraph) -> float:
@@ -116,8 +116,8 @@ def information_eigenvectors(information: Array) -> tuple[Array, Array]:
     return scale[:, None] * eigenvectors[:, is_observed], 1.0 / eigenvalues[is_observed]
 
 
-def observed_directions(information: Array) -> IntArray:
-    """Return the number of directions that each measurement observes."""
+def count_observed_directions(information: Array) -> IntArray:
+    """Return the number of directions that each measurement observes (rank of information)."""
     _, scaled_information = scale_to_unit_diagonal(information)
     eigenvalues = np.linalg.eigvalsh(scaled_information)
     counts: IntArray = np.count_nonzero(eigenvalues > MIN_OBSERVED_EIGENVALUE, axis=1)
@@ -127,8 +127,8 @@ def observed_directions(information: Array) -> IntArray:
 def scale_to_unit_diagonal(matrices: Array) -> tuple[Array, Array]:
     """Return the square roots of the diagonals, and the matrices scaled to unit diagonal."""
     scale = np.sqrt(np.clip(np.diagonal(matrices, axis1=-2, axis2=-1), 0.0, None))
-    inverse = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
-    return scale, matrices * (inverse[..., :, None] * inverse[..., None, :])
+    inverse_scale = np.divide(1.0, scale, out=np.zeros_like(scale), where=scale > 0.0)
+    return scale, matrices * (inverse_scale[..., :, None] * inverse_scale[..., None, :])
 
 
 def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> None:
@@ -137,7 +137,7 @@ def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> 
     ``edges_name`` names the edges in the error message.
     """
     if not len(graph.first_nodes):
-        raise TrajectoryError("The pose graph has no edges", "Give a file with EDGE lines.")
+        raise TrajectoryError("The pose graph has no edges", "Give a g2o file with EDGE lines.")
     is_informative = is_used & (np.trace(graph.information, axis1=1, axis2=2) > 0.0)
     connected_nodes = (graph.first_nodes[is_informative], graph.second_nodes[is_informative])
     node_count = len(graph)
@@ -156,11 +156,13 @@ def require_connected(graph: PoseGraph, is_used: BoolArray, edges_name: str) -> 
 
 def compose_odometry(graph: PoseGraph) -> PoseGraph:
     """Return the graph with poses composed from odometry. Odometry must connect all poses."""
-    poses = lie.compose(graph.poses[:1], lie.chain(odometry_steps(graph, odometry_chain(graph))))
-    return replace(graph, poses=poses, initialised=FROM_ODOMETRY)
+    poses = lie.compose(
+        graph.poses[:1], lie.chain(get_odometry_steps(graph, find_odometry_edges(graph)))
+    )
+    return replace(graph, poses=poses, initialised=POSES_FROM_ODOMETRY)
 
 
-def odometry_chain(graph: PoseGraph, excluded_edges: IntArray | None = None) -> IntArray:
+def find_odometry_edges(graph: PoseGraph, excluded_edges: IntArray | None = None) -> IntArray:
     """Return the index of the odometry edge from each pose to the next, or -1, shape (n - 1,).
 
     Of several edges between two poses the first is used.
@@ -169,7 +171,7 @@ def odometry_chain(graph: PoseGraph, excluded_edges: IntArray | None = None) -> 
     if excluded_edges is not None:
         odometry_edges = np.setdiff1d(odometry_edges, excluded_edges)
     next_edge = np.full(len(graph) - 1, -1, dtype=np.intp)
-    # Assigned in reverse order, so that the first of several edges remains
+    # Assigned in reverse order: of several edges between two poses, the first remains
     odometry_edges = odometry_edges[::-1]
     next_edge[np.minimum(graph.first_nodes[odometry_edges], graph.second_nodes[odometry_edges])] = (
         odometry_edges
@@ -177,9 +179,9 @@ def odometry_chain(graph: PoseGraph, excluded_edges: IntArray | None = None) -> 
     return next_edge
 
 
-def odometry_steps(graph: PoseGraph, edge_indices: IntArray) -> Array:
+def get_odometry_steps(graph: PoseGraph, edge_indices: IntArray) -> Array:
     """Return the measurements of edges between successive poses, from earlier to later pose."""
-    steps = graph.measurements[edge_indices].copy()
+    relative_poses = graph.measurements[edge_indices].copy()
     is_backward = graph.first_nodes[edge_indices] > graph.second_nodes[edge_indices]
-    steps[is_backward] = lie.inverse(steps[is_backward])
-    return steps
+    relative_poses[is_backward] = lie.inverse(relative_poses[is_backward])
+    return relative_poses

@@ -1,8 +1,9 @@
 """Normal equations of a pose graph, solved by multifrontal Cholesky factorisation.
 
-Successive poses in the order of elimination form groups. Each group is eliminated with dense
-matrices. Its Schur complement is added to the equations of its parent, the next group that depends
-on it. Source: Liu 1992, The multifrontal method for sparse matrix solution, sections 3 to 5.
+Successive poses in the order of elimination form groups (supernodes). Each group is eliminated
+with a dense matrix. Its Schur complement is added to the matrix of its parent, the next group that
+depends on it. Source: Liu 1992, The multifrontal method for sparse matrix solution, sections 3
+to 5.
 """
 
 from typing import NamedTuple
@@ -15,19 +16,19 @@ from scipy.sparse.linalg import splu
 
 from px4fuse.core.arrays import Array, ArrayPair, IntArray
 
-# Maximum number of unknowns of a group that depends on no other group. Larger groups need fewer
-# calls of LAPACK, but more arithmetic with zeros
+# Maximum number of unknowns of a group that is no parent. Larger groups need fewer calls of LAPACK,
+# but more arithmetic with zeros
 _MAX_LEAF_UNKNOWNS = 96
 # Added to the diagonal to fix the first pose: far above all information, with a finite square
 _FIXED_POSE_INFORMATION = 1e100
 
 
-class _Group(NamedTuple):
-    """Poses that are eliminated together.
+class _EliminationGroup(NamedTuple):
+    """Poses that are eliminated together, and indices into the unknowns and the values.
 
-    Their equations are a matrix in Fortran order with a row for each unknown of the group. The
-    columns are the unknowns of the group, the later unknowns that depend on them, and the right
-    sides.
+    The equations of a group are a dense matrix in Fortran order with a row for each unknown of the
+    group. The columns are the unknowns of the group, the later unknowns that depend on them, and
+    the right-hand sides.
     """
 
     unknown_count: int
@@ -35,14 +36,15 @@ class _Group(NamedTuple):
     unknowns: slice
     dependent_unknowns: IntArray
     parent: int
-    # Columns of ``dependent_unknowns`` and of the right sides in the equations of the parent
+    # Columns of ``dependent_unknowns`` and of the right-hand sides in the matrix of the parent
     parent_columns: IntArray
 
 
 class NormalEquations:
     """Normal equations of ``A x_i + B x_j = c`` over all edges (i, j), with x_0 = 0.
 
-    The order of elimination and all indices are computed once, from the edges.
+    Each edge has A and B, shape (d, d), and c, shape (d, k). The order of elimination and all
+    indices are computed once, from the edges.
 
     Parameters
     ----------
@@ -50,67 +52,69 @@ class NormalEquations:
         Indices i and j of the n poses. The edges must connect all poses.
     unknowns_per_pose : int
         Number d of unknowns per pose.
-    side_count : int
-        Number k of right sides.
+    rhs_count : int
+        Number k of right-hand sides (columns of c).
     """
 
-    def __init__(self, edges: IntArray, unknowns_per_pose: int, side_count: int = 1) -> None:
-        position, group_starts, later_positions = _order_of_elimination(
+    def __init__(self, edges: IntArray, unknowns_per_pose: int, rhs_count: int = 1) -> None:
+        position, group_starts, later_positions = _find_elimination_order(
             edges, _MAX_LEAF_UNKNOWNS // unknowns_per_pose
         )
         poses, unknowns = np.arange(len(position)), np.arange(unknowns_per_pose)
         pose_counts = np.diff(group_starts)
-        group_of = np.repeat(np.arange(len(later_positions)), pose_counts)
+        group_indices = np.repeat(np.arange(len(later_positions)), pose_counts)
         dependent_counts = np.array([len(later) for later in later_positions])
         dependent_start = np.append(0, np.cumsum(dependent_counts))
-        all_dependent = np.concatenate(later_positions)
+        all_dependents = np.concatenate(later_positions)
         keys = (
             np.repeat(np.arange(len(later_positions)), dependent_counts) * len(poses)
-            + all_dependent
+            + all_dependents
         )
         row_counts = pose_counts * unknowns_per_pose
-        column_counts = row_counts + dependent_counts * unknowns_per_pose + side_count
+        column_counts = row_counts + dependent_counts * unknowns_per_pose + rhs_count
         value_start = np.append(0, np.cumsum(row_counts * column_counts))
 
-        def columns_of(group: IntArray, pose: IntArray) -> IntArray:
-            """Return the columns of each pose in the equations of a group."""
-            later = np.searchsorted(keys, group * len(poses) + pose) - dependent_start[group]
+        def find_columns(group: IntArray, pose: IntArray) -> IntArray:
+            """Return the columns of each pose in the matrix of a group, shape (poses, d)."""
+            index = np.searchsorted(keys, group * len(poses) + pose) - dependent_start[group]
             column = pose - group_starts[group]
-            is_later = column >= pose_counts[group]
-            column = np.where(is_later, pose_counts[group] + later, column)
+            is_dependent = column >= pose_counts[group]
+            column = np.where(is_dependent, pose_counts[group] + index, column)
             return np.asarray(column[:, None] * unknowns_per_pose + unknowns)
 
-        def indices_of(pose: IntArray, columns: IntArray) -> IntArray:
-            """Return the indices of each pose's equations in the values, columns first."""
-            group = group_of[pose]
+        def find_value_indices(pose: IntArray, columns: IntArray) -> IntArray:
+            """Return the indices into the values of the rows of each pose: (poses, columns, d)."""
+            group = group_indices[pose]
             column_start = value_start[group][:, None] + columns * row_counts[group][:, None]
             rows = (pose - group_starts[group])[:, None] * unknowns_per_pose + unknowns
             return np.asarray(column_start[:, :, None] + rows[:, None])
 
         edge_ends = np.sort(position[edges], axis=0)
-        diagonal = indices_of(poses, columns_of(group_of, poses))
-        cross = indices_of(edge_ends[0], columns_of(group_of[edge_ends[0]], edge_ends[1]))
-        side_columns = np.arange(-side_count, 0) + column_counts[:, None]
-        sides = indices_of(poses, side_columns[group_of])
+        diagonal = find_value_indices(poses, find_columns(group_indices, poses))
+        off_diagonal = find_value_indices(
+            edge_ends[0], find_columns(group_indices[edge_ends[0]], edge_ends[1])
+        )
+        rhs_columns = np.arange(-rhs_count, 0) + column_counts[:, None]
+        rhs_indices = find_value_indices(poses, rhs_columns[group_indices])
         self._indices = np.concatenate(
-            [part.ravel() for part in (diagonal[edge_ends], cross, sides[edge_ends])]
+            [part.ravel() for part in (diagonal[edge_ends], off_diagonal, rhs_indices[edge_ends])]
         )
         self._is_swapped = (position[edges[0]] > position[edges[1]])[:, None, None]
         self._position = position
         self._diagonal = np.diagonal(diagonal, axis1=1, axis2=2)
-        self._sides = sides[position].swapaxes(1, 2)
-        parents = group_of[[later[0] if len(later) else -1 for later in later_positions]]
-        in_parents = columns_of(np.repeat(parents, dependent_counts), all_dependent)
+        self._rhs_indices = rhs_indices[position].swapaxes(1, 2)
+        parents = group_indices[[later[0] if len(later) else -1 for later in later_positions]]
+        all_parent_columns = find_columns(np.repeat(parents, dependent_counts), all_dependents)
         self._groups = [
-            _Group(
+            _EliminationGroup(
                 int(row_counts[group]),
                 slice(*value_start[group : group + 2]),
                 slice(*group_starts[group : group + 2] * unknowns_per_pose),
                 (later[:, None] * unknowns_per_pose + unknowns).ravel(),
                 int(parents[group]),
                 np.append(
-                    in_parents[slice(*dependent_start[group : group + 2])],
-                    side_columns[parents[group]],
+                    all_parent_columns[slice(*dependent_start[group : group + 2])],
+                    rhs_columns[parents[group]],
                 ),
             )
             for group, later in enumerate(later_positions)
@@ -121,16 +125,16 @@ class NormalEquations:
         first_coefficient: Array,
         second_coefficient: Array,
         information: Array,
-        edge_value: Array,
+        edge_constant: Array,
     ) -> ArrayPair:
-        """Return the values of the equations, and the right sides, shape (n, d, k).
+        """Return the matrices of all groups (one flat array), and the right-hand sides, (n, d, k).
 
         Parameters
         ----------
         first_coefficient, second_coefficient, information : ndarray, shape (m, d, d)
             A, B, and the weight matrix of each edge.
-        edge_value : ndarray, shape (m, d, k)
-            Right sides c.
+        edge_constant : ndarray, shape (m, d, k)
+            Constants c.
         """
         coefficients = np.where(
             self._is_swapped,
@@ -138,13 +142,13 @@ class NormalEquations:
             (first_coefficient, second_coefficient),
         )
         weighted = coefficients.swapaxes(2, 3) @ information
-        sides = (weighted @ edge_value).swapaxes(2, 3)
-        parts = (weighted @ coefficients, weighted[1] @ coefficients[0], sides)
+        rhs_products = (weighted @ edge_constant).swapaxes(2, 3)
+        parts = (weighted @ coefficients, weighted[1] @ coefficients[0], rhs_products)
         products = np.concatenate([part.ravel() for part in parts])
         values = np.asarray(np.bincount(self._indices, products), dtype=float)
-        right_sides = values[self._sides]
+        right_hand_sides = values[self._rhs_indices]
         values[self._diagonal[self._position[0]]] = _FIXED_POSE_INFORMATION
-        return values, right_sides
+        return values, right_hand_sides
 
     def solve(self, values: Array, damping: float = 0.0) -> Array | None:
         """Solve the equations with damping on the diagonal; the result has the shape (n, d, k).
@@ -153,8 +157,8 @@ class NormalEquations:
         """
         values = values.copy()
         values[self._diagonal] += damping
-        side_count = self._sides.shape[2]
-        complements: dict[int, Array] = {}
+        rhs_count = self._rhs_indices.shape[2]
+        schur_complements: dict[int, Array] = {}
         factors = []
         for index, group in enumerate(self._groups):
             equations = values[group.values].reshape(-1, group.unknown_count).T
@@ -168,58 +172,62 @@ class NormalEquations:
             if group is self._groups[-1]:
                 break
             column_count = rows.shape[1]
-            complement = (
-                complements.pop(index, np.zeros(column_count**2))
+            schur_complement = (
+                schur_complements.pop(index, np.zeros(column_count**2))
                 .reshape(column_count, column_count)
                 .T
             )
-            complement = blas.dsyrk(-1.0, rows, 1.0, complement, trans=1, overwrite_c=1).T
-            # only the part with row >= column is computed
+            schur_complement = blas.dsyrk(
+                -1.0, rows, 1.0, schur_complement, trans=1, overwrite_c=1
+            ).T
+            # only the lower triangle (row >= column) of the symmetric matrix is computed
             parent = self._groups[group.parent]
             columns = group.parent_columns
-            inside = np.searchsorted(columns, parent.unknown_count)
+            own_column_count = np.searchsorted(columns, parent.unknown_count)
             parent_values = values[parent.values]
-            indices = columns[:, None] * parent.unknown_count + columns[:inside]
-            parent_values[indices] += complement[:, :inside]
-            columns = columns[inside:] - parent.unknown_count
-            column_count = len(parent.dependent_unknowns) + side_count
-            parent_complement = complements.setdefault(group.parent, np.zeros(column_count**2))
-            parent_complement[columns[:, None] * column_count + columns] += complement[
-                inside:, inside:
+            indices = columns[:, None] * parent.unknown_count + columns[:own_column_count]
+            parent_values[indices] += schur_complement[:, :own_column_count]
+            columns = columns[own_column_count:] - parent.unknown_count
+            column_count = len(parent.dependent_unknowns) + rhs_count
+            parent_complement = schur_complements.setdefault(
+                group.parent, np.zeros(column_count**2)
+            )
+            parent_complement[columns[:, None] * column_count + columns] += schur_complement[
+                own_column_count:, own_column_count:
             ]
-        solution = np.empty((self._diagonal.size, side_count))
+        solution = np.empty((self._diagonal.size, rhs_count))
         for group, root, rows in reversed(factors):
-            known_part = rows[:, :-side_count] @ solution[group.dependent_unknowns]
-            solution[group.unknowns] = blas.dtrsm(1.0, root, rows[:, -side_count:] - known_part)
-        solution = solution.reshape(self._sides.shape)[self._position]
+            solved_terms = rows[:, :-rhs_count] @ solution[group.dependent_unknowns]
+            solution[group.unknowns] = blas.dtrsm(1.0, root, rows[:, -rhs_count:] - solved_terms)
+        solution = solution.reshape(self._rhs_indices.shape)[self._position]
         solution[0] = 0.0
         return solution if np.all(np.isfinite(solution)) else None
 
 
-def _order_of_elimination(
+def _find_elimination_order(
     edges: IntArray, max_leaf_poses: int
 ) -> tuple[IntArray, IntArray, list[IntArray]]:
-    """Return the order of elimination of n poses, and its groups.
+    """Return the order of elimination of n poses, divided into g groups.
 
     Returns
     -------
     position : ndarray of int, shape (n,)
-        Position of each pose in the order of elimination.
+        Index of each pose in the order of elimination.
     group_starts : ndarray of int, shape (g + 1,)
-        First position of each group, and n.
+        First index of each group in this order, and n.
     later_positions : list of ndarray of int
-        Later positions that depend on each group.
+        Indices, in this order, of the later poses that depend on each group.
     """
     rows = np.tile(np.arange(edges.shape[1]), 2)
     incidence = sparse.csc_array((np.repeat([1.0, -1.0], edges.shape[1]), (rows, edges.ravel())))
     pose_count = incidence.shape[1]
-    fixed = sparse.csc_array(([1.0], ([0], [0])), shape=(pose_count, pose_count))
+    first_pose_constraint = sparse.csc_array(([1.0], ([0], [0])), shape=(pose_count, pose_count))
     factors = splu(
-        (incidence.T @ incidence + fixed).tocsc(),
+        (incidence.T @ incidence + first_pose_constraint).tocsc(),
         # MMD_AT_PLUS_A has 1.1 to 1.9 times less fill-in than COLAMD on public benchmark graphs
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
-        # without supernodes, which contain additional zeros
+        # no relaxed supernodes, which contain additional zeros
         relax=1,
         options={"SymmetricMode": True},
     )
@@ -228,8 +236,8 @@ def _order_of_elimination(
     # elimination tree: the parent of a pose is the first later pose that depends on it
     parent = pattern.indices[pattern.indptr[:-2] + 1]
     last_pose = pose_count - 1
-    links = (dependent_count[:-1], (last_pose - parent, last_pose - np.arange(last_pose)))
-    tree = sparse.csr_array(links, shape=fixed.shape)
+    tree_entries = (dependent_count[:-1], (last_pose - parent, last_pose - np.arange(last_pose)))
+    tree = sparse.csr_array(tree_entries, shape=first_pose_constraint.shape)
     order = last_pose - depth_first_order(tree, 0, return_predecessors=False)[::-1]
     position = np.argsort(order)
     dependent_count = dependent_count[order]
@@ -241,10 +249,12 @@ def _order_of_elimination(
     is_large[pose_count] = True
     roots = np.flatnonzero(~is_large[:-1] & is_large[parent])
     is_child = parent[:-1] == np.arange(1, pose_count)
-    # a pose joins the group of its only child if this adds no zeros to the equations
+    # a pose joins the group of its child if this adds no zeros: both have the same later dependents
     is_joined = is_large[:-2] & is_child & (np.diff(dependent_count) == -1)
-    starts = np.flatnonzero(is_large[:-1] & ~np.append(False, is_joined))
-    group_starts = np.sort(np.concatenate([roots - subtree_size[roots] + 1, starts, [pose_count]]))
+    chain_starts = np.flatnonzero(is_large[:-1] & ~np.append(False, is_joined))
+    group_starts = np.sort(
+        np.concatenate([roots - subtree_size[roots] + 1, chain_starts, [pose_count]])
+    )
     later_positions = [
         np.sort(position[pattern.indices[slice(*pattern.indptr[pose : pose + 2])]])[1:]
         for pose in order[group_starts[1:] - 1]

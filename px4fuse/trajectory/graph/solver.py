@@ -16,14 +16,14 @@ from px4fuse.trajectory.graph.model import PoseGraph, Residuals
 
 # Maximum number of closures for robust optimisation by default: with more closures the optimisation
 # takes minutes
-MAX_ROBUST_CLOSURES = 1000
-# Key of the solution by robust optimisation (graduated non-convexity)
-ROBUST = "gnc"
+MAX_GNC_CLOSURES = 1000
+# Key in results.json of the solution by robust optimisation (graduated non-convexity)
+ROBUST_KEY = "gnc"
 # Labels of the pose graph solutions, by the key in results.json
 SOLUTIONS: Mapping[str, str] = {
     "all": "pose graph, all closures",
     "gated": "pose graph, gated closures",
-    ROBUST: "pose graph, robust (GNC)",
+    ROBUST_KEY: "pose graph, robust (GNC)",
 }
 
 
@@ -35,30 +35,29 @@ _DAMPING_FACTOR = 10.0
 # Maximum damping of Levenberg-Marquardt, as in GTSAM
 _MAX_DAMPING = 1e5
 # Minimum ratio of actual to predicted cost decrease for accepting a step, as in GTSAM
-_MIN_FIDELITY = 1e-3
+_MIN_GAIN_RATIO = 1e-3
 # Relative and absolute tolerance of the cost of a pose graph
 _COST_TOLERANCE = 1e-10
 _FLOAT_EPSILON = float(np.finfo(float).eps)
 # Relative tolerance of the cost in an intermediate stage of graduated non-convexity
-_STAGE_TOLERANCE = 1e-6
-# Maximum number of iterations in an intermediate stage of graduated non-convexity
-_MAX_STAGE_ITERATIONS = 20
+_GNC_STAGE_TOLERANCE = 1e-6
+_MAX_GNC_STAGE_ITERATIONS = 20
 
 # Probability that graduated non-convexity does not truncate the residual of a true closure
-GNC_PROBABILITY = 0.99
-# Probability that the χ² of a true closure is below the cost of dropping the closure
-DROP_PROBABILITY = 0.999
+GNC_INLIER_PROBABILITY = 0.99
+# Probability that the χ² of a true closure is below the cost of dropping it, so the closure is kept
+KEEP_PROBABILITY = 0.999
 # Factor on the control parameter of graduated non-convexity per stage (Yang 2020, section V)
 _GNC_CONTROL_FACTOR = 1.4
 _MAX_GNC_STAGES = 100
 # Maximum number of dropped closures that are tested again, each by an optimisation
 _MAX_RETRIED_CLOSURES = 20
 _MAX_TRUNCATION_ROUNDS = 20
-# Minimum factor by which information matrices are divided before the gate; if 40 % of the closures
-# are false, the estimated factor of correct matrices is 2.1
+# Information matrices are corrected if they are too large by at least this factor: if 40 % of the
+# closures are false, the factor is estimated as 2.1 although the matrices are correct
 MIN_INFORMATION_FACTOR = 2.5
-# Minimum number of closures for estimating the factor
-MIN_FACTOR_CLOSURES = 10
+# Minimum number of closures for estimating the factor of the information matrices
+MIN_CLOSURES_FOR_FACTOR = 10
 
 
 class Solution(Record, kw_only=True):
@@ -81,7 +80,7 @@ class Solution(Record, kw_only=True):
 
 
 @dataclass(frozen=True)
-class _Minimum:
+class _Optimum:
     residuals: Residuals
     iterations: int
     converged: bool
@@ -109,7 +108,7 @@ def solve(
         optimisation drops all edges to some poses.
     """
     model.require_connected(graph, np.ones(len(graph.first_nodes), bool), "the edges")
-    is_doubtful = ~graph.find_successive() if is_closure is None else is_closure
+    may_be_false = ~graph.find_successive() if is_closure is None else is_closure
     start_residuals = model.residuals(graph, graph.poses)
     cost_initial = 0.5 * float(np.sum(start_residuals.chi2))
     if not np.isfinite(cost_initial):
@@ -117,10 +116,10 @@ def solve(
             "The pose graph contains a pose or measurement that is not finite or too large",
             "Correct the number, or remove the vertex or edge.",
         )
-    weights = np.ones(len(is_doubtful))
+    weights = np.ones(len(may_be_false))
     minimum = _minimise(graph, start_residuals, weights)
-    if robust and np.any(is_doubtful):
-        minimum, weights = _solve_gnc(graph, start_residuals, minimum, is_doubtful)
+    if robust and np.any(may_be_false):
+        minimum, weights = _solve_gnc(graph, start_residuals, minimum, may_be_false)
     return Solution(
         poses=minimum.residuals.poses,
         cost=0.5 * float(np.sum(weights * minimum.residuals.chi2)),
@@ -138,16 +137,16 @@ def _minimise(
     weights: Array,
     tolerance: float = _COST_TOLERANCE,
     max_iterations: int = MAX_ITERATIONS,
-) -> _Minimum:
-    """Minimise the cost from ``residuals``, like GTSAM's LevenbergMarquardtOptimizer."""
+) -> _Optimum:
+    """Minimise the cost, starting at ``residuals``, like GTSAM's LevenbergMarquardtOptimizer."""
     damping = _INITIAL_DAMPING
     iterations = 0
     cost = float(np.sum(0.5 * weights * residuals.chi2))
     while iterations < max_iterations and cost > _COST_TOLERANCE:
-        # Derivatives of the residual: J by x_j, -J A by x_i, with A the adjoint of x_i relative to
-        # x_j
+        # Derivatives of the residual: J with respect to x_j, -J A with respect to x_i (J: inverse
+        # right Jacobian, A: adjoint of the pose x_i relative to x_j)
         jacobian = lie.right_jacobian_inverse(residuals.residual)
-        first_jacobian = jacobian @ lie.adjoint(lie.inverse(residuals.relative))
+        first_jacobian = jacobian @ lie.adjoint(lie.inverse(residuals.relative_poses))
         values, gradient = graph.normal_equations.assemble(
             -first_jacobian,
             jacobian,
@@ -168,39 +167,42 @@ def _minimise(
                 is_converged = abs(cost_decrease) < tolerance * cost
             is_accepted = (
                 predicted_decrease > _FLOAT_EPSILON * cost
-                and cost_decrease > _MIN_FIDELITY * predicted_decrease
+                and cost_decrease > _MIN_GAIN_RATIO * predicted_decrease
             )
             if is_accepted or is_converged or damping >= _MAX_DAMPING:
                 break
             damping *= _DAMPING_FACTOR
         if not is_accepted:
-            return _Minimum(residuals, iterations, is_converged)
+            return _Optimum(residuals, iterations, is_converged)
         residuals = trial_residuals
         cost_before = cost
         cost = cost - cost_decrease
         iterations += 1
         damping /= _DAMPING_FACTOR
         if cost_decrease <= max(tolerance * cost_before, _COST_TOLERANCE):
-            return _Minimum(residuals, iterations, True)
-    return _Minimum(residuals, iterations, cost <= _COST_TOLERANCE)
+            return _Optimum(residuals, iterations, True)
+    return _Optimum(residuals, iterations, cost <= _COST_TOLERANCE)
 
 
 def _solve_gnc(
-    graph: PoseGraph, start: Residuals, unweighted_minimum: _Minimum, is_doubtful: BoolArray
-) -> tuple[_Minimum, Array]:
+    graph: PoseGraph,
+    start: Residuals,
+    unweighted_minimum: _Optimum,
+    may_be_false: BoolArray,
+) -> tuple[_Optimum, Array]:
     """Drop false closures by graduated non-convexity from two starts; use the lower minimum.
 
     A dropped closure is restored if this lowers the truncated least-squares cost.
     """
-    degrees_of_freedom = model.observed_directions(graph.information)
-    chi2_bound = np.full(len(is_doubtful), np.inf)
-    drop_cost = np.zeros(len(is_doubtful))
-    is_testable = is_doubtful & (degrees_of_freedom > 0)
-    half_freedom = degrees_of_freedom[is_testable] / 2.0
-    chi2_bound[is_testable] = 2.0 * gammaincinv(half_freedom, GNC_PROBABILITY)
-    drop_cost[is_testable] = 2.0 * gammaincinv(half_freedom, DROP_PROBABILITY)
+    degrees_of_freedom = model.count_observed_directions(graph.information)
+    chi2_bound = np.full(len(may_be_false), np.inf)
+    drop_cost = np.zeros(len(may_be_false))
+    is_testable = may_be_false & (degrees_of_freedom > 0)
+    half_degrees_of_freedom = degrees_of_freedom[is_testable] / 2.0
+    chi2_bound[is_testable] = 2.0 * gammaincinv(half_degrees_of_freedom, GNC_INLIER_PROBABILITY)
+    drop_cost[is_testable] = 2.0 * gammaincinv(half_degrees_of_freedom, KEEP_PROBABILITY)
 
-    def truncated_cost(residuals: Residuals, edge_weights: Array) -> float:
+    def compute_truncated_cost(residuals: Residuals, edge_weights: Array) -> float:
         return 0.5 * float(np.sum(np.where(edge_weights > 0.0, residuals.chi2, drop_cost)))
 
     iteration_count = unweighted_minimum.iterations
@@ -208,7 +210,7 @@ def _solve_gnc(
     for start_residuals in (unweighted_minimum.residuals, start):
         minimum, weights = _run_gnc(graph, start_residuals, chi2_bound)
         iteration_count += minimum.iterations
-        solutions.append((truncated_cost(minimum.residuals, weights), minimum, weights))
+        solutions.append((compute_truncated_cost(minimum.residuals, weights), minimum, weights))
     lowest_cost, minimum, weights = min(solutions, key=lambda solution: solution[0])
     dropped_edges = np.flatnonzero(weights == 0.0)
     for edge_index in dropped_edges[np.argsort(minimum.residuals.chi2[dropped_edges])][
@@ -218,19 +220,19 @@ def _solve_gnc(
         trial_weights[edge_index] = 1.0
         retried_minimum = _minimise(graph, minimum.residuals, trial_weights)
         iteration_count += retried_minimum.iterations
-        if (cost := truncated_cost(retried_minimum.residuals, trial_weights)) < lowest_cost:
+        if (cost := compute_truncated_cost(retried_minimum.residuals, trial_weights)) < lowest_cost:
             lowest_cost = cost
             minimum = retried_minimum
             weights = trial_weights
     model.require_connected(graph, weights > 0.0, "the edges that robust optimisation did not drop")
-    return _Minimum(minimum.residuals, iteration_count, minimum.converged), weights
+    return _Optimum(minimum.residuals, iteration_count, minimum.converged), weights
 
 
-def _run_gnc(graph: PoseGraph, start: Residuals, chi2_bound: Array) -> tuple[_Minimum, Array]:
+def _run_gnc(graph: PoseGraph, start: Residuals, chi2_bound: Array) -> tuple[_Optimum, Array]:
     """Run graduated non-convexity from one start (Yang 2020, algorithm 1, eq. 13 and 14)."""
     residuals = start
     iteration_count = 0
-    # The excess is -1 for edges that cannot be false, because their bound is infinite
+    # -1, the minimum, for edges that cannot be false, because their bound is infinite
     chi2_excess = 2.0 * residuals.chi2 / chi2_bound - 1.0
     if np.max(chi2_excess) > 0.0:
         gnc_control = 1.0 / float(np.max(chi2_excess))
@@ -241,7 +243,7 @@ def _run_gnc(graph: PoseGraph, start: Residuals, chi2_bound: Array) -> tuple[_Mi
                 np.sqrt(gnc_control * (gnc_control + 1.0) / chi2_ratio) - gnc_control, 0.0, 1.0
             )
             stage_minimum = _minimise(
-                graph, residuals, weights, _STAGE_TOLERANCE, _MAX_STAGE_ITERATIONS
+                graph, residuals, weights, _GNC_STAGE_TOLERANCE, _MAX_GNC_STAGE_ITERATIONS
             )
             residuals = stage_minimum.residuals
             iteration_count = iteration_count + stage_minimum.iterations
@@ -258,7 +260,7 @@ def _run_gnc(graph: PoseGraph, start: Residuals, chi2_bound: Array) -> tuple[_Mi
         if np.array_equal(new_weights, weights):
             break
         weights = new_weights
-    return _Minimum(residuals, iteration_count, truncated_minimum.converged), weights
+    return _Optimum(residuals, iteration_count, truncated_minimum.converged), weights
 
 
 class Graph(Record, kw_only=True):
@@ -275,8 +277,8 @@ class Graph(Record, kw_only=True):
     reduced_chi2_interval : tuple of float
         95 % interval of ``reduced_chi2`` for correct information matrices and closures.
     information_factor : float
-        Estimated factor by which all information matrices are too large; 1 if it is not large. Gate
-        and robust optimisation use the information divided by it.
+        Estimated factor by which all information matrices are too large; 1 if it is below
+        MIN_INFORMATION_FACTOR. Gate and robust optimisation use the matrices divided by it.
     gates : tuple of GateResult, or Unavailable
         Tests of all edges that are not odometry.
     solutions : mapping from key of :data:`SOLUTIONS` to Solution
@@ -304,7 +306,7 @@ def analyse_graph(
     """Test the loop closures of a pose graph, and optimise the graph by least squares and robustly.
 
     Edges between successive vertices are odometry, all other edges are closures. By default, robust
-    optimisation is run with up to MAX_ROBUST_CLOSURES closures. Also return the pose graph with the
+    optimisation is run with up to MAX_GNC_CLOSURES closures. Also return the pose graph with the
     least-squares poses.
 
     Raises
@@ -315,32 +317,34 @@ def analyse_graph(
     is_closure = ~graph.find_successive()
     progress(f"optimising: {SOLUTIONS['all']}")
     solutions = {"all": solve(graph)}
-    freedom = int(model.observed_directions(graph.information).sum())
-    freedom -= (len(graph) - 1) * graph.information.shape[-1]
-    reduced_chi2, interval = 0.0, (0.0, 0.0)
-    if freedom > 0:
-        reduced_chi2 = 2.0 * solutions["all"].cost / freedom
-        interval = tuple((chdtri(freedom, [0.975, 0.025]) / freedom).tolist())
+    degrees_of_freedom = int(model.count_observed_directions(graph.information).sum())
+    degrees_of_freedom -= (len(graph) - 1) * graph.information.shape[-1]
+    reduced_chi2, reduced_chi2_interval = 0.0, (0.0, 0.0)
+    if degrees_of_freedom > 0:
+        reduced_chi2 = 2.0 * solutions["all"].cost / degrees_of_freedom
+        reduced_chi2_interval = tuple(
+            (chdtri(degrees_of_freedom, [0.975, 0.025]) / degrees_of_freedom).tolist()
+        )
     scaled_graph, information_factor = graph, 1.0
-    gates: tuple[GateResult, ...] | Unavailable
+    gate_results: tuple[GateResult, ...] | Unavailable
     try:
-        gates = tuple(gate_edges(graph, np.flatnonzero(is_closure)))
-        if reduced_chi2 > interval[1] and len(gates) >= MIN_FACTOR_CLOSURES:
-            factor = min(reduced_chi2, _information_factor(gates))
+        gate_results = tuple(gate_edges(graph, np.flatnonzero(is_closure)))
+        if reduced_chi2 > reduced_chi2_interval[1] and len(gate_results) >= MIN_CLOSURES_FOR_FACTOR:
+            factor = min(reduced_chi2, _estimate_information_factor(gate_results))
             if factor >= MIN_INFORMATION_FACTOR:
                 information_factor = factor
                 scaled_graph = replace(graph, information=graph.information / factor)
-                gates = tuple(gate_edges(scaled_graph, np.flatnonzero(is_closure)))
+                gate_results = tuple(gate_edges(scaled_graph, np.flatnonzero(is_closure)))
     except TrajectoryError as error:
-        gates = Unavailable(
+        gate_results = Unavailable(
             "gate", str(error), "Give an odometry edge between all successive vertices."
         )
     closure_count = int(np.count_nonzero(is_closure))
     if closure_count > 1 and (
-        closure_count <= MAX_ROBUST_CLOSURES if run_robust is None else run_robust
+        closure_count <= MAX_GNC_CLOSURES if run_robust is None else run_robust
     ):
-        progress(f"optimising: {SOLUTIONS[ROBUST]}")
-        solutions[ROBUST] = solve(scaled_graph, robust=True, is_closure=is_closure)
+        progress(f"optimising: {SOLUTIONS[ROBUST_KEY]}")
+        solutions[ROBUST_KEY] = solve(scaled_graph, robust=True, is_closure=is_closure)
     results = Graph(
         name=name,
         dimension=graph.dimension,
@@ -348,18 +352,18 @@ def analyse_graph(
         edges=len(graph.first_nodes),
         initialised=graph.initialised,
         reduced_chi2=reduced_chi2,
-        reduced_chi2_interval=interval,
+        reduced_chi2_interval=reduced_chi2_interval,
         information_factor=information_factor,
-        gates=gates,
+        gates=gate_results,
         solutions=solutions,
     )
     return results, replace(graph, poses=solutions["all"].poses)
 
 
-def _information_factor(gates: tuple[GateResult, ...]) -> float:
-    """Estimate a common factor of all information matrices from the distances of the closures.
+def _estimate_information_factor(gate_results: tuple[GateResult, ...]) -> float:
+    """Estimate a common factor of all information matrices from the d² of the closures.
 
     The median is robust against false closures if they are a minority.
     """
-    medians = chdtri([gate.degrees_of_freedom for gate in gates], 0.5)
-    return float(np.median(np.divide([gate.d2 for gate in gates], medians)))
+    chi2_medians = chdtri([gate.degrees_of_freedom for gate in gate_results], 0.5)
+    return float(np.median(np.divide([gate.d2 for gate in gate_results], chi2_medians)))
