@@ -75,14 +75,14 @@ def _compare_log(job: Job, path: Path, sha256: str) -> Outcome:
     # slow imports, which only the worker processes need
     from px4fuse.analysis import AidsOnlyAnalysis  # noqa: PLC0415
     from px4fuse.diagnose import diagnose_or_check_aids, read_flight  # noqa: PLC0415
-    from px4fuse.results.build import log_record, results  # noqa: PLC0415
+    from px4fuse.results.build import make_log_record, results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
     request = msgspec.structs.replace(job.request, log=str(path))
     row: Row = {"name": path.name, "log_sha256": sha256}
     try:
         flight = read_flight(request)
-        row |= log_columns(log_record(flight))
+        row |= log_columns(make_log_record(flight))
         analysis = diagnose_or_check_aids(request, flight=flight)
         if isinstance(analysis, AidsOnlyAnalysis):
             row |= finding_columns(analysis.findings, analysis.aids)

@@ -26,7 +26,7 @@ from px4fuse.core.record import Span
 from px4fuse.ekf2.earth_model import earth_rate_rad_s, ekf2_metres_per_metre
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import (
-    BAD_ACCELERATION,
+    BAD_ACCELERATION_FLAG,
     Columns,
     Ekf2,
     Flight,
@@ -547,8 +547,8 @@ def _make_segment(
         ).astype(np.float32),
         state_correlation=np.eye(15),
         is_acceleration_bad=(
-            fusion_record.was_in_state(BAD_ACCELERATION, step_times_s)
-            if BAD_ACCELERATION in fusion_record.states
+            fusion_record.was_in_state(BAD_ACCELERATION_FLAG, step_times_s)
+            if BAD_ACCELERATION_FLAG in fusion_record.states
             else None
         ),
     )
@@ -560,8 +560,8 @@ def _field_span(fusion_record: FusionRecord) -> Span | None:
     Return None if EKF2 did not fuse all three axes, or interrupted this fusion.
     """
     is_fused_3d = (
-        fusion_record.field_gauss["fused_3d"]
-        if len(fusion_record.field_gauss)
+        fusion_record.magnetic_field_gauss["fused_3d"]
+        if len(fusion_record.magnetic_field_gauss)
         else pd.Series(dtype=float)
     )
     fused_3d_s = is_fused_3d.index.to_numpy()
@@ -578,7 +578,7 @@ def _add_field(
     segment: ReplaySegment, fusion_record: FusionRecord, start_row: int, step_s: float
 ) -> ReplaySegment:
     initial_row = fusion_record.delayed.iloc[start_row]
-    field_gauss = fusion_record.field_gauss
+    field_gauss = fusion_record.magnetic_field_gauss
     sample_times_s = field_gauss.index.to_numpy()
     age_s = fusion_record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     fused_samples_per_row = max(MAG_FUSION_HZ * median_interval(sample_times_s), 1.0)

@@ -14,7 +14,7 @@ from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE, CHANGE, SENSOR
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
-from px4fuse.flight.model import BAD_ACCELERATION, Unavailable
+from px4fuse.flight.model import BAD_ACCELERATION_FLAG, Unavailable
 
 # Aiding sources of external vision, which other modules test by replays of EKF2
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
@@ -61,7 +61,7 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
     state_times_s = state_times_s[
         (state_times_s >= analysis.segment.start_s) & (state_times_s <= analysis.segment.end_s)
     ]
-    is_bad = ekf2.record.was_in_state(BAD_ACCELERATION, state_times_s)
+    is_bad = ekf2.record.was_in_state(BAD_ACCELERATION_FLAG, state_times_s)
     if not is_bad.any():
         return
     small_noise_parameters = {

@@ -16,7 +16,7 @@ from px4fuse.filter.signals import cut_to_segment
 from px4fuse.finding import Finding
 from px4fuse.findings.model import Findings, finding, format_percent, note, source_words, warning
 from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
-from px4fuse.flight.model import ALIGNED, Ekf2, Unavailable, positions_phrase, step_values_at
+from px4fuse.flight.model import ALIGNED_ORIGIN, Ekf2, Unavailable, positions_phrase, step_values_at
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
 # Minimum fraction of lost positions for a finding: PX4 v1.14 and later loses 0.3 %
@@ -248,10 +248,10 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
     # Intervals are not the receive intervals of PX4 if px4fuse changed the timestamps, or if PX4
-    # logged the positions after their use in EKF2 (ALIGNED)
+    # logged the positions after their use in EKF2 (ALIGNED_ORIGIN)
     if (
         source.clock_map is not None
-        or source.origin.find_preference_rank() >= ALIGNED.find_preference_rank()
+        or source.origin.find_preference_rank() >= ALIGNED_ORIGIN.find_preference_rank()
     ):
         return
     intervals_s, _ = _position_intervals_s(analysis)

@@ -37,10 +37,10 @@ from px4fuse.flight.model import (
     Ekf2,
     Truth,
     Unavailable,
+    estimate_white_noise_m,
     positions_phrase,
     reset_times_s,
     source_name,
-    white_noise_m,
 )
 
 # Minimum extent (m) of the positions (5th to 95th percentile) if the vehicle moves
@@ -553,7 +553,7 @@ def has_little_motion(comparison: Comparison) -> bool:
     positions = cut_to_segment(comparison.source.samples, comparison.segment)[
         Columns.POSITION[:2]
     ].dropna()
-    noise_m = white_noise_m(positions.to_numpy())
+    noise_m = estimate_white_noise_m(positions.to_numpy())
     return motion_range_m(comparison) < max(MIN_MOTION_RANGE_M, MIN_MOTION_RANGE_SIGMAS * noise_m)
 
 

@@ -274,7 +274,7 @@ def size_fraction(fault: InjectedFault, named_fault: NamedFault) -> float:
     1: within the tolerance. 1/2: near the tolerance. 1/3: wrong sign, or correct size of a wrong
     fault.
     """
-    named_size = named_fault.size_in_first_unit()
+    named_size = named_fault.convert_size_to_first_unit()
     if fault.size is None or fault.low is None or fault.high is None or named_size is None:
         return 0.0
     if named_fault.kind != fault.kind:
@@ -313,7 +313,7 @@ def correction_fraction(
     fault: InjectedFault, named_fault: NamedFault, right_answers: RightFormAnswers
 ) -> float:
     """Return the fraction of the points for the parameter that corrects a fault, with its value."""
-    named_value = named_fault.value_in_first_unit()
+    named_value = named_fault.convert_value_to_first_unit()
     fractions = [
         fraction
         if (low, high) == NO_BOUNDS
