@@ -78,9 +78,9 @@ def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -
 def test_event_symbols_of_long_flight_do_not_overlap() -> None:
     time_s = np.linspace(0.0, 3600.0, 20_000)
     visible = event_marks.select_marker_times(
-        time_s, 3600.0 * event_marks.MIN_MARK_INTERVAL_FRACTION
+        time_s, 3600.0 * event_marks.MIN_MARKER_INTERVAL_FRACTION
     )
-    assert len(visible) <= 1.0 / event_marks.MIN_MARK_INTERVAL_FRACTION + 1.0
+    assert len(visible) <= 1.0 / event_marks.MIN_MARKER_INTERVAL_FRACTION + 1.0
     assert set(visible) <= set(time_s)
 
 

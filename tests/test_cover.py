@@ -204,12 +204,12 @@ def test_report_cover_map_title_contains_distance_outside_map() -> None:
 
 
 def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis) -> None:
-    plot = cover_panels._innovation_plot(eventful.main)
+    plot = cover_panels._make_innovation_plot(eventful.main)
     updates = eventful.main.replay.updates
     normalised = updates["innovation_m"] / np.sqrt(updates["innovation_variance_m2"])
     largest = float(normalised.abs().max())
     assert largest > cover_panels.MAX_DRAWN_SIGMAS
-    assert f"outside ±4, up to KF {largest:.0f}" in plot.title
+    assert f"beyond ±4, largest KF {largest:.0f}" in plot.title
     axes = panels_by_title(drawn(eventful))[plot.title]
     edges = [
         line for line in axes.lines if line.get_marker() in ("^", "v") and len(line.get_xdata())

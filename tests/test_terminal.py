@@ -336,4 +336,4 @@ def test_progress_bar_appears_only_on_a_terminal(monkeypatch, capsys) -> None:
 def test_bold_text_of_report_is_bold_on_terminal() -> None:
     for weight, bold in (("bold", True), ("regular", False)):
         block = {"text": "so", "colour": "black", "weight": weight}
-        assert ("bold" in str(screen._styled_text(block).style)) is bold  # type: ignore[arg-type]
+        assert ("bold" in str(screen._make_rich_text(block).style)) is bold  # type: ignore[arg-type]
