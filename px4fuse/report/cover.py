@@ -123,7 +123,7 @@ def _make_ratio_axis(card: Card) -> dict[str, Any]:
         "axis_title": "Is the reported uncertainty right?",
         "axis_text": AIDS_CAPTION if card.aids else axis_text,
         "axis_legend": (
-            f"grey: ratio of a consistent filter ({format_consistent_ratios()}){interval_legend} · "
+            f"grey: consistent ({format_consistent_ratios()}){interval_legend} · "
             f"◀ ▶ ratio outside {ends_text}"
         ),
         "ticks": [

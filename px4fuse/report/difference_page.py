@@ -186,7 +186,7 @@ def _draw_waterfall(
     axes.set_yticks(range(row_count), ["KF - EKF2, total", *setting_names, "unexplained"])
     axes.set_ylim(row_count - 0.4, -0.6)
     axes.set_xlim(min(0.0, float(bar_ends.min())), 1.2 * right_end)
-    axes.set_xlabel("% of the mean square difference KF - EKF2")
+    axes.set_xlabel("% of the mean square difference")
     axes.grid(visible=False)
 
 
