@@ -55,7 +55,7 @@ from px4fuse.findings import (  # noqa: E402
 from px4fuse.findings.cause_grouping import CONSEQUENCES, effect_ids  # noqa: E402
 from px4fuse.findings.model import CATALOGUE, FINDING_GROUPS, load_examples  # noqa: E402
 from px4fuse.flight.model import Columns  # noqa: E402
-from px4fuse.report.panels import INNOVATIONS, POSITION, SIGMA_P  # noqa: E402
+from px4fuse.report.panels import INNOVATIONS_PANEL, POSITION_PANEL, POSITION_SIGMA_PANEL  # noqa: E402
 from px4fuse.simulation.faults import parse_faults  # noqa: E402
 from px4fuse.simulation.flights import simulate_flight  # noqa: E402
 from px4fuse.simulation.scenario import Scenario  # noqa: E402
@@ -151,7 +151,7 @@ def examples() -> dict[str, Example]:
         add_two_noise_levels,
     ):
         flight = simulate_flight(Scenario(passes=4, seed=2, ekf2=False))
-        truth = flight.truth.samples[Columns.POSITION].dropna()
+        truth = flight.truth.samples[Columns.POSITION_PANEL].dropna()
         true_position_m = CubicSpline(truth.index.to_numpy(), truth.to_numpy())
         analysis = find_faults(
             compare(laid_over(flight, true_position_m, model, 10.0, 2), Settings())
@@ -346,7 +346,8 @@ def save_picture(name: str, example: Example, folder: Path) -> str:
     assert example.analysis is not None
     axis_analysis = example.analysis.axes.get(str(axis)) or example.analysis.main
     figure, panels = pyplot.subplots(3, sharex=True, figsize=(8, 7), layout="constrained")
-    for axes, panel in zip(panels, (POSITION, INNOVATIONS, SIGMA_P), strict=True):
+    drawn_panels = (POSITION_PANEL, INNOVATIONS_PANEL, POSITION_SIGMA_PANEL)
+    for axes, panel in zip(panels, drawn_panels, strict=True):
         panel.draw(axes, axis_analysis.with_flight_tracks())
         axes.set_ylabel(fill(panel.title, LABEL_LENGTH))
     panels[0].set_title(axis_analysis.axis.name)

@@ -293,9 +293,9 @@ def write_page(analysis: Analysis, path: Pathlike) -> Path:
 
 @display_html.register
 def _display_card(analysis: Analysis) -> str | None:
-    from px4fuse.report.card_html import make_diagnosis_card, notebook_html  # noqa: PLC0415 - slow import
+    from px4fuse.report.card_html import make_diagnosis_card, make_notebook_html  # noqa: PLC0415 - slow import
 
-    return None if analysis.request is None else notebook_html(make_diagnosis_card(analysis))
+    return None if analysis.request is None else make_notebook_html(make_diagnosis_card(analysis))
 
 
 def _require_suffix(path: Pathlike, suffix: str) -> Path:

@@ -294,7 +294,7 @@ def diagnose_or_check_aids(
         See :func:`diagnose`. MissingDataError also if EKF2's innovations are missing.
     """
     flight = flight or read_flight(request, progress)
-    if request.position_source or any(track.origin.is_automatic for track in flight.positions):
+    if request.position_source or any(track.origin.is_auto_candidate for track in flight.positions):
         return diagnose(request, progress, flight)
     missing_source, aids = explain_missing_source(flight), evaluate_aids(flight)
     if isinstance(aids, Unavailable):

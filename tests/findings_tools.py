@@ -21,13 +21,20 @@ from px4fuse.filter.time_offset import ClockOffset, PartOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.findings import Finding
 from px4fuse.flight.ekf2_parameters import PARAMETERS
-from px4fuse.flight.model import NO_INVALID_ROWS, RECEIVED, Columns, Ekf2, FusionRecord, Unavailable
+from px4fuse.flight.model import (
+    NO_INVALID_ROWS,
+    RECEIVED_ORIGIN,
+    Columns,
+    Ekf2,
+    FusionRecord,
+    Unavailable,
+)
 
 T = TypeVar("T")
 
 NONE = Unavailable("it", "no topic for it", "Log it.")
 SEGMENT = Segment(10.0, 110.0, "")
-DRIFTING = replace(RECEIVED, kind="vio")
+DRIFTING = replace(RECEIVED_ORIGIN, kind="vio")
 # Settings that differ from the defaults
 CHOSEN = Settings(sigma_a_m_s2=1.0, sigma_z_m=1.0)
 
@@ -81,7 +88,7 @@ def moving(rate_hz: float) -> pd.DataFrame:
 
 def source(**parts: Any) -> Any:
     usual = {
-        "name": "uwb", "description": "UWB", "origin": RECEIVED, "orientation": None,
+        "name": "uwb", "description": "UWB", "origin": RECEIVED_ORIGIN, "orientation": None,
         "frame": "NED",
         "clock_map": None, "alignment": None, "rate_hz": 5.0, "assumed_delay_s": 0.0,
         "samples": moving(parts.get("rate_hz", 5.0)), "status": pd.DataFrame(), "velocity": None,

@@ -26,7 +26,7 @@ from px4fuse.filter.signals import Axis, Segment, project_acceleration
 from px4fuse.filter.tuning import HORIZONTAL, tune
 from px4fuse.flight.model import (
     AXIS_NAMES,
-    RECEIVED,
+    RECEIVED_ORIGIN,
     Alignment,
     Columns,
     Dropout,
@@ -69,7 +69,7 @@ class Uwb:
     outlier_share: float = 0.0
     outlier_m: float = 3.0
     name: str = "vehicle_visual_odometry"
-    origin: Origin = RECEIVED
+    origin: Origin = RECEIVED_ORIGIN
     frame: str = "NED"
 
 

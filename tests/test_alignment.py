@@ -21,7 +21,7 @@ from px4fuse.core.arrays import Array
 from px4fuse.diagnose import diagnose
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import (
-    POSITION_FILE,
+    POSITION_FILE_ORIGIN,
     Alignment,
     Columns,
     Flight,
@@ -276,7 +276,7 @@ def test_align_position_file_adds_positions_to_flight_data(flight: Flight) -> No
     result = align_position_file(flight, uwb_file(flight))
     track, *others = result.positions
     assert track.name == track.log == "uwb.csv"
-    assert (track.origin, track.frame) == (POSITION_FILE, "NED")
+    assert (track.origin, track.frame) == (POSITION_FILE_ORIGIN, "NED")
     assert track.clock.endswith(" s (matched with EKF2 position)")
     assert tuple(others) == flight.positions
     assert result.inputs == (InputFile("uwb.csv", "f" * 64, 1234, "position"),)

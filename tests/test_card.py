@@ -19,7 +19,7 @@ from px4fuse.diagnose import find_faults
 from px4fuse.errors import LogError
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import Finding
-from px4fuse.flight.model import RECEIVED
+from px4fuse.flight.model import RECEIVED_ORIGIN
 from px4fuse.readers import read_log
 from px4fuse.report.card_text import card_lines
 from px4fuse.request import ComparisonRequest
@@ -60,7 +60,7 @@ def trial(
 
 
 def analysis(*trials: Trial) -> Any:
-    source = SimpleNamespace(origin=RECEIVED, alignment=None)
+    source = SimpleNamespace(origin=RECEIVED_ORIGIN, alignment=None)
     model = SimpleNamespace(inputs=SimpleNamespace(settings={"EKF2_ACC_NOISE": 0.35}))
     return SimpleNamespace(
         select_main_trials=lambda: trials,
@@ -173,7 +173,7 @@ def test_diagnosis_of_unreadable_log_shows_first_bytes_of_file(tmp_path) -> None
     with pytest.raises(LogError) as caught:
         read_log(path)
     lines = [text for line in card_lines(build_refusal_card(caught.value, path)) for text in
-             line.wrapped(100)]  # fmt: skip
+             line.wrap(100)]  # fmt: skip
     assert lines == [
         "error[log_unreadable]: a.bin: the file is an ArduPilot DataFlash log, not a PX4 ULog",
         "  read     1,200 bytes; first bytes A3 95 80 01 (of a ULog: 55 4C 6F 67)",

@@ -16,11 +16,11 @@ import px4fuse
 from px4fuse.card.model import Action, Card, Identity, Note, map_ratio_to_axis
 from px4fuse.core.text import format_ratio
 from px4fuse.report.card_html import (
-    MARK_PATHS,
-    alternative_text,
-    card_html,
-    notebook_html,
-    sigma_ratio_html,
+    MARKER_SVG_PATHS,
+    make_alternative_text,
+    make_card_html,
+    make_notebook_html,
+    make_sigma_ratio_html,
 )
 
 HOSTILE = '<img src=x onerror="window.alive=1"></style><script>window.alive=2</script>\u202e'
@@ -31,7 +31,7 @@ def text_of(html: str) -> str:
 
 
 def test_diagnosis_html_shows_every_field_of_the_card() -> None:
-    text = text_of(card_html(SMALL_SIGMA_A))
+    text = text_of(make_card_html(SMALL_SIGMA_A))
     cause = SMALL_SIGMA_A.causes[0]
     for part in (
         "■ ERROR", SMALL_SIGMA_A.headline, SMALL_SIGMA_A.effect_text, *SMALL_SIGMA_A.do_this,
@@ -42,7 +42,7 @@ def test_diagnosis_html_shows_every_field_of_the_card() -> None:
         assert part in text
     assert text.count(SMALL_SIGMA_A.effect_text) == 1
     assert "Apply" not in text
-    assert card_html(SMALL_SIGMA_A, has_apply=True).count("data-apply") == 1
+    assert make_card_html(SMALL_SIGMA_A, has_apply_buttons=True).count("data-apply") == 1
 
 
 def test_sigma_ratio_html_plot_shows_ratio_and_interval() -> None:
@@ -50,17 +50,17 @@ def test_sigma_ratio_html_plot_shows_ratio_and_interval() -> None:
                          (None, "not evaluated")))  # fmt: skip
     four[1] = structs.replace(four[1], interval=(0.8, 1.2))
     four[3] = structs.replace(four[3], reason="the log has no <ground> truth")
-    html = sigma_ratio_html(four, "along the aisle")
+    html = make_sigma_ratio_html(four, "along the aisle")
     marks = re.findall(r'class="mark" y="10" x="([\d.]+)%"><path d="([^"]+)"', html)
     middle = f"{100.0 * map_ratio_to_axis(0.9):.2f}"
     assert marks == [
-        ("100.00", MARK_PATHS["above"]),
-        (middle, MARK_PATHS["truth"]),
-        ("0.00", MARK_PATHS["below"]),
+        ("100.00", MARKER_SVG_PATHS["above"]),
+        (middle, MARKER_SVG_PATHS["truth"]),
+        ("0.00", MARKER_SVG_PATHS["below"]),
     ]
     assert html.count('class="interval"') == 3
     assert "not evaluated: the log has no &lt;ground&gt; truth" in html
-    assert f'aria-label="{alternative_text(four[:1])}' in html
+    assert f'aria-label="{make_alternative_text(four[:1])}' in html
     # only verdicts that are not consistent are bold
     assert re.findall(r'class="ratio( loud)?">([\d.]+)', html) == [
         (" loud", format_ratio(21.0)),
@@ -71,7 +71,7 @@ def test_sigma_ratio_html_plot_shows_ratio_and_interval() -> None:
 
 def test_diagnosis_html_verdict_with_known_cause_is_not_bold() -> None:
     one = structs.replace(verdicts(*[(2.2, "overconfident")] * 4)[2], is_explained=True)
-    html = sigma_ratio_html([one], "along the aisle")
+    html = make_sigma_ratio_html([one], "along the aisle")
     assert "loud" not in html
     assert "2.2, overconfident, explained" in html
 
@@ -93,10 +93,12 @@ def test_diagnosis_html_escapes_text_from_logs() -> None:
         causes=(cause, cause),
         notes=(Note("x", HOSTILE, HOSTILE),),
     )
-    html = card_html(card, has_apply=True)
+    html = make_card_html(card, has_apply_buttons=True)
     assert {tag for tag, _ in Elements(html).found}.isdisjoint({"img", "script", "style"})
     assert "\u202e" not in html
-    allowed = {tag for tag, _ in Elements(card_html(SMALL_SIGMA_A, has_apply=True)).found}
+    allowed = {
+        tag for tag, _ in Elements(make_card_html(SMALL_SIGMA_A, has_apply_buttons=True)).found
+    }
     assert {tag for tag, _ in Elements(html).found} <= allowed
 
 
@@ -108,7 +110,7 @@ def test_diagnosis_of_rejected_log_has_no_sigma_ratio_plot() -> None:
         facts={"read": "4,096 bytes", "KF": "not run"},
         identity=Identity(file="a.BIN"),
     )
-    html = card_html(card)
+    html = make_card_html(card)
     assert "✕ REFUSED" in html
     assert "<figure" not in html
     assert "4,096 bytes" in text_of(html)
@@ -138,7 +140,7 @@ def test_diagnosis_html_fits_phone_and_is_accessible(
     file = tmp_path / "card.html"
     head = '<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>card</title>'
     viewport = '<meta name="viewport" content="width=device-width">'
-    page = f"{head}{viewport}<main><h1>Card</h1>{notebook_html(SMALL_SIGMA_A)}</main>"
+    page = f"{head}{viewport}<main><h1>Card</h1>{make_notebook_html(SMALL_SIGMA_A)}</main>"
     file.write_text(page, encoding="utf-8")
     browser.open(file, width=width)
     browser.resize(width, 800)

@@ -17,7 +17,7 @@ DELAY = Action("EKF2", "EKF2_EV_DELAY 0 → 264 ms", ("param set EKF2_EV_DELAY 2
 
 
 def text_of(card: Card) -> list[str]:
-    return [text for line in card_text.card_lines(card) for text in line.wrapped(100)]
+    return [text for line in card_text.card_lines(card) for text in line.wrap(100)]
 
 
 @pytest.mark.parametrize(

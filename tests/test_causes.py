@@ -15,7 +15,7 @@ from px4fuse.findings.cause_grouping import (
     group_by_cause,
 )
 from px4fuse.flight.model import Unavailable
-from px4fuse.report.phrases import format_verdict, verdict_notes
+from px4fuse.report.phrases import format_verdict, list_verdict_warnings
 
 
 def one(name: str, severity: str = "warning", **evidence: str) -> Finding:
@@ -85,7 +85,7 @@ def test_fault_report_lists_consequences_after_their_cause(given: Any, told: Any
 
 
 def test_consistency_notes_list_innovations_that_are_correlated(sample: Analysis) -> None:
-    (white,) = verdict_notes(sample)
+    (white,) = list_verdict_warnings(sample)
     assert format_verdict(sample.axes["aisle"].filters["kf"]) == "consistent"
     assert format_verdict(Unavailable("test", "too few innovations", "")) == "not evaluated"
     assert "Ljung-Box test, p < 0.001" in white
@@ -96,9 +96,9 @@ def test_consistency_notes_of_white_innovations_are_empty(sample: Analysis) -> N
     east = sample.axes["east"]
     fine = replace(east.filters["kf"], ljung_box_p=0.5)
     white = replace(east, filters={**east.filters, "kf": fine})
-    assert verdict_notes(replace(sample, axes={"east": white})) == []
+    assert list_verdict_warnings(replace(sample, axes={"east": white})) == []
 
 
 def test_note_on_consistent_odometry_states_that_it_may_drift(sample: Analysis) -> None:
     turning = replace(sample.source, origin=replace(sample.source.origin, kind="vio"))
-    assert "source may drift" in verdict_notes(replace(sample, source=turning))[0]
+    assert "source may drift" in list_verdict_warnings(replace(sample, source=turning))[0]

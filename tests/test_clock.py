@@ -48,17 +48,17 @@ from px4fuse.filter.likelihood import compute_profile_interval
 from px4fuse.filter.signals import Segment
 from px4fuse.filter.time_offset import MAX_CHANGE_P_VALUE, ClockOffset, PartOffset
 from px4fuse.flight.model import (
-    ALIGNED,
-    GNSS,
-    LOGGED_BY_EKF2,
-    MOTION_CAPTURE,
-    POSITION_FILE,
+    ALIGNED_ORIGIN,
+    GNSS_ORIGIN,
+    KEPT_BY_EKF2_ORIGIN,
+    MOTION_CAPTURE_ORIGIN,
+    POSITION_FILE_ORIGIN,
     Columns,
     Flight,
     Unavailable,
-    with_orientation,
+    reclassify_as_vio,
 )
-from px4fuse.report.clock import clock_advice
+from px4fuse.report.clock import make_time_offset_advice
 
 DT = SETTINGS.dt_s
 
@@ -405,7 +405,7 @@ def test_time_offset_estimate_excludes_position_outliers() -> None:
     _, found = estimate_noises_and_clock(compared)
     assert covers(found, -0.2)
     assert (found.applied_s, found.remaining_s) == (-0.2, pytest.approx(0.0, abs=0.03))
-    assert clock_advice(compared, found)["Offset"].startswith("Add -0.")
+    assert make_time_offset_advice(compared, found)["Offset"].startswith("Add -0.")
 
 
 def test_time_offset_jump_p_value_equals_bonferroni_t_test() -> None:
@@ -451,16 +451,16 @@ def stated(
 @pytest.mark.parametrize(
     ("origin", "drifts"),
     [
-        (POSITION_FILE, False),
-        (MOTION_CAPTURE, False),
-        (GNSS, False),
-        (ALIGNED, True),
-        (LOGGED_BY_EKF2, True),
+        (POSITION_FILE_ORIGIN, False),
+        (MOTION_CAPTURE_ORIGIN, False),
+        (GNSS_ORIGIN, False),
+        (ALIGNED_ORIGIN, True),
+        (KEPT_BY_EKF2_ORIGIN, True),
     ],
 )
 def test_vision_source_with_orientation_is_treated_as_drifting(origin, drifts) -> None:
-    assert with_orientation(origin, is_changing=True).may_drift is drifts
-    assert not with_orientation(origin, is_changing=False).may_drift
+    assert reclassify_as_vio(origin, has_changing_orientation=True).may_drift is drifts
+    assert not reclassify_as_vio(origin, has_changing_orientation=False).may_drift
 
 
 def test_time_offset_interval_widens_if_flight_parts_differ() -> None:

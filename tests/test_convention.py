@@ -25,7 +25,14 @@ from px4fuse.finding import Finding
 from px4fuse.findings import source_convention
 from px4fuse.findings.cause_grouping import CONVENTION_KEY
 from px4fuse.findings.model import finding
-from px4fuse.flight.model import GNSS, RECEIVED, Columns, Flight, PositionTrack, Unavailable
+from px4fuse.flight.model import (
+    GNSS_ORIGIN,
+    RECEIVED_ORIGIN,
+    Columns,
+    Flight,
+    PositionTrack,
+    Unavailable,
+)
 from px4fuse.readers import read_log
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation.faults import parse_faults
@@ -92,10 +99,10 @@ def sent(
     stamps = time + late_s + clock_drift * (time - time.mean())
     samples = pd.DataFrame(position, pd.Index(stamps, name="time_s"), Columns.POSITION)
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
-    return PositionTrack("made", RECEIVED, "", samples, "NED", "", ())
+    return PositionTrack("made", RECEIVED_ORIGIN, "", samples, "NED", "", ())
 
 
-def with_orientation(track: PositionTrack, quaternion: np.ndarray, time: np.ndarray):
+def reclassify_as_vio(track: PositionTrack, quaternion: np.ndarray, time: np.ndarray):
     table = pd.DataFrame(quaternion, pd.Index(time, name="time_s"), Columns.QUATERNION)
     return replace(track, orientation=table)
 
@@ -145,7 +152,7 @@ def test_frame_detection_finds_yaw_rotation_of_positions(rotation_deg):
 def test_yaw_rotation_refers_to_gnss_if_ekf2_heading_is_wrong():
     attitude = flown().attitude.copy()
     attitude[Columns.QUATERNION] = multiply(yaw(-14.0), attitude[Columns.QUATERNION].to_numpy())
-    gnss = replace(sent(flown(), late_s=0.2, sigma_m=0.3, seed=2), origin=GNSS)
+    gnss = replace(sent(flown(), late_s=0.2, sigma_m=0.3, seed=2), origin=GNSS_ORIGIN)
     no_ekf2 = Unavailable("EKF2", "not logged", "")
     flight = replace(flown(), attitude=attitude, positions=(gnss,), ekf2=no_ekf2)
     found = check_convention(flight, sent(flown(), rotation_deg=60.0))
@@ -191,7 +198,7 @@ def test_frame_detection_without_height_finds_horizontal_axes():
 def test_frame_detection_finds_ros_frames_of_orientation(frames):
     time, attitude = oriented(flown())
     quaternion = multiply(multiply(np.array(NED_TO[frames]), attitude), np.array(NED_TO["NWU"]))
-    track = with_orientation(sent(flown(), ENU if frames == "ENU" else NWU), quaternion, time)
+    track = reclassify_as_vio(sent(flown(), ENU if frames == "ENU" else NWU), quaternion, time)
     found = check_convention(flown(), track).orientation
     assert found.frames == f"FLU to {frames}"
     assert abs(found.heading_error_deg) < 3.0
@@ -200,7 +207,7 @@ def test_frame_detection_finds_ros_frames_of_orientation(frames):
 @pytest.mark.parametrize("error_deg", [-90.0, 45.0, 180.0])
 def test_frame_detection_finds_heading_error_of_orientation(error_deg):
     time, attitude = oriented(flown())
-    track = with_orientation(sent(flown()), multiply(yaw(error_deg), attitude), time)
+    track = reclassify_as_vio(sent(flown()), multiply(yaw(error_deg), attitude), time)
     found = check_convention(flown(), track).orientation
     assert found.frames == "FRD to NED"
     difference = (found.heading_error_deg - error_deg + 180.0) % 360.0 - 180.0
@@ -222,17 +229,17 @@ def copied(flight: Flight) -> PositionTrack:
     time = np.arange(attitude.index[0] + 1.0, attitude.index[-1], 0.1)
     quaternions = attitude[Columns.QUATERNION].to_numpy()
     sent_back = interpolate(time - 0.03, attitude.index.to_numpy(), quaternions)
-    return with_orientation(sent(flight), sent_back, time)
+    return reclassify_as_vio(sent(flight), sent_back, time)
 
 
 def w_last(flight: Flight) -> PositionTrack:
     time, attitude = oriented(flight)
-    return with_orientation(sent(flight), np.roll(attitude, -1, axis=1), time)
+    return reclassify_as_vio(sent(flight), np.roll(attitude, -1, axis=1), time)
 
 
 def turned(flight: Flight) -> PositionTrack:
     time, attitude = oriented(flight)
-    return with_orientation(sent(flight), multiply(yaw(90.0), attitude), time)
+    return reclassify_as_vio(sent(flight), multiply(yaw(90.0), attitude), time)
 
 
 # By id of the finding, and kind of the fault
@@ -250,7 +257,7 @@ CONVENTION_FAULTS = {
 
 def compared(track: PositionTrack) -> Comparison:
     """Return the prepared comparison of a flight that EKF2 flew with other positions."""
-    usual = [one for one in flown().positions if not one.origin.is_automatic]
+    usual = [one for one in flown().positions if not one.origin.is_auto_candidate]
     return prepare(replace(flown(), positions=(track, *usual)))
 
 
@@ -301,7 +308,7 @@ def test_positions_in_correct_ned_frame_give_no_frame_fault():
 def test_enu_orientation_report_contains_conversion_to_ned():
     time, attitude = oriented(flown())
     quaternion = multiply(multiply(np.array(NED_TO["ENU"]), attitude), np.array(NED_TO["NWU"]))
-    (found,) = source_convention.detect(compared(with_orientation(sent(flown()), quaternion, time)))
+    (found,) = source_convention.detect(compared(reclassify_as_vio(sent(flown()), quaternion, time)))
     assert found.evidence[CONVENTION_KEY] == "frames"
     assert "q_NED = (0, √½, √½, 0) ⊗ q ⊗ (0, 1, 0, 0)" in found.remedy
 

@@ -61,7 +61,7 @@ def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -
     axes = Figure().add_axes((0.1, 0.1, 0.8, 0.8))
     axes.plot([6.0, 94.0], [2.0, 3.0])
     limits = axes.get_xlim(), axes.get_ylim()
-    event_marks.draw_marks(axes, eventful)
+    event_marks.draw_event_markers(axes, eventful)
     axes.autoscale()
     assert (axes.get_xlim(), axes.get_ylim()) == limits
     axes.lines[0].remove()
@@ -77,20 +77,22 @@ def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -
 
 def test_event_symbols_of_long_flight_do_not_overlap() -> None:
     time_s = np.linspace(0.0, 3600.0, 20_000)
-    visible = event_marks.visible_times(time_s, 3600.0 * event_marks.MIN_MARK_INTERVAL_FRACTION)
-    assert len(visible) <= 1.0 / event_marks.MIN_MARK_INTERVAL_FRACTION + 1.0
+    visible = event_marks.select_marker_times(
+        time_s, 3600.0 * event_marks.MIN_MARKER_INTERVAL_FRACTION
+    )
+    assert len(visible) <= 1.0 / event_marks.MIN_MARKER_INTERVAL_FRACTION + 1.0
     assert set(visible) <= set(time_s)
 
 
 def test_zoomed_plot_window_avoids_position_gap() -> None:
     made = aisle_flight(duration_s=120.0, uwb=Uwb(gap_s=(50.0, 70.0)))
     comparison = compare(made)
-    start, end = flight.zoom_window(comparison.main, comparison.segment)
+    start, end = flight.find_zoom_span(comparison.main, comparison.segment)
     updates = comparison.main.replay.updates.index
     assert ((updates >= start) & (updates <= end)).sum() == flight.ZOOM_UPDATE_COUNT + 1
     assert end - start < 4.0  # beside the gap in the middle, not across it
     assert abs((start + end) / 2.0 - 60.0) < 12.5
-    sentence = panels.sigma_sentence(unexplained(comparison), comparison.main)
+    sentence = panels.describe_sigma_growth(unexplained(comparison), comparison.main)
     assert sentence.startswith("In the gap of 20.0 s")
     assert "σ grew to" in sentence
 

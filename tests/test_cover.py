@@ -98,7 +98,9 @@ def test_report_cover_shows_3_notes_and_counts_the_others() -> None:
 )  # fmt: skip
 def test_report_cover_leaves_no_space_for_empty_text(field: str, empty: Any) -> None:
     card = replace(SMALL_SIGMA_A, reconcile="The two verdicts differ.")
-    heights = [cover.free_height(page_of(each)) for each in (card, replace(card, **{field: empty}))]
+    heights = [
+        cover.find_free_height(page_of(each)) for each in (card, replace(card, **{field: empty}))
+    ]
     assert heights[1] > heights[0] + 8.0
 
 
@@ -198,16 +200,16 @@ def test_cover_map_title_states_largest_distance_outside_map() -> None:
     analysis = unexplained(compare(flight))
     titles = panels_by_title(drawn(analysis))
     (title,) = (title for title in titles if title.startswith("Map"))
-    assert title.startswith("Map; largest distance outside the map: EKF2 3")
+    assert title.startswith("Map; largest distance of tracks from the map: EKF2 3")
 
 
 def test_innovations_beyond_plot_scale_are_drawn_as_triangles(eventful: Analysis) -> None:
-    plot = cover_panels._innovation_plot(eventful.main)
+    plot = cover_panels._make_innovation_plot(eventful.main)
     updates = eventful.main.replay.updates
     normalised = updates["innovation_m"] / np.sqrt(updates["innovation_variance_m2"])
     largest = float(normalised.abs().max())
     assert largest > cover_panels.MAX_DRAWN_SIGMAS
-    assert f"outside ±4, up to KF {largest:.0f}" in plot.title
+    assert f"beyond ±4, largest KF {largest:.0f}" in plot.title
     axes = panels_by_title(drawn(eventful))[plot.title]
     edges = [
         line for line in axes.lines if line.get_marker() in ("^", "v") and len(line.get_xdata())
@@ -224,7 +226,9 @@ def test_report_cover_from_same_input_is_byte_identical(eventful: Analysis) -> N
 def test_report_cover_long_text_moves_plots_to_second_page(eventful: Analysis, count: int) -> None:
     page = page_of(replace(SMALL_SIGMA_A, causes=SMALL_SIGMA_A.causes * count))
     with report_style():
-        cover_panels.write_panels(page.blocks[0], eventful, SMALL_SIGMA_A, cover.free_height(page))
+        cover_panels.write_panels(
+            page.blocks[0], eventful, SMALL_SIGMA_A, cover.find_free_height(page)
+        )
     first, second = set_by_typst(page)
     assert "Innovations ÷ √S" not in first
     assert "Innovations ÷ √S" in second

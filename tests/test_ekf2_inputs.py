@@ -41,17 +41,17 @@ from px4fuse.flight.ekf2_parameters import (
     GNSS_POS,
     PARAMETERS,
     check_parameters,
-    effective_settings,
+    fill_with_defaults,
     uses_aid_mask,
 )
 from px4fuse.flight.model import (
-    ALIGNED,
-    DEAD_RECKONING,
-    GNSS,
-    LOGGED_BY_EKF2,
-    MOTION_CAPTURE,
-    POSITION_FILE,
-    RECEIVED,
+    ALIGNED_ORIGIN,
+    DEAD_RECKONING_FLAG,
+    GNSS_ORIGIN,
+    KEPT_BY_EKF2_ORIGIN,
+    MOTION_CAPTURE_ORIGIN,
+    POSITION_FILE_ORIGIN,
+    RECEIVED_ORIGIN,
     AidLog,
     Columns,
     Ekf2,
@@ -73,14 +73,14 @@ AID = ("estimator_aid_src_ev_pos",)
 
 def test_ekf2_parameters_missing_in_log_have_px4_defaults():
     """Defaults of PX4's module.yaml and params_*.yaml, by fused aid."""
-    vision, gnss = effective_settings({}), effective_settings({}, GNSS_POS)
+    vision, gnss = fill_with_defaults({}), fill_with_defaults({}, GNSS_POS)
     for names, other_names, begin in ((vision, gnss, "EKF2_EV"), (gnss, vision, "EKF2_GPS")):
         assert {*names} - {*other_names} == {name for name in PARAMETERS if name.startswith(begin)}
-    assert effective_settings({"EKF2_AID_MASK": 1.0}, GNSS_POS)["EKF2_GPS_DELAY"] == 110.0
-    assert effective_settings({})["EKF2_EV_DELAY"] == 0.0
-    assert effective_settings({"EKF2_AID_MASK": 8.0})["EKF2_EV_DELAY"] == 175.0
+    assert fill_with_defaults({"EKF2_AID_MASK": 1.0}, GNSS_POS)["EKF2_GPS_DELAY"] == 110.0
+    assert fill_with_defaults({})["EKF2_EV_DELAY"] == 0.0
+    assert fill_with_defaults({"EKF2_AID_MASK": 8.0})["EKF2_EV_DELAY"] == 175.0
     assert (
-        effective_settings({"EKF2_AID_MASK": 8.0, "EKF2_EV_DELAY": 50.0})["EKF2_EV_DELAY"] == 50.0
+        fill_with_defaults({"EKF2_AID_MASK": 8.0, "EKF2_EV_DELAY": 50.0})["EKF2_EV_DELAY"] == 50.0
     )
     assert not uses_aid_mask({"EKF2_AID_MASK": 8.0, "EKF2_EV_CTRL": 15.0})
 
@@ -179,15 +179,15 @@ def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> P
 
 
 @pytest.mark.parametrize(("tracks", "expected"), [
-    ([track("file", POSITION_FILE), track("vehicle_visual_odometry", RECEIVED)],
+    ([track("file", POSITION_FILE_ORIGIN), track("vehicle_visual_odometry", RECEIVED_ORIGIN)],
      "vehicle_visual_odometry"),
-    ([track("file", POSITION_FILE), track("gps", GNSS)], "file"),
-    ([track("mocap", MOTION_CAPTURE)], None),
+    ([track("file", POSITION_FILE_ORIGIN), track("gps", GNSS_ORIGIN)], "file"),
+    ([track("mocap", MOTION_CAPTURE_ORIGIN)], None),
     # complete copies: interval below 0.9 times the logger's, and at least 4 Hz
-    ([track(ALIGNED_TOPIC, ALIGNED, 0.179)], ALIGNED_TOPIC),
-    ([track(ALIGNED_TOPIC, ALIGNED, 0.181)], None),
-    ([track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2, 0.25)], "estimator_aid_src_ev_pos"),
-    ([track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2, 0.26)], None),
+    ([track(ALIGNED_TOPIC, ALIGNED_ORIGIN, 0.179)], ALIGNED_TOPIC),
+    ([track(ALIGNED_TOPIC, ALIGNED_ORIGIN, 0.181)], None),
+    ([track("estimator_aid_src_ev_pos", KEPT_BY_EKF2_ORIGIN, 0.25)], "estimator_aid_src_ev_pos"),
+    ([track("estimator_aid_src_ev_pos", KEPT_BY_EKF2_ORIGIN, 0.26)], None),
 ])  # fmt: skip
 def test_ekf2_replay_selects_the_most_complete_vision_topic(tracks, expected):
     found = _find_vision_track(made(Flight, positions=tuple(tracks)))
@@ -202,7 +202,7 @@ def test_vision_positions_in_frd_are_rotated_with_variance():
         q = Rotation.from_euler("z", heading, degrees=True).as_quat(scalar_first=True)
         return pd.DataFrame([q] * 30, index=time, columns=Columns.QUATERNION)
 
-    own = track("vehicle_visual_odometry", RECEIVED, frame="FRD", orientation=facing(0.0))
+    own = track("vehicle_visual_odometry", RECEIVED_ORIGIN, frame="FRD", orientation=facing(0.0))
     own.samples[Columns.POSITION] = [2.0, 0.5, -1.0]
     own.samples[Columns.POSITION_VARIANCE] = [0.04, np.nan, 0.09]
     for parameters, yaw, turned in (
@@ -221,7 +221,7 @@ def test_vision_positions_in_frd_are_rotated_with_variance():
         spread = [0.0, 0.04, 0.09] if turned else [0.04, 0.0, 0.09]
         assert_allclose(found.variance_m2, [spread] * 30, atol=1e-12)
         assert_allclose(found.arrival_s - time, np.linspace(0.05, 0.15, 30))
-    copy = track("estimator_aid_src_ev_pos", LOGGED_BY_EKF2)
+    copy = track("estimator_aid_src_ev_pos", KEPT_BY_EKF2_ORIGIN)
     found = read_vision(made(Flight, positions=(copy,)), ekf2, record, facing(90.0))
     assert np.all(found.arrival_s == -np.inf)
 
@@ -277,7 +277,7 @@ def test_logged_fusion_is_derived_from_time_of_last_fusion():
         aids={"ev_pos": made(AidLog, samples=logged)},
         states={"ev_pos": pd.Series([1.0], index=[0.0])},
     )  # fmt: skip
-    for states, resets_at in (({DEAD_RECKONING: steps}, 13), ({}, 14)):
+    for states, resets_at in (({DEAD_RECKONING_FLAG: steps}, 13), ({}, 14)):
         record = made(FusionRecord, parameters={}, states=states)
         rejected, reset = _read_logged_decisions(ekf2, record, taken, taken - 1.0)
         assert rejected[2] == 0.0

@@ -38,7 +38,7 @@ from px4fuse.ekf2.intervals import (
 from px4fuse.ekf2.model import Model, replay_with_settings
 from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment, add_field_states
 from px4fuse.errors import SettingsError
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, effective_settings
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, fill_with_defaults
 from px4fuse.trajectory.rotation import skew
 
 
@@ -362,7 +362,7 @@ def at_rest(
         reset_s=reset_s,
     )
     inputs = Inputs(
-        effective_settings(settings, aid, *([MAG] if segment.field else [])), (segment,), vision,
+        fill_with_defaults(settings, aid, *([MAG] if segment.field else [])), (segment,), vision,
         rules, 0.01, 0.1, 0.01,
         fuses_vision_height=False, imu_offset_m=np.zeros(3), aid=aid,
     )  # fmt: skip

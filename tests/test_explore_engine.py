@@ -18,8 +18,8 @@ from flights import Imu, Uwb, aisle_flight
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import shift_clock
-from px4fuse.explore.data import OFFSET_SLIDER_HALF_RANGE_S, kf_inputs, raw_source
-from px4fuse.explore.packing import FINE_SCALE, Packer
+from px4fuse.explore.data import OFFSET_SLIDER_HALF_RANGE_S, make_kf_inputs, undo_time_offset
+from px4fuse.explore.packing import FINE_STEPS_PER_UNIT, Packer
 from px4fuse.filter.kalman import Replay, replay, state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import make_axes
@@ -71,7 +71,7 @@ def in_browser(
     engine: Browser, comparison: Comparison, tries: list[tuple[int, Settings]]
 ) -> list[dict[str, dict[str, list[float]]]]:
     packer = Packer()
-    flight = kf_inputs(comparison, packer)
+    flight = make_kf_inputs(comparison, packer)
     tries_for_page = [(at, asdict(settings)) for at, settings in tries]
     values = {
         "text": packer.text(), "specs": packer.array_specs, "flight": json.dumps(flight),
@@ -82,7 +82,7 @@ def in_browser(
 
 def in_python(comparison: Comparison, at: int, settings: Settings) -> Replay:
     """Run KF in Python with the segment and the aisle of the comparison."""
-    track = shift_clock(raw_source(comparison), settings.clock_offset_s)
+    track = shift_clock(undo_time_offset(comparison), settings.clock_offset_s)
     original = list(comparison.axes.values())[at].axis
     axis = make_axes(
         comparison.flight, track, comparison.segment, names=(original.name,),
@@ -163,7 +163,7 @@ def test_javascript_unpack_restores_packed_arrays(engine: Browser) -> None:
     )
     for back, values in zip(unpacked, arrays, strict=False):
         # very large numbers have larger steps
-        step = 1.0 / FINE_SCALE if np.max(np.abs(values), initial=0.0) < 1e5 else 1e-6
+        step = 1.0 / FINE_STEPS_PER_UNIT if np.max(np.abs(values), initial=0.0) < 1e5 else 1e-6
         np.testing.assert_allclose(back, values, rtol=0.0, atol=step)
     assert unpacked[-1] == [0.1, 0.2, 123.456789]
 
@@ -171,7 +171,7 @@ def test_javascript_unpack_restores_packed_arrays(engine: Browser) -> None:
 def test_javascript_kf_with_too_few_measurements_returns_null(engine: Browser) -> None:
     comparison = compare(aisle_flight(duration_s=30.0))
     packer = Packer()
-    flight = kf_inputs(comparison, packer)
+    flight = make_kf_inputs(comparison, packer)
     flight["segment"] = [flight["segment"][0], flight["segment"][0] + 0.05]
     flight["axes"] = [{"time": [0.0, 1.0, 2.0], "z": [0.0, 0.0, 0.0]}]
     settings = asdict(Settings(input="zero"))

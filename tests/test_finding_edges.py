@@ -70,12 +70,12 @@ from px4fuse.findings.model import (
     zero_length_spans,
 )
 from px4fuse.flight.model import (
-    ALIGNED,
-    FROM_INNOVATIONS,
-    GNSS,
-    LOGGED_BY_EKF2,
-    MOTION_CAPTURE,
-    RECEIVED,
+    ALIGNED_ORIGIN,
+    GNSS_ORIGIN,
+    KEPT_BY_EKF2_ORIGIN,
+    MOTION_CAPTURE_ORIGIN,
+    REBUILT_ORIGIN,
+    RECEIVED_ORIGIN,
     ClockMap,
     Columns,
     Dropout,
@@ -227,7 +227,7 @@ UNKNOWN = "The log does not show why"
             "10 Hz",
         ),
         (
-            never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}, origin=LOGGED_BY_EKF2),
+            never_fusing(2.0, parameters={"EKF2_EV_CTRL": 15.0}, origin=KEPT_BY_EKF2_ORIGIN),
             UNKNOWN,
             "SDLOG_PROFILE",
         ),
@@ -371,7 +371,7 @@ def test_position_error_is_compared_with_sigma_after_alignment(
              ekf2_state=pd.DataFrame({"position_m": estimate[:, at]}, index=time))
         for at, name in enumerate(("north", "east"))
     ]  # fmt: skip
-    track = source(origin=DRIFTING if drifts else RECEIVED)
+    track = source(origin=DRIFTING if drifts else RECEIVED_ORIGIN)
     finding = only(hidden_errors.detect, analysis(axes=tuple(axes), source=track))
     assert finding.evidence["position_rmse_horizontal_m"] == pytest.approx(1.0, rel=0.01)
     assert finding.evidence["position_rmse_aligned_m"] == pytest.approx(left, rel=0.01)
@@ -430,7 +430,7 @@ def test_missing_log_of_received_positions_is_reported() -> None:
         Unavailable("it", "it was disabled", "Do.", source="vehicle_visual_odometry"),
     )
     profile = log(parameters={"SDLOG_PROFILE": 2.0})
-    for origin in (ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS):
+    for origin in (ALIGNED_ORIGIN, KEPT_BY_EKF2_ORIGIN, REBUILT_ORIGIN):
         of = source(origin=origin)
         found = only(
             missing.detect_source_not_logged, analysis(source=of, missing=lacks, log=profile)
@@ -439,8 +439,8 @@ def test_missing_log_of_received_positions_is_reported() -> None:
         assert "Reason: it was disabled." in found.message
         assert "SDLOG_PROFILE to 130 " in found.remedy
     for origin, tracks in (
-        (RECEIVED, ()), (MOTION_CAPTURE, ()), (GNSS, ()),
-        (ALIGNED, (SimpleNamespace(origin=RECEIVED),)),
+        (RECEIVED_ORIGIN, ()), (MOTION_CAPTURE_ORIGIN, ()), (GNSS_ORIGIN, ()),
+        (ALIGNED_ORIGIN, (SimpleNamespace(origin=RECEIVED_ORIGIN),)),
     ):  # fmt: skip
         one = analysis(source=source(origin=origin), flight={"positions": tracks})
         assert named(missing.detect_source_not_logged, one) == {}
@@ -537,7 +537,7 @@ def test_heading_error_report_names_wrong_gnss_noise(degrees, noise_is_wrong) ->
     """A re-run with another EKF2_GPS_P_NOISE makes EKF2's innovations consistent."""
     trial = tried("ekf2", {"EKF2_GPS_P_NOISE": 0.4})
     one = analysis(
-        heading=heading_error(*degrees, p=0.0), source=source(origin=GNSS),
+        heading=heading_error(*degrees, p=0.0), source=source(origin=GNSS_ORIGIN),
         trials=(replace(trial, kinds=("noise",)),) if noise_is_wrong else (),
     )  # fmt: skip
     finding = only(source_frame.detect, one)
@@ -557,7 +557,7 @@ def test_heading_angles_are_printed_from_minus_180_to_180_deg() -> None:
 
 
 def motion_capture_flight(name: str, first: float) -> Any:
-    fed = source(name=name, origin=MOTION_CAPTURE)
+    fed = source(name=name, origin=MOTION_CAPTURE_ORIGIN)
     return analysis(ekf2=with_fusion((0.0, first), (100.0, 0.0)), source=fed)
 
 
@@ -617,7 +617,7 @@ EDGES = [
     ),
     (
         FRAME,
-        analysis(heading=heading_error(20.0), source=source(origin=LOGGED_BY_EKF2)),
+        analysis(heading=heading_error(20.0), source=source(origin=KEPT_BY_EKF2_ORIGIN)),
         None,
     ),
 ]
@@ -627,7 +627,7 @@ EDGES = [
 
 MOVING = positions(np.arange(0.0, 120.0), np.arange(120.0))
 ODOMETRY = {"source": source(orientation=object(), samples=MOVING)}
-REBUILT = {"source": source(origin=LOGGED_BY_EKF2, samples=MOVING)}
+REBUILT = {"source": source(origin=KEPT_BY_EKF2_ORIGIN, samples=MOVING)}
 
 
 def bias_of_ekf2(*bias: float) -> dict[str, Any]:
@@ -743,8 +743,8 @@ SOURCE_EDGES = [
         ([1] * 50 + [2] * 35 + [4] * 15, "error"), ([1] * 50 + [2] * 34 + [4] * 16, None))),
     # mapped timestamps and topics rebuilt by EKF2 show nothing
     (DOWNSAMPLED, at_multiples([1, 2] * 30, clock_map=clock_map()), None),
-    (DOWNSAMPLED, at_multiples([1, 2] * 30, origin=ALIGNED), None),
-    (DOWNSAMPLED, at_multiples([1, 2] * 30, origin=MOTION_CAPTURE), "warning"),
+    (DOWNSAMPLED, at_multiples([1, 2] * 30, origin=ALIGNED_ORIGIN), None),
+    (DOWNSAMPLED, at_multiples([1, 2] * 30, origin=MOTION_CAPTURE_ORIGIN), "warning"),
     # two samples lost in one interval
     *((source_intervals.detect_lost_samples, at_multiples([1] * singles + [3], 0.25, **parts),
        expected)
@@ -794,7 +794,8 @@ SOURCE_EDGES = [
       for scale, sigma, expected in (
           (0.12, 0.01, "warning"), (0.119, 0.01, None), (0.15, 0.01, "error"),
           (0.149, 0.01, "warning"), (0.1875, 0.0625, "error"), (0.187, 0.0625, None))),
-    (SCALE, scaled(0.5, imu_hz=48.9), None), (SCALE, scaled(0.5, source=source(origin=GNSS)), None),
+    (SCALE, scaled(0.5, imu_hz=48.9), None),
+    (SCALE, scaled(0.5, source=source(origin=GNSS_ORIGIN)), None),
     # without an estimated time offset the timestamps may be late
     *((which, of(clock=clock), expected)
       for which, of in ((SCALE, partial(scaled, 0.5)),
@@ -1097,7 +1098,9 @@ def test_ekf2_delay_is_recommended_only_if_its_rerun_improves(after_m: float, re
 
 def test_gnss_time_offset_report_names_receiver_delay_parameter() -> None:
     parameters = {"EKF2_GPS_DELAY": 110.0}
-    one = analysis(clock=late(-0.05), source=source(origin=GNSS), log=log(parameters=parameters))
+    one = analysis(
+        clock=late(-0.05), source=source(origin=GNSS_ORIGIN), log=log(parameters=parameters)
+    )
     finding = only(source_clock.detect, one)
     assert finding.message.endswith(" EKF2_GPS_DELAY is 110 ms; the estimate is 160 ms.")
     assert finding.remedy == "Check the delay of the GNSS receiver (EKF2_GPS_DELAY)."

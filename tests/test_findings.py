@@ -24,7 +24,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.findings import TITLES, Finding, find, split_cause_groups
 from px4fuse.findings.model import CATALOGUE, FINDING_GROUPS, load_examples
 from px4fuse.flight.model import (
-    ALIGNED,
+    ALIGNED_ORIGIN,
     AXIS_NAMES,
     AidLog,
     ClockMap,
@@ -238,7 +238,8 @@ FAULTS = [
     Fault("ekf2_not_logged", "warning", flight={"ekf2": None}),
     # the position source
     Fault("source_not_logged", "warning", {"rate_hz": about(4.0), "sdlog_profile": 1},
-          {"uwb": Uwb(name=ALIGNED_TOPIC, origin=ALIGNED, rate_hz=4.0), "parameters": NO_VISION}),
+          {"uwb": Uwb(name=ALIGNED_TOPIC, origin=ALIGNED_ORIGIN, rate_hz=4.0),
+           "parameters": NO_VISION}),
     Fault("source_rate_at_limit", "note", {"rate_hz": about(4.0), "longest_s": about(1.0, 1e-6)},
           {"uwb": Uwb(rate_hz=4.0, gap_s=(40.0, 48.0)),
            "parameters": {**NO_VISION, "EKF2_EV_CTRL": 15},

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from px4fuse.batch.page import format_html, logs_from_table, sort_logs
 from px4fuse.html.frame import MAX_PAGE_ROWS
-from px4fuse.report.card_html import MARK_PATHS
+from px4fuse.report.card_html import MARKER_SVG_PATHS
 
 MARKUP = '<img src=x onerror="window.alive=1"><b>bold</b>'
 BREAKOUT = "</script ></noscript\n><script>window.alive=2</script><!-- \u2028 & &lt;"
@@ -164,7 +164,7 @@ def test_batch_page_sorts_filters_and_opens_rows(page: Browser) -> None:
     assert page.names()[:3] == sorted(ratios, key=lambda name: ratios[name])[:3]
     # a ratio beyond the axis is a triangle at its end
     mark = "document.querySelector('td.ratio.truth svg path').getAttribute('d')"
-    assert page.ask(mark) == MARK_PATHS["above"]
+    assert page.ask(mark) == MARKER_SVG_PATHS["above"]
     assert "flight%20" in page.ask("document.querySelector('.more a').href")
     page.choose("#filter-1", "status:failed")
     assert page.ask(COUNT) == "Showing 24 of 240"

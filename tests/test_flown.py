@@ -15,7 +15,7 @@ from px4fuse.diagnose import find_faults
 from px4fuse.filter.time_offset import MAX_CHANGE_P_VALUE
 from px4fuse.findings import find
 from px4fuse.readers import read_log
-from px4fuse.report.clock import clock_advice
+from px4fuse.report.clock import make_time_offset_advice
 from px4fuse.request import ComparisonRequest
 
 pytestmark = pytest.mark.reallogs
@@ -134,7 +134,7 @@ def test_recorded_flight_with_known_fault_reports_this_fault(shared_logs, name):
         assert abs(clock.drift_ppm) < 4.0 * clock.drift_sigma_ppm
     if name.endswith("evdelay175"):
         assert not low <= -0.175 <= high
-        advice = clock_advice(analysis, clock)["PX4"]
+        advice = make_time_offset_advice(analysis, clock)["PX4"]
         assert "EKF2_EV_DELAY" in advice
         assert "175 ms" in advice
     if name.endswith("nlos"):

@@ -12,7 +12,7 @@ from findings_tools import NONE, analysis, made, moving, named, only, positions,
 from px4fuse.ekf2.fusion_conditions import UnfusedPositions, find_unmet_condition
 from px4fuse.findings import ekf2_not_fusing
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS
-from px4fuse.flight.model import GNSS, POSITION_FILE, AidLog, ClockMap, Ekf2
+from px4fuse.flight.model import GNSS_ORIGIN, POSITION_FILE_ORIGIN, AidLog, ClockMap, Ekf2
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_innovations import has_fused_aid
 
@@ -44,7 +44,9 @@ def with_quality(*values: float) -> dict[str, Any]:
 def gnss(failed: int = 0, accuracy_m: float = 0.4, **parts: Any) -> UnfusedPositions:
     samples = moving(10.0).assign(north_m2=accuracy_m**2, down_m2=1.0)
     states = {"failed_checks": on(failed), **parts.pop("states", {})}
-    return attempt(aid=GNSS_POS, origin=GNSS, samples=samples, ekf2={"states": states}, **parts)
+    return attempt(
+        aid=GNSS_POS, origin=GNSS_ORIGIN, samples=samples, ekf2={"states": states}, **parts
+    )
 
 
 def with_gap(start_s: float, end_s: float) -> pd.DataFrame:
@@ -122,7 +124,7 @@ def test_constant_positions_not_fused_by_ekf2_are_not_reported() -> None:
 
 
 def test_position_file_that_ekf2_never_got_is_no_fusion_fault() -> None:
-    beside = unfused(source={"origin": POSITION_FILE}, ekf2={"parameters": {"EKF2_EV_CTRL": 0.0}})
+    beside = unfused(source={"origin": POSITION_FILE_ORIGIN}, ekf2={"parameters": {"EKF2_EV_CTRL": 0.0}})
     assert named(ekf2_not_fusing.detect, beside) == {}
     # EKF2 received the same or another source
     beside.flight.positions = (beside.source, source())

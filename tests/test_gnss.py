@@ -28,10 +28,17 @@ from px4fuse.ekf2.replay import inside_spans, rms
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.findings import find, noises
-from px4fuse.flight.model import GNSS, Columns, Flight, FusionRecord, PositionTrack, Unavailable
+from px4fuse.flight.model import (
+    GNSS_ORIGIN,
+    Columns,
+    Flight,
+    FusionRecord,
+    PositionTrack,
+    Unavailable,
+)
 from px4fuse.readers import px4_fixes, read_log
 from px4fuse.readers.px4_fixes import reconstruct_fixes
-from px4fuse.report.clock import clock_advice
+from px4fuse.report.clock import make_time_offset_advice
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation.flights import simulate_flight
 from px4fuse.simulation.scenario import make_scenario
@@ -183,7 +190,7 @@ def test_default_source_is_gnss_only_if_ekf2_fused_it(tmp_path):
     # external vision is not reported as missing
     assert not [part for part in prepared.missing if "vision" in f"{part.reason} {part.remedy}"]
     never = flight_of(outdoors(fused=False), tmp_path)
-    assert not track_of(never).origin.is_automatic
+    assert not track_of(never).origin.is_auto_candidate
 
 
 @pytest.mark.parametrize(("eph_m", "least_m", "axes", "expected_m"), [
@@ -346,7 +353,7 @@ FLIGHTS: dict[str, tuple[str | None, dict[str, str], str]] = {
         (None, {"gnss_pos": "underconfident", "rng_hgt": "underconfident"}, ""),
 }  # fmt: skip
 # Minimum number of fixes reconstructed from innovations in flights logged at 2 Hz
-FROM_INNOVATIONS = {"v1.13.3_gps_profile1": 100, "v1.14.4_gps_magdist": 200}
+REBUILT_ORIGIN = {"v1.13.3_gps_profile1": 100, "v1.14.4_gps_magdist": 200}
 STAMP_S = 0.016  # s, simulation steps of 8 ms from a fix to its timestamp and to the filter
 OF_OTHERS = ("EKF2_EV", "vision", "anchor", "UWB", "line of sight", " tag ")
 
@@ -379,12 +386,12 @@ def test_compare_of_real_gnss_flights_equals_reference_numbers(name, shared_logs
     assert not reason or re.search(reason, analysis.ekf2_model.reason)
     assert verdicts == {aid: analysis.aids[aid].verdict for aid in verdicts}
     assert as_in_the_log(analysis.aids, truth) >= 2
-    if name in FROM_INNOVATIONS:
+    if name in REBUILT_ORIGIN:
         track = track_of(analysis.flight)
         assert "2.0" in track.notes[0]
         pattern = r"^(\d+) unlogged GNSS fixes.*RMS error ([\d.]+) m"
         count, exact_m = re.findall(pattern, track.notes[1])[0]
-        assert int(count) > FROM_INNOVATIONS[name]
+        assert int(count) > REBUILT_ORIGIN[name]
         assert float(exact_m) < 0.1
         assert track.compute_rate_hz() > 2.9
 
@@ -652,13 +659,17 @@ def test_gnss_reset_rule_depends_on_px4_release(north_m, parameters, scale, with
 ])  # fmt: skip
 def test_gnss_time_offset_advice_names_delay_parameter(delay_ms, age_s, remaining_s, expected):
     source = SimpleNamespace(
-        origin=GNSS, assumed_delay_s=age_s, alignment=None, aid=lambda _: GNSS.aid, frame="NED"
+        origin=GNSS_ORIGIN,
+        assumed_delay_s=age_s,
+        alignment=None,
+        aid=lambda _: GNSS_ORIGIN.aid,
+        frame="NED",
     )
     log = SimpleNamespace(name="x.ulg", parameters={"EKF2_GPS_DELAY": delay_ms})
     flight = SimpleNamespace(log=log)
     comparison = SimpleNamespace(source=source, flight=flight, convention=None)
     clock = late(remaining_s, drift_ppm=None, drift_sigma_ppm=None)
-    advice = clock_advice(comparison, clock).get("PX4")  # type: ignore[arg-type]
+    advice = make_time_offset_advice(comparison, clock).get("PX4")  # type: ignore[arg-type]
     assert all(text in (advice or "") for text in expected or ())
     assert (advice is None) is (expected is None)
 

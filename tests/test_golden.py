@@ -35,8 +35,8 @@ from px4fuse.batch.page import format_html
 from px4fuse.cli import COMMANDS as CLI_COMMANDS
 from px4fuse.cli.mcp import make_tools, run_command
 from px4fuse.core.text import to_json_types
-from px4fuse.explore.data import flight_data
-from px4fuse.explore.figures import document_json
+from px4fuse.explore.data import make_flight_data
+from px4fuse.explore.figures import make_document_json
 from px4fuse.explore.packing import Packer
 from px4fuse.report import pdf
 from px4fuse.simulation.faults import FAULT_TYPES, parse_faults
@@ -249,8 +249,8 @@ def test_batch_page_matches_reference_file() -> None:
 @pytest.mark.usefixtures("cached_analyses")
 def test_explore_page_plots_match_reference_file(sample_log: Path) -> None:
     analysis = px4fuse.compare(str(sample_log))
-    data = flight_data(analysis, Packer())
-    document, _ = document_json(data)
+    data = make_flight_data(analysis, Packer())
+    document, _ = make_document_json(data)
     ids: dict[str, str] = {}
 
     def number_bokeh_ids(found: re.Match[str]) -> str:

@@ -25,9 +25,9 @@ from px4fuse.errors import SettingsError
 from px4fuse.flight.model import AidLog, Ekf2, Flight, FusionRecord
 from px4fuse.readers import read_log
 from px4fuse.report.difference_page import format_agreement
-from px4fuse.report.whatif import statistic_rows
+from px4fuse.report.whatif import make_statistic_rows
 from px4fuse.request import WhatIfRequest
-from px4fuse.results.build import whatif_results
+from px4fuse.results.build import make_whatif_results
 from px4fuse.results.contract import schema, to_json
 from px4fuse.simulation import ekf2 as simulated
 from px4fuse.simulation.faults import parse_faults
@@ -398,7 +398,10 @@ def test_barometer_samples_missing_in_log_are_reconstructed(every: int, has_filt
     bias = {"bias_m": 1.7, "innovation_m": 0.0, "bias_m2": p * 0.25 / (p + 0.25)}
     bias = pd.DataFrame(bias | {"variance_m2": p + 0.25}, pd.Index(time_s[10::10]))
     record = made(
-        FusionRecord, height_bias={"baro_hgt": bias}, stores_bias_increments=False, states={}
+        FusionRecord,
+        height_bias_updates={"baro_hgt": bias},
+        stores_bias_increments=False,
+        states={},
     )
     state = pd.DataFrame({"down_m_s": 0.0}, time_s)
     log = made(AidLog, samples=rows if has_filter else rows.drop(columns="filtered_down"))
@@ -505,11 +508,11 @@ def test_what_if_results_contain_each_height_sensor(models: dict[str, Model]) ->
     found = WhatIfAnalysis(
         model.flight, asked, changes, uses_estimates=False, difference_steps={}, without=without
     )
-    results = json.loads(to_json(whatif_results(request, found)))
+    results = json.loads(to_json(make_whatif_results(request, found)))
     jsonschema.validate(results, schema())
     assert results["whatif"]["heights"].keys() == {"baro_hgt"}
     assert results["replayed"]["heights"].keys() == {"baro_hgt", "gnss_hgt"}
-    shown = {row[0]: row[1:] for row in statistic_rows(found)}
+    shown = {row[0]: row[1:] for row in make_statistic_rows(found)}
     assert shown["GNSS height: mean NIS"][-1] == "n/a"
     row = next(row for label, row in shown.items() if label.startswith("height RMSE"))
     assert row == [

@@ -17,7 +17,7 @@ from px4fuse.cli import cli
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.diagnose import find_faults
 from px4fuse.errors import Px4FuseError
-from px4fuse.flight.model import GNSS, Dropout, Flight, Sender, Unavailable
+from px4fuse.flight.model import GNSS_ORIGIN, Dropout, Flight, Sender, Unavailable
 from px4fuse.info.inventory import (
     AnalysisOption,
     Inventory,
@@ -246,7 +246,7 @@ def test_info_reports_count_and_duration_of_gaps(tmp_path):
     aisle_flight(duration_s=20.0, ekf2=Estimator(innovations_logged=False)),
     aisle_flight(duration_s=20.0, ekf2=Estimator(fusing=None)),
     aisle_flight(duration_s=20.0, truth=False),
-    aisle_flight(duration_s=20.0, uwb=Uwb(name="vehicle_gps_position", origin=GNSS)),
+    aisle_flight(duration_s=20.0, uwb=Uwb(name="vehicle_gps_position", origin=GNSS_ORIGIN)),
     replace(aisle_flight(duration_s=20.0), positions=()),
 ])  # fmt: skip
 def test_info_lists_exactly_the_analyses_that_compare_performs(flight: Flight):

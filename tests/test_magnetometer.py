@@ -141,7 +141,7 @@ def magnetic(generation: str = "v1.16", kept_hz: float = 2.0) -> Log:
 
 
 def field_of(log: Log, folder: Path) -> pd.DataFrame:
-    return read_log(log.write(folder / "a.ulg")).ekf2.record.field_gauss
+    return read_log(log.write(folder / "a.ulg")).ekf2.record.magnetic_field_gauss
 
 
 @pytest.mark.parametrize("generation", ["v1.14", "v1.16"])
@@ -232,7 +232,7 @@ def settled(frame_hz: float, on: slice, count: int = 60) -> tuple[float, float] 
     fused = np.zeros(count)
     fused[on] = 1.0
     frame = pd.DataFrame({"fused_3d": fused}, index=np.arange(count) / frame_hz)
-    return _find_field_fusion_span(made(FusionRecord, field_gauss=frame))
+    return _find_field_fusion_span(made(FusionRecord, magnetic_field_gauss=frame))
 
 
 def test_magnetometer_replay_requires_continuous_3d_fusion() -> None:

@@ -49,7 +49,15 @@ from time_limit import time_limit
 
 from px4fuse.diagnose import find_faults
 from px4fuse.errors import LogError, MissingDataError
-from px4fuse.flight.model import MOTION_CAPTURE, RECEIVED, Columns, Ekf2, Flight, Truth, Unavailable
+from px4fuse.flight.model import (
+    MOTION_CAPTURE_ORIGIN,
+    RECEIVED_ORIGIN,
+    Columns,
+    Ekf2,
+    Flight,
+    Truth,
+    Unavailable,
+)
 from px4fuse.info.inventory import take_inventory
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_frames import wire_layout
@@ -105,7 +113,7 @@ def test_read_mavlink_of_simulated_flight_equals_closed_form(read):
     assert flight.streams["ekf2_state"].topics == ("ODOMETRY",)
     [track] = flight.positions
     assert track.name == "VISION_POSITION_ESTIMATE"
-    assert (track.origin.path, track.frame) == (RECEIVED.path, "NED")
+    assert (track.origin.path, track.frame) == (RECEIVED_ORIGIN.path, "NED")
     variance = track.samples[Columns.POSITION_VARIANCE]
     assert_allclose(variance, np.tile(POSE_VARIANCE, (200, 1)), rtol=1e-6)
 
@@ -247,9 +255,9 @@ def test_mavlink_odometry_velocity_is_rotated_to_ned(read, child):
 
 
 @pytest.mark.parametrize(("estimator", "name", "origin"), [
-    (0, "ODOMETRY", RECEIVED), (1, "ODOMETRY_NAIVE", RECEIVED),
-    (2, "ODOMETRY_VISION", RECEIVED), (3, "ODOMETRY_VIO", RECEIVED),
-    (6, "ODOMETRY_MOCAP", MOTION_CAPTURE), (4, "", None), (8, "", None),
+    (0, "ODOMETRY", RECEIVED_ORIGIN), (1, "ODOMETRY_NAIVE", RECEIVED_ORIGIN),
+    (2, "ODOMETRY_VISION", RECEIVED_ORIGIN), (3, "ODOMETRY_VIO", RECEIVED_ORIGIN),
+    (6, "ODOMETRY_MOCAP", MOTION_CAPTURE_ORIGIN), (4, "", None), (8, "", None),
 ])  # fmt: skip
 def test_mavlink_odometry_estimator_type_selects_source_name(read, estimator, name, origin):
     """ODOMETRY from the autopilot remains EKF2's state; types GPS and AUTOPILOT are no input."""
@@ -504,7 +512,7 @@ def test_mavlink_gnss_position_is_relative_to_autopilot_origin(read, origin, clo
     """The receiver's timestamps may be boot time or UNIX time."""
     flight = read(outdoors(origin=origin, clock=clock))
     (track,) = flight.positions
-    assert (track.name, track.origin.fused_as_gnss, track.origin.is_automatic) == (
+    assert (track.name, track.origin.fused_as_gnss, track.origin.is_auto_candidate) == (
         "GPS_RAW_INT",
         True,
         True,
@@ -537,7 +545,7 @@ def test_mavlink_barometer_height_is_computed_from_pressure(read):
 
 def test_mavlink_gnss_not_used_by_ekf2_is_not_default_source(read):
     flight = read(outdoors(has_global_position=False))
-    assert not flight.positions[0].origin.is_automatic
+    assert not flight.positions[0].origin.is_auto_candidate
     with pytest.raises(MissingDataError, match=r"position.source`? GPS_RAW_INT"):
         compare(flight)
 

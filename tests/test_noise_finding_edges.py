@@ -37,7 +37,7 @@ from px4fuse.findings import cause_text, ekf2_noise, hidden_errors, loops, noise
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.noises import _has_default_noises
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, PARAMETERS
-from px4fuse.flight.model import GNSS, RECEIVED
+from px4fuse.flight.model import GNSS_ORIGIN, RECEIVED_ORIGIN
 from px4fuse.loop.model import Closure, Loop, TrueEnd
 
 MOVING = source(samples=positions(np.arange(0.0, 120.0), np.arange(120.0)))
@@ -445,7 +445,7 @@ def test_wrong_ekf2_noise_report_names_parameter_or_sensor(
     inputs = SimpleNamespace(aid=aid, settings=settings, received=received)
     model = SimpleNamespace(inputs=inputs)
     result = axis("north", rejected_fraction=rejected)
-    origin = GNSS if kind == "gnss" else RECEIVED
+    origin = GNSS_ORIGIN if kind == "gnss" else RECEIVED_ORIGIN
     one = analysis(
         axes=(result,), trials=(rerun,), ekf2_model=model, source=source(origin=origin),
         settings=Settings(1.0, flown_m),

@@ -104,7 +104,7 @@ def test_simulated_magnetometer_and_height_noise_equal_settings(tmp_path: Path) 
     error = down.to_numpy() - np.interp(down.index, truth.index, truth["down_m"])
     assert error.std() == pytest.approx(0.4, rel=0.1)
     assert abs(error.mean()) < 4 * 0.4 / len(error) ** 0.5
-    measured = record.field_gauss
+    measured = record.magnetic_field_gauss
     true = interpolate(
         measured.index.to_numpy(), flight.truth.attitude.index.to_numpy(),
         flight.truth.attitude[Columns.QUATERNION].to_numpy(),

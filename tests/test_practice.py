@@ -26,7 +26,7 @@ from msgspec import structs
 
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.explore import practice
-from px4fuse.explore.practice import NOISY_UWB, QUIZ_ANSWERS, QuizFault, draw_flights
+from px4fuse.explore.practice import NOISY_UWB_FAULT, QUIZ_ANSWERS, QuizFault, draw_flights
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Flight
 from px4fuse.simulation.faults import parse_faults
@@ -70,7 +70,7 @@ def test_practice_level_3_has_some_flights_with_two_faults() -> None:
 def flown(mistake: QuizFault | None, level: int, seed: int) -> Flight:
     """Simulate a practice flight with one fault of a level, or without a fault."""
     size = "" if mistake is None else mistake.sizes[level - 1]
-    noisy = mistake is not None and mistake.name == NOISY_UWB
+    noisy = mistake is not None and mistake.name == NOISY_UWB_FAULT
     scenario = Scenario(
         **practice.SCENARIO_VALUES,
         length_m=9.0 + 0.7 * seed,
@@ -153,9 +153,9 @@ def test_clock_offset_setting_does_not_correct_misaligned_frame(level: int, seed
 
 @pytest.mark.parametrize(("level", "seed"), LEVELS_AND_SEEDS)
 def test_kf_on_noisy_practice_flight_is_consistent_at_true_noise(level: int, seed: int) -> None:
-    noisy = flown(hidden(NOISY_UWB), level, seed)
+    noisy = flown(hidden(NOISY_UWB_FAULT), level, seed)
     assert kf_statistics(noisy).nis_mean > 2.0
-    size = float(hidden(NOISY_UWB).sizes[level - 1])
+    size = float(hidden(NOISY_UWB_FAULT).sizes[level - 1])
     assert kf_statistics(noisy, sigma_z_m=size).verdict == "consistent"
     vibrating = flown(hidden("vibration"), level, seed)
     before = kf_statistics(vibrating)
@@ -185,7 +185,7 @@ def test_too_small_ekf2_gate_rejects_consistent_innovations(level: int, seed: in
 @pytest.fixture(scope="module")
 def quiz(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("practice") / "quiz.html"
-    file.write_bytes(practice.practice_text(SEED, 1, COUNT).encode())
+    file.write_bytes(practice.make_practice_page(SEED, 1, COUNT).encode())
     return file
 
 
@@ -340,7 +340,9 @@ def test_practice_command_writes_one_html_page(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(click, "launch", opened.append)
     # the content of the page is tested above
-    monkeypatch.setattr("px4fuse.explore.practice.practice_text", lambda *given: repr(given[:3]))
+    monkeypatch.setattr(
+        "px4fuse.explore.practice.make_practice_page", lambda *given: repr(given[:3])
+    )
     run_checked("practice", "--seed", "3", "--flights", "1")
     page = tmp_path / "reports" / "practice_3.html"
     assert [file for file in tmp_path.rglob("*") if file.is_file()] == [page]

@@ -10,7 +10,7 @@ from flights import Estimator, Uwb, aisle_flight, given_placement, table
 
 from px4fuse.comparison.projection import find_observation_variance, project_innovations
 from px4fuse.filter.signals import Axis, Segment, make_axes
-from px4fuse.flight.model import MOTION_CAPTURE, Columns, Flight, Unavailable
+from px4fuse.flight.model import MOTION_CAPTURE_ORIGIN, Columns, Flight, Unavailable
 
 WHOLE = Segment(0.0, 40.0, "")
 HEADING_DEG = 30.0
@@ -104,7 +104,7 @@ GONE = Unavailable("innovations", "none logged", "Log them.")
     (with_innovations(flight(), north=GONE), "aisle", WHOLE, "none logged"),
     (with_innovations(flight(), east=GONE), "aisle", WHOLE, "none logged"),
     # motion capture is never fused
-    (flight(uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE)), "north", WHOLE,
+    (flight(uwb=Uwb(name="vehicle_mocap_odometry", origin=MOTION_CAPTURE_ORIGIN)), "north", WHOLE,
      "never fuses vehicle_mocap_odometry"),
 ], ids=["segment", "north", "east", "mocap"])  # fmt: skip
 def test_axis_without_ekf2_innovations_gives_reason(made, axis, segment, says) -> None:

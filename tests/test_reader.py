@@ -30,12 +30,12 @@ from ulog_tools import (
 from px4fuse.comparison.preparation import choose_source
 from px4fuse.errors import MissingDataError
 from px4fuse.flight.model import (
-    ALIGNED,
-    FROM_INNOVATIONS,
-    GNSS,
-    LOGGED_BY_EKF2,
-    MOTION_CAPTURE,
-    RECEIVED,
+    ALIGNED_ORIGIN,
+    GNSS_ORIGIN,
+    KEPT_BY_EKF2_ORIGIN,
+    MOTION_CAPTURE_ORIGIN,
+    REBUILT_ORIGIN,
+    RECEIVED_ORIGIN,
     Columns,
     Reset,
     Unavailable,
@@ -82,7 +82,7 @@ def delay_boot(log, by_us):
 @pytest.mark.parametrize("generation", GENERATIONS)
 def test_read_ulog_of_each_px4_release_reads_external_vision(read, generation):
     (track, *_) = read(make_log(generation)).positions
-    assert (track.name, track.origin.path) == ("vehicle_visual_odometry", RECEIVED.path)
+    assert (track.name, track.origin.path) == ("vehicle_visual_odometry", RECEIVED_ORIGIN.path)
     assert_equals_external_vision(track)
     assert track.frame == ("unknown" if generation == "v1.9" else "NED")
     assert track.compute_rate_hz() == pytest.approx(5.0)
@@ -409,12 +409,12 @@ def gps_topic():
 
 
 PREFERRED = [
-    ("vehicle_visual_odometry", RECEIVED),
-    ("vehicle_mocap_odometry", MOTION_CAPTURE),
-    ("estimator_visual_odometry_aligned", ALIGNED),
-    ("estimator_aid_src_ev_pos", LOGGED_BY_EKF2),
-    ("ekf2_state_plus_innovation", FROM_INNOVATIONS),
-    ("vehicle_gps_position", GNSS),
+    ("vehicle_visual_odometry", RECEIVED_ORIGIN),
+    ("vehicle_mocap_odometry", MOTION_CAPTURE_ORIGIN),
+    ("estimator_visual_odometry_aligned", ALIGNED_ORIGIN),
+    ("estimator_aid_src_ev_pos", KEPT_BY_EKF2_ORIGIN),
+    ("ekf2_state_plus_innovation", REBUILT_ORIGIN),
+    ("vehicle_gps_position", GNSS_ORIGIN),
 ]
 
 
@@ -452,7 +452,7 @@ def test_unfused_gnss_is_used_as_source_only_on_request(read):
     flight = read(log.add(gps_topic()))
     with pytest.raises(MissingDataError, match=r"position.source`? vehicle_gps_position"):
         choose_source(flight)
-    assert choose_source(flight, "vehicle_gps_position")[0].origin == GNSS
+    assert choose_source(flight, "vehicle_gps_position")[0].origin == GNSS_ORIGIN
 
 
 @pytest.mark.parametrize("delay_ms", [0.0, 175.0])
@@ -463,7 +463,7 @@ def test_times_of_estimator_aid_src_ev_pos_exclude_ekf2_delay(read, delay_ms):
     for name in ("estimator_aid_src_ev_pos", "estimator_aid_src_ev_hgt"):
         log[name]["timestamp_sample"] -= np.uint64((delay_ms * 1e-3 + HALF_PERIOD_S) * 1e6)
     track, _ = choose_source(read(log))
-    assert (track.name, track.origin.path) == ("estimator_aid_src_ev_pos", LOGGED_BY_EKF2.path)
+    assert (track.name, track.origin.path) == ("estimator_aid_src_ev_pos", KEPT_BY_EKF2_ORIGIN.path)
     assert_equals_external_vision(track)
 
 
@@ -495,7 +495,7 @@ def test_position_reconstructed_from_innovation_equals_measured(read, generation
     track, _ = choose_source(read(log))
     assert (track.name, track.origin.path) == (
         "ekf2_state_plus_innovation",
-        FROM_INNOVATIONS.path,
+        REBUILT_ORIGIN.path,
     )
     expected = position(times(track.samples)) + ev_error(times(track.samples))
     np.testing.assert_allclose(track.samples[Columns.POSITION], expected, atol=1e-5)
@@ -597,7 +597,7 @@ def test_read_log_of_simulation_returns_simulated_uwb_samples(shared_logs, name)
     assert track.name == ("estimator_aid_src_ev_pos" if kept else "vehicle_visual_odometry")
 
     axes = (
-        slice(0, 2) if track.origin.path == LOGGED_BY_EKF2.path else slice(0, 3)
+        slice(0, 2) if track.origin.path == KEPT_BY_EKF2_ORIGIN.path else slice(0, 3)
     )  # EKF2's observations contain no height in these logs
     sent_z = np.array([sample["z"] for sample in sent["uwb"]])[:, axes]
     sent_s = np.array([sample["t_px4_us"] for sample in sent["uwb"]]) * 1e-6
@@ -620,7 +620,7 @@ def test_read_log_of_simulation_returns_simulated_uwb_samples(shared_logs, name)
     else:
         assert np.median(late) == pytest.approx(config["latency_ms"] * 1e-3, abs=0.02)
     inside = (sent_s > sent_s[match[0]]) & (sent_s < sent_s[match[-1]])
-    if track.origin.path == RECEIVED.path and not config["dropouts"]:
+    if track.origin.path == RECEIVED_ORIGIN.path and not config["dropouts"]:
         assert len(read_s) >= 0.98 * np.count_nonzero(inside)
 
 

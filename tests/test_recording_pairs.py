@@ -7,7 +7,7 @@ from flights import Imu, aisle_flight
 
 from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.filter.time_offset import ClockOffset
-from px4fuse.flight.model import Stream, Unavailable
+from px4fuse.flight.model import DataSource, Unavailable
 
 
 @pytest.mark.parametrize(("topic", "imu_hz", "needed"), [
@@ -20,7 +20,7 @@ from px4fuse.flight.model import Stream, Unavailable
 def test_time_offset_with_low_imu_rate_is_unavailable(topic, imu_hz, needed) -> None:
     """Telemetry samples of a faster IMU are single values, not means over the interval."""
     flight = aisle_flight(duration_s=40.0, imu=Imu(rate_hz=imu_hz))
-    flight = replace(flight, streams={"imu": Stream((topic,), "boot clock", flight.log.name)})
+    flight = replace(flight, streams={"imu": DataSource((topic,), "boot clock", flight.log.name)})
     _, found = estimate_noises_and_clock(compare(flight, axes=("north", "east")))
     if needed is None:
         assert isinstance(found, ClockOffset)

@@ -40,7 +40,7 @@ def _fresh(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Clear the cached fonts before and after the test."""
 
     def clear_caches() -> None:
-        for cached in (fonts.font_of, fonts._other_fonts):
+        for cached in (fonts.find_font, fonts._other_fonts):
             cached.cache_clear()
 
     clear_caches()
@@ -62,10 +62,10 @@ def with_font(monkeypatch: pytest.MonkeyPatch, name: str, characters: str) -> No
 @pytest.mark.usefixtures("_fresh")
 def test_characters_missing_in_dejavu_use_an_installed_font(monkeypatch) -> None:
     with_font(monkeypatch, "Some Thai", THAI)
-    assert fonts.missing_characters(f"Ångström σ Жанна {ARABIC} 5 ≤ 6") == ""
+    assert fonts.find_missing_characters(f"Ångström σ Жанна {ARABIC} 5 ≤ 6") == ""
     assert fonts.font_names(f"Ångström {ARABIC}") == [fonts.FONT]
     assert fonts.font_names(f"{THAI} and me") == [fonts.FONT, "Some Thai"]
-    assert fonts.missing_characters(f"{THAI} {HAN}") == HAN
+    assert fonts.find_missing_characters(f"{THAI} {HAN}") == HAN
 
 
 @pytest.mark.usefixtures("_fresh")
@@ -75,7 +75,7 @@ def test_characters_without_any_font_are_printed_as_squares(
     monkeypatch.setattr(fonts, "_other_fonts", lambda: ())
     assert fonts.font_names(THAI + HAN) == [fonts.FONT]
     assert replace_unprintable(f"a {HAN}\x1b b") == "a □□□ b"
-    advice = fonts.font_advice(THAI + HAN)
+    advice = fonts.format_font_advice(THAI + HAN)
     assert "characters สมชาย王小明;" in advice
     assert "fonts.google.com" in advice
 
@@ -213,7 +213,8 @@ def test_report_omits_time_offset_page_if_not_significant() -> None:
     whole = offset(parts=())
     fine, unknown = with_clock(whole), replace(whole, is_determinable=False, reason="no motion")
     with_finding = [
-        SimpleNamespace(findings=[Finding(name, "error", "", "")]) for name in clock.CLOCK_FINDINGS
+        SimpleNamespace(findings=[Finding(name, "error", "", "")])
+        for name in clock.TIME_OFFSET_FINDINGS
     ]
     nothing: Any = SimpleNamespace(findings=[])
     assert "no significant time offset" in clock.summarise_offset(fine, [])
@@ -252,5 +253,5 @@ def test_report_on_time_offset_reports_estimate_and_action(
     changes: dict[str, Any], delay_ms: float, expected: dict[str, str]
 ) -> None:
     analysis = with_clock(offset(**changes), delay_ms)
-    advice = clock.clock_advice(analysis, analysis.clock)
+    advice = clock.make_time_offset_advice(analysis, analysis.clock)
     assert all(text in advice[label] for label, text in expected.items()), advice

@@ -18,7 +18,7 @@ from px4fuse.flight.model import Flight
 from px4fuse.report.pdf import render_pdf
 from px4fuse.request import ComparisonRequest
 from px4fuse.results import build
-from px4fuse.results.bounds import within_bounds
+from px4fuse.results.bounds import drop_invalid_numbers
 from px4fuse.results.contract import RESULTS_BY_SCHEMA, schema, to_json
 from px4fuse.results.reading import read_results
 
@@ -190,12 +190,12 @@ def test_results_json_numbers_have_ten_significant_digits():
 def test_results_omit_number_outside_bounds_and_give_reason():
     """An optional number is left out alone, a required one with its record."""
     results = read_results(json.dumps(EXAMPLE).encode())
-    assert within_bounds(results) == results
+    assert drop_invalid_numbers(results) == results
     axis = results.axes["aisle"]
     kf = replace(axis.filters["kf"], nis_mean=-3.0)
     ekf2 = replace(axis.filters["ekf2"], sigma_p_median_m=1e10)
     wrong = replace(axis, filters={"kf": kf, "ekf2": ekf2})
-    found = within_bounds(replace(results, axes={"aisle": wrong}))
+    found = drop_invalid_numbers(replace(results, axes={"aisle": wrong}))
     filters = found.axes["aisle"].filters
     assert isinstance(filters["kf"], UntestedFilter)
     assert filters["kf"].reason == "axes.aisle.filters.kf.nis_mean is -3 (allowed: 0 to 1e+06)"
@@ -213,4 +213,4 @@ def test_results_without_any_valid_axis_raise_error():
         results.axes["aisle"], updates=replace(results.axes["aisle"].updates, input_gap_s=math.nan)
     )
     with pytest.raises(ResultsError, match=r"axes.aisle.updates.input_gap_s is not a finite"):
-        within_bounds(replace(results, axes={"aisle": wrong}))
+        drop_invalid_numbers(replace(results, axes={"aisle": wrong}))

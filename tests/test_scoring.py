@@ -179,8 +179,7 @@ class TestForm:
         points, comment = check_points("answers", with_form(["yaw"], student__id="s01"), key=key())
         assert points == 0.0
         assert (
-            "you did not name dropout (gap in the position source of this length)"
-            in comment.lower()
+            "you did not name dropout (duration of a gap in the position source)" in comment.lower()
         )
         assert "flight does not have: yaw" in comment
 

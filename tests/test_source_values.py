@@ -28,7 +28,7 @@ from px4fuse.findings import (
 )
 from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.model import finding
-from px4fuse.flight.model import REPEATED_TIMESTAMPS, ClockMap, Columns, Flight
+from px4fuse.flight.model import REPEATED_TIMESTAMPS_NOTE, ClockMap, Columns, Flight
 from px4fuse.readers import read_log
 from px4fuse.readers.common import find_invalid_rows, rounding_step
 from px4fuse.readers.position_file import read_position_file
@@ -228,7 +228,7 @@ VALUE_FAULTS = {
     "source_positions_rounded": lambda flight: with_track(flight, step_m=0.5),
     "source_timestamp_unit": lambda flight: with_clock(flight, "milliseconds"),
     "source_timestamps_shared": lambda flight: with_clock(
-        flight, "local", REPEATED_TIMESTAMPS, 120
+        flight, "local", REPEATED_TIMESTAMPS_NOTE, 120
     ),
     "source_position_held": lambda flight: without_rows(flight, "held"),
     "source_zero_positions": lambda flight: without_rows(flight, "zero"),
@@ -284,7 +284,7 @@ def test_wrong_timestamp_unit_report_shows_ekf2_never_fused():
 
 def test_equal_timestamps_report_contains_clock_resolution():
     (one,) = detected(
-        with_clock(aisle_flight(uwb=Uwb(rate_hz=1.0)), "local", REPEATED_TIMESTAMPS, 120)
+        with_clock(aisle_flight(uwb=Uwb(rate_hz=1.0)), "local", REPEATED_TIMESTAMPS_NOTE, 120)
     )
     assert one.evidence["resolution_s"] == pytest.approx(1.0)
     assert "(5 Hz)" in one.message

@@ -10,7 +10,7 @@ import pytest
 from flights import Uwb, aisle_flight
 
 from px4fuse.findings.model import SOURCE_TEXTS, find_source_texts
-from px4fuse.flight.model import Columns, PositionKind, PositionTrack, kind_without_orientation
+from px4fuse.flight.model import Columns, PositionKind, PositionTrack, infer_position_kind
 
 # Words that belong to some kinds of source only
 WORDS_OF_KINDS: dict[str, set[PositionKind]] = {
@@ -53,9 +53,9 @@ def track(rate_hz: float, sigma_m: float) -> PositionTrack:
     (5.0, 0.1, "uwb"), (20.0, 0.05, "uwb"), (100.0, 0.1, "unknown"), (10.0, 0.003, "unknown"),
 ])  # fmt: skip
 def test_position_source_kind_is_guessed_from_noise_and_rate(rate_hz, sigma_m, kind) -> None:
-    assert kind_without_orientation(track(rate_hz, sigma_m).samples) == kind
+    assert infer_position_kind(track(rate_hz, sigma_m).samples) == kind
 
 
 def test_position_source_kind_of_few_samples_is_unknown() -> None:
     samples = pd.DataFrame(np.zeros((3, 3)), [0.0, 1.0, 2.0], Columns.POSITION)
-    assert kind_without_orientation(samples) == "unknown"
+    assert infer_position_kind(samples) == "unknown"

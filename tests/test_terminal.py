@@ -24,7 +24,7 @@ from px4fuse.errors import OutputError
 from px4fuse.report import card_text, screen
 from px4fuse.report.card_text import card_lines, with_typed_path
 from px4fuse.report.page import Page
-from px4fuse.report.screen import expand_commands, print_paragraph
+from px4fuse.report.screen import extract_commands, print_paragraph
 from px4fuse.report.terminal import comparison_page
 from px4fuse.request import ComparisonRequest, PositionFile, command_line, format_settings_suffix
 from px4fuse.results.build import results
@@ -96,7 +96,7 @@ def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> N
     assert sorted(summaries[WIDTH].split()) == sorted(whole.split())
     assert "\x1b" not in whole
     # the card comes first, also in a pipe; below it a paragraph is one line there
-    first = [text for line in card_lines(card) for text in line.wrapped(card_text.CARD_WIDTH)]
+    first = [text for line in card_lines(card) for text in line.wrap(card_text.CARD_WIDTH)]
     assert whole.splitlines()[: len(first) + 1] == [*first, ""]
     assert max(map(len, whole.splitlines()[len(first) :])) > card_text.CARD_WIDTH
 
@@ -132,7 +132,7 @@ def test_printed_commands_contain_typed_files_and_options() -> None:
         log="my flights/a'b.ulg", position=PositionFile(path="u w/b.csv"),
         start_s=12.5, sigma_z_m=0.3,
     )  # fmt: skip
-    text, (command, loops) = expand_commands(
+    text, (command, loops) = extract_commands(
         "Try px4fuse compare LOG --sigma-z 0.2 --clock-offset -0.125: better. Or (px4fuse loop "
         "LOG). Not px4fuse sync LOG.ulg.",
         request,
@@ -336,4 +336,4 @@ def test_progress_bar_appears_only_on_a_terminal(monkeypatch, capsys) -> None:
 def test_bold_text_of_report_is_bold_on_terminal() -> None:
     for weight, bold in (("bold", True), ("regular", False)):
         block = {"text": "so", "colour": "black", "weight": weight}
-        assert ("bold" in str(screen._styled_text(block).style)) is bold  # type: ignore[arg-type]
+        assert ("bold" in str(screen._make_rich_text(block).style)) is bold  # type: ignore[arg-type]

@@ -35,11 +35,18 @@ from px4fuse.ekf2.whatif import what_if
 from px4fuse.errors import SettingsError
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
-from px4fuse.flight.model import RECEIVED, AidLog, Columns, Flight, PositionTrack, Unavailable
+from px4fuse.flight.model import (
+    RECEIVED_ORIGIN,
+    AidLog,
+    Columns,
+    Flight,
+    PositionTrack,
+    Unavailable,
+)
 from px4fuse.report.difference_page import format_agreement
-from px4fuse.report.whatif import statistic_rows
+from px4fuse.report.whatif import make_statistic_rows
 from px4fuse.request import WhatIfRequest
-from px4fuse.results.build import whatif_results
+from px4fuse.results.build import make_whatif_results
 from px4fuse.results.contract import schema, to_json
 from px4fuse.simulation import ekf2 as simulated
 from px4fuse.simulation.faults import parse_faults
@@ -454,7 +461,7 @@ def flown(
     rows = pd.DataFrame(np.hstack([vision.position_m, vision.variance_m2]), vision.timestamp_s,
                         [*Columns.POSITION, *Columns.POSITION_VARIANCE])  # fmt: skip
     track = PositionTrack(
-        vision.source, RECEIVED, "external vision", rows, "NED", "boot", (vision.source,)
+        vision.source, RECEIVED_ORIGIN, "external vision", rows, "NED", "boot", (vision.source,)
     )
     ekf2 = replace(flight.ekf2, aids={**flight.ekf2.aids, "ev_pos": log})
     return replace(flight, positions=(track, *flight.positions), ekf2=ekf2)
@@ -501,10 +508,10 @@ def test_what_if_with_smaller_vision_gate_rejects_more() -> None:
     made_of = run_what_if(request, flight=flown())
     found, update_records = (
         made_of.whatif,
-        {label: cells for label, *cells in statistic_rows(made_of)},
+        {label: cells for label, *cells in make_statistic_rows(made_of)},
     )
     assert "external vision, position: mean NIS" in update_records
-    results = json.loads(to_json(whatif_results(request, made_of)))
+    results = json.loads(to_json(make_whatif_results(request, made_of)))
     jsonschema.validate(results, schema())
     assert results["replayed"]["others"]["ev_pos"]["rejected_fraction"] == 0.0
     assert found.replayed.others["ev_pos"].rejected_fraction == 0.0

@@ -19,10 +19,10 @@ from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import Flight
 from px4fuse.report.whatif import (
     NOT_PREDICTABLE_TEXT,
-    column_heads,
-    statistic_rows,
-    sweep_notes,
-    sweep_table,
+    describe_sweep,
+    make_column_headings,
+    make_statistic_rows,
+    make_sweep_table,
     whatif_page,
 )
 from px4fuse.request import Sweep, WhatIfRequest, command_line
@@ -97,13 +97,13 @@ def test_what_if_without_set_option_keeps_consistent_parameters(estimated: WhatI
     texts = [str(block) for block in whatif_page(estimated).blocks]
     assert any("no parameter is changed" in text for text in texts)
     table, found = (
-        {label.strip(): cells for label, *cells in statistic_rows(estimated)},
+        {label.strip(): cells for label, *cells in make_statistic_rows(estimated)},
         estimated.whatif,
     )
     every = (found.logged, found.replayed)
     assert table["north: mean NIS"] == [f"{s.axes['north'].nis_mean:.3g}" for s in every]
     assert table["samples"] == [str(s.samples) for s in every]
-    assert all(len(cells) == len(column_heads(estimated)) == 2 for cells in table.values())
+    assert all(len(cells) == len(make_column_headings(estimated)) == 2 for cells in table.values())
 
 
 def test_whatif_sweep_also_applies_parameters_of_set_option(swept: WhatIfAnalysis) -> None:
@@ -113,9 +113,9 @@ def test_whatif_sweep_also_applies_parameters_of_set_option(swept: WhatIfAnalysi
     assert all(value.changed["EKF2_EVP_GATE"] == 3.0 for value in values)
     nis = [value.nis_mean for value in values]
     assert nis == sorted(nis, reverse=True)
-    assert sweep_table(swept)[0][0] == "EKF2_EVP_NOISE (m)"
-    assert [row[0] for row in sweep_table(swept)[1]] == ["0.05", "0.1", "0.2"]
-    best, error, *_ = sweep_notes(swept)
+    assert make_sweep_table(swept)[0][0] == "EKF2_EVP_NOISE (m)"
+    assert [row[0] for row in make_sweep_table(swept)[1]] == ["0.05", "0.1", "0.2"]
+    best, error, *_ = describe_sweep(swept)
     assert "closest to 1 at EKF2_EVP_NOISE 0.1" in best
     least = min(values, key=lambda value: value.position_rmse_to_truth_m)
     assert f"smallest at EKF2_EVP_NOISE {least.changed['EKF2_EVP_NOISE']:.3g}" in error
@@ -194,11 +194,11 @@ def test_what_if_table_shows_no_numbers_if_unpredictable(sample_flight: Flight) 
     request = WhatIfRequest(log=name, changes={"EKF2_EVP_NOISE": 0.02}, sweep=sweep)
     assert command_line(request).endswith("--set EKF2_EVP_NOISE=0.02 --sweep EKF2_EVP_GATE=1:5:2")
     told = run_what_if(request, flight=sample_flight)
-    table = statistic_rows(told)
+    table = make_statistic_rows(told)
     assert {line[3] for line in table} == {NOT_PREDICTABLE_TEXT}
     assert all(NOT_PREDICTABLE_TEXT not in line[:3] for line in table)
-    assert [line[1] for line in sweep_table(told)[1]] == [NOT_PREDICTABLE_TEXT] * 2
-    said = " ".join(sweep_notes(told))
-    assert "not predictable if more than 35% of the samples would be rejected" in said
-    assert "2 mm of position noise would change it" in said
+    assert [line[1] for line in make_sweep_table(told)[1]] == [NOT_PREDICTABLE_TEXT] * 2
+    said = " ".join(describe_sweep(told))
+    assert "not predictable in three cases: EKF2 rejects more than 35% of the samples" in said
+    assert "2 mm of added position noise change its statistics" in said
     assert "closest to 1" not in said

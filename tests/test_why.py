@@ -24,7 +24,7 @@ from px4fuse.ekf2.steps import (
 from px4fuse.filter.kalman import state_at
 from px4fuse.filter.settings import Settings
 from px4fuse.flight.model import Unavailable
-from px4fuse.report.difference_page import draw_pages, unexplained_note
+from px4fuse.report.difference_page import describe_missing_explanation, draw_pages
 from px4fuse.report.style import report_style
 
 
@@ -105,12 +105,12 @@ def test_report_without_ekf2_replay_omits_difference_page(sample: Analysis) -> N
     without = replace(sample, ekf2_model=absent, difference_steps={"north": absent, "east": absent})
     for analysis, reason in ((parted, "they part"), (without, "no IMU")):
         assert drawn(analysis) == []
-        line = unexplained_note(analysis)
-        assert line.startswith("The difference KF - EKF2 is not explained: ")
+        line = describe_missing_explanation(analysis)
+        assert line.startswith("The difference between KF and EKF2 cannot be explained: ")
         assert line.count(reason) == 1
     assert drawn(unexplained(sample)) == []
-    assert not unexplained_note(unexplained(sample))
-    assert not unexplained_note(sample)
+    assert not describe_missing_explanation(unexplained(sample))
+    assert not describe_missing_explanation(sample)
 
 
 @pytest.mark.parametrize(

@@ -323,9 +323,9 @@ def test_compare_warns_if_no_font_can_print_student_name(
 
     monkeypatch.setattr(pdf, "render_pdf", render_pdf)
     monkeypatch.setattr(fonts, "_other_fonts", lambda: ())
-    fonts.font_of.cache_clear()
+    fonts.find_font.cache_clear()
     run_main(monkeypatch, capsys, *f"compare l.ulg -o r.pdf --student {name}".split())
-    fonts.font_of.cache_clear()
+    fonts.find_font.cache_clear()
     (before,) = warnings
     assert (f"No installed font has the characters {name}" in before) == said
     assert ("Install a font with them" in before) == said

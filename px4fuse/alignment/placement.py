@@ -27,7 +27,7 @@ from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, desc
 from px4fuse.core.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import (
-    POSITION_FILE,
+    POSITION_FILE_ORIGIN,
     Alignment,
     Columns,
     Flight,
@@ -59,7 +59,7 @@ def _explain_mismatch(
     position_samples = pd.DataFrame(
         positions.to_numpy(), time_index(time_s.to_numpy()), Columns.POSITION
     )
-    track = PositionTrack("", POSITION_FILE, "", position_samples, "unknown", "", ())
+    track = PositionTrack("", POSITION_FILE_ORIGIN, "", position_samples, "unknown", "", ())
     search_limits = {} if problem.lag_s is not None else {"max_offset_s": span_s}
     convention = check_convention(flight, track, **search_limits)
     if convention is None or convention.verdict != "determined":
@@ -175,7 +175,7 @@ def align_position_file(
     )
     track = PositionTrack(
         name=recording.name,
-        origin=POSITION_FILE,
+        origin=POSITION_FILE_ORIGIN,
         description=f"position file with {len(aligned_samples)} samples in the frame "
         f"{alignment.frame}{rotation_text}",
         samples=aligned_samples,

@@ -13,7 +13,7 @@ from px4fuse.core.arrays import Array, BoolArray, ComplexArray
 from px4fuse.errors import Px4FuseError
 from px4fuse.filter.signals import Segment, ned_acceleration
 from px4fuse.flight.model import (
-    POSITION_FILE,
+    POSITION_FILE_ORIGIN,
     Columns,
     Ekf2,
     Flight,
@@ -204,6 +204,6 @@ def align_samples(
 
 def make_continuous_ekf2_track(ekf2: Ekf2, aligned_samples: pd.DataFrame) -> SampledTrack:
     """Return EKF2's track without position resets that only move the origin of EKF2's frame."""
-    track = PositionTrack("", POSITION_FILE, "", aligned_samples, "NED", "", ())
+    track = PositionTrack("", POSITION_FILE_ORIGIN, "", aligned_samples, "NED", "", ())
     segment = Segment(float(aligned_samples.index[0]), float(aligned_samples.index[-1]), "")
     return _smooth_ekf2_track(remove_origin_resets(ekf2, track, segment)[0])

@@ -82,14 +82,14 @@ def _compare_log(job: Job, path: Path, sha256: str) -> LogOutcome:
     # slow imports, which only the worker processes need
     from px4fuse.analysis import AidsOnlyAnalysis  # noqa: PLC0415
     from px4fuse.diagnose import diagnose_or_check_aids, read_flight  # noqa: PLC0415
-    from px4fuse.results.build import log_record, results  # noqa: PLC0415
+    from px4fuse.results.build import make_log_record, results  # noqa: PLC0415
     from px4fuse.results.contract import to_json  # noqa: PLC0415
 
     request = msgspec.structs.replace(job.request, log=str(path))
     row: Row = {"name": path.name, "log_sha256": sha256}
     try:
         flight = read_flight(request)
-        row |= collect_log_values(log_record(flight))
+        row |= collect_log_values(make_log_record(flight))
         analysis = diagnose_or_check_aids(request, flight=flight)
         if isinstance(analysis, AidsOnlyAnalysis):
             row |= collect_finding_values(analysis.findings, analysis.aids)

@@ -14,9 +14,9 @@ from px4fuse.core.text import count_noun, format_metres, format_number, format_r
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
 from px4fuse.findings import finding_title
 from px4fuse.html import frame
-from px4fuse.html.frame import Cell, Column, Row, Section
-from px4fuse.html.safe import clean_text, load_template, local_link
-from px4fuse.report.card_html import MARK_PATHS
+from px4fuse.html.frame import Cell, Column, Row, RowSection
+from px4fuse.html.safe import clean_text, load_template, make_relative_url
+from px4fuse.report.card_html import MARKER_SVG_PATHS
 from px4fuse.report.card_text import REFERENCE_MARKS, SEVERITY_SIGNS, format_consistent_ratios
 
 # Filter and reference of each σ ratio (source: innovations; truth: errors), as in Card.verdicts
@@ -114,10 +114,10 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
         ),
         rows=rows,
         filters=_make_drop_down_lists(logs),
-        groups=[(EXTRA_COLUMN_GROUP, "more columns")],
+        column_groups=[(EXTRA_COLUMN_GROUP, "more columns")],
         placeholder="search by name, vehicle, firmware or finding",
         full_table_note="The table fleet.csv contains all rows.",
-        ratio_axis={"bands": CONSISTENT_SIGMA_RATIOS, "ends": RATIO_AXIS_ENDS, "marks": MARK_PATHS},
+        ratio_axis={"bands": CONSISTENT_SIGMA_RATIOS, "ends": RATIO_AXIS_ENDS, "marks": MARKER_SVG_PATHS},
     )
 
 
@@ -127,22 +127,22 @@ def _make_log_cells(log: LogSummary) -> tuple[Cell, ...]:
     css_class = "command" if action.startswith(("px4fuse ", "param ")) else ""
     return (
         Cell(SEVERITY_SIGNS[severity], SEVERITIES.index(severity), style_class=f"sign {severity}"),
-        Cell(log["name"], below=log.get("changed", "")),
-        Cell(log["headline"], below=action, style_class=css_class),
+        Cell(log["name"], second_line=log.get("changed", "")),
+        Cell(log["headline"], second_line=action, style_class=css_class),
         *(
             _make_ratio_cell(log.get(f"{name}_ratio"), name, verdict)
             for name, verdict in zip(SIGMA_RATIO_COLUMNS, log["verdict_texts"], strict=True)
         ),
-        frame.number_cell(log.get("difference_rms_m"), format_metres),
+        frame.make_number_cell(log.get("difference_rms_m"), format_metres),
         Cell(log.get("date", "")[:10]),
         Cell(log.get("vehicle", "")),
         Cell(log.get("firmware", "")),
-        frame.number_cell(log.get("sigma_z_m"), format_number),
-        frame.number_cell(log.get("clock_offset_s"), format_number),
+        frame.make_number_cell(log.get("sigma_z_m"), format_number),
+        frame.make_number_cell(log.get("clock_offset_s"), format_number),
         Cell()
         if log["status"] == FAILED
-        else frame.number_cell(
-            float(len(finding_titles)), text_below=join_first(finding_titles, 2)
+        else frame.make_number_cell(
+            float(len(finding_titles)), second_line=join_first(finding_titles, 2)
         ),
     )
 
@@ -170,7 +170,7 @@ def sort_logs(logs: Iterable[LogSummary]) -> list[LogSummary]:
     return sorted(logs, key=compute_sort_key)
 
 
-def _make_log_details(log: LogSummary) -> tuple[Section, ...]:
+def _make_log_details(log: LogSummary) -> tuple[RowSection, ...]:
     value_rows = [
         [name, *(_format_value(axis.get(name, "")) for axis in log["axes"])]
         for name in AXIS_COLUMNS
@@ -178,28 +178,28 @@ def _make_log_details(log: LogSummary) -> tuple[Section, ...]:
     ]
     column_titles = ["", *(axis["axis"] for axis in log["axes"])]
     return (
-        frame.list_section(
+        frame.make_list_section(
             "Missing results",
             [reason for reason, _ in log["missing_results"] if reason],
             is_warning=True,
         ),
-        frame.list_section(
+        frame.make_list_section(
             "Actions", list(dict.fromkeys(remedy for _, remedy in log["missing_results"] if remedy))
         ),
-        frame.list_section(
+        frame.make_list_section(
             "Findings",
             [f"{finding_title(finding_id)} ({finding_id})" for finding_id in log["findings"]],
         ),
-        frame.table_section("Axes", value_rows, column_titles, range(1, len(column_titles))),
+        frame.make_table_section("Axes", value_rows, column_titles, range(1, len(column_titles))),
     )
 
 
-def _make_side_sections(log: LogSummary) -> tuple[Section, ...]:
+def _make_side_sections(log: LogSummary) -> tuple[RowSection, ...]:
     return (
-        frame.links_section(
-            "Files", [(label, local_link(log.get(name, ""))) for label, name in FILE_LINKS]
+        frame.make_links_section(
+            "Files", [(label, make_relative_url(log.get(name, ""))) for label, name in FILE_LINKS]
         ),
-        frame.name_value_section(
+        frame.make_name_value_section(
             "Flight", [(name, _format_value(log.get(name, ""))) for name in LOG_COLUMNS]
         ),
     )

@@ -52,8 +52,8 @@ def compare(
     from px4fuse.card.build import build_refusal_card
     from px4fuse.core.memory import release_free_memory
     from px4fuse.diagnose import diagnose_or_check_aids
-    from px4fuse.report.terminal import card_page, comparison_page
-    from px4fuse.results.build import outcome_results
+    from px4fuse.report.terminal import comparison_page, make_card_page
+    from px4fuse.results.build import make_outcome_results
 
     student = options.read_student(option_values, log)
     request = options.comparison_request(log, option_values)
@@ -61,7 +61,7 @@ def compare(
     try:
         with outputs.progress(json_path) as show_progress:
             outcome = diagnose_or_check_aids(request, show_progress)
-            results = outcome_results(request, outcome, student)
+            results = make_outcome_results(request, outcome, student)
             release_free_memory()  # the import of the report modules needs memory
             contents = outputs.result_files(
                 results,
@@ -74,12 +74,12 @@ def compare(
     except (LogError, MissingDataError) as error:
         if not sys.stderr.isatty():  # a program reads the error: print one line, not a card
             raise
-        outputs.show_page(card_page("card", build_refusal_card(error, log)), is_error=True)
+        outputs.show_page(make_card_page("card", build_refusal_card(error, log)), is_error=True)
         sys.exit(2)
     page = comparison_page(outcome, results, verbose=verbose, quiet=quiet)
     outputs.write_and_print(contents, page, request)
     if not quiet and STANDARD_OUTPUT not in contents:
-        outputs.show_page(card_page("closing", results.card))
+        outputs.show_page(make_card_page("closing", results.card))
     failed_verdicts = failed_checks(outcome) if checks else {}
     for name, verdict in failed_verdicts.items():
         click.echo(f"{name}: {verdict.replace('_', ' ')}", err=True)

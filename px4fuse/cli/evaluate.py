@@ -93,7 +93,7 @@ def evaluate(
     from px4fuse.loop.tracks import make_file_stem, read_source
     from px4fuse.report.evaluation import write_evaluation
     from px4fuse.report.page import Page
-    from px4fuse.results.build import evaluation_results
+    from px4fuse.results.build import make_evaluation_results
     from px4fuse.trajectory.evaluation import evaluate as evaluate_trajectory
 
     deltas = option_values.pop("rpe")
@@ -121,7 +121,7 @@ def evaluate(
             max_gap_s=request.max_gap_s,
             time_offset_s=request.time_offset_s,
         )
-        results = evaluation_results(request, evaluation)
+        results = make_evaluation_results(request, evaluation)
         name = f"{make_file_stem(estimate)}_against_{make_file_stem(reference)}"
         name += format_settings_suffix(request)
         contents = outputs.result_files(results, json_path, output, evaluation, show_progress, name)

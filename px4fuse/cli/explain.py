@@ -13,6 +13,6 @@ def explain(finding: str | None) -> None:
     FINDING is an id that px4fuse compare prints, such as source_outliers. Without FINDING, the
     ids of all findings are listed.
     """
-    from px4fuse.report.explanation import finding_page, list_page
+    from px4fuse.report.explanation import make_finding_page, make_findings_list
 
-    write_and_print({}, list_page() if finding is None else finding_page(finding))
+    write_and_print({}, make_findings_list() if finding is None else make_finding_page(finding))

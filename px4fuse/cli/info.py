@@ -50,7 +50,7 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
     """
     from px4fuse.diagnose import read_flight
     from px4fuse.info.inventory import take_inventory, to_json_dict
-    from px4fuse.report.inventory import log_page
+    from px4fuse.report.inventory import make_log_page
 
     request = comparison_request(log, option_values)
     with progress(json_path) as show_progress:
@@ -58,4 +58,4 @@ def info(log: Path, json_path: Path | None, **option_values: Any) -> None:
         show_progress("reading the contents of the log")
         inventory = take_inventory(flight)
     contents = result_files(to_json_dict(inventory), json_path)
-    write_and_print(contents, log_page(inventory, request))
+    write_and_print(contents, make_log_page(inventory, request))

@@ -151,7 +151,7 @@ def loop(
     from px4fuse.diagnose import analyse_loop_closure
     from px4fuse.loop.tracks import is_g2o, make_file_stem
     from px4fuse.report.loop import loop_page
-    from px4fuse.results.build import loop_results
+    from px4fuse.results.build import make_loop_results
 
     log = split_path_and_part(str(source))[0]  # SOURCE may be LOG:TRACK
     student = options.read_student(option_values, log)
@@ -168,7 +168,7 @@ def loop(
     outputs.check_targets([tum, g2o, *outputs.report_paths(output, json_path)])
     with outputs.progress(json_path) as show_progress:
         loop_result = analyse_loop_closure(request, show_progress)
-        results = loop_results(request, loop_result, student)
+        results = make_loop_results(request, loop_result, student)
         name = f"{make_file_stem(source)}_loop{format_settings_suffix(request)}"
         contents = _output_files(loop_result, tum, g2o) | outputs.result_files(
             results, json_path, output, loop_result, show_progress, name
@@ -210,7 +210,7 @@ def _solve_graph(
 ) -> None:
     from px4fuse.readers.g2o import g2o_text, read_g2o
     from px4fuse.report.loop import pose_graph_page
-    from px4fuse.results.build import graph_results
+    from px4fuse.results.build import make_graph_results
     from px4fuse.trajectory.graph.solver import analyse_graph
 
     path, track = split_path_and_part(str(source))
@@ -231,5 +231,5 @@ def _solve_graph(
         )
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
     contents = {} if g2o is None else {g2o: g2o_text(solved_graph).encode()}
-    contents |= outputs.result_files(graph_results(results, command), json_path)
+    contents |= outputs.result_files(make_graph_results(results, command), json_path)
     outputs.write_and_print(contents, pose_graph_page(results))

@@ -429,7 +429,7 @@ def read_student(option_values: dict[str, Any], log: Path) -> Student:
 def _warn_missing_fonts(text: str) -> None:
     if text.isascii():
         return
-    from px4fuse.report.fonts import font_advice, missing_characters
+    from px4fuse.report.fonts import find_missing_characters, format_font_advice
 
-    if characters := missing_characters(text):
-        click.echo(f"px4fuse: {font_advice(characters)}", err=True)
+    if characters := find_missing_characters(text):
+        click.echo(f"px4fuse: {format_font_advice(characters)}", err=True)

@@ -57,9 +57,9 @@ def practice(
     target = web_page_path(output, Path("reports", f"practice_{seed}.html"))
     ctx.meta[OPENS_OUTPUT_KEY] = sys.stdout.isatty() if opens_browser is None else opens_browser
     with progress(target) as show_progress:
-        from px4fuse.explore.practice import practice_text
+        from px4fuse.explore.practice import make_practice_page
 
-        page = practice_text(seed, level, flights, show_progress)
+        page = make_practice_page(seed, level, flights, show_progress)
         if output is None:
             check_default_page(target, page)
     write_and_print({target: page.encode()})

@@ -24,16 +24,16 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
     from px4fuse.diagnose import prepare_comparison, read_flight
     from px4fuse.errors import MissingDataError
     from px4fuse.flight.model import Unavailable
-    from px4fuse.report.clock import clock_advice
+    from px4fuse.report.clock import make_time_offset_advice
     from px4fuse.report.page import Page
-    from px4fuse.results.build import sync_results
+    from px4fuse.results.build import make_sync_results
 
     request = comparison_request(log, option_values)
     with progress(json_path) as show_progress:
         flight = read_flight(request, show_progress)
         comparison = prepare_comparison(flight, request, show_progress)
         _, clock_result = estimate_noises_and_clock(comparison, show_progress)
-    advice = clock_advice(comparison, clock_result)
+    advice = make_time_offset_advice(comparison, clock_result)
     if isinstance(clock_result, Unavailable) or not clock_result.is_determinable:
         name = comparison.flight.log.name
         remedy = clock_result.remedy if isinstance(clock_result, Unavailable) else advice["Action"]
@@ -41,7 +41,7 @@ def sync(log: Path, json_path: Path | None, **option_values: Any) -> None:
             f"{name}: the time offset cannot be estimated from this flight: {clock_result.reason}",
             remedy,
         )
-    results = sync_results(request, comparison, clock_result)
+    results = make_sync_results(request, comparison, clock_result)
     page = Page()
     page.write_labelled_texts(advice)
     write_and_print(result_files(results, json_path), page, request)

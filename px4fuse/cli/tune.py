@@ -24,7 +24,7 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     from px4fuse.diagnose import prepare_comparison, read_flight
     from px4fuse.errors import MissingDataError
     from px4fuse.report.tuning import tuning_page
-    from px4fuse.results.build import tuning_results
+    from px4fuse.results.build import make_tuning_results
 
     request = comparison_request(log, option_values)
     with progress(json_path) as show_progress:
@@ -38,5 +38,5 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
             f"{unavailable[0].reason}",
             unavailable[0].remedy,
         )
-    results = tuning_results(request, comparison, tunings)
+    results = make_tuning_results(request, comparison, tunings)
     write_and_print(result_files(results, json_path), tuning_page(comparison, tunings), request)

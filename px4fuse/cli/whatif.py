@@ -65,7 +65,7 @@ def whatif(
     """
     from px4fuse.diagnose import run_what_if
     from px4fuse.report.whatif import whatif_page
-    from px4fuse.results.build import whatif_results
+    from px4fuse.results.build import make_whatif_results
 
     if start_s is not None and not without:
         raise SettingsError("--from requires --without AID.")
@@ -78,7 +78,7 @@ def whatif(
     )
     with outputs.progress(json_path) as show_progress:
         analysis = run_what_if(request, show_progress)
-    results = whatif_results(request, analysis)
+    results = make_whatif_results(request, analysis)
     outputs.write_and_print(outputs.result_files(results, json_path), whatif_page(analysis))
 
 

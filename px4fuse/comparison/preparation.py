@@ -17,9 +17,9 @@ from px4fuse.filter.settings import SETTING_RANGES, requested_settings
 from px4fuse.filter.signals import AISLE, MIN_MEASUREMENTS, Segment, cut_to_segment, make_axes
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, PARAMETERS
 from px4fuse.flight.model import (
-    ALIGNED,
+    ALIGNED_ORIGIN,
     HEIGHT_ONLY_REASON,
-    POSITION_FILE,
+    POSITION_FILE_ORIGIN,
     Columns,
     Ekf2,
     Flight,
@@ -79,7 +79,7 @@ def prepare(
             source_track, origin=structs.replace(source_track.origin, kind=source_kind)
         )
     source_track = shift_clock(source_track, settings.clock_offset_s)
-    is_in_ned = source_track.origin.is_gnss or source_track.origin.path == ALIGNED.path
+    is_in_ned = source_track.origin.is_gnss or source_track.origin.path == ALIGNED_ORIGIN.path
     skips_convention_check = keep_as_sent or is_in_ned or flight.log.is_assessed
     convention = None if skips_convention_check else check_convention(flight, source_track)
     # A time offset from the user replaces the detected one
@@ -178,7 +178,7 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     """
     if name is None:
         for track in flight.positions:
-            if track.origin.is_automatic:
+            if track.origin.is_auto_candidate:
                 return track, _reason_for_choice(flight, track)
         missing_source = explain_missing_source(flight)
         raise MissingDataError(f"{flight.log.name}: {missing_source.reason}", missing_source.remedy)
@@ -320,7 +320,7 @@ def explain_missing_source(flight: Flight) -> Unavailable:
 
 
 def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
-    if track.origin == POSITION_FILE:
+    if track.origin == POSITION_FILE_ORIGIN:
         return "position file given with --position"
     if track.origin.fused_as_gnss:
         return "the only position source in the log, fused by EKF2"

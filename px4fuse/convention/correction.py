@@ -18,7 +18,7 @@ from px4fuse.flight.model import (
     Columns,
     Flight,
     PositionTrack,
-    kind_without_orientation,
+    infer_position_kind,
     time_index,
 )
 from px4fuse.trajectory.rotation import from_elements, heading
@@ -184,7 +184,7 @@ def correct_convention(
         Columns.POSITION + Columns.POSITION_VARIANCE,
     )
     if faults.orientation == "copied" and origin.kind == "vio":
-        origin = structs.replace(origin, kind=kind_without_orientation(samples))
+        origin = structs.replace(origin, kind=infer_position_kind(samples))
     if faults.orientation in ("copied", "heading"):
         orientation = None
     elif orientation is not None and convention.orientation is not None:

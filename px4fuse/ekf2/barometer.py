@@ -17,7 +17,7 @@ from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.ekf2.bias import SENSOR_BIAS_NOISE_DENSITY
 from px4fuse.ekf2.replay_segments import INNOVATION_TIME_CONSTANT_S
 from px4fuse.flight.ekf2_parameters import BAROMETER
-from px4fuse.flight.model import GROUND_EFFECT, Ekf2, FusionRecord
+from px4fuse.flight.model import GROUND_EFFECT_FLAG, Ekf2, FusionRecord
 
 # Default rate (Hz) at which EKF2 fuses the barometer, PX4 v1.15 and later
 BAROMETER_HZ = 10.0
@@ -42,7 +42,7 @@ def estimate_barometer_interval_s(fusion_record: FusionRecord) -> float:
     The interval is computed from the variance p of EKF2's barometer bias. In the steady state, an
     update reduces p as much as the random walk increases p: p' = p - p²/S and p = p' + q² Δt.
     """
-    bias_updates = fusion_record.height_bias.get(BAROMETER.name)
+    bias_updates = fusion_record.height_bias_updates.get(BAROMETER.name)
     if bias_updates is not None and len(bias_updates) > 1:
         variance_m2 = bias_updates["variance_m2"] * _compute_bias_gain(bias_updates)
         intervals_s = (variance_m2 - bias_updates["bias_m2"])[
@@ -94,7 +94,7 @@ def _combine_barometer_samples(
     displacement_m = cumulative_trapezoid(velocity_down_m_s.to_numpy(), velocity_times_s, initial=0)
     no_bias = dict.fromkeys(("bias_m", "bias_m2"), 0.0)
     no_bias |= {"innovation_m": np.nan, "variance_m2": 1.0}
-    bias_updates = fusion_record.height_bias.get(
+    bias_updates = fusion_record.height_bias_updates.get(
         BAROMETER.name, pd.DataFrame(no_bias, index=row_times_s[:1])
     )
     # EKF2 logs the barometer bias after its update, but innovations use the bias before it. Half an
@@ -108,7 +108,7 @@ def _combine_barometer_samples(
     fused_bias_m = np.column_stack([previous_bias_m, bias_updates["bias_m"]]).ravel()
     # Innovations in ground effect are not used: EKF2 subtracts a dead zone from them
     rows_outside_ground_effect = logged_rows[
-        ~fusion_record.was_in_state(GROUND_EFFECT, row_times_s)
+        ~fusion_record.was_in_state(GROUND_EFFECT_FLAG, row_times_s)
     ]
     prediction_offset_m = (
         rows_outside_ground_effect["observation_down"]

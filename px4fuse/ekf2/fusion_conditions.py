@@ -13,7 +13,7 @@ import pandas as pd
 
 from px4fuse.core.record import Span
 from px4fuse.ekf2.intervals import MAX_LATENESS_S
-from px4fuse.flight.ekf2_parameters import AID_MASK, Aid
+from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, Aid
 from px4fuse.flight.model import Columns, Ekf2, PositionTrack, step_values_at
 
 # EKF2 starts vision fusion if two samples arrive within this time (s): EV_MAX_INTERVAL of PX4 v1.14
@@ -144,7 +144,7 @@ def find_unmet_condition(positions: UnfusedPositions) -> UnmetCondition:
 def _check_switch(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     parameter_name, bit = positions.aid.switch, 0
     if not positions.has_switch:
-        parameter_name, bit = AID_MASK, 3 if positions.is_vision else 0
+        parameter_name, bit = AID_MASK_PARAMETER, 3 if positions.is_vision else 0
     parameter_value = int(positions.parameters.get(parameter_name, 1 << bit))
     if parameter_value >> bit & 1:
         return

@@ -29,7 +29,7 @@ from px4fuse.ekf2.replay_segments import (
     pad_samples,
 )
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, uses_aid_mask
-from px4fuse.flight.model import GROUND_EFFECT, Ekf2, Flight, FusionRecord, step_values_at
+from px4fuse.flight.model import GROUND_EFFECT_FLAG, Ekf2, Flight, FusionRecord, step_values_at
 
 # State indices of vertical velocity and height
 VELOCITY_DOWN, DOWN = 5, 8
@@ -84,7 +84,9 @@ def add_heights(
         sample_weight = fused_barometer["weight"].to_numpy()
     ground_effect_dead_zone_m = parameters.get("EKF2_GND_EFF_DZ", DEFAULT_DEAD_ZONE_M)
     dead_zone_m = np.where(
-        fusion_record.was_in_state(GROUND_EFFECT, measured_at_s), ground_effect_dead_zone_m, 0.0
+        fusion_record.was_in_state(GROUND_EFFECT_FLAG, measured_at_s),
+        ground_effect_dead_zone_m,
+        0.0,
     )
     new_segments = []
     delayed_down_m = fusion_record.delayed["down_m"]
@@ -92,7 +94,7 @@ def add_heights(
         start_s = float(segment.time_s[0])
         bias_and_variance = (0.0, 0.0)
         for aid_name in {*fused_aids} - {reference}:
-            logged_bias = fusion_record.height_bias.get(aid_name)
+            logged_bias = fusion_record.height_bias_updates.get(aid_name)
             if (
                 logged_bias is None
                 or not logged_bias.index[0] - MAX_BIAS_LOG_DELAY_S < start_s < logged_bias.index[-1]

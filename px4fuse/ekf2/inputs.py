@@ -23,7 +23,7 @@ from px4fuse.ekf2.replay_segments import (
     read_prediction_step_s,
 )
 from px4fuse.flight.ekf2_parameters import (
-    AID_MASK,
+    AID_MASK_PARAMETER,
     AIDS,
     BAROMETER,
     EV_POS,
@@ -33,12 +33,12 @@ from px4fuse.flight.ekf2_parameters import (
     GNSS_VEL,
     MAG,
     Aid,
-    effective_settings,
+    fill_with_defaults,
     uses_aid_mask,
 )
 from px4fuse.flight.model import (
-    DEAD_RECKONING,
-    POSITION_FILE,
+    DEAD_RECKONING_FLAG,
+    POSITION_FILE_ORIGIN,
     Columns,
     Ekf2,
     Flight,
@@ -335,7 +335,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         [BAROMETER] if height_samples and BAROMETER.name in height_samples.fused_sensors else []
     )
     return Inputs(
-        settings=effective_settings(fusion_record.parameters, aid, *other_aids) | lever_arm,
+        settings=fill_with_defaults(fusion_record.parameters, aid, *other_aids) | lever_arm,
         segments=segments,
         received=received,
         rules=_make_fusion_rules(fusion_record, ekf2.step_s, is_gnss=is_gnss),
@@ -448,7 +448,7 @@ def read_gnss(
         position_samples = position_samples[is_enabled]
         velocity_samples = velocity_samples[is_enabled]
     # The delay is added, because the replay subtracts it from all timestamps
-    logged_settings = effective_settings(parameters, GNSS_POS)
+    logged_settings = fill_with_defaults(parameters, GNSS_POS)
     logged_delay_s = logged_settings[GNSS_POS.delay] * 1e-3
     timestamp_s = position_samples.index.to_numpy() + logged_delay_s
     # Maximum reported position noise (m) that EKF2 uses (gps_control.cpp)
@@ -492,7 +492,9 @@ def read_vision(
         not isinstance(ekf2.fusion_flags, pd.DataFrame) or not ekf2.fusion_flags["yaw"].any()
     )
     if uses_aid_mask(fusion_record.parameters):
-        is_rotated_by_ekf2 = bool(int(fusion_record.parameters[AID_MASK]) & ROTATE_VISION_BIT)
+        is_rotated_by_ekf2 = bool(
+            int(fusion_record.parameters[AID_MASK_PARAMETER]) & ROTATE_VISION_BIT
+        )
     if track.frame == "FRD" and is_rotated_by_ekf2:
         if track.orientation is None:
             return Unavailable(
@@ -526,7 +528,7 @@ def read_vision(
         *rejected_and_reset,
         track.name,
         reset_s=reset_times_s(track),
-        has_all_resets=DEAD_RECKONING in fusion_record.states,
+        has_all_resets=DEAD_RECKONING_FLAG in fusion_record.states,
     )
 
 
@@ -568,7 +570,7 @@ def _read_logged_decisions(
         or innovation_topic(aid) not in ekf2.innovation_topics
     ):
         return rejected_flags, is_reset
-    delay_s = effective_settings(fusion_record.parameters, aid)[aid.delay] * 1e-3
+    delay_s = fill_with_defaults(fusion_record.parameters, aid)[aid.delay] * 1e-3
     measured_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
     # EKF2 fuses a sample at the first step after its measurement time, or after a late arrival
     fusion_due_s = np.maximum.accumulate(np.maximum(measured_s, arrival_s - horizon_s))
@@ -620,7 +622,7 @@ def _find_dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array
     EKF2 reports inertial dead reckoning after DEAD_RECKONING_TIMEOUT_S without fusion, and
     immediately if vision is disabled. Dead reckoning ends with a fusion or a reset.
     """
-    dead_reckoning_changes = fusion_record.states.get(DEAD_RECKONING)
+    dead_reckoning_changes = fusion_record.states.get(DEAD_RECKONING_FLAG)
     vision_enabled_changes = ekf2.states.get(EV_POS.name)
     if dead_reckoning_changes is None or vision_enabled_changes is None:
         return np.zeros((0, 2))
@@ -655,7 +657,7 @@ def find_horizontal_reset_times_s(ekf2: Ekf2) -> Array:
 def _find_vision_track(flight: Flight) -> PositionTrack | Unavailable:
     """Return the position track that contains all vision positions EKF2 received."""
     missing_reasons = ["the log has no topic vehicle_visual_odometry"]
-    for track in sorted(flight.positions, key=lambda track: track.origin == POSITION_FILE):
+    for track in sorted(flight.positions, key=lambda track: track.origin == POSITION_FILE_ORIGIN):
         if track.origin.is_vision and track.origin.has_all_samples:
             return track
         if track.name in VISION_REPETITION_INTERVALS_S:

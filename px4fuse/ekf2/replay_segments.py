@@ -26,7 +26,7 @@ from px4fuse.core.record import Span
 from px4fuse.ekf2.earth_model import compute_earth_rate_rad_s, compute_position_scale
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import (
-    BAD_ACCELERATION,
+    BAD_ACCELERATION_FLAG,
     Columns,
     Ekf2,
     Flight,
@@ -563,8 +563,8 @@ def _make_segment(
         ).astype(np.float32),
         state_correlation=np.eye(15),
         is_acceleration_bad=(
-            fusion_record.was_in_state(BAD_ACCELERATION, step_times_s)
-            if BAD_ACCELERATION in fusion_record.states
+            fusion_record.was_in_state(BAD_ACCELERATION_FLAG, step_times_s)
+            if BAD_ACCELERATION_FLAG in fusion_record.states
             else None
         ),
     )
@@ -576,8 +576,8 @@ def _find_field_fusion_span(fusion_record: FusionRecord) -> Span | None:
     Return None if EKF2 did not fuse all three axes, or interrupted this fusion.
     """
     is_fused_3d = (
-        fusion_record.field_gauss["fused_3d"]
-        if len(fusion_record.field_gauss)
+        fusion_record.magnetic_field_gauss["fused_3d"]
+        if len(fusion_record.magnetic_field_gauss)
         else pd.Series(dtype=float)
     )
     flag_times_s = is_fused_3d.index.to_numpy()
@@ -594,7 +594,7 @@ def _add_magnetic_field(
     segment: ReplaySegment, fusion_record: FusionRecord, start_row: int, step_s: float
 ) -> ReplaySegment:
     initial_row = fusion_record.delayed.iloc[start_row]
-    field_gauss = fusion_record.field_gauss
+    field_gauss = fusion_record.magnetic_field_gauss
     sample_times_s = field_gauss.index.to_numpy()
     age_s = fusion_record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     fused_samples_per_row = max(MAG_FUSION_HZ * median_interval(sample_times_s), 1.0)

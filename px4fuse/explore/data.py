@@ -15,7 +15,7 @@ from px4fuse.card.verdicts import make_sigma_verdicts
 from px4fuse.comparison.model import AxisComparison, Comparison, ErrorsAgainstTruth
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.comparison.remedy import find_aid
-from px4fuse.explore.packing import COARSE_SCALE, Packer
+from px4fuse.explore.packing import COARSE_STEPS_PER_UNIT, Packer
 from px4fuse.filter.consistency import CONFIDENCE_LEVEL, CONSISTENT_SIGMA_RATIOS
 from px4fuse.filter.model import INITIAL_COVARIANCE
 from px4fuse.filter.settings import KF_NUMERIC_SETTINGS, SETTING_RANGES, Settings
@@ -24,7 +24,7 @@ from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, PositionTrack, Unavailable
-from px4fuse.report.card_html import MARK_PATHS
+from px4fuse.report.card_html import MARKER_SVG_PATHS
 from px4fuse.request import ComparisonRequest, command_line
 
 # Data for the web page, in JSON types
@@ -33,9 +33,9 @@ PageData = dict[str, Any]
 OFFSET_SLIDER_HALF_RANGE_S = 0.6
 
 
-def flight_data(analysis: Analysis, packer: Packer) -> PageData:
-    """Return the data of one flight for JSON; arrays are added to the packer."""
-    signals = kf_inputs(analysis, packer)
+def make_flight_data(analysis: Analysis, packer: Packer) -> PageData:
+    """Return the data of one flight for JSON; its arrays are encoded by the packer."""
+    inputs = make_kf_inputs(analysis, packer)
     events, request = analysis.events, analysis.request
     assert request is not None
     return {
@@ -43,85 +43,87 @@ def flight_data(analysis: Analysis, packer: Packer) -> PageData:
         "settings": asdict(analysis.settings),
         "main": analysis.main.axis.name,
         "shown": [analysis.segment.flight.start_s, analysis.segment.flight.end_s],
-        **signals,
+        **inputs,
         "axes": [
-            axis_signals | _axis_data(analysis, result, packer)
-            for axis_signals, result in zip(signals["axes"], analysis.axes.values(), strict=True)
+            axis_inputs | _make_axis_data(analysis, result, packer)
+            for axis_inputs, result in zip(inputs["axes"], analysis.axes.values(), strict=True)
         ],
-        "likely": _ml_noises_by_axis(analysis),
+        "likely": _collect_ml_noises(analysis),
         "events": {
             "gap": events.gaps,
             "dropout": events.dropouts,
             "ground": events.ground_spans_s,
             "reset": list(events.resets_s),
         },
-        "command": _command_data(request, analysis),
-        "offset": _offset_data(request, analysis),
-        "flown": _ekf2_settings(analysis),
+        "command": _make_commands(request, analysis),
+        "offset": _make_offset_slider(request, analysis),
+        "flown": _format_ekf2_settings(analysis),
     }
 
 
-def kf_inputs(comparison: Comparison, packer: Packer) -> PageData:
+def make_kf_inputs(comparison: Comparison, packer: Packer) -> PageData:
     """Return the inputs of KF: positions, accelerations and initial covariance."""
-    source = raw_source(comparison)
+    source = undo_time_offset(comparison)
     return {
         "segment": [comparison.segment.start_s, comparison.segment.end_s],
         "start": list(INITIAL_COVARIANCE),
-        "imu": _imu_data(comparison, packer),
-        "axes": [_axis_signals(comparison, axis, source, packer) for axis in comparison.input_axes],
+        "imu": _make_imu_data(comparison, packer),
+        "axes": [
+            _make_axis_inputs(comparison, axis, source, packer) for axis in comparison.input_axes
+        ],
     }
 
 
-def ranges() -> PageData:
+def make_page_constants() -> PageData:
     """Return the range and default of each KF setting, and constants for drawing σ ratios."""
     return {
         "settings": {name: (low, high) for name, (low, high, *_) in SETTING_RANGES.items()},
         "lesson": asdict(Settings()),
         "bands": CONSISTENT_SIGMA_RATIOS,
         "ends": RATIO_AXIS_ENDS,
-        "marks": MARK_PATHS,
+        "marks": MARKER_SVG_PATHS,
     }
 
 
-def raw_source(comparison: Comparison) -> PositionTrack:
+def undo_time_offset(comparison: Comparison) -> PositionTrack:
     """Return the positions with their original timestamps, without the applied time offset."""
     return shift_clock(comparison.source, -comparison.settings.clock_offset_s)
 
 
-def _offset_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
+def _make_offset_slider(request: ComparisonRequest, analysis: Analysis) -> PageData:
     """Return range and estimate of the time offset, or the reason why it cannot be changed."""
     if request.position is not None:
-        return {"why": "the time offset aligns the position file with the log"}
-    analysed_offset_s, clock = analysis.settings.clock_offset_s, analysis.clock
-    estimate_s = None
+        return {"why": "Not adjustable: this offset aligns the position file with the log."}
+    applied_offset_s, clock = analysis.settings.clock_offset_s, analysis.clock
+    estimated_offset_s = None
     if isinstance(clock, ClockOffset) and clock.is_determinable:
-        estimate_s = analysed_offset_s + clock.remaining_s
+        estimated_offset_s = applied_offset_s + clock.remaining_s
     return {
-        "from": analysed_offset_s - OFFSET_SLIDER_HALF_RANGE_S,
-        "to": analysed_offset_s + OFFSET_SLIDER_HALF_RANGE_S,
-        "likely": estimate_s,
+        "from": applied_offset_s - OFFSET_SLIDER_HALF_RANGE_S,
+        "to": applied_offset_s + OFFSET_SLIDER_HALF_RANGE_S,
+        "likely": estimated_offset_s,
     }
 
 
-def _imu_data(comparison: Comparison, packer: Packer) -> PageData | str:
-    """Return times, gaps and span of the acceleration, or the reason why it is missing."""
+def _make_imu_data(comparison: Comparison, packer: Packer) -> PageData | str:
+    """Return sample times, gaps and time span (s) of the acceleration, or why it is missing."""
     acceleration = comparison.input_axes[0].acceleration
     if isinstance(acceleration, Unavailable):
         return acceleration.reason
     time_s = acceleration.time_s
     gap_start_indices = np.flatnonzero(find_imu_gaps(time_s))
-    gap_edges_s = np.stack([time_s[gap_start_indices], time_s[gap_start_indices + 1]], 1)
-    gap_sum_s = np.cumsum(np.diff(gap_edges_s, prepend=gap_edges_s[:, :1]))
+    gap_bounds_s = np.stack([time_s[gap_start_indices], time_s[gap_start_indices + 1]], 1)
+    gap_sum_s = np.cumsum(np.diff(gap_bounds_s, prepend=gap_bounds_s[:, :1]))
     return {
-        "time": packer.add_times(time_s[_segment_slice(comparison, acceleration)]),
+        "time": packer.add_times(time_s[_find_segment_slice(comparison, acceleration)]),
         "span": [time_s[0], time_s[-1]],
-        "gapEdges": gap_edges_s.ravel().tolist(),
-        # total duration (s) of all gaps before each gap edge
+        "gapEdges": gap_bounds_s.ravel().tolist(),
+        # for each start and end of a gap: total duration (s) of the gaps until then
         "gapSum": gap_sum_s.tolist(),
     }
 
 
-def _segment_slice(comparison: Comparison, acceleration: Acceleration) -> slice:
+def _find_segment_slice(comparison: Comparison, acceleration: Acceleration) -> slice:
     """Return the slice of IMU samples in the analysed time span, plus one sample at each end."""
     segment, time_s = comparison.segment, acceleration.time_s
     first_row = int(np.searchsorted(time_s, segment.start_s, side="right")) - 1
@@ -129,8 +131,8 @@ def _segment_slice(comparison: Comparison, acceleration: Acceleration) -> slice:
     return slice(max(first_row, 0), end_row)
 
 
-def _axis_signals(
-    comparison: Comparison, axis: Axis, raw_source: PositionTrack, packer: Packer
+def _make_axis_inputs(
+    comparison: Comparison, axis: Axis, source_track: PositionTrack, packer: Packer
 ) -> PageData:
     """Return position measurements (m) and integrated acceleration (m/s) along an axis.
 
@@ -138,53 +140,54 @@ def _axis_signals(
     time offset can move them into the time span.
     """
     segment = comparison.segment
-    time_s = raw_source.samples.index.to_numpy()
-    position_m = weighted_sum(raw_source.samples, Columns.POSITION, axis.direction)
+    time_s = source_track.samples.index.to_numpy()
+    position_m = weighted_sum(source_track.samples, Columns.POSITION, axis.direction)
     margin_s = OFFSET_SLIDER_HALF_RANGE_S + abs(comparison.settings.clock_offset_s)
     is_near_segment = (time_s >= segment.start_s - margin_s) & (time_s <= segment.end_s + margin_s)
     is_near_segment &= np.isfinite(position_m)
-    signals: PageData = {
+    inputs: PageData = {
         "name": axis.name,
         "time": packer.add_times(time_s[is_near_segment]),
         "z": packer.add(position_m[is_near_segment]),
     }
     if isinstance(axis.acceleration, Acceleration):
         integral_m_s = axis.acceleration.compute_integral_m_s()[
-            _segment_slice(comparison, axis.acceleration)
+            _find_segment_slice(comparison, axis.acceleration)
         ]
-        signals |= {
+        inputs |= {
             "integral": packer.add(integral_m_s - integral_m_s[0]),
             "rms": axis.acceleration.compute_rms_m_s2(),
         }
-    return signals
+    return inputs
 
 
-def _axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> PageData:
+def _make_axis_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> PageData:
     name = result.axis.name
     return {
         "called": result.axis.label,
         "along": describe_axis(analysis, result),
         "ratios": [verdict.ratio for verdict in make_sigma_verdicts(result)],
         "note": result.axis.note,
-        "bands": _nis_bands(len(result.axis.measurement_time_s), packer),
+        "bands": _pack_nis_bands(len(result.axis.measurement_time_s), packer),
         # key of the noise estimate: north and east may have a common estimate
         "noises": HORIZONTAL if name != "down" and HORIZONTAL in analysis.tuning else name,
-        "ekf2": _ekf2_data(analysis, result.with_flight_tracks(), packer),
-        "truth": _truth_data(result.with_flight_tracks(), packer),
+        "ekf2": _make_ekf2_data(analysis, result.with_flight_tracks(), packer),
+        "truth": _make_truth_data(result.with_flight_tracks(), packer),
     }
 
 
-def _nis_bands(innovation_count: int, packer: Packer) -> list[dict[str, int]]:
-    """Return the 95 % band of the mean NIS for 1 to 2 · ``innovation_count`` innovations.
+def _pack_nis_bands(innovation_count: int, packer: Packer) -> list[dict[str, int]]:
+    """Return the lower and the upper limits of the 95 % band of the mean NIS, packed.
 
-    The number of innovations changes with the time offset.
+    Row n - 1 is for n innovations. There are twice ``innovation_count`` rows, because another time
+    offset can increase the number of innovations.
     """
     innovation_counts = np.arange(1, 2 * innovation_count + 1)
     bounds = stats.chi2.interval(CONFIDENCE_LEVEL, innovation_counts)
-    return [packer.add(bound / innovation_counts, COARSE_SCALE) for bound in bounds]
+    return [packer.add(bound / innovation_counts, COARSE_STEPS_PER_UNIT) for bound in bounds]
 
 
-def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> PageData | str:
+def _make_ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> PageData | str:
     if isinstance(result.ekf2_state, Unavailable):
         return result.ekf2_state.reason
     state = result.ekf2_state.dropna()
@@ -230,7 +233,7 @@ def _ekf2_data(analysis: Analysis, result: AxisComparison, packer: Packer) -> Pa
     return ekf2_data
 
 
-def _truth_data(result: AxisComparison, packer: Packer) -> PageData | str:
+def _make_truth_data(result: AxisComparison, packer: Packer) -> PageData | str:
     if isinstance(result.truth, Unavailable):
         return result.truth.reason
     position = result.truth[["position_m"]].dropna()
@@ -242,11 +245,11 @@ def _truth_data(result: AxisComparison, packer: Packer) -> PageData | str:
 
 
 def _pack_frame(table: pd.DataFrame, columns: list[str], packer: Packer) -> list[dict[str, int]]:
-    values = [packer.add(table[column].to_numpy(), COARSE_SCALE) for column in columns]
+    values = [packer.add(table[column].to_numpy(), COARSE_STEPS_PER_UNIT) for column in columns]
     return [packer.add_times(table.index.to_numpy()), *values]
 
 
-def _ml_noises_by_axis(analysis: Analysis) -> PageData:
+def _collect_ml_noises(analysis: Analysis) -> PageData:
     return {
         name: [axis_tuning.sigma_a_two_state.value, axis_tuning.sigma_z.value]
         for name, axis_tuning in analysis.tuning.items()
@@ -254,7 +257,7 @@ def _ml_noises_by_axis(analysis: Analysis) -> PageData:
     }
 
 
-def _ekf2_settings(analysis: Analysis) -> dict[str, str]:
+def _format_ekf2_settings(analysis: Analysis) -> dict[str, str]:
     """Return the EKF2 parameters for noise, delay and gate of the position source, with units."""
     aid, logged_parameters = find_aid(analysis), analysis.flight.log.parameters
     return {
@@ -264,10 +267,10 @@ def _ekf2_settings(analysis: Analysis) -> dict[str, str]:
     }
 
 
-def _command_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
+def _make_commands(request: ComparisonRequest, analysis: Analysis) -> PageData:
     """Return the ``px4fuse compare`` command of this analysis in two forms.
 
-    "base" lets px4fuse choose time span and main axis. "fixed" states both, because the choice
+    "base" lets px4fuse choose time span and main axis. "fixed" contains both, because the choice
     depends on the time offset, which the user can change.
     """
     offset_s = None if request.position is None else request.clock_offset_s
@@ -277,7 +280,7 @@ def _command_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
     heading_deg = request.heading_deg
     if heading_deg is None and AISLE in analysis.axes:
         heading_deg = analysis[AISLE].heading_deg
-    fixed_request = msgspec.structs.replace(
+    explicit_request = msgspec.structs.replace(
         base_request,
         start_s=analysis.segment.start_s,
         end_s=analysis.segment.end_s,
@@ -285,7 +288,7 @@ def _command_data(request: ComparisonRequest, analysis: Analysis) -> PageData:
     )
     return {
         "base": command_line(base_request, for_shell=True),
-        "fixed": command_line(fixed_request, for_shell=True),
+        "fixed": command_line(explicit_request, for_shell=True),
         "input": request.input,
         "default_input": "zero"
         if isinstance(analysis.main.axis.acceleration, Unavailable)

@@ -102,6 +102,7 @@ const Engine = (() => {
     const n = line.time.length, m = line.updates, R = settings.sigma_z_m * settings.sigma_z_m;
     const columns = (names, length) => Object.fromEntries(names.split(" ").map((name) => [name, new Float64Array(length)]));
     const steps = { time: line.time, ...columns("p v p00 p01 p11", n), acceleration: mean, extra };
+    // of each update: index in `steps`, time, z, ν, S, gain K, and the state p, v and P before the update
     const updates = columns("step time z nu s k0 k1 p v p00 p01 p11", m);
     let p = line.z[0], v = 0, [p00, p01, p11] = flight.start, u = 0;
     write(steps, 0, { p, v, p00, p01, p11 });

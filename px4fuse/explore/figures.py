@@ -16,12 +16,12 @@ from px4fuse.explore.data import PageData
 BokehStyle = dict[str, Any]
 # Columns of the Bokeh data sources, which JavaScript fills
 SOURCE_COLUMNS = (
-    "t p v sp sv "  # time, position, velocity, σ of position, σ of velocity
-    "k0 k1 "  # KF gain of position and of velocity
-    "e minus plus "  # position error, lower and upper ±2σ limit
-    "x y "  # innovation ÷ √S, height of an arrow head at the edge of the plot
-    "z turn "  # measured position, angle of an arrow head (rad)
-    "row left right"  # row, start and end of an event
+    "t p v sp sv "  # t: time; p: position, v: velocity, with σ sp and sv
+    "k0 k1 "  # KF gain: k0 of position, k1 of velocity
+    "e minus plus "  # e: position error; minus, plus: its ∓2σ limits
+    "x y "  # x: innovation ÷ √S; y: height of an arrow head at the edge of the plot
+    "z turn "  # z: measured position; turn: angle of an arrow head (rad)
+    "row left right"  # event: row, start (left) and end (right)
 )
 # JavaScript sets the colours by `name`. Line styles distinguish the filters without colour
 KF_LINE: BokehStyle = {"line_width": 1.6, "name": "kf"}
@@ -31,8 +31,8 @@ HOLLOW_MARKER: BokehStyle = {"fill_color": None, "line_color": "black"}
 # Arrow head at the upper or lower edge of a plot, for a value outside the axis range
 ARROW_MARKER: BokehStyle = {"angle": "turn", "marker": "triangle"}
 # Style of the shaded band that contains the values of a consistent filter
-CONSISTENT_BAND: BokehStyle = {"level": "underlay", "fill_alpha": 1.0, "name": "consistent"}
-GAP_BAND: BokehStyle = {
+CONSISTENT_BAND_STYLE: BokehStyle = {"level": "underlay", "fill_alpha": 1.0, "name": "consistent"}
+GAP_BAND_STYLE: BokehStyle = {
     "level": "underlay",
     "fill_color": None,
     "line_color": None,
@@ -41,9 +41,9 @@ GAP_BAND: BokehStyle = {
     "hatch_alpha": 0.6,
 }
 # Limit (±) of innovation ÷ √S for 95 % of the innovations of a consistent filter
-CONSISTENT_LIMIT = 2.0
+CONSISTENT_LIMIT_SIGMAS = 2.0
 # Limit (±) of the plot axis of innovation ÷ √S
-INNOVATION_AXIS_LIMIT = 4.6
+PLOT_LIMIT_SIGMAS = 4.6
 # Left margin (pixels) of a plot
 LEFT_MARGIN_PIXELS = 50
 # Left margin (pixels) of the event plot, which has long labels, and of the plot above
@@ -88,12 +88,12 @@ class Figures(Record):
 FIGURES = read_toml(__file__, Figures)
 
 
-def document_json(data: PageData) -> tuple[Any, dict[str, str]]:
+def make_document_json(data: PageData) -> tuple[Any, dict[str, str]]:
     """Return a Bokeh document with all plots as JSON, and the name of each plot by its id."""
     document = Document()
-    time_range = _axis_range("time")
+    time_range = _make_range("time")
     plots = _make_plots(data, time_range)
-    plots |= {"strip": _event_plot(data, time_range), "step": _phase_plot()}
+    plots |= {"strip": _make_event_plot(data, time_range), "step": _make_phase_plot()}
     with document.models.freeze():  # Bokeh collects all models once, which is faster
         for plot in plots.values():
             document.add_root(plot)
@@ -101,7 +101,7 @@ def document_json(data: PageData) -> tuple[Any, dict[str, str]]:
 
 
 def has_reference(data: PageData) -> bool:
-    """Return True if the log contains ground truth or EKF2 along at least one axis."""
+    """Return True if ground truth or EKF2's state is logged for at least one axis."""
     return _has_track(data, "truth") or _has_track(data, "ekf2")
 
 
@@ -115,8 +115,8 @@ def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
     for name, plot in FIGURES.plots.items():
         if name == "error" and not has_reference(data):
             continue
-        data_sources = cache(lambda source, plot=name: _empty_source(f"{plot}:{source}"))
-        plot_figure = plots[name] = _figure(
+        get_source = cache(lambda source, plot=name: _make_source(f"{plot}:{source}"))
+        plot_figure = plots[name] = _make_figure(
             name,
             215,
             x_range=time_range,
@@ -127,19 +127,19 @@ def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
             min_border_left=EVENT_LEFT_MARGIN_PIXELS if name == "position" else LEFT_MARGIN_PIXELS,
         )
         if name == "position":
-            _draw_dots(plot_figure, data_sources("measured"), "t z", 3, name="measured")
+            _draw_dots(plot_figure, get_source("measured"), "t z", 3, name="measured")
         if name == "innovation":
-            _draw_innovations(plot_figure, data_sources, with_ekf2="ekf2" not in missing_tracks)
+            _draw_innovations(plot_figure, get_source, with_ekf2="ekf2" not in missing_tracks)
         if name == "error":
             plot_figure.varea(
-                "t", "minus", "plus", source=data_sources("error"), fill_alpha=0.25, name="kf_band"
+                "t", "minus", "plus", source=get_source("error"), fill_alpha=0.25, name="kf_band"
             )
         line_renderers: list[Any] = []
         for source_name, column, style_name, hover_name in plot.lines:
             if style_name in missing_tracks:
                 continue
             line_renderer = plot_figure.line(
-                "t", column, source=data_sources(source_name), **LINE_STYLES[style_name]
+                "t", column, source=get_source(source_name), **LINE_STYLES[style_name]
             )
             line_renderers.append(line_renderer)
             if hover_name:
@@ -150,16 +150,18 @@ def _make_plots(data: PageData, time_range: Range1d) -> dict[str, Any]:
             plot_figure.y_range.renderers = line_renderers
         _add_cursor(plot_figure)
         for low, high in data["events"]["gap"]:
-            plot_figure.add_layout(BoxAnnotation(left=low, right=high, **GAP_BAND))
+            plot_figure.add_layout(BoxAnnotation(left=low, right=high, **GAP_BAND_STYLE))
     return plots
 
 
 def _draw_innovations(
     plot_figure: Any, sources: Callable[[str], ColumnDataSource], *, with_ekf2: bool
 ) -> None:
-    plot_figure.y_range = Range1d(start=-INNOVATION_AXIS_LIMIT, end=INNOVATION_AXIS_LIMIT)
+    plot_figure.y_range = Range1d(start=-PLOT_LIMIT_SIGMAS, end=PLOT_LIMIT_SIGMAS)
     plot_figure.add_layout(
-        BoxAnnotation(bottom=-CONSISTENT_LIMIT, top=CONSISTENT_LIMIT, **CONSISTENT_BAND)
+        BoxAnnotation(
+            bottom=-CONSISTENT_LIMIT_SIGMAS, top=CONSISTENT_LIMIT_SIGMAS, **CONSISTENT_BAND_STYLE
+        )
     )
     kf_dots = _draw_dots(plot_figure, sources("updates"), "t x", 4, name="kf")
     _add_hover(plot_figure, kf_dots, "KF", "@x{0.00}")
@@ -184,7 +186,7 @@ def _add_hover(plot_figure: Any, renderer: Any, label: str, value: str) -> None:
     )
 
 
-def _figure(name: str, height: int, **options: Any) -> Any:
+def _make_figure(name: str, height: int, **options: Any) -> Any:
     return figure(
         name=name, height=height, sizing_mode="stretch_width", toolbar_location=None, **options
     )
@@ -197,20 +199,20 @@ def _add_cursor(plot_figure: Any, name: str = "cursor", **style: Any) -> None:
     )
 
 
-def _axis_range(name: str | None = None) -> Range1d:
+def _make_range(name: str | None = None) -> Range1d:
     return Range1d(start=0.1, end=1.0, name=name)
 
 
-def _empty_source(name: str) -> ColumnDataSource:
+def _make_source(name: str) -> ColumnDataSource:
     return ColumnDataSource(
         {column: [] for column in SOURCE_COLUMNS.split()}, name=f"{name}-source"
     )
 
 
-def _event_plot(data: PageData, time_range: Range1d) -> Any:
-    source = _empty_source("strip")
+def _make_event_plot(data: PageData, time_range: Range1d) -> Any:
+    source = _make_source("strip")
     rows = FIGURES.event_rows if _has_track(data, "ekf2") else FIGURES.event_rows[2:]
-    plot_figure = _figure(
+    plot_figure = _make_figure(
         "strip",
         28 * len(rows) + 24,
         x_range=time_range,
@@ -239,13 +241,13 @@ def _draw_dots(
     return plot_figure.scatter(x, y, source=source, size=size, **{"line_color": None} | style)
 
 
-def _phase_plot() -> Any:
+def _make_phase_plot() -> Any:
     """Make the plot of KF position and velocity with 2σ ellipse and measurement."""
-    plot_figure = _figure(
+    plot_figure = _make_figure(
         "step",
         330,
-        x_range=_axis_range(),
-        y_range=_axis_range(),
+        x_range=_make_range(),
+        y_range=_make_range(),
         tools="",
         x_axis_label="position (m)",
         y_axis_label="velocity (m/s)",
@@ -254,7 +256,7 @@ def _phase_plot() -> Any:
         BoxAnnotation(name="band", fill_alpha=0.25, line_color=None, visible=False)
     )
     _add_cursor(plot_figure, "measurement", line_dash=[2, 2])
-    plot_figure.line("p", "v", source=_empty_source("before"), **KF_LINE | {"line_dash": [6, 3]})
-    plot_figure.patch("p", "v", source=_empty_source("now"), fill_alpha=0.25, **KF_LINE)
-    _draw_dots(plot_figure, _empty_source("mean"), "p v", 7, name="kf")
+    plot_figure.line("p", "v", source=_make_source("before"), **KF_LINE | {"line_dash": [6, 3]})
+    plot_figure.patch("p", "v", source=_make_source("now"), fill_alpha=0.25, **KF_LINE)
+    _draw_dots(plot_figure, _make_source("mean"), "p v", 7, name="kf")
     return plot_figure

@@ -12,11 +12,11 @@ import numpy as np
 
 from px4fuse.core.arrays import Array
 
-# Factor by which inputs of KF (m, m/s or s) are multiplied before rounding. The rounding error is
-# 1 % of the tolerance between KF in JavaScript and KF in Python
-FINE_SCALE = 2.0**36
-# Factor before rounding for values (m, m/s or s) that are only drawn or averaged
-COARSE_SCALE = 1e6
+# Inputs of KF are rounded to this many steps per m, m/s or s, because integers are smaller when
+# compressed. The rounding error is 1 % of the tolerance between KF in JavaScript and KF in Python
+FINE_STEPS_PER_UNIT = 2.0**36
+# The same for values that are only drawn or averaged
+COARSE_STEPS_PER_UNIT = 1e6
 # Limit of the rounded values: half of the largest integer that JavaScript represents exactly
 MAX_EXACT_INTEGER = 2.0**52
 
@@ -26,10 +26,13 @@ class Packer:
     """Encoder of arrays; ``array_specs`` are (length, bytes per value, scale) of each array."""
 
     array_specs: list[tuple[int, int, float]] = field(default_factory=list)
-    _bytes: list[bytes] = field(default_factory=list)
+    _encoded_arrays: list[bytes] = field(default_factory=list)
 
-    def add(self, values: Array, scale: float = FINE_SCALE) -> dict[str, int]:
-        """Add an array; return ``{"array": index}``, which replaces the array in the JSON data."""
+    def add(self, values: Array, scale: float = FINE_STEPS_PER_UNIT) -> dict[str, int]:
+        """Add an array, rounded to ``scale`` steps per unit.
+
+        Return ``{"array": index}``, which replaces the array in the JSON data.
+        """
         values = np.asarray(values, dtype=np.float64)
         largest_value = float(np.max(np.abs(values), initial=1.0))
         while largest_value * scale > MAX_EXACT_INTEGER:
@@ -37,18 +40,18 @@ class Packer:
         integers = np.rint(values * scale).astype(np.int64)
         differences = np.diff(integers, prepend=0)
         # store the sign in the lowest bit, so that small negative numbers need few bytes
-        signed_integers = ((differences << 1) ^ (differences >> 63)).astype("<u8")
-        byte_count = max(1, (int(signed_integers.max(initial=0)).bit_length() + 7) // 8)
-        self._bytes.append(
-            signed_integers.view(np.uint8).reshape(-1, 8)[:, :byte_count].T.tobytes()
+        zigzag_integers = ((differences << 1) ^ (differences >> 63)).astype("<u8")
+        byte_count = max(1, (int(zigzag_integers.max(initial=0)).bit_length() + 7) // 8)
+        self._encoded_arrays.append(
+            zigzag_integers.view(np.uint8).reshape(-1, 8)[:, :byte_count].T.tobytes()
         )
         self.array_specs.append((len(values), byte_count, scale))
         return {"array": len(self.array_specs) - 1}
 
     def add_times(self, time_s: Array) -> dict[str, int]:
         is_microseconds = bool(np.all(np.abs(np.rint(time_s * 1e6) / 1e6 - time_s) < 1e-10))
-        return self.add(time_s, 1e6 if is_microseconds else FINE_SCALE)
+        return self.add(time_s, 1e6 if is_microseconds else FINE_STEPS_PER_UNIT)
 
     def text(self) -> str:
         """Return all arrays, compressed, as one base64 text."""
-        return base64.b64encode(zlib.compress(b"".join(self._bytes), 9)).decode()
+        return base64.b64encode(zlib.compress(b"".join(self._encoded_arrays), 9)).decode()

@@ -377,7 +377,7 @@ const Explore = (async () => {
     const gaps = flight.events.gap.length ? "; hatched: gap in the position source" : "";
     const shaded = `shaded: ±2σ reported by KF${gaps}`;
     if (!isText(axis.truth)) {
-      title("error", `RMSE ${both(({ truthP }) => truthP && Card.formatMetres(truthP))} · ${shaded}`);
+      title("error", `position RMSE ${both(({ truthP }) => truthP && Card.formatMetres(truthP))} · ${shaded}`);
     } else if (kf.ekf2P) {
       $("error").parentElement.querySelector("b").textContent = "KF − EKF2 position difference (m)";
       title("error", `RMS ${Card.formatMetres(kf.ekf2P)} · ${shaded}`);

@@ -6,11 +6,22 @@ from importlib.metadata import version
 from bokeh.resources import Resources
 
 from px4fuse.analysis import Analysis
-from px4fuse.explore.data import PageData, flight_data, ranges
-from px4fuse.explore.figures import FIGURES, document_json, has_reference
+from px4fuse.explore.data import PageData, make_flight_data, make_page_constants
+from px4fuse.explore.figures import FIGURES, has_reference, make_document_json
 from px4fuse.explore.packing import Packer
-from px4fuse.html.safe import clean_values, csp_hash, inert_json, load_template, read_asset
-from px4fuse.report.card_html import card_css, card_html, make_diagnosis_card, sigma_ratio_figures
+from px4fuse.html.safe import (
+    clean_values,
+    compute_csp_hash,
+    encode_safe_json,
+    load_template,
+    read_asset,
+)
+from px4fuse.report.card_html import (
+    make_card_html,
+    make_diagnosis_card,
+    make_sigma_ratio_figures,
+    read_card_css,
+)
 
 # Maximum length (characters) of a text from a log on the web page
 MAX_LOG_TEXT_LENGTH = 2000
@@ -19,42 +30,45 @@ PACKAGE = "px4fuse.explore"
 
 
 def html_text(analysis: Analysis) -> str:
-    """Make the interactive web page (HTML) of an analysis."""
     packer = Packer()
-    data, card = flight_data(analysis, packer), make_diagnosis_card(analysis)
+    data, card = make_flight_data(analysis, packer), make_diagnosis_card(analysis)
     identity = card.identity
-    return page_text(
+    return make_page_html(
         data,
-        data_scripts=data_scripts(data, analysis, packer),
+        data_scripts=make_data_elements(data, analysis, packer),
         command="explore",
         title=data["log"],
         about=f"{identity.source}, {identity.firmware}, {identity.duration_s:.1f} s",
-        card=card_html(card, has_apply=True),
+        card=make_card_html(card, has_apply_buttons=True),
         sha256=analysis.flight.log.sha256,
     )
 
 
-def data_scripts(data: PageData, analysis: Analysis, packer: Packer, suffix: str = "") -> str:
+def make_data_elements(data: PageData, analysis: Analysis, packer: Packer, suffix: str = "") -> str:
     """Return HTML elements with the data of one flight; ``suffix`` makes their ids unique."""
-    bokeh_document, name_by_plot_id = document_json(data)
+    bokeh_document, name_by_plot_id = make_document_json(data)
     content = {
         "flight": data,
-        "ranges": ranges(),
+        "ranges": make_page_constants(),
         "packed": packer.array_specs,
         "places": name_by_plot_id,
     }
-    figures = f'<template id="figures{suffix}">{sigma_ratio_figures(analysis)}</template>\n'
+    figures = f'<template id="figures{suffix}">{make_sigma_ratio_figures(analysis)}</template>\n'
     return figures + "\n".join(
         f'<script type="{kind}" id="{name}{suffix}">{text}</script>'
         for name, kind, text in (
-            ("content", "application/json", inert_json(clean_values(content, MAX_LOG_TEXT_LENGTH))),
-            ("document", "application/json", inert_json(bokeh_document)),
+            (
+                "content",
+                "application/json",
+                encode_safe_json(clean_values(content, MAX_LOG_TEXT_LENGTH)),
+            ),
+            ("document", "application/json", encode_safe_json(bokeh_document)),
             ("arrays", "text/plain", packer.text()),
         )
     )
 
 
-def page_text(
+def make_page_html(
     data: PageData,
     *,
     command: str,
@@ -86,10 +100,10 @@ def page_text(
         + "".join(read_asset(f"{name}.js", PACKAGE) for name in (*SCRIPT_NAMES, practice, "page")),
     }
     return load_template("explore/page.html").render(
-        {f"{name}_hash": csp_hash(text) for name, text in scripts_by_name.items()},
+        {f"{name}_hash": compute_csp_hash(text) for name, text in scripts_by_name.items()},
         **scripts_by_name,
         style="".join(map(read_asset, ("colours.css", "base.css")))
-        + card_css()
+        + read_card_css()
         + read_asset("page.css", PACKAGE),
         command=command,
         made_from=f"px4fuse {command} {sha256}".rstrip(),

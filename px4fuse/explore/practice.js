@@ -68,7 +68,7 @@ const Practice = (() => {
     box.replaceChildren(make("h2", { 1: "✓ Correct", 0.5: "Half correct", 0: "✕ Wrong" }[score]));
     if (!solution.mistakes.length) box.append(make("p", "The flight contains no fault."));
     for (const { fault, size, time, symptom, view, span } of solution.mistakes) {
-      const button = make("button", "Show in the plots");
+      const button = make("button", "Show the fault in the plots");
       button.addEventListener("click", () => {
         page.open(view);
         if (span !== null) page.setSpan(span[0] - 3, span[1] + 3);

@@ -19,24 +19,24 @@ from px4fuse.card.model import Card
 from px4fuse.core.record import Record, read_toml
 from px4fuse.core.text import capitalise_first
 from px4fuse.diagnose import diagnose
-from px4fuse.explore.data import flight_data
+from px4fuse.explore.data import make_flight_data
 from px4fuse.explore.packing import Packer
-from px4fuse.explore.page import data_scripts, page_text
+from px4fuse.explore.page import make_data_elements, make_page_html
 from px4fuse.findings import Finding
-from px4fuse.report.card_html import card_html
+from px4fuse.report.card_html import make_card_html
 from px4fuse.request import ComparisonRequest
 from px4fuse.simulation import flights
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.scenario import Scenario
 
 # Pairs of faults (as answers of the quiz) that do not hide each other in one flight
-COMBINABLE_CHOICES = (
+COMBINABLE_ANSWERS = (
     {"clock", "source"},
     {"clock", "gate"},
     {"frame", "source"},
     {"frame", "gate"},
 )
-MAX_LEVEL = 3
+MAX_QUIZ_LEVEL = 3  # level of the most difficult flights
 MAX_SEED = 2**32 - 1
 SIGMA_A_M_S2, SIGMA_Z_M = 0.10, 0.10
 # Settings of the simulated flights: less than a minute, with two turns. IMU errors are small,
@@ -59,7 +59,7 @@ FINDING_ID_BY_FAULT = {
     "dropout": "source_gap",
 }
 # Fault of the KF settings, not of the simulated flight: too small measurement noise
-NOISY_UWB = "noisy-uwb"
+NOISY_UWB_FAULT = "noisy-uwb"
 
 
 class QuizFault(Record):
@@ -68,9 +68,9 @@ class QuizFault(Record):
     Attributes
     ----------
     choice : str
-        Right answer of the quiz.
+        Name of the right answer.
     name : str
-        Fault, as in ``px4fuse simulate --mistake NAME``; :data:`NOISY_UWB` is a noise setting.
+        Fault, as in ``px4fuse simulate --mistake NAME``, or :data:`NOISY_UWB_FAULT`.
     sizes : tuple of str
         Size at each level of difficulty, as in ``px4fuse simulate --mistake``.
     view : str
@@ -88,7 +88,7 @@ class QuizFault(Record):
 
 
 class QuizTable(Record):
-    """Answers of the quiz with their texts, and injected faults (``practice.toml``)."""
+    """Possible answers (name and text) and injected faults of the quiz (``practice.toml``)."""
 
     choices: dict[str, str]
     faults: tuple[QuizFault, ...]
@@ -135,26 +135,26 @@ def _draw_flight(rng: np.random.Generator, right_answer: str, level: int) -> Qui
         return [candidates[rng.integers(len(candidates))]] if candidates else []
 
     faults = draw_one([fault for fault in QUIZ_FAULTS if fault.choice == right_answer])
-    if level == MAX_LEVEL and faults and rng.random() < 0.5:
+    if level == MAX_QUIZ_LEVEL and faults and rng.random() < 0.5:
         candidates = ((fault, {fault.choice, right_answer}) for fault in QUIZ_FAULTS)
-        faults += draw_one([fault for fault, pair in candidates if pair in COMBINABLE_CHOICES])
-    sizes, noise_m = [], SIGMA_Z_M
+        faults += draw_one([fault for fault, pair in candidates if pair in COMBINABLE_ANSWERS])
+    sizes, sigma_uwb_m = [], SIGMA_Z_M
     for fault in faults:
         sign = "-" if fault.has_either_sign and rng.random() < 0.5 else ""
         sizes.append(f"{sign}{fault.sizes[level - 1]}")
-        if fault.name == NOISY_UWB:
-            noise_m = float(sizes[-1])
+        if fault.name == NOISY_UWB_FAULT:
+            sigma_uwb_m = float(sizes[-1])
     scenario = Scenario(
         **SCENARIO_VALUES,
         length_m=round(float(rng.uniform(*AISLE_LENGTH_RANGE_M)), 1),
         heading_deg=round(float(rng.uniform(0.0, 359.0)), 0),
-        sigma_uwb_m=noise_m,
+        sigma_uwb_m=sigma_uwb_m,
         seed=int(rng.integers(MAX_SEED)),
     )
     return QuizFlight(scenario, tuple(faults), tuple(sizes))
 
 
-def practice_text(
+def make_practice_page(
     seed: int,
     level: int,
     count: int,
@@ -164,15 +164,15 @@ def practice_text(
 
     ``progress`` is called with a text, the number of finished flights, and the number of flights.
     """
-    elements = []
+    flight_elements = []
     data: dict[str, Any] = {}
     for flight_index, practice_flight in enumerate(draw_flights(seed, level, count)):
         progress(f"flight {flight_index + 1}", flight_index, count)
-        data, element = _flight_data(practice_flight, flight_index)
-        elements.append(element)
-    return page_text(
+        data, elements = _simulate_flight_data(practice_flight, flight_index)
+        flight_elements.append(elements)
+    return make_page_html(
         data,
-        data_scripts="\n".join(elements),
+        data_scripts="\n".join(flight_elements),
         command="practice",
         title="simulated flights with known faults",
         about=f"seed {seed}, level {level}",
@@ -181,25 +181,27 @@ def practice_text(
     )
 
 
-def _flight_data(practice_flight: QuizFlight, flight_index: int) -> tuple[dict[str, Any], str]:
+def _simulate_flight_data(
+    practice_flight: QuizFlight, flight_index: int
+) -> tuple[dict[str, Any], str]:
     faults_and_sizes = [*zip(practice_flight.faults, practice_flight.sizes, strict=True)]
     options = [
-        f"{fault.name}={size}" for fault, size in faults_and_sizes if fault.name != NOISY_UWB
+        f"{fault.name}={size}" for fault, size in faults_and_sizes if fault.name != NOISY_UWB_FAULT
     ]
     simulation = flights.simulate(practice_flight.scenario, parse_faults(options))
     flight = flights.to_flight(simulation, f"flight {flight_index + 1}")
     request = ComparisonRequest(log=flight.log.name, sigma_a_m_s2=SIGMA_A_M_S2, sigma_z_m=SIGMA_Z_M)
     # keep_as_sent: the automatic correction of axes and timestamps would hide the injected fault
     analysis, packer = diagnose(request, flight=flight, keep_as_sent=True), Packer()
-    data, card = flight_data(analysis, packer), build_card(analysis, request)
+    data, card = make_flight_data(analysis, packer), build_card(analysis, request)
     descriptions = [_describe_fault(*pair, analysis.findings) for pair in faults_and_sizes]
     answer_key = {
         "right": practice_flight.correct_answers,
         "mistakes": descriptions,
-        "card": card_html(_with_fault_headline(card, descriptions), has_apply=True),
+        "card": make_card_html(_with_fault_headline(card, descriptions), has_apply_buttons=True),
     }
     compressed_key = base64.b64encode(zlib.compress(json.dumps(answer_key).encode())).decode()
-    elements = data_scripts(data, analysis, packer, f"-{flight_index}")
+    elements = make_data_elements(data, analysis, packer, f"-{flight_index}")
     return (
         data,
         f'{elements}\n<script type="text/plain" id="key-{flight_index}">{compressed_key}</script>',
@@ -212,7 +214,7 @@ def _describe_fault(fault: QuizFault, size: str, findings: tuple[Finding, ...]) 
     time_text = f"{spans[0][0]:.1f} to {spans[-1][1]:.1f} s" if spans else "whole flight"
     return {
         "fault": fault.description,
-        "size": fault.size_text.format(*size_parts(size)),
+        "size": fault.size_text.format(*split_size(size)),
         "time": time_text,
         "symptom": fault.symptom,
         "view": fault.view,
@@ -220,10 +222,10 @@ def _describe_fault(fault: QuizFault, size: str, findings: tuple[Finding, ...]) 
     }
 
 
-def size_parts(size: str) -> list[str]:
+def split_size(size: str) -> list[str]:
     """Split the size of an injected fault at commas, and separate numbers and units by blanks.
 
-    >>> size_parts("5%,2m"), size_parts("-400ms"), size_parts("0.3")
+    >>> split_size("5%,2m"), split_size("-400ms"), split_size("0.3")
     (['5 %', '2 m'], ['-400 ms'], ['0.3'])
     """
     return [re.sub(r"(?<=\d)(?=[^\d.])", " ", part).replace("deg", "°") for part in size.split(",")]

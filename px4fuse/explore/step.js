@@ -138,7 +138,7 @@ const Step = (() => {
         + (now.updated ? "" : ": KF has predicted, but not yet updated") : `KF has predicted to ${t.toFixed(3)} s`;
       if (!isVisible("step")) return;
       drawPlane(run, now);
-      if (now.i === 0) return $("numbers").replaceChildren(make("p", "This is the initial state of KF."));
+      if (now.i === 0) return $("numbers").replaceChildren(make("p", "Initial state of KF: the first measured position, velocity 0."));
       const table = make("table");
       equations(run, settings, now).forEach((rows, isUpdate) => {
         for (const [title, text] of rows) {

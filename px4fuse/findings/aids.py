@@ -14,7 +14,7 @@ from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CAUSE_KEY, INNOVATION_SHIFT_CAUSE, SOURCE_SENSOR_CAUSE
 from px4fuse.findings.model import Findings, finding, format_percent, note, warning
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, MAG
-from px4fuse.flight.model import BAD_ACCELERATION, Unavailable
+from px4fuse.flight.model import BAD_ACCELERATION_FLAG, Unavailable
 
 # Aiding sources of external vision, which other modules test by replays of EKF2
 AIDS_OF_OTHER_DETECTORS = ("ev_pos", "ev_hgt")
@@ -65,7 +65,7 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
     state_times_s = state_times_s[
         (state_times_s >= analysis.segment.start_s) & (state_times_s <= analysis.segment.end_s)
     ]
-    is_flagged = ekf2.record.was_in_state(BAD_ACCELERATION, state_times_s)
+    is_flagged = ekf2.record.was_in_state(BAD_ACCELERATION_FLAG, state_times_s)
     if not is_flagged.any():
         return
     small_noise_parameters = {

@@ -23,7 +23,7 @@ from px4fuse.findings.model import (
     warning,
 )
 from px4fuse.flight.model import (
-    POSITION_FILE,
+    POSITION_FILE_ORIGIN,
     Ekf2,
     PositionTrack,
     Truth,
@@ -116,9 +116,9 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
 
 def _find_received_source(analysis: PreparedComparison) -> PositionTrack | None:
     """Return the track of the positions that PX4 received, without those of a position file."""
-    if analysis.source.origin != POSITION_FILE:
+    if analysis.source.origin != POSITION_FILE_ORIGIN:
         return analysis.source
-    tracks = (track for track in analysis.flight.positions if track.origin != POSITION_FILE)
+    tracks = (track for track in analysis.flight.positions if track.origin != POSITION_FILE_ORIGIN)
     return next((track for track in tracks if track.origin.is_vision), None)
 
 

@@ -17,7 +17,7 @@ from px4fuse.findings.model import (
     magnetometer_advice,
     spans_with_value,
 )
-from px4fuse.flight.ekf2_parameters import BAROMETER, EV_POS, MAG, YAW_CONTROL_BIT
+from px4fuse.flight.ekf2_parameters import BAROMETER, EV_CTRL_YAW_MASK, EV_POS, MAG
 from px4fuse.flight.model import (
     BODY_AXES,
     Columns,
@@ -213,7 +213,7 @@ def _find_heading_action(flight: Flight, source: PositionTrack | None) -> str:
         alternative_action = "let EKF2 fuse the yaw of the source"
         if source.orientation is None:
             alternative_action = f"send the orientation of the source, and {alternative_action}"
-            if int(flight.log.parameters.get(EV_POS.switch, 0)) & YAW_CONTROL_BIT:
+            if int(flight.log.parameters.get(EV_POS.switch, 0)) & EV_CTRL_YAW_MASK:
                 alternative_action = (
                     f"send the orientation of the source: {EV_POS.switch} bit 3 is set, but the "
                     "orientation is missing or constant"

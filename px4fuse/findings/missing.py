@@ -4,7 +4,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.core.text import capitalise_first
 from px4fuse.findings.model import Findings, warning
-from px4fuse.flight.model import RECEIVED, Unavailable, positions_phrase
+from px4fuse.flight.model import RECEIVED_ORIGIN, Unavailable, positions_phrase
 
 VISION_TOPIC = "vehicle_visual_odometry"
 # Bits 0 and 7 of SDLOG_PROFILE: default topics, and external vision (logged_topics.cpp)
@@ -44,7 +44,7 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
 
 def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
     """Detect that the log lacks the positions which PX4 received."""
-    source, received_rank = analysis.source, RECEIVED.find_preference_rank()
+    source, received_rank = analysis.source, RECEIVED_ORIGIN.find_preference_rank()
     has_received_positions = any(
         track.origin.find_preference_rank() == received_rank for track in analysis.flight.positions
     )

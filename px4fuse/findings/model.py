@@ -13,7 +13,7 @@ from px4fuse.core.record import Record, Span, read_toml
 from px4fuse.core.text import capitalise_first
 from px4fuse.filter.signals import Segment
 from px4fuse.finding import SEVERITIES, Finding, Severity
-from px4fuse.flight.ekf2_parameters import MAG, NO_MAGNETOMETER
+from px4fuse.flight.ekf2_parameters import MAG, MAG_TYPE_NONE
 from px4fuse.flight.model import Flight, PositionKind, PositionTrack
 
 
@@ -108,7 +108,7 @@ def find_source_texts(source: PositionTrack) -> SourceTexts:
 
 def magnetometer_advice(flight: Flight) -> str:
     """Return the action for a wrong magnetic heading; empty if EKF2 uses no magnetometer."""
-    if flight.log.parameters.get(MAG.switch) == NO_MAGNETOMETER:
+    if flight.log.parameters.get(MAG.switch) == MAG_TYPE_NONE:
         return ""
     return "Calibrate the magnetometer away from metal and motors."
 

@@ -11,7 +11,7 @@ from px4fuse.comparison.remedy import find_aid
 from px4fuse.core.text import format_metres, format_ratio
 from px4fuse.filter.consistency import assess_innovations
 from px4fuse.findings.model import Findings, note, warning
-from px4fuse.flight.ekf2_parameters import AID_MASK, PARAMETERS
+from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, PARAMETERS
 from px4fuse.flight.model import Ekf2, Unavailable
 
 # A parameter change has an effect if σ ratio or position RMSE change by at least this factor
@@ -32,7 +32,7 @@ class SpanConsistency(NamedTuple):
 def detect(analysis: Analysis) -> Findings:
     """Detect EKF2 parameters that are changed in flight and that px4fuse uses."""
     ekf2, segment = analysis.flight.ekf2, analysis.segment
-    fusion_parameters = (find_aid(analysis).switch, AID_MASK)
+    fusion_parameters = (find_aid(analysis).switch, AID_MASK_PARAMETER)
     changes = [
         change
         for change in (ekf2.parameter_changes if isinstance(ekf2, Ekf2) else ())

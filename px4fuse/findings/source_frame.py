@@ -19,7 +19,7 @@ from px4fuse.findings.model import (
     note,
     warning,
 )
-from px4fuse.flight.ekf2_parameters import EV_POS, YAW_CONTROL_BIT
+from px4fuse.flight.ekf2_parameters import EV_CTRL_YAW_MASK, EV_POS
 from px4fuse.flight.model import (
     Columns,
     Ekf2,
@@ -188,7 +188,7 @@ def _make_heading_drift_finding(analysis: Analysis, heading: HeadingError) -> Fi
         *(["odometry whose heading drifts"] if has_yaw else []),
     ]
     possible_cause, action = ", or ".join(possible_causes), ""
-    is_yaw_fused = int(analysis.flight.log.parameters.get(EV_POS.switch, 0.0)) & YAW_CONTROL_BIT
+    is_yaw_fused = int(analysis.flight.log.parameters.get(EV_POS.switch, 0.0)) & EV_CTRL_YAW_MASK
     sentence_start = "Alternatively, let" if calibration_advice else "Let"
     if has_yaw and not is_yaw_fused:
         action = f"{sentence_start} EKF2 fuse the yaw of the source (EKF2_EV_CTRL bit 3)."

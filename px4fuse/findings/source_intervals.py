@@ -23,7 +23,7 @@ from px4fuse.findings.model import (
     warning,
 )
 from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
-from px4fuse.flight.model import ALIGNED, Ekf2, Unavailable, positions_phrase, step_values_at
+from px4fuse.flight.model import ALIGNED_ORIGIN, Ekf2, Unavailable, positions_phrase, step_values_at
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
 # Minimum fraction of lost positions for a finding: PX4 v1.14 and later loses 0.3 %
@@ -259,10 +259,10 @@ def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
     # Timestamps do not show when PX4 received the positions if px4fuse changed them, or if PX4
-    # logged the positions only after EKF2 had used them (ALIGNED)
+    # logged the positions only after EKF2 had used them (ALIGNED_ORIGIN)
     if (
         source.clock_map is not None
-        or source.origin.find_preference_rank() >= ALIGNED.find_preference_rank()
+        or source.origin.find_preference_rank() >= ALIGNED_ORIGIN.find_preference_rank()
     ):
         return
     intervals_s, _ = _compute_intervals_s(analysis)

@@ -45,10 +45,10 @@ from px4fuse.flight.model import (
     Ekf2,
     Truth,
     Unavailable,
+    estimate_white_noise_m,
     positions_phrase,
     reset_times_s,
     source_name,
-    white_noise_m,
 )
 
 # The vehicle moves if the extent (m) of the positions is at least this (5th to 95th percentile)
@@ -581,7 +581,7 @@ def has_little_motion(comparison: Comparison) -> bool:
     positions = cut_to_segment(comparison.source.samples, comparison.segment)[
         Columns.POSITION[:2]
     ].dropna()
-    noise_m = white_noise_m(positions.to_numpy())
+    noise_m = estimate_white_noise_m(positions.to_numpy())
     return compute_motion_range_m(comparison) < max(
         MIN_MOTION_RANGE_M, MIN_MOTION_RANGE_SIGMAS * noise_m
     )

@@ -15,8 +15,8 @@ from px4fuse.ekf2.intervals import MAX_LATENESS_S
 from px4fuse.findings.model import Findings, error, format_percent, fraction_of_ones, note, warning
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
-    ARRIVAL_METHODS,
-    REPEATED_TIMESTAMPS,
+    ARRIVAL_CLOCK_METHODS,
+    REPEATED_TIMESTAMPS_NOTE,
     ClockMap,
     Ekf2,
     FusionRecord,
@@ -58,13 +58,13 @@ def detect(analysis: Analysis) -> Findings:
     if clock_map is None:
         yield from detect_arrival_timestamps(analysis)
         yield from detect_varying_latency(analysis)
-    elif clock_map.note == REPEATED_TIMESTAMPS and clock_map.distinct_stamps:
+    elif clock_map.note == REPEATED_TIMESTAMPS_NOTE and clock_map.distinct_stamps:
         yield from detect_shared_timestamps(analysis, clock_map.pairs, clock_map.distinct_stamps)
     elif clock_map.clock in AGE_TEXT_BY_WRONG_TIMESTAMP:
         yield from detect_timestamp_unit(analysis, clock_map.clock)
     elif clock_map.distinct_stamps is not None:
         yield from detect_constant_timestamps(positions_text, clock_map, clock_map.distinct_stamps)
-    elif clock_map.method in ARRIVAL_METHODS:
+    elif clock_map.method in ARRIVAL_CLOCK_METHODS:
         kf_times_sentence = (
             "KF uses the timestamps of the messages, converted to the autopilot's boot clock by "
             f"the {clock_map.method}."

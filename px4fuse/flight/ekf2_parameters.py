@@ -47,8 +47,8 @@ class Aid:
     fields: str = ""
     # Fields of ekf2_innovations (v1.8 to v1.10); ``_var`` is appended for the variance
     old_fields: str = ""
-    # Flags in estimator_status_flags that are 1 while EKF2 is configured to fuse this source. Each
-    # element contains the flags of one PX4 release, separated by commas
+    # Flags of estimator_status_flags that are 1 while fusion of the aiding source is enabled. Each
+    # element holds the flag of one PX4 release, or several flags separated by commas
     flags: tuple[str, ...] = ()
     # Bit of estimator_status.control_mode_flags that is used if ``flags`` are not logged
     status_bit: int | None = None
@@ -60,11 +60,18 @@ class Aid:
 
     def logged_parameters(self, logged_values: Mapping[str, float]) -> dict[str, float]:
         """Return the logged parameters for noise, delay, gate and fusion of this aiding source."""
-        names = (self.noise, self.delay, self.gate, self.noise_mode, self.switch, AID_MASK)
+        names = (
+            self.noise,
+            self.delay,
+            self.gate,
+            self.noise_mode,
+            self.switch,
+            AID_MASK_PARAMETER,
+        )
         return {name: float(logged_values[name]) for name in names if name in logged_values}
 
 
-AID_MASK = "EKF2_AID_MASK"
+AID_MASK_PARAMETER = "EKF2_AID_MASK"
 # Parameter of PX4 main since 2026, with which EKF2 uses the GNSS driver's measurement times
 GNSS_MODE_PARAMETER = "EKF2_GPS_MODE"
 # Relative tolerance of PX4's parameter ranges, because logged values are float32 (rounding 6e-8)
@@ -97,9 +104,10 @@ class Parameter(NamedTuple):
 
 
 PARAMETER_TABLES = read_toml(__file__, dict)
-# Keys of PARAMETER_TABLES whose text contains several names, separated by blanks
+# Keys of PARAMETER_TABLES whose value is a list of names, separated by blanks
 NAME_LIST_KEYS = ("axes", "lever_arm", "flags")
-AIDS, DISTURBANCES = (
+# Aiding sources, and other status flags of EKF2, by name
+AIDS, STATUS_FLAGS = (
     {
         name: msgspec.convert(
             {"name": name, **PARAMETER_TABLES["groups"].get(name.partition("_")[0], {}), **row}
@@ -124,17 +132,17 @@ PARAMETERS, _LOGGED_PARAMETERS = (
 # Parameters of the EKF2 model, and other logged parameters that px4fuse needs
 PARAMETER_RANGES = PARAMETERS | _LOGGED_PARAMETERS
 MAGNETIC_FIELD_NOISE_PARAMETERS = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
-# EKF2_MAG_TYPE without magnetometer
-NO_MAGNETOMETER = 5
-# Bit of EKF2_EV_CTRL that enables the fusion of the yaw of external vision
-YAW_CONTROL_BIT = 8
+# Value of EKF2_MAG_TYPE for flights without magnetometer
+MAG_TYPE_NONE = 5
+# Bit mask of EKF2_EV_CTRL: EKF2 fuses the yaw of external vision
+EV_CTRL_YAW_MASK = 8
 # Defaults of PX4 up to v1.13 that differ from the defaults of later releases (ekf2_params.c)
 OLD_DEFAULTS: Mapping[str, float] = {EV_POS.delay: 175.0}
 # Names of the logged parameters that the results contain
 REPORTED_PARAMETERS: tuple[str, ...] = tuple(PARAMETER_TABLES["reported"].split())
 
 
-def effective_settings(
+def fill_with_defaults(
     logged_values: Mapping[str, float], aid: Aid = EV_POS, *other_aids: Aid
 ) -> dict[str, float]:
     """Return all parameters of the EKF2 model: the logged value or, if not logged, PX4's default.
@@ -165,7 +173,7 @@ def effective_settings(
 
 def uses_aid_mask(logged_values: Mapping[str, float]) -> bool:
     """Return True if EKF2_AID_MASK selects the aiding sources in this log (PX4 up to v1.13)."""
-    return AID_MASK in logged_values and EV_POS.switch not in logged_values
+    return AID_MASK_PARAMETER in logged_values and EV_POS.switch not in logged_values
 
 
 def replace_invalid_parameters(

@@ -46,17 +46,17 @@ DataRoute = Literal[
 
 
 class Origin(Record):
-    """Kind of a position source, and the route by which its positions reach the log."""
+    """Kind of a position source, and form in which its positions are available."""
 
     # Kind of device, inferred from the data: "vio" sends a changing orientation, "uwb" only noisy
     # positions, "unknown" only precise positions
     kind: PositionKind
-    # Route of the positions into the log (not a file path)
+    # Form in which the positions are available, for example as the autopilot received them
     path: DataRoute
     # Aiding source of EKF2 for these positions; None if EKF2 never fuses them
     aid: Aid | None
     # True if px4fuse may select the source without --position-source
-    is_automatic: bool = True
+    is_auto_candidate: bool = True
 
     @property
     def may_drift(self) -> bool:
@@ -87,10 +87,9 @@ class Origin(Record):
 
     @property
     def is_gnss(self) -> bool:
-        """True for GNSS.
+        """True for GNSS, whose errors (multipath, atmosphere) are correlated over minutes.
 
-        Multipath and atmospheric errors are correlated over minutes, so R must be larger than the
-        variance of the differences of consecutive positions.
+        R must therefore be larger than the differences of consecutive positions indicate.
         """
         return self.kind == "gnss"
 
@@ -99,15 +98,23 @@ class Origin(Record):
         return [(origin.aid, origin.path) for origin in ORIGINS].index((self.aid, self.path))
 
 
-POSITION_FILE = Origin("file", "given file", EV_POS)
-RECEIVED = Origin("uwb", "as received", EV_POS)
-MOTION_CAPTURE = Origin("mocap", "as received", None)
-ALIGNED = Origin("uwb", "aligned by EKF2", EV_POS)
-LOGGED_BY_EKF2 = Origin("uwb", "kept by EKF2", EV_POS)
-FROM_INNOVATIONS = Origin("uwb", "rebuilt from innovations", EV_POS)
-GNSS = Origin("gnss", "as received", GNSS_POS, is_automatic=False)
+POSITION_FILE_ORIGIN = Origin("file", "given file", EV_POS)
+RECEIVED_ORIGIN = Origin("uwb", "as received", EV_POS)
+MOTION_CAPTURE_ORIGIN = Origin("mocap", "as received", None)
+ALIGNED_ORIGIN = Origin("uwb", "aligned by EKF2", EV_POS)
+KEPT_BY_EKF2_ORIGIN = Origin("uwb", "kept by EKF2", EV_POS)
+REBUILT_ORIGIN = Origin("uwb", "rebuilt from innovations", EV_POS)
+GNSS_ORIGIN = Origin("gnss", "as received", GNSS_POS, is_auto_candidate=False)
 # All kinds of position sources, in the order of preference for the analysis
-ORIGINS = (POSITION_FILE, RECEIVED, MOTION_CAPTURE, ALIGNED, LOGGED_BY_EKF2, FROM_INNOVATIONS, GNSS)
+ORIGINS = (
+    POSITION_FILE_ORIGIN,
+    RECEIVED_ORIGIN,
+    MOTION_CAPTURE_ORIGIN,
+    ALIGNED_ORIGIN,
+    KEPT_BY_EKF2_ORIGIN,
+    REBUILT_ORIGIN,
+    GNSS_ORIGIN,
+)
 
 
 def find_origin(kind: str, path: str) -> Origin:
@@ -117,12 +124,16 @@ def find_origin(kind: str, path: str) -> Origin:
     raise ValueError(f"no position source has the kind {kind!r} and the path {path!r}")
 
 
-def with_orientation(origin: Origin, *, is_changing: bool) -> Origin:
-    """Change the kind "uwb" to "vio" if the source sends a changing orientation."""
-    return replace(origin, kind="vio") if origin.kind == "uwb" and is_changing else origin
+def reclassify_as_vio(origin: Origin, *, has_changing_orientation: bool) -> Origin:
+    """Change the kind "uwb" to "vio" if the source sends orientations that change."""
+    return (
+        replace(origin, kind="vio") if origin.kind == "uwb" and has_changing_orientation else origin
+    )
 
 
-REPEATED_TIMESTAMPS = "most timestamps of the sender are repeated"
+REPEATED_TIMESTAMPS_NOTE = (
+    "most timestamps of the sender are repeated, so its clock is not converted"
+)
 # Clock of timestamps in a ULog that an external sender set and PX4 converted or replaced
 SENDER_CLOCK = "sender timestamps"
 # Replacement for results that would show a student the injected fault of an assignment
@@ -174,10 +185,10 @@ class ClockMap(Record):
 
     # Name of the clock ("UNIX time of system 1, component 197")
     clock: str
-    # Source of the conversion: "boot clock", "TIMESYNC", "SYSTEM_TIME", "receive time", "arrival
-    # time" or "message order"
+    # Source of the conversion: "boot clock", "TIMESYNC", "SYSTEM_TIME", "receive time" (at the
+    # recording computer), "arrival time" (at the autopilot) or "message order"
     method: str
-    # Number of simultaneous readings of both clocks
+    # Number of simultaneous readings of this clock and the boot clock
     pairs: Count
     # Boot clock minus converted clock, at the middle of the readings
     offset_s: float
@@ -187,7 +198,7 @@ class ClockMap(Record):
     jitter_s: NotNegative
     # Limitation of the conversion, if any
     note: str = ""
-    # Number of different timestamps, only if too few for a conversion
+    # Number of distinct timestamps; None if they are enough for a conversion
     distinct_stamps: Count | None = None
 
 
@@ -201,13 +212,13 @@ def clock_of_repeated_timestamps(
     if 2 * distinct_count > sample_count:
         return None
     return ClockMap(
-        clock, "as sent", sample_count, 0.0, 0.0, 0.0, REPEATED_TIMESTAMPS, distinct_count
+        clock, "as sent", sample_count, 0.0, 0.0, 0.0, REPEATED_TIMESTAMPS_NOTE, distinct_count
     )
 
 
 @dataclass(frozen=True)
-class Stream:
-    """Provenance of one kind of data: topics or messages, clock of timestamps, and file name."""
+class DataSource:
+    """Topics or messages of one kind of data, clock of their timestamps, and file name."""
 
     topics: tuple[str, ...]
     clock: str
@@ -300,11 +311,11 @@ Spans = tuple[Span, ...]
 # samples arrive in bursts
 MIN_REGULAR_FRACTION = 0.8
 # Values of ClockMap.method for which the timestamps are not times of measurement
-ARRIVAL_METHODS = ("arrival time", "receive time", "message order")
+ARRIVAL_CLOCK_METHODS = ("arrival time", "receive time", "message order")
 # Reason for missing positions if the source measures only the height
 HEIGHT_ONLY_REASON = "x and y are NaN in all messages, so the source measures only the height"
 # Ratio of the median absolute second difference to the σ of white noise
-SECOND_DIFFERENCE_FACTOR = 6.0**0.5 / 1.4826
+SECOND_DIFFERENCE_PER_SIGMA = 6.0**0.5 / 1.4826
 # Minimum number of positions to estimate their noise
 MIN_NOISE_SAMPLES = 10
 # Minimum noise (1 σ, m) of UWB positions
@@ -412,7 +423,7 @@ class PositionTrack:
     samples: pd.DataFrame
     # "NED", "FRD" (world-fixed, x is the initial heading) or "unknown"
     frame: str
-    # Clock of the timestamps
+    # Name of the clock of the timestamps, for example "boot clock"
     clock: str
     # Topics or messages with the data, and name of their file
     topics: tuple[str, ...]
@@ -425,7 +436,8 @@ class PositionTrack:
     orientation: pd.DataFrame | None = None
     # Velocity in NED and its variances, if the source measures velocity (GNSS)
     velocity: pd.DataFrame | None = None
-    # Delay from measurement to timestamp that EKF2 assumes; already subtracted from the times
+    # Delay that EKF2 assumes from measurement to timestamp. The times in ``samples`` are timestamps
+    # minus this delay
     assumed_delay_s: float = 0.0
     # Barometer height ``down_m``, if it replaces the height of the source
     barometer: pd.DataFrame | None = None
@@ -471,16 +483,16 @@ class PositionTrack:
         return sample_rate(self.samples)
 
 
-def white_noise_m(position_m: Array) -> float:
+def estimate_white_noise_m(position_m: Array) -> float:
     """Estimate the white noise (1 σ, m) of positions from second differences, shape (n, axes).
 
     Second differences are zero at constant velocity. The result is that of the noisiest axis.
     """
     second_difference_m = np.abs(np.diff(position_m, 2, axis=0))
-    return float(np.median(second_difference_m, axis=0).max()) / SECOND_DIFFERENCE_FACTOR
+    return float(np.median(second_difference_m, axis=0).max()) / SECOND_DIFFERENCE_PER_SIGMA
 
 
-def kind_without_orientation(samples: pd.DataFrame) -> PositionKind:
+def infer_position_kind(samples: pd.DataFrame) -> PositionKind:
     """Infer the kind of a source without orientation: noisy and slow is "uwb", else "unknown".
 
     Motion capture, odometry and other precise systems may also send positions only.
@@ -488,7 +500,7 @@ def kind_without_orientation(samples: pd.DataFrame) -> PositionKind:
     position_m = samples[Columns.POSITION[:2]].dropna().drop_duplicates().to_numpy()
     is_uwb = (
         len(position_m) >= MIN_NOISE_SAMPLES
-        and white_noise_m(position_m) > MIN_UWB_NOISE_M
+        and estimate_white_noise_m(position_m) > MIN_UWB_NOISE_M
         and sample_rate(samples) < MAX_UWB_RATE_HZ
     )
     return "uwb" if is_uwb else "unknown"
@@ -551,15 +563,16 @@ RECORD_NOT_LOGGED = Unavailable(
 )
 
 
-GROUND_EFFECT, BAD_ACCELERATION = "gnd_effect", "bad_acc_vertical"
-DEAD_RECKONING = "inertial_dead_reckoning"
+# Names of status flags of EKF2 in FusionRecord.states
+GROUND_EFFECT_FLAG, BAD_ACCELERATION_FLAG = "gnd_effect", "bad_acc_vertical"
+DEAD_RECKONING_FLAG = "inertial_dead_reckoning"
 # Weight of a new sample in EKF2's low-pass filter of optical flow (_flow_vel_body_lpf in ekf.h)
 FLOW_FILTER_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
 class FusionRecord:
-    """Logged data of EKF2 at its fusion horizon, from which the replay starts."""
+    """Logged data of EKF2 at its fusion horizon: initial values and inputs of the replay."""
 
     # All EKF2_ parameters at the start of the log, by PX4 name, in PX4 units
     parameters: Mapping[str, float]
@@ -574,7 +587,7 @@ class FusionRecord:
     vision_age_s: pd.Series
     # Measured magnetic field (body FRD). ``fused_3d`` is 1 while EKF2 fuses all components, 0 for
     # heading only. Since v1.16: EKF2's low-pass filtered innovations (predicted minus measured)
-    field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
+    magnetic_field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
     # Velocity from optical flow (body FRD): mean of the measurements since the previous row, with
     # the weights of EKF2's low-pass filter (FLOW_FILTER_WEIGHT). ``samples`` is their number,
     # ``interval_s`` their interval, ``noise_m2_s2`` the variance R of one measurement
@@ -585,9 +598,9 @@ class FusionRecord:
     altitude_m: float = 0.0
     # Logged updates of EKF2's height bias estimators, by aiding source: ``bias_m`` and its variance
     # ``bias_m2`` after the update, ``innovation_m`` and its variance ``variance_m2``
-    height_bias: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-    # 1 while EKF2 reports a condition, by the PX4 names GROUND_EFFECT (on the barometer),
-    # BAD_ACCELERATION (vertical) and DEAD_RECKONING
+    height_bias_updates: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    # Status flags of EKF2 by PX4 name, 1 while set: GROUND_EFFECT_FLAG (wrong barometer height),
+    # BAD_ACCELERATION_FLAG (vertical accelerometer) and DEAD_RECKONING_FLAG
     states: StepFunctions = field(default_factory=dict)
 
     __repr__ = one_line_repr
@@ -629,10 +642,10 @@ class AidLog:
     __repr__ = one_line_repr
 
 
-def step_values_at(steps: pd.Series[float], times: pd.Index[float] | Array) -> Array:
+def step_values_at(step_function: pd.Series[float], times: pd.Index[float] | Array) -> Array:
     """Return the values of a step function at times; before its start, the first value."""
-    previous_rows = np.clip(np.searchsorted(steps.index, times, side="right") - 1, 0, None)
-    return np.asarray(steps, dtype=np.float64)[previous_rows]
+    previous_rows = np.clip(np.searchsorted(step_function.index, times, side="right") - 1, 0, None)
+    return np.asarray(step_function, dtype=np.float64)[previous_rows]
 
 
 class ParameterChange(NamedTuple):
@@ -675,9 +688,9 @@ class Ekf2:
     horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
     record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
     aids: Mapping[str, AidLog] = field(default_factory=dict)
-    # Logged flags, 1 while set: enabled aiding sources by PX4 name, the conditions of
-    # FusionRecord.states, ``tilt_align``, ``yaw_align``, ``gnss_fault``, ``xy_valid`` and
-    # ``xy_global``. ``failed_checks`` contains the bits of gps_check_fail_flags
+    # Logged status flags of EKF2, 1 while set: one for each enabled aiding source (PX4 name), those
+    # of FusionRecord.states, ``tilt_align``, ``yaw_align``, ``gnss_fault``, ``xy_valid`` and
+    # ``xy_global``; and ``failed_checks``, the bit mask gps_check_fail_flags
     states: StepFunctions = field(default_factory=dict)
     # All EKF2_ parameters at take-off, by PX4 name, in PX4 units
     parameters: Mapping[str, float] = field(default_factory=dict)
@@ -686,7 +699,6 @@ class Ekf2:
     __repr__ = one_line_repr
 
     def find_horizontal_resets(self) -> list[Reset]:
-        """Return the resets of the horizontal position."""
         return [
             reset for reset in self.resets if reset.quantity == "position" and any(reset.delta[:2])
         ]
@@ -713,7 +725,7 @@ class Truth:
     __repr__ = one_line_repr
 
 
-# Flights are compared by identity (eq=False), because frames have no single truth value of ==
+# Flights are compared by identity (eq=False), because == of DataFrames has no single truth value
 @dataclass(frozen=True, eq=False)
 class Flight:
     """One recorded flight.
@@ -742,9 +754,9 @@ class Flight:
     truth: Truth | Unavailable
     airborne: Spans | Unavailable
     missing: tuple[Unavailable, ...] = ()
-    # Source of each kind of data: "imu", "attitude", "ekf2_state", "ekf2_variance",
+    # Topics of each kind of data: "imu", "attitude", "ekf2_state", "ekf2_variance",
     # "ekf2_innovations", "ekf2_fusing", "truth", "airborne"
-    streams: Mapping[str, Stream] = field(default_factory=dict)
+    streams: Mapping[str, DataSource] = field(default_factory=dict)
     clocks: tuple[ClockMap, ...] = ()
     # Other position-related data in the log that px4fuse does not use
     unused: tuple[UnusedData, ...] = ()

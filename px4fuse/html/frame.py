@@ -5,13 +5,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from px4fuse.html.safe import clean_values, csp_hash, inert_json, load_template, read_asset
+from px4fuse.html.safe import (
+    clean_values,
+    compute_csp_hash,
+    encode_safe_json,
+    load_template,
+    read_asset,
+)
 
 MAX_PAGE_ROWS = 100  # maximum number of rows on one page of the table
 
 
 class Column(NamedTuple):
-    """Column of the table.
+    """Column of the table on a web page.
 
     Attributes
     ----------
@@ -31,26 +37,27 @@ class Column(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """Cell of the table: text, second line ``below``, sort key ``value`` of a numeric column."""
+    """Cell of the table: text, text of the second line, sort key ``value`` of a numeric column."""
 
     text: str = ""
     value: float | None = None
-    below: str = ""
+    second_line: str = ""
     style_class: str = ""
 
 
-def number_cell(
+def make_number_cell(
     value: float | None,
     format_value: Callable[[float], str] = "{:.4g}".format,
-    text_below: str = "",
+    second_line: str = "",
 ) -> Cell:
     """Return a cell with a number; empty if the number is None or not finite."""
     if value is None or not math.isfinite(value):
         return Cell()
-    return Cell(format_value(value), value, text_below)
+    return Cell(format_value(value), value, second_line)
 
 
-Section = list[Any]
+# Section of an unfolded row, for frame.js: kind, title and contents
+RowSection = list[Any]
 
 
 @dataclass(frozen=True)
@@ -62,56 +69,56 @@ class Row:
 
     cells: tuple[Cell, ...]
     tags: tuple[str, ...] = ()
-    details: tuple[Section, ...] = ()
-    side_sections: tuple[Section, ...] = ()
+    details: tuple[RowSection, ...] = ()
+    side_sections: tuple[RowSection, ...] = ()
 
 
 # ------------------------------------------------------------------ sections of an unfolded row
 
 
-def list_section(title: str, texts: Sequence[str], is_warning: bool = False) -> Section:
+def make_list_section(title: str, texts: Sequence[str], is_warning: bool = False) -> RowSection:
     return ["list", title, texts, is_warning]
 
 
-def prose_section(title: str, text: str) -> Section:
+def make_prose_section(title: str, text: str) -> RowSection:
     """Return a section with a text, whose line breaks are kept."""
     return ["prose", title, text]
 
 
-def name_value_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
+def make_name_value_section(title: str, rows: Sequence[tuple[str, str]]) -> RowSection:
     """Return a section with pairs (name, value); empty values are omitted."""
     return ["pairs", title, [row for row in rows if row[1]]]
 
 
-def table_section(
+def make_table_section(
     title: str,
     rows: Sequence[Sequence[str]],
     column_titles: Sequence[str],
     numeric_columns: Sequence[int] = (),
-) -> Section:
+) -> RowSection:
     return ["table", title, rows, column_titles, list(numeric_columns)]
 
 
-def links_section(title: str, rows: Sequence[tuple[str, str]]) -> Section:
+def make_links_section(title: str, rows: Sequence[tuple[str, str]]) -> RowSection:
     return ["links", title, [row for row in rows if row[1]]]
 
 
-def input_boxes_section(
+def make_input_boxes_section(
     title: str,
     student_id: str,
     rows: Sequence[tuple[str, float, float | None, str]],
-    other_rows: Sequence[tuple[str, float | None, str]],
-) -> Section:
+    rows_without_boxes: Sequence[tuple[str, float | None, str]],
+) -> RowSection:
     """Return a section with input boxes, in which an instructor enters points and comments.
 
     Parameters
     ----------
     rows : sequence of (item, maximum, points, comment)
         Rows with input boxes.
-    other_rows : sequence of (item, points, comment)
+    rows_without_boxes : sequence of (item, points, comment)
         Rows without input boxes; the page writes all rows to a CSV file.
     """
-    return ["boxes", title, student_id, rows, other_rows]
+    return ["boxes", title, student_id, rows, rows_without_boxes]
 
 
 # ------------------------------------------------------------------ the page
@@ -126,7 +133,7 @@ def page(
     columns: Sequence[Column],
     rows: Sequence[Row],
     filters: Sequence[tuple[str, Sequence[tuple[str, str]]]],
-    groups: Sequence[tuple[str, str]] = (),
+    column_groups: Sequence[tuple[str, str]] = (),
     placeholder: str,
     full_table_note: str,
     ratio_axis: Mapping[str, Any] | None = None,
@@ -139,7 +146,7 @@ def page(
         Name of a row, singular and plural.
     filters : sequence of (label, ((tag, text), ...))
         Drop-down lists that filter rows by a tag.
-    groups : sequence of (group, label)
+    column_groups : sequence of (group, label)
         Check boxes that show or hide groups of columns.
     placeholder : str
         Hint in the search field.
@@ -168,8 +175,8 @@ def page(
         "axis": ratio_axis or {},
     }
     return load_template("html/frame.html").render(
-        style_hash=csp_hash(style),
-        script_hash=csp_hash(script),
+        style_hash=compute_csp_hash(style),
+        script_hash=compute_csp_hash(script),
         style=style,
         script=script,
         title=title,
@@ -177,8 +184,8 @@ def page(
         above=html_above,
         placeholder=placeholder,
         filters=filters,
-        groups=groups,
+        groups=column_groups,
         row_nouns=row_nouns,
         full_table_note=full_table_note,
-        content=inert_json(clean_values(page_data)),
+        content=encode_safe_json(clean_values(page_data)),
     )

@@ -17,7 +17,7 @@ from px4fuse.core.text import convert_nested
 MAX_TEXT_LENGTH = 20_000
 # Control characters except tab and line feed, surrogates, and characters that change the text
 # direction
-HARMFUL_CHARACTERS = re.compile(
+HARMFUL_CHARACTER_PATTERN = re.compile(
     "[\0-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\u202a-\u202e\u2066-\u2069]"
 )
 
@@ -29,7 +29,7 @@ def clean_text(text: str, max_length: int = MAX_TEXT_LENGTH) -> str:
     ('a��b', 'abc…')
     """
     text = text if len(text) <= max_length else text[:max_length] + "…"
-    return HARMFUL_CHARACTERS.sub("\N{REPLACEMENT CHARACTER}", text)
+    return HARMFUL_CHARACTER_PATTERN.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
 def clean_values(value: Any, max_length: int = MAX_TEXT_LENGTH) -> Any:
@@ -41,23 +41,23 @@ def clean_values(value: Any, max_length: int = MAX_TEXT_LENGTH) -> Any:
     return convert_nested(value, clean)
 
 
-def inert_json(value: object) -> str:
+def encode_safe_json(value: object) -> str:
     """Encode as JSON without the characters <, > and &, so that it cannot contain HTML tags."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.replace("<", r"\u003c").replace(">", r"\u003e").replace("&", r"\u0026")
 
 
-def csp_hash(text: str) -> str:
+def compute_csp_hash(text: str) -> str:
     """Return the SHA-256 of a script or style for the Content-Security-Policy of a page."""
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
-def local_link(path: str) -> str:
+def make_relative_url(path: str) -> str:
     r"""Convert a relative path to a URL; return "" for an absolute path.
 
-    >>> local_link("results/a b.json"), local_link("javascript:alert(1)")
+    >>> make_relative_url("results/a b.json"), make_relative_url("javascript:alert(1)")
     ('results/a%20b.json', 'javascript%3Aalert%281%29')
-    >>> local_link("//example.org/x"), local_link("C:\\x")
+    >>> make_relative_url("//example.org/x"), make_relative_url("C:\\x")
     ('', 'C%3A%5Cx')
     """
     if PurePosixPath(path).is_absolute():
@@ -79,5 +79,4 @@ def load_template(name: str) -> Template:
 
 
 def read_asset(name: str, package: str = "px4fuse.html") -> str:
-    """Read a text file of a package."""
     return files(package).joinpath(name).read_text(encoding="utf-8")

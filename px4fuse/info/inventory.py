@@ -26,10 +26,10 @@ from px4fuse.filter.signals import (
 from px4fuse.findings import ekf2_not_fusing, finding_title, imu, missing, recording
 from px4fuse.flight.model import (
     DIAGNOSIS_WITHHELD,
+    DataSource,
     Ekf2,
     Flight,
     PositionTrack,
-    Stream,
     Unavailable,
     sample_rate,
 )
@@ -248,7 +248,7 @@ def _list_logged_data(
 def _make_logged_data(
     part: str,
     data: pd.DataFrame | TimeSpans | Unavailable,
-    stream: Stream | PositionTrack | None,
+    stream: DataSource | PositionTrack | None,
     **data_fields: Any,
 ) -> LoggedData:
     if isinstance(data, Unavailable):

@@ -13,7 +13,7 @@ from px4fuse.flight.ekf2_parameters import (
     EV_POS,
     GNSS_POS,
     REPORTED_PARAMETERS,
-    effective_settings,
+    fill_with_defaults,
     replace_invalid_parameters,
 )
 from px4fuse.flight.model import (
@@ -74,7 +74,7 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     attitude = _read_attitude(recording, remedies["attitude"])
     ekf2 = _read_ekf2(recording, parameters, autopilot)
     # Only PX4 has a parameter for the delay between a GNSS fix and its timestamp
-    delay_parameters = effective_settings(parameters, GNSS_POS) if autopilot == "PX4" else {}
+    delay_parameters = fill_with_defaults(parameters, GNSS_POS) if autopilot == "PX4" else {}
     gnss_delay_s = 1e-3 * delay_parameters.get(GNSS_POS.delay, 0.0)
     positions, missing_positions = read_positions(
         recording, clock_mappings, remedies["position"], gnss_delay_s
@@ -207,7 +207,7 @@ def _read_ekf2(
         ),
         resets=(),
         instances=NO_SELECTOR,
-        gate=effective_settings(parameters)[EV_POS.gate],
+        gate=fill_with_defaults(parameters)[EV_POS.gate],
         notes=tuple(notes),
         record=replay_unavailable,
     )

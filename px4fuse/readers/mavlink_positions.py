@@ -9,7 +9,14 @@ import pandas as pd
 from msgspec import structs
 from scipy import constants
 
-from px4fuse.flight.model import GNSS, Columns, PositionTrack, Truth, Unavailable, with_orientation
+from px4fuse.flight.model import (
+    GNSS_ORIGIN,
+    Columns,
+    PositionTrack,
+    Truth,
+    Unavailable,
+    reclassify_as_vio,
+)
 from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import px4_positions
 from px4fuse.readers.common import join_nearest, read_attitude, read_orientation
@@ -102,7 +109,7 @@ def _read_track(
     return px4_positions.make_track(
         track_name,
         samples,
-        with_orientation(source.origin, is_changing=orientation is not None),
+        reclassify_as_vio(source.origin, has_changing_orientation=orientation is not None),
         remedy=remedy,
         description=source.description,
         frame=frame,
@@ -144,13 +151,13 @@ def _read_gnss(
         )
     samples = project_to_ned(fixes, local_origin(recording))
     variance = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2
-    is_automatic = bool(
+    is_auto_candidate = bool(
         recording.read(messages.MESSAGE_LAYOUTS["global_state"])["latitude_deg"].any()
     )
     return px4_positions.make_track(
         layout.topic,
         samples.join(variance),
-        structs.replace(GNSS, is_automatic=is_automatic),
+        structs.replace(GNSS_ORIGIN, is_auto_candidate=is_auto_candidate),
         description="GNSS position",
         frame="NED",
         clock=f"{BOOT_CLOCK} minus {1e3 * delay_s:g} ms",

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.core.arrays import Array, IntArray
-from px4fuse.flight.model import Columns, Stream, time_index
+from px4fuse.flight.model import Columns, DataSource, time_index
 from px4fuse.readers.common import MIN_QUATERNION_NORM
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.mavlink_clocks import (
@@ -72,7 +72,7 @@ class Recording:
     # Number of samples with an invalid timestamp, by message
     dropped: dict[str, int] = field(default_factory=dict)
     # Messages and clock of each kind of data in the flight
-    streams: dict[str, Stream] = field(default_factory=dict)
+    streams: dict[str, DataSource] = field(default_factory=dict)
 
     def rows_of_all_senders(self, message: str) -> IntArray:
         """Return the indices of the analysed frames with one message, from all senders."""
@@ -164,7 +164,7 @@ class Recording:
 
     def record_stream(self, data_kind: str, *messages: str, clock: str = BOOT_CLOCK) -> None:
         """Record the messages and the clock of one kind of data, such as "imu"."""
-        self.streams[data_kind] = Stream(messages, clock, self.frames.name)
+        self.streams[data_kind] = DataSource(messages, clock, self.frames.name)
 
 
 def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:

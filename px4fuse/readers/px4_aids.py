@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from px4fuse.core.arrays import Array
-from px4fuse.flight.ekf2_parameters import AIDS, DISTURBANCES, Aid
+from px4fuse.flight.ekf2_parameters import AIDS, STATUS_FLAGS, Aid
 from px4fuse.flight.model import AidLog, StepFunctions, step_values_at
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import join_nearest
@@ -61,7 +61,7 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     """
     enabled_aids = {}
     tables = topics.tables_of(px4.STATUS_FLAGS)
-    all_aids = (*AIDS.values(), *DISTURBANCES.values())
+    all_aids = (*AIDS.values(), *STATUS_FLAGS.values())
     flag_names = {flag for aid in all_aids for group in aid.flags for flag in group.split(",")}
     logged_flags = sorted(flag_names.intersection(*tables)) if tables else []
     if logged_flags:

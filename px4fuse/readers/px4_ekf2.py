@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from px4fuse.core.arrays import Array, IntArray, median_interval
-from px4fuse.flight.ekf2_parameters import AIDS, DISTURBANCES, EV_POS, FLOW, effective_settings
+from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, FLOW, STATUS_FLAGS, fill_with_defaults
 from px4fuse.flight.model import (
     BIAS_NOT_LOGGED,
     EKF2_STEP_S,
@@ -99,7 +99,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     topics.record_stream("ekf2_state", px4.LOCAL_POSITION.topic)
     enabled_aids = read_enabled_aids(topics)
     fusion_flags = _read_fusion_flags(topics, enabled_aids)
-    vision_gate = effective_settings(parameters)[EV_POS.gate]
+    vision_gate = fill_with_defaults(parameters)[EV_POS.gate]
     aids = read_aids(topics, enabled_aids)
     innovations, innovation_topics = innovations_by_axis(aids, fusion_flags, vision_gate)
     if innovation_topics:
@@ -367,12 +367,12 @@ def _read_fusion_record(
             if name in enabled_aids and enabled_aids[name].any()
         ),
         vision_age_s=age_s[~age_s.index.duplicated()],
-        field_gauss=_read_magnetic_field(topics, step_s),
+        magnetic_field_gauss=_read_magnetic_field(topics, step_s),
         flow=_read_optical_flow(topics, enabled_aids),
         latitude_deg=_last_finite_value(local_samples, "ref_lat", np.nan),
         altitude_m=altitude_m,
-        states={name: enabled_aids[name] for name in DISTURBANCES if name in enabled_aids},
-        height_bias={
+        states={name: enabled_aids[name] for name in STATUS_FLAGS if name in enabled_aids},
+        height_bias_updates={
             name: topics.primary_samples(layout).dropna()
             for name, layout in px4.HEIGHT_BIAS_LAYOUTS.items()
             if topics.find(layout) is not None

@@ -10,7 +10,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.core.arrays import Array, IntArray
-from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_MODE_PARAMETER, GNSS_POS, effective_settings
+from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_MODE_PARAMETER, GNSS_POS, fill_with_defaults
 from px4fuse.flight.model import (
     HEIGHT_ONLY_REASON,
     NO_INVALID_ROWS,
@@ -23,10 +23,10 @@ from px4fuse.flight.model import (
     Truth,
     Unavailable,
     clock_of_repeated_timestamps,
-    kind_without_orientation,
+    infer_position_kind,
+    reclassify_as_vio,
     sample_rate,
     time_index,
-    with_orientation,
 )
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import (
@@ -142,7 +142,7 @@ def make_track(
             fault = HEIGHT_ONLY_REASON
         return unavailable_source(name, fault, remedy)
     if origin.kind == "uwb":
-        origin = structs.replace(origin, kind=kind_without_orientation(samples))
+        origin = structs.replace(origin, kind=infer_position_kind(samples))
     variance = samples[Columns.POSITION_VARIANCE]
     return PositionTrack(
         name=name,
@@ -162,17 +162,17 @@ def _make_ulog_track(
     topic_names: tuple[str, ...],
     *,
     is_odometry: bool = False,
-    is_automatic: bool = True,
+    is_auto_candidate: bool = True,
     **track_fields: Any,
 ) -> PositionTrack | Unavailable:
     """Make a position track with the properties of the source ``name`` in ``px4_topics.toml``.
 
-    ``is_odometry``: the source sends a changing orientation. ``is_automatic``: px4fuse may use the
-    source without the option ``--position-source``.
+    ``is_odometry``: the source sends a changing orientation. ``is_auto_candidate``:
+    px4fuse may use the source without the option ``--position-source``.
     """
     source = px4.TRACKS[name]
-    origin = with_orientation(source.origin, is_changing=is_odometry)
-    origin = structs.replace(origin, is_automatic=is_automatic)
+    origin = reclassify_as_vio(source.origin, has_changing_orientation=is_odometry)
+    origin = structs.replace(origin, is_auto_candidate=is_auto_candidate)
     if origin.aid is not None:
         parameters = topics.ekf2_parameters
         lever_arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)
@@ -430,7 +430,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     has_driver_times = GNSS_MODE_PARAMETER in parameters and bool(
         np.any(published_s - fixes.index > MAX_ARRIVAL_DELAY_US * 1e-6)
     )
-    delay_ms = 0.0 if has_driver_times else effective_settings(parameters, GNSS_POS)[GNSS_POS.delay]
+    delay_ms = 0.0 if has_driver_times else fill_with_defaults(parameters, GNSS_POS)[GNSS_POS.delay]
     clock = "autopilot boot clock, measurement times from the GNSS driver"
     if not has_driver_times:
         fixes = fixes.set_axis(time_index(published_s - delay_ms * 1e-3))
@@ -472,7 +472,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         notes=tuple(notes),
         velocity=samples[Columns.VELOCITY + Columns.VELOCITY_VARIANCE],
         assumed_delay_s=delay_ms * 1e-3,
-        is_automatic=has_fused_aid(ekf2),
+        is_auto_candidate=has_fused_aid(ekf2),
         **track_fields,
     )
     if isinstance(track, Unavailable):

@@ -31,10 +31,10 @@ from px4fuse.flight.ekf2_parameters import (
     replace_invalid_parameters,
 )
 from px4fuse.flight.model import (
+    DataSource,
     Dropout,
     LogInfo,
     ParameterChange,
-    Stream,
     rows_between,
     time_index,
 )
@@ -174,7 +174,7 @@ class Topics:
     # True if pyulog skipped invalid bytes or messages
     is_damaged: bool
     # Topics and clock of each kind of data in the flight
-    streams: dict[str, Stream] = field(default_factory=dict)
+    streams: dict[str, DataSource] = field(default_factory=dict)
     # Changes of EKF2_ parameters after take-off
     parameter_changes: tuple[ParameterChange, ...] = ()
 
@@ -295,7 +295,7 @@ class Topics:
         )
         event = "measurement" if has_measurement_time else "publication"
         clock = f"autopilot boot clock ({event} time)"
-        self.streams[data_kind] = Stream(topics, clock, self.log.name)
+        self.streams[data_kind] = DataSource(topics, clock, self.log.name)
 
 
 def _empty_frame(layout: Layout) -> pd.DataFrame:

@@ -11,7 +11,7 @@ from px4fuse.core.text import format_number
 from px4fuse.ekf2.aids import AidResult, flight_span
 from px4fuse.flight.model import AidLog, Flight, Unavailable, step_values_at
 from px4fuse.report import style
-from px4fuse.report.event_marks import GROUND_BAND
+from px4fuse.report.event_marks import ON_GROUND_BAND_STYLE
 from px4fuse.report.page import Cell, Page, appendix_title
 from px4fuse.report.panels import draw_dots
 from px4fuse.report.phrases import format_sigma_verdict
@@ -30,18 +30,19 @@ OUTDOOR_AIDS = ("gnss_pos", "gnss_vel", "optical_flow", "aux_global_position")
 def draw_pages(analysis: Analysis | AidsOnlyAnalysis, _: object) -> Iterator[Page]:
     """Draw the page on aiding sources; in a comparison of KF and EKF2 only for outdoor flights."""
     is_comparison = isinstance(analysis, Analysis)
-    if aids := outdoor_aids(analysis) if isinstance(analysis, Analysis) else analysis.aids:
+    aids = select_aids_if_outdoor(analysis) if isinstance(analysis, Analysis) else analysis.aids
+    if aids:
         page = Page(appendix_title(TITLE) if is_comparison else TITLE, LEAD_TEXT)
         write_aids(page, aids)
         _draw_aid_panels(page, analysis.flight, aids)
         yield page
 
 
-def outdoor_aids(analysis: Analysis) -> Mapping[str, AidResult]:
+def select_aids_if_outdoor(analysis: Analysis) -> Mapping[str, AidResult]:
     """Return all aiding sources if EKF2 fused GNSS or optical flow (outdoor flight), else {}."""
     aids = {} if isinstance(analysis.aids, Unavailable) else analysis.aids
-    fused_names = {name for name, aid in aids.items() if aid.verdict != "disabled"}
-    return {} if fused_names.isdisjoint(OUTDOOR_AIDS) else aids
+    enabled_names = {name for name, aid in aids.items() if aid.verdict != "disabled"}
+    return {} if enabled_names.isdisjoint(OUTDOOR_AIDS) else aids
 
 
 def write_aids(page: Page, aids: Mapping[str, AidResult]) -> None:
@@ -95,17 +96,17 @@ def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) 
     flight_span_s = flight_span(flight)
     if isinstance(flight.ekf2, Unavailable) or isinstance(flight_span_s, Unavailable):
         return
-    fused_names = [name for name, aid in aids.items() if aid.verdict != "disabled"]
+    enabled_names = [name for name, aid in aids.items() if aid.verdict != "disabled"]
     page.heading("Normalised innovations of each aiding source")
     page.write_small(
         "95 % of the normalised innovations ν/√S are expected within ±2 (lines). Hollow samples "
         "were not fused. Grey: fusion was disabled. Triangles: values beyond "
         f"±{MAX_DRAWN_SIGMAS:g}."
     )
-    for name in fused_names:
-        axes = page.panel(aids[name].label, AID_PANEL_HEIGHT, above=1.0)
+    for name in enabled_names:
+        axes = page.panel(aids[name].label, AID_PANEL_HEIGHT, gap_above=1.0)
         _draw_innovations(axes, flight.ekf2.aids[name], flight_span_s)
-        style.label_time_axis(axes, name == fused_names[-1])
+        style.label_time_axis(axes, name == enabled_names[-1])
 
 
 def _draw_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:
@@ -114,11 +115,11 @@ def _draw_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:
     for axis in aid_log.axes:
         innovations = samples[f"innovation_{axis}"] / np.sqrt(samples[f"variance_{axis}"])
         for is_drawn, dot_style in (
-            (is_fused, style.INNOVATION_DOTS["EKF2"]),
-            (~is_fused, style.REJECTED_DOTS),
+            (is_fused, style.INNOVATION_STYLES["EKF2"]),
+            (~is_fused, style.REJECTED_STYLE),
         ):
-            dots = dot_style | {"ms": 1.4}
-            draw_dots(axes, innovations[is_drawn], MAX_DRAWN_SIGMAS, dots)
+            marker_style = dot_style | {"ms": 1.4}
+            draw_dots(axes, innovations[is_drawn], MAX_DRAWN_SIGMAS, marker_style)
     for limit in (-2.0, 2.0):
         axes.axhline(limit, color="black", lw=0.4, ls=(0, (1, 1.5)))
     if aid_log.enabled is not None:
@@ -131,7 +132,7 @@ def _draw_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:
                 MAX_DRAWN_SIGMAS,
                 where=is_disabled.tolist(),
                 zorder=0.1,
-                **GROUND_BAND,
+                **ON_GROUND_BAND_STYLE,
             )
     axes.set(
         xlim=span_s,

@@ -12,57 +12,61 @@ from px4fuse.errors import SettingsError
 from px4fuse.html.safe import load_template, read_asset
 from px4fuse.report.card_text import (
     LABELLED_TICKS,
-    QUANTITIES,
+    QUANTITY_LABELS,
     SEVERITY_SIGNS,
     format_consistent_ratios,
     format_spans,
     format_target,
-    marked_actions,
+    label_alternatives,
+    locate_sigma_ratio,
     rerun_columns,
     rerun_note,
-    sigma_ratio_marks,
     with_typed_path,
 )
 
-# SVG path of each marker of a σ ratio; "below" and "above" mark ratios outside the drawn axis
-MARK_PATHS = {
+# SVG path of each marker of a σ ratio (actual ÷ reported σ); "below" and "above" mark ratios
+# outside the drawn axis
+MARKER_SVG_PATHS = {
     "source": "M-5.5 0a5.5 5.5 0 1 0 11 0a5.5 5.5 0 1 0-11 0",
     "truth": "M-6.5 0L0-6.5L6.5 0L0 6.5z",
     "below": "M5-7L-7 0L5 7z",
     "above": "M-5-7L7 0L-5 7z",
 }
-SCREEN_READER_QUANTITIES = {"source": "innovation over root S", "truth": "error over sigma"}
+SCREEN_READER_QUANTITIES = {
+    "source": "innovation over root S",
+    "truth": "position error over sigma",
+}
 
 
 def make_diagnosis_card(analysis: Analysis) -> Card:
     """Return the summary of faults, causes and actions of an analysis."""
     if analysis.request is None:
         raise SettingsError(
-            "The analysis was not made by px4fuse.compare, so the command to print is unknown.",
-            "Create it with px4fuse.compare.",
+            "The command that repeats this analysis is known only for results of px4fuse.compare.",
+            "Create the analysis with px4fuse.compare.",
         )
     card = build_card(analysis, analysis.request)
     return with_typed_path(card, analysis.request.log)
 
 
-def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> str:
+def make_card_html(card: Card, *, is_open: bool = False, has_apply_buttons: bool = False) -> str:
     """Return a summary of faults, causes and actions as an HTML element.
 
     Parameters
     ----------
     is_open : bool
         True to show causes and notes without a click.
-    has_apply : bool
+    has_apply_buttons : bool
         True to show a button beside each KF command that applies the settings in the command.
     """
     return load_template("report/card.html").render(
         card=card,
         open=is_open,
-        apply=has_apply,
-        figure=sigma_ratio_html(card.verdicts, card.effect.axis)
+        apply=has_apply_buttons,
+        figure=make_sigma_ratio_html(card.verdicts, card.effect.axis)
         if card.verdicts and card.effect is not None
         else "",
-        marked_actions=marked_actions,
+        label_alternatives=label_alternatives,
         rerun_rows=lambda reruns: zip(*rerun_columns(reruns), strict=True),
         signs=SEVERITY_SIGNS,
         target=format_target,
@@ -71,7 +75,7 @@ def card_html(card: Card, *, is_open: bool = False, has_apply: bool = False) -> 
     )
 
 
-def sigma_ratio_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
+def make_sigma_ratio_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> str:
     """Draw ratios "RMS of actual error ÷ reported σ" on a logarithmic axis as an HTML figure.
 
     ``axis`` is the direction of the errors, as a text; ``name`` identifies the figure for scripts.
@@ -80,45 +84,46 @@ def sigma_ratio_html(verdicts: Sequence[Verdict], axis: str, name: str = "") -> 
         verdicts=verdicts,
         axis=axis,
         name=name,
-        marks=sigma_ratio_marks,
-        paths=MARK_PATHS,
-        percent=_axis_percent,
-        alternative=alternative_text(verdicts),
+        marks=locate_sigma_ratio,
+        paths=MARKER_SVG_PATHS,
+        percent=_format_axis_percent,
+        alternative=make_alternative_text(verdicts),
         ticks=[
-            (_axis_percent(map_ratio_to_axis(tick)), label, tick not in LABELLED_TICKS)
+            (_format_axis_percent(map_ratio_to_axis(tick)), label, tick not in LABELLED_TICKS)
             for tick, label in RATIO_AXIS_TICKS.items()
         ],
         limits=format_consistent_ratios(),
         names=FILTER_NAMES,
-        quantities=QUANTITIES,
+        quantities=QUANTITY_LABELS,
         format_ratio=format_ratio,
     )
 
 
-def sigma_ratio_figures(analysis: Analysis) -> str:
+def make_sigma_ratio_figures(analysis: Analysis) -> str:
     """Return HTML figures of the σ ratios of KF and EKF2, one figure for each axis."""
     return "".join(
-        sigma_ratio_html(make_sigma_verdicts(result), describe_axis(analysis, result), name)
+        make_sigma_ratio_html(make_sigma_verdicts(result), describe_axis(analysis, result), name)
         for name, result in analysis.axes.items()
     )
 
 
-def card_css() -> str:
+def read_card_css() -> str:
     """Return the CSS of the diagnosis card; the colours are in another style sheet."""
     return read_asset("card.css", "px4fuse.report")
 
 
-def notebook_html(card: Card) -> str:
+def make_notebook_html(card: Card) -> str:
     """Return the diagnosis card as HTML with its CSS, for a notebook."""
-    colours = read_asset("colours.css").replace(":root", ".px4fuse-card")
-    return f"<style>{colours}{card_css()}</style>{card_html(card, is_open=True)}"
+    colour_css = read_asset("colours.css").replace(":root", ".px4fuse-card")
+    return f"<style>{colour_css}{read_card_css()}</style>{make_card_html(card, is_open=True)}"
 
 
-def alternative_text(verdicts: Sequence[Verdict]) -> str:
+def make_alternative_text(verdicts: Sequence[Verdict]) -> str:
     """Describe σ ratios and consistency of the filters for screen readers.
 
-    >>> alternative_text([Verdict(filter="kf", against="truth", ratio=7.2, word="overconfident")])
-    'KF, error over sigma: 7.2, overconfident.'
+    >>> verdict = Verdict(filter="kf", against="truth", ratio=7.2, word="overconfident")
+    >>> make_alternative_text([verdict])
+    'KF, position error over sigma: 7.2, overconfident.'
     """
     sentences = []
     for verdict in verdicts:
@@ -131,7 +136,7 @@ def alternative_text(verdicts: Sequence[Verdict]) -> str:
     return " ".join(sentences)
 
 
-def _axis_percent(fraction: float) -> str:
+def _format_axis_percent(fraction: float) -> str:
     # SVG positions are percentages, so the axis fits any width without style attributes, which the
     # security policy of the pages forbids
     return f"{100.0 * min(max(fraction, 0.0), 1.0):.2f}%"

@@ -28,7 +28,7 @@ from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS, Reference
 from px4fuse.request import quote_command
 
 CARD_WIDTH = 100  # maximum number of characters per line
-AXIS_WIDTH = 37  # number of characters of the axis of σ ratios
+AXIS_WIDTH = 37  # number of characters of the axis of σ ratios (actual ÷ reported σ)
 AXIS_INDENT = 58  # number of characters left of the axis of σ ratios
 TEXT_INDENT = 11  # number of characters of a label with the blanks around it
 # Maximum length (characters) of a command beside its label; longer commands get their own line
@@ -36,7 +36,7 @@ MAX_COMMAND_LENGTH = 74
 # Labelled ticks of the axis of σ ratios
 LABELLED_TICKS = (0.1, 0.5, 1.0, 2.0, 10.0)
 REFERENCE_MARKS = {"source": "●", "truth": "◆"}
-QUANTITIES = {"source": "● source: innovation ÷ √S", "truth": "◆ ground truth: error ÷ σ"}
+QUANTITY_LABELS = {"source": "● source: innovation ÷ √S", "truth": "◆ ground truth: error ÷ σ"}
 SEVERITY_SIGNS = {
     "error": "■ ERROR",
     "warning": "▲ WARNING",
@@ -54,16 +54,16 @@ SEVERITY_STYLES = {
 ASCII_REPLACEMENTS = str.maketrans("░●◆◀▶─÷−–²³×", ":ox<>-/--23x") | str.maketrans(
     {"√": "sqrt ", "σ": "sigma", "→": "->", "°": " deg", "±": "+-", "ν": "nu", "…": "..."}
 )
-AIDS_HEADING = (
+AIDS_CAPTION = (
     "RMS of innovation ÷ √S of each aiding source that EKF2 fused. A value below 1 means that √S "
     "is too large. For barometer, magnetometer and gravity this is usual and not a fault."
 )
 
 
-class Line(NamedTuple):
+class Paragraph(NamedTuple):
     """Paragraph on the terminal, in a style of the rich package.
 
-    If ``wraps``, its first line begins with ``first_indent``, the other lines with ``indent``.
+    If ``wraps``, the first line begins with ``first_indent``, the other lines with ``indent``.
     """
 
     text: str
@@ -72,7 +72,7 @@ class Line(NamedTuple):
     indent: str = ""
     wraps: bool = False
 
-    def wrapped(self, width: int) -> list[str]:
+    def wrap(self, width: int) -> list[str]:
         if not self.wraps:
             return [f"{self.first_indent}{self.text}"]
         return textwrap.wrap(
@@ -85,12 +85,12 @@ class Line(NamedTuple):
         )
 
 
-def card_lines(card: Card) -> Iterator[Line]:
+def card_lines(card: Card) -> Iterator[Paragraph]:
     if card.severity == "refused":
-        yield Line(f"error[{card.id}]: {card.headline}", SEVERITY_STYLES["error"])
+        yield Paragraph(f"error[{card.id}]: {card.headline}", SEVERITY_STYLES["error"])
         for label, text in card.facts.items():
             yield from _labelled_lines(label, text)
-        yield Line("No file was written. Exit code 2.")
+        yield Paragraph("No file was written. Exit code 2.")
         return
     yield from _identity_lines(card)
     yield from headline_lines(card)
@@ -100,12 +100,12 @@ def card_lines(card: Card) -> Iterator[Line]:
     for number, cause in enumerate(card.causes, start=1):
         if number > 1:
             title = f"{cause.severity}[{cause.id}]: {cause.title}"
-            yield Line(title, SEVERITY_STYLES[cause.severity])
+            yield Paragraph(title, SEVERITY_STYLES[cause.severity])
         label = f"cause {number}" if len(card.causes) > 1 else "cause"
         yield from _labelled_lines(label, cause.why)
         yield from _cause_lines(cause)
     if card.more_causes:
-        yield Line(f"{card.more_causes} more causes are listed with -v")
+        yield Paragraph(f"{card.more_causes} more causes are listed with -v")
     for label, text in card.facts.items():
         yield from _labelled_lines(label, text)
     yield from _verdict_axis_lines(card)
@@ -113,7 +113,7 @@ def card_lines(card: Card) -> Iterator[Line]:
     for text in (card.reconcile, card.difference):
         yield from _wrapped_lines(text, "  ", "  ")
     if card.notes:
-        yield Line("")
+        yield Paragraph("")
     for text in note_texts(card, "with -v"):
         yield from _wrapped_lines(text, "", "  ")
 
@@ -128,9 +128,9 @@ def note_texts(card: Card, other_notes_place: str) -> list[str]:
     return texts
 
 
-def closing_lines(card: Card) -> Iterator[Line]:
+def closing_lines(card: Card) -> Iterator[Paragraph]:
     """Yield the last lines of a diagnosis card: commands that print details."""
-    actions = [action for cause in card.causes for _, action in marked_actions(cause)]
+    actions = [action for cause in card.causes for _, action in label_alternatives(cause)]
     text = "More: -v."
     if any(action.where == "console" for action in actions):
         text += " Console means the MAVLink Console of QGroundControl."
@@ -188,16 +188,16 @@ def draw_sigma_ratio(ratio: float | None, reference: Reference) -> str:
     >>> draw_sigma_ratio(128.0, "truth")
     '───────────────░░░░░░░──────────────▶'
     """
-    low, high = (_axis_column(end) for end in CONSISTENT_SIGMA_RATIOS[reference])
+    low, high = (_find_axis_column(end) for end in CONSISTENT_SIGMA_RATIOS[reference])
     characters = ["░" if low <= column <= high else "─" for column in range(AXIS_WIDTH)]
     if ratio is not None:
-        column, last_column = _axis_column(ratio), AXIS_WIDTH - 1
+        column, last_column = _find_axis_column(ratio), AXIS_WIDTH - 1
         symbol = "◀" if column < 0 else "▶" if column > last_column else REFERENCE_MARKS[reference]
         characters[min(max(column, 0), last_column)] = symbol
     return "".join(characters)
 
 
-def sigma_ratio_marks(
+def locate_sigma_ratio(
     ratio: float, reference: Reference, interval: tuple[float, float] | None
 ) -> dict[str, Any]:
     """Return the positions of a σ ratio, its consistent band and its 95 % interval on the axis.
@@ -216,33 +216,33 @@ def sigma_ratio_marks(
     }
 
 
-def _axis_column(ratio: float) -> int:
+def _find_axis_column(ratio: float) -> int:
     return round(map_ratio_to_axis(ratio) * (AXIS_WIDTH - 1))
 
 
-def _identity_lines(card: Card) -> Iterator[Line]:
+def _identity_lines(card: Card) -> Iterator[Paragraph]:
     identity = card.identity
     flight_text = f"{identity.firmware}, {identity.duration_s:.1f} s, {identity.source}"
     student_text = ", ".join(filter(None, (identity.student, identity.student_id)))
-    yield Line("  ".join(filter(None, (identity.file, flight_text, student_text))))
+    yield Paragraph("  ".join(filter(None, (identity.file, flight_text, student_text))))
     if identity.settings:
         yield from _wrapped_lines(f"KF: {identity.settings}", "  ", "      ")
     changed_options = (*identity.changed, *identity.parameters)
     if changed_options:
         yield from _wrapped_lines(f"changed: {'; '.join(changed_options)}", "  ", "           ")
-    yield Line("")
+    yield Paragraph("")
 
 
-def headline_lines(card: Card) -> Iterator[Line]:
+def headline_lines(card: Card) -> Iterator[Paragraph]:
     """Yield the first line of a diagnosis card: severity, id and title of the worst fault."""
     label = "ok" if card.severity == "clean" else card.severity
     severity_and_id = f"{label}[{card.id}]" if card.id else label
-    yield Line(f"{severity_and_id}: {card.headline}", SEVERITY_STYLES[card.severity])
+    yield Paragraph(f"{severity_and_id}: {card.headline}", SEVERITY_STYLES[card.severity])
 
 
-def _cause_lines(cause: Cause) -> Iterator[Line]:
+def _cause_lines(cause: Cause) -> Iterator[Paragraph]:
     yield from _labelled_lines("when", format_spans(cause))
-    actions = marked_actions(cause)
+    actions = label_alternatives(cause)
     labels = [f"{prefix}{format_target(action)}" for prefix, action in actions]
     label_width = max(map(len, labels), default=0) + 2
     for label, (_, action) in zip(labels, actions, strict=True):
@@ -251,7 +251,7 @@ def _cause_lines(cause: Cause) -> Iterator[Line]:
     yield from _wrapped_lines(cause.after, "  ", "  ")
 
 
-def marked_actions(cause: Cause) -> list[tuple[str, Action]]:
+def label_alternatives(cause: Cause) -> list[tuple[str, Action]]:
     """Return the actions of a cause; alternative actions begin with "EITHER " or "OR "."""
     alternatives = [
         ("OR " if place else "EITHER ", action)
@@ -265,7 +265,7 @@ def format_target(action: Action) -> str:
     return f"{action.target} ({action.where})" if action.where else action.target
 
 
-def _action_lines(label: str, label_width: int, action: Action) -> Iterator[Line]:
+def _action_lines(label: str, label_width: int, action: Action) -> Iterator[Paragraph]:
     indent = " " * (2 + label_width)
     label_text = f"  {label:{label_width}}"
     if action.sentence:
@@ -273,21 +273,21 @@ def _action_lines(label: str, label_width: int, action: Action) -> Iterator[Line
         label_text = indent
     if any(len(command) > MAX_COMMAND_LENGTH for command in action.commands):
         if label_text.strip():
-            yield Line(label_text.rstrip())
+            yield Paragraph(label_text.rstrip())
         label_text = indent = "    "
     for command in action.commands:
-        yield Line(f"{label_text}{command}", "bold")
+        yield Paragraph(f"{label_text}{command}", "bold")
         label_text = indent
 
 
-def _rerun_table_lines(reruns: Sequence[Rerun]) -> Iterator[Line]:
+def _rerun_table_lines(reruns: Sequence[Rerun]) -> Iterator[Paragraph]:
     columns = rerun_columns(reruns)
     widths = [max(map(len, column)) for column in columns]
     for row in zip(*columns, strict=True):
         cells = (f"{cell:{width}}" for cell, width in zip(row, widths, strict=True))
-        yield Line(f"  {'  '.join(cells)}".rstrip())
+        yield Paragraph(f"  {'  '.join(cells)}".rstrip())
     if note := rerun_note(reruns):
-        yield Line(f"  {note}")
+        yield Paragraph(f"  {note}")
 
 
 def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
@@ -295,10 +295,10 @@ def rerun_columns(reruns: Sequence[Rerun]) -> list[tuple[str, ...]]:
     rows = [
         {
             "re-run of this log": rerun.label,
-            "position RMSE": _before_after_text(rerun.position_rmse_m, format_metres, " m"),
-            "● innovation ÷ √S": _before_after_text(rerun.source_ratio, format_ratio),
-            "◆ error ÷ σ": _before_after_text(rerun.truth_ratio, format_ratio),
-            "rejected": _before_after_text(rerun.rejected_fraction, _format_percent, " %"),
+            "position RMSE": _format_before_after(rerun.position_rmse_m, format_metres, " m"),
+            "● innovation ÷ √S": _format_before_after(rerun.source_ratio, format_ratio),
+            "◆ error ÷ σ": _format_before_after(rerun.truth_ratio, format_ratio),
+            "rejected": _format_before_after(rerun.rejected_fraction, _format_percent, " %"),
             "improves": rerun.improves,
         }
         for rerun in reruns
@@ -316,70 +316,76 @@ def rerun_note(reruns: Sequence[Rerun]) -> str:
         return ""
     return (
         "EKF2 (replay) is a prediction by px4fuse's model of EKF2. Its values before and after "
-        f"exclude gaps and the time before {min(starts_s):.0f} s."
+        f"the change exclude gaps and the time before {min(starts_s):.0f} s."
     )
 
 
-def _before_after_text(
-    before_and_after: tuple[float, float] | None,
+def _format_before_after(
+    values: tuple[float, float] | None,
     format_value: Callable[[float], str],
     unit: str = "",
 ) -> str:
-    return " → ".join(map(format_value, before_and_after)) + unit if before_and_after else ""
+    return " → ".join(map(format_value, values)) + unit if values else ""
 
 
 def _format_percent(fraction: float) -> str:
     return f"{100.0 * fraction:.0f}"
 
 
-def _verdict_axis_lines(card: Card) -> Iterator[Line]:
+def _verdict_axis_lines(card: Card) -> Iterator[Paragraph]:
     if not card.verdicts:
         return
     direction_text = "" if card.effect is None else f", {card.effect.axis}"
-    yield Line("")
+    yield Paragraph("")
     heading = "Reported uncertainty: RMS of actual error ÷ reported σ"
     yield from _wrapped_lines(f"{heading}{direction_text}", "", "  ")
     legend, left_label = f"  ░ consistent ({format_consistent_ratios()})", "σ too large"
-    yield Line(f"{'':{AXIS_INDENT}}{left_label}{'σ too small':>{AXIS_WIDTH - len(left_label)}}")
-    yield Line(f"{legend:{AXIS_INDENT}}{_ticks_line()}")
+    yield Paragraph(
+        f"{'':{AXIS_INDENT}}{left_label}{'σ too small':>{AXIS_WIDTH - len(left_label)}}"
+    )
+    yield Paragraph(f"{legend:{AXIS_INDENT}}{_ticks_line()}")
     if any(verdict.is_explained for verdict in card.verdicts):
-        yield Line("  Verdicts in brackets are not faults of the filter: the causes explain them.")
+        yield Paragraph(
+            "  Verdicts in brackets: effects of the causes above, not faults of the filter."
+        )
     yield from map(_verdict_line, card.verdicts)
 
 
-def _verdict_line(verdict: Verdict) -> Line:
+def _verdict_line(verdict: Verdict) -> Paragraph:
     filter_label = FILTER_NAMES[verdict.filter] if verdict.against == "source" else ""
-    label_text = f"  {filter_label:4} {QUANTITIES[verdict.against]:25}"
+    label_text = f"  {filter_label:4} {QUANTITY_LABELS[verdict.against]:25}"
     if verdict.ratio is None:
         text = f"{'–':>7}  not evaluated: {verdict.reason}"
-        return Line(text, "", label_text, " " * 41, wraps=True)
+        return Paragraph(text, "", label_text, " " * 41, wraps=True)
     word = f"({verdict.word})" if verdict.is_explained else verdict.word
     text = f"{label_text}{format_ratio(verdict.ratio):>7}  {word}"
     style = "bold" if verdict.is_fault else ""
-    return Line(f"{text:{AXIS_INDENT}}{draw_sigma_ratio(verdict.ratio, verdict.against)}", style)
+    return Paragraph(
+        f"{text:{AXIS_INDENT}}{draw_sigma_ratio(verdict.ratio, verdict.against)}", style
+    )
 
 
 def _ticks_line() -> str:
     characters = [" "] * AXIS_WIDTH
     for tick in LABELLED_TICKS:
         label = RATIO_AXIS_TICKS[tick]
-        start = min(max(_axis_column(tick) - len(label) // 2, 0), AXIS_WIDTH - len(label))
+        start = min(max(_find_axis_column(tick) - len(label) // 2, 0), AXIS_WIDTH - len(label))
         characters[start : start + len(label)] = label
     return "".join(characters)
 
 
-def _aid_axis_lines(aids: Sequence[AidRow]) -> Iterator[Line]:
-    if not aids:
+def _aid_axis_lines(aid_rows: Sequence[AidRow]) -> Iterator[Paragraph]:
+    if not aid_rows:
         return
-    yield Line("")
-    yield from _wrapped_lines(AIDS_HEADING, "", "  ")
+    yield Paragraph("")
+    yield from _wrapped_lines(AIDS_CAPTION, "", "  ")
     indent = 31
-    yield Line(f"{'':{indent}}{_ticks_line()}")
-    for row, previous_row in zip(aids, (None, *aids), strict=False):
+    yield Paragraph(f"{'':{indent}}{_ticks_line()}")
+    for row, previous_row in zip(aid_rows, (None, *aid_rows), strict=False):
         label = "" if previous_row and row.label == previous_row.label else row.label
         ratio_text = "–" if row.ratio is None else format_ratio(row.ratio)
         label_text = f"  {label:13}{row.component:6}{ratio_text:>7}"
-        yield Line(f"{label_text:{indent}}{draw_sigma_ratio(row.ratio, 'source')}")
+        yield Paragraph(f"{label_text:{indent}}{draw_sigma_ratio(row.ratio, 'source')}")
 
 
 def format_spans(cause: Cause) -> str:
@@ -390,11 +396,11 @@ def format_spans(cause: Cause) -> str:
     return f"{first_s:.1f} s" if last_s - first_s < 0.05 else f"{first_s:.1f} to {last_s:.1f} s"
 
 
-def _labelled_lines(label: str, text: str) -> Iterator[Line]:
+def _labelled_lines(label: str, text: str) -> Iterator[Paragraph]:
     indent = " " * TEXT_INDENT
     yield from _wrapped_lines(text, f"  {label:{TEXT_INDENT - 2}}", indent)
 
 
-def _wrapped_lines(text: str, first_indent: str, indent: str) -> Iterator[Line]:
+def _wrapped_lines(text: str, first_indent: str, indent: str) -> Iterator[Paragraph]:
     if text:
-        yield Line(text, "", first_indent, indent, wraps=True)
+        yield Paragraph(text, "", first_indent, indent, wraps=True)

@@ -35,13 +35,13 @@ from px4fuse.report.phrases import (
     VERDICT_TABLE_HEAD,
     format_noise_estimate,
     format_settings,
+    make_verdict_row,
     statistics_by_filter,
-    verdict_cells,
 )
 from px4fuse.report.style import (
-    INNOVATION_DOTS,
+    INNOVATION_STYLES,
     KF_COLOUR,
-    TRACK_LINES,
+    TRACK_STYLES,
     Axes,
     draw_curve,
     draw_zero_line,
@@ -53,9 +53,9 @@ MAX_AUTOCORRELATION_LAG = 20
 MAX_DRAWN_SIGMAS = 4.0
 HISTOGRAM_EDGES = np.linspace(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS, 33)
 # Upper limit of the density axis; a higher one would make the normal density (up to 0.4) flat
-MAX_DENSITY = 1.6
-# Maximum p value of the Ljung-Box test for the text "not white"
-MAX_NON_WHITE_P = 0.01
+MAX_DENSITY_AXIS_LIMIT = 1.6
+# Below this p value of the Ljung-Box test, innovations are called "not white"
+MIN_WHITE_P_VALUE = 0.01
 RUNNING_NIS_HEIGHT = 140.0  # height (points) of the axes of the running mean NIS
 DISTRIBUTION_HEIGHT = 150.0  # height (points) of the axes of distribution and autocorrelation
 LEGEND_HEIGHT = 14.0  # height (points) of a legend above the axes
@@ -82,16 +82,18 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     )
     if innovations := _tested_innovations(result):
         title = "Running mean NIS (log scale)"
-        axes = event_marks.add_panel(page, analysis, title, RUNNING_NIS_HEIGHT, above=LEGEND_HEIGHT)
+        axes = event_marks.add_panel(
+            page, analysis, title, RUNNING_NIS_HEIGHT, gap_above=LEGEND_HEIGHT
+        )
         left_column, right_column = two_columns()
         histogram_axes = left_column.panel(
-            "Distribution of ν/√S", DISTRIBUTION_HEIGHT, above=LEGEND_HEIGHT, left=4.0
+            "Distribution of ν/√S", DISTRIBUTION_HEIGHT, gap_above=LEGEND_HEIGHT, left=4.0
         )
         autocorrelation_axes = right_column.panel(
             "Autocorrelation",
             DISTRIBUTION_HEIGHT,
             caption=_whiteness_sentence(result, innovations),
-            above=LEGEND_HEIGHT,
+            gap_above=LEGEND_HEIGHT,
         )
         _draw_running_nis(axes, innovations)
         _draw_histogram(histogram_axes, innovations)
@@ -105,7 +107,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     page.heading("All axes")
     column_heads = [*VERDICT_TABLE_HEAD, "n", "beyond\n2√S", "t of\nmean", "lag 1", "Ljung-\nBox"]
     rows = [
-        [*verdict_cells(axis_result, name), *_statistic_cells(consistency)]
+        [*make_verdict_row(axis_result, name), *_statistic_cells(consistency)]
         for axis_result in analysis.axes.values()
         for name, consistency in statistics_by_filter(axis_result).items()
     ]
@@ -145,9 +147,9 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
     column_heads = ["filter", "change", "quantity", "as flown", "with change", "explains"]
     page.table(column_heads, rows, right_aligned_columns=(3, 4))
     page.write_small(
-        "Each row is a re-run with one changed setting. 'explains' is the share of ln(quantity) "
-        "(of KF - EKF2: of its mean square) that the change removes; 'all' means that the "
-        "re-run is consistent. A change that explains 50 % or more is a cause."
+        "Each row is a re-run with one changed setting. 'explains' is the reduction of "
+        "ln(quantity), relative to its value as flown (of KF - EKF2: of the mean square). 'all': "
+        "the re-run is consistent. A change that explains 50 % or more is a cause."
     )
 
 
@@ -161,7 +163,7 @@ def _tested_innovations(result: AxisComparison) -> InnovationsByFilter:
 
 
 def _thin_line_style(name: str) -> dict[str, Any]:
-    return line_style(TRACK_LINES[name]["color"], 0.6, (0, (1, 1.5)))
+    return line_style(TRACK_STYLES[name]["color"], 0.6, (0, (1, 1.5)))
 
 
 def _draw_running_nis(axes: Axes, innovations: InnovationsByFilter) -> None:
@@ -169,7 +171,7 @@ def _draw_running_nis(axes: Axes, innovations: InnovationsByFilter) -> None:
     for name, values in innovations.items():
         innovation_counts = np.arange(1, len(values) + 1)
         running_nis = (values**2).cumsum() / innovation_counts
-        draw_curve(axes, running_nis.iloc[2:], **TRACK_LINES[name], label=name)
+        draw_curve(axes, running_nis.iloc[2:], **TRACK_STYLES[name], label=name)
         drawn_counts = np.unique(np.geomspace(3, len(innovation_counts), 60).astype(int))
         band_low, band_high = np.array([compute_nis_band(int(count)) for count in drawn_counts]).T
         drawn_times_s = values.index[drawn_counts - 1]
@@ -184,17 +186,17 @@ def _draw_running_nis(axes: Axes, innovations: InnovationsByFilter) -> None:
 
 
 def _draw_histogram(axes: Axes, innovations: InnovationsByFilter) -> None:
-    density_grid = np.linspace(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS, 81)
-    normal_density = np.exp(-0.5 * density_grid**2) / np.sqrt(2.0 * np.pi)
-    axes.fill_between(density_grid, normal_density, color="#dcdcdc", lw=0, label="normal")
+    innovation_grid = np.linspace(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS, 81)
+    normal_density = np.exp(-0.5 * innovation_grid**2) / np.sqrt(2.0 * np.pi)
+    axes.fill_between(innovation_grid, normal_density, color="#dcdcdc", lw=0, label="normal")
     density_limit = 0.4
     for name, values in innovations.items():
         drawn_values = values.clip(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS)
         density, _ = np.histogram(drawn_values, HISTOGRAM_EDGES, density=True)
-        axes.stairs(density, HISTOGRAM_EDGES, **TRACK_LINES[name], label=name)
+        axes.stairs(density, HISTOGRAM_EDGES, **TRACK_STYLES[name], label=name)
         density_limit = max(density_limit, float(density.max()))
     axes.set_xlim(-MAX_DRAWN_SIGMAS, MAX_DRAWN_SIGMAS)
-    axes.set_ylim(0.0, min(1.15 * density_limit, MAX_DENSITY))
+    axes.set_ylim(0.0, min(1.15 * density_limit, MAX_DENSITY_AXIS_LIMIT))
     axes.set_yticks([])
     axes.set_xlabel("ν / √S")
 
@@ -204,9 +206,9 @@ def _draw_autocorrelation(axes: Axes, innovations: InnovationsByFilter) -> None:
         lag_count = min(MAX_AUTOCORRELATION_LAG, len(values) // 3)
         correlations = compute_autocorrelation(np.asarray(values, np.float64), lag_count)
         lag_positions = np.arange(1, lag_count + 1) + shift
-        axes.vlines(lag_positions, 0.0, correlations, color=TRACK_LINES[name]["color"], lw=1.2)
+        axes.vlines(lag_positions, 0.0, correlations, color=TRACK_STYLES[name]["color"], lw=1.2)
         fill_colour = KF_COLOUR if name == "KF" else "white"
-        dots = INNOVATION_DOTS[name] | {"ms": 3.0, "mew": 0.6, "mfc": fill_colour}
+        dots = INNOVATION_STYLES[name] | {"ms": 3.0, "mew": 0.6, "mfc": fill_colour}
         axes.plot(lag_positions, correlations, **dots, label=name)
         whiteness_half_band = _whiteness_half_band(values)
         axes.axhline(-whiteness_half_band, **_thin_line_style(name))
@@ -229,8 +231,8 @@ def _whiteness_sentence(result: AxisComparison, innovations: InnovationsByFilter
         consistency = statistics_by_filter(result)[name]
         assert isinstance(consistency, Consistency)
         lag1_correlation, p_value = consistency.lag1_autocorrelation, consistency.ljung_box_p
-        interpretation = "white" if p_value >= MAX_NON_WHITE_P else "not white"
-        if p_value < MAX_NON_WHITE_P and abs(lag1_correlation) > _whiteness_half_band(values):
+        interpretation = "white" if p_value >= MIN_WHITE_P_VALUE else "not white"
+        if p_value < MIN_WHITE_P_VALUE and abs(lag1_correlation) > _whiteness_half_band(values):
             interpretation = (
                 f"{name} {'lags' if lag1_correlation > 0.0 else 'follows measurement noise'}"
             )

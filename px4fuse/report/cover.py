@@ -19,17 +19,17 @@ from px4fuse.core.text import format_ratio
 from px4fuse.filter.consistency import Reference
 from px4fuse.report import fonts
 from px4fuse.report.card_text import (
-    AIDS_HEADING,
+    AIDS_CAPTION,
     MAX_COMMAND_LENGTH,
-    QUANTITIES,
+    QUANTITY_LABELS,
     SEVERITY_SIGNS,
     format_consistent_ratios,
     format_spans,
-    marked_actions,
+    label_alternatives,
+    locate_sigma_ratio,
     note_texts,
     rerun_columns,
     rerun_note,
-    sigma_ratio_marks,
 )
 from px4fuse.report.cover_panels import write_panels
 from px4fuse.report.page import Block, Page, to_typst_data
@@ -45,9 +45,11 @@ TERMS_NOTE = (
     "innovation, as the filter reports them. KF: position and velocity along one axis, IMU "
     "acceleration as input, no gate. Replay: px4fuse's model of EKF2, run on this log."
 )
-AIDS_TERMS = "√S: standard deviation of an innovation as EKF2 reports it. Source: an aiding sensor."
-COMMAND_PLACES = {"shell": "your computer", "console": "MAVLink Console of QGroundControl"}
-ALL_FINDINGS = "All findings"
+AIDS_TERMS_NOTE = (
+    "√S: standard deviation of an innovation as EKF2 reports it. Source: an aiding sensor."
+)
+COMMAND_LOCATIONS = {"shell": "your computer", "console": "MAVLink Console of QGroundControl"}
+ALL_FINDINGS_TITLE = "All findings"
 
 
 def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
@@ -55,7 +57,7 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) ->
     page = Page()
     block = add_card(page, results.card)
     if isinstance(analysis, Analysis):
-        write_panels(block, analysis, results.card, free_height(page))
+        write_panels(block, analysis, results.card, find_free_height(page))
     yield page
 
 
@@ -63,7 +65,7 @@ def add_card(page: Page, card: Card) -> Block:
     """Add a summary of faults, causes and actions to a page."""
     identity, duration_text = card.identity, f"{card.identity.duration_s:.1f} s"
     flight_texts = identity.firmware, identity.hardware, duration_text, identity.source
-    more_causes_text = f"{card.more_causes} more causes are listed in {ALL_FINDINGS}"
+    more_causes_text = f"{card.more_causes} more causes are listed in {ALL_FINDINGS_TITLE}"
     return page.add(
         "cover",
         sign=SEVERITY_SIGNS[card.severity],
@@ -77,16 +79,18 @@ def add_card(page: Page, card: Card) -> Block:
         headline=card.headline,
         effect=card.effect_text,
         do_this=card.do_this,
-        **_axis_data(card),
+        **_make_ratio_axis(card),
         facts=list(card.facts.items()),
         reconcile=card.reconcile,
         causes_title="Cause and fix" if len(card.causes) == 1 else "Causes and fixes",
-        causes_legend=_causes_legend(card.causes),
-        causes=[_cause_data(number, cause) for number, cause in enumerate(card.causes, start=1)],
+        causes_legend=_format_causes_legend(card.causes),
+        causes=[
+            _make_cause_fields(number, cause) for number, cause in enumerate(card.causes, start=1)
+        ],
         more_causes=more_causes_text if card.more_causes else "",
         difference=card.difference,
-        notes=note_texts(card, f"in {ALL_FINDINGS}"),
-        terms=AIDS_TERMS if card.aids else TERMS_NOTE,
+        notes=note_texts(card, f"in {ALL_FINDINGS_TITLE}"),
+        terms=AIDS_TERMS_NOTE if card.aids else TERMS_NOTE,
         command=identity.command,
         segment=f"analysed {identity.segment}" if identity.segment else "",
         version=identity.version,
@@ -94,7 +98,7 @@ def add_card(page: Page, card: Card) -> Block:
     )
 
 
-def free_height(page: Page) -> float:
+def find_free_height(page: Page) -> float:
     return measure_free_height(to_typst_data(page.blocks, ""), fonts.font_names(str(page.blocks)))
 
 
@@ -110,42 +114,42 @@ def _shorten_middle(name: str) -> str:
     return f"{name[: half_length - 1]}…{name[-half_length:]}"
 
 
-def _axis_data(card: Card) -> dict[str, Any]:
+def _make_ratio_axis(card: Card) -> dict[str, Any]:
     interval_legend = "" if card.aids else " · ├─┤ 95 % interval"
-    ends_text = " and ".join(RATIO_AXIS_TICKS[end] for end in RATIO_AXIS_ENDS)
+    ends_text = " to ".join(RATIO_AXIS_TICKS[end] for end in RATIO_AXIS_ENDS)
     direction_text = f", {card.effect.axis}" if card.effect else ""
     axis_text = f"RMS of actual error ÷ reported σ{direction_text}"
     return {
         "axis_title": "Is the reported uncertainty right?",
-        "axis_text": AIDS_HEADING if card.aids else axis_text,
+        "axis_text": AIDS_CAPTION if card.aids else axis_text,
         "axis_legend": (
             f"grey: consistent ({format_consistent_ratios()}){interval_legend} · "
-            f"◀ ▶ outside {ends_text}"
+            f"◀ ▶ ratio outside {ends_text}"
         ),
         "ticks": [
             {"fraction": map_ratio_to_axis(tick), "label": label}
             for tick, label in RATIO_AXIS_TICKS.items()
         ],
-        "rows": [*map(_verdict_row_data, card.verdicts), *map(_aid_row_data, card.aids)],
+        "rows": [*map(_make_verdict_row, card.verdicts), *map(_make_aid_row, card.aids)],
     }
 
 
-def _verdict_row_data(verdict: Verdict) -> dict[str, Any]:
+def _make_verdict_row(verdict: Verdict) -> dict[str, Any]:
     verdict_text = f"{verdict.word}, explained" if verdict.is_explained else verdict.word
     if verdict.ratio is None:
         verdict_text = f"not evaluated: {verdict.reason}"
     return {
         "filter": verdict.filter,
         "label": FILTER_NAMES[verdict.filter] if verdict.against == "source" else "",
-        "quantity": QUANTITIES[verdict.against],
+        "quantity": QUANTITY_LABELS[verdict.against],
         "word": verdict_text,
         "quiet": verdict.is_explained,
         "loud": verdict.is_fault,
-        **_ratio_data(verdict.ratio, verdict.against, verdict.interval),
+        **_make_ratio_fields(verdict.ratio, verdict.against, verdict.interval),
     }
 
 
-def _aid_row_data(row: AidRow) -> dict[str, Any]:
+def _make_aid_row(row: AidRow) -> dict[str, Any]:
     return {
         "filter": "ekf2",
         "label": "",
@@ -153,25 +157,25 @@ def _aid_row_data(row: AidRow) -> dict[str, Any]:
         "word": "not evaluated" if row.ratio is None else "",
         "quiet": row.is_usual,
         "loud": False,
-        **_ratio_data(row.ratio, "source", None),
+        **_make_ratio_fields(row.ratio, "source", None),
     }
 
 
-def _ratio_data(
+def _make_ratio_fields(
     ratio: float | None, reference: Reference, interval: tuple[float, float] | None
 ) -> dict[str, Any]:
     if ratio is None:
         return {"ratio": ""}
-    return {"ratio": format_ratio(ratio), **sigma_ratio_marks(ratio, reference, interval)}
+    return {"ratio": format_ratio(ratio), **locate_sigma_ratio(ratio, reference, interval)}
 
 
-def _causes_legend(causes: Sequence[Cause]) -> str:
-    places = {action.where for cause in causes for _, action in marked_actions(cause)}
-    texts = [f"{place}: {text}" for place, text in COMMAND_PLACES.items() if place in places]
+def _format_causes_legend(causes: Sequence[Cause]) -> str:
+    places = {action.where for cause in causes for _, action in label_alternatives(cause)}
+    texts = [f"{place}: {text}" for place, text in COMMAND_LOCATIONS.items() if place in places]
     return " · ".join([*texts, "[id]: `px4fuse explain ID` explains the finding"])
 
 
-def _cause_data(number: int, cause: Cause) -> dict[str, Any]:
+def _make_cause_fields(number: int, cause: Cause) -> dict[str, Any]:
     columns = rerun_columns(cause.reruns)
     head, *rows = zip(*columns, strict=True) if columns else ((),)
     return {
@@ -179,14 +183,16 @@ def _cause_data(number: int, cause: Cause) -> dict[str, Any]:
         "title": cause.title,
         "when": f"{cause.severity} · {format_spans(cause) or 'whole flight'}",
         "why": cause.why,
-        "actions": [_action_data(prefix, action) for prefix, action in marked_actions(cause)],
+        "actions": [
+            _make_action_fields(prefix, action) for prefix, action in label_alternatives(cause)
+        ],
         "reruns": {"head": head, "rows": rows},
         "after": " ".join(filter(None, (rerun_note(cause.reruns), cause.after))),
         "id": cause.id,
     }
 
 
-def _action_data(prefix: str, action: Action) -> dict[str, Any]:
+def _make_action_fields(prefix: str, action: Action) -> dict[str, Any]:
     return {
         "label": f"{prefix}{action.target}",
         "where": action.where,

@@ -26,7 +26,7 @@ from px4fuse.filter.signals import AISLE, cut_to_segment
 from px4fuse.flight.model import Ekf2, Truth
 from px4fuse.report import event_marks, style
 from px4fuse.report.page import (
-    AXES_RIGHT,
+    AXES_RIGHT_MARGIN,
     AXIS_LABEL_HEIGHT,
     TICKS_HEIGHT,
     UNLABELLED_HEIGHT,
@@ -37,11 +37,11 @@ from px4fuse.report.page import (
     two_columns,
 )
 from px4fuse.report.panels import add_legend, draw_dots, normalised_innovations
-from px4fuse.report.style import TRACK_LINES, Axes, draw_curve
+from px4fuse.report.style import TRACK_STYLES, Axes, draw_curve
 
 POINTS_PER_MM = 72.0 / 25.4
 # Minimum ratio of length to width of a track whose map fills the page width
-MIN_LONG_TRACK_RATIO = 2.2
+MIN_ELONGATED_TRACK_RATIO = 2.2
 # Minimum and maximum height (points) of the map, with title and labels
 MAP_HEIGHT_RANGE = 40.0 * POINTS_PER_MM, 53.0 * POINTS_PER_MM
 # Minimum free height (points) on the first page for plots; otherwise they are on the next page
@@ -51,7 +51,7 @@ MIN_INNOVATIONS_HEIGHT = 50.0 * POINTS_PER_MM
 # Minimum and maximum height (points) of the innovation plot, with title and labels
 INNOVATION_HEIGHT_RANGE = 27.0 * POINTS_PER_MM, 38.0 * POINTS_PER_MM
 # Minimum height (points) of each plot of a position error
-MIN_ERROR_HEIGHT = 17.0 * POINTS_PER_MM
+MIN_ERROR_PLOT_HEIGHT = 17.0 * POINTS_PER_MM
 # Total height (points) of the plots if they are on the next page
 NEXT_PAGE_PLOTS_HEIGHT = 160.0 * POINTS_PER_MM
 TITLE_HEIGHT = 16.5  # height (points) of a title of one line, with its gaps
@@ -93,12 +93,12 @@ class TimePlot(NamedTuple):
 class FlightMap(NamedTuple):
     """Tracks seen from above: coordinates (m) to the right and upwards.
 
-    ``right_labels`` are possible labels of the horizontal axis, the longest first.
+    ``x_labels`` are possible labels of the horizontal axis, the longest first.
     """
 
     tracks: Mapping[str, Coordinates]
-    right_labels: Sequence[str]
-    up_label: str
+    x_labels: Sequence[str]
+    y_label: str
 
 
 def write_panels(block: Block, analysis: Analysis, card: Card, free_height: float) -> None:
@@ -106,24 +106,29 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free_height: floa
     page = Page()
     block["blocks"] = page.blocks
     legend = add_legend(page, analysis)
-    errors, innovations = _position_error_plots(analysis, card), _innovation_plot(analysis.main)
-    flight_map = _flight_map(analysis, card)
+    errors, innovations = (
+        _make_error_plots(analysis, card),
+        _make_innovation_plot(analysis.main),
+    )
+    flight_map = _make_flight_map(analysis, card)
     plots_height = free_height - legend["height"] - UNUSED_HEIGHT
     if plots_height < MIN_PLOTS_HEIGHT:
         plots_height = NEXT_PAGE_PLOTS_HEIGHT
         page.blocks.insert(0, {"kind": "break"})
-    min_long_map_height = (
-        MAP_HEIGHT_RANGE[0] + INNOVATION_HEIGHT_RANGE[0] + len(errors) * MIN_ERROR_HEIGHT
+    min_wide_map_height = (
+        MAP_HEIGHT_RANGE[0] + INNOVATION_HEIGHT_RANGE[0] + len(errors) * MIN_ERROR_PLOT_HEIGHT
     )
     innovation_height = float(
         np.clip(INNOVATION_HEIGHT_FRACTION * plots_height, *INNOVATION_HEIGHT_RANGE)
     )
     length_m, width_m = np.ptp(flight_map.tracks["positions"], axis=1)
-    is_elongated = length_m >= MIN_LONG_TRACK_RATIO * max(width_m, 1e-6)
-    if is_elongated and plots_height >= min_long_map_height:
+    is_elongated = length_m >= MIN_ELONGATED_TRACK_RATIO * max(width_m, 1e-6)
+    if is_elongated and plots_height >= min_wide_map_height:
         map_height = float(np.clip(MAP_HEIGHT_FRACTION * plots_height, *MAP_HEIGHT_RANGE))
         _draw_map(page, analysis, flight_map, map_height)
-        error_heights = _equal_heights(page, errors, plots_height - map_height - innovation_height)
+        error_heights = _compute_plot_heights(
+            page, errors, plots_height - map_height - innovation_height
+        )
         _draw_plots(page, analysis, [*errors, innovations], [*error_heights, innovation_height])
         return
     columns, map_height = two_columns(), plots_height
@@ -135,10 +140,10 @@ def write_panels(block: Block, analysis: Analysis, card: Card, free_height: floa
     if map_height < plots_height:
         _draw_plots(columns[0], analysis, [innovations], [innovation_height])
     label_height = HEIGHT_BELOW_AXES[True] - HEIGHT_BELOW_AXES[False]
-    heights = _equal_heights(columns[1], errors, plots_height - label_height)
+    heights = _compute_plot_heights(columns[1], errors, plots_height - label_height)
     heights[-1] += label_height
     _draw_plots(columns[1], analysis, errors, heights)
-    page.add_columns(*columns, above=0.0)
+    page.add_columns(*columns, gap_above=0.0)
 
 
 def _draw_plots(
@@ -147,9 +152,9 @@ def _draw_plots(
     """Draw plots over time; their heights (points) include titles and labels."""
     for plot, height in zip(plots, heights, strict=True):
         is_last = plot is plots[-1]
-        axes_height = height - _title_height(page, plot.title) - HEIGHT_BELOW_AXES[is_last]
+        axes_height = height - _find_title_height(page, plot.title) - HEIGHT_BELOW_AXES[is_last]
         axes = _add_panel(page, plot.title, axes_height)
-        event_marks.draw_marks(axes, analysis)
+        event_marks.draw_event_markers(axes, analysis)
         plot.draw(axes)
         style.label_time_axis(axes, is_last)
 
@@ -160,18 +165,20 @@ def _add_panel(page: Page, title: str, axes_height: float) -> Axes:
     return axes
 
 
-def _equal_heights(page: Page, plots: Sequence[TimePlot], total_height: float) -> list[float]:
+def _compute_plot_heights(
+    page: Page, plots: Sequence[TimePlot], total_height: float
+) -> list[float]:
     """Return heights (points) of plots with equally high axes and titles of one or more lines."""
-    title_heights = [_title_height(page, plot.title) for plot in plots]
+    title_heights = [_find_title_height(page, plot.title) for plot in plots]
     axes_height = (total_height - sum(title_heights)) / max(len(plots), 1)
     return [axes_height + title_height for title_height in title_heights]
 
 
-def _title_height(page: Page, title: str) -> float:
+def _find_title_height(page: Page, title: str) -> float:
     return TITLE_HEIGHT + TITLE_LINE_HEIGHT * (line_count(title, page.width) - 1)
 
 
-def _position_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
+def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
     """Return plots of the position errors of KF and EKF2, or of KF - EKF2 without ground truth."""
     result, effect = analysis.main.with_flight_tracks(), card.effect
     errors_by_filter = {
@@ -181,10 +188,10 @@ def _position_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
         and errors["error_m"].notna().any()
     }
     if errors_by_filter:
-        half_range_m = 1.1 * max(map(_error_axis_limit_m, errors_by_filter.values()))
+        half_range_m = 1.1 * max(map(_compute_error_limit_m, errors_by_filter.values()))
         rmse_by_filter_m = effect.position_rmse_m if effect else {}
         return [
-            _error_plot(
+            _make_error_plot(
                 f"{(name := FILTER_NAMES[filter_name])} error (m)",
                 ("RMSE", rmse_by_filter_m.get(filter_name)),
                 errors["error_m"],
@@ -206,19 +213,19 @@ def _position_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
     }
     limits_m = [2.2 * sigma.median() for sigma in sigmas_m.values() if sigma.notna().any()]
     half_range_m = 1.1 * max(float(difference_m.abs().max()), *limits_m)
-    rms = ("RMS", effect.difference_rms_m if effect else None)
-    return [_error_plot("KF − EKF2 (m)", rms, difference_m, sigmas_m, half_range_m)]
+    label_and_rms = ("RMS", effect.difference_rms_m if effect else None)
+    return [_make_error_plot("KF − EKF2 (m)", label_and_rms, difference_m, sigmas_m, half_range_m)]
 
 
-def _error_plot(
+def _make_error_plot(
     label: str,
-    name_and_rms_m: tuple[str, float | None],
+    label_and_rms: tuple[str, float | None],
     error_m: pd.Series[float],
     sigmas: Mapping[str, pd.Series[float]],
     half_range_m: float,
 ) -> TimePlot:
-    rms_name, rms_m = name_and_rms_m
-    statistic_texts = [] if rms_m is None else [f"{rms_name} {format_metres(rms_m)}"]
+    rms_label, rms_m = label_and_rms
+    statistic_texts = [] if rms_m is None else [f"{rms_label} {format_metres(rms_m)}"]
     finite_sigmas = {
         name: finite_sigma
         for name, sigma in sigmas.items()
@@ -230,7 +237,7 @@ def _error_plot(
     ]
     if sigma_texts:
         statistic_texts.append(f"σ {', '.join(sigma_texts)}")
-    line = TRACK_LINES[next(iter(sigmas))] if len(sigmas) == 1 else style.line_style("black", 1.0)
+    line = TRACK_STYLES[next(iter(sigmas))] if len(sigmas) == 1 else style.line_style("black", 1.0)
 
     def draw(axes: Axes) -> None:
         axes.set_ylim(-half_range_m, half_range_m)
@@ -242,7 +249,7 @@ def _error_plot(
     return TimePlot(f"{label}: {', '.join(statistic_texts)}", draw)
 
 
-def _error_axis_limit_m(errors: pd.DataFrame) -> float:
+def _compute_error_limit_m(errors: pd.DataFrame) -> float:
     largest_error, sigma = float(errors["error_m"].abs().max()), errors["sigma_m"].median()
     return max(
         largest_error, 1e-3, min(2.2 * sigma, 3.0 * largest_error) if np.isfinite(sigma) else 0.0
@@ -257,17 +264,17 @@ def _format_sigma(sigma: pd.Series[float]) -> str:
     return f"{format_metres(low)} to {format_metres(high)}"
 
 
-def _innovation_plot(result: AxisComparison) -> TimePlot:
+def _make_innovation_plot(result: AxisComparison) -> TimePlot:
     innovations = normalised_innovations(result)
     legend = ", ".join(f"{sign} {name}" for name, sign in zip(innovations, "●■", strict=False))
     titles = [f"Innovations ÷ √S ({legend}): 95 % expected within ±2"]
-    outside_texts = [
+    clipped_texts = [
         f"{name} {format_ratio(ratio)}"
         for name, values in innovations.items()
         if (ratio := float(values.abs().max())) > MAX_DRAWN_SIGMAS
     ]
-    if outside_texts:
-        titles.append(f"▲▼ outside ±{MAX_DRAWN_SIGMAS:g}, up to {', '.join(outside_texts)}")
+    if clipped_texts:
+        titles.append(f"▲▼ beyond ±{MAX_DRAWN_SIGMAS:g}, largest {', '.join(clipped_texts)}")
 
     def draw(axes: Axes) -> None:
         axes.set_ylim(-1.12 * MAX_DRAWN_SIGMAS, 1.12 * MAX_DRAWN_SIGMAS)
@@ -280,13 +287,13 @@ def _innovation_plot(result: AxisComparison) -> TimePlot:
                 axes,
                 innovations[name],
                 MAX_DRAWN_SIGMAS,
-                style.INNOVATION_DOTS[name],
+                style.INNOVATION_STYLES[name],
             )
 
     return TimePlot("; ".join(titles), draw)
 
 
-def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
+def _select_map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
     """Return north and east (m) of positions, KF, EKF2 and ground truth."""
     segment, flight = analysis.segment.flight, analysis.flight
 
@@ -306,31 +313,31 @@ def _map_tracks(analysis: Analysis) -> dict[str, Coordinates]:
     return {name: track for name, track in tracks.items() if len(track[0])}
 
 
-def _flight_map(analysis: Analysis, card: Card) -> FlightMap:
+def _make_flight_map(analysis: Analysis, card: Card) -> FlightMap:
     """Return the map with the main flight direction to the right; without it, north is up."""
     aisle_heading_deg = next(
         (line.heading_deg for line in analysis.input_axes if line.name == AISLE), None
     )
-    heading_rad, right_labels, up_label = np.pi / 2.0, ["east (m)"], "north (m)"
+    heading_rad, x_labels, y_label = np.pi / 2.0, ["east (m)"], "north (m)"
     if aisle_heading_deg is not None:
-        heading_rad, up_label = np.deg2rad(aisle_heading_deg % 180.0), "left (m)"
+        heading_rad, y_label = np.deg2rad(aisle_heading_deg % 180.0), "left (m)"
         axis = card.effect.axis if card.effect else "along the aisle"
-        right_labels = [f"{text} (m)" for text in (axis, axis.partition(", ")[2], "main axis")]
+        x_labels = [f"{text} (m)" for text in (axis, axis.partition(", ")[2], "main axis")]
     elif analysis.source.frame == "FRD":
         name = analysis.source.name
-        right_labels, up_label = [f"y of {name} (m)", "y (m)"], f"x of {name} (m)"
+        x_labels, y_label = [f"y of {name} (m)", "y (m)"], f"x of {name} (m)"
     cosine, sine = np.cos(heading_rad), np.sin(heading_rad)
     tracks = {
         name: (cosine * north + sine * east, sine * north - cosine * east)
-        for name, (north, east) in _map_tracks(analysis).items()
+        for name, (north, east) in _select_map_tracks(analysis).items()
     }
-    return FlightMap(tracks, right_labels, up_label)
+    return FlightMap(tracks, x_labels, y_label)
 
 
 def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: float) -> None:
-    tracks, width = flight_map.tracks, page.width - LEFT_MARGIN - AXES_RIGHT
+    tracks, width = flight_map.tracks, page.width - LEFT_MARGIN - AXES_RIGHT_MARGIN
     title, axes_height = "Map", height - TITLE_HEIGHT - HEIGHT_BELOW_AXES[True]
-    limits = _map_limits(tracks, width / axes_height)
+    limits = _compute_map_limits(tracks, width / axes_height)
     distance_texts = []
     for name, coordinates in tracks.items():
         track = np.transpose(coordinates)
@@ -338,49 +345,51 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
         if distance_m > 0.0:
             distance_texts.append(f"{name} {format_metres(distance_m)} m")
     if distance_texts:
-        title = f"Map; largest distance outside the map: {', '.join(distance_texts)}"
-        axes_height = height - _title_height(page, title) - HEIGHT_BELOW_AXES[True]
-        limits = _map_limits(tracks, width / axes_height)
+        title = f"Map; largest distance of tracks from the map: {', '.join(distance_texts)}"
+        axes_height = height - _find_title_height(page, title) - HEIGHT_BELOW_AXES[True]
+        limits = _compute_map_limits(tracks, width / axes_height)
     axes = _add_panel(page, title, axes_height)
-    right_label = next(
-        text for text in flight_map.right_labels if text_width(text) < page.width - LEFT_MARGIN
+    x_label = next(
+        text for text in flight_map.x_labels if text_width(text) < page.width - LEFT_MARGIN
     )
     (left, bottom), (right, top) = limits
-    axes.set(xlim=(left, right), ylim=(bottom, top), xlabel=right_label, ylabel=flight_map.up_label)
+    axes.set(xlim=(left, right), ylim=(bottom, top), xlabel=x_label, ylabel=flight_map.y_label)
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(True, axis="both")
-    for name, (right_m, up_m) in tracks.items():
+    for name, (map_x_m, map_y_m) in tracks.items():
         if name == "positions":
-            axes.plot(right_m, up_m, **style.MEASUREMENT_DOTS | {"ms": 2.4})
+            axes.plot(map_x_m, map_y_m, **style.MEASUREMENT_STYLE | {"ms": 2.4})
         else:
-            stride = max(1, len(right_m) // style.MAX_WIDE_POINTS)
-            axes.plot(right_m[::stride], up_m[::stride], **TRACK_LINES[name])
+            stride = max(1, len(map_x_m) // style.MAX_WIDE_POINTS)
+            axes.plot(map_x_m[::stride], map_y_m[::stride], **TRACK_STYLES[name])
     position_times = cut_to_segment(analysis.source.samples, analysis.segment.flight).index
-    right_m, up_m = tracks["positions"]
-    for times, mark in (
-        (analysis.events.take_off_s, event_marks.TAKE_OFF_MARK),
-        (analysis.events.landing_s, event_marks.LANDING_MARK),
+    map_x_m, map_y_m = tracks["positions"]
+    for times, marker_style in (
+        (analysis.events.take_off_s, event_marks.TAKE_OFF_MARKER_STYLE),
+        (analysis.events.landing_s, event_marks.LANDING_MARKER_STYLE),
     ):
         position_rows = position_times.get_indexer(pd.Index(times, dtype=float), method="nearest")
-        large_mark = mark | {"ms": 9.0, "mec": "white", "mew": 0.8}
-        axes.plot(right_m[position_rows], up_m[position_rows], **large_mark)
+        large_style = marker_style | {"ms": 9.0, "mec": "white", "mew": 0.8}
+        axes.plot(map_x_m[position_rows], map_y_m[position_rows], **large_style)
 
 
-def _map_limits(tracks: Mapping[str, Coordinates], aspect_ratio: float) -> tuple[Array, Array]:
+def _compute_map_limits(
+    tracks: Mapping[str, Coordinates], aspect_ratio: float
+) -> tuple[Array, Array]:
     """Return the lower left and the upper right corner of the map (m)."""
     # large errors of a filter are outside of the map, because they would reduce its scale
     middles_m, sizes_m = [], []
     for axis_index in (0, 1):
         range_ends_m = [np.percentile(tracks["positions"][axis_index], (1.0, 99.0))]
         if "ground truth" in tracks:
-            range_ends_m.append(_range_of(tracks["ground truth"][axis_index]))
-        low_m, high_m = _range_of(range_ends_m)
+            range_ends_m.append(_compute_range(tracks["ground truth"][axis_index]))
+        low_m, high_m = _compute_range(range_ends_m)
         margin_m = MAX_MAP_MARGIN_FRACTION * (high_m - low_m)
         limits_m = low_m - margin_m, high_m + margin_m
         range_ends_m += [
-            np.clip(_range_of(track[axis_index]), *limits_m) for track in tracks.values()
+            np.clip(_compute_range(track[axis_index]), *limits_m) for track in tracks.values()
         ]
-        low_m, high_m = _range_of(range_ends_m)
+        low_m, high_m = _compute_range(range_ends_m)
         middles_m.append(0.5 * (low_m + high_m))
         sizes_m.append(max(MAP_MARGIN_FACTOR * (high_m - low_m), MIN_MAP_EXTENT_M))
     map_length_m = max(sizes_m[0], sizes_m[1] * aspect_ratio)
@@ -388,5 +397,5 @@ def _map_limits(tracks: Mapping[str, Coordinates], aspect_ratio: float) -> tuple
     return np.array(middles_m) - half_size_m, np.array(middles_m) + half_size_m
 
 
-def _range_of(values: ArrayLike) -> Array:
+def _compute_range(values: ArrayLike) -> Array:
     return np.array([np.nanmin(values), np.nanmax(values)])

@@ -21,7 +21,7 @@ from px4fuse.report.style import (
     KF_BAND_COLOUR,
     KF_COLOUR,
     MUTED_COLOUR,
-    TRACK_LINES,
+    TRACK_STYLES,
     Axes,
     draw_curve,
 )
@@ -57,7 +57,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 
 
 def _explanations_by_axis(analysis: Analysis) -> Mapping[str, DifferenceExplanation | Unavailable]:
-    """Return explanations of KF - EKF2: of the main direction if available, else of all axes."""
+    """Return explanations of the difference KF - EKF2, only of the aisle axis if available."""
     explanations = analysis.difference_steps
     return {AISLE: explanations[AISLE]} if AISLE in explanations else explanations
 
@@ -70,13 +70,14 @@ def write_explanation(page: Page, explanation: DifferenceExplanation | Unavailab
     """Write the explanation of the difference KF - EKF2, or the reason why it is missing."""
     if isinstance(explanation, Unavailable):
         page.write_labelled(
-            "KF-EKF2", f"The difference KF - EKF2 is not explained: {explanation.reason}."
+            "KF-EKF2",
+            f"The difference between KF and EKF2 cannot be explained: {explanation.reason}.",
         )
     else:
         page.write_labelled("KF-EKF2", explanation.sentences[0])
 
 
-def unexplained_note(analysis: Analysis) -> str:
+def describe_missing_explanation(analysis: Analysis) -> str:
     """Return the reason why the difference KF - EKF2 is not explained; "" if it is explained."""
     explanations = _explanations_by_axis(analysis)
     if isinstance(analysis.flight.ekf2, Unavailable) or _has_explanation(explanations):
@@ -86,11 +87,14 @@ def unexplained_note(analysis: Analysis) -> str:
         for explanation in explanations.values()
         if isinstance(explanation, Unavailable)
     }
-    return f"The difference KF - EKF2 is not explained: {' '.join(reasons)}" if reasons else ""
+    return (
+        f"The difference between KF and EKF2 cannot be explained: {' '.join(reasons)}"
+        if reasons
+        else ""
+    )
 
 
 def format_agreement(agreement: Agreement) -> str:
-    """Format the agreement of the EKF2 replay with the log."""
     correlation_text = ", ".join(
         f"{axis.innovation_correlation:.4f} ({name})" for name, axis in agreement.axes.items()
     )
@@ -115,10 +119,10 @@ def format_agreement(agreement: Agreement) -> str:
 def _draw_axis_explanation(
     page: Page, name: str, explanation: DifferenceExplanation, analysis: Analysis
 ) -> None:
-    span_texts = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in explanation.spans_s)
-    page.heading(f"{name}, {span_texts}")
+    spans_text = ", ".join(f"{start:.0f} to {end:.0f} s" for start, end in explanation.spans_s)
+    page.heading(f"{name}, {spans_text}")
     for sentence in explanation.sentences:
-        page.write(sentence, size=8.5, above=1.0)
+        page.write(sentence, size=8.5, gap_above=1.0)
     setting_names = [step.name for step in explanation.steps]
     columns = two_columns(LEFT_COLUMN_FRACTION)
     quantities = (
@@ -148,22 +152,22 @@ def _draw_axis_explanation(
         analysis,
         "Position difference KF - EKF2 (m, dark) and unexplained difference (light)",
         TIME_PLOT_HEIGHT,
-        caption=_largest_difference_sentence(explanation),
+        caption=_describe_largest_difference(explanation),
         axis=name,
     )
-    position_difference, unexplained_difference = (
+    position_difference_m, unexplained_difference_m = (
         pd.Series(values, explanation.times_s)
         for values in (explanation.kf_minus_ekf2_m, explanation.unexplained_m)
     )
     for start, end in explanation.spans_s:
-        draw_curve(axes, position_difference.loc[start:end], **TRACK_LINES["KF"])
-        draw_curve(axes, unexplained_difference.loc[start:end], color=EKF2_COLOUR, lw=0.8)
+        draw_curve(axes, position_difference_m.loc[start:end], **TRACK_STYLES["KF"])
+        draw_curve(axes, unexplained_difference_m.loc[start:end], color=EKF2_COLOUR, lw=0.8)
 
 
 def _draw_waterfall(
     axes: Axes, setting_names: list[str], reductions_percent: Array, unexplained_percent: float
 ) -> None:
-    """Draw the mean square of KF - EKF2 and its reduction by each replaced setting (%)."""
+    """Draw the reduction of the mean square difference KF - EKF2 (%) by each replaced setting."""
     bar_ends = 100.0 - np.concatenate([[0.0], np.cumsum(reductions_percent)])
     row_count, right_end = len(setting_names) + 2, max(100.0, float(bar_ends.max()))
     kf_bar_style: dict[str, Any] = {"height": 0.7, "edgecolor": KF_COLOUR, "lw": 0.6}
@@ -186,7 +190,7 @@ def _draw_waterfall(
     axes.grid(visible=False)
 
 
-def _largest_difference_sentence(explanation: DifferenceExplanation) -> str:
+def _describe_largest_difference(explanation: DifferenceExplanation) -> str:
     differences_m = np.abs(explanation.kf_minus_ekf2_m)
     row = int(np.argmax(differences_m))
     return (

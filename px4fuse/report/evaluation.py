@@ -60,8 +60,8 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
             (evaluation.reference_m, REFERENCE_LINE, "reference"),
             (evaluation.unaligned_estimate_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
         ):
-            drawn_m = position_m[:, axis_indices]
-            plot_path(axes, drawn_m, evaluation.time_s, label=label, **line_style)
+            drawn_position_m = position_m[:, axis_indices]
+            plot_path(axes, drawn_position_m, evaluation.time_s, label=label, **line_style)
         style.set_map_axes(axes, *names)
         unaligned_handles = _legend_handles(axes)
         left_column.write_small(unaligned_sentence(evaluation))
@@ -115,8 +115,10 @@ def _draw_ape_and_rpe(page: Page, evaluation: Evaluation) -> None:
     page.add_columns(left_column, right_column)
     if _rpe_statistics(evaluation):
         left_column, right_column = two_columns()
-        _draw_rpe(left_column.panel("RPE for each delta (m)", PANEL_HEIGHT), evaluation)
-        right_column.write(rpe_growth_sentence(evaluation.rpe), colour=MUTED_COLOUR, above=24.0)
+        _draw_rpe(
+            left_column.panel("RPE (m) over intervals of length delta", PANEL_HEIGHT), evaluation
+        )
+        right_column.write(rpe_growth_sentence(evaluation.rpe), colour=MUTED_COLOUR, gap_above=24.0)
         page.add_columns(left_column, right_column)
 
 
@@ -192,11 +194,11 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
     for text in evaluation.warnings:
         page.write(text, bold=True, colour=style.SEVERITY_COLOURS["warning"])
     head = ["error", "RMSE", "95 %", "mean", "median", "std", "max", "n", "rotation\nRMSE (°)"]
-    page.table(head, error_rows(evaluation), right_aligned_columns=range(1, len(head)))
+    page.table(head, make_error_rows(evaluation), right_aligned_columns=range(1, len(head)))
     page.write_small(" ".join([*missing_reasons(evaluation), *evaluation.notes]))
 
 
-def error_rows(evaluation: Evaluation) -> list[list[str]]:
+def make_error_rows(evaluation: Evaluation) -> list[list[str]]:
     error_by_name: dict[str, AbsoluteError | RelativeError] = {"ATE (m)": evaluation.ate}
     error_by_name |= {f"RPE {error.delta_text} (m)": error for error in evaluation.rpe}
     rows = []

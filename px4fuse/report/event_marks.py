@@ -10,7 +10,7 @@ from px4fuse.core.arrays import Array
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.report.page import Page
 from px4fuse.report.style import (
-    REJECTED_DOTS,
+    REJECTED_STYLE,
     Artist,
     Axes,
     dot_style,
@@ -19,17 +19,20 @@ from px4fuse.report.style import (
 
 # Bands differ in shade and hatching, so they remain distinct in greyscale
 _BAND_STYLE: dict[str, Any] = {"edgecolor": "none", "lw": 0.0}
-GROUND_BAND = _BAND_STYLE | {"facecolor": "#e4e4e4"}
-DROPOUT_BAND = _BAND_STYLE | {"facecolor": "#a8a8a8"}
+ON_GROUND_BAND_STYLE = _BAND_STYLE | {"facecolor": "#e4e4e4"}
+DROPOUT_BAND_STYLE = _BAND_STYLE | {"facecolor": "#a8a8a8"}
 GAP_BAND = _BAND_STYLE | {"facecolor": "#fbfbfb", "edgecolor": "#9a9a9a", "hatch": "/////"}
-RESET_MARK = dot_style("#8a4508", 2, 6.0, 1.2)
-OUTLIER_MARK = dot_style("black", "x", 3.0, 0.7)
-TAKE_OFF_MARK, LANDING_MARK = dot_style("black", "*", 6.0), dot_style("black", "P", 5.0)
+RESET_MARKER_STYLE = dot_style("#8a4508", 2, 6.0, 1.2)
+OUTLIER_MARKER_STYLE = dot_style("black", "x", 3.0, 0.7)
+TAKE_OFF_MARKER_STYLE, LANDING_MARKER_STYLE = (
+    dot_style("black", "*", 6.0),
+    dot_style("black", "P", 5.0),
+)
 # Minimum time between two drawn event markers, as a fraction of the analysed time span
-MIN_MARK_INTERVAL_FRACTION = 1.0 / 300.0
+MIN_MARKER_INTERVAL_FRACTION = 1.0 / 300.0
 
 
-class EventMarks(NamedTuple):
+class EventMarkers(NamedTuple):
     """Events of one type in a plot over time.
 
     Markers at ``height``, a fraction of the axes; full-height bands if ``height`` is None.
@@ -41,21 +44,23 @@ class EventMarks(NamedTuple):
     height: float | None = None
 
 
-def _event_marks(analysis: Analysis, rejected_s: Sequence[float] | Array) -> tuple[EventMarks, ...]:
+def _make_event_markers(
+    analysis: Analysis, rejection_times_s: Sequence[float] | Array
+) -> tuple[EventMarkers, ...]:
     events = analysis.events
     return (
-        EventMarks("on the ground", events.ground_spans_s, GROUND_BAND),
-        EventMarks("gap in position source", events.gaps, GAP_BAND),
-        EventMarks("log dropout", events.dropouts, DROPOUT_BAND),
-        EventMarks("EKF2 rejected", rejected_s, REJECTED_DOTS, 0.025),
-        EventMarks("outlier", outlier_times(analysis), OUTLIER_MARK, 0.075),
-        EventMarks("EKF2 reset", events.resets_s, RESET_MARK, 0.92),
-        EventMarks("take-off", events.take_off_s, TAKE_OFF_MARK, 0.0),
-        EventMarks("landing", events.landing_s, LANDING_MARK, 0.0),
+        EventMarkers("on the ground", events.ground_spans_s, ON_GROUND_BAND_STYLE),
+        EventMarkers("gap in position source", events.gaps, GAP_BAND),
+        EventMarkers("log dropout", events.dropouts, DROPOUT_BAND_STYLE),
+        EventMarkers("EKF2 rejected", rejection_times_s, REJECTED_STYLE, 0.025),
+        EventMarkers("outlier", outlier_times(analysis), OUTLIER_MARKER_STYLE, 0.075),
+        EventMarkers("EKF2 reset", events.resets_s, RESET_MARKER_STYLE, 0.92),
+        EventMarkers("take-off", events.take_off_s, TAKE_OFF_MARKER_STYLE, 0.0),
+        EventMarkers("landing", events.landing_s, LANDING_MARKER_STYLE, 0.0),
     )
 
 
-def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> None:
+def draw_event_markers(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> None:
     """Draw gaps, resets, rejections and outliers on a time axis.
 
     Rejections are those along ``axis``; None is the main axis, "" draws no rejections.
@@ -66,8 +71,8 @@ def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> No
     segment, x_transform = analysis.segment.flight, axes.get_xaxis_transform()
     axes.set_xlim(segment.start_s, segment.end_s)
     name = analysis.main.axis.name if axis is None else axis
-    marks = _event_marks(analysis, analysis.events.rejected_s.get(name, ()))
-    for order, (_, spans_or_times, style, height) in enumerate(marks, start=1):
+    event_markers = _make_event_markers(analysis, analysis.events.rejected_s.get(name, ()))
+    for order, (_, spans_or_times, style, height) in enumerate(event_markers, start=1):
         if not len(spans_or_times):
             continue
         if height is None:
@@ -78,8 +83,8 @@ def draw_marks(axes: Axes, analysis: Analysis, *, axis: str | None = None) -> No
             bands = PolyCollection(corners, transform=x_transform, zorder=0.1 * order, **style)
             axes.add_collection(bands, autolim=False)
         else:
-            min_interval_s = MIN_MARK_INTERVAL_FRACTION * (segment.end_s - segment.start_s)
-            times_s = visible_times(spans_or_times, min_interval_s)
+            min_interval_s = MIN_MARKER_INTERVAL_FRACTION * (segment.end_s - segment.start_s)
+            times_s = select_marker_times(spans_or_times, min_interval_s)
             markers = Line2D(
                 times_s,
                 np.full(len(times_s), height),
@@ -103,7 +108,7 @@ def add_panel(
 ) -> Axes:
     """Add a plot over time that also shows gaps, resets, rejections and outliers."""
     axes = page.panel(title, height, **options)
-    draw_marks(axes, analysis, axis=axis)
+    draw_event_markers(axes, analysis, axis=axis)
     label_time_axis(axes, with_time_label)
     return axes
 
@@ -121,15 +126,15 @@ def legend_entries(analysis: Analysis) -> list[Artist]:
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
-    rejected_s = [time for times in analysis.events.rejected_s.values() for time in times]
+    rejection_times_s = [time for times in analysis.events.rejected_s.values() for time in times]
     return [
         Patch(**style, label=label) if height is None else Line2D([], [], **style, label=label)
-        for label, spans_or_times, style, height in _event_marks(analysis, rejected_s)
+        for label, spans_or_times, style, height in _make_event_markers(analysis, rejection_times_s)
         if len(spans_or_times)
     ]
 
 
-def visible_times(times: Any, min_interval_s: float) -> Array:
+def select_marker_times(times: Any, min_interval_s: float) -> Array:
     """Keep one time (s) per interval, so that drawn markers do not overlap."""
     times_s = np.asarray(times, dtype=np.float64)
     visible_s: Array = times_s[np.unique(np.floor(times_s / min_interval_s), return_index=True)[1]]

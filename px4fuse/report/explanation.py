@@ -7,7 +7,7 @@ from px4fuse.findings.model import CATALOGUE, FINDING_GROUPS, load_examples
 from px4fuse.report.page import Page
 
 
-def list_page() -> Page:
+def make_findings_list() -> Page:
     """List the ids and titles of all findings (detectable faults), by group."""
     page = Page()
     for group in FINDING_GROUPS:
@@ -19,7 +19,7 @@ def list_page() -> Page:
     return page
 
 
-def finding_page(finding_id: str) -> Page:
+def make_finding_page(finding_id: str) -> Page:
     """Format meaning, example, causes, effects and error rates of a finding (detectable fault).
 
     Raises

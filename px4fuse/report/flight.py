@@ -11,9 +11,9 @@ from px4fuse.core.record import Span
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import panels, style
-from px4fuse.report.difference_page import unexplained_note
+from px4fuse.report.difference_page import describe_missing_explanation
 from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
-from px4fuse.report.phrases import statistics_by_filter, verdict_notes
+from px4fuse.report.phrases import list_verdict_warnings, statistics_by_filter
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, Axes
 
 ZOOM_UPDATE_COUNT = 15  # number of updates in the enlarged plot of σ_p
@@ -26,9 +26,9 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     result = analysis.main
     page = Page(f"Position and velocity along {result.axis.label}")
     panels.add_legend(page, analysis)
-    panels.POSITION.draw_on_page(page, analysis, result, with_time_label=False)
-    panels.VELOCITY.draw_on_page(page, analysis, result, with_time_label=True)
-    page.write(unexplained_note(analysis), above=6.0)
+    panels.POSITION_PANEL.draw_on_page(page, analysis, result, with_time_label=False)
+    panels.VELOCITY_PANEL.draw_on_page(page, analysis, result, with_time_label=True)
+    page.write(describe_missing_explanation(analysis), gap_above=6.0)
     yield page
 
 
@@ -36,11 +36,15 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw innovations, σ_p and σ_v along the main axis over time, and σ_p over a few updates."""
     result = analysis.main
     page = Page(f"Innovations and variances along {result.axis.label}")
-    for panel in (panels.INNOVATIONS, panels.SIGMA_P, panels.SIGMA_V):
-        is_last = panel is panels.SIGMA_V
+    for panel in (
+        panels.INNOVATIONS_PANEL,
+        panels.POSITION_SIGMA_PANEL,
+        panels.VELOCITY_SIGMA_PANEL,
+    ):
+        is_last = panel is panels.VELOCITY_SIGMA_PANEL
         panel.draw_on_page(page, analysis, result, with_time_label=is_last)
     _draw_zoom(page, analysis)
-    for note in verdict_notes(analysis):
+    for note in list_verdict_warnings(analysis):
         page.write_small(note)
     yield page
 
@@ -48,9 +52,9 @@ def draw_innovations(analysis: Analysis, _: object) -> Iterator[Page]:
 def _draw_zoom(page: Page, analysis: Analysis) -> None:
     """Draw the growth of σ_p by predictions and its reduction by updates over a few seconds."""
     result = analysis.main
-    start_s, end_s = zoom_span_s = zoom_window(result, analysis.segment)
+    start_s, end_s = zoom_span_s = find_zoom_span(result, analysis.segment)
     title = f"σ of position (m), {end_s - start_s:.1f} s of the flight"
-    axes = page.panel(title, ZOOM_HEIGHT, caption=zoom_sentence(result))
+    axes = page.panel(title, ZOOM_HEIGHT, caption=describe_sigma_at_updates(result))
     _draw_sawtooth(axes, result, zoom_span_s)
     update_times_s = result.replay.updates.loc[start_s:end_s].index
     axes.vlines(
@@ -68,7 +72,7 @@ def _draw_zoom(page: Page, analysis: Analysis) -> None:
     page.write_small(f"The line is σ of KF; grey ticks mark measurements.{ekf2_legend}")
 
 
-def zoom_window(result: AxisComparison, segment: Segment) -> Span:
+def find_zoom_span(result: AxisComparison, segment: Segment) -> Span:
     """Return start and end (s) of a few updates in the middle of the flight."""
     update_times_s = result.replay.updates.index.to_numpy()
     if len(update_times_s) < 2:
@@ -109,20 +113,20 @@ def _draw_sawtooth(axes: Axes, result: AxisComparison, zoom_span_s: Span) -> Non
     axes.set_xlim(*zoom_span_s)
 
 
-def zoom_sentence(result: AxisComparison) -> str:
+def describe_sigma_at_updates(result: AxisComparison) -> str:
     filter_texts = []
     for name, filter_summary in statistics_by_filter(result).items():
-        prior_m = filter_summary.sigma_p_before_update_m
-        posterior_m = filter_summary.sigma_p_after_update_m
-        if prior_m is None or posterior_m is None:
+        prior_sigma_m = filter_summary.sigma_p_before_update_m
+        posterior_sigma_m = filter_summary.sigma_p_after_update_m
+        if prior_sigma_m is None or posterior_sigma_m is None:
             if name == "EKF2":
                 filter_texts.append(
                     "σ of EKF2 before and after an update is unknown: S or R is not logged"
                 )
             continue
         text = (
-            f"{name} {prior_m:.3f} to {posterior_m:.3f} m, {1.0 - posterior_m**2 / prior_m**2:.0%} "
-            "less variance"
+            f"{name}: σ from {prior_sigma_m:.3f} to {posterior_sigma_m:.3f} m by an update, "
+            f"{1.0 - posterior_sigma_m**2 / prior_sigma_m**2:.0%} less variance"
         )
         if name == "KF":
             text = (
@@ -143,13 +147,22 @@ def draw_other_axes(analysis: Analysis, _: object) -> Iterator[Page]:
         "Position, velocity, innovations and σ of the other axes, drawn as for the main axis.",
     )
     width = (PAGE_WIDTH - COLUMN_GAP * (len(secondary_axes) - 1)) / max(len(secondary_axes), 2)
-    for panel in (panels.POSITION, panels.VELOCITY, panels.INNOVATIONS, panels.SIGMA_P):
+    for panel in (
+        panels.POSITION_PANEL,
+        panels.VELOCITY_PANEL,
+        panels.INNOVATIONS_PANEL,
+        panels.POSITION_SIGMA_PANEL,
+    ):
         columns = [Page(width=width) for _ in secondary_axes]
         for column, result in zip(columns, secondary_axes, strict=True):
-            if panel is panels.POSITION:
+            if panel is panels.POSITION_PANEL:
                 column.heading(result.axis.name)
             panel.draw_on_page(
-                column, analysis, result, with_time_label=panel is panels.SIGMA_P, is_narrow=True
+                column,
+                analysis,
+                result,
+                with_time_label=panel is panels.POSITION_SIGMA_PANEL,
+                is_narrow=True,
             )
         page.add_columns(*columns)
     yield page

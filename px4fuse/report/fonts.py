@@ -12,13 +12,13 @@ from matplotlib.font_manager import FontEntry, FontPath
 from px4fuse.report.style import FONT
 
 # Words in the names of fonts that draw a box for every character
-BOX_FONT_WORDS = ("lastresort", "last resort", "blank", "notdef")
+PLACEHOLDER_FONT_WORDS = ("lastresort", "last resort", "blank", "notdef")
 NO_GLYPH = "\N{WHITE SQUARE}"
 MAX_LISTED_CHARACTERS = 12
 
 
 @cache
-def font_of(character: str) -> str | None:
+def find_font(character: str) -> str | None:
     """Return the name of an installed font with a character, preferably DejaVu Sans, or None."""
     if ord(character) in _font_characters(font_manager.findfont(FONT)):
         return FONT
@@ -29,21 +29,21 @@ def font_of(character: str) -> str | None:
 
 def font_names(text: str) -> list[str]:
     """Return the names of the fonts for a text, DejaVu Sans first."""
-    return list(dict.fromkeys([FONT, *filter(None, map(font_of, _non_ascii(text)))]))
+    return list(dict.fromkeys([FONT, *filter(None, map(find_font, _find_non_ascii(text)))]))
 
 
-def font_folders(names: tuple[str, ...]) -> list[str]:
+def find_font_folders(names: tuple[str, ...]) -> list[str]:
     paths = {name: path for name, path in _other_fonts() if name in names} if len(names) > 1 else {}
     font_files = [font_manager.findfont(FONT), *paths.values()]
     return list(dict.fromkeys(str(Path(str(path)).parent) for path in font_files))
 
 
-def missing_characters(text: str) -> str:
+def find_missing_characters(text: str) -> str:
     """Return each character of a text for which no font is installed."""
-    return "".join(character for character in _non_ascii(text) if font_of(character) is None)
+    return "".join(character for character in _find_non_ascii(text) if find_font(character) is None)
 
 
-def font_advice(characters: str) -> str:
+def format_font_advice(characters: str) -> str:
     listed_characters = characters[:MAX_LISTED_CHARACTERS] + (
         "…" if len(characters) > MAX_LISTED_CHARACTERS else ""
     )
@@ -54,7 +54,7 @@ def font_advice(characters: str) -> str:
     )
 
 
-def _non_ascii(text: str) -> list[str]:
+def _find_non_ascii(text: str) -> list[str]:
     return [c for c in dict.fromkeys(text) if not c.isascii() and c.isprintable()]
 
 
@@ -72,7 +72,7 @@ def _other_fonts() -> tuple[tuple[str, FontPath], ...]:
         entry
         for entry in manager.ttflist
         if entry.style == "normal"
-        and not any(word in entry.name.lower() for word in BOX_FONT_WORDS)
+        and not any(word in entry.name.lower() for word in PLACEHOLDER_FONT_WORDS)
     ]
     return tuple(
         (entry.name, FontPath(entry.fname, entry.index))

@@ -13,7 +13,7 @@ from px4fuse.request import ComparisonRequest, command_line
 SOURCES_HEAD = ("data", "topic", "samples", "rate (Hz)", "gaps", "span (s)")
 
 
-def log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
+def make_log_page(inventory: Inventory, request: ComparisonRequest) -> Page:
     """List the contents of a log, the possible analyses, and the ``compare`` command."""
     page = Page()
     page.write(inventory.flight.log.name, bold=True)
@@ -95,13 +95,13 @@ def _start_text(inventory: Inventory) -> str:
 
 
 def _airborne_text(inventory: Inventory) -> str:
-    airborne = inventory.flight.airborne
-    if isinstance(airborne, Unavailable):
+    airborne_spans = inventory.flight.airborne
+    if isinstance(airborne_spans, Unavailable):
         return "unknown (the log contains no land detector)"
-    if not airborne:
+    if not airborne_spans:
         return "the land detector never reported a flight"
-    spans = [f"{start:.1f} s to {end:.1f} s" for start, end in airborne]
-    return join_first(spans, 3)
+    span_texts = [f"{start:.1f} s to {end:.1f} s" for start, end in airborne_spans]
+    return join_first(span_texts, 3)
 
 
 def _sender_rows(inventory: Inventory) -> list[tuple[str, ...]]:
@@ -129,7 +129,7 @@ def _source_rows(inventory: Inventory) -> Iterator[tuple[Cell, ...]]:
             f"{data_type:8} (used)" if source.chosen else data_type,
             source.name,
             "" if source.samples is None else f"{source.samples}",
-            "" if source.rate_hz is None else _format_short(source.rate_hz),
+            "" if source.rate_hz is None else _format_narrow(source.rate_hz),
             _gaps_text(source),
             _span_text(source),
         )
@@ -140,10 +140,10 @@ def _gaps_text(source: LoggedData) -> str:
         return ""
     if not source.gaps.count:
         return "0"
-    return f"{source.gaps.count} ({_format_short(source.gaps.longest_s)} s)"
+    return f"{source.gaps.count} ({_format_narrow(source.gaps.longest_s)} s)"
 
 
-def _format_short(value: float) -> str:
+def _format_narrow(value: float) -> str:
     """Format a rate (Hz) or time (s) with two or more digits, for a narrow column."""
     return f"{value:.{2 if value < 1 else 1 if value < 10 else 0}f}"
 

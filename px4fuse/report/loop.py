@@ -13,12 +13,12 @@ from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
 from px4fuse.report.evaluation import describe_method, format_interval, plot_path
 from px4fuse.report.page import Cell, Page, appendix_title
-from px4fuse.report.phrases import student_line, write_findings
+from px4fuse.report.phrases import format_student, write_findings
 from px4fuse.report.style import (
     EKF2_COLOUR,
     KF_COLOUR,
     SEVERITY_COLOURS,
-    TRACK_LINES,
+    TRACK_STYLES,
     Axes,
     line_style,
     set_map_axes,
@@ -38,7 +38,7 @@ LEAD_TEXT = (
 MAX_LISTED_CLOSURES = 10
 ERROR_COLOUR = SEVERITY_COLOURS["error"]
 PATH_STYLES = {
-    corrections.UNCORRECTED_LABEL: TRACK_LINES["EKF2"],
+    corrections.UNCORRECTED_LABEL: TRACK_STYLES["EKF2"],
     corrections.POSITIONS_CORRECTED_LABEL: line_style("#79b294", 1.3, (0, (1.2, 1.2))),
     corrections.HEADINGS_CORRECTED_LABEL: line_style("#3a7d5c", 1.0, (0, (6, 1.2, 1, 1.2))),
     SOLUTIONS["gated"]: line_style(KF_COLOUR, 1.2),
@@ -50,7 +50,7 @@ TRACK_KINDS = {
     "kf": "KF track",
     "truth": "ground truth",
     "slam": "SLAM trajectory",
-    "unknown": "trajectory of unknown kind",
+    "unknown": "trajectory from an unknown source",
 }
 TITLE = "Loop closure"
 MAP_HEIGHT = 290.0  # height (points) of the axes of the map
@@ -67,7 +67,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
 def draw_report(loop: Loop, results: LoopResults) -> Iterator[Page]:
     """Draw the report page of ``px4fuse loop``, with the detected faults (findings)."""
     page = Page(TITLE, LEAD_TEXT)
-    if student := student_line(results.student, ", "):
+    if student := format_student(results.student, ", "):
         page.write_labelled("Student", student)
     page.write_labelled("SHA-256", loop.odometry.trajectory.sha256)
     write_findings(page, results.findings)
@@ -80,13 +80,13 @@ def _write_page(page: Page, loop: Loop) -> None:
     axes = page.panel("Map in the frame of the odometry", MAP_HEIGHT, left=36.0)
     draw_map(axes, loop)
     page.legend(axes.get_legend_handles_labels()[0])
-    page.heading("Loop closures and scores")
+    page.heading("Loop closures and RPE")
     page.write_small(
         "d²: squared Mahalanobis distance of the closure error, from drift and closure "
         "noise. p: probability of a larger d² for a true closure. GNC weight: "
         "1 if the closure is used, 0 if it is excluded."
     )
-    write_scores(page, loop)
+    write_closures_and_rpe(page, loop)
 
 
 def draw_map(axes: Axes, loop: Loop) -> None:
@@ -124,7 +124,7 @@ def _draw_reference(axes: Axes, loop: Loop) -> None:
         evaluation = loop.choose_best_path().scores.get(reference.name)
         if isinstance(evaluation, Evaluation):
             reference_m = evaluation.transform.apply_inverse(evaluation.reference_m)[:, (1, 0)]
-            line = TRACK_LINES["ground truth"]
+            line = TRACK_STYLES["ground truth"]
             plot_path(axes, reference_m, evaluation.time_s, label=reference.name, zorder=4, **line)
 
 
@@ -132,7 +132,7 @@ def loop_page(loop: Loop, findings: tuple[Finding, ...]) -> Page:
     """Make the terminal output on a loop: closure error, corrected paths and detected faults."""
     page = Page()
     write_loop(page, loop)
-    write_scores(page, loop)
+    write_closures_and_rpe(page, loop)
     write_findings(page, findings)
     return page
 
@@ -151,12 +151,12 @@ def write_loop(page: Page, loop: Loop) -> None:
     for closure in loop.closures[:1]:
         texts["Gate"] = describe_gate(closure)
     page.write_labelled_texts(texts)
-    for note in (correction_by_distance_sentence(loop), *missing_corrections(loop)):
+    for note in (correction_by_distance_sentence(loop), *list_missing_corrections(loop)):
         page.write_small(note)
     names = [reference.name for reference in loop.references]
     head = [
         "path",
-        "shift from odometry\nRMS / max (m)",
+        "position correction\nRMS / max (m)",
         *(f"ATE against\n{name} (m)" for name in names),
     ]
     rows = []
@@ -181,12 +181,12 @@ def write_loop(page: Page, loop: Loop) -> None:
     )
 
 
-def write_scores(page: Page, loop: Loop) -> None:
+def write_closures_and_rpe(page: Page, loop: Loop) -> None:
     """Write a table of the loop closures, and a table of the RPE against each reference."""
     rows: list[list[Cell]] = []
     for closure in loop.closures:
         cells = [
-            closure_name(closure, loop),
+            format_closure_times(closure, loop),
             f"{closure.distance_m:.2f}",
             f"{closure.d2:.1f}",
             f"{closure.degrees_of_freedom}",
@@ -219,8 +219,8 @@ def write_scores(page: Page, loop: Loop) -> None:
             for name, evaluation in evaluations.items()
         ]
         for evaluation in [*evaluations.values()][:1]:
-            delta_heads = [f"{error.delta_text} (m)" for error in evaluation.rpe]
-            page.table(["path", *delta_heads, "rotation (°)"], rows)
+            delta_headings = [f"{error.delta_text} (m)" for error in evaluation.rpe]
+            page.table(["path", *delta_headings, "rotation (°)"], rows)
             for text in (describe_method(evaluation), *evaluation.notes, *evaluation.warnings):
                 page.write_small(capitalise_first(text))
 
@@ -232,15 +232,17 @@ def _format_span(loop: Loop) -> str:
 
 
 def describe_closure_error(loop: Loop) -> str:
-    error_m, error_axes_m = loop.closure_error_m, loop.closure_error_axes_m
+    error_m, error_components_m = loop.closure_error_m, loop.closure_error_axes_m
     length_m = loop.path_length_m
-    if error_m is None or error_axes_m is None:
+    if error_m is None or error_components_m is None:
         if loop.is_assessed:
-            return f"hidden in an assignment; the path is {length_m:.1f} m long"
-        return f"none: --open states that the path of {length_m:.1f} m does not return to its start"
+            return (
+                f"error hidden, because the flight is an assignment; path length {length_m:.1f} m"
+            )
+        return f"none: with --open, the path of {length_m:.1f} m does not return to its start"
     text = (
         f"{error_m:.2f} m after {length_m:.1f} m ({error_m / length_m:.2%}): "
-        f"{format_vector(error_axes_m)}"
+        f"{format_vector(error_components_m)}"
     )
     heading_deg = loop.heading_error_deg
     if isinstance(heading_deg, Unavailable):
@@ -250,7 +252,7 @@ def describe_closure_error(loop: Loop) -> str:
 
 def describe_gate(closure: Closure) -> str:
     gate_decision = (
-        "accepted" if closure.accepted else "REJECTED, not consistent with the stated drift"
+        "accepted" if closure.accepted else "REJECTED, the closure error is too large for the drift"
     )
     return (
         f"d² {closure.d2:.1f} with {closure.degrees_of_freedom} degrees of freedom, "
@@ -258,12 +260,12 @@ def describe_gate(closure: Closure) -> str:
     )
 
 
-def closure_name(closure: Closure, loop: Loop) -> str:
+def format_closure_times(closure: Closure, loop: Loop) -> str:
     """Format the times of the two poses of a loop closure (s)."""
     if closure.source == LANDING_CLOSURE_SOURCE:
         return "take-off and landing"
-    origin_s = loop.start_s if loop.start_s > MIN_UNIX_TIME_S else 0.0
-    return f"{closure.time_1_s - origin_s:.2f} s and {closure.time_2_s - origin_s:.2f} s"
+    time_origin_s = loop.start_s if loop.start_s > MIN_UNIX_TIME_S else 0.0
+    return f"{closure.time_1_s - time_origin_s:.2f} s and {closure.time_2_s - time_origin_s:.2f} s"
 
 
 def correction_by_distance_sentence(loop: Loop) -> str:
@@ -283,7 +285,7 @@ def correction_by_distance_sentence(loop: Loop) -> str:
     )
 
 
-def missing_corrections(loop: Loop) -> list[str]:
+def list_missing_corrections(loop: Loop) -> list[str]:
     reasons = {
         f"{correction.what}: {correction.reason}": None
         for correction in loop.corrections.values()
@@ -349,8 +351,8 @@ def pose_graph_page(solved_graph: Graph) -> Page:
         if not solution.converged:
             unconverged_solutions.append(SOLUTIONS[key])
         cost_texts = [f"{cost:.6g}" for cost in (solution.cost_initial, solution.cost)]
-        dropped_text = "" if key == "all" else f"{solution.dropped}"
-        rows.append([SOLUTIONS[key], *cost_texts, f"{solution.iterations}", dropped_text])
+        dropped_count_text = "" if key == "all" else f"{solution.dropped}"
+        rows.append([SOLUTIONS[key], *cost_texts, f"{solution.iterations}", dropped_count_text])
     if unconverged_solutions:
         page.write_labelled(
             "Solver",

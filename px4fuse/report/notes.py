@@ -77,27 +77,27 @@ def parse_markdown(notes: str, name: str = "the notes") -> list[Token]:
         raise SettingsError(
             f"{name}: emphasis, lists and quotes are nested {depth} levels deep; at most "
             f"{MAX_NESTING_DEPTH} levels are allowed",
-            "Remove repeated * and _.",
+            "Remove repeated * and _ from the text.",
         )
     return tokens
 
 
-def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, mark: str = "") -> None:
+def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, marker: str = "") -> None:
     indent = INDENT * min(indent_level, MAX_INDENTS)
     children = node.children
-    if mark and (not children or children[0].type.endswith("_list")):
-        page.write("", indent=indent, mark=mark)
-        mark = ""
+    if marker and (not children or children[0].type.endswith("_list")):
+        page.write("", indent=indent, marker=marker)
+        marker = ""
     for child in children:
         match child.type:
             case "heading":
                 size = HEADING_SIZES.get(child.tag, 8.0)
-                page.write(_inline_text(child), size=size, bold=True, indent=indent, above=6.0)
+                page.write(_inline_text(child), size=size, bold=True, indent=indent, gap_above=6.0)
             case "bullet_list" | "ordered_list":
                 first_number = int(child.attrs.get("start", 1))
                 for number, item in enumerate(child.children, first_number):
-                    item_mark = f"{number}." if child.type == "ordered_list" else "•"
-                    _write_blocks(page, item, indent_level + 1, item_mark)
+                    item_marker = f"{number}." if child.type == "ordered_list" else "•"
+                    _write_blocks(page, item, indent_level + 1, item_marker)
             case "blockquote":
                 _write_blocks(page, child, indent_level + 1)
             case "fence" | "code_block":
@@ -109,10 +109,15 @@ def _write_blocks(page: Page, node: SyntaxTreeNode, indent_level: int, mark: str
                 page.table(head, body_rows, column_widths=[1.0] * len(head))
             case "html_block":
                 page.write(TAG_PATTERN.sub("", child.content).strip(), indent=indent)
-            case _:  # paragraphs; a horizontal rule has no text
-                above = 0.0 if mark else 2.0
-                page.write(_inline_text(child), indent=indent, mark=mark, above=above)
-        mark = ""
+            case _:  # paragraph; a horizontal rule, which has no text, is omitted
+                gap_above = 0.0 if marker else 2.0
+                page.write(
+                    _inline_text(child),
+                    indent=indent,
+                    marker=marker,
+                    gap_above=gap_above,
+                )
+        marker = ""
 
 
 def _inline_text(node: SyntaxTreeNode) -> str:

@@ -16,9 +16,9 @@ from px4fuse.report.ticks import replace_ticks
 
 PAGE_WIDTH = 178.0 * 72.0 / 25.4  # width (points) of the text on a page
 COLUMN_GAP = 5.0 * 72.0 / 25.4  # gap (points) between two columns
-LABEL_WIDTH = 52.0  # width (points) of the labels of texts
-AXIS_LEFT = 30.0  # width (points) for the tick labels left of the axes
-AXES_RIGHT = 8.0  # margin (points) right of the axes
+LABEL_WIDTH = 52.0  # width (points) of the column of labels beside texts
+AXES_LEFT_MARGIN = 30.0  # width (points) for the tick labels left of the axes
+AXES_RIGHT_MARGIN = 8.0  # margin (points) right of the axes
 LEGEND_LINE_HEIGHT = 12.0  # height (points) of one line of a legend
 LEGEND_HANDLE_WIDTH = 30.0  # width (points) of the line sample and the gaps of a legend entry
 TICKS_HEIGHT = 12.0  # height (points) of the tick labels below the axes
@@ -33,7 +33,7 @@ Cell = str | tuple[str, str]
 
 
 class Page:
-    """Section of a report, or a column of a section."""
+    """Blocks of a section of a report, which may need several sheets, or of one column."""
 
     def __init__(self, title: str = "", lead: str = "", *, width: float = PAGE_WIDTH) -> None:
         self.blocks: list[Block] = []
@@ -53,33 +53,33 @@ class Page:
         size: float = 8.0,
         bold: bool = False,
         colour: str = "black",
-        above: float = 0.0,
+        gap_above: float = 0.0,
         indent: float = 0.0,
-        mark: str = "",
+        marker: str = "",
     ) -> None:
-        """Write a paragraph; lengths in points, ``mark`` precedes a list item."""
-        if text or mark:
+        """Write a paragraph; lengths in points, ``marker`` precedes a list item."""
+        if text or marker:
             block = styled_text(text, size, colour, bold)
-            self.add("text", above=above, indent=indent, mark=mark, **block)
+            self.add("text", above=gap_above, indent=indent, mark=marker, **block)
 
     def heading(self, text: str) -> None:
         self.add("heading", **styled_text(text, 9.5, bold=True))
 
     def write_small(self, text: str) -> None:
-        self.write(text, colour=MUTED_COLOUR, above=-1.0)
+        self.write(text, colour=MUTED_COLOUR, gap_above=-1.0)
 
     def write_labelled(
         self,
         label: str,
         *texts: str | Block,
         width: float = LABEL_WIDTH,
-        above: float = 0.0,
+        gap_above: float = 0.0,
         colour: str = "black",
         bold: bool = True,
     ) -> None:
         styled_texts = [styled_text(text) if isinstance(text, str) else text for text in texts]
         styled_label = styled_text(label, 8.0, colour, bold)
-        self.add("labelled", label=styled_label, texts=styled_texts, width=width, above=above)
+        self.add("labelled", label=styled_label, texts=styled_texts, width=width, above=gap_above)
 
     def write_labelled_texts(self, texts: Mapping[str, str]) -> None:
         for label, text in texts.items():
@@ -113,14 +113,14 @@ class Page:
         height: float,
         *,
         caption: str = "",
-        above: float = 4.0,
-        left: float = AXIS_LEFT,
-        right: float = AXES_RIGHT,
+        gap_above: float = 4.0,
+        left: float = AXES_LEFT_MARGIN,
+        right: float = AXES_RIGHT_MARGIN,
         is_compact: bool = False,
     ) -> Axes:
         """Add axes below a title and a caption; return the axes.
 
-        ``height`` of the axes and margins ``above``, ``left`` and ``right`` are in points.
+        ``height`` of the axes and margins ``gap_above``, ``left`` and ``right`` are in points.
         """
         # imported here, because text-only commands do not need matplotlib (0.3 s)
         from matplotlib.figure import Figure  # noqa: PLC0415
@@ -134,7 +134,7 @@ class Page:
             caption=caption,
             alt=": ".join(filter(None, (title, caption))),
             axes=axes,
-            margins=(left, right, above),
+            margins=(left, right, gap_above),
             height=height,
             width=self.width,
             figure=axes.figure,
@@ -174,9 +174,9 @@ class Page:
             "legend", alt=f"Legend: {labels}", width=self.width, height=height, figure=figure
         )
 
-    def add_columns(self, *columns: Page, above: float = 6.0) -> None:
+    def add_columns(self, *columns: Page, gap_above: float = 6.0) -> None:
         blocks, widths = [column.blocks for column in columns], [column.width for column in columns]
-        self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP, above=above)
+        self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP, above=gap_above)
 
 
 def two_columns(left_fraction: float = 0.5) -> tuple[Page, Page]:
@@ -238,7 +238,9 @@ def replace_unprintable(text: str) -> str:
     from px4fuse.report import fonts  # noqa: PLC0415 - as in :meth:`Page.panel`
 
     return "".join(
-        character if character in ALLOWED_CHARACTERS or fonts.font_of(character) else fonts.NO_GLYPH
+        character
+        if character in ALLOWED_CHARACTERS or fonts.find_font(character)
+        else fonts.NO_GLYPH
         for character in LONG_WORD.sub(r"\g<0>\n", text.expandtabs(4))
         if character in ALLOWED_CHARACTERS or character.isprintable()
     )
@@ -271,13 +273,18 @@ def _figure_svg(block: Mapping[str, Any]) -> str:
 
 def _place_axes(block: Mapping[str, Any]) -> None:
     axes, width, height = block["axes"], block["width"], block["height"]
-    left, right, above = block["margins"]
+    left, right, top_margin = block["margins"]
     has_tick_labels = axes.axison and axes.xaxis.get_tick_params()["labelbottom"]
-    below = (TICKS_HEIGHT if has_tick_labels else UNLABELLED_HEIGHT) + (
+    bottom_margin = (TICKS_HEIGHT if has_tick_labels else UNLABELLED_HEIGHT) + (
         AXIS_LABEL_HEIGHT if axes.get_xlabel() else 0.0
     )
-    total_height = above + height + below
+    total_height = top_margin + height + bottom_margin
     block["figure"].set_size_inches(width / 72.0, total_height / 72.0)
     axes.set_position(
-        (left / width, below / total_height, (width - left - right) / width, height / total_height)
+        (
+            left / width,
+            bottom_margin / total_height,
+            (width - left - right) / width,
+            height / total_height,
+        )
     )

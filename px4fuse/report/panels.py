@@ -17,8 +17,8 @@ from px4fuse.report import event_marks, style
 from px4fuse.report.page import Block, Page
 from px4fuse.report.phrases import format_verdict, statistics_by_filter
 from px4fuse.report.style import (
-    INNOVATION_DOTS,
-    TRACK_LINES,
+    INNOVATION_STYLES,
+    TRACK_STYLES,
     Artist,
     Axes,
     draw_curve,
@@ -29,8 +29,8 @@ from px4fuse.report.style import (
 NARROW_HEIGHT = 72.0  # height (points) of the axes in narrow columns
 # Ratio of the axis limit to the largest innovation in a plot of innovations
 INNOVATION_AXIS_MARGIN_FACTOR = 1.3
-# Maximum innovation (multiple of the median √S) for which the innovation plot is enlarged
-MAX_INNOVATION_AXIS_SIGMAS = 5.0
+# The axis of an innovation plot grows to show innovations up to this multiple of the median √S
+MAX_INNOVATION_LIMIT_SIGMAS = 5.0
 
 
 class Quantity(NamedTuple):
@@ -43,10 +43,10 @@ class Quantity(NamedTuple):
     median_sigma_field: str
 
 
-POSITIONS = Quantity(
+POSITION_QUANTITY = Quantity(
     "m", "position_m", "position_variance_m2", "position_rmse_m", "sigma_p_median_m"
 )
-VELOCITIES = Quantity(
+VELOCITY_QUANTITY = Quantity(
     "m/s", "velocity_m_s", "velocity_variance_m2_s2", "velocity_rmse_m_s", "sigma_v_median_m_s"
 )
 
@@ -81,8 +81,8 @@ class Panel(NamedTuple):
             title,
             height,
             caption=caption,
-            # rejected innovations are drawn as hollow dots, so they need no marks: axis ""
-            axis="" if self is INNOVATIONS else result.axis.name,
+            # axis "": no event markers of rejections, because rejected innovations are hollow dots
+            axis="" if self is INNOVATIONS_PANEL else result.axis.name,
             with_time_label=with_time_label,
         )
         if is_narrow:
@@ -92,21 +92,22 @@ class Panel(NamedTuple):
 
 
 def add_legend(page: Page, analysis: Analysis) -> Block:
-    """Add the legend of tracks and events to a page."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
     lines: list[Artist] = [
-        Line2D([], [], **style.MEASUREMENT_DOTS | {"ms": 5.0}, label="position"),
-        Line2D([], [], **TRACK_LINES["KF"], label="KF"),
+        Line2D([], [], **style.MEASUREMENT_STYLE | {"ms": 5.0}, label="position"),
+        Line2D([], [], **TRACK_STYLES["KF"], label="KF"),
         Patch(facecolor=style.KF_BAND_COLOUR, lw=0, label="±2σ reported"),
-        *(Line2D([], [], **TRACK_LINES[name], label=name) for name in _other_tracks(analysis.main)),
+        *(
+            Line2D([], [], **TRACK_STYLES[name], label=name)
+            for name in _other_tracks(analysis.main)
+        ),
     ]
     return page.legend([*lines, *event_marks.legend_entries(analysis)])
 
 
 def available_tables(**tables: object) -> dict[str, pd.DataFrame]:
-    """Return the tables that are not missing, by name."""
     return {name: table for name, table in tables.items() if isinstance(table, pd.DataFrame)}
 
 
@@ -116,30 +117,30 @@ def _other_tracks(result: AxisComparison) -> dict[str, pd.DataFrame]:
 
 def draw_tracks(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
     """Draw position or velocity: measurements, KF with ±2σ, EKF2 and ground truth."""
-    if quantity is POSITIONS:
+    if quantity is POSITION_QUANTITY:
         measurements = pd.Series(result.axis.measurement_m, result.axis.measurement_time_s)
-        draw_curve(axes, measurements, **style.MEASUREMENT_DOTS)
+        draw_curve(axes, measurements, **style.MEASUREMENT_STYLE)
     kf_values = result.replay.steps[quantity.column]
     draw_sigma_band(axes, kf_values, np.sqrt(result.replay.steps[quantity.variance_column]))
     drawn_series = [kf_values]
     for name, track in _other_tracks(result).items():
         values = track[quantity.column]
         if values.notna().any():
-            draw_curve(axes, values, **TRACK_LINES[name], zorder=2.5)
+            draw_curve(axes, values, **TRACK_STYLES[name], zorder=2.5)
             drawn_series.append(values)
-    draw_curve(axes, kf_values, **TRACK_LINES["KF"])
+    draw_curve(axes, kf_values, **TRACK_STYLES["KF"])
     # the ±2σ band is very wide in the first second, so the axis is scaled to the tracks
     all_values = pd.concat(drawn_series)
     margin = 0.08 * (all_values.max() - all_values.min()) + 1e-3
     axes.set_ylim(all_values.min() - margin, all_values.max() + margin)
 
 
-def _measurements_sentence(_: Analysis, result: AxisComparison) -> str:
+def _describe_measurements(_: Analysis, result: AxisComparison) -> str:
     extent_m = float(np.ptp(result.axis.measurement_m))
     return f"{len(result.replay.updates)} measurements over {extent_m:.3g} m."
 
 
-def _rmse_texts(result: AxisComparison, quantity: Quantity) -> list[str]:
+def _format_rmse(result: AxisComparison, quantity: Quantity) -> list[str]:
     rmse_texts = [
         f"{name} {rmse:.3f} {quantity.unit}"
         for name, filter_summary in statistics_by_filter(result).items()
@@ -148,33 +149,33 @@ def _rmse_texts(result: AxisComparison, quantity: Quantity) -> list[str]:
     return [f"RMSE against ground truth {', '.join(rmse_texts)}"] if rmse_texts else []
 
 
-def _position_difference_text(result: AxisComparison) -> str:
-    difference, texts = result.difference, _rmse_texts(result, POSITIONS)
+def _describe_position_difference(result: AxisComparison) -> str:
+    difference, texts = result.difference, _format_rmse(result, POSITION_QUANTITY)
     if isinstance(difference, Unavailable):
         texts.append(f"{difference.what}: {difference.reason}")
     else:
         texts.append(
-            f"KF - EKF2 RMS {difference.position_rms_m:.3f} m, mean "
+            f"position KF - EKF2 RMS {difference.position_rms_m:.3f} m, mean "
             f"{difference.position_mean_m:+.3f} m, maximum {difference.position_maximum_m:.2f} m"
         )
     return "; ".join(texts)
 
 
-def _velocity_difference_text(result: AxisComparison) -> str:
-    texts = _rmse_texts(result, VELOCITIES)
+def _describe_velocity_difference(result: AxisComparison) -> str:
+    texts = _format_rmse(result, VELOCITY_QUANTITY)
     if isinstance(result.difference, Difference):
-        texts.append(f"KF - EKF2 RMS {result.difference.velocity_rms_m_s:.3f} m/s")
+        texts.append(f"velocity KF - EKF2 RMS {result.difference.velocity_rms_m_s:.3f} m/s")
     return "; ".join(texts)
 
 
-def _innovation_axis_limit_m(result: AxisComparison) -> float:
+def _find_innovation_limit_m(result: AxisComparison) -> float:
     limits_m = []
     for innovations in _innovation_tables(result).values():
         median_sqrt_s_m = float(np.sqrt(innovations["innovation_variance_m2"].median()))
         # a quantile, so that outliers do not enlarge the axis
         quantile_m = float(np.quantile(innovations["innovation_m"].abs(), 0.99))
-        largest_m = min(quantile_m, MAX_INNOVATION_AXIS_SIGMAS * median_sqrt_s_m)
-        limits_m.append(max(2.0 * median_sqrt_s_m, largest_m))
+        shown_innovation_m = min(quantile_m, MAX_INNOVATION_LIMIT_SIGMAS * median_sqrt_s_m)
+        limits_m.append(max(2.0 * median_sqrt_s_m, shown_innovation_m))
     return INNOVATION_AXIS_MARGIN_FACTOR * max(limits_m)
 
 
@@ -197,27 +198,27 @@ def draw_dots(
     draw_curve(axes, values[values.abs() <= axis_limit], **marker_style)
     for sign, marker in ((1.0, "^"), (-1.0, "v")):
         outside = values[sign * values > axis_limit]
-        triangles = {**marker_style, "marker": marker, "ms": 3.2, "clip_on": False}
+        triangle_style = {**marker_style, "marker": marker, "ms": 3.2, "clip_on": False}
         if len(outside):
-            draw_curve(axes, 0.0 * outside + sign * axis_limit, **triangles)
+            draw_curve(axes, 0.0 * outside + sign * axis_limit, **triangle_style)
 
 
 def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     """Draw the innovations of KF and EKF2 with ±2√S; rejected innovations are hollow."""
-    axis_limit_m, ekf2_innovations = _innovation_axis_limit_m(result), result.ekf2_innovations
+    axis_limit_m, ekf2_innovations = _find_innovation_limit_m(result), result.ekf2_innovations
     updates, kf_innovations = result.replay.updates, result.replay.updates["innovation_m"]
     draw_sigma_band(axes, 0.0 * kf_innovations, np.sqrt(updates["innovation_variance_m2"]))
     style.draw_zero_line(axes)
-    innovations_and_styles = [(kf_innovations, INNOVATION_DOTS["KF"])]
+    innovations_and_styles = [(kf_innovations, INNOVATION_STYLES["KF"])]
     if isinstance(ekf2_innovations, pd.DataFrame):
-        two_sigma = 2.0 * np.sqrt(ekf2_innovations["innovation_variance_m2"])
-        for limit in (two_sigma, -two_sigma):
-            draw_curve(axes, limit, **TRACK_LINES["EKF2"])
+        two_sqrt_s_m = 2.0 * np.sqrt(ekf2_innovations["innovation_variance_m2"])
+        for limit in (two_sqrt_s_m, -two_sqrt_s_m):
+            draw_curve(axes, limit, **TRACK_STYLES["EKF2"])
         is_rejected = ekf2_innovations["rejected"] > 0
         innovations = ekf2_innovations["innovation_m"]
         innovations_and_styles = [
-            (innovations[~is_rejected], INNOVATION_DOTS["EKF2"]),
-            (innovations[is_rejected], style.REJECTED_DOTS),
+            (innovations[~is_rejected], INNOVATION_STYLES["EKF2"]),
+            (innovations[is_rejected], style.REJECTED_STYLE),
             *innovations_and_styles,
         ]
     for values, marker_style in innovations_and_styles:
@@ -225,9 +226,9 @@ def draw_innovations(axes: Axes, result: AxisComparison) -> None:
     axes.set_ylim(-1.04 * axis_limit_m, 1.04 * axis_limit_m)
 
 
-def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
+def describe_innovations(_: Analysis, result: AxisComparison) -> str:
     """Return the caption of the innovation plot."""
-    axis_limit_m, sentences = _innovation_axis_limit_m(result), []
+    axis_limit_m, sentences = _find_innovation_limit_m(result), []
     innovation_tables = _innovation_tables(result)
     for name, consistency in statistics_by_filter(result).items():
         if isinstance(consistency, Unavailable):
@@ -250,7 +251,7 @@ def innovation_sentence(_: Analysis, result: AxisComparison) -> str:
     return " ".join(sentences)
 
 
-def _fraction_outside_text(result: AxisComparison) -> str:
+def _format_fraction_outside(result: AxisComparison) -> str:
     fractions = ", ".join(
         f"{name} {consistency.fraction_outside_two_sigma:.1%}"
         for name, consistency in statistics_by_filter(result).items()
@@ -261,7 +262,7 @@ def _fraction_outside_text(result: AxisComparison) -> str:
 
 def _draw_sigma(axes: Axes, result: AxisComparison, quantity: Quantity) -> None:
     for name, variance in _variance_tables(result).items():
-        draw_curve(axes, np.sqrt(variance[quantity.variance_column]), **TRACK_LINES[name])
+        draw_curve(axes, np.sqrt(variance[quantity.variance_column]), **TRACK_STYLES[name])
     set_log_scale(axes)
 
 
@@ -269,7 +270,7 @@ def _variance_tables(result: AxisComparison) -> dict[str, pd.DataFrame]:
     return available_tables(KF=result.replay.steps, EKF2=result.ekf2_variance)
 
 
-def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
+def describe_sigma_growth(analysis: Analysis, result: AxisComparison) -> str:
     """Return the caption of the σ plot: growth of σ in the longest gap of the position source."""
     if not analysis.events.gaps:
         return ""
@@ -287,7 +288,7 @@ def sigma_sentence(analysis: Analysis, result: AxisComparison) -> str:
     )
 
 
-def _median_sigma_text(result: AxisComparison, quantity: Quantity) -> str:
+def _format_median_sigma(result: AxisComparison, quantity: Quantity) -> str:
     texts = []
     for name, filter_summary in statistics_by_filter(result).items():
         median = getattr(filter_summary, quantity.median_sigma_field)
@@ -296,38 +297,38 @@ def _median_sigma_text(result: AxisComparison, quantity: Quantity) -> str:
     return f"median: {', '.join(texts)}"
 
 
-POSITION = Panel(
+POSITION_PANEL = Panel(
     "Position (m)",
     150.0,
-    partial(draw_tracks, quantity=POSITIONS),
-    _measurements_sentence,
-    _position_difference_text,
+    partial(draw_tracks, quantity=POSITION_QUANTITY),
+    _describe_measurements,
+    _describe_position_difference,
 )
-VELOCITY = Panel(
+VELOCITY_PANEL = Panel(
     "Velocity (m/s)",
     150.0,
-    partial(draw_tracks, quantity=VELOCITIES),
+    partial(draw_tracks, quantity=VELOCITY_QUANTITY),
     lambda *_: "Velocity is not measured: each filter estimates it from positions and IMU.",
-    _velocity_difference_text,
+    _describe_velocity_difference,
 )
-INNOVATIONS = Panel(
+INNOVATIONS_PANEL = Panel(
     "Innovations (m)",
     140.0,
     draw_innovations,
-    innovation_sentence,
-    _fraction_outside_text,
+    describe_innovations,
+    _format_fraction_outside,
 )
-SIGMA_P = Panel(
+POSITION_SIGMA_PANEL = Panel(
     "σ of position (m), log scale",
     80.0,
-    partial(_draw_sigma, quantity=POSITIONS),
-    sigma_sentence,
-    partial(_median_sigma_text, quantity=POSITIONS),
+    partial(_draw_sigma, quantity=POSITION_QUANTITY),
+    describe_sigma_growth,
+    partial(_format_median_sigma, quantity=POSITION_QUANTITY),
 )
-SIGMA_V = Panel(
+VELOCITY_SIGMA_PANEL = Panel(
     "σ of velocity (m/s), log scale",
     60.0,
-    partial(_draw_sigma, quantity=VELOCITIES),
+    partial(_draw_sigma, quantity=VELOCITY_QUANTITY),
     lambda *_: "",
-    partial(_median_sigma_text, quantity=VELOCITIES),
+    partial(_format_median_sigma, quantity=VELOCITY_QUANTITY),
 )

@@ -20,7 +20,7 @@ from px4fuse.report import (
     provenance,
 )
 from px4fuse.report.page import Page, replace_unprintable, to_typst_data
-from px4fuse.report.phrases import student_line
+from px4fuse.report.phrases import format_student
 from px4fuse.report.style import report_style
 from px4fuse.report.typesetting import compile_pdf
 from px4fuse.results import contract
@@ -53,7 +53,8 @@ PAGES: Mapping[type, tuple[Callable[[Any, Any], Iterator[Page]], ...]] = {
 }
 
 
-def _title_name_hash(results: Any) -> tuple[str, str, str]:
+def _describe_document(results: Any) -> tuple[str, str, str]:
+    """Return the title of the report, and name and SHA-256 of its input file."""
     match results:
         case contract.LoopResults(track=track):
             return f"px4fuse loop {track.name}", track.name, track.sha256
@@ -80,7 +81,7 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
     bytes
         Identical for the same input and versions: no dates, no random identifiers.
     """
-    title, name, sha256 = _title_name_hash(results)
+    title, name, sha256 = _describe_document(results)
     blocks, written_text = list[Any](), ""
     with report_style():
         # each page is converted immediately, because the figures of all pages need much memory
@@ -88,7 +89,7 @@ def render_pdf(content: Any, results: Any, results_json: str) -> bytes:
             written_text += json.dumps(page.blocks, ensure_ascii=False, default=repr)
             blocks += to_typst_data(page.blocks, name)
     producer = f"px4fuse {metadata.version('px4fuse')}"
-    student = student_line(getattr(results, "student", NO_STUDENT), " · ")
+    student = format_student(getattr(results, "student", NO_STUDENT), " · ")
     release_free_memory()  # free the memory of the figures before Typst starts
     # fonts for other scripts are not needed in figures: figures contain no names and no notes
     all_text = title + name + student + written_text

@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 # Minimum p value of the Ljung-Box test for white innovations: with eight tests per flight, less
 # than 1 % of the flights have a false alarm
 MIN_WHITE_P_VALUE = 0.001
-# Deviation of the reported σ from the actual error of an inconsistent filter
-SIGMA_DEVIATIONS = {"underconfident": "too large", "overconfident": "too small"}
+# Error of the reported σ, by verdict on the filter
+SIGMA_ERROR_TEXTS = {"underconfident": "too large", "overconfident": "too small"}
 DIFFERENCE_FIELDS = ("position_rms_m", "velocity_rms_m_s")
 RMSE_FIELDS = ("position_rmse_m", "velocity_rmse_m_s")
 
@@ -69,9 +69,9 @@ def format_sigma_verdict(verdict: str, factor: float) -> str:
     >>> format_sigma_verdict("overconfident", 2.41)
     'overconfident, σ 2.4× too small'
     """
-    if verdict not in SIGMA_DEVIATIONS:
+    if verdict not in SIGMA_ERROR_TEXTS:
         return verdict
-    return f"{verdict}, σ {format_factor(factor)}× {SIGMA_DEVIATIONS[verdict]}"
+    return f"{verdict}, σ {format_factor(factor)}× {SIGMA_ERROR_TEXTS[verdict]}"
 
 
 def statistics_by_filter(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
@@ -87,7 +87,7 @@ def statistics_by_filter(result: AxisComparison) -> dict[str, FilterSummary | Un
 VERDICT_TABLE_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
 
 
-def verdict_cells(result: AxisComparison, name: str) -> list[Cell]:
+def make_verdict_row(result: AxisComparison, name: str) -> list[Cell]:
     """Return the table row on the consistency of a filter (KF or EKF2) along an axis."""
     consistency = statistics_by_filter(result)[name]
     label = result.axis.label.removeprefix("the ") if name == "KF" else ""
@@ -112,7 +112,7 @@ def write_error_table(page: Page, analysis: Analysis) -> None:
             difference = result.difference if name == "KF" else None
             cells = [_format_rms(difference, field) for field in DIFFERENCE_FIELDS if has_ekf2]
             cells += [_format_rms(consistency.truth, field) for field in RMSE_FIELDS if has_truth]
-            rows.append([*verdict_cells(result, name), *cells])
+            rows.append([*make_verdict_row(result, name), *cells])
     head = [*VERDICT_TABLE_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
     head += ["RMSE\n(m)", "\n(m/s)"] if has_truth else []
     page.table(head, rows, right_aligned_columns=(2, 3, 5, 6, 7, 8))
@@ -123,9 +123,9 @@ def _format_rms(statistic: object, field: str) -> str:
     return "" if value is None else f"{value:.3f}"
 
 
-def verdict_notes(comparison: Comparison) -> list[str]:
+def list_verdict_warnings(comparison: Comparison) -> list[str]:
     """Return warnings about consistency tests: drifting position source, correlated innovations."""
-    consistencies = [
+    consistency_rows = [
         (result.axis.label, filter_name, consistency)
         for result in comparison.axes.values()
         for filter_name, consistency in statistics_by_filter(result).items()
@@ -139,7 +139,7 @@ def verdict_notes(comparison: Comparison) -> list[str]:
         )
     correlated_filter_texts = [
         f"{filter_name} along {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"
-        for axis, filter_name, consistency in consistencies
+        for axis, filter_name, consistency in consistency_rows
         if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITE_P_VALUE
     ]
     if correlated_filter_texts:
@@ -166,7 +166,7 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
     """Describe the alignment of a position file with the flight, by label."""
     north_m, east_m, down_m = alignment.origin_m
     yaw_sigma_text = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
-    clock_sigma_s, residual_m = alignment.clock_offset_sigma_s, alignment.residual_rms_m
+    clock_sigma_s, residual_rms_m = alignment.clock_offset_sigma_s, alignment.residual_rms_m
     clock_sigma_text = "" if clock_sigma_s is None else f" ± {clock_sigma_s:.3f} s"
     texts = {
         "frame": f"{alignment.frame} ({alignment.frame_reason})",
@@ -176,13 +176,13 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
         f"({alignment.clock_reason})",
     }
     if alignment.correlation is not None:
-        residual_text = "" if residual_m is None else f", {residual_m:.3f} m RMS per axis"
+        residual_text = "" if residual_rms_m is None else f", {residual_rms_m:.3f} m RMS per axis"
         correlation_text = f"correlation {alignment.correlation:.4f} with {alignment.reference}"
         texts["match"] = correlation_text + residual_text
     return texts
 
 
-def tuning_advice(
+def make_tuning_advice(
     comparison: PreparedComparison, tuning_by_axis: Mapping[str, AxisTuning | Unavailable]
 ) -> dict[str, str]:
     """Return recommendations after noise estimation, by label such as "SIGMA_Z"."""
@@ -210,7 +210,8 @@ def tuning_advice(
         advice_by_label["Action"] = f"Re-run with the estimates of {axis_name}: {command}"
     if sigma_z.value is None and sigma_z.low is not None:
         advice_by_label["SIGMA_Z"] = (
-            f"SIGMA_Z is at least {sigma_z.low:.2g} m: the source may not measure this position."
+            f"SIGMA_Z is at least {sigma_z.low:.2g} m. The source may not measure the position "
+            "along this axis."
         )
     elif sigma_z.value is None:
         bound_text = "" if sigma_z.high is None else f" (at most {sigma_z.high:.2g} m)"
@@ -219,22 +220,24 @@ def tuning_advice(
             "process noise between samples. Log the source at a higher rate."
         )
     elif log.autopilot == "PX4" and not may_drift and comparison.source.origin.is_vision:
-        logged_m, name = log.parameters.get(EV_POS.noise), EV_POS.noise
+        logged_noise_m, name = log.parameters.get(EV_POS.noise), EV_POS.noise
         variance_m2 = comparison.source.samples[Columns.POSITION_VARIANCE[:2]].median().mean()
-        reported_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
-        changes = make_noise_change(EV_POS, log.parameters, reported_m, sigma_z.value)
-        logged_text = "" if logged_m is None else f" (now {logged_m:g} m)"
-        advice_by_label["PX4"] = f"Set {name} to {changes[name]:g} m{logged_text}."
-        is_logged_within_interval = logged_m is not None and (sigma_z.low or 0.0) <= logged_m <= (
+        reported_sigma_m = 0.0 if np.isnan(variance_m2) else float(np.sqrt(variance_m2))
+        changes = make_noise_change(EV_POS, log.parameters, reported_sigma_m, sigma_z.value)
+        logged_noise_text = "" if logged_noise_m is None else f" (now {logged_noise_m:g} m)"
+        advice_by_label["PX4"] = f"Set {name} to {changes[name]:g} m{logged_noise_text}."
+        is_logged_within_interval = logged_noise_m is not None and (sigma_z.low or 0.0) <= logged_noise_m <= (
             sigma_z.high or 0.0
         )
-        if EV_POS.noise_mode in changes and reported_m > (sigma_z.high or np.inf):
+        if EV_POS.noise_mode in changes and reported_sigma_m > (sigma_z.high or np.inf):
             changes = select_changed_settings(changes, log.parameters)
             advice_by_label["PX4"] = (
-                f"Set {format_parameters(changes)}: EKF2 uses the reported σ, {reported_m:.2g} m."
+                f"Set {format_parameters(changes)}: EKF2 now uses the σ reported by the source, "
+                f"{reported_sigma_m:.2g} m, which is larger than the estimate."
             )
         elif is_logged_within_interval:
-            advice_by_label["PX4"] = f"{name} {logged_m:g} m is within the 95 % interval."
+            advice_by_label["PX4"] = ( f"{name} {logged_noise_m:g} m is within the 95 % interval of the estimate."
+            )
         advice_by_label["PX4"] += make_height_noise_advice(
             comparison, tuning_by_axis, sigma_z.value
         )
@@ -264,7 +267,7 @@ def tuning_advice(
     return advice_by_label
 
 
-def student_line(student: Student, separator: str) -> str:
+def format_student(student: Student, separator: str) -> str:
     return separator.join(filter(None, (student.name, student.id)))
 
 
@@ -280,7 +283,7 @@ def write_findings(page: Page, findings: tuple[Finding, ...]) -> None:
         page.write_labelled(
             f"{finding.severity}\n{finding.spans_text}".strip(),
             *texts,
-            above=2.0,
+            gap_above=2.0,
             colour=SEVERITY_COLOURS[finding.severity],
         )
 

@@ -7,7 +7,7 @@ from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.flight.model import Flight, PositionTrack, Unavailable
 from px4fuse.loop.model import Loop
 from px4fuse.report import clock
-from px4fuse.report.cover import ALL_FINDINGS, FlightResults
+from px4fuse.report.cover import ALL_FINDINGS_TITLE, FlightResults
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import describe_alignment, format_clock_map, write_findings
 from px4fuse.report.style import MUTED_COLOUR
@@ -19,7 +19,7 @@ LABEL_WIDTH = 168.0  # width (points) of the labels
 
 def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) -> Iterator[Page]:
     """Draw the page with all detected faults (findings), and the provenance page of a flight."""
-    page = Page(ALL_FINDINGS)
+    page = Page(ALL_FINDINGS_TITLE)
     write_findings(page, results.findings)
     page.write("" if results.findings else "None.")
     yield page
@@ -46,7 +46,7 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) ->
 
 def _write_log(page: Page, flight: Flight, source: PositionTrack | None) -> None:
     log = flight.log
-    other_positions = (
+    other_source_texts = (
         f"{track.name} ({track.compute_rate_hz():.1f} Hz)"
         for track in flight.positions
         if track is not source
@@ -61,7 +61,7 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None) -> None
             f"{source.name} ({source.origin.kind}, {source.origin.path}) from "
             f"{', '.join(source.topics)}; clock: {source.clock}"
         )
-    text_by_label["other positions"] = ", ".join(other_positions) or "none"
+    text_by_label["other positions"] = ", ".join(other_source_texts) or "none"
     text_by_label["parameters"] = ", ".join(parameters) or "none"
     for file in flight.inputs:
         text_by_label[file.role] = f"{file.name}, {file.bytes} bytes, SHA-256 {file.sha256}"
@@ -69,7 +69,7 @@ def _write_log(page: Page, flight: Flight, source: PositionTrack | None) -> None
     text_by_label["SHA-256"] = log.sha256
     section = Page()
     _write_section(section, "Log", text_by_label.items())
-    page.add_columns(section)  # Typst does not split a column between pages
+    page.add_columns(section)  # as a column, because Typst does not split columns between pages
 
 
 def _write_missing(page: Page, unavailable_parts: Iterable[Unavailable]) -> None:
@@ -99,11 +99,13 @@ def draw_loop(loop: Loop, results: LoopResults) -> Iterator[Page]:
 
 
 def _write_versions(page: Page, results: FlightResults | LoopResults) -> None:
-    versions = results.provenance
+    provenance = results.provenance
     text_by_label = {
-        "command": versions.command,
-        "px4fuse": f"{versions.px4fuse} on Python {versions.python}",
-        "libraries": ", ".join(f"{name} {version}" for name, version in versions.libraries.items()),
+        "command": provenance.command,
+        "px4fuse": f"{provenance.px4fuse} on Python {provenance.python}",
+        "libraries": ", ".join(
+            f"{name} {version}" for name, version in provenance.libraries.items()
+        ),
         "results": "attached to this PDF as results.json",
     }
     _write_section(page, "Made with", text_by_label.items())
@@ -118,7 +120,7 @@ def _write_section(page: Page, title: str, texts: Iterable[str | tuple[str, str]
             page.write(text)
         else:
             page.write_labelled(
-                *text, width=LABEL_WIDTH, above=-1.0, colour=MUTED_COLOUR, bold=False
+                *text, width=LABEL_WIDTH, gap_above=-1.0, colour=MUTED_COLOUR, bold=False
             )
 
 

@@ -12,7 +12,7 @@ from rich.text import Text
 from px4fuse.card.model import Card
 from px4fuse.report.card_text import (
     CARD_WIDTH,
-    Line,
+    Paragraph,
     card_lines,
     closing_lines,
     headline_lines,
@@ -27,7 +27,7 @@ from px4fuse.request import ComparisonRequest, Request, command_line
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
 # Function that yields the lines of a diagnosis card, by kind of block
 CARD_LINE_FUNCTIONS = {"card": card_lines, "closing": closing_lines, "headline": headline_lines}
-LABEL_COLUMNS = 9  # width (characters) of a label on the terminal
+LABEL_CHARACTERS = 9  # width (characters) of a label on the terminal
 MIN_TABLE_WIDTH = 50  # minimum width (characters) of a terminal for tables
 POINTS_PER_COLUMN = 6.0  # indent (points) in the PDF that is one character on the terminal
 # Terminal styles of text colours; the other colours belong to plots
@@ -52,14 +52,14 @@ def print_blocks(console: Console, blocks: Iterable[Block], request: Request | N
             case "text" | "heading":
                 print_paragraph(
                     console,
-                    _styled_text(block),
+                    _make_rich_text(block),
                     indent=round(block.get("indent", 0.0) / POINTS_PER_COLUMN),
                 )
             case "labelled":
                 _show_labelled(console, block, request)
             case "table":
                 if console.width >= MIN_TABLE_WIDTH:
-                    console.print(_rich_table(**block))
+                    console.print(_make_rich_table(**block))
                 else:
                     _print_rows(console, **block)
             case "command":
@@ -72,14 +72,14 @@ def print_blocks(console: Console, blocks: Iterable[Block], request: Request | N
 
 def _show_card(
     console: Console,
-    make_lines: Callable[[Card], Iterator[Line]],
+    make_lines: Callable[[Card], Iterator[Paragraph]],
     card: Card,
     request: Request | None,
 ) -> None:
     is_ascii_terminal = console.encoding.lower() not in UNICODE_ENCODINGS
     log_argument = None if request is None else getattr(request, "log", None)
     for line in make_lines(with_typed_path(card, log_argument)):
-        for text in line.wrapped(min(console.width, CARD_WIDTH)):
+        for text in line.wrap(min(console.width, CARD_WIDTH)):
             console.print(
                 Text(to_ascii(text) if is_ascii_terminal else text, line.style), soft_wrap=True
             )
@@ -87,24 +87,24 @@ def _show_card(
 
 def _show_labelled(console: Console, block: Block, request: Request | None) -> None:
     label_lines = block["label"]["text"].split("\n")
-    labels = [line for line in label_lines if len(line) < LABEL_COLUMNS]
-    long_label_text = "".join(f" ({line})" for line in label_lines if len(line) >= LABEL_COLUMNS)
+    labels = [line for line in label_lines if len(line) < LABEL_CHARACTERS]
+    long_label_text = "".join(f" ({line})" for line in label_lines if len(line) >= LABEL_CHARACTERS)
     for index, (label, text_block) in enumerate(zip_longest(labels, block["texts"])):
-        text, commands = Text() if text_block is None else _styled_text(text_block), list[str]()
+        text, commands = Text() if text_block is None else _make_rich_text(text_block), list[str]()
         if request is not None:
-            text.plain, commands = expand_commands(text.plain, request)
+            text.plain, commands = extract_commands(text.plain, request)
         text.append("" if index else long_label_text)
-        head = _styled_text({**block["label"], "text": label or ""})
-        print_paragraph(console, text, head, indent=LABEL_COLUMNS)
+        rich_label = _make_rich_text({**block["label"], "text": label or ""})
+        print_paragraph(console, text, rich_label, indent=LABEL_CHARACTERS)
         for command in commands:
             print_line(console, "", command)
 
 
-def expand_commands(text: str, request: Request) -> tuple[str, list[str]]:
-    """Return a text with its commands shortened to their options, and the complete commands.
+def extract_commands(text: str, request: Request) -> tuple[str, list[str]]:
+    """Replace each command in a text by its options; return the text and the complete commands.
 
     >>> request = ComparisonRequest(log="a b.ulg")
-    >>> expand_commands("px4fuse compare LOG --sigma-z 0.2: better.", request)
+    >>> extract_commands("px4fuse compare LOG --sigma-z 0.2: better.", request)
     ('--sigma-z 0.2: better.', ["px4fuse compare 'a b.ulg' --sigma-z 0.2"])
     """
     log_path = str(getattr(request, "log", "") or getattr(request, "source", ""))
@@ -118,27 +118,27 @@ def expand_commands(text: str, request: Request) -> tuple[str, list[str]]:
     return short_text, list(dict.fromkeys(commands))
 
 
-def _styled_text(block: Block) -> Text:
+def _make_rich_text(block: Block) -> Text:
     style = STYLES_BY_COLOUR.get(block["colour"], "")
     return Text(block["text"], f"{style} bold" if block["weight"] == "bold" else style)
 
 
 def print_paragraph(
-    console: Console, text: str | Text, head: str | Text = "", *, indent: int
+    console: Console, text: str | Text, label: str | Text = "", *, indent: int
 ) -> None:
-    """Print a paragraph that wraps beside its label (``head``), indented by ``indent`` columns."""
+    """Print a paragraph that wraps beside its label, indented by ``indent`` columns."""
     body = Text(text) if isinstance(text, str) else text
-    head = Text(head) if isinstance(head, str) else head.copy()
-    head.pad_right(max(indent - head.cell_len, 0))
+    margin = Text(label) if isinstance(label, str) else label.copy()
+    margin.pad_right(max(indent - margin.cell_len, 0))
     for line in body.wrap(console, max(console.width - indent, 1)):
         line.rstrip()
-        console.print(head.append_text(line), soft_wrap=True)
-        head = Text(" " * indent)
+        console.print(margin.append_text(line), soft_wrap=True)
+        margin = Text(" " * indent)
 
 
 def print_line(console: Console, label: str, text: str, style: str = "bold cyan not dim") -> None:
     """Print a command or path on one line, so it can be copied."""
-    console.print(Text(f"{label:{LABEL_COLUMNS}}", "bold").append(text, style), soft_wrap=True)
+    console.print(Text(f"{label:{LABEL_CHARACTERS}}", "bold").append(text, style), soft_wrap=True)
 
 
 def _print_rows(
@@ -150,7 +150,7 @@ def _print_rows(
         print_paragraph(console, ", ".join(filter(None, texts)), indent=2)
 
 
-def _rich_table(
+def _make_rich_table(
     head: Sequence[str],
     rows: Iterable[Iterable[Cell]],
     right: Sequence[int],

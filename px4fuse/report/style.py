@@ -56,16 +56,19 @@ def dot_style(
 
 
 # Style of the line of each track, by its name in legends
-TRACK_LINES = {
+TRACK_STYLES = {
     "KF": line_style(KF_COLOUR, 1.0),
     "EKF2": line_style(EKF2_COLOUR, 1.1, (0, (4, 1.6))),
     "ground truth": line_style(TRUTH_COLOUR, 0.7, (0, (1, 1.5))),
 }
 # Style of the innovations of each filter
-INNOVATION_DOTS = {"KF": dot_style(KF_COLOUR, "o", 2.0), "EKF2": dot_style(EKF2_COLOUR, "s", 2.2)}
+INNOVATION_STYLES = {
+    "KF": dot_style(KF_COLOUR, "o", 2.0),
+    "EKF2": dot_style(EKF2_COLOUR, "s", 2.2),
+}
 # Innovations that EKF2 rejected are hollow in all plots
-REJECTED_DOTS = dot_style(EKF2_COLOUR, "s", 2.8, 0.6) | {"mfc": "white"}
-MEASUREMENT_DOTS = dot_style(MEASUREMENT_COLOUR, ".", 1.8)
+REJECTED_STYLE = dot_style(EKF2_COLOUR, "s", 2.8, 0.6) | {"mfc": "white"}
+MEASUREMENT_STYLE = dot_style(MEASUREMENT_COLOUR, ".", 1.8)
 # Colour of the ±2σ band of each filter
 SIGMA_BAND_COLOURS = {"KF": KF_BAND_COLOUR, "EKF2": EKF2_BAND_COLOUR}
 
@@ -87,7 +90,7 @@ def draw_curve(axes: Axes, values: pd.Series[float], **style: Any) -> None:
     """Draw a time series with a limited number of points."""
     axes.plot(
         *decimate_series(
-            values.index.to_numpy(), np.asarray(values, np.float64), _max_points(axes)
+            values.index.to_numpy(), np.asarray(values, np.float64), _choose_max_points(axes)
         ),
         **style,
     )
@@ -102,13 +105,13 @@ def draw_sigma_band(
     """Draw the ±2σ band about a series."""
     time_s = centre.index.to_numpy()
     drawn_time_s, upper = decimate_series(
-        time_s, np.asarray(centre + 2.0 * sigma, np.float64), _max_points(axes)
+        time_s, np.asarray(centre + 2.0 * sigma, np.float64), _choose_max_points(axes)
     )
     lower = np.interp(drawn_time_s, time_s, (centre - 2.0 * sigma).to_numpy())
     axes.fill_between(drawn_time_s, lower, upper, color=colour, lw=0)
 
 
-def _max_points(axes: Axes) -> int:
+def _choose_max_points(axes: Axes) -> int:
     is_wide = axes.bbox.width / axes.figure.dpi > MIN_WIDE_AXES_INCHES
     return MAX_WIDE_POINTS if is_wide else MAX_NARROW_POINTS
 
@@ -145,11 +148,11 @@ def label_time_axis(axes: Axes, with_time_label: bool) -> None:
         axes.tick_params(axis="x", labelbottom=False)
 
 
-def set_map_axes(axes: Axes, right_name: str, up_name: str) -> None:
+def set_map_axes(axes: Axes, x_name: str, y_name: str) -> None:
     """Set equal scales, a grid and the axis labels (m) of a map."""
     axes.set_aspect("equal", adjustable="datalim", anchor="W")
     axes.grid(True, axis="both")
-    axes.set(xlabel=f"{right_name} (m)", ylabel=f"{up_name} (m)")
+    axes.set(xlabel=f"{x_name} (m)", ylabel=f"{y_name} (m)")
     axes.locator_params(nbins=6)
 
 
@@ -158,7 +161,7 @@ def decimate_series(times: Array, values: Array, max_points: int) -> tuple[Array
     if len(times) <= max_points:
         return times, values
     intervals = np.array_split(np.arange(len(times)), max_points // 2)
-    lowest_rows = [rows[values[rows].argmin()] for rows in intervals]
-    highest_rows = [rows[values[rows].argmax()] for rows in intervals]
-    selected_rows = np.unique(lowest_rows + highest_rows)
+    minimum_rows = [rows[values[rows].argmin()] for rows in intervals]
+    maximum_rows = [rows[values[rows].argmax()] for rows in intervals]
+    selected_rows = np.unique(minimum_rows + maximum_rows)
     return times[selected_rows], values[selected_rows]

@@ -7,13 +7,13 @@ from px4fuse.card.model import Card
 from px4fuse.comparison.model import Comparison
 from px4fuse.core.text import capitalise_first
 from px4fuse.ekf2.steps import DifferenceExplanation
-from px4fuse.report.aids import outdoor_aids, write_aids
+from px4fuse.report.aids import select_aids_if_outdoor, write_aids
 from px4fuse.report.difference_page import write_explanation
 from px4fuse.report.page import Page
 from px4fuse.report.phrases import (
     describe_alignment,
     format_settings,
-    verdict_notes,
+    list_verdict_warnings,
     write_error_table,
     write_findings,
 )
@@ -35,7 +35,7 @@ def comparison_page(
 
     ``quiet``: only the headline; ``verbose``: also settings, statistics of all axes, and findings.
     """
-    page = card_page("headline" if quiet else "card", results.card)
+    page = make_card_page("headline" if quiet else "card", results.card)
     if not verbose:
         return page
     if isinstance(analysis, AidsOnlyAnalysis):
@@ -52,18 +52,18 @@ def _write_details(page: Page, analysis: Analysis, results: Any) -> None:
     page.add("blank")
     page.write_labelled_texts(_describe_setup(analysis))
     write_error_table(page, analysis)
-    for note in (ERROR_LEGEND, *verdict_notes(analysis)):
+    for note in (ERROR_LEGEND, *list_verdict_warnings(analysis)):
         page.write_small(note)
     explanation = analysis.difference_steps.get(analysis.main.axis.name)
     if isinstance(explanation, DifferenceExplanation):
         write_explanation(page, explanation)
-    if aids := outdoor_aids(analysis):
+    if aids := select_aids_if_outdoor(analysis):
         write_aids(page, aids)
     write_findings(page, results.findings)
 
 
-def card_page(block_kind: str, card: Card) -> Page:
-    """Make a page with one block; ``block_kind`` is "card", "headline" or "closing"."""
+def make_card_page(block_kind: str, card: Card) -> Page:
+    """Make a page with a card, or only with its first ("headline") or last lines ("closing")."""
     page = Page()
     page.add(block_kind, card=card)
     return page
@@ -75,10 +75,10 @@ def _describe_setup(comparison: Comparison) -> dict[str, str]:
         f"{source.name}: {source.description}, {source.compute_rate_hz():.1f} Hz, "
         f"{source.frame}; {comparison.source_reason}"
     )
-    alignment = {} if source.alignment is None else describe_alignment(source.alignment)
+    alignment_texts = {} if source.alignment is None else describe_alignment(source.alignment)
     return {
         "Filter": format_settings(comparison.settings),
         "Position": position_text,
-        **{capitalise_first(label): text for label, text in alignment.items()},
+        **{capitalise_first(label): text for label, text in alignment_texts.items()},
         "Segment": f"{segment.start_s:.2f} s to {segment.end_s:.2f} s, {segment.reason}",
     }

@@ -4,12 +4,12 @@ from px4fuse.comparison.model import PreparedComparison
 from px4fuse.filter.tuning import AxisTuning
 from px4fuse.flight.model import Unavailable
 from px4fuse.report.page import Page
-from px4fuse.report.phrases import format_noise_estimate, format_settings, tuning_advice
+from px4fuse.report.phrases import format_noise_estimate, format_settings, make_tuning_advice
 
 TUNING_HEAD = (
     "axis",
-    "SIGMA_A (m/s²)\nvalue, 95 %",
-    "SIGMA_Z (m)\nvalue, 95 %",
+    "SIGMA_A (m/s²)\nestimate (95 %)",
+    "SIGMA_Z (m)\nestimate (95 %)",
     "log-likelihood\ngain (nats)",
     "gain on\n2nd half",
     "autocorrelation\nbefore, after",
@@ -35,11 +35,11 @@ def tuning_page(
         if not isinstance(tuning.held_out, Unavailable):
             held_out_gain = f"{tuning.held_out.log_likelihood_gain_per_measurement:+.3f}"
         if not isinstance(tuning.before, Unavailable) and not isinstance(tuning.after, Unavailable):
-            before, after = (
+            correlation_before, correlation_after = (
                 tuning.before.lag1_autocorrelation,
                 tuning.after.lag1_autocorrelation,
             )
-            correlation_text = f"{before:+.2f} {after:+.2f}"
+            correlation_text = f"{correlation_before:+.2f} {correlation_after:+.2f}"
         rows.append(
             [
                 name,
@@ -56,5 +56,5 @@ def tuning_page(
         sentences.append(TUNING_NOTE)
     for text in sentences:
         page.write_small(text)
-    page.write_labelled_texts(tuning_advice(comparison, tunings))
+    page.write_labelled_texts(make_tuning_advice(comparison, tunings))
     return page

@@ -26,7 +26,7 @@ def compile_pdf(report: Mapping[str, Any], template: str | None = None) -> bytes
 
 
 def measure_free_height(blocks: Any, font_names: Sequence[str]) -> float:
-    """Typeset a cover without plots, and return the free height (points) below the card."""
+    """Typeset the first page, and return the free height (points) below its diagnosis card."""
     report = dict.fromkeys(("title", "author", "head", "student", "foot"), "")
     data = {**report, "fonts": font_names, "blocks": blocks, "results": None}
     with TemporaryDirectory() as empty_folder:
@@ -44,7 +44,7 @@ def _compiler(report: Mapping[str, Any], template: str | None, empty_folder: str
         font_paths=typst.Fonts(
             include_system_fonts=False,
             include_embedded_fonts=False,
-            font_paths=fonts.font_folders(tuple(report["fonts"])),
+            font_paths=fonts.find_font_folders(tuple(report["fonts"])),
         ),
         package_path=empty_folder,
         package_cache_path=empty_folder,

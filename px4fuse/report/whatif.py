@@ -21,7 +21,7 @@ from px4fuse.report.page import Page
 NOT_PREDICTABLE_TEXT = "not predictable"
 
 
-def column_heads(analysis: WhatIfAnalysis) -> list[str]:
+def make_column_headings(analysis: WhatIfAnalysis) -> list[str]:
     change_texts = [
         f"{name} {format_number(value)} {PARAMETERS[name].unit}".rstrip()
         for name, value in analysis.changes.items()
@@ -36,12 +36,12 @@ def column_heads(analysis: WhatIfAnalysis) -> list[str]:
     return heads
 
 
-def statistic_rows(analysis: WhatIfAnalysis) -> list[list[str]]:
+def make_statistic_rows(analysis: WhatIfAnalysis) -> list[list[str]]:
     """Return a row for each statistic of EKF2: as logged, replayed, and replayed with changes."""
     result = analysis.whatif
-    texts_by_label = _statistic_texts(result.replayed, result.replayed)
+    texts_by_label = _format_statistics(result.replayed, result.replayed)
     columns = [
-        _statistic_texts(summary, result.replayed)
+        _format_statistics(summary, result.replayed)
         if summary.is_predictable
         else dict.fromkeys(texts_by_label, NOT_PREDICTABLE_TEXT)
         for summary in (
@@ -53,14 +53,14 @@ def statistic_rows(analysis: WhatIfAnalysis) -> list[list[str]]:
     return [[label, *(column.get(label, "n/a") for column in columns)] for label in texts_by_label]
 
 
-def _statistic_texts(summary: Summary, replayed: Summary) -> dict[str, str]:
+def _format_statistics(summary: Summary, replayed: Summary) -> dict[str, str]:
     text_by_label = dict[str, str]()
     for name, axis in summary.axes.items():
-        text_by_label |= _nis_texts(name, axis) | {
+        text_by_label |= _format_nis_statistics(name, axis) | {
             f"{name}: median σ_p (m)": _format_number(axis.sigma_p_median_m),
             f"{name}: position RMSE (m)": _format_number(axis.position_rmse_to_truth_m),
         }
-    text_by_label |= {"samples": f"{summary.samples}", **_fusion_texts(summary)}
+    text_by_label |= {"samples": f"{summary.samples}", **_format_fusion_statistics(summary)}
     if summary.velocity_rejected_fraction is not None:
         text_by_label["GNSS velocities rejected"] = f"{summary.velocity_rejected_fraction:.1%}"
     if isinstance(replayed.heading_error_mean_deg, float):
@@ -69,13 +69,13 @@ def _statistic_texts(summary: Summary, replayed: Summary) -> dict[str, str]:
         text_by_label["height RMSE (m)"] = _format_number(summary.height_rmse_to_truth_m)
     for name, aid in {**summary.heights, **summary.others}.items():
         label = AIDS[name].label
-        text_by_label |= _nis_texts(label, aid) | {
+        text_by_label |= _format_nis_statistics(label, aid) | {
             f"{label}: rejected": f"{aid.rejected_fraction:.1%}"
         }
     return text_by_label
 
 
-def _nis_texts(name: str, statistics: AxisSummary | HeightSummary) -> dict[str, str]:
+def _format_nis_statistics(name: str, statistics: AxisSummary | HeightSummary) -> dict[str, str]:
     return {
         f"{name}: mean NIS": format_number(statistics.nis_mean),
         f"{name}: expected NIS": "{:.2f} to {:.2f}".format(*statistics.nis_band),
@@ -83,7 +83,7 @@ def _nis_texts(name: str, statistics: AxisSummary | HeightSummary) -> dict[str, 
     }
 
 
-def _fusion_texts(summary: Summary) -> dict[str, str]:
+def _format_fusion_statistics(summary: Summary) -> dict[str, str]:
     return {
         "rejected": f"{summary.rejected_fraction:.1%}",
         "longest time without fusion (s)": _format_number(summary.longest_without_fusion_s, 2),
@@ -91,15 +91,15 @@ def _fusion_texts(summary: Summary) -> dict[str, str]:
     }
 
 
-def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
+def make_sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
     """Return the headings, and a row of statistics for each value of the swept parameter."""
-    name, rows = swept_parameter(analysis), []
+    name, rows = find_swept_parameter(analysis), []
     unit = PARAMETERS[name].unit
-    for summary in sweep_summaries(analysis):
+    for summary in select_sweep(analysis):
         axes = summary.axes.values()
         cells = [
             "/".join(format_number(axis.nis_mean) for axis in axes),
-            *_fusion_texts(summary).values(),
+            *_format_fusion_statistics(summary).values(),
             "/".join(_format_number(axis.sigma_p_median_m) for axis in axes),
             "/".join(_format_number(axis.position_rmse_to_truth_m) for axis in axes),
         ]
@@ -118,41 +118,42 @@ def sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str]]]:
     return head, rows
 
 
-def sweep_summaries(analysis: WhatIfAnalysis) -> tuple[Summary, ...]:
+def select_sweep(analysis: WhatIfAnalysis) -> tuple[Summary, ...]:
     return analysis.whatif.whatif[analysis.sweep_start_index :]
 
 
-def swept_parameter(analysis: WhatIfAnalysis) -> str:
-    (name,) = sweep_summaries(analysis)[0].changed.keys() - analysis.changes.keys()
+def find_swept_parameter(analysis: WhatIfAnalysis) -> str:
+    (name,) = select_sweep(analysis)[0].changed.keys() - analysis.changes.keys()
     return name
 
 
-def sweep_notes(analysis: WhatIfAnalysis) -> list[str]:
+def describe_sweep(analysis: WhatIfAnalysis) -> list[str]:
     """Return sentences on the best value of the swept parameter."""
     sentences = []
-    if summaries := [summary for summary in sweep_summaries(analysis) if summary.is_predictable]:
-        name = swept_parameter(analysis)
+    if summaries := [summary for summary in select_sweep(analysis) if summary.is_predictable]:
+        name = find_swept_parameter(analysis)
         best_summary = min(summaries, key=lambda s: abs(math.log(s.nis_mean)))
         sentences.append(
             f"The mean NIS is closest to 1 at {name} {format_number(best_summary.changed[name])} "
             f"({format_number(best_summary.nis_mean)})."
         )
-        values_by_rmse_m = {
+        value_by_rmse_m = {
             rmse_m: summary.changed[name]
             for summary in summaries
             if isinstance(rmse_m := summary.position_rmse_to_truth_m, float)
         }
-        if values_by_rmse_m:
-            min_rmse_m = min(values_by_rmse_m)
+        if value_by_rmse_m:
+            min_rmse_m = min(value_by_rmse_m)
             sentences.append(
                 f"The horizontal position RMSE against ground truth is smallest at {name} "
-                f"{format_number(values_by_rmse_m[min_rmse_m])} ({min_rmse_m:.3f} m)."
+                f"{format_number(value_by_rmse_m[min_rmse_m])} ({min_rmse_m:.3f} m)."
             )
     if not all(summary.is_predictable for summary in analysis.whatif.whatif):
         sentences.append(
-            f"A result is not predictable if more than {MAX_REJECTED_FRACTION:.0%} of the "
-            f"samples would be rejected, {1000.0 * ADDED_NOISE_M:.0f} mm of position noise would "
-            f"change it, or heights would be rejected for {HEIGHT_TIMEOUT_S:g} s."
+            "A replay is not predictable in three cases: EKF2 rejects more than "
+            f"{MAX_REJECTED_FRACTION:.0%} of the samples, {1000.0 * ADDED_NOISE_M:.0f} mm of added "
+            "position noise change its statistics, or EKF2 fuses no height for "
+            f"{HEIGHT_TIMEOUT_S:g} s."
         )
     return [*sentences, *(f"{note}." for note in analysis.whatif.notes)]
 
@@ -162,16 +163,15 @@ def _format_number(value: float | Unavailable, digits: int = 3) -> str:
 
 
 def whatif_page(analysis: WhatIfAnalysis) -> Page:
-    """Make the terminal output of ``px4fuse whatif``."""
     page = Page()
     if AISLE in analysis.difference_steps:
         write_explanation(page, analysis.difference_steps[AISLE])
     log, whatif_result = analysis.flight.log, analysis.whatif
     page.write_labelled("Log", f"{log.name}, {log.firmware}, {log.duration_s:.1f} s")
-    span_texts = ", ".join(
+    spans_text = ", ".join(
         f"{start:.1f} to {end:.1f} s" for start, end in whatif_result.evaluated_s
     )
-    page.write_labelled("Used", f"All columns are evaluated over the time {span_texts}.")
+    page.write_labelled("Used", f"The statistics of all columns are for {spans_text}.")
     page.write_labelled("Replay", format_agreement(whatif_result.agreement))
     if analysis.uses_estimates and not analysis.changes:
         no_change_text = (
@@ -179,11 +179,11 @@ def whatif_page(analysis: WhatIfAnalysis) -> Page:
             "Test another value with --set NAME=VALUE."
         )
         page.write_labelled("Change", no_change_text)
-    head = ["", *column_heads(analysis)]
-    page.table(head, statistic_rows(analysis), right_aligned_columns=range(1, len(head)))
-    if sweep_summaries(analysis):
-        page.table(*sweep_table(analysis), right_aligned_columns=range(1, 7))
-    for line in sweep_notes(analysis):
+    head = ["", *make_column_headings(analysis)]
+    page.table(head, make_statistic_rows(analysis), right_aligned_columns=range(1, len(head)))
+    if select_sweep(analysis):
+        page.table(*make_sweep_table(analysis), right_aligned_columns=range(1, 7))
+    for line in describe_sweep(analysis):
         page.write(line)
     page.write("Replays use px4fuse's model of EKF2, not PX4's code.")
     return page

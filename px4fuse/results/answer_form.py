@@ -30,29 +30,29 @@ NO_FAULT_KIND = "none"
 EMPTY_CELL = "\u2013"
 
 
-class FaultKind(Record, rename={"size_quantity": "in"}):
+class FaultKind(Record, rename={"size_quantity": "in", "size_range": "range"}):
     """Kind of fault that a student can name.
 
     Attributes
     ----------
     size_quantity : str
         Key of the allowed units in ``form.toml``, for example "m"; "" for a fault without a size.
-    range : (float, float)
+    size_range : (float, float)
         Smallest and largest allowed size, in the first allowed unit.
     """
 
     description: str
     size_quantity: str = ""
-    range: tuple[float, float] = (-1e6, 1e6)
+    size_range: tuple[float, float] = (-1e6, 1e6)
 
     @property
     def units(self) -> Mapping[str, float]:
-        """Allowed units of the size, each with the factor that converts to the first unit."""
+        """Allowed units of the fault's size, each with the factor that converts to the first."""
         return _UNITS_BY_QUANTITY[self.size_quantity]
 
 
 class AllowedAnswers(Record):
-    """Allowed answers (``form.toml``)."""
+    """Allowed answers to the questions of the answer form (``form.toml``)."""
 
     behaviours: tuple[str, ...]
     panels: tuple[str, ...]
@@ -61,12 +61,16 @@ class AllowedAnswers(Record):
     corrections: dict[str, str]
 
 
-_ALLOWED = read_toml(__file__, AllowedAnswers, "form.toml")
-_UNITS_BY_QUANTITY: Mapping[str, Mapping[str, float]] = {"": {}, **_ALLOWED.units}
-FAULT_KINDS, EKF2_BEHAVIOURS, PANELS = _ALLOWED.mistakes, _ALLOWED.behaviours, _ALLOWED.panels
+_ALLOWED_ANSWERS = read_toml(__file__, AllowedAnswers, "form.toml")
+_UNITS_BY_QUANTITY: Mapping[str, Mapping[str, float]] = {"": {}, **_ALLOWED_ANSWERS.units}
+FAULT_KINDS, EKF2_BEHAVIOURS, PANELS = (
+    _ALLOWED_ANSWERS.mistakes,
+    _ALLOWED_ANSWERS.behaviours,
+    _ALLOWED_ANSWERS.panels,
+)
 # Allowed units for the new value of a parameter that corrects a fault, by parameter
 CORRECTIONS = {
-    name: _UNITS_BY_QUANTITY[quantity] for name, quantity in _ALLOWED.corrections.items()
+    name: _UNITS_BY_QUANTITY[quantity] for name, quantity in _ALLOWED_ANSWERS.corrections.items()
 }
 # Answer if the consistency of a filter cannot be evaluated
 NOT_AVAILABLE = "not available"
@@ -83,7 +87,7 @@ ACCEPTED_VALUES = {
     "when": '"whole flight", or an empty text with the times from_s and until_s',
     "ekf2_did": "a list of behaviours, each in quotes",
     "choices": "a letter from a to e in quotes",
-    "log_sha256": "the SHA-256 of the log, as in an empty form from the command px4fuse answers",
+    "log_sha256": "the SHA-256 of the log, which px4fuse answers LOG writes into an empty form",
     **dict.fromkeys(("kind", "unit", "parameter", "value_unit", "panel"), "a short text in quotes"),
 }
 # Answer to a question about KF: a number, a list of KF updates, or None if left blank
@@ -141,7 +145,7 @@ class NamedFault(Record):
     value_unit: Unit = ""
     panel: str = ""
 
-    def size_in_first_unit(self) -> float | None:
+    def convert_size_to_first_unit(self) -> float | None:
         """Convert the size to the first allowed unit, for example factor 1.05 to 5 %."""
         units = FAULT_KINDS[self.kind].units
         if self.size is None or not units:
@@ -150,8 +154,8 @@ class NamedFault(Record):
             return (self.size - 1.0) * 100.0
         return self.size * (units[self.unit] if self.unit else next(iter(units.values())))
 
-    def value_in_first_unit(self) -> float | None:
-        """Convert the new parameter value to the first allowed unit, for example cm to m."""
+    def convert_value_to_first_unit(self) -> float | None:
+        """Convert ``value`` of ``parameter`` to the first allowed unit, for example cm to m."""
         units = CORRECTIONS.get(self.parameter, {})
         if self.value is None or not units:
             return self.value
@@ -185,7 +189,6 @@ class Answers(Record, kw_only=True):
 
     @property
     def states_no_fault(self) -> bool:
-        """True if the student states that the flight has no fault."""
         return [mistake.kind for mistake in self.mistakes] == [NO_FAULT_KIND]
 
 
@@ -205,7 +208,7 @@ class FormQuestion(Record):
     ----------
     update : int
         Number of the KF update, from 1. The first measurement only sets the state.
-    duration_or_gate : float
+    duration_s_or_gate : float
         Kind "prediction": duration without update (s). Kind "gate": innovation gate (in √S).
     """
 
@@ -213,25 +216,26 @@ class FormQuestion(Record):
     update: int
     sigma_a_m_s2: float
     sigma_z_m: float
-    duration_or_gate: float = 0.0
+    duration_s_or_gate: float = 0.0
 
     @property
     def text(self) -> str:
-        update, number = self.update, f"{self.duration_or_gate:g}"
+        update, number = self.update, f"{self.duration_s_or_gate:g}"
         quantity = {
-            "gain": f"position gain of update {update}",
+            "gain": f"Kalman gain of the position in update {update}",
             "variance": f"position variance after update {update} (m²)",
             "innovation": f"innovation of update {update} (m)",
             "nis": f"NIS of update {update}",
-            "prediction": f"position sigma (m) {number} s after update {update}, no further update",
-            "gate": f"list of the updates {update} to {update + GATE_QUESTION_UPDATES} with an "
-            f"innovation outside {number} sqrt(S); KF rejects no measurement",
+            "prediction": f"position sigma (m) {number} s after update {update}, without later "
+            "updates",
+            "gate": f"numbers of the updates {update} to {update + GATE_FURTHER_UPDATES}"
+            f" whose innovation is outside ±{number} sqrt(S); KF rejects no measurement",
         }[self.kind]
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
 
-# Number of KF updates after the first one, in a question about the innovation gate
-GATE_QUESTION_UPDATES = 20
+# A question of kind "gate" is about one KF update and this number of further updates
+GATE_FURTHER_UPDATES = 20
 
 
 def select_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
@@ -243,12 +247,12 @@ def select_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
 
     sigmas = (draw_between(0.2, 0.45, 2), draw_between(0.06, 0.14, 3))
     first_kind, second_kind, third_kind = (pair[next(random_bytes) % 2] for pair in _QUESTION_PAIRS)
-    limits = (1.0, 4.0) if third_kind == "prediction" else (0.8, 1.3)
-    duration_or_gate = draw_between(*limits, 1)
+    number_range = (1.0, 4.0) if third_kind == "prediction" else (0.8, 1.3)
+    duration_s_or_gate = draw_between(*number_range, 1)
     return (
         FormQuestion(first_kind, 2 + next(random_bytes) % 7, *sigmas),
         FormQuestion(second_kind, 20 + next(random_bytes) % 130, *sigmas),
-        FormQuestion(third_kind, 20 + next(random_bytes) % 100, *sigmas, duration_or_gate),
+        FormQuestion(third_kind, 20 + next(random_bytes) % 100, *sigmas, duration_s_or_gate),
     )
 
 
@@ -294,8 +298,8 @@ def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
     accepted_text = ACCEPTED_VALUES.get(path_names[0], ACCEPTED_VALUES.get(field, NUMBER_HELP))
     if path_names[0] in ("quantities", "choices"):
         field = f"{path_names[0][0]}{number}"
-    place_text = f" of mistake {number}" if path_names[0] == "mistakes" else ""
-    return f"{field}{place_text} is {one_line(str(invalid_value), 60)!r}; give {accepted_text}"
+    mistake_text = f" of mistake {number}" if path_names[0] == "mistakes" else ""
+    return f"{field}{mistake_text} is {one_line(str(invalid_value), 60)!r}; give {accepted_text}"
 
 
 def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
@@ -305,21 +309,21 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
         msgspec.convert(filled_form.pop(name, {}), dict[str, Any])
         for name in ("quantities", "choices")
     )
-    quantity_names = [f"q{number}" for number in range(1, len(_QUESTION_PAIRS) + 1)]
-    choice_names = [f"c{number}" for number in range(1, MAX_CHOICES + 1)]
+    quantity_fields = [f"q{number}" for number in range(1, len(_QUESTION_PAIRS) + 1)]
+    choice_fields = [f"c{number}" for number in range(1, MAX_CHOICES + 1)]
     if unknown_fields := sorted(
-        {*quantities, *({"mistakes"} & filled_form.keys())} - set(quantity_names)
-        | choices.keys() - set(choice_names)
+        {*quantities, *({"mistakes"} & filled_form.keys())} - set(quantity_fields)
+        | choices.keys() - set(choice_fields)
     ):
         raise ValueError(
             f"the field {unknown_fields[0]} is unknown; known fields: mistake, "
-            f"{', '.join(quantity_names)}"
+            f"{', '.join(quantity_fields)}"
         )
-    answered_names = choice_names if choices else ()
+    answered_names = choice_fields if choices else ()
     return {
         **filled_form,
         "mistakes": mistakes,
-        "quantities": tuple(map(quantities.get, quantity_names)),
+        "quantities": tuple(map(quantities.get, quantity_fields)),
         "choices": tuple(choices.get(name, "") for name in answered_names),
     }
 
@@ -356,8 +360,8 @@ def check_answers(answers: Answers) -> None:
             chosen_name = getattr(named_fault, field)
             if chosen_name and choices is not None:
                 _require_choice(f"{named_fault.kind}: {field}", chosen_name, choices)
-        low, high = fault_kind.range
-        size = named_fault.size_in_first_unit()
+        low, high = fault_kind.size_range
+        size = named_fault.convert_size_to_first_unit()
         if size is not None and not low <= size <= high:
             unit = next(iter(fault_kind.units))
             raise ValueError(
@@ -367,8 +371,9 @@ def check_answers(answers: Answers) -> None:
 
 def _require_choice(field: str, value: str, choices: Any) -> None:
     if value not in choices:
-        allowed = _join_quoted(choices) or "an empty field"
-        raise ValueError(f"{field} {value!r} is not one of {allowed}")
+        choices_text = _join_quoted(choices)
+        fault = f"is not one of {choices_text}" if choices_text else "must be left empty"
+        raise ValueError(f"{field} {value!r} {fault}")
 
 
 def form_name(log_name: str) -> str:
@@ -396,10 +401,10 @@ def form_text(log_name: str, log_sha256: str, choices: Sequence[Choice] = ()) ->
         form=form_name(log_name),
         sha256=log_sha256,
         verdicts=_join_quoted(VERDICTS),
-        behaviours=_format_block(_format_in_threes(EKF2_BEHAVIOURS)),
+        behaviours=_format_block(_join_in_threes(EKF2_BEHAVIOURS)),
         kinds=_format_block(kind_lines),
         corrections=_format_block(name + _format_units(CORRECTIONS[name]) for name in CORRECTIONS),
-        panels=_format_block(_format_in_threes(PANELS)),
+        panels=_format_block(_join_in_threes(PANELS)),
         questions="\n".join(questions),
     ) + "".join(
         f'{CHOICES_HEAD * (number == 1)}# {choice.text}\nc{number} = ""\n'
@@ -431,9 +436,11 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
         numbers = answer if isinstance(answer, tuple) else (answer,)
         numbers_text = ", ".join(f"{number:g}" for number in numbers if number is not None)
         yield question.text, numbers_text or EMPTY_CELL
-    letters = [f"c{number} {letter}" for number, letter in enumerate(answers.choices, 1) if letter]
-    if letters:
-        yield "Answers about the figures", ", ".join(letters)
+    choice_texts = [
+        f"c{number} {letter}" for number, letter in enumerate(answers.choices, 1) if letter
+    ]
+    if choice_texts:
+        yield "Answers about the figures", ", ".join(choice_texts)
 
 
 def _format_number_with_unit(number: float | None, unit: str, units: Mapping[str, float]) -> str:
@@ -453,5 +460,5 @@ def _join_quoted(names: Iterable[str]) -> str:
     return ", ".join(f'"{name}"' for name in names)
 
 
-def _format_in_threes(names: tuple[str, ...]) -> Iterator[str]:
+def _join_in_threes(names: tuple[str, ...]) -> Iterator[str]:
     return (_join_quoted(names[start : start + 3]) for start in range(0, len(names), 3))

@@ -22,7 +22,7 @@ BOUNDS = {
     r"(^|_)(ratio|factor)($|_)": (-MAX_RATIO, MAX_RATIO),
     r"_m$": (-MAX_LENGTH_M, MAX_LENGTH_M),
 }
-CHECK_LOG_REMEDY = "Check the values in the log."
+CHECK_LOG_REMEDY = "Check the logged data from which this number is computed."
 T = TypeVar("T", bound=msgspec.Struct)
 
 
@@ -30,17 +30,17 @@ class _OutOfBoundsError(Exception):
     """Number in results outside its valid range."""
 
 
-def bounds_of(name: str) -> tuple[float, float]:
+def find_bounds(name: str) -> tuple[float, float]:
     """Return the smallest and the largest valid value of a field in the results.
 
-    >>> bounds_of("nis_mean"), bounds_of("position_rmse_m"), bounds_of("start_s")
+    >>> find_bounds("nis_mean"), find_bounds("position_rmse_m"), find_bounds("start_s")
     ((0.0, 1000000.0), (-1000000000.0, 1000000000.0), (-inf, inf))
     """
     matching_bounds = (bounds for pattern, bounds in BOUNDS.items() if re.search(pattern, name))
     return next(matching_bounds, (-math.inf, math.inf))
 
 
-def within_bounds(results: T) -> T:
+def drop_invalid_numbers(results: T) -> T:
     """Remove fields of type NotWritten and numbers outside their valid range from results.
 
     An optional number is set to None. If the number is required, the record that contains it is
@@ -55,29 +55,31 @@ def within_bounds(results: T) -> T:
     try:
         checked_results: T = _check_value(results, None, "", reasons)
     except _OutOfBoundsError as error:
-        raise ResultsError(f"the results are not usable: {error}", CHECK_LOG_REMEDY) from error
+        raise ResultsError(
+            f"the results need a number that is not valid: {error}", CHECK_LOG_REMEDY
+        ) from error
     if hasattr(checked_results, "missing"):
-        removed_numbers = (
+        unavailable_numbers = (
             Unavailable(reason.partition(" ")[0], reason, CHECK_LOG_REMEDY) for reason in reasons
         )
-        return replace(checked_results, missing=(*checked_results.missing, *removed_numbers))
+        return replace(checked_results, missing=(*checked_results.missing, *unavailable_numbers))
     if hasattr(checked_results, "notes"):
         return replace(checked_results, notes=(*checked_results.notes, *reasons))
     return checked_results
 
 
-def types_of(annotation: Any) -> tuple[Any, ...]:
+def list_types(annotation: Any) -> tuple[Any, ...]:
     """Return the types in a type annotation, for example float and None for ``float | None``."""
     if get_origin(annotation) is Annotated:
-        return types_of(get_args(annotation)[0])
+        return list_types(get_args(annotation)[0])
     if get_origin(annotation) in (Union, UnionType):
-        return tuple(member for part in get_args(annotation) for member in types_of(part))
+        return tuple(member for part in get_args(annotation) for member in list_types(part))
     return getattr(annotation, "union_members", (annotation,))
 
 
 def _check_value(value: Any, annotation: Any, path: str, reasons: list[str]) -> Any:
     if isinstance(value, float):
-        low, high = bounds_of(path.rpartition(".")[2])
+        low, high = find_bounds(path.rpartition(".")[2])
         if not math.isfinite(value):
             raise _OutOfBoundsError(f"{path} is not a finite number")
         if not low <= value <= high:
@@ -108,7 +110,8 @@ def _check_struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgsp
 
 def _check_mapping(value: Mapping[str, Any], annotation: Any, path: str, reasons: list[str]) -> Any:
     value_type = next(
-        (get_args(member)[1] for member in types_of(annotation) if len(get_args(member)) == 2), Any
+        (get_args(member)[1] for member in list_types(annotation) if len(get_args(member)) == 2),
+        Any,
     )
     checked_elements: dict[str, Any] = {}
     for key, element in value.items():
@@ -141,7 +144,7 @@ def _check_or_replace(value: Any, annotation: Any, path: str, reasons: list[str]
     try:
         return _check_value(value, annotation, path, reasons)
     except _OutOfBoundsError as error:
-        for unavailable_type in types_of(annotation):
+        for unavailable_type in list_types(annotation):
             if isinstance(unavailable_type, type) and issubclass(unavailable_type, Unavailable):
                 text_fields = {
                     "what": path,

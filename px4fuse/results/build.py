@@ -23,7 +23,7 @@ from px4fuse.request import (
 )
 from px4fuse.results import contract
 from px4fuse.results.answer_form import EMPTY_CELL, Answers, form_rows
-from px4fuse.results.bounds import within_bounds
+from px4fuse.results.bounds import drop_invalid_numbers
 from px4fuse.results.contract import AvailableTrack, ChosenSettings, Log, PositionSource
 from px4fuse.results.model import NO_STUDENT, Student, provenance, schema_of
 from px4fuse.trajectory.evaluation import Evaluation
@@ -54,16 +54,16 @@ def results(
     for name in contract.ComparisonResults.__struct_fields__:
         if name not in fields:
             fields[name] = getattr(analysis, name)
-    return within_bounds(contract.ComparisonResults(**fields))
+    return drop_invalid_numbers(contract.ComparisonResults(**fields))
 
 
-def outcome_results(
+def make_outcome_results(
     request: ComparisonRequest, outcome: Analysis | AidsOnlyAnalysis, student: Student = NO_STUDENT
 ) -> contract.ComparisonResults | contract.AidsResults:
     """Return the results of ``px4fuse compare`` for a flight with or without positions."""
     if isinstance(outcome, Analysis):
         return results(request, outcome, student)
-    return within_bounds(
+    return drop_invalid_numbers(
         contract.AidsResults(
             **_common_fields(contract.AIDS_SCHEMA, request, outcome.flight),
             aids=dict(outcome.aids),
@@ -75,25 +75,29 @@ def outcome_results(
     )
 
 
-def tuning_results(
+def make_tuning_results(
     request: ComparisonRequest,
     comparison: PreparedComparison,
     tuning_by_axis: Mapping[str, AxisTuning | Unavailable],
 ) -> contract.TuningResults:
     common_fields = _flight_fields("px4fuse-tuning", request, comparison, "tune")
-    return within_bounds(contract.TuningResults(**common_fields, tuning=dict(tuning_by_axis)))
+    return drop_invalid_numbers(
+        contract.TuningResults(**common_fields, tuning=dict(tuning_by_axis))
+    )
 
 
-def sync_results(
-    request: ComparisonRequest, comparison: PreparedComparison, clock: ClockOffset | Unavailable
+def make_sync_results(
+    request: ComparisonRequest,
+    comparison: PreparedComparison,
+    time_offset: ClockOffset | Unavailable,
 ) -> contract.SyncResults:
     common_fields = _flight_fields("px4fuse-sync", request, comparison, "sync")
-    return within_bounds(contract.SyncResults(**common_fields, clock=clock))
+    return drop_invalid_numbers(contract.SyncResults(**common_fields, clock=time_offset))
 
 
-def whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract.WhatIfResults:
+def make_whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract.WhatIfResults:
     summaries, sweep_start_index = analysis.whatif, analysis.sweep_start_index
-    return within_bounds(
+    return drop_invalid_numbers(
         contract.WhatIfResults(
             **_common_fields(contract.WHATIF_SCHEMA, request, analysis.flight),
             agreement=summaries.agreement,
@@ -108,8 +112,8 @@ def whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> contract
     )
 
 
-def loop_results(request: LoopRequest, loop: Loop, student: Student) -> contract.LoopResults:
-    return within_bounds(
+def make_loop_results(request: LoopRequest, loop: Loop, student: Student) -> contract.LoopResults:
+    return drop_invalid_numbers(
         contract.LoopResults(
             schema=schema_of(contract.LOOP_SCHEMA),
             request=request.with_file_names(),
@@ -123,10 +127,10 @@ def loop_results(request: LoopRequest, loop: Loop, student: Student) -> contract
     )
 
 
-def evaluation_results(
+def make_evaluation_results(
     request: EvaluationRequest, evaluation: Evaluation
 ) -> contract.EvaluationResults:
-    return within_bounds(
+    return drop_invalid_numbers(
         contract.EvaluationResults(
             schema=schema_of("px4fuse-evaluation"),
             estimate=evaluation.estimate_track.track(),
@@ -137,13 +141,13 @@ def evaluation_results(
     )
 
 
-def graph_results(solved_graph: Graph, command: str) -> contract.GraphResults:
-    return within_bounds(
+def make_graph_results(solved_graph: Graph, command: str) -> contract.GraphResults:
+    return drop_invalid_numbers(
         contract.GraphResults(schema_of("px4fuse-graph"), solved_graph, provenance(command))
     )
 
 
-def log_record(flight: Flight) -> Log:
+def make_log_record(flight: Flight) -> Log:
     return Log(**msgspec.structs.asdict(flight.log), joined=flight.inputs, clocks=flight.clocks)
 
 
@@ -156,7 +160,7 @@ def _common_fields(
     return {
         "schema": schema_of(name),
         "request": request.with_file_names(),
-        "log": log_record(flight),
+        "log": make_log_record(flight),
         "provenance": provenance(command_line(request, command)),
     }
 
@@ -169,7 +173,7 @@ def _flight_fields(
 ) -> dict[str, Any]:
     track, segment, settings = comparison.source, comparison.segment, comparison.settings
     origin, parameters = track.origin, comparison.flight.log.parameters
-    file_offset_s = 0.0 if track.alignment is None else track.alignment.clock_offset_s
+    file_clock_offset_s = 0.0 if track.alignment is None else track.alignment.clock_offset_s
     source = PositionSource(
         **track.description_fields(),
         ekf2_parameters={} if origin.aid is None else origin.aid.logged_parameters(parameters),
@@ -188,7 +192,7 @@ def _flight_fields(
         missing=tuple(part for part in comparison.missing if part.source),
     )
     kf_settings: dict[str, Any] = asdict(settings) | {
-        "clock_offset_s": settings.clock_offset_s + file_offset_s
+        "clock_offset_s": settings.clock_offset_s + file_clock_offset_s
     }
     return _common_fields(name, request, comparison.flight, command) | {
         "source": source,

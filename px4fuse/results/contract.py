@@ -45,7 +45,7 @@ SIGNIFICANT_DIGITS = 10
 
 
 class Log(LogInfo, kw_only=True):
-    """Description of a log, of other input files, and of clocks converted to the boot clock."""
+    """Log, files read in addition (``joined``), and clocks that were converted to boot time."""
 
     joined: tuple[InputFile, ...]
     clocks: tuple[ClockMap, ...]
@@ -67,7 +67,7 @@ class PositionSource(Record, kw_only=True):
     kind : str
         Type of sensor.
     path : str
-        Way of the positions into the log, for example "as received".
+        Form in which the positions are available, for example "as received".
     ekf2_parameters : mapping
         Logged EKF2 parameters for this source, in units of PX4.
     reason : str
@@ -130,16 +130,18 @@ class DiffInput(Record, kw_only=True):
 
 
 class NumberChange(Record, kw_only=True):
-    """Number that differs between the inputs A and B of ``px4fuse diff``, with 95 % intervals.
+    """Number that differs between the inputs A and B of ``px4fuse diff``.
 
     Attributes
     ----------
     path : str
         Field of the results, for example ``axes.aisle.filters.ekf2.nis_mean``.
     unit : str
-        "share" is a fraction from 0 to 1.
+        Unit of both values; "share" for fractions from 0 to 1.
     a, b : float or None
         Values in A and B; None for a missing number.
+    a_interval, b_interval : (float, float or None), or None
+        Their 95 % intervals.
     """
 
     path: str
@@ -376,7 +378,8 @@ def schema_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]], dict
     components: dict[str, Any] = {}
 
     def describe_union(union_type: Any) -> dict[str, Any]:
-        if union_type is msgspec.UnsetType:  # an unset field is not written
+        # an unset field is not written, so the schema allows no value
+        if union_type is msgspec.UnsetType:
             return {"not": {}}
         record_types.update(dict.fromkeys(union_type.union_members))
         return {

@@ -1,4 +1,4 @@
-"""Records in the results of several commands: schema, student and provenance."""
+"""Records that the results of several commands share: schema, student and provenance."""
 
 import platform
 from importlib import metadata

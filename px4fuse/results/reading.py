@@ -10,7 +10,7 @@ from msgspec.structs import fields
 from px4fuse.core.record import decode_record_or_unavailable
 from px4fuse.core.text import clean_text, convert_nested, one_line
 from px4fuse.errors import ResultsError
-from px4fuse.results.bounds import types_of
+from px4fuse.results.bounds import list_types
 from px4fuse.results.contract import RESULTS_BY_SCHEMA, Results
 from px4fuse.results.model import SCHEMA_VERSION
 
@@ -23,7 +23,7 @@ class _SchemaVersion(msgspec.Struct, frozen=True):
     version: str
 
 
-class _Head(msgspec.Struct, frozen=True):
+class _ResultsHeader(msgspec.Struct, frozen=True):
     """Fields that results of all schema versions contain."""
 
     schema: _SchemaVersion
@@ -50,16 +50,18 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     except (msgspec.DecodeError, ValueError) as error:
         raise ResultsError(f"{name} is not JSON ({one_line(str(error), 100)}).") from error
     try:
-        head = msgspec.convert(decoded, _Head)
-        results_type = RESULTS_BY_SCHEMA[head.schema.name]
+        header = msgspec.convert(decoded, _ResultsHeader)
+        results_type = RESULTS_BY_SCHEMA[header.schema.name]
     except (msgspec.ValidationError, KeyError) as error:
         raise ResultsError(f"{name} contains no results of px4fuse.") from error
-    version, (major, minor) = head.schema.version, SCHEMA_VERSION.split(".")
+    version, (major, minor) = header.schema.version, SCHEMA_VERSION.split(".")
     if not re.fullmatch(rf"{major}\.[0-9]{{1,4}}", version):
-        writer = head.provenance.get("px4fuse") if isinstance(head.provenance, dict) else None
+        writer_version = (
+            header.provenance.get("px4fuse") if isinstance(header.provenance, dict) else None
+        )
         version_text = (
-            f"px4fuse {one_line(str(writer), 60)}"
-            if writer
+            f"px4fuse {one_line(str(writer_version), 60)}"
+            if writer_version
             else "the version that wrote the results"
         )
         raise ResultsError(
@@ -81,7 +83,7 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
 
 def _remove_unknown_fields(value: Any, annotation: Any) -> Any:
     """Remove fields that are unknown to this version from decoded JSON."""
-    types = types_of(annotation)
+    types = list_types(annotation)
     if isinstance(value, dict):
         record_types = [record for record in types if hasattr(record, "__struct_fields__")]
         field_types = {field.encode_name: field.type for r in record_types for field in fields(r)}

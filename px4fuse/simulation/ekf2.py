@@ -48,7 +48,7 @@ from px4fuse.flight.ekf2_parameters import (
     GNSS_VEL,
     MAG,
     Aid,
-    effective_settings,
+    fill_with_defaults,
 )
 from px4fuse.simulation import sensors
 from px4fuse.simulation.ekf2_topics import VEHICLE_AID_SOURCE_HZ, Ekf2Output, make_ekf2_topics
@@ -98,7 +98,7 @@ def make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | f
     """Return the values of all EKF2 parameters that the model uses, by PX4 name."""
     aid = scenario.aid
     is_gnss = aid == GNSS_POS
-    defaults = effective_settings({}, *_select_fused_aids(scenario))
+    defaults = fill_with_defaults({}, *_select_fused_aids(scenario))
     delay_ms = defaults[aid.delay] if faults.ekf2_delay_s is None else 1e3 * faults.ekf2_delay_s
     aid_parameters: dict[str, float] = {aid.noise_mode: 1}
     if is_gnss:
@@ -164,7 +164,7 @@ def simulate_ekf2(
                 np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)]),
                 np.full(6, FIELD_SIGMA_GAUSS**2),
             )
-    settings = effective_settings(logged_values, *fused_aids)
+    settings = fill_with_defaults(logged_values, *fused_aids)
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
     buffer_length = int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICTION_STEP_US))
     inputs = Inputs(

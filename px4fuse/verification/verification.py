@@ -192,7 +192,7 @@ def _repeat_loop(
     submitted_results: LoopResults, link_file: _LinkFile
 ) -> tuple[object, ReportedResults]:
     from px4fuse.diagnose import analyse_loop_closure  # noqa: PLC0415
-    from px4fuse.results.build import loop_results  # noqa: PLC0415
+    from px4fuse.results.build import make_loop_results  # noqa: PLC0415
 
     recorded_request = submitted_results.request
     path, track = split_track(recorded_request.source)
@@ -203,7 +203,7 @@ def _repeat_loop(
         sha256 = submitted_results.references[-1].sha256 if submitted_results.references else None
         request = replace(request, reference=link_file(path, sha256, "--reference") + track)
     analysis = analyse_loop_closure(request)
-    return analysis, loop_results(recorded_request, analysis, submitted_results.student)
+    return analysis, make_loop_results(recorded_request, analysis, submitted_results.student)
 
 
 def _draw_report(

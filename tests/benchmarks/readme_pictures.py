@@ -65,7 +65,7 @@ PICTURES = (
     Picture("lab_1", AISLE, "Position and velocity along the main axis"),
     Picture("lab_2", SMALL_Q, "Innovations and variances along"),
     Picture("lab_3", AISLE, "position difference, "),
-    Picture("lab_4", "loop sample_logs/loop_vio.ulg", "Loop closure", "Loop closures and scores"),
+    Picture("lab_4", "loop sample_logs/loop_vio.ulg", "Loop closure", "Loop closures and RPE"),
     Picture("lab_5", EVALUATE, "Trajectory error"),
 )
 

@@ -95,11 +95,11 @@ def flight_outputs(request: ComparisonRequest, flight: Flight | None = None) -> 
     }
     comparison = prepare_comparison(flight, request)
     noises = estimate_noises(comparison)
-    outputs["tune"] = phrases.tuning_advice(comparison, noises)
-    outputs["tune_json"] = to_json_dict(build.tuning_results(request, comparison, noises))
+    outputs["tune"] = phrases.make_tuning_advice(comparison, noises)
+    outputs["tune_json"] = to_json_dict(build.make_tuning_results(request, comparison, noises))
     _, offset = estimate_noises_and_clock(comparison)
-    outputs["sync"] = clock.clock_advice(comparison, offset)
-    outputs["sync_json"] = to_json_dict(build.sync_results(request, comparison, offset))
+    outputs["sync"] = clock.make_time_offset_advice(comparison, offset)
+    outputs["sync_json"] = to_json_dict(build.make_sync_results(request, comparison, offset))
     if request.position is None:
         asked = WhatIfRequest(log=request.log)
         try:
@@ -107,7 +107,7 @@ def flight_outputs(request: ComparisonRequest, flight: Flight | None = None) -> 
         except Px4FuseError as error:
             outputs["whatif_error"] = str(error)
         else:
-            outputs["whatif_json"] = to_json_dict(build.whatif_results(asked, replayed))
+            outputs["whatif_json"] = to_json_dict(build.make_whatif_results(asked, replayed))
     return outputs
 
 

@@ -131,7 +131,7 @@ def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterNa
     assert isinstance(truth, pd.DataFrame)
     colour = style.SIGMA_BAND_COLOURS[name]
     style.draw_sigma_band(axes, 0.0 * errors["error_m"], errors["sigma_m"], colour)
-    style.draw_curve(axes, errors["error_m"], **style.TRACK_LINES[name])
+    style.draw_curve(axes, errors["error_m"], **style.TRACK_STYLES[name])
     axes.fill_between(
         truth.index,
         0.0,
@@ -148,11 +148,11 @@ def _draw_map(axes: style.Axes, comparison: Comparison) -> None:
     ekf2, truth = comparison.flight.ekf2, comparison.flight.truth
     assert isinstance(ekf2, Ekf2)
     assert isinstance(truth, Truth)
-    dots = style.MEASUREMENT_DOTS | {"ms": 4.0}
+    dots = style.MEASUREMENT_STYLE | {"ms": 4.0}
     for track, line in (
         (comparison.source.samples, dots),
-        (ekf2.state, style.TRACK_LINES["EKF2"]),
-        (truth.samples, style.TRACK_LINES["ground truth"]),
+        (ekf2.state, style.TRACK_STYLES["EKF2"]),
+        (truth.samples, style.TRACK_STYLES["ground truth"]),
     ):
         axes.plot(track["east_m"], track["north_m"], **line)
     style.set_map_axes(axes, "east", "north")

@@ -25,7 +25,7 @@ from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest
 from px4fuse.results.answer_form import (
-    GATE_QUESTION_UPDATES,
+    GATE_FURTHER_UPDATES,
     Choice,
     ChoiceName,
     FormQuestion,
@@ -240,14 +240,14 @@ def compute_numeric_answer(
     nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
     match question.kind:
         case "gate":
-            is_outside = nis.iloc[: GATE_QUESTION_UPDATES + 1] > question.duration_or_gate**2
+            is_outside = nis.iloc[: GATE_FURTHER_UPDATES + 1] > question.duration_s_or_gate**2
             rejected_update_numbers = np.flatnonzero(is_outside) + question.update
             return tuple(rejected_update_numbers.astype(float).tolist())
         case "prediction":
             p, f = symmetric_matrix(tuple(covariance)), transition(settings.dt_s)
             q = symmetric_matrix(compute_unit_process_noise(settings.dt_s))
             q *= settings.sigma_a_m_s2**2 * settings.dt_s
-            for _ in range(round(question.duration_or_gate / settings.dt_s)):
+            for _ in range(round(question.duration_s_or_gate / settings.dt_s)):
                 p = f @ p @ f.T + q
             return math.sqrt(p[0, 0])
         case "nis":

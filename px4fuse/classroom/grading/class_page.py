@@ -18,8 +18,8 @@ from px4fuse.classroom.grading.model import (
 )
 from px4fuse.core.text import count_noun, format_number
 from px4fuse.html import frame
-from px4fuse.html.frame import Cell, Column, Row, Section
-from px4fuse.html.safe import load_template, local_link
+from px4fuse.html.frame import Cell, Column, Row, RowSection
+from px4fuse.html.safe import load_template, make_relative_url
 from px4fuse.results.answer_form import form_rows
 
 HISTOGRAM_BIN_COUNT = 10
@@ -63,7 +63,7 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
         ),
         rows=[_make_class_row(grade, item_titles, number_titles) for grade in grades],
         filters=[("Status", [("", f"Everyone ({len(grades)})"), *options])],
-        groups=(("items", "Points of each rubric item"), ("numbers", "Numbers")),
+        column_groups=(("items", "Points of each rubric item"), ("numbers", "Numbers")),
         placeholder="search for name, id, file or flag",
         full_table_note="The table class.csv contains all rows.",
     )
@@ -121,33 +121,35 @@ def _make_class_row(grade: Grade, item_titles: Sequence[str], number_titles: Seq
     points_by_title = {item.title: item.points for item in report.items} if report else {}
     number_values = report.numbers if report else {}
     cells = (
-        Cell(grade.display_name, below=grade.file_name),
+        Cell(grade.display_name, second_line=grade.file_name),
         Cell(grade.student_id),
         Cell(f"{symbol} {status}", float(STATUSES.index(status)), flag_count_text, css_class),
         _make_points_cell(grade),
-        Cell(grade.submission_time, below=late_text),
+        Cell(grade.submission_time, second_line=late_text),
         Cell("\n".join(grade.flags), float(flag_count), "", "flags"),
-        *(frame.number_cell(points_by_title.get(title)) for title in item_titles),
-        *(frame.number_cell(number_values.get(title)) for title in number_titles),
+        *(frame.make_number_cell(points_by_title.get(title)) for title in item_titles),
+        *(frame.make_number_cell(number_values.get(title)) for title in number_titles),
     )
     # the points of an anonymous student cannot be entered: overrides.csv needs the id or the file
     points_inputs = (_make_points_inputs(grade),) if grade.student_id or grade.file_name else ()
     links = (
-        [("Report redrawn from the log (PDF)", local_link(report.redrawn_path))] if report else []
+        [("Report redrawn from the log (PDF)", make_relative_url(report.redrawn_path))]
+        if report
+        else []
     )
     return Row(
         cells,
         tuple(_make_grade_tags(grade)),
         (*_make_grade_details(grade), *points_inputs),
-        (frame.links_section("Report", links),),
+        (frame.make_links_section("Report", links),),
     )
 
 
-def _make_grade_details(grade: Grade) -> Iterator[Section]:
+def _make_grade_details(grade: Grade) -> Iterator[RowSection]:
     """Yield the details of a student, which the web page shows after a click on the row."""
-    report, comment = grade.counted_report, frame.prose_section("Your comment", grade.comment)
+    report, comment = grade.counted_report, frame.make_prose_section("Your comment", grade.comment)
     if report is None:
-        yield frame.list_section("Missing", ["No submission."])
+        yield frame.make_list_section("Missing", ["No submission."])
         yield comment
         return
     verification = report.verification
@@ -171,20 +173,20 @@ def _make_grade_details(grade: Grade) -> Iterator[Section]:
     other_report_texts = [
         f"{other_report.submission}: {other_report.status}" for other_report in grade.other_reports
     ]
-    yield frame.list_section("Flags", grade.flags, is_warning=True)
+    yield frame.make_list_section("Flags", grade.flags, is_warning=True)
     actions = [report.instructor_action] if report.instructor_action else []
-    yield frame.list_section("Required decision of the instructor", actions, is_warning=True)
-    yield frame.list_section("Verification", verification.reasons)
-    yield frame.table_section(
+    yield frame.make_list_section("Required decision of the instructor", actions, is_warning=True)
+    yield frame.make_list_section("Verification", verification.reasons)
+    yield frame.make_table_section(
         "Numbers that differ in the new run", differences, ("Value", "Report", "New run")
     )
     title = "Points (proposed)" if report.instructor_action else "Points"
-    yield frame.table_section(title, items, ("Item", "Points", "Of", "Comment"), (1, 2))
+    yield frame.make_table_section(title, items, ("Item", "Points", "Of", "Comment"), (1, 2))
     yield comment
-    yield frame.list_section("Injected faults of this flight", fault_texts)
-    yield frame.name_value_section("Answer form", [*form_rows(report.form)] if report.form else [])
-    yield frame.prose_section("Text of the student", report.notes)
-    yield frame.list_section("Other attempts", other_report_texts)
+    yield frame.make_list_section("Injected faults of this flight", fault_texts)
+    yield frame.make_name_value_section("Answer form", [*form_rows(report.form)] if report.form else [])
+    yield frame.make_prose_section("Text of the student", report.notes)
+    yield frame.make_list_section("Other attempts", other_report_texts)
 
 
 def _make_points_cell(grade: Grade) -> Cell:
@@ -204,7 +206,7 @@ def _make_points_cell(grade: Grade) -> Cell:
     return Cell(text, grade.total, ", ".join(notes))
 
 
-def _make_points_inputs(grade: Grade) -> Section:
+def _make_points_inputs(grade: Grade) -> RowSection:
     """Make the input boxes for the points that the instructor can enter."""
     report = grade.counted_report
     max_by_title = {
@@ -225,6 +227,6 @@ def _make_points_inputs(grade: Grade) -> Section:
         if title not in max_by_title
     ]
     identity = grade.student_id or grade.file_name
-    return frame.input_boxes_section(
+    return frame.make_input_boxes_section(
         "Points and comments of the instructor", identity, rows, other_rows
     )

@@ -280,7 +280,7 @@ def score_fault_size(fault: InjectedFault, named_fault: NamedFault) -> float:
     1: within the tolerance. 1/2: relative error up to HALF_POINTS_SIZE_ERROR. 1/3: wrong sign,
     or correct size of a wrong fault. A guessable fault has a score from 0 to 1 instead of 1/2.
     """
-    stated_size = named_fault.size_in_first_unit()
+    stated_size = named_fault.convert_size_to_first_unit()
     if fault.size is None or fault.low is None or fault.high is None or stated_size is None:
         return 0.0
     if named_fault.kind != fault.kind:
@@ -322,7 +322,7 @@ def score_correction(
     fault: InjectedFault, named_fault: NamedFault, right_answers: RightFormAnswers
 ) -> float:
     """Return the score for the parameter that corrects a fault, and for the value of it."""
-    stated_value = named_fault.value_in_first_unit()
+    stated_value = named_fault.convert_value_to_first_unit()
     scores = [
         score
         if (low, high) == NO_BOUNDS
