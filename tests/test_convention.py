@@ -308,7 +308,9 @@ def test_positions_in_correct_ned_frame_give_no_frame_fault():
 def test_enu_orientation_report_contains_conversion_to_ned():
     time, attitude = oriented(flown())
     quaternion = multiply(multiply(np.array(NED_TO["ENU"]), attitude), np.array(NED_TO["NWU"]))
-    (found,) = source_convention.detect(compared(reclassify_as_vio(sent(flown()), quaternion, time)))
+    (found,) = source_convention.detect(
+        compared(reclassify_as_vio(sent(flown()), quaternion, time))
+    )
     assert found.evidence[CONVENTION_KEY] == "frames"
     assert "q_NED = (0, √½, √½, 0) ⊗ q ⊗ (0, 1, 0, 0)" in found.remedy
 

@@ -124,7 +124,9 @@ def test_constant_positions_not_fused_by_ekf2_are_not_reported() -> None:
 
 
 def test_position_file_that_ekf2_never_got_is_no_fusion_fault() -> None:
-    beside = unfused(source={"origin": POSITION_FILE_ORIGIN}, ekf2={"parameters": {"EKF2_EV_CTRL": 0.0}})
+    beside = unfused(
+        source={"origin": POSITION_FILE_ORIGIN}, ekf2={"parameters": {"EKF2_EV_CTRL": 0.0}}
+    )
     assert named(ekf2_not_fusing.detect, beside) == {}
     # EKF2 received the same or another source
     beside.flight.positions = (beside.source, source())

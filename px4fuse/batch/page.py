@@ -117,7 +117,11 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
         column_groups=[(EXTRA_COLUMN_GROUP, "more columns")],
         placeholder="search by name, vehicle, firmware or finding",
         full_table_note="The table fleet.csv contains all rows.",
-        ratio_axis={"bands": CONSISTENT_SIGMA_RATIOS, "ends": RATIO_AXIS_ENDS, "marks": MARKER_SVG_PATHS},
+        ratio_axis={
+            "bands": CONSISTENT_SIGMA_RATIOS,
+            "ends": RATIO_AXIS_ENDS,
+            "marks": MARKER_SVG_PATHS,
+        },
     )
 
 

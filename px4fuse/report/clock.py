@@ -100,8 +100,10 @@ def make_time_offset_advice(
     return advice_by_label
 
 
-def _delay_advice(comparison: PreparedComparison, time_offset: ClockOffset, logged_delay_ms: float) -> str:
-    name, fitted_delay_ms = ( (
+def _delay_advice(
+    comparison: PreparedComparison, time_offset: ClockOffset, logged_delay_ms: float
+) -> str:
+    name, fitted_delay_ms = (
         find_aid(comparison).delay,
         estimate_delay_if_wrong_ms(comparison, time_offset, logged_delay_ms),
     )

@@ -226,9 +226,9 @@ def make_tuning_advice(
         changes = make_noise_change(EV_POS, log.parameters, reported_sigma_m, sigma_z.value)
         logged_noise_text = "" if logged_noise_m is None else f" (now {logged_noise_m:g} m)"
         advice_by_label["PX4"] = f"Set {name} to {changes[name]:g} m{logged_noise_text}."
-        is_logged_within_interval = logged_noise_m is not None and (sigma_z.low or 0.0) <= logged_noise_m <= (
-            sigma_z.high or 0.0
-        )
+        is_logged_within_interval = logged_noise_m is not None and (
+            sigma_z.low or 0.0
+        ) <= logged_noise_m <= (sigma_z.high or 0.0)
         if EV_POS.noise_mode in changes and reported_sigma_m > (sigma_z.high or np.inf):
             changes = select_changed_settings(changes, log.parameters)
             advice_by_label["PX4"] = (
@@ -236,7 +236,8 @@ def make_tuning_advice(
                 f"{reported_sigma_m:.2g} m, which is larger than the estimate."
             )
         elif is_logged_within_interval:
-            advice_by_label["PX4"] = ( f"{name} {logged_noise_m:g} m is within the 95 % interval of the estimate."
+            advice_by_label["PX4"] = (
+                f"{name} {logged_noise_m:g} m is within the 95 % interval of the estimate."
             )
         advice_by_label["PX4"] += make_height_noise_advice(
             comparison, tuning_by_axis, sigma_z.value

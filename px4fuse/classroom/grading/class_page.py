@@ -184,7 +184,9 @@ def _make_grade_details(grade: Grade) -> Iterator[RowSection]:
     yield frame.make_table_section(title, items, ("Item", "Points", "Of", "Comment"), (1, 2))
     yield comment
     yield frame.make_list_section("Injected faults of this flight", fault_texts)
-    yield frame.make_name_value_section("Answer form", [*form_rows(report.form)] if report.form else [])
+    yield frame.make_name_value_section(
+        "Answer form", [*form_rows(report.form)] if report.form else []
+    )
     yield frame.make_prose_section("Text of the student", report.notes)
     yield frame.make_list_section("Other attempts", other_report_texts)
 
