@@ -17,8 +17,8 @@ from flights import given_placement
 from px4fuse.comparison.model import Comparison
 from px4fuse.convention.axes import AXIS_ASSIGNMENTS, CLOCKWISE_DIRECTIONS, UNIT_SIZES_M
 from px4fuse.convention.check import check_convention
-from px4fuse.convention.correction import Faults, convention_faults
-from px4fuse.convention.model import Axes, Convention, OrientationConvention
+from px4fuse.convention.correction import ConventionFaults, find_convention_faults
+from px4fuse.convention.model import AxisDirections, Convention, OrientationConvention
 from px4fuse.diagnose import prepare_comparison, refine_delay
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.finding import Finding
@@ -73,7 +73,7 @@ def flown(seed: int = 3, *mistakes: str) -> Flight:
 
 def sent(
     flight: Flight,
-    axes: Axes = ("north", "east", "down"),
+    axes: AxisDirections = ("north", "east", "down"),
     unit: str = "m",
     rotation_deg: float = 0.0,
     late_s: float = 0.0,
@@ -149,7 +149,7 @@ def test_yaw_rotation_refers_to_gnss_if_ekf2_heading_is_wrong():
     no_ekf2 = Unavailable("EKF2", "not logged", "")
     flight = replace(flown(), attitude=attitude, positions=(gnss,), ekf2=no_ekf2)
     found = check_convention(flight, sent(flown(), rotation_deg=60.0))
-    assert convention_faults(found, flight, "NED").rotation_deg == pytest.approx(60.0, abs=2.0)
+    assert find_convention_faults(found, flight, "NED").rotation_deg == pytest.approx(60.0, abs=2.0)
 
 
 @pytest.mark.parametrize("clock_drift", [-0.04, -0.01, 0.02])
@@ -315,9 +315,9 @@ def fused(flight: Flight) -> Flight:
 @pytest.mark.parametrize(("axes", "rotation_deg", "expected"), [
     (
         ("west", "south", "up"), 20.0,
-        Faults(has_wrong_axes=True, affects_ekf2=True, is_north_unknown=True),
+        ConventionFaults(has_wrong_axes=True, affects_ekf2=True, is_north_unknown=True),
     ),
-    (("west", "north", "down"), -32.0, Faults()),
+    (("west", "north", "down"), -32.0, ConventionFaults()),
 ])  # fmt: skip
 def test_vision_that_defines_heading_of_ekf2_has_no_yaw_fault(axes, rotation_deg, expected):
     convention = Convention(
@@ -325,13 +325,13 @@ def test_vision_that_defines_heading_of_ekf2_has_no_yaw_fault(axes, rotation_deg
         heading_from="gyroscopes", orientation=OrientationConvention(verdict="determined",
         frames="FLU to ENU" if axes[2] == "up" else "FRD to NED"),
     )  # fmt: skip
-    assert convention_faults(convention, fused(flown()), "NED") == expected
+    assert find_convention_faults(convention, fused(flown()), "NED") == expected
 
 
 def test_positions_in_frd_frame_have_no_yaw_fault():
     convention = Convention(verdict="determined", x="west", y="north", rotation_deg=-32.0)
-    assert not convention_faults(convention, flown(), "FRD")
-    assert convention_faults(convention, flown(), "NED").rotation_deg == pytest.approx(58.0)
+    assert not find_convention_faults(convention, flown(), "FRD")
+    assert find_convention_faults(convention, flown(), "NED").rotation_deg == pytest.approx(58.0)
 
 
 @pytest.mark.parametrize(("estimate_s", "reported_s"), [(-0.55, 0.55), (-0.48, 0.52)])

@@ -9,14 +9,18 @@ from msgspec.structs import replace
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.convention.axes import UNIT_SIZES_M
-from px4fuse.convention.correction import MIN_REMAINDER_DEG, Faults, convention_faults
+from px4fuse.convention.correction import (
+    MIN_RESIDUAL_ROTATION_DEG,
+    ConventionFaults,
+    find_convention_faults,
+)
 from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.convention.texts import (
     FRAME_AXES,
-    axes_as_sent,
     describe_axes,
     describe_conversion,
     describe_unit,
+    find_true_axes,
     format_axes,
 )
 from px4fuse.finding import Finding
@@ -33,7 +37,7 @@ ConventionFault = tuple[str, str, str, str]
 
 
 def detect(analysis: Comparison) -> Findings:
-    convention, faults = analysis.convention, _convention_faults(analysis)
+    convention, faults = analysis.convention, _find_convention_faults(analysis)
     if convention is None:
         return
     for name, kind, message, action in (
@@ -53,7 +57,7 @@ def apply_convention(analysis: Comparison, findings: Sequence[Finding]) -> list[
 
     Findings on EKF2 remain as effects, because EKF2 used the positions without correction.
     """
-    faults = _convention_faults(analysis)
+    faults = _find_convention_faults(analysis)
     root_findings = [item for item in findings if CONVENTION in item.evidence]
     unusable_findings = [item for item in findings if CATALOGUE[item.id].role == "unusable"]
     if unusable_findings:
@@ -104,12 +108,12 @@ def _is_effect(item: Finding) -> bool:
     return CATALOGUE[item.id].after_wrong_convention == "effect"
 
 
-def _convention_faults(analysis: Comparison) -> Faults:
-    return convention_faults(analysis.convention, analysis.flight, analysis.source.frame)
+def _find_convention_faults(analysis: Comparison) -> ConventionFaults:
+    return find_convention_faults(analysis.convention, analysis.flight, analysis.source.frame)
 
 
 def _position_faults(
-    convention: Convention, faults: Faults, source: PositionTrack
+    convention: Convention, faults: ConventionFaults, source: PositionTrack
 ) -> Iterator[ConventionFault]:
     positions, alignment = positions_phrase(source), source.alignment
     is_file = alignment is not None
@@ -119,8 +123,8 @@ def _position_faults(
         f"to the second best {'above ' if log_odds == 99.0 else ''}{log_odds:.0f} nats)."
     )
     stated_frame = alignment.frame.upper() if alignment else "NED"
-    axes, turn_deg = axes_as_sent(convention.axes, stated_frame), faults.rotation_deg
-    is_other_frame = is_file and abs(convention.rotation_deg) <= MIN_REMAINDER_DEG
+    axes, turn_deg = find_true_axes(convention.axes, stated_frame), faults.rotation_deg
+    is_other_frame = is_file and abs(convention.rotation_deg) <= MIN_RESIDUAL_ROTATION_DEG
     if faults.has_wrong_axes or (turn_deg and is_other_frame and axes in FRAME_AXES.values()):
         orientation = convention.orientation
         usage_text = "The analysis uses the positions converted to NED."
@@ -201,7 +205,7 @@ def _position_faults(
 
 
 def _orientation_faults(
-    orientation: OrientationConvention | None, faults: Faults, source: str
+    orientation: OrientationConvention | None, faults: ConventionFaults, source: str
 ) -> Iterator[ConventionFault]:
     if orientation is None or not faults.orientation:
         return
