@@ -471,7 +471,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     ),
     "the first page away": (kids(lambda k: k[1:]), "", False),
     "a page twice": (kids(lambda k: [*k[:2], *k[1:]]), "", False),
-    "a page more": (kids(lambda k: [*k, k[0]]), "the redrawn report has only 2 pages", False),
+    "a page more": (kids(lambda k: [*k, k[0]]), "drawn from the log has only 2 pages", False),
     "two pages exchanged": (kids(lambda k: [k[1], k[0], *k[2:]]), "", False),
     # the document
     "an opening action": (
@@ -591,8 +591,8 @@ FILES: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "a version appended": (lambda pdf: append_update(pdf, empty_first_page), "drawing operation"),
     "a table behind the end": (shadowed, "the file has bytes after the end of the PDF"),
     "bytes behind the end": (lambda pdf: pdf + b"\n% Eve\n", "bytes after the end of the PDF"),
-    "a table at the beginning": (linearised, "the file has a second cross-reference table"),
-    "a hybrid table": (hybrid, "the file has a second cross-reference table"),
+    "a table at the beginning": (linearised, "second cross-reference table"),
+    "a hybrid table": (hybrid, "second cross-reference table"),
     "a later generation": (later_generation, "/Contents refers to an object of generation above 0"),
     "a key twice": (
         lambda pdf: pdf.replace(b"/Tabs/S", b"/Tabs/S/Tabs/S", 1), "the PDF cannot be read",
