@@ -41,7 +41,7 @@ from px4fuse.flight.model import (
     Unavailable,
 )
 from px4fuse.readers import read_log
-from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S
+from px4fuse.readers.px4_aids import MAX_VARIANCE_TIME_DIFFERENCE_S
 from px4fuse.readers.px4_positions import motion_capture_truth
 
 HALF_PERIOD_S = 0.005  # s; half of the prediction interval, EKF2_PREDICT_US 10,000
@@ -330,7 +330,7 @@ def test_ekf2_innovations_without_variance_in_time_are_dropped(read):
     for name in late:
         late[name] = late[name][kept]
     whole, ekf2 = read(make_log("v1.12")).ekf2, read(log).ekf2
-    assert times(ekf2.innovations["north"]).max() < 5.0 + JOIN_TOLERANCE_S
+    assert times(ekf2.innovations["north"]).max() < 5.0 + MAX_VARIANCE_TIME_DIFFERENCE_S
     assert not any("were dropped" in note for note in whole.notes)
     gone = len(whole.innovations["north"]) - len(ekf2.innovations["north"])
     said = f"{gone} samples of estimator_innovations (north, east) were dropped, because"

@@ -36,7 +36,7 @@ from px4fuse.flight.model import (
     rows_between,
     time_index,
 )
-from px4fuse.readers.px4_ekf2 import rows_of_timestamps, samples_per_step
+from px4fuse.readers.px4_ekf2 import find_rows_of_timestamps, samples_per_step
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
@@ -481,7 +481,7 @@ def _make_segment(
     imu_s = imu_s[segment_rows]
     imu = imu.iloc[segment_rows]
     imu_intervals_s = np.diff(imu_s)
-    end_stamps = rows_of_timestamps(imu_s, fusion_record.delayed.index)
+    end_stamps = find_rows_of_timestamps(imu_s, fusion_record.delayed.index)
     step_end_indices = step_ends(imu_intervals_s, end_stamps, predict_s(fusion_record))
     accelerometer_bias = np.asarray(initial_row[Columns.ACCELEROMETER_BIAS])
     gyro_bias = np.asarray(initial_row[Columns.GYRO_BIAS])
