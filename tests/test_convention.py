@@ -37,7 +37,9 @@ UNIT_VECTORS = {
     "north": (1, 0, 0), "south": (-1, 0, 0), "east": (0, 1, 0), "west": (0, -1, 0),
     "down": (0, 0, 1), "up": (0, 0, -1),
 }  # fmt: skip
-ALL_AXES = [assignment.axes(quarter) for assignment in AXIS_ASSIGNMENTS for quarter in range(4)]
+ALL_AXES = [
+    assignment.find_directions(quarter) for assignment in AXIS_ASSIGNMENTS for quarter in range(4)
+]
 ENU, NWU = ("east", "north", "up"), ("north", "west", "up")
 # Rotations of NED to ENU and NWU, and of FRD to FLU
 NED_TO = {"ENU": (0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0), "NWU": (0.0, 1.0, 0.0, 0.0)}
