@@ -38,7 +38,7 @@ from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.comparison.preparation import explain_missing_source, prepare, shift_clock
 from px4fuse.comparison.remedy import estimate_ekf2_parameters
 from px4fuse.comparison.reruns import Reruns, list_rerun_configurations, rerun_filters
-from px4fuse.convention.correction import convention_faults
+from px4fuse.convention.correction import find_convention_faults
 from px4fuse.core.memory import release_free_memory
 from px4fuse.core.reading import display_name
 from px4fuse.ekf2.aids import evaluate_aids
@@ -183,7 +183,7 @@ def refine_delay(comparison: Comparison, clock: ClockOffset | Unavailable) -> Co
     # Positions were corrected by the detected delay, so the report must contain it: keep it if the
     # refined delay is too small to be a fault
     is_fault = all(
-        convention_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
+        find_convention_faults(convention, comparison.flight, comparison.source.frame).late_s != 0.0
         for convention in (comparison.convention, refined_convention)
     )
     return replace(comparison, convention=refined_convention) if is_fault else comparison

@@ -28,7 +28,7 @@ from px4fuse.results.contract import ReportedResults, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.verification import verification
 from px4fuse.verification.model import Verification
-from px4fuse.verification.verification import Recomputed, verify
+from px4fuse.verification.verification import RecomputedReport, verify
 
 Forge = Callable[[PdfWriter], Any]
 Edit = Callable[[bytes], bytes]
@@ -202,7 +202,7 @@ RECOMPUTE = verification.recompute
 def verify_with(
     pdf: bytes,
     files: Mapping[str, Path],
-    recompute: Callable[..., Recomputed | Verification],
+    recompute: Callable[..., RecomputedReport | Verification],
 ) -> Verification:
     """Verify a report with another function that repeats its analysis."""
     report = read_attached_results(pdf)
@@ -216,12 +216,12 @@ class VerifiedReport:
 
     pdf: bytes
     results: dict[str, Any]
-    again: Recomputed
+    again: RecomputedReport
     files: Mapping[str, Path]
 
     def recompute(
         self, results: ReportedResults, logs: Mapping[str, Path]
-    ) -> Recomputed | Verification:
+    ) -> RecomputedReport | Verification:
         """Return the analysis; the stored one if request, student, log and versions are equal."""
         ours, theirs = (
             # the command is derived from the request

@@ -89,9 +89,9 @@ def position_file(
     values = np.full((len(time_s), len(SAMPLE_COLUMNS)), np.nan)
     values[:, :3], values[:, 3:6] = xyz_m, sigma_m
     return PositionRecording(
-        name="uwb.csv", sha256="f" * 64, size_bytes=1234, clock="UNIX",
+        name="uwb.csv", sha256="f" * 64, size_bytes=1234, clock_kind="UNIX",
         frames=(frame,) if frame else (),
-        samples=table(time_s, values, SAMPLE_COLUMNS), detected=("time: column 1",),
+        samples=table(time_s, values, SAMPLE_COLUMNS), detection_notes=("time: column 1",),
         notes=("two rows dropped",),
     )  # fmt: skip
 

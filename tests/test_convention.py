@@ -17,8 +17,8 @@ from flights import given_placement
 from px4fuse.comparison.model import Comparison
 from px4fuse.convention.axes import AXIS_ASSIGNMENTS, CLOCKWISE_DIRECTIONS, UNIT_SIZES_M
 from px4fuse.convention.check import check_convention
-from px4fuse.convention.correction import Faults, convention_faults
-from px4fuse.convention.model import Axes, Convention, OrientationConvention
+from px4fuse.convention.correction import ConventionFaults, find_convention_faults
+from px4fuse.convention.model import AxisDirections, Convention, OrientationConvention
 from px4fuse.diagnose import prepare_comparison, refine_delay
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.finding import Finding
@@ -44,7 +44,9 @@ UNIT_VECTORS = {
     "north": (1, 0, 0), "south": (-1, 0, 0), "east": (0, 1, 0), "west": (0, -1, 0),
     "down": (0, 0, 1), "up": (0, 0, -1),
 }  # fmt: skip
-ALL_AXES = [assignment.axes(quarter) for assignment in AXIS_ASSIGNMENTS for quarter in range(4)]
+ALL_AXES = [
+    assignment.find_directions(quarter) for assignment in AXIS_ASSIGNMENTS for quarter in range(4)
+]
 ENU, NWU = ("east", "north", "up"), ("north", "west", "up")
 # Rotations of NED to ENU and NWU, and of FRD to FLU
 NED_TO = {"ENU": (0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0), "NWU": (0.0, 1.0, 0.0, 0.0)}
@@ -80,7 +82,7 @@ def flown(seed: int = 3, *mistakes: str) -> Flight:
 
 def sent(
     flight: Flight,
-    axes: Axes = ("north", "east", "down"),
+    axes: AxisDirections = ("north", "east", "down"),
     unit: str = "m",
     rotation_deg: float = 0.0,
     late_s: float = 0.0,
@@ -156,7 +158,7 @@ def test_yaw_rotation_refers_to_gnss_if_ekf2_heading_is_wrong():
     no_ekf2 = Unavailable("EKF2", "not logged", "")
     flight = replace(flown(), attitude=attitude, positions=(gnss,), ekf2=no_ekf2)
     found = check_convention(flight, sent(flown(), rotation_deg=60.0))
-    assert convention_faults(found, flight, "NED").rotation_deg == pytest.approx(60.0, abs=2.0)
+    assert find_convention_faults(found, flight, "NED").rotation_deg == pytest.approx(60.0, abs=2.0)
 
 
 @pytest.mark.parametrize("clock_drift", [-0.04, -0.01, 0.02])
@@ -324,9 +326,9 @@ def fused(flight: Flight) -> Flight:
 @pytest.mark.parametrize(("axes", "rotation_deg", "expected"), [
     (
         ("west", "south", "up"), 20.0,
-        Faults(has_wrong_axes=True, affects_ekf2=True, is_north_unknown=True),
+        ConventionFaults(has_wrong_axes=True, affects_ekf2=True, is_north_unknown=True),
     ),
-    (("west", "north", "down"), -32.0, Faults()),
+    (("west", "north", "down"), -32.0, ConventionFaults()),
 ])  # fmt: skip
 def test_vision_that_defines_heading_of_ekf2_has_no_yaw_fault(axes, rotation_deg, expected):
     convention = Convention(
@@ -334,13 +336,13 @@ def test_vision_that_defines_heading_of_ekf2_has_no_yaw_fault(axes, rotation_deg
         heading_from="gyroscopes", orientation=OrientationConvention(verdict="determined",
         frames="FLU to ENU" if axes[2] == "up" else "FRD to NED"),
     )  # fmt: skip
-    assert convention_faults(convention, fused(flown()), "NED") == expected
+    assert find_convention_faults(convention, fused(flown()), "NED") == expected
 
 
 def test_positions_in_frd_frame_have_no_yaw_fault():
     convention = Convention(verdict="determined", x="west", y="north", rotation_deg=-32.0)
-    assert not convention_faults(convention, flown(), "FRD")
-    assert convention_faults(convention, flown(), "NED").rotation_deg == pytest.approx(58.0)
+    assert not find_convention_faults(convention, flown(), "FRD")
+    assert find_convention_faults(convention, flown(), "NED").rotation_deg == pytest.approx(58.0)
 
 
 @pytest.mark.parametrize(("estimate_s", "reported_s"), [(-0.55, 0.55), (-0.48, 0.52)])

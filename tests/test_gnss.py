@@ -734,8 +734,8 @@ def test_gnss_receiver_interval_is_found_from_logged_fixes():
     rng = np.random.default_rng(3)
     for interval_s in (0.1, 0.096, 0.2, 0.125):
         remaining = np.cumsum(rng.choice([4, 5, 6], 100)) * interval_s
-        found = px4_fixes._receiver_interval_s(remaining + rng.normal(0.0, 0.0005, 100))
+        found = px4_fixes._estimate_receiver_interval(remaining + rng.normal(0.0, 0.0005, 100))
         assert found == pytest.approx(interval_s, rel=0.01)
-    assert px4_fixes._receiver_interval_s(np.cumsum(rng.uniform(0.3, 0.9, 100))) is None
+    assert px4_fixes._estimate_receiver_interval(np.cumsum(rng.uniform(0.3, 0.9, 100))) is None
     # ambiguous: every fifth of 0.1 s, or every fourth of 0.125 s
-    assert px4_fixes._receiver_interval_s(np.arange(100) * 0.5) is None
+    assert px4_fixes._estimate_receiver_interval(np.arange(100) * 0.5) is None

@@ -201,8 +201,8 @@ def link_and_page_action(writer: PdfWriter) -> None:
 
 
 ACTS = {
-    "opens an address": on_root("/OpenAction", OPENS),
-    "that opens an address": on_root("/OpenAction", dictionary(S=NameObject("/GoTo"), Next=OPENS)),
+    "opens a URL": on_root("/OpenAction", OPENS),
+    "that opens a URL": on_root("/OpenAction", dictionary(S=NameObject("/GoTo"), Next=OPENS)),
     "an action that opens": on_root(
         "/OpenAction", dictionary(S=NameObject("/GoTo"), Next=ArrayObject([OPENS]))
     ),
@@ -216,7 +216,7 @@ ACTS = {
     "SubmitForm": on_root("/Outlines", dictionary(A=action("SubmitForm"))),
     "GoToR": on_root("/Outlines", dictionary(A=action("GoToR", F=TEXT))),
     "GoToE": on_root("/Outlines", dictionary(A=action("GoToE"))),
-    "a reference to another": on_root("/X", dictionary(Type=NameObject("/Filespec"), F=TEXT)),
+    "a reference to an external": on_root("/X", dictionary(Type=NameObject("/Filespec"), F=TEXT)),
     "Rendition": annotation(Subtype=NameObject("/Screen"), A=action("Rendition")),
     "contains Launch": annotation(Subtype=NameObject("/Link"), A=action("Launch")),
     "contains a reference": annotation(FS=dictionary(Type=NameObject("/Filespec"))),

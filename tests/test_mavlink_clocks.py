@@ -30,7 +30,7 @@ from mavlink_tools import (
 from px4fuse.errors import SettingsError
 from px4fuse.flight.model import Flight, sample_rate
 from px4fuse.readers import read_log
-from px4fuse.readers.mavlink_clocks import ClockLine, fit_least_delay, map_clock
+from px4fuse.readers.mavlink_clocks import ClockLine, fit_clock_line, map_clock
 
 EMPTY = np.zeros(0)
 NO_EXCHANGES = (EMPTY, EMPTY), (EMPTY, EMPTY)
@@ -57,7 +57,7 @@ def test_mavlink_clock_fit_with_random_delay_recovers_offset(offset, drift_ppm, 
     rng = np.random.default_rng(seed)
     x = np.arange(1200) * 0.1
     exact = offset + (1.0 + drift_ppm * 1e-6) * x
-    line = fit_least_delay(x, exact + least + rng.exponential(scale, len(x)))
+    line = fit_clock_line(x, exact + least + rng.exponential(scale, len(x)))
     error = line.at(x) - exact - least
     rounding = 4.0 * np.spacing(abs(offset) + 200.0)
     assert np.all(error > -0.2 * scale - rounding)
@@ -68,7 +68,7 @@ def test_mavlink_clock_fit_with_random_delay_recovers_offset(offset, drift_ppm, 
 @pytest.mark.parametrize(("span", "slope"), [(100.0, 1.00005), (20.0, 1.0)])
 def test_mavlink_clock_fit_of_messages_without_delay_is_exact(span, slope):
     x = np.linspace(0.0, span, 500)
-    line = fit_least_delay(x, 7.0 + 1.00005 * x)
+    line = fit_clock_line(x, 7.0 + 1.00005 * x)
     assert (line.pair_count, line.slope) == (500, pytest.approx(slope, abs=1e-12))
     np.testing.assert_allclose(line.at(x), 7.0 + 1.00005 * x, atol=1e-9 if span > 30 else 1e-3)
     np.testing.assert_allclose(line.inverse().at(line.at(x)), x, atol=1e-9)
@@ -80,7 +80,7 @@ def test_mavlink_clock_fit_of_messages_without_delay_is_exact(span, slope):
 def test_clock_fit_finds_playback_speed_of_recording(speed, span):
     x = np.linspace(0.0, span, 600)
     delay = np.random.default_rng(1).exponential(0.01, len(x))
-    line = fit_least_delay(x, 5.0 + speed * x + delay)
+    line = fit_clock_line(x, 5.0 + speed * x + delay)
     assert line.slope == pytest.approx(speed, rel=0.01)
     assert np.abs(line.at(x) - 5.0 - speed * x).max() < 0.05
 
@@ -93,7 +93,7 @@ def test_clock_fit_finds_playback_speed_of_recording(speed, span):
 @settings(max_examples=100)
 def test_mavlink_clock_fit_of_any_time_pairs_is_invertible(pairs):
     x, y = np.array(pairs).T
-    line = fit_least_delay(x, y)
+    line = fit_clock_line(x, y)
     turned = line.inverse()
     assert line.slope > 0.0
     assert turned.slope > 0.0

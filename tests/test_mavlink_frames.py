@@ -70,7 +70,7 @@ def read(tmp_path):
 
 
 def names(frames: MavlinkFrames) -> list[str]:
-    return [message_name(number) for number in frames.message_id.tolist()]
+    return [message_name(number) for number in frames.message_ids.tolist()]
 
 
 def stamped(*contents: bytes) -> bytes:
@@ -131,7 +131,7 @@ def assert_equals_pymavlink(path: Path) -> None:
     count = 0
     for name, all_heard in heard.items():
         rows = np.array([at[one.start] for one in all_heard], dtype=np.intp)
-        assert (frames.message_id[rows] == MESSAGES[name].id).all()
+        assert (frames.message_ids[rows] == MESSAGES[name].id).all()
         assert_same_values(MESSAGES[name], name, frames.table(name, rows), all_heard)
         senders = np.column_stack([frames.system[rows], frames.component[rows]])
         np.testing.assert_array_equal(senders, [one.sender for one in all_heard])

@@ -329,14 +329,14 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     },
     "no annotations": (page(1, "/Annots", array()), "an annotation", True),
     # fonts
-    "glyphs exchanged by a map": (exchanged_glyphs, "the type of the PDF entry /CIDToGIDMap", True),
+    "glyphs exchanged by a map": (exchanged_glyphs, "/CIDToGIDMap has another type", True),
     "outlines exchanged": (
-        replace_stream(descriptor, "/FontFile2", exchanged_outlines), "the content of /FontFile2 ",
+        replace_stream(descriptor, "/FontFile2", exchanged_outlines), "/FontFile2 differs",
         False,
     ),
     "letters exchanged": (
         replace_stream(font("/f0"), "/ToUnicode", lambda c: c.replace(b"> <0031>", b"> <0039>")),
-        "the content of /ToUnicode ", False,
+        "the PDF entry /ToUnicode differs", False,
     ),
     "widths": (descendant("/W", array(N(0), N(60), N(0))), "the PDF array /W has 3 elements", True),
     "the default width": (descendant("/DW", N(900)), "the PDF entry /DW is '900'", False),
@@ -412,10 +412,10 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "an inline image": (
         draw_on_page(b"BI /W 1 /H 1 /BPC 8 /CS /G ID \xff EI"), "drawing operation", False,
     ),
-    "a long content": (content(lambda c: c * 5), "the content of /Contents ", False),
+    "a long content": (content(lambda c: c * 5), "the PDF entry /Contents differs", False),
     "a comment": (content(lambda c: c + b"\n% x\n"), "drawing operation", False),
-    "a second content stream": (second_content, "the type of the PDF entry /Contents", True),
-    "an array of contents": (contents_in_an_array, "the type of the PDF entry /Contents", True),
+    "a second content stream": (second_content, "/Contents has another type", True),
+    "an array of contents": (contents_in_an_array, "/Contents has another type", True),
     "content taken for a JPEG": (jpeg_content, "the compression of the PDF entry /Contents", True),
     # resources
     "an image": (
@@ -471,7 +471,7 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     ),
     "the first page away": (kids(lambda k: k[1:]), "", False),
     "a page twice": (kids(lambda k: [*k[:2], *k[1:]]), "", False),
-    "a page more": (kids(lambda k: [*k, k[0]]), "the redrawn report has only 2 pages", False),
+    "a page more": (kids(lambda k: [*k, k[0]]), "drawn from the log has only 2 pages", False),
     "two pages exchanged": (kids(lambda k: [k[1], k[0], *k[2:]]), "", False),
     # the document
     "an opening action": (
@@ -516,12 +516,12 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "a subject": (document_info(Subject="verified"), "an entry /Subject", True),
     "XMP's title": (
         replace_stream(lambda w: w.root_object, "/Metadata",
-                 lambda c: c.replace(b"px4fuse loop", b"verified:")), "the content of /M", False,
+                 lambda c: c.replace(b"px4fuse loop", b"verified:")), "/Metadata differs", False,
     ),
     "XMP with entities": (
         replace_stream(lambda w: w.root_object, "/Metadata",
                  lambda c: c.replace(b"?><x:", b'?><!DOCTYPE a [<!ENTITY b "c">]><x:')),
-        "the content of /Metadata", False,
+        "/Metadata differs", False,
     ),
     "XMP that is no XML": (
         replace_stream(lambda w: w.root_object, "/Metadata", lambda c: c + b"<"), "the PDF cannot",
@@ -591,9 +591,9 @@ FILES: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "a version appended": (lambda pdf: append_update(pdf, empty_first_page), "drawing operation"),
     "a table behind the end": (shadowed, "the file has bytes after the end of the PDF"),
     "bytes behind the end": (lambda pdf: pdf + b"\n% Eve\n", "bytes after the end of the PDF"),
-    "a table at the beginning": (linearised, "the file has a second cross-reference table"),
-    "a hybrid table": (hybrid, "the file has a second cross-reference table"),
-    "a later generation": (later_generation, "/Contents refers to an object of generation above 0"),
+    "a table at the beginning": (linearised, "second cross-reference table"),
+    "a hybrid table": (hybrid, "second cross-reference table"),
+    "a later generation": (later_generation, "/Contents was changed (object generation above 0)"),
     "a key twice": (
         lambda pdf: pdf.replace(b"/Tabs/S", b"/Tabs/S/Tabs/S", 1), "the PDF cannot be read",
     ),

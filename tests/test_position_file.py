@@ -107,7 +107,7 @@ def assert_track(
 
 def assert_stated(file: PositionRecording, *words: str) -> None:
     """Check that one of the sentences contains all of these words."""
-    sentences = (*file.detected, *file.notes)
+    sentences = (*file.detection_notes, *file.notes)
     assert any(all(word in sentence for word in words) for sentence in sentences), sentences
 
 
@@ -150,7 +150,7 @@ def test_read_position_file_of_every_dialect_gives_equal_samples(read, dialect):
     assert_track(file)
     assert (file.name, file.size_bytes) == ("uwb.csv", len(content))
     assert file.sha256 == hashlib.sha256(content).hexdigest()
-    assert file.clock == "UNIX"
+    assert file.clock_kind == "UNIX"
     assert file.frames == ()
     assert file.samples[SAMPLE_COLUMNS[3:]].isna().all(axis=None)
 
@@ -190,7 +190,7 @@ def test_read_position_file_detects_time_unit_and_clock(read, case):
     name, texts, start_us, clock = TIMES[case]
     file = read(table({name: texts, "x": X, "y": Y, "z": Z}))
     assert_track(file, start_us=start_us)
-    assert file.clock == clock
+    assert file.clock_kind == clock
 
 
 def test_read_position_file_keeps_microseconds_of_ns_timestamps(read):
@@ -295,7 +295,7 @@ def test_read_position_file_unit_option_overrides_column_name(read, unit):
 
 @pytest.mark.parametrize(("x", "words"), [
     ([*X[:7], "4000.0", *X[8:]], "px4fuse assumes metres, because the column names contain no"),
-    (fixed(np.linspace(0.0, 5e6, ROWS), 1), "no unit gives the extent of an indoor flight"),
+    (fixed(np.linspace(0.0, 5e6, ROWS), 1), "the extent is too large for an indoor flight"),
 ])  # fmt: skip
 def test_read_position_file_unit_is_not_changed_by_outlier(read, x, words):
     file = read(table({**PLAIN, "x": x}))
@@ -395,9 +395,9 @@ def test_read_position_file_drops_backward_timestamps(read, shifts_us, dropped):
 @pytest.mark.parametrize("name", ["tag_id", "tagid", "node"])
 def test_read_position_file_with_two_tags_requires_body(read, name):
     text = table({name: ["A1", "B2"] * (ROWS // 2), **PLAIN})
-    assert "contains the bodies A1, B2. Choose a body with --body." in error_message(read, text)
+    assert "contains the rigid bodies or tags A1, B2. Choose one" in error_message(read, text)
     assert_track(read(text, body="B2"), rows=slice(1, None, 2))
-    assert "contains the bodies A1, B2" in error_message(read, text, body="C3")
+    assert "contains the rigid bodies or tags A1, B2" in error_message(read, text, body="C3")
     assert "only one body, which has no name" in error_message(read, table(PLAIN), body="C3")
 
 
@@ -497,7 +497,7 @@ def check_any(read, content: bytes) -> None:
     assert np.isfinite(samples.index).all()
     assert np.isfinite(samples[["x_m", "y_m"]].to_numpy()).all()
     assert not np.isinf(samples.to_numpy()).any()
-    assert all(len(line.splitlines()) == 1 for line in (*file.detected, *file.notes))
+    assert all(len(line.splitlines()) == 1 for line in (*file.detection_notes, *file.notes))
 
 
 @pytest.mark.parametrize(
@@ -529,7 +529,7 @@ def test_read_position_file_of_real_uwb_file_keeps_its_values(pattern, time, cou
         truth = truth[truth[["v0", "v1", "v2"]].notna().all(axis=1)]
         np.testing.assert_array_equal(file.samples.index, truth[time])
         np.testing.assert_array_equal(file.samples[AXES], truth[["v0", "v1", "v2"]])
-        assert file.clock == "UNIX"
+        assert file.clock_kind == "UNIX"
         assert_stated(file, f"'{time}'", "of recording" if time == "bag_time" else "of measurement")
         dropped = len(pd.read_csv(path)) - len(truth)
         if dropped:

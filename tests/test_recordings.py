@@ -57,7 +57,7 @@ def largest_errors(
     ])  # fmt: skip
     xyz = original[:, 1:][:, order] * signs
     error_s = time_s - original[:, 0]
-    if recording.clock == "local":
+    if recording.clock_kind == "local":
         error_s = error_s - np.median(error_s)
     error_m = recording.samples[["x_m", "y_m", "z_m"]].to_numpy() - xyz
     return float(np.abs(error_m).max()), float(np.abs(error_s).max())
@@ -185,7 +185,7 @@ def check_track(recording: PositionRecording, clock: str) -> None:
     error_m, error_s = largest_errors(recording, original, "x north, y east, z down")
     assert error_m <= 1e-9
     assert error_s <= 2e-6
-    assert recording.clock == clock
+    assert recording.clock_kind == clock
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -201,7 +201,7 @@ def test_read_position_file_with_two_bodies_lists_their_names(name: str, tmp_pat
     file_name, content, body, _ = FORMATS[name]
     path = tmp_path / file_name
     path.write_text(content)
-    with pytest.raises(Px4FuseError, match=rf"the bodies .*{body}.*--body"):
+    with pytest.raises(Px4FuseError, match=rf"bodies or tags .*{body}.*--body"):
         read_position_file(path)
     check_track(read_position_file(f"{path}:{body}"), FORMATS[name][3])
 
@@ -304,7 +304,7 @@ def test_read_trajectory_from_each_rosbag_format_equals_original(plugin, tmp_pat
         assert (trajectory.rotation.inv() * ROTATION).magnitude().max() < 1e-9
         assert any("received 0.0" in note for note in trajectory.notes)
     with pytest.raises(
-        Px4FuseError, match=r"these topics with positions: /drone/pose\. Give .*:TOPIC"
+        Px4FuseError, match=r"topics with positions: /drone/pose\. Give the topic as .*:TOPIC"
     ):
         read_trajectory(path, "/text")
 

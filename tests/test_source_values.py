@@ -30,7 +30,7 @@ from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.model import finding
 from px4fuse.flight.model import REPEATED_TIMESTAMPS_NOTE, ClockMap, Columns, Flight
 from px4fuse.readers import read_log
-from px4fuse.readers.common import find_invalid_rows, rounding_step
+from px4fuse.readers.common import estimate_rounding_step, find_invalid_rows
 from px4fuse.readers.position_file import read_position_file
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
@@ -96,12 +96,12 @@ def test_constant_positions_at_rest_are_valid():
 @pytest.mark.parametrize(("origin", "step"), [(5_334_567.0, 0.5), (691_234.0, 0.0625)])
 def test_rounding_step_of_float32_positions_is_found(origin, step):
     values = origin + np.random.default_rng(1).normal(0.0, 5.0, 400)
-    assert rounding_step(values.astype(np.float32).astype(float)) == step
-    assert rounding_step(values) < 0.01
+    assert estimate_rounding_step(values.astype(np.float32).astype(float)) == step
+    assert estimate_rounding_step(values) < 0.01
 
 
 def test_position_resolution_of_subnormal_difference_is_zero():
-    assert rounding_step(np.array([0.0, 5e-324, 1e10])) == 0.0
+    assert estimate_rounding_step(np.array([0.0, 5e-324, 1e10])) == 0.0
 
 
 @pytest.mark.parametrize(("column", "name", "severity", "control"), [

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.errors import TrajectoryError
 from px4fuse.readers import position_file
-from px4fuse.readers.trajectory import read_trajectory, tum_text
+from px4fuse.readers.trajectory import format_tum, read_trajectory
 from px4fuse.trajectory.model import Trajectory
 
 # Track of all dialects
@@ -132,7 +132,7 @@ def test_read_trajectory_detects_camera_frame_by_level_motion(
     position = level[:, ["xyz".index(axis) for axis in axes]]
     position = Rotation.from_euler("x", tilt_deg, degrees=True).apply(position)
     made = Trajectory("t", "slam", angle, position, Rotation.identity(200))
-    got = read_trajectory(write(tmp_path, tum_text(made)))
+    got = read_trajectory(write(tmp_path, format_tum(made)))
     assert (got.kind, got.frame) == ("slam", frame)
 
 
@@ -140,12 +140,12 @@ def test_read_trajectory_reports_gaps_and_repeated_timestamps(tmp_path: Path) ->
     time = np.arange(1000) * 0.05
     keep = ((time < 10) | (time > 14)) & ((time < 30) | (time > 31))
     made = Trajectory("t", "unknown", time, np.tile(POSITION_M, (20, 1)), Rotation.identity(1000))
-    notes = " ".join(read_trajectory(write(tmp_path, tum_text(made[keep]))).notes)
+    notes = " ".join(read_trajectory(write(tmp_path, format_tum(made[keep]))).notes)
     gaps = "Poses are missing for 5.1 s in 2 gaps. The longest gap begins 10.0 s after the"
     assert gaps in notes
     irregular = made[np.flatnonzero(np.random.default_rng(1).random(1000) < 0.2)]
-    assert "key frames" in " ".join(read_trajectory(write(tmp_path, tum_text(irregular))).notes)
-    lines = tum_text(made).split("\n")
+    assert "key frames" in " ".join(read_trajectory(write(tmp_path, format_tum(irregular))).notes)
+    lines = format_tum(made).split("\n")
     lines.insert(500, lines[500])
     again = read_trajectory(write(tmp_path, "\n".join(lines)))
     assert len(again) == 1000
@@ -241,18 +241,18 @@ def test_trajectory_written_as_tum_is_read_back_exactly(
 ) -> None:
     time_s, rotation = start + np.cumsum(steps), Rotation.from_quat(quaternion)
     made = Trajectory("t", "unknown", time_s, position, rotation)
-    once = read_trajectory(write(tmp_path, tum_text(made)))
+    once = read_trajectory(write(tmp_path, format_tum(made)))
     np.testing.assert_array_equal(once.time_s, made.time_s)
     np.testing.assert_array_equal(once.position_m, made.position_m)
     np.testing.assert_array_equal(once.rotation.as_quat(), made.rotation.as_quat())
-    assert tum_text(once) == tum_text(made)
+    assert format_tum(once) == format_tum(made)
 
 
 def test_tum_file_has_unix_time_and_requires_orientation(tmp_path: Path) -> None:
     made = Trajectory("t", "vio", np.arange(5.0), POSITION_M[:5], ROTATION[:5], unix_offset_s=1.5e9)
-    assert read_trajectory(write(tmp_path, tum_text(made))).time_s[0] == 1.5e9
+    assert read_trajectory(write(tmp_path, format_tum(made))).time_s[0] == 1.5e9
     with pytest.raises(TrajectoryError, match="has no orientations"):
-        tum_text(replace(made, rotation=None))
+        format_tum(replace(made, rotation=None))
 
 
 @pytest.mark.parametrize("quaternion", ["0 0 0 0", "nan nan nan nan"])

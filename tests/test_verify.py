@@ -54,9 +54,9 @@ from px4fuse.verification import pages, verification
 from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import (
     ESTIMATE_RELATIVE_TOLERANCE,
-    LIMIT_NOTE,
     NO_LOG_REASON,
     RELATIVE_TOLERANCE,
+    VERIFICATION_SCOPE_NOTE,
     compare_results,
     flatten,
     verify,
@@ -99,7 +99,7 @@ def test_verify_unchanged_example_report_returns_verified(aisle: VerifiedReport)
     assert verdict.status == "verified", verdict
     assert verdict.with_log
     assert verdict.page_status == "same"
-    assert LIMIT_NOTE in verdict.reasons
+    assert VERIFICATION_SCOPE_NOTE in verdict.reasons
 
 
 def test_verify_unchanged_loop_report_returns_verified(loop: VerifiedReport) -> None:
@@ -177,7 +177,7 @@ def test_verify_reports_numbers_that_differ_by_1e_4(aisle: VerifiedReport) -> No
     for share, least in ((1e-4, RELATIVE_TOLERANCE), (1e-2, ESTIMATE_RELATIVE_TOLERANCE)):
         theirs = scaled(ours, share)
         found = {one.path for one in compare_results(theirs, ours)[0]}
-        wide = verification.ESTIMATE_PATHS if least == RELATIVE_TOLERANCE else ()
+        wide = verification.ESTIMATE_FIELDS if least == RELATIVE_TOLERANCE else ()
         expected = {
             path[:120] for path, value in flatten(ours)
             if isinstance(value, float) and abs(value) > 0.01 and not path.startswith(wide)
@@ -464,7 +464,7 @@ def test_verify_report_with_changed_page_returns_page_differs(
 DOCUMENT: dict[str, tuple[Forge, str, str]] = {
     "a page away": (
         lambda w: w.remove_page(REPORT_PAGES - 1), "page differs",
-        f"page {REPORT_PAGES}: the page is missing",
+        f"page {REPORT_PAGES}: the page of the new report is missing",
     ),
     "another title": (document_info(Title="my report"), "page differs", "document: the PDF entry"),
     "a form": (
@@ -492,7 +492,7 @@ def test_verify_report_with_changed_pdf_document_gives_reason(
     if expected == "cannot verify":
         assert said in verdict.reasons[0]
         assert verdict.remedy.startswith("Ask the author of the report")
-        assert LIMIT_NOTE not in verdict.reasons
+        assert VERIFICATION_SCOPE_NOTE not in verdict.reasons
 
 
 @pytest.mark.parametrize("key", ["/OpenAction", "/AA"])
@@ -599,10 +599,10 @@ def test_verify_command_prints_and_writes_the_verdict(
     target = tmp_path / "verdict.json"
     output = run_checked("verify", REPORT, LOOP_LOG, "--json", target, code=1).output
     assert "other log" in output
-    assert LIMIT_NOTE in output
+    assert VERIFICATION_SCOPE_NOTE in output
     told = json.loads(target.read_text(encoding="utf-8"))
     assert told["status"] == "other log"
-    assert told["limit"] == LIMIT_NOTE
+    assert told["limit"] == VERIFICATION_SCOPE_NOTE
     assert "cannot verify" in run_checked("verify", REPORT, code=1).output
     output = run_checked("verify", REPORT, "--json", "-", code=1).output
     assert json.loads(output)["status"] == "cannot verify"

@@ -37,7 +37,7 @@ from px4fuse.flight.model import (
     clock_of_repeated_timestamps,
     time_index,
 )
-from px4fuse.readers.common import finite_rows
+from px4fuse.readers.common import select_valid_rows
 from px4fuse.readers.position_file import PositionRecording
 from px4fuse.trajectory.model import NED_COMPONENTS
 
@@ -60,7 +60,7 @@ def _explain_mismatch(
         positions.to_numpy(), time_index(time_s.to_numpy()), Columns.POSITION
     )
     track = PositionTrack("", POSITION_FILE_ORIGIN, "", position_samples, "unknown", "", ())
-    search_limits = {} if problem.lag_s is not None else {"max_offset_s": span_s}
+    search_limits = {} if problem.lag_s is not None else {"max_time_offset_s": span_s}
     convention = check_convention(flight, track, **search_limits)
     if convention is None or convention.verdict != "determined":
         return None
@@ -123,7 +123,7 @@ def align_position_file(
         An option cannot be estimated, or file and log do not overlap in time.
     """
     _check_options(frame, yaw_deg, clock_offset_s)
-    samples = finite_rows(recording.samples, ["x_m", "y_m"])
+    samples = select_valid_rows(recording.samples, ["x_m", "y_m"])
     if len(samples) < tracks.MIN_SAMPLES:
         raise MissingDataError(
             f"{recording.name} contains {len(samples)} positions; at least "
@@ -134,8 +134,8 @@ def align_position_file(
     boot_time_s, duration_s = flight.log.boot_time_s, flight.log.duration_s
     spans_text = (
         f"the log is from {boot_time_s:.2f} s to {boot_time_s + duration_s:.2f} s on the boot "
-        f"clock, the position file from {start_s:.2f} s to {end_s:.2f} s on a {recording.clock} "
-        "clock"
+        f"clock, the position file from {start_s:.2f} s to {end_s:.2f} s on a "
+        f"{recording.clock_kind} clock"
     )
     lag_s = None if clock_offset_s is None else start_s + clock_offset_s - boot_time_s
     if lag_s is not None and not start_s - end_s <= lag_s <= duration_s:
@@ -171,7 +171,7 @@ def align_position_file(
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
     invalid, sample_count = recording.invalid, len(recording.samples)
     clock_map = clock_of_repeated_timestamps(
-        recording.clock, sample_count + recording.dropped, sample_count
+        recording.clock_kind, sample_count + recording.dropped_row_count, sample_count
     )
     track = PositionTrack(
         name=recording.name,
@@ -180,18 +180,20 @@ def align_position_file(
         f"{alignment.frame}{rotation_text}",
         samples=aligned_samples,
         frame="NED",
-        clock=f"{recording.clock} clock of the position file; boot clock minus this clock: "
+        clock=f"{recording.clock_kind} clock of the position file; boot clock minus this clock: "
         f"{alignment.clock_offset_s:+.3f} s ({offset_origin})",
         topics=(recording.name,),
         log=recording.name,
         alignment=alignment,
         clock_map=clock_map,
         invalid=invalid.set_axis(invalid.index + (aligned_samples.index[0] - start_s)),
-        step_m=recording.step_m,
+        step_m=recording.rounding_step_m,
     )
-    notes = [f"{recording.name}: {text}" for text in (*recording.detected, *recording.notes)]
+    notes = [f"{recording.name}: {text}" for text in (*recording.detection_notes, *recording.notes)]
     dropped_counts = (
-        {recording.name: recording.dropped} if recording.dropped and not clock_map else {}
+        {recording.name: recording.dropped_row_count}
+        if recording.dropped_row_count and not clock_map
+        else {}
     )
     log = flight.log
     return replace(
@@ -280,7 +282,7 @@ def _apply_alignment(
             "Check time offset, frame and yaw of the position file."
         )
     unix_start_s = flight.log.start_unix_s
-    if recording.clock == "UNIX" and unix_start_s is not None and clock_offset_s is not None:
+    if recording.clock_kind == "UNIX" and unix_start_s is not None and clock_offset_s is not None:
         difference_s = abs(flight.log.boot_time_s - clock_offset_s - unix_start_s)
         if difference_s >= MAX_UNIX_DIFFERENCE_S:
             warnings.append(

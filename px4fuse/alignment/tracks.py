@@ -21,7 +21,7 @@ from px4fuse.flight.model import (
     Unavailable,
     time_index,
 )
-from px4fuse.readers.common import finite_rows
+from px4fuse.readers.common import select_valid_rows
 from px4fuse.trajectory.association import gap_limit, is_bracketed
 from px4fuse.trajectory.model import NED_COMPONENTS
 from px4fuse.trajectory.time_offset import GRID_STEP_S
@@ -131,7 +131,7 @@ def compute_horizontal_range_m(track: SampledTrack) -> float:
 
 
 def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
-    finite_state = finite_rows(state, Columns.POSITION[:2])
+    finite_state = select_valid_rows(state, Columns.POSITION[:2])
     if len(finite_state) < MIN_SAMPLES:
         raise NoMatchError(f"the log has fewer than {MIN_SAMPLES} horizontal EKF2 positions")
     position_m = finite_state[Columns.POSITION].to_numpy()

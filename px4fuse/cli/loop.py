@@ -186,8 +186,8 @@ def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
 def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict[Path, bytes]:
     """Return the contents of the TUM file (corrected path) and the g2o file (pose graph)."""
     from px4fuse.loop.closure import from_z_down
-    from px4fuse.readers.g2o import g2o_text
-    from px4fuse.readers.trajectory import tum_text
+    from px4fuse.readers.g2o import format_g2o
+    from px4fuse.readers.trajectory import format_tum
 
     contents = {}
     if tum is not None:
@@ -197,18 +197,18 @@ def _output_files(loop_result: Loop, tum: Path | None, g2o: Path | None) -> dict
                 f"--tum {display_name(tum)}: the path is not corrected, as no loop closure was "
                 "accepted. Give a loop closure (--closure) or the landing place (--landed-at)."
             )
-        contents[tum] = tum_text(
+        contents[tum] = format_tum(
             from_z_down(best_path.trajectory, loop_result.original_frame)
         ).encode()
     if g2o is not None:
-        contents[g2o] = g2o_text(loop_result.solved_graph()).encode()
+        contents[g2o] = format_g2o(loop_result.solved_graph()).encode()
     return contents
 
 
 def _solve_graph(
     source: Path, json_path: Path | None, g2o: Path | None, robust: bool | None
 ) -> None:
-    from px4fuse.readers.g2o import g2o_text, read_g2o
+    from px4fuse.readers.g2o import format_g2o, read_g2o
     from px4fuse.report.loop import pose_graph_page
     from px4fuse.results.build import make_graph_results
     from px4fuse.trajectory.graph.solver import analyse_graph
@@ -230,6 +230,6 @@ def _solve_graph(
             display_name(source), read_g2o(path), show_progress, run_robust=robust
         )
     command = command_line(LoopRequest(source=str(source))) + (" --robust" if robust else "")
-    contents = {} if g2o is None else {g2o: g2o_text(solved_graph).encode()}
+    contents = {} if g2o is None else {g2o: format_g2o(solved_graph).encode()}
     contents |= outputs.result_files(make_graph_results(results, command), json_path)
     outputs.write_and_print(contents, pose_graph_page(results))

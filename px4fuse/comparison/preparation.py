@@ -9,7 +9,7 @@ from msgspec import structs
 from px4fuse.comparison.model import PreparedComparison
 from px4fuse.comparison.projection import find_observation_variance
 from px4fuse.convention.check import check_convention
-from px4fuse.convention.correction import convention_faults, correct_convention
+from px4fuse.convention.correction import correct_convention, find_convention_faults
 from px4fuse.core.text import capitalise_first
 from px4fuse.ekf2.fusion_conditions import constant_coordinates
 from px4fuse.errors import MissingDataError, SettingsError, suggest_name
@@ -85,7 +85,7 @@ def prepare(
     # A time offset from the user replaces the detected one
     if convention is not None and settings.clock_offset_s:
         convention = structs.replace(convention, late_s=0.0)
-    late_s = convention_faults(convention, flight, source_track.frame).late_s
+    late_s = find_convention_faults(convention, flight, source_track.frame).late_s
     # A time offset outside the valid range is set to the limit of the range
     limits_s = SETTING_RANGES["clock_offset_s"][:2]
     clock_offset_s = float(np.clip(settings.clock_offset_s - late_s, *limits_s))

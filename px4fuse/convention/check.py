@@ -7,7 +7,7 @@ import pandas as pd
 from msgspec import structs
 
 from px4fuse.convention.axes import (
-    MAX_OFFSET_S,
+    MAX_TIME_OFFSET_S,
     SMALL_ROTATION_RAD,
     UNIT_SIZES_M,
     Hypothesis,
@@ -25,10 +25,10 @@ from px4fuse.convention.model import (
 from px4fuse.convention.motion import (
     DIFFERENCE_WINDOW_S,
     MIN_GAP_S,
-    ImuMotion,
+    ImuSecondDifferences,
     InertialData,
-    motion_from_imu,
-    read_inertial,
+    integrate_imu_motion,
+    integrate_inertial_data,
     replace_heading,
 )
 from px4fuse.convention.orientation import check_orientation
@@ -37,25 +37,28 @@ from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack
 from px4fuse.trajectory.association import gap_limit, is_bracketed
 from px4fuse.trajectory.rotation import heading
 
-# Minimum log likelihood ratio to the second best convention for an unambiguous result
-MIN_LOG_ODDS = 4.0
-# Minimum log-likelihood gain of a convention over positions unrelated to the motion
+# Minimum log likelihood ratio of the best to the second best convention, for the result
+# "determined"
+MIN_CONVENTION_LOG_ODDS = 4.0
+# Minimum log likelihood ratio of the best convention to the null hypothesis that the positions do
+# not depend on the motion
 MIN_LIKELIHOOD_GAIN = 8.0
-# Minimum log-likelihood gain per independent sample, for an unambiguous and for an ambiguous
-# convention
+# The same ratio divided by the number of independent samples: minimum if one convention fits, and
+# if several fit
 MIN_LIKELIHOOD_GAIN_PER_SAMPLE = (0.15, 0.4)
-# Accepted range of the ratio of displacements, from the positions over from the IMU
-MIN_SCALE, MAX_SCALE = 0.88, 1.12
-# Maximum accepted ratio of the residuals to the noise of source and IMU
+# Accepted ratio of the source's displacements to those from the IMU
+MIN_DISPLACEMENT_RATIO, MAX_DISPLACEMENT_RATIO = 0.88, 1.12
+# A convention is doubtful if its residuals are larger than this multiple of the expected noise
 MAX_RESIDUAL_RATIO = 2.4
 # σ (m) of the second differences of the position that are integrated from the IMU
-IMU_SIGMA_M = 0.05
-# EKF2's heading, which is relative to north, is preferred to the heading from the gyroscopes if its
-# log likelihood is at most this much lower
-MAX_LOGGED_HEADING_DEFICIT = 20.0
-# Minimum number of GNSS positions for an estimate of the rotation relative to them
+IMU_DIFFERENCE_SIGMA_M = 0.05
+# EKF2's heading, which is relative to north, is preferred to the heading from the gyroscopes if the
+# score of its hypothesis is at most this much lower
+MAX_EKF2_HEADING_SCORE_LOSS = 20.0
+# Minimum number of GNSS positions to fit the rotation of the source's frame from north
 MIN_GNSS_POSITIONS = 30
-# Maximum ratio of the residuals to the GNSS positions for an estimate of the rotation: 0.1 rad
+# The rotation is used if the RMS residual of this fit is at most this fraction of the RMS extent of
+# the GNSS positions; 0.1 corresponds to 0.1 rad
 MAX_GNSS_RESIDUAL_RATIO = 0.1
 # Minimum log-likelihood gain from a clock drift; a drift with a smaller gain is not corrected
 MIN_DRIFT_SCORE_GAIN = 15.0
@@ -64,7 +67,7 @@ TESTED_CLOCK_DRIFTS = np.linspace(-0.05, 0.05, 21)
 # Repeated positions are removed if they are less than this fraction of all positions
 MAX_REPEATED_FRACTION = 0.5
 # Heights are used if at least this fraction of the positions has a height
-MIN_HEIGHT_FRACTION = 0.5
+MIN_WITH_HEIGHT_FRACTION = 0.5
 # Variance of third differences of white noise with variance 1
 THIRD_DIFFERENCE_VARIANCE = 20.0
 # Variance of second differences of white noise with variance 1
@@ -72,7 +75,7 @@ SECOND_DIFFERENCE_VARIANCE = 6.0
 
 
 def check_convention(
-    flight: Flight, track: PositionTrack, max_offset_s: float = MAX_OFFSET_S
+    flight: Flight, track: PositionTrack, max_time_offset_s: float = MAX_TIME_OFFSET_S
 ) -> Convention | None:
     """Determine axes, unit, clock and orientation of a position source.
 
@@ -81,27 +84,31 @@ def check_convention(
     flight : Flight
     track : PositionTrack
         Positions as read: north, east, down if the source follows PX4's convention.
-    max_offset_s : float
+    max_time_offset_s : float
         Maximum tested time offset (s).
 
     Returns
     -------
     Convention, or None without IMU data, attitude or enough motion at the same time.
     """
-    inertial_data = read_inertial(flight)
+    inertial_data = integrate_inertial_data(flight)
     if inertial_data is None:
         return None
-    positions = _read_positions(flight, track, max_offset_s)
-    motions = {
-        name: motion_from_imu(inertial_data, attitude)
+    positions = _read_positions(flight, track, max_time_offset_s)
+    imu_motion_by_heading = {
+        name: integrate_imu_motion(inertial_data, attitude)
         for name, attitude in inertial_data.compute_attitudes().items()
     }
-    hypotheses = _rank_convention_hypotheses(positions, motions)
+    hypotheses = _rank_convention_hypotheses(positions, imu_motion_by_heading)
     if not hypotheses:
         return None
-    if clock_drift := _clock_drift(positions, motions[hypotheses[0].heading_from], hypotheses[0]):
+    if clock_drift := _estimate_clock_drift(
+        positions, imu_motion_by_heading[hypotheses[0].heading_from], hypotheses[0]
+    ):
         positions_without_drift = positions.remove_clock_drift(clock_drift)
-        hypotheses_without_drift = _rank_convention_hypotheses(positions_without_drift, motions)
+        hypotheses_without_drift = _rank_convention_hypotheses(
+            positions_without_drift, imu_motion_by_heading
+        )
         if (
             hypotheses_without_drift
             and hypotheses_without_drift[0].score > hypotheses[0].score + MIN_DRIFT_SCORE_GAIN
@@ -120,32 +127,34 @@ def check_convention(
     return structs.replace(convention, orientation=orientation)
 
 
-def _read_positions(flight: Flight, track: PositionTrack, max_offset_s: float) -> SentPositions:
+def _read_positions(
+    flight: Flight, track: PositionTrack, max_time_offset_s: float
+) -> SentPositions:
     """Return the positions without repetitions; heights are 0 if the source has none."""
     samples, barometer = track.samples[Columns.POSITION], flight.barometer
-    if samples["down_m"].notna().mean() < MIN_HEIGHT_FRACTION:
+    if samples["down_m"].notna().mean() < MIN_WITH_HEIGHT_FRACTION:
         samples = samples.assign(down_m=0.0)
     samples = samples.dropna()
     is_repeated = (samples.diff() == 0.0).all(axis=1)
     if is_repeated.mean() < MAX_REPEATED_FRACTION:
         samples = samples[~is_repeated]
-    barometer_heights = None
+    barometer_times_and_heights = None
     if barometer is not None:
-        barometer_heights = barometer.index.to_numpy(), -barometer["down_m"].to_numpy()
+        barometer_times_and_heights = barometer.index.to_numpy(), -barometer["down_m"].to_numpy()
     return SentPositions(
-        samples.index.to_numpy(), samples.to_numpy(), max_offset_s, barometer_heights
+        samples.index.to_numpy(), samples.to_numpy(), max_time_offset_s, barometer_times_and_heights
     )
 
 
 def _rank_convention_hypotheses(
-    positions: SentPositions, motions: dict[HeadingSource, ImuMotion]
+    positions: SentPositions, imu_motion_by_heading: dict[HeadingSource, ImuSecondDifferences]
 ) -> list[Hypothesis]:
-    """Return the likely hypotheses, best first; a hypothesis with EKF2's heading is preferred."""
-    hypotheses = search_hypotheses(positions, motions)
+    """Return the likely hypotheses on axes, unit and delay, best first; prefer EKF2's heading."""
+    hypotheses = search_hypotheses(positions, imu_motion_by_heading)
     for hypothesis in hypotheses:
         if (
             hypothesis.heading_from == "EKF2"
-            and hypothesis.score > hypotheses[0].score - MAX_LOGGED_HEADING_DEFICIT
+            and hypothesis.score > hypotheses[0].score - MAX_EKF2_HEADING_SCORE_LOSS
             and hypothesis.is_similar_to(hypotheses[0], SMALL_ROTATION_RAD)
         ):
             other_hypotheses = [other for other in hypotheses if other is not hypothesis]
@@ -167,18 +176,21 @@ def _rotate_to_gnss(
     if not gnss_tracks or track.origin.is_gnss or not hypothesis.has_rotation:
         return hypothesis
     gnss_positions = gnss_tracks[0].samples[Columns.POSITION[:2]].dropna()
-    time_s = gnss_positions.index.to_numpy() + hypothesis.offset_s
+    time_s = gnss_positions.index.to_numpy() + hypothesis.delay_s
     source_time_s = positions.time_s
     is_near = is_bracketed(time_s, source_time_s, gap_limit(source_time_s, MIN_GAP_S))
     if np.count_nonzero(is_near) < MIN_GNSS_POSITIONS:
         return hypothesis
-    sent_m = UNIT_SIZES_M[hypothesis.unit] * positions.position_m
+    sent_position_m = UNIT_SIZES_M[hypothesis.unit] * positions.position_m
     assignment = hypothesis.assignment
-    source_m = (
-        sent_m[:, assignment.axis_a] + 1j * assignment.handedness * sent_m[:, assignment.axis_b]
+    source_horizontal_m = (
+        sent_position_m[:, assignment.first_axis]
+        + 1j * assignment.handedness * sent_position_m[:, assignment.second_axis]
     )
-    velocity_m_s = np.interp(time_s, source_time_s, np.gradient(source_m, source_time_s))
-    columns = np.column_stack([np.interp(time_s, source_time_s, source_m), velocity_m_s])[is_near]
+    velocity_m_s = np.interp(time_s, source_time_s, np.gradient(source_horizontal_m, source_time_s))
+    columns = np.column_stack(
+        [np.interp(time_s, source_time_s, source_horizontal_m), velocity_m_s]
+    )[is_near]
     columns -= columns.mean(axis=0)
     north_east_m = (gnss_positions.to_numpy() @ [1.0, 1j])[is_near]
     north_east_m -= north_east_m.mean()
@@ -205,23 +217,23 @@ def _choose_convention(
             if hypothesis.axes[:2] != best_hypothesis.axes[:2]
         ]
     log_odds = best_hypothesis.score - other_conventions[0].score if other_conventions else None
-    is_ambiguous = log_odds is not None and log_odds < MIN_LOG_ODDS
+    is_ambiguous = log_odds is not None and log_odds < MIN_CONVENTION_LOG_ODDS
     verdict: ConventionVerdict = "ambiguous" if is_ambiguous else "determined"
     if best_hypothesis.score < MIN_LIKELIHOOD_GAIN:
         verdict = "not determinable"
     elif (
         best_hypothesis.score
-        < MIN_LIKELIHOOD_GAIN_PER_SAMPLE[is_ambiguous] * best_hypothesis.independent_count
-        or best_hypothesis.min_scale > MAX_SCALE
-        or best_hypothesis.max_scale < MIN_SCALE
-        or residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_RATIO
+        < MIN_LIKELIHOOD_GAIN_PER_SAMPLE[is_ambiguous] * best_hypothesis.independent_residual_count
+        or best_hypothesis.min_scale > MAX_DISPLACEMENT_RATIO
+        or best_hypothesis.max_scale < MIN_DISPLACEMENT_RATIO
+        or compute_residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_RATIO
     ):
         verdict = "doubtful"
     x, y, z = best_hypothesis.axes
     likely_conventions = [
         _describe_hypothesis(hypothesis)
         for hypothesis in other_conventions
-        if hypothesis.score > best_hypothesis.score - MIN_LOG_ODDS
+        if hypothesis.score > best_hypothesis.score - MIN_CONVENTION_LOG_ODDS
     ]
     return Convention(
         verdict=verdict,
@@ -231,9 +243,9 @@ def _choose_convention(
         unit=best_hypothesis.unit,
         heading_from=best_hypothesis.heading_from,
         is_mirrored=best_hypothesis.assignment.is_mirrored,
-        rotation_deg=-float(np.degrees(best_hypothesis.remainder_rad))
+        rotation_deg=-float(np.degrees(best_hypothesis.heading_remainder_rad))
         * best_hypothesis.has_rotation,
-        late_s=best_hypothesis.offset_s,
+        late_s=best_hypothesis.delay_s,
         clock_drift=clock_drift,
         scale=best_hypothesis.min_scale,
         log_odds=log_odds,
@@ -245,13 +257,13 @@ def _choose_convention(
 def _describe_hypothesis(hypothesis: Hypothesis) -> str:
     properties = [format_axes(hypothesis.axes, hypothesis.unit)]
     if hypothesis.has_rotation:
-        properties.append(f"rotated by {-np.degrees(hypothesis.remainder_rad):+.0f}°")
-    properties.append(f"timestamps {hypothesis.offset_s:+.1f} s late")
+        properties.append(f"rotated by {-np.degrees(hypothesis.heading_remainder_rad):+.0f}°")
+    properties.append(f"timestamps {hypothesis.delay_s:+.1f} s late")
     return ", ".join(properties)
 
 
-def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
-    """Return the ratio of the residuals to the noise of source and IMU.
+def compute_residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
+    """Return σ of the horizontal residuals divided by σ of the noise of source and IMU.
 
     The noise of the source is estimated from third differences of the positions, because they
     contain hardly any motion.
@@ -265,17 +277,17 @@ def residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> float:
         * third_difference_sigma
         * np.sqrt(SECOND_DIFFERENCE_VARIANCE / THIRD_DIFFERENCE_VARIANCE)
     )
-    return float(hypothesis.residual_sigma_m / np.hypot(noise_m, IMU_SIGMA_M))
+    return float(hypothesis.residual_sigma_m / np.hypot(noise_m, IMU_DIFFERENCE_SIGMA_M))
 
 
-def _clock_drift(
-    positions: SentPositions, imu_motion: ImuMotion, best_hypothesis: Hypothesis
+def _estimate_clock_drift(
+    positions: SentPositions, imu_motion: ImuSecondDifferences, best_hypothesis: Hypothesis
 ) -> float:
     """Return the drift of the source's clock (rate minus 1), or 0 if it is not significant."""
-    start_drift = 0.0
+    initial_clock_drift = 0.0
     if (
         best_hypothesis.score < MIN_LIKELIHOOD_GAIN
-        or residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_RATIO
+        or compute_residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_RATIO
     ):
         hypotheses = [
             (candidates[0], clock_drift)
@@ -286,19 +298,19 @@ def _clock_drift(
                 )
             )
         ]
-        best_candidate, start_drift = max(hypotheses, key=lambda pair: pair[0].score)
+        best_candidate, initial_clock_drift = max(hypotheses, key=lambda pair: pair[0].score)
         best_hypothesis = replace(best_candidate, heading_from=best_hypothesis.heading_from)
-        positions = positions.remove_clock_drift(start_drift)
+        positions = positions.remove_clock_drift(initial_clock_drift)
     hypothesis = refine_hypothesis(
         replace(best_hypothesis, has_clock_drift=True),
         positions,
         positions.motion(imu_motion),
         imu_motion,
     )
-    clock_drift = (1.0 + start_drift) / (1.0 - float(hypothesis.parameters[3])) - 1.0
+    clock_drift = (1.0 + initial_clock_drift) / (1.0 - float(hypothesis.parameters[3])) - 1.0
     return (
         clock_drift
-        if start_drift or hypothesis.score > best_hypothesis.score + MIN_DRIFT_SCORE_GAIN
+        if initial_clock_drift or hypothesis.score > best_hypothesis.score + MIN_DRIFT_SCORE_GAIN
         else 0.0
     )
 
@@ -327,15 +339,14 @@ def _check_orientation(
     ):
         return convention
     source_heading = np.interp(inertial_data.time_s, time_s, heading(attitude))
-    imu_motion = motion_from_imu(
+    imu_motion = integrate_imu_motion(
         inertial_data, replace_heading(inertial_data.gyro_attitude, source_heading)
     )
     is_covered = (imu_motion.time_s > time_s[0] + DIFFERENCE_WINDOW_S) & (
         imu_motion.time_s < time_s[-1] - DIFFERENCE_WINDOW_S
     )
     imu_motion = replace(imu_motion, is_valid=imu_motion.is_valid & is_covered)
-    # heading (°) that x of the positions must have, by frames of the orientation; two values if
-    # these frames do not determine it
+    # possible headings (°) of the positions' x axis, if positions and orientation have one frame
     correct_headings_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(
         convention.frames, [0.0, 90.0]
     )
@@ -348,9 +359,9 @@ def _check_orientation(
             True,
         ):
             x_heading_deg = float(np.degrees(hypothesis.parameters[1]))
-            heading_errors = [
+            heading_errors_deg = [
                 (x_heading_deg - correct_heading_deg + 180.0) % 360.0 - 180.0
                 for correct_heading_deg in correct_headings_deg
             ]
-            return structs.replace(convention, heading_error_deg=min(heading_errors, key=abs))
+            return structs.replace(convention, heading_error_deg=min(heading_errors_deg, key=abs))
     return convention

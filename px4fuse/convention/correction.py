@@ -7,12 +7,12 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.convention.axes import CLOCKWISE_DIRECTIONS, UNIT_SIZES_M, without_clock_drift
+from px4fuse.convention.axes import CLOCKWISE_DIRECTIONS, UNIT_SIZES_M, correct_clock_drift
 from px4fuse.convention.check import is_source_fused
 from px4fuse.convention.model import Convention
-from px4fuse.convention.motion import read_inertial, replace_heading
-from px4fuse.convention.orientation import to_attitude
-from px4fuse.convention.texts import FRAME_AXES, OPPOSITE, format_axes
+from px4fuse.convention.motion import integrate_inertial_data, replace_heading
+from px4fuse.convention.orientation import convert_to_attitude
+from px4fuse.convention.texts import FRAME_AXES, OPPOSITE_DIRECTION, format_axes
 from px4fuse.core.arrays import Array
 from px4fuse.flight.model import (
     Columns,
@@ -23,9 +23,9 @@ from px4fuse.flight.model import (
 )
 from px4fuse.trajectory.rotation import from_elements, heading
 
-# Minimum rotation (°) that is corrected in a frame with wrong axes; smaller rotations are reported
+# Minimum rotation (°) that is corrected in addition to wrong axes; smaller rotations are reported
 # as a heading error
-MIN_REMAINDER_DEG = 8.0
+MIN_RESIDUAL_ROTATION_DEG = 8.0
 # Minimum rotation (°) that is corrected in a frame with correct axes; smaller rotations are
 # reported as a heading error
 MIN_ROTATION_DEG = 15.0
@@ -39,8 +39,8 @@ OrientationFault = Literal["", "copied", "order", "frames", "heading"]
 
 
 @dataclass(frozen=True)
-class Faults:
-    """Deviations of a position source from PX4's convention.
+class ConventionFaults:
+    """Deviations of a position source from PX4's convention: NED, metres, boot clock.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Faults:
     is_north_unknown : bool
         True if EKF2's heading is from the source, so the log contains no independent heading.
     is_ambiguous : bool
-        True if several conventions fit, and NED in metres is not among them.
+        True if several axes and units fit, and NED in metres is not among them.
     """
 
     has_wrong_axes: bool = False
@@ -82,14 +82,16 @@ class Faults:
         )
 
     def __bool__(self) -> bool:
-        return self != Faults()
+        return self != ConventionFaults()
 
 
-def convention_faults(convention: Convention | None, flight: Flight, frame: str) -> Faults:
-    """Return the deviations of a source from PX4's convention; ``frame`` is the logged frame."""
+def find_convention_faults(
+    convention: Convention | None, flight: Flight, frame: str
+) -> ConventionFaults:
+    """Return the deviations of a source from NED in metres; ``frame`` is the logged frame."""
     if convention is None:
-        return Faults()
-    orientation_fault = _orientation_fault(convention)
+        return ConventionFaults()
+    orientation_fault = _find_orientation_fault(convention)
     if convention.verdict == "ambiguous":
         ned_text = format_axes(FRAME_AXES["NED"], "m")
         likely_conventions = (
@@ -100,11 +102,11 @@ def convention_faults(convention: Convention | None, flight: Flight, frame: str)
             f"{convention_text},".startswith(f"{ned_text},")
             for convention_text in likely_conventions
         )
-        return Faults(orientation=orientation_fault, is_ambiguous=not is_ned_likely)
+        return ConventionFaults(orientation=orientation_fault, is_ambiguous=not is_ned_likely)
     if convention.verdict != "determined":
-        return Faults(orientation=orientation_fault)
+        return ConventionFaults(orientation=orientation_fault)
     is_fused = is_source_fused(flight)
-    has_wrong_axes, rotation_deg = _axes_and_rotation(convention)
+    has_wrong_axes, rotation_deg = _check_axes_and_rotation(convention)
     has_wrong_heading = orientation_fault in ("order", "heading")
     uses_gyro_heading = convention.heading_from == "gyroscopes"
     # EKF2 fused the yaw of the source, so no heading in the log is independent of the source
@@ -122,7 +124,7 @@ def convention_faults(convention: Convention | None, flight: Flight, frame: str)
         or frame == "FRD"
     ):
         rotation_deg = 0.0
-    faults = Faults(
+    faults = ConventionFaults(
         has_wrong_axes=has_wrong_axes,
         rotation_deg=rotation_deg,
         has_wrong_unit=convention.unit != "m",
@@ -136,20 +138,20 @@ def convention_faults(convention: Convention | None, flight: Flight, frame: str)
     )
 
 
-def _axes_and_rotation(convention: Convention) -> tuple[bool, float]:
+def _check_axes_and_rotation(convention: Convention) -> tuple[bool, float]:
     """Return (True if the axes are not NED, clockwise rotation of the positions in °)."""
-    rotation_deg, is_up = convention.rotation_deg, convention.z == "up"
+    rotation_deg, is_z_up = convention.rotation_deg, convention.z == "up"
     is_known_frame = convention.axes in (FRAME_AXES["ENU"], FRAME_AXES["NWU"])
     if convention.is_mirrored or is_known_frame or convention.z not in ("up", "down"):
-        return True, rotation_deg * (abs(rotation_deg) > MIN_REMAINDER_DEG)
+        return True, rotation_deg * (abs(rotation_deg) > MIN_RESIDUAL_ROTATION_DEG)
     total_rotation_deg = (
-        rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x) + 90.0 * is_up
+        rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x) + 90.0 * is_z_up
     )
     total_rotation_deg = (total_rotation_deg + 180.0) % 360.0 - 180.0
-    return is_up, total_rotation_deg * (abs(total_rotation_deg) > MIN_ROTATION_DEG)
+    return is_z_up, total_rotation_deg * (abs(total_rotation_deg) > MIN_ROTATION_DEG)
 
 
-def _orientation_fault(convention: Convention) -> OrientationFault:
+def _find_orientation_fault(convention: Convention) -> OrientationFault:
     orientation = convention.orientation
     if orientation is None or orientation.verdict not in ("determined", "copied"):
         return ""
@@ -157,8 +159,10 @@ def _orientation_fault(convention: Convention) -> OrientationFault:
         return "copied"
     if orientation.order != "w x y z":
         return "order"
-    is_ned = convention.verdict == "determined" and convention.z == "down"
-    expected_frames = {"FRD to NED"} if is_ned else {"FRD to NED", "FLU to ENU", "FLU to NWU"}
+    is_z_known_down = convention.verdict == "determined" and convention.z == "down"
+    expected_frames = (
+        {"FRD to NED"} if is_z_known_down else {"FRD to NED", "FLU to ENU", "FLU to NWU"}
+    )
     if orientation.frames not in expected_frames:
         return "frames"
     return "heading" if abs(orientation.heading_error_deg or 0.0) > MIN_HEADING_ERROR_DEG else ""
@@ -169,18 +173,19 @@ def correct_convention(
 ) -> tuple[Flight, PositionTrack]:
     """Convert a position source to axes, unit and clock of PX4.
 
-    If EKF2 fused the unconverted positions, its attitude is replaced by that of the gyroscopes.
+    If EKF2 fused the unconverted positions, EKF2's attitude is wrong. The attitude integrated from
+    the gyroscopes then replaces it.
     """
-    faults = convention_faults(convention, flight, track.frame)
+    faults = find_convention_faults(convention, flight, track.frame)
     if convention is None or not faults:
         return flight, track
     samples, orientation, origin = track.samples, track.orientation, track.origin
-    to_ned = _matrix_to_ned_metres(convention, faults)
-    position_m = _transform_known(samples[Columns.POSITION].to_numpy(), to_ned)
-    variance_m2 = _transform_known(samples[Columns.POSITION_VARIANCE].to_numpy(), to_ned**2)
+    to_ned = _make_matrix_to_ned_metres(convention, faults)
+    position_m = _multiply_known_values(samples[Columns.POSITION].to_numpy(), to_ned)
+    variance_m2 = _multiply_known_values(samples[Columns.POSITION_VARIANCE].to_numpy(), to_ned**2)
     samples = pd.DataFrame(
         np.hstack([position_m, variance_m2]),
-        _corrected_times(samples.index, faults),
+        _correct_times(samples.index, faults),
         Columns.POSITION + Columns.POSITION_VARIANCE,
     )
     if faults.orientation == "copied" and origin.kind == "vio":
@@ -189,41 +194,43 @@ def correct_convention(
         orientation = None
     elif orientation is not None and convention.orientation is not None:
         quaternion = orientation[Columns.QUATERNION].to_numpy()
-        orientation = orientation.set_axis(_corrected_times(orientation.index, faults))
-        orientation[Columns.QUATERNION] = to_attitude(quaternion, convention.orientation)
+        orientation = orientation.set_axis(_correct_times(orientation.index, faults))
+        orientation[Columns.QUATERNION] = convert_to_attitude(quaternion, convention.orientation)
     track = replace(track, samples=samples, orientation=orientation, origin=origin)
-    inertial_data = read_inertial(flight) if faults.affects_ekf2 else None
+    inertial_data = integrate_inertial_data(flight) if faults.affects_ekf2 else None
     if inertial_data is None:
         return flight, track
     attitude = inertial_data.compute_attitudes()[convention.heading_from]
-    # the axes of the positions are correct, so the attitude is rotated to their north direction
+    # the positions are not rotated, so the attitude is rotated to the positions' north
     if not faults.has_wrong_axes and not faults.rotation_deg:
-        turn_deg = convention.rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x)
-        attitude = replace_heading(attitude, heading(attitude) + np.radians(turn_deg))
+        heading_change_deg = convention.rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(
+            convention.x
+        )
+        attitude = replace_heading(attitude, heading(attitude) + np.radians(heading_change_deg))
     attitude_table = pd.DataFrame(attitude, time_index(inertial_data.time_s), Columns.QUATERNION)
     return replace(flight, attitude=attitude_table), track
 
 
-def _matrix_to_ned_metres(convention: Convention, faults: Faults) -> Array:
+def _make_matrix_to_ned_metres(convention: Convention, faults: ConventionFaults) -> Array:
     unit_size_m = UNIT_SIZES_M[convention.unit]
     if not faults.has_wrong_axes and not faults.rotation_deg:
         return unit_size_m * np.eye(3)
     permutation = [
-        [(axis == name) - (OPPOSITE[axis] == name) for axis in convention.axes]
+        [(axis == name) - (OPPOSITE_DIRECTION[axis] == name) for axis in convention.axes]
         for name in FRAME_AXES["NED"]
     ]
-    is_rotated = abs(convention.rotation_deg) > MIN_REMAINDER_DEG
+    is_rotated = abs(convention.rotation_deg) > MIN_RESIDUAL_ROTATION_DEG
     rotation_rad = -np.radians(convention.rotation_deg) * is_rotated
     cosine, sine = np.cos(rotation_rad), np.sin(rotation_rad)
     rotation = from_elements((cosine, -sine, 0.0), (sine, cosine, 0.0), (0.0, 0.0, 1.0))
     return np.asarray(unit_size_m * rotation @ np.array(permutation))
 
 
-def _transform_known(values: Array, matrix: Array) -> Array:
+def _multiply_known_values(values: Array, matrix: Array) -> Array:
     """Multiply each row by a matrix; NaN only where an unknown value contributes."""
     is_unknown = np.isnan(values).astype(float) @ (matrix != 0.0).T > 0.0
     return np.where(is_unknown, np.nan, np.nan_to_num(values) @ matrix.T)
 
 
-def _corrected_times(times: "pd.Index[float]", faults: Faults) -> "pd.Index[float]":
-    return time_index(without_clock_drift(times.to_numpy(), faults.clock_drift) - faults.late_s)
+def _correct_times(times: "pd.Index[float]", faults: ConventionFaults) -> "pd.Index[float]":
+    return time_index(correct_clock_drift(times.to_numpy(), faults.clock_drift) - faults.late_s)

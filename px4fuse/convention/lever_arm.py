@@ -7,9 +7,9 @@ import numpy as np
 from px4fuse.convention.motion import (
     DIFFERENCE_WINDOW_S,
     GRID_INTERVAL_S,
-    SourceMotion,
-    motion_from_imu,
-    read_inertial,
+    SourceSecondDifferences,
+    integrate_imu_motion,
+    integrate_inertial_data,
 )
 from px4fuse.core.arrays import Array
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Truth, Unavailable
@@ -17,23 +17,23 @@ from px4fuse.trajectory.rotation import interpolate, to_matrix
 from px4fuse.trajectory.scores import autocorrelation_time
 
 # Minimum lever arm (m) that is reported: twice the noise of good UWB (0.1 m)
-MIN_ARM_M = 0.2
+MIN_LEVER_ARM_M = 0.2
 # Minimum lever arm, in σ of its estimate, that is reported: 1.5 σ occur without a lever arm
-MIN_ARM_SIGMAS = 2.5
-# Minimum lever arm (m) that is reported if it is estimated with ground truth
-MIN_TRUE_ARM_M = 0.05
-# Minimum lever arm, in σ, that is reported if it is estimated with ground truth
-MIN_TRUE_ARM_SIGMAS = 5.0
+MIN_LEVER_ARM_SIGMAS = 2.5
+# Minimum lever arm (m) that is reported if it is estimated from ground truth
+MIN_LEVER_ARM_WITH_TRUTH_M = 0.05
+# Minimum lever arm, in σ, that is reported if it is estimated from ground truth
+MIN_SIGMAS_WITH_TRUTH = 5.0
 # Maximum lever arm (m) that is reported: a larger one is a frame error of the position source
-MAX_ARM_M = 5.0
+MAX_LEVER_ARM_M = 5.0
 # Maximum residual (σ) of a sample that is used in the next fit of the lever arm
 MAX_RESIDUAL_SIGMAS = 3.0
 # Minimum ratio of singular values in the lever arm fit with ground truth
-MIN_SINGULAR_RATIO = 0.02
+MIN_SINGULAR_VALUE_RATIO = 0.02
 # Minimum number of position coordinates in the lever arm fit with ground truth
-MIN_COORDINATES = 40
+MIN_COORDINATE_COUNT = 40
 # Number of lever arm fits; each excludes the outliers of the previous one
-FIT_COUNT = 4
+LEVER_ARM_FIT_COUNT = 4
 
 
 class LeverArm(NamedTuple):
@@ -44,12 +44,12 @@ class LeverArm(NamedTuple):
     sigma_m: float
 
     @property
-    def size_m(self) -> float:
+    def horizontal_length_m(self) -> float:
         return float(np.hypot(self.forward_m, self.right_m))
 
 
 def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
-    """Estimate the lever arm that EKF2's parameters do not contain, if it is significant.
+    """Estimate the lever arm minus that in EKF2's parameters; None if not significant.
 
     Ground truth is used if logged, else the IMU.
     """
@@ -82,10 +82,10 @@ def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverAr
     design = np.concatenate([rotation, identity_columns, velocity_m_s[:, :, None]], axis=2)
     is_known = np.isfinite(velocity_m_s).all(axis=1)
     design_rows, known_errors_m = design[is_known].reshape(-1, 5), error_m[is_known].ravel()
-    if len(design_rows) < MIN_COORDINATES:
+    if len(design_rows) < MIN_COORDINATE_COUNT:
         return None
     fitted_parameters, _, rank, _ = np.linalg.lstsq(
-        design_rows, known_errors_m, rcond=MIN_SINGULAR_RATIO
+        design_rows, known_errors_m, rcond=MIN_SINGULAR_VALUE_RATIO
     )
     if rank < design_rows.shape[1]:  # with a constant heading, a lever arm is a constant offset
         return None
@@ -97,34 +97,45 @@ def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverAr
     )
     sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))
     lever_arm = LeverArm(float(fitted_parameters[0]), float(fitted_parameters[1]), sigma_m)
-    is_significant = lever_arm.size_m > max(MIN_TRUE_ARM_M, MIN_TRUE_ARM_SIGMAS * sigma_m)
-    return lever_arm if is_significant and lever_arm.size_m < MAX_ARM_M else None
+    is_significant = lever_arm.horizontal_length_m > max(
+        MIN_LEVER_ARM_WITH_TRUTH_M, MIN_SIGMAS_WITH_TRUTH * sigma_m
+    )
+    return lever_arm if is_significant and lever_arm.horizontal_length_m < MAX_LEVER_ARM_M else None
 
 
 def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
-    inertial_data = read_inertial(flight)
+    inertial_data = integrate_inertial_data(flight)
     position_samples = track.samples[Columns.POSITION[:2]].dropna()
     if inertial_data is None or len(position_samples) < 2:
         return None
     attitude = inertial_data.compute_attitudes()["EKF2"]
-    imu_motion = motion_from_imu(inertial_data, attitude)
+    imu_motion = integrate_imu_motion(inertial_data, attitude)
     rotation = to_matrix(attitude)[:, :2, :2].reshape(-1, 4)
-    arm_differences = SourceMotion.of(
+    rotation_second_differences = SourceSecondDifferences.from_positions(
         inertial_data.time_s, rotation, imu_motion.time_s
     ).second_differences.reshape(-1, 2, 2)
     design = np.concatenate(
-        [arm_differences, imu_motion.rate_m_s[:, :2, None], imu_motion.table[:, :2, 1:]], axis=2
+        [
+            rotation_second_differences,
+            imu_motion.second_difference_rate_m_s[:, :2, None],
+            imu_motion.table[:, :2, 1:],
+        ],
+        axis=2,
     )
     time_s, is_used = position_samples.index.to_numpy(), imu_motion.is_valid
-    for _ in range(FIT_COUNT):
-        source_motion = SourceMotion.of(time_s, position_samples.to_numpy(), imu_motion.time_s)
+    for _ in range(LEVER_ARM_FIT_COUNT):
+        source_motion = SourceSecondDifferences.from_positions(
+            time_s, position_samples.to_numpy(), imu_motion.time_s
+        )
         is_used = is_used & source_motion.is_valid
         difference_m = source_motion.second_differences - imu_motion.table[:, :2, 0]
         design_rows = design[is_used].reshape(-1, design.shape[2])
         used_differences_m = difference_m[is_used].ravel()
         # second differences within twice the window contain common positions, so are correlated
-        independent_count = len(used_differences_m) * GRID_INTERVAL_S / (2.0 * DIFFERENCE_WINDOW_S)
-        if independent_count < 2 * design_rows.shape[1]:
+        independent_difference_count = (
+            len(used_differences_m) * GRID_INTERVAL_S / (2.0 * DIFFERENCE_WINDOW_S)
+        )
+        if independent_difference_count < 2 * design_rows.shape[1]:
             return None
         fitted_parameters = np.linalg.lstsq(design_rows, used_differences_m, rcond=None)[0]
         residual_m: Array = np.linalg.norm(difference_m - design @ fitted_parameters, axis=1)
@@ -133,11 +144,18 @@ def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
             np.linalg.pinv(design_rows.T @ design_rows)
             * sigma_m**2
             * len(used_differences_m)
-            / independent_count
+            / independent_difference_count
         )
-        arm_sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))
+        lever_arm_sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))
         is_used &= residual_m < MAX_RESIDUAL_SIGMAS * sigma_m
         # the third parameter is the time by which the timestamps are early
         time_s = time_s + fitted_parameters[2]
-    lever_arm = LeverArm(float(fitted_parameters[0]), float(fitted_parameters[1]), arm_sigma_m)
-    return lever_arm if lever_arm.size_m > max(MIN_ARM_M, MIN_ARM_SIGMAS * arm_sigma_m) else None
+    lever_arm = LeverArm(
+        float(fitted_parameters[0]), float(fitted_parameters[1]), lever_arm_sigma_m
+    )
+    return (
+        lever_arm
+        if lever_arm.horizontal_length_m
+        > max(MIN_LEVER_ARM_M, MIN_LEVER_ARM_SIGMAS * lever_arm_sigma_m)
+        else None
+    )

@@ -6,7 +6,7 @@ from px4fuse.core.record import NotNegative, Positive, Record
 
 ConventionVerdict = Literal["determined", "ambiguous", "doubtful", "not determinable"]
 Direction = Literal["north", "east", "south", "west", "up", "down"]
-Axes = tuple[Direction, Direction, Direction]
+AxisDirections = tuple[Direction, Direction, Direction]
 Unit = Literal["m", "cm", "mm", "feet"]
 HeadingSource = Literal["EKF2", "gyroscopes", "GNSS"]
 QuaternionOrder = Literal["w x y z", "x y z w"]
@@ -39,7 +39,7 @@ class OrientationConvention(Record, kw_only=True, omit_defaults=False):
 
 
 class Convention(Record, kw_only=True, omit_defaults=False):
-    """Axes, unit and clock of the positions of a source, as sent.
+    """Axes, unit and clock of the positions that a source sends.
 
     Attributes
     ----------
@@ -55,13 +55,13 @@ class Convention(Record, kw_only=True, omit_defaults=False):
     clock_drift : float
         Rate of the sender's clock minus 1.
     scale : float
-        Ratio of displacements, from the positions over from the IMU.
+        Ratio of the source's displacements to those from the IMU.
     log_odds : float or None
         Log likelihood ratio (with priors) to the second best convention.
     log_likelihood_gain : float
-        Log likelihood ratio to positions that are unrelated to the motion.
+        Log likelihood ratio to the hypothesis that the positions do not depend on the motion.
     alternatives : tuple of str
-        Other conventions that fit nearly as well.
+        Other axes, units and delays that fit nearly as well, as texts.
     """
 
     verdict: ConventionVerdict
@@ -81,5 +81,5 @@ class Convention(Record, kw_only=True, omit_defaults=False):
     orientation: OrientationConvention | None = None
 
     @property
-    def axes(self) -> Axes:
+    def axes(self) -> AxisDirections:
         return self.x, self.y, self.z

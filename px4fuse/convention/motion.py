@@ -38,7 +38,7 @@ DIFFERENCE_WINDOW_S = 2.0
 GRID_INTERVAL_S = 0.1
 # Integration step (s) of the IMU
 INTEGRATION_STEP_S = 0.02
-# Length (s) of the running mean that is subtracted from the second differences
+# Length (s) of the running mean that is subtracted from the second differences (high pass)
 HIGH_PASS_WINDOW_S = 12.0
 # Length (s) of the centred running mean of the specific force that defines the vertical
 LEVELLING_WINDOW_S = 40.0
@@ -72,7 +72,7 @@ class InertialData:
     valid_spans_s: tuple[tuple[float, float], ...]
 
     def compute_attitudes(self) -> dict[HeadingSource, Array]:
-        """Return the attitudes with tilt from the gyroscopes, by source of the heading."""
+        """Return quaternions at ``time_s`` with tilt from the gyroscopes, by source of heading."""
         return {
             "EKF2": replace_heading(self.gyro_attitude, heading(self.logged_attitude)),
             "gyroscopes": self.gyro_attitude,
@@ -80,22 +80,24 @@ class InertialData:
 
 
 @dataclass(frozen=True)
-class SourceMotion:
-    """Second differences of positions, at a constant interval ``GRID_INTERVAL_S``."""
+class SourceSecondDifferences:
+    """Second differences of a source's positions, in its axes and unit, every GRID_INTERVAL_S."""
 
     time_s: Array
     second_differences: Array
     is_valid: BoolArray
 
     @classmethod
-    def of(cls, time_s: Array, position: Array, grid_s: Array) -> "SourceMotion":
+    def from_positions(
+        cls, time_s: Array, position: Array, grid_s: Array
+    ) -> "SourceSecondDifferences":
         """Compute the second differences of positions at the times ``grid_s``; invalid in gaps."""
         window_steps = round(DIFFERENCE_WINDOW_S / GRID_INTERVAL_S)
         position_times_s = grid_s[0] + GRID_INTERVAL_S * np.arange(
             -window_steps, len(grid_s) + window_steps
         )
         has_near_samples = is_bracketed(position_times_s, time_s, gap_limit(time_s, MIN_GAP_S))
-        columns = np.column_stack(
+        interpolated_positions = np.column_stack(
             [np.interp(position_times_s, time_s, column) for column in position.T]
         )
         is_valid = (
@@ -103,12 +105,16 @@ class SourceMotion:
             & has_near_samples[window_steps:-window_steps]
             & has_near_samples[: -2 * window_steps]
         )
-        return cls(grid_s, high_pass(second_difference(columns, window_steps), is_valid), is_valid)
+        return cls(
+            grid_s,
+            high_pass(second_difference(interpolated_positions, window_steps), is_valid),
+            is_valid,
+        )
 
 
 @dataclass(frozen=True)
-class ImuMotion:
-    """Second differences (m, NED) of the position, integrated from the IMU.
+class ImuSecondDifferences:
+    """Second differences (m, NED) of the vehicle's position, integrated from the IMU.
 
     Attributes
     ----------
@@ -116,17 +122,17 @@ class ImuMotion:
     is_valid : ndarray of bool, shape (n,)
     table : ndarray, shape (n, 3, 4)
         Second difference, and its derivatives with respect to the accelerometer bias (FRD, m/s²).
-    rate_m_s : ndarray, shape (n, 3)
-        Time derivative of the second difference.
+    second_difference_rate_m_s : ndarray, shape (n, 3)
+        Derivative of the second difference with respect to time.
     """
 
     time_s: Array
     is_valid: BoolArray
     table: Array
-    rate_m_s: Array
+    second_difference_rate_m_s: Array
 
 
-def read_inertial(flight: Flight) -> InertialData | None:
+def integrate_inertial_data(flight: Flight) -> InertialData | None:
     """Integrate the gyroscopes of a flight to an attitude without EKF2's corrections.
 
     Return None if IMU data and attitude overlap for less than 8 s.
@@ -209,9 +215,9 @@ def running_mean(values: Array, is_valid: BoolArray, width: int) -> Array:
     first_rows = np.clip(rows - width // 2, 0, None)
     end_rows = np.clip(rows + width // 2 + 1, None, len(rows))
     valid_values = np.where(is_valid[:, None], values.reshape(len(rows), -1), 0.0)
-    cumulative = np.cumsum(np.column_stack([valid_values, is_valid]), axis=0)
-    cumulative = np.concatenate([np.zeros_like(cumulative[:1]), cumulative])
-    window_sums = cumulative[end_rows] - cumulative[first_rows]
+    cumulative_sums = np.cumsum(np.column_stack([valid_values, is_valid]), axis=0)
+    cumulative_sums = np.concatenate([np.zeros_like(cumulative_sums[:1]), cumulative_sums])
+    window_sums = cumulative_sums[end_rows] - cumulative_sums[first_rows]
     means: Array = window_sums[:, :-1] / np.maximum(window_sums[:, -1:], 1.0)
     return means.reshape(values.shape)
 
@@ -226,14 +232,14 @@ def second_difference(position: Array, window: int) -> Array:
     return position[2 * window :] - 2.0 * position[window:-window] + position[: -2 * window]
 
 
-def motion_from_imu(inertial_data: InertialData, attitude: Array) -> ImuMotion:
-    """Integrate the specific force twice to second differences of the position in NED.
+def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSecondDifferences:
+    """Integrate specific force and gravity twice to second differences of the position (NED).
 
     ``attitude``, shape (n + 1, 4), is a quaternion (w, x, y, z; FRD to NED).
     """
-    middle_attitude = attitude[1:] + attitude[:-1]
+    quaternion_sums = attitude[1:] + attitude[:-1]
     body_to_ned = to_matrix(
-        middle_attitude / np.linalg.norm(middle_attitude, axis=1, keepdims=True)
+        quaternion_sums / np.linalg.norm(quaternion_sums, axis=1, keepdims=True)
     )
     acceleration = body_to_ned @ inertial_data.force_m_s2[..., None] + [[0.0], [0.0], [constants.g]]
     table = np.concatenate([acceleration, body_to_ned], axis=2)
@@ -248,12 +254,12 @@ def motion_from_imu(inertial_data: InertialData, attitude: Array) -> ImuMotion:
     stride = round(GRID_INTERVAL_S / INTEGRATION_STEP_S)
     second_differences = second_difference(position_m, window_steps)[::stride]
     time_s = inertial_data.time_s[window_steps:-window_steps][::stride]
-    # second differences within T of an IMU gap are invalid
+    # a second difference spans DIFFERENCE_WINDOW_S before and after its time
     is_valid = inside_spans(time_s, inertial_data.valid_spans_s)
     for (_, end), (start, _) in pairwise(inertial_data.valid_spans_s):
         is_valid &= (time_s < end - DIFFERENCE_WINDOW_S) | (time_s > start + DIFFERENCE_WINDOW_S)
     filtered = high_pass(second_differences, is_valid)
-    return ImuMotion(
+    return ImuSecondDifferences(
         time_s, is_valid, filtered, np.gradient(filtered[..., 0], GRID_INTERVAL_S, axis=0)
     )
 

@@ -29,29 +29,32 @@ FRAMES: Final[dict[BodyAndWorldFrame, tuple[Array, Array]]] = {
     "FLU to NED": (IDENTITY_QUATERNION, FLU_TO_FRD),
     "FRD to ENU": (ENU_TO_NED, IDENTITY_QUATERNION),
 }
-ORDERS: tuple[QuaternionOrder, QuaternionOrder] = ("w x y z", "x y z w")
-# Maximum median difference (°) from EKF2's attitude of an orientation that is copied from EKF2:
-# copies differ by 0.03°, fused motion capture by more than 0.2°
+QUATERNION_ORDERS: tuple[QuaternionOrder, QuaternionOrder] = ("w x y z", "x y z w")
+# An orientation is a copy of EKF2's attitude if their median difference is at most this (°): copies
+# differ by 0.03°, fused motion capture by more than 0.2°
 MAX_COPY_DIFFERENCE_DEG = 0.15
 # Tested delays (s) of a copy of EKF2's attitude
 COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
-# Maximum median tilt difference (°) of a correct convention
+# Maximum median difference (°) of the converted tilt from the gyroscopes' tilt, for a correct
+# convention
 MAX_TILT_DIFFERENCE_DEG = 6.0
-# Maximum median heading difference (°) of a correct convention
+# Maximum median difference (°) of the converted heading, without its mean difference, from the
+# gyroscopes' heading, for a correct convention
 MAX_HEADING_DIFFERENCE_DEG = 12.0
-# Minimum tilt and heading differences (°) in the score of a convention: smaller ones are noise
-MIN_SCORED_DIFFERENCE_DEG = 0.7
-# Decrease of the score (log likelihood) of a convention per second and per ln(angle difference)
-SCORE_PER_S = 0.5
-# Minimum score difference between the best and the second best convention
-MIN_LOG_ODDS = 4.0
+# Smaller tilt and heading differences (°) are noise; the score uses this value instead
+MIN_SCORED_ANGLE_DEG = 0.7
+# Score (log likelihood) of a convention: minus this factor · duration (s) · (ln tilt difference +
+# ln heading difference), plus log prior odds
+SCORE_LOSS_PER_S = 0.5
+# Minimum lead of the best score over the second best, for the result "determined"
+MIN_SCORE_DIFFERENCE = 4.0
 # Maximum number of orientations that are compared with the attitude from the gyroscopes
-MAX_SAMPLES = 600
+MAX_ORIENTATION_COUNT = 600
 # Minimum number of orientations in flight for a check of their convention
-MIN_SAMPLES = 20
+MIN_ORIENTATION_COUNT = 20
 
 
-class Candidate(NamedTuple):
+class OrientationCandidate(NamedTuple):
     """Possible convention of an orientation, with its difference from the reference attitude."""
 
     convention: OrientationConvention
@@ -60,7 +63,7 @@ class Candidate(NamedTuple):
 
     @property
     def order_and_frames(self) -> tuple[str, str]:
-        """Quaternion order and frames; ENU is replaced by NWU, which differs only in heading."""
+        """Quaternion order and frames; NWU for ENU, because both differ only in heading."""
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
 
@@ -74,31 +77,35 @@ def check_orientation(
     convention : OrientationConvention
         Without ``heading_error_deg``.
     time_s : ndarray, shape (m,)
-        Times in flight, at most MAX_SAMPLES.
+        Times in flight, at most MAX_ORIENTATION_COUNT.
     attitude : ndarray, shape (m, 4)
         FRD to NED.
 
-    The result is None for fewer than MIN_SAMPLES orientations.
+    The result is None for fewer than MIN_ORIENTATION_COUNT orientations.
     """
     flight_rows = np.flatnonzero(inside_spans(time_s, inertial_data.valid_spans_s))
-    if len(flight_rows) < MIN_SAMPLES:
+    if len(flight_rows) < MIN_ORIENTATION_COUNT:
         return None
-    flight_rows = flight_rows[:: -(-len(flight_rows) // MAX_SAMPLES)]
-    sample_s, sent_quaternions = time_s[flight_rows], quaternion[flight_rows]
+    flight_rows = flight_rows[:: -(-len(flight_rows) // MAX_ORIENTATION_COUNT)]
+    sample_times_s, sent_quaternions = time_s[flight_rows], quaternion[flight_rows]
     sent_quaternions = sent_quaternions / np.linalg.norm(sent_quaternions, axis=1, keepdims=True)
     for delay_s in COPY_DELAYS_S:
         logged_attitude = interpolate(
-            sample_s - delay_s, inertial_data.time_s, inertial_data.logged_attitude
+            sample_times_s - delay_s, inertial_data.time_s, inertial_data.logged_attitude
         )
-        cosine = np.clip(np.abs(np.sum(sent_quaternions * logged_attitude, axis=1)), 0.0, 1.0)
-        if np.median(2.0 * np.arccos(cosine)) < np.radians(MAX_COPY_DIFFERENCE_DEG):
-            return OrientationConvention(verdict="copied"), sample_s, sent_quaternions
-    reference_attitude = interpolate(sample_s, inertial_data.time_s, inertial_data.gyro_attitude)
+        cos_half_angle = np.clip(
+            np.abs(np.sum(sent_quaternions * logged_attitude, axis=1)), 0.0, 1.0
+        )
+        if np.median(2.0 * np.arccos(cos_half_angle)) < np.radians(MAX_COPY_DIFFERENCE_DEG):
+            return OrientationConvention(verdict="copied"), sample_times_s, sent_quaternions
+    reference_attitude = interpolate(
+        sample_times_s, inertial_data.time_s, inertial_data.gyro_attitude
+    )
     candidates = [
-        _make_candidate(
-            sample_s, sent_quaternions, reference_attitude, order, frames, quarter_turns
+        _score_convention(
+            sample_times_s, sent_quaternions, reference_attitude, order, frames, quarter_turns
         )
-        for order, frames, quarter_turns in product(ORDERS, FRAMES, range(4))
+        for order, frames, quarter_turns in product(QUATERNION_ORDERS, FRAMES, range(4))
     ]
     candidates.sort(key=lambda candidate: -candidate.score)
     best = candidates[0]
@@ -106,18 +113,18 @@ def check_orientation(
         candidate for candidate in candidates if candidate.order_and_frames != best.order_and_frames
     )
     convention = best.convention
-    tilt_deg = convention.tilt_difference_deg
+    tilt_difference_deg = convention.tilt_difference_deg
     if (
-        tilt_deg > MAX_TILT_DIFFERENCE_DEG
+        tilt_difference_deg > MAX_TILT_DIFFERENCE_DEG
         or best.heading_difference_deg > MAX_HEADING_DIFFERENCE_DEG
     ):
         convention = replace(convention, verdict="unrelated")
-    elif best.score - second_best.score < MIN_LOG_ODDS:
+    elif best.score - second_best.score < MIN_SCORE_DIFFERENCE:
         convention = replace(convention, verdict="ambiguous")
-    return convention, sample_s, to_attitude(sent_quaternions, convention)
+    return convention, sample_times_s, convert_to_attitude(sent_quaternions, convention)
 
 
-def to_attitude(sent_quaternions: Array, convention: OrientationConvention) -> Array:
+def convert_to_attitude(sent_quaternions: Array, convention: OrientationConvention) -> Array:
     """Convert an orientation as sent to the attitude (w, x, y, z; FRD to NED)."""
     world_rotation, body_rotation = FRAMES[convention.frames]
     w_first_quaternions = (
@@ -126,14 +133,14 @@ def to_attitude(sent_quaternions: Array, convention: OrientationConvention) -> A
     return multiply(multiply(world_rotation, w_first_quaternions), body_rotation)
 
 
-def _make_candidate(
+def _score_convention(
     time_s: Array,
     sent_quaternions: Array,
     reference_attitude: Array,
     order: QuaternionOrder,
     frames: BodyAndWorldFrame,
     body_quarter_turns: int,
-) -> Candidate:
+) -> OrientationCandidate:
     """Score one convention of the quaternions by their distance from the reference attitude.
 
     The score decreases with the median differences of tilt and heading, without the constant
@@ -142,18 +149,24 @@ def _make_candidate(
     """
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
     body_rotation = from_vector(np.array([0.0, 0.0, body_quarter_turns * np.pi / 2.0]))
-    attitude = multiply(to_attitude(sent_quaternions, convention), body_rotation)
-    heading_difference = np.exp(1j * (heading(attitude) - heading(reference_attitude)))
-    offset_rad = np.angle(np.mean(heading_difference))
-    heading_difference_rad = np.abs(np.angle(heading_difference * np.exp(-1j * offset_rad)))
+    attitude = multiply(convert_to_attitude(sent_quaternions, convention), body_rotation)
+    heading_difference_phasor = np.exp(1j * (heading(attitude) - heading(reference_attitude)))
+    mean_heading_difference_rad = np.angle(np.mean(heading_difference_phasor))
+    heading_difference_rad = np.abs(
+        np.angle(heading_difference_phasor * np.exp(-1j * mean_heading_difference_rad))
+    )
     tilt_cosine = np.sum(to_matrix(attitude)[:, 2] * to_matrix(reference_attitude)[:, 2], axis=1)
-    tilt_rad = np.arccos(np.clip(tilt_cosine, -1.0, 1.0))
-    tilt_deg, heading_deg = np.degrees(
-        np.median([tilt_rad, heading_difference_rad], axis=1)
+    tilt_difference_rad = np.arccos(np.clip(tilt_cosine, -1.0, 1.0))
+    tilt_difference_deg, heading_difference_deg = np.degrees(
+        np.median([tilt_difference_rad, heading_difference_rad], axis=1)
     ).tolist()
-    log_differences = np.log(np.maximum([tilt_deg, heading_deg], MIN_SCORED_DIFFERENCE_DEG))
-    score = -SCORE_PER_S * (time_s[-1] - time_s[0]) * float(np.sum(log_differences))
+    ln_differences = np.log(
+        np.maximum([tilt_difference_deg, heading_difference_deg], MIN_SCORED_ANGLE_DEG)
+    )
+    score = -SCORE_LOSS_PER_S * (time_s[-1] - time_s[0]) * float(np.sum(ln_differences))
     score -= 4.0 * (order != "w x y z") + 2.0 * (frames != "FRD to NED")
-    score -= 2.0 * (body_quarter_turns != 0) + 1.0 * (abs(offset_rad) > np.radians(8.0))
-    convention = replace(convention, tilt_difference_deg=tilt_deg)
-    return Candidate(convention, heading_deg, score)
+    score -= 2.0 * (body_quarter_turns != 0) + 1.0 * (
+        abs(mean_heading_difference_rad) > np.radians(8.0)
+    )
+    convention = replace(convention, tilt_difference_deg=tilt_difference_deg)
+    return OrientationCandidate(convention, heading_difference_deg, score)

@@ -1,14 +1,14 @@
-"""Messages on wrong axes, unit and orientation of a position source, with the action."""
+"""Messages on wrong axes, unit and orientation of a position source: fault and remedy."""
 
 from collections.abc import Sequence
 
 from px4fuse.convention.axes import UNIT_SIZES_M
-from px4fuse.convention.model import Axes, Direction, Unit
+from px4fuse.convention.model import AxisDirections, Direction, Unit
 
 # All directions: the opposite of each has the same index in the reversed tuple
 DIRECTIONS: tuple[Direction, ...] = ("north", "east", "down", "up", "west", "south")
-OPPOSITE = dict(zip(DIRECTIONS, DIRECTIONS[::-1], strict=True))
-FRAME_AXES: dict[str, Axes] = {
+OPPOSITE_DIRECTION = dict(zip(DIRECTIONS, DIRECTIONS[::-1], strict=True))
+FRAME_AXES: dict[str, AxisDirections] = {
     "NED": ("north", "east", "down"),
     "ENU": ("east", "north", "up"),
     "NWU": ("north", "west", "up"),
@@ -23,22 +23,22 @@ UNIT_NAMES: dict[Unit, str] = {
 }
 
 
-def with_opposites(axes: Axes) -> list[Direction]:
+def append_opposites(axes: AxisDirections) -> list[Direction]:
     """Return the directions of x, y, z, -z, -y, -x."""
-    return [*axes, *(OPPOSITE[direction] for direction in axes[::-1])]
+    return [*axes, *(OPPOSITE_DIRECTION[direction] for direction in axes[::-1])]
 
 
-def axes_as_sent(axes: Axes, frame: str) -> Axes:
-    """Return the true directions of x, y, z of a position file.
+def find_true_axes(axes: AxisDirections, frame: str) -> AxisDirections:
+    """Undo the reader's conversion to NED: return the true directions of x, y, z in the file.
 
     Parameters
     ----------
     axes : tuple of str
-        True directions of the three components that were read as north, east, down.
+        True directions of the components that the reader made north, east, down.
     frame : {"NED", "ENU", "NWU"}
         Frame that the reader assumed.
     """
-    true_directions = dict(zip(DIRECTIONS, with_opposites(axes), strict=True))
+    true_directions = dict(zip(DIRECTIONS, append_opposites(axes), strict=True))
     x, y, z = (true_directions[name] for name in FRAME_AXES[frame])
     return x, y, z
 
@@ -48,7 +48,7 @@ def format_axes(axes: Sequence[str], unit: str) -> str:
 
 
 def describe_axes(
-    axes: Axes, stated_frame: str, *, is_mirrored: bool, is_file: bool
+    axes: AxisDirections, stated_frame: str, *, is_mirrored: bool, is_file: bool
 ) -> tuple[str, str]:
     """Describe wrong axes of a position source or file, and the action.
 
@@ -67,7 +67,7 @@ def describe_axes(
     elif y == "up":
         title = "y points up"
     fault = f"{title}: x is {x}, y {y}, z {z}{' (left-handed frame)' if is_mirrored else ''}"
-    source_axes = dict(zip(with_opposites(axes), ("x", "y", "z", "-z", "-y", "-x"), strict=True))
+    source_axes = dict(zip(append_opposites(axes), ("x", "y", "z", "-z", "-y", "-x"), strict=True))
     ned_axes_text = ", ".join(source_axes[direction] for direction in FRAME_AXES["NED"])
     ned_text = f"(north, east, down) = ({ned_axes_text})"
     if is_file and frame_name:
@@ -93,8 +93,8 @@ def describe_unit(
     fault = f"{positions} are in {UNIT_NAMES[unit]}, not in {stated_unit}"
     if is_file and unit != "feet":
         return fault, f"Run again with --position-unit {unit}."
-    place = "in the file" if is_file else "before sending"
-    return fault, f"Multiply x, y and z by {UNIT_SIZES_M[unit]:g} {place}."
+    correction_place = "in the file" if is_file else "before sending"
+    return fault, f"Multiply x, y and z by {UNIT_SIZES_M[unit]:g} {correction_place}."
 
 
 def describe_conversion(frames: str) -> str:

@@ -48,7 +48,7 @@ from px4fuse.flight.model import (
     reset_times_s,
     step_values_at,
 )
-from px4fuse.readers.common import flight_spans
+from px4fuse.readers.common import find_flight_spans
 from px4fuse.readers.px4_innovations import has_fused_aid, with_gnss_innovations
 from px4fuse.readers.px4_positions import MAX_DOWNSAMPLED_HZ
 from px4fuse.readers.px4_topics import DEFAULT_PROFILE_REMEDY
@@ -626,7 +626,7 @@ def _find_dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array
     vision_enabled_changes = ekf2.states.get(EV_POS.name)
     if dead_reckoning_changes is None or vision_enabled_changes is None:
         return np.zeros((0, 2))
-    spans_s = np.array(flight_spans(dead_reckoning_changes == 0.0, np.inf)).reshape(-1, 2)
+    spans_s = np.array(find_flight_spans(dead_reckoning_changes == 0.0, np.inf)).reshape(-1, 2)
     spans_s[:, 0] -= DEAD_RECKONING_TIMEOUT_S * (
         step_values_at(vision_enabled_changes, spans_s[:, 0]) > 0.0
     )

@@ -42,7 +42,7 @@ from px4fuse.flight.model import (
     Truth,
     Unavailable,
 )
-from px4fuse.readers.px4_innovations import innovations_along
+from px4fuse.readers.px4_innovations import select_axis_innovations
 
 Spans = tuple[Span, ...]
 T = TypeVar("T", pd.DataFrame, "pd.Series[float]")
@@ -410,7 +410,7 @@ def logged_aid_innovations(name: str, aid_log: AidLog) -> pd.DataFrame:
     """Return logged innovations, S and rejections of the aiding source ``name`` (PX4's name)."""
     gate = aid_log.parameters.get(AIDS[name].gate, AIDS[name].default_gate)
     axes = [axis for axis in AXIS_NAMES if axis in aid_log.axes]
-    return _join_axes({axis: innovations_along(aid_log, axis, gate) for axis in axes})
+    return _join_axes({axis: select_axis_innovations(aid_log, axis, gate) for axis in axes})
 
 
 def list_innovation_axes(updates: pd.DataFrame) -> list[NedAxis]:

@@ -36,7 +36,7 @@ from px4fuse.flight.model import (
     rows_between,
     time_index,
 )
-from px4fuse.readers.px4_ekf2 import rows_of_timestamps, samples_per_step
+from px4fuse.readers.px4_ekf2 import find_rows_of_timestamps, samples_per_step
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
@@ -492,7 +492,7 @@ def _make_segment(
     imu_times_s = imu_times_s[segment_rows]
     imu = imu.iloc[segment_rows]
     imu_intervals_s = np.diff(imu_times_s)
-    logged_end_indices = rows_of_timestamps(imu_times_s, fusion_record.delayed.index)
+    logged_end_indices = find_rows_of_timestamps(imu_times_s, fusion_record.delayed.index)
     step_end_indices = find_step_ends(
         imu_intervals_s, logged_end_indices, read_prediction_step_s(fusion_record)
     )

@@ -9,14 +9,18 @@ from msgspec.structs import replace
 
 from px4fuse.comparison.model import Comparison
 from px4fuse.convention.axes import UNIT_SIZES_M
-from px4fuse.convention.correction import MIN_REMAINDER_DEG, Faults, convention_faults
+from px4fuse.convention.correction import (
+    MIN_RESIDUAL_ROTATION_DEG,
+    ConventionFaults,
+    find_convention_faults,
+)
 from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.convention.texts import (
     FRAME_AXES,
-    axes_as_sent,
     describe_axes,
     describe_conversion,
     describe_unit,
+    find_true_axes,
     format_axes,
 )
 from px4fuse.finding import Finding
@@ -112,12 +116,12 @@ def _is_convention_effect(item: Finding) -> bool:
     return CATALOGUE[item.id].after_wrong_convention == "effect"
 
 
-def _find_convention_faults(analysis: Comparison) -> Faults:
-    return convention_faults(analysis.convention, analysis.flight, analysis.source.frame)
+def _find_convention_faults(analysis: Comparison) -> ConventionFaults:
+    return find_convention_faults(analysis.convention, analysis.flight, analysis.source.frame)
 
 
 def _find_position_faults(
-    convention: Convention, faults: Faults, source: PositionTrack
+    convention: Convention, faults: ConventionFaults, source: PositionTrack
 ) -> Iterator[ConventionFaultTexts]:
     positions_text, alignment = positions_phrase(source), source.alignment
     is_file = alignment is not None
@@ -127,8 +131,8 @@ def _find_position_faults(
         f"to the second best {'above ' if log_odds == 99.0 else ''}{log_odds:.0f} nats)."
     )
     stated_frame = alignment.frame.upper() if alignment else "NED"
-    axes, turn_deg = axes_as_sent(convention.axes, stated_frame), faults.rotation_deg
-    is_frame_choice = is_file and abs(convention.rotation_deg) <= MIN_REMAINDER_DEG
+    axes, turn_deg = find_true_axes(convention.axes, stated_frame), faults.rotation_deg
+    is_frame_choice = is_file and abs(convention.rotation_deg) <= MIN_RESIDUAL_ROTATION_DEG
     if faults.has_wrong_axes or (turn_deg and is_frame_choice and axes in FRAME_AXES.values()):
         orientation = convention.orientation
         frame_sentence = "The analysis uses the positions converted to NED."
@@ -209,7 +213,7 @@ def _find_position_faults(
 
 
 def _find_orientation_faults(
-    orientation: OrientationConvention | None, faults: Faults, source: str
+    orientation: OrientationConvention | None, faults: ConventionFaults, source: str
 ) -> Iterator[ConventionFaultTexts]:
     if orientation is None or not faults.orientation:
         return

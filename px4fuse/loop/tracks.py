@@ -26,7 +26,7 @@ from px4fuse.flight.model import (
     Unavailable,
 )
 from px4fuse.readers import read_log
-from px4fuse.readers.common import finite_rows
+from px4fuse.readers.common import select_valid_rows
 from px4fuse.readers.ros_bag import is_bag
 from px4fuse.readers.text_table import decode_text
 from px4fuse.readers.trajectory import read_trajectory
@@ -124,7 +124,7 @@ def _make_trajectory(
     frame: Frame = "NED",
 ) -> Trajectory:
     """Make a trajectory at the times of the positions, with interpolated orientations (slerp)."""
-    position_samples = finite_rows(position_samples, Columns.POSITION)
+    position_samples = select_valid_rows(position_samples, Columns.POSITION)
     rotation = None
     rotation_variance = None
     if isinstance(orientation, pd.DataFrame):

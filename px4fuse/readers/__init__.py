@@ -8,7 +8,7 @@ from px4fuse.flight.model import Flight
 from px4fuse.readers.text_table import refuse_foreign_format
 
 # Number of bytes at the start of a file that are read to detect its format
-_FORMAT_BYTES = 100
+_FORMAT_DETECTION_BYTES = 100
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
 # Text files that users give by mistake instead of a flight log: suffixes, format and advice
 _TEXT_FILES = {
@@ -16,10 +16,7 @@ _TEXT_FILES = {
         "table",
         "If the table contains positions, use px4fuse compare LOG --position {name}.",
     ),
-    (".tum", ".g2o"): (
-        "trajectory or pose graph",
-        "Use px4fuse evaluate or px4fuse loop {name}.",
-    ),
+    (".tum", ".g2o"): ("trajectory or pose graph", "Use px4fuse evaluate or px4fuse loop {name}."),
 }
 
 
@@ -45,7 +42,7 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
     """
     path = Path(path)
     name = display_name(path)
-    first_bytes = read_head(path, _FORMAT_BYTES, LogError)
+    first_bytes = read_head(path, _FORMAT_DETECTION_BYTES, LogError)
     # Imports are local, because the import of pyulog or pymavlink takes 0.1 s or more
     if first_bytes.startswith(ULOG_MAGIC):
         if system is not None:

@@ -11,14 +11,14 @@ from px4fuse.flight.model import Columns, Ekf2, Spans, Unavailable
 MAX_VALID_VALUE = 1e9
 # Maximum absolute value (m/s², rad/s) of valid IMU data: above the range of accelerometers (400 g)
 # and gyros (4000 °/s)
-MAX_IMU_VALUE = 1e4
+MAX_IMU_READING = 1e4
 # Minimum distance (m) of a rejected position 0, 0, 0 from the previous and the next position: 3 σ
 # of accurate UWB (0.1 m)
-MIN_ZERO_DISTANCE_M = 0.3
+MIN_INVALID_ZERO_DISTANCE_M = 0.3
 # Minimum distance (m) of a damaged position from the median position
-MIN_FAR_DISTANCE_M = 1e4
+MIN_DAMAGED_DISTANCE_M = 1e4
 # Minimum ratio of the distance of a damaged position to the median distance of all positions
-MIN_FAR_DISTANCE_RATIO = 100.0
+MIN_DAMAGED_DISTANCE_RATIO = 100.0
 # Minimum duration (s) of equal positions that are rejected as frozen: some sources repeat each
 # position for a shorter time
 MIN_FROZEN_S = 1.0
@@ -26,23 +26,25 @@ MIN_FROZEN_S = 1.0
 MIN_FROZEN_COUNT = 5
 # Maximum fraction of frozen positions. With more, none is rejected: the vehicle may be at rest
 MAX_FROZEN_FRACTION = 0.5
-# Maximum probability that positions which a source repeats at random are rejected as frozen
+# Maximum probability of a false alarm: a source that repeats single positions at random is rejected
+# as frozen
 MAX_RANDOM_RUN_PROBABILITY = 0.01
-# Maximum distance of coordinate difference / rounding step from a whole number
-MAX_STEP_ERROR = 0.01
+# Values are multiples of a rounding step if difference / step is at most this far from whole
+# numbers
+MAX_STEP_COUNT_ERROR = 0.01
 # Minimum norm of a valid quaternion: senders without attitude send zeros
 MIN_QUATERNION_NORM = 0.5
 
 
 def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
-    """Return the missing data of a flight and of its EKF2 data, each with its reason."""
+    """Return the records of data that a flight or its EKF2 data lack, each with its reason."""
     for data in flight_data:
         if isinstance(data, Ekf2):
             flight_data += (data.variance, *data.innovations.values(), data.fusion_flags)
     return tuple(data for data in flight_data if isinstance(data, Unavailable))
 
 
-def flight_spans(landed: pd.Series, duration_s: float) -> Spans:
+def find_flight_spans(landed: pd.Series, duration_s: float) -> Spans:
     """Return start and end (s) of each flight: the intervals in which ``landed`` is 0 or False."""
     landed_changes = landed[landed.ne(landed.shift())]
     start_times_s = np.maximum.accumulate(np.maximum(landed_changes.index.to_numpy(), 0.0)).tolist()
@@ -57,15 +59,15 @@ def ends_in_flight(airborne: Spans | Unavailable, duration_s: float) -> bool:
     )
 
 
-def format_truncation(unit: str, duration_s: float, in_flight: bool) -> str:
-    """Return a note that the file ends in the middle of a ``unit``: a "frame" or "message"."""
+def format_truncation(item: str, duration_s: float, in_flight: bool) -> str:
+    """Return a note that the file ends in the middle of an item: a "frame" or "message"."""
     return (
-        f"the file ends within a {unit} after {duration_s:.1f} s{', in flight' * in_flight}; later "
+        f"the file ends within a {item} after {duration_s:.1f} s{', in flight' * in_flight}; later "
         "data are missing"
     )
 
 
-def finite_rows(
+def select_valid_rows(
     samples: pd.DataFrame, columns: list[str], limit: float = MAX_VALID_VALUE
 ) -> pd.DataFrame:
     """Return the rows in which the absolute values of all ``columns`` are below ``limit``."""
@@ -91,13 +93,13 @@ def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[s
             np.clip([next_index - 1, next_index], 0, len(measured_rows) - 1)
         ]
         distance_m = np.linalg.norm(values[neighbour_rows], axis=2).min(axis=0)
-        reason_by_row.iloc[zero_rows[distance_m > MIN_ZERO_DISTANCE_M]] = "zero"
+        reason_by_row.iloc[zero_rows[distance_m > MIN_INVALID_ZERO_DISTANCE_M]] = "zero"
     valid_rows = np.flatnonzero(reason_by_row == "")
     if len(valid_rows):
         median_offset_m = values[valid_rows] - np.median(values[valid_rows], axis=0)
         distance_m = np.linalg.norm(median_offset_m, axis=1)
         is_far = distance_m > max(
-            MIN_FAR_DISTANCE_M, MIN_FAR_DISTANCE_RATIO * float(np.median(distance_m))
+            MIN_DAMAGED_DISTANCE_M, MIN_DAMAGED_DISTANCE_RATIO * float(np.median(distance_m))
         )
         reason_by_row.iloc[valid_rows[is_far]] = "far"
         valid_rows = valid_rows[~is_far]
@@ -105,13 +107,13 @@ def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[s
     run_starts = np.flatnonzero(np.append(True, ~is_repeated))
     # Longest run of equal positions that is likely if the source repeats positions at random
     repeated_fraction = np.clip(np.mean(is_repeated), 1e-6, 1.0 - 1e-6) if len(is_repeated) else 0.5
-    random_run_length = np.log(max(len(valid_rows), 1) / MAX_RANDOM_RUN_PROBABILITY) / -np.log(
+    max_random_run_length = np.log(max(len(valid_rows), 1) / MAX_RANDOM_RUN_PROBABILITY) / -np.log(
         repeated_fraction
     )
     frozen_rows = [
         valid_rows[run_start + 1 : run_end]
         for run_start, run_end in zip(run_starts, [*run_starts[1:], len(valid_rows)], strict=True)
-        if run_end - run_start >= max(MIN_FROZEN_COUNT, random_run_length)
+        if run_end - run_start >= max(MIN_FROZEN_COUNT, max_random_run_length)
         and np.ptp(time_s[valid_rows[run_start:run_end]]) >= MIN_FROZEN_S
     ]
     if frozen_rows and len(rows := np.concatenate(frozen_rows)) < MAX_FROZEN_FRACTION * len(
@@ -121,14 +123,14 @@ def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[s
     return reason_by_row
 
 
-def rounding_step(values: Array) -> float:
+def estimate_rounding_step(values: Array) -> float:
     """Return the quantisation step of rounded values; 0 if the values are not rounded."""
     differences = np.diff(np.unique(values[np.isfinite(values)]))
     if not len(differences):
         return 0.0
     with np.errstate(over="ignore", invalid="ignore"):  # a tiny step makes the ratio infinite
         step_counts = differences / differences.min()
-        is_multiple = np.abs(step_counts - np.rint(step_counts)) < MAX_STEP_ERROR
+        is_multiple = np.abs(step_counts - np.rint(step_counts)) < MAX_STEP_COUNT_ERROR
     return float(differences.min()) if is_multiple.all() else 0.0
 
 
@@ -154,7 +156,7 @@ def join_nearest(
     )
 
 
-def rows_with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
+def select_rows_with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with a valid quaternion; norm 0 means that no attitude was sent."""
     norm: Array = np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1)
     return samples[(norm > MIN_QUATERNION_NORM) & (norm < MAX_VALID_VALUE)]
@@ -165,7 +167,7 @@ def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:
 
     A variance of 0 becomes NaN: it means "not sent" (``EKF2.cpp``).
     """
-    orientation = rows_with_attitude(
+    orientation = select_rows_with_attitude(
         samples.reindex(columns=Columns.QUATERNION + Columns.ROTATION_VARIANCE)
     )
     quaternions = orientation[Columns.QUATERNION]

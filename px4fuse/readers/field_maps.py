@@ -25,14 +25,14 @@ class Layout:
     topic: str = ""
     # Required field of each column; ``name[i]`` is an array element
     columns: Mapping[str, str] = field(default_factory=dict)
-    # Optional field of each column; only for PX4 topics, because MAVLink messages have all fields
+    # Fields that only some PX4 releases log, by column; empty for MAVLink
     optional: Mapping[str, str] = field(default_factory=dict)
     # Factor of each column, by which the field is multiplied; 1 if absent
     scale: Mapping[str, float] = field(default_factory=dict)
 
 
 def expand_layouts(toml_tables: Mapping[str, Any]) -> dict[str, Layout]:
-    """Convert TOML tables to layouts in which each column has its own field."""
+    """Convert TOML tables to layouts; expand lists such as ``q[]`` to one field per column."""
     return {
         name: replace(
             layout,

@@ -8,14 +8,14 @@ import numpy as np
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.core.reading import display_name, read_bytes_limited
 from px4fuse.errors import TrajectoryError
-from px4fuse.readers.text_table import Rows, decode_text, line_error, quote
+from px4fuse.readers.text_table import Rows, decode_text, make_line_error, quote
 from px4fuse.readers.trajectory import MAX_COORDINATE_M, UNIT_NORM_TOLERANCE
 from px4fuse.trajectory.graph.initialisation import initialise
 from px4fuse.trajectory.graph.model import POSES_FROM_FILE, PoseGraph
 
 MAX_FILE_BYTES = 500_000_000
 # Number of vertex ids, and number of values after the ids, by the tag that begins a line
-_COUNTS_BY_TAG = {
+_ID_AND_VALUE_COUNTS = {
     "VERTEX_SE2": (1, 3),
     "VERTEX_SE3:QUAT": (1, 7),
     "EDGE_SE2": (2, 3 + 6),
@@ -60,13 +60,13 @@ def read_g2o(path: str | Path) -> PoseGraph:
 
 def parse_g2o(text: str, name: str) -> PoseGraph:
     """Parse the text of a g2o file. ``name`` is the file name, for error messages."""
-    rows_by_tag = _rows_by_tag(text, name)
+    rows_by_tag = _group_rows_by_tag(text, name)
     is_in_plane = any(rows.lines for tag, rows in rows_by_tag.items() if tag.endswith("SE2"))
     dimension, pose_type, pose_width = (2, "SE2", 3) if is_in_plane else (3, "SE3:QUAT", 7)
     for tag, rows in rows_by_tag.items():
         if rows.lines and not tag.endswith(pose_type):
-            fault = "the file contains SE2 and SE3 poses"
-            raise rows.row_error(0, fault, "Use only SE2 or only SE3.")
+            fault = "the file contains 2D entries (SE2) and 3D entries (SE3)"
+            raise rows.make_row_error(0, fault, "Remove the entries of one kind.")
     vertices = rows_by_tag[f"VERTEX_{pose_type}"]
     edges = rows_by_tag[f"EDGE_{pose_type}"]
     if not edges.lines:
@@ -83,11 +83,13 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         is_repeated = np.zeros(len(ids), bool)
         is_repeated[id_order[1:]] = ids[1:] == ids[:-1]
         vertices.raise_where(
-            is_repeated, "another line has the same vertex id", "Remove one of the two lines."
+            is_repeated,
+            "another line defines the vertex with this id",
+            "Remove one of the two lines.",
         )
-    vertex_index = np.minimum(np.searchsorted(ids, edge_vertex_ids), len(ids) - 1)
+    vertex_indices = np.minimum(np.searchsorted(ids, edge_vertex_ids), len(ids) - 1)
     edges.raise_where(
-        ids[vertex_index] != edge_vertex_ids,
+        ids[vertex_indices] != edge_vertex_ids,
         "the edge refers to a vertex that is not in the file",
         "Add the VERTEX line of this vertex, or remove all VERTEX lines.",
     )
@@ -100,10 +102,10 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         dimension=dimension,
         ids=ids,
         poses=poses,
-        first_nodes=vertex_index[:, 0],
-        second_nodes=vertex_index[:, 1],
+        first_nodes=vertex_indices[:, 0],
+        second_nodes=vertex_indices[:, 1],
         measurements=_normalise_quaternions(edges, edge_values[:, :pose_width]),
-        information=_information_matrices(
+        information=_make_information_matrices(
             edges, edge_values[:, pose_width:], 3 if dimension == 2 else 6
         ),
         initialised=POSES_FROM_FILE,
@@ -114,7 +116,7 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         raise TrajectoryError(f"{name}: {error}") from None
 
 
-def g2o_text(graph: PoseGraph) -> str:
+def format_g2o(graph: PoseGraph) -> str:
     """Return the text of a g2o file with the vertices, a FIX of the first vertex, and the edges.
 
     Numbers have all digits of float64.
@@ -138,8 +140,8 @@ def g2o_text(graph: PoseGraph) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
-    rows_by_tag = {tag: Rows(name) for tag in _COUNTS_BY_TAG}
+def _group_rows_by_tag(text: str, name: str) -> dict[str, Rows]:
+    rows_by_tag = {tag: Rows(name) for tag in _ID_AND_VALUE_COUNTS}
     fixed_ids: set[str] = set()
     for line_number, raw_line in enumerate(text.split("\n"), start=1):
         line = raw_line.partition("#")[0].strip()
@@ -151,21 +153,21 @@ def _rows_by_tag(text: str, name: str) -> dict[str, Rows]:
         elif tag == "FIX":
             fixed_ids.update(" ".join(values).split())
             if len(fixed_ids) > 1:
-                raise line_error(
+                raise make_line_error(
                     name,
                     line_number,
-                    "the line fixes a second vertex",
-                    "Remove this line, or connect both vertices by an edge.",
+                    "FIX names a second vertex, but px4fuse fixes only one",
+                    "Remove this line. To keep the relative pose of both vertices, add an edge.",
                 )
         elif not tag.startswith(_SKIPPED_TAGS):
             fault = f"lines with the tag {quote(tag)} are not supported"
-            raise line_error(name, line_number, fault, _FORMAT_REMEDY)
+            raise make_line_error(name, line_number, fault, _FORMAT_REMEDY)
     return rows_by_tag
 
 
 def _parse_rows(rows: Rows, tag: str) -> tuple[IntArray, Array]:
     """Return the vertex ids, shape (n, 1 or 2), and the other numbers of all lines with a tag."""
-    vertex_count, value_count = _COUNTS_BY_TAG[tag]
+    vertex_count, value_count = _ID_AND_VALUE_COUNTS[tag]
     cells, numbers = rows.parse(1 + vertex_count, value_count)
     is_invalid_id = [
         _VERTEX_ID.fullmatch(id_text) is None or abs(int(id_text)) > _MAX_VERTEX_ID
@@ -202,7 +204,7 @@ def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
     return np.hstack([poses[:, :3], poses[:, 3:] / quaternion_norms[:, None]])
 
 
-def _information_matrices(edges: Rows, numbers: Array, dimension: int) -> Array:
+def _make_information_matrices(edges: Rows, numbers: Array, dimension: int) -> Array:
     """Return the information matrices, shape (n, dimension, dimension).
 
     ``numbers`` contains the upper triangle of each matrix, row by row.
@@ -214,13 +216,13 @@ def _information_matrices(edges: Rows, numbers: Array, dimension: int) -> Array:
     is_too_small = (row == column) & (magnitudes > 0.0) & (magnitudes < _MIN_INFORMATION)
     edges.raise_where(
         is_too_small | (magnitudes > _MAX_INFORMATION),
-        "the information matrix contains a number that is too small or too large",
-        f"Give 0, or a number from {_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}.",
+        "a number of the information matrix is too small or too large",
+        f"Give 0, or an absolute value from {_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}.",
     )
     eigenvalues = np.linalg.eigvalsh(matrices)
     edges.raise_where(
         eigenvalues[:, 0] < -_EIGENVALUE_TOLERANCE * np.maximum(eigenvalues[:, -1], 0.0),
         "the information matrix has a negative eigenvalue",
-        "Give the upper triangle of an inverse covariance, row by row.",
+        "Write the upper triangle of the inverse covariance matrix, row by row.",
     )
     return matrices

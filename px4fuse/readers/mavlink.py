@@ -34,13 +34,13 @@ from px4fuse.readers.mavlink_clocks import MIN_UNIX_TIME_S
 from px4fuse.readers.mavlink_frames import MESSAGE_IDS, VEHICLE_TYPES, read_frames
 from px4fuse.readers.mavlink_positions import pressure_altitude, read_positions, read_truth
 from px4fuse.readers.mavlink_recording import (
-    RECEIPT_CLOCK,
+    RECEIPT_CLOCK_TEXT,
     Recording,
     map_boot_to_unix,
     read_recording,
 )
 from px4fuse.readers.px4_positions import barometer
-from px4fuse.readers.ulog_topics import NO_SELECTOR, dropped_notes
+from px4fuse.readers.ulog_topics import SINGLE_INSTANCE, describe_dropped_samples
 
 VARIANCE_COLUMNS = Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE
 # MAV_PARAM_TYPE_REAL32; types with smaller numbers are integers
@@ -80,8 +80,8 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
         recording, clock_mappings, remedies["position"], gnss_delay_s
     )
     truth = read_truth(recording, positions, remedies)
-    airborne = _read_airborne(recording, remedies["landed"])
-    is_in_flight = common.ends_in_flight(airborne, recording.duration_s)
+    airborne_spans_s = _read_airborne(recording, remedies["landed"])
+    is_in_flight = common.ends_in_flight(airborne_spans_s, recording.duration_s)
     pressure_hpa = recording.read(messages.MESSAGE_LAYOUTS["pressure"])["pressure_hpa"]
     return Flight(
         # The log description is made last, because it counts the samples that the readers dropped
@@ -91,15 +91,15 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
         positions=positions,
         ekf2=ekf2,
         truth=truth,
-        airborne=airborne,
+        airborne=airborne_spans_s,
         barometer=barometer(pressure_altitude(pressure_hpa)),
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
         streams=recording.streams,
-        clocks=senders.clock_maps(recording, clock_mappings),
+        clocks=senders.describe_clock_conversions(recording, clock_mappings),
         unused=tuple(
             UnusedData(name, count, reason)
             for name, reason in messages.UNUSED_MESSAGES.items()
-            if (count := int(np.count_nonzero(frames.message_id == MESSAGE_IDS[name])))
+            if (count := int(np.count_nonzero(frames.message_ids == MESSAGE_IDS[name])))
         ),
     )
 
@@ -118,7 +118,7 @@ def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
         rows = rows[table["id"] == np.bincount(table["id"]).argmax()]
     del table
     imu = recording.read(layout, rows)
-    imu = common.finite_rows(imu, imu.columns.tolist(), common.MAX_IMU_VALUE)
+    imu = common.select_valid_rows(imu, imu.columns.tolist(), common.MAX_IMU_READING)
     if len(imu) < 2:
         return Unavailable(
             "IMU",
@@ -131,7 +131,7 @@ def _read_imu(recording: Recording, remedy: str) -> TableOrUnavailable:
 
 def _read_attitude(recording: Recording, remedy: str) -> TableOrUnavailable:
     layout = max(messages.ATTITUDE_LAYOUTS, key=lambda layout: len(recording.rows(layout.topic)))
-    attitude = common.rows_with_attitude(recording.read(layout))[Columns.QUATERNION]
+    attitude = common.select_rows_with_attitude(recording.read(layout))[Columns.QUATERNION]
     if len(attitude) < 2:
         names = " or ".join(layout.topic for layout in messages.ATTITUDE_LAYOUTS)
         return Unavailable("attitude", f"the recording contains no usable {names}", remedy)
@@ -143,13 +143,15 @@ def _read_ekf2(
     recording: Recording, parameters: Mapping[str, float], autopilot: str
 ) -> Ekf2 | Unavailable:
     remedies, replay_unavailable = messages.remedies_of_autopilot(autopilot)
-    odometry, local_position = messages.STATE_LAYOUTS
+    odometry_layout, local_position_layout = messages.STATE_LAYOUTS
     odometry_count, local_position_count = (
         len(recording.rows(layout.topic)) for layout in messages.STATE_LAYOUTS
     )
     # ODOMETRY has variances, so it is preferred unless its message rate is below half of the rate
     # of LOCAL_POSITION_NED
-    layout = odometry if 2 * odometry_count >= local_position_count else local_position
+    layout = (
+        odometry_layout if 2 * odometry_count >= local_position_count else local_position_layout
+    )
     message_name = layout.topic
     if len(recording.rows(message_name)) < 2:
         return Unavailable(
@@ -175,7 +177,7 @@ def _read_ekf2(
     variance = variance[(variance > 0.0).all(axis=1)]
     if variance.empty:
         message_name = messages.MESSAGE_LAYOUTS["accuracy"].topic
-        variance = _variance_from_accuracy(recording)
+        variance = _compute_accuracy_variance(recording)
         if len(variance):
             notes.append(
                 "the EKF2 position variances are from ESTIMATOR_STATUS (on each horizontal axis "
@@ -183,14 +185,14 @@ def _read_ekf2(
             )
     if len(variance):
         recording.record_stream("ekf2_variance", message_name)
-    no_variance = Unavailable(
+    missing_variance = Unavailable(
         "EKF2 variances",
-        "the autopilot sent no ODOMETRY with covariance and no ESTIMATOR_STATUS",
+        "the recording has no ODOMETRY with covariance and no ESTIMATOR_STATUS",
         remedies["variance"],
     )
     return Ekf2(
         state=state,
-        variance=variance if len(variance) else no_variance,
+        variance=variance if len(variance) else missing_variance,
         innovations={
             axis: Unavailable(
                 f"EKF2 innovations, {axis}",
@@ -206,14 +208,14 @@ def _read_ekf2(
             remedies["innovations"],
         ),
         resets=(),
-        instances=NO_SELECTOR,
+        instances=SINGLE_INSTANCE,
         gate=fill_with_defaults(parameters)[EV_POS.gate],
         notes=tuple(notes),
         record=replay_unavailable,
     )
 
 
-def _variance_from_accuracy(recording: Recording) -> pd.DataFrame:
+def _compute_accuracy_variance(recording: Recording) -> pd.DataFrame:
     """Compute position variances (m²) from the accuracies (1 σ, m) in ESTIMATOR_STATUS.
 
     PX4's horizontal accuracy is the square root of the sum of both axes' variances
@@ -236,10 +238,10 @@ def _read_airborne(recording: Recording, remedy: str) -> Spans | Unavailable:
         return Unavailable(
             "land detector", "the recording contains no usable EXTENDED_SYS_STATE", remedy
         )
-    recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK)
-    time_s = recording.receipt_boot_s(rows[is_known]) - recording.zero_s
+    recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK_TEXT)
+    time_s = recording.receipt_boot_s(rows[is_known]) - recording.time_origin_s
     landed = pd.Series(landed_states[is_known] == messages.ON_GROUND_STATE, index=time_s)
-    return common.flight_spans(landed, recording.duration_s)
+    return common.find_flight_spans(landed, recording.duration_s)
 
 
 def _read_parameters(recording: Recording, autopilot: str) -> dict[str, float]:
@@ -272,7 +274,7 @@ def _describe_log(
         damage_notes.append(common.format_truncation("frame", recording.duration_s, is_in_flight))
     firmware = f"{autopilot}, unknown version"
     firmware_hash = "unknown"
-    vehicle = ""
+    vehicle_id = ""
     version_rows = recording.rows("AUTOPILOT_VERSION")
     if len(version_rows):
         version = frames.table("AUTOPILOT_VERSION", version_rows[:1])[0]
@@ -282,7 +284,7 @@ def _describe_log(
         hash_hex = bytes(version["flight_custom_version"][::-1]).hex()
         firmware_hash = hash_hex if hash_hex.strip("0") else "unknown"
         hardware_id = bytes(version["uid2"]).hex()
-        vehicle = hardware_id if hardware_id.strip("0") else ""
+        vehicle_id = hardware_id if hardware_id.strip("0") else ""
     vehicle_types = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))["type"].tolist()
     vehicle_name = VEHICLE_TYPES.get(next(iter(vehicle_types), -1), "vehicle")
     dropped_counts = sorted(recording.dropped.items())
@@ -294,18 +296,18 @@ def _describe_log(
         firmware=firmware,
         firmware_hash=firmware_hash,
         hardware=f"{vehicle_name} (MAVLink system {recording.address[0]})",
-        boot_time_s=recording.zero_s,
+        boot_time_s=recording.time_origin_s,
         duration_s=recording.duration_s,
         parameters=parameters,
-        notes=(*recording.notes, *parameter_faults, *dropped_notes(dropped_counts)),
-        restarts=recording.restarts,
-        receive_time_reversals=recording.receive_time_reversals,
+        notes=(*recording.notes, *parameter_faults, *describe_dropped_samples(dropped_counts)),
+        restarts=recording.restart_count,
+        receive_time_reversals=recording.receive_time_reversal_count,
         dropped=dict(dropped_counts),
         autopilot=autopilot,
         start_unix_s=_start_unix_s(recording),
         senders=senders.describe_senders(recording),
-        vehicle=vehicle,
-        damage=(*damage_notes, *recording.damage),
+        vehicle=vehicle_id,
+        damage=(*damage_notes, *recording.damage_notes),
         ends_in_flight=is_in_flight,
         bytes_read=len(frames.content) - frames.bad_byte_count,
     )
@@ -317,12 +319,14 @@ def _start_unix_s(recording: Recording) -> float | None:
     The clock of the autopilot is preferred to the clock of the recording computer. Return None if
     the recording contains no UNIX time.
     """
-    if recording.zero_s >= MIN_UNIX_TIME_S:
-        return recording.zero_s
+    if recording.time_origin_s >= MIN_UNIX_TIME_S:
+        return recording.time_origin_s
     boot_to_unix = map_boot_to_unix(recording)
     if boot_to_unix is not None:
-        return float(boot_to_unix.at(recording.zero_s))
+        return float(boot_to_unix.at(recording.time_origin_s))
     received_us = recording.frames.received_us
-    if received_us is None or not recording.receipt_to_boot.pair_count:
+    if received_us is None or not recording.receipt_to_boot_line.pair_count:
         return None
-    return float(received_us[0] * 1e-6 + recording.receipt_to_boot.inverse().at(recording.zero_s))
+    return float(
+        received_us[0] * 1e-6 + recording.receipt_to_boot_line.inverse().at(recording.time_origin_s)
+    )

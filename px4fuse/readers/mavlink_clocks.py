@@ -31,13 +31,14 @@ MIN_DRIFT_SPAN_S = 30.0
 # Maximum relative difference between the rates of two clocks. If the difference is larger, the
 # recording was replayed faster or slower than real time
 MAX_RELATIVE_RATE_DIFFERENCE = 0.01
-# Maximum valid ratio of the rates of two clocks: a wrong unit of time gives up to 1e9 (s for ns)
-MAX_RATE_RATIO = 1e12
+# Maximum valid ratio of the rates of two clocks, with a margin to that of a wrong unit of time: up
+# to 1e9 (s for ns)
+MAX_CLOCK_RATE_RATIO = 1e12
 MIN_TIMESYNC_PAIRS = 3
 # Minimum fraction of distinct timestamps of a running clock
-MIN_DISTINCT_FRACTION = 0.1
+MIN_DISTINCT_TIME_FRACTION = 0.1
 # Maximum regular interval (s) between positions: a longer interval is a gap
-MAX_REGULAR_INTERVAL_S = 1.0
+MAX_REGULAR_SAMPLE_INTERVAL_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class ClockLine:
         )
 
 
-def fit_least_delay(x: Array, y: Array) -> ClockLine:
+def fit_clock_line(x: Array, y: Array) -> ClockLine:
     """Fit a line to clock readings x and y (s); y is read after x, with an unknown delay.
 
     The pairs x, y with the least delay determine the line. Its slope is 1 if the time span is too
@@ -83,7 +84,7 @@ def fit_least_delay(x: Array, y: Array) -> ClockLine:
     middle_rows = [rows[len(rows) // 2] for rows in interval_rows]
     if len(middle_rows) > 1 and x[middle_rows[-1]] > x[middle_rows[0]]:
         initial_slope = _median_slope(x[middle_rows], y[middle_rows])
-        if abs(initial_slope - 1.0) > MAX_RELATIVE_RATE_DIFFERENCE and _is_rate_ratio(
+        if abs(initial_slope - 1.0) > MAX_RELATIVE_RATE_DIFFERENCE and _is_plausible_rate_ratio(
             initial_slope
         ):
             slope = initial_slope
@@ -97,7 +98,7 @@ def fit_least_delay(x: Array, y: Array) -> ClockLine:
         # Two iterations, because a new slope may change which messages have the smallest delay
         for _ in range(2):
             corrected_slope = slope + _median_slope(x[envelope_rows], residual_s[envelope_rows])
-            slope = corrected_slope if _is_rate_ratio(corrected_slope) else 1.0
+            slope = corrected_slope if _is_plausible_rate_ratio(corrected_slope) else 1.0
             residual_s, envelope_rows = find_envelope(slope)
     return ClockLine(
         x0, float(np.median(residual_s[envelope_rows])), slope, robust_std(residual_s), len(x)
@@ -110,13 +111,13 @@ def _median_slope(x: Array, y: Array) -> float:
         return float(theilslopes(y, x)[0])
 
 
-def _is_rate_ratio(slope: float) -> bool:
-    return 1.0 / MAX_RATE_RATIO < slope < MAX_RATE_RATIO
+def _is_plausible_rate_ratio(slope: float) -> bool:
+    return 1.0 / MAX_CLOCK_RATE_RATIO < slope < MAX_CLOCK_RATE_RATIO
 
 
 def is_running_clock(timestamp_s: Array) -> bool:
-    """Return True if at least MIN_DISTINCT_FRACTION of the timestamps are distinct."""
-    return len(np.unique(timestamp_s)) >= max(MIN_DISTINCT_FRACTION * len(timestamp_s), 2)
+    """Return True if at least MIN_DISTINCT_TIME_FRACTION of the timestamps are distinct."""
+    return len(np.unique(timestamp_s)) >= max(MIN_DISTINCT_TIME_FRACTION * len(timestamp_s), 2)
 
 
 def robust_std(values: Array) -> float:
@@ -139,7 +140,7 @@ def map_clock(
     name: str,
     timestamp_s: Array,
     received_s: Array,
-    receipt_to_boot: ClockLine,
+    receipt_to_boot_line: ClockLine,
     sender_replies: tuple[Array, Array],
     autopilot_replies: tuple[Array, Array],
     boot_to_unix: ClockLine | None,
@@ -152,7 +153,7 @@ def map_clock(
 
     Parameters
     ----------
-    receipt_to_boot : ClockLine
+    receipt_to_boot_line : ClockLine
         Conversion of receive times to the boot clock.
     sender_replies : tuple of ndarray
         Times (s) of the autopilot's TIMESYNC requests, and of the sender's replies.
@@ -164,7 +165,7 @@ def map_clock(
         True if the recording contains receive times, False if only the order of the messages.
     """
     time_source = "receive time" if has_receive_times else "message order"
-    boot_at_receipt = receipt_to_boot.at(received_s)
+    boot_at_receipt = receipt_to_boot_line.at(received_s)
     if not is_running_clock(timestamp_s):
         distinct_count = len(np.unique(timestamp_s))
         note = (
@@ -173,25 +174,27 @@ def map_clock(
         )
         # Jitter of the receive time, assuming that the sender sends at regular intervals
         intervals_s = np.diff(received_s)
-        intervals_s = intervals_s[intervals_s < MAX_REGULAR_INTERVAL_S]
+        intervals_s = intervals_s[intervals_s < MAX_REGULAR_SAMPLE_INTERVAL_S]
         jitter_s = float(np.std(intervals_s) / np.sqrt(2.0)) if len(intervals_s) else 0.0
         description = ClockMap(
             name, time_source, len(timestamp_s), 0.0, 0.0, jitter_s, note, distinct_count
         )
         return ClockMapping(None, description)
 
-    def distance_s(boot_s: Array) -> float:
+    def compute_receipt_difference_s(boot_s: Array) -> float:
         return abs(float(np.median(boot_at_receipt - boot_s)))
 
     timesync_line = _fit_timesync(sender_replies, autopilot_replies)
-    unmapped_distance_s = distance_s(timestamp_s)
+    uncorrected_difference_s = compute_receipt_difference_s(timestamp_s)
     # A separate clock that started only seconds after the autopilot's clock looks like the boot
     # clock; only TIMESYNC distinguishes them
     improvement_s = 0.0
     if timesync_line is not None:
-        improvement_s = unmapped_distance_s - distance_s(timesync_line.at(timestamp_s))
+        improvement_s = uncorrected_difference_s - compute_receipt_difference_s(
+            timesync_line.at(timestamp_s)
+        )
     if (
-        unmapped_distance_s <= MAX_BOOT_CLOCK_DISTANCE_S
+        uncorrected_difference_s <= MAX_BOOT_CLOCK_DISTANCE_S
         and improvement_s < MIN_TIMESYNC_IMPROVEMENT_S
     ):
         sender_to_boot = ClockLine(
@@ -208,18 +211,22 @@ def map_clock(
         unix_note = "sender and autopilot are assumed to have the same UNIX time"
         candidate_lines.append(("SYSTEM_TIME", boot_to_unix.inverse(), unix_note))
     for method, sender_to_boot, note in candidate_lines:
-        # If TIMESYNC or SYSTEM_TIME are from another clock, boot times differ from receive times
-        if distance_s(sender_to_boot.at(timestamp_s)) <= MAX_BOOT_CLOCK_DISTANCE_S:
-            return _clock_mapping(clock_name, method, sender_to_boot, timestamp_s, note)
-    sender_to_boot = fit_least_delay(timestamp_s, received_s)
-    slope = sender_to_boot.slope * receipt_to_boot.slope
-    y0 = float(receipt_to_boot.at(sender_to_boot.y0))
+        # Use a conversion only if it agrees with the receive times; otherwise it is of another
+        # clock
+        if (
+            compute_receipt_difference_s(sender_to_boot.at(timestamp_s))
+            <= MAX_BOOT_CLOCK_DISTANCE_S
+        ):
+            return _make_clock_mapping(clock_name, method, sender_to_boot, timestamp_s, note)
+    sender_to_boot = fit_clock_line(timestamp_s, received_s)
+    slope = sender_to_boot.slope * receipt_to_boot_line.slope
+    y0 = float(receipt_to_boot_line.at(sender_to_boot.y0))
     sender_to_boot = replace(sender_to_boot, y0=y0, slope=slope)
     note = (
         "the recording has no usable TIMESYNC or SYSTEM_TIME, so the boot times of the samples are "
         "too late by the unknown minimum link delay"
     )
-    return _clock_mapping(clock_name, time_source, sender_to_boot, timestamp_s, note)
+    return _make_clock_mapping(clock_name, time_source, sender_to_boot, timestamp_s, note)
 
 
 def _fit_timesync(
@@ -228,10 +235,11 @@ def _fit_timesync(
     """Fit the relation of sender clock to boot clock by TIMESYNC, averaged over both directions."""
     clock_lines = []
     if len(sender_replies[0]) >= MIN_TIMESYNC_PAIRS:
-        # The autopilot reads its clock first, so the fitted line converts boot to sender times
-        clock_lines.append(fit_least_delay(*sender_replies).inverse())
+        # These replies contain an earlier boot time (x) and a later sender time (y), so the line
+        # from boot to sender times is inverted
+        clock_lines.append(fit_clock_line(*sender_replies).inverse())
     if len(autopilot_replies[0]) >= MIN_TIMESYNC_PAIRS:
-        clock_lines.append(fit_least_delay(*autopilot_replies))
+        clock_lines.append(fit_clock_line(*autopilot_replies))
     if not clock_lines:
         return None
     x0 = clock_lines[0].x0
@@ -240,7 +248,7 @@ def _fit_timesync(
     return ClockLine(x0, y0, slope, jitter, sum(line.pair_count for line in clock_lines))
 
 
-def _clock_mapping(
+def _make_clock_mapping(
     clock: str, method: str, line: ClockLine, timestamp_s: Array, note: str
 ) -> ClockMapping:
     middle_s = float(0.5 * (timestamp_s.min() + timestamp_s.max()))

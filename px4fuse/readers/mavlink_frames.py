@@ -40,8 +40,9 @@ BLOCK_BYTES = 1 << 16
 DECODE_BATCH_SIZE = 1 << 12
 # Minimum fraction of the bytes of a MAVLink recording that are in frames with a valid checksum. In
 # random data, one such frame is expected in about eight million bytes
-MIN_VALID_FRACTION = 0.01
-# A receive time is damaged if it differs by more than this time (µs) from the median (pymavlink)
+MIN_VALID_FRAME_FRACTION = 0.01
+# A receive time is damaged if it differs by more than this time (µs) from the median receive time;
+# pymavlink has the same limit
 MAX_RECEIVE_TIME_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
 MESSAGE_IDS: Mapping[str, int] = {
     message.msgname: number for number, message in dialect.mavlink_map.items()
@@ -57,7 +58,7 @@ _CRC_EXTRA = np.full(
 )
 _CRC_EXTRA[[*dialect.mavlink_map]] = [message.crc_extra for message in dialect.mavlink_map.values()]
 # CRC of each byte value, to append the byte CRC_EXTRA to the CRC of a frame
-_BYTE_CHECKSUMS = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], dtype=np.uint16)
+_CRC_TABLE = np.array([mcrf4xx(bytes([byte]), 0) for byte in range(256)], dtype=np.uint16)
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class MavlinkFrames:
     sha256: str
     # Offset of the first byte of each frame in the content
     start_offsets: Int64Array
-    message_id: NDArray[np.int32]
+    message_ids: NDArray[np.int32]
     system: ByteArray
     component: ByteArray
     sequence: ByteArray
@@ -91,9 +92,9 @@ class MavlinkFrames:
 
     def rows(self, message: str) -> IntArray:
         """Return the indices of the frames that contain a message, by its MAVLink name."""
-        return np.flatnonzero(self.message_id == MESSAGE_IDS[message])
+        return np.flatnonzero(self.message_ids == MESSAGE_IDS[message])
 
-    def sent_by(self, address: Address, rows: IntArray | slice = slice(None)) -> BoolArray:
+    def is_sent_by(self, address: Address, rows: IntArray | slice = slice(None)) -> BoolArray:
         """Return True for each frame in ``rows`` (default: all) that ``address`` sent."""
         system, component = address
         return np.asarray((self.system[rows] == system) & (self.component[rows] == component))
@@ -152,15 +153,15 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
     LogError
         The content is not MAVLink.
     """
-    start_offsets, end_offsets, message_id = _remove_nested_frames(_find_valid_frames(content)).T
+    start_offsets, end_offsets, message_ids = _remove_nested_frames(_find_valid_frames(content)).T
     receive_time_bytes = (
         RECEIVE_TIME_BYTES
         if len(start_offsets) and _has_receive_times(start_offsets, end_offsets)
         else 0
     )
-    if int(np.sum(end_offsets - start_offsets)) < MIN_VALID_FRACTION * len(content) or not len(
-        start_offsets
-    ):
+    if int(np.sum(end_offsets - start_offsets)) < MIN_VALID_FRAME_FRACTION * len(
+        content
+    ) or not len(start_offsets):
         raise LogError(
             f"{name}: the file is neither a PX4 ULog nor a MAVLink recording. It contains "
             f"{len(start_offsets)} frames with a valid checksum in {len(content)} bytes.",
@@ -168,8 +169,8 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
         )
     content_bytes = np.frombuffer(content, dtype=np.uint8)
     is_version_2 = content_bytes[start_offsets] == MAGIC_BYTE_V2
-    # Three consecutive header bytes: sequence, system, component
-    sequence_offset = start_offsets + np.where(is_version_2, 4, 2)
+    # Sequence, system and component are consecutive bytes of the header
+    sequence_offsets = start_offsets + np.where(is_version_2, 4, 2)
     unknown_frame_count, bad_byte_count, ends_in_frame = _count_other_bytes(
         content, start_offsets - receive_time_bytes, end_offsets, receive_time_bytes
     )
@@ -183,10 +184,10 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
         content=content,
         sha256=hashlib.sha256(content).hexdigest(),
         start_offsets=start_offsets,
-        message_id=message_id.astype(np.int32),
-        system=content_bytes[sequence_offset + 1],
-        component=content_bytes[sequence_offset + 2],
-        sequence=content_bytes[sequence_offset],
+        message_ids=message_ids.astype(np.int32),
+        system=content_bytes[sequence_offsets + 1],
+        component=content_bytes[sequence_offsets + 2],
+        sequence=content_bytes[sequence_offsets],
         payload_start=start_offsets + np.where(is_version_2, HEADER_BYTES_V2, HEADER_BYTES_V1),
         payload_length=content_bytes[start_offsets + 1],
         received_us=received_us,
@@ -209,7 +210,7 @@ def _find_valid_frames(content: bytes) -> Int64Array:
             [mcrf4xx(content_view[first_byte:end_byte]) for first_byte, end_byte in byte_ranges],
             dtype=np.uint16,
         )
-        crc = (crc >> 8) ^ _BYTE_CHECKSUMS[
+        crc = (crc >> 8) ^ _CRC_TABLE[
             (crc ^ _CRC_EXTRA[possible_frames[:, 2]].astype(np.uint16)) & 0xFF
         ]
         stored_crc = content_bytes[crc_end] | content_bytes[crc_end + 1].astype(np.uint16) << 8
@@ -230,11 +231,11 @@ def _remove_nested_frames(frames: Int64Array) -> Int64Array:
     end_offsets = frames[:, 1].tolist()
     kept_rows = []
     previous_end = 0
-    start_set = {*start_offsets}
+    known_starts = {*start_offsets}
     for row, frame_start in enumerate(start_offsets):
         expected_starts = previous_end, previous_end + RECEIVE_TIME_BYTES
         if frame_start >= previous_end and (
-            frame_start in expected_starts or start_set.isdisjoint(expected_starts)
+            frame_start in expected_starts or known_starts.isdisjoint(expected_starts)
         ):
             kept_rows.append(row)
             previous_end = end_offsets[row]
@@ -244,9 +245,10 @@ def _remove_nested_frames(frames: Int64Array) -> Int64Array:
 def _find_possible_frames(
     content_bytes: ByteArray, block_start: int
 ) -> tuple[Int64Array, Int64Array]:
-    """Return first byte, end and message id of possible frames, and the offset of each checksum.
+    """Find frames whose checksum is not tested yet.
 
-    Only the block of BLOCK_BYTES from ``block_start`` is searched.
+    Return first byte, end and message id of each frame, shape (n, 3), and the offset of each
+    checksum, shape (n,). Only the block of BLOCK_BYTES from ``block_start`` is searched.
     """
     block = content_bytes[block_start : block_start + BLOCK_BYTES]
     start_offsets = block_start + np.flatnonzero(
@@ -260,12 +262,12 @@ def _find_possible_frames(
     header_bytes = header_bytes[has_whole_header]
     is_version_2 = header_bytes == HEADER_BYTES_V2
     start_offsets_v2 = start_offsets[is_version_2]
-    message_id = content_bytes[start_offsets + 5].astype(np.int64)
-    message_id[is_version_2] = (
+    message_ids = content_bytes[start_offsets + 5].astype(np.int64)
+    message_ids[is_version_2] = (
         content_bytes[start_offsets_v2 + 7]
         | content_bytes[start_offsets_v2 + 8].astype(np.int64) << 8
     )
-    is_candidate = _CRC_EXTRA[message_id] >= 0
+    is_candidate = _CRC_EXTRA[message_ids] >= 0
     is_candidate[is_version_2] &= (content_bytes[start_offsets_v2 + 9] == 0) & (
         content_bytes[start_offsets_v2 + 2] <= SIGNED_FLAG
     )
@@ -275,7 +277,7 @@ def _find_possible_frames(
         content_bytes[start_offsets_v2 + 2] & SIGNED_FLAG
     ).astype(np.int64)
     is_candidate &= end_offsets <= len(content_bytes)
-    return np.stack([start_offsets, end_offsets, message_id], axis=1)[is_candidate], crc_end[
+    return np.stack([start_offsets, end_offsets, message_ids], axis=1)[is_candidate], crc_end[
         is_candidate
     ]
 
@@ -354,12 +356,12 @@ def _read_receive_times(
     """Return the receive time (UNIX, µs) of each frame, and the number of damaged receive times."""
     is_usable = start_offsets >= RECEIVE_TIME_BYTES
     is_usable[1:] &= start_offsets[1:] - end_offsets[:-1] >= RECEIVE_TIME_BYTES
-    time_windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)
+    eight_byte_windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)
     # The file may begin without the receive time of the first frame
     raw_us = np.ascontiguousarray(
-        time_windows[np.maximum(start_offsets - RECEIVE_TIME_BYTES, 0)]
+        eight_byte_windows[np.maximum(start_offsets - RECEIVE_TIME_BYTES, 0)]
     ).view(">u8")[:, 0]
-    # values above 1 << 63 become negative and are then invalid
+    # damaged values above the range of int64 become negative
     received_us = raw_us.astype(np.int64)
     is_usable &= (received_us >= 0) & (received_us < 1 << 62)
     median_us = int(np.median(received_us[is_usable])) if np.any(is_usable) else 0
@@ -368,8 +370,8 @@ def _read_receive_times(
     if np.any(is_usable):
         rows = np.flatnonzero(is_usable)
         # Times are relative to the first receive time, so that float64 resolves microseconds
-        since_first_us = np.interp(
+        since_first_receipt_us = np.interp(
             np.arange(len(start_offsets)), rows, received_us[rows] - received_us[rows[0]]
         )
-        received_us = received_us[rows[0]] + np.rint(since_first_us).astype(np.int64)
+        received_us = received_us[rows[0]] + np.rint(since_first_receipt_us).astype(np.int64)
     return received_us, int(np.count_nonzero(~is_usable))

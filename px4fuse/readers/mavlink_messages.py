@@ -17,7 +17,7 @@ AUTOPILOT_COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
 INVALID_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: sent by ground stations, cameras, companions
 GROUND_STATION_TYPE = 6  # MAV_TYPE_GCS
 ON_GROUND_STATE = 1  # MAV_LANDED_STATE_ON_GROUND
-ARDUPILOT_REPLAY = Unavailable(
+ARDUPILOT_REPLAY_UNAVAILABLE = Unavailable(
     "estimator replay",
     "px4fuse has no model of ArduPilot's estimator (EKF3)",
     "Give a PX4 ULog. px4fuse replays only PX4's EKF2.",
@@ -41,7 +41,7 @@ AUTOPILOT_MESSAGES = (
 
 @dataclass(frozen=True)
 class PositionInput:
-    """Message that sends an external position to the autopilot."""
+    """Message type that carries an external position to the autopilot: fields, frame, clock."""
 
     # Key in MESSAGE_LAYOUTS, which defines the fields of the message
     row: str
@@ -81,16 +81,20 @@ class FrameOfReference:
     body: bool = False
 
 
-_TABLE = read_toml(__file__, dict[str, dict[str, Any]])
-MESSAGE_LAYOUTS = expand_layouts(_TABLE["layouts"])
+_MESSAGE_TABLES = read_toml(__file__, dict[str, dict[str, Any]])
+MESSAGE_LAYOUTS = expand_layouts(_MESSAGE_TABLES["layouts"])
 assert not any(layout.optional for layout in MESSAGE_LAYOUTS.values()), (
-    "a MAVLink layout has optional fields"
+    "mavlink_messages.toml has optional fields, which the MAVLink reader ignores"
 )
-_INPUTS = msgspec.convert(_TABLE["positions"], dict[str, PositionInput])
-FRAMES_OF_REFERENCE = msgspec.convert(_TABLE["frames"], dict[int, FrameOfReference], strict=False)
-AUTOPILOTS = msgspec.convert(_TABLE["autopilots"], dict[int, str], strict=False)
-UNUSED_MESSAGES: Mapping[str, str] = _TABLE["unused"]
-POSITION_INPUTS = tuple(replace(message, track_name=name) for name, message in _INPUTS.items())
+_INPUT_BY_TRACK_NAME = msgspec.convert(_MESSAGE_TABLES["positions"], dict[str, PositionInput])
+FRAMES_OF_REFERENCE = msgspec.convert(
+    _MESSAGE_TABLES["frames"], dict[int, FrameOfReference], strict=False
+)
+AUTOPILOTS = msgspec.convert(_MESSAGE_TABLES["autopilots"], dict[int, str], strict=False)
+UNUSED_MESSAGES: Mapping[str, str] = _MESSAGE_TABLES["unused"]
+POSITION_INPUTS = tuple(
+    replace(message, track_name=name) for name, message in _INPUT_BY_TRACK_NAME.items()
+)
 _SCALED_IMU_LAYOUTS = (
     replace(MESSAGE_LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{number}") for number in ("", "2", "3")
 )
@@ -111,5 +115,5 @@ GNSS_LAYOUTS = (MESSAGE_LAYOUTS["gnss"], replace(MESSAGE_LAYOUTS["gnss"], topic=
 def remedies_of_autopilot(autopilot: str) -> tuple[Mapping[str, str], Unavailable]:
     """Return advice on recording each missing kind of data, and why EKF2 cannot be replayed."""
     if autopilot == "ArduPilot":
-        return _TABLE["remedies"][autopilot], ARDUPILOT_REPLAY
-    return _TABLE["remedies"]["PX4"], RECORD_NOT_LOGGED
+        return _MESSAGE_TABLES["remedies"][autopilot], ARDUPILOT_REPLAY_UNAVAILABLE
+    return _MESSAGE_TABLES["remedies"]["PX4"], RECORD_NOT_LOGGED

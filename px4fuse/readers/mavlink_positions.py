@@ -23,8 +23,8 @@ from px4fuse.readers.common import join_nearest, read_attitude, read_orientation
 from px4fuse.readers.field_maps import Layout
 from px4fuse.readers.mavlink_clocks import ClockMapping
 from px4fuse.readers.mavlink_frames import Address
-from px4fuse.readers.mavlink_recording import BOOT_CLOCK, RECEIPT_CLOCK, Recording
-from px4fuse.readers.mavlink_senders import senders_of
+from px4fuse.readers.mavlink_recording import BOOT_CLOCK_TEXT, RECEIPT_CLOCK_TEXT, Recording
+from px4fuse.readers.mavlink_senders import find_senders
 from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unproject
 
 # Maximum median difference (s) between GNSS timestamps in boot time and their receive times. If the
@@ -54,9 +54,9 @@ def read_positions(
     positions : tuple of PositionTrack
     missing : tuple of Unavailable
     """
-    tracks_and_missing: list[PositionTrack | Unavailable] = []
+    tracks_or_unavailable: list[PositionTrack | Unavailable] = []
     for message in dict.fromkeys(source.message for source in messages.POSITION_INPUTS):
-        senders = senders_of(recording, message)
+        senders = find_senders(recording, message)
         tracks = [
             track
             for sender in senders
@@ -64,14 +64,14 @@ def read_positions(
             if source.message == message
             if (track := _read_track(recording, source, sender, clocks[sender], remedy, senders))
         ]
-        tracks_and_missing += tracks or [
+        tracks_or_unavailable += tracks or [
             px4_positions.unavailable_source(
                 message, f"the recording contains no {message} sent to the autopilot", remedy
             )
         ]
     gnss_tracks = (_read_gnss(recording, layout, delay_s) for layout in messages.GNSS_LAYOUTS)
-    tracks_and_missing += [track for track in gnss_tracks if track]
-    return px4_positions.split_tracks(tracks_and_missing)
+    tracks_or_unavailable += [track for track in gnss_tracks if track]
+    return px4_positions.split_tracks(tracks_or_unavailable)
 
 
 def _read_track(
@@ -135,21 +135,24 @@ def _read_gnss(
         return None
     message_count = len(rows)
     rows = rows[np.diff(recording.frames.table(layout.topic, rows)["time_usec"], prepend=0) > 0]
-    fix_boot_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
+    fix_boot_time_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
     receipt_boot_s = recording.receipt_boot_s(rows)
-    if len(rows) and np.median(np.abs(receipt_boot_s - fix_boot_s)) > MAX_BOOT_CLOCK_DISTANCE_S:
-        # The timestamps are UNIX time, or the recording has no boot clock
-        fix_boot_s = receipt_boot_s
-    fixes = recording.read(layout, rows, fix_boot_s - delay_s)
+    if (
+        len(rows)
+        and np.median(np.abs(receipt_boot_s - fix_boot_time_s)) > MAX_BOOT_CLOCK_DISTANCE_S
+    ):
+        # Timestamps in UNIX time, or without a boot clock, are replaced by receive times
+        fix_boot_time_s = receipt_boot_s
+    fixes = recording.read(layout, rows, fix_boot_time_s - delay_s)
     fixes = fixes[fixes["fix_type"] >= px4_positions.FIX_TYPE_3D]
     if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
-        fix_count = "none" if fixes.empty else f"only {len(fixes)}"
+        fix_count_text = "none" if fixes.empty else f"only {len(fixes)}"
         return px4_positions.unavailable_source(
             layout.topic,
-            f"the recording has {message_count} {layout.topic}, {fix_count} with a 3D fix",
+            f"the recording has {message_count} {layout.topic}, {fix_count_text} with a 3D fix",
             px4_positions.NO_FIX_ACTION,
         )
-    samples = project_to_ned(fixes, local_origin(recording))
+    samples = project_to_ned(fixes, find_local_origin(recording))
     variance = fixes[["eph_m", "eph_m", "epv_m"]].set_axis(Columns.POSITION_VARIANCE, axis=1) ** 2
     is_auto_candidate = bool(
         recording.read(messages.MESSAGE_LAYOUTS["global_state"])["latitude_deg"].any()
@@ -160,7 +163,7 @@ def _read_gnss(
         structs.replace(GNSS_ORIGIN, is_auto_candidate=is_auto_candidate),
         description="GNSS position",
         frame="NED",
-        clock=f"{BOOT_CLOCK} minus {1e3 * delay_s:g} ms",
+        clock=f"{BOOT_CLOCK_TEXT} minus {1e3 * delay_s:g} ms",
         topics=(layout.topic,),
         log=recording.frames.name,
         assumed_delay_s=delay_s,
@@ -173,7 +176,7 @@ def pressure_altitude(pressure_hpa: pd.Series[float]) -> pd.Series[float]:
     return 288.15 / 0.0065 * (1.0 - (pressure_hpa / 1013.25) ** exponent)
 
 
-def local_origin(recording: Recording) -> GeodeticPosition | None:
+def find_local_origin(recording: Recording) -> GeodeticPosition | None:
     """Return latitude, longitude (degrees) and altitude (m) of the autopilot's local origin.
 
     The origin is read from GPS_GLOBAL_ORIGIN, or computed from global and local positions. Return
@@ -224,8 +227,8 @@ def read_truth(
         if not samples[Columns.VELOCITY].to_numpy().any():
             # Velocities that are zero in all samples were not sent
             samples[Columns.VELOCITY] = np.nan
-        recording.record_stream("truth", layout.topic, clock=RECEIPT_CLOCK)
-        origin = local_origin(recording) if positions and positions[0].origin.is_gnss else None
+        recording.record_stream("truth", layout.topic, clock=RECEIPT_CLOCK_TEXT)
+        origin = find_local_origin(recording) if positions and positions[0].origin.is_gnss else None
         state = project_to_ned(samples, origin).join(samples[Columns.VELOCITY])
         return Truth(layout.topic, state[Columns.STATE], read_attitude(samples))
     mocap_truth = px4_positions.motion_capture_truth(positions)

@@ -15,7 +15,7 @@ from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
 from px4fuse.readers.mavlink_clocks import (
     MIN_UNIX_TIME_S,
     ClockLine,
-    fit_least_delay,
+    fit_clock_line,
     is_running_clock,
 )
 from px4fuse.readers.mavlink_frames import (
@@ -29,8 +29,8 @@ from px4fuse.readers.mavlink_messages import BOOT_CLOCK_MESSAGES, FRAMES_OF_REFE
 from px4fuse.readers.ulog_topics import longest_increasing_run
 from px4fuse.trajectory.rotation import rotate
 
-BOOT_CLOCK = "autopilot boot clock"
-RECEIPT_CLOCK = "autopilot boot clock, estimated from receive times"
+BOOT_CLOCK_TEXT = "autopilot boot clock"
+RECEIPT_CLOCK_TEXT = "autopilot boot clock, estimated from receive times"
 # Minimum backward step (s) of the boot clock at a restart; a smaller step is a late packet
 MIN_RESTART_STEP_S = 5.0
 # Number of messages before and after a backward step of the boot clock that have to confirm a
@@ -38,16 +38,16 @@ MIN_RESTART_STEP_S = 5.0
 RESTART_CHECK_MESSAGES = 20
 # A group of timestamps between two gaps is damaged if its size is below this fraction of the size
 # of the largest group
-MIN_GROUP_FRACTION = 0.01
+MIN_TIMESTAMP_GROUP_FRACTION = 0.01
 # Maximum distance (s) of a valid timestamp from the analysed time span, or from the next timestamp
-MAX_OUTSIDE_S = 60.0
+MAX_TIME_OUTSIDE_S = 60.0
 # A file is damaged if a larger fraction of its bytes is outside of MAVLink frames
 MAX_STRAY_BYTE_FRACTION = 0.002
-# Minimum number of mostly equal timestamps which show that the clock does not run
+# The clock does not run if at least this number of timestamps have mostly equal values
 MIN_CONSTANT_TIMESTAMPS = 10
 
 
-@dataclass(eq=False)  # filled while the data are read
+@dataclass(eq=False)  # not frozen: the readers add streams and counts
 class Recording:
     """MAVLink recording of one flight, with the relation of receive time to the boot clock."""
 
@@ -55,37 +55,39 @@ class Recording:
     # Address of the autopilot of this flight
     address: Address
     # Analysed frames: the longest part of the recording between two restarts of the autopilot
-    session: slice
+    session_frames: slice
     # Receive time of each frame (s since the first frame). If the file contains no receive times,
     # the boot time of the last autopilot message before the frame replaces them
     received_s: Array
     # Conversion of receive times to the boot clock
-    receipt_to_boot: ClockLine
-    # Boot time at the start of the session, which is time zero of the flight
-    zero_s: float
+    receipt_to_boot_line: ClockLine
+    # Boot time (s) at flight time zero: the start of the session
+    time_origin_s: float
     duration_s: float
     notes: list[str]
     # Sentences on unreadable parts of the file
-    damage: tuple[str, ...] = ()
-    restarts: int | None = None
-    receive_time_reversals: int | None = None
+    damage_notes: tuple[str, ...] = ()
+    restart_count: int | None = None
+    receive_time_reversal_count: int | None = None
     # Number of samples with an invalid timestamp, by message
     dropped: dict[str, int] = field(default_factory=dict)
     # Messages and clock of each kind of data in the flight
     streams: dict[str, DataSource] = field(default_factory=dict)
 
     def rows_of_all_senders(self, message: str) -> IntArray:
-        """Return the indices of the analysed frames with one message, from all senders."""
+        """Return the indices of the frames of one message type in the session, from all senders."""
         rows = self.frames.rows(message)
-        return np.asarray(rows[(rows >= self.session.start) & (rows < self.session.stop)])
+        return np.asarray(
+            rows[(rows >= self.session_frames.start) & (rows < self.session_frames.stop)]
+        )
 
     def rows(self, message: str, address: Address | None = None) -> IntArray:
-        """Return the indices of the analysed frames with one message from ``address``.
+        """Return the indices of the frames of one message type that ``address`` sent.
 
         The default of ``address`` is the autopilot.
         """
         rows = self.rows_of_all_senders(message)
-        return rows[self.frames.sent_by(address or self.address, rows)]
+        return rows[self.frames.is_sent_by(address or self.address, rows)]
 
     def read(
         self,
@@ -126,7 +128,7 @@ class Recording:
             values[:, column_index] *= layout.scale.get(column, 1.0)
         del table
         values[~(np.abs(values) < MAX_FIELD_VALUE)] = np.nan
-        index = time_index(boot_s[selected_rows] - self.zero_s)
+        index = time_index(boot_s[selected_rows] - self.time_origin_s)
         samples = pd.DataFrame(values, index, list(layout.columns), copy=False)
         if "roll" in samples:
             attitude = Rotation.from_euler("ZYX", samples[["yaw", "pitch", "roll"]].to_numpy())
@@ -135,8 +137,10 @@ class Recording:
 
     def _select_rows(self, name: str, boot_s: Array) -> IntArray:
         """Return the indices of valid and increasing boot times; count all others as dropped."""
-        time_s = boot_s - self.zero_s
-        is_inside = (time_s >= -MAX_OUTSIDE_S) & (time_s <= self.duration_s + MAX_OUTSIDE_S)
+        time_s = boot_s - self.time_origin_s
+        is_inside = (time_s >= -MAX_TIME_OUTSIDE_S) & (
+            time_s <= self.duration_s + MAX_TIME_OUTSIDE_S
+        )
         rows = np.flatnonzero(is_inside & (boot_s > 0.0))
         time_us = np.rint(boot_s[rows] * 1e6).astype(np.int64)
         # A message that is received twice, over two links, is one sample
@@ -148,22 +152,22 @@ class Recording:
 
     def receipt_boot_s(self, rows: IntArray) -> Array:
         """Return the receive time since boot (s) of frames, without the minimum link delay."""
-        return self.receipt_to_boot.at(self.received_s[rows])
+        return self.receipt_to_boot_line.at(self.received_s[rows])
 
     def boot_s(self, table: NDArray[Any], rows: IntArray) -> Array:
         """Return the time since boot (s) of each message, or its receive time if it has none."""
-        if not self.receipt_to_boot.pair_count:  # no message contains the boot clock
+        if not self.receipt_to_boot_line.pair_count:  # no message contains the boot clock
             return self.receipt_boot_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
             return np.asarray(table["time_boot_ms"] * 1e-3)
         timestamp_s: Array = table["time_usec"] * 1e-6
         is_boot_time = (timestamp_s > 0.0) & (
-            (timestamp_s < MIN_UNIX_TIME_S) == (self.zero_s < MIN_UNIX_TIME_S)
+            (timestamp_s < MIN_UNIX_TIME_S) == (self.time_origin_s < MIN_UNIX_TIME_S)
         )
         return np.where(is_boot_time, timestamp_s, self.receipt_boot_s(rows))
 
-    def record_stream(self, data_kind: str, *messages: str, clock: str = BOOT_CLOCK) -> None:
-        """Record the messages and the clock of one kind of data, such as "imu"."""
+    def record_stream(self, data_kind: str, *messages: str, clock: str = BOOT_CLOCK_TEXT) -> None:
+        """Store for the report which messages and clock supply data such as "imu"."""
         self.streams[data_kind] = DataSource(messages, clock, self.frames.name)
 
 
@@ -206,10 +210,10 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
 
 def _read_boot_times(frames: MavlinkFrames, address: Address) -> tuple[IntArray, Array]:
     """Return the indices of the autopilot's frames with a time since boot, and these times (s)."""
-    is_from_autopilot = frames.sent_by(address)
+    is_from_autopilot = frames.is_sent_by(address)
     all_rows = [np.zeros(0, dtype=np.intp)]
     all_times_s = [np.zeros(0)]
-    for message_id in np.unique(frames.message_id[is_from_autopilot]).tolist():
+    for message_id in np.unique(frames.message_ids[is_from_autopilot]).tolist():
         name = message_name(message_id)
         if "time_boot_ms" in (wire_layout(message_id).names or ()):
             field_name, unit_s = "time_boot_ms", 1e-3
@@ -227,48 +231,51 @@ def _read_boot_times(frames: MavlinkFrames, address: Address) -> tuple[IntArray,
     is_usable = is_boot_time if np.any(is_boot_time) else (times_s >= MIN_UNIX_TIME_S)
     if is_usable.sum() >= MIN_CONSTANT_TIMESTAMPS and not is_running_clock(times_s[is_usable]):
         is_usable &= False
-    usable_order = np.flatnonzero(is_usable)
-    usable_order = usable_order[np.argsort(rows[usable_order])]
-    return rows[usable_order], times_s[usable_order]
+    usable_indices = np.flatnonzero(is_usable)
+    usable_indices = usable_indices[np.argsort(rows[usable_indices])]
+    return rows[usable_indices], times_s[usable_indices]
 
 
 def read_recording(frames: MavlinkFrames, address: Address) -> Recording:
-    """Choose the longest time span between two restarts, and relate receive time to boot time."""
+    """Return the longest part of a recording without restart, with receive times in boot time."""
     notes: list[str] = []
     rows, boot_s = _read_boot_times(frames, address)
-    session = slice(0, len(frames))
+    session_frames = slice(0, len(frames))
     restart_rows = np.flatnonzero(np.diff(boot_s) < -MIN_RESTART_STEP_S) + 1
     # A single late or early packet is not a restart: the packets before and after have to agree
-    boot_before_s = boot_s[np.maximum(restart_rows - 1 - RESTART_CHECK_MESSAGES, 0)]
-    boot_after_s = boot_s[np.minimum(restart_rows + RESTART_CHECK_MESSAGES, len(boot_s) - 1)]
+    boot_before_restart_s = boot_s[np.maximum(restart_rows - 1 - RESTART_CHECK_MESSAGES, 0)]
+    boot_after_restart_s = boot_s[
+        np.minimum(restart_rows + RESTART_CHECK_MESSAGES, len(boot_s) - 1)
+    ]
     restart_rows = restart_rows[
-        boot_after_s < np.minimum(boot_before_s, boot_s[restart_rows - 1]) - MIN_RESTART_STEP_S
+        boot_after_restart_s
+        < np.minimum(boot_before_restart_s, boot_s[restart_rows - 1]) - MIN_RESTART_STEP_S
     ]
     if len(restart_rows):
         row_limits = [0, *restart_rows.tolist(), len(rows)]
         session_index = int(np.argmax(np.diff(row_limits)))
         session_rows = slice(*row_limits[session_index : session_index + 2])
-        used_fraction = len(rows[session_rows]) / len(rows)
+        session_fraction = len(rows[session_rows]) / len(rows)
         rows, boot_s = rows[session_rows], boot_s[session_rows]
-        session = slice(
+        session_frames = slice(
             int(rows[0]) if session_index else 0,
             int(rows[-1]) + 1 if session_index < len(restart_rows) else len(frames),
         )
         notes.append(
             f"number of restarts of the boot clock: {len(restart_rows)}. Only the longest part "
             f"between two restarts is analysed: {boot_s[0]:.1f} s to {boot_s[-1]:.1f} s after boot "
-            f"({used_fraction:.0%} of the data)"
+            f"({session_fraction:.0%} of the data)"
         )
     increasing_rows = _remove_stray_timestamps(
         boot_s, longest_increasing_run(np.rint(boot_s * 1e6).astype(np.int64))
     )
     rows, boot_s = rows[increasing_rows], boot_s[increasing_rows]
-    receipt_to_boot = ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
+    receipt_to_boot_line = ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
     received_s = np.zeros(len(frames))
     if frames.received_us is not None:
         received_s = (frames.received_us - frames.received_us[0]) * 1e-6
         if len(rows):
-            receipt_to_boot = fit_least_delay(boot_s, received_s[rows]).inverse()
+            receipt_to_boot_line = fit_clock_line(boot_s, received_s[rows]).inverse()
     elif len(rows):
         # A raw stream has no receive times; the last boot time before each frame is used instead
         previous_message_index = np.searchsorted(rows, np.arange(len(frames)), side="right") - 1
@@ -291,24 +298,26 @@ def read_recording(frames: MavlinkFrames, address: Address) -> Recording:
         f"{bad_byte_count:,} bytes ({bad_byte_count / byte_count:.2%}) are not part of a complete "
         "MAVLink frame"
     )
-    damage: tuple[str, ...] = ()
+    damage_notes: tuple[str, ...] = ()
     # Incomplete frames at the beginning and end of the file do not count as damage
     if bad_byte_count - 2 * MAX_FRAME_BYTES > MAX_STRAY_BYTE_FRACTION * byte_count:
-        damage = (f"the file is damaged: {stray_bytes_note}",)
+        damage_notes = (f"the file is damaged: {stray_bytes_note}",)
     elif bad_byte_count:
         notes.append(stray_bytes_note)
-    # Without a boot clock, flight time is receive time
-    zero_s, end_s = (boot_s if len(boot_s) else np.array([0.0, received_s.max()]))[[0, -1]].tolist()
+    # Without boot times, the time axis is the receive time
+    time_origin_s, end_s = (boot_s if len(boot_s) else np.array([0.0, received_s.max()]))[
+        [0, -1]
+    ].tolist()
     return Recording(
         frames,
         address,
-        session,
+        session_frames,
         received_s,
-        receipt_to_boot,
-        zero_s,
-        end_s - zero_s,
+        receipt_to_boot_line,
+        time_origin_s,
+        end_s - time_origin_s,
         notes,
-        damage,
+        damage_notes,
         len(restart_rows) or None,
         receipt_reversal_count or None,
     )
@@ -317,11 +326,13 @@ def read_recording(frames: MavlinkFrames, address: Address) -> Recording:
 def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
     """Remove small groups of timestamps at the beginning and at the end of a recording.
 
-    Groups are separated by gaps of more than MAX_OUTSIDE_S. A group is small if it has less than
-    MIN_GROUP_FRACTION of the timestamps of the largest group.
+    Groups are separated by gaps of more than MAX_TIME_OUTSIDE_S. A group is small if it has
+    less than MIN_TIMESTAMP_GROUP_FRACTION of the timestamps of the largest group.
     """
-    timestamp_groups = np.split(rows, np.flatnonzero(np.diff(times_s[rows]) > MAX_OUTSIDE_S) + 1)
-    min_group_size = MIN_GROUP_FRACTION * max(len(group) for group in timestamp_groups)
+    timestamp_groups = np.split(
+        rows, np.flatnonzero(np.diff(times_s[rows]) > MAX_TIME_OUTSIDE_S) + 1
+    )
+    min_group_size = MIN_TIMESTAMP_GROUP_FRACTION * max(len(group) for group in timestamp_groups)
     large_groups = [
         index for index, group in enumerate(timestamp_groups) if len(group) >= min_group_size
     ]
@@ -334,4 +345,4 @@ def map_boot_to_unix(recording: Recording) -> ClockLine | None:
     table = table[table["time_unix_usec"] * 1e-6 > MIN_UNIX_TIME_S]
     if not len(table):
         return None
-    return fit_least_delay(table["time_boot_ms"] * 1e-3, table["time_unix_usec"] * 1e-6)
+    return fit_clock_line(table["time_boot_ms"] * 1e-3, table["time_unix_usec"] * 1e-6)

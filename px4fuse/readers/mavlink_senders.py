@@ -22,7 +22,7 @@ from px4fuse.readers.mavlink_recording import MIN_RESTART_STEP_S, Recording, map
 # Maximum number of senders that are read; senders with more messages are preferred
 MAX_SENDERS = 32
 # Maximum fraction of lost messages: above it, the sender does not number its messages in sequence
-MAX_LOST_FRACTION = 0.9
+MAX_LOST_MESSAGE_FRACTION = 0.9
 # Maximum number of later messages of a sender that overtake a message, on a faster link
 MAX_LATE_MESSAGES = 16
 # Maximum difference (s) of TIMESYNC timestamps from a sender's position timestamps: a larger
@@ -83,7 +83,7 @@ def choose_autopilot(frames: MavlinkFrames, system: int | None) -> tuple[Address
     candidates = candidates or [
         address for address in frame_counts if address[1] == messages.AUTOPILOT_COMPONENT_ID
     ]
-    # The recording may contain no message that the autopilot sent
+    # If no message is from an autopilot, assume that each system has one that sent nothing
     candidates = candidates or [
         (address[0], messages.AUTOPILOT_COMPONENT_ID) for address in frame_counts
     ]
@@ -104,8 +104,8 @@ def choose_autopilot(frames: MavlinkFrames, system: int | None) -> tuple[Address
     return best_address, messages.AUTOPILOTS.get(autopilot_type, "unknown autopilot")
 
 
-def senders_of(recording: Recording, message: str) -> list[Address]:
-    """Return the senders of a message, such as companion computers, without autopilots."""
+def find_senders(recording: Recording, message: str) -> list[Address]:
+    """Return the senders of a message type, such as companion computers, without autopilots."""
     frames = recording.frames
     autopilot_address = recording.address
     other_vehicles = {
@@ -124,7 +124,7 @@ def senders_of(recording: Recording, message: str) -> list[Address]:
 def map_senders(recording: Recording) -> dict[Address, ClockMapping]:
     """Return the relation of each position sender's clock to the autopilot's boot clock."""
     message_names = {source.message for source in messages.POSITION_INPUTS}
-    senders = {address for message in message_names for address in senders_of(recording, message)}
+    senders = {address for message in message_names for address in find_senders(recording, message)}
     boot_to_unix = map_boot_to_unix(recording)
     return {
         sender: _map_sender_clock(recording, sender, boot_to_unix) for sender in sorted(senders)
@@ -147,7 +147,8 @@ def _map_sender_clock(
     timesync = frames.table("TIMESYNC", rows)
     sender_reply_s = timesync["tc1"] * 1e-9
     request_s = timesync["ts1"] * 1e-9
-    # In a reply, ts1 is the clock of the requester: the boot clock only in replies to the autopilot
+    # A TIMESYNC reply repeats the requester's time in ts1, which is boot time only if the autopilot
+    # sent the request
     is_sender_reply = (sender_reply_s != 0.0) & (
         np.abs(request_s - recording.receipt_boot_s(rows)) <= MIN_RESTART_STEP_S
     )
@@ -172,7 +173,7 @@ def _map_sender_clock(
         f"system {sender[0]}, component {sender[1]}",
         np.concatenate(timestamps_s),
         np.concatenate(received_s),
-        recording.receipt_to_boot,
+        recording.receipt_to_boot_line,
         (request_s[is_sender_reply], sender_reply_s[is_sender_reply]),
         (sender_request_s[is_autopilot_reply], autopilot_reply_s[is_autopilot_reply]),
         boot_to_unix,
@@ -184,36 +185,38 @@ def _requests_of_other_senders(recording: Recording, sender: Address) -> Int64Ar
     """Return the TIMESYNC request times ``ts1`` (ns) of all senders except ``sender``."""
     frames = recording.frames
     rows = frames.rows("TIMESYNC")
-    timesync = frames.table("TIMESYNC", rows[~frames.sent_by(sender, rows)])
+    timesync = frames.table("TIMESYNC", rows[~frames.is_sent_by(sender, rows)])
     return np.asarray(timesync["ts1"][timesync["tc1"] == 0])
 
 
-def clock_maps(
+def describe_clock_conversions(
     recording: Recording, clock_mappings: dict[Address, ClockMapping]
 ) -> tuple[ClockMap, ...]:
     """Describe the conversions of sender clocks and of the receive time to the boot clock."""
-    clocks = [mapping.description for mapping in clock_mappings.values()]
+    clock_descriptions = [mapping.description for mapping in clock_mappings.values()]
     received_us = recording.frames.received_us
-    receipt_to_boot = recording.receipt_to_boot
-    if received_us is not None and receipt_to_boot.pair_count:
+    receipt_to_boot_line = recording.receipt_to_boot_line
+    if received_us is not None and receipt_to_boot_line.pair_count:
         note = "the recorded link was replayed faster or slower than real time"
-        if abs(receipt_to_boot.slope - 1.0) < MAX_RELATIVE_RATE_DIFFERENCE:
+        if abs(receipt_to_boot_line.slope - 1.0) < MAX_RELATIVE_RATE_DIFFERENCE:
             note = (
-                "the messages with the least link delay determine the boot time of a receive time, "
-                "which only orders messages and converts other clocks"
+                "receive times are converted by the messages with the least link delay; they serve "
+                "only to order messages and to convert other clocks"
             )
-        clocks.append(
+        clock_descriptions.append(
             ClockMap(
                 clock="receive time (UNIX time of the recording computer)",
                 method="receive time",
-                pairs=receipt_to_boot.pair_count,
-                offset_s=receipt_to_boot.y0 - receipt_to_boot.x0 - float(received_us[0]) * 1e-6,
-                drift_ppm=(receipt_to_boot.slope - 1.0) * 1e6,
-                jitter_s=receipt_to_boot.jitter,
+                pairs=receipt_to_boot_line.pair_count,
+                offset_s=receipt_to_boot_line.y0
+                - receipt_to_boot_line.x0
+                - float(received_us[0]) * 1e-6,
+                drift_ppm=(receipt_to_boot_line.slope - 1.0) * 1e6,
+                jitter_s=receipt_to_boot_line.jitter,
                 note=note,
             )
         )
-    return tuple(clocks)
+    return tuple(clock_descriptions)
 
 
 def describe_senders(recording: Recording) -> tuple[Sender, ...]:
@@ -228,22 +231,26 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
             description = VEHICLE_TYPES.get(vehicle_type, f"vehicle of MAV_TYPE {vehicle_type}")
             if autopilot != messages.INVALID_AUTOPILOT:
                 description = f"{messages.AUTOPILOTS.get(autopilot, 'autopilot')} {description}"
-        lost_fraction = _lost_fraction(frames, address)
+        lost_fraction = _estimate_lost_fraction(frames, address)
         is_analysed = address == recording.address
         sender_descriptions.append(Sender(*address, description, count, lost_fraction, is_analysed))
     return tuple(sender_descriptions)
 
 
-def _lost_fraction(frames: MavlinkFrames, address: Address) -> float | None:
+def _estimate_lost_fraction(frames: MavlinkFrames, address: Address) -> float | None:
     """Return the fraction of a sender's messages that are lost, from gaps in the sequence numbers.
 
     Return None if the sender does not count its messages, or counts them separately on two links.
     """
-    sequence = frames.sequence[frames.sent_by(address)].astype(np.int64)
+    sequence = frames.sequence[frames.is_sent_by(address)].astype(np.int64)
     sequence_steps = np.mod(np.diff(sequence) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES
     unwrapped_sequence = np.append(0, np.cumsum(sequence_steps))
     lost_fraction = float(
         1.0 - len(np.unique(unwrapped_sequence)) / (np.ptp(unwrapped_sequence) + 1)
     )
     has_sequence_numbers = len(unwrapped_sequence) == 1 or bool(unwrapped_sequence.any())
-    return lost_fraction if has_sequence_numbers and lost_fraction < MAX_LOST_FRACTION else None
+    return (
+        lost_fraction
+        if has_sequence_numbers and lost_fraction < MAX_LOST_MESSAGE_FRACTION
+        else None
+    )

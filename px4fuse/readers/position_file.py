@@ -20,12 +20,12 @@ from px4fuse.core.reading import read_bytes_limited, split_path_and_part
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import NO_INVALID_ROWS, time_index
 from px4fuse.readers import position_names
-from px4fuse.readers.common import find_invalid_rows, rounding_step
+from px4fuse.readers.common import estimate_rounding_step, find_invalid_rows
 from px4fuse.readers.position_names import (
     LENGTH_UNITS,
     TIME_UNITS,
     ColumnMeaning,
-    find_quaternion,
+    find_quaternion_columns,
     read_column_name,
 )
 from px4fuse.readers.recording_table import (
@@ -38,7 +38,12 @@ from px4fuse.readers.recording_table import (
     find_table,
 )
 from px4fuse.readers.ros_bag import is_bag, read_bag
-from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S, quote, refuse_foreign_format
+from px4fuse.readers.text_table import (
+    MAX_VALID_UNIX_TIME_S,
+    MIN_VALID_UNIX_TIME_S,
+    quote,
+    refuse_foreign_format,
+)
 from px4fuse.readers.ulog_topics import longest_increasing_run
 
 SIGMA_COLUMNS = ["sigma_x_m", "sigma_y_m", "sigma_z_m"]
@@ -47,24 +52,24 @@ SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 # Maximum number of UWB tags in a column; a column with more different values is a counter
 MAX_TAGS = 100
 MIN_USABLE_ROWS = 3
-# Minimum fraction of rows with increasing times in a time column, or with whole seconds if another
-# column contains the nanoseconds
+# Minimum fraction of rows with increasing times, in a file without header; and minimum fraction of
+# rows with whole seconds, if another column contains the nanoseconds
 MIN_USABLE_FRACTION = 0.9
 # Minimum plausible median interval (s): UWB systems send at most 200 positions per second, ±10 %
 MIN_INTERVAL_S = 0.9 / 200
 # Maximum plausible median interval (s): UWB systems send a position every 5 s or more often, ±10 %
 MAX_INTERVAL_S = 1.1 / 0.2
 # Plausible units of the timestamps of positions, and plausible median intervals (s)
-POSITION_TIME_LIMITS = tuple(TIME_UNITS), (MIN_INTERVAL_S, MAX_INTERVAL_S)
+POSITION_UNITS_AND_INTERVALS = tuple(TIME_UNITS), (MIN_INTERVAL_S, MAX_INTERVAL_S)
 # Plausible units of the timestamps of trajectories, and plausible median intervals (s)
-TRAJECTORY_TIME_LIMITS = ("s", "ns"), (1e-3, 1e3)
+TRAJECTORY_UNITS_AND_INTERVALS = ("s", "ns"), (1e-3, 1e3)
 # Maximum median interval (s) of UNIX times in seconds. Numbers with a longer interval are boot
 # times in µs
 MAX_UNIX_TIME_INTERVAL_S = 60.0
 # Maximum extent (m) of an indoor flight. Positions with a larger extent are probably in mm
 MAX_INDOOR_EXTENT_M = 200.0
-# Maximum absolute coordinate in any unit of length: larger values are timestamps or damaged text
-MAX_COORDINATE = 1e9
+# Maximum absolute coordinate in the unit of the file: larger values are timestamps or damaged text
+MAX_RAW_COORDINATE = 1e9
 
 
 @dataclass(frozen=True)
@@ -77,22 +82,22 @@ class PositionRecording:
     # Position and σ (SAMPLE_COLUMNS), indexed by increasing time (s); NaN if not in the file. Axes
     # x, y, z in frame "ned": north, east, down; in "enu": east, north, up
     samples: pd.DataFrame
-    # "UNIX" if the timestamps are between 2000 and 2100
-    clock: Literal["UNIX", "local"]
+    # "UNIX" if the timestamps are UNIX times between 2000 and 2100
+    clock_kind: Literal["UNIX", "local"]
     # Coordinate frames that column names and format allow; empty if all are possible
     frames: tuple[str, ...]
     # Sentences about the detected format, such as unit or frame
-    detected: tuple[str, ...]
-    # Sentences about dropped rows and warnings
+    detection_notes: tuple[str, ...]
+    # Warnings, and sentences about dropped rows
     notes: tuple[str, ...]
     # Number of rows with an invalid timestamp
-    dropped: int = 0
+    dropped_row_count: int = 0
     # Factor that converted the positions of the file to metres
     metres_per_unit: float = 1.0
     # Dropped rows, each with the reason from :func:`find_invalid_rows`
     invalid: "pd.Series[str]" = field(default_factory=lambda: NO_INVALID_ROWS)
     # Quantisation step of the horizontal position; 0 if it is not quantised
-    step_m: float = 0.0
+    rounding_step_m: float = 0.0
     # Name of the format; "" for a table with a header
     format: str = ""
     # Number of rows in the file that contain the body or tag which is read
@@ -102,7 +107,7 @@ class PositionRecording:
 
 
 # Column indices of position or sigma along x, y, z; None if missing
-_Columns = tuple[int | None, ...]
+_ColumnIndices = tuple[int | None, ...]
 
 
 def read_position_file(
@@ -143,8 +148,8 @@ def read_position_file(
     table, sha256, size_bytes = _open_table(path, columns, body or body_in_path)
     notes = [*table.notes]
     meanings = [read_column_name(name) for name in table.names]
-    given_columns = _column_indices(table, columns or ())
-    quaternion_columns = find_quaternion(table.names)
+    given_columns = _find_column_indices(table, columns or ())
+    quaternion_columns = find_quaternion_columns(table.names)
     numbers, has_time_zone = _read_numbers(
         table, meanings, given_columns, quaternion_columns, body or body_in_path
     )
@@ -155,17 +160,19 @@ def read_position_file(
     position_columns = [index for index in axis_columns if index is not None]
     # pandas reads numbers such as 1e999 as infinite
     has_time = np.isfinite(numbers[time_column])
-    is_usable = has_time & (numbers[position_columns].abs() < MAX_COORDINATE).all(axis=1)
+    is_usable = has_time & (numbers[position_columns].abs() < MAX_RAW_COORDINATE).all(axis=1)
     if unusable_count := int(np.count_nonzero(~is_usable)):
         notes.append(
             f"number of dropped rows without valid time or position: {unusable_count}"
-            f"{table.first_line(numbers.index[~is_usable])}"
+            f"{table.format_first_line(numbers.index[~is_usable])}"
         )
     times_without_position = numbers.loc[has_time & ~is_usable, time_column].to_numpy()
     numbers = numbers[is_usable]
     file_times = numbers[time_column].to_numpy()
-    units, interval_range_s = TRAJECTORY_TIME_LIMITS if is_trajectory else POSITION_TIME_LIMITS
-    unit, unit_text = _time_unit(
+    units, interval_range_s = (
+        TRAJECTORY_UNITS_AND_INTERVALS if is_trajectory else POSITION_UNITS_AND_INTERVALS
+    )
+    unit, unit_text = _choose_time_unit(
         file_times, meanings[time_column].unit, time_unit, units, interval_range_s
     )
     units_per_second: float = round(1.0 / TIME_UNITS[unit])
@@ -173,7 +180,7 @@ def read_position_file(
         unit_text = f"the frame rate is {table.rate_hz:g} Hz"
         unit, units_per_second = "frame numbers", table.rate_hz
     times_s = file_times / units_per_second
-    kept_rows = _increasing_rows(times_s)
+    kept_rows = _find_increasing_rows(times_s)
     if dropped_count := len(times_s) - len(kept_rows):
         notes.append(
             "number of dropped rows with timestamps that repeat, decrease or are after 2100: "
@@ -189,7 +196,8 @@ def read_position_file(
                     *notes,
                 )
             ),
-            f"Write decimal points. Alternatively, name the columns with {COLUMNS_OPTION}.",
+            f"Write numbers with decimal points. Alternatively, name the columns with "
+            f"{COLUMNS_OPTION}.",
         )
     numbers = numbers.iloc[kept_rows].set_index(time_index(times_s[kept_rows]))
     median_interval_s = median_interval(numbers.index)
@@ -198,7 +206,7 @@ def read_position_file(
             f"a median interval of {median_interval_s:.3g} s is unusual: check the unit of time "
             "(--position-time-unit)"
         )
-    scale_by_column, length_unit_text = _length_units(
+    scale_by_column, length_unit_text = _choose_length_units(
         numbers,
         position_columns,
         meanings,
@@ -220,8 +228,11 @@ def read_position_file(
     quaternions = numbers.loc[invalid_reasons == "", quaternion_columns].to_numpy()
     samples = samples[invalid_reasons == ""]
     notes += _drop_invalid_sigmas(samples)
-    is_unix = has_time_zone and UNIX_START_S <= float(np.median(numbers.index)) < UNIX_END_S
-    clock: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
+    is_unix = (
+        has_time_zone
+        and MIN_VALID_UNIX_TIME_S <= float(np.median(numbers.index)) < MAX_VALID_UNIX_TIME_S
+    )
+    clock_kind: Literal["UNIX", "local"] = "UNIX" if is_unix else "local"
     axes_text = (frame.upper() if frame else "x, y, z") + " without height" * (
         len(position_columns) < 3
     )
@@ -230,18 +241,18 @@ def read_position_file(
         sha256=sha256,
         size_bytes=size_bytes,
         samples=samples,
-        clock=clock,
+        clock_kind=clock_kind,
         frames=(frame,) if frame else table.frames,
-        dropped=dropped_count,
-        detected=(
+        dropped_row_count=dropped_count,
+        detection_notes=(
             f"the file format is {table.format}"
             if table.format
             else f"the separator is {SEPARATORS[table.separator]}, the header is line "
             f"{table.header_line}",
-            f"time: column {time_text}, {clock} clock, unit {unit} ({unit_text})",
-            f"position: columns {table.label(*axis_columns)} as {axes_text}, unit "
+            f"time: column {time_text}, {clock_kind} clock, unit {unit} ({unit_text})",
+            f"position: columns {table.format_labels(*axis_columns)} as {axes_text}, unit "
             f"{length_unit_text}",
-            f"sigma: columns {table.label(*sigma_columns) or 'none'}",
+            f"sigma: columns {table.format_labels(*sigma_columns) or 'none'}",
         ),
         notes=tuple(notes),
         metres_per_unit=scale_by_column[position_columns[0]],
@@ -249,27 +260,29 @@ def read_position_file(
         format=table.format,
         row_count=row_count,
         quaternions=quaternions if quaternion_columns else None,
-        step_m=max(rounding_step(samples[name].to_numpy()) for name in ("x_m", "y_m")),
+        rounding_step_m=max(
+            estimate_rounding_step(samples[name].to_numpy()) for name in ("x_m", "y_m")
+        ),
     )
 
 
 def _open_table(
-    path: Path, columns: tuple[str, ...] | None, body: str | None
+    path: Path, columns: tuple[str, ...] | None, body_name: str | None
 ) -> tuple[Table, str, int]:
     """Return the table of positions in a file or ROS bag, and the SHA-256 and size (bytes)."""
     if is_bag(path):
-        return read_bag(path, body)
+        return read_bag(path, body_name)
     content = read_bytes_limited(
         path, LogError, MAX_FILE_BYTES, empty_remedy="Copy the position file again."
     )
     refuse_foreign_format(path, content, LogError)
-    table = find_table(path, content, columns, body)
+    table = find_table(path, content, columns, body_name)
     return table, hashlib.sha256(content).hexdigest(), len(content)
 
 
-def _increasing_rows(times_s: Array) -> IntArray:
+def _find_increasing_rows(times_s: Array) -> IntArray:
     """Return the indices of the rows with strictly increasing times before 2100."""
-    usable_rows = np.flatnonzero(np.abs(times_s) < UNIX_END_S)
+    usable_rows = np.flatnonzero(np.abs(times_s) < MAX_VALID_UNIX_TIME_S)
     # Ranks are used instead of times, because longest_increasing_run requires positive values
     ranks = np.unique(times_s[usable_rows], return_inverse=True)[1].astype(np.int64)
     return usable_rows[longest_increasing_run(ranks + 1)]
@@ -298,7 +311,7 @@ def _read_numbers(
     meanings: list[ColumnMeaning],
     given_columns: list[int],
     quaternion_columns: list[int],
-    body: str | None,
+    body_name: str | None,
 ) -> tuple[pd.DataFrame, bool]:
     """Convert the text of the needed columns to numbers.
 
@@ -306,11 +319,13 @@ def _read_numbers(
     value is False for dates without time zone, otherwise True.
     """
     known_columns = [index for index, meaning in enumerate(meanings) if meaning.kind]
-    texts = table.texts([*given_columns, *quaternion_columns, *known_columns])
-    texts = _select_body(table, texts, meanings, body)
-    is_comma_decimal = table.separator != ","
+    texts = table.read_cells([*given_columns, *quaternion_columns, *known_columns])
+    texts = _select_body(table, texts, meanings, body_name)
+    may_have_decimal_comma = table.separator != ","
     # apply on an empty table returns the dtype object
-    numbers = texts.apply(_to_numbers, is_comma_decimal=is_comma_decimal).astype(np.float64)
+    numbers = texts.apply(_to_numbers, may_have_decimal_comma=may_have_decimal_comma).astype(
+        np.float64
+    )
     has_time_zone = True
     for index in given_columns[:1] or [i for i in known_columns if meanings[i].kind == "time"]:
         if numbers[index].isna().mean() > 0.5 and texts[index].notna().any():
@@ -331,9 +346,9 @@ def _drop_invalid_sigmas(samples: pd.DataFrame) -> list[str]:
     )
 
 
-def _to_numbers(texts: "pd.Series[str]", *, is_comma_decimal: bool) -> "pd.Series[float]":
+def _to_numbers(texts: "pd.Series[str]", *, may_have_decimal_comma: bool) -> "pd.Series[float]":
     """Convert texts to numbers; a comma is the decimal mark if most cells contain one."""
-    if is_comma_decimal and texts.str.contains(",", regex=False).mean() > 0.5:
+    if may_have_decimal_comma and texts.str.contains(",", regex=False).mean() > 0.5:
         texts = texts.str.replace(",", ".", regex=False)
     return pd.to_numeric(texts, errors="coerce").astype(np.float64)
 
@@ -347,23 +362,23 @@ def _read_dates(texts: "pd.Series[str]") -> tuple["pd.Series[float]", bool]:
 
 
 def _select_body(
-    table: Table, texts: pd.DataFrame, meanings: Sequence[ColumnMeaning], body: str | None
+    table: Table, texts: pd.DataFrame, meanings: Sequence[ColumnMeaning], body_name: str | None
 ) -> pd.DataFrame:
     """Return the rows of one rigid body or UWB tag, if a column contains their names."""
     for index, meaning in enumerate(meanings):
         if meaning.kind == "tag":
             tags = texts[index].dropna().unique().tolist()
-            if 1 < len(tags) <= MAX_TAGS or (tags and body is not None):
-                return texts[texts[index] == choose_body(table.file_name, tags, body)]
-    if body is not None and not table.is_chosen_body:
+            if 1 < len(tags) <= MAX_TAGS or (tags and body_name is not None):
+                return texts[texts[index] == choose_body(table.file_name, tags, body_name)]
+    if body_name is not None and not table.is_chosen_body:
         raise LogError(
             f"{table.file_name} contains only one body, which has no name",
-            "Omit the name after the file, and --body.",
+            "Omit --body, and the name after the colon in FILE:NAME.",
         )
     return texts
 
 
-def _column_indices(table: Table, wanted_columns: tuple[str, ...]) -> list[int]:
+def _find_column_indices(table: Table, wanted_columns: tuple[str, ...]) -> list[int]:
     names = [name.casefold() for name in table.names]
     # A number is the name of a column, or else its position in the header
     names += [str(index + 1) for index in range(len(names))]
@@ -373,7 +388,7 @@ def _column_indices(table: Table, wanted_columns: tuple[str, ...]) -> list[int]:
         if wanted_name not in names:
             raise SettingsError(
                 f"{table.file_name} has no column {quote(column)}; the columns are "
-                f"{table.label(*range(len(table.names)))}",
+                f"{table.format_labels(*range(len(table.names)))}",
                 f"Name the columns with {COLUMNS_OPTION}.",
             )
         indices.append(names.index(wanted_name) % len(table.names))
@@ -385,65 +400,61 @@ def _column_indices(table: Table, wanted_columns: tuple[str, ...]) -> list[int]:
 
 
 def _choose_columns(
-    table: Table,
-    meanings: Sequence[ColumnMeaning],
-    given_columns: list[int],
-    numbers: pd.DataFrame,
-) -> tuple[int, _Columns, _Columns, str | None, str]:
+    table: Table, meanings: Sequence[ColumnMeaning], given_columns: list[int], numbers: pd.DataFrame
+) -> tuple[int, _ColumnIndices, _ColumnIndices, str | None, str]:
     """Choose the columns of time, position and σ; return also the frame and the time format.
 
     A column with the time of measurement is preferred to the time of recording.
     """
     if given_columns:
         time_column = given_columns[0]
-        time_text = table.label(time_column)
+        time_text = table.format_labels(time_column)
         frame = None
-        axis_columns: _Columns = (*given_columns[1:4], None)[:3]
+        axis_columns: _ColumnIndices = (*given_columns[1:4], None)[:3]
         # The column names may contain the frame, which determines the order of the axes
         given_meanings = [
             meaning if index in axis_columns else ColumnMeaning()
             for index, meaning in enumerate(meanings)
         ]
-        named_axis_columns = position_names.find_position(given_meanings)
+        named_axis_columns = position_names.find_position_columns(given_meanings)
         if named_axis_columns and {*named_axis_columns[1]} == {*axis_columns}:
             frame, axis_columns = named_axis_columns
     else:
         time_columns = [index for index, column in enumerate(meanings) if column.kind == "time"]
         is_mostly_empty = numbers[time_columns].fillna(0.0).eq(0.0).mean() >= 0.5
-        kind_rank = position_names.TIME_KINDS.index
+        rank_time_kind = position_names.TIME_KINDS.index
         time_column, *other_time_columns = sorted(
             time_columns,
             key=lambda index: (
                 is_mostly_empty[index],
-                kind_rank(meanings[index].key),
+                rank_time_kind(meanings[index].axis_or_time_kind),
                 meanings[index].unit == "ns",
             ),
         )
-        time_text = table.label(time_column)
+        time_text = table.format_labels(time_column)
         for index in [*other_time_columns]:
-            are_whole_seconds = (numbers[time_column] % 1.0 == 0.0).mean() > MIN_USABLE_FRACTION
-            if are_whole_seconds and meanings[index].unit == "ns" and numbers[index].max() < 1e9:
+            has_whole_seconds = (numbers[time_column] % 1.0 == 0.0).mean() > MIN_USABLE_FRACTION
+            if has_whole_seconds and meanings[index].unit == "ns" and numbers[index].max() < 1e9:
                 numbers[time_column] += numbers[index] * 1e-9
                 other_time_columns.remove(index)
-                time_text += f" plus {table.label(index)}"
+                time_text += f" plus {table.format_labels(index)}"
         if other_time_columns:
-            time_text += (
-                f" ({meanings[time_column].key}; not used: {table.label(*other_time_columns)})"
-            )
-        frame, axis_columns = position_names.find_position(meanings) or (None, ())
+            unused_labels = table.format_labels(*other_time_columns)
+            time_text += f" ({meanings[time_column].axis_or_time_kind}; not used: {unused_labels})"
+        frame, axis_columns = position_names.find_position_columns(meanings) or (None, ())
     if axis_columns[2] is not None and numbers[axis_columns[2]].isna().all():
         axis_columns = (*axis_columns[:2], None)
     sigma_columns = (
         (given_columns[4],) * 3
         if len(given_columns) > 4
-        else position_names.find_sigma(meanings, frame)
+        else position_names.find_sigma_columns(meanings, frame)
     )
     return time_column, axis_columns, sigma_columns, frame, time_text
 
 
-def _time_unit(
+def _choose_time_unit(
     times: Array,
-    name_unit: str,
+    column_name_unit: str,
     given_unit: str | None,
     units: Container[str],
     interval_range_s: tuple[float, float],
@@ -456,13 +467,13 @@ def _time_unit(
     if given_unit is not None:
         return given_unit, "the unit was given with --position-time-unit"
     median_time = float(np.median(times)) if len(times) else 0.0
-    if abs(median_time) * TIME_UNITS.get(name_unit, np.inf) < UNIX_END_S:
-        return name_unit, "the column name contains the unit"
+    if abs(median_time) * TIME_UNITS.get(column_name_unit, np.inf) < MAX_VALID_UNIX_TIME_S:
+        return column_name_unit, "the column name contains the unit"
     time_steps = np.diff(times)
     median_step = float(np.median(time_steps[time_steps > 0])) if (time_steps > 0).any() else 0.0
     plausible_units = []
     for unit, unit_s in TIME_UNITS.items():
-        is_unix = UNIX_START_S <= median_time * unit_s < UNIX_END_S
+        is_unix = MIN_VALID_UNIX_TIME_S <= median_time * unit_s < MAX_VALID_UNIX_TIME_S
         if is_unix and median_step * unit_s <= MAX_UNIX_TIME_INTERVAL_S:
             return unit, f"as UNIX times in {unit}, the times are between 2000 and 2100"
         if unit in units and interval_range_s[0] <= median_step * unit_s <= interval_range_s[1]:
@@ -473,13 +484,13 @@ def _time_unit(
             "with --position-time-unit"
         )
     unit, *other_units = plausible_units
-    reasons = [f"in {unit}, the median interval is {median_step * TIME_UNITS[unit]:.3g} s"]
+    reasons = [f"in this unit, the median interval is {median_step * TIME_UNITS[unit]:.3g} s"]
     if other_units:
         reasons.append(f"if the unit is {other_units[0]}, give --position-time-unit")
     return unit, "; ".join(reasons)
 
 
-def _length_units(
+def _choose_length_units(
     numbers: pd.DataFrame,
     position_columns: list[int],
     meanings: Sequence[ColumnMeaning],
@@ -491,7 +502,7 @@ def _length_units(
     Without a unit from the user or in the column names, positions are in mm if their extent in
     metres exceeds ``max_extent_m``.
     """
-    name_units = {
+    column_name_units = {
         index: meaning.unit
         for index, meaning in enumerate(meanings)
         if meaning.unit in LENGTH_UNITS
@@ -503,9 +514,11 @@ def _length_units(
     reason = "px4fuse assumes metres, because the column names contain no unit"
     if given_unit is not None:
         unit = given_unit
-        name_units = {}
+        column_name_units = {}
         reason = "the unit was given with --position-unit"
-    elif axis_units := [name_units[index] for index in position_columns if index in name_units]:
+    elif axis_units := [
+        column_name_units[index] for index in position_columns if index in column_name_units
+    ]:
         unit = axis_units[0]
         reason = "the column names contain the unit"
     elif max_extent_m < max_extent <= max_extent_m / LENGTH_UNITS["mm"]:
@@ -516,10 +529,12 @@ def _length_units(
         )
     elif max_extent > max_extent_m:
         reason = (
-            "px4fuse assumes metres, because no unit gives the extent of an indoor flight; set "
-            "another unit with --position-unit"
+            "px4fuse assumes metres, because the extent is too large for an indoor flight in any "
+            "unit; set another unit with --position-unit"
         )
-    unit_by_column = {index: name_units.get(index, unit) for index in map(int, numbers.columns)}
+    unit_by_column = {
+        index: column_name_units.get(index, unit) for index in map(int, numbers.columns)
+    }
     scale_by_column = {index: LENGTH_UNITS[name] for index, name in unit_by_column.items()}
     extent_m = max(float(extents[index]) * scale_by_column[index] for index in position_columns)
     used_units = ", ".join(dict.fromkeys(unit_by_column[index] for index in position_columns))

@@ -12,25 +12,32 @@ LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 # Column indices of x, y and z; None without height
 PositionColumns = tuple[int, int, int | None]
-_TABLE = read_toml(__file__, dict[str, dict[str, str]])
-_UNITS, _AXES = (
+_WORD_TABLES = read_toml(__file__, dict[str, dict[str, str]])
+_UNIT_BY_WORD, _AXIS_BY_WORD = (
     {
         word: meaning
-        for meaning, column_words in _TABLE[group].items()
+        for meaning, column_words in _WORD_TABLES[group].items()
         for word in column_words.split(",")
     }
     for group in ("units", "axes")
 )
-_ROLES = {role: {*column_words.split(",")} for role, column_words in _TABLE["roles"].items()}
-_TIME_ROLES = _ROLES["time"] | _ROLES["measured"] | _ROLES["recorded"] | _ROLES["context"]
+_WORDS_BY_ROLE = {
+    role: {*column_words.split(",")} for role, column_words in _WORD_TABLES["roles"].items()
+}
+_TIME_WORDS = (
+    _WORDS_BY_ROLE["time"]
+    | _WORDS_BY_ROLE["measured"]
+    | _WORDS_BY_ROLE["recorded"]
+    | _WORDS_BY_ROLE["context"]
+)
 # Kinds of time columns, in order of preference
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
 # Column names of two words without separator, such as "px" (position, x) and "xstd" (x, sigma)
 _JOINED_NAMES = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
 # Quaternion components, such as "qx", "q_RS_w []" and "pose.orientation.x"
 _QUATERNION_NAME = re.compile(r"(?:\bq|orientation|rotation|quat)(?:\w*_|[ .])?([wxyz])\b")
-# Coordinate frames with the names of their axes. The first frame is used of which the file has both
-# horizontal axes
+# Coordinate frames with the names of their axes. A file has the first frame whose horizontal axes
+# are both among its columns
 _FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
     ("ned", ("north", "east", "down")),
     ("enu", ("east", "north", "up")),
@@ -48,15 +55,15 @@ class ColumnMeaning:
     ----------
     kind : str
         "time", "position", "sigma" or "tag" (number of a UWB tag).
-    key : str
-        Name of the axis, or an element of :data:`TIME_KINDS`.
+    axis_or_time_kind : str
+        Axis of a position or sigma, or element of :data:`TIME_KINDS` for a time.
     unit : str
     group : str
         Column name without axis and unit. The columns x, y and z of one position have one group.
     """
 
     kind: str = ""
-    key: str = ""
+    axis_or_time_kind: str = ""
     unit: str = ""
     group: str = ""
 
@@ -66,46 +73,50 @@ def read_column_name(name: str) -> ColumnMeaning:
     plain_name = unicodedata.normalize("NFKC", name).replace("μ", "u")
     plain_name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", plain_name).lower()
     column_words = re.findall(r"[^\W_]+", plain_name)
-    unit = _UNITS.get(column_words[-1], "") if column_words else ""
+    unit = _UNIT_BY_WORD.get(column_words[-1], "") if column_words else ""
     if len(column_words) == 1 and unit in TIME_UNITS and len(column_words[0]) > 2:
-        return ColumnMeaning("time", "time", unit)  # such as "sec" and "nanosec"
+        return ColumnMeaning("time", "time", unit)  # a unit alone, such as "sec", is a time
     unit = unit if len(column_words) > 1 else ""
     column_words = column_words[:-1] if unit else column_words
     word_set = {*column_words}
-    if word_set & _ROLES["time"] and word_set <= _TIME_ROLES and unit not in LENGTH_UNITS:
-        is_time_kind = [
-            bool(word_set & _ROLES["measured"]),
-            not word_set & _ROLES["recorded"],
+    if word_set & _WORDS_BY_ROLE["time"] and word_set <= _TIME_WORDS and unit not in LENGTH_UNITS:
+        matches_time_kind = [
+            bool(word_set & _WORDS_BY_ROLE["measured"]),
+            not word_set & _WORDS_BY_ROLE["recorded"],
             True,
         ]
-        return ColumnMeaning("time", TIME_KINDS[is_time_kind.index(True)], unit)
-    if word_set and word_set <= _ROLES["tag"]:
+        return ColumnMeaning("time", TIME_KINDS[matches_time_kind.index(True)], unit)
+    if word_set and word_set <= _WORDS_BY_ROLE["tag"]:
         return ColumnMeaning("tag")
-    position_words = _ROLES["sigma"] | _ROLES["context"]
+    sigma_and_context_words = _WORDS_BY_ROLE["sigma"] | _WORDS_BY_ROLE["context"]
     split_words: list[str] = []
     for word in column_words:
-        match = None if word in position_words else _JOINED_NAMES.fullmatch(word)
+        match = None if word in sigma_and_context_words else _JOINED_NAMES.fullmatch(word)
         split_words += [group for group in match.groups() if group] if match else [word]
-    axes = [_AXES[word] for word in split_words if word in _AXES]
-    other_words = [word for word in split_words if word not in _AXES]
-    if unit in TIME_UNITS or len(axes) > 1 or not {*other_words} <= position_words:
+    axes = [_AXIS_BY_WORD[word] for word in split_words if word in _AXIS_BY_WORD]
+    other_words = [word for word in split_words if word not in _AXIS_BY_WORD]
+    if unit in TIME_UNITS or len(axes) > 1 or not {*other_words} <= sigma_and_context_words:
         return ColumnMeaning()
-    if {*other_words} & _ROLES["sigma"]:
+    if {*other_words} & _WORDS_BY_ROLE["sigma"]:
         return ColumnMeaning("sigma", "".join(axes), unit)
     return (
         ColumnMeaning("position", axes[0], unit, ".".join(other_words)) if axes else ColumnMeaning()
     )
 
 
-def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, PositionColumns] | None:
+def find_position_columns(
+    column_meanings: Sequence[ColumnMeaning],
+) -> tuple[str | None, PositionColumns] | None:
     """Return the coordinate frame of the position, and the column indices of its axes.
 
     A position with height is preferred. Return None if no column contains a position.
     """
     columns_by_group: dict[str, dict[str, int]] = {}
-    for index, column in enumerate(meanings):
+    for index, column in enumerate(column_meanings):
         if column.kind == "position":
-            columns_by_group.setdefault(column.group, {}).setdefault(column.key, index)
+            columns_by_group.setdefault(column.group, {}).setdefault(
+                column.axis_or_time_kind, index
+            )
     for axis_count in (3, 2):
         for axes in columns_by_group.values():
             for frame, names in () if "w" in axes else _FRAMES:  # x, y, z, w is a quaternion
@@ -114,12 +125,14 @@ def find_position(meanings: Sequence[ColumnMeaning]) -> tuple[str | None, Positi
     return None
 
 
-def find_sigma(meanings: Sequence[ColumnMeaning], frame: str | None) -> tuple[int | None, ...]:
+def find_sigma_columns(
+    column_meanings: Sequence[ColumnMeaning], frame: str | None
+) -> tuple[int | None, ...]:
     """Return the index of each axis's sigma column; one column may apply to all axes."""
     sigma_columns: dict[str, int] = {}
-    for index, meaning in enumerate(meanings):
+    for index, meaning in enumerate(column_meanings):
         if meaning.kind == "sigma":
-            sigma_columns.setdefault(meaning.key, index)
+            sigma_columns.setdefault(meaning.axis_or_time_kind, index)
     axes = next(axes for name, axes in _FRAMES if name == frame)
     return tuple(
         sigma_columns.get(axis, sigma_columns.get(letter, sigma_columns.get("")))
@@ -127,7 +140,7 @@ def find_sigma(meanings: Sequence[ColumnMeaning], frame: str | None) -> tuple[in
     )
 
 
-def find_quaternion(names: Sequence[str]) -> list[int]:
+def find_quaternion_columns(names: Sequence[str]) -> list[int]:
     """Return the column indices of the quaternion x, y, z, w; empty if the file has none."""
     indices: dict[str, int] = {}
     for index, name in enumerate(names):

@@ -21,14 +21,14 @@ from px4fuse.readers.ulog_topics import Topics
 
 # Maximum time difference (s) between a logged innovation and its logged variance S. By default, PX4
 # logs each topic every 0.5 s, and S changes little in this time
-JOIN_TOLERANCE_S = 0.6
-# Field of estimator_aid_src topics with the time of the last fusion, by column name
-LAST_FUSED = {"last_fused_us": "time_last_fuse"}
+MAX_VARIANCE_TIME_DIFFERENCE_S = 0.6
+# Column name and estimator_aid_src field of the time of the last fusion
+LAST_FUSION_FIELD = {"last_fused_us": "time_last_fuse"}
 # Fields of estimator_aid_src topics that are read if they are logged, by aid and column name
 OPTIONAL_FIELDS = {
     "baro_hgt": {"observation_down": "observation", "filtered_down": "innovation_filtered"},
-    "ev_pos": LAST_FUSED,
-    "gnss_pos": LAST_FUSED,
+    "ev_pos": LAST_FUSION_FIELD,
+    "gnss_pos": LAST_FUSION_FIELD,
 }
 
 
@@ -42,8 +42,8 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
     for name, aid in AIDS.items():
         aid_enabled = enabled_aids.get(name)
         aid_log = _read_aid_topic(topics, aid, aid_enabled)
-        # While EKF2 does not fuse an aiding source, the older topics contain its old values, or
-        # values of other sources
+        # While the fusion of a source is disabled, the topics that are common to all sources
+        # contain old values, or values of other sources
         if aid_log is None and (
             name.startswith("ev_") if aid_enabled is None else aid_enabled.any()
         ):
@@ -66,46 +66,52 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     logged_flags = sorted(flag_names.intersection(*tables)) if tables else []
     if logged_flags:
         layout = Layout(px4.STATUS_FLAGS, {name: name for name in logged_flags})
-        flags = topics.primary_samples(layout, step=True)
+        flags = topics.primary_samples(layout, is_step_function=True)
         for aid in all_aids if len(flags) else ():
             groups = (group.split(",") for group in aid.flags)
             group = next((group for group in groups if {*group} <= {*logged_flags}), None)
             if group is not None:
                 enabled_aids[aid.name] = flags[group].max(axis=1)
-    if not logged_flags and topics.find(px4.LAYOUTS["control_bits"]) is not None:
-        bits = topics.primary_samples(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
-        for aid in all_aids if len(bits) else ():
+    if not logged_flags and topics.find_layout(px4.TOPIC_LAYOUTS["control_bits"]) is not None:
+        control_bits = topics.primary_samples(
+            px4.TOPIC_LAYOUTS["control_bits"], is_step_function=True
+        )["bits"].dropna()
+        for aid in all_aids if len(control_bits) else ():
             if aid.status_bit is not None:
-                is_enabled = bits.to_numpy().astype(np.int64) >> aid.status_bit & 1
-                enabled_aids[aid.name] = pd.Series(is_enabled.astype(float), index=bits.index)
+                is_enabled = control_bits.to_numpy().astype(np.int64) >> aid.status_bit & 1
+                enabled_aids[aid.name] = pd.Series(
+                    is_enabled.astype(float), index=control_bits.index
+                )
     return enabled_aids
 
 
-def _read_aid_topic(topics: Topics, aid: Aid, enabled: pd.Series[float] | None) -> AidLog | None:
+def _read_aid_topic(
+    topics: Topics, aid: Aid, fusion_enabled: pd.Series[float] | None
+) -> AidLog | None:
     field_by_quantity = {
         "innovation": "innovation",
         "variance": "innovation_variance",
         "noise": "observation_variance",
         "ratio": "test_ratio",
     }
-    if aid.name in px4.AIDS_WITH_OBSERVATION:
+    if aid.name in px4.AIDS_WITH_LOCAL_OBSERVATION:
         field_by_quantity["observation"] = "observation"
     columns = {"fused": "fused", "rejected": "innovation_rejected"}
     for name, field in field_by_quantity.items():
-        columns |= _columns_by_axis(name, aid, field + "[]" * (len(aid.axes) > 1))
+        columns |= _expand_columns_by_axis(name, aid, field + "[]" * (len(aid.axes) > 1))
     layout = Layout(f"estimator_aid_src_{aid.name}", columns, OPTIONAL_FIELDS.get(aid.name, {}))
-    if topics.find(layout) is None:  # return early: reading an empty table takes time
+    if topics.find_layout(layout) is None:  # return early: reading an empty table takes time
         return None
     samples = topics.primary_samples(layout).dropna()
     if "last_fused_us" in samples:
-        samples["last_fused_s"] = (samples.pop("last_fused_us") - topics.zero_us) * 1e-6
-    if enabled is not None and aid.name in px4.AIDS_ALWAYS_FUSED:
-        samples["fused"] = step_values_at(enabled, samples.index)
-    return _make_aid_log(topics, (layout.topic,), aid, samples, enabled)
+        samples["last_fused_s"] = (samples.pop("last_fused_us") - topics.time_origin_us) * 1e-6
+    if fusion_enabled is not None and aid.name in px4.AIDS_ALWAYS_FUSED:
+        samples["fused"] = step_values_at(fusion_enabled, samples.index)
+    return _make_aid_log(topics, (layout.topic,), aid, samples, fusion_enabled)
 
 
 def _read_common_topics(
-    topics: Topics, aid: Aid, enabled: pd.Series[float] | None
+    topics: Topics, aid: Aid, fusion_enabled: pd.Series[float] | None
 ) -> AidLog | None:
     """Read the innovations of an aiding source from the topics that contain all aiding sources."""
     is_in_gauss = aid.name == "mag_heading" and any(
@@ -113,22 +119,22 @@ def _read_common_topics(
     )
     layouts = []
     if aid.fields and not is_in_gauss:
-        topic_quantities = zip(px4.INNOVATION_TOPICS, ("innovation", "variance"), strict=True)
+        topics_and_quantities = zip(px4.INNOVATION_TOPICS, ("innovation", "variance"), strict=True)
         layouts.append(
             [
-                Layout(topic, _columns_by_axis(name, aid, aid.fields))
-                for topic, name in topic_quantities
+                Layout(topic, _expand_columns_by_axis(name, aid, aid.fields))
+                for topic, name in topics_and_quantities
             ]
         )
     if aid.old_fields:
-        fields = _columns_by_axis("innovation", aid, aid.old_fields)
+        fields = _expand_columns_by_axis("innovation", aid, aid.old_fields)
         variance_fields = aid.old_fields.replace("innov", "innov_var")
-        fields |= _columns_by_axis("variance", aid, variance_fields)
+        fields |= _expand_columns_by_axis("variance", aid, variance_fields)
         layouts.append([Layout(px4.OLD_INNOVATION_TOPIC, fields)] * 2)
     for value_layout, variance_layout in layouts:
         innovations = topics.primary_samples(value_layout)
         samples = topics.primary_samples(value_layout, select=_drop_repeats)
-        unknown_fusion_times_s = _unknown_fusion_times(
+        unknown_fusion_times_s = _find_unknown_fusion_times(
             innovations[f"innovation_{aid.axes[0]}"],
             topics.primary_samples(variance_layout)[f"variance_{aid.axes[0]}"],
         )
@@ -136,12 +142,12 @@ def _read_common_topics(
             # The logger downsamples both topics separately. S changes slowly, so that the nearest
             # logged S is used
             variance_samples = topics.primary_samples(variance_layout).dropna()
-            samples = join_nearest(samples, variance_samples, JOIN_TOLERANCE_S)
+            samples = join_nearest(samples, variance_samples, MAX_VARIANCE_TIME_DIFFERENCE_S)
         excluded_count = len(samples) - len(samples := samples.dropna())
-        if enabled is not None:
-            samples = samples[step_values_at(enabled, samples.index) > 0.0]
+        if fusion_enabled is not None:
+            samples = samples[step_values_at(fusion_enabled, samples.index) > 0.0]
         used_topics = tuple(dict.fromkeys((value_layout.topic, variance_layout.topic)))
-        aid_log = _make_aid_log(topics, used_topics, aid, samples, enabled, excluded_count)
+        aid_log = _make_aid_log(topics, used_topics, aid, samples, fusion_enabled, excluded_count)
         if aid_log is not None:
             return replace(aid_log, unknown_fusion_times_s=unknown_fusion_times_s)
     return None
@@ -154,7 +160,7 @@ def _drop_repeats(samples: pd.DataFrame) -> pd.DataFrame:
     return finite_samples[first_column.ne(first_column.shift()) & (first_column != 0.0)]
 
 
-def _unknown_fusion_times(innovation: pd.Series, variance: pd.Series) -> Array:
+def _find_unknown_fusion_times(innovation: pd.Series, variance: pd.Series) -> Array:
     """Return the times (s) at which EKF2 had no sample, or fused a sample with unlogged innovation.
 
     Without a sample, EKF2 logs the innovation 0. A new variance S shows that EKF2 fused a sample,
@@ -164,7 +170,7 @@ def _unknown_fusion_times(innovation: pd.Series, variance: pd.Series) -> Array:
     return np.union1d(innovation.index[innovation == 0.0], variance.index[is_changed])
 
 
-def _columns_by_axis(name: str, aid: Aid, fields: str) -> dict[str, str]:
+def _expand_columns_by_axis(name: str, aid: Aid, fields: str) -> dict[str, str]:
     return expand_columns({" ".join(f"{name}_{axis}" for axis in aid.axes): fields})
 
 
@@ -173,7 +179,7 @@ def _make_aid_log(
     used_topics: tuple[str, ...],
     aid: Aid,
     samples: pd.DataFrame,
-    enabled: pd.Series[float] | None,
+    fusion_enabled: pd.Series[float] | None,
     excluded_count: int = 0,
 ) -> AidLog | None:
     """Return the innovations of an aiding source; None without a positive innovation variance.
@@ -186,4 +192,4 @@ def _make_aid_log(
     innovation_columns = [f"innovation_{axis}" for axis in aid.axes]
     parameters = aid.logged_parameters(topics.ekf2_parameters)
     samples = samples.assign(**-samples[innovation_columns])
-    return AidLog(used_topics, aid.axes, samples, enabled, parameters, excluded_count)
+    return AidLog(used_topics, aid.axes, samples, fusion_enabled, parameters, excluded_count)

@@ -30,8 +30,8 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout
-from px4fuse.readers.px4_aids import JOIN_TOLERANCE_S, read_aids, read_enabled_aids
-from px4fuse.readers.px4_innovations import innovations_by_axis
+from px4fuse.readers.px4_aids import MAX_VARIANCE_TIME_DIFFERENCE_S, read_aids, read_enabled_aids
+from px4fuse.readers.px4_innovations import collect_innovations_by_axis
 from px4fuse.readers.ulog_topics import Topics, measurement_time_us
 
 VISION_TOPIC = "vehicle_visual_odometry"
@@ -44,10 +44,10 @@ STATE_COUNT = 22
 MAG_3D_BIT = 5
 # Minimum logged rate (Hz) of magnetometer samples to assume that no sample is missing: EKF2 uses 14
 # samples per second
-MIN_COMPLETE_FIELD_HZ = 10.0
+MIN_MAGNETOMETER_HZ = 10.0
 # EKF2 rounds the ratio of prediction interval to IMU interval to a whole number. If the ratio is
 # closer to n + 0.5 than this limit, both whole numbers are possible
-MAX_HALF_RATIO_DISTANCE = 0.05
+MAX_HALF_INTEGER_DISTANCE = 0.05
 # Maximum interval (s) between two logged samples of low-pass filtered optical flow from which the
 # unfiltered flow is computed
 MAX_FLOW_INTERVAL_S = 0.5
@@ -82,10 +82,10 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         return Unavailable(
             "EKF2",
             f"another estimator was running, because SYS_MC_EST_GROUP is {estimator_group:.0f}",
-            "Set SYS_MC_EST_GROUP to 2.",
+            "Set SYS_MC_EST_GROUP to 2 (EKF2).",
         )
-    local_position = topics.read(px4.LOCAL_POSITION)
-    if topics.find(px4.LOCAL_POSITION) is None:
+    local_position = topics.read(px4.LOCAL_POSITION_LAYOUT)
+    if topics.find_layout(px4.LOCAL_POSITION_LAYOUT) is None:
         return Unavailable(
             "EKF2", "vehicle_local_position is not logged", px4.DEFAULT_PROFILE_REMEDY
         )
@@ -96,12 +96,12 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
             "vehicle_local_position has no finite sample",
             "Start the recording after EKF2 has started.",
         )
-    topics.record_stream("ekf2_state", px4.LOCAL_POSITION.topic)
+    topics.record_stream("ekf2_state", px4.LOCAL_POSITION_LAYOUT.topic)
     enabled_aids = read_enabled_aids(topics)
     fusion_flags = _read_fusion_flags(topics, enabled_aids)
     vision_gate = fill_with_defaults(parameters)[EV_POS.gate]
     aids = read_aids(topics, enabled_aids)
-    innovations, innovation_topics = innovations_by_axis(aids, fusion_flags, vision_gate)
+    innovations, innovation_topics = collect_innovations_by_axis(aids, fusion_flags, vision_gate)
     if innovation_topics:
         topics.record_stream("ekf2_innovations", *innovation_topics)
     notes = [
@@ -112,16 +112,20 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
     ]
     notes += [
         f"{log.excluded_count} samples of {log.topics[0]} ({', '.join(log.axes)}) were dropped, "
-        f"because {log.topics[-1]} has no variance within {JOIN_TOLERANCE_S:g} s"
+        f"because {log.topics[-1]} has no variance within {MAX_VARIANCE_TIME_DIFFERENCE_S:g} s"
         for log in (aids[name] for name in ("ev_pos", "ev_hgt") if name in aids)
         if log.excluded_count
     ]
-    states = dict(enabled_aids)
-    states |= {name: local_position[name] for name in VALIDITY_FLAGS if name in local_position}
-    failed_checks = topics.primary_samples(px4.LAYOUTS["gnss_checks"], step=True)["failed"].dropna()
+    status_flags = dict(enabled_aids)
+    status_flags |= {
+        name: local_position[name] for name in VALIDITY_FLAGS if name in local_position
+    }
+    failed_checks = topics.primary_samples(px4.TOPIC_LAYOUTS["gnss_checks"], is_step_function=True)[
+        "failed"
+    ].dropna()
     if len(failed_checks):
-        states["failed_checks"] = failed_checks
-    step_s = _prediction_interval_s(topics)
+        status_flags["failed_checks"] = failed_checks
+    step_s = _estimate_step_s(topics)
     delayed_state = variance = _read_delayed_state(topics, step_s)
     if isinstance(delayed_state, pd.DataFrame):
         variance = delayed_state[Columns.POSITION_VARIANCE + Columns.VELOCITY_VARIANCE]
@@ -129,7 +133,7 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         if variance.empty:
             variance = VARIANCES_NOT_LOGGED
         else:
-            topics.record_stream("ekf2_variance", _state_vector(topics)[0])
+            topics.record_stream("ekf2_variance", _find_state_vector(topics)[0])
     return Ekf2(
         state=state,
         variance=variance,
@@ -140,18 +144,18 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         instances=topics.primary_instances,
         gate=vision_gate,
         notes=tuple(notes),
-        accelerometer_bias=_accelerometer_bias(topics, delayed_state),
+        accelerometer_bias=_read_accelerometer_bias(topics, delayed_state),
         step_s=step_s,
-        horizon_s=_horizon_delay_s(topics, step_s),
+        horizon_s=_compute_horizon_delay_s(topics, step_s),
         record=_read_fusion_record(topics, delayed_state, local_position, enabled_aids, step_s),
         aids=aids,
-        states=states,
+        states=status_flags,
         parameters=topics.ekf2_parameters,
         parameter_changes=topics.parameter_changes,
     )
 
 
-def _state_vector(topics: Topics) -> tuple[str, int]:
+def _find_state_vector(topics: Topics) -> tuple[str, int]:
     """Return the topic with EKF2's state vector, and its number of attitude variances (3 or 4).
 
     The topic is "" if it is not logged. The number is 0 if no PX4 release has this state vector.
@@ -161,7 +165,7 @@ def _state_vector(topics: Topics) -> tuple[str, int]:
             state_count = sum(name.startswith("states[") for name in table)
             variance_count = sum(name.startswith("covariances[") for name in table)
             if variance_count:
-                return topic, px4.ATTITUDE_VARIANCE_COUNTS.get((state_count, variance_count), 0)
+                return topic, px4.ATTITUDE_VARIANCES_BY_SIZE.get((state_count, variance_count), 0)
     return "", 0
 
 
@@ -171,13 +175,13 @@ def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
     The columns are equal for all PX4 releases. Older releases log the IMU biases as increments per
     prediction; they are divided by the prediction interval ``step_s`` (s).
     """
-    topic, attitude_variance_count = _state_vector(topics)
+    topic, attitude_variance_count = _find_state_vector(topics)
     if not topic:
         return VARIANCES_NOT_LOGGED
     if not attitude_variance_count:
         return Unavailable(
             "EKF2 variances",
-            f"the arrays in {topic} have the lengths of no supported PX4 release",
+            f"no supported PX4 release has arrays of these lengths in {topic}",
             "Report the PX4 version in an issue of px4fuse.",
         )
     state_fields = [f"states[{i}]" for i in range(STATE_COUNT)]
@@ -191,7 +195,9 @@ def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
     variance = samples[variance_fields].to_numpy(copy=True)
     if attitude_variance_count == px4.QUATERNION_VARIANCE_COUNT:
         state[:, 10:16] /= step_s
-        variance = np.hstack([_attitude_variance(state[:, :4], variance[:, :4]), variance[:, 4:]])
+        variance = np.hstack(
+            [_convert_attitude_variance(state[:, :4], variance[:, :4]), variance[:, 4:]]
+        )
         variance[:, 9:15] /= step_s**2
     columns = Columns.DELAYED_STATE + Columns.DELAYED_VARIANCE
     return pd.DataFrame(np.hstack([state, variance]), index=samples.index, columns=columns)
@@ -202,21 +208,21 @@ def configured_step_s(topics: Topics) -> float:
     return topics.log.parameters.get("EKF2_PREDICT_US", EKF2_STEP_S * 1e6) * 1e-6
 
 
-def _prediction_interval_s(topics: Topics) -> float:
+def _estimate_step_s(topics: Topics) -> float:
     """Return EKF2's prediction interval (s), a multiple of the IMU interval (ImuDownSampler)."""
-    configured_s = configured_step_s(topics)
-    imu_time_s = topics.read(Layout(px4.IMU.topic, {"time": "timestamp"})).index.to_numpy()
-    if len(imu_time_s) < 2 or (interval_s := median_interval(imu_time_s)) >= configured_s:
-        return configured_s
-    layout = Layout(_state_vector(topics)[0], {"states[0]": "states[0]"})
-    prediction_end_rows = rows_of_timestamps(imu_time_s, topics.primary_samples(layout).index)
+    configured_interval_s = configured_step_s(topics)
+    imu_time_s = topics.read(Layout(px4.IMU_LAYOUT.topic, {"time": "timestamp"})).index.to_numpy()
+    if len(imu_time_s) < 2 or (interval_s := median_interval(imu_time_s)) >= configured_interval_s:
+        return configured_interval_s
+    layout = Layout(_find_state_vector(topics)[0], {"states[0]": "states[0]"})
+    prediction_end_rows = find_rows_of_timestamps(imu_time_s, topics.primary_samples(layout).index)
     # time differences are used instead of row numbers, because IMU samples may be missing
     prediction_ends = np.rint((imu_time_s[prediction_end_rows] - imu_time_s[0]) / interval_s)
-    return samples_per_step(configured_s, interval_s, prediction_ends) * interval_s
+    return samples_per_step(configured_interval_s, interval_s, prediction_ends) * interval_s
 
 
-def rows_of_timestamps(times_s: Array, wanted_times_s: ArrayLike) -> IntArray:
-    """Return the indices of ``times_s`` (increasing) that ``wanted_times_s`` contains, to 1 µs."""
+def find_rows_of_timestamps(times_s: Array, wanted_times_s: ArrayLike) -> IntArray:
+    """Return the indices of the ``times_s`` (increasing) that equal a wanted time to 1 µs."""
     times_us, wanted_us = (
         np.rint(np.asarray(times, float) * 1e6) for times in (times_s, wanted_times_s)
     )
@@ -245,38 +251,40 @@ def samples_per_step(
     sample_differences = np.diff(np.asarray(step_ends, dtype=float))
     if (
         sample_count > 1
-        and abs(ratio_plus_half - sample_count) < MAX_HALF_RATIO_DISTANCE
+        and abs(ratio_plus_half - sample_count) < MAX_HALF_INTEGER_DISTANCE
         and len(sample_differences)
     ):
-        fits_larger, fits_smaller = (
+        fits_larger_count, fits_smaller_count = (
             np.mean(sample_differences % step_sample_count == 0.0) > 0.9
             for step_sample_count in (sample_count, sample_count - 1)
         )
-        return sample_count - int(fits_smaller and not fits_larger)
+        return sample_count - int(fits_smaller_count and not fits_larger_count)
     return sample_count
 
 
-def _accelerometer_bias(topics: Topics, delayed_state: TableOrUnavailable) -> TableOrUnavailable:
-    if len(bias := topics.primary_samples(px4.LAYOUTS["sensor_bias"]).dropna()):
+def _read_accelerometer_bias(
+    topics: Topics, delayed_state: TableOrUnavailable
+) -> TableOrUnavailable:
+    if len(bias := topics.primary_samples(px4.TOPIC_LAYOUTS["sensor_bias"]).dropna()):
         return bias
     if isinstance(delayed_state, Unavailable) or delayed_state.empty:
         return BIAS_NOT_LOGGED
     return delayed_state[Columns.ACCELEROMETER_BIAS].set_axis(Columns.SPECIFIC_FORCE, axis=1)
 
 
-def _horizon_delay_s(topics: Topics, step_s: float) -> float | Unavailable:
+def _compute_horizon_delay_s(topics: Topics, step_s: float) -> float | Unavailable:
     """Return the median delay (s) from EKF2's fusion horizon to the publication of its state.
 
     The delay is not available before v1.13, where timestamp_sample is the time of the newest IMU
     sample instead of the fusion horizon.
     """
-    age_s = _publication_age_s(topics, _state_vector(topics)[0])
+    age_s = _compute_publication_age_s(topics, _find_state_vector(topics)[0])
     if len(age_s) and (median_age_s := float(age_s.median())) > step_s:
         return median_age_s
     return HORIZON_NOT_LOGGED
 
 
-def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
+def _compute_publication_age_s(topics: Topics, topic: str) -> pd.Series:
     """Return the delay (s) from measurement to publication of each sample of a topic.
 
     The index is the measurement time (s).
@@ -284,7 +292,7 @@ def _publication_age_s(topics: Topics, topic: str) -> pd.Series:
     for table in topics.tables_of(topic)[:1]:
         if "timestamp_sample" in table:
             measured_us = measurement_time_us(table)
-            measured_index = time_index((measured_us - topics.zero_us) * 1e-6)
+            measured_index = time_index((measured_us - topics.time_origin_us) * 1e-6)
             age_us = table["timestamp"].astype(np.int64) - measured_us
             return pd.Series(age_us * 1e-6, index=measured_index)
     return pd.Series(dtype=np.float64)
@@ -341,7 +349,7 @@ def _read_fusion_record(
 
     ``local_samples`` contains ``vehicle_local_position``, EKF2's published position.
     """
-    topic, attitude_variance_count = _state_vector(topics)
+    topic, attitude_variance_count = _find_state_vector(topics)
     if topic != px4.STATE_VECTOR_TOPICS[0] or isinstance(delayed_state, Unavailable):
         return RECORD_NOT_LOGGED
     quaternion_norm = np.linalg.norm(delayed_state[Columns.QUATERNION], axis=1)
@@ -356,7 +364,7 @@ def _read_fusion_record(
         usable_state[horizontal_columns] = np.nan
         altitude_m = _last_finite_value(local_samples, "ref_alt", 0.0)
         usable_state["down_m"] += altitude_m
-    age_s = _publication_age_s(topics, VISION_TOPIC).sort_index()
+    age_s = _compute_publication_age_s(topics, VISION_TOPIC).sort_index()
     return FusionRecord(
         parameters=topics.ekf2_parameters,
         delayed=usable_state,
@@ -375,7 +383,7 @@ def _read_fusion_record(
         height_bias_updates={
             name: topics.primary_samples(layout).dropna()
             for name, layout in px4.HEIGHT_BIAS_LAYOUTS.items()
-            if topics.find(layout) is not None
+            if topics.find_layout(layout) is not None
         },
     )
 
@@ -388,7 +396,8 @@ def _last_finite_value(samples: pd.DataFrame, column: str, default: float) -> fl
 def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
     """Read the measured magnetic field from the magnetometer topic or from EKF2's observations.
 
-    A topic without missing samples is preferred, then a topic with innovations.
+    A topic without missing samples is preferred, then the observations, which EKF2 logs with the
+    innovations.
     """
     field_candidates = [
         topics.primary_samples(layout).dropna() for layout in px4.MAGNETIC_FIELD_LAYOUTS
@@ -399,13 +408,15 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
     complete_fields = [
         field
         for field in field_candidates
-        if len(field) > MIN_COMPLETE_FIELD_HZ * topics.log.duration_s
+        if len(field) > MIN_MAGNETOMETER_HZ * topics.log.duration_s
     ]
     fields_with_innovation = [
         field for field in field_candidates if Columns.FIELD_INNOVATION[0] in field
     ]
     field = max(complete_fields or fields_with_innovation or field_candidates, key=len)
-    control_bits = topics.read(px4.LAYOUTS["control_bits"], step=True)["bits"].dropna()
+    control_bits = topics.read(px4.TOPIC_LAYOUTS["control_bits"], is_step_function=True)[
+        "bits"
+    ].dropna()
     if field.empty or control_bits.empty:
         return pd.DataFrame()
     flags = step_values_at(control_bits, field.index).astype(np.int64)
@@ -418,7 +429,7 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     EKF2 logs low-pass filtered flow.
     """
     flow_velocity, flow_intervals, flow_noise = (
-        topics.primary_samples(px4.LAYOUTS[f"flow_{quantity}"]).dropna()
+        topics.primary_samples(px4.TOPIC_LAYOUTS[f"flow_{quantity}"]).dropna()
         for quantity in ("velocity", "interval", "noise")
     )
     interval_s = float(flow_intervals["interval_us"].median()) * 1e-6
@@ -431,18 +442,18 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     if FLOW.name in enabled_aids:
         used_rows = used_rows[step_values_at(enabled_aids[FLOW.name], times_s[used_rows]) > 0.0]
     sample_count = np.rint((times_s[used_rows] - times_s[used_rows - 1]) / interval_s)
-    filter_memory = ((1.0 - FLOW_FILTER_WEIGHT) ** sample_count)[:, None]
+    previous_output_weight = ((1.0 - FLOW_FILTER_WEIGHT) ** sample_count)[:, None]
     filtered_velocity = flow_velocity[["forward_m_s", "right_m_s"]].to_numpy()
     forward_m_s, right_m_s = (
-        (filtered_velocity[used_rows] - filter_memory * filtered_velocity[used_rows - 1])
-        / (1.0 - filter_memory)
+        (filtered_velocity[used_rows] - previous_output_weight * filtered_velocity[used_rows - 1])
+        / (1.0 - previous_output_weight)
     ).T
     flow_velocity = flow_velocity.iloc[used_rows]
-    newest_columns, rate_columns = (
+    newest_velocity_columns, rate_columns = (
         ["newest_forward_m_s", "newest_right_m_s"],
         ["x_rad_s", "y_rad_s"],
     )
-    squared_range = (flow_velocity[newest_columns] ** 2).sum(axis=1) / (
+    squared_range = (flow_velocity[newest_velocity_columns] ** 2).sum(axis=1) / (
         flow_velocity[rate_columns] ** 2
     ).sum(axis=1)
     flow = pd.DataFrame(
@@ -459,7 +470,7 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     return flow.replace(np.inf, np.nan).dropna()
 
 
-def _attitude_variance(quaternion: Array, variance: Array) -> Array:
+def _convert_attitude_variance(quaternion: Array, variance: Array) -> Array:
     """Convert quaternion variances to variances (rad²) of the attitude error about the NED axes.
 
     The attitude error is δθ = 2 Im(δq ⊗ q*). Correlations of the quaternion elements are assumed to

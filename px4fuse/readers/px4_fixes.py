@@ -12,20 +12,20 @@ from px4fuse.readers.ulog_topics import Topics
 
 # A logged fix and an EKF2 observation are from one GNSS measurement if their times differ by less
 # than this limit (s): receivers send at most 20 fixes per second
-MAX_SAME_FIX_S = 0.01
+MAX_SAME_FIX_TIME_DIFFERENCE_S = 0.01
 # EKF2's observation is a latitude (°) if it differs by less than this limit from the logged
 # latitude, otherwise a local position (m)
 MAX_LATITUDE_DISTANCE_DEG = 1.0
 # Possible intervals (s) between the fixes of a GNSS receiver: 4 to 20 fixes per second
-FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
+CANDIDATE_FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
 # Maximum deviation (s) of a logged interval between fixes from a multiple of the receiver's
 # interval: half of an EKF2 prediction interval, plus clock jitter
-MAX_MULTIPLE_ERROR_S = 0.006
+MAX_MULTIPLE_DEVIATION_S = 0.006
 # Minimum number of fixes that are both logged and reconstructed, to measure the error
 MIN_LOGGED_FIXES = 10
-# Minimum number of logged intervals that are n receiver intervals long, and of those that are n + 1
-# long: with fewer, n is uncertain
-MIN_REPEATED_INTERVALS = 3
+# The receiver interval is known if logged intervals of n and of n + 1 receiver intervals each occur
+# at least this often
+MIN_MULTIPLE_COUNT = 3
 # Maximum RMS error (m) of reconstructed fixes, measured at fixes that are both logged and
 # reconstructed
 MAX_RECONSTRUCTION_ERROR_M = 0.1
@@ -38,19 +38,20 @@ def read_unlogged_fixes(
 
     The logger writes at most 10 fixes per second.
     """
-    layouts = px4.LAYOUTS["fused_position"], px4.LAYOUTS["fused_velocity"]
-    if isinstance(ekf2, Unavailable) or not all(map(topics.find, layouts)):
+    layouts = px4.TOPIC_LAYOUTS["fused_position"], px4.TOPIC_LAYOUTS["fused_velocity"]
+    if isinstance(ekf2, Unavailable) or not all(map(topics.find_layout, layouts)):
         return pd.DataFrame()
     position, velocity = map(topics.primary_samples, layouts)
     # Rows of EKF2's GNSS topic that are neither fused nor rejected contain no new fix
     is_fix = position[["fused", "rejected"]].any(axis=1)
     position = position.loc[is_fix].drop(columns=["fused", "rejected"])
-    # EKF2 shifts GNSS times back by half a prediction step (estimator_interface.cpp)
     fixes = position.join(velocity, how="inner").dropna()
-    # Unless GNSS is the height reference, EKF2's estimate of the GNSS bias is part of the height
-    height_layout = px4.LAYOUTS["fused_height"]
-    if topics.find(height_layout) and topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
+    # Use the height of EKF2's topic only if GNSS is the height reference: otherwise it contains
+    # EKF2's estimate of the GNSS height bias
+    height_layout = px4.TOPIC_LAYOUTS["fused_height"]
+    if topics.find_layout(height_layout) and topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
         fixes = fixes.join(topics.primary_samples(height_layout))
+    # EKF2 shifts GNSS times back by half a prediction step (estimator_interface.cpp)
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
     next_row = np.clip(np.searchsorted(logged_fixes.index, fixes.index), 1, len(logged_fixes) - 1)
     distance_s = np.minimum(
@@ -62,9 +63,9 @@ def read_unlogged_fixes(
     is_between_fixes = (fixes.index > logged_fixes.index[0]) & (
         fixes.index < logged_fixes.index[-1]
     )
-    matched_fixes = fixes[distance_s <= MAX_SAME_FIX_S]
-    unlogged_fixes = fixes[(distance_s > MAX_SAME_FIX_S) & is_between_fixes]
-    # Before v1.16 the observation is a local position in m
+    matched_fixes = fixes[distance_s <= MAX_SAME_FIX_TIME_DIFFERENCE_S]
+    unlogged_fixes = fixes[(distance_s > MAX_SAME_FIX_TIME_DIFFERENCE_S) & is_between_fixes]
+    # Before v1.16 the topic contains a local position (m) instead of latitude and longitude
     is_in_degrees = (
         matched_fixes["latitude_deg"].sub(logged_fixes["latitude_deg"].median()).abs().median()
         < MAX_LATITUDE_DISTANCE_DEG
@@ -75,7 +76,7 @@ def read_unlogged_fixes(
 def reconstruct_fixes(
     fixes: pd.DataFrame, ekf2: Ekf2 | Unavailable, delay_s: float
 ) -> tuple[pd.DataFrame, str]:
-    """Reconstruct GNSS fixes that are not logged as EKF2 position plus innovation (up to v1.15).
+    """Compute unlogged GNSS fixes: sum of EKF2 position and innovation (PX4 up to v1.15).
 
     Return the fixes, with interpolated heights, and a note for the user. Both are empty if the
     error of reconstructed fixes exceeds MAX_RECONSTRUCTION_ERROR_M.
@@ -87,24 +88,24 @@ def reconstruct_fixes(
     delay_s : float
         Delay from measurement to timestamp that EKF2 assumes.
     """
-    no_fixes = pd.DataFrame(columns=fixes.columns), ""
+    empty_result = pd.DataFrame(columns=fixes.columns), ""
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.horizon_s, Unavailable) or len(fixes) < 3:
-        return no_fixes
+        return empty_result
     gnss_innovations = with_gnss_innovations(ekf2).innovations
     north, east = gnss_innovations["north"], gnss_innovations["east"]
     logged_fix_s = fixes.index.to_numpy()
-    receiver_interval_s = _receiver_interval_s(logged_fix_s)
+    receiver_interval_s = _estimate_receiver_interval(logged_fix_s)
     if (
         receiver_interval_s is None
         or isinstance(north, Unavailable)
         or isinstance(east, Unavailable)
     ):
-        return no_fixes
-    # EKF2 fuses a fix that is older than the fusion horizon at the horizon (RingBuffer.h)
+        return empty_result
+    # If a fix is older than the fusion horizon, EKF2 fuses it at the horizon (RingBuffer.h)
     delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
     fused_s = north.index.to_numpy() - delay_beyond_horizon_s
-    # An innovation belongs to the last fix before it. This fix came a whole number of receiver
-    # intervals after the last logged fix, 0 if the fix itself is logged
+    # An innovation belongs to the last fix before it, logged or not. That fix is a whole number of
+    # receiver intervals after the last logged fix; 0 if it is that fix
     previous_fix_index = np.searchsorted(logged_fix_s, fused_s) - 1
     elapsed_intervals = (fused_s - logged_fix_s[previous_fix_index]) / receiver_interval_s
     is_between_fixes = (previous_fix_index >= 0) & (previous_fix_index < len(logged_fix_s) - 1)
@@ -133,10 +134,10 @@ def reconstruct_fixes(
     reconstructed_fixes = reconstructed_fixes[~is_logged].dropna()
     reconstructed_fixes = reconstructed_fixes[~reconstructed_fixes.index.duplicated()]
     if len(position_error) < MIN_LOGGED_FIXES or reconstructed_fixes.empty:
-        return no_fixes
-    error_m = float(np.sqrt(np.mean(position_error.to_numpy() ** 2)))
-    if error_m > MAX_RECONSTRUCTION_ERROR_M:
-        return no_fixes
+        return empty_result
+    rms_error_m = float(np.sqrt(np.mean(position_error.to_numpy() ** 2)))
+    if rms_error_m > MAX_RECONSTRUCTION_ERROR_M:
+        return empty_result
     for column in (Columns.POSITION[2], *Columns.POSITION_VARIANCE):
         if column in fixes:
             reconstructed_fixes[column] = np.interp(
@@ -144,31 +145,34 @@ def reconstruct_fixes(
             )
     return reconstructed_fixes, (
         f"{len(reconstructed_fixes)} unlogged GNSS fixes are reconstructed as EKF2 position plus "
-        f"innovation (RMS error {error_m:.2f} m per axis at {len(position_error)} logged fixes)"
+        f"innovation (RMS error {rms_error_m:.2f} m per axis at {len(position_error)} logged fixes)"
     )
 
 
-def _receiver_interval_s(fix_times_s: Array) -> float | None:
+def _estimate_receiver_interval(fix_times_s: Array) -> float | None:
     """Estimate the interval (s) of a GNSS receiver of which the log contains only some fixes.
 
     It is the longest interval of which all logged intervals are multiples. Return None if all
     logged intervals are equal, because the multiple is then unknown.
     """
     logged_intervals_s = np.diff(fix_times_s)[:, None]
-    multiples = logged_intervals_s / FIX_INTERVALS_S
-    multiple_error_s = np.abs(multiples - np.round(multiples)) * FIX_INTERVALS_S
-    worst_error_s = np.percentile(multiple_error_s, 98, axis=0)
-    possible_indices = np.flatnonzero(worst_error_s <= MAX_MULTIPLE_ERROR_S)
+    multiples = logged_intervals_s / CANDIDATE_FIX_INTERVALS_S
+    multiple_deviation_s = np.abs(multiples - np.round(multiples)) * CANDIDATE_FIX_INTERVALS_S
+    worst_deviation_s = np.percentile(multiple_deviation_s, 98, axis=0)
+    possible_indices = np.flatnonzero(worst_deviation_s <= MAX_MULTIPLE_DEVIATION_S)
     if not len(possible_indices):
         return None
-    longest_interval_s = FIX_INTERVALS_S[possible_indices[-1]]
-    # Use the interval with the smallest error within 10 % of the longest possible interval
+    longest_interval_s = CANDIDATE_FIX_INTERVALS_S[possible_indices[-1]]
+    # Of the candidates within 10 % of the longest possible interval, use that with the smallest
+    # deviation
     near_indices = np.flatnonzero(
-        np.abs(FIX_INTERVALS_S - longest_interval_s) < 0.1 * longest_interval_s
+        np.abs(CANDIDATE_FIX_INTERVALS_S - longest_interval_s) < 0.1 * longest_interval_s
     )
-    best_interval_s = FIX_INTERVALS_S[near_indices[np.argmin(worst_error_s[near_indices])]]
+    best_interval_s = CANDIDATE_FIX_INTERVALS_S[
+        near_indices[np.argmin(worst_deviation_s[near_indices])]
+    ]
     interval_multiples = np.round(logged_intervals_s[:, 0] / best_interval_s)
-    is_frequent = np.bincount(interval_multiples.astype(int)) >= MIN_REPEATED_INTERVALS
+    is_frequent = np.bincount(interval_multiples.astype(int)) >= MIN_MULTIPLE_COUNT
     if not np.any(is_frequent[1:] & is_frequent[:-1]):
         return None
     return float(np.median(logged_intervals_s[:, 0] / interval_multiples))

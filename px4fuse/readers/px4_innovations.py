@@ -21,9 +21,9 @@ class Ekf2Source:
     # PX4's names of the aiding sources for horizontal position and height
     horizontal: str
     vertical: str
-    # Advice how to enable the fusion, by "horizontal" and "vertical" (height)
+    # Advice to enable the fusion, by "horizontal" and "vertical" (height)
     remedies: Mapping[str, str]
-    # Advice to the user if the innovations are not logged
+    # Advice to log the innovations
     to_log: str
     # Name of the height sensor, if it is not the position source itself
     height: str = ""
@@ -78,7 +78,7 @@ def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
             pd.DataFrame(enabled_flags).ffill().bfill().reindex(columns=columns, fill_value=0.0)
         )
     gate = ekf2.parameters.get(GNSS_POS.gate, GNSS_POS.default_gate)
-    innovations, topics = innovations_by_axis(ekf2.aids, fusion_flags, gate, source)
+    innovations, topics = collect_innovations_by_axis(ekf2.aids, fusion_flags, gate, source)
     return replace(
         ekf2,
         innovations=innovations,
@@ -88,7 +88,7 @@ def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
     )
 
 
-def innovations_by_axis(
+def collect_innovations_by_axis(
     aids: Mapping[str, AidLog],
     fusion_flags: TableOrUnavailable,
     gate: float,
@@ -111,7 +111,7 @@ def innovations_by_axis(
         group = "vertical" if axis == "down" else "horizontal"
         sensor = (axis == "down" and source.height) or source.name
         aid_log = aids.get(source.vertical if axis == "down" else source.horizontal)
-        axis_innovations = None if aid_log is None else innovations_along(aid_log, axis, gate)
+        axis_innovations = None if aid_log is None else select_axis_innovations(aid_log, axis, gate)
         if isinstance(fusion_flags, pd.DataFrame) and not fusion_flags[group].any():
             quantity = "height" if axis == "down" else "horizontal position"
             reason = f"EKF2 never fused the {quantity} from {sensor} in this log"
@@ -131,7 +131,7 @@ def innovations_by_axis(
     return innovations, tuple(used_topics)
 
 
-def innovations_along(log: AidLog, axis: NedAxis, gate: float) -> pd.DataFrame:
+def select_axis_innovations(log: AidLog, axis: NedAxis, gate: float) -> pd.DataFrame:
     """Return the innovations of an aiding source along one axis which EKF2 fused or rejected.
 
     EKF2 rejects a sample along all axes if one axis exceeds the ``gate`` (√S).

@@ -30,18 +30,18 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import (
+    estimate_rounding_step,
     find_invalid_rows,
-    finite_rows,
     interpolate_inside,
     join_nearest,
     read_attitude,
     read_orientation,
-    rounding_step,
+    select_valid_rows,
 )
 from px4fuse.readers.px4_ekf2 import configured_step_s
 from px4fuse.readers.px4_fixes import read_unlogged_fixes, reconstruct_fixes
 from px4fuse.readers.px4_innovations import has_fused_aid
-from px4fuse.readers.text_table import UNIX_END_S, UNIX_START_S
+from px4fuse.readers.text_table import MAX_VALID_UNIX_TIME_S, MIN_VALID_UNIX_TIME_S
 from px4fuse.readers.ulog_topics import MAX_PUBLICATION_LAG_S, Topics
 
 MIN_TRACK_SAMPLES = 3
@@ -51,17 +51,17 @@ NO_FIX_ACTION = "Give the antenna a free view of the sky and wait for a fix."
 # Maximum delay (µs) from timestamp to publication if PX4 set the timestamp at the arrival
 MAX_ARRIVAL_DELAY_US = 100
 # If at least this fraction of the timestamps are arrival times, the log has no measurement times
-MIN_ARRIVAL_FRACTION = 0.9
+MIN_ARRIVAL_TIME_FRACTION = 0.9
 # Maximum time difference (s) between a height and the horizontal position to which it is joined:
 # at a climb rate of 0.5 m/s, the height error is 2.5 cm
 MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
-# Maximum GNSS rate (Hz) of a log without some of the fixes: receivers send 5 to 20 Hz
+# Below this logged GNSS rate (Hz), the logger dropped fixes: receivers send 5 to 20 Hz
 MAX_DOWNSAMPLED_HZ = 4.0
 STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
 # Length (µs) of each possible unit of timestamps
 STAMP_UNITS = {"microseconds": 1.0, "milliseconds": 1e3, "seconds": 1e6, "nanoseconds": 1e-3}
-# A clock has a unit if its rate in this unit differs by less than this fraction from the boot clock
-MAX_RATE_ERROR = 0.05
+# Timestamps have a unit if their rate in this unit is that of the boot clock within this fraction
+MAX_RELATIVE_RATE_ERROR = 0.05
 AUTOPILOT_CLOCK = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude in degrees, optionally altitude in m
 GeodeticPosition = tuple[float, ...]
@@ -100,7 +100,7 @@ def unavailable_source(name: str, reason: str = "", remedy: str = "") -> Unavail
     return Unavailable(
         f"position source {name}",
         reason or f"{name} is not logged",
-        remedy or px4.TRACKS[name].remedy,
+        remedy or px4.TRACK_SOURCES[name].remedy,
         name,
     )
 
@@ -130,12 +130,17 @@ def make_track(
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
     is_nan = samples[Columns.POSITION].isna().to_numpy()
     is_height_only = bool(is_nan[:, :2].all() and not is_nan[:, 2].all())
-    step_m = max(rounding_step(samples[name].to_numpy()) for name in needed_columns[:2])
-    if origin.is_gnss:  # a receiver at rest may repeat its position
-        samples, invalid = finite_rows(samples, needed_columns), NO_INVALID_ROWS
+    rounding_step_m = max(
+        estimate_rounding_step(samples[name].to_numpy()) for name in needed_columns[:2]
+    )
+    if origin.is_gnss:  # repetitions are valid: a receiver at rest may repeat its position
+        samples, invalid_rows = select_valid_rows(samples, needed_columns), NO_INVALID_ROWS
     else:
         invalid_reasons = find_invalid_rows(samples, needed_columns)
-        samples, invalid = samples[invalid_reasons == ""], invalid_reasons[invalid_reasons != ""]
+        samples, invalid_rows = (
+            samples[invalid_reasons == ""],
+            invalid_reasons[invalid_reasons != ""],
+        )
     if len(samples) < MIN_TRACK_SAMPLES:
         fault = f"the track has only {len(samples)} finite samples, fewer than {MIN_TRACK_SAMPLES}"
         if is_height_only:
@@ -148,9 +153,9 @@ def make_track(
         name=name,
         samples=samples.assign(**variance.where(variance > 0)),
         origin=origin,
-        invalid=invalid,
+        invalid=invalid_rows,
         status=source_status,
-        step_m=step_m,
+        step_m=rounding_step_m,
         **track_fields,
     )
 
@@ -170,7 +175,7 @@ def _make_ulog_track(
     ``is_odometry``: the source sends a changing orientation. ``is_auto_candidate``:
     px4fuse may use the source without the option ``--position-source``.
     """
-    source = px4.TRACKS[name]
+    source = px4.TRACK_SOURCES[name]
     origin = reclassify_as_vio(source.origin, has_changing_orientation=is_odometry)
     origin = structs.replace(origin, is_auto_candidate=is_auto_candidate)
     if origin.aid is not None:
@@ -183,18 +188,18 @@ def _make_ulog_track(
 
 
 def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable:
-    layout = topics.find(*px4.layouts_of_track(name))
+    layout = topics.find_layout(*px4.find_track_layouts(name))
     if layout is None:
         return unavailable_source(name)
     # Topics of EKF2 have one topic instance per EKF2 instance
     is_ekf2 = layout.topic.startswith("estimator_")
     samples = topics.primary_samples(layout) if is_ekf2 else topics.read_instance(layout)
-    frame = px4.TRACKS[name].frame
-    for frame_field, frame_names in px4.FRAMES.items():
+    frame = px4.TRACK_SOURCES[name].frame
+    for frame_field, frame_names in px4.FRAME_BY_FIELD_VALUE.items():
         if frame == "unknown" and frame_field in samples and len(samples):
             frame = frame_names.get(int(samples[frame_field].iloc[-1]), "unknown")
     if "published_us" in samples:
-        samples["age_s"] = 1e-6 * (samples["published_us"] - topics.zero_us) - samples.index
+        samples["age_s"] = 1e-6 * (samples["published_us"] - topics.time_origin_us) - samples.index
     orientation = read_orientation(samples)
     instance_count = len(topics.instances(layout.topic))
     note = (
@@ -209,16 +214,16 @@ def _read_logged_track(topics: Topics, name: str) -> PositionTrack | Unavailable
         notes=(note,) if instance_count > 1 and not is_ekf2 else (),
         is_odometry=orientation is not None,
         frame=frame,
-        clock_map=_arrival_clock_map(topics, layout.topic),
+        clock_map=_describe_arrival_clock(topics, layout.topic),
         orientation=orientation,
     )
 
 
-def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
-    """Describe the clock of a topic whose timestamps are not measurement times, or return None.
+def _describe_arrival_clock(topics: Topics, topic: str) -> ClockMap | None:
+    """Describe the clock of a topic with arrival times or repeated times; else return None.
 
     PX4 replaces timestamps by arrival times until it has received 500 TIMESYNC replies
-    (``Timesync.cpp``). px4fuse does so if ``timestamp_sample`` is not boot time in microseconds.
+    (``Timesync.cpp``). px4fuse replaces a ``timestamp_sample`` that is not boot time in µs.
     """
     table = topics.tables_of(topic)[0]
     if "timestamp_sample" not in table or len(table["timestamp"]) < MIN_TRACK_SAMPLES:
@@ -226,11 +231,11 @@ def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
     published_us = table["timestamp"].astype(np.int64)
     sampled_us = table["timestamp_sample"].astype(np.int64)
     age_us = published_us - sampled_us
-    if np.mean(np.abs(age_us) <= MAX_ARRIVAL_DELAY_US) >= MIN_ARRIVAL_FRACTION:
+    if np.mean(np.abs(age_us) <= MAX_ARRIVAL_DELAY_US) >= MIN_ARRIVAL_TIME_FRACTION:
         clock = SENDER_CLOCK
         note = "PX4 replaced timestamps by arrival times, because the clocks were not synchronised"
     elif abs(np.median(age_us)) > MAX_PUBLICATION_LAG_S * 1e6:
-        clock = _timestamp_clock(published_us, sampled_us)
+        clock = _describe_timestamp_clock(published_us, sampled_us)
         note = "timestamp_sample does not contain boot times in microseconds"
     else:
         return clock_of_repeated_timestamps(
@@ -239,31 +244,36 @@ def _arrival_clock_map(topics: Topics, topic: str) -> ClockMap | None:
     return ClockMap(clock, "arrival time", len(age_us), 0.0, 0.0, 0.0, note)
 
 
-def _timestamp_clock(published_us: IntArray, sampled_us: IntArray) -> str:
+def _describe_timestamp_clock(published_us: IntArray, sampled_us: IntArray) -> str:
     """Describe timestamps that are not boot time in µs, for example "UNIX time in milliseconds"."""
     if not sampled_us.any():
         return "0"
     rate_ratio = float(np.ptp(published_us)) / max(float(np.ptp(sampled_us)), 1.0)
     for unit, unit_us in STAMP_UNITS.items():
-        if abs(rate_ratio / unit_us - 1.0) < MAX_RATE_ERROR:
-            if UNIX_START_S <= float(np.median(sampled_us)) * unit_us * 1e-6 < UNIX_END_S:
+        if abs(rate_ratio / unit_us - 1.0) < MAX_RELATIVE_RATE_ERROR:
+            if (
+                MIN_VALID_UNIX_TIME_S
+                <= float(np.median(sampled_us)) * unit_us * 1e-6
+                < MAX_VALID_UNIX_TIME_S
+            ):
                 return f"UNIX time in {unit}"
             return "another clock" if unit == "microseconds" else unit
     return "an unknown clock"
 
 
 def _read_fused_observation(topics: Topics, is_odometry: bool) -> PositionTrack | Unavailable:
-    horizontal, vertical = px4.LAYOUTS["kept_horizontal"], px4.LAYOUTS["kept_vertical"]
-    if topics.find(horizontal) is None:
-        return unavailable_source(px4.FUSED_OBSERVATION)
-    has_height = topics.find(vertical) is not None
+    horizontal, vertical = px4.TOPIC_LAYOUTS["kept_horizontal"], px4.TOPIC_LAYOUTS["kept_vertical"]
+    if topics.find_layout(horizontal) is None:
+        return unavailable_source(px4.FUSED_OBSERVATION_TRACK)
+    has_height = topics.find_layout(vertical) is not None
     return _make_derived_track(
         topics,
-        px4.FUSED_OBSERVATION,
+        px4.FUSED_OBSERVATION_TRACK,
         topics.primary_samples(horizontal),
         topics.primary_samples(vertical) if has_height else None,
         (horizontal.topic, vertical.topic)[: 1 + has_height],
-        # EKF2 subtracts half its prediction interval from the times (estimator_interface.cpp)
+        # EKF2 subtracts half its prediction interval from measurement times
+        # (estimator_interface.cpp)
         shift_s=0.5 * configured_step_s(topics),
         is_odometry=is_odometry,
     )
@@ -273,7 +283,7 @@ def _make_derived_track(
     topics: Topics,
     name: str,
     samples: pd.DataFrame,
-    height: pd.DataFrame | None,
+    height_samples: pd.DataFrame | None,
     topic_names: tuple[str, ...],
     *,
     shift_s: float = 0.0,
@@ -285,12 +295,14 @@ def _make_derived_track(
     EKF2_EV_DELAY is added to the times, because EKF2 subtracts it from the sender's timestamps.
     """
     notes: tuple[str, ...] = ()
-    if height is not None:
-        samples = join_nearest(samples, height.assign(_found=True), MAX_HEIGHT_TIME_DIFFERENCE_S)
+    if height_samples is not None:
+        samples = join_nearest(
+            samples, height_samples.assign(_found=True), MAX_HEIGHT_TIME_DIFFERENCE_S
+        )
         if missing_count := int(samples.pop("_found").isna().sum()):
             notes = (
                 f"{missing_count} of {len(samples)} external vision positions have no height "
-                f"within {1e3 * MAX_HEIGHT_TIME_DIFFERENCE_S:.0f} ms",
+                f"within {1e3 * MAX_HEIGHT_TIME_DIFFERENCE_S:.0f} ms and are used without height",
             )
     shift_s += topics.log.parameters.get(EV_POS.delay, 0.0) * 1e-3
     return _make_ulog_track(
@@ -316,7 +328,7 @@ def _reconstruct_track(
     The times of the innovations are used. They are late by up to one interval of the source.
     """
     if isinstance(ekf2, Unavailable):
-        return unavailable_source(px4.RECONSTRUCTION, "the log contains no EKF2 state")
+        return unavailable_source(px4.RECONSTRUCTED_TRACK, "the log contains no EKF2 state")
     positions = {
         column: innovations["innovation_m"]
         + interpolate_inside(innovations.index, ekf2.state[column])
@@ -325,17 +337,17 @@ def _reconstruct_track(
     }
     if not {"north_m", "east_m"} <= positions.keys():
         return unavailable_source(
-            px4.RECONSTRUCTION, "EKF2 fused no horizontal external vision position"
+            px4.RECONSTRUCTED_TRACK, "EKF2 fused no horizontal external vision position"
         )
-    height = positions.pop("down_m", None)
+    height_m = positions.pop("down_m", None)
     return _make_derived_track(
         topics,
-        px4.RECONSTRUCTION,
+        px4.RECONSTRUCTED_TRACK,
         pd.DataFrame(positions),
-        None if height is None else height.to_frame("down_m"),
+        None if height_m is None else height_m.to_frame("down_m"),
         ("vehicle_local_position", *ekf2.innovation_topics),
         is_odometry=is_odometry,
-        clock=f"innovation time plus {EV_POS.delay}, too late by up to one sample interval",
+        clock=f"times of the innovations plus {EV_POS.delay}, late by up to one sample interval",
     )
 
 
@@ -368,22 +380,24 @@ def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[
     latitude_0, longitude_0 = np.radians(origin[:2])
     sine, cosine = np.sin(latitude_0), np.cos(latitude_0)
     angle = np.hypot(x, y)
-    # sin(c)/c, with the limit 1 at the origin
-    sine_ratio = np.sinc(angle / np.pi)
-    latitude = np.arcsin(np.cos(angle) * sine + x * sine_ratio * cosine)
+    # sin(angle)/angle, 1 at the origin
+    sinc_angle = np.sinc(angle / np.pi)
+    latitude = np.arcsin(np.cos(angle) * sine + x * sinc_angle * cosine)
     longitude = longitude_0 + np.arctan2(
-        y * sine_ratio, cosine * np.cos(angle) - x * sine * sine_ratio
+        y * sinc_angle, cosine * np.cos(angle) - x * sine * sinc_angle
     )
     return np.degrees(latitude), np.degrees(longitude)
 
 
-def _local_origin(topics: Topics) -> GeodeticPosition | None:
+def _find_local_origin(topics: Topics) -> GeodeticPosition | None:
     """Return EKF2's origin: latitude, longitude (degrees), altitude (m).
 
     Return None if the log contains no origin.
     """
     columns = ["ref_lat", "ref_lon", "ref_alt"]
-    origin = finite_rows(topics.read(px4.LOCAL_POSITION).reindex(columns=columns), columns)
+    origin = select_valid_rows(
+        topics.read(px4.LOCAL_POSITION_LAYOUT).reindex(columns=columns), columns
+    )
     origin = origin[origin["ref_lat"] != 0]
     return tuple(origin.iloc[-1].tolist()) if len(origin) else None
 
@@ -411,14 +425,14 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     the GNSS driver if they differ from the timestamps (EKF2.cpp UpdateGpsSample,
     estimator_interface.cpp).
     """
-    layout = topics.find(*px4.layouts_of_track(px4.GPS_POSITION))
+    layout = topics.find_layout(*px4.find_track_layouts(px4.GPS_POSITION))
     if layout is None:
         return unavailable_source(px4.GPS_POSITION)
     fixes = topics.read_instance(layout)
-    message_count, no_fix = len(fixes), fixes.iloc[:0]
+    message_count, samples_without_fix = len(fixes), fixes.iloc[:0]
     if "fix_type" in fixes:
         has_fix = fixes["fix_type"] >= FIX_TYPE_3D
-        fixes, no_fix = fixes[has_fix], fixes[~has_fix]
+        fixes, samples_without_fix = fixes[has_fix], fixes[~has_fix]
     if fixes.empty:
         return unavailable_source(
             px4.GPS_POSITION,
@@ -426,7 +440,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
             NO_FIX_ACTION,
         )
     parameters = topics.ekf2_parameters
-    published_s = (fixes["published_us"].to_numpy() - topics.zero_us) * 1e-6
+    published_s = (fixes["published_us"].to_numpy() - topics.time_origin_us) * 1e-6
     has_driver_times = GNSS_MODE_PARAMETER in parameters and bool(
         np.any(published_s - fixes.index > MAX_ARRIVAL_DELAY_US * 1e-6)
     )
@@ -441,7 +455,7 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
         interpolated_count = int(fixes["altitude_m"].isna().sum())
         # EKF2's topics lack some fields of a fix, which are copied from the previous fix
         fixes = fixes.assign(altitude_m=fixes["altitude_m"].interpolate("index")).ffill()
-    samples = _gnss_samples(fixes, _local_origin(topics))
+    samples = _convert_gnss_fixes(fixes, _find_local_origin(topics))
     rate_hz = sample_rate(samples)
     notes, is_downsampled = list[str](), rate_hz < MAX_DOWNSAMPLED_HZ
     if is_downsampled:
@@ -477,11 +491,15 @@ def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack 
     )
     if isinstance(track, Unavailable):
         return track
-    no_fix_s = (no_fix["published_us"].to_numpy() - topics.zero_us) * 1e-6 - delay_ms * 1e-3
-    return replace(track, invalid=pd.Series("no fix", time_index(no_fix_s), dtype=object))
+    times_without_fix_s = (
+        samples_without_fix["published_us"].to_numpy() - topics.time_origin_us
+    ) * 1e-6 - delay_ms * 1e-3
+    return replace(
+        track, invalid=pd.Series("no fix", time_index(times_without_fix_s), dtype=object)
+    )
 
 
-def _gnss_samples(fixes: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
+def _convert_gnss_fixes(fixes: pd.DataFrame, origin: GeodeticPosition | None) -> pd.DataFrame:
     """Convert GNSS fixes to positions and velocities in NED with their variances."""
     samples = project_to_ned(fixes, origin)
     if {"eph_m", "epv_m"} <= {*fixes}:
@@ -495,7 +513,7 @@ def _gnss_samples(fixes: pd.DataFrame, origin: GeodeticPosition | None) -> pd.Da
     samples = samples.assign(
         **velocity, **dict.fromkeys(Columns.VELOCITY_VARIANCE, speed_accuracy_m_s**2)
     )
-    return finite_rows(samples, Columns.POSITION)
+    return select_valid_rows(samples, Columns.POSITION)
 
 
 def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFrame | None:
@@ -517,19 +535,22 @@ def read_truth(
     Up to v1.13, the simulation logs latitude and longitude only. If EKF2 fused GNSS, the ground
     truth is shifted from the origin of the simulation to EKF2's origin.
     """
-    attitude = read_attitude(topics.read(px4.LAYOUTS["truth_attitude"]))
-    local_layout, global_layout = px4.LAYOUTS["truth_local"], px4.LAYOUTS["truth_global"]
-    logged_local = topics.read(local_layout)
-    local_samples = finite_rows(logged_local, logged_local.columns.tolist())
-    global_positions = finite_rows(topics.read(global_layout), Columns.GEODETIC[:2])
+    attitude = read_attitude(topics.read(px4.TOPIC_LAYOUTS["truth_attitude"]))
+    local_layout, global_layout = (
+        px4.TOPIC_LAYOUTS["truth_local"],
+        px4.TOPIC_LAYOUTS["truth_global"],
+    )
+    logged_local_samples = topics.read(local_layout)
+    local_samples = select_valid_rows(logged_local_samples, logged_local_samples.columns.tolist())
+    global_positions = select_valid_rows(topics.read(global_layout), Columns.GEODETIC[:2])
     if len(global_positions):
-        projected_positions = project_to_ned(global_positions, _local_origin(topics))
+        projected_positions = project_to_ned(global_positions, _find_local_origin(topics))
         if local_samples.empty:
             velocity = global_positions.reindex(columns=Columns.VELOCITY)
             return Truth(global_layout.topic, projected_positions.join(velocity), attitude)
         if has_fused_aid(ekf2):
             local_samples = local_samples.copy()
-            for column in Columns.POSITION:  # shift by the median difference
+            for column in Columns.POSITION:  # both frames differ by a constant
                 interpolated_m = interpolate_inside(
                     projected_positions.index, local_samples[column]
                 )
@@ -539,8 +560,8 @@ def read_truth(
         return Truth(local_layout.topic, local_samples, attitude)
     mocap_truth = motion_capture_truth(positions)
     reason = "the log has neither simulation ground truth nor motion capture"
-    remedy = px4.TRACKS["vehicle_mocap_odometry"].remedy
-    if len(logged_local):
+    remedy = px4.TRACK_SOURCES["vehicle_mocap_odometry"].remedy
+    if len(logged_local_samples):
         reason = f"{local_layout.topic} has no finite sample"
         remedy = "Check the simulation that writes the ground truth."
     return mocap_truth or Unavailable("ground truth", reason, remedy)

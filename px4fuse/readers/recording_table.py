@@ -57,7 +57,7 @@ class Table:
     is_chosen_body: bool = False
     notes: tuple[str, ...] = ()
 
-    def label(self, *columns: int | None) -> str:
+    def format_labels(self, *columns: int | None) -> str:
         """Join the names of columns for a message; repeated indices and None are omitted."""
         labels = dict.fromkeys(
             quote(self.names[index]) if self.names[index] else f"column {index + 1}"
@@ -66,13 +66,13 @@ class Table:
         )
         return ", ".join([*labels][:12]) + (", ..." if len(labels) > 12 else "")
 
-    def first_line(self, rows: pd.Index) -> str:
-        """Return the line number of the first row for a message; "" if rows are not lines."""
+    def format_first_line(self, rows: pd.Index) -> str:
+        """Return " (first: line N)" for the first of ``rows``; "" if rows are not lines."""
         return (
             "" if self.header_line is None else f" (first: line {self.header_line + 1 + rows[0]})"
         )
 
-    def texts(self, columns: Iterable[int]) -> pd.DataFrame:
+    def read_cells(self, columns: Iterable[int]) -> pd.DataFrame:
         """Return the text in each cell of the given columns, without empty rows."""
         column_indices = sorted({*columns})
         try:
@@ -86,7 +86,7 @@ class Table:
                 dtype=str,
                 skipinitialspace=True,
                 quoting=csv.QUOTE_NONE,
-                skip_blank_lines=False,  # the index counts the lines
+                skip_blank_lines=False,  # so that the index gives the line number
             )
         except ValueError as error:
             raise LogError(
@@ -96,7 +96,7 @@ class Table:
         return texts.dropna(how="all")
 
 
-def choose_body(file_name: str, bodies: Iterable[str], wanted_body: str | None) -> str:
+def choose_body(file_name: str, body_names: Iterable[str], wanted_body: str | None) -> str:
     """Return the name of the rigid body whose positions are read.
 
     ``drone`` also selects ``drone:drone``, because Vicon Nexus repeats the name of a body.
@@ -106,13 +106,14 @@ def choose_body(file_name: str, bodies: Iterable[str], wanted_body: str | None) 
     LogError
         The file does not contain ``wanted_body``, or this is None and the file has several bodies.
     """
-    names = [*dict.fromkeys(bodies)]
+    names = [*dict.fromkeys(body_names)]
     matches = names if wanted_body is None else [name for name in names if name == wanted_body]
     matches = matches or [name for name in names if name.partition(":")[0] == wanted_body]
     if len(matches) == 1:
         return matches[0]
     raise LogError(
-        f"{file_name} contains the bodies {', '.join(names[:12])}", "Choose a body with --body."
+        f"{file_name} contains the rigid bodies or tags {', '.join(names[:12])}",
+        "Choose one with --body NAME.",
     )
 
 
@@ -204,7 +205,7 @@ def _find_header_table(
         for separator in SEPARATORS:
             names = _split_line(line.strip("#% "), separator)
             if len(names) <= MAX_COLUMNS and _is_header(names, wanted_names):
-                data_text = _without_comments(text.split("\n", index + 1)[index + 1])
+                data_text = _remove_comments(text.split("\n", index + 1)[index + 1])
                 return Table(file_name, "", names, data_text, separator, index + 1)
     return None
 
@@ -214,7 +215,7 @@ def _is_header(fields: list[str], wanted_names: set[str]) -> bool:
         return wanted_names <= {name.casefold() for name in fields}
     meanings = [read_column_name(name) for name in fields]
     has_time = any(column.kind == "time" for column in meanings)
-    return has_time and position_names.find_position(meanings) is not None
+    return has_time and position_names.find_position_columns(meanings) is not None
 
 
 def _find_body_table(
@@ -233,7 +234,7 @@ def _find_body_table(
         row_by_title = {row[1]: row for row in rows[2:header_index]}
         body_names, body_types = (row_by_title.get(title, axes) for title in ("Name", "Type"))
         used_types = {"Rigid Body"} if "Rigid Body" in body_types else {*body_types}
-        # Columns without a name are not read: rotations, because a rigid body's axes are not FRD
+        # Rotations get no column name, so they are not read: a rigid body's axes are not FRD
         names = [
             f"{axis}_{unit}" if group == "Position" and body_type in used_types else ""
             for axis, group, body_type in zip(
@@ -326,7 +327,7 @@ def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Table
         if not 4 <= len(fields) <= MAX_COLUMNS or not all(map(is_number, decimal_fields[1:])):
             continue
         if separator == " " and len(fields) == 12:
-            return _kitti_table(path, text)
+            return _read_kitti_table(path, text)
         if is_number(decimal_fields[0]) or _ISO_DATE.match(fields[0]):
             name, quaternion_order = NO_HEADER, ""
             if separator in " \t" and len(fields) == 8:
@@ -336,16 +337,16 @@ def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Table
             names = ["time", "x", "y", "z", *(f"q{axis}" for axis in quaternion_order)]
             names += [""] * (len(fields) - len(names))
             note = "the file has no header: columns 1 to 4 are read as time, x, y, z"
-            data_text = _without_comments(text)
+            data_text = _remove_comments(text)
             return Table(display_name(path), name, names, data_text, separator, 0, notes=(note,))
     return None
 
 
-def _without_comments(text: str) -> str:
+def _remove_comments(text: str) -> str:
     return re.sub(r"(?m)[ \t]*#.*|^[ \t]*%.*", "", text)
 
 
-def _kitti_table(path: Path, text: str) -> Table:
+def _read_kitti_table(path: Path, text: str) -> Table:
     """Read poses from the 3x4 matrices of a KITTI file, and times from a file in its folder."""
     # imported here, because most recordings need no rotations
     from scipy.spatial.transform import Rotation  # noqa: PLC0415

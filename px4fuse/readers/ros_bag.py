@@ -18,7 +18,7 @@ from px4fuse.core.reading import (
 from px4fuse.errors import LogError
 from px4fuse.readers.recording_table import Table
 
-_SUFFIXES = (".bag", ".mcap", ".db3")
+_BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 _PATH_TYPE = "nav_msgs/msg/Path"
 _FRAME_NED = 1  # VehicleOdometry.POSE_FRAME_NED
 _POSE_COLUMNS = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "sigma_x_m", "sigma_y_m", "sigma_z_m"]
@@ -36,7 +36,7 @@ _POSITION_TYPES = (
 )
 
 
-def _pose_values(message: Any) -> list[float]:
+def _read_pose_values(message: Any) -> list[float]:
     """Return x, y, z and, if the message contains them, qx, qy, qz, qw and the σ of x, y and z."""
     if hasattr(message, "q"):
         return [*message.position.tolist(), *np.roll(message.q, -1).tolist()]
@@ -58,7 +58,7 @@ def _pose_values(message: Any) -> list[float]:
 
 def is_bag(path: Path) -> bool:
     """Return True for the folder of a ROS 2 bag, or a file with the suffix of a bag."""
-    return (path / "metadata.yaml").exists() or path.suffix.lower() in _SUFFIXES
+    return (path / "metadata.yaml").exists() or path.suffix.lower() in _BAG_SUFFIXES
 
 
 def read_bag(path: Path, topic: str | None) -> tuple[Table, str, int]:
@@ -77,7 +77,7 @@ def read_bag(path: Path, topic: str | None) -> tuple[Table, str, int]:
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
     except ImportError:
         raise LogError(
-            f"{name} is a ROS bag, and the library rosbags is not installed",
+            f"{name} is a ROS bag, but the library rosbags, which reads it, is not installed",
             "Run pip install 'px4fuse[ros]'.",
         ) from None
     files = files_below(path) if path.is_dir() else [path]
@@ -109,8 +109,11 @@ def _read_topic(name: str, reader: Any, topic: str | None) -> Table:
     chosen_topic = usable_topics[0] if topic is None and len(usable_topics) == 1 else topic
     if chosen_topic not in usable_topics:
         raise LogError(
-            f"{name} contains these topics with positions: {', '.join(usable_topics) or 'none'}",
-            f"Give {name}:TOPIC." if usable_topics else "Record the positions as PoseStamped.",
+            f"{name} does not contain {f'topic {topic}' if topic else 'exactly one topic'} with "
+            f"positions; topics with positions: {', '.join(usable_topics) or 'none'}",
+            f"Give the topic as {name}:TOPIC."
+            if usable_topics
+            else "Record the positions as PoseStamped.",
         )
     message_type = type_by_topic[chosen_topic]
     messages = reader.messages(
@@ -124,16 +127,16 @@ def _read_topic(name: str, reader: Any, topic: str | None) -> Table:
     for connection, receive_ns, raw_message in messages:
         message = reader.deserialize(raw_message, connection.msgtype)
         for stamped_message in message.poses if message_type == _PATH_TYPE else [message]:
-            time_ns = _time_ns(stamped_message)
+            time_ns = _read_time_ns(stamped_message)
             pose_frames.add(getattr(stamped_message, "pose_frame", None))
             lags_s.append((receive_ns - time_ns) * 1e-9)
-            csv_rows.append(f"{time_ns},{str(_pose_values(stamped_message))[1:-1]}\n")
+            csv_rows.append(f"{time_ns},{str(_read_pose_values(stamped_message))[1:-1]}\n")
     notes = [f"the topic is {chosen_topic} ({message_type})"]
     if csv_rows:
-        low_s, median_s, high_s = np.percentile(lags_s, [2.5, 50.0, 97.5])
+        low_lag_s, median_lag_s, high_lag_s = np.percentile(lags_s, [2.5, 50.0, 97.5])
         notes.append(
-            f"the timestamps in the messages are used; they were received {median_s:.3f} s later "
-            f"(95 % {low_s:.3f} to {high_s:.3f} s)"
+            f"the timestamps in the messages are used; they were received {median_lag_s:.3f} s "
+            f"later (95 % {low_lag_s:.3f} to {high_lag_s:.3f} s)"
         )
     return Table(
         name,
@@ -146,7 +149,7 @@ def _read_topic(name: str, reader: Any, topic: str | None) -> Table:
     )
 
 
-def _time_ns(message: Any) -> int:
+def _read_time_ns(message: Any) -> int:
     if hasattr(message, "header"):
         return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
     return int(message.timestamp_sample) * 1000

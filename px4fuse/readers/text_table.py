@@ -32,12 +32,12 @@ def refuse_foreign_format(path: Path, first_bytes: bytes, error_type: type[Px4Fu
 
 
 # Minimum and maximum valid UNIX time (s): the years 2000 and 2100
-UNIX_START_S, UNIX_END_S = 946_684_800.0, 4_102_444_800.0
+MIN_VALID_UNIX_TIME_S, MAX_VALID_UNIX_TIME_S = 946_684_800.0, 4_102_444_800.0
 # Number of first characters that are searched for a control character, which shows a binary file.
 # NUL is searched in the whole file
-_CHECKED_CHARS = 100_000
+_CHECKED_CHAR_COUNT = 100_000
 # Byte order marks of UTF-16, the encoding of texts from Windows shells
-_UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
+_UTF_16_BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _CONTROL_CHARACTER = re.compile("[\x00-\x08\x0e-\x1b]")
 _NUMBER = re.compile(
     r"[+-]?(?:(?:[0-9]+\.?|[0-9]*\.[0-9]+)(?:e[+-]?[0-9]+)?|nan|inf)", re.IGNORECASE
@@ -49,7 +49,7 @@ def decode_text(content: bytes) -> str | None:
 
     All line ends become line feeds.
     """
-    if content.startswith(_UTF_16_MARKS):
+    if content.startswith(_UTF_16_BYTE_ORDER_MARKS):
         text = content[: len(content) // 2 * 2].decode("utf-16", errors="replace")
     else:
         content = content.rstrip(b"\0\x1a")  # NUL at the end after a power loss, 0x1a from DOS
@@ -57,7 +57,7 @@ def decode_text(content: bytes) -> str | None:
             text = content.decode("utf-8-sig")
         except UnicodeDecodeError:
             text = content.decode("latin-1")
-    if "\0" in text or _CONTROL_CHARACTER.search(text, 0, _CHECKED_CHARS):
+    if "\0" in text or _CONTROL_CHARACTER.search(text, 0, _CHECKED_CHAR_COUNT):
         return None
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
@@ -72,16 +72,16 @@ def quote(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
-def line_error(name: str, line_number: int, fault: str, remedy: str) -> TrajectoryError:
+def make_line_error(name: str, line_number: int, fault: str, remedy: str) -> TrajectoryError:
     """Make an error message with the file name and the line number of the fault.
 
-    >>> str(line_error("uwb.csv", 7, "'x' is not a number", "Correct or remove this line."))
+    >>> str(make_line_error("uwb.csv", 7, "'x' is not a number", "Correct or remove this line."))
     "uwb.csv, line 7: 'x' is not a number. Correct or remove this line."
     """
     return TrajectoryError(f"{name}, line {line_number}: {fault}. {remedy}")
 
 
-@dataclass(eq=False)  # filled while the data are read
+@dataclass(eq=False)  # not frozen: the reader appends lines
 class Rows:
     """Rows of a text table, with the line number of each row for error messages.
 
@@ -96,15 +96,15 @@ class Rows:
     file_name: str
     lines: list[tuple[int, str]] = field(default_factory=list)
 
-    def row_error(self, row: int, description: str, remedy: str) -> TrajectoryError:
+    def make_row_error(self, row: int, description: str, remedy: str) -> TrajectoryError:
         """Make an error message with the line number of a row."""
-        return line_error(self.file_name, self.lines[row][0], description, remedy)
+        return make_line_error(self.file_name, self.lines[row][0], description, remedy)
 
     def raise_where(self, is_invalid: BoolArray, description: str, remedy: str) -> None:
         """Raise TrajectoryError for the first invalid row; ``is_invalid``: shape (n,) or (n, k)."""
         invalid_indices = np.argwhere(is_invalid)
         if len(invalid_indices):
-            raise self.row_error(int(invalid_indices[0, 0]), description, remedy)
+            raise self.make_row_error(int(invalid_indices[0, 0]), description, remedy)
 
     def parse(
         self, text_count: int, number_count: int
@@ -138,7 +138,7 @@ class Rows:
                 for fields in row_fields
             )
             row = next((row for row, is_row_valid in enumerate(is_valid) if not is_row_valid), 0)
-            raise self.row_error(
+            raise self.make_row_error(
                 row,
                 f"{quote(lines[row])} does not have {text_count + number_count} columns with "
                 "numbers",

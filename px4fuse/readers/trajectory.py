@@ -20,28 +20,28 @@ from px4fuse.readers.ros_bag import is_bag
 from px4fuse.trajectory.model import Frame, Trajectory, TrajectoryKind
 
 # Maximum deviation of a valid quaternion from norm 1
-MAX_NORM_ERROR = 0.1
+MAX_QUATERNION_NORM_ERROR = 0.1
 # Maximum absolute coordinate (m): larger values are timestamps or damaged text
 MAX_COORDINATE_M = 1e9
 # Quaternions are normalised if their norm deviates by more than this from 1 (rounding of float64)
 UNIT_NORM_TOLERANCE = 1e-15
 # Maximum fraction of invalid rows of a file. With more, its timestamps are probably rounded, or it
 # contains several recordings: it is rejected
-MAX_DROPPED_FRACTION = 0.01
-# Maximum coordinate (m) and rotation angle (rad) of a first pose that is the identity: SLAM begins
-# at the identity
+MAX_DROPPED_ROW_FRACTION = 0.01
+# The first pose is the identity up to this coordinate (m) and rotation angle (rad). SLAM begins at
+# the identity
 MAX_IDENTITY_DISTANCE = 1e-6
 # Maximum ratio smallest / second RMS extent along the principal axes, for a motion in a plane
-MAX_THICKNESS_RATIO = 1 / 3
+MAX_PLANE_THICKNESS_RATIO = 1 / 3
 # Minimum ratio second / largest RMS extent along the principal axes, for a motion in a plane: a
 # straight motion has no unique plane
-MIN_WIDTH_RATIO = 0.1
+MIN_PLANE_WIDTH_RATIO = 0.1
 # Maximum angle (rad) between the normal of the plane of motion and the y axis of a camera frame
 MAX_TILT_RAD = math.radians(20.0)
 # Minimum fraction of pose intervals that are near the median interval, for a regular frame rate
-MIN_REGULAR_FRACTION = 0.9
-# Maximum relative deviation of a pose interval that is near the median interval
-MAX_INTERVAL_DEVIATION = 0.5
+MIN_REGULAR_INTERVAL_FRACTION = 0.9
+# A pose interval is near the median interval if it differs by at most this fraction
+MAX_INTERVAL_DEVIATION_RATIO = 0.5
 # Minimum interval between two poses that counts as a gap, in median intervals
 MIN_GAP_INTERVALS = 2.5
 # Minimum interval (s) between two poses that counts as a gap
@@ -49,7 +49,9 @@ MIN_GAP_S = 0.3
 
 # Words in comments and file names that indicate ground truth; b_w_RS_S is the column of the gyro
 # bias in EuRoC ground truth
-_TRUTH_WORDS = re.compile(r"truth|vicon|leica|mocap|(?<![a-z])gt(?![a-z])|b_w_RS_S", re.IGNORECASE)
+_TRUTH_NAME_PATTERN = re.compile(
+    r"truth|vicon|leica|mocap|(?<![a-z])gt(?![a-z])|b_w_RS_S", re.IGNORECASE
+)
 # Number of bytes at the start of a file in which comments are searched
 _HEAD_BYTES = 4096
 _FRAMES: dict[tuple[str, ...], Frame] = {("ned",): "NED", ("enu",): "ENU", ("edn",): "camera"}
@@ -80,11 +82,11 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
             f"{name} has no header that names its columns",
             "Add a header such as '# time x y z qx qy qz qw'.",
         )
-    if dropped_count > MAX_DROPPED_FRACTION * recording.row_count:
+    if dropped_count > MAX_DROPPED_ROW_FRACTION * recording.row_count:
         raise TrajectoryError(
             f"{name}: {dropped_count} of {recording.row_count} rows are not valid poses "
             f"({'; '.join(recording.notes)})",
-            "Export the timestamps with all digits (%.9f), and remove other rows.",
+            "Export the timestamps with all digits (%.9f), and remove the invalid rows.",
         )
     if np.isnan(position_m).any():
         raise TrajectoryError(f"{name} contains no height", "Export x, y and z.")
@@ -94,7 +96,7 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     kind, kind_note = _detect_kind(path, comments, position_m, rotation)
     frame, frame_note = _detect_frame(kind, position_m)
     time_s = samples.index.to_numpy()
-    notes = (*recording.detected, *recording.notes)
+    notes = (*recording.detection_notes, *recording.notes)
     more_notes = (kind_note, frame_note, _describe_gaps(time_s))
     return Trajectory(
         name=name,
@@ -103,7 +105,7 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
         position_m=position_m,
         rotation=rotation,
         frame=_FRAMES.get(recording.frames, frame),
-        unix_offset_s=0.0 if recording.clock == "UNIX" else None,
+        unix_offset_s=0.0 if recording.clock_kind == "UNIX" else None,
         sha256=recording.sha256,
         size_bytes=recording.size_bytes,
         notes=(
@@ -113,7 +115,7 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     )
 
 
-def tum_text(trajectory: Trajectory) -> str:
+def format_tum(trajectory: Trajectory) -> str:
     """Return the text of a TUM file with the trajectory; numbers have all digits of float64.
 
     Timestamps are UNIX time if ``trajectory.unix_offset_s`` is known.
@@ -141,7 +143,7 @@ def _read_rotation(recording: PositionRecording) -> Rotation | None:
     norms = np.linalg.norm(quaternions, axis=1)
     if not np.nan_to_num(norms).any():  # zeros or NaN: the file has positions only
         return None
-    if not (np.abs(norms - 1.0) <= MAX_NORM_ERROR).all():
+    if not (np.abs(norms - 1.0) <= MAX_QUATERNION_NORM_ERROR).all():
         raise TrajectoryError(
             f"{recording.name}: a quaternion does not have norm 1",
             "Check the columns qx, qy, qz and qw.",
@@ -156,12 +158,12 @@ def _detect_kind(
     # EuRoC files are always called data.csv; their folder name indicates the kind
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
     text_by_note = {
-        "A comment states that the trajectory is ground truth.": comments,
+        "A comment in the file states that the trajectory is ground truth.": comments,
         "The file name states that the trajectory is ground truth.": path.name,
         "The folder name states that the trajectory is ground truth.": folder,
     }
     for note, text in text_by_note.items():
-        if _TRUTH_WORDS.search(text):
+        if _TRUTH_NAME_PATTERN.search(text):
             return "truth", note
     if (
         rotation is not None
@@ -176,9 +178,14 @@ def _detect_frame(kind: TrajectoryKind, position_m: Array) -> tuple[Frame, str]:
         return "unknown", ""
     centred_m = position_m - position_m.mean(axis=0)
     eigenvalues, axes = np.linalg.eigh(centred_m.T @ centred_m)  # eigenvalues in ascending order
-    thickness_m, width_m, length_m = np.sqrt(np.maximum(eigenvalues, 0.0) / len(position_m))
+    thickness_rms_m, width_rms_m, length_rms_m = np.sqrt(
+        np.maximum(eigenvalues, 0.0) / len(position_m)
+    )
     tilt_rad = math.acos(min(1.0, abs(float(axes[1, 0]))))
-    is_planar = width_m > MIN_WIDTH_RATIO * length_m and thickness_m < MAX_THICKNESS_RATIO * width_m
+    is_planar = (
+        width_rms_m > MIN_PLANE_WIDTH_RATIO * length_rms_m
+        and thickness_rms_m < MAX_PLANE_THICKNESS_RATIO * width_rms_m
+    )
     if not is_planar or tilt_rad > MAX_TILT_RAD:
         return "unknown", ""
     return "camera", (
@@ -191,8 +198,10 @@ def _describe_gaps(time_s: Array) -> str:
     """Return a note on gaps or irregular intervals between poses; "" if there are none."""
     intervals_s = np.diff(time_s)
     median_s = float(np.median(intervals_s))
-    is_regular: BoolArray = np.abs(intervals_s - median_s) <= MAX_INTERVAL_DEVIATION * median_s
-    if is_regular.mean() < MIN_REGULAR_FRACTION:
+    is_regular: BoolArray = (
+        np.abs(intervals_s - median_s) <= MAX_INTERVAL_DEVIATION_RATIO * median_s
+    )
+    if is_regular.mean() < MIN_REGULAR_INTERVAL_FRACTION:
         return (
             "The poses are key frames, or many poses are missing: the pose intervals are irregular "
             f"(median {median_s:.3g} s, maximum {intervals_s.max():.3g} s)."

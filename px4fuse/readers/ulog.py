@@ -20,11 +20,16 @@ from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.field_maps import Layout
 from px4fuse.readers.px4_ekf2 import read_ekf2
 from px4fuse.readers.px4_positions import FIX_TYPE_3D, barometer, read_positions, read_truth
-from px4fuse.readers.ulog_topics import Topics, dropped_notes, longest_increasing_run, read_topics
+from px4fuse.readers.ulog_topics import (
+    Topics,
+    describe_dropped_samples,
+    longest_increasing_run,
+    read_topics,
+)
 
 ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
-# Maximum interval (s) between two IMU samples if none is missing; 4 ms is normal
-MIN_MISSING_IMU_S = 0.2
+# IMU samples are missing in an interval longer than this (s); 4 ms is normal
+MIN_IMU_GAP_S = 0.2
 # Minimum and maximum valid UTC (UNIX time, s) of a GNSS receiver: GPS_EPOCH_SECS of PX4
 # (gps_helper.h), and the year 2100
 UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
@@ -39,12 +44,12 @@ def read_ulog(name: str, content: bytes) -> Flight:
         The content is not a ULog, or contains no usable data.
     """
     topics = read_topics(name, content)
-    remedy = "Check that the sensors were running during logging."
-    imu = _require_samples(topics, _read_imu(topics), "IMU", px4.IMU, remedy)
-    attitude_samples = common.rows_with_attitude(topics.read(px4.LAYOUTS["attitude"]))
-    remedy = "Check that the estimator was running during logging."
+    remedy = "Check that the accelerometer and gyroscope were running during logging."
+    imu = _require_samples(topics, _read_imu(topics), "IMU", px4.IMU_LAYOUT, remedy)
+    attitude_samples = common.select_rows_with_attitude(topics.read(px4.TOPIC_LAYOUTS["attitude"]))
+    remedy = "Check that EKF2 was running during logging (EKF2_EN is 1)."
     attitude = _require_samples(
-        topics, attitude_samples, "attitude", px4.LAYOUTS["attitude"], remedy
+        topics, attitude_samples, "attitude", px4.TOPIC_LAYOUTS["attitude"], remedy
     )
     ekf2 = read_ekf2(topics)
     positions, missing_positions = read_positions(topics, ekf2)
@@ -52,15 +57,17 @@ def read_ulog(name: str, content: bytes) -> Flight:
     if isinstance(truth, Truth):
         topics.record_stream("truth", truth.name)
     airborne = _read_airborne(topics)
-    altitude_m = topics.read(px4.LAYOUTS["barometer"])["altitude_m"]
+    altitude_m = topics.read(px4.TOPIC_LAYOUTS["barometer"])["altitude_m"]
     delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
     is_in_flight = common.ends_in_flight(airborne, topics.log.duration_s)
     dropped_counts = [(topic, count) for (topic, _), count in sorted(topics.dropped.items())]
-    tilt_failures = topics.read(px4.LAYOUTS["failure"], step=True)[["roll", "pitch"]]
+    tilt_failures = topics.read(px4.TOPIC_LAYOUTS["failure"], is_step_function=True)[
+        ["roll", "pitch"]
+    ]
     return Flight(
         log=structs.replace(
             topics.log,
-            notes=(*topics.log.notes, *dropped_notes(dropped_counts)),
+            notes=(*topics.log.notes, *describe_dropped_samples(dropped_counts)),
             dropped=dict(dropped_counts),
             start_unix_s=_start_unix_s(topics),
             damage=_describe_damage(topics, imu, is_in_flight),
@@ -72,7 +79,9 @@ def read_ulog(name: str, content: bytes) -> Flight:
         ekf2=ekf2,
         truth=truth,
         airborne=airborne,
-        tumble_spans=common.flight_spans(tilt_failures.max(axis=1) == 0.0, topics.log.duration_s),
+        tumble_spans=common.find_flight_spans(
+            tilt_failures.max(axis=1) == 0.0, topics.log.duration_s
+        ),
         barometer=barometer(altitude_m, delay_s),
         missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
         streams=topics.streams,
@@ -94,8 +103,8 @@ def _describe_damage(
     if topics.is_damaged:
         missing_imu_s = duration_s
         if not isinstance(imu, Unavailable):
-            steps_s = np.diff(imu.index.to_numpy())
-            missing_imu_s = float(steps_s[steps_s > MIN_MISSING_IMU_S].sum())
+            imu_intervals_s = np.diff(imu.index.to_numpy())
+            missing_imu_s = float(imu_intervals_s[imu_intervals_s > MIN_IMU_GAP_S].sum())
         damage_sentences.append(
             f"the file is damaged: {missing_imu_s:.1f} s of {duration_s:.1f} s of IMU data are "
             "missing"
@@ -105,7 +114,7 @@ def _describe_damage(
 
 def _start_unix_s(topics: Topics) -> float | None:
     """Return the UNIX time (s) at flight time zero, from the GNSS fixes; None without UTC."""
-    gps = topics.read(*px4.layouts_of_track(px4.GPS_POSITION))
+    gps = topics.read(*px4.find_track_layouts(px4.GPS_POSITION))
     if "utc_us" not in gps:
         return None
     utc_s = gps["utc_us"] * 1e-6
@@ -120,7 +129,7 @@ def _require_samples(
 ) -> TableOrUnavailable:
     """Return the samples of a topic, or the reason why the log contains fewer than two."""
     topic = layout.topic
-    if topics.find(layout) is None:
+    if topics.find_layout(layout) is None:
         return Unavailable(name, f"{topic} is not logged", px4.DEFAULT_PROFILE_REMEDY)
     if len(samples) < 2:
         return Unavailable(name, f"{topic} contains only {len(samples)} usable samples", remedy)
@@ -129,31 +138,31 @@ def _require_samples(
 
 
 def _read_imu(topics: Topics) -> pd.DataFrame:
-    imu = topics.read(px4.IMU)
+    imu = topics.read(px4.IMU_LAYOUT)
     # single arrays instead of tables, because a copy of all samples needs much memory
     columns = {name: values.to_numpy() for name, values in imu.items()}
     time_s, rows = imu.index.to_numpy(), np.arange(len(imu))
     if (offset_us := columns.pop("accelerometer_offset_us", None)) is not None:
         rows = np.flatnonzero(offset_us != ACCELEROMETER_OFFSET_INVALID_US)
         time_us = np.rint(time_s[rows] * 1e6 + offset_us[rows])
-        kept_rows = longest_increasing_run(time_us.astype(np.int64) + topics.zero_us)
+        kept_rows = longest_increasing_run(time_us.astype(np.int64) + topics.time_origin_us)
         time_s, rows = time_us[kept_rows] * 1e-6, rows[kept_rows]
     for name in Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE:
-        is_valid = np.abs(columns[name][rows]) < common.MAX_IMU_VALUE
+        is_valid = np.abs(columns[name][rows]) < common.MAX_IMU_READING
         time_s, rows = time_s[is_valid], rows[is_valid]
-    samples = np.empty((len(columns), len(rows)), np.float32)  # as in the log
+    samples = np.empty((len(columns), len(rows)), np.float32)  # type in the log
     for row, values in zip(samples, columns.values(), strict=True):
         row[:] = values[rows]
     return pd.DataFrame(samples.T, time_index(time_s), list(columns), copy=False)
 
 
 def _read_airborne(topics: Topics) -> Spans | Unavailable:
-    land_detected = topics.read(px4.LAYOUTS["land_detected"], step=True)
+    land_detected = topics.read(px4.TOPIC_LAYOUTS["land_detected"], is_step_function=True)
     if land_detected.empty:
         return Unavailable(
             "land detector",
             "vehicle_land_detected is not logged or not usable",
             f"{px4.DEFAULT_PROFILE_REMEDY} Alternatively, give the flight time (--start, --end).",
         )
-    topics.record_stream("airborne", px4.LAYOUTS["land_detected"].topic)
-    return common.flight_spans(land_detected["landed"], topics.log.duration_s)
+    topics.record_stream("airborne", px4.TOPIC_LAYOUTS["land_detected"].topic)
+    return common.find_flight_spans(land_detected["landed"], topics.log.duration_s)

@@ -39,21 +39,21 @@ from px4fuse.flight.model import (
     time_index,
 )
 from px4fuse.readers.field_maps import MAX_FIELD_VALUE, Layout
-from px4fuse.readers.px4_topics import IMU, LAYOUTS, topics
+from px4fuse.readers.px4_topics import IMU_LAYOUT, TOPIC_LAYOUTS, list_topics
 
 _MICROSECOND_S = 1e-6
 # Maximum delay (s) from measurement to publication. With a longer delay, the measurement time is
 # not boot time: GPS topics before v1.16 contain receiver time, ground truth in v1.13 contains 0
 MAX_PUBLICATION_LAG_S = 10.0
-# Maximum distance (s) of valid samples from the time span of the IMU data
-MAX_OUTSIDE_S = 2.0
+# Samples more than this time (s) before or after the IMU data are invalid
+MAX_TIME_OUTSIDE_S = 2.0
 # ULog info message with a note from the author of the log to its users
 NOTE_KEY = "px4fuse_note"
 # ULog info message which states that the log is an assignment for a student
 ASSESSED_KEY = "px4fuse_assessed"
-# True while an instructor's command reads logs: the diagnosis of a student's assignment is then
-# shown
-ignores_assessed = ContextVar("ignores_assessed", default=False)
+# True while an instructor's command reads logs: the mark ASSESSED_KEY, which hides the diagnosis of
+# an assignment, is then ignored
+ignores_assessed_mark = ContextVar("ignores_assessed_mark", default=False)
 # Maximum interval (s) between IMU timestamps of one flight: after a longer interval, the autopilot
 # was restarted
 MAX_DATA_GAP_S = 600.0
@@ -67,13 +67,13 @@ TopicArrays = dict[str, NDArray[Any]]
 # Tables by topic name and instance number
 Tables = dict[tuple[str, int], TopicArrays]
 # For each change of the primary EKF2 instance: time (s) and number of the new primary instance
-Instances = tuple[tuple[float, int], ...]
+InstanceSwitches = tuple[tuple[float, int], ...]
 # Without the selector topic there is one EKF2 instance
-NO_SELECTOR: Instances = ((-np.inf, 0),)
+SINGLE_INSTANCE: InstanceSwitches = ((-np.inf, 0),)
 
 
-class _CountingContent(io.BytesIO):
-    """Content of a ULog file that counts the bytes which pyulog skips.
+class _SkippedByteCounter(io.BytesIO):
+    """Content of a ULog file; counts the damaged bytes that pyulog skips.
 
     pyulog reads a message header of 3 bytes, then the message. After an invalid header, pyulog
     skips one byte, or all bytes until the next synchronisation message.
@@ -156,7 +156,7 @@ class _Reader(ULog):  # type: ignore[misc]
         return ULog._MessageAddLogged(data, header, formats)
 
 
-@dataclass(eq=False)  # filled while the data are read
+@dataclass(eq=False)  # not frozen: the readers add streams and counts
 class Topics:
     """Decoded topics of one ULog, and its description."""
 
@@ -164,10 +164,10 @@ class Topics:
     log: LogInfo
     tables: Tables
     # Boot time (µs) at flight time zero
-    zero_us: int
+    time_origin_us: int
     # Number of samples with an invalid timestamp, by topic and instance
     dropped: dict[tuple[str, int], int]
-    # All EKF2_ parameters at take-off; ``log`` contains only those in the results
+    # All EKF2_ parameters at take-off; ``log.parameters`` has only REPORTED_PARAMETERS
     ekf2_parameters: Mapping[str, float]
     # True if the file ends within a message
     is_truncated: bool
@@ -187,16 +187,16 @@ class Topics:
         return [self.tables[topic, number] for number in self.instances(topic)]
 
     @cached_property
-    def primary_instances(self) -> Instances:
+    def primary_instances(self) -> InstanceSwitches:
         """Start time (s) and number of each primary EKF2 instance (``EKF2Selector.cpp``)."""
-        instances = self.read(LAYOUTS["selector"], step=True)["instance"]
+        instances = self.read(TOPIC_LAYOUTS["selector"], is_step_function=True)["instance"]
         instances = instances[instances < 255]  # 255 means that no instance is selected yet
         primary_changes = instances[instances.ne(instances.shift())]
         switch_times_s = [-np.inf, *primary_changes.index[1:]]
         numbers = primary_changes.astype(int).tolist()
-        return tuple(zip(switch_times_s, numbers, strict=False)) or NO_SELECTOR
+        return tuple(zip(switch_times_s, numbers, strict=False)) or SINGLE_INSTANCE
 
-    def find(self, *layouts: Layout) -> Layout | None:
+    def find_layout(self, *layouts: Layout) -> Layout | None:
         """Return the first layout whose required fields are in the log, or None."""
         for layout in layouts:
             if any(
@@ -206,17 +206,17 @@ class Topics:
         return None
 
     def read_instance(
-        self, layout: Layout, instance: int = 0, *, step: bool = False
+        self, layout: Layout, instance: int = 0, *, is_step_function: bool = False
     ) -> pd.DataFrame:
         """Read the fields of a topic instance as float64, indexed by measurement time (s).
 
         Parameters
         ----------
         layout : Layout
-            A layout that :meth:`find` returned.
+            A layout that :meth:`find_layout` returned.
         instance : int
             Number of the topic instance; if it is not in the log, the lowest number is read.
-        step : bool
+        is_step_function : bool
             True if a value is valid until the next sample: samples before time zero are then kept.
 
         Returns
@@ -242,21 +242,25 @@ class Topics:
                 field_values, scale = table[field_name][kept_rows], layout.scale.get(column, 1.0)
                 np.multiply(field_values, scale, out=row, dtype=np.float64)
                 row[~(np.abs(row) < MAX_FIELD_VALUE)] = np.nan  # damaged values
-        index = time_index((time_us[kept_rows] - self.zero_us) * _MICROSECOND_S)
+        index = time_index((time_us[kept_rows] - self.time_origin_us) * _MICROSECOND_S)
         samples = pd.DataFrame(values.T, index, list(fields), copy=False)
-        end_s = self.log.duration_s + MAX_OUTSIDE_S
-        return samples if step else rows_between(samples, -MAX_OUTSIDE_S, end_s)
+        end_s = self.log.duration_s + MAX_TIME_OUTSIDE_S
+        return samples if is_step_function else rows_between(samples, -MAX_TIME_OUTSIDE_S, end_s)
 
-    def read(self, *layouts: Layout, step: bool = False) -> pd.DataFrame:
+    def read(self, *layouts: Layout, is_step_function: bool = False) -> pd.DataFrame:
         """Read the first layout whose required fields are in the log; empty without them."""
-        layout = self.find(*layouts)
-        return _empty_frame(layouts[0]) if layout is None else self.read_instance(layout, step=step)
+        layout = self.find_layout(*layouts)
+        return (
+            _empty_frame(layouts[0])
+            if layout is None
+            else self.read_instance(layout, is_step_function=is_step_function)
+        )
 
     def primary_samples(
         self,
         layout: Layout,
         *,
-        step: bool = False,
+        is_step_function: bool = False,
         select: Callable[[pd.DataFrame], pd.DataFrame] | None = None,
     ) -> pd.DataFrame:
         """Read an EKF2 topic from the EKF2 instance that was primary at each time.
@@ -265,29 +269,33 @@ class Topics:
 
         Parameters
         ----------
-        layout, step
+        layout, is_step_function
             See :meth:`read_instance`.
         select : callable, optional
             Function that selects rows from the samples of each instance.
         """
-        if self.find(layout) is None:
+        if self.find_layout(layout) is None:
             return _empty_frame(layout)
         instance_numbers = self.instances(layout.topic)
-        is_single = self.primary_instances == NO_SELECTOR
-        switch_times_s, primary_numbers = (
+        has_single_instance = self.primary_instances == SINGLE_INSTANCE
+        switch_times_s, primary_instance_numbers = (
             np.array(values) for values in zip(*self.primary_instances, strict=True)
         )
         instance_tables: list[pd.DataFrame] = []
-        for number in instance_numbers[:1] if is_single else instance_numbers:
-            samples = self.read_instance(layout, number, step=step)
+        for number in instance_numbers[:1] if has_single_instance else instance_numbers:
+            samples = self.read_instance(layout, number, is_step_function=is_step_function)
             samples = samples if select is None else select(samples)
-            switch_index = np.searchsorted(switch_times_s, samples.index, side="right") - 1
-            instance_tables.append(samples[is_single | (primary_numbers[switch_index] == number)])
+            last_switch_indices = np.searchsorted(switch_times_s, samples.index, side="right") - 1
+            instance_tables.append(
+                samples[
+                    has_single_instance | (primary_instance_numbers[last_switch_indices] == number)
+                ]
+            )
         joined_tables = pd.concat(instance_tables).sort_index()
         return joined_tables[~joined_tables.index.duplicated()]
 
     def record_stream(self, data_kind: str, *topics: str) -> None:
-        """Store topics and clock (measurement or publication time) of data such as "imu"."""
+        """Store for the report which topics and timestamps supply data such as "imu"."""
         # The timestamp of sensor_combined is the gyro's measurement time
         has_measurement_time = data_kind == "imu" or any(
             np.any(measurement_time_us(table) != table["timestamp"].astype(np.int64))
@@ -300,9 +308,7 @@ class Topics:
 
 def _empty_frame(layout: Layout) -> pd.DataFrame:
     return pd.DataFrame(
-        columns=list(layout.columns),
-        index=time_index(np.zeros(0)),
-        dtype=np.float64,
+        columns=list(layout.columns), index=time_index(np.zeros(0)), dtype=np.float64
     )
 
 
@@ -335,7 +341,8 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     positive_times = time_us[positive_indices]
     if len(positive_times) < 2 or np.all(np.diff(positive_times) > 0):
         return positive_indices
-    # Element k: smallest timestamp (and its index) that ends an increasing subsequence of k + 1
+    # Element k: smallest last timestamp, and its index, of the increasing subsequences of length k
+    # + 1
     last_times: list[int] = []
     last_indices: list[int] = []
     previous_index = np.empty(len(positive_times), dtype=np.intp)
@@ -352,11 +359,11 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     return positive_indices[np.array(run_indices[::-1], dtype=np.intp)]
 
 
-def dropped_notes(topic_counts: Iterable[tuple[str, int]]) -> tuple[str, ...]:
+def describe_dropped_samples(dropped_counts: Iterable[tuple[str, int]]) -> tuple[str, ...]:
     """Return one note per topic on the samples that were dropped, with their number."""
     return tuple(
         f"number of samples of {topic} dropped because of an invalid timestamp: {count}"
-        for topic, count in topic_counts
+        for topic, count in dropped_counts
     )
 
 
@@ -368,33 +375,33 @@ def read_topics(name: str, content: bytes) -> Topics:
     LogError
         The content is not a ULog, or contains no data with valid timestamps.
     """
-    content_reader = _CountingContent(content)
+    content_reader = _SkippedByteCounter(content)
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # suppress the warnings that pyulog prints
-            ulog = _Reader(content_reader, message_name_filter_list=topics())
+            ulog = _Reader(content_reader, message_name_filter_list=list_topics())
             tables = _read_tables(ulog)
             # If px4fuse uses no topic of the log, the other topics give the duration of the log
-            time_tables = tables or _read_tables(_Reader(_CountingContent(content)))
+            time_span_tables = tables or _read_tables(_Reader(_SkippedByteCounter(content)))
     except Exception as error:  # pyulog raises many types for damaged bytes
         raise LogError(
             f"{name}: the ULog cannot be read ({str(error) or type(error).__name__}).",
             "Copy the .ulg from the vehicle again.",
         ) from error
     notes: tuple[str, ...] = ()
-    if not time_tables:
+    if not time_span_tables:
         raise LogError(
             f"{name}: the ULog contains no samples",
             "Copy the file again, or set SDLOG_PROFILE to 129 (default and vision topics).",
         )
     if not tables:
-        names = sorted({topic for topic, _ in time_tables})
+        names = sorted({topic for topic, _ in time_span_tables})
         notes += (
             f"the log contains only topics that px4fuse does not use ({join_first(names, 5)})",
         )
     if NOTE_KEY in ulog.msg_info_dict:
         notes += (_printable_text(ulog.msg_info_dict, NOTE_KEY, ""),)
-    zero_us, data_end_us = _data_span_us(time_tables, name)
-    logged_values, parameter_changes = _read_parameters(ulog, tables, zero_us)
+    time_origin_us, data_end_us = _data_span_us(time_span_tables, name)
+    logged_values, parameter_changes = _read_parameters(ulog, tables, time_origin_us)
     parameter_values, parameter_faults = replace_invalid_parameters(logged_values)
     log = LogInfo(
         name=name,
@@ -404,10 +411,10 @@ def read_topics(name: str, content: bytes) -> Topics:
         firmware=_firmware_text(ulog.msg_info_dict),
         firmware_hash=_printable_text(ulog.msg_info_dict, "ver_sw", "unknown"),
         hardware=_printable_text(ulog.msg_info_dict, "ver_hw", "unknown"),
-        boot_time_s=zero_us * _MICROSECOND_S,
-        duration_s=(data_end_us - zero_us) * _MICROSECOND_S,
+        boot_time_s=time_origin_us * _MICROSECOND_S,
+        duration_s=(data_end_us - time_origin_us) * _MICROSECOND_S,
         dropouts=tuple(
-            Dropout((dropout.timestamp - zero_us) * _MICROSECOND_S, dropout.duration * 1e-3)
+            Dropout((dropout.timestamp - time_origin_us) * _MICROSECOND_S, dropout.duration * 1e-3)
             for dropout in ulog.dropouts
         ),
         parameters={
@@ -423,13 +430,13 @@ def read_topics(name: str, content: bytes) -> Topics:
         autopilot=_printable_text(ulog.msg_info_dict, "sys_name", "PX4"),
         vehicle=_printable_text(ulog.msg_info_dict, "sys_uuid", ""),
         is_assessed=True
-        if ASSESSED_KEY in ulog.msg_info_dict and not ignores_assessed.get()
+        if ASSESSED_KEY in ulog.msg_info_dict and not ignores_assessed_mark.get()
         else UNSET,
     )
     return Topics(
         log,
         tables,
-        zero_us,
+        time_origin_us,
         {},
         {name: value for name, value in parameter_values.items() if name.startswith("EKF2_")},
         content_reader.header_start < len(content) < content_reader.read_end,
@@ -439,15 +446,15 @@ def read_topics(name: str, content: bytes) -> Topics:
 
 
 def _read_parameters(
-    ulog: ULog, tables: Tables, zero_us: int
+    ulog: ULog, tables: Tables, time_origin_us: int
 ) -> tuple[dict[str, float], tuple[ParameterChange, ...]]:
-    """Return the parameters at take-off (or at the start of the log), and later EKF2_ changes."""
+    """Return the parameters at take-off (or log start), and later changes of EKF2_ parameters."""
     parameter_values = {
         name: float(value)
         for name, value in ulog.initial_parameters.items()
         if isinstance(value, int | float)
     }
-    layout, take_off_us = LAYOUTS["land_detected"], 0
+    layout, take_off_us = TOPIC_LAYOUTS["land_detected"], 0
     landed = tables.get((layout.topic, 0), {}).get(layout.columns["landed"])
     if landed is not None and not landed.all():
         take_off_us = int(tables[layout.topic, 0]["timestamp"][np.argmin(landed)])
@@ -459,7 +466,7 @@ def _read_parameters(
         if time_us <= take_off_us or name not in parameter_values:
             parameter_values[name] = float(value)
         elif name.startswith("EKF2_") and last_parameter_values[name] != value:
-            time_s = (time_us - zero_us) * _MICROSECOND_S
+            time_s = (time_us - time_origin_us) * _MICROSECOND_S
             parameter_changes.append(
                 ParameterChange(time_s, name, last_parameter_values[name], float(value))
             )
@@ -493,15 +500,15 @@ def _read_tables(ulog: ULog) -> Tables:
 def _data_span_us(tables: Tables, name: str) -> tuple[int, int]:
     """Return first and last time (µs) of the IMU data; without IMU, of the largest topic."""
     for key in sorted(
-        tables, key=lambda key: (key[0] != IMU.topic, -len(tables[key]["timestamp"]))
+        tables, key=lambda key: (key[0] != IMU_LAYOUT.topic, -len(tables[key]["timestamp"]))
     ):
         time_us = tables[key]["timestamp"].astype(np.int64)
         increasing_us = time_us[longest_increasing_run(time_us)]
         if len(increasing_us):
             # Only the longest run without a gap is used: timestamps hours away are invalid
             gap_rows = np.flatnonzero(np.diff(increasing_us) > MAX_DATA_GAP_S / _MICROSECOND_S) + 1
-            longest_us = max(np.split(increasing_us, gap_rows), key=len)
-            return int(longest_us[0]), int(longest_us[-1])
+            longest_run_us = max(np.split(increasing_us, gap_rows), key=len)
+            return int(longest_run_us[0]), int(longest_run_us[-1])
     raise LogError(f"{name}: all timestamps are zero", "Record the flight again.")
 
 

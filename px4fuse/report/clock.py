@@ -10,7 +10,7 @@ from px4fuse.comparison.remedy import (
     find_aid,
     find_logged_delay_ms,
 )
-from px4fuse.convention.correction import convention_faults
+from px4fuse.convention.correction import find_convention_faults
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings import Finding
 from px4fuse.findings.source_clock import clock_offset_option_s
@@ -81,7 +81,9 @@ def make_time_offset_advice(
             f"{part.offset_s:+.2f} s from {part.start_s:.0f} s" for part in time_offset.parts
         )
         advice_by_label["Changes"] = f"The time offset changes during the flight: {offset_texts}."
-    faults = convention_faults(comparison.convention, comparison.flight, comparison.source.frame)
+    faults = find_convention_faults(
+        comparison.convention, comparison.flight, comparison.source.frame
+    )
     if clock_drift := faults.clock_drift:
         advice_by_label["Drift"] = (
             f"The clock of the timestamps is {abs(100.0 * clock_drift):.1f} % "

@@ -23,7 +23,7 @@ class Mismatch:
     """Value in a report that differs from a new analysis of the log.
 
     ``path`` is the field in the results, for example ``axes.north.filters.kf.nis_mean``. A missing
-    value is "absent".
+    value is "absent". ``recorded`` is in the report, ``recomputed`` is of the new analysis.
     """
 
     path: str
@@ -82,6 +82,6 @@ class Verification:
 
     @property
     def outcome(self) -> str:
-        """``status``, or "page differs" if the numbers are right but pages were changed."""
+        """Status, or "page differs" if the numbers are right but pages of the PDF were changed."""
         has_different_pages = self.status == "verified" and self.page_status == "differ"
         return "page differs" if has_different_pages else self.status

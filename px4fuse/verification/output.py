@@ -8,7 +8,7 @@ from px4fuse.core.text import one_line
 from px4fuse.report.page import Page
 from px4fuse.report.style import GOOD_COLOUR, MUTED_COLOUR, SEVERITY_COLOURS
 from px4fuse.verification.model import Verification
-from px4fuse.verification.verification import LIMIT_NOTE
+from px4fuse.verification.verification import VERIFICATION_SCOPE_NOTE
 
 SCHEMA = {"name": "px4fuse-verification", "version": "3.0"}
 
@@ -23,7 +23,7 @@ def verification_data(pdf: bytes, verification: Verification) -> dict[str, objec
         "report_sha256": hashlib.sha256(pdf).hexdigest(),
         "outcome": verification.outcome,
         **values,
-        "limit": LIMIT_NOTE,
+        "limit": VERIFICATION_SCOPE_NOTE,
     }
 
 
@@ -33,7 +33,11 @@ def verification_page(name: str, verification: Verification, output: Path | None
     colours = {"verified": GOOD_COLOUR, "cannot verify": SEVERITY_COLOURS["warning"]}
     colour = colours.get(verification.outcome, SEVERITY_COLOURS["error"])
     page.write(f"{one_line(name, 200)}: {verification.outcome}", bold=True, colour=colour)
-    sentences = [one_line(reason, 400) for reason in verification.reasons if reason != LIMIT_NOTE]
+    sentences = [
+        one_line(reason, 400)
+        for reason in verification.reasons
+        if reason != VERIFICATION_SCOPE_NOTE
+    ]
     sentences += [
         f"{difference.path}: report {difference.recorded}, re-computed {difference.recomputed}"
         for difference in verification.differences
@@ -46,5 +50,5 @@ def verification_page(name: str, verification: Verification, output: Path | None
         page.write(
             "Action: write the report again from the log with -o FILE.pdf, and read that report."
         )
-    page.write(LIMIT_NOTE, colour=MUTED_COLOUR)
+    page.write(VERIFICATION_SCOPE_NOTE, colour=MUTED_COLOUR)
     return page

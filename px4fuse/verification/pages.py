@@ -51,18 +51,19 @@ from px4fuse.verification.pdf_input import (
 # 0.25 pt is not visible
 COORDINATE_TOLERANCE_PT = 0.25
 # Relative and absolute tolerance of PDF numbers except coordinates: programs may save 32-bit floats
-NUMBER_TOLERANCE = 1e-5
-# Maximum kerning (1/1000 em) of a text with tolerated numbers: a forger could change the order of
-# the digits by a larger kerning
-MAX_KERNING = 200.0
-# Maximum ratio of submitted to redrawn page content (bytes): an escaped character has four bytes
-MAX_CONTENT_RATIO = 4
+PDF_NUMBER_TOLERANCE = 1e-5
+# Maximum kerning (1/1000 em) of a text with tolerated numbers, because a forger could change the
+# order of the digits by a larger kerning
+MAX_KERNING_PER_MILLE_EM = 200.0
+# Maximum ratio of the sizes of submitted to redrawn page content: an escaped character has four
+# bytes
+MAX_CONTENT_SIZE_RATIO = 4
 # Maximum time (s) for comparing two PDFs; the comparison of the largest report takes 3 s
 TIMEOUT_S = 12.0
 # Maximum memory (bytes) for comparing two PDFs; the largest report needs 0.3 GB
 MAX_MEMORY_BYTES = 1_000_000_000
 MAX_LISTED_DIFFERENCES = 20
-SECOND_TABLE_REASON = "the file has a second cross-reference table"
+SECOND_TABLE_REASON = "the PDF was changed after px4fuse wrote it (second cross-reference table)"
 # PDF dictionary keys that are not compared, because programs that save a PDF change them
 _COMPRESSION_KEYS = frozenset(("/Length", "/Filter"))
 _WRITER_KEYS = frozenset(("/Producer", "/CreationDate", "/ModDate"))
@@ -129,7 +130,9 @@ def compare_pages(
     if not isinstance(differences, JobFailure):
         return differences
     reason = differences.reason.rstrip(".")
-    return (PageDifference(0, f"the pages could not be compared ({reason})", True),)
+    return (
+        PageDifference(0, f"the pages could not be compared with the new report ({reason})", True),
+    )
 
 
 def _compare_pdfs(job: tuple[bytes, bytes, TextComparison]) -> tuple[PageDifference, ...]:
@@ -163,7 +166,7 @@ class _PdfComparison:
     is_same_text: TextComparison
     # object number and generation in the submitted PDF, object number in the redrawn PDF
     compared_objects: set[tuple[int, int, int]] = field(default_factory=set)
-    # entries "/Parent" of pages; compared last, after the document catalogue
+    # pairs of "/Parent" entries of pages; compared last, because they refer to all other pages
     page_parents: list[tuple[Any, Any, str]] = field(default_factory=list)
     # fonts of the current page by name
     fonts: Mapping[str, Any] = field(default_factory=dict)
@@ -177,9 +180,9 @@ class _PdfComparison:
         pages = [_get_page_references(reader) for reader in (submitted_pdf, redrawn_pdf)]
         for page_number, (submitted_page, redrawn_page) in enumerate(zip_longest(*pages), start=1):
             if submitted_page is None or redrawn_page is None:
-                description = "the page is missing"
+                description = "the page of the new report is missing"
                 if redrawn_page is None:
-                    description = f"the redrawn report has only {len(pages[1])} pages"
+                    description = f"the report drawn from the log has only {len(pages[1])} pages"
                 yield PageDifference(page_number, description)
                 return
             self.fonts = resolve_reference(redrawn_page.get_object()["/Resources"].get("/Font", {}))
@@ -191,23 +194,24 @@ class _PdfComparison:
             yield from self._compare(submitted_value, redrawn_value, key, 0)
         for values in self.page_parents:
             yield from self._compare(*values, 0)
-        # old programs (PDF 1.4) would use another cross-reference table than new ones
+        # programs for PDF 1.4 use another cross-reference table, so they could display other pages
         if "/XRefStm" in submitted_pdf.trailer:
             yield PageDifference(0, SECOND_TABLE_REASON, True)
 
     def _compare(
         self, submitted_value: Any, redrawn_value: Any, key: str, page_number: int
     ) -> Iterator[PageDifference]:
-        """Yield the differences of two PDF values, including all nested values."""
+        """Yield the differences of two values at one place in both PDFs, and of nested values."""
         remaining_values = [(submitted_value, redrawn_value, key)]
         while remaining_values:
             submitted_value, redrawn_value, key = remaining_values.pop()
             self.value_count += 1
             if self.value_count > MAX_PDF_VALUES:
-                raise LimitReachedError("the PDF contains too many values")
+                raise LimitReachedError(f"the PDF contains more than {MAX_PDF_VALUES} values")
             if isinstance(submitted_value, IndirectObject):
-                if submitted_value.generation:  # some programs ignore generation numbers
-                    description = f"the PDF entry {key} refers to an object of generation above 0"
+                if submitted_value.generation:
+                    # programs that ignore generation numbers would display another object
+                    description = f"the PDF entry {key} was changed (object generation above 0)"
                     yield PageDifference(page_number, description, True)
                 if isinstance(redrawn_value, IndirectObject):
                     object_ids = (
@@ -224,7 +228,7 @@ class _PdfComparison:
             if _pdf_type_of(submitted_value) is not _pdf_type_of(redrawn_value):
                 yield PageDifference(
                     page_number,
-                    f"the type of the PDF entry {key} differs from the redrawn report",
+                    f"the PDF entry {key} has another type than in the report drawn from the log",
                     True,
                 )
             elif isinstance(redrawn_value, DictionaryObject):
@@ -255,8 +259,8 @@ class _PdfComparison:
         remaining_values: list[tuple[Any, Any, str]],
     ) -> Iterator[PageDifference]:
         """Yield keys and streams that differ; append the values to ``remaining_values``."""
-        submitted_keys = _compared_keys(submitted_dictionary, key)
-        redrawn_keys = _compared_keys(redrawn_dictionary, key)
+        submitted_keys = _select_compared_keys(submitted_dictionary, key)
+        redrawn_keys = _select_compared_keys(redrawn_dictionary, key)
         for name in sorted(submitted_keys ^ redrawn_keys):
             feature = _FEATURE_NAMES.get(name, f"an entry {one_line(name, 40)}")
             description = f"{feature} is missing"
@@ -276,7 +280,10 @@ class _PdfComparison:
     def _is_same_value(self, submitted_value: Any, redrawn_value: Any) -> bool:
         if _pdf_type_of(redrawn_value) is float:
             return math.isclose(
-                submitted_value, redrawn_value, rel_tol=NUMBER_TOLERANCE, abs_tol=NUMBER_TOLERANCE
+                submitted_value,
+                redrawn_value,
+                rel_tol=PDF_NUMBER_TOLERANCE,
+                abs_tol=PDF_NUMBER_TOLERANCE,
             )
         if _pdf_type_of(redrawn_value) is not str:
             return bool(submitted_value == redrawn_value)
@@ -294,7 +301,7 @@ class _PdfComparison:
         page_number: int,
     ) -> Iterator[PageDifference]:
         stream_type = redrawn_stream.get("/Type")
-        if stream_type == "/EmbeddedFile":  # the attached results are compared as numbers
+        if stream_type == "/EmbeddedFile":  # attached results: compared in verification.py
             return
         filters = resolve_reference(submitted_stream.get("/Filter"))
         if filters not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
@@ -305,13 +312,14 @@ class _PdfComparison:
         submitted_data, redrawn_data = submitted_stream.get_data(), redrawn_stream.get_data()
         if submitted_data == redrawn_data or (
             stream_type == "/Metadata"
-            and _xmp_metadata(submitted_data) == _xmp_metadata(redrawn_data)
+            and _normalise_xmp_metadata(submitted_data) == _normalise_xmp_metadata(redrawn_data)
         ):
             return
         is_drawing = key == "/Contents" or stream_type == "/Pattern"
-        if not is_drawing or len(submitted_data) > MAX_CONTENT_RATIO * len(redrawn_data):
+        if not is_drawing or len(submitted_data) > MAX_CONTENT_SIZE_RATIO * len(redrawn_data):
             yield PageDifference(
-                page_number, f"the content of {key} differs from the redrawn report"
+                page_number,
+                f"the content of the PDF entry {key} differs from the report drawn from the log",
             )
         elif description := self._describe_operation_difference(submitted_data, redrawn_data):
             yield PageDifference(page_number, description)
@@ -320,7 +328,7 @@ class _PdfComparison:
         self, submitted_content: bytes, redrawn_content: bytes
     ) -> str:
         """Describe the first drawing operation that differs; "" if all are equal."""
-        operation_lists = map(_drawing_operations, (submitted_content, redrawn_content))
+        operation_lists = map(_parse_drawing_operations, (submitted_content, redrawn_content))
         font_name = ""
         for operation_number, operations in enumerate(
             zip_longest(*operation_lists, fillvalue=("", ())), start=1
@@ -338,24 +346,24 @@ class _PdfComparison:
             if {submitted_operator, redrawn_operator} <= _TEXT_OPERATORS:
                 texts = [self._decode_text(operands, font_name) for _, operands in operations]
                 kerning = [abs(value) for value in submitted_operands if isinstance(value, float)]
-                has_small_kerning = max(kerning, default=0.0) < MAX_KERNING
+                has_small_kerning = max(kerning, default=0.0) < MAX_KERNING_PER_MILLE_EM
                 if texts[0] != texts[1] and has_small_kerning and self.is_same_text(*texts):
                     continue
                 submitted_text, redrawn_text = (one_line(text, 60) for text in texts)
                 return f"the text is {submitted_text!r}; px4fuse prints {redrawn_text!r}"
             operator_text = one_line(redrawn_operator, 9)
             return (
-                f"drawing operation {operation_number} differs from px4fuse's operation "
-                f"{operator_text}"
+                f"drawing operation {operation_number} differs from operation {operator_text!r} of "
+                "the report drawn from the log"
             )
         return ""
 
     def _decode_text(self, operands: tuple[Operand, ...], font: str) -> str:
         """Decode a PDF text (operator Tj or TJ) with the ToUnicode map of its font."""
-        to_unicode = self.fonts[font].get_object()["/ToUnicode"].get_data().decode("latin-1")
+        to_unicode_map = self.fonts[font].get_object()["/ToUnicode"].get_data().decode("latin-1")
         text_by_glyph = {
             bytes.fromhex(glyph): bytes.fromhex(utf16_text)
-            for glyph, utf16_text in _TO_UNICODE_ENTRY_PATTERN.findall(to_unicode)
+            for glyph, utf16_text in _TO_UNICODE_ENTRY_PATTERN.findall(to_unicode_map)
         }
         glyph_bytes = b"".join(operand for operand in operands if isinstance(operand, bytes))
         utf16_text = b"".join(
@@ -371,7 +379,8 @@ def _find_ambiguities(pdf: bytes) -> Iterator[str]:
     if end_match is None:
         yield "the file has bytes after the end of the PDF"
     elif b"/Linearized" in pdf[:1024]:
-        # the position at the end of the file must be that of the first cross-reference table
+        # the file must end with the position of its first cross-reference table; a second table
+        # could replace pages
         table_start = pdf.find(b"endobj") + len(b"endobj")
         if pdf[table_start : int(end_match[1])].strip():
             yield SECOND_TABLE_REASON
@@ -393,18 +402,18 @@ def _pdf_type_of(value: Any) -> type:
     return next((pdf_type for pdf_type in pdf_types if isinstance(value, pdf_type)), type(value))
 
 
-def _compared_keys(value: DictionaryObject, key: str) -> set[str]:
+def _select_compared_keys(value: DictionaryObject, key: str) -> set[str]:
     """Return the keys of a PDF dictionary that must be equal, without null values."""
     compared_keys = {name for name in value if not isinstance(value.raw_get(name), NullObject)}
     if isinstance(value, StreamObject):
         compared_keys -= _COMPRESSION_KEYS
     if key == "/Info":
         compared_keys -= _WRITER_KEYS
-    # /Params of an attached file contains times and its size, and the file itself is compared
+    # /Params has only times and size of an attachment, whose content is compared
     return compared_keys - {"/Params"} if value.get("/Type") == "/EmbeddedFile" else compared_keys
 
 
-def _xmp_metadata(xmp_bytes: bytes) -> str:
+def _normalise_xmp_metadata(xmp_bytes: bytes) -> str:
     """Return XMP metadata in canonical form, without the fields that differ between programs."""
     # do not parse a document type ("<!"): its entities may expand to huge texts
     if len(xmp_bytes) > MAX_XMP_BYTES or b"<!" in xmp_bytes:
@@ -414,7 +423,7 @@ def _xmp_metadata(xmp_bytes: bytes) -> str:
     return _TYPST_VERSION_PATTERN.sub("Typst", _XMP_WRITER_FIELDS.sub("", canonical_text))
 
 
-def _drawing_operations(content: bytes) -> Iterator[Operation]:
+def _parse_drawing_operations(content: bytes) -> Iterator[Operation]:
     """Parse the content of a PDF page into drawing operators with their operands."""
     operands: list[Operand] = []
     for match in _TOKEN_PATTERN.finditer(content.decode("latin-1")):
@@ -457,9 +466,11 @@ def _has_near_operands(
             and math.isclose(
                 submitted_operand,
                 redrawn_operand,
-                rel_tol=NUMBER_TOLERANCE,
+                rel_tol=PDF_NUMBER_TOLERANCE,
                 abs_tol=(
-                    COORDINATE_TOLERANCE_PT if index >= first_coordinate_index else NUMBER_TOLERANCE
+                    COORDINATE_TOLERANCE_PT
+                    if index >= first_coordinate_index
+                    else PDF_NUMBER_TOLERANCE
                 ),
             )
         )

@@ -72,7 +72,7 @@ PYPDF_LIMITS: dict[str, Any] = {
 # PDF compression methods (filters) for which _check_file limits the decompressed size
 _ALLOWED_FILTERS = frozenset(("/FlateDecode", "/DCTDecode"))
 
-_STREAM_START = re.compile(rb"(?<!end)stream *\r?\n?")
+_STREAM_START_PATTERN = re.compile(rb"(?<!end)stream *\r?\n?")
 
 
 # pypdf must not print warnings about damaged PDFs on the terminal
@@ -144,9 +144,9 @@ def _check_file(pdf: bytes) -> None:
         raise ResultsError("the end of the PDF is missing. Hand in the complete file.")
     # find decompression bombs before pypdf reads the file
     remaining_bytes = MAX_DOCUMENT_BYTES
-    for stream_match in _STREAM_START.finditer(pdf):
+    for stream_match in _STREAM_START_PATTERN.finditer(pdf):
         # test each word "stream" in the file, even inside other data
-        inflated_bytes = _inflated_bytes(
+        inflated_bytes = _estimate_inflated_bytes(
             pdf, stream_match.end(), min(remaining_bytes, MAX_CONTENT_BYTES)
         )
         remaining_bytes -= inflated_bytes
@@ -157,10 +157,10 @@ def _check_file(pdf: bytes) -> None:
             )
 
 
-def _inflated_bytes(pdf: bytes, start: int, limit_bytes: int) -> int:
-    """Return the size (bytes) of the zlib data at ``start``; 0 without zlib data.
+def _estimate_inflated_bytes(pdf: bytes, start: int, limit_bytes: int) -> int:
+    """Estimate the cost (bytes) of decompressing the zlib data at ``start``; 0 without zlib data.
 
-    The size is the maximum of the compressed size, the decompressed size, and 1000. It is at most
+    The cost is the maximum of compressed size, decompressed size and 1000, but at most
     ``limit_bytes`` + 1.
     """
     zlib_header = pdf[start : start + 2]
@@ -170,24 +170,24 @@ def _inflated_bytes(pdf: bytes, start: int, limit_bytes: int) -> int:
         or int.from_bytes(zlib_header) % 31
     ):
         return 0  # not zlib data (RFC 1950, section 2.2)
-    inflate = zlib.decompressobj()
+    decompressor = zlib.decompressobj()
     input_bytes = output_bytes = 0
-    while not inflate.eof and max(input_bytes, output_bytes) <= limit_bytes:
-        if not (chunk := inflate.unconsumed_tail):
+    while not decompressor.eof and max(input_bytes, output_bytes) <= limit_bytes:
+        if not (chunk := decompressor.unconsumed_tail):
             chunk = pdf[start + input_bytes : start + input_bytes + 16_384]
             input_bytes += len(chunk)
         if not chunk:
             break
         try:
-            output_bytes += len(inflate.decompress(chunk, 1_000_000))
-        except zlib.error:  # not an error here: pypdf rejects this stream
+            output_bytes += len(decompressor.decompress(chunk, 1_000_000))
+        except zlib.error:  # pypdf will reject this stream
             break
-    input_bytes -= len(inflate.unused_data)
+    input_bytes -= len(decompressor.unused_data)
     # at least 1000 bytes, because each start of the decompression needs time
     return min(max(input_bytes, output_bytes, 1000), limit_bytes + 1)
 
 
-def _all_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, bool]]:
+def _walk_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, bool]]:
     """Yield each PDF dictionary, with True if it is reached by a click on a link or bookmark."""
     visited: set[tuple[IndirectObject, bool]] = set()
     missing_count = value_count = 0
@@ -217,19 +217,21 @@ def _all_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObjec
             remaining_values.extend((element, False) for element in list.__iter__(value))
 
 
-def _foreign_features(dictionary: DictionaryObject, is_reached_by_click: bool) -> Iterator[str]:
+def _find_foreign_features(
+    dictionary: DictionaryObject, is_reached_by_click: bool
+) -> Iterator[str]:
     """Yield features that reports of px4fuse do not have: active content, links to files, ..."""
     yield from (key[1:] for key in dictionary if _ACTIVE_KEYS.fullmatch(key))
     action, dictionary_type = (_pdf_name(dictionary.get(key)) or "" for key in ("/S", "/Type"))
     if _ACTIVE_ACTIONS.fullmatch(action):
         yield action[1:]
     if action == "/URI" and not is_reached_by_click:
-        yield "an action that opens an address"
+        yield "an action that opens a URL"
     is_stream = isinstance(dictionary, StreamObject)
     if ("/EF" not in dictionary and dictionary_type in {"/Filespec", "/F"}) or (
         is_stream and "/F" in dictionary
     ):
-        yield "a reference to another file"
+        yield "a reference to an external file"
     if is_stream:
         filters = resolve_reference(dictionary.get("/Filter"))
         filters = filters if isinstance(filters, ArrayObject) else [filters]
@@ -239,8 +241,8 @@ def _foreign_features(dictionary: DictionaryObject, is_reached_by_click: bool) -
         if not _ALLOWED_FILTERS.issuperset(all_filter_names) or len(set(all_filter_names)) != len(
             all_filter_names
         ):
-            filter_names = " ".join(name or "?" for name in all_filter_names[:3])
-            yield f"a stream with unsupported compression ({one_line(filter_names, 60)})"
+            filter_text = " ".join(name or "?" for name in all_filter_names[:3])
+            yield f"a stream with unsupported compression ({one_line(filter_text, 60)})"
 
 
 def resolve_reference(value: Any) -> Any:
@@ -258,8 +260,8 @@ def _read_attachment(reader: pypdf.PdfReader) -> bytes:
     file_specifications: list[DictionaryObject] = []
     streams: dict[int, StreamObject] = {}
     features: set[str] = set()
-    for dictionary, is_reached_by_click in _all_dictionaries(reader):
-        features.update(_foreign_features(dictionary, is_reached_by_click))
+    for dictionary, is_reached_by_click in _walk_dictionaries(reader):
+        features.update(_find_foreign_features(dictionary, is_reached_by_click))
         embedded_files: list[object] = (
             [dictionary] if _pdf_name(dictionary.get("/Type")) == "/EmbeddedFile" else []
         )

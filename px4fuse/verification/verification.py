@@ -42,7 +42,7 @@ FOREIGN_REQUEST_REASON = "the recorded command was not written by px4fuse"
 # Minimum KF prediction interval DT (s): 60,000 steps for a flight of ten minutes take half a minute
 MIN_DT_S = 0.01
 ORIGINAL_PDF_REMEDY = "Ask the author of the report for the PDF that px4fuse wrote."
-LIMIT_NOTE = (
+VERIFICATION_SCOPE_NOTE = (
     "Verification confirms that the numbers follow from the log. It does not confirm the author."
 )
 NO_LOG_REASON = "no log was given, so the analysis could not be repeated"
@@ -57,7 +57,7 @@ ESTIMATE_RELATIVE_TOLERANCE = 1e-3
 # Absolute tolerance of maximum-likelihood estimates in a report
 ESTIMATE_ABSOLUTE_TOLERANCE = 1e-5
 # Fields of the results that contain maximum-likelihood estimates, or depend on them
-ESTIMATE_PATHS = (
+ESTIMATE_FIELDS = (
     "tuning",
     "clock",
     "ekf2_replay",
@@ -75,7 +75,7 @@ ITERATIONS_FIELD = "iterations"
 # Maximum difference between numbers of iterations: a solver may stop earlier on another processor
 MAX_ITERATION_DIFFERENCE = 2
 # Fields of the results that are not compared, because they describe the computer
-MACHINE_PATHS = ("provenance.python", "provenance.libraries")
+MACHINE_DEPENDENT_FIELDS = ("provenance.python", "provenance.libraries")
 MAX_LISTED_DIFFERENCES = 20
 MAX_LISTED_PAGE_DIFFERENCES = 5
 MAX_TEXT_LENGTH = 120
@@ -86,12 +86,13 @@ MAX_NOTES_LINES = 5_000
 _NUMBER_PATTERN = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
 # Results of the new analysis, and a function that draws the report with these results
-Recomputed = tuple[ReportedResults, Callable[[], bytes]]
-_LinkFile = Callable[[str, str | None, str], str]
+RecomputedReport = tuple[ReportedResults, Callable[[], bytes]]
+# Function from file name, SHA-256 and label for messages to the path of a link
+_FileLinker = Callable[[str, str | None, str], str]
 
 
 class NotRepeatableError(Exception):
-    """Reason why an analysis cannot be repeated, with the action of the user and a missing file."""
+    """Reason why an analysis cannot be repeated, remedy, and name of a missing file if any."""
 
 
 def log_sha256(results: ReportedResults) -> str:
@@ -104,7 +105,9 @@ def log_name(results: ReportedResults) -> str:
     return results.log.name
 
 
-def recompute(results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed | Verification:
+def recompute(
+    results: ReportedResults, logs: Mapping[str, Path]
+) -> RecomputedReport | Verification:
     """Repeat the analysis of a report with the settings in ``results``.
 
     Return the status "cannot verify" if the settings are not valid, a file is missing, or the
@@ -116,11 +119,11 @@ def recompute(results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed 
                 "the results do not list the library versions", ASK_AUTHOR_REMEDY
             )
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
-            link_file = partial(_link_file, logs, Path(folder))
+            file_linker = partial(_link_file, logs, Path(folder))
             if isinstance(results, LoopResults):
-                analysis, new_results = _repeat_loop(results, link_file)
+                analysis, new_results = _repeat_loop_closure(results, file_linker)
             else:
-                analysis, new_results = _repeat_comparison(results, link_file)
+                analysis, new_results = _repeat_comparison(results, file_linker)
         return new_results, partial(_draw_report, analysis, new_results, results.provenance)
     except SettingsError as error:  # px4fuse cannot have made a report with invalid settings
         return cannot_verify(f"{FOREIGN_REQUEST_REASON}: {error}", ASK_AUTHOR_REMEDY)
@@ -129,7 +132,7 @@ def recompute(results: ReportedResults, logs: Mapping[str, Path]) -> Recomputed 
     except Px4FuseError as error:
         return cannot_verify(str(error), ASK_AUTHOR_REMEDY)
     except Exception as error:  # noqa: BLE001 - forged settings may fail anywhere
-        reason = f"the analysis cannot be repeated ({type(error).__name__})"
+        reason = f"the analysis with the settings in the report failed ({type(error).__name__})"
         return cannot_verify(reason, ASK_AUTHOR_REMEDY)
 
 
@@ -138,8 +141,8 @@ def _link_file(
 ) -> str:
     """Link the file with this SHA-256 into a temporary folder, and return the path of the link.
 
-    The link has the file name in the report, which the new report must also print. ``file_label``
-    is for error messages.
+    The link has the name that the submitted report prints, so that the new report prints the same
+    name. ``file_label`` is for error messages.
     """
     path = None if sha256 is None else logs.get(sha256)
     if path is None:
@@ -147,7 +150,7 @@ def _link_file(
         reason = f"none of the given files has the SHA-256 of {file_label}"
         raise NotRepeatableError(reason, f"Add {missing_name} to --logs.", missing_name)
     if name != Path(name).name or name == ".." or "\\" in name or not name.isprintable():
-        reason = f"{FOREIGN_REQUEST_REASON}: it contains a path instead of a file name"
+        reason = f"{FOREIGN_REQUEST_REASON}: its file name contains a folder or is not printable"
         raise NotRepeatableError(reason, ASK_AUTHOR_REMEDY)
     # a separate folder for each link, because file names may be equal
     target = Path(tempfile.mkdtemp(dir=folder), name)
@@ -167,7 +170,7 @@ def split_track(source: str) -> tuple[str, str]:
 
 
 def _repeat_comparison(
-    submitted_results: ComparisonResults, link_file: _LinkFile
+    submitted_results: ComparisonResults, file_linker: _FileLinker
 ) -> tuple[object, ReportedResults]:
     from px4fuse.diagnose import diagnose  # noqa: PLC0415
     from px4fuse.results.build import results  # noqa: PLC0415
@@ -179,29 +182,29 @@ def _repeat_comparison(
     hash_by_role = {file.role: file.sha256 for file in submitted_results.log.joined}
     request = replace(
         recorded_request,
-        log=link_file(recorded_request.log, submitted_results.log.sha256, "the log"),
+        log=file_linker(recorded_request.log, submitted_results.log.sha256, "the log"),
     )
     if (position := recorded_request.position) is not None:
-        linked_path = link_file(position.path, hash_by_role.get("position"), "--position")
+        linked_path = file_linker(position.path, hash_by_role.get("position"), "--position")
         request = replace(request, position=replace(position, path=linked_path))
     analysis = diagnose(request)
     return analysis, results(recorded_request, analysis, submitted_results.student)
 
 
-def _repeat_loop(
-    submitted_results: LoopResults, link_file: _LinkFile
+def _repeat_loop_closure(
+    submitted_results: LoopResults, file_linker: _FileLinker
 ) -> tuple[object, ReportedResults]:
     from px4fuse.diagnose import analyse_loop_closure  # noqa: PLC0415
     from px4fuse.results.build import make_loop_results  # noqa: PLC0415
 
     recorded_request = submitted_results.request
     path, track = split_track(recorded_request.source)
-    linked_path = link_file(path, submitted_results.track.sha256, "the log")
+    linked_path = file_linker(path, submitted_results.track.sha256, "the log")
     request = replace(recorded_request, source=linked_path + track)
     if recorded_request.reference is not None:
         path, track = split_track(recorded_request.reference)
         sha256 = submitted_results.references[-1].sha256 if submitted_results.references else None
-        request = replace(request, reference=link_file(path, sha256, "--reference") + track)
+        request = replace(request, reference=file_linker(path, sha256, "--reference") + track)
     analysis = analyse_loop_closure(request)
     return analysis, make_loop_results(recorded_request, analysis, submitted_results.student)
 
@@ -209,7 +212,7 @@ def _repeat_loop(
 def _draw_report(
     analysis: object, results: ReportedResults, submitted_provenance: Provenance
 ) -> bytes:
-    """Draw the report, with the library versions in the submitted report."""
+    """Draw the report, but print the library versions of the submitted report."""
     from px4fuse.report.pdf import render_pdf  # noqa: PLC0415
 
     new_provenance = replace(submitted_provenance, command=results.provenance.command)
@@ -251,10 +254,10 @@ def verify(results: ReportedResults, pdf: bytes, logs: Mapping[str, Path]) -> Ve
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"the student's notes have more than {MAX_NOTES_LINES} lines"
         return cannot_verify(reason, ASK_AUTHOR_REMEDY)
-    recomputed = recompute(results, logs)
-    if isinstance(recomputed, Verification):
-        return recomputed
-    return _verify_with_log(results, pdf, *recomputed)
+    recomputed_report = recompute(results, logs)
+    if isinstance(recomputed_report, Verification):
+        return recomputed_report
+    return _verify_with_log(results, pdf, *recomputed_report)
 
 
 def cannot_verify(reason: str, remedy: str = "", missing_input: str = "") -> Verification:
@@ -273,7 +276,11 @@ def _verify_with_log(
     if redrawn_pdf == pdf:
         reason = "a new run on the log gives an identical PDF"
         return Verification(
-            "verified", (reason, LIMIT_NOTE), True, page_status="same", redrawn_pdf=redrawn_pdf
+            "verified",
+            (reason, VERIFICATION_SCOPE_NOTE),
+            True,
+            page_status="same",
+            redrawn_pdf=redrawn_pdf,
         )
     mismatches, is_same_number, value_count = compare_results(
         to_json_dict(submitted_results), to_json_dict(new_results)
@@ -319,10 +326,11 @@ def _verify_with_log(
     if differing_libraries:
         versions_text = one_line(", ".join(map(" ".join, sorted(differing_libraries))), 300)
         reasons.append(
-            f"the report was made with {versions_text}; this computer has other versions"
+            f"the report was made with {versions_text}; this computer has other versions, which "
+            "may draw other pages"
         )
         remedy = remedy or f"Verify the report with {versions_text}."
-    reasons += [LIMIT_NOTE] * (status == "verified")
+    reasons += [VERIFICATION_SCOPE_NOTE] * (status == "verified")
     return Verification(
         status,
         tuple(reasons),
@@ -338,14 +346,14 @@ def _verify_with_log(
 def is_same_number_rounded(
     agreeing_pairs: Iterable[tuple[float, float]], submitted_number: str, redrawn_number: str
 ) -> bool:
-    """Return True if two printed numbers are roundings of one pair of results that agree.
+    """Return True if two printed numbers are one result, rounded, that agrees in both reports.
 
     ``agreeing_pairs`` are results in the report and in the new analysis that differ by less than
     the tolerance.
     """
-    decimals = _decimal_count(submitted_number)
+    decimals = _count_decimals(submitted_number)
     printed_pair = float(submitted_number), float(redrawn_number)
-    return decimals == _decimal_count(redrawn_number) and any(
+    return decimals == _count_decimals(redrawn_number) and any(
         printed_pair == (round(abs(a) * scale, decimals), round(abs(b) * scale, decimals))
         for scale in PRINTED_SCALES
         for a, b in agreeing_pairs
@@ -362,36 +370,37 @@ def compare_results(
     mismatches : tuple of Mismatch
         Values that differ by more than the tolerances.
     is_same_number : callable
-        Returns True if two printed numbers are roundings of results that agree.
+        Returns True if two printed numbers are one result, rounded, that agrees.
     value_count : int
         Number of compared values.
     """
     command = str(new_results["provenance"]["command"])
-    # "auto" and --position estimate time offset or frame alignment, on which all numbers depend
-    are_all_estimated = not {"auto", "--position"}.isdisjoint(command.split())
+    # "auto" and --position estimate time offset or frame alignment, on which all numbers depend.
+    # All numbers then have the tolerance of estimates
+    has_estimated_inputs = not {"auto", "--position"}.isdisjoint(command.split())
     recorded_values, new_values = dict(flatten(recorded_results)), dict(flatten(new_results))
     pair_by_path = {
         path: (recorded_values.get(path, _ABSENT), new_values.get(path, _ABSENT))
         for path in {**new_values, **recorded_values}
-        if not path.startswith(MACHINE_PATHS)
+        if not path.startswith(MACHINE_DEPENDENT_FIELDS)
     }
     is_near_by_path = {
-        path: _is_near(path, *value_pair, are_all_estimated or path.startswith(ESTIMATE_PATHS))
+        path: _is_near(path, *value_pair, has_estimated_inputs or path.startswith(ESTIMATE_FIELDS))
         for path, value_pair in pair_by_path.items()
         if all(map(is_number, value_pair))
     }
     near_pairs = (pair_by_path[path] for path, is_near in is_near_by_path.items() if is_near)
     unequal_pairs = tuple((float(a), float(b)) for a, b in near_pairs if a != b)
     is_same_number = partial(is_same_number_rounded, unequal_pairs)
-    wrong_paths = [path for path, is_near in is_near_by_path.items() if not is_near]
-    wrong_paths += [
+    mismatched_paths = [path for path, is_near in is_near_by_path.items() if not is_near]
+    mismatched_paths += [
         path
         for path in pair_by_path
         if path not in is_near_by_path and not _is_same(*pair_by_path[path], is_same_number)
     ]
     mismatches = (
         Mismatch(one_line(path, MAX_TEXT_LENGTH), *map(_format_value, pair_by_path[path]))
-        for path in wrong_paths
+        for path in mismatched_paths
     )
     return tuple(mismatches), is_same_number, len(pair_by_path)
 
@@ -437,7 +446,7 @@ def _is_same(submitted_value: Any, new_value: Any, is_same_number: TextCompariso
 
 
 def is_same_text_rounded(first_text: str, second_text: str, is_same_number: TextComparison) -> bool:
-    """Return True if two texts are equal up to the rounding of their numbers.
+    """Return True if texts are equal except for numbers, which ``is_same_number`` compares.
 
     >>> is_same_text_rounded("0.15 m", "0.16 m", lambda one, other: True)
     True
@@ -446,7 +455,7 @@ def is_same_text_rounded(first_text: str, second_text: str, is_same_number: Text
     """
     if first_text == second_text:
         return True
-    # elements 1, 3, 5, ... are numbers
+    # re.split with a group returns texts at even indices, and numbers at odd indices
     first_parts, second_parts = map(_NUMBER_PATTERN.split, (first_text, second_text))
     number_pairs = zip(first_parts[1::2], second_parts[1::2], strict=False)
     return first_parts[::2] == second_parts[::2] and all(
@@ -454,10 +463,10 @@ def is_same_text_rounded(first_text: str, second_text: str, is_same_number: Text
     )
 
 
-def _decimal_count(number: str) -> int:
+def _count_decimals(number: str) -> int:
     """Count the decimal places of a printed number.
 
-    >>> _decimal_count("0.15"), _decimal_count("3"), _decimal_count("1.2e-3")
+    >>> _count_decimals("0.15"), _count_decimals("3"), _count_decimals("1.2e-3")
     (2, 0, 4)
     """
     mantissa, _, exponent = number.partition("e")

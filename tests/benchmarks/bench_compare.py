@@ -77,7 +77,7 @@ def print_ratio(name: str, ours: list[str], peer: list[str], runs: int, more: st
 def main() -> None:
     from pypdf import PdfReader
 
-    from px4fuse.readers.px4_topics import topics
+    from px4fuse.readers.px4_topics import list_topics
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("runs", nargs="?", type=int, default=5)
@@ -91,7 +91,7 @@ def main() -> None:
         measured(compare)  # warm the file cache and count the pages
         pages = len(PdfReader(report).pages)
         floor_pdf = str(Path(folder) / "floor.pdf")
-        floor = [python, "-c", FLOOR, str(LOG), floor_pdf, ",".join(topics()), str(pages)]
+        floor = [python, "-c", FLOOR, str(LOG), floor_pdf, ",".join(list_topics()), str(pages)]
         print_ratio("compare / floor", compare, floor, given.runs, f", {pages} pages")
         ours, click = [python, "-m", "px4fuse", "--help"], [python, "-c", "import click"]
         print_ratio("--help / python with click", ours, click, given.runs)

@@ -24,7 +24,7 @@ def main() -> None:
     import numpy as np
     from trajectory_tools import flight
 
-    from px4fuse.readers.trajectory import read_trajectory, tum_text
+    from px4fuse.readers.trajectory import format_tum, read_trajectory
     from px4fuse.trajectory.association import associate
     from px4fuse.trajectory.evaluation import evaluate
     from px4fuse.trajectory.scores import estimate_rmse_interval
@@ -36,14 +36,14 @@ def main() -> None:
     estimate = replace(estimate, position_m=estimate.position_m + noise)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "track.tum"
-        path.write_text(tum_text(reference[:20_000]))
+        path.write_text(format_tum(reference[:20_000]))
         size = path.stat().st_size / 1e6
         took = seconds(lambda: read_trajectory(path), RUNS)
         print(f"read 20,000 poses, {size:.1f} MB       {took:7.3f} s")
     x, y, _ = associate(estimate, reference)
     error = np.linalg.norm(x.position_m - y.position_m, axis=1)
     for words, work in (
-        ("write 120,000 poses", lambda: tum_text(reference)),
+        ("write 120,000 poses", lambda: format_tum(reference)),
         ("associate 18,000 with 120,000", lambda: associate(estimate, reference)),
         ("interval of 18,000 errors", lambda: estimate_rmse_interval(error, "ATE")),
         ("all scores", lambda: evaluate(estimate, reference)),

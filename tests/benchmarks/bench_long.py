@@ -42,7 +42,7 @@ def growth(sizes: list[int], cpu_s: list[float]) -> str:
 
 
 def main() -> None:
-    from px4fuse.readers.px4_topics import topics
+    from px4fuse.readers.px4_topics import list_topics
 
     px4fuse = [sys.executable, "-m", "px4fuse"]
     with tempfile.TemporaryDirectory() as folder:
@@ -56,7 +56,7 @@ def main() -> None:
                 for name, times in cpu_s.items():
                     more = ["-o", str(Path(folder) / "report.pdf")] if name == "compare" else []
                     took = measured([*px4fuse, name, str(log), *more])
-                    read = measured([sys.executable, "-c", READ, str(log), ",".join(topics())])
+                    read = measured([sys.executable, "-c", READ, str(log), ",".join(list_topics())])
                     times.append(took.cpu_s)
                     print(
                         f"{size} {unit}, {log.stat().st_size / 1e6:.1f} MB, {name}: "

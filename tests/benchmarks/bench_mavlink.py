@@ -33,7 +33,7 @@ def read_columns(path: Path) -> int:
     from px4fuse.readers.mavlink_frames import message_name, read_frames
 
     frames = read_frames(path.name, path.read_bytes())
-    for number in np.unique(frames.message_id).tolist():
+    for number in np.unique(frames.message_ids).tolist():
         name = message_name(number)
         frames.table(name, frames.rows(name))
     return len(frames)

@@ -14,7 +14,7 @@ from msgspec import structs
 
 from px4fuse.core.writing import write_all
 from px4fuse.errors import ResultsError
-from px4fuse.readers.ulog_topics import ignores_assessed
+from px4fuse.readers.ulog_topics import ignores_assessed_mark
 from px4fuse.results.contract import ReportedResults, file_hashes_in, to_json
 from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
@@ -111,11 +111,11 @@ def repeat_with_diagnosis(
 
     Return results and report (PDF).
     """
-    token = ignores_assessed.set(True)
+    token = ignores_assessed_mark.set(True)
     try:
         outcome = recompute(results, path_by_sha256)
     finally:
-        ignores_assessed.reset(token)
+        ignores_assessed_mark.reset(token)
     if isinstance(outcome, Verification):
         raise ResultsError(f"The diagnosis for the feedback failed: {'; '.join(outcome.reasons)}.")
     diagnosed_results, draw = outcome
