@@ -711,7 +711,8 @@ def _integrate_shared_errors(attitude: pd.DataFrame, acceleration: Acceleration)
 def _make_knot_weights(start_s: float, end_s: float) -> ArrayPair:
     """Return times (s) from start to end, and the interpolation weight of each knot at these times.
 
-    Linear interpolation between knots of the slow acceleration error, :data:`KNOT_SPACING_S` apart.
+    Linear interpolation between knots of the slow acceleration error at intervals of
+    :data:`KNOT_SPACING_S`.
     """
     knot_count = int(np.clip(np.ceil((end_s - start_s) / KNOT_SPACING_S), 1, MAX_KNOTS)) + 1
     weight_time_s = np.linspace(start_s, end_s, 20 * (knot_count - 1) + 1)
