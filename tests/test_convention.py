@@ -360,6 +360,20 @@ def test_late_timestamps_finding_has_maximum_likelihood_offset(estimate_s, repor
     assert refine_delay(comparison, unclear) is comparison
 
 
+@pytest.mark.parametrize("time_constant_s", [0.7, 1.5])
+def test_low_pass_filtered_positions_are_not_reported_as_late(time_constant_s: float) -> None:
+    track = sent(flown())
+    position_m = track.samples[Columns.POSITION].to_numpy(copy=True)
+    for row in range(1, len(position_m)):
+        position_m[row] += np.exp(-0.1 / time_constant_s) * (position_m[row - 1] - position_m[row])
+    filtered = track.samples.assign(**dict(zip(Columns.POSITION, position_m.T, strict=True)))
+    convention = check_convention(flown(), replace(track, samples=filtered))
+    assert convention.verdict == "determined"
+    assert abs(convention.late_s) < 0.3 * time_constant_s
+    delayed = check_convention(flown(), sent(flown(), late_s=time_constant_s))
+    assert delayed.late_s == pytest.approx(time_constant_s, abs=0.1)
+
+
 def test_clock_offset_auto_note_contains_already_applied_delay():
     late = replace(flown(), positions=(sent(flown(), late_s=0.7),))
     request = ComparisonRequest(log="made", clock_offset_s="auto", axes=("north", "east"))

@@ -27,6 +27,7 @@ from px4fuse.convention.motion import (
     MIN_GAP_S,
     ImuSecondDifferences,
     InertialData,
+    filter_imu_motion,
     integrate_imu_motion,
     integrate_inertial_data,
     replace_heading,
@@ -64,6 +65,11 @@ MAX_GNSS_RESIDUAL_RATIO = 0.1
 MIN_DRIFT_SCORE_GAIN = 15.0
 # Tested clock drifts (rate of the clock minus 1)
 TESTED_CLOCK_DRIFTS = np.linspace(-0.05, 0.05, 21)
+# Minimum log-likelihood gain from a low-pass filter instead of a delay. In simulated flights it
+# is above 13 with a low-pass filter, and below 3 with a delay
+MIN_LOW_PASS_SCORE_GAIN = 8.0
+# Delays (s) between these limits can be the effect of a low-pass filter in the source
+MIN_LOW_PASS_DELAY_S, MAX_LOW_PASS_DELAY_S = 0.2, 5.0
 # Repeated positions are removed if they are less than this fraction of all positions
 MAX_REPEATED_FRACTION = 0.5
 # Heights are used if at least this fraction of the positions has a height
@@ -116,6 +122,9 @@ def check_convention(
             hypotheses, positions = hypotheses_without_drift, positions_without_drift
         else:
             clock_drift = 0.0
+    hypotheses[0] = _replace_delay_by_low_pass(
+        hypotheses[0], positions, imu_motion_by_heading[hypotheses[0].heading_from]
+    )
     if not is_source_fused(flight):
         hypotheses[0] = _rotate_to_gnss(hypotheses[0], positions, flight, track)
     convention = _choose_convention(hypotheses, positions, clock_drift)
@@ -160,6 +169,29 @@ def _rank_convention_hypotheses(
             other_hypotheses = [other for other in hypotheses if other is not hypothesis]
             return [replace(hypothesis, score=hypotheses[0].score), *other_hypotheses]
     return hypotheses
+
+
+def _replace_delay_by_low_pass(
+    hypothesis: Hypothesis, positions: SentPositions, imu_motion: ImuSecondDifferences
+) -> Hypothesis:
+    """Return the hypothesis without its delay, if a low-pass filter explains the delay better.
+
+    A first-order low-pass filter delays the positions by its time constant, and also reduces fast
+    motion. Its positions have correct timestamps.
+    """
+    if not MIN_LOW_PASS_DELAY_S < hypothesis.delay_s < MAX_LOW_PASS_DELAY_S:
+        return hypothesis
+    filtered_motion = filter_imu_motion(imu_motion, hypothesis.delay_s)
+    parameters = hypothesis.parameters.copy()
+    parameters[0] = 0.0
+    low_pass_hypothesis = refine_hypothesis(
+        replace(hypothesis, parameters=parameters),
+        positions,
+        positions.motion(filtered_motion),
+        filtered_motion,
+    )
+    score_gain = low_pass_hypothesis.score - hypothesis.score
+    return low_pass_hypothesis if score_gain > MIN_LOW_PASS_SCORE_GAIN else hypothesis
 
 
 def is_source_fused(flight: Flight) -> bool:

@@ -8,7 +8,7 @@ p(t + T) - 2 p(t) + p(t - T) = ∫ (T - |s|) a(t + s) ds, s from -T to T
 Subtracting its running mean removes constant acceleration errors (tilt, bias).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -262,6 +262,18 @@ def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSec
     return ImuSecondDifferences(
         time_s, is_valid, filtered, np.gradient(filtered[..., 0], GRID_INTERVAL_S, axis=0)
     )
+
+
+def filter_imu_motion(
+    imu_motion: ImuSecondDifferences, time_constant_s: float
+) -> ImuSecondDifferences:
+    """Apply a first-order low-pass filter to second differences from the IMU."""
+    previous_weight = np.exp(-GRID_INTERVAL_S / time_constant_s)
+    table = imu_motion.table.copy()
+    for row in range(1, len(table)):
+        table[row] += previous_weight * (table[row - 1] - table[row])
+    rate_m_s = np.gradient(table[..., 0], GRID_INTERVAL_S, axis=0)
+    return replace(imu_motion, table=table, second_difference_rate_m_s=rate_m_s)
 
 
 def replace_heading(attitude: Array, heading_rad: Array) -> Array:
