@@ -44,6 +44,20 @@ def test_diagnosis_text_has_at_most_40_lines() -> None:
         assert part in whole
 
 
+def test_diagnosis_text_below_95_columns_has_ratios_without_plot() -> None:
+    card = replace(SMALL_SIGMA_A, causes=())
+    wide, narrow = (
+        [text for line in card_text.card_lines(card) for text in line.wrap(width)]
+        for width in (95, 80)
+    )
+    assert any("─░" in text for text in wide)
+    assert not any("─" in text for text in narrow)
+    assert max(map(len, wide)) <= 95
+    assert max(map(len, narrow)) <= 80
+    ratio_lines = [text[:58].rstrip() for text in wide if "─░" in text]
+    assert ratio_lines == [text for text in narrow if text in ratio_lines]
+
+
 def test_diagnosis_text_joins_alternative_actions_by_either_or() -> None:
     cause = replace(SMALL_SIGMA_A.causes[0], alternatives=((SENDER,), (DELAY,)))
     card = replace(SMALL_SIGMA_A, causes=(cause,))

@@ -64,6 +64,7 @@ class Paragraph(NamedTuple):
     """Paragraph on the terminal, in a style of the rich package.
 
     If ``wraps``, the first line begins with ``first_indent``, the other lines with ``indent``.
+    Otherwise the ``plot`` follows the text, if the line is not too long for the terminal.
     """
 
     text: str
@@ -71,10 +72,14 @@ class Paragraph(NamedTuple):
     first_indent: str = ""
     indent: str = ""
     wraps: bool = False
+    plot: str = ""
 
     def wrap(self, width: int) -> list[str]:
         if not self.wraps:
-            return [f"{self.first_indent}{self.text}"]
+            text = f"{self.first_indent}{self.text}"
+            if not self.plot or len(text) + len(self.plot) <= width:
+                return [text + self.plot]
+            return [text.rstrip()] if text.strip() else []
         return textwrap.wrap(
             self.text,
             width,
@@ -340,10 +345,9 @@ def _verdict_axis_lines(card: Card) -> Iterator[Paragraph]:
     heading = "Reported uncertainty: RMS of actual error ÷ reported σ"
     yield from _wrapped_lines(f"{heading}{direction_text}", "", "  ")
     legend, left_label = f"  ░ consistent ({format_consistent_ratios()})", "σ too large"
-    yield Paragraph(
-        f"{'':{AXIS_INDENT}}{left_label}{'σ too small':>{AXIS_WIDTH - len(left_label)}}"
-    )
-    yield Paragraph(f"{legend:{AXIS_INDENT}}{_ticks_line()}")
+    directions = f"{left_label}{'σ too small':>{AXIS_WIDTH - len(left_label)}}"
+    yield Paragraph(f"{'':{AXIS_INDENT}}", plot=directions)
+    yield Paragraph(f"{legend:{AXIS_INDENT}}", plot=_ticks_line())
     if any(verdict.is_explained for verdict in card.verdicts):
         yield Paragraph(
             "  Verdicts in brackets: effects of the causes above, not faults of the filter."
@@ -360,9 +364,8 @@ def _verdict_line(verdict: Verdict) -> Paragraph:
     word = f"({verdict.word})" if verdict.is_explained else verdict.word
     text = f"{label_text}{format_ratio(verdict.ratio):>7}  {word}"
     style = "bold" if verdict.is_fault else ""
-    return Paragraph(
-        f"{text:{AXIS_INDENT}}{draw_sigma_ratio(verdict.ratio, verdict.against)}", style
-    )
+    sigma_ratio_plot = draw_sigma_ratio(verdict.ratio, verdict.against)
+    return Paragraph(f"{text:{AXIS_INDENT}}", style, plot=sigma_ratio_plot)
 
 
 def _ticks_line() -> str:
@@ -380,12 +383,12 @@ def _aid_axis_lines(aid_rows: Sequence[AidRow]) -> Iterator[Paragraph]:
     yield Paragraph("")
     yield from _wrapped_lines(AIDS_CAPTION, "", "  ")
     indent = 31
-    yield Paragraph(f"{'':{indent}}{_ticks_line()}")
+    yield Paragraph(f"{'':{indent}}", plot=_ticks_line())
     for row, previous_row in zip(aid_rows, (None, *aid_rows), strict=False):
         label = "" if previous_row and row.label == previous_row.label else row.label
         ratio_text = "–" if row.ratio is None else format_ratio(row.ratio)
         label_text = f"  {label:13}{row.component:6}{ratio_text:>7}"
-        yield Paragraph(f"{label_text:{indent}}{draw_sigma_ratio(row.ratio, 'source')}")
+        yield Paragraph(f"{label_text:{indent}}", plot=draw_sigma_ratio(row.ratio, "source"))
 
 
 def format_spans(cause: Cause) -> str:
