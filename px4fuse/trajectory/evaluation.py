@@ -16,7 +16,7 @@ from msgspec import structs
 
 from px4fuse.core.arrays import Array, BoolArray, median_interval
 from px4fuse.core.record import NOT_WRITTEN, NotWritten, OrUnavailable, Record
-from px4fuse.core.text import capitalise_first
+from px4fuse.core.text import capitalise_first, format_metres
 from px4fuse.errors import TrajectoryError
 from px4fuse.flight.model import Unavailable
 from px4fuse.trajectory import scores
@@ -144,6 +144,10 @@ MIN_COVERED_FRACTION = 0.5
 # Minimum estimated time offset (s) for a warning that the clocks differ: a smaller time offset may
 # be the delay of a filter
 MIN_REPORTED_OFFSET_S = 0.1
+# Another time offset is reported if it reduces the ATE to at most this fraction
+MAX_OFFSET_ATE_RATIO = 0.8
+# Minimum ratio of the numbers of evaluated poses with and without the other time offset
+MIN_OFFSET_POSES_RATIO = 0.8
 # Maximum ratio of the pose interval of the reference to that of the estimate; above it, the user
 # probably interchanged reference and estimate
 MAX_POSE_INTERVAL_RATIO = 5.0
@@ -248,7 +252,9 @@ def evaluate(
     (estimate, reference), constant_orientation_notes = zip(
         *map(drop_constant_orientation, (estimate, reference)), strict=True
     )
-    time_offset, offset_warnings = _choose_time_offset(estimate, reference, time_offset_s)
+    time_offset, offset_warnings, other_offset_s = _choose_time_offset(
+        estimate, reference, time_offset_s
+    )
     added_offset_s = time_offset.offset_s or 0.0
     is_frozen, frozen_warnings = find_frozen_poses(estimate, reference, added_offset_s)
     matched_estimate, matched_reference, association_result = associate(
@@ -280,6 +286,20 @@ def evaluate(
     position_error_m = np.linalg.norm(
         aligned_estimate.position_m - matched_reference.position_m, axis=1
     )
+    position_statistics = scores.compute_statistics(position_error_m)
+    if other_offset_s is not None:
+        other_statistics = evaluate(
+            estimate,
+            reference,
+            alignment=alignment,
+            association=association,
+            max_gap_s=max_gap_s,
+            time_offset_s=other_offset_s,
+            rpe_deltas=(),
+        ).ate.translation_m
+        offset_warnings += _find_offset_warnings(
+            position_statistics, other_statistics, other_offset_s
+        )
     rotations = scores.get_rotations(aligned_estimate, matched_reference, "ATE of the orientation")
     if rpe_deltas is None:
         rpe_deltas = scores.choose_default_deltas(distance_m, matched_estimate.time_s)
@@ -292,7 +312,7 @@ def evaluate(
         association=association_result,
         time_offset=time_offset,
         ate=AbsoluteError(
-            scores.compute_statistics(position_error_m),
+            position_statistics,
             scores.estimate_rmse_interval(position_error_m, "ATE"),
             rotations
             if isinstance(rotations, Unavailable)
@@ -389,8 +409,11 @@ def choose_alignment(estimate: Trajectory, reference: Trajectory) -> tuple[Align
 
 def _choose_time_offset(
     estimate: Trajectory, reference: Trajectory, given_offset_s: float | Literal["auto"] | None
-) -> tuple[TimeOffset, list[str]]:
-    """Choose the offset to add to the timestamps of the estimate; also return warnings."""
+) -> tuple[TimeOffset, list[str], float | None]:
+    """Choose the offset to add to the timestamps of the estimate.
+
+    Also return warnings, and another offset (s) with which the motions match better, if any.
+    """
     is_given = given_offset_s not in (None, "auto")
     clock_offset_s = compute_clock_offset_s(estimate, reference)
     if isinstance(given_offset_s, float | int):
@@ -406,28 +429,43 @@ def _choose_time_offset(
     )
     start_s, end_s = estimate.time_s[[0, -1]] + added_offset_s
     is_disjoint = start_s > reference.time_s[-1] or end_s < reference.time_s[0]
-    # The boot clock of a flight log and the clock of a trajectory file are unrelated
-    are_clocks_unrelated = clock_offset_s is None and estimate.is_from_log != reference.is_from_log
     is_estimated = given_offset_s == "auto" or is_disjoint
-    if is_given or not (is_estimated or are_clocks_unrelated):
-        return default_offset, []
+    if is_given:
+        return default_offset, [], None
     estimated_offset = estimate_time_offset(estimate, reference)
     if is_estimated:
         if estimated_offset.is_determinable:
-            return estimated_offset, []
+            return estimated_offset, [], None
         fallback_offset = structs.replace(
             default_offset, is_determinable=False, reason=estimated_offset.reason
         )
-        return fallback_offset, [
-            f"{estimated_offset.reason} Instead, poses are matched by {clock_text}."
-        ]
-    low_s, high_s = estimated_offset.interval_s or (0.0, 0.0)
-    if low_s <= 0.0 <= high_s or abs(estimated_offset.offset_s or 0.0) < MIN_REPORTED_OFFSET_S:
-        return default_offset, []
-    return default_offset, [
-        "The timestamps are unchanged, but the motions match best with "
-        f"{estimated_offset.offset_s:+.3f} s added to the timestamps of the estimate. For "
-        "unrelated clocks, give --time-offset auto."
+        return (
+            fallback_offset,
+            [f"{estimated_offset.reason} Instead, poses are matched by {clock_text}."],
+            None,
+        )
+    low_s, high_s = estimated_offset.interval_s or (added_offset_s, added_offset_s)
+    best_offset_s = estimated_offset.offset_s or added_offset_s
+    is_other_offset = (
+        not low_s <= added_offset_s <= high_s
+        and abs(best_offset_s - added_offset_s) >= MIN_REPORTED_OFFSET_S
+    )
+    return default_offset, [], best_offset_s if is_other_offset else None
+
+
+def _find_offset_warnings(
+    statistics: Statistics, other_statistics: Statistics, other_offset_s: float
+) -> list[str]:
+    """Warn if the ATE with another time offset is smaller for nearly the same number of poses."""
+    if (
+        other_statistics.rmse > MAX_OFFSET_ATE_RATIO * statistics.rmse
+        or other_statistics.count < MIN_OFFSET_POSES_RATIO * statistics.count
+    ):
+        return []
+    return [
+        f"With {other_offset_s:+.3f} s added to the timestamps of the estimate, the ATE decreases "
+        f"from {format_metres(statistics.rmse)} to {format_metres(other_statistics.rmse)} m. If "
+        "the clocks differ, give --time-offset auto."
     ]
 
 
