@@ -433,6 +433,23 @@ def test_evaluate_reports_cause_and_time_of_estimate_jump(restarts: bool, cause:
     assert not any("scale factor" in warning for warning in got.warnings)
 
 
+@pytest.mark.parametrize(("axis", "column"), [("y", 1), ("z", 2)])
+@pytest.mark.parametrize("alignment", [None, "se3", "sim3"])
+def test_evaluate_mirrored_estimate_warns_and_names_an_axis(
+    axis: str, column: int, alignment: AlignmentKind | None
+) -> None:
+    reference = flight()
+    estimate = transformed(reference, Rotation.from_euler("z", 0.4), SHIFT, kind="vio")
+    assert not evaluate(estimate, reference, alignment=alignment).warnings
+    mirrored_m = estimate.position_m.copy()
+    mirrored_m[:, column] *= -1.0
+    mirrored = replace(estimate, position_m=mirrored_m)
+    warnings = evaluate(mirrored, reference, alignment=alignment).warnings
+    (warning,) = (text for text in warnings if "mirrored" in text)
+    # with a free rotation (se3, sim3), every reversed axis is equivalent
+    assert f"the sign of {'y' if alignment else axis} reversed" in warning
+
+
 def test_evaluate_with_implausible_arguments_gives_warnings() -> None:
     truth = flight()
     vio = transformed(truth, Rotation.from_euler("z", 1.0), SHIFT, kind="vio", name="log:vio")

@@ -64,7 +64,13 @@ class Transform(Record):
         return rotated / self.scale
 
 
-def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) -> Transform:
+def fit_alignment(
+    estimate_m: Array,
+    reference_m: Array,
+    kind: AlignmentKind,
+    *,
+    requires_motion: bool = True,
+) -> Transform:
     """Fit the transform that minimises the squared distance of the estimate to the reference.
 
     "se3" and "sim3" are fitted by Umeyama (1991), eqs. 40 to 43; "yaw" by the closed form of Zhang
@@ -76,6 +82,8 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
         Positions at the same times.
     kind : {"none", "yaw", "se3", "sim3"}
         Kind of transform. For "yaw", z must be vertical with the same direction in both frames.
+    requires_motion : bool
+        False to return one of the best transforms if the motion does not determine the transform.
 
     Raises
     ------
@@ -100,7 +108,8 @@ def fit_alignment(estimate_m: Array, reference_m: Array, kind: AlignmentKind) ->
         transform = _make_transform(
             Rotation.from_euler("z", yaw_rad), estimate_m, reference_m, 1.0, 4
         )
-    _require_sufficient_motion(transform, estimate_m, reference_m, kind)
+    if requires_motion:
+        _require_sufficient_motion(transform, estimate_m, reference_m, kind)
     return umeyama(estimate_m, reference_m, with_scale=False) if kind == "se3" else transform
 
 

@@ -144,6 +144,10 @@ MIN_COVERED_FRACTION = 0.5
 # Minimum estimated time offset (s) for a warning that the clocks differ: a smaller time offset may
 # be the delay of a filter
 MIN_REPORTED_OFFSET_S = 0.1
+# An estimate counts as mirrored if one reversed axis reduces the ATE to at most this fraction
+MAX_MIRRORED_ATE_RATIO = 0.3
+# The mirror test requires an ATE of at least this fraction of the extent of the reference
+MIN_MIRRORED_ATE_FRACTION = 0.03
 # Another time offset is reported if it reduces the ATE to at most this fraction
 MAX_OFFSET_ATE_RATIO = 0.8
 # Minimum ratio of the numbers of evaluated poses with and without the other time offset
@@ -336,6 +340,9 @@ def evaluate(
             *jump_warnings,
             *line_motion_warnings,
             *_find_swap_warnings(estimate, reference),
+            *_find_mirror_warnings(
+                matched_estimate, matched_reference, alignment, position_statistics.rmse
+            ),
             *offset_warnings,
             *_find_comparison_warnings(
                 matched_estimate,
@@ -469,6 +476,28 @@ def _find_offset_warnings(
     ]
 
 
+def _find_mirror_warnings(
+    estimate: Trajectory, reference: Trajectory, alignment: AlignmentKind, ate_m: float
+) -> Iterator[str]:
+    """Warn if the estimate fits much better with one reversed axis (left-handed frame)."""
+    if ate_m < MIN_MIRRORED_ATE_FRACTION * np.ptp(reference.position_m, axis=0).max():
+        return
+    for axis, signs in (("y", (1.0, -1.0, 1.0)), ("z", (1.0, 1.0, -1.0))):
+        mirrored = replace(estimate, position_m=estimate.position_m * signs)
+        transform = fit_alignment(
+            mirrored.position_m, reference.position_m, alignment, requires_motion=False
+        )
+        error_m = _apply_transform(transform, mirrored).position_m - reference.position_m
+        mirrored_ate_m = float(np.sqrt(np.mean(np.sum(error_m**2, axis=1))))
+        if mirrored_ate_m < MAX_MIRRORED_ATE_RATIO * ate_m:
+            yield (
+                f"The estimate is mirrored: with the sign of {axis} reversed, the ATE decreases "
+                f"from {format_metres(ate_m)} to {format_metres(mirrored_ate_m)} m. Convert the "
+                "estimate to a right-handed frame such as ENU or NED."
+            )
+            return
+
+
 def _find_swap_warnings(estimate: Trajectory, reference: Trajectory) -> Iterator[str]:
     if reference.kind == "truth" != estimate.kind:
         return
@@ -517,7 +546,7 @@ def _find_comparison_warnings(
 def _fit_or_approximate(
     estimate: Trajectory, reference: Trajectory, alignment: AlignmentKind, *, is_requested: bool
 ) -> tuple[Transform, tuple[str, ...]]:
-    """Fit the alignment. For motion along a line, return a best fit and a warning.
+    """Fit the alignment. If the motion does not determine it, return a best fit and a warning.
 
     Raises
     ------
@@ -528,9 +557,11 @@ def _fit_or_approximate(
     try:
         return fit_alignment(estimate.position_m, reference.position_m, alignment), ()
     except TrajectoryError as error:
-        if is_requested or alignment != "se3" or len(estimate) < MIN_POSES:
+        if is_requested or len(estimate) < MIN_POSES:
             raise
-        transform = umeyama(estimate.position_m, reference.position_m, with_scale=False)
+        transform = fit_alignment(
+            estimate.position_m, reference.position_m, alignment, requires_motion=False
+        )
         return transform, (
             f"{capitalise_first(error.reason)}. The best fit is used, so the ATE is a lower limit, "
             "and rotation errors may be wrong.",
