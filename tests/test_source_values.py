@@ -136,6 +136,18 @@ def test_read_log_detects_unit_and_clock_of_timestamps(tmp_path, stamp, clock):
     assert clock in source_stamps.AGE_TEXT_BY_WRONG_TIMESTAMP
 
 
+@pytest.mark.parametrize(("clock", "action"), [
+    ("an unknown clock", "Synchronise the clocks"),
+    ("another clock", "Synchronise the clocks"),
+    ("milliseconds", "Set timestamp_sample to the time of measurement"),
+])  # fmt: skip
+def test_timestamps_of_wrong_clock_have_action_for_their_cause(clock, action):
+    (finding,) = source_stamps.detect_timestamp_unit(
+        compare(simulate_flight(Scenario(passes=1))), clock
+    )
+    assert action in finding.remedy
+
+
 def test_read_log_reads_reset_counter_and_quality(tmp_path):
     log = make_log("v1.16").drop("vehicle_visual_odometry")
     source = odometry("vehicle_visual_odometry", 10.0, 16)

@@ -203,6 +203,12 @@ def _check_position_gap(positions: UnfusedPositions) -> Iterator[UnmetCondition]
         )
 
 
+def find_timestamp_action(clock_name: str) -> str:
+    """Return the action for timestamps of a wrong clock or in a wrong unit."""
+    is_wrong_clock = clock_name in AGE_TEXT_BY_WRONG_CLOCK
+    return SYNCHRONISE_ACTION if is_wrong_clock else SET_TIMESTAMP_ACTION
+
+
 def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     clock_map, status = positions.source.clock_map, positions.source.status
     if clock_map and (clock := clock_map.clock) in AGE_TEXT_BY_WRONG_TIMESTAMP:
@@ -211,7 +217,7 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
             "the timestamps are " + ("0" if clock == "0" else f"in {clock}"),
             "EKF2 reads timestamp_sample in microseconds since the autopilot's boot, so for EKF2 "
             f"these positions are {AGE_TEXT_BY_WRONG_TIMESTAMP[clock]}.",
-            SYNCHRONISE_ACTION if clock in AGE_TEXT_BY_WRONG_CLOCK else SET_TIMESTAMP_ACTION,
+            find_timestamp_action(clock),
         )
     if "age_s" not in status:
         return

@@ -8,8 +8,7 @@ from px4fuse.core.arrays import Array, rank_correlation
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.fusion_conditions import (
     AGE_TEXT_BY_WRONG_TIMESTAMP,
-    SET_TIMESTAMP_ACTION,
-    SYNCHRONISE_ACTION,
+    find_timestamp_action,
 )
 from px4fuse.ekf2.intervals import MAX_LATENESS_S
 from px4fuse.findings.model import Findings, error, format_percent, fraction_of_ones, note, warning
@@ -134,14 +133,13 @@ def detect_timestamp_unit(analysis: Analysis, clock_name: str) -> Findings:
             f"EKF2 never fused the positions, because it treats them as "
             f"{AGE_TEXT_BY_WRONG_TIMESTAMP[clock_name]}. "
         )
-    is_other_clock = clock_name.startswith("UNIX") or clock_name == "another clock"
     yield error(
         "source_timestamp_unit",
         f"The timestamps of the {positions_phrase(analysis.source)} are "
         f"{'0 in every message' if clock_name == '0' else f'in {clock_name}'}. PX4 expects "
         f"timestamp_sample in microseconds since the autopilot's boot. {fusion_sentence}px4fuse "
         "uses the arrival times, which are late by the latency.",
-        SYNCHRONISE_ACTION if is_other_clock else SET_TIMESTAMP_ACTION,
+        find_timestamp_action(clock_name),
         {"clock": clock_name},
     )
 
