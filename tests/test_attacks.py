@@ -31,7 +31,12 @@ from results_tools import LOOP, changed_results, decode_results
 from px4fuse.classroom.assignment.key import AnswerKey, RightAnswers
 from px4fuse.classroom.assignment.truth import compute_form_answers
 from px4fuse.classroom.grading.model import GradedReport
-from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable, read_rubric, score_report
+from px4fuse.classroom.grading.rubric import (
+    Rubric,
+    grade_unreadable_file,
+    read_rubric,
+    score_report,
+)
 from px4fuse.errors import ResultsError
 from px4fuse.report import pdf as pdf_module
 from px4fuse.results.answer_form import form_text
@@ -79,7 +84,7 @@ class Flight:
         self, report: ReportedResults | ResultsError, verdict: Verification, rubric: Rubric
     ) -> GradedReport:
         if isinstance(report, ResultsError):
-            made = grade_unreadable(rubric, self.key, f"{report.reason}.", report.remedy)
+            made = grade_unreadable_file(rubric, self.key, f"{report.reason}.", report.remedy)
             return GradedReport(
                 "a.pdf", "", "", verdict, made.items, instructor_action=made.instructor_action
             )

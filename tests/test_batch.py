@@ -217,7 +217,7 @@ def test_batch_log_without_position_has_status_not_compared(tmp_path):
     assert row["duration_s"] > 10
     assert "--position" in row["remedy"]
     assert row["aids"].startswith("gnss_pos underconfident")
-    assert "from an earlier run: 1" in command(log, "-o", tmp_path / "out").output
+    assert "from an earlier run: 1 log" in command(log, "-o", tmp_path / "out").output
 
 
 @pytest.mark.reallogs
@@ -353,7 +353,7 @@ def test_batch_interrupted_run_reuses_finished_results(
     (tmp_path / "rows" / f"{'0' * 64}.json").write_bytes(b"{}")
     (tmp_path / "rows" / "folder.json").mkdir()
     again = command(flights, "-o", tmp_path)
-    assert "3 logs: 3 done; from an earlier run: 1" in again.output
+    assert "3 logs: 3 done. Results from an earlier run: 1 log." in again.output
     assert_same(pd.read_parquet(tmp_path / "fleet.parquet"), undisturbed)
 
 

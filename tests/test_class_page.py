@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from px4fuse.classroom.grading.class_page import count_by_bin, format_class_page
-from px4fuse.classroom.grading.model import Grade, GradedReport, ItemScore, Override
+from px4fuse.classroom.grading.model import Grade, GradedReport, GradeOverride, ItemScore
 from px4fuse.classroom.grading.outputs import anonymise_grade
 from px4fuse.html.safe import MAX_TEXT_LENGTH
 from px4fuse.results.answer_form import Answers, NamedFault
@@ -44,7 +44,7 @@ def graded(name: str, points: float | None, **more: Any) -> GradedReport:
     )  # fmt: skip
 
 
-OF_ENTRY = ("submitted_at", "late_s", "deduction", "overrides", "comment", "total",
+OF_ENTRY = ("submitted_at", "lateness_s", "deducted_points", "overrides", "comment", "total",
             "other_reports")  # fmt: skip
 
 
@@ -67,7 +67,7 @@ CLASS = (
         18.5,
         id="1007",
         numbers={"mean NIS": 1.02},
-        redrawn_path="reports/1007.pdf",
+        redrawn_report_path="reports/1007.pdf",
         is_found_by_fault={"positions that jump": True},
     ),
     row(
@@ -77,8 +77,8 @@ CLASS = (
         status="numbers differ",
         flags=("The same log as Zoë.",),
         is_found_by_fault={"positions that jump": False, "outliers": False},
-        late_s=7200.0,
-        deduction=1.0,
+        lateness_s=7200.0,
+        deducted_points=1.0,
     ),
     row("Émile", 9.0, id="1010", numbers={"mean NIS": 0.5}),
     row("Bo", 20.0, id="99", numbers={"mean NIS": -3.0}),
@@ -95,7 +95,7 @@ CLASS = (
         instructor_action=MARKUP,
         form=FORM,
         is_found_by_fault={MARKUP: False},
-        redrawn_path="javascript:alert(1)",
+        redrawn_report_path="javascript:alert(1)",
         comment=BREAKOUT,
         items=(
             ItemScore(
@@ -103,7 +103,7 @@ CLASS = (
             ),
         ),
         submitted_at=MARKUP,
-        overrides={BREAKOUT: Override(None, MARKUP)},
+        overrides={BREAKOUT: GradeOverride(None, MARKUP)},
     ),
     row(REVERSED, 8.0, id="5"),
     row(LONG, 7.0, id="6"),
@@ -145,8 +145,8 @@ def test_grades_page_escapes_html_in_student_text(text: str) -> None:
 
 
 def test_grades_page_mean_excludes_pending_points() -> None:
-    said = {"Notes": Override(9.0, "Good.")}
-    grades = [row("Ada", 10.0, late_s=61), row("Bo", 20.0),
+    said = {"Notes": GradeOverride(9.0, "Good.")}
+    grades = [row("Ada", 10.0, lateness_s=61), row("Bo", 20.0),
                row("Cy", 12.0, instructor_action="Run 0.1.1."),
                row("Di", 13.0, overrides=said, total=13.0)]  # fmt: skip
     text = format_class_page(grades, "Class", "px4fuse 1")
@@ -192,9 +192,9 @@ def anonymous_class() -> list[Grade]:
             notes=f"{name} ({student_id}): {SAYS} 王小明", form=FORM,
             numbers={"mean NIS": 1.0}, items=(ItemScore("Settings", 9.0, 20.0, said),),
             is_found_by_fault={"positions that jump": False}, comment=said,
-            overrides={"Settings": Override(10.0, said)},
+            overrides={"Settings": GradeOverride(10.0, said)},
             other_reports=(graded(name, 3.0, file=f"old/{file}"),),
-            redrawn_path=f"reports/{student_id}.pdf", sha256="ab" * 32,
+            redrawn_report_path=f"reports/{student_id}.pdf", sha256="ab" * 32,
         )  # fmt: skip
         grade = grade if file else Grade(name, student_id, None)
         grades.append(anonymise_grade(grade, f"Student {(7 * number) % 4 + 1:03}"))
@@ -292,7 +292,9 @@ def test_grades_page_keyboard_selects_next_and_previous_report(page: Browser) ->
 
 
 def test_grades_page_links_report_redrawn_from_the_log() -> None:
-    one = row("Zoë", 18.5, redrawn_path="reports/1.pdf", pages=(PageDifference(1, "a word"),))
+    one = row(
+        "Zoë", 18.5, redrawn_report_path="reports/1.pdf", pages=(PageDifference(1, "a word"),)
+    )
     made = content(format_class_page([one, row("Bo", 1.0)], "Class", "px4fuse 1"))
     (leads,) = (part for part in made["rows"][0][3] if part[0] == "links")
     assert [to for _, to in leads[2]] == ["reports/1.pdf"]

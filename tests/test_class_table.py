@@ -142,7 +142,7 @@ def test_grades_csv_begins_with_bom_and_has_crlf_line_ends() -> None:
 
 def test_grades_csv_lists_late_and_missing_students() -> None:
     one = GradedReport("a.pdf", "A", "1", VERIFIED, (ItemScore("notes", 1.5, 2.0, ""),))
-    late = entry(one, late_s=5400.0, deduction=0.4, total=1.1, comment="see me")
+    late = entry(one, lateness_s=5400.0, deducted_points=0.4, total=1.1, comment="see me")
     pending = entry(replace(one, instructor_action="Run 0.1.1."), total=None)
     head, *rest = cells(
         format_class_table([late, pending, Grade("C", "-17", None, max_points=4.0)])

@@ -10,7 +10,11 @@ from msgspec import structs
 
 from px4fuse.batch.changes import compare_numbers, list_changes
 from px4fuse.batch.inputs import InputResults
-from px4fuse.batch.measures import NUMBER_DEFINITIONS, ComparedNumber, collect_numbers
+from px4fuse.batch.measures import (
+    COMPARED_NUMBER_DEFINITIONS,
+    ComparedNumber,
+    collect_compared_numbers,
+)
 from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.aids import AidAxis, AidResult
 from px4fuse.request import ComparisonRequest
@@ -162,9 +166,9 @@ def test_diff_with_additional_fault_is_reported_as_worse(clean):
 
 
 def test_diff_compares_each_json_number_only_once(clean):
-    paths = [one["path"] for one in NUMBER_DEFINITIONS]
+    paths = [one["path"] for one in COMPARED_NUMBER_DEFINITIONS]
     assert len(set(paths)) == len(paths)
-    found = collect_numbers(clean.results)
+    found = collect_compared_numbers(clean.results)
     assert {path for path, one in found.items() if one.interval} >= {
         "tuning.horizontal.sigma_z_m", "tuning.horizontal.sigma_a_two_state_m_s2", "clock.offset_s",
     }  # fmt: skip
@@ -190,7 +194,7 @@ def aid_axis(nis_mean: float) -> AidAxis:
 def test_diff_of_aiding_sources_excludes_the_position_source(clean):
     axes = aid_axis(1.2), aid_axis(0.9)
     judged = {"gnss_vel": aid(*axes, rejected_fraction=0.1), "ev_pos": aid(*axes)}
-    found = collect_numbers(structs.replace(clean.results, aids=judged))
+    found = collect_compared_numbers(structs.replace(clean.results, aids=judged))
     of_aids = {path: one for path, one in found.items() if path.startswith("aids.")}
     # external vision is the source itself, and listed by axis
     assert {path.split(".")[1] for path in of_aids} == {"gnss_vel"}
@@ -202,7 +206,7 @@ def test_diff_of_aiding_sources_excludes_the_position_source(clean):
         "share",
     )
     source = structs.replace(clean.results.source, kind="gnss")
-    found = collect_numbers(structs.replace(clean.results, source=source, aids=judged))
+    found = collect_compared_numbers(structs.replace(clean.results, source=source, aids=judged))
     assert "ev_pos" in {path.split(".")[1] for path in found}
 
 

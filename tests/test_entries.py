@@ -21,7 +21,7 @@ from px4fuse.classroom.grading.entries import (
     parse_moodle_time,
     read_overrides,
 )
-from px4fuse.classroom.grading.model import Override, Submission
+from px4fuse.classroom.grading.model import GradeOverride, Submission
 from px4fuse.classroom.grading.outputs import feedback_text
 from px4fuse.classroom.grading.rubric import read_rubric
 from px4fuse.classroom.grading.submissions import parse_submission_path
@@ -69,17 +69,17 @@ def test_grade_attempt_option_selects_the_report_that_counts(attempt, points) ->
 def test_grade_of_late_report_has_points_deducted() -> None:
     term = Course(RUBRIC, due=DUE, late_rule=parse_late_rule("10%/day"))
     (ada, _), _ = make_grades(THREE, term)
-    assert (ada.late_s, ada.deduction, ada.total) == (46 * 3600.0, 2.0, 5.0)
+    assert (ada.lateness_s, ada.deducted_points, ada.total) == (46 * 3600.0, 2.0, 5.0)
     assert ada.submission_time == "2026-11-22 10:00"
     # the best attempt is the one after deduction
     files = {blackboard("ada", "20-11-00-00"): graded_report("", 6.0),
              blackboard("ada", "22-10-00-00"): graded_report("", 7.0)}  # fmt: skip
     (ada, _), _ = make_grades(files, replace(term, attempt="best"))
-    assert (ada.late_s, ada.deduction, ada.total) == (0.0, 0.0, 6.0)
+    assert (ada.lateness_s, ada.deducted_points, ada.total) == (0.0, 0.0, 6.0)
 
 
 @pytest.mark.parametrize(
-    ("due", "rule", "late_s", "off"),
+    ("due", "rule", "lateness_s", "off"),
     [
         (DUE, "100%/day", 46 * 3600.0, 10.0),  # points are never negative
         # end of summer time: on 25 October the hour from 2 to 3 occurs twice
@@ -91,9 +91,9 @@ def test_grade_of_late_report_has_points_deducted() -> None:
         ),
     ],
 )
-def test_grade_of_very_late_report_is_not_below_zero(due, rule, late_s, off) -> None:
+def test_grade_of_very_late_report_is_not_below_zero(due, rule, lateness_s, off) -> None:
     (ada, _), _ = make_grades(THREE, Course(RUBRIC, due=due, late_rule=parse_late_rule(rule)))
-    assert (ada.late_s, ada.deduction) == (late_s, off)
+    assert (ada.lateness_s, ada.deducted_points) == (lateness_s, off)
     assert ada.total == 0.0
 
 
@@ -103,16 +103,16 @@ def test_grade_uses_zip_entry_time_only_to_order_reports() -> None:
     files = {second: graded_report("", 7.0), first: graded_report("", 9.0)}
     term = Course(RUBRIC, due=DUE, late_rule=parse_late_rule("10%/day"))
     (_, grace), _ = make_grades(files, term, packed=packed)
-    assert (grace.total, grace.late_s, grace.submission_time) == (7.0, None, "")
+    assert (grace.total, grace.lateness_s, grace.submission_time) == (7.0, None, "")
     assert "no points" in grace.flags[0]
     # a late mark without a time has no deduction either
     (_, grace), _ = make_grades({"hoppergrace_LATE_7_8_r.pdf": graded_report("", 7.0)}, term)
-    assert (grace.late_s, grace.total) == (None, 7.0)
+    assert (grace.lateness_s, grace.total) == (None, 7.0)
     assert "Canvas marks the file as late" in grace.flags[0]
 
 
 @pytest.mark.parametrize(
-    ("extension", "grace_s", "late_s"),
+    ("extension", "grace_s", "lateness_s"),
     [
         ("", 0.0, 46 * 3600.0),
         ("2026-11-22 09:00", 0.0, 3541.0),
@@ -120,11 +120,13 @@ def test_grade_uses_zip_entry_time_only_to_order_reports() -> None:
         ("2026-11-22", 0.0, 0.0),
     ],
 )
-def test_due_date_extension_and_grace_period_reduce_lateness(extension, grace_s, late_s) -> None:
+def test_due_date_extension_and_grace_period_reduce_lateness(
+    extension, grace_s, lateness_s
+) -> None:
     term = Course(RUBRIC, due=DUE, grace_s=grace_s, late_rule=parse_late_rule("10%/day"))
     people = (replace(PEOPLE[0], extended_due=extension), *PEOPLE[1:])
     (ada, _), _ = make_grades(THREE, term, people=people)
-    assert (ada.late_s, ada.deduction > 0.0) == (late_s, late_s > 0.0)
+    assert (ada.lateness_s, ada.deducted_points > 0.0) == (lateness_s, lateness_s > 0.0)
 
 
 def test_invalid_due_date_extension_error_names_the_student() -> None:
@@ -269,8 +271,8 @@ def test_instructor_overrides_replace_points_and_add_comments(tmp_path) -> None:
     )  # fmt: skip
     (ada, grace), notes = make_grades(TWO, overrides=rows)
     assert ada.overrides == {
-        "A": Override(9.5, "A good idea."), "total": Override(8.0, "Agreed."),
-        "": Override(None, "Come and\nsee me."),
+        "A": GradeOverride(9.5, "A good idea."), "total": GradeOverride(8.0, "Agreed."),
+        "": GradeOverride(None, "Come and\nsee me."),
     }  # fmt: skip
     assert (ada.counted_report.points, ada.total, grace.total) == (15.5, 8.0, 3.0)
     told = ("student 1 has no item 'C'", "student 2 has no item 'B'", "no student has the id 3")
@@ -307,11 +309,11 @@ def test_grades_download_includes_students_without_report(tmp_path) -> None:
         tmp_path, "1,A,9.5,Good.", "1,,,Come.", "1,total,8,Agreed.", "2,total,5,Shown."
     )
     grades, notes = make_grades({"1.pdf": TWO["1.pdf"]}, overrides=rows)
-    again: dict[str, dict[str, Override]] = {}
+    again: dict[str, dict[str, GradeOverride]] = {}
     for _, _, owner, boxes, kept in map(_make_points_inputs, grades):
         for item, points, comment in (*((a, c, d) for a, _, c, d in boxes), *kept):
             if points is not None or comment:
-                again.setdefault(owner, {})[item] = Override(points, comment)
+                again.setdefault(owner, {})[item] = GradeOverride(points, comment)
     assert (again, notes) == (rows, ())
 
 
@@ -335,17 +337,17 @@ def test_instructor_override_without_submission_gives_points(tmp_path) -> None:
 
 def test_instructor_overrides_csv_accepts_decimal_commas(tmp_path) -> None:
     rows = write_overrides(tmp_path, "1;A;7,5;", head="\ufeffid;item;points;comment")
-    assert rows == {"1": {"A": Override(7.5)}}
+    assert rows == {"1": {"A": GradeOverride(7.5)}}
 
 
 @pytest.mark.parametrize(
     ("row", "says"),
     [
-        ("1,A,abc,", "row 2: points 'abc' are not a number of 0 or more"),
+        ("1,A,abc,", "row 2: the points 'abc' are not a number of 0 or more"),
         ("1,A,-1,", "are not a number of 0 or more"),
         ("1,A,nan,", "are not a number of 0 or more"),
         ("1,A,1_5,", "are not a number of 0 or more"),
-        ("1,,5,", "points 5 need the title of an item, or total"),
+        ("1,,5,", "the points 5 need a rubric title or 'total' as item"),
         ("1,A,5,\n1,A,6,", "student 1 has two rows for the item A"),
     ],
 )
@@ -400,8 +402,8 @@ def test_invalid_due_time_or_late_rule_raises_one_line_error(read, said, texts) 
 
 
 def test_late_rule_deducts_points_per_started_day_up_to_limit() -> None:
-    for late_s, off in ((0.0, 0), (1.0, 12), (86_400.0, 12), (86_400.5, 24), (1e9, 120)):
-        assert parse_late_rule("10%/day").compute_deduction(late_s, 120.0) == off
+    for lateness_s, off in ((0.0, 0), (1.0, 12), (86_400.0, 12), (86_400.5, 24), (1e9, 120)):
+        assert parse_late_rule("10%/day").compute_deduction(lateness_s, 120.0) == off
     # a rule may state a limit, and hours
     assert parse_late_rule("1 % / hour up to 5%").compute_deduction(3600.0 * 3.5, 100.0) == 4.0
     assert parse_late_rule("1%/hour up to 5%").compute_deduction(1e6, 100.0) == 5.0

@@ -175,7 +175,7 @@ class TestForm:
         points, comment = check_points("answers", found, key=key())
         assert points == 0.3
         assert "mistakes 30 of 30, sizes 0 of 15" in comment
-        assert "you named dropout, which is right: " in comment.lower()
+        assert "you named dropout, which is right (" in comment.lower()
         points, comment = check_points("answers", with_form(["yaw"], student__id="s01"), key=key())
         assert points == 0.0
         assert (
@@ -410,7 +410,7 @@ class TestClassFlags:
         for flag in (flag for flags in made.values() for flag in flags):
             assert re.fullmatch(r"[A-Z].*\.", flag)
             assert flag.isprintable()
-        assert "The id in this report is also in the report of" in made["5.pdf"][0]
+        assert "The student id in this report is also in the report of" in made["5.pdf"][0]
         assert "identical to the PDF of" in made["8.pdf"][0]
 
     def test_two_reports_with_one_student_id_are_flagged(self):
@@ -420,10 +420,12 @@ class TestClassFlags:
         ]
         assert flag_equal_contents(two) == {
             "1.pdf": [
-                "The id in this report is also in the report of Student1 Name1, 1001 (b.pdf)."
+                "The student id in this report is also in the report of "
+                "Student1 Name1, 1001 (b.pdf)."
             ],
             "b.pdf": [
-                "The id in this report is also in the report of Student1 Name1, 1001 (1.pdf)."
+                "The student id in this report is also in the report of "
+                "Student1 Name1, 1001 (1.pdf)."
             ],
         }
 

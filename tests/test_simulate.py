@@ -63,7 +63,7 @@ def test_each_simulated_fault_size_has_limits() -> None:
 
 def motion_of(scenario, mistakes=NO_FAULTS):
     return plan_flight(
-        scenario, mistakes, sensors.random_stream(scenario, sensors.RandomStream.WANDER)
+        scenario, mistakes, sensors.make_random_generator(scenario, sensors.RandomStream.WANDER)
     )
 
 

@@ -5,12 +5,12 @@ import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-from px4fuse.batch.inputs import InputResults, ProgressCallback, Results, read_inputs
+from px4fuse.batch.inputs import InputResults, ProgressCallback, Results, read_diff_inputs
 from px4fuse.batch.measures import (
     ABSOLUTE_TOLERANCE,
     RELATIVE_TOLERANCE,
     ComparedNumber,
-    collect_numbers,
+    collect_compared_numbers,
 )
 from px4fuse.batch.rows import find_value
 from px4fuse.comparison.model import FILTER_NAMES, FilterSummary
@@ -59,7 +59,7 @@ def diff(
     LogError, MissingDataError, ResultsError
         A file cannot be read or is not from ``px4fuse compare``, or A and B are the same file.
     """
-    return list_changes(*read_inputs(Path(a), Path(b), progress))
+    return list_changes(*read_diff_inputs(Path(a), Path(b), progress))
 
 
 def list_changes(a: InputResults, b: InputResults) -> contract.ChangeResults:
@@ -70,7 +70,11 @@ def list_changes(a: InputResults, b: InputResults) -> contract.ChangeResults:
         a=_describe_input(a),
         b=_describe_input(b),
         settings=tuple(_list_setting_changes(a.results, b.results)),
-        numbers=tuple(compare_numbers(collect_numbers(a.results), collect_numbers(b.results))),
+        numbers=tuple(
+            compare_numbers(
+                collect_compared_numbers(a.results), collect_compared_numbers(b.results)
+            )
+        ),
         findings=findings,
         worse=tuple(_describe_worse_verdicts(a.results, b.results, findings)),
         provenance=provenance(shlex.join(["px4fuse", "diff", a.file_name, b.file_name])),
@@ -91,14 +95,14 @@ def _describe_input(diff_input: InputResults) -> contract.DiffInput:
 def _list_setting_changes(
     results_a: Results, results_b: Results
 ) -> Iterator[contract.SettingChange]:
-    values_a, values_b = (
+    settings_a, settings_b = (
         {label: find_value(results, path) for label, path in SETTING_PATHS_BY_LABEL.items()}
         | _collect_parameters(results)
         for results in (results_a, results_b)
     )
-    for name in {**values_a, **values_b}:
-        if (value_a := values_a.get(name)) != (value_b := values_b.get(name)):
-            yield contract.SettingChange(name, value_a, value_b)
+    for name in {**settings_a, **settings_b}:
+        if (setting_a := settings_a.get(name)) != (setting_b := settings_b.get(name)):
+            yield contract.SettingChange(name, setting_a, setting_b)
 
 
 def _collect_parameters(results: Results) -> dict[str, float]:
@@ -152,9 +156,11 @@ def _list_finding_changes(
         (results_a, results_b, "A"),
     )
     for results, other_results, only_in in comparisons:
-        other_findings = {(finding.id, finding.severity) for finding in other_results.findings}
+        other_ids_and_severities = {
+            (finding.id, finding.severity) for finding in other_results.findings
+        }
         for finding in results.findings:
-            if (finding.id, finding.severity) not in other_findings:
+            if (finding.id, finding.severity) not in other_ids_and_severities:
                 yield contract.UnsharedFinding(
                     finding.id, finding.severity, finding.message, only_in
                 )
@@ -164,9 +170,9 @@ def _describe_worse_verdicts(
     results_a: Results, results_b: Results, findings: Iterable[contract.UnsharedFinding]
 ) -> Iterator[str]:
     """Yield sentences on filters that are consistent only in results A, and errors only in B."""
-    statistics_a, statistics_b = map(_mean_statistics_by_label, (results_a, results_b))
-    for label, (mean_a, was_consistent) in statistics_a.items():
-        mean_b, is_consistent = statistics_b.get(label, (mean_a, True))
+    nis_and_nees_a, nis_and_nees_b = map(_collect_nis_and_nees, (results_a, results_b))
+    for label, (mean_a, was_consistent) in nis_and_nees_a.items():
+        mean_b, is_consistent = nis_and_nees_b.get(label, (mean_a, True))
         if was_consistent and not is_consistent:
             ratio = mean_b**0.5
             factor_text = format_factor(max(ratio, 1.0 / ratio))
@@ -184,16 +190,16 @@ def _describe_worse_verdicts(
         yield f"New finding of severity error: {finding_id}."
 
 
-def _mean_statistics_by_label(results: Results) -> dict[str, tuple[float, bool]]:
+def _collect_nis_and_nees(results: Results) -> dict[str, tuple[float, bool]]:
     """Return each mean NIS and mean NEES by label, with True for a consistent filter."""
-    statistics: dict[str, tuple[float, bool]] = {}
+    mean_by_label: dict[str, tuple[float, bool]] = {}
     for axis, result in (find_value(results, "axes") or {}).items():
         for name, label in FILTER_NAMES.items():
             summary = result.filters[name]
             if isinstance(summary, FilterSummary):
                 is_consistent = not is_inconsistent(summary)
-                statistics[f"Mean NIS of {label}, {axis}"] = summary.nis_mean, is_consistent
+                mean_by_label[f"Mean NIS of {label}, {axis}"] = summary.nis_mean, is_consistent
             if (nees := find_value(summary, "truth.nees_position_mean")) is not None:
                 is_consistent = MAX_SQRT_MEAN_NEES**-2 <= nees <= MAX_SQRT_MEAN_NEES**2
-                statistics[f"Mean NEES of {label}, {axis}"] = nees, is_consistent
-    return statistics
+                mean_by_label[f"Mean NEES of {label}, {axis}"] = nees, is_consistent
+    return mean_by_label

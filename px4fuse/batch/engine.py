@@ -120,7 +120,7 @@ def run_jobs(
             task_jobs = futures.pop(future)
             if future.status not in ("finished", "error"):
                 raise Px4FuseError("the connection to the Dask scheduler was lost.")
-            # an exception here is a failure of the worker process: jobs catch their own errors
+            # jobs catch their own errors, so an exception means that the worker process failed
             error = future.exception()
             failure = JobFailure(one_line(f"{type(error).__name__}: {error}", 300))
             results = [failure] * len(task_jobs) if error else future.result()

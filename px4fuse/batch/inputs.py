@@ -20,9 +20,9 @@ from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_attached_results
 InputKind = Literal["log", "report", "results"]
 ProgressCallback = Callable[[str], None]
 Results = ComparisonResults | AidsResults
-# Settings with which a log is analysed if the other input has the results of another log
+# Settings of the other input with which a log is analysed, if both inputs are about different logs
 _FILTER_SETTINGS = {*Settings.__dataclass_fields__, "axes"}
-# Options that name input files: the analysis of a log never takes them from the other input
+# Options that are not copied from the other input if both are about the same log: input files
 _INPUT_FILE_SETTINGS = {"log", "system", "position"}
 
 
@@ -35,7 +35,7 @@ class InputResults:
     results: Results
 
 
-def read_inputs(
+def read_diff_inputs(
     a: Path, b: Path, progress: ProgressCallback = lambda _: None
 ) -> tuple[InputResults, InputResults]:
     """Read two logs, reports or results; analyse a log with the settings of the other input.
@@ -80,12 +80,12 @@ def _analyse_log(
     request = ComparisonRequest(log=str(path))
     if other_input is not None:
         is_same_log = other_input.results.log.sha256 in files_by_sha256([path])
-        copied_settings = (
+        copied_setting_names = (
             {*request.__struct_fields__} - _INPUT_FILE_SETTINGS if is_same_log else _FILTER_SETTINGS
         )
         request = replace(
             request,
-            **{name: getattr(other_input.results.request, name) for name in copied_settings},
+            **{name: getattr(other_input.results.request, name) for name in copied_setting_names},
         )
     analysis = diagnose_or_check_aids(request, progress)
     # to_json rounds all numbers, as in the results of a report

@@ -62,13 +62,13 @@ def find_logs(patterns: Iterable[str]) -> list[LogAddress]:
 def _find_pattern_logs(pattern: str) -> list[LogAddress]:
     if not pattern:
         raise SettingsError("the name of a log is empty", "Give files, folders, globs or URLs.")
-    file_system, root_path = _file_system(pattern)
+    file_system, root_path = _open_file_system(pattern)
     suffixes: tuple[str, ...] = ("",)
     try:
         if file_system.isdir(root_path):
             suffixes = LOG_SUFFIXES
             info_by_path = file_system.find(root_path, detail=True)
-        # a device or pipe is not excluded here: the worker process reports it
+        # also devices and pipes: the worker process rejects them with an error message
         elif file_system.exists(root_path):
             is_file = file_system.isfile(root_path)
             info_by_path = {root_path: file_system.info(root_path) if is_file else {}}
@@ -111,7 +111,7 @@ def local_file(address: str) -> Iterator[Path]:
     SettingsError
         The URL requires a package that is not installed.
     """
-    file_system, path = _file_system(address)
+    file_system, path = _open_file_system(address)
     if _is_local(file_system):
         yield Path(path)
         return
@@ -127,7 +127,7 @@ def local_file(address: str) -> Iterator[Path]:
         yield local_path
 
 
-def _file_system(address: str) -> tuple[AbstractFileSystem, str]:
+def _open_file_system(address: str) -> tuple[AbstractFileSystem, str]:
     from fsspec.core import url_to_fs  # noqa: PLC0415 - needs the extra `batch`
 
     try:

@@ -17,21 +17,21 @@ from px4fuse.flight.ekf2_parameters import AIDS
 from px4fuse.results.contract import AidsResults, ComparisonResults, Interval
 
 # Rows of measures.csv; "interval" is the field in the results that contains the 95 % interval
-NUMBER_DEFINITIONS = [
+COMPARED_NUMBER_DEFINITIONS = [
     row
     | {"path": row["path"].replace("FILTER", name), "label": row["label"].replace("FILTER", label)}
     for row in read_rows("measures.csv")
     for name, label in (FILTER_NAMES.items() if "FILTER" in row["path"] else [("", "")])
 ]
-# Maximum relative difference of two numbers that count as equal
+# px4fuse diff omits numbers of A and B that differ by at most this fraction
 RELATIVE_TOLERANCE = 0.01
-# Maximum difference of two numbers that count as equal, in the unit of the numbers
+# px4fuse diff omits numbers of A and B that differ by at most this, in the unit of the numbers
 ABSOLUTE_TOLERANCE = 0.001
 
 
 @dataclass(frozen=True)
 class ComparedNumber:
-    """Number in the results, with its 95 % interval if it is an estimate."""
+    """Number that ``px4fuse diff`` compares, with its 95 % interval if it is an estimate."""
 
     label: str
     unit: str
@@ -39,17 +39,17 @@ class ComparedNumber:
     interval: Interval | None = None
 
 
-def collect_numbers(results: ComparisonResults | AidsResults) -> dict[str, ComparedNumber]:
+def collect_compared_numbers(results: ComparisonResults | AidsResults) -> dict[str, ComparedNumber]:
     """Return the numbers that ``px4fuse diff`` compares, by path (``clock.offset_s``)."""
     axes = {} if isinstance(results, AidsResults) else results.axes
-    # EKF2 accepts or rejects north and east together: compare the fraction on one of these axes
+    # EKF2 rejects north and east together, so their rejected fractions are equal: keep only one
     horizontal_axis = next((name for name in ("north", "east", AISLE) if name in axes), "")
-    # the results of each axis already contain the numbers of the position source
+    # omit the aiding source of the positions: the results of the axes contain its numbers
     position_source_aids: tuple[str, ...] = ("ev_pos", "ev_hgt") if axes else ()
     if find_value(results, "source.kind") == "gnss":
         position_source_aids = ("gnss_pos",)
     numbers_by_path: dict[str, ComparedNumber] = {}
-    for definition in NUMBER_DEFINITIONS:
+    for definition in COMPARED_NUMBER_DEFINITIONS:
         pattern, interval_field = definition["path"], definition["interval"]
         for path, keys in _find_matching_paths(results, pattern):
             record_path, _, field_name = path.rpartition(".")

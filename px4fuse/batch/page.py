@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from px4fuse.batch.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, RESULT_PATHS
+from px4fuse.batch.rows import DONE, FAILED, FINDING_SEPARATOR, NOT_COMPARED, RESULT_PATH_BY_COLUMN
 from px4fuse.card.model import RATIO_AXIS_ENDS
 from px4fuse.core.text import count_noun, format_metres, format_number, format_ratio, join_first
 from px4fuse.filter.consistency import CONSISTENT_SIGMA_RATIOS
@@ -24,11 +24,11 @@ SIGMA_RATIO_COLUMNS = ("kf_source", "kf_truth", "ekf2_source", "ekf2_truth")
 SEVERITIES = list(SEVERITY_SIGNS)
 FILE_LINKS = (("Report (PDF)", "report"), ("Results (JSON)", "results"))
 # Columns with one value per axis; the page shows them after a click on a row
-AXIS_COLUMNS = [name for name, path in RESULT_PATHS.items() if "{" in path]
+AXIS_COLUMNS = [name for name, path in RESULT_PATH_BY_COLUMN.items() if "{" in path]
 # Columns with one value per log; the page shows them after a click on a row
 LOG_COLUMNS = [
     name
-    for name, path in RESULT_PATHS.items()
+    for name, path in RESULT_PATH_BY_COLUMN.items()
     if name
     not in (
         *AXIS_COLUMNS,
@@ -57,7 +57,7 @@ DROP_DOWN_LABELS = {
     "finding": "Finding",
     "remedy": "Action",
 }
-# Axes whose numbers the table shows: the first group that the log contains
+# Axes whose numbers the row of a log shows: the first of these groups with results
 MAIN_AXES_BY_PREFERENCE = (("aisle",), ("north", "east"), ("down",))
 
 #: Values of one log by column name, with the columns that :func:`_summarise_log` adds
@@ -76,7 +76,7 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
     version_text : str
         Name and version of px4fuse.
     """
-    logs = sort_logs(logs_from_table(table))
+    logs = sort_logs(summarise_logs(table))
     rows = [
         Row(
             _make_log_cells(log),
@@ -155,8 +155,10 @@ def _make_ratio_cell(ratio: float | None, name: str, verdict: str) -> Cell:
     if ratio is None:
         return Cell()
     filter_name, _, reference_name = name.partition("_")
-    emphasis = " loud" if verdict in ("overconfident", "underconfident") else ""
-    return Cell(format_ratio(ratio), ratio, style_class=f"{filter_name} {reference_name}{emphasis}")
+    emphasis_class = " loud" if verdict in ("overconfident", "underconfident") else ""
+    return Cell(
+        format_ratio(ratio), ratio, style_class=f"{filter_name} {reference_name}{emphasis_class}"
+    )
 
 
 def sort_logs(logs: Iterable[LogSummary]) -> list[LogSummary]:
@@ -214,7 +216,7 @@ def _format_value(value: str | float) -> str:
 
 
 def _make_drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Return label and options of the drop-down lists that filter logs, by frequency."""
+    """Return the lists that filter logs: label, and options (tag, text), most frequent first."""
     count_by_tag = Counter(tag for log in logs for tag in log["tags"])
     label_by_tag: Mapping[str, str] = {
         tag: label for log in logs for tag, label in log["tags"].items()
@@ -234,7 +236,7 @@ def _make_drop_down_lists(logs: Sequence[LogSummary]) -> list[tuple[str, list[tu
 # -------------------- combination of the table rows of each log
 
 
-def logs_from_table(table: pd.DataFrame) -> list[LogSummary]:
+def summarise_logs(table: pd.DataFrame) -> list[LogSummary]:
     """Combine the table rows (one per axis) of each log into one summary."""
     rows_by_log: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in table.to_dict("records"):

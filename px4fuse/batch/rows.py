@@ -20,7 +20,7 @@ from px4fuse.results.contract import ComparisonResults, Log
 
 DONE, NOT_COMPARED, FAILED = "done", "not compared", "failed"
 FINDING_SEPARATOR = ";"
-# Key of the noise estimate in the results; north and east have a common estimate
+# Key in the results for the noise estimate of north and east; other axes have their own name as key
 _TUNING_KEY_BY_AXIS = {"north": "horizontal", "east": "horizontal"}
 
 
@@ -30,11 +30,11 @@ def read_rows(name: str) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-_COLUMNS = read_rows("columns.csv")
-#: Path of each table column in the results; "" for a column that is computed
-RESULT_PATHS = {row["column"]: row["path"] for row in _COLUMNS}
+_COLUMN_DEFINITIONS = read_rows("columns.csv")
+#: Path of each column in the results (``log.firmware``); "" if px4fuse batch computes the column
+RESULT_PATH_BY_COLUMN = {row["column"]: row["path"] for row in _COLUMN_DEFINITIONS}
 #: Data type of each table column; missing numbers are NA, and missing texts are empty
-COLUMN_TYPES = {row["column"]: row["type"] for row in _COLUMNS}
+COLUMN_TYPES = {row["column"]: row["type"] for row in _COLUMN_DEFINITIONS}
 
 Row = dict[str, Any]
 
@@ -59,16 +59,18 @@ def make_axis_rows(results: ComparisonResults) -> list[Row]:
     is_offset_determinable = bool(find_value(results, "clock.is_determinable"))
     rows = []
     for name, axis in results.axes.items():
-        missing_filter = next(
+        unavailable_filter = next(
             (summary for summary in axis.filters.values() if isinstance(summary, Unavailable)), None
         )
         row = common_values | {
             "axis": name,
             "status": NOT_COMPARED if isinstance(axis.filters["kf"], Unavailable) else DONE,
-            "reason": f"{missing_filter.what}: {missing_filter.reason}" if missing_filter else "",
-            "remedy": missing_filter.remedy if missing_filter else "",
+            "reason": f"{unavailable_filter.what}: {unavailable_filter.reason}"
+            if unavailable_filter
+            else "",
+            "remedy": unavailable_filter.remedy if unavailable_filter else "",
         }
-        for column, path in RESULT_PATHS.items():
+        for column, path in RESULT_PATH_BY_COLUMN.items():
             if (
                 column not in row
                 and path
@@ -130,11 +132,11 @@ def find_first_action(card: Card) -> str:
     return card.do_this[0] if card.do_this else ""
 
 
-def with_log_path(row: Row, path: str) -> Row:
+def replace_name_by_path(row: Row, path: str) -> Row:
     """Replace the file name of the log by its path, in the command of a table row.
 
     >>> row = {"name": "a.ulg", "action": "px4fuse compare a.ulg --sigma-a 0.4"}
-    >>> with_log_path(row, "my logs/a.ulg")["action"]
+    >>> replace_name_by_path(row, "my logs/a.ulg")["action"]
     "px4fuse compare 'my logs/a.ulg' --sigma-a 0.4"
     """
     action = row.get("action", "")
@@ -146,7 +148,9 @@ def with_log_path(row: Row, path: str) -> Row:
 
 def collect_log_values(log: Log) -> Row:
     start_utc, record = format_utc_time(log.start_unix_s), {"log": log}
-    path_by_column = {name: path for name, path in RESULT_PATHS.items() if path.startswith("log.")}
+    path_by_column = {
+        name: path for name, path in RESULT_PATH_BY_COLUMN.items() if path.startswith("log.")
+    }
     return {name: find_value(record, path) for name, path in path_by_column.items()} | {
         "airframe": f"{airframe:g}" if (airframe := log.parameters.get("SYS_AUTOSTART")) else "",
         "date": f"{start_utc[:19]}Z" if start_utc else "",

@@ -26,7 +26,7 @@ from px4fuse.batch.rows import (
     clean_row,
     format_csv,
     make_table,
-    with_log_path,
+    replace_name_by_path,
 )
 from px4fuse.core.input_files import check_output_folder
 from px4fuse.core.reading import max_log_bytes
@@ -91,7 +91,7 @@ class _RunState:
     first_log_by_hash: dict[str, LogAddress] = field(default_factory=dict)
     failed_row_by_address: dict[str, Row] = field(default_factory=dict)
     # SHA-256 of logs that were finished in an earlier run
-    reused_hashes: set[str] = field(default_factory=set)
+    reused_log_hashes: set[str] = field(default_factory=set)
 
 
 def run_batch(
@@ -184,7 +184,7 @@ def run(
         request = ComparisonRequest(log="LOG", **settings)
     except TypeError as error:
         raise SettingsError(
-            f"a setting is not an argument of px4fuse.compare ({error})."
+            f"px4fuse.compare has no such setting ({error})", "Omit or correct the setting."
         ) from error
     if request.position is not None:
         raise SettingsError("A position file belongs to one flight. Omit `position` for many logs.")
@@ -264,7 +264,7 @@ def _cache_outcome(state: _RunState, log: LogAddress, outcome: LogOutcome | JobF
         return
     first_log = min(log, state.first_log_by_hash.get(outcome.sha256, log))
     if not outcome.rows:
-        state.reused_hashes.add(outcome.sha256)
+        state.reused_log_hashes.add(outcome.sha256)
     elif first_log is log:
         _write_log(state, log, outcome)
     state.hash_by_address[log.address] = outcome.sha256
@@ -307,15 +307,15 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
             reason = "another run of px4fuse batch changed the results of this log"
         return [{"status": status, "log_sha256": sha256, "reason": reason}]
 
-    def complete_rows() -> Iterator[Row]:
+    def make_complete_rows() -> Iterator[Row]:
         for log in logs:
             common_values = {"log": log.table_path, "name": log.name}
             common_values |= {"px4fuse": state.version, "settings": state.settings}
             for row in find_rows(log):
                 severities.update(row.get("severities", ()))
-                yield with_log_path(row, log.table_path) | common_values
+                yield replace_name_by_path(row, log.table_path) | common_values
 
-    table = make_table(complete_rows())
+    table = make_table(make_complete_rows())
     page = format_html(table, state.output.resolve().name, f"px4fuse {state.version}")
     contents = {
         state.output / "fleet.parquet": table.to_parquet(index=False),
@@ -323,4 +323,4 @@ def _write_table(state: _RunState, logs: Iterable[LogAddress]) -> BatchResult:
         state.output / "fleet.html": page.encode(),
     }
     write_all(contents)
-    return BatchResult(table, len(state.reused_hashes), frozenset(severities), tuple(contents))
+    return BatchResult(table, len(state.reused_log_hashes), frozenset(severities), tuple(contents))

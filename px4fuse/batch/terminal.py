@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from px4fuse.batch.measures import ABSOLUTE_TOLERANCE, RELATIVE_TOLERANCE
-from px4fuse.batch.page import SIGMA_RATIO_COLUMNS, LogSummary, logs_from_table, sort_logs
+from px4fuse.batch.page import SIGMA_RATIO_COLUMNS, LogSummary, sort_logs, summarise_logs
 from px4fuse.batch.rows import FAILED
-from px4fuse.core.text import format_number, format_ratio
+from px4fuse.core.text import count_noun, format_number, format_ratio
 from px4fuse.report.card_text import SEVERITY_SIGNS
 from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
@@ -39,7 +39,7 @@ def format_summary(batch_result: BatchResult) -> Page:
         page.write(template.format_map(reason).rstrip(), colour=colour)
     if (unlisted_count := len(reason_table) - MAX_LISTED_REASONS) > 0:
         page.write(f"fleet.html lists {unlisted_count} more reasons for logs without a result.")
-    sorted_logs = sort_logs(logs_from_table(batch_result.table))
+    sorted_logs = sort_logs(summarise_logs(batch_result.table))
     if sorted_logs:
         rows = [_make_log_row(log) for log in sorted_logs[:MAX_LISTED_LOGS]]
         page.table(
@@ -54,8 +54,8 @@ def format_summary(batch_result: BatchResult) -> Page:
     counts_text = ", ".join(f"{count} {status}" for status, count in counts.items())
     retry_note = " Run the same command to repeat failed logs." if FAILED in counts else ""
     page.write(
-        f"{len(logs)} logs: {counts_text}; from an earlier run: {batch_result.reused_count}."
-        f"{retry_note}"
+        f"{len(logs)} logs: {counts_text}. Results from an earlier run: "
+        f"{count_noun(batch_result.reused_count, 'log')}.{retry_note}"
     )
     return page
 

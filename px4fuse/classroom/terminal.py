@@ -23,7 +23,7 @@ def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count:
         for mistake in answer.mistakes or ("none",)
     )
     difficulties = [answer.difficulty for answer in key.answers if answer.difficulty is not None]
-    folder_text, key_text = (to_one_line(str(path)) for path in (folder, key_file))
+    folder_text, key_file_text = (to_one_line(str(path)) for path in (folder, key_file))
     flight_count = len(key.answers)
     text_by_label = {
         "Class": f"{count_noun(flight_count, 'student')}, {key.kind}",
@@ -35,7 +35,7 @@ def assignment_page(key: AnswerKey, folder: Path, key_file: Path, written_count:
         "size that px4fuse detects in 19 of 20 flights, divided by the size in the flight.",
         "Flights": f"{folder_text} ({written_count} logs written, {flight_count - written_count} "
         "existed already)",
-        "Answers": f"{key_text} (not for students: the file lists the injected faults)",
+        "Answers": f"{key_file_text} (not for students: the file lists the injected faults)",
     }
     if key.secret:
         text_by_label["Secret"] = (
@@ -58,17 +58,19 @@ def grading_page(outcome: GradeOutcome) -> Page:
         points_text = "–" if grade.total is None else f"{grade.total:g}"
         points_text += f" / {grade.max_points:g}"
         name = one_line(grade.student or grade.student_id, 60)
-        flag_count = f"{len(grade.flags) or ''}"
-        rows.append((name, grade.file_name, (status, status_colour), points_text, flag_count))
+        flag_count_text = f"{len(grade.flags) or ''}"
+        rows.append((name, grade.file_name, (status, status_colour), points_text, flag_count_text))
     page.table(
         ("student", "submission", "status", "points", "flags"), rows, right_aligned_columns=(3, 4)
     )
-    counts = Counter(report.status for report in outcome.reports)
-    counts_text = ", ".join(f"{count} {status}" for status, count in counts.most_common())
-    missing_count = sum(grade.counted_report is None for grade in outcome.grades)
+    report_count_by_status = Counter(report.status for report in outcome.reports)
+    counts_text = ", ".join(
+        f"{count} {status}" for status, count in report_count_by_status.most_common()
+    )
+    missing_student_count = sum(grade.counted_report is None for grade in outcome.grades)
     page.write(
         f"{len(outcome.reports)} submissions: {counts_text or 'none'}; no submission from "
-        f"{missing_count} of {len(outcome.grades)} students; verified in an earlier run: "
+        f"{missing_student_count} of {len(outcome.grades)} students; verified in an earlier run: "
         f"{outcome.reused_count} submissions"
     )
     for grade in outcome.grades:

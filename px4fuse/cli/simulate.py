@@ -219,7 +219,7 @@ def _check_options(assignment: Path | None) -> None:
 
 
 def _read_secret(file: Path | None) -> bytes | None:
-    from px4fuse.classroom.assignment.random_assignment import parse_secret
+    from px4fuse.classroom.assignment.random_assignment import derive_seed_from_secret
 
     if file is None:
         return None
@@ -231,7 +231,7 @@ def _read_secret(file: Path | None) -> bytes | None:
         name=name,
         size_remedy="Give a file with the secret as one line of text.",
     )
-    return parse_secret(secret_text, name)
+    return derive_seed_from_secret(secret_text, name)
 
 
 def _write_assignment(

@@ -1,11 +1,11 @@
-"""EKF2 topics of a simulated flight as PX4 v1.16 logs them, from px4fuse's model of EKF2.
+"""EKF2 topics of a simulated flight as PX4 v1.16 logs them, computed by :mod:`px4fuse.ekf2`.
 
-The model :mod:`px4fuse.ekf2` starts at rest with PX4's initial variances, and runs on the simulated
+This model of EKF2 starts at rest with PX4's initial variances, and runs on the simulated
 IMU and positions. Its error states are linearised about the true attitude.
 
 Outdoors, EKF2 fuses magnetometer and barometer. Indoors, its heading and height have a simulated
-slow error. vehicle_attitude is then simulated without the model, so that KF does not depend on EKF2
-parameters.
+slow error. Indoors, vehicle_attitude does not come from the model, so that KF does not depend on
+EKF2 parameters.
 """
 
 from collections.abc import Mapping
@@ -51,7 +51,11 @@ from px4fuse.flight.ekf2_parameters import (
     fill_with_defaults,
 )
 from px4fuse.simulation import sensors
-from px4fuse.simulation.ekf2_topics import VEHICLE_AID_SOURCE_HZ, Ekf2Output, make_ekf2_topics
+from px4fuse.simulation.ekf2_topics import (
+    VEHICLE_AID_SOURCE_LOG_RATE_HZ,
+    Ekf2Output,
+    make_ekf2_topics,
+)
 from px4fuse.simulation.faults import FaultSizes
 from px4fuse.simulation.motion import Motion, compute_attitude
 from px4fuse.simulation.scenario import Scenario
@@ -69,7 +73,7 @@ from px4fuse.trajectory.rotation import (
 # EKF2's prediction step (µs): EKF2_PREDICT_US
 PREDICTION_STEP_US = 10_000
 # σ (gauss) per axis of earth field and magnetometer bias at the start of the log
-FIELD_SIGMA_GAUSS = 0.03
+MAGNETIC_FIELD_SIGMA_GAUSS = 0.03
 # Time (s) without fusion of an aiding source after which EKF2 holds the position: EKF2_NOAID_TOUT
 # (fake_pos_control.cpp)
 NO_AID_TIMEOUT_S = 5.0
@@ -86,7 +90,7 @@ REST_MEASUREMENT_SIGMA = np.repeat([0.05, 0.0005, 0.06], 3)
 HEADING_SIGMA_RAD = 0.03
 # σ of EKF2's height (m) as PX4 v1.16 logs it in flight
 HEIGHT_SIGMA_M = 0.15
-# Maximum time (s) between two computations of the variances, which estimator_states contains
+# Maximum time (s) between two events at which the model computes variances for estimator_states
 MAX_EVENT_INTERVAL_S = 0.1
 
 
@@ -113,7 +117,7 @@ def make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | f
             aid.noise: faults.ekf2_noise_m or sensors.compute_reported_sigma_m(scenario, faults),
             aid.gate: faults.ekf2_gate,
             aid.delay: delay_ms,
-            # EKF2 does not fuse samples that are older than EKF2_DELAY_MAX
+            # EKF2 does not fuse older positions; with a clock jump, positions arrive late by it
             "EKF2_DELAY_MAX": max(defaults["EKF2_DELAY_MAX"], 100.0 + 1e3 * faults.clock_jump_s),
             "EKF2_PREDICT_US": PREDICTION_STEP_US,
         }
@@ -140,12 +144,14 @@ def simulate_ekf2(
     logged_values = {name: float(np.float32(value)) for name, value in log_parameters.items()}
     step_s = float(np.median(segment.step_s))
     if other_sensors:
-        magnetometer, barometer = other_sensors
+        magnetometer_topic, barometer_topic = other_sensors
         magnetometer_times_s, barometer_times_s = (
             sensors.to_seconds(sensors.get_time_us(topic)) - 0.5 * step_s for topic in other_sensors
         )
         # the barometer is EKF2's only height source outdoors
-        down_m = sensors.HOME_POSITION[2] - barometer.fields["baro_alt_meter"].astype(np.float64)
+        down_m = sensors.HOME_POSITION[2] - barometer_topic.fields["baro_alt_meter"].astype(
+            np.float64
+        )
         dead_zone_m, sample_weight = np.zeros(len(down_m)), np.ones(len(down_m))
         barometer_samples = select_samples_in_segment(
             segment, barometer_times_s, down_m, dead_zone_m, sample_weight
@@ -158,11 +164,11 @@ def simulate_ekf2(
             segment = add_field_states(
                 segment,
                 magnetometer_times_s,
-                magnetometer.fields["magnetometer_ga"].astype(np.float64),
+                magnetometer_topic.fields["magnetometer_ga"].astype(np.float64),
                 1.0,
                 # EKF2 initialises earth field and magnetometer bias on the ground
                 np.concatenate([sensors.EARTH_FIELD_GAUSS, np.zeros(3)]),
-                np.full(6, FIELD_SIGMA_GAUSS**2),
+                np.full(6, MAGNETIC_FIELD_SIGMA_GAUSS**2),
             )
     settings = fill_with_defaults(logged_values, *fused_aids)
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
@@ -171,8 +177,8 @@ def simulate_ekf2(
         settings=settings,
         segments=(segment,),
         received=_select_positions(source),
-        # without bit 0 of EKF2_EV_CTRL, EKF2 only tests the samples (ev_pos_control.cpp): fusion
-        # never starts
+        # without bit 0 of EKF2_EV_CTRL, EKF2 tests the samples but never starts fusion
+        # (ev_pos_control.cpp): no two samples arrive within start_interval_s = 0
         rules=rules
         if int(log_parameters[aid.switch]) & 1
         else replace(rules, start_interval_s=0.0),
@@ -185,9 +191,11 @@ def simulate_ekf2(
         max_interval_s=MAX_EVENT_INTERVAL_S,
     )
     model_run = run_configurations(inputs, [FilterConfiguration(settings)], {})[0]
-    output = _compute_output(inputs, model_run, time_us, true_quaternions)
-    aid_source_hz = VEHICLE_AID_SOURCE_HZ if faults.no_vvo else 0.0
-    return make_ekf2_topics(inputs, model_run, output, scenario.attitude_rate_hz, aid_source_hz)
+    ekf2_output = _compute_output(inputs, model_run, time_us, true_quaternions)
+    aid_source_log_rate_hz = VEHICLE_AID_SOURCE_LOG_RATE_HZ if faults.no_vvo else 0.0
+    return make_ekf2_topics(
+        inputs, model_run, ekf2_output, scenario.attitude_rate_hz, aid_source_log_rate_hz
+    )
 
 
 def _make_segment(
@@ -218,7 +226,7 @@ def _make_segment(
     attitude_error_rad[:, HEADING] = sensors.simulate_attitude_error(
         scenario, faults, time_s
     ).as_rotvec()[:, HEADING]
-    force_m_s2, rate_rad_s = sensors.measure_imu(
+    specific_force_m_s2, rate_rad_s = sensors.measure_imu(
         scenario,
         faults,
         motion,
@@ -227,7 +235,7 @@ def _make_segment(
         REST_BEFORE_LOG_S * scenario.imu_rate_hz,
     )
     state, covariance = _compute_state_at_rest(
-        body_to_ned[0], force_m_s2[0], rate_rad_s[0], float(attitude_error_rad[0, HEADING])
+        body_to_ned[0], specific_force_m_s2[0], rate_rad_s[0], float(attitude_error_rad[0, HEADING])
     )
     variance = np.diagonal(covariance).copy()
     sigma = np.sqrt(variance)
@@ -260,7 +268,7 @@ def _make_segment(
 
 
 def _compute_state_at_rest(
-    rotation: Array, force_m_s2: Array, rate_rad_s: Array, heading_error_rad: float
+    rotation: Array, specific_force_m_s2: Array, rate_rad_s: Array, heading_error_rad: float
 ) -> tuple[Array, Array]:
     """Compute EKF2's error state and covariance after REST_BEFORE_LOG_S at rest.
 
@@ -268,11 +276,11 @@ def _compute_state_at_rest(
     specific force -g, angular rate 0 and velocity 0.
     """
     H = np.zeros((9, STATE_COUNT))
-    H[0:3, THETA] = -skew(rotation @ force_m_s2)
+    H[0:3, THETA] = -skew(rotation @ specific_force_m_s2)
     H[0:3, ACCELEROMETER_BIAS] = -rotation
     H[3:6, GYRO_BIAS] = np.eye(3)
     H[6:9, VELOCITY] = np.eye(3)
-    z = np.concatenate([-GRAVITY_M_S2 - rotation @ force_m_s2, rate_rad_s, np.zeros(3)])
+    z = np.concatenate([-GRAVITY_M_S2 - rotation @ specific_force_m_s2, rate_rad_s, np.zeros(3)])
     P = np.diag(INITIAL_STATE_SIGMA**2)
     x = np.zeros(STATE_COUNT)
     P[HEADING, HEADING], x[HEADING] = HEADING_SIGMA_RAD**2, heading_error_rad
@@ -323,7 +331,7 @@ def _compute_output(
     segment = model_run.segment
     lag_steps = round(inputs.horizon_s / inputs.mean_step_s)
     state, _ = compute_delayed_states(model_run, 0)
-    resets, is_step_aided = _hold_without_aiding(model_run, state)
+    resets, is_step_aided = _hold_unaided_position(model_run, state)
     reset_sum_m = np.zeros((len(state), 3))
     for step, reset_m in resets:
         reset_sum_m[step:, :2] += reset_m
@@ -350,7 +358,7 @@ def _compute_output(
     )
 
 
-def _hold_without_aiding(
+def _hold_unaided_position(
     model_run: SegmentRun, state: Array
 ) -> tuple[list[tuple[int, Array]], BoolArray]:
     """Hold the position in ``state`` constant without aiding, like PX4 (fake_pos_control.cpp).
@@ -360,9 +368,9 @@ def _hold_without_aiding(
     """
     events, time_s = model_run.events[0], model_run.segment.time_s
     aid_events = np.flatnonzero(model_run.fused[:, 0] | model_run.reset[:, 0])
-    last_aid_s = np.zeros(len(time_s))
-    last_aid_s[events.end_step[aid_events]] = time_s[events.end_step[aid_events]]
-    is_step_aided = time_s - np.maximum.accumulate(last_aid_s) <= NO_AID_TIMEOUT_S
+    aiding_times_s = np.zeros(len(time_s))
+    aiding_times_s[events.end_step[aid_events]] = time_s[events.end_step[aid_events]]
+    is_step_aided = time_s - np.maximum.accumulate(aiding_times_s) <= NO_AID_TIMEOUT_S
     last_aided_steps = np.maximum.accumulate(np.arange(len(time_s)) * is_step_aided)
     state[:, HORIZONTAL_POSITION] = state[last_aided_steps, HORIZONTAL_POSITION]
     state[~is_step_aided, VELOCITY.start : VELOCITY.start + 2] = 0.0

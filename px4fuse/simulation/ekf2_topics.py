@@ -18,7 +18,7 @@ from px4fuse.simulation.ulog_writer import Topic, make_topic
 
 # Logging rate (Hz) of estimator_aid_src_ev_pos on a vehicle (PX4 v1.16, logged_topics.cpp); PX4's
 # simulation (SITL) logs all messages
-VEHICLE_AID_SOURCE_HZ = 2.0
+VEHICLE_AID_SOURCE_LOG_RATE_HZ = 2.0
 # Logging rates (Hz) of EKF2 topics and vehicle_magnetometer on a vehicle (PX4 v1.16,
 # logged_topics.cpp)
 STATES_LOG_RATE_HZ = 2.0
@@ -81,81 +81,88 @@ class Ekf2Output:
         is_published = end_step < len(self.time_us) - self.lag_steps
         events = np.flatnonzero(is_message_event & is_published)
         times_s = sensors.to_seconds(self.time_us[end_step[events]])
-        return events[sensors.keep_at_rate(times_s, rate_hz)]
+        return events[sensors.is_kept_at_rate(times_s, rate_hz)]
 
 
 def make_ekf2_topics(
     model_inputs: Inputs,
     model_run: SegmentRun,
-    output: Ekf2Output,
-    attitude_hz: float,
-    aid_source_hz: float,
+    ekf2_output: Ekf2Output,
+    attitude_rate_hz: float,
+    aid_source_log_rate_hz: float,
 ) -> tuple[Topic, ...]:
     """Return the EKF2 topics of a flight, without empty topics.
 
-    ``attitude_hz`` is the rate of vehicle_attitude, and ``aid_source_hz`` the rate at which
-    estimator_aid_src_ev_pos is logged (0: all messages).
+    ``attitude_rate_hz`` is the rate of vehicle_attitude, and ``aid_source_log_rate_hz`` the rate at
+    which estimator_aid_src_ev_pos is logged (0: all messages).
     """
     topics = (
-        _make_local_position_topic(model_inputs, output),
-        _make_states_topic(model_inputs, model_run, output),
-        *_make_position_aid_topics(model_inputs, model_run, output, aid_source_hz),
-        *_make_barometer_topics(model_inputs, model_run, output),
-        *_make_magnetometer_topics(model_inputs, model_run, output, attitude_hz),
-        _make_flags_topic(model_inputs, model_run, output),
+        _make_local_position_topic(model_inputs, ekf2_output),
+        _make_states_topic(model_inputs, model_run, ekf2_output),
+        *_make_position_aid_topics(model_inputs, model_run, ekf2_output, aid_source_log_rate_hz),
+        *_make_barometer_topics(model_inputs, model_run, ekf2_output),
+        *_make_magnetometer_topics(model_inputs, model_run, ekf2_output, attitude_rate_hz),
+        _make_flags_topic(model_inputs, model_run, ekf2_output),
     )
     return tuple(topic for topic in topics if len(topic.fields["timestamp"]))
 
 
-def _make_local_position_topic(model_inputs: Inputs, output: Ekf2Output) -> Topic:
+def _make_local_position_topic(model_inputs: Inputs, ekf2_output: Ekf2Output) -> Topic:
     logged_steps = np.flatnonzero(
-        sensors.keep_at_rate(sensors.to_seconds(output.time_us), LOCAL_POSITION_LOG_RATE_HZ)
+        sensors.is_kept_at_rate(sensors.to_seconds(ekf2_output.time_us), LOCAL_POSITION_LOG_RATE_HZ)
     )
-    reset_steps = np.array([step for step, _ in output.resets], dtype=np.intp)
-    resets_m = np.array([[0.0, 0.0], *(reset_m for _, reset_m in output.resets)])
+    reset_steps = np.array([step for step, _ in ekf2_output.resets], dtype=np.intp)
+    reset_sizes_m = np.array([[0.0, 0.0], *(reset_m for _, reset_m in ekf2_output.resets)])
     reset_count = np.searchsorted(reset_steps, logged_steps, side="right")
-    fields = sensors.make_timestamps(output.time_us[logged_steps], PUBLICATION_DELAY_US)
+    fields = sensors.make_timestamps(ekf2_output.time_us[logged_steps], PUBLICATION_DELAY_US)
     fields |= sensors.split_vectors(
-        {"": output.position_m[logged_steps], "v": output.velocity_m_s[logged_steps]}
+        {"": ekf2_output.position_m[logged_steps], "v": ekf2_output.velocity_m_s[logged_steps]}
     )
-    is_step_aided = output.is_step_aided[np.maximum(logged_steps - output.lag_steps, 0)]
-    fields |= {"delta_xy": resets_m[reset_count], "xy_reset_counter": reset_count % 256}
+    is_step_aided = ekf2_output.is_step_aided[np.maximum(logged_steps - ekf2_output.lag_steps, 0)]
+    fields |= {"delta_xy": reset_sizes_m[reset_count], "xy_reset_counter": reset_count % 256}
     fields |= dict.fromkeys(("xy_valid", "v_xy_valid"), is_step_aided)
     if model_inputs.aid == GNSS_POS:
         fields |= dict(zip(("ref_lat", "ref_lon", "ref_alt"), sensors.HOME_POSITION, strict=True))
     return make_topic("vehicle_local_position", fields)
 
 
-def _make_states_topic(model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output) -> Topic:
-    """Make estimator_states as PX4 v1.16 logs it: horizontal positions are 0."""
+def _make_states_topic(
+    model_inputs: Inputs, model_run: SegmentRun, ekf2_output: Ekf2Output
+) -> Topic:
+    """Make estimator_states as PX4 v1.16 logs it, with horizontal positions of 0."""
     end_step = model_run.events[0].end_step
-    logged_indices = output.find_logged_messages(
+    logged_indices = ekf2_output.find_logged_messages(
         np.diff(end_step, prepend=0) > 0, end_step, STATES_LOG_RATE_HZ
     )
     logged_steps = end_step[logged_indices]
     states = np.zeros((len(logged_steps), 25), np.float32)
-    states[:, 0:4] = output.delayed_attitude[logged_steps]
-    states[:, 4 : 4 + output.delayed_states.shape[1]] = output.delayed_states[logged_steps]
+    states[:, 0:4] = ekf2_output.delayed_attitude[logged_steps]
+    states[:, 4 : 4 + ekf2_output.delayed_states.shape[1]] = ekf2_output.delayed_states[
+        logged_steps
+    ]
     # v1.16 stores the horizontal position outside this vector, as latitude and longitude
     states[:, 7:9] = 0.0
     if model_inputs.aid == GNSS_POS:
         # with a global origin, v1.16 logs the altitude instead of the down position
         states[:, 9] -= sensors.HOME_POSITION[2]
-    covariances = np.zeros((len(logged_steps), 24), np.float32)
-    covariances[:, : model_run.variance.shape[2]] = model_run.variance[logged_indices + 1, 0]
-    fields = output.make_timestamps(logged_steps) | {"states": states, "covariances": covariances}
+    variances = np.zeros((len(logged_steps), 24), np.float32)
+    variances[:, : model_run.variance.shape[2]] = model_run.variance[logged_indices + 1, 0]
+    fields = ekf2_output.make_timestamps(logged_steps) | {
+        "states": states,
+        "covariances": variances,
+    }
     return make_topic("estimator_states", fields)
 
 
 def _make_position_aid_topics(
-    model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output, rate_hz: float
+    model_inputs: Inputs, model_run: SegmentRun, ekf2_output: Ekf2Output, rate_hz: float
 ) -> tuple[Topic, ...]:
     """Make estimator_aid_src_* of the position source, with one message per usable position."""
     events, received_positions = model_run.events[0], model_inputs.received
     velocity_m_s = received_positions.velocity_m_s
-    logged_indices = output.find_logged_messages(events.usable, events.end_step, rate_hz)
+    logged_indices = ekf2_output.find_logged_messages(events.usable, events.end_step, rate_hz)
     steps, sample_indices = events.end_step[logged_indices], events.sample[logged_indices]
-    timestamps = output.make_timestamps(steps, events.time_s[logged_indices])
+    timestamps = ekf2_output.make_timestamps(steps, events.time_s[logged_indices])
     measured_m = received_positions.position_m[sample_indices, :2]
     north, east = measured_m.T
     innovation_arrays = (model_run.innovation, model_run.innovation_variance, model_run.noise)
@@ -167,14 +174,14 @@ def _make_position_aid_topics(
     innovation, innovation_variance = np.where(
         np.isnan(innovation[:, :1]),
         (
-            measured_m - output.delayed_states[steps][:, POSITION][:, :2],
+            measured_m - ekf2_output.delayed_states[steps][:, POSITION][:, :2],
             model_run.variance[logged_indices + 1, 0, HORIZONTAL_POSITION] + noise_variance,
         ),
         (innovation, innovation_variance),
     )
     fusion_times_us = np.where(
         model_run.fused[logged_indices, 0] | model_run.reset[logged_indices, 0],
-        output.time_us[steps],
+        ekf2_output.time_us[steps],
         -1,
     )
     newest_fusion_us = np.maximum.accumulate(fusion_times_us)
@@ -213,15 +220,17 @@ def _make_position_aid_topics(
 
 
 def _make_barometer_topics(
-    model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output
+    model_inputs: Inputs, model_run: SegmentRun, ekf2_output: Ekf2Output
 ) -> list[Topic]:
     """Return estimator_aid_src_baro_hgt, or nothing without barometer."""
     height_samples, end_step = model_run.segment.height_samples, model_run.events[0].end_step
     if height_samples is None or model_run.height_filter is None:
         return []
     updates = model_run.height_filter.make_update_table(BAROMETER.name, 0, end_step.astype(float))
-    updates = updates[updates["fused_at_s"] < len(output.time_us) - output.lag_steps].iloc[1:]
-    updates = updates[sensors.keep_at_rate(updates.index.to_numpy(), OTHER_AIDS_LOG_RATE_HZ)]
+    updates = updates[
+        updates["fused_at_s"] < len(ekf2_output.time_us) - ekf2_output.lag_steps
+    ].iloc[1:]
+    updates = updates[sensors.is_kept_at_rate(updates.index.to_numpy(), OTHER_AIDS_LOG_RATE_HZ)]
     innovation, innovation_variance, is_rejected, is_fused, update_steps = updates.to_numpy().T
     measurement_times_s, steps = updates.index.to_numpy(), update_steps.astype(np.intp)
     measured_m = (
@@ -233,7 +242,7 @@ def _make_barometer_topics(
         _make_aid_source_topic(
             BAROMETER,
             model_inputs.settings,
-            output.make_timestamps(steps, measurement_times_s),
+            ekf2_output.make_timestamps(steps, measurement_times_s),
             measured_m,
             (innovation, innovation_variance, noise_variance),
             (is_rejected > 0, is_fused > 0),
@@ -242,7 +251,7 @@ def _make_barometer_topics(
 
 
 def _make_magnetometer_topics(
-    model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output, attitude_hz: float
+    model_inputs: Inputs, model_run: SegmentRun, ekf2_output: Ekf2Output, attitude_rate_hz: float
 ) -> list[Topic]:
     """Return the topics that need a magnetometer, or nothing without magnetometer."""
     field, settings = model_run.segment.field, model_inputs.settings
@@ -250,7 +259,7 @@ def _make_magnetometer_topics(
     if field is None:
         return []
     has_sample = np.isfinite(model_run.magnetometer_updates[:, 2, 0, 0])
-    logged_indices = output.find_logged_messages(has_sample, end_step, OTHER_AIDS_LOG_RATE_HZ)
+    logged_indices = ekf2_output.find_logged_messages(has_sample, end_step, OTHER_AIDS_LOG_RATE_HZ)
     logged_steps = end_step[logged_indices]
     innovation, innovation_variance, fused_fraction = np.moveaxis(
         model_run.magnetometer_updates[logged_indices, :, 0], 1, 0
@@ -259,30 +268,30 @@ def _make_magnetometer_topics(
     noise_variance = np.full(innovation.shape, settings[MAG.noise] ** 2)
     is_fused = fused_fraction[:, 0] > 0.0
     attitude_steps, status_steps = (
-        np.flatnonzero(sensors.keep_at_rate(sensors.to_seconds(time_us), rate_hz))
+        np.flatnonzero(sensors.is_kept_at_rate(sensors.to_seconds(time_us), rate_hz))
         for time_us, rate_hz in (
-            (output.time_us, attitude_hz),
-            (output.time_us[: -output.lag_steps], FLAGS_LOG_RATE_HZ),
+            (ekf2_output.time_us, attitude_rate_hz),
+            (ekf2_output.time_us[: -ekf2_output.lag_steps], FLAGS_LOG_RATE_HZ),
         )
     )
     return [
         sensors.make_attitude_topic(
             "vehicle_attitude",
-            output.time_us[attitude_steps],
+            ekf2_output.time_us[attitude_steps],
             PUBLICATION_DELAY_US,
-            output.attitude[attitude_steps],
+            ekf2_output.attitude[attitude_steps],
         ),
         _make_aid_source_topic(
             MAG,
             settings,
-            output.make_timestamps(logged_steps),
+            ekf2_output.make_timestamps(logged_steps),
             observed_gauss,
             (innovation, innovation_variance, noise_variance),
             (~is_fused, is_fused),
         ),
         make_topic(
             "estimator_status",
-            output.make_timestamps(status_steps) | {"control_mode_flags": 1 << MAG_3D_BIT},
+            ekf2_output.make_timestamps(status_steps) | {"control_mode_flags": 1 << MAG_3D_BIT},
         ),
     ]
 
@@ -315,8 +324,10 @@ def _make_aid_source_topic(
     return make_topic(f"estimator_aid_src_{aid.name}", fields)
 
 
-def _make_flags_topic(model_inputs: Inputs, model_run: SegmentRun, output: Ekf2Output) -> Topic:
-    """Make estimator_status_flags: once a second, and when fusion starts or stops."""
+def _make_flags_topic(
+    model_inputs: Inputs, model_run: SegmentRun, ekf2_output: Ekf2Output
+) -> Topic:
+    """Make estimator_status_flags: one message per second and per start or end of fusion."""
     events, time_s = model_run.events[0], model_run.segment.time_s
     attempt_indices = np.flatnonzero(
         model_run.fused[:, 0] | model_run.rejected[:, 0] | model_run.reset[:, 0]
@@ -329,10 +340,10 @@ def _make_flags_topic(model_inputs: Inputs, model_run: SegmentRun, output: Ekf2O
         stop_s = time_s[step] + model_inputs.rules.stop_timeout_s
         is_fusing[step : int(np.searchsorted(time_s, min(next_attempt_s, stop_s)))] = True
     has_changed = np.diff(is_fusing.astype(int), prepend=0) != 0
-    is_logged = has_changed | sensors.keep_at_rate(time_s, FLAGS_LOG_RATE_HZ)
-    logged_steps = np.flatnonzero(is_logged[: len(time_s) - output.lag_steps])
+    is_logged = has_changed | sensors.is_kept_at_rate(time_s, FLAGS_LOG_RATE_HZ)
+    logged_steps = np.flatnonzero(is_logged[: len(time_s) - ekf2_output.lag_steps])
     is_gnss = model_inputs.aid == GNSS_POS
-    fields = output.make_timestamps(logged_steps) | {
+    fields = ekf2_output.make_timestamps(logged_steps) | {
         "control_status_changes": np.cumsum(has_changed)[logged_steps],
         "cs_gnss_pos": is_fusing[logged_steps] & is_gnss,
         "cs_ev_pos": is_fusing[logged_steps] & (not is_gnss),

@@ -95,16 +95,18 @@ class FaultType:
 
     @property
     def size_fields(self) -> tuple[str, ...]:
-        """Fields of size, start and duration; empty for a fault without a size."""
+        """Names of the fields with the values of the fault; empty for a fault without a size."""
         return () if self.default is True else self.fields
 
     @property
     def usage(self) -> str:
         """Syntax of the values after the name of the fault, such as ``=PERCENT[,SIZE]``."""
-        required, *optional = [
+        required_placeholder, *optional_placeholders = [
             f"={BOUNDS_BY_FIELD[field_name].cli_name}" for field_name in self.size_fields
         ] or [""]
-        return required + "".join(f"[,{placeholder[1:]}]" for placeholder in optional)
+        return required_placeholder + "".join(
+            f"[,{placeholder[1:]}]" for placeholder in optional_placeholders
+        )
 
 
 FAULT_TYPES: Mapping[str, FaultType] = {

@@ -24,9 +24,9 @@ NO_FAULTS = FaultSizes()
 # PX4 parameter values with which EKF2 fuses positions (GNSS: positions and velocities)
 FUSION_SWITCH_VALUES = {EV_POS.switch: 1, GNSS_POS.switch: 5}
 # SDLOG_PROFILE that logs the topics of external vision
-PROFILE_WITH_VISION = 129
+LOG_PROFILE_WITH_VISION = 129
 # SDLOG_PROFILE that does not log the topics of external vision
-PROFILE_WITHOUT_VISION = 1
+LOG_PROFILE_WITHOUT_VISION = 1
 # Version number of PX4 v1.16.0, the release whose topics are simulated
 PX4_RELEASE = 1 << 24 | 16 << 16 | 255
 SIMULATION_HARDWARE = "px4fuse simulation"
@@ -69,7 +69,7 @@ def simulate(scenario: Scenario, faults: FaultSizes = NO_FAULTS) -> Simulation:
             f"({reported_m:g} m). Use a larger value."
         )
     motion = plan_flight(
-        scenario, faults, sensors.random_stream(scenario, sensors.RandomStream.WANDER)
+        scenario, faults, sensors.make_random_generator(scenario, sensors.RandomStream.WANDER)
     )
     positions = sensors.simulate_positions(scenario, faults, motion)
     imu = sensors.simulate_imu(scenario, faults, motion)
@@ -129,16 +129,16 @@ def to_flight(simulation: Simulation, name: str = "simulation.ulg") -> Flight:
 
 
 def _make_parameters(scenario: Scenario, faults: FaultSizes) -> dict[str, int | float]:
-    fusion_switch = 0 if faults.ekf2_off else FUSION_SWITCH_VALUES[scenario.aid.switch]
+    fusion_parameter_value = 0 if faults.ekf2_off else FUSION_SWITCH_VALUES[scenario.aid.switch]
     return {
         **ekf2.make_parameters(scenario, faults),
         "EKF2_EN": int(scenario.ekf2),
         **dict.fromkeys(FUSION_SWITCH_VALUES, 0),
-        scenario.aid.switch: fusion_switch,
+        scenario.aid.switch: fusion_parameter_value,
         "EKF2_HGT_REF": 0,
-        "SDLOG_PROFILE": PROFILE_WITHOUT_VISION
+        "SDLOG_PROFILE": LOG_PROFILE_WITHOUT_VISION
         if faults.no_vvo or scenario.aid == GNSS_POS
-        else PROFILE_WITH_VISION,
+        else LOG_PROFILE_WITH_VISION,
     }
 
 

@@ -18,24 +18,24 @@ from scipy.interpolate import BPoly, PPoly
 from px4fuse.core.arrays import Array
 from px4fuse.errors import SettingsError
 from px4fuse.simulation.faults import FaultSizes
-from px4fuse.simulation.scenario import CORNER_DURATION_S, SPEED_RAMP_S, Scenario
+from px4fuse.simulation.scenario import CORNER_DURATION_S, SPEED_RAMP_DURATION_S, Scenario
 
 # Time (s) on the ground before take-off and after landing
 TIME_ON_GROUND_S = 6.0
 # Maximum climb and descent rate (m/s)
 MAX_CLIMB_RATE_M_S = 0.75
 # Duration (s) of each change of the climb rate
-CLIMB_RAMP_S = 1.5
+CLIMB_RAMP_DURATION_S = 1.5
 # Maximum flight time (s): the log then has 70 MB
 MAX_FLIGHT_S = 3600.0
 # Time (s) in which the slow deviation from the path increases to its full size after take-off, and
 # decreases to zero before landing
-DEVIATION_RAMP_S = 3.0
+DEVIATION_RAMP_DURATION_S = 3.0
 # Time (s) of a 180° turn at the end of the aisle with --yaw follow
-TURN_ROUND_S = 4.0
+TURN_ROUND_DURATION_S = 4.0
 # Minimum distance (s) of the breakpoints of piecewise polynomials; nearer breakpoints are merged
 MIN_BREAKPOINT_DISTANCE_S = 1e-9
-# Range of the periods (s) of the sines whose sum is the slow deviation from the path
+# Range of the periods (s) of the slow deviation from the path, a sum of sines
 DEVIATION_PERIOD_RANGE_S = (3.0, 20.0)
 # Number of sines in a slow deviation or sensor error
 SINE_COUNT = 4
@@ -59,7 +59,7 @@ def _sum_ramps(ramps: Sequence[tuple[float, float, Array]]) -> PPoly:
 
 
 def _differentiate(ramp_function: PPoly, time_s: Array, orders: Sequence[int]) -> list[Array]:
-    """Return derivatives of a :func:`_sum_ramps`, shape (t, k); order -1 is the integral."""
+    """Return derivatives of a sum of ramps, shape (t, k), one per order; -1 is the integral."""
     clipped_times_s = np.clip(time_s, *ramp_function.x[[0, -1]])
     return [np.asarray(ramp_function.derivative(order)(clipped_times_s)) for order in orders]
 
@@ -97,7 +97,7 @@ class Sines:
 
 
 @dataclass(frozen=True)
-class State:
+class TrueState:
     """True state at n times: vectors (NED), shape (n, 3), and yaw and yaw rate, shape (n,)."""
 
     position_m: Array
@@ -112,17 +112,17 @@ class State:
 class Motion:
     """True motion of a flight: velocity (NED) and yaw (rad) as functions of time.
 
-    ``deviation`` is a slow deviation (m) of the position from the planned path.
+    ``path_deviation`` is a slow deviation (m) of the position from the planned path.
     """
 
     velocity: PPoly
     yaw: PPoly
-    deviation: Sines
+    path_deviation: Sines
     take_off_s: float
     touch_down_s: float
     duration_s: float
 
-    def at(self, time_s: Array) -> State:
+    def at(self, time_s: Array) -> TrueState:
         """Return the true state at the times ``time_s``, which are seconds from the first data."""
         position, velocity, acceleration, jerk = _differentiate(
             self.velocity, time_s, (-1, 0, 1, 2)
@@ -131,14 +131,18 @@ class Motion:
         # the deviation from the path is multiplied by 1 in the air and by 0 on the ground
         deviation_factor = _sum_ramps(
             [
-                (self.take_off_s, DEVIATION_RAMP_S, np.array([1.0])),
-                (self.touch_down_s - DEVIATION_RAMP_S, DEVIATION_RAMP_S, np.array([-1.0])),
+                (self.take_off_s, DEVIATION_RAMP_DURATION_S, np.array([1.0])),
+                (
+                    self.touch_down_s - DEVIATION_RAMP_DURATION_S,
+                    DEVIATION_RAMP_DURATION_S,
+                    np.array([-1.0]),
+                ),
             ]
         )
         # derivatives of the product factor · deviation (Leibniz rule)
         f0, f1, f2, f3 = _differentiate(deviation_factor, time_s, range(4))
-        d0, d1, d2, d3 = self.deviation.at(time_s, 4)
-        return State(
+        d0, d1, d2, d3 = self.path_deviation.at(time_s, 4)
+        return TrueState(
             position_m=position + f0 * d0,
             velocity_m_s=velocity + f0 * d1 + f1 * d0,
             acceleration_m_s2=acceleration + f0 * d2 + 2.0 * f1 * d1 + f2 * d0,
@@ -167,39 +171,39 @@ class AttitudeAndImu:
     specific_force_m_s2: Array
 
 
-def compute_attitude(state: State) -> AttitudeAndImu:
+def compute_attitude(state: TrueState) -> AttitudeAndImu:
     """Return attitude, angular rate and specific force of a quadrotor in the true motion."""
     gravity = np.array([0.0, 0.0, constants.g])
     opposite_thrust_m_s2 = gravity - state.acceleration_m_s2
     specific_thrust_m_s2 = np.sqrt(_dot(opposite_thrust_m_s2, opposite_thrust_m_s2))[:, None]
     z = opposite_thrust_m_s2 / specific_thrust_m_s2
-    z_rate_1_s = -state.jerk_m_s3 / specific_thrust_m_s2
-    z_rate_1_s -= z * _dot(z, z_rate_1_s)[:, None]
+    z_derivative_1_s = -state.jerk_m_s3 / specific_thrust_m_s2
+    z_derivative_1_s -= z * _dot(z, z_derivative_1_s)[:, None]
     yaw_rad = state.yaw_rad
-    forward, rightward = (
+    forward_direction, right_direction = (
         np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
         for angle in (yaw_rad, yaw_rad + np.pi / 2.0)
     )
-    # n = z × nose is parallel to the body's y axis
-    n = np.cross(z, forward)
-    n_rate_1_s = np.cross(z_rate_1_s, forward) + state.yaw_rate_rad_s[:, None] * np.cross(
-        z, rightward
-    )
-    n_length = np.sqrt(_dot(n, n))
-    y = n / n_length[:, None]
+    # n = z × forward_direction: direction of the body's y axis, but not of length 1
+    n = np.cross(z, forward_direction)
+    n_derivative_1_s = np.cross(z_derivative_1_s, forward_direction) + state.yaw_rate_rad_s[
+        :, None
+    ] * np.cross(z, right_direction)
+    n_norm = np.sqrt(_dot(n, n))
+    y = n / n_norm[:, None]
     x = np.cross(y, z)
     # angular rate ω in body axes, from dR/dt = R [ω]×
     rate_rad_s = np.stack(
         [
-            -_dot(z_rate_1_s, y),
-            _dot(z_rate_1_s, x),
-            -_dot(n_rate_1_s, x) / n_length,
+            -_dot(z_derivative_1_s, y),
+            _dot(z_derivative_1_s, x),
+            -_dot(n_derivative_1_s, x) / n_norm,
         ],
         axis=1,
     )
-    force_m_s2 = np.zeros_like(z)
-    force_m_s2[:, 2] = -specific_thrust_m_s2[:, 0]
-    return AttitudeAndImu(np.stack([x, y, z], axis=2), rate_rad_s, force_m_s2)
+    specific_force_m_s2 = np.zeros_like(z)
+    specific_force_m_s2[:, 2] = -specific_thrust_m_s2[:, 0]
+    return AttitudeAndImu(np.stack([x, y, z], axis=2), rate_rad_s, specific_force_m_s2)
 
 
 def _dot(a: Array, b: Array) -> Array:
@@ -220,26 +224,26 @@ def plan_flight(scenario: Scenario, faults: FaultSizes, rng: np.random.Generator
     climb_rate_m_s = min(MAX_CLIMB_RATE_M_S, scenario.altitude_m / 2.0)
     climb_time_s = scenario.altitude_m / climb_rate_m_s
     climb_velocity_m_s = np.array([0.0, 0.0, -climb_rate_m_s])
-    flight_plan.add_velocity_change(climb_velocity_m_s, CLIMB_RAMP_S, climb_time_s)
+    flight_plan.add_velocity_change(climb_velocity_m_s, CLIMB_RAMP_DURATION_S, climb_time_s)
     flight_plan.add_velocity_change(
-        -climb_velocity_m_s, CLIMB_RAMP_S, CLIMB_RAMP_S / 2.0 + scenario.pause_s
+        -climb_velocity_m_s, CLIMB_RAMP_DURATION_S, CLIMB_RAMP_DURATION_S / 2.0 + scenario.pause_s
     )
     if scenario.kind == "aisle":
         _fly_aisle(flight_plan, scenario, 0.0 if faults.no_motion else scenario.speed_m_s)
     else:
         _fly_loop(flight_plan, scenario, faults)
-    flight_plan.add_velocity_change(-climb_velocity_m_s, CLIMB_RAMP_S, climb_time_s)
-    touch_down_s = flight_plan.ramp_centre_s + CLIMB_RAMP_S / 2.0
+    flight_plan.add_velocity_change(-climb_velocity_m_s, CLIMB_RAMP_DURATION_S, climb_time_s)
+    touch_down_s = flight_plan.ramp_centre_s + CLIMB_RAMP_DURATION_S / 2.0
     if touch_down_s > MAX_FLIGHT_S:
         raise SettingsError(
             f"This flight would take {touch_down_s:.0f} s; the simulation is limited to "
             f"{MAX_FLIGHT_S:g} s. Reduce --passes or --length."
         )
-    flight_plan.add_velocity_change(climb_velocity_m_s, CLIMB_RAMP_S, 0.0)
+    flight_plan.add_velocity_change(climb_velocity_m_s, CLIMB_RAMP_DURATION_S, 0.0)
     return Motion(
         velocity=_sum_ramps(flight_plan.velocity_ramps),
         yaw=_sum_ramps(flight_plan.yaw_ramps),
-        deviation=Sines.draw(rng, np.full(3, scenario.wander_m), DEVIATION_PERIOD_RANGE_S),
+        path_deviation=Sines.draw(rng, np.full(3, scenario.wander_m), DEVIATION_PERIOD_RANGE_S),
         take_off_s=TIME_ON_GROUND_S,
         touch_down_s=touch_down_s,
         duration_s=float(np.ceil(touch_down_s + TIME_ON_GROUND_S)),
@@ -254,7 +258,7 @@ class _FlightPlan:
     """
 
     def __init__(self, climb_start_s: float, heading_deg: float) -> None:
-        self.ramp_centre_s = climb_start_s + CLIMB_RAMP_S / 2.0
+        self.ramp_centre_s = climb_start_s + CLIMB_RAMP_DURATION_S / 2.0
         self.velocity_ramps: list[tuple[float, float, Array]] = []
         # initial yaw: a ramp from 0 to the heading that ends before the first data
         self.yaw_ramps = [(-1.0, 1.0, np.radians([heading_deg]))]
@@ -262,7 +266,7 @@ class _FlightPlan:
     def add_velocity_change(
         self, velocity_change_m_s: Array, duration_s: float, time_to_next_s: float
     ) -> None:
-        """Append a velocity change; ``time_to_next_s`` is from its centre to that of the next."""
+        """Append a velocity ramp; ``time_to_next_s`` is the time from its centre to the next."""
         self.velocity_ramps.append(
             (self.ramp_centre_s - duration_s / 2.0, duration_s, velocity_change_m_s)
         )
@@ -281,42 +285,48 @@ def compute_direction(heading_deg: float) -> Array:
 def _fly_aisle(flight_plan: _FlightPlan, scenario: Scenario, speed_m_s: float) -> None:
     velocity_m_s = speed_m_s * compute_direction(scenario.heading_deg)
     nose_follows_path = scenario.nose_follows_path and speed_m_s > 0.0
-    pause_s = max(scenario.pause_s, TURN_ROUND_S) if nose_follows_path else scenario.pause_s
-    flight_plan.ramp_centre_s += SPEED_RAMP_S / 2.0
+    pause_s = (
+        max(scenario.pause_s, TURN_ROUND_DURATION_S) if nose_follows_path else scenario.pause_s
+    )
+    flight_plan.ramp_centre_s += SPEED_RAMP_DURATION_S / 2.0
     for pass_index in range(scenario.passes):
         pass_velocity_m_s = velocity_m_s if pass_index % 2 == 0 else -velocity_m_s
         flight_plan.add_velocity_change(
-            pass_velocity_m_s, SPEED_RAMP_S, scenario.length_m / scenario.speed_m_s
+            pass_velocity_m_s, SPEED_RAMP_DURATION_S, scenario.length_m / scenario.speed_m_s
         )
-        stop_s = flight_plan.ramp_centre_s + SPEED_RAMP_S / 2.0
-        flight_plan.add_velocity_change(-pass_velocity_m_s, SPEED_RAMP_S, SPEED_RAMP_S + pause_s)
+        stop_s = flight_plan.ramp_centre_s + SPEED_RAMP_DURATION_S / 2.0
+        flight_plan.add_velocity_change(
+            -pass_velocity_m_s, SPEED_RAMP_DURATION_S, SPEED_RAMP_DURATION_S + pause_s
+        )
         if nose_follows_path and pass_index < scenario.passes - 1:
-            flight_plan.add_turn(np.pi, stop_s, TURN_ROUND_S)
+            flight_plan.add_turn(np.pi, stop_s, TURN_ROUND_DURATION_S)
 
 
 def _fly_loop(flight_plan: _FlightPlan, scenario: Scenario, faults: FaultSizes) -> None:
     speed_m_s = 0.0 if faults.no_motion else scenario.speed_m_s
-    last_side_m = scenario.length_m - faults.open_end_m
-    if last_side_m < scenario.speed_m_s * CORNER_DURATION_S:
+    last_side_length_m = scenario.length_m - faults.open_end_m
+    if last_side_length_m < scenario.speed_m_s * CORNER_DURATION_S:
         raise SettingsError(
-            f"--mistake open-end={faults.open_end_m:g}: the last side is {last_side_m:g} m long. "
-            f"Use at most {scenario.length_m - scenario.speed_m_s * CORNER_DURATION_S:g} m."
+            f"--mistake open-end={faults.open_end_m:g}: the last side is {last_side_length_m:g} m "
+            f"long. Use at most {scenario.length_m - scenario.speed_m_s * CORNER_DURATION_S:g} m."
         )
     side_count = 4 * scenario.passes
     previous_velocity_m_s = np.zeros(3)
-    flight_plan.ramp_centre_s += SPEED_RAMP_S / 2.0
+    flight_plan.ramp_centre_s += SPEED_RAMP_DURATION_S / 2.0
     for side_index in range(side_count):
         velocity_m_s = speed_m_s * compute_direction(scenario.heading_deg + 90.0 * side_index)
-        ramp_duration_s = CORNER_DURATION_S if side_index else SPEED_RAMP_S
+        ramp_duration_s = CORNER_DURATION_S if side_index else SPEED_RAMP_DURATION_S
         if side_index and scenario.nose_follows_path and speed_m_s > 0.0:
             flight_plan.add_turn(
                 np.pi / 2.0, flight_plan.ramp_centre_s - CORNER_DURATION_S / 2.0, CORNER_DURATION_S
             )
-        side_m = last_side_m if side_index == side_count - 1 else scenario.length_m
+        side_length_m = last_side_length_m if side_index == side_count - 1 else scenario.length_m
         flight_plan.add_velocity_change(
-            velocity_m_s - previous_velocity_m_s, ramp_duration_s, side_m / scenario.speed_m_s
+            velocity_m_s - previous_velocity_m_s,
+            ramp_duration_s,
+            side_length_m / scenario.speed_m_s,
         )
         previous_velocity_m_s = velocity_m_s
     flight_plan.add_velocity_change(
-        -previous_velocity_m_s, SPEED_RAMP_S, SPEED_RAMP_S + scenario.pause_s
+        -previous_velocity_m_s, SPEED_RAMP_DURATION_S, SPEED_RAMP_DURATION_S + scenario.pause_s
     )

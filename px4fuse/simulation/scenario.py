@@ -16,7 +16,7 @@ YAW_MODES: tuple[YawMode, ...] = get_args(YawMode)
 # Averaging time (s) for which the accelerometer noise SIGMA_A is defined: DT of KF
 DT_S = 0.1
 # Duration (s) of acceleration and braking along the aisle
-SPEED_RAMP_S = 1.5
+SPEED_RAMP_DURATION_S = 1.5
 CORNER_DURATION_S = 2.0
 # Defaults of the scenario that depend on the kind of flight
 DEFAULTS_BY_KIND: Mapping[ScenarioKind, Mapping[str, float]] = {
@@ -91,7 +91,12 @@ class Scenario:
     kind: ScenarioKind = "aisle"
     passes: int = make_bounded_field(6, 1, 100, "", "--passes")
     length_m: float = make_bounded_field(
-        12.0, 2.0, 1000.0, "m", "--length", "Length of the aisle, or of one side of the square."
+        12.0,
+        2.0,
+        1000.0,
+        "m",
+        "--length",
+        "Length of the aisle, or of one side of the square path.",
     )
     speed_m_s: float = make_bounded_field(
         1.0, 0.1, 10.0, "m/s", "--speed", "Speed on the straight segments of the path."
@@ -102,7 +107,7 @@ class Scenario:
         360.0,
         "°",
         "--heading",
-        "Heading of the aisle or of the first side, clockwise from north.",
+        "Heading of the aisle, or of the first side of the square path, clockwise from north.",
     )
     altitude_m: float = 1.5
     yaw: YawMode | None = None
@@ -163,7 +168,7 @@ class Scenario:
         for name, bounds in collect_field_bounds(Scenario).items():
             bounds.check(getattr(self, name), bounds.cli_name)
         min_length_m = self.speed_m_s * (
-            SPEED_RAMP_S if self.kind == "aisle" else CORNER_DURATION_S
+            SPEED_RAMP_DURATION_S if self.kind == "aisle" else CORNER_DURATION_S
         )
         if self.length_m < min_length_m:
             raise SettingsError(
@@ -190,7 +195,7 @@ class Scenario:
 
     @property
     def aid(self) -> Aid:
-        """Aiding source of EKF2 that fuses the positions."""
+        """Aiding source as which EKF2 fuses the positions."""
         return GNSS_POS if self.kind == "outdoor" else EV_POS
 
     @property

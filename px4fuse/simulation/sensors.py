@@ -70,7 +70,7 @@ RandomStream = IntEnum(
 )
 
 
-def random_stream(scenario: Scenario, stream: RandomStream) -> np.random.Generator:
+def make_random_generator(scenario: Scenario, stream: RandomStream) -> np.random.Generator:
     return np.random.default_rng([scenario.seed, stream])
 
 
@@ -103,7 +103,7 @@ class SimulatedPositions:
 
 def draw_biases(scenario: Scenario, faults: FaultSizes) -> tuple[Array, Array]:
     """Return accelerometer (m/s²) and gyro (rad/s) biases, body FRD, each of shape (3,)."""
-    rng = random_stream(scenario, RandomStream.BIAS)
+    rng = make_random_generator(scenario, RandomStream.BIAS)
     accelerometer_bias_m_s2 = rng.normal(0.0, scenario.accel_bias_sigma_m_s2, 3)
     accelerometer_bias_m_s2[0] += faults.accel_bias_m_s2
     return accelerometer_bias_m_s2, rng.normal(0.0, scenario.gyro_bias_sigma_rad_s, 3)
@@ -112,20 +112,20 @@ def draw_biases(scenario: Scenario, faults: FaultSizes) -> tuple[Array, Array]:
 def simulate_imu(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
     """Simulate sensor_combined (accelerometer and gyro) at the full rate, without gaps."""
     time_us = _make_sample_times_us(motion, scenario.imu_rate_hz)
-    force_m_s2, rate_rad_s = measure_imu(
+    specific_force_m_s2, rate_rad_s = measure_imu(
         scenario, faults, motion, to_seconds(time_us), RandomStream.IMU
     )
     if faults.vibration_m_s2:
         vibration_sigma_m_s2 = faults.vibration_m_s2 * np.sqrt(DT_S * scenario.imu_rate_hz)
-        force_m_s2 += vibration_sigma_m_s2 * random_stream(
+        specific_force_m_s2 += vibration_sigma_m_s2 * make_random_generator(
             scenario, RandomStream.VIBRATION
-        ).standard_normal(force_m_s2.shape)
+        ).standard_normal(specific_force_m_s2.shape)
     interval_us = round(1e6 / scenario.imu_rate_hz)
     integral_fields = dict.fromkeys(("gyro_integral_dt", "accelerometer_integral_dt"), interval_us)
     sample_fields: dict[str, Any] = {
         "timestamp": _to_boot_time(time_us),
         "gyro_rad": rate_rad_s,
-        "accelerometer_m_s2": force_m_s2,
+        "accelerometer_m_s2": specific_force_m_s2,
     }
     return make_topic("sensor_combined", sample_fields | integral_fields)
 
@@ -139,7 +139,7 @@ def simulate_magnetometer(scenario: Scenario, faults: FaultSizes, motion: Motion
             simulate_attitude_error(scenario, faults, to_seconds(time_us)).as_matrix() @ body_to_ned
         )
     field_gauss = np.einsum("nji,j->ni", body_to_ned, EARTH_FIELD_GAUSS)
-    field_gauss += SIGMA_MAGNETOMETER_GAUSS * random_stream(
+    field_gauss += SIGMA_MAGNETOMETER_GAUSS * make_random_generator(
         scenario, RandomStream.FIELD
     ).standard_normal(field_gauss.shape)
     disturbance_start_s = motion.duration_s / 2.0 if faults.mag_at_s is None else faults.mag_at_s
@@ -153,33 +153,35 @@ def simulate_barometer(scenario: Scenario, motion: Motion) -> Topic:
     time_us = _make_sample_times_us(motion, BAROMETER_RATE_HZ)
     height_m = HOME_POSITION[2] - motion.at(to_seconds(time_us)).position_m[:, 2]
     height_m -= simulate_height_error(scenario, to_seconds(time_us))
-    unit_noise = random_stream(scenario, RandomStream.BAROMETER).standard_normal(len(time_us))
+    unit_noise = make_random_generator(scenario, RandomStream.BAROMETER).standard_normal(
+        len(time_us)
+    )
     height_m += SIGMA_BAROMETER_M * unit_noise
     return make_topic("vehicle_air_data", make_timestamps(time_us) | {"baro_alt_meter": height_m})
 
 
 def simulate_height_error(scenario: Scenario, time_s: Array) -> Array:
     """Simulate the slow error (m, positive downward) of the barometer and of EKF2's height."""
-    rng, rms = random_stream(scenario, RandomStream.HEIGHT), np.array([HEIGHT_ERROR_RMS_M])
+    rng, rms = make_random_generator(scenario, RandomStream.HEIGHT), np.array([HEIGHT_ERROR_RMS_M])
     return Sines.draw(rng, rms, SLOW_ERROR_PERIOD_RANGE_S).at(time_s)[0][:, 0]
 
 
-def limit_rate(full_topic: Topic, rate_hz: float, is_kept: BoolArray | bool = True) -> Topic:
+def limit_rate(full_rate_topic: Topic, rate_hz: float, is_kept: BoolArray | bool = True) -> Topic:
     """Return the messages that a logger with a rate limit (Hz) writes; 0 is no limit."""
-    is_logged = keep_at_rate(to_seconds(get_time_us(full_topic)), rate_hz) & is_kept
-    logged_fields = {name: values[is_logged] for name, values in full_topic.fields.items()}
-    return Topic(full_topic.name, logged_fields)
+    is_logged = is_kept_at_rate(to_seconds(get_time_us(full_rate_topic)), rate_hz) & is_kept
+    logged_fields = {name: values[is_logged] for name, values in full_rate_topic.fields.items()}
+    return Topic(full_rate_topic.name, logged_fields)
 
 
-def select_logged_imu(full_topic: Topic, faults: FaultSizes, motion: Motion) -> Topic:
+def select_logged_imu(full_rate_topic: Topic, faults: FaultSizes, motion: Motion) -> Topic:
     """Return sensor_combined as logged, with the gap and the reduced rate of ``faults``."""
     is_outside_gap = _is_outside_gap(
-        to_seconds(get_time_us(full_topic)),
+        to_seconds(get_time_us(full_rate_topic)),
         faults.imu_dropout_s,
         faults.imu_dropout_at_s,
         motion.duration_s,
     )
-    return limit_rate(full_topic, faults.imu_rate_hz, is_outside_gap)
+    return limit_rate(full_rate_topic, faults.imu_rate_hz, is_outside_gap)
 
 
 def get_time_us(topic: Topic, field: str = "timestamp") -> IntArray:
@@ -195,9 +197,12 @@ def measure_imu(
     stream: RandomStream,
     averaged_sample_count: float = 1.0,
 ) -> ArrayPair:
-    """Simulate specific force (m/s²) and angular rate (rad/s), each a mean of samples."""
+    """Simulate specific force (m/s²) and angular rate (rad/s), with bias and white noise.
+
+    The noise is that of the mean of ``averaged_sample_count`` samples.
+    """
     truth = compute_attitude(motion.at(time_s))
-    rng, measurements = random_stream(scenario, stream), []
+    rng, measurements = make_random_generator(scenario, stream), []
     for true_value, bias, sigma in zip(
         (truth.specific_force_m_s2, truth.angular_rate_rad_s),
         draw_biases(scenario, faults),
@@ -206,8 +211,8 @@ def measure_imu(
     ):
         noise = 1.0 / np.sqrt(averaged_sample_count) * sigma * rng.standard_normal(true_value.shape)
         measurements.append(true_value + bias + noise)
-    force_m_s2, rate_rad_s = measurements
-    return force_m_s2, rate_rad_s
+    specific_force_m_s2, rate_rad_s = measurements
+    return specific_force_m_s2, rate_rad_s
 
 
 def simulate_logged_attitude(scenario: Scenario, faults: FaultSizes, motion: Motion) -> Topic:
@@ -238,7 +243,7 @@ def simulate_attitude_error(scenario: Scenario, faults: FaultSizes, time_s: Arra
     """Simulate the error of the logged attitude, a rotation in NED."""
     tilt_rms_deg = scenario.tilt_error_deg
     rms_rad = np.radians([tilt_rms_deg, tilt_rms_deg, scenario.yaw_error_deg])
-    rng = random_stream(scenario, RandomStream.ATTITUDE)
+    rng = make_random_generator(scenario, RandomStream.ATTITUDE)
     error_rad = Sines.draw(rng, rms_rad, SLOW_ERROR_PERIOD_RANGE_S).at(time_s)[0]
     if faults.heading_deg:
         heading_error_rad = np.radians(faults.heading_deg)
@@ -279,7 +284,7 @@ def simulate_positions(
     scenario: Scenario, faults: FaultSizes, motion: Motion
 ) -> SimulatedPositions:
     """Simulate UWB (aisle), VIO (loop) or GNSS (outdoor) positions with injected faults."""
-    timing_rng = random_stream(scenario, RandomStream.TIMING)
+    timing_rng = make_random_generator(scenario, RandomStream.TIMING)
     interval_s = 1.0 / scenario.source_rate_hz
     position_count = int((motion.duration_s - FIRST_POSITION_TIME_S) / interval_s)
     nominal_times_s = FIRST_POSITION_TIME_S + interval_s * np.arange(position_count)
@@ -298,7 +303,7 @@ def simulate_positions(
     position_m += drift_m
     is_outdoor = scenario.kind == "outdoor"
     sigma_m = scenario.source_sigma_m * (GNSS_SIGMA_FACTORS if is_outdoor else 1.0)
-    position_m += sigma_m * random_stream(scenario, RandomStream.SOURCE).standard_normal(
+    position_m += sigma_m * make_random_generator(scenario, RandomStream.SOURCE).standard_normal(
         position_m.shape
     )
     is_airborne = (time_s > motion.take_off_s) & (time_s < motion.touch_down_s)
@@ -307,7 +312,7 @@ def simulate_positions(
     if faults.slow_error_m:
         position_m += simulate_correlated_noise(scenario, faults, len(time_s), interval_s)
     if faults.smoothed_s:
-        position_m = _low_pass(position_m, interval_s, faults.smoothed_s)
+        position_m = _apply_low_pass(position_m, interval_s, faults.smoothed_s)
     position_m *= 1.0 + faults.scale_percent / 100.0
     if faults.yaw_deg:
         position_m = Rotation.from_euler("z", faults.yaw_deg, degrees=True).apply(position_m)
@@ -318,16 +323,16 @@ def simulate_positions(
         )
     is_logged = _is_outside_gap(
         time_s, faults.dropout_s, faults.dropout_at_s, motion.duration_s
-    ) & keep_at_rate(time_s, faults.decimate_hz)
-    arrival_us, timestamp_us = _simulate_position_times_us(faults, time_s, timing_rng)
+    ) & is_kept_at_rate(time_s, faults.decimate_hz)
+    arrival_times_us, timestamp_us = _simulate_position_times_us(faults, time_s, timing_rng)
     reported_sigma_m = compute_reported_sigma_m(scenario, faults)
     velocity_m_s = None
     if is_outdoor:
-        velocity_noise = random_stream(scenario, RandomStream.FIX_VELOCITY).standard_normal(
-            position_m.shape
-        )
+        unit_velocity_noise = make_random_generator(
+            scenario, RandomStream.FIX_VELOCITY
+        ).standard_normal(position_m.shape)
         velocity_m_s = (
-            state.velocity_m_s + scenario.sigma_gnss_m_s * GNSS_SIGMA_FACTORS * velocity_noise
+            state.velocity_m_s + scenario.sigma_gnss_m_s * GNSS_SIGMA_FACTORS * unit_velocity_noise
         )[is_logged]
         gnss_timestamp_us = timestamp_us + round(1e6 * GNSS_DELAY_S)
         topic = _make_gnss_topic(
@@ -342,7 +347,7 @@ def simulate_positions(
             compute_attitude(state).body_to_ned[is_logged] if scenario.kind == "loop" else None
         )
         topic = _make_odometry_topic(
-            arrival_us[is_logged],
+            arrival_times_us[is_logged],
             timestamp_us[is_logged],
             position_m[is_logged],
             reported_sigma_m,
@@ -370,7 +375,7 @@ def simulate_correlated_noise(
 ) -> Array:
     """Simulate time-correlated noise (m), shape (n, 3): a first-order Gauss-Markov process."""
     noise_m = (
-        random_stream(scenario, RandomStream.SLOW).standard_normal((sample_count, 3))
+        make_random_generator(scenario, RandomStream.SLOW).standard_normal((sample_count, 3))
         * faults.slow_error_m
     )
     decay_factor = np.exp(-interval_s / faults.slow_error_s)
@@ -380,7 +385,7 @@ def simulate_correlated_noise(
 
 def simulate_vio_drift(scenario: Scenario, distance_m: Array) -> Array:
     """Simulate the VIO drift (m, NED), shape (n, 3): proportional to distance, and random walk."""
-    rng = random_stream(scenario, RandomStream.DRIFT)
+    rng = make_random_generator(scenario, RandomStream.DRIFT)
     drift_per_metre = scenario.vio_drift * compute_direction(rng.uniform(0.0, 360.0))
     sqrt_step_lengths = np.sqrt(np.diff(distance_m, prepend=0.0))[:, None]
     random_walk = np.cumsum(sqrt_step_lengths * rng.standard_normal((len(distance_m), 3)), axis=0)
@@ -401,7 +406,7 @@ def simulate_outliers(
     outlier_count = round(len(airborne_indices) * faults.nlos_percent / 100.0)
     if outlier_count == 0:
         return outlier_error_m, is_outlier
-    rng = random_stream(scenario, RandomStream.NLOS)
+    rng = make_random_generator(scenario, RandomStream.NLOS)
     burst_count = -(-outlier_count // MEAN_OUTLIER_BURST_LENGTH)
     burst_lengths = 1 + rng.multinomial(
         outlier_count - burst_count, np.full(burst_count, 1.0 / burst_count)
@@ -410,8 +415,7 @@ def simulate_outliers(
         len(airborne_indices) - outlier_count, np.full(burst_count + 1, 1.0 / (burst_count + 1))
     )
     burst_index = np.repeat(np.arange(burst_count), burst_lengths)
-    # number of positions before an outlier: earlier outliers, and positions in the gaps between
-    # bursts
+    # index of an outlier: number of earlier outliers, plus good positions in the gaps before it
     outlier_indices = airborne_indices[
         np.arange(outlier_count) + np.cumsum(gap_lengths)[burst_index]
     ]
@@ -423,7 +427,7 @@ def simulate_outliers(
     return outlier_error_m, is_outlier
 
 
-def keep_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
+def is_kept_at_rate(time_s: Array, rate_hz: float) -> BoolArray:
     """Return a mask of the samples that a logger with a rate limit (Hz) writes; 0 is no limit."""
     if rate_hz <= 0.0:
         return np.ones(len(time_s), np.bool_)
@@ -439,23 +443,25 @@ def _simulate_position_times_us(
     latency_s = np.maximum(
         rng.normal(mean_latency_s, POSITION_LATENCY_SIGMA_S, len(time_s)), MIN_POSITION_LATENCY_S
     )
-    arrival_us = np.maximum.accumulate(np.rint((time_s + latency_s) * 1e6).astype(np.int64))
+    arrival_times_us = np.maximum.accumulate(np.rint((time_s + latency_s) * 1e6).astype(np.int64))
     offset_s = faults.clock_offset_s + faults.clock_drift_ppm * 1e-6 * time_s
     timestamp_us = np.rint((time_s + offset_s) * 1e6).astype(np.int64)
     if faults.clock_jump_s:
-        timestamp_us = np.where(time_s < TIMESYNC_CONVERGENCE_TIME_S, arrival_us, timestamp_us)
-    return arrival_us, timestamp_us
+        timestamp_us = np.where(
+            time_s < TIMESYNC_CONVERGENCE_TIME_S, arrival_times_us, timestamp_us
+        )
+    return arrival_times_us, timestamp_us
 
 
 def _make_odometry_topic(
-    arrival_us: IntArray,
+    arrival_times_us: IntArray,
     timestamp_us: IntArray,
     position_m: Array,
     sigma_m: float,
     body_to_ned: Array | None,
 ) -> Topic:
     variance_m2 = np.full(position_m.shape, sigma_m**2)
-    fields = make_timestamps(timestamp_us, arrival_us - timestamp_us)
+    fields = make_timestamps(timestamp_us, arrival_times_us - timestamp_us)
     fields |= {"position": position_m, "position_variance": variance_m2}
     if body_to_ned is not None:
         fields["q"] = to_quaternions(body_to_ned)
@@ -482,16 +488,16 @@ def _make_gnss_topic(
     return make_topic(GPS_POSITION, fields)
 
 
-def _low_pass(position_m: Array, interval_s: float, time_constant_s: float) -> Array:
+def _apply_low_pass(position_m: Array, interval_s: float, time_constant_s: float) -> Array:
     decay_factor = np.exp(-interval_s / time_constant_s)
-    filtered_m, _ = lfilter(
+    filtered_position_m, _ = lfilter(
         [1.0 - decay_factor],
         [1.0, -decay_factor],
         position_m,
         axis=0,
         zi=decay_factor * position_m[:1],
     )
-    return np.asarray(filtered_m)
+    return np.asarray(filtered_position_m)
 
 
 def _is_outside_gap(

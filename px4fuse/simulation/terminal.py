@@ -8,7 +8,7 @@ from px4fuse.report.page import Page
 from px4fuse.simulation.faults import FAULT_TYPES, format_fault, injected_fault_names
 from px4fuse.simulation.flights import Simulation
 
-SOURCE_BY_KIND = {"aisle": "UWB", "loop": "VIO", "outdoor": "GNSS"}
+POSITION_SOURCE_BY_KIND = {"aisle": "UWB", "loop": "VIO", "outdoor": "GNSS"}
 
 
 def summary(simulation: Simulation, answer: Path | None) -> Page:
@@ -21,7 +21,7 @@ def summary(simulation: Simulation, answer: Path | None) -> Page:
     texts = {
         "Flight": f"{scenario.kind}, {path} at {scenario.speed_m_s:g} m/s, "
         f"{simulation.motion.duration_s:g} s, seed {scenario.seed}",
-        "Position": f"{SOURCE_BY_KIND[scenario.kind]}, {scenario.source_sigma_m:g} m at "
+        "Position": f"{POSITION_SOURCE_BY_KIND[scenario.kind]}, {scenario.source_sigma_m:g} m at "
         f"{scenario.source_rate_hz:g} Hz",
     }
     if scenario.kind == "loop":

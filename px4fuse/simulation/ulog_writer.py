@@ -19,7 +19,7 @@ _ULOG_VERSION = b"\x01"
 _ULOG_TYPES = {"float64": "double", "float32": "float", "bool": "bool"}
 _FLAG_BITS_MESSAGE = bytes(40)
 # Types, defaults and names of the fields of each topic
-TOPIC_FIELDS = read_toml(__file__, dict[str, str], "topics.toml")
+FIELD_DEFINITIONS_BY_TOPIC = read_toml(__file__, dict[str, str], "topics.toml")
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,9 @@ def make_topic(name: str, field_values: Mapping[str, ArrayLike]) -> Topic:
 
     A scalar value is used for all messages.
     """
-    fields_text = TOPIC_FIELDS.get(name, TOPIC_FIELDS["estimator_aid_src"])
+    fields_text = FIELD_DEFINITIONS_BY_TOPIC.get(
+        name, FIELD_DEFINITIONS_BY_TOPIC["estimator_aid_src"]
+    )
     known_fields = {
         field: type_and_default
         for line in ["uint64: timestamp timestamp_sample", *fields_text.splitlines()]
@@ -50,12 +52,14 @@ def make_topic(name: str, field_values: Mapping[str, ArrayLike]) -> Topic:
     assert not unknown_fields, f"{name} has no {unknown_fields}"
     message_count, fields = np.size(field_values["timestamp"]), {}
     for field, type_and_default in known_fields.items():
-        numpy_type, *default = type_and_default.split()
+        numpy_type, *default_and_shape = type_and_default.split()
         if field in field_values:
             values = np.asarray(field_values[field])
             values = values if values.ndim else np.full(message_count, values)
-        elif default:
-            values = np.full([message_count, *map(int, default[1:])], float(default[0]))
+        elif default_and_shape:
+            values = np.full(
+                [message_count, *map(int, default_and_shape[1:])], float(default_and_shape[0])
+            )
         else:
             continue
         fields[field] = values.astype(numpy_type)

@@ -22,7 +22,7 @@ from px4fuse.simulation.scenario import make_scenario
 
 FIGURE_COUNT = 3
 AISLE_PASS_COUNT = 4
-# Minimum speed (m/s) along the aisle, in the direction of the axis, for a grey background
+# Grey background of the figures: velocity (m/s) along the positive aisle direction above this value
 MIN_SHADED_SPEED_M_S = 0.2
 # Questions about each figure, by the field of FigureFault that contains the right answer
 QUESTIONS = {
@@ -37,9 +37,9 @@ QUESTIONS = {
 class FigureFault(Record):
     """Injected fault of a simulated flight, and right answers to the questions about its figure.
 
-    ``prediction`` is the effect of three times larger position noises, and ``useless`` a change
-    that does not correct the fault. ``option`` is the value of ``px4fuse simulate --mistake``, or
-    "" without a fault.
+    The texts are the right answers to QUESTIONS. ``prediction`` is the effect of position noises
+    that are three times as large; ``useless`` is a change that does not correct the fault, with the
+    reason. ``option`` is the value of ``px4fuse simulate --mistake``; "" without a fault.
     """
 
     fault: str
@@ -57,10 +57,10 @@ def _shuffle(names: Iterable[str], prefix: str, draw_number: Callable[[str], flo
     return sorted(names, key=lambda name: draw_number(f"{prefix} {name}"))
 
 
-def _select_kinds(draw_number: Callable[[str], float]) -> dict[str, str]:
+def _select_fault_kinds(draw_number: Callable[[str], float]) -> dict[str, str]:
     """Select the injected fault of each figure at random; return the fault by figure title."""
-    kinds = _shuffle(FIGURE_FAULTS, "figures", draw_number)[:FIGURE_COUNT]
-    return {f"Figure {number}": kind for number, kind in enumerate(kinds, start=1)}
+    fault_kinds = _shuffle(FIGURE_FAULTS, "figures", draw_number)[:FIGURE_COUNT]
+    return {f"Figure {number}": kind for number, kind in enumerate(fault_kinds, start=1)}
 
 
 def select_choices(
@@ -71,11 +71,11 @@ def select_choices(
     ``draw_number`` returns a random number in [0, 1) that depends only on its argument.
     """
     choices = []
-    for title, kind in _select_kinds(draw_number).items():
-        other_kinds = _shuffle(FIGURE_FAULTS.keys() - {kind}, f"{title} other", draw_number)
-        kinds = [kind, *other_kinds[: len(CHOICE_NAMES) - 1]]
+    for title, kind in _select_fault_kinds(draw_number).items():
+        other_fault_kinds = _shuffle(FIGURE_FAULTS.keys() - {kind}, f"{title} other", draw_number)
+        fault_kinds = [kind, *other_fault_kinds[: len(CHOICE_NAMES) - 1]]
         for field, question in QUESTIONS.items():
-            shuffled_kinds = _shuffle(kinds, f"{title} {field}", draw_number)
+            shuffled_kinds = _shuffle(fault_kinds, f"{title} {field}", draw_number)
             options = tuple(getattr(FIGURE_FAULTS[each], field) for each in shuffled_kinds)
             right_letter = CHOICE_NAMES[shuffled_kinds.index(kind)]
             choices.append((Choice(f"{title}: {question}", options), right_letter))
@@ -88,7 +88,7 @@ def draw_figures(draw_number: Callable[[str], float]) -> bytes:
     ``draw_number`` is that of :func:`select_choices`.
     """
     comparisons = {}
-    for title, kind in _select_kinds(draw_number).items():
+    for title, kind in _select_fault_kinds(draw_number).items():
 
         def draw_figure_number(quantity: str, title: str = title) -> float:
             return draw_number(f"{title} {quantity}")
@@ -123,7 +123,7 @@ def _plot_figures(comparisons: Mapping[str, Comparison]) -> bytes:
 
 
 def _draw_errors(axes: style.Axes, result: AxisComparison, filter_name: FilterName) -> None:
-    """Plot the position error of a filter with ±2σ; the background is grey on forward passes."""
+    """Plot the position error of a filter and ±2σ; grey: flight in the positive direction."""
     name, truth = FILTER_NAMES[filter_name], result.truth
     errors = compute_position_errors(result, filter_name)
     axes.set_title(f"{name}: error along the aisle and ±2σ (m)")
@@ -148,9 +148,9 @@ def _draw_map(axes: style.Axes, comparison: Comparison) -> None:
     ekf2, truth = comparison.flight.ekf2, comparison.flight.truth
     assert isinstance(ekf2, Ekf2)
     assert isinstance(truth, Truth)
-    dots = style.MEASUREMENT_STYLE | {"ms": 4.0}
+    dot_style = style.MEASUREMENT_STYLE | {"ms": 4.0}
     for track, line in (
-        (comparison.source.samples, dots),
+        (comparison.source.samples, dot_style),
         (ekf2.state, style.TRACK_STYLES["EKF2"]),
         (truth.samples, style.TRACK_STYLES["ground truth"]),
     ):

@@ -19,7 +19,7 @@ ANSWER_KEY_NOTE = (
 )
 _Text = Annotated[str, Meta(max_length=1000)]
 _Number = Annotated[float, Meta(gt=-1e12, lt=1e12)]
-_Texts = Annotated[
+_ShortTexts = Annotated[
     tuple[Annotated[str, Meta(min_length=1, max_length=200)], ...], Meta(max_length=20)
 ]
 
@@ -48,13 +48,13 @@ class RightAnswers(
     file: _Text
     sha256: Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
     scenario: dict[str, str | int | float | bool | None] = {}
-    mistakes: _Texts = ()
+    mistakes: _ShortTexts = ()
     true_values: dict[str, _Number] = {}
     difficulty: _Number | None = None
     form: RightFormAnswers | None = None
 
 
-class _Schema(msgspec.Struct, frozen=True):
+class _AnswerKeySchema(msgspec.Struct, frozen=True):
     name: Literal["px4fuse-assignment"] = "px4fuse-assignment"
     version: Literal[3] = 3
 
@@ -71,7 +71,7 @@ class AnswerKey(msgspec.Struct, frozen=True):
         msgspec.field(name="students")
     )
     secret: _Text = ""
-    schema: _Schema = _Schema()
+    schema: _AnswerKeySchema = _AnswerKeySchema()
     note: str = ANSWER_KEY_NOTE
 
     def __repr__(self) -> str:  # an error message must not show the secret

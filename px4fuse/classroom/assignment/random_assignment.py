@@ -28,8 +28,8 @@ FlightKind = Literal["aisle", "loop", "mixed"]
 MIN_SECRET_LENGTH = 16
 # First part of each HMAC message. Another label would change the flights of existing answer keys
 HMAC_LABEL = "px4fuse assignment 2"
-# Fractions of the flights that have 0, 1 and 2 injected faults. A loop has at most the fault
-# "open-end" (landing far from the start), which students could guess if most loops had it
+# Fractions of the flights that have 0, 1 and 2 injected faults. The only fault of a loop is
+# "open-end" (landing far from the start); 40 % have no fault, so that students cannot guess it
 FAULT_COUNT_FRACTIONS: dict[ScenarioKind, tuple[float, ...]] = {
     "aisle": (0.1, 0.5, 0.4),
     "loop": (0.4, 0.6),
@@ -39,7 +39,7 @@ LOOP_FLIGHT_FRACTION = 1 / 3
 # Range of the difficulty of an injected fault. Difficulty: smallest size that px4fuse detects,
 # divided by the size in the flight
 EASIEST_DIFFICULTY, HARDEST_DIFFICULTY = 0.6, 1.0
-# Fraction of the flights whose faults are too small to be detected by px4fuse, and the maximum
+# Fraction of the flights with faults that px4fuse may not detect (difficulty above 1), and maximum
 # difficulty of these faults: students must analyse them without the findings of px4fuse
 UNDETECTABLE_FLIGHT_FRACTION, MAX_FAULT_DIFFICULTY = 0.25, 1.5
 
@@ -96,14 +96,15 @@ class AssignableFault(Record):
         option_value = f"{self.name}={math.copysign(float(f'{size:.3g}'), sign):g}{self.unit}"
         if self.start_range_s is None:
             return option_value
-        earliest_s, latest_s = self.start_range_s
-        return f"{option_value},{earliest_s + start_fraction * (latest_s - earliest_s):.0f}s"
+        earliest_start_s, latest_start_s = self.start_range_s
+        start_s = earliest_start_s + start_fraction * (latest_start_s - earliest_start_s)
+        return f"{option_value},{start_s:.0f}s"
 
 
 class SamplingRules(Record):
     """Possible faults and random parameters of one kind of simulated flight.
 
-    ``numbers`` are minimum, maximum and number of decimals of each parameter of the simulation.
+    ``numbers`` gives (minimum, maximum, number of decimals) of each random field of the scenario.
     """
 
     faults: tuple[AssignableFault, ...]
@@ -227,7 +228,7 @@ def draw_scenario_numbers(
     }
 
 
-def parse_secret(text: str, source_name: str) -> bytes:
+def derive_seed_from_secret(text: str, source_name: str) -> bytes:
     """Derive the seed of the random numbers from the instructor's secret.
 
     Raises

@@ -165,7 +165,7 @@ class ClassList:
                 numbers = other_person.numbers | student.numbers
                 self.people[student_index] = replace(student, numbers=numbers, **fields)
 
-    def find_student_index(self, other: Person) -> int | None:
+    def find_student_index(self, searched_person: Person) -> int | None:
         """Return the index of a person in ``people``; None for an unknown person.
 
         The fields are compared in this order until exactly one student matches: number on the
@@ -175,14 +175,18 @@ class ClassList:
         match_rules: tuple[tuple[Callable[[str, str], bool], Callable[[Person], str], str], ...] = (
             *(
                 (_is_same_text, lambda person, at=platform: person.numbers.get(at, ""), value)
-                for platform, value in other.numbers.items()
+                for platform, value in searched_person.numbers.items()
             ),
-            (_is_same_text, attrgetter("student_id"), other.student_id),
-            (is_same_id, attrgetter("student_id"), other.student_id),
-            (_is_same_text, attrgetter("email"), other.email),
+            (_is_same_text, attrgetter("student_id"), searched_person.student_id),
+            (is_same_id, attrgetter("student_id"), searched_person.student_id),
+            (_is_same_text, attrgetter("email"), searched_person.email),
             # a class list without a login column may contain logins in its id column
-            (_is_same_text, lambda person: person.login or person.student_id, other.login),
-            (is_same_name, attrgetter("name"), other.name),
+            (
+                _is_same_text,
+                lambda person: person.login or person.student_id,
+                searched_person.login,
+            ),
+            (is_same_name, attrgetter("name"), searched_person.name),
         )
         for is_same, get_field, value in match_rules:
             matches = [
@@ -224,12 +228,12 @@ def is_same_name(name: str, other_name: str) -> bool:
     words, other_words = (
         re.findall(r"[^\W_]+", normalise_text(text)) for text in (name, other_name)
     )
-    short_name, long_name = sorted((words, other_words), key=len)
+    shorter_words, longer_words = sorted((words, other_words), key=len)
     joined_names = (
-        "".join(long_name[start:] + long_name[:start]) for start in range(len(long_name))
+        "".join(longer_words[start:] + longer_words[:start]) for start in range(len(longer_words))
     )
-    is_joined = len(short_name) == 1 < len(long_name) and short_name[0] in joined_names
-    return bool(short_name) and (sorted(words) == sorted(other_words) or is_joined)
+    is_joined = len(shorter_words) == 1 < len(longer_words) and shorter_words[0] in joined_names
+    return bool(shorter_words) and (sorted(words) == sorted(other_words) or is_joined)
 
 
 def make_file_stem(student_id: str) -> str | None:

@@ -36,7 +36,7 @@ from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED_MISTAKES
 from px4fuse.simulation.sensors import TIMESYNC_CONVERGENCE_TIME_S
 
 # Maximum relative error of the size of a fault in a student's answer
-RELATIVE_SIZE_TOLERANCE = 0.15
+FAULT_SIZE_TOLERANCE_FRACTION = 0.15
 # Maximum deviation (m) of a student's loop closure error from the right value
 CLOSURE_TOLERANCE_M = 0.3
 # Minimum fraction of positions rejected by EKF2 for which the student must report rejections
@@ -46,8 +46,8 @@ MIN_RESET_M = 0.2
 # Duration (s) at the start of the flight in which position resets are ignored: EKF2 resets to the
 # first position
 RESET_IGNORE_DURATION_S = 5.0
-# Faults by behaviour of EKF2, such as "never fused", that the student must ("required") or may
-# ("allowed") report for these faults
+# For each behaviour of EKF2 in the answer form, such as "never fused": faults for which the student
+# must ("required") or may ("allowed") report this behaviour
 BEHAVIOUR_RULES = read_toml(__file__, dict[str, dict[str, set[str]]], "did.toml")
 
 
@@ -135,12 +135,12 @@ def compute_form_answers(simulation: flights.Simulation, log_sha256: str) -> Rig
 def compare_simulation(simulation: flights.Simulation) -> Comparison:
     """Analyse a simulated flight with the default settings of KF."""
     flight = flights.to_flight(simulation)
-    preparation = prepare(
+    prepared_comparison = prepare(
         flight,
         ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M),
         keep_as_sent=True,  # do not correct frame and clock: the student has to find these faults
     )
-    return compare(preparation, run_kf(preparation))
+    return compare(prepared_comparison, run_kf(prepared_comparison))
 
 
 def _make_injected_fault(
@@ -150,29 +150,31 @@ def _make_injected_fault(
     if not size_fields:
         return InjectedFault(name)
     size = values[size_fields[0]]
-    tolerance = RELATIVE_SIZE_TOLERANCE * abs(size)
-    if name == "open-end":  # the student measures the closure error, which contains odometry drift
+    tolerance = FAULT_SIZE_TOLERANCE_FRACTION * abs(size)
+    if name == "open-end":
+        # the student can only measure the closure error, which includes the odometry drift
         odometry = trajectory_of(comparison.flight, "vio")
         closure_error_m = analyse(LoopSource(odometry, comparison.flight)).closure_error_m
         size = closure_error_m if isinstance(closure_error_m, float) else size
         tolerance = CLOSURE_TOLERANCE_M
     low, high = size - tolerance, size + tolerance
-    if name == "clock-offset":  # accept also each value in the 95 % interval of the estimate
+    if name == "clock-offset":
+        # the estimate is the correction, the negative offset: accept also its 95 % interval
         _, time_offset = estimate_noises_and_clock(comparison)
         if isinstance(time_offset, ClockOffset) and time_offset.is_determinable:
             low, high = min(low, -time_offset.interval_s[1]), max(high, -time_offset.interval_s[0])
-    from_s = until_s = None
+    fault_start_s = fault_end_s = None
     match name:
         case "clock-jump":
-            until_s = TIMESYNC_CONVERGENCE_TIME_S
+            fault_end_s = TIMESYNC_CONVERGENCE_TIME_S
         case "open-end":
-            _, from_s = truth["airborne_s"]
+            _, fault_start_s = truth["airborne_s"]
         case "nlos" if truth["outlier_time_s"]:
-            from_s, *_, until_s = truth["outlier_time_s"] * 2
+            fault_start_s, *_, fault_end_s = truth["outlier_time_s"] * 2
         case "dropout" | "imu-dropout" | "jump" | "heading" | "mag":
-            from_s = values[size_fields[1]]
-            until_s = from_s + abs(size) if name.endswith("dropout") else None
-    return InjectedFault(name, size, low, high, from_s, until_s)
+            fault_start_s = values[size_fields[1]]
+            fault_end_s = fault_start_s + abs(size) if name.endswith("dropout") else None
+    return InjectedFault(name, size, low, high, fault_start_s, fault_end_s)
 
 
 def _make_right_verdict(comparison: Comparison, filter_name: FilterName) -> RightVerdict:

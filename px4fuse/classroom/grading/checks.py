@@ -38,14 +38,17 @@ MAX_QUOTE_LENGTH = 160
 FORM_MISMATCH_REASON = "your answer form and your report are about different logs"
 BOTH_AXES_ADVICE = "Make the report without --axis: the axes north and east are required"
 # Regular expression of one character, without control characters
-_PLAIN_CHARACTER = r"[^\x00-\x1f\x7f]"
-Text = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN_CHARACTER}*$")]
+_PLAIN_CHARACTER_PATTERN = r"[^\x00-\x1f\x7f]"
+Text = Annotated[str, Meta(max_length=200, pattern=rf"^{_PLAIN_CHARACTER_PATTERN}*$")]
 Title = Annotated[
     str,
-    Meta(max_length=200, pattern=rf"^{_PLAIN_CHARACTER}*[^\s\x00-\x1f\x7f]{_PLAIN_CHARACTER}*$"),
+    Meta(
+        max_length=200,
+        pattern=rf"^{_PLAIN_CHARACTER_PATTERN}*[^\s\x00-\x1f\x7f]{_PLAIN_CHARACTER_PATTERN}*$",
+    ),
 ]
 Bound = Annotated[float, Meta(ge=-1e12, le=1e12)]
-ZeroPointsFactor = Annotated[float, Meta(ge=1.0, le=1000.0)]
+ZeroPointsErrorFactor = Annotated[float, Meta(ge=1.0, le=1000.0)]
 # Fraction of the maximum points (0 to 1), and reason for the student
 ScoreAndReason = tuple[float, str]
 
@@ -63,14 +66,14 @@ class RubricItem(
         Only reports of this px4fuse command are scored, as the instructor decided.
     command : {"any", "compare", "loop"}
         Only reports of this px4fuse command contain the data that the check needs.
-    needs_key : bool
+    needs_answer_key : bool
         True if the check requires an answer key.
     is_scored_by_instructor : bool
         True if the instructor enters the points.
     """
 
     command: ClassVar[str] = "any"
-    needs_key: ClassVar[bool] = False
+    needs_answer_key: ClassVar[bool] = False
     is_scored_by_instructor: ClassVar[bool] = False
 
     title: Title
@@ -83,8 +86,8 @@ class RubricItem(
 
     def is_applicable(self, command_name: str, key: AnswerKey | None) -> bool:
         """Return True if the item scores reports of the command, with or without answer key."""
-        has_key = key is not None or not self.needs_key
-        return has_key and {self.report, self.command} <= {"any", command_name}
+        has_required_key = key is not None or not self.needs_answer_key
+        return has_required_key and {self.report, self.command} <= {"any", command_name}
 
 
 def score_deviation(deviation_factor: float, zero_points_factor: float) -> float:
@@ -230,8 +233,8 @@ class VerifiedItem(RubricItem, frozen=True, tag="verified"):
 class NumberItem(RubricItem, frozen=True, tag="number"):
     """Check that a number of the report is between ``at_least`` and ``at_most``.
 
-    Outside, the points decrease linearly to zero at the value ``zero_at``. If ``path`` matches
-    several numbers, the lowest score counts.
+    Outside these bounds, the points decrease linearly to zero at the value ``zero_at``. If ``path``
+    matches several numbers, the lowest score counts.
     """
 
     path: Text
@@ -244,8 +247,8 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
 
     def __post_init__(self) -> None:
         is_bounded = math.isfinite(self.at_least) or math.isfinite(self.at_most)
-        is_zero_at_outside = self.zero_at is None or self._compute_excess(self.zero_at) >= 0.0
-        if not is_bounded or self.at_least > self.at_most or not is_zero_at_outside:
+        is_zero_limit_outside = self.zero_at is None or self._compute_excess(self.zero_at) >= 0.0
+        if not is_bounded or self.at_least > self.at_most or not is_zero_limit_outside:
             raise ValueError(
                 "give at_least, at_most or both (at_least <= at_most); zero_at must be outside"
             )
@@ -258,8 +261,10 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
         excess = self._compute_excess(number)
         if excess <= 0.0:
             return 1.0
-        zero_points_excess = 0.0 if self.zero_at is None else self._compute_excess(self.zero_at)
-        return max(1.0 - excess / zero_points_excess, 0.0) if zero_points_excess > 0.0 else 0.0
+        excess_for_zero_points = 0.0 if self.zero_at is None else self._compute_excess(self.zero_at)
+        return (
+            max(1.0 - excess / excess_for_zero_points, 0.0) if excess_for_zero_points > 0.0 else 0.0
+        )
 
     def score(self, check_input: CheckInput) -> ScoreAndReason:
         values = find_values(check_input.values, self.path)
@@ -270,19 +275,19 @@ class NumberItem(RubricItem, frozen=True, tag="number"):
             label = self.name or f"the number {self.path}"
             reason_text = check_input.find_missing_reason(self.path)
             return 0.0, f"Your report does not contain {label}{reason_text}."
-        fraction, number, path = min(numbers, key=lambda each: each[0])
+        points_fraction, number, path = min(numbers, key=lambda each: each[0])
         label = self.name or f"the number {shorten_text(path)}"
         bounds = (("at least", self.at_least), ("at most", self.at_most))
         limit_texts = [f"{word} {bound:.4g}" for word, bound in bounds if math.isfinite(bound)]
         statement = f"{capitalise_first(label)} is {f'{number:.4g} {self.unit}'.strip()}"
-        advice = f" {self.advice}" if fraction < 1.0 and self.advice else ""
-        return fraction, f"{statement}; required: {' and '.join(limit_texts)}.{advice}"
+        advice = f" {self.advice}" if points_fraction < 1.0 and self.advice else ""
+        return points_fraction, f"{statement}; required: {' and '.join(limit_texts)}.{advice}"
 
 
 class AnswersItem(RubricItem, frozen=True, tag="answers"):
     """Compare the student's answers with the answer key."""
 
-    needs_key: ClassVar[bool] = True
+    needs_answer_key: ClassVar[bool] = True
 
     def score(self, check_input: CheckInput) -> ScoreAndReason:
         points_or_reason = check_input.form_points
@@ -299,7 +304,7 @@ class AnswersItem(RubricItem, frozen=True, tag="answers"):
 class TextItem(RubricItem, frozen=True, tag="text"):
     """Let the instructor score the student's text about the flight (option ``--notes``)."""
 
-    needs_key: ClassVar[bool] = True
+    needs_answer_key: ClassVar[bool] = True
     is_scored_by_instructor: ClassVar[bool] = True
 
     def score(self, check_input: CheckInput) -> ScoreAndReason:
@@ -324,13 +329,14 @@ NOISE_SETTINGS: dict[NoiseSettingName, tuple[str, str, str]] = {
 class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"zero_points_factor": "factor"}):
     """Check that SIGMA_A or SIGMA_Z is within the 95 % interval of its estimate.
 
-    Outside, the points decrease to zero at ``zero_points_factor`` times the interval bound.
+    Outside the interval, the points decrease to zero at ``zero_points_factor`` times the upper
+    bound, and at the lower bound divided by this factor.
     """
 
     command: ClassVar[str] = "compare"
 
     setting: NoiseSettingName
-    zero_points_factor: ZeroPointsFactor = 2.0
+    zero_points_factor: ZeroPointsErrorFactor = 2.0
 
     def score(self, check_input: CheckInput) -> ScoreAndReason:
         comparison = check_input.comparison
@@ -354,7 +360,7 @@ class TuningItem(RubricItem, frozen=True, tag="tuning", rename={"zero_points_fac
         if deviation_factor > 1.0:
             side = "above" if chosen_value > high else "below"
             relation = f"a factor of {format_factor(deviation_factor)} {side}"
-            advice = f" Set {option} within this interval."
+            advice = f" Set {option} to a value in this interval."
         return score_deviation(deviation_factor, self.zero_points_factor), (
             f"Your {label} {chosen_value:.3g} {unit} is {relation} the 95 % interval of the "
             f"maximum-likelihood estimate ({low:.3g} to {high:.3g} {unit}).{advice}"
@@ -377,13 +383,14 @@ class ConsistencyItem(
 ):
     """Check that KF is consistent, by the mean NIS of north and east together.
 
-    The points decrease to zero if the reported σ is wrong by ``zero_points_factor``. A report with
-    SIGMA_A and SIGMA_Z within the 95 % intervals of their estimates gets all points.
+    The points decrease to zero if the reported σ is ``zero_points_factor`` times too small or too
+    large. A report with SIGMA_A and SIGMA_Z within the 95 % intervals of their estimates gets all
+    points.
     """
 
     command: ClassVar[str] = "compare"
 
-    zero_points_factor: ZeroPointsFactor = 2.0
+    zero_points_factor: ZeroPointsErrorFactor = 2.0
 
     def score(self, check_input: CheckInput) -> ScoreAndReason:
         nis_result = check_input.comparison.horizontal.get("kf")
@@ -394,24 +401,24 @@ class ConsistencyItem(
             return 1.0, "KF is consistent."
         direction = "small" if nis_result.nis_mean > 1.0 else "large"
         sigma_factor = nis_result.sigma_error_factor
-        fraction = score_deviation(sigma_factor, self.zero_points_factor)
+        points_fraction = score_deviation(sigma_factor, self.zero_points_factor)
         advice = (
             "Compare SIGMA_A and SIGMA_Z with the maximum-likelihood estimates, and look for "
             "errors that are not white noise."
         )
         tuning_items = [TuningItem(title="", points=0.0, setting=name) for name in NOISE_SETTINGS]
         if all(item.score(check_input)[0] == 1.0 for item in tuning_items):
-            fraction = 1.0
+            points_fraction = 1.0
             advice = (
                 "SIGMA_A and SIGMA_Z are within the 95 % intervals of their estimates, so other "
                 "settings do not make KF consistent."
             )
-        return fraction, (
+        return points_fraction, (
             f"The reported σ of KF is {format_factor(sigma_factor)} times too {direction}. {advice}"
         )
 
 
-class ClockItem(RubricItem, frozen=True, tag="clock"):
+class TimeOffsetItem(RubricItem, frozen=True, tag="clock"):
     """Check that the applied time offset of the position source agrees with the estimate.
 
     Attributes
@@ -430,11 +437,11 @@ class ClockItem(RubricItem, frozen=True, tag="clock"):
     def score(self, check_input: CheckInput) -> ScoreAndReason:
         clock = check_input.comparison.clock
         if not isinstance(clock, ClockOffset) or not clock.is_determinable:
-            fraction = self.undeterminable if isinstance(clock, ClockOffset) else 0.0
+            points_fraction = self.undeterminable if isinstance(clock, ClockOffset) else 0.0
             reason_text = format_reason(clock.reason or "")
             statement = f"The time offset cannot be estimated from your flight{reason_text}."
-            # all points for an assigned log: the student could not fly more motion
-            return 1.0 if check_input.right_answers is not None else fraction, statement
+            # all points for an assigned log: the student cannot change its motion
+            return 1.0 if check_input.right_answers is not None else points_fraction, statement
         (low, high), applied_s = clock.interval_s, clock.applied_s
         statement = (
             f"You applied a time offset of {applied_s:.3f} s. The 95 % interval of the estimate is "
@@ -465,7 +472,8 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
     """Score the analysis of a loop.
 
     1/4 of the points for a loop closure error, 1/2 for an accepted loop closure, and all points for
-    a corrected path. If the vehicle did not return, all points if no loop closure was accepted.
+    a corrected path. If the vehicle landed far from its start, all points for a report without
+    accepted loop closure.
     """
 
     def score(self, check_input: CheckInput) -> ScoreAndReason:
@@ -488,16 +496,16 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
             return 0.0, (
                 "The track in your report does not drift. Analyse odometry, for example LOG:vio."
             )
-        fraction, comment = 0.25, "No loop closure was accepted."
+        points_fraction, comment = 0.25, "No loop closure was accepted."
         if is_accepted:
             corrected_paths = map(loop.corrections.get, CORRECTIONS)
             is_corrected = any(isinstance(path, CorrectedPath) for path in corrected_paths)
-            fraction = 1.0 if is_corrected else 0.5
+            points_fraction = 1.0 if is_corrected else 0.5
             comment = (
                 "A loop closure was accepted, and the drift of the path was "
                 f"{'' if is_corrected else 'not '}corrected."
             )
         error_text, path_text = map(format_length, (loop.closure_error_m, loop.path_length_m))
-        return fraction, (
+        return points_fraction, (
             f"You measured a loop closure error of {error_text} after {path_text}. {comment}"
         )

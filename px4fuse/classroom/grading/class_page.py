@@ -12,7 +12,7 @@ from px4fuse.classroom.grading.item_analysis import analyse_items
 from px4fuse.classroom.grading.model import (
     TOTAL_TITLE,
     Grade,
-    Override,
+    GradeOverride,
     counted_reports,
     list_titles,
 )
@@ -61,7 +61,7 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
             *(Column(title, "number", "items") for title in item_titles),
             *(Column(title, "number", "numbers") for title in number_titles),
         ),
-        rows=[_make_class_row(grade, item_titles, number_titles) for grade in grades],
+        rows=[_make_grade_row(grade, item_titles, number_titles) for grade in grades],
         filters=[("Status", [("", f"Everyone ({len(grades)})"), *options])],
         column_groups=(("items", "Points of each rubric item"), ("numbers", "Numbers")),
         placeholder="search for name, id, file or flag",
@@ -71,14 +71,16 @@ def format_class_page(grades: Sequence[Grade], title: str, version_text: str) ->
 
 def _format_statistics(grades: Sequence[Grade], count_by_tag: Mapping[str, int]) -> str:
     """Format the statistics of the class: number of reports by status, and histograms of points."""
-    totals = [grade.total for grade in grades if grade.total is not None]
+    total_points = [grade.total for grade in grades if grade.total is not None]
     max_points = max((grade.max_points for grade in grades if grade.max_points > 0.0), default=1.0)
     reports = counted_reports(grades)
     return load_template("classroom/grading/above.html").render(
         students=len(grades),
         counts=count_by_tag,
-        averages=(statistics.fmean(totals), statistics.median(totals)) if totals else (),
-        totals=count_by_bin(totals, max_points) if totals else (),
+        averages=(statistics.fmean(total_points), statistics.median(total_points))
+        if total_points
+        else (),
+        totals=count_by_bin(total_points, max_points) if total_points else (),
         max_points_text=format_cell_number(max_points),
         max_points_edge=format_number(max_points),
         pending_points=[report.points for report in reports if report.instructor_action],
@@ -101,7 +103,7 @@ def count_by_bin(values: Sequence[float], maximum: float) -> list[tuple[int, str
 def _make_grade_tags(grade: Grade) -> list[str]:
     report = grade.counted_report
     tags = [report.status if report else NO_SUBMISSION_STATUS]
-    tags += ["flagged"] * bool(grade.flags) + ["late"] * bool(grade.late_s)
+    tags += ["flagged"] * bool(grade.flags) + ["late"] * bool(grade.lateness_s)
     if report:
         tags += ["pending"] * bool(report.instructor_action)
         tags += ["to read"] * report.is_awaiting_points
@@ -111,13 +113,13 @@ def _make_grade_tags(grade: Grade) -> list[str]:
     return tags + ["changed by instructor"] * bool(grade.overrides or grade.comment)
 
 
-def _make_class_row(grade: Grade, item_titles: Sequence[str], number_titles: Sequence[str]) -> Row:
+def _make_grade_row(grade: Grade, item_titles: Sequence[str], number_titles: Sequence[str]) -> Row:
     report = grade.counted_report
     status = report.status if report else NO_SUBMISSION_STATUS
     css_class, symbol = STATUS_STYLES[status]
     flag_count = len(grade.flags)
     flag_count_text = count_noun(flag_count, "flag") if flag_count else ""
-    late_text = f"{math.ceil(grade.late_s / 60.0)} min late" if grade.late_s else ""
+    late_text = f"{math.ceil(grade.lateness_s / 60.0)} min late" if grade.lateness_s else ""
     points_by_title = {item.title: item.points for item in report.items} if report else {}
     number_values = report.numbers if report else {}
     cells = (
@@ -133,7 +135,7 @@ def _make_class_row(grade: Grade, item_titles: Sequence[str], number_titles: Seq
     # the points of an anonymous student cannot be entered: overrides.csv needs the id or the file
     points_inputs = (_make_points_inputs(grade),) if grade.student_id or grade.file_name else ()
     links = (
-        [("Report redrawn from the log (PDF)", make_relative_url(report.redrawn_path))]
+        [("Report redrawn from the log (PDF)", make_relative_url(report.redrawn_report_path))]
         if report
         else []
     )
@@ -200,7 +202,9 @@ def _make_points_cell(grade: Grade) -> Cell:
             else ""
         )
         return Cell("pending" if proposed_points_text else "–", None, proposed_points_text)
-    notes = [f"{format_cell_number(grade.deduction)} deducted (late)"] * bool(grade.deduction)
+    notes = [f"{format_cell_number(grade.deducted_points)} deducted (late)"] * bool(
+        grade.deducted_points
+    )
     notes += ["changed by instructor"] * any(
         override.points is not None for override in grade.overrides.values()
     )
@@ -211,24 +215,26 @@ def _make_points_cell(grade: Grade) -> Cell:
 def _make_points_inputs(grade: Grade) -> RowSection:
     """Make the input boxes for the points that the instructor can enter."""
     report = grade.counted_report
-    max_by_title = {
+    max_points_by_title = {
         item.title: item.max_points
         for item in (report.items if report else ())
         if item.is_scored_by_instructor
     }
-    max_by_title[TOTAL_TITLE] = grade.max_points
-    override_by_title = {title: grade.overrides.get(title, Override()) for title in max_by_title}
+    max_points_by_title[TOTAL_TITLE] = grade.max_points
+    override_by_title = {
+        title: grade.overrides.get(title, GradeOverride()) for title in max_points_by_title
+    }
     rows = [
-        (title, max_by_title[title], override.points, override.comment)
+        (title, max_points_by_title[title], override.points, override.comment)
         for title, override in override_by_title.items()
     ]
     # the page writes a complete overrides.csv, also with the points that have no input box
-    other_rows = [
+    rows_without_input_box = [
         (title, override.points, override.comment)
         for title, override in grade.overrides.items()
-        if title not in max_by_title
+        if title not in max_points_by_title
     ]
     identity = grade.student_id or grade.file_name
     return frame.make_input_boxes_section(
-        "Points and comments of the instructor", identity, rows, other_rows
+        "Points and comments of the instructor", identity, rows, rows_without_input_box
     )

@@ -23,8 +23,8 @@ from px4fuse.classroom.grading.model import (
     TOTAL_TITLE,
     Grade,
     GradedReport,
+    GradeOverride,
     ItemScore,
-    Override,
     Submission,
     counted_reports,
 )
@@ -40,7 +40,7 @@ OVERRIDES_TEMPLATE = "\ufeff" + ",".join(OVERRIDE_TITLES) + "\r\n"
 MAX_COMMENT_LENGTH = 10_000
 
 # Points and comment of the instructor, by student id and rubric item ("" for the whole report)
-Overrides = Mapping[str, Mapping[str, Override]]
+OverridesByStudent = Mapping[str, Mapping[str, GradeOverride]]
 # Syntax of the option --late, for example "10 % / day up to 50 %"
 _LATE_RULE_PATTERN = re.compile(
     r"(?P<rate>\d+(?:\.\d+)?)\s*%\s*/\s*(?P<unit>day|hour)"
@@ -64,17 +64,19 @@ class LateRule:
     unit_s: float
     max_deduction_fraction: float
 
-    def compute_deduction(self, late_s: float, max_points: float) -> float:
-        """Compute the points to deduct from a submission that is late by ``late_s`` seconds.
+    def compute_deduction(self, lateness_s: float, max_points: float) -> float:
+        """Compute the points to deduct from a submission that is late by ``lateness_s`` seconds.
 
         >>> parse_late_rule("10%/day").compute_deduction(86_401.0, 50.0)
         10.0
         >>> parse_late_rule("10%/day up to 30%").compute_deduction(1e9, 50.0)
         15.0
         """
-        late_units = math.ceil(max(late_s, 0.0) / self.unit_s)
+        late_unit_count = math.ceil(max(lateness_s, 0.0) / self.unit_s)
         return round(
-            max_points * min(late_units * self.deduction_per_unit, self.max_deduction_fraction), 2
+            max_points
+            * min(late_unit_count * self.deduction_per_unit, self.max_deduction_fraction),
+            2,
         )
 
 
@@ -134,7 +136,8 @@ class Course:
         return ClassList(people, *people_by_sheet)
 
 
-# Sort key (UNIX times of submission and zip entry), report, and grade if only this report counts
+# Sort key (UNIX times of submission and zip entry) of a report, the report, and the grade of the
+# student if only this report counts
 RankedAttempt = tuple[tuple[float, float], GradedReport, Grade]
 
 
@@ -142,7 +145,7 @@ def build_grades(
     reports: Sequence[GradedReport],
     submissions: Sequence[Submission],
     course: Course,
-    overrides: Overrides,
+    overrides: OverridesByStudent,
 ) -> tuple[tuple[Grade, ...], tuple[str, ...]]:
     """Assign the reports to students, and compute the grade of each student.
 
@@ -185,18 +188,18 @@ def build_grades(
         replace(grade, flags=(unknown_student_flag, *grade.flags))
         for *_, grade in attempts_by_index[None]
     ]
-    overrides_by_grade, notes = match_overrides(overrides, grades)
+    overrides_of_grades, notes = match_overrides(overrides, grades)
     flags_by_submission = flag_equal_contents(counted_reports(grades))
     grades_with_report = [grade for grade in grades if grade.counted_report]
-    unknown_count = sum(grade.late_s is None for grade in grades_with_report)
-    if course.late_rule and unknown_count:
+    unknown_time_count = sum(grade.lateness_s is None for grade in grades_with_report)
+    if course.late_rule and unknown_time_count:
         notes += (
-            f"The submission time is unknown for {unknown_count} of {len(grades_with_report)} "
+            f"The submission time is unknown for {unknown_time_count} of {len(grades_with_report)} "
             "students, so no points were deducted. Add the times with --worksheet.",
         )
     final_grades = (
         _apply_overrides(*grade_and_overrides, flags_by_submission, course)
-        for grade_and_overrides in zip(grades, overrides_by_grade, strict=True)
+        for grade_and_overrides in zip(grades, overrides_of_grades, strict=True)
     )
     return tuple(final_grades), notes
 
@@ -213,8 +216,8 @@ def _collect_students(
             if class_list.find_student_index(person) is not None:
                 continue
             # ignore the id in the report if another student already has this id
-            unclaimed_id = report.student_id if reported_student_index is None else ""
-            student_id = person.student_id or unclaimed_id
+            unassigned_id = report.student_id if reported_student_index is None else ""
+            student_id = person.student_id or unassigned_id
             name = one_line(report.student if student_id else person.name, 200) or person.name
             student_id = next(filter(None, (student_id, person.login, *person.numbers.values())))
             class_list.people.append(replace(person, student_id=student_id, name=name))
@@ -230,7 +233,7 @@ def _make_attempt(
     student_index: int | None,
     class_list: ClassList,
 ) -> RankedAttempt:
-    """Compute the grade of a student if only this report counts."""
+    """Return a report with its sort key, and the grade of the student if this report is chosen."""
     origin, platform = submission.origin, submission.origin.platform.capitalize()
     person = (
         Person(report.student_id) if student_index is None else class_list.people[student_index]
@@ -245,11 +248,11 @@ def _make_attempt(
         submission_time and add_time_zone(submission_time, due_time)
         for submission_time in (stated_time, submission.time)
     )
-    late_s, flags = None, []
+    lateness_s, flags = None, []
     if due_time is not None and submission_time is not None:
         # UNIX times, because differences of datetime objects ignore daylight saving time
-        late_s = submission_time.timestamp() - due_time.timestamp()
-        late_s = late_s if late_s > course.grace_s else 0.0
+        lateness_s = submission_time.timestamp() - due_time.timestamp()
+        lateness_s = lateness_s if lateness_s > course.grace_s else 0.0
     elif origin.is_late:
         flags.append(
             f"{platform} marks the file as late without a time, so no points were deducted."
@@ -259,7 +262,7 @@ def _make_attempt(
             f"The time in the zip file ({zip_time:{TIME_FORMAT}}) is after the due time. It may be "
             "the time of the download, so no points were deducted."
         )
-    if origin.is_imitated:
+    if origin.has_imitated_platform_name:
         flags.append(
             "The student's part of the file name imitates a learning platform (platform of the "
             f"export: {platform or 'none'}). Check who handed in the file."
@@ -279,9 +282,9 @@ def _make_attempt(
         person.student_id,
         report,
         submission_time="" if submission_time is None else submission_time.strftime(TIME_FORMAT),
-        late_s=late_s,
-        deduction=late_rule.compute_deduction(late_s, report.max_points)
-        if late_rule and late_s
+        lateness_s=lateness_s,
+        deducted_points=late_rule.compute_deduction(lateness_s, report.max_points)
+        if late_rule and lateness_s
         else 0.0,
         max_points=report.max_points,
         flags=tuple(flags),
@@ -295,7 +298,7 @@ def _make_attempt(
 
 def _deduct_points(attempt: RankedAttempt) -> float:
     _, report, grade = attempt
-    return max(report.points - grade.deduction, 0.0)
+    return max(report.points - grade.deducted_points, 0.0)
 
 
 def _choose_attempt(attempts: Sequence[RankedAttempt], course: Course) -> Grade:
@@ -307,13 +310,13 @@ def _choose_attempt(attempts: Sequence[RankedAttempt], course: Course) -> Grade:
     )
     # prefer reports that need no decision of the instructor, then readable reports
     attempts_with_report = [attempt for attempt in sorted_attempts if attempt[1].version]
-    attempts_without_action = [
+    attempts_without_decision = [
         attempt for attempt in attempts_with_report if not attempt[1].instructor_action
     ]
-    eligible_attempts = attempts_without_action or attempts_with_report or sorted_attempts
-    chosen_key, chosen_report, grade = {
+    eligible_attempts = attempts_without_decision or attempts_with_report or sorted_attempts
+    chosen_sort_key, chosen_report, grade = {
         "latest": eligible_attempts[-1],
-        # several reports may have the earliest time: take the one with most points
+        # of several reports with the earliest time, the last one has the most points (sort order)
         "first": [
             attempt for attempt in eligible_attempts if attempt[0] == eligible_attempts[0][0]
         ][-1],
@@ -321,7 +324,9 @@ def _choose_attempt(attempts: Sequence[RankedAttempt], course: Course) -> Grade:
     }[course.attempt]
     flags = list(grade.flags)
     other_reports = tuple(report for _, report, _ in sorted_attempts if report is not chosen_report)
-    forms = [report.form for sort_key, report, _ in eligible_attempts if sort_key == chosen_key]
+    forms = [
+        report.form for sort_key, report, _ in eligible_attempts if sort_key == chosen_sort_key
+    ]
     # without this rule, students could hand in several answer forms with different guesses
     if course.attempt != "best" and len(set(forms)) > 1:
         action = f"Ask the student which of {len(forms)} reports counts: the answer forms differ."
@@ -330,12 +335,12 @@ def _choose_attempt(attempts: Sequence[RankedAttempt], course: Course) -> Grade:
         course.attempt == "best" and len({report.form for _, report, _ in attempts_with_report}) > 1
     ):
         flags.append(f"The student handed in {len(attempts)} reports with different answer forms.")
-    elif len(forms) > 1 and any(chosen_key):
+    elif len(forms) > 1 and any(chosen_sort_key):
         flags.append(f"{len(forms)} reports have the same time; the one with most points counts.")
     for sort_key, report, _ in sorted_attempts:
         if (
             report in other_reports
-            and sort_key >= chosen_key
+            and sort_key >= chosen_sort_key
             and (report.instructor_action or not report.version)
         ):
             status = "pending" if report.version else "no report"
@@ -349,7 +354,7 @@ def _choose_attempt(attempts: Sequence[RankedAttempt], course: Course) -> Grade:
 
 def _apply_overrides(
     grade: Grade,
-    override_by_title: Mapping[str, Override],
+    override_by_title: Mapping[str, GradeOverride],
     flags_by_submission: Mapping[str, Sequence[str]],
     course: Course,
 ) -> Grade:
@@ -360,9 +365,9 @@ def _apply_overrides(
         report = replace(report, items=tuple(items))
         flags = (*flags, *report.flags, *flags_by_submission.get(report.submission, ()))
         if report.counted_points is not None or course.include_pending:
-            total_points = round(max(report.points - grade.deduction, 0.0), 2)
+            total_points = round(max(report.points - grade.deducted_points, 0.0), 2)
     report_override, total_override = (
-        override_by_title.get(title, Override()) for title in ("", TOTAL_TITLE)
+        override_by_title.get(title, GradeOverride()) for title in ("", TOTAL_TITLE)
     )
     return replace(
         grade,
@@ -374,7 +379,7 @@ def _apply_overrides(
     )
 
 
-def _override_item(item: ItemScore, override: Override | None) -> ItemScore:
+def _override_item(item: ItemScore, override: GradeOverride | None) -> ItemScore:
     """Replace the points of a rubric item by the instructor's points, and append the comment."""
     if override is None:
         return item
@@ -391,7 +396,7 @@ def _override_item(item: ItemScore, override: Override | None) -> ItemScore:
 # ------------------------------------------------------------------ overrides
 
 
-def read_overrides(path: Path) -> Overrides:
+def read_overrides(path: Path) -> OverridesByStudent:
     """Read the instructor's points and comments from ``overrides.csv``, if the file exists.
 
     Columns: id (as in class.csv, or the file name of the report), item (a title of the rubric,
@@ -411,12 +416,12 @@ def read_overrides(path: Path) -> Overrides:
     if missing_titles:
         remedy = f"Required columns: {', '.join(OVERRIDE_TITLES)}."
         raise SettingsError(f"{path}: no column {', '.join(missing_titles)}.", remedy)
-    overrides: dict[str, dict[str, Override]] = defaultdict(dict)
+    overrides: dict[str, dict[str, GradeOverride]] = defaultdict(dict)
     for row_number, row in enumerate(sheet.rows, start=2):
         if any(cell.strip() for cell in row[len(sheet.column_titles) :]):
             raise SettingsError(
                 f"{path}: row {row_number} has more cells than the header.",
-                "Put a comment that contains a comma in double quotes.",
+                "Enclose a comment that contains a comma in double quotes.",
             )
         student, item_title, points, comment = (
             sheet.find_cell(row, (title,)).removeprefix("'") for title in OVERRIDE_TITLES
@@ -427,20 +432,20 @@ def read_overrides(path: Path) -> Overrides:
             item_text = one_line(item_title, 40) or "(whole report)"
             problem = f"student {one_line(student, 40)} has two rows for the item {item_text}"
         elif points and (parsed_points is None or parsed_points < 0.0):
-            problem = f"points {one_line(points, 20)!r} are not a number of 0 or more"
+            problem = f"the points {one_line(points, 20)!r} are not a number of 0 or more"
         elif points and not item_title:
-            problem = f"points {one_line(points, 20)} need the title of an item, or total"
+            problem = f"the points {one_line(points, 20)} need a rubric title or 'total' as item"
         if problem:
             raise SettingsError(f"{path}: row {row_number}: {problem}.")
-        overrides[student][item_title] = Override(
+        overrides[student][item_title] = GradeOverride(
             parsed_points, clean_text(comment[:MAX_COMMENT_LENGTH])
         )
     return overrides
 
 
 def match_overrides(
-    overrides: Overrides, grades: Sequence[Grade]
-) -> tuple[list[dict[str, Override]], tuple[str, ...]]:
+    overrides: OverridesByStudent, grades: Sequence[Grade]
+) -> tuple[list[dict[str, GradeOverride]], tuple[str, ...]]:
     """Assign the instructor's points and comments to students and rubric items.
 
     Returns
@@ -450,31 +455,31 @@ def match_overrides(
     notes : tuple of str
         Sentences about points and comments without a matching student or item.
     """
-    matched_overrides: list[dict[str, Override]] = [{} for _ in grades]
+    matched_overrides: list[dict[str, GradeOverride]] = [{} for _ in grades]
     max_points_of_reports = (report.max_points for grade in grades for report in grade.reports)
     max_total_points = max(max_points_of_reports, default=math.inf)
-    people = ClassList(Person(grade.student_id, login=grade.file_name) for grade in grades)
+    class_list = ClassList(Person(grade.student_id, login=grade.file_name) for grade in grades)
     notes = []
     for student, override_by_item in overrides.items():
         # the instructor may type an id, with or without leading zeros, or a file name
-        student_index = people.find_student_index(Person(student, login=student))
+        student_index = class_list.find_student_index(Person(student, login=student))
         student_text = one_line(student, 40) or "(empty)"
         if student_index is None:
             notes.append(f"{OVERRIDES_NAME}: no student has the id {student_text}.")
             continue
-        max_by_title = {TOTAL_TITLE: max_total_points, "": math.inf}
+        max_points_by_title = {TOTAL_TITLE: max_total_points, "": math.inf}
         if report := grades[student_index].counted_report:
-            max_by_title |= {item.title: item.max_points for item in report.items}
-            max_by_title[TOTAL_TITLE] = report.max_points
-        title_by_normalised = {normalise_text(title): title for title in max_by_title}
+            max_points_by_title |= {item.title: item.max_points for item in report.items}
+            max_points_by_title[TOTAL_TITLE] = report.max_points
+        title_by_normalised_title = {normalise_text(title): title for title in max_points_by_title}
         for item_title, override in override_by_item.items():
-            title, problem = title_by_normalised.get(normalise_text(item_title)), ""
+            title, problem = title_by_normalised_title.get(normalise_text(item_title)), ""
             if title is None:
                 problem = f"student {student_text} has no item {one_line(item_title, 60)!r}"
             elif title in matched_overrides[student_index]:
                 problem = f"student {student_text} has two rows for {title or 'the whole report'!r}"
-            elif (override.points or 0.0) > max_by_title[title]:
-                limit_text = f"{max_by_title[title]:g} points of {one_line(title, 60)!r}"
+            elif (override.points or 0.0) > max_points_by_title[title]:
+                limit_text = f"{max_points_by_title[title]:g} points of {one_line(title, 60)!r}"
                 problem = f"points of student {student_text} are above the maximum, {limit_text}"
             else:
                 matched_overrides[student_index][title] = override
@@ -503,7 +508,9 @@ def parse_late_rule(text: str) -> LateRule:
     return LateRule(float(match["rate"]) / 100.0, unit_s, max_deduction_fraction)
 
 
-def parse_due_time(text: str, name: str = "--due", default_zone: tzinfo | None = None) -> datetime:
+def parse_due_time(
+    text: str, name: str = "--due", default_time_zone: tzinfo | None = None
+) -> datetime:
     """Parse a due time: ``2026-11-20 23:59``, optionally with ``+01:00`` or ``Europe/Berlin``.
 
     A date without a time means the end of the day. The default time zone is that of this computer.
@@ -516,28 +523,28 @@ def parse_due_time(text: str, name: str = "--due", default_zone: tzinfo | None =
     """
     words = text.split()
     try:
-        time_zone = ZoneInfo(words.pop()) if words and words[-1][0].isalpha() else default_zone
+        time_zone = ZoneInfo(words.pop()) if words and words[-1][0].isalpha() else default_time_zone
         due_time = datetime.fromisoformat("T".join(words[:2]) + "".join(words[2:]))
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
         raise SettingsError(
             f"{name} {text!r} is not a valid time. Use '2026-11-20 23:59', optionally "
             "followed by a time zone ('+01:00' or 'Europe/Berlin')."
         ) from error
-    time_of_day = re.search(r"\d\d:\d\d(:\d\d)?", text)
-    if time_of_day is None:
+    time_of_day_match = re.search(r"\d\d:\d\d(:\d\d)?", text)
+    if time_of_day_match is None:
         due_time = due_time.replace(hour=23, minute=59)
-    if time_of_day is None or time_of_day[1] is None:
+    if time_of_day_match is None or time_of_day_match[1] is None:
         due_time = due_time.replace(second=59)
     if due_time.tzinfo is not None:
         return due_time
     return due_time.replace(tzinfo=time_zone) if time_zone else due_time.astimezone()
 
 
-def add_time_zone(time: datetime, due: datetime | None) -> datetime:
-    """Add the time zone of ``due``, or of this computer, to a time without a time zone."""
+def add_time_zone(time: datetime, due_time: datetime | None) -> datetime:
+    """Add the time zone of ``due_time``, or of this computer, to a time without a time zone."""
     if time.tzinfo is not None:
         return time
-    return time.replace(tzinfo=due.tzinfo) if due is not None else time.astimezone()
+    return time.replace(tzinfo=due_time.tzinfo) if due_time is not None else time.astimezone()
 
 
 def parse_moodle_time(text: str) -> datetime | None:

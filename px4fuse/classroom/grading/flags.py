@@ -24,12 +24,12 @@ MIN_SAME_NUMBERS = 3
 # Minimum number of answered multiple-choice questions for comparing two students
 MIN_ANSWERED_CHOICES = 6
 # Maximum relative difference of numbers that count as equal: a copy may have small changes
-SAME_NUMBER_TOLERANCE = 0.02
+SAME_NUMBER_RELATIVE_TOLERANCE = 0.02
 # Minimum fraction of the log that a report must analyse (--start, --end): else it is flagged
-MIN_ANALYSED_FRACTION = 0.5
+MIN_ANALYSED_LOG_FRACTION = 0.5
 # Maximum factor by which --drift or --heading-drift may be above or below its default: else the
 # report is flagged
-MAX_DRIFT_FACTOR = 4.0
+MAX_DRIFT_OPTION_FACTOR = 4.0
 MAX_LISTED_REPORTS = 4
 # Pairs of reports with equal contents
 ReportPairs = Iterator[tuple[GradedReport, GradedReport]]
@@ -40,10 +40,10 @@ def flag_page_differences(verification: Verification) -> Iterator[str]:
     if verification.pages:
         first_difference, *further_differences = verification.pages
         count = len(further_differences)
-        more_text = f" Further differences: {count}." if count else ""
+        further_text = f" Further differences: {count}." if count else ""
         yield (
             "The PDF differs from the report that px4fuse draws from the log. "
-            f"{capitalise_first(first_difference.sentence)}.{more_text} Read the redrawn report."
+            f"{capitalise_first(first_difference.sentence)}.{further_text} Read the redrawn report."
         )
 
 
@@ -60,7 +60,7 @@ def flag_settings(results: ReportedResults, has_key: bool = False) -> Iterator[s
         (settings.end_s - settings.start_s) / log_duration_s if log_duration_s else 1.0
     )
     has_time_options = (results.request.start_s, results.request.end_s) != (None, None)
-    if has_time_options and analysed_fraction < MIN_ANALYSED_FRACTION:
+    if has_time_options and analysed_fraction < MIN_ANALYSED_LOG_FRACTION:
         yield (
             f"The student analysed only {analysed_fraction:.0%} of the log ({settings.start_s:.1f} "
             f"to {settings.end_s:.1f} s of {log_duration_s:.1f} s). Ask the student for the reason."
@@ -86,7 +86,7 @@ def _flag_drift(request: LoopRequest) -> Iterator[str]:
         ("--drift", "m", request.position_drift_m, defaults.position_drift_m),
         ("--heading-drift", "°", request.heading_drift_deg, defaults.heading_drift_deg),
     ):
-        if not default / MAX_DRIFT_FACTOR <= drift <= default * MAX_DRIFT_FACTOR:
+        if not default / MAX_DRIFT_OPTION_FACTOR <= drift <= default * MAX_DRIFT_OPTION_FACTOR:
             yield (
                 f"{option} is {drift:g} {unit} per 100 m (default {default:g} {unit}). The test of "
                 "the loop closure depends on this value. Ask the student for the reason."
@@ -116,12 +116,12 @@ def _count_same_numbers(numbers: Mapping[Any, float], other_numbers: Mapping[Any
     """Count the equal numbers of two students, except numbers with one digit (equal by chance).
 
     Numbers with the field name "value" (lists, values of corrections) must be exactly equal, others
-    within SAME_NUMBER_TOLERANCE.
+    within SAME_NUMBER_RELATIVE_TOLERANCE.
     """
     return sum(
         _count_digits(number) > 1
         and abs(number - other_numbers[key])
-        <= (key[1] != "value") * SAME_NUMBER_TOLERANCE * abs(number)
+        <= (key[1] != "value") * SAME_NUMBER_RELATIVE_TOLERANCE * abs(number)
         for key, number in numbers.items()
         if key in other_numbers
     )
@@ -138,7 +138,7 @@ EQUAL_CONTENT_CHECKS: tuple[
 ] = (
     ("This PDF is identical to the PDF of {}.", attrgetter("sha256"), attrgetter("submission")),
     (
-        "The id in this report is also in the report of {}.",
+        "The student id in this report is also in the report of {}.",
         lambda report: normalise_text(report.student_id),
         attrgetter("submission"),
     ),
@@ -211,8 +211,8 @@ def _find_equal_reports(
 
 def _find_copied_forms(reports: Sequence[GradedReport]) -> ReportPairs:
     """Yield pairs of reports of different students whose answers have equal numbers."""
-    numbers_by_report = [(report, _collect_form_numbers(report)) for report in reports]
-    for (report, numbers), (other_report, other_numbers) in combinations(numbers_by_report, 2):
+    reports_and_numbers = [(report, _collect_form_numbers(report)) for report in reports]
+    for (report, numbers), (other_report, other_numbers) in combinations(reports_and_numbers, 2):
         is_copied = _count_same_numbers(numbers, other_numbers) >= MIN_SAME_NUMBERS
         if is_copied and _identify_student(report) != _identify_student(other_report):
             yield report, other_report

@@ -33,30 +33,32 @@ from px4fuse.results.answer_form import (
 FLIGHT_POINTS_FRACTION = 0.2
 # Points deducted for each false fault
 FALSE_FAULT_DEDUCTION = 10.0
-# Minimum number of false faults with which the faults give no points: the student guessed
+# With this number of false faults or more, named faults give no points: the student guessed
 FALSE_FAULTS_FOR_ZERO_POINTS = 3
 # Score for naming a fault that is similar to the injected fault
 SIMILAR_FAULT_SCORE = 0.4
-# Score for naming ekf2-noise instead of r-scale: both make R of EKF2 wrong
-NOISE_FOR_R_SCALE_SCORE = 2.0 / 3.0
+# Score for naming ekf2-noise (wrong EKF2_EVP_NOISE) instead of r-scale (wrong reported variance),
+# because both make R of EKF2 wrong
+EKF2_NOISE_FOR_R_SCALE_SCORE = 2.0 / 3.0
 # Score for naming a consequence of the injected fault instead of the fault
-CONSEQUENCE_SCORE = 0.15
+FAULT_CONSEQUENCE_SCORE = 0.15
 # Kinds of injected faults that can be guessed without a measurement
 GUESSABLE_FAULT_KINDS = frozenset(("open-end",))
-# Points for the size of a guessable fault decrease to zero if the relative error is this much above
-# the tolerance. Small, because the sizes in the students' flights differ little
-ZERO_POINTS_SIZE_EXCESS = 0.08
+# Size of a guessable fault: the points decrease to zero while the relative error increases from the
+# tolerance by this fraction. Small, because the sizes in the students' flights differ little
+ZERO_POINTS_EXCESS_FRACTION = 0.08
 NO_BOUNDS = (-math.inf, math.inf)
 # Minimum tolerance (s) of the start and the end of an injected fault
-TIME_TOLERANCE_S = 2.0
-# Tolerance of the start and the end of an injected fault, relative to the time since the first data
-TIME_TOLERANCE_FRACTION = 0.05
+FAULT_TIME_TOLERANCE_S = 2.0
+# Tolerance of the start and the end of an injected fault, as a fraction of the time from the first
+# data to the start or end
+FAULT_TIME_TOLERANCE_FRACTION = 0.05
 # Maximum relative error of a number that the student computed, for full points
-FULL_POINTS_NUMBER_ERROR = 0.02
+MAX_NUMBER_ERROR_FULL_POINTS = 0.02
 # Maximum relative error of a number that the student computed, for half of the points
-HALF_POINTS_NUMBER_ERROR = 0.10
+MAX_NUMBER_ERROR_HALF_POINTS = 0.10
 # Maximum relative error of the size of an injected fault for half of the points
-HALF_POINTS_SIZE_ERROR = 0.4
+MAX_SIZE_ERROR_HALF_POINTS = 0.4
 
 
 class _CorrectionRule(NamedTuple):
@@ -66,14 +68,14 @@ class _CorrectionRule(NamedTuple):
     ----------
     score_by_kind : mapping
         Score for naming the parameter, by kind of fault.
-    right_values : (float, float) or str
+    right_value_range : (float, float) or str
         Smallest and largest right value, or the name of a rule in
         :func:`find_accepted_corrections`.
     """
 
     parameter: str
     score_by_kind: Mapping[str, float]
-    right_values: tuple[float, float] | str = NO_BOUNDS
+    right_value_range: tuple[float, float] | str = NO_BOUNDS
 
 
 POINTS_TABLE = read_toml(__file__, dict)
@@ -88,7 +90,7 @@ FORM_PART_NAMES = tuple(POINTS_TABLE["weights"])
 class FormPoints:
     """Points for the parts of a student's answers ("mistakes", "sizes", ...), and feedback.
 
-    ``is_named_by_kind`` is True for each injected fault that the student named.
+    ``is_named_by_kind`` states for each kind of injected fault whether the student named it.
     """
 
     parts: tuple[ItemScore, ...] = ()
@@ -119,7 +121,7 @@ def compute_form_points(answers: Answers, right_answers: RightFormAnswers) -> Fo
     if is_no_fault_recognised:
         points_by_part["mistakes"] = weights["mistakes"]
     elif right_answers.mistakes and all(fault.size is None for fault in right_answers.mistakes):
-        # the faults have no size: add the points for sizes to the points for naming the faults
+        # no injected fault has a size: add the points for sizes to those for naming the faults
         points_by_part["mistakes"] += weights["sizes"] * scores["mistakes"]
     points_by_part["mistakes"] -= FALSE_FAULT_DEDUCTION * len(false_faults)
     points_by_part["mistakes"] = max(points_by_part["mistakes"], 0.0)
@@ -133,8 +135,8 @@ def compute_form_points(answers: Answers, right_answers: RightFormAnswers) -> Fo
     named_kinds = [named_fault.kind for named_fault in answers.mistakes]
     is_named_by_kind = {fault.kind: fault.kind in named_kinds for fault in right_answers.mistakes}
     feedback = (
-        *_fault_feedback(matches, false_faults, is_no_fault_recognised),
-        *_answer_feedback(answers, right_answers),
+        *_describe_fault_answers(matches, false_faults, is_no_fault_recognised),
+        *_describe_wrong_answers(answers, right_answers),
     )
     parts = tuple(
         ItemScore(name, points_by_part[name], max_points, "")
@@ -148,10 +150,10 @@ def compute_form_points(answers: Answers, right_answers: RightFormAnswers) -> Fo
 FaultMatch = tuple[InjectedFault, NamedFault | None, float]
 
 
-def _fault_feedback(
+def _describe_fault_answers(
     matches: list[FaultMatch], false_faults: list[NamedFault], is_no_fault_recognised: bool
 ) -> Iterator[str]:
-    """Yield feedback on each injected fault, and on faults that the flight does not have."""
+    """Yield feedback on each injected fault, and on named faults that the flight does not have."""
     if not matches:
         yield f"your flight has no injected fault{', as your form states' * is_no_fault_recognised}"
     for fault, named_fault, _ in matches:
@@ -162,7 +164,7 @@ def _fault_feedback(
         elif named_fault.kind != fault.kind:
             yield f"you named {named_fault.kind} instead of {fault_text}: {right_answer}"
         else:
-            yield f"you named {fault.kind}, which is right: {right_answer}"
+            yield f"you named {fault.kind}, which is right ({right_answer})"
     if false_faults:
         kinds = ", ".join(named_fault.kind for named_fault in false_faults)
         yield f"you named faults that your flight does not have: {kinds}"
@@ -180,7 +182,7 @@ def describe_right_answer(fault: InjectedFault) -> str:
     return ", ".join([*texts, f"shown in {' or '.join(find_panels(fault.kind))}"])
 
 
-def _answer_feedback(answers: Answers, right_answers: RightFormAnswers) -> Iterator[str]:
+def _describe_wrong_answers(answers: Answers, right_answers: RightFormAnswers) -> Iterator[str]:
     """Yield feedback on wrong answers about consistency, EKF2, numbers and figures."""
     rows: list[tuple[str, object, object]] = [
         (
@@ -201,7 +203,11 @@ def _answer_feedback(answers: Answers, right_answers: RightFormAnswers) -> Itera
     ):
         if right not in (None, ()) and _score_number(given, right) < 1.0:
             rows.append(
-                (f"{question.text}, within {100.0 * FULL_POINTS_NUMBER_ERROR:g} %", given, right)
+                (
+                    f"{question.text}, within {100.0 * MAX_NUMBER_ERROR_FULL_POINTS:g} %",
+                    given,
+                    right,
+                )
             )
     for letter, (choice, right_letter) in zip_longest(
         answers.choices[: len(right_answers.choices)], right_answers.choices
@@ -251,10 +257,10 @@ def score_named_kind(kind: str, named_kind: str) -> float:
     if kind == named_kind:
         return 1.0
     if (kind, named_kind) == ("r-scale", "ekf2-noise"):
-        return NOISE_FOR_R_SCALE_SCORE
+        return EKF2_NOISE_FOR_R_SCALE_SCORE
     if any({kind, named_kind} <= group for group in SIMILAR_FAULT_GROUPS):
         return SIMILAR_FAULT_SCORE
-    return CONSEQUENCE_SCORE if named_kind in POINTS_TABLE["effects"].get(kind, ()) else 0.0
+    return FAULT_CONSEQUENCE_SCORE if named_kind in POINTS_TABLE["effects"].get(kind, ()) else 0.0
 
 
 def _score_faults(matches: list[FaultMatch], right_answers: RightFormAnswers) -> dict[str, float]:
@@ -266,9 +272,9 @@ def _score_faults(matches: list[FaultMatch], right_answers: RightFormAnswers) ->
             continue
         size_score = score_fault_size(fault, named_fault)
         weight = (size_score if fault.kind in GUESSABLE_FAULT_KINDS else 1.0) / len(matches)
-        time_weight = weight if named_fault.kind == fault.kind else 0.5 * weight
+        evidence_weight = weight if named_fault.kind == fault.kind else 0.5 * weight
         scores["mistakes"] += score / len(matches)
-        scores["time and panel"] += score_evidence(fault, named_fault) * time_weight
+        scores["time and panel"] += score_evidence(fault, named_fault) * evidence_weight
         scores["correction"] += score_correction(fault, named_fault, right_answers) * weight
         scores["sizes"] += size_score / max(sized_fault_count, 1)
     return scores
@@ -277,8 +283,9 @@ def _score_faults(matches: list[FaultMatch], right_answers: RightFormAnswers) ->
 def score_fault_size(fault: InjectedFault, named_fault: NamedFault) -> float:
     """Return the score for the size that the student states for a fault.
 
-    1: within the tolerance. 1/2: relative error up to HALF_POINTS_SIZE_ERROR. 1/3: wrong sign,
-    or correct size of a wrong fault. A guessable fault has a score from 0 to 1 instead of 1/2.
+    1: within the tolerance. 1/2: relative error up to MAX_SIZE_ERROR_HALF_POINTS. 1/3: wrong sign,
+    or correct size of a wrong fault. For GUESSABLE_FAULT_KINDS, the score outside the tolerance
+    decreases from 1 to 0 within ZERO_POINTS_EXCESS_FRACTION.
     """
     stated_size = named_fault.convert_size_to_first_unit()
     if fault.size is None or fault.low is None or fault.high is None or stated_size is None:
@@ -288,11 +295,11 @@ def score_fault_size(fault: InjectedFault, named_fault: NamedFault) -> float:
         is_right = fault.low <= stated_size <= fault.high and units[0] == units[1]
         return is_right / 3.0
     deviation = abs(stated_size - fault.size) / abs(fault.size)
-    near_score = 0.5 * (deviation <= HALF_POINTS_SIZE_ERROR)
+    score_outside = 0.5 * (deviation <= MAX_SIZE_ERROR_HALF_POINTS)
     if fault.kind in GUESSABLE_FAULT_KINDS:
         tolerance = (fault.high - fault.low) / (2.0 * abs(fault.size))
-        near_score = max(1.0 - (deviation - tolerance) / ZERO_POINTS_SIZE_EXCESS, 0.0)
-    return _score_value(stated_size, fault.low, fault.high, near_score)
+        score_outside = max(1.0 - (deviation - tolerance) / ZERO_POINTS_EXCESS_FRACTION, 0.0)
+    return _score_value(stated_size, fault.low, fault.high, score_outside)
 
 
 def score_evidence(fault: InjectedFault, named_fault: NamedFault) -> float:
@@ -306,7 +313,8 @@ def score_evidence(fault: InjectedFault, named_fault: NamedFault) -> float:
         )
         is_time_right = not named_fault.when and all(
             named_s is not None
-            and abs(named_s - true_s) <= max(TIME_TOLERANCE_S, TIME_TOLERANCE_FRACTION * true_s)
+            and abs(named_s - true_s)
+            <= max(FAULT_TIME_TOLERANCE_S, FAULT_TIME_TOLERANCE_FRACTION * true_s)
             for true_s, named_s in true_and_named_times_s
             if true_s is not None
         )
@@ -347,15 +355,15 @@ AcceptedCorrection = tuple[str, tuple[float, float], float]
 def find_accepted_corrections(
     fault: InjectedFault, right_answers: RightFormAnswers
 ) -> tuple[AcceptedCorrection, ...]:
-    size, low, high = (value or 0.0 for value in (fault.size, fault.low, fault.high))
+    size, lower_bound, upper_bound = (value or 0.0 for value in (fault.size, fault.low, fault.high))
     from_s = fault.from_s or 0.0
     until_s = from_s if fault.until_s is None else fault.until_s
     bounds_by_name = {
-        "negated": (-high, -low),
-        "size": (low, high),
-        "late milliseconds": (1e3 * low, 1e3 * high),
+        "negated": (-upper_bound, -lower_bound),
+        "size": (lower_bound, upper_bound),
+        "late milliseconds": (1e3 * lower_bound, 1e3 * upper_bound),
         "twice": (2.0 * size, 1e4),
-        "factors": (100.0 / (100.0 + high), 100.0 / (100.0 + low)),
+        "factors": (100.0 / (100.0 + upper_bound), 100.0 / (100.0 + lower_bound)),
         "noise": (0.8 * right_answers.sigma_z_m, 1.25 * right_answers.sigma_z_m),
         "after": (until_s - 1.0, until_s + 15.0),
         "before": (from_s - 15.0, from_s + 1.0),
@@ -363,47 +371,47 @@ def find_accepted_corrections(
     return tuple(
         (
             rule.parameter,
-            bounds_by_name[values] if isinstance(values := rule.right_values, str) else values,
+            bounds_by_name[values] if isinstance(values := rule.right_value_range, str) else values,
             rule.score_by_kind[fault.kind],
         )
         for rule in CORRECTIONS
         if fault.kind in rule.score_by_kind
         # EKF2_EV_DELAY cannot be negative
-        and (size > 0.0 or rule.right_values != "late milliseconds")
+        and (size > 0.0 or rule.right_value_range != "late milliseconds")
     )
 
 
 def _score_verdicts(answers: Answers, right_answers: RightFormAnswers) -> float:
-    """Return the mean score for the consistency of KF and of EKF2, and the behaviour of EKF2."""
+    """Return the mean of three scores (0 to 1): verdict on KF, on EKF2, and behaviour of EKF2."""
     given_and_right_verdicts = (
         (answers.verdict_kf, right_answers.kf.verdict),
         (answers.verdict_ekf2, right_answers.ekf2.verdict),
     )
-    right_count = sum(
+    right_verdict_count = sum(
         answer == (right or NOT_AVAILABLE) for answer, right in given_and_right_verdicts
     )
-    return (right_count + _score_ekf2_behaviour(answers, right_answers)) / 3.0
+    return (right_verdict_count + _score_ekf2_behaviour(answers, right_answers)) / 3.0
 
 
 def _score_ekf2_behaviour(answers: Answers, right_answers: RightFormAnswers) -> float:
     """Return 1 if the reported behaviour of EKF2 is right, 1/2 with one error, otherwise 0."""
     stated_behaviours, required_behaviours = set(answers.ekf2_did), set(right_answers.ekf2_did)
     allowed_behaviours = set(right_answers.ekf2_did_also)
-    false_count = len(stated_behaviours - required_behaviours - allowed_behaviours)
-    if len(stated_behaviours) == false_count or false_count > 1:
+    false_behaviour_count = len(stated_behaviours - required_behaviours - allowed_behaviours)
+    if len(stated_behaviours) == false_behaviour_count or false_behaviour_count > 1:
         return 0.0
     is_complete = required_behaviours <= stated_behaviours or (
         len(required_behaviours) == 1 and stated_behaviours & allowed_behaviours
     )
-    return 1.0 if is_complete and not false_count else 0.5
+    return 1.0 if is_complete and not false_behaviour_count else 0.5
 
 
 def _score_choices(answers: Answers, right_answers: RightFormAnswers) -> float:
     """Return the mean score of the multiple-choice questions; random answers give 0 on average."""
-    wrong_points = -1.0 / (len(CHOICE_NAMES) - 1)
+    wrong_choice_points = -1.0 / (len(CHOICE_NAMES) - 1)
     right_letters = (right_letter for _, right_letter in right_answers.choices)
     points = (
-        1.0 if letter == right_letter else wrong_points
+        1.0 if letter == right_letter else wrong_choice_points
         for letter, right_letter in zip(answers.choices, right_letters, strict=False)
         if letter
     )
@@ -413,9 +421,11 @@ def _score_choices(answers: Answers, right_answers: RightFormAnswers) -> float:
 def _score_numbers(answers: Answers, right_answers: RightFormAnswers) -> float:
     """Return the mean score for the numbers that the student computed with KF."""
     # an empty list as right answer is not scored, because it could be guessed
-    scored_count = sum(value not in (None, ()) for value in right_answers.quantities)
+    scored_number_count = sum(value not in (None, ()) for value in right_answers.quantities)
     given_and_right_numbers = zip(answers.quantities, right_answers.quantities, strict=False)
-    return sum(_score_number(*pair) for pair in given_and_right_numbers) / max(scored_count, 1)
+    return sum(_score_number(*pair) for pair in given_and_right_numbers) / max(
+        scored_number_count, 1
+    )
 
 
 def _score_number(answer: QuantityAnswer, right_answer: QuantityAnswer) -> float:
@@ -426,7 +436,10 @@ def _score_number(answer: QuantityAnswer, right_answer: QuantityAnswer) -> float
         return max(1.0 - 0.5 * difference_count, 0.0) * has_right_number
     if isinstance(answer, float | int) and isinstance(right_answer, float | int):
         error = abs(answer - right_answer)
-        for tolerance, score in ((FULL_POINTS_NUMBER_ERROR, 1.0), (HALF_POINTS_NUMBER_ERROR, 0.5)):
+        for tolerance, score in (
+            (MAX_NUMBER_ERROR_FULL_POINTS, 1.0),
+            (MAX_NUMBER_ERROR_HALF_POINTS, 0.5),
+        ):
             if error <= tolerance * abs(right_answer):
                 return score
     return 0.0

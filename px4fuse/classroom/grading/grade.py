@@ -13,13 +13,13 @@ from px4fuse.classroom.grading.entries import OVERRIDES_NAME, Course, build_grad
 from px4fuse.classroom.grading.model import Grade, GradedReport, Submission
 from px4fuse.classroom.grading.outputs import find_grade_column, write_grading_files
 from px4fuse.classroom.grading.records import RECORDS_FOLDER, load_or_verify
-from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable, score_report
+from px4fuse.classroom.grading.rubric import Rubric, grade_unreadable_file, score_report
 from px4fuse.core.reading import files_by_sha256, max_log_bytes
 from px4fuse.core.text import one_line
 from px4fuse.core.workers import JobFailure, run_with_limits
 from px4fuse.errors import ResultsError
 
-FAILURE_REMEDY = (
+HARMFUL_FILE_REMEDY = (
     "Do not open the file: it may be harmful. Ask the student for the PDF that px4fuse wrote."
 )
 
@@ -80,7 +80,7 @@ def grade(
     overrides = read_overrides(output / OVERRIDES_NAME)
     for worksheet in course.worksheets:
         find_grade_column(worksheet, course.column)
-    unread_notes = [
+    unread_file_notes = [
         f"{one_line(file.name, 80)} was not read; only {OVERRIDES_NAME} is read."
         for file in sorted(output.glob("overrides*"))
         if file.name != OVERRIDES_NAME
@@ -98,33 +98,33 @@ def grade(
     grade_job = partial(
         grade_submission, *rubric_and_key, log_by_sha256, records_folder, max_log_bytes.get()
     )
-    graded_by_index: dict[int, GradedReport] = {}
+    report_by_index: dict[int, GradedReport] = {}
     reused_count = 0
     progress(0, len(found_submissions))
     with closing(run_with_limits(grade_job, jobs, processes=processes)) as results:
         for index, result in results:
             if isinstance(result, JobFailure):
                 reason = f"the grading of this file failed: {result.reason}"
-                report = grade_unreadable(*rubric_and_key, reason, FAILURE_REMEDY)
+                report = grade_unreadable_file(*rubric_and_key, reason, HARMFUL_FILE_REMEDY)
                 is_loaded = False
             else:
                 report, is_loaded = result
             submission, student = found_submissions[index], report.student
             if not student and not report.student_id:
                 student = submission.origin.person.name
-            graded_by_index[index] = replace(report, submission=submission.name, student=student)
+            report_by_index[index] = replace(report, submission=submission.name, student=student)
             reused_count += is_loaded
-            progress(len(graded_by_index), len(found_submissions))
-    graded_reports = [graded_by_index[index] for index in range(len(found_submissions))]
+            progress(len(report_by_index), len(found_submissions))
+    graded_reports = [report_by_index[index] for index in range(len(found_submissions))]
     grades, override_notes = build_grades(graded_reports, found_submissions, course, overrides)
     written_paths, class_notes = write_grading_files(grades, course, output)
-    all_notes = *notes, *unread_notes, *override_notes, *class_notes
+    all_notes = *notes, *unread_file_notes, *override_notes, *class_notes
     return GradeOutcome(grades, all_notes, reused_count, written_paths)
 
 
 def grade_submission(
     rubric: Rubric,
-    key: AnswerKey | None,
+    answer_key: AnswerKey | None,
     path_by_sha256: Mapping[str, Path],
     records_folder: Path,
     max_bytes: int,
@@ -149,7 +149,9 @@ def grade_submission(
     """
     max_log_bytes.set(max_bytes)
     submission, submitter_id = job
-    assigned_hashes = frozenset(answer.sha256 for answer in key.answers) if key else frozenset()
+    assigned_hashes = (
+        frozenset(answer.sha256 for answer in answer_key.answers) if answer_key else frozenset()
+    )
     sha256, is_loaded = "", False
     try:
         content = submissions.read_submission(submission)
@@ -158,7 +160,7 @@ def grade_submission(
             records_folder, content, path_by_sha256, assigned_hashes
         )
     except ResultsError as error:
-        graded_report = grade_unreadable(rubric, key, f"{error.reason}.", error.remedy)
+        graded_report = grade_unreadable_file(rubric, answer_key, f"{error.reason}.", error.remedy)
     else:
-        graded_report = score_report(results, verification, rubric, key, submitter_id)
+        graded_report = score_report(results, verification, rubric, answer_key, submitter_id)
     return replace(graded_report, sha256=sha256), is_loaded

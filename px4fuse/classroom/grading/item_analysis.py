@@ -9,7 +9,7 @@ import numpy as np
 from px4fuse.classroom.grading.model import GradedReport
 
 # Minimum number of reports for the correlation of an item with the other items
-MIN_CORRELATED_REPORTS = 5
+MIN_REPORTS_FOR_CORRELATION = 5
 ITEM_STATISTICS_TITLES = ("item", "reports", "mean_fraction", "discrimination", "without_points")
 
 
@@ -44,9 +44,9 @@ class ItemStatistics:
 
 
 def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
-    """Compute statistics of rubric items, parts of the answers, and faults, in this order.
+    """Compute points and discrimination of each rubric item, part of the answer form, and fault.
 
-    Reports and items that wait for the instructor are omitted.
+    Reports that need a decision of the instructor and items without points are omitted.
     """
     scores_by_item: dict[tuple[int, str], list[tuple[float, float, float]]] = defaultdict(list)
     for report in reports:
@@ -68,7 +68,11 @@ def analyse_items(reports: Sequence[GradedReport]) -> list[ItemStatistics]:
     for (_, title), scores in sorted(scores_by_item.items(), key=lambda item: item[0][0]):
         item_points, max_points, other_points = np.transpose(scores)
         discrimination = None
-        if len(scores) >= MIN_CORRELATED_REPORTS and np.ptp(item_points) and np.ptp(other_points):
+        if (
+            len(scores) >= MIN_REPORTS_FOR_CORRELATION
+            and np.ptp(item_points)
+            and np.ptp(other_points)
+        ):
             discrimination = round(float(np.corrcoef(item_points, other_points)[0, 1]), 2)
         point_fractions = item_points / np.where(max_points > 0.0, max_points, 1.0)
         statistics.append(

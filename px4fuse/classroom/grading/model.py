@@ -30,7 +30,7 @@ class ExportOrigin:
         Submission time; without time zone if the platform omits it.
     is_late : bool
         True if the platform marks the file as late.
-    is_imitated : bool
+    has_imitated_platform_name : bool
         True if the student's part of the file name imitates a platform.
     """
 
@@ -38,7 +38,7 @@ class ExportOrigin:
     person: Person = UNKNOWN_PERSON
     time: datetime | None = None
     is_late: bool = False
-    is_imitated: bool = False
+    has_imitated_platform_name: bool = False
 
 
 UNKNOWN_SUBMITTER = ExportOrigin()
@@ -106,7 +106,7 @@ class GradedReport:
         For each injected fault of the student's flight: True if the student found the fault.
     form_part_scores : tuple of ItemScore
         Points for each part of ``form``, 100 points in total.
-    redrawn_path : str
+    redrawn_report_path : str
         Relative path of the PDF that px4fuse draws from the log for comparison.
     """
 
@@ -125,7 +125,7 @@ class GradedReport:
     notes: str = field(default="", repr=False)
     is_found_by_fault: Mapping[str, bool] = field(default_factory=dict)
     form_part_scores: tuple[ItemScore, ...] = ()
-    redrawn_path: str = ""
+    redrawn_report_path: str = ""
 
     @property
     def status(self) -> str:
@@ -162,7 +162,7 @@ class GradedReport:
 
 
 @dataclass(frozen=True)
-class Override:
+class GradeOverride:
     """Points and comment of the instructor; the points replace those computed by px4fuse."""
 
     points: float | None = None
@@ -179,9 +179,9 @@ class Grade:
         Report that counts; None without a submission.
     other_reports : tuple of GradedReport
         Reports of the student that do not count, earliest first.
-    late_s : float or None
+    lateness_s : float or None
         Submission time minus due time (s), 0 if in time; None if unknown.
-    deduction : float
+    deducted_points : float
         Points deducted for late submission.
     overrides : mapping
         Points and comments of the instructor, by rubric item, "total", or "" (whole report).
@@ -194,9 +194,9 @@ class Grade:
     counted_report: GradedReport | None
     other_reports: tuple[GradedReport, ...] = ()
     submission_time: str = ""
-    late_s: float | None = None
-    deduction: float = 0.0
-    overrides: Mapping[str, Override] = field(default_factory=dict)
+    lateness_s: float | None = None
+    deducted_points: float = 0.0
+    overrides: Mapping[str, GradeOverride] = field(default_factory=dict)
     comment: str = ""
     total: float | None = None
     max_points: float = 0.0

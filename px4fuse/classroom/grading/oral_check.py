@@ -11,7 +11,7 @@ from px4fuse.core.text import one_line
 from px4fuse.results.answer_form import FAULT_KINDS, NO_FAULT_KIND, PANELS, Answers
 
 # Question to the student, and expected answer
-Question = tuple[str, str]
+QuestionAndAnswer = tuple[str, str]
 
 
 def format_questions(grades: Sequence[Grade], key: AnswerKey, count: int) -> str:
@@ -30,19 +30,21 @@ def format_questions(grades: Sequence[Grade], key: AnswerKey, count: int) -> str
     return "\n".join(lines) + "\n"
 
 
-def ask_about_form(answers: Answers, right_answers: RightFormAnswers) -> Iterator[Question]:
+def ask_about_form(
+    answers: Answers, right_answers: RightFormAnswers
+) -> Iterator[QuestionAndAnswer]:
     """Yield questions about the faults and figures in a student's answers, wrong answers first."""
     named_kinds = [fault.kind for fault in answers.mistakes]
     true_kinds = [fault.kind for fault in right_answers.mistakes]
-    flight_text = ", ".join(true_kinds) or "no fault"
+    true_faults_text = ", ".join(true_kinds) or "no fault"
     for kind in named_kinds:
         if kind in (*true_kinds, NO_FAULT_KIND):
             continue
         yield (
             f"You named {kind} ({FAULT_KINDS[kind].description}). Which plot would show this "
             "fault, and does this plot in your report show the fault?",
-            f"Plot: {' or '.join(find_panels(kind))}. The plot does not show the fault, because "
-            f"the flight has {flight_text}.",
+            f"{' or '.join(find_panels(kind))} would show {kind}. This plot does not show {kind}, "
+            f"because the injected fault of the flight is: {true_faults_text}.",
         )
     for fault in right_answers.mistakes:
         description = FAULT_KINDS[fault.kind].description
@@ -57,7 +59,7 @@ def ask_about_form(answers: Answers, right_answers: RightFormAnswers) -> Iterato
         yield (
             f"You named {fault.kind} ({description}). Show this fault in a plot of your report. "
             "Name a plot that cannot show this fault, with the reason.",
-            f"{describe_right_answer(fault)}. Plots that cannot show the fault, for example: "
+            f"{describe_right_answer(fault)}. Examples of plots that cannot show {fault.kind}: "
             f"{' or '.join(other_panels[:2])}.",
         )
     given_letters = dict(enumerate(answers.choices))

@@ -12,7 +12,7 @@ not changed: platforms delete a grade if the cell is empty, and read 0 as a grad
   Student, ID, SIS User ID, SIS Login ID, Section, and ``Title (12345)`` for an assignment. Columns
   marked "(read only)" in the row "Points Possible" are ignored.
 - Other platforms: a table with a column of ids, logins, emails or names, and a grade column with
-  the title of ``--column`` or one of :data:`GRADE_TITLES`.
+  the title of ``--column`` or one of :data:`GRADE_COLUMN_TITLES`.
 """
 
 import html
@@ -46,7 +46,11 @@ from px4fuse.classroom.grading.model import (
     list_titles,
 )
 from px4fuse.classroom.grading.oral_check import format_questions
-from px4fuse.classroom.grading.records import DIAGNOSIS_SUFFIX, RECORDS_FOLDER, REDRAWN_SUFFIX
+from px4fuse.classroom.grading.records import (
+    DIAGNOSIS_SUFFIX,
+    RECORDS_FOLDER,
+    REDRAWN_REPORT_SUFFIX,
+)
 from px4fuse.core.input_files import inputs_not_registered
 from px4fuse.core.spreadsheet import neutralise_formulas
 from px4fuse.core.text import join_first, one_line
@@ -87,13 +91,13 @@ LIST_SEPARATOR = " | "
 # Maximum number of reasons for a failed verification in the feedback
 MAX_LISTED_REASONS = 4
 # Titles of grade columns in tables of learning platforms, as lower-case letters and digits
-GRADE_TITLES = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
-MAX_GRADE_TITLES = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
+GRADE_COLUMN_TITLES = ("grade", "bewertung", "points", "punkte", "mark", "note", "score")
+MAX_GRADE_COLUMN_TITLES = ("maximumgrade", "hoechstebewertung", "höchstebewertung")
 # Titles of feedback columns that contain HTML (Moodle)
-HTML_COMMENT_TITLES = ("feedbackcomments", "feedbackalskommentar")
+HTML_COMMENT_COLUMN_TITLES = ("feedbackcomments", "feedbackalskommentar")
 # Titles of all feedback columns
-COMMENT_TITLES = (*HTML_COMMENT_TITLES, "feedbacktolearner", "feedback", "comment")
-_ASSIGNMENT_NUMBER = re.compile(r" \(\d+\)$")
+COMMENT_COLUMN_TITLES = (*HTML_COMMENT_COLUMN_TITLES, "feedbacktolearner", "feedback", "comment")
+_ASSIGNMENT_NUMBER_PATTERN = re.compile(r" \(\d+\)$")
 # Text in columns that Canvas computes: px4fuse must not change them
 READ_ONLY_TEXT = "(read only)"
 
@@ -126,7 +130,7 @@ def write_grading_files(
         _copy_redrawn_report(grade, stem, output)
         for grade, stem in zip(grades, file_stems, strict=True)
     ]
-    has_redrawn_reports = any(report.redrawn_path for report in counted_reports(page_grades))
+    has_redrawn_reports = any(report.redrawn_report_path for report in counted_reports(page_grades))
     feedback_texts = [feedback_text(grade, class_title) for grade in grades]
     item_rows = (statistics.csv_row for statistics in analyse_items(counted_reports(grades)))
     contents = {
@@ -134,8 +138,8 @@ def write_grading_files(
         "items.csv": _format_csv(ITEM_STATISTICS_TITLES, item_rows).encode(),
     }
     if course.anonymous:
-        page_grades, names_table = _anonymise_grades(page_grades, output / PSEUDONYMS_FILE)
-        contents[PSEUDONYMS_FILE] = names_table.encode()
+        page_grades, pseudonym_csv = _anonymise_grades(page_grades, output / PSEUDONYMS_FILE)
+        contents[PSEUDONYMS_FILE] = pseudonym_csv.encode()
     version_text = f"px4fuse {metadata.version('px4fuse')}"
     contents["class.html"] = format_class_page(page_grades, class_title, version_text).encode()
     if course.question_count and course.key is not None:
@@ -168,19 +172,21 @@ def _identify_student(grade: Grade, use_file_stem: bool = False) -> str:
 
 
 def _copy_redrawn_report(grade: Grade, stem: str, output: Path) -> Grade:
-    """Copy the PDFs that px4fuse drew from the log to STEM.pdf; return the grade with the path."""
+    """Copy redrawn report and diagnosis (STEM.pdf); return the grade with the report's path."""
     report = grade.counted_report
     if report is None or not report.sha256:
         return grade
     record_path = output / RECORDS_FOLDER / report.sha256
-    redrawn_file, diagnosis_file = map(record_path.with_suffix, (REDRAWN_SUFFIX, DIAGNOSIS_SUFFIX))
+    redrawn_file, diagnosis_file = map(
+        record_path.with_suffix, (REDRAWN_REPORT_SUFFIX, DIAGNOSIS_SUFFIX)
+    )
     if diagnosis_file.exists():
         write_all({output / FEEDBACK_FOLDER / f"{stem}.pdf": diagnosis_file.read_bytes()})
     if not redrawn_file.exists():
         return grade
     name = f"{REPORTS_FOLDER}/{stem}.pdf"
     write_all({output / name: redrawn_file.read_bytes()})
-    return replace(grade, counted_report=replace(report, redrawn_path=name))
+    return replace(grade, counted_report=replace(report, redrawn_report_path=name))
 
 
 def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade], str]:
@@ -218,8 +224,8 @@ def _anonymise_grades(grades: Sequence[Grade], path: Path) -> tuple[list[Grade],
         anonymise_grade(grade, name_pair_by_identity[_identify_student(grade)][0])
         for grade in grades
     ]
-    names_table = _format_csv(PSEUDONYM_TITLES, rows)
-    return sorted(anonymous_grades, key=lambda grade: grade.student), names_table
+    pseudonym_csv = _format_csv(PSEUDONYM_TITLES, rows)
+    return sorted(anonymous_grades, key=lambda grade: grade.student), pseudonym_csv
 
 
 def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
@@ -233,7 +239,7 @@ def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
             replace(report.verification, reasons=(), differences=()),
             tuple(replace(item, comment="") for item in report.items),
             instructor_action=report.instructor_action
-            and "The instructor has to decide on the points.",
+            and "The points are not final: the instructor has to decide.",
             form=report.form,
             numbers=report.numbers,
             is_found_by_fault=report.is_found_by_fault,
@@ -244,8 +250,8 @@ def anonymise_grade(grade: Grade, pseudonym: str) -> Grade:
         "",
         report,
         submission_time=grade.submission_time,
-        late_s=grade.late_s,
-        deduction=grade.deduction,
+        lateness_s=grade.lateness_s,
+        deducted_points=grade.deducted_points,
         total=grade.total,
         max_points=grade.max_points,
         flags=("This report is flagged. The reasons are in class.csv.",) * bool(grade.flags),
@@ -271,12 +277,12 @@ def format_class_table(grades: Sequence[Grade]) -> str:
             report.counted_points if report else None,
             report.points if report and report.counted_points is None else None,
             grade.max_points,
-            grade.deduction or None,
+            grade.deducted_points or None,
             grade.total,
             *map(points_by_title.get, item_titles),
             *(report.numbers.get(title) if report else None for title in number_titles),
             grade.submission_time,
-            None if grade.late_s is None else grade.late_s / 3600.0,
+            None if grade.lateness_s is None else grade.lateness_s / 3600.0,
             report.pending_actions if report else "",
             grade.comment,
             LIST_SEPARATOR.join(grade.flags),
@@ -350,9 +356,9 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         for index, title in enumerate(sheet.column_titles)
         if not any(READ_ONLY_TEXT in row[index] for row in sheet.rows[:3])
     }
-    grade_index = sheet.find_column_index(GRADE_TITLES)
+    grade_column_index = sheet.find_column_index(GRADE_COLUMN_TITLES)
     short_title_by_index = {
-        index: _ASSIGNMENT_NUMBER.sub("", title) for index, title in title_by_index.items()
+        index: _ASSIGNMENT_NUMBER_PATTERN.sub("", title) for index, title in title_by_index.items()
     }
     assignment_indices = [
         index for index, title in title_by_index.items() if short_title_by_index[index] != title
@@ -362,7 +368,7 @@ def find_grade_column(sheet: Sheet, column_title: str) -> int:
         for index, title in title_by_index.items()
         if normalise_text(column_title) in map(normalise_text, (title, short_title_by_index[index]))
     ]
-    candidate_indices = assignment_indices if grade_index is None else [grade_index]
+    candidate_indices = assignment_indices if grade_column_index is None else [grade_column_index]
     # a Moodle table has one grade column: if --column does not match it, the option is for another
     # table
     if column_title and (matching_indices or sheet.find_column_index(("identifier",)) is None):
@@ -409,46 +415,48 @@ def fill_grades(
     SettingsError
         No grade column was found, or several.
     """
-    grade_index, feedback_index = (
+    grade_column_index, feedback_column_index = (
         find_grade_column(sheet, grade_column_title),
-        sheet.find_column_index(COMMENT_TITLES),
+        sheet.find_column_index(COMMENT_COLUMN_TITLES),
     )
     format_feedback = (
-        neutralise_formulas if sheet.find_column_index(HTML_COMMENT_TITLES) is None else escape_html
+        neutralise_formulas
+        if sheet.find_column_index(HTML_COMMENT_COLUMN_TITLES) is None
+        else escape_html
     )
     cells_by_row = [list(row) for row in sheet.rows]
     names = [one_line(grade.student or grade.student_id, 40) for grade in grades]
     has_decimal_comma = any(
         re.fullmatch(r"\d+,\d+", cell.strip()) for row in cells_by_row for cell in row
     )
-    notes, found_indices = [], set()
+    notes, matched_student_indices = [], set()
     for row in cells_by_row:
         person = read_student(sheet, row)
         student_index = class_list.find_student_index(person) if person else None
         if student_index is None:
             continue
-        found_indices.add(student_index)
+        matched_student_indices.add(student_index)
         total_points = (grade := grades[student_index]).total
         if total_points is None:
             continue
         if platform_max_points is not None and grade.max_points:
             total_points = round(total_points * platform_max_points / grade.max_points, 2)
-        max_points = _find_max_points(sheet, row, grade_index)
+        max_points = _find_max_points(sheet, row, grade_column_index)
         if max_points is not None and total_points > max_points:
             notes.append(
                 f"{sheet.path.name}: {names[student_index]} has {total_points:.10g} points, above "
                 f"the maximum of {max_points:.10g} on the platform. Increase the maximum there, or "
                 f"run grade again with --scale {max_points:.10g}."
             )
-        row[grade_index] = format_cell_number(total_points).replace(
+        row[grade_column_index] = format_cell_number(total_points).replace(
             ".", "," if has_decimal_comma else "."
         )
-        if feedback_index is not None and feedback_index != grade_index:
-            row[feedback_index] = format_feedback(feedback_texts[student_index])
+        if feedback_column_index is not None and feedback_column_index != grade_column_index:
+            row[feedback_column_index] = format_feedback(feedback_texts[student_index])
     missing_names = [
         names[index]
         for index in range(len(class_list.people))
-        if index not in found_indices and grades[index].total is not None
+        if index not in matched_student_indices and grades[index].total is not None
     ]
     if missing_names:
         notes.append(
@@ -458,11 +466,13 @@ def fill_grades(
     return replace(sheet, rows=tuple(map(tuple, cells_by_row))), tuple(notes)
 
 
-def _find_max_points(sheet: Sheet, row: Sequence[str], grade_index: int) -> float | None:
+def _find_max_points(sheet: Sheet, row: Sequence[str], grade_column_index: int) -> float | None:
     maximum_texts = (
-        cells[grade_index] for cells in sheet.rows[:3] if "points possible" in cells[0].casefold()
+        cells[grade_column_index]
+        for cells in sheet.rows[:3]
+        if "points possible" in cells[0].casefold()
     )
-    return parse_decimal(next(maximum_texts, sheet.find_cell(row, MAX_GRADE_TITLES)))
+    return parse_decimal(next(maximum_texts, sheet.find_cell(row, MAX_GRADE_COLUMN_TITLES)))
 
 
 def escape_html(text: str) -> str:

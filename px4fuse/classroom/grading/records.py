@@ -25,7 +25,7 @@ from px4fuse.verification.verification import log_sha256, recompute, verify
 # Subfolder of the output folder for the cached results
 RECORDS_FOLDER = "records"
 # Suffix of the report that px4fuse draws from the log, to be compared with the submitted PDF
-REDRAWN_SUFFIX = ".pdf"
+REDRAWN_REPORT_SUFFIX = ".pdf"
 # Suffix of the report with the faults that px4fuse found, as feedback for the student
 DIAGNOSIS_SUFFIX = ".diagnosis.pdf"
 
@@ -89,7 +89,7 @@ def load_or_verify(
     # the log is in the answer key but not available: the status must be "cannot verify"
     is_log_missing = dependencies.get(log_sha256(results)) == "assigned"
     verification = verify(results, pdf, {} if is_log_missing else path_by_sha256)
-    files = {REDRAWN_SUFFIX: verification.redrawn_pdf} if verification.redrawn_pdf else {}
+    files = {REDRAWN_REPORT_SUFFIX: verification.redrawn_pdf} if verification.redrawn_pdf else {}
     if verification.status == "verified" and log_sha256(results) in assigned_hashes:
         results, files[DIAGNOSIS_SUFFIX] = repeat_with_diagnosis(results, path_by_sha256)
     stored_verification = replace(verification, redrawn_pdf=b"")
@@ -117,7 +117,7 @@ def repeat_with_diagnosis(
     finally:
         ignores_assessed_mark.reset(token)
     if isinstance(outcome, Verification):
-        raise ResultsError(f"The diagnosis for the feedback failed: {'; '.join(outcome.reasons)}.")
+        raise ResultsError(f"No diagnosis report for the student: {'; '.join(outcome.reasons)}.")
     diagnosed_results, draw = outcome
     return structs.replace(diagnosed_results, provenance=results.provenance), draw()
 

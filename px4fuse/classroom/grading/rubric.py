@@ -249,7 +249,7 @@ def _make_foreign_log_advice(check_input: CheckInput) -> str:
     )
 
 
-def grade_unreadable(
+def grade_unreadable_file(
     rubric: Rubric, key: AnswerKey | None, reason: str, remedy: str = ""
 ) -> GradedReport:
     """Return zero points for a file that is not a report."""

@@ -64,11 +64,12 @@ _UTF8_FLAG = 0x800
 MAX_LISTED_FILES = 5
 GRADESCOPE_METADATA = "submission_metadata.yml"
 # Pattern of the file paths in an export, by learning platform
-PLATFORMS = {
+PATH_PATTERN_BY_PLATFORM = {
     name: re.compile(pattern)
     for name, pattern in read_toml(__file__, dict[str, str], "platforms.toml").items()
 }
-# Parts of a path that a learning platform writes once: the student wrote a second one
+# Parts of a path that only a learning platform writes; a path with more of them than the platform
+# writes contains an imitation by the student
 _PLATFORM_NAME_PATTERN = re.compile(r"_attempt_\d{4}-|_\d+_assignsubmission_")
 BLACKBOARD_TIME_FORMAT = "%Y-%m-%d-%H-%M-%S"
 _SUBMISSION_PATTERN = re.compile(
@@ -82,7 +83,7 @@ class _EntryError(Exception):
 
 
 _BROKEN_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, MemoryError)
-# BAD_VALUE_ERRORS contains RuntimeError, and so the NotImplementedError of zipfile
+# zipfile raises NotImplementedError for unknown methods: a RuntimeError, as in BAD_VALUE_ERRORS
 _UNREADABLE_FILE_ERRORS = (_EntryError, *_BROKEN_ZIP_ERRORS, *BAD_VALUE_ERRORS)
 
 
@@ -216,11 +217,11 @@ def read_submission(submission: Submission) -> bytes:
 
 def _is_gradescope_metadata(name: str) -> bool:
     *folders, file = name.split("/")
-    is_submitted = any(folder.startswith("submission_") for folder in folders)
-    return file == GRADESCOPE_METADATA and not is_submitted
+    is_in_submission_folder = any(folder.startswith("submission_") for folder in folders)
+    return file == GRADESCOPE_METADATA and not is_in_submission_folder
 
 
-class _LimitedFile:
+class _BlockLimitedFile:
     """Zip file that can be read only in blocks of at most MAX_DIRECTORY_BYTES."""
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -237,7 +238,7 @@ class _LimitedFile:
 
 @contextmanager
 def _open_zip(file: IO[bytes]) -> Iterator[zipfile.ZipFile]:
-    with zipfile.ZipFile(_LimitedFile(file)) as archive:
+    with zipfile.ZipFile(_BlockLimitedFile(file)) as archive:
         if len(archive.infolist()) > MAX_ZIP_ENTRIES:
             raise _EntryError(f"the zip file has more than {MAX_ZIP_ENTRIES} entries.")
         yield archive
@@ -248,7 +249,7 @@ def _list_zip_submissions(path: Path, notes: list[str]) -> list[Submission]:
     try:
         with path.open("rb") as file, _open_zip(file) as archive:
             entries = [entry for entry in archive.infolist() if not entry.is_dir()]
-        # the declared sizes are sufficient: zipfile never unpacks more
+        # a false declared size cannot exceed the limit: zipfile unpacks at most the declared size
         if sum(entry.file_size for entry in entries) > MAX_UNPACKED_BYTES:
             raise _EntryError(
                 f"the zip file unpacks to more than {MAX_UNPACKED_BYTES // 10**9} GB."
@@ -365,7 +366,9 @@ def _shorten_name(name: str) -> str:
 # ------------------------------------------------------------------ student and time in exports
 
 
-def parse_submission_path(name: str, platforms: Iterable[str] = tuple(PLATFORMS)) -> ExportOrigin:
+def parse_submission_path(
+    name: str, platforms: Iterable[str] = tuple(PATH_PATTERN_BY_PLATFORM)
+) -> ExportOrigin:
     """Return student and submission time from a file path that a learning platform wrote.
 
     >>> parse_submission_path("Doe Jane_4711_assignsubmission_file_/report.pdf").person.name
@@ -380,7 +383,7 @@ def parse_submission_path(name: str, platforms: Iterable[str] = tuple(PLATFORMS)
     remaining_path = name
     while remaining_path:
         for platform in platforms:
-            match = PLATFORMS[platform].match(remaining_path)
+            match = PATH_PATTERN_BY_PLATFORM[platform].match(remaining_path)
             if match is None:
                 continue
             name_parts = {key: value or "" for key, value in match.groupdict().items()}
@@ -393,9 +396,13 @@ def parse_submission_path(name: str, platforms: Iterable[str] = tuple(PLATFORMS)
             numbers = {platform: name_parts["number"]} if "number" in name_parts else {}
             full_name, login = " ".join(filter(None, person_names)), name_parts.get("login", "")
             person = Person("", full_name, "", login, numbers)
-            expected_name_count = platform in ("moodle", "blackboard")
-            is_imitated = len(_PLATFORM_NAME_PATTERN.findall(name)) > expected_name_count
-            return ExportOrigin(platform, person, time, bool(name_parts.get("late")), is_imitated)
+            max_platform_name_count = platform in ("moodle", "blackboard")
+            has_imitated_platform_name = (
+                len(_PLATFORM_NAME_PATTERN.findall(name)) > max_platform_name_count
+            )
+            return ExportOrigin(
+                platform, person, time, bool(name_parts.get("late")), has_imitated_platform_name
+            )
         remaining_path = remaining_path.partition("/")[2]
     return UNKNOWN_SUBMITTER
 
