@@ -49,7 +49,7 @@ def detect(analysis: Analysis) -> Findings:
     else:
         effect_text, gain_size_word = "", "large" if is_set_too_small else "small"
         reason = (
-            f"With a noise of {used_noise_m:.3g} m, EKF2's gain is too {gain_size_word}, and EKF2's "
+            f"With a noise of {used_noise_m:.3g} m, EKF2's gain is too {gain_size_word}, and its "
             f"reported σ is too {size_word}."
         )
     name = "EKF2's position noise" if is_noise_from_source else aid.noise
