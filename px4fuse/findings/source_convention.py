@@ -151,7 +151,7 @@ def _find_position_faults(
             axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=is_position_file
         )
         if faults.has_wrong_axes and rotation_deg:
-            fault_text += f", and rotated in yaw by {rotation_deg:+.0f}° (clockwise from above)"
+            fault_text += f", and rotated by {rotation_deg:+.0f}° (clockwise from above)"
         if orientation and orientation.frames.startswith("FLU"):
             action += f" {describe_conversion(orientation.frames)}"
         message = f"{fault_text}. {evidence_sentence} {frame_sentence}"
