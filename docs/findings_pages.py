@@ -45,15 +45,15 @@ from px4fuse.ekf2.aids import evaluate_aids  # noqa: E402
 from px4fuse.filter.frame_rotation import HeadingPart, combine_heading_parts  # noqa: E402
 from px4fuse.filter.settings import Settings  # noqa: E402
 from px4fuse.findings import (  # noqa: E402
-    TITLES,
+    FINDING_TITLES,
     Finding,
     find,
     find_aid_findings,
     find_loop_findings,
     source_frame,
 )
-from px4fuse.findings.cause_grouping import CONSEQUENCES, effect_ids  # noqa: E402
-from px4fuse.findings.model import CATALOGUE, FINDING_GROUPS, load_examples  # noqa: E402
+from px4fuse.findings.cause_grouping import EFFECTS_BY_CAUSE, effect_ids  # noqa: E402
+from px4fuse.findings.model import FINDING_CATALOGUE, FINDING_GROUPS, load_examples  # noqa: E402
 from px4fuse.flight.model import Columns  # noqa: E402
 from px4fuse.report.panels import INNOVATIONS_PANEL, POSITION_PANEL, POSITION_SIGMA_PANEL  # noqa: E402
 from px4fuse.simulation.faults import parse_faults  # noqa: E402
@@ -220,12 +220,12 @@ def find_detector_modules() -> dict[str, str]:
             continue
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(tree):
-            if isinstance(node, ast.Constant) and node.value in TITLES:
+            if isinstance(node, ast.Constant) and node.value in FINDING_TITLES:
                 module_by_id.setdefault(str(node.value), path.stem)
     # These modules form finding ids from a filter or parameter name and a suffix
     module_by_generated_id = {
         name: stem
-        for name in TITLES
+        for name in FINDING_TITLES
         for stem, prefixes in {
             "noises": ("sigma_", "kf_", "ekf2_over", "ekf2_under"),
             "ekf2_noise": ("ekf2_noise_",),
@@ -271,10 +271,10 @@ def format_rate_rows(name: str) -> Iterator[str]:
 
 def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
     """Yield the Markdown paragraphs of the page on a finding."""
-    entry = CATALOGUE[name]
+    entry = FINDING_CATALOGUE[name]
     yield f"# {entry.title}\n\n`{name}` ({entry.group})\n"
     yield f"## What it means\n\n{entry.meaning}\n"
-    causes = [cause for cause in CONSEQUENCES if name in effect_ids(cause)]
+    causes = [cause for cause in EFFECTS_BY_CAUSE if name in effect_ids(cause)]
     effects = effect_ids(name)
     if causes:
         yield "The finding can be a consequence of: " + links(causes) + ".\n"
@@ -310,13 +310,13 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
 
 def links(names: Iterable[str]) -> str:
     """Format Markdown links to the pages of other findings."""
-    return ", ".join(f"[{TITLES[name]}]({name}.md)" for name in dict.fromkeys(names))
+    return ", ".join(f"[{FINDING_TITLES[name]}]({name}.md)" for name in dict.fromkeys(names))
 
 
 def collect_examples_and_rates(simulated: Mapping[str, Example]) -> dict[str, Any]:
     """Return message, action and error rates of each finding, which ``px4fuse explain`` prints."""
     table, recorded, contents = read_detection_rates(), load_examples(), {}
-    for name in TITLES:
+    for name in FINDING_TITLES:
         rows = table[table["finding"] == name]
         fault_free_rows = rows[rows["condition"] == "none"]
         example = simulated[name].finding if name in simulated else recorded[name]
@@ -360,10 +360,10 @@ def index() -> Iterator[str]:
     """Yield the Markdown paragraphs of the index, with a table for each group of findings."""
     yield "# Findings\n\n`px4fuse explain ID` prints the page on a finding in the terminal.\n"
     for group in FINDING_GROUPS:
-        names = [name for name, entry in CATALOGUE.items() if entry.group == group]
+        names = [name for name, entry in FINDING_CATALOGUE.items() if entry.group == group]
         caption = group[0].upper() + group[1:]
         yield f"## {caption}\n\n| finding | id |\n|---|---|"
-        yield "\n".join(f"| [{TITLES[name]}]({name}.md) | `{name}` |" for name in names)
+        yield "\n".join(f"| [{FINDING_TITLES[name]}]({name}.md) | `{name}` |" for name in names)
         yield f"\n```{{toctree}}\n:hidden:\n:caption: {caption}\n"
         yield "\n".join(names) + "\n```\n"
 
@@ -373,9 +373,9 @@ def write_finding_pages(folder: Path) -> None:
     mpl.use("Agg")
     folder.mkdir(parents=True, exist_ok=True)
     example_by_id = examples()
-    missing_ids = set(TITLES) - set(example_by_id) - IDS_WITH_RECORDED_EXAMPLE
+    missing_ids = set(FINDING_TITLES) - set(example_by_id) - IDS_WITH_RECORDED_EXAMPLE
     assert not missing_ids, f"these findings have no example: {sorted(missing_ids)}"
-    for name in TITLES:
+    for name in FINDING_TITLES:
         text = "\n".join(page(name, example_by_id.get(name), folder))
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
         pyplot.close("all")

@@ -6,11 +6,11 @@ import pytest
 from exchange import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.findings import TITLES, Finding
+from px4fuse.findings import FINDING_TITLES, Finding
 from px4fuse.findings.cause_grouping import (
-    CONSEQUENCES,
+    EFFECTS_BY_CAUSE,
     GAP_CAUSE,
-    OTHER_CAUSE,
+    UNKNOWN_CAUSE,
     effect_ids,
     group_by_cause,
 )
@@ -23,12 +23,12 @@ def one(name: str, severity: str = "warning", **evidence: str) -> Finding:
 
 
 def test_fault_table_contains_only_existing_fault_names() -> None:
-    listed = {name for cause in CONSEQUENCES for name in effect_ids(cause)}
-    assert listed | set(CONSEQUENCES) <= set(TITLES)
+    listed = {name for cause in EFFECTS_BY_CAUSE for name in effect_ids(cause)}
+    assert listed | set(EFFECTS_BY_CAUSE) <= set(FINDING_TITLES)
 
 
 def test_fault_table_order_puts_consequence_before_cause() -> None:
-    outer = list(CONSEQUENCES)
+    outer = list(EFFECTS_BY_CAUSE)
     for at, cause in enumerate(outer):
         assert set(effect_ids(cause)) & set(outer) <= set(outer[:at]), cause
 
@@ -54,7 +54,7 @@ UNDERSTATED, REJECTING = "ekf2_overconfident", "ekf2_rejects_positions"
           (REJECTING, "warning", UNDERSTATED)]),
         # jump and scale are consequences of changed noise; a jump's consequence follows the jump
         ([*map(one, ("source_noise_varies", "source_position_jump", "source_scale_error")),
-          one("ekf2_resets", cause=OTHER_CAUSE)],
+          one("ekf2_resets", cause=UNKNOWN_CAUSE)],
          [("source_noise_varies", "warning", None),
           ("source_position_jump", "warning", "source_noise_varies"),
           ("ekf2_resets", "warning", "source_position_jump"),
@@ -64,7 +64,7 @@ UNDERSTATED, REJECTING = "ekf2_overconfident", "ekf2_rejects_positions"
           one("ekf2_resets", cause=GAP_CAUSE)],
          [("source_outliers", "error", None), (REJECTING, "warning", "source_outliers"),
           ("source_gap", "warning", None), ("ekf2_resets", "warning", "source_gap")]),
-        ([one("source_outliers", "error"), one(REJECTING), one("ekf2_resets", cause=OTHER_CAUSE)],
+        ([one("source_outliers", "error"), one(REJECTING), one("ekf2_resets", cause=UNKNOWN_CAUSE)],
          [("source_outliers", "error", None), (REJECTING, "warning", "source_outliers"),
           ("ekf2_resets", "warning", REJECTING)]),
         # the severity of a KF variance does not raise that of advice

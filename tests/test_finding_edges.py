@@ -62,12 +62,12 @@ from px4fuse.findings import (
     source_stamps,
     split_cause_groups,
 )
-from px4fuse.findings.cause_grouping import GAP_CAUSE, OTHER_CAUSE
+from px4fuse.findings.cause_grouping import GAP_CAUSE, UNKNOWN_CAUSE
 from px4fuse.findings.model import (
     SOURCE_TEXTS,
-    fraction_of_ones,
-    spans_with_value,
-    zero_length_spans,
+    compute_flag_fraction,
+    find_spans_with_value,
+    make_zero_length_spans,
 )
 from px4fuse.flight.model import (
     ALIGNED_ORIGIN,
@@ -111,11 +111,11 @@ def test_fault_report_lists_times_of_occurrence(spans: Any, expected: str) -> No
 
 def test_status_flag_before_first_sample_has_first_value() -> None:
     flag, whole = pd.Series([1.0, 0.0, 1.0], index=[20.0, 30.0, 80.0]), Segment(10.0, 110.0, "")
-    assert fraction_of_ones(flag, whole) == 0.5
-    assert fraction_of_ones(flag, Segment(25.0, 35.0, "")) == 0.5
-    assert spans_with_value(0.0, flag, whole) == ((30.0, 80.0),)
-    assert spans_with_value(1.0, flag, whole) == ((10.0, 30.0), (80.0, 110.0))
-    assert spans_with_value(0.0, flag, Segment(40.0, 50.0, "")) == ((40.0, 50.0),)
+    assert compute_flag_fraction(flag, whole) == 0.5
+    assert compute_flag_fraction(flag, Segment(25.0, 35.0, "")) == 0.5
+    assert find_spans_with_value(0.0, flag, whole) == ((30.0, 80.0),)
+    assert find_spans_with_value(1.0, flag, whole) == ((10.0, 30.0), (80.0, 110.0))
+    assert find_spans_with_value(0.0, flag, Segment(40.0, 50.0, "")) == ((40.0, 50.0),)
 
 
 def test_fault_report_lists_consequences_below_root_cause() -> None:
@@ -144,7 +144,7 @@ def test_ekf2_resets_outside_evaluated_segment_are_ignored(
     reset, switch = ekf2_resets.detect(one)
     assert switch.evidence == {"count": 2, "at_s": 10.5}
     # the reset of the height alone is not counted
-    assert reset.evidence == {"count": 1, "largest_m": 5.0, "at_s": 10.5, "cause": OTHER_CAUSE}
+    assert reset.evidence == {"count": 1, "largest_m": 5.0, "at_s": 10.5, "cause": UNKNOWN_CAUSE}
 
 
 @pytest.mark.parametrize(
@@ -152,12 +152,12 @@ def test_ekf2_resets_outside_evaluated_segment_are_ignored(
     [
         # a height reset within 10 s of take-off is usual
         (Reset(30.0, "position", (0.0, 0.0, 1.0)), (), None),
-        (Reset(30.1, "position", (0.0, 0.0, 1.0)), (), ("note", OTHER_CAUSE)),
-        (Reset(19.9, "position", (0.0, 0.0, 1.0)), (), ("note", OTHER_CAUSE)),
-        (Reset(30.0, "position", (1.0, 0.0, 1.0)), (), ("warning", OTHER_CAUSE)),
+        (Reset(30.1, "position", (0.0, 0.0, 1.0)), (), ("note", UNKNOWN_CAUSE)),
+        (Reset(19.9, "position", (0.0, 0.0, 1.0)), (), ("note", UNKNOWN_CAUSE)),
+        (Reset(30.0, "position", (1.0, 0.0, 1.0)), (), ("warning", UNKNOWN_CAUSE)),
         # up to 5 s after a gap in the source
         (Reset(65.0, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", GAP_CAUSE)),
-        (Reset(65.1, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", OTHER_CAUSE)),
+        (Reset(65.1, "position", (1.0, 0.0, 0.0)), ((50.0, 60.0),), ("warning", UNKNOWN_CAUSE)),
     ],
 )
 def test_ekf2_height_reset_at_take_off_is_not_reported(
@@ -280,7 +280,7 @@ def test_ekf2_rejection_severity_depends_on_rejected_fraction(
     ):
         assert severity(ekf2_rejecting.detect, one) == expected
         for finding in ekf2_rejecting.detect(one):
-            assert finding.spans_s == zero_length_spans(20.0 + np.arange(count))
+            assert finding.spans_s == make_zero_length_spans(20.0 + np.arange(count))
             assert quantity in finding.message
             assert finding.remedy.endswith(remedy)
 
@@ -698,7 +698,7 @@ def delayed(delay_ms: float | None, clock: Any, **parts: Any) -> Any:
 
 
 BIAS, JUMPS, SCALE = (
-    imu.detect_bias,
+    imu.detect_accelerometer_bias,
     source_positions.detect_jumps,
     source_positions.detect_scale_error,
 )
@@ -839,12 +839,16 @@ SOURCE_EDGES = [
 
 def test_accelerometer_bias_report_contains_95_percent_interval() -> None:
     one = analysis(systematic_errors=with_bias(0.3, 0.05, -0.4), ekf2=bias_of_ekf2(0.1, -0.2, 0.0))
-    finding = only(imu.detect_bias, one)
+    finding = only(imu.detect_accelerometer_bias, one)
     assert "tilt error of 2.9° has the same effect" in finding.message  # 0.5 of 9.80665 m/s²
-    assert "EKF2 estimates +0.10 m/s² forward and -0.20 m/s² right." in finding.message
+    assert (
+        "EKF2's estimate of the bias is +0.10 m/s² forward and -0.20 m/s² right." in finding.message
+    )
     assert finding.evidence == {"bias_m_s2": 0.5, "sigma_m_s2": 0.05}
     outside = bias_of_ekf2(9.0, 9.0, 9.0)["accelerometer_bias"].iloc[[0, 4]]
-    assert named(imu.detect_bias, analysis(ekf2={"accelerometer_bias": outside})) == {}
+    assert (
+        named(imu.detect_accelerometer_bias, analysis(ekf2={"accelerometer_bias": outside})) == {}
+    )
 
 
 @pytest.mark.parametrize(
@@ -863,8 +867,8 @@ def test_arrival_times_used_until_clock_sync_are_reported() -> None:
     finding = only(source_stamps.detect_arrival_timestamps, one)
     assert finding.evidence == {"until_s": 32.0, "latency_s": 0.05}
     assert finding.spans_s == ((20.0, 32.0),)
-    assert source_stamps.find_synchronisation(one) == (32.0, 0.05)
-    assert source_stamps.find_synchronisation(analysis(ekf2=ages(30, 0))) is None
+    assert source_stamps.find_timesync_convergence(one) == (32.0, 0.05)
+    assert source_stamps.find_timesync_convergence(analysis(ekf2=ages(30, 0))) is None
 
 
 @pytest.mark.parametrize(("growth_s", "severity"), [(0.05, None), (0.2, "warning")])

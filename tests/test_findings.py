@@ -21,8 +21,8 @@ from px4fuse.diagnose import prepare_comparison, read_flight
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
 from px4fuse.filter.consistency import MIN_INNOVATIONS
 from px4fuse.filter.settings import Settings
-from px4fuse.findings import TITLES, Finding, find, split_cause_groups
-from px4fuse.findings.model import CATALOGUE, FINDING_GROUPS, load_examples
+from px4fuse.findings import FINDING_TITLES, Finding, find, split_cause_groups
+from px4fuse.findings.model import FINDING_CATALOGUE, FINDING_GROUPS, load_examples
 from px4fuse.flight.model import (
     ALIGNED_ORIGIN,
     AXIS_NAMES,
@@ -397,7 +397,7 @@ def found(comparison: Comparison, *, tuned: bool = False) -> tuple[Finding, ...]
     findings = find(with_noises(comparison) if tuned else unexplained(comparison))
     earlier_ids: set[str | None] = {None}
     for finding in findings:
-        assert finding.id in TITLES
+        assert finding.id in FINDING_TITLES
         assert finding.caused_by in earlier_ids
         earlier_ids.add(finding.id)
         assert re.fullmatch(r"[A-Z0-9a-z].*[^.: ;]", finding.title)
@@ -490,7 +490,7 @@ def test_late_attitude_is_reported_with_its_delay(late_s: float, sample_flight: 
 
 
 def test_each_reportable_fault_has_a_simulated_test_flight() -> None:
-    assert set(TITLES) == {fault.id for fault in FAULTS} | TESTED_ELSEWHERE
+    assert set(FINDING_TITLES) == {fault.id for fault in FAULTS} | TESTED_ELSEWHERE
 
 
 @pytest.mark.parametrize(
@@ -559,7 +559,7 @@ def test_fault_detection_on_very_short_flight_does_not_raise(
 
 
 def test_each_reportable_fault_belongs_to_a_known_group() -> None:
-    for entry in CATALOGUE.values():
+    for entry in FINDING_CATALOGUE.values():
         assert entry.group in FINDING_GROUPS
         assert not entry.title.endswith(".")
         assert entry.meaning.endswith(".")
@@ -567,7 +567,7 @@ def test_each_reportable_fault_belongs_to_a_known_group() -> None:
 
 def test_explain_command_examples_show_measured_detection_rates() -> None:
     examples = load_examples()
-    assert list(examples) == list(CATALOGUE)
+    assert list(examples) == list(FINDING_CATALOGUE)
     rows = pd.read_csv(Path(__file__).parent / "studies" / "rates.csv")
     for name, example in examples.items():
         clean = rows[(rows["finding"] == name) & (rows["condition"] == "none")]
@@ -587,8 +587,8 @@ def test_explain_command_prints_meaning_and_example_of_fault(typed, monkeypatch,
     assert (code, err) == (0, "")
     example = load_examples()["source_scale_error"]
     for text in (
-        TITLES["source_scale_error"],
-        CATALOGUE["source_scale_error"].meaning,
+        FINDING_TITLES["source_scale_error"],
+        FINDING_CATALOGUE["source_scale_error"].meaning,
         example.message,
         example.remedy,
         "source_samples_repeated",  # a possible cause
@@ -611,7 +611,7 @@ def test_explain_command_without_argument_lists_all_faults(monkeypatch, capsys) 
     lines = out.splitlines()
     places = [lines.index(group[0].upper() + group[1:]) for group in FINDING_GROUPS]
     assert places == sorted(places)
-    for name, title in TITLES.items():
+    for name, title in FINDING_TITLES.items():
         assert re.search(rf"^{name} +{re.escape(title)} *$", out, re.MULTILINE)
 
 

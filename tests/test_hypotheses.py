@@ -31,7 +31,7 @@ from px4fuse.simulation.scenario import Scenario
 
 RIGHT = Settings(sigma_a_m_s2=0.27, sigma_z_m=0.10)
 OF_CAUSES = (
-    imu.detect_bias,
+    imu.detect_accelerometer_bias,
     sent.detect,
     stamps.detect_arrival_timestamps,
     intervals.detect_downsampling,

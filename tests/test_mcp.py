@@ -27,7 +27,7 @@ from ulog_tools import load
 from px4fuse.classroom.assignment.assignment import simulate_assigned_flight
 from px4fuse.classroom.assignment.roster import Person
 from px4fuse.cli.mcp import make_tools, run_command
-from px4fuse.findings.model import CATALOGUE
+from px4fuse.findings.model import FINDING_CATALOGUE
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD
 from px4fuse.mcp.server import (
     INSTRUCTIONS,
@@ -157,9 +157,9 @@ def test_mcp_server_returns_each_listed_resource(tmp_path: Path, serve: Any) -> 
         glossary = (REPOSITORY / "docs" / "glossary.md").read_text(encoding="utf-8")
         assert texts.pop("px4fuse://glossary") == glossary
         assert texts.pop("px4fuse://results") == to_json(schema())
-        assert texts.keys() == {f"px4fuse://findings/{name}" for name in CATALOGUE}
+        assert texts.keys() == {f"px4fuse://findings/{name}" for name in FINDING_CATALOGUE}
         listed = text_of(await client.call_tool("list_findings", {}))
-        for name, entry in CATALOGUE.items():
+        for name, entry in FINDING_CATALOGUE.items():
             page = texts[f"px4fuse://findings/{name}"]
             # the title is wrapped at the width of the terminal
             assert "".join(page.split()).startswith("".join(f"{entry.title}[{name}]".split()))

@@ -146,14 +146,14 @@ def test_wrong_noise_report_contains_factor_and_estimated_noise() -> None:
     assert worse.evidence["factor"] == pytest.approx(10.0)
     assert worse.message == (
         "SIGMA_A is 10 times too large: KF follows the measurement noise. SIGMA_A is 1 m/s²; "
-        "its maximum-likelihood estimate is 0.1 m/s² (95 % 0.09 to 0.11 m/s²). P grows too much "
-        "between updates, so KF's gain is too large."
+        "its maximum-likelihood estimate is 0.1 m/s² (95 % 0.09 to 0.11 m/s²). KF's covariance P "
+        "grows too much between updates, so KF's gain is too large."
     )
     small = tuned(NoiseEstimate(2.0, 1.9, 2.1), NoiseEstimate(9.0, 8.9, None))
     worse, _ = noises.detect_wrong_settings(analysis(source=MOVING, tuning=small))
     assert (
         "too small: KF lags behind the motion. SIGMA_A is 1 m/s²; its maximum-likelihood estimate "
-        "is 9 m/s². P" in worse.message
+        "is 9 m/s². KF's covariance P grows too little" in worse.message
     )
     assert named(noises.detect_wrong_settings, analysis(source=MOVING)) == {}
 
@@ -559,7 +559,7 @@ def test_drift_report_contains_closure_error_at_known_landing(loop: Any, size: s
         ("kf", {"clock_offset_s": 0.25}, "timestamps corrected (0.15 s early)"),
         ("kf", {"clock_offset_s": 0.05}, "timestamps corrected (0.05 s late)"),
         ("ekf2", {"clock_offset_s": 0.25}, "timestamps corrected (0.25 s early)"),
-        ("kf", {"turned_deg": -20.0}, "positions rotated by -20°"),
+        ("kf", {"turned_deg": -20.0}, "positions rotated in yaw by -20°"),
         ("kf", {"sigma_a_m_s2": 0.3, "sigma_z_m": 0.2},
          "SIGMA_A 0.3 m/s² instead of 1 m/s² and SIGMA_Z 0.2 m instead of 1 m"),
         ("ekf2", {"EKF2_EV_DELAY": 90.0, "EKF2_DELAY_MAX": 250.0},

@@ -24,7 +24,7 @@ from px4fuse.classroom.grading.model import Grade, GradedReport
 from px4fuse.classroom.grading.outputs import feedback_text
 from px4fuse.classroom.grading.rubric import parse_rubric, read_rubric, score_report
 from px4fuse.errors import ResultsError
-from px4fuse.findings import TITLES
+from px4fuse.findings import FINDING_TITLES
 from px4fuse.results.answer_form import Answers, NamedFault
 from px4fuse.simulation.flights import SIMULATION_HARDWARE
 from px4fuse.verification.model import Verification
@@ -331,7 +331,7 @@ class TestFeedback:
 
     def test_grading_comments_contain_no_internal_names(self):
         """Ids of findings and paths in results are internal names."""
-        wrong = [finding(name, "error") for name in TITLES]
+        wrong = [finding(name, "error") for name in FINDING_TITLES]
         spoilt = [
             changed_results(findings=wrong, student__notes="It is a flight of 5 s.", tuning={},
                             clock=NONE),

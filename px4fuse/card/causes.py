@@ -30,7 +30,7 @@ from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CONVENTION_KEY
 from px4fuse.findings.cause_text import format_shift
-from px4fuse.findings.model import CATALOGUE
+from px4fuse.findings.model import FINDING_CATALOGUE
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
@@ -83,7 +83,7 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
         if finding.severity == "note":
             continue
         trials = find_trials_of_finding(analysis.select_main_trials(), finding)
-        if CATALOGUE[finding.id].verdict == "repeated":
+        if FINDING_CATALOGUE[finding.id].verdict == "repeated":
             trials = tuple(filter(may_improve_filter, trials))
         elif trials and not any(
             has_effect(trial) or not can_show_effect(trial) for trial in trials
@@ -93,7 +93,9 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
         rank = _find_cause_rank(finding, trials)
         ranked_causes.append(RankedCause(finding, rank, reduction, trials))
     fault_causes = [
-        cause for cause in ranked_causes if CATALOGUE[cause.finding.id].verdict != "repeated"
+        cause
+        for cause in ranked_causes
+        if FINDING_CATALOGUE[cause.finding.id].verdict != "repeated"
     ]
     return sorted(
         fault_causes or ranked_causes,
@@ -107,12 +109,12 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
 
 
 def _is_setting_fault(finding: Finding) -> bool:
-    rerun_kinds = CATALOGUE[finding.id].reruns
+    rerun_kinds = FINDING_CATALOGUE[finding.id].reruns
     return bool(rerun_kinds) and rerun_kinds <= SETTING_CHANGE_KINDS
 
 
 def _find_cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
-    if CATALOGUE[finding.id].verdict == "meaningless" or CONVENTION_KEY in finding.evidence:
+    if FINDING_CATALOGUE[finding.id].verdict == "meaningless" or CONVENTION_KEY in finding.evidence:
         return 0
     if _is_setting_fault(finding) and any(map(remains_overconfident, trials)):
         return 3
@@ -125,7 +127,7 @@ def _find_cause_rank(finding: Finding, trials: Iterable[Trial]) -> int:
 
 def find_trials_of_finding(trials: Iterable[Trial], finding: Finding) -> tuple[Trial, ...]:
     """Return the best re-run of KF and of EKF2 for each kind of change that tests a finding."""
-    tested_kinds = CATALOGUE[finding.id].reruns
+    tested_kinds = FINDING_CATALOGUE[finding.id].reruns
     tested_kinds |= {"defaults"} if "noises" in tested_kinds else set()
     best_trials: dict[tuple[FilterName, str], Trial] = {}
     for trial in trials:
@@ -262,7 +264,7 @@ def _explain_no_change(
     if not verdict_by_reference:
         return ""
     if set(verdict_by_reference.values()) == {"consistent"}:
-        needs_ground_truth = CATALOGUE[finding.id].reruns & TRUTH_ONLY_CHANGE_KINDS
+        needs_ground_truth = FINDING_CATALOGUE[finding.id].reruns & TRUTH_ONLY_CHANGE_KINDS
         if needs_ground_truth and "truth" not in verdict_by_reference:
             return "no change: only ground truth shows this fault, and the log has none"
         return "no change: the reported σ is consistent"
@@ -278,7 +280,7 @@ def _explain_no_change(
 
 
 def _find_action_target(finding: Finding, source: PositionTrack | None = None) -> ActionTarget:
-    group = CATALOGUE[finding.id].group
+    group = FINDING_CATALOGUE[finding.id].group
     target = ACTION_TARGET_BY_ID.get(finding.id) or ACTION_TARGET_BY_GROUP[group]
     is_gnss_receiver = target == "sender" and source is not None and source.origin.is_gnss
     return "receiver" if is_gnss_receiver else target

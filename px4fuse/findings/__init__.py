@@ -36,13 +36,13 @@ from px4fuse.findings import (
     source_values,
 )
 from px4fuse.findings.cause_grouping import group_by_cause
-from px4fuse.findings.model import TITLES, split_cause_groups, warning
+from px4fuse.findings.model import FINDING_TITLES, split_cause_groups, warning
 from px4fuse.flight.model import Ekf2, Flight
 from px4fuse.loop.model import Loop
 from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
 __all__ = [
-    "TITLES",
+    "FINDING_TITLES",
     "Finding",
     "Severity",
     "find",
@@ -86,7 +86,7 @@ def find(analysis: Analysis) -> tuple[Finding, ...]:
 
 def find_loop_findings(loop: Loop) -> tuple[Finding, ...]:
     """Return the findings on the loop closures of a path, most severe first."""
-    return () if loop.is_assessed else group_by_cause(loops.detect_in_loop(loop))
+    return () if loop.is_assessed else group_by_cause(loops.detect_loop_faults(loop))
 
 
 def find_aid_findings(
@@ -114,4 +114,4 @@ def finding_title(finding_id: str) -> str:
     >>> finding_title("source_gap"), finding_title("of_a_later_version")
     ('Gap in the position source', 'of a later version')
     """
-    return TITLES.get(finding_id, finding_id.replace("_", " "))
+    return FINDING_TITLES.get(finding_id, finding_id.replace("_", " "))

@@ -25,8 +25,8 @@ GROUND_EFFECT_DURATION_S = 10.0
 MIN_GAP_HEIGHT_ERROR_RATIO = 3.0
 # Aiding sources whose vertical innovations can set EKF2's flag for a bad vertical acceleration
 VERTICAL_AIDS = ("gnss_vel", "gnss_hgt", "baro_hgt")
-# Severity warning if EKF2 flags its vertical acceleration as bad for more than this fraction of the
-# time, otherwise note
+# The finding is a note if EKF2 flags its vertical acceleration as bad for at most this fraction of
+# the time, otherwise a warning
 MAX_FLAGGED_FRACTION_FOR_NOTE = 0.3
 # Action if EKF2 does not fuse a sensor, by the PX4 parameter that enables the fusion of the sensor
 ACTION_BY_SWITCH = {
@@ -65,21 +65,22 @@ def detect_bad_acceleration(analysis: Analysis, aids: Mapping[str, AidResult]) -
     state_times_s = state_times_s[
         (state_times_s >= analysis.segment.start_s) & (state_times_s <= analysis.segment.end_s)
     ]
-    is_flagged = ekf2.record.was_in_state(BAD_ACCELERATION_FLAG, state_times_s)
-    if not is_flagged.any():
+    is_flagged_bad = ekf2.record.was_in_state(BAD_ACCELERATION_FLAG, state_times_s)
+    if not is_flagged_bad.any():
         return
-    small_noise_parameters = {
+    too_small_noises = {
         AIDS[name].noise
         for name in VERTICAL_AIDS
         if name in aids and aids[name].verdict == "overconfident"
     }
-    cause = "Normal measurement noise can set this flag for some seconds."
-    remedy = "If the flag is set for longer, check the IMU for vibration and clipping."
-    if small_noise_parameters:
-        names = " and ".join(sorted(small_noise_parameters))
-        cause = f"The noise of EKF2 is set too small: {names}."
-        remedy = f"Increase {names} to the true noise of the sensor."
-    flagged_fraction, start_s = float(is_flagged.mean()), float(state_times_s[is_flagged.argmax()])
+    cause = "Normal measurement noise can set the flag fs_bad_acc_vertical for some seconds."
+    remedy = "If EKF2 sets the flag for longer, check the IMU for vibration and clipping."
+    if too_small_noises:
+        parameters_text = " and ".join(sorted(too_small_noises))
+        cause = f"The noise of EKF2 is set too small: {parameters_text}."
+        remedy = f"Increase {parameters_text} to the true noise of the sensor."
+    flagged_fraction = float(is_flagged_bad.mean())
+    start_s = float(state_times_s[is_flagged_bad.argmax()])
     yield finding(
         "warning" if flagged_fraction > MAX_FLAGGED_FRACTION_FOR_NOTE else "note",
         "ekf2_acceleration_bad",
@@ -130,7 +131,7 @@ def _make_not_fused_finding(
     height_error_m: float | None,
 ) -> Finding:
     longest_gap_aid = max(aids_of_sensor, key=lambda aid: aid.longest_gap_duration_s)
-    aid_labels = ", ".join(_format_aid_label(aid) for aid in aids_of_sensor)
+    aid_labels_text = ", ".join(_format_aid_label(aid) for aid in aids_of_sensor)
     has_innovation_shift = any(axis.change for aid in aids_of_sensor for axis in aid.axes.values())
     is_barometer, height_error_text = fusion_parameter == BAROMETER.switch, ""
     if is_barometer and height_error_m is not None:
@@ -138,13 +139,13 @@ def _make_not_fused_finding(
     return finding(
         "note" if is_barometer and not height_error_text else "warning",
         "aid_not_fused",
-        f"EKF2 fused no sample of {aid_labels} for "
+        f"EKF2 fused no sample of {aid_labels_text} for "
         f"{longest_gap_aid.longest_gap_duration_s:.0f} s{height_error_text}. EKF2 rejected "
         f"{format_percent(longest_gap_aid.rejected_fraction)} of the samples, and relied on "
         "the IMU and other aiding sources.",
         ACTION_BY_SWITCH.get(fusion_parameter, DEFAULT_ACTION),
         {
-            "aid": aid_labels,
+            "aid": aid_labels_text,
             "longest_gap_s": longest_gap_aid.longest_gap_duration_s,
             "rejected_fraction": longest_gap_aid.rejected_fraction,
             CAUSE_KEY: _find_sensor_cause(fusion_parameter, source_aid)
@@ -157,13 +158,13 @@ def _make_not_fused_finding(
 def _make_innovation_shift_finding(name: str, aid: AidResult) -> Finding:
     shifts_by_axis = {axis: result.change for axis, result in aid.axes.items() if result.change}
     axis, (time_s, mean_change) = max(shifts_by_axis.items(), key=lambda item: abs(item[1][1]))
-    s_sqrt = aid.axes[axis].s_sqrt_median
+    innovation_sigma = aid.axes[axis].s_sqrt_median
     return warning(
         "aid_innovation_shift",
         f"{_format_aid_label(aid)}: the mean {axis} innovation shifts by "
-        f"{format_number(abs(mean_change) * s_sqrt, 2)} {aid.unit} at {time_s:.0f} s. This is "
-        f"{abs(mean_change):.1f} times its expected standard deviation √S "
-        f"({format_number(s_sqrt, 2)} {aid.unit}).",
+        f"{format_number(abs(mean_change) * innovation_sigma, 2)} {aid.unit} at {time_s:.0f} s. "
+        f"This is {abs(mean_change):.1f} times its expected standard deviation √S "
+        f"({format_number(innovation_sigma, 2)} {aid.unit}).",
         f"Check what was switched, moved or passed near the sensor at {time_s:.0f} s.",
         {"aid": name, "axis": axis, "time_s": time_s, "moved": mean_change},
         ((time_s, time_s + CHANGE_WINDOW_S),),
@@ -224,10 +225,12 @@ def _find_large_height_error_m(analysis: Analysis, span_s: Span) -> float | None
         return None
     error_m = errors["error_m"].abs()
     is_in_span = (error_m.index >= span_s[0]) & (error_m.index <= span_s[1])
-    rmse_outside_m = float(np.sqrt(np.mean(error_m[~is_in_span] ** 2)))
+    rmse_outside_gap_m = float(np.sqrt(np.mean(error_m[~is_in_span] ** 2)))
     largest_error_m = float(error_m[is_in_span].max())
     return (
-        largest_error_m if largest_error_m > MIN_GAP_HEIGHT_ERROR_RATIO * rmse_outside_m else None
+        largest_error_m
+        if largest_error_m > MIN_GAP_HEIGHT_ERROR_RATIO * rmse_outside_gap_m
+        else None
     )
 
 

@@ -27,7 +27,7 @@ from px4fuse.request import COMPARISON_OPTIONS
 def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
     """Return the kind of fault that a re-run corrects, such as "measurement noise"."""
     if cause is None:
-        return kinds.OTHER_CAUSE
+        return kinds.UNKNOWN_CAUSE
     aid = find_aid(analysis)
     kind_by_change = {
         trials.OUTLIERS: kinds.OUTLIER_CAUSE,
@@ -35,8 +35,8 @@ def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
         aid.delay: kinds.CLOCK_CAUSE,
         trials.ROTATION: kinds.FRAME_CAUSE,
         trials.FORWARD_BIAS: kinds.ACCELEROMETER_CAUSE,
-        changes.SIGMA_Z: kinds.NOISE_CAUSE,
-        aid.noise: kinds.NOISE_CAUSE,
+        changes.SIGMA_Z: kinds.MEASUREMENT_NOISE_CAUSE,
+        aid.noise: kinds.MEASUREMENT_NOISE_CAUSE,
         aid.gate: kinds.GATE_CAUSE,
     }
     return next(
@@ -70,7 +70,7 @@ def _find_used_settings(analysis: Analysis) -> Mapping[str, float]:
 
 
 def format_explained_fraction(cause: Trial, statistic: Statistic) -> str:
-    """Format the fraction of ln(mean NIS) or ln(mean NEES) that a change removes."""
+    """Format by how much a change moves ln(mean NIS) or ln(mean NEES) towards 0, its ideal."""
     if makes_overconfident(cause, statistic):
         return "contradicts ground truth"
     if statistic != "difference" and brings_inside_limits(cause, statistic):
@@ -128,13 +128,13 @@ def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
             return f"{value:.0f} outlier{'s' if value > 1 else ''} removed"
         case trials.CLOCK_OFFSET:
             offset_s = value - (settings.clock_offset_s if cause.filter == "kf" else 0.0)
-            direction = "late" if offset_s < 0 else "early"
-            return f"timestamps corrected ({abs(offset_s):.2g} s {direction})"
+            late_or_early = "late" if offset_s < 0 else "early"
+            return f"timestamps corrected ({abs(offset_s):.2g} s {late_or_early})"
         case trials.FORWARD_BIAS:
-            right_bias = cause.change[trials.RIGHT_BIAS]
+            right_bias_m_s2 = cause.change[trials.RIGHT_BIAS]
             return (
-                f"accelerometer bias removed ({value:+.2f} m/s² forward, {right_bias:+.2f} m/s² "
-                "right)"
+                f"accelerometer bias removed ({value:+.2f} m/s² forward, {right_bias_m_s2:+.2f} "
+                "m/s² right)"
             )
         case trials.ROTATION:
             is_drifting = isinstance(analysis.heading, HeadingError) and analysis.heading.drifts
@@ -142,7 +142,7 @@ def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
             return (
                 f"EKF2's heading corrected (error {value:+.0f}°{average_text})"
                 if analysis.source.origin.is_gnss
-                else f"positions rotated by {value:+.0f}°{average_text}"
+                else f"positions rotated in yaw by {value:+.0f}°{average_text}"
             )
         case changes.SIGMA_A | changes.SIGMA_Z:
             unit, label = SETTING_RANGES[name][2:]

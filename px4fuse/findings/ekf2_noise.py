@@ -19,25 +19,25 @@ from px4fuse.findings.cause_grouping import CAUSE_KEY, REPORTED_VARIANCE_CAUSE
 from px4fuse.findings.model import Findings, finding, format_percent
 from px4fuse.flight.model import Unavailable, source_name
 
-# Minimum factor between EKF2's noise parameter and the estimated noise, for severity error: smaller
-# factors hardly change EKF2's position error
+# Minimum factor between EKF2's noise parameter and the estimated noise, for severity "error":
+# smaller factors hardly change EKF2's position error
 MIN_NOISE_FACTOR_FOR_ERROR = 2.0
-# Minimum fraction of rejected positions that is stated in the first sentence of the message
+# The first sentence of the message states the fraction of rejected positions from this value on
 MIN_STATED_REJECTED_FRACTION = 0.05
 
 
 def detect(analysis: Analysis) -> Findings:
-    """Detect a wrong noise parameter: a replay with the estimated noise makes EKF2 consistent."""
+    """Detect a wrong EKF2 measurement noise: EKF2 is consistent in a replay with the estimate."""
     trial, aid = find_confirmed_noise_trial(analysis), find_aid(analysis)
     if trial is None:
         return
     assert not isinstance(analysis.ekf2_model, Unavailable)
     inputs = analysis.ekf2_model.inputs
-    used_noise_m, estimate_m = find_used_noise_m(inputs), trial.change[aid.noise]
-    # EKF2 uses the reported σ or the noise parameter, the larger one
-    is_reported = used_noise_m > inputs.settings[aid.noise]
-    ratio, is_set_too_small = estimate_m / used_noise_m, estimate_m > used_noise_m
-    factor, direction = max(ratio, 1.0 / ratio), "small" if is_set_too_small else "large"
+    used_noise_m, estimated_noise_m = find_used_noise_m(inputs), trial.change[aid.noise]
+    # EKF2 uses the larger one: the σ that the source reports, or the noise parameter
+    is_noise_from_source = used_noise_m > inputs.settings[aid.noise]
+    ratio, is_set_too_small = estimated_noise_m / used_noise_m, estimated_noise_m > used_noise_m
+    factor, size_word = max(ratio, 1.0 / ratio), "small" if is_set_too_small else "large"
     sensor_name = source_name(analysis.source)
     is_kf_noise_equal = analysis.source.origin.is_gnss and math.isclose(
         analysis.settings.sigma_z_m, used_noise_m, rel_tol=1e-2
@@ -47,26 +47,31 @@ def detect(analysis: Analysis) -> Findings:
         effect_text = f": EKF2 rejects {format_percent(rejected_fraction)} of the positions"
         reason = f"EKF2 rejects normal {sensor_name} noise as outliers and relies on the IMU."
     else:
-        effect_text, gain_size = "", "large" if is_set_too_small else "small"
-        reason = f"EKF2's gain is therefore too {gain_size}, and its reported σ too {direction}."
-    name = "EKF2's position noise" if is_reported else aid.noise
-    title = f"{name} is {format_factor(factor)} times too {direction}{effect_text}"
-    is_default = used_noise_m == analysis.flight.log.default_of(aid.noise)
-    # PX4's default fits usual sensors, so the sensor is at fault
-    if is_set_too_small and is_default:
-        filters = "KF and EKF2" if is_kf_noise_equal else "EKF2"
+        effect_text, gain_size_word = "", "large" if is_set_too_small else "small"
+        reason = (
+            f"With a noise of {used_noise_m:.3g} m, EKF2's gain is too {gain_size_word}, and its "
+            f"reported σ is too {size_word}."
+        )
+    name = "EKF2's position noise" if is_noise_from_source else aid.noise
+    title = f"{name} is {format_factor(factor)} times too {size_word}{effect_text}"
+    is_default_noise = used_noise_m == analysis.flight.log.default_of(aid.noise)
+    # PX4's default suits usual sensors: if it is too small, the sensor is noisier than usual
+    if is_set_too_small and is_default_noise:
+        filter_names = "KF and EKF2" if is_kf_noise_equal else "EKF2"
         title = (
             f"{sensor_name} noise is {format_factor(factor)} times the noise setting of "
-            f"{filters}{effect_text}"
+            f"{filter_names}{effect_text}"
         )
-    source_text = ""
+    source_sentence = ""
     variance_action = ""
-    if is_reported:
-        variance_action = f", or report a variance of {estimate_m**2:.2g} m² with each position"
+    if is_noise_from_source:
+        variance_action = (
+            f", or report a variance of {estimated_noise_m**2:.2g} m² with each position"
+        )
         mode_text = f" ({aid.noise_mode} 0)" if aid.noise_mode else ""
-        source_text = (
-            f", the σ that {sensor_name} reports{mode_text}, because {aid.noise} is only "
-            f"{inputs.settings[aid.noise]:g} m"
+        source_sentence = (
+            f"EKF2 uses the σ that {sensor_name} reports{mode_text}, because this σ is larger than "
+            f"{aid.noise} ({inputs.settings[aid.noise]:g} m). "
         )
     interval_text, horizontal_tuning = "", analysis.tuning.get(HORIZONTAL)
     if (
@@ -80,18 +85,19 @@ def detect(analysis: Analysis) -> Findings:
     severity: Severity = "error" if factor >= MIN_NOISE_FACTOR_FOR_ERROR else "warning"
     yield finding(
         severity,
-        f"ekf2_noise_too_{direction}",
-        f"{title}. {name} is {used_noise_m:.3g} m{source_text}; the maximum-likelihood estimate is "
-        f"{estimate_m:.3g} m{interval_text}. "
-        f"{reason}{f' KF takes SIGMA_Z from {aid.noise}.' if is_kf_noise_equal else ''}",
+        f"ekf2_noise_too_{size_word}",
+        f"{title}. {name} is {used_noise_m:.3g} m; the maximum-likelihood estimate is "
+        f"{estimated_noise_m:.3g} m{interval_text}. "
+        f"{source_sentence}{reason}"
+        f"{f' KF takes SIGMA_Z from {aid.noise}.' if is_kf_noise_equal else ''}",
         f"Set {format_settings(select_changed_settings(trial.change, inputs.settings))}"
-        f""
-        f"{variance_action}.{make_height_noise_advice(analysis, analysis.tuning, estimate_m)}",
+        f"{variance_action}."
+        f"{make_height_noise_advice(analysis, analysis.tuning, estimated_noise_m)}",
         {
             "flown_m": used_noise_m,
-            "estimate_m": estimate_m,
+            "estimate_m": estimated_noise_m,
             "factor": ratio,
-            CAUSE_KEY: REPORTED_VARIANCE_CAUSE if is_reported else "",
+            CAUSE_KEY: REPORTED_VARIANCE_CAUSE if is_noise_from_source else "",
         },
     )
 

@@ -1,4 +1,4 @@
-"""Faults of fusion: missing, interrupted or late fusion of positions, and an invalid position."""
+"""Positions that EKF2 fuses never, with interruptions or late; an invalid EKF2 position."""
 
 import numpy as np
 import pandas as pd
@@ -15,11 +15,11 @@ from px4fuse.ekf2.fusion_conditions import (
 )
 from px4fuse.findings.model import (
     Findings,
+    compute_flag_fraction,
+    find_spans_with_value,
     finding,
     format_percent,
-    fraction_of_ones,
     note,
-    spans_with_value,
     warning,
 )
 from px4fuse.flight.model import (
@@ -31,14 +31,15 @@ from px4fuse.flight.model import (
     positions_phrase,
 )
 
-# Severity error if EKF2 fuses the positions for less than this fraction of the time
+# Missing fusion is an error if EKF2 fuses the positions for less than this fraction of the time
 FUSED_FRACTION_FOR_ERROR = 0.5
-# Severity warning if EKF2 fuses the positions for less than this fraction of the time
+# Missing fusion is reported if EKF2 fuses the positions for less than this fraction of the time
 FUSED_FRACTION_FOR_WARNING = 0.98
-# Minimum interval (s) between positions for late starts of fusion, due to jitter of the interval
+# Minimum mean interval (s) between positions to test for a late start of fusion: due to jitter,
+# single intervals then exceed EV_START_INTERVAL_S
 MIN_LATE_START_INTERVAL_S = 0.18
 MOTION_CAPTURE_TOPIC = "vehicle_mocap_odometry"
-# Minimum distance (m) of an EKF2 position that is flagged as invalid from ground truth or source
+# An invalid EKF2 position is reported from this distance (m) to ground truth or source on
 MIN_INVALID_POSITION_ERROR_M = 1.0
 
 
@@ -55,7 +56,7 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
     if not isinstance(ekf2, Ekf2) or isinstance(ekf2.fusion_flags, Unavailable):
         return
     fusion_flag = ekf2.fusion_flags["horizontal"]
-    fused_fraction = fraction_of_ones(fusion_flag, analysis.segment)
+    fused_fraction = compute_flag_fraction(fusion_flag, analysis.segment)
     if fused_fraction >= FUSED_FRACTION_FOR_ERROR:
         yield from _detect_slow_restart(analysis, ekf2, fusion_flag)
     if source is None or fused_fraction >= FUSED_FRACTION_FOR_WARNING:
@@ -77,7 +78,7 @@ def detect_missing_fusion(analysis: PreparedComparison) -> Findings:
                 evidence,
             )
         return
-    spans = spans_with_value(0.0, fusion_flag, analysis.segment)
+    spans = find_spans_with_value(0.0, fusion_flag, analysis.segment)
     longest_span_s = max(spans, key=lambda span: span[1] - span[0])
     parameters = {**analysis.flight.log.parameters, **ekf2.parameters}
     unmet_condition = find_unmet_condition(
@@ -126,10 +127,10 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
     is_valid = ekf2.states.get("xy_valid")
     if is_valid is None or is_valid.empty:
         return
-    invalid_fraction = 1.0 - fraction_of_ones(is_valid, analysis.segment)
+    invalid_fraction = 1.0 - compute_flag_fraction(is_valid, analysis.segment)
     if invalid_fraction <= 1.0 - FUSED_FRACTION_FOR_WARNING:
         return
-    spans = spans_with_value(0.0, is_valid, analysis.segment)
+    spans = find_spans_with_value(0.0, is_valid, analysis.segment)
     distance_m = _find_largest_distance_m(analysis, ekf2, spans)
     if distance_m < MIN_INVALID_POSITION_ERROR_M:
         return
@@ -143,7 +144,7 @@ def _detect_invalid_position(analysis: Comparison, ekf2: Ekf2) -> Findings:
         "error" if invalid_fraction > FUSED_FRACTION_FOR_ERROR else "warning",
         "ekf2_position_invalid",
         f"EKF2's horizontal position is invalid {format_percent(invalid_fraction)} of the time "
-        f"(xy_valid 0), and PX4 does not use it.{distance_sentence}",
+        f"(xy_valid 0), and PX4 does not use this position.{distance_sentence}",
         "Restore the fusion of positions first. While EKF2's position is invalid, its errors do "
         "not depend on noise settings.",
         {"invalid_fraction": invalid_fraction, "distance_m": distance_m},
@@ -155,10 +156,10 @@ def _find_largest_distance_m(analysis: Comparison, ekf2: Ekf2, spans: tuple[Span
     """Return EKF2's largest horizontal distance (m) from ground truth or source in time spans."""
     truth, columns = analysis.flight.truth, ["north_m", "east_m"]
     reference = truth.samples if isinstance(truth, Truth) else analysis.source.samples
-    invalid_state = pd.concat([ekf2.state[columns].loc[start:end] for start, end in spans])
+    ekf2_position_m = pd.concat([ekf2.state[columns].loc[start:end] for start, end in spans])
     distances_m = [
-        invalid_state[axis]
-        - np.interp(invalid_state.index, reference.index, reference[axis], np.nan, np.nan)
+        ekf2_position_m[axis]
+        - np.interp(ekf2_position_m.index, reference.index, reference[axis], np.nan, np.nan)
         for axis in columns
     ]
     return float(np.hypot(*distances_m).max())
@@ -180,7 +181,7 @@ def _detect_slow_restart(
     time_s = source.samples.index.to_numpy()
     gap_ends_s = time_s[1:][np.diff(time_s) > EV_STOP_INTERVAL_S]
     restart_delay_spans = []
-    for start_s, end_s in spans_with_value(0.0, fusion_flag, analysis.segment):
+    for start_s, end_s in find_spans_with_value(0.0, fusion_flag, analysis.segment):
         gap_ends_without_fusion_s = gap_ends_s[
             (gap_ends_s > start_s - EV_STOP_INTERVAL_S) & (gap_ends_s < end_s)
         ]

@@ -13,42 +13,42 @@ from px4fuse.findings.model import (
     find_source_texts,
     finding,
     format_percent,
-    zero_length_spans,
+    make_zero_length_spans,
 )
 from px4fuse.flight.model import Ekf2, Unavailable
 
 # Minimum fraction of rejected positions for a warning. With a gate of 5 √S, a consistent filter
 # rejects 6e-7
 REJECTED_FRACTION_FOR_WARNING = 0.01
-# Minimum fraction of rejected positions for severity error
+# Minimum fraction of rejected positions, for severity "error"
 REJECTED_FRACTION_FOR_ERROR = 0.20
-# A change prevents rejections if it reduces the rejected fraction at least to this fraction of it
+# A change prevents rejections if the rejected fraction after it ÷ before it is below this ratio
 MAX_REJECTED_FRACTION_RATIO = 0.5
 
 
 def detect(analysis: Analysis) -> Findings:
-    rejections = tuple(_detect_rejections(analysis))
-    yield from _detect_small_gate(analysis, rejections)
-    yield from rejections
+    rejection_findings = tuple(_detect_rejections(analysis))
+    yield from _detect_small_gate(analysis, rejection_findings)
+    yield from rejection_findings
 
 
-def _detect_small_gate(analysis: Analysis, rejections: tuple[Finding, ...]) -> Findings:
+def _detect_small_gate(analysis: Analysis, rejection_findings: tuple[Finding, ...]) -> Findings:
     """Detect a gate so small that a consistent filter would reject 1 % of the positions."""
     ekf2 = analysis.flight.ekf2
-    if isinstance(ekf2, Ekf2) and rejections:
+    if isinstance(ekf2, Ekf2) and rejection_findings:
         # Probability that both innovations, north and east, are inside the gate: erf(gate/√2)²
         expected_rejected_fraction = 1.0 - math.erf(ekf2.gate / math.sqrt(2.0)) ** 2
         if expected_rejected_fraction >= REJECTED_FRACTION_FOR_WARNING:
             aid = find_aid(analysis)
-            rejected_fraction = float(rejections[0].evidence["rejected_fraction"])
+            rejected_fraction = float(rejection_findings[0].evidence["rejected_fraction"])
             yield finding(
-                rejections[0].severity,
+                rejection_findings[0].severity,
                 "ekf2_gate_too_small",
                 f"{aid.gate} {ekf2.gate:g} is too small: EKF2 rejects "
                 f"{format_percent(rejected_fraction)} of the positions. Without any fault, this "
                 f"gate rejects {format_percent(expected_rejected_fraction)} of the positions. "
                 "Rejected positions do not correct EKF2.",
-                f"Set {aid.gate} to {aid.default_gate:g} √S (PX4's default).",
+                f"Set {aid.gate} to {aid.default_gate:g} (PX4's default, in multiples of √S).",
                 {"gate": ekf2.gate, "rejected_by_gate": expected_rejected_fraction},
             )
 
@@ -65,7 +65,7 @@ def _detect_rejections(analysis: Analysis) -> Findings:
         if isinstance(innovations, Unavailable) or not isinstance(ekf2, Ekf2):
             continue
         rejected_flags = innovations["rejected"].dropna()
-        rejected_fraction = float(rejected_flags.mean())  # NaN if the log has no rejections
+        rejected_fraction = float(rejected_flags.mean())  # NaN without logged flags
         if rejected_fraction >= REJECTED_FRACTION_FOR_WARNING:
             quantity = "heights" if result is down_comparison else "positions"
             yield finding(
@@ -80,7 +80,7 @@ def _detect_rejections(analysis: Analysis) -> Findings:
                     "count": len(innovations),
                     "axis": result.axis.name,
                 },
-                zero_length_spans(rejected_flags.index[rejected_flags > 0.0]),
+                make_zero_length_spans(rejected_flags.index[rejected_flags > 0.0]),
             )
 
 
@@ -98,11 +98,11 @@ def _find_rejection_remedy(analysis: Analysis, result: AxisComparison) -> str:
 
 
 def _prevents_rejections(trial: Trial) -> bool:
-    fraction_before, fraction_after = trial.before.rejected_fraction, trial.after.rejected_fraction
+    rejected_before, rejected_after = trial.before.rejected_fraction, trial.after.rejected_fraction
     if (
-        fraction_before is None
-        or fraction_after is None
+        rejected_before is None
+        or rejected_after is None
         or classify_improvement(trial) == "nothing"
     ):
         return False
-    return len(trial.kinds) == 1 and fraction_after < MAX_REJECTED_FRACTION_RATIO * fraction_before
+    return len(trial.kinds) == 1 and rejected_after < MAX_REJECTED_FRACTION_RATIO * rejected_before

@@ -7,16 +7,16 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.flight_events import find_airborne_spans
 from px4fuse.comparison.projection import remove_origin_resets
 from px4fuse.core.record import Span
-from px4fuse.findings.cause_grouping import CAUSE_KEY, GAP_CAUSE, OTHER_CAUSE
-from px4fuse.findings.model import Findings, finding, format_count, warning, zero_length_spans
+from px4fuse.findings.cause_grouping import CAUSE_KEY, GAP_CAUSE, UNKNOWN_CAUSE
+from px4fuse.findings.model import Findings, finding, format_count, make_zero_length_spans, warning
 from px4fuse.flight.model import Ekf2, Reset
 
 # Time (s) after take-off in which a height reset of EKF2 is normal
 TAKE_OFF_DURATION_S = 10.0
 # Maximum time (s) from the end of a gap in the position source to the EKF2 reset caused by the gap
 MAX_RESET_DELAY_S = 5.0
-# Maximum time (s) from EKF2's logged start of fusion to the normal first reset, because fusion
-# flags are logged at 1 Hz
+# EKF2 starts fusion by a reset to the first position. This normal reset can be up to this time (s)
+# after the logged start of fusion, because fusion flags are logged at 1 Hz
 MAX_START_RESET_DELAY_S = 1.0
 
 
@@ -24,7 +24,7 @@ def detect(analysis: Analysis) -> Findings:
     ekf2, segment = analysis.flight.ekf2, analysis.segment.flight
     if not isinstance(ekf2, Ekf2):
         return
-    # EKF2 starts fusion by a reset to the first position: resets up to this time (s) are normal
+    # Earlier resets are normal. NaN if EKF2 fuses no position: the comparison below is then False
     fusion_start_s = -np.inf
     if isinstance(ekf2.fusion_flags, pd.DataFrame):
         is_fused = ekf2.fusion_flags["horizontal"] > 0.0
@@ -36,7 +36,7 @@ def detect(analysis: Analysis) -> Findings:
         and reset.quantity == "position"
         and any(reset.delta)
         and not _is_take_off_height_reset(analysis, reset)
-        and not reset.time_s <= fusion_start_s  # False for NaN, if EKF2 fuses no position
+        and not reset.time_s <= fusion_start_s
     ]
     if position_resets:
         horizontal_resets = [reset for reset in position_resets if any(reset.delta[:2])]
@@ -65,9 +65,9 @@ def detect(analysis: Analysis) -> Findings:
                 "count": len(sizes_m),
                 "largest_m": max(sizes_m),
                 "at_s": largest_reset_time_s,
-                CAUSE_KEY: GAP_CAUSE if follows_gap else OTHER_CAUSE,
+                CAUSE_KEY: GAP_CAUSE if follows_gap else UNKNOWN_CAUSE,
             },
-            zero_length_spans(reset.time_s for reset in reported_resets),
+            make_zero_length_spans(reset.time_s for reset in reported_resets),
         )
     yield from detect_instance_switches(ekf2, (segment.start_s, segment.end_s))
 
@@ -83,7 +83,7 @@ def detect_instance_switches(ekf2: Ekf2, span_s: Span) -> Findings:
             "Compare vibration and clipping of the IMUs (vehicle_imu_status). For a lab flight set "
             "EKF2_MULTI_IMU to 1, so that EKF2 uses only one IMU.",
             {"count": len(switch_times_s), "at_s": switch_times_s[0]},
-            zero_length_spans(switch_times_s),
+            make_zero_length_spans(switch_times_s),
         )
 
 

@@ -11,11 +11,11 @@ from px4fuse.core.text import format_metres
 from px4fuse.filter.signals import Segment, cut_to_segment
 from px4fuse.findings.model import (
     Findings,
+    compute_flag_fraction,
     error,
+    find_spans_with_value,
     format_percent,
-    fraction_of_ones,
     magnetometer_advice,
-    spans_with_value,
 )
 from px4fuse.flight.ekf2_parameters import BAROMETER, EV_CTRL_YAW_MASK, EV_POS, MAG
 from px4fuse.flight.model import (
@@ -29,7 +29,7 @@ from px4fuse.flight.model import (
 )
 
 # Limits of EKF2's bias estimates: parameter, its unit, sensor, and columns of the bias
-BIAS_LIMITS = (
+BIAS_LIMIT_PARAMETERS = (
     ("EKF2_ABL_LIM", "m/s²", "accelerometer", Columns.ACCELEROMETER_BIAS),
     ("EKF2_GYR_B_LIM", "rad/s", "gyroscope", Columns.GYRO_BIAS),
 )
@@ -40,14 +40,15 @@ MIN_TIME_AT_LIMIT_FRACTION = 0.5
 # Length (s) of the windows in which px4fuse tests if the vehicle is at rest
 REST_WINDOW_S = 1.0
 # Time (s) before take-off in which the motors run, so that the IMU is not at rest
-MOTORS_ON_S = 0.5
+MOTOR_RUN_UP_DURATION_S = 0.5
 # Maximum standard deviation of angular rate (rad/s) and specific force (m/s²) at rest
-MAX_STDS_AT_REST = (0.04, 1.5)
+MAX_IMU_STDS_AT_REST = (0.04, 1.5)
 # Maximum change (rad/s) of the mean angular rate between windows at rest
 MAX_RATE_CHANGE_AT_REST_RAD_S = 0.01
 # Minimum gyroscope bias (rad/s) for a finding: the heading turns by 90° in 30 s
 MIN_GYRO_BIAS_RAD_S = 0.05
-# Minimum |gravity - specific force at rest| (m/s²) that the message on a limited bias states
+# The message states the vertical accelerometer bias if specific force at rest and gravity differ by
+# more than this value (m/s²)
 MIN_GRAVITY_ERROR_M_S2 = 0.3
 # Missing tilt or yaw alignment is reported if it lasts for a larger fraction of the flight
 MAX_UNALIGNED_FRACTION = 0.02
@@ -59,12 +60,12 @@ def detect(analysis: Analysis) -> Findings:
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2):
         return
-    imu_at_rest = measure_imu_at_rest(analysis.flight)
+    median_imu_at_rest = measure_imu_at_rest(analysis.flight)
     if not isinstance(ekf2.record, Unavailable):
         bias_states = cut_to_segment(ekf2.record.delayed, analysis.segment)
         if len(bias_states):
-            yield from _detect_limited_bias(analysis, ekf2, bias_states, imu_at_rest)
-            yield from _detect_gyro_bias(bias_states, imu_at_rest)
+            yield from _detect_limited_bias(analysis, ekf2, bias_states, median_imu_at_rest)
+            yield from _detect_gyro_bias(bias_states, median_imu_at_rest)
     yield from detect_missing_alignment(analysis.flight, analysis.segment, analysis.source)
 
 
@@ -74,12 +75,13 @@ def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
         return None
     if isinstance(flight.airborne, Unavailable):
         return None
-    imu = rows_between(flight.imu, -np.inf, flight.airborne[0][0] - MOTORS_ON_S).astype(np.float64)
+    end_s = flight.airborne[0][0] - MOTOR_RUN_UP_DURATION_S
+    imu = rows_between(flight.imu, -np.inf, end_s).astype(np.float64)
     windows = imu.groupby(np.floor(imu.index / REST_WINDOW_S))
     window_means, window_stds = windows.mean(), windows.std()
     is_at_rest = np.ones(len(window_means), bool)
     for columns, limit in zip(
-        (Columns.ANGULAR_RATE, Columns.SPECIFIC_FORCE), MAX_STDS_AT_REST, strict=True
+        (Columns.ANGULAR_RATE, Columns.SPECIFIC_FORCE), MAX_IMU_STDS_AT_REST, strict=True
     ):
         is_at_rest &= np.linalg.norm(window_stds[columns], axis=1) < limit
     window_means = window_means[is_at_rest]
@@ -92,23 +94,24 @@ def measure_imu_at_rest(flight: Flight) -> pd.Series | None:
 
 
 def _detect_limited_bias(
-    analysis: Analysis, ekf2: Ekf2, bias_states: pd.DataFrame, imu_at_rest: pd.Series | None
+    analysis: Analysis, ekf2: Ekf2, bias_states: pd.DataFrame, median_imu_at_rest: pd.Series | None
 ) -> Findings:
-    for parameter, unit, sensor, columns in BIAS_LIMITS:
+    for parameter, unit, sensor, columns in BIAS_LIMIT_PARAMETERS:
         limit = ekf2.parameters.get(parameter, 0.0)
         fractions = (bias_states[columns].abs() >= MIN_BIAS_LIMIT_RATIO * limit).mean().to_numpy()
         axis_index = int(np.argmax(fractions))
-        at_limit_fraction = float(fractions[axis_index])
-        if limit <= 0.0 or at_limit_fraction < MIN_TIME_AT_LIMIT_FRACTION:
+        time_at_limit_fraction = float(fractions[axis_index])
+        if limit <= 0.0 or time_at_limit_fraction < MIN_TIME_AT_LIMIT_FRACTION:
             continue
-        bias = float(bias_states[columns[axis_index]].median())
+        median_bias = float(bias_states[columns[axis_index]].median())
         message = (
             f"EKF2's {sensor} bias is at its limit {parameter} {limit:.3g} {unit} for "
-            f"{format_percent(at_limit_fraction)} of the flight. The estimate is {bias:+.3g} "
-            f"{unit} {BODY_AXES[axis_index]}; EKF2 cannot estimate a larger bias."
+            f"{format_percent(time_at_limit_fraction)} of the flight. The estimate is "
+            f"{median_bias:+.3g} {unit} {BODY_AXES[axis_index]}; "
+            "EKF2 cannot estimate a larger bias."
         )
-        if sensor == "accelerometer" and imu_at_rest is not None:
-            force_m_s2 = float(np.linalg.norm(imu_at_rest[Columns.SPECIFIC_FORCE]))
+        if sensor == "accelerometer" and median_imu_at_rest is not None:
+            force_m_s2 = float(np.linalg.norm(median_imu_at_rest[Columns.SPECIFIC_FORCE]))
             if abs(force_m_s2 - constants.g) > MIN_GRAVITY_ERROR_M_S2:
                 message += (
                     f" At rest before take-off the accelerometer measures {force_m_s2:.2f} m/s² "
@@ -119,7 +122,7 @@ def _detect_limited_bias(
             "ekf2_bias_at_limit",
             message + (_describe_height_error(analysis, ekf2) if axis_index == 2 else ""),
             f"Calibrate the {sensor}s at the temperature of the flight.",
-            {"bias": bias, "limit": limit, "limited_fraction": at_limit_fraction},
+            {"bias": median_bias, "limit": limit, "limited_fraction": time_at_limit_fraction},
         )
 
 
@@ -138,10 +141,10 @@ def _describe_height_error(analysis: Analysis, ekf2: Ekf2) -> str:
     return error_text
 
 
-def _detect_gyro_bias(bias_states: pd.DataFrame, imu_at_rest: pd.Series | None) -> Findings:
-    if imu_at_rest is None:
+def _detect_gyro_bias(bias_states: pd.DataFrame, median_imu_at_rest: pd.Series | None) -> Findings:
+    if median_imu_at_rest is None:
         return
-    measured_biases_rad_s: Array = imu_at_rest[Columns.ANGULAR_RATE].to_numpy()
+    measured_biases_rad_s: Array = median_imu_at_rest[Columns.ANGULAR_RATE].to_numpy()
     estimated_biases_rad_s: Array = bias_states[Columns.GYRO_BIAS].median().to_numpy()
     differences_rad_s = np.abs(measured_biases_rad_s - estimated_biases_rad_s)
     axis_index = int(np.argmax(differences_rad_s))
@@ -167,7 +170,8 @@ def detect_missing_alignment(
 ) -> Findings:
     """Detect that EKF2 aligned its tilt or its heading late or never.
 
-    Without ``source``, the flight has no positions of external vision.
+    ``source`` is None for a flight without position source. If EKF2 takes its heading from the
+    source, the alignment of the heading is not tested.
     """
     ekf2 = flight.ekf2
     if not isinstance(ekf2, Ekf2):
@@ -175,7 +179,7 @@ def detect_missing_alignment(
     fusion_flags = ekf2.fusion_flags
     fuses_source_yaw = (source is not None and source.frame == "FRD") or (
         isinstance(fusion_flags, pd.DataFrame)
-        and fraction_of_ones(fusion_flags["yaw"], segment) > 0.0
+        and compute_flag_fraction(fusion_flags["yaw"], segment) > 0.0
     )
     alignment_end_s = segment.start_s
     for flag, quantity, action in (
@@ -185,8 +189,8 @@ def detect_missing_alignment(
         alignment_flag = ekf2.states.get(flag)
         if alignment_flag is None or (flag == "yaw_align" and fuses_source_yaw):
             continue
-        spans = spans_with_value(0.0, alignment_flag, segment)
-        unaligned_fraction = 1.0 - fraction_of_ones(alignment_flag, segment)
+        spans = find_spans_with_value(0.0, alignment_flag, segment)
+        unaligned_fraction = 1.0 - compute_flag_fraction(alignment_flag, segment)
         if (
             unaligned_fraction > MAX_UNALIGNED_FRACTION
             and spans[-1][1] > alignment_end_s + MAX_HEADING_ALIGNMENT_DELAY_S

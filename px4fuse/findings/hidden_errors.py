@@ -20,7 +20,7 @@ from px4fuse.comparison.model import (
 )
 from px4fuse.comparison.reruns import ErrorAboveSigma, find_error_above_sigma
 from px4fuse.comparison.trials import Trial, find_cause_trial
-from px4fuse.core.text import format_metres, format_ratio
+from px4fuse.core.text import capitalise_first, format_metres, format_ratio
 from px4fuse.errors import TrajectoryError
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
 from px4fuse.finding import Finding
@@ -31,9 +31,9 @@ from px4fuse.flight.model import Unavailable, source_name
 from px4fuse.loop.model import Loop
 from px4fuse.trajectory.alignment import fit_alignment
 
-# Minimum mean NEES for severity error: the RMS position error is 4 reported σ
+# Minimum mean NEES, for severity "error": an RMS position error of 4 times the reported σ
 MIN_NEES_FOR_ERROR = 16.0
-# Maximum ratio of KF's position RMSE to EKF2's, at which the fault is in EKF2 alone
+# EKF2 has a fault that KF does not have if KF's position RMSE ÷ EKF2's is below this ratio
 MAX_KF_TO_EKF2_RMSE_RATIO = 0.7
 # Maximum ratio of position RMSE after alignment to RMSE before it, for a misaligned position frame
 MAX_ALIGNED_RMSE_RATIO = 0.5
@@ -52,7 +52,7 @@ HEIGHT_REMEDY = (
 )
 
 
-class AlignedError(NamedTuple):
+class AlignmentRmse(NamedTuple):
     """Horizontal position RMSE (m) against ground truth, before and after the best alignment."""
 
     rmse_before_m: float
@@ -60,7 +60,7 @@ class AlignedError(NamedTuple):
 
     def __str__(self) -> str:
         return (
-            f"{format_metres(self.rmse_before_m)} m before and "
+            f"horizontal position RMSE {format_metres(self.rmse_before_m)} m before and "
             f"{format_metres(self.rmse_after_m)} m after the best shift and rotation"
         )
 
@@ -75,8 +75,8 @@ def find_hidden_errors(comparison: Comparison) -> list[tuple[FilterName, str, Er
     Return (filter, axis, error) for each error, largest mean NEES first.
     """
     alignment, frame_residual_rms_m = comparison.source.alignment, 0.0
-    # A frame fitted to EKF2's track contains EKF2's errors. KF's errors up to the residual of the
-    # fit, and in height, may thus be errors of the frame
+    # A frame fitted to EKF2's track contains EKF2's errors. KF's height errors, and KF errors below
+    # the residual of the fit, may thus be errors of the frame
     if is_frame_fitted := alignment is not None and alignment.yaw_sigma_deg is not None:
         frame_residual_rms_m = alignment.residual_rms_m or 0.0
     hidden_errors = [
@@ -105,8 +105,8 @@ def make_hidden_error_finding(
     hidden_errors = sorted(hidden_errors, key=lambda entry: entry[1] != analysis.main.axis.name)
     worst_filter, main_axis, worst_error = hidden_errors[0]
     evidence: dict[str, float | str] = {"axis": main_axis, "filter": worst_filter}
-    ratio_by_filter, sentences = dict[str, float](), list[str]()
-    cause_by_filter = dict[FilterName, Trial]()
+    sigma_ratio_by_filter, sentences = dict[str, float](), list[str]()
+    trial_by_filter = dict[FilterName, Trial]()
     for filter_name in FILTER_NAMES:
         label = FILTER_NAMES[filter_name]
         for _, axis, hidden_error in [entry for entry in hidden_errors if entry[0] == filter_name][
@@ -121,36 +121,36 @@ def make_hidden_error_finding(
             }
             cause = find_cause_trial(analysis.trials, filter_name, axis, "nees")
             if cause is not None and not is_refuted(analysis, filter_name, cause):
-                cause_by_filter[filter_name] = cause
-            ratio_by_filter[label] = hidden_error.nees**0.5
+                trial_by_filter[filter_name] = cause
+            sigma_ratio_by_filter[label] = hidden_error.nees**0.5
             sentences.append(
                 f"{label}: position RMSE {format_metres(hidden_error.rmse_m)} m along "
                 f"{analysis.axes[axis].axis.label}, reported σ "
                 f"{format_metres(hidden_error.reported_sigma_m)} m."
             )
-    cause = cause_by_filter.get(worst_filter) or next(iter(cause_by_filter.values()), None)
+    cause = trial_by_filter.get(worst_filter) or next(iter(trial_by_filter.values()), None)
     evidence |= {CAUSE_KEY: classify_cause(analysis, cause)}
-    aligned_error = None if cause_by_filter else _compute_aligned_error(analysis, worst_filter)
-    if aligned_error is not None:
+    alignment_rmse = None if trial_by_filter else _compute_alignment_rmse(analysis, worst_filter)
+    if alignment_rmse is not None:
         evidence |= {
-            "position_rmse_horizontal_m": aligned_error.rmse_before_m,
-            "position_rmse_aligned_m": aligned_error.rmse_after_m,
+            "position_rmse_horizontal_m": alignment_rmse.rmse_before_m,
+            "position_rmse_aligned_m": alignment_rmse.rmse_after_m,
         }
-    is_misaligned = aligned_error is not None and aligned_error.is_misaligned
-    if analysis.source.origin.may_drift and not cause_by_filter and not is_misaligned:
+    is_misaligned = alignment_rmse is not None and alignment_rmse.is_misaligned
+    if analysis.source.origin.may_drift and not trial_by_filter and not is_misaligned:
         return _make_drift_finding(
-            analysis, aligned_error, worst_error, evidence, tuple(ratio_by_filter)
+            analysis, alignment_rmse, worst_error, evidence, tuple(sigma_ratio_by_filter)
         )
-    if is_misaligned and aligned_error is not None:
-        sentences.append(
-            f"The position frame is misaligned: horizontal position RMSE {aligned_error}."
-        )
+    if is_misaligned and alignment_rmse is not None:
+        sentences.append(f"The position frame is misaligned: {alignment_rmse}.")
     kf_errors = analysis.axes[main_axis].filters["kf"].truth
     is_kf_better = (
         isinstance(kf_errors, ErrorsAgainstTruth)
         and kf_errors.position_rmse_m < MAX_KF_TO_EKF2_RMSE_RATIO * worst_error.rmse_m
     )
-    is_ekf2_alone = is_kf_better and all(filter_name == "ekf2" for filter_name, *_ in hidden_errors)
+    is_fault_of_ekf2_only = is_kf_better and all(
+        filter_name == "ekf2" for filter_name, *_ in hidden_errors
+    )
     remedy = (
         "Check the time offset of the positions (px4fuse sync LOG). "
         f"Then check {find_source_texts(analysis.source).errors}."
@@ -159,11 +159,11 @@ def make_hidden_error_finding(
         remedy = format_action(analysis, cause.change)
     elif is_misaligned:
         remedy = FRAME_REMEDY
-    elif is_ekf2_alone:
+    elif is_fault_of_ekf2_only:
         remedy = HEIGHT_REMEDY if main_axis == "down" else EKF2_REMEDY
     ratio_texts = (
         f"{label} {format_ratio(ratio)} times the reported σ"
-        for label, ratio in ratio_by_filter.items()
+        for label, ratio in sigma_ratio_by_filter.items()
     )
     title = f"Position errors that innovations do not show: {', '.join(ratio_texts)}"
     return finding(
@@ -177,7 +177,7 @@ def make_hidden_error_finding(
 
 def _make_drift_finding(
     analysis: Analysis,
-    aligned_error: AlignedError | None,
+    alignment_rmse: AlignmentRmse | None,
     worst_error: ErrorAboveSigma,
     evidence: Mapping[str, float | str],
     filter_labels: tuple[str, ...],
@@ -189,31 +189,31 @@ def _make_drift_finding(
     sensor_name, loop = source_name(analysis.source), analysis.loop
     drift_text = f"position RMSE {format_metres(worst_error.rmse_m)} m against ground truth"
     rmse_sentence = ""
-    if aligned_error is not None:
+    if alignment_rmse is not None:
         drift_text = (
-            f"horizontal position RMSE {format_metres(aligned_error.rmse_after_m)} m after the "
+            f"horizontal position RMSE {format_metres(alignment_rmse.rmse_after_m)} m after the "
             "best alignment"
         )
         rmse_sentence = (
-            f"Before the alignment the RMSE is {format_metres(aligned_error.rmse_before_m)} m. "
+            f"Before the alignment the RMSE is {format_metres(alignment_rmse.rmse_before_m)} m. "
         )
     if isinstance(loop, Loop) and (closure_error_m := _find_closure_error_m(loop)) is not None:
         length_m = loop.path_length_m
         evidence = {**evidence, "closure_error_m": closure_error_m, "path_length_m": length_m}
         rmse_sentence = (
-            "" if aligned_error is None else f"Horizontal position RMSE {aligned_error}. "
+            "" if alignment_rmse is None else f"{capitalise_first(str(alignment_rmse))}. "
         )
         drift_text = (
             f"loop closure error {format_metres(closure_error_m)} m, "
             f"{format_percent(closure_error_m / length_m, 1)} of a path of {length_m:.0f} m"
         )
     noise_parameter = "" if analysis.source.origin.aid is None else analysis.source.origin.aid.noise
-    noise_settings = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
+    noise_setting_names = " or ".join(filter(None, ("SIGMA_Z", noise_parameter)))
     return error(
         "source_drift",
         f"{sensor_name} drifts: {drift_text}. {rmse_sentence}The innovations of "
         f"{' and '.join(filter_labels)} do not show the drift, because the estimates follow "
-        f"{sensor_name}. Do not reduce {noise_settings}.",
+        f"{sensor_name}. Do not reduce {noise_setting_names}.",
         DRIFT_REMEDY,
         evidence,
     )
@@ -225,7 +225,9 @@ def _find_closure_error_m(loop: Loop) -> float | None:
     return loop.closure_error_m
 
 
-def _compute_aligned_error(comparison: Comparison, filter_name: FilterName) -> AlignedError | None:
+def _compute_alignment_rmse(
+    comparison: Comparison, filter_name: FilterName
+) -> AlignmentRmse | None:
     """Return the horizontal position RMSE before and after alignment with ground truth.
 
     The alignment is a shift and a rotation about the vertical axis.
@@ -252,7 +254,7 @@ def _compute_aligned_error(comparison: Comparison, filter_name: FilterName) -> A
         float(np.linalg.norm(errors)) / len(true_m) ** 0.5
         for errors in (error_m, aligned_m - true_m)
     )
-    return AlignedError(rmse_m, aligned_rmse_m)
+    return AlignmentRmse(rmse_m, aligned_rmse_m)
 
 
 def make_possible_drift_finding(analysis: Analysis) -> Finding:

@@ -10,7 +10,7 @@ from px4fuse.ekf2.inputs import MAX_LOST_FRACTION, compute_lost_imu_fraction
 from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, SystematicErrors
 from px4fuse.filter.signals import Segment, cut_to_segment, find_imu_gaps
 from px4fuse.finding import MIN_SPAN_S
-from px4fuse.findings.missing import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_BIT
+from px4fuse.findings.missing import DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK
 from px4fuse.findings.model import Findings, error, finding, format_percent, warning
 from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 
@@ -18,7 +18,7 @@ from px4fuse.flight.model import Columns, Ekf2, Flight, sample_rate
 MAX_SPECIFIC_FORCE_M_S2 = 343.0
 # Minimum number of samples above MAX_SPECIFIC_FORCE_M_S2 for a finding
 MIN_OUT_OF_RANGE_SAMPLES = 3
-# Minimum accelerometer bias (m/s²) for severity error: a position error of 0.15 m after 1 s
+# Minimum accelerometer bias (m/s²), for severity "error": a position error of 0.15 m after 1 s
 MIN_BIAS_FOR_ERROR_M_S2 = 0.3
 # Tilt error (°) that has the same effect as an accelerometer bias of 1 m/s²
 TILT_DEG_PER_M_S2 = float(np.degrees(1.0 / 9.80665))
@@ -29,11 +29,11 @@ MIN_IMU_RATE_HZ = 50.0
 # Minimum attitude rate (Hz) for interpolation of the attitude to the times of IMU samples
 MIN_ATTITUDE_RATE_HZ = 10.0
 # Clipping is reported if it lasts longer than this time (s): a touch-down clips one or two samples
-MAX_CLIPPED_S = 0.1
+MAX_CLIPPING_DURATION_S = 0.1
 # Minimum time (s) without clipped samples between two reported time spans of clipping
 MIN_CLIPPING_PAUSE_S = 2.0
-# Bit 4 of SDLOG_PROFILE: full IMU rate (logged_topics.cpp)
-HIGH_RATE_BIT = 16
+# Mask of SDLOG_PROFILE, bit 4: full IMU rate (logged_topics.cpp)
+HIGH_RATE_MASK = 16
 # Minimum ratio of measured to required sample rate: sensors are up to 2 % slower than nominal
 MIN_REQUIRED_RATE_FRACTION = 0.98
 
@@ -41,7 +41,7 @@ MIN_REQUIRED_RATE_FRACTION = 0.98
 def detect(analysis: Analysis) -> Findings:
     yield from detect_impossible_acceleration(analysis)
     yield from detect_tumbling(analysis)
-    yield from detect_bias(analysis)
+    yield from detect_accelerometer_bias(analysis)
     yield from detect_clipping(analysis)
     yield from detect_missing_imu_samples(analysis)
     yield from detect_imu_gaps(analysis)
@@ -69,9 +69,10 @@ def detect_impossible_acceleration(analysis: Analysis) -> Findings:
     )
 
 
-def detect_bias(analysis: Analysis) -> Findings:
+def detect_accelerometer_bias(analysis: Analysis) -> Findings:
     """Detect an accelerometer bias, estimated from the positions or by EKF2."""
-    systematic_errors, ekf2_bias = analysis.systematic_errors, _compute_ekf2_bias(analysis)
+    systematic_errors = analysis.systematic_errors
+    ekf2_bias_m_s2 = _find_ekf2_accelerometer_bias(analysis)
     if isinstance(systematic_errors, SystematicErrors) and systematic_errors.has_significant_bias():
         forward_bias, right_bias, bias_m_s2 = (
             systematic_errors.accelerometer_bias_forward,
@@ -85,10 +86,10 @@ def detect_bias(analysis: Analysis) -> Findings:
             f"{bias_m_s2 * TILT_DEG_PER_M_S2:.1f}° has the same effect. KF does not estimate "
             "biases."
         )
-        if ekf2_bias is not None:
+        if ekf2_bias_m_s2 is not None:
             message += (
-                f" EKF2 estimates {ekf2_bias[0]:+.2f} m/s² forward and {ekf2_bias[1]:+.2f} m/s² "
-                "right."
+                f" EKF2's estimate of the bias is {ekf2_bias_m_s2[0]:+.2f} m/s² forward and "
+                f"{ekf2_bias_m_s2[1]:+.2f} m/s² right."
             )
         yield finding(
             "error" if bias_m_s2 >= MIN_BIAS_FOR_ERROR_M_S2 else "warning",
@@ -97,25 +98,27 @@ def detect_bias(analysis: Analysis) -> Findings:
             "Calibrate the accelerometers and the level horizon at the temperature of the flight.",
             {"bias_m_s2": bias_m_s2, "sigma_m_s2": systematic_errors.compute_bias().sigma},
         )
-    elif ekf2_bias is not None:
+    elif ekf2_bias_m_s2 is not None:
         # The positions show no significant horizontal bias, so only EKF2's vertical bias counts
         bias_m_s2 = float(
             np.linalg.norm(
-                ekf2_bias[2:] if isinstance(systematic_errors, SystematicErrors) else ekf2_bias
+                ekf2_bias_m_s2[2:]
+                if isinstance(systematic_errors, SystematicErrors)
+                else ekf2_bias_m_s2
             )
         )
         if bias_m_s2 >= MIN_BIAS_M_S2:
             yield warning(
                 "accelerometer_bias",
                 f"EKF2 estimates an accelerometer bias of {bias_m_s2:.2f} m/s². Its components are "
-                f"{ekf2_bias[0]:+.2f} forward, {ekf2_bias[1]:+.2f} right and {ekf2_bias[2]:+.2f} "
-                "down. KF does not estimate biases.",
+                f"{ekf2_bias_m_s2[0]:+.2f} forward, {ekf2_bias_m_s2[1]:+.2f} right and "
+                f"{ekf2_bias_m_s2[2]:+.2f} down. KF does not estimate biases.",
                 "Calibrate the accelerometers at the temperature of the flight.",
                 {"bias_m_s2": bias_m_s2},
             )
 
 
-def _compute_ekf2_bias(analysis: Analysis) -> list[float] | None:
+def _find_ekf2_accelerometer_bias(analysis: Analysis) -> list[float] | None:
     """Return EKF2's median accelerometer bias forward, right and down (m/s²), if logged."""
     ekf2 = analysis.flight.ekf2
     if not isinstance(ekf2, Ekf2) or not isinstance(ekf2.accelerometer_bias, pd.DataFrame):
@@ -145,20 +148,20 @@ def detect_clipping(analysis: Analysis) -> Findings:
         return
     imu_samples = cut_to_segment(imu, analysis.segment)
     time_s = imu_samples.index[imu_samples["clipped"] > 0.0].to_numpy()
-    total_s = len(time_s) / sample_rate(imu)
-    if total_s > MAX_CLIPPED_S:
-        clipping_bursts_s = np.split(
+    clipped_duration_s = len(time_s) / sample_rate(imu)
+    if clipped_duration_s > MAX_CLIPPING_DURATION_S:
+        clipping_times_by_burst_s = np.split(
             time_s, np.flatnonzero(np.diff(time_s) > MIN_CLIPPING_PAUSE_S) + 1
         )
         yield warning(
             "accelerometer_clipping",
-            f"The accelerometer was clipped for {total_s:.2f} s ({len(time_s)} samples). The log "
-            "lacks motion beyond the sensor range. Height and vertical velocity are affected "
-            "first; the error resembles a bias.",
+            f"The accelerometer was clipped for {clipped_duration_s:.2f} s ({len(time_s)} "
+            "samples). The log lacks motion beyond the sensor range. Height and vertical velocity "
+            "are affected first; the error resembles a bias.",
             "Check propellers, motors and mounting for vibration or impacts. Analyse a segment "
             "without clipping (--start, --end).",
-            {"count": len(time_s), "total_s": total_s},
-            tuple((float(burst[0]), float(burst[-1])) for burst in clipping_bursts_s),
+            {"count": len(time_s), "total_s": clipped_duration_s},
+            tuple((float(times_s[0]), float(times_s[-1])) for times_s in clipping_times_by_burst_s),
         )
 
 
@@ -196,7 +199,7 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
         return
     sdlog_profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE))
     action = "Use a faster SD card."
-    if other_topics := sdlog_profile & ~(DEFAULT_SDLOG_PROFILE | VISION_PROFILE_BIT):
+    if other_topics := sdlog_profile & ~(DEFAULT_SDLOG_PROFILE | VISION_PROFILE_MASK):
         action = (
             "Use a faster SD card, or log fewer topics: set SDLOG_PROFILE to "
             f"{sdlog_profile ^ other_topics}."
@@ -221,34 +224,34 @@ def _find_gap_spans(imu: pd.DataFrame, segment: Segment) -> tuple[Span, ...]:
     return tuple(sorted(gaps_inside))
 
 
-def is_rate_too_low(samples: pd.DataFrame, required_hz: float) -> bool:
-    return sample_rate(samples) < MIN_REQUIRED_RATE_FRACTION * required_hz
+def is_rate_too_low(samples: pd.DataFrame, required_rate_hz: float) -> bool:
+    return sample_rate(samples) < MIN_REQUIRED_RATE_FRACTION * required_rate_hz
 
 
 def detect_low_rates(flight: Flight) -> Findings:
     """Detect an IMU or attitude rate too low to compute the acceleration in NED."""
     log = flight.log
-    for samples, name, label, default_topic, required_hz in (
+    for samples, name, label, default_topic, required_rate_hz in (
         (flight.imu, "imu", "IMU", "sensor_combined", MIN_IMU_RATE_HZ),
         (flight.attitude, "attitude", "attitude", "vehicle_attitude", MIN_ATTITUDE_RATE_HZ),
     ):
         topic = flight.streams[name].topics[0] if name in flight.streams else default_topic
-        if isinstance(samples, pd.DataFrame) and is_rate_too_low(samples, required_hz):
-            rate_hz, requested_hz = sample_rate(samples), 2.0 * required_hz
+        if isinstance(samples, pd.DataFrame) and is_rate_too_low(samples, required_rate_hz):
+            rate_hz, requested_rate_hz = sample_rate(samples), 2.0 * required_rate_hz
             sdlog_profile = (
-                int(log.parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE)) | HIGH_RATE_BIT
+                int(log.parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE)) | HIGH_RATE_MASK
             )
             action = f"Set SDLOG_PROFILE to {sdlog_profile} (bit 4 logs {topic} at full rate)."
             if log.format.startswith("MAVLink"):
                 action = (
-                    f"Request {topic} at {requested_hz:g} Hz "
+                    f"Request {topic} at {requested_rate_hz:g} Hz "
                     "(MAV_CMD_SET_MESSAGE_INTERVAL)"
                     f"{', or give the ULog of the flight' if log.has_ulog else ''}."
                 )
             yield warning(
                 "imu_rate_too_low",
-                f"The {label} was logged at {rate_hz:.1f} Hz, but {required_hz:g} Hz are needed. "
-                "Motion between samples is lost, and vibration is aliased.",
+                f"The {label} was logged at {rate_hz:.1f} Hz, but {required_rate_hz:g} Hz are "
+                "needed. Motion between samples is lost, and vibration is aliased.",
                 action,
-                {"rate_hz": rate_hz, "needed_hz": required_hz, "topic": topic},
+                {"rate_hz": rate_hz, "needed_hz": required_rate_hz, "topic": topic},
             )

@@ -17,10 +17,10 @@ MIN_GNC_WEIGHT = 0.5
 
 def detect(analysis: Analysis) -> Findings:
     if isinstance(analysis.loop, Loop):
-        yield from detect_in_loop(analysis.loop)
+        yield from detect_loop_faults(analysis.loop)
 
 
-def detect_in_loop(loop: Loop) -> Findings:
+def detect_loop_faults(loop: Loop) -> Findings:
     """Detect false loop closures and wrong assumptions about a loop."""
     yield from detect_inconsistent_closures(loop)
     yield from detect_wrong_assumptions(loop)
@@ -32,8 +32,8 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
         1.0 if closure.weight_gnc is None else closure.weight_gnc for closure in loop.closures
     ]
     rejected_count = sum(gnc_weight < MIN_GNC_WEIGHT for gnc_weight in gnc_weights)
-    rejects_most = rejected_count > MAX_REJECTED_CLOSURE_FRACTION * len(gnc_weights)
-    if rejects_most:
+    rejects_most_closures = rejected_count > MAX_REJECTED_CLOSURE_FRACTION * len(gnc_weights)
+    if rejects_most_closures:
         yield warning(
             "loop_drift_too_small",
             f"Robust optimisation rejects {rejected_count} of {len(gnc_weights)} loop closures. "
@@ -44,7 +44,7 @@ def detect_inconsistent_closures(loop: Loop) -> Findings:
     for closure, gnc_weight in zip(loop.closures, gnc_weights, strict=True):
         if not closure.accepted:
             yield _make_false_closure_finding(closure, loop.is_end_assumed)
-        elif gnc_weight < MIN_GNC_WEIGHT and not rejects_most:
+        elif gnc_weight < MIN_GNC_WEIGHT and not rejects_most_closures:
             yield warning(
                 "loop_closure_inconsistent",
                 f"{closure!s} contradicts the other loop closures. Robust "
@@ -78,12 +78,9 @@ def detect_wrong_assumptions(loop: Loop) -> Findings:
 
 def _make_false_closure_finding(closure: Closure, is_end_assumed: bool) -> Finding:
     is_landing = closure.source == LANDING_CLOSURE_SOURCE
-    fault = f"False loop closure (closure error {closure.distance_m:.2f} m): "
-    fault += (
-        "the landing place is not the take-off place"
-        if is_landing and is_end_assumed
-        else f"{closure}"
-    )
+    closure_text = str(closure)
+    if is_landing and is_end_assumed:
+        closure_text = "the landing place is not the take-off place"
     action = "Remove this loop closure. In this run, px4fuse already ignores it."
     if is_landing:
         action = (
@@ -92,7 +89,8 @@ def _make_false_closure_finding(closure: Closure, is_end_assumed: bool) -> Findi
         )
     return error(
         "false_loop_closure",
-        f"{fault}. The stated drift of the odometry does not explain the closure error (squared "
+        f"False loop closure (closure error {closure.distance_m:.2f} m): {closure_text}. The "
+        "stated drift of the odometry does not explain the closure error (squared "
         f"Mahalanobis distance {closure.d2:.0f}, {closure.degrees_of_freedom} degrees of freedom, "
         f"p {closure.p:.1g}). A path that contains this closure would be deformed.",
         f"{action} If the odometry has more drift than stated, increase --drift and "

@@ -7,8 +7,8 @@ from px4fuse.findings.model import Findings, warning
 from px4fuse.flight.model import RECEIVED_ORIGIN, Unavailable, positions_phrase
 
 VISION_TOPIC = "vehicle_visual_odometry"
-# Bits 0 and 7 of SDLOG_PROFILE: default topics, and external vision (logged_topics.cpp)
-DEFAULT_SDLOG_PROFILE, VISION_PROFILE_BIT = 1, 128
+# SDLOG_PROFILE: default value, and mask of bit 7 for external vision (logged_topics.cpp)
+DEFAULT_SDLOG_PROFILE, VISION_PROFILE_MASK = 1, 128
 
 
 def detect(analysis: Analysis) -> Findings:
@@ -44,9 +44,10 @@ def detect_unavailable_data(analysis: Analysis) -> Findings:
 
 def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
     """Detect that the log lacks the positions which PX4 received."""
-    source, received_rank = analysis.source, RECEIVED_ORIGIN.find_preference_rank()
+    source, received_origin_rank = analysis.source, RECEIVED_ORIGIN.find_preference_rank()
     has_received_positions = any(
-        track.origin.find_preference_rank() == received_rank for track in analysis.flight.positions
+        track.origin.find_preference_rank() == received_origin_rank
+        for track in analysis.flight.positions
     )
     if source.origin.has_all_samples or has_received_positions:
         return
@@ -62,7 +63,7 @@ def detect_source_not_logged(analysis: PreparedComparison) -> Findings:
         f"The log lacks the {positions_phrase(source)} as PX4 received them. Reason: "
         f"{next(reasons, f'{VISION_TOPIC} is not in this log')}. px4fuse uses {source.name} "
         f"({source.description}) at {rate_hz:.1f} Hz instead.",
-        f"Set SDLOG_PROFILE to {sdlog_profile | VISION_PROFILE_BIT} (bit 7: vision topics) and fly "
-        "again.",
+        f"Set SDLOG_PROFILE to {sdlog_profile | VISION_PROFILE_MASK} (bit 7: vision topics) and "
+        "fly again.",
         {"rate_hz": rate_hz, "sdlog_profile": sdlog_profile},
     )

@@ -25,17 +25,18 @@ class CatalogueEntry(Record):
     group : str
         One of :data:`FINDING_GROUPS`.
     role : str
-        Effect on the estimates, and place in the list of findings. "unusable" (all positions are
-        wrong), "misleading" (some positions are wrong) and "first" are listed first, "noise" after
-        other errors, "recording" before other warnings.
+        Effect on the estimates, which determines the place in the list of findings. Listed first:
+        "unusable" (all positions are wrong), "misleading" (some positions are wrong) and "first"
+        (other important causes). "noise" is listed after other errors, "recording" before other
+        warnings.
     verdict : str
-        Relation to the statements that KF or EKF2 is consistent, over- or underconfident.
-        "meaningless": the statements are invalid. "repeated": the finding repeats a statement.
+        Relation to the verdicts on KF and EKF2 (consistent, over- or underconfident).
+        "meaningless": the finding makes them invalid. "repeated": the finding repeats a verdict.
     reruns : frozenset of str
         Kinds of re-runs (``Trial.kinds``) that test the finding.
     after_wrong_convention : str
-        Treatment of the finding if axes, unit or clock of the positions are wrong. "effect": it is
-        listed as an effect of this fault. "withdrawn": it is removed. Empty: it remains.
+        What becomes of the finding if axes, unit or clock of the positions are wrong. "effect":
+        listed as an effect of the wrong convention. "withdrawn": removed. Empty: unchanged.
     """
 
     title: str
@@ -48,11 +49,11 @@ class CatalogueEntry(Record):
 
 
 # All possible findings by id; findings of equal severity are listed in this order
-CATALOGUE: Mapping[str, CatalogueEntry] = read_toml(
+FINDING_CATALOGUE: Mapping[str, CatalogueEntry] = read_toml(
     __file__, dict[str, CatalogueEntry], "catalogue.toml"
 )
 FINDING_GROUPS = ("position source", "time", "IMU", "tuning", "EKF2", "loops", "logging")
-TITLES: Mapping[str, str] = {name: entry.title for name, entry in CATALOGUE.items()}
+FINDING_TITLES: Mapping[str, str] = {name: entry.title for name, entry in FINDING_CATALOGUE.items()}
 
 
 class FindingExample(Record):
@@ -144,7 +145,7 @@ def split_cause_groups(findings: Iterable[Finding]) -> list[list[Finding]]:
     return groups
 
 
-def zero_length_spans(times_s: Iterable[float]) -> tuple[Span, ...]:
+def make_zero_length_spans(times_s: Iterable[float]) -> tuple[Span, ...]:
     """Convert times (s) to time spans of length zero."""
     return tuple((float(time), float(time)) for time in times_s)
 
@@ -161,7 +162,9 @@ def format_percent(fraction: float, digits: int = 0) -> str:
     return f"{100.0 * fraction:.{digits}f} %"
 
 
-def spans_with_value(value: float, step_function: pd.Series, segment: Segment) -> tuple[Span, ...]:
+def find_spans_with_value(
+    value: float, step_function: pd.Series, segment: Segment
+) -> tuple[Span, ...]:
     """Return the time spans (s) in a segment in which a step function equals ``value``."""
     step_times_s = np.clip(
         np.append(step_function.index.to_numpy(), np.inf), segment.start_s, segment.end_s
@@ -174,9 +177,9 @@ def spans_with_value(value: float, step_function: pd.Series, segment: Segment) -
     return tuple(zip(change_times_s[::2], change_times_s[1::2], strict=True))
 
 
-def fraction_of_ones(step_function: pd.Series, segment: Segment) -> float:
+def compute_flag_fraction(step_function: pd.Series, segment: Segment) -> float:
     """Return the fraction of a segment's duration in which a flag (0 or 1) is 1."""
     duration_of_ones_s = sum(
-        end - start for start, end in spans_with_value(1.0, step_function, segment)
+        end - start for start, end in find_spans_with_value(1.0, step_function, segment)
     )
     return duration_of_ones_s / (segment.end_s - segment.start_s)

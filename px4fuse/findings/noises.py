@@ -29,7 +29,7 @@ from px4fuse.filter.settings import SETTING_RANGES, Settings
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning, NoiseEstimate
 from px4fuse.finding import SEVERITIES, Finding, Severity
-from px4fuse.findings.cause_grouping import CAUSE_KEY, NOISE_CAUSE, OTHER_CAUSE
+from px4fuse.findings.cause_grouping import CAUSE_KEY, MEASUREMENT_NOISE_CAUSE, UNKNOWN_CAUSE
 from px4fuse.findings.cause_text import (
     classify_cause,
     format_action,
@@ -47,9 +47,9 @@ from px4fuse.request import COMPARISON_OPTIONS
 # Minimum factor between a noise setting and its estimate, for a warning: smaller factors hardly
 # change the track
 MIN_NOISE_FACTOR = 1.5
-# Minimum factor between a noise setting and its estimate for severity error
+# Minimum factor between a noise setting and its estimate, for severity "error"
 MIN_NOISE_FACTOR_FOR_ERROR = 4.0
-# Minimum time constant (s) of a KF that ignores new positions: vehicles turn in less time
+# KF ignores new positions if its time constant exceeds this value (s): vehicles turn in less time
 MIN_TIME_CONSTANT_S = 2.5
 # Factor on the 95 % interval of ln(noise estimate): 0.3 % of correct settings are outside the
 # widened interval
@@ -58,12 +58,12 @@ INTERVAL_WIDENING_FACTOR = 1.5
 # reach 0.2
 MIN_LAG1_AUTOCORRELATION = 0.3
 
-# Minimum factor between actual and reported σ for severity error
+# Minimum factor between actual and reported σ, for severity "error"
 MIN_SIGMA_FACTOR_FOR_ERROR = 2.0
-# Two noise σ count as equal up to this ratio: two standard errors of a median of 100 values
+# Two noise σ count as equal up to this ratio: the median of 100 values has a standard error of 12 %
 NOISE_RATIO_TOLERANCE = 1.25
 # If EKF2's √R is larger than EKF2_EVP_NOISE times this factor, R is the variance in the messages
-MIN_REPORTED_NOISE_RATIO = 1.25
+MIN_USED_TO_SET_NOISE_RATIO = 1.25
 # Action if no change in a re-run corrects the wrong σ
 UNEXPLAINED_SIGMA_ACTION = (
     "No tested change of noise, time offset, frame or outliers explains the wrong σ. Check the "
@@ -92,11 +92,11 @@ SETTING_EFFECTS = {
     (SIGMA_Z, "large"): ("KF follows the positions slowly", "KF's gain is too small."),
     (SIGMA_A, "small"): (
         "KF lags behind the motion",
-        "P grows too little between updates, so KF's gain is too small.",
+        "KF's covariance P grows too little between updates, so KF's gain is too small.",
     ),
     (SIGMA_A, "large"): (
         "KF follows the measurement noise",
-        "P grows too much between updates, so KF's gain is too large.",
+        "KF's covariance P grows too much between updates, so KF's gain is too large.",
     ),
 }
 
@@ -104,9 +104,10 @@ AxisWithSummary = tuple[AxisComparison, FilterSummary]
 
 
 class SettingDeviation(NamedTuple):
-    """Deviation of a noise setting from its estimate, or from an upper bound of the estimate.
+    """Deviation of a noise setting from its estimate.
 
-    ``factor`` = larger / smaller of setting and estimate.
+    ``estimate`` is the upper bound of the estimate if only the bound is known. ``factor`` is the
+    larger of setting / estimate and estimate / setting.
     """
 
     estimate: float
@@ -134,8 +135,8 @@ def detect_wrong_settings(analysis: Analysis) -> Findings:
         for name, noise in noise_estimates.items()
         if (deviation := find_setting_deviation(name, settings[name], noise))
     }
-    # Innovations do not contain drift and time-correlated errors. A noise setting that includes
-    # these errors is not too large
+    # The estimate is from innovations, which do not show drift and time-correlated errors. A larger
+    # setting may include these errors, so only smaller settings are reported
     may_drift = analysis.source.origin.may_drift
     if (
         may_drift
@@ -166,15 +167,15 @@ def _make_setting_finding(
     estimated_noise, factor, severity = deviation
     setting = getattr(analysis.settings, name)
     noise = axis_tuning.sigma_z if name == SIGMA_Z else axis_tuning.sigma_a_two_state
-    direction = "small" if setting < estimated_noise else "large"
+    label, size_word = SETTING_RANGES[name].label, "small" if setting < estimated_noise else "large"
     is_upper_bound = noise.value is None
-    effect, reason = SETTING_EFFECTS[name, direction]
+    effect, reason = SETTING_EFFECTS[name, size_word]
     action = format_setting_action(analysis, name, estimated_noise)
     return finding(
         "note" if action == NO_IMPROVEMENT_ACTION else severity,
-        f"{name[:7]}_too_{direction}",
-        f"{name[:7].upper()} is {'at least ' if is_upper_bound else ''}{format_factor(factor)} "
-        f"times too {direction}: {effect}. {format_estimate(name, setting, noise)}. {reason}",
+        f"{label.lower()}_too_{size_word}",
+        f"{label} is {'at least ' if is_upper_bound else ''}{format_factor(factor)} "
+        f"times too {size_word}: {effect}. {format_estimate(name, setting, noise)}. {reason}",
         action,
         {
             "chosen": setting,
@@ -224,7 +225,7 @@ def find_setting_deviation(
     if low <= setting <= high or factor < MIN_NOISE_FACTOR:
         return None
     severity: Severity = "error" if factor >= MIN_NOISE_FACTOR_FOR_ERROR else "warning"
-    if setting == getattr(Settings(), name):  # less severe, because the user did not choose it
+    if setting == getattr(Settings(), name):  # the user did not choose the wrong value
         severity = lower_severity(severity)
     return SettingDeviation(estimate, factor, severity)
 
@@ -233,8 +234,7 @@ def detect_process_noise_near_zero(analysis: Analysis) -> Findings:
     """Detect a SIGMA_A so small that KF ignores new positions."""
     for result in sorted(analysis.axes.values(), key=lambda result: result is not analysis.main):
         updates, summary = result.replay.updates, result.filters["kf"]
-        # Innovations that are consistent or white show no fault: without motion, a small SIGMA_A
-        # is correct
+        # Without motion, a small SIGMA_A is correct: the innovations are then consistent or white
         if (
             isinstance(summary, Unavailable)
             or summary.verdict != "overconfident"
@@ -290,24 +290,24 @@ def _make_variance_finding(
     axis_group: str,
     inconsistent_axes: list[AxisWithSummary],
 ) -> Finding:
-    result, summary = max(
+    worst_axis, summary = max(
         inconsistent_axes,
         key=lambda axis: (axis[0] is analysis.main, abs(np.log(axis[1].nis_mean))),
     )
-    is_underconfident, sigma_factor = summary.sigma_ratio < 1.0, summary.sigma_error_factor
-    severity: Severity = "error" if sigma_factor >= MIN_SIGMA_FACTOR_FOR_ERROR else "warning"
-    if _has_default_noises(analysis, filter_name, result):
+    is_underconfident, sigma_error_factor = summary.sigma_ratio < 1.0, summary.sigma_error_factor
+    severity: Severity = "error" if sigma_error_factor >= MIN_SIGMA_FACTOR_FOR_ERROR else "warning"
+    if _has_default_noises(analysis, filter_name, worst_axis):
         severity = lower_severity(severity)
-    axis_tuning = find_axis_tuning(analysis.tuning, result.axis.name)
+    axis_tuning = find_axis_tuning(analysis.tuning, worst_axis.axis.name)
     verdict = "underconfident" if is_underconfident else "overconfident"
     if is_underconfident and analysis.source.origin.may_drift:
-        severity, remedy_text, cause = "note", KEEP_NOISE_ACTION_DRIFT, OTHER_CAUSE
+        severity, remedy_text, cause = "note", KEEP_NOISE_ACTION_DRIFT, UNKNOWN_CAUSE
     elif is_underconfident and analysis.source.origin.is_gnss:
-        is_barometer = analysis.source.aid(result.axis.name) == BAROMETER
+        is_barometer = analysis.source.aid(worst_axis.axis.name) == BAROMETER
         remedy_text = (
             _format_excessive_noise(analysis) if filter_name == "ekf2" and not is_barometer else ""
         )
-        cause = NOISE_CAUSE if remedy_text else OTHER_CAUSE
+        cause = MEASUREMENT_NOISE_CAUSE if remedy_text else UNKNOWN_CAUSE
         keep_noise_action = KEEP_NOISE_ACTION_CORRELATED.format(
             sensor="a barometer" if is_barometer else "GNSS"
         )
@@ -320,27 +320,27 @@ def _make_variance_finding(
         and filter_name == "ekf2"
         and (minimum_text := _format_noise_minimum(analysis))
     ):
-        severity, remedy_text, cause = "note", minimum_text, OTHER_CAUSE
+        severity, remedy_text, cause = "note", minimum_text, UNKNOWN_CAUSE
     elif is_underconfident and any(
         filter_with_error == filter_name for filter_with_error, *_ in find_hidden_errors(analysis)
     ):
-        remedy_text, cause = KEEP_NOISE_ACTION_TRUTH, OTHER_CAUSE
+        remedy_text, cause = KEEP_NOISE_ACTION_TRUTH, UNKNOWN_CAUSE
     else:
-        rerun = find_cause_trial(analysis.trials, filter_name, result.axis.name)
+        rerun = find_cause_trial(analysis.trials, filter_name, worst_axis.axis.name)
         cause = classify_cause(analysis, rerun)
-        remedy_text = _find_variance_remedy(analysis, filter_name, result, axis_tuning, rerun)
+        remedy_text = _find_variance_remedy(analysis, filter_name, worst_axis, axis_tuning, rerun)
         severity = "note" if remedy_text == KEEP_NOISE_ACTION_TRUTH else severity
     low, high = summary.nis_band
     return finding(
         severity,
         f"{filter_name}_{verdict}",
-        f"{FILTER_NAMES[filter_name]} is {verdict} along {result.axis.label}: σ is "
-        f"{format_ratio(sigma_factor)} times too {'large' if is_underconfident else 'small'}. The "
-        f"mean NIS of this {axis_group} axis is {format_number(summary.nis_mean)}, expected "
-        f"{low:.2f} to {high:.2f}.",
+        f"{FILTER_NAMES[filter_name]} is {verdict} along {worst_axis.axis.label}: σ is "
+        f"{format_ratio(sigma_error_factor)} times too "
+        f"{'large' if is_underconfident else 'small'}. The mean NIS of this {axis_group} axis is "
+        f"{format_number(summary.nis_mean)}, expected {low:.2f} to {high:.2f}.",
         remedy_text,
         {
-            "axis": result.axis.name,
+            "axis": worst_axis.axis.name,
             "sigma_ratio": summary.sigma_ratio,
             "nis_mean": summary.nis_mean,
             "fraction_outside_gate": summary.fraction_outside_gate,
@@ -394,12 +394,12 @@ def _has_default_noises(
         )
     noise_parameter = find_aid(analysis, result.axis.name).noise
     log = analysis.flight.log
-    default = log.default_of(noise_parameter)
-    is_parameter_default = log.parameters.get(noise_parameter, default) == default
-    # An R far from the parameter is a variance that the sender reports: not PX4's default
-    return is_parameter_default and not abs(np.log(find_ekf2_noise_m(result) / default)) > np.log(
-        NOISE_RATIO_TOLERANCE
-    )
+    default_noise = log.default_of(noise_parameter)
+    is_parameter_default = log.parameters.get(noise_parameter, default_noise) == default_noise
+    # If R differs from the parameter, EKF2 uses the variance that the source reports, not a default
+    return is_parameter_default and not abs(
+        np.log(find_ekf2_noise_m(result) / default_noise)
+    ) > np.log(NOISE_RATIO_TOLERANCE)
 
 
 def _find_variance_remedy(
@@ -425,15 +425,15 @@ def _find_remedy_without_replay(
     analysis: Analysis, result: AxisComparison, axis_tuning: AxisTuning
 ) -> str:
     aid, noise = find_aid(analysis, result.axis.name), axis_tuning.sigma_z
-    summary = result.filters["ekf2"]
-    assert not isinstance(summary, Unavailable)
+    ekf2_summary = result.filters["ekf2"]
+    assert not isinstance(ekf2_summary, Unavailable)
     if not (estimated_noise_m := noise.value or noise.high):
         return UNEXPLAINED_SIGMA_ACTION
     noise_m, used_noise_m = max(estimated_noise_m, EKF2_MIN_NOISE_M), find_ekf2_noise_m(result)
-    ratio = used_noise_m / noise_m if summary.sigma_ratio < 1.0 else noise_m / used_noise_m
+    ratio = used_noise_m / noise_m if ekf2_summary.sigma_ratio < 1.0 else noise_m / used_noise_m
     if ratio > NOISE_RATIO_TOLERANCE:
         parameters = analysis.flight.log.parameters
-        uses_reported_noise = used_noise_m > MIN_REPORTED_NOISE_RATIO * parameters.get(
+        uses_reported_noise = used_noise_m > MIN_USED_TO_SET_NOISE_RATIO * parameters.get(
             aid.noise, np.inf
         )
         changes = {

@@ -15,7 +15,7 @@ from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, PARAMETERS
 from px4fuse.flight.model import Ekf2, Unavailable
 
 # A parameter change has an effect if σ ratio or position RMSE change by at least this factor
-MIN_EFFECT_FACTOR = 1.5
+MIN_EFFECTIVE_CHANGE_FACTOR = 1.5
 
 
 class SpanConsistency(NamedTuple):
@@ -24,7 +24,7 @@ class SpanConsistency(NamedTuple):
     Unknown values are NaN or "".
     """
 
-    verdict: str
+    verdict_text: str
     sigma_ratio: float
     rmse_m: float
 
@@ -41,26 +41,31 @@ def detect(analysis: Analysis) -> Findings:
     ]
     span_edges_s = [segment.start_s, *(change.time_s for change in changes), segment.end_s]
     for change_index, (time_s, name, before, after) in enumerate(changes):
-        span_before, span_after = (
+        consistency_before, consistency_after = (
             _assess_span(analysis, *span_edges_s[span_index : span_index + 2])
             for span_index in (change_index, change_index + 1)
         )
         unit = "" if name in fusion_parameters else f" {PARAMETERS[name].printed_unit}".rstrip()
         effect_sentences, has_effect = "", name in fusion_parameters
-        if span_before.verdict and span_after.verdict:
-            verdicts = {span.verdict.partition(" ")[0] for span in (span_before, span_after)}
+        if consistency_before.verdict_text and consistency_after.verdict_text:
+            verdicts = {
+                span.verdict_text.partition(" ")[0]
+                for span in (consistency_before, consistency_after)
+            }
             has_effect |= len(verdicts) > 1
-            has_effect |= _differ_significantly(span_before.sigma_ratio, span_after.sigma_ratio)
-            effect_sentences = (
-                f" EKF2 is {span_before.verdict} before the change and "
-                f"{span_after.verdict} after it (innovations along the main axis)."
+            has_effect |= _differ_significantly(
+                consistency_before.sigma_ratio, consistency_after.sigma_ratio
             )
-        if _differ_significantly(span_before.rmse_m, span_after.rmse_m):
+            effect_sentences = (
+                f" EKF2 is {consistency_before.verdict_text} before the change and "
+                f"{consistency_after.verdict_text} after it (innovations along the main axis)."
+            )
+        if _differ_significantly(consistency_before.rmse_m, consistency_after.rmse_m):
             has_effect = True
             effect_sentences += (
                 " EKF2's position RMSE along the main axis is "
-                f"{format_metres(span_before.rmse_m)} m before the change and "
-                f"{format_metres(span_after.rmse_m)} m after it."
+                f"{format_metres(consistency_before.rmse_m)} m before the change and "
+                f"{format_metres(consistency_after.rmse_m)} m after it."
             )
         action = (
             "Analyse the flight before and after the change separately "
@@ -79,29 +84,31 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def _differ_significantly(before: float, after: float) -> bool:
-    """Return True if both values are known and differ by more than the factor MIN_EFFECT_FACTOR."""
+    """Return True if both values are known and the change is large enough for an effect."""
     return (
-        before > 0.0 and after > 0.0 and abs(math.log(after / before)) > math.log(MIN_EFFECT_FACTOR)
+        before > 0.0
+        and after > 0.0
+        and abs(math.log(after / before)) > math.log(MIN_EFFECTIVE_CHANGE_FACTOR)
     )
 
 
 def _assess_span(analysis: Analysis, start_s: float, end_s: float) -> SpanConsistency:
-    unknown, rmse_m = float("nan"), float("nan")
+    rmse_m = math.nan
     errors = compute_position_errors(analysis.main, "ekf2")
     if not isinstance(errors, Unavailable):
         rmse_m = float(np.sqrt((errors["error_m"].loc[start_s:end_s] ** 2).mean()))
     innovations = analysis.main.ekf2_innovations
     if isinstance(innovations, Unavailable):
-        return SpanConsistency("", unknown, rmse_m)
+        return SpanConsistency("", math.nan, rmse_m)
     samples = innovations[(innovations.index >= start_s) & (innovations.index < end_s)]
     consistency = assess_innovations(
         samples["innovation_m"].to_numpy(), samples["innovation_variance_m2"].to_numpy(), math.inf
     )
     if isinstance(consistency, Unavailable):
-        return SpanConsistency("", unknown, rmse_m)
-    direction = "small" if consistency.sigma_ratio > 1.0 else "large"
+        return SpanConsistency("", math.nan, rmse_m)
+    size_word = "small" if consistency.sigma_ratio > 1.0 else "large"
     factor = format_ratio(consistency.sigma_error_factor)
-    verdict = f"{consistency.verdict} (σ {factor} times too {direction})"
+    verdict_text = f"{consistency.verdict} (σ {factor} times too {size_word})"
     if consistency.verdict == "consistent":
-        verdict = consistency.verdict
-    return SpanConsistency(verdict, consistency.sigma_ratio, rmse_m)
+        verdict_text = consistency.verdict
+    return SpanConsistency(verdict_text, consistency.sigma_ratio, rmse_m)

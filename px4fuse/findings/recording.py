@@ -68,10 +68,12 @@ def detect_lost_data(flight: Flight) -> Findings:
             {"lost_bytes": log.bytes - log.bytes_read, "ends_in_flight": float(log.ends_in_flight)},
         )
     for topic, count in list(log.dropped.items())[:1]:
-        other_count = len(log.dropped) - 1
-        topics = "topic" if other_count == 1 else "topics"
+        other_topic_count = len(log.dropped) - 1
+        topics = "topic" if other_topic_count == 1 else "topics"
         other_topics_sentence = (
-            f" {other_count} other {topics} also contain wrong timestamps." if other_count else ""
+            f" {other_topic_count} other {topics} also contain wrong timestamps."
+            if other_topic_count
+            else ""
         )
         yield note(
             "samples_out_of_order",
@@ -79,7 +81,7 @@ def detect_lost_data(flight: Flight) -> Findings:
             f"before. px4fuse ignores these samples.{other_topics_sentence} Possible cause: a "
             "clock was set back, or messages arrived in another order.",
             "Synchronise the clock of the sending computer before take-off (TIMESYNC).",
-            {"notes": other_count + 1},
+            {"notes": other_topic_count + 1},
         )
 
 
@@ -106,7 +108,7 @@ def detect_decreasing_clocks(flight: Flight) -> Findings:
 
 
 def detect_other_estimators(analysis: Analysis) -> Findings:
-    """Detect an estimator that is not PX4's EKF2, and missing innovations."""
+    """Detect estimates that are not from PX4's EKF2, and MAVLink logs, which lack innovations."""
     log, ekf2 = analysis.flight.log, analysis.flight.ekf2
     if SIMULATED_EKF2_NOTE in log.notes:
         yield note(

@@ -10,13 +10,13 @@ from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.findings.cause_text import format_shift
 from px4fuse.findings.model import Findings, error, finding, warning
 from px4fuse.findings.source_positions import find_low_pass
-from px4fuse.findings.source_stamps import find_synchronisation
+from px4fuse.findings.source_stamps import find_timesync_convergence
 from px4fuse.flight.ekf2_parameters import GNSS_POS, RECEIVER_DELAY_PARAMETERS
 from px4fuse.flight.model import Unavailable
 
-# Minimum time offset (s) for severity error: a position error of 0.1 m at 1 m/s
+# Minimum time offset (s), for severity "error": a position error of 0.1 m at 1 m/s
 MIN_OFFSET_FOR_ERROR_S = 0.10
-# Maximum position RMSE of KF with a corrected time offset / RMSE without correction, for a finding
+# A time offset is not reported if its correction increases KF's position RMSE by a larger ratio
 MAX_RMSE_RATIO = 1.005
 CORRECT_AT_SENDER_ACTION = "Correct the position timestamps before sending."
 
@@ -28,12 +28,12 @@ def detect(analysis: Analysis) -> Findings:
         and time_offset.is_determinable
         and not is_reconstructed
     ):
-        yield from detect_offset(analysis, time_offset)
+        yield from detect_time_offset(analysis, time_offset)
         yield from detect_wrong_delay(analysis, time_offset)
     yield from detect_wrong_gnss_delay(analysis)
 
 
-def detect_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings:
+def detect_time_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings:
     if find_low_pass(analysis) is not None:  # a low-pass filter delays positions, not timestamps
         return
     interval_low_s, interval_high_s = time_offset.interval_s
@@ -48,8 +48,8 @@ def detect_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings:
             "source_time_offset_changes",
             f"The time offset of the positions changes in flight from {start_offset_s:+.2f} s to "
             f"{end_offset_s:+.2f} s (significance test: p {time_offset.change_p_value:.1g}). No "
-            "single --clock-offset corrects both. Possible cause: PX4 uses arrival times until 500 "
-            "TIMESYNC answers have synchronised the clocks.",
+            "single --clock-offset corrects the whole flight. Possible cause: PX4 uses arrival "
+            "times until 500 TIMESYNC answers have synchronised the clocks.",
             "Let the clocks synchronise for one minute before take-off. Analyse only the time "
             "before or after the change of the offset (--start, --end).",
             {**evidence, "change_p_value": time_offset.change_p_value},
@@ -59,7 +59,7 @@ def detect_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings:
     # If timestamps are arrival times in a part of the flight, one offset cannot correct them
     if (
         not time_offset.is_significant(time_offset.remaining_s)
-        or find_synchronisation(analysis) is not None
+        or find_timesync_convergence(analysis) is not None
         or _compute_rmse_ratio(_find_trial(analysis, "kf", "time offset")) > MAX_RMSE_RATIO
     ):
         return
@@ -67,14 +67,16 @@ def detect_offset(analysis: Analysis, time_offset: ClockOffset) -> Findings:
         (interval_low_s - time_offset.applied_s, interval_high_s - time_offset.applied_s),
         time_offset.remaining_s < 0,
     )
-    lower_s, upper_s = (-interval_s[1], -interval_s[0]) if has_late_timestamps else interval_s
+    offset_low_s, offset_high_s = (
+        (-interval_s[1], -interval_s[0]) if has_late_timestamps else interval_s
+    )
     yield finding(
         "error" if abs_offset_s > MIN_OFFSET_FOR_ERROR_S else "warning",
         "source_time_offset",
         f"Position timestamps are {abs_offset_s:.2f} s {'late' if has_late_timestamps else 'early'}"
-        f". The estimate from IMU and positions is {abs_offset_s:.3f} s (95 % {lower_s:.3f} to "
-        f"{upper_s:.3f} s). At 1 m/s this is a position error of {abs_offset_s:.2f} m in KF and "
-        "EKF2. Innovations hardly show this "
+        f". The estimate from IMU and positions is {abs_offset_s:.3f} s (95 % {offset_low_s:.3f} "
+        f"to {offset_high_s:.3f} s). At 1 m/s this is a position error of {abs_offset_s:.2f} m in "
+        "KF and EKF2. Innovations hardly show this "
         f"error.{_format_assumed_delay(analysis, time_offset)}",
         _find_offset_remedy(analysis, time_offset),
         evidence,
@@ -121,21 +123,24 @@ def _find_offset_remedy(analysis: Analysis, time_offset: ClockOffset) -> str:
     if delay_parameter := _find_receiver_delay_parameter(analysis):
         return f"Check the delay of the GNSS receiver ({delay_parameter})."
     if analysis.source.alignment is not None:
-        total_offset_s = clock_offset_option_s(analysis, time_offset)
+        total_offset_s = compute_clock_offset_option_s(analysis, time_offset)
         return f"Run again with --clock-offset {total_offset_s:.3f}."
-    age_ms = (remedy.find_logged_delay_ms(analysis) or 0.0) - 1e3 * time_offset.remaining_s
-    horizon_parameters = remedy.make_delay_max_change(analysis.flight.log.parameters, age_ms)
+    position_age_ms = (remedy.find_logged_delay_ms(analysis) or 0.0) - 1e3 * time_offset.remaining_s
+    horizon_parameters = remedy.make_delay_max_change(
+        analysis.flight.log.parameters, position_age_ms
+    )
     delay_action = (
         f", and set {remedy.format_settings(horizon_parameters)}" if horizon_parameters else ""
     )
-    shift_text = format_shift(time_offset.remaining_s)
-    return f"{shift_text} the timestamp of each position{delay_action}."
+    shift_action = format_shift(time_offset.remaining_s)
+    return f"{shift_action} the timestamp of each position{delay_action}."
 
 
-def clock_offset_option_s(comparison: PreparedComparison, time_offset: ClockOffset) -> float:
+def compute_clock_offset_option_s(
+    comparison: PreparedComparison, time_offset: ClockOffset
+) -> float:
     """Return the value (s) of ``--clock-offset`` that corrects a time offset."""
-    # --clock-offset is the total offset of a position file, including that which its alignment
-    # already applied
+    # --clock-offset replaces the offset that the alignment of a position file found and applied
     alignment = comparison.source.alignment
     return time_offset.offset_s + (0.0 if alignment is None else alignment.clock_offset_s)
 
@@ -149,13 +154,13 @@ def detect_wrong_delay(analysis: Analysis, time_offset: ClockOffset) -> Findings
         or remedy.estimate_delay_if_wrong_ms(analysis, time_offset, delay_ms) is None
     ):
         return
-    low_ms, high_ms = (-1e3 * end_s for end_s in reversed(time_offset.interval_s))
+    delay_low_ms, delay_high_ms = (-1e3 * end_s for end_s in reversed(time_offset.interval_s))
     interval_low_ms, interval_high_ms, abs_delay_ms = (
-        round(low_ms),
-        round(high_ms),
+        round(delay_low_ms),
+        round(delay_high_ms),
         round(abs(estimated_delay_ms)),
     )
-    if low_ms <= 0.0 <= high_ms:
+    if delay_low_ms <= 0.0 <= delay_high_ms:
         delay_text = "the positions have no significant delay"
     elif estimated_delay_ms < 0.0:
         delay_text, interval_low_ms, interval_high_ms = (

@@ -25,15 +25,15 @@ from px4fuse.convention.texts import (
 )
 from px4fuse.finding import Finding
 from px4fuse.findings.cause_grouping import CONVENTION_KEY, RESET_TIME_KEY
-from px4fuse.findings.model import CATALOGUE, Findings, error, warning
+from px4fuse.findings.model import FINDING_CATALOGUE, Findings, error, warning
 from px4fuse.flight.model import PositionTrack, positions_phrase, source_name
 
 # Groups of findings that are valid even if all positions are wrong
 POSITION_INDEPENDENT_GROUPS = ("logging", "IMU")
 
 
-# Fault of the convention (axes, unit, clock or orientation): id of the finding, kind (the value of
-# CONVENTION_KEY in its evidence), message, and action
+# Wrong axes, unit, clock or orientation: (id of the finding, kind of the fault, which is the value
+# of CONVENTION_KEY in the evidence, message, action)
 ConventionFaultTexts = tuple[str, str, str, str]
 
 
@@ -45,8 +45,10 @@ def detect(analysis: Comparison) -> Findings:
         *_find_orientation_faults(convention.orientation, faults, source_name(analysis.source)),
         *_find_position_faults(convention, faults, analysis.source),
     ):
-        gain_nats = round(convention.log_likelihood_gain, 1)
-        evidence: dict[str, float | str] = {CONVENTION_KEY: kind, "log_likelihood": gain_nats}
+        evidence: dict[str, float | str] = {
+            CONVENTION_KEY: kind,
+            "log_likelihood": round(convention.log_likelihood_gain, 1),
+        }
         if kind == "rotation":
             evidence["misalignment_deg"] = faults.rotation_deg
         make_finding = warning if kind in ("copied", "ambiguous") else error
@@ -60,7 +62,7 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
     """
     faults = _find_convention_faults(analysis)
     cause_findings = [item for item in findings if CONVENTION_KEY in item.evidence]
-    unusable_findings = [item for item in findings if CATALOGUE[item.id].role == "unusable"]
+    unusable_findings = [item for item in findings if FINDING_CATALOGUE[item.id].role == "unusable"]
     if unusable_findings:
         cause_findings = unusable_findings
         findings = [
@@ -69,7 +71,7 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
             if item in unusable_findings
             or _is_convention_effect(item)
             or (
-                CATALOGUE[item.id].group in POSITION_INDEPENDENT_GROUPS
+                FINDING_CATALOGUE[item.id].group in POSITION_INDEPENDENT_GROUPS
                 and item.id != "accelerometer_bias"
             )
         ]
@@ -78,7 +80,7 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
     cause_findings += [
         item
         for item in findings
-        if CATALOGUE[item.id].role == "misleading" or RESET_TIME_KEY in item.evidence
+        if FINDING_CATALOGUE[item.id].role == "misleading" or RESET_TIME_KEY in item.evidence
     ]
     if not cause_findings:
         return [*findings]
@@ -86,7 +88,7 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
         item
         for item in findings
         if item not in cause_findings
-        and CATALOGUE[item.id].after_wrong_convention != "withdrawn"
+        and FINDING_CATALOGUE[item.id].after_wrong_convention != "withdrawn"
         # a drifting clock has no constant time offset
         and not (faults.clock_drift and item.id == "source_time_offset")
     ]
@@ -99,21 +101,21 @@ def remove_convention_effects(analysis: Comparison, findings: Sequence[Finding])
                 if _is_convention_effect(item) or item.severity == "note"
             ),
         ]
-    effects = [
+    effect_findings = [
         replace(item, message=f"{item.title}.", caused_by=cause_findings[0].id)
         for item in other_findings
         if _is_convention_effect(item) and item.caused_by is None
     ]
     return [
         cause_findings[0],
-        *effects,
+        *effect_findings,
         *cause_findings[1:],
         *(item for item in other_findings if not _is_convention_effect(item)),
     ]
 
 
 def _is_convention_effect(item: Finding) -> bool:
-    return CATALOGUE[item.id].after_wrong_convention == "effect"
+    return FINDING_CATALOGUE[item.id].after_wrong_convention == "effect"
 
 
 def _find_convention_faults(analysis: Comparison) -> ConventionFaults:
@@ -124,16 +126,20 @@ def _find_position_faults(
     convention: Convention, faults: ConventionFaults, source: PositionTrack
 ) -> Iterator[ConventionFaultTexts]:
     positions_text, alignment = positions_phrase(source), source.alignment
-    is_file = alignment is not None
+    is_position_file = alignment is not None
     log_odds = 99.0 if convention.log_odds is None else min(convention.log_odds, 99.0)
-    basis_text = (
+    evidence_sentence = (
         "Of all tested axes, units and time offsets, these fit the IMU best (log likelihood ratio "
         f"to the second best {'above ' if log_odds == 99.0 else ''}{log_odds:.0f} nats)."
     )
     stated_frame = alignment.frame.upper() if alignment else "NED"
-    axes, turn_deg = find_true_axes(convention.axes, stated_frame), faults.rotation_deg
-    is_frame_choice = is_file and abs(convention.rotation_deg) <= MIN_RESIDUAL_ROTATION_DEG
-    if faults.has_wrong_axes or (turn_deg and is_frame_choice and axes in FRAME_AXES.values()):
+    axes, rotation_deg = find_true_axes(convention.axes, stated_frame), faults.rotation_deg
+    is_rotation_of_file_frame = (
+        is_position_file and abs(convention.rotation_deg) <= MIN_RESIDUAL_ROTATION_DEG
+    )
+    if faults.has_wrong_axes or (
+        rotation_deg and is_rotation_of_file_frame and axes in FRAME_AXES.values()
+    ):
         orientation = convention.orientation
         frame_sentence = "The analysis uses the positions converted to NED."
         if faults.is_north_unknown and orientation and axes not in FRAME_AXES.values():
@@ -141,47 +147,52 @@ def _find_position_faults(
             frame_sentence = (
                 "EKF2 took its heading from this source, so nothing shows the direction of north."
             )
-        fault, action = describe_axes(
-            axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=is_file
+        fault_text, action = describe_axes(
+            axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=is_position_file
         )
-        if faults.has_wrong_axes and turn_deg:
-            fault += f", rotated by {turn_deg:+.0f}° (clockwise from above)"
+        if faults.has_wrong_axes and rotation_deg:
+            fault_text += f", and rotated by {rotation_deg:+.0f}° (clockwise from above)"
         if orientation and orientation.frames.startswith("FLU"):
             action += f" {describe_conversion(orientation.frames)}"
-        yield "source_axes_wrong", "axes", f"{fault}. {basis_text} {frame_sentence}", action
-    elif turn_deg:
-        heading_text = {
+        message = f"{fault_text}. {evidence_sentence} {frame_sentence}"
+        yield "source_axes_wrong", "axes", message, action
+    elif rotation_deg:
+        reference_text = {
             "EKF2": "EKF2's heading",
             "gyroscopes": "the heading at take-off",
             "GNSS": "the GNSS positions",
         }[convention.heading_from]
-        other_cause = "." if convention.heading_from == "GNSS" else f", or {heading_text} is wrong."
+        other_cause = (
+            "." if convention.heading_from == "GNSS" else f", or {reference_text} is wrong."
+        )
         message = (
-            f"{positions_text} are rotated by {turn_deg:+.0f}° (clockwise from above) "
-            f"relative to {heading_text}. The x axis of the source does not point north"
-            f"{other_cause} {basis_text} The analysis uses the positions rotated to NED."
+            f"{positions_text} are rotated by {rotation_deg:+.0f}° (clockwise from above) "
+            f"relative to {reference_text}. The x axis of the source does not point north"
+            f"{other_cause} {evidence_sentence} The analysis uses the positions rotated to NED."
         )
         action = (
             "Align the frame of the positioning system with north, or rotate positions and "
-            f"orientation by {-turn_deg:+.0f}° before sending."
+            f"orientation by {-rotation_deg:+.0f}° before sending."
         )
-        if is_file:
+        if is_position_file:
             action = "Run again with --position-yaw auto."
         yield "source_frame_misaligned", "rotation", message, action
     if faults.has_wrong_unit:
-        fault, action = describe_unit(convention.unit, positions_text, is_file=is_file)
+        fault_text, action = describe_unit(
+            convention.unit, positions_text, is_file=is_position_file
+        )
         distance_ratio = convention.scale / UNIT_SIZES_M[convention.unit]
         message = (
-            f"{fault}. Distances are {distance_ratio:.3g} times those that the IMU measures. "
-            f"{basis_text} The analysis uses the positions in metres."
+            f"{fault_text}. Distances are {distance_ratio:.3g} times those that the IMU measures. "
+            f"{evidence_sentence} The analysis uses the positions in metres."
         )
         yield "source_unit_wrong", "unit", message, action
-    late_s, drift_percent = convention.late_s, 100.0 * faults.clock_drift
-    if drift_percent:
+    late_s, clock_drift_percent = convention.late_s, 100.0 * faults.clock_drift
+    if clock_drift_percent:
         message = (
-            f"The clock of the position timestamps is {abs(drift_percent):.1f} % too "
-            f"{'fast' if drift_percent > 0 else 'slow'}. In the middle of the flight the "
-            f"timestamps are {late_s:+.2f} s late. {basis_text} The analysis uses corrected "
+            f"The clock of the position timestamps is {abs(clock_drift_percent):.1f} % too "
+            f"{'fast' if clock_drift_percent > 0 else 'slow'}. In the middle of the flight the "
+            f"timestamps are {late_s:+.2f} s late. {evidence_sentence} The analysis uses corrected "
             "timestamps."
         )
         action = (
@@ -192,13 +203,13 @@ def _find_position_faults(
     elif faults.late_s:
         message = (
             f"Position timestamps are {abs(late_s):.2f} s {'late' if late_s > 0 else 'early'}. "
-            f"{basis_text} The analysis uses corrected timestamps."
+            f"{evidence_sentence} The analysis uses corrected timestamps."
         )
         action = (
             "Synchronise the clocks (TIMESYNC; uXRCE-DDS: UXRCE_DDS_SYNCT 1) and set the timestamp "
             "at the time of measurement."
         )
-        if is_file:
+        if is_position_file:
             action = "Run again with --clock-offset auto."
         yield "source_time_offset", "time offset", message, action
     if faults.is_ambiguous:
@@ -233,7 +244,7 @@ def _find_orientation_faults(
         "the roll and pitch of the source agree with the autopilot (median difference "
         f"{orientation.tilt_difference_deg:.1f}°)"
     )
-    fault, action = {
+    fault_text, action = {
         "order": (
             f"The quaternion of {source} is sent in the order x, y, z, w, but PX4 reads w, x, y, "
             f"z. After a correction of the order, {agreement_text}",
@@ -253,6 +264,8 @@ def _find_orientation_faults(
             "heading, which is zero at east.",
         ),
     }[faults.orientation]
-    message = f"{fault}. If EKF2 fuses the yaw of this orientation, EKF2's heading becomes wrong."
-    action += " Until then do not fuse the yaw (EKF2_EV_CTRL bit 3)."
+    message = (
+        f"{fault_text}. If EKF2 fuses the yaw of this orientation, EKF2's heading becomes wrong."
+    )
+    action += " Until the orientation is correct, do not fuse the yaw (EKF2_EV_CTRL bit 3)."
     yield "source_orientation_wrong", faults.orientation, message, action

@@ -13,8 +13,8 @@ from px4fuse.findings.ekf2_noise import find_confirmed_noise_trial
 from px4fuse.findings.ekf2_not_fusing import FUSED_FRACTION_FOR_ERROR
 from px4fuse.findings.model import (
     Findings,
+    compute_flag_fraction,
     finding,
-    fraction_of_ones,
     magnetometer_advice,
     note,
     warning,
@@ -36,22 +36,22 @@ from px4fuse.trajectory.rotation import interpolate
 MIN_MISALIGNMENT_SIGMAS = 4.0
 # Minimum yaw misalignment (°) for a finding: magnetic headings of real flights are wrong by 3 to 4°
 MIN_HEADING_ERROR_DEG = 5.0
-# Minimum yaw misalignment (°) for severity error: 26 % of the motion appears on the other axis
+# Minimum yaw misalignment (°), for severity "error": 26 % of the motion appears on the other axis
 MIN_SEVERE_HEADING_ERROR_DEG = 15.0
-# Minimum ratio of the drift of EKF2's heading against ground truth to that against the positions.
-# Below this ratio, the frame of the positions drifts, not EKF2's heading
-MIN_TRUE_TO_ESTIMATED_DRIFT = 0.5
+# If EKF2's heading drifts relative to the positions, but its drift relative to ground truth is less
+# than this fraction of that drift, the frame of the positions drifts, not EKF2's heading
+MIN_TRUE_DRIFT_RATIO = 0.5
 # Topic of the positions that EKF2 rotated into the frame of its state (EKF2.cpp)
-ALIGNED_TOPIC = "estimator_visual_odometry_aligned"
+ALIGNED_VISION_TOPIC = "estimator_visual_odometry_aligned"
 CHECK_GNSS_DELAY_ACTION = "Check EKF2_GPS_DELAY: a wrong delay also causes a heading error."
 
 
 def detect(analysis: Analysis) -> Findings:
     if analysis.source.frame == "FRD":
         yield make_frame_finding(analysis)
-    heading = analysis.heading
-    if isinstance(heading, HeadingError) and not analysis.source.origin.reconstructed:
-        yield from detect_misalignment(analysis, heading)
+    heading_error = analysis.heading
+    if isinstance(heading_error, HeadingError) and not analysis.source.origin.reconstructed:
+        yield from detect_misalignment(analysis, heading_error)
     yield from detect_uncertain_alignment(analysis)
 
 
@@ -71,9 +71,11 @@ def make_frame_finding(analysis: Analysis) -> Finding:
             action += " Give the ULog of this flight as well: it shows the frame that EKF2 uses."
     elif (
         fusion_flags is not None
-        and fraction_of_ones(fusion_flags["yaw"], analysis.segment) > FUSED_FRACTION_FOR_ERROR
+        and compute_flag_fraction(fusion_flags["yaw"], analysis.segment) > FUSED_FRACTION_FOR_ERROR
     ):
-        fusion_sentence = f"EKF2 fused the yaw of {sensor_name}, so EKF2 has the same axes."
+        fusion_sentence = (
+            f"EKF2 fused the yaw of {sensor_name}, so EKF2's axes are those of {sensor_name}."
+        )
     has_yaw = analysis.source.orientation is not None
     if fusion_sentence:
         return note("source_frame_frd", f"{fault} {fusion_sentence}", action)
@@ -86,12 +88,15 @@ def make_frame_finding(analysis: Analysis) -> Finding:
     )
 
 
-def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
+def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Findings:
     """Detect a yaw misalignment between positions and IMU."""
-    rotation_deg, sigma_deg = math.remainder(heading.misalignment_deg, 360.0), heading.sigma_deg
-    if heading.drifts:
-        if not _is_drift_refuted(analysis.flight, heading):
-            yield _make_heading_drift_finding(analysis, heading)
+    rotation_deg, sigma_deg = (
+        math.remainder(heading_error.misalignment_deg, 360.0),
+        heading_error.sigma_deg,
+    )
+    if heading_error.drifts:
+        if not _is_drift_refuted(analysis.flight, heading_error):
+            yield _make_heading_drift_finding(analysis, heading_error)
         return
     systematic_errors = analysis.systematic_errors
     is_explained_by_bias = (
@@ -107,12 +112,14 @@ def detect_misalignment(analysis: Analysis, heading: HeadingError) -> Findings:
     positions_text = positions_phrase(analysis.source)
     finding_id, reference = "ekf2_heading_error", "EKF2's heading"
     if analysis.source.origin.is_gnss:
-        reason = "GNSS positions refer to true north, so EKF2's heading is wrong."
-        _, action = _explain_gnss_heading_error(analysis)
-    elif analysis.source.name == ALIGNED_TOPIC:
         reason = (
-            "EKF2 fused the positions in the frame of its state, but the IMU measures motion in "
-            "another direction."
+            "GNSS positions refer to true north, so the rotation is an error of EKF2's heading."
+        )
+        _, action = _explain_gnss_heading_error(analysis)
+    elif analysis.source.name == ALIGNED_VISION_TOPIC:
+        reason = (
+            "EKF2 had rotated these positions into its own frame, but the IMU measures the motion "
+            "in another direction."
         )
         action = "Align the positioning frame with north."
     else:
@@ -151,7 +158,7 @@ def _explain_gnss_heading_error(analysis: Analysis) -> tuple[str, str]:
     return cause, f"{advice} {CHECK_GNSS_DELAY_ACTION}".lstrip()
 
 
-def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
+def _is_drift_refuted(flight: Flight, heading_error: HeadingError) -> bool:
     truth, attitude = flight.truth, flight.attitude
     if (
         isinstance(truth, Unavailable)
@@ -159,25 +166,30 @@ def _is_drift_refuted(flight: Flight, heading: HeadingError) -> bool:
         or isinstance(attitude, Unavailable)
     ):
         return False
-    errors_deg, (first_part, last_part) = [], heading.find_extreme_parts()
+    heading_errors_deg, (first_part, last_part) = [], heading_error.find_extreme_parts()
     for part in (first_part, last_part):
         samples = rows_between(attitude, part.start_s, part.end_s)[Columns.QUATERNION]
         true_attitude = interpolate(
             samples.index.to_numpy(), truth.attitude.index.to_numpy(), truth.attitude.to_numpy()
         )
         error_rad = heading_of(samples.to_numpy()) - heading_of(true_attitude)
-        wrapped_rad = np.arctan2(np.sin(error_rad), np.cos(error_rad))
-        errors_deg.append(float(np.degrees(np.median(wrapped_rad))))
+        wrapped_error_rad = np.arctan2(np.sin(error_rad), np.cos(error_rad))
+        heading_errors_deg.append(float(np.degrees(np.median(wrapped_error_rad))))
     heading_change_deg = abs(last_part.heading_error_deg - first_part.heading_error_deg)
-    return abs(errors_deg[1] - errors_deg[0]) < MIN_TRUE_TO_ESTIMATED_DRIFT * heading_change_deg
+    return (
+        abs(heading_errors_deg[1] - heading_errors_deg[0])
+        < MIN_TRUE_DRIFT_RATIO * heading_change_deg
+    )
 
 
-def _make_heading_drift_finding(analysis: Analysis, heading: HeadingError) -> Finding:
-    first_part, last_part = heading.find_extreme_parts()
-    errors_deg = [math.remainder(part.heading_error_deg, 360.0) for part in (first_part, last_part)]
+def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError) -> Finding:
+    first_part, last_part = heading_error.find_extreme_parts()
+    heading_errors_deg = [
+        math.remainder(part.heading_error_deg, 360.0) for part in (first_part, last_part)
+    ]
     heading_change_deg = last_part.heading_error_deg - first_part.heading_error_deg
     estimation_basis = "positions and IMU"
-    if heading.by == "orientation":
+    if heading_error.by == "orientation":
         estimation_basis = f"the orientation of {source_name(analysis.source)}"
     calibration_advice, has_yaw = (
         magnetometer_advice(analysis.flight),
@@ -201,18 +213,18 @@ def _make_heading_drift_finding(analysis: Analysis, heading: HeadingError) -> Fi
         "error" if abs(heading_change_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",
         "ekf2_heading_error",
         f"EKF2's heading drifts by {heading_change_deg:+.0f}° relative to the "
-        f"{positions_phrase(analysis.source)}. Its error is {errors_deg[0]:+.0f}° from "
-        f"{first_part.start_s:.0f} to {first_part.end_s:.0f} s and {errors_deg[1]:+.0f}° from "
-        f"{last_part.start_s:.0f} to {last_part.end_s:.0f} s (clockwise from above, estimated from "
-        f"{estimation_basis}). A constant rotation of the positions cannot correct this. Possible "
-        f"cause: {possible_cause}.",
+        f"{positions_phrase(analysis.source)}. Its error is {heading_errors_deg[0]:+.0f}° from "
+        f"{first_part.start_s:.0f} to {first_part.end_s:.0f} s and {heading_errors_deg[1]:+.0f}° "
+        f"from {last_part.start_s:.0f} to {last_part.end_s:.0f} s (clockwise from above, estimated "
+        f"from {estimation_basis}). A constant rotation of the positions cannot correct the drift. "
+        f"Possible cause: {possible_cause}.",
         f"{calibration_advice} {action}".strip() or "Check the heading source of EKF2.",
         {
             "from_deg": first_part.heading_error_deg,
             "to_deg": last_part.heading_error_deg,
             "from_s": first_part.start_s,
             "to_s": last_part.end_s,
-            "p": max(heading.drift_p, 1e-300),
+            "p": max(heading_error.drift_p, 1e-300),
         },
     )
 

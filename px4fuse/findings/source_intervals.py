@@ -27,21 +27,21 @@ from px4fuse.flight.model import ALIGNED_ORIGIN, Ekf2, Unavailable, positions_ph
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
 # Minimum fraction of lost positions for a finding: PX4 v1.14 and later loses 0.3 %
-MIN_LOST_FRACTION = 0.02
+MIN_LOST_POSITION_FRACTION = 0.02
 # Minimum number of intervals between positions to detect downsampling
-MIN_INTERVALS = 50
+MIN_INTERVAL_COUNT = 50
 # Minimum fraction of missing positions to report downsampling: a radio link loses fewer
 MIN_DOWNSAMPLED_FRACTION = 0.25
-# Intervals of downsampled positions are n or n + 1 periods of the source (30 Hz to 20 Hz: 1 or 2).
-# Minimum fraction of intervals of n or n + 1 periods, for a finding
+# Each interval of downsampled positions is n or n + 1 periods of the source: 1 or 2 if positions at
+# 30 Hz are downsampled to 20 Hz. Minimum fraction of intervals with one of these two lengths
 MIN_INTERVAL_PAIR_FRACTION = 0.85
-# Minimum fraction of intervals with the less frequent of both lengths, for a finding
-MIN_RARER_INTERVAL_FRACTION = 0.1
+# Minimum fraction of intervals with the rarer one of these two lengths
+MIN_RARER_LENGTH_FRACTION = 0.1
 # Intervals are multiples of a period if the RMS of (interval / period - nearest integer) is at most
 # this value: jitter causes 0.03, random intervals cause 0.29
 MAX_ROUNDING_RMS_ERROR = 0.06
-# Tested periods of the source are the median interval divided by 1 to this number
-MAX_PERIODS_PER_INTERVAL = 4
+# The tested periods of the source are median interval / n, with n from 1 to this number
+MAX_PERIODS_IN_MEDIAN_INTERVAL = 4
 # Minimum length (s) of a gap at the start or end of the flight for a finding: shorter gaps may be
 # errors of take-off and landing times, because the land detector is seconds late
 MIN_END_GAP_S = 3.0
@@ -62,7 +62,7 @@ def detect_source_gaps(analysis: Analysis) -> Findings:
     invalid_times_s = analysis.source.invalid.index
     for gap in analysis.events.gaps:
         if np.any((invalid_times_s > gap[0]) & (invalid_times_s < gap[1])):
-            continue  # source_values reports the invalid positions in this gap
+            continue  # source_values.py reports these invalid positions
         aids = _find_fused_aids(ekf2, gap)
         if source.origin.aid in aids and source.alignment is None:
             fused_gap_spans.append(gap)
@@ -113,7 +113,7 @@ def _make_partial_source_finding(
 ) -> Finding:
     (start_s, end_s), source = span_s, analysis.source
     is_source_stop = end_s == analysis.segment.flight.end_s
-    event_verb, event_s, before_or_after = (
+    event_verb, start_or_stop_s, before_or_after = (
         ("stop", start_s, "after") if is_source_stop else ("begin", end_s, "before")
     )
     action = "" if is_source_stop or source.alignment else " Take off only when positions arrive."
@@ -135,10 +135,12 @@ def _make_partial_source_finding(
     return finding(
         "error" if has_aids and not fused_aids and duration_s > MAX_NOT_FUSED_S else "warning",
         "source_stops" if is_source_stop else "source_begins",
-        f"{positions_phrase(source)} {event_verb} in flight at {event_s:.1f} s{effect_text}. "
-        f"{aiding_sentence}px4fuse evaluates KF and EKF2 only while positions arrive.",
-        f"Check {find_source_texts(source).reception} {before_or_after} {event_s:.1f} s.{action}",
-        {"at_s": event_s, "duration_s": duration_s, **ekf2_errors_at_end},
+        f"{positions_phrase(source)} {event_verb} in flight at {start_or_stop_s:.1f} "
+        f"s{effect_text}. {aiding_sentence}px4fuse evaluates KF and EKF2 only while positions "
+        "arrive.",
+        f"Check {find_source_texts(source).reception} {before_or_after} {start_or_stop_s:.1f} "
+        f"s.{action}",
+        {"at_s": start_or_stop_s, "duration_s": duration_s, **ekf2_errors_at_end},
         (span_s,),
     )
 
@@ -149,7 +151,7 @@ def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, floa
     The mapping does not contain unknown values.
     """
     axes = [analysis.axes[name] for name in ("north", "east") if name in analysis.axes]
-    squares_m2 = []
+    squared_errors_m2 = []
     for result in axes if len(axes) == 2 else [analysis.main]:
         tracks = result.with_flight_tracks()
         if isinstance(tracks.ekf2_state, Unavailable):
@@ -162,11 +164,11 @@ def _find_ekf2_errors_at_end(analysis: Analysis, span_s: Span) -> dict[str, floa
                 time_s, true_positions.index, true_positions, np.nan, np.nan
             )
         sigma_m = interpolate_sigma(time_s, tracks.ekf2_variance, "position_variance_m2")
-        squares_m2.append([(position_m - true_position_m) ** 2, sigma_m**2])
-    squared_sums_by_name = zip(("error_m", "sigma_m"), np.sum(squares_m2, axis=0), strict=True)
+        squared_errors_m2.append([(position_m - true_position_m) ** 2, sigma_m**2])
+    named_square_sums = zip(("error_m", "sigma_m"), np.sum(squared_errors_m2, axis=0), strict=True)
     return {
         name: float(np.sqrt(values[np.isfinite(values)][-1]))
-        for name, values in squared_sums_by_name
+        for name, values in named_square_sums
         if np.isfinite(values).any()
     }
 
@@ -192,8 +194,10 @@ def describe_errors_after_gap(analysis: Analysis, gap_s: Span) -> str:
         if _has_aids(analysis.flight.ekf2):
             aiding_sentence = "In the gap KF and EKF2 rely on the IMU alone."
         if other_aids := _find_fused_aids(analysis.flight.ekf2, gap_s):
-            aid_labels = " and ".join(aid.label for aid in other_aids)
-            aiding_sentence = f"In the gap KF relies on the IMU alone, EKF2 also on {aid_labels}."
+            aid_labels_text = " and ".join(aid.label for aid in other_aids)
+            aiding_sentence = (
+                f"In the gap KF relies on the IMU alone, EKF2 also on {aid_labels_text}."
+            )
         variance, state_time_s = result.ekf2_variance, float(positions_before.index[-1])
         sigma_text = ""
         if isinstance(variance, pd.DataFrame) and len(variance):
@@ -241,7 +245,7 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
     intervals_s, median_interval_s = _compute_intervals_s(analysis)
     lost_count = int(np.sum(np.rint(intervals_s / median_interval_s) - 1.0))
     sent_count = lost_count + len(intervals_s)
-    if len(intervals_s) > 1 and lost_count / sent_count > MIN_LOST_FRACTION:
+    if len(intervals_s) > 1 and lost_count / sent_count > MIN_LOST_POSITION_FRACTION:
         action = "Record on the companion computer or on a link without message loss."
         if analysis.flight.log.has_ulog:
             action += " Or set SDLOG_PROFILE to 129: the ULog then contains the received positions."
@@ -258,28 +262,30 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
 def detect_downsampling(analysis: Analysis) -> Findings:
     """Detect positions that were downsampled before PX4 received them."""
     source = analysis.source
-    # Timestamps do not show when PX4 received the positions if px4fuse changed them, or if PX4
-    # logged the positions only after EKF2 had used them (ALIGNED_ORIGIN)
+    # Timestamps do not show the intervals at which PX4 received the positions if px4fuse converted
+    # the timestamps, or if PX4 logged positions only after EKF2 had used them (ALIGNED_ORIGIN)
     if (
         source.clock_map is not None
         or source.origin.find_preference_rank() >= ALIGNED_ORIGIN.find_preference_rank()
     ):
         return
     intervals_s, _ = _compute_intervals_s(analysis)
-    period_and_counts = _find_period(intervals_s) if len(intervals_s) >= MIN_INTERVALS else None
+    period_and_counts = (
+        _find_period(intervals_s) if len(intervals_s) >= MIN_INTERVAL_COUNT else None
+    )
     if period_and_counts is None:
         return
     period_s, period_counts = period_and_counts
     lost_fraction = 1.0 - 1.0 / float(np.mean(period_counts))
-    count_fractions = np.bincount(period_counts.astype(np.intp)) / len(period_counts)
-    count_pair_fractions = count_fractions[:-1] + count_fractions[1:]
-    first_multiple = int(np.argmax(count_pair_fractions))
-    has_two_lengths = (
-        count_pair_fractions[first_multiple] >= MIN_INTERVAL_PAIR_FRACTION
-        and count_fractions[first_multiple : first_multiple + 2].min()
-        >= MIN_RARER_INTERVAL_FRACTION
+    fraction_by_period_count = np.bincount(period_counts.astype(np.intp)) / len(period_counts)
+    adjacent_pair_fractions = fraction_by_period_count[:-1] + fraction_by_period_count[1:]
+    shorter_period_count = int(np.argmax(adjacent_pair_fractions))
+    has_two_interval_lengths = (
+        adjacent_pair_fractions[shorter_period_count] >= MIN_INTERVAL_PAIR_FRACTION
+        and fraction_by_period_count[shorter_period_count : shorter_period_count + 2].min()
+        >= MIN_RARER_LENGTH_FRACTION
     )
-    if lost_fraction < MIN_DOWNSAMPLED_FRACTION or not has_two_lengths:
+    if lost_fraction < MIN_DOWNSAMPLED_FRACTION or not has_two_interval_lengths:
         return
     mean_interval_s = float(np.mean(intervals_s))
     is_too_slow = mean_interval_s > EV_START_INTERVAL_S
@@ -320,7 +326,7 @@ def _find_period(intervals_s: Array) -> tuple[float, Array] | None:
     # The upper median is one of the intervals. The mean of two intervals may be no multiple of the
     # period
     median_interval_s = float(np.sort(intervals_s)[len(intervals_s) // 2])
-    for median_count in range(1, MAX_PERIODS_PER_INTERVAL + 1):
+    for median_count in range(1, MAX_PERIODS_IN_MEDIAN_INTERVAL + 1):
         period_counts = np.rint(intervals_s * median_count / median_interval_s)
         if np.any(period_counts < 1.0):
             continue

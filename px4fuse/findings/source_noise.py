@@ -19,20 +19,20 @@ from px4fuse.findings.noises import NOISE_RATIO_TOLERANCE, find_ekf2_noise_m
 from px4fuse.findings.source_positions import MIN_LAG_LIKELIHOOD_NATS, has_little_motion
 from px4fuse.flight.model import Columns, positions_phrase, source_name
 
-# Minimum ratio of white to time-correlated noise σ, at which white noise is a separate fault
-MIN_WHITE_TO_CORRELATED_RATIO = 0.3
-# Minimum log likelihood ratio (nats) of time-correlated to white noise: larger in 1 of 400 flights
-# without a fault
+# White noise is a separate fault if its σ ÷ σ of the time-correlated noise is above this ratio
+MIN_WHITE_TO_SLOW_SIGMA_RATIO = 0.3
+# Minimum log likelihood ratio (nats) of time-correlated to white noise: 1 of 400 flights without a
+# fault exceeds it
 MIN_CORRELATED_LIKELIHOOD_NATS = 5.0
 # Minimum time-correlated error (m, 1 σ): timestamps in ms cause 2 mm at 4 m/s, and the motion from
 # IMU or ground truth also has errors of some mm
 MIN_CORRELATED_SIGMA_M = 0.005
 # Minimum fraction of repeated positions for a warning
 MIN_REPEATED_FRACTION = 0.05
-# Minimum fraction of repeated positions for severity error
+# Minimum fraction of repeated positions, for severity "error"
 MIN_REPEATED_FRACTION_FOR_ERROR = 0.3
 # Minimum number of repeated positions for a finding
-MIN_REPEATED_COUNT = 10
+MIN_REPEATED_POSITION_COUNT = 10
 # Minimum ratio of the larger to the smaller position noise σ of north and east, for a finding
 MIN_AXIS_NOISE_RATIO = 1.5
 # Minimum ratio of the noise in one part of the flight to the noise in the rest, for a warning
@@ -40,7 +40,7 @@ MIN_PART_NOISE_RATIO = 2.0
 # Minimum ratio of the noise in one part of the flight to the noise in the rest, without outliers,
 # for a warning
 MIN_PART_NOISE_RATIO_WITHOUT_OUTLIERS = 1.5
-# Minimum ratio of the noise in one part of the flight to the noise in the rest, for severity error
+# Minimum ratio of the noise in one part of the flight to that in the rest, for severity "error"
 MIN_PART_NOISE_RATIO_FOR_ERROR = 4.0
 
 
@@ -65,25 +65,25 @@ def detect_time_correlated_noise(analysis: Analysis) -> Findings:
         or noise.low_pass_likelihood_gain_nats >= MIN_LAG_LIKELIHOOD_NATS
     ):
         return
-    low_text, high_text = (format_number(end, 1) for end in (noise.low_s, noise.high_s))
+    tau_low_text, tau_high_text = (format_number(end, 1) for end in (noise.low_s, noise.high_s))
     correlation_time_text, interval_text = (
         f"{format_number(noise.tau_s, 1)} s",
-        f"95 % {low_text} to {high_text} s",
+        f"95 % {tau_low_text} to {tau_high_text} s",
     )
     if not np.isfinite(noise.high_s):
-        correlation_time_text, interval_text = f"at least {low_text} s", "95 %"
+        correlation_time_text, interval_text = f"at least {tau_low_text} s", "95 %"
     is_gnss, name = analysis.source.origin.is_gnss, source_name(analysis.source)
     evidence = {name: value for name, value in asdict(noise).items() if np.isfinite(value)}
     assumed_noises_m = [
         analysis.settings.sigma_z_m,
         *map(find_ekf2_noise_m, analysis.axes.values()),
     ]
-    white_noise_ratio = noise.white_m / float(np.nanmin(assumed_noises_m))
+    white_to_assumed_noise_ratio = noise.white_m / float(np.nanmin(assumed_noises_m))
     if (
-        white_noise_ratio > NOISE_RATIO_TOLERANCE
-        and noise.white_m > MIN_WHITE_TO_CORRELATED_RATIO * noise.slow_m
+        white_to_assumed_noise_ratio > NOISE_RATIO_TOLERANCE
+        and noise.white_m > MIN_WHITE_TO_SLOW_SIGMA_RATIO * noise.slow_m
     ):
-        evidence[WHITE_NOISE_RATIO_KEY] = white_noise_ratio
+        evidence[WHITE_NOISE_RATIO_KEY] = white_to_assumed_noise_ratio
     # Time-correlated errors are normal for GNSS: if they are within the reported σ, they are a note
     make_finding = note if is_gnss and not _has_error_above_reported_sigma(analysis) else warning
     yield make_finding(
@@ -122,7 +122,7 @@ def detect_repeated_positions(analysis: Analysis) -> Findings:
         int(is_repeated.sum()),
         float(is_repeated.mean()) if len(is_repeated) else 0.0,
     )
-    if repeated_count < MIN_REPEATED_COUNT or repeated_fraction < MIN_REPEATED_FRACTION:
+    if repeated_count < MIN_REPEATED_POSITION_COUNT or repeated_fraction < MIN_REPEATED_FRACTION:
         return
     make_finding = error if repeated_fraction >= MIN_REPEATED_FRACTION_FOR_ERROR else warning
     yield make_finding(
@@ -147,12 +147,12 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
     if len(axis_noise_estimates) < 2:
         return
     (
-        (smaller_noise_m, _, smaller_noise_high_m, smaller_noise_axis),
-        (larger_noise_m, larger_noise_low_m, _, larger_noise_axis),
+        (smaller_noise_m, _, smaller_noise_upper_bound_m, smaller_noise_axis),
+        (larger_noise_m, larger_noise_lower_bound_m, _, larger_noise_axis),
     ) = axis_noise_estimates
     if (
         larger_noise_m < MIN_AXIS_NOISE_RATIO * smaller_noise_m
-        or larger_noise_low_m <= smaller_noise_high_m
+        or larger_noise_lower_bound_m <= smaller_noise_upper_bound_m
     ):
         return
     yield warning(
@@ -174,8 +174,8 @@ def detect_noise_variation(analysis: Analysis) -> Findings:
     if (
         noisy_part is None
         or noisy_part.sigma_ratio < MIN_PART_NOISE_RATIO
-        # Without outliers, too, the noise must be larger: a fused outlier also increases the next
-        # innovations
+        # The noise must also be larger without the outliers of that part: a fused outlier increases
+        # the next innovations, too
         or noisy_part.sigma_ratio_without_outliers < MIN_PART_NOISE_RATIO_WITHOUT_OUTLIERS
     ):
         return

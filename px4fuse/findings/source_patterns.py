@@ -1,7 +1,6 @@
-"""Position errors with a pattern: timestamp jitter, noise that grows with speed, late attitude.
+"""Systematic errors: timestamp jitter, noise that grows with speed, late attitude.
 
-Only with ground truth: periodic errors, a time offset that varies in flight, and a scale factor
-error.
+With ground truth also: periodic errors, a time offset that varies in flight, a scale factor error.
 """
 
 import pandas as pd
@@ -38,9 +37,9 @@ from px4fuse.flight.model import positions_phrase, source_name
 
 # Minimum scale factor error (ratio minus 1) against ground truth for a finding: 0.8 m in 10 m
 MIN_SCALE_ERROR_AGAINST_TRUTH = 0.08
-# Minimum jitter (s) for severity error: a position error of 3 cm at 1 m/s
+# Minimum jitter (s), for severity "error": a position error of 3 cm at 1 m/s
 MIN_JITTER_FOR_ERROR_S = 0.03
-# Minimum amplitude (m) of a periodic error for severity error: twice the noise of good UWB
+# Minimum amplitude (m) of a periodic error, for severity "error": twice the noise of good UWB
 MIN_AMPLITUDE_FOR_ERROR_M = 0.2
 
 
@@ -48,23 +47,23 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_attitude_delay(analysis)
     burst_findings = [*detect_bursts(analysis)]
     yield from burst_findings
-    white = (
+    local_residuals = (
         None
         if burst_findings or analysis.source.origin.reconstructed
         else compute_local_residuals(analysis)
     )
-    if white is None:
+    if local_residuals is None:
         return
-    yield from detect_jitter_and_speed_noise(analysis, white)
-    error_fit = fit_errors(analysis, white)
+    yield from detect_jitter_and_speed_noise(analysis, local_residuals)
+    error_fit = fit_errors(analysis, local_residuals)
     if error_fit is not None:
         yield from detect_slow_errors(analysis, error_fit)
         if not analysis.source.origin.is_gnss:  # GNSS has no scale factor error
             yield from detect_scale_error(analysis, error_fit)
 
 
-def detect_jitter_and_speed_noise(analysis: Analysis, white: LocalResiduals) -> Findings:
-    jitter_s, clock_map = find_timestamp_jitter(white), analysis.source.clock_map
+def detect_jitter_and_speed_noise(analysis: Analysis, local_residuals: LocalResiduals) -> Findings:
+    jitter_s, clock_map = find_timestamp_jitter(local_residuals), analysis.source.clock_map
     if jitter_s is not None and (clock_map is None or clock_map.distinct_stamps is None):
         yield (error if jitter_s >= MIN_JITTER_FOR_ERROR_S else warning)(
             "source_timestamp_jitter",
@@ -76,18 +75,18 @@ def detect_jitter_and_speed_noise(analysis: Analysis, white: LocalResiduals) -> 
             "processed, sent or received.",
             {"jitter_s": jitter_s},
         )
-    noise = find_speed_noise(white)
-    if noise is not None:
+    speed_noise = find_speed_noise(local_residuals)
+    if speed_noise is not None:
         yield error(
             "source_noise_grows_with_speed",
             f"{source_name(analysis.source)} noise grows with speed: "
-            f"{format_metres(noise.slow_m)} m at {noise.slow_m_s:.1f} m/s and "
-            f"{format_metres(noise.fast_m)} m at {noise.fast_m_s:.1f} m/s (1 σ). The noise grows "
-            "along and across the motion, so time offset and jitter are not the cause. No single "
-            "measurement noise fits the whole flight.",
+            f"{format_metres(speed_noise.slow_m)} m at {speed_noise.slow_m_s:.1f} m/s and "
+            f"{format_metres(speed_noise.fast_m)} m at {speed_noise.fast_m_s:.1f} m/s (1 σ). The "
+            "noise grows along and across the motion, so time offset and jitter are not the cause. "
+            "No single measurement noise fits the whole flight.",
             "Let the source send a variance that grows with speed (EKF2_EV_NOISE_MD 0). "
             "Shorten the time of one measurement: exposure time or ranging time.",
-            noise._asdict(),
+            speed_noise._asdict(),
         )
 
 
@@ -108,21 +107,21 @@ def detect_slow_errors(analysis: Analysis, error_fit: ErrorFit) -> Findings:
             periodic_error._asdict(),
         )
         return
-    clock, offset_variation = analysis.clock, find_offset_variation(error_fit)
+    clock, offset_change = analysis.clock, find_offset_variation(error_fit)
     if isinstance(clock, ClockOffset) and clock.has_changed():
-        return  # source_clock reports the change of the time offset
-    if offset_variation is not None:
+        return  # source_clock.py reports this change
+    if offset_change is not None:
         yield error(
             "source_time_offset_changes",
             f"The time offset of the {positions_text} varies in flight by "
-            f"{offset_variation.most_s - offset_variation.least_s:.2f} s. Its deviation from the "
-            f"mean is {offset_variation.least_s:+.2f} s at {offset_variation.least_at_s:.0f} s and "
-            f"{offset_variation.most_s:+.2f} s at {offset_variation.most_at_s:.0f} s, estimated "
+            f"{offset_change.most_s - offset_change.least_s:.2f} s. Its deviation from the "
+            f"mean is {offset_change.least_s:+.2f} s at {offset_change.least_at_s:.0f} s and "
+            f"{offset_change.most_s:+.2f} s at {offset_change.most_at_s:.0f} s, estimated "
             "from the errors along the motion against ground truth. No single --clock-offset "
-            "corrects this.",
+            "corrects the whole flight.",
             "Synchronise the clocks during the whole flight. Send the time of measurement, not the "
             "time at which a position was sent or received.",
-            offset_variation._asdict(),
+            offset_change._asdict(),
         )
 
 

@@ -1,4 +1,4 @@
-"""Faults of the positions: constant, low-pass filtered, jumps, scale factor, outliers, variance.
+"""Positions that are constant, low-pass filtered, jump or have outliers; wrong scale or variance.
 
 Flights with too little motion are also reported.
 """
@@ -34,9 +34,9 @@ from px4fuse.findings.model import (
     finding,
     format_count,
     format_percent,
+    make_zero_length_spans,
     note,
     warning,
-    zero_length_spans,
 )
 from px4fuse.findings.source_stamps import detect_arrival_timestamps
 from px4fuse.flight.ekf2_parameters import EV_POS
@@ -53,8 +53,8 @@ from px4fuse.flight.model import (
 
 # The vehicle moves if the extent (m) of the positions is at least this (5th to 95th percentile)
 MIN_MOTION_RANGE_M = 0.5
-# The vehicle moves if the ratio of this extent to the position noise σ is at least this: white
-# noise at rest has 3.29 (5th to 95th percentile), plus 25 %
+# The vehicle moves if this extent of the positions ÷ position noise σ is at least this ratio. White
+# noise at rest has the ratio 3.29; 25 % is margin
 MIN_MOTION_RANGE_SIGMAS = 1.25 * 3.29
 # Minimum log likelihood ratio (nats) of low-pass filtered to white noise; for positions that are
 # not filtered it is 0 to 2
@@ -62,12 +62,12 @@ MIN_LOW_PASS_LIKELIHOOD_NATS = 6.0
 # Minimum log likelihood ratio (nats) of low-pass filtered to time-correlated noise, to report a
 # low-pass filter. Only the filter delays the positions
 MIN_LAG_LIKELIHOOD_NATS = 1.0
-# Maximum ratio of the lag estimated from the noise correlation to the upper 95 % limit of the time
-# offset. Above this ratio, the time offset is reported as the lag
+# The lag of low-pass filtered positions is estimated from the noise correlation. If it exceeds the
+# upper 95 % limit of the delay by this factor, the delay (the time offset) is reported as the lag
 MAX_LAG_TO_DELAY_RATIO = 4.0
 # Minimum lag (s) due to a low-pass filter, for a warning: a position error of 5 cm at 1 m/s
 MIN_LAG_S = 0.05
-# Minimum lag (s) due to a low-pass filter, for severity error: a position error of 10 cm at 1 m/s
+# Minimum lag (s) due to a low-pass filter, for severity "error": a position error of 10 cm at 1 m/s
 MIN_LAG_FOR_ERROR_S = 0.10
 # Minimum position jump (m) for a warning: twice the noise of good UWB (0.1 m)
 MIN_JUMP_M = 0.2
@@ -81,15 +81,15 @@ MIN_UNANNOUNCED_JUMPS = 3
 MIN_UNANNOUNCED_JUMP_M = 0.1
 # Minimum ratio of a jump without a change of reset_counter to the median of position changes
 MIN_UNANNOUNCED_JUMP_RATIO = 8.0
-# Number of successive position changes around a jump, whose median is compared with the jump
+# A jump is compared with the median of this number of position changes around it
 CHANGE_WINDOW_SAMPLES = 61
 # Minimum number of positions to detect jumps
 MIN_POSITIONS_FOR_JUMPS = 100
 # Minimum time (s) and number of positions after a jump without return: outliers return earlier
 MIN_JUMP_DURATION_S, MIN_JUMP_DURATION_SAMPLES = 0.6, 9
-# The shift between the median positions before and after a jump differs from the jump by less than
-# this fraction of the jump; otherwise the positions have returned
-MAX_SHIFT_DEVIATION_RATIO = 0.5
+# A jump lasts if the shift of the median position, from before to after the jump, differs from the
+# jump by less than this fraction of the jump; otherwise the positions have returned
+MAX_SHIFT_TO_JUMP_DEVIATION = 0.5
 # Maximum ratio of the interval before a jump to the median interval: a position change in a longer
 # interval may be motion
 MAX_JUMP_INTERVAL_RATIO = 1.5
@@ -101,30 +101,30 @@ MAX_JUMP_TO_RESET_TIME_S = 5.0
 # Maximum number of jumps whose times are printed
 MAX_LISTED_JUMPS = 8
 # Maximum rounding difference (s) between the time of a position and that of its reset_counter
-RESET_TOLERANCE_S = 1e-4
-# Bits of EKF2_EV_CTRL: horizontal position, and height
-HORIZONTAL_CONTROL_BIT, HEIGHT_CONTROL_BIT = 1, 2
+RESET_TIME_TOLERANCE_S = 1e-4
+# Masks of EKF2_EV_CTRL: horizontal position (bit 0), and height (bit 1)
+HORIZONTAL_CONTROL_MASK, HEIGHT_CONTROL_MASK = 1, 2
 # Maximum time (s) between a jump and the increment of reset_counter: two intervals at 2 Hz
 MAX_JUMP_TO_COUNTER_TIME_S = 1.0
-# Minimum position jump (m) for severity error: five times the noise of good UWB (0.1 m)
+# Minimum position jump (m), for severity "error": five times the noise of good UWB (0.1 m)
 MIN_JUMP_FOR_ERROR_M = 0.5
 # Minimum scale factor error (ratio minus 1) for a warning: flights without a fault reach 0.11
 MIN_SCALE_ERROR_FOR_WARNING = 0.12
-# Minimum scale factor error (ratio minus 1) for severity error: 1 m in a distance of 7 m
+# Minimum scale factor error (ratio minus 1), for severity "error": 1 m in a distance of 7 m
 MIN_SCALE_ERROR_FOR_ERROR = 0.15
 # Minimum |scale factor error| / σ of its estimate, for a warning: 0.3 % of correct sources exceed 3
 MIN_SCALE_ERROR_SIGMAS = 3.0
 # Minimum fraction of outliers for a warning: normal noise has 0.02 % beyond 3.7 σ
 MIN_OUTLIER_FRACTION = 0.005
-# Minimum fraction of outliers for severity error: one outlier in 10 s at 5 Hz
+# Minimum fraction of outliers, for severity "error": one outlier in 10 s at 5 Hz
 MIN_OUTLIER_FRACTION_FOR_ERROR = 0.02
 # Minimum number of outliers for a finding
 MIN_OUTLIERS = 3
 # Minimum fraction of positions with logged innovations, to state the number of rejected outliers
-MIN_LOGGED_FRACTION = 0.75
+MIN_LOGGED_POSITION_FRACTION = 0.75
 # Minimum factor between reported and estimated position variance for a warning
 MIN_VARIANCE_RATIO = 2.0
-# Minimum factor between reported and estimated position variance for severity error
+# Minimum factor between reported and estimated position variance, for severity "error"
 MIN_VARIANCE_RATIO_FOR_ERROR = 3.0
 
 
@@ -146,22 +146,24 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     """Return the low-pass filter of the position source; None if its positions are not filtered."""
     source, low_pass = analysis.source, analysis.source_low_pass
     if (
-        source.orientation is not None  # drift of odometry also correlates successive errors
+        source.orientation is not None  # odometry: drift also correlates errors
         or source.origin.reconstructed
-        or not _is_clock_known(analysis)
+        or not _has_valid_time_offset(analysis)
         or not isinstance(low_pass, SourceLowPass)
         or low_pass.likelihood_gain_nats < MIN_LOW_PASS_LIKELIHOOD_NATS
         or low_pass.lag_s < MIN_LAG_S
     ):
         return None
-    clock, correlated_noise = analysis.clock, analysis.time_correlated_noise
-    # At a high rate, the time offset (negative for a lag) shows the lag more accurately than the
-    # noise correlation
+    time_offset, correlated_noise = analysis.clock, analysis.time_correlated_noise
+    # A much larger lag from the noise correlation is less accurate than the time offset (negative
+    # for a lag), for example at a high rate
     lag_limit_s = (
-        -MAX_LAG_TO_DELAY_RATIO * clock.interval_s[0] if isinstance(clock, ClockOffset) else 0.0
+        -MAX_LAG_TO_DELAY_RATIO * time_offset.interval_s[0]
+        if isinstance(time_offset, ClockOffset)
+        else 0.0
     )
-    if isinstance(clock, ClockOffset) and low_pass.lag_s > lag_limit_s >= MIN_LAG_S:
-        low_pass = replace(low_pass, lag_s=-clock.offset_s)
+    if isinstance(time_offset, ClockOffset) and low_pass.lag_s > lag_limit_s >= MIN_LAG_S:
+        low_pass = replace(low_pass, lag_s=-time_offset.offset_s)
     # A low-pass filter delays positions: correlated errors without lag have another cause
     if (
         isinstance(correlated_noise, TimeCorrelatedNoise)
@@ -171,7 +173,7 @@ def find_low_pass(analysis: Analysis) -> SourceLowPass | None:
     return low_pass
 
 
-def _is_clock_known(analysis: Analysis) -> bool:
+def _has_valid_time_offset(analysis: Analysis) -> bool:
     return isinstance(analysis.clock, ClockOffset) and not any(detect_arrival_timestamps(analysis))
 
 
@@ -203,7 +205,7 @@ def detect_jumps(analysis: Analysis) -> Findings:
     correlated_noise = analysis.time_correlated_noise
     min_jump_m = MIN_JUMP_M
     if not isinstance(correlated_noise, Unavailable):
-        # Time-correlated noise also changes within seconds (1 σ of the change: up to √2 σ)
+        # Smaller jumps may be changes of the time-correlated noise
         min_jump_m = max(min_jump_m, MIN_JUMP_SIGMAS * correlated_noise.slow_m)
     large_jumps = [jump for jump in systematic_errors.jumps if jump.size_m >= min_jump_m]
     counter_change_times_s = reset_times_s(analysis.source)
@@ -215,8 +217,8 @@ def detect_jumps(analysis: Analysis) -> Findings:
             max(step.sigma for step in largest_jump.step_m),
         )
         positions_text = positions_phrase(analysis.source)
-        texts = find_source_texts(analysis.source)
-        cause = f"Possible causes: {texts.jump}."
+        source_texts = find_source_texts(analysis.source)
+        cause = f"Possible causes: {source_texts.jump}."
         evidence = {
             "count": len(large_jumps),
             "size_m": size_m,
@@ -231,59 +233,60 @@ def detect_jumps(analysis: Analysis) -> Findings:
                 "The source announced the jump (reset_counter): it relocalised or set a new origin."
             )
         jump_text = f"jump by {size_m:.2f} m"
-        steps_m = np.array([[step.value for step in jump.step_m] for jump in large_jumps])
-        end_text = "stay there"
-        if np.linalg.norm(steps_m.sum(axis=0)) < MIN_JUMP_M:
-            end_text = "return afterwards"
+        jump_steps_m = np.array([[step.value for step in jump.step_m] for jump in large_jumps])
+        after_jump_text = "stay there"
+        if np.linalg.norm(jump_steps_m.sum(axis=0)) < MIN_JUMP_M:
+            after_jump_text = "return afterwards"
         if len(large_jumps) > 1:
             jump_text = f"jump {format_count(len(large_jumps))}, by up to {size_m:.2f} m"
         yield finding(
             "error" if size_m >= MIN_JUMP_FOR_ERROR_M else "warning",
             "source_position_jump",
-            f"{positions_text} {jump_text} at {jump_time_s:.1f} s and {end_text}. The IMU measures "
-            f"no such motion (± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow the "
-            "jump, and their innovations stay consistent.",
-            f"{texts.jump_action} Analyse only the time before or after the jump (--start, --end).",
+            f"{positions_text} {jump_text} at {jump_time_s:.1f} s and {after_jump_text}. The IMU "
+            f"measures no such motion (± {1.96 * sigma_m:.2f} m, 95 %). {cause} KF and EKF2 follow "
+            "the jump, and their innovations stay consistent.",
+            f"{source_texts.jump_action} Analyse only the time before or after the jump (--start, "
+            "--end).",
             evidence,
-            zero_length_spans(jump.time_s for jump in large_jumps),
+            make_zero_length_spans(jump.time_s for jump in large_jumps),
         )
 
 
 def detect_constant_coordinates(analysis: Analysis) -> Findings:
     """Detect coordinates that never change, so that the source does not measure them."""
-    source, parameter = analysis.source, EV_POS.switch
-    names = constant_coordinates(source)
-    is_single_coordinate = len(names) == 1
+    source, fusion_switch = analysis.source, EV_POS.switch
+    coordinates = constant_coordinates(source)
+    is_single_coordinate = len(coordinates) == 1
     if not (is_single_coordinate or is_height_only(source)) or (
         is_single_coordinate and source.step_m > 0.0
     ):
         return  # coarsely rounded positions may be constant while the vehicle moves
     values_m = dict(zip("xyz", source.samples[Columns.POSITION].median().tolist(), strict=True))
-    name, bit, make_finding = "source_coordinate_constant", HORIZONTAL_CONTROL_BIT, error
+    finding_id, mask, make_finding = "source_coordinate_constant", HORIZONTAL_CONTROL_MASK, error
     consequence = "px4fuse estimates nothing from these positions."
-    if names == ["z"]:
-        name, bit, make_finding = "source_height_constant", HEIGHT_CONTROL_BIT, warning
-        consequence = "The height is not evaluated."
-    elif names == ["x", "y"]:
+    if coordinates == ["z"]:
+        finding_id, mask, make_finding = "source_height_constant", HEIGHT_CONTROL_MASK, warning
+        consequence = "The height is not a measurement, so it is not evaluated."
+    elif coordinates == ["x", "y"]:
         make_finding = warning
         consequence = "Only the height is a measurement. The horizontal position is not evaluated."
-    action, listed_names = "", " and ".join(names)
-    if parameter in analysis.flight.log.parameters:
-        control_mask = int(analysis.flight.log.parameters[parameter])
-        action = f"Leave {parameter} at {control_mask}"
-        if control_mask & bit:
-            other_bit = HORIZONTAL_CONTROL_BIT + HEIGHT_CONTROL_BIT - bit
-            action = f"Set {parameter} to {control_mask & ~bit | other_bit}"
-        elif names == ["z"]:
+    action, coordinates_text = "", " and ".join(coordinates)
+    if fusion_switch in analysis.flight.log.parameters:
+        control_value = int(analysis.flight.log.parameters[fusion_switch])
+        action = f"Leave {fusion_switch} at {control_value}"
+        if control_value & mask:
+            other_mask = HORIZONTAL_CONTROL_MASK + HEIGHT_CONTROL_MASK - mask
+            action = f"Set {fusion_switch} to {control_value & ~mask | other_mask}"
+        elif coordinates == ["z"]:
             make_finding = note
-        action += f", so that EKF2 does not fuse {listed_names}. "
-    coordinate_text = f"coordinate {listed_names} of {source.name} is"
+        action += f", so that EKF2 does not fuse {coordinates_text}. "
+    fault_text = f"The coordinate {coordinates_text} of {source.name} is constant"
     if not is_single_coordinate:
-        coordinate_text = f"coordinates {listed_names} of {source.name} are"
-    values_text = ", ".join(f"{values_m[each]:g}" for each in names)
+        fault_text = f"The coordinates {coordinates_text} of {source.name} are constant"
+    values_text = ", ".join(f"{values_m[each]:g}" for each in coordinates)
     yield make_finding(
-        name,
-        f"The {coordinate_text} constant ({values_text} m): the source does not measure "
+        finding_id,
+        f"{fault_text} ({values_text} m): the source does not measure "
         f"{'it' if is_single_coordinate else 'them'}. {consequence}",
         f"{action}Send NaN for a coordinate that is not measured.",
         {f"{each}_m": value for each, value in values_m.items()},
@@ -291,7 +294,7 @@ def detect_constant_coordinates(analysis: Analysis) -> Findings:
 
 
 def detect_repeated_jumps(analysis: Analysis) -> Findings:
-    """Detect a source that jumps repeatedly: it corrects drift, or alternates between points."""
+    """Detect repeated jumps: a source corrects its drift, or alternates between two positions."""
     ekf2 = analysis.flight.ekf2
     jumps, is_announced = _find_jumps(analysis)
     if len(jumps) < MIN_UNANNOUNCED_JUMPS and not is_announced:
@@ -323,10 +326,10 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
             " EKF2 rejects the positions after a jump and resets its position "
             f"{np.median(reset_delays_s):.1f} s later."
         )
-    listed_times = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
+    jump_times_text = ", ".join(f"{at_s:.1f}" for at_s in times_s[:MAX_LISTED_JUMPS])
     is_reversal = np.sum(steps_m[1:] * steps_m[:-1], axis=1) < 0.0
     counter_text = "and its reset_counter increases at each jump"
-    cause_sentence = "The source (VIO or SLAM) drifts and corrects its drift."
+    cause_sentence = "The source (VIO or SLAM) drifts, and each jump corrects its drift."
     if not is_announced:
         counter_text = "without a change of its reset_counter"
         cause_sentence = f"Possible causes: {find_source_texts(analysis.source).jump}."
@@ -340,31 +343,33 @@ def detect_repeated_jumps(analysis: Analysis) -> Findings:
     yield error(
         "source_relocalises",
         f"The source jumps {len(jumps)} times, by up to {sizes_m.max():.2f} m, {counter_text}. The "
-        f"jumps are at {listed_times} s, about every {np.median(np.diff(times_s)):.0f} s. "
+        f"jumps are at {jump_times_text} s, about every {np.median(np.diff(times_s)):.0f} s. "
         f"{cause_sentence}{reset_sentence}",
         f"{action} Analyse the time between two jumps (--start, --end).",
         {"count": len(jumps), "largest_m": float(sizes_m.max()), "announced": is_announced},
-        zero_length_spans(times_s.tolist()),
+        make_zero_length_spans(times_s.tolist()),
     )
 
 
 def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
-    """Return time (s) and step (m) of each jump, and True if ``reset_counter`` changes with them.
+    """Return time (s) and step (m) of each jump, and True if ``reset_counter`` announces the jumps.
 
-    If it does not change, a jump must last for :data:`MIN_JUMP_DURATION_S`, and must be
+    Jumps that are not announced must last for :data:`MIN_JUMP_DURATION_S`, and must be
     :data:`MIN_UNANNOUNCED_JUMP_RATIO` times larger than other position changes.
     """
     position_m = cut_to_segment(analysis.source.samples, analysis.segment)[
         Columns.POSITION[:2]
     ].dropna()
-    # Repeated positions are dropped, because they make the next step larger
+    # Drop repeated positions: the step after one contains the motion of two intervals, like a jump
     position_m = position_m[(position_m.diff() != 0.0).any(axis=1)]
     time_s, steps_m = position_m.index.to_numpy(), np.diff(position_m.to_numpy(), axis=0)
     if len(steps_m) < MIN_POSITIONS_FOR_JUMPS:
         return [], False
     jump_steps_m = steps_m[1:-1] - 0.5 * (steps_m[:-2] + steps_m[2:])
     jump_sizes_m, intervals_s = np.linalg.norm(jump_steps_m, axis=1), np.diff(time_s)[1:-1]
-    reset_rows = np.searchsorted(time_s, reset_times_s(analysis.source) - RESET_TOLERANCE_S) - 2
+    reset_rows = (
+        np.searchsorted(time_s, reset_times_s(analysis.source) - RESET_TIME_TOLERANCE_S) - 2
+    )
     reset_rows = reset_rows[(reset_rows >= 0) & (reset_rows < len(jump_sizes_m))]
     reset_rows = reset_rows[jump_sizes_m[reset_rows] >= MIN_JUMP_M]
     if len(reset_rows) >= MIN_ANNOUNCED_JUMPS:
@@ -378,24 +383,24 @@ def _find_jumps(analysis: Analysis) -> tuple[list[tuple[float, Array]], bool]:
     is_jump = (jump_sizes_m > limit_m) & (
         intervals_s < MAX_JUMP_INTERVAL_RATIO * np.median(intervals_s)
     )
-    window_count = max(
+    window_sample_count = max(
         MIN_JUMP_DURATION_SAMPLES, round(MIN_JUMP_DURATION_S / float(np.median(intervals_s)))
     )
     jumps = []
     for row in np.flatnonzero(is_jump) + 2:  # the first position after the jump
         positions_before_m, positions_after_m = (
-            position_m.iloc[max(row - window_count, 0) : row],
-            position_m.iloc[row:][:window_count],
+            position_m.iloc[max(row - window_sample_count, 0) : row],
+            position_m.iloc[row:][:window_sample_count],
         )
-        nearby_steps_m = steps_m[max(row - window_count, 0) : row + window_count]
+        nearby_steps_m = steps_m[max(row - window_sample_count, 0) : row + window_sample_count]
         lasting_shift_m = (
             positions_after_m.median()
             - positions_before_m.median()
-            - window_count * np.median(nearby_steps_m, axis=0)
+            - window_sample_count * np.median(nearby_steps_m, axis=0)
         )
         if (
             np.linalg.norm(lasting_shift_m - jump_steps_m[row - 2])
-            < MAX_SHIFT_DEVIATION_RATIO * jump_sizes_m[row - 2]
+            < MAX_SHIFT_TO_JUMP_DEVIATION * jump_sizes_m[row - 2]
         ):
             jumps.append((float(time_s[row]), jump_steps_m[row - 2]))
     return jumps, False
@@ -408,12 +413,12 @@ def detect_scale_error(analysis: Analysis) -> Findings:
         return
     if (
         analysis.source.origin.is_gnss  # GNSS has no scale factor error
-        or isinstance(analysis.flight.truth, Truth)  # source_patterns finds the error more exactly
+        or isinstance(analysis.flight.truth, Truth)  # source_patterns.py is more exact
         or not isinstance(systematic_errors, SystematicErrors)
         # the effect of a low-pass filter or of time-correlated noise may resemble a scale error
         or find_low_pass(analysis) is not None
         or not isinstance(analysis.time_correlated_noise, Unavailable)
-        or not _is_clock_known(analysis)
+        or not _has_valid_time_offset(analysis)
     ):
         return
     scale_error, sigma = systematic_errors.scale.value, systematic_errors.scale.sigma
@@ -454,25 +459,25 @@ def detect_outliers(analysis: Analysis) -> Findings:
     outlier_count, outlier_fraction = len(outlier_times_s), len(outlier_times_s) / axis_tuning.count
     if outlier_fraction < MIN_OUTLIER_FRACTION or outlier_count < MIN_OUTLIERS:
         return
-    texts = find_source_texts(analysis.source)
-    sizes_m, reference = compute_outlier_sizes_m(analysis, np.array(outlier_times_s))
+    source_texts = find_source_texts(analysis.source)
+    outlier_sizes_m, reference = compute_outlier_sizes_m(analysis, np.array(outlier_times_s))
     yield finding(
         "error" if outlier_fraction >= MIN_OUTLIER_FRACTION_FOR_ERROR else "warning",
         "source_outliers",
         f"{outlier_count} of {axis_tuning.count} {positions_phrase(analysis.source)} "
         f"({format_percent(outlier_fraction, 1)}) are outliers of up to "
-        f"{format_metres(float(sizes_m.max()))} m. Their median distance to {reference} is "
-        f"{format_metres(float(np.median(sizes_m)))} m. Possible cause: {texts.outliers}. KF "
-        "rejects no outliers and follows each "
+        f"{format_metres(float(outlier_sizes_m.max()))} m. Their median distance to {reference} is "
+        f"{format_metres(float(np.median(outlier_sizes_m)))} m. Possible cause: "
+        f"{source_texts.outliers}. KF rejects no outliers and follows each "
         f"outlier.{_format_rejected_outliers(analysis, outlier_times_s)}",
-        texts.outliers_action,
+        source_texts.outliers_action,
         {
             "count": outlier_count,
             "share": outlier_fraction,
             "first_s": outlier_times_s[0],
-            "max_m": float(sizes_m.max()),
+            "max_m": float(outlier_sizes_m.max()),
         },
-        zero_length_spans(outlier_times_s),
+        make_zero_length_spans(outlier_times_s),
     )
 
 
@@ -483,24 +488,28 @@ def compute_outlier_sizes_m(analysis: Analysis, outlier_time_s: Array) -> tuple[
     """
     axes = select_north_and_east(analysis) or [analysis.main]
     has_truth = all(isinstance(result.truth, pd.DataFrame) for result in axes)
-    squares_m2 = np.zeros(len(outlier_time_s))
+    squared_distances_m2 = np.zeros(len(outlier_time_s))
     for result in axes:
         time_s, measured_m = result.axis.measurement_time_s, result.axis.measurement_m
         is_outlier = np.isin(time_s, outlier_time_s)
-        reference_time_s, reference_m = time_s[~is_outlier], measured_m[~is_outlier]
+        reference_time_s, reference_position_m = time_s[~is_outlier], measured_m[~is_outlier]
         if has_truth and isinstance(result.truth, pd.DataFrame):
-            true_m = result.truth["position_m"].dropna()
-            reference_time_s, reference_m = true_m.index.to_numpy(), true_m.to_numpy()
-        expected_m = np.interp(outlier_time_s, reference_time_s, reference_m)
-        squares_m2 += (np.interp(outlier_time_s, time_s, measured_m) - expected_m) ** 2
-    return np.sqrt(squares_m2), "ground truth" if has_truth else "the neighbouring positions"
+            true_position_m = result.truth["position_m"].dropna()
+            reference_time_s = true_position_m.index.to_numpy()
+            reference_position_m = true_position_m.to_numpy()
+        expected_position_m = np.interp(outlier_time_s, reference_time_s, reference_position_m)
+        squared_distances_m2 += (
+            np.interp(outlier_time_s, time_s, measured_m) - expected_position_m
+        ) ** 2
+    reference = "ground truth" if has_truth else "the neighbouring positions"
+    return np.sqrt(squared_distances_m2), reference
 
 
 def _format_rejected_outliers(analysis: Analysis, outlier_times_s: Sequence[float]) -> str:
     innovations = analysis.main.ekf2_innovations
     if not isinstance(innovations, pd.DataFrame) or innovations["rejected"].isna().any():
         return ""
-    if len(innovations) < MIN_LOGGED_FRACTION * len(analysis.main.axis.measurement_time_s):
+    if len(innovations) < MIN_LOGGED_POSITION_FRACTION * len(analysis.main.axis.measurement_time_s):
         return ""
     rejection_times_s = innovations.index[innovations["rejected"] > 0.0].to_numpy()
     tolerance_s = 0.5 / analysis.source.compute_rate_hz()
@@ -527,25 +536,33 @@ def detect_wrong_variance(analysis: Analysis) -> Findings:
         return
     reported_sigma_m = float(np.sqrt(reported_variance_m2.to_numpy().mean(axis=1)).mean())
     variance_ratio = (reported_sigma_m / noise_m) ** 2
-    ratio = max(variance_ratio, 1.0 / variance_ratio)
-    # R has to include time-correlated errors, too, which innovations do not show
+    variance_error_factor = max(variance_ratio, 1.0 / variance_ratio)
+    # Do not report a variance that contains time-correlated errors: R has to include them, although
+    # innovations do not show them. With ground truth, the RMSE shows these errors
     rmse_m = _compute_rmse_per_axis_m(analysis) if variance_ratio > 1.0 else None
     if rmse_m is not None and reported_sigma_m**2 < MIN_VARIANCE_RATIO * rmse_m**2:
         return
-    if ratio >= MIN_VARIANCE_RATIO and not low <= reported_sigma_m <= high:
-        direction, correlation_note = "small" if variance_ratio < 1.0 else "large", ""
-        if direction == "large" and rmse_m is None:
-            correlation_note = " The reported σ may include time-correlated errors."
-        severity: Severity = "error" if ratio >= MIN_VARIANCE_RATIO_FOR_ERROR else "warning"
-        effect = "EKF2 uses the larger of it and EKF2_EVP_NOISE² (EKF2_EV_NOISE_MD 0)."
+    if variance_error_factor >= MIN_VARIANCE_RATIO and not low <= reported_sigma_m <= high:
+        size_word, correlation_note = "small" if variance_ratio < 1.0 else "large", ""
+        if size_word == "large" and rmse_m is None:
+            correlation_note = (
+                " The reported σ may include time-correlated errors, which innovations do not show."
+            )
+        severity: Severity = (
+            "error" if variance_error_factor >= MIN_VARIANCE_RATIO_FOR_ERROR else "warning"
+        )
+        effect = (
+            "EKF2 uses the larger of reported variance and EKF2_EVP_NOISE² (EKF2_EV_NOISE_MD 0)."
+        )
         if analysis.flight.log.parameters.get("EKF2_EV_NOISE_MD") == 1:
             severity, effect = "note", "EKF2 ignores reported variances (EKF2_EV_NOISE_MD 1)."
         yield finding(
             severity,
             "source_reported_variance_wrong",
-            f"The variance that {source_name(source)} reports is {format_factor(ratio)} times too "
-            f"{direction}. The reported σ is {reported_sigma_m:.3g} m, the position noise "
-            f"{noise_m:.3g} m (95 % {low:.3g} to {high:.3g} m). {effect}{correlation_note}",
+            f"The variance that {source_name(source)} reports is "
+            f"{format_factor(variance_error_factor)} times too {size_word}. The reported σ is "
+            f"{reported_sigma_m:.3g} m, the position noise {noise_m:.3g} m (95 % {low:.3g} to "
+            f"{high:.3g} m). {effect}{correlation_note}",
             f"Report a variance of {noise_m**2:.2g} m² with each position.",
             {
                 "reported_sigma_m": reported_sigma_m,
@@ -562,10 +579,10 @@ def _compute_rmse_per_axis_m(analysis: Analysis) -> float | None:
         if isinstance(result.truth, Unavailable):
             return None
         true_positions, axis = result.truth["position_m"].dropna(), result.axis
-        true_m = np.interp(
+        true_position_m = np.interp(
             axis.measurement_time_s, true_positions.index, true_positions, left=np.nan, right=np.nan
         )
-        mean_squares_m2.append(np.nanmean((axis.measurement_m - true_m) ** 2))
+        mean_squares_m2.append(np.nanmean((axis.measurement_m - true_position_m) ** 2))
     return float(np.sqrt(np.mean(mean_squares_m2))) if mean_squares_m2 else None
 
 

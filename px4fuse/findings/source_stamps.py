@@ -11,7 +11,14 @@ from px4fuse.ekf2.fusion_conditions import (
     find_timestamp_action,
 )
 from px4fuse.ekf2.intervals import MAX_LATENESS_S
-from px4fuse.findings.model import Findings, error, format_percent, fraction_of_ones, note, warning
+from px4fuse.findings.model import (
+    Findings,
+    compute_flag_fraction,
+    error,
+    format_percent,
+    note,
+    warning,
+)
 from px4fuse.flight.ekf2_parameters import EV_POS
 from px4fuse.flight.model import (
     ARRIVAL_CLOCK_METHODS,
@@ -26,20 +33,21 @@ from px4fuse.flight.model import (
 # Jitter of receive times is reported above this value (s): a position error of 1 cm at 1 m/s
 MAX_RECEIPT_JITTER_S = 0.010
 # A timestamp is an arrival time if PX4 publishes the position within this time (s) after it
-MAX_ARRIVAL_TIME_AGE_S = 0.001
+MAX_ARRIVAL_TO_PUBLICATION_S = 0.001
 # Minimum latency (s) for a warning: a position error of 2 cm at 1 m/s
 MIN_LATENCY_S = 0.02
-# Minimum latency (s) for severity error: a position error of 10 cm at 1 m/s
+# Minimum latency (s), for severity "error": a position error of 10 cm at 1 m/s
 MIN_LATENCY_FOR_ERROR_S = 0.10
 # The latency of the positions grows in flight if its rank correlation with time is at least this
 MIN_LATENCY_CORRELATION = 0.8
 # Minimum fraction of positions that EKF2 drops because of their latency, for a finding
-MIN_DROPPED_FRACTION = 0.02
-# Minimum number of positions before the convergence of TIMESYNC, and after it, to detect it
-MIN_SAMPLES = 10
-# TIMESYNC converged in flight if at least this fraction of timestamps are arrival times before
-# that, and if at least this fraction are measurement times afterwards
-MIN_CONSISTENT_FRACTION = 0.95
+MIN_DROPPED_POSITION_FRACTION = 0.02
+# Convergence of TIMESYNC in flight is detected with at least this number of positions before it and
+# after it
+MIN_TIMESYNC_POSITIONS = 10
+# TIMESYNC converged in flight if at least this fraction of earlier timestamps are arrival times and
+# at least this fraction of later timestamps are measurement times
+MIN_TIMESTAMP_KIND_FRACTION = 0.95
 # Minimum mean number of positions that arrive together (burst)
 MIN_BURST_POSITIONS = 2.5
 # Minimum number of bursts. With fewer bursts, the pauses are gaps in the position source
@@ -70,7 +78,7 @@ def detect(analysis: Analysis) -> Findings:
         )
         if clock_map.method == "arrival time":
             kf_times_sentence = (
-                "KF also uses arrival times, so its track is late by the position latency."
+                "Like EKF2, KF uses arrival times, so the tracks are late by the position latency."
             )
         yield warning(
             "companion_not_synchronised",
@@ -82,7 +90,7 @@ def detect(analysis: Analysis) -> Findings:
 
 
 def detect_bursts(analysis: Analysis) -> Findings:
-    """Detect timestamps in bursts: arrival times of positions that wait and arrive together."""
+    """Detect positions that wait and arrive in bursts, and whose timestamps are arrival times."""
     intervals_s = np.diff(analysis.source.samples.index.to_numpy())
     is_pause = intervals_s > intervals_s.mean()
     if np.count_nonzero(is_pause) < MIN_BURST_COUNT:
@@ -126,7 +134,7 @@ def detect_timestamp_unit(analysis: Analysis, clock_name: str) -> Findings:
     ekf2, segment = analysis.flight.ekf2, analysis.segment
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
     fusion_sentence = ""
-    if isinstance(fusion_flags, pd.DataFrame) and not fraction_of_ones(
+    if isinstance(fusion_flags, pd.DataFrame) and not compute_flag_fraction(
         fusion_flags["horizontal"], segment
     ):
         fusion_sentence = (
@@ -177,9 +185,9 @@ def detect_arrival_timestamps(analysis: Analysis) -> Findings:
     position_age_s = _find_position_age_s(analysis)
     if position_age_s is None:
         return
-    synchronisation = find_synchronisation(analysis)
-    if synchronisation is not None:
-        until_s, latency_s = synchronisation
+    timesync_convergence = find_timesync_convergence(analysis)
+    if timesync_convergence is not None:
+        until_s, latency_s = timesync_convergence
         make_finding = error if latency_s >= MIN_LATENCY_FOR_ERROR_S else warning
         airborne = analysis.flight.airborne
         if not isinstance(airborne, Unavailable) and all(start >= until_s for start, _ in airborne):
@@ -195,7 +203,9 @@ def detect_arrival_timestamps(analysis: Analysis) -> Findings:
             {"until_s": until_s, "latency_s": latency_s},
             ((float(position_age_s.index[0]), until_s),),
         )
-    elif np.mean(position_age_s.abs() < MAX_ARRIVAL_TIME_AGE_S) >= MIN_CONSISTENT_FRACTION:
+    elif (
+        np.mean(position_age_s.abs() < MAX_ARRIVAL_TO_PUBLICATION_S) >= MIN_TIMESTAMP_KIND_FRACTION
+    ):
         yield warning(
             "source_timestamps_are_arrival_times",
             "Position timestamps are arrival times in the whole flight. The source was never "
@@ -208,15 +218,17 @@ def detect_arrival_timestamps(analysis: Analysis) -> Findings:
 def detect_varying_latency(analysis: Analysis) -> Findings:
     """Detect positions that arrive later and later, or too late for EKF2's buffer."""
     position_age_s = _find_position_age_s(analysis)
-    if position_age_s is None or find_synchronisation(analysis) is not None:
+    if position_age_s is None or find_timesync_convergence(analysis) is not None:
         return
-    sample_count = max(MIN_SAMPLES, len(position_age_s) // 10)
+    sample_count = max(MIN_TIMESYNC_POSITIONS, len(position_age_s) // 10)
     start_s, end_s = (
         float(age_s.median())
         for age_s in (position_age_s.iloc[:sample_count], position_age_s.iloc[-sample_count:])
     )
-    change_text = "grows in flight"
-    age_correlation = rank_correlation(position_age_s.index.to_numpy(), position_age_s.to_numpy())
+    latency_change_text = "grows in flight"
+    age_time_rank_correlation = rank_correlation(
+        position_age_s.index.to_numpy(), position_age_s.to_numpy()
+    )
     ekf2, buffer_sentence, dropped_fraction = analysis.flight.ekf2, "", 0.0
     if isinstance(ekf2, Ekf2) and isinstance(ekf2.horizon_s, float):
         delay_s = 1e-3 * analysis.flight.log.parameters.get(EV_POS.delay, 0.0)
@@ -226,14 +238,21 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
             f" EKF2 drops positions that arrive later than {limit_s:.2f} s (here "
             f"{format_percent(dropped_fraction)})."
         )
-    if end_s - start_s < MIN_LATENCY_FOR_ERROR_S or age_correlation < MIN_LATENCY_CORRELATION:
-        if not MIN_DROPPED_FRACTION < dropped_fraction < 1.0 - MIN_DROPPED_FRACTION:
+    if (
+        end_s - start_s < MIN_LATENCY_FOR_ERROR_S
+        or age_time_rank_correlation < MIN_LATENCY_CORRELATION
+    ):
+        if (
+            not MIN_DROPPED_POSITION_FRACTION
+            < dropped_fraction
+            < 1.0 - MIN_DROPPED_POSITION_FRACTION
+        ):
             return
-        change_text = "varies"
+        latency_change_text = "varies"
         start_s, end_s = position_age_s.quantile([0.05, 0.95]).tolist()
-    yield (error if dropped_fraction > MIN_DROPPED_FRACTION else warning)(
+    yield (error if dropped_fraction > MIN_DROPPED_POSITION_FRACTION else warning)(
         "source_latency_varies",
-        f"The latency of the {positions_phrase(analysis.source)} {change_text} from "
+        f"The latency of the {positions_phrase(analysis.source)} {latency_change_text} from "
         f"{start_s:.2f} s to {end_s:.2f} s (time from measurement to arrival).{buffer_sentence}",
         "Find the queue that fills up: sender, bridge or link. Send fewer or smaller messages, and "
         "let the sender drop old positions.",
@@ -241,28 +260,28 @@ def detect_varying_latency(analysis: Analysis) -> Findings:
     )
 
 
-def find_synchronisation(analysis: Analysis) -> tuple[float, float] | None:
+def find_timesync_convergence(analysis: Analysis) -> tuple[float, float] | None:
     """Find the time (s) at which TIMESYNC converged in flight, and the position latency (s)."""
     position_age_s = _find_position_age_s(analysis)
     if position_age_s is None:
         return None
-    is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_TIME_AGE_S).to_numpy()
-    # For each position: number of wrong timestamps if TIMESYNC converged directly after it. These
-    # are measurement times before the convergence, and arrival times after it
-    inconsistent_count: Array = (
+    is_arrival_time = (position_age_s.abs() < MAX_ARRIVAL_TO_PUBLICATION_S).to_numpy()
+    # For each position, if TIMESYNC converged directly after it: number of timestamps of the wrong
+    # kind (measurement times before the convergence, arrival times after it)
+    wrong_timestamp_counts: Array = (
         np.cumsum(~is_arrival_time) + np.sum(is_arrival_time) - np.cumsum(is_arrival_time)
     )
-    converged_index = int(np.argmin(inconsistent_count)) + 1
+    converged_index = int(np.argmin(wrong_timestamp_counts)) + 1
     if (
-        np.mean(is_arrival_time) >= MIN_CONSISTENT_FRACTION
-        or min(converged_index, len(position_age_s) - converged_index) < MIN_SAMPLES
+        np.mean(is_arrival_time) >= MIN_TIMESTAMP_KIND_FRACTION
+        or min(converged_index, len(position_age_s) - converged_index) < MIN_TIMESYNC_POSITIONS
     ):
         return None
     latency_s = float(position_age_s.iloc[converged_index:].median())
-    consistent_fraction = min(
+    correct_timestamp_fraction = min(
         np.mean(is_arrival_time[:converged_index]), np.mean(~is_arrival_time[converged_index:])
     )
-    if consistent_fraction < MIN_CONSISTENT_FRACTION or latency_s < MIN_LATENCY_S:
+    if correct_timestamp_fraction < MIN_TIMESTAMP_KIND_FRACTION or latency_s < MIN_LATENCY_S:
         return None
     return float(position_age_s.index[converged_index]), latency_s
 
@@ -281,4 +300,4 @@ def _find_position_age_s(analysis: Analysis) -> pd.Series | None:
     ):
         return None
     position_age_s = fusion_record.vision_age_s.loc[segment.start_s : segment.end_s]
-    return position_age_s if len(position_age_s) >= 2 * MIN_SAMPLES else None
+    return position_age_s if len(position_age_s) >= 2 * MIN_TIMESYNC_POSITIONS else None

@@ -23,28 +23,29 @@ from px4fuse.readers.px4_positions import NO_FIX_ACTION
 
 # Minimum rounding step (m) for a finding: the error of smaller steps is below the noise of UWB
 MIN_ROUNDING_STEP_M = 0.05
-# Maximum ratio of EKF2's position RMSE in a replay with the estimated lever arm to that with the
-# lever arm used in flight, for a finding
+# A lever arm is reported if a replay of EKF2 with the estimated lever arm reduces the position RMSE
+# at least to this fraction
 MAX_LEVER_ARM_RMSE_RATIO = 0.7
 # Minimum distance (m) between the positions of two alternating senders, for a finding: smaller
 # distances may be the noise of good UWB
 MIN_SENDER_DISTANCE_M = 0.1
-# Minimum ratio of this distance to its scatter (1 σ), for a finding: noise of one sender reaches 2
+# Minimum ratio of the distance between two senders to its scatter (1 σ): the noise of one sender
+# reaches a ratio of 2
 MIN_SENDER_DISTANCE_SIGMAS = 4.0
-# Window length (samples) for the detection of two senders: short, because a lost sample exchanges
-# the senders of odd and even samples
+# Window length (samples) for the detection of two senders: one sends the odd samples, the other one
+# the even samples. Windows are short, because a lost sample exchanges odd and even
 WINDOW_SAMPLES = 16
 # Minimum number of windows to detect two senders: in fewer windows, outliers of one sender resemble
 # a second sender
 MIN_WINDOWS = 10
 # Positions are a copy of EKF2's position if their median distance is below this limit (m)
 MAX_COPY_DISTANCE_M = 0.01
-# The same limit (m) if EKF2 fuses the positions: smaller, because EKF2 follows each fused source
+# Limit (m) for positions that EKF2 fuses: smaller, because EKF2 is near each source that it fuses
 MAX_FUSED_COPY_DISTANCE_M = 0.001
 # Positions are compared with EKF2's position above this speed (m/s): at rest, any source may agree
 MIN_COPY_SPEED_M_S = 0.2
 # Tested delays (s) between EKF2's position and a source that sends it back
-COPY_DELAYS_S = np.arange(0.0, 0.305, 0.005)
+TESTED_COPY_DELAYS_S = np.arange(0.0, 0.305, 0.005)
 NO_ESTIMATES_SENTENCE = "px4fuse estimates nothing from these positions."
 # For each reason of an invalid position: id of the finding, fault, and action
 INVALID_POSITION_TEXTS: Mapping[str, tuple[str, str, str]] = {
@@ -84,12 +85,14 @@ def detect(analysis: Analysis) -> Findings:
     yield from detect_copied_estimate(analysis)
 
 
-def _find_invalid_spans(time_s: Array, valid_s: Array) -> tuple[Span, ...]:
+def _find_invalid_spans(time_s: Array, valid_times_s: Array) -> tuple[Span, ...]:
     # Successive invalid samples have the same number of valid samples before them
-    valid_count_before = np.searchsorted(valid_s, time_s)
-    starts = np.flatnonzero(np.diff(valid_count_before, prepend=-1))
-    ends = np.append(starts[1:], len(time_s)) - 1
-    return tuple(zip(time_s[starts].tolist(), time_s[ends].tolist(), strict=True))
+    valid_count_before = np.searchsorted(valid_times_s, time_s)
+    span_start_indices = np.flatnonzero(np.diff(valid_count_before, prepend=-1))
+    span_end_indices = np.append(span_start_indices[1:], len(time_s)) - 1
+    return tuple(
+        zip(time_s[span_start_indices].tolist(), time_s[span_end_indices].tolist(), strict=True)
+    )
 
 
 def detect_invalid_rows(analysis: Analysis) -> Findings:
@@ -106,9 +109,9 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
             sum(end - start for start, end in spans),
         )
         fault_sentence = fault_template.format(positions=f"{count} {positions_phrase(source)}")
-        times = f"{len(spans)} parts from {spans[0][0]:.1f} s to {spans[-1][1]:.1f} s"
+        times_text = f"{len(spans)} time spans between {spans[0][0]:.1f} s and {spans[-1][1]:.1f} s"
         if len(spans) <= 3:
-            times = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
+            times_text = " and ".join(f"{start:.1f} s to {end:.1f} s" for start, end in spans)
         error_text, make_finding = "", note if reason == "NaN" else warning
         if duration_s > compute_max_interval_s(1.0 / source.compute_rate_hz()):
             make_finding = warning
@@ -116,8 +119,8 @@ def detect_invalid_rows(analysis: Analysis) -> Findings:
             error_text = f" {describe_errors_after_gap(analysis, valid_times_s)}"
         yield make_finding(
             name,
-            f"{fault_sentence}. Times of these positions: {times} ({total_s:.1f} s in total). KF "
-            f"does not use them.{error_text}",
+            f"{fault_sentence}. Times of these positions: {times_text} ({total_s:.1f} s in total). "
+            f"KF does not use them.{error_text}",
             action or f"Check {find_source_texts(source).reception} at {longest_span_s[0]:.1f} s.",
             {
                 "count": count,
@@ -170,26 +173,26 @@ def detect_lever_arm(analysis: Analysis) -> Findings:
     lever_arm = estimate_lever_arm(analysis.flight, source)
     if lever_arm is None:
         return
-    forward_m, right_m, sigma_m = lever_arm
+    arm_forward_m, arm_right_m, sigma_m = lever_arm
     # + 0.0 replaces -0.0 by 0.0
     lever_arm_m = np.add(source.lever_arm_m[:2], lever_arm[:2]).round(2) + 0.0
     change = dict(zip(find_aid(analysis).lever_arm, lever_arm_m.tolist(), strict=False))
     effect_sentence = _describe_replayed_effect(analysis, change)
     if effect_sentence is None:
         return
-    forward_m, right_m = (round(part, 2) + 0.0 for part in (forward_m, right_m))
+    arm_forward_m, arm_right_m = (round(part, 2) + 0.0 for part in (arm_forward_m, arm_right_m))
     sensor_text, action = f"{source_name(source)} sensor", f"Set {format_settings(change)}."
-    if source.alignment is not None:  # EKF2 did not fuse a file, so no parameter corrects it
+    if source.alignment is not None:  # no EKF2 parameter corrects positions of a file
         sensor_text = "sensor"
         action = "Subtract this lever arm, rotated to NED by the attitude, from the positions."
     yield warning(
         "source_lever_arm",
-        f"The {sensor_text} is mounted {np.hypot(forward_m, right_m):.2f} m from the mounting "
-        f"point that EKF2 assumes: {forward_m:+.2f} m forward, {right_m:+.2f} m right (± "
-        f"{1.96 * sigma_m:.2f} m, 95 %). When the vehicle turns, the error of the positions "
-        f"changes by up to twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
+        f"The {sensor_text} is mounted {np.hypot(arm_forward_m, arm_right_m):.2f} m from the "
+        f"mounting point that EKF2 assumes: {arm_forward_m:+.2f} m forward, {arm_right_m:+.2f} m "
+        f"right (± {1.96 * sigma_m:.2f} m, 95 %). When the vehicle turns, the error of the "
+        f"positions changes by up to twice this distance. {effect_sentence}{NO_ESTIMATES_SENTENCE}",
         f"{action} Measure the position of the sensor relative to the IMU.",
-        {"forward_m": forward_m, "right_m": right_m, "sigma_m": sigma_m},
+        {"forward_m": arm_forward_m, "right_m": arm_right_m, "sigma_m": sigma_m},
     )
 
 
@@ -249,7 +252,7 @@ def detect_two_senders(analysis: Analysis) -> Findings:
         "source_two_senders",
         f"Two systems alternately send positions that differ by {distance_m:.2f} m. Successive "
         f"{positions_phrase(analysis.source)} ({rate_hz:.3g} Hz in total) differ by "
-        f"{distance_texts}, in addition to the motion. {NO_ESTIMATES_SENTENCE}",
+        f"{distance_texts} in addition to the motion of the vehicle. {NO_ESTIMATES_SENTENCE}",
         "Send the positions of one system only, for example stop the second node, bridge or "
         "MAVROS plugin.",
         {"distance_m": distance_m, "rate_hz": rate_hz},
@@ -267,7 +270,8 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
         return
     time_s, position_m = samples.index.to_numpy(), samples.to_numpy()
     distances_m = [
-        _compute_median_distance_m(position_m, time_s - delay_s, state) for delay_s in COPY_DELAYS_S
+        _compute_median_distance_m(position_m, time_s - delay_s, state)
+        for delay_s in TESTED_COPY_DELAYS_S
     ]
     best_index = int(np.nanargmin(distances_m)) if np.isfinite(distances_m).any() else 0
     fusion_flags = ekf2.fusion_flags
@@ -285,24 +289,27 @@ def detect_copied_estimate(analysis: Analysis) -> Findings:
     yield error(
         "source_is_ekf2_estimate",
         f"{source_name(source)} sends EKF2's own {copied_quantity} back. The positions equal those "
-        f"that EKF2 estimated {1e3 * COPY_DELAYS_S[best_index]:.0f} ms before (median "
+        f"that EKF2 estimated {1e3 * TESTED_COPY_DELAYS_S[best_index]:.0f} ms before (median "
         f"difference {1e3 * distances_m[best_index]:.1f} mm). They contain no measurement, so "
         "fusion reduces EKF2's σ, but not its error.",
         "Send the position of the positioning system. Do not connect the autopilot's local "
         "position (MAVROS local_position) to its vision input.",
-        {"delay_s": float(COPY_DELAYS_S[best_index]), "difference_m": distances_m[best_index]},
+        {
+            "delay_s": float(TESTED_COPY_DELAYS_S[best_index]),
+            "difference_m": distances_m[best_index],
+        },
     )
 
 
 def _compute_median_distance_m(position_m: Array, time_s: Array, ekf2_state: pd.DataFrame) -> float:
     """Return the median distance (m) of positions from EKF2's position at ``time_s``."""
     state_times_s = ekf2_state.index.to_numpy()
-    state_curve = CubicHermiteSpline(
+    ekf2_position_spline = CubicHermiteSpline(
         state_times_s, ekf2_state[Columns.POSITION], ekf2_state[Columns.VELOCITY]
     )
-    is_moving = np.linalg.norm(state_curve(time_s, 1), axis=1) > MIN_COPY_SPEED_M_S
+    is_moving = np.linalg.norm(ekf2_position_spline(time_s, 1), axis=1) > MIN_COPY_SPEED_M_S
     is_inside = (time_s > state_times_s[0]) & (time_s < state_times_s[-1]) & is_moving
     if np.count_nonzero(is_inside) < WINDOW_SAMPLES:
         return float("nan")
-    distance_m = np.linalg.norm(position_m - state_curve(time_s), axis=1)
+    distance_m = np.linalg.norm(position_m - ekf2_position_spline(time_s), axis=1)
     return float(np.median(distance_m[is_inside]))

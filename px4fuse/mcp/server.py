@@ -23,7 +23,7 @@ from px4fuse.core.record import read_toml
 from px4fuse.core.text import one_line
 from px4fuse.core.workers import JobFailure, poll_with_limits
 from px4fuse.errors import Px4FuseError
-from px4fuse.findings.model import TITLES
+from px4fuse.findings.model import FINDING_TITLES
 from px4fuse.results.contract import schema, to_json
 
 # Maximum number of cached tool results (5 to 100 kB each)
@@ -89,7 +89,7 @@ class Server(MCPServer[Any]):
         self._add_resource(
             "results", "JSON Schema of results", "application/json", lambda: to_json(schema())
         )
-        for name, title in TITLES.items():
+        for name, title in FINDING_TITLES.items():
             self._add_resource(
                 f"findings/{name}", title, "text/plain", partial(self._explain, name)
             )

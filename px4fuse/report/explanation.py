@@ -2,8 +2,8 @@
 
 from px4fuse.core.text import capitalise_first
 from px4fuse.errors import SettingsError, suggest_name
-from px4fuse.findings.cause_grouping import CONSEQUENCES, effect_ids
-from px4fuse.findings.model import CATALOGUE, FINDING_GROUPS, load_examples
+from px4fuse.findings.cause_grouping import EFFECTS_BY_CAUSE, effect_ids
+from px4fuse.findings.model import FINDING_CATALOGUE, FINDING_GROUPS, load_examples
 from px4fuse.report.page import Page
 
 
@@ -13,7 +13,9 @@ def make_findings_list() -> Page:
     for group in FINDING_GROUPS:
         page.heading(capitalise_first(group))
         rows = [
-            (name, finding.title) for name, finding in CATALOGUE.items() if finding.group == group
+            (name, finding.title)
+            for name, finding in FINDING_CATALOGUE.items()
+            if finding.group == group
         ]
         page.table(("id", "finding"), rows)
     return page
@@ -28,13 +30,13 @@ def make_finding_page(finding_id: str) -> Page:
         There is no finding with this id.
     """
     name = finding_id.lower().replace("-", "_")
-    if name not in CATALOGUE:
+    if name not in FINDING_CATALOGUE:
         raise SettingsError(
             f"{finding_id!r} is not a finding",
-            f"{suggest_name(name, CATALOGUE)}For a list of findings, run px4fuse explain.",
+            f"{suggest_name(name, FINDING_CATALOGUE)}For a list of findings, run px4fuse explain.",
         )
-    finding, example = CATALOGUE[name], load_examples()[name]
-    causes = [cause for cause in CONSEQUENCES if name in effect_ids(cause)]
+    finding, example = FINDING_CATALOGUE[name], load_examples()[name]
+    causes = [cause for cause in EFFECTS_BY_CAUSE if name in effect_ids(cause)]
     page = Page()
     page.write(f"{finding.title}  [{name}]", bold=True)
     page.write_labelled("Meaning", finding.meaning)

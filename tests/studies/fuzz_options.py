@@ -51,7 +51,7 @@ from px4fuse.classroom.grading.rubric import rubric_text  # noqa: E402
 from px4fuse.cli import COMMANDS, cli  # noqa: E402
 from px4fuse.core import workers  # noqa: E402
 from px4fuse.errors import Px4FuseError  # noqa: E402
-from px4fuse.findings.model import CATALOGUE  # noqa: E402
+from px4fuse.findings.model import FINDING_CATALOGUE  # noqa: E402
 from px4fuse.report import pdf  # noqa: E402
 from px4fuse.simulation.faults import FAULT_TYPES  # noqa: E402
 
@@ -62,7 +62,7 @@ ARGUMENTS: dict[str, tuple[str, ...]] = {
     "whatif": ("aisle.ulg", "gnss.ulg"),
     "batch": ("aisle.ulg", "aisle.ulg m.tlog", "logs"),
     "diff": ("r.pdf aisle.ulg", "r.json r.pdf", "aisle.ulg gnss.ulg"),
-    "explain": tuple(CATALOGUE),
+    "explain": tuple(FINDING_CATALOGUE),
     "loop": ("a.tum", "vio.ulg:vio", "vio.ulg", "g.g2o"),
     "evaluate": ("a.tum b.tum", "aisle.ulg:ekf2 aisle.ulg:truth", "a.tum a.tum"),
     "verify": ("r.pdf", "r.pdf aisle.ulg", "r.pdf logs"),
