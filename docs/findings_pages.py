@@ -151,7 +151,7 @@ def collect_examples() -> dict[str, FindingExample]:
         add_two_noise_levels,
     ):
         flight = simulate_flight(Scenario(passes=4, seed=2, ekf2=False))
-        truth = flight.truth.samples[Columns.POSITION_PANEL].dropna()
+        truth = flight.truth.samples[Columns.POSITION].dropna()
         true_position_m = CubicSpline(truth.index.to_numpy(), truth.to_numpy())
         analysis = find_faults(
             compare(laid_over(flight, true_position_m, model, 10.0, 2), Settings())
@@ -235,6 +235,14 @@ def find_detector_modules() -> dict[str, str]:
     return module_by_id | module_by_generated_id
 
 
+def is_numeric_literal(expression: ast.expr) -> bool:
+    """Return True for a number or a tuple of literals, False for text and for named constants."""
+    try:
+        return not isinstance(ast.literal_eval(expression), str)
+    except ValueError:
+        return False
+
+
 def format_threshold_rows(module_name: str) -> Iterator[str]:
     """Yield a Markdown table row with value and comment of each constant of a detector module."""
     source = (FINDINGS_FOLDER / f"{module_name}.py").read_text(encoding="utf-8")
@@ -249,7 +257,7 @@ def format_threshold_rows(module_name: str) -> Iterator[str]:
             )
             comment_above = " ".join(reversed([text.removeprefix("# ") for text in lines_above]))
             comment = line.partition("  # ")[2] or comment_above
-            if name.isupper() and not isinstance(ast.literal_eval(node.value), str):
+            if name.isupper() and is_numeric_literal(node.value):
                 comment = comment.replace("|", r"\|")
                 yield f"| `{name}` | {ast.unparse(node.value)} | {comment} |"
 
