@@ -53,14 +53,14 @@ def draw_layers() -> Figure:
         names = layer.split(" | ")
         for column, name in enumerate(names):
             left, width = 0.08 + 0.9 * column / len(names), 0.9 / len(names) - 0.01
-            axes.add_patch(_box(left, row + 0.08, width, 0.84))
+            axes.add_patch(_make_rounded_box(left, row + 0.08, width, 0.84))
             axes.text(left + width / 2.0, row + 0.5, name, ha="center", va="center", size=9)
     axes.annotate("", (0.03, len(layers) - 0.3), (0.03, 0.3), arrowprops={"arrowstyle": "->"})
     axes.text(0.012, len(layers) / 2.0, "imports", rotation=90, ha="center", va="center", size=8)
     return figure
 
 
-def _box(left: float, top: float, width: float, height: float) -> FancyBboxPatch:
+def _make_rounded_box(left: float, top: float, width: float, height: float) -> FancyBboxPatch:
     return FancyBboxPatch(
         (left, top), width, height, boxstyle="round,pad=0,rounding_size=0.02", fc="#eef3f8",
         ec="#5b7fa6", lw=0.8,

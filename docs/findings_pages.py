@@ -64,7 +64,7 @@ add_time_correlated_errors, add_two_noise_levels = (
     partial(coloured, tau_s=0.5, share=1.0),
     partial(two_levels, factor=3.0),
 )
-AXIS_NOISES_M = (0.05, 0.2, 0.1)
+SIGMA_Z_BY_AXIS_M = (0.05, 0.2, 0.1)
 FINDINGS_FOLDER = ROOT / "px4fuse" / "findings"
 EXAMPLES_PATH = FINDINGS_FOLDER / "examples.json"
 # Findings that no simulated flight shows; their examples in examples.json are of recorded flights
@@ -81,7 +81,7 @@ IDS_WITH_RECORDED_EXAMPLE = {
     "source_relocalises",
 }
 LABEL_LENGTH = 26  # characters per line of an axis label
-# Simulated faults (option --mistake) and KF settings with which a finding appears, by finding id
+# By finding id: --mistake options and KF settings with which a simulated flight shows the finding
 FAULTS_AND_SETTINGS_BY_ID: Mapping[str, tuple[tuple[str, ...], Mapping[str, float]]] = {
     "accelerometer_bias": (("accel-bias",), {}),
     "ekf2_ev_delay_wrong": (("ekf2-delay=250ms",), {}),
@@ -106,7 +106,7 @@ FAULTS_AND_SETTINGS_BY_ID: Mapping[str, tuple[tuple[str, ...], Mapping[str, floa
 
 
 @dataclass(frozen=True)
-class Example:
+class FindingExample:
     """Example of a finding: the finding, a description of the flight, and the analysis to plot."""
 
     finding: Finding
@@ -128,13 +128,13 @@ def simulate_late_timestamps() -> list[Finding]:
     return [finding for finding in find(unexplained(compare(flight))) if finding.id in faults]
 
 
-def examples() -> dict[str, Example]:
+def collect_examples() -> dict[str, FindingExample]:
     """Return an example of each finding, by finding id."""
-    example_by_id: dict[str, Example] = {}
+    example_by_id: dict[str, FindingExample] = {}
 
     def add_examples(findings: Any, flight: str, analysis: Analysis | None = None) -> None:
         for finding in findings:
-            example_by_id.setdefault(finding.id, Example(finding, flight, analysis))
+            example_by_id.setdefault(finding.id, FindingExample(finding, flight, analysis))
 
     for name, (faults, settings) in FAULTS_AND_SETTINGS_BY_ID.items():
         flight = simulate_flight(Scenario(passes=4, seed=2), parse_faults(faults))
@@ -147,11 +147,11 @@ def examples() -> dict[str, Example]:
     for model in (
         add_time_correlated_errors,
         partial(held, share=0.2),
-        partial(white, sigma=AXIS_NOISES_M),
+        partial(white, sigma=SIGMA_Z_BY_AXIS_M),
         add_two_noise_levels,
     ):
         flight = simulate_flight(Scenario(passes=4, seed=2, ekf2=False))
-        truth = flight.truth.samples[Columns.POSITION_PANEL].dropna()
+        truth = flight.truth.samples[Columns.POSITION].dropna()
         true_position_m = CubicSpline(truth.index.to_numpy(), truth.to_numpy())
         analysis = find_faults(
             compare(laid_over(flight, true_position_m, model, 10.0, 2), Settings())
@@ -199,8 +199,8 @@ def examples() -> dict[str, Example]:
     changed_log.samples.loc[35.0:, "innovation_east"] -= 0.7
     aids = {"gnss_pos": log_with_outage, "baro_hgt": aid_log(sigma=1.5), "mag": aid_log(mean=-0.4),
             "mag_heading": changed_log}  # fmt: skip
-    aid_analysis = evaluate_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
-    add_examples(find_aid_findings(aid_analysis), "simulated innovations of the aiding sources")
+    aid_results = evaluate_aids(replace(flight, ekf2=replace(flight.ekf2, aids=aids)))
+    add_examples(find_aid_findings(aid_results), "simulated innovations of the aiding sources")
     add_examples(simulate_late_timestamps(), "a simulated flight with changed timestamps")
     for fault in FAULTS:
         if fault.id in example_by_id:
@@ -235,6 +235,14 @@ def find_detector_modules() -> dict[str, str]:
     return module_by_id | module_by_generated_id
 
 
+def is_numeric_literal(expression: ast.expr) -> bool:
+    """Return True for a number or a tuple of literals, False for text and for named constants."""
+    try:
+        return not isinstance(ast.literal_eval(expression), str)
+    except ValueError:
+        return False
+
+
 def format_threshold_rows(module_name: str) -> Iterator[str]:
     """Yield a Markdown table row with value and comment of each constant of a detector module."""
     source = (FINDINGS_FOLDER / f"{module_name}.py").read_text(encoding="utf-8")
@@ -249,7 +257,7 @@ def format_threshold_rows(module_name: str) -> Iterator[str]:
             )
             comment_above = " ".join(reversed([text.removeprefix("# ") for text in lines_above]))
             comment = line.partition("  # ")[2] or comment_above
-            if name.isupper() and not isinstance(ast.literal_eval(node.value), str):
+            if name.isupper() and is_numeric_literal(node.value):
                 comment = comment.replace("|", r"\|")
                 yield f"| `{name}` | {ast.unparse(node.value)} | {comment} |"
 
@@ -269,7 +277,7 @@ def format_rate_rows(name: str) -> Iterator[str]:
         )
 
 
-def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
+def format_page(name: str, example: FindingExample | None, folder: Path) -> Iterator[str]:
     """Yield the Markdown paragraphs of the page on a finding."""
     entry = FINDING_CATALOGUE[name]
     yield f"# {entry.title}\n\n`{name}` ({entry.group})\n"
@@ -277,9 +285,9 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
     causes = [cause for cause in EFFECTS_BY_CAUSE if name in effect_ids(cause)]
     effects = effect_ids(name)
     if causes:
-        yield "The finding can be a consequence of: " + links(causes) + ".\n"
+        yield "The finding can be a consequence of: " + format_finding_links(causes) + ".\n"
     if effects:
-        yield "Possible consequences of the finding: " + links(effects) + ".\n"
+        yield "Possible consequences of the finding: " + format_finding_links(effects) + ".\n"
     if entry.role == "recording":
         yield "This finding is about the recording. It is listed before findings about noises.\n"
     if example is not None:
@@ -290,14 +298,14 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
             file = save_picture(name, example, folder)
             yield f"![Position, innovations and σ of the example flight]({file})\n"
         yield f"## What to do\n\n> {finding.remedy}\n"
-    rates = list(format_rate_rows(name))
-    if rates:
+    rate_rows = list(format_rate_rows(name))
+    if rate_rows:
         yield "## False alarms and detection\n"
         yield "The rates were measured on simulated flights. In flights with the fault `none`,"
         yield "each finding is a false alarm.\n"
         yield "| fault | kind of flight | number of flights | rate of the finding | 95 % interval |"
         yield "|---|---|---|---|---|"
-        yield "\n".join(rates) + "\n"
+        yield "\n".join(rate_rows) + "\n"
     module_name = find_detector_modules()[name]
     rows = list(format_threshold_rows(module_name))
     if rows:
@@ -308,18 +316,18 @@ def page(name: str, example: Example | None, folder: Path) -> Iterator[str]:
         yield "\n".join(rows) + "\n"
 
 
-def links(names: Iterable[str]) -> str:
+def format_finding_links(names: Iterable[str]) -> str:
     """Format Markdown links to the pages of other findings."""
     return ", ".join(f"[{FINDING_TITLES[name]}]({name}.md)" for name in dict.fromkeys(names))
 
 
-def collect_examples_and_rates(simulated: Mapping[str, Example]) -> dict[str, Any]:
+def collect_examples_and_rates(simulated_by_id: Mapping[str, FindingExample]) -> dict[str, Any]:
     """Return message, action and error rates of each finding, which ``px4fuse explain`` prints."""
-    table, recorded, contents = read_detection_rates(), load_examples(), {}
+    table, recorded_by_id, contents = read_detection_rates(), load_examples(), {}
     for name in FINDING_TITLES:
         rows = table[table["finding"] == name]
         fault_free_rows = rows[rows["condition"] == "none"]
-        example = simulated[name].finding if name in simulated else recorded[name]
+        example = simulated_by_id[name].finding if name in simulated_by_id else recorded_by_id[name]
         contents[name] = {
             "message": example.message,
             "remedy": example.remedy,
@@ -336,27 +344,27 @@ def collect_examples_and_rates(simulated: Mapping[str, Example]) -> dict[str, An
 
 def write_examples() -> None:
     """Write the examples for ``px4fuse explain`` to ``examples.json``."""
-    text = json.dumps(collect_examples_and_rates(examples()), ensure_ascii=False, indent=1)
+    text = json.dumps(collect_examples_and_rates(collect_examples()), ensure_ascii=False, indent=1)
     EXAMPLES_PATH.write_text(f"{text}\n", encoding="utf-8")
 
 
-def save_picture(name: str, example: Example, folder: Path) -> str:
+def save_picture(name: str, example: FindingExample, folder: Path) -> str:
     """Plot position, innovations and σ along the axis of an example; return the file name."""
     axis = example.finding.evidence.get("axis")
     assert example.analysis is not None
     axis_analysis = example.analysis.axes.get(str(axis)) or example.analysis.main
-    figure, panels = pyplot.subplots(3, sharex=True, figsize=(8, 7), layout="constrained")
+    figure, axes_list = pyplot.subplots(3, sharex=True, figsize=(8, 7), layout="constrained")
     drawn_panels = (POSITION_PANEL, INNOVATIONS_PANEL, POSITION_SIGMA_PANEL)
-    for axes, panel in zip(panels, drawn_panels, strict=True):
+    for axes, panel in zip(axes_list, drawn_panels, strict=True):
         panel.draw(axes, axis_analysis.with_flight_tracks())
         axes.set_ylabel(fill(panel.title, LABEL_LENGTH))
-    panels[0].set_title(axis_analysis.axis.name)
-    panels[-1].set_xlabel("time (s)")
+    axes_list[0].set_title(axis_analysis.axis.name)
+    axes_list[-1].set_xlabel("time (s)")
     figure.savefig(folder / f"{name}.png", dpi=70)
     return f"{name}.png"
 
 
-def index() -> Iterator[str]:
+def format_index() -> Iterator[str]:
     """Yield the Markdown paragraphs of the index, with a table for each group of findings."""
     yield "# Findings\n\n`px4fuse explain ID` prints the page on a finding in the terminal.\n"
     for group in FINDING_GROUPS:
@@ -372,14 +380,14 @@ def write_finding_pages(folder: Path) -> None:
     """Write the index and the pages of all findings."""
     mpl.use("Agg")
     folder.mkdir(parents=True, exist_ok=True)
-    example_by_id = examples()
+    example_by_id = collect_examples()
     missing_ids = set(FINDING_TITLES) - set(example_by_id) - IDS_WITH_RECORDED_EXAMPLE
     assert not missing_ids, f"these findings have no example: {sorted(missing_ids)}"
     for name in FINDING_TITLES:
-        text = "\n".join(page(name, example_by_id.get(name), folder))
+        text = "\n".join(format_page(name, example_by_id.get(name), folder))
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
         pyplot.close("all")
-    (folder / "index.md").write_text("\n".join(index()), encoding="utf-8")
+    (folder / "index.md").write_text("\n".join(format_index()), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -74,7 +74,7 @@ def evaluate(log: AidLog, name: str = "gnss_pos") -> AidResult:
     (0.5, "consistent"), (0.58, "consistent"), (0.68, "overconfident"),
     (0.43, "consistent"), (0.37, "underconfident"),
 ])  # fmt: skip
-def test_aiding_source_verdict_follows_from_its_sigma_ratio(sigma, verdict) -> None:
+def test_aid_verdict_changes_at_sigma_ratios_of_0_8_and_1_25(sigma, verdict) -> None:
     aid = evaluate(aid_log(sigma=sigma))
     assert aid.verdict == verdict
     assert aid.nis_mean == pytest.approx((sigma / 0.5) ** 2, rel=0.06)
@@ -290,7 +290,7 @@ def test_compare_with_checks_option_exits_with_1_on_sensor_fault(
 
 
 @pytest.mark.parametrize(("sigma", "bad"), [(0.5, False), (0.25, False), (1.5, True)])
-def test_compare_with_checks_option_accepts_too_large_noise(sigma: float, bad: bool) -> None:
+def test_checks_option_accepts_underconfident_aiding_source(sigma: float, bad: bool) -> None:
     made = with_aids(gnss_pos=aid_log(sigma=sigma))
     alone = AidsOnlyAnalysis(made, evaluate_aids(made), Unavailable("it", "not there", "Log it."))
     assert failed_checks(alone) == ({"GNSS position": "overconfident"} if bad else {})

@@ -136,7 +136,7 @@ def test_expected_answer_for_predicted_sigma_equals_closed_form() -> None:
 
 
 @pytest.mark.usefixtures("cached_analyses", "cached_pages")
-def test_compare_with_answers_option_prints_answers_in_report(
+def test_answers_option_of_compare_prints_answer_form_in_report(
     tmp_path: Path, sample_log: Path
 ) -> None:
     """``answers`` writes the form, ``compare`` reads it."""

@@ -190,7 +190,7 @@ class TestDraw:
             larger = [s for s in sizes if (s < choice.detectable_size) == choice.is_smaller_easier]
             assert set(larger) <= {choice.detectable_size, *found}
 
-    def test_assignment_flights_cover_full_range_of_difficulty(self):
+    def test_assignment_difficulties_cover_range_from_easy_to_hard(self):
         each = [assign_random_flight(SECRET, f"s{n}", "loop", 1).difficulty for n in range(500)]
         counts, _ = np.histogram(each, bins=4, range=(EASIEST_DIFFICULTY, HARDEST_DIFFICULTY))
         assert counts.min() > 65

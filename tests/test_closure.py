@@ -17,7 +17,7 @@ COORDINATE = st.floats(-50.0, 50.0)
 
 
 @given(st.lists(st.tuples(COORDINATE, COORDINATE), min_size=3, max_size=30, unique=True))
-def test_loop_correction_proportional_to_distance_equals_formula(
+def test_loop_correction_is_error_times_fraction_of_distance(
     odom: list[tuple[float, float]],
 ) -> None:
     err = (odom[-1][0] - odom[0][0], odom[-1][1] - odom[0][1])

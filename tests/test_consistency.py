@@ -65,7 +65,7 @@ def test_sigma_ratio_with_scaled_s_equals_inverse_root_of_scale(factor: float) -
     assert result.verdict == ("underconfident" if factor > 1 else "overconfident")
 
 
-def test_innovation_statistics_equal_their_formulas() -> None:
+def test_innovation_statistics_equal_direct_computation() -> None:
     nu, s = white(9, 60) + 0.2, np.linspace(0.5, 2.0, 60)
     result = assessed(nu, s)
     normalised = [n / math.sqrt(v) for n, v in zip(nu, s, strict=True)]

@@ -197,7 +197,7 @@ def test_frame_detection_without_height_finds_horizontal_axes():
 
 
 @pytest.mark.parametrize("frames", ["ENU", "NWU"])
-def test_frame_detection_finds_ros_frames_of_orientation(frames):
+def test_frame_detection_finds_orientation_sent_as_flu_to_enu(frames):
     time, attitude = oriented(flown())
     quaternion = multiply(multiply(np.array(NED_TO[frames]), attitude), np.array(NED_TO["NWU"]))
     track = reclassify_as_vio(sent(flown(), ENU if frames == "ENU" else NWU), quaternion, time)
@@ -403,7 +403,7 @@ def test_position_file_in_wrong_frame_report_names_true_frame(axes, message, rem
     assert remedy in found.remedy
 
 
-def test_ekf2_faults_are_reported_as_effects_of_wrong_axes():
+def test_findings_caused_by_wrong_axes_are_marked_as_effects():
     comparison = compared(sent(flown(), ENU))
     roots = list(source_convention.detect(comparison))
     other = finding("error", "ekf2_rejects_positions", "EKF2 rejects 9 %. Why.", "Set a gate.")
@@ -440,7 +440,7 @@ def test_frame_detection_on_recorded_logs_finds_known_frame(name):
     assert_found(check_convention(flight, track), **expected)
 
 
-def test_convention_check_without_heights_keeps_horizontal_positions() -> None:
+def test_frame_check_without_heights_keeps_all_x_and_y() -> None:
     flight = simulate_flight(Scenario(seed=5), parse_faults(["no-vvo"]))
     prepared = prepare(flight)
     assert prepared.source.samples[Columns.POSITION[:2]].notna().all(axis=None)

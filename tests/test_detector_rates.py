@@ -49,13 +49,13 @@ def test_undetectable_faults_are_found_in_below_10_percent() -> None:
         assert row.rate <= 0.1
 
 
-def test_clock_jump_is_detected_despite_rounded_likelihood() -> None:
+def test_clock_jump_is_detected_despite_likelihood_rounding() -> None:
     """Time-correlated error of 10 m, SIGMA_Z 1 mm, an interval of 0.5 ms between two positions."""
     jump = Condition("source_time_offset_changes", "--mistake clock-jump=400ms")
     assert found(FAULTY_SEED + 2, jump)[0] == "source_time_offset_changes"
 
 
-def test_faults_with_detection_rate_of_100_percent_are_detected() -> None:
+def test_faults_always_detected_in_study_are_still_detected() -> None:
     certain = {(row.finding, row.condition) for row in TABLE.itertuples() if row.rate == 1.0}
     assert found(5) == ()
     for condition in (
@@ -68,7 +68,7 @@ def test_faults_with_detection_rate_of_100_percent_are_detected() -> None:
         assert condition.finding in found(20_000, condition)
 
 
-def test_rate_table_counts_first_and_lower_ranked_findings() -> None:
+def test_rate_table_counts_findings_at_any_and_at_first_rank() -> None:
     usual, yaw = clean(DEFAULT), Condition("source_frame_misaligned", "--mistake yaw=30")
     flown = [Job(0, (usual,)), Job(1, (usual,)), Job(FAULTY_SEED, (yaw,))]
     made = pd.DataFrame(

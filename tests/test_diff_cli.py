@@ -85,7 +85,7 @@ def test_diff_accepts_report_with_aiding_sources_only(tmp_path):
 # -- bad input -------------------------------------------------------------------------------------
 
 
-def test_diff_of_unsuitable_files_is_rejected(settings, tmp_path):
+def test_diff_of_same_file_or_without_results_is_rejected(settings, tmp_path):
     usual = settings[0]
     link, printed, text = tmp_path / "link.pdf", tmp_path / "printed.pdf", tmp_path / "notes.txt"
     link.symlink_to(usual)

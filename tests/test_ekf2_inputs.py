@@ -143,7 +143,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     return prepared
 
 
-def test_ekf2_fusion_rules_depend_on_px4_release(flown):
+def test_ekf2_fusion_rules_are_those_of_logged_px4_release(flown):
     """EV_MAX_INTERVAL, ev_control.cpp; no_aid_timeout_max and reset_timeout_max, common.h."""
     new = flown(EKF2_DELAY_MAX=200.0, EKF2_IMU_POS_Y=0.25)
     assert new.rules == FusionRules(0.2, 0.4, 1.0, 5, None, False)

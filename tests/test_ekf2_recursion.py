@@ -129,7 +129,7 @@ def deciding(
     ({"follows_log": True}, (True, False, False, 9.5, False, 5)),
     ({"logged": 0.0}, (True, False, False, 9.5, False, 5)),
 ])  # fmt: skip
-def test_replayed_fusion_decision_follows_ekf2_rules(case, expected):
+def test_replay_rejects_stops_and_resets_at_ekf2_timeouts(case, expected):
     assert deciding(**case) == expected
 
 
@@ -240,7 +240,7 @@ def test_ekf2_replay_rejects_gnss_velocity_outside_gate(speed_m_s, moves):
     assert abs(wider.state[11, 0, 3]) > 1e-3
 
 
-def test_ekf2_replay_initial_state_correlation_equals_reference():
+def test_initial_correlation_equals_reference_filter_at_rest():
     """Reference: a plain Kalman filter of a vehicle at rest for one minute, facing east."""
     turn = Rotation.from_euler("z", 110.0, degrees=True).as_matrix()
     count = 6000

@@ -110,7 +110,7 @@ def test_kf_ekf2_difference_without_common_time_is_unavailable(model):
 # ----------------------------------------------------------- cases with a known answer
 
 
-def test_kf_ekf2_difference_is_explained_one_property_at_a_time():
+def test_each_step_replaces_one_more_kf_setting_by_ekf2_value():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(ReceivedPositions)
     plain = (made(ReplaySegment, flow=None, height_samples=None),)
@@ -270,7 +270,7 @@ def test_what_if_delay_that_prevents_fusion_raises_error(model, monkeypatch):
         what_if(model, [changed])
 
 
-def test_what_if_with_many_rejections_is_marked_unpredictable(model):
+def test_what_if_above_35_percent_rejections_is_not_predictable(model):
     unpredictable, some, none = what_if(
         model, [{"EKF2_EVP_NOISE": 0.02}, {"EKF2_EVP_NOISE": 0.05}, {"EKF2_EVP_NOISE": 0.2}]
     ).whatif

@@ -67,7 +67,7 @@ def test_flight_events_list_rejections_per_axis() -> None:
     assert len(found.rejected_s["aisle"]) > 50
 
 
-def test_flight_events_without_data_are_empty() -> None:
+def test_flight_without_ekf2_and_land_detector_has_no_events() -> None:
     flight = aisle_flight(ekf2=None)
     absent = Unavailable("land detector", "no topic", "Record it.")
     found = collect_events(compare(replace(flight, airborne=absent)))

@@ -98,7 +98,7 @@ def test_extract_from_gnss_flight_writes_gnss_innovations(tmp_path):
     assert {*read(tmp_path / "o" / "ekf2_innovations.csv")["axis"]} == {"north", "east"}
 
 
-def test_extracted_tables_contain_resets_clocks_and_parameters():
+def test_extract_writes_tables_of_resets_and_parameters():
     flight = rich_flight()
     tables = extraction.tables(flight)
     resets = tables["resets"]
@@ -240,7 +240,7 @@ def test_extract_to_parquet_writes_the_same_tables(tmp_path, sample_log, sample_
 # ---- the lesson by hand -----------------------------------------------------------------------
 
 
-def test_kf_example_of_docs_on_extracted_tables_equals_compare(
+def test_kf_code_in_documentation_gives_states_of_compare(
     tmp_path, monkeypatch, capsys, sample_log, sample_flight
 ):
     """The example is KF, except that it rounds the time of each measurement to the DT grid."""

@@ -17,7 +17,7 @@ from px4fuse.classroom.assignment.random_assignment import draw_uniform
 from px4fuse.results.answer_form import CHOICE_NAMES, MAX_CHOICES, MAX_FORM_BYTES, form_text
 
 
-def test_right_answers_of_each_figure_belong_to_one_fault() -> None:
+def test_right_answers_on_each_figure_describe_the_same_fault() -> None:
     for number in range(20):
         choices = select_choices(partial(draw_uniform, b"secret", f"s{number}", "aisle"))
         assert len(choices) == len(QUESTIONS) * figures.FIGURE_COUNT <= MAX_CHOICES

@@ -185,7 +185,7 @@ def test_log_dropouts_outside_evaluated_segment_are_ignored() -> None:
         (60.0, {"ekf2_fusion_interrupted": "warning"}), (59.9, {"ekf2_not_fusing": "error"}),
     ],
 )  # fmt: skip
-def test_severity_of_missing_ekf2_fusion_depends_on_its_duration(
+def test_ekf2_fusion_below_98_percent_warns_below_50_is_error(
     until_s: float, expected: dict[str, str]
 ) -> None:
     one = analysis(ekf2=with_fusion((0.0, 1.0), (until_s, 0.0)))
@@ -266,7 +266,7 @@ def rejected(count: int, of: int) -> pd.DataFrame:
     ("count", "of", "expected"),
     [(1, 100, "warning"), (1, 101, None), (20, 100, "error"), (19, 100, "warning")],
 )
-def test_ekf2_rejection_severity_depends_on_rejected_fraction(
+def test_ekf2_rejections_warn_from_1_and_are_error_from_20_pct(
     count: int, of: int, expected: str | None
 ) -> None:
     """EKF2 rejects the horizontal vector, so the main axis is used."""
@@ -354,7 +354,7 @@ def test_finding_of_error_above_sigma_names_axis_and_action() -> None:
 
 @pytest.mark.parametrize(("left", "frame"), [(0.45, True), (0.55, False)])
 @pytest.mark.parametrize("drifts", [False, True])
-def test_position_error_is_compared_with_sigma_after_alignment(
+def test_frame_is_misaligned_if_alignment_halves_position_rmse(
     left: float, frame: bool, drifts: bool
 ) -> None:
     """Circle of 5 m with a shift and an error that changes its sign with each sample."""
@@ -858,7 +858,9 @@ def test_accelerometer_bias_report_contains_95_percent_interval() -> None:
       ["source_timestamps_constant", "source_timestamp_jitter"]),
      (clock_map(jitter_s=0.5), []), (clock_map("arrival time"), ["companion_not_synchronised"])],
 )  # fmt: skip
-def test_faulty_timestamps_of_recording_are_reported(clock: Any, expected: list[str]) -> None:
+def test_constant_jittery_or_unsynchronised_times_are_reported(
+    clock: Any, expected: list[str]
+) -> None:
     assert list(named(source_stamps.detect, analysis(source=source(clock_map=clock)))) == expected
 
 
@@ -907,7 +909,7 @@ def test_position_sample_interval_is_found_despite_jitter() -> None:
         assert (found == pytest.approx(1.0)) if there else found is None
 
 
-def test_lost_samples_in_a_position_gap_are_not_counted() -> None:
+def test_interval_above_20_samples_is_a_gap_not_lost_samples() -> None:
     for longest, lost in ((5.0, [4]), (5.1, [])):  # intervals of 0.25 s
         one = at_multiples([1.0] * 20 + [longest], 0.25, clock_map=clock_map())  # type: ignore[list-item]
         assert [each.evidence["lost"] for each in source_intervals.detect_lost_samples(one)] == lost
@@ -920,7 +922,7 @@ def test_position_jump_report_contains_count_and_largest_jump() -> None:
     assert finding.spans_s == ((30.0, 30.0), (60.0, 60.0))
 
 
-def test_scale_error_report_shows_if_distances_are_too_long() -> None:
+def test_scale_and_variance_findings_state_too_large_or_small() -> None:
     for signed, word in ((0.2, "long"), (-0.2, "short")):
         finding = only(source_positions.detect_scale_error, scaled(signed))
         assert finding.title == f"UWB distances are 20 % too {word}"
@@ -977,7 +979,7 @@ def test_position_outlier_size_is_distance_to_ground_truth() -> None:
         assert f"distance to {reference} is {north_m:.2f} m" in finding.message
 
 
-def test_position_outlier_report_contains_number_ekf2_rejected() -> None:
+def test_position_outlier_finding_states_how_many_ekf2_rejected() -> None:
     innovations = pd.DataFrame({"rejected": np.zeros(120)}, index=np.arange(0.05, 120.0))
     innovations.iloc[[20, 40, 50], 0] = 1.0
     outliers = tuned(outlier_time_s=np.array([20.0, 30.0, 40.0]), count=120)

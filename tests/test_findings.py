@@ -481,7 +481,7 @@ def test_position_jump_is_not_reported_as_time_offset_change() -> None:
 
 
 @pytest.mark.parametrize("late_s", [0.1, -0.24])
-def test_late_attitude_is_reported_with_its_delay(late_s: float, sample_flight: Flight) -> None:
+def test_attitude_delay_to_gyroscopes_is_reported(late_s: float, sample_flight: Flight) -> None:
     attitude = sample_flight.attitude
     shifted = replace(sample_flight, attitude=attitude.set_axis(attitude.index + late_s))
     (finding,) = (one for one in found(compare(shifted)) if one.id == "attitude_late")

@@ -110,7 +110,7 @@ def track_of(flight: Flight) -> PositionTrack:
 
 
 @pytest.mark.parametrize("generation", ["v1.9", "v1.12", "v1.14", "v1.16"])
-def test_read_gnss_fixes_have_position_and_time_as_in_ekf2(generation, tmp_path):
+def test_gnss_fixes_have_position_and_time_that_ekf2_uses(generation, tmp_path):
     """Relative to EKF2's origin, and EKF2_GPS_DELAY before their timestamps."""
     track = track_of(flight_of(outdoors(generation), tmp_path))
     times = track.samples.index.to_numpy()
@@ -130,9 +130,7 @@ def test_read_gnss_fixes_have_position_and_time_as_in_ekf2(generation, tmp_path)
     ({"EKF2_GPS_MODE": 0}, 0.03, 0.11 - 0.03),  # main of 2026: measurement time of the driver
     ({"EKF2_GPS_MODE": 0}, 0.0, 0.0),  # without one: the delay
 ])  # fmt: skip
-def test_gnss_measurement_time_is_driver_time_or_minus_delay(
-    parameters, own_s, expected_s, tmp_path
-):
+def test_gnss_time_is_driver_time_or_timestamp_minus_delay(parameters, own_s, expected_s, tmp_path):
     track = track_of(flight_of(outdoors(own_s=own_s, **parameters), tmp_path))
     first = seconds_of(stamps(SECONDS, 5.0, 0.2))[0]
     assert track.samples.index[0] - first == pytest.approx(expected_s, abs=1e-6)
@@ -311,7 +309,7 @@ def test_ground_truth_of_gnss_flight_is_relative_to_ekf2_origin(fused, tmp_path)
 @pytest.mark.parametrize(("least_m", "eph_m", "expected"), [
     (2.0, 0.3, True), (0.5, 0.45, False), (0.5, 0.9, False), (None, 0.3, False),
 ])  # fmt: skip
-def test_gnss_noise_above_receiver_sigma_is_advised_smaller(
+def test_gnss_noise_above_receiver_sigma_should_be_decreased(
     least_m, eph_m, expected, tmp_path, monkeypatch
 ):
     log = outdoors(eph_m=eph_m)

@@ -171,7 +171,7 @@ def test_command_output_matches_reference_file(
 
 
 @pytest.mark.usefixtures("cached_analyses")
-def test_mcp_session_in_documentation_has_current_answers(
+def test_mcp_session_in_docs_equals_current_server_answers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The page contains calls of the tools of `px4fuse mcp`, each followed by its answer."""

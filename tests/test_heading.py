@@ -120,7 +120,9 @@ def test_heading_misalignment_without_data_gives_reason():
         ("mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3", False, -15.0, 15.0),
     ],
 )
-def test_heading_misalignment_of_real_logs_is_in_known_range(shared_logs, log, drifts, low, high):
+def test_heading_error_from_positions_equals_that_of_orientation(
+    shared_logs, log, drifts, low, high
+):
     """Their orientation gives the misalignment of EKF2's magnetometer heading; so do positions."""
     flight = read_log(shared_logs / "real" / f"{log}.ulg")
     found = estimate(flight, 0.001)

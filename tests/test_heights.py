@@ -115,7 +115,7 @@ def test_barometer_bias_matches_scalar_kalman_filter() -> None:
     np.testing.assert_allclose(found["innovation_down_m"], innovations, atol=1e-9)
 
 
-def test_barometer_bias_without_height_reference_is_constant() -> None:
+def test_barometer_bias_is_constant_after_reference_ends() -> None:
     steps = list(range(10, 400, 10))
     _, found = standing(sampled(steps, [-1.0] * len(steps)), reference_until=1.005)
     after = found["innovation_down_m"].loc[1.15:]
@@ -202,7 +202,7 @@ def opened_once() -> Model:
     return opened(outdoors())
 
 
-def test_what_if_with_barometer_noise_equals_flight_with_noise() -> None:
+def test_what_if_barometer_noise_gives_nis_of_flight_with_it() -> None:
     model = opened_once()
     assert model.agreement.baro_hgt["down"].innovation_correlation > 0.999
     assert model.agreement.baro_hgt["down"].position_rms_difference_m < 0.02

@@ -68,7 +68,7 @@ def found(analysis: Analysis, detectors: tuple[Any, ...] = DETECTORS) -> dict[st
 # ------------------------------------------------------------------ the regression
 
 
-def test_bias_regression_columns_equal_kf_step_responses() -> None:
+def test_innovations_after_position_step_equal_kf_replay() -> None:
     """Compare innovations with and without a step with KF replays."""
     north = compare(aisle_flight(duration_s=30.0), RIGHT, axes=("north",))["north"].axis
     step = np.where(north.measurement_time_s >= 12.0, 0.7, 0.0)
@@ -95,7 +95,7 @@ def test_bias_regression_columns_equal_kf_step_responses() -> None:
     np.testing.assert_allclose([nu[:, 0], s], expected, atol=1e-9)
 
 
-def test_innovations_of_bias_regression_equal_kf_over_imu_gap() -> None:
+def test_bias_regression_over_imu_gap_reproduces_kf_innovations() -> None:
     analysis = flown()
     axes = tuple(analysis.axes[name].axis for name in ("north", "east"))
     model = make_design_matrix(analysis.flight, axes, RIGHT, 0.10, 0.0)
@@ -246,7 +246,7 @@ def with_ekf2(*mistakes: str) -> Analysis:
 
 
 @pytest.mark.parametrize(("jump", "severity"), [("50ms", "warning"), ("300ms", "error")])
-def test_clock_jump_severity_depends_on_its_size(jump, severity):
+def test_clock_jump_of_50_ms_is_warning_and_of_300_ms_is_error(jump, severity):
     (finding,) = stamps.detect_arrival_timestamps(with_ekf2(f"clock-jump={jump}"))
     assert finding.severity == severity
     assert finding.evidence["until_s"] == pytest.approx(50.0, abs=0.5)
@@ -273,7 +273,7 @@ def without_variances(flight: Flight) -> Flight:
         ("r-scale=0.25", without_variances),
     ],
 )
-def test_accelerometer_bias_without_its_data_is_not_reported(mistake, change) -> None:
+def test_causes_without_needed_imu_or_variance_are_not_reported(mistake, change) -> None:
     named = set(found(analysed(change(flight(mistake))), OF_CAUSES))
     assert named <= {"source_outliers"}
 

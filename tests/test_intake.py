@@ -224,7 +224,7 @@ ACTS = {
 
 
 @pytest.mark.parametrize(("said", "edit"), ACTS.items(), ids=ACTS)
-def test_read_report_pdf_with_action_is_rejected(edit, said):
+def test_report_pdf_with_script_link_or_launch_is_rejected(edit, said):
     assert said in reason(small_report(edit=edit))
     assert "the PDF contains" in reason(small_report(edit=edit))
 

@@ -42,7 +42,7 @@ def peak_bytes(work: Callable[[], object]) -> int:
     return peak
 
 
-def test_memory_for_varying_offset_is_proportional_to_length():
+def test_memory_of_varying_offset_fit_grows_linearly_with_time():
     short, long = (fit_of(count, varying_offset) for count in (1000, 8000))
     peaks = [peak_bytes(lambda fit=fit: find_offset_variation(fit)) for fit in (short, long)]
     assert peaks[1] < 10.0 * peaks[0]

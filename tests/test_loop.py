@@ -313,7 +313,7 @@ def test_loop_drift_option_below_true_drift_is_reported() -> None:
     assert "loop_drift_too_small" in {finding.id for finding in find_loop_findings(found)}
 
 
-def test_loop_without_known_landing_point_gives_a_note(
+def test_loop_without_ground_truth_notes_assumed_landing_point(
     sample: LoopSource, sample_loop: Loop
 ) -> None:
     assert find_loop_findings(sample_loop) == ()  # the log contains ground truth
@@ -337,7 +337,7 @@ def test_odometry_that_stops_in_flight_gets_no_loop_closure(sample: LoopSource) 
     assert analyse(replace(sample, flight=flight, trajectory=early), chosen).is_end_assumed
 
 
-def test_odometry_variance_uses_growth_of_reported_variance() -> None:
+def test_odometry_edge_variance_is_increase_of_logged_variance() -> None:
     _, odometry = laps(1, 6, OdometryNoise())
     nodes = np.arange(0, len(odometry), 10)
     constant = replace(odometry, position_variance_m2=np.full((len(odometry), 3), 0.0025))

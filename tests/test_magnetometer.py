@@ -181,7 +181,7 @@ def test_slowly_logged_magnetometer_is_replaced_by_ekf2_samples(tmp_path: Path) 
     assert list(field) == ["forward_gauss", "right_gauss", "down_gauss", "fused_3d"]
 
 
-def test_mean_magnetometer_sample_inverts_logged_low_pass() -> None:
+def test_mean_magnetometer_sample_is_recovered_from_low_pass() -> None:
     """The vehicle rotates, EKF2's attitude differs from the published one, the sensor is noisy."""
     count, every, rows = 12, 7, 30
     interval_s, dt = 0.5 / every, 0.008

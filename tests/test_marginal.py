@@ -103,7 +103,7 @@ def test_banded_solver_equals_dense_normal_equations(seed: int) -> None:
     np.testing.assert_allclose(system.position_variance(), variance, rtol=1e-6)
 
 
-def test_banded_factorisation_with_singular_q_is_accurate() -> None:
+def test_log_determinant_with_singular_q_grows_with_noise() -> None:
     """Q of a single step has rank one, so the term that makes it invertible is below rounding."""
     step, joined = np.full(19, 0.09755900000000004), np.ones(19, dtype=bool)
     unit = 0.1 * step * np.stack([step**2 / 4.0, step / 2.0, np.ones(19)])
@@ -220,7 +220,7 @@ def joint_normal(
     return signals[:, 0], covariance + block_diag(*(each[2] for each in made)), made
 
 
-def test_likelihood_with_imu_biases_equals_dense_joint_normal() -> None:
+def test_likelihood_with_imu_biases_equals_multivariate_normal() -> None:
     """Equal at all offsets and noises, except for a constant."""
     part = with_constants()
 
@@ -315,7 +315,7 @@ def test_likelihood_is_unchanged_if_imu_motion_is_subtracted() -> None:
 
 
 @pytest.mark.parametrize("which", ["filter", "constants"])
-def test_interpolated_likelihood_equals_computed_likelihood(which: str) -> None:
+def test_likelihood_between_grid_points_equals_exact_likelihood(which: str) -> None:
     """Equal over four decades of the ratio and of SIGMA_Z, except for a constant."""
     parts = [convert_to_positions(preintegrate(modelled(seed, COUNT), TRUE)) for seed in (1, 2)]
     if which == "constants":
@@ -345,7 +345,7 @@ def with_gap() -> Axis:
 
 
 @pytest.mark.parametrize("interval", [0.1, 0.2, 0.5, None])
-def test_banded_likelihood_equals_that_of_kf_innovations(interval: float | None) -> None:
+def test_banded_likelihood_equals_likelihood_of_kf_innovations(interval: float | None) -> None:
     """Intervals of one step (singular Q), of several steps, and with an IMU gap."""
     axis, chosen = with_gap(), Settings()
     if interval is not None:
@@ -460,7 +460,7 @@ def test_maximum_likelihood_fit_finds_simulated_outliers(clean, share, size_m, l
 
 
 @pytest.mark.parametrize(("axes", "share", "width"), [(1, 0.15, 4.0), (2, 0.1, 5.0), (2, 0.3, 3.0)])
-def test_sigma_of_noise_estimate_equals_likelihood_curvature(axes, share, width):
+def test_noise_sigma_is_inverse_root_of_likelihood_curvature(axes, share, width):
     """Without motion the likelihood has a closed form."""
     rng = np.random.default_rng(axes)
     wrong = rng.random(4000) < share
@@ -493,7 +493,7 @@ def test_sigma_of_noise_estimate_equals_likelihood_curvature(axes, share, width)
     assert widening == pytest.approx(curved * 2.0 * axes * 4000, rel=0.01)
 
 
-def test_maximum_likelihood_without_outlier_model_keeps_weights() -> None:
+def test_noise_fit_without_outlier_model_keeps_given_weights() -> None:
     weight = np.random.default_rng(1).uniform(0.2, 1.0, MANY)
     parts = [convert_to_positions(preintegrate(pair(1)[0], TRUE))]
     found = maximise_likelihood(parts, NoiseParameters(0.5, 0.1), weight, fits_outliers=False)

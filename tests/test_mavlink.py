@@ -89,7 +89,7 @@ def reason(flight: Flight, what: str) -> str:
 # ---- whole simulated flight ---------------------------------------------------------------------
 
 
-def test_read_mavlink_of_simulated_flight_equals_closed_form(read):
+def test_read_mavlink_returns_the_simulated_motion_and_imu(read):
     """All parts equal their closed form; HIGHRES_IMU is preferred to a denser SCALED_IMU."""
     aisle = Aisle(asks=True)
     made = aisle.record()
@@ -388,7 +388,7 @@ def parameter(name: bytes, value: int | float, *, by_bytes: bool):
 
 
 @pytest.mark.parametrize(("autopilot", "by_bytes"), [(12, True), (3, False)])
-def test_mavlink_integer_parameter_encoding_depends_on_autopilot(read, autopilot, by_bytes):
+def test_integer_parameters_are_bytes_in_px4_floats_in_ardupilot(read, autopilot, by_bytes):
     recorder = record_without(Aisle(), "HEARTBEAT")
     add(recorder, 1.0, lambda t: heartbeat(2, autopilot))
     for i, (name, value) in enumerate(

@@ -139,7 +139,7 @@ NOTES = {"SYSTEM_TIME": "same UNIX time", "receive time": "minimum link delay"}
 
 
 @pytest.mark.parametrize("case", METHODS)
-def test_mavlink_clock_mapping_uses_best_available_method(read, case):
+def test_clock_mapping_prefers_timesync_then_system_time(read, case):
     aisle, method, clock, (low, high) = METHODS[case]
     flight = read(aisle)
     found = flight.positions[0].clock_map
@@ -303,7 +303,7 @@ def test_mavlink_autopilot_without_heartbeat_is_found(read, change, stamped):
         np.testing.assert_allclose(np.diff(flight.imu.index), 1.0 / aisle.imu_hz, atol=1e-5)
 
 
-def test_mavlink_stream_without_any_time_has_a_note(read):
+def test_mavlink_stream_without_times_notes_missing_times(read):
     flight = read(Recorder().hear(0.0, AUTOPILOT, heartbeat()), stamped=False)
     assert flight.log.duration_s == 0.0
     assert any("no message in the stream contains a time" in note for note in flight.log.notes)

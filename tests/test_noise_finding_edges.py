@@ -81,7 +81,7 @@ def trial(
         (0.101, NoiseEstimate(0.033, 0.032, 0.034), ("warning", 3.06)),
     ],
 )  # fmt: skip
-def test_wrong_noise_severity_depends_on_ratio_to_estimate(
+def test_noise_setting_wrong_by_factor_4_is_error_else_warning(
     chosen: float, estimate: NoiseEstimate, expected: Any
 ) -> None:
     off = noises.find_setting_deviation("sigma_z_m", chosen, estimate)
@@ -110,7 +110,7 @@ SIGMA_A_TO_0_1, BOTH = {"sigma_a_m_s2": 0.1}, {"sigma_a_m_s2": 0.1, "sigma_z_m":
           ("sigma_a_too_large", "note", noises.NO_IMPROVEMENT_ACTION)]),
     ],
 )  # fmt: skip
-def test_wrong_noise_report_recommends_noise_of_better_rerun(trials: Any, expected: Any) -> None:
+def test_wrong_noise_action_states_noise_of_improving_rerun(trials: Any, expected: Any) -> None:
     fitted = tuned(NoiseEstimate(0.5, 0.45, 0.55), NoiseEstimate(0.1, 0.09, 0.11))
     cause, other = noises.detect_wrong_settings(
         analysis(source=MOVING, tuning=fitted, trials=trials)
@@ -218,7 +218,7 @@ def test_near_zero_q_with_white_innovations_is_not_reported(one: Any, expected: 
     assert severity(noises.detect_process_noise_near_zero, analysis(axes=(one,))) == expected
 
 
-def test_near_zero_process_noise_report_contains_response_time() -> None:
+def test_finding_on_near_zero_sigma_a_states_kf_response_time() -> None:
     slower = following(0.01)
     slower.axis.name = "east"
     finding = only(noises.detect_process_noise_near_zero, analysis(axes=(following(0.05), slower)))
@@ -337,7 +337,7 @@ def test_ekf2_noise_counts_as_default_within_25_percent(flown, used_m, default):
         ("ekf2", {"EKF2_ACC_NOISE": 0.35}, "process noise", "Set EKF2_ACC_NOISE to 0.35 m/s²."),
     ],
 )  # fmt: skip
-def test_action_for_inconsistent_filter_depends_on_its_cause(owner, change, kind, action) -> None:
+def test_inconsistent_filter_action_corrects_the_found_cause(owner, change, kind, action) -> None:
     # changes that explain less than 0.5 or more than 1.5 are not causes
     causes = (tried(owner, {"sigma_z_m": 7.0}, explained_fraction=0.4), tried(owner, change),
               tried(owner, {"sigma_z_m": 7.0}, explained_fraction=1.6))  # fmt: skip
@@ -431,7 +431,7 @@ def test_overconfident_ekf2_without_replay_gets_noise_advice(
           "positions")),
     ],
 )  # fmt: skip
-def test_wrong_ekf2_noise_report_names_parameter_or_sensor(
+def test_wrong_ekf2_noise_title_names_sensor_if_value_is_default(
     flown_m: float, kind: str, rejected: float, expected: tuple[str, str, str]
 ) -> None:
     aid = GNSS_POS if kind == "gnss" else EV_POS
@@ -508,7 +508,7 @@ def closing(gap_m: float | None, length_m: float = 50.0, end: Any = NONE, **part
     return loop(closure_error_m=gap_m, path_length_m=length_m, true_end=end, **usual | parts)
 
 
-def test_possible_drift_report_contains_loop_closure_error() -> None:
+def test_possible_drift_finding_states_loop_closure_error() -> None:
     finding = only(hidden_errors.detect, analysis(source=ODOMETRY))
     assert finding.evidence == {"source": "uwb"}
     assert finding.message.endswith("innovations do not show the drift.")

@@ -173,7 +173,7 @@ def test_simulated_outdoor_fault_is_reported_first(mistake: str, root: str) -> N
         ("r-scale=0.1", "nis", "EKF2_GPS_P_NOISE", 0.4, 0.02),
     ],
 )
-def test_simulated_outdoor_fault_is_cause_of_ekf2_error(
+def test_correction_of_outdoor_fault_makes_ekf2_consistent(
     mistake: str, of: Any, name: str, value: float, within: float
 ) -> None:
     analysis = flown(mistake)
@@ -201,7 +201,7 @@ def test_larger_ekf2_acc_noise_reduces_nees_under_vibration() -> None:
     assert np.nanmean(error_m**2) / variances < 1.5**2 < tried.after.nees_mean
 
 
-def test_what_if_with_true_gnss_delay_equals_faultless_flight() -> None:
+def test_what_if_with_true_gnss_delay_gives_rmse_without_fault() -> None:
     wrong, right = (flown(*texts).ekf2_model for texts in (("ekf2-delay=0",), ()))
     result, other = what_if(wrong, [{"EKF2_GPS_DELAY": 110.0}]), what_if(right, [])
     (predicted,), true = result.whatif, other.logged
@@ -248,7 +248,7 @@ def test_magnetometer_disturbance_is_cause_of_missing_fusion() -> None:
     assert changed.evidence["time_s"] == pytest.approx(67.0, abs=10.0)
 
 
-def test_simulate_ekf2_noise_below_reported_one_raises_error() -> None:
+def test_simulated_ekf2_noise_below_receiver_sigma_raises_error() -> None:
     with pytest.raises(SettingsError, match=r"the larger of EKF2_GPS_P_NOISE .*0\.4 m"):
         simulate(OUTDOOR, parse_faults(["ekf2-noise=0.05"]))
     parameters = simulate(OUTDOOR, parse_faults(["ekf2-noise=0.8"])).parameters
@@ -279,7 +279,7 @@ def test_simulated_heading_error_builds_up_with_a_lag() -> None:
     assert turned == pytest.approx([0.0, 0.0, 25.0 * (1.0 - np.exp(-1.0)), 25.0], abs=0.01)
 
 
-def test_simulate_outdoor_command_uses_outdoor_defaults(tmp_path: Path) -> None:
+def test_simulate_outdoor_default_is_square_of_30_m_with_gnss(tmp_path: Path) -> None:
     arguments = "simulate", "--kind", "outdoor", "-o", tmp_path / "o.ulg"
     output = run_checked(*arguments, "--speed", "3").output
     assert "outdoor, 3 laps of a square of 30 m at 3 m/s" in output

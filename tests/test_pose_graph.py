@@ -433,7 +433,7 @@ def test_loop_closure_gate_without_odometry_edge_raises_error() -> None:
     assert gate_edges(graph, []) == []
 
 
-def test_scaled_information_matrices_keep_the_gate_decisions() -> None:
+def test_scaling_all_information_matrices_keeps_gate_results() -> None:
     graph = odometry_graph(2, 3e-3)
     ends = np.arange(4, 34)
     truth, information = graph.poses, np.tile(graph.information[:1], (len(ends), 1, 1))

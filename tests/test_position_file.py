@@ -280,7 +280,7 @@ def test_read_position_file_detects_frame_from_column_names(read, case, separato
     ("mm unsaid", ("mm", "m is too large for an indoor flight", "--position-unit")),
     ("two tracks", ("'raw_x', 'raw_y', 'raw_z' as x, y, z",)),
 ])  # fmt: skip
-def test_read_position_file_reports_used_position_columns(read, case, words):
+def test_position_file_note_names_the_used_position_columns(read, case, words):
     assert_stated(read(table({"time": UNIX_S, **POSITIONS[case][0]})), "position: ", *words)
 
 
@@ -418,7 +418,7 @@ MISNAMED = {"x_m": UNIX_S, "time_ms": X, "b": Y, "c": Z, "x": JUNK, "y": JUNK}
     (BY_NAME, ("t", "north_mm", "east_mm", "up_mm"), "enu"),  # frame from the column names
     (MISNAMED, ("1", "2", "3", "4"), None),
 ])  # fmt: skip
-def test_read_position_file_columns_option_selects_columns(read, given, columns, frame):
+def test_columns_option_overrides_detected_column_names(read, given, columns, frame):
     file = read(PREAMBLE + table(given), columns=columns)
     assert_track(file)
     assert file.frames == ((frame,) if frame else ())
@@ -504,7 +504,7 @@ def check_any(read, content: bytes) -> None:
     "line",
     [line * 9_000 for line in (b'"', b" ", b"1 ", b"1,", b"(", b"x,", b"a1B", b"_", b"1", b"[ ")],
 )
-def test_read_position_file_of_repeated_characters_ends_fast(read, line):
+def test_position_file_of_repeated_characters_meets_time_limit(read, line):
     text = table(PLAIN).encode()
     line += b"1\n"
     for content in (line + text, text + line, line * 30 + text, line * 300):

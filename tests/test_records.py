@@ -48,7 +48,7 @@ def test_assignment_to_a_settings_field_raises_error() -> None:
         flight.sigma_a_m_s2 = 1.0  # type: ignore[misc]
 
 
-def test_results_write_values_equal_to_their_default() -> None:
+def test_json_results_contain_fields_that_have_default_values() -> None:
     """msgspec omits a default only if it is the same object, which differs between processes."""
     written_names = set(schema()["$defs"]) - {"Identity"}  # its duration_s is never 0
     unreliable = {

@@ -226,7 +226,7 @@ def test_ekf2_delay_with_worse_replay_is_not_recommended(sample: Analysis) -> No
     assert found == ["ekf2_ev_delay_wrong"]
 
 
-def test_height_with_other_noise_and_same_parameter_is_named(sample: Analysis) -> None:
+def test_height_noise_unlike_position_noise_is_in_advice(sample: Analysis) -> None:
     """The sample fuses the horizontal position only."""
     down = sample.tuning["down"]
     assert isinstance(down, AxisTuning)

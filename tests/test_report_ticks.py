@@ -70,7 +70,7 @@ def drawn_texts(
 
 
 @pytest.mark.parametrize("plot", PLOTS, ids=lambda plot: plot.__name__)
-def test_replaced_ticks_have_labels_and_places_of_matplotlib(plot: Callable[[Axes], None]) -> None:
+def test_fast_tick_labels_have_matplotlib_texts_and_positions(plot: Callable[[Axes], None]) -> None:
     expected = drawn_texts(plot, few_artists=False)
     drawn = drawn_texts(plot, few_artists=True)
     assert [text for text, *_ in drawn] == [text for text, *_ in expected]

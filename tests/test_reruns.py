@@ -185,7 +185,7 @@ def test_rerun_gives_kf_ekf2_difference_with_and_without_change() -> None:
     )
 
 
-def test_filter_rerun_with_time_offset_excludes_shifted_outliers() -> None:
+def test_rerun_with_time_offset_excludes_outliers_at_moved_times() -> None:
     analysis = flown("clock-offset=-0.19", "nlos=7%")
     count = cause(analysis, "ekf2").change[OUTLIERS]
     rows = [one for one in analysis.trials if one.filter == "ekf2" and one.axis == "aisle"]

@@ -84,7 +84,7 @@ BAD = {
 
 
 @pytest.mark.parametrize(("text", "said"), BAD.values(), ids=BAD.keys())
-def test_read_invalid_rubric_names_line_in_one_line_error(tmp_path, text, said):
+def test_invalid_rubric_raises_one_line_error_with_file_name(tmp_path, text, said):
     path = tmp_path / "mine.toml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(SettingsError) as error:

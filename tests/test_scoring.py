@@ -170,7 +170,7 @@ def key(*mistakes, sha256=SHA, **values):
 
 
 class TestForm:
-    def test_answer_form_is_scored_by_answer_key(self):
+    def test_answer_form_earns_points_only_for_answers_in_key(self):
         found = with_form(["dropout"], student__id="S01 ")
         points, comment = check_points("answers", found, key=key())
         assert points == 0.3
@@ -236,7 +236,7 @@ class TestScore:
         assert all("SIGMA_A is 0.5" in item.comment for item in made.items)
         assert made.instructor_action == ""
 
-    def test_unverified_report_earns_pending_or_no_points(self):
+    def test_unverified_report_points_are_pending_or_zero_by_rubric(self):
         verdict = Verification("other log", ("no log",), False, remedy="Look.")
         made = assess_results(verdict=verdict)
         assert made.items[0].points == 0.0
@@ -247,7 +247,7 @@ class TestScore:
         assert zero.instructor_action == ""
 
     @pytest.mark.parametrize("student_id", ["s02", "S02", "ѕ02", "s77", "", " "])
-    def test_points_of_other_students_log_depend_on_rubric_rule(self, student_id):
+    def test_log_of_other_student_counts_only_if_rubric_allows(self, student_id):
         given = changed_results(student__id=student_id)
         said = f"id in the report is {student_id}" if student_id.strip() else "report has no id"
         assert (
@@ -377,7 +377,7 @@ def test_report_with_suspicious_settings_is_flagged(values, said):
         ("heading_drift_deg", 90.0, "--heading-drift is 90 ° per 100 m (default 3 °)."),
     ],
 )
-def test_report_with_unusual_drift_setting_is_flagged(option, stated, said):
+def test_report_with_drift_far_from_default_is_flagged(option, stated, said):
     found = list(
         flag_settings(decode_results(changed_results(LOOP, **{f"request__{option}": stated})))
     )

@@ -147,7 +147,7 @@ def test_acceleration_mean_per_step_of_linear_signal_is_exact(gaps_ms, data):
         (np.r_[0.0 : 20.0 : 1 / 8.6], np.arange(0.0, 19.0, 0.1), np.zeros(189)),
     ],
 )  # fmt: skip
-def test_imu_gap_per_step_is_fraction_without_imu(time, edges, gaps):
+def test_imu_gap_fraction_is_part_of_step_without_imu_data(time, edges, gaps):
     """In a gap between equal values the mean is that value; outside the data it is zero."""
     mean, gap = compute_mean_step_acceleration(acceleration_of(time, np.ones(len(time))), edges)
     np.testing.assert_allclose(gap, gaps, atol=1e-9)
@@ -252,7 +252,7 @@ def straight(first_s, last_s):
     (((19.0, 20.0),), (2.0, 18.0)),  # no positions in flight
     (ABSENT, (2.0, 18.0)),  # no land detector
 ])  # fmt: skip
-def test_default_evaluated_segment_is_airborne_part_of_source(airborne, expected):
+def test_default_segment_is_time_in_flight_with_positions(airborne, expected):
     track = straight(2.0, 18.0)
     flight = flight_of(track=track, duration_s=20.0, airborne=airborne)
     segment = choose_segment(flight, track)
@@ -307,7 +307,7 @@ WHOLE = Segment(0.0, 19.9, "")
     ("at", "good"),
     [([2.0], 0), ([6.0], 0), ([17.0], 0), *(([5.0, 15.0], good) for good in range(3))],
 )
-def test_ekf2_reset_that_shifts_the_origin_is_removed(at, good):
+def test_ekf2_position_jump_at_origin_shift_is_removed(at, good):
     """The source is in the frame of the first, middle or last stretch between resets."""
     deltas = np.array([[1.0, 0.5, 0.0], [-3.0, 2.0, 0.0]])[: len(at)]
     later = STATE_TIME[:, None] >= np.array(at)
@@ -346,7 +346,7 @@ def test_ekf2_height_reset_is_kept_if_position_reset_is_removed():
     assert "height" in statement.split("not removed")[1]
 
 
-def test_ekf2_reset_along_an_unmeasured_axis_is_kept():
+def test_ekf2_reset_on_axis_without_source_data_is_not_removed():
     """A source without height contains no information on a change of the frame."""
     track = noisy_track()
     blind = replace(track, samples=track.samples.assign(down_m=np.nan))

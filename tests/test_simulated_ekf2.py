@@ -173,7 +173,7 @@ def test_imu_samples_per_ekf2_step_are_rounded_to_nearest():
     assert samples_per_step(0.01, 0.004 + 1e-12) == samples_per_step(0.01, 0.004 - 1e-12) == 3
 
 
-def test_imu_samples_per_ekf2_step_near_2_5_are_read_from_log():
+def test_ambiguous_imu_samples_per_step_are_taken_from_log():
     """EKF2 rounds a measured mean: 2.5 samples become two or three."""
     by_two, by_three = 2 * np.arange(0, 60, 7), 3 * np.arange(0, 60, 7)
     ends = by_two, by_three, [5], [0, 25, 50]

@@ -257,7 +257,7 @@ def test_time_correlation_fit_without_imu_is_unavailable() -> None:
     )
 
 
-def test_time_correlation_fit_tries_zero_and_estimated_offset(
+def test_time_correlation_fit_searches_with_and_without_offset(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     analysis, tried = analysed(MIXED), []

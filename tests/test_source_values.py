@@ -66,7 +66,7 @@ def test_invalid_positions_are_found_with_their_reason():
     assert invalid(samples) == {"NaN": [5, 6], "held": [*range(30, 45)], "zero": [10, 20]}
 
 
-def test_randomly_repeated_positions_are_not_lost_tracking():
+def test_randomly_repeated_positions_give_no_lost_tracking():
     """One run of more than ten is expected in 700 positions with 60 % repetitions."""
     random = np.random.default_rng(3)
     rows = np.maximum.accumulate(np.where(random.random(700) < 0.6, 0, np.arange(700)))
@@ -313,7 +313,7 @@ def test_unfused_vision_report_shows_quality_below_ekf2_ev_qmin(quality, words):
     assert words in one.remedy
 
 
-def test_two_position_senders_suppress_findings_they_cause():
+def test_findings_from_two_senders_are_removed_or_made_effects():
     analysis = unexplained(compare(aisle_flight()))
     findings = [
         finding("error", name, "m.", "r.")

@@ -98,7 +98,7 @@ def test_student_name_is_read_from_learning_platform_file_name(name, is_):
     assert name_and_number(name) == is_
 
 
-def test_submission_file_name_gives_login_time_and_lateness():
+def test_login_and_lateness_are_read_from_submission_file_name():
     blackboard = parse_submission_path(
         "Lab 3_roe1_attempt_2026-11-20-12-34-56_Lab_doe1_attempt_x.pdf"
     )

@@ -102,7 +102,7 @@ def test_loop_report_is_reproducible_and_contains_no_paths(made, tmp_path):
 
 
 @pytest.mark.parametrize("reference", [f"{LOG}:truth", str(LOG)])
-def test_loop_tum_file_has_the_ate_stated_in_the_report(made, found, reference) -> None:
+def test_path_in_loop_tum_file_has_same_ate_as_report(made, found, reference) -> None:
     gated = found["loop"]["corrections"]["pose_graph_gated"]["scores"][TRUTH]
     again = results("evaluate", made[0] / "r.tum", reference, "--alignment", gated["alignment"])
     in_loop, in_evaluate = (score["ate"]["translation_m"]["rmse"] for score in (gated, again))

@@ -104,7 +104,7 @@ def test_read_trajectory_of_every_dialect_gives_equal_poses(dialect: str, tmp_pa
     assert is_ns == any(", unit ns" in note for note in got.notes)
 
 
-def test_read_trajectory_without_unix_clock_has_no_offset(tmp_path: Path) -> None:
+def test_read_trajectory_with_local_clock_has_no_unix_offset(tmp_path: Path) -> None:
     values = text(rows()[:4]).replace("14036365", "")
     assert read_trajectory(write(tmp_path, values)).unix_offset_s is None
     lines = [f"{12_000_000_000 + 33_000_000 * i}.000000 {i} 0 0 0 0 0 1" for i in range(9)]

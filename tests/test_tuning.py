@@ -62,7 +62,7 @@ def test_tune_finds_no_outliers_in_clean_data() -> None:
     assert sum(len(found.outlier_time_s) for found in many()) <= 0.001 * SEEDS * COUNT
 
 
-def test_long_flight_fit_equals_fit_of_all_measurements(
+def test_two_stage_fit_of_long_flight_equals_single_fit(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The fit that starts at the first measurements has the same result, also with outliers."""
@@ -82,7 +82,7 @@ def test_long_flight_fit_equals_fit_of_all_measurements(
     assert set(axis.measurement_time_s[outliers]) <= set(found.outlier_time_s)
 
 
-def test_tune_of_fast_source_finds_outliers_in_skipped_rows() -> None:
+def test_outliers_between_downsampled_positions_are_found() -> None:
     """Only every fourth position is used for the noises at 100 Hz."""
     axis = modelled(4, 2000)
     fast = replace(axis, measurement_time_s=0.01 * np.arange(2001.0))
@@ -106,7 +106,7 @@ def test_true_noises_have_no_likelihood_gain_on_held_out_data() -> None:
     assert np.mean(seen) == pytest.approx(1.0, abs=2.6 / np.sqrt(SEEDS))
 
 
-def test_wrong_noises_show_likelihood_gain_on_held_out_data() -> None:
+def test_noise_estimates_increase_likelihood_of_held_out_data() -> None:
     bad = Settings(sigma_a_m_s2=5.0, sigma_z_m=0.02, input="zero")
     found = tuned(modelled(1), chosen=bad)
     assert found.held_out.log_likelihood_gain_per_measurement > 0.1
@@ -123,7 +123,7 @@ def test_wrong_noises_show_likelihood_gain_on_held_out_data() -> None:
         assert one == pytest.approx(two, rel=1e-4)
 
 
-def test_noise_interval_of_two_axes_is_root_2_below_one_axis() -> None:
+def test_noise_interval_of_two_axes_is_narrower_by_root_2() -> None:
     for seed in range(2):
         north, east = modelled(seed), modelled(seed + 100)
         both = tuned(north, east)
@@ -139,7 +139,7 @@ def test_noise_interval_of_two_axes_is_root_2_below_one_axis() -> None:
 # --- the map ---
 
 
-def test_tuned_noise_intervals_equal_profile_likelihood() -> None:
+def test_noise_interval_ends_where_profile_likelihood_drops() -> None:
     axis = modelled(5)
     found = tuned(axis)
     assert len(found.outlier_time_s) == 0
@@ -178,7 +178,7 @@ def test_tune_on_noise_free_positions_gives_sigma_z_upper_limit(sigma_a: float) 
     assert found.sigma_a.low <= sigma_a <= found.sigma_a.high or sigma_a < 0.1
 
 
-def test_tuned_noise_at_end_of_search_range_has_one_bound() -> None:
+def test_noise_at_end_of_search_range_is_reported_as_bound() -> None:
     noise = np.random.default_rng(0).normal(0.0, 1.0, 300)
     still, wild = (tuned(line(0.2 * np.arange(300), sigma * noise)) for sigma in (0.1, 30.0))
     assert still.sigma_a.value is still.sigma_a.low is None

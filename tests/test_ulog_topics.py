@@ -107,7 +107,7 @@ def test_read_ulog_sets_time_zero_to_first_imu_sample(tmp_path):
     (255, "PX4 v1.16.2"), (192, "PX4 v1.16.2-rc"), (128, "PX4 v1.16.2-beta"),
     (64, "PX4 v1.16.2-alpha"), (0, "PX4 v1.16.2-dev"),
 ])  # fmt: skip
-def test_read_ulog_formats_firmware_version(kind, text):
+def test_firmware_version_of_ulog_includes_release_type(kind, text):
     log = make_log("v1.16", 2.0)
     log.info["ver_sw_release"] = 1 << 24 | 16 << 16 | 2 << 8 | kind
     assert read_topics("made.ulg", log.encode()).log.firmware == text

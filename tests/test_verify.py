@@ -554,7 +554,7 @@ FILES: dict[str, tuple[Callable[[VerifiedReport, VerifiedReport], bytes], set[st
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_verify_gives_expected_outcome_for_each_pdf_change(
+def test_verify_accepts_resaved_pdf_and_rejects_changed_content(
     aisle: VerifiedReport, loop: VerifiedReport, name: str
 ) -> None:
     forge, expected = FILES[name]

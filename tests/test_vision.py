@@ -485,7 +485,7 @@ def test_ekf2_model_of_gnss_and_vision_agrees_with_log() -> None:
     assert model().inputs.settings["EKF2_EVP_NOISE"] == pytest.approx(0.1)
 
 
-def test_what_if_vision_noise_equals_flight_with_this_noise() -> None:
+def test_what_if_vision_noise_gives_nis_of_flight_with_it() -> None:
     other = opened(flown(EKF2_EVP_NOISE=1.0))
     for one, value, then in ((model(), 1.0, other), (other, 0.1, model())):
         found, true = what_if(one, [{"EKF2_EVP_NOISE": value}]), what_if(then, [])
@@ -572,7 +572,7 @@ def test_ekf2_model_with_incomplete_vision_is_unavailable() -> None:
     assert "changes of the vision position" in refused.reason
 
 
-def test_kf_ekf2_difference_on_gnss_flight_includes_vision() -> None:
+def test_gnss_flight_difference_steps_include_vision_fusion() -> None:
     found = steps.explain_by_steps(model())
     for why in found.values():
         names = [step.name for step in why.steps]

@@ -189,7 +189,7 @@ def error(summary: Summary) -> float:
     return float(np.hypot(*parts))
 
 
-def test_what_if_table_shows_no_numbers_if_unpredictable(sample_flight: Flight) -> None:
+def test_what_if_table_omits_numbers_if_not_predictable(sample_flight: Flight) -> None:
     name, sweep = sample_flight.log.name, Sweep("EKF2_EVP_GATE", 1.0, 5.0, 2)
     request = WhatIfRequest(log=name, changes={"EKF2_EVP_NOISE": 0.02}, sweep=sweep)
     assert command_line(request).endswith("--set EKF2_EVP_NOISE=0.02 --sweep EKF2_EVP_GATE=1:5:2")

@@ -53,7 +53,7 @@ def test_position_difference_on_report_page_is_kf_minus_ekf2(sample: Analysis) -
     )
 
 
-def test_kf_setting_changes_only_its_part_of_ekf2_difference(sample: Analysis) -> None:
+def test_kf_setting_changes_only_its_own_difference_step(sample: Analysis) -> None:
     plain = of(sample)
     zero = explain_again(sample, Settings(input="zero"))
     assert zero.steps[0].name == SAMPLES_STEP

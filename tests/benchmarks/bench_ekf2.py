@@ -124,7 +124,7 @@ def agreement_page(models: dict[str, Model], left: dict[str, float]) -> str:
     """Return the table of agreement for the documentation."""
     lines = [
         "| flight | innovations | correlation | S replayed / logged | rejected | "
-        "position difference (m) | unexplained | height |",
+        "position difference (m) | KF - EKF2 unexplained | height: correlation, RMS (m) |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for name, model in models.items():
