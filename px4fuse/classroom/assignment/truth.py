@@ -25,7 +25,7 @@ from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest
 from px4fuse.results.answer_form import (
-    GATE_FURTHER_UPDATES,
+    FURTHER_GATE_UPDATE_COUNT,
     Choice,
     ChoiceName,
     FormQuestion,
@@ -233,15 +233,15 @@ def compute_numeric_answer(
     """
     settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)
     kf_replay = replay(axis_comparison.axis, settings)
-    updates = kf_replay.updates.iloc[question.update - 1 :]
+    updates = kf_replay.updates.iloc[question.update_number - 1 :]
     if updates.empty:
         return None
     covariance = kf_replay.steps.loc[updates.index[0], COVARIANCE_COLUMNS]
     nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
     match question.kind:
         case "gate":
-            is_outside = nis.iloc[: GATE_FURTHER_UPDATES + 1] > question.duration_s_or_gate**2
-            rejected_update_numbers = np.flatnonzero(is_outside) + question.update
+            is_outside = nis.iloc[: FURTHER_GATE_UPDATE_COUNT + 1] > question.duration_s_or_gate**2
+            rejected_update_numbers = np.flatnonzero(is_outside) + question.update_number
             return tuple(rejected_update_numbers.astype(float).tolist())
         case "prediction":
             p, f = symmetric_matrix(tuple(covariance)), transition(settings.dt_s)
