@@ -9,7 +9,7 @@ import numpy as np
 from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
-from px4fuse.comparison.preparation import prepare
+from px4fuse.comparison.preparation import prepare_comparison_inputs
 from px4fuse.core.record import Record, read_toml
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.model import (
@@ -135,7 +135,7 @@ def compute_form_answers(simulation: flights.Simulation, log_sha256: str) -> Rig
 def compare_simulation(simulation: flights.Simulation) -> Comparison:
     """Analyse a simulated flight with the default settings of KF."""
     flight = flights.to_flight(simulation)
-    preparation = prepare(
+    preparation = prepare_comparison_inputs(
         flight,
         ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M),
         keep_as_sent=True,  # do not correct frame and clock: the student has to find these faults
