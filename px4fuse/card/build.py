@@ -367,8 +367,10 @@ def _format_actions(causes: Sequence[Cause]) -> tuple[str, ...]:
         return ("Change nothing.",)
     numbered_sentences: list[str] = []
     for number, cause in enumerate(causes, 1):
-        alternatives = [_format_action(action) for group in cause.alternatives for action in group]
-        sentences = [", or ".join(alternatives)] if alternatives else []
+        alternative_texts = [
+            _format_action(action) for group in cause.alternatives for action in group
+        ]
+        sentences = [", or ".join(alternative_texts)] if alternative_texts else []
         sentences += [
             _format_action(action)
             for action in cause.actions

@@ -12,8 +12,8 @@ from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
 from px4fuse.comparison.model import FILTER_NAMES, FilterName
 from px4fuse.comparison.remedy import select_changed_settings
 from px4fuse.comparison.trials import (
-    CLOCK_OFFSET,
-    OUTLIERS,
+    CLOCK_OFFSET_KEY,
+    OUTLIERS_KEY,
     Trial,
     becomes_consistent,
     classify_improvement,
@@ -210,7 +210,7 @@ def _make_actions(
         delay_actions = [make_parameter_action(analysis, delay_change)]
     # users cannot shift the timestamps of a GNSS receiver
     if offset_trial and not (analysis.source.origin.is_gnss and sender_actions):
-        shift_s = offset_trial.change[CLOCK_OFFSET]
+        shift_s = offset_trial.change[CLOCK_OFFSET_KEY]
         if offset_trial.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
         shift_instruction = lower_first(format_shift(shift_s))
@@ -233,9 +233,9 @@ def _make_actions(
             default_settings = default_trial.change if default_trial else {}
             change, alignment = trial.change, analysis.source.alignment
             # --clock-offset replaces the alignment's time offset, so it must include that offset
-            if CLOCK_OFFSET in change and alignment:
-                total_s = change[CLOCK_OFFSET] + alignment.clock_offset_s
-                change = {**change, CLOCK_OFFSET: round(total_s, 3)}
+            if CLOCK_OFFSET_KEY in change and alignment:
+                total_s = change[CLOCK_OFFSET_KEY] + alignment.clock_offset_s
+                change = {**change, CLOCK_OFFSET_KEY: round(total_s, 3)}
             actions.append(make_rerun_action(request, change, default_settings))
         elif filter_name == "ekf2" and kind != "delay":
             changes = {name: value for name, value in trial.change.items() if name in PARAMETERS}
@@ -353,8 +353,8 @@ def _make_rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
 
 def _format_trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
     kind, label = trial.kinds[0], "KF" if trial.filter == "kf" else "EKF2 (replay)"
-    if OUTLIERS in trial.change:
-        return f"{label} without {trial.change[OUTLIERS]:.0f} outliers"
+    if OUTLIERS_KEY in trial.change:
+        return f"{label} without {trial.change[OUTLIERS_KEY]:.0f} outliers"
     if trial.filter == "kf":
         options_text = " ".join(
             f"{COMPARISON_OPTIONS[name]} {value:g}"

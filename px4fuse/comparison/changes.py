@@ -16,12 +16,12 @@ from px4fuse.comparison.remedy import (
     make_estimated_noise_change,
 )
 from px4fuse.comparison.trials import (
-    CLOCK_OFFSET,
+    CLOCK_OFFSET_KEY,
     DISCREPANCY_STATISTICS,
-    FORWARD_BIAS,
-    OUTLIERS,
-    RIGHT_BIAS,
-    ROTATION,
+    FORWARD_BIAS_KEY,
+    OUTLIERS_KEY,
+    RIGHT_BIAS_KEY,
+    ROTATION_KEY,
     SECONDARY_CHANGE_KEYS,
     Change,
     Statistic,
@@ -41,11 +41,11 @@ SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
 KIND_BY_KF_CHANGE = {
     SIGMA_A: "noises",
     SIGMA_Z: "noises",
-    OUTLIERS: "outliers",
-    CLOCK_OFFSET: "time offset",
-    ROTATION: "rotation",
-    FORWARD_BIAS: "bias",
-    RIGHT_BIAS: "bias",
+    OUTLIERS_KEY: "outliers",
+    CLOCK_OFFSET_KEY: "time offset",
+    ROTATION_KEY: "rotation",
+    FORWARD_BIAS_KEY: "bias",
+    RIGHT_BIAS_KEY: "bias",
 }
 # KF settings that re-runs change. All other changes in re-runs of KF correct the data, for example
 # outliers
@@ -91,7 +91,7 @@ def find_candidate_changes(
             else _find_ekf2_noise_changes(ekf2_inputs, summary, axis_tuning)
         )
     if axis_tuning is not None and not is_underconfident and len(axis_tuning.outlier_time_s):
-        changes.append({OUTLIERS: float(len(axis_tuning.outlier_time_s))})
+        changes.append({OUTLIERS_KEY: float(len(axis_tuning.outlier_time_s))})
     delay_parameters = (
         {}
         if ekf2_inputs is None
@@ -104,7 +104,7 @@ def find_candidate_changes(
         return changes
     if isinstance(heading := estimates.heading, HeadingError):
         is_significant = abs(heading.misalignment_deg) > MIN_MISALIGNMENT_SIGMAS * heading.sigma_deg
-        changes += [{ROTATION: -round(heading.misalignment_deg, 1)}] if is_significant else []
+        changes += [{ROTATION_KEY: -round(heading.misalignment_deg, 1)}] if is_significant else []
     if ekf2_inputs is None:
         return changes + _find_bias_changes(estimates)
     changes += _find_default_changes(comparison.flight.log, ekf2_inputs)
@@ -190,7 +190,7 @@ def _find_offset_changes(estimates: Estimates, ekf2_inputs: Inputs | None) -> li
         clock_offset.remaining_s if ekf2_inputs is None else clock_offset.offset_s
     ):
         return []
-    change = {CLOCK_OFFSET: round(clock_offset.offset_s, 3)}
+    change = {CLOCK_OFFSET_KEY: round(clock_offset.offset_s, 3)}
     if ekf2_inputs is not None:
         position_age_ms = ekf2_inputs.settings[ekf2_inputs.aid.delay] - 1e3 * clock_offset.offset_s
         change |= make_delay_max_change(ekf2_inputs.settings, position_age_ms)
@@ -225,8 +225,8 @@ def _find_bias_changes(estimates: Estimates) -> list[Change]:
     if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_significant_bias():
         return []
     biases = {
-        FORWARD_BIAS: systematic_errors.accelerometer_bias_forward,
-        RIGHT_BIAS: systematic_errors.accelerometer_bias_right,
+        FORWARD_BIAS_KEY: systematic_errors.accelerometer_bias_forward,
+        RIGHT_BIAS_KEY: systematic_errors.accelerometer_bias_right,
     }
     return [{name: round(bias.value, 3) for name, bias in biases.items()}]
 

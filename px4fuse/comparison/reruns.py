@@ -39,13 +39,13 @@ from px4fuse.comparison.model import (
 from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_source_fused
 from px4fuse.comparison.trials import (
-    CLOCK_OFFSET,
+    CLOCK_OFFSET_KEY,
     DISCREPANCY_STATISTICS,
-    FORWARD_BIAS,
+    FORWARD_BIAS_KEY,
     MIN_REPORTED_NEES,
-    OUTLIERS,
-    RIGHT_BIAS,
-    ROTATION,
+    OUTLIERS_KEY,
+    RIGHT_BIAS_KEY,
+    ROTATION_KEY,
     Change,
     RunStatistics,
     Statistic,
@@ -348,9 +348,12 @@ def _rerun_kf(
         name: change[name] for name in change if name in vars(Settings())
     }
     changed_settings = replace(comparison.settings, **kf_settings)
-    truth, rotates_gnss_positions = axis_result.truth, ROTATION in change and source.origin.is_gnss
-    if ROTATION in change:
-        rotated_direction = _rotate_direction(axis.direction, change[ROTATION])
+    truth, rotates_gnss_positions = (
+        axis_result.truth,
+        ROTATION_KEY in change and source.origin.is_gnss,
+    )
+    if ROTATION_KEY in change:
+        rotated_direction = _rotate_direction(axis.direction, change[ROTATION_KEY])
         measured_m = weighted_sum(
             cut_to_segment(source.samples, segment), Columns.POSITION, rotated_direction
         )
@@ -360,12 +363,12 @@ def _rerun_kf(
             # instead is equivalent
             rotated_axis = replace(axis, direction=rotated_direction)
             truth = project_truth(comparison.flight.truth, rotated_axis, segment)
-    if FORWARD_BIAS in change:
+    if FORWARD_BIAS_KEY in change:
         acceleration = _remove_accelerometer_bias(comparison, change, axis.direction)
         axis = replace(axis, acceleration=acceleration)
     time_s, axis_tuning = axis.measurement_time_s, find_axis_tuning(tuning, axis.name)
     is_used = np.ones(len(time_s), dtype=bool)
-    if OUTLIERS in change and axis_tuning is not None:
+    if OUTLIERS_KEY in change and axis_tuning is not None:
         is_used = ~np.isin(time_s, axis_tuning.outlier_time_s)
     shift_s = changed_settings.clock_offset_s - comparison.settings.clock_offset_s
     axis = replace(
@@ -391,7 +394,7 @@ def _remove_accelerometer_bias(
     if isinstance(imu, Unavailable):
         return imu
     accelerometer_bias = pd.Series(
-        [change[FORWARD_BIAS], change[RIGHT_BIAS], 0.0], Columns.SPECIFIC_FORCE
+        [change[FORWARD_BIAS_KEY], change[RIGHT_BIAS_KEY], 0.0], Columns.SPECIFIC_FORCE
     )
     flight = replace(flight, imu=imu.assign(**(imu[Columns.SPECIFIC_FORCE] - accelerometer_bias)))
     return project_acceleration(ned_acceleration(flight), direction, comparison.segment)
@@ -404,14 +407,14 @@ def _replay_ekf2(
         return model.baseline_replay
     changed_parameters = {name: value for name, value in change.items() if name in PARAMETERS}
     misaligned_model = with_misaligned_positions(
-        model, change.get(ROTATION, 0.0), change.get(CLOCK_OFFSET, 0.0)
+        model, change.get(ROTATION_KEY, 0.0), change.get(CLOCK_OFFSET_KEY, 0.0)
     )
     excluded_times_s, axis_tuning = None, find_axis_tuning(tuning, HORIZONTAL)
-    if OUTLIERS in change and axis_tuning is not None:
+    if OUTLIERS_KEY in change and axis_tuning is not None:
         excluded_times_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
         if comparison.source.origin.fused_as_gnss:
             excluded_times_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
-        excluded_times_s += change.get(CLOCK_OFFSET, 0.0)
+        excluded_times_s += change.get(CLOCK_OFFSET_KEY, 0.0)
     (replay,) = replay_with_settings(misaligned_model, [changed_parameters], excluded_times_s)
     return replay
 
@@ -429,9 +432,9 @@ def _summarise_replay(
     before and after each update, because the replay contains no variance between updates.
     """
     evaluated_spans_s, axis = model.baseline_replay.find_evaluated_spans(), axis_result.axis
-    if ROTATION in change and comparison.source.origin.is_gnss:
+    if ROTATION_KEY in change and comparison.source.origin.is_gnss:
         # EKF2's frame rotates with the GNSS positions, so the axis is rotated by the same angle
-        axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))
+        axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION_KEY]))
     cosines, ekf2_updates = axis.direction[:2], ekf2_replay.updates
     ekf2_updates = rows_inside(ekf2_updates, evaluated_spans_s)
     innovation_variance_m2 = weighted_sum(ekf2_updates, INNOVATION_VARIANCE_COLUMNS, cosines**2)

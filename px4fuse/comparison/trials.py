@@ -12,18 +12,18 @@ from px4fuse.filter.consistency import Reference, classify_sigma_ratio, compute_
 from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
-# Statistics that a change may bring inside the limits of a consistent filter
+# Statistics that show if a change makes a filter consistent
 DISCREPANCY_STATISTICS: tuple[Statistic, Statistic] = ("nees", "nis")
 # Values of KF settings, EKF2 parameters and corrections of the data, by name
 Change = Mapping[str, float]
 # Keys of Trial.change for corrections of the data, not of parameters
-CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
-FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
+CLOCK_OFFSET_KEY, ROTATION_KEY, OUTLIERS_KEY = "clock_offset_s", "turned_deg", "outliers_left_out"
+FORWARD_BIAS_KEY, RIGHT_BIAS_KEY = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
 # Position errors are reported if the mean NEES exceeds this limit (2 reported σ): flights without a
 # fault have a mean NEES below 3
 MIN_REPORTED_NEES = 4.0
-# Maximum mean NEES after a noise is reduced, if the mean NEES exceeds 1 with the original noise
+# A smaller noise makes a filter overconfident if the mean NEES was above 1 and reaches this limit
 MAX_NEES_AFTER_CHANGE = 2.0
 # A change may be the cause if it removes a fraction of 1 ± this tolerance of ln(mean NIS) or
 # ln(mean NEES), which are 0 for a consistent filter
@@ -33,9 +33,9 @@ SENSOR_CAUSE_TOLERANCE = 0.25
 # Changes are combined in one re-run if each alone removes a fraction of 1 ± this tolerance
 COMBINATION_TOLERANCE = 0.9
 # Keys of Trial.change that correct faulty sensor data; other keys change settings of a filter
-SENSOR_CHANGE_KEYS = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
+SENSOR_CHANGE_KEYS = frozenset((OUTLIERS_KEY, CLOCK_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
 # Keys of Trial.change that have an effect only together with another change
-SECONDARY_CHANGE_KEYS = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
+SECONDARY_CHANGE_KEYS = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS_KEY))
 # A re-run has an effect if it changes a ratio of actual to reported σ by at least this factor
 MIN_SIGMA_RATIO_FACTOR = 1.10
 # A re-run has an effect if it changes the position RMSE by more than this fraction

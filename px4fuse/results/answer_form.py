@@ -359,15 +359,15 @@ def check_answers(answers: Answers) -> None:
         _require_choice("ekf2_did", behaviour, EKF2_BEHAVIOURS)
     for named_fault in answers.mistakes:
         fault_kind = FAULT_KINDS[named_fault.kind]
-        for field, choices in (
+        for field_name, choices in (
             ("parameter", UNITS_BY_CORRECTION),
             ("panel", PANELS),
             ("unit", fault_kind.units),
             ("value_unit", UNITS_BY_CORRECTION.get(named_fault.parameter)),
         ):
-            chosen_name = getattr(named_fault, field)
+            chosen_name = getattr(named_fault, field_name)
             if chosen_name and choices is not None:
-                _require_choice(f"{named_fault.kind}: {field}", chosen_name, choices)
+                _require_choice(f"{named_fault.kind}: {field_name}", chosen_name, choices)
         min_size, max_size = fault_kind.size_range
         size = named_fault.convert_size_to_first_unit()
         if size is not None and not min_size <= size <= max_size:
@@ -378,11 +378,11 @@ def check_answers(answers: Answers) -> None:
             )
 
 
-def _require_choice(field: str, value: str, choices: Any) -> None:
+def _require_choice(field_name: str, value: str, choices: Any) -> None:
     if value not in choices:
         choices_text = _join_quoted(choices)
         fault = f"is not one of {choices_text}" if choices_text else "must be left empty"
-        raise ValueError(f"{field} {value!r} {fault}")
+        raise ValueError(f"{field_name} {value!r} {fault}")
 
 
 def form_name(log_name: str) -> str:
