@@ -35,7 +35,11 @@ from px4fuse.comparison.estimates import (
 )
 from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison, PreparedComparison
-from px4fuse.comparison.preparation import explain_missing_source, prepare, shift_clock
+from px4fuse.comparison.preparation import (
+    explain_missing_source,
+    prepare_comparison_inputs,
+    shift_clock,
+)
 from px4fuse.comparison.remedy import estimate_ekf2_parameters
 from px4fuse.comparison.reruns import Reruns, list_rerun_configurations, rerun_filters
 from px4fuse.convention.correction import find_convention_faults
@@ -173,8 +177,8 @@ def find_faults(comparison: Comparison, progress: Progress = ignore_progress) ->
 def refine_delay(comparison: Comparison, clock: ClockOffset | Unavailable) -> Comparison:
     """Replace the detected delay of the position timestamps by the more precise estimate ``clock``.
 
-    KF is not run again: :func:`prepare` has already corrected the detected delay, and later re-runs
-    test the remaining offset ``clock.remaining_s``.
+    KF is not run again: :func:`prepare_comparison_inputs` has already corrected the detected delay,
+    and later re-runs test the remaining offset ``clock.remaining_s``.
     """
     if comparison.convention is None or isinstance(clock, Unavailable) or not clock.is_determinable:
         return comparison
@@ -235,7 +239,7 @@ def prepare_comparison(
 
     For arguments and errors see :func:`diagnose`.
     """
-    prepared_comparison = prepare(flight, request, keep_as_sent=keep_as_sent)
+    prepared_comparison = prepare_comparison_inputs(flight, request, keep_as_sent=keep_as_sent)
     # read_flight has already corrected the time offset of a position file
     if request.clock_offset_s != AUTO or request.position is not None:
         return prepared_comparison
@@ -256,7 +260,7 @@ def prepare_comparison(
             note += f". The check of the timestamps has already applied {clock.applied_s:+.3f} s"
         return replace(prepared_comparison, notes=(*prepared_comparison.notes, note))
     request = structs.replace(request, clock_offset_s=clock.offset_s)
-    return prepare(flight, request, keep_as_sent=keep_as_sent)
+    return prepare_comparison_inputs(flight, request, keep_as_sent=keep_as_sent)
 
 
 def rerun(
@@ -346,7 +350,7 @@ def run_what_if(
     try:
         if ekf2_model.agreement.good and not flight.log.is_assessed:
             comparison_request = structs.replace(comparison_request, axes=("north", "east", AISLE))
-            prepared_comparison = prepare(flight, comparison_request)
+            prepared_comparison = prepare_comparison_inputs(flight, comparison_request)
             comparison = compare(prepared_comparison, run_kf(prepared_comparison))
     except MissingDataError:  # only needed to estimate the parameters, if the user gave none
         if is_default_change:

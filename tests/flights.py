@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from px4fuse.analysis import Analysis
-from px4fuse.comparison.estimates import Estimates, Tuning
+from px4fuse.comparison.estimates import Estimates, TuningByAxis
 from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.noise_differences import find_noisy_part, tune_by_axis
@@ -340,14 +340,14 @@ def given_placement(*warnings: str) -> Alignment:
     )  # fmt: skip
 
 
-def unexplained(comparison: Comparison, tuning: Tuning | None = None) -> Analysis:
+def unexplained(comparison: Comparison, tuning: TuningByAxis | None = None) -> Analysis:
     """Return an analysis of the comparison without estimates other than ``tuning``."""
     parts = {part.name: getattr(comparison, part.name) for part in fields(Comparison)}
     missing = unavailable("estimates")
     estimates = Estimates(
         tuning=tuning or {}, clock=missing, heading=missing, systematic_errors=missing,
         source_low_pass=missing, time_correlated_noise=missing,
-        tuning_by_axis=tune_by_axis(comparison),
+        axis_tunings=tune_by_axis(comparison),
         noisy_part=find_noisy_part(comparison, (tuning or {}).get(HORIZONTAL)),
     )  # fmt: skip
     trials = rerun_filters(comparison, estimates, missing)

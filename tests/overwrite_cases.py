@@ -15,7 +15,7 @@ from conftest import REPORT, SAMPLES
 from ulog_tools import make_log
 
 from px4fuse.classroom.assignment.key import AnswerKey, format_answer_key
-from px4fuse.results.answer_form import form_text
+from px4fuse.results.answer_form import format_answer_form
 
 # Command, its inputs, its options for an output file (with the required ending), and the names that
 # it writes to the folder of -o ("" for the folder itself)
@@ -61,7 +61,7 @@ def make_desk(folder: Path) -> Path:
         "l.ulg": log, "logs/x.ulg": log,
         "pos.csv": (SAMPLES / "aisle_uwb_external.csv").read_bytes(),
         "notes.md": b"words",
-        "form.toml": form_text("l.ulg", hashlib.sha256(log).hexdigest()).encode(),
+        "form.toml": format_answer_form("l.ulg", hashlib.sha256(log).hexdigest()).encode(),
         "r.pdf": report, "subs/s1.pdf": report,
         "subs/in/s2.pdf": report, "q.json": REPORT.with_suffix(".json").read_bytes(),
         "a.tum": (SAMPLES / "loop_slam.tum").read_bytes(),

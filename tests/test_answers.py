@@ -18,7 +18,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.results.answer_form import (
     FAULT_KINDS,
     NamedFault,
-    form_text,
+    format_answer_form,
     read_answers,
     select_questions,
 )
@@ -27,7 +27,7 @@ from px4fuse.results.reading import read_results
 from px4fuse.simulation.faults import FAULT_TYPES as SIMULATED
 
 SHA256 = "b" * 64
-EMPTY = form_text("s07.ulg", SHA256)
+EMPTY = format_answer_form("s07.ulg", SHA256)
 CLAIM = '[[mistake]]\nkind = "{}"\n{}\n'
 
 
@@ -105,7 +105,7 @@ def test_answer_form_questions_differ_for_each_log() -> None:
     main = compare(aisle_flight(duration_s=60.0)).main
     for quantity in next(iter(drawn)):
         run = replay(main.axis, Settings(quantity.sigma_a_m_s2, quantity.sigma_z_m))
-        row = run.updates.iloc[quantity.update - 1]
+        row = run.updates.iloc[quantity.update_number - 1]
         s, p = row["innovation_variance_m2"], row["prior_position_variance_m2"]
         by_hand = {
             "gain": p / s, "variance": p * (1.0 - p / s), "nis": row["innovation_m"] ** 2 / s,
@@ -123,7 +123,7 @@ def test_expected_answer_for_predicted_sigma_equals_closed_form() -> None:
     )
     settings = Settings(quantity.sigma_a_m_s2, quantity.sigma_z_m)
     run = replay(main.axis, settings)
-    at = run.updates.index[quantity.update - 1]
+    at = run.updates.index[quantity.update_number - 1]
     p0, p1, p2 = run.steps.loc[at, ["position_variance_m2", "covariance_m2_s",
                                     "velocity_variance_m2_s2"]]  # fmt: skip
     dt, n = settings.dt_s, round(quantity.duration_s_or_gate / settings.dt_s)
@@ -155,7 +155,7 @@ def test_answers_option_of_compare_prints_answer_form_in_report(
 
 def test_student_answers_about_another_log_are_rejected(tmp_path: Path, sample_log: Path) -> None:
     form = tmp_path / "f.toml"
-    form.write_text(form_text(sample_log.name, SHA256), encoding="utf-8")
+    form.write_text(format_answer_form(sample_log.name, SHA256), encoding="utf-8")
     for command in ("compare", "loop"):
         said = error_line(command, sample_log, "--answers", form, "-o", tmp_path / "r.pdf")
         assert "f.toml was made for another log than" in said

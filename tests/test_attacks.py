@@ -39,7 +39,7 @@ from px4fuse.classroom.grading.rubric import (
 )
 from px4fuse.errors import ResultsError
 from px4fuse.report import pdf as pdf_module
-from px4fuse.results.answer_form import form_text
+from px4fuse.results.answer_form import format_answer_form
 from px4fuse.results.contract import ReportedResults
 from px4fuse.simulation import flights
 from px4fuse.simulation.faults import parse_faults
@@ -119,7 +119,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     log, notes, pdf = (folder / name for name in ("s01.ulg", "notes.md", "report.pdf"))
     simulation = flights.simulate(scenario, parse_faults(FAULT_TYPES))
     log.write_bytes(flights.to_ulog(simulation))
-    form = form_text(log.name, hashlib.sha256(log.read_bytes()).hexdigest())
+    form = format_answer_form(log.name, hashlib.sha256(log.read_bytes()).hexdigest())
     form = form.replace('kind = ""', 'kind = "nlos"', 1) + GAP
     (folder / "a.toml").write_text(form, encoding="utf-8")
     notes.write_text(HONEST, encoding="utf-8")

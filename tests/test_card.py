@@ -11,7 +11,7 @@ from comparisons import compare
 from exchange import replace
 
 from px4fuse.analysis import Analysis
-from px4fuse.card.build import build_card, build_refusal_card
+from px4fuse.card.build import build_card, build_unusable_log_card
 from px4fuse.card.causes import make_cause, rank_causes
 from px4fuse.card.model import Action
 from px4fuse.comparison.trials import RunStatistics, Trial, classify_improvement
@@ -172,7 +172,7 @@ def test_diagnosis_of_unreadable_log_shows_first_bytes_of_file(tmp_path) -> None
     path.write_bytes(b"\xa3\x95\x80\x01" * 300)
     with pytest.raises(LogError) as caught:
         read_log(path)
-    lines = [text for line in card_lines(build_refusal_card(caught.value, path)) for text in
+    lines = [text for line in card_lines(build_unusable_log_card(caught.value, path)) for text in
              line.wrap(100)]  # fmt: skip
     assert lines == [
         "error[log_unreadable]: a.bin: the file is an ArduPilot DataFlash log, not a PX4 ULog",
@@ -180,7 +180,7 @@ def test_diagnosis_of_unreadable_log_shows_first_bytes_of_file(tmp_path) -> None
         "  fix      Give the MAVLink recording (.tlog) of the ground station.",
         "No file was written. Exit code 2.",
     ]
-    missing = build_refusal_card(LogError("b.ulg: cannot be read"), tmp_path / "b.ulg")
+    missing = build_unusable_log_card(LogError("b.ulg: cannot be read"), tmp_path / "b.ulg")
     assert missing.facts == {}
 
 
@@ -200,7 +200,6 @@ def test_diagnosis_explains_differing_nis_and_nees_verdicts() -> None:
         "position and σ",
     )
     assert card.reconcile == (
-        "The σ ratio of EKF2 against the position source differs from that against ground truth, "
-        "because innovations show little of the first fault of this card. The re-run without this "
-        "fault reduces the position error."
+        "The innovations of EKF2 show little of the first fault on this card; the errors against "
+        "ground truth show it. The re-run without this fault reduces the position error."
     )

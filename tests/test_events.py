@@ -32,8 +32,8 @@ def test_flight_events_outside_evaluated_segment_are_excluded() -> None:
     assert (start, end) == pytest.approx((60.0, 65.0), abs=0.21)
     assert found.dropouts == ((10.0, 11.0), (50.0, 50.5))
     assert found.ground_spans_s == ((10.0, 20.0), (70.0, 80.0))
-    assert (found.take_off_s, found.landing_s) == ((20.0, 80.0), (70.0,))
-    assert found.resets_s == (30.0,)
+    assert (found.take_off_times_s, found.landing_times_s) == ((20.0, 80.0), (70.0,))
+    assert found.reset_times_s == (30.0,)
 
 
 def test_time_without_positions_is_plotted_but_not_evaluated() -> None:
@@ -44,7 +44,7 @@ def test_time_without_positions_is_plotted_but_not_evaluated() -> None:
     chosen = compare(flight, end_s=100.0).segment
     assert (chosen.end_s, chosen.flight.end_s) == (80.0, 100.0)
     events = collect_events(whole)
-    assert (events.gaps, events.resets_s, events.landing_s) == (
+    assert (events.gaps, events.reset_times_s, events.landing_times_s) == (
         ((80.0, 120.0),),
         (100.0,),
         (120.0,),
@@ -63,8 +63,10 @@ def test_flight_events_list_rejections_per_axis() -> None:
     found = collect_events(comparison)
     for result in comparison.axes.values():
         frame = result.ekf2_innovations
-        assert list(found.rejected_s[result.axis.name]) == list(frame.index[frame["rejected"] > 0])
-    assert len(found.rejected_s["aisle"]) > 50
+        assert list(found.rejection_times_s[result.axis.name]) == list(
+            frame.index[frame["rejected"] > 0]
+        )
+    assert len(found.rejection_times_s["aisle"]) > 50
 
 
 def test_flight_without_ekf2_and_land_detector_has_no_events() -> None:
@@ -72,6 +74,10 @@ def test_flight_without_ekf2_and_land_detector_has_no_events() -> None:
     absent = Unavailable("land detector", "no topic", "Record it.")
     found = collect_events(compare(replace(flight, airborne=absent)))
     assert (found.gaps, found.dropouts, found.ground_spans_s) == ((), (), ())
-    assert (found.take_off_s, found.resets_s, dict(found.rejected_s)) == ((), (), {})
+    assert (found.take_off_times_s, found.reset_times_s, dict(found.rejection_times_s)) == (
+        (),
+        (),
+        {},
+    )
     never = compare(replace(flight, airborne=()))
     assert collect_events(never).ground_spans_s == ((never.segment.start_s, never.segment.end_s),)

@@ -14,7 +14,12 @@ from px4fuse.classroom.assignment.figures import (
     select_choices,
 )
 from px4fuse.classroom.assignment.random_assignment import draw_uniform
-from px4fuse.results.answer_form import CHOICE_NAMES, MAX_CHOICES, MAX_FORM_BYTES, form_text
+from px4fuse.results.answer_form import (
+    CHOICE_NAMES,
+    MAX_CHOICES,
+    MAX_FORM_BYTES,
+    format_answer_form,
+)
 
 
 def test_right_answers_on_each_figure_describe_the_same_fault() -> None:
@@ -26,7 +31,7 @@ def test_right_answers_on_each_figure_describe_the_same_fault() -> None:
             right = [(choice.answer_text(letter), field) for (choice, letter), field in rows]
             fault = next(each for each in FIGURE_FAULTS.values() if each.fault == right[0][0])
             assert all(getattr(fault, field) == text for text, field in right)
-        form = form_text("s.ulg", "0" * 64, [choice for choice, _ in choices])
+        form = format_answer_form("s.ulg", "0" * 64, [choice for choice, _ in choices])
         assert len(form.encode()) < MAX_FORM_BYTES
 
 

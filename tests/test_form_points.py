@@ -31,9 +31,9 @@ from px4fuse.classroom.grading.form_points import (
 from px4fuse.cli.simulate import simulate
 from px4fuse.core.text import convert_nested
 from px4fuse.results.answer_form import (
-    CORRECTIONS,
     FAULT_KINDS,
     PANELS,
+    UNITS_BY_CORRECTION,
     Answers,
     Choice,
     NamedFault,
@@ -104,7 +104,7 @@ def test_answer_form_offers_correct_answers_for_each_fault() -> None:
     assert set(POINTS_TABLE["shows"]) | {"cover"} == set(PANELS)
     for name in SIMULATED:
         offered = find_accepted_corrections(InjectedFault(name, 1.0, 0.85, 1.15, 10.0, 20.0), TRUTH)
-        assert {cure for cure, _, _ in offered} <= set(CORRECTIONS)
+        assert {cure for cure, _, _ in offered} <= set(UNITS_BY_CORRECTION)
         assert max(share for _, _, share in offered) == 1.0
         assert set(find_panels(name)) > {"cover"}
 
@@ -244,8 +244,10 @@ def answers_of(form: dict[str, Any]) -> Answers:
     claims = []
     for one in form["mistakes"] or []:
         when = one["when"]
-        parameter = one["parameter"] if one["parameter"] in CORRECTIONS else ""
-        unit = one["value_unit"] if one["value_unit"] in CORRECTIONS.get(parameter, {}) else ""
+        parameter = one["parameter"] if one["parameter"] in UNITS_BY_CORRECTION else ""
+        unit = (
+            one["value_unit"] if one["value_unit"] in UNITS_BY_CORRECTION.get(parameter, {}) else ""
+        )
         claims.append(
             NamedFault(
                 one["kind"], one["size"],

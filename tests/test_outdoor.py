@@ -22,7 +22,7 @@ from px4fuse.comparison.projection import project as project_state
 from px4fuse.comparison.remedy import find_aid
 from px4fuse.comparison.reruns import POSITION_VARIANCE_COLUMNS
 from px4fuse.comparison.trials import (
-    ROTATION,
+    ROTATION_KEY,
     brings_inside_limits,
     compute_explained_fraction,
     find_cause_trial,
@@ -168,7 +168,7 @@ def test_simulated_outdoor_fault_is_reported_first(mistake: str, root: str) -> N
 @pytest.mark.parametrize(
     ("mistake", "of", "name", "value", "within"),
     [
-        ("heading=20", "nees", ROTATION, 20.0, 3.0),
+        ("heading=20", "nees", ROTATION_KEY, 20.0, 3.0),
         ("clock-offset=-0.1", "nees", "EKF2_GPS_DELAY", 10.0, 60.0),
         ("r-scale=0.1", "nis", "EKF2_GPS_P_NOISE", 0.4, 0.02),
     ],

@@ -15,10 +15,10 @@ from px4fuse.comparison.reruns import (
     rerun_filters,
 )
 from px4fuse.comparison.trials import (
-    CLOCK_OFFSET,
-    FORWARD_BIAS,
-    OUTLIERS,
-    ROTATION,
+    CLOCK_OFFSET_KEY,
+    FORWARD_BIAS_KEY,
+    OUTLIERS_KEY,
+    ROTATION_KEY,
     RunStatistics,
     Trial,
     brings_inside_limits,
@@ -26,7 +26,7 @@ from px4fuse.comparison.trials import (
     find_cause_trial,
     find_trials,
 )
-from px4fuse.comparison.trials import RIGHT_BIAS as TO_RIGHT
+from px4fuse.comparison.trials import RIGHT_BIAS_KEY as TO_RIGHT
 from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.model import replay_with_settings, with_misaligned_positions, with_position_noise
@@ -62,17 +62,19 @@ def test_filter_reruns_of_consistent_flight_report_no_cause() -> None:
         ("", {"sigma_z": 0.03}, "kf", "nis", {"sigma_z_m": (0.1, 0.01)}),
         ("", {"sigma_z": 0.4}, "kf", "nis", {"sigma_z_m": (0.1, 0.01)}),
         ("", {"sigma_a": 0.02}, "kf", "nis", {"sigma_a_m_s2": (0.27, 0.05)}),
-        ("nlos=7%", {}, "kf", "nis", {OUTLIERS: (25, 4)}),
-        ("nlos=7%", {}, "ekf2", "nis", {OUTLIERS: (25, 4)}),
-        ("nlos=7%", {"sigma_z": 0.05}, "kf", "nis", {OUTLIERS: (25, 4), "sigma_z_m": (0.1, 0.01)}),
-        (LATE, {}, "kf", "nees", {CLOCK_OFFSET: (-0.25, 0.06)}),
+        ("nlos=7%", {}, "kf", "nis", {OUTLIERS_KEY: (25, 4)}),
+        ("nlos=7%", {}, "ekf2", "nis", {OUTLIERS_KEY: (25, 4)}),
+        ("nlos=7%", {"sigma_z": 0.05}, "kf", "nis",
+         {OUTLIERS_KEY: (25, 4), "sigma_z_m": (0.1, 0.01)}),
+        (LATE, {}, "kf", "nees", {CLOCK_OFFSET_KEY: (-0.25, 0.06)}),
         (LATE, {}, "ekf2", "nees",
          {"EKF2_EV_DELAY": (250, 60), "EKF2_DELAY_MAX": (300, 0)}),
         # no parameter of EKF2 shifts positions to an earlier time than their timestamp
-        ("clock-offset=-0.19", {}, "ekf2", "nees", {CLOCK_OFFSET: (0.19, 0.06)}),
-        ("accel-bias=0.5", {}, "kf", "nis", {FORWARD_BIAS: (0.5, 0.03), TO_RIGHT: (-0.04, 0.03)}),
-        ("yaw=20", {}, "kf", "nees", {ROTATION: (-20, 4)}),
-        ("yaw=20", {}, "ekf2", "nees", {ROTATION: (-20, 4)}),
+        ("clock-offset=-0.19", {}, "ekf2", "nees", {CLOCK_OFFSET_KEY: (0.19, 0.06)}),
+        ("accel-bias=0.5", {}, "kf", "nis",
+         {FORWARD_BIAS_KEY: (0.5, 0.03), TO_RIGHT: (-0.04, 0.03)}),
+        ("yaw=20", {}, "kf", "nees", {ROTATION_KEY: (-20, 4)}),
+        ("yaw=20", {}, "ekf2", "nees", {ROTATION_KEY: (-20, 4)}),
         ("ekf2-noise=0.03", {}, "ekf2", "nis", {"EKF2_EVP_NOISE": (0.1, 0.01)}),
         ("ekf2-noise=0.5", {}, "ekf2", "nis", {"EKF2_EVP_NOISE": (0.1, 0.01)}),
         ("ekf2-gate=1", {"passes": 6}, "ekf2", "nis", {"EKF2_EVP_GATE": (5, 0)}),
@@ -95,7 +97,7 @@ def test_kf_rerun_without_bias_equals_run_on_unbiased_imu() -> None:
     analysis = flown("accel-bias=0.5")
     found, imu = cause(analysis, "kf"), analysis.flight.imu
     without = imu[Columns.SPECIFIC_FORCE] - [
-        found.change[FORWARD_BIAS],
+        found.change[FORWARD_BIAS_KEY],
         found.change[TO_RIGHT],
         0.0,
     ]
@@ -114,7 +116,7 @@ def test_filter_rerun_for_vibration_increases_ekf2_acc_noise() -> None:
 
 def test_time_offset_applied_to_kf_is_also_tested_for_ekf2() -> None:
     bare = flown("clock-offset=-0.19")
-    offset_s = cause(bare, "kf", "nees").change[CLOCK_OFFSET]
+    offset_s = cause(bare, "kf", "nees").change[CLOCK_OFFSET_KEY]
     analysis = find_faults(compare(bare.flight, replace(RIGHT, clock_offset_s=offset_s)))
     assert {row.filter for row in analysis.trials if row.discrepancies} == {"ekf2"}
     again, before = cause(analysis, "ekf2", "nees"), cause(bare, "ekf2", "nees")
@@ -187,9 +189,9 @@ def test_rerun_gives_kf_ekf2_difference_with_and_without_change() -> None:
 
 def test_rerun_with_time_offset_excludes_outliers_at_moved_times() -> None:
     analysis = flown("clock-offset=-0.19", "nlos=7%")
-    count = cause(analysis, "ekf2").change[OUTLIERS]
+    count = cause(analysis, "ekf2").change[OUTLIERS_KEY]
     rows = [one for one in analysis.trials if one.filter == "ekf2" and one.axis == "aisle"]
-    alone = next(one for one in rows if one.change == {OUTLIERS: count})
+    alone = next(one for one in rows if one.change == {OUTLIERS_KEY: count})
     assert brings_inside_limits(alone, "nis")
     model, out = analysis.ekf2_model, analysis.tuning["horizontal"]
     (bare,) = replay_with_settings(model, [{}], out.outlier_time_s)
@@ -227,15 +229,15 @@ def test_cause_must_explain_50_to_150_percent_of_nis_deviation() -> None:
     assert (
         find_cause_trial([part, whole], "kf", "aisle") is whole
     )  # a change into the band precedes a larger share
-    both = one({CLOCK_OFFSET: 0.1, "sigma_z_m": 1.0}, 1.0, into=True)
+    both = one({CLOCK_OFFSET_KEY: 0.1, "sigma_z_m": 1.0}, 1.0, into=True)
     assert find_cause_trial([both, whole], "kf", "aisle") is whole  # fewer changes precede
-    fault = one({CLOCK_OFFSET: 0.1}, 0.9, into=True)
+    fault = one({CLOCK_OFFSET_KEY: 0.1}, 0.9, into=True)
     assert (
         find_cause_trial([whole, fault], "kf", "aisle") is fault
     )  # sensor faults precede settings
     nearly, far = (
-        one({FORWARD_BIAS: 0.3, TO_RIGHT: 0.1}, 0.8),
-        one({FORWARD_BIAS: 0.3, TO_RIGHT: 0.1}, 0.7),
+        one({FORWARD_BIAS_KEY: 0.3, TO_RIGHT: 0.1}, 0.8),
+        one({FORWARD_BIAS_KEY: 0.3, TO_RIGHT: 0.1}, 0.7),
     )
     assert (
         find_cause_trial([whole, nearly], "kf", "aisle") is nearly
@@ -256,12 +258,12 @@ def test_filter_rerun_without_required_data_is_skipped() -> None:
         rows = rerun_filters(analysis, replace(analysis, **parts), model)
         return {(row.filter, name) for row in rows if row.discrepancies for name in row.change}
 
-    assert tried() == {("kf", "sigma_z_m"), ("kf", OUTLIERS), ("ekf2", OUTLIERS)}
-    assert tried(model=missing) == {("kf", "sigma_z_m"), ("kf", OUTLIERS)}
+    assert tried() == {("kf", "sigma_z_m"), ("kf", OUTLIERS_KEY), ("ekf2", OUTLIERS_KEY)}
+    assert tried(model=missing) == {("kf", "sigma_z_m"), ("kf", OUTLIERS_KEY)}
     assert tried(tuning={}) == set()
     turned = HeadingError(
         misalignment_deg=2.9, sigma_deg=1.0, drifts=False, parts=(), drift_p=1.0, by="positions"
     )
     assert tried(heading=turned, tuning={}) == set()
     turned = replace(turned, misalignment_deg=3.1)
-    assert tried(heading=turned, tuning={}) == {("kf", ROTATION), ("ekf2", ROTATION)}
+    assert tried(heading=turned, tuning={}) == {("kf", ROTATION_KEY), ("ekf2", ROTATION_KEY)}

@@ -19,7 +19,7 @@ from px4fuse.classroom.grading.rubric import read_rubric, score_report
 from px4fuse.core.reading import files_by_sha256
 from px4fuse.flight.model import DIAGNOSIS_WITHHELD
 from px4fuse.readers.ulog_topics import ASSESSED_KEY
-from px4fuse.results.answer_form import CHOICE_NAMES, form_text
+from px4fuse.results.answer_form import CHOICE_NAMES, format_answer_form
 from px4fuse.results.contract import ComparisonResults, to_json
 from px4fuse.results.reading import read_results
 from px4fuse.verification.model import Verification
@@ -41,7 +41,7 @@ def assigned(tmp_path_factory: pytest.TempPathFactory) -> Assigned:
     content, answer = simulate_assigned_flight(SECRET, Person("s01"), "aisle", 2)
     log, form, report = (folder / name for name in ("s01.ulg", "s01.toml", "s01.pdf"))
     log.write_bytes(content)
-    text = form_text(log.name, answer.sha256)
+    text = format_answer_form(log.name, answer.sha256)
     form.write_text(text.replace('verdict_kf = ""', 'verdict_kf = "consistent"'))
     run_checked("compare", log, "--answers", form, "-o", report)
     results = read_results(report.with_suffix(".json").read_bytes())

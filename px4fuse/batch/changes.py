@@ -66,7 +66,7 @@ def list_changes(a: InputResults, b: InputResults) -> contract.ChangeResults:
     """List the settings, numbers and findings that differ between the results of A and B."""
     findings = tuple(_list_finding_changes(a.results, b.results))
     return contract.ChangeResults(
-        schema=schema_of(contract.CHANGES_SCHEMA),
+        schema=schema_of(contract.CHANGES_SCHEMA_NAME),
         a=_describe_input(a),
         b=_describe_input(b),
         settings=tuple(_list_setting_changes(a.results, b.results)),

@@ -14,7 +14,7 @@ from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.flight.ekf2_parameters import AIDS
-from px4fuse.results.contract import AidsResults, ComparisonResults, Interval
+from px4fuse.results.contract import AidsResults, ComparisonResults, ConfidenceInterval
 
 # Rows of measures.csv; "interval" is the field in the results that contains the 95 % interval
 COMPARED_NUMBER_DEFINITIONS = [
@@ -36,7 +36,7 @@ class ComparedNumber:
     label: str
     unit: str
     value: float
-    interval: Interval | None = None
+    interval: ConfidenceInterval | None = None
 
 
 def collect_compared_numbers(results: ComparisonResults | AidsResults) -> dict[str, ComparedNumber]:

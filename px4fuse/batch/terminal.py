@@ -11,7 +11,7 @@ from px4fuse.core.text import count_noun, format_number, format_ratio
 from px4fuse.report.card_text import SEVERITY_SIGNS
 from px4fuse.report.page import Cell, Page, styled_text
 from px4fuse.report.style import MUTED_COLOUR, SEVERITY_COLOURS
-from px4fuse.results.contract import ChangeResults, Interval
+from px4fuse.results.contract import ChangeResults, ConfidenceInterval
 
 if TYPE_CHECKING:
     from px4fuse.batch.run import BatchResult
@@ -121,7 +121,7 @@ def _format_value(value: float | None, factor: float) -> str:
     return "" if value is None else format_number(factor * value)
 
 
-def _format_interval(interval: Interval | None) -> str:
+def _format_interval(interval: ConfidenceInterval | None) -> str:
     if interval is None:
         return ""
     low, high = interval

@@ -65,7 +65,7 @@ from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line,
 
 MAX_ACTIONS = 3
 # Minimum fraction of positions rejected by EKF2 for a sentence about rejections
-MIN_NAMED_REJECTED_FRACTION = 0.01
+MIN_REPORTED_REJECTED_FRACTION = 0.01
 # Aiding sources whose √S is usually too large with PX4's default noises, which is not a fault
 USUALLY_UNDERCONFIDENT_AIDS = frozenset({"baro_hgt", "mag", "gravity"})
 DRIFT_EXPLANATION = (
@@ -82,9 +82,9 @@ OUTLIER_EXPLANATION = (
     "The mean NIS of EKF2 includes the outliers that EKF2's gate rejects. They do not affect the "
     "position."
 )
-UNEXPLAINED_DIFFERENCE = (
-    "The σ ratio of KF or EKF2 against the position source differs from that against ground "
-    "truth. No re-run explains the difference."
+UNEXPLAINED_DIFFERENCE_TEXT = (
+    "The ratio of actual to reported σ of KF or EKF2 is different for innovations and for errors "
+    "against ground truth. No re-run explains the difference."
 )
 # Reasons why innovations are consistent but errors against ground truth are not, by finding ids
 SOURCE_FAULTS_AND_SENTENCES = (
@@ -139,7 +139,7 @@ def build_card(
         for ranked_finding in ranked_causes[:MAX_CAUSES]
     )
     sigma_verdicts, explanation = _explain_verdict_differences(analysis, sigma_verdicts, causes)
-    effect = _make_effect(analysis)
+    effect = _summarise_errors(analysis)
     has_fault = any(verdict.is_fault for verdict in sigma_verdicts)
     severity: CardSeverity = "note" if has_fault else "clean"
     return Card(
@@ -190,22 +190,22 @@ def build_aids_card(
     )
 
 
-def build_refusal_card(error: LogError | MissingDataError, path: Path) -> Card:
+def build_unusable_log_card(error: LogError | MissingDataError, path: Path) -> Card:
     """Build the diagnosis card of a log that cannot be analysed, with reason and action."""
-    facts = {}
+    text_by_label = {}
     with suppress(LogError):  # the headline already contains the reason of an unreadable file
         first_bytes = read_head(path, PRINTED_BYTE_COUNT, LogError).hex(" ").upper()
         size_bytes = file_size(path, LogError)
-        facts["read"] = (
+        text_by_label["read"] = (
             f"{size_bytes:,} bytes; first bytes {first_bytes} (of a ULog: {ULOG_FIRST_BYTES})"
         )
     if error.remedy:
-        facts["fix"] = with_options(with_log_name(error.remedy, str(path)))
+        text_by_label["fix"] = with_options(with_log_name(error.remedy, str(path)))
     return Card(
         severity="refused",
         id=error.id,
         headline=with_options(error.reason),
-        facts=facts,
+        facts=text_by_label,
         identity=Identity(file=display_name(path)),
     )
 
@@ -237,12 +237,14 @@ def _make_headline(causes: Sequence[Cause], sigma_verdicts: Sequence[Verdict]) -
     return f"No fault found: {FILTER_NAMES[consistent_filters.pop()]} is consistent"
 
 
-def _make_effect(analysis: Analysis) -> Effect:
+def _summarise_errors(analysis: Analysis) -> Effect:
     comparison, segment, reset_count = analysis.main, analysis.segment.flight, None
     difference = comparison.difference
     if isinstance(analysis.flight.ekf2, Ekf2):
-        resets_s = find_horizontal_reset_times_s(analysis.flight.ekf2)
-        reset_count = int(((segment.start_s < resets_s) & (resets_s <= segment.end_s)).sum())
+        reset_times_s = find_horizontal_reset_times_s(analysis.flight.ekf2)
+        reset_count = int(
+            ((segment.start_s < reset_times_s) & (reset_times_s <= segment.end_s)).sum()
+        )
     return Effect(
         axis=describe_axis(analysis, comparison),
         position_rmse_m=_find_rmse_by_filter_m(comparison),
@@ -286,21 +288,21 @@ def _describe_effect(analysis: Analysis, effect: Effect, sigma_verdicts: Sequenc
     if is_height_only(analysis.source):
         return "The source measures only the height, so horizontal errors are not evaluated."
     if effect.position_rmse_m:
-        span_text = horizontal_text = ""
+        span_text = horizontal_rmse_text = ""
         if max(segment.start_s - flight.start_s, flight.end_s - segment.end_s) > MIN_GAP_S:
             span_text = f" from {segment.start_s:.1f} to {segment.end_s:.1f} s"
         if effect.horizontal_rmse_m:
-            horizontal_text = f" (horizontal: {_format_lengths(effect.horizontal_rmse_m)})"
-        is_track_direction = (
+            horizontal_rmse_text = f" (horizontal: {_format_lengths(effect.horizontal_rmse_m)})"
+        is_axis_along_motion = (
             analysis.main.axis.name == AISLE
             and analysis.request is not None
             and analysis.request.heading_deg is None
         )
-        axis_text = " (direction of most motion)" if is_track_direction else ""
+        axis_text = " (direction of largest motion)" if is_axis_along_motion else ""
         sentences.append(
             f"Position RMSE against ground truth along {analysis.main.axis.label}{axis_text}"
             f"{span_text}: "
-            f"{_format_lengths(effect.position_rmse_m)}{horizontal_text}."
+            f"{_format_lengths(effect.position_rmse_m)}{horizontal_rmse_text}."
         )
         sentences += [
             f"The position error of {FILTER_NAMES[verdict.filter]} is "
@@ -319,7 +321,7 @@ def _describe_effect(analysis: Analysis, effect: Effect, sigma_verdicts: Sequenc
             "The log has no ground truth, so the position errors of KF and EKF2 are unknown."
         )
     rejected_fraction = effect.rejected_fraction or 0.0
-    if rejected_fraction >= MIN_NAMED_REJECTED_FRACTION:
+    if rejected_fraction >= MIN_REPORTED_REJECTED_FRACTION:
         sentences.append(f"EKF2 rejected {format_percent(rejected_fraction)} of the positions.")
     if effect.horizontal_resets:
         count_text = format_count(effect.horizontal_resets)
@@ -329,16 +331,16 @@ def _describe_effect(analysis: Analysis, effect: Effect, sigma_verdicts: Sequenc
 
 def _describe_worst_axis(analysis: Analysis) -> list[str]:
     results = (analysis.main, *analysis.select_secondary_axes())
-    nees_with_results = [
+    nees_result_and_rmse = [
         (truth.nees_position_mean, result, truth.position_rmse_m)
         for result in results
         if isinstance(truth := result.filters["ekf2"].truth, ErrorsAgainstTruth)
         and truth.nees_position_mean
-        and not (truth.is_lag_only and result is not analysis.main)
+        and not (truth.has_only_lag_errors and result is not analysis.main)
     ]
-    if not nees_with_results:
+    if not nees_result_and_rmse:
         return []
-    nees, worst_result, rmse_m = max(nees_with_results, key=lambda item: item[0])
+    nees, worst_result, rmse_m = max(nees_result_and_rmse, key=lambda item: item[0])
     ratio = math.sqrt(nees)
     is_overconfident = classify_sigma_ratio(ratio, "truth") == "overconfident"
     if worst_result is analysis.main or not is_overconfident:
@@ -365,8 +367,10 @@ def _format_actions(causes: Sequence[Cause]) -> tuple[str, ...]:
         return ("Change nothing.",)
     numbered_sentences: list[str] = []
     for number, cause in enumerate(causes, 1):
-        alternatives = [_format_action(action) for group in cause.alternatives for action in group]
-        sentences = [", or ".join(alternatives)] if alternatives else []
+        alternative_texts = [
+            _format_action(action) for group in cause.alternatives for action in group
+        ]
+        sentences = [", or ".join(alternative_texts)] if alternative_texts else []
         sentences += [
             _format_action(action)
             for action in cause.actions
@@ -393,7 +397,11 @@ def _format_action(action: Action) -> str:
 def _mark_explained_verdicts(
     sigma_verdicts: Sequence[Verdict], causes: Sequence[Cause], *, may_drift: bool
 ) -> tuple[Verdict, ...]:
-    """Set ``is_explained`` if the inconsistency is no reason to change settings of the filter."""
+    """Set ``is_explained`` of inconsistent verdicts that require no change of filter settings.
+
+    Reasons: a cause recommends no change, the errors against ground truth are consistent, or
+    innovations are small and the source may drift.
+    """
     filters_to_keep_unchanged = {
         name
         for cause in causes
@@ -412,7 +420,7 @@ def _mark_explained_verdicts(
         and (
             FILTER_NAMES[verdict.filter] in filters_to_keep_unchanged
             or verdict.filter in filters_consistent_with_truth
-            # a small NIS does not prove a too large σ: innovations do not show drift
+            # small innovations do not prove a too large σ: they do not contain drift
             or (may_drift and (verdict.against, verdict.word) == ("source", "underconfident"))
         )
         else verdict
@@ -423,7 +431,10 @@ def _mark_explained_verdicts(
 def _explain_verdict_differences(
     analysis: Analysis, sigma_verdicts: tuple[Verdict, ...], causes: Sequence[Cause]
 ) -> tuple[tuple[Verdict, ...], str]:
-    """Explain why the innovations of a filter are consistent and its errors not, or vice versa."""
+    """Return verdicts with ``is_explained``, and why innovations and errors disagree.
+
+    They disagree if only one of both is consistent with the σ that a filter reports.
+    """
     may_drift, ekf2_errors = analysis.source.origin.may_drift, analysis.main.filters["ekf2"].truth
     sigma_verdicts = _mark_explained_verdicts(sigma_verdicts, causes, may_drift=may_drift)
     *other_verdicts, ekf2_verdict = sigma_verdicts
@@ -442,7 +453,7 @@ def _explain_verdict_differences(
             "error of the published position also contains the lag of the output predictor."
         )
     explanation = _explain_differing_verdicts(analysis, sigma_verdicts, causes)
-    if explanation == UNEXPLAINED_DIFFERENCE:
+    if explanation == UNEXPLAINED_DIFFERENCE_TEXT:
         sigma_verdicts = tuple(replace(verdict, is_explained=False) for verdict in sigma_verdicts)
     elif not explanation and may_drift and any(verdict.is_explained for verdict in sigma_verdicts):
         explanation = DRIFT_EXPLANATION
@@ -480,9 +491,9 @@ def _explain_differing_verdicts(
     if corrected_filters.issuperset(differing_filters):
         filter_labels = " and ".join(FILTER_NAMES[filter_name] for filter_name in differing_filters)
         return (
-            f"The σ ratio of {filter_labels} against the position source differs from that against "
-            "ground truth, because innovations show little of the first fault of this card. The "
-            "re-run without this fault reduces the position error."
+            f"The innovations of {filter_labels} show little of the first fault on this card; the "
+            "errors against ground truth show it. The re-run without this fault reduces the "
+            "position error."
         )
     horizontal_tuning = analysis.tuning.get(HORIZONTAL)
     if analysis.source.origin.may_drift:
@@ -499,9 +510,9 @@ def _explain_differing_verdicts(
             "errors; only ground truth does."
         )
     has_heading_error = "ekf2_heading_error" in finding_ids
-    explanation = HEADING_ERROR_EXPLANATION if has_heading_error else UNEXPLAINED_DIFFERENCE
-    rejects_outliers = "source_outliers" in finding_ids and "ekf2" in differing_filters
-    return OUTLIER_EXPLANATION if rejects_outliers else explanation
+    explanation = HEADING_ERROR_EXPLANATION if has_heading_error else UNEXPLAINED_DIFFERENCE_TEXT
+    has_rejected_outliers = "source_outliers" in finding_ids and "ekf2" in differing_filters
+    return OUTLIER_EXPLANATION if has_rejected_outliers else explanation
 
 
 def _describe_difference(effect: Effect, ranked_causes: Sequence[RankedCause]) -> str:
@@ -519,15 +530,18 @@ def _describe_difference(effect: Effect, ranked_causes: Sequence[RankedCause]) -
             f"{difference_text}. The fault affects both KF and EKF2, so the position difference "
             "hardly shows the fault."
         )
-    rerun_rms_by_filter_m = {
+    rerun_difference_by_filter_m = {
         trial.filter: trial.after.difference_rms_m for trial in reversed(trials)
     }
-    is_only_ekf2_corrected = {"ekf2"} in (corrected_filters, rerun_rms_by_filter_m.keys())
-    rerun_rms_m = rerun_rms_by_filter_m.get("ekf2" if is_only_ekf2_corrected else "kf")
-    if rerun_rms_m is None:
+    is_only_ekf2_corrected = {"ekf2"} in (corrected_filters, rerun_difference_by_filter_m.keys())
+    rerun_difference_rms_m = rerun_difference_by_filter_m.get(
+        "ekf2" if is_only_ekf2_corrected else "kf"
+    )
+    if rerun_difference_rms_m is None:
         return f"{difference_text}."
     corrected_filter = "EKF2 (predicted by replay)" if is_only_ekf2_corrected else "KF"
-    return f"{difference_text}; {format_metres(rerun_rms_m)} m after correcting {corrected_filter}."
+    rerun_text = f"{format_metres(rerun_difference_rms_m)} m after correcting {corrected_filter}"
+    return f"{difference_text}; {rerun_text}."
 
 
 def _make_notes(root_findings: Sequence[Finding], log_name: str) -> tuple[Note, ...]:

@@ -12,8 +12,8 @@ from px4fuse.comparison.changes import SIGMA_A, SIGMA_Z
 from px4fuse.comparison.model import FILTER_NAMES, FilterName
 from px4fuse.comparison.remedy import select_changed_settings
 from px4fuse.comparison.trials import (
-    CLOCK_OFFSET,
-    OUTLIERS,
+    CLOCK_OFFSET_KEY,
+    OUTLIERS_KEY,
     Trial,
     becomes_consistent,
     classify_improvement,
@@ -36,8 +36,8 @@ from px4fuse.flight.model import PositionTrack, Unavailable
 from px4fuse.request import COMPARISON_OPTIONS, ComparisonRequest, command_line
 
 SETTING_CHANGE_KINDS = frozenset({"noises", "noise", "gate", "process noise"})
-# Changes that shift the positions, and so the estimates of KF and EKF2: only ground truth shows
-# their effect
+# Kinds of change that shift the measured positions. The estimates of KF and EKF2 shift, too, so
+# only ground truth shows the effect
 TRUTH_ONLY_CHANGE_KINDS = frozenset({"time offset", "delay", "rotation"})
 # Name endings of PX4 parameters that require a reboot (reboot_required)
 REBOOT_PARAMETER_SUFFIXES = ("_DELAY", "_DELAY_MAX", "_PREDICT_US")
@@ -66,8 +66,8 @@ ACTION_TARGET_BY_ID: Mapping[str, ActionTarget] = {
 class RankedCause(NamedTuple):
     """Possible cause of a fault, its rank (0 first), and the re-runs of KF and EKF2 that test it.
 
-    Of causes with equal rank, the one whose re-runs most reduce |ln(actual / reported σ)|
-    (``log_ratio_reduction``) is first.
+    Causes of equal rank are sorted by ``log_ratio_reduction``, largest first: the decrease of
+    |ln(actual / reported σ)| in the re-runs.
     """
 
     finding: Finding
@@ -77,7 +77,7 @@ class RankedCause(NamedTuple):
 
 
 def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[RankedCause]:
-    """Sort errors and warnings by importance; a cause that no re-run confirms is omitted."""
+    """Sort errors and warnings by importance; omit those whose re-runs show no effect."""
     ranked_causes = []
     for finding in root_findings:
         if finding.severity == "note":
@@ -89,9 +89,9 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
             has_effect(trial) or not can_show_effect(trial) for trial in trials
         ):
             continue
-        reduction = sum(map(compute_log_ratio_reduction, trials))
+        log_ratio_reduction = sum(map(compute_log_ratio_reduction, trials))
         rank = _find_cause_rank(finding, trials)
-        ranked_causes.append(RankedCause(finding, rank, reduction, trials))
+        ranked_causes.append(RankedCause(finding, rank, log_ratio_reduction, trials))
     fault_causes = [
         cause
         for cause in ranked_causes
@@ -101,7 +101,7 @@ def rank_causes(analysis: Analysis, root_findings: Sequence[Finding]) -> list[Ra
         fault_causes or ranked_causes,
         key=lambda cause: (
             cause.rank,
-            # False is first: source faults precede settings, whose change may only hide a fault
+            # source faults (False) precede settings (True): a changed setting may only hide a fault
             cause.rank in (1, 2, 3) and _is_setting_fault(cause.finding),
             -cause.log_ratio_reduction,
         ),
@@ -129,16 +129,18 @@ def find_trials_of_finding(trials: Iterable[Trial], finding: Finding) -> tuple[T
     """Return the best re-run of KF and of EKF2 for each kind of change that tests a finding."""
     tested_kinds = FINDING_CATALOGUE[finding.id].reruns
     tested_kinds |= {"defaults"} if "noises" in tested_kinds else set()
-    best_trials: dict[tuple[FilterName, str], Trial] = {}
+    best_trial_by_change: dict[tuple[FilterName, str], Trial] = {}
     for trial in trials:
         if len(trial.kinds) == 1 and trial.kinds[0] in tested_kinds:
             key = trial.filter, trial.kinds[0]
-            best_trials[key] = min(trial, best_trials.get(key, trial), key=compute_preference_key)
-    return tuple(best_trials.values())
+            best_trial_by_change[key] = min(
+                trial, best_trial_by_change.get(key, trial), key=compute_preference_key
+            )
+    return tuple(best_trial_by_change.values())
 
 
 def can_show_effect(trial: Trial) -> bool:
-    """Return False if only ground truth shows the effect of a re-run, and none is logged."""
+    """Return True unless only ground truth, which is not logged, shows the effect of a re-run."""
     has_truth = trial.before.position_rmse_m is not None
     return has_truth or TRUTH_ONLY_CHANGE_KINDS.isdisjoint(trial.kinds) or has_effect(trial)
 
@@ -156,20 +158,20 @@ def make_cause(
     """Describe a fault, with actions for position source, KF and EKF2."""
     finding, trials = ranked_cause.finding, ranked_cause.trials
     useful_trials = [trial for trial in trials if may_improve_filter(trial)]
-    alternatives, actions = _make_actions(
+    alternative_groups, actions = _make_actions(
         analysis, ranked_cause, useful_trials, sigma_verdicts, request
     )
     return structs.replace(
         make_plain_cause(finding),
-        alternatives=alternatives,
+        alternatives=alternative_groups,
         actions=actions,
         reruns=tuple(_make_rerun(trial, trials) for trial in trials if can_show_effect(trial)),
-        after=_format_closing_sentence(analysis, useful_trials, alternatives),
+        after=_format_closing_sentence(analysis, useful_trials, alternative_groups),
     )
 
 
 def make_plain_cause(finding: Finding) -> Cause:
-    """Make a cause from the texts of a finding, without results of re-runs."""
+    """Make a cause from the texts of a finding alone, without results of filter re-runs."""
     return Cause(
         id=finding.id,
         severity="error" if finding.severity == "error" else "warning",
@@ -187,7 +189,7 @@ def _make_actions(
     sigma_verdicts: Sequence[Verdict],
     request: ComparisonRequest,
 ) -> tuple[tuple[tuple[Action, ...], ...], tuple[Action, ...]]:
-    """Return (alternatives, actions): the user needs one group of alternatives and all actions."""
+    """Return (alternative_groups, actions): the user takes one group, and all actions."""
     finding = ranked_cause.finding
     trial_by_change = {(trial.filter, trial.kinds[0]): trial for trial in useful_trials}
     sender_actions: list[Action] = []
@@ -200,23 +202,25 @@ def _make_actions(
     )
     delay_actions = []
     if delay_trial:
-        # A new delay and shifted timestamps may both need EKF2_DELAY_MAX: it is a separate action
-        common_names = offset_trial.change.keys() if offset_trial else ()
+        # If both a new delay and shifted timestamps need EKF2_DELAY_MAX, it is a separate action
+        offset_setting_names = offset_trial.change.keys() if offset_trial else ()
         delay_change = {
-            name: value for name, value in delay_trial.change.items() if name not in common_names
+            name: value
+            for name, value in delay_trial.change.items()
+            if name not in offset_setting_names
         }
         delay_actions = [make_parameter_action(analysis, delay_change)]
     # users cannot shift the timestamps of a GNSS receiver
     if offset_trial and not (analysis.source.origin.is_gnss and sender_actions):
-        shift_s = offset_trial.change[CLOCK_OFFSET]
+        shift_s = offset_trial.change[CLOCK_OFFSET_KEY]
         if offset_trial.filter == "kf":
             shift_s -= analysis.settings.clock_offset_s
         shift_instruction = lower_first(format_shift(shift_s))
         sender_actions = [Action("sender", f"{shift_instruction} the timestamp of each position")]
-    alternatives: tuple[tuple[Action, ...], ...] = ()
+    alternative_groups: tuple[tuple[Action, ...], ...] = ()
     actions = delay_actions or sender_actions
     if offset_trial and delay_trial:
-        actions, alternatives = [], (tuple(sender_actions), tuple(delay_actions))
+        actions, alternative_groups = [], (tuple(sender_actions), tuple(delay_actions))
     elif (
         not offset_trial and not delay_trial and _is_setting_fault(finding) and ranked_cause.trials
     ):
@@ -231,16 +235,16 @@ def _make_actions(
             default_settings = default_trial.change if default_trial else {}
             change, alignment = trial.change, analysis.source.alignment
             # --clock-offset replaces the alignment's time offset, so it must include that offset
-            if CLOCK_OFFSET in change and alignment:
-                total_s = change[CLOCK_OFFSET] + alignment.clock_offset_s
-                change = {**change, CLOCK_OFFSET: round(total_s, 3)}
+            if CLOCK_OFFSET_KEY in change and alignment:
+                total_s = change[CLOCK_OFFSET_KEY] + alignment.clock_offset_s
+                change = {**change, CLOCK_OFFSET_KEY: round(total_s, 3)}
             actions.append(make_rerun_action(request, change, default_settings))
         elif filter_name == "ekf2" and kind != "delay":
             changes = {name: value for name, value in trial.change.items() if name in PARAMETERS}
             actions += [make_parameter_action(analysis, changes)] if changes else []
     # actions on KF are last: first correct the vehicle
     actions.sort(key=lambda action: action.target == "KF")
-    targets = {action.target for group in (actions, *alternatives) for action in group}
+    targets = {action.target for group in (actions, *alternative_groups) for action in group}
     reason_by_filter: dict[ActionTarget, str] = {
         name: reason
         for filter_name, name in FILTER_NAMES.items()
@@ -250,7 +254,7 @@ def _make_actions(
     if len(reason_by_filter) == 2 and len(set(reason_by_filter.values())) == 1:
         reason_by_filter = {"KF, EKF2": reason_by_filter["KF"]}
     actions += [Action(target, reason) for target, reason in reason_by_filter.items()]
-    return alternatives, tuple(actions)
+    return alternative_groups, tuple(actions)
 
 
 def _explain_no_change(
@@ -271,10 +275,11 @@ def _explain_no_change(
     if finding.id == "source_outliers":
         if filter_name == "kf":
             return (
-                "no option of KF rejects outliers, and a larger SIGMA_Z (--sigma-z) only hides them"
+                "no KF option rejects outliers; a larger SIGMA_Z (--sigma-z) only reduces the mean "
+                "NIS"
             )
         if verdict_by_reference.get("truth", "consistent") == "consistent":
-            return "no change: EKF2's gate rejects outliers, and the reported σ is consistent"
+            return "no change: EKF2's gate rejects these outliers, and the reported σ is consistent"
     fault_text = "drift of the position source" if finding.id == "source_drift" else "this fault"
     return f"no filter setting corrects {fault_text}"
 
@@ -320,32 +325,38 @@ def make_parameter_action(analysis: Analysis, change: Mapping[str, float]) -> Ac
 
 
 def _make_rerun(trial: Trial, trials: Sequence[Trial]) -> Rerun:
-    statistics_pair = trial.before, trial.after
-    rejected_fractions = [statistics.rejected_fraction for statistics in statistics_pair]
-    before_and_after: dict[str, Any] = {
-        "position_rmse_m": [statistics.position_rmse_m for statistics in statistics_pair],
+    statistics_before_and_after = trial.before, trial.after
+    rejected_fractions = [
+        statistics.rejected_fraction for statistics in statistics_before_and_after
+    ]
+    values_before_and_after: dict[str, Any] = {
+        "position_rmse_m": [
+            statistics.position_rmse_m for statistics in statistics_before_and_after
+        ],
         "source_ratio": [
-            compute_sigma_ratios(statistics).get("source") for statistics in statistics_pair
+            compute_sigma_ratios(statistics).get("source")
+            for statistics in statistics_before_and_after
         ],
         "truth_ratio": [
-            compute_sigma_ratios(statistics).get("truth") for statistics in statistics_pair
+            compute_sigma_ratios(statistics).get("truth")
+            for statistics in statistics_before_and_after
         ],
     }
     if max(fraction or 0.0 for fraction in rejected_fractions) >= MIN_SHOWN_REJECTED_FRACTION:
-        before_and_after["rejected_fraction"] = rejected_fractions
+        values_before_and_after["rejected_fraction"] = rejected_fractions
     return Rerun(
         label=_format_trial_label(trial, trials),
         is_prediction=trial.filter == "ekf2",
         from_s=trial.from_s,
         improves=classify_improvement(trial),
-        **{name: tuple(pair) for name, pair in before_and_after.items() if None not in pair},
+        **{name: tuple(pair) for name, pair in values_before_and_after.items() if None not in pair},
     )
 
 
 def _format_trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
     kind, label = trial.kinds[0], "KF" if trial.filter == "kf" else "EKF2 (replay)"
-    if OUTLIERS in trial.change:
-        return f"{label} without {trial.change[OUTLIERS]:.0f} outliers"
+    if OUTLIERS_KEY in trial.change:
+        return f"{label} without {trial.change[OUTLIERS_KEY]:.0f} outliers"
     if trial.filter == "kf":
         options_text = " ".join(
             f"{COMPARISON_OPTIONS[name]} {value:g}"
@@ -360,13 +371,15 @@ def _format_trial_label(trial: Trial, trials: Sequence[Trial]) -> str:
 
 
 def _format_closing_sentence(
-    analysis: Analysis, useful_trials: Sequence[Trial], alternative_groups: Sequence[object]
+    analysis: Analysis,
+    useful_trials: Sequence[Trial],
+    alternative_groups: Sequence[tuple[Action, ...]],
 ) -> str:
     if alternative_groups:
         return (
-            "The actions on timestamps and on the delay parameter correct the same time offset: "
-            "take only one of them, and all other actions. For late timestamps, a delay parameter "
-            "(ms) is positive, and --clock-offset (s) is negative."
+            "Shift the timestamps or change the delay parameter, not both: each corrects the same "
+            "time offset. Take all other actions, too. If timestamps are 0.2 s late, the delay "
+            "parameter is 200 ms and --clock-offset is -0.2 s."
         )
     if any(trial.kinds == ("defaults",) for trial in useful_trials):
         return "KF is consistent with the default noises as well as with the estimated noises."
@@ -379,10 +392,13 @@ def _format_closing_sentence(
                     f"PX4's default of {default_noise_m:g} m is inside the 95 % interval of the "
                     "estimate, so the default is as good as the estimate."
                 )
-    ratios_after = [
+    truth_sigma_ratios = [
         math.sqrt(trial.after.nees_mean) for trial in useful_trials if trial.after.nees_mean
     ]
-    if ratios_after and classify_sigma_ratio(min(ratios_after), "truth") == "overconfident":
+    if (
+        truth_sigma_ratios
+        and classify_sigma_ratio(min(truth_sigma_ratios), "truth") == "overconfident"
+    ):
         return (
             "After this fix, the reported σ is still too small against ground truth: another "
             "error remains."

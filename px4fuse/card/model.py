@@ -33,8 +33,8 @@ def map_ratio_to_axis(ratio: float) -> float:
     >>> map_ratio_to_axis(0.1), map_ratio_to_axis(1.0), map_ratio_to_axis(10.0)
     (0.0, 0.5, 1.0)
     """
-    log_low, log_high = (math.log10(end) for end in RATIO_AXIS_ENDS)
-    return (math.log10(ratio) - log_low) / (log_high - log_low)
+    log_axis_start, log_axis_end = (math.log10(end) for end in RATIO_AXIS_ENDS)
+    return (math.log10(ratio) - log_axis_start) / (log_axis_end - log_axis_start)
 
 
 class Verdict(Record, kw_only=True):
@@ -129,6 +129,8 @@ class Rerun(Record, kw_only=True):
     position_rmse_m, source_ratio, truth_ratio, rejected_fraction : (float, float) or None
         Before and after the change: position RMSE, σ ratio (actual / reported σ) from innovations,
         σ ratio from errors against ground truth, and fraction of rejected positions.
+    improves : str
+        Quantities that the change improves.
     """
 
     label: str

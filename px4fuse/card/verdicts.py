@@ -32,7 +32,7 @@ def make_sigma_verdicts(result: AxisComparison) -> tuple[Verdict, ...]:
 def _assess_against_source(result: AxisComparison, filter_name: FilterName) -> Verdict:
     summary = result.filters[filter_name]
     if not isinstance(summary, FilterSummary):
-        return _make_unevaluated(filter_name, "source", summary)
+        return _make_unevaluated_verdict(filter_name, "source", summary)
     return Verdict(
         filter=filter_name,
         against="source",
@@ -46,10 +46,10 @@ def _assess_against_source(result: AxisComparison, filter_name: FilterName) -> V
 def _assess_against_truth(result: AxisComparison, filter_name: FilterName) -> Verdict:
     errors_against_truth = result.filters[filter_name].truth
     if isinstance(errors_against_truth, Unavailable):
-        return _make_unevaluated(filter_name, "truth", errors_against_truth)
+        return _make_unevaluated_verdict(filter_name, "truth", errors_against_truth)
     errors = compute_normalised_errors(result, filter_name)
     if isinstance(errors, Unavailable):
-        return _make_unevaluated(filter_name, "truth", errors)
+        return _make_unevaluated_verdict(filter_name, "truth", errors)
     time_s, normalised_errors = errors
     ratio = float(np.sqrt(np.mean(np.square(normalised_errors))))
     interval = block_bootstrap_rms(time_s, normalised_errors)
@@ -63,7 +63,7 @@ def _assess_against_truth(result: AxisComparison, filter_name: FilterName) -> Ve
     )
 
 
-def _make_unevaluated(
+def _make_unevaluated_verdict(
     filter_name: FilterName, reference: Reference, unavailable: Unavailable
 ) -> Verdict:
     return Verdict(
@@ -83,10 +83,10 @@ def block_bootstrap_rms(time_s: Array, values: Array) -> tuple[float, float] | N
     end_indices = np.searchsorted(time_s, time_s[start_indices] + BOOTSTRAP_BLOCK_S)
     cumulative_squares = np.concatenate(([0.0], np.cumsum(np.square(values))))
     block_square_sums = cumulative_squares[end_indices] - cumulative_squares[start_indices]
-    drawn_blocks = np.random.default_rng(0).integers(
+    drawn_block_indices = np.random.default_rng(0).integers(
         len(start_indices), size=(BOOTSTRAP_RESAMPLES, block_count)
     )
-    sample_counts = (end_indices - start_indices)[drawn_blocks].sum(axis=1)
-    mean_squares = block_square_sums[drawn_blocks].sum(axis=1) / sample_counts
+    sample_counts = (end_indices - start_indices)[drawn_block_indices].sum(axis=1)
+    mean_squares = block_square_sums[drawn_block_indices].sum(axis=1) / sample_counts
     rms_low, rms_high = np.percentile(np.sqrt(mean_squares), (2.5, 97.5))
     return float(rms_low), float(rms_high)

@@ -19,8 +19,8 @@ def answers(log: Path, output: Path | None) -> None:
     Complete the form and give it to px4fuse compare --answers.
     """
     from px4fuse.core.reading import read_log_bytes
-    from px4fuse.results.answer_form import form_name, form_text
+    from px4fuse.results.answer_form import form_name, format_answer_form
 
     target = output or log.with_name(form_name(log.name))
     sha256 = hashlib.sha256(read_log_bytes(log)).hexdigest()
-    write_new(target, form_text(log.name, sha256).encode())
+    write_new(target, format_answer_form(log.name, sha256).encode())

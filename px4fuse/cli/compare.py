@@ -49,7 +49,7 @@ def compare(
     reports/LOG_sigma-z-0.05.pdf and .json.
     """
     from px4fuse.analysis import failed_checks
-    from px4fuse.card.build import build_refusal_card
+    from px4fuse.card.build import build_unusable_log_card
     from px4fuse.core.memory import release_free_memory
     from px4fuse.diagnose import diagnose_or_check_aids
     from px4fuse.report.terminal import comparison_page, make_card_page
@@ -74,7 +74,9 @@ def compare(
     except (LogError, MissingDataError) as error:
         if not sys.stderr.isatty():  # a program reads the error: print one line, not a card
             raise
-        outputs.show_page(make_card_page("card", build_refusal_card(error, log)), is_error=True)
+        outputs.show_page(
+            make_card_page("card", build_unusable_log_card(error, log)), is_error=True
+        )
         sys.exit(2)
     page = comparison_page(outcome, results, verbose=verbose, quiet=quiet)
     outputs.write_and_print(contents, page, request)

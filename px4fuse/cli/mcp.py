@@ -153,7 +153,9 @@ def make_tools(folders: tuple[Path, ...]) -> list[tuple[Any, Any]]:
         parameters = {} if name == "list_findings" else _list_parameters(command_name)
         output_schema = None
         if result_type is not None:
-            schemas, definitions = contract.schema_of_types(get_args(result_type) or (result_type,))
+            schemas, definitions = contract.make_schemas_of_types(
+                get_args(result_type) or (result_type,)
+            )
             output_schema = {"type": "object", "anyOf": schemas, "$defs": definitions}
         tool = Tool(
             name=name,

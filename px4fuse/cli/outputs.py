@@ -163,11 +163,11 @@ def _is_same_report(
     new_results: Results, read: Callable[[bytes, str], Results], existing_content: bytes
 ) -> bool:
     """Return True for equal input files and student; the existing report may have no student."""
-    from px4fuse.results.contract import file_hashes_in, to_json
+    from px4fuse.results.contract import find_file_hashes, to_json
 
     existing_results = read(existing_content, "report")
-    existing_hashes = file_hashes_in(to_json(existing_results))
-    return existing_hashes == file_hashes_in(to_json(new_results)) and _student_name_and_id(
+    existing_hashes = find_file_hashes(to_json(existing_results))
+    return existing_hashes == find_file_hashes(to_json(new_results)) and _student_name_and_id(
         existing_results
     ) in (NO_STUDENT_NAME, _student_name_and_id(new_results))
 

@@ -8,20 +8,20 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from px4fuse.comparison.estimates import Estimates, Tuning, find_first_tuning
+from px4fuse.comparison.estimates import Estimates, TuningByAxis, find_first_tuning
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterSummary
 from px4fuse.comparison.remedy import (
     make_delay_max_change,
-    make_ml_delay_change,
-    make_ml_noise_change,
+    make_estimated_delay_change,
+    make_estimated_noise_change,
 )
 from px4fuse.comparison.trials import (
-    CLOCK_OFFSET,
+    CLOCK_OFFSET_KEY,
     DISCREPANCY_STATISTICS,
-    FORWARD_BIAS,
-    OUTLIERS,
-    RIGHT_BIAS,
-    ROTATION,
+    FORWARD_BIAS_KEY,
+    OUTLIERS_KEY,
+    RIGHT_BIAS_KEY,
+    ROTATION_KEY,
     SECONDARY_CHANGE_KEYS,
     Change,
     Statistic,
@@ -35,18 +35,20 @@ from px4fuse.flight.model import LogInfo, Unavailable
 
 # Minimum SIGMA_Z (m) in a re-run of KF: noise of motion capture, the most accurate position source
 MIN_RERUN_SIGMA_Z_M = 0.005
+# Names of KF's noise settings
 SIGMA_A, SIGMA_Z = "sigma_a_m_s2", "sigma_z_m"
 # Kind of change in :attr:`Trial.kinds`, for each KF setting and each correction of the data
 KIND_BY_KF_CHANGE = {
     SIGMA_A: "noises",
     SIGMA_Z: "noises",
-    OUTLIERS: "outliers",
-    CLOCK_OFFSET: "time offset",
-    ROTATION: "rotation",
-    FORWARD_BIAS: "bias",
-    RIGHT_BIAS: "bias",
+    OUTLIERS_KEY: "outliers",
+    CLOCK_OFFSET_KEY: "time offset",
+    ROTATION_KEY: "rotation",
+    FORWARD_BIAS_KEY: "bias",
+    RIGHT_BIAS_KEY: "bias",
 }
-# KF settings that re-runs change; all other changes in re-runs of KF correct the data
+# KF settings that re-runs change. All other changes in re-runs of KF correct the data, for example
+# outliers
 CHANGED_KF_SETTINGS = frozenset((SIGMA_A, SIGMA_Z))
 ACC_NOISE = "EKF2_ACC_NOISE"
 # EKF2 is re-run with a larger EKF2_ACC_NOISE if the estimated SIGMA_A exceeds it by this factor. A
@@ -72,7 +74,7 @@ def find_candidate_changes(
     axis_result: AxisComparison,
     statistic: Statistic,
 ) -> list[Change]:
-    """Return the changes of a filter that may bring its mean NIS or NEES inside the limits."""
+    """Return the changes of settings or data that may bring ``statistic`` inside its limits."""
     summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
     assert isinstance(summary, FilterSummary)  # an UntestedFilter has no mean NIS or NEES
     is_underconfident = statistic == "nis" and summary.nis_mean < 1.0
@@ -89,11 +91,11 @@ def find_candidate_changes(
             else _find_ekf2_noise_changes(ekf2_inputs, summary, axis_tuning)
         )
     if axis_tuning is not None and not is_underconfident and len(axis_tuning.outlier_time_s):
-        changes.append({OUTLIERS: float(len(axis_tuning.outlier_time_s))})
+        changes.append({OUTLIERS_KEY: float(len(axis_tuning.outlier_time_s))})
     delay_parameters = (
         {}
         if ekf2_inputs is None
-        else make_ml_delay_change(comparison, ekf2_inputs, estimates.clock)
+        else make_estimated_delay_change(comparison, ekf2_inputs, estimates.clock)
     )
     changes += (
         [delay_parameters] if delay_parameters else _find_offset_changes(estimates, ekf2_inputs)
@@ -102,22 +104,22 @@ def find_candidate_changes(
         return changes
     if isinstance(heading := estimates.heading, HeadingError):
         is_significant = abs(heading.misalignment_deg) > MIN_MISALIGNMENT_SIGMAS * heading.sigma_deg
-        changes += [{ROTATION: -round(heading.misalignment_deg, 1)}] if is_significant else []
+        changes += [{ROTATION_KEY: -round(heading.misalignment_deg, 1)}] if is_significant else []
     if ekf2_inputs is None:
         return changes + _find_bias_changes(estimates)
     changes += _find_default_changes(comparison.flight.log, ekf2_inputs)
     if axis_tuning is not None and not is_underconfident:
-        changes += _find_vibration_changes(comparison.settings, ekf2_inputs, axis_tuning)
+        changes += _find_acc_noise_changes(comparison.settings, ekf2_inputs, axis_tuning)
     return changes
 
 
 def find_main_axis_changes(
     comparison: Comparison, estimates: Estimates, ekf2_inputs: Inputs | None
 ) -> list[Change]:
-    """Return the changes that re-runs along the main axis test.
+    """Return the changes of settings or data for re-runs along the main axis.
 
-    In addition to :func:`find_candidate_changes`, KF is tested with both noises changed and with
-    its default noises, EKF2 with shifted timestamps if its delay parameter is wrong.
+    Added to :func:`find_candidate_changes` are, for KF, a change of both noises and the default
+    noises; for EKF2 with a wrong delay parameter, shifted timestamps.
     """
     changes = remove_repeated_changes(
         change
@@ -133,8 +135,8 @@ def find_main_axis_changes(
     noise_changes = [change for change in changes if change.keys() <= CHANGED_KF_SETTINGS]
     if len(noise_changes) > 1:
         changes.append({name: value for change in noise_changes for name, value in change.items()})
-    defaults = find_default_settings(comparison)
-    return [*changes, *([defaults] if defaults and noise_changes else [])]
+    default_settings = find_default_settings(comparison)
+    return [*changes, *([default_settings] if default_settings and noise_changes else [])]
 
 
 def remove_repeated_changes(changes: Iterable[Change]) -> list[Change]:
@@ -162,16 +164,16 @@ def classify_change(
 
 def find_default_settings(comparison: Comparison) -> Change:
     """Return the default of each KF noise for which the user chose another value."""
-    user_settings, px4fuse_default = comparison.settings, Settings()
+    user_settings, default_settings = comparison.settings, Settings()
     setting_names = (SIGMA_A,) if comparison.source.origin.is_gnss else (SIGMA_A, SIGMA_Z)
     return {
-        name: getattr(px4fuse_default, name)
+        name: getattr(default_settings, name)
         for name in setting_names
-        if getattr(user_settings, name) != getattr(px4fuse_default, name)
+        if getattr(user_settings, name) != getattr(default_settings, name)
     }
 
 
-def find_axis_tuning(tuning: Tuning, axis: str) -> AxisTuning | None:
+def find_axis_tuning(tuning: TuningByAxis, axis: str) -> AxisTuning | None:
     """Return the noise estimate of an axis. North and east have a common estimate."""
     return find_first_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
@@ -188,7 +190,7 @@ def _find_offset_changes(estimates: Estimates, ekf2_inputs: Inputs | None) -> li
         clock_offset.remaining_s if ekf2_inputs is None else clock_offset.offset_s
     ):
         return []
-    change = {CLOCK_OFFSET: round(clock_offset.offset_s, 3)}
+    change = {CLOCK_OFFSET_KEY: round(clock_offset.offset_s, 3)}
     if ekf2_inputs is not None:
         position_age_ms = ekf2_inputs.settings[ekf2_inputs.aid.delay] - 1e3 * clock_offset.offset_s
         change |= make_delay_max_change(ekf2_inputs.settings, position_age_ms)
@@ -198,23 +200,23 @@ def _find_offset_changes(estimates: Estimates, ekf2_inputs: Inputs | None) -> li
 def _find_kf_noise_changes(
     settings: Settings, axis_tuning: AxisTuning, is_underconfident: bool
 ) -> list[Change]:
-    """Return changes of SIGMA_A and SIGMA_Z to their estimates, if significantly different.
+    """Return changes of SIGMA_A and SIGMA_Z to their estimates, if outside the 95 % intervals.
 
     The noises of an underconfident KF are only reduced, otherwise they are only increased.
     """
     changes = list[Change]()
     for name, noise in ((SIGMA_A, axis_tuning.sigma_a_two_state), (SIGMA_Z, axis_tuning.sigma_z)):
         current_sigma = getattr(settings, name)
-        ml_sigma = noise.value or (noise.high if is_underconfident else None) or 0.0
+        estimated_sigma = noise.value or (noise.high if is_underconfident else None) or 0.0
         noise_bound = noise.high if is_underconfident else noise.low
         if noise.value is None and name == SIGMA_Z:
-            ml_sigma = max(ml_sigma, MIN_RERUN_SIGMA_Z_M)
+            estimated_sigma = max(estimated_sigma, MIN_RERUN_SIGMA_Z_M)
         if (
-            ml_sigma
+            estimated_sigma
             and noise_bound is not None
             and (current_sigma > noise_bound if is_underconfident else current_sigma < noise_bound)
         ):
-            changes.append({name: float(f"{ml_sigma:.3g}")})
+            changes.append({name: float(f"{estimated_sigma:.3g}")})
     return changes
 
 
@@ -223,8 +225,8 @@ def _find_bias_changes(estimates: Estimates) -> list[Change]:
     if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_significant_bias():
         return []
     biases = {
-        FORWARD_BIAS: systematic_errors.accelerometer_bias_forward,
-        RIGHT_BIAS: systematic_errors.accelerometer_bias_right,
+        FORWARD_BIAS_KEY: systematic_errors.accelerometer_bias_forward,
+        RIGHT_BIAS_KEY: systematic_errors.accelerometer_bias_right,
     }
     return [{name: round(bias.value, 3) for name, bias in biases.items()}]
 
@@ -232,11 +234,11 @@ def _find_bias_changes(estimates: Estimates) -> list[Change]:
 def _find_ekf2_noise_changes(
     ekf2_inputs: Inputs, summary: FilterSummary, axis_tuning: AxisTuning
 ) -> list[Change]:
-    """Return the EKF2 parameters for the estimated position noise, if significantly different."""
+    """Return EKF2 parameters for the estimated noise, if EKF2's is outside the 95 % interval."""
     noise_m = axis_tuning.sigma_z.value
     if noise_m is None:  # the RMS innovation is an upper bound of the noise
         noise_m = float(np.hypot(summary.innovation_std_m, summary.innovation_mean_m))
-    change = make_ml_noise_change(ekf2_inputs, axis_tuning.sigma_z, noise_m)
+    change = make_estimated_noise_change(ekf2_inputs, axis_tuning.sigma_z, noise_m)
     return [change] if change else []
 
 
@@ -245,18 +247,20 @@ def _find_default_changes(log: LogInfo, ekf2_inputs: Inputs) -> list[Change]:
 
     The gate is included if the logged gate is below PX4's default.
     """
-    gate, logged_parameters = ekf2_inputs.aid.gate, ekf2_inputs.settings
-    defaults = {name: log.default_of(name) for name in (gate, *PARAMETERS_SET_TO_DEFAULT)}
+    gate_parameter, logged_parameters = ekf2_inputs.aid.gate, ekf2_inputs.settings
+    default_by_parameter = {
+        name: log.default_of(name) for name in (gate_parameter, *PARAMETERS_SET_TO_DEFAULT)
+    }
     return [
         {name: value}
-        for name, value in defaults.items()
+        for name, value in default_by_parameter.items()
         if name in logged_parameters
         and not np.isclose(logged_parameters[name], value, rtol=1e-3)
-        and (name != gate or logged_parameters[name] < value)
+        and (name != gate_parameter or logged_parameters[name] < value)
     ]
 
 
-def _find_vibration_changes(
+def _find_acc_noise_changes(
     settings: Settings, ekf2_inputs: Inputs, axis_tuning: AxisTuning
 ) -> list[Change]:
     """Return the EKF2_ACC_NOISE for the estimated SIGMA_A, if it is much larger than logged.
@@ -265,12 +269,16 @@ def _find_vibration_changes(
     SIGMA_A² · DT².
     """
     ekf2_steps_per_dt = settings.dt_s / ekf2_inputs.mean_step_s
-    logged_acc_noise, px4_maximum = ekf2_inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
+    logged_acc_noise, max_acc_noise = ekf2_inputs.settings[ACC_NOISE], PARAMETERS[ACC_NOISE].maximum
     if (
         axis_tuning.sigma_a_two_state.low or 0.0
     ) * ekf2_steps_per_dt**0.5 <= MIN_VIBRATION_RATIO * logged_acc_noise:
         return []
-    ml_acc_noise = min(
-        (axis_tuning.sigma_a_two_state.value or 0.0) * ekf2_steps_per_dt**0.5, px4_maximum
+    estimated_acc_noise = min(
+        (axis_tuning.sigma_a_two_state.value or 0.0) * ekf2_steps_per_dt**0.5, max_acc_noise
     )
-    return [{ACC_NOISE: float(f"{ml_acc_noise:.2g}")}] if ml_acc_noise > logged_acc_noise else []
+    return (
+        [{ACC_NOISE: float(f"{estimated_acc_noise:.2g}")}]
+        if estimated_acc_noise > logged_acc_noise
+        else []
+    )

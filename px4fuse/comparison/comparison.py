@@ -42,57 +42,68 @@ from px4fuse.flight.model import (
 VARIANCE_COLUMNS = ("position_variance_m2", "velocity_variance_m2_s2")
 
 
-def run_kf(prepared: PreparedComparison) -> dict[str, Replay]:
+def run_kf(prepared_comparison: PreparedComparison) -> dict[str, Replay]:
     """Run KF along each axis of a comparison, and return the runs by axis name."""
-    return {axis.name: replay(axis, prepared.settings) for axis in prepared.input_axes}
+    return {
+        axis.name: replay(axis, prepared_comparison.settings)
+        for axis in prepared_comparison.input_axes
+    }
 
 
-def compare(prepared: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comparison:
+def compare(prepared_comparison: PreparedComparison, kf_runs: Mapping[str, Replay]) -> Comparison:
     """Compare the runs of KF with EKF2, and both with ground truth, along each axis."""
-    notes, ekf2 = list(prepared.notes), prepared.flight.ekf2
+    notes, ekf2 = list(prepared_comparison.notes), prepared_comparison.flight.ekf2
     if isinstance(ekf2, Ekf2):
-        state, note = projection.remove_origin_resets(ekf2, prepared.source, prepared.segment)
+        state, note = projection.remove_origin_resets(
+            ekf2, prepared_comparison.source, prepared_comparison.segment
+        )
         notes += [note] if note else []
         notes += ekf2.notes
         if not state.equals(ekf2.state):
-            # The states at the fusion horizon still contain the removed resets, so they are omitted
+            # The states at the fusion horizon contain the resets that ``state`` no longer has
             ekf2 = replace(ekf2, state=state, aids={}, record=RECORD_NOT_LOGGED)
-    axes = {name: _compare_axis(prepared, ekf2, kf_run) for name, kf_run in kf_runs.items()}
+    axes = {
+        name: _compare_axis(prepared_comparison, ekf2, kf_run) for name, kf_run in kf_runs.items()
+    }
     innovations: dict[FilterName, dict[str, TableOrUnavailable]] = {
         "kf": {name: axis.replay.updates for name, axis in axes.items()},
         "ekf2": {name: axis.ekf2_innovations for name, axis in axes.items()},
     }
-    horizontal = {
-        name: nis for name, tables in innovations.items() if (nis := _assess_horizontal(tables))
+    horizontal_nis = {
+        name: nis
+        for name, tables in innovations.items()
+        if (nis := _assess_horizontal_innovations(tables))
     }
-    prepared = replace(prepared, notes=tuple(notes))
-    return Comparison(**vars(prepared), axes=axes, horizontal=horizontal)
+    prepared_comparison = replace(prepared_comparison, notes=tuple(notes))
+    return Comparison(**vars(prepared_comparison), axes=axes, horizontal=horizontal_nis)
 
 
 def _compare_axis(
-    prepared: PreparedComparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
+    prepared_comparison: PreparedComparison, ekf2: Ekf2 | Unavailable, kf_run: Replay
 ) -> AxisComparison:
-    axis, segment, flight = kf_run.axis, prepared.segment, prepared.flight
+    axis, segment, flight = kf_run.axis, prepared_comparison.segment, prepared_comparison.flight
     tracks = project_tracks(ekf2, flight.truth, axis, segment)
     ekf2_state, ekf2_variance, truth = tracks.values()
     innovations: TableOrUnavailable
     if isinstance(ekf2, Unavailable):
         innovations, gate = ekf2, DEFAULT_GATE
     else:
-        innovations = projection.project_innovations(flight, ekf2, prepared.source, axis, segment)
+        innovations = projection.project_innovations(
+            flight, ekf2, prepared_comparison.source, axis, segment
+        )
         gate = ekf2.gate
     ekf2_errors = compute_error_statistics(ekf2_state, ekf2_variance, truth)
     if isinstance(ekf2_errors, ErrorsAgainstTruth) and isinstance(ekf2, Ekf2):
-        horizon_nees = _compute_horizon_nees(
+        fusion_horizon_nees = _compute_horizon_nees(
             projection.project_horizon_position(ekf2, axis, segment), truth
         )
-        ekf2_errors = structs.replace(ekf2_errors, nees_position_horizon_mean=horizon_nees)
+        ekf2_errors = structs.replace(ekf2_errors, nees_position_horizon_mean=fusion_horizon_nees)
     updates = kf_run.updates.assign(
         prior_variance_m2=kf_run.updates["prior_position_variance_m2"],
         posterior_variance_m2=kf_run.steps["position_variance_m2"].reindex(kf_run.updates.index),
     )
     north_component, east_component, down_component = axis.direction.tolist()
-    rejected_flags = _find_known_values(innovations, "rejected")
+    rejected_flags = _drop_missing_values(innovations, "rejected")
     return AxisComparison(
         heading_deg=axis.heading_deg,
         direction=(north_component, east_component, down_component),
@@ -149,25 +160,27 @@ def _summarise_filter(
     sigmas: dict[str, Any] = {
         name: float(np.sqrt(values.median())) if len(values) else None
         for name, values in (
-            ("sigma_p_median_m", _find_known_values(variance, "position_variance_m2")),
-            ("sigma_v_median_m_s", _find_known_values(variance, "velocity_variance_m2_s2")),
-            ("sigma_p_before_update_m", _find_known_values(innovations, "prior_variance_m2")),
-            ("sigma_p_after_update_m", _find_known_values(innovations, "posterior_variance_m2")),
+            ("sigma_p_median_m", _drop_missing_values(variance, "position_variance_m2")),
+            ("sigma_v_median_m_s", _drop_missing_values(variance, "velocity_variance_m2_s2")),
+            ("sigma_p_before_update_m", _drop_missing_values(innovations, "prior_variance_m2")),
+            ("sigma_p_after_update_m", _drop_missing_values(innovations, "posterior_variance_m2")),
         )
     }
     if not isinstance(innovations, Unavailable):
-        innovation_m, variance_m2 = (
+        innovation_m, innovation_variance_m2 = (
             innovations["innovation_m"],
             innovations["innovation_variance_m2"],
         )
-        consistency = assess_innovations(innovation_m.to_numpy(), variance_m2.to_numpy(), gate)
+        consistency = assess_innovations(
+            innovation_m.to_numpy(), innovation_variance_m2.to_numpy(), gate
+        )
         if not isinstance(consistency, Unavailable):
             return FilterSummary(**structs.asdict(consistency), **sigmas, truth=truth)
         innovations = consistency
     return UntestedFilter(**structs.asdict(innovations), **sigmas, truth=truth)
 
 
-def _find_known_values(table: TableOrUnavailable, column: str) -> pd.Series:
+def _drop_missing_values(table: TableOrUnavailable, column: str) -> pd.Series:
     return pd.Series(dtype=float) if isinstance(table, Unavailable) else table[column].dropna()
 
 
@@ -277,7 +290,7 @@ def _compute_errors(state: pd.DataFrame, truth: pd.DataFrame, column: str) -> Ar
 
 def interpolate_sigma(time_s: Array, variance: TableOrUnavailable, column: str) -> Array:
     """Interpolate the reported σ to the times ``time_s``; NaN if it is unknown."""
-    known_variance = _find_known_values(variance, column)
+    known_variance = _drop_missing_values(variance, column)
     if known_variance.empty:
         return np.full(len(time_s), np.nan)
     variance_at_times = np.interp(time_s, known_variance.index, known_variance, np.nan, np.nan)
@@ -335,7 +348,9 @@ def compute_normalised_errors(
     return normalised_errors.index.to_numpy(), normalised_errors.to_numpy()
 
 
-def _assess_horizontal(axis_innovations: Mapping[str, TableOrUnavailable]) -> HorizontalNis | None:
+def _assess_horizontal_innovations(
+    axis_innovations: Mapping[str, TableOrUnavailable],
+) -> HorizontalNis | None:
     columns = ["innovation_m", "innovation_variance_m2"]
     tables = [
         table[columns]
@@ -345,7 +360,5 @@ def _assess_horizontal(axis_innovations: Mapping[str, TableOrUnavailable]) -> Ho
     if len(tables) < 2:
         return None
     # Only updates with innovations along both axes (equal timestamps) are used
-    north_and_east = pd.concat(tables, axis=1, join="inner").to_numpy().T
-    return assess_horizontal_nis(
-        (north_and_east[0], north_and_east[1]), (north_and_east[2], north_and_east[3])
-    )
+    north_nu, north_s, east_nu, east_s = pd.concat(tables, axis=1, join="inner").to_numpy().T
+    return assess_horizontal_nis((north_nu, north_s), (east_nu, east_s))

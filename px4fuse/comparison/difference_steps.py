@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.comparison.estimates import Tuning, find_first_tuning
+from px4fuse.comparison.estimates import TuningByAxis, find_first_tuning
 from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.remedy import find_used_noise_m
 from px4fuse.ekf2 import steps
@@ -30,10 +30,10 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.model import Unavailable
 from px4fuse.request import COMPARISON_OPTIONS
 
-# The position RMSEs of KF and EKF2 are reported as equal up to this relative difference
-EQUAL_RMSE_TOLERANCE = 0.05
-# The second largest contribution is reported if it explains at least this fraction of the mean
-# square difference KF - EKF2
+# Maximum relative difference of the position RMSEs of KF and EKF2 to report them as equal
+MAX_RELATIVE_RMSE_DIFFERENCE = 0.05
+# The property of EKF2 with the second largest contribution is reported if it explains at least this
+# fraction of the mean square difference KF - EKF2
 MIN_CONTRIBUTION_FRACTION = 0.05
 # A noise setting of KF that differs from its estimate by at least this factor dominates the
 # difference KF - EKF2. The explanation then uses KF with the estimate
@@ -45,19 +45,19 @@ MIN_STEP_EFFECT_M = 1e-6
 MIN_DIFFERENCE_OUTSIDE_REPLAY_M = 0.5
 # Position differences KF - EKF2 outside the replayed times are reported if they exceed the
 # differences inside by this factor
-MIN_OUTSIDE_TO_INSIDE_RATIO = 3.0
+UNREPLAYED_DIFFERENCE_RATIO = 3.0
 
 
 def explain_ekf2_difference(
     comparison: Comparison,
     model: Model | Unavailable,
     clock_offset: ClockOffset | Unavailable,
-    estimated_noises: Mapping[str, Any],
+    estimate_by_setting: Mapping[str, Any],
 ) -> dict[str, DifferenceExplanation | Unavailable]:
     """Explain the difference KF - EKF2 along each horizontal axis of a comparison.
 
-    ``estimated_noises`` contains the noise estimates from :func:`estimate_wrong_settings`. If only
-    the down axis is analysed, return the reason why its difference is not explained.
+    ``estimate_by_setting`` is from :func:`estimate_wrong_settings`. If only the down axis is
+    analysed, return the reason why its difference is not explained.
     """
     axis_results = {
         name: axis_result for name, axis_result in comparison.axes.items() if name != "down"
@@ -68,10 +68,10 @@ def explain_ekf2_difference(
         return {"down": Unavailable(steps.ANALYSIS_NAME, reason, action)}
     if isinstance(model, Unavailable):
         return {name: structs.replace(model, what=steps.ANALYSIS_NAME) for name in axis_results}
-    kf_settings = _comparable_settings(comparison, model.inputs, estimated_noises)
-    changed_settings = replace(comparison.settings, **estimated_noises)
+    kf_settings = _make_comparable_settings(comparison, model.inputs, estimate_by_setting)
+    changed_settings = replace(comparison.settings, **estimate_by_setting)
     kf_runs = {
-        name: replay(axis.axis, changed_settings, fast=True) if estimated_noises else axis.replay
+        name: replay(axis.axis, changed_settings, fast=True) if estimate_by_setting else axis.replay
         for name, axis in axis_results.items()
     }
     explanations = steps.explain_by_steps(model, kf_settings, kf_runs)
@@ -82,7 +82,7 @@ def explain_ekf2_difference(
     for name, by_steps in explanations.items():
         explanation = structs.replace(
             by_steps,
-            corrected=dict(estimated_noises),
+            corrected=dict(estimate_by_setting),
             steps=tuple(
                 step for step in by_steps.steps if step.position_moved_m > MIN_STEP_EFFECT_M
             ),
@@ -94,11 +94,11 @@ def explain_ekf2_difference(
     return explanation_by_axis
 
 
-def estimate_wrong_settings(comparison: Comparison, tuning: Tuning) -> dict[str, float]:
+def estimate_wrong_settings(comparison: Comparison, tuning: TuningByAxis) -> dict[str, float]:
     """Return noise estimates for those KF settings that are wrong by a large factor.
 
-    With a very wrong setting, each property of EKF2 alone would remove most of the difference
-    KF - EKF2, so the contributions of the properties could not be separated.
+    They replace the settings before the difference KF - EKF2 is explained. Otherwise each property
+    of EKF2 would remove most of the difference, and the contributions could not be separated.
     """
     axis_tuning = find_first_tuning(tuning, HORIZONTAL, AISLE, "north", "east")
     if axis_tuning is None or comparison.source.origin.is_gnss:
@@ -117,20 +117,20 @@ def estimate_wrong_settings(comparison: Comparison, tuning: Tuning) -> dict[str,
 
 
 def list_step_configurations(
-    comparison: Comparison, ekf2_inputs: Inputs, estimated_noises: Mapping[str, Any]
+    comparison: Comparison, ekf2_inputs: Inputs, estimate_by_setting: Mapping[str, Any]
 ) -> list[FilterConfiguration]:
     """Return the EKF2 configurations that :func:`explain_ekf2_difference` replays."""
     return list(
         steps.make_step_configurations(
-            ekf2_inputs, _comparable_settings(comparison, ekf2_inputs, estimated_noises)
+            ekf2_inputs, _make_comparable_settings(comparison, ekf2_inputs, estimate_by_setting)
         ).values()
     )
 
 
-def _comparable_settings(
-    comparison: Comparison, ekf2_inputs: Inputs, estimated_noises: Mapping[str, Any]
+def _make_comparable_settings(
+    comparison: Comparison, ekf2_inputs: Inputs, estimate_by_setting: Mapping[str, Any]
 ) -> Settings:
-    settings = replace(comparison.settings, **estimated_noises)
+    settings = replace(comparison.settings, **estimate_by_setting)
     is_same_source = comparison.source.name == ekf2_inputs.received.source
     return settings if is_same_source else replace(settings, clock_offset_s=0.0)
 
@@ -197,12 +197,15 @@ def add_cause_sentences(
             f"{step_reasons[second_largest_step.name]}. "
             f"{_describe_step_effect(second_largest_step, explanation)}"
         )
-    sentences += [_describe_unexplained(explanation), *_describe_rmse(explanation)]
-    min_reported_m = max(
+    sentences += [_describe_unexplained_fractions(explanation), *_describe_rmse(explanation)]
+    min_reported_difference_m = max(
         MIN_DIFFERENCE_OUTSIDE_REPLAY_M,
-        MIN_OUTSIDE_TO_INSIDE_RATIO * float(np.max(np.abs(explanation.kf_minus_ekf2_m))),
+        UNREPLAYED_DIFFERENCE_RATIO * float(np.max(np.abs(explanation.kf_minus_ekf2_m))),
     )
-    if explanation.outside is not None and explanation.outside.maximum_m > min_reported_m:
+    if (
+        explanation.outside is not None
+        and explanation.outside.maximum_m > min_reported_difference_m
+    ):
         sentences.append(
             "Outside the replayed times (while EKF2 initialises or does not fuse positions) the "
             f"positions of KF and EKF2 differ by up to {explanation.outside.maximum_m:.1f} m (at "
@@ -213,16 +216,16 @@ def add_cause_sentences(
 
 def _describe_step_effect(step: Step, explanation: DifferenceExplanation) -> str:
     explained_fraction = step.position_mean_square_m2 / explanation.position_mean_square_m2
-    # The fractions of all properties add up to 1. If one is above 1, others are negative
+    # The fractions explained by all steps add up to 1. If one is above 1, others are negative
     increase_text = (
-        " With other properties of EKF2, the difference KF - EKF2 increases."
+        " Other properties of EKF2 increase the difference KF - EKF2."
         if explained_fraction > 1.0
         else ""
     )
     return (
-        f"With EKF2's {step.name}, KF's position changes by up to {step.position_moved_m:.2f} m "
-        f"(at {step.moved_at_s:.1f} s), and the mean square difference KF - EKF2 decreases by "
-        f"{100 * explained_fraction:.0f} %.{increase_text}"
+        f"If KF uses EKF2's {step.name}, KF's position changes by up to "
+        f"{step.position_moved_m:.2f} m (at {step.moved_at_s:.1f} s), and the mean square "
+        f"difference KF - EKF2 decreases by {100 * explained_fraction:.0f} %.{increase_text}"
     )
 
 
@@ -232,8 +235,9 @@ def _describe_rejections(explanation: DifferenceExplanation) -> str:
         return ""
     count_text = f"{rejection_run.samples} position{'s' if rejection_run.samples > 1 else ''}"
     return (
-        f". From {rejection_run.start_s:.0f} s on EKF2 rejected {count_text} in a row; its "
-        f"position drifted by {rejection_run.distance_m:.2g} m in {rejection_run.duration_s:.1f} s"
+        f". From {rejection_run.start_s:.0f} s on, EKF2 rejected {count_text} in a row for "
+        f"{rejection_run.duration_s:.1f} s. This changes EKF2's position by up to "
+        f"{rejection_run.distance_m:.2g} m (replay with and without gate)"
     )
 
 
@@ -258,13 +262,13 @@ def _explain_steps(
         f"assumes {position_age_ms:.0f} ms"
     )
     if isinstance(clock_offset, ClockOffset) and clock_offset.is_determinable:
-        estimate_and_limits_s = (clock_offset.offset_s, *clock_offset.interval_s[::-1])
+        offset_and_limits_s = (clock_offset.offset_s, *clock_offset.interval_s[::-1])
         estimated_delay_ms, low_ms, high_ms = (
-            1e3 * (source.assumed_delay_s - offset_s) for offset_s in estimate_and_limits_s
+            1e3 * (source.assumed_delay_s - offset_s) for offset_s in offset_and_limits_s
         )
         delay_text = (
-            f"{delay_text}. The maximum-likelihood estimate of the age is {estimated_delay_ms:.0f} "
-            f"ms (95 % {low_ms:.0f} to {high_ms:.0f} ms)"
+            f"{delay_text}. The maximum-likelihood estimate of this age is "
+            f"{estimated_delay_ms:.0f} ms (95 % {low_ms:.0f} to {high_ms:.0f} ms)"
         )
     equivalent_sigma_a = ekf2_parameters["EKF2_ACC_NOISE"] * np.sqrt(
         ekf2_inputs.mean_step_s / kf_settings.dt_s
@@ -275,7 +279,7 @@ def _explain_steps(
         steps.TIMESTAMPS_STEP: delay_text,
         steps.NOISE_STEP: (
             f"EKF2 uses a measurement noise of {find_used_noise_m(model.inputs):.2g} m "
-            f" ({aid.noise}),KF {kf_settings.sigma_z_m:.2g} m"
+            f"({aid.noise}), KF uses {kf_settings.sigma_z_m:.2g} m"
         ),
         steps.BIASES_STEP: "EKF2 estimates the accelerometer bias; KF does not",
         steps.PROCESS_NOISE_STEP: (
@@ -294,7 +298,7 @@ def _explain_steps(
         steps.VISION_STEP: "EKF2 fuses external vision and GNSS; KF uses one position source",
         steps.GATE_STEP: (
             f"EKF2 rejects {100 * model.agreement.rejected_fraction_logged:.1f} % of the "
-            "positions; KF has no innovation gate"
+            "positions; KF has no innovation gate and uses all positions"
         ),
         steps.OUTPUT_PREDICTOR_STEP: (
             f"EKF2 fuses positions {1e3 * ekf2_inputs.horizon_s:.0f} ms late, and its output "
@@ -304,7 +308,7 @@ def _explain_steps(
     }
 
 
-def _describe_unexplained(explanation: DifferenceExplanation) -> str:
+def _describe_unexplained_fractions(explanation: DifferenceExplanation) -> str:
     position_mean_square_m2, velocity_mean_square_m2_s2 = (
         explanation.position_mean_square_m2,
         explanation.velocity_mean_square_m2_s2,
@@ -328,10 +332,11 @@ def _describe_rmse(explanation: DifferenceExplanation) -> list[str]:
     kf_rmse_m, ekf2_rmse_m = (explanation.position_rmse_to_truth_m[name] for name in ("kf", "ekf2"))
     if isinstance(kf_rmse_m, Unavailable) or isinstance(ekf2_rmse_m, Unavailable):
         return []
-    if abs(kf_rmse_m - ekf2_rmse_m) <= EQUAL_RMSE_TOLERANCE * max(kf_rmse_m, ekf2_rmse_m):
+    if abs(kf_rmse_m - ekf2_rmse_m) <= MAX_RELATIVE_RMSE_DIFFERENCE * max(kf_rmse_m, ekf2_rmse_m):
         return [
-            f"KF and EKF2 have the same position RMSE (within {100 * EQUAL_RMSE_TOLERANCE:.0f} %): "
-            f"KF {kf_rmse_m:.3f} m, EKF2 {ekf2_rmse_m:.3f} m."
+            "KF and EKF2 have the same position RMSE (within "
+            f"{100 * MAX_RELATIVE_RMSE_DIFFERENCE:.0f} %): KF {kf_rmse_m:.3f} m, EKF2 "
+            f"{ekf2_rmse_m:.3f} m."
         ]
     rmse_by_step = [
         kf_rmse_m,

@@ -1,8 +1,9 @@
 """Patterns in the errors of a position source: jitter, noise that increases with speed, and others.
 
 White noise and timestamp jitter are found without ground truth: each position is compared with a
-cubic polynomial through its four neighbours, which removes the motion. Slow errors are the
-differences from ground truth, without constant, scale factor, rotation and time offset.
+cubic polynomial through its four neighbours, which removes the motion. Slow errors are what remains
+of the errors against ground truth after a fit of constant offset, scale factor, rotation and time
+offset.
 """
 
 from typing import NamedTuple
@@ -19,40 +20,42 @@ from px4fuse.flight.model import Columns, Ekf2, Unavailable, rows_between
 from px4fuse.trajectory.rotation import conjugate, interpolate, multiply, to_vector
 from px4fuse.trajectory.scores import autocorrelation_time
 
-# Minimum number of positions for a search of error patterns
+# Minimum number of positions to search for jitter and other error patterns
 MIN_POSITIONS = 100
 # Rows of the neighbours of a position, relative to its row
 NEIGHBOUR_ROW_OFFSETS = np.array([-2, -1, 1, 2])
 # Maximum time from the first to the last neighbour of a position, in median intervals: cubic
 # interpolation across a gap is inaccurate
 MAX_NEIGHBOUR_SPAN_INTERVALS = 8.0
-# Maximum ratio of the σ of a residual to the σ of a position: above it, the interpolation is
-# inaccurate, and the residual is not used
+# Maximum σ of a residual (position minus interpolation of its neighbours), in units of the
+# position's σ. Residuals with a larger σ are not used, because their interpolation is inaccurate
 MAX_RESIDUAL_SIGMA_RATIO = 4.0
-# Number of timestamps in a running median: it follows steps by missing positions, but not jitter
-TIMESTAMP_MEDIAN_LENGTH = 9
+# Number of timestamps in a running median, which follows steps due to missing positions, but not
+# jitter
+TIMESTAMP_MEDIAN_SAMPLES = 9
 # Half of the time (s) over which a velocity is averaged
 VELOCITY_HALF_WINDOW_S = 0.3
 # Number of residuals per independent residual: successive residuals have common neighbours
-DEPENDENT_RESIDUALS = 3
-# Minimum timestamp jitter (s, 1 σ): an error of 1 cm at 1 m/s
+RESIDUALS_PER_INDEPENDENT = 3
+# Minimum reported timestamp jitter (s, 1 σ): a position error of 8 mm at 1 m/s
 MIN_JITTER_S = 0.008
-# Jitter is confirmed if position residual / (timestamp residual · velocity) is in this range
+# Jitter alone causes position residuals of timestamp residual · velocity. It is confirmed if the
+# ratio of both is in this range
 JITTER_RATIO_LIMITS = 0.6, 1.5
 # Jitter is reported if it causes at least this fraction of the RMS position residual
 MIN_JITTER_FRACTION = 0.4
-# Minimum significance (σ) of jitter, and of noise that increases with speed
+# Minimum ratio of an estimate to its σ, to report jitter or noise that increases with speed
 MIN_SIGNIFICANCE_SIGMAS = 6.0
-# Number of flight parts with a test of noise against speed, and minimum median of its significance
-# (σ) in these parts
-FLIGHT_PART_COUNT, MIN_PART_SIGMAS = 5, 1.2
+# Noise must correlate with speed also inside the parts of a flight: number of parts, and minimum
+# median of correlation / σ
+FLIGHT_PART_COUNT, MIN_PART_CORRELATION_SIGMAS = 5, 1.2
 # Quantiles of the speed: below the first, the vehicle is slow; above the second, it is fast
 SLOW_SPEED_QUANTILE, FAST_SPEED_QUANTILE = 0.3, 0.7
 # Minimum ratio of the noise at high speed to the noise at low speed, both along and across the
 # motion, to report noise that increases with speed
 MIN_FAST_TO_SLOW_NOISE_RATIO = 1.6
-# Minimum extent (m, RMS) of a path whose errors are fitted to ground truth
-MIN_PATH_RMS_M = 0.5
+# Minimum extent (m, RMS distance from its mean) of a path to fit scale factor and rotation
+MIN_PATH_EXTENT_RMS_M = 0.5
 # Length (s) of the running mean that is removed from the errors of odometry, which drifts
 DRIFT_WINDOW_S = 12.0
 # Length (s) of the flight parts with separate time offsets
@@ -62,28 +65,29 @@ MIN_SPEED_FOR_OFFSET_M_S = 0.3
 # Minimum range (s) of a varying time offset to report it: a position error of 8 cm at 1 m/s
 MIN_OFFSET_RANGE_S = 0.08
 # Varying time offsets are reported only if the mean square of the slow errors is at least this
-# multiple of the white-noise variance: the offsets of many flight parts also fit noise
-MIN_SLOW_TO_WHITE_RATIO = 0.25
-# Varying time offsets explain the slow errors if at most this fraction of their mean square remains
-MAX_REMAINING_SLOW_FRACTION = 0.2
+# multiple of the white-noise variance: the offsets of many flight parts can also fit noise
+MIN_SLOW_TO_WHITE_NOISE_RATIO = 0.25
+# Varying time offsets are reported only if at most this fraction of the mean square of the slow
+# errors remains after their correction
+MAX_REMAINING_SLOW_ERROR = 0.2
 # A sinusoidal error is reported if it explains at least this fraction of the mean square of the
 # slow errors
-MIN_PERIODIC_FRACTION = 0.88
+MIN_PERIODIC_ERROR_FRACTION = 0.88
 # Minimum ratio of the amplitude of a sinusoidal error to the σ of white noise
 MIN_AMPLITUDE_SIGMAS = 1.0
 # Minimum number of periods of a sinusoidal error in the flight
-MIN_PERIODS = 5.0
+MIN_PERIOD_COUNT = 5.0
 # Maximum tested frequency (Hz) of a sinusoidal error
 MAX_FREQUENCY_HZ = 2.0
 # Spacing of the tested frequencies, in periods per flight duration
-FREQUENCY_STEP_PERIODS = 0.2
+PERIODS_PER_FREQUENCY_STEP = 0.2
 # Minimum number of time bins per period: an amplitude is then too small by at most 0.2 %
 MIN_BINS_PER_PERIOD = 30
-# A sinusoidal error is reported if at most this fraction of the mean square motion of the vehicle
-# has the same frequency
+# A sinusoidal error is not reported if more than this fraction of the mean square of the vehicle's
+# motion has the same frequency: the error may then be due to the motion
 MAX_PERIODIC_MOTION_FRACTION = 0.1
-# Interval (s) of the compared rotations, half the step of the tested delays of the logged attitude;
-# largest tested delay (s)
+# Sampling interval (s) of the compared rotations. The tested delays of the logged attitude are
+# multiples of two intervals, up to the second value (s)
 ROTATION_INTERVAL_S, MAX_ATTITUDE_DELAY_S = 0.01, 0.5
 # Smaller delays (s) of the logged attitude are not reported
 MIN_ATTITUDE_DELAY_S = 0.04
@@ -92,11 +96,12 @@ MIN_ATTITUDE_DELAY_S = 0.04
 MAX_ROTATION_COUNT = 20_000
 # Time (s) over which a rotation from attitude is compared with the rotation from gyroscopes
 ROTATION_STEP_S = 0.1
-# Limit (rad) of the difference between both rotations: resets of the attitude cause larger ones
+# Larger differences (rad) between rotations from attitude and from gyroscopes are limited to this
+# value, because resets of the attitude cause them
 MAX_ROTATION_DIFFERENCE_RAD = 0.2
 # A delay of the attitude is reported if its correction reduces the mean square difference between
-# both rotations to less than this fraction
-MAX_CORRECTED_SQUARE_RATIO = 0.5
+# rotations from attitude and from gyroscopes to less than this fraction
+MAX_CORRECTED_DIFFERENCE_RATIO = 0.5
 # Minimum speed (m/s) of the fast part of a flight, and minimum noise (m) at this speed, to report
 # noise that increases with speed
 MIN_FAST_SPEED_M_S, MIN_FAST_NOISE_M = 0.3, 0.02
@@ -104,8 +109,8 @@ MIN_FAST_SPEED_M_S, MIN_FAST_NOISE_M = 0.3, 0.02
 SIGMA_PER_MEDIAN_ABSOLUTE = 1.4826
 
 
-class SpeedNoise(NamedTuple):
-    """Position noise ``slow_m`` and ``fast_m`` (1 σ) at low and high speed, and these speeds."""
+class SpeedDependentNoise(NamedTuple):
+    """Position noise ``slow_m``, ``fast_m`` (1 σ) at the speeds ``slow_m_s``, ``fast_m_s``."""
 
     slow_m: float
     fast_m: float
@@ -116,9 +121,9 @@ class SpeedNoise(NamedTuple):
 class LocalResiduals(NamedTuple):
     """Deviations of positions and timestamps from a cubic polynomial through their four neighbours.
 
-    ``residual_m``, shape (n, 2), is that of the horizontal position. ``timestamp_residual_s`` is
-    that of the timestamp minus the time at a constant rate. Both are scaled to the σ of a single
-    position or timestamp. ``ekf2_speed_m_s`` is EKF2's horizontal speed.
+    ``residual_m``, shape (n, 2), is the deviation of the horizontal position. Before the fit, the
+    time at a constant rate is subtracted from the timestamps. Both residuals are scaled to the σ of
+    a single position or timestamp. ``ekf2_speed_m_s`` is EKF2's horizontal speed.
     """
 
     residual_m: Array
@@ -128,7 +133,7 @@ class LocalResiduals(NamedTuple):
 
 
 class ErrorFit(NamedTuple):
-    """Fit of a constant, scale factor, rotation and time offset to the errors of a source.
+    """Fit of constant offset, scale factor, rotation and time offset to the errors of a source.
 
     ``residual_m``, shape (n, 2), is the error against ground truth that the fit does not explain.
     ``columns``, shape (n, 2, 5), contains the effects of the fitted parameters.
@@ -139,13 +144,13 @@ class ErrorFit(NamedTuple):
     path_m: Array
     columns: Array
     residual_m: Array
-    white_sigma_m: float
+    white_noise_sigma_m: float
     scale: float
     scale_sigma: float
 
     def compute_slow_mean_square_m2(self) -> float:
-        """Return the mean square (m²) of the slow errors, the residual without white noise."""
-        return float(np.mean(self.residual_m**2, axis=0).sum()) - 2.0 * self.white_sigma_m**2
+        """Return the mean square (m²) of the slow errors: residuals minus white noise."""
+        return float(np.mean(self.residual_m**2, axis=0).sum()) - 2.0 * self.white_noise_sigma_m**2
 
 
 class PeriodicError(NamedTuple):
@@ -157,7 +162,7 @@ class PeriodicError(NamedTuple):
 
 
 class OffsetVariation(NamedTuple):
-    """Smallest and largest time offset in flight, and their times ``least_at_s``, ``most_at_s``."""
+    """Smallest (``least_s``) and largest time offset in flight, and the times of both."""
 
     least_s: float
     most_s: float
@@ -189,23 +194,23 @@ def compute_local_residuals(comparison: Comparison) -> LocalResiduals | None:
     rows, neighbour_rows, elapsed_s = (
         array[is_complete] for array in (rows, neighbour_rows, elapsed_s)
     )
-    weights = np.ones_like(elapsed_s)  # of Lagrange's interpolation at the time of the position
+    weights = np.ones_like(elapsed_s)  # for Lagrange's interpolation at the time of the position
     for neighbour in range(len(NEIGHBOUR_ROW_OFFSETS)):
         for other_neighbour in set(range(len(NEIGHBOUR_ROW_OFFSETS))) - {neighbour}:
             other_elapsed_s = elapsed_s[:, other_neighbour]
             weights[:, neighbour] *= other_elapsed_s / (other_elapsed_s - elapsed_s[:, neighbour])
     residual_sigma_ratio = np.sqrt(1.0 + np.sum(weights**2, axis=1))
-    deviation_s = time_s - interval_s * np.arange(len(time_s))
-    timestamp_delay_s = deviation_s - median_filter(
-        deviation_s, TIMESTAMP_MEDIAN_LENGTH, mode="nearest"
+    timestamp_deviation_s = time_s - interval_s * np.arange(len(time_s))
+    timestamp_delay_s = timestamp_deviation_s - median_filter(
+        timestamp_deviation_s, TIMESTAMP_MEDIAN_SAMPLES, mode="nearest"
     )
     half_window_rows = max(2, round(VELOCITY_HALF_WINDOW_S / interval_s))
-    first_row, last_row = (
+    window_first_rows, window_last_rows = (
         np.clip(rows - half_window_rows, 0, None),
         np.clip(rows + half_window_rows, None, len(time_s) - 1),
     )
-    displacement_m = position_m[last_row] - position_m[first_row]
-    velocity_m_s = displacement_m / (time_s[last_row] - time_s[first_row])[:, None]
+    displacement_m = position_m[window_last_rows] - position_m[window_first_rows]
+    velocity_m_s = displacement_m / (time_s[window_last_rows] - time_s[window_first_rows])[:, None]
     is_accurate = residual_sigma_ratio < MAX_RESIDUAL_SIGMA_RATIO
 
     def compute_residual(values: Array) -> Array:
@@ -233,34 +238,36 @@ def find_timestamp_jitter(errors: LocalResiduals) -> float | None:
 
     If a position has a late timestamp, it is behind the interpolated position by delay · velocity.
     """
-    expected_m = -errors.velocity_m_s * errors.timestamp_residual_s[:, None]
-    expected_square_m2 = float(np.sum(expected_m**2))
+    expected_residual_m = -errors.velocity_m_s * errors.timestamp_residual_s[:, None]
+    expected_square_sum_m2 = float(np.sum(expected_residual_m**2))
     jitter_s = float(np.std(errors.timestamp_residual_s))
-    if jitter_s < MIN_JITTER_S or not expected_square_m2:
+    if jitter_s < MIN_JITTER_S or not expected_square_sum_m2:
         return None
-    ratio = float(np.sum(errors.residual_m * expected_m)) / expected_square_m2
-    unexplained_m = errors.residual_m - ratio * expected_m
-    sigma = np.sqrt(DEPENDENT_RESIDUALS * np.mean(unexplained_m**2) / expected_square_m2)
-    jitter_fraction = np.sqrt(expected_square_m2 / np.sum(errors.residual_m**2))
+    ratio = float(np.sum(errors.residual_m * expected_residual_m)) / expected_square_sum_m2
+    unexplained_residual_m = errors.residual_m - ratio * expected_residual_m
+    ratio_sigma = np.sqrt(
+        RESIDUALS_PER_INDEPENDENT * np.mean(unexplained_residual_m**2) / expected_square_sum_m2
+    )
+    jitter_fraction = np.sqrt(expected_square_sum_m2 / np.sum(errors.residual_m**2))
     is_jitter = (
         JITTER_RATIO_LIMITS[0] < ratio < JITTER_RATIO_LIMITS[1]
-        and ratio > MIN_SIGNIFICANCE_SIGMAS * sigma
+        and ratio > MIN_SIGNIFICANCE_SIGMAS * ratio_sigma
         and jitter_fraction > MIN_JITTER_FRACTION
     )
     return jitter_s if is_jitter else None
 
 
-def find_speed_noise(errors: LocalResiduals) -> SpeedNoise | None:
+def find_speed_noise(errors: LocalResiduals) -> SpeedDependentNoise | None:
     """Return the noise at low and high speed if it increases with speed in all directions."""
     # The speed is from EKF2, because a speed from the positions would contain their noise
     speed_m_s = errors.ekf2_speed_m_s
     if speed_m_s is None:
         return None
     residual_norms_m = np.linalg.norm(errors.residual_m, axis=1)
-    # Parts are tested, because noise that is larger in one part only may correlate with speed, too
+    # Each part of the flight is tested, too: larger noise in only one part may correlate with speed
     correlation_z_scores = [
         rank_correlation(residual_norms_m[part], speed_m_s[part])
-        * np.sqrt(len(part) / DEPENDENT_RESIDUALS)
+        * np.sqrt(len(part) / RESIDUALS_PER_INDEPENDENT)
         for part in (
             np.arange(len(residual_norms_m)),
             *np.array_split(np.arange(len(residual_norms_m)), FLIGHT_PART_COUNT),
@@ -270,19 +277,19 @@ def find_speed_noise(errors: LocalResiduals) -> SpeedNoise | None:
     if (
         len(correlation_z_scores) <= FLIGHT_PART_COUNT
         or correlation_z_scores[0] < MIN_SIGNIFICANCE_SIGMAS
-        or np.median(correlation_z_scores[1:]) < MIN_PART_SIGMAS
+        or np.median(correlation_z_scores[1:]) < MIN_PART_CORRELATION_SIGMAS
     ):
         return None
     speed_limits_m_s = np.quantile(speed_m_s, [SLOW_SPEED_QUANTILE, FAST_SPEED_QUANTILE])
     is_slow, is_fast = speed_m_s <= speed_limits_m_s[0], speed_m_s >= speed_limits_m_s[1]
     source_speed_m_s = np.linalg.norm(errors.velocity_m_s, axis=1, keepdims=True)
     direction = errors.velocity_m_s / np.maximum(source_speed_m_s, 1e-6)
-    along_residual_m = np.abs(np.sum(errors.residual_m * direction, axis=1))
-    across_residual_m = np.abs(np.sum(errors.residual_m * _rotate_90(direction), axis=1))
-    # Noise along the motion only is not reported: timestamp jitter causes it, too
+    along_track_residual_m = np.abs(np.sum(errors.residual_m * direction, axis=1))
+    cross_track_residual_m = np.abs(np.sum(errors.residual_m * _rotate_90(direction), axis=1))
+    # Noise must increase along and across the track: timestamp jitter causes noise along it
     if any(
         np.median(noise_m[is_fast]) < MIN_FAST_TO_SLOW_NOISE_RATIO * np.median(noise_m[is_slow])
-        for noise_m in (along_residual_m, across_residual_m)
+        for noise_m in (along_track_residual_m, cross_track_residual_m)
     ):
         return None
     slow_and_fast_noise_m = (
@@ -290,7 +297,7 @@ def find_speed_noise(errors: LocalResiduals) -> SpeedNoise | None:
         for rows in (is_slow, is_fast)
     )
     slow_and_fast_speed_m_s = (float(np.median(speed_m_s[rows])) for rows in (is_slow, is_fast))
-    speed_noise = SpeedNoise(*slow_and_fast_noise_m, *slow_and_fast_speed_m_s)
+    speed_noise = SpeedDependentNoise(*slow_and_fast_noise_m, *slow_and_fast_speed_m_s)
     is_relevant = (
         speed_noise.fast_m_s >= MIN_FAST_SPEED_M_S and speed_noise.fast_m >= MIN_FAST_NOISE_M
     )
@@ -298,7 +305,7 @@ def find_speed_noise(errors: LocalResiduals) -> SpeedNoise | None:
 
 
 def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> ErrorFit | None:
-    """Fit a constant, scale factor, rotation and time offset to the errors against ground truth."""
+    """Fit constant offset, scale, rotation and time offset to the errors against ground truth."""
     truth = comparison.flight.truth
     if isinstance(truth, Unavailable):
         return None
@@ -312,7 +319,7 @@ def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> Error
     path_m, velocity_m_s = true_spline(time_s), true_spline(time_s, 1)
     path_m = path_m - path_m.mean(axis=0)
     path_mean_square_m2 = float(np.mean(np.sum(path_m**2, axis=1)))
-    if path_mean_square_m2 < MIN_PATH_RMS_M**2:
+    if path_mean_square_m2 < MIN_PATH_EXTENT_RMS_M**2:
         return None
     columns = np.stack(
         [
@@ -324,32 +331,34 @@ def fit_errors(comparison: Comparison, local_residuals: LocalResiduals) -> Error
         axis=-1,
     )
     error_m = position_m - true_spline(time_s)
-    parameters, residual_m = _least_squares(columns, error_m)
-    # Successive errors are correlated, so fewer errors are independent
+    parameters, residual_m = _fit_least_squares(columns, error_m)
+    # The σ of the scale factor depends on the independent errors; successive errors are correlated
     interval_s = float(np.median(np.diff(time_s)))
-    independent_count = len(time_s) / max(*map(autocorrelation_time, residual_m.T), 1.0)
-    sigma = np.sqrt(np.mean(residual_m**2) / (path_mean_square_m2 * independent_count))
+    independent_error_count = len(time_s) / max(*map(autocorrelation_time, residual_m.T), 1.0)
+    scale_sigma = np.sqrt(np.mean(residual_m**2) / (path_mean_square_m2 * independent_error_count))
     if comparison.source.origin.may_drift:
         window_rows = max(1, round(DRIFT_WINDOW_S / interval_s))
 
         def high_pass(values: Array) -> Array:
             return values - uniform_filter1d(values, window_rows, axis=0)
 
-        _, residual_m = _least_squares(high_pass(columns)[..., 2:], high_pass(error_m))
-    white_sigma_m = SIGMA_PER_MEDIAN_ABSOLUTE * float(np.median(np.abs(local_residuals.residual_m)))
+        _, residual_m = _fit_least_squares(high_pass(columns)[..., 2:], high_pass(error_m))
+    white_noise_sigma_m = SIGMA_PER_MEDIAN_ABSOLUTE * float(
+        np.median(np.abs(local_residuals.residual_m))
+    )
     return ErrorFit(
         time_s,
         velocity_m_s,
         path_m,
         columns,
         residual_m,
-        white_sigma_m,
+        white_noise_sigma_m,
         float(parameters[2]),
-        float(sigma),
+        float(scale_sigma),
     )
 
 
-def _least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
+def _fit_least_squares(columns: Array, values: Array) -> tuple[Array, Array]:
     """Fit ``columns``, shape (n, 2, k), to values; return the k parameters and the residuals."""
     rows = columns.reshape(-1, columns.shape[-1])
     parameters = np.asarray(np.linalg.lstsq(rows, values.ravel(), rcond=None)[0], dtype=np.float64)
@@ -362,23 +371,28 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     Return None without such an error, or if the motion contains its frequency.
     """
     duration_s = fit.time_s[-1] - fit.time_s[0]
-    highest_hz = min(MAX_FREQUENCY_HZ, 0.25 / float(np.median(np.diff(fit.time_s))))
-    step_hz = FREQUENCY_STEP_PERIODS / duration_s
-    rows = slice(round(MIN_PERIODS / FREQUENCY_STEP_PERIODS), int(np.ceil(highest_hz / step_hz)))
+    max_frequency_hz = min(MAX_FREQUENCY_HZ, 0.25 / float(np.median(np.diff(fit.time_s))))
+    frequency_step_hz = PERIODS_PER_FREQUENCY_STEP / duration_s
+    rows = slice(
+        round(MIN_PERIOD_COUNT / PERIODS_PER_FREQUENCY_STEP),
+        int(np.ceil(max_frequency_hz / frequency_step_hz)),
+    )
     if rows.stop <= rows.start or fit.compute_slow_mean_square_m2() <= 0.0:
         return None
-    # With the errors summed in time bins of equal length, one FFT contains all tested frequencies
-    bin_count = 2 ** int(np.ceil(np.log2(MIN_BINS_PER_PERIOD * highest_hz / step_hz)))
-    bin_indices = np.rint((fit.time_s - fit.time_s[0]) * step_hz * bin_count).astype(int)
+    # Errors are summed in time bins of equal length, so that one FFT tests all frequencies
+    bin_count = 2 ** int(
+        np.ceil(np.log2(MIN_BINS_PER_PERIOD * max_frequency_hz / frequency_step_hz))
+    )
+    bin_indices = np.rint((fit.time_s - fit.time_s[0]) * frequency_step_hz * bin_count).astype(int)
     spectrum = np.fft.rfft(
         [np.bincount(bin_indices, error, bin_count) for error in fit.residual_m.T]
     )
     powers = np.sum(np.abs(spectrum[:, rows]) ** 2, axis=0)
-    frequency_hz = float(step_hz * (rows.start + np.argmax(powers)))
+    frequency_hz = float(frequency_step_hz * (rows.start + np.argmax(powers)))
 
     def compute_mean_square_m2(values: Array, frequency_hz: float) -> float:
-        wave = np.exp(-2j * np.pi * frequency_hz * fit.time_s)
-        return 2.0 * float(np.sum(np.abs(wave @ values / len(values)) ** 2))
+        complex_sinusoid = np.exp(-2j * np.pi * frequency_hz * fit.time_s)
+        return 2.0 * float(np.sum(np.abs(complex_sinusoid @ values / len(values)) ** 2))
 
     periodic_mean_square_m2 = compute_mean_square_m2(fit.residual_m, frequency_hz)
     motion_fraction = compute_mean_square_m2(fit.path_m, frequency_hz) / np.mean(
@@ -387,8 +401,8 @@ def find_periodic_error(fit: ErrorFit) -> PeriodicError | None:
     amplitude_m = float(np.sqrt(2.0 * periodic_mean_square_m2))
     explained_fraction = periodic_mean_square_m2 / fit.compute_slow_mean_square_m2()
     if (
-        explained_fraction < MIN_PERIODIC_FRACTION
-        or amplitude_m < MIN_AMPLITUDE_SIGMAS * fit.white_sigma_m
+        explained_fraction < MIN_PERIODIC_ERROR_FRACTION
+        or amplitude_m < MIN_AMPLITUDE_SIGMAS * fit.white_noise_sigma_m
         or motion_fraction > MAX_PERIODIC_MOTION_FRACTION
     ):
         return None
@@ -407,29 +421,32 @@ def find_offset_variation(fit: ErrorFit) -> OffsetVariation | None:
     moving_part_indices = np.flatnonzero(mean_square_speeds > MIN_SPEED_FOR_OFFSET_M_S**2)
     if len(moving_part_indices) < 2:
         return None
-    # The time offset of a part affects only this part, so it is eliminated part by part. Then the
-    # parameters that are constant in flight are fitted
-    effect = -fit.velocity_m_s
+    # Each flight part has its own time offset. Its effect is first removed from all columns, then
+    # the parameters that are constant in flight are fitted
+    error_per_offset_m_s = -fit.velocity_m_s
     inverse_square_sums = np.zeros_like(square_speed_sums)
     inverse_square_sums[moving_part_indices] = 1.0 / square_speed_sums[moving_part_indices]
 
     def fit_offsets(values: Array) -> Array:
         sums = np.zeros((len(inverse_square_sums), values.shape[-1]))
-        np.add.at(sums, part_indices, np.einsum("na,nak->nk", effect, values))
+        np.add.at(sums, part_indices, np.einsum("na,nak->nk", error_per_offset_m_s, values))
         return sums * inverse_square_sums[:, None]
 
-    # Effects of the constant parameters, except the constant time offset, and residual of the fit
+    # Effects of the constant parameters, and the errors. The offsets of the flight parts replace
+    # the constant time offset
     columns = np.concatenate([fit.columns[..., :-1], fit.residual_m[..., None]], axis=-1)
     offsets_by_column_s = fit_offsets(columns)
-    columns -= effect[:, :, None] * offsets_by_column_s[part_indices, None]
-    parameters, residual_m = _least_squares(columns[..., :-1], columns[..., -1])
+    columns -= error_per_offset_m_s[:, :, None] * offsets_by_column_s[part_indices, None]
+    parameters, residual_m = _fit_least_squares(columns[..., :-1], columns[..., -1])
     offsets_s = (offsets_by_column_s @ np.append(-parameters, 1.0))[moving_part_indices]
-    slow_square_m2 = fit.compute_slow_mean_square_m2()
-    remaining_square_m2 = float(np.mean(residual_m**2, axis=0).sum()) - 2.0 * fit.white_sigma_m**2
+    slow_mean_square_m2 = fit.compute_slow_mean_square_m2()
+    remaining_mean_square_m2 = (
+        float(np.mean(residual_m**2, axis=0).sum()) - 2.0 * fit.white_noise_sigma_m**2
+    )
     if (
         np.ptp(offsets_s) < MIN_OFFSET_RANGE_S
-        or slow_square_m2 < MIN_SLOW_TO_WHITE_RATIO * 2.0 * fit.white_sigma_m**2
-        or remaining_square_m2 > MAX_REMAINING_SLOW_FRACTION * slow_square_m2
+        or slow_mean_square_m2 < MIN_SLOW_TO_WHITE_NOISE_RATIO * 2.0 * fit.white_noise_sigma_m**2
+        or remaining_mean_square_m2 > MAX_REMAINING_SLOW_ERROR * slow_mean_square_m2
     ):
         return None
     times_s = fit.time_s[0] + OFFSET_PART_LENGTH_S * (moving_part_indices + 0.5)
@@ -462,14 +479,16 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     angle_rad = cumulative_integral(imu[Columns.ANGULAR_RATE].to_numpy(), imu_time_s)
 
     def compute_mean_square_rad2(delay_s: float) -> float:
-        delayed_rad = np.array(
+        delayed_angle_rad = np.array(
             [np.interp(time_s - delay_s, imu_time_s, column) for column in angle_rad.T]
         )
         differences_rad = (
             rotation_rad
-            - (delayed_rad[:, rows_per_rotation:] - delayed_rad[:, :-rows_per_rotation]).T
+            - (
+                delayed_angle_rad[:, rows_per_rotation:] - delayed_angle_rad[:, :-rows_per_rotation]
+            ).T
         )
-        differences_rad -= np.median(differences_rad, axis=0)  # removes the gyroscope bias
+        differences_rad -= np.median(differences_rad, axis=0)  # due to the gyroscope bias
         # Each difference is limited, because resets of the attitude cause large differences
         norms_rad = np.minimum(np.linalg.norm(differences_rad, axis=1), MAX_ROTATION_DIFFERENCE_RAD)
         return float(np.mean(norms_rad**2))
@@ -478,5 +497,5 @@ def find_attitude_delay(imu: pd.DataFrame, attitude: pd.DataFrame) -> float | No
     delay_s = float(min(delays_s, key=compute_mean_square_rad2))
     is_late = abs(delay_s) >= MIN_ATTITUDE_DELAY_S and compute_mean_square_rad2(
         delay_s
-    ) < MAX_CORRECTED_SQUARE_RATIO * compute_mean_square_rad2(0.0)
+    ) < MAX_CORRECTED_DIFFERENCE_RATIO * compute_mean_square_rad2(0.0)
     return delay_s if is_late else None

@@ -47,20 +47,19 @@ MIN_TELEMETRY_IMU_HZ = 200.0
 MIN_IMU_RATE_RATIO = 0.98
 TELEMETRY_IMU_MESSAGES = ("HIGHRES_IMU", "SCALED_IMU", "SCALED_IMU2", "SCALED_IMU3")
 
-# A change of the time offset in flight is tested with at least this number of estimates before and
-# after it
-MIN_ESTIMATES_BEFORE_AFTER = 2
+# Minimum number of time offset estimates before a tested change of the offset in flight, and after
+MIN_OFFSETS_PER_SIDE = 2
 
 # Axes with a noise estimate in the report; north and east have a common estimate
 REPORTED_AXES = (HORIZONTAL, "down")
 
 Progress = Callable[[str], None]
-Tuning = Mapping[str, AxisTuning | Unavailable]
+TuningByAxis = Mapping[str, AxisTuning | Unavailable]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Estimates:
-    """Maximum-likelihood estimates from positions and IMU.
+    """Maximum-likelihood estimates of noises, time offset and errors of the position source.
 
     Attributes
     ----------
@@ -70,19 +69,19 @@ class Estimates:
         Time offset between position source and IMU.
     heading : HeadingError or Unavailable
         Yaw misalignment of the position frame.
-    tuning_by_axis : tuple of AxisTuning
+    axis_tunings : tuple of AxisTuning
         Separate noises along north and east, if they differ; empty for GNSS and odometry.
     noisy_part : NoisyPart or None
-        Time span in which most innovations are larger; None for odometry.
+        Time span with larger innovations than in the rest of the flight; None for odometry.
     """
 
-    tuning: Tuning
+    tuning: TuningByAxis
     clock: ClockOffset | Unavailable
     heading: HeadingError | Unavailable
     systematic_errors: SystematicErrors | Unavailable
     source_low_pass: SourceLowPass | Unavailable
     time_correlated_noise: TimeCorrelatedNoise | Unavailable
-    tuning_by_axis: tuple[AxisTuning, ...] = ()
+    axis_tunings: tuple[AxisTuning, ...] = ()
     noisy_part: NoisyPart | None = None
 
 
@@ -90,7 +89,7 @@ def ignore_progress(_: str) -> None:
     """Ignore the progress text."""
 
 
-def find_first_tuning(tuning: Tuning, *axis_names: str) -> AxisTuning | None:
+def find_first_tuning(tuning: TuningByAxis, *axis_names: str) -> AxisTuning | None:
     """Return the noise estimate of the first axis in ``axis_names`` that has an estimate."""
     axis_tunings = map(tuning.get, axis_names)
     return next(
@@ -111,17 +110,19 @@ def estimate(comparison: Comparison, progress: Progress = ignore_progress) -> Es
         else None
     )
     tuning, clock_offset = estimate_noises_and_clock(comparison, progress, tuned_axes)
-    fit, low_pass, correlated_noise = _fit_source_errors(comparison, tuning, clock_offset)
+    systematic_errors, source_low_pass, correlated_noise = _fit_source_errors(
+        comparison, tuning, clock_offset
+    )
     progress("heading")
     source, is_odometry = comparison.source, comparison.source.orientation is not None
     return Estimates(
         tuning=tuning,
         clock=clock_offset,
         heading=estimate_frame_rotation(comparison, tuning, clock_offset),
-        systematic_errors=fit,
-        source_low_pass=low_pass,
+        systematic_errors=systematic_errors,
+        source_low_pass=source_low_pass,
         time_correlated_noise=correlated_noise,
-        tuning_by_axis=() if is_odometry or source.origin.is_gnss else tune_by_axis(comparison),
+        axis_tunings=() if is_odometry or source.origin.is_gnss else tune_by_axis(comparison),
         noisy_part=None if is_odometry else find_noisy_part(comparison, tuning.get(HORIZONTAL)),
     )
 
@@ -144,7 +145,7 @@ def estimate_noises(
     motion_cache : dict, optional
         IMU motion that several estimates share.
     """
-    flight, low_imu_rate = comparison.flight, explain_low_imu_rate(comparison.flight)
+    flight, low_imu_rate_reason = comparison.flight, explain_low_imu_rate(comparison.flight)
     if flight.log.is_assessed:
         return {HORIZONTAL: DIAGNOSIS_WITHHELD}
     return tune(
@@ -152,7 +153,7 @@ def estimate_noises(
         comparison.settings,
         axis_names,
         lambda name: progress(f"tuning {name}"),
-        flight if low_imu_rate is None else replace(flight, imu=low_imu_rate),
+        flight if low_imu_rate_reason is None else replace(flight, imu=low_imu_rate_reason),
         comparison.source.origin.may_drift,
         motion_cache,
     )
@@ -162,7 +163,7 @@ def estimate_noises_and_clock(
     comparison: PreparedComparison,
     progress: Progress = ignore_progress,
     axis_names: tuple[str, ...] | None = (HORIZONTAL,),
-) -> tuple[Tuning, ClockOffset | Unavailable]:
+) -> tuple[TuningByAxis, ClockOffset | Unavailable]:
     """Estimate measurement noise, process noise, and the time offset between positions and IMU.
 
     Parameters are those of :func:`estimate_noises`.
@@ -171,8 +172,8 @@ def estimate_noises_and_clock(
     tuning = estimate_noises(comparison, axis_names, progress, motion_cache)
     if comparison.flight.log.is_assessed:
         return tuning, DIAGNOSIS_WITHHELD
-    if low_imu_rate := explain_low_imu_rate(comparison.flight):
-        return tuning, low_imu_rate
+    if low_imu_rate_reason := explain_low_imu_rate(comparison.flight):
+        return tuning, low_imu_rate_reason
     settings, axis_tuning = comparison.settings, find_first_tuning(tuning, HORIZONTAL, *tuning)
     clock_offset = estimate_time_offset(
         comparison.flight,
@@ -194,7 +195,7 @@ def estimate_noises_and_clock(
 
 def estimate_frame_rotation(
     comparison: Comparison,
-    tuning: Tuning,
+    tuning: TuningByAxis,
     clock_offset: ClockOffset | Unavailable,
 ) -> HeadingError | Unavailable:
     """Estimate the yaw misalignment of the position frame."""
@@ -215,7 +216,7 @@ def estimate_frame_rotation(
 
 
 def _fit_source_errors(
-    comparison: Comparison, tuning: Tuning, clock_offset: ClockOffset | Unavailable
+    comparison: Comparison, tuning: TuningByAxis, clock_offset: ClockOffset | Unavailable
 ) -> tuple[
     SystematicErrors | Unavailable,
     SourceLowPass | Unavailable,
@@ -249,7 +250,7 @@ def _fit_source_errors(
     for jump in jumps:
         is_after_jump = (time_s >= jump.time_s) & (time_s < jump.time_s + OUTLIER_RETEST_DURATION_S)
         excluded_times_s = np.union1d(excluded_times_s, time_s[is_after_jump])
-    correlated_fit = fit_time_correlation(
+    time_correlation_fit = fit_time_correlation(
         flight,
         axes,
         settings,
@@ -258,20 +259,20 @@ def _fit_source_errors(
         clock_offset_s=offset_s,
         jumps=jumps,
     )
-    if isinstance(correlated_fit, Unavailable):
-        return systematic_errors, correlated_fit, correlated_fit
-    low_pass, correlated_noise = correlated_fit
+    if isinstance(time_correlation_fit, Unavailable):
+        return systematic_errors, time_correlation_fit, time_correlation_fit
+    source_low_pass, correlated_noise = time_correlation_fit
     truths = [comparison.axes[axis.name].truth for axis in axes]
     known_truths = [truth for truth in truths if not isinstance(truth, Unavailable)]
     if len(known_truths) == len(axes):
         correlated_noise = fit_time_correlation_to_truth(
-            axes, known_truths, excluded_times_s, offset_s, jumps, correlated_noise, low_pass
+            axes, known_truths, excluded_times_s, offset_s, jumps, correlated_noise, source_low_pass
         )
-    return systematic_errors, low_pass, correlated_noise
+    return systematic_errors, source_low_pass, correlated_noise
 
 
 def _select_horizontal_axes(
-    comparison: Comparison, tuning: Tuning
+    comparison: Comparison, tuning: TuningByAxis
 ) -> tuple[tuple[Axis, ...], AxisTuning] | Unavailable:
     """Return the horizontal axes that have a noise estimate, with the estimate."""
     for name, axis_names in ((HORIZONTAL, ("north", "east")), (AISLE, (AISLE,))):
@@ -279,7 +280,7 @@ def _select_horizontal_axes(
         if isinstance(axis_tuning, AxisTuning) and comparison.axes.keys() >= set(axis_names):
             return tuple(comparison.axes[axis].axis for axis in axis_names), axis_tuning
     return Unavailable(
-        "errors of the position source other than noise",
+        "systematic and time-correlated errors of the position source",
         "the position and acceleration noise of the horizontal axes could not be estimated",
         "Analyse the axes north and east, or the main axis (--axis aisle).",
     )
@@ -288,8 +289,9 @@ def _select_horizontal_axes(
 def explain_low_imu_rate(flight: Flight) -> Unavailable | None:
     """Return a reason if the IMU rate is too low to estimate a time offset, otherwise None.
 
-    Telemetry needs a higher rate than a ULog: it sends only the newest of several samples, and
-    subtracts EKF2's bias estimate (``HIGHRES_IMU.hpp``). A ULog sample is the mean of its interval.
+    Telemetry needs a higher rate than a ULog, because a ULog sample is the mean over its interval.
+    Telemetry sends only the newest of several samples, minus EKF2's bias estimate
+    (``HIGHRES_IMU.hpp``).
     """
     if isinstance(flight.imu, Unavailable) or len(flight.imu) < 2:
         return None
@@ -321,12 +323,12 @@ def widen_for_drift(clock_offset: ClockOffset) -> ClockOffset:
     """
     offsets_s = np.array([part.offset_s for part in clock_offset.parts])
     weights = np.array([part.sigma_s**-2.0 for part in clock_offset.parts])
-    if len(offsets_s) <= MIN_ESTIMATES_BEFORE_AFTER:
+    if len(offsets_s) <= MIN_OFFSETS_PER_SIDE:
         return structs.replace(
             clock_offset, change_p_value=None, drift_ppm=None, drift_sigma_ppm=None
         )
     sigma_factor = np.sqrt(
-        max(1.0, _weighted_square_sum(offsets_s, weights) / (len(offsets_s) - 1))
+        max(1.0, _compute_weighted_square_sum(offsets_s, weights) / (len(offsets_s) - 1))
     )
     low_s, high_s = (
         clock_offset.offset_s + sigma_factor * (limit_s - clock_offset.offset_s)
@@ -346,22 +348,22 @@ def widen_for_drift(clock_offset: ClockOffset) -> ClockOffset:
         reason=drift_reason,
         drift_ppm=None,
         drift_sigma_ppm=None,
-        change_p_value=_largest_step_p_value(offsets_s, weights),
+        change_p_value=_compute_change_p_value(offsets_s, weights),
     )
 
 
-def _weighted_square_sum(offsets_s: Array, weights: Array) -> float:
+def _compute_weighted_square_sum(offsets_s: Array, weights: Array) -> float:
     return float(np.sum(weights * (offsets_s - np.average(offsets_s, weights=weights)) ** 2))
 
 
-def _largest_step_p_value(offsets_s: Array, weights: Array) -> float | None:
+def _compute_change_p_value(offsets_s: Array, weights: Array) -> float | None:
     """Return the p-value of the largest change of the time offset; None for a short flight.
 
     Method: Student's t-test of the mean offsets before and after each time, with Bonferroni
     correction. Changes below ``MIN_TIME_OFFSET_CHANGE_S`` are ignored.
     """
     part_count = len(offsets_s)
-    split_rows = range(MIN_ESTIMATES_BEFORE_AFTER, part_count - MIN_ESTIMATES_BEFORE_AFTER + 1)
+    split_rows = range(MIN_OFFSETS_PER_SIDE, part_count - MIN_OFFSETS_PER_SIDE + 1)
     smallest_p = 1.0
     for split_row in split_rows:
         before_and_after = [
@@ -381,7 +383,7 @@ def _largest_step_p_value(offsets_s: Array, weights: Array) -> float | None:
         variance_factor = max(
             1.0,
             sum(
-                _weighted_square_sum(side_offsets_s, side_weights)
+                _compute_weighted_square_sum(side_offsets_s, side_weights)
                 for side_offsets_s, side_weights in before_and_after
             )
             / (part_count - 2),

@@ -29,19 +29,19 @@ class Events:
         Spans in which the logger wrote no data.
     ground_spans_s : tuple of (float, float)
         Spans on the ground, from the land detector.
-    resets_s : tuple of float
+    reset_times_s : tuple of float
         Resets of EKF2's position or velocity.
-    rejected_s : mapping from axis name to ndarray
+    rejection_times_s : mapping from axis name to ndarray
         Positions that EKF2 rejected.
     """
 
     gaps: tuple[Span, ...]
     dropouts: tuple[Span, ...]
     ground_spans_s: tuple[Span, ...]
-    take_off_s: tuple[float, ...]
-    landing_s: tuple[float, ...]
-    resets_s: tuple[float, ...]
-    rejected_s: Mapping[str, Array]
+    take_off_times_s: tuple[float, ...]
+    landing_times_s: tuple[float, ...]
+    reset_times_s: tuple[float, ...]
+    rejection_times_s: Mapping[str, Array]
 
 
 def compute_max_interval_s(interval_s: float) -> float:
@@ -78,12 +78,12 @@ def collect_events(comparison: Comparison) -> Events:
         ground_spans_s=()
         if isinstance(flight.airborne, Unavailable)
         else segment.cut(zip(flight_edges_s[::2], flight_edges_s[1::2], strict=True)),
-        take_off_s=tuple(start for start, _ in airborne_spans_s if start_s <= start <= end_s),
-        landing_s=tuple(end for _, end in airborne_spans_s if start_s <= end <= end_s),
-        resets_s=tuple(
+        take_off_times_s=tuple(start for start, _ in airborne_spans_s if start_s <= start <= end_s),
+        landing_times_s=tuple(end for _, end in airborne_spans_s if start_s <= end <= end_s),
+        reset_times_s=tuple(
             sorted({reset.time_s for reset in resets if start_s <= reset.time_s <= end_s})
         ),
-        rejected_s={
+        rejection_times_s={
             axis_result.axis.name: frame.index[frame["rejected"] > 0].to_numpy()
             for axis_result in comparison.axes.values()
             if isinstance(frame := axis_result.ekf2_innovations, pd.DataFrame)

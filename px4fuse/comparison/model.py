@@ -47,7 +47,7 @@ class ErrorsAgainstTruth(Record, kw_only=True):
     nees_position_horizon_mean: NotNegative | None = None
 
     @property
-    def is_lag_only(self) -> bool:
+    def has_only_lag_errors(self) -> bool:
         """True if EKF2's errors exceed σ only because its output predictor lags."""
         nees = self.nees_position_horizon_mean
         return nees is not None and classify_sigma_ratio(nees**0.5, "truth") != "overconfident"

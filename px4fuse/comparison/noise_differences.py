@@ -63,41 +63,54 @@ def find_noisy_part(
     axes = [axis_result.axis for axis_result in select_north_and_east(comparison)]
     if sigma_a is None or sigma_z is None or len(axes) < 2:
         return None
-    kf_inputs = [preintegrate(axis, settings) for axis in axes]
-    time_s = axes[0].measurement_time_s[-len(kf_inputs[0].measurement_m) :]
+    axis_motions = [preintegrate(axis, settings) for axis in axes]
+    time_s = axes[0].measurement_time_s[-len(axis_motions[0].measurement_m) :]
     if len(time_s) < MAX_FLIGHT_PART_COUNT * MIN_PART_MEASUREMENTS // 2:
         return None
     part_count = min(MAX_FLIGHT_PART_COUNT, len(time_s) // MIN_PART_MEASUREMENTS)
     part_edges = np.linspace(0, len(time_s), part_count + 1).astype(int)
 
     def compute_relative_magnitudes(is_excluded: BoolArray | None) -> Array:
-        # Innovations are divided by their median, because wrong noise settings scale all of them
         axis_innovations = [
-            innovations(kf_input, sigma_a, sigma_z, is_excluded) for kf_input in kf_inputs
+            innovations(axis_motion, sigma_a, sigma_z, is_excluded) for axis_motion in axis_motions
         ]
         magnitudes = np.abs([nu / np.sqrt(s) for nu, s in axis_innovations])
+        # Wrong noise settings scale all innovations, so they are divided by their median
         return np.asarray(magnitudes / np.median(magnitudes, axis=1, keepdims=True))
 
     relative_magnitudes = compute_relative_magnitudes(None)
-    magnitude_by_part = np.array(
+    median_magnitude_by_part = np.array(
         [
             np.median(relative_magnitudes[:, first_row:end_row])
             for first_row, end_row in pairwise(part_edges)
         ]
     )
-    is_noisy = magnitude_by_part > np.sqrt(magnitude_by_part.min() * magnitude_by_part.max())
-    first_noisy = int(np.argmax(is_noisy))
-    end_noisy = first_noisy + int(np.argmin(np.append(is_noisy[first_noisy:], False)))
-    if is_noisy.sum() != end_noisy - first_noisy or is_noisy.all() or not is_noisy.any():
-        return None  # not exactly one noisy time span
-    is_quiet = np.ones(len(time_s), bool)
-    is_quiet[part_edges[first_noisy] : part_edges[end_noisy]] = False
+    is_noisy = median_magnitude_by_part > np.sqrt(
+        median_magnitude_by_part.min() * median_magnitude_by_part.max()
+    )
+    first_noisy_index = int(np.argmax(is_noisy))
+    end_noisy_index = first_noisy_index + int(
+        np.argmin(np.append(is_noisy[first_noisy_index:], False))
+    )
+    if (
+        is_noisy.sum() != end_noisy_index - first_noisy_index
+        or is_noisy.all()
+        or not is_noisy.any()
+    ):
+        return None  # the noisy parts are not one continuous time span
+    is_outside_noisy_part = np.ones(len(time_s), bool)
+    is_outside_noisy_part[part_edges[first_noisy_index] : part_edges[end_noisy_index]] = False
     sigma_ratios = (
-        float(np.median(magnitudes[:, ~is_quiet]) / np.median(magnitudes[:, is_quiet]))
+        float(
+            np.median(magnitudes[:, ~is_outside_noisy_part])
+            / np.median(magnitudes[:, is_outside_noisy_part])
+        )
         for magnitudes in (
             relative_magnitudes,
             compute_relative_magnitudes(np.isin(time_s, outlier_time_s)),
         )
     )
-    start_s, end_s = time_s[[part_edges[first_noisy], part_edges[end_noisy] - 1]].tolist()
+    start_s, end_s = time_s[
+        [part_edges[first_noisy_index], part_edges[end_noisy_index] - 1]
+    ].tolist()
     return NoisyPart(start_s, end_s, *sigma_ratios)

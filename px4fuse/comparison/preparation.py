@@ -40,8 +40,8 @@ from px4fuse.readers.px4_topics import ORIGIN_BY_TRACK_NAME, SOURCE_TRACKS
 from px4fuse.request import ComparisonRequest, HeightName
 from px4fuse.trajectory.rotation import interpolate, to_matrix
 
-# Kind and route into the log of each position source, by PX4 topic or MAVLink message
-LOGGED_ORIGINS = ORIGIN_BY_TRACK_NAME | {
+# Kind of sensor and way into the log of each position source, by PX4 topic or MAVLink message
+ORIGIN_BY_SOURCE_NAME = ORIGIN_BY_TRACK_NAME | {
     source.track_name: source.origin for source in POSITION_INPUTS
 }
 NO_SEPARATE_TRUTH = Unavailable(
@@ -49,12 +49,12 @@ NO_SEPARATE_TRUTH = Unavailable(
     "KF uses the only ground truth in the log as its position source",
     "Choose another position source for KF with --position-source.",
 )
-# Default axes for GNSS, because one SIGMA_Z does not fit the much noisier GNSS height, and for
-# sources whose height is constant
+# Default axes for sources with constant height, and for GNSS, whose height is too noisy for a
+# common SIGMA_Z
 HORIZONTAL_AXES = (AISLE, "north", "east")
 
 
-def prepare(
+def prepare_comparison_inputs(
     flight: Flight, request: ComparisonRequest, *, keep_as_sent: bool = False
 ) -> PreparedComparison:
     """Choose position source, segment and axes of a flight for the comparison of KF with EKF2.
@@ -94,7 +94,7 @@ def prepare(
     source_track = _subtract_lever_arm(source_track, flight)
     source_track = _shift_vision_to_ekf2_origin(source_track, flight)
     source_track = _use_barometer_height(source_track, flight, request.height)
-    flight = select_innovations(flight, source_track)
+    flight = select_source_innovations(flight, source_track)
     missing_data = flight.missing
     segment = choose_segment(flight, source_track, request.start_s, request.end_s)
     has_height = not source_track.origin.fused_as_gnss and "z" not in constant_coordinates(
@@ -108,9 +108,11 @@ def prepare(
         flight = replace(flight, truth=NO_SEPARATE_TRUTH)
     notes = (*flight.log.notes, *source_track.notes)
     if source_track.origin.fused_as_gnss and request.sigma_z_m is None:
-        default_m = PARAMETERS[GNSS_POS.noise].default
+        default_noise_m = PARAMETERS[GNSS_POS.noise].default
         sigma_z_m = (
-            find_observation_variance(flight, source_track, compared_axes[0], segment, default_m)
+            find_observation_variance(
+                flight, source_track, compared_axes[0], segment, default_noise_m
+            )
             ** 0.5
         )
         if sigma_z_m >= SETTING_RANGES["sigma_z_m"].low:
@@ -140,12 +142,15 @@ def prepare(
     )
 
 
-def select_innovations(flight: Flight, track: PositionTrack) -> Flight:
+def select_source_innovations(flight: Flight, track: PositionTrack) -> Flight:
     """Return the flight with EKF2's GNSS innovations for a GNSS source, else those of vision."""
     if isinstance(flight.ekf2, Unavailable) or not track.origin.fused_as_gnss:
         return flight
-    # KF and EKF2 use GNSS in this flight, so missing external vision is not reported
-    missing_vision_innovations, streams = _missing_innovations(flight.ekf2), dict(flight.streams)
+    # Missing innovations of external vision are not reported, because KF and EKF2 use GNSS
+    missing_vision_innovations, streams = (
+        _find_missing_innovations(flight.ekf2),
+        dict(flight.streams),
+    )
     ekf2 = with_gnss_innovations(
         flight.ekf2, GNSS if track.barometer is None else GNSS_AND_BAROMETER
     )
@@ -157,11 +162,14 @@ def select_innovations(flight: Flight, track: PositionTrack) -> Flight:
     if "ekf2_state" in streams and ekf2.aids:
         streams["ekf2_innovations"] = replace(streams["ekf2_state"], topics=ekf2.innovation_topics)
     return replace(
-        flight, ekf2=ekf2, streams=streams, missing=other_missing_data + _missing_innovations(ekf2)
+        flight,
+        ekf2=ekf2,
+        streams=streams,
+        missing=other_missing_data + _find_missing_innovations(ekf2),
     )
 
 
-def _missing_innovations(ekf2: Ekf2) -> tuple[Unavailable, ...]:
+def _find_missing_innovations(ekf2: Ekf2) -> tuple[Unavailable, ...]:
     return tuple(item for item in ekf2.innovations.values() if isinstance(item, Unavailable))
 
 
@@ -179,16 +187,16 @@ def choose_source(flight: Flight, name: str | None = None) -> tuple[PositionTrac
     if name is None:
         for track in flight.positions:
             if track.origin.is_auto_candidate:
-                return track, _reason_for_choice(flight, track)
+                return track, _explain_choice(flight, track)
         missing_source = explain_missing_source(flight)
         raise MissingDataError(f"{flight.log.name}: {missing_source.reason}", missing_source.remedy)
     for track in flight.positions:
         if track.name == name:
             return track, "chosen with --position-source"
     track_names = [track.name for track in flight.positions]
-    missing_reasons = {missing.source: missing.reason for missing in flight.missing}
+    reasons = {missing.source: missing.reason for missing in flight.missing}
     raise MissingDataError(
-        f"{flight.log.name}: position source {name}: {missing_reasons.get(name, 'no such source')}",
+        f"{flight.log.name}: position source {name}: {reasons.get(name, 'no such source')}",
         f"{suggest_name(name, track_names)}Position sources in this log: "
         f"{', '.join(track_names) or 'none'}.",
     )
@@ -199,10 +207,12 @@ def _subtract_lever_arm(track: PositionTrack, flight: Flight) -> PositionTrack:
     attitude = flight.attitude
     if not any(track.lever_arm_m) or isinstance(attitude, Unavailable) or track.frame != "NED":
         return track
-    attitude_samples = attitude.index.to_numpy(), attitude[Columns.QUATERNION].to_numpy()
-    lever_arm_ned_m = to_matrix(
-        interpolate(track.samples.index.to_numpy(), *attitude_samples)
-    ) @ np.asarray(track.lever_arm_m)
+    quaternions = interpolate(
+        track.samples.index.to_numpy(),
+        attitude.index.to_numpy(),
+        attitude[Columns.QUATERNION].to_numpy(),
+    )
+    lever_arm_ned_m = to_matrix(quaternions) @ np.asarray(track.lever_arm_m)
     samples = track.samples.copy()
     samples[Columns.POSITION] -= lever_arm_ned_m
     forward_m, right_m, down_m = track.lever_arm_m
@@ -273,7 +283,7 @@ def _use_barometer_height(
         )
         if np.isfinite(ekf2_down_m).any():
             zero_height_down_m = float(np.nanmedian(barometer_heights["down_m"] - ekf2_down_m))
-        height_origin_text = "EKF2's height 0 (median difference removed)"
+        height_origin_text = "EKF2's height 0 (median difference to EKF2's height removed)"
     height_note = f"heights are from the barometer; height 0 is {height_origin_text}"
     return replace(
         track,
@@ -319,7 +329,7 @@ def explain_missing_source(flight: Flight) -> Unavailable:
     return Unavailable("position source", reason, capitalise_first(remedy))
 
 
-def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
+def _explain_choice(flight: Flight, track: PositionTrack) -> str:
     if track.origin == POSITION_FILE_ORIGIN:
         return "position file given with --position"
     if track.origin.fused_as_gnss:
@@ -328,26 +338,26 @@ def _reason_for_choice(flight: Flight, track: PositionTrack) -> str:
     unusable_sources = [
         missing.source
         for missing in flight.missing
-        if missing.source in LOGGED_ORIGINS
-        and LOGGED_ORIGINS[missing.source].find_preference_rank()
+        if missing.source in ORIGIN_BY_SOURCE_NAME
+        and ORIGIN_BY_SOURCE_NAME[missing.source].find_preference_rank()
         < track.origin.find_preference_rank()
     ]
     if not unusable_sources:
         return f"chosen automatically: positions as received by PX4{origin_text}"
-    unusable_text = ", ".join(unusable_sources)
-    return f"chosen automatically{origin_text}; preferred sources are not usable: {unusable_text}"
+    sources_text = ", ".join(unusable_sources)
+    return f"chosen automatically{origin_text}; preferred sources are not usable: {sources_text}"
 
 
 def shift_clock(track: PositionTrack, clock_offset_s: float) -> PositionTrack:
     """Add a time offset (s) to all timestamps of a position track."""
     if clock_offset_s == 0.0:
         return track
-    shifted_frames = {
-        name: frame.set_axis(frame.index + clock_offset_s)
+    shifted_tables = {
+        name: table.set_axis(table.index + clock_offset_s)
         for name in ("samples", "orientation", "velocity", "invalid", "status")
-        if (frame := getattr(track, name)) is not None
+        if (table := getattr(track, name)) is not None
     }
-    return replace(track, **shifted_frames)
+    return replace(track, **shifted_tables)
 
 
 def choose_segment(
@@ -397,9 +407,12 @@ def choose_segment(
         time_options = {"--start": start_s, "--end": end_s}
         given_options = [option for option, time_s in time_options.items() if time_s is not None]
         reason = f"chosen with {' and '.join(given_options)}"
-        clipped_s = max(chosen_start_s, 0.0), min(chosen_end_s, flight.log.duration_s)
-        if clipped_s != (chosen_start_s, chosen_end_s) and clipped_s[0] < clipped_s[1]:
-            chosen_start_s, chosen_end_s = clipped_s
+        clipped_span_s = max(chosen_start_s, 0.0), min(chosen_end_s, flight.log.duration_s)
+        if (
+            clipped_span_s != (chosen_start_s, chosen_end_s)
+            and clipped_span_s[0] < clipped_span_s[1]
+        ):
+            chosen_start_s, chosen_end_s = clipped_span_s
             reason += ", limited to the logged time"
     if not chosen_start_s < chosen_end_s:
         raise SettingsError(

@@ -33,8 +33,8 @@ PROJECTED_COLUMNS: Mapping[str, tuple[list[str], int]] = {
     "position_variance_m2": (Columns.POSITION_VARIANCE, 2),
     "velocity_variance_m2_s2": (Columns.VELOCITY_VARIANCE, 2),
 }
-# Resets are removed if this reduces EKF2's median squared distance from the positions to less than
-# this fraction
+# EKF2's resets are removed if EKF2's median squared distance from the positions then decreases to
+# less than this fraction
 MAX_SQUARED_DISTANCE_RATIO = 0.95
 
 
@@ -57,7 +57,7 @@ def remove_origin_resets(
         reset for reset in ekf2.resets if segment.start_s < reset.time_s <= segment.end_s
     ]
     state = ekf2.state.copy() if resets_inside else ekf2.state
-    removed_resets, kept_resets = list[str](), list[str]()
+    removed_reset_texts, kept_reset_texts = list[str](), list[str]()
     for label, quantity, columns in (
         ("horizontal position", "position", Columns.POSITION[:2]),
         ("height", "position", Columns.POSITION[2:]),
@@ -72,44 +72,48 @@ def remove_origin_resets(
         ]
         if not resets:
             continue
-        group = kept_resets
+        group = kept_reset_texts
         if quantity == "position":  # a velocity does not depend on the origin
             samples = cut_to_segment(track.samples, segment)[columns].dropna()
-            compute_distance_m2 = partial(_compute_median_distance_m2, samples)
-            candidates = _states_without_resets(ekf2.state[columns], resets, axes)
-            best_state = min(candidates, key=compute_distance_m2)
-            if compute_distance_m2(best_state) < MAX_SQUARED_DISTANCE_RATIO * compute_distance_m2(
-                ekf2.state
-            ):
-                state[columns], group = best_state, removed_resets
+            compute_squared_distance_m2 = partial(_compute_squared_distance_m2, samples)
+            candidates = _make_states_without_resets(ekf2.state[columns], resets, axes)
+            best_state = min(candidates, key=compute_squared_distance_m2)
+            if compute_squared_distance_m2(
+                best_state
+            ) < MAX_SQUARED_DISTANCE_RATIO * compute_squared_distance_m2(ekf2.state):
+                state[columns], group = best_state, removed_reset_texts
         group.append(f"{len(resets)} of {label}")
     reset_statements = (
         f"{treatment}: {', '.join(reset_texts)}"
         for treatment, reset_texts in (
-            ("EKF2 resets removed, because they move the origin of EKF2's frame", removed_resets),
-            ("EKF2 resets not removed, because they correct an error of EKF2", kept_resets),
+            (
+                "EKF2 resets removed, because they only move the origin of EKF2's frame",
+                removed_reset_texts,
+            ),
+            ("EKF2 resets not removed, because they correct an error of EKF2", kept_reset_texts),
         )
         if reset_texts
     )
     return state, "; ".join(reset_statements)
 
 
-def _states_without_resets(
+def _make_states_without_resets(
     published: pd.DataFrame, resets: list[Reset], axes: list[int]
 ) -> Iterator[pd.DataFrame]:
-    """Yield EKF2's position without resets, with the origin of each interval between resets."""
+    """Yield EKF2's position without resets, in the frame of each interval between resets."""
     reset_m = np.array([reset.delta for reset in resets])[:, axes]
-    is_after = np.array([published.index >= reset.time_s for reset in resets]).T
+    is_after_reset = np.array([published.index >= reset.time_s for reset in resets]).T
     for earlier_count in range(len(resets) + 1):
-        # The origin after earlier_count resets is kept: earlier resets are added to the positions
-        # before them, later resets are subtracted from the positions after them
-        shift_m = (~is_after[:, :earlier_count]) @ reset_m[:earlier_count] - is_after[
+        # All positions are converted to the frame between the resets earlier_count and
+        # earlier_count + 1: earlier resets are added to the positions before them, later resets are
+        # subtracted from the positions after them
+        shift_m = (~is_after_reset[:, :earlier_count]) @ reset_m[:earlier_count] - is_after_reset[
             :, earlier_count:
         ] @ reset_m[earlier_count:]
         yield published + shift_m
 
 
-def _compute_median_distance_m2(samples: pd.DataFrame, state: pd.DataFrame) -> float:
+def _compute_squared_distance_m2(samples: pd.DataFrame, state: pd.DataFrame) -> float:
     squared_distance_m2 = np.zeros(len(samples))
     for column in samples:
         squared_distance_m2 += (
@@ -126,11 +130,11 @@ def project(table: pd.DataFrame, axis: Axis, segment: Segment) -> pd.DataFrame:
         for name, (columns, exponent) in PROJECTED_COLUMNS.items()
         if columns[0] in table
     }
-    projected = {
+    projected_columns = {
         name: weighted_sum(rows, columns, axis.direction**exponent)
         for name, (columns, exponent) in available_columns.items()
     }
-    return pd.DataFrame(projected, index=rows.index)
+    return pd.DataFrame(projected_columns, index=rows.index)
 
 
 def _report_no_samples(quantity_name: str) -> Unavailable:
@@ -142,10 +146,10 @@ def project_variance(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame |
     """Project EKF2's variances onto an axis. Covariances between axes are not logged."""
     if isinstance(ekf2.variance, Unavailable):
         return ekf2.variance
-    projected = project(ekf2.variance, axis, segment)
-    if projected.empty:
+    projected_variance = project(ekf2.variance, axis, segment)
+    if projected_variance.empty:
         return _report_no_samples("EKF2 variances")
-    return projected
+    return projected_variance
 
 
 def project_horizon_position(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.DataFrame | None:
@@ -176,9 +180,9 @@ def project_horizon_position(ekf2: Ekf2, axis: Axis, segment: Segment) -> pd.Dat
         return horizon_positions[horizon_positions["position_variance_m2"] > 0.0]
     if isinstance(ekf2.record, Unavailable):
         return None
-    # Before PX4 v1.16, the log contains the state at the fusion horizon
-    projected = project(ekf2.record.delayed, axis, segment)
-    horizon_positions = projected[["position_m", "position_variance_m2"]].dropna()
+    # Logs of PX4 before v1.16 contain the state at the fusion horizon
+    horizon_state = project(ekf2.record.delayed, axis, segment)
+    horizon_positions = horizon_state[["position_m", "position_variance_m2"]].dropna()
     return horizon_positions if len(horizon_positions) else None
 
 
@@ -239,13 +243,13 @@ def _combine_north_and_east(
     common_times = north_innovations.index.intersection(east_innovations.index)
     north, east = north_innovations.loc[common_times], east_innovations.loc[common_times]
     cosine, sine = float(direction[0]), float(direction[1])
-    # Weights of variances; all other columns are replaced below
-    projected = cosine * cosine * north + sine * sine * east
-    projected["innovation_m"] = cosine * north["innovation_m"] + sine * east["innovation_m"]
+    # cos² and sin² are the weights of variances; columns of other quantities are replaced below
+    combined = cosine * cosine * north + sine * sine * east
+    combined["innovation_m"] = cosine * north["innovation_m"] + sine * east["innovation_m"]
     for column in ("test_ratio", "fused", "rejected"):
         # EKF2 fuses or rejects both axes together, so the larger value is used
-        projected[column] = np.fmax(north[column], east[column])
-    return projected
+        combined[column] = np.fmax(north[column], east[column])
+    return combined
 
 
 def find_observation_variance(
@@ -283,7 +287,7 @@ def project_truth(
 ) -> pd.DataFrame | Unavailable:
     if isinstance(truth, Unavailable):
         return truth
-    projected = project(truth.samples, axis, segment)
-    if len(projected) < MIN_COMMON_SAMPLES:
+    projected_truth = project(truth.samples, axis, segment)
+    if len(projected_truth) < MIN_COMMON_SAMPLES:
         return _report_no_samples("ground truth")
-    return projected
+    return projected_truth

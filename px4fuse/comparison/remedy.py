@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from px4fuse.comparison.estimates import Tuning, find_first_tuning
+from px4fuse.comparison.estimates import TuningByAxis, find_first_tuning
 from px4fuse.comparison.model import Comparison, PreparedComparison
 from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model, replay_with_settings
@@ -22,7 +22,7 @@ GNSS_DELAYS_MS = (0.0, 150.0, 300.0)
 # Transmission time (ms) of a position message: EKF2_DELAY_MAX includes it
 TRANSMISSION_DELAY_MS = 30.0
 # EKF2_DELAY_MAX is rounded up to a multiple of this value (ms)
-DELAY_MAX_STEP_MS = 50.0
+DELAY_MAX_ROUNDING_MS = 50.0
 # A height noise that differs from the horizontal noise is reported only if EKF2 fuses heights of
 # the source for at least this fraction of the time
 MIN_HEIGHT_FUSED_FRACTION = 0.5
@@ -52,25 +52,29 @@ def estimate_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
             for axis in ("north", "east")
             for updates in update_tables
         ]
-        # The mean NIS is multiplied by a constant number of samples, because the number of samples
-        # in a re-run depends on the delay
+        # Sum of NIS for an equal number of samples in all re-runs: the true number depends on the
+        # delay
         nis_sums.append(float(np.mean(nis)) * len(nis) * len(received.timestamp_s))
     quadratic_coefficient, linear_coefficient, _ = np.polyfit(GNSS_DELAYS_MS, nis_sums, 2)
     if quadratic_coefficient <= 0.0:
         return None
-    estimate_ms, sigma_ms = (
+    gnss_delay_ms, delay_sigma_ms = (
         -0.5 * linear_coefficient / quadratic_coefficient,
         quadratic_coefficient**-0.5,
     )
-    limit_ms = max(1e3 * MIN_TIME_OFFSET_S, MIN_OFFSET_SIGMAS * sigma_ms)
-    error_ms = abs(estimate_ms - model.inputs.settings[GNSS_POS.delay])
-    return (estimate_ms, sigma_ms) if error_ms > limit_ms and estimate_ms >= 0.0 else None
+    min_delay_error_ms = max(1e3 * MIN_TIME_OFFSET_S, MIN_OFFSET_SIGMAS * delay_sigma_ms)
+    delay_error_ms = abs(gnss_delay_ms - model.inputs.settings[GNSS_POS.delay])
+    return (
+        (gnss_delay_ms, delay_sigma_ms)
+        if delay_error_ms > min_delay_error_ms and gnss_delay_ms >= 0.0
+        else None
+    )
 
 
 def estimate_ekf2_parameters(
     comparison: Comparison,
     model: Model,
-    tuning: Tuning,
+    tuning: TuningByAxis,
     clock_offset: ClockOffset | Unavailable,
 ) -> dict[str, float]:
     """Return the maximum-likelihood values of those EKF2 noises and delays that are wrong.
@@ -99,8 +103,8 @@ def estimate_ekf2_parameters(
         and noise_m > min_noise_m
         and (max(noise_m, used_noise_m) > min_vision_noise_m)
     ):
-        changes |= make_ml_noise_change(ekf2_inputs, axis_tuning.sigma_z, noise_m)
-    return changes | make_ml_delay_change(comparison, ekf2_inputs, clock_offset)
+        changes |= make_estimated_noise_change(ekf2_inputs, axis_tuning.sigma_z, noise_m)
+    return changes | make_estimated_delay_change(comparison, ekf2_inputs, clock_offset)
 
 
 def is_source_fused(comparison: Comparison, ekf2_inputs: Inputs) -> bool:
@@ -109,15 +113,15 @@ def is_source_fused(comparison: Comparison, ekf2_inputs: Inputs) -> bool:
     return source.name == ekf2_inputs.received.source and source.alignment is None
 
 
-def make_ml_delay_change(
+def make_estimated_delay_change(
     comparison: Comparison, ekf2_inputs: Inputs, clock_offset: ClockOffset | Unavailable
 ) -> dict[str, float]:
     if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
         return {}
-    ml_delay_ms = estimate_delay_if_wrong_ms(
+    estimated_delay_ms = estimate_delay_if_wrong_ms(
         comparison, clock_offset, ekf2_inputs.settings[ekf2_inputs.aid.delay]
     )
-    return {} if ml_delay_ms is None else make_delay_change(ekf2_inputs, ml_delay_ms)
+    return {} if estimated_delay_ms is None else make_delay_change(ekf2_inputs, estimated_delay_ms)
 
 
 def estimate_delay_if_wrong_ms(
@@ -127,21 +131,25 @@ def estimate_delay_if_wrong_ms(
 
     Return None if the difference is not significant.
     """
-    ml_delay_ms = 1e3 * (comparison.source.assumed_delay_s - clock_offset.offset_s)
+    estimated_delay_ms = 1e3 * (comparison.source.assumed_delay_s - clock_offset.offset_s)
     return (
-        ml_delay_ms if clock_offset.is_significant(1e-3 * (logged_delay_ms - ml_delay_ms)) else None
+        estimated_delay_ms
+        if clock_offset.is_significant(1e-3 * (logged_delay_ms - estimated_delay_ms))
+        else None
     )
 
 
-def describe_delay_limit(parameter_name: str, ml_delay_ms: float, logged_delay_ms: float) -> str:
+def describe_delay_limit(
+    parameter_name: str, estimated_delay_ms: float, logged_delay_ms: float
+) -> str:
     """Return "exceed 300 ms" or "be negative" for a delay that PX4 does not permit, else ""."""
-    if ml_delay_ms > (maximum_ms := PARAMETERS[parameter_name].maximum):
+    if estimated_delay_ms > (maximum_ms := PARAMETERS[parameter_name].maximum):
         return f"exceed {maximum_ms:g} ms"
-    return "be negative" if round(ml_delay_ms) <= 0.0 == logged_delay_ms else ""
+    return "be negative" if round(estimated_delay_ms) <= 0.0 == logged_delay_ms else ""
 
 
 def find_aid(comparison: PreparedComparison, axis: str = "") -> Aid:
-    """Return the EKF2 aiding source that fuses the positions along an axis."""
+    """Return EKF2's aiding source (vision, GNSS, ...) for the positions along an axis."""
     return comparison.source.aid(axis) or EV_POS
 
 
@@ -161,14 +169,18 @@ def find_logged_delay_ms(comparison: PreparedComparison) -> float | None:
     )
 
 
-def make_ml_noise_change(
-    ekf2_inputs: Inputs, ml_noise: NoiseEstimate, noise_m: float
+def make_estimated_noise_change(
+    ekf2_inputs: Inputs, noise_estimate: NoiseEstimate, noise_m: float
 ) -> dict[str, float]:
     """Return the EKF2 parameters for the position noise ``noise_m``.
 
-    The mapping is empty if EKF2's noise is inside the 95 % interval of the estimate ``ml_noise``.
+    The mapping is empty if EKF2's noise is inside the 95 % interval of ``noise_estimate``.
     """
-    if (ml_noise.low or 0.0) <= find_used_noise_m(ekf2_inputs) <= (ml_noise.high or math.inf):
+    if (
+        (noise_estimate.low or 0.0)
+        <= find_used_noise_m(ekf2_inputs)
+        <= (noise_estimate.high or math.inf)
+    ):
         return {}
     return make_noise_change(
         ekf2_inputs.aid, ekf2_inputs.settings, _compute_reported_noise_m(ekf2_inputs), noise_m
@@ -209,10 +221,13 @@ def make_delay_max_change(
 
     PX4 has this parameter since v1.14.
     """
-    required_ms = position_age_ms + TRANSMISSION_DELAY_MS
-    if required_ms <= settings.get("EKF2_DELAY_MAX", math.inf):
+    required_delay_max_ms = position_age_ms + TRANSMISSION_DELAY_MS
+    if required_delay_max_ms <= settings.get("EKF2_DELAY_MAX", math.inf):
         return {}
-    return {"EKF2_DELAY_MAX": DELAY_MAX_STEP_MS * math.ceil(required_ms / DELAY_MAX_STEP_MS)}
+    return {
+        "EKF2_DELAY_MAX": DELAY_MAX_ROUNDING_MS
+        * math.ceil(required_delay_max_ms / DELAY_MAX_ROUNDING_MS)
+    }
 
 
 def find_used_noise_m(ekf2_inputs: Inputs) -> float:
@@ -229,7 +244,9 @@ def _compute_reported_noise_m(ekf2_inputs: Inputs) -> float:
     return float(np.sqrt(np.median(ekf2_inputs.received.variance_m2[:, :2])))
 
 
-def make_height_noise_advice(comparison: PreparedComparison, tuning: Tuning, noise_m: float) -> str:
+def make_height_noise_advice(
+    comparison: PreparedComparison, tuning: TuningByAxis, noise_m: float
+) -> str:
     """Return an action if the height noise is much larger than the horizontal noise ``noise_m``.
 
     EKF2 has one noise parameter for the horizontal position and the height of external vision.

@@ -26,7 +26,7 @@ from px4fuse.comparison.comparison import (
     compute_error_statistics,
     compute_kf_error_statistics,
 )
-from px4fuse.comparison.estimates import Estimates, Tuning
+from px4fuse.comparison.estimates import Estimates, TuningByAxis
 from px4fuse.comparison.model import (
     AxisComparison,
     Comparison,
@@ -39,13 +39,13 @@ from px4fuse.comparison.model import (
 from px4fuse.comparison.projection import project, project_truth
 from px4fuse.comparison.remedy import is_source_fused
 from px4fuse.comparison.trials import (
-    CLOCK_OFFSET,
+    CLOCK_OFFSET_KEY,
     DISCREPANCY_STATISTICS,
-    FORWARD_BIAS,
+    FORWARD_BIAS_KEY,
     MIN_REPORTED_NEES,
-    OUTLIERS,
-    RIGHT_BIAS,
-    ROTATION,
+    OUTLIERS_KEY,
+    RIGHT_BIAS_KEY,
+    ROTATION_KEY,
     Change,
     RunStatistics,
     Statistic,
@@ -71,18 +71,20 @@ from px4fuse.filter.tuning import HORIZONTAL
 from px4fuse.flight.ekf2_parameters import PARAMETERS
 from px4fuse.flight.model import Columns, Unavailable
 
-# A filter with a mean NIS below this limit has no conspicuous innovations
+# Mean NIS from which the innovations of a filter are too large for its reported σ
 MAX_NORMAL_NIS = 1.5
 INNOVATION_COLUMNS = [f"innovation_{axis}_m" for axis in HORIZONTAL_AXES]
 INNOVATION_VARIANCE_COLUMNS = [f"innovation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 POSITION_VARIANCE_COLUMNS = [f"position_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 OBSERVATION_VARIANCE_COLUMNS = [f"observation_variance_{axis}_m2" for axis in HORIZONTAL_AXES]
 DIFFERENCE_UNAVAILABLE = Unavailable(
-    "difference KF - EKF2", "this re-run rotates the frame of KF, but not that of EKF2", ""
+    "difference KF - EKF2",
+    "this re-run rotates KF's frame but not EKF2's, so their positions are not comparable",
+    "",
 )
 # Re-runs of EKF2 are compared with the log if position RMSE and σ ratios of the replay agree with
 # the log within this factor. Otherwise they are compared with the replay
-MAX_REPLAY_TO_LOG_FACTOR = 1.10
+MAX_REPLAY_TO_LOG_RATIO = 1.10
 
 
 class ErrorAboveSigma(NamedTuple):
@@ -95,18 +97,18 @@ class ErrorAboveSigma(NamedTuple):
 
 
 def find_error_above_sigma(summary: FilterSummary | UntestedFilter) -> ErrorAboveSigma | None:
-    """Return the position error of a filter if it exceeds the reported σ although NIS is small.
+    """Return the position error of a filter if it exceeds the reported σ, but mean NIS is normal.
 
-    Without innovations along the axis, NIS is assumed to be small.
+    Without innovations along the axis, the mean NIS counts as normal.
     """
     truth = summary.truth
     if isinstance(truth, Unavailable):
         return None
     nis_mean = None if isinstance(summary, Unavailable) else summary.nis_mean
     nees, rmse_m = truth.nees_position_mean or 0.0, truth.position_rmse_m
-    # NEES at the fusion horizon does not contain the lag of the output predictor
-    horizon_nees = truth.nees_position_horizon_mean or nees
-    if min(nees, horizon_nees) < MIN_REPORTED_NEES or (nis_mean or 0.0) >= MAX_NORMAL_NIS:
+    # Lag of the output predictor is no such error: NEES at the fusion horizon does not contain it
+    fusion_horizon_nees = truth.nees_position_horizon_mean or nees
+    if min(nees, fusion_horizon_nees) < MIN_REPORTED_NEES or (nis_mean or 0.0) >= MAX_NORMAL_NIS:
         return None
     reported_sigma_m = summary.sigma_p_median_m or rmse_m / float(np.sqrt(nees))
     return ErrorAboveSigma(nees, rmse_m, reported_sigma_m, nis_mean)
@@ -114,12 +116,14 @@ def find_error_above_sigma(summary: FilterSummary | UntestedFilter) -> ErrorAbov
 
 @dataclass(frozen=True, kw_only=True)
 class Reruns:
-    """Replay of EKF2, and re-runs of KF and EKF2 with changes.
+    """Replay of EKF2, and re-runs of KF and EKF2 with changed settings or data.
 
     Attributes
     ----------
     ekf2_model : Model or Unavailable
+        Replay of EKF2 with the logged parameters.
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
+        Contribution of each property of EKF2 to the difference KF - EKF2.
     trials : tuple of Trial
         Re-runs along the main axis, and along each axis with an inconsistent filter.
     """
@@ -170,7 +174,7 @@ def rerun_filters(
         trial
         for tested_filter in filters
         for axis_result in comparison.axes.values()
-        for trial in _try_changes(comparison, estimates, tested_filter, axis_result)
+        for trial in _rerun_with_changes(comparison, estimates, tested_filter, axis_result)
     )
 
 
@@ -200,13 +204,13 @@ def _find_changes_to_test(
     ekf2_inputs: Inputs | None,
     axis_result: AxisComparison,
 ) -> list[tuple[Change, tuple[Statistic, ...]]]:
-    """Return each change to test along an axis, and the statistics that it may correct."""
+    """Return the changes for re-runs along an axis, each with the statistics it may correct."""
     summary = axis_result.filters["kf" if ekf2_inputs is None else "ekf2"]
     if not isinstance(summary, FilterSummary) or (
         ekf2_inputs is not None and axis_result.axis.name == "down"
     ):
-        return []  # EKF2's replay contains no vertical position to test a change
-    is_discrepant = {
+        return []  # EKF2's replay contains no vertical position
+    has_discrepancy = {
         "nees": find_error_above_sigma(summary) is not None,
         "nis": is_inconsistent(summary),
     }
@@ -215,7 +219,7 @@ def _find_changes_to_test(
             comparison, estimates, ekf2_inputs, axis_result, statistic
         )
         for statistic in DISCREPANCY_STATISTICS
-        if is_discrepant[statistic]
+        if has_discrepancy[statistic]
     }
     changes = remove_repeated_changes(chain.from_iterable(candidates.values()))
     if axis_result is comparison.main:
@@ -226,7 +230,7 @@ def _find_changes_to_test(
     ]
 
 
-def _try_changes(
+def _rerun_with_changes(
     comparison: Comparison,
     estimates: Estimates,
     tested_filter: _Filter,
@@ -235,10 +239,10 @@ def _try_changes(
     changes = _find_changes_to_test(comparison, estimates, tested_filter.ekf2_inputs, axis_result)
     if not changes:
         return []
-    before, is_logged = _find_original_statistics(tested_filter, axis_result)
+    original_statistics, is_logged = _find_original_statistics(tested_filter, axis_result)
 
     def make_trial(change: Change, discrepancies: Iterable[Statistic]) -> Trial:
-        after = tested_filter.rerun(axis_result, change)
+        changed_statistics = tested_filter.rerun(axis_result, change)
         return Trial(
             filter=tested_filter.name,
             axis=axis_result.axis.name,
@@ -247,11 +251,11 @@ def _try_changes(
             discrepancies=tuple(
                 statistic
                 for statistic in discrepancies
-                if before.value(statistic) and after.value(statistic)
+                if original_statistics.value(statistic) and changed_statistics.value(statistic)
             ),
-            before=before,
+            before=original_statistics,
             is_logged=is_logged,
-            after=after,
+            after=changed_statistics,
             from_s=None
             if tested_filter.ekf2_model is None
             else tested_filter.ekf2_model.baseline_replay.find_evaluated_spans()[0][0],
@@ -292,13 +296,13 @@ def _find_original_statistics(
         (
             logged_statistics.position_rmse_m,
             replayed_statistics.position_rmse_m,
-            MAX_REPLAY_TO_LOG_FACTOR,
+            MAX_REPLAY_TO_LOG_RATIO,
         ),
-        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAY_TO_LOG_FACTOR**2),
+        (logged_statistics.nis_mean, replayed_statistics.nis_mean, MAX_REPLAY_TO_LOG_RATIO**2),
         (
             logged_statistics.nees_mean,
             replayed_statistics.nees_mean,
-            MAX_REPLAY_TO_LOG_FACTOR**2,
+            MAX_REPLAY_TO_LOG_RATIO**2,
         ),
     )
     is_replay_similar = all(
@@ -311,7 +315,7 @@ def _find_original_statistics(
 
 def _summarise_run(
     innovation_m: Array,
-    variance_m2: Array,
+    innovation_variance_m2: Array,
     errors: ErrorsAgainstTruth | Unavailable,
     kf_minus_ekf2: Difference | Unavailable,
     rejected_fraction: float | None = None,
@@ -320,7 +324,9 @@ def _summarise_run(
     has_innovations = len(innovation_m) > 0
     return RunStatistics(
         innovations=len(innovation_m),
-        nis_mean=float(np.mean(innovation_m**2 / variance_m2)) if has_innovations else None,
+        nis_mean=float(np.mean(innovation_m**2 / innovation_variance_m2))
+        if has_innovations
+        else None,
         position_rmse_m=None if truth is None else truth.position_rmse_m,
         nees_mean=None if truth is None else truth.nees_position_mean,
         difference_rms_m=None
@@ -335,31 +341,34 @@ def _rotate_direction(direction: Array, rotation_deg: float) -> Array:
 
 
 def _rerun_kf(
-    comparison: Comparison, tuning: Tuning, axis_result: AxisComparison, change: Change
+    comparison: Comparison, tuning: TuningByAxis, axis_result: AxisComparison, change: Change
 ) -> RunStatistics:
     source, segment, axis = comparison.source, comparison.segment, axis_result.axis
     kf_settings: dict[str, Any] = {
         name: change[name] for name in change if name in vars(Settings())
     }
     changed_settings = replace(comparison.settings, **kf_settings)
-    truth, rotates_gnss_positions = axis_result.truth, ROTATION in change and source.origin.is_gnss
-    if ROTATION in change:
-        rotated_direction = _rotate_direction(axis.direction, change[ROTATION])
+    truth, rotates_gnss_positions = (
+        axis_result.truth,
+        ROTATION_KEY in change and source.origin.is_gnss,
+    )
+    if ROTATION_KEY in change:
+        rotated_direction = _rotate_direction(axis.direction, change[ROTATION_KEY])
         measured_m = weighted_sum(
             cut_to_segment(source.samples, segment), Columns.POSITION, rotated_direction
         )
         axis = replace(axis, measurement_m=measured_m[np.isfinite(measured_m)])
         if rotates_gnss_positions:
-            # GNSS positions and ground truth are rotated instead of the acceleration, whose heading
-            # is wrong
+            # The acceleration has the wrong heading. Rotating GNSS positions and ground truth
+            # instead is equivalent
             rotated_axis = replace(axis, direction=rotated_direction)
             truth = project_truth(comparison.flight.truth, rotated_axis, segment)
-    if FORWARD_BIAS in change:
-        acceleration = _acceleration_without_bias(comparison, change, axis.direction)
+    if FORWARD_BIAS_KEY in change:
+        acceleration = _remove_accelerometer_bias(comparison, change, axis.direction)
         axis = replace(axis, acceleration=acceleration)
     time_s, axis_tuning = axis.measurement_time_s, find_axis_tuning(tuning, axis.name)
     is_used = np.ones(len(time_s), dtype=bool)
-    if OUTLIERS in change and axis_tuning is not None:
+    if OUTLIERS_KEY in change and axis_tuning is not None:
         is_used = ~np.isin(time_s, axis_tuning.outlier_time_s)
     shift_s = changed_settings.clock_offset_s - comparison.settings.clock_offset_s
     axis = replace(
@@ -378,34 +387,34 @@ def _rerun_kf(
     )
 
 
-def _acceleration_without_bias(
+def _remove_accelerometer_bias(
     comparison: Comparison, change: Change, direction: Array
 ) -> Acceleration | Unavailable:
     flight, imu = comparison.flight, comparison.flight.imu
     if isinstance(imu, Unavailable):
         return imu
     accelerometer_bias = pd.Series(
-        [change[FORWARD_BIAS], change[RIGHT_BIAS], 0.0], Columns.SPECIFIC_FORCE
+        [change[FORWARD_BIAS_KEY], change[RIGHT_BIAS_KEY], 0.0], Columns.SPECIFIC_FORCE
     )
     flight = replace(flight, imu=imu.assign(**(imu[Columns.SPECIFIC_FORCE] - accelerometer_bias)))
     return project_acceleration(ned_acceleration(flight), direction, comparison.segment)
 
 
 def _replay_ekf2(
-    comparison: Comparison, tuning: Tuning, model: Model, change: Change
+    comparison: Comparison, tuning: TuningByAxis, model: Model, change: Change
 ) -> Ekf2Replay:
     if not change:
         return model.baseline_replay
     changed_parameters = {name: value for name, value in change.items() if name in PARAMETERS}
     misaligned_model = with_misaligned_positions(
-        model, change.get(ROTATION, 0.0), change.get(CLOCK_OFFSET, 0.0)
+        model, change.get(ROTATION_KEY, 0.0), change.get(CLOCK_OFFSET_KEY, 0.0)
     )
     excluded_times_s, axis_tuning = None, find_axis_tuning(tuning, HORIZONTAL)
-    if OUTLIERS in change and axis_tuning is not None:
+    if OUTLIERS_KEY in change and axis_tuning is not None:
         excluded_times_s = axis_tuning.outlier_time_s - comparison.settings.clock_offset_s
         if comparison.source.origin.fused_as_gnss:
             excluded_times_s += 1e-3 * model.inputs.settings[model.inputs.aid.delay]
-        excluded_times_s += change.get(CLOCK_OFFSET, 0.0)
+        excluded_times_s += change.get(CLOCK_OFFSET_KEY, 0.0)
     (replay,) = replay_with_settings(misaligned_model, [changed_parameters], excluded_times_s)
     return replay
 
@@ -423,9 +432,9 @@ def _summarise_replay(
     before and after each update, because the replay contains no variance between updates.
     """
     evaluated_spans_s, axis = model.baseline_replay.find_evaluated_spans(), axis_result.axis
-    if ROTATION in change and comparison.source.origin.is_gnss:
-        # Rotated GNSS positions rotate EKF2's frame, so the axis is rotated by the same angle
-        axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION]))
+    if ROTATION_KEY in change and comparison.source.origin.is_gnss:
+        # EKF2's frame rotates with the GNSS positions, so the axis is rotated by the same angle
+        axis = replace(axis, direction=_rotate_direction(axis.direction, -change[ROTATION_KEY]))
     cosines, ekf2_updates = axis.direction[:2], ekf2_replay.updates
     ekf2_updates = rows_inside(ekf2_updates, evaluated_spans_s)
     innovation_variance_m2 = weighted_sum(ekf2_updates, INNOVATION_VARIANCE_COLUMNS, cosines**2)
@@ -440,16 +449,16 @@ def _summarise_replay(
         },
         index=pd.Index(ekf2_updates["fused_at_s"].to_numpy()),
     )
-    published = project(ekf2_replay.published, axis, comparison.segment)
-    published = rows_inside(published, evaluated_spans_s)
-    logged_state, compared_track = axis_result.ekf2_state, published
-    # Without a change, KF is compared with the logged state of EKF2, as in the report
+    published_track = project(ekf2_replay.published, axis, comparison.segment)
+    published_track = rows_inside(published_track, evaluated_spans_s)
+    logged_state, compared_track = axis_result.ekf2_state, published_track
+    # Without a change, KF is compared with the logged EKF2 (as in the report), else with the replay
     if not change and not isinstance(logged_state, Unavailable):
         compared_track = rows_inside(logged_state, evaluated_spans_s)
     return _summarise_run(
         weighted_sum(ekf2_updates, INNOVATION_COLUMNS, cosines),
         innovation_variance_m2,
-        compute_error_statistics(published, variance_by_time, axis_result.truth),
+        compute_error_statistics(published_track, variance_by_time, axis_result.truth),
         compute_difference_statistics(axis_result.replay, compared_track),
         float((ekf2_updates["rejected"] > 0.0).mean()) if len(ekf2_updates) else None,
     )

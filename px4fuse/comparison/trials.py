@@ -12,37 +12,38 @@ from px4fuse.filter.consistency import Reference, classify_sigma_ratio, compute_
 from px4fuse.flight.ekf2_parameters import EV_POS
 
 Statistic = Literal["nis", "nees", "difference"]
-# Statistics that a change may bring inside the limits of a consistent filter
+# Statistics that show if a change makes a filter consistent
 DISCREPANCY_STATISTICS: tuple[Statistic, Statistic] = ("nees", "nis")
 # Values of KF settings, EKF2 parameters and corrections of the data, by name
 Change = Mapping[str, float]
 # Keys of Trial.change for corrections of the data, not of parameters
-CLOCK_OFFSET, ROTATION, OUTLIERS = "clock_offset_s", "turned_deg", "outliers_left_out"
-FORWARD_BIAS, RIGHT_BIAS = "bias_forward_m_s2", "bias_right_m_s2"
+CLOCK_OFFSET_KEY, ROTATION_KEY, OUTLIERS_KEY = "clock_offset_s", "turned_deg", "outliers_left_out"
+FORWARD_BIAS_KEY, RIGHT_BIAS_KEY = "bias_forward_m_s2", "bias_right_m_s2"
 Improvement = Literal["position and σ", "position", "σ only", "nothing"]
 # Position errors are reported if the mean NEES exceeds this limit (2 reported σ): flights without a
 # fault have a mean NEES below 3
 MIN_REPORTED_NEES = 4.0
-# Maximum mean NEES after a noise is reduced, if the mean NEES exceeds 1 with the original noise
+# A smaller noise makes a filter overconfident if the mean NEES was above 1 and reaches this limit
 MAX_NEES_AFTER_CHANGE = 2.0
-# A change is a cause if compute_explained_fraction returns 1 ± this tolerance
+# A change may be the cause if it removes a fraction of 1 ± this tolerance of ln(mean NIS) or
+# ln(mean NEES), which are 0 for a consistent filter
 CAUSE_FRACTION_TOLERANCE = 0.5
-# A corrected sensor fault is the only cause if the explained fraction is 1 ± this tolerance
-SENSOR_FRACTION_TOLERANCE = 0.25
-# Changes are combined in one re-run if each alone explains a fraction of 1 ± this tolerance
-COMBINED_FRACTION_TOLERANCE = 0.9
+# A corrected sensor fault is the only cause if it removes a fraction of 1 ± this tolerance
+SENSOR_CAUSE_TOLERANCE = 0.25
+# Changes are combined in one re-run if each alone removes a fraction of 1 ± this tolerance
+COMBINATION_TOLERANCE = 0.9
 # Keys of Trial.change that correct faulty sensor data; other keys change settings of a filter
-SENSOR_CHANGE_KEYS = frozenset((OUTLIERS, CLOCK_OFFSET, ROTATION, FORWARD_BIAS))
+SENSOR_CHANGE_KEYS = frozenset((OUTLIERS_KEY, CLOCK_OFFSET_KEY, ROTATION_KEY, FORWARD_BIAS_KEY))
 # Keys of Trial.change that have an effect only together with another change
-SECONDARY_CHANGE_KEYS = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS))
+SECONDARY_CHANGE_KEYS = frozenset(("EKF2_DELAY_MAX", EV_POS.noise_mode, RIGHT_BIAS_KEY))
 # A re-run has an effect if it changes a ratio of actual to reported σ by at least this factor
 MIN_SIGMA_RATIO_FACTOR = 1.10
 # A re-run has an effect if it changes the position RMSE by more than this fraction
 MIN_RMSE_CHANGE_FRACTION = 0.05
 # A re-run improves the position if it reduces the position RMSE by at least this fraction
 MIN_RMSE_REDUCTION = 0.20
-# A filter remains overconfident if more than this fraction of ln(actual / reported σ) remains after
-# a re-run
+# A re-run leaves a filter overconfident if more than this fraction of ln(actual / reported σ)
+# against ground truth remains
 MAX_REMAINING_ERROR_FRACTION = 0.75
 
 
@@ -106,12 +107,12 @@ def compute_explained_fraction(trial: Trial, statistic: Statistic) -> float:
     For the statistic "difference", it is the fraction of the mean square difference KF - EKF2.
     Above 1, the change is too large. The fraction is 0 if it is unknown.
     """
-    before, after = trial.before.value(statistic), trial.after.value(statistic)
-    if not before or not after:
+    value_before, value_after = trial.before.value(statistic), trial.after.value(statistic)
+    if not value_before or not value_after:
         return 0.0
     if statistic == "difference":
-        return 1.0 - (after / before) ** 2
-    return 1.0 - float(np.log(after) / np.log(before))
+        return 1.0 - (value_after / value_before) ** 2
+    return 1.0 - float(np.log(value_after) / np.log(value_before))
 
 
 def _compute_explanation_error(trial: Trial, statistic: Statistic) -> float:
@@ -163,7 +164,7 @@ def find_cause_trial(
 
     def rank(trial: Trial) -> tuple[bool, int, bool, float]:
         explanation_error = _compute_explanation_error(trial, statistic)
-        is_complete = trial.corrects_sensor and explanation_error <= SENSOR_FRACTION_TOLERANCE
+        is_complete = trial.corrects_sensor and explanation_error <= SENSOR_CAUSE_TOLERANCE
         return (
             not (is_complete or brings_inside_limits(trial, statistic)),
             len(trial.change.keys() - SECONDARY_CHANGE_KEYS),
@@ -189,14 +190,14 @@ def find_helpful_trials(trials: Iterable[Trial], statistic: Statistic) -> list[T
         trial
         for trial in trials
         if statistic in trial.discrepancies
-        and _compute_explanation_error(trial, statistic) < COMBINED_FRACTION_TOLERANCE
+        and _compute_explanation_error(trial, statistic) < COMBINATION_TOLERANCE
     ]
     candidates.sort(key=lambda trial: _compute_explanation_error(trial, statistic))
     return [] if any(brings_inside_limits(trial, statistic) for trial in candidates) else candidates
 
 
 def compute_log_ratio_sum(statistics: RunStatistics) -> float:
-    """Return the sum of |ln(actual / reported σ)| from innovations and from ground truth."""
+    """Return |ln(actual / reported σ)| from innovations plus that from errors; 0 is consistent."""
     squared_ratios = [
         squared_ratio
         for squared_ratio in (statistics.nis_mean, statistics.nees_mean)
@@ -210,10 +211,10 @@ def compute_preference_key(trial: Trial) -> tuple[bool, int, float]:
 
     Re-runs that make a filter consistent precede others, then few changed values precede many.
     """
-    is_solved = becomes_consistent(trial)
+    is_made_consistent = becomes_consistent(trial)
     return (
-        not is_solved,
-        len(trial.change) if is_solved else 0,
+        not is_made_consistent,
+        len(trial.change) if is_made_consistent else 0,
         compute_log_ratio_sum(trial.after),
     )
 
@@ -240,43 +241,46 @@ def compare_sigma_ratios(trial: Trial) -> list[tuple[Reference, float, float]]:
 
     The reference is "source" (ratio from innovations) or "truth" (from errors).
     """
-    ratios_before, ratios_after = (
+    sigma_ratios_before, sigma_ratios_after = (
         compute_sigma_ratios(trial.before),
         compute_sigma_ratios(trial.after),
     )
     return [
-        (reference, ratios_before[reference], ratios_after[reference])
-        for reference in ratios_before.keys() & ratios_after.keys()
+        (reference, sigma_ratios_before[reference], sigma_ratios_after[reference])
+        for reference in sigma_ratios_before.keys() & sigma_ratios_after.keys()
     ]
 
 
 def becomes_consistent(trial: Trial) -> bool:
-    """Return True if the change makes an inconsistent filter consistent."""
+    """Return True if a re-run makes an inconsistent filter consistent."""
     return any(
-        classify_sigma_ratio(before, reference) != "consistent"
-        and classify_sigma_ratio(after, reference) == "consistent"
-        for reference, before, after in compare_sigma_ratios(trial)
+        classify_sigma_ratio(ratio_before, reference) != "consistent"
+        and classify_sigma_ratio(ratio_after, reference) == "consistent"
+        for reference, ratio_before, ratio_after in compare_sigma_ratios(trial)
     )
 
 
 def halves_discrepancy(trial: Trial) -> bool:
     """Return True if a re-run halves |ln(actual / reported σ)| of an inconsistent filter."""
     return any(
-        classify_sigma_ratio(before, reference) != "consistent"
-        and abs(math.log(after)) <= 0.5 * abs(math.log(before))
-        for reference, before, after in compare_sigma_ratios(trial)
+        classify_sigma_ratio(ratio_before, reference) != "consistent"
+        and abs(math.log(ratio_after)) <= 0.5 * abs(math.log(ratio_before))
+        for reference, ratio_before, ratio_after in compare_sigma_ratios(trial)
     )
 
 
 def remains_overconfident(trial: Trial) -> bool:
-    """Return True if a re-run hardly reduces the overconfidence against ground truth."""
+    """Return True if a filter is overconfident against ground truth before and after a re-run.
+
+    More than 75 % of ln(actual / reported σ) must remain.
+    """
     return any(
         reference == "truth"
-        and classify_sigma_ratio(before, reference)
-        == classify_sigma_ratio(after, reference)
+        and classify_sigma_ratio(ratio_before, reference)
+        == classify_sigma_ratio(ratio_after, reference)
         == "overconfident"
-        and math.log(after) > MAX_REMAINING_ERROR_FRACTION * math.log(before)
-        for reference, before, after in compare_sigma_ratios(trial)
+        and math.log(ratio_after) > MAX_REMAINING_ERROR_FRACTION * math.log(ratio_before)
+        for reference, ratio_before, ratio_after in compare_sigma_ratios(trial)
     )
 
 
@@ -304,8 +308,8 @@ def find_trial(
 def has_effect(trial: Trial) -> bool:
     """Return True if a re-run changes a σ ratio by 10 % or the position RMSE by 5 %."""
     if any(
-        not 1.0 / MIN_SIGMA_RATIO_FACTOR <= after / before <= MIN_SIGMA_RATIO_FACTOR
-        for _, before, after in compare_sigma_ratios(trial)
+        not 1.0 / MIN_SIGMA_RATIO_FACTOR <= ratio_after / ratio_before <= MIN_SIGMA_RATIO_FACTOR
+        for _, ratio_before, ratio_after in compare_sigma_ratios(trial)
     ):
         return True
     rmse_before_m, rmse_after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
@@ -322,16 +326,16 @@ def can_show_improvement(trial: Trial) -> bool:
     This requires ground truth, or a filter that is inconsistent before the change.
     """
     return trial.before.position_rmse_m is not None or any(
-        classify_sigma_ratio(before, reference) != "consistent"
-        for reference, before, _ in compare_sigma_ratios(trial)
+        classify_sigma_ratio(ratio_before, reference) != "consistent"
+        for reference, ratio_before, _ in compare_sigma_ratios(trial)
     )
 
 
 def classify_improvement(trial: Trial) -> Improvement:
     """Return the quantities that a re-run improves: position, σ, both or nothing.
 
-    Position: the RMSE decreases by at least 20 %. σ: a σ ratio becomes consistent or its |ln| is
-    halved, and no σ ratio becomes worse.
+    Position: the RMSE decreases by at least 20 %. σ: actual / reported σ from innovations or from
+    errors becomes consistent, or its |ln| is halved, and neither ratio becomes worse.
     """
     rmse_before_m, rmse_after_m = trial.before.position_rmse_m, trial.after.position_rmse_m
     is_position_better = bool(
@@ -340,9 +344,9 @@ def classify_improvement(trial: Trial) -> Improvement:
         and rmse_after_m <= (1.0 - MIN_RMSE_REDUCTION) * rmse_before_m
     )
     is_sigma_better = (becomes_consistent(trial) or halves_discrepancy(trial)) and all(
-        abs(math.log(after)) <= abs(math.log(before))
-        or classify_sigma_ratio(after, reference) == "consistent"
-        for reference, before, after in compare_sigma_ratios(trial)
+        abs(math.log(ratio_after)) <= abs(math.log(ratio_before))
+        or classify_sigma_ratio(ratio_after, reference) == "consistent"
+        for reference, ratio_before, ratio_after in compare_sigma_ratios(trial)
     )
     if is_position_better:
         return "position and σ" if is_sigma_better else "position"

@@ -53,7 +53,7 @@ def make_flight_data(analysis: Analysis, packer: Packer) -> PageData:
             "gap": events.gaps,
             "dropout": events.dropouts,
             "ground": events.ground_spans_s,
-            "reset": list(events.resets_s),
+            "reset": list(events.reset_times_s),
         },
         "command": _make_commands(request, analysis),
         "offset": _make_offset_slider(request, analysis),

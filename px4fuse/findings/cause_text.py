@@ -30,11 +30,11 @@ def classify_cause(analysis: Analysis, cause: Trial | None) -> str:
         return kinds.UNKNOWN_CAUSE
     aid = find_aid(analysis)
     kind_by_change = {
-        trials.OUTLIERS: kinds.OUTLIER_CAUSE,
-        trials.CLOCK_OFFSET: kinds.CLOCK_CAUSE,
+        trials.OUTLIERS_KEY: kinds.OUTLIER_CAUSE,
+        trials.CLOCK_OFFSET_KEY: kinds.CLOCK_CAUSE,
         aid.delay: kinds.CLOCK_CAUSE,
-        trials.ROTATION: kinds.FRAME_CAUSE,
-        trials.FORWARD_BIAS: kinds.ACCELEROMETER_CAUSE,
+        trials.ROTATION_KEY: kinds.FRAME_CAUSE,
+        trials.FORWARD_BIAS_KEY: kinds.ACCELEROMETER_CAUSE,
         changes.SIGMA_Z: kinds.MEASUREMENT_NOISE_CAUSE,
         aid.noise: kinds.MEASUREMENT_NOISE_CAUSE,
         aid.gate: kinds.GATE_CAUSE,
@@ -84,19 +84,19 @@ def format_explained_fraction(cause: Trial, statistic: Statistic) -> str:
 def format_action(analysis: Analysis, change: Mapping[str, float]) -> str:
     actions, change = [], dict(change)
     is_gnss = analysis.source.origin.is_gnss
-    if change.pop(trials.OUTLIERS, None):
+    if change.pop(trials.OUTLIERS_KEY, None):
         actions.append(find_source_texts(analysis.source).outliers_action)
-    if change.pop(trials.FORWARD_BIAS, None) is not None:
+    if change.pop(trials.FORWARD_BIAS_KEY, None) is not None:
         actions.append("Calibrate the accelerometer and the level horizon.")
-        change.pop(trials.RIGHT_BIAS)
-    if rotation_deg := change.pop(trials.ROTATION, None):
+        change.pop(trials.RIGHT_BIAS_KEY)
+    if rotation_deg := change.pop(trials.ROTATION_KEY, None):
         # GNSS positions refer to true north: if they are rotated, EKF2's heading is wrong
         actions.append(
             magnetometer_advice(analysis.flight) or "Check the heading source of EKF2."
             if is_gnss
             else f"Rotate the positions by {rotation_deg:+.0f}° before they are sent."
         )
-    if (offset_s := change.pop(trials.CLOCK_OFFSET, None)) is not None:
+    if (offset_s := change.pop(trials.CLOCK_OFFSET_KEY, None)) is not None:
         actions.append(f"{format_shift(offset_s)} the position timestamps before sending.")
     settings = {name: change.pop(name) for name in changes.CHANGED_KF_SETTINGS & change.keys()}
     if change:
@@ -124,19 +124,19 @@ def format_kf_settings(settings: Mapping[str, float]) -> str:
 def _format_one_change(analysis: Analysis, cause: Trial, name: str) -> str:
     value, settings = cause.change[name], analysis.settings
     match name:
-        case trials.OUTLIERS:
+        case trials.OUTLIERS_KEY:
             return f"{value:.0f} outlier{'s' if value > 1 else ''} removed"
-        case trials.CLOCK_OFFSET:
+        case trials.CLOCK_OFFSET_KEY:
             offset_s = value - (settings.clock_offset_s if cause.filter == "kf" else 0.0)
             late_or_early = "late" if offset_s < 0 else "early"
             return f"timestamps corrected ({abs(offset_s):.2g} s {late_or_early})"
-        case trials.FORWARD_BIAS:
-            right_bias_m_s2 = cause.change[trials.RIGHT_BIAS]
+        case trials.FORWARD_BIAS_KEY:
+            right_bias_m_s2 = cause.change[trials.RIGHT_BIAS_KEY]
             return (
                 f"accelerometer bias removed ({value:+.2f} m/s² forward, {right_bias_m_s2:+.2f} "
                 "m/s² right)"
             )
-        case trials.ROTATION:
+        case trials.ROTATION_KEY:
             is_drifting = isinstance(analysis.heading, HeadingError) and analysis.heading.drifts
             average_text = " on average" if is_drifting else ""
             return (

@@ -101,7 +101,7 @@ def _has_error_above_reported_sigma(analysis: Analysis) -> bool:
     truths = [summary.truth for summary in analysis.main.filters.values()]
     return any(
         isinstance(truth, ErrorsAgainstTruth)
-        and not truth.is_lag_only
+        and not truth.has_only_lag_errors
         and truth.nees_position_mean is not None
         and truth.nees_position_mean > CONSISTENT_SIGMA_RATIOS["truth"][1] ** 2
         for truth in truths
@@ -141,7 +141,7 @@ def detect_unequal_noise(analysis: Analysis) -> Findings:
         return  # the estimate of SIGMA_Z lacks the time-correlated noise, which dominates in GNSS
     axis_noise_estimates = sorted(
         (noise.value, noise.low, noise.high, axis_tuning.name)
-        for axis_tuning in analysis.tuning_by_axis
+        for axis_tuning in analysis.axis_tunings
         if (noise := axis_tuning.sigma_z).value and noise.low and noise.high
     )
     if len(axis_noise_estimates) < 2:

@@ -10,7 +10,7 @@ import pandas as pd
 from px4fuse.comparison.comparison import project_tracks
 from px4fuse.comparison.flight_events import compute_max_interval_s
 from px4fuse.comparison.model import PreparedComparison
-from px4fuse.comparison.preparation import prepare, select_innovations
+from px4fuse.comparison.preparation import prepare_comparison_inputs, select_source_innovations
 from px4fuse.comparison.projection import project_innovations
 from px4fuse.core.text import capitalise_first, format_utc_time, to_json_types
 from px4fuse.ekf2.aids import evaluate_aids
@@ -163,7 +163,9 @@ def take_inventory(flight: Flight) -> Inventory:
     """List the data in a log, the possible analyses, and changes for the next flight."""
     comparison, reason, position_remedy = None, "", ""
     try:
-        comparison = prepare(flight, ComparisonRequest(log=flight.log.name), keep_as_sent=True)
+        comparison = prepare_comparison_inputs(
+            flight, ComparisonRequest(log=flight.log.name), keep_as_sent=True
+        )
         reason = comparison.source_reason
     except Px4FuseError as error:
         reason = with_options(error.reason).removeprefix(f"{flight.log.name}: ")
@@ -173,7 +175,7 @@ def take_inventory(flight: Flight) -> Inventory:
                 "Set SDLOG_MODE to 0 (logging from arming) to record the whole flight."
             )
     if comparison is not None:
-        flight = select_innovations(flight, comparison.source)
+        flight = select_source_innovations(flight, comparison.source)
     log = flight.log
     is_incomplete = log.ends_in_flight and not log.damage
     return Inventory(

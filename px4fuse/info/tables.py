@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.comparison.preparation import choose_source, select_innovations
+from px4fuse.comparison.preparation import choose_source, select_source_innovations
 from px4fuse.core.text import to_json_types
 from px4fuse.errors import MissingDataError
 from px4fuse.filter.signals import imu_and_attitude, ned_acceleration
@@ -50,7 +50,7 @@ class DescribedTable:
 def with_source_innovations(flight: Flight) -> Flight:
     """Add the EKF2 innovations of the default position source to a flight."""
     try:
-        return select_innovations(flight, choose_source(flight)[0])
+        return select_source_innovations(flight, choose_source(flight)[0])
     except MissingDataError:
         return flight
 

@@ -365,8 +365,8 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
     position_times = cut_to_segment(analysis.source.samples, analysis.segment.flight).index
     map_x_m, map_y_m = tracks["positions"]
     for times, marker_style in (
-        (analysis.events.take_off_s, event_marks.TAKE_OFF_MARKER_STYLE),
-        (analysis.events.landing_s, event_marks.LANDING_MARKER_STYLE),
+        (analysis.events.take_off_times_s, event_marks.TAKE_OFF_MARKER_STYLE),
+        (analysis.events.landing_times_s, event_marks.LANDING_MARKER_STYLE),
     ):
         position_rows = position_times.get_indexer(pd.Index(times, dtype=float), method="nearest")
         large_style = marker_style | {"ms": 9.0, "mec": "white", "mew": 0.8}

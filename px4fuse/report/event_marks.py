@@ -54,9 +54,9 @@ def _make_event_markers(
         EventMarkers("log dropout", events.dropouts, DROPOUT_BAND_STYLE),
         EventMarkers("EKF2 rejected", rejection_times_s, REJECTED_STYLE, 0.025),
         EventMarkers("outlier", outlier_times(analysis), OUTLIER_MARKER_STYLE, 0.075),
-        EventMarkers("EKF2 reset", events.resets_s, RESET_MARKER_STYLE, 0.92),
-        EventMarkers("take-off", events.take_off_s, TAKE_OFF_MARKER_STYLE, 0.0),
-        EventMarkers("landing", events.landing_s, LANDING_MARKER_STYLE, 0.0),
+        EventMarkers("EKF2 reset", events.reset_times_s, RESET_MARKER_STYLE, 0.92),
+        EventMarkers("take-off", events.take_off_times_s, TAKE_OFF_MARKER_STYLE, 0.0),
+        EventMarkers("landing", events.landing_times_s, LANDING_MARKER_STYLE, 0.0),
     )
 
 
@@ -71,7 +71,7 @@ def draw_event_markers(axes: Axes, analysis: Analysis, *, axis: str | None = Non
     segment, x_transform = analysis.segment.flight, axes.get_xaxis_transform()
     axes.set_xlim(segment.start_s, segment.end_s)
     name = analysis.main.axis.name if axis is None else axis
-    event_markers = _make_event_markers(analysis, analysis.events.rejected_s.get(name, ()))
+    event_markers = _make_event_markers(analysis, analysis.events.rejection_times_s.get(name, ()))
     for order, (_, spans_or_times, style, height) in enumerate(event_markers, start=1):
         if not len(spans_or_times):
             continue
@@ -126,7 +126,9 @@ def legend_entries(analysis: Analysis) -> list[Artist]:
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
-    rejection_times_s = [time for times in analysis.events.rejected_s.values() for time in times]
+    rejection_times_s = [
+        time for times in analysis.events.rejection_times_s.values() for time in times
+    ]
     return [
         Patch(**style, label=label) if height is None else Line2D([], [], **style, label=label)
         for label, spans_or_times, style, height in _make_event_markers(analysis, rejection_times_s)

@@ -68,8 +68,8 @@ FAULT_KINDS, EKF2_BEHAVIOURS, PANELS = (
     _ALLOWED_ANSWERS.behaviours,
     _ALLOWED_ANSWERS.panels,
 )
-# Allowed units for the new value of a parameter that corrects a fault, by parameter
-CORRECTIONS = {
+# Allowed units for the value of each correction of a fault, for example of a changed parameter
+UNITS_BY_CORRECTION = {
     name: _UNITS_BY_QUANTITY[quantity] for name, quantity in _ALLOWED_ANSWERS.corrections.items()
 }
 # Answer if the consistency of a filter cannot be evaluated
@@ -80,12 +80,14 @@ Unit = Annotated[str, Meta(max_length=10)]
 VerdictWord = Literal["", "consistent", "overconfident", "underconfident", "not available"]
 VERDICTS = get_args(VerdictWord)[1:]
 ChoiceName = Literal["", "a", "b", "c", "d", "e"]
-NUMBER_HELP = "a number with a decimal point, without quotes and unit (0.2), or a list ([61, 64])"
+NUMBER_HELP = (
+    "a number with a decimal point such as 0.2, without quotes or unit, or a list such as [61, 64]"
+)
 # Description of the accepted answers, by field of the form
-ACCEPTED_VALUES = {
+ACCEPTED_ANSWER_BY_FIELD = {
     **dict.fromkeys(("verdict_kf", "verdict_ekf2"), f"one of {', '.join(VERDICTS)}"),
-    "when": '"whole flight", or an empty text with the times from_s and until_s',
-    "ekf2_did": "a list of behaviours, each in quotes",
+    "when": '"whole flight", or "" with times in from_s and until_s',
+    "ekf2_did": "a list of behaviours of EKF2, each in quotes",
     "choices": "a letter from a to e in quotes",
     "log_sha256": "the SHA-256 of the log, which px4fuse answers LOG writes into an empty form",
     **dict.fromkeys(("kind", "unit", "parameter", "value_unit", "panel"), "a short text in quotes"),
@@ -98,10 +100,10 @@ QuantityAnswer = Number | Annotated[tuple[Number, ...], Meta(max_length=200)] | 
 CHOICE_NAMES: tuple[ChoiceName, ...] = get_args(ChoiceName)[1:]
 MAX_CHOICES = 20
 CHOICES_HEAD = """
-# Figures: the picture of the same name (.png) shows flights with other faults, analysed with
+# Figures: the picture of the same name (.png) shows other flights with other faults, analysed with
 # SIGMA_A 0.5 and SIGMA_Z 0.1. The background is grey while the vehicle flies in the direction of
-# the aisle, and white otherwise. Give the letter of the right answer. A wrong letter costs a
-# quarter of the points of a right letter.
+# the aisle, and white otherwise. Give the letter of the right answer. A wrong letter subtracts a
+# quarter of the points that a right letter gives.
 [choices]
 """
 
@@ -126,6 +128,8 @@ class NamedFault(Record):
 
     Attributes
     ----------
+    when : str
+        "whole flight", or "" if the times are given.
     from_s, until_s : float or None
         Start and end of the fault (s since the first data).
     parameter, value : str and float
@@ -146,7 +150,7 @@ class NamedFault(Record):
     panel: str = ""
 
     def convert_size_to_first_unit(self) -> float | None:
-        """Convert the size to the first allowed unit, for example factor 1.05 to 5 %."""
+        """Convert the fault's size to the first allowed unit, such as scale factor 1.05 to 5 %."""
         units = FAULT_KINDS[self.kind].units
         if self.size is None or not units:
             return None
@@ -156,7 +160,7 @@ class NamedFault(Record):
 
     def convert_value_to_first_unit(self) -> float | None:
         """Convert ``value`` of ``parameter`` to the first allowed unit, for example cm to m."""
-        units = CORRECTIONS.get(self.parameter, {})
+        units = UNITS_BY_CORRECTION.get(self.parameter, {})
         if self.value is None or not units:
             return self.value
         return self.value * units.get(self.value_unit, 1.0)
@@ -202,40 +206,41 @@ _QUESTION_PAIRS: tuple[tuple[QuestionKind, QuestionKind], ...] = (
 
 
 class FormQuestion(Record):
-    """Question about KF along the main axis; the student programs this filter to find the answer.
+    """Numeric question about KF along the main axis, which students answer with their own program.
 
     Attributes
     ----------
-    update : int
+    update_number : int
         Number of the KF update, from 1. The first measurement only sets the state.
     duration_s_or_gate : float
         Kind "prediction": duration without update (s). Kind "gate": innovation gate (in √S).
     """
 
     kind: QuestionKind
-    update: int
+    update_number: int
     sigma_a_m_s2: float
     sigma_z_m: float
     duration_s_or_gate: float = 0.0
 
     @property
     def text(self) -> str:
-        update, number = self.update, f"{self.duration_s_or_gate:g}"
+        update, number_text = self.update_number, f"{self.duration_s_or_gate:g}"
         quantity = {
             "gain": f"Kalman gain of the position in update {update}",
             "variance": f"position variance after update {update} (m²)",
             "innovation": f"innovation of update {update} (m)",
             "nis": f"NIS of update {update}",
-            "prediction": f"position sigma (m) {number} s after update {update}, without later "
-            "updates",
-            "gate": f"numbers of the updates {update} to {update + GATE_FURTHER_UPDATES}"
-            f" whose innovation is outside ±{number} sqrt(S); KF rejects no measurement",
+            "prediction": f"position sigma (m) of KF {number_text} s after update {update}, if no "
+            "update follows",
+            "gate": f"numbers of the updates {update} to {update + FURTHER_GATE_UPDATE_COUNT}"
+            f" whose innovation is outside ±{number_text} sqrt(S); KF rejects no measurement",
         }[self.kind]
         return f"{quantity}; with SIGMA_A {self.sigma_a_m_s2:g} and SIGMA_Z {self.sigma_z_m:g}"
 
 
-# A question of kind "gate" is about one KF update and this number of further updates
-GATE_FURTHER_UPDATES = 20
+# A question of kind "gate" asks which innovations are outside the gate, in one KF update and this
+# number of further updates
+FURTHER_GATE_UPDATE_COUNT = 20
 
 
 def select_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
@@ -247,8 +252,8 @@ def select_questions(log_sha256: str) -> tuple[FormQuestion, ...]:
 
     sigmas = (draw_between(0.2, 0.45, 2), draw_between(0.06, 0.14, 3))
     first_kind, second_kind, third_kind = (pair[next(random_bytes) % 2] for pair in _QUESTION_PAIRS)
-    number_range = (1.0, 4.0) if third_kind == "prediction" else (0.8, 1.3)
-    duration_s_or_gate = draw_between(*number_range, 1)
+    duration_or_gate_range = (1.0, 4.0) if third_kind == "prediction" else (0.8, 1.3)
+    duration_s_or_gate = draw_between(*duration_or_gate_range, 1)
     return (
         FormQuestion(first_kind, 2 + next(random_bytes) % 7, *sigmas),
         FormQuestion(second_kind, 20 + next(random_bytes) % 130, *sigmas),
@@ -267,43 +272,46 @@ def read_answers(path: Path) -> Answers:
     form_toml = read_text(path, SettingsError, MAX_FORM_BYTES, name=str(path))
     if any(len(line) > MAX_LINE_LENGTH for line in form_toml.splitlines()):
         raise SettingsError(f"{path}: a line has more than {MAX_LINE_LENGTH} characters.")
-    record: dict[str, Any] = {}
+    form_values: dict[str, Any] = {}
     try:
-        record = _convert_form(tomllib.loads(form_toml))
-        answers = msgspec.convert(record, Answers)
+        form_values = _convert_form(tomllib.loads(form_toml))
+        answers = msgspec.convert(form_values, Answers)
         check_answers(answers)
     except (tomllib.TOMLDecodeError, RecursionError, msgspec.ValidationError, ValueError) as error:
-        message = _describe_error(error, form_toml, record)
+        message = _describe_error(error, form_toml, form_values)
         raise SettingsError(f"{path}: {message}", "Correct the answer form.") from error
     return answers
 
 
-def _describe_error(error: Exception, text: str, record: dict[str, Any]) -> str:
+def _describe_error(error: Exception, form_toml: str, form_values: dict[str, Any]) -> str:
     """Describe an invalid answer and the accepted answers, or a line that is not TOML."""
     message = str(error)
     if line_match := re.search(r"\(at line (\d+), column \d+\)", message):
         line = line_match[1]
-        content = one_line(text.splitlines()[int(line) - 1], 60)
+        content = one_line(form_toml.splitlines()[int(line) - 1], 60)
         return f"line {line} ({content}) is not valid; give {NUMBER_HELP}, or a word in quotes"
     reason, _, path = message.partition(" - at `$.")
     path_names = re.findall(r"\w+", path)
     if not path_names:
         return message
-    invalid_value: Any = record
+    invalid_value: Any = form_values
     for name in path_names:
         invalid_value = invalid_value[int(name) if name.isdigit() else name]
-    field, number = path_names[-1], int(path_names[1]) + 1 if len(path_names) > 1 else 0
+    field_name, number = path_names[-1], int(path_names[1]) + 1 if len(path_names) > 1 else 0
     if isinstance(invalid_value, dict):
         return f"mistake {number}: {reason}"
-    accepted_text = ACCEPTED_VALUES.get(path_names[0], ACCEPTED_VALUES.get(field, NUMBER_HELP))
+    accepted_values = ACCEPTED_ANSWER_BY_FIELD.get(
+        path_names[0], ACCEPTED_ANSWER_BY_FIELD.get(field_name, NUMBER_HELP)
+    )
     if path_names[0] in ("quantities", "choices"):
-        field = f"{path_names[0][0]}{number}"
+        field_name = f"{path_names[0][0]}{number}"
     mistake_text = f" of mistake {number}" if path_names[0] == "mistakes" else ""
-    return f"{field}{mistake_text} is {one_line(str(invalid_value), 60)!r}; give {accepted_text}"
+    value_text = one_line(str(invalid_value), 60)
+    return f"{field_name}{mistake_text} is {value_text!r}; give {accepted_values}"
 
 
 def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
-    filled_form = _without_blanks(form)
+    filled_form = _remove_blanks(form)
     mistakes = filled_form.pop("mistake", ())
     quantities, choices = (
         msgspec.convert(filled_form.pop(name, {}), dict[str, Any])
@@ -328,11 +336,11 @@ def _convert_form(form: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _without_blanks(value: Any) -> Any:
+def _remove_blanks(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _without_blanks(element) for key, element in value.items() if element != ""}
+        return {key: _remove_blanks(element) for key, element in value.items() if element != ""}
     if isinstance(value, list):
-        return [element for element in map(_without_blanks, value) if element not in ("", {})]
+        return [element for element in map(_remove_blanks, value) if element not in ("", {})]
     return value
 
 
@@ -351,29 +359,30 @@ def check_answers(answers: Answers) -> None:
         _require_choice("ekf2_did", behaviour, EKF2_BEHAVIOURS)
     for named_fault in answers.mistakes:
         fault_kind = FAULT_KINDS[named_fault.kind]
-        for field, choices in (
-            ("parameter", CORRECTIONS),
+        for field_name, choices in (
+            ("parameter", UNITS_BY_CORRECTION),
             ("panel", PANELS),
             ("unit", fault_kind.units),
-            ("value_unit", CORRECTIONS.get(named_fault.parameter)),
+            ("value_unit", UNITS_BY_CORRECTION.get(named_fault.parameter)),
         ):
-            chosen_name = getattr(named_fault, field)
+            chosen_name = getattr(named_fault, field_name)
             if chosen_name and choices is not None:
-                _require_choice(f"{named_fault.kind}: {field}", chosen_name, choices)
-        low, high = fault_kind.size_range
+                _require_choice(f"{named_fault.kind}: {field_name}", chosen_name, choices)
+        min_size, max_size = fault_kind.size_range
         size = named_fault.convert_size_to_first_unit()
-        if size is not None and not low <= size <= high:
+        if size is not None and not min_size <= size <= max_size:
             unit = next(iter(fault_kind.units))
             raise ValueError(
-                f"{named_fault.kind}: size {size:g} is out of range ({low:g} to {high:g} {unit})"
+                f"{named_fault.kind}: size {size:g} is out of range "
+                f"({min_size:g} to {max_size:g} {unit})"
             )
 
 
-def _require_choice(field: str, value: str, choices: Any) -> None:
+def _require_choice(field_name: str, value: str, choices: Any) -> None:
     if value not in choices:
         choices_text = _join_quoted(choices)
         fault = f"is not one of {choices_text}" if choices_text else "must be left empty"
-        raise ValueError(f"{field} {value!r} {fault}")
+        raise ValueError(f"{field_name} {value!r} {fault}")
 
 
 def form_name(log_name: str) -> str:
@@ -385,7 +394,7 @@ def form_name(log_name: str) -> str:
     return f"{Path(log_name).stem}.answers.toml"
 
 
-def form_text(log_name: str, log_sha256: str, choices: Sequence[Choice] = ()) -> str:
+def format_answer_form(log_name: str, log_sha256: str, choices: Sequence[Choice] = ()) -> str:
     """Return an empty answer form (TOML) for a log, with all allowed answers in comments."""
     template = Path(__file__).with_name("answer_form.toml").read_text(encoding="utf-8")
     questions = [
@@ -401,10 +410,12 @@ def form_text(log_name: str, log_sha256: str, choices: Sequence[Choice] = ()) ->
         form=form_name(log_name),
         sha256=log_sha256,
         verdicts=_join_quoted(VERDICTS),
-        behaviours=_format_block(_join_in_threes(EKF2_BEHAVIOURS)),
-        kinds=_format_block(kind_lines),
-        corrections=_format_block(name + _format_units(CORRECTIONS[name]) for name in CORRECTIONS),
-        panels=_format_block(_join_in_threes(PANELS)),
+        behaviours=_format_comment_lines(_join_in_threes(EKF2_BEHAVIOURS)),
+        kinds=_format_comment_lines(kind_lines),
+        corrections=_format_comment_lines(
+            name + _format_units(UNITS_BY_CORRECTION[name]) for name in UNITS_BY_CORRECTION
+        ),
+        panels=_format_comment_lines(_join_in_threes(PANELS)),
         questions="\n".join(questions),
     ) + "".join(
         f'{CHOICES_HEAD * (number == 1)}# {choice.text}\nc{number} = ""\n'
@@ -419,7 +430,7 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
     yield "Behaviour of EKF2", ", ".join(answers.ekf2_did) or EMPTY_CELL
     for mistake in answers.mistakes:
         size_units = FAULT_KINDS.get(mistake.kind, FaultKind("")).units
-        value_units = CORRECTIONS.get(mistake.parameter, {})
+        value_units = UNITS_BY_CORRECTION.get(mistake.parameter, {})
         value_text = _format_number_with_unit(mistake.value, mistake.value_unit, value_units)
         times = (("from", mistake.from_s), ("until", mistake.until_s))
         time_texts = [f"{word} {time_s:g} s" for word, time_s in times if time_s is not None]
@@ -443,16 +454,16 @@ def form_rows(answers: Answers) -> Iterator[tuple[str, str]]:
         yield "Answers about the figures", ", ".join(choice_texts)
 
 
-def _format_number_with_unit(number: float | None, unit: str, units: Mapping[str, float]) -> str:
+def _format_number_with_unit(number: float | None, unit: str, units: Iterable[str]) -> str:
     return "" if number is None else f"{number:g} {unit or next(iter(units), '')}".rstrip()
 
 
-def _format_units(units: Mapping[str, float]) -> str:
+def _format_units(units: Iterable[str]) -> str:
     unit_text = ", ".join(filter(None, units))
     return f" [{unit_text}]" if unit_text else ""
 
 
-def _format_block(lines: Iterable[str]) -> str:
+def _format_comment_lines(lines: Iterable[str]) -> str:
     return "\n".join(f"#     {line}" for line in lines)
 
 

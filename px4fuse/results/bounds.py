@@ -15,7 +15,7 @@ from px4fuse.errors import ResultsError
 # Maximum absolute values in results: length (m) and ratio
 MAX_LENGTH_M, MAX_RATIO = 1e9, 1e6
 # Valid range of a number, by pattern of its field name; the first match applies
-BOUNDS = {
+RANGE_BY_FIELD_PATTERN = {
     r"(^|_)(nis|nees)($|_)": (0.0, MAX_RATIO),
     r"(enabled|fused|lost|rejected)_fraction($|_)": (0.0, 1.0),
     r"(^|_)correlation$": (-1.0, 1.0),
@@ -36,7 +36,9 @@ def find_bounds(name: str) -> tuple[float, float]:
     >>> find_bounds("nis_mean"), find_bounds("position_rmse_m"), find_bounds("start_s")
     ((0.0, 1000000.0), (-1000000000.0, 1000000000.0), (-inf, inf))
     """
-    matching_bounds = (bounds for pattern, bounds in BOUNDS.items() if re.search(pattern, name))
+    matching_bounds = (
+        bounds for pattern, bounds in RANGE_BY_FIELD_PATTERN.items() if re.search(pattern, name)
+    )
     return next(matching_bounds, (-math.inf, math.inf))
 
 
@@ -56,7 +58,7 @@ def drop_invalid_numbers(results: T) -> T:
         checked_results: T = _check_value(results, None, "", reasons)
     except _OutOfBoundsError as error:
         raise ResultsError(
-            f"the results need a number that is not valid: {error}", CHECK_LOG_REMEDY
+            f"a number that the results require is not valid: {error}", CHECK_LOG_REMEDY
         ) from error
     if hasattr(checked_results, "missing"):
         unavailable_numbers = (
@@ -97,9 +99,11 @@ def _check_struct(value: msgspec.Struct, path: str, reasons: list[str]) -> msgsp
     for field in fields(value):
         if field.type is msgspec.UnsetType:  # NotWritten
             continue
-        element, field_path = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
+        field_value, field_path = getattr(value, field.name), f"{path}.{field.name}".lstrip(".")
         try:
-            changes[field.name] = _check_or_replace(element, field.type, field_path, reasons)
+            changes[field.name] = _check_or_replace_value(
+                field_value, field.type, field_path, reasons
+            )
         except _OutOfBoundsError as error:
             if field.default is not None:
                 raise
@@ -116,7 +120,9 @@ def _check_mapping(value: Mapping[str, Any], annotation: Any, path: str, reasons
     checked_elements: dict[str, Any] = {}
     for key, element in value.items():
         try:
-            checked_elements[key] = _check_or_replace(element, value_type, f"{path}.{key}", reasons)
+            checked_elements[key] = _check_or_replace_value(
+                element, value_type, f"{path}.{key}", reasons
+            )
         except _OutOfBoundsError as error:
             reasons.append(str(error))
     if not checked_elements and any(
@@ -139,7 +145,7 @@ def _check_tuple(value: tuple[Any, ...], path: str, reasons: list[str]) -> tuple
     return tuple(checked_elements)
 
 
-def _check_or_replace(value: Any, annotation: Any, path: str, reasons: list[str]) -> Any:
+def _check_or_replace_value(value: Any, annotation: Any, path: str, reasons: list[str]) -> Any:
     """Return the value, or an Unavailable if a number in the value is outside its valid range."""
     try:
         return _check_value(value, annotation, path, reasons)

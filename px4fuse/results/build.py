@@ -45,7 +45,7 @@ def results(
             if answer_text != EMPTY_CELL
         )
         card = msgspec.structs.replace(card, facts={"Answers": "; ".join(answer_texts)})
-    fields = _flight_fields(contract.COMPARISON_SCHEMA, request, analysis) | {
+    fields = _make_flight_fields(contract.COMPARISON_SCHEMA_NAME, request, analysis) | {
         "aids": {} if isinstance(analysis.aids, Unavailable) else dict(analysis.aids),
         "card": card,
         "student": student,
@@ -65,7 +65,7 @@ def make_outcome_results(
         return results(request, outcome, student)
     return drop_invalid_numbers(
         contract.AidsResults(
-            **_common_fields(contract.AIDS_SCHEMA, request, outcome.flight),
+            **_make_common_fields(contract.AIDS_SCHEMA_NAME, request, outcome.flight),
             aids=dict(outcome.aids),
             card=build_aids_card(outcome, request.with_file_names(), (student.name, student.id)),
             findings=outcome.findings,
@@ -80,7 +80,7 @@ def make_tuning_results(
     comparison: PreparedComparison,
     tuning_by_axis: Mapping[str, AxisTuning | Unavailable],
 ) -> contract.TuningResults:
-    common_fields = _flight_fields("px4fuse-tuning", request, comparison, "tune")
+    common_fields = _make_flight_fields("px4fuse-tuning", request, comparison, "tune")
     return drop_invalid_numbers(
         contract.TuningResults(**common_fields, tuning=dict(tuning_by_axis))
     )
@@ -91,7 +91,7 @@ def make_sync_results(
     comparison: PreparedComparison,
     time_offset: ClockOffset | Unavailable,
 ) -> contract.SyncResults:
-    common_fields = _flight_fields("px4fuse-sync", request, comparison, "sync")
+    common_fields = _make_flight_fields("px4fuse-sync", request, comparison, "sync")
     return drop_invalid_numbers(contract.SyncResults(**common_fields, clock=time_offset))
 
 
@@ -99,7 +99,7 @@ def make_whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> con
     summaries, sweep_start_index = analysis.whatif, analysis.sweep_start_index
     return drop_invalid_numbers(
         contract.WhatIfResults(
-            **_common_fields(contract.WHATIF_SCHEMA, request, analysis.flight),
+            **_make_common_fields(contract.WHATIF_SCHEMA_NAME, request, analysis.flight),
             agreement=summaries.agreement,
             evaluated_s=summaries.evaluated_s,
             uses_estimates=analysis.uses_estimates,
@@ -115,7 +115,7 @@ def make_whatif_results(request: WhatIfRequest, analysis: WhatIfAnalysis) -> con
 def make_loop_results(request: LoopRequest, loop: Loop, student: Student) -> contract.LoopResults:
     return drop_invalid_numbers(
         contract.LoopResults(
-            schema=schema_of(contract.LOOP_SCHEMA),
+            schema=schema_of(contract.LOOP_SCHEMA_NAME),
             request=request.with_file_names(),
             track=loop.odometry.trajectory.track(),
             references=tuple(reference.track() for reference in loop.references),
@@ -151,7 +151,7 @@ def make_log_record(flight: Flight) -> Log:
     return Log(**msgspec.structs.asdict(flight.log), joined=flight.inputs, clocks=flight.clocks)
 
 
-def _common_fields(
+def _make_common_fields(
     name: str,
     request: ComparisonRequest | WhatIfRequest,
     flight: Flight,
@@ -165,7 +165,7 @@ def _common_fields(
     }
 
 
-def _flight_fields(
+def _make_flight_fields(
     name: str,
     request: ComparisonRequest,
     comparison: PreparedComparison,
@@ -194,7 +194,7 @@ def _flight_fields(
     kf_settings: dict[str, Any] = asdict(settings) | {
         "clock_offset_s": settings.clock_offset_s + file_clock_offset_s
     }
-    return _common_fields(name, request, comparison.flight, command) | {
+    return _make_common_fields(name, request, comparison.flight, command) | {
         "source": source,
         "settings": ChosenSettings(
             **kf_settings,

@@ -35,11 +35,11 @@ from px4fuse.trajectory.evaluation import Evaluation
 from px4fuse.trajectory.graph.solver import Graph
 from px4fuse.trajectory.model import Track
 
-COMPARISON_SCHEMA = "px4fuse-results"
-LOOP_SCHEMA = "px4fuse-loop"
-WHATIF_SCHEMA = "px4fuse-whatif"
-AIDS_SCHEMA = "px4fuse-aids"
-CHANGES_SCHEMA = "px4fuse-changes"
+COMPARISON_SCHEMA_NAME = "px4fuse-results"
+LOOP_SCHEMA_NAME = "px4fuse-loop"
+WHATIF_SCHEMA_NAME = "px4fuse-whatif"
+AIDS_SCHEMA_NAME = "px4fuse-aids"
+CHANGES_SCHEMA_NAME = "px4fuse-changes"
 # Maximum number of significant digits of a number in the results
 SIGNIFICANT_DIGITS = 10
 
@@ -116,11 +116,11 @@ ESTIMATE_FIELD_BY_SETTING = {"sigma_a_m_s2": "sigma_a_two_state_m_s2", "sigma_z_
 
 DiffSide = Literal["A", "B"]
 # 95 % interval; the upper bound is None if the data do not limit it
-Interval = tuple[float, float | None]
+ConfidenceInterval = tuple[float, float | None]
 
 
 class DiffInput(Record, kw_only=True):
-    """Input A or B of ``px4fuse diff``: file name (``given``), and its log."""
+    """Input A or B of ``px4fuse diff``: file name as given by the user, and its log."""
 
     given: str
     kind: Literal["log", "report", "results"]
@@ -149,8 +149,8 @@ class NumberChange(Record, kw_only=True):
     unit: str
     a: float | None = None
     b: float | None = None
-    a_interval: Interval | None = None
-    b_interval: Interval | None = None
+    a_interval: ConfidenceInterval | None = None
+    b_interval: ConfidenceInterval | None = None
 
 
 class SettingChange(Record):
@@ -285,11 +285,11 @@ class WhatIfResults(Record, kw_only=True, rename={"uses_estimates": "asked"}):
     Attributes
     ----------
     agreement : Agreement
-        Agreement of the replay (logged parameters) with the logged EKF2.
+        Agreement of EKF2's replay with the logged EKF2, both with the logged parameters.
     evaluated_s : tuple of (float, float)
         Time spans (s) of all statistics.
     uses_estimates : bool
-        True if the changed parameters are maximum-likelihood estimates, because the user gave none.
+        True if the user gave no parameters: they are set to maximum-likelihood estimates.
     logged, replayed, whatif : Summary
         EKF2 as logged, replay with logged parameters, replay with changed parameters.
     sweep : tuple of Summary
@@ -340,15 +340,15 @@ Results = (
 )
 # Type of the results, by name of the JSON schema
 RESULTS_BY_SCHEMA: dict[str, type[Results]] = {
-    COMPARISON_SCHEMA: ComparisonResults,
-    LOOP_SCHEMA: LoopResults,
-    AIDS_SCHEMA: AidsResults,
+    COMPARISON_SCHEMA_NAME: ComparisonResults,
+    LOOP_SCHEMA_NAME: LoopResults,
+    AIDS_SCHEMA_NAME: AidsResults,
     "px4fuse-tuning": TuningResults,
     "px4fuse-sync": SyncResults,
     "px4fuse-graph": GraphResults,
     "px4fuse-evaluation": EvaluationResults,
-    WHATIF_SCHEMA: WhatIfResults,
-    CHANGES_SCHEMA: ChangeResults,
+    WHATIF_SCHEMA_NAME: WhatIfResults,
+    CHANGES_SCHEMA_NAME: ChangeResults,
 }
 
 
@@ -367,11 +367,11 @@ def schema() -> dict[str, Any]:
             }
             for name, kind in RESULTS_BY_SCHEMA.items()
         ],
-        "$defs": schema_of_types(RESULTS_BY_SCHEMA.values())[1],
+        "$defs": make_schemas_of_types(RESULTS_BY_SCHEMA.values())[1],
     }
 
 
-def schema_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def make_schemas_of_types(types: Collection[type]) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Return the JSON Schema of each type, and the definitions (``$defs``) that they use."""
     record_types = dict.fromkeys(types)
     schemas: tuple[dict[str, Any], ...] = ()
@@ -436,6 +436,6 @@ def to_json(results: msgspec.Struct | dict[str, Any]) -> str:
     return json.dumps(rounded_results, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def file_hashes_in(text: str) -> list[str]:
+def find_file_hashes(text: str) -> list[str]:
     """Return the SHA-256 of all input files in results (JSON text), in order of appearance."""
     return re.findall(r'"([0-9a-f]{64})"', text)

@@ -43,14 +43,14 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
     if len(data) > MAX_RESULTS_BYTES:
         raise ResultsError(f"{name} is larger than {MAX_RESULTS_BYTES // 1_000_000} MB.")
     try:
-        decoded = convert_nested(msgspec.json.decode(data), _clean_value)
+        decoded_results = convert_nested(msgspec.json.decode(data), _clean_value)
         json.loads(data, object_pairs_hook=_require_unique_keys)
     except RecursionError as error:
         raise ResultsError(f"{name} is nested too deeply.") from error
     except (msgspec.DecodeError, ValueError) as error:
         raise ResultsError(f"{name} is not JSON ({one_line(str(error), 100)}).") from error
     try:
-        header = msgspec.convert(decoded, _ResultsHeader)
+        header = msgspec.convert(decoded_results, _ResultsHeader)
         results_type = RESULTS_BY_SCHEMA[header.schema.name]
     except (msgspec.ValidationError, KeyError) as error:
         raise ResultsError(f"{name} contains no results of px4fuse.") from error
@@ -69,10 +69,10 @@ def read_results(data: bytes, name: str = "results.json") -> Results:
             f"Create the report again, or read it with {version_text}.",
         )
     if int(version.partition(".")[2]) > int(minor):
-        decoded = _remove_unknown_fields(decoded, results_type)
+        decoded_results = _remove_unknown_fields(decoded_results, results_type)
     try:
         results: Results = msgspec.convert(
-            decoded, results_type, dec_hook=decode_record_or_unavailable
+            decoded_results, results_type, dec_hook=decode_record_or_unavailable
         )
     except msgspec.ValidationError as error:
         raise ResultsError(

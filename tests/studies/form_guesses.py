@@ -28,11 +28,11 @@ from px4fuse.classroom.grading.form_points import (
 )
 from px4fuse.results.answer_form import (
     CHOICE_NAMES,
-    CORRECTIONS,
     EKF2_BEHAVIOURS,
     FAULT_KINDS,
     NOT_AVAILABLE,
     PANELS,
+    UNITS_BY_CORRECTION,
     VERDICTS,
     Answers,
     NamedFault,
@@ -69,7 +69,8 @@ def at_random(rng: np.random.Generator, one: RightFormAnswers) -> Answers:
     claims = tuple(
         NamedFault(
             str(kind), float(rng.lognormal(-1.0, 1.5)), when="whole flight",
-            parameter=str(rng.choice(list(CORRECTIONS))), value=float(rng.lognormal(-1.0, 1.5)),
+            parameter=str(rng.choice(list(UNITS_BY_CORRECTION))),
+            value=float(rng.lognormal(-1.0, 1.5)),
             panel=str(rng.choice(PANELS)),
         )
         for kind in kinds

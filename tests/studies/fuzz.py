@@ -227,7 +227,7 @@ TARGETS = (
     Target("g2o", _text(_GRAPH_2D, _GRAPH_3D), read_g2o, ".g2o", True, 1800, 20.0),
     Target("pose graph", _text(_GRAPH_2D, _GRAPH_3D), _graph, ".g2o", True, 180, 2.0),
     Target(
-        "answers", lambda: [answer_form.form_text("a.ulg", "0" * 64).encode()],
+        "answers", lambda: [answer_form.format_answer_form("a.ulg", "0" * 64).encode()],
         answer_form.read_answers, ".toml", True, 900, 8.0,
     ),
     Target(

@@ -28,7 +28,7 @@ from px4fuse.core.input_files import inputs_not_registered
 from px4fuse.core.text import to_json_types
 from px4fuse.core.writing import write_all
 from px4fuse.errors import OutputError
-from px4fuse.results.answer_form import form_name, form_text
+from px4fuse.results.answer_form import form_name, format_answer_form
 from px4fuse.simulation import flights
 from px4fuse.simulation.faults import parse_faults
 
@@ -154,7 +154,7 @@ def write_assignment(
         stored_answer = answers.setdefault(normalise_text(student.student_id), answer)
         _require_same_flights(key_file, stored_answer.sha256 == answer.sha256)
         choices = stored_answer.form.choices if stored_answer.form else ()
-        empty_form = form_text(
+        empty_form = format_answer_form(
             student.log_file_name, answer.sha256, [choice for choice, _ in choices]
         )
         content_by_path = {

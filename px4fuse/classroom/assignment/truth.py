@@ -9,7 +9,7 @@ import numpy as np
 from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.estimates import estimate_noises_and_clock
 from px4fuse.comparison.model import AxisComparison, Comparison, FilterName, FilterSummary
-from px4fuse.comparison.preparation import prepare
+from px4fuse.comparison.preparation import prepare_comparison_inputs
 from px4fuse.core.record import Record, read_toml
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.model import (
@@ -25,7 +25,7 @@ from px4fuse.loop.analysis import analyse
 from px4fuse.loop.tracks import LoopSource, trajectory_of
 from px4fuse.request import SIGMA_Z_M, ComparisonRequest
 from px4fuse.results.answer_form import (
-    GATE_FURTHER_UPDATES,
+    FURTHER_GATE_UPDATE_COUNT,
     Choice,
     ChoiceName,
     FormQuestion,
@@ -135,7 +135,7 @@ def compute_form_answers(simulation: flights.Simulation, log_sha256: str) -> Rig
 def compare_simulation(simulation: flights.Simulation) -> Comparison:
     """Analyse a simulated flight with the default settings of KF."""
     flight = flights.to_flight(simulation)
-    prepared_comparison = prepare(
+    prepared_comparison = prepare_comparison_inputs(
         flight,
         ComparisonRequest(log=flight.log.name, sigma_z_m=SIGMA_Z_M),
         keep_as_sent=True,  # do not correct frame and clock: the student has to find these faults
@@ -235,15 +235,15 @@ def compute_numeric_answer(
     """
     settings = Settings(question.sigma_a_m_s2, question.sigma_z_m)
     kf_replay = replay(axis_comparison.axis, settings)
-    updates = kf_replay.updates.iloc[question.update - 1 :]
+    updates = kf_replay.updates.iloc[question.update_number - 1 :]
     if updates.empty:
         return None
     covariance = kf_replay.steps.loc[updates.index[0], COVARIANCE_COLUMNS]
     nis = updates["innovation_m"] ** 2 / updates["innovation_variance_m2"]
     match question.kind:
         case "gate":
-            is_outside = nis.iloc[: GATE_FURTHER_UPDATES + 1] > question.duration_s_or_gate**2
-            rejected_update_numbers = np.flatnonzero(is_outside) + question.update
+            is_outside = nis.iloc[: FURTHER_GATE_UPDATE_COUNT + 1] > question.duration_s_or_gate**2
+            rejected_update_numbers = np.flatnonzero(is_outside) + question.update_number
             return tuple(rejected_update_numbers.astype(float).tolist())
         case "prediction":
             p, f = symmetric_matrix(tuple(covariance)), transition(settings.dt_s)

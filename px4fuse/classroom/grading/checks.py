@@ -465,7 +465,11 @@ class TimeOffsetItem(RubricItem, frozen=True, tag="clock"):
 
 # Maximum distance (m) between take-off and landing position of a closed loop
 MAX_LANDING_DISTANCE_M = 0.5
-CORRECTIONS: tuple[CorrectionName, ...] = ("by_distance_plain", "by_distance", "pose_graph_gated")
+UNITS_BY_CORRECTION: tuple[CorrectionName, ...] = (
+    "by_distance_plain",
+    "by_distance",
+    "pose_graph_gated",
+)
 
 
 class LoopItem(RubricItem, frozen=True, tag="loop"):
@@ -498,7 +502,7 @@ class LoopItem(RubricItem, frozen=True, tag="loop"):
             )
         points_fraction, comment = 0.25, "No loop closure was accepted."
         if is_accepted:
-            corrected_paths = map(loop.corrections.get, CORRECTIONS)
+            corrected_paths = map(loop.corrections.get, UNITS_BY_CORRECTION)
             is_corrected = any(isinstance(path, CorrectedPath) for path in corrected_paths)
             points_fraction = 1.0 if is_corrected else 0.5
             comment = (

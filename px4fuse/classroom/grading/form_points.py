@@ -79,7 +79,7 @@ class _CorrectionRule(NamedTuple):
 
 
 POINTS_TABLE = read_toml(__file__, dict)
-CORRECTIONS = msgspec.convert(POINTS_TABLE["corrections"], tuple[_CorrectionRule, ...])
+UNITS_BY_CORRECTION = msgspec.convert(POINTS_TABLE["corrections"], tuple[_CorrectionRule, ...])
 SIMILAR_FAULT_GROUPS = msgspec.convert(
     [*POINTS_TABLE["neighbours"].values()], tuple[frozenset[str], ...]
 )
@@ -374,7 +374,7 @@ def find_accepted_corrections(
             bounds_by_name[values] if isinstance(values := rule.right_value_range, str) else values,
             rule.score_by_kind[fault.kind],
         )
-        for rule in CORRECTIONS
+        for rule in UNITS_BY_CORRECTION
         if fault.kind in rule.score_by_kind
         # EKF2_EV_DELAY cannot be negative
         and (size > 0.0 or rule.right_value_range != "late milliseconds")

@@ -15,7 +15,7 @@ from msgspec import structs
 from px4fuse.core.writing import write_all
 from px4fuse.errors import ResultsError
 from px4fuse.readers.ulog_topics import ignores_assessed_mark
-from px4fuse.results.contract import ReportedResults, file_hashes_in, to_json
+from px4fuse.results.contract import ReportedResults, find_file_hashes, to_json
 from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
 from px4fuse.verification.model import Verification
@@ -132,7 +132,7 @@ def _collect_dependencies(
         else "assigned"
         if sha256 in assigned_hashes
         else "missing"
-        for sha256 in sorted(set(file_hashes_in(results)))
+        for sha256 in sorted(set(find_file_hashes(results)))
     }
 
 
