@@ -58,7 +58,7 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
         axes = left_column.panel("Before alignment", MAP_HEIGHT, left=LABEL_MARGIN)
         for position_m, line_style, label in (
             (evaluation.reference_m, REFERENCE_LINE, "reference"),
-            (evaluation.unaligned_estimate_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
+            (evaluation.unaligned_m, {"color": KF_COLOUR, "lw": 1.2}, "estimate"),
         ):
             drawn_position_m = position_m[:, axis_indices]
             plot_path(axes, drawn_position_m, evaluation.time_s, label=label, **line_style)
@@ -225,7 +225,7 @@ def missing_reasons(evaluation: Evaluation) -> list[str]:
 
 
 def unaligned_sentence(evaluation: Evaluation) -> str:
-    estimate_m, reference_m = evaluation.unaligned_estimate_m, evaluation.reference_m
+    estimate_m, reference_m = evaluation.unaligned_m, evaluation.reference_m
     rmse_m = float(np.sqrt(((estimate_m - reference_m) ** 2).sum(axis=1).mean()))
     alignment = evaluation.transform
     scale_text = f", scale {alignment.scale:.3g}" if alignment.degrees_of_freedom == 7 else ""

@@ -195,7 +195,7 @@ class Evaluation(Record, kw_only=True):
         Times of the compared poses, on the clock of the estimate.
     distance_m : ndarray, shape (n,)
         Distance along the reference, from the first compared pose.
-    unaligned_estimate_m, estimate_m, reference_m : ndarray, shape (n, 3)
+    unaligned_m, estimate_m, reference_m : ndarray, shape (n, 3)
         Positions of the estimate before and after alignment, and of the reference.
     position_error_m : ndarray, shape (n,)
     """
@@ -213,7 +213,7 @@ class Evaluation(Record, kw_only=True):
     reference_track: NotWritten[Trajectory] = NOT_WRITTEN
     time_s: NotWritten[Array] = NOT_WRITTEN
     distance_m: NotWritten[Array] = NOT_WRITTEN
-    unaligned_estimate_m: NotWritten[Array] = NOT_WRITTEN
+    unaligned_m: NotWritten[Array] = NOT_WRITTEN
     estimate_m: NotWritten[Array] = NOT_WRITTEN
     reference_m: NotWritten[Array] = NOT_WRITTEN
     position_error_m: NotWritten[Array] = NOT_WRITTEN
@@ -330,7 +330,7 @@ def evaluate(
         ),
         time_s=matched_estimate.time_s,
         distance_m=distance_m,
-        unaligned_estimate_m=matched_estimate.position_m,
+        unaligned_m=matched_estimate.position_m,
         estimate_m=aligned_estimate.position_m,
         reference_m=matched_reference.position_m,
         position_error_m=position_error_m,
