@@ -223,8 +223,8 @@ def _find_bias_changes(estimates: Estimates) -> list[Change]:
     if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_significant_bias():
         return []
     biases = {
-        FORWARD_BIAS: systematic_errors.accelerometer_bias_forward,
-        RIGHT_BIAS: systematic_errors.accelerometer_bias_right,
+        FORWARD_BIAS: systematic_errors.forward_bias_m_s2,
+        RIGHT_BIAS: systematic_errors.right_bias_m_s2,
     }
     return [{name: round(bias.value, 3) for name, bias in biases.items()}]
 
