@@ -173,7 +173,7 @@ def compute_autocorrelation(values: Array, lag_count: int) -> Array:
 def assess_innovations(
     innovation_m: Array, innovation_variance_m2: Array, gate: float = DEFAULT_GATE
 ) -> Consistency | Unavailable:
-    """Test innovations (in time order) against the reported S: NIS, bias and whiteness.
+    """Test innovations in time order against their reported variances: NIS, bias, whiteness.
 
     ``gate`` is the innovation gate in √S. Fewer than ten finite innovations are not tested.
     """

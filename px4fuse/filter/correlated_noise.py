@@ -48,7 +48,7 @@ COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
 COARSE_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
 # Tested multiples of SIGMA_A in the coarse search, for each fraction and time constant above
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
-# Tested factors on all σ (SIGMA_A, SIGMA_Z, σ_c) of each combination above
+# Tested factors on all σ (SIGMA_A, SIGMA_Z, σ_c) in the coarse search, for each combination above
 COARSE_NOISE_FACTORS = np.geomspace(0.7, 1.6, 12)
 # Approximate number of position measurements in the coarse search for time-correlated noise
 COARSE_MEASUREMENT_COUNT = 1000

@@ -55,9 +55,11 @@ MAX_OUTLIER_PROBABILITY_CHANGE = 0.01
 UNCOMPUTABLE_SCORE = 1e6
 # Step of ln σ for numerical derivatives of the log-likelihood
 DERIVATIVE_LOG_STEP = 1e-4
-# -ln p is interpolated over ln σ: number of grid nodes in each dimension, and their spacing in ln σ
+# -ln p is interpolated on a grid over ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z: number of nodes in each
+# dimension, and their spacing
 NODE_COUNT_AND_LOG_STEP = 10, 0.25
-# Smaller grid for an approximate maximum, until the outlier probabilities have converged
+# Smaller grid for an approximate maximum of the likelihood, until the outlier probabilities have
+# converged
 COARSE_NODE_COUNT_AND_LOG_STEP = 6, 0.2
 # A noise fit to a long flight is initialised with a fit to this number of its first measurements
 INITIAL_FIT_MEASUREMENT_COUNT = 2000

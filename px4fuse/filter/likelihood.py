@@ -229,14 +229,14 @@ def compute_profile_interval(
     At its ends, -ln p is ``max_log_likelihood_drop`` larger than the minimum; the default gives a
     95 % interval. An end outside the grid is None.
     """
-    score_drops = profile - profile.min()
-    first_index, last_index = np.flatnonzero(score_drops <= max_log_likelihood_drop)[[0, -1]]
+    score_rises = profile - profile.min()
+    first_index, last_index = np.flatnonzero(score_rises <= max_log_likelihood_drop)[[0, -1]]
 
     def interpolate_end(inside_index: int, outside_index: int) -> float | None:
         if not 0 <= outside_index < len(grid):
             return None
-        grid_fraction = (max_log_likelihood_drop - score_drops[inside_index]) / (
-            score_drops[outside_index] - score_drops[inside_index]
+        grid_fraction = (max_log_likelihood_drop - score_rises[inside_index]) / (
+            score_rises[outside_index] - score_rises[inside_index]
         )
         return float(
             grid[inside_index] + grid_fraction * (grid[outside_index] - grid[inside_index])

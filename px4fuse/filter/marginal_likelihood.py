@@ -227,7 +227,7 @@ class PositionFit:
         return np.asarray(self.gram[..., 1:, 1:] + np.diag(self.constant_prior_sigmas**-2.0))
 
     def estimate_segment_constants(self) -> Array:
-        """Return maximum-likelihood values of biases etc., shape (segments, time offsets, c)."""
+        """Return maximum-likelihood constants (biases, ...), shape (segments, time offsets, c)."""
         return np.asarray(
             -np.linalg.solve(self.compute_information(), self.gram[..., 1:, :1])[..., 0]
         )
@@ -356,10 +356,10 @@ def estimate_squared_errors(
     variance_m2 : ndarray, shape (m,)
         Variance of each measurement.
     constants : ndarray, shape (segments, c)
-        Maximum-likelihood values of biases etc.
+        Maximum-likelihood values of the constants (biases, ...).
     """
     input_weights = np.concatenate([np.ones((len(constants), 1)), constants], axis=1)
-    # Correct Δp and Δv of each interval with the biases etc. of the segment in which it ends
+    # Correct Δp and Δv of each interval with the constants (biases, ...) of its segment
     interval_input_weights = np.repeat(
         input_weights, np.diff([*positions.segment_starts, len(variance_m2)]), axis=0
     )[1:]

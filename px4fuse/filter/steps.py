@@ -81,8 +81,8 @@ def make_timeline(
     mean_acceleration_m_s2, gap_fraction = compute_mean_step_acceleration(axis.acceleration, time_s)
     gap_s = gap_fraction * np.diff(time_s)
     # The unknown acceleration (rms) in an IMU gap of T seconds is assumed to be constant. It causes
-    # a velocity error of rms·T. White noise would cause rms·√(DT·T), so the variance is multiplied by
-    # T/DT
+    # a velocity error of rms·T. White noise would cause rms·√(DT·T), so the variance is multiplied
+    # by T/DT
     interval_index = np.searchsorted(
         np.flatnonzero(measurement_index >= 0), np.arange(1, len(time_s))
     )

@@ -211,7 +211,7 @@ def estimate_time_offset(
     has_both_ends = interval_low_s is not None and interval_high_s is not None
     offset_s = _fit_minimum_and_sigma(curve_offsets_s, profile_scores)[0]
     # An IMU sample is the mean over one interval, and its timestamp may be any time in it. The
-    # error is half an interval (1 σ). 1.96 σ widen both sides of the 95 % interval, as independent error
+    # error is half an interval (1 σ). 1.96 σ of it widen the 95 % interval on both sides
     resolution_s = 0.5 * imu_motion.imu_interval_s
     interval_limits_s = (
         curve_offsets_s[0] if interval_low_s is None else interval_low_s,

@@ -83,7 +83,7 @@ class HeldOutCheck(Record):
     count : int
         Number of measurements in the second half.
     log_likelihood_gain_per_measurement : float
-        Log-likelihood (nats) of the second half, minus that with KF's current settings.
+        Log-likelihood (nats) of the second half minus that with KF's current settings.
     """
 
     sigma_a_m_s2: NotNegative
@@ -103,7 +103,7 @@ class AxisTuning(Record, kw_only=True):
     sigma_a_two_state_m_s2 : float or None
         SIGMA_A for KF. It also covers biases and tilt, for which KF has no states.
     log_likelihood_gain_per_measurement : float
-        Log-likelihood (nats) with the estimated settings of KF, minus that with its current ones.
+        Log-likelihood (nats) with the estimated settings of KF minus that with its current ones.
     before, after : Consistency or Unavailable
         Consistency of KF along the first axis, with its current and with the estimated settings.
     outliers : int

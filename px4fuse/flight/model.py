@@ -773,7 +773,7 @@ class Flight:
 
 
 def join_flights(airborne: Spans) -> Spans:
-    """Return start and end (s) of flights that are MIN_LANDED_DURATION_S or more apart."""
+    """Return start and end (s) of flights with at least MIN_LANDED_DURATION_S between them."""
     flight_spans_s: list[Span] = []
     for start_s, end_s in airborne:
         if flight_spans_s and start_s - flight_spans_s[-1][1] < MIN_LANDED_DURATION_S:
