@@ -71,7 +71,7 @@ class StandIn:
 
 def log(**parts: Any) -> Any:
     usual = {
-        "parameters": {}, "notes": (), "format": "ULog", "has_ulog": True, "autopilot": "PX4",
+        "parameters": {}, "notes": (), "format": "ULog", "writes_ulog": True, "autopilot": "PX4",
         "default_of": lambda name: PARAMETERS[name].default,
         "dropouts": (), "damage": (), "ends_in_flight": False, "duration_s": 60.0, "bytes": 0,
         "bytes_read": 0, "restarts": None, "receive_time_reversals": None, "dropped": {},
@@ -275,6 +275,6 @@ def late(
 def with_bias(forward: float, sigma: float = 0.01, right: float = 0.0) -> SystematicErrors:
     return made(
         SystematicErrors,
-        accelerometer_bias_forward=Estimate(forward, sigma),
-        accelerometer_bias_right=Estimate(right, 0.0),
+        forward_bias_m_s2=Estimate(forward, sigma),
+        right_bias_m_s2=Estimate(right, 0.0),
     )

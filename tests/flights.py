@@ -33,9 +33,9 @@ from px4fuse.flight.model import (
     Ekf2,
     Flight,
     LogInfo,
-    Origin,
     PositionTrack,
     Reset,
+    SourceOrigin,
     Truth,
     Unavailable,
 )
@@ -69,7 +69,7 @@ class Uwb:
     outlier_share: float = 0.0
     outlier_m: float = 3.0
     name: str = "vehicle_visual_odometry"
-    origin: Origin = RECEIVED_ORIGIN
+    origin: SourceOrigin = RECEIVED_ORIGIN
     frame: str = "NED"
 
 

@@ -37,8 +37,8 @@ from px4fuse.core.arrays import Array
 from px4fuse.filter import time_offset
 from px4fuse.filter.fitting import NoiseParameters
 from px4fuse.filter.imu_motion import (
-    CONSTANTS_PRIOR_SIGMA,
     INTEGRATION_STEP_S,
+    SEGMENT_CONSTANT_PRIOR_SIGMAS,
     SEGMENT_START_PRIOR_PRECISION,
     SegmentMotion,
     compute_imu_motion,
@@ -100,7 +100,7 @@ def test_imu_error_sensitivities_at_rest_equal_closed_form() -> None:
     t, g = signals.time_s - signals.time_s[0], GRAVITY[2]
     speed = signals.table[:, 1]
     value = np.diff(speed, axis=0) / INTEGRATION_STEP_S
-    assert signals.table.shape == (len(t), 2, 3, len(CONSTANTS_PRIOR_SIGMA))
+    assert signals.table.shape == (len(t), 2, 3, len(SEGMENT_CONSTANT_PRIOR_SIGMAS))
     np.testing.assert_allclose(signals.table[..., 0], 0.0, atol=1e-10)
     # tilt θ about north and east moves it sideways by θ × f, f = [0, 0, -g]; heading does not
     tilted = np.tile([[0, -g, 0], [g, 0, 0], [0, 0, 0]], (len(value), 1, 1))
@@ -143,7 +143,7 @@ def test_integrated_constant_acceleration_equals_closed_form() -> None:
     assert moved.time_s[[0, -1]] == pytest.approx([0.75, 79.25])
     positions = moved.make_positions(np.array([-0.3, 0.0, 0.21]))
     way, speed = positions.delta_position_m, positions.delta_velocity_m_s
-    assert way.shape == (2, 3, 1 + len(CONSTANTS_PRIOR_SIGMA), len(moved.time_s) - 1)
+    assert way.shape == (2, 3, 1 + len(SEGMENT_CONSTANT_PRIOR_SIGMAS), len(moved.time_s) - 1)
     inside = np.flatnonzero(positions.is_within_segment)
     np.testing.assert_allclose(way[0, :, 0], 0.0, atol=1e-9)
     np.testing.assert_allclose(way[1, :, 0, inside], 1.5 * 0.25**2 / 2.0, atol=1e-9)
@@ -307,11 +307,11 @@ def test_time_offset_maximises_joint_likelihood_of_flight_parts(monkeypatch, off
     """Use parabolas as profiles of the parts."""
     shift, sigma = np.array([-0.05, 0.025, 0.0, 0.0]), np.array([0.03, 0.02, 0.03, 0.5])
 
-    def fit_with_noises(grid: Array, *_: object) -> SimpleNamespace:
+    def fit_constant_errors(grid: Array, *_: object) -> SimpleNamespace:
         square = (grid - offset_s - shift[:, None]) ** 2 / sigma[:, None] ** 2
         return SimpleNamespace(compute_segment_scores=lambda: 0.5 * square[None])
 
-    monkeypatch.setattr(time_offset, "fit_with_noises", fit_with_noises)
+    monkeypatch.setattr(time_offset, "fit_constant_errors", fit_constant_errors)
     moved = SimpleNamespace(
         segment_edges=np.arange(5) * 2,
         time_s=np.arange(8.0),

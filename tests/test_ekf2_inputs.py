@@ -57,9 +57,9 @@ from px4fuse.flight.model import (
     Ekf2,
     Flight,
     FusionRecord,
-    Origin,
     PositionTrack,
     Reset,
+    SourceOrigin,
     Unavailable,
 )
 from px4fuse.trajectory.rotation import to_matrix
@@ -171,7 +171,7 @@ def test_ekf2_replay_without_complete_imu_data_is_unavailable(flown):
     assert isinstance(flown(without=np.arange(400, 600)), Inputs)
 
 
-def track(name: str, origin: Origin, interval_s: float = 0.1, **parts: Any) -> PositionTrack:
+def track(name: str, origin: SourceOrigin, interval_s: float = 0.1, **parts: Any) -> PositionTrack:
     time = 10.0 + interval_s * np.arange(30)
     samples = pd.DataFrame(1.0, index=time, columns=Columns.POSITION + Columns.POSITION_VARIANCE)
     usual = {"frame": "NED", "orientation": None, "topics": (name,), "status": pd.DataFrame()}

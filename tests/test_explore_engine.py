@@ -20,7 +20,7 @@ from px4fuse.comparison.model import Comparison
 from px4fuse.comparison.preparation import shift_clock
 from px4fuse.explore.data import OFFSET_SLIDER_HALF_RANGE_S, make_kf_inputs, undo_time_offset
 from px4fuse.explore.packing import FINE_STEPS_PER_UNIT, Packer
-from px4fuse.filter.kalman import Replay, replay, state_at
+from px4fuse.filter.kalman import Replay, predict_state, replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import make_axes
 from px4fuse.readers import read_log
@@ -130,7 +130,7 @@ def test_javascript_kf_matches_python_replay(engine: Browser, sample_log: Path, 
             for column, python_column in columns.items():
                 close(page[part][column], frame[python_column], column, settings)
         times = np.array(page["between"]["time"])
-        for column, values in zip(("p", "v"), state_at(run, times), strict=True):
+        for column, values in zip(("p", "v"), predict_state(run, times), strict=True):
             # null in JSON means no state
             found = np.array(page["between"][column], dtype=float)
             close(list(found), values, column, settings)

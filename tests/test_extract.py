@@ -15,9 +15,9 @@ from flights import Estimator, aisle_flight
 from msgspec import structs
 from ulog_tools import make_log
 
-from px4fuse.filter.kalman import state_at
+from px4fuse.filter.kalman import predict_state
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import ned_acceleration
+from px4fuse.filter.signals import compute_ned_acceleration
 from px4fuse.flight.model import ClockMap, Dropout, Flight, InputFile, Reset
 from px4fuse.info import tables as extraction
 from px4fuse.readers import read_log
@@ -66,7 +66,7 @@ def test_extracted_csv_read_again_gives_identical_floats(written, sample_flight)
     ekf2 = sample_flight.ekf2
     expected = {
         "imu": sample_flight.imu.astype(float), "attitude": sample_flight.attitude,
-        "acceleration_ned": ned_acceleration(sample_flight), "ekf2_state": ekf2.state,
+        "acceleration_ned": compute_ned_acceleration(sample_flight), "ekf2_state": ekf2.state,
         "ekf2_variance": ekf2.variance, "ekf2_fusing": ekf2.fusion_flags,
         "truth": sample_flight.truth.samples,
     } | {f"position_{track.name}": track.samples for track in sample_flight.positions}  # fmt: skip
@@ -253,7 +253,7 @@ def test_kf_code_in_documentation_gives_states_of_compare(
     north = compare(sample_flight, Settings(), axes=("north",), start_s=0.0)["north"]
     # both filters have settled, and the vehicle is airborne
     inside = (time > 5.0) & (time < 125.0)
-    kf_state = state_at(north.replay, time[inside])
+    kf_state = predict_state(north.replay, time[inside])
     step_m = np.abs(kf_state[1]).max() * 0.1  # m; motion within the 0.1 s of rounding
     assert np.abs(position[inside] - kf_state[0]).max() < 2.0 * step_m
     assert np.sqrt(np.mean((velocity[inside] - kf_state[1]) ** 2)) < 0.1

@@ -416,7 +416,7 @@ def test_imu_rate_below_98_percent_of_required_is_reported(imu_hz, attitude_hz, 
     flight = {"imu": at_rate(imu_hz), "attitude": at_rate(attitude_hz)}
     for info, action in (
         (log(), "Set SDLOG_PROFILE to 17 "),
-        (log(format="MAVLink tlog", has_ulog=False), "at {:g} Hz (MAV_CMD_SET"),
+        (log(format="MAVLink tlog", writes_ulog=False), "at {:g} Hz (MAV_CMD_SET"),
         (log(format="MAVLink tlog"), "SET_MESSAGE_INTERVAL), or give the ULog"),
     ):
         found = list(imu.detect_low_rates(analysis(flight=flight, log=info).flight))
@@ -493,11 +493,11 @@ def test_frd_positions_with_fused_yaw_give_only_a_note(until_s: float, expected:
     assert ("Send the position in NED" in finding.remedy) is (expected == "warning")
     assert severity(source_frame.detect, analysis(source=frd)) == "warning"
     assert severity(source_frame.detect, analysis()) is None
-    for has_ulog in (True, False):
-        one = analysis(source=frd, ekf2={"fusion_flags": NONE}, log=log(has_ulog=has_ulog))
+    for writes_ulog in (True, False):
+        one = analysis(source=frd, ekf2={"fusion_flags": NONE}, log=log(writes_ulog=writes_ulog))
         finding = only(source_frame.detect, one)
         assert finding.severity == "note"
-        assert ("Give the ULog" in finding.remedy) is has_ulog
+        assert ("Give the ULog" in finding.remedy) is writes_ulog
 
 
 def heading_error(*degrees: float, sigma_deg: float = 1.0, p: float = 1.0) -> HeadingError:
@@ -518,11 +518,11 @@ def test_misaligned_frame_report_contains_rotation_to_apply() -> None:
 
 def test_heading_drift_report_contains_heading_at_start_and_end() -> None:
     drifting = heading_error(2.0, 30.0, p=0.0)
-    for has_ulog, orientation in ((True, object()), (False, object()), (True, None)):
+    for writes_ulog, orientation in ((True, object()), (False, object()), (True, None)):
         sent = source(orientation=orientation)
-        one = analysis(heading=drifting, log=log(has_ulog=has_ulog), source=sent)
+        one = analysis(heading=drifting, log=log(writes_ulog=writes_ulog), source=sent)
         finding = only(source_frame.detect, one)
-        has_yaw_of_source = has_ulog and orientation is not None
+        has_yaw_of_source = writes_ulog and orientation is not None
         assert ("EKF2_EV_CTRL bit 3" in finding.remedy) is has_yaw_of_source
     assert finding.title == "EKF2's heading drifts by +28° relative to the UWB positions"
     assert finding.id == "ekf2_heading_error"

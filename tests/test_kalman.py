@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from px4fuse.errors import SettingsError
 from px4fuse.filter import model
-from px4fuse.filter.kalman import UPDATE_COLUMNS, replay, state_at, variance_at
+from px4fuse.filter.kalman import UPDATE_COLUMNS, predict_state, predict_variance, replay
 from px4fuse.filter.model import COVARIANCE_COLUMNS, STATE_COLUMNS
 from px4fuse.filter.settings import InitialState, Settings
 from px4fuse.filter.signals import Axis
@@ -117,14 +117,14 @@ def test_kf_state_between_steps_is_predicted_from_previous_step(axis: Axis) -> N
     """At a step the state is that of the step, between two predicted, outside NaN."""
     run = replay(axis, Settings())
     edges = run.steps.index.to_numpy()
-    np.testing.assert_array_equal(np.transpose(state_at(run, edges)), run.steps[STATE[:2]])
+    np.testing.assert_array_equal(np.transpose(predict_state(run, edges)), run.steps[STATE[:2]])
     step = run.steps.iloc[30]
-    position, velocity = state_at(run, edges[[30]] + 0.01)
+    position, velocity = predict_state(run, edges[[30]] + 0.01)
     expected = step["position_m"] + 0.01 * step["velocity_m_s"] + 0.5 * 0.01**2 * 0.3
     assert position[0] == pytest.approx(expected, abs=1e-12)
     assert velocity[0] == pytest.approx(step["velocity_m_s"] + 0.01 * 0.3, abs=1e-12)
     around = np.array([edges[0] - 0.01, edges[0], edges[-1], edges[-1] + 0.01])
-    for part in (*state_at(run, around), *variance_at(run, around)):
+    for part in (*predict_state(run, around), *predict_variance(run, around)):
         assert np.isnan(part).tolist() == [True, False, False, True]
 
 
@@ -140,11 +140,11 @@ def test_kf_variance_between_steps_is_predicted_from_previous(dt: float, gap: bo
     edges = run.steps.index.to_numpy()
     for share in (0.0, 0.3, 0.9):
         times = edges[:-1] + share * np.diff(edges)
-        position, velocity = variance_at(run, times)
+        position, velocity = predict_variance(run, times)
         for k, at in enumerate(times):
             step = run.steps.iloc[k]
             ahead = at - edges[k]
-            P = model.symmetric_matrix(step[COVARIANCE_COLUMNS])
+            P = model.make_symmetric_matrix(step[COVARIANCE_COLUMNS])
             F = np.array([[1.0, ahead], [0.0, 1.0]])
             q = (0.7**2 + step["input_variance_m2_s4"]) * dt
             Q = q * np.array([[ahead**3 / 4.0, ahead**2 / 2.0], [ahead**2 / 2.0, ahead]])
@@ -163,7 +163,7 @@ def test_kf_state_does_not_depend_on_later_measurements(axis, chosen, data) -> N
     other = replace(axis, measurement_m=measured)
     times = np.append(np.linspace(axis.measurement_time_s[0], arrival - 1e-9, 50), arrival)
 
-    before, after = (np.array(state_at(replay(one, chosen), times)) for one in (axis, other))
+    before, after = (np.array(predict_state(replay(one, chosen), times)) for one in (axis, other))
     np.testing.assert_array_equal(before[:, :-1], after[:, :-1])
     assert abs(after[0, -1] - before[0, -1]) > 0.0
 
@@ -205,16 +205,18 @@ P = (0.5, -0.2, 0.7)
 @pytest.mark.parametrize("dt", [0.01, 0.1, 0.7])
 def test_kf_prediction_formulas_equal_matrix_products(dt: float) -> None:
     f, b = np.array([[1.0, dt], [0.0, 1.0]]), np.array([[dt**2 / 2.0], [dt]])
-    propagate_covariance = f @ model.symmetric_matrix(P) @ f.T
+    propagate_covariance = f @ model.make_symmetric_matrix(P) @ f.T
     np.testing.assert_allclose(
-        model.symmetric_matrix(model.propagate_covariance(P, dt)), propagate_covariance, rtol=1e-14
+        model.make_symmetric_matrix(model.propagate_covariance(P, dt)),
+        propagate_covariance,
+        rtol=1e-14,
     )
     x = np.array([[1.5], [-2.0]])
     moved = f @ x + b * 3.0
     np.testing.assert_allclose(model.propagate_state(1.5, -2.0, 3.0, dt), moved[:, 0], rtol=1e-14)
     # Q = B Bᵀ / dt: the acceleration is constant over the step
     np.testing.assert_allclose(
-        model.symmetric_matrix(model.compute_unit_process_noise(dt)), b @ b.T / dt, rtol=1e-14
+        model.make_symmetric_matrix(model.compute_unit_process_noise(dt)), b @ b.T / dt, rtol=1e-14
     )
 
 

@@ -11,8 +11,8 @@ from scipy.stats import norm
 
 from px4fuse.filter.kalman import replay
 from px4fuse.filter.likelihood import (
+    fit_parabola_vertex,
     innovations,
-    parabola_vertex,
     preintegrate,
 )
 from px4fuse.filter.settings import Settings
@@ -96,8 +96,8 @@ def test_kf_likelihood_equals_normal_density_of_innovations() -> None:
 def test_parabola_vertex_from_three_points_is_exact() -> None:
     steps = np.arange(7) - 3.0
     for vertex, bend in ((-0.5, 0.3), (-0.2, 4.0), (0.0, 0.3), (0.35, 4.0)):
-        found = parabola_vertex(1.0 + 0.5 * bend * (steps - vertex) ** 2, 3)
+        found = fit_parabola_vertex(1.0 + 0.5 * bend * (steps - vertex) ** 2, 3)
         assert found == pytest.approx((vertex, bend), abs=1e-12)
     # without upward curvature there is no vertex
-    assert parabola_vertex(np.array([3.0, 2.0, 1.0]), 1) == (0.0, 0.0)
-    assert parabola_vertex(np.array([1.0, 2.0, 1.0]), 1) == (0.0, -2.0)
+    assert fit_parabola_vertex(np.array([3.0, 2.0, 1.0]), 1) == (0.0, 0.0)
+    assert fit_parabola_vertex(np.array([1.0, 2.0, 1.0]), 1) == (0.0, -2.0)

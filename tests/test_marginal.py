@@ -19,13 +19,13 @@ from px4fuse.core.arrays import Array, IntArray
 from px4fuse.filter.fitting import (
     START_OUTLIER_FRACTION,
     START_OUTLIER_SIGMA_RATIO,
-    Likelihood,
+    NegativeLogLikelihood,
     NoiseFit,
     NoiseParameters,
     _compute_outlier_probability,
     compute_variance_inflation,
     convert_to_positions,
-    fit_with_noises,
+    fit_constant_errors,
     maximise_likelihood,
     negative_log_likelihood,
 )
@@ -149,7 +149,7 @@ def with_constants(offsets: int = 3) -> PositionsAndIncrements:
         measurement_m=measured, segment_starts=START, interval_s=length,
         unit_process_noise=0.1 * np.stack(compute_unit_continuous_noise(length)),
         added_process_noise=np.outer([0.3, 0.0, 0.2], rng.choice([0.0, 0.01], COUNT - 1)),
-        prior_precision=initial, constants_prior_sigma=np.array([0.3, 1.0, 0.1]),
+        prior_precision=initial, constant_prior_sigmas=np.array([0.3, 1.0, 0.1]),
         delta_position_m=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
         delta_velocity_m_s=rng.normal(0.0, 0.3, (3, offsets, 4, COUNT - 1)),
     )  # fmt: skip
@@ -216,7 +216,7 @@ def joint_normal(
     """Return data and covariance (with constants) of all axes, and each axis separately."""
     made = [stretch_normal(part, noises, variance, stretch, axis, at) for axis in range(3)]
     signals = np.concatenate([each[1] for each in made])
-    covariance = signals[:, 1:] * part.constants_prior_sigma**2 @ signals[:, 1:].T
+    covariance = signals[:, 1:] * part.constant_prior_sigmas**2 @ signals[:, 1:].T
     return signals[:, 0], covariance + block_diag(*(each[2] for each in made)), made
 
 
@@ -245,7 +245,7 @@ def test_likelihood_with_imu_biases_equals_multivariate_normal() -> None:
     )
     # in units of SIGMA_Z, which changes only negligible priors
     scaled = np.array(
-        [fit_with_noises([part], noises, WEIGHT).compute_scores()[0] for noises in SOME_NOISES]
+        [fit_constant_errors([part], noises, WEIGHT).compute_scores()[0] for noises in SOME_NOISES]
     )
     np.testing.assert_allclose(
         scaled - scaled[0, 0], found_values - found_values[0, 0], rtol=1e-5, atol=1e-3
@@ -264,7 +264,10 @@ def test_segment_with_one_position_does_not_change_likelihood(start_known: bool)
         one, none = (fit_positions(*arguments(each, noises, np.ones(COUNT))) for each in both)
         np.testing.assert_allclose(one.compute_scores(), none.compute_scores(), rtol=1e-12)
         np.testing.assert_allclose(
-            one.estimate_constants(), none.estimate_constants(), rtol=1e-9, atol=1e-12
+            one.estimate_segment_constants(),
+            none.estimate_segment_constants(),
+            rtol=1e-9,
+            atol=1e-12,
         )
 
 
@@ -275,10 +278,10 @@ def test_fitted_imu_biases_equal_dense_least_squares() -> None:
     for noises in SOME_NOISES[:5]:
         variance, square = np.full(COUNT, noises.sigma_z_m**2), np.zeros(COUNT)
         arranged = arguments(part, noises, np.ones(COUNT))
-        constants = fit_positions(*arranged).estimate_constants()[:, 0]
+        constants = fit_positions(*arranged).estimate_segment_constants()[:, 0]
         for stretch in range(2):
             _, _, made = joint_normal(part, noises, variance, stretch)
-            information, right = np.diag(part.constants_prior_sigma**-2.0), np.zeros(3)
+            information, right = np.diag(part.constant_prior_sigmas**-2.0), np.zeros(3)
             for _, signals, covariance in made[:2]:
                 by = -signals[:, 1:]  # effect of a constant on the positions
                 information = information + by.T @ np.linalg.solve(covariance, by)
@@ -326,7 +329,7 @@ def test_likelihood_between_grid_points_equals_exact_likelihood(which: str) -> N
     assert np.ptp(direct) > 100.0
     # far from the maximum the weak prior of the initial state has an effect
     for rough, error in ((False, 1e-6 if which == "filter" else 1e-4), (True, 2e-3)):
-        score = Likelihood(parts, WEIGHT, 0.1, rough)
+        score = NegativeLogLikelihood(parts, WEIGHT, 0.1, rough)
         assert score.is_interpolated
         found_values = np.array([score(NoiseParameters(*pair)) for pair in some])
         expected = np.array(direct) - direct[0]

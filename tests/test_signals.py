@@ -18,10 +18,10 @@ from px4fuse.comparison.projection import remove_origin_resets
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.filter.signals import (
     Segment,
-    aisle_heading,
     compute_mean_step_acceleration,
+    compute_ned_acceleration,
+    estimate_aisle_heading,
     make_axes,
-    ned_acceleration,
     project_acceleration,
 )
 from px4fuse.flight.model import (
@@ -63,7 +63,7 @@ def flight_of(*, imu=ABSENT, attitude=ABSENT, track=None, duration_s=10.0, airbo
 
 def ned_acceleration_of(time, force, attitude):
     """Return the acceleration in NED of a specific force in the body frame."""
-    return ned_acceleration(flight_of(imu=still_imu(time, force), attitude=attitude))
+    return compute_ned_acceleration(flight_of(imu=still_imu(time, force), attitude=attitude))
 
 
 @pytest.mark.parametrize(
@@ -105,8 +105,8 @@ def test_ned_acceleration_of_rotating_body_stays_constant(axis, rate_rad_s):
 def test_ned_acceleration_without_attitude_is_unavailable():
     time = np.arange(0.0, 1.0, 0.01)
     level = attitude_table(time, Rotation.identity(len(time)))
-    assert ned_acceleration(flight_of(attitude=level)) is ABSENT
-    assert ned_acceleration(flight_of(imu=still_imu(time))) is ABSENT
+    assert compute_ned_acceleration(flight_of(attitude=level)) is ABSENT
+    assert compute_ned_acceleration(flight_of(imu=still_imu(time))) is ABSENT
     assert (
         "overlap" in ned_acceleration_of(time, (0.0, 0.0, 0.0), level.set_axis(time + 100.0)).reason
     )
@@ -179,7 +179,7 @@ def line_track(heading_deg, count=200, noise=0.0):
 
 @pytest.mark.parametrize("heading_deg", [0.0, 30.0, 90.0, 135.0, 179.0, 210.0])
 def test_main_axis_of_straight_track_equals_track_direction(heading_deg):
-    heading, elongation = aisle_heading(line_track(heading_deg)[0], ALL)
+    heading, elongation = estimate_aisle_heading(line_track(heading_deg)[0], ALL)
     assert (heading - heading_deg + 90.0) % 180.0 - 90.0 == pytest.approx(0.0, abs=1e-6)
     assert 0.0 <= heading < 180.0
     assert elongation > 1e6

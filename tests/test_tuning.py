@@ -72,7 +72,7 @@ def test_two_stage_fit_of_long_flight_equals_single_fit(
     measured_m[outliers] += 1.5
     axis = replace(axis, measurement_m=measured_m)
     expected = tuned(axis)
-    monkeypatch.setattr(fitting, "FIRST_MEASUREMENT_COUNT", 400)
+    monkeypatch.setattr(fitting, "INITIAL_FIT_MEASUREMENT_COUNT", 400)
     found = tuned(axis)
     for name in ("sigma_a_two_state", "sigma_z"):
         noise, expected_noise = getattr(found, name), getattr(expected, name)
@@ -191,7 +191,7 @@ def test_noise_at_end_of_search_range_is_reported_as_bound() -> None:
 def test_tune_with_too_few_measurements_is_unavailable() -> None:
     short = tune_axes("down", (modelled(1, MIN_MEASUREMENTS - 1),), TRUE)
     assert isinstance(short, Unavailable)
-    assert short.what == "estimate of the noises (down)"
+    assert short.what == "estimate of SIGMA_A and SIGMA_Z (down)"
     assert f"only {MIN_MEASUREMENTS - 1} measurements" in short.reason
     enough = tuned(modelled(1, MIN_MEASUREMENTS))
     assert isinstance(enough.held_out, Unavailable)

@@ -34,7 +34,7 @@ from px4fuse.flight.model import (
     InputFile,
     PositionTrack,
     Unavailable,
-    clock_of_repeated_timestamps,
+    describe_repeated_timestamps,
     time_index,
 )
 from px4fuse.readers.common import select_valid_rows
@@ -170,7 +170,7 @@ def align_position_file(
     offset_origin = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
     invalid, sample_count = recording.invalid, len(recording.samples)
-    clock_map = clock_of_repeated_timestamps(
+    clock_map = describe_repeated_timestamps(
         recording.clock_kind, sample_count + recording.dropped_row_count, sample_count
     )
     track = PositionTrack(

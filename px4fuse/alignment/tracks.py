@@ -11,7 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 from px4fuse.comparison.projection import remove_origin_resets
 from px4fuse.core.arrays import Array, BoolArray, ComplexArray
 from px4fuse.errors import Px4FuseError
-from px4fuse.filter.signals import Segment, ned_acceleration
+from px4fuse.filter.signals import Segment, compute_ned_acceleration
 from px4fuse.flight.model import (
     POSITION_FILE_ORIGIN,
     Columns,
@@ -164,7 +164,7 @@ def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
 
 def make_imu_references(flight: Flight) -> list[SampledTrack]:
     """Return the IMU acceleration integrated twice, band-pass filtered after each integration."""
-    acceleration = ned_acceleration(flight)
+    acceleration = compute_ned_acceleration(flight)
     if isinstance(acceleration, Unavailable):
         raise NoMatchError(f"the log has no acceleration in NED ({acceleration.reason})")
     time_s = acceleration.index.to_numpy()

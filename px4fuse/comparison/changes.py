@@ -225,8 +225,8 @@ def _find_bias_changes(estimates: Estimates) -> list[Change]:
     if isinstance(systematic_errors, Unavailable) or not systematic_errors.has_significant_bias():
         return []
     biases = {
-        FORWARD_BIAS_KEY: systematic_errors.accelerometer_bias_forward,
-        RIGHT_BIAS_KEY: systematic_errors.accelerometer_bias_right,
+        FORWARD_BIAS_KEY: systematic_errors.forward_bias_m_s2,
+        RIGHT_BIAS_KEY: systematic_errors.right_bias_m_s2,
     }
     return [{name: round(bias.value, 3) for name, bias in biases.items()}]
 

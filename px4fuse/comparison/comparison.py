@@ -27,7 +27,7 @@ from px4fuse.filter.consistency import (
     assess_horizontal_nis,
     assess_innovations,
 )
-from px4fuse.filter.kalman import Replay, replay, state_at, variance_at
+from px4fuse.filter.kalman import Replay, predict_state, predict_variance, replay
 from px4fuse.filter.model import STATE_COLUMNS
 from px4fuse.filter.signals import Axis, Segment
 from px4fuse.flight.model import (
@@ -191,7 +191,7 @@ def compute_difference_statistics(
     if isinstance(ekf2_state, Unavailable):
         return ekf2_state
     kf_minus_ekf2 = (
-        np.array(state_at(kf_run, ekf2_state.index.to_numpy()))
+        np.array(predict_state(kf_run, ekf2_state.index.to_numpy()))
         - ekf2_state[STATE_COLUMNS].to_numpy().T
     )
     position_m, velocity_m_s = kf_minus_ekf2[:, np.isfinite(kf_minus_ekf2).all(axis=0)]
@@ -237,7 +237,10 @@ def sample_kf_run(kf_run: Replay, times_s: Array) -> tuple[pd.DataFrame, pd.Data
         pd.DataFrame(
             dict(zip(columns, state_function(kf_run, times_s), strict=True)), index=times_s
         )
-        for columns, state_function in ((STATE_COLUMNS, state_at), (VARIANCE_COLUMNS, variance_at))
+        for columns, state_function in (
+            (STATE_COLUMNS, predict_state),
+            (VARIANCE_COLUMNS, predict_variance),
+        )
     )
     return state, variance
 

@@ -22,7 +22,7 @@ from px4fuse.ekf2.inputs import Inputs
 from px4fuse.ekf2.model import Model
 from px4fuse.ekf2.replay import Spans, inside_spans
 from px4fuse.ekf2.steps import DifferenceExplanation, Step, UnreplayedDifference
-from px4fuse.filter.kalman import Replay, replay, state_at
+from px4fuse.filter.kalman import Replay, predict_state, replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import ClockOffset
@@ -143,7 +143,7 @@ def _compare_unreplayed_times(
     unreplayed_state = axis_result.ekf2_state[~inside_spans(axis_result.ekf2_state.index, spans_s)]
     unreplayed_times_s = unreplayed_state.index.to_numpy()
     difference_m = np.abs(
-        state_at(kf_run, unreplayed_times_s)[0] - unreplayed_state["position_m"].to_numpy()
+        predict_state(kf_run, unreplayed_times_s)[0] - unreplayed_state["position_m"].to_numpy()
     )
     if not np.isfinite(difference_m).any():
         return None

@@ -306,7 +306,7 @@ def explain_low_imu_rate(flight: Flight) -> Unavailable | None:
     if is_telemetry:
         rate_note = f"telemetry contains only some of the IMU samples ({rate_hz:.3g} Hz)"
         remedy = f"Request the IMU message at {required_hz:g} Hz."
-        if flight.log.has_ulog:
+        if flight.log.writes_ulog:
             remedy = "Give the ULog of this flight as argument LOG."
     return Unavailable(
         "time offset",

@@ -304,7 +304,9 @@ def explain_missing_source(flight: Flight) -> Unavailable:
         topics = " or ".join(dict.fromkeys(source.message for source in POSITION_INPUTS))
         remedy = "give the position file of the positioning system as argument `position`"
         remedy = (
-            f"{remedy}, or read the ULog of this flight." if flight.log.has_ulog else f"{remedy}."
+            f"{remedy}, or read the ULog of this flight."
+            if flight.log.writes_ulog
+            else f"{remedy}."
         )
     if flight.positions:
         track_name = flight.positions[0].name

@@ -62,8 +62,8 @@ from px4fuse.filter.kalman import replay
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import (
     Acceleration,
+    compute_ned_acceleration,
     cut_to_segment,
-    ned_acceleration,
     project_acceleration,
     weighted_sum,
 )
@@ -397,7 +397,7 @@ def _remove_accelerometer_bias(
         [change[FORWARD_BIAS_KEY], change[RIGHT_BIAS_KEY], 0.0], Columns.SPECIFIC_FORCE
     )
     flight = replace(flight, imu=imu.assign(**(imu[Columns.SPECIFIC_FORCE] - accelerometer_bias)))
-    return project_acceleration(ned_acceleration(flight), direction, comparison.segment)
+    return project_acceleration(compute_ned_acceleration(flight), direction, comparison.segment)
 
 
 def _replay_ekf2(

@@ -16,7 +16,7 @@ from px4fuse.core.record import Correlation, Count, NotNegative, Positive, Recor
 from px4fuse.ekf2.heights import GNSS_HEIGHT_NOISE_FACTOR
 from px4fuse.filter.consistency import assess_innovations, classify_mean_nis, compute_nis_band
 from px4fuse.flight.ekf2_parameters import AIDS, Aid
-from px4fuse.flight.model import AidLog, Flight, Unavailable, longest_flight, step_values_at
+from px4fuse.flight.model import AidLog, Flight, Unavailable, longest_flight, sample_step_function
 
 AidVerdict = Literal[
     "consistent",
@@ -197,9 +197,11 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
     is_enabled = np.ones(len(samples), bool)
     enabled_fraction = None
     if aid_log.enabled is not None:
-        is_enabled = np.asarray(step_values_at(aid_log.enabled, samples.index) > 0.0)
+        is_enabled = np.asarray(sample_step_function(aid_log.enabled, samples.index) > 0.0)
         flight_grid_s = pd.Index(np.arange(start_s, end_s, 0.1))
-        enabled_fraction = float(np.mean(step_values_at(aid_log.enabled, flight_grid_s) > 0.0))
+        enabled_fraction = float(
+            np.mean(sample_step_function(aid_log.enabled, flight_grid_s) > 0.0)
+        )
     is_fusion_logged = "fused" in samples
     is_reset = np.zeros(len(samples), bool)
     noise_sigma_median = None
@@ -331,7 +333,7 @@ def _find_longest_gap(
     is_enabled = np.ones(len(gap_starts_s), bool)
     if aid_log.enabled is not None:
         # EKF2 disables an aiding source up to 1 s after the last fused sample
-        is_enabled = step_values_at(aid_log.enabled, pd.Index(gap_starts_s + 1.0)) > 0.0
+        is_enabled = sample_step_function(aid_log.enabled, pd.Index(gap_starts_s + 1.0)) > 0.0
     longest_index = int(np.argmax(np.diff(gap_ends_s) * is_enabled))
     if not is_enabled[longest_index]:
         return start_s, start_s

@@ -14,7 +14,7 @@ import pandas as pd
 from px4fuse.core.record import Span
 from px4fuse.ekf2.intervals import MAX_LATENESS_S
 from px4fuse.flight.ekf2_parameters import AID_MASK_PARAMETER, Aid
-from px4fuse.flight.model import Columns, Ekf2, PositionTrack, step_values_at
+from px4fuse.flight.model import Columns, Ekf2, PositionTrack, sample_step_function
 
 # EKF2 starts vision fusion if two samples arrive within this time (s): EV_MAX_INTERVAL of PX4 v1.14
 # and later (ev_control.cpp)
@@ -131,7 +131,7 @@ class UnfusedPositions:
         state_changes = self.ekf2.states.get(state)
         if state_changes is None:
             return float("nan")
-        state_values = step_values_at(state_changes, np.linspace(*self.span_s, 200))
+        state_values = sample_step_function(state_changes, np.linspace(*self.span_s, 200))
         return float(np.mean(state_values.astype(np.int64) >> bit & 1))
 
 

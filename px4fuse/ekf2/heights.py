@@ -29,7 +29,13 @@ from px4fuse.ekf2.replay_segments import (
     pad_samples,
 )
 from px4fuse.flight.ekf2_parameters import AIDS, BAROMETER, GNSS_HGT, uses_aid_mask
-from px4fuse.flight.model import GROUND_EFFECT_FLAG, Ekf2, Flight, FusionRecord, step_values_at
+from px4fuse.flight.model import (
+    GROUND_EFFECT_FLAG,
+    Ekf2,
+    Flight,
+    FusionRecord,
+    sample_step_function,
+)
 
 # State indices of vertical velocity and height
 VELOCITY_DOWN, DOWN = 5, 8
@@ -60,7 +66,7 @@ def add_heights(
     if uses_aid_mask(parameters):
         return "EKF2 before PX4 v1.14 fuses only one height sensor"
     enabled_fractions = {
-        name: np.mean(step_values_at(aid_log.enabled, replayed_s) > 0.0)
+        name: np.mean(sample_step_function(aid_log.enabled, replayed_s) > 0.0)
         for name, aid_log in ekf2.aids.items()
         if aid_log.enabled is not None
     }

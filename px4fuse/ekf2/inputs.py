@@ -46,7 +46,7 @@ from px4fuse.flight.model import (
     PositionTrack,
     Unavailable,
     reset_times_s,
-    step_values_at,
+    sample_step_function,
 )
 from px4fuse.readers.common import find_flight_spans
 from px4fuse.readers.px4_innovations import has_fused_aid, with_gnss_innovations
@@ -444,7 +444,7 @@ def read_gnss(
     position_samples, velocity_samples = track.samples, track.velocity
     # EKF2 ignores GNSS fixes while GNSS is disabled
     if (enabled_changes := ekf2.aids[GNSS_POS.name].enabled) is not None:
-        is_enabled = step_values_at(enabled_changes, position_samples.index) > 0.0
+        is_enabled = sample_step_function(enabled_changes, position_samples.index) > 0.0
         position_samples = position_samples[is_enabled]
         velocity_samples = velocity_samples[is_enabled]
     # The delay is added, because the replay subtracts it from all timestamps
@@ -548,7 +548,7 @@ def _read_vision_besides_gnss(
     received = read_vision(flight, ekf2, fusion_record, attitude)
     if isinstance(received, Unavailable):
         return received
-    is_disabled = step_values_at(enabled_changes, received.timestamp_s) == 0.0
+    is_disabled = sample_step_function(enabled_changes, received.timestamp_s) == 0.0
     position_m = received.position_m * compute_position_scale(fusion_record)
     return replace(received, position_m=np.where(is_disabled[:, None], np.nan, position_m))
 
@@ -628,7 +628,7 @@ def _find_dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array
         return np.zeros((0, 2))
     spans_s = np.array(find_flight_spans(dead_reckoning_changes == 0.0, np.inf)).reshape(-1, 2)
     spans_s[:, 0] -= DEAD_RECKONING_TIMEOUT_S * (
-        step_values_at(vision_enabled_changes, spans_s[:, 0]) > 0.0
+        sample_step_function(vision_enabled_changes, spans_s[:, 0]) > 0.0
     )
     return spans_s
 

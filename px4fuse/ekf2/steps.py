@@ -35,7 +35,7 @@ from px4fuse.ekf2.replay import (
     interpolate_component,
     rows_inside,
 )
-from px4fuse.filter.kalman import Replay, state_at
+from px4fuse.filter.kalman import Replay, predict_state
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment
 from px4fuse.flight.ekf2_parameters import EV_POS, FLOW, GNSS_POS, GNSS_VEL, MAG
@@ -236,7 +236,7 @@ def explain_by_steps(
     explanations = {}
     for axis_index, (axis, direction) in enumerate(directions.items()):
         axis_tracks = [step_tracks[axis_index] for step_tracks in tracks_by_step]
-        kf_state = state_at(kf_runs[axis], state_times_s) if kf_runs else axis_tracks[0]
+        kf_state = predict_state(kf_runs[axis], state_times_s) if kf_runs else axis_tracks[0]
         explanations[axis] = _explain_axis(
             model.flight,
             direction,

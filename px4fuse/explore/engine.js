@@ -133,7 +133,7 @@ const Engine = (() => {
   }
 
   // Position, velocity and position variance at other ascending times, NaN outside the KF run
-  // (kalman.state_at and variance_at)
+  // (kalman.predict_state and predict_variance)
   function stateAt(run, times) {
     const { steps: s, settings } = run, { time, p, v, acceleration } = s, n = time.length;
     const position = new Float64Array(times.length), velocity = position.slice(), variance = position.slice();

@@ -32,8 +32,8 @@ Limits = tuple[float, float]
 # Minimum number of innovations in a consistency test; their mean NIS has the 95 % band 0.3 to 2.1
 MIN_INNOVATIONS = 10
 CONFIDENCE_LEVEL = 0.95
-# Number of lags of the Ljung-Box whiteness test
-LJUNG_BOX_LAGS = 10
+# Maximum number of lags of the Ljung-Box whiteness test
+MAX_LJUNG_BOX_LAG_COUNT = 10
 # Data that give the actual σ: innovations of the position source, or ground truth
 Reference = Literal["source", "truth"]
 # A filter is consistent if actual σ / reported σ is in this range. It is wider for ground truth,
@@ -104,17 +104,17 @@ class HorizontalNis(NisVerdict, kw_only=True):
     """
 
 
-def compute_nis_band(count: int, dimensions: int = 1) -> Limits:
+def compute_nis_band(count: int, dimension_count: int = 1) -> Limits:
     """Return the two-sided 95 % chi-square band of the mean of ``count`` NIS values.
 
-    Each NIS is divided by its number of ``dimensions``, so that the expected mean is 1.
+    Each NIS is divided by its number of dimensions, so that the expected mean is 1.
 
     >>> low, high = compute_nis_band(128, 2)
     >>> round(2 * low, 2), round(2 * high, 2)
     (1.67, 2.36)
     """
     # Half of the sum of all NIS values has a gamma distribution with this shape parameter
-    gamma_shape = 0.5 * count * dimensions
+    gamma_shape = 0.5 * count * dimension_count
     low, high = (
         float(gammaincinv(gamma_shape, (1 + sign * CONFIDENCE_LEVEL) / 2)) / gamma_shape
         for sign in (-1, 1)
@@ -147,9 +147,9 @@ def classify_mean_nis(nis_mean: float, nis_band: Limits) -> SigmaVerdict:
     )
 
 
-def _nis_verdict_fields(nis: Array, dimensions: int = 1) -> dict[str, Any]:
-    nis_mean = float(np.mean(nis)) / dimensions
-    mean_nis_band = compute_nis_band(len(nis), dimensions)
+def _compute_nis_verdict_fields(nis: Array, dimension_count: int = 1) -> dict[str, Any]:
+    nis_mean = float(np.mean(nis)) / dimension_count
+    mean_nis_band = compute_nis_band(len(nis), dimension_count)
     return {
         "count": len(nis),
         "nis_mean": nis_mean,
@@ -173,9 +173,9 @@ def compute_autocorrelation(values: Array, lag_count: int) -> Array:
 def assess_innovations(
     innovation_m: Array, innovation_variance_m2: Array, gate: float = DEFAULT_GATE
 ) -> Consistency | Unavailable:
-    """Test innovations (in time order) against the innovation variances S that the filter reports.
+    """Test innovations in time order against their reported variances: NIS, bias, whiteness.
 
-    ``gate`` is the innovation gate in √S. At least ten finite innovations are needed.
+    ``gate`` is the innovation gate in √S. Fewer than ten finite innovations are not tested.
     """
     is_usable = np.isfinite(innovation_m) & (innovation_variance_m2 > 0)
     nu_m = innovation_m[is_usable]
@@ -197,11 +197,11 @@ def assess_innovations(
     normalised_innovation = nu_m / np.sqrt(variance_m2)
     std_m = float(np.std(nu_m, ddof=1))
     mean_t_statistic = float(np.sqrt(innovation_count) * np.mean(nu_m) / std_m)
-    lag_count = min(LJUNG_BOX_LAGS, innovation_count // 5)
+    lag_count = min(MAX_LJUNG_BOX_LAG_COUNT, innovation_count // 5)
     autocorrelations = compute_autocorrelation(normalised_innovation, lag_count)
     ljung_box_terms = autocorrelations**2 / (innovation_count - np.arange(1, lag_count + 1))
     return Consistency(
-        **_nis_verdict_fields(normalised_innovation**2),
+        **_compute_nis_verdict_fields(normalised_innovation**2),
         innovation_mean_m=float(np.mean(nu_m)),
         innovation_std_m=std_m,
         sqrt_s_median_m=float(np.median(np.sqrt(variance_m2))),
@@ -226,4 +226,4 @@ def assess_horizontal_nis(north: ArrayPair, east: ArrayPair) -> HorizontalNis | 
     nis = np.sum([nu[is_usable] ** 2 / s[is_usable] for nu, s in (north, east)], axis=0)
     if len(nis) < MIN_INNOVATIONS or not nis.any():
         return None
-    return HorizontalNis(**_nis_verdict_fields(nis, 2))
+    return HorizontalNis(**_compute_nis_verdict_fields(nis, 2))

@@ -22,12 +22,17 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
 from px4fuse.core.arrays import Array
-from px4fuse.filter.fitting import NoiseFit, NoiseParameters, fit_with_noises, maximise_likelihood
+from px4fuse.filter.fitting import (
+    NoiseFit,
+    NoiseParameters,
+    fit_constant_errors,
+    maximise_likelihood,
+)
 from px4fuse.filter.hypotheses import Jump, make_unit_steps
 from px4fuse.filter.imu_motion import MotionCache, PositionsAndImuMotion, compute_imu_motion
 from px4fuse.filter.likelihood import MAX_LOG_LIKELIHOOD_DROP
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, too_few_measurements
+from px4fuse.filter.signals import Axis, report_too_few_measurements
 from px4fuse.flight.model import Flight, Unavailable
 
 MIN_MEASUREMENTS = 100
@@ -35,30 +40,30 @@ MIN_MEASUREMENTS = 100
 MAX_MEASUREMENTS = 2000
 # The noise of two successive positions is uncorrelated if the interval between them exceeds this
 # multiple of the median interval
-MAX_INTERVAL_RATIO = 3.0
+MAX_INTERVAL_TO_MEDIAN_RATIO = 3.0
 # Time constants (s) in the coarse search for time-correlated noise
 COARSE_TAUS_S = (0.2, 0.6, 2.0, 6.0)
-# Tested fractions σ_c² / SIGMA_Z² in the coarse search, where the white and the time-correlated
-# variance (σ_c²) together are SIGMA_Z²
-COARSE_CORRELATED_FRACTIONS = (0.12, 0.35, 0.8)
-# Tested multiples of SIGMA_A in the coarse search for time-correlated noise
+# Tested fractions σ_c² / SIGMA_Z² in the coarse search. σ_c² is the time-correlated part of the
+# total variance SIGMA_Z²
+COARSE_VARIANCE_FRACTIONS = (0.12, 0.35, 0.8)
+# Tested multiples of SIGMA_A in the coarse search, for each fraction and time constant above
 COARSE_SIGMA_A_FACTORS = (0.4, 0.9)
-# In the coarse search for time-correlated noise, all noises are multiplied by these factors
+# Tested factors on all σ (SIGMA_A, SIGMA_Z, σ_c) in the coarse search, for each combination above
 COARSE_NOISE_FACTORS = np.geomspace(0.7, 1.6, 12)
 # Approximate number of position measurements in the coarse search for time-correlated noise
 COARSE_MEASUREMENT_COUNT = 1000
 # Minimum log-likelihood gain of time-correlated over white noise in the coarse search. Below it, no
 # full fit is run
 MIN_COARSE_LIKELIHOOD_GAIN_NATS = 0.5
-# Positions with a smaller SIGMA_Z (m) are probably low-pass filtered
+# An estimated SIGMA_Z below this limit (m) suggests that the source low-pass filters its positions
 MAX_LOW_PASS_SIGMA_Z_M = 0.01
 # Minimum log-likelihood gain of time-correlated over white noise to report time-correlated noise
 MIN_LIKELIHOOD_GAIN_NATS = 2.0
-# Penalty (nats) for time-correlated noise with shifted timestamps, which has two more parameters
-# than a low-pass filter: 1 per parameter (Akaike 1974)
+# Penalty (nats) on the score of time-correlated noise with shifted timestamps, in the comparison
+# with a low-pass filter: 1 per additional parameter (Akaike 1974)
 OFFSET_PENALTY_NATS = 2.0
 # Search range (s) of the time constant of a low pass
-LOW_PASS_TAU_S = (0.02, 3.0)
+LOW_PASS_TAU_RANGE_S = (0.02, 3.0)
 # Tolerance of ln τ in the search for the time constant τ of a low pass
 LOG_TAU_TOLERANCE = 0.05
 # Maximum number of position errors against ground truth in the noise fit, to limit computing time
@@ -77,7 +82,7 @@ FLIGHT_PART_COUNT = 12
 # Tested time constants (s) of time-correlated noise in the noise fit to ground truth
 TESTED_TAUS_S = np.geomspace(0.3, 80.0, 17)
 # Tested time-correlated fractions of the error variance in the noise fit to ground truth
-CORRELATED_FRACTIONS = np.linspace(0.05, 0.999, 20)
+CORRELATED_VARIANCE_FRACTIONS = np.linspace(0.05, 0.999, 20)
 
 
 @dataclass(frozen=True)
@@ -156,7 +161,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     """
     time_s = axes[0].measurement_time_s
     if len(time_s) < MIN_MEASUREMENTS:
-        return too_few_measurements(
+        return report_too_few_measurements(
             "time correlation of the position errors", len(time_s), MIN_MEASUREMENTS
         )
     first_row = max(0, (len(time_s) - MAX_MEASUREMENTS) // 2)
@@ -169,7 +174,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         )
     interval_s = np.diff(time_s, prepend=time_s[0])
     is_outlier = np.isin(time_s, outlier_time_s)
-    is_short_interval = (interval_s < MAX_INTERVAL_RATIO * np.median(interval_s[1:])) & (
+    is_short_interval = (interval_s < MAX_INTERVAL_TO_MEDIAN_RATIO * np.median(interval_s[1:])) & (
         interval_s > 0.0
     )
     directions = np.array([axis.direction for axis in axes])
@@ -178,8 +183,8 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     def undo_low_pass(tau_s: float) -> tuple[PositionsAndImuMotion | Unavailable, float]:
         """Invert a low-pass filter with time constant ``tau_s``.
 
-        Return the unfiltered positions with their IMU motion, and -ln(Π 1/(1 - ρ)), the score term
-        of this change of variables.
+        Return the unfiltered positions u with their IMU motion, and -ln|du/dz|, to be added to
+        their -ln p. |du/dz| is Π 1/(1 - ρ) with ρ = exp(-Δt/τ).
         """
         rho = np.zeros(len(time_s))
         if tau_s:
@@ -200,7 +205,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
         )
         if isinstance(unfiltered_motion, Unavailable):
             return unfiltered_motion, 0.0
-        # The likelihood omits the first position of each IMU segment: it is the initial state
+        # The first position of each IMU segment determines only the initial state, not -ln p
         is_used = np.isin(
             time_s, np.delete(unfiltered_motion.time_s, unfiltered_motion.segment_edges[:-1])
         )
@@ -221,9 +226,9 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
             correlated_sigma_m=sigma_z_m * fraction**0.5,
             tau_s=tau,
         )
-        for fraction, tau in product(COARSE_CORRELATED_FRACTIONS, COARSE_TAUS_S)
+        for fraction, tau in product(COARSE_VARIANCE_FRACTIONS, COARSE_TAUS_S)
     ]
-    # Scores are -ln p
+    # Scores are -ln p of the positions: the lowest is the best
     (coarse_white_score, _), (coarse_correlated_score, correlated_start_parameters) = (
         _search_coarse_grid(coarse_motion, tested_offsets_s, candidate_parameters)
         for candidate_parameters in ([noise_parameters], correlated_candidates)
@@ -231,16 +236,16 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     no_correlation = Unavailable(
         "time-correlated noise of the positions", "the position errors are not time-correlated", ""
     )
-    is_smooth = sigma_z_m < MAX_LOW_PASS_SIGMA_Z_M
+    is_sigma_z_small = sigma_z_m < MAX_LOW_PASS_SIGMA_Z_M
     if (
         coarse_white_score - coarse_correlated_score < MIN_COARSE_LIKELIHOOD_GAIN_NATS
-        and not is_smooth
+        and not is_sigma_z_small
     ):
         return source_low_pass, no_correlation
     (white_fit, _), (correlated_fit, offset_s) = (
         min(
             (
-                (_fit_noises_at(imu_motion, offset, start_parameters), offset)
+                (_fit_noises_at_offset(imu_motion, offset, start_parameters), offset)
                 for offset in tested_offsets_s
             ),
             key=lambda fit_and_offset: fit_and_offset[0].compute_score(),
@@ -252,23 +257,23 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
     # A low-pass filter also looks like time-correlated noise. It is only fitted if time-correlated
     # noise is significant, or if the positions are too smooth for white noise
     is_correlated = white_noise_score - correlated_noise_score >= MIN_LIKELIHOOD_GAIN_NATS
-    if not (is_correlated or is_smooth):
+    if not (is_correlated or is_sigma_z_small):
         return source_low_pass, no_correlation
 
     def fit_low_pass(log_tau: float) -> tuple[float, NoiseParameters]:
-        unfiltered_motion, jacobian_term = undo_low_pass(float(np.exp(log_tau)))
-        # unfiltered_motion was available for τ = 0, and the measurement times are the same
+        unfiltered_motion, negative_log_jacobian = undo_low_pass(float(np.exp(log_tau)))
+        # Availability depends only on the measurement times, which are the same as for τ = 0
         assert not isinstance(unfiltered_motion, Unavailable)
-        noise_fit = _fit_noises_at(unfiltered_motion, 0.0, white_fit.noise_parameters)
-        return noise_fit.compute_score() + jacobian_term, noise_fit.noise_parameters
+        noise_fit = _fit_noises_at_offset(unfiltered_motion, 0.0, white_fit.noise_parameters)
+        return noise_fit.compute_score() + negative_log_jacobian, noise_fit.noise_parameters
 
-    low_log_tau, high_log_tau = np.log(LOW_PASS_TAU_S)
+    low_log_tau, high_log_tau = np.log(LOW_PASS_TAU_RANGE_S)
     log_tau = minimize_scalar(
         lambda log_tau: fit_low_pass(log_tau)[0],
         bounds=(low_log_tau, high_log_tau),
         options={"xatol": LOG_TAU_TOLERANCE},
     ).x
-    low_pass_score, unfiltered_parameters = fit_low_pass(log_tau)
+    low_pass_score, low_pass_parameters = fit_low_pass(log_tau)
     if low_pass_score < white_noise_score:
         median_s = float(np.median(np.diff(time_s)))
         lag1_correlation = float(np.exp(-median_s / np.exp(log_tau)))
@@ -277,7 +282,7 @@ def fit_time_correlation(  # noqa: PLR0915 (two models with common data)
             lag1_correlation,
             lag_s,
             white_noise_score - low_pass_score,
-            unfiltered_parameters.sigma_z_m,
+            low_pass_parameters.sigma_z_m,
         )
     if not is_correlated:
         return source_low_pass, no_correlation
@@ -305,8 +310,8 @@ def fit_time_correlation_to_truth(
     """Fit time-correlated noise to the position errors against ground truth.
 
     Frame errors and time offsets are removed from the errors. ``imu_fit`` and ``low_pass`` are the
-    results of :func:`fit_time_correlation`. ``imu_fit`` is returned if the log-likelihood gain
-    of time-correlated over white noise is larger in it than in this fit.
+    results of :func:`fit_time_correlation`. ``imu_fit`` is returned if its log-likelihood gain over
+    white noise is larger.
     """
     min_likelihood_gain_nats = MIN_TRUTH_LIKELIHOOD_GAIN_NATS
     low_pass_likelihood_gain_nats = low_pass.likelihood_gain_nats
@@ -350,7 +355,7 @@ def fit_time_correlation_to_truth(
     if np.abs(residuals).max() < MIN_TRUTH_RESIDUAL_M:
         return imu_fit
     grid_scores = []
-    half_axis_and_residual_count = 0.5 * np.array([len(axes), len(residuals)])
+    half_axis_and_residual_counts = 0.5 * np.array([len(axes), len(residuals)])
     for tested_tau_s in TESTED_TAUS_S:
         correlation_matrix = (
             residual_basis.T
@@ -358,19 +363,23 @@ def fit_time_correlation_to_truth(
             @ residual_basis
         )
         eigenvalues, eigenvectors = np.linalg.eigh(correlation_matrix)
-        relative_variance = 1.0 - CORRELATED_FRACTIONS + CORRELATED_FRACTIONS * eigenvalues[:, None]
+        relative_variance = (
+            1.0
+            - CORRELATED_VARIANCE_FRACTIONS
+            + CORRELATED_VARIANCE_FRACTIONS * eigenvalues[:, None]
+        )
         mean_squares = (
             ((eigenvectors.T @ residuals) ** 2).T @ (1.0 / relative_variance) / len(residuals)
         )
-        scores = half_axis_and_residual_count @ [
+        scores = half_axis_and_residual_counts @ [
             np.log(relative_variance).sum(axis=0),
             np.log(mean_squares).sum(axis=0),
         ]
         grid_scores.append((scores, mean_squares.mean(axis=0)))
-    # Both arrays have the shape (time constants, correlated fractions)
+    # Rows are time constants, columns time-correlated fractions of the variance
     scores, mean_squares = np.transpose(grid_scores, (1, 0, 2))
-    tau_index, fraction_index = divmod(int(np.argmin(scores)), len(CORRELATED_FRACTIONS))
-    likelihood_gains_nats = half_axis_and_residual_count[1] * np.log(
+    tau_index, fraction_index = divmod(int(np.argmin(scores)), len(CORRELATED_VARIANCE_FRACTIONS))
+    likelihood_gains_nats = half_axis_and_residual_counts[1] * np.log(
         np.mean(residuals**2, axis=0)
     ).sum() - scores.min(axis=1)
     if likelihood_gains_nats.max() < min_likelihood_gain_nats:
@@ -385,7 +394,10 @@ def fit_time_correlation_to_truth(
     sigmas_m = np.sqrt(
         mean_squares[tau_index, fraction_index]
         * np.array(
-            [CORRELATED_FRACTIONS[fraction_index], 1.0 - CORRELATED_FRACTIONS[fraction_index]]
+            [
+                CORRELATED_VARIANCE_FRACTIONS[fraction_index],
+                1.0 - CORRELATED_VARIANCE_FRACTIONS[fraction_index],
+            ]
         )
     )
     return TimeCorrelatedNoise(
@@ -393,7 +405,7 @@ def fit_time_correlation_to_truth(
     )
 
 
-def _fit_noises_at(
+def _fit_noises_at_offset(
     imu_motion: PositionsAndImuMotion, offset_s: float, start_parameters: NoiseParameters
 ) -> NoiseFit:
     return maximise_likelihood(
@@ -409,14 +421,17 @@ def _search_coarse_grid(
     offsets_s: Sequence[float],
     candidate_parameters: Sequence[NoiseParameters],
 ) -> tuple[float, NoiseParameters]:
-    """Return the lowest -ln p on a coarse grid of time offsets and noises, with its noises."""
+    """Return the lowest score on a coarse grid of time offsets and noises, and these noises.
+
+    The score is -ln p of the positions.
+    """
     scored_parameters = []
     for positions in map(imu_motion.make_positions_at_offset, offsets_s):
         for candidate, sigma_a_factor in product(candidate_parameters, COARSE_SIGMA_A_FACTORS):
             noise_parameters = replace(
                 candidate, sigma_a_m_s2=sigma_a_factor * candidate.sigma_a_m_s2
             )
-            total_scores = fit_with_noises(
+            total_scores = fit_constant_errors(
                 [positions], noise_parameters, imu_motion.measurement_weights
             ).compute_scores(COARSE_NOISE_FACTORS)[:, 0]
             scored_parameters.append(

@@ -19,7 +19,7 @@ from scipy.special import chdtri, comb, expit
 from px4fuse.core.arrays import Array
 from px4fuse.filter.likelihood import PreintegratedMotion
 from px4fuse.filter.marginal_likelihood import (
-    FittedPositions,
+    PositionFit,
     PositionsAndIncrements,
     estimate_squared_errors,
     fit_positions,
@@ -38,7 +38,7 @@ MAX_OUTLIER_ITERATIONS = 12
 MAX_FINAL_ITERATIONS = 50
 # Maximum number of L-BFGS-B iterations between two estimates of the outlier probabilities
 MAX_COARSE_ITERATIONS = 3
-# Minimum ratio of the outliers' σ to SIGMA_Z: outliers with a smaller σ cannot be distinguished
+# Minimum ratio of the outliers' σ to SIGMA_Z: outliers with a smaller σ look like normal noise
 MIN_OUTLIER_SIGMA_RATIO = 3.0
 # Initial value of the fraction of outliers
 START_OUTLIER_FRACTION = 0.005
@@ -46,21 +46,23 @@ START_OUTLIER_FRACTION = 0.005
 START_OUTLIER_SIGMA_RATIO = 10.0
 # Upper limit of the estimated fraction of outliers
 MAX_OUTLIER_FRACTION = 0.4
-# Upper limit of the SIGMA_Z that classifies outliers, as a multiple of its robust estimate from the
-# median squared error
-MAX_SIGMA_Z_RATIO = 1.2
+# Outliers are classified with at most this multiple of the SIGMA_Z from the median squared error,
+# because outliers increase the SIGMA_Z with the maximum likelihood
+MAX_SIGMA_Z_TO_ROBUST_RATIO = 1.2
 # Expectation maximisation has converged if no outlier probability changes by more than this
 MAX_OUTLIER_PROBABILITY_CHANGE = 0.01
 # Value of -ln p per measurement if the likelihood cannot be computed: larger than any real value
 UNCOMPUTABLE_SCORE = 1e6
 # Step of ln σ for numerical derivatives of the log-likelihood
 DERIVATIVE_LOG_STEP = 1e-4
-# Interpolation of -ln p over ln σ: number of grid nodes, and their spacing in ln σ
-NODE_COUNT_AND_SPACING = 10, 0.25
-# The same for an approximate maximum, until the outlier probabilities have converged
-COARSE_NODE_COUNT_AND_SPACING = 6, 0.2
+# -ln p is interpolated on a grid over ln(SIGMA_A/SIGMA_Z) and ln SIGMA_Z: number of nodes in each
+# dimension, and their spacing
+NODE_COUNT_AND_LOG_STEP = 10, 0.25
+# Smaller grid for an approximate maximum of the likelihood, until the outlier probabilities have
+# converged
+COARSE_NODE_COUNT_AND_LOG_STEP = 6, 0.2
 # A noise fit to a long flight is initialised with a fit to this number of its first measurements
-FIRST_MEASUREMENT_COUNT = 2000
+INITIAL_FIT_MEASUREMENT_COUNT = 2000
 # Precision of a known initial position (1/m²) and velocity (s²/m²): σ of 1 µm and 1 µm/s
 KNOWN_START_PRECISION = 1e12
 
@@ -98,7 +100,7 @@ SEARCH_RANGES = {
 }
 
 
-class Likelihood:
+class NegativeLogLikelihood:
     """Negative log-likelihood (-ln p) of the measurements as a function of the noise parameters.
 
     Constant terms are omitted. For white noise, -ln p is computed at the nodes of a grid over
@@ -130,11 +132,11 @@ class Likelihood:
             positions.added_process_noise.any() for positions in axis_positions
         )
         self.node_count, self.node_spacing = node_count, node_spacing = (
-            COARSE_NODE_COUNT_AND_SPACING if is_coarse else NODE_COUNT_AND_SPACING
+            COARSE_NODE_COUNT_AND_LOG_STEP if is_coarse else NODE_COUNT_AND_LOG_STEP
         )
 
         @cache
-        def fit_axes_at_ratio(sigma_ratio_index: int) -> list[FittedPositions]:
+        def fit_axes_at_ratio(sigma_ratio_index: int) -> list[PositionFit]:
             ratio = float(np.exp(node_spacing * sigma_ratio_index))
             return [
                 fit_with_sigma_ratios([positions], [ratio], 0.0, measurement_weights, sigma_z_m)[0]
@@ -197,12 +199,12 @@ def _compute_barycentric_weights(node_count: int) -> Array:
     return np.asarray((-1.0) ** nodes * comb(node_count - 1, nodes))
 
 
-def _compute_interpolation_weights(node_position: float, node_count: int) -> Array:
-    """Return the weights of the values at nodes 0, 1, ... to interpolate at ``node_position``.
+def _compute_interpolation_weights(node_coordinate: float, node_count: int) -> Array:
+    """Return the weights of the values at nodes 0, 1, ... to interpolate at ``node_coordinate``.
 
     Method: barycentric interpolation, Berrut and Trefethen (2004).
     """
-    node_distances = node_position - np.arange(node_count)
+    node_distances = node_coordinate - np.arange(node_count)
     if not node_distances.all():
         return np.asarray(node_distances == 0.0, dtype=np.float64)
     weights = _compute_barycentric_weights(node_count) / node_distances
@@ -211,23 +213,23 @@ def _compute_interpolation_weights(node_position: float, node_count: int) -> Arr
 
 def fit_with_sigma_ratios(
     position_batches: Iterable[PositionsAndIncrements],
-    sigma_ratios: Sequence[float],
-    random_walk: float,
+    sigma_a_to_sigma_z_ratios: Sequence[float],
+    random_walk_to_sigma_z: float,
     measurement_weights: Array,
     sigma_z_m: float,
-) -> list[FittedPositions]:
-    """Return the fit of the constant errors for each ratio SIGMA_A / SIGMA_Z (1/s²).
+) -> list[PositionFit]:
+    """Fit the constant errors (biases, ...) with each ratio SIGMA_A / SIGMA_Z (1/s²).
 
-    The σ of the fits are in units of SIGMA_Z. Each item of ``position_batches`` contains the same
-    positions with other time offsets; each fit contains all offsets. ``random_walk`` (1/√s) is the
-    random walk of the source, divided by SIGMA_Z.
+    All σ are divided by SIGMA_Z. ``position_batches`` contains the same positions for different
+    time offsets of the source; each returned fit contains all offsets.
+    ``random_walk_to_sigma_z`` (1/√s) is the random walk of the source, divided by SIGMA_Z.
     """
     scaled_batches = (
-        positions.normalise_by_sigma_z(sigma_z_m, random_walk, measurement_weights)
+        positions.normalise_by_sigma_z(sigma_z_m, random_walk_to_sigma_z, measurement_weights)
         for positions in position_batches
     )
     fits_by_batch = [
-        [fit_positions(scaled_positions, ratio, variance_m2) for ratio in sigma_ratios]
+        [fit_positions(scaled_positions, ratio, variance_m2) for ratio in sigma_a_to_sigma_z_ratios]
         for scaled_positions, variance_m2 in scaled_batches
     ]
     return [
@@ -238,14 +240,14 @@ def fit_with_sigma_ratios(
     ]
 
 
-def fit_with_noises(
+def fit_constant_errors(
     position_batches: Iterable[PositionsAndIncrements],
     noise_parameters: NoiseParameters,
     measurement_weights: Array,
-) -> FittedPositions:
-    """Return the fit of the constant errors with given noise parameters, for all time offsets.
+) -> PositionFit:
+    """Fit the constant errors (biases, ...) with given noise parameters, for all time offsets.
 
-    The variance of a measurement is SIGMA_Z² / weight.
+    See :func:`fit_with_sigma_ratios`. The variance of a measurement is SIGMA_Z² / weight.
     """
     sigma_z_m = noise_parameters.sigma_z_m
     if noise_parameters.correlated_sigma_m:
@@ -256,14 +258,14 @@ def fit_with_noises(
             )
             for positions in position_batches
         )
-    (fitted_positions,) = fit_with_sigma_ratios(
+    (position_fit,) = fit_with_sigma_ratios(
         position_batches,
         [noise_parameters.sigma_a_m_s2 / sigma_z_m],
         noise_parameters.random_walk_m / sigma_z_m,
         measurement_weights,
         sigma_z_m,
     )
-    return fitted_positions.scale_sigmas(sigma_z_m)
+    return position_fit.scale_sigmas(sigma_z_m)
 
 
 def negative_log_likelihood(
@@ -274,9 +276,9 @@ def negative_log_likelihood(
     """Return -ln p of the measurements of all axes without its multiple of ln 2π."""
     return float(
         sum(
-            fit_with_noises([positions], noise_parameters, measurement_weights).compute_scores()[
-                0, 0
-            ]
+            fit_constant_errors(
+                [positions], noise_parameters, measurement_weights
+            ).compute_scores()[0, 0]
             for positions in axis_positions
         )
     )
@@ -293,7 +295,7 @@ class NoiseFit:
     outlier_probability : ndarray, shape (m,)
     measurement_weights : ndarray, shape (m,)
         1 for a good measurement, 1/``outlier_sigma_ratio``² for an outlier.
-    score : Likelihood
+    score : NegativeLogLikelihood
         -ln p as a function of the noise parameters.
     sigma_z_variance_inflation : float
         Factor (at least 1) by which the uncertain classification of measurements as outliers
@@ -303,43 +305,43 @@ class NoiseFit:
     noise_parameters: NoiseParameters
     measurement_weights: Array
     outlier_probability: Array
-    score: Likelihood
+    score: NegativeLogLikelihood
     sigma_z_variance_inflation: float
     outlier_fraction: float
     outlier_sigma_ratio: float
 
     def compute_score(self) -> float:
-        """Return -ln p at the maximum-likelihood noise parameters."""
+        """Return -ln p of the measurements at the maximum-likelihood noise parameters."""
         return self.score(self.noise_parameters)
 
 
-def convert_to_positions(kf_motion: PreintegratedMotion) -> PositionsAndIncrements:
+def convert_to_positions(preintegrated_motion: PreintegratedMotion) -> PositionsAndIncrements:
     """Convert KF's measurements and integrated acceleration to positions of one segment.
 
     The unknown constants of the segment are the errors of the initial position and velocity.
     """
-    measurement_count = len(kf_motion.measurement_m)
+    measurement_count = len(preintegrated_motion.measurement_m)
     prior_precision = np.zeros((measurement_count + 1, 2))
     prior_precision[0] = KNOWN_START_PRECISION
-    measured_m = np.append(np.nan, kf_motion.measurement_m - kf_motion.initial_state.position_m)[
-        :, None
-    ]
+    measured_m = np.append(
+        np.nan, preintegrated_motion.measurement_m - preintegrated_motion.initial_state.position_m
+    )[:, None]
     dp, dv = np.zeros((2, 1, 1, 3, measurement_count))
-    dp[0, 0, 0] = kf_motion.delta_position_m
-    dv[0, 0, 0] = kf_motion.delta_velocity_m_s
-    # Derivatives with respect to the initial position and velocity. Both errors enter in the first
-    # interval only: later intervals start from the estimated state
-    dp[0, 0, 1:, 0] = (1.0, kf_motion.interval_s[0])
+    dp[0, 0, 0] = preintegrated_motion.delta_position_m
+    dv[0, 0, 0] = preintegrated_motion.delta_velocity_m_s
+    # Derivatives with respect to the errors of the initial position and velocity. These errors
+    # enter in the first interval only: later intervals start from the estimated state
+    dp[0, 0, 1:, 0] = (1.0, preintegrated_motion.interval_s[0])
     dv[0, 0, 2, 0] = 1.0
     return subtract_smooth_path(
         PositionsAndIncrements(
             measurement_m=measured_m,
             segment_starts=np.array([0]),
-            interval_s=kf_motion.interval_s,
-            unit_process_noise=kf_motion.unit_process_noise.T,
-            added_process_noise=kf_motion.added_process_noise.T,
+            interval_s=preintegrated_motion.interval_s,
+            unit_process_noise=preintegrated_motion.unit_process_noise.T,
+            added_process_noise=preintegrated_motion.added_process_noise.T,
             prior_precision=prior_precision,
-            constants_prior_sigma=np.sqrt([INITIAL_COVARIANCE[0], INITIAL_COVARIANCE[2]]),
+            constant_prior_sigmas=np.sqrt([INITIAL_COVARIANCE[0], INITIAL_COVARIANCE[2]]),
             delta_position_m=dp,
             delta_velocity_m_s=dv,
         )
@@ -370,18 +372,20 @@ def maximise_likelihood(
     """
     outlier_probability = np.zeros_like(measurement_weights)
     outlier_fraction, outlier_sigma_ratio = START_OUTLIER_FRACTION, START_OUTLIER_SIGMA_RATIO
-    is_long = len(measurement_weights) > 2 * FIRST_MEASUREMENT_COUNT
+    is_long = len(measurement_weights) > 2 * INITIAL_FIT_MEASUREMENT_COUNT
     if is_long:
         first_positions = [
             positions.first(
-                len(positions.measurement_m) - len(measurement_weights) + FIRST_MEASUREMENT_COUNT
+                len(positions.measurement_m)
+                - len(measurement_weights)
+                + INITIAL_FIT_MEASUREMENT_COUNT
             )
             for positions in axis_positions
         ]
         first_fit = maximise_likelihood(
             first_positions,
             start_parameters,
-            measurement_weights[:FIRST_MEASUREMENT_COUNT],
+            measurement_weights[:INITIAL_FIT_MEASUREMENT_COUNT],
             fits_outliers,
         )
         start_parameters = first_fit.noise_parameters
@@ -391,7 +395,7 @@ def maximise_likelihood(
         )
     noise_parameters = start_parameters
     for iteration in range(MAX_OUTLIER_ITERATIONS if fits_outliers else 0):
-        likelihood = Likelihood(
+        likelihood = NegativeLogLikelihood(
             axis_positions, measurement_weights, start_parameters.sigma_z_m, is_coarse=True
         )
         noise_parameters = _maximise_by_gradient(
@@ -413,7 +417,7 @@ def maximise_likelihood(
         if robust_variance_m2 > SIGMA_Z_SEARCH_RANGE_M[1] ** 2:
             break
         limited_variance_m2 = min(
-            noise_parameters.sigma_z_m**2, MAX_SIGMA_Z_RATIO**2 * robust_variance_m2
+            noise_parameters.sigma_z_m**2, MAX_SIGMA_Z_TO_ROBUST_RATIO**2 * robust_variance_m2
         )
         normalised_squares = expected_squared_errors_m2 / limited_variance_m2
         previous_probability = outlier_probability
@@ -444,7 +448,7 @@ def maximise_likelihood(
         ):
             break
         noise_parameters = replace(noise_parameters, sigma_z_m=float(np.sqrt(limited_variance_m2)))
-    likelihood = Likelihood(
+    likelihood = NegativeLogLikelihood(
         axis_positions, measurement_weights, start_parameters.sigma_z_m, is_coarse=is_long
     )
     noise_parameters = _maximise_by_gradient(likelihood, noise_parameters)
@@ -471,25 +475,25 @@ def maximise_likelihood(
 
 
 def estimate_outlier_probability(
-    axis_positions: Sequence[PositionsAndIncrements], fit: NoiseFit, count: int
+    axis_positions: Sequence[PositionsAndIncrements], fit: NoiseFit, measurement_count: int
 ) -> Array:
-    """Return the probability that each of ``count`` measurements is an outlier.
+    """Return the probability of each measurement to be an outlier.
 
     Noise parameters and fraction of outliers are those of ``fit``.
     """
-    probability = np.zeros(count)
+    outlier_probability = np.zeros(measurement_count)
     for _ in range(MAX_COARSE_ITERATIONS):
-        measurement_weights = 1.0 - probability * (1.0 - fit.outlier_sigma_ratio**-2.0)
+        measurement_weights = 1.0 - outlier_probability * (1.0 - fit.outlier_sigma_ratio**-2.0)
         expected_squared_errors_m2, measured_axis_counts = _estimate_squared_errors(
             axis_positions, fit.noise_parameters, measurement_weights
         )
-        probability = _compute_outlier_probability(
+        outlier_probability = _compute_outlier_probability(
             expected_squared_errors_m2 / fit.noise_parameters.sigma_z_m**2,
             measured_axis_counts,
             fit.outlier_fraction,
             fit.outlier_sigma_ratio,
         )
-    return probability
+    return outlier_probability
 
 
 def _estimate_squared_errors(
@@ -501,22 +505,22 @@ def _estimate_squared_errors(
 
     The squared error is summed over the axes.
     """
-    squares_and_counts = []
+    squared_errors_and_axis_counts = []
     for positions in axis_positions:
-        constants = fit_with_noises(
+        constants = fit_constant_errors(
             [positions], noise_parameters, measurement_weights
-        ).estimate_constants()[:, 0]
+        ).estimate_segment_constants()[:, 0]
         scaled_positions, scaled_variance = positions.normalise_by_sigma_z(
             1.0, noise_parameters.random_walk_m, measurement_weights / noise_parameters.sigma_z_m**2
         )
-        squares_and_counts.append(
+        squared_errors_and_axis_counts.append(
             estimate_squared_errors(
                 scaled_positions, noise_parameters.sigma_a_m_s2, scaled_variance, constants
             )
         )
-    expected_squared_errors_m2, measured_axis_counts = np.sum(squares_and_counts, axis=0)[
-        :, -len(measurement_weights) :
-    ]
+    expected_squared_errors_m2, measured_axis_counts = np.sum(
+        squared_errors_and_axis_counts, axis=0
+    )[:, -len(measurement_weights) :]
     return expected_squared_errors_m2, measured_axis_counts
 
 
@@ -542,10 +546,10 @@ def compute_variance_inflation(
 ) -> float:
     """Return the factor on the variance of ln SIGMA_Z due to the uncertain outlier classification.
 
-    The variance is an element of the inverse of observed information = complete information -
-    missing information (Louis 1982). The parameters are ln SIGMA_Z, ln ``outlier_sigma_ratio`` and
-    the log odds of an outlier. ``normalised_squares`` is the squared error of each measurement
-    divided by SIGMA_Z², summed over its ``measured_axis_counts`` axes.
+    The factor is relative to the variance with known outliers. Observed information is complete
+    minus missing information (Louis 1982). The parameters are ln SIGMA_Z,
+    ln ``outlier_sigma_ratio`` and the log odds of an outlier. ``normalised_squares`` is the squared
+    error of each measurement divided by SIGMA_Z², summed over its ``measured_axis_counts`` axes.
     """
     outlier_fraction = np.mean(outlier_probability)
     sigma_information = 2.0 * float(np.sum(measured_axis_counts))
@@ -565,14 +569,16 @@ def compute_variance_inflation(
     )
     missing_information = (scores * (outlier_probability * (1.0 - outlier_probability))) @ scores.T
     observed_information = complete_information - missing_information
-    # With very few outliers, the information matrix is singular, but their effect is negligible
+    # With very few outliers, the matrix is not positive definite, but their effect is negligible
     if np.linalg.eigvalsh(observed_information)[0] <= 0.0:
         return 1.0
     return max(1.0, sigma_information * float(np.linalg.inv(observed_information)[0, 0]))
 
 
 def _maximise_by_gradient(
-    likelihood: Likelihood, start_parameters: NoiseParameters, max_steps: int = MAX_FINAL_ITERATIONS
+    likelihood: NegativeLogLikelihood,
+    start_parameters: NoiseParameters,
+    max_steps: int = MAX_FINAL_ITERATIONS,
 ) -> NoiseParameters:
     nonzero_parameters = {name: value for name, value in vars(start_parameters).items() if value}
     log_bounds = np.log([SEARCH_RANGES[name] for name in nonzero_parameters])
@@ -582,7 +588,7 @@ def _maximise_by_gradient(
         # Per measurement, so that the gradient and the first step of L-BFGS-B have a size near 1
         try:
             return likelihood(to_noise_parameters(log_parameters)) / measurement_count
-        # Rounding errors made the equations singular. The large value shortens L-BFGS-B's step
+        # Rounding errors made the equations singular. A large score shortens L-BFGS-B's step
         except np.linalg.LinAlgError:
             return UNCOMPUTABLE_SCORE
 

@@ -19,7 +19,7 @@ from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array, median_interval
 from px4fuse.core.record import NotNegative, Record, Share
-from px4fuse.filter.fitting import NoiseParameters, fit_with_noises, maximise_likelihood
+from px4fuse.filter.fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
 from px4fuse.filter.imu_motion import (
     MAX_IMU_INTERVAL_S,
     MIN_SEGMENT_MEASUREMENTS,
@@ -27,7 +27,7 @@ from px4fuse.filter.imu_motion import (
     compute_imu_motion,
 )
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Segment, cut_to_segment, too_few_measurements
+from px4fuse.filter.signals import Segment, cut_to_segment, report_too_few_measurements
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
 from px4fuse.trajectory.rotation import heading
 
@@ -53,7 +53,7 @@ MIN_HEADING_DRIFT_DEG = 5.5
 # Maximum yaw rate (°/s) for a comparison of headings: a delay of 0.2 s then causes 2° error
 MAX_YAW_RATE_DEG_S = 10.0
 # Minimum σ (°) of a heading difference between source and EKF2
-MIN_SIGMA_DEG = 0.5
+MIN_HEADING_SIGMA_DEG = 0.5
 # Maximum median interval (s) between logged attitudes for estimating the heading error
 MAX_ATTITUDE_INTERVAL_S = 0.11
 # Maximum number of iterations in the fit of the heading error
@@ -64,12 +64,12 @@ CONVERGED_HEADING_CHANGE_RAD = 0.01
 HEADING_SIGMA_RAD = 1.0
 # Minimum estimated scale factor of the positions, to avoid a division by zero
 MIN_POSITION_SCALE = 0.1
-# Index of the heading error among the unknown constants of a flight part
+# Index of the heading error in the vector of constants that are fitted to each flight part
 HEADING_ERROR_INDEX = 2
 
 
 class HeadingPart(Record):
-    """Yaw misalignment in one part of the flight."""
+    """Yaw misalignment (°) between source frame and EKF2's heading in one part of the flight."""
 
     start_s: float
     end_s: float
@@ -104,22 +104,26 @@ class HeadingError(Record):
 
     def find_extreme_parts(self) -> tuple[HeadingPart, HeadingPart]:
         """Return flight parts with the smallest and the largest misalignment, in time order."""
-        angles_deg = [heading_part.heading_error_deg for heading_part in self.parts]
-        first_index, last_index = sorted((int(np.argmin(angles_deg)), int(np.argmax(angles_deg))))
+        heading_errors_deg = [heading_part.heading_error_deg for heading_part in self.parts]
+        first_index, last_index = sorted(
+            (int(np.argmin(heading_errors_deg)), int(np.argmax(heading_errors_deg)))
+        )
         return self.parts[first_index], self.parts[last_index]
 
 
 def combine_heading_parts(
-    parts: tuple[HeadingPart, ...], drift_p: float, method: Literal["orientation", "positions"]
+    parts: tuple[HeadingPart, ...],
+    drift_p_value: float,
+    method: Literal["orientation", "positions"],
 ) -> HeadingError:
-    angles_deg = [heading_part.heading_error_deg for heading_part in parts]
+    heading_errors_deg = [heading_part.heading_error_deg for heading_part in parts]
     return HeadingError(
-        misalignment_deg=float(np.mean(angles_deg)),
+        misalignment_deg=float(np.mean(heading_errors_deg)),
         sigma_deg=float(np.mean([heading_part.sigma_deg for heading_part in parts])),
-        drifts=drift_p < MAX_DRIFT_P_VALUE
-        and max(angles_deg) - min(angles_deg) >= MIN_HEADING_DRIFT_DEG,
+        drifts=drift_p_value < MAX_DRIFT_P_VALUE
+        and max(heading_errors_deg) - min(heading_errors_deg) >= MIN_HEADING_DRIFT_DEG,
         parts=parts,
-        drift_p=drift_p,
+        drift_p=drift_p_value,
         by=method,
     )
 
@@ -163,13 +167,15 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
             return orientation_heading_error
     if isinstance(flight.imu, Unavailable):
         return flight.imu
-    if np.median(np.diff(flight.imu.index)) > MAX_IMU_INTERVAL_S:
+    if (interval_s := np.median(np.diff(flight.imu.index))) > MAX_IMU_INTERVAL_S:
         return Unavailable(
-            "heading error", "the IMU rate is too low", "Log sensor_combined at full rate."
+            "heading error",
+            f"the IMU is logged at only {1.0 / interval_s:.1f} Hz",
+            "Log sensor_combined at full rate.",
         )
     position_samples = cut_to_segment(track.samples, segment)[Columns.POSITION[:2]].dropna()
     if len(position_samples) < MIN_MEASUREMENTS:
-        return too_few_measurements("heading error", len(position_samples), MIN_MEASUREMENTS)
+        return report_too_few_measurements("heading error", len(position_samples), MIN_MEASUREMENTS)
     position_samples = position_samples.iloc[
         :: int(np.ceil(len(position_samples) / MAX_MEASUREMENTS))
     ]
@@ -177,7 +183,7 @@ def estimate_heading_error(  # noqa: PLR0911 (one return per missing input)
     noise_parameters = NoiseParameters(settings.sigma_a_m_s2, sigma_z_m)
     # The mounting angle of the source is unknown, so orientations do not give the misalignment.
     # They show only that it is constant
-    return _estimate_from_positions(
+    return _fit_heading_to_positions(
         flight,
         position_samples,
         noise_parameters,
@@ -243,19 +249,24 @@ def _compare_orientations(
     time_s = time_s[has_low_yaw_rate]
     misalignment_rad = misalignment_rad[has_low_yaw_rate]
     # Robust σ from the median absolute difference of successive samples
-    noise_rad = 1.4826 * np.median(np.abs(np.diff(misalignment_rad))) / np.sqrt(2.0)
-    sigma_rad = np.full(len(time_s), max(float(noise_rad), np.radians(MIN_SIGMA_DEG)))
+    noise_sigma_rad = 1.4826 * np.median(np.abs(np.diff(misalignment_rad))) / np.sqrt(2.0)
+    sigma_rad = np.full(len(time_s), max(float(noise_sigma_rad), np.radians(MIN_HEADING_SIGMA_DEG)))
     heading_parts = _average_flight_parts(time_s, misalignment_rad, sigma_rad)
     if len(heading_parts) < MIN_FLIGHT_PART_COUNT:
         return None
-    angles_deg = np.array([heading_part.heading_error_deg for heading_part in heading_parts])
-    chi_square = np.sum((angles_deg - angles_deg.mean()) ** 2) / np.degrees(sigma_rad[0]) ** 2
+    heading_errors_deg = np.array(
+        [heading_part.heading_error_deg for heading_part in heading_parts]
+    )
+    chi_square = (
+        np.sum((heading_errors_deg - heading_errors_deg.mean()) ** 2)
+        / np.degrees(sigma_rad[0]) ** 2
+    )
     return combine_heading_parts(
         heading_parts, float(chdtrc(len(heading_parts) - 1, chi_square)), "orientation"
     )
 
 
-def _estimate_from_positions(
+def _fit_heading_to_positions(
     flight: Flight,
     position_samples: pd.DataFrame,
     noise_parameters: NoiseParameters,
@@ -283,7 +294,7 @@ def _estimate_from_positions(
             dt_s=dt_s,
             motion_cache=motion_cache,
             heading_sigma_rad=HEADING_SIGMA_RAD,
-            max_segment_s=fit_duration_s,
+            max_segment_duration_s=fit_duration_s,
         )
         if isinstance(motion, Unavailable):
             return structs.replace(motion, what="heading error")
@@ -299,48 +310,50 @@ def _estimate_from_positions(
                 "Analyse a longer segment.",
             )
         positions = motion.make_positions_at_offset(0.0)
-        # The derivative with respect to the heading is the smoothed path: IMU noise in it would
-        # bias the estimate towards zero (errors in variables)
+        # Rotate the smoothed measured path, not the IMU motion, for the derivative with respect to
+        # the heading: noise in a regressor biases its coefficient towards zero
         for increments in (positions.delta_position_m, positions.delta_velocity_m_s):
             north_m, east_m = increments[:, :, -1]
             increments[:, :, HEADING_ERROR_INDEX] = -east_m, north_m
         noise_parameters = maximise_likelihood(
             [positions], noise_parameters, motion.measurement_weights, fits_outliers=False
         ).noise_parameters
-        fitted_positions = fit_with_noises(
+        position_fit = fit_constant_errors(
             [positions], noise_parameters, motion.measurement_weights
         )
-        fitted_constants = fitted_positions.estimate_constants()[is_long, 0]
-        constants_covariance = np.linalg.inv(fitted_positions.compute_information())[is_long, 0]
-        # The smoothed path of the derivative has the scale factor of the positions. The fitted
-        # heading error is therefore divided by this factor
+        fitted_constants = position_fit.estimate_segment_constants()[is_long, 0]
+        constants_covariance = np.linalg.inv(position_fit.compute_information())[is_long, 0]
+        # This derivative contains the scale factor of the positions, so the fitted heading error is
+        # divided by the factor
         position_scale = np.maximum(1.0 + fitted_constants[:, -1], MIN_POSITION_SCALE)
         error_rad = fitted_constants[:, HEADING_ERROR_INDEX] / position_scale
-        heading_variance = (
+        heading_variance_rad2 = (
             constants_covariance[:, HEADING_ERROR_INDEX, HEADING_ERROR_INDEX] / position_scale**2
         )
         correction_rad, weight_sum = np.average(
-            error_rad, weights=1.0 / heading_variance, returned=True
+            error_rad, weights=1.0 / heading_variance_rad2, returned=True
         )
         misalignment_rad += float(correction_rad)
         if abs(correction_rad) < CONVERGED_HEADING_CHANGE_RAD:
             break
     deviation_rad = error_rad - correction_rad
     # Variance of the estimates = variance of the true heading errors + estimation variance
-    excess_variance = max(float(np.mean(deviation_rad**2 - heading_variance)), 0.0)
-    drift_variance = 0.0 if has_constant_heading else excess_variance
+    excess_variance_rad2 = max(float(np.mean(deviation_rad**2 - heading_variance_rad2)), 0.0)
+    heading_drift_variance_rad2 = 0.0 if has_constant_heading else excess_variance_rad2
     # Shrinkage: the deviation of an uncertain flight part from the mean heading error is reduced
-    drift_fraction = drift_variance / (drift_variance + heading_variance)
+    drift_variance_fraction = heading_drift_variance_rad2 / (
+        heading_drift_variance_rad2 + heading_variance_rad2
+    )
     misalignment_rad = float(np.angle(np.exp(1j * misalignment_rad)))
     heading_part_columns = [
         spans_s[is_long],
-        np.degrees(misalignment_rad + drift_fraction * deviation_rad),
-        np.degrees(np.sqrt(1.0 / weight_sum + drift_fraction * heading_variance)),
+        np.degrees(misalignment_rad + drift_variance_fraction * deviation_rad),
+        np.degrees(np.sqrt(1.0 / weight_sum + drift_variance_fraction * heading_variance_rad2)),
     ]
-    chi_square = float(np.sum(deviation_rad**2 / heading_variance))
-    is_drift_tested = len(heading_variance) > 1 and not has_constant_heading
+    chi_square = float(np.sum(deviation_rad**2 / heading_variance_rad2))
+    is_drift_tested = len(heading_variance_rad2) > 1 and not has_constant_heading
     return combine_heading_parts(
         tuple(HeadingPart(*row) for row in np.column_stack(heading_part_columns).tolist()),
-        float(chdtrc(len(heading_variance) - 1, chi_square)) if is_drift_tested else 1.0,
+        float(chdtrc(len(heading_variance_rad2) - 1, chi_square)) if is_drift_tested else 1.0,
         "positions",
     )

@@ -27,13 +27,13 @@ from scipy.special import chdtri
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray, cumulative_integral
 from px4fuse.filter.likelihood import (
     PreintegratedMotion,
+    fit_parabola_vertex,
     innovations,
     integrate_acceleration,
-    parabola_vertex,
     preintegrate,
 )
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Acceleration, Axis, too_few_measurements
+from px4fuse.filter.signals import Acceleration, Axis, report_too_few_measurements
 from px4fuse.filter.steps import Timeline, make_timeline
 from px4fuse.flight.model import Columns, Flight, Unavailable
 
@@ -58,7 +58,7 @@ MAX_TESTED_JUMP_TIMES = 800
 # Number of jump times that are tested at once, to limit the memory
 JUMP_BATCH_SIZE = 80
 # Positions within this time (s) after a tested jump are ignored: a burst of outliers is no jump
-OUTLIER_BURST_S = 1.0
+OUTLIER_BURST_DURATION_S = 1.0
 # Outliers within this time (s) after a jump are tested again: positions after a jump look like
 # outliers
 OUTLIER_RETEST_DURATION_S = 6.0
@@ -73,8 +73,8 @@ MAX_JUMPS = 3
 MIN_BIAS_M_S2 = 0.2
 # Minimum ratio of an accelerometer bias to its σ to report it: false alarm rate 6e-5
 MIN_BIAS_TO_SIGMA_RATIO = 4.0
-# Minimum number of measurements on each side of a jump: before it and after it
-MIN_MEASUREMENTS_PER_SIDE = 8
+# Minimum number of measurements before a jump, and also after it
+MIN_MEASUREMENTS_PER_JUMP_SIDE = 8
 
 
 @dataclass(frozen=True)
@@ -104,33 +104,33 @@ class SystematicErrors:
 
     Attributes
     ----------
-    accelerometer_bias_forward, accelerometer_bias_right : Estimate
-        Accelerometer bias (m/s²). At constant heading, a tilt error has an equal effect.
-    rotation : Estimate
-        Yaw of the position source's frame relative to the attitude (rad, clockwise from above).
+    forward_bias_m_s2, right_bias_m_s2 : Estimate
+        Accelerometer bias. At constant heading, a tilt error has an equal effect.
+    rotation_rad : Estimate
+        Yaw of the position source's frame relative to the attitude (clockwise from above).
     scale : Estimate
         Scale factor error: distances from positions over distances from the IMU, minus 1.
     sigma_a_m_s2 : float
         White noise of the acceleration that remains after the fit.
     """
 
-    accelerometer_bias_forward: Estimate
-    accelerometer_bias_right: Estimate
-    rotation: Estimate
+    forward_bias_m_s2: Estimate
+    right_bias_m_s2: Estimate
+    rotation_rad: Estimate
     scale: Estimate
     jumps: tuple[Jump, ...]
     sigma_a_m_s2: float
 
-    def compute_bias(self) -> Estimate:
+    def compute_horizontal_bias(self) -> Estimate:
         """Return the magnitude of the horizontal accelerometer bias (m/s²)."""
-        forward_bias, right_bias = self.accelerometer_bias_forward, self.accelerometer_bias_right
+        forward_bias, right_bias = self.forward_bias_m_s2, self.right_bias_m_s2
         return Estimate(
             math.hypot(forward_bias.value, right_bias.value),
             math.hypot(forward_bias.sigma, right_bias.sigma),
         )
 
     def has_significant_bias(self) -> bool:
-        bias = self.compute_bias()
+        bias = self.compute_horizontal_bias()
         return bias.value >= max(MIN_BIAS_M_S2, MIN_BIAS_TO_SIGMA_RATIO * bias.sigma)
 
 
@@ -167,7 +167,7 @@ def fit_systematic_errors(
         return design
     is_skipped = np.isin(axes[0].measurement_time_s[-len(design.time_s) :], outlier_time_s)
     if (used_count := int(np.count_nonzero(~is_skipped))) < MIN_MEASUREMENTS:
-        return too_few_measurements(ANALYSIS_NAME, used_count, MIN_MEASUREMENTS)
+        return report_too_few_measurements(ANALYSIS_NAME, used_count, MIN_MEASUREMENTS)
     sigma_a_grid = sigma_a_m_s2 * TESTED_SIGMA_A_FACTORS
     sigma_a, design_fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
     jumps, is_skipped = _find_jumps(
@@ -178,13 +178,13 @@ def fit_systematic_errors(
             design, jump_columns=make_unit_steps(design.time_s, [jump.time_s for jump in jumps])
         )
         sigma_a, design_fit = _fit_sigma_a(design, sigma_a_grid, is_skipped)
-    accelerometer_bias_forward, accelerometer_bias_right, frame_rotation = map(
+    forward_bias_m_s2, right_bias_m_s2, frame_rotation_rad = map(
         design_fit.estimate, (FORWARD_COLUMN, RIGHT_COLUMN, ROTATION_COLUMN)
     )
     return SystematicErrors(
-        accelerometer_bias_forward,
-        accelerometer_bias_right,
-        frame_rotation,
+        forward_bias_m_s2,
+        right_bias_m_s2,
+        frame_rotation_rad,
         _fit_scale(design, sigma_a, is_skipped),
         jumps,
         sigma_a,
@@ -195,9 +195,9 @@ def _fit_sigma_a(
     design: DesignMatrix, sigma_a_grid: Array, is_skipped: BoolArray
 ) -> tuple[float, DesignFit]:
     """Return the maximum-likelihood SIGMA_A on a grid, and the least squares fit with it."""
-    fit_at = cache(lambda index: design.fit(float(sigma_a_grid[index]), is_skipped))
-    best_index = _index_of_minimum(lambda index: fit_at(index).score, len(sigma_a_grid))
-    return float(sigma_a_grid[best_index]), fit_at(best_index)
+    fit_sigma_a = cache(lambda index: design.fit(float(sigma_a_grid[index]), is_skipped))
+    best_index = _index_of_minimum(lambda index: fit_sigma_a(index).score, len(sigma_a_grid))
+    return float(sigma_a_grid[best_index]), fit_sigma_a(best_index)
 
 
 def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
@@ -214,28 +214,30 @@ def _index_of_minimum(score: Callable[[int], float], count: int) -> int:
 
 def _fit_scale(design: DesignMatrix, sigma_a: float, is_skipped: BoolArray) -> Estimate:
     """Estimate the scale factor error of the positions from fits with several scale factors."""
-    fit_at = cache(
+    fit_scale = cache(
         lambda grid_index: design.fit(sigma_a, is_skipped, float(TESTED_SCALE_FACTORS[grid_index]))
     )
-    # ln S is omitted from the score: the innovation variance S grows with the scale factor, so ln S
-    # would bias the estimated scale factor to zero
-    lowest_index = _index_of_minimum(
-        lambda grid_index: fit_at(grid_index).square_sum, len(TESTED_SCALE_FACTORS)
+    # A larger tested scale factor of the positions increases S. ln S is omitted from the score,
+    # because it would bias the estimated scale factor to zero
+    best_scale_index = _index_of_minimum(
+        lambda grid_index: fit_scale(grid_index).square_sum, len(TESTED_SCALE_FACTORS)
     )
-    grid_index = int(np.clip(lowest_index, 1, len(TESTED_SCALE_FACTORS) - 2))
-    scores_at_minimum = [
-        fit_at(grid_index + grid_shift).square_sum / 2.0 for grid_shift in (-1, 0, 1)
+    grid_index = int(np.clip(best_scale_index, 1, len(TESTED_SCALE_FACTORS) - 2))
+    scores_around_minimum = [
+        fit_scale(grid_index + grid_shift).square_sum / 2.0 for grid_shift in (-1, 0, 1)
     ]
-    vertex_shift, curvature = parabola_vertex(np.array(scores_at_minimum), 1)
+    vertex_shift, curvature = fit_parabola_vertex(np.array(scores_around_minimum), 1)
     grid_step = float(TESTED_SCALE_FACTORS[1] - TESTED_SCALE_FACTORS[0])
     if curvature <= 0.0:
         return Estimate(0.0, float("inf"))
     best_scale = (
         TESTED_SCALE_FACTORS[grid_index] + float(np.clip(vertex_shift, -1.5, 1.5)) * grid_step
     )
-    scale_sigma = grid_step / np.sqrt(curvature) * max(fit_at(grid_index).residual_rms, 1.0)
-    rotation_factor = np.hypot(1.0, fit_at(grid_index).coefficients[ROTATION_COLUMN])
-    return Estimate(float(best_scale * rotation_factor - 1.0), float(scale_sigma))
+    scale_sigma = grid_step / np.sqrt(curvature) * max(fit_scale(grid_index).residual_rms, 1.0)
+    scale_correction_for_rotation = np.hypot(
+        1.0, fit_scale(grid_index).coefficients[ROTATION_COLUMN]
+    )
+    return Estimate(float(best_scale * scale_correction_for_rotation - 1.0), float(scale_sigma))
 
 
 def _find_jumps(
@@ -248,29 +250,35 @@ def _find_jumps(
     """
     jumps: list[Jump] = []
 
-    def make_skip_mask(jump_s: float) -> BoolArray:
-        # The positions after a reset of the source are used: they are no burst of outliers
-        if jump_s in source_resets_s:
-            return is_skipped & ~_is_in_window(design.time_s, jump_s, OUTLIER_RETEST_DURATION_S)
-        return is_skipped | _is_in_window(design.time_s, jump_s, OUTLIER_BURST_S)
+    def make_skip_mask(jump_time_s: float) -> BoolArray:
+        # A jump at a reset of the source is no burst of outliers: use the positions after it
+        if jump_time_s in source_resets_s:
+            return is_skipped & ~_is_in_window(
+                design.time_s, jump_time_s, OUTLIER_RETEST_DURATION_S
+            )
+        return is_skipped | _is_in_window(design.time_s, jump_time_s, OUTLIER_BURST_DURATION_S)
 
     for _ in range(MAX_JUMPS):
         design = replace(
             design, jump_columns=make_unit_steps(design.time_s, [jump.time_s for jump in jumps])
         )
-        outlier_run_starts = design.time_s[
+        outlier_run_starts_s = design.time_s[
             np.flatnonzero(is_skipped & ~np.append(False, is_skipped[:-1]))
         ]
         jump_times = [
             *source_resets_s,
-            *_find_significant_jump_times(design, sigma_a, is_skipped, outlier_run_starts),
+            *_find_significant_jump_times(design, sigma_a, is_skipped, outlier_run_starts_s),
             *_find_significant_jump_times(design, sigma_a, is_skipped)[:1],
         ]
-        false_alarm_p = MAX_JUMP_FALSE_ALARM_P / max(len(outlier_run_starts), 1)
+        max_false_alarm_p = MAX_JUMP_FALSE_ALARM_P / max(len(outlier_run_starts_s), 1)
         significant_jumps = [
             jump
             for time_s in jump_times
-            if (jump := _test_jump(design, sigma_a, make_skip_mask(time_s), time_s, false_alarm_p))
+            if (
+                jump := _test_jump(
+                    design, sigma_a, make_skip_mask(time_s), time_s, max_false_alarm_p
+                )
+            )
         ]
         if not significant_jumps:
             break
@@ -280,7 +288,7 @@ def _find_jumps(
         source_resets_s = [
             reset_time_s
             for reset_time_s in source_resets_s
-            if abs(reset_time_s - best_jump.time_s) > OUTLIER_BURST_S
+            if abs(reset_time_s - best_jump.time_s) > OUTLIER_BURST_DURATION_S
         ]
     return tuple(sorted(jumps, key=lambda jump: jump.time_s)), is_skipped
 
@@ -300,7 +308,9 @@ def _find_significant_jump_times(
     By default, all measurement times are tested.
     """
     if candidate_times_s is None:
-        candidate_times_s = design.time_s[MIN_MEASUREMENTS_PER_SIDE:-MIN_MEASUREMENTS_PER_SIDE]
+        candidate_times_s = design.time_s[
+            MIN_MEASUREMENTS_PER_JUMP_SIDE:-MIN_MEASUREMENTS_PER_JUMP_SIDE
+        ]
         candidate_times_s = candidate_times_s[
             :: max(1, -(-len(candidate_times_s) // MAX_TESTED_JUMP_TIMES))
         ]
@@ -334,9 +344,11 @@ def _compute_jump_chi_squares(
         )[0][~is_skipped]
         for axis_index in range(design.axis_count):
             axis_residual = fit_without_jump.residual[fit_without_jump.axis == axis_index]
-            cross_product = columns[axis_index].T @ jump_response
+            columns_times_jump_response = columns[axis_index].T @ jump_response
             jump_information = np.sum(jump_response**2, axis=0) - np.sum(
-                cross_product * (fit_without_jump.covariance @ cross_product), axis=0
+                columns_times_jump_response
+                * (fit_without_jump.covariance @ columns_times_jump_response),
+                axis=0,
             )
             chi_squares[batch] += (
                 axis_residual @ jump_response / fit_without_jump.compute_axis_rms()[axis_index]
@@ -348,9 +360,9 @@ def _locate_jump(
     design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, jump: Jump
 ) -> tuple[Jump, BoolArray]:
     """Return a detected jump with its exact time and change (m), and a mask of outliers to skip."""
-    is_near = np.abs(design.time_s - jump.time_s) <= OUTLIER_BURST_S
-    # Fit with the jump, without the measurements within OUTLIER_BURST_S of its time. Later outliers
-    # are used again if their residual is now small
+    is_near = np.abs(design.time_s - jump.time_s) <= OUTLIER_BURST_DURATION_S
+    # Fit with the jump, but without the measurements near it. Outliers after the jump are used
+    # again if their residual is now small
     residual_squares = design.add_jump(jump.time_s)[0].compute_residual_squares(
         sigma_a, is_skipped | is_near
     )
@@ -366,34 +378,39 @@ def _locate_jump(
         -_compute_jump_chi_squares(design, sigma_a, is_skipped & ~is_near, candidate_times_s)
     )[:MAX_CANDIDATE_JUMP_TIMES]
     outlier_mask_by_jump_time = {}
-    for jump_s in candidate_times_s[best_indices].tolist():
-        residual_squares = design.add_jump(jump_s)[0].compute_residual_squares(
+    for jump_time_s in candidate_times_s[best_indices].tolist():
+        residual_squares = design.add_jump(jump_time_s)[0].compute_residual_squares(
             sigma_a, is_skipped | is_near
         )
-        outlier_mask_by_jump_time[jump_s] = np.where(
+        outlier_mask_by_jump_time[jump_time_s] = np.where(
             is_near, residual_squares > max_residual_square, is_skipped
         )
     # With a wrong jump time, good measurements look like outliers: use the time with the fewest
-    best_time_s = min(
+    # outliers
+    best_jump_time_s = min(
         outlier_mask_by_jump_time,
-        key=lambda jump_s: np.count_nonzero(outlier_mask_by_jump_time[jump_s]),
+        key=lambda jump_time_s: np.count_nonzero(outlier_mask_by_jump_time[jump_time_s]),
     )
-    is_skipped = outlier_mask_by_jump_time[best_time_s]
-    jump_design, jump_column_indices = design.add_jump(best_time_s)
+    is_skipped = outlier_mask_by_jump_time[best_jump_time_s]
+    jump_design, jump_column_indices = design.add_jump(best_jump_time_s)
     design_fit = jump_design.fit(sigma_a, is_skipped)
     step_m = tuple(design_fit.estimate(int(column)) for column in jump_column_indices)
-    return replace(jump, time_s=best_time_s, step_m=step_m), is_skipped
+    return replace(jump, time_s=best_jump_time_s, step_m=step_m), is_skipped
 
 
 def _test_jump(
-    design: DesignMatrix, sigma_a: float, is_skipped: BoolArray, time_s: float, false_alarm_p: float
+    design: DesignMatrix,
+    sigma_a: float,
+    is_skipped: BoolArray,
+    time_s: float,
+    max_false_alarm_p: float,
 ) -> Jump | None:
     """Test for a jump at ``time_s``, and return it if it is significant."""
     design, jump_column_indices = design.add_jump(time_s)
-    count_before = np.count_nonzero(~is_skipped & (design.time_s < time_s))
+    count_before_jump = np.count_nonzero(~is_skipped & (design.time_s < time_s))
     if (
-        min(count_before, np.count_nonzero(~is_skipped & (design.time_s >= time_s)))
-        < MIN_MEASUREMENTS_PER_SIDE
+        min(count_before_jump, np.count_nonzero(~is_skipped & (design.time_s >= time_s)))
+        < MIN_MEASUREMENTS_PER_JUMP_SIDE
     ):
         return None
     design_fit = design.fit(sigma_a, is_skipped)
@@ -401,7 +418,7 @@ def _test_jump(
     jump_covariance = design_fit.covariance[np.ix_(jump_column_indices, jump_column_indices)]
     normalised_jump = normalised_jump / design_fit.compute_axis_rms()
     chi_square = float(normalised_jump @ np.linalg.solve(jump_covariance, normalised_jump))
-    if chi_square < chdtri(len(jump_column_indices), false_alarm_p):
+    if chi_square < chdtri(len(jump_column_indices), max_false_alarm_p):
         return None
     return Jump(
         time_s,
@@ -443,7 +460,10 @@ class DesignFit:
         return np.sqrt(np.maximum(mean_square, 1.0))
 
     def estimate(self, column: int) -> Estimate:
-        """Return a coefficient and its σ, which is multiplied by ``residual_rms`` if above 1."""
+        """Return the coefficient of a column and its σ.
+
+        If ``residual_rms`` is above 1, σ is multiplied by it.
+        """
         coefficient_sigma = float(np.sqrt(self.covariance[column, column])) * max(
             self.residual_rms, 1.0
         )
@@ -452,10 +472,10 @@ class DesignFit:
 
 @dataclass(frozen=True)
 class DesignMatrix:
-    """Inputs of KF along several axes, for the data and for each error of size 1.
+    """Inputs of KF along several axes: the data, and each systematic error with size 1.
 
-    KF's responses to the data are innovations; its responses to the errors are the columns of the
-    design matrix.
+    KF's innovations for the data are fitted by its innovations for the errors, which are the
+    columns of the design matrix. The slow acceleration error is linear between knots.
 
     Attributes
     ----------
@@ -490,10 +510,10 @@ class DesignMatrix:
     def whiten_inputs(
         self, dp: Array, dv: Array, measured_m: Array, sigma_a: float, is_skipped: BoolArray
     ) -> tuple[Array, float]:
-        """Run KF on k inputs at once.
+        """Return normalised innovations ν/√S of KF, shape (m, k), and Σ ln S.
 
-        Return normalised innovations ν/√S of m measurements, shape (m, k), and Σ ln S of the fused
-        measurements.
+        ``dp``, ``dv`` and ``measured_m`` have one column for each of k inputs, which KF filters at
+        once. The sum is over the fused measurements.
         """
         preintegrated_columns = replace(
             self.preintegrated_columns,
@@ -506,10 +526,11 @@ class DesignMatrix:
         return nu, float(np.sum(np.log(s[~is_skipped])))
 
     def fit(self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0) -> DesignFit:
-        """Fit biases, rotation, slow error and jumps together by least squares.
+        """Fit biases, rotation, slow error and jumps to KF's innovations by least squares.
 
-        ``scale`` is a trial scale factor of the positions: it multiplies the acceleration and its
-        noise. ``is_skipped``, shape (m,), is True for measurements that are not used.
+        ``scale`` is a trial scale factor of the positions. Instead of dividing the positions by it,
+        the acceleration and its noise are multiplied by it. ``is_skipped``, shape (m,), is True for
+        measurements that are not used.
         """
         return self.regress(*self.whiten_design(sigma_a, is_skipped, scale), is_skipped)
 
@@ -532,7 +553,7 @@ class DesignMatrix:
             self.prior_sigma, np.full(column_count - len(self.prior_sigma), np.inf)
         )
         information = np.diag(prior_sigma**-2.0) + columns.T @ columns
-        # A small diagonal prevents a singular matrix if a column is zero (frame rotation in hover)
+        # A small diagonal prevents a singular matrix: in hover, the column of the rotation is zero
         information += 1e-12 * np.diag(np.diag(information)) + 1e-12 * np.eye(column_count)
         right_hand_side = columns.T @ innovations_by_axis
         information_factor = cho_factor(information)
@@ -553,7 +574,7 @@ class DesignMatrix:
         )
 
     def compute_residual_squares(self, sigma_a: float, is_skipped: BoolArray) -> Array:
-        """Return the squared residual of each measurement (in S) after the fit, summed over axes.
+        """Return the squared residual of each measurement over S, summed over axes.
 
         Measurements in ``is_skipped`` have residuals, but are not used in the fit.
         """
@@ -565,10 +586,10 @@ class DesignMatrix:
     def whiten_design(
         self, sigma_a: float, is_skipped: BoolArray, scale: float = 1.0
     ) -> tuple[Array, Array, float]:
-        """Return KF's responses to the data and to each error, normalised by √S, and Σ ln S.
+        """Return KF's normalised innovations, the design matrix, and Σ ln S.
 
-        The responses to the data are innovations, shape (axes, measurements). Those to errors form
-        the design matrix, shape (axes, measurements, columns).
+        Innovations ν/√S have the shape (axes, measurements). The design matrix, shape (axes,
+        measurements, columns), contains the innovations due to each error of size 1.
         """
         preintegrated_columns, axis_count, jump_count = (
             self.preintegrated_columns,
@@ -578,8 +599,8 @@ class DesignMatrix:
         column_count = len(self.prior_sigma)
         whitened_innovations = np.empty((axis_count, len(is_skipped)))
         columns = np.zeros((axis_count, len(is_skipped), column_count + axis_count * jump_count))
-        # The scale factor multiplies measured accelerations: the columns of the data and of the
-        # rotation. Biases are in unscaled m/s²
+        # The scale factor multiplies the columns that are computed from measured acceleration: data
+        # and rotation. The columns of the biases are 1 m/s²
         data_column_indices = (1 + CONSTANT_ERROR_COUNT) * np.arange(axis_count)
         column_factors = np.ones(preintegrated_columns.measurement_m.shape[1])
         column_factors[
@@ -593,20 +614,20 @@ class DesignMatrix:
             scale * sigma_a,
             is_skipped,
         )
-        *columns_by_axis, shared_columns = np.split(
+        *columns_by_axis, knot_and_jump_columns = np.split(
             whitened_columns, (1 + CONSTANT_ERROR_COUNT) * np.arange(1, 1 + axis_count), 1
         )
-        knot_count = shared_columns.shape[1] - jump_count
+        knot_count = knot_and_jump_columns.shape[1] - jump_count
         for axis, axis_columns in enumerate(columns_by_axis):
             whitened_innovations[axis] = axis_columns[:, 0]
             first_knot_column = CONSTANT_ERROR_COUNT + knot_count * axis
             first_jump_column = column_count + jump_count * axis
             columns[axis][:, :CONSTANT_ERROR_COUNT] = axis_columns[:, 1:]
-            shared_column_indices = np.r_[
+            knot_and_jump_indices = np.r_[
                 first_knot_column : first_knot_column + knot_count,
                 first_jump_column : first_jump_column + jump_count,
             ]
-            columns[axis][:, shared_column_indices] = shared_columns
+            columns[axis][:, knot_and_jump_indices] = knot_and_jump_columns
         return whitened_innovations, columns, axis_count * log_variance_sum
 
 
@@ -617,7 +638,7 @@ def make_design_matrix(
     sigma_z_m: float,
     clock_offset_s: float,
 ) -> DesignMatrix | Unavailable:
-    """Make the design matrix without columns for jumps.
+    """Make the design matrix with columns for biases, rotation and slow error, but not for jumps.
 
     ``clock_offset_s`` is added to the timestamps of the positions.
     """
@@ -627,50 +648,55 @@ def make_design_matrix(
     if isinstance(attitude, Unavailable):
         return attitude
     if len(axes[0].measurement_time_s) <= MIN_MEASUREMENTS:
-        return too_few_measurements(
+        return report_too_few_measurements(
             ANALYSIS_NAME, len(axes[0].measurement_time_s), MIN_MEASUREMENTS
         )
     time_s = axes[0].measurement_time_s + clock_offset_s
     shifted_axes = [replace(axis, measurement_time_s=time_s) for axis in axes]
     settings = replace(settings, input="imu")
     timeline = make_timeline(shifted_axes[0], settings)
-    error_integrals = _integrate_shared_errors(attitude, acceleration)
-    kf_motions = [preintegrate(axis, settings) for axis in shifted_axes]
-    column_pairs: list[ArrayPair] = []
-    for axis, kf_motion in zip(axes, kf_motions, strict=True):
-        column_pairs.append((kf_motion.delta_position_m, kf_motion.delta_velocity_m_s))
-        column_pairs += [
+    error_integrals = _integrate_unit_errors(attitude, acceleration)
+    preintegrated_motions = [preintegrate(axis, settings) for axis in shifted_axes]
+    increment_pairs: list[ArrayPair] = []
+    for axis, preintegrated_motion in zip(axes, preintegrated_motions, strict=True):
+        increment_pairs.append(
+            (preintegrated_motion.delta_position_m, preintegrated_motion.delta_velocity_m_s)
+        )
+        increment_pairs += [
             _integrate_between_measurements(integral @ axis.direction, input_time_s, timeline)
             for input_time_s, integral in error_integrals
         ]
-    time_s = axes[0].measurement_time_s[-len(kf_motions[0].measurement_m) :]
+    time_s = axes[0].measurement_time_s[-len(preintegrated_motions[0].measurement_m) :]
     weight_time_s, knot_weights = _make_knot_weights(
         time_s[0] + clock_offset_s, time_s[-1] + clock_offset_s
     )
-    column_pairs += [
+    increment_pairs += [
         _integrate_between_measurements(
             cumulative_integral(weights, weight_time_s), weight_time_s, timeline
         )
         for weights in knot_weights
     ]
-    dp, dv = (np.stack(arrays, axis=1) for arrays in zip(*column_pairs, strict=True))
+    dp, dv = (np.stack(arrays, axis=1) for arrays in zip(*increment_pairs, strict=True))
     measured_m = np.zeros_like(dp)
-    for index, kf_motion in enumerate(kf_motions):
+    for index, preintegrated_motion in enumerate(preintegrated_motions):
         # Positions are relative to the first measurement, which is KF's initial position
         measured_m[:, index * (1 + CONSTANT_ERROR_COUNT)] = (
-            kf_motion.measurement_m - kf_motion.initial_state.position_m
+            preintegrated_motion.measurement_m - preintegrated_motion.initial_state.position_m
         )
     preintegrated_columns = replace(
-        kf_motions[0],
+        preintegrated_motions[0],
         delta_position_m=dp,
         delta_velocity_m_s=dv,
         measurement_m=measured_m,
         # All axes share one process noise, including the additional noise in IMU gaps
         added_process_noise=np.mean(
-            [kf_motion.added_process_noise for kf_motion in kf_motions],
+            [
+                preintegrated_motion.added_process_noise
+                for preintegrated_motion in preintegrated_motions
+            ],
             axis=0,
         ),
-        initial_state=replace(kf_motions[0].initial_state, position_m=0.0),
+        initial_state=replace(preintegrated_motions[0].initial_state, position_m=0.0),
     )
     tilt_sigma_m_s2 = np.full(len(axes) * len(knot_weights), TILT_SIGMA_RAD * constants.g)
     prior_sigma = np.append(np.full(CONSTANT_ERROR_COUNT, np.inf), tilt_sigma_m_s2)
@@ -692,10 +718,10 @@ def _integrate_between_measurements(
     return integrate_acceleration(timeline, np.diff(velocity_m_s) / np.diff(timeline.time_s))
 
 
-def _integrate_shared_errors(attitude: pd.DataFrame, acceleration: Acceleration) -> list[ArrayPair]:
-    """Return the NED velocity errors due to a bias of 1 m/s² forward or right, or 1 rad yaw error.
+def _integrate_unit_errors(attitude: pd.DataFrame, acceleration: Acceleration) -> list[ArrayPair]:
+    """Return the NED velocity errors due to 1 m/s² forward bias, 1 m/s² right bias and 1 rad yaw.
 
-    These errors are shared by all axes. Each item is (times in s, velocity error since the start).
+    Each of the three items is (times in s, velocity error in m/s since the start).
     """
     quaternions = attitude[Columns.QUATERNION].to_numpy(copy=True)
     body_to_ned = Rotation.from_quat(quaternions, scalar_first=True)
@@ -709,10 +735,10 @@ def _integrate_shared_errors(attitude: pd.DataFrame, acceleration: Acceleration)
 
 
 def _make_knot_weights(start_s: float, end_s: float) -> ArrayPair:
-    """Return times (s) from start to end, and the interpolation weight of each knot at these times.
+    """Return times (s) from start to end, and the weight of each knot at these times.
 
-    Linear interpolation between knots of the slow acceleration error at intervals of
-    :data:`KNOT_SPACING_S`.
+    The slow acceleration error is interpolated linearly between knots, which have intervals of
+    :data:`KNOT_SPACING_S`. The weights have the shape (knots, times).
     """
     knot_count = int(np.clip(np.ceil((end_s - start_s) / KNOT_SPACING_S), 1, MAX_KNOTS)) + 1
     weight_time_s = np.linspace(start_s, end_s, 20 * (knot_count - 1) + 1)

@@ -8,9 +8,9 @@ Unknown constants of each segment are errors of the initial attitude (rad, NED),
 body), accelerometer biases (m/s², body) and the scale factor error of the positions. The motion is
 linear in small constants. Its derivatives are integrated once and interpolated for any time offset.
 
-The derivative with respect to the scale is the smooth path of
-:func:`px4fuse.filter.marginal_likelihood.subtract_smooth_path`. With the IMU motion instead, the
-IMU noise would bias the estimated scale (errors in variables, Fuller 1987).
+The derivative with respect to the scale is the smoothed measured path
+(:func:`px4fuse.filter.marginal_likelihood.subtract_smooth_path`), not the IMU motion, whose noise
+would bias the estimated scale (errors in variables, Fuller 1987).
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ from px4fuse.trajectory.rotation import (
 HEADING_SIGMA_RAD = 0.05
 # Prior σ of the unknown constants, wide for consumer sensors: initial tilt and heading (rad), gyro
 # bias (rad/s), accelerometer bias (m/s²), scale of the positions (1)
-CONSTANTS_PRIOR_SIGMA = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
-# Maximum gyro bias (rad/s) that the prior of the estimated bias allows (5 σ). A larger bias is
-# estimated from EKF2's attitude and removed
+SEGMENT_CONSTANT_PRIOR_SIGMAS = np.repeat([HEADING_SIGMA_RAD, 0.004, 0.3, 0.1], [3, 3, 3, 1])
+# Maximum gyro bias (rad/s) that is fitted to the positions: 5 σ of its prior. A larger bias is
+# first estimated from EKF2's attitude and subtracted
 MAX_PRIOR_GYRO_BIAS_RAD_S = 0.02
 # Maximum gyro bias (rad/s) that EKF2 can remove from its attitude: the maximum of EKF2_GYR_B_LIM
 MAX_REMOVED_GYRO_BIAS_RAD_S = 0.4
 # Maximum length (s) of a segment: in 30 s a gyro bias of 0.004 rad/s rotates the attitude by
-# 0.12 rad, with a linearisation error of 0.07 m/s²
-MAX_SEGMENT_S = 30.0
+# 0.12 rad. The linearised acceleration then has an error of 0.07 m/s²: g · 0.12² / 2
+MAX_SEGMENT_DURATION_S = 30.0
 # Maximum tested time offset (s) between position source and IMU
 MAX_OFFSET_S = 0.6
 # Number of tested time offsets in the coarse search
@@ -90,7 +90,7 @@ class SegmentMotion:
     table: Array
 
     def interpolate(self, time_s: Array) -> tuple[Array, Array]:
-        """Interpolate position and velocity, and their derivatives, shape (..., 3, 1 + c)."""
+        """Interpolate position and velocity, each with its c derivatives, shape (..., 3, 1 + c)."""
         last_index = len(self.time_s) - 2
         row = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, last_index)
         elapsed_s = (time_s - self.time_s[row])[..., None, None]
@@ -139,41 +139,45 @@ class PositionsAndImuMotion:
     imu_interval_s: float
     heading_sigma_rad: float = HEADING_SIGMA_RAD
 
-    def downsample(self, max_count: int) -> PositionsAndImuMotion:
-        """Keep about ``max_count`` measurements, and the segments that still have enough.
+    def downsample(self, max_measurement_count: int) -> PositionsAndImuMotion:
+        """Keep about ``max_measurement_count`` measurements.
 
-        If no segment had enough, all measurements are kept.
+        Segments with fewer than ``MIN_KEPT_MEASUREMENTS`` of them are dropped. If this would drop
+        all segments, all measurements are kept.
         """
-        is_kept = np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / max_count)) == 0
+        is_kept = (
+            np.arange(len(self.time_s)) % max(1, round(len(self.time_s) / max_measurement_count))
+            == 0
+        )
         kept_counts = np.add.reduceat(is_kept.astype(int), self.segment_edges[:-1])
-        has_enough_kept = kept_counts >= MIN_KEPT_MEASUREMENTS
-        if not has_enough_kept.any():
+        has_enough_measurements = kept_counts >= MIN_KEPT_MEASUREMENTS
+        if not has_enough_measurements.any():
             return self
-        is_kept &= np.repeat(has_enough_kept, np.diff(self.segment_edges))
-        arrays = {
+        is_kept &= np.repeat(has_enough_measurements, np.diff(self.segment_edges))
+        kept_fields = {
             name: getattr(self, name)[is_kept]
             for name in ("time_s", "measurement_m", "measurement_weights")
         }
         segment_motions = tuple(
-            self.segment_motions[index] for index in np.flatnonzero(has_enough_kept)
+            self.segment_motions[index] for index in np.flatnonzero(has_enough_measurements)
         )
         return replace(
             self,
-            **arrays,
-            segment_edges=np.cumsum([0, *kept_counts[has_enough_kept]]),
+            **kept_fields,
+            segment_edges=np.cumsum([0, *kept_counts[has_enough_measurements]]),
             segment_motions=segment_motions,
         )
 
     def make_positions(self, time_offsets_s: Array) -> PositionsAndIncrements:
-        """Return the positions and the IMU increments between them for each time offset.
+        """Return the positions, and the IMU increments between them for each time offset.
 
-        The scale factor of the positions is 1.
+        The scale factor of the positions is not fitted.
         """
         interval_s = np.diff(self.time_s)
         unit_process_noise = self.dt_s * np.stack(compute_unit_continuous_noise(interval_s))
         prior_precision = np.zeros((len(self.time_s), 2))
         prior_precision[self.segment_edges[:-1]] = SEGMENT_START_PRIOR_PRECISION
-        column_count = 1 + len(CONSTANTS_PRIOR_SIGMA)
+        column_count = 1 + len(SEGMENT_CONSTANT_PRIOR_SIGMAS)
         dp, dv = np.zeros(
             (2, len(self.directions), len(time_offsets_s), column_count, len(interval_s))
         )
@@ -181,7 +185,8 @@ class PositionsAndImuMotion:
             self.segment_edges, self.segment_edges[1:], self.segment_motions, strict=False
         ):
             measurement_time_s = self.time_s[begin:end]
-            # Shape (axes, time offsets, 1 + constants, times): motion, then its derivatives
+            # Shape (axes, time offsets, 1 + constants, times). The third dimension contains the
+            # motion, then its derivative with respect to each constant
             position, velocity = (
                 np.moveaxis(self.directions @ signal, (2, 0, 3, 1), range(4))
                 for signal in segment_motion.interpolate(
@@ -198,15 +203,17 @@ class PositionsAndImuMotion:
             unit_process_noise=unit_process_noise,
             added_process_noise=np.zeros_like(unit_process_noise),
             prior_precision=prior_precision,
-            constants_prior_sigma=np.r_[
-                CONSTANTS_PRIOR_SIGMA[:2], self.heading_sigma_rad, CONSTANTS_PRIOR_SIGMA[3:]
+            constant_prior_sigmas=np.r_[
+                SEGMENT_CONSTANT_PRIOR_SIGMAS[:2],
+                self.heading_sigma_rad,
+                SEGMENT_CONSTANT_PRIOR_SIGMAS[3:],
             ],
             delta_position_m=dp,
             delta_velocity_m_s=dv,
         )
 
     def make_positions_at_offset(self, offset_s: float) -> PositionsAndIncrements:
-        """Return positions and IMU increments for one time offset, with an unknown scale factor."""
+        """Return positions and IMU increments for one time offset, to fit also a scale factor."""
         return next(self.make_position_batches(np.array([offset_s])))
 
     def make_position_batches(
@@ -214,10 +221,10 @@ class PositionsAndImuMotion:
     ) -> Iterator[PositionsAndIncrements]:
         """Yield positions and IMU increments for batches of time offsets.
 
-        With ``estimates_scale``, the scale factor of the positions is an unknown constant; else 1.
+        With ``estimates_scale``, the scale factor of the positions is a constant to be fitted.
         """
         values_per_offset = (
-            len(self.time_s) * len(self.directions) * (1 + len(CONSTANTS_PRIOR_SIGMA))
+            len(self.time_s) * len(self.directions) * (1 + len(SEGMENT_CONSTANT_PRIOR_SIGMAS))
         )
         batch_size = max(1, MAX_BATCH_ELEMENTS // values_per_offset)
         for batch in np.split(time_offsets_s, range(batch_size, len(time_offsets_s), batch_size)):
@@ -242,7 +249,7 @@ class PositionsAndImuMotion:
         """
         tested_offsets_s = np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSET_COUNT)
         sigma_z_m = noise_parameters.sigma_z_m
-        sigma_ratios = [
+        sigma_a_to_sigma_z_ratios = [
             sigma_a_factor * noise_parameters.sigma_a_m_s2 / sigma_z_m
             for sigma_a_factor in sigma_a_factors
         ]
@@ -250,15 +257,18 @@ class PositionsAndImuMotion:
         position_batches = coarse_motion.make_position_batches(
             tested_offsets_s, estimates_scale=estimates_scale
         )
-        ratio_fits = fit_with_sigma_ratios(
+        fits_by_sigma_ratio = fit_with_sigma_ratios(
             position_batches,
-            sigma_ratios,
+            sigma_a_to_sigma_z_ratios,
             noise_parameters.random_walk_m / sigma_z_m,
             coarse_motion.measurement_weights,
             sigma_z_m,
         )
         minus_log_likelihood = np.stack(
-            [ratio_fit.scale_sigmas(sigma_z_m).compute_scores()[0] for ratio_fit in ratio_fits]
+            [
+                ratio_fit.scale_sigmas(sigma_z_m).compute_scores()[0]
+                for ratio_fit in fits_by_sigma_ratio
+            ]
         )
         factor_index, offset_index = np.unravel_index(
             np.argmin(minus_log_likelihood), minus_log_likelihood.shape
@@ -279,7 +289,7 @@ def compute_imu_motion(
     measurement_weights: Array | None = None,
     motion_cache: MotionCache | None = None,
     heading_sigma_rad: float = HEADING_SIGMA_RAD,
-    max_segment_s: float = MAX_SEGMENT_S,
+    max_segment_duration_s: float = MAX_SEGMENT_DURATION_S,
 ) -> PositionsAndImuMotion | Unavailable:
     """Divide measurements into segments without IMU gap, and compute their motion from the IMU.
 
@@ -292,7 +302,7 @@ def compute_imu_motion(
         See :class:`PositionsAndImuMotion`; weights are 1 by default.
     motion_cache : dict, optional
         IMU motion of this flight that is already computed; new motion is added.
-    max_segment_s : float
+    max_segment_duration_s : float
         Maximum length of a segment.
     """
     imu = flight.imu
@@ -314,19 +324,19 @@ def compute_imu_motion(
             continue
         covered_time_s = time_s[covered_rows]
         segment_count = max(
-            1, int(np.ceil((covered_time_s[-1] - covered_time_s[0]) / max_segment_s))
+            1, int(np.ceil((covered_time_s[-1] - covered_time_s[0]) / max_segment_duration_s))
         )
         cut_times_s = np.linspace(covered_time_s[0], covered_time_s[-1], segment_count + 1)[1:-1]
         for segment_rows in np.split(covered_rows, np.searchsorted(covered_time_s, cut_times_s)):
             if len(segment_rows) >= MIN_SEGMENT_MEASUREMENTS:
                 rows_by_segment.append(segment_rows)
-                span = (
+                imu_span_s = (
                     time_s[segment_rows[0]] - MAX_OFFSET_S,
                     time_s[segment_rows[-1]] + MAX_OFFSET_S,
                 )
-                if span not in motion_cache:
-                    motion_cache[span] = make_segment_motion(imu, attitude, span)
-                segment_motions.append(motion_cache[span])
+                if imu_span_s not in motion_cache:
+                    motion_cache[imu_span_s] = make_segment_motion(imu, attitude, imu_span_s)
+                segment_motions.append(motion_cache[imu_span_s])
     used_rows = np.concatenate([np.zeros(0, dtype=np.intp), *rows_by_segment])
     if len(used_rows) < MIN_MEASUREMENTS:
         return Unavailable(
@@ -364,12 +374,14 @@ def _find_covered_spans(imu_time_s: Array, attitude_time_s: Array) -> list[Span]
     return list(zip(starts_s.tolist(), ends_s.tolist(), strict=True))
 
 
-def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -> SegmentMotion:
-    """Compute the motion in NED from the IMU, and its derivatives (see :class:`SegmentMotion`)."""
+def make_segment_motion(
+    imu: pd.DataFrame, attitude: pd.DataFrame, imu_span_s: Span
+) -> SegmentMotion:
+    """Compute the motion in NED from the IMU, and its derivatives with respect to IMU errors."""
     imu_time_s = imu.index.to_numpy()
     first_row, end_row = np.searchsorted(
         imu_time_s,
-        [span[0] - 2 * INTEGRATION_STEP_S, span[1] + 2 * INTEGRATION_STEP_S],
+        [imu_span_s[0] - 2 * INTEGRATION_STEP_S, imu_span_s[1] + 2 * INTEGRATION_STEP_S],
         side="left",
     )
     imu_samples = imu.iloc[first_row:end_row]
@@ -381,18 +393,18 @@ def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -
         [np.interp(step_times_s, imu_time_s, column) for column in imu_integral.T]
     )
     specific_force_integral_m_s = integrals_at_steps[:, :3]
-    angle_rad = integrals_at_steps[:, 3:]
-    angle_rad -= np.outer(
-        step_times_s, _estimate_large_gyro_bias(step_times_s, angle_rad, attitude)
+    gyro_integral_rad = integrals_at_steps[:, 3:]
+    gyro_integral_rad -= np.outer(
+        step_times_s, _estimate_large_gyro_bias(step_times_s, gyro_integral_rad, attitude)
     )
-    attitude_quaternion = _integrate_gyros(step_times_s, angle_rad, attitude)
+    attitude_quaternion = _integrate_gyros(step_times_s, gyro_integral_rad, attitude)
     # The mean specific force of each step is rotated by the attitude in the middle of the step
     mean_specific_force_m_s2 = np.diff(specific_force_integral_m_s, axis=0) / INTEGRATION_STEP_S
     body_to_ned = to_matrix(
-        multiply(attitude_quaternion[:-1], from_vector(np.diff(angle_rad, axis=0) / 2.0))
+        multiply(attitude_quaternion[:-1], from_vector(np.diff(gyro_integral_rad, axis=0) / 2.0))
     )
     specific_force_ned_m_s2 = rotate(body_to_ned, mean_specific_force_m_s2)
-    table = np.zeros((len(mean_specific_force_m_s2), 2, 3, len(CONSTANTS_PRIOR_SIGMA)))
+    table = np.zeros((len(mean_specific_force_m_s2), 2, 3, len(SEGMENT_CONSTANT_PRIOR_SIGMAS)))
     position, velocity = np.moveaxis(table, 1, 0)
     acceleration = np.zeros_like(velocity)
     acceleration[:, :, 0] = specific_force_ned_m_s2
@@ -421,7 +433,7 @@ def make_segment_motion(imu: pd.DataFrame, attitude: pd.DataFrame, span: Span) -
 
 
 def _estimate_large_gyro_bias(
-    step_times_s: Array, angle_rad: Array, attitude: pd.DataFrame
+    step_times_s: Array, gyro_integral_rad: Array, attitude: pd.DataFrame
 ) -> Array:
     """Estimate a large gyro bias (rad/s) from the logged attitude.
 
@@ -434,21 +446,25 @@ def _estimate_large_gyro_bias(
         return np.zeros(3)
     attitude_time_s, quaternions = samples.index.to_numpy(), samples.to_numpy()
     gyro_angle_rad = np.column_stack(
-        [np.interp(attitude_time_s, step_times_s, column) for column in angle_rad.T]
+        [np.interp(attitude_time_s, step_times_s, column) for column in gyro_integral_rad.T]
     )
     drift_rad = np.diff(gyro_angle_rad, axis=0) - to_vector(
         multiply(conjugate(quaternions[:-1]), quaternions[1:])
     )
     bias_rad_s = np.asarray(np.median(drift_rad / np.diff(attitude_time_s)[:, None], axis=0))
-    is_removed = MAX_PRIOR_GYRO_BIAS_RAD_S < np.abs(bias_rad_s).max() <= MAX_REMOVED_GYRO_BIAS_RAD_S
-    return bias_rad_s if is_removed else np.zeros(3)
+    is_bias_removed = (
+        MAX_PRIOR_GYRO_BIAS_RAD_S < np.abs(bias_rad_s).max() <= MAX_REMOVED_GYRO_BIAS_RAD_S
+    )
+    return bias_rad_s if is_bias_removed else np.zeros(3)
 
 
-def _integrate_gyros(step_times_s: Array, angle_rad: Array, attitude: pd.DataFrame) -> Array:
-    """Integrate the gyroscopes, starting at the logged attitude.
+def _integrate_gyros(
+    step_times_s: Array, gyro_integral_rad: Array, attitude: pd.DataFrame
+) -> Array:
+    """Return attitudes from angular increments, starting at the logged attitude.
 
-    ``angle_rad`` is the integral of the angular rate (rad). Return quaternions from body to NED, w
-    first.
+    ``gyro_integral_rad`` is the integral of the angular rate. The attitudes are quaternions from
+    body to NED, w first.
     """
     attitude_time_s = attitude.index.to_numpy()
     nearby_rows = slice(
@@ -463,5 +479,5 @@ def _integrate_gyros(step_times_s: Array, angle_rad: Array, attitude: pd.DataFra
     start_s = np.clip(step_times_s[0], nearby_attitude_time_s[0], nearby_attitude_time_s[-1])
     slerp = Slerp(nearby_attitude_time_s, Rotation.from_quat(logged_quaternions, scalar_first=True))
     start_quaternion = slerp(start_s).as_quat(scalar_first=True)
-    rotation_since_start = cumulative_product(from_vector(np.diff(angle_rad, axis=0)))
+    rotation_since_start = cumulative_product(from_vector(np.diff(gyro_integral_rad, axis=0)))
     return np.vstack([start_quaternion, multiply(start_quaternion, rotation_since_start)])

@@ -96,12 +96,14 @@ def replay(
             for index in timeline.measurement_index[1:]
         ],
     )
-    time_arrays = timeline.time_s, timeline.time_s[timeline.measurement_index >= 0]
-    step_times_s, update_index = (pd.Index(times_s, name="time_s") for times_s in time_arrays)
+    step_times_s, update_times_s = (
+        pd.Index(times_s, name="time_s")
+        for times_s in (timeline.time_s, timeline.time_s[timeline.measurement_index >= 0])
+    )
     steps = _make_table(states, step_times_s, model.STATE_COLUMNS + model.COVARIANCE_COLUMNS)
     steps["acceleration_m_s2"] = np.append(timeline.acceleration_m_s2, 0.0)
     steps["input_variance_m2_s4"] = np.append(timeline.input_variance_m2_s4, 0.0)
-    update_table = _make_table(updates, update_index, UPDATE_COLUMNS)
+    update_table = _make_table(updates, update_times_s, UPDATE_COLUMNS)
     return Replay(axis, settings, steps, update_table, timeline.input_gap_s)
 
 
@@ -123,7 +125,7 @@ def _run_with_filterpy(
 
     kalman = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
     kalman.x = np.array([[initial_state.position_m], [initial_state.velocity_m_s]])
-    kalman.P = model.symmetric_matrix(model.INITIAL_COVARIANCE)
+    kalman.P = model.make_symmetric_matrix(model.INITIAL_COVARIANCE)
     kalman.H = np.array([[1.0, 0.0]])
     kalman.R = np.array([[measurement_variance]])
     kalman.inv = np.reciprocal  # S is 1 by 1
@@ -135,8 +137,9 @@ def _run_with_filterpy(
     matrices = (
         acceleration,
         np.concatenate([dt_s**2 / 2.0, dt_s], axis=1),
-        model.transition(dt_s[:, 0, 0]),
-        noise_density * model.symmetric_matrix(model.compute_unit_process_noise(dt_s[:, 0, 0])),
+        model.make_transition_matrix(dt_s[:, 0, 0]),
+        noise_density
+        * model.make_symmetric_matrix(model.compute_unit_process_noise(dt_s[:, 0, 0])),
     )
     for u, B, F, Q, measured_m in zip(*matrices, inputs[3], strict=True):
         kalman.predict(u=u, B=B, F=F, Q=Q)
@@ -204,7 +207,7 @@ def _find_previous_steps(run: Replay, times_s: Array) -> tuple[IntArray, Array, 
     )
 
 
-def state_at(run: Replay, times_s: Array) -> Array:
+def predict_state(run: Replay, times_s: Array) -> Array:
     """Predict position (m) and velocity (m/s) at each time from KF's last step before it.
 
     Interpolation would use a measurement before its time. Times outside the run of KF give NaN.
@@ -218,8 +221,8 @@ def state_at(run: Replay, times_s: Array) -> Array:
     return np.where(is_outside, np.nan, state)
 
 
-def variance_at(run: Replay, times_s: Array) -> Array:
-    """Return the variances (m², m²/s²) of the results of :func:`state_at`: FPFᵀ + Q."""
+def predict_variance(run: Replay, times_s: Array) -> Array:
+    """Return the variances (m², m²/s²) of the results of :func:`predict_state`: FPFᵀ + Q."""
     step_index, elapsed_s, is_outside = _find_previous_steps(run, times_s)
     p00, p01, p11 = run.steps[model.COVARIANCE_COLUMNS].to_numpy()[step_index].T
     input_variance_m2_s4 = run.steps["input_variance_m2_s4"].to_numpy()[step_index]

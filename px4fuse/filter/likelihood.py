@@ -1,7 +1,7 @@
-"""Fast innovations of KF, and 95 % intervals of its noises from the likelihood.
+"""KF with one prediction per measurement, and 95 % likelihood intervals of its noises.
 
-The acceleration is integrated between measurements, so KF needs only one prediction per
-measurement. If SIGMA_A and SIGMA_Z are at least 1e-3, the innovations equal those of
+The acceleration is first integrated between measurements, so KF needs few predictions and is fast.
+If SIGMA_A and SIGMA_Z are at least 1e-3, the innovations equal those of
 :mod:`px4fuse.filter.kalman` to 1e-9.
 """
 
@@ -19,7 +19,7 @@ from scipy.special import chdtri
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.filter.model import (
     INITIAL_COVARIANCE,
-    Symmetric,
+    SymmetricElements,
     compute_unit_process_noise,
     propagate_covariance,
     propagate_state,
@@ -34,27 +34,30 @@ from px4fuse.filter.steps import Timeline, make_timeline
 MAX_LOG_LIKELIHOOD_DROP = float(chdtri(1, 0.05)) / 2.0
 # Initial distance (in ln σ) from the maximum in the search for an end of a 95 % interval
 START_LOG_SIGMA_DISTANCE = 0.05
-# The profile likelihood of one σ (SIGMA_A or SIGMA_Z) is maximised over the other σ. Maximum change
-# of ln(other σ) between two points of the profile
-MAX_OTHER_LOG_SIGMA_STEP = 1.0
-# Tolerance of ln(other σ) in this maximisation
-OTHER_LOG_SIGMA_TOLERANCE = 2e-3
+# The profile likelihood of SIGMA_A or SIGMA_Z is maximised over the other σ, the nuisance
+# parameter. Maximum change of ln(nuisance σ) from one point of the profile to the next
+MAX_NUISANCE_LOG_SIGMA_STEP = 1.0
+# Tolerance of ln(nuisance σ) when the likelihood is maximised over it
+NUISANCE_LOG_SIGMA_TOLERANCE = 2e-3
 
 
 @dataclass(frozen=True)
 class PreintegratedMotion:
-    """Measurements of KF, and its acceleration integrated over the intervals between them.
+    """Positions for KF, and IMU acceleration integrated over the intervals between them.
 
     Arrays have the shape (m,), if not stated otherwise.
 
     Attributes
     ----------
     interval_s : ndarray
+        Time from the initial state or the previous position to each position.
     delta_position_m, delta_velocity_m_s : ndarray
         Δp and Δv in each interval due to the acceleration.
     unit_process_noise, added_process_noise : ndarray, shape (m, 3)
-        Elements 00, 01, 11 of Q for SIGMA_A = 1 m/s², and of the additional Q in gaps of the IMU.
+        Elements 00, 01, 11 of the process noise Q in each interval for SIGMA_A = 1 m/s², and of
+        the additional Q in gaps of the IMU.
     measurement_m : ndarray
+        Measured positions.
     initial_state : InitialState
     """
 
@@ -137,7 +140,7 @@ def _assign_steps_to_intervals(timeline: Timeline) -> tuple[IntArray, IntArray, 
 
 
 def innovations(
-    kf_motion: PreintegratedMotion,
+    preintegrated_motion: PreintegratedMotion,
     sigma_a_m_s2: float,
     sigma_z_m: float,
     is_skipped: BoolArray | None = None,
@@ -149,19 +152,21 @@ def innovations(
 
     Parameters
     ----------
-    kf_motion : PreintegratedMotion
+    preintegrated_motion : PreintegratedMotion
     sigma_a_m_s2, sigma_z_m : float
     is_skipped : ndarray of bool, shape (m,), optional
         True for measurements without update; their innovation is computed.
     """
     q, r = sigma_a_m_s2 * sigma_a_m_s2, sigma_z_m * sigma_z_m
-    covariance: Symmetric[float] = INITIAL_COVARIANCE
+    covariance: SymmetricElements[float] = INITIAL_COVARIANCE
     variances_and_gains = []
     for dt, unit_process_noise, added_process_noise, skips_update in zip(
-        kf_motion.interval_s.tolist(),
-        kf_motion.unit_process_noise.tolist(),
-        kf_motion.added_process_noise.tolist(),
-        [False] * len(kf_motion.interval_s) if is_skipped is None else is_skipped.tolist(),
+        preintegrated_motion.interval_s.tolist(),
+        preintegrated_motion.unit_process_noise.tolist(),
+        preintegrated_motion.added_process_noise.tolist(),
+        [False] * len(preintegrated_motion.interval_s)
+        if is_skipped is None
+        else is_skipped.tolist(),
         strict=True,
     ):
         p00, p01, p11 = propagate_covariance(covariance, dt)  # P = FPFᵀ + Q
@@ -174,20 +179,20 @@ def innovations(
         variances_and_gains.append((s, 0.0, 0.0) if skips_update else (s, k0, k1))
         covariance = covariance if skips_update else updated_covariance
     s, k0, k1 = np.array(variances_and_gains).T
-    # The predicted state x at the next measurement is F(x + K(z - Hx)) + [Δp, Δv], with KF's
-    # transition matrix F and gain K. This is linear in x, so the states of all times are the
-    # solution of one lower triangular band system with unit diagonal
-    dt = kf_motion.interval_s[1:]
+    # KF predicts x' = F(x + K(z - Hx)) + [Δp, Δv] at the next measurement, with transition matrix F
+    # and gain K. This is linear in x, so LAPACK solves for the states at all measurements at once,
+    # in a lower triangular band system with unit diagonal
+    dt = preintegrated_motion.interval_s[1:]
     position_gain = k0[:-1] + dt * k1[:-1]
-    measured_m = np.ascontiguousarray(kf_motion.measurement_m.T)
+    measured_m = np.ascontiguousarray(preintegrated_motion.measurement_m.T)
     right_hand_side = np.empty((*measured_m.shape, 2))
-    right_hand_side[..., 0] = kf_motion.delta_position_m.T
-    right_hand_side[..., 1] = kf_motion.delta_velocity_m_s.T
+    right_hand_side[..., 0] = preintegrated_motion.delta_position_m.T
+    right_hand_side[..., 1] = preintegrated_motion.delta_velocity_m_s.T
     right_hand_side[..., 1:, 0] += position_gain * measured_m[..., :-1]
     right_hand_side[..., 1:, 1] += k1[:-1] * measured_m[..., :-1]
-    initial_state = kf_motion.initial_state
+    initial_state = preintegrated_motion.initial_state
     right_hand_side[..., 0, 0] += (
-        initial_state.position_m + kf_motion.interval_s[0] * initial_state.velocity_m_s
+        initial_state.position_m + preintegrated_motion.interval_s[0] * initial_state.velocity_m_s
     )
     right_hand_side[..., 0, 1] += initial_state.velocity_m_s
     bands = np.zeros((len(s), 2, 4))
@@ -205,7 +210,7 @@ def innovations(
     return np.asarray((measured_m - state[::2].T.reshape(measured_m.shape)).T), s
 
 
-def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
+def fit_parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
     """Fit a parabola to ``profile[index]`` and its two neighbours.
 
     Return the distance from ``index`` to the minimum (0 without a minimum), and the second
@@ -217,21 +222,21 @@ def parabola_vertex(profile: Array, index: int) -> tuple[float, float]:
 
 
 def compute_profile_interval(
-    grid: Array, profile: Array, max_drop: float = MAX_LOG_LIKELIHOOD_DROP
+    grid: Array, profile: Array, max_log_likelihood_drop: float = MAX_LOG_LIKELIHOOD_DROP
 ) -> tuple[float | None, float | None]:
-    """Return the 95 % interval of a parameter from its profile -ln p on a grid.
+    """Return the interval of a parameter in which -ln p on a grid is close to its minimum.
 
-    None replaces an end outside the grid. ``max_drop`` is the decrease of the log-likelihood from
-    its maximum to the ends.
+    At its ends, -ln p is ``max_log_likelihood_drop`` larger than the minimum; the default gives a
+    95 % interval. An end outside the grid is None.
     """
-    score_drops = profile - profile.min()
-    first_index, last_index = np.flatnonzero(score_drops <= max_drop)[[0, -1]]
+    score_rises = profile - profile.min()
+    first_index, last_index = np.flatnonzero(score_rises <= max_log_likelihood_drop)[[0, -1]]
 
     def interpolate_end(inside_index: int, outside_index: int) -> float | None:
         if not 0 <= outside_index < len(grid):
             return None
-        grid_fraction = (max_drop - score_drops[inside_index]) / (
-            score_drops[outside_index] - score_drops[inside_index]
+        grid_fraction = (max_log_likelihood_drop - score_rises[inside_index]) / (
+            score_rises[outside_index] - score_rises[inside_index]
         )
         return float(
             grid[inside_index] + grid_fraction * (grid[outside_index] - grid[inside_index])
@@ -244,7 +249,7 @@ def compute_profile_interval(
 
 def find_profile_interval(
     score: Callable[[float, float], float],
-    best_log_values: tuple[float, float],
+    best_log_sigmas: tuple[float, float],
     parameter_bounds: tuple[float, float],
     variance_factor: float = 1.0,
 ) -> tuple[float | None, float | None]:
@@ -255,50 +260,53 @@ def find_profile_interval(
     score : callable
         -ln p as a function of the logarithms of the parameter and of a second parameter, over
         which -ln p is minimised.
-    best_log_values : (float, float)
+    best_log_sigmas : (float, float)
         Natural logarithms of both parameters at the minimum.
     parameter_bounds : (float, float)
         Bounds of the first parameter, not of its logarithm.
     variance_factor : float
         Factor on the parameter's variance, for uncertainty that ``score`` does not include.
     """
-    best_score = score(*best_log_values)
-    max_sqrt_drop = float(np.sqrt(MAX_LOG_LIKELIHOOD_DROP * variance_factor))
+    best_score = score(*best_log_sigmas)
+    max_sqrt_likelihood_drop = float(np.sqrt(MAX_LOG_LIKELIHOOD_DROP * variance_factor))
 
     def find_interval_end(direction: float, bound: float) -> float | None:
-        other_log_sigma = best_log_values[1]
+        nuisance_log_sigma = best_log_sigmas[1]
 
         # √(decrease of the log-likelihood from its maximum) is nearly linear in the distance of ln
         # σ from its estimate, so brentq is fast
         @cache
-        def compute_sqrt_drop_excess(log_sigma_distance: float) -> float:
-            nonlocal other_log_sigma
+        def compute_sqrt_drop_minus_limit(log_sigma_distance: float) -> float:
+            nonlocal nuisance_log_sigma
             if log_sigma_distance == 0.0:
-                return -max_sqrt_drop
-            minimum_over_other_sigma = minimize_scalar(
-                lambda log_value: score(
-                    best_log_values[0] + direction * log_sigma_distance, log_value
+                return -max_sqrt_likelihood_drop
+            minimum_over_nuisance = minimize_scalar(
+                lambda log_nuisance: score(
+                    best_log_sigmas[0] + direction * log_sigma_distance, log_nuisance
                 ),
                 bounds=(
-                    other_log_sigma - MAX_OTHER_LOG_SIGMA_STEP,
-                    other_log_sigma + MAX_OTHER_LOG_SIGMA_STEP,
+                    nuisance_log_sigma - MAX_NUISANCE_LOG_SIGMA_STEP,
+                    nuisance_log_sigma + MAX_NUISANCE_LOG_SIGMA_STEP,
                 ),
-                options={"xatol": OTHER_LOG_SIGMA_TOLERANCE},
+                options={"xatol": NUISANCE_LOG_SIGMA_TOLERANCE},
             )
-            other_log_sigma = float(minimum_over_other_sigma.x)
+            nuisance_log_sigma = float(minimum_over_nuisance.x)
             return float(
-                np.sqrt(max(minimum_over_other_sigma.fun - best_score, 0.0)) - max_sqrt_drop
+                np.sqrt(max(minimum_over_nuisance.fun - best_score, 0.0)) - max_sqrt_likelihood_drop
             )
 
-        max_distance = direction * (float(np.log(bound)) - best_log_values[0])
-        distance_limit = min(START_LOG_SIGMA_DISTANCE, max_distance)
-        while compute_sqrt_drop_excess(distance_limit) < 0.0:
-            if distance_limit == max_distance:
+        max_log_sigma_distance = direction * (float(np.log(bound)) - best_log_sigmas[0])
+        outer_log_sigma_distance = min(START_LOG_SIGMA_DISTANCE, max_log_sigma_distance)
+        while compute_sqrt_drop_minus_limit(outer_log_sigma_distance) < 0.0:
+            if outer_log_sigma_distance == max_log_sigma_distance:
                 return None
-            distance_limit = min(2.0 * distance_limit, max_distance)
+            outer_log_sigma_distance = min(2.0 * outer_log_sigma_distance, max_log_sigma_distance)
         log_sigma_distance = brentq(
-            compute_sqrt_drop_excess, 0.0, distance_limit, xtol=1e-3 * distance_limit
+            compute_sqrt_drop_minus_limit,
+            0.0,
+            outer_log_sigma_distance,
+            xtol=1e-3 * outer_log_sigma_distance,
         )
-        return float(np.exp(best_log_values[0] + direction * log_sigma_distance))
+        return float(np.exp(best_log_sigmas[0] + direction * log_sigma_distance))
 
     return find_interval_end(-1.0, parameter_bounds[0]), find_interval_end(1.0, parameter_bounds[1])

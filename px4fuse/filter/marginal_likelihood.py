@@ -12,11 +12,12 @@ The matrix A of this quadratic form has three bands below the diagonal, so LAPAC
 flight in a millisecond. log|A| and the squared residuals at the minimum give the likelihood, which
 equals that of KF's innovations (Schweppe 1965).
 
-The states at the minimum are linear in the data and in the constants. The system is therefore
-solved for the data and for their derivative with respect to each constant ("inputs": z, Δp and Δv
-of all measurements). The inner products of all inputs, weighted by the inverse covariance, are a
-Gram matrix; its Schur complement eliminates the constants. Time-correlated noise is a third state,
-c_{k+1} = ρ c_k + noise, in the measurement: z - p - c.
+The states at the minimum are linear in the data and in the constants. This is a linear regression:
+the system is solved for several inputs, the data and their derivative with respect to each
+constant. An input consists of z, Δp and Δv of all measurements. The inner products of all inputs,
+weighted by the inverse covariance, are a Gram matrix; its Schur complement eliminates the
+constants. Time-correlated noise is a third state, c_{k+1} = ρ c_k + noise. The residual of a
+measurement is then z - p - c.
 
 Symbols in shapes: m measurements, a axes, s segments, T time offsets, c constants.
 """
@@ -37,13 +38,15 @@ from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 UNIT_SCALE = np.ones(1)
 # Noise parameters with which positions are smoothed to a path
 SMOOTHER_SIGMA_A_M_S2, SMOOTHER_SIGMA_Z_M = 0.5, 0.1
-# An initial position counts as known if its prior precision (1/m²) is larger than this
-MIN_KNOWN_START_PRECISION = 1e-3
-# Ratio of the σ that is added to make a singular process noise Q invertible: Q₀₀ (position
-# variance) increases by the square of this ratio times R + Q₀₀
-ADDED_NOISE_RATIO = 1e-5
-# Number of pairs of inputs (see above) whose inner products are computed at once, to limit memory
-INPUT_BATCH_SIZE = 8
+# A larger prior precision (1/m² or s²/m²) means that the initial state is known. A smaller one only
+# prevents a singular matrix
+MIN_KNOWN_STATE_PRECISION = 1e-3
+# To make a singular process noise Q invertible, (this ratio)² · (R + Q₀₀) is added to Q₀₀, the
+# position variance
+ADDED_SIGMA_RATIO = 1e-5
+# Number of pairs of inputs (z, Δp and Δv) whose inner products are computed at once, to limit
+# memory
+INPUT_PAIRS_PER_BATCH = 8
 # Minimum ratio |Q| / (Q₀₀ Q₁₁): a smaller determinant is a rounding error
 MIN_Q_DETERMINANT_RATIO = 1e-12
 
@@ -51,6 +54,9 @@ MIN_Q_DETERMINANT_RATIO = 1e-12
 @dataclass(frozen=True)
 class PositionsAndIncrements:
     """Positions of one source along several axes, and the IMU increments Δp and Δv between them.
+
+    Symbols in shapes: m measurements, a axes, s segments, T tested time offsets, c unknown
+    constants (biases, ...).
 
     Attributes
     ----------
@@ -64,7 +70,7 @@ class PositionsAndIncrements:
         Elements 00, 01, 11 of Q for SIGMA_A = 1 m/s², and of additional process noise.
     prior_precision : ndarray, shape (m, 2)
         Prior precision of position and velocity; 0 without a prior.
-    constants_prior_sigma : ndarray, shape (c,)
+    constant_prior_sigmas : ndarray, shape (c,)
         Prior σ of the unknown constants of each segment.
     delta_position_m, delta_velocity_m_s : ndarray, shape (a, T, 1 + c, m - 1)
         Position and velocity change by the acceleration in each interval, then their derivative
@@ -79,7 +85,7 @@ class PositionsAndIncrements:
     unit_process_noise: Array
     added_process_noise: Array
     prior_precision: Array
-    constants_prior_sigma: Array
+    constant_prior_sigmas: Array
     delta_position_m: Array
     delta_velocity_m_s: Array
     correlated_noise: tuple[float, float] | None = None
@@ -115,16 +121,16 @@ class PositionsAndIncrements:
         )
 
     def normalise_by_sigma_z(
-        self, sigma_z_m: float, random_walk: float, measurement_weights: Array
+        self, sigma_z_m: float, random_walk_to_sigma_z: float, measurement_weights: Array
     ) -> tuple[PositionsAndIncrements, Array]:
-        """Divide the σ of all noises by SIGMA_Z; return the result and the measurement variances.
+        """Divide all σ by SIGMA_Z; return the result and the variance of each measurement.
 
-        ``random_walk`` (1/√s) is the random walk of the source, divided by SIGMA_Z. The variance of
-        a measurement is 1 / weight. First measurements in excess of the weights get the weight 1.
+        ``random_walk_to_sigma_z`` (1/√s) is the random walk of the source, divided by SIGMA_Z. The
+        variance is 1 / weight, or 1 for measurements before the first with a weight.
         """
         added_process_noise = self.added_process_noise / sigma_z_m**2
-        added_process_noise[0] += self.interval_s * random_walk**2
-        start_weights = np.ones(len(self.measurement_m) - len(measurement_weights))
+        added_process_noise[0] += self.interval_s * random_walk_to_sigma_z**2
+        initial_state_weights = np.ones(len(self.measurement_m) - len(measurement_weights))
         correlated_noise = self.correlated_noise
         if correlated_noise:
             correlated_noise = correlated_noise[0] / sigma_z_m, correlated_noise[1]
@@ -134,7 +140,7 @@ class PositionsAndIncrements:
             prior_precision=self.prior_precision * sigma_z_m**2,
             correlated_noise=correlated_noise,
         )
-        return scaled_positions, 1.0 / np.concatenate([start_weights, measurement_weights])
+        return scaled_positions, 1.0 / np.concatenate([initial_state_weights, measurement_weights])
 
     def factorise_equations(
         self, sigma_a_m_s2: float, variance_m2: Array
@@ -168,7 +174,7 @@ class PositionsAndIncrements:
             state_precision[self.segment_starts[has_too_few_measurements]] += 1.0
             is_known = (state_precision > 0.0) & (
                 (state_precision > self.prior_precision)
-                | (self.prior_precision > MIN_KNOWN_START_PRECISION)
+                | (self.prior_precision > MIN_KNOWN_STATE_PRECISION)
             )
             system = factorise(
                 self.interval_s,
@@ -186,28 +192,28 @@ class PositionsAndIncrements:
 
 
 @dataclass(frozen=True)
-class FittedPositions:
-    """Fit of the constants to positions with given noise parameters, and its likelihood.
+class PositionFit:
+    """Fit of the constants (biases, ...) to positions with given noise parameters.
 
     Attributes
     ----------
-    gram : ndarray, shape (s, T, 1 + c, 1 + c)
+    gram : ndarray, shape (segments, time offsets, 1 + c, 1 + c)
         Inner products of the data, and of their derivatives with respect to the constants, weighted
         by the inverse covariance of the positions.
     covariance_log_determinant : float
         Logarithm of the determinant of this covariance.
     degrees_of_freedom : int
         Number of measured positions minus the number that determines the initial states.
-    constants_prior_sigma : ndarray, shape (c,)
-        Prior σ of the constants.
+    constant_prior_sigmas : ndarray, shape (c,)
+        Prior σ of the c constants.
     """
 
     gram: Array
     covariance_log_determinant: float
     degrees_of_freedom: int
-    constants_prior_sigma: Array
+    constant_prior_sigmas: Array
 
-    def scale_sigmas(self, factor: float) -> FittedPositions:
+    def scale_sigmas(self, factor: float) -> PositionFit:
         """Return the fit with the σ of all noises multiplied by ``factor``."""
         covariance_log_determinant = (
             self.covariance_log_determinant + 2.0 * self.degrees_of_freedom * math.log(factor)
@@ -217,37 +223,37 @@ class FittedPositions:
         )
 
     def compute_information(self) -> Array:
-        """Return the inverse covariance of the constants (biases, ...), shape (s, T, c, c)."""
-        return np.asarray(self.gram[..., 1:, 1:] + np.diag(self.constants_prior_sigma**-2.0))
+        """Return the inverse covariance of the constants, shape (segments, time offsets, c, c)."""
+        return np.asarray(self.gram[..., 1:, 1:] + np.diag(self.constant_prior_sigmas**-2.0))
 
-    def estimate_constants(self) -> Array:
-        """Return the maximum-likelihood values of the constants (biases, ...), shape (s, T, c)."""
+    def estimate_segment_constants(self) -> Array:
+        """Return maximum-likelihood constants (biases, ...), shape (segments, time offsets, c)."""
         return np.asarray(
             -np.linalg.solve(self.compute_information(), self.gram[..., 1:, :1])[..., 0]
         )
 
     def compute_segment_scores(self, sigma_factors: Array = UNIT_SCALE) -> Array:
-        """Return -ln p of the positions in each segment, shape (k, s, T).
+        """Return -ln p of the positions in each segment, shape (factors, segments, time offsets).
 
-        The σ of all noises is multiplied by each of k ``sigma_factors``. The log-determinant of the
-        covariance, which is equal for all time offsets, is omitted.
+        All σ are multiplied by each of ``sigma_factors``. The log-determinant of the covariance,
+        which is equal for all time offsets, is omitted.
         """
         scaled_gram = self.gram / sigma_factors[:, None, None, None, None] ** 2
-        prior_sigma = self.constants_prior_sigma
+        prior_sigma = self.constant_prior_sigmas
         information = scaled_gram[..., 1:, 1:] * np.outer(prior_sigma, prior_sigma) + np.eye(
             len(prior_sigma)
         )
         cross_products = scaled_gram[..., 1:, 0] * prior_sigma
-        cholesky = np.linalg.cholesky(information)
+        cholesky_factor = np.linalg.cholesky(information)
         estimated_constants = np.linalg.solve(information, cross_products[..., None])[..., 0]
-        half_log_determinant = np.log(np.diagonal(cholesky, axis1=-2, axis2=-1)).sum(axis=-1)
+        half_log_determinant = np.log(np.diagonal(cholesky_factor, axis1=-2, axis2=-1)).sum(axis=-1)
         square_sum = scaled_gram[..., 0, 0] - np.sum(cross_products * estimated_constants, axis=-1)
         return np.asarray(0.5 * square_sum + half_log_determinant)
 
     def compute_scores(self, sigma_factors: Array = UNIT_SCALE) -> Array:
-        """Return -ln p of the positions, shape (k, T), without its multiple of ln 2π.
+        """Return -ln p of the positions, shape (factors, time offsets), without a constant term.
 
-        The σ of all noises is multiplied by each of k ``sigma_factors``.
+        All σ are multiplied by each of ``sigma_factors``.
         """
         determinant_terms = (
             0.5 * self.covariance_log_determinant + self.degrees_of_freedom * np.log(sigma_factors)
@@ -262,16 +268,16 @@ def fit_positions(
     sigma_a_m_s2: float,
     variance_m2: Array,
     measured_m: Array | None = None,
-) -> FittedPositions:
-    """Fit the constants to positions with given SIGMA_A and variance of each measurement.
+) -> PositionFit:
+    """Fit the constants (biases, ...) to positions, with given SIGMA_A and measurement variances.
 
-    The inputs (see above) are the data, then their derivative with respect to each constant.
-    ``measured_m``, shape (a, 1 or T, k, m), contains the measured positions of the first k inputs;
-    by default, only the data have measured positions. The other inputs have zeros.
+    The inputs are the data, then their derivative with respect to each constant. ``measured_m``,
+    shape (axes, 1 or time offsets, k, measurements), contains the measured positions of the first k
+    inputs, by default of the data only. They are zero for the other inputs.
     """
     if measured_m is None:
         measured_m = np.nan_to_num(positions.measurement_m.T)[:, None, None]
-    measured_count = measured_m.shape[2]
+    measured_input_count = measured_m.shape[2]
     dp = positions.delta_position_m
     dv = positions.delta_velocity_m_s
     gram = np.zeros((len(positions.segment_starts), *dp.shape[1:3], dp.shape[2]))
@@ -286,19 +292,19 @@ def fit_positions(
         for index, (begin, end) in enumerate(positions.segments):
             rows, interval_index = slice(begin, end), np.s_[axes, ..., begin : end - 1]
             segment_measured_m = measured_m[axes, ..., rows]
-            increments, explained_component = system.cut(rows).whiten(
+            increments, state_projection = system.cut(rows).whiten(
                 segment_measured_m, dp[interval_index], dv[interval_index]
             )
             whitened_measurements = np.sqrt(system.precision[rows, 0]) * segment_measured_m
-            gram[index] += _compute_gram(increments) - _compute_gram(explained_component)
-            gram[index, :, :measured_count, :measured_count] += _compute_gram(whitened_measurements)
-    return FittedPositions(
-        gram, log_determinant, degrees_of_freedom, positions.constants_prior_sigma
-    )
+            gram[index] += _compute_gram(increments) - _compute_gram(state_projection)
+            gram[index, :, :measured_input_count, :measured_input_count] += _compute_gram(
+                whitened_measurements
+            )
+    return PositionFit(gram, log_determinant, degrees_of_freedom, positions.constant_prior_sigmas)
 
 
 def _compute_gram(whitened: Array) -> Array:
-    """Return the Gram matrix of whitened inputs, shape (..., inputs, values), summed over axes."""
+    """Return XXᵀ of whitened inputs X, shape (axes, ..., inputs, values), summed over axes."""
     return np.asarray((whitened @ np.swapaxes(whitened, -1, -2)).sum(axis=0))
 
 
@@ -307,8 +313,8 @@ def subtract_smooth_path(
 ) -> PositionsAndIncrements:
     """Subtract a smooth path through the positions from positions and IMU increments.
 
-    The likelihood stays equal, but its rounding errors decrease. With ``estimates_scale``, the last
-    constant is the scale factor error of the positions, and the path is the derivative for it.
+    The likelihood stays equal, but its rounding errors decrease. With ``estimates_scale``, the path
+    becomes the derivative with respect to the last constant, the scale factor error of positions.
     """
     measured_m = positions.measurement_m.copy()
     dp = positions.delta_position_m.copy()
@@ -325,7 +331,8 @@ def subtract_smooth_path(
         path_velocity_m_s = smoothed_state[..., 1]
         measured_m[:, axes] -= path_m[:, 0].T
         path_delta_position_m = np.diff(path_m) - positions.interval_s * path_velocity_m_s[..., :-1]
-        # Measurements are common to all time offsets, so all get the path of the first offset
+        # The measurements do not depend on the time offset, so the path of the first time offset is
+        # subtracted for all time offsets
         for array, increment in ((dp, path_delta_position_m), (dv, np.diff(path_velocity_m_s))):
             array[axes, :, 0] -= increment[:, :1]
             if estimates_scale:
@@ -338,7 +345,8 @@ def estimate_squared_errors(
 ) -> ArrayPair:
     """Return the expected squared error (m²) and the number of measured axes of each measurement.
 
-    The error is the measured minus the true position, given all measurements, summed over the axes.
+    The error is measured minus true position. Its expected square is the squared residual of the
+    smoothed position plus the variance of this position, summed over the axes.
 
     Parameters
     ----------
@@ -347,17 +355,16 @@ def estimate_squared_errors(
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
         Variance of each measurement.
-    constants : ndarray, shape (s, c)
-        Maximum-likelihood values of the constants.
+    constants : ndarray, shape (segments, c)
+        Maximum-likelihood values of the constants (biases, ...).
     """
-    coefficients = np.concatenate([np.ones((len(constants), 1)), constants], axis=1)
-    # Δp and Δv are corrected with the constants (biases, ...) of the segment in which the interval
-    # ends
-    interval_coefficients = np.repeat(
-        coefficients, np.diff([*positions.segment_starts, len(variance_m2)]), axis=0
+    input_weights = np.concatenate([np.ones((len(constants), 1)), constants], axis=1)
+    # Correct Δp and Δv of each interval with the constants (biases, ...) of its segment
+    interval_input_weights = np.repeat(
+        input_weights, np.diff([*positions.segment_starts, len(variance_m2)]), axis=0
     )[1:]
     increments = positions.delta_position_m, positions.delta_velocity_m_s
-    dp, dv = (np.einsum("akn,nk->an", array[:, 0], interval_coefficients) for array in increments)
+    dp, dv = (np.einsum("akn,nk->an", array[:, 0], interval_input_weights) for array in increments)
     expected_squared_error_m2 = np.zeros(len(variance_m2))
     for axes, system, _ in positions.factorise_equations(sigma_a_m_s2, variance_m2):
         measured_m = positions.measurement_m[:, axes].T
@@ -367,17 +374,17 @@ def estimate_squared_errors(
     return expected_squared_error_m2, np.isfinite(positions.measurement_m).sum(axis=1)
 
 
-def compute_segment_products(
+def compute_segment_inner_products(
     positions: PositionsAndIncrements,
     sigma_a_m_s2: float,
     variance_m2: Array,
     first_positions_and_increments: Sequence[Array],
-    second_positions_m: Array,
+    second_input_positions_m: Array,
 ) -> Array:
-    """Return the inner products of k pairs of inputs in each of s segments, shape (s, k).
+    """Return the inner product uᵀC⁻¹v of each of k pairs of inputs, shape (segments, k).
 
-    An input consists of measured positions, Δp and Δv. The inner product is uᵀC⁻¹v, where C is the
-    covariance of the positions given the acceleration, including that due to unknown constants.
+    An input u or v consists of measured positions, Δp and Δv. C is the covariance of the positions
+    given the acceleration, including the effect of the unknown constants (biases, ...).
 
     Parameters
     ----------
@@ -386,10 +393,11 @@ def compute_segment_products(
     sigma_a_m_s2 : float
     variance_m2 : ndarray, shape (m,)
         Variance of each measurement.
-    first_positions_and_increments : three ndarray, shape (a, k, m) and twice (a, k, m - 1)
-        First input of each pair: measured positions, Δp and Δv.
-    second_positions_m : ndarray, shape (a, k, m)
-        Measured positions of the second input of each pair; its Δp and Δv are zero.
+    first_positions_and_increments : three ndarray
+        First input u of each pair: measured positions, shape (axes, k, m); Δp and Δv, shape (axes,
+        k, m - 1).
+    second_input_positions_m : ndarray, shape (axes, k, m)
+        Measured positions of the second input v of each pair; its Δp and Δv are zero.
     """
     first_positions_m, *increments = first_positions_and_increments
     constant_increments = (
@@ -397,9 +405,10 @@ def compute_segment_products(
         positions.delta_velocity_m_s[:, 0, 1:],
     )
     batch_products = []
-    for begin in range(0, second_positions_m.shape[1], INPUT_BATCH_SIZE):
-        batch = np.s_[:, begin : begin + INPUT_BATCH_SIZE]
-        # Inputs: first of each pair, second of each pair, derivatives with respect to the constants
+    for begin in range(0, second_input_positions_m.shape[1], INPUT_PAIRS_PER_BATCH):
+        batch = np.s_[:, begin : begin + INPUT_PAIRS_PER_BATCH]
+        # Stack the first inputs of all pairs, the second inputs of all pairs, and the derivatives
+        # of the data with respect to the constants
         dp, dv = (
             np.concatenate([increment[batch], 0.0 * increment[batch], constant_increment], axis=1)[
                 :, None
@@ -410,22 +419,24 @@ def compute_segment_products(
             np.arange(dp.shape[2]), np.array([1, 2]) * first_positions_m[batch].shape[1]
         )
         batch_measured_m = np.concatenate(
-            [first_positions_m[batch], second_positions_m[batch]], axis=1
+            [first_positions_m[batch], second_input_positions_m[batch]], axis=1
         )[:, None]
         stacked_positions = replace(positions, delta_position_m=dp, delta_velocity_m_s=dv)
         gram = fit_positions(stacked_positions, sigma_a_m_s2, variance_m2, batch_measured_m).gram[
             :, 0
         ]
         information = gram[:, constant_rows[:, None], constant_rows] + np.diag(
-            positions.constants_prior_sigma**-2.0
+            positions.constant_prior_sigmas**-2.0
         )
         constant_coefficients = np.linalg.solve(
             information, gram[:, constant_rows[:, None], second_input_rows]
         )
-        explained_by_constants = np.einsum(
+        products_due_to_constants = np.einsum(
             "skc,sck->sk", gram[:, first_input_rows[:, None], constant_rows], constant_coefficients
         )
-        batch_products.append(gram[:, first_input_rows, second_input_rows] - explained_by_constants)
+        batch_products.append(
+            gram[:, first_input_rows, second_input_rows] - products_due_to_constants
+        )
     return np.concatenate(batch_products, axis=1)
 
 
@@ -443,7 +454,7 @@ class BandedSystem:
         Elements 00, 01, 11 of the inverse process noise Q⁻¹; zero for intervals between segments.
     inverse_sqrt_q11 : ndarray, shape (m - 1,)
         1/√Q₁₁; zero for intervals between segments.
-    bands, cholesky_factor : ndarray, shape (2 + states, states · m)
+    bands, cholesky_factor : ndarray, shape (2 + state_count, state_count · m)
         Information matrix A of all states and its Cholesky factor in LAPACK's band storage.
     log_determinant : float
         ln|A| + Σ ln|Q| - Σ ln precision.
@@ -463,34 +474,35 @@ class BandedSystem:
         return len(self.bands) - 2
 
     def cut(self, rows: slice) -> BandedSystem:
-        """Return the equations of one segment, which does not depend on others."""
+        """Return the equations of one segment. Segments do not depend on each other."""
         columns = slice(self.state_count * rows.start, self.state_count * rows.stop)
-        intervals = slice(rows.start, rows.stop - 1)
+        interval_slice = slice(rows.start, rows.stop - 1)
         return replace(
             self,
             precision=self.precision[rows],
-            interval_s=self.interval_s[intervals],
-            inverse_q=self.inverse_q[:, intervals],
-            inverse_sqrt_q11=self.inverse_sqrt_q11[intervals],
+            interval_s=self.interval_s[interval_slice],
+            inverse_q=self.inverse_q[:, interval_slice],
+            inverse_sqrt_q11=self.inverse_sqrt_q11[interval_slice],
             bands=self.bands[:, columns],
             cholesky_factor=self.cholesky_factor[:, columns],
         )
 
     def whiten(self, measured_m: Array, dp: Array, dv: Array) -> ArrayPair:
-        """Return the whitened Δp and Δv of inputs (w), and their projection on the states (e).
+        """Return whitened Δp and Δv of each input (w), and its projection on the states (e).
 
-        The inner product of inputs i and j, weighted by the inverse covariance, is wᵢᵀwⱼ - eᵢᵀeⱼ +
-        zᵢᵀzⱼ/σ², with measured positions z. ``measured_m``, shape (..., k, m), contains z of the
-        first k inputs; z of the others is zero.
+        An input consists of measured positions z, Δp and Δv. The inner product of inputs i and j,
+        weighted by the inverse covariance of the positions, is wᵢᵀwⱼ - eᵢᵀeⱼ + zᵢᵀzⱼ/σ².
+        ``measured_m``, shape (..., k, m), contains z of the first k inputs; z of the others is
+        zero.
         """
-        whitened, right_hand_side = self._whiten_increments(measured_m, dp, dv)
+        whitened_increments, right_hand_side = self._whiten_increments(measured_m, dp, dv)
         # LAPACK solves a triangular system with unit diagonal 30 % faster: without divisions
         diagonal = self.cholesky_factor[0]
         unit_diagonal_factor = self.cholesky_factor / diagonal
-        explained_component, _ = lapack.dtbtrs(
+        state_projection, _ = lapack.dtbtrs(
             unit_diagonal_factor, right_hand_side.T, uplo="L", diag="U", overwrite_b=1
         )
-        return whitened, (explained_component.T / diagonal).reshape(*dp.shape[:-1], -1)
+        return whitened_increments, (state_projection.T / diagonal).reshape(*dp.shape[:-1], -1)
 
     def solve(self, measured_m: Array, dp: Array, dv: Array) -> Array:
         """Estimate the states from measured positions, Δp and Δv; shape (..., m, states).
@@ -502,16 +514,16 @@ class BandedSystem:
         return np.asarray(state.T.reshape(*dp.shape[:-1], -1, self.state_count))
 
     def _whiten_increments(self, measured_m: Array, dp: Array, dv: Array) -> ArrayPair:
-        """Return Δp and Δv whitened with Q, and the right-hand side b of the normal equations."""
+        """Return Δp and Δv whitened with Q, and b of the normal equations Ax = b."""
         inverse_q00, inverse_q01, _ = self.inverse_q
         # Cholesky factor U of Q⁻¹ = UᵀU
         u00 = np.sqrt(inverse_q00)
         u01 = np.divide(inverse_q01, u00, out=np.zeros_like(inverse_q01), where=u00 > 0.0)
-        whitened = np.empty((*dp.shape, 2))
-        whitened[..., 0] = u00 * dp + u01 * dv
-        whitened[..., 1] = self.inverse_sqrt_q11 * dv
-        g0 = u00 * whitened[..., 0]
-        g1 = u01 * whitened[..., 0] + self.inverse_sqrt_q11 * whitened[..., 1]
+        whitened_increments = np.empty((*dp.shape, 2))
+        whitened_increments[..., 0] = u00 * dp + u01 * dv
+        whitened_increments[..., 1] = self.inverse_sqrt_q11 * dv
+        g0 = u00 * whitened_increments[..., 0]
+        g1 = u01 * whitened_increments[..., 0] + self.inverse_sqrt_q11 * whitened_increments[..., 1]
         right_hand_side = np.zeros((*dp.shape[:-1], len(self.precision), self.state_count))
         right_hand_side[..., 1:, 0] = g0
         right_hand_side[..., 1:, 1] = g1
@@ -523,7 +535,7 @@ class BandedSystem:
         measured_right_hand_side = right_hand_side[..., : measured_m.shape[-2], :, :]
         measured_right_hand_side[..., 0] += weighted_measurements
         measured_right_hand_side[..., 2:] += weighted_measurements[..., None]
-        return whitened.reshape(*dp.shape[:-1], -1), right_hand_side.reshape(
+        return whitened_increments.reshape(*dp.shape[:-1], -1), right_hand_side.reshape(
             -1, self.state_count * len(self.precision)
         )
 
@@ -531,9 +543,10 @@ class BandedSystem:
         """Return the variance (m²) of the position at each measurement, given all measurements.
 
         The information from earlier and from later measurements is added (Fraser and Potter 1969).
-        The first is a block of the Cholesky factor of A, the second of A in reversed order.
+        That from earlier ones is a block of the Cholesky factor of A (Ax = b), that from later ones
+        is a block of the factor of A with reversed rows and columns.
         """
-        # Reverse the rows and columns of A, so that the last state is first
+        # Reverse A: its Cholesky factor then contains the information from later measurements
         reversed_bands = np.zeros_like(self.bands)
         unknown_count = self.bands.shape[1]
         for band in range(4):
@@ -541,8 +554,8 @@ class BandedSystem:
                 ::-1
             ]
         reversed_cholesky_factor, _ = lapack.dpbtrf(reversed_bands, lower=1, overwrite_ab=1)
-        # Diagonal blocks of the factors: [[a, 0], [b, c]], and [[d, 0], [e, f]] in reversed order,
-        # with velocity before position
+        # Diagonal blocks of the Cholesky factors: [[a, 0], [b, c]] of A, [[d, 0], [e, f]] of the
+        # reversed A, in which velocity precedes position
         (a, c) = (self.cholesky_factor[0, first_row::2] for first_row in (0, 1))
         b = self.cholesky_factor[1, 0::2]
         (d, f) = (reversed_cholesky_factor[0, first_row::2][::-1] for first_row in (0, 1))
@@ -560,7 +573,7 @@ def factorise(
     state_precision: Array,
     correlated_noise: tuple[float, float] | None = None,
 ) -> BandedSystem:
-    """Factorise the normal equations of the states at the measurements.
+    """Factorise A of the normal equations Ax = b for the states x at the measurements.
 
     Parameters
     ----------
@@ -582,7 +595,7 @@ def factorise(
     """
     q00, q01, q11 = process_noise
     measured_precision = state_precision[:, 0]
-    added_variance = ADDED_NOISE_RATIO**2 * (
+    added_variance = ADDED_SIGMA_RATIO**2 * (
         1.0 / np.median(measured_precision[measured_precision > 0.0]) + q00
     )
     # Q of one prediction step is singular. added_variance makes it invertible. Determinants that
@@ -599,8 +612,8 @@ def factorise(
     inverse_q00, inverse_q01, inverse_q11 = inverse_q
     velocity_weight = inverse_q00 * interval_s
     position_velocity_weight = velocity_weight + inverse_q01
-    # Information matrix A = diag(precision) + Σ [-F I]ᵀ Q⁻¹ [-F I] over the intervals, with KF's
-    # transition matrix F, in the columns of LAPACK's band storage
+    # Information matrix of the states: A = diag(precision) + Σ [-F I]ᵀ Q⁻¹ [-F I] over the
+    # intervals, with KF's transition matrix F. It is stored by columns in LAPACK's band format
     state_count = 2 if correlated_noise is None else 3
     band_columns = np.zeros((len(state_precision), state_count, state_count + 2))
     position_rows = band_columns[:, 0]
@@ -622,13 +635,13 @@ def factorise(
         rho = np.where(is_within_segment, np.exp(-interval_s / tau_s), 0.0)
         # Variance of the driving white noise of a first-order Gauss-Markov process: σ_c² at the
         # first time of a segment, then (1 - ρ²) σ_c²
-        correlated_variance = correlated_sigma_m**2 * np.append(1.0, 1.0 - rho**2)
+        driving_noise_variance_m2 = correlated_sigma_m**2 * np.append(1.0, 1.0 - rho**2)
         correlated_noise_rows = band_columns[:, 2]
         position_rows[:, 2] = measured_precision
-        correlated_noise_rows[:, 0] = measured_precision + 1.0 / correlated_variance
-        correlated_noise_rows[:-1, 0] += rho**2 / correlated_variance[1:]
-        correlated_noise_rows[:-1, state_count] = -rho / correlated_variance[1:]
-        process_noise_log_determinant += np.sum(np.log(correlated_variance))
+        correlated_noise_rows[:, 0] = measured_precision + 1.0 / driving_noise_variance_m2
+        correlated_noise_rows[:-1, 0] += rho**2 / driving_noise_variance_m2[1:]
+        correlated_noise_rows[:-1, state_count] = -rho / driving_noise_variance_m2[1:]
+        process_noise_log_determinant += np.sum(np.log(driving_noise_variance_m2))
     bands = band_columns.reshape(-1, state_count + 2).T
     cholesky_factor, is_singular = lapack.dpbtrf(bands, lower=1)
     if is_singular:

@@ -21,36 +21,36 @@ from px4fuse.trajectory.rotation import from_elements
 STATE_COLUMNS = ["position_m", "velocity_m_s"]
 COVARIANCE_COLUMNS = ["position_variance_m2", "covariance_m2_s", "velocity_variance_m2_s2"]
 # Initial standard deviations in the lesson UAT 366, module 2: P₀ = diag(0.5², 1.0²)
-INITIAL_SIGMA_P_M = 0.5
-INITIAL_SIGMA_V_M_S = 1.0
-INITIAL_COVARIANCE = (INITIAL_SIGMA_P_M**2, 0.0, INITIAL_SIGMA_V_M_S**2)
+INITIAL_POSITION_SIGMA_M = 0.5
+INITIAL_VELOCITY_SIGMA_M_S = 1.0
+INITIAL_COVARIANCE = (INITIAL_POSITION_SIGMA_M**2, 0.0, INITIAL_VELOCITY_SIGMA_M_S**2)
 
 T = TypeVar("T", float, Array)
 # Elements 00, 01, 11 of a symmetric 2 × 2 matrix
-Symmetric = tuple[T, T, T]
+SymmetricElements = tuple[T, T, T]
 
 
-def symmetric_matrix(covariance: Symmetric[float] | Symmetric[Array]) -> Array:
+def make_symmetric_matrix(covariance: SymmetricElements[float] | SymmetricElements[Array]) -> Array:
     """Return a symmetric 2 × 2 matrix from its elements 00, 01, 11."""
     p00, p01, p11 = covariance
     return from_elements((p00, p01), (p01, p11))
 
 
-def transition(dt_s: float | Array) -> Array:
+def make_transition_matrix(dt_s: float | Array) -> Array:
     """Return KF's transition matrix F, shape (2, 2)."""
     return from_elements((1.0, dt_s), (0.0, 1.0))
 
 
-def compute_unit_process_noise(dt_s: T) -> Symmetric[T]:
+def compute_unit_process_noise(dt_s: T) -> SymmetricElements[T]:
     """Return Q / (SIGMA_A² · DT) of a prediction step of ``dt_s``: elements 00, 01, 11."""
     return dt_s**3 / 4.0, dt_s**2 / 2.0, dt_s
 
 
-def compute_unit_continuous_noise(dt_s: T) -> Symmetric[T]:
+def compute_unit_continuous_noise(dt_s: T) -> SymmetricElements[T]:
     """Return Q / (SIGMA_A² · DT) over ``dt_s`` for continuous white acceleration noise.
 
-    Element 00 is dt³/3, the limit for many short steps; in one prediction step, whose acceleration
-    error is constant, it is dt³/4. DT is the interval for which SIGMA_A is defined.
+    DT is the interval for which SIGMA_A is defined. Element 00 is dt³/3. One prediction step, with
+    a constant acceleration error, has dt³/4; many short steps approach dt³/3.
     """
     return dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s
 
@@ -61,15 +61,20 @@ def propagate_state(position: T, velocity: T, acceleration: T, dt_s: T) -> tuple
     return new_position, velocity + acceleration * dt_s
 
 
-def propagate_covariance(covariance: Symmetric[T], dt_s: T) -> Symmetric[T]:
+def propagate_covariance(covariance: SymmetricElements[T], dt_s: T) -> SymmetricElements[T]:
     """Return FPFᵀ, the predicted covariance without process noise: elements 00, 01, 11."""
     p00, p01, p11 = covariance
     return p00 + 2.0 * dt_s * p01 + dt_s**2 * p11, p01 + dt_s * p11, p11
 
 
 def predict_step(
-    position: T, velocity: T, covariance: Symmetric[T], acceleration: T, noise_density: T, dt_s: T
-) -> tuple[T, T, Symmetric[T]]:
+    position: T,
+    velocity: T,
+    covariance: SymmetricElements[T],
+    acceleration: T,
+    noise_density: T,
+    dt_s: T,
+) -> tuple[T, T, SymmetricElements[T]]:
     """Predict position, velocity and covariance: x = Fx + Ba, P = FPFᵀ + Q.
 
     ``noise_density`` (m²/s³) is the increase of the velocity variance per second, SIGMA_A² · DT.
@@ -86,8 +91,8 @@ def predict_step(
 
 
 def update_step(
-    position: T, velocity: T, covariance: Symmetric[T], measured_m: T, variance: T
-) -> tuple[tuple[T, T, T, T], tuple[T, T, Symmetric[T]]]:
+    position: T, velocity: T, covariance: SymmetricElements[T], measured_m: T, variance: T
+) -> tuple[tuple[T, T, T, T], tuple[T, T, SymmetricElements[T]]]:
     """Update with a measurement: ν = z - Hx, S = HPHᵀ + R, K = PHᵀS⁻¹, x = x + Kν, P = (I - KH)P.
 
     Return (ν in m, S in m², gain of position, gain of velocity), and the updated (position,

@@ -27,6 +27,7 @@ from px4fuse.flight.model import (
     rows_between,
 )
 
+# Name of the axis along the main horizontal direction of the flight
 AISLE = "aisle"
 # Minimum length (s) of a gap in the IMU
 MIN_IMU_GAP_S = 0.1
@@ -34,8 +35,8 @@ MIN_IMU_GAP_S = 0.1
 MIN_IMU_GAP_INTERVALS = 5.0
 # Positions at a higher rate are downsampled to 1 to 2 times this rate (Hz) before the noises are
 # estimated: at short intervals, position errors are time-correlated and add no information
-MAX_INDEPENDENT_RATE_HZ = 25.0
-# Minimum number of position measurements along an axis
+MAX_INDEPENDENT_ERROR_RATE_HZ = 25.0
+# Minimum number of position measurements to run KF along an axis
 MIN_MEASUREMENTS = 3
 
 
@@ -96,7 +97,7 @@ class Acceleration:
         return np.asarray(self.direction @ self.acceleration_integral_m_s)
 
     def compute_rms_m_s2(self) -> float:
-        """Return the RMS acceleration in the segment: σ of the unknown acceleration in IMU gaps."""
+        """Return the RMS acceleration in the segment, used as σ of the acceleration in IMU gaps."""
         return float(np.sqrt(self.direction @ self.acceleration_products_m2_s4 @ self.direction))
 
 
@@ -159,7 +160,7 @@ def imu_and_attitude(flight: Flight) -> tuple[pd.DataFrame, pd.DataFrame] | Unav
     return imu, attitude
 
 
-def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
+def compute_ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     """Return the acceleration in NED without gravity (m/s²) for each IMU sample.
 
     The attitude is interpolated (slerp, Shoemake 1985), because PX4 by default logs it at a tenth
@@ -180,7 +181,7 @@ def ned_acceleration(flight: Flight) -> pd.DataFrame | Unavailable:
     return pd.DataFrame(acceleration, imu.index, list(AXIS_NAMES), copy=False)
 
 
-def aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]:
+def estimate_aisle_heading(track: PositionTrack, segment: Segment) -> tuple[float, float]:
     """Return the main horizontal direction of the positions.
 
     Returns
@@ -227,7 +228,7 @@ def make_axes(
     SettingsError
         An axis has an unknown name, or the heading is not between 0 and 360.
     """
-    acceleration = project_acceleration(ned_acceleration(flight), np.zeros(3), segment)
+    acceleration = project_acceleration(compute_ned_acceleration(flight), np.zeros(3), segment)
     valid_names = (*AXIS_NAMES, AISLE)
     axis_names = tuple(dict.fromkeys(valid_names if names is None else names))
     if heading_deg is not None and not 0.0 <= heading_deg <= 360.0:
@@ -240,7 +241,7 @@ def make_axes(
     source_label = f"{flight.log.name}: {track.name}"
     axes = []
     for name in axis_names:
-        direction, heading, note = _axis_direction(name, track, segment, heading_deg)
+        direction, heading, note = _choose_axis_direction(name, track, segment, heading_deg)
         track_samples = track.samples
         if name == "down" and track.barometer is not None:
             track_samples = track.barometer.reindex(columns=Columns.POSITION)
@@ -274,17 +275,18 @@ def make_axes(
 def make_downsampling_slice(time_s: Array) -> slice:
     """Return a slice that downsamples positions at a high rate to every k-th position.
 
-    The rate is then 1 to 2 times ``MAX_INDEPENDENT_RATE_HZ``.
+    The rate is then 1 to 2 times ``MAX_INDEPENDENT_ERROR_RATE_HZ``.
     """
     interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else np.inf
-    return slice(None, None, max(1, int(1.0 / (interval_s * MAX_INDEPENDENT_RATE_HZ))))
+    return slice(None, None, max(1, int(1.0 / (interval_s * MAX_INDEPENDENT_ERROR_RATE_HZ))))
 
 
-def too_few_measurements(name: str, count: int, min_count: int) -> Unavailable:
-    """Return the message that an analysis has too few measurements."""
+def report_too_few_measurements(
+    analysis_name: str, measurement_count: int, min_count: int
+) -> Unavailable:
     return Unavailable(
-        name,
-        f"only {count} measurements (at least {min_count} are needed)",
+        analysis_name,
+        f"only {measurement_count} measurements (at least {min_count} are needed)",
         "Analyse a longer segment, or log the source at a higher rate.",
     )
 
@@ -298,14 +300,14 @@ def weighted_sum(samples: pd.DataFrame, columns: list[str], weights: Array) -> A
     return weighted_total
 
 
-def _axis_direction(
+def _choose_axis_direction(
     name: str, track: PositionTrack, segment: Segment, heading_deg: float | None
 ) -> tuple[Array, float | None, str]:
     if name != AISLE:
         axis_index = AXIS_NAMES.index(name)
         return np.eye(3)[axis_index], (None if name == "down" else 90.0 * axis_index), ""
     if heading_deg is None:
-        axis_heading_deg, elongation = aisle_heading(track, segment)
+        axis_heading_deg, elongation = estimate_aisle_heading(track, segment)
         note = f"main direction of the track (ratio of length to width: {elongation:.1f})"
     else:
         axis_heading_deg = heading_deg
@@ -333,7 +335,7 @@ def project_acceleration(
     is_gap = find_imu_gaps(time_s)
     gap_rows = np.flatnonzero(is_gap)
     gap_sum_s = np.cumsum(np.where(is_gap, np.diff(time_s), 0.0))
-    gap_ends = np.unique([0, *gap_rows, *(gap_rows + 1), len(time_s) - 1])
+    gap_edge_rows = np.unique([0, *gap_rows, *(gap_rows + 1), len(time_s) - 1])
     return Acceleration(
         time_s=time_s,
         acceleration_integral_m_s=np.array(
@@ -343,8 +345,8 @@ def project_acceleration(
         @ segment_acceleration_m_s2
         / len(segment_acceleration_m_s2),
         direction=direction,
-        gap_edge_time_s=time_s[gap_ends],
-        cumulative_gap_s=np.append(0.0, gap_sum_s)[gap_ends],
+        gap_edge_time_s=time_s[gap_edge_rows],
+        cumulative_gap_s=np.append(0.0, gap_sum_s)[gap_edge_rows],
     )
 
 
@@ -357,7 +359,7 @@ def find_imu_gaps(time_s: Array) -> BoolArray:
 def compute_mean_step_acceleration(
     acceleration: Acceleration, step_edges_s: ArrayLike
 ) -> tuple[Array, Array]:
-    """Return for each prediction step the mean acceleration, and its fraction in an IMU gap.
+    """Return the mean acceleration of each prediction step, and its fraction of time in IMU gaps.
 
     ``step_edges_s`` contains the start of the first step, and the end (s) of each step.
     """

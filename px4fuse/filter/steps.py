@@ -62,8 +62,10 @@ def make_timeline(
     # Multiples of DT that equal a measurement time are omitted, so that no step has zero length
     next_index = np.searchsorted(measurement_time_s, grid_s)
     neighbour_indices = np.clip([next_index - 1, next_index], 0, len(measurement_time_s) - 1)
-    distance_s = np.abs(measurement_time_s[neighbour_indices] - grid_s).min(axis=0)
-    time_s = np.union1d(grid_s[distance_s > MAX_EQUAL_TIME_DIFFERENCE_S], measurement_time_s)
+    time_to_measurement_s = np.abs(measurement_time_s[neighbour_indices] - grid_s).min(axis=0)
+    time_s = np.union1d(
+        grid_s[time_to_measurement_s > MAX_EQUAL_TIME_DIFFERENCE_S], measurement_time_s
+    )
     if time_s[0] > start_s + MAX_EQUAL_TIME_DIFFERENCE_S:
         time_s = np.append(start_s, time_s)
     measurement_index = np.full(len(time_s), -1, dtype=np.intp)
@@ -78,14 +80,15 @@ def make_timeline(
         )
     mean_acceleration_m_s2, gap_fraction = compute_mean_step_acceleration(axis.acceleration, time_s)
     gap_s = gap_fraction * np.diff(time_s)
-    # The unknown acceleration in an IMU gap of T seconds is assumed to be constant. The velocity
-    # error is rms·T instead of rms·√(DT·T) for white noise, so the variance is multiplied by T/DT
+    # The unknown acceleration (rms) in an IMU gap of T seconds is assumed to be constant. It causes
+    # a velocity error of rms·T. White noise would cause rms·√(DT·T), so the variance is multiplied
+    # by T/DT
     interval_index = np.searchsorted(
         np.flatnonzero(measurement_index >= 0), np.arange(1, len(time_s))
     )
     gap_in_interval_s = np.bincount(interval_index, weights=gap_s)[interval_index]
     variance_scale = np.maximum(gap_in_interval_s / settings.dt_s, 1.0)
-    gap_variance = gap_fraction * variance_scale * axis.acceleration.compute_rms_m_s2() ** 2
+    gap_variance_m2_s4 = gap_fraction * variance_scale * axis.acceleration.compute_rms_m_s2() ** 2
     return Timeline(
-        time_s, measurement_index, mean_acceleration_m_s2, gap_variance, float(np.sum(gap_s))
+        time_s, measurement_index, mean_acceleration_m_s2, gap_variance_m2_s4, float(np.sum(gap_s))
     )

@@ -18,7 +18,7 @@ from scipy.special import chdtrc
 
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Record, Share, Span
-from px4fuse.filter.fitting import NoiseParameters, fit_with_noises, maximise_likelihood
+from px4fuse.filter.fitting import NoiseParameters, fit_constant_errors, maximise_likelihood
 from px4fuse.filter.imu_motion import (
     COARSE_MEASUREMENT_COUNT,
     COARSE_OFFSET_COUNT,
@@ -31,9 +31,9 @@ from px4fuse.filter.imu_motion import (
 from px4fuse.filter.likelihood import (
     MAX_LOG_LIKELIHOOD_DROP,
     compute_profile_interval,
-    parabola_vertex,
+    fit_parabola_vertex,
 )
-from px4fuse.filter.marginal_likelihood import compute_segment_products
+from px4fuse.filter.marginal_likelihood import compute_segment_inner_products
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.signals import Segment, cut_to_segment, make_downsampling_slice
 from px4fuse.flight.model import Columns, Flight, PositionTrack, Unavailable
@@ -57,8 +57,8 @@ MIN_TIME_OFFSET_CHANGE_S = 0.10
 MIN_OFFSET_SIGMAS = 3.0
 # A time offset is significant if it exceeds this time (s): position error of 3 cm at 1 m/s
 MIN_TIME_OFFSET_S = 0.03
-# The variance of the time offset is simulated with about 96 samples. Each group of 12 segments
-# gives one sample per series of IMU noise, so a longer flight needs fewer series
+# The variance of the time offset is simulated with about 96 samples. Each group of 12 flight
+# segments gives one sample per simulated series of IMU noise, so a longer flight needs fewer series
 SIMULATION_COUNT, SIMULATED_SEGMENT_COUNT = 96, 12
 
 
@@ -112,7 +112,7 @@ class ClockOffset(Record, kw_only=True):
 
     @property
     def remaining_s(self) -> float:
-        """Offset (s) still to be added to the timestamps."""
+        """Estimated offset (s) minus the offset that was already added to the timestamps."""
         return self.offset_s - self.applied_s
 
     @property
@@ -120,7 +120,7 @@ class ClockOffset(Record, kw_only=True):
         return MIN_OFFSET_SIGMAS * self.sigma_s
 
     def has_changed(self) -> bool:
-        """Return True for a significant change in flight of at least MIN_TIME_OFFSET_CHANGE_S."""
+        """Return True if the offset changes significantly, by MIN_TIME_OFFSET_CHANGE_S or more."""
         if self.change_p_value is None or self.change_p_value >= MAX_CHANGE_P_VALUE:
             return False
         return abs(self.parts[-1].offset_s - self.parts[0].offset_s) >= MIN_TIME_OFFSET_CHANGE_S
@@ -179,7 +179,7 @@ def estimate_time_offset(
     progress("time offset")
     coarse_motion = imu_motion.downsample(COARSE_MEASUREMENT_COUNT)
     offset_s, _ = imu_motion.search_offset(noise_parameters)
-    sigma_s = 0.0
+    offset_sigma_s = 0.0
     half_width_s = 0.1
     for motion in (coarse_motion, imu_motion):
         noise_parameters = maximise_likelihood(
@@ -189,62 +189,65 @@ def estimate_time_offset(
             fits_outliers=False,
         ).noise_parameters
         tested_offsets_s = _make_offset_grid(offset_s, half_width_s, FINE_OFFSET_COUNT)
-        fitted_positions = fit_with_noises(
+        position_fit = fit_constant_errors(
             motion.make_position_batches(tested_offsets_s),
             noise_parameters,
             motion.measurement_weights,
         )
-        offset_s, sigma_s = _fit_minimum_and_sigma(
-            tested_offsets_s, fitted_positions.compute_scores()[0]
+        offset_s, offset_sigma_s = _fit_minimum_and_sigma(
+            tested_offsets_s, position_fit.compute_scores()[0]
         )
-        half_width_s = float(np.clip(3.5 * sigma_s, 0.01, MAX_OFFSET_S))
+        half_width_s = float(np.clip(3.5 * offset_sigma_s, 0.01, MAX_OFFSET_S))
     offset_variance_factor = _simulate_offset_variance_factor(
-        imu_motion, offset_s, noise_parameters, sigma_s**-2.0
+        imu_motion, offset_s, noise_parameters, offset_sigma_s**-2.0
     )
-    curve_offsets_s, profile_scores, low_s, high_s = _compute_offset_profile(
+    curve_offsets_s, profile_scores, interval_low_s, interval_high_s = _compute_offset_profile(
         imu_motion,
         noise_parameters,
         offset_s,
         half_width_s,
         MAX_LOG_LIKELIHOOD_DROP * offset_variance_factor,
     )
-    has_both_ends = low_s is not None and high_s is not None
+    has_both_ends = interval_low_s is not None and interval_high_s is not None
     offset_s = _fit_minimum_and_sigma(curve_offsets_s, profile_scores)[0]
     # An IMU sample is the mean over one interval, and its timestamp may be any time in it. The
-    # error is half an interval (1 σ), and is added to both half-widths of the 95 % interval
+    # error is half an interval (1 σ). 1.96 σ of it widen the 95 % interval on both sides
     resolution_s = 0.5 * imu_motion.imu_interval_s
-    ends_s = (
-        curve_offsets_s[0] if low_s is None else low_s,
-        curve_offsets_s[-1] if high_s is None else high_s,
+    interval_limits_s = (
+        curve_offsets_s[0] if interval_low_s is None else interval_low_s,
+        curve_offsets_s[-1] if interval_high_s is None else interval_high_s,
     )
-    half_intervals_s = np.hypot(np.array(ends_s) - offset_s, 1.96 * resolution_s)
-    low_s = float(offset_s - half_intervals_s[0])
-    high_s = float(offset_s + half_intervals_s[1])
+    interval_half_widths_s = np.hypot(np.array(interval_limits_s) - offset_s, 1.96 * resolution_s)
+    interval_low_s = float(offset_s - interval_half_widths_s[0])
+    interval_high_s = float(offset_s + interval_half_widths_s[1])
     rejection_reason = ""
-    if not has_both_ends or (high_s - low_s) / 2.0 > MAX_OFFSET_HALF_INTERVAL_S:
+    if not has_both_ends or (interval_high_s - interval_low_s) / 2.0 > MAX_OFFSET_HALF_INTERVAL_S:
         rejection_reason = (
-            f"time offsets from {low_s:+.2f} s to {high_s:+.2f} s have nearly the same likelihood: "
-            "the flight has too little acceleration, or the positions have too much noise"
+            f"time offsets from {interval_low_s:+.2f} s to {interval_high_s:+.2f} s have nearly "
+            "the same likelihood: the flight has too little acceleration, or the positions have "
+            "too much noise"
         )
     parts: tuple[PartOffset, ...] = ()
     change_p_value = None
     if not rejection_reason:
         progress("changes of the time offset in flight")
-        parts, change_p_value = _estimate_part_offsets(
+        parts, change_p_value = _estimate_flight_part_offsets(
             imu_motion, offset_s, noise_parameters, offset_variance_factor
         )
     drift_ppm, drift_sigma_ppm = _fit_clock_drift(parts)
-    applied_s = settings.clock_offset_s
+    applied_offset_s = settings.clock_offset_s
     return ClockOffset(
-        offset_s=applied_s + offset_s,
-        interval_s=(applied_s + low_s, applied_s + high_s),
-        applied_s=applied_s,
-        sigma_s=float(np.hypot(sigma_s * np.sqrt(offset_variance_factor), resolution_s)),
+        offset_s=applied_offset_s + offset_s,
+        interval_s=(applied_offset_s + interval_low_s, applied_offset_s + interval_high_s),
+        applied_s=applied_offset_s,
+        sigma_s=float(np.hypot(offset_sigma_s * np.sqrt(offset_variance_factor), resolution_s)),
         is_determinable=not rejection_reason,
         reason=rejection_reason,
-        curve_s=applied_s + curve_offsets_s,
+        curve_s=applied_offset_s + curve_offsets_s,
         curve_log_likelihood_drop=profile_scores - profile_scores.min(),
-        parts=tuple(structs.replace(part, offset_s=applied_s + part.offset_s) for part in parts),
+        parts=tuple(
+            structs.replace(part, offset_s=applied_offset_s + part.offset_s) for part in parts
+        ),
         drift_ppm=drift_ppm,
         drift_sigma_ppm=drift_sigma_ppm,
         change_p_value=change_p_value,
@@ -272,19 +275,21 @@ def _compute_offset_profile(
             for offset_count in (FINE_OFFSET_COUNT, LIKELIHOOD_CURVE_POINT_COUNT)
         )
         position_batches = motion.make_position_batches(node_offsets_s)
-        node_scores = fit_with_noises(
+        node_scores = fit_constant_errors(
             position_batches, noise_parameters, motion.measurement_weights
         ).compute_scores()[0]
         profile_scores = CubicSpline(node_offsets_s, node_scores)(curve_offsets_s)
-        low_s, high_s = compute_profile_interval(curve_offsets_s, profile_scores, score_rise)
-        if None not in (low_s, high_s) or half_width_s >= 2.0 * MAX_OFFSET_S:
-            return curve_offsets_s, profile_scores, low_s, high_s
+        interval_low_s, interval_high_s = compute_profile_interval(
+            curve_offsets_s, profile_scores, score_rise
+        )
+        if None not in (interval_low_s, interval_high_s) or half_width_s >= 2.0 * MAX_OFFSET_S:
+            return curve_offsets_s, profile_scores, interval_low_s, interval_high_s
         half_width_s *= 2.0
 
 
 def _make_offset_grid(centre_s: float, half_width_s: float, offset_count: int) -> Array:
-    low_s = max(centre_s - half_width_s, -MAX_OFFSET_S)
-    return np.linspace(low_s, min(centre_s + half_width_s, MAX_OFFSET_S), offset_count)
+    start_s = max(centre_s - half_width_s, -MAX_OFFSET_S)
+    return np.linspace(start_s, min(centre_s + half_width_s, MAX_OFFSET_S), offset_count)
 
 
 def _simulate_offset_variance_factor(
@@ -295,25 +300,26 @@ def _simulate_offset_variance_factor(
 ) -> float:
     """Simulate the factor on the variance of the estimated time offset due to IMU noise.
 
-    The factor is the variance times ``fisher_information``, the curvature of -ln p. The derivative
-    of -ln p with respect to the time offset is eᵀM(v + n), with residuals e, inverse covariance M,
-    velocity v and velocity noise n of the IMU. The term eᵀMn increases the variance: e also
-    contains n.
+    The factor is relative to 1 / ``fisher_information``; the latter is the curvature of -ln p. The
+    derivative of -ln p with respect to the time offset is eᵀM(v + n), with residuals e, inverse
+    covariance M, velocity v and velocity noise n of the IMU. The term eᵀMn increases the variance:
+    e also contains n.
     """
-    offset_positions = imu_motion.make_positions_at_offset(offset_s)
-    is_within_segment = offset_positions.is_within_segment
+    positions_at_offset = imu_motion.make_positions_at_offset(offset_s)
+    is_within_segment = positions_at_offset.is_within_segment
     measurement_count = len(imu_motion.time_s)
     axis_count = len(imu_motion.directions)
     interval_count = int(np.count_nonzero(is_within_segment))
     rng = np.random.default_rng(measurement_count)
-    first_segments = np.arange(0, len(imu_motion.segment_motions), SIMULATED_SEGMENT_COUNT)
-    series_count = -(-SIMULATION_COUNT // len(first_segments))
+    group_start_segments = np.arange(0, len(imu_motion.segment_motions), SIMULATED_SEGMENT_COUNT)
+    series_count = -(-SIMULATION_COUNT // len(group_start_segments))
 
     def draw_normal(count: int) -> Array:
         return rng.standard_normal((count, axis_count, series_count)).transpose(1, 2, 0)
 
     q00, q01, q11 = (
-        noise_parameters.sigma_a_m_s2**2 * offset_positions.unit_process_noise[:, is_within_segment]
+        noise_parameters.sigma_a_m_s2**2
+        * positions_at_offset.unit_process_noise[:, is_within_segment]
     )
     dp, dv = np.zeros((2, axis_count, series_count, measurement_count - 1))
     dp[..., is_within_segment] = np.sqrt(q00) * draw_normal(interval_count)
@@ -322,44 +328,44 @@ def _simulate_offset_variance_factor(
     error_m = noise_parameters.sigma_z_m * draw_normal(measurement_count)
     # The velocity noise of the IMU is the sum of the noise of Δv since the start of the segment
     velocity_noise = np.zeros_like(error_m)
-    for begin, end in offset_positions.segments:
+    for begin, end in positions_at_offset.segments:
         np.cumsum(dv[..., begin : end - 1], axis=-1, out=velocity_noise[..., begin + 1 : end])
-    # The random walk of the source changes Δp only: the velocity of the IMU does not contain it
+    # The random walk is an error of the positions: it changes Δp, but not the velocity from the IMU
     if noise_parameters.random_walk_m:
         dp[..., is_within_segment] += (
             noise_parameters.random_walk_m
-            * np.sqrt(offset_positions.interval_s[is_within_segment])
+            * np.sqrt(positions_at_offset.interval_s[is_within_segment])
             * draw_normal(interval_count)
         )
-    offset_positions, scaled_variance = offset_positions.normalise_by_sigma_z(
+    positions_at_offset, scaled_variance = positions_at_offset.normalise_by_sigma_z(
         1.0,
         noise_parameters.random_walk_m,
         imu_motion.measurement_weights / noise_parameters.sigma_z_m**2,
     )
-    noise_products = compute_segment_products(
-        offset_positions,
+    noise_inner_products = compute_segment_inner_products(
+        positions_at_offset,
         noise_parameters.sigma_a_m_s2,
         scaled_variance,
         (error_m, dp, dv),
         velocity_noise,
     )
-    variances = np.add.reduceat(noise_products, first_segments).var(axis=1)
+    variances = np.add.reduceat(noise_inner_products, group_start_segments).var(axis=1)
     return 1.0 + float(variances.sum()) / fisher_information
 
 
-def _fit_minimum_and_sigma(grid: Array, profile: Array) -> tuple[float, float]:
+def _fit_minimum_and_sigma(grid: Array, scores: Array) -> tuple[float, float]:
     """Fit a parabola to -ln p on a grid; return its minimiser, and σ from its curvature."""
-    minimum_index = int(np.clip(np.argmin(profile), 1, len(grid) - 2))
+    minimum_index = int(np.clip(np.argmin(scores), 1, len(grid) - 2))
     grid_step = grid[1] - grid[0]
-    vertex_shift, curvature = parabola_vertex(profile, minimum_index)
+    vertex_shift, curvature = fit_parabola_vertex(scores, minimum_index)
     if curvature <= 0.0:
-        return float(grid[int(np.argmin(profile))]), float(grid[-1] - grid[0])
+        return float(grid[int(np.argmin(scores))]), float(grid[-1] - grid[0])
     return float(grid[minimum_index] + np.clip(vertex_shift, -1.0, 1.0) * grid_step), float(
         grid_step / np.sqrt(curvature)
     )
 
 
-def _estimate_part_offsets(
+def _estimate_flight_part_offsets(
     imu_motion: PositionsAndImuMotion,
     offset_s: float,
     noise_parameters: NoiseParameters,
@@ -371,7 +377,7 @@ def _estimate_part_offsets(
     """
     coarse_offsets_s = offset_s + np.linspace(-MAX_OFFSET_S, MAX_OFFSET_S, COARSE_OFFSET_COUNT)
     coarse_offsets_s = coarse_offsets_s[np.abs(coarse_offsets_s) <= MAX_OFFSET_S]
-    coarse_profiles = fit_with_noises(
+    coarse_segment_scores = fit_constant_errors(
         imu_motion.make_position_batches(coarse_offsets_s),
         noise_parameters,
         imu_motion.measurement_weights,
@@ -379,24 +385,24 @@ def _estimate_part_offsets(
     grid_offsets_s = np.linspace(
         coarse_offsets_s[0], coarse_offsets_s[-1], LIKELIHOOD_CURVE_POINT_COUNT
     )
-    segment_profiles = CubicSpline(coarse_offsets_s, coarse_profiles, axis=1)(grid_offsets_s)
+    segment_scores = CubicSpline(coarse_offsets_s, coarse_segment_scores, axis=1)(grid_offsets_s)
     part_offsets = []
-    score_drops = []
-    for begin, end, profile in zip(
+    score_rises = []
+    for begin, end, scores in zip(
         imu_motion.segment_edges,
         imu_motion.segment_edges[1:],
-        segment_profiles,
+        segment_scores,
         strict=False,
     ):
-        part_offset_s, sigma_s = _fit_minimum_and_sigma(grid_offsets_s, profile)
+        part_offset_s, sigma_s = _fit_minimum_and_sigma(grid_offsets_s, scores)
         sigma_s *= float(np.sqrt(offset_variance_factor))
         if sigma_s < MAX_SEGMENT_OFFSET_SIGMA_S:
             start_s, end_s = imu_motion.time_s[[begin, end - 1]].tolist()
             part_offsets.append(PartOffset(start_s, end_s, part_offset_s, sigma_s))
-            score_drops.append(profile - profile.min())
+            score_rises.append(scores - scores.min())
     if len(part_offsets) < 2:
         return tuple(part_offsets), None
-    chi_square = 2.0 * float(np.sum(score_drops, axis=0).min()) / offset_variance_factor
+    chi_square = 2.0 * float(np.sum(score_rises, axis=0).min()) / offset_variance_factor
     return tuple(part_offsets), float(chdtrc(len(part_offsets) - 1, chi_square))
 
 
@@ -407,11 +413,11 @@ def _fit_clock_drift(part_offsets: tuple[PartOffset, ...]) -> tuple[float | None
     """
     if len(part_offsets) < 3:
         return None, None
-    offsets_with_sigma = [
+    times_offsets_and_sigmas = [
         ((part_offset.start_s + part_offset.end_s) / 2.0, part_offset.offset_s, part_offset.sigma_s)
         for part_offset in part_offsets
     ]
-    time_s, offset_s, sigma_s = np.transpose(offsets_with_sigma)
+    time_s, offset_s, sigma_s = np.transpose(times_offsets_and_sigmas)
     coefficients, covariance = np.polyfit(
         time_s - time_s.mean(), offset_s, 1, w=1.0 / sigma_s, cov="unscaled"
     )

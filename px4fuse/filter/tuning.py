@@ -34,7 +34,7 @@ from px4fuse.filter.likelihood import (
     preintegrate,
 )
 from px4fuse.filter.settings import Settings
-from px4fuse.filter.signals import Axis, make_downsampling_slice, too_few_measurements
+from px4fuse.filter.signals import Axis, make_downsampling_slice, report_too_few_measurements
 from px4fuse.flight.model import Flight, Unavailable
 
 HORIZONTAL = "horizontal"
@@ -45,9 +45,9 @@ MIN_MEASUREMENTS = 30
 MAX_OUTLIER_FRACTION = 0.3
 # Initial values of SIGMA_A in the estimate with IMU biases, as multiples of KF's SIGMA_A
 START_SIGMA_A_FACTORS = (0.1, 0.3, 1.0)
-# Initial value of the random walk (m/√s) of a source that may drift
+# Initial value (m/√s) in the search for the random walk of a source that may drift
 START_RANDOM_WALK_M = 0.02
-# A noise estimate is only a bound if its ratio to an end of its search range is within this factor
+# A noise estimate within this factor of an end of its search range is only a bound
 MAX_SEARCH_LIMIT_RATIO = 1.001
 
 
@@ -76,14 +76,14 @@ class NoiseEstimate(Record):
 
 
 class HeldOutCheck(Record):
-    """Noises that are estimated from the first half of the flight and tested on the second half.
+    """Noises that are estimated from the first half of a flight, and their test on the second half.
 
     Attributes
     ----------
     count : int
         Number of measurements in the second half.
     log_likelihood_gain_per_measurement : float
-        Gain in the second half over KF's current settings.
+        Log-likelihood (nats) of the second half minus that with KF's current settings.
     """
 
     sigma_a_m_s2: NotNegative
@@ -101,9 +101,9 @@ class AxisTuning(Record, kw_only=True):
     Attributes
     ----------
     sigma_a_two_state_m_s2 : float or None
-        SIGMA_A for KF, whose two states do not include biases: also covers biases and tilt.
+        SIGMA_A for KF. It also covers biases and tilt, for which KF has no states.
     log_likelihood_gain_per_measurement : float
-        Gain of the estimated over the current settings of KF.
+        Log-likelihood (nats) with the estimated settings of KF minus that with its current ones.
     before, after : Consistency or Unavailable
         Consistency of KF along the first axis, with its current and with the estimated settings.
     outliers : int
@@ -134,12 +134,12 @@ class AxisTuning(Record, kw_only=True):
 
     @property
     def sigma_a(self) -> NoiseEstimate:
-        """SIGMA_A (m/s²) of the acceleration noise, without the effect of biases and tilt."""
+        """Estimated SIGMA_A (m/s²) for the acceleration noise alone, without biases and tilt."""
         return NoiseEstimate.from_fields(self.sigma_a_m_s2, self.sigma_a_m_s2_interval)
 
     @property
     def sigma_a_two_state(self) -> NoiseEstimate:
-        """SIGMA_A (m/s²) for KF: acceleration noise and the effect of biases and tilt."""
+        """Estimated SIGMA_A (m/s²) for KF. It covers biases and tilt: KF has no states for them."""
         return NoiseEstimate.from_fields(
             self.sigma_a_two_state_m_s2, self.sigma_a_two_state_m_s2_interval
         )
@@ -193,12 +193,12 @@ def tune(
                     name, group_axes, settings, flight, may_drift, motion_cache
                 )
             except np.linalg.LinAlgError as error:
-                # Positions far from the path cause rounding errors, which make the normal equations
-                # singular
+                # Positions far from the path caused rounding errors, which made the normal
+                # equations singular
                 tunings[name] = Unavailable(
-                    f"estimate of the noises ({name})",
+                    f"estimate of SIGMA_A and SIGMA_Z ({name})",
                     str(error),
-                    "Remove positions far from the path.",
+                    "Remove outliers far from the flight path.",
                 )
     return tunings
 
@@ -215,14 +215,16 @@ def tune_axes(
 
     See :func:`tune` for the parameters.
     """
-    kf_motions = [preintegrate(axis, settings) for axis in axes]
-    all_measurement_time_s = axes[0].measurement_time_s[-len(kf_motions[0].measurement_m) :]
+    preintegrated_motions = [preintegrate(axis, settings) for axis in axes]
+    all_measurement_time_s = axes[0].measurement_time_s[
+        -len(preintegrated_motions[0].measurement_m) :
+    ]
     axes = tuple(axis.keep_rows(make_downsampling_slice(axis.measurement_time_s)) for axis in axes)
     axis_positions = [convert_to_positions(preintegrate(axis, settings)) for axis in axes]
     measurement_count = len(axis_positions[0].measurement_m) - 1
     if measurement_count < MIN_MEASUREMENTS:
-        return too_few_measurements(
-            f"estimate of the noises ({name})", measurement_count, MIN_MEASUREMENTS
+        return report_too_few_measurements(
+            f"estimate of SIGMA_A and SIGMA_Z ({name})", measurement_count, MIN_MEASUREMENTS
         )
     current_parameters = NoiseParameters(settings.sigma_a_m_s2, settings.sigma_z_m)
     kf_fit = maximise_likelihood(axis_positions, current_parameters, np.ones(measurement_count))
@@ -230,7 +232,7 @@ def tune_axes(
     motion_fit = None
     if flight is not None and settings.input == "imu":
         measured_m = np.column_stack([axis.measurement_m for axis in axes])
-        # KF's fit has no weights of measurements that are its initial state: their weight is 1
+        # KF's fit has no weight for the first measurement, which is its initial state: use weight 1
         measurement_weights = np.concatenate(
             [np.ones(len(measured_m) - measurement_count), kf_fit.measurement_weights]
         )
@@ -259,14 +261,17 @@ def tune_axes(
     best_fit = kf_fit if motion_fit is None else motion_fit
     is_outlier = kf_fit.outlier_probability > 0.5
     if len(all_measurement_time_s) > measurement_count:
-        all_axis_positions = [convert_to_positions(kf_motion) for kf_motion in kf_motions]
+        all_axis_positions = [
+            convert_to_positions(preintegrated_motion)
+            for preintegrated_motion in preintegrated_motions
+        ]
         is_outlier = (
             estimate_outlier_probability(all_axis_positions, kf_fit, len(all_measurement_time_s))
             > 0.5
         )
     if np.mean(is_outlier) > MAX_OUTLIER_FRACTION:
         return Unavailable(
-            f"estimate of the noises ({name})",
+            f"estimate of SIGMA_A and SIGMA_Z ({name})",
             f"{100 * np.mean(is_outlier):.0f} % of the measurements are outliers, too many to "
             "estimate SIGMA_Z",
             "Reduce the outliers of the positioning system.",
@@ -275,7 +280,8 @@ def tune_axes(
     final_sigma_z_m = sigma_z.value or sigma_z.high or best_fit.noise_parameters.sigma_z_m
     kf_sigma_a = sigma_a if motion_fit is None else _estimate_kf_sigma_a(kf_fit, final_sigma_z_m)
     if motion_fit is None and flight is not None and settings.input == "imu":
-        # Without estimates of biases and tilt, KF's SIGMA_A is only an upper bound of the noise
+        # Without estimates of biases and tilt, KF's SIGMA_A also covers them, and is only an upper
+        # bound of the acceleration noise
         sigma_a = NoiseEstimate(None, None, kf_sigma_a.high)
     final_parameters = NoiseParameters(
         kf_sigma_a.value or kf_sigma_a.high or kf_fit.noise_parameters.sigma_a_m_s2, final_sigma_z_m
@@ -287,12 +293,12 @@ def tune_axes(
         **sigma_z.as_fields("sigma_z_m"),
         **kf_sigma_a.as_fields("sigma_a_two_state_m_s2"),
         log_likelihood_gain_per_measurement=likelihood_gain_nats / measurement_count,
-        before=_assess_kf(kf_motions[0], current_parameters, is_outlier),
-        after=_assess_kf(kf_motions[0], final_parameters, is_outlier),
+        before=_assess_kf_consistency(preintegrated_motions[0], current_parameters, is_outlier),
+        after=_assess_kf_consistency(preintegrated_motions[0], final_parameters, is_outlier),
         outlier_time_s=all_measurement_time_s[is_outlier],
         count=len(all_measurement_time_s),
         outliers=int(np.count_nonzero(is_outlier)),
-        held_out=_check_held_out(name, current_parameters, kf_fit),
+        held_out=_check_on_second_half(name, current_parameters, kf_fit),
         noises=best_fit.noise_parameters,
         biases_fitted=motion_fit is not None,
     )
@@ -302,9 +308,9 @@ def _estimate_noise(fit: NoiseFit, noise_index: int) -> NoiseEstimate:
     """Return SIGMA_A (``noise_index`` 0) or SIGMA_Z (1) of a fit with its 95 % interval."""
     best_parameters = fit.noise_parameters.sigma_a_m_s2, fit.noise_parameters.sigma_z_m
 
-    def score(log_value: float, log_other_sigma: float) -> float:
+    def score(log_sigma: float, log_other_sigma: float) -> float:
         log_parameters = (
-            (log_value, log_other_sigma) if noise_index == 0 else (log_other_sigma, log_value)
+            (log_sigma, log_other_sigma) if noise_index == 0 else (log_other_sigma, log_sigma)
         )
         sigma_a, sigma_z = np.exp(log_parameters).tolist()
         return fit.score(NoiseParameters(sigma_a, sigma_z, fit.noise_parameters.random_walk_m))
@@ -319,9 +325,9 @@ def _estimate_noise(fit: NoiseFit, noise_index: int) -> NoiseEstimate:
     )
 
 
-def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z: float) -> NoiseEstimate:
+def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z_m: float) -> NoiseEstimate:
     def score(log_sigma_a: float, _: float = 0.0) -> float:
-        return fit.score(NoiseParameters(float(np.exp(log_sigma_a)), sigma_z))
+        return fit.score(NoiseParameters(float(np.exp(log_sigma_a)), sigma_z_m))
 
     low_log_sigma, high_log_sigma = np.log(SIGMA_A_SEARCH_RANGE_M_S2)
     best_log_sigma_a = float(
@@ -332,58 +338,68 @@ def _estimate_kf_sigma_a(fit: NoiseFit, sigma_z: float) -> NoiseEstimate:
 
 def _make_noise_estimate(
     score: Callable[[float, float], float],
-    best_log_values: tuple[float, float],
+    best_log_sigmas: tuple[float, float],
     search_range: tuple[float, float],
     variance_factor: float = 1.0,
 ) -> NoiseEstimate:
-    estimate = float(np.exp(best_log_values[0]))
-    low, high = find_profile_interval(score, best_log_values, search_range, variance_factor)
+    estimate = float(np.exp(best_log_sigmas[0]))
+    interval_low, interval_high = find_profile_interval(
+        score, best_log_sigmas, search_range, variance_factor
+    )
     is_inside = (
         search_range[0] * MAX_SEARCH_LIMIT_RATIO
         < estimate
         < search_range[1] / MAX_SEARCH_LIMIT_RATIO
     )
-    has_both_ends = low is not None and high is not None
-    return NoiseEstimate(estimate if is_inside and has_both_ends else None, low, high)
+    has_both_ends = interval_low is not None and interval_high is not None
+    return NoiseEstimate(
+        estimate if is_inside and has_both_ends else None, interval_low, interval_high
+    )
 
 
-def _assess_kf(
-    kf_motion: PreintegratedMotion,
+def _assess_kf_consistency(
+    preintegrated_motion: PreintegratedMotion,
     noise_parameters: NoiseParameters,
     is_outlier: BoolArray,
 ) -> Consistency | Unavailable:
     nu, s = innovations(
-        kf_motion, noise_parameters.sigma_a_m_s2, noise_parameters.sigma_z_m, is_outlier
+        preintegrated_motion, noise_parameters.sigma_a_m_s2, noise_parameters.sigma_z_m, is_outlier
     )
     return assess_innovations(nu[~is_outlier], s[~is_outlier])
 
 
-def _check_held_out(
+def _check_on_second_half(
     name: str, current_parameters: NoiseParameters, fit: NoiseFit
 ) -> HeldOutCheck | Unavailable:
-    half_count = len(fit.measurement_weights) // 2
-    if half_count < MIN_MEASUREMENTS:
+    first_half_count = len(fit.measurement_weights) // 2
+    if first_half_count < MIN_MEASUREMENTS:
         return Unavailable(
-            f"held-out test of SIGMA_A and SIGMA_Z ({name})",
-            f"the first half of the segment contains only {half_count} measurements (at least "
-            f"{MIN_MEASUREMENTS} are needed)",
+            f"test of SIGMA_A and SIGMA_Z on the second half ({name})",
+            f"the first half of the segment contains only {first_half_count} measurements (at "
+            f"least {MIN_MEASUREMENTS} are needed)",
             "Analyse a longer segment.",
         )
-    # The first measurement is KF's initial state
-    first_half = [positions.first(1 + half_count) for positions in fit.score.axis_positions]
+    # One more position than measurements, because the first position is KF's initial state
+    first_half_positions = [
+        positions.first(1 + first_half_count) for positions in fit.score.axis_positions
+    ]
     first_fit = maximise_likelihood(
-        first_half, fit.noise_parameters, fit.measurement_weights[:half_count], fits_outliers=False
+        first_half_positions,
+        fit.noise_parameters,
+        fit.measurement_weights[:first_half_count],
+        fits_outliers=False,
     )
     tuned_parameters = first_fit.noise_parameters
-    # -ln p of the second half: whole flight minus first half
+    # Log-likelihoods add: the score of the second half is that of the whole flight minus that of
+    # the first half
     current_score, tuned_score = (
         fit.score(noise_parameters) - first_fit.score(noise_parameters)
         for noise_parameters in (current_parameters, tuned_parameters)
     )
-    count = len(fit.measurement_weights) - half_count
+    second_half_count = len(fit.measurement_weights) - first_half_count
     return HeldOutCheck(
         tuned_parameters.sigma_a_m_s2,
         tuned_parameters.sigma_z_m,
-        count,
-        (current_score - tuned_score) / count,
+        second_half_count,
+        (current_score - tuned_score) / second_half_count,
     )

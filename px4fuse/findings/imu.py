@@ -75,9 +75,9 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
     ekf2_bias_m_s2 = _find_ekf2_accelerometer_bias(analysis)
     if isinstance(systematic_errors, SystematicErrors) and systematic_errors.has_significant_bias():
         forward_bias, right_bias, bias_m_s2 = (
-            systematic_errors.accelerometer_bias_forward,
-            systematic_errors.accelerometer_bias_right,
-            systematic_errors.compute_bias().value,
+            systematic_errors.forward_bias_m_s2,
+            systematic_errors.right_bias_m_s2,
+            systematic_errors.compute_horizontal_bias().value,
         )
         message = (
             f"The accelerometer is biased by {forward_bias.value:+.2f} m/s² forward and "
@@ -96,7 +96,10 @@ def detect_accelerometer_bias(analysis: Analysis) -> Findings:
             "accelerometer_bias",
             message,
             "Calibrate the accelerometers and the level horizon at the temperature of the flight.",
-            {"bias_m_s2": bias_m_s2, "sigma_m_s2": systematic_errors.compute_bias().sigma},
+            {
+                "bias_m_s2": bias_m_s2,
+                "sigma_m_s2": systematic_errors.compute_horizontal_bias().sigma,
+            },
         )
     elif ekf2_bias_m_s2 is not None:
         # The positions show no significant horizontal bias, so only EKF2's vertical bias counts
@@ -246,7 +249,7 @@ def detect_low_rates(flight: Flight) -> Findings:
                 action = (
                     f"Request {topic} at {requested_rate_hz:g} Hz "
                     "(MAV_CMD_SET_MESSAGE_INTERVAL)"
-                    f"{', or give the ULog of the flight' if log.has_ulog else ''}."
+                    f"{', or give the ULog of the flight' if log.writes_ulog else ''}."
                 )
             yield warning(
                 "imu_rate_too_low",

@@ -134,7 +134,7 @@ def detect_other_estimators(analysis: Analysis) -> Findings:
             f"A MAVLink recording contains the {contents} of EKF2, but no innovations. The "
             "consistency of EKF2 cannot be tested.",
             "Give the ULog of this flight as argument LOG."
-            if log.has_ulog
+            if log.writes_ulog
             else "The innovations are in the autopilot's DataFlash log (.BIN), which px4fuse does "
             "not read.",
         )

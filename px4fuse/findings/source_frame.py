@@ -67,7 +67,7 @@ def make_frame_finding(analysis: Analysis) -> Finding:
     fusion_sentence, action = "", f"In this report, north is the x axis of {sensor_name}."
     if isinstance(fusion_flags, Unavailable):
         fusion_sentence = f"The log does not show whether EKF2 fused the yaw of {sensor_name}."
-        if log.has_ulog:
+        if log.writes_ulog:
             action += " Give the ULog of this flight as well: it shows the frame that EKF2 uses."
     elif (
         fusion_flags is not None
@@ -102,8 +102,8 @@ def detect_misalignment(analysis: Analysis, heading_error: HeadingError) -> Find
     is_explained_by_bias = (
         not isinstance(systematic_errors, Unavailable)
         and analysis.source.orientation is None
-        and abs(systematic_errors.rotation.value)
-        < MIN_MISALIGNMENT_SIGMAS * systematic_errors.rotation.sigma
+        and abs(systematic_errors.rotation_rad.value)
+        < MIN_MISALIGNMENT_SIGMAS * systematic_errors.rotation_rad.sigma
     )
     if is_explained_by_bias or abs(rotation_deg) < max(
         MIN_MISALIGNMENT_SIGMAS * sigma_deg, MIN_HEADING_ERROR_DEG
@@ -207,7 +207,7 @@ def _make_heading_drift_finding(analysis: Analysis, heading_error: HeadingError)
     if analysis.source.origin.is_gnss:
         calibration_advice = ""
         possible_cause, action = _explain_gnss_heading_error(analysis)
-    elif action and not analysis.flight.log.has_ulog:
+    elif action and not analysis.flight.log.writes_ulog:
         action = f"{sentence_start} the autopilot fuse the yaw of the source."
     return finding(
         "error" if abs(heading_change_deg) >= MIN_SEVERE_HEADING_ERROR_DEG else "warning",

@@ -11,7 +11,7 @@ from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
 from px4fuse.ekf2.aids import MAX_NOT_FUSED_S
 from px4fuse.ekf2.fusion_conditions import EV_START_INTERVAL_S
-from px4fuse.filter.kalman import state_at, variance_at
+from px4fuse.filter.kalman import predict_state, predict_variance
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.finding import Finding
 from px4fuse.findings.model import (
@@ -23,7 +23,13 @@ from px4fuse.findings.model import (
     warning,
 )
 from px4fuse.flight.ekf2_parameters import AIDS, EV_POS, Aid
-from px4fuse.flight.model import ALIGNED_ORIGIN, Ekf2, Unavailable, positions_phrase, step_values_at
+from px4fuse.flight.model import (
+    ALIGNED_ORIGIN,
+    Ekf2,
+    Unavailable,
+    positions_phrase,
+    sample_step_function,
+)
 from px4fuse.readers.px4_ekf2 import OTHER_HORIZONTAL_AIDS
 
 # Minimum fraction of lost positions for a finding: PX4 v1.14 and later loses 0.3 %
@@ -205,8 +211,8 @@ def describe_errors_after_gap(analysis: Analysis, gap_s: Span) -> str:
             sigma_text = f" (σ {format_metres(float(np.sqrt(variance_m2)))} m)"
         error_m = abs(float(positions_before.iloc[-1]) - reference_m)
         error_texts.append(f"EKF2 {format_metres(error_m)} m{sigma_text}")
-    kf_error_m = abs(float(state_at(result.replay, start_and_end_times_s)[0][1]) - reference_m)
-    kf_sigma_m = float(np.sqrt(variance_at(result.replay, start_and_end_times_s)[0][1]))
+    kf_error_m = abs(float(predict_state(result.replay, start_and_end_times_s)[0][1]) - reference_m)
+    kf_sigma_m = float(np.sqrt(predict_variance(result.replay, start_and_end_times_s)[0][1]))
     error_texts.append(f"KF {format_metres(kf_error_m)} m (σ {format_metres(kf_sigma_m)} m)")
     return f"{aiding_sentence} {quantity} along {axis.label}: {', '.join(error_texts)}."
 
@@ -227,7 +233,7 @@ def _find_fused_aids(ekf2: Ekf2 | Unavailable, span_s: Span) -> list[Aid]:
         if "fused" in samples:
             is_fused = samples["fused"].to_numpy() > 0.0
         elif aid_log.enabled is not None:
-            is_fused = step_values_at(aid_log.enabled, samples.index) > 0.0
+            is_fused = sample_step_function(aid_log.enabled, samples.index) > 0.0
         times_s = [start_s, *samples.index[is_fused], end_s]
         if np.diff(times_s).max() < 0.5 * (end_s - start_s):
             aids.append(AIDS[name])
@@ -247,7 +253,7 @@ def detect_lost_samples(analysis: Analysis) -> Findings:
     sent_count = lost_count + len(intervals_s)
     if len(intervals_s) > 1 and lost_count / sent_count > MIN_LOST_POSITION_FRACTION:
         action = "Record on the companion computer or on a link without message loss."
-        if analysis.flight.log.has_ulog:
+        if analysis.flight.log.writes_ulog:
             action += " Or set SDLOG_PROFILE to 129: the ULog then contains the received positions."
         yield note(
             "source_samples_lost",

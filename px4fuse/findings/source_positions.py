@@ -15,7 +15,11 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.text import format_factor, format_metres
 from px4fuse.ekf2.fusion_conditions import constant_coordinates, is_height_only
 from px4fuse.filter.correlated_noise import SourceLowPass, TimeCorrelatedNoise
-from px4fuse.filter.hypotheses import OUTLIER_BURST_S, OUTLIER_RETEST_DURATION_S, SystematicErrors
+from px4fuse.filter.hypotheses import (
+    OUTLIER_BURST_DURATION_S,
+    OUTLIER_RETEST_DURATION_S,
+    SystematicErrors,
+)
 from px4fuse.filter.signals import cut_to_segment
 from px4fuse.filter.time_offset import ClockOffset
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -452,7 +456,9 @@ def detect_outliers(analysis: Analysis) -> Findings:
         time_s
         for time_s in axis_tuning.outlier_time_s.tolist()
         if not any(
-            jump_time_s - OUTLIER_BURST_S <= time_s < jump_time_s + OUTLIER_RETEST_DURATION_S
+            jump_time_s - OUTLIER_BURST_DURATION_S
+            <= time_s
+            < jump_time_s + OUTLIER_RETEST_DURATION_S
             for jump_time_s in jump_times_s
         )
     ]

@@ -32,18 +32,18 @@ class Aid:
     noise_mode: str = ""
     # Parameters for the position of the sensor (m, FRD)
     lever_arm: tuple[str, ...] = ()
-    # Name in reports
+    # Name of the aiding source in reports
     label: str = ""
     # Unit of the innovations
     unit: str = "m"
-    # Source of the measurement variance, if it is not the parameter ``noise`` alone
+    # Data from which EKF2 computes R, if it is not the parameter ``noise`` alone; noun phrase
     noise_origin: str = ""
     # Gate (√S) for logs without the parameter ``gate``
     default_gate: float = 5.0
     # Axes of the innovations, in the order of PX4
     axes: tuple[str, ...] = ()
-    # Fields of the topics estimator_innovations and estimator_innovation_variances, by axis, as in
-    # readers/field_maps.py
+    # Fields of the topics estimator_innovations and estimator_innovation_variances, one for each
+    # axis: ``ev_hpos[]`` stands for ``ev_hpos[0] ev_hpos[1]``
     fields: str = ""
     # Fields of ekf2_innovations (v1.8 to v1.10); ``_var`` is appended for the variance
     old_fields: str = ""
@@ -55,7 +55,7 @@ class Aid:
 
     @property
     def measurement_parameters(self) -> frozenset[str]:
-        """Names of the parameters for noise, gate and delay, without the fusion switch."""
+        """Names of the parameters for noise, gate and delay, without that which enables fusion."""
         return frozenset((self.noise, self.gate, self.delay, self.noise_mode))
 
     def logged_parameters(self, logged_values: Mapping[str, float]) -> dict[str, float]:
@@ -130,7 +130,7 @@ PARAMETERS, _LOGGED_PARAMETERS = (
     for table in ("parameters", "logged")
 )
 # Parameters of the EKF2 model, and other logged parameters that px4fuse needs
-PARAMETER_RANGES = PARAMETERS | _LOGGED_PARAMETERS
+KNOWN_PARAMETERS = PARAMETERS | _LOGGED_PARAMETERS
 MAGNETIC_FIELD_NOISE_PARAMETERS = ("EKF2_MAG_E_NOISE", "EKF2_MAG_B_NOISE")
 # Value of EKF2_MAG_TYPE for flights without magnetometer
 MAG_TYPE_NONE = 5
@@ -149,7 +149,8 @@ def fill_with_defaults(
 
     Parameters of aiding sources other than ``aid`` and ``other_aids`` are omitted.
     """
-    # Aiding sources of one sensor, such as GNSS position and velocity, have one fusion switch
+    # One parameter enables all aiding sources of one sensor, such as GNSS position and velocity, so
+    # their parameters are returned together
     used_switches = {fused_aid.switch for fused_aid in (aid, *other_aids)}
     excluded_names = {
         name
@@ -189,11 +190,11 @@ def replace_invalid_parameters(
     {'EKF2_EVP_GATE': 5.0, 'SYS_AUTOSTART': 4001.0}
     """
     valid_values, notes = {}, []
-    defaults = {name: parameter.default for name, parameter in PARAMETER_RANGES.items()}
+    defaults = {name: parameter.default for name, parameter in KNOWN_PARAMETERS.items()}
     if uses_aid_mask(logged_values):
         defaults |= OLD_DEFAULTS
     for name, value in logged_values.items():
-        parameter_range = PARAMETER_RANGES.get(name)
+        parameter_range = KNOWN_PARAMETERS.get(name)
         fault = "" if parameter_range is None else parameter_range.describe_range_error(name, value)
         if not math.isfinite(value):
             fault = f"{name} is not a finite number"

@@ -45,13 +45,13 @@ DataRoute = Literal[
 ]
 
 
-class Origin(Record):
-    """Kind of a position source, and form in which its positions are available."""
+class SourceOrigin(Record):
+    """Kind of a position source, and data of the log that contain its positions."""
 
     # Kind of device, inferred from the data: "vio" sends a changing orientation, "uwb" only noisy
     # positions, "unknown" only precise positions
     kind: PositionKind
-    # Form in which the positions are available, for example as the autopilot received them
+    # Data that contain the positions: for example messages to the autopilot, or EKF2's innovations
     path: DataRoute
     # Aiding source of EKF2 for these positions; None if EKF2 never fuses them
     aid: Aid | None
@@ -98,14 +98,15 @@ class Origin(Record):
         return [(origin.aid, origin.path) for origin in ORIGINS].index((self.aid, self.path))
 
 
-POSITION_FILE_ORIGIN = Origin("file", "given file", EV_POS)
-RECEIVED_ORIGIN = Origin("uwb", "as received", EV_POS)
-MOTION_CAPTURE_ORIGIN = Origin("mocap", "as received", None)
-ALIGNED_ORIGIN = Origin("uwb", "aligned by EKF2", EV_POS)
-KEPT_BY_EKF2_ORIGIN = Origin("uwb", "kept by EKF2", EV_POS)
-REBUILT_ORIGIN = Origin("uwb", "rebuilt from innovations", EV_POS)
-GNSS_ORIGIN = Origin("gnss", "as received", GNSS_POS, is_auto_candidate=False)
-# All kinds of position sources, in the order of preference for the analysis
+# Kinds of position sources, and the data of the log with their positions
+POSITION_FILE_ORIGIN = SourceOrigin("file", "given file", EV_POS)
+RECEIVED_ORIGIN = SourceOrigin("uwb", "as received", EV_POS)
+MOTION_CAPTURE_ORIGIN = SourceOrigin("mocap", "as received", None)
+ALIGNED_ORIGIN = SourceOrigin("uwb", "aligned by EKF2", EV_POS)
+KEPT_BY_EKF2_ORIGIN = SourceOrigin("uwb", "kept by EKF2", EV_POS)
+REBUILT_ORIGIN = SourceOrigin("uwb", "rebuilt from innovations", EV_POS)
+GNSS_ORIGIN = SourceOrigin("gnss", "as received", GNSS_POS, is_auto_candidate=False)
+# In the order of preference for the analysis
 ORIGINS = (
     POSITION_FILE_ORIGIN,
     RECEIVED_ORIGIN,
@@ -117,14 +118,14 @@ ORIGINS = (
 )
 
 
-def find_origin(kind: str, path: str) -> Origin:
+def find_source_origin(kind: str, path: str) -> SourceOrigin:
     for origin in ORIGINS:
         if (origin.kind, origin.path) == (kind, path):
             return origin
     raise ValueError(f"no position source has the kind {kind!r} and the path {path!r}")
 
 
-def reclassify_as_vio(origin: Origin, *, has_changing_orientation: bool) -> Origin:
+def reclassify_as_vio(origin: SourceOrigin, *, has_changing_orientation: bool) -> SourceOrigin:
     """Change the kind "uwb" to "vio" if the source sends orientations that change."""
     return (
         replace(origin, kind="vio") if origin.kind == "uwb" and has_changing_orientation else origin
@@ -190,19 +191,19 @@ class ClockMap(Record):
     method: str
     # Number of simultaneous readings of this clock and the boot clock
     pairs: Count
-    # Boot clock minus converted clock, at the middle of the readings
+    # Boot clock minus this clock, at the middle of the timestamps
     offset_s: float
-    # Rate of the boot clock minus rate of the converted clock
+    # Rate of the boot clock minus rate of this clock
     drift_ppm: float
     # Standard deviation of the readings from the fitted line (1.4826 · median absolute deviation)
     jitter_s: NotNegative
     # Limitation of the conversion, if any
     note: str = ""
-    # Number of distinct timestamps; None if they are enough for a conversion
+    # Number of distinct timestamps, if too few for a conversion; otherwise None
     distinct_stamps: Count | None = None
 
 
-def clock_of_repeated_timestamps(
+def describe_repeated_timestamps(
     clock: str, sample_count: int, distinct_count: int
 ) -> ClockMap | None:
     """Describe a clock that cannot be converted, because most timestamps are repeated.
@@ -255,7 +256,7 @@ class LogInfo(Record, omit_defaults=False):
     firmware: str
     firmware_hash: str
     hardware: str
-    # Boot clock at time zero of the flight, which is the first sample
+    # Boot clock at the first sample, which is time zero of the flight
     boot_time_s: float
     # Time span of the IMU samples, or of the topic with the most samples if the IMU is not logged.
     # MAVLink: time span of the boot times. Outlying timestamps are ignored
@@ -296,7 +297,7 @@ class LogInfo(Record, omit_defaults=False):
         return self.parameter_defaults.get(parameter, PARAMETERS[parameter].default)
 
     @property
-    def has_ulog(self) -> bool:
+    def writes_ulog(self) -> bool:
         """True if the autopilot writes ULog files, as PX4 does."""
         return self.autopilot != "ArduPilot"
 
@@ -309,7 +310,7 @@ StepFunctions: TypeAlias = "Mapping[str, pd.Series[float]]"
 Spans = tuple[Span, ...]
 # Minimum fraction of sample intervals that are at most three median intervals. Below it, the
 # samples arrive in bursts
-MIN_REGULAR_FRACTION = 0.8
+MIN_REGULAR_INTERVAL_FRACTION = 0.8
 # Values of ClockMap.method for which the timestamps are not times of measurement
 ARRIVAL_CLOCK_METHODS = ("arrival time", "receive time", "message order")
 # Reason for missing positions if the source measures only the height
@@ -318,12 +319,12 @@ HEIGHT_ONLY_REASON = "x and y are NaN in all messages, so the source measures on
 SECOND_DIFFERENCE_PER_SIGMA = 6.0**0.5 / 1.4826
 # Minimum number of positions to estimate their noise
 MIN_NOISE_SAMPLES = 10
-# Minimum noise (1 σ, m) of UWB positions
+# Positions with less noise (1 σ, m) are not classified as UWB
 MIN_UWB_NOISE_M = 0.03
-# Maximum rate (Hz) of UWB positions
+# Positions at a higher rate (Hz) are not classified as UWB
 MAX_UWB_RATE_HZ = 25.0
 # Minimum time (s) on the ground between two flights: shorter landings are detector errors
-MIN_LANDED_S = 5.0
+MIN_LANDED_DURATION_S = 5.0
 BODY_AXES = ("forward", "right", "down")
 AXIS_NAMES: tuple[NedAxis, NedAxis, NedAxis] = ("north", "east", "down")
 SOURCE_NAMES: Mapping[PositionKind, str] = {
@@ -416,7 +417,7 @@ class PositionTrack:
 
     # Name for ``--position-source``: the PX4 topic, if there is one
     name: str
-    origin: Origin
+    origin: SourceOrigin
     description: str
     # Position in NED and the reported variances (columns POSITION and POSITION_VARIANCE); NaN for
     # variances that are not logged
@@ -484,9 +485,9 @@ class PositionTrack:
 
 
 def estimate_white_noise_m(position_m: Array) -> float:
-    """Estimate the white noise (1 σ, m) of positions from second differences, shape (n, axes).
+    """Estimate the white noise (1 σ, m) of positions, shape (n, axes), along the noisiest axis.
 
-    Second differences are zero at constant velocity. The result is that of the noisiest axis.
+    It is computed from second differences, because they are zero at constant velocity.
     """
     second_difference_m = np.abs(np.diff(position_m, 2, axis=0))
     return float(np.median(second_difference_m, axis=0).max()) / SECOND_DIFFERENCE_PER_SIGMA
@@ -572,7 +573,7 @@ FLOW_FILTER_WEIGHT = 0.1
 
 @dataclass(frozen=True)
 class FusionRecord:
-    """Logged data of EKF2 at its fusion horizon: initial values and inputs of the replay."""
+    """Logged states of EKF2 at its fusion horizon, and logged measurements, for the replay."""
 
     # All EKF2_ parameters at the start of the log, by PX4 name, in PX4 units
     parameters: Mapping[str, float]
@@ -586,11 +587,12 @@ class FusionRecord:
     # Delay (s) from measurement to publication of each external vision sample
     vision_age_s: pd.Series
     # Measured magnetic field (body FRD). ``fused_3d`` is 1 while EKF2 fuses all components, 0 for
-    # heading only. Since v1.16: EKF2's low-pass filtered innovations (predicted minus measured)
+    # heading only. Logs since v1.16 also fill the columns FIELD_INNOVATION: EKF2's low-pass
+    # filtered innovations (predicted minus measured)
     magnetic_field_gauss: pd.DataFrame = field(default_factory=pd.DataFrame)
-    # Velocity from optical flow (body FRD): mean of the measurements since the previous row, with
-    # the weights of EKF2's low-pass filter (FLOW_FILTER_WEIGHT). ``samples`` is their number,
-    # ``interval_s`` their interval, ``noise_m2_s2`` the variance R of one measurement
+    # Velocity from optical flow (body FRD): mean of the ``samples`` measurements since the previous
+    # row, at intervals of ``interval_s``. Their weights are those of EKF2's low-pass filter
+    # (FLOW_FILTER_WEIGHT), which is inverted. ``noise_m2_s2`` is the variance R of one measurement
     flow: pd.DataFrame = field(default_factory=pd.DataFrame)
     # Latitude of the origin
     latitude_deg: float = np.nan
@@ -615,7 +617,7 @@ class FusionRecord:
         return (
             np.zeros(len(times_s), bool)
             if step_function is None
-            else step_values_at(step_function, times_s) > 0.0
+            else sample_step_function(step_function, times_s) > 0.0
         )
 
 
@@ -635,14 +637,14 @@ class AidLog:
     # EKF2 parameters of the aiding source at the start of the log
     parameters: Mapping[str, float] = field(default_factory=dict)
     # Number of innovations that were dropped because no variance is near in time
-    excluded_count: int = 0
+    excluded_sample_count: int = 0
     # Times of innovations for which the log does not show whether EKF2 fused them
     unknown_fusion_times_s: Array = field(default_factory=lambda: np.zeros(0))
 
     __repr__ = one_line_repr
 
 
-def step_values_at(step_function: pd.Series[float], times: pd.Index[float] | Array) -> Array:
+def sample_step_function(step_function: pd.Series[float], times: pd.Index[float] | Array) -> Array:
     """Return the values of a step function at times; before its start, the first value."""
     previous_rows = np.clip(np.searchsorted(step_function.index, times, side="right") - 1, 0, None)
     return np.asarray(step_function, dtype=np.float64)[previous_rows]
@@ -688,9 +690,9 @@ class Ekf2:
     horizon_s: float | Unavailable = HORIZON_NOT_LOGGED
     record: FusionRecord | Unavailable = RECORD_NOT_LOGGED
     aids: Mapping[str, AidLog] = field(default_factory=dict)
-    # Logged status flags of EKF2, 1 while set: one for each enabled aiding source (PX4 name), those
-    # of FusionRecord.states, ``tilt_align``, ``yaw_align``, ``gnss_fault``, ``xy_valid`` and
-    # ``xy_global``; and ``failed_checks``, the bit mask gps_check_fail_flags
+    # Logged status flags of EKF2, 1 while set: one for each enabled aiding source (PX4 name), the
+    # flags in FusionRecord.states, ``tilt_align``, ``yaw_align``, ``gnss_fault``, ``xy_valid`` and
+    # ``xy_global``. In addition the bit mask gps_check_fail_flags, as ``failed_checks``
     states: StepFunctions = field(default_factory=dict)
     # All EKF2_ parameters at take-off, by PX4 name, in PX4 units
     parameters: Mapping[str, float] = field(default_factory=dict)
@@ -762,7 +764,7 @@ class Flight:
     unused: tuple[UnusedData, ...] = ()
     # Files read in addition to the log
     inputs: tuple[InputFile, ...] = ()
-    # Intervals in which PX4's failure detector reports roll or pitch beyond the limits
+    # Intervals (s) in which PX4's failure detector reports roll or pitch beyond the limits
     tumble_spans: Spans = ()
     # Barometer height ``down_m`` with unknown zero
     barometer: pd.DataFrame | None = None
@@ -771,14 +773,14 @@ class Flight:
 
 
 def join_flights(airborne: Spans) -> Spans:
-    """Return start and end (s) of each flight, separated by at least MIN_LANDED_S on the ground."""
-    flights: list[Span] = []
+    """Return start and end (s) of flights with at least MIN_LANDED_DURATION_S between them."""
+    flight_spans_s: list[Span] = []
     for start_s, end_s in airborne:
-        if flights and start_s - flights[-1][1] < MIN_LANDED_S:
-            flights[-1] = (flights[-1][0], end_s)
+        if flight_spans_s and start_s - flight_spans_s[-1][1] < MIN_LANDED_DURATION_S:
+            flight_spans_s[-1] = (flight_spans_s[-1][0], end_s)
         else:
-            flights.append((start_s, end_s))
-    return tuple(flights)
+            flight_spans_s.append((start_s, end_s))
+    return tuple(flight_spans_s)
 
 
 def longest_flight(airborne: Spans) -> Span:
@@ -812,6 +814,6 @@ def sample_rate(samples: pd.DataFrame) -> float:
         return float("nan")
     intervals_s = samples.index.to_series().diff().dropna()
     regular_intervals_s = intervals_s[intervals_s <= 3.0 * intervals_s.median()]
-    if len(regular_intervals_s) < MIN_REGULAR_FRACTION * len(intervals_s):
+    if len(regular_intervals_s) < MIN_REGULAR_INTERVAL_FRACTION * len(intervals_s):
         regular_intervals_s = intervals_s
     return float(1.0 / regular_intervals_s.mean())

@@ -389,7 +389,7 @@ def _collect_logging_advice(
         (missing_data.remedy, missing_data.what)
         for missing_data in list_missing_data(flight)
         if missing_data is not NO_POSITION
-        and (flight.log.has_ulog or any(missing_data is data for data in possible_mavlink_data))
+        and (flight.log.writes_ulog or any(missing_data is data for data in possible_mavlink_data))
     ]
     purposes_by_action: dict[str, dict[str, None]] = {}
     for action, purpose in actions_and_purposes:

@@ -15,7 +15,7 @@ from msgspec import structs
 from px4fuse.comparison.preparation import choose_source, select_source_innovations
 from px4fuse.core.text import to_json_types
 from px4fuse.errors import MissingDataError
-from px4fuse.filter.signals import imu_and_attitude, ned_acceleration
+from px4fuse.filter.signals import compute_ned_acceleration, imu_and_attitude
 from px4fuse.flight.model import Ekf2, Flight, PositionTrack, Truth, Unavailable
 
 SCHEMA_NAME = "px4fuse-flight"
@@ -173,7 +173,7 @@ def _make_described_tables(flight: Flight) -> Iterator[DescribedTable]:
         flight, "imu", imu if isinstance(imu, Unavailable) else imu.astype(np.float64)
     )
     yield from _make_stream_table(flight, "attitude", flight.attitude)
-    acceleration = ned_acceleration(flight)
+    acceleration = compute_ned_acceleration(flight)
     if isinstance(acceleration, pd.DataFrame):
         acceleration = acceleration.set_axis(["north_m_s2", "east_m_s2", "down_m_s2"], axis=1)
         imu_topics, clock = _find_topics_and_clock(flight, "imu")

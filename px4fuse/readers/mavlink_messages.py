@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from px4fuse.core.record import read_toml
-from px4fuse.flight.model import RECORD_NOT_LOGGED, Origin, Unavailable, find_origin
+from px4fuse.flight.model import RECORD_NOT_LOGGED, SourceOrigin, Unavailable, find_source_origin
 from px4fuse.readers.field_maps import Layout, expand_layouts
 
 AUTOPILOT_COMPONENT_ID = 1  # MAV_COMP_ID_AUTOPILOT1
@@ -63,8 +63,8 @@ class PositionInput:
         return MESSAGE_LAYOUTS[self.row]
 
     @property
-    def origin(self) -> Origin:
-        return find_origin(self.kind, "as received")
+    def origin(self) -> SourceOrigin:
+        return find_source_origin(self.kind, "as received")
 
     @property
     def message(self) -> str:

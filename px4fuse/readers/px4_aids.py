@@ -13,7 +13,7 @@ import pandas as pd
 
 from px4fuse.core.arrays import Array
 from px4fuse.flight.ekf2_parameters import AIDS, STATUS_FLAGS, Aid
-from px4fuse.flight.model import AidLog, StepFunctions, step_values_at
+from px4fuse.flight.model import AidLog, StepFunctions, sample_step_function
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import join_nearest
 from px4fuse.readers.field_maps import Layout, expand_columns
@@ -106,7 +106,7 @@ def _read_aid_topic(
     if "last_fused_us" in samples:
         samples["last_fused_s"] = (samples.pop("last_fused_us") - topics.time_origin_us) * 1e-6
     if fusion_enabled is not None and aid.name in px4.AIDS_ALWAYS_FUSED:
-        samples["fused"] = step_values_at(fusion_enabled, samples.index)
+        samples["fused"] = sample_step_function(fusion_enabled, samples.index)
     return _make_aid_log(topics, (layout.topic,), aid, samples, fusion_enabled)
 
 
@@ -143,11 +143,13 @@ def _read_common_topics(
             # logged S is used
             variance_samples = topics.primary_samples(variance_layout).dropna()
             samples = join_nearest(samples, variance_samples, MAX_VARIANCE_TIME_DIFFERENCE_S)
-        excluded_count = len(samples) - len(samples := samples.dropna())
+        excluded_sample_count = len(samples) - len(samples := samples.dropna())
         if fusion_enabled is not None:
-            samples = samples[step_values_at(fusion_enabled, samples.index) > 0.0]
+            samples = samples[sample_step_function(fusion_enabled, samples.index) > 0.0]
         used_topics = tuple(dict.fromkeys((value_layout.topic, variance_layout.topic)))
-        aid_log = _make_aid_log(topics, used_topics, aid, samples, fusion_enabled, excluded_count)
+        aid_log = _make_aid_log(
+            topics, used_topics, aid, samples, fusion_enabled, excluded_sample_count
+        )
         if aid_log is not None:
             return replace(aid_log, unknown_fusion_times_s=unknown_fusion_times_s)
     return None
@@ -180,7 +182,7 @@ def _make_aid_log(
     aid: Aid,
     samples: pd.DataFrame,
     fusion_enabled: pd.Series[float] | None,
-    excluded_count: int = 0,
+    excluded_sample_count: int = 0,
 ) -> AidLog | None:
     """Return the innovations of an aiding source; None without a positive innovation variance.
 
@@ -192,4 +194,4 @@ def _make_aid_log(
     innovation_columns = [f"innovation_{axis}" for axis in aid.axes]
     parameters = aid.logged_parameters(topics.ekf2_parameters)
     samples = samples.assign(**-samples[innovation_columns])
-    return AidLog(used_topics, aid.axes, samples, fusion_enabled, parameters, excluded_count)
+    return AidLog(used_topics, aid.axes, samples, fusion_enabled, parameters, excluded_sample_count)

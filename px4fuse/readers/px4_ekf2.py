@@ -25,7 +25,7 @@ from px4fuse.flight.model import (
     StepFunctions,
     TableOrUnavailable,
     Unavailable,
-    step_values_at,
+    sample_step_function,
     time_index,
 )
 from px4fuse.readers import px4_topics as px4
@@ -111,10 +111,11 @@ def read_ekf2(topics: Topics) -> Ekf2 | Unavailable:
         if not any("timestamp_sample" in table for table in topics.tables_of(topic))
     ]
     notes += [
-        f"{log.excluded_count} samples of {log.topics[0]} ({', '.join(log.axes)}) were dropped, "
-        f"because {log.topics[-1]} has no variance within {MAX_VARIANCE_TIME_DIFFERENCE_S:g} s"
+        f"{log.excluded_sample_count} samples of {log.topics[0]} ({', '.join(log.axes)}) were "
+        f"dropped, because {log.topics[-1]} has no variance within "
+        f"{MAX_VARIANCE_TIME_DIFFERENCE_S:g} s"
         for log in (aids[name] for name in ("ev_pos", "ev_hgt") if name in aids)
-        if log.excluded_count
+        if log.excluded_sample_count
     ]
     status_flags = dict(enabled_aids)
     status_flags |= {
@@ -419,7 +420,7 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
     ].dropna()
     if field.empty or control_bits.empty:
         return pd.DataFrame()
-    flags = step_values_at(control_bits, field.index).astype(np.int64)
+    flags = sample_step_function(control_bits, field.index).astype(np.int64)
     return field.assign(fused_3d=(flags >> MAG_3D_BIT & 1).astype(float))
 
 
@@ -440,7 +441,9 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     steps_s = np.diff(times_s)
     used_rows = np.flatnonzero((steps_s > 0.5 * interval_s) & (steps_s <= MAX_FLOW_INTERVAL_S)) + 1
     if FLOW.name in enabled_aids:
-        used_rows = used_rows[step_values_at(enabled_aids[FLOW.name], times_s[used_rows]) > 0.0]
+        used_rows = used_rows[
+            sample_step_function(enabled_aids[FLOW.name], times_s[used_rows]) > 0.0
+        ]
     sample_count = np.rint((times_s[used_rows] - times_s[used_rows - 1]) / interval_s)
     previous_output_weight = ((1.0 - FLOW_FILTER_WEIGHT) ** sample_count)[:, None]
     filtered_velocity = flow_velocity[["forward_m_s", "right_m_s"]].to_numpy()

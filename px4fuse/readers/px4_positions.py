@@ -18,11 +18,11 @@ from px4fuse.flight.model import (
     ClockMap,
     Columns,
     Ekf2,
-    Origin,
     PositionTrack,
+    SourceOrigin,
     Truth,
     Unavailable,
-    clock_of_repeated_timestamps,
+    describe_repeated_timestamps,
     infer_position_kind,
     reclassify_as_vio,
     sample_rate,
@@ -108,7 +108,7 @@ def unavailable_source(name: str, reason: str = "", remedy: str = "") -> Unavail
 def make_track(
     name: str,
     samples: pd.DataFrame,
-    origin: Origin,
+    origin: SourceOrigin,
     *,
     needed_columns: list[str] = Columns.POSITION,
     remedy: str = "",
@@ -238,7 +238,7 @@ def _describe_arrival_clock(topics: Topics, topic: str) -> ClockMap | None:
         clock = _describe_timestamp_clock(published_us, sampled_us)
         note = "timestamp_sample does not contain boot times in microseconds"
     else:
-        return clock_of_repeated_timestamps(
+        return describe_repeated_timestamps(
             SENDER_CLOCK, len(sampled_us), len(np.unique(sampled_us))
         )
     return ClockMap(clock, "arrival time", len(age_us), 0.0, 0.0, 0.0, note)

@@ -15,7 +15,7 @@ from msgspec import structs
 
 from px4fuse.core.record import read_toml
 from px4fuse.flight.ekf2_parameters import AIDS
-from px4fuse.flight.model import Origin, find_origin
+from px4fuse.flight.model import SourceOrigin, find_source_origin
 from px4fuse.readers.field_maps import Layout, expand_layouts
 
 
@@ -23,7 +23,7 @@ from px4fuse.readers.field_maps import Layout, expand_layouts
 class TrackSource:
     """Description of a position source in ``px4_topics.toml``: topic, fields, frame, advice."""
 
-    # Kind of the source, such as "uwb", and how its positions reached the log (see Origin)
+    # Kind of the source, such as "uwb", and how its positions reached the log (see SourceOrigin)
     kind: str
     path: str
     description: str
@@ -39,8 +39,8 @@ class TrackSource:
     layouts: tuple[str, ...] = ()
 
     @property
-    def origin(self) -> Origin:
-        origin = find_origin(self.kind, self.path)
+    def origin(self) -> SourceOrigin:
+        origin = find_source_origin(self.kind, self.path)
         return origin if self.fused else structs.replace(origin, aid=None)
 
 

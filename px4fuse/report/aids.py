@@ -9,7 +9,7 @@ from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_number
 from px4fuse.ekf2.aids import AidResult, flight_span
-from px4fuse.flight.model import AidLog, Flight, Unavailable, step_values_at
+from px4fuse.flight.model import AidLog, Flight, Unavailable, sample_step_function
 from px4fuse.report import style
 from px4fuse.report.event_marks import ON_GROUND_BAND_STYLE
 from px4fuse.report.page import Cell, Page, appendix_title
@@ -124,7 +124,7 @@ def _draw_innovations(axes: style.Axes, aid_log: AidLog, span_s: Span) -> None:
         axes.axhline(limit, color="black", lw=0.4, ls=(0, (1, 1.5)))
     if aid_log.enabled is not None:
         times_s = np.linspace(*span_s, 2000)
-        is_disabled = step_values_at(aid_log.enabled, pd.Index(times_s)) <= 0.0
+        is_disabled = sample_step_function(aid_log.enabled, pd.Index(times_s)) <= 0.0
         if is_disabled.any():
             axes.fill_between(
                 times_s,

@@ -61,7 +61,7 @@ from ulog_tools import Log, load  # noqa: E402
 
 from px4fuse.cli import cli  # noqa: E402
 from px4fuse.errors import Px4FuseError  # noqa: E402
-from px4fuse.flight.ekf2_parameters import PARAMETER_RANGES  # noqa: E402
+from px4fuse.flight.ekf2_parameters import KNOWN_PARAMETERS  # noqa: E402
 from px4fuse.readers import mavlink, read_log, ulog  # noqa: E402
 from px4fuse.report import pdf  # noqa: E402
 from px4fuse.results.bounds import MAX_LENGTH_M, MAX_RATIO  # noqa: E402
@@ -205,14 +205,14 @@ def changed_times(log: Log, rng: random.Random) -> str:
 
 def changed_parameters(log: Log, rng: random.Random) -> str:
     """Remove a parameter, or set it out of range or to a limit of its range."""
-    name = rng.choice(sorted({*log.parameters} | {*PARAMETER_RANGES}))
+    name = rng.choice(sorted({*log.parameters} | {*KNOWN_PARAMETERS}))
     value: float | None = rng.choice(
         (None, np.nan, np.inf, -1.0, 0.0, 1e30, -1e30, 1e6, 1e-30, "low", "high")
     )
     if value is None:
         log.parameters.pop(name, None)
     elif isinstance(value, str):
-        known = PARAMETER_RANGES.get(name)
+        known = KNOWN_PARAMETERS.get(name)
         value = 0.0 if known is None else known.minimum if value == "low" else known.maximum
     if value is not None:
         log.parameters[name] = float(value)
@@ -400,7 +400,7 @@ def make_changed_tlog(rng: random.Random) -> tuple[str, str, bytes]:
     recorder.sent = [*recorder.sent]
     if rng.random() < 0.3:
         recorder.hear(mavlink_tools.unix(60.0), mavlink_tools.AUTOPILOT, message(
-            "PARAM_VALUE", param_type=9, param_id=rng.choice(sorted(PARAMETER_RANGES)).encode(),
+            "PARAM_VALUE", param_type=9, param_id=rng.choice(sorted(KNOWN_PARAMETERS)).encode(),
             param_value=rng.choice((1e30, -1.0, 0.0, math.nan)),
         ))  # fmt: skip
     kind, key, v1_share = rng.choice(TLOG_KINDS), None, 0.0

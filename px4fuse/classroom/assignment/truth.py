@@ -15,8 +15,8 @@ from px4fuse.filter.kalman import replay
 from px4fuse.filter.model import (
     COVARIANCE_COLUMNS,
     compute_unit_process_noise,
-    symmetric_matrix,
-    transition,
+    make_symmetric_matrix,
+    make_transition_matrix,
 )
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.time_offset import ClockOffset
@@ -246,8 +246,8 @@ def compute_numeric_answer(
             rejected_update_numbers = np.flatnonzero(is_outside) + question.update_number
             return tuple(rejected_update_numbers.astype(float).tolist())
         case "prediction":
-            p, f = symmetric_matrix(tuple(covariance)), transition(settings.dt_s)
-            q = symmetric_matrix(compute_unit_process_noise(settings.dt_s))
+            p, f = make_symmetric_matrix(tuple(covariance)), make_transition_matrix(settings.dt_s)
+            q = make_symmetric_matrix(compute_unit_process_noise(settings.dt_s))
             q *= settings.sigma_a_m_s2**2 * settings.dt_s
             for _ in range(round(question.duration_s_or_gate / settings.dt_s)):
                 p = f @ p @ f.T + q
