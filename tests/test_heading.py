@@ -95,6 +95,23 @@ def test_drifting_heading_error_is_estimated_per_flight_part(by):
     assert first.heading_error_deg > last.heading_error_deg
 
 
+def test_heading_error_of_scaled_positions_has_the_same_range():
+    flight, _ = with_heading_drift(simulated(passes=6))
+    scale = 1.3
+    scaled = tuple(
+        replace(track, samples=track.samples.assign(**scale * track.samples[Columns.POSITION]))
+        for track in flight.positions
+    )
+    ranges_deg = []
+    for flown, sigma_m in (
+        (flight, SIGMA_UWB_M),
+        (replace(flight, positions=scaled), scale * SIGMA_UWB_M),
+    ):
+        first, last = estimate(flown, sigma_m).find_extreme_parts()
+        ranges_deg.append(first.heading_error_deg - last.heading_error_deg)
+    assert ranges_deg[1] == pytest.approx(ranges_deg[0], rel=0.1)
+
+
 def test_heading_misalignment_without_data_gives_reason():
     flight = simulated()
     few = tuple(replace(t, samples=t.samples.iloc[:40]) for t in flight.positions)
