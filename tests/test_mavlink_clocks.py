@@ -420,7 +420,7 @@ def test_timesync_that_contradicts_receive_time_is_ignored():
     wrong = (received, UNIX_S + 3600.0 + received), NO_EXCHANGES[1]
     stamps, found = map_unix_timestamps(received, *wrong)
     assert found.description.method == "receive time"
-    np.testing.assert_allclose(found.sender_to_boot.at(stamps), received, atol=1e-6)
+    np.testing.assert_allclose(found.sender_to_boot_fit.at(stamps), received, atol=1e-6)
 
 
 def test_mavlink_clock_mapping_equals_reported_offset_and_drift():
@@ -431,5 +431,5 @@ def test_mavlink_clock_mapping_equals_reported_offset_and_drift():
     assert statement.drift_ppm == pytest.approx(100.0, abs=0.1)
     middle = 0.5 * (stamps[0] + stamps[-1])
     by_statement = stamps + statement.offset_s + statement.drift_ppm * 1e-6 * (stamps - middle)
-    np.testing.assert_allclose(by_statement, found.sender_to_boot.at(stamps), atol=2e-6)
+    np.testing.assert_allclose(by_statement, found.sender_to_boot_fit.at(stamps), atol=2e-6)
     np.testing.assert_allclose(by_statement, received, atol=2e-6)

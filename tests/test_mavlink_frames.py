@@ -202,7 +202,7 @@ def test_mavlink_2_trailing_zeros_of_payload_are_restored(read):
     whole = message("PARAM_VALUE", param_id=b"EKF2_EV_DELAY", param_value=3.5, param_type=9)
     short = message("ATTITUDE", time_boot_ms=7)
     frames = read(stamped(frame(short), frame(whole, sequence=1), frame(ATTITUDE, sequence=2)))
-    assert frames.payload_length.tolist()[0] == 1  # of 28
+    assert frames.payload_lengths.tolist()[0] == 1  # of 28
     table = decoded(frames, "ATTITUDE")
     assert table["time_boot_ms"].tolist() == [7, 1000]
     np.testing.assert_array_equal(table["yaw"], np.float32([0.0, 1.5]))
@@ -214,7 +214,7 @@ def test_mavlink_payload_with_unknown_extension_is_truncated(read):
     payload = bytes(ATTITUDE.unpacker.pack(1000, 0.1, -0.2, 1.5, 0.0, 0.0, 0.0)) + b"\x07" * 20
     longer = raw_frame(30, payload, seed=ATTITUDE.crc_extra)
     frames = read(stamped(frame(ATTITUDE), longer))
-    assert frames.payload_length.tolist() == [16, 48]
+    assert frames.payload_lengths.tolist() == [16, 48]
     table = decoded(frames, "ATTITUDE")
     assert table[0] == table[1]
 

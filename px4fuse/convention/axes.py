@@ -373,7 +373,7 @@ def _evaluate_hypothesis(
     source_motion: SourceSecondDifferences,
     imu_motion: ImuSecondDifferences,
 ) -> tuple[Hypothesis, Array]:
-    """Return the hypothesis with its log likelihood, and the Gauss-Newton step of its parameters."""
+    """Return the hypothesis with its log likelihood, and a Gauss-Newton step of its parameters."""
     delay_s, rotation_rad, heading_drift_rad_s, clock_drift, *_ = hypothesis.parameters
     time_s = source_motion.time_s[rows]
     row_interval_s = GRID_INTERVAL_S * float(np.median(np.diff(rows)))

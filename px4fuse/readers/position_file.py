@@ -20,7 +20,7 @@ from px4fuse.core.reading import read_bytes_limited, split_path_and_part
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import NO_INVALID_ROWS, time_index
 from px4fuse.readers import position_names
-from px4fuse.readers.common import estimate_rounding_step, find_invalid_rows
+from px4fuse.readers.common import classify_invalid_positions, estimate_rounding_step
 from px4fuse.readers.position_names import (
     LENGTH_UNITS,
     TIME_UNITS,
@@ -94,7 +94,7 @@ class PositionRecording:
     dropped_row_count: int = 0
     # Factor that converted the positions of the file to metres
     metres_per_unit: float = 1.0
-    # Dropped rows, each with the reason from :func:`find_invalid_rows`
+    # Dropped rows, each with the reason from :func:`classify_invalid_positions`
     invalid: "pd.Series[str]" = field(default_factory=lambda: NO_INVALID_ROWS)
     # Quantisation step of the horizontal position; 0 if it is not quantised
     rounding_step_m: float = 0.0
@@ -218,7 +218,7 @@ def read_position_file(
         for name, index in zip(SAMPLE_COLUMNS, (*axis_columns, *sigma_columns), strict=True)
     }
     samples = pd.DataFrame(columns_m, index=numbers.index).replace([np.inf, -np.inf], np.nan)
-    invalid_reasons = find_invalid_rows(samples, SAMPLE_COLUMNS[: len(position_columns)])
+    invalid_reasons = classify_invalid_positions(samples, SAMPLE_COLUMNS[: len(position_columns)])
     if is_trajectory:
         invalid_reasons[:] = ""
     invalid_parts = (

@@ -30,8 +30,8 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import (
+    classify_invalid_positions,
     estimate_rounding_step,
-    find_invalid_rows,
     interpolate_inside,
     join_nearest,
     read_attitude,
@@ -136,7 +136,7 @@ def make_track(
     if origin.is_gnss:  # repetitions are valid: a receiver at rest may repeat its position
         samples, invalid_rows = select_valid_rows(samples, needed_columns), NO_INVALID_ROWS
     else:
-        invalid_reasons = find_invalid_rows(samples, needed_columns)
+        invalid_reasons = classify_invalid_positions(samples, needed_columns)
         samples, invalid_rows = (
             samples[invalid_reasons == ""],
             invalid_reasons[invalid_reasons != ""],
