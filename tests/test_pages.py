@@ -746,7 +746,7 @@ def test_pdf_comparison_beyond_time_limit_reports_difference(
     pdf: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pages are compared in a separate process."""
-    monkeypatch.setattr(pages, "TIMEOUT_S", 0.001)
+    monkeypatch.setattr(pages, "PDF_COMPARISON_TIMEOUT_S", 0.001)
     (found,) = compare(pdf, pdf)
     assert found.is_structural
     assert "could not be compared" in found.what

@@ -169,7 +169,7 @@ def align_position_file(
     )
     offset_origin = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
-    invalid, sample_count = recording.invalid, len(recording.samples)
+    invalid_reasons, sample_count = recording.reason_by_invalid_row, len(recording.samples)
     clock_map = clock_of_repeated_timestamps(
         recording.clock_kind, sample_count + recording.dropped_row_count, sample_count
     )
@@ -186,7 +186,9 @@ def align_position_file(
         log=recording.name,
         alignment=alignment,
         clock_map=clock_map,
-        invalid=invalid.set_axis(invalid.index + (aligned_samples.index[0] - start_s)),
+        invalid=invalid_reasons.set_axis(
+            invalid_reasons.index + (aligned_samples.index[0] - start_s)
+        ),
         step_m=recording.rounding_step_m,
     )
     notes = [f"{recording.name}: {text}" for text in (*recording.detection_notes, *recording.notes)]

@@ -71,9 +71,9 @@ class MavlinkFrames:
     # Offset of the first byte of each frame in the content
     start_offsets: Int64Array
     message_ids: NDArray[np.int32]
-    system: ByteArray
-    component: ByteArray
-    sequence: ByteArray
+    system_ids: ByteArray
+    component_ids: ByteArray
+    sequence_numbers: ByteArray
     payload_offsets: Int64Array
     payload_lengths: ByteArray
     # Receive times (UNIX time); damaged values are interpolated. None for a raw stream
@@ -99,7 +99,9 @@ class MavlinkFrames:
     ) -> BoolArray:
         """Return True for each frame in ``rows`` (default: all) that ``address`` sent."""
         system, component = address
-        return np.asarray((self.system[rows] == system) & (self.component[rows] == component))
+        return np.asarray(
+            (self.system_ids[rows] == system) & (self.component_ids[rows] == component)
+        )
 
     def table(self, message: str, rows: IntArray) -> NDArray[Any]:
         """Decode frames of one message to a structured array with its fields, in MAVLink units.
@@ -187,9 +189,9 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
         sha256=hashlib.sha256(content).hexdigest(),
         start_offsets=start_offsets,
         message_ids=message_ids.astype(np.int32),
-        system=content_bytes[sequence_offsets + 1],
-        component=content_bytes[sequence_offsets + 2],
-        sequence=content_bytes[sequence_offsets],
+        system_ids=content_bytes[sequence_offsets + 1],
+        component_ids=content_bytes[sequence_offsets + 2],
+        sequence_numbers=content_bytes[sequence_offsets],
         payload_offsets=start_offsets + np.where(is_version_2, HEADER_BYTES_V2, HEADER_BYTES_V1),
         payload_lengths=content_bytes[start_offsets + 1],
         receive_times_us=receive_times_us,

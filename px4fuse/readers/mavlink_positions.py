@@ -138,14 +138,13 @@ def _read_gnss(
     message_count = len(rows)
     rows = rows[np.diff(recording.frames.table(layout.topic, rows)["time_usec"], prepend=0) > 0]
     fix_boot_time_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
-    compute_receipt_boot_times_s = recording.compute_receipt_boot_times_s(rows)
+    receipt_boot_times_s = recording.compute_receipt_boot_times_s(rows)
     if (
         len(rows)
-        and np.median(np.abs(compute_receipt_boot_times_s - fix_boot_time_s))
-        > MAX_BOOT_TIME_DIFFERENCE_S
+        and np.median(np.abs(receipt_boot_times_s - fix_boot_time_s)) > MAX_BOOT_TIME_DIFFERENCE_S
     ):
         # The timestamps are not boot times, for example UNIX times: use the receive times
-        fix_boot_time_s = compute_receipt_boot_times_s
+        fix_boot_time_s = receipt_boot_times_s
     fixes = recording.read(layout, rows, fix_boot_time_s - delay_s)
     fixes = fixes[fixes["fix_type"] >= px4_positions.FIX_TYPE_3D]
     if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
@@ -234,7 +233,7 @@ def read_truth(
         origin = find_local_origin(recording) if positions and positions[0].origin.is_gnss else None
         state = project_to_ned(samples, origin).join(samples[Columns.VELOCITY])
         return Truth(layout.topic, state[Columns.STATE], read_attitude(samples))
-    mocap_truth = px4_positions.motion_capture_truth(positions)
+    mocap_truth = px4_positions.find_motion_capture_truth(positions)
     for track in positions:
         if mocap_truth and track.name == mocap_truth.name:
             recording.record_stream("truth", *track.topics, clock=track.clock)

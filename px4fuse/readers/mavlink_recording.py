@@ -114,7 +114,9 @@ class Recording:
         """
         rows = self.rows(layout.topic) if rows is None else rows
         table = self.frames.table(layout.topic, rows)
-        boot_times_s = self.boot_times_s(table, rows) if boot_times_s is None else boot_times_s
+        boot_times_s = (
+            self.compute_boot_times_s(table, rows) if boot_times_s is None else boot_times_s
+        )
         selected_rows = self._select_rows(name or layout.topic, boot_times_s)
         if len(selected_rows) < len(table):
             table = table[selected_rows]
@@ -161,7 +163,7 @@ class Recording:
         """Return receive times on the boot clock (s), minus the unknown minimum link delay."""
         return self.receipt_to_boot_fit.at(self.receive_times_s[rows])
 
-    def boot_times_s(self, table: NDArray[Any], rows: IntArray) -> Array:
+    def compute_boot_times_s(self, table: NDArray[Any], rows: IntArray) -> Array:
         """Return the time since boot (s) of each message, or its receive time if it has none."""
         if not self.receipt_to_boot_fit.pair_count:  # no message contains the boot clock
             return self.compute_receipt_boot_times_s(rows)

@@ -39,7 +39,7 @@ def _read_vehicle_types(frames: MavlinkFrames) -> dict[MavlinkAddress, tuple[int
 
 
 def _read_addresses(frames: MavlinkFrames, rows: IntArray | slice) -> Iterator[MavlinkAddress]:
-    return zip(frames.system[rows].tolist(), frames.component[rows].tolist(), strict=True)
+    return zip(frames.system_ids[rows].tolist(), frames.component_ids[rows].tolist(), strict=True)
 
 
 def _count_frames(
@@ -247,7 +247,7 @@ def _estimate_lost_fraction(frames: MavlinkFrames, address: MavlinkAddress) -> f
 
     Return None if the sender does not count its messages, or counts them separately on two links.
     """
-    sequence_numbers = frames.sequence[frames.is_sent_by(address)].astype(np.int64)
+    sequence_numbers = frames.sequence_numbers[frames.is_sent_by(address)].astype(np.int64)
     sequence_steps = np.mod(np.diff(sequence_numbers) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES
     unwrapped_sequence = np.append(0, np.cumsum(sequence_steps))
     lost_fraction = float(
