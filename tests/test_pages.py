@@ -493,7 +493,9 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "a base address": (
         catalogue("/URI", dictionary(Base=STRING("http://x"))), "an entry /URI", True,
     ),
-    "another language": (catalogue("/Lang", STRING("de")), "the PDF entry /Lang was changed: 'de'", False),
+    "another language": (
+        catalogue("/Lang", STRING("de")), "the PDF entry /Lang was changed: 'de'", False,
+    ),
     "no structure tree": (
         lambda w: w.root_object.pop("/StructTreeRoot"), "an entry /StructTreeRoot is", True,
     ),
@@ -511,7 +513,9 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "another version": (catalogue("/Version", name("2.0")), "an entry /Version", True),
     # metadata
     "another title": (document_info(Title="verified by px4fuse"), "the PDF entry /Title", False),
-    "another author": (document_info(Author="Ada"), "the PDF entry /Author was changed: 'Ada'", False),
+    "another author": (
+        document_info(Author="Ada"), "the PDF entry /Author was changed: 'Ada'", False,
+    ),
     "another creator": (document_info(Creator="Typst 1 by Ada"), "the PDF entry /Creator", False),
     "a subject": (document_info(Subject="verified"), "an entry /Subject", True),
     "XMP's title": (

@@ -127,7 +127,7 @@ def estimate_rounding_step(values: Array) -> float:
     differences = np.diff(np.unique(values[np.isfinite(values)]))
     if not len(differences):
         return 0.0
-    # a tiny minimum makes the counts infinite: then they are not whole numbers
+    # a tiny minimum makes the counts infinite: is_multiple is then False
     with np.errstate(over="ignore", invalid="ignore"):
         step_counts = differences / differences.min()
         is_multiple = np.abs(step_counts - np.rint(step_counts)) < MAX_STEP_MULTIPLE_ERROR

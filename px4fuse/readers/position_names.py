@@ -127,9 +127,8 @@ def find_position_columns(
             )
     for axis_count in (3, 2):
         for axes in columns_by_group.values():
-            for frame, names in (
-                () if "w" in axes else _AXIS_NAMES_BY_FRAME
-            ):  # x, y, z, w is a quaternion
+            # x, y, z, w is a quaternion
+            for frame, names in () if "w" in axes else _AXIS_NAMES_BY_FRAME:
                 if {*names[:axis_count]} <= axes.keys():
                     return frame, (axes[names[0]], axes[names[1]], axes.get(names[2]))
     return None

@@ -28,7 +28,8 @@ UNIT_NORM_TOLERANCE = 1e-15
 # A file with a larger fraction of invalid rows is rejected: its timestamps are probably rounded, or
 # it contains several recordings
 MAX_DROPPED_ROW_FRACTION = 0.01
-# The first pose is the identity, as in SLAM, if coordinates (m) and rotation angle (rad) are below
+# The first pose is the identity, as in SLAM, if its coordinates (m) and rotation angle (rad) are
+# below this limit
 MAX_IDENTITY_DEVIATION = 1e-6
 # Maximum ratio smallest / second RMS extent along the principal axes, for a motion in a plane
 MAX_PLANE_THICKNESS_RATIO = 1 / 3
