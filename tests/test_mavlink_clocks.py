@@ -135,7 +135,7 @@ METHODS = {
         (Aisle(clock=lambda boot: boot + 2 * HOUR_S, replies=False), "receive time", "clock of",
          (-1.5 * WAY_S, 1.5 * WAY_S)),
 }  # fmt: skip
-NOTES = {"SYSTEM_TIME": "same UNIX time", "receive time": "minimum link delay"}
+NOTES = {"SYSTEM_TIME": "UNIX clocks of sender and autopilot", "receive time": "minimum link delay"}
 
 
 @pytest.mark.parametrize("case", METHODS)

@@ -154,7 +154,7 @@ def test_read_position_file_lists_times_of_rows_without_position(tmp_path):
     path = tmp_path / "uwb.csv"
     path.write_text("\n".join(["time,x,y,z", *rows, ""]))
     recording = read_position_file(path)
-    assert recording.invalid.to_dict() == {1.0: "NaN", 1.1: "NaN", 2.0: "zero"}
+    assert recording.reason_by_invalid_row.to_dict() == {1.0: "NaN", 1.1: "NaN", 2.0: "zero"}
     assert len(recording.samples) == 37
 
 
