@@ -48,7 +48,7 @@ MIN_LIKELIHOOD_GAIN = 8.0
 # the motion: if one convention fits, and if several fit
 MIN_LIKELIHOOD_GAIN_PER_SAMPLE = (0.15, 0.4)
 # Accepted ratio of the source's displacements to those from the IMU
-MIN_DISPLACEMENT_RATIO, MAX_DISPLACEMENT_RATIO = 0.88, 1.12
+MIN_SOURCE_TO_IMU_RATIO, MAX_SOURCE_TO_IMU_RATIO = 0.88, 1.12
 # A convention is doubtful if σ of its residuals is above this multiple of the expected noise
 MAX_RESIDUAL_TO_NOISE_RATIO = 2.4
 # σ (m) of the second differences of the position integrated from the IMU
@@ -262,8 +262,8 @@ def _choose_convention(
     elif (
         best_hypothesis.score
         < MIN_LIKELIHOOD_GAIN_PER_SAMPLE[is_ambiguous] * best_hypothesis.independent_residual_count
-        or best_hypothesis.min_displacement_ratio > MAX_DISPLACEMENT_RATIO
-        or best_hypothesis.max_displacement_ratio < MIN_DISPLACEMENT_RATIO
+        or best_hypothesis.min_displacement_ratio > MAX_SOURCE_TO_IMU_RATIO
+        or best_hypothesis.max_displacement_ratio < MIN_SOURCE_TO_IMU_RATIO
         or compute_residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_TO_NOISE_RATIO
     ):
         verdict = "doubtful"
