@@ -196,7 +196,7 @@ def read_again(results: dict[str, Any]) -> ReportedResults:
     return read_results(to_json(results).encode())
 
 
-RECOMPUTE = verification.recompute
+RECOMPUTE = verification.recompute_report
 
 
 def verify_with(
@@ -206,7 +206,7 @@ def verify_with(
 ) -> Verification:
     """Verify a report with another function that repeats its analysis."""
     report = read_attached_results(pdf)
-    with mock.patch.object(verification, "recompute", recompute):
+    with mock.patch.object(verification, "recompute_report", recompute):
         return verify(report, pdf, files)
 
 
@@ -245,7 +245,7 @@ class VerifiedReport:
 
 def make_verified_report(pdf: bytes, log: Path) -> VerifiedReport:
     files = files_by_sha256([log])
-    again = verification.recompute(read_attached_results(pdf), files)
+    again = verification.recompute_report(read_attached_results(pdf), files)
     drawn = again[1]()
     return VerifiedReport(
         drawn, to_dict(read_attached_results(drawn)), (again[0], lambda: drawn), files

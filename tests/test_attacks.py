@@ -47,7 +47,7 @@ from px4fuse.simulation.scenario import Scenario
 from px4fuse.verification import pages
 from px4fuse.verification.model import Verification
 from px4fuse.verification.pdf_input import read_report
-from px4fuse.verification.verification import cannot_verify
+from px4fuse.verification.verification import make_unverifiable_result
 
 ASK = "Ask the author how the report was made"  # beginning of the action for a forged report
 
@@ -295,7 +295,7 @@ def test_grade_report_with_forged_results_is_not_verified(
         report: ReportedResults | ResultsError = read_report(pdf, "a.pdf")
         verdict = flight.honest.verified(pdf)
     except ResultsError as error:
-        report, verdict = error, cannot_verify(str(error))
+        report, verdict = error, make_unverifiable_result(str(error))
     graded = flight.graded(report, verdict, rubric)
     assert graded.status != "verified"
     assert not graded.counted_points

@@ -15,7 +15,7 @@ from exchange import replace
 from flights import given_placement
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.convention.axes import AXIS_ASSIGNMENTS, CLOCKWISE_DIRECTIONS, UNIT_SIZES_M
+from px4fuse.convention.axes import AXIS_ASSIGNMENTS, CLOCKWISE_DIRECTIONS, METRES_PER_UNIT
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import ConventionFaults, find_convention_faults
 from px4fuse.convention.model import AxisDirections, Convention, OrientationConvention
@@ -97,7 +97,7 @@ def sent(
     true += np.random.default_rng(seed).normal(0.0, sigma_m, true.shape)
     cosine, sine = np.cos(np.radians(rotation_deg)), np.sin(np.radians(rotation_deg))
     true = true @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    position = true @ np.array([UNIT_VECTORS[name] for name in axes]).T / UNIT_SIZES_M[unit]
+    position = true @ np.array([UNIT_VECTORS[name] for name in axes]).T / METRES_PER_UNIT[unit]
     stamps = time + late_s + clock_drift * (time - time.mean())
     samples = pd.DataFrame(position, pd.Index(stamps, name="time_s"), Columns.POSITION)
     samples = samples.reindex(columns=Columns.POSITION + Columns.POSITION_VARIANCE)
@@ -136,7 +136,7 @@ def assert_found(convention: Convention, **expected: object) -> None:
 @pytest.mark.parametrize("index", range(0, len(ALL_AXES), 5))
 def test_frame_detection_finds_axes_unit_and_time_offset(index):
     rng = np.random.default_rng(index)
-    axes, unit = ALL_AXES[index], [*UNIT_SIZES_M][index % 4]
+    axes, unit = ALL_AXES[index], [*METRES_PER_UNIT][index % 4]
     late_s = float(rng.uniform(-8.0, 8.0))
     found = check_convention(flown(), sent(flown(), axes, unit, late_s=late_s, seed=index))
     assert_found(found, **dict(zip("xyz", axes, strict=True)), unit=unit, late_s=late_s)

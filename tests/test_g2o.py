@@ -119,11 +119,11 @@ INVALID_TEXTS = {
     ),
     "too small": (
         PLANE.replace(UNIT_2, "1e-51 0 0 1 0 1"),
-        "line 3: a number of the information matrix",
+        "line 3: the absolute value of an information matrix element",
     ),
     "smallest": (
         PLANE.replace(UNIT_2, "1 0 0 5e-324 0 1"),
-        "line 3: a number of the information matrix",
+        "line 3: the absolute value of an information matrix element",
     ),
     "far vertex": (
         PLANE.replace("1 1 0 0\n", "1 1e30 0 0\n"),
@@ -135,7 +135,7 @@ INVALID_TEXTS = {
     ),
     "too large": (
         PLANE.replace(UNIT_2, "1 0 0 1 0 1e51"),
-        "line 3: a number of the information matrix",
+        "line 3: the absolute value of an information matrix element",
     ),
 }
 

@@ -61,7 +61,7 @@ from px4fuse.flight.model import (
 from px4fuse.info.inventory import take_inventory
 from px4fuse.readers import read_log
 from px4fuse.readers.mavlink_frames import wire_layout
-from px4fuse.readers.mavlink_positions import pressure_altitude
+from px4fuse.readers.mavlink_positions import compute_pressure_altitude_m
 from px4fuse.readers.px4_positions import unproject
 
 FUZZ_CASES = int(os.environ.get("PX4FUSE_FUZZ_CASES", "60"))
@@ -530,7 +530,7 @@ def test_mavlink_gnss_position_is_relative_to_autopilot_origin(read, origin, clo
 
 def test_mavlink_barometer_height_is_computed_from_pressure(read):
     """Pressures are from the table of the standard atmosphere (ISO 2533), at 400 m and 1 km."""
-    altitude_m = pressure_altitude(np.array([1013.25, 966.114, 898.746]))
+    altitude_m = compute_pressure_altitude_m(np.array([1013.25, 966.114, 898.746]))
     assert altitude_m == pytest.approx([0.0, 400.0, 1000.0], abs=0.1)
     flight = read(add(outdoors(), 5.0, pressure))
     assert compare(flight, axes=("down",)).source.barometer is None

@@ -133,14 +133,16 @@ def assert_equals_pymavlink(path: Path) -> None:
         rows = np.array([at[one.start] for one in all_heard], dtype=np.intp)
         assert (frames.message_ids[rows] == MESSAGES[name].id).all()
         assert_same_values(MESSAGES[name], name, frames.table(name, rows), all_heard)
-        senders = np.column_stack([frames.system[rows], frames.component[rows]])
+        senders = np.column_stack([frames.system_ids[rows], frames.component_ids[rows]])
         np.testing.assert_array_equal(senders, [one.sender for one in all_heard])
-        np.testing.assert_array_equal(frames.sequence[rows], [one.sequence for one in all_heard])
+        np.testing.assert_array_equal(
+            frames.sequence_numbers[rows], [one.sequence for one in all_heard]
+        )
         if with_stamps:
             received = [one.received_us for one in all_heard]
-            np.testing.assert_array_equal(frames.received_us[rows], received)
+            np.testing.assert_array_equal(frames.receive_times_us[rows], received)
         count += len(rows)
-    assert (frames.received_us is not None) == with_stamps
+    assert (frames.receive_times_us is not None) == with_stamps
     assert len(frames) - count == BEYOND_PYMAVLINK.get(path.name, 0)
     if path.name not in BEYOND_PYMAVLINK:  # pymavlink counts some of them as unknown frames
         assert frames.unknown_frame_count == unknown
@@ -202,7 +204,7 @@ def test_mavlink_2_trailing_zeros_of_payload_are_restored(read):
     whole = message("PARAM_VALUE", param_id=b"EKF2_EV_DELAY", param_value=3.5, param_type=9)
     short = message("ATTITUDE", time_boot_ms=7)
     frames = read(stamped(frame(short), frame(whole, sequence=1), frame(ATTITUDE, sequence=2)))
-    assert frames.payload_length.tolist()[0] == 1  # of 28
+    assert frames.payload_lengths.tolist()[0] == 1  # of 28
     table = decoded(frames, "ATTITUDE")
     assert table["time_boot_ms"].tolist() == [7, 1000]
     np.testing.assert_array_equal(table["yaw"], np.float32([0.0, 1.5]))
@@ -214,7 +216,7 @@ def test_mavlink_payload_with_unknown_extension_is_truncated(read):
     payload = bytes(ATTITUDE.unpacker.pack(1000, 0.1, -0.2, 1.5, 0.0, 0.0, 0.0)) + b"\x07" * 20
     longer = raw_frame(30, payload, seed=ATTITUDE.crc_extra)
     frames = read(stamped(frame(ATTITUDE), longer))
-    assert frames.payload_length.tolist() == [16, 48]
+    assert frames.payload_lengths.tolist() == [16, 48]
     table = decoded(frames, "ATTITUDE")
     assert table[0] == table[1]
 
@@ -241,7 +243,7 @@ def test_read_mavlink_counts_unknown_frames_and_bad_bytes(
 ):
     """Signatures are not bad bytes, and unknown frames do not affect other frames."""
     frames = read(stamped(*parts) if with_stamps else b"".join(parts))
-    assert frames.sequence.tolist() == [*good]
+    assert frames.sequence_numbers.tolist() == [*good]
     assert frames.unknown_frame_count == unknown_frame_count
     assert frames.bad_byte_count == bad * (len(BEATS[4]) + 8 * with_stamps)
 
@@ -281,7 +283,7 @@ def test_complete_mavlink_recording_is_not_reported_truncated(read, rest: bytes)
 def test_invalid_bytes_between_mavlink_frames_are_skipped(read, junk):
     parts = beats(6)
     frames = read(b"".join(parts[:3]) + junk + b"".join(parts[3:]))
-    assert frames.sequence.tolist() == list(range(6))
+    assert frames.sequence_numbers.tolist() == list(range(6))
     assert frames.bad_byte_count == len(junk)
 
 
@@ -319,14 +321,14 @@ def test_incomplete_first_and_last_mavlink_frame_are_dropped(read):
     whole = b"".join(parts)
     for cut in (1, 5, len(parts[0]) - 1):
         frames = read(whole[cut : len(whole) - cut])
-        assert frames.sequence.tolist() == [1, 2, 3]
+        assert frames.sequence_numbers.tolist() == [1, 2, 3]
         assert frames.bad_byte_count == 2 * (len(parts[0]) - cut)
     tlog = stamped(*parts)
     for cut in (3, 8, 12):
         frames = read(tlog[cut : len(tlog) - cut])
         expected = [0, 1, 2, 3] if cut <= 8 else [1, 2, 3]
-        assert frames.sequence.tolist() == expected
-        assert (np.diff(frames.received_us[1:]) == 1000).all()
+        assert frames.sequence_numbers.tolist() == expected
+        assert (np.diff(frames.receive_times_us[1:]) == 1000).all()
 
 
 def test_damaged_tlog_receive_times_are_interpolated(read):
@@ -337,7 +339,7 @@ def test_damaged_tlog_receive_times_are_interpolated(read):
     content = b"".join(stamp(us) + part for us, part in zip(times, parts, strict=True))
     frames = read(content)
     assert frames.damaged_receive_time_count == 3
-    assert frames.received_us.tolist() == [START_US + 1000 * i for i in range(9)]
+    assert frames.receive_times_us.tolist() == [START_US + 1000 * i for i in range(9)]
 
 
 @pytest.mark.parametrize("with_stamps", [True, False])
@@ -345,7 +347,7 @@ def test_mavlink_file_of_a_single_message_is_read(read, with_stamps):
     content = frame(odometry(5_000_000, [1, 2, 3], [0, 0, 0], estimator=8))
     frames = read(stamped(content) if with_stamps else content)
     assert len(frames) == 1
-    assert (frames.received_us is not None) == with_stamps
+    assert (frames.receive_times_us is not None) == with_stamps
     assert frames.bad_byte_count == 0
 
 

@@ -339,22 +339,22 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
         "the PDF entry /ToUnicode differs", False,
     ),
     "widths": (descendant("/W", array(N(0), N(60), N(0))), "the PDF array /W has 3 elements", True),
-    "the default width": (descendant("/DW", N(900)), "the PDF entry /DW is '900'", False),
+    "the default width": (descendant("/DW", N(900)), "the PDF entry /DW was changed: '900'", False),
     "vertical widths": (descendant("/DW2", array(N(0), N(1))), "an entry /DW2", True),
     "another encoding": (
         lambda w: font("/f0")(w).update({NameObject("/Encoding"): name("Identity-V")}),
-        "the PDF entry /Encoding is '/Identity-V'", False,
+        "the PDF entry /Encoding was changed: '/Identity-V'", False,
     ),
     "another name": (
         lambda w: font("/f0")(w).update({NameObject("/BaseFont"): name("Helvetica")}),
-        "the PDF entry /BaseFont is '/Helvetica'", False,
+        "the PDF entry /BaseFont was changed: '/Helvetica'", False,
     ),
     "no font program": (lambda w: descriptor(w).pop("/FontFile2"), "an entry /FontFile2", True),
     "a second font program": (
         lambda w: descriptor(w).update({NameObject("/FontFile3"): w._add_object(stream(b"x"))}),
         "an entry /FontFile3", True,
     ),
-    "another font under the name": (another_font, "the PDF entry /BaseFont is", True),
+    "another font under the name": (another_font, "the PDF entry /BaseFont was changed", True),
     "a Type3 font": (type3, "an entry /CharProcs", True),
     "one font more": (resource("/Font", "/f9", dictionary()), "an entry /f9", True),
     # content of a page
@@ -487,13 +487,15 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "viewer preferences": (
         catalogue("/ViewerPreferences", dictionary(HideMenubar=ON)), "an entry /HideMenubar", True,
     ),
-    "a bookmark": (bookmark, "the PDF entry /Title is 'consistent'", False),
+    "a bookmark": (bookmark, "the PDF entry /Title was changed: 'consistent'", False),
     "no bookmarks": (lambda w: w.root_object.pop("/Outlines"), "bookmarks is missing", True),
     "named places": (catalogue("/Dests", dictionary()), "an entry /Dests", True),
     "a base address": (
         catalogue("/URI", dictionary(Base=STRING("http://x"))), "an entry /URI", True,
     ),
-    "another language": (catalogue("/Lang", STRING("de")), "the PDF entry /Lang is 'de'", False),
+    "another language": (
+        catalogue("/Lang", STRING("de")), "the PDF entry /Lang was changed: 'de'", False,
+    ),
     "no structure tree": (
         lambda w: w.root_object.pop("/StructTreeRoot"), "an entry /StructTreeRoot is", True,
     ),
@@ -504,14 +506,16 @@ FORGERIES: dict[str, tuple[Forge, str, bool]] = {
     "another attachment": (another_file, "the PDF array /Names has 4 elements", True),
     "a description of the attachment": (
         lambda w: w.root_object["/AF"][0].update({NameObject("/Desc"): STRING("x")}),  # type: ignore[index]
-        "the PDF entry /Desc is 'x'", False,
+        "the PDF entry /Desc was changed: 'x'", False,
     ),
     "a collection": (catalogue("/Collection", dictionary()), "an entry /Collection", True),
     "permissions": (catalogue("/Perms", dictionary()), "an entry /Perms", True),
     "another version": (catalogue("/Version", name("2.0")), "an entry /Version", True),
     # metadata
     "another title": (document_info(Title="verified by px4fuse"), "the PDF entry /Title", False),
-    "another author": (document_info(Author="Ada"), "the PDF entry /Author is 'Ada'", False),
+    "another author": (
+        document_info(Author="Ada"), "the PDF entry /Author was changed: 'Ada'", False,
+    ),
     "another creator": (document_info(Creator="Typst 1 by Ada"), "the PDF entry /Creator", False),
     "a subject": (document_info(Subject="verified"), "an entry /Subject", True),
     "XMP's title": (
@@ -746,7 +750,7 @@ def test_pdf_comparison_beyond_time_limit_reports_difference(
     pdf: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pages are compared in a separate process."""
-    monkeypatch.setattr(pages, "TIMEOUT_S", 0.001)
+    monkeypatch.setattr(pages, "PDF_COMPARISON_TIMEOUT_S", 0.001)
     (found,) = compare(pdf, pdf)
     assert found.is_structural
     assert "could not be compared" in found.what

@@ -13,9 +13,9 @@ from time_limit import time_limit
 from px4fuse.errors import LogError, Px4FuseError, SettingsError
 from px4fuse.readers import position_file
 from px4fuse.readers.position_file import (
-    LENGTH_UNITS,
+    METRES_BY_LENGTH_UNIT,
     SAMPLE_COLUMNS,
-    TIME_UNITS,
+    SECONDS_BY_TIME_UNIT,
     PositionRecording,
     read_position_file,
 )
@@ -217,11 +217,11 @@ def test_read_position_file_with_implausible_rate_adds_note(read, step):
     assert file.samples.index[-1] == pytest.approx(float(texts[-1]))
 
 
-@pytest.mark.parametrize("unit", TIME_UNITS)
+@pytest.mark.parametrize("unit", SECONDS_BY_TIME_UNIT)
 def test_read_position_file_time_unit_overrides_column_name(read, unit):
     texts = [str(10 * i) for i in range(ROWS)]
     file = read(table({"time_us": texts, "x": X, "y": Y, "z": Z}), time_unit=unit)
-    assert file.samples.index[1] == pytest.approx(10 * TIME_UNITS[unit])
+    assert file.samples.index[1] == pytest.approx(10 * SECONDS_BY_TIME_UNIT[unit])
     assert_stated(file, f"{unit} (the unit was given with --position-time-unit)")
 
 
@@ -284,13 +284,13 @@ def test_position_file_note_names_the_used_position_columns(read, case, words):
     assert_stated(read(table({"time": UNIX_S, **POSITIONS[case][0]})), "position: ", *words)
 
 
-@pytest.mark.parametrize("unit", LENGTH_UNITS)
+@pytest.mark.parametrize("unit", METRES_BY_LENGTH_UNIT)
 def test_read_position_file_unit_option_overrides_column_name(read, unit):
     columns = {"time": UNIX_S, "x_cm": X, "y_cm": Y, "z": Z, "sigma_cm": fixed(SIGMA_M, 3)}
     samples = read(table(columns), length_unit=unit).samples
-    assert samples["x_m"].to_numpy() == pytest.approx(TRACK_M[:, 0] * LENGTH_UNITS[unit])
-    assert samples["z_m"].to_numpy() == pytest.approx(TRACK_M[:, 2] * LENGTH_UNITS[unit])
-    assert samples["sigma_z_m"].to_numpy() == pytest.approx(SIGMA_M * LENGTH_UNITS[unit])
+    assert samples["x_m"].to_numpy() == pytest.approx(TRACK_M[:, 0] * METRES_BY_LENGTH_UNIT[unit])
+    assert samples["z_m"].to_numpy() == pytest.approx(TRACK_M[:, 2] * METRES_BY_LENGTH_UNIT[unit])
+    assert samples["sigma_z_m"].to_numpy() == pytest.approx(SIGMA_M * METRES_BY_LENGTH_UNIT[unit])
 
 
 @pytest.mark.parametrize(("x", "words"), [

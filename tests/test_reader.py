@@ -42,7 +42,7 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers import read_log
 from px4fuse.readers.px4_aids import MAX_VARIANCE_TIME_DIFFERENCE_S
-from px4fuse.readers.px4_positions import motion_capture_truth
+from px4fuse.readers.px4_positions import find_motion_capture_truth
 
 HALF_PERIOD_S = 0.005  # s; half of the prediction interval, EKF2_PREDICT_US 10,000
 HOUR_US = 3_600_000_000
@@ -176,7 +176,7 @@ def test_ekf2_covariance_of_unknown_length_is_unavailable(read):
     fields["covariances"] = fields["covariances"][:, :22]
     variance = read(log).ekf2.variance
     assert isinstance(variance, Unavailable)
-    assert "no supported PX4 release has arrays of these lengths in" in variance.reason
+    assert "no supported PX4 release has states and covariances of these lengths" in variance.reason
 
 
 @pytest.mark.parametrize(("generation", "code", "frame"), [
@@ -521,7 +521,7 @@ def test_motion_capture_is_ground_truth_if_other_source_exists(read):
     flight = read(log)
     assert flight.truth.name == "vehicle_mocap_odometry"
     without_north = (replace(track, frame="FRD") for track in flight.positions)
-    assert motion_capture_truth(tuple(without_north)) is None
+    assert find_motion_capture_truth(tuple(without_north)) is None
     log.drop(*(n for n in log.names() if "_ev_" in n or n == "vehicle_visual_odometry"))
     flight = read(log)
     assert isinstance(flight.truth, Unavailable)

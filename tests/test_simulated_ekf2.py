@@ -17,7 +17,7 @@ from px4fuse.filter.settings import Settings
 from px4fuse.findings import find
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.readers import read_log
-from px4fuse.readers.px4_ekf2 import samples_per_step
+from px4fuse.readers.px4_ekf2 import compute_samples_per_step
 from px4fuse.simulation import ekf2, sensors
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate, simulate_flight, to_ulog
@@ -167,21 +167,25 @@ def test_simulated_ekf2_does_not_fuse_late_samples():
 
 
 def test_imu_samples_per_ekf2_step_are_rounded_to_nearest():
-    found = [samples_per_step(0.01, t) for t in (0.00375, 0.004, 0.005, 0.0021, 0.05)]
+    found = [compute_samples_per_step(0.01, t) for t in (0.00375, 0.004, 0.005, 0.0021, 0.05)]
     assert found == [3, 3, 2, 5, 1]
     # a median of timestamps is never exactly 4 ms
-    assert samples_per_step(0.01, 0.004 + 1e-12) == samples_per_step(0.01, 0.004 - 1e-12) == 3
+    assert (
+        compute_samples_per_step(0.01, 0.004 + 1e-12)
+        == compute_samples_per_step(0.01, 0.004 - 1e-12)
+        == 3
+    )
 
 
 def test_ambiguous_imu_samples_per_step_are_taken_from_log():
     """EKF2 rounds a measured mean: 2.5 samples become two or three."""
     by_two, by_three = 2 * np.arange(0, 60, 7), 3 * np.arange(0, 60, 7)
     ends = by_two, by_three, [5], [0, 25, 50]
-    assert [samples_per_step(0.01, 0.004, each) for each in ends] == [2, 3, 3, 3]
+    assert [compute_samples_per_step(0.01, 0.004, each) for each in ends] == [2, 3, 3, 3]
     # IMU dropouts change single steps
-    assert samples_per_step(0.01, 0.004, np.append(3 * np.arange(30), [91])) == 3
+    assert compute_samples_per_step(0.01, 0.004, np.append(3 * np.arange(30), [91])) == 3
     # the log is not used if the ratio is not close to a half
-    assert samples_per_step(0.01, 0.00375, by_two) == 3
+    assert compute_samples_per_step(0.01, 0.00375, by_two) == 3
 
 
 def test_simulated_ekf2_ignores_samples_with_older_timestamps():

@@ -30,7 +30,7 @@ from px4fuse.findings.cause_grouping import group_by_cause
 from px4fuse.findings.model import finding
 from px4fuse.flight.model import REPEATED_TIMESTAMPS_NOTE, ClockMap, Columns, Flight
 from px4fuse.readers import read_log
-from px4fuse.readers.common import estimate_rounding_step, find_invalid_rows
+from px4fuse.readers.common import classify_invalid_positions, estimate_rounding_step
 from px4fuse.readers.position_file import read_position_file
 from px4fuse.simulation.faults import parse_faults
 from px4fuse.simulation.flights import simulate_flight
@@ -54,7 +54,7 @@ def track(count: int = 60) -> pd.DataFrame:
 
 def invalid(samples: pd.DataFrame) -> dict[str, list[int]]:
     """Return the row numbers of invalid positions by reason."""
-    reason = find_invalid_rows(samples, ["x", "y", "z"]).to_numpy()
+    reason = classify_invalid_positions(samples, ["x", "y", "z"]).to_numpy()
     return {name: np.flatnonzero(reason == name).tolist() for name in sorted({*reason} - {""})}
 
 
@@ -166,7 +166,7 @@ def test_read_position_file_lists_times_of_rows_without_position(tmp_path):
     path = tmp_path / "uwb.csv"
     path.write_text("\n".join(["time,x,y,z", *rows, ""]))
     recording = read_position_file(path)
-    assert recording.invalid.to_dict() == {1.0: "NaN", 1.1: "NaN", 2.0: "zero"}
+    assert recording.reason_by_invalid_row.to_dict() == {1.0: "NaN", 1.1: "NaN", 2.0: "zero"}
     assert len(recording.samples) == 37
 
 

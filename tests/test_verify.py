@@ -55,7 +55,7 @@ from px4fuse.verification.pdf_input import read_report
 from px4fuse.verification.verification import (
     ESTIMATE_RELATIVE_TOLERANCE,
     NO_LOG_REASON,
-    RELATIVE_TOLERANCE,
+    RESULT_RELATIVE_TOLERANCE,
     VERIFICATION_SCOPE_NOTE,
     compare_results,
     flatten,
@@ -155,7 +155,7 @@ def test_verify_accepts_report_of_other_operating_system(
     elsewhere = (scaled_results, lambda: drawn)
     verdict = verify_with(one.pdf, one.files, lambda *_: elsewhere)
     assert verdict.outcome == "verified", verdict
-    assert f"within {RELATIVE_TOLERANCE:g}" in verdict.reasons[0]
+    assert f"within {RESULT_RELATIVE_TOLERANCE:g}" in verdict.reasons[0]
     aside = move_lines(one.pdf, 0.6)
     elsewhere = (one.again[0], lambda: aside)
     verdict = verify_with(one.pdf, one.files, lambda *_: elsewhere)
@@ -174,10 +174,10 @@ def test_verify_accepts_numbers_that_differ_by_1e_12(aisle: VerifiedReport) -> N
 def test_verify_reports_numbers_that_differ_by_1e_4(aisle: VerifiedReport) -> None:
     """All numbers, except estimates, which have another tolerance, and those near zero."""
     ours = json.loads(to_json(aisle.again[0]))
-    for share, least in ((1e-4, RELATIVE_TOLERANCE), (1e-2, ESTIMATE_RELATIVE_TOLERANCE)):
+    for share, least in ((1e-4, RESULT_RELATIVE_TOLERANCE), (1e-2, ESTIMATE_RELATIVE_TOLERANCE)):
         theirs = scaled(ours, share)
         found = {one.path for one in compare_results(theirs, ours)[0]}
-        wide = verification.ESTIMATE_FIELDS if least == RELATIVE_TOLERANCE else ()
+        wide = verification.ESTIMATE_FIELDS if least == RESULT_RELATIVE_TOLERANCE else ()
         expected = {
             path[:120] for path, value in flatten(ours)
             if isinstance(value, float) and abs(value) > 0.01 and not path.startswith(wide)
@@ -192,8 +192,8 @@ KF = ("axes", "north", "filters", "kf")
 def test_verify_applies_the_tolerance_of_each_number(aisle: VerifiedReport) -> None:
     ours = json.loads(to_json(aisle.again[0]))
     for share, path, alike in (
-        (0.5 * RELATIVE_TOLERANCE, (*KF, "nis_mean"), True),
-        (2.0 * RELATIVE_TOLERANCE, (*KF, "nis_mean"), False),
+        (0.5 * RESULT_RELATIVE_TOLERANCE, (*KF, "nis_mean"), True),
+        (2.0 * RESULT_RELATIVE_TOLERANCE, (*KF, "nis_mean"), False),
         (0.5 * ESTIMATE_RELATIVE_TOLERANCE, ("tuning", "horizontal", "sigma_a_m_s2"), True),
         (2.0 * ESTIMATE_RELATIVE_TOLERANCE, ("tuning", "horizontal", "sigma_a_m_s2"), False),
     ):
@@ -326,7 +326,7 @@ def test_verify_report_with_changed_student_name_is_not_verified(
 ) -> None:
     results = copy.deepcopy(loop.results)
     set_value({"name": "Eve", "notes": "I flew it."}.get(path[-1], "9.9.9"), *path)(results)
-    again = verification.recompute(read_again(results), loop.files)
+    again = verification.recompute_report(read_again(results), loop.files)
     pdf = loop.with_results(results)
     verdict = verify_with(pdf, loop.files, lambda *_: again)
     assert verdict.outcome != "verified", verdict
@@ -341,7 +341,7 @@ def foreign(loop: VerifiedReport) -> VerifiedReport:
     """Report that states another Matplotlib version, in its results and on its last page."""
     results = copy.deepcopy(loop.results)
     set_value("3.99.0", "provenance", "libraries", "matplotlib")(results)
-    again = verification.recompute(read_again(results), loop.files)
+    again = verification.recompute_report(read_again(results), loop.files)
     drawn = again[1]()
     return VerifiedReport(forged(drawn, with_results(to_json(results))), results, again, loop.files)
 

@@ -20,9 +20,9 @@ from px4fuse.alignment import matching, tracks
 from px4fuse.alignment.matching import AlignmentProblem, Match
 from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, compute_clipped_rms_m
 from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
-from px4fuse.convention.axes import UNIT_SIZES_M
+from px4fuse.convention.axes import METRES_PER_UNIT
 from px4fuse.convention.check import check_convention
-from px4fuse.convention.correction import MIN_ROTATION_DEG
+from px4fuse.convention.correction import MIN_FRAME_ROTATION_DEG
 from px4fuse.convention.texts import FRAME_AXES, UNIT_NAMES, describe_axes, describe_unit
 from px4fuse.core.arrays import Array
 from px4fuse.errors import MissingDataError, SettingsError
@@ -65,13 +65,13 @@ def _explain_mismatch(
     if convention is None or convention.verdict != "determined":
         return None
     axes, faults = convention.axes, []
-    if UNIT_SIZES_M[convention.unit] != metres_per_unit:
+    if METRES_PER_UNIT[convention.unit] != metres_per_unit:
         stated_unit = next(
-            name for unit, name in UNIT_NAMES.items() if UNIT_SIZES_M[unit] == metres_per_unit
+            name for unit, name in UNIT_NAMES.items() if METRES_PER_UNIT[unit] == metres_per_unit
         )
         faults.append(describe_unit(convention.unit, "the positions", stated_unit, is_file=True))
     stated_frame = problem.frames[0].upper() if len(problem.frames) == 1 else ""
-    is_rotated = abs(convention.rotation_deg) > MIN_ROTATION_DEG
+    is_rotated = abs(convention.rotation_deg) > MIN_FRAME_ROTATION_DEG
     if stated_frame and axes != FRAME_AXES[stated_frame] and not is_rotated:
         faults.append(
             describe_axes(axes, stated_frame, is_mirrored=convention.is_mirrored, is_file=True)
@@ -169,7 +169,7 @@ def align_position_file(
     )
     offset_origin = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
-    invalid, sample_count = recording.invalid, len(recording.samples)
+    invalid_reasons, sample_count = recording.reason_by_invalid_row, len(recording.samples)
     clock_map = describe_repeated_timestamps(
         recording.clock_kind, sample_count + recording.dropped_row_count, sample_count
     )
@@ -186,7 +186,9 @@ def align_position_file(
         log=recording.name,
         alignment=alignment,
         clock_map=clock_map,
-        invalid=invalid.set_axis(invalid.index + (aligned_samples.index[0] - start_s)),
+        invalid=invalid_reasons.set_axis(
+            invalid_reasons.index + (aligned_samples.index[0] - start_s)
+        ),
         step_m=recording.rounding_step_m,
     )
     notes = [f"{recording.name}: {text}" for text in (*recording.detection_notes, *recording.notes)]

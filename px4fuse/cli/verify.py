@@ -35,7 +35,7 @@ def verify(
     Exit code 0: verified; 1: differences, another log, or not verifiable; 2: invalid input.
     """
     from px4fuse.core.workers import JobFailure, run_one_with_limits
-    from px4fuse.verification.output import verification_data, verification_page
+    from px4fuse.verification.output import make_verification_output, verification_page
     from px4fuse.verification.pdf_input import MAX_PDF_BYTES, read_report
     from px4fuse.verification.verification import verify as verify_report
 
@@ -51,7 +51,7 @@ def verify(
             raise LogError("The folders LOG contain no files. Give the flight log or its folder.")
         show_progress("repeating the analysis")
         verification = run_one_with_limits(
-            partial(verify_report, pdf=content, logs=file_by_sha256),
+            partial(verify_report, pdf=content, path_by_sha256=file_by_sha256),
             recorded_results,
             ANALYSIS_TIMEOUT_S,
         )
@@ -60,6 +60,8 @@ def verify(
     report_files = (
         {} if output is None or not verification.redrawn_pdf else {output: verification.redrawn_pdf}
     )
-    contents = report_files | result_files(verification_data(content, verification), json_path)
+    contents = report_files | result_files(
+        make_verification_output(content, verification), json_path
+    )
     write_and_print(contents, verification_page(display_name(report), verification, output))
     sys.exit(0 if verification.outcome == "verified" else 1)

@@ -28,7 +28,7 @@ from px4fuse.flight.model import (
     Unavailable,
     join_flights,
 )
-from px4fuse.readers.mavlink_messages import POSITION_INPUTS
+from px4fuse.readers.mavlink_messages import POSITION_MESSAGE_TYPES
 from px4fuse.readers.px4_innovations import (
     GNSS,
     GNSS_AND_BAROMETER,
@@ -42,7 +42,7 @@ from px4fuse.trajectory.rotation import interpolate, to_matrix
 
 # Kind of sensor and way into the log of each position source, by PX4 topic or MAVLink message
 ORIGIN_BY_SOURCE_NAME = ORIGIN_BY_TRACK_NAME | {
-    source.track_name: source.origin for source in POSITION_INPUTS
+    source.track_name: source.origin for source in POSITION_MESSAGE_TYPES
 }
 NO_SEPARATE_TRUTH = Unavailable(
     "ground truth",
@@ -301,7 +301,7 @@ def explain_missing_source(flight: Flight) -> Unavailable:
         "give the position file with --position."
     )
     if flight.log.format.startswith("MAVLink"):
-        topics = " or ".join(dict.fromkeys(source.message for source in POSITION_INPUTS))
+        topics = " or ".join(dict.fromkeys(source.message for source in POSITION_MESSAGE_TYPES))
         remedy = "give the position file of the positioning system as argument `position`"
         remedy = (
             f"{remedy}, or read the ULog of this flight."

@@ -18,8 +18,8 @@ import numpy as np
 
 from px4fuse.convention.model import AxisDirections, Direction, HeadingSource, Unit
 from px4fuse.convention.motion import (
-    DIFFERENCE_WINDOW_S,
     GRID_INTERVAL_S,
+    SECOND_DIFFERENCE_WINDOW_S,
     ImuSecondDifferences,
     SourceSecondDifferences,
 )
@@ -27,29 +27,28 @@ from px4fuse.core.arrays import Array, IntArray
 
 # Maximum tested time offset (s) of the positions
 MAX_TIME_OFFSET_S = 10.0
-# Minimum time (s) with positions and IMU data to compare hypotheses
+# Minimum time (s) with positions and IMU data, to determine axes, unit and time offset
 MIN_OVERLAP_S = 10.0
 # Lower limit of σ (m) of the horizontal residuals, because IMU noise, tilt errors and interpolation
 # errors are always present
 MIN_HORIZONTAL_SIGMA_M = 0.05
-# Lower limit of σ (m) of the vertical residuals, for the same reason
+# Lower limit of σ (m) of the vertical residuals, also because of IMU and interpolation errors
 MIN_VERTICAL_SIGMA_M = 0.08
 # Degrees of freedom of the Student distribution of the residuals
 STUDENT_DEGREES_OF_FREEDOM = 4.0
-# Size of each length unit in metres
-UNIT_SIZES_M: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
-# A frame that is rotated about the vertical by at most this angle (rad) counts as misaligned; with
-# a larger rotation, as another frame, which is less probable a priori
+METRES_PER_UNIT: Final[dict[Unit, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "feet": 0.3048}
+# A frame that is rotated from NED about the vertical by at most this angle (rad) is a misaligned
+# NED. With a larger angle it is a different frame, which has a lower prior probability
 SMALL_ROTATION_RAD = np.radians(8.0)
 # Hypotheses with a time offset of at most this time (s) are equally probable a priori
 SMALL_TIME_OFFSET_S = 0.3
-# Log prior odds of a frame that is rotated by more than SMALL_ROTATION_RAD
+# Log prior odds, against an unrotated frame, of a frame rotated by more than SMALL_ROTATION_RAD
 ROTATION_LOG_ODDS = -1.0
-# Log prior odds of a frame that is rotated by less than SMALL_ROTATION_RAD, but not by zero
+# Log prior odds, against an unrotated frame, of a frame rotated by up to SMALL_ROTATION_RAD
 SMALL_ROTATION_LOG_ODDS = -0.5
-# Log prior odds of a time offset above SMALL_TIME_OFFSET_S
+# Log prior odds, against a smaller one, of a time offset above SMALL_TIME_OFFSET_S
 TIME_OFFSET_LOG_ODDS = -2.0
-# Log prior odds of a unit other than metres
+# Log prior odds, against metres, of another unit
 UNIT_LOG_ODDS = -2.0
 # σ (m) of barometer heights in the comparison with the heights of the source
 BAROMETER_SIGMA_M = 0.5
@@ -59,28 +58,28 @@ INDEPENDENT_HEIGHT_COUNT = 6.0
 MAX_HEIGHT_ERROR_M = 20.0 * BAROMETER_SIGMA_M
 # Maximum number of hypotheses of the grid search that are refined
 MAX_REFINED_HYPOTHESES = 8
-# Hypotheses are refined if their score (log likelihood plus log prior odds) is at most this much
-# below the best score
+# A hypothesis on axes, unit and delay is refined if its score (log likelihood plus log prior odds)
+# is at most this much (nats) below the best score
 MAX_REFINED_SCORE_DEFICIT = 60.0
 # Maximum number of second differences in one least-squares fit, to limit the computing time
 MAX_REFINEMENT_ROWS = 1200
-# Number of Gauss-Newton iterations in the refinement of a hypothesis
+# Number of Gauss-Newton iterations in the refinement of a hypothesis on axes, unit and delay
 REFINEMENT_ITERATIONS = 7
 # Maximum change (s) of the time offset in one Gauss-Newton iteration
 MAX_TIME_OFFSET_STEP_S = 0.15
 # Prior precision (σ⁻²) of the seven Hypothesis.parameters: heading drift of the gyroscopes (σ
 # 0.05 °/s), accelerometer bias (σ 0.3 m/s², 3 axes), no prior (0) for the others
-PRIOR_PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
+PARAMETER_PRIOR_PRECISION = np.array([0.0, 0.0, np.radians(0.05) ** -2, 0.0, *[0.3**-2] * 3])
 # Horizontal directions, clockwise from above
 CLOCKWISE_DIRECTIONS: tuple[Direction, ...] = ("north", "east", "south", "west")
-# Log prior odds of common directions of x, y, z; compute_log_odds has those of all others
+# Log prior odds of common directions of x, y, z; compute_log_odds returns those of all others
 AXES_LOG_ODDS: Final[dict[AxisDirections, float]] = {
     ("north", "east", "down"): 1.0,  # as PX4 expects
     ("east", "north", "up"): -0.5,
     ("north", "west", "up"): -1.0,
-    ("north", "east", "up"): -2.5,  # NED with wrong sign of z
+    ("north", "east", "up"): -2.5,  # NED, but z inverted
     ("east", "north", "down"): -2.5,  # NED with x and y exchanged
-    ("north", "west", "down"): -2.5,  # NED with wrong sign of y
+    ("north", "west", "down"): -2.5,  # NED, but y inverted
 }
 
 
@@ -108,7 +107,7 @@ class AxisAssignment(NamedTuple):
         return (self.vertical_sign * self.handedness < 0) != (self.vertical_axis == 1)
 
     def find_directions(self, quarter_turns: int) -> AxisDirections:
-        """Return the directions of x, y, z if ``first_axis`` points to 90° · ``quarter_turns``."""
+        """Return the directions of x, y, z; ``first_axis`` is n quarter turns east of north."""
         directions: list[Direction] = ["down" if self.vertical_sign > 0 else "up"] * 3
         directions[self.first_axis] = CLOCKWISE_DIRECTIONS[quarter_turns % 4]
         directions[self.second_axis] = CLOCKWISE_DIRECTIONS[(quarter_turns + self.handedness) % 4]
@@ -138,8 +137,8 @@ class SentPositions:
     def remove_clock_drift(self, clock_drift: float) -> "SentPositions":
         return replace(self, time_s=correct_clock_drift(self.time_s, clock_drift))
 
-    def motion(self, imu: ImuSecondDifferences) -> SourceSecondDifferences:
-        """Return the second differences of the positions at a constant interval."""
+    def compute_second_differences(self, imu: ImuSecondDifferences) -> SourceSecondDifferences:
+        """Return the second differences from ``max_time_offset_s`` before ``imu`` to after it."""
         margin_steps = round(self.max_time_offset_s / GRID_INTERVAL_S)
         grid_s = imu.time_s[0] + GRID_INTERVAL_S * np.arange(
             -margin_steps, len(imu.time_s) + margin_steps
@@ -161,12 +160,12 @@ class Hypothesis:
         Log likelihood plus log prior odds (nats).
     has_rotation : bool
         False if the rotation is fixed to a multiple of 90°.
-    min_scale, max_scale : float
+    min_displacement_ratio, max_displacement_ratio : float
         Bounds of the ratio of the source's displacements to those from the IMU.
     residual_sigma_m : float
         Scale (m) of the Student distribution of the horizontal residuals.
     independent_residual_count : float
-        Number of independent residuals: duration of the data over DIFFERENCE_WINDOW_S.
+        Number of independent residuals: duration of the data over SECOND_DIFFERENCE_WINDOW_S.
     """
 
     assignment: AxisAssignment
@@ -175,8 +174,8 @@ class Hypothesis:
     score: float
     has_rotation: bool = True
     has_clock_drift: bool = False
-    min_scale: float = 1.0
-    max_scale: float = 1.0
+    min_displacement_ratio: float = 1.0
+    max_displacement_ratio: float = 1.0
     residual_sigma_m: float = 0.0
     independent_residual_count: float = 0.0
     heading_from: HeadingSource = "EKF2"
@@ -225,7 +224,7 @@ def search_hypotheses(
     """
     hypotheses = []
     for heading_from, imu_motion in imu_motion_by_heading.items():
-        source_motion = positions.motion(imu_motion)
+        source_motion = positions.compute_second_differences(imu_motion)
         for candidate in find_candidates(source_motion, imu_motion):
             start_hypotheses = [replace(candidate, heading_from=heading_from)]
             if abs(candidate.heading_remainder_rad) < 3.0 * SMALL_ROTATION_RAD:
@@ -247,7 +246,7 @@ def search_hypotheses(
 def find_candidates(
     source_motion: SourceSecondDifferences, imu_motion: ImuSecondDifferences
 ) -> list[Hypothesis]:
-    """Return the most likely hypotheses of a search over axes, units and time offsets."""
+    """Return the likely combinations of axes, unit and time offset, most likely first."""
     source_moment_columns = np.column_stack(
         [
             source_motion.second_differences,
@@ -265,14 +264,14 @@ def find_candidates(
             for step in offset_steps
         ]
     )
-    # column 6 is 1 for valid samples, so moments[:, 6, 6] counts the samples with both data
+    # column 6 is 1 for valid samples: moments[:, 6, 6] counts samples valid in source and IMU
     has_overlap = moments[:, 6, 6] * GRID_INTERVAL_S >= MIN_OVERLAP_S
     if not has_overlap.any():
         return []
     delay_s = (offset_steps[has_overlap] - offset_steps[-1] / 2.0) * GRID_INTERVAL_S
     moments = moments[has_overlap]
     independent_residual_count = moments[:, 6, 6, None, None] * (
-        GRID_INTERVAL_S / DIFFERENCE_WINDOW_S
+        GRID_INTERVAL_S / SECOND_DIFFERENCE_WINDOW_S
     )
     moments /= moments[:, 6:, 6:]
     vertical_axis, vertical_sign, first_axis, second_axis, handedness = np.array(AXIS_ASSIGNMENTS).T
@@ -283,23 +282,26 @@ def find_candidates(
     )
     correlation -= 1j * handedness * moments[:, second_axis, 0]
     source_mean_square = np.maximum(moments[:, 3:6, 6, None], 1e-12)
-    unit_sizes_m = np.array([*UNIT_SIZES_M.values()])
+    metres_per_unit = np.array([*METRES_PER_UNIT.values()])
     north_mean_square_m2, east_mean_square_m2, down_mean_square_m2 = np.moveaxis(
         moments[:, 6, 3:6, None, None], 1, 0
     )
     horizontal_residual_m2 = (
-        unit_sizes_m**2 * (source_mean_square[:, first_axis] + source_mean_square[:, second_axis])
+        metres_per_unit**2
+        * (source_mean_square[:, first_axis] + source_mean_square[:, second_axis])
         + north_mean_square_m2
         + east_mean_square_m2
     )
     horizontal_residual_m2 = (
-        horizontal_residual_m2 - 2.0 * unit_sizes_m * np.abs(correlation)[..., None]
+        horizontal_residual_m2 - 2.0 * metres_per_unit * np.abs(correlation)[..., None]
     ) / 2.0
-    down_residual_m2 = unit_sizes_m**2 * source_mean_square[:, vertical_axis] + down_mean_square_m2
-    down_residual_m2 -= (
-        2.0 * unit_sizes_m * (vertical_sign * moments[:, vertical_axis, 2])[..., None]
+    down_residual_m2 = (
+        metres_per_unit**2 * source_mean_square[:, vertical_axis] + down_mean_square_m2
     )
-    score = np.sum(np.log(source_mean_square), axis=1)[:, None] + 6.0 * np.log(unit_sizes_m)
+    down_residual_m2 -= (
+        2.0 * metres_per_unit * (vertical_sign * moments[:, vertical_axis, 2])[..., None]
+    )
+    score = np.sum(np.log(source_mean_square), axis=1)[:, None] + 6.0 * np.log(metres_per_unit)
     score = score - 2.0 * np.log(np.maximum(horizontal_residual_m2, MIN_HORIZONTAL_SIGMA_M**2))
     score = (
         0.5
@@ -317,10 +319,10 @@ def find_candidates(
             np.argmax(quarter_turn_scores, axis=0)
         ):
             unit_name, assignment = (
-                [*UNIT_SIZES_M][unit_index],
+                [*METRES_PER_UNIT][unit_index],
                 AXIS_ASSIGNMENTS[assignment_index],
             )
-            # a third coordinate without changes means that the source measures no height
+            # a constant third coordinate: the source measures no height, so z is vertical
             if assignment.vertical_axis != 2 and not source_motion.second_differences[:, 2].any():
                 continue
             total_score = (
@@ -346,7 +348,7 @@ def refine_hypothesis(
     source_motion: SourceSecondDifferences,
     imu_motion: ImuSecondDifferences,
 ) -> Hypothesis:
-    """Refine the parameters of a hypothesis by robust least squares (Gauss-Newton)."""
+    """Refine delay, rotation and drifts of a hypothesis by robust least squares (Gauss-Newton)."""
     rows = np.flatnonzero(source_motion.is_valid)
     rows = rows[:: max(1, len(rows) // MAX_REFINEMENT_ROWS)]
     best_hypothesis, parameters = (
@@ -371,112 +373,124 @@ def _evaluate_hypothesis(
     source_motion: SourceSecondDifferences,
     imu_motion: ImuSecondDifferences,
 ) -> tuple[Hypothesis, Array]:
-    """Return the hypothesis with its log likelihood as score, and the step of its parameters."""
+    """Return the hypothesis with its log likelihood, and a Gauss-Newton step of its parameters."""
     delay_s, rotation_rad, heading_drift_rad_s, clock_drift, *_ = hypothesis.parameters
     time_s = source_motion.time_s[rows]
     row_interval_s = GRID_INTERVAL_S * float(np.median(np.diff(rows)))
     mean_time_s = float(np.mean(time_s))
-    grid_position = time_s - delay_s - clock_drift * (time_s - mean_time_s)
-    grid_position = (grid_position - imu_motion.time_s[0]) / GRID_INTERVAL_S
-    grid_index = np.clip(np.floor(grid_position).astype(int), 0, len(imu_motion.time_s) - 2)
+    measurement_time_s = time_s - delay_s - clock_drift * (time_s - mean_time_s)
+    fractional_grid_index = (measurement_time_s - imu_motion.time_s[0]) / GRID_INTERVAL_S
+    grid_index = np.clip(np.floor(fractional_grid_index).astype(int), 0, len(imu_motion.time_s) - 2)
     is_used = (
-        (grid_position >= 0)
-        & (grid_position < len(imu_motion.time_s) - 1)
+        (fractional_grid_index >= 0)
+        & (fractional_grid_index < len(imu_motion.time_s) - 1)
         & imu_motion.is_valid[grid_index]
     )
     independent_residual_count = (
-        float(np.count_nonzero(is_used)) * row_interval_s / DIFFERENCE_WINDOW_S
+        float(np.count_nonzero(is_used)) * row_interval_s / SECOND_DIFFERENCE_WINDOW_S
     )
-    rejected_result = replace(hypothesis, score=-np.inf), np.zeros(len(PRIOR_PRECISION))
-    if independent_residual_count * DIFFERENCE_WINDOW_S < MIN_OVERLAP_S:
+    rejected_result = replace(hypothesis, score=-np.inf), np.zeros(len(PARAMETER_PRIOR_PRECISION))
+    if independent_residual_count * SECOND_DIFFERENCE_WINDOW_S < MIN_OVERLAP_S:
         return rejected_result
     grid_index, time_s = grid_index[is_used], time_s[is_used]
     elapsed_s = time_s - time_s[0]
-    grid_fraction = (grid_position[is_used] - grid_index)[:, None, None]
-    imu_differences = (1.0 - grid_fraction) * imu_motion.table[
+    grid_fraction = (fractional_grid_index[is_used] - grid_index)[:, None, None]
+    imu_table_rows = (1.0 - grid_fraction) * imu_motion.table[
         grid_index
     ] + grid_fraction * imu_motion.table[grid_index + 1]
     sent_second_differences = source_motion.second_differences[rows[is_used]]
     vertical_axis, vertical_sign, first_axis, second_axis, handedness = hypothesis.assignment
-    unit_size_m = UNIT_SIZES_M[hypothesis.unit]
-    complex_rotation = unit_size_m * np.exp(1j * (rotation_rad + heading_drift_rad_s * elapsed_s))
-    horizontal_m = complex_rotation * (
+    metres_per_unit = METRES_PER_UNIT[hypothesis.unit]
+    complex_rotation = metres_per_unit * np.exp(
+        1j * (rotation_rad + heading_drift_rad_s * elapsed_s)
+    )
+    horizontal_difference_m = complex_rotation * (
         sent_second_differences[:, first_axis]
         + 1j * handedness * sent_second_differences[:, second_axis]
     )
-    source_difference_m = np.column_stack(
+    source_second_difference_m = np.column_stack(
         [
-            horizontal_m.real,
-            horizontal_m.imag,
-            unit_size_m * vertical_sign * sent_second_differences[:, vertical_axis],
+            horizontal_difference_m.real,
+            horizontal_difference_m.imag,
+            metres_per_unit * vertical_sign * sent_second_differences[:, vertical_axis],
         ]
     )
-    imu_difference_m = (
-        imu_differences[..., 0] - imu_differences[..., 1:] @ hypothesis.parameters[4:]
+    imu_second_difference_m = (
+        imu_table_rows[..., 0] - imu_table_rows[..., 1:] @ hypothesis.parameters[4:]
     )
-    residual = source_difference_m - imu_difference_m
+    residual = source_second_difference_m - imu_second_difference_m
     residual_squares = np.stack([np.sum(residual[:, :2] ** 2, axis=1), residual[:, 2] ** 2])
-    log_likelihood_gain, sigma_m = fit_student(residual_squares[0], 2, MIN_HORIZONTAL_SIGMA_M)
-    vertical_log_likelihood, sigma_down_m = fit_student(
+    log_likelihood_gain, sigma_m = fit_student_distribution(
+        residual_squares[0], 2, MIN_HORIZONTAL_SIGMA_M
+    )
+    vertical_log_likelihood, sigma_down_m = fit_student_distribution(
         residual_squares[1], 1, MIN_VERTICAL_SIGMA_M
     )
-    is_axis_known = sent_second_differences.any(axis=0)  # False for missing heights
+    # a constant axis (missing heights) must not change the likelihood
+    is_axis_known = sent_second_differences.any(axis=0)
     log_likelihood_gain += vertical_log_likelihood * is_axis_known[vertical_axis] + np.log(
-        unit_size_m
+        metres_per_unit
     ) * np.count_nonzero(is_axis_known)
     log_likelihood_gain -= sum(
-        fit_student(column**2, 1, 1e-6)[0] for column in sent_second_differences.T[is_axis_known]
+        fit_student_distribution(column**2, 1, 1e-6)[0]
+        for column in sent_second_differences.T[is_axis_known]
     )
     weight = 1.0 / (
         np.array([[sigma_m**2], [sigma_down_m**2]]) + residual_squares / STUDENT_DEGREES_OF_FREEDOM
     )
-    weight *= row_interval_s / DIFFERENCE_WINDOW_S
+    weight *= row_interval_s / SECOND_DIFFERENCE_WINDOW_S
     source_square_sum, product_sum, imu_square_sum = (
         float(np.sum(weight[0] @ (first * second)[:, :2]))
         for first, second in (
-            (source_difference_m, source_difference_m),
-            (source_difference_m, imu_difference_m),
-            (imu_difference_m, imu_difference_m),
+            (source_second_difference_m, source_second_difference_m),
+            (source_second_difference_m, imu_second_difference_m),
+            (imu_second_difference_m, imu_second_difference_m),
         )
     )
     # without motion the convention is unknown
     if 0.0 in (source_square_sum, product_sum, imu_square_sum):
         return rejected_result
-    jacobian = np.zeros((len(grid_index), 3, len(PRIOR_PRECISION)))
+    jacobian = np.zeros((len(grid_index), 3, len(PARAMETER_PRIOR_PRECISION)))
     jacobian[..., 0] = imu_motion.second_difference_rate_m_s[grid_index]
-    jacobian[:, 0, 1], jacobian[:, 1, 1] = -horizontal_m.imag, horizontal_m.real
+    jacobian[:, 0, 1], jacobian[:, 1, 1] = (
+        -horizontal_difference_m.imag,
+        horizontal_difference_m.real,
+    )
     jacobian[..., 2] = jacobian[..., 1] * elapsed_s[:, None]
     jacobian[..., 3] = jacobian[..., 0] * (time_s - mean_time_s)[:, None]
-    jacobian[..., 4:] = imu_differences[..., 1:]
+    jacobian[..., 4:] = imu_table_rows[..., 1:]
     uses_gyro_heading = hypothesis.heading_from != "EKF2"
     is_free = np.array(
         [True, hypothesis.has_rotation, uses_gyro_heading, hypothesis.has_clock_drift, *[True] * 3]
     )
     columns = jacobian[..., is_free].reshape(-1, is_free.sum())
     weighted_columns = columns.T * weight[[0, 0, 1]].T.ravel()
-    normal_matrix = weighted_columns @ columns + np.diag(PRIOR_PRECISION[is_free] + 1e-9)
+    normal_matrix = weighted_columns @ columns + np.diag(PARAMETER_PRIOR_PRECISION[is_free] + 1e-9)
     gradient = (
-        weighted_columns @ residual.ravel() + (PRIOR_PRECISION * hypothesis.parameters)[is_free]
+        weighted_columns @ residual.ravel()
+        + (PARAMETER_PRIOR_PRECISION * hypothesis.parameters)[is_free]
     )
-    parameter_step = np.zeros(len(PRIOR_PRECISION))
+    parameter_step = np.zeros(len(PARAMETER_PRIOR_PRECISION))
     parameter_step[is_free] = -np.linalg.solve(normal_matrix, gradient)
     parameter_step[0] = np.clip(parameter_step[0], -MAX_TIME_OFFSET_STEP_S, MAX_TIME_OFFSET_STEP_S)
     scored_hypothesis = replace(
         hypothesis,
         score=float(
             independent_residual_count * log_likelihood_gain
-            - 0.5 * PRIOR_PRECISION @ hypothesis.parameters**2
+            - 0.5 * PARAMETER_PRIOR_PRECISION @ hypothesis.parameters**2
         ),
-        min_scale=product_sum / imu_square_sum,
-        max_scale=source_square_sum / product_sum,
+        min_displacement_ratio=product_sum / imu_square_sum,
+        max_displacement_ratio=source_square_sum / product_sum,
         residual_sigma_m=sigma_m,
         independent_residual_count=independent_residual_count,
     )
     return scored_hypothesis, parameter_step
 
 
-def fit_student(squared_residuals: Array, dimensions: int, min_sigma: float) -> tuple[float, float]:
-    """Fit a Student distribution to squared residuals; return mean log likelihood and scale σ."""
+def fit_student_distribution(
+    squared_residuals: Array, dimensions: int, min_sigma: float
+) -> tuple[float, float]:
+    """Fit Student's t distribution to squared residuals; return mean log likelihood and scale."""
     variance = max(
         float(np.median(squared_residuals)) / (0.455, 1.386)[dimensions - 1], min_sigma**2
     )
@@ -509,12 +523,12 @@ def _compute_log_odds(hypothesis: Hypothesis, positions: SentPositions) -> float
 
 
 def _compute_height_log_ratio(
-    hypothesis: Hypothesis, positions: SentPositions, time_s: Array, barometer_m: Array
+    hypothesis: Hypothesis, positions: SentPositions, time_s: Array, barometer_height_m: Array
 ) -> float:
     """Return ln p(heights | they follow the barometer) - ln p(heights | constant height)."""
-    height_m = np.interp(positions.time_s - hypothesis.delay_s, time_s, barometer_m)
+    height_m = np.interp(positions.time_s - hypothesis.delay_s, time_s, barometer_height_m)
     down_m = (
-        UNIT_SIZES_M[hypothesis.unit]
+        METRES_PER_UNIT[hypothesis.unit]
         * hypothesis.assignment.vertical_sign
         * positions.position_m[:, hypothesis.assignment.vertical_axis]
     )

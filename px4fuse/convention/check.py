@@ -8,8 +8,8 @@ from msgspec import structs
 
 from px4fuse.convention.axes import (
     MAX_TIME_OFFSET_S,
+    METRES_PER_UNIT,
     SMALL_ROTATION_RAD,
-    UNIT_SIZES_M,
     Hypothesis,
     SentPositions,
     find_candidates,
@@ -23,8 +23,8 @@ from px4fuse.convention.model import (
     OrientationConvention,
 )
 from px4fuse.convention.motion import (
-    DIFFERENCE_WINDOW_S,
     MIN_GAP_S,
+    SECOND_DIFFERENCE_WINDOW_S,
     ImuSecondDifferences,
     InertialData,
     filter_imu_motion,
@@ -38,28 +38,28 @@ from px4fuse.flight.model import Columns, Ekf2, Flight, PositionTrack
 from px4fuse.trajectory.association import gap_limit, is_bracketed
 from px4fuse.trajectory.rotation import heading
 
-# Minimum log likelihood ratio of the best to the second best convention, for the result
+# Minimum lead (nats) in score of the best convention over the second best, for the verdict
 # "determined"
 MIN_CONVENTION_LOG_ODDS = 4.0
-# Minimum log likelihood ratio of the best convention to the null hypothesis that the positions do
-# not depend on the motion
+# Minimum log-likelihood gain (nats) of the best convention over positions that are unrelated to the
+# motion
 MIN_LIKELIHOOD_GAIN = 8.0
-# The same ratio divided by the number of independent samples: minimum if one convention fits, and
-# if several fit
+# Minimum log-likelihood gain (nats) per independent sample, over positions that are unrelated to
+# the motion: if one convention fits, and if several fit
 MIN_LIKELIHOOD_GAIN_PER_SAMPLE = (0.15, 0.4)
 # Accepted ratio of the source's displacements to those from the IMU
-MIN_DISPLACEMENT_RATIO, MAX_DISPLACEMENT_RATIO = 0.88, 1.12
-# A convention is doubtful if its residuals are larger than this multiple of the expected noise
-MAX_RESIDUAL_RATIO = 2.4
-# σ (m) of the second differences of the position that are integrated from the IMU
-IMU_DIFFERENCE_SIGMA_M = 0.05
-# EKF2's heading, which is relative to north, is preferred to the heading from the gyroscopes if the
-# score of its hypothesis is at most this much lower
+MIN_SOURCE_TO_IMU_RATIO, MAX_SOURCE_TO_IMU_RATIO = 0.88, 1.12
+# A convention is doubtful if σ of its residuals is above this multiple of the expected noise
+MAX_RESIDUAL_TO_NOISE_RATIO = 2.4
+# σ (m) of the second differences of the position integrated from the IMU
+IMU_SECOND_DIFFERENCE_SIGMA_M = 0.05
+# EKF2's heading (relative to north) is used, unless the heading from the gyroscopes fits better by
+# more than this (nats)
 MAX_EKF2_HEADING_SCORE_LOSS = 20.0
-# Minimum number of GNSS positions to fit the rotation of the source's frame from north
+# Minimum number of GNSS positions for a fit of the heading of the source's frame
 MIN_GNSS_POSITIONS = 30
-# The rotation is used if the RMS residual of this fit is at most this fraction of the RMS extent of
-# the GNSS positions; 0.1 corresponds to 0.1 rad
+# The heading fitted to GNSS is used if the RMS residual is at most this fraction of the RMS extent
+# of the GNSS positions; 0.1 is a heading error of about 0.1 rad
 MAX_GNSS_RESIDUAL_RATIO = 0.1
 # Minimum log-likelihood gain from a clock drift; a drift with a smaller gain is not corrected
 MIN_DRIFT_SCORE_GAIN = 15.0
@@ -71,9 +71,9 @@ MIN_LOW_PASS_SCORE_GAIN = 8.0
 # Delays (s) between these limits can be the effect of a low-pass filter in the source
 MIN_LOW_PASS_DELAY_S, MAX_LOW_PASS_DELAY_S = 0.2, 5.0
 # Repeated positions are removed if they are less than this fraction of all positions
-MAX_REPEATED_FRACTION = 0.5
+MAX_REPEATED_POSITION_FRACTION = 0.5
 # Heights are used if at least this fraction of the positions has a height
-MIN_WITH_HEIGHT_FRACTION = 0.5
+MIN_HEIGHT_FRACTION = 0.5
 # Variance of third differences of white noise with variance 1
 THIRD_DIFFERENCE_VARIANCE = 20.0
 # Variance of second differences of white noise with variance 1
@@ -141,11 +141,11 @@ def _read_positions(
 ) -> SentPositions:
     """Return the positions without repetitions; heights are 0 if the source has none."""
     samples, barometer = track.samples[Columns.POSITION], flight.barometer
-    if samples["down_m"].notna().mean() < MIN_WITH_HEIGHT_FRACTION:
+    if samples["down_m"].notna().mean() < MIN_HEIGHT_FRACTION:
         samples = samples.assign(down_m=0.0)
     samples = samples.dropna()
     is_repeated = (samples.diff() == 0.0).all(axis=1)
-    if is_repeated.mean() < MAX_REPEATED_FRACTION:
+    if is_repeated.mean() < MAX_REPEATED_POSITION_FRACTION:
         samples = samples[~is_repeated]
     barometer_times_and_heights = None
     if barometer is not None:
@@ -158,7 +158,11 @@ def _read_positions(
 def _rank_convention_hypotheses(
     positions: SentPositions, imu_motion_by_heading: dict[HeadingSource, ImuSecondDifferences]
 ) -> list[Hypothesis]:
-    """Return the likely hypotheses on axes, unit and delay, best first; prefer EKF2's heading."""
+    """Return the likely hypotheses on axes, unit and delay, best first.
+
+    A hypothesis with EKF2's heading is before a similar one with the heading from the gyroscopes,
+    unless its score is lower by more than MAX_EKF2_HEADING_SCORE_LOSS.
+    """
     hypotheses = search_hypotheses(positions, imu_motion_by_heading)
     for hypothesis in hypotheses:
         if (
@@ -187,7 +191,7 @@ def _replace_delay_by_low_pass(
     low_pass_hypothesis = refine_hypothesis(
         replace(hypothesis, parameters=parameters),
         positions,
-        positions.motion(filtered_motion),
+        positions.compute_second_differences(filtered_motion),
         filtered_motion,
     )
     score_gain = low_pass_hypothesis.score - hypothesis.score
@@ -210,24 +214,26 @@ def _rotate_to_gnss(
     gnss_positions = gnss_tracks[0].samples[Columns.POSITION[:2]].dropna()
     time_s = gnss_positions.index.to_numpy() + hypothesis.delay_s
     source_time_s = positions.time_s
-    is_near = is_bracketed(time_s, source_time_s, gap_limit(source_time_s, MIN_GAP_S))
-    if np.count_nonzero(is_near) < MIN_GNSS_POSITIONS:
-        return hypothesis
-    sent_position_m = UNIT_SIZES_M[hypothesis.unit] * positions.position_m
-    assignment = hypothesis.assignment
-    source_horizontal_m = (
-        sent_position_m[:, assignment.first_axis]
-        + 1j * assignment.handedness * sent_position_m[:, assignment.second_axis]
+    has_near_source_samples = is_bracketed(
+        time_s, source_time_s, gap_limit(source_time_s, MIN_GAP_S)
     )
-    velocity_m_s = np.interp(time_s, source_time_s, np.gradient(source_horizontal_m, source_time_s))
-    columns = np.column_stack(
-        [np.interp(time_s, source_time_s, source_horizontal_m), velocity_m_s]
-    )[is_near]
+    if np.count_nonzero(has_near_source_samples) < MIN_GNSS_POSITIONS:
+        return hypothesis
+    sent_position_m = METRES_PER_UNIT[hypothesis.unit] * positions.position_m
+    axis_assignment = hypothesis.assignment
+    source_position_m = (
+        sent_position_m[:, axis_assignment.first_axis]
+        + 1j * axis_assignment.handedness * sent_position_m[:, axis_assignment.second_axis]
+    )
+    velocity_m_s = np.interp(time_s, source_time_s, np.gradient(source_position_m, source_time_s))
+    columns = np.column_stack([np.interp(time_s, source_time_s, source_position_m), velocity_m_s])[
+        has_near_source_samples
+    ]
     columns -= columns.mean(axis=0)
-    north_east_m = (gnss_positions.to_numpy() @ [1.0, 1j])[is_near]
+    north_east_m = (gnss_positions.to_numpy() @ [1.0, 1j])[has_near_source_samples]
     north_east_m -= north_east_m.mean()
-    factors, residual_m2, *_ = np.linalg.lstsq(columns, north_east_m)
-    if not residual_m2 < (MAX_GNSS_RESIDUAL_RATIO * np.linalg.norm(north_east_m)) ** 2:
+    factors, residual_square_sum_m2, *_ = np.linalg.lstsq(columns, north_east_m)
+    if not residual_square_sum_m2 < (MAX_GNSS_RESIDUAL_RATIO * np.linalg.norm(north_east_m)) ** 2:
         return hypothesis
     parameters = hypothesis.parameters.copy()
     parameters[1] = np.angle(factors[0])
@@ -237,7 +243,7 @@ def _rotate_to_gnss(
 def _choose_convention(
     hypotheses: list[Hypothesis], positions: SentPositions, clock_drift: float
 ) -> Convention:
-    """Decide whether the best convention is unambiguous and its residuals are plausible."""
+    """Return the best convention, with a verdict from its lead and its residuals."""
     best_hypothesis = hypotheses[0]
     other_conventions = [
         hypothesis for hypothesis in hypotheses if not hypothesis.is_similar_to(best_hypothesis)
@@ -256,9 +262,9 @@ def _choose_convention(
     elif (
         best_hypothesis.score
         < MIN_LIKELIHOOD_GAIN_PER_SAMPLE[is_ambiguous] * best_hypothesis.independent_residual_count
-        or best_hypothesis.min_scale > MAX_DISPLACEMENT_RATIO
-        or best_hypothesis.max_scale < MIN_DISPLACEMENT_RATIO
-        or compute_residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_RATIO
+        or best_hypothesis.min_displacement_ratio > MAX_SOURCE_TO_IMU_RATIO
+        or best_hypothesis.max_displacement_ratio < MIN_SOURCE_TO_IMU_RATIO
+        or compute_residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_TO_NOISE_RATIO
     ):
         verdict = "doubtful"
     x, y, z = best_hypothesis.axes
@@ -279,7 +285,7 @@ def _choose_convention(
         * best_hypothesis.has_rotation,
         late_s=best_hypothesis.delay_s,
         clock_drift=clock_drift,
-        scale=best_hypothesis.min_scale,
+        scale=best_hypothesis.min_displacement_ratio,
         log_odds=log_odds,
         log_likelihood_gain=best_hypothesis.score,
         alternatives=tuple(dict.fromkeys(likely_conventions)),
@@ -305,28 +311,34 @@ def compute_residual_ratio(hypothesis: Hypothesis, positions: SentPositions) -> 
         np.median(np.abs(third_differences - np.median(third_differences, axis=0)))
     )
     noise_m = (
-        UNIT_SIZES_M[hypothesis.unit]
+        METRES_PER_UNIT[hypothesis.unit]
         * third_difference_sigma
         * np.sqrt(SECOND_DIFFERENCE_VARIANCE / THIRD_DIFFERENCE_VARIANCE)
     )
-    return float(hypothesis.residual_sigma_m / np.hypot(noise_m, IMU_DIFFERENCE_SIGMA_M))
+    return float(hypothesis.residual_sigma_m / np.hypot(noise_m, IMU_SECOND_DIFFERENCE_SIGMA_M))
 
 
 def _estimate_clock_drift(
     positions: SentPositions, imu_motion: ImuSecondDifferences, best_hypothesis: Hypothesis
 ) -> float:
-    """Return the drift of the source's clock (rate minus 1), or 0 if it is not significant."""
+    """Return the rate error (s/s) of the source's clock relative to the autopilot's boot clock.
+
+    0 if it is not significant.
+    """
     initial_clock_drift = 0.0
     if (
         best_hypothesis.score < MIN_LIKELIHOOD_GAIN
-        or compute_residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_RATIO
+        or compute_residual_ratio(best_hypothesis, positions) > MAX_RESIDUAL_TO_NOISE_RATIO
     ):
         hypotheses = [
             (candidates[0], clock_drift)
             for clock_drift in TESTED_CLOCK_DRIFTS.tolist()
             if (
                 candidates := find_candidates(
-                    positions.remove_clock_drift(clock_drift).motion(imu_motion), imu_motion
+                    positions.remove_clock_drift(clock_drift).compute_second_differences(
+                        imu_motion
+                    ),
+                    imu_motion,
                 )
             )
         ]
@@ -336,7 +348,7 @@ def _estimate_clock_drift(
     hypothesis = refine_hypothesis(
         replace(best_hypothesis, has_clock_drift=True),
         positions,
-        positions.motion(imu_motion),
+        positions.compute_second_differences(imu_motion),
         imu_motion,
     )
     clock_drift = (1.0 + initial_clock_drift) / (1.0 - float(hypothesis.parameters[3])) - 1.0
@@ -354,15 +366,18 @@ def _check_orientation(
     best_hypothesis: Hypothesis,
     verdict: ConventionVerdict,
 ) -> OrientationConvention | None:
-    """Determine the convention of the source's orientation, and its heading error."""
+    """Return the convention of the source's orientation, with its heading error if determinable.
+
+    None with too few orientations in flight.
+    """
     assert track.orientation is not None
     quaternions = track.orientation[Columns.QUATERNION].to_numpy()
-    checked_orientation = check_orientation(
+    orientation_check_result = check_orientation(
         inertial_data, track.orientation.index.to_numpy(), quaternions
     )
-    if checked_orientation is None:
+    if orientation_check_result is None:
         return None
-    convention, time_s, attitude = checked_orientation
+    convention, time_s, attitude = orientation_check_result
     if (
         verdict != "determined"
         or convention.verdict not in ("determined", "ambiguous")
@@ -370,15 +385,15 @@ def _check_orientation(
         or best_hypothesis.assignment.is_mirrored
     ):
         return convention
-    source_heading = np.interp(inertial_data.time_s, time_s, heading(attitude))
+    source_heading_rad = np.interp(inertial_data.time_s, time_s, heading(attitude))
     imu_motion = integrate_imu_motion(
-        inertial_data, replace_heading(inertial_data.gyro_attitude, source_heading)
+        inertial_data, replace_heading(inertial_data.gyro_attitude, source_heading_rad)
     )
-    is_covered = (imu_motion.time_s > time_s[0] + DIFFERENCE_WINDOW_S) & (
-        imu_motion.time_s < time_s[-1] - DIFFERENCE_WINDOW_S
+    is_covered = (imu_motion.time_s > time_s[0] + SECOND_DIFFERENCE_WINDOW_S) & (
+        imu_motion.time_s < time_s[-1] - SECOND_DIFFERENCE_WINDOW_S
     )
     imu_motion = replace(imu_motion, is_valid=imu_motion.is_valid & is_covered)
-    # possible headings (°) of the positions' x axis, if positions and orientation have one frame
+    # possible headings (°) of the positions' x axis for an orientation without heading error
     correct_headings_deg = {"FLU to ENU": [90.0], "FLU to NWU": [0.0]}.get(
         convention.frames, [0.0, 90.0]
     )

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 from msgspec import structs
 
-from px4fuse.convention.axes import CLOCKWISE_DIRECTIONS, UNIT_SIZES_M, correct_clock_drift
+from px4fuse.convention.axes import CLOCKWISE_DIRECTIONS, METRES_PER_UNIT, correct_clock_drift
 from px4fuse.convention.check import is_source_fused
 from px4fuse.convention.model import Convention
 from px4fuse.convention.motion import integrate_inertial_data, replace_heading
@@ -28,11 +28,11 @@ from px4fuse.trajectory.rotation import from_elements, heading
 MIN_RESIDUAL_ROTATION_DEG = 8.0
 # Minimum rotation (°) that is corrected in a frame with correct axes; smaller rotations are
 # reported as a heading error
-MIN_ROTATION_DEG = 15.0
+MIN_FRAME_ROTATION_DEG = 15.0
 # Minimum delay (s) that is corrected together with axes and unit; smaller delays are left to the
 # estimate of the time offset
 MIN_CORRECTED_DELAY_S = 0.5
-# Minimum heading error (°) of the source's orientation, relative to its positions, that is a fault
+# Minimum heading difference (°) between the source's orientation and its positions that is reported
 MIN_HEADING_ERROR_DEG = 10.0
 # Fault of the source's orientation; empty without a fault
 OrientationFault = Literal["", "copied", "order", "frames", "heading"]
@@ -88,7 +88,7 @@ class ConventionFaults:
 def find_convention_faults(
     convention: Convention | None, flight: Flight, frame: str
 ) -> ConventionFaults:
-    """Return the deviations of a source from NED in metres; ``frame`` is the logged frame."""
+    """Return the deviations of a source from PX4's convention; ``frame`` is the logged frame."""
     if convention is None:
         return ConventionFaults()
     orientation_fault = _find_orientation_fault(convention)
@@ -148,7 +148,7 @@ def _check_axes_and_rotation(convention: Convention) -> tuple[bool, float]:
         rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(convention.x) + 90.0 * is_z_up
     )
     total_rotation_deg = (total_rotation_deg + 180.0) % 360.0 - 180.0
-    return is_z_up, total_rotation_deg * (abs(total_rotation_deg) > MIN_ROTATION_DEG)
+    return is_z_up, total_rotation_deg * (abs(total_rotation_deg) > MIN_FRAME_ROTATION_DEG)
 
 
 def _find_orientation_fault(convention: Convention) -> OrientationFault:
@@ -171,18 +171,20 @@ def _find_orientation_fault(convention: Convention) -> OrientationFault:
 def correct_convention(
     flight: Flight, track: PositionTrack, convention: Convention | None
 ) -> tuple[Flight, PositionTrack]:
-    """Convert a position source to axes, unit and clock of PX4.
+    """Convert a position source to PX4's axes (NED), unit (m) and boot clock.
 
-    If EKF2 fused the unconverted positions, EKF2's attitude is wrong. The attitude integrated from
-    the gyroscopes then replaces it.
+    If EKF2 fused the unconverted positions, EKF2's attitude is wrong. The returned flight then
+    contains the attitude integrated from the gyroscopes instead.
     """
     faults = find_convention_faults(convention, flight, track.frame)
     if convention is None or not faults:
         return flight, track
     samples, orientation, origin = track.samples, track.orientation, track.origin
-    to_ned = _make_matrix_to_ned_metres(convention, faults)
-    position_m = _multiply_known_values(samples[Columns.POSITION].to_numpy(), to_ned)
-    variance_m2 = _multiply_known_values(samples[Columns.POSITION_VARIANCE].to_numpy(), to_ned**2)
+    matrix_to_ned = _make_matrix_to_ned_metres(convention, faults)
+    position_m = _multiply_known_values(samples[Columns.POSITION].to_numpy(), matrix_to_ned)
+    variance_m2 = _multiply_known_values(
+        samples[Columns.POSITION_VARIANCE].to_numpy(), matrix_to_ned**2
+    )
     samples = pd.DataFrame(
         np.hstack([position_m, variance_m2]),
         _correct_times(samples.index, faults),
@@ -201,7 +203,7 @@ def correct_convention(
     if inertial_data is None:
         return flight, track
     attitude = inertial_data.compute_attitudes()[convention.heading_from]
-    # the positions are not rotated, so the attitude is rotated to the positions' north
+    # if the positions keep their axes, rotate the attitude instead: to the north of the positions
     if not faults.has_wrong_axes and not faults.rotation_deg:
         heading_change_deg = convention.rotation_deg - 90.0 * CLOCKWISE_DIRECTIONS.index(
             convention.x
@@ -212,10 +214,10 @@ def correct_convention(
 
 
 def _make_matrix_to_ned_metres(convention: Convention, faults: ConventionFaults) -> Array:
-    unit_size_m = UNIT_SIZES_M[convention.unit]
+    metres_per_unit = METRES_PER_UNIT[convention.unit]
     if not faults.has_wrong_axes and not faults.rotation_deg:
-        return unit_size_m * np.eye(3)
-    permutation = [
+        return metres_per_unit * np.eye(3)
+    signed_permutation_matrix = [
         [(axis == name) - (OPPOSITE_DIRECTION[axis] == name) for axis in convention.axes]
         for name in FRAME_AXES["NED"]
     ]
@@ -223,7 +225,7 @@ def _make_matrix_to_ned_metres(convention: Convention, faults: ConventionFaults)
     rotation_rad = -np.radians(convention.rotation_deg) * is_rotated
     cosine, sine = np.cos(rotation_rad), np.sin(rotation_rad)
     rotation = from_elements((cosine, -sine, 0.0), (sine, cosine, 0.0), (0.0, 0.0, 1.0))
-    return np.asarray(unit_size_m * rotation @ np.array(permutation))
+    return np.asarray(metres_per_unit * rotation @ np.array(signed_permutation_matrix))
 
 
 def _multiply_known_values(values: Array, matrix: Array) -> Array:

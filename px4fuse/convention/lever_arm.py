@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from px4fuse.convention.motion import (
-    DIFFERENCE_WINDOW_S,
     GRID_INTERVAL_S,
+    SECOND_DIFFERENCE_WINDOW_S,
     SourceSecondDifferences,
     integrate_imu_motion,
     integrate_inertial_data,
@@ -23,7 +23,7 @@ MIN_LEVER_ARM_SIGMAS = 2.5
 # Minimum lever arm (m) that is reported if it is estimated from ground truth
 MIN_LEVER_ARM_WITH_TRUTH_M = 0.05
 # Minimum lever arm, in σ, that is reported if it is estimated from ground truth
-MIN_SIGMAS_WITH_TRUTH = 5.0
+MIN_LEVER_ARM_SIGMAS_WITH_TRUTH = 5.0
 # Maximum lever arm (m) that is reported: a larger one is a frame error of the position source
 MAX_LEVER_ARM_M = 5.0
 # Maximum residual (σ) of a sample that is used in the next fit of the lever arm
@@ -49,23 +49,23 @@ class LeverArm(NamedTuple):
 
 
 def estimate_lever_arm(flight: Flight, track: PositionTrack) -> LeverArm | None:
-    """Estimate the lever arm minus that in EKF2's parameters; None if not significant.
+    """Estimate the error of the lever arm in EKF2's parameters (true minus parameter).
 
-    Ground truth is used if logged, else the IMU.
+    None if it is not significant. Ground truth is used if logged, else the IMU.
     """
     lever_arm = None
     if isinstance(flight.truth, Truth):
-        lever_arm = _fit_to_truth(flight, flight.truth, track)
-    return lever_arm if lever_arm or track.origin.is_gnss else _fit_to_imu(flight, track)
+        lever_arm = _fit_lever_arm_to_truth(flight, flight.truth, track)
+    return lever_arm if lever_arm or track.origin.is_gnss else _fit_lever_arm_to_imu(flight, track)
 
 
-def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverArm | None:
+def _fit_lever_arm_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverArm | None:
     """Fit a constant, a lever arm and a delay to the position errors against ground truth."""
     attitude, columns = flight.attitude, Columns.POSITION[:2]
-    airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
+    airborne_spans_s = () if isinstance(flight.airborne, Unavailable) else flight.airborne
     position_samples = track.samples[columns].dropna()
-    if airborne:
-        position_samples = position_samples.loc[airborne[0][0] : airborne[-1][1]]
+    if airborne_spans_s:
+        position_samples = position_samples.loc[airborne_spans_s[0][0] : airborne_spans_s[-1][1]]
     if isinstance(attitude, Unavailable) or len(position_samples) < 2:
         return None
     time_s, true_samples = position_samples.index.to_numpy(), truth.samples
@@ -98,12 +98,12 @@ def _fit_to_truth(flight: Flight, truth: Truth, track: PositionTrack) -> LeverAr
     sigma_m = float(np.sqrt(np.trace(covariance[:2, :2])))
     lever_arm = LeverArm(float(fitted_parameters[0]), float(fitted_parameters[1]), sigma_m)
     is_significant = lever_arm.horizontal_length_m > max(
-        MIN_LEVER_ARM_WITH_TRUTH_M, MIN_SIGMAS_WITH_TRUTH * sigma_m
+        MIN_LEVER_ARM_WITH_TRUTH_M, MIN_LEVER_ARM_SIGMAS_WITH_TRUTH * sigma_m
     )
     return lever_arm if is_significant and lever_arm.horizontal_length_m < MAX_LEVER_ARM_M else None
 
 
-def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
+def _fit_lever_arm_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
     inertial_data = integrate_inertial_data(flight)
     position_samples = track.samples[Columns.POSITION[:2]].dropna()
     if inertial_data is None or len(position_samples) < 2:
@@ -128,17 +128,19 @@ def _fit_to_imu(flight: Flight, track: PositionTrack) -> LeverArm | None:
             time_s, position_samples.to_numpy(), imu_motion.time_s
         )
         is_used = is_used & source_motion.is_valid
-        difference_m = source_motion.second_differences - imu_motion.table[:, :2, 0]
+        second_difference_error_m = source_motion.second_differences - imu_motion.table[:, :2, 0]
         design_rows = design[is_used].reshape(-1, design.shape[2])
-        used_differences_m = difference_m[is_used].ravel()
-        # second differences within twice the window contain common positions, so are correlated
+        used_differences_m = second_difference_error_m[is_used].ravel()
+        # second differences closer than two windows share positions: one per two windows counts
         independent_difference_count = (
-            len(used_differences_m) * GRID_INTERVAL_S / (2.0 * DIFFERENCE_WINDOW_S)
+            len(used_differences_m) * GRID_INTERVAL_S / (2.0 * SECOND_DIFFERENCE_WINDOW_S)
         )
         if independent_difference_count < 2 * design_rows.shape[1]:
             return None
         fitted_parameters = np.linalg.lstsq(design_rows, used_differences_m, rcond=None)[0]
-        residual_m: Array = np.linalg.norm(difference_m - design @ fitted_parameters, axis=1)
+        residual_m: Array = np.linalg.norm(
+            second_difference_error_m - design @ fitted_parameters, axis=1
+        )
         sigma_m = float(np.sqrt(np.mean(residual_m[is_used] ** 2) / 2.0))
         covariance = (
             np.linalg.pinv(design_rows.T @ design_rows)

@@ -32,8 +32,8 @@ from px4fuse.trajectory.rotation import (
     to_vector,
 )
 
-# Time T (s) between the three positions of a second difference
-DIFFERENCE_WINDOW_S = 2.0
+# Time T (s) between successive positions of a second difference p(t + T) - 2 p(t) + p(t - T)
+SECOND_DIFFERENCE_WINDOW_S = 2.0
 # Sample interval (s) of the second differences
 GRID_INTERVAL_S = 0.1
 # Integration step (s) of the IMU
@@ -44,7 +44,7 @@ HIGH_PASS_WINDOW_S = 12.0
 LEVELLING_WINDOW_S = 40.0
 # Length (s) of the windows for the estimate of the gyro bias
 GYRO_BIAS_WINDOW_S = 1.0
-# Minimum length (s) of a gap between two positions
+# Shorter intervals (s) between two positions are no gap
 MIN_GAP_S = 0.35
 
 
@@ -55,7 +55,7 @@ class InertialData:
     Attributes
     ----------
     time_s : ndarray, shape (n + 1,)
-    force_m_s2 : ndarray, shape (n, 3)
+    specific_force_m_s2 : ndarray, shape (n, 3)
         Mean specific force in the body frame (FRD) between successive times.
     logged_attitude : ndarray, shape (n + 1, 4)
         EKF2's attitude as quaternion (w, x, y, z; FRD to NED).
@@ -66,13 +66,13 @@ class InertialData:
     """
 
     time_s: Array
-    force_m_s2: Array
+    specific_force_m_s2: Array
     logged_attitude: Array
     gyro_attitude: Array
     valid_spans_s: tuple[tuple[float, float], ...]
 
     def compute_attitudes(self) -> dict[HeadingSource, Array]:
-        """Return quaternions at ``time_s`` with tilt from the gyroscopes, by source of heading."""
+        """Return quaternions at ``time_s`` by source of their heading; tilt is from the gyros."""
         return {
             "EKF2": replace_heading(self.gyro_attitude, heading(self.logged_attitude)),
             "gyroscopes": self.gyro_attitude,
@@ -92,7 +92,7 @@ class SourceSecondDifferences:
         cls, time_s: Array, position: Array, grid_s: Array
     ) -> "SourceSecondDifferences":
         """Compute the second differences of positions at the times ``grid_s``; invalid in gaps."""
-        window_steps = round(DIFFERENCE_WINDOW_S / GRID_INTERVAL_S)
+        window_steps = round(SECOND_DIFFERENCE_WINDOW_S / GRID_INTERVAL_S)
         position_times_s = grid_s[0] + GRID_INTERVAL_S * np.arange(
             -window_steps, len(grid_s) + window_steps
         )
@@ -107,21 +107,24 @@ class SourceSecondDifferences:
         )
         return cls(
             grid_s,
-            high_pass(second_difference(interpolated_positions, window_steps), is_valid),
+            high_pass(compute_second_differences(interpolated_positions, window_steps), is_valid),
             is_valid,
         )
 
 
 @dataclass(frozen=True)
 class ImuSecondDifferences:
-    """Second differences (m, NED) of the vehicle's position, integrated from the IMU.
+    """Second differences p(t + T) - 2 p(t) + p(t - T) (m, NED) of the position, from the IMU.
+
+    T is SECOND_DIFFERENCE_WINDOW_S.
 
     Attributes
     ----------
     time_s : ndarray, shape (n,)
     is_valid : ndarray of bool, shape (n,)
     table : ndarray, shape (n, 3, 4)
-        Second difference, and its derivatives with respect to the accelerometer bias (FRD, m/s²).
+        Column 0: second difference. Columns 1 to 3: its derivatives with respect to the
+        accelerometer bias (FRD, m/s²).
     second_difference_rate_m_s : ndarray, shape (n, 3)
         Derivative of the second difference with respect to time.
     """
@@ -140,33 +143,39 @@ def integrate_inertial_data(flight: Flight) -> InertialData | None:
     imu, attitude = flight.imu, flight.attitude
     if isinstance(imu, Unavailable) or isinstance(attitude, Unavailable):
         return None
-    imu_s, attitude_s = imu.index.to_numpy(), attitude.index.to_numpy()
+    imu_times_s, attitude_times_s = imu.index.to_numpy(), attitude.index.to_numpy()
     time_s = np.arange(
-        max(imu_s[0], attitude_s[0]), min(imu_s[-1], attitude_s[-1]), INTEGRATION_STEP_S
+        max(imu_times_s[0], attitude_times_s[0]),
+        min(imu_times_s[-1], attitude_times_s[-1]),
+        INTEGRATION_STEP_S,
     )
-    if len(time_s) < 4 * DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S:
+    if len(time_s) < 4 * SECOND_DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S:
         return None
     columns = [*Columns.SPECIFIC_FORCE, *Columns.ANGULAR_RATE]
-    integrals = (cumulative_integral(imu[name].to_numpy(), imu_s) for name in columns)
-    integral_steps = np.diff([np.interp(time_s, imu_s, integral) for integral in integrals]).T
-    force_m_s2 = integral_steps[:, :3] / INTEGRATION_STEP_S
-    logged_attitude = interpolate(time_s, attitude_s, attitude[Columns.QUATERNION].to_numpy())
+    imu_integrals = (cumulative_integral(imu[name].to_numpy(), imu_times_s) for name in columns)
+    integral_increments = np.diff(
+        [np.interp(time_s, imu_times_s, integral) for integral in imu_integrals]
+    ).T
+    specific_force_m_s2 = integral_increments[:, :3] / INTEGRATION_STEP_S
+    logged_attitude = interpolate(time_s, attitude_times_s, attitude[Columns.QUATERNION].to_numpy())
     gyro_attitude = _level_attitude(
-        _integrate_gyros(integral_steps[:, 3:], logged_attitude), force_m_s2
+        _integrate_gyros(integral_increments[:, 3:], logged_attitude), specific_force_m_s2
     )
-    airborne = flight.airborne
-    if isinstance(airborne, Unavailable):
-        airborne = ((float(time_s[0]), float(time_s[-1])),)
-    gap_rows = np.flatnonzero(find_imu_gaps(imu_s))
-    recorded_spans_s = zip([-np.inf, *imu_s[gap_rows + 1]], [*imu_s[gap_rows], np.inf], strict=True)
+    airborne_spans_s = flight.airborne
+    if isinstance(airborne_spans_s, Unavailable):
+        airborne_spans_s = ((float(time_s[0]), float(time_s[-1])),)
+    gap_rows = np.flatnonzero(find_imu_gaps(imu_times_s))
+    recorded_spans_s = zip(
+        [-np.inf, *imu_times_s[gap_rows + 1]], [*imu_times_s[gap_rows], np.inf], strict=True
+    )
     valid_spans_s = (
         (max(flight_start_s, recorded_from_s), min(flight_end_s, recorded_until_s))
         for recorded_from_s, recorded_until_s in recorded_spans_s
-        for flight_start_s, flight_end_s in airborne
+        for flight_start_s, flight_end_s in airborne_spans_s
     )
     return InertialData(
         time_s,
-        force_m_s2,
+        specific_force_m_s2,
         logged_attitude,
         gyro_attitude,
         tuple(span for span in valid_spans_s if span[0] < span[1]),
@@ -184,18 +193,18 @@ def _integrate_gyros(rotation_rad: Array, logged_attitude: Array) -> Array:
     )
     gyro_error_sum_rad = np.cumsum(gyro_error_rad, axis=0)
     window_steps = round(GYRO_BIAS_WINDOW_S / INTEGRATION_STEP_S)
-    gyro_bias_rad = (
+    gyro_bias_rad_per_step = (
         np.median(gyro_error_sum_rad[window_steps:] - gyro_error_sum_rad[:-window_steps], axis=0)
         / window_steps
     )
     return cumulative_product(
-        np.concatenate([logged_attitude[:1], from_vector(rotation_rad - gyro_bias_rad)])
+        np.concatenate([logged_attitude[:1], from_vector(rotation_rad - gyro_bias_rad_per_step)])
     )
 
 
-def _level_attitude(attitude: Array, force_m_s2: Array) -> Array:
+def _level_attitude(attitude: Array, specific_force_m_s2: Array) -> Array:
     """Correct the tilt of an attitude, so that the mean specific force is vertical."""
-    mean_force_m_s2 = rotate(to_matrix(attitude[:-1]), force_m_s2)
+    mean_force_m_s2 = rotate(to_matrix(attitude[:-1]), specific_force_m_s2)
     for _ in range(2):
         mean_force_m_s2 = running_mean(
             mean_force_m_s2,
@@ -228,12 +237,12 @@ def high_pass(values: Array, is_valid: BoolArray) -> Array:
     return filtered
 
 
-def second_difference(position: Array, window: int) -> Array:
+def compute_second_differences(position: Array, window: int) -> Array:
     return position[2 * window :] - 2.0 * position[window:-window] + position[: -2 * window]
 
 
 def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSecondDifferences:
-    """Integrate specific force and gravity twice to second differences of the position (NED).
+    """Compute second differences of the position (NED) from specific force and gravity.
 
     ``attitude``, shape (n + 1, 4), is a quaternion (w, x, y, z; FRD to NED).
     """
@@ -241,23 +250,29 @@ def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSec
     body_to_ned = to_matrix(
         quaternion_sums / np.linalg.norm(quaternion_sums, axis=1, keepdims=True)
     )
-    acceleration = body_to_ned @ inertial_data.force_m_s2[..., None] + [[0.0], [0.0], [constants.g]]
+    acceleration = body_to_ned @ inertial_data.specific_force_m_s2[..., None] + [
+        [0.0],
+        [0.0],
+        [constants.g],
+    ]
     table = np.concatenate([acceleration, body_to_ned], axis=2)
     position_m = np.zeros((len(attitude), 3, 4))
-    # displacement of each step from the mean velocity, in place to limit memory
+    # trapezoidal rule: mean velocity of each step · step; in place to limit memory
     displacement_m = np.cumsum(table, axis=0)
     table /= 2.0
     displacement_m -= table
     displacement_m *= INTEGRATION_STEP_S**2
     np.cumsum(displacement_m, axis=0, out=position_m[1:])
-    window_steps = round(DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S)
+    window_steps = round(SECOND_DIFFERENCE_WINDOW_S / INTEGRATION_STEP_S)
     stride = round(GRID_INTERVAL_S / INTEGRATION_STEP_S)
-    second_differences = second_difference(position_m, window_steps)[::stride]
+    second_differences = compute_second_differences(position_m, window_steps)[::stride]
     time_s = inertial_data.time_s[window_steps:-window_steps][::stride]
-    # a second difference spans DIFFERENCE_WINDOW_S before and after its time
+    # a second difference spans SECOND_DIFFERENCE_WINDOW_S before and after its time
     is_valid = inside_spans(time_s, inertial_data.valid_spans_s)
     for (_, end), (start, _) in pairwise(inertial_data.valid_spans_s):
-        is_valid &= (time_s < end - DIFFERENCE_WINDOW_S) | (time_s > start + DIFFERENCE_WINDOW_S)
+        is_valid &= (time_s < end - SECOND_DIFFERENCE_WINDOW_S) | (
+            time_s > start + SECOND_DIFFERENCE_WINDOW_S
+        )
     filtered = high_pass(second_differences, is_valid)
     return ImuSecondDifferences(
         time_s, is_valid, filtered, np.gradient(filtered[..., 0], GRID_INTERVAL_S, axis=0)

@@ -1,4 +1,4 @@
-"""Order of the quaternion components, body frame and world frame of a source's orientation.
+"""Determination of the quaternion order, body frame and world frame of a source's orientation.
 
 Each possible convention is compared with the attitude from the gyroscopes, in tilt and in heading
 changes.
@@ -21,8 +21,9 @@ IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 FLU_TO_FRD = np.array([0.0, 1.0, 0.0, 0.0])
 # Quaternion (w, x, y, z) from ENU to NED
 ENU_TO_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
-# Quaternions that convert the world frame to NED and the body frame to FRD, by names of both frames
-FRAMES: Final[dict[BodyAndWorldFrame, tuple[Array, Array]]] = {
+# Quaternions that convert the world frame to NED and the body frame to FRD, by body and world frame
+# of the source's orientation
+QUATERNIONS_BY_FRAMES: Final[dict[BodyAndWorldFrame, tuple[Array, Array]]] = {
     "FRD to NED": (IDENTITY_QUATERNION, IDENTITY_QUATERNION),
     "FLU to ENU": (ENU_TO_NED, FLU_TO_FRD),
     "FLU to NWU": (FLU_TO_FRD, FLU_TO_FRD),
@@ -38,16 +39,18 @@ COPY_DELAYS_S = np.arange(0.0, 0.205, 0.01)
 # Maximum median difference (°) of the converted tilt from the gyroscopes' tilt, for a correct
 # convention
 MAX_TILT_DIFFERENCE_DEG = 6.0
-# Maximum median difference (°) of the converted heading, without its mean difference, from the
-# gyroscopes' heading, for a correct convention
+# Maximum median difference (°) between converted heading and the gyroscopes' heading for a correct
+# convention, after their mean difference is removed
 MAX_HEADING_DIFFERENCE_DEG = 12.0
-# Smaller tilt and heading differences (°) are noise; the score uses this value instead
+# Lower limit (°) of tilt and heading differences in the score of a convention: smaller differences
+# are noise
 MIN_SCORED_ANGLE_DEG = 0.7
-# Score (log likelihood) of a convention: minus this factor · duration (s) · (ln tilt difference +
-# ln heading difference), plus log prior odds
-SCORE_LOSS_PER_S = 0.5
-# Minimum lead of the best score over the second best, for the result "determined"
-MIN_SCORE_DIFFERENCE = 4.0
+# Factor k of the score of a convention: log prior odds - k · duration (s) · ln(tilt difference (°)
+# · heading difference (°)), with the differences from the gyroscopes' attitude
+SCORE_FACTOR_PER_S = 0.5
+# Minimum lead (nats) in score of the best convention over the second best, for the verdict
+# "determined"
+MIN_CONVENTION_SCORE_LEAD = 4.0
 # Maximum number of orientations that are compared with the attitude from the gyroscopes
 MAX_ORIENTATION_COUNT = 600
 # Minimum number of orientations in flight for a check of their convention
@@ -63,7 +66,7 @@ class OrientationCandidate(NamedTuple):
 
     @property
     def order_and_frames(self) -> tuple[str, str]:
-        """Quaternion order and frames; NWU for ENU, because both differ only in heading."""
+        """Quaternion order and frames, with ENU as NWU: a heading offset does not distinguish."""
         return self.convention.order, self.convention.frames.replace("ENU", "NWU")
 
 
@@ -105,28 +108,32 @@ def check_orientation(
         _score_convention(
             sample_times_s, sent_quaternions, reference_attitude, order, frames, quarter_turns
         )
-        for order, frames, quarter_turns in product(QUATERNION_ORDERS, FRAMES, range(4))
+        for order, frames, quarter_turns in product(
+            QUATERNION_ORDERS, QUATERNIONS_BY_FRAMES, range(4)
+        )
     ]
     candidates.sort(key=lambda candidate: -candidate.score)
-    best = candidates[0]
-    second_best = next(
-        candidate for candidate in candidates if candidate.order_and_frames != best.order_and_frames
+    best_candidate = candidates[0]
+    second_best_candidate = next(
+        candidate
+        for candidate in candidates
+        if candidate.order_and_frames != best_candidate.order_and_frames
     )
-    convention = best.convention
+    convention = best_candidate.convention
     tilt_difference_deg = convention.tilt_difference_deg
     if (
         tilt_difference_deg > MAX_TILT_DIFFERENCE_DEG
-        or best.heading_difference_deg > MAX_HEADING_DIFFERENCE_DEG
+        or best_candidate.heading_difference_deg > MAX_HEADING_DIFFERENCE_DEG
     ):
         convention = replace(convention, verdict="unrelated")
-    elif best.score - second_best.score < MIN_SCORE_DIFFERENCE:
+    elif best_candidate.score - second_best_candidate.score < MIN_CONVENTION_SCORE_LEAD:
         convention = replace(convention, verdict="ambiguous")
     return convention, sample_times_s, convert_to_attitude(sent_quaternions, convention)
 
 
 def convert_to_attitude(sent_quaternions: Array, convention: OrientationConvention) -> Array:
     """Convert an orientation as sent to the attitude (w, x, y, z; FRD to NED)."""
-    world_rotation, body_rotation = FRAMES[convention.frames]
+    world_rotation, body_rotation = QUATERNIONS_BY_FRAMES[convention.frames]
     w_first_quaternions = (
         sent_quaternions if convention.order == "w x y z" else np.roll(sent_quaternions, 1, 1)
     )
@@ -143,9 +150,9 @@ def _score_convention(
 ) -> OrientationCandidate:
     """Score one convention of the quaternions by their distance from the reference attitude.
 
-    The score decreases with the median differences of tilt and heading, without the constant
-    heading offset. It prefers usual conventions: quaternion order w x y z, FRD to NED, no rotation
-    of the body, and a heading offset of at most 8°.
+    The score decreases with the median differences of tilt and heading; the mean heading difference
+    is removed first. The prior prefers quaternion order w x y z, FRD to NED, no rotation of the
+    body, and a mean heading difference of at most 8°.
     """
     convention = OrientationConvention(verdict="determined", order=order, frames=frames)
     body_rotation = from_vector(np.array([0.0, 0.0, body_quarter_turns * np.pi / 2.0]))
@@ -160,10 +167,10 @@ def _score_convention(
     tilt_difference_deg, heading_difference_deg = np.degrees(
         np.median([tilt_difference_rad, heading_difference_rad], axis=1)
     ).tolist()
-    ln_differences = np.log(
+    log_angle_differences = np.log(
         np.maximum([tilt_difference_deg, heading_difference_deg], MIN_SCORED_ANGLE_DEG)
     )
-    score = -SCORE_LOSS_PER_S * (time_s[-1] - time_s[0]) * float(np.sum(ln_differences))
+    score = -SCORE_FACTOR_PER_S * (time_s[-1] - time_s[0]) * float(np.sum(log_angle_differences))
     score -= 4.0 * (order != "w x y z") + 2.0 * (frames != "FRD to NED")
     score -= 2.0 * (body_quarter_turns != 0) + 1.0 * (
         abs(mean_heading_difference_rad) > np.radians(8.0)

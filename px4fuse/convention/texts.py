@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from px4fuse.convention.axes import UNIT_SIZES_M
+from px4fuse.convention.axes import METRES_PER_UNIT
 from px4fuse.convention.model import AxisDirections, Direction, Unit
 
 # All directions: the opposite of each has the same index in the reversed tuple
@@ -28,15 +28,10 @@ def append_opposites(axes: AxisDirections) -> list[Direction]:
     return [*axes, *(OPPOSITE_DIRECTION[direction] for direction in axes[::-1])]
 
 
-def find_true_axes(axes: AxisDirections, frame: str) -> AxisDirections:
-    """Undo the reader's conversion to NED: return the true directions of x, y, z in the file.
+def find_axes_in_file(axes: AxisDirections, frame: str) -> AxisDirections:
+    """Return the true directions of x, y, z in a file that was read as ``frame``.
 
-    Parameters
-    ----------
-    axes : tuple of str
-        True directions of the components that the reader made north, east, down.
-    frame : {"NED", "ENU", "NWU"}
-        Frame that the reader assumed.
+    ``axes`` are the true directions of the components that were read as north, east, down.
     """
     true_directions = dict(zip(DIRECTIONS, append_opposites(axes), strict=True))
     x, y, z = (true_directions[name] for name in FRAME_AXES[frame])
@@ -67,8 +62,12 @@ def describe_axes(
     elif y == "up":
         title = "y points up"
     fault = f"{title}: x is {x}, y {y}, z {z}{' (left-handed frame)' if is_mirrored else ''}"
-    source_axes = dict(zip(append_opposites(axes), ("x", "y", "z", "-z", "-y", "-x"), strict=True))
-    ned_axes_text = ", ".join(source_axes[direction] for direction in FRAME_AXES["NED"])
+    source_axis_by_direction = dict(
+        zip(append_opposites(axes), ("x", "y", "z", "-z", "-y", "-x"), strict=True)
+    )
+    ned_axes_text = ", ".join(
+        source_axis_by_direction[direction] for direction in FRAME_AXES["NED"]
+    )
     ned_text = f"(north, east, down) = ({ned_axes_text})"
     if is_file and frame_name:
         return fault, f"Run again with --position-frame {frame_name.lower()}."
@@ -94,17 +93,18 @@ def describe_unit(
     if is_file and unit != "feet":
         return fault, f"Run again with --position-unit {unit}."
     correction_place = "in the file" if is_file else "before sending"
-    return fault, f"Multiply x, y and z by {UNIT_SIZES_M[unit]:g} {correction_place}."
+    return fault, f"Multiply x, y and z by {METRES_PER_UNIT[unit]:g} {correction_place}."
 
 
-def describe_conversion(frames: str) -> str:
+def describe_quaternion_conversion(frames: str) -> str:
     """Describe the conversion of a quaternion from other frames to FRD and NED.
 
-    >>> describe_conversion("FLU to NWU")
+    >>> describe_quaternion_conversion("FLU to NWU")
     'Convert the orientation: q_NED = (0, 1, 0, 0) ⊗ q ⊗ (0, 1, 0, 0), in the order w, x, y, z.'
     """
-    left_factor = {"ENU": "(0, √½, √½, 0) ⊗ ", "NWU": "(0, 1, 0, 0) ⊗ "}.get(frames[-3:], "")
-    right_factor = " ⊗ (0, 1, 0, 0)" if frames.startswith("FLU") else ""
+    left_factor_text = {"ENU": "(0, √½, √½, 0) ⊗ ", "NWU": "(0, 1, 0, 0) ⊗ "}.get(frames[-3:], "")
+    right_factor_text = " ⊗ (0, 1, 0, 0)" if frames.startswith("FLU") else ""
     return (
-        f"Convert the orientation: q_NED = {left_factor}q{right_factor}, in the order w, x, y, z."
+        f"Convert the orientation: q_NED = {left_factor_text}q{right_factor_text}, in the order w, "
+        "x, y, z."
     )

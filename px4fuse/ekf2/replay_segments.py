@@ -36,7 +36,7 @@ from px4fuse.flight.model import (
     rows_between,
     time_index,
 )
-from px4fuse.readers.px4_ekf2 import find_rows_of_timestamps, samples_per_step
+from px4fuse.readers.px4_ekf2 import compute_samples_per_step, find_rows_of_timestamps
 from px4fuse.trajectory.rotation import (
     conjugate,
     cumulative_product,
@@ -756,8 +756,8 @@ def _interpolate(table: pd.DataFrame, times_s: Array) -> Array:
 def find_step_ends(interval_s: Array, logged_ends: IntArray, configured_step_s: float) -> IntArray:
     """Return the index of the IMU sample at the end of each prediction step of EKF2.
 
-    A step ends after :func:`samples_per_step` IMU samples, after ``configured_step_s``, or at a
-    logged end of a step, whichever is first.
+    A step ends after :func:`compute_samples_per_step` IMU samples, after ``configured_step_s``, or
+    at a logged end of a step, whichever is first.
     """
     median_interval_s = float(np.median(interval_s))
     # Number of IMU samples in each interval. If few samples are missing, the IMU itself may have
@@ -766,7 +766,9 @@ def find_step_ends(interval_s: Array, logged_ends: IntArray, configured_step_s: 
     if sample_counts.mean() <= 1.0 + MAX_LOST_IMU_FRACTION:
         sample_counts[:] = 1.0
     sample_counts_at_ends = np.append(0.0, np.cumsum(sample_counts))[logged_ends]
-    samples_needed = samples_per_step(configured_step_s, median_interval_s, sample_counts_at_ends)
+    samples_needed = compute_samples_per_step(
+        configured_step_s, median_interval_s, sample_counts_at_ends
+    )
     logged_end_set = set(logged_ends.tolist())
     end_indices = []
     accumulated_count = accumulated_s = 0.0

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from msgspec.structs import replace
 
 from px4fuse.comparison.model import Comparison
-from px4fuse.convention.axes import UNIT_SIZES_M
+from px4fuse.convention.axes import METRES_PER_UNIT
 from px4fuse.convention.correction import (
     MIN_RESIDUAL_ROTATION_DEG,
     ConventionFaults,
@@ -18,9 +18,9 @@ from px4fuse.convention.model import Convention, OrientationConvention
 from px4fuse.convention.texts import (
     FRAME_AXES,
     describe_axes,
-    describe_conversion,
+    describe_quaternion_conversion,
     describe_unit,
-    find_true_axes,
+    find_axes_in_file,
     format_axes,
 )
 from px4fuse.finding import Finding
@@ -133,7 +133,7 @@ def _find_position_faults(
         f"to the second best {'above ' if log_odds == 99.0 else ''}{log_odds:.0f} nats)."
     )
     stated_frame = alignment.frame.upper() if alignment else "NED"
-    axes, rotation_deg = find_true_axes(convention.axes, stated_frame), faults.rotation_deg
+    axes, rotation_deg = find_axes_in_file(convention.axes, stated_frame), faults.rotation_deg
     is_rotation_of_file_frame = (
         is_position_file and abs(convention.rotation_deg) <= MIN_RESIDUAL_ROTATION_DEG
     )
@@ -153,7 +153,7 @@ def _find_position_faults(
         if faults.has_wrong_axes and rotation_deg:
             fault_text += f", and rotated by {rotation_deg:+.0f}° (clockwise from above)"
         if orientation and orientation.frames.startswith("FLU"):
-            action += f" {describe_conversion(orientation.frames)}"
+            action += f" {describe_quaternion_conversion(orientation.frames)}"
         message = f"{fault_text}. {evidence_sentence} {frame_sentence}"
         yield "source_axes_wrong", "axes", message, action
     elif rotation_deg:
@@ -181,7 +181,7 @@ def _find_position_faults(
         fault_text, action = describe_unit(
             convention.unit, positions_text, is_file=is_position_file
         )
-        distance_ratio = convention.scale / UNIT_SIZES_M[convention.unit]
+        distance_ratio = convention.scale / METRES_PER_UNIT[convention.unit]
         message = (
             f"{fault_text}. Distances are {distance_ratio:.3g} times those that the IMU measures. "
             f"{evidence_sentence} The analysis uses the positions in metres."
@@ -254,7 +254,7 @@ def _find_orientation_faults(
         "frames": (
             f"The orientation of {source} is the rotation {orientation.frames}, but PX4 expects "
             f"FRD to NED. With converted frames, {agreement_text}",
-            describe_conversion(orientation.frames),
+            describe_quaternion_conversion(orientation.frames),
         ),
         "heading": (
             f"The heading of the orientation of {source} differs by "

@@ -11,7 +11,7 @@ from px4fuse.readers.text_table import refuse_foreign_format
 _FORMAT_DETECTION_BYTES = 100
 ULOG_MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
 # Text files that users give by mistake instead of a flight log: suffixes, format and advice
-_TEXT_FILES = {
+_ADVICE_BY_TEXT_SUFFIX = {
     (".csv", ".tsv", ".jsonl"): (
         "table",
         "If the table contains positions, use px4fuse compare LOG --position {name}.",
@@ -53,7 +53,7 @@ def read_log(path: str | Path, *, system: int | None = None) -> Flight:
 
         return read_ulog(name, read_log_bytes(path))
     refuse_foreign_format(path, first_bytes, LogError)
-    for suffixes, (file_kind, advice) in _TEXT_FILES.items():
+    for suffixes, (file_kind, advice) in _ADVICE_BY_TEXT_SUFFIX.items():
         if path.suffix.lower() in suffixes and first_bytes.isascii():
             raise LogError(
                 f"{name}: the file is a {file_kind}, not a flight log", advice.format(name=name)

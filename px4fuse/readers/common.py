@@ -8,7 +8,7 @@ from px4fuse.flight.model import Columns, Ekf2, Spans, Unavailable
 
 # Maximum absolute value (SI units) of valid positions, velocities, accelerations and angles:
 # larger values are from damaged bytes
-MAX_VALID_VALUE = 1e9
+MAX_VALID_SI_VALUE = 1e9
 # Maximum absolute value (m/s², rad/s) of valid IMU data: above the range of accelerometers (400 g)
 # and gyros (4000 °/s)
 MAX_IMU_READING = 1e4
@@ -17,8 +17,8 @@ MAX_IMU_READING = 1e4
 MIN_INVALID_ZERO_DISTANCE_M = 0.3
 # Minimum distance (m) of a damaged position from the median position
 MIN_DAMAGED_DISTANCE_M = 1e4
-# Minimum ratio of the distance of a damaged position to the median distance of all positions
-MIN_DAMAGED_DISTANCE_RATIO = 100.0
+# Minimum distance of a damaged position from the median position, relative to the median distance
+MIN_DAMAGED_TO_MEDIAN_RATIO = 100.0
 # Minimum duration (s) of equal positions that are rejected as frozen: some sources repeat each
 # position for a shorter time
 MIN_FROZEN_S = 1.0
@@ -26,12 +26,11 @@ MIN_FROZEN_S = 1.0
 MIN_FROZEN_COUNT = 5
 # Maximum fraction of frozen positions. With more, none is rejected: the vehicle may be at rest
 MAX_FROZEN_FRACTION = 0.5
-# Maximum probability of a false alarm: a source that repeats single positions at random is rejected
-# as frozen
+# Maximum probability that positions repeated at random are rejected as frozen
 MAX_RANDOM_RUN_PROBABILITY = 0.01
 # Values are multiples of a rounding step if difference / step is at most this far from whole
 # numbers
-MAX_STEP_COUNT_ERROR = 0.01
+MAX_STEP_MULTIPLE_ERROR = 0.01
 # Minimum norm of a valid quaternion: senders without attitude send zeros
 MIN_QUATERNION_NORM = 0.5
 
@@ -44,9 +43,9 @@ def collect_unavailable(*flight_data: object) -> tuple[Unavailable, ...]:
     return tuple(data for data in flight_data if isinstance(data, Unavailable))
 
 
-def find_flight_spans(landed: pd.Series, duration_s: float) -> Spans:
-    """Return start and end (s) of each flight: the intervals in which ``landed`` is 0 or False."""
-    landed_changes = landed[landed.ne(landed.shift())]
+def find_flight_spans(landed_flags: pd.Series, duration_s: float) -> Spans:
+    """Return start and end (s) of each flight: the intervals in which the flags are 0 or False."""
+    landed_changes = landed_flags[landed_flags.ne(landed_flags.shift())]
     start_times_s = np.maximum.accumulate(np.maximum(landed_changes.index.to_numpy(), 0.0)).tolist()
     spans = zip(start_times_s, [*start_times_s[1:], duration_s], landed_changes, strict=False)
     return tuple((start, end) for start, end, is_landed in spans if end > start and not is_landed)
@@ -68,14 +67,14 @@ def format_truncation(item: str, duration_s: float, in_flight: bool) -> str:
 
 
 def select_valid_rows(
-    samples: pd.DataFrame, columns: list[str], limit: float = MAX_VALID_VALUE
+    samples: pd.DataFrame, columns: list[str], limit: float = MAX_VALID_SI_VALUE
 ) -> pd.DataFrame:
     """Return the rows in which the absolute values of all ``columns`` are below ``limit``."""
     is_valid: BoolArray = (np.abs(samples[columns].to_numpy()) < limit).all(axis=1)
     return samples[is_valid]
 
 
-def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
+def classify_invalid_positions(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[str]":
     """Return for each position the reason why it is not a measurement, or "" if it is.
 
     "NaN": a coordinate is not finite. "zero": the source sent 0, 0, 0 instead of a position. "far":
@@ -83,23 +82,23 @@ def find_invalid_rows(samples: pd.DataFrame, columns: list[str]) -> "pd.Series[s
     """
     values, time_s = samples[columns].to_numpy(), samples.index.to_numpy()
     reason_by_row = pd.Series("", index=samples.index)
-    is_number: BoolArray = (np.abs(values) < MAX_VALID_VALUE).all(axis=1)
+    is_number: BoolArray = (np.abs(values) < MAX_VALID_SI_VALUE).all(axis=1)
     reason_by_row[~is_number] = "NaN"
     is_zero: BoolArray = (values == 0.0).all(axis=1)
-    measured_rows, zero_rows = np.flatnonzero(is_number & ~is_zero), np.flatnonzero(is_zero)
-    if len(measured_rows):
-        next_index = np.searchsorted(measured_rows, zero_rows)
-        neighbour_rows = measured_rows[
-            np.clip([next_index - 1, next_index], 0, len(measured_rows) - 1)
+    nonzero_rows, zero_rows = np.flatnonzero(is_number & ~is_zero), np.flatnonzero(is_zero)
+    if len(nonzero_rows):
+        next_index = np.searchsorted(nonzero_rows, zero_rows)
+        neighbour_rows = nonzero_rows[
+            np.clip([next_index - 1, next_index], 0, len(nonzero_rows) - 1)
         ]
         distance_m = np.linalg.norm(values[neighbour_rows], axis=2).min(axis=0)
         reason_by_row.iloc[zero_rows[distance_m > MIN_INVALID_ZERO_DISTANCE_M]] = "zero"
     valid_rows = np.flatnonzero(reason_by_row == "")
     if len(valid_rows):
-        median_offset_m = values[valid_rows] - np.median(values[valid_rows], axis=0)
-        distance_m = np.linalg.norm(median_offset_m, axis=1)
+        offset_from_median_m = values[valid_rows] - np.median(values[valid_rows], axis=0)
+        distance_m = np.linalg.norm(offset_from_median_m, axis=1)
         is_far = distance_m > max(
-            MIN_DAMAGED_DISTANCE_M, MIN_DAMAGED_DISTANCE_RATIO * float(np.median(distance_m))
+            MIN_DAMAGED_DISTANCE_M, MIN_DAMAGED_TO_MEDIAN_RATIO * float(np.median(distance_m))
         )
         reason_by_row.iloc[valid_rows[is_far]] = "far"
         valid_rows = valid_rows[~is_far]
@@ -128,9 +127,10 @@ def estimate_rounding_step(values: Array) -> float:
     differences = np.diff(np.unique(values[np.isfinite(values)]))
     if not len(differences):
         return 0.0
-    with np.errstate(over="ignore", invalid="ignore"):  # a tiny step makes the ratio infinite
+    # a tiny minimum makes the counts infinite: is_multiple is then False
+    with np.errstate(over="ignore", invalid="ignore"):
         step_counts = differences / differences.min()
-        is_multiple = np.abs(step_counts - np.rint(step_counts)) < MAX_STEP_COUNT_ERROR
+        is_multiple = np.abs(step_counts - np.rint(step_counts)) < MAX_STEP_MULTIPLE_ERROR
     return float(differences.min()) if is_multiple.all() else 0.0
 
 
@@ -159,7 +159,7 @@ def join_nearest(
 def select_rows_with_attitude(samples: pd.DataFrame) -> pd.DataFrame:
     """Return the rows with a valid quaternion; norm 0 means that no attitude was sent."""
     norm: Array = np.linalg.norm(samples[Columns.QUATERNION].to_numpy(), axis=1)
-    return samples[(norm > MIN_QUATERNION_NORM) & (norm < MAX_VALID_VALUE)]
+    return samples[(norm > MIN_QUATERNION_NORM) & (norm < MAX_VALID_SI_VALUE)]
 
 
 def read_orientation(samples: pd.DataFrame) -> pd.DataFrame | None:

@@ -25,7 +25,7 @@ class Layout:
     topic: str = ""
     # Required field of each column; ``name[i]`` is an array element
     columns: Mapping[str, str] = field(default_factory=dict)
-    # Fields that only some PX4 releases log, by column; empty for MAVLink
+    # Field of each column that only some PX4 releases log; empty for MAVLink
     optional: Mapping[str, str] = field(default_factory=dict)
     # Factor of each column, by which the field is multiplied; 1 if absent
     scale: Mapping[str, float] = field(default_factory=dict)

@@ -8,7 +8,7 @@ import numpy as np
 from px4fuse.core.arrays import Array, IntArray
 from px4fuse.core.reading import display_name, read_bytes_limited
 from px4fuse.errors import TrajectoryError
-from px4fuse.readers.text_table import Rows, decode_text, make_line_error, quote
+from px4fuse.readers.text_table import TextTableRows, decode_text, make_line_error, quote
 from px4fuse.readers.trajectory import MAX_COORDINATE_M, UNIT_NORM_TOLERANCE
 from px4fuse.trajectory.graph.initialisation import initialise
 from px4fuse.trajectory.graph.model import POSES_FROM_FILE, PoseGraph
@@ -27,7 +27,7 @@ _FORMAT_REMEDY = (
     "Give poses as VERTEX_SE2 or VERTEX_SE3:QUAT, and edges as EDGE_SE2 or EDGE_SE3:QUAT. Remove "
     "all other lines."
 )
-_VERTEX_ID = re.compile("[+-]?[0-9]{1,19}")
+_VERTEX_ID_PATTERN = re.compile("[+-]?[0-9]{1,19}")
 # Maximum vertex id: GTSAM writes 64-bit symbols, such as 6989586621679009792 for a0
 _MAX_VERTEX_ID = 2**63 - 1
 # A negative eigenvalue λ of an information matrix is a rounding error if |λ| is below this fraction
@@ -66,7 +66,7 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
     for tag, rows in rows_by_tag.items():
         if rows.lines and not tag.endswith(pose_type):
             fault = "the file contains 2D entries (SE2) and 3D entries (SE3)"
-            raise rows.make_row_error(0, fault, "Remove the entries of one kind.")
+            raise rows.make_row_error(0, fault, "Keep only the 2D or only the 3D entries.")
     vertices = rows_by_tag[f"VERTEX_{pose_type}"]
     edges = rows_by_tag[f"EDGE_{pose_type}"]
     if not edges.lines:
@@ -85,7 +85,7 @@ def parse_g2o(text: str, name: str) -> PoseGraph:
         vertices.raise_where(
             is_repeated,
             "another line defines the vertex with this id",
-            "Remove one of the two lines.",
+            "Keep only one of the lines with this id.",
         )
     vertex_indices = np.minimum(np.searchsorted(ids, edge_vertex_ids), len(ids) - 1)
     edges.raise_where(
@@ -124,9 +124,10 @@ def format_g2o(graph: PoseGraph) -> str:
     pose_type = "SE2" if graph.dimension == 2 else "SE3:QUAT"
     ids = graph.ids.tolist()
     upper_triangle = np.triu_indices(graph.degrees_of_freedom)
-    poses = zip(ids, graph.poses.tolist(), strict=True)
+    id_pose_pairs = zip(ids, graph.poses.tolist(), strict=True)
     lines = [
-        f"VERTEX_{pose_type} {vertex_id} {' '.join(map(repr, pose))}" for vertex_id, pose in poses
+        f"VERTEX_{pose_type} {vertex_id} {' '.join(map(repr, pose))}"
+        for vertex_id, pose in id_pose_pairs
     ]
     lines.append(f"FIX {ids[0]}")
     edge_values = np.hstack(
@@ -140,8 +141,8 @@ def format_g2o(graph: PoseGraph) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _group_rows_by_tag(text: str, name: str) -> dict[str, Rows]:
-    rows_by_tag = {tag: Rows(name) for tag in _ID_AND_VALUE_COUNTS}
+def _group_rows_by_tag(text: str, name: str) -> dict[str, TextTableRows]:
+    rows_by_tag = {tag: TextTableRows(name) for tag in _ID_AND_VALUE_COUNTS}
     fixed_ids: set[str] = set()
     for line_number, raw_line in enumerate(text.split("\n"), start=1):
         line = raw_line.partition("#")[0].strip()
@@ -165,12 +166,12 @@ def _group_rows_by_tag(text: str, name: str) -> dict[str, Rows]:
     return rows_by_tag
 
 
-def _parse_rows(rows: Rows, tag: str) -> tuple[IntArray, Array]:
+def _parse_rows(rows: TextTableRows, tag: str) -> tuple[IntArray, Array]:
     """Return the vertex ids, shape (n, 1 or 2), and the other numbers of all lines with a tag."""
     vertex_count, value_count = _ID_AND_VALUE_COUNTS[tag]
     cells, numbers = rows.parse(1 + vertex_count, value_count)
     is_invalid_id = [
-        _VERTEX_ID.fullmatch(id_text) is None or abs(int(id_text)) > _MAX_VERTEX_ID
+        _VERTEX_ID_PATTERN.fullmatch(id_text) is None or abs(int(id_text)) > _MAX_VERTEX_ID
         for id_text in cells[:, 1:].flat
     ]
     rows.raise_where(
@@ -189,7 +190,7 @@ def _parse_rows(rows: Rows, tag: str) -> tuple[IntArray, Array]:
     return cells[:, 1:].astype(np.int64), numbers
 
 
-def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
+def _normalise_quaternions(rows: TextTableRows, poses: Array) -> Array:
     if poses.shape[1] == 3:
         return poses
     with np.errstate(over="ignore"):
@@ -204,7 +205,7 @@ def _normalise_quaternions(rows: Rows, poses: Array) -> Array:
     return np.hstack([poses[:, :3], poses[:, 3:] / quaternion_norms[:, None]])
 
 
-def _make_information_matrices(edges: Rows, numbers: Array, dimension: int) -> Array:
+def _make_information_matrices(edges: TextTableRows, numbers: Array, dimension: int) -> Array:
     """Return the information matrices, shape (n, dimension, dimension).
 
     ``numbers`` contains the upper triangle of each matrix, row by row.
@@ -216,7 +217,7 @@ def _make_information_matrices(edges: Rows, numbers: Array, dimension: int) -> A
     is_too_small = (row == column) & (magnitudes > 0.0) & (magnitudes < _MIN_INFORMATION)
     edges.raise_where(
         is_too_small | (magnitudes > _MAX_INFORMATION),
-        "a number of the information matrix is too small or too large",
+        "the absolute value of an information matrix element is too small or too large",
         f"Give 0, or an absolute value from {_MIN_INFORMATION:g} to {_MAX_INFORMATION:g}.",
     )
     eigenvalues = np.linalg.eigvalsh(matrices)

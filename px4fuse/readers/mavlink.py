@@ -32,7 +32,11 @@ from px4fuse.readers import mavlink_messages as messages
 from px4fuse.readers import mavlink_senders as senders
 from px4fuse.readers.mavlink_clocks import MIN_UNIX_TIME_S
 from px4fuse.readers.mavlink_frames import MESSAGE_IDS, VEHICLE_TYPES, read_frames
-from px4fuse.readers.mavlink_positions import pressure_altitude, read_positions, read_truth
+from px4fuse.readers.mavlink_positions import (
+    compute_pressure_altitude_m,
+    read_positions,
+    read_truth,
+)
 from px4fuse.readers.mavlink_recording import (
     RECEIPT_CLOCK_TEXT,
     Recording,
@@ -49,10 +53,10 @@ REAL32_PARAMETER_TYPE = 9
 
 # No warnings for damaged values: they become NaN or infinite, and their samples are dropped
 @np.errstate(invalid="ignore", over="ignore", divide="ignore")
-def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight:
+def read_mavlink(name: str, content: bytes, system_id: int | None = None) -> Flight:
     """Read a MAVLink recording: a ``.tlog``, or a raw stream of MAVLink 1 and 2.
 
-    ``system`` is the MAVLink system id of the vehicle. By default, the autopilot with the most
+    ``system_id`` is the MAVLink system id of the vehicle. By default, the autopilot with the most
     messages is read.
 
     Raises
@@ -60,13 +64,13 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     LogError
         The content is not MAVLink.
     SettingsError
-        No autopilot in the recording has the id ``system``.
+        No autopilot in the recording has the id ``system_id``.
     """
     frames = read_frames(name, content)
-    address, autopilot = senders.choose_autopilot(frames, system)
+    address, autopilot = senders.choose_autopilot(frames, system_id)
     recording = read_recording(frames, address)
     clock_mappings = senders.map_senders(recording)
-    parameters, parameter_faults = replace_invalid_parameters(
+    parameters, replaced_parameter_notes = replace_invalid_parameters(
         _read_parameters(recording, autopilot)
     )
     remedies, _ = messages.remedies_of_autopilot(autopilot)
@@ -76,29 +80,29 @@ def read_mavlink(name: str, content: bytes, system: int | None = None) -> Flight
     # Only PX4 has a parameter for the delay between a GNSS fix and its timestamp
     delay_parameters = fill_with_defaults(parameters, GNSS_POS) if autopilot == "PX4" else {}
     gnss_delay_s = 1e-3 * delay_parameters.get(GNSS_POS.delay, 0.0)
-    positions, missing_positions = read_positions(
+    positions, unavailable_positions = read_positions(
         recording, clock_mappings, remedies["position"], gnss_delay_s
     )
     truth = read_truth(recording, positions, remedies)
-    airborne_spans_s = _read_airborne(recording, remedies["landed"])
+    airborne_spans_s = _read_airborne_spans(recording, remedies["landed"])
     is_in_flight = common.ends_in_flight(airborne_spans_s, recording.duration_s)
     pressure_hpa = recording.read(messages.MESSAGE_LAYOUTS["pressure"])["pressure_hpa"]
     return Flight(
         # The log description is made last, because it counts the samples that the readers dropped
-        log=_describe_log(recording, parameters, parameter_faults, autopilot, is_in_flight),
+        log=_describe_log(recording, parameters, replaced_parameter_notes, autopilot, is_in_flight),
         imu=imu,
         attitude=attitude,
         positions=positions,
         ekf2=ekf2,
         truth=truth,
         airborne=airborne_spans_s,
-        barometer=barometer(pressure_altitude(pressure_hpa)),
-        missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
+        barometer=barometer(compute_pressure_altitude_m(pressure_hpa)),
+        missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *unavailable_positions),
         streams=recording.streams,
         clocks=senders.describe_clock_conversions(recording, clock_mappings),
         unused=tuple(
             UnusedData(name, count, reason)
-            for name, reason in messages.UNUSED_MESSAGES.items()
+            for name, reason in messages.REASON_BY_UNUSED_MESSAGE.items()
             if (count := int(np.count_nonzero(frames.message_ids == MESSAGE_IDS[name])))
         ),
     )
@@ -180,8 +184,8 @@ def _read_ekf2(
         variance = _compute_accuracy_variance(recording)
         if len(variance):
             notes.append(
-                "the EKF2 position variances are from ESTIMATOR_STATUS (on each horizontal axis "
-                "half of the squared horizontal accuracy); velocity variances are not sent"
+                "the EKF2 position variances are from ESTIMATOR_STATUS (variance of each "
+                "horizontal axis = pos_horiz_accuracy² / 2); velocity variances are not sent"
             )
     if len(variance):
         recording.record_stream("ekf2_variance", message_name)
@@ -230,7 +234,7 @@ def _compute_accuracy_variance(recording: Recording) -> pd.DataFrame:
     return variance.reindex(columns=VARIANCE_COLUMNS)
 
 
-def _read_airborne(recording: Recording, remedy: str) -> Spans | Unavailable:
+def _read_airborne_spans(recording: Recording, remedy: str) -> Spans | Unavailable:
     rows = recording.rows("EXTENDED_SYS_STATE")
     landed_states = recording.frames.table("EXTENDED_SYS_STATE", rows)["landed_state"]
     is_known = landed_states > 0
@@ -239,9 +243,9 @@ def _read_airborne(recording: Recording, remedy: str) -> Spans | Unavailable:
             "land detector", "the recording contains no usable EXTENDED_SYS_STATE", remedy
         )
     recording.record_stream("airborne", "EXTENDED_SYS_STATE", clock=RECEIPT_CLOCK_TEXT)
-    time_s = recording.receipt_boot_s(rows[is_known]) - recording.time_origin_s
-    landed = pd.Series(landed_states[is_known] == messages.ON_GROUND_STATE, index=time_s)
-    return common.find_flight_spans(landed, recording.duration_s)
+    time_s = recording.compute_receipt_boot_times_s(rows[is_known]) - recording.time_origin_s
+    is_landed = pd.Series(landed_states[is_known] == messages.ON_GROUND_STATE, index=time_s)
+    return common.find_flight_spans(is_landed, recording.duration_s)
 
 
 def _read_parameters(recording: Recording, autopilot: str) -> dict[str, float]:
@@ -264,7 +268,7 @@ def _read_parameters(recording: Recording, autopilot: str) -> dict[str, float]:
 def _describe_log(
     recording: Recording,
     parameters: Mapping[str, float],
-    parameter_faults: tuple[str, ...],
+    replaced_parameter_notes: tuple[str, ...],
     autopilot: str,
     is_in_flight: bool,
 ) -> LogInfo:
@@ -287,24 +291,28 @@ def _describe_log(
         vehicle_id = hardware_id if hardware_id.strip("0") else ""
     vehicle_types = frames.table("HEARTBEAT", recording.rows("HEARTBEAT"))["type"].tolist()
     vehicle_name = VEHICLE_TYPES.get(next(iter(vehicle_types), -1), "vehicle")
-    dropped_counts = sorted(recording.dropped.items())
+    dropped_message_counts = sorted(recording.dropped_count_by_message.items())
     return LogInfo(
         name=frames.name,
         sha256=frames.sha256,
         bytes=len(frames.content),
-        format="MAVLink stream" if frames.received_us is None else "MAVLink tlog",
+        format="MAVLink stream" if frames.receive_times_us is None else "MAVLink tlog",
         firmware=firmware,
         firmware_hash=firmware_hash,
         hardware=f"{vehicle_name} (MAVLink system {recording.address[0]})",
         boot_time_s=recording.time_origin_s,
         duration_s=recording.duration_s,
         parameters=parameters,
-        notes=(*recording.notes, *parameter_faults, *describe_dropped_samples(dropped_counts)),
+        notes=(
+            *recording.notes,
+            *replaced_parameter_notes,
+            *describe_dropped_samples(dropped_message_counts),
+        ),
         restarts=recording.restart_count,
         receive_time_reversals=recording.receive_time_reversal_count,
-        dropped=dict(dropped_counts),
+        dropped=dict(dropped_message_counts),
         autopilot=autopilot,
-        start_unix_s=_start_unix_s(recording),
+        start_unix_s=_estimate_start_unix_s(recording),
         senders=senders.describe_senders(recording),
         vehicle=vehicle_id,
         damage=(*damage_notes, *recording.damage_notes),
@@ -313,7 +321,7 @@ def _describe_log(
     )
 
 
-def _start_unix_s(recording: Recording) -> float | None:
+def _estimate_start_unix_s(recording: Recording) -> float | None:
     """Return the UNIX time (s) at flight time zero.
 
     The clock of the autopilot is preferred to the clock of the recording computer. Return None if
@@ -321,12 +329,13 @@ def _start_unix_s(recording: Recording) -> float | None:
     """
     if recording.time_origin_s >= MIN_UNIX_TIME_S:
         return recording.time_origin_s
-    boot_to_unix = map_boot_to_unix(recording)
-    if boot_to_unix is not None:
-        return float(boot_to_unix.at(recording.time_origin_s))
-    received_us = recording.frames.received_us
-    if received_us is None or not recording.receipt_to_boot_line.pair_count:
+    boot_to_unix_fit = map_boot_to_unix(recording)
+    if boot_to_unix_fit is not None:
+        return float(boot_to_unix_fit.at(recording.time_origin_s))
+    receive_times_us = recording.frames.receive_times_us
+    if receive_times_us is None or not recording.receipt_to_boot_fit.pair_count:
         return None
     return float(
-        received_us[0] * 1e-6 + recording.receipt_to_boot_line.inverse().at(recording.time_origin_s)
+        receive_times_us[0] * 1e-6
+        + recording.receipt_to_boot_fit.inverse().at(recording.time_origin_s)
     )

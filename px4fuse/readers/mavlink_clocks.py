@@ -16,8 +16,9 @@ from scipy.stats import theilslopes
 from px4fuse.core.arrays import Array
 from px4fuse.flight.model import ClockMap
 
-# Maximum median difference (s) between timestamps on the boot clock and their receive times
-MAX_BOOT_CLOCK_DISTANCE_S = 10.0
+# Timestamps whose median difference (s) from their receive times is larger are not of the boot
+# clock
+MAX_BOOT_TIME_DIFFERENCE_S = 10.0
 # If TIMESYNC reduces the difference between timestamps and receive times by at least this time (s),
 # the sender has its own clock, not the autopilot's boot clock
 MIN_TIMESYNC_IMPROVEMENT_S = 0.1
@@ -31,8 +32,7 @@ MIN_DRIFT_SPAN_S = 30.0
 # Maximum relative difference between the rates of two clocks. If the difference is larger, the
 # recording was replayed faster or slower than real time
 MAX_RELATIVE_RATE_DIFFERENCE = 0.01
-# Maximum valid ratio of the rates of two clocks, with a margin to that of a wrong unit of time: up
-# to 1e9 (s for ns)
+# Maximum valid ratio of the rates of two clocks: above 1e9, that of a wrong unit (s for ns)
 MAX_CLOCK_RATE_RATIO = 1e12
 MIN_TIMESYNC_PAIRS = 3
 # Minimum fraction of distinct timestamps of a running clock
@@ -43,26 +43,28 @@ MAX_REGULAR_SAMPLE_INTERVAL_S = 1.0
 
 @dataclass(frozen=True)
 class ClockLine:
-    """Linear relation between the readings x and y of two clocks: y = y0 + slope · (x - x0).
+    """Linear relation between readings x of a source clock and y of a target clock.
 
-    ``pair_count`` is the number of pairs x, y to which the line is fitted. ``jitter`` (unit of y)
+    y = y0 + slope · (x - x0).
+
+    ``pair_count`` is the number of pairs x, y to which the line is fitted. ``jitter_s`` (unit of y)
     is their robust standard deviation from the line, 1.4826 · median absolute deviation.
     """
 
     x0: float
     y0: float
     slope: float
-    jitter: float
+    jitter_s: float
     pair_count: int
 
     def at(self, x: Array | float) -> Array:
-        """Return the readings y of the second clock at readings x of the first."""
+        """Return the readings y of the target clock at readings x of the source clock."""
         return np.asarray(self.y0 + self.slope * (x - self.x0), dtype=np.float64)
 
     def inverse(self) -> ClockLine:
         """Return the inverse map, from y to x."""
         return ClockLine(
-            self.y0, self.x0, 1.0 / self.slope, self.jitter / self.slope, self.pair_count
+            self.y0, self.x0, 1.0 / self.slope, self.jitter_s / self.slope, self.pair_count
         )
 
 
@@ -83,7 +85,7 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
     slope = 1.0
     middle_rows = [rows[len(rows) // 2] for rows in interval_rows]
     if len(middle_rows) > 1 and x[middle_rows[-1]] > x[middle_rows[0]]:
-        initial_slope = _median_slope(x[middle_rows], y[middle_rows])
+        initial_slope = _compute_median_slope(x[middle_rows], y[middle_rows])
         if abs(initial_slope - 1.0) > MAX_RELATIVE_RATE_DIFFERENCE and _is_plausible_rate_ratio(
             initial_slope
         ):
@@ -95,9 +97,11 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
 
     residual_s, envelope_rows = find_envelope(slope)
     if span_s >= MIN_DRIFT_SPAN_S and len(envelope_rows) > 1:
-        # Two iterations, because a new slope may change which messages have the smallest delay
+        # Two iterations, because the slope determines which messages have the smallest delay
         for _ in range(2):
-            corrected_slope = slope + _median_slope(x[envelope_rows], residual_s[envelope_rows])
+            corrected_slope = slope + _compute_median_slope(
+                x[envelope_rows], residual_s[envelope_rows]
+            )
             slope = corrected_slope if _is_plausible_rate_ratio(corrected_slope) else 1.0
             residual_s, envelope_rows = find_envelope(slope)
     return ClockLine(
@@ -105,7 +109,7 @@ def fit_clock_line(x: Array, y: Array) -> ClockLine:
     )
 
 
-def _median_slope(x: Array, y: Array) -> float:
+def _compute_median_slope(x: Array, y: Array) -> float:
     """Return the Theil-Sen slope of y over x, which is not finite if all x are almost equal."""
     with np.errstate(over="ignore", invalid="ignore"):
         return float(theilslopes(y, x)[0])
@@ -115,9 +119,9 @@ def _is_plausible_rate_ratio(slope: float) -> bool:
     return 1.0 / MAX_CLOCK_RATE_RATIO < slope < MAX_CLOCK_RATE_RATIO
 
 
-def is_running_clock(timestamp_s: Array) -> bool:
+def is_running_clock(timestamps_s: Array) -> bool:
     """Return True if at least MIN_DISTINCT_TIME_FRACTION of the timestamps are distinct."""
-    return len(np.unique(timestamp_s)) >= max(MIN_DISTINCT_TIME_FRACTION * len(timestamp_s), 2)
+    return len(np.unique(timestamps_s)) >= max(MIN_DISTINCT_TIME_FRACTION * len(timestamps_s), 2)
 
 
 def robust_std(values: Array) -> float:
@@ -129,21 +133,21 @@ def robust_std(values: Array) -> float:
 class ClockMapping:
     """Conversion of a sender's timestamps to the autopilot's boot clock, with its description.
 
-    ``sender_to_boot`` is None if most timestamps are equal: receive times then replace them.
+    ``sender_to_boot_fit`` is None if most timestamps are equal: receive times then replace them.
     """
 
-    sender_to_boot: ClockLine | None
+    sender_to_boot_fit: ClockLine | None
     description: ClockMap
 
 
 def map_clock(
     name: str,
-    timestamp_s: Array,
-    received_s: Array,
-    receipt_to_boot_line: ClockLine,
+    timestamps_s: Array,
+    receive_times_s: Array,
+    receipt_to_boot_fit: ClockLine,
     sender_replies: tuple[Array, Array],
     autopilot_replies: tuple[Array, Array],
-    boot_to_unix: ClockLine | None,
+    boot_to_unix_fit: ClockLine | None,
     *,
     has_receive_times: bool,
 ) -> ClockMapping:
@@ -153,80 +157,80 @@ def map_clock(
 
     Parameters
     ----------
-    receipt_to_boot_line : ClockLine
+    receipt_to_boot_fit : ClockLine
         Conversion of receive times to the boot clock.
     sender_replies : tuple of ndarray
         Times (s) of the autopilot's TIMESYNC requests, and of the sender's replies.
     autopilot_replies : tuple of ndarray
         Times (s) of the sender's TIMESYNC requests, and of the autopilot's replies.
-    boot_to_unix : ClockLine or None
+    boot_to_unix_fit : ClockLine or None
         Conversion of the boot clock to UNIX time, from the autopilot's SYSTEM_TIME.
     has_receive_times : bool
         True if the recording contains receive times, False if only the order of the messages.
     """
     time_source = "receive time" if has_receive_times else "message order"
-    boot_at_receipt = receipt_to_boot_line.at(received_s)
-    if not is_running_clock(timestamp_s):
-        distinct_count = len(np.unique(timestamp_s))
+    boot_time_at_receipt_s = receipt_to_boot_fit.at(receive_times_s)
+    if not is_running_clock(timestamps_s):
+        distinct_count = len(np.unique(timestamps_s))
         note = (
-            f"the {len(timestamp_s)} timestamps have only {distinct_count} distinct values, so "
+            f"the {len(timestamps_s)} timestamps have only {distinct_count} distinct values, so "
             f"px4fuse uses the {time_source}"
         )
         # Jitter of the receive time, assuming that the sender sends at regular intervals
-        intervals_s = np.diff(received_s)
+        intervals_s = np.diff(receive_times_s)
         intervals_s = intervals_s[intervals_s < MAX_REGULAR_SAMPLE_INTERVAL_S]
         jitter_s = float(np.std(intervals_s) / np.sqrt(2.0)) if len(intervals_s) else 0.0
         description = ClockMap(
-            name, time_source, len(timestamp_s), 0.0, 0.0, jitter_s, note, distinct_count
+            name, time_source, len(timestamps_s), 0.0, 0.0, jitter_s, note, distinct_count
         )
         return ClockMapping(None, description)
 
-    def compute_receipt_difference_s(boot_s: Array) -> float:
-        return abs(float(np.median(boot_at_receipt - boot_s)))
+    def compute_receipt_difference_s(boot_time_s: Array) -> float:
+        return abs(float(np.median(boot_time_at_receipt_s - boot_time_s)))
 
-    timesync_line = _fit_timesync(sender_replies, autopilot_replies)
-    uncorrected_difference_s = compute_receipt_difference_s(timestamp_s)
-    # A separate clock that started only seconds after the autopilot's clock looks like the boot
-    # clock; only TIMESYNC distinguishes them
-    improvement_s = 0.0
-    if timesync_line is not None:
-        improvement_s = uncorrected_difference_s - compute_receipt_difference_s(
-            timesync_line.at(timestamp_s)
+    timesync_fit = _fit_timesync(sender_replies, autopilot_replies)
+    receipt_difference_s = compute_receipt_difference_s(timestamps_s)
+    # A clock that started seconds after the boot clock looks like the boot clock, unless TIMESYNC
+    # reduces the difference from the receive times
+    receipt_difference_reduction_s = 0.0
+    if timesync_fit is not None:
+        receipt_difference_reduction_s = receipt_difference_s - compute_receipt_difference_s(
+            timesync_fit.at(timestamps_s)
         )
     if (
-        uncorrected_difference_s <= MAX_BOOT_CLOCK_DISTANCE_S
-        and improvement_s < MIN_TIMESYNC_IMPROVEMENT_S
+        receipt_difference_s <= MAX_BOOT_TIME_DIFFERENCE_S
+        and receipt_difference_reduction_s < MIN_TIMESYNC_IMPROVEMENT_S
     ):
-        sender_to_boot = ClockLine(
-            float(timestamp_s[0]), float(timestamp_s[0]), 1.0, 0.0, len(timestamp_s)
+        sender_to_boot_fit = ClockLine(
+            float(timestamps_s[0]), float(timestamps_s[0]), 1.0, 0.0, len(timestamps_s)
         )
         note = "the timestamps of the sender are boot times of the autopilot"
         return ClockMapping(
-            sender_to_boot, ClockMap(name, "boot clock", len(timestamp_s), 0.0, 0.0, 0.0, note)
+            sender_to_boot_fit, ClockMap(name, "boot clock", len(timestamps_s), 0.0, 0.0, 0.0, note)
         )
-    clock_kind = "UNIX time" if float(np.median(timestamp_s)) > MIN_UNIX_TIME_S else "clock"
+    clock_kind = "UNIX time" if float(np.median(timestamps_s)) > MIN_UNIX_TIME_S else "clock"
     clock_name = f"{clock_kind} of {name}"
-    candidate_lines = [] if timesync_line is None else [("TIMESYNC", timesync_line, "")]
-    if clock_kind == "UNIX time" and boot_to_unix is not None:
-        unix_note = "sender and autopilot are assumed to have the same UNIX time"
-        candidate_lines.append(("SYSTEM_TIME", boot_to_unix.inverse(), unix_note))
-    for method, sender_to_boot, note in candidate_lines:
-        # Use a conversion only if it agrees with the receive times; otherwise it is of another
-        # clock
+    candidate_fits = [] if timesync_fit is None else [("TIMESYNC", timesync_fit, "")]
+    if clock_kind == "UNIX time" and boot_to_unix_fit is not None:
+        unix_note = "assumption: the UNIX clocks of sender and autopilot are synchronised"
+        candidate_fits.append(("SYSTEM_TIME", boot_to_unix_fit.inverse(), unix_note))
+    for method, sender_to_boot_fit, note in candidate_fits:
+        # If the converted timestamps disagree with the receive times, the conversion is of another
+        # clock than the timestamps
         if (
-            compute_receipt_difference_s(sender_to_boot.at(timestamp_s))
-            <= MAX_BOOT_CLOCK_DISTANCE_S
+            compute_receipt_difference_s(sender_to_boot_fit.at(timestamps_s))
+            <= MAX_BOOT_TIME_DIFFERENCE_S
         ):
-            return _make_clock_mapping(clock_name, method, sender_to_boot, timestamp_s, note)
-    sender_to_boot = fit_clock_line(timestamp_s, received_s)
-    slope = sender_to_boot.slope * receipt_to_boot_line.slope
-    y0 = float(receipt_to_boot_line.at(sender_to_boot.y0))
-    sender_to_boot = replace(sender_to_boot, y0=y0, slope=slope)
+            return _make_clock_mapping(clock_name, method, sender_to_boot_fit, timestamps_s, note)
+    sender_to_boot_fit = fit_clock_line(timestamps_s, receive_times_s)
+    slope = sender_to_boot_fit.slope * receipt_to_boot_fit.slope
+    y0 = float(receipt_to_boot_fit.at(sender_to_boot_fit.y0))
+    sender_to_boot_fit = replace(sender_to_boot_fit, y0=y0, slope=slope)
     note = (
-        "the recording has no usable TIMESYNC or SYSTEM_TIME, so the boot times of the samples are "
-        "too late by the unknown minimum link delay"
+        "the recording has no usable TIMESYNC or SYSTEM_TIME: all sample times are too late by the "
+        "minimum link delay, which is unknown"
     )
-    return _make_clock_mapping(clock_name, time_source, sender_to_boot, timestamp_s, note)
+    return _make_clock_mapping(clock_name, time_source, sender_to_boot_fit, timestamps_s, note)
 
 
 def _fit_timesync(
@@ -235,24 +239,24 @@ def _fit_timesync(
     """Fit the relation of sender clock to boot clock by TIMESYNC, averaged over both directions."""
     clock_lines = []
     if len(sender_replies[0]) >= MIN_TIMESYNC_PAIRS:
-        # These replies contain an earlier boot time (x) and a later sender time (y), so the line
-        # from boot to sender times is inverted
+        # The autopilot's request (boot time) is before the sender's reply, so the fit converts boot
+        # to sender time
         clock_lines.append(fit_clock_line(*sender_replies).inverse())
     if len(autopilot_replies[0]) >= MIN_TIMESYNC_PAIRS:
         clock_lines.append(fit_clock_line(*autopilot_replies))
     if not clock_lines:
         return None
     x0 = clock_lines[0].x0
-    line_values = [(float(line.at(x0)), line.slope, line.jitter) for line in clock_lines]
-    y0, slope, jitter = np.mean(line_values, axis=0).tolist()
-    return ClockLine(x0, y0, slope, jitter, sum(line.pair_count for line in clock_lines))
+    line_parameters = [(float(line.at(x0)), line.slope, line.jitter_s) for line in clock_lines]
+    y0, slope, jitter_s = np.mean(line_parameters, axis=0).tolist()
+    return ClockLine(x0, y0, slope, jitter_s, sum(line.pair_count for line in clock_lines))
 
 
 def _make_clock_mapping(
-    clock: str, method: str, line: ClockLine, timestamp_s: Array, note: str
+    clock: str, method: str, line: ClockLine, timestamps_s: Array, note: str
 ) -> ClockMapping:
-    middle_s = float(0.5 * (timestamp_s.min() + timestamp_s.max()))
+    middle_s = float(0.5 * (timestamps_s.min() + timestamps_s.max()))
     offset_s = float(line.at(middle_s)) - middle_s
     drift_ppm = (line.slope - 1.0) * 1e6
-    description = ClockMap(clock, method, line.pair_count, offset_s, drift_ppm, line.jitter, note)
+    description = ClockMap(clock, method, line.pair_count, offset_s, drift_ppm, line.jitter_s, note)
     return ClockMapping(line, description)

@@ -24,7 +24,7 @@ from px4fuse.errors import LogError
 Int64Array = NDArray[np.int64]
 ByteArray = NDArray[np.uint8]
 # Address of a sender: MAVLink system id and component id
-Address = tuple[int, int]
+MavlinkAddress = tuple[int, int]
 
 MAGIC_BYTE_V1, MAGIC_BYTE_V2 = 0xFE, 0xFD
 HEADER_BYTES_V1, HEADER_BYTES_V2 = 6, 10
@@ -43,7 +43,7 @@ DECODE_BATCH_SIZE = 1 << 12
 MIN_VALID_FRAME_FRACTION = 0.01
 # A receive time is damaged if it differs by more than this time (µs) from the median receive time;
 # pymavlink has the same limit
-MAX_RECEIVE_TIME_DISTANCE_US = 3 * 24 * 3600 * 1_000_000
+MAX_RECEIVE_TIME_DIFFERENCE_US = 3 * 24 * 3600 * 1_000_000
 MESSAGE_IDS: Mapping[str, int] = {
     message.msgname: number for number, message in dialect.mavlink_map.items()
 }
@@ -71,13 +71,13 @@ class MavlinkFrames:
     # Offset of the first byte of each frame in the content
     start_offsets: Int64Array
     message_ids: NDArray[np.int32]
-    system: ByteArray
-    component: ByteArray
-    sequence: ByteArray
-    payload_start: Int64Array
-    payload_length: ByteArray
+    system_ids: ByteArray
+    component_ids: ByteArray
+    sequence_numbers: ByteArray
+    payload_offsets: Int64Array
+    payload_lengths: ByteArray
     # Receive times (UNIX time); damaged values are interpolated. None for a raw stream
-    received_us: Int64Array | None
+    receive_times_us: Int64Array | None
     # Number of complete frames with messages that are not in the dialect
     unknown_frame_count: int
     # Number of bytes that are not part of a frame
@@ -94,10 +94,14 @@ class MavlinkFrames:
         """Return the indices of the frames that contain a message, by its MAVLink name."""
         return np.flatnonzero(self.message_ids == MESSAGE_IDS[message])
 
-    def is_sent_by(self, address: Address, rows: IntArray | slice = slice(None)) -> BoolArray:
+    def is_sent_by(
+        self, address: MavlinkAddress, rows: IntArray | slice = slice(None)
+    ) -> BoolArray:
         """Return True for each frame in ``rows`` (default: all) that ``address`` sent."""
         system, component = address
-        return np.asarray((self.system[rows] == system) & (self.component[rows] == component))
+        return np.asarray(
+            (self.system_ids[rows] == system) & (self.component_ids[rows] == component)
+        )
 
     def table(self, message: str, rows: IntArray) -> NDArray[Any]:
         """Decode frames of one message to a structured array with its fields, in MAVLink units.
@@ -107,8 +111,8 @@ class MavlinkFrames:
         layout = wire_layout(MESSAGE_IDS[message])
         payload = np.zeros((len(rows), layout.itemsize), dtype=np.uint8)
         content_bytes = np.frombuffer(self.content, dtype=np.uint8)
-        payload_starts = self.payload_start[rows]
-        payload_lengths = self.payload_length[rows]
+        payload_starts = self.payload_offsets[rows]
+        payload_lengths = self.payload_lengths[rows]
         for length in np.unique(payload_lengths).tolist():
             byte_count = min(length, layout.itemsize)
             if byte_count:
@@ -174,7 +178,7 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
     unknown_frame_count, bad_byte_count, ends_in_frame = _count_other_bytes(
         content, start_offsets - receive_time_bytes, end_offsets, receive_time_bytes
     )
-    received_us, damaged_receive_time_count = (
+    receive_times_us, damaged_receive_time_count = (
         _read_receive_times(content_bytes, start_offsets, end_offsets)
         if receive_time_bytes
         else (None, 0)
@@ -185,12 +189,12 @@ def read_frames(name: str, content: bytes) -> MavlinkFrames:
         sha256=hashlib.sha256(content).hexdigest(),
         start_offsets=start_offsets,
         message_ids=message_ids.astype(np.int32),
-        system=content_bytes[sequence_offsets + 1],
-        component=content_bytes[sequence_offsets + 2],
-        sequence=content_bytes[sequence_offsets],
-        payload_start=start_offsets + np.where(is_version_2, HEADER_BYTES_V2, HEADER_BYTES_V1),
-        payload_length=content_bytes[start_offsets + 1],
-        received_us=received_us,
+        system_ids=content_bytes[sequence_offsets + 1],
+        component_ids=content_bytes[sequence_offsets + 2],
+        sequence_numbers=content_bytes[sequence_offsets],
+        payload_offsets=start_offsets + np.where(is_version_2, HEADER_BYTES_V2, HEADER_BYTES_V1),
+        payload_lengths=content_bytes[start_offsets + 1],
+        receive_times_us=receive_times_us,
         unknown_frame_count=unknown_frame_count,
         bad_byte_count=bad_byte_count,
         ends_in_frame=ends_in_frame,
@@ -285,10 +289,10 @@ def _find_possible_frames(
 def _has_receive_times(start_offsets: Int64Array, end_offsets: Int64Array) -> bool:
     """Return True if a receive time of eight bytes precedes most frames, as in a ``.tlog``."""
     gap_bytes = start_offsets[1:] - end_offsets[:-1]
-    with_time_count = int(np.count_nonzero(gap_bytes == RECEIVE_TIME_BYTES))
-    without_time_count = int(np.count_nonzero(gap_bytes == 0))
-    if with_time_count + without_time_count:
-        return with_time_count > without_time_count
+    timed_frame_count = int(np.count_nonzero(gap_bytes == RECEIVE_TIME_BYTES))
+    untimed_frame_count = int(np.count_nonzero(gap_bytes == 0))
+    if timed_frame_count + untimed_frame_count:
+        return timed_frame_count > untimed_frame_count
     return bool(start_offsets[0] == RECEIVE_TIME_BYTES)
 
 
@@ -309,7 +313,7 @@ def _count_other_bytes(
         gap_starts < gap_ends
     ].tolist():
         offset = gap_start
-        for frame_bytes in _unknown_frames(content, gap_start, gap_end, receive_time_bytes):
+        for frame_bytes in _measure_unknown_frames(content, gap_start, gap_end, receive_time_bytes):
             unknown_frame_count += 1
             offset += frame_bytes
         bad_byte_count += gap_end - offset
@@ -322,7 +326,7 @@ def _count_other_bytes(
     return unknown_frame_count, bad_byte_count, ends_in_frame
 
 
-def _unknown_frames(
+def _measure_unknown_frames(
     content: bytes, offset: int, gap_end: int, receive_time_bytes: int
 ) -> Iterator[int]:
     """Yield the size (bytes) of each frame with an unknown message in a gap between valid frames.
@@ -358,20 +362,22 @@ def _read_receive_times(
     is_usable[1:] &= start_offsets[1:] - end_offsets[:-1] >= RECEIVE_TIME_BYTES
     eight_byte_windows = np.lib.stride_tricks.sliding_window_view(content_bytes, RECEIVE_TIME_BYTES)
     # The file may begin without the receive time of the first frame
-    raw_us = np.ascontiguousarray(
+    unchecked_receive_times_us = np.ascontiguousarray(
         eight_byte_windows[np.maximum(start_offsets - RECEIVE_TIME_BYTES, 0)]
     ).view(">u8")[:, 0]
     # damaged values above the range of int64 become negative
-    received_us = raw_us.astype(np.int64)
-    is_usable &= (received_us >= 0) & (received_us < 1 << 62)
-    median_us = int(np.median(received_us[is_usable])) if np.any(is_usable) else 0
-    is_usable &= np.abs(received_us - median_us) <= MAX_RECEIVE_TIME_DISTANCE_US
-    received_us = np.where(is_usable, received_us, 0)
+    receive_times_us = unchecked_receive_times_us.astype(np.int64)
+    is_usable &= (receive_times_us >= 0) & (receive_times_us < 1 << 62)
+    median_receive_time_us = int(np.median(receive_times_us[is_usable])) if np.any(is_usable) else 0
+    is_usable &= np.abs(receive_times_us - median_receive_time_us) <= MAX_RECEIVE_TIME_DIFFERENCE_US
+    receive_times_us = np.where(is_usable, receive_times_us, 0)
     if np.any(is_usable):
         rows = np.flatnonzero(is_usable)
         # Times are relative to the first receive time, so that float64 resolves microseconds
-        since_first_receipt_us = np.interp(
-            np.arange(len(start_offsets)), rows, received_us[rows] - received_us[rows[0]]
+        time_since_first_receipt_us = np.interp(
+            np.arange(len(start_offsets)), rows, receive_times_us[rows] - receive_times_us[rows[0]]
         )
-        received_us = received_us[rows[0]] + np.rint(since_first_receipt_us).astype(np.int64)
-    return received_us, int(np.count_nonzero(~is_usable))
+        receive_times_us = receive_times_us[rows[0]] + np.rint(time_since_first_receipt_us).astype(
+            np.int64
+        )
+    return receive_times_us, int(np.count_nonzero(~is_usable))

@@ -40,10 +40,10 @@ AUTOPILOT_MESSAGES = (
 
 
 @dataclass(frozen=True)
-class PositionInput:
+class PositionMessageType:
     """Message type that carries an external position to the autopilot: fields, frame, clock."""
 
-    # Key in MESSAGE_LAYOUTS, which defines the fields of the message
+    # Key of the message's fields in MESSAGE_LAYOUTS
     row: str
     description: str
     # Name of the position source for the option --position-source
@@ -86,14 +86,14 @@ MESSAGE_LAYOUTS = expand_layouts(_MESSAGE_TABLES["layouts"])
 assert not any(layout.optional for layout in MESSAGE_LAYOUTS.values()), (
     "mavlink_messages.toml has optional fields, which the MAVLink reader ignores"
 )
-_INPUT_BY_TRACK_NAME = msgspec.convert(_MESSAGE_TABLES["positions"], dict[str, PositionInput])
+_TYPE_BY_TRACK_NAME = msgspec.convert(_MESSAGE_TABLES["positions"], dict[str, PositionMessageType])
 FRAMES_OF_REFERENCE = msgspec.convert(
     _MESSAGE_TABLES["frames"], dict[int, FrameOfReference], strict=False
 )
-AUTOPILOTS = msgspec.convert(_MESSAGE_TABLES["autopilots"], dict[int, str], strict=False)
-UNUSED_MESSAGES: Mapping[str, str] = _MESSAGE_TABLES["unused"]
-POSITION_INPUTS = tuple(
-    replace(message, track_name=name) for name, message in _INPUT_BY_TRACK_NAME.items()
+AUTOPILOT_NAME_BY_ID = msgspec.convert(_MESSAGE_TABLES["autopilots"], dict[int, str], strict=False)
+REASON_BY_UNUSED_MESSAGE: Mapping[str, str] = _MESSAGE_TABLES["unused"]
+POSITION_MESSAGE_TYPES = tuple(
+    replace(message, track_name=name) for name, message in _TYPE_BY_TRACK_NAME.items()
 )
 _SCALED_IMU_LAYOUTS = (
     replace(MESSAGE_LAYOUTS["scaled_imu"], topic=f"SCALED_IMU{number}") for number in ("", "2", "3")

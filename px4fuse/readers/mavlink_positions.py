@@ -22,21 +22,21 @@ from px4fuse.readers import px4_positions
 from px4fuse.readers.common import join_nearest, read_attitude, read_orientation
 from px4fuse.readers.field_maps import Layout
 from px4fuse.readers.mavlink_clocks import ClockMapping
-from px4fuse.readers.mavlink_frames import Address
+from px4fuse.readers.mavlink_frames import MavlinkAddress
 from px4fuse.readers.mavlink_recording import BOOT_CLOCK_TEXT, RECEIPT_CLOCK_TEXT, Recording
 from px4fuse.readers.mavlink_senders import find_senders
 from px4fuse.readers.px4_positions import GeodeticPosition, project_to_ned, unproject
 
 # Maximum median difference (s) between GNSS timestamps in boot time and their receive times. If the
 # difference is larger, the timestamps are not boot time
-MAX_BOOT_CLOCK_DISTANCE_S = 5.0
+MAX_BOOT_TIME_DIFFERENCE_S = 5.0
 # Maximum time difference (s) of the global and local position from which the origin of the local
 # frame is computed; at 1 m/s, the error of the origin is 5 cm
 MAX_ORIGIN_TIME_DIFFERENCE_S = 0.05
 
 
 def read_positions(
-    recording: Recording, clocks: dict[Address, ClockMapping], remedy: str, delay_s: float
+    recording: Recording, clocks: dict[MavlinkAddress, ClockMapping], remedy: str, delay_s: float
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Read the external positions sent to the autopilot, best first, and the GNSS positions.
 
@@ -55,12 +55,12 @@ def read_positions(
     missing : tuple of Unavailable
     """
     tracks_or_unavailable: list[PositionTrack | Unavailable] = []
-    for message in dict.fromkeys(source.message for source in messages.POSITION_INPUTS):
+    for message in dict.fromkeys(source.message for source in messages.POSITION_MESSAGE_TYPES):
         senders = find_senders(recording, message)
         tracks = [
             track
             for sender in senders
-            for source in messages.POSITION_INPUTS
+            for source in messages.POSITION_MESSAGE_TYPES
             if source.message == message
             if (track := _read_track(recording, source, sender, clocks[sender], remedy, senders))
         ]
@@ -76,11 +76,11 @@ def read_positions(
 
 def _read_track(
     recording: Recording,
-    source: messages.PositionInput,
-    sender: Address,
+    source: messages.PositionMessageType,
+    sender: MavlinkAddress,
     clock: ClockMapping,
     remedy: str,
-    senders: list[Address],
+    senders: list[MavlinkAddress],
 ) -> PositionTrack | Unavailable | None:
     """Read the positions in one message type from one sender; None if it sent no such message."""
     rows = recording.rows(source.message, sender)
@@ -93,10 +93,12 @@ def _read_track(
         return None
     track_name = source.track_name + (f"_{sender[0]}_{sender[1]}" if len(senders) > 1 else "")
     timestamp_s = table[source.timestamp_field] * 1e-6
-    sample_boot_s = recording.receipt_boot_s(rows)
-    if clock.sender_to_boot is not None:
-        sample_boot_s = np.where(timestamp_s > 0.0, clock.sender_to_boot.at(timestamp_s), np.nan)
-    samples = recording.read(source.layout, rows, sample_boot_s, track_name)
+    sample_boot_time_s = recording.compute_receipt_boot_times_s(rows)
+    if clock.sender_to_boot_fit is not None:
+        sample_boot_time_s = np.where(
+            timestamp_s > 0.0, clock.sender_to_boot_fit.at(timestamp_s), np.nan
+        )
+    samples = recording.read(source.layout, rows, sample_boot_time_s, track_name)
     frame = source.frame
     if "frame_id" in samples and len(samples):
         # A track has one coordinate frame: the frame of the last sample, as in PX4
@@ -136,13 +138,13 @@ def _read_gnss(
     message_count = len(rows)
     rows = rows[np.diff(recording.frames.table(layout.topic, rows)["time_usec"], prepend=0) > 0]
     fix_boot_time_s = recording.frames.table(layout.topic, rows)["time_usec"] * 1e-6
-    receipt_boot_s = recording.receipt_boot_s(rows)
+    receipt_boot_times_s = recording.compute_receipt_boot_times_s(rows)
     if (
         len(rows)
-        and np.median(np.abs(receipt_boot_s - fix_boot_time_s)) > MAX_BOOT_CLOCK_DISTANCE_S
+        and np.median(np.abs(receipt_boot_times_s - fix_boot_time_s)) > MAX_BOOT_TIME_DIFFERENCE_S
     ):
-        # Timestamps in UNIX time, or without a boot clock, are replaced by receive times
-        fix_boot_time_s = receipt_boot_s
+        # The timestamps are not boot times, for example UNIX times: use the receive times
+        fix_boot_time_s = receipt_boot_times_s
     fixes = recording.read(layout, rows, fix_boot_time_s - delay_s)
     fixes = fixes[fixes["fix_type"] >= px4_positions.FIX_TYPE_3D]
     if len(fixes) < px4_positions.MIN_TRACK_SAMPLES:
@@ -170,7 +172,7 @@ def _read_gnss(
     )
 
 
-def pressure_altitude(pressure_hpa: pd.Series[float]) -> pd.Series[float]:
+def compute_pressure_altitude_m(pressure_hpa: pd.Series[float]) -> pd.Series[float]:
     """Convert pressure (hPa) to altitude (m) in the standard troposphere (ISO 2533:1975)."""
     exponent = constants.R * 0.0065 / (constants.g * 0.0289644)
     return 288.15 / 0.0065 * (1.0 - (pressure_hpa / 1013.25) ** exponent)
@@ -182,9 +184,9 @@ def find_local_origin(recording: Recording) -> GeodeticPosition | None:
     The origin is read from GPS_GLOBAL_ORIGIN, or computed from global and local positions. Return
     None if the recording contains none of them.
     """
-    sent_origin = recording.read(messages.MESSAGE_LAYOUTS["origin"]).dropna()
-    if len(sent_origin):
-        return tuple(sent_origin.iloc[-1].tolist())
+    sent_origins = recording.read(messages.MESSAGE_LAYOUTS["origin"]).dropna()
+    if len(sent_origins):
+        return tuple(sent_origins.iloc[-1].tolist())
     joined_positions = join_nearest(
         recording.read(messages.MESSAGE_LAYOUTS["global_state"]),
         recording.read(messages.STATE_LAYOUTS[-1])[Columns.POSITION],
@@ -211,14 +213,14 @@ def read_truth(
     """Read ground truth from the simulation, or from motion capture if EKF2 uses another source.
 
     Simulation ground truth has receive times, because ``HIL_STATE_QUATERNION.time_usec`` is 0 in
-    PX4. If the position source is GNSS, NED positions refer to the autopilot's origin, otherwise to
-    the first sample, the start of the simulated vehicle.
+    PX4. The origin of NED is the autopilot's origin if the position source is GNSS, else the first
+    sample of ground truth.
     """
     for layout in messages.TRUTH_LAYOUTS:
         rows = recording.rows(layout.topic)
         if len(rows) < px4_positions.MIN_TRACK_SAMPLES:
             continue
-        samples = recording.read(layout, rows, recording.receipt_boot_s(rows))
+        samples = recording.read(layout, rows, recording.compute_receipt_boot_times_s(rows))
         samples = samples.dropna(subset=Columns.GEODETIC[:2])
         if not samples["latitude_deg"].any():
             continue
@@ -231,7 +233,7 @@ def read_truth(
         origin = find_local_origin(recording) if positions and positions[0].origin.is_gnss else None
         state = project_to_ned(samples, origin).join(samples[Columns.VELOCITY])
         return Truth(layout.topic, state[Columns.STATE], read_attitude(samples))
-    mocap_truth = px4_positions.motion_capture_truth(positions)
+    mocap_truth = px4_positions.find_motion_capture_truth(positions)
     for track in positions:
         if mocap_truth and track.name == mocap_truth.name:
             recording.record_stream("truth", *track.topics, clock=track.clock)

@@ -20,7 +20,7 @@ from px4fuse.readers.mavlink_clocks import (
 )
 from px4fuse.readers.mavlink_frames import (
     MAX_FRAME_BYTES,
-    Address,
+    MavlinkAddress,
     MavlinkFrames,
     message_name,
     wire_layout,
@@ -40,10 +40,10 @@ RESTART_CHECK_MESSAGES = 20
 # of the largest group
 MIN_TIMESTAMP_GROUP_FRACTION = 0.01
 # Maximum distance (s) of a valid timestamp from the analysed time span, or from the next timestamp
-MAX_TIME_OUTSIDE_S = 60.0
+MAX_TIME_OUTSIDE_FLIGHT_S = 60.0
 # A file is damaged if a larger fraction of its bytes is outside of MAVLink frames
 MAX_STRAY_BYTE_FRACTION = 0.002
-# The clock does not run if at least this number of timestamps have mostly equal values
+# Minimum number of timestamps for the conclusion from mostly equal values that the clock stands
 MIN_CONSTANT_TIMESTAMPS = 10
 
 
@@ -53,14 +53,14 @@ class Recording:
 
     frames: MavlinkFrames
     # Address of the autopilot of this flight
-    address: Address
+    address: MavlinkAddress
     # Analysed frames: the longest part of the recording between two restarts of the autopilot
     session_frames: slice
     # Receive time of each frame (s since the first frame). If the file contains no receive times,
     # the boot time of the last autopilot message before the frame replaces them
-    received_s: Array
+    receive_times_s: Array
     # Conversion of receive times to the boot clock
-    receipt_to_boot_line: ClockLine
+    receipt_to_boot_fit: ClockLine
     # Boot time (s) at flight time zero: the start of the session
     time_origin_s: float
     duration_s: float
@@ -70,7 +70,7 @@ class Recording:
     restart_count: int | None = None
     receive_time_reversal_count: int | None = None
     # Number of samples with an invalid timestamp, by message
-    dropped: dict[str, int] = field(default_factory=dict)
+    dropped_count_by_message: dict[str, int] = field(default_factory=dict)
     # Messages and clock of each kind of data in the flight
     streams: dict[str, DataSource] = field(default_factory=dict)
 
@@ -81,7 +81,7 @@ class Recording:
             rows[(rows >= self.session_frames.start) & (rows < self.session_frames.stop)]
         )
 
-    def rows(self, message: str, address: Address | None = None) -> IntArray:
+    def rows(self, message: str, address: MavlinkAddress | None = None) -> IntArray:
         """Return the indices of the frames of one message type that ``address`` sent.
 
         The default of ``address`` is the autopilot.
@@ -93,7 +93,7 @@ class Recording:
         self,
         layout: Layout,
         rows: IntArray | None = None,
-        boot_s: Array | None = None,
+        boot_times_s: Array | None = None,
         name: str = "",
     ) -> pd.DataFrame:
         """Read one message as a DataFrame with strictly increasing flight times (s).
@@ -106,65 +106,74 @@ class Recording:
             Message and fields to read.
         rows : ndarray, shape (n,), optional
             Frame indices from :meth:`rows`; by default all from the autopilot.
-        boot_s : ndarray, shape (n,), optional
+        boot_times_s : ndarray, shape (n,), optional
             Times since boot, by default the timestamps of the messages. Samples with NaN are
             dropped.
         name : str, optional
-            Key in :attr:`dropped`; by default the message name.
+            Key in :attr:`dropped_count_by_message`; by default the message name.
         """
         rows = self.rows(layout.topic) if rows is None else rows
         table = self.frames.table(layout.topic, rows)
-        boot_s = self.boot_s(table, rows) if boot_s is None else boot_s
-        selected_rows = self._select_rows(name or layout.topic, boot_s)
+        boot_times_s = (
+            self.compute_boot_times_s(table, rows) if boot_times_s is None else boot_times_s
+        )
+        selected_rows = self._select_rows(name or layout.topic, boot_times_s)
         if len(selected_rows) < len(table):
             table = table[selected_rows]
         # One hour of IMU data has hundreds of megabytes, so fields are copied only once
         values = np.empty((len(selected_rows), len(layout.columns)))
         for column_index, (column, field_name) in enumerate(layout.columns.items()):
-            array_name, _, element_text = field_name.removesuffix("]").partition("[")
+            array_name, _, element_index_text = field_name.removesuffix("]").partition("[")
             values[:, column_index] = (
-                table[array_name][:, int(element_text)] if element_text else table[array_name]
+                table[array_name][:, int(element_index_text)]
+                if element_index_text
+                else table[array_name]
             )
             values[:, column_index] *= layout.scale.get(column, 1.0)
         del table
         values[~(np.abs(values) < MAX_FIELD_VALUE)] = np.nan
-        index = time_index(boot_s[selected_rows] - self.time_origin_s)
+        index = time_index(boot_times_s[selected_rows] - self.time_origin_s)
         samples = pd.DataFrame(values, index, list(layout.columns), copy=False)
         if "roll" in samples:
             attitude = Rotation.from_euler("ZYX", samples[["yaw", "pitch", "roll"]].to_numpy())
             samples[Columns.QUATERNION] = attitude.as_quat(scalar_first=True)
         return _to_ned(samples) if "frame_id" in samples else samples
 
-    def _select_rows(self, name: str, boot_s: Array) -> IntArray:
+    def _select_rows(self, name: str, boot_times_s: Array) -> IntArray:
         """Return the indices of valid and increasing boot times; count all others as dropped."""
-        time_s = boot_s - self.time_origin_s
-        is_inside = (time_s >= -MAX_TIME_OUTSIDE_S) & (
-            time_s <= self.duration_s + MAX_TIME_OUTSIDE_S
+        time_s = boot_times_s - self.time_origin_s
+        is_inside = (time_s >= -MAX_TIME_OUTSIDE_FLIGHT_S) & (
+            time_s <= self.duration_s + MAX_TIME_OUTSIDE_FLIGHT_S
         )
-        rows = np.flatnonzero(is_inside & (boot_s > 0.0))
-        time_us = np.rint(boot_s[rows] * 1e6).astype(np.int64)
+        rows = np.flatnonzero(is_inside & (boot_times_s > 0.0))
+        time_us = np.rint(boot_times_s[rows] * 1e6).astype(np.int64)
         # A message that is received twice, over two links, is one sample
         first_copy_rows = np.sort(np.unique(time_us, return_index=True)[1])
-        increasing_rows = longest_increasing_run(time_us[first_copy_rows])
-        if dropped_count := len(boot_s) - len(rows) + len(first_copy_rows) - len(increasing_rows):
-            self.dropped[name] = dropped_count
-        return np.asarray(rows[first_copy_rows[increasing_rows]])
+        increasing_time_rows = longest_increasing_run(time_us[first_copy_rows])
+        if (
+            dropped_count := len(boot_times_s)
+            - len(rows)
+            + len(first_copy_rows)
+            - len(increasing_time_rows)
+        ):
+            self.dropped_count_by_message[name] = dropped_count
+        return np.asarray(rows[first_copy_rows[increasing_time_rows]])
 
-    def receipt_boot_s(self, rows: IntArray) -> Array:
-        """Return the receive time since boot (s) of frames, without the minimum link delay."""
-        return self.receipt_to_boot_line.at(self.received_s[rows])
+    def compute_receipt_boot_times_s(self, rows: IntArray) -> Array:
+        """Return receive times on the boot clock (s), minus the unknown minimum link delay."""
+        return self.receipt_to_boot_fit.at(self.receive_times_s[rows])
 
-    def boot_s(self, table: NDArray[Any], rows: IntArray) -> Array:
+    def compute_boot_times_s(self, table: NDArray[Any], rows: IntArray) -> Array:
         """Return the time since boot (s) of each message, or its receive time if it has none."""
-        if not self.receipt_to_boot_line.pair_count:  # no message contains the boot clock
-            return self.receipt_boot_s(rows)
+        if not self.receipt_to_boot_fit.pair_count:  # no message contains the boot clock
+            return self.compute_receipt_boot_times_s(rows)
         if "time_boot_ms" in (table.dtype.names or ()):
             return np.asarray(table["time_boot_ms"] * 1e-3)
         timestamp_s: Array = table["time_usec"] * 1e-6
         is_boot_time = (timestamp_s > 0.0) & (
             (timestamp_s < MIN_UNIX_TIME_S) == (self.time_origin_s < MIN_UNIX_TIME_S)
         )
-        return np.where(is_boot_time, timestamp_s, self.receipt_boot_s(rows))
+        return np.where(is_boot_time, timestamp_s, self.compute_receipt_boot_times_s(rows))
 
     def record_stream(self, data_kind: str, *messages: str, clock: str = BOOT_CLOCK_TEXT) -> None:
         """Store for the report which messages and clock supply data such as "imu"."""
@@ -185,20 +194,20 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     ned_samples[Columns.STATE + Columns.POSITION_VARIANCE] = np.nan
     ned_samples[Columns.VELOCITY_VARIANCE + orientation] = np.nan
     for frame_number, frame in FRAMES_OF_REFERENCE.items():
-        is_body = frame.body
-        in_frame = (samples["frame_id"] == frame_number) & (not is_body)
-        in_child_frame = (samples["child_frame_id"] == frame_number) & (
-            has_quaternion | (not is_body)
+        is_body_frame = frame.body
+        is_in_frame = (samples["frame_id"] == frame_number) & (not is_body_frame)
+        is_in_child_frame = (samples["child_frame_id"] == frame_number) & (
+            has_quaternion | (not is_body_frame)
         )
         if min(frame.signs) > 0.0:
-            ned_samples.loc[in_frame, orientation] = samples.loc[in_frame, orientation]
+            ned_samples.loc[is_in_frame, orientation] = samples.loc[is_in_frame, orientation]
         for rows, vector_columns, variance_columns in (
-            (in_frame, Columns.POSITION, Columns.POSITION_VARIANCE),
-            (in_child_frame, Columns.VELOCITY, Columns.VELOCITY_VARIANCE),
+            (is_in_frame, Columns.POSITION, Columns.POSITION_VARIANCE),
+            (is_in_child_frame, Columns.VELOCITY, Columns.VELOCITY_VARIANCE),
         ):
             vectors = samples.loc[rows, vector_columns].to_numpy()[:, frame.order] * frame.signs
             variances = samples.loc[rows, variance_columns].to_numpy()[:, frame.order]
-            if is_body and rows.any():
+            if is_body_frame and rows.any():
                 rotation = Rotation.from_quat(quaternions[rows], scalar_first=True).as_matrix()
                 vectors = rotate(rotation, vectors)
                 # The variances in NED are the diagonal of R diag(σ²) Rᵀ
@@ -208,7 +217,7 @@ def _to_ned(samples: pd.DataFrame) -> pd.DataFrame:
     return ned_samples
 
 
-def _read_boot_times(frames: MavlinkFrames, address: Address) -> tuple[IntArray, Array]:
+def _read_boot_times(frames: MavlinkFrames, address: MavlinkAddress) -> tuple[IntArray, Array]:
     """Return the indices of the autopilot's frames with a time since boot, and these times (s)."""
     is_from_autopilot = frames.is_sent_by(address)
     all_rows = [np.zeros(0, dtype=np.intp)]
@@ -236,53 +245,59 @@ def _read_boot_times(frames: MavlinkFrames, address: Address) -> tuple[IntArray,
     return rows[usable_indices], times_s[usable_indices]
 
 
-def read_recording(frames: MavlinkFrames, address: Address) -> Recording:
-    """Return the longest part of a recording without restart, with receive times in boot time."""
+def read_recording(frames: MavlinkFrames, address: MavlinkAddress) -> Recording:
+    """Return the longest part of a recording between restarts of the autopilot.
+
+    Receive times are converted to the boot clock.
+    """
     notes: list[str] = []
-    rows, boot_s = _read_boot_times(frames, address)
+    rows, boot_times_s = _read_boot_times(frames, address)
     session_frames = slice(0, len(frames))
-    restart_rows = np.flatnonzero(np.diff(boot_s) < -MIN_RESTART_STEP_S) + 1
+    restart_rows = np.flatnonzero(np.diff(boot_times_s) < -MIN_RESTART_STEP_S) + 1
     # A single late or early packet is not a restart: the packets before and after have to agree
-    boot_before_restart_s = boot_s[np.maximum(restart_rows - 1 - RESTART_CHECK_MESSAGES, 0)]
-    boot_after_restart_s = boot_s[
-        np.minimum(restart_rows + RESTART_CHECK_MESSAGES, len(boot_s) - 1)
+    boot_time_before_restart_s = boot_times_s[
+        np.maximum(restart_rows - 1 - RESTART_CHECK_MESSAGES, 0)
+    ]
+    boot_time_after_restart_s = boot_times_s[
+        np.minimum(restart_rows + RESTART_CHECK_MESSAGES, len(boot_times_s) - 1)
     ]
     restart_rows = restart_rows[
-        boot_after_restart_s
-        < np.minimum(boot_before_restart_s, boot_s[restart_rows - 1]) - MIN_RESTART_STEP_S
+        boot_time_after_restart_s
+        < np.minimum(boot_time_before_restart_s, boot_times_s[restart_rows - 1])
+        - MIN_RESTART_STEP_S
     ]
     if len(restart_rows):
         row_limits = [0, *restart_rows.tolist(), len(rows)]
         session_index = int(np.argmax(np.diff(row_limits)))
         session_rows = slice(*row_limits[session_index : session_index + 2])
         session_fraction = len(rows[session_rows]) / len(rows)
-        rows, boot_s = rows[session_rows], boot_s[session_rows]
+        rows, boot_times_s = rows[session_rows], boot_times_s[session_rows]
         session_frames = slice(
             int(rows[0]) if session_index else 0,
             int(rows[-1]) + 1 if session_index < len(restart_rows) else len(frames),
         )
         notes.append(
             f"number of restarts of the boot clock: {len(restart_rows)}. Only the longest part "
-            f"between two restarts is analysed: {boot_s[0]:.1f} s to {boot_s[-1]:.1f} s after boot "
-            f"({session_fraction:.0%} of the data)"
+            f"between two restarts is analysed: {boot_times_s[0]:.1f} s to {boot_times_s[-1]:.1f} "
+            f"s after boot ({session_fraction:.0%} of the data)"
         )
-    increasing_rows = _remove_stray_timestamps(
-        boot_s, longest_increasing_run(np.rint(boot_s * 1e6).astype(np.int64))
+    increasing_time_rows = _remove_stray_timestamps(
+        boot_times_s, longest_increasing_run(np.rint(boot_times_s * 1e6).astype(np.int64))
     )
-    rows, boot_s = rows[increasing_rows], boot_s[increasing_rows]
-    receipt_to_boot_line = ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
-    received_s = np.zeros(len(frames))
-    if frames.received_us is not None:
-        received_s = (frames.received_us - frames.received_us[0]) * 1e-6
+    rows, boot_times_s = rows[increasing_time_rows], boot_times_s[increasing_time_rows]
+    receipt_to_boot_fit = ClockLine(0.0, 0.0, 1.0, 0.0, len(rows))
+    receive_times_s = np.zeros(len(frames))
+    if frames.receive_times_us is not None:
+        receive_times_s = (frames.receive_times_us - frames.receive_times_us[0]) * 1e-6
         if len(rows):
-            receipt_to_boot_line = fit_clock_line(boot_s, received_s[rows]).inverse()
+            receipt_to_boot_fit = fit_clock_line(boot_times_s, receive_times_s[rows]).inverse()
     elif len(rows):
         # A raw stream has no receive times; the last boot time before each frame is used instead
         previous_message_index = np.searchsorted(rows, np.arange(len(frames)), side="right") - 1
-        received_s = boot_s[np.maximum(previous_message_index, 0)]
+        receive_times_s = boot_times_s[np.maximum(previous_message_index, 0)]
     else:
         notes.append("no message in the stream contains a time")
-    receipt_reversal_count = int(np.count_nonzero(np.diff(received_s) < 0.0))
+    receipt_reversal_count = int(np.count_nonzero(np.diff(receive_times_s) < 0.0))
     for quantity, count in (
         ("number of ignored MAVLink frames with unknown message type", frames.unknown_frame_count),
         (
@@ -305,15 +320,15 @@ def read_recording(frames: MavlinkFrames, address: Address) -> Recording:
     elif bad_byte_count:
         notes.append(stray_bytes_note)
     # Without boot times, the time axis is the receive time
-    time_origin_s, end_s = (boot_s if len(boot_s) else np.array([0.0, received_s.max()]))[
-        [0, -1]
-    ].tolist()
+    time_origin_s, end_s = (
+        boot_times_s if len(boot_times_s) else np.array([0.0, receive_times_s.max()])
+    )[[0, -1]].tolist()
     return Recording(
         frames,
         address,
         session_frames,
-        received_s,
-        receipt_to_boot_line,
+        receive_times_s,
+        receipt_to_boot_fit,
         time_origin_s,
         end_s - time_origin_s,
         notes,
@@ -326,17 +341,17 @@ def read_recording(frames: MavlinkFrames, address: Address) -> Recording:
 def _remove_stray_timestamps(times_s: Array, rows: IntArray) -> IntArray:
     """Remove small groups of timestamps at the beginning and at the end of a recording.
 
-    Groups are separated by gaps of more than MAX_TIME_OUTSIDE_S. A group is small if it has
+    Groups are separated by gaps of more than MAX_TIME_OUTSIDE_FLIGHT_S. A group is small if it has
     less than MIN_TIMESTAMP_GROUP_FRACTION of the timestamps of the largest group.
     """
     timestamp_groups = np.split(
-        rows, np.flatnonzero(np.diff(times_s[rows]) > MAX_TIME_OUTSIDE_S) + 1
+        rows, np.flatnonzero(np.diff(times_s[rows]) > MAX_TIME_OUTSIDE_FLIGHT_S) + 1
     )
     min_group_size = MIN_TIMESTAMP_GROUP_FRACTION * max(len(group) for group in timestamp_groups)
-    large_groups = [
+    large_group_indices = [
         index for index, group in enumerate(timestamp_groups) if len(group) >= min_group_size
     ]
-    return np.concatenate(timestamp_groups[large_groups[0] : large_groups[-1] + 1])
+    return np.concatenate(timestamp_groups[large_group_indices[0] : large_group_indices[-1] + 1])
 
 
 def map_boot_to_unix(recording: Recording) -> ClockLine | None:

@@ -1,4 +1,4 @@
-"""Senders of a MAVLink recording: the autopilot, position senders, and their clocks."""
+"""Detection of the autopilot and position senders in a MAVLink recording, and of their clocks."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -16,34 +16,35 @@ from px4fuse.readers.mavlink_clocks import (
     is_running_clock,
     map_clock,
 )
-from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, Address, Int64Array, MavlinkFrames
+from px4fuse.readers.mavlink_frames import VEHICLE_TYPES, Int64Array, MavlinkAddress, MavlinkFrames
 from px4fuse.readers.mavlink_recording import MIN_RESTART_STEP_S, Recording, map_boot_to_unix
 
 # Maximum number of senders that are read; senders with more messages are preferred
 MAX_SENDERS = 32
 # Maximum fraction of lost messages: above it, the sender does not number its messages in sequence
 MAX_LOST_MESSAGE_FRACTION = 0.9
-# Maximum number of later messages of a sender that overtake a message, on a faster link
+# A message is late, not lost, if at most this many later messages of its sender arrive before it
+# (over a faster link)
 MAX_LATE_MESSAGES = 16
 # Maximum difference (s) of TIMESYNC timestamps from a sender's position timestamps: a larger
 # difference shows another clock
-MAX_SAME_CLOCK_DISTANCE_S = 1e5
+MAX_SAME_CLOCK_DIFFERENCE_S = 1e5
 
 
-def _read_vehicle_types(frames: MavlinkFrames) -> dict[Address, tuple[int, int]]:
+def _read_vehicle_types(frames: MavlinkFrames) -> dict[MavlinkAddress, tuple[int, int]]:
     rows = frames.rows("HEARTBEAT")
     heartbeats = frames.table("HEARTBEAT", rows)
     type_pairs = zip(heartbeats["type"].tolist(), heartbeats["autopilot"].tolist(), strict=True)
     return dict([*zip(_read_addresses(frames, rows), type_pairs, strict=True)][::-1])
 
 
-def _read_addresses(frames: MavlinkFrames, rows: IntArray | slice) -> Iterator[Address]:
-    return zip(frames.system[rows].tolist(), frames.component[rows].tolist(), strict=True)
+def _read_addresses(frames: MavlinkFrames, rows: IntArray | slice) -> Iterator[MavlinkAddress]:
+    return zip(frames.system_ids[rows].tolist(), frames.component_ids[rows].tolist(), strict=True)
 
 
 def _count_frames(
     frames: MavlinkFrames, rows: IntArray | slice = slice(None)
-) -> list[tuple[Address, int]]:
+) -> list[tuple[MavlinkAddress, int]]:
     """Count frames by sender, most frames first."""
     counts = Counter(_read_addresses(frames, rows))
     return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
@@ -53,62 +54,64 @@ def _is_vehicle(vehicle_type: int, autopilot: int) -> bool:
     return autopilot != messages.INVALID_AUTOPILOT and vehicle_type != messages.GROUND_STATION_TYPE
 
 
-def choose_autopilot(frames: MavlinkFrames, system: int | None) -> tuple[Address, str]:
+def choose_autopilot(frames: MavlinkFrames, system_id: int | None) -> tuple[MavlinkAddress, str]:
     """Return the address of an autopilot, and its type: "PX4", "ArduPilot" or another.
 
-    ``system`` is its MAVLink system id; None selects the autopilot with the most messages.
+    ``system_id`` is its MAVLink system id; None selects the autopilot with the most messages.
 
     Raises
     ------
     SettingsError
         No autopilot has the given system id.
     """
-    frame_counts = dict(_count_frames(frames))
+    frame_count_by_address = dict(_count_frames(frames))
     vehicle_types = _read_vehicle_types(frames)
     vehicle_addresses = [
         address
-        for address in frame_counts
+        for address in frame_count_by_address
         if address in vehicle_types and _is_vehicle(*vehicle_types[address])
     ]
     rows = np.concatenate([frames.rows(message) for message in messages.AUTOPILOT_MESSAGES])
-    autopilot_counts = dict(_count_frames(frames, rows))
+    message_count_by_autopilot = dict(_count_frames(frames, rows))
     # Companion computers may send autopilot heartbeats, so senders of messages that only autopilots
     # send are preferred. Without a heartbeat, these messages or the component id identify the
     # autopilot
     candidates = (
-        [address for address in vehicle_addresses if address in autopilot_counts]
-        or [address for address in autopilot_counts if address not in vehicle_types]
+        [address for address in vehicle_addresses if address in message_count_by_autopilot]
+        or [address for address in message_count_by_autopilot if address not in vehicle_types]
         or vehicle_addresses
     )
     candidates = candidates or [
-        address for address in frame_counts if address[1] == messages.AUTOPILOT_COMPONENT_ID
+        address
+        for address in frame_count_by_address
+        if address[1] == messages.AUTOPILOT_COMPONENT_ID
     ]
     # If no message is from an autopilot, assume that each system has one that sent nothing
     candidates = candidates or [
-        (address[0], messages.AUTOPILOT_COMPONENT_ID) for address in frame_counts
+        (address[0], messages.AUTOPILOT_COMPONENT_ID) for address in frame_count_by_address
     ]
-    if system is not None:
+    if system_id is not None:
         candidates = [
-            address for address in {*vehicle_addresses, *candidates} if address[0] == system
+            address for address in {*vehicle_addresses, *candidates} if address[0] == system_id
         ]
         if not candidates:
-            system_ids = (
+            system_ids_text = (
                 ", ".join(map(str, sorted({address[0] for address in vehicle_addresses}))) or "none"
             )
             raise SettingsError(
-                f"{frames.name}: no autopilot has MAVLink system id {system}. System ids of "
-                f"autopilots in this file: {system_ids}."
+                f"{frames.name}: no autopilot has MAVLink system id {system_id}. System ids of "
+                f"autopilots in this file: {system_ids_text}."
             )
-    best_address = max(candidates, key=lambda address: frame_counts.get(address, 0))
+    best_address = max(candidates, key=lambda address: frame_count_by_address.get(address, 0))
     _, autopilot_type = vehicle_types.get(best_address, (-1, -1))
-    return best_address, messages.AUTOPILOTS.get(autopilot_type, "unknown autopilot")
+    return best_address, messages.AUTOPILOT_NAME_BY_ID.get(autopilot_type, "unknown autopilot")
 
 
-def find_senders(recording: Recording, message: str) -> list[Address]:
+def find_senders(recording: Recording, message: str) -> list[MavlinkAddress]:
     """Return the senders of a message type, such as companion computers, without autopilots."""
     frames = recording.frames
     autopilot_address = recording.address
-    other_vehicles = {
+    other_vehicle_ids = {
         address[0]
         for address, vehicle_type in _read_vehicle_types(frames).items()
         if _is_vehicle(*vehicle_type)
@@ -117,71 +120,71 @@ def find_senders(recording: Recording, message: str) -> list[Address]:
     return [
         address
         for address, _ in counts
-        if address != autopilot_address and address[0] not in other_vehicles
+        if address != autopilot_address and address[0] not in other_vehicle_ids
     ][:MAX_SENDERS]
 
 
-def map_senders(recording: Recording) -> dict[Address, ClockMapping]:
+def map_senders(recording: Recording) -> dict[MavlinkAddress, ClockMapping]:
     """Return the relation of each position sender's clock to the autopilot's boot clock."""
-    message_names = {source.message for source in messages.POSITION_INPUTS}
+    message_names = {source.message for source in messages.POSITION_MESSAGE_TYPES}
     senders = {address for message in message_names for address in find_senders(recording, message)}
-    boot_to_unix = map_boot_to_unix(recording)
+    boot_to_unix_fit = map_boot_to_unix(recording)
     return {
-        sender: _map_sender_clock(recording, sender, boot_to_unix) for sender in sorted(senders)
+        sender: _map_sender_clock(recording, sender, boot_to_unix_fit) for sender in sorted(senders)
     }
 
 
 def _map_sender_clock(
-    recording: Recording, sender: Address, boot_to_unix: ClockLine | None
+    recording: Recording, sender: MavlinkAddress, boot_to_unix_fit: ClockLine | None
 ) -> ClockMapping:
     frames = recording.frames
     timestamps_s = []
-    received_s = []
-    for source in messages.POSITION_INPUTS:
+    receive_times_s = []
+    for source in messages.POSITION_MESSAGE_TYPES:
         rows = recording.rows(source.message, sender)
         timestamps_s.append(frames.table(source.message, rows)[source.timestamp_field] * 1e-6)
-        received_s.append(recording.received_s[rows])
+        receive_times_s.append(recording.receive_times_s[rows])
     median_timestamp_s = float(np.median(np.concatenate(timestamps_s)))
     has_running_clock = is_running_clock(np.concatenate(timestamps_s))
     rows = recording.rows("TIMESYNC", sender)
     timesync = frames.table("TIMESYNC", rows)
-    sender_reply_s = timesync["tc1"] * 1e-9
-    request_s = timesync["ts1"] * 1e-9
+    sender_reply_times_s = timesync["tc1"] * 1e-9
+    request_times_s = timesync["ts1"] * 1e-9
     # A TIMESYNC reply repeats the requester's time in ts1, which is boot time only if the autopilot
     # sent the request
-    is_sender_reply = (sender_reply_s != 0.0) & (
-        np.abs(request_s - recording.receipt_boot_s(rows)) <= MIN_RESTART_STEP_S
+    is_sender_reply = (sender_reply_times_s != 0.0) & (
+        np.abs(request_times_s - recording.compute_receipt_boot_times_s(rows)) <= MIN_RESTART_STEP_S
     )
-    # A TIMESYNC request is sent as soon as its clock is read, so it has the smallest delay
+    # The sender reads its clock just before it sends a TIMESYNC request: the delay is smallest
     is_request = (
         has_running_clock
-        & (sender_reply_s == 0.0)
-        & (np.abs(request_s - median_timestamp_s) < MAX_SAME_CLOCK_DISTANCE_S)
+        & (sender_reply_times_s == 0.0)
+        & (np.abs(request_times_s - median_timestamp_s) < MAX_SAME_CLOCK_DIFFERENCE_S)
     )
-    timestamps_s.append(request_s[is_request])
-    received_s.append(recording.received_s[rows][is_request])
+    timestamps_s.append(request_times_s[is_request])
+    receive_times_s.append(recording.receive_times_s[rows][is_request])
     autopilot_timesync = frames.table("TIMESYNC", recording.rows("TIMESYNC"))
-    autopilot_reply_s = autopilot_timesync["tc1"] * 1e-9
-    sender_request_s = autopilot_timesync["ts1"] * 1e-9
-    is_autopilot_reply = (autopilot_reply_s != 0.0) & (
-        np.abs(sender_request_s - median_timestamp_s) < MAX_SAME_CLOCK_DISTANCE_S
+    autopilot_reply_times_s = autopilot_timesync["tc1"] * 1e-9
+    sender_request_times_s = autopilot_timesync["ts1"] * 1e-9
+    is_autopilot_reply = (autopilot_reply_times_s != 0.0) & (
+        np.abs(sender_request_times_s - median_timestamp_s) < MAX_SAME_CLOCK_DIFFERENCE_S
     )
     is_autopilot_reply &= ~np.isin(
-        autopilot_timesync["ts1"], _requests_of_other_senders(recording, sender)
+        autopilot_timesync["ts1"], _read_other_request_times(recording, sender)
     )
     return map_clock(
         f"system {sender[0]}, component {sender[1]}",
         np.concatenate(timestamps_s),
-        np.concatenate(received_s),
-        recording.receipt_to_boot_line,
-        (request_s[is_sender_reply], sender_reply_s[is_sender_reply]),
-        (sender_request_s[is_autopilot_reply], autopilot_reply_s[is_autopilot_reply]),
-        boot_to_unix,
-        has_receive_times=frames.received_us is not None,
+        np.concatenate(receive_times_s),
+        recording.receipt_to_boot_fit,
+        (request_times_s[is_sender_reply], sender_reply_times_s[is_sender_reply]),
+        (sender_request_times_s[is_autopilot_reply], autopilot_reply_times_s[is_autopilot_reply]),
+        boot_to_unix_fit,
+        has_receive_times=frames.receive_times_us is not None,
     )
 
 
-def _requests_of_other_senders(recording: Recording, sender: Address) -> Int64Array:
+def _read_other_request_times(recording: Recording, sender: MavlinkAddress) -> Int64Array:
     """Return the TIMESYNC request times ``ts1`` (ns) of all senders except ``sender``."""
     frames = recording.frames
     rows = frames.rows("TIMESYNC")
@@ -190,29 +193,29 @@ def _requests_of_other_senders(recording: Recording, sender: Address) -> Int64Ar
 
 
 def describe_clock_conversions(
-    recording: Recording, clock_mappings: dict[Address, ClockMapping]
+    recording: Recording, clock_mappings: dict[MavlinkAddress, ClockMapping]
 ) -> tuple[ClockMap, ...]:
     """Describe the conversions of sender clocks and of the receive time to the boot clock."""
     clock_descriptions = [mapping.description for mapping in clock_mappings.values()]
-    received_us = recording.frames.received_us
-    receipt_to_boot_line = recording.receipt_to_boot_line
-    if received_us is not None and receipt_to_boot_line.pair_count:
+    receive_times_us = recording.frames.receive_times_us
+    receipt_to_boot_fit = recording.receipt_to_boot_fit
+    if receive_times_us is not None and receipt_to_boot_fit.pair_count:
         note = "the recorded link was replayed faster or slower than real time"
-        if abs(receipt_to_boot_line.slope - 1.0) < MAX_RELATIVE_RATE_DIFFERENCE:
+        if abs(receipt_to_boot_fit.slope - 1.0) < MAX_RELATIVE_RATE_DIFFERENCE:
             note = (
-                "receive times are converted by the messages with the least link delay; they serve "
-                "only to order messages and to convert other clocks"
+                "receive times are converted to the boot clock with the messages that have the "
+                "least link delay; they serve only to order messages and to convert other clocks"
             )
         clock_descriptions.append(
             ClockMap(
                 clock="receive time (UNIX time of the recording computer)",
                 method="receive time",
-                pairs=receipt_to_boot_line.pair_count,
-                offset_s=receipt_to_boot_line.y0
-                - receipt_to_boot_line.x0
-                - float(received_us[0]) * 1e-6,
-                drift_ppm=(receipt_to_boot_line.slope - 1.0) * 1e6,
-                jitter_s=receipt_to_boot_line.jitter,
+                pairs=receipt_to_boot_fit.pair_count,
+                offset_s=receipt_to_boot_fit.y0
+                - receipt_to_boot_fit.x0
+                - float(receive_times_us[0]) * 1e-6,
+                drift_ppm=(receipt_to_boot_fit.slope - 1.0) * 1e6,
+                jitter_s=receipt_to_boot_fit.jitter_s,
                 note=note,
             )
         )
@@ -230,20 +233,22 @@ def describe_senders(recording: Recording) -> tuple[Sender, ...]:
             vehicle_type, autopilot = vehicle_types[address]
             description = VEHICLE_TYPES.get(vehicle_type, f"vehicle of MAV_TYPE {vehicle_type}")
             if autopilot != messages.INVALID_AUTOPILOT:
-                description = f"{messages.AUTOPILOTS.get(autopilot, 'autopilot')} {description}"
+                description = (
+                    f"{messages.AUTOPILOT_NAME_BY_ID.get(autopilot, 'autopilot')} {description}"
+                )
         lost_fraction = _estimate_lost_fraction(frames, address)
         is_analysed = address == recording.address
         sender_descriptions.append(Sender(*address, description, count, lost_fraction, is_analysed))
     return tuple(sender_descriptions)
 
 
-def _estimate_lost_fraction(frames: MavlinkFrames, address: Address) -> float | None:
+def _estimate_lost_fraction(frames: MavlinkFrames, address: MavlinkAddress) -> float | None:
     """Return the fraction of a sender's messages that are lost, from gaps in the sequence numbers.
 
     Return None if the sender does not count its messages, or counts them separately on two links.
     """
-    sequence = frames.sequence[frames.is_sent_by(address)].astype(np.int64)
-    sequence_steps = np.mod(np.diff(sequence) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES
+    sequence_numbers = frames.sequence_numbers[frames.is_sent_by(address)].astype(np.int64)
+    sequence_steps = np.mod(np.diff(sequence_numbers) + MAX_LATE_MESSAGES, 256) - MAX_LATE_MESSAGES
     unwrapped_sequence = np.append(0, np.cumsum(sequence_steps))
     lost_fraction = float(
         1.0 - len(np.unique(unwrapped_sequence)) / (np.ptp(unwrapped_sequence) + 1)

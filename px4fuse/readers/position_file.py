@@ -20,10 +20,10 @@ from px4fuse.core.reading import read_bytes_limited, split_path_and_part
 from px4fuse.errors import LogError, SettingsError
 from px4fuse.flight.model import NO_INVALID_ROWS, time_index
 from px4fuse.readers import position_names
-from px4fuse.readers.common import estimate_rounding_step, find_invalid_rows
+from px4fuse.readers.common import classify_invalid_positions, estimate_rounding_step
 from px4fuse.readers.position_names import (
-    LENGTH_UNITS,
-    TIME_UNITS,
+    METRES_BY_LENGTH_UNIT,
+    SECONDS_BY_TIME_UNIT,
     ColumnMeaning,
     find_quaternion_columns,
     read_column_name,
@@ -33,7 +33,7 @@ from px4fuse.readers.recording_table import (
     MAX_FILE_BYTES,
     NO_HEADER,
     SEPARATORS,
-    Table,
+    PositionTable,
     choose_body,
     find_table,
 )
@@ -52,19 +52,17 @@ SAMPLE_COLUMNS = ["x_m", "y_m", "z_m", *SIGMA_COLUMNS]
 # Maximum number of UWB tags in a column; a column with more different values is a counter
 MAX_TAGS = 100
 MIN_USABLE_ROWS = 3
-# Minimum fraction of rows with increasing times, in a file without header; and minimum fraction of
-# rows with whole seconds, if another column contains the nanoseconds
-MIN_USABLE_FRACTION = 0.9
+# Minimum fraction of rows that fit an assumption: increasing times in a file without header, or
+# whole seconds if another column contains the nanoseconds
+MIN_FITTING_ROW_FRACTION = 0.9
 # Minimum plausible median interval (s): UWB systems send at most 200 positions per second, ±10 %
 MIN_INTERVAL_S = 0.9 / 200
 # Maximum plausible median interval (s): UWB systems send a position every 5 s or more often, ±10 %
 MAX_INTERVAL_S = 1.1 / 0.2
-# Plausible units of the timestamps of positions, and plausible median intervals (s)
-POSITION_UNITS_AND_INTERVALS = tuple(TIME_UNITS), (MIN_INTERVAL_S, MAX_INTERVAL_S)
-# Plausible units of the timestamps of trajectories, and plausible median intervals (s)
-TRAJECTORY_UNITS_AND_INTERVALS = ("s", "ns"), (1e-3, 1e3)
-# Maximum median interval (s) of UNIX times in seconds. Numbers with a longer interval are boot
-# times in µs
+# Plausible units of timestamps in trajectories, and plausible median intervals (s)
+TRAJECTORY_TIME_UNITS, TRAJECTORY_INTERVAL_RANGE_S = ("s", "ns"), (1e-3, 1e3)
+# Maximum median interval (s) of UNIX times: timestamps with a longer interval in this unit are
+# boot times in a smaller unit
 MAX_UNIX_TIME_INTERVAL_S = 60.0
 # Maximum extent (m) of an indoor flight. Positions with a larger extent are probably in mm
 MAX_INDOOR_EXTENT_M = 200.0
@@ -94,8 +92,8 @@ class PositionRecording:
     dropped_row_count: int = 0
     # Factor that converted the positions of the file to metres
     metres_per_unit: float = 1.0
-    # Dropped rows, each with the reason from :func:`find_invalid_rows`
-    invalid: "pd.Series[str]" = field(default_factory=lambda: NO_INVALID_ROWS)
+    # Dropped rows, each with the reason from :func:`classify_invalid_positions`
+    reason_by_invalid_row: "pd.Series[str]" = field(default_factory=lambda: NO_INVALID_ROWS)
     # Quantisation step of the horizontal position; 0 if it is not quantised
     rounding_step_m: float = 0.0
     # Name of the format; "" for a table with a header
@@ -147,9 +145,9 @@ def read_position_file(
     path, body_in_path = split_path_and_part(str(path))
     table, sha256, size_bytes = _open_table(path, columns, body or body_in_path)
     notes = [*table.notes]
-    meanings = [read_column_name(name) for name in table.names]
+    meanings = [read_column_name(name) for name in table.column_names]
     given_columns = _find_column_indices(table, columns or ())
-    quaternion_columns = find_quaternion_columns(table.names)
+    quaternion_columns = find_quaternion_columns(table.column_names)
     numbers, has_time_zone = _read_numbers(
         table, meanings, given_columns, quaternion_columns, body or body_in_path
     )
@@ -164,18 +162,20 @@ def read_position_file(
     if unusable_count := int(np.count_nonzero(~is_usable)):
         notes.append(
             f"number of dropped rows without valid time or position: {unusable_count}"
-            f"{table.format_first_line(numbers.index[~is_usable])}"
+            f"{table.format_first_line_number(numbers.index[~is_usable])}"
         )
     times_without_position = numbers.loc[has_time & ~is_usable, time_column].to_numpy()
     numbers = numbers[is_usable]
     file_times = numbers[time_column].to_numpy()
     units, interval_range_s = (
-        TRAJECTORY_UNITS_AND_INTERVALS if is_trajectory else POSITION_UNITS_AND_INTERVALS
+        (TRAJECTORY_TIME_UNITS, TRAJECTORY_INTERVAL_RANGE_S)
+        if is_trajectory
+        else (tuple(SECONDS_BY_TIME_UNIT), (MIN_INTERVAL_S, MAX_INTERVAL_S))
     )
     unit, unit_text = _choose_time_unit(
         file_times, meanings[time_column].unit, time_unit, units, interval_range_s
     )
-    units_per_second: float = round(1.0 / TIME_UNITS[unit])
+    units_per_second: float = round(1.0 / SECONDS_BY_TIME_UNIT[unit])
     if table.rate_hz is not None:
         unit_text = f"the frame rate is {table.rate_hz:g} Hz"
         unit, units_per_second = "frame numbers", table.rate_hz
@@ -186,7 +186,9 @@ def read_position_file(
             "number of dropped rows with timestamps that repeat, decrease or are after 2100: "
             f"{dropped_count}"
         )
-    has_no_times = table.format == NO_HEADER and len(kept_rows) < MIN_USABLE_FRACTION * row_count
+    has_no_times = (
+        table.format == NO_HEADER and len(kept_rows) < MIN_FITTING_ROW_FRACTION * row_count
+    )
     if has_no_times or len(kept_rows) < MIN_USABLE_ROWS:
         raise LogError(
             "; ".join(
@@ -218,10 +220,10 @@ def read_position_file(
         for name, index in zip(SAMPLE_COLUMNS, (*axis_columns, *sigma_columns), strict=True)
     }
     samples = pd.DataFrame(columns_m, index=numbers.index).replace([np.inf, -np.inf], np.nan)
-    invalid_reasons = find_invalid_rows(samples, SAMPLE_COLUMNS[: len(position_columns)])
+    invalid_reasons = classify_invalid_positions(samples, SAMPLE_COLUMNS[: len(position_columns)])
     if is_trajectory:
         invalid_reasons[:] = ""
-    invalid_parts = (
+    invalid_reason_series = (
         invalid_reasons[invalid_reasons != ""],
         pd.Series("NaN", times_without_position / units_per_second),
     )
@@ -256,7 +258,7 @@ def read_position_file(
         ),
         notes=tuple(notes),
         metres_per_unit=scale_by_column[position_columns[0]],
-        invalid=pd.concat(invalid_parts).sort_index(),
+        reason_by_invalid_row=pd.concat(invalid_reason_series).sort_index(),
         format=table.format,
         row_count=row_count,
         quaternions=quaternions if quaternion_columns else None,
@@ -268,7 +270,7 @@ def read_position_file(
 
 def _open_table(
     path: Path, columns: tuple[str, ...] | None, body_name: str | None
-) -> tuple[Table, str, int]:
+) -> tuple[PositionTable, str, int]:
     """Return the table of positions in a file or ROS bag, and the SHA-256 and size (bytes)."""
     if is_bag(path):
         return read_bag(path, body_name)
@@ -293,8 +295,8 @@ def _check_options(
 ) -> None:
     """Raise SettingsError if the units or the number of columns are not valid."""
     for name, value, units in (
-        ("time_unit", time_unit, TIME_UNITS),
-        ("length_unit", length_unit, LENGTH_UNITS),
+        ("time_unit", time_unit, SECONDS_BY_TIME_UNIT),
+        ("length_unit", length_unit, METRES_BY_LENGTH_UNIT),
     ):
         if value is not None and value not in units:
             raise SettingsError(f"`{name}`: {value!r} is not one of {', '.join(units)}.")
@@ -307,7 +309,7 @@ def _check_options(
 
 
 def _read_numbers(
-    table: Table,
+    table: PositionTable,
     meanings: list[ColumnMeaning],
     given_columns: list[int],
     quaternion_columns: list[int],
@@ -357,12 +359,15 @@ def _read_dates(texts: "pd.Series[str]") -> tuple["pd.Series[float]", bool]:
     """Convert dates in ISO 8601 to UNIX time (s), and return True if they have a time zone."""
     texts = texts.str.replace(",", ".", regex=False)
     dates = pd.to_datetime(texts, format="ISO8601", utc=True, errors="coerce")
-    unix_s = (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
-    return unix_s, bool(texts.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$").mean() > 0.5)
+    unix_time_s = (dates - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
+    return unix_time_s, bool(texts.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$").mean() > 0.5)
 
 
 def _select_body(
-    table: Table, texts: pd.DataFrame, meanings: Sequence[ColumnMeaning], body_name: str | None
+    table: PositionTable,
+    texts: pd.DataFrame,
+    meanings: Sequence[ColumnMeaning],
+    body_name: str | None,
 ) -> pd.DataFrame:
     """Return the rows of one rigid body or UWB tag, if a column contains their names."""
     for index, meaning in enumerate(meanings):
@@ -370,7 +375,7 @@ def _select_body(
             tags = texts[index].dropna().unique().tolist()
             if 1 < len(tags) <= MAX_TAGS or (tags and body_name is not None):
                 return texts[texts[index] == choose_body(table.file_name, tags, body_name)]
-    if body_name is not None and not table.is_chosen_body:
+    if body_name is not None and not table.has_only_chosen_body:
         raise LogError(
             f"{table.file_name} contains only one body, which has no name",
             "Omit --body, and the name after the colon in FILE:NAME.",
@@ -378,8 +383,8 @@ def _select_body(
     return texts
 
 
-def _find_column_indices(table: Table, wanted_columns: tuple[str, ...]) -> list[int]:
-    names = [name.casefold() for name in table.names]
+def _find_column_indices(table: PositionTable, wanted_columns: tuple[str, ...]) -> list[int]:
+    names = [name.casefold() for name in table.column_names]
     # A number is the name of a column, or else its position in the header
     names += [str(index + 1) for index in range(len(names))]
     indices = []
@@ -388,10 +393,10 @@ def _find_column_indices(table: Table, wanted_columns: tuple[str, ...]) -> list[
         if wanted_name not in names:
             raise SettingsError(
                 f"{table.file_name} has no column {quote(column)}; the columns are "
-                f"{table.format_labels(*range(len(table.names)))}",
+                f"{table.format_labels(*range(len(table.column_names)))}",
                 f"Name the columns with {COLUMNS_OPTION}.",
             )
-        indices.append(names.index(wanted_name) % len(table.names))
+        indices.append(names.index(wanted_name) % len(table.column_names))
     if len({*indices}) < len(indices):
         raise SettingsError(
             f"{COLUMNS_OPTION}: {quote(','.join(wanted_columns))} names one column twice."
@@ -400,7 +405,10 @@ def _find_column_indices(table: Table, wanted_columns: tuple[str, ...]) -> list[
 
 
 def _choose_columns(
-    table: Table, meanings: Sequence[ColumnMeaning], given_columns: list[int], numbers: pd.DataFrame
+    table: PositionTable,
+    meanings: Sequence[ColumnMeaning],
+    given_columns: list[int],
+    numbers: pd.DataFrame,
 ) -> tuple[int, _ColumnIndices, _ColumnIndices, str | None, str]:
     """Choose the columns of time, position and σ; return also the frame and the time format.
 
@@ -411,7 +419,7 @@ def _choose_columns(
         time_text = table.format_labels(time_column)
         frame = None
         axis_columns: _ColumnIndices = (*given_columns[1:4], None)[:3]
-        # The column names may contain the frame, which determines the order of the axes
+        # Only the names of the given columns may define the frame and so the order of the axes
         given_meanings = [
             meaning if index in axis_columns else ColumnMeaning()
             for index, meaning in enumerate(meanings)
@@ -433,7 +441,9 @@ def _choose_columns(
         )
         time_text = table.format_labels(time_column)
         for index in [*other_time_columns]:
-            has_whole_seconds = (numbers[time_column] % 1.0 == 0.0).mean() > MIN_USABLE_FRACTION
+            has_whole_seconds = (
+                numbers[time_column] % 1.0 == 0.0
+            ).mean() > MIN_FITTING_ROW_FRACTION
             if has_whole_seconds and meanings[index].unit == "ns" and numbers[index].max() < 1e9:
                 numbers[time_column] += numbers[index] * 1e-9
                 other_time_columns.remove(index)
@@ -467,15 +477,18 @@ def _choose_time_unit(
     if given_unit is not None:
         return given_unit, "the unit was given with --position-time-unit"
     median_time = float(np.median(times)) if len(times) else 0.0
-    if abs(median_time) * TIME_UNITS.get(column_name_unit, np.inf) < MAX_VALID_UNIX_TIME_S:
-        return column_name_unit, "the column name contains the unit"
+    if (
+        abs(median_time) * SECONDS_BY_TIME_UNIT.get(column_name_unit, np.inf)
+        < MAX_VALID_UNIX_TIME_S
+    ):
+        return column_name_unit, "from the column name"
     time_steps = np.diff(times)
     median_step = float(np.median(time_steps[time_steps > 0])) if (time_steps > 0).any() else 0.0
     plausible_units = []
-    for unit, unit_s in TIME_UNITS.items():
+    for unit, unit_s in SECONDS_BY_TIME_UNIT.items():
         is_unix = MIN_VALID_UNIX_TIME_S <= median_time * unit_s < MAX_VALID_UNIX_TIME_S
         if is_unix and median_step * unit_s <= MAX_UNIX_TIME_INTERVAL_S:
-            return unit, f"as UNIX times in {unit}, the times are between 2000 and 2100"
+            return unit, "in this unit, the timestamps are UNIX times between 2000 and 2100"
         if unit in units and interval_range_s[0] <= median_step * unit_s <= interval_range_s[1]:
             plausible_units.append(unit)
     if not plausible_units:
@@ -484,7 +497,9 @@ def _choose_time_unit(
             "with --position-time-unit"
         )
     unit, *other_units = plausible_units
-    reasons = [f"in this unit, the median interval is {median_step * TIME_UNITS[unit]:.3g} s"]
+    reasons = [
+        f"in this unit, the median interval is {median_step * SECONDS_BY_TIME_UNIT[unit]:.3g} s"
+    ]
     if other_units:
         reasons.append(f"if the unit is {other_units[0]}, give --position-time-unit")
     return unit, "; ".join(reasons)
@@ -505,7 +520,7 @@ def _choose_length_units(
     column_name_units = {
         index: meaning.unit
         for index, meaning in enumerate(meanings)
-        if meaning.unit in LENGTH_UNITS
+        if meaning.unit in METRES_BY_LENGTH_UNIT
     }
     # The extent is the range from 5 % to 95 %, so that outliers do not determine the unit
     extents = numbers[position_columns].quantile(0.95) - numbers[position_columns].quantile(0.05)
@@ -521,7 +536,7 @@ def _choose_length_units(
     ]:
         unit = axis_units[0]
         reason = "the column names contain the unit"
-    elif max_extent_m < max_extent <= max_extent_m / LENGTH_UNITS["mm"]:
+    elif max_extent_m < max_extent <= max_extent_m / METRES_BY_LENGTH_UNIT["mm"]:
         unit = "mm"
         reason = (
             f"an extent of {max_extent:.0f} m is too large for an indoor flight; if the unit is "
@@ -535,10 +550,10 @@ def _choose_length_units(
     unit_by_column = {
         index: column_name_units.get(index, unit) for index in map(int, numbers.columns)
     }
-    scale_by_column = {index: LENGTH_UNITS[name] for index, name in unit_by_column.items()}
+    scale_by_column = {index: METRES_BY_LENGTH_UNIT[name] for index, name in unit_by_column.items()}
     extent_m = max(float(extents[index]) * scale_by_column[index] for index in position_columns)
-    used_units = ", ".join(dict.fromkeys(unit_by_column[index] for index in position_columns))
+    used_units_text = ", ".join(dict.fromkeys(unit_by_column[index] for index in position_columns))
     return (
         scale_by_column,
-        f"{used_units} ({reason}); 90 % of the positions are within {extent_m:.3g} m",
+        f"{used_units_text} ({reason}); 90 % of the positions are within {extent_m:.3g} m",
     )

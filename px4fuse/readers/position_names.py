@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from px4fuse.core.record import read_toml
 
-TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-LENGTH_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+SECONDS_BY_TIME_UNIT = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+METRES_BY_LENGTH_UNIT = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 # Column indices of x, y and z; None without height
 PositionColumns = tuple[int, int, int | None]
@@ -33,12 +33,12 @@ _TIME_WORDS = (
 # Kinds of time columns, in order of preference
 TIME_KINDS = ["time of measurement", "time", "time of recording"]
 # Column names of two words without separator, such as "px" (position, x) and "xstd" (x, sigma)
-_JOINED_NAMES = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
+_JOINED_NAME_PATTERN = re.compile(r"(pos|p|t|sigma|std|s)([xyzneud])|([xyz])(pos|std|sigma)")
 # Quaternion components, such as "qx", "q_RS_w []" and "pose.orientation.x"
-_QUATERNION_NAME = re.compile(r"(?:\bq|orientation|rotation|quat)(?:\w*_|[ .])?([wxyz])\b")
-# Coordinate frames with the names of their axes. A file has the first frame whose horizontal axes
-# are both among its columns
-_FRAMES: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
+_QUATERNION_NAME_PATTERN = re.compile(r"(?:\bq|orientation|rotation|quat)(?:\w*_|[ .])?([wxyz])\b")
+# Axis names by coordinate frame. The frame of a file is the first of which both horizontal axes are
+# among the columns
+_AXIS_NAMES_BY_FRAME: tuple[tuple[str | None, tuple[str, str, str]], ...] = (
     ("ned", ("north", "east", "down")),
     ("enu", ("east", "north", "up")),
     (None, ("x", "y", "z")),
@@ -74,12 +74,16 @@ def read_column_name(name: str) -> ColumnMeaning:
     plain_name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", plain_name).lower()
     column_words = re.findall(r"[^\W_]+", plain_name)
     unit = _UNIT_BY_WORD.get(column_words[-1], "") if column_words else ""
-    if len(column_words) == 1 and unit in TIME_UNITS and len(column_words[0]) > 2:
+    if len(column_words) == 1 and unit in SECONDS_BY_TIME_UNIT and len(column_words[0]) > 2:
         return ColumnMeaning("time", "time", unit)  # a unit alone, such as "sec", is a time
     unit = unit if len(column_words) > 1 else ""
     column_words = column_words[:-1] if unit else column_words
     word_set = {*column_words}
-    if word_set & _WORDS_BY_ROLE["time"] and word_set <= _TIME_WORDS and unit not in LENGTH_UNITS:
+    if (
+        word_set & _WORDS_BY_ROLE["time"]
+        and word_set <= _TIME_WORDS
+        and unit not in METRES_BY_LENGTH_UNIT
+    ):
         matches_time_kind = [
             bool(word_set & _WORDS_BY_ROLE["measured"]),
             not word_set & _WORDS_BY_ROLE["recorded"],
@@ -91,11 +95,15 @@ def read_column_name(name: str) -> ColumnMeaning:
     sigma_and_context_words = _WORDS_BY_ROLE["sigma"] | _WORDS_BY_ROLE["context"]
     split_words: list[str] = []
     for word in column_words:
-        match = None if word in sigma_and_context_words else _JOINED_NAMES.fullmatch(word)
+        match = None if word in sigma_and_context_words else _JOINED_NAME_PATTERN.fullmatch(word)
         split_words += [group for group in match.groups() if group] if match else [word]
     axes = [_AXIS_BY_WORD[word] for word in split_words if word in _AXIS_BY_WORD]
     other_words = [word for word in split_words if word not in _AXIS_BY_WORD]
-    if unit in TIME_UNITS or len(axes) > 1 or not {*other_words} <= sigma_and_context_words:
+    if (
+        unit in SECONDS_BY_TIME_UNIT
+        or len(axes) > 1
+        or not {*other_words} <= sigma_and_context_words
+    ):
         return ColumnMeaning()
     if {*other_words} & _WORDS_BY_ROLE["sigma"]:
         return ColumnMeaning("sigma", "".join(axes), unit)
@@ -119,7 +127,8 @@ def find_position_columns(
             )
     for axis_count in (3, 2):
         for axes in columns_by_group.values():
-            for frame, names in () if "w" in axes else _FRAMES:  # x, y, z, w is a quaternion
+            # x, y, z, w is a quaternion
+            for frame, names in () if "w" in axes else _AXIS_NAMES_BY_FRAME:
                 if {*names[:axis_count]} <= axes.keys():
                     return frame, (axes[names[0]], axes[names[1]], axes.get(names[2]))
     return None
@@ -133,7 +142,7 @@ def find_sigma_columns(
     for index, meaning in enumerate(column_meanings):
         if meaning.kind == "sigma":
             sigma_columns.setdefault(meaning.axis_or_time_kind, index)
-    axes = next(axes for name, axes in _FRAMES if name == frame)
+    axes = next(axes for name, axes in _AXIS_NAMES_BY_FRAME if name == frame)
     return tuple(
         sigma_columns.get(axis, sigma_columns.get(letter, sigma_columns.get("")))
         for axis, letter in zip(axes, "xyz", strict=True)
@@ -144,6 +153,6 @@ def find_quaternion_columns(names: Sequence[str]) -> list[int]:
     """Return the column indices of the quaternion x, y, z, w; empty if the file has none."""
     indices: dict[str, int] = {}
     for index, name in enumerate(names):
-        if match := _QUATERNION_NAME.search(name.casefold()):
+        if match := _QUATERNION_NAME_PATTERN.search(name.casefold()):
             indices.setdefault(match[1], index)
     return [indices[axis] for axis in "xyzw"] if len(indices) == 4 else []

@@ -40,14 +40,14 @@ def read_aids(topics: Topics, enabled_aids: StepFunctions) -> dict[str, AidLog]:
     """
     log_by_aid = {}
     for name, aid in AIDS.items():
-        aid_enabled = enabled_aids.get(name)
-        aid_log = _read_aid_topic(topics, aid, aid_enabled)
+        enabled_changes = enabled_aids.get(name)
+        aid_log = _read_aid_topic(topics, aid, enabled_changes)
         # While the fusion of a source is disabled, the topics that are common to all sources
         # contain old values, or values of other sources
         if aid_log is None and (
-            name.startswith("ev_") if aid_enabled is None else aid_enabled.any()
+            name.startswith("ev_") if enabled_changes is None else enabled_changes.any()
         ):
-            aid_log = _read_common_topics(topics, aid, aid_enabled)
+            aid_log = _read_common_topics(topics, aid, enabled_changes)
         if aid_log is not None:
             log_by_aid[name] = aid_log
     return log_by_aid
@@ -63,16 +63,16 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
     tables = topics.tables_of(px4.STATUS_FLAGS)
     all_aids = (*AIDS.values(), *STATUS_FLAGS.values())
     flag_names = {flag for aid in all_aids for group in aid.flags for flag in group.split(",")}
-    logged_flags = sorted(flag_names.intersection(*tables)) if tables else []
-    if logged_flags:
-        layout = Layout(px4.STATUS_FLAGS, {name: name for name in logged_flags})
+    logged_flag_names = sorted(flag_names.intersection(*tables)) if tables else []
+    if logged_flag_names:
+        layout = Layout(px4.STATUS_FLAGS, {name: name for name in logged_flag_names})
         flags = topics.primary_samples(layout, is_step_function=True)
         for aid in all_aids if len(flags) else ():
             groups = (group.split(",") for group in aid.flags)
-            group = next((group for group in groups if {*group} <= {*logged_flags}), None)
+            group = next((group for group in groups if {*group} <= {*logged_flag_names}), None)
             if group is not None:
                 enabled_aids[aid.name] = flags[group].max(axis=1)
-    if not logged_flags and topics.find_layout(px4.TOPIC_LAYOUTS["control_bits"]) is not None:
+    if not logged_flag_names and topics.find_layout(px4.TOPIC_LAYOUTS["control_bits"]) is not None:
         control_bits = topics.primary_samples(
             px4.TOPIC_LAYOUTS["control_bits"], is_step_function=True
         )["bits"].dropna()
@@ -86,7 +86,7 @@ def read_enabled_aids(topics: Topics) -> dict[str, pd.Series[float]]:
 
 
 def _read_aid_topic(
-    topics: Topics, aid: Aid, fusion_enabled: pd.Series[float] | None
+    topics: Topics, aid: Aid, enabled_changes: pd.Series[float] | None
 ) -> AidLog | None:
     field_by_quantity = {
         "innovation": "innovation",
@@ -105,15 +105,15 @@ def _read_aid_topic(
     samples = topics.primary_samples(layout).dropna()
     if "last_fused_us" in samples:
         samples["last_fused_s"] = (samples.pop("last_fused_us") - topics.time_origin_us) * 1e-6
-    if fusion_enabled is not None and aid.name in px4.AIDS_ALWAYS_FUSED:
-        samples["fused"] = sample_step_function(fusion_enabled, samples.index)
-    return _make_aid_log(topics, (layout.topic,), aid, samples, fusion_enabled)
+    if enabled_changes is not None and aid.name in px4.AIDS_ALWAYS_FUSED:
+        samples["fused"] = sample_step_function(enabled_changes, samples.index)
+    return _make_aid_log(topics, (layout.topic,), aid, samples, enabled_changes)
 
 
 def _read_common_topics(
-    topics: Topics, aid: Aid, fusion_enabled: pd.Series[float] | None
+    topics: Topics, aid: Aid, enabled_changes: pd.Series[float] | None
 ) -> AidLog | None:
-    """Read the innovations of an aiding source from the topics that contain all aiding sources."""
+    """Read innovations from ``estimator_innovations`` or ``ekf2_innovations``, with all sources."""
     is_in_gauss = aid.name == "mag_heading" and any(
         "cs_mag" in table for table in topics.tables_of(px4.STATUS_FLAGS)
     )
@@ -133,37 +133,37 @@ def _read_common_topics(
         layouts.append([Layout(px4.OLD_INNOVATION_TOPIC, fields)] * 2)
     for value_layout, variance_layout in layouts:
         innovations = topics.primary_samples(value_layout)
-        samples = topics.primary_samples(value_layout, select=_drop_repeats)
+        samples = topics.primary_samples(value_layout, select=_drop_repeats_and_zeros)
         unknown_fusion_times_s = _find_unknown_fusion_times(
             innovations[f"innovation_{aid.axes[0]}"],
             topics.primary_samples(variance_layout)[f"variance_{aid.axes[0]}"],
         )
         if variance_layout is not value_layout:
-            # The logger downsamples both topics separately. S changes slowly, so that the nearest
-            # logged S is used
+            # Innovations and variances S are in two topics that the logger downsamples separately.
+            # The nearest S is used, because S changes slowly
             variance_samples = topics.primary_samples(variance_layout).dropna()
             samples = join_nearest(samples, variance_samples, MAX_VARIANCE_TIME_DIFFERENCE_S)
         excluded_sample_count = len(samples) - len(samples := samples.dropna())
-        if fusion_enabled is not None:
-            samples = samples[sample_step_function(fusion_enabled, samples.index) > 0.0]
+        if enabled_changes is not None:
+            samples = samples[sample_step_function(enabled_changes, samples.index) > 0.0]
         used_topics = tuple(dict.fromkeys((value_layout.topic, variance_layout.topic)))
         aid_log = _make_aid_log(
-            topics, used_topics, aid, samples, fusion_enabled, excluded_sample_count
+            topics, used_topics, aid, samples, enabled_changes, excluded_sample_count
         )
         if aid_log is not None:
             return replace(aid_log, unknown_fusion_times_s=unknown_fusion_times_s)
     return None
 
 
-def _drop_repeats(samples: pd.DataFrame) -> pd.DataFrame:
-    """Remove repeated rows, and rows of zeros, which PX4 logs before the first fusion."""
+def _drop_repeats_and_zeros(samples: pd.DataFrame) -> pd.DataFrame:
+    """Remove repeated innovations, and zeros, which PX4 logs before the first fusion."""
     finite_samples = samples.dropna()
     first_column = finite_samples.iloc[:, 0]
     return finite_samples[first_column.ne(first_column.shift()) & (first_column != 0.0)]
 
 
 def _find_unknown_fusion_times(innovation: pd.Series, variance: pd.Series) -> Array:
-    """Return the times (s) at which EKF2 had no sample, or fused a sample with unlogged innovation.
+    """Return the times (s) at which the log does not show if EKF2 fused a sample, and which.
 
     Without a sample, EKF2 logs the innovation 0. A new variance S shows that EKF2 fused a sample,
     even if the logged innovation belongs to an older sample.
@@ -181,7 +181,7 @@ def _make_aid_log(
     used_topics: tuple[str, ...],
     aid: Aid,
     samples: pd.DataFrame,
-    fusion_enabled: pd.Series[float] | None,
+    enabled_changes: pd.Series[float] | None,
     excluded_sample_count: int = 0,
 ) -> AidLog | None:
     """Return the innovations of an aiding source; None without a positive innovation variance.
@@ -194,4 +194,4 @@ def _make_aid_log(
     innovation_columns = [f"innovation_{axis}" for axis in aid.axes]
     parameters = aid.logged_parameters(topics.ekf2_parameters)
     samples = samples.assign(**-samples[innovation_columns])
-    return AidLog(used_topics, aid.axes, samples, fusion_enabled, parameters, excluded_sample_count)
+    return AidLog(used_topics, aid.axes, samples, enabled_changes, parameters, excluded_sample_count)

@@ -48,8 +48,8 @@ MIN_MAGNETOMETER_HZ = 10.0
 # EKF2 rounds the ratio of prediction interval to IMU interval to a whole number. If the ratio is
 # closer to n + 0.5 than this limit, both whole numbers are possible
 MAX_HALF_INTEGER_DISTANCE = 0.05
-# Maximum interval (s) between two logged samples of low-pass filtered optical flow from which the
-# unfiltered flow is computed
+# EKF2 logs low-pass filtered optical flow. The filter is inverted only between two samples of at
+# most this interval (s)
 MAX_FLOW_INTERVAL_S = 0.5
 # Aiding sources of horizontal position and velocity, except for the external vision position
 OTHER_HORIZONTAL_AIDS = (
@@ -166,7 +166,7 @@ def _find_state_vector(topics: Topics) -> tuple[str, int]:
             state_count = sum(name.startswith("states[") for name in table)
             variance_count = sum(name.startswith("covariances[") for name in table)
             if variance_count:
-                return topic, px4.ATTITUDE_VARIANCES_BY_SIZE.get((state_count, variance_count), 0)
+                return topic, px4.ATTITUDE_VARIANCE_COUNTS.get((state_count, variance_count), 0)
     return "", 0
 
 
@@ -182,7 +182,7 @@ def _read_delayed_state(topics: Topics, step_s: float) -> TableOrUnavailable:
     if not attitude_variance_count:
         return Unavailable(
             "EKF2 variances",
-            f"no supported PX4 release has arrays of these lengths in {topic}",
+            f"no supported PX4 release has states and covariances of these lengths in {topic}",
             "Report the PX4 version in an issue of px4fuse.",
         )
     state_fields = [f"states[{i}]" for i in range(STATE_COUNT)]
@@ -218,22 +218,24 @@ def _estimate_step_s(topics: Topics) -> float:
     layout = Layout(_find_state_vector(topics)[0], {"states[0]": "states[0]"})
     prediction_end_rows = find_rows_of_timestamps(imu_time_s, topics.primary_samples(layout).index)
     # time differences are used instead of row numbers, because IMU samples may be missing
-    prediction_ends = np.rint((imu_time_s[prediction_end_rows] - imu_time_s[0]) / interval_s)
-    return samples_per_step(configured_interval_s, interval_s, prediction_ends) * interval_s
+    end_sample_counts = np.rint((imu_time_s[prediction_end_rows] - imu_time_s[0]) / interval_s)
+    return (
+        compute_samples_per_step(configured_interval_s, interval_s, end_sample_counts) * interval_s
+    )
 
 
 def find_rows_of_timestamps(times_s: Array, wanted_times_s: ArrayLike) -> IntArray:
     """Return the indices of the ``times_s`` (increasing) that equal a wanted time to 1 µs."""
-    times_us, wanted_us = (
+    times_us, wanted_times_us = (
         np.rint(np.asarray(times, float) * 1e6) for times in (times_s, wanted_times_s)
     )
-    rows = np.searchsorted(times_us, wanted_us)
+    rows = np.searchsorted(times_us, wanted_times_us)
     is_inside = rows < len(times_us)
-    rows, wanted_us = rows[is_inside], wanted_us[is_inside]
-    return np.unique(rows[times_us[rows] == wanted_us])
+    rows, wanted_times_us = rows[is_inside], wanted_times_us[is_inside]
+    return np.unique(rows[times_us[rows] == wanted_times_us])
 
 
-def samples_per_step(
+def compute_samples_per_step(
     configured_step_s: float, imu_interval_s: float, step_ends: ArrayLike = ()
 ) -> int:
     """Return the number of IMU samples in one EKF2 prediction.
@@ -241,25 +243,25 @@ def samples_per_step(
     This is the ratio of both intervals, rounded. A ratio near n + 0.5 is rounded down if only n
     agrees with ``step_ends``, the indices of the IMU samples at which logged predictions end.
 
-    >>> samples_per_step(0.010, 0.00375), samples_per_step(0.010, 0.004)
+    >>> compute_samples_per_step(0.010, 0.00375), compute_samples_per_step(0.010, 0.004)
     (3, 3)
-    >>> samples_per_step(0.010, 0.004, [0, 4, 6, 14])
+    >>> compute_samples_per_step(0.010, 0.004, [0, 4, 6, 14])
     2
     """
-    ratio_plus_half = configured_step_s / imu_interval_s + 0.5
+    samples_per_step_plus_half = configured_step_s / imu_interval_s + 0.5
     # The added 1e-6 makes the result independent of the rounding of timestamps to µs
-    sample_count = max(int(ratio_plus_half + 1e-6), 1)
-    sample_differences = np.diff(np.asarray(step_ends, dtype=float))
+    sample_count = max(int(samples_per_step_plus_half + 1e-6), 1)
+    samples_between_ends = np.diff(np.asarray(step_ends, dtype=float))
     if (
         sample_count > 1
-        and abs(ratio_plus_half - sample_count) < MAX_HALF_INTEGER_DISTANCE
-        and len(sample_differences)
+        and abs(samples_per_step_plus_half - sample_count) < MAX_HALF_INTEGER_DISTANCE
+        and len(samples_between_ends)
     ):
-        fits_larger_count, fits_smaller_count = (
-            np.mean(sample_differences % step_sample_count == 0.0) > 0.9
+        is_multiple_of_larger, is_multiple_of_smaller = (
+            np.mean(samples_between_ends % step_sample_count == 0.0) > 0.9
             for step_sample_count in (sample_count, sample_count - 1)
         )
-        return sample_count - int(fits_smaller_count and not fits_larger_count)
+        return sample_count - int(is_multiple_of_smaller and not is_multiple_of_larger)
     return sample_count
 
 
@@ -292,10 +294,10 @@ def _compute_publication_age_s(topics: Topics, topic: str) -> pd.Series:
     """
     for table in topics.tables_of(topic)[:1]:
         if "timestamp_sample" in table:
-            measured_us = measurement_time_us(table)
-            measured_index = time_index((measured_us - topics.time_origin_us) * 1e-6)
-            age_us = table["timestamp"].astype(np.int64) - measured_us
-            return pd.Series(age_us * 1e-6, index=measured_index)
+            sample_times_us = measurement_time_us(table)
+            sample_time_index = time_index((sample_times_us - topics.time_origin_us) * 1e-6)
+            age_us = table["timestamp"].astype(np.int64) - sample_times_us
+            return pd.Series(age_us * 1e-6, index=sample_time_index)
     return pd.Series(dtype=np.float64)
 
 
@@ -330,12 +332,13 @@ def read_resets(local_samples: pd.DataFrame) -> tuple[Reset, ...]:
         for row in (
             np.flatnonzero(np.diff(local_samples[counter_field].to_numpy()) != 0) + 1
         ).tolist():
-            north, east, down = (
+            delta_north, delta_east, delta_down = (
                 float(local_samples[name].iloc[row]) if name in local_samples else 0.0
                 for name in delta_fields
             )
-            if all(np.isfinite([north, east, down])):
-                resets.append(Reset(float(local_samples.index[row]), quantity, (north, east, down)))
+            if all(np.isfinite([delta_north, delta_east, delta_down])):
+                delta = delta_north, delta_east, delta_down
+                resets.append(Reset(float(local_samples.index[row]), quantity, delta))
     return tuple(sorted(resets, key=lambda reset: reset.time_s))
 
 
@@ -397,24 +400,26 @@ def _last_finite_value(samples: pd.DataFrame, column: str, default: float) -> fl
 def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
     """Read the measured magnetic field from the magnetometer topic or from EKF2's observations.
 
-    A topic without missing samples is preferred, then the observations, which EKF2 logs with the
-    innovations.
+    Order of preference: a topic without missing samples, EKF2's observations (logged with the
+    innovations), the incomplete magnetometer topic.
     """
-    field_candidates = [
+    magnetic_field_tables = [
         topics.primary_samples(layout).dropna() for layout in px4.MAGNETIC_FIELD_LAYOUTS
     ]
     # EKF2 subtracts EKF2_MAG_DELAY and half a prediction step from the times of its observations
     delay_s = topics.ekf2_parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
-    field_candidates[1] = field_candidates[1].set_axis(field_candidates[1].index + delay_s)
-    complete_fields = [
+    magnetic_field_tables[1] = magnetic_field_tables[1].set_axis(
+        magnetic_field_tables[1].index + delay_s
+    )
+    complete_field_tables = [
         field
-        for field in field_candidates
+        for field in magnetic_field_tables
         if len(field) > MIN_MAGNETOMETER_HZ * topics.log.duration_s
     ]
-    fields_with_innovation = [
-        field for field in field_candidates if Columns.FIELD_INNOVATION[0] in field
+    tables_with_innovation = [
+        field for field in magnetic_field_tables if Columns.FIELD_INNOVATION[0] in field
     ]
-    field = max(complete_fields or fields_with_innovation or field_candidates, key=len)
+    field = max(complete_field_tables or tables_with_innovation or magnetic_field_tables, key=len)
     control_bits = topics.read(px4.TOPIC_LAYOUTS["control_bits"], is_step_function=True)[
         "bits"
     ].dropna()
@@ -425,10 +430,7 @@ def _read_magnetic_field(topics: Topics, step_s: float) -> pd.DataFrame:
 
 
 def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFrame:
-    """Compute the mean unfiltered optical flow between successive logged samples.
-
-    EKF2 logs low-pass filtered flow.
-    """
+    """Invert EKF2's low-pass filter: return the mean optical flow between logged samples."""
     flow_velocity, flow_intervals, flow_noise = (
         topics.primary_samples(px4.TOPIC_LAYOUTS[f"flow_{quantity}"]).dropna()
         for quantity in ("velocity", "interval", "noise")
@@ -437,7 +439,7 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     if not interval_s > 0.0 or flow_noise.empty:
         return pd.DataFrame()
     times_s = flow_velocity.index.to_numpy()
-    # After a longer interval, the previous logged flow no longer affects the filtered flow
+    # Only rows at most MAX_FLOW_INTERVAL_S after the previous row are used
     steps_s = np.diff(times_s)
     used_rows = np.flatnonzero((steps_s > 0.5 * interval_s) & (steps_s <= MAX_FLOW_INTERVAL_S)) + 1
     if FLOW.name in enabled_aids:
@@ -447,7 +449,7 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     sample_count = np.rint((times_s[used_rows] - times_s[used_rows - 1]) / interval_s)
     previous_output_weight = ((1.0 - FLOW_FILTER_WEIGHT) ** sample_count)[:, None]
     filtered_velocity = flow_velocity[["forward_m_s", "right_m_s"]].to_numpy()
-    forward_m_s, right_m_s = (
+    forward_velocity_m_s, right_velocity_m_s = (
         (filtered_velocity[used_rows] - previous_output_weight * filtered_velocity[used_rows - 1])
         / (1.0 - previous_output_weight)
     ).T
@@ -461,8 +463,8 @@ def _read_optical_flow(topics: Topics, enabled_aids: StepFunctions) -> pd.DataFr
     ).sum(axis=1)
     flow = pd.DataFrame(
         {
-            "forward_m_s": forward_m_s,
-            "right_m_s": right_m_s,
+            "forward_m_s": forward_velocity_m_s,
+            "right_m_s": right_velocity_m_s,
             "samples": sample_count,
             "interval_s": interval_s,
             "noise_m2_s2": squared_range
@@ -480,5 +482,5 @@ def _convert_attitude_variance(quaternion: Array, variance: Array) -> Array:
     be zero, because they are not logged.
     """
     w, x, y, z = quaternion.T
-    error_per_quaternion = np.array([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])
-    return np.asarray(4.0 * np.einsum("ijn,nj->ni", error_per_quaternion**2, variance))
+    attitude_error_jacobian = np.array([[-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])
+    return np.asarray(4.0 * np.einsum("ijn,nj->ni", attitude_error_jacobian**2, variance))

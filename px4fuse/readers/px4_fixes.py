@@ -18,14 +18,14 @@ MAX_SAME_FIX_TIME_DIFFERENCE_S = 0.01
 MAX_LATITUDE_DISTANCE_DEG = 1.0
 # Possible intervals (s) between the fixes of a GNSS receiver: 4 to 20 fixes per second
 CANDIDATE_FIX_INTERVALS_S = np.arange(0.05, 0.26, 0.0005)
-# Maximum deviation (s) of a logged interval between fixes from a multiple of the receiver's
-# interval: half of an EKF2 prediction interval, plus clock jitter
-MAX_MULTIPLE_DEVIATION_S = 0.006
+# Maximum deviation (s) of the interval between two logged fixes from a whole multiple of the
+# receiver's interval: half an EKF2 prediction interval, plus clock jitter
+MAX_DEVIATION_FROM_MULTIPLE_S = 0.006
 # Minimum number of fixes that are both logged and reconstructed, to measure the error
 MIN_LOGGED_FIXES = 10
-# The receiver interval is known if logged intervals of n and of n + 1 receiver intervals each occur
-# at least this often
-MIN_MULTIPLE_COUNT = 3
+# The receiver interval is known if logged intervals of both n and n + 1 receiver intervals occur at
+# least this often
+MIN_EQUAL_INTERVAL_COUNT = 3
 # Maximum RMS error (m) of reconstructed fixes, measured at fixes that are both logged and
 # reconstructed
 MAX_RECONSTRUCTION_ERROR_M = 0.1
@@ -51,7 +51,7 @@ def read_unlogged_fixes(
     height_layout = px4.TOPIC_LAYOUTS["fused_height"]
     if topics.find_layout(height_layout) and topics.ekf2_parameters.get("EKF2_HGT_REF", 1.0) == 1.0:
         fixes = fixes.join(topics.primary_samples(height_layout))
-    # EKF2 shifts GNSS times back by half a prediction step (estimator_interface.cpp)
+    # Undo EKF2's shift of GNSS times by half a prediction step (estimator_interface.cpp)
     fixes = fixes.set_axis(fixes.index + 0.5 * ekf2.step_s)
     next_row = np.clip(np.searchsorted(logged_fixes.index, fixes.index), 1, len(logged_fixes) - 1)
     distance_s = np.minimum(
@@ -92,41 +92,49 @@ def reconstruct_fixes(
     if isinstance(ekf2, Unavailable) or isinstance(ekf2.horizon_s, Unavailable) or len(fixes) < 3:
         return empty_result
     gnss_innovations = with_gnss_innovations(ekf2).innovations
-    north, east = gnss_innovations["north"], gnss_innovations["east"]
-    logged_fix_s = fixes.index.to_numpy()
-    receiver_interval_s = _estimate_receiver_interval(logged_fix_s)
+    north_innovations, east_innovations = gnss_innovations["north"], gnss_innovations["east"]
+    logged_fix_times_s = fixes.index.to_numpy()
+    receiver_interval_s = _estimate_receiver_interval(logged_fix_times_s)
     if (
         receiver_interval_s is None
-        or isinstance(north, Unavailable)
-        or isinstance(east, Unavailable)
+        or isinstance(north_innovations, Unavailable)
+        or isinstance(east_innovations, Unavailable)
     ):
         return empty_result
     # If a fix is older than the fusion horizon, EKF2 fuses it at the horizon (RingBuffer.h)
     delay_beyond_horizon_s = max(0.0, delay_s - ekf2.horizon_s)
-    fused_s = north.index.to_numpy() - delay_beyond_horizon_s
-    # An innovation belongs to the last fix before it, logged or not. That fix is a whole number of
-    # receiver intervals after the last logged fix; 0 if it is that fix
-    previous_fix_index = np.searchsorted(logged_fix_s, fused_s) - 1
-    elapsed_intervals = (fused_s - logged_fix_s[previous_fix_index]) / receiver_interval_s
-    is_between_fixes = (previous_fix_index >= 0) & (previous_fix_index < len(logged_fix_s) - 1)
+    fusion_times_s = north_innovations.index.to_numpy() - delay_beyond_horizon_s
+    # An innovation belongs to the last fix before it. Count the receiver intervals from the last
+    # logged fix to that fix: 0 if that fix is logged
+    previous_fix_index = np.searchsorted(logged_fix_times_s, fusion_times_s) - 1
+    elapsed_interval_count = (
+        fusion_times_s - logged_fix_times_s[previous_fix_index]
+    ) / receiver_interval_s
+    is_between_fixes = (previous_fix_index >= 0) & (
+        previous_fix_index < len(logged_fix_times_s) - 1
+    )
     # Skip innovations within one EKF2 step after a fix: they may also belong to the fix before
     is_unambiguous = is_between_fixes & (
-        elapsed_intervals % 1.0 > ekf2.step_s / receiver_interval_s
+        elapsed_interval_count % 1.0 > ekf2.step_s / receiver_interval_s
     )
     previous_fix_index = previous_fix_index[is_unambiguous]
-    elapsed_intervals = np.floor(elapsed_intervals[is_unambiguous])
-    reconstructed_fix_s = logged_fix_s[previous_fix_index] + elapsed_intervals * receiver_interval_s
+    elapsed_interval_count = np.floor(elapsed_interval_count[is_unambiguous])
+    reconstructed_fix_times_s = (
+        logged_fix_times_s[previous_fix_index] + elapsed_interval_count * receiver_interval_s
+    )
     reconstructed_fixes = pd.DataFrame(
         {
             column: interpolate_inside(
-                reconstructed_fix_s + delay_beyond_horizon_s, ekf2.state[column]
+                reconstructed_fix_times_s + delay_beyond_horizon_s, ekf2.state[column]
             )
             + innovations["innovation_m"].to_numpy()[is_unambiguous]
-            for column, innovations in zip(Columns.POSITION, (north, east), strict=False)
+            for column, innovations in zip(
+                Columns.POSITION, (north_innovations, east_innovations), strict=False
+            )
         },
-        index=time_index(reconstructed_fix_s),
+        index=time_index(reconstructed_fix_times_s),
     )
-    is_logged = elapsed_intervals == 0.0
+    is_logged = elapsed_interval_count == 0.0
     position_error = (
         reconstructed_fixes - fixes[reconstructed_fixes.columns].to_numpy()[previous_fix_index]
     )
@@ -141,7 +149,7 @@ def reconstruct_fixes(
     for column in (Columns.POSITION[2], *Columns.POSITION_VARIANCE):
         if column in fixes:
             reconstructed_fixes[column] = np.interp(
-                reconstructed_fixes.index, logged_fix_s, fixes[column]
+                reconstructed_fixes.index, logged_fix_times_s, fixes[column]
             )
     return reconstructed_fixes, (
         f"{len(reconstructed_fixes)} unlogged GNSS fixes are reconstructed as EKF2 position plus "
@@ -158,21 +166,21 @@ def _estimate_receiver_interval(fix_times_s: Array) -> float | None:
     logged_intervals_s = np.diff(fix_times_s)[:, None]
     multiples = logged_intervals_s / CANDIDATE_FIX_INTERVALS_S
     multiple_deviation_s = np.abs(multiples - np.round(multiples)) * CANDIDATE_FIX_INTERVALS_S
-    worst_deviation_s = np.percentile(multiple_deviation_s, 98, axis=0)
-    possible_indices = np.flatnonzero(worst_deviation_s <= MAX_MULTIPLE_DEVIATION_S)
+    deviation_percentile_98_s = np.percentile(multiple_deviation_s, 98, axis=0)
+    possible_indices = np.flatnonzero(deviation_percentile_98_s <= MAX_DEVIATION_FROM_MULTIPLE_S)
     if not len(possible_indices):
         return None
     longest_interval_s = CANDIDATE_FIX_INTERVALS_S[possible_indices[-1]]
-    # Of the candidates within 10 % of the longest possible interval, use that with the smallest
-    # deviation
-    near_indices = np.flatnonzero(
+    # Of the candidates within 10 % of the longest possible interval, use the one from whose
+    # multiples the logged intervals deviate least
+    near_longest_indices = np.flatnonzero(
         np.abs(CANDIDATE_FIX_INTERVALS_S - longest_interval_s) < 0.1 * longest_interval_s
     )
     best_interval_s = CANDIDATE_FIX_INTERVALS_S[
-        near_indices[np.argmin(worst_deviation_s[near_indices])]
+        near_longest_indices[np.argmin(deviation_percentile_98_s[near_longest_indices])]
     ]
     interval_multiples = np.round(logged_intervals_s[:, 0] / best_interval_s)
-    is_frequent = np.bincount(interval_multiples.astype(int)) >= MIN_MULTIPLE_COUNT
+    is_frequent = np.bincount(interval_multiples.astype(int)) >= MIN_EQUAL_INTERVAL_COUNT
     if not np.any(is_frequent[1:] & is_frequent[:-1]):
         return None
     return float(np.median(logged_intervals_s[:, 0] / interval_multiples))

@@ -23,7 +23,7 @@ class Ekf2Source:
     vertical: str
     # Advice to enable the fusion, by "horizontal" and "vertical" (height)
     remedies: Mapping[str, str]
-    # Advice to log the innovations
+    # Advice to the user if the innovations are not logged
     to_log: str
     # Name of the height sensor, if it is not the position source itself
     height: str = ""
@@ -63,7 +63,7 @@ def has_fused_aid(ekf2: Ekf2 | Unavailable, aid: str = GNSS_POS.name) -> bool:
 
 
 def with_gnss_innovations(ekf2: Ekf2, source: Ekf2Source = GNSS) -> Ekf2:
-    """Return the EKF2 data with GNSS innovations in place of external vision innovations."""
+    """Return the EKF2 data with the innovations of ``source`` instead of external vision."""
     enabled_flags = {
         group: ekf2.states[name]
         for group, name in (("horizontal", source.horizontal), ("vertical", source.vertical))
@@ -109,16 +109,16 @@ def collect_innovations_by_axis(
     used_topics: dict[str, None] = {}
     for axis in AXIS_NAMES:
         group = "vertical" if axis == "down" else "horizontal"
-        sensor = (axis == "down" and source.height) or source.name
+        sensor_name = (axis == "down" and source.height) or source.name
         aid_log = aids.get(source.vertical if axis == "down" else source.horizontal)
         axis_innovations = None if aid_log is None else select_axis_innovations(aid_log, axis, gate)
         if isinstance(fusion_flags, pd.DataFrame) and not fusion_flags[group].any():
             quantity = "height" if axis == "down" else "horizontal position"
-            reason = f"EKF2 never fused the {quantity} from {sensor} in this log"
+            reason = f"EKF2 never fused the {quantity} from {sensor_name} in this log"
             remedy = source.remedies[group]
         elif aid_log is None or axis_innovations is None or axis_innovations.empty:
             reason = (
-                f"while {sensor} was fused, the log has no usable sample of "
+                f"while {sensor_name} was fused, the log has no usable sample of "
                 f"estimator_aid_src_{source.horizontal}, estimator_aid_src_{source.vertical}, "
                 "estimator_innovations or ekf2_innovations"
             )
@@ -132,9 +132,9 @@ def collect_innovations_by_axis(
 
 
 def select_axis_innovations(log: AidLog, axis: NedAxis, gate: float) -> pd.DataFrame:
-    """Return the innovations of an aiding source along one axis which EKF2 fused or rejected.
+    """Return innovations along one axis, with flags "fused" and "rejected".
 
-    EKF2 rejects a sample along all axes if one axis exceeds the ``gate`` (√S).
+    A sample is rejected along all axes if any axis exceeds the ``gate`` (√S).
     """
     samples = log.samples
     nis_by_axis = {

@@ -30,8 +30,8 @@ from px4fuse.flight.model import (
 )
 from px4fuse.readers import px4_topics as px4
 from px4fuse.readers.common import (
+    classify_invalid_positions,
     estimate_rounding_step,
-    find_invalid_rows,
     interpolate_inside,
     join_nearest,
     read_attitude,
@@ -59,10 +59,16 @@ MAX_HEIGHT_TIME_DIFFERENCE_S = 0.05
 MAX_DOWNSAMPLED_HZ = 4.0
 STATUS_COLUMNS = ["reset_counter", "quality", "age_s"]
 # Length (µs) of each possible unit of timestamps
-STAMP_UNITS = {"microseconds": 1.0, "milliseconds": 1e3, "seconds": 1e6, "nanoseconds": 1e-3}
-# Timestamps have a unit if their rate in this unit is that of the boot clock within this fraction
+MICROSECONDS_BY_UNIT = {
+    "microseconds": 1.0,
+    "milliseconds": 1e3,
+    "seconds": 1e6,
+    "nanoseconds": 1e-3,
+}
+# Timestamps are in a unit in which their rate differs from that of the boot clock by at most this
+# fraction
 MAX_RELATIVE_RATE_ERROR = 0.05
-AUTOPILOT_CLOCK = "autopilot boot clock (PX4 converted the sender's timestamps)"
+AUTOPILOT_CLOCK_TEXT = "autopilot boot clock (PX4 converted the sender's timestamps)"
 # Latitude and longitude in degrees, optionally altitude in m
 GeodeticPosition = tuple[float, ...]
 
@@ -72,8 +78,8 @@ def read_positions(
 ) -> tuple[tuple[PositionTrack, ...], tuple[Unavailable, ...]]:
     """Read the positions of all sources in the log, best first, and the missing sources."""
     fusion_flags = ekf2.fusion_flags if isinstance(ekf2, Ekf2) else ekf2
-    # EKF2's position observations contain no orientation. If EKF2 also fused yaw from the position
-    # source, the source is odometry
+    # EKF2's position observations contain no orientation: only fused yaw shows that the source is
+    # odometry
     is_odometry = isinstance(fusion_flags, pd.DataFrame) and bool((fusion_flags["yaw"] > 0).any())
     return split_tracks(
         [
@@ -136,7 +142,7 @@ def make_track(
     if origin.is_gnss:  # repetitions are valid: a receiver at rest may repeat its position
         samples, invalid_rows = select_valid_rows(samples, needed_columns), NO_INVALID_ROWS
     else:
-        invalid_reasons = find_invalid_rows(samples, needed_columns)
+        invalid_reasons = classify_invalid_positions(samples, needed_columns)
         samples, invalid_rows = (
             samples[invalid_reasons == ""],
             invalid_reasons[invalid_reasons != ""],
@@ -182,7 +188,7 @@ def _make_ulog_track(
         parameters = topics.ekf2_parameters
         lever_arm_m = tuple(parameters.get(parameter, 0.0) for parameter in origin.aid.lever_arm)
         track_fields = {"lever_arm_m": lever_arm_m, **track_fields}
-    fields = {"frame": "NED", "clock": AUTOPILOT_CLOCK, **track_fields}
+    fields = {"frame": "NED", "clock": AUTOPILOT_CLOCK_TEXT, **track_fields}
     fields |= {"description": source.description, "topics": topic_names, "log": topics.log.name}
     return make_track(name, samples, origin, **fields)
 
@@ -229,31 +235,31 @@ def _describe_arrival_clock(topics: Topics, topic: str) -> ClockMap | None:
     if "timestamp_sample" not in table or len(table["timestamp"]) < MIN_TRACK_SAMPLES:
         return None
     published_us = table["timestamp"].astype(np.int64)
-    sampled_us = table["timestamp_sample"].astype(np.int64)
-    age_us = published_us - sampled_us
+    sample_timestamps_us = table["timestamp_sample"].astype(np.int64)
+    age_us = published_us - sample_timestamps_us
     if np.mean(np.abs(age_us) <= MAX_ARRIVAL_DELAY_US) >= MIN_ARRIVAL_TIME_FRACTION:
-        clock = SENDER_CLOCK
+        clock_name = SENDER_CLOCK
         note = "PX4 replaced timestamps by arrival times, because the clocks were not synchronised"
     elif abs(np.median(age_us)) > MAX_PUBLICATION_LAG_S * 1e6:
-        clock = _describe_timestamp_clock(published_us, sampled_us)
+        clock_name = _describe_timestamp_clock(published_us, sample_timestamps_us)
         note = "timestamp_sample does not contain boot times in microseconds"
     else:
         return describe_repeated_timestamps(
-            SENDER_CLOCK, len(sampled_us), len(np.unique(sampled_us))
+            SENDER_CLOCK, len(sample_timestamps_us), len(np.unique(sample_timestamps_us))
         )
-    return ClockMap(clock, "arrival time", len(age_us), 0.0, 0.0, 0.0, note)
+    return ClockMap(clock_name, "arrival time", len(age_us), 0.0, 0.0, 0.0, note)
 
 
-def _describe_timestamp_clock(published_us: IntArray, sampled_us: IntArray) -> str:
+def _describe_timestamp_clock(published_us: IntArray, sample_timestamps_us: IntArray) -> str:
     """Describe timestamps that are not boot time in µs, for example "UNIX time in milliseconds"."""
-    if not sampled_us.any():
+    if not sample_timestamps_us.any():
         return "0"
-    rate_ratio = float(np.ptp(published_us)) / max(float(np.ptp(sampled_us)), 1.0)
-    for unit, unit_us in STAMP_UNITS.items():
+    rate_ratio = float(np.ptp(published_us)) / max(float(np.ptp(sample_timestamps_us)), 1.0)
+    for unit, unit_us in MICROSECONDS_BY_UNIT.items():
         if abs(rate_ratio / unit_us - 1.0) < MAX_RELATIVE_RATE_ERROR:
             if (
                 MIN_VALID_UNIX_TIME_S
-                <= float(np.median(sampled_us)) * unit_us * 1e-6
+                <= float(np.median(sample_timestamps_us)) * unit_us * 1e-6
                 < MAX_VALID_UNIX_TIME_S
             ):
                 return f"UNIX time in {unit}"
@@ -339,15 +345,15 @@ def _reconstruct_track(
         return unavailable_source(
             px4.RECONSTRUCTED_TRACK, "EKF2 fused no horizontal external vision position"
         )
-    height_m = positions.pop("down_m", None)
+    down_m = positions.pop("down_m", None)
     return _make_derived_track(
         topics,
         px4.RECONSTRUCTED_TRACK,
         pd.DataFrame(positions),
-        None if height_m is None else height_m.to_frame("down_m"),
+        None if down_m is None else down_m.to_frame("down_m"),
         ("vehicle_local_position", *ekf2.innovation_topics),
         is_odometry=is_odometry,
-        clock=f"times of the innovations plus {EV_POS.delay}, late by up to one sample interval",
+        clock=f"fusion times plus {EV_POS.delay}, late by up to one interval of the source",
     )
 
 
@@ -358,17 +364,25 @@ def project(
 
     Source: PX4 ``MapProjection::project``, src/lib/geo/geo.cpp (Snyder 1987, equation 25-2).
     """
-    latitude_0, longitude_0 = np.radians(origin[:2])
-    latitude = np.radians(latitude_deg)
-    longitude_difference = np.radians(longitude_deg) - longitude_0
-    sine, cosine = np.sin(latitude), np.cos(latitude)
-    sine_0, cosine_0 = np.sin(latitude_0), np.cos(latitude_0)
-    cosine_difference = np.cos(longitude_difference)
-    angle = np.arccos(np.clip(sine_0 * sine + cosine_0 * cosine * cosine_difference, -1.0, 1.0))
-    arc_over_chord = np.where(angle > 0, angle / np.where(angle > 0, np.sin(angle), 1.0), 1.0)
-    north = arc_over_chord * (cosine_0 * sine - sine_0 * cosine * cosine_difference)
-    east = arc_over_chord * cosine * np.sin(longitude_difference)
-    return north * EARTH_RADIUS_M, east * EARTH_RADIUS_M
+    origin_latitude_rad, origin_longitude_rad = np.radians(origin[:2])
+    latitude_rad = np.radians(latitude_deg)
+    longitude_step_rad = np.radians(longitude_deg) - origin_longitude_rad
+    sin_latitude, cos_latitude = np.sin(latitude_rad), np.cos(latitude_rad)
+    sin_origin, cos_origin = np.sin(origin_latitude_rad), np.cos(origin_latitude_rad)
+    cos_longitude_step = np.cos(longitude_step_rad)
+    arc_rad = np.arccos(
+        np.clip(
+            sin_origin * sin_latitude + cos_origin * cos_latitude * cos_longitude_step, -1.0, 1.0
+        )
+    )
+    arc_over_chord = np.where(
+        arc_rad > 0, arc_rad / np.where(arc_rad > 0, np.sin(arc_rad), 1.0), 1.0
+    )
+    north_rad = arc_over_chord * (
+        cos_origin * sin_latitude - sin_origin * cos_latitude * cos_longitude_step
+    )
+    east_rad = arc_over_chord * cos_latitude * np.sin(longitude_step_rad)
+    return north_rad * EARTH_RADIUS_M, east_rad * EARTH_RADIUS_M
 
 
 def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[Array, Array]:
@@ -376,17 +390,17 @@ def unproject(north_m: Array, east_m: Array, origin: GeodeticPosition) -> tuple[
 
     Source: PX4 ``MapProjection::reproject``, src/lib/geo/geo.cpp (Snyder 1987, equation 20-14).
     """
-    x, y = north_m / EARTH_RADIUS_M, east_m / EARTH_RADIUS_M
-    latitude_0, longitude_0 = np.radians(origin[:2])
-    sine, cosine = np.sin(latitude_0), np.cos(latitude_0)
-    angle = np.hypot(x, y)
-    # sin(angle)/angle, 1 at the origin
-    sinc_angle = np.sinc(angle / np.pi)
-    latitude = np.arcsin(np.cos(angle) * sine + x * sinc_angle * cosine)
-    longitude = longitude_0 + np.arctan2(
-        y * sinc_angle, cosine * np.cos(angle) - x * sine * sinc_angle
+    north_rad, east_rad = north_m / EARTH_RADIUS_M, east_m / EARTH_RADIUS_M
+    origin_latitude_rad, origin_longitude_rad = np.radians(origin[:2])
+    sin_origin, cos_origin = np.sin(origin_latitude_rad), np.cos(origin_latitude_rad)
+    arc_rad = np.hypot(north_rad, east_rad)
+    # sin(arc)/arc, 1 at the origin
+    sinc_arc = np.sinc(arc_rad / np.pi)
+    latitude_rad = np.arcsin(np.cos(arc_rad) * sin_origin + north_rad * sinc_arc * cos_origin)
+    longitude_rad = origin_longitude_rad + np.arctan2(
+        east_rad * sinc_arc, cos_origin * np.cos(arc_rad) - north_rad * sin_origin * sinc_arc
     )
-    return np.degrees(latitude), np.degrees(longitude)
+    return np.degrees(latitude_rad), np.degrees(longitude_rad)
 
 
 def _find_local_origin(topics: Topics) -> GeodeticPosition | None:
@@ -411,11 +425,11 @@ def project_to_ned(global_positions: pd.DataFrame, origin: GeodeticPosition | No
     global_positions = global_positions[Columns.GEODETIC]
     is_missing = (global_positions.iloc[:, :2] == 0.0).all(axis=1)
     global_positions = global_positions.mask(is_missing)
-    latitude, longitude, altitude = global_positions.to_numpy().T
-    origin = origin or (latitude[0], longitude[0], altitude[0])
-    north, east = project(latitude, longitude, origin)
-    ned = {"north_m": north, "east_m": east, "down_m": origin[2] - altitude}
-    return pd.DataFrame(ned, index=global_positions.index)
+    latitude_deg, longitude_deg, altitude_m = global_positions.to_numpy().T
+    origin = origin or (latitude_deg[0], longitude_deg[0], altitude_m[0])
+    north_m, east_m = project(latitude_deg, longitude_deg, origin)
+    position_columns = {"north_m": north_m, "east_m": east_m, "down_m": origin[2] - altitude_m}
+    return pd.DataFrame(position_columns, index=global_positions.index)
 
 
 def _read_gnss_track(topics: Topics, ekf2: Ekf2 | Unavailable) -> PositionTrack | Unavailable:
@@ -517,7 +531,7 @@ def _convert_gnss_fixes(fixes: pd.DataFrame, origin: GeodeticPosition | None) ->
 
 
 def barometer(altitude_m: pd.Series[float], delay_s: float = 0.0) -> pd.DataFrame | None:
-    """Convert barometer altitude to the column ``down_m`` (m), at times minus ``delay_s``.
+    """Convert barometer altitude to the column ``down_m`` (m); subtract ``delay_s`` from the times.
 
     Return None with fewer than three samples.
     """
@@ -558,7 +572,7 @@ def read_truth(
                 local_samples[column] += np.nan_to_num(shift_m)
     if len(local_samples):
         return Truth(local_layout.topic, local_samples, attitude)
-    mocap_truth = motion_capture_truth(positions)
+    mocap_truth = find_motion_capture_truth(positions)
     reason = "the log has neither simulation ground truth nor motion capture"
     remedy = px4.TRACK_SOURCES["vehicle_mocap_odometry"].remedy
     if len(logged_local_samples):
@@ -567,7 +581,7 @@ def read_truth(
     return mocap_truth or Unavailable("ground truth", reason, remedy)
 
 
-def motion_capture_truth(positions: tuple[PositionTrack, ...]) -> Truth | None:
+def find_motion_capture_truth(positions: tuple[PositionTrack, ...]) -> Truth | None:
     """Return motion capture as ground truth, or None if EKF2 may have fused it.
 
     EKF2 may have fused it if the log contains no external vision. Motion capture in FRD is not

@@ -27,15 +27,15 @@ class TrackSource:
     kind: str
     path: str
     description: str
-    # Advice to record these positions
+    # Advice to the user if the positions of this source are not logged
     remedy: str
     # False if EKF2 never fuses these positions
     fused: bool = True
     # Coordinate frame of the positions. If "unknown", a field of the topic may contain it, see
     # FRAME_BY_FIELD_VALUE
     frame: str = "unknown"
-    # Keys in TOPIC_LAYOUTS: formats of the topic in PX4 releases, best first; empty for positions
-    # that are computed from several topics
+    # Keys in TOPIC_LAYOUTS of the formats of this topic, preferred format first; empty for
+    # positions that are computed from several topics
     layouts: tuple[str, ...] = ()
 
     @property
@@ -60,17 +60,18 @@ STATE_VECTOR_TOPICS = ("estimator_states", "estimator_status")  # since v1.12, v
 # Layouts of the measured magnetic field: magnetometer topic, and observation in EKF2's aiding
 # source topic (since v1.14)
 MAGNETIC_FIELD_LAYOUTS = TOPIC_LAYOUTS["magnetometer"], TOPIC_LAYOUTS["observed_field"]
-# Number of attitude variances, by the numbers of logged states and of logged variances: 4 variances
-# of the quaternion, or 3 of the rotation error (generated/state.h, v1.15.4 and v1.16)
-ATTITUDE_VARIANCES_BY_SIZE: Mapping[tuple[int, int], int] = {
+# (number of logged states, number of logged variances): number of attitude variances, which are 4
+# of the quaternion or 3 of the rotation error (generated/state.h, v1.15.4 and v1.16)
+ATTITUDE_VARIANCE_COUNTS: Mapping[tuple[int, int], int] = {
     (24, 24): 4,
     (24, 23): 3,
     (25, 24): 3,
-    (32, 28): 4,  # before v1.9: both arrays have unused elements after the 24 states
+    (32, 28): 4,  # before v1.9: 24 states, then unused elements
 }
 QUATERNION_VARIANCE_COUNT = 4
 ANTENNA_COLUMNS = ["antenna_forward_m", "antenna_right_m", "antenna_down_m"]
-# Names in the option --position-source: EKF2's observations, EKF2 position plus innovation, GNSS
+# Values of the option --position-source: positions that EKF2 fused, positions reconstructed as EKF2
+# position plus innovation, GNSS positions
 FUSED_OBSERVATION_TRACK = "estimator_aid_src_ev_pos"
 RECONSTRUCTED_TRACK = "ekf2_state_plus_innovation"
 GPS_POSITION = "vehicle_gps_position"
@@ -100,8 +101,10 @@ def find_track_layouts(source_name: str) -> list[Layout]:
 
 def list_topics() -> list[str]:
     """Return the sorted names of all PX4 topics that the ULog reader decodes."""
-    named_topics = {layout.topic for track in TRACK_SOURCES for layout in find_track_layouts(track)}
-    named_topics |= {layout.topic for layout in TOPIC_LAYOUTS.values() if layout.topic}
-    named_topics |= {f"estimator_aid_src_{name}" for name in AIDS}
+    layout_topics = {
+        layout.topic for track in TRACK_SOURCES for layout in find_track_layouts(track)
+    }
+    layout_topics |= {layout.topic for layout in TOPIC_LAYOUTS.values() if layout.topic}
+    layout_topics |= {f"estimator_aid_src_{name}" for name in AIDS}
     aid_topics = {STATUS_FLAGS, *INNOVATION_TOPICS, OLD_INNOVATION_TOPIC}
-    return sorted(named_topics | UNUSED_TOPICS.keys() | aid_topics | {*STATE_VECTOR_TOPICS})
+    return sorted(layout_topics | UNUSED_TOPICS.keys() | aid_topics | {*STATE_VECTOR_TOPICS})

@@ -36,13 +36,13 @@ _ISO_DATE = re.compile(r"\d{4}-\d\d-\d\d")
 
 
 @dataclass(frozen=True)
-class Table:
+class PositionTable:
     """Table of positions in a file, as text with named columns."""
 
     file_name: str
     # Name of the format; "" for a table with a header
     format: str
-    names: list[str]
+    column_names: list[str]
     # Text of the rows, without the header
     data_text: str
     separator: str = ","
@@ -54,19 +54,19 @@ class Table:
     # Frame rate, if the time column contains frame numbers instead of times
     rate_hz: float | None = None
     # True if the table contains only the rigid body, tag or topic that the user selected
-    is_chosen_body: bool = False
+    has_only_chosen_body: bool = False
     notes: tuple[str, ...] = ()
 
     def format_labels(self, *columns: int | None) -> str:
         """Join the names of columns for a message; repeated indices and None are omitted."""
         labels = dict.fromkeys(
-            quote(self.names[index]) if self.names[index] else f"column {index + 1}"
+            quote(self.column_names[index]) if self.column_names[index] else f"column {index + 1}"
             for index in columns
             if index is not None
         )
         return ", ".join([*labels][:12]) + (", ..." if len(labels) > 12 else "")
 
-    def format_first_line(self, rows: pd.Index) -> str:
+    def format_first_line_number(self, rows: pd.Index) -> str:
         """Return " (first: line N)" for the first of ``rows``; "" if rows are not lines."""
         return (
             "" if self.header_line is None else f" (first: line {self.header_line + 1 + rows[0]})"
@@ -119,7 +119,7 @@ def choose_body(file_name: str, body_names: Iterable[str], wanted_body: str | No
 
 def find_table(
     path: Path, content: bytes, columns: tuple[str, ...] | None, body: str | None
-) -> Table:
+) -> PositionTable:
     """Find the table of positions in a file.
 
     Parameters
@@ -170,9 +170,9 @@ def find_table(
         )
     first_row = table.data_text[:MAX_HEADER_CHARS].lstrip("\n").partition("\n")[0]
     row_width = len(_split_line(first_row.rstrip(f"{table.separator} "), table.separator))
-    if row_width > len(table.names):
+    if row_width > len(table.column_names):
         raise LogError(
-            f"{file_name}: the header has {len(table.names)} columns, but the rows have "
+            f"{file_name}: the header has {len(table.column_names)} columns, but the rows have "
             f"{row_width}.",
             "Write numbers with decimal points, and give each column a name.",
         )
@@ -196,17 +196,17 @@ def _split_line(line: str, separator: str) -> list[str]:
 
 def _find_header_table(
     file_name: str, text: str, lines: Sequence[str], wanted_names: set[str]
-) -> Table | None:
+) -> PositionTable | None:
     """Find the header: the first line with column names for time and position.
 
     If ``wanted_names`` is not empty, the header is the first line with these column names.
     """
     for index, line in enumerate(lines):
         for separator in SEPARATORS:
-            names = _split_line(line.strip("#% "), separator)
-            if len(names) <= MAX_COLUMNS and _is_header(names, wanted_names):
+            column_names = _split_line(line.strip("#% "), separator)
+            if len(column_names) <= MAX_COLUMNS and _is_header(column_names, wanted_names):
                 data_text = _remove_comments(text.split("\n", index + 1)[index + 1])
-                return Table(file_name, "", names, data_text, separator, index + 1)
+                return PositionTable(file_name, "", column_names, data_text, separator, index + 1)
     return None
 
 
@@ -220,7 +220,7 @@ def _is_header(fields: list[str], wanted_names: set[str]) -> bool:
 
 def _find_body_table(
     file_name: str, text: str, lines: Sequence[str], wanted_body: str | None
-) -> Table | None:
+) -> PositionTable | None:
     """Find the columns of one rigid body in a CSV export of Motive or Vicon Nexus."""
     header_index = next((i for i, line in enumerate(lines[:12]) if line.startswith("Frame,")), 0)
     rows = [_split_line(line, ",") for line in lines[: header_index + 2]]
@@ -233,45 +233,45 @@ def _find_body_table(
         unit = dict(zip(rows[0][::2], rows[0][1::2], strict=False)).get("Length Units", "")
         row_by_title = {row[1]: row for row in rows[2:header_index]}
         body_names, body_types = (row_by_title.get(title, axes) for title in ("Name", "Type"))
-        used_types = {"Rigid Body"} if "Rigid Body" in body_types else {*body_types}
+        used_body_types = {"Rigid Body"} if "Rigid Body" in body_types else {*body_types}
         # Rotations get no column name, so they are not read: a rigid body's axes are not FRD
-        names = [
-            f"{axis}_{unit}" if group == "Position" and body_type in used_types else ""
+        column_names = [
+            f"{axis}_{unit}" if group == "Position" and body_type in used_body_types else ""
             for axis, group, body_type in zip(
                 axes, rows[header_index - 1], body_types, strict=False
             )
         ]
     else:
         body_names = pd.Series(rows[2]).replace("", None).ffill().fillna("").tolist()
-        names = [
+        column_names = [
             f"{axis.removeprefix('T')}_{unit}" if axis.removeprefix("T") in {*"XYZ"} else ""
             for axis, unit in zip(axes, rows[header_index + 1], strict=False)
         ]
         data_text = re.split(r"\n[, ]*\n", data_text.partition("\n")[2], maxsplit=1)[0] + "\n"
     bodies_with_position = (
-        body_name for body_name, name in zip(body_names, names, strict=False) if name
+        body_name for body_name, name in zip(body_names, column_names, strict=False) if name
     )
-    chosen_body = choose_body(file_name, bodies_with_position, wanted_body)
-    names = [
-        name * (body_name == chosen_body)
-        for body_name, name in zip(body_names, names, strict=False)
+    chosen_body_name = choose_body(file_name, bodies_with_position, wanted_body)
+    column_names = [
+        name * (body_name == chosen_body_name)
+        for body_name, name in zip(body_names, column_names, strict=False)
     ]
-    names[:2] = axes[:2] if is_motive else ["time", ""]
-    return Table(
+    column_names[:2] = axes[:2] if is_motive else ["time", ""]
+    return PositionTable(
         file_name,
         "OptiTrack Motive CSV export" if is_motive else "Vicon Nexus CSV export",
-        names,
+        column_names,
         data_text,
         header_line=header_index + 1,
         # Motive exports y up by default, and z up by an option that the file does not contain
         frames=("eus", "enu") if is_motive else (),
         rate_hz=None if is_motive else float(rows[1][0]),
-        is_chosen_body=True,
-        notes=(f"the body is {quote(chosen_body)}",),
+        has_only_chosen_body=True,
+        notes=(f"the positions are those of body {quote(chosen_body_name)}",),
     )
 
 
-def _find_stream_table(file_name: str, text: str, lines: Sequence[str]) -> Table | None:
+def _find_stream_table(file_name: str, text: str, lines: Sequence[str]) -> PositionTable | None:
     """Find the positions in a text format of ``formats.toml``, such as the output of a UWB tag."""
     for stream_format in STREAM_FORMATS:
         pattern = re.compile(stream_format["row"], re.MULTILINE)
@@ -283,12 +283,14 @@ def _find_stream_table(file_name: str, text: str, lines: Sequence[str]) -> Table
             if lost_count := text.count("\n") - len(rows):
                 notes.append(f"lines without a position: {lost_count}")
             csv_text = "".join(f"{','.join(row)}\n" for row in rows)
-            names = [*pattern.groupindex]
-            return Table(file_name, stream_format["name"], names, csv_text, notes=tuple(notes))
+            column_names = [*pattern.groupindex]
+            return PositionTable(
+                file_name, stream_format["name"], column_names, csv_text, notes=tuple(notes)
+            )
     return None
 
 
-def _find_json_table(file_name: str, text: str) -> Table | None:
+def _find_json_table(file_name: str, text: str) -> PositionTable | None:
     """Convert a file of JSON lines to a table with column names like ``data.coordinates.x``."""
     if not text.lstrip().startswith(("{", "[{")):
         return None
@@ -306,7 +308,7 @@ def _find_json_table(file_name: str, text: str) -> Table | None:
         column_path for column_path in map(str, columns) if read_column_name(column_path).kind
     ]
     is_pozyx = "data.coordinates.x" in column_paths
-    return Table(
+    return PositionTable(
         file_name,
         "Pozyx JSON stream" if is_pozyx else "JSON lines",
         [
@@ -317,7 +319,7 @@ def _find_json_table(file_name: str, text: str) -> Table | None:
     )
 
 
-def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Table | None:
+def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> PositionTable | None:
     """Read a table without header: columns time, x, y, z, or 3x4 matrices in KITTI files."""
     plain_lines = (line.partition("#")[0] for line in lines)
     first_row = next((line for line in plain_lines if line.strip(" \t%")), "")
@@ -334,11 +336,13 @@ def _find_headerless_table(path: Path, text: str, lines: Sequence[str]) -> Table
                 name, quaternion_order = "TUM trajectory", "xyzw"
             elif separator == "," and len(fields) in (8, 17) and len(fields[0]) == 19:
                 name, quaternion_order = "EuRoC ground truth", "wxyz"
-            names = ["time", "x", "y", "z", *(f"q{axis}" for axis in quaternion_order)]
-            names += [""] * (len(fields) - len(names))
+            column_names = ["time", "x", "y", "z", *(f"q{axis}" for axis in quaternion_order)]
+            column_names += [""] * (len(fields) - len(column_names))
             note = "the file has no header: columns 1 to 4 are read as time, x, y, z"
             data_text = _remove_comments(text)
-            return Table(display_name(path), name, names, data_text, separator, 0, notes=(note,))
+            return PositionTable(
+                display_name(path), name, column_names, data_text, separator, 0, notes=(note,)
+            )
     return None
 
 
@@ -346,7 +350,7 @@ def _remove_comments(text: str) -> str:
     return re.sub(r"(?m)[ \t]*#.*|^[ \t]*%.*", "", text)
 
 
-def _read_kitti_table(path: Path, text: str) -> Table:
+def _read_kitti_table(path: Path, text: str) -> PositionTable:
     """Read poses from the 3x4 matrices of a KITTI file, and times from a file in its folder."""
     # imported here, because most recordings need no rotations
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
@@ -373,4 +377,4 @@ def _read_kitti_table(path: Path, text: str) -> Table:
     names = ["time_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
     note = f"the times are from {display_name(times_path)}"
     csv_text = pd.DataFrame(pose_rows).to_csv(index=False, header=False)
-    return Table(name, "KITTI poses", names, csv_text, frames=("edn",), notes=(note,))
+    return PositionTable(name, "KITTI poses", names, csv_text, frames=("edn",), notes=(note,))

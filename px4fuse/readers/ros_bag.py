@@ -16,22 +16,22 @@ from px4fuse.core.reading import (
     max_log_bytes,
 )
 from px4fuse.errors import LogError
-from px4fuse.readers.recording_table import Table
+from px4fuse.readers.recording_table import PositionTable
 
 _BAG_SUFFIXES = (".bag", ".mcap", ".db3")
-_PATH_TYPE = "nav_msgs/msg/Path"
+_PATH_MESSAGE_TYPE = "nav_msgs/msg/Path"
 _FRAME_NED = 1  # VehicleOdometry.POSE_FRAME_NED
 _POSE_COLUMNS = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "sigma_x_m", "sigma_y_m", "sigma_z_m"]
 
 
 # Message types that contain a position
-_POSITION_TYPES = (
+_POSITION_MESSAGE_TYPES = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/TransformStamped",
     "geometry_msgs/msg/PointStamped",
     "nav_msgs/msg/Odometry",
-    _PATH_TYPE,
+    _PATH_MESSAGE_TYPE,
     "px4_msgs/msg/VehicleOdometry",
 )
 
@@ -61,7 +61,7 @@ def is_bag(path: Path) -> bool:
     return (path / "metadata.yaml").exists() or path.suffix.lower() in _BAG_SUFFIXES
 
 
-def read_bag(path: Path, topic: str | None) -> tuple[Table, str, int]:
+def read_bag(path: Path, topic: str | None) -> tuple[PositionTable, str, int]:
     """Read the poses in one topic of a bag; return also the SHA-256 and size (bytes) of the bag.
 
     Raises
@@ -99,12 +99,12 @@ def read_bag(path: Path, topic: str | None) -> tuple[Table, str, int]:
         ) from error
 
 
-def _read_topic(name: str, reader: Any, topic: str | None) -> Table:
+def _read_topic(name: str, reader: Any, topic: str | None) -> PositionTable:
     type_by_topic = {connection.topic: connection.msgtype for connection in reader.connections}
     usable_topics = [
         topic_name
         for topic_name, message_type in type_by_topic.items()
-        if message_type in _POSITION_TYPES
+        if message_type in _POSITION_MESSAGE_TYPES
     ]
     chosen_topic = usable_topics[0] if topic is None and len(usable_topics) == 1 else topic
     if chosen_topic not in usable_topics:
@@ -119,14 +119,12 @@ def _read_topic(name: str, reader: Any, topic: str | None) -> Table:
     messages = reader.messages(
         [connection for connection in reader.connections if connection.topic == chosen_topic]
     )
-    if message_type == _PATH_TYPE:
-        messages = deque(
-            messages, maxlen=1
-        )  # the last path contains the poses of all previous paths
+    if message_type == _PATH_MESSAGE_TYPE:
+        messages = deque(messages, maxlen=1)  # the last path repeats the poses of all others
     lags_s, csv_rows, pose_frames = [], [], set()
     for connection, receive_ns, raw_message in messages:
         message = reader.deserialize(raw_message, connection.msgtype)
-        for stamped_message in message.poses if message_type == _PATH_TYPE else [message]:
+        for stamped_message in message.poses if message_type == _PATH_MESSAGE_TYPE else [message]:
             time_ns = _read_time_ns(stamped_message)
             pose_frames.add(getattr(stamped_message, "pose_frame", None))
             lags_s.append((receive_ns - time_ns) * 1e-9)
@@ -138,12 +136,12 @@ def _read_topic(name: str, reader: Any, topic: str | None) -> Table:
             f"the timestamps in the messages are used; they were received {median_lag_s:.3f} s "
             f"later (95 % {low_lag_s:.3f} to {high_lag_s:.3f} s)"
         )
-    return Table(
+    return PositionTable(
         name,
         "ROS bag",
         ["time_ns", *_POSE_COLUMNS[: csv_rows[0].count(",") if csv_rows else 3]],
         "".join(csv_rows),
-        is_chosen_body=True,
+        has_only_chosen_body=True,
         frames=("ned",) if pose_frames == {_FRAME_NED} else (),
         notes=tuple(notes),
     )

@@ -15,15 +15,15 @@ from px4fuse.core.reading import display_name
 from px4fuse.core.record import read_toml
 from px4fuse.errors import Px4FuseError, TrajectoryError
 
-_FORMATS = read_toml(__file__, dict[str, list[dict[str, Any]]], "formats.toml")
+_TEXT_FORMATS = read_toml(__file__, dict[str, list[dict[str, Any]]], "formats.toml")
 # Text formats of UWB systems: name, and regular expressions of a position and of the ranges
-STREAM_FORMATS = _FORMATS["streams"]
+STREAM_FORMATS = _TEXT_FORMATS["streams"]
 
 
 def refuse_foreign_format(path: Path, first_bytes: bytes, error_type: type[Px4FuseError]) -> None:
     """Raise an error that names the file format, if px4fuse does not support it."""
     name = display_name(path)
-    for foreign_format in _FORMATS["foreign"]:
+    for foreign_format in _TEXT_FORMATS["foreign"]:
         if any(
             first_bytes.startswith(start.encode("latin-1")) for start in foreign_format["starts"]
         ):
@@ -38,8 +38,8 @@ MIN_VALID_UNIX_TIME_S, MAX_VALID_UNIX_TIME_S = 946_684_800.0, 4_102_444_800.0
 _CHECKED_CHAR_COUNT = 100_000
 # Byte order marks of UTF-16, the encoding of texts from Windows shells
 _UTF_16_BYTE_ORDER_MARKS = (b"\xff\xfe", b"\xfe\xff")
-_CONTROL_CHARACTER = re.compile("[\x00-\x08\x0e-\x1b]")
-_NUMBER = re.compile(
+_CONTROL_CHARACTER_PATTERN = re.compile("[\x00-\x08\x0e-\x1b]")
+_NUMBER_PATTERN = re.compile(
     r"[+-]?(?:(?:[0-9]+\.?|[0-9]*\.[0-9]+)(?:e[+-]?[0-9]+)?|nan|inf)", re.IGNORECASE
 )
 
@@ -57,14 +57,14 @@ def decode_text(content: bytes) -> str | None:
             text = content.decode("utf-8-sig")
         except UnicodeDecodeError:
             text = content.decode("latin-1")
-    if "\0" in text or _CONTROL_CHARACTER.search(text, 0, _CHECKED_CHAR_COUNT):
+    if "\0" in text or _CONTROL_CHARACTER_PATTERN.search(text, 0, _CHECKED_CHAR_COUNT):
         return None
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def is_number(text: str) -> bool:
     """Return True if the text is a number, also with decimal point or exponent, NaN or infinity."""
-    return _NUMBER.fullmatch(text) is not None
+    return _NUMBER_PATTERN.fullmatch(text) is not None
 
 
 def quote(text: str) -> str:
@@ -82,7 +82,7 @@ def make_line_error(name: str, line_number: int, fault: str, remedy: str) -> Tra
 
 
 @dataclass(eq=False)  # not frozen: the reader appends lines
-class Rows:
+class TextTableRows:
     """Rows of a text table, with the line number of each row for error messages.
 
     Attributes
@@ -107,19 +107,19 @@ class Rows:
             raise self.make_row_error(int(invalid_indices[0, 0]), description, remedy)
 
     def parse(
-        self, text_count: int, number_count: int
+        self, text_column_count: int, number_column_count: int
     ) -> tuple[np.ndarray[Any, np.dtype[np.str_]], Array]:
         """Parse rows of text columns followed by number columns, separated by white space.
 
         Parameters
         ----------
-        text_count, number_count : int
+        text_column_count, number_column_count : int
             Numbers of text columns and of number columns.
 
         Returns
         -------
-        texts : ndarray of str, shape (n, text_count)
-        numbers : ndarray, shape (n, number_count)
+        texts : ndarray of str, shape (n, text_column_count)
+        numbers : ndarray, shape (n, number_column_count)
 
         Raises
         ------
@@ -127,21 +127,24 @@ class Rows:
             A row has too few or too many columns, or a cell in a number column is not a number.
         """
         lines = [text for _, text in self.lines]
-        columns = [("texts", "U80", (text_count,)), ("numbers", "f8", (number_count,))]
+        columns = [
+            ("texts", "U80", (text_column_count,)),
+            ("numbers", "f8", (number_column_count,)),
+        ]
         try:
             table = np.loadtxt(lines, dtype=columns, ndmin=1)
         except ValueError as error:
             row_fields = (text.split() for text in lines)
             is_valid = (
-                len(fields) == text_count + number_count
-                and all(is_number(field_text.strip()) for field_text in fields[text_count:])
+                len(fields) == text_column_count + number_column_count
+                and all(is_number(field_text.strip()) for field_text in fields[text_column_count:])
                 for fields in row_fields
             )
             row = next((row for row, is_row_valid in enumerate(is_valid) if not is_row_valid), 0)
             raise self.make_row_error(
                 row,
-                f"{quote(lines[row])} does not have {text_count + number_count} columns with "
-                "numbers",
+                f"{quote(lines[row])} does not have {text_column_count + number_column_count} "
+                "columns with numbers",
                 "Correct or remove this line.",
             ) from error
         return table["texts"], np.ascontiguousarray(table["numbers"])

@@ -25,12 +25,12 @@ MAX_QUATERNION_NORM_ERROR = 0.1
 MAX_COORDINATE_M = 1e9
 # Quaternions are normalised if their norm deviates by more than this from 1 (rounding of float64)
 UNIT_NORM_TOLERANCE = 1e-15
-# Maximum fraction of invalid rows of a file. With more, its timestamps are probably rounded, or it
-# contains several recordings: it is rejected
+# A file with a larger fraction of invalid rows is rejected: its timestamps are probably rounded, or
+# it contains several recordings
 MAX_DROPPED_ROW_FRACTION = 0.01
-# The first pose is the identity up to this coordinate (m) and rotation angle (rad). SLAM begins at
-# the identity
-MAX_IDENTITY_DISTANCE = 1e-6
+# The first pose is the identity, as in SLAM, if its coordinates (m) and rotation angle (rad) are
+# below this limit
+MAX_IDENTITY_DEVIATION = 1e-6
 # Maximum ratio smallest / second RMS extent along the principal axes, for a motion in a plane
 MAX_PLANE_THICKNESS_RATIO = 1 / 3
 # Minimum ratio second / largest RMS extent along the principal axes, for a motion in a plane: a
@@ -41,11 +41,11 @@ MAX_TILT_RAD = math.radians(20.0)
 # Minimum fraction of pose intervals that are near the median interval, for a regular frame rate
 MIN_REGULAR_INTERVAL_FRACTION = 0.9
 # A pose interval is near the median interval if it differs by at most this fraction
-MAX_INTERVAL_DEVIATION_RATIO = 0.5
+MAX_MEDIAN_INTERVAL_DEVIATION = 0.5
 # Minimum interval between two poses that counts as a gap, in median intervals
 MIN_GAP_INTERVALS = 2.5
 # Minimum interval (s) between two poses that counts as a gap
-MIN_GAP_S = 0.3
+MIN_POSE_GAP_S = 0.3
 
 # Words in comments and file names that indicate ground truth; b_w_RS_S is the column of the gyro
 # bias in EuRoC ground truth
@@ -71,7 +71,7 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
     try:
         recording = read_position_file(path, body=body, is_trajectory=True)
     except LogError as error:
-        # The option exists only in px4fuse compare, not in evaluate and loop
+        # Remove the advice to use an option that evaluate and loop do not have
         remedy = re.sub(f" [^.]*{COLUMNS_OPTION}.", "", error.remedy)
         raise TrajectoryError(error.reason, remedy) from error
     name, samples = recording.name, recording.samples
@@ -92,8 +92,8 @@ def read_trajectory(path: str | Path, body: str | None = None) -> Trajectory:
         raise TrajectoryError(f"{name} contains no height", "Export x, y and z.")
     rotation = _read_rotation(recording)
     first_bytes = b"" if is_bag(path) else read_head(path, _HEAD_BYTES, TrajectoryError)
-    comments = "\n".join(re.findall(r"(?m)^\s*#.*", first_bytes.decode(errors="replace")))
-    kind, kind_note = _detect_kind(path, comments, position_m, rotation)
+    comment_text = "\n".join(re.findall(r"(?m)^\s*#.*", first_bytes.decode(errors="replace")))
+    kind, kind_note = _detect_kind(path, comment_text, position_m, rotation)
     frame, frame_note = _detect_frame(kind, position_m)
     time_s = samples.index.to_numpy()
     notes = (*recording.detection_notes, *recording.notes)
@@ -153,12 +153,12 @@ def _read_rotation(recording: PositionRecording) -> Rotation | None:
 
 
 def _detect_kind(
-    path: Path, comments: str, position_m: Array, rotation: Rotation | None
+    path: Path, comment_text: str, position_m: Array, rotation: Rotation | None
 ) -> tuple[TrajectoryKind, str]:
     # EuRoC files are always called data.csv; their folder name indicates the kind
     folder = path.absolute().parent.name if path.name == "data.csv" else ""
     text_by_note = {
-        "A comment in the file states that the trajectory is ground truth.": comments,
+        "A comment in the file states that the trajectory is ground truth.": comment_text,
         "The file name states that the trajectory is ground truth.": path.name,
         "The folder name states that the trajectory is ground truth.": folder,
     }
@@ -167,7 +167,7 @@ def _detect_kind(
             return "truth", note
     if (
         rotation is not None
-        and max(np.abs(position_m[0]).max(), rotation[0].magnitude()) < MAX_IDENTITY_DISTANCE
+        and max(np.abs(position_m[0]).max(), rotation[0].magnitude()) < MAX_IDENTITY_DEVIATION
     ):
         return "slam", "The trajectory is from SLAM, because the first pose is the identity."
     return "unknown", ""
@@ -189,29 +189,31 @@ def _detect_frame(kind: TrajectoryKind, position_m: Array) -> tuple[Frame, str]:
     if not is_planar or tilt_rad > MAX_TILT_RAD:
         return "unknown", ""
     return "camera", (
-        "The frame is a camera frame (x right, y down, z forward), because the motion is in a "
-        f"plane with the normal {math.degrees(tilt_rad):.0f}° from the y axis."
+        "The frame is a camera frame (x right, y down, z forward): the motion is in a plane "
+        f"perpendicular to y within {math.degrees(tilt_rad):.0f}°, so y is vertical."
     )
 
 
 def _describe_gaps(time_s: Array) -> str:
     """Return a note on gaps or irregular intervals between poses; "" if there are none."""
     intervals_s = np.diff(time_s)
-    median_s = float(np.median(intervals_s))
+    median_interval_s = float(np.median(intervals_s))
     is_regular: BoolArray = (
-        np.abs(intervals_s - median_s) <= MAX_INTERVAL_DEVIATION_RATIO * median_s
+        np.abs(intervals_s - median_interval_s) <= MAX_MEDIAN_INTERVAL_DEVIATION * median_interval_s
     )
     if is_regular.mean() < MIN_REGULAR_INTERVAL_FRACTION:
         return (
             "The poses are key frames, or many poses are missing: the pose intervals are irregular "
-            f"(median {median_s:.3g} s, maximum {intervals_s.max():.3g} s)."
+            f"(median {median_interval_s:.3g} s, maximum {intervals_s.max():.3g} s)."
         )
-    gap_indices = np.flatnonzero(intervals_s > max(MIN_GAP_INTERVALS * median_s, MIN_GAP_S))
+    gap_indices = np.flatnonzero(
+        intervals_s > max(MIN_GAP_INTERVALS * median_interval_s, MIN_POSE_GAP_S)
+    )
     if not len(gap_indices):
         return ""
-    lost_s = intervals_s[gap_indices] - median_s
-    longest_start_s = time_s[gap_indices[np.argmax(lost_s)]] - time_s[0]
+    lost_s = intervals_s[gap_indices] - median_interval_s
+    longest_gap_start_s = time_s[gap_indices[np.argmax(lost_s)]] - time_s[0]
     return (
         f"Poses are missing for {lost_s.sum():.1f} s in {len(gap_indices)} gaps. The longest gap "
-        f"begins {longest_start_s:.1f} s after the first pose."
+        f"begins {longest_gap_start_s:.1f} s after the first pose."
     )

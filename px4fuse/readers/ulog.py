@@ -32,7 +32,7 @@ ACCELEROMETER_OFFSET_INVALID_US = 0x7FFFFFFF
 MIN_IMU_GAP_S = 0.2
 # Minimum and maximum valid UTC (UNIX time, s) of a GNSS receiver: GPS_EPOCH_SECS of PX4
 # (gps_helper.h), and the year 2100
-UTC_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
+VALID_UNIX_TIME_RANGE_S = (1_234_567_890.0, 4_102_444_800.0)
 
 
 def read_ulog(name: str, content: bytes) -> Flight:
@@ -52,24 +52,26 @@ def read_ulog(name: str, content: bytes) -> Flight:
         topics, attitude_samples, "attitude", px4.TOPIC_LAYOUTS["attitude"], remedy
     )
     ekf2 = read_ekf2(topics)
-    positions, missing_positions = read_positions(topics, ekf2)
+    positions, unavailable_positions = read_positions(topics, ekf2)
     truth = read_truth(topics, positions, ekf2)
     if isinstance(truth, Truth):
         topics.record_stream("truth", truth.name)
-    airborne = _read_airborne(topics)
+    airborne_spans_s = _read_airborne_spans(topics)
     altitude_m = topics.read(px4.TOPIC_LAYOUTS["barometer"])["altitude_m"]
     delay_s = topics.ekf2_parameters.get(BAROMETER.delay, 0.0) * 1e-3
-    is_in_flight = common.ends_in_flight(airborne, topics.log.duration_s)
-    dropped_counts = [(topic, count) for (topic, _), count in sorted(topics.dropped.items())]
+    is_in_flight = common.ends_in_flight(airborne_spans_s, topics.log.duration_s)
+    dropped_message_counts = [
+        (topic, count) for (topic, _), count in sorted(topics.dropped.items())
+    ]
     tilt_failures = topics.read(px4.TOPIC_LAYOUTS["failure"], is_step_function=True)[
         ["roll", "pitch"]
     ]
     return Flight(
         log=structs.replace(
             topics.log,
-            notes=(*topics.log.notes, *describe_dropped_samples(dropped_counts)),
-            dropped=dict(dropped_counts),
-            start_unix_s=_start_unix_s(topics),
+            notes=(*topics.log.notes, *describe_dropped_samples(dropped_message_counts)),
+            dropped=dict(dropped_message_counts),
+            start_unix_s=_estimate_start_unix_s(topics),
             damage=_describe_damage(topics, imu, is_in_flight),
             ends_in_flight=is_in_flight,
         ),
@@ -78,12 +80,12 @@ def read_ulog(name: str, content: bytes) -> Flight:
         positions=positions,
         ekf2=ekf2,
         truth=truth,
-        airborne=airborne,
+        airborne=airborne_spans_s,
         tumble_spans=common.find_flight_spans(
             tilt_failures.max(axis=1) == 0.0, topics.log.duration_s
         ),
         barometer=barometer(altitude_m, delay_s),
-        missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *missing_positions),
+        missing=(*common.collect_unavailable(imu, attitude, ekf2, truth), *unavailable_positions),
         streams=topics.streams,
         unused=tuple(
             UnusedData(name, len(table["timestamp"]), reason)
@@ -101,27 +103,27 @@ def _describe_damage(
     if topics.is_truncated:
         damage_sentences.append(common.format_truncation("message", duration_s, is_in_flight))
     if topics.is_damaged:
-        missing_imu_s = duration_s
+        missing_imu_duration_s = duration_s
         if not isinstance(imu, Unavailable):
             imu_intervals_s = np.diff(imu.index.to_numpy())
-            missing_imu_s = float(imu_intervals_s[imu_intervals_s > MIN_IMU_GAP_S].sum())
+            missing_imu_duration_s = float(imu_intervals_s[imu_intervals_s > MIN_IMU_GAP_S].sum())
         damage_sentences.append(
-            f"the file is damaged: {missing_imu_s:.1f} s of {duration_s:.1f} s of IMU data are "
-            "missing"
+            f"the file is damaged: {missing_imu_duration_s:.1f} s of {duration_s:.1f} s of IMU "
+            "data are missing"
         )
     return tuple(damage_sentences)
 
 
-def _start_unix_s(topics: Topics) -> float | None:
+def _estimate_start_unix_s(topics: Topics) -> float | None:
     """Return the UNIX time (s) at flight time zero, from the GNSS fixes; None without UTC."""
-    gps = topics.read(*px4.find_track_layouts(px4.GPS_POSITION))
-    if "utc_us" not in gps:
+    gps_samples = topics.read(*px4.find_track_layouts(px4.GPS_POSITION))
+    if "utc_us" not in gps_samples:
         return None
-    utc_s = gps["utc_us"] * 1e-6
-    is_valid = utc_s.between(*UTC_RANGE_S)
-    if "fix_type" in gps:
-        is_valid &= gps["fix_type"] >= FIX_TYPE_3D
-    return float((utc_s - gps.index)[is_valid].median()) if is_valid.any() else None
+    unix_time_s = gps_samples["utc_us"] * 1e-6
+    is_valid = unix_time_s.between(*VALID_UNIX_TIME_RANGE_S)
+    if "fix_type" in gps_samples:
+        is_valid &= gps_samples["fix_type"] >= FIX_TYPE_3D
+    return float((unix_time_s - gps_samples.index)[is_valid].median()) if is_valid.any() else None
 
 
 def _require_samples(
@@ -150,13 +152,13 @@ def _read_imu(topics: Topics) -> pd.DataFrame:
     for name in Columns.SPECIFIC_FORCE + Columns.ANGULAR_RATE:
         is_valid = np.abs(columns[name][rows]) < common.MAX_IMU_READING
         time_s, rows = time_s[is_valid], rows[is_valid]
-    samples = np.empty((len(columns), len(rows)), np.float32)  # type in the log
+    samples = np.empty((len(columns), len(rows)), np.float32)  # as in the log, to save memory
     for row, values in zip(samples, columns.values(), strict=True):
         row[:] = values[rows]
     return pd.DataFrame(samples.T, time_index(time_s), list(columns), copy=False)
 
 
-def _read_airborne(topics: Topics) -> Spans | Unavailable:
+def _read_airborne_spans(topics: Topics) -> Spans | Unavailable:
     land_detected = topics.read(px4.TOPIC_LAYOUTS["land_detected"], is_step_function=True)
     if land_detected.empty:
         return Unavailable(

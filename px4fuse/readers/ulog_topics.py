@@ -50,9 +50,9 @@ MAX_TIME_OUTSIDE_S = 2.0
 # ULog info message with a note from the author of the log to its users
 NOTE_KEY = "px4fuse_note"
 # ULog info message which states that the log is an assignment for a student
-ASSESSED_KEY = "px4fuse_assessed"
-# True while an instructor's command reads logs: the mark ASSESSED_KEY, which hides the diagnosis of
-# an assignment, is then ignored
+ASSESSED_MARK_KEY = "px4fuse_assessed"
+# True while an instructor's command reads logs: the mark ASSESSED_MARK_KEY, which hides the
+# diagnosis of an assignment, is then ignored
 ignores_assessed_mark = ContextVar("ignores_assessed_mark", default=False)
 # Maximum interval (s) between IMU timestamps of one flight: after a longer interval, the autopilot
 # was restarted
@@ -79,7 +79,7 @@ class _SkippedByteCounter(io.BytesIO):
     skips one byte, or all bytes until the next synchronisation message.
     """
 
-    skipped_bytes = 0  # number of bytes
+    skipped_bytes = 0
     header_start = read_end = position = 0  # byte offsets in the file
 
     def read(self, size: int, /) -> bytes:  # type: ignore[override]  # pyulog gives a size
@@ -106,20 +106,20 @@ def _skip_if_short(parse: Callable[..., Any]) -> Callable[..., Any]:
     pyulog then skips the message. After struct.error, pyulog would not read the rest of the file.
     """
 
-    def parse_checked(*arguments: Any, **keywords: Any) -> Any:
+    def parse_or_raise_value_error(*arguments: Any, **keywords: Any) -> Any:
         try:
             return parse(*arguments, **keywords)
         except struct.error as error:
             raise ValueError(str(error)) from error
 
-    return parse_checked
+    return parse_or_raise_value_error
 
 
 class _MessageData(ULog._MessageData):  # type: ignore[misc]  # pyulog has no types
     initialize = _skip_if_short(ULog._MessageData.initialize)
 
 
-class _Reader(ULog):  # type: ignore[misc]
+class _TolerantULogParser(ULog):  # type: ignore[misc]
     """ULog parser of pyulog that continues after damaged bytes and limits the number of fields.
 
     A format definition of 20 bytes can define 65,535 fields, and nested formats multiply them.
@@ -319,16 +319,16 @@ def measurement_time_us(table: TopicArrays) -> NDArray[np.int64]:
     the publication is up to 0.2 s later.
     """
     published_us = table["timestamp"].astype(np.int64)
-    sampled_us = table.get("timestamp_sample")
-    if sampled_us is None:
+    sample_timestamps_us = table.get("timestamp_sample")
+    if sample_timestamps_us is None:
         return published_us
-    sampled_us = sampled_us.astype(np.int64)
-    lag_s = np.abs(published_us - sampled_us) * _MICROSECOND_S
+    sample_timestamps_us = sample_timestamps_us.astype(np.int64)
+    lag_s = np.abs(published_us - sample_timestamps_us) * _MICROSECOND_S
     # Single invalid measurement times, as in the first message, are replaced by publication times
-    is_plausible = (sampled_us > 0) & (lag_s <= MAX_PUBLICATION_LAG_S)
+    is_plausible = (sample_timestamps_us > 0) & (lag_s <= MAX_PUBLICATION_LAG_S)
     if np.count_nonzero(is_plausible) * 2 < len(is_plausible):
         return published_us
-    return np.where(is_plausible, sampled_us, published_us)
+    return np.where(is_plausible, sample_timestamps_us, published_us)
 
 
 def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
@@ -337,12 +337,12 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     If one timestamp is hours too late, only this sample is removed. A running maximum would remove
     all samples after it. Method: patience sorting, Fredman 1975.
     """
-    positive_indices = np.flatnonzero(time_us > 0)
-    positive_times = time_us[positive_indices]
+    positive_time_indices = np.flatnonzero(time_us > 0)
+    positive_times = time_us[positive_time_indices]
     if len(positive_times) < 2 or np.all(np.diff(positive_times) > 0):
-        return positive_indices
-    # Element k: smallest last timestamp, and its index, of the increasing subsequences of length k
-    # + 1
+        return positive_time_indices
+    # Element k: smallest last timestamp, and its index, of all increasing subsequences with k + 1
+    # timestamps
     last_times: list[int] = []
     last_indices: list[int] = []
     previous_index = np.empty(len(positive_times), dtype=np.intp)
@@ -356,7 +356,7 @@ def longest_increasing_run(time_us: NDArray[np.int64]) -> IntArray:
     while index >= 0:
         run_indices.append(index)
         index = int(previous_index[index])
-    return positive_indices[np.array(run_indices[::-1], dtype=np.intp)]
+    return positive_time_indices[np.array(run_indices[::-1], dtype=np.intp)]
 
 
 def describe_dropped_samples(dropped_counts: Iterable[tuple[str, int]]) -> tuple[str, ...]:
@@ -378,10 +378,12 @@ def read_topics(name: str, content: bytes) -> Topics:
     content_reader = _SkippedByteCounter(content)
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # suppress the warnings that pyulog prints
-            ulog = _Reader(content_reader, message_name_filter_list=list_topics())
+            ulog = _TolerantULogParser(content_reader, message_name_filter_list=list_topics())
             tables = _read_tables(ulog)
             # If px4fuse uses no topic of the log, the other topics give the duration of the log
-            time_span_tables = tables or _read_tables(_Reader(_SkippedByteCounter(content)))
+            time_span_tables = tables or _read_tables(
+                _TolerantULogParser(_SkippedByteCounter(content))
+            )
     except Exception as error:  # pyulog raises many types for damaged bytes
         raise LogError(
             f"{name}: the ULog cannot be read ({str(error) or type(error).__name__}).",
@@ -399,8 +401,8 @@ def read_topics(name: str, content: bytes) -> Topics:
             f"the log contains only topics that px4fuse does not use ({join_first(names, 5)})",
         )
     if NOTE_KEY in ulog.msg_info_dict:
-        notes += (_printable_text(ulog.msg_info_dict, NOTE_KEY, ""),)
-    time_origin_us, data_end_us = _data_span_us(time_span_tables, name)
+        notes += (_read_printable_text(ulog.msg_info_dict, NOTE_KEY, ""),)
+    time_origin_us, data_end_us = _find_data_span_us(time_span_tables, name)
     logged_values, parameter_changes = _read_parameters(ulog, tables, time_origin_us)
     parameter_values, parameter_faults = replace_invalid_parameters(logged_values)
     log = LogInfo(
@@ -408,9 +410,9 @@ def read_topics(name: str, content: bytes) -> Topics:
         sha256=hashlib.sha256(content).hexdigest(),
         bytes=len(content),
         format="ULog",
-        firmware=_firmware_text(ulog.msg_info_dict),
-        firmware_hash=_printable_text(ulog.msg_info_dict, "ver_sw", "unknown"),
-        hardware=_printable_text(ulog.msg_info_dict, "ver_hw", "unknown"),
+        firmware=_format_firmware(ulog.msg_info_dict),
+        firmware_hash=_read_printable_text(ulog.msg_info_dict, "ver_sw", "unknown"),
+        hardware=_read_printable_text(ulog.msg_info_dict, "ver_hw", "unknown"),
         boot_time_s=time_origin_us * _MICROSECOND_S,
         duration_s=(data_end_us - time_origin_us) * _MICROSECOND_S,
         dropouts=tuple(
@@ -427,10 +429,10 @@ def read_topics(name: str, content: bytes) -> Topics:
         },
         notes=(*notes, *parameter_faults),
         bytes_read=content_reader.header_start - content_reader.skipped_bytes,
-        autopilot=_printable_text(ulog.msg_info_dict, "sys_name", "PX4"),
-        vehicle=_printable_text(ulog.msg_info_dict, "sys_uuid", ""),
+        autopilot=_read_printable_text(ulog.msg_info_dict, "sys_name", "PX4"),
+        vehicle=_read_printable_text(ulog.msg_info_dict, "sys_uuid", ""),
         is_assessed=True
-        if ASSESSED_KEY in ulog.msg_info_dict and not ignores_assessed_mark.get()
+        if ASSESSED_MARK_KEY in ulog.msg_info_dict and not ignores_assessed_mark.get()
         else UNSET,
     )
     return Topics(
@@ -454,16 +456,16 @@ def _read_parameters(
         for name, value in ulog.initial_parameters.items()
         if isinstance(value, int | float)
     }
-    layout, take_off_us = TOPIC_LAYOUTS["land_detected"], 0
+    layout, take_off_time_us = TOPIC_LAYOUTS["land_detected"], 0
     landed = tables.get((layout.topic, 0), {}).get(layout.columns["landed"])
     if landed is not None and not landed.all():
-        take_off_us = int(tables[layout.topic, 0]["timestamp"][np.argmin(landed)])
+        take_off_time_us = int(tables[layout.topic, 0]["timestamp"][np.argmin(landed)])
     parameter_changes: list[ParameterChange] = []
     last_parameter_values = parameter_values.copy()
     for time_us, name, value in sorted(ulog.changed_parameters, key=lambda change: change[0]):
         if not isinstance(value, int | float):
             continue
-        if time_us <= take_off_us or name not in parameter_values:
+        if time_us <= take_off_time_us or name not in parameter_values:
             parameter_values[name] = float(value)
         elif name.startswith("EKF2_") and last_parameter_values[name] != value:
             time_s = (time_us - time_origin_us) * _MICROSECOND_S
@@ -497,29 +499,31 @@ def _read_tables(ulog: ULog) -> Tables:
     return tables
 
 
-def _data_span_us(tables: Tables, name: str) -> tuple[int, int]:
+def _find_data_span_us(tables: Tables, name: str) -> tuple[int, int]:
     """Return first and last time (µs) of the IMU data; without IMU, of the largest topic."""
     for key in sorted(
         tables, key=lambda key: (key[0] != IMU_LAYOUT.topic, -len(tables[key]["timestamp"]))
     ):
         time_us = tables[key]["timestamp"].astype(np.int64)
-        increasing_us = time_us[longest_increasing_run(time_us)]
-        if len(increasing_us):
+        increasing_times_us = time_us[longest_increasing_run(time_us)]
+        if len(increasing_times_us):
             # Only the longest run without a gap is used: timestamps hours away are invalid
-            gap_rows = np.flatnonzero(np.diff(increasing_us) > MAX_DATA_GAP_S / _MICROSECOND_S) + 1
-            longest_run_us = max(np.split(increasing_us, gap_rows), key=len)
-            return int(longest_run_us[0]), int(longest_run_us[-1])
+            gap_rows = (
+                np.flatnonzero(np.diff(increasing_times_us) > MAX_DATA_GAP_S / _MICROSECOND_S) + 1
+            )
+            longest_run_times_us = max(np.split(increasing_times_us, gap_rows), key=len)
+            return int(longest_run_times_us[0]), int(longest_run_times_us[-1])
     raise LogError(f"{name}: all timestamps are zero", "Record the flight again.")
 
 
-def _printable_text(info: dict[str, Any], key: str, default: str) -> str:
+def _read_printable_text(info: dict[str, Any], key: str, default: str) -> str:
     return (
         "".join(character for character in str(info.get(key, default)) if character.isprintable())
         or default
     )
 
 
-def _firmware_text(info: dict[str, Any]) -> str:
+def _format_firmware(info: dict[str, Any]) -> str:
     release = info.get("ver_sw_release")
     if not isinstance(release, int):
         return "unknown"
@@ -529,4 +533,4 @@ def _firmware_text(info: dict[str, Any]) -> str:
     # Release type in the last byte: 0 development, 64 alpha, 128 beta, 192 release candidate, 255
     # release
     suffix = ("-dev", "-alpha", "-beta", "-rc", "")[(release_type + 1) // 64]
-    return f"{_printable_text(info, 'sys_name', 'PX4')} v{major}.{minor}.{patch}{suffix}"
+    return f"{_read_printable_text(info, 'sys_name', 'PX4')} v{major}.{minor}.{patch}{suffix}"

@@ -14,7 +14,7 @@ BAD_VALUE_ERRORS = (
     ValueError,
 )
 # Result of comparing numbers (Status) and pages (PageStatus) of a report with a new analysis
-Status = Literal["verified", "numbers differ", "other log", "cannot verify"]
+VerificationStatus = Literal["verified", "numbers differ", "other log", "cannot verify"]
 PageStatus = Literal["same", "differ", "not compared"]
 
 
@@ -70,7 +70,7 @@ class Verification:
         Name of a missing log or other input file.
     """
 
-    status: Status
+    status: VerificationStatus
     reasons: tuple[str, ...]
     with_log: bool
     differences: tuple[Mismatch, ...] = ()

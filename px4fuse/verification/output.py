@@ -13,7 +13,7 @@ from px4fuse.verification.verification import VERIFICATION_SCOPE_NOTE
 SCHEMA = {"name": "px4fuse-verification", "version": "3.0"}
 
 
-def verification_data(pdf: bytes, verification: Verification) -> dict[str, object]:
+def make_verification_output(pdf: bytes, verification: Verification) -> dict[str, object]:
     """Return the JSON output of ``px4fuse verify``."""
     values = asdict(verification)
     for name in ("redrawn_pdf", "remedy", "missing"):  # only px4fuse grade uses these fields
@@ -30,8 +30,8 @@ def verification_data(pdf: bytes, verification: Verification) -> dict[str, objec
 def verification_page(name: str, verification: Verification, output: Path | None) -> Page:
     """Format the terminal output of ``px4fuse verify``."""
     page = Page()
-    colours = {"verified": GOOD_COLOUR, "cannot verify": SEVERITY_COLOURS["warning"]}
-    colour = colours.get(verification.outcome, SEVERITY_COLOURS["error"])
+    colour_by_outcome = {"verified": GOOD_COLOUR, "cannot verify": SEVERITY_COLOURS["warning"]}
+    colour = colour_by_outcome.get(verification.outcome, SEVERITY_COLOURS["error"])
     page.write(f"{one_line(name, 200)}: {verification.outcome}", bold=True, colour=colour)
     sentences = [
         one_line(reason, 400)
@@ -45,7 +45,7 @@ def verification_page(name: str, verification: Verification, output: Path | None
     for sentence in sentences:
         page.write(sentence, indent=12.0)
     if output is not None and not verification.redrawn_pdf:
-        page.write("No report was written with -o, because the analysis was not repeated.")
+        page.write("No report was written with -o: the analysis could not be repeated.")
     elif output is None and verification.pages:
         page.write(
             "Action: write the report again from the log with -o FILE.pdf, and read that report."

@@ -59,11 +59,13 @@ MAX_KERNING_PER_MILLE_EM = 200.0
 # bytes
 MAX_CONTENT_SIZE_RATIO = 4
 # Maximum time (s) for comparing two PDFs; the comparison of the largest report takes 3 s
-TIMEOUT_S = 12.0
+PDF_COMPARISON_TIMEOUT_S = 12.0
 # Maximum memory (bytes) for comparing two PDFs; the largest report needs 0.3 GB
 MAX_MEMORY_BYTES = 1_000_000_000
 MAX_LISTED_DIFFERENCES = 20
-SECOND_TABLE_REASON = "the PDF was changed after px4fuse wrote it (second cross-reference table)"
+SECOND_XREF_TABLE_REASON = (
+    "the PDF was changed after px4fuse wrote it (second cross-reference table)"
+)
 # PDF dictionary keys that are not compared, because programs that save a PDF change them
 _COMPRESSION_KEYS = frozenset(("/Length", "/Filter"))
 _WRITER_KEYS = frozenset(("/Producer", "/CreationDate", "/ModDate"))
@@ -75,7 +77,7 @@ MAX_XMP_BYTES = 100_000
 # Typst version in the PDF; not compared, because different versions produce equal pages
 _TYPST_VERSION_PATTERN = re.compile(r"Typst \d+(\.\d+)*")
 _END_OF_FILE_PATTERN = re.compile(rb"startxref\s+(\d{1,10})\s+%%EOF\s*\Z")
-_FEATURE_NAMES = {
+_ENTRY_DESCRIPTIONS = {
     "/AA": "a PDF action that runs automatically",
     "/AcroForm": "form fields",
     "/Annots": "an annotation",
@@ -126,7 +128,9 @@ def compare_pages(
     MAX_LISTED_DIFFERENCES are returned, in page order.
     """
     job = submitted_pdf, redrawn_pdf, is_same_text
-    differences = run_one_with_limits(_compare_pdfs, job, TIMEOUT_S, MAX_MEMORY_BYTES)
+    differences = run_one_with_limits(
+        _compare_pdfs, job, PDF_COMPARISON_TIMEOUT_S, MAX_MEMORY_BYTES
+    )
     if not isinstance(differences, JobFailure):
         return differences
     reason = differences.reason.rstrip(".")
@@ -140,7 +144,9 @@ def _compare_pdfs(job: tuple[bytes, bytes, TextComparison]) -> tuple[PageDiffere
     try:
         with pypdf.apply_configuration(**PYPDF_LIMITS):
             submitted_pdf, redrawn_pdf = map(open_strictly, (submitted_bytes, redrawn_bytes))
-            page_differences = _PdfComparison(is_same_text).differences(submitted_pdf, redrawn_pdf)
+            page_differences = _PdfComparison(is_same_text).find_differences(
+                submitted_pdf, redrawn_pdf
+            )
             differences = [
                 *(
                     PageDifference(0, ambiguity, True)
@@ -164,16 +170,17 @@ class _PdfComparison:
     """Pairwise comparison of all objects of two PDFs."""
 
     is_same_text: TextComparison
-    # object number and generation in the submitted PDF, object number in the redrawn PDF
+    # pairs of objects that are not compared again: number and generation in the submitted PDF,
+    # number in the redrawn PDF
     compared_objects: set[tuple[int, int, int]] = field(default_factory=set)
     # pairs of "/Parent" entries of pages; compared last, because they refer to all other pages
-    page_parents: list[tuple[Any, Any, str]] = field(default_factory=list)
+    page_parent_pairs: list[tuple[Any, Any, str]] = field(default_factory=list)
     # fonts of the current page by name
     fonts: Mapping[str, Any] = field(default_factory=dict)
     # number of compared values, which is limited because a malicious PDF may contain millions
     value_count: int = 0
 
-    def differences(
+    def find_differences(
         self, submitted_pdf: pypdf.PdfReader, redrawn_pdf: pypdf.PdfReader
     ) -> Iterator[PageDifference]:
         """Yield the differences of pages, document information and catalogue."""
@@ -192,11 +199,11 @@ class _PdfComparison:
                 dict.get(reader.trailer, key) for reader in (submitted_pdf, redrawn_pdf)
             )
             yield from self._compare(submitted_value, redrawn_value, key, 0)
-        for values in self.page_parents:
+        for values in self.page_parent_pairs:
             yield from self._compare(*values, 0)
         # programs for PDF 1.4 use another cross-reference table, so they could display other pages
         if "/XRefStm" in submitted_pdf.trailer:
-            yield PageDifference(0, SECOND_TABLE_REASON, True)
+            yield PageDifference(0, SECOND_XREF_TABLE_REASON, True)
 
     def _compare(
         self, submitted_value: Any, redrawn_value: Any, key: str, page_number: int
@@ -247,7 +254,9 @@ class _PdfComparison:
                 remaining_values += [(*pair, key) for pair in pairs][::-1]
             elif not self._is_same_value(submitted_value, redrawn_value):
                 texts = [one_line(str(value), 60) for value in (submitted_value, redrawn_value)]
-                description = f"the PDF entry {key} is {texts[0]!r}; px4fuse writes {texts[1]!r}"
+                description = (
+                    f"the PDF entry {key} was changed: {texts[0]!r} instead of {texts[1]!r}"
+                )
                 yield PageDifference(page_number, description)
 
     def _compare_dictionaries(
@@ -258,20 +267,20 @@ class _PdfComparison:
         page_number: int,
         remaining_values: list[tuple[Any, Any, str]],
     ) -> Iterator[PageDifference]:
-        """Yield keys and streams that differ; append the values to ``remaining_values``."""
+        """Yield differences in keys and streams; append the values that are still to compare."""
         submitted_keys = _select_compared_keys(submitted_dictionary, key)
         redrawn_keys = _select_compared_keys(redrawn_dictionary, key)
         for name in sorted(submitted_keys ^ redrawn_keys):
-            feature = _FEATURE_NAMES.get(name, f"an entry {one_line(name, 40)}")
-            description = f"{feature} is missing"
+            entry_description = _ENTRY_DESCRIPTIONS.get(name, f"an entry {one_line(name, 40)}")
+            description = f"{entry_description} is missing"
             if name in submitted_keys:
-                description = f"the PDF contains {feature}, which px4fuse does not write"
+                description = f"the PDF contains {entry_description}, which px4fuse does not write"
             yield PageDifference(page_number, description, True)
         for name in sorted(submitted_keys & redrawn_keys, reverse=True):
             values = submitted_dictionary.raw_get(name), redrawn_dictionary.raw_get(name), name
-            (self.page_parents if page_number and name == "/Parent" else remaining_values).append(
-                values
-            )
+            (
+                self.page_parent_pairs if page_number and name == "/Parent" else remaining_values
+            ).append(values)
         if isinstance(redrawn_dictionary, StreamObject):
             yield from self._compare_streams(
                 submitted_dictionary, redrawn_dictionary, key, page_number
@@ -306,7 +315,9 @@ class _PdfComparison:
         filters = resolve_reference(submitted_stream.get("/Filter"))
         if filters not in (None, "/FlateDecode", ["/FlateDecode"]):  # pypdf does not decode JPEG
             yield PageDifference(
-                page_number, f"the compression of the PDF entry {key} is not supported", True
+                page_number,
+                f"the compression of the PDF entry {key} is not supported: px4fuse cannot read it",
+                True,
             )
             return
         submitted_data, redrawn_data = submitted_stream.get_data(), redrawn_stream.get_data()
@@ -353,8 +364,8 @@ class _PdfComparison:
                 return f"the text is {submitted_text!r}; px4fuse prints {redrawn_text!r}"
             operator_text = one_line(redrawn_operator, 9)
             return (
-                f"drawing operation {operation_number} differs from operation {operator_text!r} of "
-                "the report drawn from the log"
+                f"drawing operation {operation_number} of the page differs from that of the report "
+                f"drawn from the log ({operator_text})"
             )
         return ""
 
@@ -374,7 +385,7 @@ class _PdfComparison:
 
 
 def _find_ambiguities(pdf: bytes) -> Iterator[str]:
-    """Describe file structures for which PDF programs could display different contents."""
+    """Yield a description of each file structure that PDF programs may interpret differently."""
     end_match = _END_OF_FILE_PATTERN.search(pdf[-1024:])
     if end_match is None:
         yield "the file has bytes after the end of the PDF"
@@ -383,7 +394,7 @@ def _find_ambiguities(pdf: bytes) -> Iterator[str]:
         # could replace pages
         table_start = pdf.find(b"endobj") + len(b"endobj")
         if pdf[table_start : int(end_match[1])].strip():
-            yield SECOND_TABLE_REASON
+            yield SECOND_XREF_TABLE_REASON
 
 
 def _get_page_references(reader: pypdf.PdfReader) -> list[Any]:
@@ -403,7 +414,7 @@ def _pdf_type_of(value: Any) -> type:
 
 
 def _select_compared_keys(value: DictionaryObject, key: str) -> set[str]:
-    """Return the keys of a PDF dictionary that must be equal, without null values."""
+    """Return the keys of a PDF dictionary to compare with the redrawn PDF, without null values."""
     compared_keys = {name for name in value if not isinstance(value.raw_get(name), NullObject)}
     if isinstance(value, StreamObject):
         compared_keys -= _COMPRESSION_KEYS

@@ -45,9 +45,11 @@ BROKEN_PDF_ERRORS = (*BAD_VALUE_ERRORS, PyPdfError, AttributeError, zlib.error)
 
 # Keys of PDF dictionaries with active content. Links, comments, forms and the initial view are
 # allowed, because programs add them when they save a PDF
-_ACTIVE_KEYS = re.compile("/(JS|JavaScript|XFA|RichMediaContent|RichMediaSettings|Collection|RF)")
+_ACTIVE_CONTENT_KEY_PATTERN = re.compile(
+    "/(JS|JavaScript|XFA|RichMediaContent|RichMediaSettings|Collection|RF)"
+)
 # Types of PDF actions that run programs or open other files and addresses
-_ACTIVE_ACTIONS = re.compile(
+_ACTIVE_ACTION_PATTERN = re.compile(
     "/(JavaScript|Launch|SubmitForm|ImportData|GoToR|GoToE|Rendition|RichMediaExecute|Movie|Sound)"
 )
 
@@ -189,22 +191,25 @@ def _estimate_inflated_bytes(pdf: bytes, start: int, limit_bytes: int) -> int:
 
 def _walk_dictionaries(reader: pypdf.PdfReader) -> Iterator[tuple[DictionaryObject, bool]]:
     """Yield each PDF dictionary, with True if it is reached by a click on a link or bookmark."""
-    visited: set[tuple[IndirectObject, bool]] = set()
+    visited_references: set[tuple[IndirectObject, bool]] = set()
     missing_count = value_count = 0
     remaining_values: list[tuple[Any, bool]] = [(reader.trailer, False)]
     while remaining_values:
         value, is_reached_by_click = remaining_values.pop()
         value_count += 1
         if isinstance(value, IndirectObject):
-            if (value, is_reached_by_click) in visited:
+            if (value, is_reached_by_click) in visited_references:
                 continue
-            visited.add((value, is_reached_by_click))
-            # count unlisted objects, because pypdf would search the whole file for each
+            visited_references.add((value, is_reached_by_click))
+            # count objects without cross-reference: pypdf would search the whole file for each
             number, generation = value.idnum, value.generation
-            is_packed = generation == 0 and number in reader.xref_objStm
-            is_listed = is_packed or number in reader.xref.get(generation, {})
+            is_in_object_stream = generation == 0 and number in reader.xref_objStm
+            is_listed = is_in_object_stream or number in reader.xref.get(generation, {})
             missing_count += not is_listed
-            if len(visited) > MAX_PDF_OBJECTS or missing_count > MAX_UNRESOLVED_REFERENCES:
+            if (
+                len(visited_references) > MAX_PDF_OBJECTS
+                or missing_count > MAX_UNRESOLVED_REFERENCES
+            ):
                 raise ResultsError(_COSTLY_REASON)
             # a reference to a missing object is null (ISO 32000-1, 7.3.10)
             value = value.get_object() if is_listed else None
@@ -221,9 +226,9 @@ def _find_foreign_features(
     dictionary: DictionaryObject, is_reached_by_click: bool
 ) -> Iterator[str]:
     """Yield features that reports of px4fuse do not have: active content, links to files, ..."""
-    yield from (key[1:] for key in dictionary if _ACTIVE_KEYS.fullmatch(key))
-    action, dictionary_type = (_pdf_name(dictionary.get(key)) or "" for key in ("/S", "/Type"))
-    if _ACTIVE_ACTIONS.fullmatch(action):
+    yield from (key[1:] for key in dictionary if _ACTIVE_CONTENT_KEY_PATTERN.fullmatch(key))
+    action, dictionary_type = (_read_pdf_name(dictionary.get(key)) or "" for key in ("/S", "/Type"))
+    if _ACTIVE_ACTION_PATTERN.fullmatch(action):
         yield action[1:]
     if action == "/URI" and not is_reached_by_click:
         yield "an action that opens a URL"
@@ -236,7 +241,7 @@ def _find_foreign_features(
         filters = resolve_reference(dictionary.get("/Filter"))
         filters = filters if isinstance(filters, ArrayObject) else [filters]
         all_filter_names = [
-            _pdf_name(filter_object) for filter_object in filters if filter_object is not None
+            _read_pdf_name(filter_object) for filter_object in filters if filter_object is not None
         ]
         if not _ALLOWED_FILTERS.issuperset(all_filter_names) or len(set(all_filter_names)) != len(
             all_filter_names
@@ -250,7 +255,7 @@ def resolve_reference(value: Any) -> Any:
     return value.get_object() if isinstance(value, IndirectObject) else value
 
 
-def _pdf_name(value: object) -> str | None:
+def _read_pdf_name(value: object) -> str | None:
     value = resolve_reference(value)
     return str(value) if isinstance(value, str) else None
 
@@ -259,11 +264,11 @@ def _read_attachment(reader: pypdf.PdfReader) -> bytes:
     """Return the content of the attached file RESULTS_NAME; other attachments are an error."""
     file_specifications: list[DictionaryObject] = []
     streams: dict[int, StreamObject] = {}
-    features: set[str] = set()
+    foreign_features: set[str] = set()
     for dictionary, is_reached_by_click in _walk_dictionaries(reader):
-        features.update(_find_foreign_features(dictionary, is_reached_by_click))
+        foreign_features.update(_find_foreign_features(dictionary, is_reached_by_click))
         embedded_files: list[object] = (
-            [dictionary] if _pdf_name(dictionary.get("/Type")) == "/EmbeddedFile" else []
+            [dictionary] if _read_pdf_name(dictionary.get("/Type")) == "/EmbeddedFile" else []
         )
         if "/EF" in dictionary:
             file_specifications.append(dictionary)
@@ -273,8 +278,8 @@ def _read_attachment(reader: pypdf.PdfReader) -> bytes:
             )
         objects = map(resolve_reference, embedded_files)
         streams |= {id(each): each for each in objects if isinstance(each, StreamObject)}
-    if features:
-        feature_names = ", ".join(sorted(features))
+    if foreign_features:
+        feature_names = ", ".join(sorted(foreign_features))
         raise ResultsError(f"the PDF contains {feature_names}, which px4fuse never writes.")
     if not file_specifications and not streams:
         raise ResultsError(
@@ -286,8 +291,8 @@ def _read_attachment(reader: pypdf.PdfReader) -> bytes:
             "The PDF has several attachments, or an unreadable one. Hand in one report per PDF."
         )
     (file_specification,), (stream,) = file_specifications, streams.values()
-    keys = {"/UF", "/F", "/DOS", "/Mac", "/Unix"} & file_specification.keys()
-    file_names = {str(resolve_reference(file_specification.get(key))) for key in keys}
+    file_name_keys = {"/UF", "/F", "/DOS", "/Mac", "/Unix"} & file_specification.keys()
+    file_names = {str(resolve_reference(file_specification.get(key))) for key in file_name_keys}
     if file_names != {RESULTS_NAME}:
         name_text = one_line(" / ".join(sorted(file_names)), 80)
         raise ResultsError(f"the name of the attached file is {name_text!r}, not {RESULTS_NAME!r}.")

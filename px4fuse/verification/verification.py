@@ -32,13 +32,13 @@ from px4fuse.results.contract import (
     to_json_dict,
 )
 from px4fuse.results.model import LIBRARIES, Provenance
-from px4fuse.verification.model import Mismatch, PageStatus, Status, Verification
+from px4fuse.verification.model import Mismatch, PageStatus, Verification, VerificationStatus
 from px4fuse.verification.pages import TextComparison, compare_pages
 
 ASK_AUTHOR_REMEDY = (
     "Ask the author how the report was made, and for its log and all other input files."
 )
-FOREIGN_REQUEST_REASON = "the recorded command was not written by px4fuse"
+FOREIGN_REQUEST_REASON = "px4fuse cannot have written the command in the report"
 # Minimum KF prediction interval DT (s): 60,000 steps for a flight of ten minutes take half a minute
 MIN_DT_S = 0.01
 ORIGINAL_PDF_REMEDY = "Ask the author of the report for the PDF that px4fuse wrote."
@@ -48,13 +48,13 @@ VERIFICATION_SCOPE_NOTE = (
 NO_LOG_REASON = "no log was given, so the analysis could not be repeated"
 # Relative tolerance of numbers in a report: the results on four types of processors (OpenBLAS
 # kernels) differ by at most 3e-8 (six flights)
-RELATIVE_TOLERANCE = 1e-6
-# Absolute tolerance of numbers in a report
-ABSOLUTE_TOLERANCE = 1e-9
+RESULT_RELATIVE_TOLERANCE = 1e-6
+# Absolute tolerance of numbers in a report, compared with a new analysis
+RESULT_ABSOLUTE_TOLERANCE = 1e-9
 # Relative tolerance of maximum-likelihood estimates in a report. The cost is flat at its minimum: a
 # change in its 12th digit changes the 4th digit of the estimate. Reports print up to three digits
 ESTIMATE_RELATIVE_TOLERANCE = 1e-3
-# Absolute tolerance of maximum-likelihood estimates in a report
+# Absolute tolerance of maximum-likelihood estimates in a report, compared with a new analysis
 ESTIMATE_ABSOLUTE_TOLERANCE = 1e-5
 # Fields of the results that contain maximum-likelihood estimates, or depend on them
 ESTIMATE_FIELDS = (
@@ -72,7 +72,8 @@ ESTIMATE_FIELDS = (
 )
 # Field of the results with the number of iterations of a solver
 ITERATIONS_FIELD = "iterations"
-# Maximum difference between numbers of iterations: a solver may stop earlier on another processor
+# Maximum difference between a solver's iterations in a report and in a new analysis: the solver may
+# stop earlier on another processor
 MAX_ITERATION_DIFFERENCE = 2
 # Fields of the results that are not compared, because they describe the computer
 MACHINE_DEPENDENT_FIELDS = ("provenance.python", "provenance.libraries")
@@ -85,9 +86,9 @@ PRINTED_SCALES = (1.0, 100.0, 1000.0)
 MAX_NOTES_LINES = 5_000
 _NUMBER_PATTERN = re.compile(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)")
 
-# Results of the new analysis, and a function that draws the report with these results
+# Results of the new analysis, and a function that draws its PDF when pages are compared
 RecomputedReport = tuple[ReportedResults, Callable[[], bytes]]
-# Function from file name, SHA-256 and label for messages to the path of a link
+# Function that links an input file: file name, SHA-256, label for messages -> path of the link
 _FileLinker = Callable[[str, str | None, str], str]
 
 
@@ -105,50 +106,54 @@ def log_name(results: ReportedResults) -> str:
     return results.log.name
 
 
-def recompute(
-    results: ReportedResults, logs: Mapping[str, Path]
+def recompute_report(
+    results: ReportedResults, path_by_sha256: Mapping[str, Path]
 ) -> RecomputedReport | Verification:
     """Repeat the analysis of a report with the settings in ``results``.
 
     Return the status "cannot verify" if the settings are not valid, a file is missing, or the
-    analysis fails. ``logs`` are paths of input files by SHA-256.
+    analysis fails. ``path_by_sha256`` are paths of input files by SHA-256.
     """
     try:
         if tuple(results.provenance.libraries) != LIBRARIES:
             raise NotRepeatableError(
-                "the results do not list the library versions", ASK_AUTHOR_REMEDY
+                "the results do not list the library versions of px4fuse", ASK_AUTHOR_REMEDY
             )
         with tempfile.TemporaryDirectory(prefix="px4fuse-") as folder:
-            file_linker = partial(_link_file, logs, Path(folder))
+            file_linker = partial(_link_file, path_by_sha256, Path(folder))
             if isinstance(results, LoopResults):
                 analysis, new_results = _repeat_loop_closure(results, file_linker)
             else:
                 analysis, new_results = _repeat_comparison(results, file_linker)
         return new_results, partial(_draw_report, analysis, new_results, results.provenance)
     except SettingsError as error:  # px4fuse cannot have made a report with invalid settings
-        return cannot_verify(f"{FOREIGN_REQUEST_REASON}: {error}", ASK_AUTHOR_REMEDY)
+        return make_unverifiable_result(f"{FOREIGN_REQUEST_REASON}: {error}", ASK_AUTHOR_REMEDY)
     except NotRepeatableError as error:
-        return cannot_verify(*error.args)
+        return make_unverifiable_result(*error.args)
     except Px4FuseError as error:
-        return cannot_verify(str(error), ASK_AUTHOR_REMEDY)
+        return make_unverifiable_result(str(error), ASK_AUTHOR_REMEDY)
     except Exception as error:  # noqa: BLE001 - forged settings may fail anywhere
         reason = f"the analysis with the settings in the report failed ({type(error).__name__})"
-        return cannot_verify(reason, ASK_AUTHOR_REMEDY)
+        return make_unverifiable_result(reason, ASK_AUTHOR_REMEDY)
 
 
 def _link_file(
-    logs: Mapping[str, Path], folder: Path, name: str, sha256: str | None, file_label: str
+    path_by_sha256: Mapping[str, Path],
+    folder: Path,
+    name: str,
+    sha256: str | None,
+    file_label: str,
 ) -> str:
     """Link the file with this SHA-256 into a temporary folder, and return the path of the link.
 
     The link has the name that the submitted report prints, so that the new report prints the same
     name. ``file_label`` is for error messages.
     """
-    path = None if sha256 is None else logs.get(sha256)
+    path = None if sha256 is None else path_by_sha256.get(sha256)
     if path is None:
-        missing_name = one_line(name, 80) or "the file"
+        missing_file_name = one_line(name, 80) or "the file"
         reason = f"none of the given files has the SHA-256 of {file_label}"
-        raise NotRepeatableError(reason, f"Add {missing_name} to --logs.", missing_name)
+        raise NotRepeatableError(reason, f"Add {missing_file_name} to --logs.", missing_file_name)
     if name != Path(name).name or name == ".." or "\\" in name or not name.isprintable():
         reason = f"{FOREIGN_REQUEST_REASON}: its file name contains a folder or is not printable"
         raise NotRepeatableError(reason, ASK_AUTHOR_REMEDY)
@@ -222,7 +227,9 @@ def _draw_report(
 # ------------------------------------------------------------------ the verdict
 
 
-def verify(results: ReportedResults, pdf: bytes, logs: Mapping[str, Path]) -> Verification:
+def verify(
+    results: ReportedResults, pdf: bytes, path_by_sha256: Mapping[str, Path]
+) -> Verification:
     """Verify a report: repeat its analysis, draw it again, and compare numbers and pages.
 
     Parameters
@@ -231,7 +238,7 @@ def verify(results: ReportedResults, pdf: bytes, logs: Mapping[str, Path]) -> Ve
         Results attached to the report.
     pdf : bytes
         Content of the report file.
-    logs : mapping of str to Path
+    path_by_sha256 : mapping of str to Path
         Logs and other input files by SHA-256.
     """
     report_version, installed_version = results.provenance.px4fuse, metadata.version("px4fuse")
@@ -241,26 +248,30 @@ def verify(results: ReportedResults, pdf: bytes, logs: Mapping[str, Path]) -> Ve
             f"the report was made with px4fuse {report_version}; the installed version is "
             f"{installed_version}"
         )
-        return cannot_verify(reason, f"Verify the report with px4fuse {report_version}.")
+        return make_unverifiable_result(reason, f"Verify the report with px4fuse {report_version}.")
     log_file_name = one_line(log_name(results), 80) or "the log"
-    if not logs:
-        return cannot_verify(NO_LOG_REASON, f"Add {log_file_name} to --logs.", log_file_name)
+    if not path_by_sha256:
+        return make_unverifiable_result(
+            NO_LOG_REASON, f"Add {log_file_name} to --logs.", log_file_name
+        )
     sha256 = log_sha256(results)
-    if sha256 not in logs:
+    if sha256 not in path_by_sha256:
         expected_hash = one_line(sha256, 64) or "none"
         reason = f"the given files do not contain the log (SHA-256 {expected_hash})"
         remedy = f"If the log is yours, add {log_file_name} to --logs."
         return Verification("other log", (reason,), False, remedy=remedy, missing=log_file_name)
     if results.student.notes.count("\n") > MAX_NOTES_LINES:
         reason = f"the student's notes have more than {MAX_NOTES_LINES} lines"
-        return cannot_verify(reason, ASK_AUTHOR_REMEDY)
-    recomputed_report = recompute(results, logs)
+        return make_unverifiable_result(reason, ASK_AUTHOR_REMEDY)
+    recomputed_report = recompute_report(results, path_by_sha256)
     if isinstance(recomputed_report, Verification):
         return recomputed_report
     return _verify_with_log(results, pdf, *recomputed_report)
 
 
-def cannot_verify(reason: str, remedy: str = "", missing_input: str = "") -> Verification:
+def make_unverifiable_result(
+    reason: str, remedy: str = "", missing_input: str = ""
+) -> Verification:
     """Return the status "cannot verify" with its reason."""
     reasons = (one_line(reason, 400),)
     return Verification("cannot verify", reasons, False, remedy=remedy, missing=missing_input)
@@ -287,7 +298,7 @@ def _verify_with_log(
     )
     reasons = [
         f"all {value_count} values agree with a new run on the log (within "
-        f"{RELATIVE_TOLERANCE:g}, estimates within {ESTIMATE_RELATIVE_TOLERANCE:g})"
+        f"{RESULT_RELATIVE_TOLERANCE:g}, estimates within {ESTIMATE_RELATIVE_TOLERANCE:g})"
     ]
     if mismatches:
         paths_text = ", ".join(mismatch.path for mismatch in mismatches[:3])
@@ -310,18 +321,18 @@ def _verify_with_log(
     page_status: PageStatus = "same"
     if page_differences:
         page_status = "differ" if is_comparable else "not compared"
-    status: Status = "verified" if is_comparable else "cannot verify"
+    status: VerificationStatus = "verified" if is_comparable else "cannot verify"
     if mismatches:
         status = "numbers differ"
     difference_sentences = [difference.sentence for difference in page_differences]
-    page_sentences = difference_sentences[:MAX_LISTED_PAGE_DIFFERENCES]
-    if unlisted_count := len(difference_sentences) - len(page_sentences):
-        page_sentences.append(f"the PDF has {unlisted_count} more differences")
+    listed_sentences = difference_sentences[:MAX_LISTED_PAGE_DIFFERENCES]
+    if unlisted_count := len(difference_sentences) - len(listed_sentences):
+        listed_sentences.append(f"the PDF has {unlisted_count} more differences")
     # the decisive reason is first: some tables show only one reason
     if status == "cannot verify":
-        reasons = page_sentences + reasons
+        reasons = listed_sentences + reasons
     else:
-        reasons += page_sentences
+        reasons += listed_sentences
     remedy = ORIGINAL_PDF_REMEDY if is_from_other_program else ""
     if differing_libraries:
         versions_text = one_line(", ".join(map(" ".join, sorted(differing_libraries))), 300)
@@ -346,7 +357,7 @@ def _verify_with_log(
 def is_same_number_rounded(
     agreeing_pairs: Iterable[tuple[float, float]], submitted_number: str, redrawn_number: str
 ) -> bool:
-    """Return True if two printed numbers are one result, rounded, that agrees in both reports.
+    """Return True if the two printed numbers are the rounded values of an agreeing pair.
 
     ``agreeing_pairs`` are results in the report and in the new analysis that differ by less than
     the tolerance.
@@ -370,39 +381,44 @@ def compare_results(
     mismatches : tuple of Mismatch
         Values that differ by more than the tolerances.
     is_same_number : callable
-        Returns True if two printed numbers are one result, rounded, that agrees.
+        Returns True if two printed numbers are the rounded values of a result that agrees.
     value_count : int
         Number of compared values.
     """
     command = str(new_results["provenance"]["command"])
-    # "auto" and --position estimate time offset or frame alignment, on which all numbers depend.
-    # All numbers then have the tolerance of estimates
+    # With "auto" or --position, all numbers depend on an estimated time offset or frame alignment,
+    # so all have the tolerance of estimates
     has_estimated_inputs = not {"auto", "--position"}.isdisjoint(command.split())
     recorded_values, new_values = dict(flatten(recorded_results)), dict(flatten(new_results))
-    pair_by_path = {
+    value_pair_by_path = {
         path: (recorded_values.get(path, _ABSENT), new_values.get(path, _ABSENT))
         for path in {**new_values, **recorded_values}
         if not path.startswith(MACHINE_DEPENDENT_FIELDS)
     }
-    is_near_by_path = {
-        path: _is_near(path, *value_pair, has_estimated_inputs or path.startswith(ESTIMATE_FIELDS))
-        for path, value_pair in pair_by_path.items()
+    agreement_by_path = {
+        path: _is_within_tolerance(
+            path, *value_pair, has_estimated_inputs or path.startswith(ESTIMATE_FIELDS)
+        )
+        for path, value_pair in value_pair_by_path.items()
         if all(map(is_number, value_pair))
     }
-    near_pairs = (pair_by_path[path] for path, is_near in is_near_by_path.items() if is_near)
-    unequal_pairs = tuple((float(a), float(b)) for a, b in near_pairs if a != b)
+    agreeing_pairs = (
+        value_pair_by_path[path] for path, agrees in agreement_by_path.items() if agrees
+    )
+    unequal_pairs = tuple((float(a), float(b)) for a, b in agreeing_pairs if a != b)
     is_same_number = partial(is_same_number_rounded, unequal_pairs)
-    mismatched_paths = [path for path, is_near in is_near_by_path.items() if not is_near]
+    mismatched_paths = [path for path, agrees in agreement_by_path.items() if not agrees]
     mismatched_paths += [
         path
-        for path in pair_by_path
-        if path not in is_near_by_path and not _is_same(*pair_by_path[path], is_same_number)
+        for path in value_pair_by_path
+        if path not in agreement_by_path
+        and not _is_equal_after_rounding(*value_pair_by_path[path], is_same_number)
     ]
     mismatches = (
-        Mismatch(one_line(path, MAX_TEXT_LENGTH), *map(_format_value, pair_by_path[path]))
+        Mismatch(one_line(path, MAX_TEXT_LENGTH), *map(_format_value, value_pair_by_path[path]))
         for path in mismatched_paths
     )
-    return tuple(mismatches), is_same_number, len(pair_by_path)
+    return tuple(mismatches), is_same_number, len(value_pair_by_path)
 
 
 # Mark of a value that is missing in one of two results
@@ -429,17 +445,21 @@ def is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _is_near(path: str, submitted_number: float, new_number: float, is_estimated: bool) -> bool:
+def _is_within_tolerance(
+    path: str, submitted_number: float, new_number: float, is_estimated: bool
+) -> bool:
     if isinstance(new_number, int):
         tolerance: float = MAX_ITERATION_DIFFERENCE * path.endswith(ITERATIONS_FIELD)
     elif is_estimated:
         tolerance = ESTIMATE_RELATIVE_TOLERANCE * abs(new_number) + ESTIMATE_ABSOLUTE_TOLERANCE
     else:
-        tolerance = RELATIVE_TOLERANCE * abs(new_number) + ABSOLUTE_TOLERANCE
+        tolerance = RESULT_RELATIVE_TOLERANCE * abs(new_number) + RESULT_ABSOLUTE_TOLERANCE
     return abs(submitted_number - new_number) <= tolerance
 
 
-def _is_same(submitted_value: Any, new_value: Any, is_same_number: TextComparison) -> bool:
+def _is_equal_after_rounding(
+    submitted_value: Any, new_value: Any, is_same_number: TextComparison
+) -> bool:
     if isinstance(submitted_value, str) and isinstance(new_value, str):
         return is_same_text_rounded(submitted_value, clean_text(new_value), is_same_number)
     return type(submitted_value) is type(new_value) and bool(submitted_value == new_value)

@@ -20,7 +20,7 @@ from px4fuse.results.model import provenance
 from px4fuse.results.reading import read_results
 from px4fuse.verification.model import Verification
 from px4fuse.verification.pdf_input import read_report
-from px4fuse.verification.verification import log_sha256, recompute, verify
+from px4fuse.verification.verification import log_sha256, recompute_report, verify
 
 # Subfolder of the output folder for the cached results
 RECORDS_FOLDER = "records"
@@ -113,7 +113,7 @@ def repeat_with_diagnosis(
     """
     token = ignores_assessed_mark.set(True)
     try:
-        outcome = recompute(results, path_by_sha256)
+        outcome = recompute_report(results, path_by_sha256)
     finally:
         ignores_assessed_mark.reset(token)
     if isinstance(outcome, Verification):

@@ -29,7 +29,7 @@ from px4fuse.errors import SettingsError
 from px4fuse.results.answer_form import Answers
 from px4fuse.results.contract import LoopResults, ReportedResults
 from px4fuse.verification.model import Verification
-from px4fuse.verification.verification import cannot_verify, log_sha256
+from px4fuse.verification.verification import log_sha256, make_unverifiable_result
 
 DEFAULT_RUBRIC_NAME = "rubric.toml"
 MAX_RUBRIC_BYTES = 1_000_000
@@ -254,7 +254,7 @@ def grade_unreadable_file(
 ) -> GradedReport:
     """Return zero points for a file that is not a report."""
     comment = f"No points: the file is not a px4fuse report ({shorten_text(reason).rstrip('.')})."
-    verification, items = cannot_verify(reason, remedy), rubric.items
+    verification, items = make_unverifiable_result(reason, remedy), rubric.items
     graded_items = tuple(
         ItemScore(item.title, 0.0, item.points, comment)
         for item in items
