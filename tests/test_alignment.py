@@ -404,7 +404,7 @@ BOTH_SPANS = r"the log is from 2416\.25 s to 2536\.25 s on the boot clock, .* fr
 def test_align_position_file_at_rest_requires_clock_offset() -> None:
     flight = flight_along(partial(passes, across_m=0.0), length_m=0.0)
     for parts in ({}, {"ekf2": unavailable("EKF2")}):
-        said = rf"^uwb\.csv: .*change by less than 0.5 m; {BOTH_SPANS}.*Give `clock_offset_s`\.$"
+        said = rf"^uwb\.csv: .*change by less than 0.5 m, too .*; {BOTH_SPANS}.*Give `clock_offset_s`\.$"
         with pytest.raises(MissingDataError, match=said):
             align_position_file(replace(flight, **parts), uwb_file(flight), frame="enu")
     alignment, track = align(flight, uwb_file(flight), frame="enu", clock_offset_s=OFFSET_S)
