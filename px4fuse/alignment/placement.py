@@ -282,8 +282,8 @@ def _apply_alignment(
         and reference_correlation < MIN_CONCORDANCE[EKF2_REFERENCE]
     ):
         warnings.append(
-            f"The position file does not match the EKF2 position (correlation {reference_correlation:.2f}). "
-            "Check time offset, frame and yaw of the position file."
+            "The position file does not match the EKF2 position (correlation "
+            f"{reference_correlation:.2f}). Check time offset, frame and yaw of the position file."
         )
     unix_start_s = flight.log.start_unix_s
     if recording.clock_kind == "UNIX" and unix_start_s is not None and clock_offset_s is not None:
@@ -371,8 +371,8 @@ def _find_warnings(match: Match, is_yaw_estimated: bool) -> Iterator[str]:
     if fit.second_peak_ratio < MAX_SIMILAR_RESIDUAL_RATIO[reference_name]:
         yield (
             f"A time offset that differs by {fit.second_peak_lag_s:+.1f} s fits nearly as well: "
-            f"the residual is {fit.second_peak_ratio:.1f} times larger. Check the time offset, or set "
-            "the time offset with --clock-offset."
+            f"the residual is {fit.second_peak_ratio:.1f} times larger. Check the time offset, or "
+            "set the time offset with --clock-offset."
         )
     if is_yaw_estimated and reference_name == IMU_REFERENCE:
         yield (
