@@ -4,8 +4,8 @@ The flight is replayed with KF. In each step, one more property of KF is replace
 times, noise settings, estimated states, gate, and output predictor. A step reduces or increases the
 mean square difference from the logged EKF2.
 
-Bias states are added first, because EKF2's process noise is too small for a filter without bias
-states. The steps gate and output predictor use EKF2's logged rejections.
+Bias states are added before EKF2's process noise, because this noise is too small for a filter
+without bias states. The steps gate and output predictor use EKF2's logged rejections.
 """
 
 import math
