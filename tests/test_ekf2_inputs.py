@@ -385,7 +385,7 @@ def segments(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
         return made(ReplaySegment, **dict.fromkeys(map(attrgetter("name"), fields(ReplaySegment))))
 
     monkeypatch.setattr("px4fuse.ekf2.replay_segments._make_segment", keep)
-    monkeypatch.setattr("px4fuse.ekf2.replay_segments.CORRELATION_HISTORY_S", 0.0)
+    monkeypatch.setattr("px4fuse.ekf2.replay_segments.STATE_CORRELATION_HISTORY_S", 0.0)
     imu, fused, delayed = (
         pd.DataFrame(index=each) for each in (given.imu, given.fused, given.delayed)
     )

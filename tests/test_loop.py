@@ -349,7 +349,7 @@ def test_odometry_variance_uses_growth_of_reported_variance() -> None:
     with_growing = replace(odometry, position_variance_m2=growing)
     grown, _, words = compute_odometry_variances(with_growing, nodes, OdometryNoise())
     np.testing.assert_allclose(grown.sum(), 0.4 - 0.001, rtol=0.05)
-    assert "increase of the logged position variances" in words
+    assert "increase of the logged position variance" in words
 
 
 def test_pose_graph_correction_interpolates_between_key_frames(sample_loop: Loop) -> None:

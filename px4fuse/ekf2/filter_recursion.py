@@ -63,7 +63,7 @@ MIN_STATE_VARIANCE = 1e-30
 # Number of events whose transition matrices are copied at once, to limit the memory
 EVENT_BATCH_SIZE = 64
 # Measurement variance (m² or rad²) so large that the measurement has no effect
-IGNORED_VARIANCE = 1e9
+VARIANCE_WITHOUT_EFFECT = 1e9
 # Acceleration noise (m/s²) while EKF2 reports a bad or clipped acceleration (BADACC_BIAS_PNOISE,
 # common.h; covariance.cpp)
 BAD_ACCELERATION_NOISE_M_S2 = 4.9
@@ -324,7 +324,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         or configuration.keeps_logged_bad_acceleration(inputs)
         for configuration in configurations
     ]
-    bad_acceleration = BadAccelerationFlag(
+    bad_acceleration_flag = BadAccelerationFlag(
         np.array(uses_logged_flag), inputs.rules.bad_acceleration_duration_s, segment
     )
     if segment.height_samples is not None:
@@ -337,7 +337,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             is_enabled_by_aid,
             parameters,
             has_gate,
-            bad_acceleration,
+            bad_acceleration_flag,
         )
     if inputs.vision is not None:
         grouped_vision_samples = [
@@ -378,13 +378,13 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             * (BAD_ACCELERATION_NOISE_M_S2**2 - acceleration_variance)
         )
     x, P = _make_start_state(segment, has_biases, has_attitude)
-    if bad_acceleration.until_s[0] > segment.time_s[0]:
+    if bad_acceleration_flag.until_s[0] > segment.time_s[0]:
         # The log contains no accelerometer bias while the bad-acceleration flag is set. The replay
         # starts with the segment's mean bias, computed from the change of the published velocity
         set_states(
             x,
             P,
-            ~bad_acceleration.uses_logged_flag & has_biases,
+            ~bad_acceleration_flag.uses_logged_flag & has_biases,
             slice(ACCELEROMETER_BIAS_DOWN, ACCELEROMETER_BIAS_DOWN + 1),
             np.full((configuration_count, 1), segment.mean_bias_down_m_s2),
             np.full((configuration_count, 1), INITIAL_BIAS_SIGMA_M_S2**2),
@@ -444,7 +444,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         P[:, :, :STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
         P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += process_noise[batch_index]
         is_bias_constant = None
-        flagged_fraction = bad_acceleration.compute_flagged_fraction(
+        flagged_fraction = bad_acceleration_flag.compute_flagged_fraction(
             event_time_s[event - 1] if event else start_s, event_time_s[event]
         )
         if flagged_fraction is not None:
@@ -454,7 +454,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += (
                 variance_increase[:, None, None] * accelerometer_noise[batch_index]
             )
-            is_bias_constant = bad_acceleration.until_s > event_time_s[event]
+            is_bias_constant = bad_acceleration_flag.until_s > event_time_s[event]
             bias_before_fusion = x[:, ACCELEROMETER_BIAS].copy()
             bias_covariance = P[:, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS].copy()
         bias_variance = _get_state_variances(P)[:, BIASES.start :]
@@ -462,7 +462,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         if inputs.rules.min_bias_variance_m2_s4 is not None:
             _limit_bias_variance(P, inputs.rules.min_bias_variance_m2_s4, has_biases)
         innovation[:, 2:] = 0.0
-        R[:, 2:] = IGNORED_VARIANCE
+        R[:, 2:] = VARIANCE_WITHOUT_EFFECT
         for event_means, gate, state_rows in sensor_means:
             if event_means.sample_count[event].any():
                 event_mean = EventSamples(*(quantity[event] for quantity in event_means))
@@ -480,7 +480,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             if is_outside_gate[:, DOWN_COLUMN].any():
                 # With a bad vertical acceleration, EKF2 clips the vertical innovation to the gate
                 # if the horizontal velocity is inside the gate
-                is_clipped = has_gate & (bad_acceleration.until_s > event_time_s[event])
+                is_clipped = has_gate & (bad_acceleration_flag.until_s > event_time_s[event])
                 is_clipped &= ~is_outside_gate[:, :DOWN_COLUMN].any(axis=1)
                 innovation_limit = np.sqrt(gate_squared * S)[is_clipped, DOWN_COLUMN]
                 nu[is_clipped, DOWN_COLUMN] = np.clip(
@@ -538,11 +538,11 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             )
             heading_error_rad = np.where(has_attitude, x[:, HEADING] + innovation[:, 0], 0.0)
             if inputs.fuses_vision_height or height_filter is not None:
-                R[:, 1] = IGNORED_VARIANCE
+                R[:, 1] = VARIANCE_WITHOUT_EFFECT
                 if has_sample[event] and height_filter is None:
                     innovation[:, 1] = nu[:, 5]
                     R[:, 1] = np.where(
-                        is_active[event], measurement_variance[event, :, 5], IGNORED_VARIANCE
+                        is_active[event], measurement_variance[event, :, 5], VARIANCE_WITHOUT_EFFECT
                     )
             x, P = _update_jointly(x, P, innovation, R)
             x[:, HEADING] = heading_error_rad
@@ -561,7 +561,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 decisions.last_position_s = np.maximum(
                     decisions.last_position_s, vision_filter.last_fusion_s
                 )
-        if height_filter is not None and bad_acceleration.models_flag:
+        if height_filter is not None and bad_acceleration_flag.models_flag:
             if has_sample[event] and has_velocity:
                 height_filter.update_records[event, -1, 0] = np.where(
                     can_fuse_velocity[event], nu[:, DOWN_COLUMN], np.nan
@@ -858,7 +858,7 @@ def _compute_noise_for_variance(variance: Array, target_variance: Array) -> Arra
     With this R, updates with EKF2's published height and heading give the logged variances.
     """
     excess_variance = variance - target_variance
-    noise_variance = np.full(excess_variance.shape, IGNORED_VARIANCE)
+    noise_variance = np.full(excess_variance.shape, VARIANCE_WITHOUT_EFFECT)
     np.divide(
         variance * target_variance, excess_variance, out=noise_variance, where=excess_variance > 0.0
     )

@@ -187,7 +187,7 @@ class HeightFilter:
     parameters : mapping from parameter name to ndarray, shape (filters,)
     has_gate : ndarray of bool, shape (filters,)
         False to fuse every sample.
-    bad_acceleration : BadAcceleration
+    bad_acceleration_flag : BadAcceleration
 
     Attributes
     ----------
@@ -205,9 +205,9 @@ class HeightFilter:
         is_enabled_by_aid: Mapping[str, BoolArray],
         parameters: Mapping[str, Array],
         has_gate: BoolArray,
-        bad_acceleration: BadAccelerationFlag,
+        bad_acceleration_flag: BadAccelerationFlag,
     ) -> None:
-        self.bad_acceleration = bad_acceleration
+        self.bad_acceleration_flag = bad_acceleration_flag
         height_samples = segment.height_samples
         configuration_count = len(has_gate)
         assert height_samples is not None
@@ -306,7 +306,7 @@ class HeightFilter:
         innovations = -update_records[:, :, 0] / np.sqrt(update_records[:, :, 1])
         if (innovations > MIN_LARGER_HEIGHT_INNOVATION).any():
             innovations[:, -2] = np.fmax(innovations[:, -2], innovations[:, -1])
-            self.bad_acceleration.update(time_s, innovations[0, :-1], innovations[-1, :-1])
+            self.bad_acceleration_flag.update(time_s, innovations[0, :-1], innovations[-1, :-1])
 
     def _fuse_sample(
         self,
@@ -348,7 +348,7 @@ class HeightFilter:
             is_clipped = (
                 has_sample
                 & ~is_fused
-                & (self.bad_acceleration.until_s > self.time_s[sample_index, event])
+                & (self.bad_acceleration_flag.until_s > self.time_s[sample_index, event])
             )
             innovation_limit = np.sqrt(self.gate_squared[sensor_index] * S)
             nu = np.where(is_clipped, np.clip(nu, -innovation_limit, innovation_limit), nu)

@@ -59,38 +59,38 @@ def compute_published_state(
     mean_step_s = float(np.mean(segment.step_s))
     # EKF2 corrects the newest IMU samples with the bias at the fusion horizon. To save memory, one
     # array contains specific force, then velocity increments, then position increments
-    increments = segment.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag_steps)[1:]
-    increments = rotate(segment.body_to_ned[1:], increments)
-    increments += np.cross(attitude_difference_rad[1:], increments)
-    increments += GRAVITY_M_S2
-    increments *= step_s
+    imu_increments = segment.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag_steps)[1:]
+    imu_increments = rotate(segment.body_to_ned[1:], imu_increments)
+    imu_increments += np.cross(attitude_difference_rad[1:], imu_increments)
+    imu_increments += GRAVITY_M_S2
+    imu_increments *= step_s
     velocity_m_s = _predict_output(
-        state[:, VELOCITY], increments, lag_steps, mean_step_s, settings["EKF2_TAU_VEL"]
+        state[:, VELOCITY], imu_increments, lag_steps, mean_step_s, settings["EKF2_TAU_VEL"]
     )
     # mean velocity of a step = velocity before + half of the IMU increment, because corrections are
     # added at the end of the step
-    increments *= 0.5
-    increments += velocity_m_s[:-1]
-    increments *= step_s
+    imu_increments *= 0.5
+    imu_increments += velocity_m_s[:-1]
+    imu_increments *= step_s
     # without resets: a reset shifts all buffered outputs, so the predictor has no error to correct
     position_without_resets = state[:, POSITION] - reset_m
     position_m = _predict_output(
-        position_without_resets, increments, lag_steps, mean_step_s, settings["EKF2_TAU_POS"]
+        position_without_resets, imu_increments, lag_steps, mean_step_s, settings["EKF2_TAU_POS"]
     )
     position_m += delay_by(reset_m, lag_steps)
     return velocity_m_s, position_m
 
 
 def _predict_output(
-    state: Array, increments: Array, lag_steps: int, step_s: float, tau_s: float
+    state: Array, output_increments: Array, lag_steps: int, step_s: float, tau_s: float
 ) -> Array:
-    """Return the sum of IMU ``increments``, corrected towards the delayed ``state`` as in EKF2.
+    """Return the sum of increments from the IMU, corrected with the delayed ``state`` as in EKF2.
 
     o: state minus sum of increments; c: sum of corrections, each of which shifts all buffered
     outputs; g: gain. In step k, the error at the fusion horizon, ``lag_steps`` ago, is
     e_k = o_(k-lag) - c_k, and c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
     """
-    dead_reckoned_state = np.concatenate([state[:1], increments])
+    dead_reckoned_state = np.concatenate([state[:1], output_increments])
     np.cumsum(dead_reckoned_state, axis=0, out=dead_reckoned_state)
     offset = state - dead_reckoned_state
     offset -= (start_offset := offset[0].copy())

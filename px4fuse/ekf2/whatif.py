@@ -391,7 +391,7 @@ def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Sum
             f"time: {replay.lost} samples arrive after the fusion horizon has passed them",
             "Choose another parameter value.",
         )
-    # Position variance before and after each update, 1 µs apart for the interpolation
+    # Interpolated position variance: before each update (1 µs earlier), and after it
     variance = pd.DataFrame(index=np.column_stack([update_times_s - 1e-6, update_times_s]).ravel())
     for axis in HORIZONTAL_AXES:
         innovation_variance, noise_variance = (
