@@ -90,8 +90,8 @@ def compute_odometry_variances(
             MIN_ODOMETRY_VARIANCE_FRACTION * translation_variance_m2,
         )
         variance_texts.append(
-            "the translation variance between two key frames is the increase of the logged "
-            "position variance"
+            "the translation variance between two nodes is the increase of the logged position "
+            "variance"
         )
     elif path.position_variance_m2 is not None:
         variance_texts.append("the logged position variances do not grow, so they are not used")
@@ -101,8 +101,8 @@ def compute_odometry_variances(
             rotation_variance_growth, MIN_ODOMETRY_VARIANCE_FRACTION * rotation_variance_rad2
         )
         variance_texts.append(
-            "the rotation variance between two key frames is the increase of the logged "
-            "orientation variance"
+            "the rotation variance between two nodes is the increase of the logged orientation "
+            "variance"
         )
     return translation_variance_m2, rotation_variance_rad2, "; ".join(variance_texts)
 
