@@ -532,7 +532,7 @@ def test_what_if_without_aiding_source_predicts_position_error(models):
 
 @pytest.mark.reallogs
 def test_what_if_with_unused_parameter_raises_settings_error(models):
-    with pytest.raises(SettingsError, match="EKF2 fused GNSS position, to which this"):
+    with pytest.raises(SettingsError, match="EKF2 fused GNSS position, which this"):
         what_if(models["nominal"], [{"EKF2_EVP_NOISE": 0.2}])
     own = replace(models["nominal"].inputs.received, uses_sender_times=True)
     model = replace(models["nominal"], inputs=replace(models["nominal"].inputs, received=own))
