@@ -118,7 +118,7 @@ class Reruns:
 
     Attributes
     ----------
-    ekf2_model : Model or Unavailable
+    ekf2_model : Ekf2Model or Unavailable
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
     trials : tuple of Trial
         Re-runs along the main axis, and along each axis with an inconsistent filter.
