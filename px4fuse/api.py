@@ -14,7 +14,7 @@ from px4fuse.core.record import display_html
 from px4fuse.core.writing import write_all
 from px4fuse.diagnose import diagnose, require_available, run_what_if
 from px4fuse.ekf2 import whatif
-from px4fuse.ekf2.model import open_model
+from px4fuse.ekf2.model import prepare_ekf2_model
 from px4fuse.ekf2.whatif import WhatIf
 from px4fuse.errors import OutputError, SettingsError
 from px4fuse.flight.model import Flight, Unavailable
@@ -343,7 +343,7 @@ def what_if(
     flight = log if isinstance(log, Flight) else read_log(log)
     if changes is None and not without:
         return run_what_if(request.WhatIfRequest(log=flight.log.name), flight=flight).whatif
-    ekf2_model = require_available(open_model(flight), flight)
+    ekf2_model = require_available(prepare_ekf2_model(flight), flight)
     changes = {} if changes is None else changes
     change_sets = [changes] if isinstance(changes, Mapping) else changes
     return require_available(whatif.what_if(ekf2_model, change_sets, without), flight)

@@ -46,7 +46,7 @@ from px4fuse.convention.correction import find_convention_faults
 from px4fuse.core.memory import release_free_memory
 from px4fuse.core.reading import display_name
 from px4fuse.ekf2.aids import evaluate_aids
-from px4fuse.ekf2.model import Model, open_model
+from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.ekf2.whatif import make_sweep_values, what_if
 from px4fuse.errors import MissingDataError, SettingsError
@@ -270,7 +270,7 @@ def rerun(
     progress("replaying EKF2")
     estimated_settings = estimate_wrong_settings(comparison, estimates.tuning)
     # Replay all parameter sets that the next two functions need at once, which is faster
-    ekf2_model = open_model(
+    ekf2_model = prepare_ekf2_model(
         comparison.flight,
         lambda inputs: [
             *list_step_configurations(comparison, inputs, estimated_settings),
@@ -282,7 +282,7 @@ def rerun(
         comparison, ekf2_model, estimates.clock, estimated_settings
     )
     trials = rerun_filters(comparison, estimates, ekf2_model)
-    if isinstance(ekf2_model, Model):  # to free memory
+    if isinstance(ekf2_model, Ekf2Model):  # to free memory
         ekf2_model = replace(ekf2_model, runs=(), intervals={})
     return Reruns(ekf2_model=ekf2_model, difference_steps=difference_steps, trials=trials)
 
@@ -344,7 +344,7 @@ def run_what_if(
             f"{flight.log.name}: {DIAGNOSIS_WITHHELD.reason}", "Give --set or --sweep."
         )
     progress("replaying EKF2")
-    ekf2_model = require_available(open_model(flight), flight)
+    ekf2_model = require_available(prepare_ekf2_model(flight), flight)
     difference_steps: Mapping[str, DifferenceExplanation | Unavailable] = {}
     comparison = None
     try:

@@ -32,7 +32,7 @@ from ulog_tools import Log
 from px4fuse import api, diagnose
 from px4fuse.analysis import Analysis
 from px4fuse.comparison.estimates import Progress, ignore_progress
-from px4fuse.ekf2.model import Model, open_model
+from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.loop import tracks
 from px4fuse.readers import read_log
@@ -142,7 +142,7 @@ def sample_flight(sample_log: Path) -> Flight:
 
 
 @pytest.fixture(scope="session")
-def model(sample_flight: Flight) -> Model:
+def model(sample_flight: Flight) -> Ekf2Model:
     """EKF2 model of the sample flight; it caches its replays."""
     return opened(sample_flight)
 
@@ -168,9 +168,9 @@ def shared_logs() -> Path:
 
 
 @pytest.fixture(scope="session")
-def model_of() -> Callable[[Path], Model | Unavailable]:
+def model_of() -> Callable[[Path], Ekf2Model | Unavailable]:
     """Function that returns the EKF2 model of a log; the last 8 are cached."""
-    return lru_cache(8)(lambda path: open_model(read_log(path)))
+    return lru_cache(8)(lambda path: prepare_ekf2_model(read_log(path)))
 
 
 @pytest.fixture

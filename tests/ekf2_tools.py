@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from px4fuse.ekf2.inputs import FusionRules, Inputs
+from px4fuse.ekf2.inputs import FusionRules, ReplayInputs
 from px4fuse.ekf2.intervals import StepEvents
-from px4fuse.ekf2.model import Model, open_model
+from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model
 from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment
 from px4fuse.flight.model import Flight
 from px4fuse.trajectory.rotation import skew
@@ -14,9 +14,9 @@ EYE = np.eye(15)
 RULES = FusionRules(0.2, 0.4, 1.0, 5, None, False)
 
 
-def opened(flight: Flight) -> Model:
-    found = open_model(flight)
-    assert isinstance(found, Model), found
+def opened(flight: Flight) -> Ekf2Model:
+    found = prepare_ekf2_model(flight)
+    assert isinstance(found, Ekf2Model), found
     return found
 
 
@@ -50,7 +50,7 @@ def step_state(segment: ReplaySegment, k: int, x: np.ndarray) -> np.ndarray:
 
 
 def plain_replay(
-    inputs: Inputs, segment: ReplaySegment, events: StepEvents
+    inputs: ReplayInputs, segment: ReplaySegment, events: StepEvents
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return innovations and variances of a flight as flown, without rejections.
 

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from px4fuse.alignment.placement import align_position_file
-from px4fuse.alignment.tracks import EKF2_POSITION, IMU
+from px4fuse.alignment.tracks import EKF2_REFERENCE, IMU_REFERENCE
 from px4fuse.core.arrays import Array
 from px4fuse.diagnose import diagnose
 from px4fuse.errors import MissingDataError, SettingsError
@@ -168,7 +168,7 @@ def test_align_position_file_detects_frame_and_time_offset(
     alignment, track = align(sample_flight, external)
     assert alignment.frame == "enu"
     assert "smallest residual against the EKF2 position" in alignment.frame_reason
-    assert alignment.reference == EKF2_POSITION
+    assert alignment.reference == EKF2_REFERENCE
     assert alignment.yaw_deg == 0.0
     assert alignment.yaw_sigma_deg is None
     assert alignment.origin_m == (0.0, 0.0, 0.0)
@@ -372,7 +372,7 @@ def test_position_file_is_aligned_by_imu_if_ekf2_is_missing(noise: float) -> Non
     flight = flight_along(imu=Imu(sigma_a_m_s2=noise), ekf2=None)
     file = uwb_file(flight, yaw_deg=25.0, origin_m=(4.0, 5.0, 0.0))
     alignment, _ = align(flight, file, frame="enu", yaw_deg="auto")
-    assert alignment.reference == IMU
+    assert alignment.reference == IMU_REFERENCE
     assert clock_error_s(alignment, sigma_s=(2e-3, 0.05)) < 0.05
     assert alignment.yaw_deg == pytest.approx(25.0, abs=3.0)
     assert alignment.origin_m == (0.0, 0.0, 0.0)
@@ -392,7 +392,7 @@ def test_align_position_file_without_ekf2_finds_frame_and_yaw() -> None:
     # with a constant EKF2 position the IMU is the reference
     still = replace(flight, ekf2=replace(flight.ekf2, state=flight.ekf2.state * 0.0))
     alignment, _ = align(still, uwb_file(flight), frame="enu")
-    assert alignment.reference == IMU
+    assert alignment.reference == IMU_REFERENCE
     assert clock_error_s(alignment) < 0.05
 
 
@@ -404,7 +404,9 @@ BOTH_SPANS = r"the log is from 2416\.25 s to 2536\.25 s on the boot clock, .* fr
 def test_align_position_file_at_rest_requires_clock_offset() -> None:
     flight = flight_along(partial(passes, across_m=0.0), length_m=0.0)
     for parts in ({}, {"ekf2": unavailable("EKF2")}):
-        said = rf"^uwb\.csv: .*change by less than 0.5 m; {BOTH_SPANS}.*Give `clock_offset_s`\.$"
+        said = (
+            rf"^uwb\.csv: .*change by less than 0.5 m, .*; {BOTH_SPANS}.*Give `clock_offset_s`\.$"
+        )
         with pytest.raises(MissingDataError, match=said):
             align_position_file(replace(flight, **parts), uwb_file(flight), frame="enu")
     alignment, track = align(flight, uwb_file(flight), frame="enu", clock_offset_s=OFFSET_S)

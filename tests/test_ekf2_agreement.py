@@ -22,7 +22,7 @@ from px4fuse.ekf2.replay import (
     _compute_heading_difference_deg,
     _judge_agreement,
     compare_with_log,
-    inside_spans,
+    is_inside_spans,
     logged_innovations,
     match_updates,
     with_logged_rejections,
@@ -62,7 +62,7 @@ def test_ekf2_replay_evaluation_excludes_first_5_s_of_segments():
                    flow_only_spans_s=((20.0, 23.0), (52.0, 58.0)))  # fmt: skip
     assert carried.find_evaluated_spans() == ((15.0, 20.0), (28.0, 30.0), (45.0, 52.0))
     times = np.array([15.0, 15.1, 29.9, 30.0, 45.0, 50.0, 60.0])
-    assert inside_spans(times, evaluated_spans).tolist() == [
+    assert is_inside_spans(times, evaluated_spans).tolist() == [
         False,
         True,
         True,
@@ -95,7 +95,7 @@ def agreeing(
     (agreeing(published_m=0.10004), 0.0, 0.0, False, "differ by 0.10004 m"),
     (agreeing(0.949), 0.0, 0.04, False, "a correlation of 0.9490, below"),
     # with many rejections, shares and NIS decide
-    (agreeing(0.5), 0.1, 0.06, True, "rejected 6.0% of the samples, EKF2 10.0%"),
+    (agreeing(0.5), 0.1, 0.06, True, "rejected 6.0% of the samples, EKF2 in the log 10.0%"),
     (agreeing(0.5), 0.06, 0.1, True, "single innovations are not compared"),
     (agreeing(0.5), 0.25, 0.19, False, "limits "),
     (agreeing(0.5), 0.125, 0.1875, False, "limits "),

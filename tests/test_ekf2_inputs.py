@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 from px4fuse.ekf2 import inputs as inputs_module
 from px4fuse.ekf2.inputs import (
     FusionRules,
-    Inputs,
     ReceivedPositions,
+    ReplayInputs,
     _find_vision_track,
     _read_logged_decisions,
     prepare_inputs,
@@ -149,7 +149,7 @@ def test_ekf2_fusion_rules_are_those_of_logged_px4_release(flown):
     assert new.rules == FusionRules(0.2, 0.4, 1.0, 5, None, False)
     assert new.imu_offset_m.tolist() == [0.0, 0.25, 0.0]
     assert (new.mean_step_s, new.configured_step_s) == (0.01, 0.01)
-    assert (new.horizon_s, new.max_interval_s) == (0.1, 0.25)
+    assert (new.horizon_s, new.max_event_interval_s) == (0.1, 0.25)
     old = flown(EKF2_AID_MASK=8.0, stores_bias_increments=True)
     assert old.rules == FusionRules(math.inf, 7.0, 7.0, 1_000_000, pytest.approx(5e-4), True)
     assert old.settings["EKF2_EV_DELAY"] == 175.0
@@ -157,7 +157,7 @@ def test_ekf2_fusion_rules_are_those_of_logged_px4_release(flown):
 
 
 def test_ekf2_replay_without_complete_imu_data_is_unavailable(flown):
-    assert isinstance(flown(0.0119), Inputs)
+    assert isinstance(flown(0.0119), ReplayInputs)
     assert "logged at 80 Hz" in flown(0.0125).reason
     assert isinstance(flown(horizon_s=NONE), Unavailable)
     assert flown(horizon_s=NONE, firmware="PX4 v1.13.3").horizon_s == 0.0
@@ -167,8 +167,8 @@ def test_ekf2_replay_without_complete_imu_data_is_unavailable(flown):
     every = np.arange(2, 998)
     assert "12 % of the IMU samples are missing" in flown(without=every[::8]).reason
     # fewer missing samples, and a gap, at which a segment ends
-    assert isinstance(flown(without=every[::12]), Inputs)
-    assert isinstance(flown(without=np.arange(400, 600)), Inputs)
+    assert isinstance(flown(without=every[::12]), ReplayInputs)
+    assert isinstance(flown(without=np.arange(400, 600)), ReplayInputs)
 
 
 def track(name: str, origin: SourceOrigin, interval_s: float = 0.1, **parts: Any) -> PositionTrack:
@@ -385,7 +385,7 @@ def segments(monkeypatch, **parts: Any) -> list[tuple[float, float]]:
         return made(ReplaySegment, **dict.fromkeys(map(attrgetter("name"), fields(ReplaySegment))))
 
     monkeypatch.setattr("px4fuse.ekf2.replay_segments._make_segment", keep)
-    monkeypatch.setattr("px4fuse.ekf2.replay_segments.CORRELATION_HISTORY_S", 0.0)
+    monkeypatch.setattr("px4fuse.ekf2.replay_segments.STATE_CORRELATION_HISTORY_S", 0.0)
     imu, fused, delayed = (
         pd.DataFrame(index=each) for each in (given.imu, given.fused, given.delayed)
     )

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from px4fuse.diagnose import run_what_if
-from px4fuse.ekf2.model import open_model
+from px4fuse.ekf2.model import prepare_ekf2_model
 from px4fuse.flight.model import Unavailable
 from px4fuse.readers import read_log
 from px4fuse.request import WhatIfRequest
@@ -37,14 +37,14 @@ def test_ekf2_replay_benchmark_matches_documented_numbers(shared_logs, model_of,
 
 @pytest.mark.parametrize("name", NOT_CARRIED)
 def test_ekf2_model_of_insufficient_log_gives_reason(shared_logs, name):
-    found = open_model(read_log(shared_logs / "simulated" / f"{name}.ulg"))
+    found = prepare_ekf2_model(read_log(shared_logs / "simulated" / f"{name}.ulg"))
     assert isinstance(found, Unavailable)
     assert NOT_CARRIED[name] in found.reason
 
 
 def test_ekf2_model_reports_fraction_of_missing_imu_samples(shared_logs):
     name = "mengchaoheng_PX4_ulog_plottools_hist_6a8cf408_test3.ulg"
-    found = open_model(read_log(shared_logs / "real" / name))
+    found = prepare_ekf2_model(read_log(shared_logs / "real" / name))
     assert isinstance(found, Unavailable)
     assert "23 % of the IMU samples are missing" in found.reason
 
@@ -63,7 +63,7 @@ REJECTING_FLIGHTS = {
 
 @pytest.mark.parametrize("name", REJECTING_FLIGHTS)
 def test_ekf2_replay_of_flights_with_rejections_agrees_with_log(shared_logs, name):
-    model = open_model(read_log(shared_logs / f"{name}.ulg"))
+    model = prepare_ekf2_model(read_log(shared_logs / f"{name}.ulg"))
     assert not isinstance(model, Unavailable)
     assert model.agreement.good
     correlations = [axis.innovation_correlation for axis in model.agreement.axes.values()]
@@ -72,7 +72,7 @@ def test_ekf2_replay_of_flights_with_rejections_agrees_with_log(shared_logs, nam
 
 def test_ekf2_replay_with_86_percent_rejected_does_not_agree(shared_logs):
     """EKF2 rejects 86 % of the positions, and its variance is reduced by unlogged samples."""
-    model = open_model(read_log(shared_logs / "conventions" / "nwu_vio.ulg"))
+    model = prepare_ekf2_model(read_log(shared_logs / "conventions" / "nwu_vio.ulg"))
     assert not isinstance(model, Unavailable)
     assert not model.agreement.good
     assert "rejected 86% of the positions and relied on the IMU" in model.agreement.reason

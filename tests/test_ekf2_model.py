@@ -12,9 +12,9 @@ from exchange import replace
 
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
 from px4fuse.ekf2.model import (
-    Model,
+    Ekf2Model,
     compute_delayed_states,
-    open_model,
+    prepare_ekf2_model,
     replay_with_settings,
     run_configurations,
 )
@@ -38,7 +38,7 @@ def vision_of(flight: Flight) -> pd.DataFrame:
     return next(t for t in flight.positions if t.name == "vehicle_visual_odometry").samples
 
 
-def test_ekf2_model_transition_equals_product_of_step_matrices(model: Model) -> None:
+def test_ekf2_model_transition_equals_product_of_step_matrices(model: Ekf2Model) -> None:
     segment, intervals = model.inputs.segments[0], next(iter(model.intervals.values()))[0]
     made, end = intervals.compute_transitions(slice(None)), intervals.events.end_step
     starts = np.concatenate([[0], end[:-1]])
@@ -63,7 +63,9 @@ def test_ekf2_model_transition_equals_product_of_step_matrices(model: Model) -> 
 
 
 @pytest.mark.parametrize("attitude", [True, False])
-def test_ekf2_model_state_between_updates_is_imu_prediction(model: Model, attitude: bool) -> None:
+def test_ekf2_model_state_between_updates_is_imu_prediction(
+    model: Ekf2Model, attitude: bool
+) -> None:
     """Without attitude as a state, the nominal attitude is not corrected."""
     configuration = FilterConfiguration(model.inputs.settings, estimates_attitude=attitude)
     (part,) = run_configurations(model.inputs, [configuration], model.intervals)
@@ -81,7 +83,7 @@ def test_ekf2_model_state_between_updates_is_imu_prediction(model: Model, attitu
             np.testing.assert_allclose(state[k + 1], x, rtol=0.0, atol=1e-10)
 
 
-def test_ekf2_model_innovations_equal_reference_filter(model: Model) -> None:
+def test_ekf2_model_innovations_equal_reference_filter(model: Ekf2Model) -> None:
     events = next(iter(model.intervals.values()))[0].events
     nu, S = plain_replay(model.inputs, model.inputs.segments[0], events[events.end_step < 3000])
     updates = model.baseline_replay.updates.iloc[: len(nu)]
@@ -91,7 +93,7 @@ def test_ekf2_model_innovations_equal_reference_filter(model: Model) -> None:
         np.testing.assert_allclose(updates[f"innovation_variance_{axis}_m2"], S[:, at], rtol=3e-3)
 
 
-def test_ekf2_model_of_sample_flight_agrees_with_log(model: Model) -> None:
+def test_ekf2_model_of_sample_flight_agrees_with_log(model: Ekf2Model) -> None:
     agreement = model.agreement
     assert agreement.good
     assert agreement.samples > 200
@@ -108,7 +110,7 @@ def test_ekf2_model_of_sample_flight_agrees_with_log(model: Model) -> None:
 
 
 def test_ekf2_replay_memory_does_not_grow_with_setting_count(
-    model: Model, monkeypatch: pytest.MonkeyPatch
+    model: Ekf2Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("px4fuse.ekf2.model.REPLAY_BATCH_SIZE", 2)
 
@@ -123,7 +125,7 @@ def test_ekf2_replay_memory_does_not_grow_with_setting_count(
     assert peak(6) < 1.15 * peak(2)
 
 
-def test_ekf2_replay_of_several_settings_equals_separate_runs(model: Model) -> None:
+def test_ekf2_replay_of_several_settings_equals_separate_runs(model: Ekf2Model) -> None:
     settings = [
         {"EKF2_EVP_NOISE": 0.02}, {"EKF2_EV_DELAY": 80.0},
         {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_DELAY": 40.0, "EKF2_EVP_GATE": 2.0}, {},
@@ -140,7 +142,7 @@ def test_ekf2_replay_of_several_settings_equals_separate_runs(model: Model) -> N
     )
 
 
-def test_ekf2_replay_counts_late_and_lost_vision_samples(model: Model) -> None:
+def test_ekf2_replay_counts_late_and_lost_vision_samples(model: Ekf2Model) -> None:
     vision = model.inputs.received
     assert (model.baseline_replay.late, model.baseline_replay.lost) == (0, 0)
     # the horizon is 214 ms, and samples may be 100 ms later
@@ -170,7 +172,7 @@ def with_copies(flight: Flight) -> Flight:
 
 
 def unavailable(flight: Flight) -> str:
-    found = open_model(flight)
+    found = prepare_ekf2_model(flight)
     assert isinstance(found, Unavailable)
     assert found.remedy.endswith(".")
     return found.reason
@@ -186,7 +188,7 @@ def test_ekf2_model_without_required_topic_gives_reason(sample_flight: Flight) -
     slow = sample_flight.imu.iloc[::5]
     assert "53 Hz" in unavailable(replace(sample_flight, imu=slow))
     copies = unavailable(with_copies(sample_flight))
-    assert "estimator_aid_src_ev_pos has a sample interval of 0.5" in copies
+    assert "estimator_aid_src_ev_pos is logged every 0.5" in copies
     dropped = sample_flight.imu[(sample_flight.imu.index % 8.0) > 0.1]
     assert "without a gap" in unavailable(replace(sample_flight, imu=dropped))
     frame = with_vision(sample_flight, vision_of(sample_flight), frame="FRD")
@@ -199,7 +201,7 @@ def test_ekf2_model_of_mavlink_recording_is_unavailable() -> None:
     assert "estimator_states" in unavailable(read_log(LOG.with_suffix(".tlog")))
 
 
-def test_ekf2_model_fuses_vision_height_if_enabled(model: Model, sample_flight: Flight) -> None:
+def test_ekf2_model_fuses_vision_height_if_enabled(model: Ekf2Model, sample_flight: Flight) -> None:
     ekf2 = sample_flight.ekf2
     samples = vision_of(sample_flight).copy()
     samples["down_m"] += 0.7

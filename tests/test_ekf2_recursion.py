@@ -20,11 +20,11 @@ from px4fuse.ekf2.filter_recursion import (
     _compute_settled_correlation,
     _FusionDecisions,
     _limit_bias_variance,
-    _sequential_update,
+    _update_sequentially,
     run_segment,
 )
 from px4fuse.ekf2.filter_recursion import _collect_measurements as measurements
-from px4fuse.ekf2.inputs import FusionRules, Inputs, ReceivedPositions
+from px4fuse.ekf2.inputs import FusionRules, ReceivedPositions, ReplayInputs
 from px4fuse.ekf2.intervals import (
     FUSE,
     NO_ACTION,
@@ -35,7 +35,7 @@ from px4fuse.ekf2.intervals import (
     _make_events,
     make_intervals,
 )
-from px4fuse.ekf2.model import Model, replay_with_settings
+from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
 from px4fuse.ekf2.replay_segments import GRAVITY_M_S2, ReplaySegment, add_field_states
 from px4fuse.errors import SettingsError
 from px4fuse.flight.ekf2_parameters import EV_POS, GNSS_POS, MAG, Aid, fill_with_defaults
@@ -65,7 +65,7 @@ def test_vision_measurements_apply_lever_arm_and_noise_minimum():
         "EKF2_EV_POS_X": np.array([0.0, 0.3]), "EKF2_EV_POS_Y": np.zeros(2),
         "EKF2_EV_POS_Z": np.zeros(2),
     }  # fmt: skip
-    inputs = made(Inputs, received=vision, imu_offset_m=np.zeros(3))
+    inputs = made(ReplayInputs, received=vision, imu_offset_m=np.zeros(3))
     at = np.array([0]), np.array([[1]])
     position, noise = measurements(inputs, segment, *at, parameters, np.array([True, True]))
     # 0.3 m ahead of a body that faces east: the body is west of the sensor
@@ -145,7 +145,7 @@ def test_fusion_horizon_equals_length_of_ekf2_buffer(settings, by_delay, timing)
     usual = {"EKF2_EV_DELAY": 0.0, "EKF2_DELAY_MAX": 200.0}
     rules = replace(RULES, uses_delay_as_horizon=by_delay)
     inputs = made(
-        Inputs,
+        ReplayInputs,
         rules=rules,
         settings=usual,
         horizon_s=0.12,
@@ -161,9 +161,9 @@ def test_fusion_horizon_equals_length_of_ekf2_buffer(settings, by_delay, timing)
 def test_what_if_with_ekf2_delay_max_on_px4_v1_14_raises_error():
     rules = replace(RULES, uses_delay_as_horizon=True)
     received = made(ReceivedPositions, uses_sender_times=False)
-    inputs = made(Inputs, rules=rules, settings={}, aid=EV_POS, received=received)
+    inputs = made(ReplayInputs, rules=rules, settings={}, aid=EV_POS, received=received)
     flight = SimpleNamespace(log=log(firmware="PX4 v1.14"))
-    model = made(Model, inputs=inputs, flight=flight)
+    model = made(Ekf2Model, inputs=inputs, flight=flight)
     with pytest.raises(
         SettingsError, match=r"in PX4 v1\.14 the largest delay parameter is the delay"
     ):
@@ -196,7 +196,7 @@ def test_second_axis_update_uses_innovation_before_first_update():
     P, nu, R = root @ np.swapaxes(root, 1, 2), rng.normal(size=(2, 6)), np.full((2, 6), 0.5)
     S = np.diagonal(P, axis1=1, axis2=2)[:, 3:9] + R
     taken = np.array([True, False])
-    x, left = _sequential_update(np.zeros((2, 15)), P, nu, S, R, slice(3, 5), taken[:, None])
+    x, left = _update_sequentially(np.zeros((2, 15)), P, nu, S, R, slice(3, 5), taken[:, None])
     expected, state = P[0], np.zeros(15)
     for column, row in ((3, 6), (4, 7)):
         K = expected[:, row] / S[0, column]
@@ -359,9 +359,9 @@ def at_rest(
         vision,
         velocity_m_s=speed_m_s,
         velocity_variance_m2_s2=exact,
-        reset_s=reset_s,
+        reset_times_s=reset_s,
     )
-    inputs = Inputs(
+    inputs = ReplayInputs(
         fill_with_defaults(settings, aid, *([MAG] if segment.field else [])), (segment,), vision,
         rules, 0.01, 0.1, 0.01,
         fuses_vision_height=False, imu_offset_m=np.zeros(3), aid=aid,
@@ -454,7 +454,7 @@ def acting(stamps: list[float], *, fusing: bool = True, rules: FusionRules = RUL
     segment = stretch_of(500, fusing=fusing)
     taken = np.array(stamps)
     end = np.searchsorted(segment.time_s, taken - 1e-9)
-    inputs = made(Inputs, rules=rules)
+    inputs = made(ReplayInputs, rules=rules)
     action, _ = _find_sample_actions(inputs, segment, taken, end, np.ones(len(taken), bool))
     return action.tolist()
 
@@ -474,11 +474,11 @@ def events(
     stamps: list[float], *, delay_s: float = 0.0, age_s: float = -9.0, horizon_s: float = 0.0
 ) -> Any:
     inputs = made(
-        Inputs,
+        ReplayInputs,
         received=vision_of(stamps, age_s),
         mean_step_s=0.01,
         rules=RULES,
-        max_interval_s=0.25,
+        max_event_interval_s=0.25,
     )
     return _make_events(inputs, stretch_of(100), FusionDelays(delay_s, horizon_s))
 

@@ -14,18 +14,18 @@ from findings_tools import NONE, made
 from msgspec import structs
 
 from px4fuse.ekf2 import whatif
-from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
-from px4fuse.ekf2.model import Model
+from px4fuse.ekf2.inputs import ReceivedPositions, ReplayInputs
+from px4fuse.ekf2.model import Ekf2Model
 from px4fuse.ekf2.replay import Ekf2Replay, compute_rmse_to_truth, interpolate_component
 from px4fuse.ekf2.replay_segments import ReplaySegment, SensorSamples
 from px4fuse.ekf2.steps import (
     ATTITUDE_STEP,
     FLOW_STEP,
-    GATE_STEP,
+    GNSS_VELOCITY_STEP,
     MAGNETOMETER_STEP,
     OUTPUT_PREDICTOR_STEP,
+    REJECTION_STEP,
     REPLACEMENT_STEPS,
-    VELOCITY_STEP,
     DifferenceExplanation,
     _find_longest_rejection,
     explain_by_steps,
@@ -114,7 +114,7 @@ def test_each_step_replaces_one_more_kf_setting_by_ekf2_value():
     flown = {"EKF2_EVP_NOISE": 0.3, "EKF2_EV_NOISE_MD": 0.0, "EKF2_ACC_NOISE": 0.35}
     received = made(ReceivedPositions)
     plain = (made(ReplaySegment, flow=None, height_samples=None),)
-    flight = made(Inputs, settings=flown, mean_step_s=0.01, received=received, segments=plain)
+    flight = made(ReplayInputs, settings=flown, mean_step_s=0.01, received=received, segments=plain)
     kf_settings = Settings(0.5, 0.2, 0.16, clock_offset_s=-0.05)
     found = list(make_step_configurations(flight, kf_settings).values())
     settings = [configuration.settings for configuration in found]
@@ -130,7 +130,7 @@ def test_each_step_replaces_one_more_kf_setting_by_ekf2_value():
     assert [configuration.uses_logged_decisions for configuration in found] == [False] * 6 + [True]
     assert [configuration.timestamp_offset_s for configuration in found] == [-0.05] + [None] * 6
     gnss = made(
-        Inputs,
+        ReplayInputs,
         aid=GNSS_POS,
         mean_step_s=0.01,
         received=made(ReceivedPositions, velocity_m_s=np.zeros((1, 3))),
@@ -147,13 +147,15 @@ def test_each_step_replaces_one_more_kf_setting_by_ekf2_value():
     ] * 6
     flow = (made(ReplaySegment, flow=made(SensorSamples), height_samples=None),)
     more = {"segments": flow, "settings": gnss.settings | {"EKF2_MAG_NOISE": 0.05}}
-    configurations = make_step_configurations(made(Inputs, **{**vars(gnss), **more}), kf_settings)
+    configurations = make_step_configurations(
+        made(ReplayInputs, **{**vars(gnss), **more}), kf_settings
+    )
     assert list(configurations)[-5:] == [
         ATTITUDE_STEP,
         MAGNETOMETER_STEP,
-        VELOCITY_STEP,
+        GNSS_VELOCITY_STEP,
         FLOW_STEP,
-        GATE_STEP,
+        REJECTION_STEP,
     ]
     assert ["mag" in each.without for each in configurations.values()] == [True] * 6 + [False] * 4
     assert ["optical_flow" in each.without for each in configurations.values()] == [True] * 8 + [
@@ -222,7 +224,7 @@ def test_what_if_with_late_samples_adds_a_note():
         )
         (note,) = _describe_replay_limits(model, one)
         assert note.startswith("EKF2_EV_DELAY=90: 5 of 10 samples")
-        assert note.endswith(f"(2 would never be fused){remedy}")
+        assert note.endswith(f"EKF2 would never fuse 2 of them{remedy}")
         few = SimpleNamespace(**(vars(one) | {"updates": range(1)}))
         assert "5 of 5 samples" in next(_describe_replay_limits(model, few))
         one.late = one.lost = 0
@@ -232,7 +234,7 @@ def test_what_if_with_late_samples_adds_a_note():
 # ---------------------------------------------------------- predictability of results
 
 
-def flown(tmp_path: Path, mistake: str, seed: int) -> Model:
+def flown(tmp_path: Path, mistake: str, seed: int) -> Ekf2Model:
     """Return the model of a simulated flight with one wrong EKF2 parameter, read from its log."""
     log = tmp_path / f"{seed}{mistake.partition('=')[2]}.ulg"
     log.write_bytes(
@@ -290,12 +292,12 @@ def test_what_if_sensitive_to_noise_is_marked_unpredictable(model, monkeypatch):
     )  # fmt: skip
     runs: list[tuple[float, int]] = []
 
-    def with_position_noise(model: object, sigma_m: float, seed: int) -> object:
+    def add_position_noise(model: object, sigma_m: float, seed: int) -> object:
         runs.append((sigma_m, seed))
         return model
 
     def is_predictable(changed: Summary) -> bool:
-        monkeypatch.setattr(whatif, "with_position_noise", with_position_noise)
+        monkeypatch.setattr(whatif, "add_position_noise", add_position_noise)
         monkeypatch.setattr(whatif, "replay_with_settings", lambda _, changes, **_more: changes)
         monkeypatch.setattr(whatif, "_summarise_replay", lambda *_: changed)
         (found,) = whatif._mark_unpredictable(model, [base], ((0.0, 1.0),), {})

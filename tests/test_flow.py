@@ -12,7 +12,7 @@ from ulog_tools import gnss_log, seconds_of, stamps, topic
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.inputs import read_gnss
 from px4fuse.ekf2.magnetometer import EventSamples, average_by_event, fuse_mean
-from px4fuse.ekf2.model import Model, replay_with_settings
+from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
 from px4fuse.ekf2.replay_segments import VELOCITY
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.flight.model import Columns, Flight, Reset
@@ -35,7 +35,7 @@ def low_pass_weights(raw: np.ndarray) -> np.ndarray:
 
 
 @cache
-def model() -> Model:
+def model() -> Ekf2Model:
     return opened(simulate_flight(make_scenario("outdoor", seed=3, passes=3), parse_faults(())))
 
 
@@ -61,7 +61,7 @@ def flow_of(noise_m_s: float = 0.0, every: int = 10) -> pd.DataFrame:
     }, index=times[every::every])  # fmt: skip
 
 
-def flying(noise_m_s: float = 0.3) -> Model:
+def flying(noise_m_s: float = 0.3) -> Ekf2Model:
     """Return the model with flow samples."""
     inputs = model().inputs
     segments = tuple(add_flow_samples(one, flow_of(noise_m_s), 3.0) for one in inputs.segments)

@@ -23,8 +23,8 @@ from px4fuse.diagnose import prepare_comparison
 from px4fuse.ekf2.aids import AidResult
 from px4fuse.ekf2.inputs import _make_fusion_rules, read_gnss
 from px4fuse.ekf2.inputs import prepare_inputs as prepare_replay
-from px4fuse.ekf2.model import Model
-from px4fuse.ekf2.replay import inside_spans, rms
+from px4fuse.ekf2.model import Ekf2Model
+from px4fuse.ekf2.replay import is_inside_spans, rms
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.findings import find, noises
@@ -418,7 +418,7 @@ REPLAYED = ("delay0", "fullrate", "nominal", "overconfident")
 
 
 @pytest.fixture(scope="module")
-def models(shared_logs: Path, model_of: Any) -> dict[str, Model]:
+def models(shared_logs: Path, model_of: Any) -> dict[str, Ekf2Model]:
     found = {}
     for name in REPLAYED:
         model = model_of(shared_logs / "gps" / f"v1.16.1_gps_{name}.ulg")
@@ -493,7 +493,7 @@ def test_what_if_with_correct_gnss_delay_reduces_heading_error(models):
             model.flight.ekf2.state["down_m"],
             model.baseline_replay.published["down_m"],
         )
-        state = state[inside_spans(state.index, model.baseline_replay.find_evaluated_spans())]
+        state = state[is_inside_spans(state.index, model.baseline_replay.find_evaluated_spans())]
         assert rms(np.interp(state.index, replayed.index, replayed) - state.to_numpy()) < 0.05
     assert heading_deg("delay0", EKF2_GPS_DELAY=200.0) == pytest.approx((4.7, 1.5), abs=0.3)
     # 110 ms of delay error rotate the heading in proportion to 4.7° for 200 ms
@@ -530,7 +530,7 @@ def test_what_if_without_aiding_source_predicts_position_error(models):
 
 @pytest.mark.reallogs
 def test_what_if_with_unused_parameter_raises_settings_error(models):
-    with pytest.raises(SettingsError, match="EKF2 fused GNSS position, to which this"):
+    with pytest.raises(SettingsError, match="EKF2 fused GNSS position, which this"):
         what_if(models["nominal"], [{"EKF2_EVP_NOISE": 0.2}])
     own = replace(models["nominal"].inputs.received, uses_sender_times=True)
     model = replace(models["nominal"], inputs=replace(models["nominal"].inputs, received=own))

@@ -18,7 +18,7 @@ from px4fuse.ekf2.bad_acceleration import BadAccelerationFlag
 from px4fuse.ekf2.barometer import estimate_barometer_interval_s, find_fused_barometer_samples
 from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun
 from px4fuse.ekf2.heights import HeightFilter, add_heights, group_barometer_by_event
-from px4fuse.ekf2.model import Model, run_configurations
+from px4fuse.ekf2.model import Ekf2Model, run_configurations
 from px4fuse.ekf2.replay_segments import HeightSamples, ReplaySegment
 from px4fuse.ekf2.whatif import HEIGHT_LOGGED_NOTE, HEIGHT_REPLAYED_NOTE, what_if
 from px4fuse.errors import SettingsError
@@ -84,7 +84,7 @@ def fusing(
 
 def standing(of: HeightSamples, count: int = 400, **how: Any) -> tuple[HeightFilter, pd.DataFrame]:
     """Return the filter of a state at rest, and the update of each barometer sample."""
-    end = np.unique(of.step)
+    end = np.unique(of.step_indices)
     heights = fusing(climbing(of, count), end, **how)
     for e in range(len(end)):
         heights.fuse_barometer(e, np.zeros((1, 9)), np.zeros((1, 9, 9)))
@@ -103,7 +103,7 @@ def test_barometer_bias_matches_scalar_kalman_filter() -> None:
     p = (q + np.sqrt(q * q + 4.0 * q * R)) / 2.0
     assert heights.bias.variance_m2[0] == pytest.approx(p * R / (p + R), rel=1e-6)
     assert found["innovation_variance_down_m2"].iloc[-1] == pytest.approx(p + R, rel=1e-6)
-    assert heights.bias.value_m[0] == pytest.approx(1.7, abs=1e-6)
+    assert heights.bias.bias_m[0] == pytest.approx(1.7, abs=1e-6)
     # transient as in the scalar recursion
     bias, variance, innovations = 0.0, 1.0, []
     for _ in steps:
@@ -127,14 +127,14 @@ def test_barometer_bias_is_constant_after_reference_ends() -> None:
 def test_barometer_bias_outside_gate_is_not_updated(down_m, learned) -> None:
     """The gate is 3 √(0.25 + 0.25) m."""
     heights, _ = standing(sampled([10], [down_m]))
-    assert (heights.bias.value_m[0] > 0.0) == learned
+    assert (heights.bias.bias_m[0] > 0.0) == learned
 
 
 @pytest.mark.parametrize("reference", BOTH)
 def test_height_bias_of_the_reference_sensor_stays_zero(reference: str) -> None:
     steps = list(range(10, 400, 10))
     heights, _ = standing(sampled(steps, [-1.0] * len(steps), reference=reference))
-    assert (heights.bias.value_m[0] == 0.0) == (reference == "baro_hgt")
+    assert (heights.bias.bias_m[0] == 0.0) == (reference == "baro_hgt")
 
 
 def test_height_innovation_refers_to_sample_time() -> None:
@@ -198,7 +198,7 @@ def outdoors(baro_noise_m: float = 0.4) -> Flight:
 
 
 @cache
-def opened_once() -> Model:
+def opened_once() -> Ekf2Model:
     return opened(outdoors())
 
 
@@ -436,14 +436,14 @@ FLOWN = {
 
 
 @pytest.fixture(scope="module")
-def models(shared_logs: Path, model_of: Any) -> dict[str, Model]:
+def models(shared_logs: Path, model_of: Any) -> dict[str, Ekf2Model]:
     return {name: model_of(shared_logs / "gps" / f"v1.16.1_gps_{name}.ulg") for name in FLOWN}
 
 
 @pytest.mark.reallogs
 @pytest.mark.parametrize("name", FLOWN)
 def test_ekf2_model_heights_of_real_flights_agree_with_log(
-    models: dict[str, Model], name: str
+    models: dict[str, Ekf2Model], name: str
 ) -> None:
     """Half of the barometer samples are not logged, except in the last flight."""
     gnss, barometer, published_m = FLOWN[name]
@@ -463,7 +463,7 @@ def test_ekf2_model_heights_of_real_flights_agree_with_log(
 
 
 @pytest.mark.reallogs
-def test_what_if_with_smaller_barometer_gate_rejects_more(models: dict[str, Model]) -> None:
+def test_what_if_with_smaller_barometer_gate_rejects_more(models: dict[str, Ekf2Model]) -> None:
     """EKF2_BARO_NOISE scales NIS; the gate rejects innovations outside it."""
 
     def heights(without: dict[str, float] | None = None, **settings: float) -> Any:
@@ -501,7 +501,7 @@ def test_what_if_on_flight_with_range_finder_raises_error(shared_logs: Path) -> 
 
 
 @pytest.mark.reallogs
-def test_what_if_results_contain_each_height_sensor(models: dict[str, Model]) -> None:
+def test_what_if_results_contain_each_height_sensor(models: dict[str, Ekf2Model]) -> None:
     model, changes, without = models["nominal"], {"EKF2_BARO_GATE": 1.5}, {"gnss_hgt": 100.0}
     request = WhatIfRequest(log=model.flight.log.name, changes=changes, without=without)
     asked = what_if(model, [changes], without)

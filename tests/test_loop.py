@@ -108,7 +108,7 @@ def test_loop_corrections_of_sample_flight_reduce_ate(sample_loop):
         before = rmse(sample_loop, "uncorrected", reference)
         for way in ("by_distance", "gated"):
             assert rmse(sample_loop, way, reference) < 0.8 * before
-    end = sample_loop.true_end.displacement
+    end = sample_loop.true_end.displacement_vector_m
     for way, within in (("by_distance_plain", 1e-9), ("by_distance", 1e-9), ("gated", 0.02)):
         position = path(sample_loop, way).trajectory.position_m
         assert np.linalg.norm(position[-1] - position[0] - end) < within
@@ -170,7 +170,7 @@ def test_loop_correction_methods_agree_without_heading_error(sample, sample_loop
 def test_loop_closure_error_with_known_landing_equals_truth(
     sample: LoopSource, sample_loop: Loop
 ) -> None:
-    forward, right, _ = sample_loop.true_end.displacement  # the vehicle heads along x
+    forward, right, _ = sample_loop.true_end.displacement_vector_m  # the vehicle heads along x
     heading = sample_loop.true_end.heading_change_deg
     taped = analyse_loop(sample, landed_at=Landing(forward, right, heading))
     # --landed-at has no height; ground truth is 0.16 m lower
@@ -266,8 +266,8 @@ def test_loop_that_does_not_return_to_start_is_not_corrected() -> None:
     assert judged.distance_m == pytest.approx(SIDE_M * np.sqrt(2.0), rel=0.2)
     for part in (found.corrections["by_distance"], found.corrections["pose_graph_gated"]):
         assert isinstance(part, Unavailable)
-        assert "the gate rejects the loop closure" in part.reason
-        assert "the gate rejects the loop closure" in part.reason
+        assert "χ² gate rejects the loop closure" in part.reason
+        assert "χ² gate rejects the loop closure" in part.reason
     finding = find_loop_findings(found)[0]
     assert (finding.id, finding.severity) == ("false_loop_closure", "error")
     assert finding.evidence["p"] < 0.001
@@ -349,7 +349,7 @@ def test_odometry_edge_variance_is_increase_of_logged_variance() -> None:
     with_growing = replace(odometry, position_variance_m2=growing)
     grown, _, words = compute_odometry_variances(with_growing, nodes, OdometryNoise())
     np.testing.assert_allclose(grown.sum(), 0.4 - 0.001, rtol=0.05)
-    assert "increase of the logged position variances" in words
+    assert "increase of the logged position variance" in words
 
 
 def test_pose_graph_correction_interpolates_between_key_frames(sample_loop: Loop) -> None:

@@ -212,7 +212,7 @@ def test_mean_magnetometer_sample_is_recovered_from_low_pass() -> None:
     near = np.flatnonzero(np.diff(remaining) < 20) + 1
     assert found.sample_count.tolist() == np.diff(remaining)[near - 1].tolist()
     assert sorted(set(found.sample_count)) == [7.0, 14.0]
-    assert found.step.tolist() == step[remaining[near]].tolist()
+    assert found.step_indices.tolist() == step[remaining[near]].tolist()
     for row, samples, value, turn in zip(
         remaining[near],
         found.sample_count.astype(int),

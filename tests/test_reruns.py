@@ -29,7 +29,7 @@ from px4fuse.comparison.trials import (
 from px4fuse.comparison.trials import RIGHT_BIAS_KEY as TO_RIGHT
 from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
-from px4fuse.ekf2.model import replay_with_settings, with_misaligned_positions, with_position_noise
+from px4fuse.ekf2.model import add_position_noise, misalign_positions, replay_with_settings
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import Settings
@@ -162,7 +162,7 @@ def test_ekf2_rerun_equals_what_if_with_the_same_parameters() -> None:
     )
     once, other = (
         next(replay_with_settings(of, [change]))
-        for of in (model, with_position_noise(model, 0.01, 1))
+        for of in (model, add_position_noise(model, 0.01, 1))
     )
     assert not once.updates.equals(other.updates)
 
@@ -196,7 +196,7 @@ def test_rerun_with_time_offset_excludes_outliers_at_moved_times() -> None:
     model, out = analysis.ekf2_model, analysis.tuning["horizontal"]
     (bare,) = replay_with_settings(model, [{}], out.outlier_time_s)
     (late,) = replay_with_settings(
-        with_misaligned_positions(model, 0.0, 0.19), [{}], out.outlier_time_s + 0.19
+        misalign_positions(model, 0.0, 0.19), [{}], out.outlier_time_s + 0.19
     )
     assert len(late.updates) == pytest.approx(len(bare.updates), abs=2)
     # both replays exclude their outliers

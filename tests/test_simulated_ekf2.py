@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from px4fuse.diagnose import find_faults
 from px4fuse.ekf2.inputs import SIMULATED_EKF2_NOTE
-from px4fuse.ekf2.model import open_model
+from px4fuse.ekf2.model import prepare_ekf2_model
 from px4fuse.ekf2.replay import Agreement
 from px4fuse.filter.consistency import compute_nis_band
 from px4fuse.filter.settings import Settings
@@ -39,7 +39,7 @@ def fused(flight: Flight, axis: str = "north") -> pd.DataFrame:
 
 
 def agreement(flight: Flight) -> Agreement:
-    model = open_model(flight)
+    model = prepare_ekf2_model(flight)
     return model.agreement
 
 

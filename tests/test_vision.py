@@ -20,12 +20,12 @@ from exchange import replace
 from px4fuse.diagnose import find_faults, run_what_if
 from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_recursion import FilterConfiguration, SegmentRun, run_segment
-from px4fuse.ekf2.inputs import Inputs, ReceivedPositions
+from px4fuse.ekf2.inputs import ReceivedPositions, ReplayInputs
 from px4fuse.ekf2.intervals import StepEvents, make_intervals
 from px4fuse.ekf2.model import (
-    Model,
+    Ekf2Model,
     list_modelled_aids,
-    open_model,
+    prepare_ekf2_model,
     replay_with_settings,
     run_configurations,
 )
@@ -63,7 +63,7 @@ FRAME_M = np.array([5.0, -3.0, 0.0])  # origin of the vision frame
 
 
 @cache
-def on_gnss() -> Model:
+def on_gnss() -> Ekf2Model:
     return opened(simulate_flight(OUTDOOR, parse_faults(())))
 
 
@@ -114,7 +114,7 @@ class PlainBias:
 
 
 def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
-    inputs: Inputs, segment: ReplaySegment, events: StepEvents
+    inputs: ReplayInputs, segment: ReplaySegment, events: StepEvents
 ) -> tuple[np.ndarray, np.ndarray]:
     """Run a plain EKF: one prediction at a time, each fix and each vision sample at its step.
 
@@ -188,7 +188,9 @@ def plain_both(  # noqa: PLR0915 (one filter, read from top to bottom)
     return np.array(fixes), np.array(update_records)
 
 
-def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: float) -> Inputs:
+def flying(
+    vision: ReceivedPositions | None, seconds: float = 40.0, **settings: float
+) -> ReplayInputs:
     """Return the start of the flight, with only GNSS and vision correcting tilt and height."""
     inputs = on_gnss().inputs
     (whole,) = inputs.segments
@@ -208,7 +210,7 @@ def flying(vision: ReceivedPositions | None, seconds: float = 40.0, **settings: 
     return replace(inputs, segments=(segment,), vision=vision, settings=known)
 
 
-def ran(inputs: Inputs, *configurations: FilterConfiguration) -> SegmentRun:
+def ran(inputs: ReplayInputs, *configurations: FilterConfiguration) -> SegmentRun:
     (segment,) = inputs.segments
     configurations = configurations or (FilterConfiguration(inputs.settings),)
     made = [make_intervals(inputs, segment, one.compute_delays(inputs)) for one in configurations]
@@ -285,7 +287,7 @@ def test_vision_lever_arm_is_subtracted_in_replay() -> None:
 def test_vision_position_bias_estimates_frame_offset() -> None:
     done = ran(flying(sent(sigma_m=0.05)))
     assert done.vision_filter is not None
-    np.testing.assert_allclose(-done.vision_filter.bias.value_m[0], FRAME_M[:2], atol=0.5)
+    np.testing.assert_allclose(-done.vision_filter.bias.bias_m[0], FRAME_M[:2], atol=0.5)
     truth = on_gnss().flight.truth
     end_s = float(done.segment.time_s[done.events[0].end_step[-1]])
     for axis in (0, 1):
@@ -344,7 +346,7 @@ def test_loss_of_gnss_resets_position_to_vision() -> None:
     moved = done.position_reset_m[:, 1]
     np.testing.assert_allclose(moved.sum(axis=0), FRAME_M[:2], atol=0.6)
     assert done.vision_filter is not None
-    np.testing.assert_array_equal(done.vision_filter.bias.value_m[1], 0.0)
+    np.testing.assert_array_equal(done.vision_filter.bias.bias_m[1], 0.0)
     difference = done.state[-1, 1, 6:8] - done.state[-1, 0, 6:8]
     np.testing.assert_allclose(difference, FRAME_M[:2], atol=0.6)
     after = found.loc[reset_s + 1.0 :]
@@ -383,7 +385,7 @@ def test_rejection_of_gnss_and_vision_resets_position_to_vision() -> None:
     np.testing.assert_allclose(done.position_reset_m.sum(axis=(0, 1)), [20.0, 0.0], atol=0.7)
     assert found.loc[reset_s + 0.1 :, "fused"].all()
     assert done.vision_filter is not None
-    np.testing.assert_allclose(-done.vision_filter.bias.value_m[0], FRAME_M[:2], atol=0.7)
+    np.testing.assert_allclose(-done.vision_filter.bias.bias_m[0], FRAME_M[:2], atol=0.7)
 
 
 def test_larger_vision_delay_extends_the_fusion_horizon() -> None:
@@ -432,7 +434,7 @@ def flown(
                     + wrong_m * noise)  # fmt: skip
 
     def both(
-        inputs: Inputs, configurations: list[FilterConfiguration], known: Any
+        inputs: ReplayInputs, configurations: list[FilterConfiguration], known: Any
     ) -> list[SegmentRun]:
         settings = {**inputs.settings, **SETTINGS, **changed}
         given = replace(inputs, vision=heard, settings=settings)
@@ -468,7 +470,7 @@ def flown(
 
 
 @cache
-def model() -> Model:
+def model() -> Ekf2Model:
     return opened(flown())
 
 
@@ -561,13 +563,13 @@ def test_ekf2_model_does_not_fuse_vision_while_disabled() -> None:
 def test_ekf2_model_with_incomplete_vision_is_unavailable() -> None:
     flight = flown()
     gnss_alone = replace(flight, positions=flight.positions[1:])
-    lacking = open_model(gnss_alone)
+    lacking = prepare_ekf2_model(gnss_alone)
     assert isinstance(lacking, Unavailable)
     assert "no topic vehicle_visual_odometry" in lacking.reason
     record = flight.ekf2.record
     remaining = {name: v for name, v in record.parameters.items() if name != "EKF2_EV_CTRL"}
     older = replace(record, parameters={**remaining, "EKF2_AID_MASK": 9.0})
-    refused = open_model(replace(flight, ekf2=replace(flight.ekf2, record=older)))
+    refused = prepare_ekf2_model(replace(flight, ekf2=replace(flight.ekf2, record=older)))
     assert isinstance(refused, Unavailable)
     assert "changes of the vision position" in refused.reason
 
@@ -577,13 +579,13 @@ def test_gnss_flight_difference_steps_include_vision_fusion() -> None:
     for why in found.values():
         names = [step.name for step in why.steps]
         assert (
-            names.index(steps.VELOCITY_STEP)
+            names.index(steps.GNSS_VELOCITY_STEP)
             < names.index(steps.VISION_STEP)
-            < names.index(steps.GATE_STEP)
+            < names.index(steps.REJECTION_STEP)
         )
         assert why.unexplained_fraction < 0.05
         moved_m = {step.name: step.position_moved_m for step in why.steps}
-        assert min(moved_m[steps.VELOCITY_STEP], moved_m[steps.VISION_STEP]) > 0.05
+        assert min(moved_m[steps.GNSS_VELOCITY_STEP], moved_m[steps.VISION_STEP]) > 0.05
     analysis = find_faults(compare(flown(), Settings(0.27, 0.4)))
     # the noise of vision does not lead to a remedy for GNSS noise
     assert analysis.source.name == "vehicle_visual_odometry"

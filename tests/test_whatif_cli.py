@@ -13,7 +13,7 @@ from cli_tools import run_checked
 
 from px4fuse.analysis import WhatIfAnalysis
 from px4fuse.diagnose import run_what_if
-from px4fuse.ekf2.model import open_model
+from px4fuse.ekf2.model import prepare_ekf2_model
 from px4fuse.ekf2.whatif import Summary, what_if
 from px4fuse.errors import MissingDataError, SettingsError
 from px4fuse.flight.model import Flight
@@ -77,7 +77,7 @@ def test_whatif_command_without_vision_predicts_position_drift(sample_log: Path)
 
 
 def test_what_if_with_unknown_aiding_source_raises_error(estimated: WhatIfAnalysis) -> None:
-    model = open_model(estimated.flight)
+    model = prepare_ekf2_model(estimated.flight)
     for without, said in (
         (
             {"baro_hgt": 60.0},
@@ -162,7 +162,7 @@ class TestFlownFlights:
         with pytest.raises(
             SettingsError, match="the largest delay parameter is the delay of the fusion horizon"
         ):
-            what_if(open_model(found.flight), [{"EKF2_DELAY_MAX": 300.0}])
+            what_if(prepare_ekf2_model(found.flight), [{"EKF2_DELAY_MAX": 300.0}])
 
     @pytest.mark.parametrize(
         ("log", "said"),

@@ -15,9 +15,9 @@ from px4fuse.comparison.difference_steps import (
     explain_ekf2_difference,
 )
 from px4fuse.ekf2.steps import (
-    NOISE_STEP,
+    MEASUREMENT_NOISE_STEP,
     REPLACEMENT_STEPS,
-    SAMPLES_STEP,
+    SAMPLE_TIMES_STEP,
     TIMESTAMPS_STEP,
     DifferenceExplanation,
 )
@@ -56,12 +56,15 @@ def test_position_difference_on_report_page_is_kf_minus_ekf2(sample: Analysis) -
 def test_kf_setting_changes_only_its_own_difference_step(sample: Analysis) -> None:
     plain = of(sample)
     zero = explain_again(sample, Settings(input="zero"))
-    assert zero.steps[0].name == SAMPLES_STEP
+    assert zero.steps[0].name == SAMPLE_TIMES_STEP
     assert zero.steps[0].position_mean_square_m2 > 10 * plain.steps[0].position_mean_square_m2
     assert "KF uses no acceleration (--input zero)" in " ".join(zero.sentences)
     small = explain_again(sample, Settings(sigma_z_m=0.02))
-    assert next(step for step in small.steps if step.name == NOISE_STEP).position_moved_m > 0.05
-    assert NOISE_STEP not in {step.name for step in plain.steps}  # equal settings
+    assert (
+        next(step for step in small.steps if step.name == MEASUREMENT_NOISE_STEP).position_moved_m
+        > 0.05
+    )
+    assert MEASUREMENT_NOISE_STEP not in {step.name for step in plain.steps}  # equal settings
     late = explain_again(sample, Settings(clock_offset_s=-0.3))
     assert TIMESTAMPS_STEP in late.sentences[0]
     assert "300 ms" in late.sentences[0]

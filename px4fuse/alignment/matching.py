@@ -13,7 +13,7 @@ from px4fuse.alignment.time_and_pose_fit import (
     CorrelationPeak,
     TrackFit,
 )
-from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTrack
+from px4fuse.alignment.tracks import EKF2_REFERENCE, IMU_REFERENCE, NoMatchError, SampledTrack
 from px4fuse.flight.model import Flight, Unavailable
 from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_PEAK_RATIO
 
@@ -21,19 +21,20 @@ from px4fuse.trajectory.time_offset import GRID_STEP_S, MIN_SECOND_PEAK_RATIO
 ESTIMATED_YAW_FRAMES = ("ned", "enu")
 # Frames to try if the user gives the yaw; without eus and edn (y up or down), because a level
 # flight along one axis cannot distinguish them from frames with z up
-GIVEN_YAW_FRAMES = ("ned", "enu", "nwu")
+FIXED_YAW_FRAMES = ("ned", "enu", "nwu")
 # Maximum time span (s) of a position file, which limits the computing time to five seconds
 MAX_FILE_DURATION_S = 86400.0
-# Minimum concordance correlation coefficient (Lin 1989) of a reliable match, by reference
-MIN_RELIABLE_CONCORDANCE = {EKF2_POSITION: 0.9, IMU: 0.7}
+# Minimum concordance correlation coefficient (Lin 1989) of a position file with EKF2's position or
+# the IMU, for a match that is reported without a warning
+MIN_RELIABLE_CONCORDANCE = {EKF2_REFERENCE: 0.9, IMU_REFERENCE: 0.7}
 # Maximum standard deviation (s) of an accepted time offset
-MAX_CLOCK_SIGMA_S = 0.5
+MAX_TIME_OFFSET_SIGMA_S = 0.5
 # Minimum ratio of the residuals in the second best and the best frame; with a smaller ratio, the
 # frame is ambiguous
 MIN_FRAME_RESIDUAL_RATIO = 1.3
-# Minimum ratio of the position residual with the given yaw (default 0) to the residual with
-# estimated yaw, to report a misaligned frame
-MIN_MISALIGNED_RATIO = 2.0
+# A misaligned frame is reported only if the position residual with the given yaw (default 0) is
+# more than this many times the residual with estimated yaw
+MIN_MISALIGNED_RESIDUAL_RATIO = 2.0
 # Minimum position residual (m, RMS) with the given yaw, to report a misaligned frame
 MIN_MISALIGNED_RESIDUAL_M = 0.3
 
@@ -88,7 +89,7 @@ class Match:
 
     @property
     def time_offset_fit(self) -> TrackFit:
-        """Fit for the time offset: with estimated yaw if a wrong given yaw would bias it."""
+        """Fit for the time offset: with estimated yaw if the user's yaw is wrong."""
         return self.free_yaw_fit if self.is_rotated else self.fit
 
     @property
@@ -144,35 +145,39 @@ def _find_best_match(references: list[SampledTrack], problem: AlignmentProblem) 
         raise NoMatchError(
             "the position file covers more than one day; shorten the file to the flight"
         )
-    frames = problem.frames or (ESTIMATED_YAW_FRAMES if yaw_rad is None else GIVEN_YAW_FRAMES)
+    frames = problem.frames or (ESTIMATED_YAW_FRAMES if yaw_rad is None else FIXED_YAW_FRAMES)
     if (
         tracks.compute_horizontal_range_m(tracks.convert_to_ned(samples, frames[0]))
         < tracks.MIN_MOTION_M
     ):
         raise NoMatchError(
-            f"the positions in the file change by less than {tracks.MIN_MOTION_M:g} m"
+            f"the positions in the file change by less than {tracks.MIN_MOTION_M:g} m, too little "
+            "to match the file with the log"
         )
     matches = []
     for reference in references:
         reference_name = reference.name
         fit_frame = partial(_fit_in_frame, problem, reference)
         frames_and_fits = [(frame, fit_frame(frame, yaw_rad)) for frame in frames]
-        frames_and_fits.sort(key=lambda frame_and_fit: frame_and_fit[1].rms_m)
+        frames_and_fits.sort(key=lambda frame_and_fit: frame_and_fit[1].residual_rms_m)
         best_frame, fit = frames_and_fits[0]
         free_yaw_fit = fit if yaw_rad is None else fit_frame(best_frame, None)
         is_rotated = is_reliable_fit(free_yaw_fit, reference_name) and (
             fit.concordance < MIN_CONCORDANCE[reference_name]
             or needs_rotation(fit.horizontal_rms_m, free_yaw_fit, reference_name)
         )
-        rms_m_by_frame = {frame: fit.rms_m for frame, fit in frames_and_fits}
+        rms_m_by_frame = {frame: fit.residual_rms_m for frame, fit in frames_and_fits}
         matches.append(Match(reference, best_frame, rms_m_by_frame, fit, free_yaw_fit, is_rotated))
-    return min(matches, key=lambda match: match.time_offset_fit.rms_m)
+    return min(matches, key=lambda match: match.time_offset_fit.residual_rms_m)
 
 
 def needs_rotation(horizontal_rms_m: float, free_yaw_fit: TrackFit, reference: str) -> bool:
-    """Return True if estimating the yaw makes the residual much less than ``horizontal_rms_m``."""
-    return horizontal_rms_m > MIN_MISALIGNED_RATIO * free_yaw_fit.horizontal_rms_m and (
-        horizontal_rms_m > MIN_MISALIGNED_RESIDUAL_M or reference == IMU
+    """Return True if the fit with estimated yaw has a residual far below ``horizontal_rms_m``.
+
+    The residual must be below ``horizontal_rms_m`` / MIN_MISALIGNED_RESIDUAL_RATIO.
+    """
+    return horizontal_rms_m > MIN_MISALIGNED_RESIDUAL_RATIO * free_yaw_fit.horizontal_rms_m and (
+        horizontal_rms_m > MIN_MISALIGNED_RESIDUAL_M or reference == IMU_REFERENCE
     )
 
 
@@ -195,11 +200,11 @@ def _require_unique_match(match: Match) -> None:
     ambiguity_text = ""
     if fit.second_peak_ratio < MIN_SECOND_PEAK_RATIO:
         ambiguity_text = (
-            f"two time offsets that differ by {abs(fit.second_peak_s):.1f} s fit equally well"
+            f"two time offsets that differ by {abs(fit.second_peak_lag_s):.1f} s fit equally well"
         )
-    elif fit.lag_sigma_s is not None and fit.lag_sigma_s > MAX_CLOCK_SIGMA_S:
+    elif fit.lag_sigma_s is not None and fit.lag_sigma_s > MAX_TIME_OFFSET_SIGMA_S:
         ambiguity_text = (
-            f"the standard deviation of the time offset exceeds {MAX_CLOCK_SIGMA_S:g} s"
+            f"the standard deviation of the time offset exceeds {MAX_TIME_OFFSET_SIGMA_S:g} s"
         )
     if ambiguity_text:
         raise NoMatchError(
@@ -208,10 +213,10 @@ def _require_unique_match(match: Match) -> None:
             "Give `clock_offset_s`",
         )
     if len(match.rms_m_by_frame) > 1:
-        best_residual_m, second_residual_m = (
+        best_residual_m, second_best_residual_m = (
             np.hypot(m, INTERPOLATION_RESIDUAL_M) for m in [*match.rms_m_by_frame.values()][:2]
         )
-        if second_residual_m < MIN_FRAME_RESIDUAL_RATIO * best_residual_m:
+        if second_best_residual_m < MIN_FRAME_RESIDUAL_RATIO * best_residual_m:
             raise NoMatchError(
                 "the frame of the position file cannot be estimated, because several frames have "
                 f"similar residuals against the {reference_name} ({match.residuals_text})",
@@ -222,7 +227,7 @@ def _require_unique_match(match: Match) -> None:
 def _refit_with_corrected_resets(flight: Flight, match: Match, problem: AlignmentProblem) -> Match:
     ekf2 = flight.ekf2
     fit = match.time_offset_fit
-    if match.reference.name == IMU or isinstance(ekf2, Unavailable) or not ekf2.resets:
+    if match.reference.name == IMU_REFERENCE or isinstance(ekf2, Unavailable) or not ekf2.resets:
         return match
     aligned_samples = tracks.align_samples(
         problem.samples, match.frame, fit.yaw_rad, fit.origin_m, fit.lag_s
@@ -232,7 +237,7 @@ def _refit_with_corrected_resets(flight: Flight, match: Match, problem: Alignmen
         time_and_pose_fit.fit_by_least_squares,
         tracks.convert_to_ned(problem.samples, match.frame),
         ekf2_track,
-        is_lag_free=problem.lag_s is None,
+        is_lag_estimated=problem.lag_s is None,
     )
     free_yaw_fit = refit(match.free_yaw_fit, None)
     fit = free_yaw_fit if problem.yaw_rad is None else refit(match.fit, problem.yaw_rad)
@@ -245,7 +250,7 @@ def _fit_in_frame(
     file_track = tracks.convert_to_ned(problem.samples, frame)
     lag_s = problem.lag_s
     grid_track = tracks.resample_to_grid(tracks.remove_spikes(file_track))
-    if reference.name == IMU:
+    if reference.name == IMU_REFERENCE:
         if len(grid_track.time_s) * GRID_STEP_S < tracks.MIN_OVERLAP_S:
             raise NoMatchError(
                 f"the position file is shorter than {tracks.MIN_OVERLAP_S:g} s, too short for a "
@@ -258,5 +263,5 @@ def _fit_in_frame(
     else:
         peak = CorrelationPeak(lag_s)
     return time_and_pose_fit.fit_by_least_squares(
-        file_track, reference, peak, yaw_rad, is_lag_free=lag_s is None
+        file_track, reference, peak, yaw_rad, is_lag_estimated=lag_s is None
     )

@@ -19,7 +19,7 @@ from msgspec import structs
 from px4fuse.alignment import matching, tracks
 from px4fuse.alignment.matching import AlignmentProblem, Match
 from px4fuse.alignment.time_and_pose_fit import MIN_CONCORDANCE, compute_clipped_rms_m
-from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError
+from px4fuse.alignment.tracks import EKF2_REFERENCE, IMU_REFERENCE, NoMatchError
 from px4fuse.convention.axes import METRES_PER_UNIT
 from px4fuse.convention.check import check_convention
 from px4fuse.convention.correction import MIN_FRAME_ROTATION_DEG
@@ -82,12 +82,12 @@ def _explain_mismatch(
     return "; ".join(fault_texts), " ".join(actions)
 
 
-# A time offset is ambiguous if the residual at the second best time offset is less than this many
-# times the residual at the best one, by reference. Correct matches with the noisy IMU: 1.4 to 1.7
-MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_POSITION: 2.0, IMU: 1.4}
+# A time offset is ambiguous if the position residual at the second best time offset is less than
+# this many times the residual at the best one. Correct matches with the noisy IMU: 1.4 to 1.7
+MAX_SIMILAR_RESIDUAL_RATIO = {EKF2_REFERENCE: 2.0, IMU_REFERENCE: 1.4}
 # Maximum difference (s) between the UNIX clocks of computers in a lab: a larger difference
 # indicates another flight
-MAX_UNIX_DIFFERENCE_S = 60.0
+MAX_UNIX_CLOCK_DIFFERENCE_S = 60.0
 # Minimum rotation (°) of the frame of a position file for a message about a misaligned frame
 MIN_REPORTED_YAW_DEG = 1.0
 # Minimum distance (m) between the origins of position file and EKF2 for a message about a
@@ -163,11 +163,11 @@ def align_position_file(
         frame_reason = "the column names of the position file contain the axis directions"
     yaw_reason = "the yaw was given with --position-yaw"
     if yaw_deg is None:
-        yaw_reason = "the position file is assumed to have the yaw of EKF2's frame"
+        yaw_reason = "the position file is assumed not to be rotated against EKF2's frame"
     alignment, aligned_samples = _apply_alignment(
         flight, recording, problem, match, frame_reason, yaw_reason, clock_offset_s
     )
-    offset_origin = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
+    offset_method = f"matched with {alignment.reference}" if clock_offset_s is None else "as given"
     rotation_text = f", rotated by {alignment.yaw_deg:.1f}°" if alignment.yaw_deg else ""
     invalid_reasons, sample_count = recording.reason_by_invalid_row, len(recording.samples)
     clock_map = describe_repeated_timestamps(
@@ -181,7 +181,7 @@ def align_position_file(
         samples=aligned_samples,
         frame="NED",
         clock=f"{recording.clock_kind} clock of the position file; boot clock minus this clock: "
-        f"{alignment.clock_offset_s:+.3f} s ({offset_origin})",
+        f"{alignment.clock_offset_s:+.3f} s ({offset_method})",
         topics=(recording.name,),
         log=recording.name,
         alignment=alignment,
@@ -232,13 +232,13 @@ def _apply_alignment(
 ) -> tuple[Alignment, pd.DataFrame]:
     samples = problem.samples
     frame = problem.frames[0] if problem.frames else ""
-    is_yaw_free = problem.yaw_rad is None
+    is_yaw_estimated = problem.yaw_rad is None
     yaw_rad = problem.yaw_rad or 0.0
     lag_s = problem.lag_s or 0.0
-    yaw_sigma_deg = clock_sigma_s = correlation = residual_rms_m = None
+    yaw_sigma_deg = time_offset_sigma_s = reference_correlation = residual_rms_m = None
     origin_m = np.zeros(3)
     reference_name = ""
-    clock_reason = "the offset was given with --clock-offset"
+    time_offset_reason = "the offset was given with --clock-offset"
     if match:
         frame = match.frame
         reference_name = match.reference.name
@@ -247,46 +247,50 @@ def _apply_alignment(
                 f"of all tried frames, {frame} has the smallest residual against the "
                 f"{reference_name} ({match.residuals_text})"
             )
-            if is_yaw_free and frame == "enu":
+            if is_yaw_estimated and frame == "enu":
                 frame_reason += " (nwu was not tried, because nwu is enu rotated by 90°)"
-        if is_yaw_free:
+        if is_yaw_estimated:
             yaw_rad = match.fit.yaw_rad
             yaw_sigma_deg = float(np.degrees(match.fit.yaw_sigma_rad or 0.0))
             yaw_reason = f"the yaw was estimated with the {reference_name}"
-            origin_m = match.fit.origin_m if reference_name == EKF2_POSITION else origin_m
+            origin_m = match.fit.origin_m if reference_name == EKF2_REFERENCE else origin_m
         if clock_offset_s is None:
             lag_s = match.time_offset_fit.lag_s
-            clock_sigma_s = match.time_offset_fit.lag_sigma_s
+            time_offset_sigma_s = match.time_offset_fit.lag_sigma_s
             clock_offset_s = lag_s + (flight.log.boot_time_s - float(samples.index[0]))
-            clock_reason = (
+            time_offset_reason = (
                 f"the offset was estimated with the {reference_name}; if the {reference_name} is "
                 "late, the offset contains this delay"
             )
-        correlation = float((np.exp(-1j * yaw_rad) * match.time_offset_fit.coherence).real)
+        reference_correlation = float(
+            (np.exp(-1j * yaw_rad) * match.time_offset_fit.coherence).real
+        )
     aligned_samples = tracks.align_samples(samples, frame, yaw_rad, origin_m, lag_s)
-    ekf2_comparison = None if reference_name == IMU else _compare_with_ekf2(flight, aligned_samples)
-    distance_m = None
+    ekf2_comparison = (
+        None if reference_name == IMU_REFERENCE else _compare_with_ekf2(flight, aligned_samples)
+    )
+    distance_to_ekf2_m = None
     if ekf2_comparison:
-        reference_name = EKF2_POSITION
-        distance_m, correlation = ekf2_comparison
-        residual_rms_m = float(np.sqrt(np.mean(distance_m**2) / 2.0))
-    frame_conflict, warnings = "", [*_find_warnings(match, is_yaw_free)] if match else []
-    if match and not is_yaw_free:
-        frame_conflict = _describe_frame_conflict(match, distance_m, yaw_rad)
+        reference_name = EKF2_REFERENCE
+        distance_to_ekf2_m, reference_correlation = ekf2_comparison
+        residual_rms_m = float(np.sqrt(np.mean(distance_to_ekf2_m**2) / 2.0))
+    frame_conflict, warnings = "", [*_find_warnings(match, is_yaw_estimated)] if match else []
+    if match and not is_yaw_estimated:
+        frame_conflict = _describe_frame_conflict(match, distance_to_ekf2_m, yaw_rad)
     if (
         ekf2_comparison
-        and not (is_yaw_free or frame_conflict)
-        and correlation is not None
-        and correlation < MIN_CONCORDANCE[EKF2_POSITION]
+        and not (is_yaw_estimated or frame_conflict)
+        and reference_correlation is not None
+        and reference_correlation < MIN_CONCORDANCE[EKF2_REFERENCE]
     ):
         warnings.append(
-            f"The position file does not match the EKF2 position (correlation {correlation:.2f}). "
-            "Check time offset, frame and yaw of the position file."
+            "The position file does not match the EKF2 position (correlation "
+            f"{reference_correlation:.2f}). Check time offset, frame and yaw of the position file."
         )
     unix_start_s = flight.log.start_unix_s
     if recording.clock_kind == "UNIX" and unix_start_s is not None and clock_offset_s is not None:
         difference_s = abs(flight.log.boot_time_s - clock_offset_s - unix_start_s)
-        if difference_s >= MAX_UNIX_DIFFERENCE_S:
+        if difference_s >= MAX_UNIX_CLOCK_DIFFERENCE_S:
             warnings.append(
                 f"The UNIX times of position file and log differ by {difference_s:.0f} s. Check "
                 "that both files are of the same flight."
@@ -299,10 +303,10 @@ def _apply_alignment(
         yaw_reason=yaw_reason,
         origin_m=(float(origin_m[0]), float(origin_m[1]), float(origin_m[2])),
         clock_offset_s=float(clock_offset_s or 0.0),
-        clock_offset_sigma_s=clock_sigma_s,
-        clock_reason=clock_reason,
+        clock_offset_sigma_s=time_offset_sigma_s,
+        clock_reason=time_offset_reason,
         reference=reference_name,
-        correlation=correlation,
+        correlation=reference_correlation,
         residual_rms_m=residual_rms_m,
         misplaced=(frame_conflict,) if frame_conflict else (),
         warnings=tuple(warnings),
@@ -325,22 +329,22 @@ def _compare_with_ekf2(
         return None
     file_position_m = aligned_samples[Columns.POSITION[:2]].to_numpy()[is_known]
     ekf2_position_m = ekf2_position_m[is_known, :2]
-    distance_m = np.linalg.norm(file_position_m - ekf2_position_m, axis=1)
+    distance_to_ekf2_m = np.linalg.norm(file_position_m - ekf2_position_m, axis=1)
     file_position_m -= file_position_m.mean(axis=0)
     ekf2_position_m -= ekf2_position_m.mean(axis=0)
     norm_product = np.linalg.norm(file_position_m) * np.linalg.norm(ekf2_position_m)
     if norm_product == 0.0 or np.ptp(ekf2_position_m, axis=0).max() < tracks.MIN_MOTION_M:
-        return distance_m, None
-    return distance_m, float(np.sum(file_position_m * ekf2_position_m) / norm_product)
+        return distance_to_ekf2_m, None
+    return distance_to_ekf2_m, float(np.sum(file_position_m * ekf2_position_m) / norm_product)
 
 
-def _describe_frame_conflict(match: Match, distance_m: Array | None, yaw_rad: float) -> str:
+def _describe_frame_conflict(match: Match, distance_to_ekf2_m: Array | None, yaw_rad: float) -> str:
     reference_name = match.reference.name
     fit = match.free_yaw_fit
     is_rotated = match.is_rotated
     shift_text, shift_m = "", 0.0
-    if distance_m is not None:
-        residual_m = compute_clipped_rms_m(distance_m) / np.sqrt(2.0)
+    if distance_to_ekf2_m is not None:
+        residual_m = compute_clipped_rms_m(distance_to_ekf2_m) / np.sqrt(2.0)
         is_rotated = matching.is_reliable_fit(fit, reference_name) and matching.needs_rotation(
             residual_m, fit, reference_name
         )
@@ -358,7 +362,7 @@ def _describe_frame_conflict(match: Match, distance_m: Array | None, yaw_rad: fl
     )
 
 
-def _find_warnings(match: Match, is_yaw_free: bool) -> Iterator[str]:
+def _find_warnings(match: Match, is_yaw_estimated: bool) -> Iterator[str]:
     reference_name = match.reference.name
     fit = match.time_offset_fit
     if fit.concordance < matching.MIN_RELIABLE_CONCORDANCE[reference_name]:
@@ -368,11 +372,11 @@ def _find_warnings(match: Match, is_yaw_free: bool) -> Iterator[str]:
         )
     if fit.second_peak_ratio < MAX_SIMILAR_RESIDUAL_RATIO[reference_name]:
         yield (
-            f"A time offset that differs by {fit.second_peak_s:+.1f} s fits nearly as well: the "
-            f"residual is {fit.second_peak_ratio:.1f} times larger. Check the time offset, or set "
-            "the time offset with --clock-offset."
+            f"A time offset that differs by {fit.second_peak_lag_s:+.1f} s fits nearly as well: "
+            f"the residual is {fit.second_peak_ratio:.1f} times larger. Check the time offset, or "
+            "set the time offset with --clock-offset."
         )
-    if is_yaw_free and reference_name == IMU:
+    if is_yaw_estimated and reference_name == IMU_REFERENCE:
         yield (
             "The yaw estimated against the IMU has an error of 1° to 6°. The origin of the file's "
             "frame is unknown and set to 0."

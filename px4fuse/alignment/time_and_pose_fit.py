@@ -6,18 +6,18 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from px4fuse.alignment import tracks
-from px4fuse.alignment.tracks import EKF2_POSITION, IMU, NoMatchError, SampledTrack
+from px4fuse.alignment.tracks import EKF2_REFERENCE, IMU_REFERENCE, NoMatchError, SampledTrack
 from px4fuse.core.arrays import Array, ComplexArray
 from px4fuse.trajectory.correlation import autocovariance, compute_moments
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 
-# Maximum distance (s) of the least-squares lag from the correlation peak
+# Maximum difference (s) between the lag fitted by least squares and the lag of the correlation peak
 MAX_LAG_FROM_PEAK_S = 1.0
-# Minimum value of Lin's concordance correlation coefficient (1989) for an accepted match, by
-# reference
-MIN_CONCORDANCE = {EKF2_POSITION: 0.7, IMU: 0.5}
-# Lower limit of 1 - concordance in the log-likelihood ratio: otherwise a short match with a
-# concordance near 1 would have a larger likelihood than a longer match
+# Minimum concordance correlation coefficient (Lin 1989) of a position file with EKF2's position or
+# the IMU, to accept the match
+MIN_CONCORDANCE = {EKF2_REFERENCE: 0.7, IMU_REFERENCE: 0.5}
+# Lower limit of 1 - concordance in the log-likelihood gain -N·ln(1 - concordance). Without it, few
+# samples with a concordance near 1 would have a larger gain than a match of many samples
 MIN_ONE_MINUS_CONCORDANCE = 1e-4
 # Minimum distance (s) between the lags of two separate correlation peaks
 MIN_PEAK_DISTANCE_S = 3.0
@@ -37,7 +37,7 @@ class CorrelationPeak:
         Time to add to the times of the file, which start at 0.
     concordance : float
         Lin's concordance correlation coefficient, 1 for equal tracks; NaN if the user gave the lag.
-    second_peak_s : float
+    second_peak_lag_s : float
         Second best lag minus best lag; NaN without a second peak.
     second_peak_ratio : float
         Residual (RMS) at the second best lag over the residual at the best lag.
@@ -45,13 +45,15 @@ class CorrelationPeak:
 
     lag_s: float
     concordance: float = float("nan")
-    second_peak_s: float = float("nan")
+    second_peak_lag_s: float = float("nan")
     second_peak_ratio: float = float("inf")
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackFit(CorrelationPeak):
     """Least-squares fit of e^{i·yaw}·file(t) + origin to reference(t + lag).
+
+    Horizontal positions are complex numbers north + i·east.
 
     Attributes
     ----------
@@ -60,8 +62,8 @@ class TrackFit(CorrelationPeak):
     origin_m : ndarray, shape (3,)
         Position of the file's origin: north, east, down.
     coherence : complex
-        Normalised complex covariance of reference and file before the rotation.
-    horizontal_rms_m, rms_m : float
+        Correlation of file and reference; its phase is the yaw.
+    horizontal_rms_m, residual_rms_m : float
         RMS residual per horizontal axis, and of the vector (with height, if available).
     """
 
@@ -71,7 +73,7 @@ class TrackFit(CorrelationPeak):
     origin_m: Array
     coherence: complex
     horizontal_rms_m: float
-    rms_m: float
+    residual_rms_m: float
 
 
 def find_correlation_peak(
@@ -79,8 +81,8 @@ def find_correlation_peak(
 ) -> CorrelationPeak:
     """Find the lag at which a position file matches a reference best.
 
-    The maximised quantity is the log-likelihood ratio to two independent tracks: for N common
-    samples and Lin's concordance (see :class:`CorrelationPeak`), -N·ln(1 - concordance).
+    The lag maximises -N·ln(1 - concordance), with N common samples and Lin's concordance
+    correlation coefficient. This is the log-likelihood gain over two unrelated tracks.
 
     Raises
     ------
@@ -90,10 +92,10 @@ def find_correlation_peak(
     shorter_sample_count = min(
         np.count_nonzero(file_track.is_valid), np.count_nonzero(reference.is_valid)
     )
-    min_count = max(
+    min_sample_count = max(
         tracks.MIN_SAMPLES, min(tracks.MIN_OVERLAP_S / GRID_STEP_S, shorter_sample_count / 2)
     )
-    if shorter_sample_count < min_count:
+    if shorter_sample_count < min_sample_count:
         raise NoMatchError("position file and reference have too few common samples for a match")
     track_moments = compute_moments(
         file_track.to_complex_m(), reference.to_complex_m(), file_track.is_valid, reference.is_valid
@@ -101,7 +103,7 @@ def find_correlation_peak(
     common_count = track_moments.count
     covariance = track_moments.covariance
     energy_sum = track_moments.energy_a + track_moments.energy_b
-    has_overlap = common_count >= min_count
+    has_overlap = common_count >= min_sample_count
     # Exclude lags at which both tracks are at rest: their variance is a rounding error
     has_overlap &= energy_sum > 1e-9 * np.max(energy_sum)
     real_covariance = (
@@ -109,16 +111,16 @@ def find_correlation_peak(
     )
     concordance = np.zeros_like(energy_sum)
     concordance[has_overlap] = 2.0 * real_covariance[has_overlap] / energy_sum[has_overlap]
-    likelihood_gain = -common_count * np.log(
+    log_likelihood_gain = -common_count * np.log(
         np.maximum(1.0 - concordance, MIN_ONE_MINUS_CONCORDANCE)
     )
-    best_index = int(np.argmax(np.where(has_overlap, likelihood_gain, -np.inf)))
+    best_index = int(np.argmax(np.where(has_overlap, log_likelihood_gain, -np.inf)))
 
     def compute_lag_s(index: int) -> float:
         return float(reference.time_s[0]) + (index - len(file_track.is_valid) + 1) * GRID_STEP_S
 
-    # The peak of the best lag includes all lags around it with at least half of its concordance,
-    # and all lags nearer to it than MIN_PEAK_DISTANCE_S
+    # Lags next to the best lag are no second peak: lags up to the first one with less than half of
+    # the best concordance, but at most MIN_PEAK_DISTANCE_S from the best lag
     low_concordance_indices = np.flatnonzero(concordance < 0.5 * concordance[best_index])
     peak_start_index = np.max(
         low_concordance_indices[low_concordance_indices < best_index], initial=-1
@@ -132,9 +134,11 @@ def find_correlation_peak(
         & (energy_sum >= 0.25 * energy_sum[best_index])
         & (concordance >= MIN_CONCORDANCE[reference.name])
     )
-    min_peak_distance = round(MIN_PEAK_DISTANCE_S / GRID_STEP_S)
-    same_peak_start = max(peak_start_index + 1, best_index - min_peak_distance)
-    is_other_peak[same_peak_start : min(peak_end_index, best_index + min_peak_distance + 1)] = False
+    min_peak_distance_steps = round(MIN_PEAK_DISTANCE_S / GRID_STEP_S)
+    best_peak_start_index = max(peak_start_index + 1, best_index - min_peak_distance_steps)
+    is_other_peak[
+        best_peak_start_index : min(peak_end_index, best_index + min_peak_distance_steps + 1)
+    ] = False
     peak = CorrelationPeak(compute_lag_s(best_index), float(concordance[best_index]))
     if not is_other_peak.any():
         return peak
@@ -143,11 +147,11 @@ def find_correlation_peak(
         2.0 * np.maximum(common_count, 1.0)
     )
     residual_m = np.sqrt(mean_square_m2 + INTERPOLATION_RESIDUAL_M**2)
-    second_index = int(np.argmin(np.where(is_other_peak, residual_m, np.inf)))
+    second_peak_index = int(np.argmin(np.where(is_other_peak, residual_m, np.inf)))
     return replace(
         peak,
-        second_peak_s=compute_lag_s(second_index) - compute_lag_s(best_index),
-        second_peak_ratio=float(residual_m[second_index] / residual_m[best_index]),
+        second_peak_lag_s=compute_lag_s(second_peak_index) - compute_lag_s(best_index),
+        second_peak_ratio=float(residual_m[second_peak_index] / residual_m[best_index]),
     )
 
 
@@ -157,12 +161,12 @@ def fit_by_least_squares(
     peak: CorrelationPeak,
     yaw_rad: float | None,
     *,
-    is_lag_free: bool,
+    is_lag_estimated: bool,
 ) -> TrackFit:
     """Fit the file to the reference by robust least squares (soft L1).
 
-    The lag is fitted if ``is_lag_free``, and the yaw if ``yaw_rad`` is None. The origin is always
-    fitted: on a flight in one direction, an offset of the origin would look like a lag.
+    The lag is fitted if ``is_lag_estimated``, and the yaw if ``yaw_rad`` is None. The origin is
+    always fitted: on a flight in one direction, an offset of the origin would look like a lag.
 
     Raises
     ------
@@ -173,7 +177,8 @@ def fit_by_least_squares(
     is_used = is_known & file_track.is_valid
     if np.count_nonzero(is_used) < tracks.MIN_SAMPLES:
         raise NoMatchError(
-            f"only {np.count_nonzero(is_used)} positions of the file overlap the reference in time"
+            f"only {np.count_nonzero(is_used)} positions of the file overlap the "
+            f"{reference.name} in time; at least {tracks.MIN_SAMPLES} are needed"
         )
     reference_time_s = file_track.time_s[is_used] + peak.lag_s
     file_position_m = file_track.to_complex_m()[is_used]
@@ -190,24 +195,28 @@ def fit_by_least_squares(
         else 0j
     )
     mean_variance_m2 = float(np.var(file_position_m) + np.var(reference_position_m)) / 2.0
-    reference_horizontal_m = reference.to_complex_m()
+    reference_horizontal_position_m = reference.to_complex_m()
 
-    # Parameters: origin north, origin east, lag minus lag of the correlation peak, yaw
+    # Parameters: origin north and east (m), fitted lag minus lag of the peak (s), yaw (rad)
     reference_mean_m = reference_position_m.mean()
     parameters = np.array([reference_mean_m.real, reference_mean_m.imag, 0.0, np.angle(coherence)])
     bounds = np.array([np.inf, np.inf, MAX_LAG_FROM_PEAK_S, np.inf])
-    is_fitted = np.array([True, True, is_lag_free, yaw_rad is None])
+    is_fitted = np.array([True, True, is_lag_estimated, yaw_rad is None])
     if yaw_rad is not None:
         parameters[3] = yaw_rad
 
     def compute_residuals_m(fitted_parameters: Array) -> Array:
         all_parameters = parameters.copy()
         all_parameters[is_fitted] = fitted_parameters
-        north, east, lag_from_peak_s, yaw = all_parameters
+        origin_north_m, origin_east_m, lag_from_peak_s, fitted_yaw_rad = all_parameters
         target_m = np.interp(
-            reference_time_s + lag_from_peak_s, reference.time_s, reference_horizontal_m
+            reference_time_s + lag_from_peak_s, reference.time_s, reference_horizontal_position_m
         )
-        residuals = np.exp(1j * yaw) * file_position_m + complex(north, east) - target_m
+        residuals = (
+            np.exp(1j * fitted_yaw_rad) * file_position_m
+            + complex(origin_north_m, origin_east_m)
+            - target_m
+        )
         return np.concatenate([residuals.real, residuals.imag])
 
     solution = least_squares(
@@ -219,7 +228,7 @@ def fit_by_least_squares(
     )
     residuals = compute_residuals_m(solution.x)
     parameters[is_fitted] = solution.x
-    north, east, lag_from_peak_s, yaw = parameters.tolist()
+    origin_north_m, origin_east_m, lag_from_peak_s, fitted_yaw_rad = parameters.tolist()
     complex_residuals = residuals[: len(file_position_m)] + 1j * residuals[len(file_position_m) :]
     jacobian = np.asarray(solution.jac)
     information = jacobian.T @ jacobian
@@ -231,7 +240,7 @@ def fit_by_least_squares(
         * _compute_autocorrelation_factor(complex_residuals)
     )
     parameter_sigma = np.sqrt(np.maximum(parameter_variance, 0.0))
-    is_at_limit = is_lag_free and abs(lag_from_peak_s) > 0.99 * MAX_LAG_FROM_PEAK_S
+    is_lag_at_limit = is_lag_estimated and abs(lag_from_peak_s) > 0.99 * MAX_LAG_FROM_PEAK_S
     reference_ned_m, _ = reference.at(reference_time_s + lag_from_peak_s)
     down_difference_m = reference_ned_m[:, 2] - file_track.position_m[is_used, 2]
     down_difference_m = down_difference_m[np.isfinite(down_difference_m)]
@@ -242,23 +251,27 @@ def fit_by_least_squares(
     )
     concordance = peak.concordance
     if np.isnan(concordance):
-        real_covariance = float((np.exp(-1j * yaw) * coherence).real)
+        rotated_coherence = float((np.exp(-1j * fitted_yaw_rad) * coherence).real)
         concordance = (
-            real_covariance * sigma_product_m2 / mean_variance_m2 if sigma_product_m2 > 0 else 0.0
+            rotated_coherence * sigma_product_m2 / mean_variance_m2 if sigma_product_m2 > 0 else 0.0
         )
-    horizontal_origin_m = complex(north, east) - np.exp(1j * yaw) * centre_m
+    horizontal_origin_m = (
+        complex(origin_north_m, origin_east_m) - np.exp(1j * fitted_yaw_rad) * centre_m
+    )
     return TrackFit(
         lag_s=peak.lag_s + lag_from_peak_s,
-        lag_sigma_s=(np.inf if is_at_limit else float(parameter_sigma[2])) if is_lag_free else None,
+        lag_sigma_s=(np.inf if is_lag_at_limit else float(parameter_sigma[2]))
+        if is_lag_estimated
+        else None,
         concordance=concordance,
-        second_peak_s=peak.second_peak_s,
+        second_peak_lag_s=peak.second_peak_lag_s,
         second_peak_ratio=peak.second_peak_ratio,
-        yaw_rad=yaw,
+        yaw_rad=fitted_yaw_rad,
         yaw_sigma_rad=float(parameter_sigma[-1]) if yaw_rad is None else None,
         origin_m=np.array([horizontal_origin_m.real, horizontal_origin_m.imag, origin_down_m]),
         coherence=coherence,
         horizontal_rms_m=float(horizontal_rms_m),
-        rms_m=float(np.sqrt(2.0 * horizontal_rms_m**2 + vertical_rms_m**2)),
+        residual_rms_m=float(np.sqrt(2.0 * horizontal_rms_m**2 + vertical_rms_m**2)),
     )
 
 
@@ -274,11 +287,13 @@ def _compute_autocorrelation_factor(residual: ComplexArray) -> float:
     covariance_by_lag = autocovariance(clipped_residual)
     if covariance_by_lag[0] <= 0.0:
         return 1.0
-    zero_crossings = np.flatnonzero(covariance_by_lag <= 0.0)
-    first_zero = zero_crossings[0] if len(zero_crossings) else len(covariance_by_lag)
-    return float(1.0 + 2.0 * np.sum(covariance_by_lag[1:first_zero]) / covariance_by_lag[0])
+    nonpositive_lags = np.flatnonzero(covariance_by_lag <= 0.0)
+    first_nonpositive_lag = nonpositive_lags[0] if len(nonpositive_lags) else len(covariance_by_lag)
+    return float(
+        1.0 + 2.0 * np.sum(covariance_by_lag[1:first_nonpositive_lag]) / covariance_by_lag[0]
+    )
 
 
-def compute_clipped_rms_m(values_m: Array) -> float:
+def compute_clipped_rms_m(residual_m: Array) -> float:
     """Return the RMS (m) of residuals that are clipped to MAX_RESIDUAL_M."""
-    return float(np.sqrt(np.mean(np.minimum(np.abs(values_m), MAX_RESIDUAL_M) ** 2)))
+    return float(np.sqrt(np.mean(np.minimum(np.abs(residual_m), MAX_RESIDUAL_M) ** 2)))

@@ -26,7 +26,7 @@ from px4fuse.trajectory.association import gap_limit, is_bracketed
 from px4fuse.trajectory.model import NED_COMPONENTS
 from px4fuse.trajectory.time_offset import GRID_STEP_S
 
-EKF2_POSITION, IMU = "EKF2 position", "IMU"
+EKF2_REFERENCE, IMU_REFERENCE = "EKF2 position", "IMU"
 
 # An interval between two samples is a gap if it is longer than this time (s), and longer than three
 # median intervals
@@ -57,7 +57,7 @@ class SampledTrack:
     Attributes
     ----------
     time_s : ndarray, shape (n,)
-        Flight time; for the position file the time since its first sample.
+        Time since the start of the log; for the position file, time since its first sample.
     position_m : ndarray, shape (n, 3)
         Positions north, east, down; down may be NaN.
     is_valid : ndarray of bool, shape (n,)
@@ -117,7 +117,7 @@ def apply_band_pass(position_m: Array) -> Array:
 
 
 def mark_transients(track: SampledTrack) -> SampledTrack:
-    """Mark the transients of the band-pass filter at ends and gaps as invalid."""
+    """Set ``is_valid`` to False near ends and gaps, where the band-pass filter has transients."""
     transient_sample_count = round(BAND_PASS_TRANSIENT_S / GRID_STEP_S)
     return replace(
         track,
@@ -139,7 +139,7 @@ def _smooth_ekf2_track(state: pd.DataFrame) -> SampledTrack:
     smoothed_position_m = gaussian_filter1d(
         grid_track.position_m, SMOOTHING_SIGMA_S / GRID_STEP_S, axis=0, mode="nearest"
     )
-    return replace(grid_track, position_m=smoothed_position_m, name=EKF2_POSITION)
+    return replace(grid_track, position_m=smoothed_position_m, name=EKF2_REFERENCE)
 
 
 def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
@@ -158,7 +158,9 @@ def make_ekf2_references(flight: Flight) -> list[SampledTrack]:
         states.append(state.assign(**(state[Columns.POSITION] - reset_sum_m)))
     references = [_smooth_ekf2_track(state) for state in states]
     if max(map(compute_horizontal_range_m, references)) < MIN_MOTION_M:
-        raise NoMatchError(f"the EKF2 position changes by less than {MIN_MOTION_M:g} m")
+        raise NoMatchError(
+            f"the EKF2 position changes by less than {MIN_MOTION_M:g} m, too little for a match"
+        )
     return references
 
 
@@ -175,13 +177,17 @@ def make_imu_references(flight: Flight) -> list[SampledTrack]:
     position_m = cumulative_trapezoid(
         apply_band_pass(grid_track.position_m), dx=GRID_STEP_S, axis=0, initial=0
     )
-    return [mark_transients(replace(grid_track, position_m=apply_band_pass(position_m), name=IMU))]
+    return [
+        mark_transients(
+            replace(grid_track, position_m=apply_band_pass(position_m), name=IMU_REFERENCE)
+        )
+    ]
 
 
 def align_samples(
     samples: pd.DataFrame, frame: str, yaw_rad: float, origin_m: Array, lag_s: float
 ) -> pd.DataFrame:
-    """Convert samples of a position file to NED; ``lag_s`` is the flight time of the first sample.
+    """Convert samples of a position file to NED, with ``lag_s`` as time of the first sample.
 
     Positions are R·C·p + origin: C converts the axes of ``frame`` to NED, R rotates by ``yaw_rad``.
     Variances are the diagonal of R·C·diag(σ²)·Cᵀ·Rᵀ.

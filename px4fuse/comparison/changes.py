@@ -26,7 +26,7 @@ from px4fuse.comparison.trials import (
     Change,
     Statistic,
 )
-from px4fuse.ekf2.inputs import Inputs
+from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.filter.frame_rotation import HeadingError
 from px4fuse.filter.settings import Settings
 from px4fuse.filter.tuning import HORIZONTAL, AxisTuning
@@ -70,7 +70,7 @@ MIN_MISALIGNMENT_SIGMAS = 3.0
 def find_candidate_changes(
     comparison: Comparison,
     estimates: Estimates,
-    ekf2_inputs: Inputs | None,
+    ekf2_inputs: ReplayInputs | None,
     axis_result: AxisComparison,
     statistic: Statistic,
 ) -> list[Change]:
@@ -114,7 +114,7 @@ def find_candidate_changes(
 
 
 def find_main_axis_changes(
-    comparison: Comparison, estimates: Estimates, ekf2_inputs: Inputs | None
+    comparison: Comparison, estimates: Estimates, ekf2_inputs: ReplayInputs | None
 ) -> list[Change]:
     """Return the changes of settings or data for re-runs along the main axis.
 
@@ -144,7 +144,7 @@ def remove_repeated_changes(changes: Iterable[Change]) -> list[Change]:
 
 
 def classify_change(
-    comparison: Comparison, ekf2_inputs: Inputs | None, change: Change
+    comparison: Comparison, ekf2_inputs: ReplayInputs | None, change: Change
 ) -> tuple[str, ...]:
     """Return the kinds of a change, for example ("noise",) or ("delay", "outliers")."""
     if ekf2_inputs is None and change == find_default_settings(comparison):
@@ -178,7 +178,7 @@ def find_axis_tuning(tuning: TuningByAxis, axis: str) -> AxisTuning | None:
     return find_first_tuning(tuning, *(() if axis == "down" else (HORIZONTAL,)), axis)
 
 
-def _find_offset_changes(estimates: Estimates, ekf2_inputs: Inputs | None) -> list[Change]:
+def _find_offset_changes(estimates: Estimates, ekf2_inputs: ReplayInputs | None) -> list[Change]:
     """Return the estimated time offset, if a significant part of it is not corrected yet.
 
     For EKF2, EKF2_DELAY_MAX is increased if the shifted positions are too old to be fused.
@@ -232,7 +232,7 @@ def _find_bias_changes(estimates: Estimates) -> list[Change]:
 
 
 def _find_ekf2_noise_changes(
-    ekf2_inputs: Inputs, summary: FilterSummary, axis_tuning: AxisTuning
+    ekf2_inputs: ReplayInputs, summary: FilterSummary, axis_tuning: AxisTuning
 ) -> list[Change]:
     """Return EKF2 parameters for the estimated noise, if EKF2's is outside the 95 % interval."""
     noise_m = axis_tuning.sigma_z.value
@@ -242,7 +242,7 @@ def _find_ekf2_noise_changes(
     return [change] if change else []
 
 
-def _find_default_changes(log: LogInfo, ekf2_inputs: Inputs) -> list[Change]:
+def _find_default_changes(log: LogInfo, ekf2_inputs: ReplayInputs) -> list[Change]:
     """Return changes to PX4's default, for each EKF2 noise with another value in the log.
 
     The gate is included if the logged gate is below PX4's default.
@@ -261,7 +261,7 @@ def _find_default_changes(log: LogInfo, ekf2_inputs: Inputs) -> list[Change]:
 
 
 def _find_acc_noise_changes(
-    settings: Settings, ekf2_inputs: Inputs, axis_tuning: AxisTuning
+    settings: Settings, ekf2_inputs: ReplayInputs, axis_tuning: AxisTuning
 ) -> list[Change]:
     """Return the EKF2_ACC_NOISE for the estimated SIGMA_A, if it is much larger than logged.
 

@@ -18,9 +18,9 @@ from px4fuse.comparison.model import AxisComparison, Comparison
 from px4fuse.comparison.remedy import find_used_noise_m
 from px4fuse.ekf2 import steps
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
-from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.model import Model
-from px4fuse.ekf2.replay import Spans, inside_spans
+from px4fuse.ekf2.inputs import ReplayInputs
+from px4fuse.ekf2.model import Ekf2Model
+from px4fuse.ekf2.replay import Spans, is_inside_spans
 from px4fuse.ekf2.steps import DifferenceExplanation, Step, UnreplayedDifference
 from px4fuse.filter.kalman import Replay, predict_state, replay
 from px4fuse.filter.settings import Settings
@@ -50,7 +50,7 @@ UNREPLAYED_DIFFERENCE_RATIO = 3.0
 
 def explain_ekf2_difference(
     comparison: Comparison,
-    model: Model | Unavailable,
+    model: Ekf2Model | Unavailable,
     clock_offset: ClockOffset | Unavailable,
     estimate_by_setting: Mapping[str, Any],
 ) -> dict[str, DifferenceExplanation | Unavailable]:
@@ -117,7 +117,7 @@ def estimate_wrong_settings(comparison: Comparison, tuning: TuningByAxis) -> dic
 
 
 def list_step_configurations(
-    comparison: Comparison, ekf2_inputs: Inputs, estimate_by_setting: Mapping[str, Any]
+    comparison: Comparison, ekf2_inputs: ReplayInputs, estimate_by_setting: Mapping[str, Any]
 ) -> list[FilterConfiguration]:
     """Return the EKF2 configurations that :func:`explain_ekf2_difference` replays."""
     return list(
@@ -128,7 +128,7 @@ def list_step_configurations(
 
 
 def _make_comparable_settings(
-    comparison: Comparison, ekf2_inputs: Inputs, estimate_by_setting: Mapping[str, Any]
+    comparison: Comparison, ekf2_inputs: ReplayInputs, estimate_by_setting: Mapping[str, Any]
 ) -> Settings:
     settings = replace(comparison.settings, **estimate_by_setting)
     is_same_source = comparison.source.name == ekf2_inputs.received.source
@@ -140,7 +140,9 @@ def _compare_unreplayed_times(
 ) -> UnreplayedDifference | None:
     if not isinstance(axis_result.ekf2_state, pd.DataFrame):
         return None
-    unreplayed_state = axis_result.ekf2_state[~inside_spans(axis_result.ekf2_state.index, spans_s)]
+    unreplayed_state = axis_result.ekf2_state[
+        ~is_inside_spans(axis_result.ekf2_state.index, spans_s)
+    ]
     unreplayed_times_s = unreplayed_state.index.to_numpy()
     difference_m = np.abs(
         predict_state(kf_run, unreplayed_times_s)[0] - unreplayed_state["position_m"].to_numpy()
@@ -169,7 +171,8 @@ def add_cause_sentences(
     """
     step_reasons = {
         **step_reasons,
-        steps.GATE_STEP: f"{step_reasons[steps.GATE_STEP]}{_describe_rejections(explanation)}",
+        steps.REJECTION_STEP: step_reasons[steps.REJECTION_STEP]
+        + _describe_rejections(explanation),
     }
     largest_step, second_largest_step, *_ = sorted(
         explanation.steps, key=lambda step: -step.position_mean_square_m2
@@ -242,7 +245,7 @@ def _describe_rejections(explanation: DifferenceExplanation) -> str:
 
 
 def _explain_steps(
-    comparison: Comparison, model: Model, clock_offset: ClockOffset | Unavailable
+    comparison: Comparison, model: Ekf2Model, clock_offset: ClockOffset | Unavailable
 ) -> dict[str, str]:
     kf_settings, ekf2_inputs, source = comparison.settings, model.inputs, comparison.source
     ekf2_parameters, aid = ekf2_inputs.settings, ekf2_inputs.aid
@@ -275,9 +278,9 @@ def _explain_steps(
     )
     trusted_input = "IMU" if equivalent_sigma_a < kf_settings.sigma_a_m_s2 else "positions"
     return {
-        steps.SAMPLES_STEP: prediction_text,
+        steps.SAMPLE_TIMES_STEP: prediction_text,
         steps.TIMESTAMPS_STEP: delay_text,
-        steps.NOISE_STEP: (
+        steps.MEASUREMENT_NOISE_STEP: (
             f"EKF2 uses a measurement noise of {find_used_noise_m(model.inputs):.2g} m "
             f"({aid.noise}), KF uses {kf_settings.sigma_z_m:.2g} m"
         ),
@@ -293,10 +296,10 @@ def _explain_steps(
         steps.MAGNETOMETER_STEP: (
             "EKF2 estimates its heading with the magnetometer; KF uses EKF2's published heading"
         ),
-        steps.VELOCITY_STEP: "EKF2 also fuses GNSS velocity; KF uses GNSS position only",
+        steps.GNSS_VELOCITY_STEP: "EKF2 also fuses GNSS velocity; KF uses GNSS position only",
         steps.FLOW_STEP: "EKF2 also fuses optical flow; KF uses positions only",
         steps.VISION_STEP: "EKF2 fuses external vision and GNSS; KF uses one position source",
-        steps.GATE_STEP: (
+        steps.REJECTION_STEP: (
             f"EKF2 rejects {100 * model.agreement.rejected_fraction_logged:.1f} % of the "
             "positions; KF has no innovation gate and uses all positions"
         ),

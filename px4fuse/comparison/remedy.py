@@ -8,8 +8,8 @@ import numpy as np
 
 from px4fuse.comparison.estimates import TuningByAxis, find_first_tuning
 from px4fuse.comparison.model import Comparison, PreparedComparison
-from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.model import Model, replay_with_settings
+from px4fuse.ekf2.inputs import ReplayInputs
+from px4fuse.ekf2.model import Ekf2Model, replay_with_settings
 from px4fuse.ekf2.replay import rows_inside
 from px4fuse.filter.signals import AISLE
 from px4fuse.filter.time_offset import MIN_OFFSET_SIGMAS, MIN_TIME_OFFSET_S, ClockOffset
@@ -30,7 +30,7 @@ MIN_HEIGHT_FUSED_FRACTION = 0.5
 MIN_HEIGHT_TO_HORIZONTAL_NOISE = 2.0
 
 
-def estimate_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
+def estimate_gnss_delay_ms(model: Ekf2Model) -> tuple[float, float] | None:
     """Estimate the delay of GNSS and its σ (ms) in a flight with vision and GNSS velocity.
 
     The delay minimises the NIS of GNSS in re-runs of EKF2 with several values of EKF2_GPS_DELAY.
@@ -73,7 +73,7 @@ def estimate_gnss_delay_ms(model: Model) -> tuple[float, float] | None:
 
 def estimate_ekf2_parameters(
     comparison: Comparison,
-    model: Model,
+    model: Ekf2Model,
     tuning: TuningByAxis,
     clock_offset: ClockOffset | Unavailable,
 ) -> dict[str, float]:
@@ -107,14 +107,14 @@ def estimate_ekf2_parameters(
     return changes | make_estimated_delay_change(comparison, ekf2_inputs, clock_offset)
 
 
-def is_source_fused(comparison: Comparison, ekf2_inputs: Inputs) -> bool:
+def is_source_fused(comparison: Comparison, ekf2_inputs: ReplayInputs) -> bool:
     """Return True if EKF2 fused the position source that KF uses."""
     source = comparison.source
     return source.name == ekf2_inputs.received.source and source.alignment is None
 
 
 def make_estimated_delay_change(
-    comparison: Comparison, ekf2_inputs: Inputs, clock_offset: ClockOffset | Unavailable
+    comparison: Comparison, ekf2_inputs: ReplayInputs, clock_offset: ClockOffset | Unavailable
 ) -> dict[str, float]:
     if isinstance(clock_offset, Unavailable) or not clock_offset.is_determinable:
         return {}
@@ -170,7 +170,7 @@ def find_logged_delay_ms(comparison: PreparedComparison) -> float | None:
 
 
 def make_estimated_noise_change(
-    ekf2_inputs: Inputs, noise_estimate: NoiseEstimate, noise_m: float
+    ekf2_inputs: ReplayInputs, noise_estimate: NoiseEstimate, noise_m: float
 ) -> dict[str, float]:
     """Return the EKF2 parameters for the position noise ``noise_m``.
 
@@ -200,7 +200,7 @@ def make_noise_change(
     return changes
 
 
-def make_delay_change(ekf2_inputs: Inputs, delay_ms: float) -> dict[str, float]:
+def make_delay_change(ekf2_inputs: ReplayInputs, delay_ms: float) -> dict[str, float]:
     """Return the EKF2 parameters for a delay of the positions. A negative delay is set to 0.
 
     The mapping is empty if PX4 does not permit the delay, or if EKF2 ignores the parameter.
@@ -230,7 +230,7 @@ def make_delay_max_change(
     }
 
 
-def find_used_noise_m(ekf2_inputs: Inputs) -> float:
+def find_used_noise_m(ekf2_inputs: ReplayInputs) -> float:
     """Return the median √R (m) that EKF2 used for the positions."""
     aid, logged_parameters = ekf2_inputs.aid, ekf2_inputs.settings
     ignores_reported_noise = aid.noise_mode and logged_parameters[aid.noise_mode] == 1.0
@@ -240,7 +240,7 @@ def find_used_noise_m(ekf2_inputs: Inputs) -> float:
     )
 
 
-def _compute_reported_noise_m(ekf2_inputs: Inputs) -> float:
+def _compute_reported_noise_m(ekf2_inputs: ReplayInputs) -> float:
     return float(np.sqrt(np.median(ekf2_inputs.received.variance_m2[:, :2])))
 
 

@@ -54,8 +54,8 @@ from px4fuse.comparison.trials import (
 )
 from px4fuse.core.arrays import Array
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
-from px4fuse.ekf2.inputs import Inputs
-from px4fuse.ekf2.model import Model, replay_with_settings, with_misaligned_positions
+from px4fuse.ekf2.inputs import ReplayInputs
+from px4fuse.ekf2.model import Ekf2Model, misalign_positions, replay_with_settings
 from px4fuse.ekf2.replay import HORIZONTAL_AXES, Ekf2Replay, rows_inside
 from px4fuse.ekf2.steps import DifferenceExplanation
 from px4fuse.filter.kalman import replay
@@ -120,7 +120,7 @@ class Reruns:
 
     Attributes
     ----------
-    ekf2_model : Model or Unavailable
+    ekf2_model : Ekf2Model or Unavailable
         Replay of EKF2 with the logged parameters.
     difference_steps : mapping from axis name to DifferenceExplanation or Unavailable
         Contribution of each property of EKF2 to the difference KF - EKF2.
@@ -128,7 +128,7 @@ class Reruns:
         Re-runs along the main axis, and along each axis with an inconsistent filter.
     """
 
-    ekf2_model: Model | Unavailable
+    ekf2_model: Ekf2Model | Unavailable
     difference_steps: Mapping[str, DifferenceExplanation | Unavailable]
     trials: tuple[Trial, ...]
 
@@ -141,15 +141,15 @@ class _Filter(NamedTuple):
 
     name: FilterName
     rerun: Callable[[AxisComparison, Change], RunStatistics]
-    ekf2_model: Model | None = None
+    ekf2_model: Ekf2Model | None = None
 
     @property
-    def ekf2_inputs(self) -> Inputs | None:
+    def ekf2_inputs(self) -> ReplayInputs | None:
         return None if self.ekf2_model is None else self.ekf2_model.inputs
 
 
 def rerun_filters(
-    comparison: Comparison, estimates: Estimates, model: Model | Unavailable
+    comparison: Comparison, estimates: Estimates, model: Ekf2Model | Unavailable
 ) -> tuple[Trial, ...]:
     """Re-run KF and EKF2 along each axis with each change that may make them consistent.
 
@@ -157,7 +157,7 @@ def rerun_filters(
     """
     filters = [_Filter("kf", partial(_rerun_kf, comparison, estimates.tuning))]
     if (
-        isinstance(model, Model)
+        isinstance(model, Ekf2Model)
         and model.agreement.good
         and is_source_fused(comparison, model.inputs)
     ):
@@ -179,7 +179,7 @@ def rerun_filters(
 
 
 def list_rerun_configurations(
-    comparison: Comparison, estimates: Estimates, ekf2_inputs: Inputs
+    comparison: Comparison, estimates: Estimates, ekf2_inputs: ReplayInputs
 ) -> list[FilterConfiguration]:
     """Return the EKF2 configurations that :func:`rerun_filters` will replay."""
     if not is_source_fused(comparison, ekf2_inputs):
@@ -201,7 +201,7 @@ def is_inconsistent(summary: FilterSummary | UntestedFilter) -> TypeGuard[Filter
 def _find_changes_to_test(
     comparison: Comparison,
     estimates: Estimates,
-    ekf2_inputs: Inputs | None,
+    ekf2_inputs: ReplayInputs | None,
     axis_result: AxisComparison,
 ) -> list[tuple[Change, tuple[Statistic, ...]]]:
     """Return the changes for re-runs along an axis, each with the statistics it may correct."""
@@ -401,12 +401,12 @@ def _remove_accelerometer_bias(
 
 
 def _replay_ekf2(
-    comparison: Comparison, tuning: TuningByAxis, model: Model, change: Change
+    comparison: Comparison, tuning: TuningByAxis, model: Ekf2Model, change: Change
 ) -> Ekf2Replay:
     if not change:
         return model.baseline_replay
     changed_parameters = {name: value for name, value in change.items() if name in PARAMETERS}
-    misaligned_model = with_misaligned_positions(
+    misaligned_model = misalign_positions(
         model, change.get(ROTATION_KEY, 0.0), change.get(CLOCK_OFFSET_KEY, 0.0)
     )
     excluded_times_s, axis_tuning = None, find_axis_tuning(tuning, HORIZONTAL)
@@ -421,7 +421,7 @@ def _replay_ekf2(
 
 def _summarise_replay(
     comparison: Comparison,
-    model: Model,
+    model: Ekf2Model,
     ekf2_replay: Ekf2Replay,
     axis_result: AxisComparison,
     change: Change,

@@ -16,7 +16,7 @@ from scipy import constants
 
 from px4fuse.convention.model import HeadingSource
 from px4fuse.core.arrays import Array, BoolArray, cumulative_integral
-from px4fuse.ekf2.replay import inside_spans
+from px4fuse.ekf2.replay import is_inside_spans
 from px4fuse.filter.signals import find_imu_gaps
 from px4fuse.flight.model import Columns, Flight, Unavailable
 from px4fuse.trajectory.association import gap_limit, is_bracketed
@@ -268,7 +268,7 @@ def integrate_imu_motion(inertial_data: InertialData, attitude: Array) -> ImuSec
     second_differences = compute_second_differences(position_m, window_steps)[::stride]
     time_s = inertial_data.time_s[window_steps:-window_steps][::stride]
     # a second difference spans SECOND_DIFFERENCE_WINDOW_S before and after its time
-    is_valid = inside_spans(time_s, inertial_data.valid_spans_s)
+    is_valid = is_inside_spans(time_s, inertial_data.valid_spans_s)
     for (_, end), (start, _) in pairwise(inertial_data.valid_spans_s):
         is_valid &= (time_s < end - SECOND_DIFFERENCE_WINDOW_S) | (
             time_s > start + SECOND_DIFFERENCE_WINDOW_S

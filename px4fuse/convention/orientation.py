@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from px4fuse.convention.model import BodyAndWorldFrame, OrientationConvention, QuaternionOrder
 from px4fuse.convention.motion import InertialData
 from px4fuse.core.arrays import Array
-from px4fuse.ekf2.replay import inside_spans
+from px4fuse.ekf2.replay import is_inside_spans
 from px4fuse.trajectory.rotation import from_vector, heading, interpolate, multiply, to_matrix
 
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
@@ -86,7 +86,7 @@ def check_orientation(
 
     The result is None for fewer than MIN_ORIENTATION_COUNT orientations.
     """
-    flight_rows = np.flatnonzero(inside_spans(time_s, inertial_data.valid_spans_s))
+    flight_rows = np.flatnonzero(is_inside_spans(time_s, inertial_data.valid_spans_s))
     if len(flight_rows) < MIN_ORIENTATION_COUNT:
         return None
     flight_rows = flight_rows[:: -(-len(flight_rows) // MAX_ORIENTATION_COUNT)]

@@ -27,25 +27,25 @@ AidVerdict = Literal[
     "disabled",
     "too few samples",
 ]
-# An aiding source is biased if |mean innovation| / RMS innovation exceeds this value, and
+# Minimum |mean innovation| / RMS innovation of a biased aiding source
 MIN_BIAS_TO_RMS_RATIO = 0.5
-# |mean innovation| / median √S exceeds this value
-MIN_BIAS_IN_SIGMA = 0.2
+# Minimum |mean innovation| / median √S of a biased aiding source
+MIN_BIAS_TO_SQRT_S_RATIO = 0.2
 # Length (s) of the windows in which normalised innovations ν/√S are averaged to detect a change
 CHANGE_WINDOW_S = 10.0
 # Minimum number of innovations in a window for a mean normalised innovation
 MIN_WINDOW_SAMPLES = 5
-# A change of the mean normalised innovation is searched only after this number of windows,
+# Minimum number of windows before a change of the mean normalised innovation
 MIN_WINDOWS_BEFORE_CHANGE = 2
-# and reported only if it is larger than this value (√S)
+# Minimum change of the mean normalised innovation (√S) for a report
 MIN_MEAN_CHANGE_IN_SIGMA = 0.5
-# and than this multiple of the standard deviation of the window means before it
-MIN_CHANGE_SCATTER_RATIO = 6.0
+# Minimum ratio of this change to the standard deviation of the window means before the change
+MIN_CHANGE_TO_SCATTER_RATIO = 6.0
 # Maximum time (s) for which EKF2 fuses no sample of an enabled aiding source. After 7 s, EKF2
 # resets its state to the source (reset_timeout_max)
-MAX_NOT_FUSED_S = 5.0
-# Maximum time for which EKF2 fuses no sample of an enabled aiding source, in logging intervals
-MAX_NOT_FUSED_INTERVALS = 10.0
+MAX_TIME_WITHOUT_FUSION_S = 5.0
+# Maximum time without fusion in logging intervals: larger than the limit in s for a sparse log
+MAX_INTERVALS_WITHOUT_FUSION = 10.0
 # Maximum |√R / noise parameter - 1| if EKF2 computes R from this parameter
 NOISE_RELATIVE_TOLERANCE = 0.02
 # Aiding sources are evaluated above this height (m): near the ground, rotor downwash disturbs the
@@ -144,7 +144,7 @@ class AidResult(Record, kw_only=True):
         return _compute_mean_nis(self.axes)
 
 
-def flight_span(flight: Flight) -> Span | Unavailable:
+def find_flight_span(flight: Flight) -> Span | Unavailable:
     """Return start and end (s) of the longest flight, without the time close to the ground."""
     if isinstance(flight.airborne, Unavailable):
         return 0.0, flight.log.duration_s
@@ -174,7 +174,7 @@ def evaluate_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
             "estimator_innovations or ekf2_innovations)",
             "Record a ULog with SDLOG_PROFILE bit 0 (default).",
         )
-    span = flight_span(flight)
+    span = find_flight_span(flight)
     if isinstance(span, Unavailable):
         return span
     aid_logs = flight.ekf2.aids
@@ -187,27 +187,30 @@ def evaluate_aids(flight: Flight) -> dict[str, AidResult] | Unavailable:
 
 def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> AidResult:
     samples = aid_log.samples.loc[start_s:end_s]
-    sample_s = samples.index.to_numpy()
+    sample_times_s = samples.index.to_numpy()
     gate = _find_effective_gate(aid, aid_log)
 
-    def values_by_axis(name: str) -> Array:
+    def select_axis_columns(name: str) -> Array:
         return samples[[f"{name}_{axis}" for axis in aid_log.axes]].to_numpy()
 
-    innovation, innovation_variance = values_by_axis("innovation"), values_by_axis("variance")
+    innovation, innovation_variance = (
+        select_axis_columns("innovation"),
+        select_axis_columns("variance"),
+    )
     is_enabled = np.ones(len(samples), bool)
     enabled_fraction = None
     if aid_log.enabled is not None:
         is_enabled = np.asarray(sample_step_function(aid_log.enabled, samples.index) > 0.0)
-        flight_grid_s = pd.Index(np.arange(start_s, end_s, 0.1))
+        flight_grid_times_s = pd.Index(np.arange(start_s, end_s, 0.1))
         enabled_fraction = float(
-            np.mean(sample_step_function(aid_log.enabled, flight_grid_s) > 0.0)
+            np.mean(sample_step_function(aid_log.enabled, flight_grid_times_s) > 0.0)
         )
     is_fusion_logged = "fused" in samples
     is_reset = np.zeros(len(samples), bool)
     noise_sigma_median = None
     if is_fusion_logged:
         is_fused, is_rejected = samples[["fused", "rejected"]].to_numpy().T > 0.0
-        noise_sigma = values_by_axis("noise")
+        noise_sigma = select_axis_columns("noise")
         # If EKF2 resets its state to a sample, it logs innovation 0 and S = R for this sample
         is_reset = ((innovation == 0.0) & np.isclose(innovation_variance, noise_sigma)).all(axis=1)
         if is_fused.any():
@@ -216,7 +219,9 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         is_rejected = np.max(innovation**2 / innovation_variance, axis=1, initial=0.0) > gate**2
         is_fused = ~is_rejected
     is_evaluated = (is_fused | is_rejected) & is_enabled & ~is_reset
-    longest_gap_s = _find_longest_gap(sample_s, is_fused & is_enabled, aid_log, start_s, end_s)
+    longest_gap_s = _find_longest_gap(
+        sample_times_s, is_fused & is_enabled, aid_log, start_s, end_s
+    )
     axes = {}
     for axis_index, axis in enumerate(aid_log.axes):
         consistency = assess_innovations(
@@ -238,7 +243,7 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
                 lag1_autocorrelation=consistency.lag1_autocorrelation,
                 ljung_box_p=consistency.ljung_box_p,
                 change=_find_largest_mean_change(
-                    sample_s[is_evaluated],
+                    sample_times_s[is_evaluated],
                     innovation[is_evaluated, axis_index]
                     / np.sqrt(innovation_variance[is_evaluated, axis_index]),
                 ),
@@ -255,9 +260,11 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
         resets=int(is_reset.sum()),
         gate=gate,
         noise=noise_sigma_median,
-        noise_from=_find_noise_origin(aid, aid_log, noise_sigma_median),
+        noise_from=_find_noise_parameter(aid, aid_log, noise_sigma_median),
         axes=axes,
-        verdict=_classify_aid(axes, longest_gap_s, sample_s[is_fused & (not is_fusion_logged)])
+        verdict=_classify_aid(
+            axes, longest_gap_s, sample_times_s[is_fused & (not is_fusion_logged)]
+        )
         if is_evaluated.any()
         else "disabled",
     )
@@ -266,9 +273,9 @@ def _evaluate_aid(aid: Aid, aid_log: AidLog, start_s: float, end_s: float) -> Ai
 def _find_largest_mean_change(time_s: Array, normalised_innovations: Array) -> Span | None:
     """Return time (s) and size (√S) of the largest change of the mean; None if not significant.
 
-    Each window of CHANGE_WINDOW_S is tested: change = mean of the next two windows - mean before
-    the window. The change starts in the window if mean of the window - mean before > change / 3,
-    else after the window.
+    For each window of CHANGE_WINDOW_S: change = mean of the two windows after it - mean of all
+    windows before it. If the mean of the window itself has moved by more than a third of the
+    change, the change starts in the window, else after it.
     """
     window_index = np.floor((time_s - time_s[0]) / CHANGE_WINDOW_S)
     windows = pd.Series(normalised_innovations).groupby(window_index).agg(["mean", "size"])
@@ -277,13 +284,15 @@ def _find_largest_mean_change(time_s: Array, normalised_innovations: Array) -> S
     largest_change = None
     min_mean_change = MIN_MEAN_CHANGE_IN_SIGMA
     for index in range(MIN_WINDOWS_BEFORE_CHANGE, len(window_means) - 2):
-        mean_before = np.mean(window_means[:index])
-        mean_change = float(np.mean(window_means[index + 1 : index + 3]) - mean_before)
+        mean_before_window = np.mean(window_means[:index])
+        mean_change = float(np.mean(window_means[index + 1 : index + 3]) - mean_before_window)
         normalised_std = np.std(normalised_innovations[window_index < windows.index[index]])
         standard_error = normalised_std / math.sqrt(2.0 * windows["size"].iloc[:index].median())
         mean_scatter = max(np.std(window_means[:index], ddof=1), standard_error)
-        if abs(mean_change) > max(min_mean_change, MIN_CHANGE_SCATTER_RATIO * mean_scatter):
-            is_change_in_window = abs(window_means[index] - mean_before) > abs(mean_change) / 3.0
+        if abs(mean_change) > max(min_mean_change, MIN_CHANGE_TO_SCATTER_RATIO * mean_scatter):
+            is_change_in_window = (
+                abs(window_means[index] - mean_before_window) > abs(mean_change) / 3.0
+            )
             first_changed_window = windows.index[index if is_change_in_window else index + 1]
             largest_change = float(time_s[0] + CHANGE_WINDOW_S * first_changed_window), mean_change
             min_mean_change = abs(mean_change)
@@ -305,7 +314,7 @@ def _find_effective_gate(aid: Aid, aid_log: AidLog) -> float:
     return max(aid_log.parameters.get(aid.gate, aid.default_gate), 0.01)
 
 
-def _find_noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
+def _find_noise_parameter(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> str:
     """Return the parameter that determines R, or another origin, such as "reported accuracy"."""
     parameter_value = aid_log.parameters.get(aid.noise)
     if noise_sigma is None or parameter_value is None:
@@ -321,13 +330,13 @@ def _find_noise_origin(aid: Aid, aid_log: AidLog, noise_sigma: float | None) -> 
 
 
 def _find_longest_gap(
-    sample_s: Array, is_fused: BoolArray, aid_log: AidLog, start_s: float, end_s: float
+    sample_times_s: Array, is_fused: BoolArray, aid_log: AidLog, start_s: float, end_s: float
 ) -> Span:
     is_inside = (aid_log.unknown_fusion_times_s > start_s) & (
         aid_log.unknown_fusion_times_s < end_s
     )
     gap_ends_s = np.union1d(
-        np.r_[start_s, sample_s[is_fused], end_s], aid_log.unknown_fusion_times_s[is_inside]
+        np.r_[start_s, sample_times_s[is_fused], end_s], aid_log.unknown_fusion_times_s[is_inside]
     )
     gap_starts_s = gap_ends_s[:-1]
     is_enabled = np.ones(len(gap_starts_s), bool)
@@ -345,14 +354,16 @@ def _classify_aid(
 ) -> AidVerdict:
     interval_s = median_interval(fusion_times_s) if len(fusion_times_s) > 1 else 0.0
     if longest_gap_s[1] - longest_gap_s[0] > max(
-        MAX_NOT_FUSED_S, MAX_NOT_FUSED_INTERVALS * interval_s
+        MAX_TIME_WITHOUT_FUSION_S, MAX_INTERVALS_WITHOUT_FUSION * interval_s
     ):
         return "not_fused"
     if not axes:
         return "too few samples"
     for axis in axes.values():
-        min_bias = max(MIN_BIAS_IN_SIGMA, MIN_BIAS_TO_RMS_RATIO * math.sqrt(axis.nis_mean))
-        if abs(axis.mean_normalised_innovation) > min_bias:
+        min_mean_innovation = max(
+            MIN_BIAS_TO_SQRT_S_RATIO, MIN_BIAS_TO_RMS_RATIO * math.sqrt(axis.nis_mean)
+        )
+        if abs(axis.mean_normalised_innovation) > min_mean_innovation:
             return "biased"
     return classify_mean_nis(
         _compute_mean_nis(axes), compute_nis_band(sum(axis.samples for axis in axes.values()))

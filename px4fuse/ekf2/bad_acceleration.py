@@ -14,11 +14,10 @@ import numpy as np
 from px4fuse.core.arrays import Array, BoolArray
 from px4fuse.ekf2.replay_segments import ReplaySegment
 
-# EKF2 sets the flag if the larger height innovation (√S) of barometer and GNSS exceeds this value
-# (vert_innov_test_lim, common.h)
+# EKF2 flags a bad vertical acceleration if the normalised height innovations of barometer and GNSS
+# are large: minimum of the larger one (vert_innov_test_lim, common.h)
 MIN_LARGER_HEIGHT_INNOVATION = 3.0
-# EKF2 sets the flag if the smaller height innovation (√S) of barometer and GNSS exceeds this value
-# (vert_innov_test_min, common.h)
+# Minimum of the smaller normalised height innovation for the same flag (vert_innov_test_min)
 MIN_SMALLER_HEIGHT_INNOVATION = 1.0
 
 
@@ -52,8 +51,10 @@ class BadAccelerationFlag:
         self.models_flag = not uses_logged_flag.all()
         self.uses_logged_flag = uses_logged_flag
         self.flag_duration_s = flag_duration_s
-        edges = np.flatnonzero(np.diff(logged_flag, prepend=False, append=False))
-        self.logged_since_s, self.logged_until_s = np.append(time_s, np.inf)[edges].reshape(-1, 2).T
+        flag_change_steps = np.flatnonzero(np.diff(logged_flag, prepend=False, append=False))
+        self.logged_since_s, self.logged_until_s = (
+            np.append(time_s, np.inf)[flag_change_steps].reshape(-1, 2).T
+        )
         self.since_s = np.full(len(uses_logged_flag), time_s[0])
         self.until_s = np.full(
             len(uses_logged_flag), time_s[0] + flag_duration_s * float(logged_flag[0])
@@ -87,26 +88,27 @@ class BadAccelerationFlag:
             Normalised height innovations (√S, positive upwards) of the previous and of the current
             event: k rows for barometer samples, one row for GNSS. NaN without a sample.
         """
-        # EKF2 tests the latest innovation of each sensor, so it is kept until the next sample
+        # EKF2's test uses the latest innovation of each height sensor, so each innovation is kept
+        # until the next sample of the sensor
         gnss_innovation = previous_innovations[-1]
         barometer_innovation = np.full(len(gnss_innovation), np.nan)
         for sample_innovation in previous_innovations[:-1]:
             barometer_innovation = np.where(
                 np.isnan(sample_innovation), barometer_innovation, sample_innovation
             )
-        is_bad = _is_falling(barometer_innovation, gnss_innovation)
+        is_acceleration_bad = _indicates_falling(barometer_innovation, gnss_innovation)
         for sample_innovation in innovations[:-1]:
             barometer_innovation = np.where(
                 np.isnan(sample_innovation), barometer_innovation, sample_innovation
             )
-            is_bad |= _is_falling(barometer_innovation, gnss_innovation)
-        is_bad |= _is_falling(barometer_innovation, innovations[-1])
-        is_bad &= ~self.uses_logged_flag
-        self.since_s = np.where(is_bad & (self.until_s < time_s), time_s, self.since_s)
-        self.until_s = np.where(is_bad, time_s + self.flag_duration_s, self.until_s)
+            is_acceleration_bad |= _indicates_falling(barometer_innovation, gnss_innovation)
+        is_acceleration_bad |= _indicates_falling(barometer_innovation, innovations[-1])
+        is_acceleration_bad &= ~self.uses_logged_flag
+        self.since_s = np.where(is_acceleration_bad & (self.until_s < time_s), time_s, self.since_s)
+        self.until_s = np.where(is_acceleration_bad, time_s + self.flag_duration_s, self.until_s)
 
 
-def _is_falling(barometer_innovation: Array, gnss_innovation: Array) -> BoolArray:
+def _indicates_falling(barometer_innovation: Array, gnss_innovation: Array) -> BoolArray:
     larger_innovation = np.maximum(barometer_innovation, gnss_innovation)
     smaller_innovation = np.minimum(barometer_innovation, gnss_innovation)
     return np.asarray(

@@ -10,34 +10,34 @@ import numpy as np
 
 from px4fuse.core.arrays import Array, BoolArray
 
-# Noise density (m/s/√Hz) of the random walk of the sensor bias (bias_nsd, common.h)
+# Noise density (m/s/√Hz) of the random walk of a height or vision bias (bias_nsd, common.h)
 SENSOR_BIAS_NOISE_DENSITY = 0.13
-# Minimum variance (m²) of the sensor bias
+# Minimum variance (m²) of the estimated height or vision bias
 MIN_BIAS_VARIANCE_M2 = 1e-8
-# Innovation gate (√S) in updates of the sensor bias
+# EKF2 updates the height or vision bias only with innovations inside this gate (√S)
 BIAS_GATE = 3.0
-# EKF2 takes its sensor bias as wrong if |mean of (test ratio · sign of innovation)| exceeds this
-# value (isOffsetDetected, bias_estimator.cpp)
+# EKF2 considers the bias wrong if |mean of (test ratio · sign of innovation)| exceeds this value
+# (isOffsetDetected, bias_estimator.cpp)
 MAX_MEAN_SIGNED_TEST_RATIO = 0.2
-# and then multiplies the variance of the random walk by this factor
+# Factor by which EKF2 multiplies the random walk variance of a bias that it considers wrong
 WRONG_BIAS_VARIANCE_FACTOR = 1e3
 # Time constant (s) of the low-pass filter of (test ratio · sign of innovation)
-TEST_RATIO_FILTER_S = 10.0
+TEST_RATIO_TIME_CONSTANT_S = 10.0
 
 
 class BiasEstimator:
-    """Bias of one sensor in each of several filter configurations, updated with each sample.
+    """Estimated bias of one sensor, for several filter configurations at once.
 
-    ``value_m`` is added to innovations. ``value_m`` and ``variance_m2`` have the shape (filters,)
-    or (filters, axes). ``steps_s`` contains the lengths of EKF2's prediction steps.
+    ``bias_m`` (state minus measurement) is added to innovations. ``bias_m`` and ``variance_m2``
+    have the shape (filters,) or (filters, axes). ``steps_s``: lengths of EKF2's prediction steps.
     """
 
-    def __init__(self, value_m: Array, variance_m2: Array, steps_s: Array) -> None:
+    def __init__(self, bias_m: Array, variance_m2: Array, steps_s: Array) -> None:
         step_s = np.median(steps_s)
-        self.value_m = value_m
+        self.bias_m = bias_m
         self.variance_m2 = variance_m2
-        self.mean_signed_test_ratio = np.zeros_like(value_m)
-        self.filter_weight = step_s / (TEST_RATIO_FILTER_S + step_s)
+        self.mean_signed_test_ratio = np.zeros_like(bias_m)
+        self.filter_weight = step_s / (TEST_RATIO_TIME_CONSTANT_S + step_s)
 
     def remove_bias(
         self,
@@ -67,12 +67,12 @@ class BiasEstimator:
             SENSOR_BIAS_NOISE_DENSITY**2,
         )
         bias_variance = np.minimum(self.variance_m2 + variance_rate * interval_s, R_m2)
-        nu = nu + self.value_m
+        nu = nu + self.bias_m
         R = R_m2 + bias_variance
         S = bias_variance + (R_m2 + predicted_variance) / weight
         test_ratio = nu * nu / (BIAS_GATE**2 * S)
         K = bias_variance / S * (updates_bias & (test_ratio < 1.0))
-        self.value_m = self.value_m - K * nu
+        self.bias_m = self.bias_m - K * nu
         self.variance_m2 = np.maximum(bias_variance - K * bias_variance, MIN_BIAS_VARIANCE_M2)
         signed_ratio_sum = (
             np.copysign(np.minimum(test_ratio, 1.0), nu) + self.mean_signed_test_ratio

@@ -36,5 +36,5 @@ def compute_position_scale(fusion_record: FusionRecord) -> tuple[float, float, f
         EQUATORIAL_RADIUS_M * np.array([(1.0 - eccentricity_squared) / q**2.5, q**-0.5])
         + fusion_record.altitude_m
     )
-    north_ratio, east_ratio = (radii_m / EARTH_RADIUS_M).tolist()
-    return north_ratio, east_ratio, 1.0
+    north_radius_ratio, east_radius_ratio = (radii_m / EARTH_RADIUS_M).tolist()
+    return north_radius_ratio, east_radius_ratio, 1.0

@@ -22,22 +22,27 @@ from px4fuse.ekf2.bad_acceleration import BadAccelerationFlag
 from px4fuse.ekf2.heights import (
     GNSS_HEIGHT_NOISE_FACTOR,
     HEIGHT_SENSORS,
-    MIN_GATE,
+    MIN_INNOVATION_GATE,
     MIN_NOISE_SIGMA,
     HeightFilter,
     group_barometer_by_event,
 )
-from px4fuse.ekf2.inputs import FusionRules, Inputs
+from px4fuse.ekf2.inputs import FusionRules, ReplayInputs
 from px4fuse.ekf2.intervals import (
     FUSE,
     NO_ACTION,
     START_FUSION,
+    EventIntervals,
     FusionDelays,
-    Intervals,
     StepEvents,
     make_intervals,
 )
-from px4fuse.ekf2.magnetometer import MIN_SIGMA_GAUSS, EventSamples, average_by_event, fuse_mean
+from px4fuse.ekf2.magnetometer import (
+    MIN_MAGNETOMETER_SIGMA_GAUSS,
+    EventSamples,
+    average_by_event,
+    fuse_mean,
+)
 from px4fuse.ekf2.replay_segments import (
     ACCELEROMETER_BIAS,
     BIASES,
@@ -58,7 +63,7 @@ MIN_STATE_VARIANCE = 1e-30
 # Number of events whose transition matrices are copied at once, to limit the memory
 EVENT_BATCH_SIZE = 64
 # Measurement variance (m² or rad²) so large that the measurement has no effect
-IGNORED_VARIANCE = 1e9
+VARIANCE_WITHOUT_EFFECT = 1e9
 # Acceleration noise (m/s²) while EKF2 reports a bad or clipped acceleration (BADACC_BIAS_PNOISE,
 # common.h; covariance.cpp)
 BAD_ACCELERATION_NOISE_M_S2 = 4.9
@@ -83,14 +88,14 @@ MAX_BIAS_SIGMA_M_S2 = 0.1 * GRAVITY_MAGNITUDE_M_S2
 # (covariance.cpp)
 MIN_BIAS_VARIANCE_RATIO = 0.01
 # State indices of heading error and position
-HEADING, NORTH, EAST, DOWN = 2, 6, 7, 8
+HEADING, POSITION_NORTH, POSITION_EAST, POSITION_DOWN = 2, 6, 7, 8
 # State indices of the accelerometer bias, rotated to NED
-BIAS_NORTH, BIAS_EAST, BIAS_DOWN = 12, 13, 14
+ACCELEROMETER_BIAS_NORTH, ACCELEROMETER_BIAS_EAST, ACCELEROMETER_BIAS_DOWN = 12, 13, 14
 # State indices of the measurements that are fused together, in this order
-JOINTLY_MEASURED_STATES = np.array([HEADING, DOWN, NORTH, EAST])
+JOINTLY_MEASURED_STATES = np.array([HEADING, POSITION_DOWN, POSITION_NORTH, POSITION_EAST])
 # State indices of heading error and height (a slice, which does not copy the states)
-HEADING_AND_DOWN = slice(HEADING, DOWN + 1, DOWN - HEADING)
-HORIZONTAL_POSITION = slice(NORTH, EAST + 1)
+HEADING_AND_DOWN = slice(HEADING, POSITION_DOWN + 1, POSITION_DOWN - HEADING)
+HORIZONTAL_POSITION = slice(POSITION_NORTH, POSITION_EAST + 1)
 # State indices of velocity and position, which a GNSS sample measures
 MEASURED_STATES = slice(3, 9)
 # Columns of velocity, vertical velocity and horizontal position within MEASURED_STATES
@@ -134,15 +139,15 @@ class FilterConfiguration:
     without: Mapping[str, float] = field(default_factory=dict)
     timestamp_offset_s: float | None = None
 
-    def keeps_logged_bad_acceleration(self, inputs: Inputs) -> bool:
-        """Return True if the configuration does not change EKF2's flag for a bad acceleration."""
+    def keeps_logged_bad_acceleration(self, inputs: ReplayInputs) -> bool:
+        """Return True if EKF2's logged bad-acceleration flag is valid for the configuration."""
         has_same_height_parameters = not self.without and all(
             value == inputs.settings[name] or name.startswith(HEIGHT_NEUTRAL_PREFIXES)
             for name, value in self.settings.items()
         )
         return self.uses_logged_decisions or has_same_height_parameters
 
-    def compute_delays(self, inputs: Inputs) -> FusionDelays:
+    def compute_delays(self, inputs: ReplayInputs) -> FusionDelays:
         """Return the delay of the position source, and the delay of the fusion horizon."""
         if self.timestamp_offset_s is not None:
             return FusionDelays(-self.timestamp_offset_s - 0.5 * inputs.mean_step_s, np.inf)
@@ -153,7 +158,8 @@ class FilterConfiguration:
             return FusionDelays(
                 delay_s, max(inputs.horizon_s, (buffer_length - 1) * inputs.mean_step_s)
             )
-        # At its start, EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp)
+        # EKF2 raises EKF2_DELAY_MAX to the largest delay parameter (EKF2.cpp), so a larger delay
+        # also delays the fusion horizon
         longest_delay_ms = max(self.settings["EKF2_DELAY_MAX"], max_delay_ms)
         if longest_delay_ms == inputs.settings["EKF2_DELAY_MAX"]:
             return FusionDelays(delay_s, inputs.horizon_s)
@@ -207,10 +213,10 @@ class SegmentRun:
 
 
 def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bottom)
-    inputs: Inputs,
+    inputs: ReplayInputs,
     segment: ReplaySegment,
     configurations: Sequence[FilterConfiguration],
-    intervals: Sequence[Intervals],
+    intervals: Sequence[EventIntervals],
 ) -> SegmentRun:
     """Run several filter configurations through one flight segment.
 
@@ -222,7 +228,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         name: np.array([configuration.settings[name] for configuration in configurations])
         for name in configurations[0].settings
     }
-    for name, value in segment.changed_parameters.items():  # parameters that were changed in flight
+    # Changes in flight apply where the configuration has the logged value
+    for name, value in segment.changed_parameters.items():
         is_unchanged = parameters[name] == inputs.settings[name]
         parameters[name] = np.where(is_unchanged, value, parameters[name])
     (
@@ -252,8 +259,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         else slice(None)
     )
 
-    def stack_configurations(interval_quantities: Sequence[Any]) -> Any:
-        return np.stack(interval_quantities, axis=1)[:, interval_index_by_filter]
+    def stack_configurations(interval_set_arrays: Sequence[Any]) -> Any:
+        return np.stack(interval_set_arrays, axis=1)[:, interval_index_by_filter]
 
     event_table = stack_configurations(
         [interval_arrays.events for interval_arrays in distinct_intervals]
@@ -280,14 +287,16 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         parameters.get(GNSS_VEL.gate, np.ones(configuration_count)),
         parameters[inputs.aid.gate],
     ]
-    gate_squared = np.maximum(np.repeat(np.stack(gates, axis=1), 3, axis=1), MIN_GATE) ** 2
-    # EKF2's logged height, and without magnetometer its logged heading, replace the sensors that
-    # the model does not contain
-    logged_values = np.stack(
+    gate_squared = (
+        np.maximum(np.repeat(np.stack(gates, axis=1), 3, axis=1), MIN_INNOVATION_GATE) ** 2
+    )
+    # EKF2's logged height and heading replace height sensors and magnetometer if the replay does
+    # not contain them
+    logged_heading_and_down = np.stack(
         [segment.attitude_error_rad[event_steps, HEADING], segment.down_m[event_steps]], axis=-1
     )
     attitude_variance = segment.attitude_variance_rad2[event_steps]
-    logged_variance = np.stack(
+    heading_and_down_variance = np.stack(
         [attitude_variance[:, :, HEADING], segment.down_variance_m2[event_steps]], axis=-1
     )
     height_filter = vision_filter = None
@@ -296,14 +305,14 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     sensor_means = []
     for aid, samples in ((MAG, segment.field), (FLOW, segment.flow)):
         if samples is not None:
-            means_by_interval = [
+            sample_means_by_interval = [
                 average_by_event(segment, samples, end_steps) for end_steps in event_step_arrays
             ]
             event_means = EventSamples(
-                *map(stack_configurations, zip(*means_by_interval, strict=True))
+                *map(stack_configurations, zip(*sample_means_by_interval, strict=True))
             )
             if aid == MAG:
-                R = np.maximum(parameters[MAG.noise], MIN_SIGMA_GAUSS) ** 2
+                R = np.maximum(parameters[MAG.noise], MIN_MAGNETOMETER_SIGMA_GAUSS) ** 2
                 event_means = event_means._replace(noise=event_means.noise + R)
             sample_count = event_means.sample_count * is_enabled_by_aid[aid.name]
             gate = parameters.get(aid.gate, np.full(configuration_count, samples.gate))
@@ -315,7 +324,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         or configuration.keeps_logged_bad_acceleration(inputs)
         for configuration in configurations
     ]
-    bad_acceleration = BadAccelerationFlag(
+    bad_acceleration_flag = BadAccelerationFlag(
         np.array(uses_logged_flag), inputs.rules.bad_acceleration_duration_s, segment
     )
     if segment.height_samples is not None:
@@ -328,10 +337,10 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             is_enabled_by_aid,
             parameters,
             has_gate,
-            bad_acceleration,
+            bad_acceleration_flag,
         )
     if inputs.vision is not None:
-        vision_by_configuration = [
+        grouped_vision_samples = [
             group_vision_by_event(
                 inputs,
                 segment,
@@ -343,7 +352,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         ]
         vision_filter = VisionFilter(
             segment,
-            vision_by_configuration,
+            grouped_vision_samples,
             is_enabled_by_aid,
             parameters,
             has_gate,
@@ -358,7 +367,8 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         parameters["EKF2_ACC_NOISE"][:, None, None] ** 2, (event_count, 1, 1, 1)
     )
     if (clipped_fraction := segment.clipped_fraction) is not None:
-        # EKF2 uses BAD_ACCELERATION_NOISE_M_S2 for clipped axes: mean over the interval
+        # In prediction steps with clipping, EKF2 uses BAD_ACCELERATION_NOISE_M_S2. The variance is
+        # the mean over the steps of an interval
         clipped_fraction_sums = np.diff(
             np.cumsum(clipped_fraction)[event_steps], axis=0, prepend=clipped_fraction[0]
         )
@@ -368,14 +378,14 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             * (BAD_ACCELERATION_NOISE_M_S2**2 - acceleration_variance)
         )
     x, P = _make_start_state(segment, has_biases, has_attitude)
-    if bad_acceleration.until_s[0] > segment.time_s[0]:
-        # The log contains no accelerometer bias while the flag is set. The replay starts with the
-        # mean bias of the segment, computed from the change of the published velocity
+    if bad_acceleration_flag.until_s[0] > segment.time_s[0]:
+        # The log contains no accelerometer bias while the bad-acceleration flag is set. The replay
+        # starts with the segment's mean bias, computed from the change of the published velocity
         set_states(
             x,
             P,
-            ~bad_acceleration.uses_logged_flag & has_biases,
-            slice(BIAS_DOWN, BIAS_DOWN + 1),
+            ~bad_acceleration_flag.uses_logged_flag & has_biases,
+            slice(ACCELEROMETER_BIAS_DOWN, ACCELEROMETER_BIAS_DOWN + 1),
             np.full((configuration_count, 1), segment.mean_bias_down_m_s2),
             np.full((configuration_count, 1), INITIAL_BIAS_SIGMA_M_S2**2),
         )
@@ -402,24 +412,24 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     states = np.empty((event_count + 1, configuration_count, x.shape[1]))
     state_variances = np.empty(states.shape, np.float32)
     states[0] = x
-    state_variances[0] = _diagonal(P)
+    state_variances[0] = _get_state_variances(P)
     innovation, R = np.empty((2, configuration_count, 4))
-    measured_slice = slice(0 if has_velocity else POSITION_COLUMNS.start, POSITION_COLUMNS.stop)
+    measured_columns = slice(0 if has_velocity else POSITION_COLUMNS.start, POSITION_COLUMNS.stop)
     is_component_fused = np.zeros((configuration_count, POSITION_COLUMNS.stop), bool)
     start_s = np.full(configuration_count, segment.time_s[0])
-    reset_states = [(HORIZONTAL_POSITION, POSITION_COLUMNS, inputs.rules.reset_variance_factor)]
+    state_resets = [(HORIZONTAL_POSITION, POSITION_COLUMNS, inputs.rules.reset_variance_factor)]
     if has_velocity and inputs.rules.resets_velocity:
-        reset_states.append((VELOCITY, VELOCITY_COLUMNS, 1.0))
+        state_resets.append((VELOCITY, VELOCITY_COLUMNS, 1.0))
     for event in range(event_count):
         batch_index = event % EVENT_BATCH_SIZE
         if not batch_index:
             event_batch = slice(event, event + EVENT_BATCH_SIZE)
-            batches = [
+            transition_batches = [
                 interval_arrays.compute_transitions(event_batch)
                 for interval_arrays in distinct_intervals
             ]
             (transition, correction_input, acceleration_input, gyro_noise, accelerometer_noise) = (
-                map(stack_configurations, zip(*batches, strict=True))
+                map(stack_configurations, zip(*transition_batches, strict=True))
             )
             state_input = acceleration_input + has_attitude[:, None] * correction_input
             process_noise = (
@@ -434,7 +444,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
         P[:, :, :STATE_COUNT] = P[:, :, :STATE_COUNT] @ np.swapaxes(phi, 1, 2)
         P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += process_noise[batch_index]
         is_bias_constant = None
-        flagged_fraction = bad_acceleration.compute_flagged_fraction(
+        flagged_fraction = bad_acceleration_flag.compute_flagged_fraction(
             event_time_s[event - 1] if event else start_s, event_time_s[event]
         )
         if flagged_fraction is not None:
@@ -444,15 +454,15 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             P[:, :IMU_STATE_COUNT, :IMU_STATE_COUNT] += (
                 variance_increase[:, None, None] * accelerometer_noise[batch_index]
             )
-            is_bias_constant = bad_acceleration.until_s > event_time_s[event]
-            bias_before = x[:, ACCELEROMETER_BIAS].copy()
+            is_bias_constant = bad_acceleration_flag.until_s > event_time_s[event]
+            bias_before_fusion = x[:, ACCELEROMETER_BIAS].copy()
             bias_covariance = P[:, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS].copy()
-        bias_variance = _diagonal(P)[:, BIASES.start :]
+        bias_variance = _get_state_variances(P)[:, BIASES.start :]
         bias_variance += (bias_variance < variance_limit) * variance_growth[batch_index]
-        if inputs.rules.min_bias_variance is not None:
-            _limit_bias_variance(P, inputs.rules.min_bias_variance, has_biases)
+        if inputs.rules.min_bias_variance_m2_s4 is not None:
+            _limit_bias_variance(P, inputs.rules.min_bias_variance_m2_s4, has_biases)
         innovation[:, 2:] = 0.0
-        R[:, 2:] = IGNORED_VARIANCE
+        R[:, 2:] = VARIANCE_WITHOUT_EFFECT
         for event_means, gate, state_rows in sensor_means:
             if event_means.sample_count[event].any():
                 event_mean = EventSamples(*(quantity[event] for quantity in event_means))
@@ -465,11 +475,12 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             x, P = height_filter.fuse_barometer(event, x, P)
         if has_sample[event]:
             nu = measured_values[event] - x[:, MEASURED_STATES]
-            S = _diagonal(P)[:, MEASURED_STATES] + measurement_variance[event]
+            S = _get_state_variances(P)[:, MEASURED_STATES] + measurement_variance[event]
             is_outside_gate = nu * nu > gate_squared * S
             if is_outside_gate[:, DOWN_COLUMN].any():
-                # EKF2 clips the vertical velocity if the horizontal velocity is inside the gate
-                is_clipped = has_gate & (bad_acceleration.until_s > event_time_s[event])
+                # With a bad vertical acceleration, EKF2 clips the vertical innovation to the gate
+                # if the horizontal velocity is inside the gate
+                is_clipped = has_gate & (bad_acceleration_flag.until_s > event_time_s[event])
                 is_clipped &= ~is_outside_gate[:, :DOWN_COLUMN].any(axis=1)
                 innovation_limit = np.sqrt(gate_squared * S)[is_clipped, DOWN_COLUMN]
                 nu[is_clipped, DOWN_COLUMN] = np.clip(
@@ -495,14 +506,14 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                         )
                 is_component_fused[:, VELOCITY_COLUMNS] = is_velocity_fused[:, None]
                 is_component_fused[:, POSITION_COLUMNS] = is_fused[event, :, None]
-                x, P = _sequential_update(
+                x, P = _update_sequentially(
                     x,
                     P,
                     nu,
                     S,
                     measurement_variance[event],
-                    measured_slice,
-                    is_component_fused[:, measured_slice],
+                    measured_columns,
+                    is_component_fused[:, measured_columns],
                 )
             else:
                 innovation[:, 2:] = nu[:, POSITION_COLUMNS]
@@ -513,42 +524,44 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
             x, P = height_filter.fuse_gnss(
                 event, x, P, measured_values[event, :, 5], measurement_variance[event, :, 5]
             )
-        # The magnetometer corrects the heading, so only the height is set to EKF2's logged value
+        # With a magnetometer, heading is estimated, so only height is set to its logged value
         elif has_magnetometer:
-            K, P = _reduce_variance_to(P, DOWN, logged_variance[event, :, 1])
-            x = x + K * (logged_values[event, :, 1] - x[:, DOWN])[:, None]
-            x[:, DOWN] = logged_values[event, :, 1]
+            K, P = _reduce_variance_to(P, POSITION_DOWN, heading_and_down_variance[event, :, 1])
+            x = x + K * (logged_heading_and_down[event, :, 1] - x[:, POSITION_DOWN])[:, None]
+            x[:, POSITION_DOWN] = logged_heading_and_down[event, :, 1]
         if not has_magnetometer:
-            np.subtract(logged_values[event], x[:, HEADING_AND_DOWN], out=innovation[:, :2])
+            np.subtract(
+                logged_heading_and_down[event], x[:, HEADING_AND_DOWN], out=innovation[:, :2]
+            )
             R[:, :2] = _compute_noise_for_variance(
-                _diagonal(P)[:, HEADING_AND_DOWN], logged_variance[event]
+                _get_state_variances(P)[:, HEADING_AND_DOWN], heading_and_down_variance[event]
             )
             heading_error_rad = np.where(has_attitude, x[:, HEADING] + innovation[:, 0], 0.0)
             if inputs.fuses_vision_height or height_filter is not None:
-                R[:, 1] = IGNORED_VARIANCE
+                R[:, 1] = VARIANCE_WITHOUT_EFFECT
                 if has_sample[event] and height_filter is None:
                     innovation[:, 1] = nu[:, 5]
                     R[:, 1] = np.where(
-                        is_active[event], measurement_variance[event, :, 5], IGNORED_VARIANCE
+                        is_active[event], measurement_variance[event, :, 5], VARIANCE_WITHOUT_EFFECT
                     )
-            x, P = _joint_update(x, P, innovation, R)
+            x, P = _update_jointly(x, P, innovation, R)
             x[:, HEADING] = heading_error_rad
         if has_sample[event] and is_reset[event].any():
-            for rows, columns, variance_factor in reset_states:
+            for rows, columns, variance_factor in state_resets:
                 reset_variance = variance_factor * measurement_variance[event, :, columns]
                 set_states(
                     x, P, is_reset[event], rows, measured_values[event, :, columns], reset_variance
                 )
             position_reset_m[event, is_reset[event]] = nu[is_reset[event], POSITION_COLUMNS]
         if vision_filter is not None:
-            vision_filter.bias.value_m = vision_filter.bias.value_m + position_reset_m[event]
+            vision_filter.bias.bias_m = vision_filter.bias.bias_m + position_reset_m[event]
             x, P = vision_filter.fuse(event, x, P, True, decisions.last_position_s)
             # A fusion of vision also postpones the position reset after a time without GNSS fusion
             if inputs.rules.resets_velocity:
                 decisions.last_position_s = np.maximum(
                     decisions.last_position_s, vision_filter.last_fusion_s
                 )
-        if height_filter is not None and bad_acceleration.models_flag:
+        if height_filter is not None and bad_acceleration_flag.models_flag:
             if has_sample[event] and has_velocity:
                 height_filter.update_records[event, -1, 0] = np.where(
                     can_fuse_velocity[event], nu[:, DOWN_COLUMN], np.nan
@@ -556,12 +569,12 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
                 height_filter.update_records[event, -1, 1] = S[:, DOWN_COLUMN]
             height_filter.update_bad_acceleration(event, event_time_s[event])
         if is_bias_constant is not None:
-            x[is_bias_constant, ACCELEROMETER_BIAS] = bias_before[is_bias_constant]
+            x[is_bias_constant, ACCELEROMETER_BIAS] = bias_before_fusion[is_bias_constant]
             P[is_bias_constant, ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = bias_covariance[
                 is_bias_constant
             ]
         states[event + 1] = x
-        state_variances[event + 1] = _diagonal(P)
+        state_variances[event + 1] = _get_state_variances(P)
     innovations[~is_active] = np.nan
     variances[~is_active] = np.nan
     return SegmentRun(
@@ -586,7 +599,7 @@ def run_segment(  # noqa: PLR0912, PLR0915 (one recursion, read from top to bott
     )
 
 
-def _joint_update(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
+def _update_jointly(x: Array, P: Array, innovation: Array, R: Array) -> ArrayPair:
     """Fuse all measurements together: K = PH'(HPH' + R)⁻¹, x = x + Kν, P = P - KHP."""
     HP = np.take(P, JOINTLY_MEASURED_STATES, axis=1)
     S = np.take(HP, JOINTLY_MEASURED_STATES, axis=2)
@@ -605,19 +618,19 @@ def _reduce_variance_to(P: Array, state_index: int, target_variance: Array) -> A
     return K, P - K[:, :, None] * P[:, None, state_index]
 
 
-def _sequential_update(
+def _update_sequentially(
     x: Array, P: Array, nu: Array, S: Array, R: Array, components: slice, is_fused: BoolArray
 ) -> ArrayPair:
-    """Fuse the components of a measurement one after the other, as EKF2 does.
+    """Fuse the components of a measurement one after the other, as EKF2 does; return x and P.
 
-    Innovations and innovation variances of all components are computed before the first update
-    (fuseDirectStateMeasurement, ``ekf_helper.cpp``). With c = PH' and K = wc, the Joseph form is P
-    - KHP - (KHP)' + K(HPH' + R)K' = P - bcc', b = w(2 - w(HPH' + R)).
+    Innovations and innovation variances S of all components are computed before the first update
+    (fuseDirectStateMeasurement, ``ekf_helper.cpp``). With w = 1/S, c = PH' and K = wc, the Joseph
+    form is P - KHP - (KHP)' + K(HPH' + R)K' = P - bcc', b = w(2 - w(HPH' + R)).
     """
     nu, S, R = (array[:, components] for array in (nu, S, R))
-    fused_weight = is_fused / S
-    weight_squared = fused_weight * fused_weight
-    b = 2.0 * fused_weight - weight_squared * R
+    inverse_variance = is_fused / S
+    weight_squared = inverse_variance * inverse_variance
+    b = 2.0 * inverse_variance - weight_squared * R
     rows = slice(MEASURED_STATES.start + components.start, MEASURED_STATES.start + components.stop)
     columns = P[:, rows].copy()
     for j in range(nu.shape[1]):
@@ -627,9 +640,9 @@ def _sequential_update(
         if j + 1 < nu.shape[1]:
             factor = b[:, j, None] * cross_covariance[:, j + 1 :]
             columns[:, j + 1 :] -= factor[:, :, None] * column
-    x = x + ((fused_weight * nu)[:, None] @ columns)[:, 0]
-    reduction_sqrt = np.sqrt(b)[:, :, None] * columns
-    return x, P - np.swapaxes(reduction_sqrt, 1, 2) @ reduction_sqrt
+    x = x + ((inverse_variance * nu)[:, None] @ columns)[:, 0]
+    covariance_reduction_sqrt = np.sqrt(b)[:, :, None] * columns
+    return x, P - np.swapaxes(covariance_reduction_sqrt, 1, 2) @ covariance_reduction_sqrt
 
 
 @dataclass
@@ -660,7 +673,7 @@ class _FusionDecisions:
         self.last_position_s, self.last_velocity_s = np.full((2, configuration_count), self.start_s)
         self.is_stopped = np.zeros(configuration_count, bool)
         self.remaining_resets = np.full(configuration_count, self.rules.max_resets)
-        # True for events without any reset, start or rejection in the log
+        # True for events without a logged reset, start or rejection
         self.only_gate_decides = (
             (self.action == FUSE).all(axis=1)
             & ~self.logged_resets
@@ -670,16 +683,16 @@ class _FusionDecisions:
     def decide_fusion(
         self, event: int, is_outside_gate: BoolArray, is_velocity_fused: BoolArray
     ) -> tuple[BoolArray, BoolArray, BoolArray, BoolArray]:
-        """Decide if each filter configuration rejects, fuses or resets to the sample of one event.
+        """Decide if filters reject the sample of an event, fuse it, or reset the position to it.
 
         Return four masks: position rejected, position fused, position reset, velocity fused.
-        ``is_velocity_fused`` is True if the velocity is inside its gate.
+        ``is_velocity_fused``: velocity inside its gate; it is not fused with a position reset.
         """
-        rules = self.rules
+        fusion_rules = self.rules
         now_s = self.time_s[event]
         action = self.action[event]
         has_gate = self.has_gate
-        follows_log = self.uses_logged_decisions
+        uses_logged_decisions = self.uses_logged_decisions
         may_fuse = action == FUSE
         is_decision_logged = math.isfinite(self.logged_rejections[event])
         self.last_velocity_s = np.where(is_velocity_fused, now_s, self.last_velocity_s)
@@ -688,48 +701,54 @@ class _FusionDecisions:
             return is_outside_gate, may_fuse, is_outside_gate, is_velocity_fused
         is_rejected = (
             np.where(
-                follows_log & is_decision_logged,
+                uses_logged_decisions & is_decision_logged,
                 self.logged_rejections[event] > 0.0,
                 is_outside_gate,
             )
             & has_gate
             & may_fuse
         )
-        since_fusion_s = now_s - self.last_position_s
+        time_since_fusion_s = now_s - self.last_position_s
         if self.has_all_resets and not is_decision_logged:
-            # If no reset is logged at the next event, EKF2 has fused the last sample before the
-            # timeout
+            # EKF2 resets its position after reset_timeout_s without fusion. If it logs no reset at
+            # the next event, which is after the timeout, it has fused this sample
             next_event = min(event + 1, len(self.time_s) - 1)
             is_last_before_timeout = (
-                self.time_s[next_event] - self.last_position_s > rules.reset_timeout_s
+                self.time_s[next_event] - self.last_position_s > fusion_rules.reset_timeout_s
             )
-            is_rejected &= ~(follows_log & is_last_before_timeout & ~self.logged_resets[next_event])
+            is_rejected &= ~(
+                uses_logged_decisions & is_last_before_timeout & ~self.logged_resets[next_event]
+            )
         is_fused = may_fuse & ~is_rejected & ~self.is_stopped
         is_starting = has_gate & (
             (action == START_FUSION) | (self.is_stopped & self.can_start[event])
         )
-        is_failing = is_rejected & ~self.is_stopped & (since_fusion_s > rules.reset_timeout_s)
-        if rules.resets_velocity:
-            is_velocity_timed_out = now_s - self.last_velocity_s > rules.reset_timeout_s
-            is_failing &= is_velocity_timed_out | (since_fusion_s > 2.0 * rules.reset_timeout_s)
+        is_failing = (
+            is_rejected & ~self.is_stopped & (time_since_fusion_s > fusion_rules.reset_timeout_s)
+        )
+        if fusion_rules.resets_velocity:
+            is_velocity_timed_out = now_s - self.last_velocity_s > fusion_rules.reset_timeout_s
+            is_failing &= is_velocity_timed_out | (
+                time_since_fusion_s > 2.0 * fusion_rules.reset_timeout_s
+            )
         is_restarted = is_starting | (is_failing & (self.remaining_resets > 0))
         if is_decision_logged or self.logged_resets[event] or self.has_all_resets:
             is_restart_logged = has_gate & (self.logged_resets[event] | (action == START_FUSION))
-            is_restarted = np.where(follows_log, is_restart_logged, is_restarted)
+            is_restarted = np.where(uses_logged_decisions, is_restart_logged, is_restarted)
             is_fused &= ~is_restarted
-            is_failing &= ~follows_log
+            is_failing &= ~uses_logged_decisions
         self.last_position_s = np.where(is_fused | is_restarted, now_s, self.last_position_s)
         self.last_velocity_s = np.where(is_restarted, now_s, self.last_velocity_s)
         self.is_stopped = (self.is_stopped & ~is_starting) | (
             is_failing & (self.remaining_resets == 0)
         )
         remaining_resets = self.remaining_resets - (is_failing & (self.remaining_resets > 0))
-        self.remaining_resets = np.where(is_starting, rules.max_resets, remaining_resets)
+        self.remaining_resets = np.where(is_starting, fusion_rules.max_resets, remaining_resets)
         return is_rejected, is_fused, is_restarted, is_velocity_fused & ~is_restarted
 
 
 def _compute_variance_growth(
-    inputs: Inputs,
+    inputs: ReplayInputs,
     segment: ReplaySegment,
     parameters: dict[str, Array],
     has_biases: BoolArray,
@@ -752,7 +771,7 @@ def _compute_variance_growth(
     )
 
 
-def with_state_correlation(inputs: Inputs, segment: ReplaySegment) -> ReplaySegment:
+def estimate_state_correlation(inputs: ReplayInputs, segment: ReplaySegment) -> ReplaySegment:
     """Estimate the correlations of the initial state of a segment by a replay of the time before.
 
     The log contains only the variances. Without correlations, the first updates would distribute
@@ -787,30 +806,32 @@ def _compute_correlation(P: Array) -> Array:
 
 
 def _compute_settled_correlation(segment: ReplaySegment) -> Array:
-    """Return the steady-state correlations of tilt error θ and accelerometer bias b.
+    """Return the steady-state correlation matrix of the states; tilt and bias are correlated.
 
-    After long fusion of velocity, their acceleration errors cancel each other: θ × f = R b, with
-    specific force f and rotation R from body to NED.
+    After long fusion of velocity, the acceleration errors of tilt error θ and accelerometer bias b
+    cancel each other: θ × f = R b, with specific force f and rotation R from body to NED.
     """
-    body_to_ned_states = np.eye(STATE_COUNT)
-    body_to_ned_states[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.body_to_ned[0]
+    state_rotation_to_ned = np.eye(STATE_COUNT)
+    state_rotation_to_ned[ACCELEROMETER_BIAS, ACCELEROMETER_BIAS] = segment.body_to_ned[0]
     P = np.diag(
         np.diagonal(
-            body_to_ned_states @ np.diag(segment.variance[:STATE_COUNT]) @ body_to_ned_states.T
+            state_rotation_to_ned
+            @ np.diag(segment.variance[:STATE_COUNT])
+            @ state_rotation_to_ned.T
         )
     )
     for tilt_state, bias_state, acceleration_per_rad in (
-        (1, BIAS_NORTH, -GRAVITY_MAGNITUDE_M_S2),
-        (0, BIAS_EAST, GRAVITY_MAGNITUDE_M_S2),
+        (1, ACCELEROMETER_BIAS_NORTH, -GRAVITY_MAGNITUDE_M_S2),
+        (0, ACCELEROMETER_BIAS_EAST, GRAVITY_MAGNITUDE_M_S2),
     ):
         P[tilt_state, bias_state] = P[bias_state, tilt_state] = (
             min(P[tilt_state, tilt_state] * acceleration_per_rad**2, P[bias_state, bias_state])
             / acceleration_per_rad
         )
-    return _compute_correlation(body_to_ned_states.T @ P @ body_to_ned_states)
+    return _compute_correlation(state_rotation_to_ned.T @ P @ state_rotation_to_ned)
 
 
-def _diagonal(P: Array) -> Array:
+def _get_state_variances(P: Array) -> Array:
     """Return the state variances of all filter configurations, as a view of P."""
     return P.reshape(len(P), -1)[:, :: P.shape[1] + 1]
 
@@ -837,18 +858,18 @@ def _compute_noise_for_variance(variance: Array, target_variance: Array) -> Arra
     With this R, updates with EKF2's published height and heading give the logged variances.
     """
     excess_variance = variance - target_variance
-    noise_variance = np.full(excess_variance.shape, IGNORED_VARIANCE)
+    noise_variance = np.full(excess_variance.shape, VARIANCE_WITHOUT_EFFECT)
     np.divide(
         variance * target_variance, excess_variance, out=noise_variance, where=excess_variance > 0.0
     )
     return noise_variance
 
 
-def _limit_bias_variance(P: Array, absolute_minimum: float, has_biases: BoolArray) -> None:
+def _limit_bias_variance(P: Array, lower_limit_m2_s4: float, has_biases: BoolArray) -> None:
     """Limit the accelerometer bias variance like PX4 up to v1.14 (fixCovarianceErrors)."""
-    bias_variance = _diagonal(P)[:, ACCELEROMETER_BIAS]
+    bias_variance = _get_state_variances(P)[:, ACCELEROMETER_BIAS]
     min_variance = np.maximum(
-        MIN_BIAS_VARIANCE_RATIO * bias_variance.max(axis=1, keepdims=True), absolute_minimum
+        MIN_BIAS_VARIANCE_RATIO * bias_variance.max(axis=1, keepdims=True), lower_limit_m2_s4
     )
     bias_variance[has_biases] = np.clip(bias_variance, min_variance, MAX_BIAS_SIGMA_M_S2**2)[
         has_biases
@@ -856,15 +877,15 @@ def _limit_bias_variance(P: Array, absolute_minimum: float, has_biases: BoolArra
 
 
 def _collect_measurements(
-    inputs: Inputs,
+    inputs: ReplayInputs,
     segment: ReplaySegment,
     sample_indices: IntArray,
     event_steps: IntArray,
     parameters: dict[str, Array],
     uses_reported_noise: BoolArray,
 ) -> ArrayPair:
-    """Return measured velocity and position (NED), and variances, shape (events, filters, 6)."""
-    received = inputs.received
+    """Return measurements and variances, shape (events, filters, 6): velocity, position (NED)."""
+    received_positions = inputs.received
     aid = inputs.aid
     sensor_offset_m = (
         np.stack([parameters[name] for name in aid.lever_arm], -1) - inputs.imu_offset_m
@@ -873,26 +894,31 @@ def _collect_measurements(
         (2, len(event_steps), len(sensor_offset_m), 6), np.nan
     )
     lever_arm_ned_m = (segment.body_to_ned[event_steps] @ sensor_offset_m)[..., 0]
-    measured_values[..., 3:] = received.position_m[sample_indices][:, None] - lever_arm_ned_m
+    measured_values[..., 3:] = (
+        received_positions.position_m[sample_indices][:, None] - lever_arm_ned_m
+    )
     if aid.noise_mode:
         uses_reported_noise = uses_reported_noise & (parameters[aid.noise_mode] != 1.0)
     reported_variance = np.where(
-        uses_reported_noise[:, None], received.variance_m2[sample_indices][:, None], 0.0
+        uses_reported_noise[:, None], received_positions.variance_m2[sample_indices][:, None], 0.0
     )
     measurement_variance[..., 3:] = np.maximum(
         reported_variance, np.maximum(parameters[aid.noise], MIN_NOISE_SIGMA)[:, None] ** 2
     )
-    if received.velocity_m_s is not None and received.velocity_variance_m2_s2 is not None:
+    if (
+        received_positions.velocity_m_s is not None
+        and received_positions.velocity_variance_m2_s2 is not None
+    ):
         # Velocity of the antenna relative to the IMU while the vehicle rotates
-        rotation_rate = (
+        rotation_matrix_rate_per_s = (
             np.diff(segment.body_to_ned, axis=0)[event_steps - 1]
             / segment.step_s[event_steps - 1, None, None]
         )
-        lever_arm_velocity_m_s = (rotation_rate @ sensor_offset_m)[..., 0]
+        lever_arm_velocity_m_s = (rotation_matrix_rate_per_s @ sensor_offset_m)[..., 0]
         measured_values[..., :3] = (
-            received.velocity_m_s[sample_indices][:, None] - lever_arm_velocity_m_s
+            received_positions.velocity_m_s[sample_indices][:, None] - lever_arm_velocity_m_s
         )
-        reported_variance = received.velocity_variance_m2_s2[sample_indices][:, None]
+        reported_variance = received_positions.velocity_variance_m2_s2[sample_indices][:, None]
         min_variance = np.maximum(parameters[GNSS_VEL.noise], MIN_NOISE_SIGMA)[:, None] ** 2
         measurement_variance[..., :3] = (
             np.maximum(reported_variance, min_variance) * VELOCITY_VARIANCE_FACTORS

@@ -36,12 +36,12 @@ def add_flow_samples(segment: ReplaySegment, flow: pd.DataFrame, gate: float) ->
         segment, flow.index.to_numpy(), sample_count, interval_s, FLOW_FILTER_WEIGHT
     )
     rotation_to_body = segment.body_to_ned[step_index].swapaxes(2, 3)[:, :, :2]
-    imu_velocity = np.einsum(
+    imu_velocity_m_s = np.einsum(
         "ki,kiab,kib->ka", weight, rotation_to_body, segment.imu_velocity_change_m_s[step_index]
     )
     sensor_samples = SensorSamples(
         step_index[:, 0],
-        flow[["forward_m_s", "right_m_s"]].to_numpy() - imu_velocity,
+        flow[["forward_m_s", "right_m_s"]].to_numpy() - imu_velocity_m_s,
         np.einsum("ki,kiab->kab", weight, rotation_to_body),
         sample_count,
         flow["noise_m2_s2"].to_numpy(),

@@ -26,7 +26,7 @@ EV_STOP_INTERVAL_S = 0.4
 # reset_timeout_max
 FUSION_STOP_TIMEOUT_S = 7.0
 # Maximum delay (s) of EKF2's fusion horizon, if the log does not contain EKF2_DELAY_MAX
-MAX_HORIZON_S = 1.0
+MAX_HORIZON_DELAY_S = 1.0
 # Maximum number of position samples in EKF2's buffer
 MAX_BUFFERED_SAMPLES = 20
 # Tolerance (s) of a sample interval: half of the timestamp resolution of 1 µs
@@ -36,7 +36,7 @@ MAX_REJECTION_DURATION_S = 1.0
 # A coordinate with a smaller range (m) in the log counts as not measured
 MIN_MEASURED_RANGE_M = 1e-3
 # A GNSS check explains missing GNSS fusion if it fails for at least this fraction of the time
-MIN_FAILED_FRACTION = 0.1
+MIN_CHECK_FAILURE_FRACTION = 0.1
 SET_TIMESTAMP_ACTION = (
     "Set timestamp_sample to the time of measurement in microseconds since the autopilot's boot."
 )
@@ -44,14 +44,14 @@ SYNCHRONISE_ACTION = (
     "Synchronise the clocks: UXRCE_DDS_SYNCT 1 with the uXRCE-DDS agent, or answer TIMESYNC of "
     "MAVLink. Send microseconds."
 )
-# Effect of a wrong clock: the positions are "too old" or "in the future" for EKF2
+# Age of positions for EKF2, by wrong clock of the timestamps
 AGE_TEXT_BY_WRONG_CLOCK = {
     **dict.fromkeys(
         ("another clock", "an unknown clock", "UNIX time in seconds"), "too old or in the future"
     ),
     **{f"UNIX time in {unit}seconds": "in the future" for unit in ("nano", "micro", "milli")},
 }
-# Effect of a wrong clock or a wrong unit of the timestamps
+# Age of positions for EKF2, by wrong clock or wrong unit of the timestamps
 AGE_TEXT_BY_WRONG_TIMESTAMP = {
     **dict.fromkeys(("0", "milliseconds", "seconds"), "too old"),
     **AGE_TEXT_BY_WRONG_CLOCK,
@@ -87,7 +87,7 @@ class UnmetCondition(NamedTuple):
 UNKNOWN_CONDITION = UnmetCondition(
     "",
     "",
-    "The log does not show why: all logged conditions for fusion in EKF2 are met.",
+    "The log does not contain the reason: EKF2's logged conditions for fusion are met.",
     "Run `ekf2 status` in the console of PX4: it prints if attitude and position are valid.",
 )
 
@@ -107,15 +107,15 @@ class UnfusedPositions:
         return self.source.origin.is_vision
 
     @property
-    def has_switch(self) -> bool:
+    def has_enabling_parameter(self) -> bool:
         """True if a parameter of this source alone enables its fusion (PX4 v1.14 and later)."""
         return self.aid.switch in self.parameters
 
     @property
-    def horizon_s(self) -> float:
-        """Maximum age (s) of buffered samples: EKF2_DELAY_MAX, or MAX_HORIZON_S if not logged."""
+    def max_sample_age_s(self) -> float:
+        """Maximum age (s) of buffered samples: EKF2_DELAY_MAX, else MAX_HORIZON_DELAY_S."""
         horizon_s = self.ekf2.horizon_s
-        max_horizon_s = 1e-3 * self.parameters.get("EKF2_DELAY_MAX", 1e3 * MAX_HORIZON_S)
+        max_horizon_s = 1e-3 * self.parameters.get("EKF2_DELAY_MAX", 1e3 * MAX_HORIZON_DELAY_S)
         return horizon_s if isinstance(horizon_s, float) else max_horizon_s
 
     @property
@@ -126,7 +126,7 @@ class UnfusedPositions:
         """Return the samples from ``lead_time_s`` before ``span_s`` to the end of ``span_s``."""
         return samples.loc[self.span_s[0] - lead_time_s : self.span_s[1]]
 
-    def compute_set_fraction(self, state: str, bit: int = 0) -> float:
+    def compute_status_bit_fraction(self, state: str, bit: int = 0) -> float:
         """Return the fraction of ``span_s`` in which a status bit is set; NaN if not logged."""
         state_changes = self.ekf2.states.get(state)
         if state_changes is None:
@@ -143,19 +143,21 @@ def find_unmet_condition(positions: UnfusedPositions) -> UnmetCondition:
 
 def _check_switch(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     parameter_name, bit = positions.aid.switch, 0
-    if not positions.has_switch:
+    if not positions.has_enabling_parameter:
         parameter_name, bit = AID_MASK_PARAMETER, 3 if positions.is_vision else 0
     parameter_value = int(positions.parameters.get(parameter_name, 1 << bit))
     if parameter_value >> bit & 1:
         return
     fused_quantity = (
-        "horizontal position" if positions.has_switch else positions.aid.label.replace(",", "")
+        "horizontal position"
+        if positions.has_enabling_parameter
+        else positions.aid.label.replace(",", "")
     )
     reason = f"Bit {bit} ({fused_quantity}) of {parameter_name} is not set."
     action = f"Set {parameter_name} to {parameter_value | 1 << bit}."
     if is_height_only(positions.source):
         reason = f"The source contains no horizontal position: x and y are constant. {reason}"
-        action = f"Leave bit {bit} of {parameter_name} unset."
+        action = f"Do not set bit {bit} of {parameter_name}."
     yield UnmetCondition("switch", f"{parameter_name} is {parameter_value}", reason, action)
 
 
@@ -173,7 +175,7 @@ def is_height_only(source: PositionTrack) -> bool:
 
 def _check_frame(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     source = positions.source
-    if positions.has_switch and (source.frame, source.name) == (
+    if positions.has_enabling_parameter and (source.frame, source.name) == (
         "unknown",
         "vehicle_visual_odometry",
     ):
@@ -187,17 +189,17 @@ def _check_frame(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
 
 
 def _check_position_gap(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
-    has_short_timeout = positions.is_vision and positions.has_switch
+    has_short_timeout = positions.is_vision and positions.has_enabling_parameter
     stop_timeout_s = EV_STOP_INTERVAL_S if has_short_timeout else FUSION_STOP_TIMEOUT_S
     times_s = positions.source.samples.index.to_numpy()
     start_s, end_s = positions.span_s
     # EKF2 stops fusion if no position arrives for stop_timeout_s
-    last_position_s = max(times_s[times_s < start_s], default=start_s)
-    duration_s = np.min(times_s[times_s >= start_s], initial=end_s) - last_position_s
+    last_position_time_s = max(times_s[times_s < start_s], default=start_s)
+    duration_s = np.min(times_s[times_s >= start_s], initial=end_s) - last_position_time_s
     if duration_s > stop_timeout_s + positions.interval_s:
         yield UnmetCondition(
             "gap",
-            f"no position for {duration_s:.1f} s from {last_position_s:.1f} s on",
+            f"no position for {duration_s:.1f} s from {last_position_time_s:.1f} s on",
             f"EKF2 stops fusion {stop_timeout_s:g} s after the last position.",
             "Check the position source and its data link.",
         )
@@ -221,7 +223,8 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
         )
     if "age_s" not in status:
         return
-    # EKF2 subtracts the delay from each timestamp; age_s is arrival time minus timestamp
+    # The log contains arrival time minus timestamp. EKF2 subtracts the delay parameter from the
+    # timestamp, so for EKF2 the age is larger by this delay
     delay_s = positions.parameters.get(positions.aid.delay, 0.0) * 1e-3
     age_s = float(positions.select_samples(status)["age_s"].median()) + delay_s
     if -age_s > MAX_BUFFERED_SAMPLES * positions.interval_s:
@@ -232,9 +235,9 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
             "positions.",
             SYNCHRONISE_ACTION,
         )
-    if age_s > positions.horizon_s + MAX_LATENESS_S:
+    if age_s > positions.max_sample_age_s + MAX_LATENESS_S:
         action = SYNCHRONISE_ACTION
-        if age_s < MAX_HORIZON_S:
+        if age_s < MAX_HORIZON_DELAY_S:
             max_delay_ms = 50.0 * np.ceil(20.0 * age_s)  # a round number, with margin
             action = (
                 "Check the clock of the positioning system. Then set EKF2_DELAY_MAX to "
@@ -243,8 +246,8 @@ def _check_timestamps(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
         yield UnmetCondition(
             "age",
             f"the positions are {age_s:.2f} s old at arrival",
-            f"EKF2 fuses no position that is older than {positions.horizon_s:.2f} s. Timestamps "
-            "that are too early also make positions too old.",
+            f"EKF2 fuses no position that is older than {positions.max_sample_age_s:.2f} s. "
+            "Timestamps that are too early also make positions too old.",
             action,
         )
 
@@ -256,14 +259,14 @@ def _check_quality(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     quality = positions.select_samples(status)["quality"]
     # EKF2 checks the quality of the fused sample, of the sample before it, and of the newest sample
     # in the buffer
-    sample_count = int(np.ceil(positions.horizon_s / positions.interval_s)) + 2
+    sample_count = int(np.ceil(positions.max_sample_age_s / positions.interval_s)) + 2
     has_min_quality = (quality >= min_quality).astype(float)
     if has_min_quality.rolling(min(sample_count, max(len(quality), 1))).min().max() == 1.0:
         return
     median_quality = float(quality.median())
     reason = (
-        f"{100.0 * (1.0 - has_min_quality.mean()):.0f} % of {len(quality)} positions have a lower "
-        "quality."
+        f"{100.0 * (1.0 - has_min_quality.mean()):.0f} % of {len(quality)} positions have a "
+        "quality below EKF2_EV_QMIN."
     )
     action = (
         "Improve light and texture in the camera view, or fly slower. Set EKF2_EV_QMIN to "
@@ -278,9 +281,12 @@ def _check_quality(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
 
 def _check_interval(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
     intervals_s = np.diff(positions.select_samples(positions.source.samples).index)
-    # Positions reconstructed from EKF2 topics have the rate of the logger, not of the source
+    # The interval of the source is unknown if positions are reconstructed from EKF2 topics, which
+    # have the rate of the logger
     is_interval_known = (
-        positions.has_switch and not positions.source.origin.reconstructed and len(intervals_s)
+        positions.has_enabling_parameter
+        and not positions.source.origin.reconstructed
+        and len(intervals_s)
     )
     if is_interval_known and intervals_s.min() >= EV_START_INTERVAL_S - INTERVAL_TOLERANCE_S:
         yield UnmetCondition(
@@ -294,7 +300,7 @@ def _check_interval(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
 
 
 def _check_alignment(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
-    if positions.compute_set_fraction("tilt_align") < 0.5:
+    if positions.compute_status_bit_fraction("tilt_align") < 0.5:
         yield UnmetCondition(
             "alignment",
             "EKF2 has not aligned its tilt",
@@ -302,9 +308,9 @@ def _check_alignment(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
             "Keep the vehicle at rest after boot until EKF2 is ready.",
         )
     needs_no_heading = (
-        positions.is_vision and positions.has_switch and positions.source.frame == "FRD"
+        positions.is_vision and positions.has_enabling_parameter and positions.source.frame == "FRD"
     )
-    if not needs_no_heading and positions.compute_set_fraction("yaw_align") < 0.5:
+    if not needs_no_heading and positions.compute_status_bit_fraction("yaw_align") < 0.5:
         actions = ["Calibrate and enable the magnetometer (EKF2_MAG_TYPE 0)"]
         if positions.is_vision:
             actions.append("send a valid orientation and set bit 3 (yaw) of EKF2_EV_CTRL")
@@ -317,40 +323,43 @@ def _check_alignment(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
 
 
 def _check_gnss(positions: UnfusedPositions) -> Iterator[UnmetCondition]:
-    if positions.compute_set_fraction("gnss_fault") > MIN_FAILED_FRACTION:
+    if positions.compute_status_bit_fraction("gnss_fault") > MIN_CHECK_FAILURE_FRACTION:
         yield UnmetCondition(
             "fault",
             "EKF2 declared GNSS faulty",
             "The flag cs_gnss_fault is set: GNSS and another position source contradicted each "
             "other for 7 s.",
-            "Compare GNSS with the other source. EKF2_GPS_MODE 1 permits a reset to GNSS.",
+            "Compare GNSS with the other position source. With EKF2_GPS_MODE 1, EKF2 may reset to "
+            "GNSS.",
         )
     parameters, source = positions.parameters, positions.source
     # Bit n of EKF2_GPS_CHECK enables check n + 1 of GNSS_CHECKS; check 0, the fix, is always on
     checked_mask = int(parameters.get("EKF2_GPS_CHECK", -1)) << 1 | 1
-    failed_fractions = {
-        bit: positions.compute_set_fraction("failed_checks", bit) for bit in range(len(GNSS_CHECKS))
+    failed_fraction_by_bit = {
+        bit: positions.compute_status_bit_fraction("failed_checks", bit)
+        for bit in range(len(GNSS_CHECKS))
     }
     failed_bits = [
         bit
-        for bit in failed_fractions
-        if checked_mask >> bit & 1 and failed_fractions[bit] > MIN_FAILED_FRACTION
+        for bit in failed_fraction_by_bit
+        if checked_mask >> bit & 1 and failed_fraction_by_bit[bit] > MIN_CHECK_FAILURE_FRACTION
     ]
     if not failed_bits:
         return
-    failed_bits.sort(key=lambda bit: -failed_fractions[bit])
+    failed_bits.sort(key=lambda bit: -failed_fraction_by_bit[bit])
     samples = positions.select_samples(source.samples)
-    reported_variances = {3: samples["north_m2"], 4: samples["down_m2"]}
+    reported_variance_by_bit = {3: samples["north_m2"], 4: samples["down_m2"]}
     if source.velocity is not None:
-        reported_variances[5] = positions.select_samples(source.velocity)["north_m2_s2"]
+        reported_variance_by_bit[5] = positions.select_samples(source.velocity)["north_m2_s2"]
     check_texts = []
     for bit in failed_bits[:3]:
         name, parameter, unit = GNSS_CHECKS[bit]
-        check_details = [f"{100.0 * failed_fractions[bit]:.0f} % of the time"]
+        check_details = [f"failed {100.0 * failed_fraction_by_bit[bit]:.0f} % of the time"]
         if np.isfinite(limit := parameters.get(parameter, np.nan)):
-            # The samples lack positions without a fix, so their median may pass the failed check
-            if bit in reported_variances:
-                median_sigma = float(np.sqrt(reported_variances[bit].median()))
+            # Positions without a fix are not in the samples, so the median of the samples may be
+            # within the limit
+            if bit in reported_variance_by_bit:
+                median_sigma = float(np.sqrt(reported_variance_by_bit[bit].median()))
                 if median_sigma > limit:
                     check_details.append(f"median {median_sigma:.2f}{unit}")
             check_details.append(f"limit {parameter} {limit:g}{unit}")

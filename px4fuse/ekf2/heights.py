@@ -38,19 +38,19 @@ from px4fuse.flight.model import (
 )
 
 # State indices of vertical velocity and height
-VELOCITY_DOWN, DOWN = 5, 8
+VELOCITY_DOWN, POSITION_DOWN = 5, 8
 HEIGHT_SENSORS = (BAROMETER, GNSS_HGT)
 HEIGHT_AIDS = (*HEIGHT_SENSORS, AIDS["rng_hgt"], AIDS["ev_hgt"])
 # Default (m) of EKF2_GND_EFF_DZ, the barometer's dead zone near the ground
 DEFAULT_DEAD_ZONE_M = 4.0
 # PX4's name of the height reference, by value of EKF2_HGT_REF
-HEIGHT_REFERENCES = {0: BAROMETER.name, 1: GNSS_HGT.name}
+HEIGHT_AID_BY_REFERENCE = {0: BAROMETER.name, 1: GNSS_HGT.name}
 # Maximum time (s) from the start of the replay to the first logged height bias (logged at 2 Hz)
 MAX_BIAS_LOG_DELAY_S = 1.0
 # Minimum rate (Hz) of the logged barometer for a replay of its fusion
 MIN_BAROMETER_LOG_HZ = 4.0
 # Minimum innovation gate (√S) that EKF2 uses
-MIN_GATE = 1.0
+MIN_INNOVATION_GATE = 1.0
 # Minimum σ of the measurement noise that EKF2 uses: position (m) or velocity (m/s)
 MIN_NOISE_SIGMA = 0.01
 # Factor on EKF2_GPS_P_NOISE for GNSS heights (gnss_height_control.cpp)
@@ -62,11 +62,11 @@ def add_heights(
 ) -> tuple[ReplaySegment, ...] | str:
     """Add height measurements to the replay segments; if they are not logged, return the reason."""
     parameters = fusion_record.parameters
-    replayed_s = np.concatenate([segment.time_s for segment in segments])
+    replayed_times_s = np.concatenate([segment.time_s for segment in segments])
     if uses_aid_mask(parameters):
         return "EKF2 before PX4 v1.14 fuses only one height sensor"
     enabled_fractions = {
-        name: np.mean(sample_step_function(aid_log.enabled, replayed_s) > 0.0)
+        name: np.mean(sample_step_function(aid_log.enabled, replayed_times_s) > 0.0)
         for name, aid_log in ekf2.aids.items()
         if aid_log.enabled is not None
     }
@@ -74,27 +74,27 @@ def add_heights(
     for aid in HEIGHT_AIDS:
         if enabled_fractions.get(aid.name) and aid.name not in fused_aids:
             return f"EKF2 also fused {aid.label} in part of the flight"
-    reference = HEIGHT_REFERENCES.get(int(parameters.get("EKF2_HGT_REF", 1.0)))
+    reference = HEIGHT_AID_BY_REFERENCE.get(int(parameters.get("EKF2_HGT_REF", 1.0)))
     # A single height sensor is the height reference
     if len(fused_aids) == 1:
         (reference,) = fused_aids
     if reference not in fused_aids:
         return "EKF2's height reference is neither GNSS nor barometer, or not logged"
-    measured_at_s, down_m, sample_weight = np.zeros((3, 0))
+    measurement_times_s, down_m, sample_weight = np.zeros((3, 0))
     if BAROMETER.name in fused_aids and flight.barometer is not None:
         barometer_down_m = flight.barometer["down_m"]
         barometer_down_m = barometer_down_m.set_axis(barometer_down_m.index - 0.5 * ekf2.step_s)
-        fused_barometer = find_fused_barometer_samples(ekf2, fusion_record, barometer_down_m)
-        measured_at_s = fused_barometer.index.to_numpy()
-        down_m = fused_barometer["down_m"].to_numpy() + fusion_record.altitude_m
-        sample_weight = fused_barometer["weight"].to_numpy()
+        barometer_samples = find_fused_barometer_samples(ekf2, fusion_record, barometer_down_m)
+        measurement_times_s = barometer_samples.index.to_numpy()
+        down_m = barometer_samples["down_m"].to_numpy() + fusion_record.altitude_m
+        sample_weight = barometer_samples["weight"].to_numpy()
     ground_effect_dead_zone_m = parameters.get("EKF2_GND_EFF_DZ", DEFAULT_DEAD_ZONE_M)
     dead_zone_m = np.where(
-        fusion_record.was_in_state(GROUND_EFFECT_FLAG, measured_at_s),
+        fusion_record.was_in_state(GROUND_EFFECT_FLAG, measurement_times_s),
         ground_effect_dead_zone_m,
         0.0,
     )
-    new_segments = []
+    segments_with_heights = []
     delayed_down_m = fusion_record.delayed["down_m"]
     for segment in segments:
         start_s = float(segment.time_s[0])
@@ -112,7 +112,7 @@ def add_heights(
             )
             bias_and_variance = bias_m, bias_variance_m2
         segment_samples = select_samples_in_segment(
-            segment, measured_at_s, down_m, dead_zone_m, sample_weight
+            segment, measurement_times_s, down_m, dead_zone_m, sample_weight
         )
         rate_hz = len(segment_samples[0]) / float(segment.time_s[-1] - start_s)
         if BAROMETER.name in fused_aids and rate_hz < MIN_BAROMETER_LOG_HZ:
@@ -121,37 +121,42 @@ def add_heights(
                 f"{MIN_BAROMETER_LOG_HZ:g} Hz"
             )
         initial_state = segment.state.copy()
-        initial_state[DOWN] = np.interp(start_s, delayed_down_m.index, delayed_down_m)
+        initial_state[POSITION_DOWN] = np.interp(start_s, delayed_down_m.index, delayed_down_m)
         height_samples = HeightSamples(
             tuple(fused_aids), reference, bias_and_variance, *segment_samples
         )
-        new_segments.append(replace(segment, state=initial_state, height_samples=height_samples))
-    return tuple(new_segments)
+        segments_with_heights.append(
+            replace(segment, state=initial_state, height_samples=height_samples)
+        )
+    return tuple(segments_with_heights)
 
 
 def select_samples_in_segment(
-    segment: ReplaySegment, measured_at_s: Array, *quantities: Array
+    segment: ReplaySegment, measurement_times_s: Array, *quantities: Array
 ) -> tuple[Any, ...]:
-    """Return the fusing prediction step, time (s) and ``quantities`` of samples in a segment."""
-    step, is_inside = find_sample_steps(segment, measured_at_s)
-    return step, *(values[is_inside] for values in (measured_at_s, *quantities))
+    """Return prediction step of the fusion, measurement time (s) and ``quantities`` of samples.
+
+    Samples outside of the segment are omitted.
+    """
+    step_indices, is_inside = find_sample_steps(segment, measurement_times_s)
+    return step_indices, *(values[is_inside] for values in (measurement_times_s, *quantities))
 
 
 def group_barometer_by_event(
     segment: ReplaySegment, event_step_arrays: Sequence[IntArray]
 ) -> list[Array]:
-    """Group the barometer samples by the event (end of an interval) that fuses them.
+    """Group the barometer samples by event: each event fuses the samples since the previous one.
 
     Parameters
     ----------
     event_step_arrays : sequence of ndarray of int
-        Prediction steps of the events; one array for each set of events.
+        Prediction step of each event; one array for each set of filter events.
 
     Returns
     -------
     list of ndarray, shape (6, k, events)
         Up to k samples per event. Rows: height (m, down), age (s), time (s), dead zone (m), weight,
-        and 1 for a sample, 0 for an empty slot.
+        and 1 for a sample, 0 for padding.
     """
     height_samples = segment.height_samples
     assert height_samples is not None
@@ -160,10 +165,10 @@ def group_barometer_by_event(
             group_samples_by_event(
                 segment,
                 event_steps,
-                height_samples.step,
+                height_samples.step_indices,
                 height_samples.down_m[:, None],
                 slice(2, 3),
-                height_samples.measured_at_s,
+                height_samples.measurement_times_s,
                 height_samples.dead_zone_m,
                 height_samples.weight,
             )
@@ -173,7 +178,9 @@ def group_barometer_by_event(
 
 
 class HeightFilter:
-    """EKF2's height fusion in several filter configurations, at the events of one segment.
+    """Fuse heights like EKF2 in one segment, for several filter configurations at once.
+
+    Each event fuses the samples since the previous event: up to k of the barometer, then GNSS.
 
     Parameters
     ----------
@@ -186,7 +193,7 @@ class HeightFilter:
     parameters : mapping from parameter name to ndarray, shape (filters,)
     has_gate : ndarray of bool, shape (filters,)
         False to fuse every sample.
-    bad_acceleration : BadAcceleration
+    bad_acceleration_flag : BadAcceleration
 
     Attributes
     ----------
@@ -204,14 +211,14 @@ class HeightFilter:
         is_enabled_by_aid: Mapping[str, BoolArray],
         parameters: Mapping[str, Array],
         has_gate: BoolArray,
-        bad_acceleration: BadAccelerationFlag,
+        bad_acceleration_flag: BadAccelerationFlag,
     ) -> None:
-        self.bad_acceleration = bad_acceleration
+        self.bad_acceleration_flag = bad_acceleration_flag
         height_samples = segment.height_samples
         configuration_count = len(has_gate)
         assert height_samples is not None
         self.fused_sensors = height_samples.fused_sensors
-        self.down_m, self.age_s, measured_at_s, self.dead_zone_m, weight, is_sample = (
+        self.down_m, self.age_s, measurement_times_s, self.dead_zone_m, weight, sample_flag = (
             barometer_by_event
         )
         has_fix = (
@@ -219,13 +226,16 @@ class HeightFilter:
             & is_enabled_by_aid[GNSS_HGT.name]
             & (GNSS_HGT.name in height_samples.fused_sensors)
         )
-        has_barometer = (is_sample > 0.0) & is_enabled_by_aid[BAROMETER.name]
+        has_barometer = (sample_flag > 0.0) & is_enabled_by_aid[BAROMETER.name]
         self.has_sample = np.concatenate(
             [has_barometer, np.broadcast_to(has_fix, (1, *has_barometer.shape[1:]))]
         )
         self.any_sample = [np.any(mask, axis=1).tolist() for mask in self.has_sample]
         self.in_ground_effect = self.dead_zone_m.any(axis=2)
-        gates = [np.maximum(parameters.get(aid.gate, MIN_GATE), MIN_GATE) for aid in HEIGHT_SENSORS]
+        gates = [
+            np.maximum(parameters.get(aid.gate, MIN_INNOVATION_GATE), MIN_INNOVATION_GATE)
+            for aid in HEIGHT_SENSORS
+        ]
         self.gate_squared = [np.where(has_gate, gate**2, np.inf) for gate in gates]
         self.R_m2 = (
             np.maximum(parameters.get(BAROMETER.noise, MIN_NOISE_SIGMA), MIN_NOISE_SIGMA) ** 2
@@ -238,47 +248,61 @@ class HeightFilter:
         start_s = segment.time_s[0]
         self.bias = BiasEstimator(bias_m, bias_variance_m2, segment.step_s)
         self.updates_bias = self.has_sample & is_enabled_by_aid[height_samples.reference]
-        slots_with_bias = slice(0, -1) if self.has_bias[0] else slice(-1, None)
+        samples_with_bias = slice(0, -1) if self.has_bias[0] else slice(-1, None)
         self.interval_s = np.zeros(self.has_sample.shape)
         self.time_s = np.stack(
-            np.broadcast_arrays(*measured_at_s, gnss_fix_times_s, self.has_sample[0])[:-1]
+            np.broadcast_arrays(*measurement_times_s, gnss_fix_times_s, self.has_sample[0])[:-1]
         )
-        slot_count, event_count, _ = self.time_s.shape
-        self.update_records = np.full((event_count, slot_count + 1, 4, configuration_count), np.nan)
-        # Interval between samples of the sensor with a bias, in the order of fusion. A slot without
-        # a sample gets start_s, which is not later than any sample
-        sample_s = np.where(self.has_sample, self.time_s, start_s)[slots_with_bias].swapaxes(0, 1)
-        latest_sample_s = np.maximum.accumulate(sample_s.reshape(-1, configuration_count), axis=0)
-        interval_s = np.diff(latest_sample_s, axis=0, prepend=start_s).reshape(sample_s.shape)
-        self.interval_s[slots_with_bias] = interval_s.swapaxes(0, 1)
+        samples_per_event, event_count, _ = self.time_s.shape
+        self.update_records = np.full(
+            (event_count, samples_per_event + 1, 4, configuration_count), np.nan
+        )
+        # Interval between samples of the sensor whose bias is estimated, in the order of fusion.
+        # start_s stands for a missing sample: it does not change the latest sample time
+        sample_times_s = np.where(self.has_sample, self.time_s, start_s)[
+            samples_with_bias
+        ].swapaxes(0, 1)
+        latest_sample_times_s = np.maximum.accumulate(
+            sample_times_s.reshape(-1, configuration_count), axis=0
+        )
+        interval_s = np.diff(latest_sample_times_s, axis=0, prepend=start_s).reshape(
+            sample_times_s.shape
+        )
+        self.interval_s[samples_with_bias] = interval_s.swapaxes(0, 1)
         self.interval_s *= self.updates_bias
 
     def make_update_table(
         self, sensor: str, configuration_index: int, end_s: Array
     ) -> pd.DataFrame:
-        """Return the updates of one filter configuration with one height sensor.
+        """Return the updates of one configuration with one height sensor, one row per sample.
 
         ``end_s`` contains the time (s) of each event.
         """
-        gnss_slot = len(self.down_m)
-        sample_slots = (
-            slice(gnss_slot, gnss_slot + 1) if sensor == GNSS_HGT.name else slice(gnss_slot)
+        gnss_index = len(self.down_m)
+        sample_slice = (
+            slice(gnss_index, gnss_index + 1) if sensor == GNSS_HGT.name else slice(gnss_index)
         )
-        update_records = self.update_records[:, sample_slots, :, configuration_index]
-        measured_at_s = self.time_s[sample_slots, :, configuration_index].T
-        return make_update_table(update_records, measured_at_s, end_s, ["down"])
+        update_records = self.update_records[:, sample_slice, :, configuration_index]
+        measurement_times_s = self.time_s[sample_slice, :, configuration_index].T
+        return make_update_table(update_records, measurement_times_s, end_s, ["down"])
 
     def fuse_barometer(self, event: int, x: Array, P: Array) -> ArrayPair:
-        for slot in range(len(self.down_m)):
+        for sample_index in range(len(self.down_m)):
             x, P = self._fuse_sample(
-                event, slot, x, P, self.down_m[slot, event], self.age_s[slot, event], self.R_m2
+                event,
+                sample_index,
+                x,
+                P,
+                self.down_m[sample_index, event],
+                self.age_s[sample_index, event],
+                self.R_m2,
             )
         return x, P
 
     def fuse_gnss(
         self, event: int, x: Array, P: Array, gnss_down_m: Array, gnss_variance_m2: Array
     ) -> ArrayPair:
-        """Fuse the GNSS height (m, down) of one event; ``gnss_variance_m2`` is its R (m²)."""
+        """Fuse the GNSS height (m, down) of one event with its R (m²); return x and P."""
         return self._fuse_sample(
             event, len(self.down_m), x, P, gnss_down_m, np.zeros(1), gnss_variance_m2
         )
@@ -288,43 +312,55 @@ class HeightFilter:
         innovations = -update_records[:, :, 0] / np.sqrt(update_records[:, :, 1])
         if (innovations > MIN_LARGER_HEIGHT_INNOVATION).any():
             innovations[:, -2] = np.fmax(innovations[:, -2], innovations[:, -1])
-            self.bad_acceleration.update(time_s, innovations[0, :-1], innovations[-1, :-1])
+            self.bad_acceleration_flag.update(time_s, innovations[0, :-1], innovations[-1, :-1])
 
     def _fuse_sample(
-        self, event: int, slot: int, x: Array, P: Array, down_m: Array, age_s: Array, R: Array
+        self,
+        event: int,
+        sample_index: int,
+        x: Array,
+        P: Array,
+        down_m: Array,
+        age_s: Array,
+        R: Array,
     ) -> ArrayPair:
         """Fuse a height (m, down), measured ``age_s`` (s) before the event."""
-        if not self.any_sample[slot][event]:
+        if not self.any_sample[sample_index][event]:
             return x, P
-        sensor_index = int(slot == len(self.down_m))
+        sensor_index = int(sample_index == len(self.down_m))
         # PH' and HPH', with H = 1 for the height and -age_s for the vertical velocity
-        state_covariance = P[:, :, DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
-        predicted_variance = state_covariance[:, DOWN] - age_s * state_covariance[:, VELOCITY_DOWN]
-        nu = down_m - x[:, DOWN] + age_s * x[:, VELOCITY_DOWN]
-        sample_weight = self.weight[slot][event]
+        state_height_covariance = P[:, :, POSITION_DOWN] - age_s[:, None] * P[:, :, VELOCITY_DOWN]
+        predicted_variance = (
+            state_height_covariance[:, POSITION_DOWN]
+            - age_s * state_height_covariance[:, VELOCITY_DOWN]
+        )
+        nu = down_m - x[:, POSITION_DOWN] + age_s * x[:, VELOCITY_DOWN]
+        sample_weight = self.weight[sample_index][event]
         if self.has_bias[sensor_index]:
             nu, R = self.bias.remove_bias(
                 nu,
                 predicted_variance,
                 R,
-                self.interval_s[slot, event],
-                self.updates_bias[slot, event],
+                self.interval_s[sample_index, event],
+                self.updates_bias[sample_index, event],
                 sample_weight,
             )
-        if sensor_index == 0 and self.in_ground_effect[slot, event]:
-            nu = np.where(nu > 0.0, np.maximum(nu - self.dead_zone_m[slot, event], 0.0), nu)
+        if sensor_index == 0 and self.in_ground_effect[sample_index, event]:
+            nu = np.where(nu > 0.0, np.maximum(nu - self.dead_zone_m[sample_index, event], 0.0), nu)
         S = predicted_variance + R
-        has_sample = self.has_sample[slot, event]
+        has_sample = self.has_sample[sample_index, event]
         is_fused = has_sample & (nu * nu <= self.gate_squared[sensor_index] * S)
         if not is_fused.all():
             is_clipped = (
-                has_sample & ~is_fused & (self.bad_acceleration.until_s > self.time_s[slot, event])
+                has_sample
+                & ~is_fused
+                & (self.bad_acceleration_flag.until_s > self.time_s[sample_index, event])
             )
             innovation_limit = np.sqrt(self.gate_squared[sensor_index] * S)
             nu = np.where(is_clipped, np.clip(nu, -innovation_limit, innovation_limit), nu)
             is_fused |= is_clipped
-        self.update_records[event, slot] = np.where(
+        self.update_records[event, sample_index] = np.where(
             has_sample, (nu, S, ~is_fused, is_fused), np.nan
         )
-        K = state_covariance * (is_fused / (predicted_variance + R / sample_weight))[:, None]
-        return x + K * nu[:, None], P - K[:, :, None] * state_covariance[:, None]
+        K = state_height_covariance * (is_fused / (predicted_variance + R / sample_weight))[:, None]
+        return x + K * nu[:, None], P - K[:, :, None] * state_height_covariance[:, None]

@@ -17,7 +17,7 @@ from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
 from px4fuse.ekf2.replay_segments import (
     IMU_GAP_S,
-    MIN_SEGMENT_S,
+    MIN_SEGMENT_DURATION_S,
     ReplaySegment,
     find_replay_segments,
     read_prediction_step_s,
@@ -81,14 +81,14 @@ MAX_RESET_PUBLICATION_DELAY_S = 0.2
 # Maximum median IMU interval (s) for an EKF2 replay: EKF2 predicts every 8 to 13 ms
 MAX_IMU_INTERVAL_S = 0.012
 # Maximum fraction of missing IMU samples outside gaps for an EKF2 replay
-MAX_LOST_FRACTION = 0.1
+MAX_MISSING_IMU_FRACTION = 0.1
 # First PX4 release with the time of the fusion horizon in estimator_states
 FIRST_RELEASE_WITH_HORIZON_TIMES = "PX4 v1.13"
 # Maximum number of successive position resets in PX4 releases without a limit: never reached
 UNLIMITED_RESETS = 1_000_000
 # In a gap of the position source, the replay fuses height and heading at least once in this time
 # (s)
-MAX_INTERVAL_S = 0.25
+MAX_EVENT_INTERVAL_S = 0.25
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class ReceivedPositions:
         True if EKF2 reset its position to the sample.
     uses_sender_times : bool
         True if EKF2 uses measurement times of the sender and ignores its delay parameter.
-    reset_s : ndarray
+    reset_times_s : ndarray
         Timestamps of the samples with a new ``reset_counter``, to which EKF2 resets its position.
     has_all_resets : bool
         True if the log contains all resets of EKF2's position to a sample.
@@ -125,7 +125,7 @@ class ReceivedPositions:
     velocity_m_s: Array | None = None
     velocity_variance_m2_s2: Array | None = None
     uses_sender_times: bool = False
-    reset_s: Array | tuple[()] = ()
+    reset_times_s: Array | tuple[()] = ()
     has_all_resets: bool = False
 
 
@@ -143,7 +143,7 @@ class FusionRules:
         The position is reset after all samples are rejected for this time.
     max_resets : int
         EKF2 stops fusing the position source after this number of successive resets.
-    min_bias_variance : float or None
+    min_bias_variance_m2_s4 : float or None
         Minimum accelerometer bias variance (m²/s⁴).
     uses_delay_as_horizon : bool
         True if the largest delay parameter is the fusion horizon, not EKF2_DELAY_MAX (v1.15).
@@ -159,7 +159,7 @@ class FusionRules:
     stop_timeout_s: float
     reset_timeout_s: float
     max_resets: int
-    min_bias_variance: float | None = None
+    min_bias_variance_m2_s4: float | None = None
     uses_delay_as_horizon: bool = False
     reset_variance_factor: float = 1.0
     resets_velocity: bool = False
@@ -184,29 +184,29 @@ GNSS_RULES = FusionRules(
 
 
 @dataclass(frozen=True)
-class Inputs:
+class ReplayInputs:
     """Data of a flight that the EKF2 replay needs.
 
     Attributes
     ----------
     settings : dict
-        EKF2 parameters in the model, by PX4 name.
+        Logged EKF2 parameters that the model uses, by PX4 name.
     received : ReceivedPositions
         Samples of the horizontal position source ``aid``.
     mean_step_s, configured_step_s : float
         Length of a prediction step: mean in the log, and EKF2_PREDICT_US.
     horizon_s : float
-        Delay of the fusion horizon.
+        Time from EKF2's delayed state (fusion horizon) to the present.
     fuses_vision_height : bool
         True if EKF2 fused the height of external vision.
     imu_offset_m : ndarray, shape (3,)
         Position of the IMU (EKF2_IMU_POS, body FRD).
-    max_interval_s : float
+    max_event_interval_s : float
         Maximum interval (s) between fusions of height and heading in a gap of the position source.
     logged_height_reason : str
         Reason why EKF2's logged height is used in a flight with GNSS.
     vision : ReceivedPositions or None
-        Vision positions that EKF2 fused in addition to GNSS; NaN while vision is disabled.
+        Positions of external vision, fused in addition to GNSS; NaN while vision is disabled.
     """
 
     settings: dict[str, float]
@@ -219,14 +219,14 @@ class Inputs:
     fuses_vision_height: bool
     imu_offset_m: Array
     aid: Aid = EV_POS
-    max_interval_s: float = MAX_INTERVAL_S
+    max_event_interval_s: float = MAX_EVENT_INTERVAL_S
     logged_height_reason: str = ""
     vision: ReceivedPositions | None = None
 
 
 def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     flight: Flight, omitted_aids: Mapping[str, str] = MappingProxyType({})
-) -> Inputs | Unavailable:
+) -> ReplayInputs | Unavailable:
     """Return the inputs of the EKF2 replay, or the reason why the log is insufficient.
 
     ``omitted_aids`` contains aiding sources (PX4's names) that the replay omits, with the reasons.
@@ -263,31 +263,31 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         return Unavailable(
             ANALYSIS_NAME,
             f"EKF2 also fused {', '.join(unmodelled_aids)}, which the model does not contain",
-            f"Fly with {', '.join(switch_settings)} and without bit 2 (velocity) of "
-            f"{EV_POS.switch}.",
+            f"Set {', '.join(switch_settings)} and clear bit 2 (velocity) of {EV_POS.switch} "
+            "before the next flight.",
         )
     if missing_imu := _explain_missing_imu(imu.index.to_numpy()):
         return missing_imu
-    received = (
+    received_positions = (
         read_gnss(flight, ekf2, fusion_record)
         if is_gnss
         else read_vision(flight, ekf2, fusion_record, attitude)
     )
-    if isinstance(received, Unavailable):
-        return received
-    if not len(received.timestamp_s):
+    if isinstance(received_positions, Unavailable):
+        return received_positions
+    if not len(received_positions.timestamp_s):
         return Unavailable(
             ANALYSIS_NAME,
             f"the log has no sample of {aid.label} while EKF2 reports its fusion",
             "Record estimator_status_flags and the position source for the whole flight.",
         )
-    vision = (
+    vision_positions = (
         _read_vision_besides_gnss(flight, logged_ekf2, fusion_record, attitude)
         if is_gnss and EV_POS.name not in omitted_aids
         else None
     )
-    if isinstance(vision, Unavailable):
-        return vision
+    if isinstance(vision_positions, Unavailable):
+        return vision_positions
     # Since PX4 v1.17, each GNSS receiver has a separate lever arm, which its messages contain
     gnss_track = _find_gnss_track(flight) if is_gnss else None
     lever_arm = (
@@ -298,7 +298,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             return Unavailable(ANALYSIS_NAME, horizon_s.reason, horizon_s.remedy)
         # EKF2's fusion horizon is the current time if EKF2_EV_DELAY is at most one prediction step
         horizon_s = 0.0
-    aiding_times_s = received.timestamp_s
+    aiding_times_s = received_positions.timestamp_s
     flow_samples = fusion_record.flow if is_gnss else fusion_record.flow.iloc[:0]
     if len(flow_samples) and FLOW.name not in omitted_aids:
         aiding_times_s = np.union1d(aiding_times_s, flow_samples.index)
@@ -308,7 +308,7 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
     if not segments:
         return Unavailable(
             ANALYSIS_NAME,
-            f"the flight contains no {MIN_SEGMENT_S:g} s in which EKF2 fused "
+            f"the flight contains no {MIN_SEGMENT_DURATION_S:g} s in which EKF2 fused "
             f"{aid.label.removesuffix(', position')} without a gap in the source or the IMU",
             "Record without dropouts (faster SD card, fewer topics) and with a steady position "
             "source.",
@@ -328,16 +328,16 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
             if isinstance(segments_or_reason, str)
             else (segments_or_reason, "")
         )
-    other_aids = [EV_POS] if vision else []
+    other_aids = [EV_POS] if vision_positions else []
     other_aids += [MAG] if any(segment.field for segment in segments) else []
     height_samples = segments[0].height_samples
     other_aids += (
         [BAROMETER] if height_samples and BAROMETER.name in height_samples.fused_sensors else []
     )
-    return Inputs(
+    return ReplayInputs(
         settings=fill_with_defaults(fusion_record.parameters, aid, *other_aids) | lever_arm,
         segments=segments,
-        received=received,
+        received=received_positions,
         rules=_make_fusion_rules(fusion_record, ekf2.step_s, is_gnss=is_gnss),
         mean_step_s=ekf2.step_s,
         horizon_s=horizon_s,
@@ -353,15 +353,17 @@ def prepare_inputs(  # noqa: PLR0911, PLR0912 (one return per reason)
         ),
         aid=aid,
         logged_height_reason=logged_height_reason,
-        vision=vision,
+        vision=vision_positions,
     )
 
 
 def compute_lost_imu_fraction(time_s: Array) -> float:
     """Return the fraction of IMU samples missing from the log, without gaps above IMU_GAP_S."""
     intervals_s = np.diff(time_s)
-    lost_counts = np.rint(intervals_s[intervals_s <= IMU_GAP_S] / np.median(intervals_s)) - 1.0
-    lost_count = lost_counts.clip(0.0).sum()
+    missing_sample_counts = (
+        np.rint(intervals_s[intervals_s <= IMU_GAP_S] / np.median(intervals_s)) - 1.0
+    )
+    lost_count = missing_sample_counts.clip(0.0).sum()
     return float(lost_count / (lost_count + len(time_s)))
 
 
@@ -373,7 +375,7 @@ def _explain_missing_imu(time_s: Array) -> Unavailable | None:
             f"the IMU is logged at {1.0 / median_interval_s:.0f} Hz, below EKF2's prediction rate",
             "Record with SDLOG_PROFILE bit 0 (default), which logs sensor_combined at full rate.",
         )
-    if (lost_fraction := compute_lost_imu_fraction(time_s)) > MAX_LOST_FRACTION:
+    if (lost_fraction := compute_lost_imu_fraction(time_s)) > MAX_MISSING_IMU_FRACTION:
         return Unavailable(
             ANALYSIS_NAME,
             f"{100.0 * lost_fraction:.0f} % of the IMU samples are missing from the log",
@@ -383,18 +385,20 @@ def _explain_missing_imu(time_s: Array) -> Unavailable | None:
 
 
 def _make_fusion_rules(fusion_record: FusionRecord, step_s: float, *, is_gnss: bool) -> FusionRules:
-    rules, parameters = VISION_RULES, fusion_record.parameters
+    fusion_rules, parameters = VISION_RULES, fusion_record.parameters
     if is_gnss:
-        # PX4 with EKF2_GPS_MODE (main since 2026) resets position and velocity separately
-        rules = replace(GNSS_RULES, resets_velocity=GNSS_MODE_PARAMETER not in parameters)
+        # Only PX4 without EKF2_GPS_MODE (before main of 2026) resets velocity with position
+        fusion_rules = replace(GNSS_RULES, resets_velocity=GNSS_MODE_PARAMETER not in parameters)
         if not fusion_record.stores_latitude():
             # The flag for a bad acceleration stays set for 10 s (BADACC_PROBATION, common.h)
-            rules = replace(rules, reset_variance_factor=1.0, bad_acceleration_duration_s=10.0)
+            fusion_rules = replace(
+                fusion_rules, reset_variance_factor=1.0, bad_acceleration_duration_s=10.0
+            )
     elif uses_aid_mask(parameters):
-        rules = FusionRules(np.inf, 7.0, 7.0, UNLIMITED_RESETS)
+        fusion_rules = FusionRules(np.inf, 7.0, 7.0, UNLIMITED_RESETS)
     return replace(
-        rules,
-        min_bias_variance=5e-8 / step_s**2 if fusion_record.stores_bias_increments else None,
+        fusion_rules,
+        min_bias_variance_m2_s4=5e-8 / step_s**2 if fusion_record.stores_bias_increments else None,
         uses_delay_as_horizon="EKF2_DELAY_MAX" not in parameters,
     )
 
@@ -447,7 +451,8 @@ def read_gnss(
         is_enabled = sample_step_function(enabled_changes, position_samples.index) > 0.0
         position_samples = position_samples[is_enabled]
         velocity_samples = velocity_samples[is_enabled]
-    # The delay is added, because the replay subtracts it from all timestamps
+    # The delay is already subtracted from the times of the GNSS samples. It is added again, because
+    # the replay subtracts it from all timestamps
     logged_settings = fill_with_defaults(parameters, GNSS_POS)
     logged_delay_s = logged_settings[GNSS_POS.delay] * 1e-3
     timestamp_s = position_samples.index.to_numpy() + logged_delay_s
@@ -519,15 +524,15 @@ def read_vision(
     arrival_s = np.full(len(timestamp_s), -np.inf)
     if len(vision_age_s) and "vehicle_visual_odometry" in track.topics:
         arrival_s = timestamp_s + np.interp(timestamp_s, vision_age_s.index, vision_age_s)
-    rejected_and_reset = _read_logged_decisions(ekf2, fusion_record, timestamp_s, arrival_s)
+    logged_decisions = _read_logged_decisions(ekf2, fusion_record, timestamp_s, arrival_s)
     return ReceivedPositions(
         timestamp_s,
         arrival_s,
         position_m,
         variance_m2,
-        *rejected_and_reset,
+        *logged_decisions,
         track.name,
-        reset_s=reset_times_s(track),
+        reset_times_s=reset_times_s(track),
         has_all_resets=DEAD_RECKONING_FLAG in fusion_record.states,
     )
 
@@ -541,24 +546,25 @@ def _read_vision_besides_gnss(
     if uses_aid_mask(fusion_record.parameters):
         return Unavailable(
             ANALYSIS_NAME,
-            f"with GNSS, {flight.log.firmware} fuses changes of the vision position, which the "
-            "model does not contain",
+            f"in flights with GNSS, {flight.log.firmware} fuses changes of the vision position; "
+            "the EKF2 model cannot fuse changes",
             "Use PX4 v1.14 or newer, or fly with GNSS only or with vision only.",
         )
-    received = read_vision(flight, ekf2, fusion_record, attitude)
-    if isinstance(received, Unavailable):
-        return received
-    is_disabled = sample_step_function(enabled_changes, received.timestamp_s) == 0.0
-    position_m = received.position_m * compute_position_scale(fusion_record)
-    return replace(received, position_m=np.where(is_disabled[:, None], np.nan, position_m))
+    received_positions = read_vision(flight, ekf2, fusion_record, attitude)
+    if isinstance(received_positions, Unavailable):
+        return received_positions
+    is_vision_disabled = sample_step_function(enabled_changes, received_positions.timestamp_s) == 0.0
+    position_m = received_positions.position_m * compute_position_scale(fusion_record)
+    return replace(
+        received_positions, position_m=np.where(is_vision_disabled[:, None], np.nan, position_m))
 
 
 def _read_logged_decisions(
     ekf2: Ekf2, fusion_record: FusionRecord, timestamp_s: Array, arrival_s: Array, aid: Aid = EV_POS
 ) -> tuple[Array, BoolArray]:
-    """Return two masks of the position samples: rejected by EKF2 (1, 0 or NaN), used for a reset.
+    """Return EKF2's logged rejection of each position sample, and True for a reset to the sample.
 
-    NaN: the rejection is not logged.
+    The rejection is 1, 0, or NaN if it is not logged.
     """
     rejected_flags = np.full(len(timestamp_s), np.nan)
     is_reset = np.zeros(len(timestamp_s), dtype=bool)
@@ -571,41 +577,43 @@ def _read_logged_decisions(
     ):
         return rejected_flags, is_reset
     delay_s = fill_with_defaults(fusion_record.parameters, aid)[aid.delay] * 1e-3
-    measured_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
-    # EKF2 fuses a sample at the first step after its measurement time, or after a late arrival
-    fusion_due_s = np.maximum.accumulate(np.maximum(measured_s, arrival_s - horizon_s))
+    measurement_times_s = timestamp_s - delay_s - 0.5 * ekf2.step_s
+    # EKF2 fuses a sample when the fusion horizon reaches its measurement time, or when it arrives
+    # if that is later
+    fusion_due_s = np.maximum.accumulate(np.maximum(measurement_times_s, arrival_s - horizon_s))
     aid_rows = ekf2.aids[aid.name].samples
-    # EKF2 rejected all samples between its last fusion or reset (last_fused_s) and the row that
-    # logs this time, and all samples in dead reckoning
+    # Each row contains the time of EKF2's last fusion or reset (last_fused_s). EKF2 rejected all
+    # samples from then to the time of the row, and all samples in dead reckoning
     last_fusion_times_s = aid_rows.reindex(columns=["last_fused_s"]).dropna()
-    fusion_to_row_spans_s = np.column_stack([last_fusion_times_s, last_fusion_times_s.index])
-    dead_reckoning_s = (
+    spans_since_fusion_s = np.column_stack([last_fusion_times_s, last_fusion_times_s.index])
+    dead_reckoning_spans_s = (
         _find_dead_reckoning_spans(ekf2, fusion_record)
         if aid == EV_POS
-        else fusion_to_row_spans_s[:0]
+        else spans_since_fusion_s[:0]
     )
-    rejection_rows = np.searchsorted(
-        fusion_due_s, np.concatenate([fusion_to_row_spans_s, dead_reckoning_s]) + STEP_TOLERANCE_S
+    rejection_row_ranges = np.searchsorted(
+        fusion_due_s,
+        np.concatenate([spans_since_fusion_s, dead_reckoning_spans_s]) + STEP_TOLERANCE_S,
     )
-    for begin, end in rejection_rows.tolist():
+    for begin, end in rejection_row_ranges.tolist():
         rejected_flags[begin : max(end - 1, 0)] = 1.0
     is_reset_possible = np.isnan(rejected_flags)
-    sample_row = find_matching_samples(innovations.index.to_numpy(), measured_s)
-    sample_innovations = innovations.iloc[sample_row[sample_row >= 0]]
-    rejected_flags[sample_row >= 0] = sample_innovations["rejected"]
+    sample_rows = find_matching_samples(innovations.index.to_numpy(), measurement_times_s)
+    sample_innovations = innovations.iloc[sample_rows[sample_rows >= 0]]
+    rejected_flags[sample_rows >= 0] = sample_innovations["rejected"]
     # If EKF2 resets its position to a sample, it logs innovation 0, and not a rejection
-    is_reset_possible[sample_row >= 0] &= (sample_innovations["rejected"] > 0.0) | (
+    is_reset_possible[sample_rows >= 0] &= (sample_innovations["rejected"] > 0.0) | (
         sample_innovations["innovation_m"] == 0.0
     )
-    last_fused_rows = rejection_rows[: len(fusion_to_row_spans_s), 0] - 1
-    last_dead_reckoning_rows = rejection_rows[len(fusion_to_row_spans_s) :, 1] - 1
+    last_fused_rows = rejection_row_ranges[: len(spans_since_fusion_s), 0] - 1
+    last_dead_reckoning_rows = rejection_row_ranges[len(spans_since_fusion_s) :, 1] - 1
     # A reset is visible in the next published state, one fusion horizon after the measurement
-    published_s = fusion_due_s + horizon_s
+    publication_times_s = fusion_due_s + horizon_s
     for reset_s in find_horizontal_reset_times_s(ekf2):
-        is_recent = (published_s <= reset_s) & (
-            published_s > reset_s - MAX_RESET_PUBLICATION_DELAY_S
+        is_published_near_reset = (publication_times_s <= reset_s) & (
+            publication_times_s > reset_s - MAX_RESET_PUBLICATION_DELAY_S
         )
-        reset_rows = np.flatnonzero(is_recent & is_reset_possible)
+        reset_rows = np.flatnonzero(is_published_near_reset & is_reset_possible)
         dead_reckoning_end_rows = np.intersect1d(reset_rows, last_dead_reckoning_rows)
         is_reset[
             dead_reckoning_end_rows[:1] if len(dead_reckoning_end_rows) else reset_rows[-1:]
@@ -617,10 +625,10 @@ def _read_logged_decisions(
 
 
 def _find_dead_reckoning_spans(ekf2: Ekf2, fusion_record: FusionRecord) -> Array:
-    """Return start and end (s) of each time span without fusion of vision.
+    """Return start and end (s) of each inertial dead reckoning, from the last fusion of vision on.
 
-    EKF2 reports inertial dead reckoning after DEAD_RECKONING_TIMEOUT_S without fusion, and
-    immediately if vision is disabled. Dead reckoning ends with a fusion or a reset.
+    EKF2 reports dead reckoning DEAD_RECKONING_TIMEOUT_S after the last fusion, and immediately if
+    vision is disabled. Dead reckoning ends with a fusion or a reset.
     """
     dead_reckoning_changes = fusion_record.states.get(DEAD_RECKONING_FLAG)
     vision_enabled_changes = ekf2.states.get(EV_POS.name)
@@ -668,8 +676,8 @@ def _find_vision_track(flight: Flight) -> PositionTrack | Unavailable:
             ):
                 return track
             missing_reasons.append(
-                f"{track.name} has a sample interval of {median_interval_s:.2g} s; EKF2 may have "
-                "fused more samples"
+                f"{track.name} is logged every {median_interval_s:.2g} s; EKF2 may have fused more "
+                "samples than are logged"
             )
     return Unavailable(
         ANALYSIS_NAME,

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from px4fuse.core.arrays import Array, BoolArray, IntArray
-from px4fuse.ekf2.inputs import Inputs
+from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.replay_segments import (
     BIASES,
     GRAVITY_M_S2,
@@ -40,12 +40,12 @@ MAX_LATENESS_S = 0.1
 # A sample is late if fusion horizon - measurement time > this time (s), which is an error of 3 cm
 # at 1 m/s
 MIN_LATENESS_S = 0.03
-# Actions on a position sample: none, update of the state, or reset of the state to the sample
+# Actions of EKF2 on a position sample: none, fusion, or start of fusion with a reset to the sample
 NO_ACTION, FUSE, START_FUSION = 0, 1, 2
 # Columns of the state derivatives: with respect to the initial attitude error (0 to 2), gyro bias
 # (3 to 5), accelerometer bias (6 to 8), correction of the nominal attitude (9), acceleration (10)
 SENSITIVITY_COLUMN_COUNT = 11
-CORRECTION_COLUMN, ACCELERATION_COLUMN = 9, 10
+ATTITUDE_CORRECTION_COLUMN, ACCELERATION_COLUMN = 9, 10
 
 # One row per event (end of an interval), in time order
 StepEvents = np.recarray[Any, Any]
@@ -58,19 +58,20 @@ EVENT_DTYPE = np.dtype(
         ("can_start", bool),  # True if EKF2 may start fusion with this sample after a stop
         ("late", bool),  # True if the sample was fused late, because it arrived late
         ("lost", bool),  # True if the sample arrived too late to be fused
-        ("time_s", float),  # measurement time in EKF2 (s): timestamp - delay - half a step
+        ("time_s", float),  # measurement time for EKF2: timestamp - delay - half a prediction step
     ]
 )
 
 
 class Transitions(NamedTuple):
-    """State transition and process noise of E intervals between events.
+    """State transition and process noise of E intervals between filter events.
 
     Attributes
     ----------
     transition : ndarray, shape (E, 15, 15)
     correction_input, acceleration_input : ndarray, shape (E, 15)
-        State changes due to the correction of the nominal attitude, and to the acceleration.
+        State changes by the difference of nominal (published) and gyro rotation, and by the
+        acceleration.
     gyro_noise, accelerometer_noise : ndarray, shape (E, 9, 9)
         Process noise of attitude, velocity and position for a sensor noise of 1 rad/s or 1 m/s².
     """
@@ -83,8 +84,8 @@ class Transitions(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Intervals:
-    """State transition and process noise of each interval between the events of one segment.
+class EventIntervals:
+    """State transition and process noise of each interval between two filter events of a segment.
 
     Attributes
     ----------
@@ -103,41 +104,44 @@ class Intervals:
     sensitivities: Array
 
     def compute_transitions(self, rows: slice) -> Transitions:
-        """Return the matrices of the intervals ``rows``; all intervals would need much memory."""
+        """Return the matrices of the intervals ``rows`` only, to limit memory."""
         sensitivities, duration_s = self.sensitivities[rows], self.duration_s[rows]
         transition = np.tile(np.eye(STATE_COUNT), (len(duration_s), 1, 1))
         correction_input, acceleration_input = np.zeros((2, len(duration_s), STATE_COUNT))
         transition[:, :IMU_STATE_COUNT, THETA] = sensitivities[..., :3]
         transition[:, :IMU_STATE_COUNT, BIASES] = sensitivities[..., 3:9]
-        correction_input[:, :IMU_STATE_COUNT] = sensitivities[..., CORRECTION_COLUMN]
+        correction_input[:, :IMU_STATE_COUNT] = sensitivities[..., ATTITUDE_CORRECTION_COLUMN]
         acceleration_input[:, :IMU_STATE_COUNT] = sensitivities[..., ACCELERATION_COLUMN]
         transition[:, POSITION, VELOCITY] = duration_s[:, None, None] * np.eye(3)
-        noises = _compute_imu_process_noise(
+        imu_process_noises = _compute_imu_process_noise(
             self.step_counts[rows], duration_s, transition[:, VELOCITY, THETA]
         )
-        return Transitions(transition, correction_input, acceleration_input, *noises)
+        return Transitions(transition, correction_input, acceleration_input, *imu_process_noises)
 
 
 @dataclass(frozen=True)
 class FusionDelays:
-    """Delay (s) of position measurements, and delay (s) of EKF2's fusion horizon.
+    """Delay (s) of the timestamps of positions, and delay (s) of EKF2's fusion horizon.
 
-    The timestamps minus ``delay_s`` are the measurement times.
+    Timestamps minus ``delay_s`` are measurement times. The fusion horizon is the time of EKF2's
+    delayed state.
     """
 
     delay_s: float
     horizon_s: float
 
 
-def make_intervals(inputs: Inputs, segment: ReplaySegment, delays: FusionDelays) -> Intervals:
-    """Compute state transition and process noise of all intervals in a segment.
+def make_intervals(
+    inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDelays
+) -> EventIntervals:
+    """Compute state transition and process noise between the filter events of a segment.
 
-    The number of intervals does not depend on ``delays``.
+    The number of events is the same for all ``delays``, so that several delays run together.
     """
     events = _make_events(inputs, segment, delays)
     end_steps = events.end_step
     start_steps = np.append(0, end_steps[:-1])
-    return Intervals(
+    return EventIntervals(
         events,
         (end_steps - start_steps).astype(float),
         segment.time_s[end_steps] - segment.time_s[start_steps],
@@ -145,29 +149,33 @@ def make_intervals(inputs: Inputs, segment: ReplaySegment, delays: FusionDelays)
     )
 
 
-def _make_events(inputs: Inputs, segment: ReplaySegment, delays: FusionDelays) -> StepEvents:
-    received = inputs.received
+def _make_events(inputs: ReplayInputs, segment: ReplaySegment, delays: FusionDelays) -> StepEvents:
+    received_positions = inputs.received
     time_s = segment.time_s
-    first_row, last_row = np.searchsorted(received.timestamp_s, time_s[[0, -1]])
-    timestamp_s = received.timestamp_s[first_row:last_row]
+    first_row, last_row = np.searchsorted(received_positions.timestamp_s, time_s[[0, -1]])
+    timestamp_s = received_positions.timestamp_s[first_row:last_row]
     last_step = len(time_s) - 1
-    measured_s = timestamp_s - delays.delay_s - 0.5 * inputs.mean_step_s
+    measurement_times_s = timestamp_s - delays.delay_s - 0.5 * inputs.mean_step_s
     # If a sample arrives after the fusion horizon has passed its measurement time, EKF2 fuses it
     # late or never
-    fusion_due_s = np.maximum(measured_s, received.arrival_s[first_row:last_row] - delays.horizon_s)
+    fusion_due_s = np.maximum(
+        measurement_times_s, received_positions.arrival_s[first_row:last_row] - delays.horizon_s
+    )
     end_steps = np.searchsorted(time_s, fusion_due_s - 1e-9)
     is_inside = (end_steps > 0) & (end_steps <= last_step)
     end_steps = np.maximum.accumulate(np.minimum(end_steps, last_step))
-    is_in_time = time_s[end_steps] < measured_s + MAX_LATENESS_S
+    is_in_time = time_s[end_steps] < measurement_times_s + MAX_LATENESS_S
     is_usable = is_inside & is_in_time
     # EKF2 fuses only the newer of two samples in one prediction step
     is_usable[:-1] &= end_steps[1:] > end_steps[:-1]
-    action, can_start = _find_sample_actions(inputs, segment, measured_s, end_steps, is_usable)
-    action[np.isin(timestamp_s, received.reset_s) & (action == FUSE)] = START_FUSION
-    # Events without a sample divide gaps of the position source: height and heading are fused at
-    # each event. Their number is the same for all delays
+    action, can_start = _find_sample_actions(
+        inputs, segment, measurement_times_s, end_steps, is_usable
+    )
+    action[np.isin(timestamp_s, received_positions.reset_times_s) & (action == FUSE)] = START_FUSION
+    # In gaps of the position source, events without a sample fuse height and heading. Their number
+    # must be the same for all delays
     gap_s = np.diff(np.r_[time_s[0], timestamp_s, time_s[-1]])
-    extra_event_counts = np.maximum(np.ceil(gap_s / inputs.max_interval_s).astype(int) - 1, 0)
+    extra_event_counts = np.maximum(np.ceil(gap_s / inputs.max_event_interval_s).astype(int) - 1, 0)
     sample_event_rows = np.cumsum(extra_event_counts[:-1] + 1) - 1
     event_count = len(timestamp_s) + int(extra_event_counts.sum())
     events = np.zeros(event_count, EVENT_DTYPE)
@@ -179,65 +187,78 @@ def _make_events(inputs: Inputs, segment: ReplaySegment, delays: FusionDelays) -
         )
     )
     events["sample"], events["time_s"] = -1, time_s[events["end_step"]]
-    is_late = is_inside & is_in_time & (fusion_due_s - measured_s > MIN_LATENESS_S)
+    is_late = is_inside & is_in_time & (fusion_due_s - measurement_times_s > MIN_LATENESS_S)
     sample_indices = np.arange(first_row, last_row)
     is_lost = is_inside & ~is_in_time
     events[sample_event_rows] = np.rec.fromarrays(
-        [end_steps, sample_indices, action, is_usable, can_start, is_late, is_lost, measured_s],
+        [
+            end_steps,
+            sample_indices,
+            action,
+            is_usable,
+            can_start,
+            is_late,
+            is_lost,
+            measurement_times_s,
+        ],
         dtype=EVENT_DTYPE,
     )
     return events.view(np.recarray)
 
 
 def _find_sample_actions(
-    inputs: Inputs,
+    inputs: ReplayInputs,
     segment: ReplaySegment,
-    measured_at_s: Array,
+    measurement_times_s: Array,
     end_steps: IntArray,
     is_usable: BoolArray,
 ) -> tuple[IntArray, BoolArray]:
     """Return the action of EKF2 on each sample, and True for samples that may start fusion.
 
-    The actions are IDLE, FUSE and START. Source: PX4-Autopilot ``ev_control.cpp``.
+    Source: PX4-Autopilot ``ev_control.cpp``.
     """
-    rules = inputs.rules
-    action = np.full(len(measured_at_s), NO_ACTION)
-    can_start = np.zeros(len(measured_at_s), dtype=bool)
+    fusion_rules = inputs.rules
+    action = np.full(len(measurement_times_s), NO_ACTION)
+    can_start = np.zeros(len(measurement_times_s), dtype=bool)
     usable_rows = np.flatnonzero(is_usable)
-    intervals_s = np.diff(measured_at_s[usable_rows], prepend=-np.inf)
-    can_start[usable_rows] = intervals_s < rules.start_interval_s
+    intervals_s = np.diff(measurement_times_s[usable_rows], prepend=-np.inf)
+    can_start[usable_rows] = intervals_s < fusion_rules.start_interval_s
     # Time (s) from the previous usable sample to each sample
     sample_gaps_s = segment.time_s[end_steps[usable_rows] - 1] - np.concatenate(
-        [[np.inf], measured_at_s[usable_rows[:-1]]]
+        [[np.inf], measurement_times_s[usable_rows[:-1]]]
     )
     is_fusing = segment.is_fusing
     for row, (interval_s, gap_s) in enumerate(
         zip(intervals_s.tolist(), sample_gaps_s.tolist(), strict=True)
     ):
-        is_fusing = is_fusing and not gap_s > rules.stop_timeout_s
+        is_fusing = is_fusing and not gap_s > fusion_rules.stop_timeout_s
         if is_fusing:
             action[usable_rows[row]] = FUSE
-        elif interval_s < rules.start_interval_s:
+        elif interval_s < fusion_rules.start_interval_s:
             action[usable_rows[row]] = START_FUSION
             is_fusing = True
     return action, can_start
 
 
-def _integrate_sensitivities(segment: ReplaySegment, start: IntArray, end: IntArray) -> Array:
-    """Integrate :attr:`Intervals.sensitivities` over the intervals from step start to end."""
-    step_counts = end - start
+def _integrate_sensitivities(
+    segment: ReplaySegment, start_steps: IntArray, end_steps: IntArray
+) -> Array:
+    """Integrate :attr:`EventIntervals.sensitivities` from start to end step of each interval."""
+    step_counts = end_steps - start_steps
     # All intervals are integrated together, step by step. They are sorted by length, so that the
     # intervals that continue are the first rows of the arrays
-    longest_first = np.argsort(-step_counts, kind="stable")
-    first_start_steps = start[longest_first]
-    d_attitude, d_velocity, d_position = sensitivities = np.zeros(
-        (3, len(end), 3, SENSITIVITY_COLUMN_COUNT)
+    longest_first_indices = np.argsort(-step_counts, kind="stable")
+    first_start_steps = start_steps[longest_first_indices]
+    attitude_sensitivity, velocity_sensitivity, position_sensitivity = sensitivities = np.zeros(
+        (3, len(end_steps), 3, SENSITIVITY_COLUMN_COUNT)
     )
-    d_attitude[:, :, 0:3] = np.eye(3)
+    attitude_sensitivity[:, :, 0:3] = np.eye(3)
     specific_force_ned_m_s2 = rotate(segment.body_to_ned[1:], segment.force_m_s2)
     step_numbers = np.arange(int(step_counts.max(initial=0)))
     for step_number, count in zip(
-        step_numbers, np.searchsorted(-step_counts[longest_first], -step_numbers), strict=True
+        step_numbers,
+        np.searchsorted(-step_counts[longest_first_indices], -step_numbers),
+        strict=True,
     ):
         step = first_start_steps[:count] + step_number
         rows = slice(count)
@@ -245,14 +266,16 @@ def _integrate_sensitivities(segment: ReplaySegment, start: IntArray, end: IntAr
         force_m_s2 = specific_force_ned_m_s2[step]
         # Derivative of attitude by gyro bias, and of velocity by accelerometer bias, in one step
         bias_sensitivity_step = -segment.body_to_ned[1:][step] * dt
-        d_position[rows] += 0.5 * dt * d_velocity[rows]
-        d_velocity[rows] += (-skew(force_m_s2) * dt) @ d_attitude[rows]
-        d_velocity[rows, :, 6:9] += bias_sensitivity_step
-        d_velocity[rows, :, ACCELERATION_COLUMN] += (force_m_s2 + GRAVITY_M_S2) * dt[:, :, 0]
-        d_position[rows] += 0.5 * dt * d_velocity[rows]
-        d_attitude[rows, :, 3:6] += bias_sensitivity_step
-        d_attitude[rows, :, CORRECTION_COLUMN] -= segment.correction_rad[step]
-    sensitivities[:, longest_first] = sensitivities.copy()
+        position_sensitivity[rows] += 0.5 * dt * velocity_sensitivity[rows]
+        velocity_sensitivity[rows] += (-skew(force_m_s2) * dt) @ attitude_sensitivity[rows]
+        velocity_sensitivity[rows, :, 6:9] += bias_sensitivity_step
+        velocity_sensitivity[rows, :, ACCELERATION_COLUMN] += (force_m_s2 + GRAVITY_M_S2) * dt[
+            :, :, 0
+        ]
+        position_sensitivity[rows] += 0.5 * dt * velocity_sensitivity[rows]
+        attitude_sensitivity[rows, :, 3:6] += bias_sensitivity_step
+        attitude_sensitivity[rows, :, ATTITUDE_CORRECTION_COLUMN] -= segment.correction_rad[step]
+    sensitivities[:, longest_first_indices] = sensitivities.copy()
     return np.concatenate(sensitivities, axis=1)
 
 
@@ -267,7 +290,7 @@ def _compute_imu_process_noise(
     """
     n = np.maximum(step_counts, 1.0)[:, None, None]
     d = duration_s[:, None, None] / n
-    # Derivative of the velocity by the attitude error for one of n equal prediction steps
+    # m: velocity change (m/s) per attitude error (rad) in one of n equal prediction steps
     m = velocity_per_attitude_error / n
     mm = m @ m.transpose(0, 2, 1)
     eye = np.eye(3)

@@ -16,7 +16,7 @@ from px4fuse.ekf2.replay_segments import THETA, VELOCITY, ReplaySegment, SensorS
 from px4fuse.trajectory.rotation import skew
 
 # Minimum magnetometer noise (gauss) that EKF2 uses
-MIN_SIGMA_GAUSS = 0.01
+MIN_MAGNETOMETER_SIGMA_GAUSS = 0.01
 IDENTITY_MATRIX = np.eye(3)
 # v @ CROSS_PRODUCT is the cross product matrix [v]× of a vector v, flattened
 CROSS_PRODUCT_TENSOR = skew(IDENTITY_MATRIX).reshape(3, 9)
@@ -48,7 +48,7 @@ def average_by_event(
     segment: ReplaySegment, sensor_samples: SensorSamples, event_steps: IntArray
 ) -> EventSamples:
     """Average the magnetometer or optical flow samples between two events (fused at the later)."""
-    event_index = np.searchsorted(event_steps, sensor_samples.step)
+    event_index = np.searchsorted(event_steps, sensor_samples.step_indices)
     is_inside = event_index < len(event_steps)
     event_count = len(event_steps)
     event_index = event_index[is_inside]
@@ -59,14 +59,15 @@ def average_by_event(
         np.add.at(event_sums, event_index, rows[is_inside])
         return np.asarray((event_sums.T / sample_counts).T)
 
-    value, rotation_to_body, noise = map(
+    value, rotation_to_body, noise_variance = map(
         mean, (sensor_samples.value, sensor_samples.rotation_to_body, sensor_samples.noise)
     )
-    if VELOCITY in sensor_samples.state_rows:  # add the IMU's velocity change up to the event
+    if VELOCITY in sensor_samples.state_rows:
+        # Optical flow samples exclude the velocity change since the start of the segment
         velocity_m_s = segment.imu_velocity_change_m_s[event_steps]
         value = value + np.einsum("eab,eb->ea", rotation_to_body, velocity_m_s)
     sample_count = np.bincount(event_index, sensor_samples.sample_count[is_inside], event_count)
-    return EventSamples(value, rotation_to_body, np.asarray(sample_count, float), noise)
+    return EventSamples(value, rotation_to_body, np.asarray(sample_count, float), noise_variance)
 
 
 def fuse_mean(
@@ -79,8 +80,8 @@ def fuse_mean(
 ) -> tuple[Array, Array, Array]:
     """Fuse the mean of magnetometer or optical flow samples in all filter configurations.
 
-    Return state, covariance, and an array of shape (3, filters, components): innovation, its
-    variance for one sample, and 1 if fused. The array is NaN without a sample.
+    Return state, covariance, and an array of shape (3, filters, components): innovation, the
+    innovation variance of a single sample (for the gate), and 1 if fused; NaN without a sample.
 
     Parameters
     ----------
@@ -95,13 +96,13 @@ def fuse_mean(
     """
     measured_state = x[:, state_rows]
     sample_count, R = sample_mean.sample_count, sample_mean.noise
-    state_cross_matrix, theta_cross_matrix = (
+    state_skew_matrix, theta_skew_matrix = (
         (vectors @ CROSS_PRODUCT_TENSOR).reshape(-1, 3, 3)
         for vectors in (measured_state, x[:, THETA])
     )
     H = np.zeros((len(x), sample_mean.value.shape[-1], x.shape[1]))
-    H[:, :, THETA] = sample_mean.rotation_to_body @ state_cross_matrix
-    H[:, :, state_rows] = sample_mean.rotation_to_body @ (IDENTITY_MATRIX - theta_cross_matrix)
+    H[:, :, THETA] = sample_mean.rotation_to_body @ state_skew_matrix
+    H[:, :, state_rows] = sample_mean.rotation_to_body @ (IDENTITY_MATRIX - theta_skew_matrix)
     predicted_value = (H[:, :, state_rows] @ measured_state[:, :, None])[:, :, 0]
     if bias_state_rows is not None:
         H[:, :, bias_state_rows] = IDENTITY_MATRIX

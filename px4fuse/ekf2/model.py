@@ -1,10 +1,9 @@
 """Replay of EKF2 with logged or changed parameters, from a log with PX4's default profile.
 
 The model has 15 error states, linearised about the published attitude, and starts from the logged
-``estimator_states``. Inputs are the logged IMU data and positions. In a flight with GNSS, the model
-also uses velocities and, if logged, the magnetometer (21 states). EKF2's published height and
-heading replace all other measurements. :mod:`px4fuse.ekf2.replay` compares each replay with the
-log.
+``estimator_states``. It fuses the logged positions; with GNSS also velocities and, if logged,
+heights and the magnetometer (21 states). A height or heading without a fused sensor is EKF2's
+published one. :mod:`px4fuse.ekf2.replay` compares each replay with the log.
 
 All filter configurations (parameters, states, aiding sources, gate) run together, to save time.
 """
@@ -27,16 +26,16 @@ from px4fuse.ekf2.filter_recursion import (
     POSITION_COLUMNS,
     FilterConfiguration,
     SegmentRun,
+    estimate_state_correlation,
     run_segment,
-    with_state_correlation,
 )
-from px4fuse.ekf2.heights import MIN_GATE
-from px4fuse.ekf2.inputs import ANALYSIS_NAME, Inputs, find_matching_samples, prepare_inputs
-from px4fuse.ekf2.intervals import FusionDelays, Intervals, make_intervals
+from px4fuse.ekf2.heights import MIN_INNOVATION_GATE
+from px4fuse.ekf2.inputs import ANALYSIS_NAME, ReplayInputs, find_matching_samples, prepare_inputs
+from px4fuse.ekf2.intervals import EventIntervals, FusionDelays, make_intervals
 from px4fuse.ekf2.output_predictor import compute_published_state, sum_attitude_corrections
 from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
-    MAX_REJECTED_FOR_COMPARISON,
+    MAX_COMPARED_REJECTED_FRACTION,
     Agreement,
     Ekf2Replay,
     compare_with_log,
@@ -71,7 +70,7 @@ from px4fuse.readers.px4_innovations import with_gnss_innovations
 from px4fuse.trajectory.rotation import rotate
 
 # Maximum delay (s) of the fusion horizon: PX4's maximum of EKF2_DELAY_MAX
-MAX_HORIZON_S = 1.0
+MAX_HORIZON_DELAY_S = 1.0
 
 # Number of replays that run together. A larger batch needs less time per replay, but more memory
 REPLAY_BATCH_SIZE = 10
@@ -80,20 +79,20 @@ EVENTS_PER_BLOCK = 512
 # State indices of velocity and position
 VELOCITY_AND_POSITION = slice(VELOCITY.start, POSITION.stop)
 
-# Field of Agreement by PX4's name of the aiding source, if it does not have this name
+# Field of Agreement by PX4's name of an aiding source, if their names differ
 AGREEMENT_FIELD_BY_AID = {FLOW.name: "carried_difference_m"}
 
-ConfigurationRequest = Callable[[Inputs], Sequence[FilterConfiguration]]
+ConfigurationRequest = Callable[[ReplayInputs], Sequence[FilterConfiguration]]
 
 
 @dataclass(frozen=True)
-class Model:
+class Ekf2Model:
     """Flight data for replays of EKF2 with other parameters.
 
     Attributes
     ----------
-    intervals : mapping from Timing to tuple of Intervals
-        Intervals of each segment that are already computed.
+    intervals : mapping from FusionDelays to tuple of EventIntervals
+        State transitions between events that are already computed, for each segment.
     baseline_replay : Ekf2Replay
         Replay with the logged parameters; ``agreement`` compares it with the log.
     runs : tuple of SegmentRun
@@ -101,16 +100,16 @@ class Model:
     """
 
     flight: Flight
-    inputs: Inputs
-    intervals: Mapping[FusionDelays, tuple[Intervals, ...]]
+    inputs: ReplayInputs
+    intervals: Mapping[FusionDelays, tuple[EventIntervals, ...]]
     baseline_replay: Ekf2Replay
     agreement: Agreement
     runs: tuple[SegmentRun, ...] = ()
 
 
-def open_model(
+def prepare_ekf2_model(
     flight: Flight, request_configurations: ConfigurationRequest = lambda _: ()
-) -> Model | Unavailable:
+) -> Ekf2Model | Unavailable:
     """Prepare a flight for EKF2 replays, and replay it with the logged parameters.
 
     ``request_configurations`` returns filter configurations that will be needed later. They run
@@ -118,7 +117,8 @@ def open_model(
     """
     failed_agreements: dict[str, Agreement] = {}
     while not isinstance(
-        model := _open_without_aids(flight, request_configurations, failed_agreements), Unavailable
+        model := _prepare_without_aids(flight, request_configurations, failed_agreements),
+        Unavailable,
     ):
         if not (further_omitted_aids := model.agreement.doubtful.keys() - failed_agreements.keys()):
             break
@@ -126,15 +126,14 @@ def open_model(
     return model
 
 
-def _open_without_aids(
+def _prepare_without_aids(
     flight: Flight,
     request_configurations: ConfigurationRequest,
     failed_agreements: Mapping[str, Agreement],
-) -> Model | Unavailable:
-    """Prepare a replay that omits some aiding sources.
+) -> Ekf2Model | Unavailable:
+    """Prepare a replay without the aiding sources whose earlier replay disagreed with the log.
 
-    ``failed_agreements`` contains each omitted source (PX4's name), and the failed agreement of an
-    earlier replay that fused it.
+    ``failed_agreements`` contains the agreement of the earlier replay by PX4's name of the source.
     """
     omitted_aids = {name: agreement.doubtful[name] for name, agreement in failed_agreements.items()}
     inputs = prepare_inputs(flight, omitted_aids)
@@ -145,10 +144,10 @@ def _open_without_aids(
     baseline_configuration = FilterConfiguration(inputs.settings)
     delays = baseline_configuration.compute_delays(inputs)
     intervals = tuple(make_intervals(inputs, segment, delays) for segment in inputs.segments)
-    segments = tuple(with_state_correlation(inputs, segment) for segment in inputs.segments)
+    segments = tuple(estimate_state_correlation(inputs, segment) for segment in inputs.segments)
     inputs = replace(inputs, segments=segments)
     configurations = [baseline_configuration]
-    if np.mean(inputs.received.rejected > 0.0) > MAX_REJECTED_FOR_COMPARISON:
+    if np.mean(inputs.received.rejected > 0.0) > MAX_COMPARED_REJECTED_FRACTION:
         configurations.append(FilterConfiguration(inputs.settings, uses_logged_decisions=True))
     for configuration in request_configurations(inputs):
         configurations += [] if configuration in configurations else [configuration]
@@ -158,18 +157,18 @@ def _open_without_aids(
     agreement = compare_with_log(flight, baseline_replay)
     if isinstance(agreement, Unavailable):
         return agreement
-    model = Model(flight, inputs, intervals_by_delays, baseline_replay, agreement, tuple(runs))
+    model = Ekf2Model(flight, inputs, intervals_by_delays, baseline_replay, agreement, tuple(runs))
     rejected_fraction = max(
         agreement.rejected_fraction_logged, agreement.rejected_fraction_replayed
     )
     if (
-        rejected_fraction > MAX_REJECTED_FOR_COMPARISON
+        rejected_fraction > MAX_COMPARED_REJECTED_FRACTION
         and np.isfinite(inputs.received.rejected).any()
     ):
         agreement_with_rejections = compare_with_log(flight, replay_with_logged_rejections(model))
         if isinstance(agreement_with_rejections, Agreement):
             agreement = with_logged_rejections(agreement, agreement_with_rejections)
-    # The agreement of an omitted source is that of the earlier replay, which fused the source
+    # For each omitted source, report the agreement of the earlier replay that fused the source
     failed_results = {
         (field_name := AGREEMENT_FIELD_BY_AID.get(name, name)): getattr(
             failed_agreement, field_name
@@ -186,25 +185,25 @@ def _open_without_aids(
     )
 
 
-def replay_with_logged_rejections(model: Model) -> Ekf2Replay:
+def replay_with_logged_rejections(model: Ekf2Model) -> Ekf2Replay:
     """Replay EKF2 with the logged parameters, rejections and resets."""
     configuration = FilterConfiguration(model.inputs.settings, uses_logged_decisions=True)
     return _make_replay(model.inputs, _run_model(model, [configuration]), configuration, {})
 
 
 def replay_with_settings(
-    model: Model,
+    model: Ekf2Model,
     settings: Sequence[Mapping[str, float]],
     excluded_times_s: Array | None = None,
     without: Mapping[str, float] | None = None,
 ) -> Iterator[Ekf2Replay]:
     """Replay EKF2 with several sets of changed parameters.
 
-    The result yields one replay at a time and runs a few together, to limit memory.
+    The replays are computed in small batches, to limit memory.
 
     Parameters
     ----------
-    model : Model
+    model : Ekf2Model
     settings : sequence of mapping
         Changed parameters of each replay, by PX4 name and in PX4's units.
     excluded_times_s : ndarray, optional
@@ -222,9 +221,9 @@ def replay_with_settings(
     unmodelled_parameters = PARAMETERS.keys() - inputs.settings.keys()
     reasons = dict.fromkeys(
         unmodelled_parameters,
-        f"EKF2 fused {inputs.aid.label}, to which this parameter does not apply",
+        f"EKF2 fused {inputs.aid.label}, which this parameter does not affect",
     )
-    height_text = f"the replay uses the logged EKF2 height ({inputs.logged_height_reason})"
+    logged_height_text = f"the replay uses the logged EKF2 height ({inputs.logged_height_reason})"
     if inputs.aid == GNSS_POS:
         for parameter_names, reason in (
             (
@@ -233,14 +232,17 @@ def replay_with_settings(
             ),
             (
                 BAROMETER.measurement_parameters,
-                height_text if inputs.logged_height_reason else "EKF2 fused no barometer height",
+                logged_height_text
+                if inputs.logged_height_reason
+                else "EKF2 fused no barometer height",
             ),
         ):
             reasons |= dict.fromkeys(unmodelled_parameters & parameter_names, reason)
     if inputs.rules.uses_delay_as_horizon:
         firmware = model.flight.log.firmware
         reasons["EKF2_DELAY_MAX"] = (
-            f"in {firmware} the largest delay parameter is the delay of the fusion horizon instead"
+            f"in {firmware} the largest delay parameter is the delay of the fusion horizon, not "
+            "EKF2_DELAY_MAX"
         )
     if inputs.received.uses_sender_times:
         reasons[GNSS_POS.delay] = "EKF2 uses the measurement times of the receiver driver"
@@ -249,12 +251,12 @@ def replay_with_settings(
     without = without or {}
     fused_aids = list_modelled_aids(inputs) if without else []
     if unknown_aids := without.keys() - set(fused_aids):
-        fused_text = ", ".join(fused_aids)
+        fused_aids_text = ", ".join(fused_aids)
         if inputs.logged_height_reason:
-            fused_text = f"{fused_text}; {height_text}"
+            fused_aids_text = f"{fused_aids_text}; {logged_height_text}"
         raise SettingsError(
             f"{min(unknown_aids)} cannot be omitted: the replay of this log fuses only "
-            f"{fused_text}."
+            f"{fused_aids_text}."
         )
     if excluded_times_s is not None:
         excluded_rows = find_matching_samples(inputs.received.timestamp_s, excluded_times_s)
@@ -280,7 +282,7 @@ def replay_with_settings(
 
 
 def _run_replays(
-    model: Model,
+    model: Ekf2Model,
     configurations: Sequence[FilterConfiguration],
     changes: Sequence[Mapping[str, float]],
     excluded_times_s: Array | None,
@@ -304,7 +306,7 @@ def _run_replays(
         yield structs.replace(replay, updates=updates, agreement=model.agreement)
 
 
-def list_modelled_aids(inputs: Inputs) -> list[str]:
+def list_modelled_aids(inputs: ReplayInputs) -> list[str]:
     """Return PX4's names of the aiding sources that the EKF2 model fuses."""
     segment = inputs.segments[0]
     is_fused = {
@@ -318,7 +320,7 @@ def list_modelled_aids(inputs: Inputs) -> list[str]:
     return [*(aid.name for aid in is_fused if is_fused[aid]), *height_aids]
 
 
-def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
+def add_position_noise(model: Ekf2Model, sigma_m: float, seed: int) -> Ekf2Model:
     """Add normal noise with standard deviation ``sigma_m`` (m) to each position in the inputs."""
     inputs = model.inputs
     rng = np.random.default_rng(seed)
@@ -327,30 +329,30 @@ def with_position_noise(model: Model, sigma_m: float, seed: int) -> Model:
         if samples is not None:
             position_noise_m = rng.normal(scale=sigma_m, size=samples.position_m.shape)
             new_inputs[name] = replace(samples, position_m=samples.position_m + position_noise_m)
-    # The noise does not change the times of the positions, so the computed intervals are reused
+    # Noise changes no times, so the computed intervals stay valid; earlier runs do not
     return replace(model, inputs=replace(inputs, **new_inputs), runs=())
 
 
-def with_misaligned_positions(model: Model, rotation_deg: float, delay_s: float) -> Model:
+def misalign_positions(model: Ekf2Model, rotation_deg: float, delay_s: float) -> Ekf2Model:
     """Rotate the positions in the inputs (clockwise from above), and delay their timestamps."""
     if not rotation_deg and not delay_s:
         return model
-    received = model.inputs.received
+    received_positions = model.inputs.received
     rotation_matrix = Rotation.from_euler("z", rotation_deg, degrees=True).as_matrix().T
-    velocity_m_s = received.velocity_m_s
-    received = replace(
-        received,
-        timestamp_s=received.timestamp_s + delay_s,
-        position_m=received.position_m @ rotation_matrix,
+    velocity_m_s = received_positions.velocity_m_s
+    received_positions = replace(
+        received_positions,
+        timestamp_s=received_positions.timestamp_s + delay_s,
+        position_m=received_positions.position_m @ rotation_matrix,
         velocity_m_s=None if velocity_m_s is None else velocity_m_s @ rotation_matrix,
     )
     intervals = {} if delay_s else model.intervals
-    inputs = replace(model.inputs, received=received)
+    inputs = replace(model.inputs, received=received_positions)
     return replace(model, inputs=inputs, intervals=intervals, runs=())
 
 
 def compute_delayed_tracks(
-    model: Model, configurations: Sequence[FilterConfiguration]
+    model: Ekf2Model, configurations: Sequence[FilterConfiguration]
 ) -> Iterator[pd.DataFrame]:
     """Yield position and velocity at the fusion horizon for each filter configuration.
 
@@ -365,7 +367,9 @@ def compute_delayed_tracks(
         yield _join_segments(tracks)
 
 
-def _run_model(model: Model, configurations: Sequence[FilterConfiguration]) -> Sequence[SegmentRun]:
+def _run_model(
+    model: Ekf2Model, configurations: Sequence[FilterConfiguration]
+) -> Sequence[SegmentRun]:
     if model.runs and all(
         configuration in model.runs[0].configurations for configuration in configurations
     ):
@@ -374,9 +378,9 @@ def _run_model(model: Model, configurations: Sequence[FilterConfiguration]) -> S
 
 
 def run_configurations(
-    inputs: Inputs,
+    inputs: ReplayInputs,
     configurations: Sequence[FilterConfiguration],
-    computed_intervals: Mapping[FusionDelays, Sequence[Intervals]],
+    computed_intervals: Mapping[FusionDelays, Sequence[EventIntervals]],
 ) -> list[SegmentRun]:
     """Run filter configurations through all segments, and return states and updates by segment.
 
@@ -399,7 +403,7 @@ def run_configurations(
 
 
 def _make_track(run: SegmentRun, position_m: Array, velocity_m_s: Array) -> pd.DataFrame:
-    """Return velocity and position (in published metres) at each prediction step."""
+    """Return position, scaled like EKF2's published position, and velocity after each step."""
     states = np.hstack([position_m / run.segment.position_scale, velocity_m_s])
     return pd.DataFrame(states, time_index(run.segment.time_s), Columns.STATE, copy=False)
 
@@ -410,19 +414,22 @@ def _join_segments(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
 
 
 def _make_replay(
-    inputs: Inputs,
+    inputs: ReplayInputs,
     runs: Sequence[SegmentRun],
     configuration: FilterConfiguration,
     changed_parameters: Mapping[str, float],
 ) -> Ekf2Replay:
     configuration_index = runs[0].configurations.index(configuration)
-    delayed_tables, published_tables = zip(
-        *(_make_delayed_and_published(inputs, run, configuration_index) for run in runs),
+    delayed_tracks, published_tracks = zip(
+        *(_make_state_tracks(inputs, run, configuration_index) for run in runs),
         strict=True,
     )
-    updates_by_run = [_collect_updates_by_aid(inputs, run, configuration_index) for run in runs]
+    aid_updates_of_runs = [
+        _collect_updates_by_aid(inputs, run, configuration_index) for run in runs
+    ]
     updates_by_aid = {
-        name: pd.concat([updates[name] for updates in updates_by_run]) for name in updates_by_run[0]
+        name: pd.concat([updates[name] for updates in aid_updates_of_runs])
+        for name in aid_updates_of_runs[0]
     }
     return Ekf2Replay(
         settings=configuration.settings,
@@ -430,12 +437,12 @@ def _make_replay(
         updates=updates_by_aid.pop(inputs.aid.name),
         flow_only_spans_s=tuple(
             span
-            for run, updates in zip(runs, updates_by_run, strict=True)
+            for run, updates in zip(runs, aid_updates_of_runs, strict=True)
             if run.segment.flow is not None
             for span in _find_flow_only_spans(updates[inputs.aid.name], run.segment)
         ),
-        delayed=_join_segments(delayed_tables),
-        published=_join_segments(published_tables),
+        delayed=_join_segments(delayed_tracks),
+        published=_join_segments(published_tracks),
         other_aid_updates=updates_by_aid,
         stretches_s=tuple(tuple(run.segment.time_s[[0, -1]].tolist()) for run in runs),
         source=inputs.received.source,
@@ -445,7 +452,7 @@ def _make_replay(
 
 
 def _find_flow_only_spans(updates: pd.DataFrame, segment: ReplaySegment) -> list[Span]:
-    """Return the time spans (s) above RESTART_GAP_S in which flow, but no position, was fused."""
+    """Return spans (s) longer than RESTART_GAP_S in which flow, but no position, was fused."""
     is_used = (updates["fused"] > 0.0) | (updates["reset"] > 0.0)
     fusion_times_s = [*updates.loc[is_used, "fused_at_s"], float(segment.time_s[-1])]
     return [
@@ -456,7 +463,7 @@ def _find_flow_only_spans(updates: pd.DataFrame, segment: ReplaySegment) -> list
 
 
 def _collect_updates_by_aid(
-    inputs: Inputs, run: SegmentRun, configuration_index: int
+    inputs: ReplayInputs, run: SegmentRun, configuration_index: int
 ) -> dict[str, pd.DataFrame]:
     """Return the updates with each aiding source; the keys are PX4's names of the sources."""
     events, height_filter = run.events[configuration_index], run.height_filter
@@ -497,10 +504,10 @@ def _collect_updates_by_aid(
             updates_by_aid[name] = height_filter.make_update_table(name, configuration_index, end_s)
     if inputs.received.velocity_m_s is not None:
         gate = run.configurations[configuration_index].settings[GNSS_VEL.gate]
-        # EKF2 clips some innovations to the gate and fuses them; the factor allows for rounding
-        squared_gate = (1.0 + 1e-9) * max(gate, MIN_GATE) ** 2
+        # Innovations that EKF2 clipped to the gate count as inside: the factor allows for rounding
+        squared_gate = (1.0 + 1e-9) * max(gate, MIN_INNOVATION_GATE) ** 2
         is_outside_gate = (nu[:, :3] ** 2 > squared_gate * S[:, :3]).any(axis=1)
-        # Without GNSS height, the replay uses EKF2's logged height
+        # Without GNSS height, the replay uses EKF2's logged height and no vertical velocity
         axes = AXIS_NAMES if GNSS_HGT.name in updates_by_aid else HORIZONTAL_AXES
         updates_by_aid[GNSS_VEL.name] = make_axis_table(axes, slice(len(axes)), is_outside_gate)
     if run.vision_filter is not None:
@@ -510,16 +517,16 @@ def _collect_updates_by_aid(
     return updates_by_aid
 
 
-def _make_delayed_and_published(
-    inputs: Inputs, run: SegmentRun, configuration_index: int
+def _make_state_tracks(
+    inputs: ReplayInputs, run: SegmentRun, configuration_index: int
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return the state at the fusion horizon, and the published state, after each step."""
     segment = run.segment
     configuration = run.configurations[configuration_index]
     state, reset = compute_delayed_states(run, configuration_index)
-    horizon_s = min(configuration.compute_delays(inputs).horizon_s, MAX_HORIZON_S)
+    horizon_s = min(configuration.compute_delays(inputs).horizon_s, MAX_HORIZON_DELAY_S)
     lag_steps = max(round(horizon_s / inputs.mean_step_s), 1)
-    # without attitude states, the published attitude is used unchanged, so its correction is 0
+    # Without attitude states, the model uses EKF2's published attitude without correction
     attitude_correction_rad = np.zeros((len(state), 3))
     if configuration.estimates_attitude:
         attitude_correction_rad = sum_attitude_corrections(
@@ -573,36 +580,37 @@ def _compute_states_after_steps(run: SegmentRun, configuration_index: int, rows:
 def _propagate_states(
     run: SegmentRun, configuration_index: int, interval_index: IntArray, steps: slice
 ) -> Array:
-    """Propagate the state from the start of the interval of each step to the end of the step."""
+    """Return the state after each prediction step, propagated from the event before the step."""
     segment, configuration = run.segment, run.configurations[configuration_index]
     start_state: Array = run.state[interval_index, configuration_index]
     state, body_to_ned = start_state.copy(), segment.body_to_ned[1:][steps]
     step_s = segment.step_s[steps, None]
-    first_step = np.searchsorted(interval_index, interval_index)
-    is_first_step = (first_step == np.arange(len(first_step)))[:, None]
+    interval_first_step = np.searchsorted(interval_index, interval_index)
+    is_first_step = (interval_first_step == np.arange(len(interval_first_step)))[:, None]
 
     def sum_since_event(increments: Array) -> Array:
         cumulative_sum = np.cumsum(increments, axis=0)
-        return np.asarray(cumulative_sum - (cumulative_sum - increments)[first_step])
+        return np.asarray(cumulative_sum - (cumulative_sum - increments)[interval_first_step])
 
-    def value_before_step(rows: slice) -> Array:
+    def get_state_before_step(rows: slice) -> Array:
         previous_state = np.concatenate([state[:1, rows], state[:-1, rows]])
         return np.where(is_first_step, start_state[:, rows], previous_state)
 
-    # As in intervals.py: θ += -R b_g Δt; v += (θ × a - R b_a + a + g) Δt; p += mean velocity · Δt
-    rotation_steps = -rotate(body_to_ned, state[:, GYRO_BIAS]) * step_s
+    # Prediction of the error state, as in intervals.py:
+    # θ += -R b_g Δt; v += (θ × a - R b_a + a + g) Δt; p += mean velocity · Δt
+    rotation_increments_rad = -rotate(body_to_ned, state[:, GYRO_BIAS]) * step_s
     if configuration.estimates_attitude:
-        rotation_steps -= segment.correction_rad[steps]
-    state[:, THETA] += sum_since_event(rotation_steps)
+        rotation_increments_rad -= segment.correction_rad[steps]
+    state[:, THETA] += sum_since_event(rotation_increments_rad)
     specific_force_ned_m_s2 = rotate(body_to_ned, segment.force_m_s2[steps])
     acceleration = (
-        np.cross(value_before_step(THETA), specific_force_ned_m_s2)
+        np.cross(get_state_before_step(THETA), specific_force_ned_m_s2)
         + specific_force_ned_m_s2
         + GRAVITY_M_S2
     )
     acceleration -= rotate(body_to_ned, state[:, ACCELEROMETER_BIAS])
     state[:, VELOCITY] += sum_since_event(acceleration * step_s)
     state[:, POSITION] += sum_since_event(
-        0.5 * step_s * (value_before_step(VELOCITY) + state[:, VELOCITY])
+        0.5 * step_s * (get_state_before_step(VELOCITY) + state[:, VELOCITY])
     )
     return state

@@ -57,41 +57,42 @@ def compute_published_state(
     """
     step_s = segment.step_s[:, None]
     mean_step_s = float(np.mean(segment.step_s))
-    # EKF2 corrects the newest IMU samples with the bias at the fusion horizon
-    increments = segment.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag_steps)[1:]
-    increments = rotate(segment.body_to_ned[1:], increments)
-    increments += np.cross(attitude_difference_rad[1:], increments)
-    increments += GRAVITY_M_S2
-    increments *= step_s
+    # EKF2 corrects the newest IMU samples with the bias at the fusion horizon. To save memory, one
+    # array contains specific force, then velocity increments, then position increments
+    imu_increments = segment.force_m_s2 - delay_by(state[:, ACCELEROMETER_BIAS], lag_steps)[1:]
+    imu_increments = rotate(segment.body_to_ned[1:], imu_increments)
+    imu_increments += np.cross(attitude_difference_rad[1:], imu_increments)
+    imu_increments += GRAVITY_M_S2
+    imu_increments *= step_s
     velocity_m_s = _predict_output(
-        state[:, VELOCITY], increments, lag_steps, mean_step_s, settings["EKF2_TAU_VEL"]
+        state[:, VELOCITY], imu_increments, lag_steps, mean_step_s, settings["EKF2_TAU_VEL"]
     )
     # mean velocity of a step = velocity before + half of the IMU increment, because corrections are
     # added at the end of the step
-    increments *= 0.5
-    increments += velocity_m_s[:-1]
-    increments *= step_s
+    imu_increments *= 0.5
+    imu_increments += velocity_m_s[:-1]
+    imu_increments *= step_s
     # without resets: a reset shifts all buffered outputs, so the predictor has no error to correct
     position_without_resets = state[:, POSITION] - reset_m
     position_m = _predict_output(
-        position_without_resets, increments, lag_steps, mean_step_s, settings["EKF2_TAU_POS"]
+        position_without_resets, imu_increments, lag_steps, mean_step_s, settings["EKF2_TAU_POS"]
     )
     position_m += delay_by(reset_m, lag_steps)
     return velocity_m_s, position_m
 
 
 def _predict_output(
-    state: Array, increments: Array, lag_steps: int, step_s: float, tau_s: float
+    state: Array, output_increments: Array, lag_steps: int, step_s: float, tau_s: float
 ) -> Array:
-    """Return the output of the predictor: sum of IMU ``increments`` and of corrections.
+    """Return the sum of increments from the IMU, corrected with the delayed ``state`` as in EKF2.
 
-    o: state minus sum of increments; c: sum of corrections, each of which shifts the whole buffer;
-    g: gain. In step k, the error at the fusion horizon is e_k = o_(k-lag) - c_k, and
-    c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
+    o: state minus sum of increments; c: sum of corrections, each of which shifts all buffered
+    outputs; g: gain. In step k, the error at the fusion horizon, ``lag_steps`` ago, is
+    e_k = o_(k-lag) - c_k, and c_(k+1) = c_k + g e_k + 0.1 g² Σ e.
     """
-    dead_reckoned = np.concatenate([state[:1], increments])
-    np.cumsum(dead_reckoned, axis=0, out=dead_reckoned)
-    offset = state - dead_reckoned
+    dead_reckoned_state = np.concatenate([state[:1], output_increments])
+    np.cumsum(dead_reckoned_state, axis=0, out=dead_reckoned_state)
+    offset = state - dead_reckoned_state
     offset -= (start_offset := offset[0].copy())
     gain = step_s / np.clip(tau_s, step_s, 10.0)
     integral_gain = INTEGRAL_GAIN * gain**2
@@ -101,8 +102,8 @@ def _predict_output(
         delay_by(offset, lag_steps),
     )
     correction_sum += start_offset
-    dead_reckoned += correction_sum
-    return dead_reckoned
+    dead_reckoned_state += correction_sum
+    return dead_reckoned_state
 
 
 def delay_by(values: Array, lag_steps: int) -> Array:
@@ -113,10 +114,10 @@ def delay_by(values: Array, lag_steps: int) -> Array:
 def sum_attitude_corrections(
     error_rad: Array, lag_steps: int, step_s: float, horizon_s: float
 ) -> Array:
-    """Return the sum of the output predictor's attitude corrections after each step.
+    """Return the sum of the output predictor's attitude corrections (rad) after each step.
 
-    Each step corrects the attitude by 0.5 · step / horizon of ``error_rad``, the attitude error at
-    the fusion horizon (rotation vectors, shape (n + 1, 3)), ``lag_steps`` behind the output.
+    ``error_rad`` (rotation vectors, shape (n + 1, 3)) is the attitude error at the fusion horizon,
+    ``lag_steps`` before the output. Each step corrects the fraction 0.5 · step_s / horizon_s of it.
     """
     gain = ATTITUDE_CORRECTION_GAIN * step_s / max(horizon_s, step_s)
     numerator, denominator = np.zeros((2, lag_steps + 2))
@@ -129,15 +130,15 @@ def sum_attitude_corrections(
 def _apply_recursive_filter(numerator: Array, denominator: Array, values: Array) -> Array:
     """Apply a recursive (IIR) filter by solving banded triangular systems (LAPACK dtbtrs)."""
     value_count = len(values)
-    filtered = np.zeros(values.shape)
+    filtered_values = np.zeros(values.shape)
     for delay in np.flatnonzero(numerator[:value_count]).tolist():
-        filtered[delay:] += numerator[delay] * values[: value_count - delay]
+        filtered_values[delay:] += numerator[delay] * values[: value_count - delay]
     for rows in row_blocks(value_count):
-        block = filtered[rows]
+        block = filtered_values[rows]
         if rows.start:
             for delay in (1 + np.flatnonzero(denominator[1:])).tolist():
-                past_output = filtered[rows.start - delay : rows.start][: len(block)]
+                past_output = filtered_values[rows.start - delay : rows.start][: len(block)]
                 block[:delay] -= denominator[delay] * past_output
         bands = np.tile(denominator, (len(block), 1)).T
         block[:] = lapack.dtbtrs(bands, block, uplo="L")[0]
-    return filtered
+    return filtered_values

@@ -53,32 +53,32 @@ CONSTANT_INNOVATIONS_REASON = "the logged or replayed innovations are constant"
 # Maximum time (s) from an update to its logged innovation (estimator_innovations)
 MAX_INNOVATION_AGE_S = 0.5
 # Two times are in one prediction step if they differ by less than this time (s)
-MAX_SAME_STEP_DIFFERENCE_S = 0.002
+SAME_STEP_TOLERANCE_S = 0.002
 # Minimum correlation of replayed and logged innovations: above 0.997 with complete logs, below 0.9
 # with a downsampled source or IMU dropouts (tests/benchmarks/bench_ekf2.py)
 MIN_INNOVATION_CORRELATION = 0.95
 # Maximum |median of (S replayed / S logged) - 1|: below 0.003 with complete logs, above 0.05 with a
 # downsampled position source
-MAX_RELATIVE_S_DIFFERENCE = 0.05
+MAX_S_RATIO_DEVIATION = 0.05
 # Maximum RMS difference (m) of replayed and logged position: below 0.013 m with complete logs
 MAX_PUBLISHED_DIFFERENCE_M = 0.10
 # Maximum difference (m) of replayed and logged position while optical flow, which is logged at a
 # reduced rate, is the only horizontal aiding source
 MAX_FLOW_ONLY_DIFFERENCE_M = 0.5
-# Single innovations are compared only if a smaller fraction of the samples is rejected. Each
-# rejection changes many later innovations
-MAX_REJECTED_FOR_COMPARISON = 0.05
-# Published positions are compared only if a smaller fraction of the samples is rejected. With more
-# rejections, EKF2's position is mostly integrated from the IMU
+# Innovations are compared sample by sample only if less than this fraction is rejected, because
+# each rejection changes many later innovations
+MAX_COMPARED_REJECTED_FRACTION = 0.05
+# Published positions are compared only if less than this fraction of the samples is rejected. With
+# more rejections, EKF2's position is mostly integrated from the IMU
 MOSTLY_REJECTED_FRACTION = 0.5
-# Minimum correlation of replayed and logged innovations if a larger fraction is rejected
-MIN_MOSTLY_IMU_CORRELATION = 0.99
+# Minimum correlation of replayed and logged innovations above MOSTLY_REJECTED_FRACTION
+MIN_IMU_DRIVEN_CORRELATION = 0.99
 # Maximum |rejected fraction of the replay - rejected fraction in the log|
-MAX_REJECTED_DIFFERENCE = 0.05
+MAX_REJECTED_DEVIATION = 0.05
 # Maximum |mean NIS of the replay / mean NIS in the log - 1|
 MAX_RELATIVE_NIS_DIFFERENCE = 0.25
-# Factor on MAX_PUBLISHED_DIFFERENCE_M for a replay with EKF2's logged rejections, which is used on
-# flights with many rejections
+# On flights with many rejections, the replay uses EKF2's logged rejections, and this factor
+# increases MAX_PUBLISHED_DIFFERENCE_M
 REJECTION_TOLERANCE_FACTOR = 3.0
 
 
@@ -118,7 +118,7 @@ class Agreement(Record, kw_only=True):
     ev_pos, gnss_pos, gnss_vel, gnss_hgt, baro_hgt : mapping from axis to AxisAgreement
         Innovations of each aiding source, by PX4's name.
     samples : int
-        Number of compared innovations, which do not include the first seconds of a segment.
+        Number of compared innovations, without the first REPLAY_SETTLING_S of each segment.
     decisions_same : float
         Fraction of the samples that EKF2 and replay both rejected or both accepted.
     published_rms_difference_m : float
@@ -206,7 +206,10 @@ class Ekf2Replay(Record, kw_only=True, omit_defaults=False):
     flow_only_spans_s: NotWritten[Spans] = NOT_WRITTEN
 
     def find_evaluated_spans(self) -> Spans:
-        """Return the replayed time spans (s), without REPLAY_SETTLING_S and optical flow alone."""
+        """Return the replayed time spans (s) for comparisons.
+
+        They exclude times with optical flow alone, and REPLAY_SETTLING_S after each start.
+        """
         evaluated_spans_s = []
         for start, end in self.stretches_s:
             begin_s = start + REPLAY_SETTLING_S
@@ -224,13 +227,13 @@ class _ComparedInnovations(NamedTuple):
 
     logged: pd.DataFrame
     replayed: pd.DataFrame
-    axes: dict[str, AxisAgreement]
+    agreement_by_axis: dict[str, AxisAgreement]
 
     def compute_rejected_fractions(self) -> tuple[float, float]:
-        logged_fraction, replayed_fraction = (
+        logged_rejected_fraction, replayed_rejected_fraction = (
             float(np.mean(innovations["rejected"] > 0.0)) for innovations in self[:2]
         )
-        return logged_fraction, replayed_fraction
+        return logged_rejected_fraction, replayed_rejected_fraction
 
 
 def compare_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavailable:
@@ -260,35 +263,38 @@ def compare_with_log(flight: Flight, replay: Ekf2Replay) -> Agreement | Unavaila
     rejected_fraction_logged, rejected_fraction_replayed = (
         position_agreement.compute_rejected_fractions()
     )
-    is_good, reason = _judge_agreement(
-        position_agreement.axes, rejected_fraction_logged, rejected_fraction_replayed
+    is_in_agreement, reason = _judge_agreement(
+        position_agreement.agreement_by_axis, rejected_fraction_logged, rejected_fraction_replayed
     )
     agreement_by_aid, omitted_aids = _compare_other_aids(ekf2, replay)
-    flow_error_m = _compute_flow_only_difference_m(ekf2, replay)
-    if flow_error_m is not None and flow_error_m > MAX_FLOW_ONLY_DIFFERENCE_M:
+    flow_only_difference_m = _compute_flow_only_difference_m(ekf2, replay)
+    if flow_only_difference_m is not None and flow_only_difference_m > MAX_FLOW_ONLY_DIFFERENCE_M:
         omitted_aids[FLOW.name] = (
             f"while {FLOW.label} was the only horizontal aiding source, replayed and logged "
-            f"positions differ by {_format_exceeding(flow_error_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
+            "positions differ by "
+            f"{_format_above_limit(flow_only_difference_m, MAX_FLOW_ONLY_DIFFERENCE_M)} m "
             f"(limit {MAX_FLOW_ONLY_DIFFERENCE_M:g} m)"
         )
     is_same_decision = (position_agreement.logged["rejected"] > 0.0).to_numpy() == (
         position_agreement.replayed["rejected"] > 0.0
     )
-    distances_m = [axis.position_rms_difference_m for axis in position_agreement.axes.values()]
+    rms_differences_m = [
+        axis.position_rms_difference_m for axis in position_agreement.agreement_by_axis.values()
+    ]
     return Agreement(
-        north=position_agreement.axes["north"],
-        east=position_agreement.axes["east"],
-        **(agreement_by_aid | {aid.name: position_agreement.axes}),
+        north=position_agreement.agreement_by_axis["north"],
+        east=position_agreement.agreement_by_axis["east"],
+        **(agreement_by_aid | {aid.name: position_agreement.agreement_by_axis}),
         doubtful=omitted_aids,
         samples=len(position_agreement.logged),
         rejected_fraction_logged=rejected_fraction_logged,
         rejected_fraction_replayed=rejected_fraction_replayed,
         decisions_same=float(np.mean(is_same_decision)),
-        published_rms_difference_m=math.hypot(*distances_m),
-        good=is_good,
+        published_rms_difference_m=math.hypot(*rms_differences_m),
+        good=is_in_agreement,
         reason=reason,
         heading_rms_difference_deg=_compute_heading_difference_deg(ekf2, replay),
-        carried_difference_m=flow_error_m,
+        carried_difference_m=flow_only_difference_m,
     )
 
 
@@ -300,18 +306,18 @@ def _compare_innovations(
     has_measurement_times: bool,
 ) -> _ComparedInnovations | str:
     """Compare replayed with logged innovations; return a reason if this is not possible."""
-    matched_updates = match_updates(
+    update_rows = match_updates(
         replayed_innovations,
         logged_innovations.index.to_numpy(),
         has_measurement_times=has_measurement_times,
     )
-    is_used = (matched_updates >= 0) & inside_spans(
+    is_used = (update_rows >= 0) & is_inside_spans(
         logged_innovations.index, replay.find_evaluated_spans()
     )
     # If EKF2 resets its state to a sample, it logs innovation 0 for this sample
     is_used &= logged_innovations.filter(regex="innovation_[a-z]+_m$").any(axis=1)
     logged_innovations = logged_innovations[is_used]
-    replayed_innovations = replayed_innovations.iloc[matched_updates[is_used]]
+    replayed_innovations = replayed_innovations.iloc[update_rows[is_used]]
     if len(logged_innovations) < MIN_COMPARED_INNOVATIONS:
         return (
             f"the log contains only {count_noun(len(logged_innovations), 'innovation')} in the "
@@ -335,7 +341,7 @@ def _compare_innovations(
 
 
 def _compute_flow_only_difference_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
-    """Return the largest position difference (m) while optical flow was the only horizontal aid.
+    """Return the largest difference (m) of replayed and logged position with optical flow alone.
 
     Return None if other horizontal aiding sources were always available.
     """
@@ -343,15 +349,17 @@ def _compute_flow_only_difference_m(ekf2: Ekf2, replay: Ekf2Replay) -> float | N
     if logged_state.empty:
         return None
     north_difference_m, east_difference_m = (
-        _subtract_logged(replay, logged_state, name) for name in Columns.POSITION[:2]
+        _compute_replayed_minus_logged(replay, logged_state, name) for name in Columns.POSITION[:2]
     )
     return float(np.hypot(north_difference_m, east_difference_m).max())
 
 
-def _subtract_logged(replay: Ekf2Replay, logged_state: pd.DataFrame, name: str) -> Array:
+def _compute_replayed_minus_logged(
+    replay: Ekf2Replay, logged_state: pd.DataFrame, name: str
+) -> Array:
     """Return replayed minus logged values of one column of the published state."""
-    replayed = np.interp(logged_state.index, replay.published.index, replay.published[name])
-    return np.asarray(replayed - logged_state[name])
+    replayed_values = np.interp(logged_state.index, replay.published.index, replay.published[name])
+    return np.asarray(replayed_values - logged_state[name])
 
 
 def _compute_heading_difference_deg(ekf2: Ekf2, replay: Ekf2Replay) -> float | None:
@@ -378,8 +386,8 @@ def _compare_other_aids(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any],
     for name, updates in replay.other_aid_updates.items():
         if (aid_log := ekf2.aids.get(name)) is None:
             continue
-        # Barometer updates are matched by measurement time: the replay fuses a sample only at the
-        # end of the interval, later than EKF2
+        # Barometer updates are matched by measurement time, not fusion time: the replay fuses them
+        # later than EKF2, at the end of an interval
         matched_updates = (
             updates.assign(fused_at_s=updates.index) if name == BAROMETER.name else updates
         )
@@ -387,30 +395,32 @@ def _compare_other_aids(ekf2: Ekf2, replay: Ekf2Replay) -> tuple[dict[str, Any],
             ekf2,
             replay,
             matched_updates,
-            logged_aid_innovations(name, aid_log),
+            select_logged_aid_innovations(name, aid_log),
             innovation_topic(AIDS[name]) in aid_log.topics,
         )
         if isinstance(comparison, str):
-            is_good, reason = (
+            is_in_agreement, reason = (
                 name == GNSS_VEL.name and comparison != CONSTANT_INNOVATIONS_REASON,
                 comparison,
             )
         else:
-            agreement_by_aid[name] = comparison.axes
-            is_good, reason = _judge_agreement(
-                comparison.axes, *comparison.compute_rejected_fractions()
+            agreement_by_aid[name] = comparison.agreement_by_axis
+            is_in_agreement, reason = _judge_agreement(
+                comparison.agreement_by_axis, *comparison.compute_rejected_fractions()
             )
-            is_good |= name == GNSS_VEL.name
-        if not is_good:
+            is_in_agreement |= name == GNSS_VEL.name
+        if not is_in_agreement:
             omitted_aids[name] = reason
     return agreement_by_aid, omitted_aids
 
 
-def logged_aid_innovations(name: str, aid_log: AidLog) -> pd.DataFrame:
+def select_logged_aid_innovations(name: str, aid_log: AidLog) -> pd.DataFrame:
     """Return logged innovations, S and rejections of the aiding source ``name`` (PX4's name)."""
     gate = aid_log.parameters.get(AIDS[name].gate, AIDS[name].default_gate)
     axes = [axis for axis in AXIS_NAMES if axis in aid_log.axes]
-    return _join_axes({axis: select_axis_innovations(aid_log, axis, gate) for axis in axes})
+    return _join_axis_innovations(
+        {axis: select_axis_innovations(aid_log, axis, gate) for axis in axes}
+    )
 
 
 def list_innovation_axes(updates: pd.DataFrame) -> list[NedAxis]:
@@ -419,10 +429,12 @@ def list_innovation_axes(updates: pd.DataFrame) -> list[NedAxis]:
 
 def logged_innovations(ekf2: Ekf2) -> pd.DataFrame:
     """Return the logged position innovations north and east, with S and rejections."""
-    return _join_axes({axis: ekf2.innovations[axis] for axis in HORIZONTAL_AXES})
+    return _join_axis_innovations({axis: ekf2.innovations[axis] for axis in HORIZONTAL_AXES})
 
 
-def _join_axes(innovations: Mapping[NedAxis, pd.DataFrame | Unavailable]) -> pd.DataFrame:
+def _join_axis_innovations(
+    innovations: Mapping[NedAxis, pd.DataFrame | Unavailable],
+) -> pd.DataFrame:
     columns = {}
     for axis, axis_innovations in innovations.items():
         if isinstance(axis_innovations, Unavailable):
@@ -433,7 +445,7 @@ def _join_axes(innovations: Mapping[NedAxis, pd.DataFrame | Unavailable]) -> pd.
     return pd.DataFrame(columns).dropna()
 
 
-def inside_spans(times_s: ArrayLike, spans_s: Spans) -> BoolArray:
+def is_inside_spans(times_s: ArrayLike, spans_s: Spans) -> BoolArray:
     """Return True for each time that is inside one of the time spans."""
     times_array_s = np.asarray(times_s)
     is_inside = np.zeros(times_array_s.shape, bool)
@@ -444,28 +456,28 @@ def inside_spans(times_s: ArrayLike, spans_s: Spans) -> BoolArray:
 
 def rows_inside(table: T, spans_s: Spans) -> T:
     """Return the rows of a table (indexed by time in s) that are inside one of the time spans."""
-    return table[inside_spans(table.index, spans_s)]
+    return table[is_inside_spans(table.index, spans_s)]
 
 
 def match_updates(
-    updates: pd.DataFrame, logged_s: Array, *, has_measurement_times: bool
+    updates: pd.DataFrame, logged_times_s: Array, *, has_measurement_times: bool
 ) -> IntArray:
     """Return for each logged innovation the index of its replayed update, or -1.
 
     ``has_measurement_times`` is True if the innovations are from estimator_aid_src topics.
     """
     if has_measurement_times:
-        return find_matching_samples(updates.index.to_numpy(), logged_s)
-    fused_at_s = updates["fused_at_s"].to_numpy()
-    update_row = np.searchsorted(fused_at_s, logged_s + 1e-4, side="right") - 1
-    age_s = logged_s - fused_at_s[np.maximum(update_row, 0)]
-    is_matched = (update_row >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
+        return find_matching_samples(updates.index.to_numpy(), logged_times_s)
+    fusion_times_s = updates["fused_at_s"].to_numpy()
+    update_rows = np.searchsorted(fusion_times_s, logged_times_s + 1e-4, side="right") - 1
+    age_s = logged_times_s - fusion_times_s[np.maximum(update_rows, 0)]
+    is_matched = (update_rows >= 0) & (age_s <= MAX_INNOVATION_AGE_S)
     # A row that is logged in the same prediction step as a fusion may still contain the previous
-    # innovation, so later rows are preferred
-    is_unambiguous = is_matched & (age_s >= MAX_SAME_STEP_DIFFERENCE_S)
+    # innovation, so rows at least one step after the fusion are preferred
+    is_unambiguous = is_matched & (age_s >= SAME_STEP_TOLERANCE_S)
     return np.where(
         is_unambiguous if is_unambiguous.sum() > 0.5 * is_matched.sum() else is_matched,
-        update_row,
+        update_rows,
         -1,
     )
 
@@ -485,7 +497,8 @@ def _compare_axis(
     s_ratio_p5, s_ratio_median, s_ratio_p95 = np.percentile(S / S_logged, [5, 50, 95]).tolist()
     logged_state = rows_inside(ekf2.state, ekf2_replay.find_evaluated_spans())
     position_m, velocity_m_s = (
-        _subtract_logged(ekf2_replay, logged_state, f"{axis}_{unit}") for unit in ("m", "m_s")
+        _compute_replayed_minus_logged(ekf2_replay, logged_state, f"{axis}_{unit}")
+        for unit in ("m", "m_s")
     )
     return AxisAgreement(
         innovation_correlation=float(np.corrcoef(nu, nu_logged)[0, 1]),
@@ -539,10 +552,10 @@ def _judge_agreement(
     """Return True if the replay agrees with the log, and the statistics as a reason."""
     s_ratios = (axis.s_ratio_median for axis in axes.values())
     worst_s_ratio = max(s_ratios, key=lambda s_ratio: abs(s_ratio - 1.0))
-    if abs(worst_s_ratio - 1.0) > MAX_RELATIVE_S_DIFFERENCE:
+    if abs(worst_s_ratio - 1.0) > MAX_S_RATIO_DEVIATION:
         return False, (
-            f"the innovation variance of the replay is {worst_s_ratio:.2f} times the logged one "
-            f"(tolerance {MAX_RELATIVE_S_DIFFERENCE:.0%}): EKF2 fused samples that are not in the "
+            f"the innovation variance S of the replay is {worst_s_ratio:.2f} times the logged S "
+            f"(limit 1 ± {MAX_S_RATIO_DEVIATION:.2f}): EKF2 fused samples that are not in the "
             "log"
         )
     min_correlation = min(axis.innovation_correlation for axis in axes.values())
@@ -551,31 +564,31 @@ def _judge_agreement(
     )
     if min_correlation >= MIN_INNOVATION_CORRELATION:
         difference_m = max(axis.position_rms_difference_m for axis in axes.values())
-        limit_m = tolerance_factor * MAX_PUBLISHED_DIFFERENCE_M
-        if difference_m > limit_m:
+        max_difference_m = tolerance_factor * MAX_PUBLISHED_DIFFERENCE_M
+        if difference_m > max_difference_m:
             return False, (
                 "the innovations agree, but replayed and published positions differ by "
-                f"{_format_exceeding(difference_m, limit_m)} m RMS (limit {limit_m:g} m): the log "
-                "lacks an input of EKF2's output predictor"
+                f"{_format_above_limit(difference_m, max_difference_m)} m RMS "
+                f"(limit {max_difference_m:g} m): the log lacks an input of EKF2's output predictor"
             )
         return True, correlation_text
-    if max(rejected_fraction_logged, rejected_fraction_replayed) < MAX_REJECTED_FOR_COMPARISON:
+    if max(rejected_fraction_logged, rejected_fraction_replayed) < MAX_COMPARED_REJECTED_FRACTION:
         return False, f"{correlation_text}, below the minimum of {MIN_INNOVATION_CORRELATION:g}"
     rejected_fraction_difference = abs(rejected_fraction_replayed - rejected_fraction_logged)
     relative_nis_difference = max(
         abs(axis.nis_mean_replayed / axis.nis_mean_logged - 1.0) for axis in axes.values()
     )
     tolerance_text = (
-        f"the replay rejected {rejected_fraction_replayed:.1%} of the samples, EKF2 "
+        f"the replay rejected {rejected_fraction_replayed:.1%} of the samples, EKF2 in the log "
         f"{rejected_fraction_logged:.1%}; "
         f"the mean NIS differs by {relative_nis_difference:.0%}"
     )
     if (
-        rejected_fraction_difference > MAX_REJECTED_DIFFERENCE
+        rejected_fraction_difference > MAX_REJECTED_DEVIATION
         or relative_nis_difference > MAX_RELATIVE_NIS_DIFFERENCE
     ):
         return False, (
-            f"{tolerance_text} (limits {MAX_REJECTED_DIFFERENCE:.0%} and "
+            f"{tolerance_text} (limits {MAX_REJECTED_DEVIATION:.0%} and "
             f"{MAX_RELATIVE_NIS_DIFFERENCE:.0%})"
         )
     return (
@@ -585,33 +598,35 @@ def _judge_agreement(
     )
 
 
-def _format_exceeding(value: float, limit: float) -> str:
+def _format_above_limit(value: float, limit: float) -> str:
     """Format a value with enough decimals (at least 2) to differ from the limit."""
     return next(f"{value:.{n}f}" for n in range(2, 17) if round(value, n) > limit or n == 16)
 
 
 def with_logged_rejections(agreement: Agreement, agreement_with_rejections: Agreement) -> Agreement:
-    """Return ``agreement_with_rejections``, judged with the limits for logged rejections.
+    """Judge the agreement of a replay that uses EKF2's logged rejections.
 
-    It compares the log with a replay that uses EKF2's logged rejections: with many rejections, one
-    sample near the gate can make a correct replay differ from the log. Rejected fraction and
-    decisions are from ``agreement``, which compares the log with a replay that has a gate.
+    Such a replay is needed with many rejections, because one sample near the gate can make a
+    correct replay differ from the log. Rejected fraction and decisions are from ``agreement`` of
+    the replay with its own gate.
     """
     rejected_fraction = agreement.rejected_fraction_logged
     relies_on_imu = rejected_fraction > MOSTLY_REJECTED_FRACTION
     tolerance_factor = np.inf if relies_on_imu else REJECTION_TOLERANCE_FACTOR
-    is_good, reason = _judge_agreement(agreement_with_rejections.axes, 0.0, 0.0, tolerance_factor)
+    is_in_agreement, reason = _judge_agreement(
+        agreement_with_rejections.axes, 0.0, 0.0, tolerance_factor
+    )
     min_correlation = min(
         axis.innovation_correlation for axis in agreement_with_rejections.axes.values()
     )
-    if is_good and relies_on_imu and min_correlation < MIN_MOSTLY_IMU_CORRELATION:
-        is_good = False
+    if is_in_agreement and relies_on_imu and min_correlation < MIN_IMU_DRIVEN_CORRELATION:
+        is_in_agreement = False
         reason = (
             f"the correlation {min_correlation:.4f} of replayed and logged innovations is below "
-            f"the minimum of {MIN_MOSTLY_IMU_CORRELATION:g}"
+            f"the minimum of {MIN_IMU_DRIVEN_CORRELATION:g}"
         )
     reason = f"in a replay with EKF2's logged rejections, {reason}"
-    if relies_on_imu and not is_good:
+    if relies_on_imu and not is_in_agreement:
         reason = (
             f"{reason}. EKF2 rejected {rejected_fraction:.0%} of the positions and relied on the "
             "IMU. The frame of the source is probably wrong"
@@ -620,6 +635,6 @@ def with_logged_rejections(agreement: Agreement, agreement_with_rejections: Agre
         agreement_with_rejections,
         rejected_fraction_replayed=agreement.rejected_fraction_replayed,
         decisions_same=agreement.decisions_same,
-        good=is_good,
+        good=is_in_agreement,
         reason=reason,
     )

@@ -51,28 +51,28 @@ from px4fuse.trajectory.rotation import (
 # After a longer gap (s) in the position source, the replay restarts from the logged state. In gaps
 # EKF2 fuses gravity, fake positions or zero velocity, which the model does not contain
 RESTART_GAP_S = 2.0
-# Maximum IMU interval (s): EKF2 limits a prediction step to 2 EKF2_PREDICT_US
+# Longer IMU intervals (s) interrupt the replay: EKF2 limits a prediction step to 2 EKF2_PREDICT_US
 IMU_GAP_S = 0.05
 # Minimum time (s) from EKF2's first position fusion to the start of the replay
 MIN_FUSION_S = 1.0
 # Minimum time (s) from take-off to the start of the replay: on the ground, EKF2 also fuses zero
 # velocity and gravity
-MIN_AIRBORNE_S = 4.0
+MIN_TIME_SINCE_TAKEOFF_S = 4.0
 # Time (s) from the start of a replay to the start of the evaluation
 REPLAY_SETTLING_S = 5.0
 # EKF2's first fusion of all magnetometer axes resets the field states. Logged field states are used
 # from this time (s) after the first fusion on
-MAGNETIC_FIELD_RESET_S = 1.0
+MAGNETIC_FIELD_SETTLING_S = 1.0
 # Flight time (s) before the replay that is used to estimate correlations of the initial state
-CORRELATION_HISTORY_S = 20.0
-# Rate (Hz) at which EKF2 fuses the magnetometer (SENS_MAG_RATE 15)
+STATE_CORRELATION_HISTORY_S = 20.0
+# Rate (Hz) at which EKF2 fuses the magnetometer with SENS_MAG_RATE 15 (default)
 MAG_FUSION_HZ = 14.0
 # Minimum rate (Hz) of the logged magnetometer for a replay of its fusion
 MIN_MAG_LOG_HZ = 1.5
 # Time constant (s) of EKF2's low-pass filter of innovations (updateAidSourceStatus, ekf_helper.cpp)
 INNOVATION_TIME_CONSTANT_S = 0.5
 # Minimum length (s) of a replayed segment
-MIN_SEGMENT_S = 10.0
+MIN_SEGMENT_DURATION_S = 10.0
 # Maximum delay (s) from a reset to its publication
 MAX_RESET_DELAY_S = 0.5
 # The EKF2 replay is interrupted if a larger fraction of the IMU samples within 1 s is clipped
@@ -96,11 +96,11 @@ EARTH_FIELD, BODY_FIELD = slice(15, 18), slice(18, 21)
 
 @dataclass(frozen=True)
 class SensorSamples:
-    """Magnetometer or optical flow data of one segment, as m means of successive samples.
+    """Means of successive magnetometer or optical flow samples in one segment, m in total.
 
     Attributes
     ----------
-    step : ndarray of int, shape (m,)
+    step_indices : ndarray of int, shape (m,)
         Prediction step that fuses the last sample of each mean.
     value : ndarray, shape (m, k)
         Magnetic field (gauss, FRD), or optical flow velocity forward and right minus the velocity
@@ -117,7 +117,7 @@ class SensorSamples:
         the sensor's bias vector (body frame).
     """
 
-    step: IntArray
+    step_indices: IntArray
     value: Array
     rotation_to_body: Array
     sample_count: Array
@@ -139,10 +139,11 @@ class HeightSamples:
     initial_bias_and_variance : (float, float)
         Initial bias of the sensor that is not the reference (m, positive: too high), and its
         variance (m²).
-    step, measured_at_s, down_m : ndarray, shape (m,)
+    step_indices, measurement_times_s, down_m : ndarray, shape (m,)
         Prediction step, measurement time, and height (m, down) of each barometer sample.
     dead_zone_m : ndarray, shape (m,)
-        EKF2 ignores heights below the state by less than this distance (ground effect).
+        EKF2 reduces the innovation of a height below the state by up to this distance (ground
+        effect).
     weight : ndarray, shape (m,)
         Number of barometer samples fused by EKF2 that each sample represents.
     """
@@ -150,8 +151,8 @@ class HeightSamples:
     fused_sensors: tuple[str, ...]
     reference: str
     initial_bias_and_variance: tuple[float, float]
-    step: IntArray
-    measured_at_s: Array
+    step_indices: IntArray
+    measurement_times_s: Array
     down_m: Array
     dead_zone_m: Array
     weight: Array
@@ -227,8 +228,8 @@ class ReplaySegment:
     @cached_property
     def imu_velocity_change_m_s(self) -> Array:
         """Velocity change (m/s, NED) since the start, integrated from the IMU, shape (n + 1, 3)."""
-        force = rotate(self.body_to_ned[1:], self.force_m_s2) + GRAVITY_M_S2
-        return cumulative_sums(force * self.step_s[:, None])
+        acceleration_m_s2 = rotate(self.body_to_ned[1:], self.force_m_s2) + GRAVITY_M_S2
+        return cumulative_sums(acceleration_m_s2 * self.step_s[:, None])
 
     @cached_property
     def imu_displacement_m(self) -> Array:
@@ -240,19 +241,19 @@ class ReplaySegment:
 def group_samples_by_event(
     segment: ReplaySegment,
     event_steps: IntArray,
-    measurement_step: IntArray,
+    measurement_steps: IntArray,
     position_m: Array,
     axes: slice,
     *quantities: Array,
 ) -> Array:
-    """Group position samples by the event (end of an interval) that fuses them.
+    """Group position samples by event: each event fuses the samples since the previous one.
 
     Parameters
     ----------
     segment : ReplaySegment
     event_steps : ndarray of int, shape (events,)
         Prediction step of each event.
-    measurement_step : ndarray of int, shape (m,)
+    measurement_steps : ndarray of int, shape (m,)
         Prediction step of each sample, increasing.
     position_m : ndarray, shape (m, a)
     axes : slice
@@ -264,19 +265,19 @@ def group_samples_by_event(
     -------
     ndarray, shape (a + 2 + len(quantities), k, events)
         Up to k samples per event. Rows: position, propagated to the event with the IMU; age (s);
-        further quantities; and 1 for a sample, 0 for an empty slot.
+        further quantities; and 1 for a sample, 0 for padding.
     """
-    event_indices = np.searchsorted(event_steps, measurement_step)
+    event_indices = np.searchsorted(event_steps, measurement_steps)
     event_indices = event_indices[event_indices < len(event_steps)]
     sample_count = len(event_indices)
-    measurement_step = measurement_step[:sample_count]
+    measurement_steps = measurement_steps[:sample_count]
     event_step = event_steps[event_indices]
-    age_s = segment.time_s[event_step] - segment.time_s[measurement_step]
+    age_s = segment.time_s[event_step] - segment.time_s[measurement_steps]
     displacement_m = segment.imu_displacement_m[:, axes]
     velocity_m_s = segment.imu_velocity_change_m_s[:, axes]
     displacement_m = (
         displacement_m[event_step]
-        - displacement_m[measurement_step]
+        - displacement_m[measurement_steps]
         - velocity_m_s[event_step] * age_s[:, None]
     )
     index_in_event = np.arange(sample_count) - np.searchsorted(event_indices, event_indices)
@@ -293,7 +294,7 @@ def group_samples_by_event(
 
 
 def make_update_table(
-    update_records: Array, measured_at_s: Array, end_s: Array, axes: Sequence[NedAxis]
+    update_records: Array, measurement_times_s: Array, end_s: Array, axes: Sequence[NedAxis]
 ) -> pd.DataFrame:
     """Return the updates with one aiding source as a table, indexed by measurement time (s).
 
@@ -302,7 +303,7 @@ def make_update_table(
     update_records : ndarray, shape (events, k, ...)
         For up to k samples of each event: innovations, their variances, and optionally further
         columns of the table in their order; NaN without a sample.
-    measured_at_s : ndarray, shape (events, k)
+    measurement_times_s : ndarray, shape (events, k)
     end_s : ndarray, shape (events,)
         Time of each event.
     axes : sequence of str
@@ -319,14 +320,14 @@ def make_update_table(
     ]
     updates = pd.DataFrame(
         update_records[has_innovation],
-        time_index(measured_at_s[has_innovation]),
+        time_index(measurement_times_s[has_innovation]),
         columns[: update_records.shape[-1]],
     )
     return updates.assign(fused_at_s=end_s[np.nonzero(has_innovation)[0]])
 
 
 def pad_samples(sample_arrays: Sequence[Array]) -> list[Array]:
-    """Pad the arrays of :func:`group_samples_by_event` with zeros to equal samples per event k."""
+    """Pad arrays of :func:`group_samples_by_event` with zeros to the same k samples per event."""
     max_samples_per_event = max(samples.shape[1] for samples in sample_arrays)
     return [
         np.pad(samples, ((0, 0), (0, max_samples_per_event - samples.shape[1]), (0, 0)))
@@ -358,11 +359,11 @@ def find_replay_segments(
         gap_rows = np.flatnonzero(np.diff(sample_times_s) > limit)
         cut_times_s += [*sample_times_s[gap_rows], *sample_times_s[gap_rows + 1]]
     cut_times_s += _find_break_times_s(imu, ekf2) if is_gnss else ()
-    first_s = max(attitude.index[0], position_times_s[0])
+    earliest_start_s = max(attitude.index[0], position_times_s[0])
     end_s = min(attitude.index[-1], position_times_s[-1] + 1.0)
     airborne = () if isinstance(flight.airborne, Unavailable) else flight.airborne
-    field_fusion_span_s = _find_field_fusion_span(fusion_record) if is_gnss else None
-    cut_times_s += field_fusion_span_s[1:] if field_fusion_span_s else ()
+    magnetic_field_span_s = _find_field_fusion_span(fusion_record) if is_gnss else None
+    cut_times_s += magnetic_field_span_s[1:] if magnetic_field_span_s else ()
     # The replay restarts when another EKF2 instance becomes primary, because its state differs
     cut_times_s += [time_s for time_s, _ in ekf2.instances[1:]]
     parameter_changes = [change for change in ekf2.parameter_changes if change.name in PARAMETERS]
@@ -370,27 +371,34 @@ def find_replay_segments(
 
     def make_segment(start_row: int, end_s: float) -> ReplaySegment:
         segment = _make_segment(imu, attitude, ekf2, fusion_record, start_row, end_s)
-        return _add_gnss_terms(segment, imu, ekf2, fusion_record) if is_gnss else segment
+        return _add_gnss_quantities(segment, imu, ekf2, fusion_record) if is_gnss else segment
 
     segments = []
-    for part_start_s, part_end_s in pairwise(np.unique(np.clip(cut_times_s, first_s, end_s))):
+    for part_start_s, part_end_s in pairwise(
+        np.unique(np.clip(cut_times_s, earliest_start_s, end_s))
+    ):
         fusion_times_in_part_s = fusion_times_s[
             (fusion_times_s >= part_start_s) & (fusion_times_s <= part_end_s)
         ]
         if not len(fusion_times_in_part_s):
             continue
-        # The replay starts MIN_AIRBORNE_S after the first take-off, if this is before part_end_s
+        # The replay starts MIN_TIME_SINCE_TAKEOFF_S after the first take-off, if before part_end_s
         earliest_starts_s = [
-            start_s + MIN_AIRBORNE_S for start_s, _ in airborne[:1] if start_s < part_end_s
+            start_s + MIN_TIME_SINCE_TAKEOFF_S
+            for start_s, _ in airborne[:1]
+            if start_s < part_end_s
         ]
-        if field_fusion_span_s and part_start_s <= field_fusion_span_s[0] < part_end_s:
-            earliest_starts_s.append(field_fusion_span_s[0])
+        if magnetic_field_span_s and part_start_s <= magnetic_field_span_s[0] < part_end_s:
+            earliest_starts_s.append(magnetic_field_span_s[0])
         start_row = int(
             np.searchsorted(
                 state_times_s, max([fusion_times_in_part_s[0] + MIN_FUSION_S, *earliest_starts_s])
             )
         )
-        if start_row == len(state_times_s) or part_end_s - state_times_s[start_row] < MIN_SEGMENT_S:
+        if (
+            start_row == len(state_times_s)
+            or part_end_s - state_times_s[start_row] < MIN_SEGMENT_DURATION_S
+        ):
             continue
         is_covered = (imu_times_s[1:] > state_times_s[start_row]) & (imu_times_s[:-1] < part_end_s)
         if not np.all(np.diff(imu_times_s)[is_covered] <= IMU_GAP_S):
@@ -401,25 +409,26 @@ def find_replay_segments(
             if change.time_s <= part_start_s
         }
         segment = make_segment(start_row, part_end_s)
-        history_row = int(
+        history_start_row = int(
             np.searchsorted(
-                state_times_s, max(first_s, state_times_s[start_row] - CORRELATION_HISTORY_S)
+                state_times_s,
+                max(earliest_start_s, state_times_s[start_row] - STATE_CORRELATION_HISTORY_S),
             )
         )
-        if history_row < start_row:
-            preceding_segment = make_segment(history_row, state_times_s[start_row])
+        if history_start_row < start_row:
+            preceding_segment = make_segment(history_start_row, state_times_s[start_row])
             segment = replace(segment, preceding_segment=preceding_segment)
         if (
-            field_fusion_span_s
-            and field_fusion_span_s[0] <= state_times_s[start_row]
-            and part_end_s <= field_fusion_span_s[1]
+            magnetic_field_span_s
+            and magnetic_field_span_s[0] <= state_times_s[start_row]
+            and part_end_s <= magnetic_field_span_s[1]
         ):
             segment = _add_magnetic_field(segment, fusion_record, start_row, ekf2.step_s)
         segments.append(replace(segment, changed_parameters=changed_parameters))
     return tuple(segments)
 
 
-def _add_gnss_terms(
+def _add_gnss_quantities(
     segment: ReplaySegment, imu: pd.DataFrame, ekf2: Ekf2, fusion_record: FusionRecord
 ) -> ReplaySegment:
     """Add quantities that only the GNSS model uses.
@@ -465,16 +474,20 @@ def _find_break_times_s(imu: pd.DataFrame, ekf2: Ekf2) -> list[float]:
 
 
 def _compute_clipped_fraction(imu: pd.DataFrame, time_s: Array) -> Array:
-    """Return the fraction of the accelerometer axes that are clipped, for each prediction step."""
-    fraction_by_step = np.zeros(len(time_s))
+    """Return the fraction of the three accelerometer axes that is clipped in each step."""
+    clipped_fraction_by_step = np.zeros(len(time_s))
     # "clipped" has one bit per axis
     if "clipped" in imu:
-        clipped = imu.loc[(imu["clipped"] > 0.0) & (imu.index <= time_s[-1]), "clipped"]
+        clipping_masks = imu.loc[(imu["clipped"] > 0.0) & (imu.index <= time_s[-1]), "clipped"]
         clipped_fraction = (
-            np.unpackbits(clipped.to_numpy(np.uint8)[:, None], axis=1).sum(axis=1) / 3.0
+            np.unpackbits(clipping_masks.to_numpy(np.uint8)[:, None], axis=1).sum(axis=1) / 3.0
         )
-        np.maximum.at(fraction_by_step, np.searchsorted(time_s, clipped.index), clipped_fraction)
-    return fraction_by_step
+        np.maximum.at(
+            clipped_fraction_by_step,
+            np.searchsorted(time_s, clipping_masks.index),
+            clipped_fraction,
+        )
+    return clipped_fraction_by_step
 
 
 def _make_segment(
@@ -524,28 +537,28 @@ def _make_segment(
         inverse_attitude = conjugate(interpolate(at_s, step_times_s, end_attitude))
         return at_s, multiply(attitude_samples[Columns.QUATERNION].to_numpy(), inverse_attitude)
 
-    # Published attitude relative to the attitude integrated from the gyro, in NED
-    published_relative_to_gyro = interpolate(
+    # Rotation (in NED) from the attitude integrated from the gyro to EKF2's published attitude
+    gyro_to_published_rotation = interpolate(
         step_times_s, *compute_relative_attitude(attitude, 0.0, gyro_attitude)
     )
-    nominal_attitude = multiply(published_relative_to_gyro, gyro_attitude)
+    nominal_attitude = multiply(gyro_to_published_rotation, gyro_attitude)
     state_times_s, error_quaternions = compute_relative_attitude(
         fusion_record.delayed, 1e-4, nominal_attitude
     )
     attitude_error_rad = to_vector(error_quaternions)
-    published_m = _interpolate(ekf2.state[Columns.POSITION], step_times_s[:1])[0]
+    published_position_m = _interpolate(ekf2.state[Columns.POSITION], step_times_s[:1])[0]
     position_m = initial_row[Columns.POSITION].to_numpy()
-    position_m = np.where(np.isfinite(position_m), position_m, published_m)
+    position_m = np.where(np.isfinite(position_m), position_m, published_position_m)
     # Since PX4 v1.16, heights in the logged state and published heights have different origins. The
     # model uses published heights
-    position_m[2] = published_m[2]
+    position_m[2] = published_position_m[2]
     return ReplaySegment(
         time_s=step_times_s,
         step_s=step_s,
         # float32 (as in PX4) saves memory: these arrays are the largest
         body_to_ned=to_matrix(nominal_attitude).astype(np.float32),
         correction_rad=to_vector(
-            multiply(published_relative_to_gyro[1:], conjugate(published_relative_to_gyro[:-1]))
+            multiply(gyro_to_published_rotation[1:], conjugate(gyro_to_published_rotation[:-1]))
         ).astype(np.float32),
         force_m_s2=velocity_increments / step_s[:, None],
         accelerometer_bias_m_s2=accelerometer_bias,
@@ -587,7 +600,7 @@ def _find_field_fusion_span(fusion_record: FusionRecord) -> Span | None:
     first_row, last_row = np.flatnonzero(is_fused)[[0, -1]]
     if not is_fused[first_row:last_row].all():
         return None
-    return float(flag_times_s[first_row]) + MAGNETIC_FIELD_RESET_S, float(flag_times_s[last_row])
+    return float(flag_times_s[first_row]) + MAGNETIC_FIELD_SETTLING_S, float(flag_times_s[last_row])
 
 
 def _add_magnetic_field(
@@ -598,10 +611,10 @@ def _add_magnetic_field(
     sample_times_s = field_gauss.index.to_numpy()
     age_s = fusion_record.parameters.get("EKF2_MAG_DELAY", 0.0) * 1e-3 + 0.5 * step_s
     fused_samples_per_row = max(MAG_FUSION_HZ * median_interval(sample_times_s), 1.0)
-    measured_at_s = sample_times_s - age_s
+    measurement_times_s = sample_times_s - age_s
     extended_segment = add_field_states(
         segment,
-        measured_at_s,
+        measurement_times_s,
         field_gauss.iloc[:, :3].to_numpy(),
         fused_samples_per_row,
         np.asarray(initial_row[[*Columns.EARTH_FIELD, *Columns.BODY_FIELD]]),
@@ -612,47 +625,55 @@ def _add_magnetic_field(
     filtered_nu_gauss = field_gauss[Columns.FIELD_INNOVATION].to_numpy()
     return replace(
         extended_segment,
-        field=_compute_mean_field(segment, fusion_record.delayed, measured_at_s, filtered_nu_gauss),
+        field=_compute_mean_field(
+            segment, fusion_record.delayed, measurement_times_s, filtered_nu_gauss
+        ),
     )
 
 
 def _compute_mean_field(
     segment: ReplaySegment,
     delayed_state: pd.DataFrame,
-    measured_at_s: Array,
+    measurement_times_s: Array,
     filtered_nu_gauss: Array,
 ) -> SensorSamples:
-    """Compute the mean measured magnetic field between two logged rows (FRD, gauss).
+    """Compute the mean of the magnetometer samples between two logged rows (FRD, gauss).
 
-    It is the field predicted from the logged states, minus the innovation. The innovation is
-    computed from EKF2's logged low-pass filtered innovation.
+    Mean = field predicted from the logged states - innovation. The innovation is computed from two
+    successive low-pass filtered innovations in the log.
     """
-    row_interval_s = np.diff(measured_at_s)
-    is_inside = (measured_at_s[:-1] > segment.time_s[0]) & (measured_at_s[1:] <= segment.time_s[-1])
+    row_interval_s = np.diff(measurement_times_s)
+    is_inside = (measurement_times_s[:-1] > segment.time_s[0]) & (
+        measurement_times_s[1:] <= segment.time_s[-1]
+    )
     gap_free_rows = (
         np.flatnonzero(is_inside & (row_interval_s > 0.0) & (row_interval_s < RESTART_GAP_S)) + 1
     )
-    measured_at_s = measured_at_s[gap_free_rows]
+    measurement_times_s = measurement_times_s[gap_free_rows]
     row_interval_s = row_interval_s[gap_free_rows - 1]
-    fused_counts = np.maximum(np.rint(MAG_FUSION_HZ * row_interval_s), 1.0)
+    fused_sample_counts = np.maximum(np.rint(MAG_FUSION_HZ * row_interval_s), 1.0)
     new_sample_weight = row_interval_s / (
-        row_interval_s + fused_counts * INNOVATION_TIME_CONSTANT_S
+        row_interval_s + fused_sample_counts * INNOVATION_TIME_CONSTANT_S
     )
-    previous_innovation_weight = ((1.0 - new_sample_weight) ** fused_counts)[:, None]
+    previous_innovation_weight = ((1.0 - new_sample_weight) ** fused_sample_counts)[:, None]
     nu_gauss = (
         filtered_nu_gauss[gap_free_rows]
         - previous_innovation_weight * filtered_nu_gauss[gap_free_rows - 1]
     ) / (1.0 - previous_innovation_weight)
-    step, weight = compute_low_pass_weights(
-        segment, measured_at_s, fused_counts, row_interval_s / fused_counts, new_sample_weight
+    step_indices, weight = compute_low_pass_weights(
+        segment,
+        measurement_times_s,
+        fused_sample_counts,
+        row_interval_s / fused_sample_counts,
+        new_sample_weight,
     )
-    rotation_to_body = segment.body_to_ned[step].swapaxes(2, 3)
+    rotation_to_body = segment.body_to_ned[step_indices].swapaxes(2, 3)
     earth_field_gauss, body_field_gauss = (
-        _interpolate(delayed_state[names], measured_at_s)
+        _interpolate(delayed_state[names], measurement_times_s)
         for names in (Columns.EARTH_FIELD, Columns.BODY_FIELD)
     )
     rotated_earth_field = earth_field_gauss[:, None] - np.cross(
-        segment.attitude_error_rad[step], earth_field_gauss[:, None]
+        segment.attitude_error_rad[step_indices], earth_field_gauss[:, None]
     )
     expected_field_gauss = (
         np.einsum("ki,kiab,kib->ka", weight, rotation_to_body, rotated_earth_field)
@@ -660,10 +681,10 @@ def _compute_mean_field(
     )
     mean = np.einsum("ki,kiab->kab", weight, rotation_to_body)
     return SensorSamples(
-        step[:, 0],
+        step_indices[:, 0],
         expected_field_gauss - nu_gauss,
         mean,
-        fused_counts,
+        fused_sample_counts,
         np.zeros(len(gap_free_rows)),
     )
 
@@ -675,7 +696,7 @@ def compute_low_pass_weights(
     interval_s: Array,
     new_sample_weight: Array | float,
 ) -> tuple[IntArray, Array]:
-    """Return prediction step and weight of the samples in m low-pass filtered means, shape (m, k).
+    """Return prediction steps and weights, shape (m, k), of up to k samples in m low-pass means.
 
     Parameters
     ----------
@@ -684,21 +705,21 @@ def compute_low_pass_weights(
     new_sample_weight : float or ndarray, shape (m,)
         Weight of a new sample in the low-pass filter.
     """
-    # Age of each sample (unit: sample interval)
-    age_samples = np.arange(int(sample_count.max(initial=1.0)))
+    # In sample intervals: 0 is the newest sample of a mean
+    age_in_samples = np.arange(int(sample_count.max(initial=1.0)))
     weight = np.where(
-        age_samples < sample_count[:, None],
-        (1.0 - np.reshape(new_sample_weight, (-1, 1))) ** age_samples,
+        age_in_samples < sample_count[:, None],
+        (1.0 - np.reshape(new_sample_weight, (-1, 1))) ** age_in_samples,
         0.0,
     )
     weight /= weight.sum(axis=1, keepdims=True)
-    measured_at_s = newest_sample_s[:, None] - age_samples * interval_s[:, None]
-    return np.searchsorted(segment.time_s, measured_at_s - 1e-9), weight
+    measurement_times_s = newest_sample_s[:, None] - age_in_samples * interval_s[:, None]
+    return np.searchsorted(segment.time_s, measurement_times_s - 1e-9), weight
 
 
 def add_field_states(
     segment: ReplaySegment,
-    measured_at_s: Array,
+    measurement_times_s: Array,
     field_gauss: Array,
     sample_weight: float,
     initial_fields_gauss: Array,
@@ -708,14 +729,14 @@ def add_field_states(
 
     Parameters
     ----------
-    measured_at_s, field_gauss : ndarray, shape (m,) and (m, 3)
+    measurement_times_s, field_gauss : ndarray, shape (m,) and (m, 3)
         Magnetometer samples (body FRD) at EKF2's measurement time.
     sample_weight : float
         Number of samples fused by EKF2 that each logged sample represents.
     initial_fields_gauss, field_variance_gauss2 : ndarray, shape (6,)
         Initial fields of earth (NED) and body (FRD), and their variances.
     """
-    step_index, is_inside = find_sample_steps(segment, measured_at_s)
+    step_index, is_inside = find_sample_steps(segment, measurement_times_s)
     rotation_to_body = segment.body_to_ned[step_index].transpose(0, 2, 1)
     sample_count = len(step_index)
     return replace(
@@ -733,12 +754,14 @@ def add_field_states(
     )
 
 
-def find_sample_steps(segment: ReplaySegment, measured_at_s: Array) -> tuple[IntArray, BoolArray]:
+def find_sample_steps(
+    segment: ReplaySegment, measurement_times_s: Array
+) -> tuple[IntArray, BoolArray]:
     """Return the index of the prediction step in which each sample of the segment is fused.
 
     The second array is True for each given sample that is in the segment.
     """
-    step_index = np.searchsorted(segment.time_s, measured_at_s - 1e-9)
+    step_index = np.searchsorted(segment.time_s, measurement_times_s - 1e-9)
     is_inside = (step_index > 0) & (step_index < len(segment.time_s))
     return step_index[is_inside], is_inside
 
@@ -753,37 +776,40 @@ def _interpolate(table: pd.DataFrame, times_s: Array) -> Array:
     return np.column_stack([np.interp(times_s, table.index, table[name]) for name in table])
 
 
-def find_step_ends(interval_s: Array, logged_ends: IntArray, configured_step_s: float) -> IntArray:
+def find_step_ends(
+    interval_s: Array, logged_end_indices: IntArray, configured_step_s: float
+) -> IntArray:
     """Return the index of the IMU sample at the end of each prediction step of EKF2.
 
     A step ends after :func:`compute_samples_per_step` IMU samples, after ``configured_step_s``, or
     at a logged end of a step, whichever is first.
     """
     median_interval_s = float(np.median(interval_s))
-    # Number of IMU samples in each interval. If few samples are missing, the IMU itself may have
-    # gaps, so they are not counted
+    # Number of IMU samples in each logged interval. Few missing samples are not counted, because
+    # they may be gaps of the IMU itself
     sample_counts = np.maximum(np.rint(interval_s / median_interval_s), 1.0)
     if sample_counts.mean() <= 1.0 + MAX_LOST_IMU_FRACTION:
         sample_counts[:] = 1.0
-    sample_counts_at_ends = np.append(0.0, np.cumsum(sample_counts))[logged_ends]
-    samples_needed = compute_samples_per_step(
+    sample_counts_at_ends = np.append(0.0, np.cumsum(sample_counts))[logged_end_indices]
+    needed_sample_count = compute_samples_per_step(
         configured_step_s, median_interval_s, sample_counts_at_ends
     )
-    logged_end_set = set(logged_ends.tolist())
+    logged_end_set = set(logged_end_indices.tolist())
     end_indices = []
-    accumulated_count = accumulated_s = 0.0
+    accumulated_count = accumulated_time_s = 0.0
     samples = np.stack([interval_s, sample_counts], axis=1)
     for sample, (interval, sample_count) in enumerate(
         chain.from_iterable(samples[rows].tolist() for rows in row_blocks(len(samples))), start=1
     ):
         accumulated_count = accumulated_count + sample_count
-        accumulated_s = accumulated_s + interval
-        is_complete = (
-            accumulated_count >= samples_needed and accumulated_s > 0.5 * configured_step_s
+        accumulated_time_s = accumulated_time_s + interval
+        is_step_complete = (
+            accumulated_count >= needed_sample_count
+            and accumulated_time_s > 0.5 * configured_step_s
         )
-        if is_complete or accumulated_s > configured_step_s or sample in logged_end_set:
+        if is_step_complete or accumulated_time_s > configured_step_s or sample in logged_end_set:
             end_indices.append(sample)
-            accumulated_count = accumulated_s = 0.0
+            accumulated_count = accumulated_time_s = 0.0
     return np.array(end_indices, dtype=np.intp)
 
 
@@ -795,17 +821,19 @@ def downsample_imu(
     The velocity change is in the body frame at the end of the step.
     """
     start_indices = np.append(0, step_end_indices[:-1])
-    summed_rotation = cumulative_sums(rotation_vectors)
+    cumulative_rotation_rad = cumulative_sums(rotation_vectors)
     rotation_at_step_end_rad = np.repeat(
-        summed_rotation[step_end_indices], step_end_indices - start_indices, axis=0
+        cumulative_rotation_rad[step_end_indices], step_end_indices - start_indices, axis=0
     )
     step_count = len(rotation_at_step_end_rad)
     rotation_at_sample_middle_rad = 0.5 * (
-        summed_rotation[:step_count] + summed_rotation[1 : step_count + 1]
+        cumulative_rotation_rad[:step_count] + cumulative_rotation_rad[1 : step_count + 1]
     )
     velocity_increments = velocity_increments[:step_count]
     rotated_increments = velocity_increments - np.cross(
         rotation_at_step_end_rad - rotation_at_sample_middle_rad, velocity_increments
     )
-    step_rotation = summed_rotation[step_end_indices] - summed_rotation[start_indices]
-    return step_rotation, np.add.reduceat(rotated_increments, start_indices, axis=0)
+    step_rotation_rad = (
+        cumulative_rotation_rad[step_end_indices] - cumulative_rotation_rad[start_indices]
+    )
+    return step_rotation_rad, np.add.reduceat(rotated_increments, start_indices, axis=0)

@@ -4,8 +4,8 @@ The flight is replayed with KF. In each step, one more property of KF is replace
 times, noise settings, estimated states, gate, and output predictor. A step reduces or increases the
 mean square difference from the logged EKF2.
 
-Bias states are added before EKF2's process noise, which is too small for a filter without bias
-states. The last replays use EKF2's logged rejections.
+Bias states are added before EKF2's process noise, because this noise is too small for a filter
+without bias states. The steps gate and output predictor use EKF2's logged rejections.
 """
 
 import math
@@ -19,9 +19,9 @@ import pandas as pd
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import NOT_WRITTEN, Count, NotNegative, NotWritten, Record, Span
 from px4fuse.ekf2.filter_recursion import FilterConfiguration
-from px4fuse.ekf2.inputs import Inputs
+from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.model import (
-    Model,
+    Ekf2Model,
     compute_delayed_tracks,
     list_modelled_aids,
     replay_with_logged_rejections,
@@ -31,8 +31,8 @@ from px4fuse.ekf2.replay import (
     Ekf2Replay,
     Spans,
     compute_rmse_to_truth,
-    inside_spans,
     interpolate_component,
+    is_inside_spans,
     rows_inside,
 )
 from px4fuse.filter.kalman import Replay, predict_state
@@ -48,30 +48,30 @@ NO_TRUTH_OVERLAP = Unavailable(
     "Record ground truth during the whole flight.",
 )
 # Names of the properties that differ between KF and EKF2
-SAMPLES_STEP = "sample times and time steps"
+SAMPLE_TIMES_STEP = "sample times and time steps"
 TIMESTAMPS_STEP = "timestamps and delay"
-NOISE_STEP = "measurement noise"
+MEASUREMENT_NOISE_STEP = "measurement noise"
 BIASES_STEP = "accelerometer bias as a state"
 PROCESS_NOISE_STEP = "process noise"
 ATTITUDE_STEP = "attitude and gyro bias as states"
 MAGNETOMETER_STEP = "magnetometer"
-VELOCITY_STEP = "GNSS velocity"
+GNSS_VELOCITY_STEP = "GNSS velocity"
 FLOW_STEP = "optical flow"
 VISION_STEP = "external vision"
-GATE_STEP = "rejections and resets"
+REJECTION_STEP = "rejections and resets"
 OUTPUT_PREDICTOR_STEP = "output predictor"
-# Step of each aiding source (PX4's name) that EKF2 may fuse in addition to its position source
+# Step that adds an aiding source (PX4's name) to the fused position source
 STEP_BY_ADDITIONAL_AID = {FLOW.name: FLOW_STEP, EV_POS.name: VISION_STEP}
 # Order in which properties of KF are replaced by properties of EKF2. Additional aiding sources are
 # inserted before GATE
 REPLACEMENT_STEPS = (
-    SAMPLES_STEP,
+    SAMPLE_TIMES_STEP,
     TIMESTAMPS_STEP,
-    NOISE_STEP,
+    MEASUREMENT_NOISE_STEP,
     BIASES_STEP,
     PROCESS_NOISE_STEP,
     ATTITUDE_STEP,
-    GATE_STEP,
+    REJECTION_STEP,
     OUTPUT_PREDICTOR_STEP,
 )
 
@@ -79,7 +79,7 @@ TRACK_COLUMNS = (Columns.POSITION, Columns.VELOCITY)
 
 
 class Step(Record, kw_only=True):
-    """Effect of the replacement of one property of KF (such as the noise) by EKF2's property.
+    """Effect of replacing one property of KF, such as the measurement noise, by EKF2's property.
 
     Attributes
     ----------
@@ -170,18 +170,18 @@ class DifferenceExplanation(Record, kw_only=True):
 
     @property
     def unexplained_fraction(self) -> float:
-        """Unexplained fraction of the mean square position difference."""
+        """Fraction of the mean square position difference that remains after all steps."""
         return self.unexplained_mean_square_m2 / self.position_mean_square_m2
 
 
 def explain_by_steps(
-    model: Model, settings: Settings | None = None, kf_runs: Mapping[str, Replay] | None = None
+    model: Ekf2Model, settings: Settings | None = None, kf_runs: Mapping[str, Replay] | None = None
 ) -> dict[str, DifferenceExplanation] | Unavailable:
-    """Return, by axis, the part of the difference KF - EKF2 that each replaced property explains.
+    """Explain the difference KF - EKF2 along each axis by the properties that differ.
 
     Parameters
     ----------
-    model : Model
+    model : Ekf2Model
     settings : Settings, optional
         Settings of KF, with the time offset of the position source that EKF2 fused.
     kf_runs : mapping from axis name to Replay, optional
@@ -197,7 +197,7 @@ def explain_by_steps(
     baseline_replay = replay_with_logged_rejections(model)
     evaluated_spans = model.baseline_replay.find_evaluated_spans()
     state_times_s = ekf2.state.index.to_numpy()
-    is_inside = inside_spans(state_times_s, evaluated_spans)
+    is_inside = is_inside_spans(state_times_s, evaluated_spans)
     # Only times at which the EKF2 replay and all runs of KF have a state are compared
     for index in (baseline_replay.delayed.index, *(run.steps.index for run in kf_runs.values())):
         is_inside &= (state_times_s >= index[0]) & (state_times_s <= index[-1])
@@ -226,7 +226,7 @@ def explain_by_steps(
                 for direction in directions.values()
             ]
         )
-        # After the last step but GATE_STEP, only EKF2's gate and output predictor are missing
+        # Before REJECTION_STEP, only EKF2's gate and output predictor are missing in the track
         if step_name == [*configurations][-2]:
             track_without_gate = track
     spans = Segment(*state_span_s, "").cut(evaluated_spans)
@@ -258,7 +258,7 @@ def _explain_axis(
     spans_s: Spans,
     longest_rejection: RejectionRun | None,
 ) -> DifferenceExplanation:
-    """Split the difference KF - EKF2 along one axis into the parts of k replaced properties.
+    """Divide the difference KF - EKF2 along one axis among k properties that KF takes from EKF2.
 
     ``positions_by_step``, shape (k + 2, 2, n), contains position and velocity of KF, of k replays
     (each with one more property of EKF2), and of the logged EKF2, at the times of EKF2's states.
@@ -268,7 +268,7 @@ def _explain_axis(
         compute_rmse_to_truth(flight, track, direction, times_s)
         for track in positions_by_step[:, 0]
     ]
-    mean_squares = np.mean(difference_by_step_m[:-1] ** 2, axis=2)
+    mean_square_differences = np.mean(difference_by_step_m[:-1] ** 2, axis=2)
     position_change = np.abs(np.diff(positions_by_step[:-1, 0], axis=0))
     steps = tuple(
         Step(
@@ -281,14 +281,14 @@ def _explain_axis(
         )
         for name, (position_reduction, velocity_reduction), position_change_m, rmse_m in zip(
             step_names,
-            (mean_squares[:-1] - mean_squares[1:]).tolist(),
+            (mean_square_differences[:-1] - mean_square_differences[1:]).tolist(),
             position_change,
             rmse_by_step[1:-1],
             strict=True,
         )
     )
-    total_mean_squares, *_, unexplained_mean_squares = mean_squares.tolist()
-    missing_truth = NO_TRUTH_OVERLAP if isinstance(flight.truth, Truth) else flight.truth
+    total_mean_squares, *_, unexplained_mean_squares = mean_square_differences.tolist()
+    missing_truth_reason = NO_TRUTH_OVERLAP if isinstance(flight.truth, Truth) else flight.truth
     rmse_by_filter = {"kf": rmse_by_step[0], "ekf2": rmse_by_step[-1]}
     return DifferenceExplanation(
         count=len(times_s),
@@ -298,7 +298,7 @@ def _explain_axis(
         unexplained_mean_square_m2=unexplained_mean_squares[0],
         unexplained_velocity_mean_square_m2_s2=unexplained_mean_squares[1],
         position_rmse_to_truth_m={
-            name: missing_truth if rmse_m is None else rmse_m
+            name: missing_truth_reason if rmse_m is None else rmse_m
             for name, rmse_m in rmse_by_filter.items()
         },
         spans_s=spans_s,
@@ -311,7 +311,7 @@ def _explain_axis(
 
 
 def make_step_configurations(
-    inputs: Inputs, kf_settings: Settings
+    inputs: ReplayInputs, kf_settings: Settings
 ) -> dict[str, FilterConfiguration]:
     """Return the model configurations that change KF into EKF2, one property (key) after the other.
 
@@ -319,10 +319,12 @@ def make_step_configurations(
     """
     logged_settings = inputs.settings
     aid = inputs.aid
-    acceleration_noise = kf_settings.sigma_a_m_s2 * math.sqrt(kf_settings.dt_s / inputs.mean_step_s)
-    kf_process_settings = {**logged_settings, "EKF2_ACC_NOISE": acceleration_noise}
+    acceleration_noise_m_s2 = kf_settings.sigma_a_m_s2 * math.sqrt(
+        kf_settings.dt_s / inputs.mean_step_s
+    )
+    kf_process_settings = {**logged_settings, "EKF2_ACC_NOISE": acceleration_noise_m_s2}
     kf_noise_settings = {**kf_process_settings, aid.noise: kf_settings.sigma_z_m}
-    # The delay is already subtracted from the timestamps of GNSS positions
+    # KF's GNSS positions have the delay already subtracted, the timestamps of the replay have not
     applied_delay_s = logged_settings[aid.delay] * 1e-3 if aid == GNSS_POS else 0.0
     time_offset_s = kf_settings.clock_offset_s - applied_delay_s
     settings_without_lever_arm = {**kf_noise_settings, **dict.fromkeys(aid.lever_arm, 0.0)}
@@ -346,29 +348,31 @@ def make_step_configurations(
     process_step_configuration = replace(
         noise_step_configuration, settings=logged_settings, estimates_biases=True
     )
-    configuration = replace(process_step_configuration, estimates_attitude=True)
+    latest_configuration = replace(process_step_configuration, estimates_attitude=True)
     configurations = {
-        SAMPLES_STEP: replace(
+        SAMPLE_TIMES_STEP: replace(
             kf_configuration, settings=settings_without_lever_arm, timestamp_offset_s=time_offset_s
         ),
         TIMESTAMPS_STEP: kf_configuration,
-        NOISE_STEP: noise_step_configuration,
+        MEASUREMENT_NOISE_STEP: noise_step_configuration,
         BIASES_STEP: replace(noise_step_configuration, estimates_biases=True),
         PROCESS_NOISE_STEP: process_step_configuration,
-        ATTITUDE_STEP: configuration,
+        ATTITUDE_STEP: latest_configuration,
     }
     if MAG.name in replayed_aids:
-        configurations[MAGNETOMETER_STEP] = configuration = replace(
-            configuration, without=dict.fromkeys(additional_aids, 0.0)
+        configurations[MAGNETOMETER_STEP] = latest_configuration = replace(
+            latest_configuration, without=dict.fromkeys(additional_aids, 0.0)
         )
     if GNSS_VEL.name in replayed_aids:
-        configurations[VELOCITY_STEP] = configuration = replace(configuration, fuses_velocity=True)
+        configurations[GNSS_VELOCITY_STEP] = latest_configuration = replace(
+            latest_configuration, fuses_velocity=True
+        )
     for next_index, step in enumerate(step_by_aid.values(), start=1):
-        configurations[step] = configuration = replace(
-            configuration, without=dict.fromkeys(additional_aids[next_index:], 0.0)
+        configurations[step] = latest_configuration = replace(
+            latest_configuration, without=dict.fromkeys(additional_aids[next_index:], 0.0)
         )
     return configurations | {
-        GATE_STEP: FilterConfiguration(logged_settings, uses_logged_decisions=True)
+        REJECTION_STEP: FilterConfiguration(logged_settings, uses_logged_decisions=True)
     }
 
 
@@ -378,7 +382,7 @@ def _find_longest_rejection(
     updates = rows_inside(baseline_replay.updates, spans_s)
     updates = updates[updates["fused_at_s"].between(*span)]
     is_rejected = updates["rejected"].to_numpy() > 0
-    fused_at_s = updates["fused_at_s"].to_numpy()
+    fusion_times_s = updates["fused_at_s"].to_numpy()
     if not is_rejected.any():
         return None
     # A run of rejections lasts from the first rejected sample to the next fused sample
@@ -386,8 +390,8 @@ def _find_longest_rejection(
     run_starts = np.flatnonzero(rejection_change == 1)
     run_ends = np.flatnonzero(rejection_change == -1)
     longest_index = int(np.argmax(run_ends - run_starts))
-    begin_s = fused_at_s[run_starts[longest_index]]
-    end_s = fused_at_s[min(run_ends[longest_index], len(fused_at_s) - 1)]
+    begin_s = fusion_times_s[run_starts[longest_index]]
+    end_s = fusion_times_s[min(run_ends[longest_index], len(fusion_times_s) - 1)]
     track_with_gate = baseline_replay.delayed.loc[begin_s:end_s]
     position_difference = [
         track_with_gate[column]

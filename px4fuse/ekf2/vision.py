@@ -16,8 +16,8 @@ import pandas as pd
 
 from px4fuse.core.arrays import Array, ArrayPair, BoolArray, IntArray
 from px4fuse.ekf2.bias import BiasEstimator
-from px4fuse.ekf2.heights import MIN_GATE, MIN_NOISE_SIGMA
-from px4fuse.ekf2.inputs import Inputs
+from px4fuse.ekf2.heights import MIN_INNOVATION_GATE, MIN_NOISE_SIGMA
+from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.intervals import MAX_LATENESS_S
 from px4fuse.ekf2.replay_segments import (
     ReplaySegment,
@@ -37,40 +37,43 @@ MAX_REJECTION_DURATION_S = 1.0
 
 
 def group_vision_by_event(
-    inputs: Inputs,
+    inputs: ReplayInputs,
     segment: ReplaySegment,
     event_steps: IntArray,
     settings: Mapping[str, float],
     horizon_s: float,
 ) -> Array:
-    """Group the vision samples by the event that fuses them, shape (8, k, events).
+    """Group the vision samples by event: each event fuses the samples since the previous one.
 
-    Rows: position north and east (m), age, measurement time, fusion time (s), reported variances
-    north and east (m²), and 1 for a sample, 0 for an empty slot.
+    Return an array of shape (8, k, events) for up to k samples per event. Rows: position north and
+    east (m), age, measurement time, fusion time (s), reported variances north and east (m²), and 1
+    for a sample, 0 for padding.
     """
-    vision = inputs.vision
+    vision_positions = inputs.vision
     time_s = segment.time_s
-    assert vision is not None
-    measured_at_s = vision.timestamp_s - settings[EV_POS.delay] * 1e-3 - 0.5 * inputs.mean_step_s
-    fusion_due_s = np.maximum(measured_at_s, vision.arrival_s - horizon_s)
+    assert vision_positions is not None
+    measurement_times_s = (
+        vision_positions.timestamp_s - settings[EV_POS.delay] * 1e-3 - 0.5 * inputs.mean_step_s
+    )
+    fusion_due_s = np.maximum(measurement_times_s, vision_positions.arrival_s - horizon_s)
     step_index = np.maximum.accumulate(np.searchsorted(time_s, fusion_due_s - 1e-9))
     is_usable = (
         (step_index > 0)
         & (step_index < len(time_s))
-        & (fusion_due_s < measured_at_s + MAX_LATENESS_S)
+        & (fusion_due_s < measurement_times_s + MAX_LATENESS_S)
     )
-    is_usable &= np.isfinite(vision.position_m[:, 0])
+    is_usable &= np.isfinite(vision_positions.position_m[:, 0])
     # EKF2 fuses only the newer of two samples in one prediction step
     is_usable[:-1] &= step_index[1:] > step_index[:-1]
     step_index = step_index[is_usable]
     lever_arm_m = np.array([settings[name] for name in EV_POS.lever_arm]) - inputs.imu_offset_m
-    position_m = (vision.position_m[is_usable] - segment.body_to_ned[step_index] @ lever_arm_m)[
-        :, :2
-    ]
+    position_m = (
+        vision_positions.position_m[is_usable] - segment.body_to_ned[step_index] @ lever_arm_m
+    )[:, :2]
     sample_quantities = (
-        measured_at_s[is_usable],
+        measurement_times_s[is_usable],
         time_s[step_index],
-        *vision.variance_m2[is_usable, :2].T,
+        *vision_positions.variance_m2[is_usable, :2].T,
     )
     return group_samples_by_event(
         segment, event_steps, step_index, position_m, slice(0, 2), *sample_quantities
@@ -78,7 +81,9 @@ def group_vision_by_event(
 
 
 class VisionFilter:
-    """EKF2's vision fusion in several filter configurations, at the events of one segment.
+    """Fuse vision positions like EKF2 in one segment, for several filter configurations at once.
+
+    Each event fuses the up to k samples since the previous event.
 
     Parameters
     ----------
@@ -111,7 +116,7 @@ class VisionFilter:
     ) -> None:
         samples = np.stack(pad_samples(sample_arrays), axis=-1)
         self.position_m = np.moveaxis(samples[:2], 0, -1)
-        self.age_s, self.measured_at_s, self.fusion_time_s = samples[2:5]
+        self.age_s, self.measurement_times_s, self.fusion_time_s = samples[2:5]
         _, sample_count, event_count, configuration_count = samples.shape
         self.update_records = np.full((event_count, sample_count, 7, configuration_count), np.nan)
         self.position_reset_m = np.zeros((event_count, configuration_count, 2))
@@ -121,7 +126,7 @@ class VisionFilter:
         self.has_sample = [has_sample & (self.age_s > 0.0), has_sample & (self.age_s == 0.0)]
         self.has_gate = has_gate
         self.is_gnss_off = ~is_enabled_by_aid[GNSS_POS.name]
-        self.gate_squared = np.maximum(parameters[EV_POS.gate], MIN_GATE)[:, None] ** 2
+        self.gate_squared = np.maximum(parameters[EV_POS.gate], MIN_INNOVATION_GATE)[:, None] ** 2
         reported_variance = samples[5:7] * (
             uses_reported_noise & (parameters[EV_POS.noise_mode] != 1.0)
         )
@@ -138,45 +143,48 @@ class VisionFilter:
 
     def make_update_table(self, configuration_index: int, end_s: Array) -> pd.DataFrame:
         """Return the vision updates of one configuration; ``end_s``: time (s) of each event."""
-        measured_at_s = self.measured_at_s[..., configuration_index].T
+        measurement_times_s = self.measurement_times_s[..., configuration_index].T
         return make_update_table(
-            self.update_records[..., configuration_index], measured_at_s, end_s, ["north", "east"]
+            self.update_records[..., configuration_index],
+            measurement_times_s,
+            end_s,
+            ["north", "east"],
         )
 
     def fuse(
         self, event: int, x: Array, P: Array, is_last_step: bool, last_gnss_fusion_s: Array
     ) -> ArrayPair:
-        """Fuse the vision samples of one event.
+        """Fuse the vision samples of one event; return x and P.
 
         ``is_last_step``: True for the samples of the last prediction step before the event, which
         EKF2 fuses after GNSS; False for older samples.
         """
-        for slot, has_sample in enumerate(self.has_sample[is_last_step][:, event]):
+        for sample_index, has_sample in enumerate(self.has_sample[is_last_step][:, event]):
             if has_sample.any():
-                x, P = self._fuse_sample(event, slot, has_sample, x, P, last_gnss_fusion_s)
+                x, P = self._fuse_sample(event, sample_index, has_sample, x, P, last_gnss_fusion_s)
         return x, P
 
     def _fuse_sample(
         self,
         event: int,
-        slot: int,
+        sample_index: int,
         has_sample: BoolArray,
         x: Array,
         P: Array,
         last_gnss_fusion_s: Array,
     ) -> ArrayPair:
-        age_s = self.age_s[slot, event][:, None]
-        fusion_time_s = self.fusion_time_s[slot, event]
+        sample_age_s = self.age_s[sample_index, event][:, None]
+        fusion_time_s = self.fusion_time_s[sample_index, event]
         is_gnss_off = self.is_gnss_off[event]
-        R_m2 = self.R_m2[slot, event]
-        HP = P[:, HORIZONTAL_POSITION] - age_s[:, None] * P[:, HORIZONTAL_VELOCITY]
-        S = HP[:, :, HORIZONTAL_POSITION] - age_s[:, None] * HP[:, :, HORIZONTAL_VELOCITY]
+        R_m2 = self.R_m2[sample_index, event]
+        HP = P[:, HORIZONTAL_POSITION] - sample_age_s[:, None] * P[:, HORIZONTAL_VELOCITY]
+        S = HP[:, :, HORIZONTAL_POSITION] - sample_age_s[:, None] * HP[:, :, HORIZONTAL_VELOCITY]
         # diagonal is a view of S: adding R to it changes S
         diagonal = S.reshape(len(S), -1)[:, ::3]
         position_innovation_m = (
-            self.position_m[slot, event]
+            self.position_m[sample_index, event]
             - x[:, HORIZONTAL_POSITION]
-            + age_s * x[:, HORIZONTAL_VELOCITY]
+            + sample_age_s * x[:, HORIZONTAL_VELOCITY]
         )
         updates_bias = has_sample & ~is_gnss_off
         interval_s = np.where(updates_bias, fusion_time_s - self.last_sample_s, 0.0)
@@ -208,7 +216,9 @@ class VisionFilter:
             is_fused,
             is_position_reset,
         )
-        self.update_records[event, slot] = np.where(is_evaluated, np.stack(update_records), np.nan)
+        self.update_records[event, sample_index] = np.where(
+            is_evaluated, np.stack(update_records), np.nan
+        )
         K = (np.linalg.inv(S) @ HP).transpose(0, 2, 1) * is_fused[:, None, None]
         x = x + (K @ nu[:, :, None])[:, :, 0]
         P = P - K @ HP
@@ -230,10 +240,10 @@ class VisionFilter:
         if is_restarting.any():
             initialises_bias = (is_restarting & ~is_position_reset)[:, None]
             clears_bias = (is_position_reset & is_gnss_off)[:, None]
-            self.bias.value_m = np.where(
+            self.bias.bias_m = np.where(
                 initialises_bias,
                 -position_innovation_m,
-                np.where(clears_bias, 0.0, self.bias.value_m),
+                np.where(clears_bias, 0.0, self.bias.bias_m),
             )
             self.bias.variance_m2 = np.where(clears_bias, 0.0, self.bias.variance_m2)
         self.last_sample_s = np.where(has_sample, fusion_time_s, self.last_sample_s)

@@ -16,19 +16,24 @@ from px4fuse.core.arrays import Array
 from px4fuse.core.record import Count, NotNegative, Record, Share, one_line_repr
 from px4fuse.ekf2.heights import HEIGHT_SENSORS
 from px4fuse.ekf2.inputs import find_horizontal_reset_times_s
-from px4fuse.ekf2.model import Model, list_modelled_aids, replay_with_settings, with_position_noise
+from px4fuse.ekf2.model import (
+    Ekf2Model,
+    add_position_noise,
+    list_modelled_aids,
+    replay_with_settings,
+)
 from px4fuse.ekf2.replay import (
     HORIZONTAL_AXES,
     Agreement,
     Ekf2Replay,
     Spans,
     compute_rmse_to_truth,
-    inside_spans,
     interpolate_component,
+    is_inside_spans,
     list_innovation_axes,
-    logged_aid_innovations,
     logged_innovations,
     rows_inside,
+    select_logged_aid_innovations,
 )
 from px4fuse.errors import SettingsError
 from px4fuse.filter.consistency import compute_nis_band
@@ -57,7 +62,7 @@ HEIGHT_START_NOTE = (
 HEIGHT_LOGGED_NOTE = "All replays use the logged EKF2 height"
 HEADING_NOT_REPLAYED = Unavailable(
     "heading error",
-    "with external vision the replay uses the logged EKF2 heading",
+    "in a flight with external vision, the replay uses the logged EKF2 heading",
     "Use the logged heading (vehicle_attitude) instead of a replayed heading.",
 )
 HEIGHT_NOT_REPLAYED = Unavailable(
@@ -67,28 +72,28 @@ HEIGHT_NOT_REPLAYED = Unavailable(
 )
 HEIGHT_AID_NAMES = {aid.name for aid in HEIGHT_SENSORS}
 # Minimum evaluated flight time (s) after an aiding source is disabled
-MIN_EVALUATED_S = 5.0
+MIN_EVALUATED_DURATION_S = 5.0
 # Default and maximum number of parameter values in a sweep
 SWEEP_VALUE_COUNT = 9
 MAX_SWEEP_VALUES = 200
 # A rejection near the gate can change the whole replay. The replay is therefore repeated with this
 # position noise (m, 1 σ), to test if its statistics are predictable
-ADDED_NOISE_M = 0.002
-# Number of repetitions with added position noise
+ADDED_POSITION_SIGMA_M = 0.002
+# Number of repeated replays with added position noise
 NOISY_REPLAY_COUNT = 4
-# A replay is repeated if it rejects more than this fraction of the samples
+# A replay is repeated with added noise if it rejects more than this fraction of the samples
 MIN_REJECTED_FRACTION = 0.02
-# The statistics of a replay are unpredictable if it rejects more than this fraction of the samples,
+# Above this rejected fraction, the statistics of a replay are unpredictable
 MAX_REJECTED_FRACTION = 0.35
 # EKF2 resets the height after this time (s) without height fusion (hgt_fusion_timeout_max,
 # common.h)
 HEIGHT_TIMEOUT_S = 5.0
-# or if the mean NIS of its repetitions differs by more than this factor,
-MAX_NIS_RATIO = 1.10
-# their rejected fraction by more than this value,
+# Maximum ratio of the mean NIS of repeated replays; above, the statistics are unpredictable
+MAX_REPEATED_NIS_RATIO = 1.10
+# Maximum difference of the rejected fractions of repeated replays
 MAX_REJECTED_FRACTION_SPREAD = 0.03
-# or their position RMSE by more than this factor
-MAX_RMSE_RATIO = 1.15
+# Maximum ratio of the position RMSE of repeated replays
+MAX_REPEATED_RMSE_RATIO = 1.15
 
 
 class AxisSummary(Record):
@@ -105,7 +110,7 @@ class AxisSummary(Record):
 
 
 class HeightSummary(Record):
-    """Innovation statistics of a height sensor, or of vision that is fused in addition to GNSS."""
+    """Innovations and rejections of a height sensor, or of vision in addition to GNSS."""
 
     nis_mean: NotNegative
     nis_band: tuple[NotNegative, NotNegative]
@@ -203,7 +208,7 @@ class WhatIf:
 
 
 def what_if(
-    model: Model,
+    model: Ekf2Model,
     settings: Sequence[Mapping[str, float]],
     without: Mapping[str, float] | None = None,
 ) -> WhatIf | Unavailable:
@@ -211,7 +216,7 @@ def what_if(
 
     Parameters
     ----------
-    model : Model
+    model : Ekf2Model
     settings : sequence of mapping
         Changed parameters of each replay, by PX4 name.
     without : mapping from PX4's name of an aiding source to float, optional
@@ -236,14 +241,14 @@ def what_if(
         remaining_spans = [
             (max(start, first_disable_time_s), end)
             for start, end in spans_s
-            if end - first_disable_time_s > MIN_EVALUATED_S
+            if end - first_disable_time_s > MIN_EVALUATED_DURATION_S
         ]
         spans_s = tuple(remaining_spans[:1])
         if not spans_s:
             raise SettingsError(
-                f"--from {first_disable_time_s:g} s leaves less than {MIN_EVALUATED_S:g} s of the "
-                f"replayed flight, which ends at {replay_end_s:.0f} s. "
-                "Choose an earlier time."
+                f"--from {first_disable_time_s:g} s leaves less than "
+                f"{MIN_EVALUATED_DURATION_S:g} s of the replayed flight, which ends at "
+                f"{replay_end_s:.0f} s. Choose an earlier time."
             )
     summaries: list[Summary] = []
     notes: list[str] = []
@@ -268,13 +273,13 @@ def what_if(
     )
 
 
-def _describe_heading_and_height(model: Model) -> tuple[str, str]:
+def _describe_heading_and_height(model: Ekf2Model) -> tuple[str, str]:
     heading_difference_deg = model.agreement.heading_rms_difference_deg
     heading_note = HEADING_LOGGED_NOTE
     if heading_difference_deg is not None:
         heading_note = (
-            "Heading is replayed with the magnetometer (with the logged parameters it differs from "
-            f"the log by {heading_difference_deg:.1f}° RMS)"
+            "Heading is replayed with the magnetometer. With the logged parameters, the replayed "
+            f"heading differs from the logged heading by {heading_difference_deg:.1f}° RMS"
         )
     height_note = HEIGHT_LOGGED_NOTE if model.inputs.logged_height_reason else HEIGHT_REPLAYED_NOTE
     bad_acceleration_flags = model.inputs.segments[0].is_acceleration_bad
@@ -318,27 +323,30 @@ def make_sweep_values(
 
 
 def _mark_unpredictable(
-    model: Model, summaries: Sequence[Summary], spans_s: Spans, without: Mapping[str, float]
+    model: Ekf2Model,
+    summaries: Sequence[Summary],
+    spans_s: Spans,
+    disable_times_s: Mapping[str, float],
 ) -> tuple[Summary, ...]:
-    """Set ``is_predictable`` to False if added position noise changes the statistics of a replay.
+    """Set ``is_predictable`` to False if repetitions of a replay with added noise differ.
 
     Many rejections or a height reset also set ``is_predictable`` to False.
     """
-    all_summaries = [[summary] for summary in summaries]
+    summaries_by_replay = [[summary] for summary in summaries]
     repeated_summaries = [
         replay_summaries
-        for replay_summaries in all_summaries
+        for replay_summaries in summaries_by_replay
         if replay_summaries[0].changed
         and MIN_REJECTED_FRACTION < replay_summaries[0].rejected_fraction <= MAX_REJECTED_FRACTION
     ]
-    repeated_changes = [replay_summaries[0].changed for replay_summaries in repeated_summaries]
-    for seed in range(NOISY_REPLAY_COUNT if repeated_changes else 0):
-        noisy_model = with_position_noise(model, ADDED_NOISE_M, seed)
-        replays = replay_with_settings(noisy_model, repeated_changes, without=without)
+    changes_to_repeat = [replay_summaries[0].changed for replay_summaries in repeated_summaries]
+    for seed in range(NOISY_REPLAY_COUNT if changes_to_repeat else 0):
+        noisy_model = add_position_noise(model, ADDED_POSITION_SIGMA_M, seed)
+        replays = replay_with_settings(noisy_model, changes_to_repeat, without=disable_times_s)
         for replay_summaries, replay in zip(repeated_summaries, replays, strict=True):
             replay_summaries.append(_summarise_replay(model.flight, replay, spans_s))
     final_summaries = []
-    for summary, *noisy_summaries in all_summaries:
+    for summary, *noisy_summaries in summaries_by_replay:
         rejected_fractions = [
             axis_summary.rejected_fraction for axis_summary in summary.others.values()
         ]
@@ -349,7 +357,9 @@ def _mark_unpredictable(
             and max(rejected_fractions, default=0.0) <= MAX_REJECTED_FRACTION
             and _results_agree([summary, *noisy_summaries])
         )
-        final_summaries.append(replace(summary, is_predictable=is_predictable, without=without))
+        final_summaries.append(
+            replace(summary, is_predictable=is_predictable, without=disable_times_s)
+        )
     return tuple(final_summaries)
 
 
@@ -365,38 +375,38 @@ def _results_agree(summaries: Sequence[Summary]) -> bool:
         [summary.axes[axis].nis_mean for summary in summaries] for axis in HORIZONTAL_AXES
     ]
     return (
-        all(max(axis_nis) <= MAX_NIS_RATIO * min(axis_nis) for axis_nis in nis_by_axis)
+        all(max(axis_nis) <= MAX_REPEATED_NIS_RATIO * min(axis_nis) for axis_nis in nis_by_axis)
         and max(rejected_fractions) - min(rejected_fractions) <= MAX_REJECTED_FRACTION_SPREAD
-        and (not rmse_values or max(rmse_values) <= MAX_RMSE_RATIO * min(rmse_values))
+        and (not rmse_values or max(rmse_values) <= MAX_REPEATED_RMSE_RATIO * min(rmse_values))
     )
 
 
 def _summarise_replay(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Summary:
     updates = replay.updates
     evaluated_updates = rows_inside(updates, spans_s)
-    fused_at_s = updates["fused_at_s"].to_numpy()
+    update_times_s = updates["fused_at_s"].to_numpy()
     if evaluated_updates.empty:
         raise SettingsError(
             f"{_format_changes(replay)}: {replay.source} would never be fused in the evaluated "
             f"time: {replay.lost} samples arrive after the fusion horizon has passed them",
             "Choose another parameter value.",
         )
-    # Position variance 1 µs before each update, and after it
-    variance = pd.DataFrame(index=np.column_stack([fused_at_s - 1e-6, fused_at_s]).ravel())
+    # Interpolated position variance: before each update (1 µs earlier), and after it
+    variance = pd.DataFrame(index=np.column_stack([update_times_s - 1e-6, update_times_s]).ravel())
     for axis in HORIZONTAL_AXES:
         innovation_variance, noise_variance = (
             updates[f"{quantity}_variance_{axis}_m2"] for quantity in ("innovation", "observation")
         )
-        variance_after = updates[f"position_variance_{axis}_m2"]
+        posterior_variance_m2 = updates[f"position_variance_{axis}_m2"]
         variance[f"{axis}_m2"] = np.column_stack(
-            [innovation_variance - noise_variance, variance_after]
+            [innovation_variance - noise_variance, posterior_variance_m2]
         ).ravel()
     fusion_times_s = evaluated_updates["fused_at_s"][
         evaluated_updates[["fused", "reset"]].any(axis=1)
     ]
     reset_count = evaluated_updates["reset"].sum()
     if (vision := replay.other_aid_updates.get(EV_POS.name)) is not None:
-        reset_count += vision["reset"][inside_spans(vision["fused_at_s"], spans_s)].sum()
+        reset_count += vision["reset"][is_inside_spans(vision["fused_at_s"], spans_s)].sum()
     return _make_summary(
         flight,
         replay,
@@ -420,7 +430,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Summar
     evaluated_updates = rows_inside(logged_innovations(ekf2), spans_s)
     horizon_s = 0.0 if isinstance(ekf2.horizon_s, Unavailable) else ekf2.horizon_s
     reset_times_s = find_horizontal_reset_times_s(ekf2) - horizon_s
-    reset_times_s = reset_times_s[inside_spans(reset_times_s, spans_s)]
+    reset_times_s = reset_times_s[is_inside_spans(reset_times_s, spans_s)]
     replayed_count = len(rows_inside(replay.updates, spans_s))
     longest_gap_s: float | Unavailable = Unavailable(
         "longest time without fusion",
@@ -436,7 +446,7 @@ def _summarise_log(flight: Flight, replay: Ekf2Replay, spans_s: Spans) -> Summar
     assert isinstance(flight.attitude, pd.DataFrame)
     headings_rad = pd.Series(heading_rad(flight.attitude), flight.attitude.index)
     other_aid_updates = {
-        name: logged_aid_innovations(name, ekf2.aids[name])
+        name: select_logged_aid_innovations(name, ekf2.aids[name])
         for name in replay.other_aid_updates
         if name in ekf2.aids
     }
@@ -473,13 +483,13 @@ def _make_summary(
     ekf2 = flight.ekf2
     assert isinstance(ekf2, Ekf2)
     logged_variance = ekf2.variance
-    evaluated_state_s = rows_inside(ekf2.state, spans_s).index.to_numpy()
+    evaluated_times_s = rows_inside(ekf2.state, spans_s).index.to_numpy()
 
     def error_m(direction: Array) -> float | Unavailable:
         position_m = interpolate_component(
-            published_track, Columns.POSITION, direction, evaluated_state_s
+            published_track, Columns.POSITION, direction, evaluated_times_s
         )
-        rmse_to_truth = compute_rmse_to_truth(flight, position_m, direction, evaluated_state_s)
+        rmse_to_truth = compute_rmse_to_truth(flight, position_m, direction, evaluated_times_s)
         return NO_TRUTH if rmse_to_truth is None else rmse_to_truth
 
     for axis, direction in zip(HORIZONTAL_AXES, np.eye(3), strict=False):
@@ -562,7 +572,7 @@ def _find_longest_gap_s(fusion_times_s: ArrayLike, spans_s: Spans) -> float:
 
 
 def _describe_deviation(
-    model: Model, replay: Ekf2Replay, disabled_aids: Mapping[str, float], spans_s: Spans
+    model: Ekf2Model, replay: Ekf2Replay, disable_times_s: Mapping[str, float], spans_s: Spans
 ) -> str:
     """Describe the position difference between replays with and without an aiding source."""
     position_difference_m = rows_inside(
@@ -574,7 +584,7 @@ def _describe_deviation(
         np.hypot(*horizontal_m),
         down_difference_m.max(),
     )
-    aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in disabled_aids.items())
+    aids_text = ", ".join(f"{aid} from {from_s:g} s on" for aid, from_s in disable_times_s.items())
     height_aids = HEIGHT_AID_NAMES & model.baseline_replay.other_aid_updates.keys()
     horizontal_aids = {*list_modelled_aids(model.inputs)} - {MAG.name} - height_aids
     at_s = position_difference_m.index[horizontal_distance_m.argmax()]
@@ -583,12 +593,12 @@ def _describe_deviation(
         f"sources by at most {horizontal_distance_m.max():.3g} m (at {at_s:.1f} s), and by "
         f"{horizontal_distance_m[-1]:.3g} m at the end"
     )
-    if height_aids & {*disabled_aids}:
+    if height_aids & {*disable_times_s}:
         note = (
             f"{note}. The heights of the two replays differ by at most "
             f"{max_height_difference_m:.3g} m"
         )
-    if horizontal_aids <= disabled_aids.keys():
+    if horizontal_aids <= disable_times_s.keys():
         note = (
             f"{note}. The replay continues with the IMU alone; EKF2 stops publishing a position "
             "after EKF2_NOAID_TOUT (5 s)"
@@ -596,7 +606,7 @@ def _describe_deviation(
     return note
 
 
-def _describe_replay_limits(model: Model, replay: Ekf2Replay) -> Iterator[str]:
+def _describe_replay_limits(model: Ekf2Model, replay: Ekf2Replay) -> Iterator[str]:
     min_noise_m = replay.settings.get(GNSS_POS.noise, 0.0)
     if min_noise_m >= replay.changed.get(EV_POS.noise, np.inf):
         yield (
@@ -604,15 +614,14 @@ def _describe_replay_limits(model: Model, replay: Ekf2Replay) -> Iterator[str]:
             f"({min_noise_m:g} m)"
         )
     if replay.late or replay.lost:
-        # EKF2 fuses only the newer of two samples in one prediction step, so that there may be
-        # fewer updates than samples
+        # Samples may lack an update: EKF2 fuses only the newer of two samples in a prediction step
         received_count = max(len(replay.updates), replay.late) + replay.lost
         note = (
             f"{_format_changes(replay)}: {replay.late + replay.lost} of {received_count} samples "
-            f"would arrive after the fusion horizon ({replay.lost} would never be fused)"
+            f"would arrive after the fusion horizon; EKF2 would never fuse {replay.lost} of them"
         )
-        has_delay_limit = not model.inputs.rules.uses_delay_as_horizon
-        yield f"{note}. Increase EKF2_DELAY_MAX" if has_delay_limit else note
+        has_delay_max_parameter = not model.inputs.rules.uses_delay_as_horizon
+        yield f"{note}. Increase EKF2_DELAY_MAX" if has_delay_max_parameter else note
 
 
 def _format_changes(replay: Ekf2Replay) -> str:

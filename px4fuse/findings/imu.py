@@ -6,7 +6,7 @@ import pandas as pd
 from px4fuse.analysis import Analysis
 from px4fuse.core.arrays import select_intervals
 from px4fuse.core.record import Span
-from px4fuse.ekf2.inputs import MAX_LOST_FRACTION, compute_lost_imu_fraction
+from px4fuse.ekf2.inputs import MAX_MISSING_IMU_FRACTION, compute_lost_imu_fraction
 from px4fuse.filter.hypotheses import MIN_BIAS_M_S2, SystematicErrors
 from px4fuse.filter.signals import Segment, cut_to_segment, find_imu_gaps
 from px4fuse.finding import MIN_SPAN_S
@@ -198,7 +198,7 @@ def detect_missing_imu_samples(analysis: Analysis) -> Findings:
         return
     samples = cut_to_segment(imu, analysis.segment)
     lost_fraction = compute_lost_imu_fraction(samples.index.to_numpy()) if len(samples) > 1 else 0.0
-    if lost_fraction <= MAX_LOST_FRACTION:
+    if lost_fraction <= MAX_MISSING_IMU_FRACTION:
         return
     sdlog_profile = int(log.parameters.get("SDLOG_PROFILE", DEFAULT_SDLOG_PROFILE))
     action = "Use a faster SD card."

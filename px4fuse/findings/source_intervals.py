@@ -9,7 +9,7 @@ from px4fuse.comparison.flight_events import compute_max_interval_s
 from px4fuse.core.arrays import Array
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_metres
-from px4fuse.ekf2.aids import MAX_NOT_FUSED_S
+from px4fuse.ekf2.aids import MAX_TIME_WITHOUT_FUSION_S
 from px4fuse.ekf2.fusion_conditions import EV_START_INTERVAL_S
 from px4fuse.filter.kalman import predict_state, predict_variance
 from px4fuse.filter.signals import cut_to_segment
@@ -139,7 +139,9 @@ def _make_partial_source_finding(
         labels = [aid.label for aid in fused_aids] or ["the IMU alone (dead reckoning)"]
         aiding_sentence = f"For {duration_s:.1f} s EKF2 relied on {' and '.join(labels)}. "
     return finding(
-        "error" if has_aids and not fused_aids and duration_s > MAX_NOT_FUSED_S else "warning",
+        "error"
+        if has_aids and not fused_aids and duration_s > MAX_TIME_WITHOUT_FUSION_S
+        else "warning",
         "source_stops" if is_source_stop else "source_begins",
         f"{positions_phrase(source)} {event_verb} in flight at {start_or_stop_s:.1f} "
         f"s{effect_text}. {aiding_sentence}px4fuse evaluates KF and EKF2 only while positions "

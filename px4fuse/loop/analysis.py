@@ -32,7 +32,7 @@ MIN_PATH_LENGTH_M = 2.0
 MIN_FLIGHT_LOOP_PATH_M = 10.0
 # Maximum distance between both ends of the path for a loop analysis in ``px4fuse compare``, as
 # fraction of the path length
-MAX_END_DISTANCE_FRACTION = 0.10
+MAX_END_TO_START_FRACTION = 0.10
 # Maximum value (m or °) of the options for drift, key frame spacing and σ
 MAX_LOOP_OPTION_VALUE = 100.0
 
@@ -73,7 +73,7 @@ def analyse(
     request_times = (request.start_s, request.end_s)
     start_s, end_s = (None if time_s is None else to_track_time(time_s) for time_s in request_times)
     segment, rests_at_ends = loop_segment.choose_loop_segment(flight, trajectory, start_s, end_s)
-    truth = None if flight is None or trajectory.kind == "truth" else truth_trajectory(flight)
+    truth = None if flight is None or trajectory.kind == "truth" else find_truth_trajectory(flight)
     z_down_trajectory = to_z_down(trajectory)
     path = loop_segment.cut_trajectory(z_down_trajectory, segment, rests_at_ends)
     end_from_truth = None
@@ -93,9 +93,13 @@ def analyse(
         closures_and_landings.insert(
             0, (GivenClosure(segment.start_s, segment.end_s, true_end.sigma_m), true_end)
         )
-    spacing_m = request.key_frames_m
-    spacing_m = compute_default_spacing_m(path.position_m) if spacing_m is None else spacing_m
-    key_frame_indices, distance_m = _choose_key_frames(path, spacing_m)
+    key_frame_spacing_m = request.key_frames_m
+    key_frame_spacing_m = (
+        compute_default_spacing_m(path.position_m)
+        if key_frame_spacing_m is None
+        else key_frame_spacing_m
+    )
+    key_frame_indices, distance_m = _choose_key_frames(path, key_frame_spacing_m)
     graph, node_indices, variance_note = build_pose_graph(
         path, key_frame_indices, closures_and_landings, noise
     )
@@ -109,11 +113,13 @@ def analyse(
     end_from_start_m = path.position_m[-1] - path.position_m[0]
     odometry_heading_change_deg = loop_segment.compute_heading_change_deg(path)
     misclosure_m = (
-        true_end if isinstance(true_end, Unavailable) else end_from_start_m - true_end.displacement
+        true_end
+        if isinstance(true_end, Unavailable)
+        else end_from_start_m - true_end.displacement_vector_m
     )
     heading_error_deg = _compute_heading_error(true_end, odometry_heading_change_deg)
     landing_closure = next((c for c in gated_closures if c.source == LANDING_CLOSURE_SOURCE), None)
-    distance_corrections = correct_paths_by_distance(
+    paths_corrected_by_distance = correct_paths_by_distance(
         path, distance_m, misclosure_m, heading_error_deg, landing_closure
     )
     references = tuple(track for track in (truth, reference) if track is not None)
@@ -131,7 +137,7 @@ def analyse(
         part_reason=segment.reason,
         poses=len(path),
         key_frames=len(key_frame_indices),
-        key_frame_spacing_m=spacing_m,
+        key_frame_spacing_m=key_frame_spacing_m,
         path_length_m=float(distance_m[-1]),
         end_from_start_m=components_by_axis(path.frame, end_from_start_m),
         heading_change_deg=odometry_heading_change_deg,
@@ -143,7 +149,7 @@ def analyse(
         is_absolute_track=flight is not None and _is_drift_free(trajectory, flight),
         odometry_noise=noise,
         closures=gated_closures,
-        corrections=score_paths(path, distance_corrections | graph_corrections, references),
+        corrections=score_paths(path, paths_corrected_by_distance | graph_corrections, references),
         notes=tuple(note for note in notes if note),
         distance_m=distance_m,
         graph=graph,
@@ -182,7 +188,7 @@ def _find_true_end(
     flight = segment.flight
     if (
         max(segment.start_s - flight.start_s, flight.end_s - segment.end_s)
-        > loop_segment.REST_TIME_S
+        > loop_segment.REST_DURATION_S
     ):
         return Unavailable(
             "loop closure error",
@@ -194,21 +200,21 @@ def _find_true_end(
 
 
 def _is_drift_free(trajectory: Trajectory, flight: Flight) -> bool:
-    """Return True for KF or EKF2 with a positioning system, whose positions do not drift."""
+    """Return True if the trajectory is from KF or EKF2, aided by positions without drift."""
     has_vision = any(track.origin.is_vision for track in flight.positions)
     has_no_odometry = isinstance(find_odometry(flight), Unavailable)
     return trajectory.kind in ("ekf2", "kf") and has_vision and has_no_odometry
 
 
-def _choose_key_frames(path: Trajectory, spacing_m: float) -> tuple[IntArray, Array]:
-    """Return the indices of the key frames, and the distance (m) along them up to each pose."""
-    _require_in_range("key_frames_m", spacing_m, 1e-3)
-    key_frame_indices = choose_key_frames(path.position_m, spacing_m)
+def _choose_key_frames(path: Trajectory, key_frame_spacing_m: float) -> tuple[IntArray, Array]:
+    """Return the key frame indices, and the path length (m) via key frames up to each pose."""
+    _require_in_range("key_frames_m", key_frame_spacing_m, 1e-3)
+    key_frame_indices = choose_key_frames(path.position_m, key_frame_spacing_m)
     distance_m = cumulative_distance(path.position_m[key_frame_indices])
-    if not distance_m[-1] >= max(MIN_PATH_LENGTH_M * min(1.0, spacing_m / 0.5), 1e-6):
+    if not distance_m[-1] >= max(MIN_PATH_LENGTH_M * min(1.0, key_frame_spacing_m / 0.5), 1e-6):
         raise TrajectoryError(
             f"{path.name}: the path of {distance_m[-1]:.2f} m is too short for key frames every "
-            f"{spacing_m:g} m",
+            f"{key_frame_spacing_m:g} m",
             "Change the time span (--from, --to) or the distance of key frames (--key-frames).",
         )
     return key_frame_indices, np.interp(path.time_s, path.time_s[key_frame_indices], distance_m)
@@ -255,7 +261,7 @@ def _compute_heading_error(
     return float(np.degrees(lie.wrap(np.radians(heading_change_deg - true_end.heading_change_deg))))
 
 
-def truth_trajectory(flight: Flight) -> Trajectory | None:
+def find_truth_trajectory(flight: Flight) -> Trajectory | None:
     """Return the ground truth of a flight as a trajectory, if the log contains it."""
     try:
         return trajectory_of(flight, "truth")
@@ -288,7 +294,7 @@ def analyse_flight_loop(
         end_distance_m = float(np.linalg.norm(segment_position_m[-1] - segment_position_m[0]))
     if (
         2.0 * extent_m < MIN_FLIGHT_LOOP_PATH_M
-        or end_distance_m > MAX_END_DISTANCE_FRACTION * 2.0 * extent_m
+        or end_distance_m > MAX_END_TO_START_FRACTION * 2.0 * extent_m
     ):
         return Unavailable(
             "loop closure",

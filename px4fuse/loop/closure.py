@@ -1,4 +1,4 @@
-"""Distribution of the loop closure error along the path, and choice of key frames.
+"""Correction of a path in proportion to its length so that the loop closes; choice of key frames.
 
 Frames have z down: NED, or FRD (forward, right, down at the start); see :func:`to_z_down`.
 """
@@ -23,8 +23,8 @@ _Z_DOWN_CONVERSIONS: dict[Frame, tuple[str, Frame, str]] = {
     ),
     "unknown": ("nwu", "FRD", "the coordinate frame is unknown, so z is assumed to be up"),
 }
-# Default key frame spacing as fraction of the extent of the path: the radius of curves grows with
-# the extent
+# Default key frame spacing as fraction of the extent of the path: larger paths have wider curves,
+# for which a wider spacing is sufficient
 KEY_FRAME_SPACING_FRACTION = 0.02
 # Minimum and maximum of the default key frame spacing (m)
 MIN_KEY_FRAME_SPACING_M = 0.02
@@ -91,15 +91,15 @@ def choose_key_frames(position_m: Array, spacing_m: float) -> IntArray:
     noise of two positions. Key frames at distances above the noise avoid this error.
     """
     key_frame_indices = [0]
-    last_key_frame_m = position_m[0]
+    last_key_frame_position_m = position_m[0]
     for pose_index, position in enumerate(position_m[1:-1], start=1):
-        displacement_m = position - last_key_frame_m
+        displacement_m = position - last_key_frame_position_m
         if displacement_m @ displacement_m >= spacing_m * spacing_m:
             key_frame_indices.append(pose_index)
-            last_key_frame_m = position
+            last_key_frame_position_m = position
     if (
         len(key_frame_indices) > 1
-        and np.linalg.norm(position_m[-1] - last_key_frame_m) < spacing_m / 2.0
+        and np.linalg.norm(position_m[-1] - last_key_frame_position_m) < spacing_m / 2.0
     ):
         # The last two key frames would be so near that their distance is mostly noise
         key_frame_indices.pop()

@@ -32,12 +32,12 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import ROBUST_KEY, SOLUTIONS, Solution, solve
 from px4fuse.trajectory.model import Trajectory, cumulative_distance
 
-# The variances that the odometry reports are used instead of the default drift if they grow by more
-# than this factor along the path
+# The variances that the odometry reports are used instead of the default drift if the variance at
+# the end of the path is more than this factor larger than at the start
 MIN_VARIANCE_GROWTH = 2.0
 # Minimum variance of an odometry edge, as fraction of the default variance: avoids a division by 0
-MIN_VARIANCE_FRACTION = 1e-2
-# Fraction of the poses at each end of the path whose median reported variance is used there
+MIN_ODOMETRY_VARIANCE_FRACTION = 1e-2
+# The variance at the start or end of the path is the median over this fraction of the poses
 END_POSES_FRACTION = 0.1
 # Loop closure, and the true final pose if the closure connects take-off and landing (else None)
 ClosureAndLanding = tuple[GivenClosure, TrueEnd | None]
@@ -78,32 +78,33 @@ def compute_odometry_variances(
     rotation_variance_rad2 = np.column_stack(
         [tilt_variance_rad2, tilt_variance_rad2, heading_variance_rad2]
     )
-    drift_origin = "default" if noise == OdometryNoise() else "from options"
-    variance_sources = [
+    drift_source = "default" if noise == OdometryNoise() else "from options"
+    variance_texts = [
         f"the odometry drift after 100 m is {noise.position_m:g} m in position and "
-        f"{noise.heading_deg:g}° in heading (1 σ, {drift_origin})"
+        f"{noise.heading_deg:g}° in heading (1 σ, {drift_source})"
     ]
     position_variance_growth = _compute_variance_growth(path.position_variance_m2, node_indices)
     if position_variance_growth is not None:
         translation_variance_m2 = np.maximum(
-            position_variance_growth.mean(axis=1), MIN_VARIANCE_FRACTION * translation_variance_m2
+            position_variance_growth.mean(axis=1),
+            MIN_ODOMETRY_VARIANCE_FRACTION * translation_variance_m2,
         )
-        variance_sources.append(
-            "the translation variances of the odometry are computed from the increase of the "
-            "logged position variances"
+        variance_texts.append(
+            "the translation variance between two nodes is the increase of the logged position "
+            "variance"
         )
     elif path.position_variance_m2 is not None:
-        variance_sources.append("the logged position variances do not grow, so they are not used")
+        variance_texts.append("the logged position variances do not grow, so they are not used")
     rotation_variance_growth = _compute_variance_growth(path.rotation_variance_rad2, node_indices)
     if rotation_variance_growth is not None:
         rotation_variance_rad2 = np.maximum(
-            rotation_variance_growth, MIN_VARIANCE_FRACTION * rotation_variance_rad2
+            rotation_variance_growth, MIN_ODOMETRY_VARIANCE_FRACTION * rotation_variance_rad2
         )
-        variance_sources.append(
-            "the rotation variances of the odometry are computed from the increase of the logged "
-            "orientation variances"
+        variance_texts.append(
+            "the rotation variance between two nodes is the increase of the logged orientation "
+            "variance"
         )
-    return translation_variance_m2, rotation_variance_rad2, "; ".join(variance_sources)
+    return translation_variance_m2, rotation_variance_rad2, "; ".join(variance_texts)
 
 
 def _compute_variance_growth(variance: Array | None, node_indices: IntArray) -> Array | None:
@@ -168,16 +169,16 @@ def build_pose_graph(
     information[step_indices[:, None], range(6), range(6)] = information_diagonal
     first_rotation_inverse = node_rotation[first_nodes].inv()
     second_rotation = node_rotation[second_nodes]
-    translation_measured = first_rotation_inverse.apply(
+    measured_translation_m = first_rotation_inverse.apply(
         node_position_m[second_nodes] - node_position_m[first_nodes]
     )
     for edge_index, (closure, true_end) in enumerate(
         closures_and_landings, start=len(step_indices)
     ):
-        translation_measured[edge_index] = (
+        measured_translation_m[edge_index] = (
             0.0
             if true_end is None
-            else first_rotation_inverse[edge_index].apply(true_end.displacement)
+            else first_rotation_inverse[edge_index].apply(true_end.displacement_vector_m)
         )
         information[edge_index, range(3), range(3)] = closure.sigma_m**-2
         if true_end is not None and true_end.heading_change_deg is not None:
@@ -203,7 +204,7 @@ def build_pose_graph(
         first_nodes=first_nodes,
         second_nodes=second_nodes,
         measurements=np.column_stack(
-            [translation_measured, (first_rotation_inverse * second_rotation).as_quat()]
+            [measured_translation_m, (first_rotation_inverse * second_rotation).as_quat()]
         ),
         information=information,
         initialised="odometry",
@@ -233,7 +234,10 @@ def correct_paths_by_distance(
     heading_error_deg: float | Unavailable,
     landing_closure: Closure | None,
 ) -> dict[CorrectionName, CorrectionOutcome]:
-    """Return two corrected paths: closure error distributed over positions, and also headings."""
+    """Distribute the closure error by path length: over positions, and over positions and headings.
+
+    Return both corrected paths.
+    """
     if landing_closure is not None and not landing_closure.accepted:
         misclosure_m = _make_gate_rejection(
             "distribution of the closure error along the path", landing_closure
@@ -254,7 +258,7 @@ def correct_paths_by_distance(
 def _make_gate_rejection(correction_name: str, closure: Closure) -> Unavailable:
     return Unavailable(
         correction_name,
-        f"the gate rejects {closure} (squared Mahalanobis distance {closure.d2:.1f}, "
+        f"the χ² gate rejects {closure} (squared Mahalanobis distance {closure.d2:.1f}, "
         f"p {closure.p:.1g})",
         "Measure the landing place (--landed-at), increase the odometry drift (--drift), or give "
         "--open if the path does not return to its start.",
@@ -264,7 +268,7 @@ def _make_gate_rejection(correction_name: str, closure: Closure) -> Unavailable:
 def gate_closures(
     graph: PoseGraph | Unavailable, closures_and_landings: Sequence[ClosureAndLanding]
 ) -> tuple[Closure, ...]:
-    """Return the loop closures (the last edges of the graph), tested against odometry."""
+    """Test the loop closures (the last edges of the graph) against odometry with a χ² gate."""
     if isinstance(graph, Unavailable):
         return ()
     closure_edges = np.arange(
@@ -280,7 +284,7 @@ def gate_closures(
         closure_fields = structs.asdict(closure) | structs.asdict(gate_result)
         del closure_fields["first"], closure_fields["second"]
         closure_fields["source"] = "given" if true_end is None else LANDING_CLOSURE_SOURCE
-        true_displacement_m = np.zeros(3) if true_end is None else true_end.displacement
+        true_displacement_m = np.zeros(3) if true_end is None else true_end.displacement_vector_m
         closures.append(
             Closure(
                 distance_m=float(np.linalg.norm(odometry_displacement_m - true_displacement_m)),
@@ -359,19 +363,22 @@ def _interpolate_corrections(
     node_corrections = (
         Rotation.from_quat(solved_poses[:, 3:]) * Rotation.from_quat(graph_poses[:, 3:]).inv()
     )
-    previous_node = np.searchsorted(node_indices, np.arange(len(path)), side="right") - 1
-    previous_node = np.clip(previous_node, 0, len(node_indices) - 2)
+    previous_node_indices = np.searchsorted(node_indices, np.arange(len(path)), side="right") - 1
+    previous_node_indices = np.clip(previous_node_indices, 0, len(node_indices) - 2)
     time_s = path.time_s
-    next_node_fraction = (time_s - time_s[node_indices[previous_node]]) / (
-        time_s[node_indices[previous_node + 1]] - time_s[node_indices[previous_node]]
+    next_node_fraction = (time_s - time_s[node_indices[previous_node_indices]]) / (
+        time_s[node_indices[previous_node_indices + 1]]
+        - time_s[node_indices[previous_node_indices]]
     )
-    previous_m, next_m = (
+    position_by_previous_node_m, position_by_next_node_m = (
         solved_poses[node, :3]
         + node_corrections[node].apply(path.position_m - graph_poses[node, :3])
-        for node in (previous_node, previous_node + 1)
+        for node in (previous_node_indices, previous_node_indices + 1)
     )
     next_node_weight = np.clip(next_node_fraction, 0.0, 1.0)[:, None]
-    position_m = (1.0 - next_node_weight) * previous_m + next_node_weight * next_m
+    position_m = (
+        1.0 - next_node_weight
+    ) * position_by_previous_node_m + next_node_weight * position_by_next_node_m
     return path.with_positions(position_m, Slerp(time_s[node_indices], node_corrections)(time_s))
 
 

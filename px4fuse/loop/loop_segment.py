@@ -1,4 +1,4 @@
-"""Segment of a trajectory that is analysed as a loop, and its true final pose."""
+"""Choice of the segment of a trajectory that is analysed as a loop, and its true final pose."""
 
 from dataclasses import replace
 
@@ -15,11 +15,11 @@ from px4fuse.request import Landing
 from px4fuse.trajectory.model import MIN_POSES, Trajectory, components_by_axis, format_vector
 
 # Time (s) over which poses on the ground are averaged
-REST_TIME_S = 1.0
+REST_DURATION_S = 1.0
 # Maximum extent (m) of the positions of a vehicle at rest
 MAX_POSITION_EXTENT_AT_REST_M = 0.15
 # Maximum heading change (°) of the odometry for which the true heading change is assumed to be zero
-MAX_NEGLIGIBLE_CHANGE_DEG = 15.0
+MAX_SMALL_HEADING_CHANGE_DEG = 15.0
 
 
 def cut_trajectory(
@@ -27,7 +27,7 @@ def cut_trajectory(
 ) -> Trajectory:
     """Return the part of a trajectory in a time segment.
 
-    If ``rests_at_ends``, the first and last pose are averages over REST_TIME_S on the ground.
+    If ``rests_at_ends``, the first and last pose are averages over REST_DURATION_S on the ground.
 
     Raises
     ------
@@ -46,9 +46,9 @@ def cut_trajectory(
         return segment_track
     position_m = segment_track.position_m.copy()
     quaternions = None if segment_track.rotation is None else segment_track.rotation.as_quat()
-    for index, rest_start_s in ((0, segment.start_s - REST_TIME_S), (-1, segment.end_s)):
-        poses_at_rest = trajectory.between(rest_start_s, rest_start_s + REST_TIME_S)
-        # If the vehicle is not at rest, the single pose at this end of the segment is used
+    for index, rest_start_s in ((0, segment.start_s - REST_DURATION_S), (-1, segment.end_s)):
+        poses_at_rest = trajectory.between(rest_start_s, rest_start_s + REST_DURATION_S)
+        # If the vehicle moves, keep the single pose at this end of the segment instead of the mean
         if (
             not len(poses_at_rest)
             or np.linalg.norm(np.ptp(poses_at_rest.position_m, axis=0))
@@ -110,7 +110,7 @@ def choose_loop_segment(
             "Change --from or --to.",
         )
     if limited_span_s != (segment_start_s, segment_end_s):
-        reason = f"{reason}, without the times that have no poses"
+        reason = f"{reason}, shortened to the times of the poses"
     return Segment(*limited_span_s, reason, flight_span_s), rests_at_ends
 
 
@@ -130,7 +130,7 @@ def assume_end_at_takeoff(path: Trajectory) -> TrueEnd:
     odometry_heading_change_deg = compute_heading_change_deg(path)
     is_same_heading = (
         odometry_heading_change_deg is not None
-        and abs(odometry_heading_change_deg) <= MAX_NEGLIGIBLE_CHANGE_DEG
+        and abs(odometry_heading_change_deg) <= MAX_SMALL_HEADING_CHANGE_DEG
     )
     source = "assumed: landing at the take-off place, final heading unknown"
     if is_same_heading:
@@ -176,7 +176,7 @@ def read_end_from_truth(
         return str(error)
     displacement_m = true_path.position_m[-1] - true_path.position_m[0]
     true_heading_change_deg = None
-    start_to_landing_m = np.linalg.norm(displacement_m)
+    start_to_landing_distance_m = np.linalg.norm(displacement_m)
     if path.rotation is not None and true_path.rotation is not None:
         heading_difference_rad = compute_heading_change_rad(
             path.rotation[0] * true_path.rotation[0].inv()
@@ -186,13 +186,16 @@ def read_end_from_truth(
         )
         true_heading_change_deg = compute_heading_change_deg(true_path)
     elif path.frame != true_path.frame:
-        return "the ground truth cannot be rotated to the odometry frame without orientation"
+        return (
+            "the ground truth cannot be rotated to the odometry frame, because the odometry or the "
+            "ground truth has no orientation"
+        )
     return TrueEnd(
         displacement_m=components_by_axis(path.frame, displacement_m),
         heading_change_deg=true_heading_change_deg,
         sigma_m=0.02,
         sigma_heading_deg=None if true_heading_change_deg is None else 0.5,
-        source=f"ground truth in the log ({truth.name}): landing {start_to_landing_m:.2f} m from "
-        "the take-off place",
+        source=f"ground truth in the log ({truth.name}): landing "
+        f"{start_to_landing_distance_m:.2f} m from the take-off place",
         assumed=False,
     )

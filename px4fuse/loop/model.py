@@ -23,7 +23,7 @@ from px4fuse.trajectory.graph.model import PoseGraph
 from px4fuse.trajectory.graph.solver import Solution
 from px4fuse.trajectory.model import AxisComponents, Frame, Trajectory, TrajectoryKind
 
-# Name of a correction of the path; the end of "pose_graph_..." is a key of SOLUTIONS (solver.py)
+# Name of a correction of the path; "pose_graph_KEY" contains a KEY of SOLUTIONS (solver.py)
 CorrectionName = Literal[
     "uncorrected",
     "by_distance_plain",
@@ -46,7 +46,7 @@ class TrueEnd(Record, kw_only=True):
     heading_change_deg : float or None
         Final heading minus initial heading, clockwise; None if unknown.
     sigma_m, sigma_heading_deg : float
-        Standard deviations of final position and final heading; None for an unknown heading.
+        Standard deviations of final position per axis and final heading; None: heading unknown.
     source : str
         Data from which the final pose is computed, for the user.
     assumed : bool
@@ -61,7 +61,7 @@ class TrueEnd(Record, kw_only=True):
     assumed: bool
 
     @property
-    def displacement(self) -> Array:
+    def displacement_vector_m(self) -> Array:
         """Final minus initial position (m), in the frame of the trajectory, shape (3,)."""
         return np.array(list(self.displacement_m.values()))
 
@@ -185,15 +185,21 @@ class Loop(Record, kw_only=True):
 
     def select_reported_paths(self) -> tuple[CorrectedPath, ...]:
         """Return the available paths, without those that equal another path by definition."""
-        duplicates: set[CorrectionName] = set()
+        duplicate_names: set[CorrectionName] = set()
         if all(closure.accepted for closure in self.closures):
-            duplicates.add("pose_graph_all")  # equals "pose_graph_gated"
+            duplicate_names.add("pose_graph_all")  # without a rejection, equals "pose_graph_gated"
         if isinstance(self.heading_error_deg, Unavailable):
-            duplicates.add("by_distance")  # equals "by_distance_plain"
-        return tuple(path for name, path in self.find_paths().items() if name not in duplicates)
+            duplicate_names.add("by_distance")  # no heading to correct: equals "by_distance_plain"
+        return tuple(
+            path for name, path in self.find_paths().items() if name not in duplicate_names
+        )
 
     def choose_best_path(self) -> CorrectedPath:
-        """Return the best path: gated pose graph, else distributed closure error, else odometry."""
+        """Return the most reliable path.
+
+        It is the pose graph with closures accepted by the χ² gate, else the path corrected by
+        distance, else odometry.
+        """
         names: tuple[CorrectionName, ...] = ("pose_graph_gated", "by_distance", "uncorrected")
         paths = self.find_paths()
         return next(paths[name] for name in names if name in paths)

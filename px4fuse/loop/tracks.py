@@ -47,10 +47,10 @@ def find_odometry(flight: Flight) -> PositionTrack | Unavailable:
     for track in flight.positions:
         if track.origin.is_vision and track.orientation is not None:
             return track
-    source_names = ", ".join(track.name for track in flight.positions) or "none"
+    source_list_text = ", ".join(track.name for track in flight.positions) or "none"
     return Unavailable(
         "visual-inertial odometry",
-        f"the log has no external vision with orientation (position sources: {source_names})",
+        f"the log has no external vision with orientation (position sources: {source_list_text})",
         "Send odometry to PX4 as MAVLink message ODOMETRY, and set SDLOG_PROFILE to 129 to log the "
         "odometry.",
     )
@@ -128,21 +128,21 @@ def _make_trajectory(
     rotation = None
     rotation_variance = None
     if isinstance(orientation, pd.DataFrame):
-        orientation_s = orientation.index.to_numpy()
+        orientation_times_s = orientation.index.to_numpy()
         covered_samples = position_samples[
-            (position_samples.index >= orientation_s[0])
-            & (position_samples.index <= orientation_s[-1])
+            (position_samples.index >= orientation_times_s[0])
+            & (position_samples.index <= orientation_times_s[-1])
         ]
         if len(covered_samples) >= MIN_POSES:
             position_samples = covered_samples
             rotations = Rotation.from_quat(
                 orientation[Columns.QUATERNION].to_numpy(copy=True), scalar_first=True
             )
-            rotation = Slerp(orientation_s, rotations)(position_samples.index.to_numpy())
+            rotation = Slerp(orientation_times_s, rotations)(position_samples.index.to_numpy())
             reported_variance = _read_reported_variances(orientation, Columns.ROTATION_VARIANCE)
             if reported_variance is not None:
                 variance_columns = [
-                    np.interp(position_samples.index, orientation_s, column)
+                    np.interp(position_samples.index, orientation_times_s, column)
                     for column in reported_variance.T
                 ]
                 rotation_variance = np.column_stack(variance_columns)

@@ -8,7 +8,7 @@ import pandas as pd
 from px4fuse.analysis import AidsOnlyAnalysis, Analysis
 from px4fuse.core.record import Span
 from px4fuse.core.text import format_number
-from px4fuse.ekf2.aids import AidResult, flight_span
+from px4fuse.ekf2.aids import AidResult, find_flight_span
 from px4fuse.flight.model import AidLog, Flight, Unavailable, sample_step_function
 from px4fuse.report import style
 from px4fuse.report.event_marks import ON_GROUND_BAND_STYLE
@@ -93,7 +93,7 @@ def format_aid_verdict(aid: AidResult) -> str:
 
 
 def _draw_aid_panels(page: Page, flight: Flight, aids: Mapping[str, AidResult]) -> None:
-    flight_span_s = flight_span(flight)
+    flight_span_s = find_flight_span(flight)
     if isinstance(flight.ekf2, Unavailable) or isinstance(flight_span_s, Unavailable):
         return
     enabled_names = [name for name, aid in aids.items() if aid.verdict != "disabled"]

@@ -5,7 +5,7 @@ import math
 from px4fuse.analysis import WhatIfAnalysis
 from px4fuse.core.text import format_number
 from px4fuse.ekf2.whatif import (
-    ADDED_NOISE_M,
+    ADDED_POSITION_SIGMA_M,
     HEIGHT_TIMEOUT_S,
     MAX_REJECTED_FRACTION,
     AxisSummary,
@@ -151,9 +151,9 @@ def describe_sweep(analysis: WhatIfAnalysis) -> list[str]:
     if not all(summary.is_predictable for summary in analysis.whatif.whatif):
         sentences.append(
             "A replay is not predictable in three cases: EKF2 rejects more than "
-            f"{MAX_REJECTED_FRACTION:.0%} of the samples, {1000.0 * ADDED_NOISE_M:.0f} mm of added "
-            "position noise change its statistics, or EKF2 fuses no height for "
-            f"{HEIGHT_TIMEOUT_S:g} s."
+            f"{MAX_REJECTED_FRACTION:.0%} of the samples, "
+            f"{1000.0 * ADDED_POSITION_SIGMA_M:.0f} mm of added position noise change its "
+            f"statistics, or EKF2 fuses no height for {HEIGHT_TIMEOUT_S:g} s."
         )
     return [*sentences, *(f"{note}." for note in analysis.whatif.notes)]
 

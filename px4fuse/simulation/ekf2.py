@@ -22,7 +22,7 @@ from px4fuse.ekf2.filter_recursion import (
     SegmentRun,
 )
 from px4fuse.ekf2.heights import select_samples_in_segment
-from px4fuse.ekf2.inputs import GNSS_RULES, VISION_RULES, Inputs, ReceivedPositions
+from px4fuse.ekf2.inputs import GNSS_RULES, VISION_RULES, ReceivedPositions, ReplayInputs
 from px4fuse.ekf2.model import compute_delayed_states, run_configurations
 from px4fuse.ekf2.output_predictor import (
     compute_published_state,
@@ -173,7 +173,7 @@ def simulate_ekf2(
     settings = fill_with_defaults(logged_values, *fused_aids)
     rules = GNSS_RULES if aid == GNSS_POS else VISION_RULES
     buffer_length = int(np.ceil(settings["EKF2_DELAY_MAX"] * 1e3 / PREDICTION_STEP_US))
-    inputs = Inputs(
+    inputs = ReplayInputs(
         settings=settings,
         segments=(segment,),
         received=_select_positions(source),
@@ -188,7 +188,7 @@ def simulate_ekf2(
         fuses_vision_height=False,
         imu_offset_m=np.zeros(3),
         aid=aid,
-        max_interval_s=MAX_EVENT_INTERVAL_S,
+        max_event_interval_s=MAX_EVENT_INTERVAL_S,
     )
     model_run = run_configurations(inputs, [FilterConfiguration(settings)], {})[0]
     ekf2_output = _compute_output(inputs, model_run, time_us, true_quaternions)
@@ -326,7 +326,7 @@ def _select_positions(source: sensors.SimulatedPositions) -> ReceivedPositions:
 
 
 def _compute_output(
-    inputs: Inputs, model_run: SegmentRun, time_us: IntArray, true_quaternions: Array
+    inputs: ReplayInputs, model_run: SegmentRun, time_us: IntArray, true_quaternions: Array
 ) -> Ekf2Output:
     segment = model_run.segment
     lag_steps = round(inputs.horizon_s / inputs.mean_step_s)

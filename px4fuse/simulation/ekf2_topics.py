@@ -8,7 +8,7 @@ import numpy as np
 
 from px4fuse.core.arrays import Array, Array32, BoolArray, IntArray
 from px4fuse.ekf2.filter_recursion import HORIZONTAL_POSITION, POSITION_COLUMNS, SegmentRun
-from px4fuse.ekf2.inputs import Inputs
+from px4fuse.ekf2.inputs import ReplayInputs
 from px4fuse.ekf2.replay_segments import POSITION
 from px4fuse.flight.ekf2_parameters import BAROMETER, GNSS_POS, GNSS_VEL, MAG, Aid
 from px4fuse.readers.px4_ekf2 import MAG_3D_BIT
@@ -85,7 +85,7 @@ class Ekf2Output:
 
 
 def make_ekf2_topics(
-    model_inputs: Inputs,
+    model_inputs: ReplayInputs,
     model_run: SegmentRun,
     ekf2_output: Ekf2Output,
     attitude_rate_hz: float,
@@ -107,7 +107,7 @@ def make_ekf2_topics(
     return tuple(topic for topic in topics if len(topic.fields["timestamp"]))
 
 
-def _make_local_position_topic(model_inputs: Inputs, ekf2_output: Ekf2Output) -> Topic:
+def _make_local_position_topic(model_inputs: ReplayInputs, ekf2_output: Ekf2Output) -> Topic:
     logged_steps = np.flatnonzero(
         sensors.is_kept_at_rate(sensors.to_seconds(ekf2_output.time_us), LOCAL_POSITION_LOG_RATE_HZ)
     )
@@ -127,7 +127,7 @@ def _make_local_position_topic(model_inputs: Inputs, ekf2_output: Ekf2Output) ->
 
 
 def _make_states_topic(
-    model_inputs: Inputs, model_run: SegmentRun, ekf2_output: Ekf2Output
+    model_inputs: ReplayInputs, model_run: SegmentRun, ekf2_output: Ekf2Output
 ) -> Topic:
     """Make estimator_states as PX4 v1.16 logs it, with horizontal positions of 0."""
     end_step = model_run.events[0].end_step
@@ -155,7 +155,7 @@ def _make_states_topic(
 
 
 def _make_position_aid_topics(
-    model_inputs: Inputs, model_run: SegmentRun, ekf2_output: Ekf2Output, rate_hz: float
+    model_inputs: ReplayInputs, model_run: SegmentRun, ekf2_output: Ekf2Output, rate_hz: float
 ) -> tuple[Topic, ...]:
     """Make estimator_aid_src_* of the position source, with one message per usable position."""
     events, received_positions = model_run.events[0], model_inputs.received
@@ -220,7 +220,7 @@ def _make_position_aid_topics(
 
 
 def _make_barometer_topics(
-    model_inputs: Inputs, model_run: SegmentRun, ekf2_output: Ekf2Output
+    model_inputs: ReplayInputs, model_run: SegmentRun, ekf2_output: Ekf2Output
 ) -> list[Topic]:
     """Return estimator_aid_src_baro_hgt, or nothing without barometer."""
     height_samples, end_step = model_run.segment.height_samples, model_run.events[0].end_step
@@ -234,7 +234,9 @@ def _make_barometer_topics(
     innovation, innovation_variance, is_rejected, is_fused, update_steps = updates.to_numpy().T
     measurement_times_s, steps = updates.index.to_numpy(), update_steps.astype(np.intp)
     measured_m = (
-        height_samples.down_m[np.searchsorted(height_samples.measured_at_s, measurement_times_s)]
+        height_samples.down_m[
+            np.searchsorted(height_samples.measurement_times_s, measurement_times_s)
+        ]
         - sensors.HOME_POSITION[2]
     )
     noise_variance = np.full(len(steps), model_inputs.settings[BAROMETER.noise] ** 2)
@@ -251,7 +253,7 @@ def _make_barometer_topics(
 
 
 def _make_magnetometer_topics(
-    model_inputs: Inputs, model_run: SegmentRun, ekf2_output: Ekf2Output, attitude_rate_hz: float
+    model_inputs: ReplayInputs, model_run: SegmentRun, ekf2_output: Ekf2Output, attitude_rate_hz: float
 ) -> list[Topic]:
     """Return the topics that need a magnetometer, or nothing without magnetometer."""
     field, settings = model_run.segment.field, model_inputs.settings
@@ -264,7 +266,9 @@ def _make_magnetometer_topics(
     innovation, innovation_variance, fused_fraction = np.moveaxis(
         model_run.magnetometer_updates[logged_indices, :, 0], 1, 0
     )
-    observed_gauss = field.value[np.searchsorted(field.step, logged_steps, side="right") - 1]
+    observed_gauss = field.value[
+        np.searchsorted(field.step_indices, logged_steps, side="right") - 1
+    ]
     noise_variance = np.full(innovation.shape, settings[MAG.noise] ** 2)
     is_fused = fused_fraction[:, 0] > 0.0
     attitude_steps, status_steps = (
@@ -325,7 +329,7 @@ def _make_aid_source_topic(
 
 
 def _make_flags_topic(
-    model_inputs: Inputs, model_run: SegmentRun, ekf2_output: Ekf2Output
+    model_inputs: ReplayInputs, model_run: SegmentRun, ekf2_output: Ekf2Output
 ) -> Topic:
     """Make estimator_status_flags: one message per second and per start or end of fusion."""
     events, time_s = model_run.events[0], model_run.segment.time_s

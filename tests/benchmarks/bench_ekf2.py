@@ -19,13 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from px4fuse.ekf2.model import Model, open_model, replay_with_settings
+from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model, replay_with_settings
 from px4fuse.ekf2.replay import Agreement
 from px4fuse.ekf2.steps import (
     FLOW_STEP,
+    GNSS_VELOCITY_STEP,
     MAGNETOMETER_STEP,
     REPLACEMENT_STEPS,
-    VELOCITY_STEP,
     explain_by_steps,
 )
 from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
@@ -41,11 +41,11 @@ BEGIN, END = "<!-- bench_ekf2: begin -->", "<!-- bench_ekf2: end -->"
 OVERCONFIDENT, OUTLIERS = "overconfident", "nlos"
 
 
-def opened(path: Path) -> Model | Unavailable:
-    return open_model(read_log(path))
+def opened(path: Path) -> Ekf2Model | Unavailable:
+    return prepare_ekf2_model(read_log(path))
 
 
-def agreement_table(paths: list[Path]) -> dict[str, Model]:
+def agreement_table(paths: list[Path]) -> dict[str, Ekf2Model]:
     """Open and evaluate the model of each flight; print the reason if there is none."""
     models = {}
     for path in paths:
@@ -58,7 +58,7 @@ def agreement_table(paths: list[Path]) -> dict[str, Model]:
     return models
 
 
-def judge_agreement(name: str, model: Model) -> None:
+def judge_agreement(name: str, model: Ekf2Model) -> None:
     agreement = model.agreement
     assert agreement.good, (name, agreement.reason)
     gnss = bool(agreement.gnss_pos)
@@ -90,7 +90,7 @@ def judge_agreement(name: str, model: Model) -> None:
             assert axis.velocity_rms_difference_m_s < 0.015, name
 
 
-def waterfalls(models: dict[str, Model]) -> dict[str, float]:
+def waterfalls(models: dict[str, Ekf2Model]) -> dict[str, float]:
     """Print and check the steps of each flight: shares of the mean square over both axes.
 
     Returns the unexplained share of each flight.
@@ -99,7 +99,7 @@ def waterfalls(models: dict[str, Model]) -> dict[str, float]:
     steps = (
         *REPLACEMENT_STEPS[:-2],
         MAGNETOMETER_STEP,
-        VELOCITY_STEP,
+        GNSS_VELOCITY_STEP,
         FLOW_STEP,
         *REPLACEMENT_STEPS[-2:],
     )
@@ -120,7 +120,7 @@ def waterfalls(models: dict[str, Model]) -> dict[str, float]:
     return unexplained
 
 
-def agreement_page(models: dict[str, Model], left: dict[str, float]) -> str:
+def agreement_page(models: dict[str, Ekf2Model], left: dict[str, float]) -> str:
     """Return the table of agreement for the documentation."""
     lines = [
         "| flight | innovations | correlation | S replayed / logged | rejected | "
@@ -166,7 +166,7 @@ def horizontal_rmse(summary: Summary) -> float:
     return float(np.hypot(*parts))
 
 
-def check_what_if(models: dict[str, Model]) -> None:
+def check_what_if(models: dict[str, Ekf2Model]) -> None:
     """Print and check predictions with other parameters, against ground truth."""
     clean = "v1.16.1_aisle_nominal"
     print("\nwhat if | mean NIS north, east | rejected | RMSE to truth m (as flown)")
@@ -207,9 +207,9 @@ def cpu_s(work: Callable[[], object], runs: int = 5) -> float:
     return min(timeit.repeat(work, number=1, repeat=runs, timer=time.process_time))
 
 
-def speed(flight: Flight, model: Model) -> None:
+def speed(flight: Flight, model: Ekf2Model) -> None:
     """Print CPU times of a two-minute flight, and their growth with its length."""
-    first = cpu_s(lambda: open_model(flight))
+    first = cpu_s(lambda: prepare_ekf2_model(flight))
     print(f"\nfirst replay {first:.3f} s of CPU (aim 0.3 s)")
     count = 10
     for name, values in (
@@ -224,7 +224,9 @@ def speed(flight: Flight, model: Model) -> None:
     for share in (0.25, 0.5, 1.0):
         assert not isinstance(flight.imu, Unavailable)
         part = replace(flight, imu=flight.imu.iloc[: int(share * len(flight.imu))])
-        print(f"{share:.0%} of the flight: {cpu_s(lambda part=part: open_model(part)):.3f} s")
+        print(
+            f"{share:.0%} of the flight: {cpu_s(lambda part=part: prepare_ekf2_model(part)):.3f} s"
+        )
 
 
 def flights(folders: list[Path]) -> list[Path]:
@@ -240,8 +242,8 @@ def main(paths: list[Path], *, readme: bool) -> None:
         write_page(table)
     check_what_if(models)
     flight = read_log(SAMPLE)
-    model = open_model(flight)
-    assert isinstance(model, Model), model
+    model = prepare_ekf2_model(flight)
+    assert isinstance(model, Ekf2Model), model
     speed(flight, model)
 
 

@@ -28,7 +28,7 @@ from px4fuse.comparison.estimates import estimate
 from px4fuse.comparison.flight_events import collect_events
 from px4fuse.comparison.reruns import rerun_filters
 from px4fuse.ekf2.aids import evaluate_aids
-from px4fuse.ekf2.model import open_model
+from px4fuse.ekf2.model import prepare_ekf2_model
 from px4fuse.filter.settings import Settings
 from px4fuse.findings import find, find_loop_findings
 from px4fuse.flight.model import Flight, Unavailable
@@ -215,7 +215,7 @@ def _explain(flight: Flight, condition: Condition) -> Analysis:
     """Make the analysis for the detectors, without the steps from KF to EKF2, which are slow."""
     comparison = compare(flight, condition.settings, axes=("north", "east"))
     estimates = estimate(comparison)
-    model = open_model(flight) if condition.ekf2 else NOT_ASKED
+    model = prepare_ekf2_model(flight) if condition.ekf2 else NOT_ASKED
     trials = rerun_filters(comparison, estimates, model)
     return Analysis(
         **vars(comparison), **vars(estimates), ekf2_model=model, difference_steps={},

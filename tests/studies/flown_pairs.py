@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from px4fuse.ekf2.model import Model, open_model, replay_with_logged_rejections
+from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model, replay_with_logged_rejections
 from px4fuse.ekf2.replay import (
     compare_with_log,
     compute_rmse_to_truth,
-    inside_spans,
     interpolate_component,
+    is_inside_spans,
 )
 from px4fuse.ekf2.whatif import Summary, WhatIf, what_if
 from px4fuse.errors import SettingsError
@@ -41,14 +41,14 @@ class FlownFlight(NamedTuple):
 
     flight: Flight
     description: dict[str, Any]
-    model: Model | Unavailable
+    model: Ekf2Model | Unavailable
 
 
 def read_flight(path: Path) -> FlownFlight:
     flight = read_log(path)
     json_file = path.with_suffix(".json")
     description = json.loads(json_file.read_text()) if json_file.exists() else {}
-    return FlownFlight(flight, description, open_model(flight))
+    return FlownFlight(flight, description, prepare_ekf2_model(flight))
 
 
 def describe_agreement(flown: FlownFlight) -> str:
@@ -93,7 +93,7 @@ def flown_errors_m(before: FlownFlight, after: FlownFlight, found: WhatIf) -> tu
     lift_off_s = [flown.flight.airborne[0][0] for flown in (before, after)]  # type: ignore[index]
     shift_s = lift_off_s[1] - lift_off_s[0]
     spans = [(begin + shift_s, end + shift_s) for begin, end in found.find_evaluated_spans()]
-    times = ekf2.state.index[inside_spans(ekf2.state.index, tuple(spans))].to_numpy()
+    times = ekf2.state.index[is_inside_spans(ekf2.state.index, tuple(spans))].to_numpy()
     north, east, down = (
         compute_rmse_to_truth(
             after.flight,

@@ -36,7 +36,7 @@ from px4fuse.analysis import Analysis
 from px4fuse.comparison.comparison import compare, run_kf
 from px4fuse.comparison.model import Comparison, ErrorsAgainstTruth, PreparedComparison
 from px4fuse.diagnose import diagnose, prepare_comparison, read_flight
-from px4fuse.ekf2.model import Model, open_model, with_misaligned_positions
+from px4fuse.ekf2.model import Ekf2Model, misalign_positions, prepare_ekf2_model
 from px4fuse.ekf2.whatif import what_if
 from px4fuse.errors import Px4FuseError
 from px4fuse.flight.ekf2_parameters import PARAMETERS
@@ -129,7 +129,7 @@ def apply_options(request: ComparisonRequest, options: dict[str, str]) -> Compar
     return structs.replace(request, **fields)
 
 
-def replayed_m(model: Model, change: dict[str, float]) -> tuple[float, float]:
+def replayed_m(model: Ekf2Model, change: dict[str, float]) -> tuple[float, float]:
     """Return the horizontal RMSE (m) of EKF2's replay as flown and with changed parameters."""
     found = what_if(model, [change])
     if isinstance(found, Unavailable):
@@ -154,7 +154,7 @@ def follow(analysis: Analysis, request: ComparisonRequest) -> list[Fix]:
         actions = {key: places for key, places in actions.items() if dict(key[1]) != horizon}
     segment, flight, fixes = analysis.segment, analysis.flight, list[Fix]()
     limit = partial(limit_m, duration_s=segment.end_s - segment.start_s)
-    model = open_model(flight) if any(kind != "KF" for kind, _ in actions) else None
+    model = prepare_ekf2_model(flight) if any(kind != "KF" for kind, _ in actions) else None
     for (kind, items), found_in in actions.items():
         places = list(dict.fromkeys(found_in))
         change, before_m, after_m = dict(items), math.nan, math.nan
@@ -164,11 +164,11 @@ def follow(analysis: Analysis, request: ComparisonRequest) -> list[Fix]:
                 fixed_flight = read_flight(fixed) if request.position else flight
                 again = compare_with_kf(prepare_comparison(fixed_flight, fixed))
                 before_m, after_m = rmse_m(analysis), rmse_m(again)
-            elif isinstance(model, Model) and kind == "EKF2":
+            elif isinstance(model, Ekf2Model) and kind == "EKF2":
                 before_m, after_m = replayed_m(model, change)
-            elif isinstance(model, Model):
+            elif isinstance(model, Ekf2Model):
                 before_m, _ = replayed_m(model, {})
-                shifted = with_misaligned_positions(model, 0.0, change["shift_s"])
+                shifted = misalign_positions(model, 0.0, change["shift_s"])
                 found = what_if(replace(shifted, agreement=model.agreement), [horizon])
                 if not isinstance(found, Unavailable):
                     after = found.whatif[0].position_rmse_to_truth_m

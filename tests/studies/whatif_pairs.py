@@ -14,7 +14,7 @@ import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 
-from px4fuse.ekf2.model import Model, open_model
+from px4fuse.ekf2.model import Ekf2Model, prepare_ekf2_model
 from px4fuse.ekf2.whatif import WhatIf, what_if
 from px4fuse.flight.model import Unavailable
 from px4fuse.simulation.faults import parse_faults
@@ -51,10 +51,12 @@ def pairs(seeds: int, kind: ScenarioKind = "aisle") -> Iterator[Pair]:
                 yield kind, seed, wrong, "", name, right
 
 
-def opened(kind: ScenarioKind, seed: int, mistake: str) -> Model | Unavailable:
+def opened(kind: ScenarioKind, seed: int, mistake: str) -> Ekf2Model | Unavailable:
     """Open the EKF2 model of a flight with a fault."""
     scenario = make_scenario(kind, seed=seed, passes=3)
-    return open_model(simulate_flight(scenario, parse_faults((mistake,) if mistake else ())))
+    return prepare_ekf2_model(
+        simulate_flight(scenario, parse_faults((mistake,) if mistake else ()))
+    )
 
 
 def flown(kind: ScenarioKind, seed: int, mistake: str) -> WhatIf | Unavailable:
