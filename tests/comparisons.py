@@ -18,9 +18,15 @@ def request_of(settings: Settings | None = None, **choices: Any) -> ComparisonRe
 
 
 def prepare(
-    flight: Flight, settings: Settings | None = None, *, keep_as_sent: bool = False, **choices: Any
+    flight: Flight,
+    settings: Settings | None = None,
+    *,
+    keep_positions_as_sent: bool = False,
+    **choices: Any,
 ) -> PreparedComparison:
-    return preparation.prepare(flight, request_of(settings, **choices), keep_as_sent=keep_as_sent)
+    return preparation.prepare(
+        flight, request_of(settings, **choices), keep_positions_as_sent=keep_positions_as_sent
+    )
 
 
 def compare(flight: Flight, settings: Settings | None = None, **choices: Any) -> Comparison:

@@ -18,7 +18,7 @@ from px4fuse.findings import Finding
 from px4fuse.flight.model import Dropout, Reset
 from px4fuse.report import cover, event_marks, flight, panels
 from px4fuse.report.page import Page
-from px4fuse.report.style import report_style
+from px4fuse.report.style import apply_report_style
 from px4fuse.request import ComparisonRequest
 from px4fuse.results.build import results
 from px4fuse.results.contract import ComparisonResults
@@ -34,7 +34,7 @@ def document(
 
 
 def drawn(draw, of: tuple[Analysis, ComparisonResults]) -> list[Page]:
-    with report_style():
+    with apply_report_style():
         return list(draw(*of))
 
 

@@ -15,8 +15,8 @@ from px4fuse.results.contract import schema
 
 # Mutable buffers, which are filled while reading, writing or replaying
 BUFFERS = {
-    "Packer", "Recording", "Rows", "Topics", "_FusionDecisions", "_InputRegister", "_PdfComparison",
-    "_RunState",
+    "ArrayEncoder", "Recording", "Rows", "Topics", "_FusionDecisions", "_InputRegister",
+    "_PdfComparison", "_RunState",
 }  # fmt: skip
 
 

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from px4fuse.report.page import text_width
-from px4fuse.report.style import Axes, report_style, set_map_axes, set_plain_ticks
+from px4fuse.report.style import Axes, apply_report_style, set_map_axes, set_plain_ticks
 from px4fuse.report.ticks import replace_ticks
 
 MAX_DISTANCE_POINTS = 3.0  # between the places of a text in both drawings
@@ -48,7 +48,7 @@ def drawn_texts(
     plot: Callable[[Axes], None], *, few_artists: bool
 ) -> list[tuple[str, float, float]]:
     """Return the texts of a plot, each with x and y (points) of its centre."""
-    with report_style():
+    with apply_report_style():
         axes = Figure(figsize=(4.0, 2.6), dpi=72.0).add_axes((0.3, 0.3, 0.6, 0.6))
         plot(axes)
         if few_artists:
@@ -80,7 +80,7 @@ def test_replaced_ticks_have_labels_and_places_of_matplotlib(plot: Callable[[Axe
 
 
 def test_replaced_ticks_keep_the_grid_of_each_axis() -> None:
-    with report_style():
+    with apply_report_style():
         for grid_axis, expected_count in (("y", 1), ("both", 2)):
             axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
             axes.grid(visible=False)

@@ -111,7 +111,7 @@ def test_terminal_paragraph_has_hanging_indent(capsys) -> None:
 def test_table_on_narrow_terminal_keeps_words_whole(capsys) -> None:
     page = Page()
     topics = ["vehicle_visual_odometry", "estimator_aid_src_ev_pos"]
-    page.table(["data", "topic", "samples"], [["position", topic, "650"] for topic in topics])
+    page.add_table(["data", "topic", "samples"], [["position", topic, "650"] for topic in topics])
     screen.print_blocks(Console(width=40, highlight=False), page.blocks)
     words = capsys.readouterr().out.replace(",", "").split()
     assert [word for word in words if word in topics] == topics

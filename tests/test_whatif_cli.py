@@ -200,5 +200,5 @@ def test_what_if_table_shows_no_numbers_if_unpredictable(sample_flight: Flight) 
     assert [line[1] for line in make_sweep_table(told)[1]] == [NOT_PREDICTABLE_TEXT] * 2
     said = " ".join(describe_sweep(told))
     assert "not predictable in three cases: EKF2 rejects more than 35% of the samples" in said
-    assert "2 mm of added position noise change its statistics" in said
+    assert "the statistics change much with 2 mm of added position noise" in said
     assert "closest to 1" not in said

@@ -42,7 +42,7 @@ def format_summary(batch_result: BatchResult) -> Page:
     sorted_logs = sort_logs(logs_from_table(batch_result.table))
     if sorted_logs:
         rows = [_make_log_row(log) for log in sorted_logs[:MAX_LISTED_LOGS]]
-        page.table(
+        page.add_table(
             ("", "log", "diagnosis", "KF ●", "◆", "EKF2 ●", "◆"),
             rows,
             right_aligned_columns=(3, 4, 5, 6),
@@ -85,7 +85,7 @@ def format_differences(results: ChangeResults) -> Page:
         for setting in results.settings
     ]
     if settings:
-        page.table(("setting", "A", "B"), settings)
+        page.add_table(("setting", "A", "B"), settings)
     rows = []
     for number in results.numbers:
         display_factor, unit = (100.0, "%") if number.unit == "share" else (1.0, number.unit)
@@ -96,7 +96,7 @@ def format_differences(results: ChangeResults) -> Page:
         ]
         rows.append((number.label, *cells, unit))
     if rows:
-        page.table(NUMBER_TABLE_TITLES, rows, right_aligned_columns=(1, 2, 3, 4))
+        page.add_table(NUMBER_TABLE_TITLES, rows, right_aligned_columns=(1, 2, 3, 4))
     tolerance_text = f"{100.0 * RELATIVE_TOLERANCE:g} % or {ABSOLUTE_TOLERANCE:g}"
     page.write(
         f"Numbers that differ by less than {tolerance_text} are not listed.", colour=MUTED_COLOUR

@@ -34,9 +34,9 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
         analysis = diagnose(request, show_progress)
         show_progress("writing the page")
         # a slow import (Bokeh), which is not needed if the analysis fails
-        from px4fuse.explore.page import html_text
+        from px4fuse.explore.page import make_analysis_page
 
-        page = html_text(analysis)
+        page = make_analysis_page(analysis)
         if output is None:
             outputs.check_default_page(target, page)
-    outputs.write_and_print({target: page.encode()})
+    outputs.write_and_print_results({target: page.encode()})

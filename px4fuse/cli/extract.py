@@ -15,7 +15,7 @@ from px4fuse.cli.options import (
     output_option,
 )
 from px4fuse.cli.outputs import write_outputs
-from px4fuse.core.input_files import check_output_folder, inputs_not_registered
+from px4fuse.core.input_files import check_output_folder, suspend_input_registration
 from px4fuse.core.reading import read_text
 from px4fuse.errors import OutputError, to_one_line
 
@@ -54,7 +54,7 @@ def extract(
     from px4fuse.info import tables as extraction
     from px4fuse.results.contract import to_json
 
-    flight = extraction.with_source_innovations(read_flight(comparison_request(log, option_values)))
+    flight = extraction.add_source_innovations(read_flight(comparison_request(log, option_values)))
     _require_same_flight(output, flight.log.sha256)
     tables = extraction.tables(flight)
     contents = {
@@ -76,7 +76,7 @@ def extract(
 
 def _require_same_flight(folder: Path, sha256: str) -> None:
     try:
-        with inputs_not_registered():
+        with suspend_input_registration():
             text = read_text(folder / "flight.json", OutputError, MAX_DESCRIPTION_BYTES)
         earlier_log = json.loads(text)["log"]
         name, earlier_sha256 = earlier_log["name"], earlier_log["sha256"]

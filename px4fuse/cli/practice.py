@@ -12,7 +12,7 @@ from px4fuse.cli.outputs import (
     check_default_page,
     progress,
     web_page_path,
-    write_and_print,
+    write_and_print_results,
 )
 
 
@@ -62,4 +62,4 @@ def practice(
         page = make_practice_page(seed, level, flights, show_progress)
         if output is None:
             check_default_page(target, page)
-    write_and_print({target: page.encode()})
+    write_and_print_results({target: page.encode()})

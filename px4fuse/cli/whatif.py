@@ -79,7 +79,9 @@ def whatif(
     with outputs.progress(json_path) as show_progress:
         analysis = run_what_if(request, show_progress)
     results = make_whatif_results(request, analysis)
-    outputs.write_and_print(outputs.result_files(results, json_path), whatif_page(analysis))
+    outputs.write_and_print_results(
+        outputs.make_result_files(results, json_path), whatif_page(analysis)
+    )
 
 
 def _parse_parameters(parameter_texts: tuple[str, ...]) -> dict[str, float]:

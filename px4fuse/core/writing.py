@@ -27,7 +27,7 @@ REMEDY_BY_ERRNO = {
 _MAX_LISTED_PATHS = 4
 
 
-def write_all(
+def write_output_files(
     contents: Mapping[Path, bytes], on_written: Callable[[Path], None] = lambda _: None
 ) -> None:
     """Write output files; create missing folders.
@@ -48,7 +48,7 @@ def write_all(
     for path, content in contents.items():
         try:
             _write_output(path, content)
-        except BrokenPipeError as error:  # the reader has ended (| head)
+        except BrokenPipeError as error:  # the program that reads the pipe has ended
             pipe_error = error
             continue
         except OSError as error:

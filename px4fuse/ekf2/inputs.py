@@ -11,7 +11,7 @@ from types import MappingProxyType
 import numpy as np
 import pandas as pd
 
-from px4fuse.core.arrays import Array, BoolArray, IntArray, median_interval
+from px4fuse.core.arrays import Array, BoolArray, IntArray, compute_median_interval_s
 from px4fuse.ekf2.earth_model import compute_position_scale
 from px4fuse.ekf2.flow import add_flow_samples
 from px4fuse.ekf2.heights import add_heights
@@ -366,7 +366,7 @@ def compute_lost_imu_fraction(time_s: Array) -> float:
 
 
 def _explain_missing_imu(time_s: Array) -> Unavailable | None:
-    median_interval_s = median_interval(time_s)
+    median_interval_s = compute_median_interval_s(time_s)
     if median_interval_s > MAX_IMU_INTERVAL_S:
         return Unavailable(
             ANALYSIS_NAME,
@@ -661,7 +661,7 @@ def _find_vision_track(flight: Flight) -> PositionTrack | Unavailable:
         if track.origin.is_vision and track.origin.has_all_samples:
             return track
         if track.name in VISION_REPETITION_INTERVALS_S:
-            median_interval_s = median_interval(track.samples.index.to_numpy())
+            median_interval_s = compute_median_interval_s(track.samples.index.to_numpy())
             if (
                 median_interval_s < 0.9 * VISION_REPETITION_INTERVALS_S[track.name]
                 and median_interval_s <= 0.25

@@ -34,7 +34,7 @@ from px4fuse.flight.model import (
     sample_rate,
 )
 from px4fuse.info.tables import NO_POSITION, list_missing_data
-from px4fuse.request import ComparisonRequest, with_options
+from px4fuse.request import ComparisonRequest, replace_argument_names
 
 SCHEMA_NAME = "px4fuse-info"
 SCHEMA_VERSION = "1.0"
@@ -52,8 +52,8 @@ DATA_LABELS = {
     "truth": "ground truth",
     "airborne": "land detector",
 }
-# Type of samples that an analysis of px4fuse compare requires
-SAMPLES_BY_ANALYSIS = {
+# Samples that each analysis of px4fuse compare requires, as text after their number
+SAMPLE_TEXT_BY_ANALYSIS = {
     "EKF2 states": "samples of EKF2's position and velocity",
     "EKF2 variances": "samples of EKF2's variances",
     "EKF2 consistency": "EKF2 innovations",
@@ -65,7 +65,10 @@ TimeSpans = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class AnalysisOption:
-    """Analysis of a log; ``reason``: the data that it uses, or why it is not possible."""
+    """Analysis that may be possible with a log.
+
+    ``reason``: the data that the analysis uses, or why it is not possible.
+    """
 
     name: str
     possible: bool
@@ -74,7 +77,7 @@ class AnalysisOption:
 
 @dataclass(frozen=True)
 class LoggingAdvice:
-    """Change before the next flight (``remedy``), and data or analyses that it makes possible."""
+    """Logging advice: change for the next flight (``remedy``), and data or analyses it adds."""
 
     remedy: str
     improves: tuple[str, ...]
@@ -144,7 +147,7 @@ class Inventory:
     segment : Segment or None
         Time span that ``px4fuse compare`` analyses by default.
     abilities : tuple of AnalysisOption
-        Analyses, with the reason if one is not possible.
+        All analyses of px4fuse; each states whether the log is sufficient.
     advice : tuple of LoggingAdvice
         Changes for the next flight.
     """
@@ -163,11 +166,13 @@ def take_inventory(flight: Flight) -> Inventory:
     """List the data in a log, the possible analyses, and changes for the next flight."""
     comparison, reason, position_remedy = None, "", ""
     try:
-        comparison = prepare(flight, ComparisonRequest(log=flight.log.name), keep_as_sent=True)
+        comparison = prepare(
+            flight, ComparisonRequest(log=flight.log.name), keep_positions_as_sent=True
+        )
         reason = comparison.source_reason
     except Px4FuseError as error:
-        reason = with_options(error.reason).removeprefix(f"{flight.log.name}: ")
-        position_remedy = with_options(error.remedy)
+        reason = replace_argument_names(error.reason).removeprefix(f"{flight.log.name}: ")
+        position_remedy = replace_argument_names(error.remedy)
         if not isinstance(error, MissingDataError):
             position_remedy = (
                 "Set SDLOG_MODE to 0 (logging from arming) to record the whole flight."
@@ -214,7 +219,7 @@ def _collect_data_by_stream(flight: Flight) -> dict[str, pd.DataFrame | TimeSpan
     if isinstance(ekf2, Unavailable):
         data_by_stream["ekf2_state"] = ekf2
     else:
-        # from the axis with most innovations, because other axes may be missing
+        # the innovations along the axis with most of them, because other axes may be missing
         innovations = max(
             ekf2.innovations.values(),
             key=lambda samples: len(samples) if isinstance(samples, pd.DataFrame) else -1,
@@ -335,7 +340,7 @@ def _list_ekf2_and_truth_analyses(
     flight: Flight, comparison: PreparedComparison | None
 ) -> Iterator[AnalysisOption]:
     """Yield the analyses that need EKF2 data or ground truth."""
-    data_by_analysis: dict[str, object] = dict.fromkeys(SAMPLES_BY_ANALYSIS, flight.ekf2)
+    data_by_analysis: dict[str, object] = dict.fromkeys(SAMPLE_TEXT_BY_ANALYSIS, flight.ekf2)
     data_by_analysis["error"] = flight.truth
     if comparison is not None:
         main_axis, segment, ekf2 = comparison.input_axes[0], comparison.segment, flight.ekf2
@@ -353,7 +358,7 @@ def _list_ekf2_and_truth_analyses(
     for name, data in data_by_analysis.items():
         has_data = not isinstance(data, Unavailable)
         count_text = (
-            f"{len(data)} {SAMPLES_BY_ANALYSIS[name]}" if isinstance(data, pd.DataFrame) else ""
+            f"{len(data)} {SAMPLE_TEXT_BY_ANALYSIS[name]}" if isinstance(data, pd.DataFrame) else ""
         )
         yield _make_analysis_option(
             name, NO_COMPARISON if comparison is None and has_data else data, count_text
@@ -382,12 +387,12 @@ def _collect_logging_advice(
         (finding.remedy, finding_title(finding.id)) for finding in findings if finding.remedy
     ]
     # data that a MAVLink recording can contain, in addition to positions
-    possible_mavlink_data = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
+    data_in_mavlink_logs = (flight.imu, flight.attitude, flight.ekf2, flight.airborne)
     actions_and_purposes += [
         (missing_data.remedy, missing_data.what)
         for missing_data in list_missing_data(flight)
         if missing_data is not NO_POSITION
-        and (flight.log.has_ulog or any(missing_data is data for data in possible_mavlink_data))
+        and (flight.log.has_ulog or any(missing_data is data for data in data_in_mavlink_logs))
     ]
     purposes_by_action: dict[str, dict[str, None]] = {}
     for action, purpose in actions_and_purposes:

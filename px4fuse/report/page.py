@@ -23,23 +23,23 @@ LEGEND_LINE_HEIGHT = 12.0  # height (points) of one line of a legend
 LEGEND_HANDLE_WIDTH = 30.0  # width (points) of the line sample and the gaps of a legend entry
 TICKS_HEIGHT = 12.0  # height (points) of the tick labels below the axes
 AXIS_LABEL_HEIGHT = 12.5  # height (points) of the axis label below the tick labels
-UNLABELLED_HEIGHT = 3.0  # height (points) below axes without tick labels
+UNLABELLED_HEIGHT = 3.0  # free height (points) below axes without tick labels
 # Characters that are printed although str.isprintable is False for them
-ALLOWED_CHARACTERS = "\n\N{NO-BREAK SPACE}"
+PRINTED_SPECIAL_CHARACTERS = "\n\N{NO-BREAK SPACE}"
 # Words of at least 500 characters are split, because PDF/A limits strings to 32,767 characters
-LONG_WORD = re.compile(r"[^ \n]{100}(?=[^ \n]{400})")
+LONG_WORD_PATTERN = re.compile(r"[^ \n]{100}(?=[^ \n]{400})")
 Block = dict[str, Any]
 Cell = str | tuple[str, str]
 
 
 class Page:
-    """Blocks of a section of a report, which may need several sheets, or of one column."""
+    """Blocks (texts, plots, tables) of a section or of a column of a report."""
 
-    def __init__(self, title: str = "", lead: str = "", *, width: float = PAGE_WIDTH) -> None:
+    def __init__(self, title: str = "", lead_text: str = "", *, width: float = PAGE_WIDTH) -> None:
         self.blocks: list[Block] = []
         self.width = width
         if title:
-            self.add("title", text=title, lead=lead)
+            self.add("title", text=title, lead=lead_text)
 
     def add(self, kind: str, **fields: Any) -> Block:
         """Add a block of a kind that ``report.typ`` defines, and return it."""
@@ -62,10 +62,10 @@ class Page:
             block = styled_text(text, size, colour, bold)
             self.add("text", above=gap_above, indent=indent, mark=marker, **block)
 
-    def heading(self, text: str) -> None:
+    def write_heading(self, text: str) -> None:
         self.add("heading", **styled_text(text, 9.5, bold=True))
 
-    def write_small(self, text: str) -> None:
+    def write_small_text(self, text: str) -> None:
         self.write(text, colour=MUTED_COLOUR, gap_above=-1.0)
 
     def write_labelled(
@@ -85,7 +85,7 @@ class Page:
         for label, text in texts.items():
             self.write_labelled(label, text)
 
-    def table(
+    def add_table(
         self,
         head: Sequence[str],
         rows: Sequence[Sequence[Cell]],
@@ -107,7 +107,7 @@ class Page:
         right, widths = right_aligned_columns, column_widths
         self.add("table", head=head, rows=rows, column_widths=widths, right=right)
 
-    def panel(
+    def add_panel(
         self,
         title: str,
         height: float,
@@ -143,7 +143,7 @@ class Page:
         _place_axes(block)
         return axes
 
-    def legend(self, entries: Iterable[Artist]) -> Block:
+    def add_legend(self, entries: Iterable[Artist]) -> Block:
         from matplotlib.figure import Figure  # noqa: PLC0415
 
         rows: list[list[Artist]] = [[]]
@@ -179,7 +179,7 @@ class Page:
         self.add("columns", columns=blocks, widths=widths, gap=COLUMN_GAP, above=gap_above)
 
 
-def two_columns(left_fraction: float = 0.5) -> tuple[Page, Page]:
+def make_two_columns(left_fraction: float = 0.5) -> tuple[Page, Page]:
     """Return a left and a right column that fill the page."""
     free_width = PAGE_WIDTH - COLUMN_GAP
     return Page(width=left_fraction * free_width), Page(width=(1.0 - left_fraction) * free_width)
@@ -192,7 +192,7 @@ def styled_text(text: str, size: float = 8.0, colour: str = "black", bold: bool 
 
 def text_width(text: str) -> float:
     """Return the width (points) of a text in DejaVu Sans of 8 points."""
-    from matplotlib import font_manager  # noqa: PLC0415 - as in :meth:`Page.panel`
+    from matplotlib import font_manager  # noqa: PLC0415 - as in :meth:`Page.add_panel`
 
     font = font_manager.get_font(font_manager.findfont(FONT))
     # measured at a large font size, because widths are rounded to whole points
@@ -235,14 +235,14 @@ def draw_legend_above(axes: Axes) -> None:
 
 def replace_unprintable(text: str) -> str:
     """Remove control characters, split long words, and replace characters without a font by □."""
-    from px4fuse.report import fonts  # noqa: PLC0415 - as in :meth:`Page.panel`
+    from px4fuse.report import fonts  # noqa: PLC0415 - as in :meth:`Page.add_panel`
 
     return "".join(
         character
-        if character in ALLOWED_CHARACTERS or fonts.find_font(character)
-        else fonts.NO_GLYPH
-        for character in LONG_WORD.sub(r"\g<0>\n", text.expandtabs(4))
-        if character in ALLOWED_CHARACTERS or character.isprintable()
+        if character in PRINTED_SPECIAL_CHARACTERS or fonts.find_font(character)
+        else fonts.MISSING_GLYPH_SYMBOL
+        for character in LONG_WORD_PATTERN.sub(r"\g<0>\n", text.expandtabs(4))
+        if character in PRINTED_SPECIAL_CHARACTERS or character.isprintable()
     )
 
 
@@ -256,13 +256,13 @@ def to_typst_data(block: Any, log: str) -> Any:
             for name, value in block.items()
             if name not in ("figure", "axes")
         }
-        return fields | ({"svg": _figure_svg(block)} if "figure" in block else {})
+        return fields | ({"svg": _render_figure_svg(block)} if "figure" in block else {})
     if isinstance(block, Sequence):
         return [to_typst_data(item, log) for item in block]
     return block
 
 
-def _figure_svg(block: Mapping[str, Any]) -> str:
+def _render_figure_svg(block: Mapping[str, Any]) -> str:
     if "axes" in block:
         _place_axes(block)
         replace_ticks(block["axes"], text_width)

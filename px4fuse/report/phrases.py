@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 # Minimum p value of the Ljung-Box test for white innovations: with eight tests per flight, less
 # than 1 % of the flights have a false alarm
-MIN_WHITE_P_VALUE = 0.001
+MIN_WHITENESS_P_VALUE = 0.001
 # Error of the reported σ, by verdict on the filter
 SIGMA_ERROR_TEXTS = {"underconfident": "too large", "overconfident": "too small"}
 DIFFERENCE_FIELDS = ("position_rms_m", "velocity_rms_m_s")
@@ -115,7 +115,7 @@ def write_error_table(page: Page, analysis: Analysis) -> None:
             rows.append([*make_verdict_row(result, name), *cells])
     head = [*VERDICT_TABLE_HEAD, *(["KF-EKF2\n(m)", "RMS\n(m/s)"] if has_ekf2 else [])]
     head += ["RMSE\n(m)", "\n(m/s)"] if has_truth else []
-    page.table(head, rows, right_aligned_columns=(2, 3, 5, 6, 7, 8))
+    page.add_table(head, rows, right_aligned_columns=(2, 3, 5, 6, 7, 8))
 
 
 def _format_rms(statistic: object, field: str) -> str:
@@ -140,12 +140,12 @@ def list_verdict_warnings(comparison: Comparison) -> list[str]:
     correlated_filter_texts = [
         f"{filter_name} along {axis}, lag-1 autocorrelation {consistency.lag1_autocorrelation:+.2f}"
         for axis, filter_name, consistency in consistency_rows
-        if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITE_P_VALUE
+        if consistency.verdict == "consistent" and consistency.ljung_box_p < MIN_WHITENESS_P_VALUE
     ]
     if correlated_filter_texts:
         notes.append(
             "Innovations are not white, although their variance is consistent (Ljung-Box test, p "
-            f"< {MIN_WHITE_P_VALUE:g}): {'; '.join(correlated_filter_texts)}. If the "
+            f"< {MIN_WHITENESS_P_VALUE:g}): {'; '.join(correlated_filter_texts)}. If the "
             "autocorrelation is positive, the filter lags and SIGMA_A may be too small. If it is "
             "negative, the filter follows the measurement noise and SIGMA_A may be too large."
         )
@@ -166,9 +166,9 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
     """Describe the alignment of a position file with the flight, by label."""
     north_m, east_m, down_m = alignment.origin_m
     yaw_sigma_text = "" if alignment.yaw_sigma_deg is None else f" ± {alignment.yaw_sigma_deg:.2f}°"
-    clock_sigma_s, residual_rms_m = alignment.clock_offset_sigma_s, alignment.residual_rms_m
-    clock_sigma_text = "" if clock_sigma_s is None else f" ± {clock_sigma_s:.3f} s"
-    texts = {
+    clock_offset_sigma_s, residual_rms_m = alignment.clock_offset_sigma_s, alignment.residual_rms_m
+    clock_sigma_text = "" if clock_offset_sigma_s is None else f" ± {clock_offset_sigma_s:.3f} s"
+    text_by_label = {
         "frame": f"{alignment.frame} ({alignment.frame_reason})",
         "yaw": f"{alignment.yaw_deg:.2f}°{yaw_sigma_text} ({alignment.yaw_reason})",
         "origin": f"north {north_m:.3f} m, east {east_m:.3f} m, down {down_m:.3f} m",
@@ -178,8 +178,8 @@ def describe_alignment(alignment: Alignment) -> dict[str, str]:
     if alignment.correlation is not None:
         residual_text = "" if residual_rms_m is None else f", {residual_rms_m:.3f} m RMS per axis"
         correlation_text = f"correlation {alignment.correlation:.4f} with {alignment.reference}"
-        texts["match"] = correlation_text + residual_text
-    return texts
+        text_by_label["match"] = correlation_text + residual_text
+    return text_by_label
 
 
 def make_tuning_advice(

@@ -15,7 +15,7 @@ from px4fuse.report.card_text import (
     Paragraph,
     card_lines,
     closing_lines,
-    headline_lines,
+    format_headline_lines,
     to_ascii,
     with_typed_path,
 )
@@ -26,10 +26,14 @@ from px4fuse.request import ComparisonRequest, Request, command_line
 # Terminal encodings that contain all characters of a diagnosis card
 UNICODE_ENCODINGS = ("utf-8", "utf8", "utf-16")
 # Function that yields the lines of a diagnosis card, by kind of block
-CARD_LINE_FUNCTIONS = {"card": card_lines, "closing": closing_lines, "headline": headline_lines}
+CARD_LINE_FUNCTIONS = {
+    "card": card_lines,
+    "closing": closing_lines,
+    "headline": format_headline_lines,
+}
 LABEL_CHARACTERS = 9  # width (characters) of a label on the terminal
 MIN_TABLE_WIDTH = 50  # minimum width (characters) of a terminal for tables
-POINTS_PER_COLUMN = 6.0  # indent (points) in the PDF that is one character on the terminal
+POINTS_PER_COLUMN = 6.0  # indent (points) in the PDF per character of indent on the terminal
 # Terminal styles of text colours; the other colours belong to plots
 STYLES_BY_COLOUR = {
     MUTED_COLOUR: "dim",

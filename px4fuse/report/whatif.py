@@ -29,11 +29,11 @@ def make_column_headings(analysis: WhatIfAnalysis) -> list[str]:
     change_texts += [
         f"without {name} from {start_s:g} s" for name, start_s in analysis.without.items()
     ]
-    heads = ["logged", "replayed"]
+    headings = ["logged", "replayed"]
     if change_texts:
         estimate_note = " (maximum-likelihood estimate)" if analysis.uses_estimates else ""
-        heads.append(f"replayed with {', '.join(change_texts)}{estimate_note}")
-    return heads
+        headings.append(f"replayed with {', '.join(change_texts)}{estimate_note}")
+    return headings
 
 
 def make_statistic_rows(analysis: WhatIfAnalysis) -> list[list[str]]:
@@ -95,7 +95,7 @@ def make_sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str
     """Return the headings, and a row of statistics for each value of the swept parameter."""
     name, rows = find_swept_parameter(analysis), []
     unit = PARAMETERS[name].unit
-    for summary in select_sweep(analysis):
+    for summary in select_sweep_summaries(analysis):
         axes = summary.axes.values()
         cells = [
             "/".join(format_number(axis.nis_mean) for axis in axes),
@@ -118,19 +118,21 @@ def make_sweep_table(analysis: WhatIfAnalysis) -> tuple[list[str], list[list[str
     return head, rows
 
 
-def select_sweep(analysis: WhatIfAnalysis) -> tuple[Summary, ...]:
+def select_sweep_summaries(analysis: WhatIfAnalysis) -> tuple[Summary, ...]:
     return analysis.whatif.whatif[analysis.sweep_start_index :]
 
 
 def find_swept_parameter(analysis: WhatIfAnalysis) -> str:
-    (name,) = select_sweep(analysis)[0].changed.keys() - analysis.changes.keys()
+    (name,) = select_sweep_summaries(analysis)[0].changed.keys() - analysis.changes.keys()
     return name
 
 
 def describe_sweep(analysis: WhatIfAnalysis) -> list[str]:
     """Return sentences on the best value of the swept parameter."""
     sentences = []
-    if summaries := [summary for summary in select_sweep(analysis) if summary.is_predictable]:
+    if summaries := [
+        summary for summary in select_sweep_summaries(analysis) if summary.is_predictable
+    ]:
         name = find_swept_parameter(analysis)
         best_summary = min(summaries, key=lambda s: abs(math.log(s.nis_mean)))
         sentences.append(
@@ -151,8 +153,8 @@ def describe_sweep(analysis: WhatIfAnalysis) -> list[str]:
     if not all(summary.is_predictable for summary in analysis.whatif.whatif):
         sentences.append(
             "A replay is not predictable in three cases: EKF2 rejects more than "
-            f"{MAX_REJECTED_FRACTION:.0%} of the samples, {1000.0 * ADDED_NOISE_M:.0f} mm of added "
-            "position noise change its statistics, or EKF2 fuses no height for "
+            f"{MAX_REJECTED_FRACTION:.0%} of the samples, the statistics change much with "
+            f"{1000.0 * ADDED_NOISE_M:.0f} mm of added position noise, or EKF2 fuses no height for "
             f"{HEIGHT_TIMEOUT_S:g} s."
         )
     return [*sentences, *(f"{note}." for note in analysis.whatif.notes)]
@@ -180,9 +182,9 @@ def whatif_page(analysis: WhatIfAnalysis) -> Page:
         )
         page.write_labelled("Change", no_change_text)
     head = ["", *make_column_headings(analysis)]
-    page.table(head, make_statistic_rows(analysis), right_aligned_columns=range(1, len(head)))
-    if select_sweep(analysis):
-        page.table(*make_sweep_table(analysis), right_aligned_columns=range(1, 7))
+    page.add_table(head, make_statistic_rows(analysis), right_aligned_columns=range(1, len(head)))
+    if select_sweep_summaries(analysis):
+        page.add_table(*make_sweep_table(analysis), right_aligned_columns=range(1, 7))
     for line in describe_sweep(analysis):
         page.write(line)
     page.write("Replays use px4fuse's model of EKF2, not PX4's code.")
