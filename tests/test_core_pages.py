@@ -53,7 +53,7 @@ def eventful() -> Analysis:
 
 
 def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -> None:
-    labels = [artist.get_label() for artist in event_marks.legend_entries(eventful)]
+    labels = [artist.get_label() for artist in event_marks.make_legend_entries(eventful)]
     assert labels == [
         "on the ground", "gap in position source", "log dropout",
         "EKF2 rejected", "outlier", "EKF2 reset", "take-off", "landing",
@@ -72,7 +72,7 @@ def test_event_symbols_in_plots_are_labelled_by_event_type(eventful: Analysis) -
     ]  # fmt: skip
     # rejected, outliers, resets, take-off, landing
     assert [len(line.get_xdata()) for line in axes.lines[2:]] == [1, 1, 1]
-    assert set(axes.lines[1].get_xdata()) <= set(event_marks.outlier_times(eventful))
+    assert set(axes.lines[1].get_xdata()) <= set(event_marks.find_outlier_times(eventful))
 
 
 def test_event_symbols_of_long_flight_do_not_overlap() -> None:

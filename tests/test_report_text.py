@@ -22,14 +22,14 @@ from px4fuse.findings import Finding
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import clock, fonts, notes
 from px4fuse.report.notes import write_markdown
-from px4fuse.report.page import Block, Page, replace_unprintable
+from px4fuse.report.page import Page, PageBlock, replace_unprintable
 from px4fuse.report.typesetting import compile_pdf
 from px4fuse.results.model import Student
 
 THAI, HAN, ARABIC = "สมชาย", "王小明", "محمد"
 
 
-def written(markdown: str) -> list[Block]:
+def written(markdown: str) -> list[PageBlock]:
     page = Page()
     write_markdown(page, markdown)
     return page.blocks

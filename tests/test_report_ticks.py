@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from px4fuse.report.page import text_width
+from px4fuse.report.page import measure_text_width
 from px4fuse.report.style import Axes, apply_report_style, set_map_axes, set_plain_ticks
 from px4fuse.report.ticks import replace_ticks
 
@@ -52,7 +52,7 @@ def drawn_texts(
         axes = Figure(figsize=(4.0, 2.6), dpi=72.0).add_axes((0.3, 0.3, 0.6, 0.6))
         plot(axes)
         if few_artists:
-            replace_ticks(axes, text_width)
+            replace_ticks(axes, measure_text_width)
             texts = axes.texts
         else:
             axes.figure.draw_without_rendering()
@@ -85,6 +85,6 @@ def test_replaced_ticks_keep_the_grid_of_each_axis() -> None:
             axes = Figure().add_axes((0.0, 0.0, 1.0, 1.0))
             axes.grid(visible=False)
             axes.grid(visible=True, axis=grid_axis)
-            replace_ticks(axes, text_width)
+            replace_ticks(axes, measure_text_width)
             colours = [line.get_color() for line in axes.lines]
             assert colours.count("#e3e3e3") == expected_count

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from px4fuse import request as requests
 from px4fuse.cli.compare import compare
-from px4fuse.cli.loop import loop, loop_request
+from px4fuse.cli.loop import loop, make_loop_request
 from px4fuse.cli.options import comparison_request
 from px4fuse.request import ComparisonRequest, LoopRequest, PositionFile, Request, command_line
 
@@ -74,7 +74,7 @@ def parsed(command: str) -> Request:
     values = {key: value for key, value in context.params.items() if key not in own}
     if name == "compare":
         return comparison_request(values.pop("log"), values)
-    return loop_request(values.pop("source"), values)
+    return make_loop_request(values.pop("source"), values)
 
 
 @settings(deadline=None)

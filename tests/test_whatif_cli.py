@@ -23,7 +23,7 @@ from px4fuse.report.whatif import (
     make_column_headings,
     make_statistic_rows,
     make_sweep_table,
-    whatif_page,
+    make_whatif_page,
 )
 from px4fuse.request import Sweep, WhatIfRequest, command_line
 from px4fuse.results.contract import WhatIfResults, schema
@@ -94,7 +94,7 @@ def test_what_if_without_set_option_keeps_consistent_parameters(estimated: WhatI
     assert estimated.uses_estimates
     assert not estimated.changes
     assert not estimated.whatif.whatif
-    texts = [str(block) for block in whatif_page(estimated).blocks]
+    texts = [str(block) for block in make_whatif_page(estimated).blocks]
     assert any("no parameter is changed" in text for text in texts)
     table, found = (
         {label.strip(): cells for label, *cells in make_statistic_rows(estimated)},

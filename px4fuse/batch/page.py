@@ -99,11 +99,11 @@ def format_html(table: pd.DataFrame, title: str, version_text: str) -> str:
                 Column(
                     f"{filter_name.upper()} {SYMBOL_BY_REFERENCE[reference_name]}",
                     "ratio",
-                    visible_from="tablet",
+                    min_screen_size="tablet",
                 )
                 for filter_name, reference_name in (name.split("_") for name in SIGMA_RATIO_COLUMNS)
             ),
-            Column("KF − EKF2 (m)", "number", visible_from="tablet"),
+            Column("KF − EKF2 (m)", "number", min_screen_size="tablet"),
             *(
                 Column(label, "line", EXTRA_COLUMN_GROUP)
                 for label in ("Date (UTC)", "Vehicle", "Firmware")

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import click
 
-from px4fuse.cli.outputs import Interrupted, written_files_sentence
+from px4fuse.cli.outputs import Interrupted, describe_written_files
 from px4fuse.core.input_files import protect_inputs
 from px4fuse.core.threads import ONE_THREAD_ENVIRONMENT
 from px4fuse.errors import OutputError, Px4FuseError, SettingsError, suggest_name, to_one_line
@@ -96,9 +96,9 @@ class LazyGroup(click.Group):
             # without errno, because click handles EPIPE with exit code 1
             raise BrokenPipeError from error
         except KeyboardInterrupt as interrupt:  # click would print an empty line
-            raise Interrupted(interrupt, written_files_sentence(ctx)) from None
+            raise Interrupted(interrupt, describe_written_files(ctx)) from None
         except (MemoryError, OSError) as error:
-            raise _make_system_error(error, written_files_sentence(ctx)) from error
+            raise _make_system_error(error, describe_written_files(ctx)) from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):

@@ -52,7 +52,7 @@ def compare(
     from px4fuse.card.build import build_refusal_card
     from px4fuse.core.memory import release_free_memory
     from px4fuse.diagnose import diagnose_or_check_aids
-    from px4fuse.report.terminal import comparison_page, make_card_page
+    from px4fuse.report.terminal import make_card_page, make_comparison_page
     from px4fuse.results.build import make_outcome_results
 
     student = options.read_student(option_values, log)
@@ -78,7 +78,7 @@ def compare(
             raise
         outputs.show_page(make_card_page("card", build_refusal_card(error, log)), uses_stderr=True)
         sys.exit(2)
-    page = comparison_page(outcome, results, verbose=verbose, quiet=quiet)
+    page = make_comparison_page(outcome, results, verbose=verbose, quiet=quiet)
     outputs.write_and_print_results(contents, page, request)
     if not quiet and STANDARD_OUTPUT not in contents:
         outputs.show_page(make_card_page("closing", results.card))

@@ -27,7 +27,7 @@ def explore(log: Path | None, output: Path | None, **option_values: Any) -> None
 
     log = log or sample_log()
     request = options.comparison_request(log, option_values)
-    target = outputs.web_page_path(
+    target = outputs.choose_web_page_path(
         output, Path("reports", f"{log.stem}{format_settings_suffix(request)}.html")
     )
     with outputs.progress(target) as show_progress:

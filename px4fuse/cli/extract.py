@@ -64,7 +64,7 @@ def extract(
     contents[output / "data_dictionary.csv"] = extraction.to_bytes(
         extraction.data_dictionary(flight), "csv"
     )
-    contents[output / "flight.json"] = to_json(extraction.description(flight)).encode()
+    contents[output / "flight.json"] = to_json(extraction.describe_flight(flight)).encode()
     write_outputs(contents)
     click.echo(f"Wrote to {to_one_line(str(output))}:")
     for name, table in tables.items():

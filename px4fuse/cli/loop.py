@@ -170,7 +170,7 @@ def loop(
     if is_g2o(log):
         _solve_graph(source, json_path, g2o_path, option_values["robust"] or None)
         return
-    request = loop_request(source, option_values)
+    request = make_loop_request(source, option_values)
     outputs.check_output_paths(
         [tum_path, g2o_path, *outputs.choose_report_paths(output, json_path)]
     )
@@ -186,7 +186,7 @@ def loop(
     )
 
 
-def loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
+def make_loop_request(source: Path, option_values: dict[str, Any]) -> LoopRequest:
     del option_values["robust"]
     return LoopRequest(
         source=str(source), closed_loop=not option_values.pop("is_open_path"), **option_values

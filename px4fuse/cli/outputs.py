@@ -106,7 +106,7 @@ def progress(*targets: Path | None) -> Iterator[ShowProgress]:
         yield show
 
 
-def default_report_path(name: str, results: Results) -> Path:
+def choose_default_report_path(name: str, results: Results) -> Path:
     """Return the path of a report if the user gives none (-o); a long name is cut.
 
     Raises
@@ -167,17 +167,17 @@ def _is_same_report(
 
     existing_results = read(existing_content, "report")
     existing_hashes = file_hashes_in(to_json(existing_results))
-    return existing_hashes == file_hashes_in(to_json(new_results)) and _student_name_and_id(
+    return existing_hashes == file_hashes_in(to_json(new_results)) and _get_student_name_and_id(
         existing_results
-    ) in (NO_STUDENT_NAME, _student_name_and_id(new_results))
+    ) in (NO_STUDENT_NAME, _get_student_name_and_id(new_results))
 
 
-def _student_name_and_id(results: Results) -> tuple[str, str]:
+def _get_student_name_and_id(results: Results) -> tuple[str, str]:
     student = getattr(results, "student", None)
     return NO_STUDENT_NAME if student is None else (student.name, student.id)
 
 
-def web_page_path(output: Path | None, default: Path) -> Path:
+def choose_web_page_path(output: Path | None, default: Path) -> Path:
     """Return the path of a web page (value of -o, or the default), and check it.
 
     Raises
@@ -227,7 +227,7 @@ def make_result_files(
     from px4fuse.results.contract import to_json
 
     if default_stem and output is None and json_path is None:
-        output = default_report_path(default_stem, results)
+        output = choose_default_report_path(default_stem, results)
     json_text, contents = to_json(results), dict[Path, bytes]()
     if (recorded_texts := click.get_current_context().meta.get(RESULTS_KEY)) is not None:
         recorded_texts.append(json_text)
@@ -259,7 +259,7 @@ def write_outputs(contents: Mapping[Path, bytes]) -> None:
     write_output_files(contents, written_files.append)
 
 
-def written_files_sentence(context: click.Context) -> str:
+def describe_written_files(context: click.Context) -> str:
     written_files: list[Path] = context.meta.get(WRITTEN_FILES_KEY, [])
     return f"{format_written_outputs(written_files)}." if written_files else "nothing was written."
 

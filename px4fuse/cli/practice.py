@@ -10,8 +10,8 @@ from px4fuse.cli.options import count_option, output_option
 from px4fuse.cli.outputs import (
     OPENS_OUTPUT_KEY,
     check_default_page,
+    choose_web_page_path,
     progress,
-    web_page_path,
     write_and_print_results,
 )
 
@@ -54,7 +54,7 @@ def practice(
     solution. Not for exams: the page contains the solutions.
     """
     seed = secrets.randbelow(10**6) if seed is None else seed
-    target = web_page_path(output, Path("reports", f"practice_{seed}.html"))
+    target = choose_web_page_path(output, Path("reports", f"practice_{seed}.html"))
     ctx.meta[OPENS_OUTPUT_KEY] = sys.stdout.isatty() if opens_browser is None else opens_browser
     with progress(target) as show_progress:
         from px4fuse.explore.practice import make_practice_page

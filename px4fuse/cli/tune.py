@@ -23,7 +23,7 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
     from px4fuse.comparison.estimates import estimate_noises
     from px4fuse.diagnose import prepare_comparison, read_flight
     from px4fuse.errors import MissingDataError
-    from px4fuse.report.tuning import tuning_page
+    from px4fuse.report.tuning import make_tuning_page
     from px4fuse.results.build import make_tuning_results
 
     request = comparison_request(log, option_values)
@@ -40,5 +40,5 @@ def tune(log: Path, json_path: Path | None, **option_values: Any) -> None:
         )
     results = make_tuning_results(request, comparison, tunings)
     write_and_print_results(
-        make_result_files(results, json_path), tuning_page(comparison, tunings), request
+        make_result_files(results, json_path), make_tuning_page(comparison, tunings), request
     )

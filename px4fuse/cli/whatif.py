@@ -64,7 +64,7 @@ def whatif(
     on.
     """
     from px4fuse.diagnose import run_what_if
-    from px4fuse.report.whatif import whatif_page
+    from px4fuse.report.whatif import make_whatif_page
     from px4fuse.results.build import make_whatif_results
 
     if start_s is not None and not without:
@@ -80,7 +80,7 @@ def whatif(
         analysis = run_what_if(request, show_progress)
     results = make_whatif_results(request, analysis)
     outputs.write_and_print_results(
-        outputs.make_result_files(results, json_path), whatif_page(analysis)
+        outputs.make_result_files(results, json_path), make_whatif_page(analysis)
     )
 
 

@@ -26,14 +26,14 @@ class Column(NamedTuple):
         "rank": text that is sorted by a number; "ratio": number that is drawn on an axis.
     group : str
         Check box with which users show or hide the column; "" for a column that is always shown.
-    visible_from : str
+    min_screen_size : str
         Smallest screen size on which the column is shown.
     """
 
     title: str
     kind: Literal["text", "name", "full", "line", "number", "rank", "ratio"] = "text"
     group: str = ""
-    visible_from: Literal["always", "tablet", "desk"] = "always"
+    min_screen_size: Literal["always", "tablet", "desk"] = "always"
 
 
 class Cell(NamedTuple):

@@ -299,11 +299,11 @@ def _list_analyses(
     else:
         source, segment = comparison.source, comparison.segment
         sample_count = len(cut_to_segment(source.samples, segment))
-        description = (
+        used_data_text = (
             f"KF with {sample_count} samples of position source {source.name} from "
             f"{segment.start_s:.1f} s to {segment.end_s:.1f} s"
         )
-        yield AnalysisOption("compare", True, description)
+        yield AnalysisOption("compare", True, used_data_text)
     low_rate_findings = () if flight.log.is_assessed else imu.detect_low_rates(flight)
     imu_fault_text = " ".join(finding.message for finding in low_rate_findings)
     if isinstance(missing_data := imu_and_attitude(flight), Unavailable):
@@ -311,7 +311,7 @@ def _list_analyses(
     acceleration_text = "IMU acceleration rotated into NED by the attitude, without gravity"
     yield AnalysisOption("acceleration", not imu_fault_text, imu_fault_text or acceleration_text)
     yield from _list_ekf2_and_truth_analyses(flight, comparison)
-    results_by_aid, ekf2, description = evaluate_aids(flight), flight.ekf2, ""
+    results_by_aid, ekf2, rates_text = evaluate_aids(flight), flight.ekf2, ""
     if isinstance(results_by_aid, dict) and isinstance(ekf2, Ekf2):
         rate_texts = (
             f"{aid.label} {sample_rate(samples):.2g} Hz"
@@ -319,21 +319,21 @@ def _list_analyses(
             else f"{aid.label} 1 sample"
             for name, aid in results_by_aid.items()
         )
-        description = ", ".join(rate_texts)
-    yield _make_analysis_option("aids", results_by_aid, description)
-    replay_inputs, description = prepare_inputs(flight), ""
+        rates_text = ", ".join(rate_texts)
+    yield _make_analysis_option("aids", results_by_aid, rates_text)
+    replay_inputs, replay_text = prepare_inputs(flight), ""
     if not isinstance(replay_inputs, Unavailable):
         replayed_duration_s = sum(
             float(np.ptp(segment.time_s)) for segment in replay_inputs.segments
         )
-        description = f"EKF2 replay of {replayed_duration_s:.0f} s with {replay_inputs.aid.label}"
-    yield _make_analysis_option("what-if", replay_inputs, description)
+        replay_text = f"EKF2 replay of {replayed_duration_s:.0f} s with {replay_inputs.aid.label}"
+    yield _make_analysis_option("what-if", replay_inputs, replay_text)
 
 
-def _make_analysis_option(name: str, data: object, description: str) -> AnalysisOption:
+def _make_analysis_option(name: str, data: object, used_data_text: str) -> AnalysisOption:
     if isinstance(data, Unavailable):
         return AnalysisOption(name, False, data.reason)
-    return AnalysisOption(name, True, description)
+    return AnalysisOption(name, True, used_data_text)
 
 
 def _list_ekf2_and_truth_analyses(

@@ -91,7 +91,7 @@ def list_missing_data(flight: Flight) -> tuple[Unavailable, ...]:
     return tuple(dict.fromkeys(missing_data))
 
 
-def description(flight: Flight) -> dict[str, Any]:
+def describe_flight(flight: Flight) -> dict[str, Any]:
     """Describe log, topics, clocks and missing data of a flight, for flight.json."""
     ekf2 = flight.ekf2
     description_fields: dict[str, Any] = {

@@ -12,7 +12,7 @@ from px4fuse.ekf2.aids import AidResult, flight_span
 from px4fuse.flight.model import AidLog, Flight, Unavailable, step_values_at
 from px4fuse.report import style
 from px4fuse.report.event_marks import ON_GROUND_BAND_STYLE
-from px4fuse.report.page import Cell, Page, appendix_title
+from px4fuse.report.page import Cell, Page, make_appendix_title
 from px4fuse.report.panels import draw_dots
 from px4fuse.report.phrases import format_sigma_verdict
 
@@ -33,7 +33,7 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, _: object) -> Iterator[Pag
     is_comparison = isinstance(analysis, Analysis)
     aids = select_aids_if_outdoor(analysis) if isinstance(analysis, Analysis) else analysis.aids
     if aids:
-        page = Page(appendix_title(TITLE) if is_comparison else TITLE, LEAD_TEXT)
+        page = Page(make_appendix_title(TITLE) if is_comparison else TITLE, LEAD_TEXT)
         write_aids(page, aids)
         _draw_aid_panels(page, analysis.flight, aids)
         yield page

@@ -85,7 +85,7 @@ class Paragraph(NamedTuple):
         )
 
 
-def card_lines(card: Card) -> Iterator[Paragraph]:
+def format_card_lines(card: Card) -> Iterator[Paragraph]:
     if card.severity == "refused":
         yield Paragraph(f"error[{card.id}]: {card.headline}", SEVERITY_STYLES["error"])
         for label, text in card.facts.items():
@@ -128,7 +128,7 @@ def note_texts(card: Card, other_notes_place: str) -> list[str]:
     return texts
 
 
-def closing_lines(card: Card) -> Iterator[Paragraph]:
+def format_closing_lines(card: Card) -> Iterator[Paragraph]:
     """Yield the last lines of a diagnosis card: commands that print details."""
     actions = [action for cause in card.causes for _, action in label_alternatives(cause)]
     text = "More: -v."

@@ -35,8 +35,8 @@ from px4fuse.report.phrases import (
     VERDICT_TABLE_HEAD,
     format_noise_estimate,
     format_settings,
+    get_statistics_by_filter,
     make_verdict_row,
-    statistics_by_filter,
 )
 from px4fuse.report.style import (
     INNOVATION_STYLES,
@@ -109,7 +109,7 @@ def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     rows = [
         [*make_verdict_row(axis_result, name), *_statistic_cells(consistency)]
         for axis_result in analysis.axes.values()
-        for name, consistency in statistics_by_filter(axis_result).items()
+        for name, consistency in get_statistics_by_filter(axis_result).items()
     ]
     page.add_table(column_heads, rows, right_aligned_columns=(2, 5, 6, 7, 8))
     noise_rows = [
@@ -154,7 +154,7 @@ def _write_causes(page: Page, analysis: Analysis) -> None:
 
 
 def _select_tested_innovations(result: AxisComparison) -> InnovationsByFilter:
-    consistency_by_name = statistics_by_filter(result)
+    consistency_by_name = get_statistics_by_filter(result)
     return {
         name: values
         for name, values in normalised_innovations(result).items()
@@ -228,7 +228,7 @@ def _compute_whiteness_limit(values: pd.Series[float]) -> float:
 def _describe_whiteness(result: AxisComparison, innovations: InnovationsByFilter) -> str:
     sentences = []
     for name, values in innovations.items():
-        consistency = statistics_by_filter(result)[name]
+        consistency = get_statistics_by_filter(result)[name]
         assert isinstance(consistency, Consistency)
         lag1_correlation, p_value = consistency.lag1_autocorrelation, consistency.ljung_box_p
         interpretation = "white" if p_value >= MIN_WHITENESS_P_VALUE else "not white"

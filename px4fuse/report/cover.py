@@ -32,7 +32,7 @@ from px4fuse.report.card_text import (
     rerun_columns,
 )
 from px4fuse.report.cover_panels import write_panels
-from px4fuse.report.page import Block, Page, to_typst_data
+from px4fuse.report.page import Page, PageBlock, to_typst_data
 from px4fuse.report.style import SEVERITY_COLOURS
 from px4fuse.report.typesetting import measure_free_height
 from px4fuse.results.contract import AidsResults, ComparisonResults
@@ -61,7 +61,7 @@ def draw_pages(analysis: Analysis | AidsOnlyAnalysis, results: FlightResults) ->
     yield page
 
 
-def add_card(page: Page, card: Card) -> Block:
+def add_card(page: Page, card: Card) -> PageBlock:
     """Add a summary of faults, causes and actions to a page."""
     identity, duration_text = card.identity, f"{card.identity.duration_s:.1f} s"
     flight_texts = identity.firmware, identity.hardware, duration_text, identity.source

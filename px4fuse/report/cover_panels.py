@@ -30,11 +30,11 @@ from px4fuse.report.page import (
     AXIS_LABEL_HEIGHT,
     TICKS_HEIGHT,
     UNLABELLED_HEIGHT,
-    Block,
     Page,
-    line_count,
+    PageBlock,
+    count_wrapped_lines,
     make_two_columns,
-    text_width,
+    measure_text_width,
 )
 from px4fuse.report.panels import add_legend, draw_dots, normalised_innovations
 from px4fuse.report.style import TRACK_STYLES, Axes, draw_curve
@@ -102,7 +102,7 @@ class FlightMap(NamedTuple):
     y_label: str
 
 
-def write_panels(block: Block, analysis: Analysis, card: Card, free_height: float) -> None:
+def write_panels(block: PageBlock, analysis: Analysis, card: Card, free_height: float) -> None:
     """Draw legend, map and plots over time on the first page; ``free_height`` is in points."""
     page = Page()
     block["blocks"] = page.blocks
@@ -183,7 +183,7 @@ def _compute_plot_heights(
 
 
 def _find_title_height(page: Page, title: str) -> float:
-    return TITLE_HEIGHT + TITLE_LINE_HEIGHT * (line_count(title, page.width) - 1)
+    return TITLE_HEIGHT + TITLE_LINE_HEIGHT * (count_wrapped_lines(title, page.width) - 1)
 
 
 def _make_error_plots(analysis: Analysis, card: Card) -> list[TimePlot]:
@@ -363,7 +363,7 @@ def _draw_map(page: Page, analysis: Analysis, flight_map: FlightMap, height: flo
         limits = _compute_map_limits(tracks, width / axes_height)
     axes = _add_panel(page, title, axes_height)
     x_label = next(
-        text for text in flight_map.x_labels if text_width(text) < page.width - LEFT_MARGIN
+        text for text in flight_map.x_labels if measure_text_width(text) < page.width - LEFT_MARGIN
     )
     (left, bottom), (right, top) = limits
     axes.set(xlim=(left, right), ylim=(bottom, top), xlabel=x_label, ylabel=flight_map.y_label)

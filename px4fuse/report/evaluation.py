@@ -63,7 +63,7 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
             drawn_position_m = position_m[:, axis_indices]
             plot_path(axes, drawn_position_m, evaluation.time_s, label=label, **line_style)
         style.set_map_axes(axes, *names)
-        unaligned_legend_handles = _legend_handles(axes)
+        unaligned_legend_handles = _get_legend_handles(axes)
         left_column.write_small_text(describe_unaligned_rmse(evaluation))
     title = f"{'Aligned path' if is_aligned else 'Path'} coloured by error"
     axes = right_column.add_panel(title, MAP_HEIGHT, left=LABEL_MARGIN, right=COLOUR_BAR_MARGIN)
@@ -71,11 +71,11 @@ def _draw_maps(page: Page, evaluation: Evaluation) -> None:
     style.set_map_axes(axes, *names)
     right_column.write_small_text("Darker poses have a larger error; × marks the largest one.")
     # one legend for both maps lists the reference once
-    page.add_legend([*(_legend_handles(axes) | unaligned_legend_handles).values()])
+    page.add_legend([*(_get_legend_handles(axes) | unaligned_legend_handles).values()])
     page.add_columns(*[left_column] * is_aligned, right_column)
 
 
-def _legend_handles(axes: Axes) -> dict[str, Artist]:
+def _get_legend_handles(axes: Axes) -> dict[str, Artist]:
     handles, labels = axes.get_legend_handles_labels()
     return dict(zip(labels, handles, strict=True))
 
@@ -113,7 +113,7 @@ def _draw_ape_and_rpe(page: Page, evaluation: Evaluation) -> None:
     axes = right_column.add_panel("APE over distance (m)", PANEL_HEIGHT)
     draw_ape(axes, evaluation, evaluation.distance_m, "distance along the reference (m)")
     page.add_columns(left_column, right_column)
-    if _rpe_statistics(evaluation):
+    if _collect_rpe_statistics(evaluation):
         left_column, right_column = make_two_columns()
         _draw_rpe(
             left_column.add_panel("RPE (m) of pose pairs at distance delta", PANEL_HEIGHT),
@@ -139,7 +139,9 @@ def draw_ape(axes: Axes, evaluation: Evaluation, x_values: Array, label: str) ->
 
 
 def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
-    for index, (error, statistics) in enumerate(rpe_statistics := _rpe_statistics(evaluation)):
+    for index, (error, statistics) in enumerate(
+        rpe_statistics := _collect_rpe_statistics(evaluation)
+    ):
         if isinstance(error.interval_m, RmseInterval):
             interval = error.interval_m.low, error.interval_m.high
             axes.plot([index] * 2, interval, color=KF_COLOUR, lw=1.6, solid_capstyle="butt")
@@ -151,7 +153,7 @@ def _draw_rpe(axes: Axes, evaluation: Evaluation) -> None:
     axes.set_xlabel("delta: distance, time or frames between the poses of a pair")
 
 
-def _rpe_statistics(evaluation: Evaluation) -> list[tuple[RelativeError, Statistics]]:
+def _collect_rpe_statistics(evaluation: Evaluation) -> list[tuple[RelativeError, Statistics]]:
     return [(e, e.translation_m) for e in evaluation.rpe if isinstance(e.translation_m, Statistics)]
 
 
@@ -199,7 +201,7 @@ def write_evaluation(page: Page, evaluation: Evaluation) -> None:
         page.write(text, bold=True, colour=style.SEVERITY_COLOURS["warning"])
     head = ["error", "RMSE", "95 %", "mean", "median", "std", "max", "n", "rotation\nRMSE (°)"]
     page.add_table(head, make_error_rows(evaluation), right_aligned_columns=range(1, len(head)))
-    page.write_small_text(" ".join([*missing_reasons(evaluation), *evaluation.notes]))
+    page.write_small_text(" ".join([*list_missing_reasons(evaluation), *evaluation.notes]))
 
 
 def make_error_rows(evaluation: Evaluation) -> list[list[str]]:
@@ -218,7 +220,7 @@ def make_error_rows(evaluation: Evaluation) -> list[list[str]]:
     return rows
 
 
-def missing_reasons(evaluation: Evaluation) -> list[str]:
+def list_missing_reasons(evaluation: Evaluation) -> list[str]:
     ate, rpe_translations = evaluation.ate, (error.translation_m for error in evaluation.rpe)
     reasons = {
         f"No {quantity.what}: {quantity.reason}.": None

@@ -53,7 +53,7 @@ def _make_event_markers(
         EventMarkers("gap in position source", events.gaps, GAP_BAND_STYLE),
         EventMarkers("log dropout", events.dropouts, DROPOUT_BAND_STYLE),
         EventMarkers("EKF2 rejected", rejection_times_s, REJECTED_STYLE, 0.025),
-        EventMarkers("outlier", outlier_times(analysis), OUTLIER_MARKER_STYLE, 0.075),
+        EventMarkers("outlier", find_outlier_times(analysis), OUTLIER_MARKER_STYLE, 0.075),
         EventMarkers("EKF2 reset", events.resets_s, RESET_MARKER_STYLE, 0.92),
         EventMarkers("take-off", events.take_off_s, TAKE_OFF_MARKER_STYLE, 0.0),
         EventMarkers("landing", events.landing_s, LANDING_MARKER_STYLE, 0.0),
@@ -113,7 +113,7 @@ def add_panel(
     return axes
 
 
-def outlier_times(analysis: Analysis) -> Array:
+def find_outlier_times(analysis: Analysis) -> Array:
     """Return the times (s) of the outliers found by noise estimation."""
     tunings = map(analysis.tuning.get, (HORIZONTAL, analysis.main.axis.name))
     times_s = [tuning.outlier_time_s for tuning in tunings if isinstance(tuning, AxisTuning)]
@@ -121,7 +121,7 @@ def outlier_times(analysis: Analysis) -> Array:
     return outlier_times_s
 
 
-def legend_entries(analysis: Analysis) -> list[Artist]:
+def make_legend_entries(analysis: Analysis) -> list[Artist]:
     """Return a legend entry for each type of event in this flight."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415

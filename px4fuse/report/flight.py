@@ -13,7 +13,7 @@ from px4fuse.flight.model import Unavailable
 from px4fuse.report import panels, style
 from px4fuse.report.difference_page import describe_missing_explanation
 from px4fuse.report.page import COLUMN_GAP, PAGE_WIDTH, Page
-from px4fuse.report.phrases import list_verdict_warnings, statistics_by_filter
+from px4fuse.report.phrases import get_statistics_by_filter, list_verdict_warnings
 from px4fuse.report.style import EKF2_COLOUR, KF_COLOUR, Axes
 
 ZOOM_UPDATE_COUNT = 15  # number of updates in the enlarged plot of σ_p
@@ -115,7 +115,7 @@ def _draw_sigma_at_updates(axes: Axes, result: AxisComparison, zoom_span_s: Span
 
 def describe_sigma_at_updates(result: AxisComparison) -> str:
     filter_texts = []
-    for name, filter_summary in statistics_by_filter(result).items():
+    for name, filter_summary in get_statistics_by_filter(result).items():
         prior_sigma_m = filter_summary.sigma_p_before_update_m
         posterior_sigma_m = filter_summary.sigma_p_after_update_m
         if prior_sigma_m is None or posterior_sigma_m is None:

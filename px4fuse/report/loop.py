@@ -12,7 +12,7 @@ from px4fuse.loop import corrections
 from px4fuse.loop.analysis import MIN_UNIX_TIME_S
 from px4fuse.loop.model import LANDING_CLOSURE_SOURCE, Closure, Loop
 from px4fuse.report.evaluation import describe_method, format_interval, plot_path
-from px4fuse.report.page import Cell, Page, appendix_title
+from px4fuse.report.page import Cell, Page, make_appendix_title
 from px4fuse.report.phrases import format_student, write_findings
 from px4fuse.report.style import (
     EKF2_COLOUR,
@@ -59,7 +59,7 @@ MAP_HEIGHT = 290.0  # height (points) of the axes of the map
 def draw_pages(analysis: Analysis, _: object) -> Iterator[Page]:
     """Draw the appendix on loop closure if the flight contains a loop."""
     if isinstance(analysis.loop, Loop):
-        page = Page(appendix_title(TITLE), LEAD_TEXT)
+        page = Page(make_appendix_title(TITLE), LEAD_TEXT)
         _write_page(page, analysis.loop)
         yield page
 

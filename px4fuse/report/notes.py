@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from px4fuse.analysis import Analysis
 from px4fuse.errors import SettingsError
 from px4fuse.report.cover import FlightResults
-from px4fuse.report.page import Page, appendix_title
+from px4fuse.report.page import Page, make_appendix_title
 from px4fuse.report.style import MUTED_COLOUR
 from px4fuse.results.answer_form import Answers, form_rows
 from px4fuse.results.contract import LoopResults
@@ -33,7 +33,7 @@ TAG_PATTERN = re.compile(r"<!--.*?-->|<[^>]*>", re.DOTALL)
 def draw_pages(analysed_item: object, results: FlightResults | LoopResults) -> Iterator[Page]:
     """Yield a page with the student's answers and notes, or nothing if there are none."""
     title, answers = "Student notes", results.student.answers
-    page = Page(appendix_title(title) if isinstance(analysed_item, Analysis) else title)
+    page = Page(make_appendix_title(title) if isinstance(analysed_item, Analysis) else title)
     if isinstance(answers, Answers):
         page.write_heading("Answer form")
         rows = [list(row) for row in form_rows(answers)]

@@ -14,8 +14,8 @@ from px4fuse.comparison.model import AxisComparison, Difference
 from px4fuse.filter.consistency import Consistency
 from px4fuse.flight.model import Unavailable
 from px4fuse.report import event_marks, style
-from px4fuse.report.page import Block, Page
-from px4fuse.report.phrases import format_verdict, statistics_by_filter
+from px4fuse.report.page import Page, PageBlock
+from px4fuse.report.phrases import format_verdict, get_statistics_by_filter
 from px4fuse.report.style import (
     INNOVATION_STYLES,
     TRACK_STYLES,
@@ -91,7 +91,7 @@ class Panel(NamedTuple):
         page.write_small_text(statistics_text)
 
 
-def add_legend(page: Page, analysis: Analysis) -> Block:
+def add_legend(page: Page, analysis: Analysis) -> PageBlock:
     from matplotlib.lines import Line2D  # noqa: PLC0415
     from matplotlib.patches import Patch  # noqa: PLC0415
 
@@ -104,15 +104,15 @@ def add_legend(page: Page, analysis: Analysis) -> Block:
             for name in _list_ekf2_and_truth_tracks(analysis.main)
         ),
     ]
-    return page.add_legend([*lines, *event_marks.legend_entries(analysis)])
+    return page.add_legend([*lines, *event_marks.make_legend_entries(analysis)])
 
 
-def available_tables(**tables: object) -> dict[str, pd.DataFrame]:
+def select_available_tables(**tables: object) -> dict[str, pd.DataFrame]:
     return {name: table for name, table in tables.items() if isinstance(table, pd.DataFrame)}
 
 
 def _list_ekf2_and_truth_tracks(result: AxisComparison) -> dict[str, pd.DataFrame]:
-    return available_tables(**{"EKF2": result.ekf2_state, "ground truth": result.truth})
+    return select_available_tables(**{"EKF2": result.ekf2_state, "ground truth": result.truth})
 
 
 def draw_tracks(axes: Axes, result: AxisComparison, quantity: QuantityColumns) -> None:
@@ -143,7 +143,7 @@ def _describe_measurements(_: Analysis, result: AxisComparison) -> str:
 def _format_rmse(result: AxisComparison, quantity: QuantityColumns) -> list[str]:
     rmse_texts = [
         f"{name} {rmse:.3f} {quantity.unit}"
-        for name, filter_summary in statistics_by_filter(result).items()
+        for name, filter_summary in get_statistics_by_filter(result).items()
         if (rmse := getattr(filter_summary.truth, quantity.rmse_field, None)) is not None
     ]
     return [f"RMSE against ground truth {', '.join(rmse_texts)}"] if rmse_texts else []
@@ -182,7 +182,7 @@ def _find_innovation_limit_m(result: AxisComparison) -> float:
 
 
 def _collect_innovation_tables(result: AxisComparison) -> dict[str, pd.DataFrame]:
-    return available_tables(KF=result.replay.updates, EKF2=result.ekf2_innovations)
+    return select_available_tables(KF=result.replay.updates, EKF2=result.ekf2_innovations)
 
 
 def normalised_innovations(result: AxisComparison) -> dict[str, pd.Series[float]]:
@@ -232,7 +232,7 @@ def describe_innovations(_: Analysis, result: AxisComparison) -> str:
     """Return the caption of the innovation plot."""
     plot_limit_m, sentences = _find_innovation_limit_m(result), []
     innovation_tables = _collect_innovation_tables(result)
-    for name, consistency in statistics_by_filter(result).items():
+    for name, consistency in get_statistics_by_filter(result).items():
         if isinstance(consistency, Unavailable):
             sentences.append(f"{name}: {consistency.reason}.")
             continue
@@ -256,7 +256,7 @@ def describe_innovations(_: Analysis, result: AxisComparison) -> str:
 def _format_fraction_outside(result: AxisComparison) -> str:
     fractions_text = ", ".join(
         f"{name} {consistency.fraction_outside_two_sigma:.1%}"
-        for name, consistency in statistics_by_filter(result).items()
+        for name, consistency in get_statistics_by_filter(result).items()
         if isinstance(consistency, Consistency)
     )
     return f"{fractions_text} outside ±2√S (expected 5 %)" if fractions_text else ""
@@ -269,7 +269,7 @@ def _draw_sigma(axes: Axes, result: AxisComparison, quantity: QuantityColumns) -
 
 
 def _collect_variance_tables(result: AxisComparison) -> dict[str, pd.DataFrame]:
-    return available_tables(KF=result.replay.steps, EKF2=result.ekf2_variance)
+    return select_available_tables(KF=result.replay.steps, EKF2=result.ekf2_variance)
 
 
 def describe_sigma_growth(analysis: Analysis, result: AxisComparison) -> str:
@@ -292,7 +292,7 @@ def describe_sigma_growth(analysis: Analysis, result: AxisComparison) -> str:
 
 def _format_median_sigma(result: AxisComparison, quantity: QuantityColumns) -> str:
     texts = []
-    for name, filter_summary in statistics_by_filter(result).items():
+    for name, filter_summary in get_statistics_by_filter(result).items():
         median_sigma = getattr(filter_summary, quantity.median_sigma_field)
         text = "not logged" if median_sigma is None else f"{median_sigma:.3f} {quantity.unit}"
         texts.append(f"{name} {text}")

@@ -74,7 +74,7 @@ def format_sigma_verdict(verdict: str, factor: float) -> str:
     return f"{verdict}, σ {format_factor(factor)}× {SIGMA_ERROR_TEXTS[verdict]}"
 
 
-def statistics_by_filter(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
+def get_statistics_by_filter(result: AxisComparison) -> dict[str, FilterSummary | UntestedFilter]:
     """Return the statistics of each filter, without EKF2 if it is not logged, by label."""
     is_ekf2_missing = isinstance(result.ekf2_state, Unavailable)
     return {
@@ -89,7 +89,7 @@ VERDICT_TABLE_HEAD = ("axis", "filter", "mean\nNIS", "95 %\nband", "verdict")
 
 def make_verdict_row(result: AxisComparison, name: str) -> list[Cell]:
     """Return the table row on the consistency of a filter (KF or EKF2) along an axis."""
-    consistency = statistics_by_filter(result)[name]
+    consistency = get_statistics_by_filter(result)[name]
     label = result.axis.label.removeprefix("the ") if name == "KF" else ""
     if isinstance(consistency, Unavailable):
         return [label, name, "", "", (format_verdict(consistency), MUTED_COLOUR)]
@@ -108,7 +108,7 @@ def write_error_table(page: Page, analysis: Analysis) -> None:
 
     rows = []
     for result in axes:
-        for name, consistency in statistics_by_filter(result).items():
+        for name, consistency in get_statistics_by_filter(result).items():
             difference = result.difference if name == "KF" else None
             cells = [_format_rms(difference, field) for field in DIFFERENCE_FIELDS if has_ekf2]
             cells += [_format_rms(consistency.truth, field) for field in RMSE_FIELDS if has_truth]
@@ -128,7 +128,7 @@ def list_verdict_warnings(comparison: Comparison) -> list[str]:
     consistency_rows = [
         (result.axis.label, filter_name, consistency)
         for result in comparison.axes.values()
-        for filter_name, consistency in statistics_by_filter(result).items()
+        for filter_name, consistency in get_statistics_by_filter(result).items()
         if isinstance(consistency, Consistency)
     ]
     notes = []

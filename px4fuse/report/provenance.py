@@ -122,7 +122,7 @@ def _write_section(page: Page, title: str, texts: Iterable[str | tuple[str, str]
             page.write(text)
         else:
             page.write_labelled(
-                *text, width=LABEL_WIDTH, gap_above=-1.0, colour=MUTED_COLOUR, bold=False
+                *text, label_width=LABEL_WIDTH, gap_above=-1.0, colour=MUTED_COLOUR, bold=False
             )
 
 

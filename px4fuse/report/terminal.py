@@ -24,7 +24,7 @@ ERROR_LEGEND = (
 )
 
 
-def comparison_page(
+def make_comparison_page(
     analysis: Analysis | AidsOnlyAnalysis,
     results: Any,
     *,

@@ -21,7 +21,7 @@ TUNING_NOTE = (
 )
 
 
-def tuning_page(
+def make_tuning_page(
     comparison: PreparedComparison, tunings: dict[str, AxisTuning | Unavailable]
 ) -> Page:
     """Format the estimates of SIGMA_A and SIGMA_Z along each axis."""

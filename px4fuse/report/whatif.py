@@ -164,7 +164,7 @@ def _format_number(value: float | Unavailable, digits: int = 3) -> str:
     return "n/a" if isinstance(value, Unavailable) else f"{value:.{digits}f}"
 
 
-def whatif_page(analysis: WhatIfAnalysis) -> Page:
+def make_whatif_page(analysis: WhatIfAnalysis) -> Page:
     page = Page()
     if AISLE in analysis.difference_steps:
         write_explanation(page, analysis.difference_steps[AISLE])
