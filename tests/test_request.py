@@ -69,7 +69,7 @@ def parsed(command: str) -> Request:
     context = made.make_context(name, [*options, "--", file])
     own = (
         "output", "json_path", "fail_on", "checks", "student", "student_id", "notes", "answers",
-        "tum", "g2o", "verbose", "quiet",
+        "tum_path", "g2o_path", "verbose", "quiet",
     )  # fmt: skip
     values = {key: value for key, value in context.params.items() if key not in own}
     if name == "compare":

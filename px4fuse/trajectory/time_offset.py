@@ -48,7 +48,7 @@ MIN_SECOND_PEAK_RATIO = 1.2
 MAX_FITTED_POSES = 2000
 # Maximum misfit (RMS residual over RMS extent of the motion) of an accepted fit of the time offset
 MAX_RELATIVE_MISFIT = 0.5
-# Lower limit of the misfit (RMS residual over RMS extent): smaller ones are equal
+# Lower limit of the misfit (RMS residual over RMS extent): better fits count as equally good
 MIN_RELATIVE_MISFIT = 1e-3
 # Minimum RMS of the residual velocity, as fraction of the RMS speed. The residual velocity is the
 # part that no shift, rotation or scale of the path explains: without it, no offset is observable
